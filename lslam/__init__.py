@@ -1,0 +1,37 @@
+"""lslam: batch LiDAR SLAM. The Python API on arrays, which the command line itself uses.
+
+>>> import lslam
+>>> sequence = lslam.open_sequence("sample_data")
+>>> outcome = lslam.run(sequence, out="runs/first")
+>>> lslam.evaluate(outcome.trajectory, sequence.ground_truth).ate["se3"].translation.rmse
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from lslam.version import __version__
+
+if TYPE_CHECKING:
+    from lslam.evaluation.evaluate import evaluate
+    from lslam.pipeline.run import run
+    from lslam.readers import open_sequence
+    from lslam.registration.registration import Registration
+
+__all__ = ["Registration", "__version__", "evaluate", "open_sequence", "run"]
+
+_HOMES = {
+    "Registration": "lslam.registration.registration",
+    "evaluate": "lslam.evaluation.evaluate",
+    "open_sequence": "lslam.readers",
+    "run": "lslam.pipeline.run",
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Import the API's parts when they are asked for, so that `import lslam` costs nothing."""
+    if name not in _HOMES:
+        raise AttributeError(f"module 'lslam' has no attribute {name!r}")
+    from importlib import import_module
+
+    return getattr(import_module(_HOMES[name]), name)

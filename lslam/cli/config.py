@@ -1,0 +1,47 @@
+"""`lslam config`: show or check a configuration."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from lslam.cli import options
+
+
+@click.group()
+def command() -> None:
+    """Show or check a configuration.
+
+    \b
+    Example: lslam config show > my.toml
+             lslam config check my.toml
+    """
+
+
+@command.command(epilog="Example: lslam config show --set map.voxel=0.1")
+@options.configuration
+@click.option("--describe", is_flag=True, help="Say beside each key what it means.")
+def show(config_file: Path | None, settings: tuple[str, ...], describe: bool) -> None:
+    """Print the resolved configuration as TOML."""
+    from lslam.config import load_config, to_toml
+
+    config = load_config(config_file, settings)
+    if not describe:
+        click.echo(to_toml(config), nl=False)
+        return
+    for section in type(config).model_fields:
+        click.echo(f"[{section}]")
+        values = getattr(config, section)
+        for key, field in type(values).model_fields.items():
+            click.echo(f"{key} = {getattr(values, key)!r}  # {field.description}")
+
+
+@command.command(epilog="Example: lslam config check my.toml")
+@click.argument("file", type=click.Path(path_type=Path))
+def check(file: Path) -> None:
+    """Check a configuration file: exit 0 when every key and value is known."""
+    from lslam.config import load_config
+
+    load_config(file)
+    click.echo(f"{file}: ok")

@@ -1,0 +1,113 @@
+"""The `lslam` command: finds the sub-command's module when it is called, and turns errors into exit codes."""
+
+from __future__ import annotations
+
+import sys
+from importlib import import_module
+from typing import Any, NoReturn
+
+import click
+
+from lslam.errors import LslamError, nearest
+from lslam.version import __version__
+
+# name -> one line for --help; the module lslam.cli.<name> has the click command `command`.
+COMMANDS = {
+    "run": "Estimate a trajectory and build a map from a recorded sequence.",
+    "eval": "Score estimated trajectories against ground truth.",
+    "simulate": "Simulate a drive with exact ground truth.",
+    "info": "Show what is in a sequence and what is wrong with it.",
+    "methods": "List the odometry methods.",
+    "config": "Show or check a configuration.",
+    "completion": "Print the completion script of a shell.",
+}
+
+STANDS_ON = (
+    "numpy",
+    "numba",
+    "scipy",
+    "kiss-icp",
+    "gtsam",
+    "open3d-cpu",
+    "open3d",
+    "pyproj",
+    "shapely",
+    "embreex",
+)
+
+
+class LazyGroup(click.Group):
+    """A group that imports a sub-command's module only when it is called, so that `--help` is instant."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        """Names in the order of the table."""
+        return list(COMMANDS)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        """The sub-command, imported now."""
+        if cmd_name not in COMMANDS:
+            return None
+        command = import_module(f"lslam.cli.{cmd_name}").command
+        assert isinstance(command, click.Command)
+        return command
+
+    def resolve_command(self, ctx: click.Context, args: list[str]) -> Any:
+        """As click does, but an unknown name is answered with the nearest one."""
+        if args and args[0] not in COMMANDS and not args[0].startswith("-"):
+            raise click.UsageError(f"no command {args[0]!r}; {nearest(args[0], COMMANDS)}")
+        return super().resolve_command(ctx, args)
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """The table itself: help needs no module."""
+        with formatter.section("Commands"):
+            formatter.write_dl(list(COMMANDS.items()))
+
+
+def _print_version(ctx: click.Context, _: click.Parameter, wanted: bool) -> None:
+    if not wanted or ctx.resilient_parsing:
+        return
+    from importlib.metadata import PackageNotFoundError, version
+
+    click.echo(f"lslam {__version__}, Python {sys.version.split()[0]}")
+    for name in STANDS_ON:
+        try:
+            click.echo(f"  {name} {version(name)}")
+        except PackageNotFoundError:
+            continue
+    ctx.exit()
+
+
+@click.group(
+    cls=LazyGroup,
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110},
+    epilog="Example: lslam run sample_data --out runs/first",
+)
+@click.option(
+    "--version", is_flag=True, is_eager=True, expose_value=False, callback=_print_version,
+    help="Show the versions of lslam and what it stands on.",
+)  # fmt: skip
+def cli() -> None:
+    """Batch LiDAR SLAM: a recorded sequence goes in; a trajectory, a map and an honest report come out."""
+
+
+def main() -> NoReturn:
+    """Entry point: results on stdout, one sentence per error on stderr, documented exit codes."""
+    try:
+        code = cli(standalone_mode=False)
+        sys.exit(code if isinstance(code, int) else 0)
+    except LslamError as error:
+        _fail(str(error), error.exit_code)
+    except click.ClickException as error:
+        error.show(file=sys.stderr)
+        sys.exit(2)
+    except (click.Abort, KeyboardInterrupt):
+        _fail("interrupted", 130)
+    except BrokenPipeError:
+        # The reader of our stdout left (`lslam ... | head`): not an error of ours.
+        sys.stderr.close()
+        sys.exit(0)
+
+
+def _fail(sentence: str, code: int) -> NoReturn:
+    click.echo(f"error: {sentence}", err=True)
+    sys.exit(code)

@@ -1,0 +1,59 @@
+"""Options that several commands share, written once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeVar
+
+import click
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+
+def verbosity(function: F) -> F:
+    """--verbose and --quiet."""
+    function = click.option("-v", "--verbose", is_flag=True, help="Say more on stderr.")(function)
+    return click.option("-q", "--quiet", is_flag=True, help="Only warnings and errors on stderr.")(function)
+
+
+def data_root(function: F) -> F:
+    """--data-root."""
+    return click.option(
+        "--data-root", type=click.Path(path_type=Path), envvar="LSLAM_DATA", metavar="DIR",
+        help="Where names like seq07 are looked up [env: LSLAM_DATA].",
+    )(function)  # fmt: skip
+
+
+def scan_range(function: F) -> F:
+    """--start, --count and --skip-frames."""
+    for name, text in (
+        ("--skip-frames", "Use every N-th scan."),
+        ("--count", "Number of scans used."),
+        ("--start", "First scan used."),
+    ):
+        function = click.option(name, type=int, metavar="N", help=text)(function)
+    return function
+
+
+def configuration(function: F) -> F:
+    """--config and --set."""
+    function = click.option(
+        "--set",
+        "settings",
+        multiple=True,
+        metavar="SECTION.KEY=VALUE",
+        help="Set one configuration key; repeatable.",
+    )(function)
+    return click.option(
+        "--config",
+        "config_file",
+        type=click.Path(path_type=Path),
+        metavar="FILE",
+        help="Configuration, TOML.",
+    )(function)
+
+
+def as_json(function: F) -> F:
+    """--json."""
+    return click.option("--json", "as_json", is_flag=True, help="Print one JSON object on stdout.")(function)

@@ -1,0 +1,24 @@
+"""The whole configuration."""
+
+from __future__ import annotations
+
+from lslam.config.eval import EvalConfig
+from lslam.config.input import InputConfig
+from lslam.config.map import MapConfig
+from lslam.config.odometry import OdometryConfig
+from lslam.config.preprocess import PreprocessConfig
+from lslam.config.registration import RegistrationConfig
+from lslam.config.report import ReportConfig
+from lslam.config.section import Section
+
+
+class Config(Section):
+    """All sections; the defaults are one configuration for every sensor."""
+
+    input: InputConfig = InputConfig()
+    preprocess: PreprocessConfig = PreprocessConfig()
+    odometry: OdometryConfig = OdometryConfig()
+    registration: RegistrationConfig = RegistrationConfig()
+    map: MapConfig = MapConfig()
+    eval: EvalConfig = EvalConfig()
+    report: ReportConfig = ReportConfig()

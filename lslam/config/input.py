@@ -1,0 +1,20 @@
+"""Section `input`: which scans are read."""
+
+from __future__ import annotations
+
+from pydantic import Field
+
+from lslam.config.section import Section
+
+
+class InputConfig(Section):
+    """Which scans of the sequence are used, and how strict the run is about them."""
+
+    start: int = Field(0, ge=0, description="first scan used")
+    count: int | None = Field(None, ge=1, description="number of scans used; all when absent")
+    skip_frames: int = Field(1, ge=1, description="use every n-th scan")
+    threads: int = Field(2, ge=1, description="1: everything in turn; 2 and more: the next scan is read meanwhile")
+    strict: bool = Field(False, description="stop at the first scan that cannot be read or registered")
+    vertical_correction_deg: float | None = Field(
+        None, description="rotation of KITTI HDL-64E points about p x z; absent: the reader knows"
+    )

@@ -1,0 +1,100 @@
+"""From defaults, file, environment and `--set` to one resolved configuration."""
+
+from __future__ import annotations
+
+import os
+import tomllib
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import tomli_w
+from pydantic import BaseModel, ValidationError
+
+from lslam.config.config import Config
+from lslam.errors import ConfigError, InputError, nearest
+
+Tree = dict[str, Any]
+
+
+def load_config(
+    path: Path | None = None, settings: Iterable[str] = (), environ: Mapping[str, str] | None = None
+) -> Config:
+    """Resolve the configuration: `settings` ("a.b=v") over LSLAM_A_B variables over the TOML file over defaults.
+
+    Raises ConfigError naming the key and the nearest known one, InputError when the file is missing or not TOML.
+    """
+    tree: Tree = {}
+    if path is not None:
+        _merge(tree, _read(path), str(path))
+    _merge(tree, _from_environment(os.environ if environ is None else environ), "environment")
+    for setting in settings:
+        _merge(tree, _parse_setting(setting), f"--set {setting}")
+    try:
+        return Config.model_validate(tree)
+    except ValidationError as error:
+        raise ConfigError(_explain(error)) from None
+
+
+def to_toml(config: Config) -> str:
+    """The resolved configuration as TOML; absent optional values are left out."""
+    return tomli_w.dumps(config.model_dump(mode="json", exclude_none=True))
+
+
+def _read(path: Path) -> Tree:
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"configuration {path} cannot be read: {error}") from None
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"configuration {path} is not valid TOML: {error}") from None
+
+
+def _from_environment(environ: Mapping[str, str]) -> Tree:
+    """LSLAM_MAP_VOXEL=0.1 is map.voxel; variables that start with no section's name (LSLAM_DATA) mean something else."""
+    tree: Tree = {}
+    for name in sorted(environ):
+        if not name.startswith("LSLAM_"):
+            continue
+        section, _, key = name.removeprefix("LSLAM_").lower().partition("_")
+        if section in Config.model_fields and key:
+            tree.setdefault(section, {})[key] = _value(environ[name])
+    return tree
+
+
+def _parse_setting(setting: str) -> Tree:
+    name, equals, value = setting.partition("=")
+    section, dot, key = name.strip().partition(".")
+    if not equals or not dot:
+        raise ConfigError(f"--set {setting}: expected section.key=value, for example map.voxel=0.1")
+    return {section: {key: _value(value.strip())}}
+
+
+def _value(text: str) -> Any:
+    """A TOML value, or the text itself when it is none: `--set odometry.method=icp` needs no quotes."""
+    try:
+        return tomllib.loads(f"v = {text}")["v"]
+    except tomllib.TOMLDecodeError:
+        return text
+
+
+def _merge(tree: Tree, more: Tree, where: str) -> None:
+    for section, values in more.items():
+        if section not in Config.model_fields:
+            raise ConfigError(f"{where}: unknown section {section!r}; {nearest(section, Config.model_fields)}")
+        if not isinstance(values, dict):
+            raise ConfigError(f"{where}: {section!r} is a section, write {section}.key = value")
+        model = Config.model_fields[section].annotation
+        assert isinstance(model, type)
+        assert issubclass(model, BaseModel)
+        for key, value in values.items():
+            if key not in model.model_fields:
+                raise ConfigError(f"{where}: unknown key {section}.{key}; {nearest(key, model.model_fields)}")
+            tree.setdefault(section, {})[key] = value
+
+
+def _explain(error: ValidationError) -> str:
+    parts = []
+    for e in error.errors():
+        parts.append(f"{'.'.join(str(p) for p in e['loc'] if not isinstance(p, int))} = {e['input']!r}: {e['msg']}")
+    return "configuration: " + "; ".join(parts)

@@ -1,0 +1,14 @@
+"""Section `odometry`: the method and when a run is given up."""
+
+from __future__ import annotations
+
+from pydantic import Field
+
+from lslam.config.section import Section
+
+
+class OdometryConfig(Section):
+    """Which method estimates the trajectory."""
+
+    method: str = Field("icp", description="a name of `lslam methods`")
+    max_failures: int = Field(20, ge=1, description="failed scans in a row after which the run counts as diverged")

@@ -1,0 +1,32 @@
+"""Section `preprocess`: which points of a scan are used, and how many."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field
+
+from lslam.config.section import Section
+
+
+class PreprocessConfig(Section):
+    """Range gate and down-sampling."""
+
+    range_min: float = Field(1.0, ge=0, description="m; nearer points hit the vehicle")
+    range_max: float = Field(100.0, gt=0, description="m; far points hold the yaw")
+    range_shape: Literal["sphere", "cylinder"] = Field("sphere", description="distance in space, or horizontal")
+    ego_box: tuple[float, float, float, float, float, float] | None = Field(
+        None,
+        description="x_min, x_max, y_min, y_max, z_min, z_max in the LiDAR frame, m: points inside are dropped",
+    )
+    map_leaf: float = Field(0.3, gt=0, description="m; centroids of this grid feed the local map")
+    downsample: Literal["target", "grid", "first", "random", "none"] = Field(
+        "target",
+        description="source points: centroids of a grid adapted to a target count, of a fixed grid, first point per "
+        "voxel, random share, or all",
+    )
+    source_voxel: float = Field(1.0, gt=0, description="m; grid of the source points, where `target` starts")
+    source_points_min: int = Field(2500, ge=50, description="`target`: fewer points make the grid finer")
+    source_points_max: int = Field(4000, ge=100, description="`target`: more points make the grid coarser")
+    random_share: float = Field(0.3, gt=0, le=1, description="`random`: share of points kept")
+    seed: int = Field(0, ge=0, description="`random`: seed")

@@ -1,0 +1,73 @@
+"""The error tree of lslam: every class carries the exit code a batch script can rely on.
+
+0 done, 1 the run failed, 2 usage, configuration or an output that exists, 3 input missing or unreadable and output
+unwritable, 4 done but a gate the user set failed, 130 interrupted.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
+
+class LslamError(Exception):
+    """Base of all errors lslam raises on purpose: one clear sentence that names the file, the place and the way out."""
+
+    exit_code = 1
+
+
+class RunFailedError(LslamError):
+    """The run produced no usable result (diverged, no scan registered)."""
+
+    exit_code = 1
+
+
+class UsageError(LslamError):
+    """Wrong arguments, names or combinations."""
+
+    exit_code = 2
+
+
+class ConfigError(UsageError):
+    """Unknown configuration key or a value out of range."""
+
+
+class OutputExistsError(UsageError):
+    """The output is there already, or another run is writing it."""
+
+
+class InputError(LslamError):
+    """Input that is missing, unreadable or contradicts itself."""
+
+    exit_code = 3
+
+
+class OutputError(LslamError):
+    """Output that cannot be written: permissions, a full disk."""
+
+    exit_code = 3
+
+
+class GateError(LslamError):
+    """Everything was done, but a gate the user set failed."""
+
+    exit_code = 4
+
+
+class InterruptedRunError(LslamError):
+    """SIGINT or SIGTERM ended the run; what was done is written."""
+
+    exit_code = 130
+
+
+def nearest(name: str, known: Iterable[str]) -> str:
+    """Sentence fragment suggesting the known name nearest to `name`, or listing the known ones.
+
+    >>> nearest("kis-icp", ["icp", "kiss-icp"])
+    "did you mean 'kiss-icp'?"
+    >>> nearest("zzz", ["icp", "kiss-icp"])
+    'known: icp, kiss-icp'
+    """
+    names = list(known)
+    close = difflib.get_close_matches(name, names, n=1, cutoff=0.5)
+    return f"did you mean {close[0]!r}?" if close else "known: " + ", ".join(names)

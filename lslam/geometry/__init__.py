@@ -1,0 +1,1 @@
+"""Rotations, rigid transforms, alignment and geodesy on float64 NumPy arrays."""

@@ -1,0 +1,84 @@
+"""Rigid transforms as 4x4 matrices, stacked or single: (..., 4, 4). `T_a_b` maps coordinates of b into a.
+
+Tangent vectors are (translation, rotation): xi = (rho, phi), metres then radians. Updates are left-multiplied:
+T' = exp(xi) T, so a covariance of xi is expressed in the parent frame.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.geometry import so3
+
+Floats = NDArray[np.float64]
+
+
+def make(R: NDArray[Any], t: NDArray[Any]) -> Floats:
+    """(..., 4, 4) transform of rotations (..., 3, 3) and translations (..., 3), m."""
+    R, t = np.asarray(R, np.float64), np.asarray(t, np.float64)
+    T = np.zeros((*np.broadcast_shapes(R.shape[:-2], t.shape[:-1]), 4, 4))
+    T[..., :3, :3], T[..., :3, 3], T[..., 3, 3] = R, t, 1.0
+    return T
+
+
+def exp(xi: NDArray[Any]) -> Floats:
+    """(..., 6) twists to (..., 4, 4) transforms."""
+    xi = np.asarray(xi, np.float64)
+    rho, phi = xi[..., :3], xi[..., 3:]
+    return make(so3.exp(phi), np.einsum("...ij,...j->...i", _left_jacobian(phi), rho))
+
+
+def log(T: NDArray[Any]) -> Floats:
+    """(..., 4, 4) transforms to (..., 6) twists."""
+    T = np.asarray(T, np.float64)
+    phi = so3.log(T[..., :3, :3])
+    rho = np.linalg.solve(_left_jacobian(phi), T[..., :3, 3, None])[..., 0]
+    return np.concatenate([rho, phi], axis=-1)
+
+
+def inverse(T: NDArray[Any]) -> Floats:
+    """Inverse of rigid transforms, by the transpose."""
+    T = np.asarray(T, np.float64)
+    Rt = np.swapaxes(T[..., :3, :3], -1, -2)
+    return make(Rt, -np.einsum("...ij,...j->...i", Rt, T[..., :3, 3]))
+
+
+def relative(T_a: NDArray[Any], T_b: NDArray[Any]) -> Floats:
+    """inv(T_a) @ T_b: pose b seen from pose a."""
+    return np.asarray(inverse(T_a) @ np.asarray(T_b, np.float64))
+
+
+def apply(T: NDArray[Any], points: NDArray[Any]) -> Floats:
+    """One transform (4, 4) applied to points (N, 3), m; float64 out."""
+    T = np.asarray(T, np.float64)
+    return np.asarray(np.asarray(points, np.float64) @ T[:3, :3].T + T[:3, 3])
+
+
+def normalise(T: NDArray[Any]) -> Floats:
+    """The same transforms with rotations put back on SO(3)."""
+    T = np.asarray(T, np.float64)
+    return make(so3.normalise(T[..., :3, :3]), T[..., :3, 3])
+
+
+def adjoint(T: NDArray[Any]) -> Floats:
+    """(..., 6, 6) adjoint: exp(Ad_T xi) = T exp(xi) inv(T), for (translation, rotation) twists."""
+    T = np.asarray(T, np.float64)
+    R, t = T[..., :3, :3], T[..., :3, 3]
+    A = np.zeros((*T.shape[:-2], 6, 6))
+    A[..., :3, :3] = A[..., 3:, 3:] = R
+    A[..., :3, 3:] = so3.hat(t) @ R
+    return A
+
+
+def _left_jacobian(phi: Floats) -> Floats:
+    theta2 = np.sum(phi * phi, axis=-1)[..., None, None]
+    theta = np.sqrt(theta2)
+    small = theta2 < 1e-8
+    safe = np.where(small, 1.0, theta)
+    b = np.where(small, 0.5 - theta2 / 24, (1 - np.cos(safe)) / safe**2)
+    c = np.where(small, 1 / 6 - theta2 / 120, (safe - np.sin(safe)) / safe**3)
+    k = so3.hat(phi)
+    return np.asarray(np.eye(3) + b * k + c * (k @ k))

@@ -1,0 +1,117 @@
+"""Rotations: exponential and logarithm on SO(3), quaternions (xyzw), angles. Arrays may be stacked: (..., 3, 3)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+
+def hat(v: NDArray[Any]) -> Floats:
+    """(..., 3) vectors to (..., 3, 3) skew matrices, so that `hat(a) @ b == cross(a, b)`."""
+    v = np.asarray(v, np.float64)
+    m = np.zeros((*v.shape[:-1], 3, 3))
+    m[..., 0, 1], m[..., 0, 2], m[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
+    m[..., 1, 0], m[..., 2, 0], m[..., 2, 1] = v[..., 2], -v[..., 1], v[..., 0]
+    return m
+
+
+def exp(phi: NDArray[Any]) -> Floats:
+    """(..., 3) rotation vectors, rad, to (..., 3, 3) matrices (Rodrigues)."""
+    phi = np.asarray(phi, np.float64)
+    theta2 = np.sum(phi * phi, axis=-1)[..., None, None]
+    theta = np.sqrt(theta2)
+    small = theta2 < 1e-10
+    safe = np.where(small, 1.0, theta)
+    a = np.where(small, 1 - theta2 / 6, np.sin(safe) / safe)
+    b = np.where(small, 0.5 - theta2 / 24, (1 - np.cos(safe)) / safe**2)
+    k = hat(phi)
+    return np.asarray(np.eye(3) + a * k + b * (k @ k))
+
+
+def log(R: NDArray[Any]) -> Floats:
+    """(..., 3, 3) rotations to (..., 3) rotation vectors, rad, of angle 0..pi; stable near 0 and near pi."""
+    q = to_quaternion(R)
+    v, w = q[..., :3], q[..., 3]
+    n = np.linalg.norm(v, axis=-1)
+    small = n < 1e-9
+    scale = np.where(small, 2.0, 2 * np.arctan2(n, w) / np.where(small, 1.0, n))
+    return np.asarray(v * scale[..., None])
+
+
+def angle(R: NDArray[Any]) -> Floats:
+    """Rotation angle |log R| in rad, shape (...)."""
+    return np.asarray(np.linalg.norm(log(R), axis=-1))
+
+
+def to_quaternion(R: NDArray[Any]) -> Floats:
+    """(..., 3, 3) rotations to (..., 4) unit quaternions xyzw with w >= 0 (Shepperd's method: the largest term leads)."""
+    R = np.asarray(R, np.float64)
+    r00, r11, r22 = R[..., 0, 0], R[..., 1, 1], R[..., 2, 2]
+    squares = np.stack([1 + r00 - r11 - r22, 1 - r00 + r11 - r22, 1 - r00 - r11 + r22, 1 + r00 + r11 + r22], axis=-1)
+    a, b, c = R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]
+    d, e, f = R[..., 1, 0] + R[..., 0, 1], R[..., 0, 2] + R[..., 2, 0], R[..., 2, 1] + R[..., 1, 2]
+    rows = np.stack(
+        [
+            np.stack([squares[..., 0], d, e, a], axis=-1),
+            np.stack([d, squares[..., 1], f, b], axis=-1),
+            np.stack([e, f, squares[..., 2], c], axis=-1),
+            np.stack([a, b, c, squares[..., 3]], axis=-1),
+        ],
+        axis=-2,
+    )
+    best = np.argmax(squares, axis=-1)
+    q = np.take_along_axis(rows, best[..., None, None], axis=-2)[..., 0, :]
+    q = q / np.linalg.norm(q, axis=-1, keepdims=True)
+    return np.asarray(np.where(q[..., 3:] < 0, -q, q))
+
+
+def from_quaternion(q: NDArray[Any]) -> Floats:
+    """(..., 4) quaternions xyzw, any non-zero length, to (..., 3, 3) rotations."""
+    q = np.asarray(q, np.float64)
+    q = q / np.linalg.norm(q, axis=-1, keepdims=True)
+    x, y, z, w = np.moveaxis(q, -1, 0)
+    m = np.empty((*q.shape[:-1], 3, 3))
+    m[..., 0, 0], m[..., 0, 1], m[..., 0, 2] = (
+        1 - 2 * (y * y + z * z),
+        2 * (x * y - z * w),
+        2 * (x * z + y * w),
+    )
+    m[..., 1, 0], m[..., 1, 1], m[..., 1, 2] = (
+        2 * (x * y + z * w),
+        1 - 2 * (x * x + z * z),
+        2 * (y * z - x * w),
+    )
+    m[..., 2, 0], m[..., 2, 1], m[..., 2, 2] = (
+        2 * (x * z - y * w),
+        2 * (y * z + x * w),
+        1 - 2 * (x * x + y * y),
+    )
+    return m
+
+
+def normalise(R: NDArray[Any]) -> Floats:
+    """Nearest rotation (SVD) to (..., 3, 3) matrices that rounding moved off SO(3)."""
+    u, _, vt = np.linalg.svd(np.asarray(R, np.float64))
+    d = np.sign(np.linalg.det(u @ vt))
+    u[..., :, 2] *= d[..., None]
+    return np.asarray(u @ vt)
+
+
+def euler_rpy(R: NDArray[Any]) -> Floats:
+    """(..., 3) roll, pitch, yaw in rad with R = Rz(yaw) Ry(pitch) Rx(roll)."""
+    R = np.asarray(R, np.float64)
+    roll = np.arctan2(R[..., 2, 1], R[..., 2, 2])
+    pitch = np.arctan2(-R[..., 2, 0], np.hypot(R[..., 0, 0], R[..., 1, 0]))
+    yaw = np.arctan2(R[..., 1, 0], R[..., 0, 0])
+    return np.stack([roll, pitch, yaw], axis=-1)
+
+
+def from_euler_rpy(rpy: NDArray[Any]) -> Floats:
+    """(..., 3) roll, pitch, yaw in rad to Rz(yaw) Ry(pitch) Rx(roll)."""
+    rpy = np.asarray(rpy, np.float64)
+    axes = np.eye(3)
+    return np.asarray(exp(rpy[..., 2:3] * axes[2]) @ exp(rpy[..., 1:2] * axes[1]) @ exp(rpy[..., 0:1] * axes[0]))

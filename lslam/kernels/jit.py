@@ -1,0 +1,69 @@
+"""All policy about compiling: flags, the shared cache folder, and one process compiling at a time.
+
+Kernels are plain loops. `nogil` lets the next scan be prepared meanwhile; no `fastmath`, because sums must not depend
+on the machine; no `parallel`, because results must not depend on the number of threads.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import sys
+import tempfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, TypeVar, cast
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+
+def cache_folder() -> Path:
+    """The user's XDG cache, or a folder of the temporary directory when the home cannot be written."""
+    base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    for folder in (
+        base / "lslam",
+        Path(tempfile.gettempdir()) / f"lslam-cache-{os.getuid() if hasattr(os, 'getuid') else 0}",
+    ):
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            with tempfile.TemporaryFile(dir=folder):
+                return folder
+        except OSError:
+            continue
+    return Path(tempfile.mkdtemp(prefix="lslam-cache-"))
+
+
+# Numba reads the variable when it is imported; a value set by the user wins.
+os.environ.setdefault("NUMBA_CACHE_DIR", str(cache_folder() / "numba"))
+
+import numba  # noqa: E402
+
+
+def kernel(function: F) -> F:
+    """Compile `function` on first use and keep the machine code in the cache."""
+    compiled = numba.njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)(function)
+    return cast(F, compiled)
+
+
+def inline(function: F) -> F:
+    """A small helper of kernels, compiled into its callers and not cached by itself."""
+    compiled = numba.njit(nogil=True, error_model="numpy")(function)
+    return cast(F, compiled)
+
+
+@contextlib.contextmanager
+def compile_lock() -> Iterator[None]:
+    """Hold the cache for this process: others wait instead of compiling the same kernels into the same files."""
+    folder = Path(os.environ["NUMBA_CACHE_DIR"])
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        stream = (folder / "compile.lock").open("a")
+    except OSError:
+        yield
+        return
+    with stream:
+        if sys.platform != "win32":
+            import fcntl
+
+            fcntl.flock(stream, fcntl.LOCK_EX)
+        yield

@@ -1,0 +1,1 @@
+"""Preparing a scan: range gate and down-sampling."""

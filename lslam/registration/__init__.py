@@ -1,0 +1,1 @@
+"""Scan against local map: Gaussian voxels, robust kernels, the solver."""

@@ -1,0 +1,1 @@
+"""Evaluation and run records for people: text, tables, JSON, plots, HTML."""

@@ -1,0 +1,1 @@
+"""The virtual environment: a city, a path, a LiDAR, exact ground truth."""

@@ -1,0 +1,1 @@
+"""The values that flow through lslam: plain frozen data, no behaviour beyond checking shapes."""

@@ -1,0 +1,23 @@
+"""Inertial measurements."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True)
+class ImuStream:
+    """Samples of one IMU in its own frame.
+
+    stamps_ns : (M,) int64; accel : (M, 3) specific force, m/s2, +g up at rest; gyro : (M, 3) rad/s
+    """
+
+    stamps_ns: NDArray[np.int64]
+    accel: NDArray[np.float64]
+    gyro: NDArray[np.float64]
+
+    def __len__(self) -> int:
+        return len(self.stamps_ns)

@@ -1,0 +1,35 @@
+"""Everything a run knows about itself when it ends: what the report is written from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.types.scan_result import ScanResult
+from lslam.types.trajectory import Trajectory
+
+
+@dataclass
+class RunRecord:
+    """One run, for reports. `manifest` is the dictionary written as manifest.json.
+
+    map_image : (H, W) float32 density of the merged map seen from above, row 0 at the largest y, or None
+    map_extent : (x_min, x_max, y_min, y_max), m
+    real_time_limit : seconds one scan may take: skip_frames / rate
+    """
+
+    name: str
+    method: str
+    folder: Path
+    results: list[ScanResult]
+    trajectory: Trajectory
+    ground_truth: Trajectory | None
+    real_time_limit: float
+    manifest: dict[str, Any] = field(default_factory=dict)
+    map_image: NDArray[np.float32] | None = None
+    map_extent: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
+    problems: list[str] = field(default_factory=list)

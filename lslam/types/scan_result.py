@@ -1,0 +1,41 @@
+"""The outcome of one scan."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+Status = Literal["ok", "bridged", "skipped"]
+
+
+@dataclass(frozen=True)
+class ScanResult:
+    """What odometry says about one scan.
+
+    status : `ok` registered; `bridged` registration failed and the motion prior stands in; `skipped` the scan could
+        not be read or was empty, the motion prior stands in
+    T_world_lidar : (4, 4) pose at scan start; covariance : (6, 6) of the left twist (translation, rotation), m2, rad2;
+        None when the method has none
+    degenerate : (K, 6) unit twists along which the scan says nothing and the motion prior was kept
+    prior_error : (translation m, rotation rad) between motion prior and result
+    stages : seconds per stage, by name, in the order they ran
+    """
+
+    index: int
+    stamp_ns: int
+    T_world_lidar: NDArray[np.float64]
+    status: Status = "ok"
+    reason: str = ""
+    covariance: NDArray[np.float64] | None = None
+    converged: bool = True
+    iterations: int = 0
+    source_points: int = 0
+    inliers: int = 0
+    rmse: float = 0.0
+    overlap: float = 0.0
+    degenerate: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 6)))
+    prior_error: tuple[float, float] = (0.0, 0.0)
+    stages: dict[str, float] = field(default_factory=dict)

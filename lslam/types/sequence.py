@@ -1,0 +1,55 @@
+"""What every reader gives: one recorded sequence."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.types.calibration import Calibration
+from lslam.types.gnss import GnssStream
+from lslam.types.imu import ImuStream
+from lslam.types.scan import Scan
+from lslam.types.trajectory import Trajectory
+
+
+class Sequence(Protocol):
+    """A recorded sequence, opened but not loaded: scans are read one at a time, from any thread.
+
+    Attributes
+    ----------
+    name : short name for run folders, for example `seq07` or `2011_09_26_drive_0005_sync`
+    path : where it lies
+    kind : the format that was detected, for example `kitti-odometry`
+    stamps_ns : (N,) int64, increasing
+    rate_hz : nominal scan rate
+    motion_compensated : True or False, None when unknown
+    calibration : extrinsics that are known
+    ground_truth : T_world_lidar at scan stamps or denser, None when unknown
+    imu, gnss : streams, None when the recording has none
+    notes : decisions the reader took, one sentence each, for the log and the manifest
+    problems : what is wrong with the recording but does not stop a run, one sentence each
+    """
+
+    name: str
+    path: Path
+    kind: str
+    stamps_ns: NDArray[np.int64]
+    rate_hz: float
+    motion_compensated: bool | None
+    calibration: Calibration
+    ground_truth: Trajectory | None
+    imu: ImuStream | None
+    gnss: GnssStream | None
+    notes: list[str]
+    problems: list[str]
+
+    def __len__(self) -> int:
+        """Number of scans."""
+        ...
+
+    def scan(self, index: int) -> Scan:
+        """Read scan `index`. Raises InputError naming the file when it cannot be read."""
+        ...

@@ -1,0 +1,3 @@
+"""The version of lslam: one place, no imports."""
+
+__version__ = "0.1.0"

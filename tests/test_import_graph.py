@@ -1,0 +1,161 @@
+"""The walls of the house: layers, siblings and cycles, lazy imports included, read from the source and not from a run."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGE = ROOT / "lslam"
+
+# Top may import below; packages on one line are siblings and never import each other.
+LAYERS = [
+    ["cli"],
+    ["studies"],
+    ["pipeline"],
+    ["reports"],
+    ["readers", "odometry", "inertial", "loops", "graph", "priors", "maps", "evaluation", "simulation"],
+    ["keyframes", "registration"],
+    ["preprocessing"],
+    ["formats"],
+    ["types"],
+    ["geometry"],
+    ["kernels", "config"],
+    ["errors", "version"],
+]
+LEVEL = {name: level for level, names in enumerate(LAYERS) for name in names}
+
+# The one home of each heavy or foreign library.
+HOMES = {
+    "gtsam": ["graph/"],
+    "rosbags": ["formats/bag_files.py"],
+    "laspy": ["formats/point_files.py"],
+    "small_gicp": ["odometry/small_gicp.py"],
+    "rerun": ["reports/"],
+    "kiss_icp": ["odometry/kiss.py"],
+    "embreex": ["simulation/lidar.py"],
+    "open3d": ["maps/", "odometry/open3d.py"],
+    "requests": ["priors/overpass.py"],
+    "pyproj": ["geometry/geodesy.py", "maps/georeference.py"],
+    "dask": ["studies/runner.py"],
+    "numba": ["kernels/"],
+    "matplotlib": ["reports/"],
+}
+
+
+def modules() -> dict[str, Path]:
+    names = {}
+    for path in sorted(PACKAGE.rglob("*.py")):
+        parts = path.relative_to(ROOT).with_suffix("").parts
+        names[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path
+    return names
+
+
+def imports_of(path: Path) -> set[str]:
+    """Every name imported anywhere in the file, also inside functions and `if TYPE_CHECKING`, with from-imports expanded."""
+    found: set[str] = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            assert node.level == 0, f"{path}: relative import"
+            found |= {node.module} | {f"{node.module}.{alias.name}" for alias in node.names}
+    return found
+
+
+def tables_of(path: Path) -> set[str]:
+    """Dotted names in string constants: modules imported lazily through a table."""
+    return {
+        node.value.split(":")[0]
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.Constant) and isinstance(node.value, str) and node.value.startswith("lslam.")
+    }
+
+
+MODULES = modules()
+
+
+def edges() -> list[tuple[str, str]]:
+    pairs = []
+    for name, path in MODULES.items():
+        for target in imports_of(path) | tables_of(path):
+            if target in MODULES and target != name:
+                pairs.append((name, target))
+    return pairs
+
+
+def package_of(name: str) -> str:
+    parts = name.split(".")
+    return parts[1] if len(parts) > 1 else ""
+
+
+def test_every_package_has_a_layer() -> None:
+    unknown = {package_of(m) for m in MODULES} - set(LEVEL) - {"", "__main__"}
+    assert not unknown, f"no layer for {unknown}"
+
+
+def test_imports_go_down() -> None:
+    wrong = []
+    for importer, imported in edges():
+        a, b = package_of(importer), package_of(imported)
+        if a in ("", "__main__") or b in ("", a):
+            continue
+        if LEVEL[b] <= LEVEL[a]:
+            wrong.append(f"{importer} -> {imported}")
+    assert not wrong, wrong
+
+
+def test_no_module_imports_the_face_of_the_package() -> None:
+    """`import lslam` inside lslam would tie everything to everything."""
+    wrong = [m for m, p in MODULES.items() if "lslam" in {i for i in imports_of(p) if "." not in i}]
+    assert not wrong, wrong
+
+
+def test_no_import_cycles() -> None:
+    graph: dict[str, set[str]] = {name: set() for name in MODULES}
+    for importer, imported in edges():
+        # `from package import module` names the package too; its face importing its own rooms is no cycle.
+        if not importer.startswith(imported + ".") and importer != "lslam":
+            graph[importer].add(imported)
+    state: dict[str, int] = {}
+
+    def visit(node: str, trail: list[str]) -> None:
+        state[node] = 1
+        for child in sorted(graph[node]):
+            if state.get(child) == 1:
+                pytest.fail("cycle: " + " -> ".join([*trail, node, child]))
+            if child not in state:
+                visit(child, [*trail, node])
+        state[node] = 2
+
+    for name in MODULES:
+        if name not in state:
+            visit(name, [])
+
+
+def test_foreign_libraries_have_one_home() -> None:
+    wrong = []
+    for name, path in MODULES.items():
+        relative = path.relative_to(PACKAGE).as_posix()
+        for target in {i.split(".")[0] for i in imports_of(path)}:
+            if target in HOMES and not any(relative.startswith(home) for home in HOMES[target]):
+                wrong.append(f"{name} imports {target}")
+    assert not wrong, wrong
+
+
+def test_kernels_know_nothing_of_lslam() -> None:
+    wrong = [
+        f"{name} -> {target}"
+        for name, path in MODULES.items()
+        if package_of(name) == "kernels"
+        for target in imports_of(path)
+        if target.startswith("lslam") and not target.startswith("lslam.kernels")
+    ]
+    assert not wrong, wrong
+
+
+def test_files_stay_small() -> None:
+    long = {str(p.relative_to(ROOT)): n for p in MODULES.values() if (n := len(p.read_text().splitlines())) > 400}
+    assert not long, long
