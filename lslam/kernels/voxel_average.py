@@ -1,0 +1,120 @@
+"""Voxel averages of transformed scans: an open-addressing hash of packed voxel indices over rows of integer sums.
+
+A row is (key, sum x, sum y, sum z, count), int64. The sums are offsets from the voxel's centre in units of
+voxel / 2**24, so they are exact whatever the coordinates, and equal for any order of the points.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.kernels.jit import inline, kernel
+
+AXIS_BITS = 21
+UNITS = float(2**24)  # 2**39 points fit into one voxel's sum
+_HALF = 1 << (AXIS_BITS - 1)
+_MIX = -7046029254386353131  # 0x9E3779B97F4A7C15 as int64: Fibonacci hashing
+
+
+@inline
+def _slot(key: int, mask: int) -> int:
+    mixed = key * _MIX
+    return (mixed ^ (mixed >> 29) ^ (mixed >> 43)) & mask
+
+
+@kernel
+def accumulate(
+    points: NDArray[np.float32],
+    intensity: NDArray[np.float32],
+    T: NDArray[np.float64],
+    range_min: float,
+    range_max: float,
+    voxel: float,
+    origin: NDArray[np.int64],
+    slots: NDArray[np.int32],
+    rows: NDArray[np.int64],
+    intensity_sums: NDArray[np.float64],
+    used: int,
+) -> tuple[int, int, int]:
+    """Add one scan's points to the voxel sums.
+
+    points : (N, 3) sensor frame, m; intensity : (N,) or (0,); T : (4, 4) world from sensor
+    origin : (3,) voxel index in the middle of the key range, which reaches 2**20 voxels to each side
+    slots : (S,) row of each hash slot or -1, S a power of two above used + N
+    rows : (R, 5) with R >= used + N; intensity_sums : (R,) or (0,), written when `intensity` is given
+
+    Returns the rows used now, the points refused by the range gate (NaN, Inf and zero points included) and the points
+    outside the key range.
+    """
+    mask = slots.shape[0] - 1
+    inverse = 1.0 / voxel
+    near, far = range_min * range_min, range_max * range_max
+    with_intensity = intensity.shape[0] > 0
+    gated = 0
+    outside = 0
+    last_key = np.int64(-1)
+    row = 0
+    for i in range(points.shape[0]):
+        px, py, pz = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
+        r2 = px * px + py * py + pz * pz
+        if not (r2 >= near and r2 <= far and r2 > 0.0):
+            gated += 1
+            continue
+        x = (T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz + T[0, 3]) * inverse
+        y = (T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3]) * inverse
+        z = (T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz + T[2, 3]) * inverse
+        fx, fy, fz = np.floor(x), np.floor(y), np.floor(z)
+        ix = np.int64(fx) - origin[0] + _HALF
+        iy = np.int64(fy) - origin[1] + _HALF
+        iz = np.int64(fz) - origin[2] + _HALF
+        if (ix | iy | iz) >> AXIS_BITS != 0:  # negative or too large on some axis
+            outside += 1
+            continue
+        key = (ix << (2 * AXIS_BITS)) | (iy << AXIS_BITS) | iz
+        # Neighbouring points of a ring mostly fall into one voxel: the table is not asked again.
+        if key != last_key:
+            slot = _slot(key, mask)
+            row = slots[slot]
+            while row >= 0 and rows[row, 0] != key:
+                slot = (slot + 1) & mask
+                row = slots[slot]
+            if row < 0:
+                row = used
+                used += 1
+                slots[slot] = row
+                rows[row, 0] = key
+                rows[row, 1:] = 0
+                if with_intensity:
+                    intensity_sums[row] = 0.0
+            last_key = key
+        rows[row, 1] += np.int64(np.rint((x - fx - 0.5) * UNITS))
+        rows[row, 2] += np.int64(np.rint((y - fy - 0.5) * UNITS))
+        rows[row, 3] += np.int64(np.rint((z - fz - 0.5) * UNITS))
+        rows[row, 4] += 1
+        if with_intensity and np.isfinite(intensity[i]):
+            intensity_sums[row] += np.float64(intensity[i])
+    return used, gated, outside
+
+
+@kernel
+def rebuild(slots: NDArray[np.int32], rows: NDArray[np.int64], used: int) -> None:
+    """Enter the first `used` rows into `slots`, which are all -1 and a power of two above `used`."""
+    mask = slots.shape[0] - 1
+    for row in range(used):
+        slot = _slot(rows[row, 0], mask)
+        while slots[slot] >= 0:
+            slot = (slot + 1) & mask
+        slots[slot] = row
+
+
+def unpack(rows: NDArray[np.int64], origin: NDArray[np.int64], voxel: float) -> NDArray[Any]:
+    """(M, 3) float64 mean positions, m, of finished rows (M, 5)."""
+    axis_mask = (1 << AXIS_BITS) - 1
+    points = np.empty((len(rows), 3))
+    for axis in range(3):
+        index = ((rows[:, 0] >> (AXIS_BITS * (2 - axis))) & axis_mask) - _HALF + origin[axis]
+        points[:, axis] = (index + 0.5 + rows[:, 1 + axis] / (rows[:, 4] * UNITS)) * voxel
+    return points
