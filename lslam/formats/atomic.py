@@ -1,0 +1,38 @@
+"""Files appear whole or not at all."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import BinaryIO
+
+from lslam.errors import OutputError
+
+
+@contextmanager
+def atomic_write(path: Path) -> Iterator[BinaryIO]:
+    """A binary stream on `<name>.part`, renamed to `path` when the block ends well and removed when it does not.
+
+    Raises OutputError naming the file when it cannot be written (permissions, a full disk).
+    """
+    part = path.with_name(path.name + ".part")
+    try:
+        with part.open("wb") as stream:
+            yield stream
+        os.replace(part, path)
+    except OSError as error:
+        _remove(part)
+        raise OutputError(f"{path} cannot be written: {error.strerror or error}") from None
+    except BaseException:
+        _remove(part)
+        raise
+
+
+def _remove(part: Path) -> None:
+    try:
+        part.unlink(missing_ok=True)
+    except OSError:
+        # The folder itself is gone or closed to us: nothing is left behind that we could remove.
+        return

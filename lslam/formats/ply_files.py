@@ -1,0 +1,135 @@
+"""PLY point files: ascii and binary of both byte orders read, binary little endian written."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.errors import InputError
+from lslam.formats.atomic import atomic_write
+from lslam.formats.point_cloud import PointCloud, cloud_from_fields
+
+_TYPES = {
+    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",
+    "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4",
+    "double": "f8", "float64": "f8",
+}  # fmt: skip
+_ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
+
+
+@dataclass
+class _Element:
+    name: str
+    count: int
+    properties: list[tuple[str, str]]  # name, numpy code; code "list" for lists
+
+
+def read_ply(path: Path) -> PointCloud:
+    """Read the vertices of a PLY file; faces and other elements after them are ignored.
+
+    Raises InputError naming the file and the line: no PLY, a bad header, missing x, y or z, data that end early.
+    """
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path} cannot be read: {error.strerror or error}") from None
+    encoding, elements, size = _read_header(path, data)
+    order = _ORDERS[encoding]
+    body = memoryview(data)[size:]
+    skipped = 0
+    for element in elements:
+        codes = [code for _, code in element.properties]
+        if "list" in codes and (element.name == "vertex" or encoding != "ascii"):
+            raise InputError(f"{path}: PLY element {element.name!r} has a list property where points are expected")
+        if element.name == "vertex":
+            if encoding == "ascii":
+                return cloud_from_fields(path, _ascii_columns(path, element, body, skipped))
+            return cloud_from_fields(path, _binary_columns(path, element, body, order, skipped))
+        record = sum(np.dtype(code).itemsize for code in codes if code != "list")
+        skipped += element.count * (record if encoding != "ascii" else 1)
+    raise InputError(f"{path}: PLY header has no element 'vertex'")
+
+
+def write_ply(path: Path, points: NDArray[Any], intensity: NDArray[Any] | None = None, comment: str = "") -> None:
+    """Write points (N, 3), m, and intensity (N,) as float32, binary little endian, atomically."""
+    names = ["x", "y", "z"] if intensity is None else ["x", "y", "z", "intensity"]
+    table = np.empty((len(points), len(names)), "<f4")
+    table[:, :3] = points
+    if intensity is not None:
+        table[:, 3] = intensity
+    comments = "".join(f"comment {line}\n" for line in comment.splitlines())
+    properties = "".join(f"property float {name}\n" for name in names)
+    header = f"ply\nformat binary_little_endian 1.0\n{comments}element vertex {len(table)}\n{properties}end_header\n"
+    with atomic_write(path) as stream:
+        stream.write(header.encode())
+        stream.write(table.data)
+
+
+def _read_header(path: Path, data: bytes) -> tuple[str, list[_Element], int]:
+    if not data.startswith((b"ply\n", b"ply\r")):
+        raise InputError(f"{path}: no PLY file, its first line is not 'ply'")
+    encoding, elements, position, number = "", list[_Element](), 0, 0
+    while True:
+        end = data.find(b"\n", position)
+        number += 1
+        if end < 0 or end - position > 65536:
+            raise InputError(f"{path}: PLY header ends at line {number} without end_header")
+        words = data[position:end].decode("ascii", "replace").split()
+        position = end + 1
+        if words == ["end_header"]:
+            break
+        if number == 1 or not words or words[0] in ("comment", "obj_info"):
+            continue
+        if words[0] == "format" and len(words) == 3 and words[1] in _ORDERS:
+            encoding = words[1]
+        elif words[0] == "element" and len(words) == 3 and words[2].isdigit():
+            elements.append(_Element(words[1], int(words[2]), []))
+        elif words[0] == "property" and elements and len(words) == 3 and words[1] in _TYPES:
+            elements[-1].properties.append((words[2], _TYPES[words[1]]))
+        elif words[0] == "property" and elements and len(words) == 5 and words[1] == "list":
+            elements[-1].properties.append((words[4], "list"))
+        else:
+            raise InputError(f"{path}, line {number}: bad PLY header entry {' '.join(words)[:60]!r}")
+    if not encoding:
+        raise InputError(f"{path}: PLY header has no format; known: {', '.join(_ORDERS)}")
+    return encoding, elements, position
+
+
+def _ascii_columns(path: Path, element: _Element, body: memoryview, skipped: int) -> dict[str, NDArray[Any]]:
+    if not element.count:
+        return {name: np.zeros(0, code) for name, code in element.properties}
+    lines = [line for line in bytes(body).split(b"\n") if line.strip()][skipped : skipped + element.count]
+    if len(lines) < element.count:
+        raise InputError(f"{path}: PLY header says {element.count} points, the file holds {len(lines)}")
+    try:
+        table = np.loadtxt([line.decode("ascii") for line in lines], np.float64, ndmin=2)
+    except ValueError as error:
+        raise InputError(f"{path}: PLY ascii data (counted from the first point) cannot be read: {error}") from None
+    if table.shape[1] != len(element.properties):
+        raise InputError(
+            f"{path}: PLY ascii lines hold {table.shape[1]} numbers for {len(element.properties)} properties"
+        )
+    return {
+        name: table[:, k].astype(code) if code.startswith("f") else table[:, k]
+        for k, (name, code) in enumerate(element.properties)
+    }
+
+
+def _binary_columns(
+    path: Path, element: _Element, body: memoryview, order: str, skipped: int
+) -> dict[str, NDArray[Any]]:
+    record = sum(np.dtype(code).itemsize for _, code in element.properties)
+    held = max(len(body) - skipped, 0)
+    if held < element.count * record:
+        raise InputError(
+            f"{path}: PLY header says {element.count} points of {record} bytes, the file holds {held // record}"
+        )
+    columns, offset = {}, skipped
+    for name, code in element.properties:
+        columns[name] = np.ndarray((element.count,), np.dtype(order + code), body, offset, (record,))
+        offset += np.dtype(code).itemsize
+    return columns

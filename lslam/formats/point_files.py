@@ -1,0 +1,104 @@
+"""Point files by suffix: KITTI `.bin`, PCD, PLY and NumPy, read and written."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.errors import InputError, UsageError
+from lslam.formats.atomic import atomic_write
+from lslam.formats.pcd_files import read_pcd, write_pcd
+from lslam.formats.ply_files import read_ply, write_ply
+from lslam.formats.point_cloud import PointCloud
+
+SUFFIXES = (".bin", ".pcd", ".ply", ".npy")
+# Record sizes other data sets use, to tell a truncated file from one of another kind.
+_OTHER_RECORDS = {12: "x, y, z", 20: "x, y, z, intensity, ring", 24: "x, y, z, intensity, ring, time"}
+
+
+def read_points(path: Path) -> PointCloud:
+    """Read one point file, chosen by its suffix; NaN, Inf and zero points are kept as they are.
+
+    Raises InputError naming the file and the place when it is missing, truncated or of another kind.
+    """
+    suffix = path.suffix.lower()
+    if suffix == ".bin":
+        raw = read_bin(path)
+        return PointCloud(np.ascontiguousarray(raw[:, :3]), np.ascontiguousarray(raw[:, 3]))
+    if suffix == ".pcd":
+        return read_pcd(path)
+    if suffix == ".ply":
+        return read_ply(path)
+    if suffix == ".npy":
+        return _read_npy(path)
+    raise InputError(f"{path}: no point file lslam reads; known suffixes: {', '.join(SUFFIXES)}")
+
+
+def read_bin(path: Path) -> NDArray[np.float32]:
+    """(N, 4) float32 x, y, z (m) and intensity of a KITTI `.bin` file.
+
+    Raises InputError naming the file and its size when that is no multiple of 16 bytes.
+    """
+    try:
+        with path.open("rb") as stream:
+            raw = np.fromfile(stream, np.uint8)
+    except OSError as error:
+        raise InputError(f"{path} cannot be read: {error.strerror or error}") from None
+    if len(raw) % 16:
+        others = [f"{size} bytes ({what})" for size, what in _OTHER_RECORDS.items() if len(raw) % size == 0]
+        could = f"or its records are of {' or '.join(others)}: convert them" if others else "fetch it again"
+        raise InputError(
+            f"{path}: {len(raw)} bytes are no multiple of 16 (x, y, z, intensity as float32): the file is truncated "
+            f"after point {len(raw) // 16}, {could}"
+        )
+    return raw.view("<f4").reshape(-1, 4)
+
+
+def write_points(path: Path, points: NDArray[Any], intensity: NDArray[Any] | None = None, *, comment: str = "") -> None:
+    """Write points (N, 3), m, and intensity (N,) as float32 to a .ply, .pcd (both binary), .bin or .npy file, atomically.
+
+    `comment` goes into PLY headers only. Raises UsageError on another suffix or arrays that do not match, OutputError
+    when the file cannot be written.
+    """
+    if np.ndim(points) != 2 or np.shape(points)[1] != 3 or (intensity is not None and len(intensity) != len(points)):
+        raise UsageError(f"{path}: points must be (N, 3) and intensity (N,), not {np.shape(points)}")
+    suffix = path.suffix.lower()
+    if suffix == ".ply":
+        write_ply(path, points, intensity, comment)
+    elif suffix == ".pcd":
+        write_pcd(path, points, intensity)
+    elif suffix in (".bin", ".npy"):
+        table = np.zeros((len(points), 4), "<f4")
+        table[:, :3] = points
+        if intensity is not None:
+            table[:, 3] = intensity
+        with atomic_write(path) as stream:
+            if suffix == ".npy":
+                np.save(stream, table)
+            else:
+                stream.write(table.data)
+    else:
+        raise UsageError(f"{path}: no point file lslam writes; known suffixes: {', '.join(SUFFIXES)}")
+
+
+def _read_npy(path: Path) -> PointCloud:
+    from lslam.formats.point_cloud import cloud_from_fields
+
+    try:
+        table = np.load(path, allow_pickle=False)
+    except (OSError, ValueError, EOFError) as error:
+        raise InputError(f"{path} cannot be read as a NumPy array: {error}") from None
+    if table.dtype.names:
+        flat = table.ravel()
+        return cloud_from_fields(path, {name: flat[name] for name in table.dtype.names})
+    # Organised clouds (rows, cols, 3 or 4) are flattened row by row.
+    if table.ndim not in (2, 3) or table.shape[-1] < 3 or table.dtype.kind not in "fiu":
+        raise InputError(
+            f"{path}: array of shape {table.shape} and type {table.dtype}, expected (N, 3) or (N, 4) numbers"
+        )
+    table = table.reshape(-1, table.shape[-1])
+    points = np.ascontiguousarray(table[:, :3], np.float32)
+    return PointCloud(points, np.ascontiguousarray(table[:, 3], np.float32) if table.shape[1] > 3 else None)

@@ -1,0 +1,155 @@
+"""`sequence.toml`: what a folder of scans cannot say by itself. Read and written; unknown keys are errors."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.errors import InputError, nearest
+from lslam.formats.atomic import atomic_write
+
+FILE_NAME = "sequence.toml"
+INSTANTS = ("scan_start", "scan_middle", "scan_end")
+FRAMES = ("lidar", "cam0", "imu")
+EXTRINSICS = ("T_cam0_lidar", "T_lidar_imu", "T_lidar_gnss")
+
+Matrix = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class SequenceInfo:
+    """What `sequence.toml`, or the user, says about a sequence; None where nothing is said.
+
+    sensor : its name, for example `HDL-64E`; rings : number of beams
+    rows, cols : organised clouds, point r * cols + c is row (ring) r; rate_hz : scans per second
+    motion_compensated : scans are free of motion distortion; compensated_to : the instant, one of `INSTANTS`
+    vertical_correction_deg : rotation of every point about p x z that the scans still need, 0 for none
+    per_point : folder of `<scan>.npz` with `t` (float32 s since scan start) and `ring` (uint16)
+    stamps, imu, gnss, ground_truth : files, relative to the sequence folder
+    ground_truth_frame : the body whose poses `ground_truth` holds, one of `FRAMES`
+    T_cam0_lidar, T_lidar_imu, T_lidar_gnss : (4, 4) extrinsics, written in the table `[extrinsics]`
+    """
+
+    name: str | None = None
+    sensor: str | None = None
+    rings: int | None = None
+    rows: int | None = None
+    cols: int | None = None
+    rate_hz: float | None = None
+    motion_compensated: bool | None = None
+    compensated_to: str | None = None
+    vertical_correction_deg: float | None = None
+    per_point: str | None = None
+    stamps: str | None = None
+    imu: str | None = None
+    gnss: str | None = None
+    ground_truth: str | None = None
+    ground_truth_frame: str | None = None
+    T_cam0_lidar: Matrix | None = None
+    T_lidar_imu: Matrix | None = None
+    T_lidar_gnss: Matrix | None = None
+
+    def over(self, other: SequenceInfo) -> SequenceInfo:
+        """What this says, and what `other` says where this is silent."""
+        pairs = ((f.name, getattr(self, f.name), getattr(other, f.name)) for f in fields(self))
+        return SequenceInfo(**{name: theirs if mine is None else mine for name, mine, theirs in pairs})
+
+
+def read_sequence_toml(path: Path) -> SequenceInfo:
+    """Read `path`, a `sequence.toml`.
+
+    Raises InputError naming the file, the key and the nearest known key or the values allowed.
+    """
+    try:
+        tree = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise InputError(f"{path} cannot be read as TOML: {error}") from None
+    extrinsics = tree.pop("extrinsics", {})
+    if not isinstance(extrinsics, dict):
+        raise InputError(f"{path}: extrinsics is a table, write [extrinsics] and below it T_lidar_imu = [...]")
+    values: dict[str, Any] = {}
+    for key, value in tree.items():
+        if key not in _CHECKS:
+            raise InputError(f"{path}: unknown key {key!r}; {nearest(key, [*_CHECKS, 'extrinsics'])}")
+        values[key] = _checked(path, key, value)
+    for key, value in extrinsics.items():
+        if key not in EXTRINSICS:
+            raise InputError(f"{path}: unknown key extrinsics.{key}; {nearest(key, EXTRINSICS)}")
+        values[key] = _transform(path, key, value)
+    if (values.get("rows") is None) != (values.get("cols") is None):
+        raise InputError(f"{path}: rows and cols of organised clouds go together, one of them is missing")
+    return SequenceInfo(**values)
+
+
+def write_sequence_toml(path: Path, info: SequenceInfo) -> None:
+    """Write `info` to `path` atomically, leaving out what is None; it reads back equal."""
+    import tomli_w
+
+    tree = {f.name: getattr(info, f.name) for f in fields(info) if f.name not in EXTRINSICS}
+    tree = {key: value for key, value in tree.items() if value is not None}
+    known = {key: getattr(info, key) for key in EXTRINSICS}
+    matrices = {key: np.asarray(T, np.float64).tolist() for key, T in known.items() if T is not None}
+    if matrices:
+        tree["extrinsics"] = matrices
+    with atomic_write(path) as stream:
+        stream.write(tomli_w.dumps(tree).encode())
+
+
+def _is_text(value: Any) -> bool:
+    return isinstance(value, str) and bool(value.strip())
+
+
+def _is_count(value: Any) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and value > 0
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and bool(np.isfinite(value))
+
+
+_CHECKS: dict[str, tuple[Callable[[Any], bool], str]] = {
+    "name": (_is_text, "text"),
+    "sensor": (_is_text, "text, for example HDL-64E"),
+    "rings": (_is_count, "a whole number above 0"),
+    "rows": (_is_count, "a whole number above 0"),
+    "cols": (_is_count, "a whole number above 0"),
+    "rate_hz": (lambda v: _is_number(v) and v > 0, "a number above 0, scans per second"),
+    "motion_compensated": (lambda v: isinstance(v, bool), "true or false"),
+    "compensated_to": (lambda v: v in INSTANTS, "one of " + ", ".join(INSTANTS)),
+    "vertical_correction_deg": (_is_number, "a number, degrees"),
+    "per_point": (_is_text, "a folder"),
+    "stamps": (_is_text, "a file"),
+    "imu": (_is_text, "a file"),
+    "gnss": (_is_text, "a file"),
+    "ground_truth": (_is_text, "a file"),
+    "ground_truth_frame": (lambda v: v in FRAMES, "one of " + ", ".join(FRAMES)),
+}
+
+
+def _checked(path: Path, key: str, value: Any) -> Any:
+    check, expected = _CHECKS[key]
+    if not check(value):
+        raise InputError(f"{path}: {key} = {value!r}, expected {expected}")
+    return float(value) if key in ("rate_hz", "vertical_correction_deg") else value
+
+
+def _transform(path: Path, key: str, value: Any) -> Matrix:
+    """3x4 or 4x4 rows, or the same numbers in one list, to a checked (4, 4) transform."""
+    try:
+        numbers = np.asarray(value, np.float64).ravel()
+    except (TypeError, ValueError):
+        numbers = np.zeros(0)
+    if len(numbers) not in (12, 16):
+        raise InputError(f"{path}: extrinsics.{key} needs 3x4 or 4x4 numbers, row by row")
+    T = np.eye(4)
+    T[:3] = numbers[:12].reshape(3, 4)
+    R = T[:3, :3]
+    if not np.isfinite(numbers).all() or np.abs(R @ R.T - np.eye(3)).max() > 1e-3 or np.linalg.det(R) < 0:
+        raise InputError(f"{path}: extrinsics.{key} is no rigid transform: its left 3x3 block is not a rotation")
+    return T
