@@ -1,0 +1,119 @@
+"""KITTI's calibration files: `calib.txt` of the odometry benchmark and the three files of a raw recording day."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.errors import InputError
+from lslam.geometry import se3
+
+Floats = NDArray[np.float64]
+LIDAR_TO_CAMERA = ("Tr", "Tr_velo_to_cam", "Tr_velo_cam")
+
+
+def read_odometry_calib(path: str | Path) -> Floats | None:
+    """`T_cam0_lidar` (4, 4) of an odometry `calib.txt`, its `Tr`; None when the file has none (as in early downloads).
+
+    Raises InputError when the file is missing, is no calibration, or states numbers that are no rigid transform.
+    """
+    path = Path(path)
+    entries = read_entries(path)
+    name = next((name for name in LIDAR_TO_CAMERA if name in entries), None)
+    if name is None:
+        return None
+    return _rigid(np.reshape(_numbers(path, entries, name, 12), (3, 4)), path, name)
+
+
+def read_rigid(path: str | Path) -> Floats:
+    """(4, 4) transform of a raw `R:`/`T:` file: `calib_velo_to_cam.txt` is T_cam0_lidar, `calib_imu_to_velo.txt` T_lidar_imu.
+
+    `T_cam0_lidar` of a raw day ends in the unrectified camera 0; see `read_raw_cam0_lidar` for the rectified one.
+    """
+    path = Path(path)
+    entries = read_entries(path)
+    R, t = _numbers(path, entries, "R", 9), _numbers(path, entries, "T", 3)
+    return _rigid(np.column_stack([np.reshape(R, (3, 3)), t]), path, "R")
+
+
+def read_rectification(path: str | Path) -> Floats | None:
+    """(4, 4) rotation into the rectified camera 0: `R_rect_00` of `calib_cam_to_cam.txt`, None when it has none."""
+    path = Path(path)
+    entries = read_entries(path)
+    if "R_rect_00" not in entries:
+        return None
+    R = np.reshape(_numbers(path, entries, "R_rect_00", 9), (3, 3))
+    return _rigid(np.column_stack([R, np.zeros(3)]), path, "R_rect_00")
+
+
+def read_raw_cam0_lidar(folder: str | Path) -> Floats:
+    """`T_cam0_lidar` (4, 4) of a raw day, in the rectified camera 0 when `calib_cam_to_cam.txt` is there."""
+    folder = Path(folder)
+    T = read_rigid(folder / "calib_velo_to_cam.txt")
+    cameras = folder / "calib_cam_to_cam.txt"
+    rectification = read_rectification(cameras) if cameras.is_file() else None
+    return T if rectification is None else np.asarray(rectification @ T)
+
+
+def read_cam0_lidar(path: str | Path) -> Floats:
+    """`T_cam0_lidar` from whichever file holds it: odometry `calib.txt`, raw `calib_velo_to_cam.txt`, or a raw day's folder.
+
+    Raises InputError when it holds none.
+    """
+    path = Path(path)
+    if path.is_dir():
+        return read_raw_cam0_lidar(path)
+    entries = read_entries(path)
+    if "R" in entries and "T" in entries:
+        if "imu" in path.name:
+            raise InputError(f"{path} is the extrinsics of the IMU: --calib needs calib_velo_to_cam.txt or calib.txt")
+        return read_raw_cam0_lidar(path.parent) if path.name == "calib_velo_to_cam.txt" else read_rigid(path)
+    T = read_odometry_calib(path)
+    if T is None:
+        raise InputError(f"{path} has no Tr (LiDAR to camera 0): entries are {', '.join(entries)}")
+    return T
+
+
+def read_entries(path: Path) -> dict[str, str]:
+    """`name: values` lines of a calibration file."""
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except FileNotFoundError:
+        raise InputError(f"calibration {path} does not exist") from None
+    except UnicodeDecodeError:
+        raise InputError(f"calibration {path} is not a text file") from None
+    except OSError as error:
+        raise InputError(f"calibration {path} cannot be read: {error.strerror}") from None
+    entries = {}
+    for line in lines:
+        name, colon, values = line.partition(":")
+        if not colon:
+            # The first odometry download wrote "Tr 1 0 0 ..." in some sequences.
+            name, _, values = line.strip().partition(" ")
+        if name.strip() and values.strip():
+            entries[name.strip()] = values.strip()
+    if not entries:
+        raise InputError(f"calibration {path} is empty")
+    return entries
+
+
+def _numbers(path: Path, entries: dict[str, str], name: str, count: int) -> list[float]:
+    if name not in entries:
+        raise InputError(f"calibration {path} has no entry {name}: entries are {', '.join(entries)}")
+    try:
+        values = [float(v) for v in entries[name].split()]
+    except ValueError:
+        raise InputError(f"calibration {path}: {name} holds something that is no number") from None
+    if len(values) != count or not np.isfinite(values).all():
+        raise InputError(f"calibration {path}: {name} has {len(values)} numbers, {count} finite ones expected")
+    return values
+
+
+def _rigid(upper: Floats, path: Path, name: str) -> Floats:
+    """(4, 4) with the rotation put back on SO(3): seven printed digits are not enough for `R^T` to be the inverse."""
+    R = upper[:, :3]
+    if np.abs(R @ R.T - np.eye(3)).max() > 1e-2 or np.linalg.det(R) < 0:
+        raise InputError(f"calibration {path}: {name} holds no rotation")
+    return se3.normalise(se3.make(R, upper[:, 3]))
