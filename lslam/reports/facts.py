@@ -1,0 +1,143 @@
+"""What a run's record says in numbers and sentences: shared by the summary on stdout and the HTML report."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.types.run_record import RunRecord
+from lslam.types.scan_result import ScanResult
+
+DIRECTIONS = ("along x", "along y", "along z", "about x", "about y", "about z")
+
+
+@dataclass(frozen=True)
+class StageTime:
+    """Seconds of one stage over all scans; `share` of the sum of all stages."""
+
+    name: str
+    median: float
+    p95: float
+    max: float
+    share: float
+
+
+@dataclass(frozen=True)
+class Failure:
+    """A scan that was bridged or skipped, and why."""
+
+    index: int
+    status: str
+    reason: str
+
+
+@dataclass(frozen=True)
+class Degeneracy:
+    """A pose with directions the scan said nothing about."""
+
+    index: int
+    directions: str
+
+
+@dataclass(frozen=True)
+class RunFacts:
+    """Numbers of a run.
+
+    status : `ok`, `degraded`, `diverged`, `interrupted` or what else the manifest says; reasons : why, one sentence each
+    path_length : m; duration : s between the first and the last pose
+    stages : in the order they ran; total : the sum of stages per scan
+    over_limit : scans whose stages took longer than the real-time limit
+    real_time_factor : recorded time per processing time, so 10 means ten times faster than the sensor; 0 when unknown
+    """
+
+    status: str
+    reasons: tuple[str, ...]
+    scans: int
+    registered: int
+    bridged: int
+    skipped: int
+    failures: tuple[Failure, ...]
+    degenerate: tuple[Degeneracy, ...]
+    path_length: float
+    duration: float
+    stages: tuple[StageTime, ...]
+    total: StageTime | None
+    over_limit: int
+    real_time_factor: float
+
+
+def run_facts(record: RunRecord) -> RunFacts:
+    """Read a record; every number is finite, whatever the poses are."""
+    results = record.results
+    names, seconds = stage_matrix(results)
+    totals = seconds.sum(1)
+    limit = record.real_time_limit
+    spent = float(totals.sum())
+    failures = tuple(Failure(r.index, r.status, r.reason) for r in results if r.status != "ok")
+    degenerate = tuple(Degeneracy(r.index, describe(r.degenerate)) for r in results if len(r.degenerate))
+    status, reasons = _status(record, bool(failures))
+    return RunFacts(
+        status=status,
+        reasons=reasons,
+        scans=len(results),
+        registered=sum(r.status == "ok" for r in results),
+        bridged=sum(r.status == "bridged" for r in results),
+        skipped=sum(r.status == "skipped" for r in results),
+        failures=failures,
+        degenerate=degenerate,
+        path_length=_path_length(record),
+        duration=float(record.trajectory.stamps_ns[-1] - record.trajectory.stamps_ns[0]) * 1e-9
+        if len(record.trajectory)
+        else 0.0,
+        stages=tuple(_stage(name, seconds[:, i], spent) for i, name in enumerate(names)),
+        total=_stage("all stages", totals, spent) if names else None,
+        over_limit=int((totals > limit).sum()) if limit > 0 else 0,
+        real_time_factor=limit * len(results) / spent if spent > 0 and limit > 0 else 0.0,
+    )
+
+
+def stage_matrix(results: list[ScanResult]) -> tuple[list[str], NDArray[np.float64]]:
+    """Names of all stages in order of appearance, and seconds (N, S); 0 where a scan has no such stage."""
+    names: dict[str, int] = {}
+    for result in results:
+        for name in result.stages:
+            names.setdefault(name, len(names))
+    seconds = np.zeros((len(results), len(names)))
+    for row, result in enumerate(results):
+        for name, value in result.stages.items():
+            seconds[row, names[name]] = value if np.isfinite(value) else 0.0
+    return list(names), seconds
+
+
+def describe(degenerate: NDArray[Any]) -> str:
+    """The main component of each unit twist (K, 6), world axes.
+
+    >>> describe(np.array([[0.1, 0.99, 0, 0, 0, 0], [0, 0, 0, 0, 0, 1.0]]))
+    'along y, about z'
+    """
+    return ", ".join(DIRECTIONS[int(np.argmax(np.abs(twist)))] for twist in np.asarray(degenerate))
+
+
+def _status(record: RunRecord, failed: bool) -> tuple[str, tuple[str, ...]]:
+    """The manifest's word, else what the record itself shows."""
+    reasons = [str(problem) for problem in record.problems]
+    more = record.manifest.get("problems")
+    if isinstance(more, (list, tuple)):
+        reasons += [str(problem) for problem in more]
+    word = record.manifest.get("status")
+    if not isinstance(word, str) or not word:
+        word = "degraded" if failed or reasons else "ok"
+    return word, tuple(dict.fromkeys(reasons))
+
+
+def _path_length(record: RunRecord) -> float:
+    steps = np.linalg.norm(np.diff(record.trajectory.positions, axis=0), axis=1)
+    return float(steps[np.isfinite(steps)].sum())
+
+
+def _stage(name: str, seconds: NDArray[np.float64], spent: float) -> StageTime:
+    median, p95 = (float(v) for v in np.percentile(seconds, [50, 95]))
+    return StageTime(name, median, p95, float(seconds.max()), float(seconds.sum()) / spent if spent > 0 else 0.0)

@@ -1,0 +1,142 @@
+"""report.html: one self-contained page about one run. No script, no second file, no network."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from lslam.formats.atomic import atomic_write
+from lslam.reports import plots
+from lslam.reports.facts import RunFacts, run_facts
+from lslam.reports.metrics import metres, metric_tables
+from lslam.reports.png import data_uri, density_png
+from lslam.types.run_record import RunRecord
+from lslam.version import __version__
+
+if TYPE_CHECKING:
+    from lslam.evaluation.results import Evaluation
+
+MOST_ROWS = 100
+
+
+@dataclass(frozen=True)
+class Card:
+    """A headline number."""
+
+    value: str
+    unit: str
+    name: str
+
+
+def write_report(path: Path, record: RunRecord, evaluation: Evaluation | None) -> None:
+    """Write the HTML report of a run, atomically.
+
+    Parameters
+    ----------
+    path : the file, usually `report.html` in the run folder
+    evaluation : the run's score against ground truth; None without: the error parts then say so in one line
+
+    Raises
+    ------
+    OutputError : the file cannot be written
+    """
+    page = render_report(record, evaluation).encode("utf-8", "replace")
+    with atomic_write(path) as stream:
+        stream.write(page)
+
+
+def render_report(record: RunRecord, evaluation: Evaluation | None) -> str:
+    """The page as text."""
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+
+    facts = run_facts(record)
+    environment = Environment(
+        loader=PackageLoader("lslam", "reports"),
+        autoescape=True,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        undefined=StrictUndefined,
+    )
+    return environment.get_template("report.html.j2").render(
+        record=record,
+        facts=facts,
+        version=__version__,
+        cards=_cards(facts, evaluation),
+        failures=facts.failures[:MOST_ROWS],
+        degenerate=facts.degenerate[:MOST_ROWS],
+        evaluation=evaluation,
+        has_truth=record.ground_truth is not None,
+        trajectory=plots.trajectory_figures(record, evaluation),
+        errors=plots.error_figures(evaluation) if evaluation is not None else [],
+        tables=metric_tables(evaluation) if evaluation is not None else [],
+        map_figure=_map_figure(record),
+        time=plots.time_figure(record, facts) if facts.stages else None,
+        share_bar=plots.share_bar(facts) if facts.stages else "",
+        registration=plots.registration_figures(record),
+        uncertainty=plots.uncertainty_figures(record),
+        facts_of_input=flatten(record.manifest),
+        config_text=_config_text(record.folder),
+    )
+
+
+def _map_figure(record: RunRecord) -> plots.Figure | None:
+    image = record.map_image
+    if image is None or not (image > 0).any():
+        return None
+    return plots.map_figure(record, data_uri(density_png(image)))
+
+
+def flatten(tree: Mapping[str, Any], prefix: str = "") -> list[tuple[str, list[str]]]:
+    """The manifest as (dotted key, texts) rows, in its order; `problems` and `status` stand elsewhere on the page.
+
+    >>> flatten({"input": {"kind": "bin"}, "notes": ["a", "b"], "status": "ok"})
+    [('input.kind', ['bin']), ('notes', ['a', 'b'])]
+    """
+    rows: list[tuple[str, list[str]]] = []
+    for key, value in tree.items():
+        name = f"{prefix}{key}"
+        if not prefix and key in ("problems", "status"):
+            continue
+        if isinstance(value, Mapping):
+            rows += flatten(value, f"{name}.")
+        elif isinstance(value, (list, tuple)):
+            if value:
+                rows.append((name, [_plain(v) for v in value]))
+        elif value is not None and value != "":
+            rows.append((name, [_plain(value)]))
+    return rows
+
+
+def _plain(value: Any) -> str:
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
+
+
+def _cards(facts: RunFacts, evaluation: Evaluation | None) -> list[Card]:
+    cards = [
+        Card(f"{facts.registered}/{facts.scans}", "", "scans registered"),
+        Card(f"{facts.path_length:.1f}", "m", f"path in {facts.duration:.1f} s"),
+    ]
+    if evaluation is not None:
+        for name, error in evaluation.ate.items():
+            if error.available and error.translation is not None:
+                cards.append(Card(metres(error.translation.rmse), "m", f"ATE rmse, {name}"))
+        drift = evaluation.kitti_drift
+        if drift.available:
+            cards.append(Card(f"{drift.translation_percent:.2f}", "%", f"KITTI drift, {drift.segments} segments"))
+    if facts.total is not None:
+        cards.append(Card(f"{1e3 * facts.total.median:.1f}", "ms", "median time per scan"))
+        if facts.real_time_factor:
+            cards.append(Card(f"{facts.real_time_factor:.1f}", "×", "real time"))
+    return cards
+
+
+def _config_text(folder: Path) -> str:
+    """The resolved configuration that lies in the run folder; empty when it does not."""
+    try:
+        return (folder / "config.toml").read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError):
+        return ""

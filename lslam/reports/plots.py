@@ -1,0 +1,239 @@
+"""The figures of the HTML report: which series, in which units, with which words."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from html import escape
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.geometry import so3
+from lslam.reports import svg
+from lslam.reports.facts import RunFacts, stage_matrix
+from lslam.reports.plane import Track, plane_chart
+from lslam.reports.stage_chart import stage_chart
+from lslam.types.run_record import RunRecord
+
+if TYPE_CHECKING:
+    from lslam.evaluation.results import AbsoluteError, Evaluation
+
+DISTANCE = "distance along ground truth, m"
+ALIGNMENTS = ("se3", "origin", "posyaw", "sim3", "none")
+ALIGNED = {
+    "se3": "aligned to ground truth by a rigid transform (se3)",
+    "sim3": "aligned to ground truth by a similarity (sim3)",
+    "posyaw": "aligned to ground truth by position and yaw",
+    "origin": "moved so that the first poses coincide (origin)",
+    "none": "not aligned",
+}
+
+
+@dataclass(frozen=True)
+class Figure:
+    """One chart of the page: SVG text, legend of (style, label), a caption that says the recipe."""
+
+    title: str
+    svg: str
+    legend: tuple[tuple[str, str], ...] = ()
+    caption: str = ""
+    wide: bool = False
+
+
+def trajectory_figures(record: RunRecord, evaluation: Evaluation | None) -> list[Figure]:
+    """Top view and height profile, with ground truth when it was evaluated."""
+    absolute = first_available(evaluation)
+    if evaluation is None or absolute is None:
+        positions = record.trajectory.positions
+        truth, distance = None, record.trajectory.path_lengths
+        caption, x_label = "Estimate in its own world.", "distance travelled, m"
+    else:
+        positions, truth, distance = absolute.aligned_positions, evaluation.gt_positions, evaluation.distance
+        caption, x_label = f"Estimate {ALIGNED.get(absolute.alignment, absolute.alignment)}.", DISTANCE
+    tracks = [] if truth is None else [Track("ground truth", truth[:, :2], "gt")]
+    tracks.append(Track("estimate", positions[:, :2], "s1", ends=True))
+    failed = _failed_positions(record) if truth is None else None
+    top = plane_chart(tracks, "trajectory from above", points=failed)
+    lines = [] if truth is None else [svg.Line("ground truth", distance, truth[:, 2], "gt")]
+    lines.append(svg.Line("estimate", distance, positions[:, 2], "s1"))
+    height = svg.line_chart(lines, x_label, "height z, m", "height profile", zero=False)
+    legend = tuple((t.style, t.label) for t in tracks)
+    start_end = (("start", "start"), ("end", "end"))
+    extra = (("bad", "bridged or skipped scan"),) if failed is not None and len(failed) else ()
+    return [
+        Figure("Trajectory from above", top, legend + start_end + extra, caption),
+        Figure("Height", height, legend, caption),
+    ]
+
+
+def error_figures(evaluation: Evaluation) -> list[Figure]:
+    """Errors over distance for each alignment, and per axis (thesis1: origin alignment)."""
+    available = [a for a in evaluation.ate.values() if a.available]
+    distance = evaluation.distance
+    position = [
+        svg.Line(a.alignment, distance, np.linalg.norm(a.errors, axis=1), f"s{i + 1}") for i, a in enumerate(available)
+    ]
+    rotation = [svg.Line(a.alignment, distance, a.rotation_errors_deg, f"s{i + 1}") for i, a in enumerate(available)]
+    axes = evaluation.thesis1
+    figures = [
+        _lines(
+            "Position error", position, DISTANCE, "position error, m", "Distance between matched poses, per alignment."
+        ),
+        _lines(
+            "Rotation error", rotation, DISTANCE, "rotation error, deg", "Angle between matched poses, per alignment."
+        ),
+    ]
+    if axes is not None:
+        recipe = "Estimate minus ground truth, first poses coincide (origin)."
+        figures += [
+            _lines(
+                "Error per axis", _three(("x", "y", "z"), distance, axes.xyz), DISTANCE, "position error, m", recipe
+            ),
+            _lines(
+                "Error per angle",
+                _three(("roll", "pitch", "yaw"), distance, axes.rpy_deg),
+                DISTANCE,
+                "angle error, deg",
+                recipe,
+            ),
+        ]
+    return [figure for figure in figures if figure.svg]
+
+
+def time_figure(record: RunRecord, facts: RunFacts) -> Figure | None:
+    """Stage times per scan, stacked, against the real-time limit; None when no stage was timed."""
+    names, seconds = stage_matrix(record.results)
+    if not names:
+        return None
+    index = np.array([r.index for r in record.results])
+    chart, remark = stage_chart(index, seconds * 1e3, record.real_time_limit * 1e3, "time per scan and stage")
+    caption = "Stages stacked; reading and preprocessing may overlap registration, so a scan takes at most this long."
+    legend = tuple((f"s{i % 6 + 1}", name) for i, name in enumerate(names))
+    return Figure("Time per scan", chart, legend, f"{caption} {remark}".strip())
+
+
+def map_figure(record: RunRecord, png_uri: str) -> Figure:
+    """The merged map from above with the trajectory on it."""
+    tracks = [Track("trajectory", record.trajectory.positions[:, :2], "s2", ends=True)]
+    chart = plane_chart(
+        tracks, "merged map from above", backdrop=(png_uri, record.map_extent), width=720, tallest=760, points=None
+    )
+    caption = "Darker columns hold more occupied voxels: walls stand out from the ground. World of the estimate."
+    return Figure(
+        "Map from above", chart, (("s2", "trajectory"), ("start", "start"), ("end", "end")), caption, wide=True
+    )
+
+
+def registration_figures(record: RunRecord) -> list[Figure]:
+    """Inliers, overlap, rmse and iterations per scan: those that the method reports."""
+    results = record.results
+    index = np.array([r.index for r in results], np.float64)
+    failed = np.array([r.index for r in results if r.status != "ok"], np.float64)
+    series = [
+        ("Inliers", "inliers", "inliers and source points", ["inliers", "source_points"]),
+        ("Overlap", "overlap", "overlap, share of source points", ["overlap"]),
+        ("Residual", "rmse", "rmse of the residuals, m", ["rmse"]),
+        ("Iterations", "iterations", "iterations", ["iterations"]),
+    ]
+    words = {"inliers": "inliers", "source_points": "source points"}
+    figures = []
+    for title, _, y_label, fields in series:
+        values = [np.array([getattr(r, f) for r in results], np.float64) for f in fields]
+        if not any(np.any(np.isfinite(v) & (v != 0)) for v in values):
+            continue
+        lines = [
+            svg.Line(words.get(f, f), index, v, f"s{i + 1}")
+            for i, (f, v) in enumerate(zip(fields, values, strict=True))
+        ]
+        chart = svg.line_chart(lines, "scan", y_label, f"{title} per scan", marks=failed, whole_x=True)
+        legend = tuple((line.style, line.label) for line in lines) if len(lines) > 1 else ()
+        if len(failed):
+            legend += (("bad", "bridged or skipped scan"),)
+        figures.append(Figure(title, chart, legend))
+    return figures
+
+
+def uncertainty_figures(record: RunRecord) -> list[Figure]:
+    """One sigma of position and rotation per pose; nothing when the method gives no covariance."""
+    covariances = _covariances(record)
+    if covariances is None:
+        return []
+    variance = pose_variance(record.trajectory.poses, covariances)
+    sigma = np.sqrt(np.where(variance >= 0, variance, np.nan))
+    distance = record.trajectory.path_lengths
+    recipe = "Square roots of the covariance's diagonal, world axes, one sigma per pose."
+    label = "distance travelled, m"
+    figures = [
+        _lines("Position uncertainty", _three(("x", "y", "z"), distance, sigma[:, :3]), label, "sigma, m", recipe),
+        _lines(
+            "Rotation uncertainty",
+            _three(("about x", "about y", "about z"), distance, np.degrees(sigma[:, 3:])),
+            label,
+            "sigma, deg",
+            recipe,
+        ),
+    ]
+    return [figure for figure in figures if figure.svg]
+
+
+def pose_variance(poses: NDArray[np.float64], covariances: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Variances (N, 6) of position and rotation in world axes from covariances (N, 6, 6) of left twists.
+
+    A left twist turns about the world's origin: the position moves by rho + phi x p.
+    """
+    J = np.zeros((len(poses), 6, 6))
+    J[:, range(6), range(6)] = 1.0
+    J[:, :3, 3:] = -so3.hat(poses[:, :3, 3])
+    return np.asarray(np.einsum("nij,njk,nik->ni", J, covariances, J))
+
+
+def first_available(evaluation: Evaluation | None) -> AbsoluteError | None:
+    """The alignment the trajectory is drawn with: se3 when there is one."""
+    if evaluation is None:
+        return None
+    for name in (*ALIGNMENTS, *evaluation.ate):
+        absolute = evaluation.ate.get(name)
+        if absolute is not None and absolute.available:
+            return absolute
+    return None
+
+
+def share_bar(facts: RunFacts) -> str:
+    """Shares of the stages as one horizontal bar."""
+    frame = svg.Frame((0, 1), (0, 1), 480, 34)
+    x = 0.0
+    for i, stage in enumerate(facts.stages):
+        width = 480 * stage.share
+        name = escape(f"{stage.name}: {100 * stage.share:.1f} %")
+        frame.add(
+            f'<rect class="area s{i % 6 + 1}" x="{x:.1f}" y="2" width="{width:.1f}" height="30"><title>{name}</title></rect>'
+        )
+        if width > 34:
+            frame.text(x + width / 2, 22, f"{100 * stage.share:.0f} %", "middle", "onbar")
+        x += width
+    return frame.svg("share of each stage")
+
+
+def _lines(title: str, lines: list[svg.Line], x_label: str, y_label: str, caption: str) -> Figure:
+    chart = svg.line_chart(lines, x_label, y_label, title)
+    return Figure(title, chart, tuple((line.style, line.label) for line in lines), caption)
+
+
+def _three(names: tuple[str, str, str], x: NDArray[Any], values: NDArray[np.float64]) -> list[svg.Line]:
+    return [svg.Line(name, x, values[:, i], f"s{i + 1}") for i, name in enumerate(names)]
+
+
+def _failed_positions(record: RunRecord) -> NDArray[np.float64]:
+    places = [r.T_world_lidar[:2, 3] for r in record.results if r.status != "ok"]
+    return np.array(places, np.float64).reshape(-1, 2)
+
+
+def _covariances(record: RunRecord) -> NDArray[np.float64] | None:
+    """The trajectory's covariances, else those of the scans; NaN where a scan has none."""
+    if record.trajectory.covariances is not None:
+        return record.trajectory.covariances
+    given = [r.covariance for r in record.results]
+    if len(given) != len(record.trajectory) or all(c is None for c in given):
+        return None
+    return np.array([np.full((6, 6), np.nan) if c is None else c for c in given])

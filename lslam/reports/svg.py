@@ -1,0 +1,205 @@
+"""Small charts as inline SVG: no plotting library, colours and fonts left to the page's style sheet.
+
+Drawn by hand because a report must be quick (importing a plotting library alone takes half a second of a run that
+lasts two), readable on a phone and follow the page's light and dark colours. Long series are drawn as minimum and
+maximum per bin, so a peak is never lost.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from html import escape
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+WIDTH = 480
+BINS = 360  # about one per pixel and a half of the plot area
+MARGIN_LEFT, MARGIN_RIGHT, MARGIN_TOP, MARGIN_BOTTOM = 52, 14, 26, 40
+
+
+@dataclass(frozen=True)
+class Line:
+    """One series: x and y (N,); `style` is a class of the style sheet (`s1`..`s6`, `gt`)."""
+
+    label: str
+    x: NDArray[Any]
+    y: NDArray[Any]
+    style: str
+
+
+class Frame:
+    """A plot area with axes: maps data to SVG units and collects elements."""
+
+    def __init__(
+        self, x_range: tuple[float, float], y_range: tuple[float, float], width: int = WIDTH, height: int = 260
+    ) -> None:
+        self.width, self.height = width, height
+        self.x0, self.x1 = _widened(*x_range)
+        self.y0, self.y1 = _widened(*y_range)
+        self.left, self.right = MARGIN_LEFT, width - MARGIN_RIGHT
+        self.top, self.bottom = MARGIN_TOP, height - MARGIN_BOTTOM
+        self.parts: list[str] = []
+
+    def px(self, x: Any) -> Any:
+        """SVG abscissa of data x."""
+        return self.left + (np.asarray(x, np.float64) - self.x0) / (self.x1 - self.x0) * (self.right - self.left)
+
+    def py(self, y: Any) -> Any:
+        """SVG ordinate of data y."""
+        return self.bottom - (np.asarray(y, np.float64) - self.y0) / (self.y1 - self.y0) * (self.bottom - self.top)
+
+    def axes(self, x_label: str, y_label: str, x_ticks: int = 6, y_ticks: int = 5, whole_x: bool = False) -> None:
+        """Grid, tick labels and axis labels; the y label stands above the axis, where it can be read."""
+        for value in ticks(self.x0, self.x1, x_ticks, whole_x):
+            x = float(self.px(value))
+            self.add(f'<path class="grid" d="M{x:.1f} {self.top}V{self.bottom}"/>')
+            self.text(x, self.bottom + 16, number(value, self.x1 - self.x0), "middle")
+        for value in ticks(self.y0, self.y1, y_ticks):
+            y = float(self.py(value))
+            self.add(f'<path class="grid" d="M{self.left} {y:.1f}H{self.right}"/>')
+            self.text(self.left - 6, y + 4, number(value, self.y1 - self.y0), "end")
+        self.add(f'<path class="axis" d="M{self.left} {self.top}V{self.bottom}H{self.right}"/>')
+        self.text((self.left + self.right) / 2, self.height - 6, x_label, "middle", "label")
+        self.text(6, 14, y_label, "start", "label")
+
+    def add(self, element: str) -> None:
+        """One more element."""
+        self.parts.append(element)
+
+    def text(self, x: float, y: float, text: str, anchor: str = "start", style: str = "tick") -> None:
+        """Escaped text."""
+        self.add(f'<text class="{style}" x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}">{escape(text)}</text>')
+
+    def polyline(self, x: NDArray[Any], y: NDArray[Any], style: str) -> None:
+        """A line, broken where a value is not finite; a single point becomes a dot."""
+        px, py = self.px(x), self.py(y)
+        for run in finite_runs(px + py):
+            if run.stop - run.start == 1:
+                self.dot(float(px[run.start]), float(py[run.start]), style, 3)
+            else:
+                self.add(f'<path class="line {style}" d="{path(px[run], py[run])}"/>')
+
+    def dot(self, px: float, py: float, style: str, radius: float = 4) -> None:
+        """A filled circle at SVG coordinates."""
+        self.add(f'<circle class="dot {style}" cx="{px:.1f}" cy="{py:.1f}" r="{radius:g}"/>')
+
+    def marks(self, x: NDArray[Any], style: str) -> None:
+        """Vertical lines over the whole height."""
+        places = sorted({round(float(v)) for v in self.px(x)})
+        if places:
+            self.add(f'<path class="{style}" d="{"".join(f"M{p} {self.top}V{self.bottom}" for p in places)}"/>')
+
+    def svg(self, title: str) -> str:
+        """The finished element; `title` is what a screen reader says."""
+        return (
+            f'<svg viewBox="0 0 {self.width} {self.height}" role="img" aria-label="{escape(title)}">'
+            + "".join(self.parts)
+            + "</svg>"
+        )
+
+
+def ticks(low: float, high: float, wanted: int = 5, whole: bool = False) -> list[float]:
+    """Round values (1, 2, 2.5 or 5 times a power of ten) inside [low, high], about `wanted` of them.
+
+    >>> ticks(0.0, 1.0)
+    [0.0, 0.2, 0.4, 0.6, 0.8, 1.0]
+    """
+    raw = (high - low) / max(wanted, 1)
+    power = 10.0 ** np.floor(np.log10(raw))
+    step = float(min((m * power for m in (1, 2, 2.5, 5, 10)), key=lambda s: abs(np.log(s / raw))))
+    if whole:
+        step = max(1.0, float(round(step)))
+    first, last = int(np.ceil(low / step - 1e-9)), int(np.floor(high / step + 1e-9))
+    return [float(f"{i * step:.12g}") for i in range(first, last + 1)]
+
+
+def number(value: float, span: float) -> str:
+    """A tick's number with the decimals that `span` asks for, and a real minus sign.
+
+    >>> number(-0.25, 1.0)
+    '−0.25'
+    """
+    if value == 0:
+        return "0"
+    if span < 1e-4 or abs(value) >= 1e6:
+        return f"{value:.3g}".replace("-", "−")
+    decimals = int(np.clip(2 - np.floor(np.log10(span)), 0, 6))
+    text = f"{value:.{decimals}f}"
+    return (text.rstrip("0").rstrip(".") if "." in text else text).replace("-", "−")
+
+
+def thin(x: NDArray[Any], y: NDArray[Any], bins: int = BINS) -> tuple[Floats, Floats]:
+    """At most about 2 `bins` points of a long series: minimum and maximum per bin of equally many points, in order."""
+    x, y = np.asarray(x, np.float64), np.asarray(y, np.float64)
+    if len(x) <= 2 * bins:
+        return x, y
+    edges = np.linspace(0, len(x), bins + 1).astype(int)[:-1]
+    size = np.diff([*edges, len(x)])
+    bin_of = np.repeat(np.arange(bins), size)
+    low = np.lexsort((np.where(np.isfinite(y), y, np.inf), bin_of))[edges]
+    high = np.lexsort((np.where(np.isfinite(y), -y, np.inf), bin_of))[edges]
+    keep = np.unique(np.concatenate([low, high, [0, len(x) - 1]]))
+    return x[keep], y[keep]
+
+
+def path(px: NDArray[Any], py: NDArray[Any]) -> str:
+    """Path data through SVG points, rounded to a tenth; runs of equal points are written once."""
+    points = np.round(np.stack([px, py], axis=1), 1)
+    fresh = np.ones(len(points), bool)
+    fresh[1:] = (points[1:] != points[:-1]).any(1)
+    return "M" + "L".join(f"{a:g} {b:g}" for a, b in points[fresh].tolist())
+
+
+def finite_runs(values: NDArray[Any]) -> list[slice]:
+    """Slices over which values are finite."""
+    good = np.concatenate([[0], np.isfinite(values).astype(np.int8), [0]])
+    edges = np.flatnonzero(np.diff(good))
+    return [slice(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+
+
+def span_of(arrays: list[NDArray[Any]], zero: bool = False) -> tuple[float, float] | None:
+    """Smallest and largest finite value of all arrays (0 included when `zero`); None when there is none."""
+    values = np.concatenate([np.asarray(a, np.float64).ravel() for a in arrays]) if arrays else np.zeros(0)
+    values = values[np.isfinite(values)]
+    if not len(values):
+        return None
+    low, high = float(values.min()), float(values.max())
+    return (min(low, 0.0), max(high, 0.0)) if zero else (low, high)
+
+
+def line_chart(
+    lines: list[Line],
+    x_label: str,
+    y_label: str,
+    title: str,
+    *,
+    zero: bool = True,
+    marks: NDArray[Any] | None = None,
+    whole_x: bool = False,
+) -> str:
+    """Lines over a common abscissa; `marks` are abscissas of failed scans. Empty text when no value is finite."""
+    x_span, y_span = span_of([line.x for line in lines]), span_of([line.y for line in lines], zero)
+    if x_span is None or y_span is None:
+        return ""
+    pad = 0.06 * (y_span[1] - y_span[0])
+    low = y_span[0] - (pad if y_span[0] < 0 or not zero else 0)
+    frame = Frame(x_span, (low, y_span[1] + pad))
+    frame.axes(x_label, y_label, whole_x=whole_x)
+    if marks is not None:
+        frame.marks(marks, "failed")
+    for line in lines:
+        frame.polyline(*thin(line.x, line.y), line.style)
+    return frame.svg(title)
+
+
+def _widened(low: float, high: float) -> tuple[float, float]:
+    """A range that can be divided by, also for one value."""
+    least = 1e-9 * max(1.0, abs(low), abs(high))
+    if high - low > least:
+        return low, high
+    half = 0.5 * max(1e-3, 0.1 * abs(low)) if low else 0.5
+    return (low, high + 2 * half) if low == 0 else (low - half, high + half)

@@ -1,0 +1,112 @@
+"""The summary a run prints on stdout: what a person wants to know before opening the report."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from lslam.evaluation.results import ALIGNMENTS
+from lslam.reports.facts import Failure, RunFacts, run_facts
+from lslam.reports.metrics import fixed, metres
+from lslam.types.run_record import RunRecord
+
+if TYPE_CHECKING:
+    from lslam.evaluation.results import AbsoluteError, Evaluation, RelativeError
+
+MOST_FAILURES = 5
+FILES = (
+    ("trajectory", "trajectory.tum"),
+    ("map", "map.ply"),
+    ("map", "map.pcd"),
+    ("evaluation", "evaluation.json"),
+    ("report", "report.html"),
+)
+
+
+def summary(record: RunRecord, evaluation: Evaluation | None) -> str:
+    """Lines of a name and a value, aligned, ending with a newline; every score with its recipe."""
+    facts = run_facts(record)
+    rows = [("status", facts.status), *(("", reason) for reason in facts.reasons)]
+    rows += _scan_rows(facts)
+    rows.append(("path", f"{facts.path_length:.1f} m in {facts.duration:.1f} s"))
+    rows += _score_rows(record, evaluation)
+    rows += _time_rows(record, facts)
+    rows += [(name, str(record.folder / file)) for name, file in FILES if (record.folder / file).is_file()]
+    lines = [f"{record.name}, {record.method}"] + [f"  {name:<12} {value}" for name, value in rows]
+    return "\n".join(lines) + "\n"
+
+
+def _scan_rows(facts: RunFacts) -> list[tuple[str, str]]:
+    parts = [f"{facts.registered} of {facts.scans} registered"]
+    parts += [f"{n} {word}" for n, word in ((facts.bridged, "bridged"), (facts.skipped, "skipped")) if n]
+    if facts.degenerate:
+        parts.append(f"{len(facts.degenerate)} degenerate")
+    rows = [("scans", ", ".join(parts))]
+    shown = facts.failures[:MOST_FAILURES]
+    rows += [("", _failure(failure)) for failure in shown]
+    if len(facts.failures) > len(shown):
+        rows.append(("", f"and {len(facts.failures) - len(shown)} more: see the report"))
+    return rows
+
+
+def _failure(failure: Failure) -> str:
+    return f"scan {failure.index} {failure.status}: {failure.reason or 'reason not given'}"
+
+
+def _score_rows(record: RunRecord, evaluation: Evaluation | None) -> list[tuple[str, str]]:
+    if evaluation is None:
+        why = "ground truth could not be compared" if record.ground_truth is not None else "no ground truth is known"
+        return [("errors", f"not stated: {why}")]
+    rows = [(f"ATE {name}", _absolute(error, evaluation)) for name, error in evaluation.ate.items()]
+    rows += [("RPE", _relative(error)) for error in evaluation.rpe]
+    drift = evaluation.kitti_drift
+    if drift.available:
+        value = (
+            f"{drift.translation_percent:.3f} %, {drift.rotation_deg_per_100m:.4f} deg/100 m "
+            f"({drift.segments} segments of 100 to 800 m)"
+        )
+    else:
+        value = drift.note or "n/a"
+    rows.append(("KITTI drift", value))
+    first, second = evaluation.thesis1, evaluation.thesis2
+    rows.append(("thesis1", f"{metres(first.thesis_rmse)} m (thesis_rmse, sqrt(sum|e|²/3N), origin alignment)"))
+    rows.append(("thesis2", f"ATE {metres(second.ate_mean)} ± {metres(second.ate_std)} m (planar, mean ± std)"))
+    return rows
+
+
+def _absolute(error: AbsoluteError, evaluation: Evaluation) -> str:
+    if not error.available or error.translation is None:
+        return error.note or "n/a"
+    rotation = f", {error.rotation_deg.rmse:.3f} deg" if error.rotation_deg else ""
+    return (
+        f"{metres(error.translation.rmse)} m rmse{rotation}, max {metres(error.translation.max)} m, "
+        f"{fixed(error.percent_of_length, 2)} % of length ({ALIGNMENTS.get(error.alignment, error.alignment)}; "
+        f"{evaluation.matched} of {evaluation.possible} poses)"
+    )
+
+
+def _relative(error: RelativeError) -> str:
+    if error.translation is None or error.rotation_deg is None:
+        return f"{error.name}: {error.note or 'n/a'}"
+    return f"{metres(error.translation.rmse)} m, {error.rotation_deg.rmse:.4f} deg rmse ({error.name}, n = {error.n_pairs})"
+
+
+def _time_rows(record: RunRecord, facts: RunFacts) -> list[tuple[str, str]]:
+    if facts.total is None:
+        return [("time", "no stage was timed")]
+    total = facts.total
+    rows = [
+        (
+            "time",
+            f"{1e3 * total.median:.1f} ms per scan (median), p95 {1e3 * total.p95:.1f}, max {1e3 * total.max:.1f}: "
+            + ", ".join(f"{s.name} {1e3 * s.median:.1f}" for s in facts.stages),
+        )
+    ]
+    if facts.real_time_factor:
+        rows.append(
+            (
+                "real time",
+                f"{facts.real_time_factor:.1f} times as fast as the sensor; {facts.over_limit} of {facts.scans} scans over the "
+                f"limit of {1e3 * record.real_time_limit:.0f} ms",
+            )
+        )
+    return rows
