@@ -1,0 +1,232 @@
+"""A town generated along a street: road with kerbs, uneven ground, two rows of houses, gardens, trees, poles, parked cars."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.simulation import furniture
+from lslam.simulation.curve import Curve
+from lslam.simulation.houses import house
+from lslam.simulation.mesh import Mesh, MeshBuilder, Surface, grid_faces
+from lslam.simulation.terrain import Terrain
+
+Floats = NDArray[np.float64]
+
+KERB = 0.12  # m
+MARGIN = 60.0  # m of ground beyond the street on every side
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Measures of a street, m: half the road's width, the pavement's width, the second row's distance behind the first;
+    ranges of what varies from house to house.
+    """
+
+    road: float = 4.5
+    pavement: float = 2.0
+    second_row: float = 16.0
+    house_width: tuple[float, float] = (8.0, 15.0)
+    house_depth: tuple[float, float] = (7.0, 11.0)
+    gap: tuple[float, float] = (0.3, 4.5)
+    setback: tuple[float, float] = (0.3, 5.0)
+    storeys: tuple[int, int] = (2, 4)
+
+    @property
+    def band(self) -> float:
+        """From the middle of the road to the outer edge of the pavement."""
+        return self.road + self.pavement
+
+
+@dataclass(frozen=True)
+class City:
+    """A scene in one city frame (x, y level, z up, m).
+
+    footprints : outlines of the houses, each (4, 2)
+    """
+
+    mesh: Mesh
+    terrain: Terrain
+    street: Curve
+    footprints: list[Floats] = field(default_factory=list)
+
+
+def build_city(street: Curve, terrain: Terrain, layout: Layout, rng: np.random.Generator) -> City:
+    """Build a town along `street`. The same generator state gives the same town."""
+    builder = MeshBuilder()
+    _add_road(builder, street, terrain, layout, rng)
+    _add_ground(builder, street, terrain, layout, rng)
+    lots = _Lots(street, layout)
+    for side in (1, -1):
+        _add_row(builder, lots, terrain, layout, rng, side, first=True)
+    for side in (1, -1):
+        _add_row(builder, lots, terrain, layout, rng, side, first=False)
+        _add_street_furniture(builder, street, terrain, layout, rng, side)
+    _add_garden_trees(builder, lots, terrain, rng)
+    return City(builder.build(), terrain, street, lots.footprints)
+
+
+class _Lots:
+    """Which ground is taken: the street and the houses so far."""
+
+    def __init__(self, street: Curve, layout: Layout) -> None:
+        from shapely import LinearRing, LineString, Polygon, prepare
+
+        self.street = street
+        points = street.position(street.sample(1.0))
+        self.corridor = (LinearRing if street.closed else LineString)(points).buffer(layout.band + 0.2)
+        prepare(self.corridor)
+        self.polygon = Polygon
+        self.taken: list[Any] = []
+        self.footprints: list[Floats] = []
+
+    def is_free(self, corners: Floats) -> bool:
+        """True when a polygon (K, 2) touches neither the street nor a house."""
+        polygon = self.polygon(corners)
+        return not self.corridor.intersects(polygon) and not any(other.intersects(polygon) for other in self.taken)
+
+    def take(self, corners: Floats) -> None:
+        self.taken.append(self.polygon(corners))
+        self.footprints.append(corners)
+
+
+def _add_road(builder: MeshBuilder, street: Curve, terrain: Terrain, layout: Layout, rng: np.random.Generator) -> None:
+    """Road, kerbs and pavements as one strip along the street."""
+    s = street.sample(0.75)
+    if street.closed:
+        s = np.append(s, 0.0)
+    half = [0.0, 1.5, 3.0, layout.road, layout.road + 0.02, layout.band]
+    offsets = np.array([-d for d in half[:0:-1]] + half)
+    lift = np.where(np.abs(offsets) > layout.road + 0.01, KERB, 0.0)
+    xy = np.stack([street.beside(s, d) for d in offsets])
+    rough = rng.normal(0, 0.003, xy.shape[:2])
+    if street.closed:
+        rough[:, -1] = rough[:, 0]
+    z = terrain.height(xy) + lift[:, None] + rough
+    faces = grid_faces(len(offsets), len(s))
+    kinds = np.where((lift[:-1] > 0) | (lift[1:] > 0), Surface.PAVEMENT, Surface.ROAD).astype(np.uint8)
+    builder.add(np.concatenate([xy, z[..., None]], -1).reshape(-1, 3), faces, np.repeat(kinds, 2 * (len(s) - 1)))
+
+
+def _add_ground(
+    builder: MeshBuilder, street: Curve, terrain: Terrain, layout: Layout, rng: np.random.Generator
+) -> None:
+    """Grass everywhere else, a little below the pavements so that their edge shows."""
+    from scipy.spatial import cKDTree
+
+    middle = street.position(street.sample(0.5))
+    low, high = middle.min(0) - MARGIN, middle.max(0) + MARGIN
+    x, y = (np.arange(low[k], high[k] + 1.0, 1.0) for k in (0, 1))
+    xy = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1)
+    z = terrain.height(xy) + KERB - 0.03 + rng.normal(0, 0.015, xy.shape[:2])
+    nearest = np.asarray(cKDTree(middle).query(xy.reshape(-1, 2), distance_upper_bound=layout.band)[0])
+    under_road = nearest < layout.band - 0.1
+    faces = grid_faces(len(x), len(y))
+    faces = faces[~under_road[faces].any(axis=1)]
+    builder.add(np.concatenate([xy, z[..., None]], -1).reshape(-1, 3), faces, Surface.LAWN)
+
+
+def _add_row(
+    builder: MeshBuilder,
+    lots: _Lots,
+    terrain: Terrain,
+    layout: Layout,
+    rng: np.random.Generator,
+    side: int,
+    first: bool,
+) -> None:
+    """Houses side by side along one side of the street (1 left, -1 right), where there is room."""
+    s, setback = rng.uniform(0, 4), rng.uniform(*layout.setback)
+    while s < lots.street.length:
+        width = rng.uniform(*layout.house_width)
+        depth = rng.uniform(*layout.house_depth)
+        if rng.random() < 0.35:
+            setback = rng.uniform(*layout.setback)
+        back = setback + (0.0 if first else layout.second_row + rng.uniform(0, 8))
+        offset = layout.band + 0.3 + back
+        # Outside a bend there is more frontage than street, inside less.
+        bend = float(lots.street.curvature(np.array([min(s, lots.street.length)]))[0])
+        along = 1 / np.clip(1 - side * offset * bend, 0.6, 3.0)
+        placed = False
+        for share in (1.0, 0.8, 0.65):
+            corners, position, yaw = _lot(lots.street, s + along * width / 2, side, offset, width, share * depth)
+            if lots.is_free(corners):
+                lots.take(corners)
+                ground = float(terrain.height(position)) + KERB
+                builder.add_mesh(house(rng, width, share * depth, layout.storeys), [*position, ground], yaw)
+                if first and setback > 1.8:
+                    _add_front_garden(builder, rng, width, setback, [*position, ground], yaw)
+                placed = True
+                break
+        opening = 9.0 if first and rng.random() < 0.08 else rng.uniform(*layout.gap)
+        s += along * (width + opening) if placed else 1.0
+
+
+def _lot(street: Curve, s: float, side: int, offset: float, width: float, depth: float) -> tuple[Floats, Floats, float]:
+    """Outline (4, 2), middle of the front (2,) and yaw of a house whose front is `offset` m from the street's middle."""
+    at = np.array([min(s, street.length)])
+    tangent = street.tangent(at)[0] * side
+    inward = np.array([-tangent[1], tangent[0]])
+    front = street.beside(at, side * offset)[0]
+    half = width / 2 * tangent
+    outline = np.array([front - half, front + half, front + half + depth * inward, front - half + depth * inward])
+    return outline, front, float(np.arctan2(tangent[1], tangent[0]))
+
+
+def _add_front_garden(
+    builder: MeshBuilder, rng: np.random.Generator, width: float, setback: float, position: Any, yaw: float
+) -> None:
+    """A hedge or a low wall between garden and pavement."""
+    kind = rng.random()
+    if kind > 0.7:
+        return
+    length, across = width * rng.uniform(0.5, 0.95), -(setback - 0.2)
+    shift = rng.uniform(-0.5, 0.5) * (width - length)
+    c, s = np.cos(yaw), np.sin(yaw)
+    place = np.asarray(position) + np.array([c * shift - s * across, s * shift + c * across, 0])
+    part = furniture.hedge(rng, length) if kind < 0.4 else furniture.garden_wall(rng, length)
+    builder.add_mesh(part, place, yaw)
+
+
+def _add_street_furniture(
+    builder: MeshBuilder, street: Curve, terrain: Terrain, layout: Layout, rng: np.random.Generator, side: int
+) -> None:
+    """Parked cars, trees, poles and bins along one side."""
+
+    def put(part: Mesh, s: float, offset: float, lift: float, turn: float = 0.0) -> None:
+        at = np.array([s])
+        xy, tangent = street.beside(at, side * offset)[0], street.tangent(at)[0] * side
+        yaw = float(np.arctan2(tangent[1], tangent[0])) + turn
+        builder.add_mesh(part, [*xy, float(terrain.height(xy)) + lift], yaw)
+
+    for s in _stations(rng, street.length, 5.6, 8.0):
+        # Nobody parks in a bend.
+        if rng.random() < 0.42 and abs(float(street.curvature(np.array([s]))[0])) < 0.06:
+            turn = rng.normal(0, 0.02) + (np.pi if rng.random() < 0.2 else 0.0)
+            put(furniture.parked_car(rng), s, layout.road - 1.05 + rng.uniform(-0.12, 0.12), 0.0, turn)
+    for s in _stations(rng, street.length, 8.0, 15.0):
+        if rng.random() < 0.6:
+            put(furniture.tree(rng), s, layout.road + 0.7, KERB)
+    for s in _stations(rng, street.length, 14.0, 30.0):
+        put(furniture.pole(rng), s, layout.road + 0.4, KERB, np.pi)
+    for s in _stations(rng, street.length, 18.0, 40.0):
+        put(furniture.bins(rng), s, layout.band - 0.5, KERB)
+
+
+def _add_garden_trees(builder: MeshBuilder, lots: _Lots, terrain: Terrain, rng: np.random.Generator) -> None:
+    """Trees wherever a random place is free."""
+    middle = lots.street.position(lots.street.sample(5.0))
+    for place in middle.repeat(3, axis=0) + rng.uniform(-35, 35, (3 * len(middle), 2)):
+        corners = place + 1.2 * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
+        if lots.is_free(corners):
+            builder.add_mesh(furniture.tree(rng), [*place, float(terrain.height(place)) + KERB])
+
+
+def _stations(rng: np.random.Generator, length: float, shortest: float, longest: float) -> Floats:
+    """Distances along a street, `shortest` to `longest` m apart."""
+    steps = rng.uniform(shortest, longest, int(length / shortest) + 2)
+    s = np.cumsum(steps) - steps[0] / 2
+    return np.asarray(s[s < length - shortest / 2])

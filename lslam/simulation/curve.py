@@ -1,0 +1,108 @@
+"""Smooth planar curves by arc length: the middle of a street, and the line a vehicle drives."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+SPACING = 0.5  # m between the spline's knots
+
+
+@dataclass(frozen=True)
+class Curve:
+    """A planar curve, twice continuously differentiable and more (quintic spline), over its length in m.
+
+    Made by `smooth_curve`. On a closed curve any distance is valid and wraps; on an open one 0..length.
+    """
+
+    spline: Any
+    length: float
+    closed: bool
+
+    def position(self, s: NDArray[Any]) -> Floats:
+        """(M, 2) positions at distances `s` (M,), m."""
+        return np.asarray(self.spline(self._wrap(s)))
+
+    def tangent(self, s: NDArray[Any]) -> Floats:
+        """(M, 2) unit tangents at distances `s` (M,)."""
+        d = np.asarray(self.spline(self._wrap(s), nu=1))
+        return np.asarray(d / np.linalg.norm(d, axis=-1, keepdims=True))
+
+    def curvature(self, s: NDArray[Any]) -> Floats:
+        """(M,) signed curvature, 1/m, positive to the left."""
+        at = self._wrap(s)
+        d, dd = np.asarray(self.spline(at, nu=1)), np.asarray(self.spline(at, nu=2))
+        return np.asarray((d[:, 0] * dd[:, 1] - d[:, 1] * dd[:, 0]) / np.linalg.norm(d, axis=1) ** 3)
+
+    def beside(self, s: NDArray[Any], offset: Any) -> Floats:
+        """(M, 2) positions `offset` m to the left of the curve at distances `s` (M,)."""
+        t = self.tangent(s)
+        left = np.stack([-t[:, 1], t[:, 0]], axis=1)
+        return np.asarray(self.position(s) + np.broadcast_to(np.asarray(offset, np.float64), len(t))[:, None] * left)
+
+    def sample(self, spacing: float) -> Floats:
+        """(M,) distances about `spacing` m apart along the whole curve; a closed one ends before its start."""
+        count = max(int(np.ceil(self.length / spacing)), 2)
+        return np.linspace(0, self.length, count + 1)[: -1 if self.closed else None]
+
+    def _wrap(self, s: NDArray[Any]) -> Floats:
+        s = np.asarray(s, np.float64)
+        return np.asarray(np.mod(s, self.length) if self.closed else s)
+
+
+def smooth_curve(points: NDArray[Any], closed: bool, smoothing: float = 1.5) -> Curve:
+    """Curve through way-points (N, 2), corners rounded by a Gaussian of `smoothing` m along the line.
+
+    A closed curve must not repeat its first point at the end.
+    """
+    from scipy.interpolate import make_interp_spline
+    from scipy.ndimage import gaussian_filter1d
+
+    points = np.asarray(points, np.float64)
+    if closed:
+        points = np.concatenate([points, points[:1]])
+    even, step = _resample(points)
+    if closed:
+        even = gaussian_filter1d(even[:-1], smoothing / step, axis=0, mode="wrap")
+        even = np.concatenate([even, even[:1]])
+    else:
+        # Mirroring the differences, not the positions, keeps the ends where they are and straight.
+        reach = int(np.ceil(4 * smoothing / step))
+        ahead, behind = 2 * even[0] - even[reach:0:-1], 2 * even[-1] - even[-2 : -reach - 2 : -1]
+        even = gaussian_filter1d(np.concatenate([ahead, even, behind]), smoothing / step, axis=0)[reach:-reach]
+    knots = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(even, axis=0), axis=1))])
+    spline = make_interp_spline(knots, even, k=5, bc_type="periodic" if closed else None)
+    return Curve(spline, float(knots[-1]), closed)
+
+
+def _resample(points: Floats) -> tuple[Floats, float]:
+    """The polyline at even distances near `SPACING`, and the distance."""
+    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+    count = max(int(np.round(along[-1] / SPACING)), 12)
+    at = np.linspace(0, along[-1], count + 1)
+    return np.stack([np.interp(at, along, points[:, k]) for k in (0, 1)], axis=1), float(at[1])
+
+
+def rounded_rectangle(width: float, depth: float, radius: float) -> Floats:
+    """(N, 2) points counter-clockwise round a rectangle with round corners, from the middle of the lower side along +x."""
+    corners = []
+    for k, (sx, sy) in enumerate(((1, -1), (1, 1), (-1, 1), (-1, -1))):
+        angle = np.linspace(-np.pi / 2, 0, 12) + k * np.pi / 2
+        centre = np.array([sx * (width / 2 - radius), sy * (depth / 2 - radius)])
+        corners.append(centre + radius * np.stack([np.cos(angle), np.sin(angle)], axis=1))
+    return np.concatenate([[[0.0, -depth / 2]], *corners])
+
+
+def winding_line(rng: np.random.Generator, length: float, bend: float = 0.22) -> Floats:
+    """(N, 2) points of a street of `length` m whose heading swings by about `bend` rad over 150 to 260 m."""
+    s = np.arange(0, length + 1.0)
+    heading = np.zeros_like(s)
+    for wavelength, share in ((rng.uniform(200, 260), 1.0), (rng.uniform(150, 190), 0.5)):
+        heading += bend * share * np.sin(2 * np.pi * s / wavelength + rng.uniform(0, 2 * np.pi))
+    steps = np.stack([np.cos(heading), np.sin(heading)], axis=1)
+    return np.asarray(np.cumsum(steps, axis=0))

@@ -1,0 +1,124 @@
+"""Triangle meshes with a surface class per face, and a builder that collects them part by part."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+
+class Surface(IntEnum):
+    """What a face is made of: the LiDAR's intensity and losses follow from it."""
+
+    ROAD = 0
+    PAVEMENT = 1
+    LAWN = 2
+    WALL = 3
+    GLASS = 4
+    ROOF = 5
+    FOLIAGE = 6
+    TRUNK = 7
+    POLE = 8
+    CAR = 9
+    FENCE = 10
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """Triangles in one frame.
+
+    vertices : (V, 3) float32, m; faces : (F, 3) int32 indices of vertices; surfaces : (F,) uint8 values of `Surface`
+    """
+
+    vertices: NDArray[np.float32]
+    faces: NDArray[np.int32]
+    surfaces: NDArray[np.uint8]
+
+    @cached_property
+    def normals(self) -> NDArray[np.float32]:
+        """(F, 3) unit face normals; zero for degenerate faces. Their sign is not defined."""
+        a, b, c = (self.vertices[self.faces[:, k]].astype(np.float64) for k in range(3))
+        cross = np.cross(b - a, c - a)
+        length = np.linalg.norm(cross, axis=1, keepdims=True)
+        return np.asarray(cross / np.where(length > 0, length, 1), np.float32)
+
+
+class MeshBuilder:
+    """Collects parts in one frame; `build` joins them."""
+
+    def __init__(self) -> None:
+        self._vertices: list[NDArray[Any]] = []
+        self._faces: list[NDArray[Any]] = []
+        self._surfaces: list[NDArray[np.uint8]] = []
+        self._count = 0
+
+    def add(self, vertices: NDArray[Any], faces: NDArray[Any], surfaces: int | NDArray[np.uint8]) -> None:
+        """Add vertices (V, 3), m, and faces (F, 3) that index them, of one surface or one per face."""
+        self._vertices.append(np.asarray(vertices, np.float64))
+        self._faces.append(np.asarray(faces, np.int64) + self._count)
+        self._surfaces.append(np.broadcast_to(np.asarray(surfaces, np.uint8), len(faces)))
+        self._count += len(vertices)
+
+    def add_quads(self, corners: Any, surface: int) -> None:
+        """Add quadrilaterals (N, 4, 3), corners in order round each."""
+        corners = np.asarray(corners, np.float64).reshape(-1, 4, 3)
+        first = 4 * np.arange(len(corners))[:, None]
+        faces = np.concatenate([first + np.array([0, 1, 2]), first + np.array([0, 2, 3])])
+        self.add(corners.reshape(-1, 3), faces, surface)
+
+    def add_box(self, low: Any, high: Any, surface: int) -> None:
+        """Add an axis-aligned box between two corners (3,)."""
+        self.add(*box(low, high), surface)
+
+    def add_mesh(self, mesh: Mesh, position: Any = (0, 0, 0), yaw: float = 0.0) -> None:
+        """Add a mesh turned by `yaw` (rad, about z) and moved to `position` (3,)."""
+        c, s = np.cos(yaw), np.sin(yaw)
+        turned = mesh.vertices @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
+        self.add(turned + np.asarray(position, np.float64), mesh.faces, mesh.surfaces)
+
+    def build(self) -> Mesh:
+        """All parts as one mesh."""
+        if not self._faces:
+            return Mesh(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32), np.zeros(0, np.uint8))
+        return Mesh(
+            np.concatenate(self._vertices).astype(np.float32),
+            np.concatenate(self._faces).astype(np.int32),
+            np.concatenate(self._surfaces),
+        )
+
+
+def box(low: Any, high: Any) -> tuple[Floats, NDArray[np.int64]]:
+    """Vertices (8, 3) and faces (12, 3) of the axis-aligned box between two corners."""
+    pair = np.array([low, high], np.float64)
+    corners = np.array([[pair[i, 0], pair[j, 1], pair[k, 2]] for i in (0, 1) for j in (0, 1) for k in (0, 1)])
+    sides = np.array([[0, 1, 3, 2], [4, 5, 7, 6], [0, 1, 5, 4], [2, 3, 7, 6], [0, 2, 6, 4], [1, 3, 7, 5]])
+    return corners, np.concatenate([sides[:, [0, 1, 2]], sides[:, [0, 2, 3]]])
+
+
+def tube(
+    radius_low: float, radius_high: float, bottom: float, top: float, sides: int
+) -> tuple[Floats, NDArray[np.int64]]:
+    """Vertices and faces of an open vertical tube round the z axis, possibly conical."""
+    angle = 2 * np.pi * np.arange(sides) / sides
+    ring = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    low = np.column_stack([radius_low * ring, np.full(sides, bottom)])
+    high = np.column_stack([radius_high * ring, np.full(sides, top)])
+    here, there = np.arange(sides), (np.arange(sides) + 1) % sides
+    faces = np.concatenate(
+        [np.stack([here, there, there + sides], 1), np.stack([here, there + sides, here + sides], 1)]
+    )
+    return np.concatenate([low, high]), faces
+
+
+def grid_faces(rows: int, columns: int) -> NDArray[np.int64]:
+    """Faces of a (rows x columns) grid of vertices stored row by row: two per cell, cell after cell."""
+    index = np.arange(rows * columns).reshape(rows, columns)
+    a, b, c, d = index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]
+    both = np.stack([np.stack([a, b, c], -1), np.stack([a, c, d], -1)], axis=2)
+    return np.asarray(both.reshape(-1, 3))

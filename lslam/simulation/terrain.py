@@ -1,0 +1,45 @@
+"""Gently uneven ground: a sum of plane waves, so that height and slope are exact everywhere."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Terrain:
+    """Ground height as a sum of K plane waves `amplitude sin(wave . xy + phase)`.
+
+    waves : (K, 2) wave vectors, rad/m; amplitudes : (K,) m; phases : (K,) rad
+    """
+
+    waves: Floats
+    amplitudes: Floats
+    phases: Floats
+
+    def height(self, xy: NDArray[Any]) -> Floats:
+        """Height at (..., 2) positions, m, shape (...)."""
+        return np.asarray(np.sin(xy @ self.waves.T + self.phases) @ self.amplitudes)
+
+    def slope(self, xy: NDArray[Any]) -> Floats:
+        """Gradient of the height at (..., 2) positions, m/m, shape (..., 2)."""
+        return np.asarray((np.cos(xy @ self.waves.T + self.phases) * self.amplitudes) @ self.waves)
+
+
+def rolling(rng: np.random.Generator, relief: float = 0.35, unevenness: float = 0.012) -> Terrain:
+    """Ground of a town: long swells of about `relief` m, bumps of about `unevenness` m over 7 to 20 m."""
+    lengths = np.concatenate([rng.uniform(60, 140, 4), rng.uniform(7, 20, 5)])
+    amplitudes = np.concatenate([rng.uniform(0.4, 1.0, 4) * relief, rng.uniform(0.4, 1.0, 5) * unevenness])
+    heading = rng.uniform(0, 2 * np.pi, len(lengths))
+    waves = (2 * np.pi / lengths)[:, None] * np.stack([np.cos(heading), np.sin(heading)], axis=1)
+    return Terrain(waves, amplitudes, rng.uniform(0, 2 * np.pi, len(lengths)))
+
+
+def flat() -> Terrain:
+    """Ground at height zero everywhere."""
+    return Terrain(np.zeros((1, 2)), np.zeros(1), np.zeros(1))
