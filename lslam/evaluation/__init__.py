@@ -1,1 +1,1 @@
-"""Trajectories against ground truth: every number with its recipe."""
+"""How good is a trajectory: ATE, RPE, KITTI drift and the two theses' numbers, each beside its recipe."""

@@ -1,0 +1,170 @@
+"""Which pose of the estimate belongs to which pose of the ground truth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.errors import InputError
+from lslam.geometry import interpolate
+from lslam.types.trajectory import Trajectory
+
+Floats = NDArray[np.float64]
+Stamps = NDArray[np.int64]
+LEAST = 3
+# Interpolation pays when truth has a pose at least every 0.6 estimate intervals, and stops at holes of 5 of its own.
+DENSER, HOLE = 0.6, 5
+
+
+@dataclass(frozen=True)
+class Matches:
+    """Matched poses: estimate (N, 4, 4), truth (N, 4, 4), stamps_ns (N,) on the truth's clock or the one that is known.
+
+    seconds : (N,) s since the first match, None when neither file knows time; recipe : the rule, for people
+    """
+
+    estimate: Floats
+    truth: Floats
+    stamps_ns: Stamps
+    seconds: Floats | None
+    possible: int
+    recipe: str
+
+
+def associate(estimate: Trajectory, truth: Trajectory, max_diff: float = 0.01, offset_ns: int = 0) -> Matches:
+    """Match poses: by index when a file has no stamps, else by nearest stamp one to one, interpolating denser truth.
+
+    Parameters
+    ----------
+    max_diff : s, largest difference of stamps in a pair
+    offset_ns : added to the estimate's stamps first
+
+    Raises
+    ------
+    InputError when fewer than 3 poses match, with both time ranges, or when counts differ and there are no stamps.
+    """
+    for which, trajectory in (("estimate", estimate), ("ground truth", truth)):
+        if len(trajectory) < LEAST:
+            raise InputError(
+                f"{which} {trajectory.source or 'without a name'} has {len(trajectory)} poses, {LEAST} are needed "
+                f"(estimate: {time_range(estimate)}; ground truth: {time_range(truth)})"
+            )
+    if not (estimate.has_stamps and truth.has_stamps):
+        return _by_index(estimate, truth)
+    limit = round(max_diff * 1e9)
+    stamps = estimate.stamps_ns + offset_ns
+    if _is_denser(truth.stamps_ns, stamps):
+        matches = _interpolated(estimate, stamps, truth, limit)
+    else:
+        matches = _nearest(estimate, stamps, truth, limit)
+    if len(matches.stamps_ns) < LEAST:
+        raise InputError(_no_overlap(estimate, stamps, truth, len(matches.stamps_ns), max_diff))
+    return matches
+
+
+def nearest_one_to_one(stamps: Stamps, others: Stamps, limit_ns: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Indices into two increasing lists of stamps: nearest neighbours within `limit_ns`, each used once.
+
+    As in evo the shorter list looks for partners; when two want the same one, the nearer gets it.
+    """
+    if len(others) < len(stamps):
+        b, a = nearest_one_to_one(others, stamps, limit_ns)
+        return a, b
+    after = np.clip(np.searchsorted(others, stamps, side="right"), 0, len(others) - 1)
+    before = np.maximum(after - 1, 0)
+    partner = np.where(np.abs(others[after] - stamps) < np.abs(others[before] - stamps), after, before)
+    off = np.abs(others[partner] - stamps)
+    order = np.lexsort((np.arange(len(stamps)), off))
+    order = order[off[order] <= limit_ns]
+    _, first = np.unique(partner[order], return_index=True)
+    chosen = np.sort(order[first])
+    return chosen, partner[chosen]
+
+
+def time_range(trajectory: Trajectory, offset_ns: int = 0) -> str:
+    """First and last stamp in words."""
+    if not trajectory.has_stamps:
+        return f"{len(trajectory)} poses without stamps"
+    if len(trajectory) == 0:
+        return "no poses"
+    first, last = (int(s) + offset_ns for s in trajectory.stamps_ns[[0, -1]])
+    return f"{first / 1e9:.3f} .. {last / 1e9:.3f} s"
+
+
+def _by_index(estimate: Trajectory, truth: Trajectory) -> Matches:
+    bare = [name for name, t in (("estimate", estimate), ("ground truth", truth)) if not t.has_stamps]
+    who = " and ".join(bare) + (" have" if len(bare) == 2 else " has")
+    if len(estimate) != len(truth):
+        raise InputError(
+            f"{who} no stamps and the counts differ: {len(estimate)} poses in {estimate.source}, {len(truth)} in "
+            f"{truth.source}; give the stamps of the KITTI file with --times, or use a format that has them (TUM)"
+        )
+    clock = truth if truth.has_stamps else estimate
+    return Matches(
+        estimate=estimate.poses,
+        truth=truth.poses,
+        stamps_ns=clock.stamps_ns,
+        seconds=_seconds(clock.stamps_ns) if clock.has_stamps else None,
+        possible=len(truth),
+        recipe=f"by index (line i with line i), because {who} no stamps",
+    )
+
+
+def _nearest(estimate: Trajectory, stamps: Stamps, truth: Trajectory, limit: int) -> Matches:
+    i, j = nearest_one_to_one(stamps, truth.stamps_ns, limit)
+    return Matches(
+        estimate=estimate.poses[i],
+        truth=truth.poses[j],
+        stamps_ns=truth.stamps_ns[j],
+        seconds=_seconds(truth.stamps_ns[j]),
+        possible=min(len(estimate), len(truth)),
+        recipe=f"nearest stamp, one to one, within {limit / 1e9:g} s",
+    )
+
+
+def _interpolated(estimate: Trajectory, stamps: Stamps, truth: Trajectory, limit: int) -> Matches:
+    known = truth.stamps_ns
+    after = np.clip(np.searchsorted(known, stamps, side="left"), 1, len(known) - 1)
+    gap = known[after] - known[after - 1]
+    hole = max(HOLE * float(np.median(np.diff(known))), 2 * limit)
+    nearest = np.minimum(np.abs(known[after] - stamps), np.abs(known[after - 1] - stamps))
+    inside = (stamps >= known[0]) & (stamps <= known[-1]) & (gap <= hole)
+    i = np.flatnonzero(inside | (nearest <= limit))
+    truth_poses = interpolate.poses_at(known, truth.poses, stamps[i]) if len(i) else np.zeros((0, 4, 4))
+    return Matches(
+        estimate=estimate.poses[i],
+        truth=truth_poses,
+        stamps_ns=stamps[i],
+        seconds=_seconds(stamps[i]),
+        possible=len(estimate),
+        recipe="denser ground truth interpolated at the estimate's stamps",
+    )
+
+
+def _is_denser(truth: Stamps, estimate: Stamps) -> bool:
+    """Whether truth has clearly more poses per second than the estimate, and its stamps are not simply the same ones."""
+    if float(np.median(np.diff(truth))) >= DENSER * float(np.median(np.diff(estimate))):
+        return False
+    return not bool(np.isin(estimate, truth).all())
+
+
+def _seconds(stamps: Stamps) -> Floats:
+    return np.asarray((stamps - stamps[:1]) / 1e9, np.float64)
+
+
+def _no_overlap(estimate: Trajectory, stamps: Stamps, truth: Trajectory, found: int, max_diff: float) -> str:
+    ranges = (
+        f"estimate {estimate.source} covers {stamps[0] / 1e9:.3f} .. {stamps[-1] / 1e9:.3f} s, "
+        f"ground truth {truth.source} {time_range(truth)}"
+    )
+    if stamps[0] <= truth.stamps_ns[-1] and truth.stamps_ns[0] <= stamps[-1]:
+        after = np.clip(np.searchsorted(truth.stamps_ns, stamps), 1, len(truth) - 1)
+        off = np.minimum(np.abs(truth.stamps_ns[after] - stamps), np.abs(truth.stamps_ns[after - 1] - stamps))
+        way_out = (
+            f"their stamps are {np.median(off) / 1e9:.3f} s apart (median): raise --max-diff or try --time-offset auto"
+        )
+    else:
+        way_out = "they share no time: try --time-offset auto (or seconds) if one clock is shifted"
+    return f"only {found} poses match within {max_diff:g} s, {LEAST} are needed: {ranges}; {way_out}"

@@ -1,0 +1,123 @@
+"""One estimate against one ground truth: associate, bring into one frame, measure."""
+
+from __future__ import annotations
+
+import logging
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.config.eval import EvalConfig
+from lslam.errors import InputError
+from lslam.evaluation.absolute import absolute_error
+from lslam.evaluation.associate import Matches, associate
+from lslam.evaluation.frames import reconcile
+from lslam.evaluation.kitti_drift import kitti_drift
+from lslam.evaluation.relative import relative_error
+from lslam.evaluation.results import Evaluation
+from lslam.evaluation.thesis import axis_errors, planar
+from lslam.evaluation.time_offset import estimate_offset
+from lslam.geometry import se3
+from lslam.types.calibration import Calibration
+from lslam.types.trajectory import Trajectory
+
+log = logging.getLogger("lslam")
+Floats = NDArray[np.float64]
+
+
+def evaluate(
+    estimate: Trajectory,
+    ground_truth: Trajectory,
+    config: EvalConfig | None = None,
+    *,
+    T_est_gt: Floats | None = None,
+    calibration: Calibration | None = None,
+) -> Evaluation:
+    """Score `estimate` against `ground_truth`.
+
+    Parameters
+    ----------
+    config : alignments, RPE distances, association; defaults when None
+    T_est_gt : (4, 4) pose of the truth's body in the estimate's body, m; carries the truth to the estimate's body
+    calibration : its `T_cam0_lidar` converts when one trajectory is the camera's and the other the LiDAR's
+
+    Raises
+    ------
+    InputError when fewer than 3 poses match, poses are not finite, or stamps do not increase.
+
+    Notes
+    -----
+    Definitions: CONVENTIONS, "Metrics". Every part of the result carries its recipe.
+    """
+    config = config or EvalConfig()
+    for which, trajectory in (("estimate", estimate), ("ground truth", ground_truth)):
+        _check(which, trajectory)
+    offset_ns, notes = _offset(estimate, ground_truth, config)
+    matches = associate(estimate, ground_truth, config.max_diff, offset_ns)
+    if len(matches.stamps_ns) < matches.possible:
+        notes.append(f"{matches.possible - len(matches.stamps_ns)} of {matches.possible} poses found no partner")
+    truth = matches.truth if T_est_gt is None else matches.truth @ se3.inverse(T_est_gt)
+    same = reconcile(
+        matches.estimate,
+        truth,
+        (estimate.frame, ground_truth.frame),
+        calibration.T_cam0_lidar if calibration else None,
+        is_given=T_est_gt is not None,
+    )
+    if T_est_gt is not None:
+        notes.append("ground truth carried to the estimate's body by --T-est-gt")
+    notes += same.notes
+    for note in notes:
+        log.log(logging.WARNING if "WRONG" in note else logging.INFO, "%s: %s", estimate.source or "estimate", note)
+    return _measure(same.estimate, same.truth, matches, config, (estimate, ground_truth), offset_ns / 1e9, notes)
+
+
+def _measure(
+    P: Floats,
+    Q: Floats,
+    matches: Matches,
+    config: EvalConfig,
+    trajectories: tuple[Trajectory, Trajectory],
+    time_offset: float,
+    notes: list[str],
+) -> Evaluation:
+    """All metrics of matched poses in one body frame: P estimate, Q ground truth, (N, 4, 4)."""
+    distance = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(Q[:, :3, 3], axis=0), axis=1))])
+    return Evaluation(
+        estimate=trajectories[0].source or "estimate",
+        ground_truth=trajectories[1].source or "ground truth",
+        matched=len(P),
+        possible=matches.possible,
+        stamps_ns=matches.stamps_ns,
+        distance=distance,
+        gt_positions=Q[:, :3, 3],
+        path_length=float(distance[-1]),
+        ate={name: absolute_error(P, Q, name) for name in config.align},
+        rpe=[relative_error(P, Q, matches.seconds, delta) for delta in config.delta],
+        kitti_drift=kitti_drift(P, Q),
+        thesis1=axis_errors(P, Q),
+        thesis2=planar(P, Q),
+        time_offset=time_offset,
+        association=matches.recipe,
+        notes=notes,
+    )
+
+
+def _check(which: str, trajectory: Trajectory) -> None:
+    name = trajectory.source or "without a name"
+    if not np.isfinite(trajectory.poses).all():
+        bad = int(np.flatnonzero(~np.isfinite(trajectory.poses).all(axis=(1, 2)))[0])
+        raise InputError(f"{which} {name}: pose {bad} holds NaN or infinity")
+    if trajectory.has_stamps and (np.diff(trajectory.stamps_ns) <= 0).any():
+        bad = int(np.flatnonzero(np.diff(trajectory.stamps_ns) <= 0)[0]) + 1
+        raise InputError(f"{which} {name}: the stamp of pose {bad} is not after the one before")
+
+
+def _offset(estimate: Trajectory, truth: Trajectory, config: EvalConfig) -> tuple[int, list[str]]:
+    if config.time_offset != "auto":
+        offset = round(float(config.time_offset) * 1e9)
+        if offset and not (estimate.has_stamps and truth.has_stamps):
+            raise InputError("a time offset needs stamps in both trajectories: give --times for the KITTI file")
+        return offset, [f"time offset {config.time_offset:g} s added to the estimate"] if offset else []
+    offset, score = estimate_offset(estimate, truth)
+    return offset, [f"time offset auto: {offset / 1e9:.6f} s added to the estimate (correlation of motion {score:.3f})"]

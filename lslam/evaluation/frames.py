@@ -1,0 +1,159 @@
+"""Whose poses are these? Telling camera from LiDAR poses by the motion, and bringing both into one body frame.
+
+A vehicle's camera advances along its own +z, its LiDAR along +x. Scoring one against the other ruins every number but
+the aligned positions, so it is detected, said, and undone when the extrinsics are known.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.geometry import se3, so3
+
+Floats = NDArray[np.float64]
+
+# Camera axes (x right, y down, z forward) to body axes (x forward, y left, z up): signed ones, so turning is exact.
+R_BODY_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+STEADY = 0.8  # |mean direction| above which a body counts as moving along one of its axes
+SAME_DEG = 30.0
+
+
+@dataclass
+class Reconciled:
+    """Both trajectories in one body frame, poses (N, 4, 4), and what was found out."""
+
+    estimate: Floats
+    truth: Floats
+    notes: list[str] = field(default_factory=list)
+
+
+def reconcile(
+    estimate: Floats, truth: Floats, frames: tuple[str, str], T_cam0_lidar: Floats | None, is_given: bool = False
+) -> Reconciled:
+    """Bring matched poses (N, 4, 4) into one body frame.
+
+    Parameters
+    ----------
+    frames : the frames the files state (estimate, ground truth); the motion outranks them where it is clear
+    T_cam0_lidar : (4, 4) or None when unknown
+    is_given : the user stated the transform between the bodies: nothing is converted, a remaining difference is said
+    """
+    camera = [_is_camera(poses, frame) for poses, frame in zip((estimate, truth), frames, strict=True)]
+    out = Reconciled(estimate, truth)
+    if is_given:
+        _say_difference(out, "--T-est-gt leaves a difference: ")
+        return out
+    for who, frame, poses in (("estimate", frames[0], estimate), ("ground truth", frames[1], truth)):
+        if frame == "cam0" and main_axis(poses) == "+x":
+            out.notes.append(
+                f"{who} is a KITTI file (camera 0 by convention) but advances along +x: taken as LiDAR poses"
+            )
+    if camera[0] is None or camera[1] is None or camera[0] == camera[1]:
+        _say_difference(out)
+        if camera[0] and camera[1] and "cam0" in frames and not out.notes:
+            # One rigid relabelling of both: no norm changes, and up is z again.
+            out.estimate, out.truth = _turn(estimate), _turn(truth)
+        return out
+    which, other = ("estimate", "ground truth") if camera[0] else ("ground truth", "estimate")
+    fact = f"{which} is in the camera frame (advances along +z), {other} in the LiDAR frame (advances along +x)"
+    if T_cam0_lidar is None:
+        out.notes.append(
+            f"WRONG FRAMES: {fact}; without calibration (--calib) they are compared as they are: "
+            "origin-aligned, rotational, KITTI drift and per-axis numbers mean nothing"
+        )
+        return out
+    moved = se3.inverse(T_cam0_lidar) @ (estimate if camera[0] else truth) @ T_cam0_lidar
+    if camera[0]:
+        out.estimate = moved
+    else:
+        out.truth = moved
+    out.notes.append(f"{fact}: {which} converted to the LiDAR with T_cam0_lidar")
+    _say_difference(out)
+    return out
+
+
+def main_axis(poses: Floats) -> str | None:
+    """The body axis along which poses (N, 4, 4) advance, `+x` .. `-z`, None when they advance along none in particular."""
+    direction = _mean_direction(poses)
+    if direction is None:
+        return None
+    k = int(np.argmax(np.abs(direction)))
+    if abs(direction[k]) < STEADY:
+        return None
+    return f"{'+' if direction[k] > 0 else '-'}{'xyz'[k]}"
+
+
+def _is_camera(poses: Floats, frame: str) -> bool | None:
+    """True for camera poses, False for LiDAR poses, None when neither motion nor file says."""
+    axis = main_axis(poses)
+    if axis in ("+z", "-z") and frame != "lidar":
+        return True
+    if axis in ("+x", "-x"):
+        return False
+    return {"cam0": True, "lidar": False}.get(frame)
+
+
+def _mean_direction(poses: Floats) -> Floats | None:
+    steps = _steps(poses)
+    travelled = float(np.linalg.norm(steps, axis=1).sum())
+    if travelled < 1.0:
+        return None
+    mean = np.asarray(steps.sum(axis=0) / travelled)
+    return mean if np.linalg.norm(mean) > STEADY else None
+
+
+def _steps(poses: Floats, stride: int = 1) -> Floats:
+    """(M, 3) motions in the body frame at their start, m."""
+    d = poses[stride::stride, :3, 3] - poses[:-stride:stride, :3, 3][: len(poses[stride::stride])]
+    R = poses[:-stride:stride, :3, :3][: len(d)]
+    return np.asarray(np.einsum("nji,nj->ni", R, d))
+
+
+def body_rotation(estimate: Floats, truth: Floats) -> Floats | None:
+    """Rotation (3, 3) that takes directions of the truth's body into the estimate's, from the motions of both.
+
+    None when motion does not determine it: standing, straight without turns, or an estimate unlike the truth.
+    """
+    stride = max(1, len(truth) // 300)
+    t_est, t_gt = _steps(estimate, stride), _steps(truth, stride)
+    w_est, w_gt = _turns(estimate, stride), _turns(truth, stride)
+    B = np.zeros((3, 3))
+    total = 0.0
+    for a, b, least in ((t_est, t_gt, 1.0), (w_est, w_gt, 0.3)):
+        size = float(np.sum(np.linalg.norm(a, axis=1) * np.linalg.norm(b, axis=1)))
+        if min(np.linalg.norm(a, axis=1).sum(), np.linalg.norm(b, axis=1).sum()) < least or size == 0:
+            continue
+        B += a.T @ b / size
+        total += 1.0
+    if total == 0:
+        return None
+    u, d, vt = np.linalg.svd(B)
+    R = u @ np.diag([1.0, 1.0, float(np.sign(np.linalg.det(u @ vt)))]) @ vt
+    is_determined = d[1] > 0.2 * d[0] and float(np.trace(R.T @ B)) > 0.75 * total
+    return np.asarray(R) if is_determined else None
+
+
+def _turns(poses: Floats, stride: int) -> Floats:
+    """(M, 3) rotation vectors of the same motions, rad."""
+    R = so3.normalise(poses[::stride, :3, :3])
+    return so3.log(np.swapaxes(R[:-1], -1, -2) @ R[1:])
+
+
+def _say_difference(out: Reconciled, prefix: str = "") -> None:
+    """Note a body frame that is turned against the other one, seen from the motion alone."""
+    R = body_rotation(out.estimate, out.truth)
+    if R is None or np.rad2deg(so3.angle(R)) < SAME_DEG:
+        return
+    rpy = ", ".join(f"{v:.0f}" for v in np.rad2deg(so3.euler_rpy(R)))
+    out.notes.append(
+        f"WRONG FRAMES: {prefix}the ground truth's body is turned against the estimate's by about roll, pitch, yaw = {rpy} "
+        "deg; give the transform with --T-est-gt"
+    )
+
+
+def _turn(poses: Floats) -> Floats:
+    C = se3.make(R_BODY_CAMERA, np.zeros(3))
+    return np.asarray(C @ poses @ C.T)

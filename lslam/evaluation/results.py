@@ -1,0 +1,169 @@
+"""What an evaluation says: plain frozen values, each with the recipe it was made by."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.evaluation.statistics import Statistics
+
+Floats = NDArray[np.float64]
+
+ALIGNMENTS = {
+    "none": "estimate as it is",
+    "origin": "first pose on the first true pose",
+    "se3": "least squares over positions (Umeyama), rotation and translation",
+    "sim3": "least squares over positions (Umeyama), rotation, translation and scale",
+    "posyaw": "least squares over positions, translation and rotation about the vertical",
+}
+UNITS = {"scan": "scans", "m": "m", "s": "s"}
+
+
+@dataclass(frozen=True)
+class AbsoluteError:
+    """ATE under one alignment: q_i - S p_i over the N matched poses.
+
+    translation, horizontal, vertical : m; rotation_deg : |log(inv(R_est) R_gt)|; percent_of_length : rmse in % of the
+        ground truth's path length; nan when the path has none
+    T_gt_est, scale : the alignment, q ~ scale * R p + t
+    errors : (N, 3) estimate minus ground truth in the ground truth's world axes, m; aligned_positions : (N, 3) m
+    available : False when the alignment is not determined; `note` then says why, and the statistics are None
+    """
+
+    alignment: str
+    available: bool
+    note: str
+    translation: Statistics | None
+    rotation_deg: Statistics | None
+    horizontal: Statistics | None
+    vertical: Statistics | None
+    percent_of_length: float
+    T_gt_est: Floats
+    scale: float
+    errors: Floats
+    rotation_errors_deg: Floats
+    aligned_positions: Floats
+
+    @property
+    def recipe(self) -> str:
+        """Alignment and number of poses, for people."""
+        return f"alignment {self.alignment}: {ALIGNMENTS[self.alignment]}; {len(self.errors)} poses"
+
+
+@dataclass(frozen=True)
+class RelativeError:
+    """RPE at one distance: E = inv(inv(Q_i) Q_j) (inv(P_i) P_j) over pairs (i, j).
+
+    translation : |E_t|, m; rotation_deg : |log E_R|; both None when no pair exists, and `note` says so
+    pair_ends : (n_pairs,) index j of each pair among the matched poses; translation_errors, rotation_errors_deg : (n_pairs,)
+    """
+
+    delta: float
+    unit: str
+    pairs: str
+    n_pairs: int
+    translation: Statistics | None
+    rotation_deg: Statistics | None
+    note: str
+    rule: str = ""
+    pair_ends: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+    translation_errors: Floats = field(default_factory=lambda: np.zeros(0))
+    rotation_errors_deg: Floats = field(default_factory=lambda: np.zeros(0))
+
+    @property
+    def name(self) -> str:
+        """For example `10 m, all pairs`."""
+        unit = "scan" if self.unit == "scan" and self.delta == 1 else UNITS[self.unit]
+        return f"{self.delta:g} {unit}, {self.pairs} pairs"
+
+    @property
+    def recipe(self) -> str:
+        """Distance, pair rule and number of pairs, for people."""
+        return f"{self.name}: {self.rule}; {self.n_pairs} pairs; no alignment"
+
+
+@dataclass(frozen=True)
+class KittiDrift:
+    """KITTI's odometry metric: mean drift over all segments of 100..800 m.
+
+    by_length : length in m -> (translation %, rotation deg/100 m, segments)
+    """
+
+    available: bool
+    note: str
+    translation_percent: float
+    rotation_deg_per_100m: float
+    segments: int
+    by_length: dict[int, tuple[float, float, int]]
+    recipe: str = "KITTI devkit: 100..800 m of ground truth, a start every 10 scans, mean over segments, no alignment"
+
+
+@dataclass(frozen=True)
+class AxisErrors:
+    """The first thesis' numbers, origin alignment: estimate minus ground truth per axis of the ground truth's world.
+
+    thesis_rmse : sqrt(sum |e|^2 / 3N), m, its equation 2.14 divided by sqrt(3); xyz : (N, 3) m; rpy_deg : (N, 3)
+    angular : (N,) deg, equation 2.15; the _rmse values are per axis
+    """
+
+    alignment: str
+    thesis_rmse: float
+    rmse: float
+    max_error: float
+    percent_of_length: float
+    xyz_rmse: tuple[float, float, float]
+    rpy_rmse_deg: tuple[float, float, float]
+    angular_rmse_deg: float
+    angular_max_deg: float
+    xyz: Floats
+    rpy_deg: Floats
+    angular: Floats
+    recipe: str = "origin alignment; thesis_rmse = sqrt(sum|e|^2 / 3N): compare with the first thesis' tables only"
+
+
+@dataclass(frozen=True)
+class Planar:
+    """The second thesis' numbers on SE(2) poses: mean and std of ATE (m), translational (m) and signed rotational RPE (rad).
+
+    spacing : mean ground-truth distance between consecutive poses, m; the thesis' is about 2 m
+    """
+
+    ate_mean: float
+    ate_std: float
+    rpe_translation_mean: float
+    rpe_translation_std: float
+    rpe_rotation_mean: float
+    rpe_rotation_std: float
+    spacing: float
+    recipe: str = (
+        "SE(2) poses (x, y, yaw), shared start and heading; RPE between consecutive matched poses, rotation signed"
+    )
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """One estimate against one ground truth.
+
+    matched, possible : pairs found, pairs at most; stamps_ns : (N,) of the matched poses, on the ground truth's clock
+    distance : (N,) m travelled along the ground truth; gt_positions : (N, 3) m; path_length : m
+    time_offset : s added to the estimate's stamps; association : recipe sentence; notes : what was decided or is doubtful
+    """
+
+    estimate: str
+    ground_truth: str
+    matched: int
+    possible: int
+    stamps_ns: NDArray[np.int64]
+    distance: Floats
+    gt_positions: Floats
+    path_length: float
+    ate: dict[str, AbsoluteError]
+    rpe: list[RelativeError]
+    kitti_drift: KittiDrift
+    thesis1: AxisErrors
+    thesis2: Planar
+    time_offset: float
+    association: str
+    notes: list[str]

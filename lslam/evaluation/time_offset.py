@@ -1,0 +1,127 @@
+"""The shift between two clocks, from what both trajectories say about the motion."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.errors import InputError
+from lslam.evaluation.associate import LEAST, nearest_one_to_one, time_range
+from lslam.geometry import interpolate, so3
+from lslam.types.trajectory import Trajectory
+
+Floats = NDArray[np.float64]
+LEAST_OVERLAP = 0.6  # of the shorter trajectory
+LEAST_SCORE = 0.6
+SAME_STAMPS_NS = 1_000_000
+
+
+def estimate_offset(estimate: Trajectory, truth: Trajectory) -> tuple[int, float]:
+    """Shift in ns to add to the estimate's stamps, and the correlation (0..1) that speaks for it.
+
+    Speed and rotation rate, which no frame changes, are correlated over all shifts in which at least 60 % of the shorter
+    trajectory overlaps; the best one is refined between samples. When the stamps then agree up to one constant to 1 ms,
+    that constant is the answer.
+
+    Raises
+    ------
+    InputError when a trajectory has no stamps or fewer than 3 poses, or when the motion does not determine the shift.
+    """
+    for which, t in (("estimate", estimate), ("ground truth", truth)):
+        if not t.has_stamps or len(t) < LEAST:
+            raise InputError(f"--time-offset auto: {which} {t.source} has no stamps or fewer than {LEAST} poses")
+    step = _step(estimate, truth)
+    a, b = _rates(estimate, step), _rates(truth, step)
+    if min(len(a), len(b)) < 10:
+        raise InputError(f"--time-offset auto: the trajectories are shorter than 10 samples of {step / 1e9:.2f} s")
+    scores, lags = _correlation(a, b)
+    if not len(scores) or scores.max() < LEAST_SCORE:
+        best = f"{scores.max():.2f}" if len(scores) else "none"
+        raise InputError(
+            f"--time-offset auto: the speeds and turns of both trajectories fit nowhere (best correlation {best}, "
+            f"{LEAST_SCORE} needed; estimate {time_range(estimate)}, ground truth {time_range(truth)}); "
+            "give the offset in seconds"
+        )
+    lag = int(lags[np.argmax(scores)]) * step
+    start = int(truth.stamps_ns[0]) - int(estimate.stamps_ns[0]) + lag
+    offset = _refine(estimate, truth, start, step)
+    return _snap(estimate, truth, offset, step), float(scores.max())
+
+
+def _step(estimate: Trajectory, truth: Trajectory) -> int:
+    """Sample distance, ns: the coarser of both, so that noise between dense poses averages out."""
+    slow = max(float(np.median(np.diff(t.stamps_ns))) for t in (estimate, truth))
+    return int(np.clip(slow, 50_000_000, 1_000_000_000))
+
+
+def _rates(t: Trajectory, step: int, first: int | None = None, count: int | None = None) -> Floats:
+    """(M, 2) speed m/s and rotation rate rad/s over intervals of `step` ns."""
+    first = int(t.stamps_ns[0]) if first is None else first
+    if count is None:
+        count = int((t.stamps_ns[-1] - t.stamps_ns[0]) // step) + 1
+    poses = interpolate.poses_at(t.stamps_ns, t.poses, first + step * np.arange(count))
+    speed = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
+    turn = so3.angle(np.swapaxes(poses[:-1, :3, :3], -1, -2) @ poses[1:, :3, :3])
+    return np.stack([speed, turn], axis=1) * (1e9 / step)
+
+
+def _correlation(a: Floats, b: Floats) -> tuple[Floats, NDArray[np.int64]]:
+    """Pearson correlation of a shifted by lag against b, mean of the channels that vary, and the lags."""
+    from scipy.signal import correlate
+
+    n, m = len(a), len(b)
+    lags = np.arange(-(n - 1), m)
+    overlap = np.rint(correlate(np.ones(m), np.ones(n), method="fft"))
+    allowed = overlap >= max(LEAST_OVERLAP * min(n, m), 10)
+    total = np.zeros(len(lags))
+    channels = 0
+    for k in range(a.shape[1]):
+        x, y = a[:, k] - a[:, k].mean(), b[:, k] - b[:, k].mean()
+        spread = min(float(x.std()), float(y.std()))
+        if spread < (0.02, 0.002)[k]:
+            continue
+        sx, sy = correlate(np.ones(m), x, method="fft"), correlate(y, np.ones(n), method="fft")
+        sxx, syy = correlate(np.ones(m), x * x, method="fft"), correlate(y * y, np.ones(n), method="fft")
+        count = np.maximum(overlap, 1)
+        cov = correlate(y, x, method="fft") - sx * sy / count
+        var_x, var_y = sxx - sx * sx / count, syy - sy * sy / count
+        # A stretch that hardly varies correlates with anything: such shifts count as no evidence.
+        floor = 0.05 * count
+        enough = (var_x > floor * x.var()) & (var_y > floor * y.var())
+        total += np.where(enough, cov / np.sqrt(np.where(enough, var_x * var_y, 1.0)), 0.0)
+        channels += 1
+    if channels == 0:
+        return np.zeros(0), np.zeros(0, np.int64)
+    return total[allowed] / channels, lags[allowed]
+
+
+def _refine(estimate: Trajectory, truth: Trajectory, start: int, step: int) -> int:
+    """The shift within one sample of `start` at which the rates differ least."""
+    from scipy.optimize import minimize_scalar
+
+    low = max(int(estimate.stamps_ns[0]), int(truth.stamps_ns[0]) - start + step)
+    high = min(int(estimate.stamps_ns[-1]), int(truth.stamps_ns[-1]) - start - step)
+    count = (high - low) // step + 1
+    if count < 3:
+        return start
+    own = _rates(estimate, step, low, count)
+    scale = own.std(axis=0) + np.array([0.02, 0.002])
+
+    def cost(shift: float) -> float:
+        other = _rates(truth, step, low + start + round(shift), count)
+        return float(np.mean(np.minimum(np.abs(own - other) / scale, 1.0) ** 2))
+
+    best = minimize_scalar(cost, bounds=(-step, step), method="bounded", options={"xatol": 1e4})
+    return start + round(float(best.x))
+
+
+def _snap(estimate: Trajectory, truth: Trajectory, offset: int, step: int) -> int:
+    """The exact constant when both files carry the same stamps on two clocks."""
+    stamps = estimate.stamps_ns + offset
+    i, j = nearest_one_to_one(stamps, truth.stamps_ns, step // 2)
+    if len(i) < LEAST:
+        return offset
+    rest = truth.stamps_ns[j] - stamps[i]
+    middle = int(np.median(rest))
+    is_constant = float(np.mean(np.abs(rest - middle) <= SAME_STAMPS_NS)) >= 0.9
+    return offset + middle if is_constant else offset
