@@ -14,7 +14,7 @@ class InputConfig(Section):
     count: int | None = Field(None, ge=1, description="number of scans used; all when absent")
     skip_frames: int = Field(1, ge=1, description="use every n-th scan")
     threads: int = Field(2, ge=1, description="1: everything in turn; 2 and more: the next scan is read meanwhile")
-    strict: bool = Field(False, description="stop at the first scan that cannot be read or registered")
+    strict: bool = Field(False, description="every degradation is a failed gate: exit 4")
     vertical_correction_deg: float | None = Field(
         None, description="rotation of KITTI HDL-64E points about p x z; absent: the reader knows"
     )

@@ -26,7 +26,7 @@ class PreprocessConfig(Section):
         "voxel, random share, or all",
     )
     source_voxel: float = Field(1.0, gt=0, description="m; grid of the source points, where `target` starts")
-    source_points_min: int = Field(2500, ge=50, description="`target`: fewer points make the grid finer")
-    source_points_max: int = Field(4000, ge=100, description="`target`: more points make the grid coarser")
+    source_points_min: int = Field(4000, ge=50, description="`target`: fewer points make the grid finer")
+    source_points_max: int = Field(6000, ge=100, description="`target`: more points make the grid coarser")
     random_share: float = Field(0.3, gt=0, le=1, description="`random`: share of points kept")
     seed: int = Field(0, ge=0, description="`random`: seed")

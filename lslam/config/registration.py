@@ -10,5 +10,26 @@ from lslam.config.section import Section
 class RegistrationConfig(Section):
     """The local map of Gaussian voxels and the robust Gauss-Newton solver."""
 
-    voxel_size: float = Field(0.8, gt=0, description="m; voxels of the local map")
+    voxel_size: float = Field(0.8, gt=0, description="m; voxels of the local map, eight are searched per point")
+    min_points: int = Field(6, ge=4, description="points a voxel needs before it is matched")
+    planarity: float = Field(0.3, gt=0, lt=1, description="(l1 - l0) / l2 above which a voxel is a plane")
+    count_cap: float = Field(200, gt=10, description="points a voxel remembers; older ones fade")
+    sigma: float = Field(0.03, gt=0, description="m; noise of a point, ranging and calibration together")
+    blob_weight: float = Field(0.5, ge=0, description="weight of voxels that are no plane; 0 leaves them out")
+    kernel_max: float = Field(1.0, gt=0, description="m; widest Geman-McClure kernel, where annealing starts")
+    kernel_min: float = Field(0.15, gt=0, description="m; width at which annealing ends: five sigma")
+    kernel_decay: float = Field(0.5, gt=0, lt=1, description="factor of the width from step to step")
     max_iterations: int = Field(10, ge=1, description="Gauss-Newton steps per scan")
+    start_scans: int = Field(5, ge=1, description="first scans, registered coarse to fine because the speed is unknown")
+    start_iterations: int = Field(30, ge=1, description="steps of each stage while starting or recovering")
+    coarse_factor: int = Field(3, ge=2, description="coarse voxels are this many times larger")
+    coarse_kernel: float = Field(5.0, gt=0, description="m; where coarse annealing starts: the capture range")
+    recover_m: float = Field(0.3, gt=0, description="m; a correction beyond this is checked coarse to fine")
+    recover_deg: float = Field(3.0, gt=0, description="deg; likewise for rotation")
+    min_inliers: float = Field(0.3, ge=0, le=1, description="share of matched points within the kernel below which a scan fails")
+    min_overlap: float = Field(0.2, ge=0, le=1, description="share of points that found a voxel below which a scan fails")
+    max_jump_m: float = Field(6.0, gt=0, description="m; a correction of the motion prior beyond this fails")
+    max_jump_deg: float = Field(45.0, gt=0, description="deg; likewise for rotation")
+    weak_share: float = Field(
+        1e-3, ge=0, lt=1, description="share of the information below which a direction keeps the motion prior"
+    )

@@ -7,9 +7,11 @@ on the machine; no `parallel`, because results must not depend on the number of 
 from __future__ import annotations
 
 import contextlib
+import logging
 import os
 import sys
 import tempfile
+import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -67,3 +69,17 @@ def compile_lock() -> Iterator[None]:
 
             fcntl.flock(stream, fcntl.LOCK_EX)
         yield
+
+
+@contextlib.contextmanager
+def announced(log: logging.Logger, after_s: float = 2.0) -> Iterator[None]:
+    """Say that kernels are being compiled when the block takes longer than loading them would."""
+    timer = threading.Timer(
+        after_s, log.info, ["compiling kernels, once; they are kept in %s", os.environ["NUMBA_CACHE_DIR"]]
+    )
+    timer.daemon = True
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()

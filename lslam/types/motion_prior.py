@@ -22,4 +22,5 @@ class MotionPrior:
     @property
     def start(self) -> NDArray[np.float64]:
         """(4, 4) predicted T_world_lidar at scan start."""
-        return self.poses[0]
+        start: NDArray[np.float64] = self.poses[0]
+        return start

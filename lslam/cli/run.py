@@ -1,0 +1,149 @@
+"""`lslam run`: the main job."""
+
+from __future__ import annotations
+
+import signal
+import sys
+import threading
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from lslam.cli import options
+from lslam.cli.console import progress, setup_logging
+
+if TYPE_CHECKING:
+    from lslam.config import Config
+    from lslam.pipeline.run import Watch
+    from lslam.types.sequence import Sequence
+    from lslam.types.trajectory import Trajectory
+
+
+@click.command(
+    epilog="\b\nExamples: lslam run sample_data --out runs/first\n"
+    "          lslam run seq07 --data-root ~/kitti --method kiss-icp\n"
+    "          lslam run 2011_09_26_drive_0005_sync --set map.voxel=0.1 --json"
+)
+@click.argument("sequence")
+@click.option("--method", metavar="NAME", help="Odometry method, see `lslam methods` [default: icp].")
+@click.option(
+    "--gt", type=click.Path(path_type=Path), metavar="FILE", help="Ground truth instead of the sequence's own."
+)
+@click.option(
+    "--out", type=click.Path(path_type=Path), metavar="DIR", help="Run folder [default: runs/NAME-METHOD-TIME]."
+)
+@click.option("--overwrite", is_flag=True, help="Replace an earlier run in the folder.")
+@options.scan_range
+@click.option("--threads", type=int, metavar="N", help="1: one thread; 2 and more: the next scan is read meanwhile.")
+@click.option("--strict", is_flag=True, help="Exit 4 when anything was degraded: a scan skipped or bridged.")
+@click.option("--dry-run", is_flag=True, help="Resolve everything, write nothing.")
+@options.data_root
+@options.configuration
+@options.as_json
+@options.verbosity
+def command(sequence: str, **given: Any) -> None:
+    """Estimate a trajectory and build a map.
+
+    SEQUENCE is a path, or a name under --data-root: seq07, 07, kitti/07, 2011_09_26_drive_0005_sync.
+    """
+    setup_logging(given["verbose"], given["quiet"])
+    from lslam.pipeline.run import run
+    from lslam.pipeline.run_folder import default_folder
+    from lslam.readers import open_sequence, select
+
+    config = _resolve(given)
+    opened = open_sequence(
+        sequence, data_root=given["data_root"], vertical_correction_deg=config.input.vertical_correction_deg
+    )
+    truth = _read_truth(given["gt"], opened)
+    out = given["out"] or default_folder(opened.name, config.odometry.method)
+    if given["dry_run"]:
+        from lslam.odometry import create_odometry
+
+        chosen = select(opened, config.input.start, config.input.count, config.input.skip_frames)
+        create_odometry(config)
+        return _print_plan(chosen, config, out)
+    with ExitStack() as stack:
+        outcome = run(
+            opened, config, out=out, ground_truth=truth, overwrite=given["overwrite"],
+            command=" ".join(["lslam", *sys.argv[1:]]), watch=_watch(stack),
+        )  # fmt: skip
+    return _print_result(outcome, out, given["as_json"])
+
+
+def _resolve(given: dict[str, Any]) -> Config:
+    """Flags over --set over environment over --config over defaults."""
+    from lslam.config import load_config
+
+    flags = {
+        "odometry.method": given["method"],
+        "input.start": given["start"],
+        "input.count": given["count"],
+        "input.skip_frames": given["skip_frames"],
+        "input.threads": given["threads"],
+        "input.strict": "true" if given["strict"] else None,
+    }
+    return load_config(
+        given["config_file"], [*given["settings"], *(f"{k}={v}" for k, v in flags.items() if v is not None)]
+    )
+
+
+def _read_truth(path: Path | None, sequence: Sequence) -> Trajectory | None:
+    """Ground truth of --gt; a file without stamps takes those of the sequence, line by line."""
+    if path is None:
+        return None
+    from dataclasses import replace
+
+    from lslam.formats.trajectory_files import read_trajectory
+
+    truth = read_trajectory(path)
+    if not truth.has_stamps and len(truth) == len(sequence):
+        return replace(truth, stamps_ns=sequence.stamps_ns, has_stamps=True)
+    return truth
+
+
+def _watch(stack: ExitStack) -> Watch:
+    """Progress bars, and SIGINT and SIGTERM as a wish to stop after the scan at hand."""
+    from lslam.pipeline.run import Watch
+
+    stop = threading.Event()
+    bar = stack.enter_context(ExitStack())
+    advance: list[Any] = []
+
+    def on_start(stage: str, total: int) -> None:
+        bar.close()
+        advance[:] = [bar.enter_context(progress(stage, total))]
+
+    def on_signal(number: int, _: object) -> None:
+        stop.set()
+        # A second signal means it: the default handler ends the process.
+        signal.signal(number, signal.SIG_DFL)
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        previous = signal.signal(number, on_signal)
+        stack.callback(signal.signal, number, previous)
+    return Watch(on_start, lambda: advance[0](), stop.is_set)
+
+
+def _print_plan(sequence: Sequence, config: Config, out: Path) -> None:
+    from lslam.config import to_toml
+
+    lines = [f"# {sequence.name}: {len(sequence)} scans, {sequence.kind}, {sequence.path}", f"# output: {out}"]
+    click.echo("\n".join([*lines, *(f"# {note}" for note in sequence.notes)]))
+    click.echo(to_toml(config), nl=False)
+
+
+def _print_result(outcome: Any, out: Path, as_json: bool) -> None:
+    if not as_json:
+        from lslam.reports.text import summary
+
+        click.echo(summary(outcome.record, outcome.evaluation), nl=False)
+        return
+    import json
+
+    from lslam.reports.evaluation_json import evaluation_to_dict
+
+    score = None if outcome.evaluation is None else evaluation_to_dict(outcome.evaluation)
+    click.echo(json.dumps({"folder": str(out), "manifest": outcome.record.manifest, "evaluation": score}, default=str))

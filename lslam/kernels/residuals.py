@@ -1,0 +1,166 @@
+"""Normal equations of scan points against Gaussian voxels.
+
+Pose update: t <- t + d[:3], R <- exp(d[3:]) R, so a residual n . (R s + t - m) has the Jacobian [n, (R s) x n].
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.kernels.gaussians import EMPTY, PLANE, find
+from lslam.kernels.jit import inline, kernel
+from lslam.kernels.voxel import index_of, pack
+
+Floats = NDArray[np.float64]
+
+
+@inline
+def octant_slots(x: float, y: float, z: float, i: int, inverse: float, cells: NDArray[np.int64],
+                 slots: NDArray[np.int32], keys: NDArray[np.int64], table: NDArray[np.int32]) -> None:  # fmt: skip
+    """Slots of the eight voxels around a world point, looked up again only when the point left its octant cell."""
+    ix, iy, iz = (
+        index_of(x - 0.5 / inverse, inverse),
+        index_of(y - 0.5 / inverse, inverse),
+        index_of(z - 0.5 / inverse, inverse),
+    )
+    cell = pack(ix, iy, iz)
+    if cells[i] == cell:
+        return
+    cells[i] = cell
+    k = 0
+    for dx in range(2):
+        for dy in range(2):
+            for dz in range(2):
+                slots[i, k] = find(pack(ix + dx, iy + dy, iz + dz), keys, table)
+                k += 1
+
+
+@kernel
+def linearise(source: Floats, scatter: Floats, R: Floats, t: Floats, size: float, scale: float, sigma2: float,
+              blob_weight: float, planes: Floats, keys: NDArray[np.int64], table: NDArray[np.int32],
+              cells: NDArray[np.int64], slots: NDArray[np.int32], H: Floats, g: Floats,
+              facts: Floats) -> None:  # fmt: skip
+    """Fill H (6, 6), g (6,) and facts from all source points (S, 3), LiDAR frame, with scatter (S, 6) around each.
+
+    Each point takes the nearest plane voxel of the eight around it: residual n . (R s + t - mean), variance = map
+    eigenvalue + source scatter along the normal + sigma2, Geman-McClure weight of width `scale`. Without a plane the nearest
+    blob stands in: isotropic, its mean variance, times `blob_weight`. `facts`: sum of information, weighted squared
+    residuals (m2), inliers within `scale`, matched, sum of squared lever arms, sum of robust weights.
+    """
+    inverse = 1.0 / size
+    H[:] = 0.0
+    g[:] = 0.0
+    facts[:] = 0.0
+    c2 = scale * scale
+    for i in range(len(source)):
+        a, b, c = source[i, 0], source[i, 1], source[i, 2]
+        rx = R[0, 0] * a + R[0, 1] * b + R[0, 2] * c
+        ry = R[1, 0] * a + R[1, 1] * b + R[1, 2] * c
+        rz = R[2, 0] * a + R[2, 1] * b + R[2, 2] * c
+        x, y, z = rx + t[0], ry + t[1], rz + t[2]
+        octant_slots(x, y, z, i, inverse, cells, slots, keys, table)
+        best, blob = -1, -1
+        best_d, blob_d = 1e300, 1e300
+        for k in range(8):
+            s = slots[i, k]
+            if s < 0:
+                continue
+            p = planes[s]
+            kind = p[7]
+            if kind == EMPTY:
+                continue
+            d = (x - p[0]) ** 2 + (y - p[1]) ** 2 + (z - p[2]) ** 2
+            if kind == PLANE:
+                if d < best_d:
+                    best_d, best = d, s
+            elif d < blob_d:
+                blob_d, blob = d, s
+        if best >= 0:
+            p = planes[best]
+            nx, ny, nz = p[3], p[4], p[5]
+            r = nx * (x - p[0]) + ny * (y - p[1]) + nz * (z - p[2])
+            # The normal seen from the scan, to read the source scatter along it.
+            lx = R[0, 0] * nx + R[1, 0] * ny + R[2, 0] * nz
+            ly = R[0, 1] * nx + R[1, 1] * ny + R[2, 1] * nz
+            lz = R[0, 2] * nx + R[1, 2] * ny + R[2, 2] * nz
+            q = scatter[i]
+            spread = (
+                q[0] * lx * lx + q[3] * ly * ly + q[5] * lz * lz
+                + 2.0 * (q[1] * lx * ly + q[2] * lx * lz + q[4] * ly * lz)
+            )  # fmt: skip
+            robust = c2 / (c2 + r * r)
+            robust *= robust
+            w = robust / (p[6] + max(spread, 0.0) + sigma2)
+            j3, j4, j5 = ry * nz - rz * ny, rz * nx - rx * nz, rx * ny - ry * nx
+            _add(H, g, w, r, nx, ny, nz, j3, j4, j5)
+            facts[0] += w
+            facts[1] += robust * r * r
+            facts[3] += 1.0
+            facts[4] += w * (rx * rx + ry * ry + rz * rz)
+            facts[5] += robust
+            if abs(r) < scale:
+                facts[2] += 1.0
+        elif blob >= 0 and blob_weight > 0.0:
+            p = planes[blob]
+            robust = c2 / (c2 + blob_d)
+            robust *= robust
+            q = scatter[i]
+            w = blob_weight * robust / (p[6] + (q[0] + q[3] + q[5]) / 3.0 + sigma2)
+            ex, ey, ez = x - p[0], y - p[1], z - p[2]
+            _add(H, g, w, ex, 1.0, 0.0, 0.0, 0.0, rz, -ry)
+            _add(H, g, w, ey, 0.0, 1.0, 0.0, -rz, 0.0, rx)
+            _add(H, g, w, ez, 0.0, 0.0, 1.0, ry, -rx, 0.0)
+            facts[0] += 3.0 * w
+            facts[3] += 1.0
+            facts[4] += 3.0 * w * (rx * rx + ry * ry + rz * rz)
+            if blob_d < c2:
+                facts[2] += 1.0
+    for i in range(6):
+        for j in range(i):
+            H[i, j] = H[j, i]
+
+
+@inline
+def _add(H: Floats, g: Floats, w: float, r: float, j0: float, j1: float, j2: float, j3: float, j4: float,
+         j5: float) -> None:  # fmt: skip
+    """Upper triangle of H += w j j^T and g += w r j."""
+    w0, w1, w2, w3, w4, w5 = w * j0, w * j1, w * j2, w * j3, w * j4, w * j5
+    H[0, 0] += w0 * j0
+    H[0, 1] += w0 * j1
+    H[0, 2] += w0 * j2
+    H[0, 3] += w0 * j3
+    H[0, 4] += w0 * j4
+    H[0, 5] += w0 * j5
+    H[1, 1] += w1 * j1
+    H[1, 2] += w1 * j2
+    H[1, 3] += w1 * j3
+    H[1, 4] += w1 * j4
+    H[1, 5] += w1 * j5
+    H[2, 2] += w2 * j2
+    H[2, 3] += w2 * j3
+    H[2, 4] += w2 * j4
+    H[2, 5] += w2 * j5
+    H[3, 3] += w3 * j3
+    H[3, 4] += w3 * j4
+    H[3, 5] += w3 * j5
+    H[4, 4] += w4 * j4
+    H[4, 5] += w4 * j5
+    H[5, 5] += w5 * j5
+    g[0] += w0 * r
+    g[1] += w1 * r
+    g[2] += w2 * r
+    g[3] += w3 * r
+    g[4] += w4 * r
+    g[5] += w5 * r
+
+
+@inline
+def step_norms(d: Floats) -> tuple[float, float]:
+    """Translation, m, and rotation, rad, of an update (6,)."""
+    return (
+        math.sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2]),
+        math.sqrt(d[3] * d[3] + d[4] * d[4] + d[5] * d[5]),
+    )

@@ -1,0 +1,164 @@
+"""Hashed voxels: packed keys, range gate and centroid down-sampling.
+
+A voxel is floor(p / size); its three indices are packed into 64 bits, 21 per axis, so coordinates up to a million voxels
+from the origin have a key. Tables are open addressing with linear probing and hold slots into dense arrays.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.kernels.jit import inline, kernel
+
+OFFSET = 1 << 20
+MASK = (1 << 21) - 1
+
+
+@inline
+def pack(ix: int, iy: int, iz: int) -> int:
+    """64-bit key of voxel indices in [-2**20, 2**20)."""
+    return ((ix + OFFSET) << 42) | ((iy + OFFSET) << 21) | (iz + OFFSET)
+
+
+@inline
+def hash_key(key: int, mask: int) -> int:
+    """Home position of a key in a table of mask + 1 entries (multiply by the golden ratio, fold the high bits down)."""
+    h = key * -7046029254386353131
+    return ((h >> 32) ^ h) & mask
+
+
+@inline
+def index_of(x: float, inverse_size: float) -> int:
+    """Voxel index of one coordinate."""
+    return int(np.floor(x * inverse_size))
+
+
+@kernel
+def gate(
+    points: NDArray[np.float32], range_min: float, range_max: float, is_cylinder: bool, box: NDArray[np.float64]
+) -> NDArray[np.int64]:
+    """Indices of the points that are finite, not zero, inside the range gate and outside the ego box.
+
+    `box` is x_min, x_max, y_min, y_max, z_min, z_max, or empty.
+    """
+    n = len(points)
+    kept = np.empty(n, np.int64)
+    count = 0
+    low, high = range_min * range_min, range_max * range_max
+    has_box = len(box) == 6
+    for i in range(n):
+        x, y, z = float(points[i, 0]), float(points[i, 1]), float(points[i, 2])
+        d = x * x + y * y
+        full = d + z * z
+        if not is_cylinder:
+            d = full
+        # The comparison is false for NaN and the upper bound stops Inf; zero points fail even with range_min = 0.
+        if not (d >= low and d <= high and full > 1e-12 and np.isfinite(full)):
+            continue
+        if has_box and box[0] <= x <= box[1] and box[2] <= y <= box[3] and box[4] <= z <= box[5]:
+            continue
+        kept[count] = i
+        count += 1
+    return kept[:count]
+
+
+@inline
+def table_size(n: int) -> int:
+    """Power of two that keeps a table of n keys at most half full."""
+    size = 64
+    while size < 2 * n:
+        size *= 2
+    return size
+
+
+@kernel
+def centroids(points: NDArray[np.float32], size: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """One centroid per voxel in order of first appearance: (M, 3) float32 and the scatter inside each voxel (M, 6).
+
+    The scatter is the covariance xx, xy, xz, yy, yz, zz of the voxel's points, m2. Sums run relative to the first point
+    of the voxel, so float32 input keeps its digits.
+    """
+    n = len(points)
+    entries = table_size(n)
+    mask = entries - 1
+    table = np.full(entries, -1, np.int32)
+    keys = np.empty(n, np.int64)
+    first = np.empty(n, np.int32)
+    sums = np.zeros((n, 10))
+    inverse = 1.0 / size
+    count = 0
+    last_key = -1
+    slot = 0
+    for i in range(n):
+        x, y, z = float(points[i, 0]), float(points[i, 1]), float(points[i, 2])
+        key = pack(index_of(x, inverse), index_of(y, inverse), index_of(z, inverse))
+        if key != last_key:
+            h = hash_key(key, mask)
+            while table[h] >= 0 and keys[table[h]] != key:
+                h = (h + 1) & mask
+            if table[h] < 0:
+                table[h] = count
+                keys[count] = key
+                first[count] = i
+                count += 1
+            slot = int(table[h])
+            last_key = key
+        f = first[slot]
+        dx, dy, dz = x - float(points[f, 0]), y - float(points[f, 1]), z - float(points[f, 2])
+        s = sums[slot]
+        s[0] += 1.0
+        s[1] += dx
+        s[2] += dy
+        s[3] += dz
+        s[4] += dx * dx
+        s[5] += dx * dy
+        s[6] += dx * dz
+        s[7] += dy * dy
+        s[8] += dy * dz
+        s[9] += dz * dz
+    out = np.empty((count, 3), np.float32)
+    scatter = np.empty((count, 6), np.float32)
+    for j in range(count):
+        s = sums[j]
+        f = first[j]
+        w = 1.0 / s[0]
+        mx, my, mz = s[1] * w, s[2] * w, s[3] * w
+        out[j, 0] = float(points[f, 0]) + mx
+        out[j, 1] = float(points[f, 1]) + my
+        out[j, 2] = float(points[f, 2]) + mz
+        scatter[j, 0] = s[4] * w - mx * mx
+        scatter[j, 1] = s[5] * w - mx * my
+        scatter[j, 2] = s[6] * w - mx * mz
+        scatter[j, 3] = s[7] * w - my * my
+        scatter[j, 4] = s[8] * w - my * mz
+        scatter[j, 5] = s[9] * w - mz * mz
+    return out, scatter
+
+
+@kernel
+def first_points(points: NDArray[np.float32], size: float) -> NDArray[np.int64]:
+    """Index of the first point in each voxel, increasing."""
+    n = len(points)
+    entries = table_size(n)
+    mask = entries - 1
+    table = np.full(entries, -1, np.int32)
+    keys = np.empty(n, np.int64)
+    first = np.empty(n, np.int64)
+    inverse = 1.0 / size
+    count = 0
+    for i in range(n):
+        key = pack(
+            index_of(float(points[i, 0]), inverse),
+            index_of(float(points[i, 1]), inverse),
+            index_of(float(points[i, 2]), inverse),
+        )
+        h = hash_key(key, mask)
+        while table[h] >= 0 and keys[table[h]] != key:
+            h = (h + 1) & mask
+        if table[h] < 0:
+            table[h] = count
+            keys[count] = key
+            first[count] = i
+            count += 1
+    return first[:count]

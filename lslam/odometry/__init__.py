@@ -1,0 +1,40 @@
+"""Odometry methods by name. A new method is one file and one line here; others register an entry point `lslam.methods`."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from importlib.metadata import entry_points
+from typing import TYPE_CHECKING, cast
+
+from lslam.errors import UsageError, nearest
+from lslam.odometry.base import Odometry
+
+if TYPE_CHECKING:
+    from lslam.config.config import Config
+
+# name -> (module with `create(config) -> Odometry`, one line for people)
+METHODS = {
+    "icp": (
+        "lslam.odometry.icp",
+        "scan to map of Gaussian voxels, point to plane; own, deterministic, with covariances",
+    ),
+    "kiss-icp": ("lslam.odometry.kiss", "the baseline: the kiss-icp package with its own preprocessing and defaults"),
+}
+
+
+def known_methods() -> dict[str, str]:
+    """Names and one-line summaries, those of other packages included."""
+    own = {name: summary for name, (_, summary) in METHODS.items()}
+    foreign = {e.name: f"from {e.value}" for e in entry_points(group="lslam.methods") if e.name not in own}
+    return own | foreign
+
+
+def create_odometry(config: Config) -> Odometry:
+    """The method `odometry.method` names. Raises UsageError with the nearest name when there is none."""
+    name = config.odometry.method
+    if name in METHODS:
+        return cast(Odometry, import_module(METHODS[name][0]).create(config))
+    for entry in entry_points(group="lslam.methods"):
+        if entry.name == name:
+            return cast(Odometry, entry.load()(config))
+    raise UsageError(f"no method {name!r}; {nearest(name, known_methods())}")

@@ -1,0 +1,76 @@
+"""Method `kiss-icp`: a thin adapter on the kiss-icp package with its own preprocessing and defaults."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import numpy as np
+
+from lslam.config.config import Config
+from lslam.errors import InputError
+from lslam.geometry import se3
+from lslam.types.motion_prior import MotionPrior
+from lslam.types.scan import Scan
+from lslam.types.scan_result import ScanResult
+
+
+def create(config: Config) -> Kiss:
+    """The baseline with kiss-icp's defaults; only its range gate follows `preprocess` when the user changed it."""
+    return Kiss(config.preprocess.range_max, has_user_range="range_max" in config.preprocess.model_fields_set)
+
+
+class Kiss:
+    """kiss-icp as its authors run it: it predicts, deskews and down-samples by itself and ignores the motion prior.
+
+    kiss-icp's pose belongs to the scan's end when it deskews: it is carried back to the start along the scan's own
+    motion (CONVENTIONS, "Trajectory files"). Compensated scans have one instant and are left alone.
+    """
+
+    def __init__(self, range_max: float, has_user_range: bool) -> None:
+        try:
+            from kiss_icp.config import KISSConfig
+            from kiss_icp.kiss_icp import KissICP
+        except ImportError as error:
+            raise InputError(f"kiss-icp cannot be imported: {error}; install it with: pip install kiss-icp") from None
+        config = KISSConfig()
+        if has_user_range:
+            config.data.max_range = range_max
+        if config.mapping.voxel_size is None:
+            config.mapping.voxel_size = float(config.data.max_range / 100.0)
+        self._config, self._make = config, KissICP
+        self._with_deskew: bool | None = None
+        self._kiss: Any = None
+
+    def prepare(self, scan: Scan) -> tuple[Any, Any]:
+        """Points as float64 and their times scaled to 0..1 as kiss-icp wants them."""
+        finite = np.isfinite(scan.points).all(axis=1)
+        points = scan.points[finite].astype(np.float64)
+        if scan.times is None or not len(points):
+            return points, np.zeros(0)
+        times = scan.times[finite].astype(np.float64)
+        span = float(times.max() - times.min())
+        return points, (times - times.min()) / span if span > 0 else np.zeros(0)
+
+    def register(self, scan: Scan, prepared: tuple[Any, Any], prior: MotionPrior) -> ScanResult:
+        """One kiss-icp frame."""
+        points, times = prepared
+        if self._kiss is None:
+            # The choice is made once: a sequence has per-point times or has not.
+            self._with_deskew = len(times) > 0
+            self._config.data.deskew = self._with_deskew
+            self._kiss = self._make(self._config)
+        if len(points) == 0:
+            return ScanResult(scan.index, scan.stamp_ns, prior.start, "bridged", "no usable points", converged=False)
+        began = time.perf_counter()
+        _, source = self._kiss.register_frame(points, times if len(times) else np.zeros(len(points)))
+        pose = np.asarray(self._kiss.last_pose, np.float64).copy()
+        if self._with_deskew:
+            pose = pose @ se3.inverse(np.asarray(self._kiss.last_delta, np.float64))
+        took = time.perf_counter() - began
+        return ScanResult(
+            scan.index, scan.stamp_ns, se3.normalise(pose), source_points=len(source), stages={"register": took}
+        )
+
+    def warm_up(self) -> None:
+        """Nothing to compile."""

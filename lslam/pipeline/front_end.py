@@ -1,0 +1,122 @@
+"""Scans in, poses out: read ahead, predict, register, correct."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from lslam.errors import InputError
+from lslam.odometry.base import Odometry
+from lslam.registration.motion import ConstantVelocity
+from lslam.types.motion_prior import MotionPrior
+from lslam.types.scan import Scan
+from lslam.types.scan_result import ScanResult
+from lslam.types.sequence import Sequence
+from lslam.types.trajectory import Trajectory
+
+# Half a metre and two degrees: what a pose that no scan supports may be wrong by, one sigma.
+DOUBT = np.diag([0.25] * 3 + [np.deg2rad(2.0) ** 2] * 3)
+
+
+@dataclass(frozen=True)
+class Loaded:
+    """One scan as the background thread leaves it; `error` says why there is none."""
+
+    index: int
+    stamp_ns: int
+    scan: Scan | None = None
+    prepared: Any = None
+    error: str = ""
+    read_s: float = 0.0
+    prepare_s: float = 0.0
+
+
+def estimate(
+    sequence: Sequence,
+    odometry: Odometry,
+    *,
+    threads: int = 2,
+    max_failures: int = 20,
+    should_stop: Callable[[], bool] = lambda: False,
+    on_scan: Callable[[ScanResult], None] = lambda result: None,
+) -> list[ScanResult]:
+    """Register every scan of the sequence; stops early on `should_stop` or after `max_failures` failures in a row.
+
+    A scan that cannot be read, or is empty, is skipped: the motion prior stands in for its pose.
+    """
+    motion = ConstantVelocity()
+    results: list[ScanResult] = []
+    failures = 0
+    for loaded in read_ahead(sequence, odometry.prepare, threads):
+        prior = MotionPrior(np.zeros(1), motion.predict(loaded.stamp_ns)[None])
+        if loaded.scan is None:
+            result = ScanResult(loaded.index, loaded.stamp_ns, prior.start, "skipped", loaded.error, converged=False)
+        else:
+            result = odometry.register(loaded.scan, loaded.prepared, prior)
+        result = replace(result, stages={"read": loaded.read_s, "prepare": loaded.prepare_s, **result.stages})
+        motion.correct(result.stamp_ns, result.T_world_lidar)
+        results.append(result)
+        on_scan(result)
+        failures = 0 if result.status == "ok" else failures + 1
+        if failures >= max_failures or should_stop():
+            break
+    return results
+
+
+def is_diverged(results: list[ScanResult], max_failures: int) -> bool:
+    """Whether the run was given up: the last `max_failures` scans all failed, or hardly any scan was registered."""
+    tail = results[-max_failures:]
+    given_up = len(tail) == max_failures and all(r.status != "ok" for r in tail)
+    return given_up or sum(r.status == "ok" for r in results) < max(1, len(results) // 2)
+
+
+def to_trajectory(results: list[ScanResult], method: str) -> Trajectory:
+    """The poses of all scans; covariances when the method has them, with `DOUBT` where a scan was skipped."""
+    known = any(r.covariance is not None for r in results)
+    return Trajectory(
+        stamps_ns=np.array([r.stamp_ns for r in results], np.int64),
+        poses=np.stack([r.T_world_lidar for r in results]),
+        covariances=np.stack([DOUBT if r.covariance is None else r.covariance for r in results]) if known else None,
+        source=method,
+    )
+
+
+def read_ahead(
+    sequence: Sequence, prepare: Callable[[Scan], Any] | None, threads: int, depth: int = 2
+) -> Iterator[Loaded]:
+    """The scans in order, read (and prepared) by one background thread while the caller works on earlier ones."""
+    if threads < 2:
+        for i in range(len(sequence)):
+            yield _load(sequence, i, prepare)
+        return
+    pending: list[Future[Loaded]] = []
+    with ThreadPoolExecutor(1, "lslam-read") as pool:
+        try:
+            for i in range(len(sequence)):
+                pending.append(pool.submit(_load, sequence, i, prepare))
+                if len(pending) > depth:
+                    yield pending.pop(0).result()
+            while pending:
+                yield pending.pop(0).result()
+        finally:
+            for future in pending:
+                future.cancel()
+
+
+def _load(sequence: Sequence, i: int, prepare: Callable[[Scan], Any] | None) -> Loaded:
+    stamp_ns = int(sequence.stamps_ns[i])
+    began = time.perf_counter()
+    try:
+        scan = sequence.scan(i)
+    except InputError as error:
+        return Loaded(i, stamp_ns, error=str(error), read_s=time.perf_counter() - began)
+    read = time.perf_counter()
+    if len(scan) == 0:
+        return Loaded(scan.index, stamp_ns, error="the scan has no points", read_s=read - began)
+    prepared = prepare(scan) if prepare is not None else None
+    return Loaded(scan.index, stamp_ns, scan, prepared, "", read - began, time.perf_counter() - read)

@@ -1,0 +1,132 @@
+"""manifest.json: what was run on what, every decision taken, how it ended and what it cost."""
+
+from __future__ import annotations
+
+import platform
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from datetime import UTC, datetime
+from importlib.metadata import PackageNotFoundError, version
+from typing import Any
+
+from lslam.config import Config
+from lslam.errors import InterruptedRunError
+from lslam.types.scan_result import ScanResult
+from lslam.types.sequence import Sequence
+from lslam.version import __version__
+
+SCHEMA = 1
+LIBRARIES = ("numpy", "numba", "scipy", "kiss-icp")
+
+
+class Manifest:
+    """Gathers facts while the run goes on; `as_dict` is the file at any moment.
+
+    outcome : done, degraded (a scan was bridged or skipped, or a problem arose), diverged or interrupted
+    """
+
+    def __init__(self, command: str, sequence: Sequence, config: Config) -> None:
+        self.command, self.sequence, self.config = command, sequence, config
+        self.started = datetime.now(UTC)
+        self.timings: dict[str, float] = {}
+        self.problems: list[str] = []
+        self.counts: dict[str, int] = {}
+        self.map_points: int | None = None
+        self._ended = ""
+
+    @property
+    def outcome(self) -> str:
+        """How the run ends if nothing else goes wrong."""
+        return self._ended or ("degraded" if self.problems else "done")
+
+    @contextmanager
+    def timed(self, name: str) -> Iterator[None]:
+        """Add the seconds the block takes to the timings."""
+        began = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.timings[name] = self.timings.get(name, 0.0) + time.perf_counter() - began
+
+    def judge(self, results: list[ScanResult], expected: int, diverged: bool) -> None:
+        """Count what became of the scans and decide how the run ended."""
+        self.counts = {"scans": len(results)} | {
+            status: sum(r.status == status for r in results) for status in ("ok", "bridged", "skipped")
+        }
+        self.counts["degenerate"] = sum(len(r.degenerate) > 0 for r in results)
+        bad = [r for r in results if r.status != "ok"]
+        if bad:
+            self.problems.append(
+                f"{len(bad)} of {len(results)} scans were not registered and follow the motion prior, "
+                f"the first is scan {bad[0].index}: {bad[0].reason}"
+            )
+        if diverged:
+            self._ended = "diverged"
+        elif len(results) < expected:
+            self._ended = "interrupted"
+
+    def word_for(self, error: BaseException) -> str:
+        """Status of a run that `error` ended."""
+        return "interrupted" if isinstance(error, (KeyboardInterrupt, InterruptedRunError)) else "failed"
+
+    def as_dict(self, status: str, why: str = "") -> dict[str, Any]:
+        """The manifest as plain values."""
+        s = self.sequence
+        has_camera = s.calibration.T_cam0_lidar is not None
+        return {
+            "schema": SCHEMA,
+            "status": status,
+            **({"why": why} if why else {}),
+            "problems": list(self.problems),
+            "command": self.command,
+            "lslam": __version__,
+            "method": self.config.odometry.method,
+            "sequence": {
+                "name": s.name,
+                "path": str(s.path),
+                "format": s.kind,
+                "scans": len(s),
+                "rate_hz": s.rate_hz,
+                "motion_compensated": s.motion_compensated,
+                "decisions": list(s.notes),
+                "problems": list(s.problems),
+            },
+            "frames": {
+                "world": "LiDAR at the first scan, not levelled",
+                "trajectory.tum": "T_world_lidar",
+                "trajectory_kitti.txt": "camera 0 (Tr is known)" if has_camera else "LiDAR (no Tr is known)",
+                "pose_time": "scan_start",
+                "deskew": "none",
+                "covariances.npz": "of t' = t + d[:3], R' = exp(d[3:]) R in world axes, m2 and rad2",
+            },
+            "counts": dict(self.counts),
+            **({"map_points": self.map_points} if self.map_points is not None else {}),
+            "timings": {name: round(seconds, 3) for name, seconds in self.timings.items()},
+            "peak_memory_mb": peak_memory_mb(),
+            "started": self.started.isoformat(timespec="seconds"),
+            "written": datetime.now(UTC).isoformat(timespec="seconds"),
+            "machine": {
+                "python": sys.version.split()[0],
+                "platform": platform.platform(),
+                **{name: _version(name) for name in LIBRARIES},
+            },
+        }
+
+
+def peak_memory_mb() -> float | None:
+    """Largest resident memory of this process so far, MB; None where the system does not say."""
+    try:
+        import resource
+    except ImportError:
+        return None
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return round(peak / (1e6 if sys.platform == "darwin" else 1e3), 1)
+
+
+def _version(name: str) -> str | None:
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return None

@@ -1,0 +1,99 @@
+"""What a run writes: trajectories, per-scan tables, map, evaluation and report."""
+
+from __future__ import annotations
+
+import io
+import json
+
+import numpy as np
+
+from lslam.config import Config, to_toml
+from lslam.config.map import MapConfig
+from lslam.evaluation.evaluate import Evaluation
+from lslam.formats.point_files import write_points
+from lslam.formats.trajectory_files import write_kitti, write_tum
+from lslam.geometry import se3
+from lslam.maps.merge import MergedMap
+from lslam.pipeline.run_folder import RunFolder
+from lslam.reports.evaluation_json import evaluation_to_dict
+from lslam.reports.facts import stage_matrix
+from lslam.types.calibration import Calibration
+from lslam.types.run_record import RunRecord
+from lslam.types.trajectory import Trajectory
+from lslam.version import __version__
+
+# Bytes per point of the map files: three doubles or floats and an intensity, with room for the header.
+BYTES_PER_POINT = 28
+
+
+def config_text(config: Config) -> str:
+    """config.toml: a run repeats with `--config` and this file."""
+    return f"# lslam {__version__}, resolved configuration\n" + to_toml(config)
+
+
+def write_trajectories(folder: RunFolder, record: RunRecord, calibration: Calibration) -> None:
+    """trajectory.tum (LiDAR), trajectory_kitti.txt (camera 0 when Tr is known, else LiDAR), covariances.npz."""
+    trajectory = record.trajectory
+    write_tum(
+        folder.path / "trajectory.tum", trajectory,
+        comment=f"lslam {__version__}, {record.method}: T_world_lidar\nframe: lidar\npose_time: scan_start",
+    )  # fmt: skip
+    write_kitti(folder.path / "trajectory_kitti.txt", _in_camera(trajectory, calibration))
+    if trajectory.covariances is not None:
+        stream = io.BytesIO()
+        np.savez_compressed(stream, stamps_ns=trajectory.stamps_ns, covariances=trajectory.covariances)
+        folder.write_bytes("covariances.npz", stream.getvalue())
+
+
+def write_scans(folder: RunFolder, record: RunRecord) -> None:
+    """timing.csv, seconds per stage, and scans.csv, what became of each scan."""
+    names, seconds = stage_matrix(record.results)
+    rows = [",".join(["index", "stamp_ns", *names, "total"])]
+    for result, row in zip(record.results, seconds, strict=True):
+        rows.append(",".join([str(result.index), str(result.stamp_ns), *(f"{v:.6f}" for v in (*row, row.sum()))]))
+    folder.write_text("timing.csv", "\n".join(rows) + "\n")
+    columns = (
+        "index,stamp_ns,status,converged,iterations,source_points,inliers,overlap,rmse_m,degenerate,prior_m,prior_deg"
+    )
+    rows = [columns]
+    for r in record.results:
+        values = (
+            r.index, r.stamp_ns, r.status, int(r.converged), r.iterations, r.source_points, r.inliers,
+            f"{r.overlap:.4f}", f"{r.rmse:.5f}", len(r.degenerate), f"{r.prior_error[0]:.5f}",
+            f"{np.rad2deg(r.prior_error[1]):.5f}",
+        )  # fmt: skip
+        rows.append(",".join(str(v) for v in values))
+    folder.write_text("scans.csv", "\n".join(rows) + "\n")
+
+
+def write_map(folder: RunFolder, merged: MergedMap, config: MapConfig) -> None:
+    """map.ply or map.pcd, world frame of the trajectory."""
+    folder.require_space(BYTES_PER_POINT * len(merged), "the map")
+    path = folder.path / f"map.{config.format}"
+    write_points(
+        path, merged.points, merged.intensity, comment="lslam map, not georeferenced, world = LiDAR at first scan"
+    )
+
+
+def write_evaluation(folder: RunFolder, evaluation: Evaluation | None) -> None:
+    """evaluation.json, when ground truth is known."""
+    if evaluation is not None:
+        text = json.dumps(evaluation_to_dict(evaluation), indent=2, allow_nan=False, ensure_ascii=False)
+        folder.write_text("evaluation.json", text + "\n")
+
+
+def write_html(folder: RunFolder, record: RunRecord, evaluation: Evaluation | None) -> None:
+    """report.html."""
+    from lslam.reports.html import write_report
+
+    write_report(folder.path / "report.html", record, evaluation)
+
+
+def _in_camera(trajectory: Trajectory, calibration: Calibration) -> Trajectory:
+    """Poses of camera 0 in camera 0 at the start, or unchanged when no Tr is known."""
+    T = calibration.T_cam0_lidar
+    if T is None:
+        return trajectory
+    return Trajectory(
+        trajectory.stamps_ns, T @ trajectory.poses @ se3.inverse(T), frame="cam0", source=trajectory.source
+    )

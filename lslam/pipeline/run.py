@@ -1,0 +1,189 @@
+"""The whole program on one page: a sequence goes in; a trajectory, a map and an honest report come out."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from lslam.config import Config
+from lslam.errors import GateError, InterruptedRunError, LslamError, OutputError, RunFailedError
+from lslam.evaluation.evaluate import Evaluation, evaluate
+from lslam.kernels import jit
+from lslam.odometry import create_odometry
+from lslam.odometry.base import Odometry
+from lslam.pipeline import outputs
+from lslam.pipeline.front_end import estimate, is_diverged, to_trajectory
+from lslam.pipeline.manifest import Manifest
+from lslam.pipeline.map_pass import build_map
+from lslam.pipeline.run_folder import RunFolder
+from lslam.readers import open_sequence, select
+from lslam.types.run_record import RunRecord
+from lslam.types.scan_result import ScanResult
+from lslam.types.sequence import Sequence
+from lslam.types.trajectory import Trajectory
+
+log = logging.getLogger("lslam")
+
+
+@dataclass(frozen=True)
+class RunOutcome:
+    """What a run gives back to Python: the record the report is written from, and the score when truth is known."""
+
+    record: RunRecord
+    evaluation: Evaluation | None
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """T_world_lidar per scan, at scan start."""
+        return self.record.trajectory
+
+
+@dataclass(frozen=True)
+class Watch:
+    """How a caller follows a run (`on_start(stage, scans)`, then `on_step()` per scan) and ends it early."""
+
+    on_start: Callable[[str, int], None] = lambda stage, total: None
+    on_step: Callable[[], None] = lambda: None
+    should_stop: Callable[[], bool] = lambda: False
+
+
+def run(
+    sequence: Sequence | str | Path,
+    config: Config | None = None,
+    *,
+    out: Path | str | None = None,
+    ground_truth: Trajectory | None = None,
+    overwrite: bool = False,
+    command: str = "",
+    watch: Watch | None = None,
+) -> RunOutcome:
+    """Estimate the trajectory of a sequence, build its map, score it when truth is known, and write the run folder.
+
+    Parameters
+    ----------
+    sequence : an open sequence, or what `open_sequence` takes
+    out : the run folder; None writes nothing and builds no map
+    ground_truth : replaces the sequence's own
+
+    Raises
+    ------
+    RunFailedError : diverged. InterruptedRunError : `watch.should_stop` said so. GateError : `input.strict` and the run
+        is degraded. In all three, everything up to there is written. InputError, OutputError, UsageError : as named.
+    """
+    config, watch = config or Config(), watch or Watch()
+    if isinstance(sequence, (str, Path)):
+        sequence = open_sequence(sequence)
+    chosen = select(sequence, config.input.start, config.input.count, config.input.skip_frames)
+    truth = ground_truth or sequence.ground_truth
+    odometry = create_odometry(config)
+    manifest = Manifest(command, chosen, config)
+    if out is None:
+        record = _estimate(chosen, odometry, config, manifest, Path(), truth, watch)
+        evaluation = _score(record, chosen, config)
+    else:
+        with RunFolder(Path(out), overwrite) as folder:
+            try:
+                folder.write_text("config.toml", outputs.config_text(config))
+                folder.write_manifest(manifest.as_dict("running"))
+                record = _estimate(chosen, odometry, config, manifest, folder.path, truth, watch)
+                outputs.write_trajectories(folder, record, chosen.calibration)
+                outputs.write_scans(folder, record)
+                evaluation = _score(record, chosen, config)
+                _map(folder, chosen, record, config, manifest, watch)
+                _report(folder, record, evaluation, config, manifest)
+            except BaseException as error:
+                _write_last(folder, manifest.as_dict(manifest.word_for(error), str(error)))
+                raise
+            _write_last(folder, manifest.as_dict(manifest.outcome))
+    _raise_outcome(manifest, config)
+    return RunOutcome(record, evaluation)
+
+
+def _estimate(
+    sequence: Sequence, odometry: Odometry, config: Config, manifest: Manifest, folder: Path, truth: Trajectory | None,
+    watch: Watch,
+) -> RunRecord:  # fmt: skip
+    """Odometry over all scans, judged."""
+    with manifest.timed("compile_s"), jit.compile_lock(), jit.announced(log):
+        odometry.warm_up()
+
+    def seen(result: ScanResult) -> None:
+        if result.status != "ok":
+            log.warning("scan %d %s: %s", result.index, result.status, result.reason)
+        watch.on_step()
+
+    watch.on_start("odometry", len(sequence))
+    limit = config.odometry.max_failures
+    with manifest.timed("odometry_s"):
+        results = estimate(
+            sequence, odometry, threads=config.input.threads, max_failures=limit,
+            should_stop=watch.should_stop, on_scan=seen,
+        )  # fmt: skip
+    manifest.judge(results, len(sequence), is_diverged(results, limit))
+    return RunRecord(
+        name=sequence.name,
+        method=config.odometry.method,
+        folder=folder,
+        results=results,
+        trajectory=to_trajectory(results, config.odometry.method),
+        ground_truth=truth,
+        real_time_limit=config.input.skip_frames / sequence.rate_hz,
+    )
+
+
+def _score(record: RunRecord, sequence: Sequence, config: Config) -> Evaluation | None:
+    """The evaluation, or None with the reason among the record's problems."""
+    if record.ground_truth is None:
+        return None
+    try:
+        return evaluate(record.trajectory, record.ground_truth, config.eval, calibration=sequence.calibration)
+    except LslamError as error:
+        record.problems.append(f"not scored: {error}")
+        log.warning("not scored: %s", error)
+        return None
+
+
+def _map(
+    folder: RunFolder, sequence: Sequence, record: RunRecord, config: Config, manifest: Manifest, watch: Watch
+) -> None:
+    """The merged map, from the raw scans and the final poses."""
+    if not config.map.write or manifest.outcome == "interrupted":
+        return
+    watch.on_start("map", len(record.results))
+    with manifest.timed("map_s"):
+        built = build_map(sequence, record.results, config, watch.on_step, watch.should_stop)
+        record.map_image, record.map_extent = built.image, built.extent
+        outputs.write_map(folder, built.merged, config.map)
+    manifest.map_points = len(built.merged)
+
+
+def _report(
+    folder: RunFolder, record: RunRecord, evaluation: Evaluation | None, config: Config, manifest: Manifest
+) -> None:
+    """evaluation.json and report.html."""
+    manifest.problems += record.problems
+    record.manifest = manifest.as_dict(manifest.outcome)
+    with manifest.timed("report_s"):
+        outputs.write_evaluation(folder, evaluation)
+        if config.report.html:
+            outputs.write_html(folder, record, evaluation)
+
+
+def _write_last(folder: RunFolder, manifest: dict[str, object]) -> None:
+    """The status, after everything else; a disk too full even for this must not hide the first error."""
+    try:
+        folder.write_manifest(manifest)
+    except OutputError as error:
+        log.error("%s", error)
+
+
+def _raise_outcome(manifest: Manifest, config: Config) -> None:
+    why = "; ".join(manifest.problems)
+    if manifest.outcome == "interrupted":
+        raise InterruptedRunError("interrupted; what was done is written")
+    if manifest.outcome == "diverged":
+        raise RunFailedError(f"the run diverged: {why}")
+    if manifest.outcome == "degraded" and config.input.strict:
+        raise GateError(f"--strict: the run is degraded: {why}")

@@ -1,0 +1,78 @@
+"""The local map: hashed voxels, each a running Gaussian with a normal; old ground is forgotten as the sensor leaves it."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.kernels import gaussians
+
+# Variance added to every voxel, (1 cm)2: a standing sensor would otherwise collapse the Gaussians.
+FLOOR = 1e-4
+
+
+class GaussianMap:
+    """Voxels of one size around the sensor.
+
+    Parameters
+    ----------
+    size : m, edge of a voxel
+    min_points, planarity, count_cap : when a voxel is matched, when it is a plane, how much it remembers
+    reach : m, voxels farther than this from the sensor are given back
+    """
+
+    def __init__(
+        self, size: float, *, min_points: int = 6, planarity: float = 0.3, count_cap: float = 200.0,
+        reach: float = 150.0, capacity: int = 1 << 16,
+    ) -> None:  # fmt: skip
+        self.size, self.min_points, self.planarity = size, min_points, planarity
+        self.count_cap, self.reach = count_cap, reach
+        self.moments = np.zeros((capacity, 10))
+        self.planes = np.zeros((capacity, 8))
+        self.keys = np.full(capacity, gaussians.FREE, np.int64)
+        self.refreshed = np.zeros(capacity)
+        self.table = np.full(4 * capacity, -1, np.int32)
+        self.state = np.zeros(4, np.int64)
+        self.free = np.zeros(capacity, np.int32)
+
+    def __len__(self) -> int:
+        """Voxels that hold points."""
+        return int(self.state[gaussians.LIVE])
+
+    def insert(self, points: NDArray[np.float32], T_world_lidar: NDArray[np.float64]) -> int:
+        """Add points (N, 3), m, LiDAR frame; returns how many lie too far from the origin to have a voxel.
+
+        The pool grows before it can overflow: every point might open a voxel of its own.
+        """
+        while len(self.keys) - len(self) < len(points):
+            self._grow()
+        R, t = np.ascontiguousarray(T_world_lidar[:3, :3]), np.ascontiguousarray(T_world_lidar[:3, 3])
+        return gaussians.insert(
+            points, R, t, self.size, self.count_cap, float(self.min_points), self.planarity, FLOOR, self.reach,
+            self.moments, self.planes, self.keys, self.refreshed, self.table, self.state, self.free,
+        )  # fmt: skip
+
+    def coarsen(self, factor: int) -> GaussianMap:
+        """The same points in voxels `factor` times larger, from the exact moments."""
+        capacity = 1 << max(8, int(np.ceil(np.log2(len(self) + 1))))
+        coarse = GaussianMap(
+            self.size * factor, min_points=self.min_points, planarity=self.planarity, count_cap=self.count_cap,
+            reach=self.reach, capacity=capacity,
+        )  # fmt: skip
+        gaussians.coarsen(
+            factor, coarse.size, float(self.min_points), self.planarity, FLOOR, self.moments, self.keys,
+            int(self.state[gaussians.USED]), coarse.moments, coarse.planes, coarse.keys, coarse.refreshed,
+            coarse.table, coarse.state, coarse.free,
+        )  # fmt: skip
+        return coarse
+
+    def _grow(self) -> None:
+        capacity = 2 * len(self.keys)
+        used = int(self.state[gaussians.USED])
+        for name in ("moments", "planes", "keys", "refreshed", "free"):
+            old = getattr(self, name)
+            new = np.full((capacity, *old.shape[1:]), gaussians.FREE if name == "keys" else 0, old.dtype)
+            new[: len(old)] = old
+            setattr(self, name, new)
+        self.table = np.full(4 * capacity, -1, np.int32)
+        gaussians.rehash(self.keys, self.table, used)

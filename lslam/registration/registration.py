@@ -1,0 +1,143 @@
+"""Scan-to-map registration on arrays: the engine of `icp`, usable by itself."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.config.preprocess import PreprocessConfig
+from lslam.config.registration import RegistrationConfig
+from lslam.geometry import se3, so3
+from lslam.preprocessing.prepare import PreparedPoints, prepare_points
+from lslam.registration.gaussian_map import GaussianMap
+from lslam.registration.motion import ConstantVelocity
+from lslam.registration.robust import AdaptiveThreshold, Annealing
+from lslam.registration.solver import RegistrationResult, solve
+
+MIN_SOURCE_POINTS = 30
+
+
+class Registration:
+    """Registers scans one after the other against a local map that it keeps.
+
+    >>> import numpy as np
+    >>> from lslam import Registration
+    >>> registration = Registration()
+    >>> result = registration.register(np.random.default_rng(0).uniform(-20, 20, (5000, 3)))
+    >>> result.T_world_lidar.shape
+    (4, 4)
+    """
+
+    def __init__(self, config: RegistrationConfig | None = None, preprocess: PreprocessConfig | None = None) -> None:
+        self.config = config or RegistrationConfig()
+        self.preprocess = preprocess or PreprocessConfig()
+        self.map = GaussianMap(
+            self.config.voxel_size,
+            min_points=self.config.min_points,
+            planarity=self.config.planarity,
+            count_cap=self.config.count_cap,
+            reach=1.2 * self.preprocess.range_max,
+        )
+        self.threshold = AdaptiveThreshold(2 * self.config.kernel_min, self.config.kernel_max)
+        self._motion = ConstantVelocity()
+        self._index = 0
+        self._starting = self.config.start_scans
+
+    def register(self, points: NDArray[Any], prior: NDArray[np.float64] | None = None) -> RegistrationResult:
+        """Pose of points (N, 3), m, LiDAR frame; without `prior` (4, 4) the velocity is taken as constant."""
+        return self.align(prepare_points(points, self.preprocess, self._index), prior)
+
+    def align(self, points: PreparedPoints, prior: NDArray[np.float64] | None = None) -> RegistrationResult:
+        """As `register`, for points that are prepared already; aligns, judges, then updates the map."""
+        T_prior = self._motion.predict(self._index) if prior is None else np.asarray(prior, np.float64)
+        result = self.locate(points, T_prior)
+        self.update(points, result)
+        return result
+
+    def locate(self, points: PreparedPoints, T_prior: NDArray[np.float64]) -> RegistrationResult:
+        """Align with the map as it is; the result says whether to believe it."""
+        if len(points.source) < MIN_SOURCE_POINTS:
+            return _failed(
+                T_prior, len(points.source), f"{len(points.source)} usable points, {MIN_SOURCE_POINTS} needed"
+            )
+        if len(self.map) == 0:
+            return RegistrationResult(T_prior, covariance=np.diag([1e-12] * 6), source_points=len(points.source))
+        if self._starting > 0:
+            return self._judge(self._coarse_to_fine(points, T_prior), T_prior)
+        c = self.config
+        fine = self._solve(
+            points, T_prior, Annealing(self.threshold.width, c.kernel_min, c.kernel_decay, c.max_iterations)
+        )
+        fine = self._judge(fine, T_prior)
+        move, turn = fine.prior_error
+        if fine.ok and move < c.recover_m and turn < np.deg2rad(c.recover_deg):
+            return fine
+        coarse = self._judge(self._coarse_to_fine(points, T_prior), T_prior)
+        coarse = replace(coarse, iterations=coarse.iterations + fine.iterations)
+        return coarse if not fine.ok or (coarse.ok and coarse.inliers > fine.inliers) else fine
+
+    def update(self, points: PreparedPoints, result: RegistrationResult) -> None:
+        """Enter the scan into the map unless its registration failed, and learn from how wrong the prior was."""
+        if result.ok:
+            first = len(self.map) == 0
+            self.map.insert(points.map_points, result.T_world_lidar)
+            if not first:
+                self._starting = max(self._starting - 1, 0)
+                move, turn = result.prior_error
+                self.threshold.observe(move + turn * result.lever_arm)
+        else:
+            self._starting = max(self._starting, 1)
+            self.threshold.widen()
+        self._motion.correct(self._index, result.T_world_lidar)
+        self._index += 1
+
+    def _coarse_to_fine(self, points: PreparedPoints, T_prior: NDArray[np.float64]) -> RegistrationResult:
+        """Coarse planes, annealed slowly, catch what fine voxels lose: metres per scan instead of decimetres."""
+        c = self.config
+        slow = Annealing(c.coarse_kernel, 0.1 * c.coarse_kernel, 0.9, c.start_iterations)
+        coarse = self._solve(points, T_prior, slow, self.map.coarsen(c.coarse_factor))
+        start = coarse.T_world_lidar if coarse.ok else T_prior
+        fine = self._solve(points, start, Annealing(c.kernel_max, c.kernel_min, c.kernel_decay, c.start_iterations))
+        # A sparse sensor's first scans leave too few points in fine voxels: then the coarse planes have the last word.
+        best = fine if fine.ok and (fine.overlap >= c.min_overlap or fine.matched >= coarse.matched) else coarse
+        return replace(best, iterations=coarse.iterations + fine.iterations)
+
+    def _solve(
+        self,
+        points: PreparedPoints,
+        T_prior: NDArray[np.float64],
+        annealing: Annealing,
+        target: GaussianMap | None = None,
+    ) -> RegistrationResult:
+        c = self.config
+        return solve(
+            target or self.map, points, T_prior, annealing,
+            sigma=c.sigma, blob_weight=c.blob_weight, weak_share=c.weak_share,
+        )  # fmt: skip
+
+    def _judge(self, result: RegistrationResult, T_prior: NDArray[np.float64]) -> RegistrationResult:
+        """The result with its correction of the prior, or a failed one that keeps the prior and says why."""
+        c = self.config
+        delta = se3.relative(T_prior, result.T_world_lidar)
+        move, turn = float(np.linalg.norm(delta[:3, 3])), float(so3.angle(delta[:3, :3]))
+        reason = result.reason
+        if not reason and result.overlap < c.min_overlap:
+            reason = f"only {result.overlap:.0%} of the points overlap the map"
+        elif not reason and result.inlier_share < c.min_inliers:
+            reason = f"only {result.inlier_share:.0%} of the matches agree"
+        elif not reason and (move > c.max_jump_m or turn > np.deg2rad(c.max_jump_deg)):
+            reason = f"impossible jump of {move:.1f} m and {np.rad2deg(turn):.0f} deg"
+        if reason:
+            return replace(_failed(T_prior, result.source_points, reason), iterations=result.iterations)
+        return replace(result, prior_error=(move, turn))
+
+
+def _failed(T_prior: NDArray[np.float64], source_points: int, reason: str) -> RegistrationResult:
+    """The motion prior with half a metre and two degrees of doubt."""
+    doubt = np.diag([0.25] * 3 + [np.deg2rad(2.0) ** 2] * 3)
+    return RegistrationResult(
+        T_prior.copy(), ok=False, reason=reason, covariance=doubt, converged=False, source_points=source_points
+    )

@@ -1,0 +1,43 @@
+"""How wide the robust kernel opens."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Annealing:
+    """Widths of the Geman-McClure kernel, m: from `start` times `decay` per step down to `end`, `steps` at most."""
+
+    start: float
+    end: float
+    decay: float
+    steps: int
+
+
+class AdaptiveThreshold:
+    """Opens the kernel as wide as the motion prior has lately been wrong, between `low` and `high`, m.
+
+    The prediction error of a scan is its correction in metres at the rms lever arm (KISS-ICP, section III-C, measures
+    the same at the far end of the scan). Three times the rms of recent errors covers nearly all of the next ones.
+    """
+
+    FORGETTING = 0.8
+
+    def __init__(self, low: float, high: float) -> None:
+        self.low, self.high = low, high
+        self._mean_square = (high / 3) ** 2
+
+    @property
+    def width(self) -> float:
+        """Kernel width for the next scan, m."""
+        return min(max(3 * math.sqrt(self._mean_square), self.low), self.high)
+
+    def observe(self, error: float) -> None:
+        """Learn from one registered scan's prediction error, m."""
+        self._mean_square = self.FORGETTING * self._mean_square + (1 - self.FORGETTING) * error**2
+
+    def widen(self) -> None:
+        """Forget the confidence after a bad scan."""
+        self._mean_square = (self.high / 3) ** 2

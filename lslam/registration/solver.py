@@ -1,0 +1,97 @@
+"""One scan against one map: pose, covariance and the facts of convergence."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.geometry import se3
+from lslam.kernels.gauss_newton import align
+from lslam.preprocessing.prepare import PreparedPoints
+from lslam.registration.gaussian_map import GaussianMap
+from lslam.registration.robust import Annealing
+
+# A step below these ends the iteration: a tenth of the noise of a point, and what that is at 10 m.
+STEP_M, STEP_RAD = 1e-3, 1e-4
+
+
+@dataclass(frozen=True)
+class RegistrationResult:
+    """What came of registering one scan.
+
+    T_world_lidar : (4, 4); covariance : (6, 6) of t' = t + d[:3], R' = exp(d[3:]) R in world axes, m2 and rad2
+    ok : False when the pose is the motion prior because registration failed, `reason` says why
+    inliers : source points within the final kernel; matched : points that found a voxel; overlap : matched / source
+    rmse : weighted distance to the planes, m; degenerate : (K, 6) unobserved unit directions (rotation scaled by lever arm)
+    prior_error : correction of the motion prior, (m, rad)
+    """
+
+    T_world_lidar: NDArray[np.float64]
+    ok: bool = True
+    reason: str = ""
+    covariance: NDArray[np.float64] | None = None
+    converged: bool = True
+    iterations: int = 0
+    source_points: int = 0
+    matched: int = 0
+    inliers: int = 0
+    rmse: float = 0.0
+    degenerate: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 6)))
+    prior_error: tuple[float, float] = (0.0, 0.0)
+    lever_arm: float = 1.0
+
+    @property
+    def overlap(self) -> float:
+        """Share of the source points that found a voxel."""
+        return self.matched / max(self.source_points, 1)
+
+    @property
+    def inlier_share(self) -> float:
+        """Share of the matched points within the final kernel."""
+        return self.inliers / max(self.matched, 1)
+
+
+def solve(
+    target: GaussianMap, points: PreparedPoints, T_prior: NDArray[np.float64], annealing: Annealing, *, sigma: float,
+    blob_weight: float, weak_share: float,
+) -> RegistrationResult:  # fmt: skip
+    """Align the source points with the map by annealed Gauss-Newton, starting at `T_prior` (4, 4)."""
+    R, t = np.ascontiguousarray(T_prior[:3, :3]).copy(), T_prior[:3, 3].copy()
+    H, facts, step, iterations, converged, weak_count, weak = align(
+        points.source, points.scatter, R, t, target.size, annealing.start, annealing.end, annealing.decay,
+        annealing.steps, STEP_M, STEP_RAD, sigma**2, blob_weight, weak_share, target.planes, target.keys, target.table,
+    )  # fmt: skip
+    pose = se3.make(R, t)
+    finite = bool(np.isfinite(pose).all() and np.isfinite(step).all())
+    lever = float(np.sqrt(max(facts[4] / max(facts[0], 1e-300), 1e-6)))
+    return RegistrationResult(
+        T_world_lidar=pose if finite else T_prior,
+        ok=finite,
+        reason="" if finite else "the solution is not finite",
+        covariance=_covariance(H, facts, weak[:weak_count], lever) if finite and facts[3] >= 6 else None,
+        converged=converged,
+        iterations=iterations,
+        source_points=len(points.source),
+        matched=int(facts[3]),
+        inliers=int(facts[2]),
+        rmse=float(np.sqrt(facts[1] / max(facts[5], 1e-12))),
+        degenerate=weak[:weak_count].copy(),
+        lever_arm=lever,
+    )
+
+
+def _covariance(
+    H: NDArray[np.float64], facts: NDArray[np.float64], weak: NDArray[np.float64], lever: float
+) -> NDArray[np.float64]:
+    """Inverse of the information, with one metre of doubt along directions the scan does not observe."""
+    scale = np.array([1.0, 1.0, 1.0, 1 / lever, 1 / lever, 1 / lever])
+    A = H * np.outer(scale, scale)
+    values, vectors = np.linalg.eigh(A)
+    values = np.maximum(values, 1e-9 * max(float(facts[0]), 1e-9))
+    if len(weak):
+        along = ((weak @ vectors) ** 2).sum(0) > 0.5
+        values = np.where(along, np.minimum(values, 1.0), values)
+    C = (vectors / values) @ vectors.T
+    return np.asarray(C * np.outer(scale, scale))
