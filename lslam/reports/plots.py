@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.geometry import so3
 from lslam.reports import svg
 from lslam.reports.facts import RunFacts, stage_matrix
 from lslam.reports.plane import Track, plane_chart
@@ -53,14 +52,14 @@ def trajectory_figures(record: RunRecord, evaluation: Evaluation | None) -> list
         caption, x_label = f"Estimate {ALIGNED.get(absolute.alignment, absolute.alignment)}.", DISTANCE
     tracks = [] if truth is None else [Track("ground truth", truth[:, :2], "gt")]
     tracks.append(Track("estimate", positions[:, :2], "s1", ends=True))
-    failed = _failed_positions(record) if truth is None else None
+    failed = _failed_positions(record, absolute)
     top = plane_chart(tracks, "trajectory from above", points=failed)
     lines = [] if truth is None else [svg.Line("ground truth", distance, truth[:, 2], "gt")]
     lines.append(svg.Line("estimate", distance, positions[:, 2], "s1"))
     height = svg.line_chart(lines, x_label, "height z, m", "height profile", zero=False)
     legend = tuple((t.style, t.label) for t in tracks)
     start_end = (("start", "start"), ("end", "end"))
-    extra = (("bad", "bridged or skipped scan"),) if failed is not None and len(failed) else ()
+    extra = (("bad", "bridged or skipped scan"),) if len(failed) else ()
     return [
         Figure("Trajectory from above", top, legend + start_end + extra, caption),
         Figure("Height", height, legend, caption),
@@ -119,7 +118,9 @@ def map_figure(record: RunRecord, png_uri: str) -> Figure:
     chart = plane_chart(
         tracks, "merged map from above", backdrop=(png_uri, record.map_extent), width=720, tallest=760, points=None
     )
-    caption = "Darker columns hold more occupied voxels: walls stand out from the ground. World of the estimate."
+    caption = (
+        "The more voxels of a column are occupied, the stronger it is drawn: walls stand out. World of the estimate."
+    )
     return Figure(
         "Map from above", chart, (("s2", "trajectory"), ("start", "start"), ("end", "end")), caption, wide=True
     )
@@ -149,43 +150,42 @@ def registration_figures(record: RunRecord) -> list[Figure]:
         chart = svg.line_chart(lines, "scan", y_label, f"{title} per scan", marks=failed, whole_x=True)
         legend = tuple((line.style, line.label) for line in lines) if len(lines) > 1 else ()
         if len(failed):
-            legend += (("bad", "bridged or skipped scan"),)
+            legend += (("failed", "bridged or skipped scan"),)
         figures.append(Figure(title, chart, legend))
     return figures
 
 
 def uncertainty_figures(record: RunRecord) -> list[Figure]:
-    """One sigma of position and rotation per pose; nothing when the method gives no covariance."""
+    """One sigma of position and rotation per pose; nothing when the method gives no covariance.
+
+    The covariance is read as registration gives it: of t' = t + d[:3], R' = exp(d[3:]) R in world axes, so its diagonal
+    holds the variances of the position itself, without a lever arm to the world's origin.
+    """
     covariances = _covariances(record)
     if covariances is None:
         return []
-    variance = pose_variance(record.trajectory.poses, covariances)
+    variance = np.diagonal(covariances, axis1=1, axis2=2)
     sigma = np.sqrt(np.where(variance >= 0, variance, np.nan))
     distance = record.trajectory.path_lengths
     recipe = "Square roots of the covariance's diagonal, world axes, one sigma per pose."
-    label = "distance travelled, m"
-    figures = [
-        _lines("Position uncertainty", _three(("x", "y", "z"), distance, sigma[:, :3]), label, "sigma, m", recipe),
-        _lines(
-            "Rotation uncertainty",
-            _three(("about x", "about y", "about z"), distance, np.degrees(sigma[:, 3:])),
-            label,
-            "sigma, deg",
-            recipe,
-        ),
-    ]
+    failed = np.zeros(len(sigma), bool)
+    if len(record.results) == len(sigma):
+        failed = np.array([r.status != "ok" for r in record.results], bool)
+    if failed.any():
+        # A bridged pose has the doubt of a guess: drawn, it would press the registered ones flat.
+        sigma[failed] = np.nan
+        recipe += " Bridged and skipped scans are marked and left out of the lines."
+    figures = []
+    for title, unit, names, values in (
+        ("Position uncertainty", "m", ("x", "y", "z"), sigma[:, :3]),
+        ("Rotation uncertainty", "deg", ("about x", "about y", "about z"), np.degrees(sigma[:, 3:])),
+    ):
+        lines = _three(names, distance, values)
+        chart = svg.line_chart(lines, "distance travelled, m", f"sigma, {unit}", title, marks=distance[failed])
+        legend = tuple((line.style, line.label) for line in lines)
+        legend += (("failed", "bridged or skipped scan"),) if failed.any() else ()
+        figures.append(Figure(title, chart, legend, recipe))
     return [figure for figure in figures if figure.svg]
-
-
-def pose_variance(poses: NDArray[np.float64], covariances: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Variances (N, 6) of position and rotation in world axes from covariances (N, 6, 6) of left twists.
-
-    A left twist turns about the world's origin: the position moves by rho + phi x p.
-    """
-    J = np.zeros((len(poses), 6, 6))
-    J[:, range(6), range(6)] = 1.0
-    J[:, :3, 3:] = -so3.hat(poses[:, :3, 3])
-    return np.asarray(np.einsum("nij,njk,nik->ni", J, covariances, J))
 
 
 def first_available(evaluation: Evaluation | None) -> AbsoluteError | None:
@@ -224,9 +224,12 @@ def _three(names: tuple[str, str, str], x: NDArray[Any], values: NDArray[np.floa
     return [svg.Line(name, x, values[:, i], f"s{i + 1}") for i, name in enumerate(names)]
 
 
-def _failed_positions(record: RunRecord) -> NDArray[np.float64]:
-    places = [r.T_world_lidar[:2, 3] for r in record.results if r.status != "ok"]
-    return np.array(places, np.float64).reshape(-1, 2)
+def _failed_positions(record: RunRecord, absolute: AbsoluteError | None) -> NDArray[np.float64]:
+    """(K, 2) where bridged and skipped scans are drawn: moved like the estimate."""
+    places = np.array([r.T_world_lidar[:3, 3] for r in record.results if r.status != "ok"]).reshape(-1, 3)
+    if absolute is not None:
+        places = absolute.scale * places @ absolute.T_gt_est[:3, :3].T + absolute.T_gt_est[:3, 3]
+    return np.asarray(places[:, :2])
 
 
 def _covariances(record: RunRecord) -> NDArray[np.float64] | None:
