@@ -34,6 +34,8 @@ def read_points(path: Path) -> PointCloud:
         return read_ply(path)
     if suffix == ".npy":
         return _read_npy(path)
+    if suffix == ".txt":
+        return _read_text(path)
     raise InputError(f"{path}: no point file lslam reads; known suffixes: {', '.join(SUFFIXES)}")
 
 
@@ -102,3 +104,15 @@ def _read_npy(path: Path) -> PointCloud:
     table = table.reshape(-1, table.shape[-1])
     points = np.ascontiguousarray(table[:, :3], np.float32)
     return PointCloud(points, np.ascontiguousarray(table[:, 3], np.float32) if table.shape[1] > 3 else None)
+
+
+def _read_text(path: Path) -> PointCloud:
+    """KITTI raw `extract` scans: x y z intensity, one point per line."""
+    try:
+        text = path.read_text(encoding="ascii")
+        table = np.loadtxt(text.splitlines(), np.float32, ndmin=2) if text.strip() else np.zeros((0, 4), np.float32)
+    except (OSError, UnicodeDecodeError, ValueError) as error:
+        raise InputError(f"{path} cannot be read as lines of x y z intensity: {error}") from None
+    if table.shape[1] != 4:
+        raise InputError(f"{path}: {table.shape[1]} numbers a line where x y z intensity are 4")
+    return PointCloud(np.ascontiguousarray(table[:, :3]), np.ascontiguousarray(table[:, 3]))

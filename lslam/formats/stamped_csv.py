@@ -1,0 +1,72 @@
+"""CSV files of stamped numbers with named columns: what imu.csv and gnss.csv share."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.errors import InputError
+from lslam.formats.atomic import atomic_write
+from lslam.formats.stamps_files import parse_stamp
+
+TIME_COLUMNS = ("stamp_ns", "timestamp", "stamp", "time", "t", "time_s", "stamp_s")
+
+
+def read_stamped_csv(
+    path: Path, columns: Sequence[tuple[str, ...]], optional: Sequence[tuple[str, ...]] = ()
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Stamps (N,) ns and values (N, K), one column per entry of `columns`, each entry its accepted names.
+
+    Columns of `optional` follow and are NaN where the file has none. The header is the first line, a leading `#`, units
+    in brackets and case aside. Raises InputError naming file, line and what is missing.
+    """
+    try:
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path} cannot be read: {error}") from None
+    header = [_plain(name) for name in lines[0].split(",")] if lines else []
+    time = _find(header, TIME_COLUMNS)
+    if time is None:
+        raise InputError(f"{path}, line 1: no time column ({', '.join(TIME_COLUMNS)}) in {', '.join(header)!r}")
+    where = [_find(header, names) for names in columns]
+    missing = [names[0] for names, k in zip(columns, where, strict=True) if k is None]
+    if missing:
+        raise InputError(f"{path}, line 1: no column {', '.join(missing)}; the file has {', '.join(header)}")
+    where += [_find(header, names) for names in optional]
+    stamps: list[int] = []
+    rows: list[list[float]] = []
+    for number, line in enumerate(lines[1:], 2):
+        cells = line.split(",")
+        if not line.strip() or line.startswith("#"):
+            continue
+        if len(cells) != len(header):
+            raise InputError(f"{path}, line {number}: {len(cells)} columns where the header has {len(header)}")
+        try:
+            stamps.append(parse_stamp(cells[time].strip()))
+            rows.append([float("nan") if k is None else float(cells[k]) for k in where])
+        except ValueError:
+            raise InputError(f"{path}, line {number}: {line[:60]!r} holds something that is no number") from None
+    return np.array(stamps, np.int64), np.array(rows, np.float64).reshape(len(stamps), len(where))
+
+
+def write_stamped_csv(
+    path: Path, names: Sequence[str], stamps_ns: NDArray[np.int64], values: NDArray[np.float64]
+) -> None:
+    """Write stamps (N,) as `stamp_ns` and values (N, K) under `names`, atomically; both read back exactly."""
+    rows = [",".join(["stamp_ns", *names])]
+    for stamp, row in zip(stamps_ns.tolist(), values.tolist(), strict=True):
+        rows.append(",".join([str(stamp), *map(repr, row)]))
+    with atomic_write(path) as stream:
+        stream.write(("\n".join(rows) + "\n").encode())
+
+
+def _plain(name: str) -> str:
+    return re.sub(r"\[.*?\]", "", name).strip().lstrip("#").strip().lower()
+
+
+def _find(header: list[str], names: Sequence[str]) -> int | None:
+    return next((header.index(name) for name in names if name in header), None)

@@ -1,0 +1,79 @@
+"""A data set on disk becomes a Sequence. A new reader is one file with `locate` and `open_folder` and one line here."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from lslam.errors import InputError, UsageError
+from lslam.formats.sequence_toml import SequenceInfo
+from lslam.readers.lookup import find_folder
+from lslam.readers.selection import select
+from lslam.types.sequence import Sequence
+
+__all__ = ["READERS", "open_sequence", "select"]
+
+# Tried in this order: a KITTI layout is also a folder with scans somewhere in it.
+READERS = {
+    "kitti-odometry": "lslam.readers.kitti_odometry",
+    "kitti-raw": "lslam.readers.kitti_raw",
+    "scan-folder": "lslam.readers.scan_folder",
+}
+
+
+def open_sequence(
+    name_or_path: str | Path,
+    *,
+    data_root: Path | None = None,
+    rows: int | None = None,
+    cols: int | None = None,
+    rate_hz: float | None = None,
+    motion_compensated: bool | None = None,
+    vertical_correction_deg: float | None = None,
+) -> Sequence:
+    """Open a recorded sequence without reading its scans.
+
+    Parameters
+    ----------
+    name_or_path : a folder, or a name looked up under `data_root` (or LSLAM_DATA): `seq07`, `07`, a raw drive
+    rows, cols : organised clouds: point r * cols + c is of ring r
+    rate_hz : nominal scan rate, where stamps are missing
+    motion_compensated : whether scans are free of motion distortion
+    vertical_correction_deg : rotation of every point about p x z; None leaves it to the reader
+        These five win over `sequence.toml`, which wins over what the layout implies.
+
+    Raises
+    ------
+    InputError naming where it looked and what is wrong; UsageError for values that make no sense.
+    """
+    if (rows is None) != (cols is None) or min(rows or 1, cols or 1) < 1:
+        raise UsageError(f"rows {rows} and cols {cols} of organised clouds go together and are above 0")
+    if rate_hz is not None and not 0 < rate_hz < 1e6:
+        raise UsageError(f"a scan rate of {rate_hz} Hz makes no sense")
+    overrides = SequenceInfo(
+        rows=rows,
+        cols=cols,
+        rate_hz=rate_hz,
+        motion_compensated=motion_compensated,
+        vertical_correction_deg=vertical_correction_deg,
+    )
+    folder = find_folder(name_or_path, data_root)
+    for dotted in READERS.values():
+        reader: Any = import_module(dotted)
+        located = reader.locate(folder)
+        if located is not None:
+            sequence: Sequence = reader.open_folder(located[0], overrides, located[1])
+            return sequence
+    raise InputError(_nothing_in(folder))
+
+
+def _nothing_in(folder: Path) -> str:
+    inside = sorted(p.name for p in folder.iterdir())
+    if not inside:
+        return f"{folder} is empty: there is no sequence in it"
+    shown = ", ".join(inside[:8]) + (", ..." if len(inside) > 8 else "")
+    return (
+        f"{folder} holds no scans: looked for velodyne/, sequences/, velodyne_points/ and *.bin, *.pcd, *.ply, *.npy "
+        f"here and in data/, found {shown}"
+    )

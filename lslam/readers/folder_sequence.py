@@ -1,0 +1,115 @@
+"""A sequence whose scans are files of one folder: what all folder readers give."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.errors import InputError
+from lslam.formats.point_cloud import PointCloud
+from lslam.formats.point_files import read_bin, read_points
+from lslam.readers.point_times import TimeRule, apply_rule, azimuth_times
+from lslam.types.calibration import Calibration
+from lslam.types.gnss import GnssStream
+from lslam.types.imu import ImuStream
+from lslam.types.scan import Scan
+from lslam.types.trajectory import Trajectory
+
+
+@dataclass
+class FolderSequence:
+    """A `Sequence` over point files. See `lslam.types.sequence` for the attributes every sequence has.
+
+    files : one per scan; correction_deg : rotation of every point about p x z, 0 for none
+    rows, cols : organised clouds, point r * cols + c has ring r; per_point : folder of `<stem>.npz` with `t` and `ring`
+    time_rule : how the files' own per-point times are understood, None when they have none or are not to be used
+    sweep_s : (N,) duration of each sweep, s, when per-point times follow from the azimuth; None otherwise
+    rings : number of beams, if known; sensor : its name, if known
+    """
+
+    name: str
+    path: Path
+    kind: str
+    files: list[Path]
+    stamps_ns: NDArray[np.int64]
+    rate_hz: float
+    motion_compensated: bool | None = None
+    calibration: Calibration = field(default_factory=Calibration)
+    ground_truth: Trajectory | None = None
+    imu: ImuStream | None = None
+    gnss: GnssStream | None = None
+    notes: list[str] = field(default_factory=list)
+    problems: list[str] = field(default_factory=list)
+    correction_deg: float = 0.0
+    rows: int | None = None
+    cols: int | None = None
+    per_point: Path | None = None
+    time_rule: TimeRule | None = None
+    sweep_s: NDArray[np.float64] | None = None
+    rings: int | None = None
+    sensor: str | None = None
+
+    def __len__(self) -> int:
+        return len(self.files)
+
+    def scan(self, index: int) -> Scan:
+        """Read scan `index`; an empty file gives an empty scan.
+
+        Raises InputError naming the file when it cannot be read or contradicts `sequence.toml`, IndexError beyond the end.
+        """
+        if not 0 <= index < len(self.files):
+            raise IndexError(f"scan {index} of {len(self.files)}")
+        path = self.files[index]
+        stamp = int(self.stamps_ns[index])
+        cloud = _split(read_bin(path)) if path.suffix.lower() == ".bin" else read_points(path)
+        times, rings, stamp = self._times_and_rings(path, cloud, index, stamp)
+        if self.correction_deg and len(cloud):
+            from lslam.kernels.correction import rotate_up
+
+            angle = math.radians(self.correction_deg)
+            rotate_up(cloud.points, math.sin(angle), math.cos(angle))
+        return Scan(cloud.points, stamp, index, cloud.intensity, times, rings)
+
+    def _times_and_rings(
+        self, path: Path, cloud: PointCloud, index: int, stamp: int
+    ) -> tuple[NDArray[np.float32] | None, NDArray[np.uint16] | None, int]:
+        times: NDArray[np.float32] | None = None
+        rings = cloud.rings
+        if self.per_point is not None:
+            times, rings = _read_per_point(self.per_point / f"{path.stem}.npz", len(cloud))
+        elif self.time_rule is not None and cloud.times is not None:
+            times, shift_ns = apply_rule(self.time_rule, cloud.times, stamp)
+            stamp += shift_ns
+        elif self.sweep_s is not None:
+            times = azimuth_times(cloud.points, float(self.sweep_s[index]))
+        if rings is None and self.rows is not None and self.cols is not None and len(cloud):
+            if self.rows * self.cols != len(cloud):
+                raise InputError(f"{path}: {len(cloud)} points are not {self.rows} rows of {self.cols} columns")
+            rings = np.repeat(np.arange(self.rows, dtype=np.uint16), self.cols)
+        return times, rings, stamp
+
+
+def _split(raw: NDArray[np.float32]) -> PointCloud:
+    from lslam.kernels.correction import split
+
+    points = np.empty((len(raw), 3), np.float32)
+    intensity = np.empty(len(raw), np.float32)
+    split(raw, points, intensity)
+    return PointCloud(points, intensity)
+
+
+def _read_per_point(path: Path, count: int) -> tuple[NDArray[np.float32] | None, NDArray[np.uint16] | None]:
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            times = np.asarray(file["t"], np.float32) if "t" in file else None
+            rings = np.asarray(file["ring"], np.uint16) if "ring" in file else None
+    except (OSError, ValueError, EOFError, KeyError) as error:
+        raise InputError(f"{path}, named by per_point of sequence.toml, cannot be read: {error}") from None
+    for name, values in (("t", times), ("ring", rings)):
+        if values is not None and values.shape != (count,):
+            raise InputError(f"{path}: {name} has shape {values.shape} for a scan of {count} points")
+    return times, rings

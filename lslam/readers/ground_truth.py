@@ -1,0 +1,141 @@
+"""Ground truth of a sequence as LiDAR poses: found, paired with the scans, carried into the LiDAR frame, said aloud."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.errors import InputError
+from lslam.formats.pose_rows import numbers, read_rows
+from lslam.formats.sequence_toml import FILE_NAME, SequenceInfo
+from lslam.formats.trajectory_files import read_trajectory
+from lslam.geometry import se3
+from lslam.readers.listing import file_numbers, rows_of
+from lslam.types.calibration import Calibration
+from lslam.types.trajectory import Trajectory
+
+USUAL_NAMES = (
+    "gt.tum", "groundtruth.tum", "ground_truth.tum", "gt_poses.tum", "poses.tum", "gt.csv", "groundtruth.csv",
+    "ground_truth.csv", "pose_inW.csv", "poses.csv", "gt.txt", "groundtruth.txt", "ground_truth.txt", "poses.txt",
+)  # fmt: skip
+
+_NUMBER_COLUMNS = ("num", "number", "index", "scan")
+
+
+@dataclass
+class Voice:
+    """Where a reader's sentences go."""
+
+    notes: list[str]
+    problems: list[str]
+
+
+def find_ground_truth(folder: Path, info: SequenceInfo, voice: Voice) -> Path | None:
+    """The file `sequence.toml` names, else the first of the usual names in `folder`."""
+    if info.ground_truth is not None:
+        path = folder / info.ground_truth
+        if path.is_file():
+            return path
+        voice.problems.append(f"ground truth {path}, named by {FILE_NAME}, does not exist")
+        return None
+    return next((folder / name for name in USUAL_NAMES if (folder / name).is_file()), None)
+
+
+def load_poses(path: Path, stamps_ns: NDArray[np.int64], files: list[Path], voice: Voice) -> Trajectory | None:
+    """Poses of `path` in the frame of the file; rows without time get the stamps of the scans they belong to."""
+    try:
+        if _is_kitti(path):
+            return _pair(path, _kitti_poses(path), stamps_ns, files, voice)
+        return read_trajectory(path)
+    except InputError as error:
+        voice.problems.append(f"ground truth is not used: {error}")
+        return None
+
+
+def pair_by_number(truth: Trajectory, files: list[Path]) -> Trajectory | None:
+    """The poses of a named CSV that belong to the scans by its first column, `num` (MCD), and the scans' file names.
+
+    Exactly one pose per scan, in order; None when the file has no such column or lacks a scan.
+    """
+    numbers_of_files = file_numbers(files)
+    rows, _ = read_rows(Path(truth.source))
+    if numbers_of_files is None or rows[0].text.split(",")[0].strip().lower() not in _NUMBER_COLUMNS:
+        return None
+    cells = [row.text.split(",")[0].strip() for row in rows[1:]]
+    if len(cells) != len(truth) or not all(c.isdigit() for c in cells):
+        return None
+    row_of = {int(c): k for k, c in enumerate(cells)}
+    found = [row_of.get(int(n), -1) for n in numbers_of_files]
+    return None if min(found) < 0 else truth.select(np.array(found))
+
+
+def to_lidar(
+    truth: Trajectory,
+    frame: str,
+    calibration: Calibration,
+    voice: Voice,
+    T_body_lidar: NDArray[np.float64] | None = None,
+) -> Trajectory | None:
+    """`truth`, poses of `frame`, as poses of the LiDAR; None, with the reason in the problems, when extrinsics are missing.
+
+    KITTI's camera poses live in a world that is camera 0 at the start: T_world_lidar = inv(Tr) @ T_cam0 @ Tr.
+    """
+    if frame == "cam0":
+        T = calibration.T_cam0_lidar
+        if T is None:
+            voice.problems.append(
+                f"ground truth {truth.source} holds poses of camera 0 and no calibration gives Tr (T_cam0_lidar), so it "
+                f"cannot be compared: add calib.txt with Tr, or [extrinsics] T_cam0_lidar to {FILE_NAME}"
+            )
+            return None
+        return replace(truth, poses=se3.normalise(se3.inverse(T) @ truth.poses @ T), frame="lidar")
+    if frame == "imu" and T_body_lidar is None and calibration.T_lidar_imu is not None:
+        T_body_lidar = se3.inverse(calibration.T_lidar_imu)
+    if T_body_lidar is not None:
+        return replace(truth, poses=se3.normalise(truth.poses @ T_body_lidar), frame="lidar")
+    if frame == "imu":
+        voice.problems.append(
+            f"ground truth {truth.source} holds poses of the IMU and T_lidar_imu is unknown: they are taken as LiDAR poses; "
+            f"add [extrinsics] T_lidar_imu to {FILE_NAME}"
+        )
+    elif frame != "lidar":
+        voice.notes.append(
+            f"ground truth {truth.source}: its body is not stated and taken as the LiDAR; ground_truth_frame in {FILE_NAME} "
+            "says otherwise"
+        )
+    return replace(truth, frame="lidar")
+
+
+def _is_kitti(path: Path) -> bool:
+    rows, _ = read_rows(path)
+    if not rows:
+        raise InputError(f"{path} holds no poses")
+    return len(rows[0].text.split()) == 12 and "," not in rows[0].text
+
+
+def _kitti_poses(path: Path) -> NDArray[np.float64]:
+    rows, _ = read_rows(path)
+    upper = numbers(rows, 12, path, "KITTI poses").reshape(-1, 3, 4)
+    R = upper[:, :, :3]
+    wrong = np.flatnonzero(np.abs(np.swapaxes(R, 1, 2) @ R - np.eye(3)).max(axis=(1, 2)) > 1e-2)
+    if len(wrong):
+        raise InputError(f"{path}, line {rows[wrong[0]].number}: the 3x3 part is no rotation matrix")
+    return se3.make(R, upper[:, :, 3])
+
+
+def _pair(
+    path: Path, poses: NDArray[np.float64], stamps_ns: NDArray[np.int64], files: list[Path], voice: Voice
+) -> Trajectory | None:
+    rows, rule = rows_of(files, len(poses))
+    have = rows >= 0
+    if not have.any():
+        voice.problems.append(f"ground truth {path} has no pose for any scan")
+        return None
+    if len(poses) != len(files):
+        voice.problems.append(
+            f"{path} has {len(poses)} poses for {len(files)} scans: the {int(have.sum())} common ones are used, {rule}"
+        )
+    return Trajectory(stamps_ns[have], poses[rows[have]], "cam0", True, None, str(path))

@@ -1,0 +1,146 @@
+"""KITTI odometry layout: `sequences/NN/{velodyne/*.bin, calib.txt, times.txt}` and `poses/NN.txt`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.errors import InputError
+from lslam.formats.kitti_calib import read_odometry_calib
+from lslam.formats.sequence_toml import SequenceInfo
+from lslam.readers.folder_sequence import FolderSequence
+from lslam.readers.ground_truth import Voice, find_ground_truth, load_poses, to_lidar
+from lslam.readers.listing import list_scans, rows_of
+from lslam.readers.sidecars import (
+    calibration_over,
+    load_gnss,
+    load_imu,
+    per_point_folder,
+    read_info,
+    vertical_correction,
+)
+from lslam.readers.stamps import DEFAULT_RATE_HZ, check_stamps, load_stamps, nominal_stamps
+from lslam.types.calibration import Calibration
+from lslam.types.trajectory import Trajectory
+
+KIND = "kitti-odometry"
+
+
+def locate(folder: Path) -> tuple[Path, str] | None:
+    """The sequence folder in or at `folder` and why it is one; None when this is no KITTI odometry layout.
+
+    Raises InputError listing the sequences when `folder` is a root that holds several.
+    """
+    if (folder / "velodyne").is_dir():
+        return folder, "it has velodyne/, as KITTI odometry sequences do"
+    for sequences in (folder / "sequences", folder / "dataset" / "sequences"):
+        if sequences.is_dir():
+            found = sorted(p for p in sequences.iterdir() if (p / "velodyne").is_dir())
+            if len(found) == 1:
+                return found[0], f"{sequences} holds this single KITTI odometry sequence"
+            names = ", ".join(p.name for p in found)
+            if found:
+                raise InputError(f"{folder} holds {len(found)} sequences ({names}): name one, for example {found[0]}")
+            raise InputError(f"{sequences} holds no sequence with a velodyne folder: fetch the velodyne data")
+    return None
+
+
+def open_folder(folder: Path, overrides: SequenceInfo, why: str) -> FolderSequence:
+    """Open the sequence in `folder`. Raises InputError when it has no scans or a broken `sequence.toml`."""
+    info, has_toml = read_info(folder, overrides)
+    files, left_out = list_scans(folder / "velodyne")
+    if not files:
+        raise InputError(f"{folder / 'velodyne'} holds no scans (*.bin): fetch the velodyne data of this sequence")
+    voice = Voice([f"format {KIND}: {why}", *left_out], [])
+    name = info.name or (f"seq{folder.name}" if folder.name.isdigit() else folder.resolve().name)
+    files, stamps, rate = _stamps(folder, info, files, voice)
+    calibration = calibration_over(info, Calibration(T_cam0_lidar=_tr(folder, voice)))
+    compensated = True if info.motion_compensated is None and info.per_point is None else info.motion_compensated
+    if info.motion_compensated is None and compensated:
+        voice.notes.append("scans are motion compensated, as in the KITTI odometry benchmark")
+    return FolderSequence(
+        name=name,
+        path=folder,
+        kind=KIND,
+        files=files,
+        stamps_ns=stamps,
+        rate_hz=rate,
+        motion_compensated=compensated,
+        calibration=calibration,
+        ground_truth=_ground_truth(folder, info, files, stamps, calibration, voice),
+        imu=load_imu(folder, info, voice.problems),
+        gnss=load_gnss(folder, info, voice.problems),
+        correction_deg=vertical_correction(info, files, voice.notes),
+        rows=info.rows,
+        cols=info.cols,
+        per_point=per_point_folder(folder, info),
+        rings=info.rings or info.rows,
+        sensor=info.sensor or (None if has_toml else "HDL-64E"),
+        notes=voice.notes,
+        problems=voice.problems,
+    )
+
+
+def _stamps(
+    folder: Path, info: SequenceInfo, files: list[Path], voice: Voice
+) -> tuple[list[Path], NDArray[np.int64], float]:
+    path = folder / (info.stamps or "times.txt")
+    stamps = load_stamps(path, voice.problems) if path.is_file() else None
+    if stamps is None:
+        rate = info.rate_hz or DEFAULT_RATE_HZ
+        voice.notes.append(f"no usable {path.name}: scans are stamped at {rate:g} Hz")
+        return files, nominal_stamps(len(files), rate), rate
+    rows, rule = rows_of(files, len(stamps))
+    have = rows >= 0
+    if len(stamps) != len(files):
+        voice.problems.append(
+            f"{path} has {len(stamps)} times for {len(files)} scans: the {int(have.sum())} common ones are used, {rule}"
+        )
+    files = [f for f, known in zip(files, have, strict=True) if known]
+    checked, rate = check_stamps(stamps[rows[have]], info.rate_hz, path, voice.problems)
+    return files, checked, rate
+
+
+def _tr(folder: Path, voice: Voice) -> NDArray[np.float64] | None:
+    path = folder / "calib.txt"
+    if not path.is_file():
+        voice.notes.append(f"{path} is missing: the camera's place is unknown")
+        return None
+    try:
+        T_cam0_lidar = read_odometry_calib(path)
+    except InputError as error:
+        voice.problems.append(f"calibration is not used: {error}")
+        return None
+    if T_cam0_lidar is None:
+        voice.problems.append(f"{path} has no Tr (T_cam0_lidar): poses cannot be carried between camera and LiDAR")
+    return T_cam0_lidar
+
+
+def _ground_truth(
+    folder: Path,
+    info: SequenceInfo,
+    files: list[Path],
+    stamps: NDArray[np.int64],
+    calibration: Calibration,
+    voice: Voice,
+) -> Trajectory | None:
+    path: Path | None = folder.resolve().parent.parent / "poses" / f"{folder.resolve().name}.txt"
+    if info.ground_truth is not None:
+        path = find_ground_truth(folder, info, voice)
+    elif path is not None and not path.is_file():
+        if (folder / "poses.txt").is_file():
+            voice.notes.append(
+                f"{folder / 'poses.txt'} (SemanticKITTI) holds SLAM estimates, it is not taken as ground truth"
+            )
+        path = None
+    if path is None:
+        return None
+    truth = load_poses(path, stamps, files, voice)
+    if truth is None:
+        return None
+    frame = info.ground_truth_frame or truth.frame
+    if frame == "cam0":
+        voice.notes.append(f"ground truth {path}: camera 0 poses, carried to the LiDAR with Tr")
+    return to_lidar(truth, frame, calibration, voice)

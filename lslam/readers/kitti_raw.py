@@ -1,0 +1,225 @@
+"""KITTI raw drives: `<date>/<date>_drive_NNNN_{sync,extract}` with `velodyne_points/` and `oxts/`."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.errors import InputError
+from lslam.formats.kitti_calib import read_raw_cam0_lidar, read_rigid
+from lslam.formats.oxts_files import ACCEL, GYRO, POS_ACC, Oxts, read_oxts
+from lslam.formats.point_files import SUFFIXES
+from lslam.formats.sequence_toml import SequenceInfo
+from lslam.readers.folder_sequence import FolderSequence
+from lslam.readers.ground_truth import Voice, find_ground_truth, load_poses, to_lidar
+from lslam.readers.listing import list_scans, rows_of
+from lslam.readers.oxts_truth import oxts_truth
+from lslam.readers.sidecars import (
+    calibration_over,
+    load_gnss,
+    load_imu,
+    per_point_folder,
+    read_info,
+    vertical_correction,
+)
+from lslam.readers.stamps import DEFAULT_RATE_HZ, check_stamps, load_stamps, measured_rate, nominal_stamps
+from lslam.types.calibration import Calibration
+from lslam.types.gnss import GnssStream
+from lslam.types.imu import ImuStream
+from lslam.types.trajectory import Trajectory
+
+KIND = "kitti-raw"
+DRIVE = re.compile(r"\d{4}_\d\d_\d\d_drive_\d{4}(_sync|_extract)?$")
+
+
+def locate(folder: Path) -> tuple[Path, str] | None:
+    """The drive in or at `folder` and why it is one; None when this is no KITTI raw layout.
+
+    Raises InputError listing the drives when `folder` is a day that holds several.
+    """
+    if (folder / "velodyne_points").is_dir():
+        return folder, "it has velodyne_points/, as KITTI raw drives do"
+    if (folder / "oxts").is_dir():
+        raise InputError(f"{folder} is a KITTI raw drive without velodyne_points/: fetch its velodyne data")
+    try:
+        drives = sorted(p for p in folder.iterdir() if DRIVE.match(p.name) and (p / "velodyne_points").is_dir())
+    except OSError as error:
+        raise InputError(f"{folder} cannot be read: {error.strerror or error}") from None
+    if len(drives) > 1:
+        raise InputError(f"{folder} holds {len(drives)} drives ({', '.join(p.name for p in drives)}): name one")
+    return (drives[0], f"{folder} holds this single KITTI raw drive") if drives else None
+
+
+def open_folder(folder: Path, overrides: SequenceInfo, why: str) -> FolderSequence:
+    """Open the drive in `folder`. Raises InputError when it has no scans or a broken `sequence.toml`."""
+    info, has_toml = read_info(folder, overrides)
+    data = folder / "velodyne_points" / "data"
+    # Unsynchronised (`extract`) drives come as text.
+    files, left_out = list_scans(data, (*SUFFIXES, ".txt")) if data.is_dir() else ([], [])
+    if not files:
+        raise InputError(f"{data} holds no scans (*.bin or *.txt): fetch the velodyne data of this drive")
+    voice = Voice([f"format {KIND}: {why}", *left_out], [])
+    is_extract = folder.resolve().name.endswith("_extract")
+    oxts = _oxts(folder, voice)
+    files, stamps, rate = _stamps(folder, info, files, oxts, is_extract, voice)
+    calibration = calibration_over(info, _calibration(folder.resolve().parent, voice))
+    compensated = not is_extract if info.motion_compensated is None else info.motion_compensated
+    per_point = per_point_folder(folder, info)
+    sweep = None
+    if is_extract and not compensated and per_point is None:
+        sweep = _sweeps(folder, files, rate, voice)
+    if info.motion_compensated is None:
+        drive = "extract drives are distorted" if is_extract else "sync drives are motion compensated"
+        voice.notes.append(f"motion compensated: {'yes' if compensated else 'no'} (KITTI raw {drive})")
+    return FolderSequence(
+        name=info.name or folder.resolve().name,
+        path=folder,
+        kind=KIND,
+        files=files,
+        stamps_ns=stamps,
+        rate_hz=rate,
+        motion_compensated=compensated,
+        calibration=calibration,
+        ground_truth=_ground_truth(folder, info, files, stamps, oxts, calibration, voice),
+        imu=load_imu(folder, info, voice.problems) or _imu(oxts),
+        gnss=load_gnss(folder, info, voice.problems) or _gnss(oxts),
+        correction_deg=vertical_correction(info, files, voice.notes),
+        rows=info.rows,
+        cols=info.cols,
+        per_point=per_point,
+        sweep_s=sweep,
+        rings=info.rings or info.rows,
+        sensor=info.sensor or (None if has_toml else "HDL-64E"),
+        notes=voice.notes,
+        problems=voice.problems,
+    )
+
+
+def _oxts(folder: Path, voice: Voice) -> Oxts | None:
+    try:
+        oxts = read_oxts(folder / "oxts")
+    except InputError as error:
+        voice.problems.append(f"OXTS is not used: {error}")
+        return None
+    if oxts is None:
+        voice.problems.append(f"{folder / 'oxts'} holds no samples: no ground truth, IMU or GNSS")
+        return None
+    voice.problems += oxts.problems
+    if oxts.stamps_ns is not None and len(oxts.stamps_ns) > 1:
+        back = np.flatnonzero(np.diff(oxts.stamps_ns) <= 0)
+        if len(back):
+            voice.problems.append(
+                f"{folder / 'oxts' / 'timestamps.txt'}: time repeats or goes back at line {back[0] + 2} "
+                f"({len(back)} place{'s' if len(back) > 1 else ''})"
+            )
+    return oxts
+
+
+def _stamps(
+    folder: Path, info: SequenceInfo, files: list[Path], oxts: Oxts | None, is_extract: bool, voice: Voice
+) -> tuple[list[Path], NDArray[np.int64], float]:
+    """Stamps of the LiDAR; of OXTS by index where a shared excerpt leaves them out; else nominal."""
+    names = ("timestamps_start.txt", "timestamps.txt") if is_extract else ("timestamps.txt", "timestamps_start.txt")
+    paths = [folder / "velodyne_points" / name for name in names]
+    if info.stamps is not None:
+        paths.insert(0, folder / info.stamps)
+    path = next((p for p in paths if p.is_file()), None)
+    stamps = load_stamps(path, voice.problems) if path else None
+    if path is not None and stamps is not None:
+        voice.notes.append(f"scan stamps from {path.name}")
+        return _common(files, stamps, path, info.rate_hz, voice)
+    if oxts is None or oxts.stamps_ns is None or not len(oxts.stamps_ns) or is_extract:
+        rate = info.rate_hz or DEFAULT_RATE_HZ
+        start = 0 if oxts is None or oxts.stamps_ns is None or not len(oxts.stamps_ns) else int(oxts.stamps_ns[0])
+        voice.problems.append(
+            f"no stamps of the scans in {folder / 'velodyne_points'}: they are stamped at {rate:g} Hz"
+        )
+        return files, nominal_stamps(len(files), rate, start), rate
+    voice.notes.append("no velodyne_points/timestamps*.txt: scan i goes with OXTS sample i and takes its stamp")
+    full = np.full(int(oxts.numbers.max()) + 1, -1, np.int64)
+    full[oxts.numbers] = oxts.stamps_ns
+    source = folder / "oxts" / "timestamps.txt"
+    if (full < 0).any():
+        return _common(files, oxts.stamps_ns, source, info.rate_hz, voice)
+    return _common(files, full, source, info.rate_hz, voice)
+
+
+def _common(
+    files: list[Path], stamps: NDArray[np.int64], source: Path, rate_hz: float | None, voice: Voice
+) -> tuple[list[Path], NDArray[np.int64], float]:
+    rows, rule = rows_of(files, len(stamps))
+    have = rows >= 0
+    if len(stamps) != len(files):
+        voice.problems.append(
+            f"{source} has {len(stamps)} stamps for {len(files)} scans: the {int(have.sum())} common ones are used, {rule}"
+        )
+    files = [f for f, known in zip(files, have, strict=True) if known]
+    checked, _ = check_stamps(stamps[rows[have]], rate_hz, source, voice.problems)
+    return files, checked, rate_hz or measured_rate(checked)
+
+
+def _sweeps(folder: Path, files: list[Path], rate: float, voice: Voice) -> NDArray[np.float64]:
+    """Duration of each sweep, s, from KITTI's start and end stamps, else one period."""
+    voice.notes.append("per-point times from the azimuth: the HDL-64E turns clockwise and a scan starts behind")
+    ends = [folder / "velodyne_points" / f"timestamps_{which}.txt" for which in ("start", "end")]
+    nominal = np.full(len(files), 1 / rate)
+    if not all(p.is_file() for p in ends):
+        return nominal
+    start, end = (load_stamps(p, voice.problems) for p in ends)
+    if start is None or end is None or len(start) != len(end):
+        return nominal
+    rows, _ = rows_of(files, len(start))
+    seconds = (end - start) * 1e-9
+    return np.asarray(
+        np.where((rows >= 0) & (seconds[rows] > 0.5 / rate) & (seconds[rows] < 2 / rate), seconds[rows], 1 / rate)
+    )
+
+
+def _calibration(day: Path, voice: Voice) -> Calibration:
+    T_lidar_imu = _optional(day / "calib_imu_to_velo.txt", read_rigid, voice)
+    T_cam0_lidar = _optional(day / "calib_velo_to_cam.txt", lambda path: read_raw_cam0_lidar(path.parent), voice)
+    # The OXTS position is that of the IMU's origin (devkit readme), so both extrinsics are one.
+    return Calibration(T_cam0_lidar, T_lidar_imu, T_lidar_imu)
+
+
+def _optional(path: Path, read: Callable[[Path], NDArray[np.float64]], voice: Voice) -> NDArray[np.float64] | None:
+    if not path.is_file():
+        voice.notes.append(f"{path} is missing")
+        return None
+    try:
+        return read(path)
+    except InputError as error:
+        voice.problems.append(f"calibration is not used: {error}")
+        return None
+
+
+def _imu(oxts: Oxts | None) -> ImuStream | None:
+    if oxts is None or oxts.stamps_ns is None:
+        return None
+    return ImuStream(oxts.stamps_ns, oxts.values[:, ACCEL].copy(), oxts.values[:, GYRO].copy())
+
+
+def _gnss(oxts: Oxts | None) -> GnssStream | None:
+    if oxts is None or oxts.stamps_ns is None:
+        return None
+    return GnssStream(oxts.stamps_ns, oxts.values[:, :3].copy(), oxts.values[:, POS_ACC].copy())
+
+
+def _ground_truth(
+    folder: Path,
+    info: SequenceInfo,
+    files: list[Path],
+    stamps: NDArray[np.int64],
+    oxts: Oxts | None,
+    calibration: Calibration,
+    voice: Voice,
+) -> Trajectory | None:
+    if info.ground_truth is not None:
+        path = find_ground_truth(folder, info, voice)
+        truth = load_poses(path, stamps, files, voice) if path else None
+        return to_lidar(truth, info.ground_truth_frame or truth.frame, calibration, voice) if truth else None
+    return None if oxts is None else oxts_truth(oxts, stamps, calibration.T_lidar_imu, voice)

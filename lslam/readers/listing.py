@@ -1,0 +1,70 @@
+"""Scan files of a folder, their order, and the rows of stamp and pose files that belong to them."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.errors import InputError
+from lslam.formats.point_files import SUFFIXES
+from lslam.formats.stamps_files import parse_stamp
+
+
+def list_scans(folder: Path, suffixes: tuple[str, ...] = SUFFIXES) -> tuple[list[Path], list[str]]:
+    """Point files of `folder` in natural order (scan2 before scan10), and notes about what was left out.
+
+    Only files of the most frequent suffix count: a map beside the scans is no scan.
+    """
+    try:
+        files = [p for p in folder.iterdir() if p.suffix.lower() in suffixes and not p.name.startswith(".")]
+    except OSError as error:
+        raise InputError(f"{folder} cannot be read: {error.strerror or error}") from None
+    kinds = Counter(p.suffix.lower() for p in files)
+    if not kinds:
+        return [], []
+    suffix = max(kinds, key=lambda s: (kinds[s], s == ".bin"))
+    notes = [f"{n} *{s} files in {folder} are not scans: *{suffix} are" for s, n in kinds.items() if s != suffix]
+    return sorted((p for p in files if p.suffix.lower() == suffix), key=natural_key), notes
+
+
+def natural_key(path: Path) -> list[tuple[int, int, str]]:
+    """Sort key of a file name with numbers compared as numbers."""
+    parts = re.split(r"(\d+)", path.stem)
+    return [(0, int(p), "") if p.isdigit() else (1, 0, p) for p in parts]
+
+
+def file_numbers(files: list[Path]) -> NDArray[np.int64] | None:
+    """The number in each name when all names are plain numbers of up to nine digits, else None."""
+    if not all(re.fullmatch(r"\d{1,9}", p.stem) for p in files):
+        return None
+    return np.array([int(p.stem) for p in files], np.int64)
+
+
+def rows_of(files: list[Path], count: int) -> tuple[NDArray[np.int64], str]:
+    """Row of a file with `count` rows that belongs to each scan, -1 for none, and the rule in words.
+
+    Scans in KITTI are numbered by row, and scans may be missing. Where the numbers reach beyond the rows the i-th scan goes
+    with the i-th row.
+    """
+    numbers = file_numbers(files)
+    if numbers is not None and len(numbers) and numbers[-1] < count and len(files) != count:
+        return numbers, "by the number in the file name"
+    rows = np.arange(len(files), dtype=np.int64)
+    rows[rows >= count] = -1
+    return rows, "by index"
+
+
+def stamps_in_names(files: list[Path]) -> NDArray[np.int64] | None:
+    """Stamps (N,) ns when every file name is one (`1670403902.235281229.pcd`, `1670403902235281229.bin`), else None."""
+    parse: Callable[[str], int] = parse_stamp
+    stamps = []
+    for path in files:
+        if not re.fullmatch(r"\d{9,10}[._]\d+|\d{18,19}", path.stem):
+            return None
+        stamps.append(parse(path.stem.replace("_", ".")))
+    return np.array(stamps, np.int64)

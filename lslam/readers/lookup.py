@@ -1,0 +1,90 @@
+"""From what the user typed to a folder: a path, or a name looked up under the data root."""
+
+from __future__ import annotations
+
+import difflib
+import os
+import re
+from pathlib import Path
+
+from lslam.errors import InputError
+
+_SEQUENCE = re.compile(r"(?:.*/)?(?:seq)?(\d{1,2})$")
+_DRIVE_NAME = re.compile(r"(?:(?P<date>\d{4}_\d\d_\d\d)_)?(?:drive_)?(?P<number>\d{4})(?P<kind>_sync|_extract)?$")
+_DRIVE = re.compile(r"(?P<date>\d{4}_\d\d_\d\d)_drive_(?P<number>\d{4})(?P<kind>_sync|_extract)?$")
+_ROOTS = ("", "dataset", "kitti", "kitti/dataset", "raw", "kitti_raw", "kitti/raw")
+
+
+def find_folder(name_or_path: str | Path, data_root: Path | None = None) -> Path:
+    """The folder of a sequence: `name_or_path` itself when it exists, else the name looked up under `data_root`.
+
+    `data_root` is LSLAM_DATA when None. `seq07`, `07` and `kitti/07` find `sequences/07`; a drive is found by its name, by
+    `drive_0005` or `0005` when only one has it. Raises InputError naming where it looked and names that are near.
+    """
+    text = str(name_or_path)
+    path = Path(name_or_path).expanduser()
+    if path.is_dir():
+        return path
+    if path.exists():
+        raise InputError(
+            f"{path} is a file: give the folder of the sequence (a KITTI sequence, a raw drive, or its scans)"
+        )
+    if data_root is None and os.environ.get("LSLAM_DATA"):
+        data_root = Path(os.environ["LSLAM_DATA"])
+    if data_root is None:
+        raise InputError(
+            f"no sequence {text!r}: {path} does not exist; names such as seq07 need --data-root or LSLAM_DATA"
+        )
+    root = data_root.expanduser()
+    if not root.is_dir():
+        raise InputError(f"no sequence {text!r}: the data root {root} does not exist")
+    if (root / text).is_dir():
+        return root / text
+    found = _sequences(root, text) or _drives(root, text)
+    if len(found) == 1:
+        return found[0]
+    if found:
+        raise InputError(f"{text!r} may be any of {', '.join(str(p) for p in found)}: name one of them")
+    raise InputError(_not_found(text, root))
+
+
+def _sequences(root: Path, text: str) -> list[Path]:
+    match = _SEQUENCE.match(text)
+    if not match:
+        return []
+    number = match.group(1).zfill(2)
+    folders = [root / part / "sequences" / number for part in _ROOTS]
+    return [p for p in folders if p.is_dir()][:1]
+
+
+def _drives(root: Path, text: str) -> list[Path]:
+    wanted = _DRIVE_NAME.match(text.rsplit("/", 1)[-1])
+    if not wanted:
+        return []
+    found = []
+    for path in _all_drives(root):
+        have = _DRIVE.match(path.name)
+        assert have is not None
+        if all(wanted[k] in (None, have[k]) for k in ("date", "number", "kind")):
+            found.append(path)
+    return found
+
+
+def _all_drives(root: Path) -> list[Path]:
+    places = [root, *(p for part in _ROOTS if (p := root / part).is_dir() and part)]
+    days = [d for place in places for d in place.glob("[0-9]*_[0-9]*_[0-9]*") if d.is_dir()]
+    candidates = [p for place in [*places, *days] for p in place.glob("*_drive_*") if p.is_dir()]
+    return sorted({p for p in candidates if _DRIVE.match(p.name)})
+
+
+def _not_found(text: str, root: Path) -> str:
+    sequences = [
+        p for part in _ROOTS if (root / part / "sequences").is_dir() for p in (root / part / "sequences").iterdir()
+    ]
+    names = [f"seq{p.name}" for p in sequences if p.is_dir()]
+    names += [p.name for p in _all_drives(root)]
+    names += [p.name for p in root.iterdir() if p.is_dir() and p.name not in ("sequences", "poses")]
+    names = sorted(set(names))
+    near = difflib.get_close_matches(text, names, n=3, cutoff=0.5) or names[:12]
+    hint = f"; there are {', '.join(near)}" if near else "; it is empty"
+    return f"no sequence {text!r}: looked for {Path(text)}, {root / text}, sequences/ and raw drives under {root}{hint}"

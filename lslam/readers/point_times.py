@@ -1,0 +1,83 @@
+"""Per-point times of any sensor to seconds since scan start: the rule is decided once per sequence and said aloud."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.errors import InputError
+
+_UNITS_NS = {"s": 1e9, "ms": 1e6, "us": 1e3, "ns": 1.0}
+# A stored time this near the scan's stamp is a clock reading and not an offset.
+_NEAR_NS = 10e9
+
+
+@dataclass(frozen=True)
+class TimeRule:
+    """How a per-point time field is read.
+
+    ns_per_unit : length of its unit, ns; is_absolute : clock readings instead of offsets
+    is_before_stamp : offsets are negative, the stamp belongs to the scan's end
+    sentence : the decision in words, for the log and the manifest
+    """
+
+    ns_per_unit: float
+    is_absolute: bool
+    is_before_stamp: bool
+    sentence: str
+
+
+def decide_rule(name: str, values: NDArray[Any], stamp_ns: int, rate_hz: float) -> TimeRule:
+    """Find unit and reference of a time field from one scan.
+
+    The unit is the one in which the scan lasts about 1 / `rate_hz`; integers are ns when that fits too. Offsets that are
+    negative refer to the scan's end, values near the stamp or beyond 1e9 s are clock readings (CONVENTIONS).
+    Raises InputError with field, type, range and stamp when no unit fits.
+    """
+    finite = values[np.isfinite(values)] if values.dtype.kind == "f" else values
+    low, high = (float(finite.min()), float(finite.max())) if len(finite) else (0.0, 0.0)
+    period_ns = 1e9 / rate_hz
+    fitting = [u for u, ns in _UNITS_NS.items() if 0.05 <= (high - low) * ns / period_ns <= 3]
+    if not fitting or values.dtype.kind not in "fiu":
+        raise InputError(
+            f"per-point time field {name!r} ({values.dtype}, {low:.9g} to {high:.9g}, scan stamp {stamp_ns} ns) spans no "
+            f"scan of {1 / rate_hz:.3g} s in s, ms, us or ns; state rate_hz in sequence.toml or convert the field"
+        )
+    unit = "ns" if values.dtype.kind in "iu" and "ns" in fitting else fitting[0]
+    scale = _UNITS_NS[unit]
+    is_absolute = low * scale > 1e18 or (low * scale > _NEAR_NS and abs(low * scale - stamp_ns) < _NEAR_NS)
+    is_before_stamp = not is_absolute and low < 0
+    reference = "absolute" if is_absolute else "relative to the scan's end" if is_before_stamp else "since scan start"
+    return TimeRule(
+        scale,
+        is_absolute,
+        is_before_stamp,
+        f"per-point times from field {name!r} ({values.dtype}), {unit}, {reference}",
+    )
+
+
+def apply_rule(rule: TimeRule, values: NDArray[Any], stamp_ns: int) -> tuple[NDArray[np.float32], int]:
+    """Times (N,) float32 s since scan start, and what to add to the stamp (ns) so that it is the scan's start."""
+    if not len(values):
+        return np.zeros(0, np.float32), 0
+    if not rule.is_absolute and not rule.is_before_stamp:
+        return (values * (rule.ns_per_unit * 1e-9)).astype(np.float32), 0
+    first = values[np.isfinite(values)].min() if values.dtype.kind == "f" else values.min()
+    # The difference is taken in the field's own type first: absolute ns do not fit a float.
+    times = ((values - first).astype(np.float64) * (rule.ns_per_unit * 1e-9)).astype(np.float32)
+    if rule.is_before_stamp:
+        return times, round(float(first) * rule.ns_per_unit)
+    start_ns = (
+        int(first) if values.dtype.kind in "iu" and rule.ns_per_unit == 1 else round(float(first) * rule.ns_per_unit)
+    )
+    # Another clock or only nominal stamps: the sequence's own stamps stay.
+    return times, start_ns - stamp_ns if abs(start_ns - stamp_ns) < 1e9 else 0
+
+
+def azimuth_times(points: NDArray[np.float32], sweep_s: float) -> NDArray[np.float32]:
+    """Times (N,) float32 s of a sensor that turns clockwise seen from above and starts behind (KITTI's HDL-64E)."""
+    azimuth = np.arctan2(points[:, 1], points[:, 0])
+    return (0.5 * (1 - azimuth / np.pi) * sweep_s).astype(np.float32)

@@ -1,0 +1,209 @@
+"""A plain folder of scans: `.bin`, `.pcd`, `.ply` or `.npy` files, directly or in a subfolder."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.errors import InputError
+from lslam.formats.kitti_calib import read_odometry_calib
+from lslam.formats.mcd_calib import read_mcd_extrinsics
+from lslam.formats.point_files import SUFFIXES, read_points
+from lslam.formats.sequence_toml import SequenceInfo
+from lslam.readers.folder_sequence import FolderSequence
+from lslam.readers.ground_truth import Voice, find_ground_truth, load_poses, pair_by_number, to_lidar
+from lslam.readers.listing import list_scans, rows_of, stamps_in_names
+from lslam.readers.point_times import TimeRule, decide_rule
+from lslam.readers.sidecars import calibration_over, load_gnss, load_imu, per_point_folder, read_info
+from lslam.readers.stamps import DEFAULT_RATE_HZ, check_stamps, load_stamps, nominal_stamps
+from lslam.types.calibration import Calibration
+from lslam.types.trajectory import Trajectory
+
+KIND = "scan-folder"
+SUBFOLDERS = ("data", "scans", "lidar", "points", "clouds", "pcd", "ply", "bin")
+STAMP_NAMES = ("times.txt", "timestamps.txt", "stamps.txt", "times.csv", "timestamps.csv", "stamps.csv")
+
+
+def locate(folder: Path) -> tuple[Path, str] | None:
+    """`folder` when point files lie in it or in a subfolder of a usual name, and why; None otherwise."""
+    scans = _scans_in(folder)
+    if scans is None:
+        return None
+    # `NN/velodyne` or `drive/velodyne_points/data` themselves are plain folders too: that is how a user gets around a layout.
+    return folder, f"it holds *{scans[1][0].suffix} files in {scans[0].name}/"
+
+
+def open_folder(folder: Path, overrides: SequenceInfo, why: str) -> FolderSequence:
+    """Open the scans of `folder`. Raises InputError when there are none or `sequence.toml` is broken."""
+    info, _ = read_info(folder, overrides)
+    scans = _scans_in(folder)
+    if scans is None:
+        raise InputError(f"{folder} holds no scans ({', '.join('*' + s for s in SUFFIXES)})")
+    _, files, left_out = scans
+    voice = Voice([f"format {KIND}: {why}", *left_out], [])
+    calibration = calibration_over(info, Calibration(T_cam0_lidar=_tr(folder, voice)))
+    files, stamps, rate, truth = _stamps_and_truth(folder, info, files, calibration, voice)
+    correction = info.vertical_correction_deg or 0.0
+    if correction:
+        voice.notes.append(f"vertical correction {correction:g} deg, as stated")
+    rule = None if info.motion_compensated else _time_rule(files, stamps, rate, voice)
+    if info.rows and info.cols:
+        voice.notes.append(f"organised clouds of {info.rows} rows x {info.cols} columns: the row is the ring")
+    return FolderSequence(
+        name=info.name or folder.resolve().name,
+        path=folder,
+        kind=KIND,
+        files=files,
+        stamps_ns=stamps,
+        rate_hz=rate,
+        motion_compensated=info.motion_compensated,
+        calibration=calibration,
+        ground_truth=truth,
+        imu=load_imu(folder, info, voice.problems),
+        gnss=load_gnss(folder, info, voice.problems),
+        correction_deg=correction,
+        rows=info.rows,
+        cols=info.cols,
+        per_point=per_point_folder(folder, info),
+        time_rule=rule,
+        rings=info.rings or info.rows,
+        sensor=info.sensor,
+        notes=voice.notes,
+        problems=voice.problems,
+    )
+
+
+def _scans_in(folder: Path) -> tuple[Path, list[Path], list[str]] | None:
+    for place in (folder, *(folder / name for name in SUBFOLDERS)):
+        if place.is_dir():
+            files, notes = list_scans(place)
+            if files:
+                return place, files, notes
+    return None
+
+
+def _tr(folder: Path, voice: Voice) -> NDArray[np.float64] | None:
+    if not (folder / "calib.txt").is_file():
+        return None
+    try:
+        return read_odometry_calib(folder / "calib.txt")
+    except InputError as error:
+        voice.problems.append(f"calibration is not used: {error}")
+        return None
+
+
+def _stamps_and_truth(
+    folder: Path, info: SequenceInfo, files: list[Path], calibration: Calibration, voice: Voice
+) -> tuple[list[Path], NDArray[np.int64], float, Trajectory | None]:
+    """Stamps from their file, the file names, or the ground truth that goes with the scans by index; else nominal."""
+    found = _own_stamps(folder, info, files, voice)
+    truth_file = find_ground_truth(folder, info, voice)
+    if found is not None:
+        files, stamps, rate = found
+        return files, stamps, rate, _truth(truth_file, folder, info, files, stamps, calibration, voice)
+    rate = info.rate_hz or DEFAULT_RATE_HZ
+    nominal = nominal_stamps(len(files), rate)
+    truth = _truth(truth_file, folder, info, files, nominal, calibration, voice)
+    if truth is not None and truth_file is not None and not np.isin(truth.stamps_ns, nominal).all():
+        numbered = pair_by_number(truth, files)
+        if numbered is not None or len(truth) == len(files):
+            rule = "by its number column" if numbered is not None else "by index"
+            truth = truth if numbered is None else numbered
+            voice.notes.append(f"no stamps of the scans: each takes the stamp of its row of {truth_file.name}, {rule}")
+            stamps, rate = check_stamps(truth.stamps_ns, info.rate_hz, truth_file, voice.problems)
+            return files, stamps, rate, replace(truth, stamps_ns=stamps)
+        voice.problems.append(
+            f"{truth_file} has {len(truth)} stamped poses for {len(files)} scans without stamps: ground truth is not used; "
+            "add times.txt"
+        )
+        truth = None
+    voice.notes.append(
+        f"no stamps of the scans (looked for {', '.join(STAMP_NAMES[:3])} and stamps in file names): stamped at {rate:g} Hz"
+    )
+    return files, nominal, rate, truth
+
+
+def _own_stamps(
+    folder: Path, info: SequenceInfo, files: list[Path], voice: Voice
+) -> tuple[list[Path], NDArray[np.int64], float] | None:
+    names = STAMP_NAMES if info.stamps is None else (info.stamps,)
+    path = next((p for p in (folder / name for name in names) if p.is_file()), None)
+    if path is None and info.stamps is not None:
+        voice.problems.append(f"stamps {folder / info.stamps}, named by sequence.toml, do not exist")
+    stamps = load_stamps(path, voice.problems) if path else None
+    if path is None or stamps is None:
+        in_names = stamps_in_names(files)
+        if in_names is None:
+            return None
+        voice.notes.append("scan stamps from the file names")
+        checked, rate = check_stamps(in_names, info.rate_hz, folder, voice.problems)
+        return files, checked, rate
+    rows, rule = rows_of(files, len(stamps))
+    have = rows >= 0
+    if len(stamps) != len(files):
+        voice.problems.append(
+            f"{path} has {len(stamps)} stamps for {len(files)} scans: the {int(have.sum())} common ones are used, {rule}"
+        )
+    files = [f for f, known in zip(files, have, strict=True) if known]
+    voice.notes.append(f"scan stamps from {path.name}")
+    checked, rate = check_stamps(stamps[rows[have]], info.rate_hz, path, voice.problems)
+    return files, checked, rate
+
+
+def _truth(
+    path: Path | None,
+    folder: Path,
+    info: SequenceInfo,
+    files: list[Path],
+    stamps: NDArray[np.int64],
+    calibration: Calibration,
+    voice: Voice,
+) -> Trajectory | None:
+    if path is None:
+        return None
+    truth = load_poses(path, stamps, files, voice)
+    if truth is None:
+        return None
+    frame = info.ground_truth_frame or truth.frame
+    if frame == "cam0" and info.ground_truth_frame is None and calibration.T_cam0_lidar is None:
+        # Outside KITTI's layout and without a camera calibration, 12 numbers a line are LiDAR poses.
+        frame = "unknown"
+    T_body_lidar = _mcd_extrinsics(folder, voice) if frame == "unknown" else None
+    return to_lidar(truth, frame, calibration, voice, T_body_lidar)
+
+
+def _mcd_extrinsics(folder: Path, voice: Voice) -> NDArray[np.float64] | None:
+    """T_body_lidar of a Multi-Campus recording, where its calibration lies beside the scans."""
+    for path in sorted(folder.glob("*_calib.yaml")):
+        try:
+            T_body_lidar = read_mcd_extrinsics(path)
+        except InputError as error:
+            voice.problems.append(f"extrinsics are not used: {error}")
+            continue
+        if T_body_lidar is not None:
+            voice.notes.append(f"ground truth holds body poses, carried to the LiDAR with os_sensor of {path.name}")
+            return T_body_lidar
+    return None
+
+
+def _time_rule(files: list[Path], stamps: NDArray[np.int64], rate: float, voice: Voice) -> TimeRule | None:
+    """How per-point times of the files are read, decided on the first scan that has any."""
+    if files[0].suffix.lower() == ".bin":
+        return None
+    for path, stamp in zip(files[:5], stamps[:5], strict=True):
+        try:
+            cloud = read_points(path)
+        except InputError:
+            continue
+        if cloud.times is not None and len(cloud):
+            try:
+                rule = decide_rule(cloud.time_field, cloud.times, int(stamp), rate)
+            except InputError as error:
+                voice.problems.append(f"no deskew: {error}")
+                return None
+            voice.notes.append(rule.sentence)
+            return rule
+    return None

@@ -1,0 +1,67 @@
+"""A part of a sequence: what --start, --count and --skip-frames leave."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.errors import UsageError
+from lslam.types.calibration import Calibration
+from lslam.types.gnss import GnssStream
+from lslam.types.imu import ImuStream
+from lslam.types.scan import Scan
+from lslam.types.sequence import Sequence
+from lslam.types.trajectory import Trajectory
+
+
+@dataclass
+class Selection:
+    """Every `step`-th scan of a sequence; scans keep their index of the recording, all else is the sequence's own."""
+
+    whole: Sequence
+    indices: NDArray[np.int64]
+    name: str
+    path: Path
+    kind: str
+    stamps_ns: NDArray[np.int64]
+    rate_hz: float
+    motion_compensated: bool | None
+    calibration: Calibration
+    ground_truth: Trajectory | None
+    imu: ImuStream | None
+    gnss: GnssStream | None
+    notes: list[str]
+    problems: list[str]
+
+    def __len__(self) -> int:
+        return len(self.indices)
+
+    def scan(self, index: int) -> Scan:
+        """Read the `index`-th scan of the selection; its own `index` counts in the whole recording."""
+        if not 0 <= index < len(self.indices):
+            raise IndexError(f"scan {index} of {len(self.indices)}")
+        return self.whole.scan(int(self.indices[index]))
+
+
+def select(sequence: Sequence, start: int = 0, count: int | None = None, skip_frames: int = 1) -> Sequence:
+    """Scans `start`, `start + skip_frames`, ..., at most `count` of them; the sequence itself when that is all.
+
+    `rate_hz` stays the recording's. Raises UsageError when nothing is left or a number is out of range.
+    """
+    if start < 0 or skip_frames < 1 or (count is not None and count < 1):
+        raise UsageError(
+            f"--start {start} --count {count} --skip-frames {skip_frames}: start from 0, the others from 1"
+        )
+    if start >= len(sequence):
+        raise UsageError(f"--start {start} is beyond the last scan of {sequence.name}, which has {len(sequence)} scans")
+    indices = np.arange(start, len(sequence), skip_frames, dtype=np.int64)[:count]
+    if len(indices) == len(sequence):
+        return sequence
+    return Selection(
+        sequence, indices, sequence.name, sequence.path, sequence.kind, sequence.stamps_ns[indices], sequence.rate_hz,
+        sequence.motion_compensated, sequence.calibration, sequence.ground_truth, sequence.imu, sequence.gnss,
+        sequence.notes, sequence.problems,
+    )  # fmt: skip

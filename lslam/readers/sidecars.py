@@ -1,0 +1,113 @@
+"""What lies beside the scans: `sequence.toml`, the IMU and GNSS files it names, and the HDL-64E's vertical correction."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+
+from lslam.errors import InputError
+from lslam.formats.gnss_csv import read_gnss_csv
+from lslam.formats.imu_csv import read_imu_csv
+from lslam.formats.point_files import read_points
+from lslam.formats.sequence_toml import FILE_NAME, SequenceInfo, read_sequence_toml
+from lslam.types.calibration import Calibration
+from lslam.types.gnss import GnssStream
+from lslam.types.imu import ImuStream
+
+T = TypeVar("T")
+
+# Elevation error of KITTI's HDL-64E calibration (Deschaud 2018, IMLS-SLAM).
+HDL64_CORRECTION_DEG = 0.205
+# An HDL-64E looks up to +2 deg; objects close by reach a few more through the laser offsets.
+_HDL64_TOP_DEG = 6.0
+
+
+def read_info(folder: Path, overrides: SequenceInfo) -> tuple[SequenceInfo, bool]:
+    """`overrides` over what `sequence.toml` in `folder` says, and whether there is such a file."""
+    path = folder / FILE_NAME
+    if not path.is_file():
+        return overrides, False
+    return overrides.over(read_sequence_toml(path)), True
+
+
+def vertical_correction(info: SequenceInfo, files: list[Path], notes: list[str]) -> float:
+    """Degrees by which real KITTI HDL-64E points are lifted, 0 where something says otherwise; the reason goes to `notes`."""
+    if info.vertical_correction_deg is not None:
+        degrees = info.vertical_correction_deg
+        notes.append(
+            f"vertical correction {degrees:g} deg, as stated" if degrees else "no vertical correction, as stated"
+        )
+        return degrees
+    if info.sensor is not None and not re.match(
+        r"hdl64", re.sub(r"[^a-z0-9]", "", info.sensor.lower()).replace("velodyne", "")
+    ):
+        notes.append(f"no vertical correction: the sensor is {info.sensor}")
+        return 0.0
+    top = _top_elevation_deg(files)
+    if top is not None and top > _HDL64_TOP_DEG:
+        notes.append(f"no vertical correction: points up to {top:.1f} deg of elevation are no HDL-64E's")
+        return 0.0
+    notes.append(f"vertical correction of {HDL64_CORRECTION_DEG} deg for KITTI's HDL-64E, applied in the reader")
+    return HDL64_CORRECTION_DEG
+
+
+def _top_elevation_deg(files: list[Path]) -> float | None:
+    """99th percentile of elevation in the first scan that can be read, None when there is none."""
+    for path in files[:5]:
+        try:
+            points = read_points(path).points
+        except InputError:
+            continue
+        points = points[np.isfinite(points).all(1)]
+        h = np.hypot(points[:, 0], points[:, 1])
+        far = h > 2
+        if far.sum() >= 100:
+            return float(np.degrees(np.percentile(np.arctan2(points[far, 2], h[far]), 99)))
+    return None
+
+
+def load_imu(folder: Path, info: SequenceInfo, problems: list[str]) -> ImuStream | None:
+    """The IMU file `sequence.toml` names, or `imu.csv` in the sequence folder."""
+    return _load(folder, info.imu, "imu.csv", read_imu_csv, problems)
+
+
+def load_gnss(folder: Path, info: SequenceInfo, problems: list[str]) -> GnssStream | None:
+    """The GNSS file `sequence.toml` names, or `gnss.csv` in the sequence folder."""
+    return _load(folder, info.gnss, "gnss.csv", read_gnss_csv, problems)
+
+
+def calibration_over(info: SequenceInfo, found: Calibration) -> Calibration:
+    """Extrinsics that `sequence.toml` states, else those found."""
+    return Calibration(
+        T_cam0_lidar=found.T_cam0_lidar if info.T_cam0_lidar is None else info.T_cam0_lidar,
+        T_lidar_imu=found.T_lidar_imu if info.T_lidar_imu is None else info.T_lidar_imu,
+        T_lidar_gnss=found.T_lidar_gnss if info.T_lidar_gnss is None else info.T_lidar_gnss,
+    )
+
+
+def per_point_folder(folder: Path, info: SequenceInfo) -> Path | None:
+    """The folder of per-point times and rings that `sequence.toml` names. Raises InputError when it is not there."""
+    if info.per_point is None:
+        return None
+    path = folder / info.per_point
+    if not path.is_dir():
+        raise InputError(f"{path}, named by per_point of {folder / FILE_NAME}, is no folder: correct or remove the key")
+    return path
+
+
+def _load(folder: Path, named: str | None, usual: str, read: Callable[[Path], T], problems: list[str]) -> T | None:
+    path = folder / (named or usual)
+    if not path.is_file():
+        if named is not None:
+            problems.append(f"{path}, named by {FILE_NAME}, does not exist")
+        return None
+    try:
+        stream = read(path)
+    except InputError as error:
+        problems.append(f"not used: {error}")
+        return None
+    return stream
