@@ -58,10 +58,10 @@ def record(
     check_target(out, overwrite)
     part = sequence.with_name(NUMBER + ".part")
     try:
-        _check_space(out, drive)
         shutil.rmtree(part, ignore_errors=True)
         for folder in (part / "velodyne", part / PER_POINT, poses.parent):
             folder.mkdir(parents=True, exist_ok=True)
+        _check_space(out, drive)
         points = _write_scans(drive, part, on_scan)
         _write_texts(drive, part)
         if sequence.exists():
@@ -92,11 +92,8 @@ def check_target(out: Path, overwrite: bool) -> None:
 
 def _check_space(out: Path, drive: SimulatedDrive) -> None:
     """Refuse at once what will not fit, instead of failing hours later."""
-    above = out.absolute()
-    while not above.exists():
-        above = above.parent
     needed = len(drive) * drive.lidar.rays * (16 + 2)
-    free = shutil.disk_usage(above).free
+    free = shutil.disk_usage(out).free
     if needed > free:
         raise OutputError(
             f"{out} needs up to {needed / 1e9:.1f} GB, the disk has {free / 1e9:.1f} GB left: use fewer scans (--count)"
