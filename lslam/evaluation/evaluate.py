@@ -21,6 +21,8 @@ from lslam.geometry import se3
 from lslam.types.calibration import Calibration
 from lslam.types.trajectory import Trajectory
 
+__all__ = ["Evaluation", "evaluate"]
+
 log = logging.getLogger("lslam")
 Floats = NDArray[np.float64]
 

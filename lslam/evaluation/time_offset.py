@@ -12,8 +12,10 @@ from lslam.types.trajectory import Trajectory
 
 Floats = NDArray[np.float64]
 LEAST_OVERLAP = 0.6  # of the shorter trajectory
-LEAST_SCORE = 0.6
+LEAST_SCORE = 0.8
 SAME_STAMPS_NS = 1_000_000
+WINDOW = 5
+AMBIGUOUS = 1.2
 
 
 def estimate_offset(estimate: Trajectory, truth: Trajectory) -> tuple[int, float]:
@@ -33,7 +35,7 @@ def estimate_offset(estimate: Trajectory, truth: Trajectory) -> tuple[int, float
     step = _step(estimate, truth)
     a, b = _rates(estimate, step), _rates(truth, step)
     if min(len(a), len(b)) < 10:
-        raise InputError(f"--time-offset auto: the trajectories are shorter than 10 samples of {step / 1e9:.2f} s")
+        raise InputError(f"--time-offset auto: the trajectories are shorter than 15 samples of {step / 1e9:.2f} s")
     scores, lags = _correlation(a, b)
     if not len(scores) or scores.max() < LEAST_SCORE:
         best = f"{scores.max():.2f}" if len(scores) else "none"
@@ -42,10 +44,26 @@ def estimate_offset(estimate: Trajectory, truth: Trajectory) -> tuple[int, float
             f"{LEAST_SCORE} needed; estimate {time_range(estimate)}, ground truth {time_range(truth)}); "
             "give the offset in seconds"
         )
-    lag = int(lags[np.argmax(scores)]) * step
-    start = int(truth.stamps_ns[0]) - int(estimate.stamps_ns[0]) + lag
-    offset = _refine(estimate, truth, start, step)
-    return _snap(estimate, truth, offset, step), float(scores.max())
+    zero = int(truth.stamps_ns[0]) - int(estimate.stamps_ns[0])
+    peaks = _peaks(scores, lags)
+    refined = [(_refine(estimate, truth, zero + int(lags[p]) * step, step), p) for p in peaks]
+    (cost, offset, best), *others = sorted((cost, offset, p) for (offset, cost), p in refined)
+    if others and others[0][0] < AMBIGUOUS * cost:
+        raise InputError(
+            f"--time-offset auto: {offset / 1e9:.3f} s and {others[0][1] / 1e9:.3f} s fit alike; give the offset in seconds"
+        )
+    return _snap(estimate, truth, offset, step), float(scores[best])
+
+
+def _peaks(scores: Floats, lags: NDArray[np.int64]) -> list[int]:
+    """Indices of the best scores that are neither poor nor neighbours of a better one, at most 20."""
+    chosen: list[int] = []
+    for k in np.argsort(-scores, kind="stable")[:2000].tolist():
+        if scores[k] < LEAST_SCORE or len(chosen) == 20:
+            break
+        if all(abs(int(lags[k] - lags[c])) > 2 * WINDOW for c in chosen):
+            chosen.append(k)
+    return chosen
 
 
 def _step(estimate: Trajectory, truth: Trajectory) -> int:
@@ -55,14 +73,17 @@ def _step(estimate: Trajectory, truth: Trajectory) -> int:
 
 
 def _rates(t: Trajectory, step: int, first: int | None = None, count: int | None = None) -> Floats:
-    """(M, 2) speed m/s and rotation rate rad/s over intervals of `step` ns."""
+    """(M, 2) speed m/s and rotation rate rad/s, a sample every `step` ns, each over WINDOW samples against pose noise."""
     first = int(t.stamps_ns[0]) if first is None else first
     if count is None:
         count = int((t.stamps_ns[-1] - t.stamps_ns[0]) // step) + 1
+    if count <= WINDOW:
+        return np.zeros((0, 2))
     poses = interpolate.poses_at(t.stamps_ns, t.poses, first + step * np.arange(count))
-    speed = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
-    turn = so3.angle(np.swapaxes(poses[:-1, :3, :3], -1, -2) @ poses[1:, :3, :3])
-    return np.stack([speed, turn], axis=1) * (1e9 / step)
+    start, end = poses[:-WINDOW], poses[WINDOW:]
+    speed = np.linalg.norm(end[:, :3, 3] - start[:, :3, 3], axis=1)
+    turn = so3.angle(np.swapaxes(start[:, :3, :3], -1, -2) @ end[:, :3, :3])
+    return np.stack([speed, turn], axis=1) * (1e9 / (WINDOW * step))
 
 
 def _correlation(a: Floats, b: Floats) -> tuple[Floats, NDArray[np.int64]]:
@@ -95,15 +116,15 @@ def _correlation(a: Floats, b: Floats) -> tuple[Floats, NDArray[np.int64]]:
     return total[allowed] / channels, lags[allowed]
 
 
-def _refine(estimate: Trajectory, truth: Trajectory, start: int, step: int) -> int:
-    """The shift within one sample of `start` at which the rates differ least."""
+def _refine(estimate: Trajectory, truth: Trajectory, start: int, step: int) -> tuple[int, float]:
+    """The shift within one sample of `start` at which the rates differ least, and by how much (0..1)."""
     from scipy.optimize import minimize_scalar
 
     low = max(int(estimate.stamps_ns[0]), int(truth.stamps_ns[0]) - start + step)
     high = min(int(estimate.stamps_ns[-1]), int(truth.stamps_ns[-1]) - start - step)
     count = (high - low) // step + 1
-    if count < 3:
-        return start
+    if count < WINDOW + 3:
+        return start, 1.0
     own = _rates(estimate, step, low, count)
     scale = own.std(axis=0) + np.array([0.02, 0.002])
 
@@ -112,7 +133,7 @@ def _refine(estimate: Trajectory, truth: Trajectory, start: int, step: int) -> i
         return float(np.mean(np.minimum(np.abs(own - other) / scale, 1.0) ** 2))
 
     best = minimize_scalar(cost, bounds=(-step, step), method="bounded", options={"xatol": 1e4})
-    return start + round(float(best.x))
+    return start + round(float(best.x)), float(best.fun)
 
 
 def _snap(estimate: Trajectory, truth: Trajectory, offset: int, step: int) -> int:

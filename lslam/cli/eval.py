@@ -1,0 +1,197 @@
+"""`lslam eval`: score estimated trajectories against ground truth."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from lslam.cli import options
+
+if TYPE_CHECKING:
+    from lslam.config.eval import EvalConfig
+    from lslam.evaluation.results import Evaluation
+    from lslam.evaluation.timing import Timing
+    from lslam.types.calibration import Calibration
+    from lslam.types.trajectory import Trajectory
+
+FORMATS = ["kitti", "tum", "euroc", "csv"]
+EPILOG = """\b
+Examples:
+  lslam eval runs/seq07-icp poses/07.txt
+  lslam eval ours.tum theirs.tum gt.csv --align se3 --delta 1scan --delta 100m/all
+  lslam eval runs/seq07-icp poses/07.txt --fail-ate 1.0 --fail-drift 0.6
+"""
+
+
+@click.command(epilog=EPILOG)
+@click.argument("estimates", metavar="EST...", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.argument("truth", metavar="GT", type=click.Path(path_type=Path))
+@click.option(
+    "--align", multiple=True, metavar="A[,A]", help="ATE alignments: none, origin, se3, sim3, posyaw  [se3,origin]."
+)
+@click.option(
+    "--delta",
+    multiple=True,
+    metavar="D",
+    help="RPE distance: 1scan, 10m, 2s, with /consecutive or /all  [1scan, 10m/all].",
+)
+@click.option("--max-diff", type=float, metavar="S", help="Largest difference of stamps in a pair  [0.01].")
+@click.option(
+    "--time-offset", metavar="S|auto", help="Seconds added to the estimate's stamps, or found by correlating motion."
+)
+@click.option(
+    "--T-est-gt", "transform", metavar="T", help="Truth's body in the estimate's: 12, 16 or 7 numbers, or a file."
+)
+@click.option(
+    "--calib", type=click.Path(path_type=Path), metavar="FILE", help="KITTI calibration, for camera 0 against LiDAR."
+)
+@click.option("--times", type=click.Path(path_type=Path), metavar="FILE", help="Stamps of KITTI files, one per line.")
+@click.option(
+    "--format", "file_format", type=click.Choice(FORMATS), help="Format of the estimates; detected by default."
+)
+@click.option("--gt-format", type=click.Choice(FORMATS), help="Format of the ground truth; detected by default.")
+@click.option(
+    "--timing", "timing_file", type=click.Path(path_type=Path), metavar="CSV", help="timing.csv of the one estimate."
+)
+@options.as_json
+@click.option("--table", type=click.Choice(["text", "md", "csv", "tex"]), default="text", help="Style of the table.")
+@click.option("--plot", type=click.Path(path_type=Path), metavar="FILE", help="Draw a .png, .svg or .pdf.")
+@click.option("--fail-ate", type=float, metavar="M", help="Exit 4 when the first ATE's rmse is larger.")
+@click.option("--fail-rpe", type=float, metavar="M", help="Exit 4 when the first RPE's translational rmse is larger.")
+@click.option("--fail-drift", type=float, metavar="PERCENT", help="Exit 4 when the KITTI drift is larger.")
+@options.configuration
+@options.verbosity
+def command(
+    estimates: tuple[Path, ...], truth: Path, as_json: bool, table: str, plot: Path | None, **given: Any
+) -> None:
+    """Score estimated trajectories (files or run folders) against ground truth.
+
+    Formats are detected: KITTI, TUM, EuRoC, CSV with named columns. Every number is printed with its recipe.
+    """
+    from lslam.cli.console import setup_logging
+    from lslam.reports import evaluation_json, evaluation_plot, evaluation_table
+
+    setup_logging(given["verbose"], given["quiet"])
+    if plot is not None:
+        evaluation_plot.check_plot_path(plot)
+    config = _config(given)
+    evaluations = _evaluate_all(estimates, truth, config, given)
+    timings = [_timing(path, given["timing_file"], len(estimates)) for path in estimates]
+    if as_json:
+        click.echo(evaluation_json.to_json(evaluations, timings))
+    else:
+        click.echo(evaluation_table.render(evaluations, timings, table))
+    if plot is not None:
+        evaluation_plot.write_plot(plot, evaluations)
+    _hold_gates(evaluations, given)
+
+
+def _config(given: dict[str, Any]) -> EvalConfig:
+    """Section `eval` with the flags over it."""
+    from pydantic import ValidationError
+
+    from lslam.config import load_config
+    from lslam.config.eval import EvalConfig
+    from lslam.errors import UsageError, nearest
+    from lslam.evaluation.relative import parse_delta
+    from lslam.evaluation.results import ALIGNMENTS
+
+    values = load_config(given["config_file"], given["settings"]).eval.model_dump()
+    align = [name for text in given["align"] for name in text.split(",") if name]
+    for name in align:
+        if name not in ALIGNMENTS:
+            raise UsageError(f"--align {name}: {nearest(name, ALIGNMENTS)}")
+    deltas = [part for text in given["delta"] for part in text.split(",") if part]
+    offset = given["time_offset"]
+    if offset is not None and offset != "auto":
+        try:
+            offset = float(offset)
+        except ValueError:
+            raise UsageError(f"--time-offset {offset}: seconds, or auto") from None
+    flags = {"align": align, "delta": deltas, "max_diff": given["max_diff"], "time_offset": offset}
+    values.update({key: value for key, value in flags.items() if value not in (None, [])})
+    for delta in values["delta"]:
+        parse_delta(delta)
+    try:
+        return EvalConfig.model_validate(values)
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise UsageError(f"{first['loc'][0]} = {first['input']!r}: {first['msg']}") from None
+
+
+def _evaluate_all(
+    estimates: tuple[Path, ...], truth: Path, config: EvalConfig, given: dict[str, Any]
+) -> list[Evaluation]:
+    from lslam.errors import InputError
+    from lslam.evaluation.evaluate import evaluate
+    from lslam.formats.trajectory_files import read_trajectory
+    from lslam.formats.transform_text import read_transform
+
+    ground_truth = read_trajectory(truth, given["gt_format"], given["times"])
+    T_est_gt = None if given["transform"] is None else read_transform(given["transform"])
+    calibration = _calibration(truth, given["calib"])
+    evaluations = []
+    for path in estimates:
+        estimate: Trajectory = read_trajectory(path, given["file_format"], given["times"])
+        result = evaluate(estimate, ground_truth, config, T_est_gt=T_est_gt, calibration=calibration)
+        for name, error in result.ate.items():
+            if given["align"] and not error.available:
+                raise InputError(f"--align {name}: {error.note} for {path} against {truth}; use --align origin")
+        evaluations.append(result)
+    return evaluations
+
+
+def _calibration(truth: Path, calib: Path | None) -> Calibration | None:
+    """--calib, or the calibration that lies where KITTI puts it for this ground truth."""
+    from lslam.formats import kitti_calib
+    from lslam.types.calibration import Calibration
+
+    if calib is not None:
+        return Calibration(T_cam0_lidar=kitti_calib.read_cam0_lidar(calib))
+    above = truth.resolve().parent
+    for found in (above / "calib.txt", above.parent / "sequences" / truth.stem / "calib.txt"):
+        if found.is_file():
+            return Calibration(T_cam0_lidar=kitti_calib.read_odometry_calib(found))
+    return None
+
+
+def _timing(estimate: Path, given: Path | None, count: int) -> Timing | None:
+    """--timing, or the timing.csv beside the estimate."""
+    from lslam.errors import UsageError
+    from lslam.evaluation.timing import read_timing
+
+    if given is not None:
+        if count > 1:
+            raise UsageError("--timing belongs to one estimate; with several, put timing.csv beside each")
+        return read_timing(given)
+    beside = (estimate if estimate.is_dir() else estimate.parent) / "timing.csv"
+    return read_timing(beside) if beside.is_file() else None
+
+
+def _hold_gates(evaluations: list[Evaluation], given: dict[str, Any]) -> None:
+    """GateError naming every number that is over its gate; a number that is not available holds no gate."""
+    from lslam.errors import GateError
+
+    broken = []
+    for e in evaluations:
+        ate = next((error for error in e.ate.values() if error.translation), None)
+        rpe = e.rpe[0]
+        values = {
+            "fail_ate": (
+                f"ATE {ate.alignment} rmse" if ate else "ATE",
+                ate and ate.translation and ate.translation.rmse,
+                "m",
+            ),
+            "fail_rpe": (f"RPE {rpe.name} rmse", rpe.translation and rpe.translation.rmse, "m"),
+            "fail_drift": ("KITTI drift", e.kitti_drift.translation_percent if e.kitti_drift.available else None, "%"),
+        }
+        for key, (what, value, unit) in values.items():
+            gate = given[key]
+            if gate is None or (value is not None and value <= gate):
+                continue
+            number = "n/a" if value is None else f"{value:.4g} {unit}"
+            broken.append(f"{what} of {e.estimate} is {number}, --{key.replace('_', '-')} allows {gate:g} {unit}")
+    if broken:
+        raise GateError("; ".join(broken))

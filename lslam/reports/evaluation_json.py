@@ -1,0 +1,137 @@
+"""`evaluation.json`: every value beside its recipe, under a schema with a version. Strict JSON: what is not known is null.
+
+Version 1, one estimate:
+
+    schema, version, lslam, estimate, ground_truth
+    association   {recipe, matched, possible, time_offset_s}
+    path_length_m, notes[]
+    ate.<alignment>   {recipe, available, note, rmse, mean, median, std, min, max, sse, n (m), rotation_deg{..}, horizontal{..},
+                       vertical{..}, percent_of_length, T_gt_est, scale}
+    rpe[]         {recipe, delta, unit, pairs, n_pairs, note, translation{..} (m), rotation_deg{..}}
+    kitti_drift   {recipe, available, note, translation_percent, rotation_deg_per_100m, segments, by_length.<m>{..}}
+    thesis1, thesis2, timing
+
+Several estimates: {schema, version, evaluations: [the above, ...]}.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from lslam.errors import OutputError
+from lslam.evaluation.results import AbsoluteError, Evaluation, KittiDrift, RelativeError
+from lslam.evaluation.statistics import Statistics
+from lslam.evaluation.timing import Timing
+from lslam.version import __version__
+
+SCHEMA, VERSION = "lslam-evaluation", 1
+Document = dict[str, Any]
+
+
+def to_document(evaluation: Evaluation, timing: Timing | None = None) -> Document:
+    """The evaluation as plain values, ready for `json.dumps`; numbers that are NaN or infinite become None."""
+    e = evaluation
+    t1, t2 = asdict(e.thesis1), asdict(e.thesis2)
+    for arrays in ("xyz", "rpy_deg", "angular"):
+        t1.pop(arrays)
+    document = {
+        "schema": SCHEMA,
+        "version": VERSION,
+        "lslam": __version__,
+        "estimate": e.estimate,
+        "ground_truth": e.ground_truth,
+        "association": {
+            "recipe": e.association,
+            "matched": e.matched,
+            "possible": e.possible,
+            "time_offset_s": e.time_offset,
+        },
+        "path_length_m": e.path_length,
+        "notes": list(e.notes),
+        "ate": {name: _absolute(error) for name, error in e.ate.items()},
+        "rpe": [_relative(error) for error in e.rpe],
+        "kitti_drift": _drift(e.kitti_drift),
+        "thesis1": t1,
+        "thesis2": t2,
+        "timing": None if timing is None else {"recipe": "s per scan, from timing.csv", **asdict(timing)},
+    }
+    strict = _strict(document)
+    assert isinstance(strict, dict)
+    return strict
+
+
+def to_json(evaluations: Sequence[Evaluation], timings: Sequence[Timing | None] = ()) -> str:
+    """One JSON object: the document of one evaluation, or a list of them under `evaluations`."""
+    padded = [*timings, *[None] * (len(evaluations) - len(timings))]
+    documents = [to_document(e, t) for e, t in zip(evaluations, padded, strict=True)]
+    whole = documents[0] if len(documents) == 1 else {"schema": SCHEMA, "version": VERSION, "evaluations": documents}
+    return json.dumps(whole, indent=2, allow_nan=False)
+
+
+def write_json(path: str | Path, evaluations: Sequence[Evaluation], timings: Sequence[Timing | None] = ()) -> None:
+    """Write `to_json` to `path`, atomically. Raises OutputError when that is impossible."""
+    path = Path(path)
+    part = path.with_name(path.name + ".part")
+    try:
+        part.write_text(to_json(evaluations, timings) + "\n", encoding="utf-8")
+        part.replace(path)
+    except OSError as error:
+        part.unlink(missing_ok=True)
+        raise OutputError(f"{path} cannot be written: {error.strerror}") from None
+
+
+def _absolute(error: AbsoluteError) -> Document:
+    return {
+        "recipe": error.recipe,
+        "available": error.available,
+        "note": error.note,
+        "unit": "m",
+        **_statistics(error.translation),
+        "rotation_deg": _statistics(error.rotation_deg),
+        "horizontal": _statistics(error.horizontal),
+        "vertical": _statistics(error.vertical),
+        "percent_of_length": error.percent_of_length,
+        "T_gt_est": error.T_gt_est.tolist(),
+        "scale": error.scale,
+    }
+
+
+def _relative(error: RelativeError) -> Document:
+    return {
+        "recipe": error.recipe,
+        "delta": error.delta,
+        "unit": error.unit,
+        "pairs": error.pairs,
+        "n_pairs": error.n_pairs,
+        "note": error.note,
+        "translation": _statistics(error.translation),
+        "rotation_deg": _statistics(error.rotation_deg),
+    }
+
+
+def _drift(drift: KittiDrift) -> Document:
+    names = ("translation_percent", "rotation_deg_per_100m", "segments")
+    whole = asdict(drift)
+    lengths = {str(length): dict(zip(names, values, strict=True)) for length, values in drift.by_length.items()}
+    return {"recipe": whole.pop("recipe"), **whole, "by_length": lengths}
+
+
+def _statistics(values: Statistics | None) -> Document:
+    if values is None:
+        return {**dict.fromkeys(("rmse", "mean", "median", "std", "min", "max", "sse")), "n": 0}
+    return asdict(values)
+
+
+def _strict(value: Any) -> Any:
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, dict):
+        return {key: _strict(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_strict(item) for item in value]
+    return value

@@ -1,0 +1,126 @@
+"""Evaluations as one picture: trajectories from above, height, errors over distance, errors per axis."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lslam.errors import OutputError, UsageError, nearest
+from lslam.evaluation.results import AbsoluteError, Evaluation
+
+FORMATS = ("png", "svg", "pdf")
+COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")  # Okabe and Ito: safe for colour blindness
+
+
+def check_plot_path(path: Path) -> None:
+    """UsageError when the suffix of `path` names no picture format we write: asked before the work, not after."""
+    kind = path.suffix.lstrip(".").lower()
+    if kind not in FORMATS:
+        raise UsageError(f"--plot {path}: {nearest(kind, FORMATS) if kind else 'end the name with .png, .svg or .pdf'}")
+
+
+def write_plot(path: str | Path, evaluations: Sequence[Evaluation], names: Sequence[str] | None = None) -> None:
+    """Draw evaluations against one ground truth into `path` (.png, .svg, .pdf), atomically.
+
+    Raises UsageError for another suffix, OutputError when the file cannot be written.
+    """
+    path = Path(path)
+    check_plot_path(path)
+    from matplotlib import rc_context
+
+    # Text stays text, and the same input gives the same bytes.
+    with rc_context({"svg.hashsalt": "lslam", "svg.fonttype": "none", "font.size": 9}):
+        figure = _draw(evaluations, names or [Path(e.estimate).stem for e in evaluations])
+        kind = path.suffix.lstrip(".").lower()
+        part = path.with_name(path.name + ".part")
+        try:
+            stamp: dict[str, Any] = {"svg": {"Date": None}, "pdf": {"CreationDate": None}, "png": {}}[kind]
+            figure.savefig(part, format=kind, dpi=120, metadata=stamp)
+            part.replace(path)
+        except OSError as error:
+            part.unlink(missing_ok=True)
+            raise OutputError(f"{path} cannot be written: {error.strerror}") from None
+
+
+def _draw(evaluations: Sequence[Evaluation], names: Sequence[str]) -> Any:
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(13, 9), layout="constrained")
+    grid = figure.add_gridspec(4, 2, width_ratios=[1.15, 1])
+    above, height = figure.add_subplot(grid[:3, 0]), figure.add_subplot(grid[3, 0])
+    position, rotation = figure.add_subplot(grid[0, 1]), figure.add_subplot(grid[1, 1])
+    axes, drift = figure.add_subplot(grid[2, 1]), figure.add_subplot(grid[3, 1])
+    shown = [_best_alignment(e) for e in evaluations]
+    _trajectories(above, height, evaluations, names, shown)
+    for e, name, error, colour in zip(evaluations, names, shown, _colours(len(names)), strict=True):
+        position.plot(e.distance, np.linalg.norm(error.errors, axis=1), color=colour, lw=1.1, label=name)
+        rotation.plot(e.distance, error.rotation_errors_deg, color=colour, lw=1.1)
+        if e.kitti_drift.available:
+            lengths = sorted(e.kitti_drift.by_length)
+            drift.plot(lengths, [e.kitti_drift.by_length[n][0] for n in lengths], "o-", ms=3, color=colour)
+    rmse = ", ".join(f"{error.translation.rmse:.3f} m" for error in shown if error.translation)
+    position.set_title(f"position error, alignment {shown[0].alignment}: rmse {rmse}", fontsize=9)
+    rotation.set_title("rotation error, same alignment", fontsize=9)
+    _label(position, "", "m")
+    _label(rotation, "distance along ground truth, m", "deg")
+    _axis_errors(axes, evaluations[0], names[0])
+    _drift_axes(drift, evaluations)
+    return figure
+
+
+def _trajectories(
+    above: Any, height: Any, evaluations: Sequence[Evaluation], names: Sequence[str], shown: Sequence[AbsoluteError]
+) -> None:
+    first = evaluations[0]
+    above.plot(*first.gt_positions[:, :2].T, color="black", lw=2.5, alpha=0.35, label="ground truth")
+    height.plot(first.distance, first.gt_positions[:, 2], color="black", lw=2.5, alpha=0.35)
+    for e, name, error, colour in zip(evaluations, names, shown, _colours(len(names)), strict=True):
+        above.plot(*error.aligned_positions[:, :2].T, color=colour, lw=1.2, label=f"{name} ({error.alignment})")
+        height.plot(e.distance, error.aligned_positions[:, 2], color=colour, lw=1.1)
+    above.plot(*first.gt_positions[0, :2], "o", color="black", ms=5)
+    above.annotate("start", first.gt_positions[0, :2], textcoords="offset points", xytext=(6, 6))
+    above.set_aspect("equal", adjustable="datalim")
+    above.legend(loc="best", frameon=False)
+    above.set_title(f"seen from above; {first.matched} poses, {first.path_length:.1f} m", fontsize=9)
+    _label(above, "x, m", "y, m")
+    _label(height, "distance along ground truth, m", "z, m")
+
+
+def _axis_errors(plot: Any, evaluation: Evaluation, name: str) -> None:
+    for k, axis in enumerate("xyz"):
+        plot.plot(evaluation.distance, evaluation.thesis1.xyz[:, k], lw=1.0, color=COLOURS[k], label=axis)
+    plot.legend(loc="best", ncol=3, frameon=False)
+    plot.set_title(f"error per axis, alignment origin: {name}", fontsize=9)
+    _label(plot, "distance along ground truth, m", "m")
+
+
+def _drift_axes(plot: Any, evaluations: Sequence[Evaluation]) -> None:
+    if any(e.kitti_drift.available for e in evaluations):
+        plot.set_title("KITTI drift over segment length", fontsize=9)
+        plot.set_ylim(bottom=0)
+        _label(plot, "segment, m", "%")
+        return
+    plot.set_axis_off()
+    plot.text(0.5, 0.5, f"KITTI drift: {evaluations[0].kitti_drift.note}", ha="center", va="center")
+
+
+def _best_alignment(evaluation: Evaluation) -> AbsoluteError:
+    """The first alignment asked for that is determined; the origin's errors otherwise."""
+    for error in evaluation.ate.values():
+        if error.available:
+            return error
+    raise UsageError(f"--plot: no alignment of {evaluation.estimate} is determined; add --align origin")
+
+
+def _colours(count: int) -> list[str]:
+    return [COLOURS[k % len(COLOURS)] for k in range(count)]
+
+
+def _label(plot: Any, x: str, y: str) -> None:
+    plot.set_xlabel(x)
+    plot.set_ylabel(y)
+    plot.grid(alpha=0.25)
+    plot.spines[["top", "right"]].set_visible(False)
