@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -39,8 +38,8 @@ def natural_key(path: Path) -> list[tuple[int, int, str]]:
 
 
 def file_numbers(files: list[Path]) -> NDArray[np.int64] | None:
-    """The number in each name when all names are plain numbers of up to nine digits, else None."""
-    if not all(re.fullmatch(r"\d{1,9}", p.stem) for p in files):
+    """The number in each name when all names are plain numbers below 1e9 (larger ones are times), else None."""
+    if not all(re.fullmatch(r"0*\d{1,9}", p.stem) for p in files):
         return None
     return np.array([int(p.stem) for p in files], np.int64)
 
@@ -61,10 +60,9 @@ def rows_of(files: list[Path], count: int) -> tuple[NDArray[np.int64], str]:
 
 def stamps_in_names(files: list[Path]) -> NDArray[np.int64] | None:
     """Stamps (N,) ns when every file name is one (`1670403902.235281229.pcd`, `1670403902235281229.bin`), else None."""
-    parse: Callable[[str], int] = parse_stamp
     stamps = []
     for path in files:
         if not re.fullmatch(r"\d{9,10}[._]\d+|\d{18,19}", path.stem):
             return None
-        stamps.append(parse(path.stem.replace("_", ".")))
+        stamps.append(parse_stamp(path.stem.replace("_", ".")))
     return np.array(stamps, np.int64)

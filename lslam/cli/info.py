@@ -1,0 +1,131 @@
+"""`lslam info`: what is in a sequence, and what is wrong with it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import click
+
+from lslam.cli import options
+
+
+@click.command(epilog="Example: lslam info sample_data")
+@click.argument("sequence")
+@options.data_root
+@click.option("--scans", type=click.IntRange(min=1), default=50, show_default=True, metavar="N",
+              help="Scans whose points are looked at, spread evenly.")  # fmt: skip
+@click.option("--all", "all_scans", is_flag=True, help="Look at the points of every scan.")
+@click.option("--rows", type=int, metavar="N", help="Organised clouds: rows (rings).")
+@click.option("--cols", type=int, metavar="N", help="Organised clouds: columns.")
+@options.as_json
+def command(
+    sequence: str,
+    data_root: Path | None,
+    scans: int,
+    all_scans: bool,
+    rows: int | None,
+    cols: int | None,
+    as_json: bool,
+) -> None:
+    """Show what is in SEQUENCE: a folder, or a name under the data root."""
+    from lslam.pipeline.inspect import inspect
+    from lslam.readers import open_sequence
+
+    opened = open_sequence(sequence, data_root=data_root, rows=rows, cols=cols)
+    facts = inspect(opened, None if all_scans else scans)
+    if as_json:
+        import json
+
+        click.echo(json.dumps(facts, indent=1, allow_nan=False))
+        return
+    for label, value in _lines(facts):
+        click.echo(f"{label:<18} {value}".rstrip())
+    for title in ("notes", "problems"):
+        if facts[title]:
+            click.echo(f"\n{title}")
+            for sentence in facts[title]:
+                click.echo(f"  - {sentence}")
+    if not facts["problems"]:
+        click.echo("\nno problems found")
+
+
+def _lines(facts: dict[str, Any]) -> Iterator[tuple[str, str]]:
+    time, points = facts["time"], facts["points"]
+    yield "sequence", f"{facts['name']}  ({facts['path']})"
+    yield "format", facts["format"] + (f", sensor {facts['sensor']}" if facts["sensor"] else "")
+    yield "scans", f"{facts['scans']} in {time['duration_s']:.2f} s, {time['rate_hz']:g} Hz"
+    if time["period_s"]:
+        period = time["period_s"]
+        gaps = len(time["gaps"])
+        yield (
+            "period",
+            f"{_ms(period['min'])} .. {_ms(period['median'])} .. {_ms(period['max'])} ms, {gaps or 'no'} gaps",
+        )
+    yield "scans looked at", _looked_at(points)
+    if points["count"]:
+        count = points["count"]
+        yield "points per scan", f"{count['min']:,} .. {count['median']:,.0f} .. {count['max']:,}  (min, median, max)"
+        yield "NaN, zero points", f"{points['share_nan']:.2%}, {points['share_zero']:.2%}"
+    if points["range_m"]:
+        r = points["range_m"]
+        yield (
+            "range",
+            f"{r['min']:.2f} .. {r['max']:.2f} m, median {r['median']:.1f}, 5..95 %: {r['p5']:.1f} .. {r['p95']:.1f}",
+        )
+        low, high = points["elevation_deg"]
+        yield "elevation", f"{low:.1f} .. {high:.1f} deg (98 % of the points)"
+    yield "intensity", _limits(points["intensity"], "")
+    yield "per-point times", _limits(points["per_point_times"], " s since scan start")
+    yield "rings", _limits(points["rings"], "")
+    yield "compensated", {True: "yes", False: "no", None: "unknown"}[facts["motion_compensated"]]
+    known = [key for key, T in facts["extrinsics"].items() if T is not None]
+    yield "extrinsics", ", ".join(known) or "none"
+    yield "IMU", _imu(facts["imu"])
+    yield "GNSS", _gnss(facts["gnss"])
+    yield "ground truth", _ground_truth(facts["ground_truth"])
+
+
+def _looked_at(points: dict[str, Any]) -> str:
+    extra = [f"{points[key]} {word}" for key, word in (("scans_unreadable", "unreadable"), ("scans_empty", "empty"))
+             if points[key]]  # fmt: skip
+    return f"{points['scans_read'] + points['scans_unreadable']}" + (f" ({', '.join(extra)})" if extra else "")
+
+
+def _ms(seconds: float) -> str:
+    return f"{seconds * 1e3:.1f}"
+
+
+def _limits(limits: list[float] | None, unit: str) -> str:
+    return "none" if limits is None else f"{limits[0]:.6g} .. {limits[1]:.6g}{unit}"
+
+
+def _imu(imu: dict[str, Any] | None) -> str:
+    if imu is None:
+        return "none"
+    rate = f"{imu['rate_hz']:.1f} Hz, " if imu["rate_hz"] else ""
+    unit = imu["gravity_unit"] or "of unknown unit"
+    return (
+        f"{imu['samples']} samples, {rate}mean specific force {imu['gravity_norm']:.3f} {unit}, "
+        f"turning {imu['gyro_median_deg_s']:.1f} deg/s (median)"
+    )
+
+
+def _gnss(gnss: dict[str, Any] | None) -> str:
+    if gnss is None:
+        return "none"
+    lat, lon, alt = gnss["first"]
+    sigma = gnss["sigma_m"]
+    accuracy = f", sigma {sigma['median']:.2f} m median, {sigma['max']:.2f} m worst" if sigma else ", accuracy unknown"
+    return f"{gnss['fixes']} fixes from {lat:.7f}, {lon:.7f}, {alt:.1f} m{accuracy}"
+
+
+def _ground_truth(truth: dict[str, Any] | None) -> str:
+    if truth is None:
+        return "none"
+    x, y, z = truth["extent_m"]
+    return (
+        f"{truth['poses']} {truth['frame']} poses ({truth['source']}), path {truth['path_length_m']:.2f} m, "
+        f"extent {x:.1f} x {y:.1f} x {z:.1f} m"
+    )
