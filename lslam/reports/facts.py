@@ -46,7 +46,7 @@ class Degeneracy:
 class RunFacts:
     """Numbers of a run.
 
-    status : `ok`, `degraded`, `diverged`, `interrupted` or what else the manifest says; reasons : why, one sentence each
+    status : the manifest's word: `done`, `degraded`, `diverged`, `interrupted`, `failed`; reasons : why, one sentence each
     path_length : m; duration : s between the first and the last pose
     stages : in the order they ran; total : the sum of stages per scan
     over_limit : scans whose stages took longer than the real-time limit
@@ -67,6 +67,11 @@ class RunFacts:
     total: StageTime | None
     over_limit: int
     real_time_factor: float
+
+    @property
+    def is_flawless(self) -> bool:
+        """Nothing at all went wrong."""
+        return self.status in ("done", "ok") and not (self.reasons or self.failures or self.degenerate)
 
 
 def run_facts(record: RunRecord) -> RunFacts:
@@ -127,9 +132,11 @@ def _status(record: RunRecord, failed: bool) -> tuple[str, tuple[str, ...]]:
     more = record.manifest.get("problems")
     if isinstance(more, (list, tuple)):
         reasons += [str(problem) for problem in more]
+    if record.manifest.get("why"):
+        reasons.append(str(record.manifest["why"]))
     word = record.manifest.get("status")
     if not isinstance(word, str) or not word:
-        word = "degraded" if failed or reasons else "ok"
+        word = "degraded" if failed or reasons else "done"
     return word, tuple(dict.fromkeys(reasons))
 
 

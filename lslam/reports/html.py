@@ -57,6 +57,7 @@ def render_report(record: RunRecord, evaluation: Evaluation | None) -> str:
         autoescape=True,
         trim_blocks=True,
         lstrip_blocks=True,
+        keep_trailing_newline=True,
         undefined=StrictUndefined,
     )
     return environment.get_template("report.html.j2").render(
@@ -89,7 +90,7 @@ def _map_figure(record: RunRecord) -> plots.Figure | None:
 
 
 def flatten(tree: Mapping[str, Any], prefix: str = "") -> list[tuple[str, list[str]]]:
-    """The manifest as (dotted key, texts) rows, in its order; `problems` and `status` stand elsewhere on the page.
+    """The manifest as (dotted key, texts) rows, in its order; status and problems stand elsewhere on the page.
 
     >>> flatten({"input": {"kind": "bin"}, "notes": ["a", "b"], "status": "ok"})
     [('input.kind', ['bin']), ('notes', ['a', 'b'])]
@@ -97,7 +98,7 @@ def flatten(tree: Mapping[str, Any], prefix: str = "") -> list[tuple[str, list[s
     rows: list[tuple[str, list[str]]] = []
     for key, value in tree.items():
         name = f"{prefix}{key}"
-        if not prefix and key in ("problems", "status"):
+        if not prefix and key in ("problems", "status", "why"):
             continue
         if isinstance(value, Mapping):
             rows += flatten(value, f"{name}.")

@@ -49,7 +49,8 @@ def _levels(image: NDArray[np.float32]) -> NDArray[np.uint8]:
     occupied = image[image > 0]
     if not len(occupied):
         return np.zeros(image.shape, np.uint8)
-    top = np.log1p(np.partition(occupied, int(0.995 * (len(occupied) - 1)))[int(0.995 * (len(occupied) - 1))])
+    rank = int(np.ceil(0.995 * (len(occupied) - 1)))
+    top = np.log1p(np.partition(occupied, rank)[rank])
     share = np.log1p(np.maximum(image, 0)) / top
     # Anything occupied is seen: the faintest level of a point is 2.
     return np.where(image > 0, np.clip(np.rint(share * (LEVELS - 1)), 2, LEVELS - 1), 0).astype(np.uint8)
