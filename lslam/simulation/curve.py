@@ -92,7 +92,7 @@ def rounded_rectangle(width: float, depth: float, radius: float) -> Floats:
     """(N, 2) points counter-clockwise round a rectangle with round corners, from the middle of the lower side along +x."""
     corners = []
     for k, (sx, sy) in enumerate(((1, -1), (1, 1), (-1, 1), (-1, -1))):
-        angle = np.linspace(-np.pi / 2, 0, 12) + k * np.pi / 2
+        angle = np.linspace(-np.pi / 2, 0, 48) + k * np.pi / 2
         centre = np.array([sx * (width / 2 - radius), sy * (depth / 2 - radius)])
         corners.append(centre + radius * np.stack([np.cos(angle), np.sin(angle)], axis=1))
     return np.concatenate([[[0.0, -depth / 2]], *corners])

@@ -18,7 +18,7 @@ for _surface, _share in {
     Surface.PAVEMENT: 0.28,
     Surface.LAWN: 0.40,
     Surface.WALL: 0.45,
-    Surface.GLASS: 0.08,
+    Surface.GLASS: 0.03,
     Surface.ROOF: 0.25,
     Surface.FOLIAGE: 0.45,
     Surface.TRUNK: 0.30,

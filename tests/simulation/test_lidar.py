@@ -1,0 +1,179 @@
+"""Rays against surfaces with known answers."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from lslam.errors import UsageError
+from lslam.geometry import se3, so3
+from lslam.simulation.lidar import RayScene, trace
+from lslam.simulation.lidar_models import LIDARS, LidarModel, lidar_named
+from lslam.simulation.mesh import Mesh, MeshBuilder, Surface
+
+# A LiDAR without faults, so that answers are exact.
+PERFECT = LidarModel("perfect", (10.0, 2.0, -5.0, -15.0, -30.0), 360, 0.1, 500.0, 0.0, 1e-6, 0.0, 1e6, 0.0)
+
+
+def quad(*corners: tuple[float, float, float], surface: int = Surface.WALL) -> Mesh:
+    builder = MeshBuilder()
+    builder.add_quads([corners], surface)
+    return builder.build()
+
+
+def floor(z: float) -> Mesh:
+    return quad((-900, -900, z), (900, -900, z), (900, 900, z), (-900, 900, z))
+
+
+def room(half: float) -> Mesh:
+    builder = MeshBuilder()
+    builder.add_box([-half] * 3, [half] * 3, Surface.WALL)
+    return builder.build()
+
+
+def rng() -> np.random.Generator:
+    return np.random.default_rng(3)
+
+
+def elevation(points: NDArray[np.float32]) -> NDArray[np.float64]:
+    p = points.astype(np.float64)
+    return np.degrees(np.arctan2(p[:, 2], np.hypot(p[:, 0], p[:, 1])))
+
+
+def test_ground_is_met_at_the_height_over_the_sine() -> None:
+    scan = trace(RayScene(floor(-1.73)), PERFECT, np.eye(4), rng())
+    assert len(scan) == 3 * 360  # the two upper rings see the sky
+    ranges = np.linalg.norm(scan.points.astype(np.float64), axis=1)
+    assert scan.rings is not None
+    expected = 1.73 / np.sin(-np.radians(np.array(PERFECT.elevations_deg)[scan.rings]))
+    np.testing.assert_allclose(ranges, expected, rtol=1e-5)
+    np.testing.assert_allclose(scan.points[:, 2], -1.73, atol=1e-4)
+
+
+def test_points_come_ring_by_ring_with_growing_azimuth() -> None:
+    scan = trace(RayScene(room(8.0)), PERFECT, np.eye(4), rng())
+    assert scan.rings is not None
+    np.testing.assert_array_equal(scan.rings, np.repeat(np.arange(5), 360))
+    np.testing.assert_allclose(elevation(scan.points), np.repeat(PERFECT.elevations_deg, 360), atol=1e-3)
+    azimuth = np.degrees(np.arctan2(scan.points[:, 1], scan.points[:, 0])) % 360
+    np.testing.assert_allclose((azimuth - np.tile(np.arange(360.0), 5) + 180) % 360 - 180, 0, atol=1e-3)
+
+
+def test_points_come_column_by_column_and_clockwise_when_the_model_says_so() -> None:
+    model = replace(PERFECT, order="column", clockwise=True, start_deg=180.0)
+    scan = trace(RayScene(room(8.0)), model, np.eye(4), rng())
+    assert scan.rings is not None
+    np.testing.assert_array_equal(scan.rings, np.tile(np.arange(5), 360))
+    azimuth = np.degrees(np.arctan2(scan.points[:, 1], scan.points[:, 0]))
+    np.testing.assert_allclose(azimuth[5], 179.0, atol=1e-3)
+
+
+def test_pose_carries_the_sensor() -> None:
+    """In a room, every point carried by the pose lies on a wall."""
+    T = se3.make(so3.from_euler_rpy(np.array([0.1, -0.2, 0.7])), np.array([1.0, -2.0, 0.5]))
+    scan = trace(RayScene(room(8.0)), PERFECT, T, rng())
+    assert len(scan) == PERFECT.rays
+    np.testing.assert_allclose(np.abs(se3.apply(T, scan.points)).max(axis=1), 8.0, atol=1e-4)
+
+
+def test_distorted_points_lie_on_the_walls_from_their_own_poses() -> None:
+    """Points with times, each carried by the pose of its time, land on the walls; by the first pose they do not."""
+    times = np.arange(360) * 0.1 / 360
+    poses = se3.exp(times[:, None] * np.array([20.0, -5.0, 0.0, 0.0, 0.0, 1.5]))
+    scan = trace(RayScene(room(8.0)), PERFECT, poses, rng())
+    assert scan.times is not None
+    column = np.round(scan.times * 3600).astype(int)
+    carried = np.einsum("nij,nj->ni", poses[column, :3, :3], scan.points.astype(float)) + poses[column, :3, 3]
+    np.testing.assert_allclose(np.abs(carried).max(axis=1), 8.0, atol=1e-4)
+    off = np.abs(np.abs(scan.points).max(axis=1) - 8.0)
+    assert off.max() > 0.5
+
+
+def test_times_run_over_the_scan() -> None:
+    poses = np.tile(np.eye(4), (360, 1, 1))
+    column_major = trace(RayScene(room(8.0)), replace(PERFECT, order="column"), poses, rng(), period=0.2)
+    assert column_major.times is not None
+    assert column_major.times.dtype == np.float32
+    assert (np.diff(column_major.times) >= 0).all()
+    assert column_major.times[0] == 0
+    assert 0.199 < column_major.times[-1] < 0.2
+    compensated = trace(RayScene(room(8.0)), PERFECT, np.eye(4), rng())
+    assert compensated.times is None
+
+
+def test_nearer_and_farther_surfaces_give_nothing() -> None:
+    scene = RayScene(floor(-2.0))
+    gated = replace(PERFECT, range_min=5.0, range_max=20.0)
+    scan = trace(scene, gated, np.eye(4), rng())
+    # 2 m / sin(30 deg) = 4 m is too near, 2 m / sin(5 deg) = 22.9 m too far.
+    assert scan.rings is not None
+    assert set(scan.rings.tolist()) == {3}
+
+
+def test_noise_and_resolution_are_those_of_the_model() -> None:
+    model = replace(PERFECT, range_noise=0.03, range_step=0.01, elevations_deg=(0.0,), columns=20000)
+    wall = RayScene(room(50.0))
+    exact = trace(wall, replace(model, range_noise=0.0, range_step=1e-6), np.eye(4), rng())
+    noisy = trace(wall, model, np.eye(4), rng())
+    truth, ranges = (np.linalg.norm(s.points.astype(np.float64), axis=1) for s in (exact, noisy))
+    assert np.std(ranges - truth) == pytest.approx(0.03, rel=0.05)
+    assert abs(np.mean(ranges - truth)) < 0.001
+    np.testing.assert_allclose(ranges / 0.01, np.round(ranges / 0.01), atol=1e-3)
+
+
+def test_angle_noise_moves_points_across_the_ray() -> None:
+    model = replace(PERFECT, angle_noise_deg=0.1, elevations_deg=(0.0,), columns=20000)
+    scan = trace(RayScene(room(50.0)), model, np.eye(4), rng())
+    assert np.std(elevation(scan.points)) == pytest.approx(0.1, rel=0.05)
+
+
+def wall_at(x: float, surface: int = Surface.WALL) -> Mesh:
+    return quad((x, -500, -500), (x, 500, -500), (x, 500, 500), (x, -500, 500), surface=surface)
+
+
+def returned(mesh: Mesh, azimuth_deg: float = 0.0) -> float:
+    """Share of rays near one azimuth that come back."""
+    model = replace(LIDARS["hdl64"], elevations_deg=(0.0,), columns=36000)
+    scan = trace(RayScene(mesh), model, np.eye(4), rng())
+    azimuth = np.degrees(np.arctan2(scan.points[:, 1], scan.points[:, 0]))
+    return float(np.sum(np.abs(azimuth - azimuth_deg) < 5) / 1000)
+
+
+def test_far_grazing_and_dark_surfaces_return_less() -> None:
+    near, far = returned(wall_at(10)), returned(wall_at(110))
+    assert near > 0.95
+    assert far < near - 0.03
+    assert returned(wall_at(10), 83.0) < 0.9 * near
+    assert returned(wall_at(50, Surface.GLASS)) < 0.8 * returned(wall_at(50))
+
+
+def test_intensity_falls_with_incidence_and_differs_by_surface() -> None:
+    scan = trace(RayScene(wall_at(10)), LIDARS["hdl64"], np.eye(4), rng())
+    assert scan.intensity is not None
+    assert scan.intensity.min() >= 0
+    assert scan.intensity.max() <= 1
+    azimuth = np.abs(np.degrees(np.arctan2(scan.points[:, 1], scan.points[:, 0])))
+    assert scan.intensity[azimuth > 60].mean() < 0.6 * scan.intensity[azimuth < 10].mean()
+    road = trace(RayScene(wall_at(10, Surface.ROAD)), LIDARS["hdl64"], np.eye(4), rng())
+    assert road.intensity is not None
+    assert road.intensity.mean() < 0.6 * scan.intensity.mean()
+
+
+def test_nothing_around_gives_an_empty_scan() -> None:
+    scan = trace(RayScene(floor(-1000.0)), PERFECT, np.eye(4), rng())
+    assert scan.points.shape == (0, 3)
+    assert scan.points.dtype == np.float32
+
+
+def test_ready_models_are_what_they_are_called() -> None:
+    assert (LIDARS["sample"].rings, LIDARS["sample"].columns) == (16, 400)
+    assert LIDARS["hdl64"].rings == 64
+    assert LIDARS["hdl64"].elevations_deg[0] == 2.0
+    assert LIDARS["hdl64"].elevations_deg[-1] == -24.33
+    assert LIDARS["os1-32"].rays == 32 * 1024
+    assert all(np.all(np.diff(m.elevations_deg) < 0) for m in LIDARS.values())
+    with pytest.raises(UsageError, match="did you mean 'hdl64'"):
+        lidar_named("hdl46")
