@@ -22,7 +22,8 @@ def top_view(
     Parameters
     ----------
     points : (M, 3) world frame, m; rows that are not finite are ignored
-    pixel : smallest edge of a pixel, m; larger when the long side would exceed `longest` pixels
+    pixel : smallest edge of a pixel, m, not under the map's voxel (empty lines would appear); larger when the long side
+        would exceed `longest` pixels
     trim : share of points that may fall off each side, so that a few far points do not shrink the rest
 
     Returns
@@ -50,8 +51,8 @@ def top_view(
 
 
 def _bounds(xy: NDArray[Any], trim: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Quantiles of a regular sample of at most half a million points: cheap, deterministic, blind to stray points."""
-    sample = np.asarray(xy[:: max(1, len(xy) // 500_000)], np.float64)
+    """Quantiles of a regular sample of some 100,000 points: cheap, deterministic, blind to stray points."""
+    sample = np.asarray(xy[:: max(1, len(xy) // 100_000)], np.float64)
     sample = sample[np.isfinite(sample).all(1)]
     if not len(sample):
         return np.full(2, np.nan), np.full(2, np.nan)
