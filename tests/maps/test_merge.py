@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from typing import Any
 
 import numpy as np
 import pytest
@@ -32,7 +33,7 @@ def merge(scans: Scans, voxel: float = 0.5, near: float = 2.0, far: float = 30.0
     return merger.result()
 
 
-def reference(scans: Scans, voxel: float, near: float, far: float) -> tuple[NDArray[np.float64], ...]:
+def reference(scans: Scans, voxel: float, near: float, far: float) -> tuple[NDArray[Any], ...]:
     world, values = [], []
     for cloud, T, intensity in scans:
         keep = (np.linalg.norm(cloud, axis=1) >= near) & (np.linalg.norm(cloud, axis=1) <= far)

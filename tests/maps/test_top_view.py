@@ -54,7 +54,7 @@ def test_large_coordinates_keep_their_pixels() -> None:
 
 
 @pytest.mark.parametrize("points", [np.zeros((0, 3)), np.full((4, 3), np.nan)])
-def test_nothing_to_see(points: np.ndarray) -> None:  # type: ignore[type-arg]
+def test_nothing_to_see(points: np.ndarray) -> None:
     image, extent = top_view(points)
     assert image.tolist() == [[0.0]]
     assert extent == (0.0, 1.0, 0.0, 1.0)
