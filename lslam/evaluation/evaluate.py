@@ -25,6 +25,7 @@ __all__ = ["Evaluation", "evaluate"]
 
 log = logging.getLogger("lslam")
 Floats = NDArray[np.float64]
+STRAIGHT = 0.01
 
 
 def evaluate(
@@ -58,7 +59,13 @@ def evaluate(
     matches = associate(estimate, ground_truth, config.max_diff, offset_ns)
     if len(matches.stamps_ns) < matches.possible:
         notes.append(f"{matches.possible - len(matches.stamps_ns)} of {matches.possible} poses found no partner")
-    truth = matches.truth if T_est_gt is None else matches.truth @ se3.inverse(T_est_gt)
+    truth = matches.truth
+    if T_est_gt is not None:
+        truth = truth @ se3.inverse(T_est_gt)
+        if ground_truth.frame == "cam0":
+            # KITTI's world is the body at the start: it follows the body, and z is up again.
+            truth = T_est_gt @ truth
+        notes.append("ground truth carried to the estimate's body by the transform given (T_est_gt)")
     same = reconcile(
         matches.estimate,
         truth,
@@ -66,9 +73,8 @@ def evaluate(
         calibration.T_cam0_lidar if calibration else None,
         is_given=T_est_gt is not None,
     )
-    if T_est_gt is not None:
-        notes.append("ground truth carried to the estimate's body by --T-est-gt")
     notes += same.notes
+    notes += _nearly_straight(same.truth, config)
     for note in notes:
         log.log(logging.WARNING if "WRONG" in note else logging.INFO, "%s: %s", estimate.source or "estimate", note)
     return _measure(same.estimate, same.truth, matches, config, (estimate, ground_truth), offset_ns / 1e9, notes)
@@ -103,6 +109,18 @@ def _measure(
         association=matches.recipe,
         notes=notes,
     )
+
+
+def _nearly_straight(truth: Floats, config: EvalConfig) -> list[str]:
+    """A note when positions hardly hold the rotation about the path, which then spoils aligned rotation errors."""
+    centred = truth[:, :3, 3] - truth[:, :3, 3].mean(axis=0)
+    spread = np.linalg.svd(centred, compute_uv=False) / np.sqrt(len(truth))
+    if not {"se3", "sim3"} & set(config.align) or not 1e-4 * spread[0] < spread[1] <= STRAIGHT * spread[0]:
+        return []
+    return [
+        f"the path is nearly straight ({spread[1]:.2g} m sideways, {spread[0]:.3g} m along, standard deviations): "
+        "se3 and sim3 hardly determine the rotation about it; read rotation errors under origin"
+    ]
 
 
 def _check(which: str, trajectory: Trajectory) -> None:

@@ -44,7 +44,11 @@ def reconcile(
     camera = [_is_camera(poses, frame) for poses, frame in zip((estimate, truth), frames, strict=True)]
     out = Reconciled(estimate, truth)
     if is_given:
-        _say_difference(out, "--T-est-gt leaves a difference: ")
+        _say_difference(out, "check")
+        if out.notes:
+            out.notes[-1] += (
+                " (it is the pose of the truth's body in the estimate's body; the one given may be the inverse)"
+            )
         return out
     for who, frame, poses in (("estimate", frames[0], estimate), ("ground truth", frames[1], truth)):
         if frame == "cam0" and main_axis(poses) == "+x":
@@ -142,15 +146,15 @@ def _turns(poses: Floats, stride: int) -> Floats:
     return so3.log(np.swapaxes(R[:-1], -1, -2) @ R[1:])
 
 
-def _say_difference(out: Reconciled, prefix: str = "") -> None:
+def _say_difference(out: Reconciled, way_out: str = "give") -> None:
     """Note a body frame that is turned against the other one, seen from the motion alone."""
     R = body_rotation(out.estimate, out.truth)
     if R is None or np.rad2deg(so3.angle(R)) < SAME_DEG:
         return
     rpy = ", ".join(f"{v:.0f}" for v in np.rad2deg(so3.euler_rpy(R)))
     out.notes.append(
-        f"WRONG FRAMES: {prefix}the ground truth's body is turned against the estimate's by about roll, pitch, yaw = {rpy} "
-        "deg; give the transform with --T-est-gt"
+        f"WRONG FRAMES: the ground truth's body is turned against the estimate's by about roll, pitch, yaw = {rpy} deg: "
+        f"{way_out} the transform between the bodies with --T-est-gt"
     )
 
 

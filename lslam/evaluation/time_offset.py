@@ -38,9 +38,9 @@ def estimate_offset(estimate: Trajectory, truth: Trajectory) -> tuple[int, float
         raise InputError(f"--time-offset auto: the trajectories are shorter than 15 samples of {step / 1e9:.2f} s")
     scores, lags = _correlation(a, b)
     if not len(scores) or scores.max() < LEAST_SCORE:
-        best = f"{scores.max():.2f}" if len(scores) else "none"
+        highest = f"{scores.max():.2f}" if len(scores) else "none"
         raise InputError(
-            f"--time-offset auto: the speeds and turns of both trajectories fit nowhere (best correlation {best}, "
+            f"--time-offset auto: the speeds and turns of both trajectories fit nowhere (best correlation {highest}, "
             f"{LEAST_SCORE} needed; estimate {time_range(estimate)}, ground truth {time_range(truth)}); "
             "give the offset in seconds"
         )
@@ -48,7 +48,7 @@ def estimate_offset(estimate: Trajectory, truth: Trajectory) -> tuple[int, float
     peaks = _peaks(scores, lags)
     refined = [(_refine(estimate, truth, zero + int(lags[p]) * step, step), p) for p in peaks]
     (cost, offset, best), *others = sorted((cost, offset, p) for (offset, cost), p in refined)
-    if others and others[0][0] < AMBIGUOUS * cost:
+    if others and others[0][0] <= AMBIGUOUS * cost + 1e-9:
         raise InputError(
             f"--time-offset auto: {offset / 1e9:.3f} s and {others[0][1] / 1e9:.3f} s fit alike; give the offset in seconds"
         )

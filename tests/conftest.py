@@ -1,0 +1,32 @@
+"""What tests of several rooms share: the real recordings, unpacked once per session, absent on most machines."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
+
+
+@pytest.fixture(scope="session")
+def recordings(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
+    """`recordings(name)` unpacks one recording and gives the folder it lies in; the test skips where there is none."""
+    target = tmp_path_factory.getbasetemp() / "recordings"
+    done: set[str] = set()
+
+    def unpack(name: str) -> Path:
+        if not (SHARED / "unpack.py").is_file() or not any(SHARED.glob(f"{name}.*")):
+            pytest.skip(f"recording {name} is not on this machine")
+        if name not in done:
+            target.mkdir(exist_ok=True)
+            subprocess.run(
+                [sys.executable, str(SHARED / "unpack.py"), str(target), name], check=True, capture_output=True
+            )
+            done.add(name)
+        return target
+
+    return unpack
