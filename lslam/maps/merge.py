@@ -165,3 +165,10 @@ class MapMerger:
             size = 1 << int(np.ceil(np.log2(rows * 2)))
             self._slots = np.full(size, -1, np.int32)
             rebuild(self._slots, self._rows, self._used)
+
+
+def warm_up() -> None:
+    """Compile or load the merger's kernels, so that a caller can do it under the compile lock."""
+    merger = MapMerger(1.0, 0.0)
+    merger.add(np.ones((1, 3), np.float32), np.eye(4))
+    merger._reserve(_START_ROWS * 2)

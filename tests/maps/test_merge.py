@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from lslam.errors import ConfigError, InputError
 from lslam.geometry import se3, so3
-from lslam.maps.merge import MapMerger, MergedMap
+from lslam.maps.merge import MapMerger, MergedMap, warm_up
 
 Scans = list[tuple[NDArray[np.float32], NDArray[np.float64], NDArray[np.float32]]]
 
@@ -165,3 +165,14 @@ def test_other_layouts_and_types_are_accepted() -> None:
     plain.add(cloud, T)
     odd.add(np.asfortranarray(cloud.astype(np.float64)), np.asfortranarray(T))
     assert plain.result().points.tobytes() == odd.result().points.tobytes()
+
+
+def test_warm_up_compiles_all_that_a_run_needs() -> None:
+    from lslam.kernels.voxel_average import accumulate, rebuild
+
+    warm_up()
+    scans = make_scans(2, 200_000)
+    signatures = len(accumulate.signatures), len(rebuild.signatures)  # type: ignore[attr-defined]
+    merge(scans, voxel=0.1)
+    assert signatures == (1, 1)
+    assert (len(accumulate.signatures), len(rebuild.signatures)) == (1, 1)  # type: ignore[attr-defined]
