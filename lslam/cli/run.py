@@ -143,7 +143,7 @@ def _print_result(outcome: Any, out: Path, as_json: bool) -> None:
         return
     import json
 
-    from lslam.reports.evaluation_json import evaluation_to_dict
+    from lslam.reports.evaluation_json import to_document
 
-    score = None if outcome.evaluation is None else evaluation_to_dict(outcome.evaluation)
+    score = None if outcome.evaluation is None else to_document(outcome.evaluation)
     click.echo(json.dumps({"folder": str(out), "manifest": outcome.record.manifest, "evaluation": score}, default=str))

@@ -21,13 +21,21 @@ class RegistrationConfig(Section):
     kernel_decay: float = Field(0.5, gt=0, lt=1, description="factor of the width from step to step")
     max_iterations: int = Field(10, ge=1, description="Gauss-Newton steps per scan")
     start_scans: int = Field(5, ge=1, description="first scans, registered coarse to fine because the speed is unknown")
-    start_iterations: int = Field(30, ge=1, description="steps of each stage while starting or recovering")
+    start_overlap: float = Field(
+        0.8, ge=0, le=1, description="while starting, share of points in fine voxels from which these decide"
+    )
+    start_iterations: int = Field(40, ge=1, description="steps of each stage while starting or recovering")
     coarse_factor: int = Field(3, ge=2, description="coarse voxels are this many times larger")
     coarse_kernel: float = Field(5.0, gt=0, description="m; where coarse annealing starts: the capture range")
+    coarse_decay: float = Field(0.85, gt=0, lt=1, description="factor of the width per coarse step")
     recover_m: float = Field(0.3, gt=0, description="m; a correction beyond this is checked coarse to fine")
     recover_deg: float = Field(3.0, gt=0, description="deg; likewise for rotation")
-    min_inliers: float = Field(0.3, ge=0, le=1, description="share of matched points within the kernel below which a scan fails")
-    min_overlap: float = Field(0.2, ge=0, le=1, description="share of points that found a voxel below which a scan fails")
+    min_inliers: float = Field(
+        0.3, ge=0, le=1, description="share of matched points within the kernel below which a scan fails"
+    )
+    min_overlap: float = Field(
+        0.2, ge=0, le=1, description="share of points that found a voxel below which a scan fails"
+    )
     max_jump_m: float = Field(6.0, gt=0, description="m; a correction of the motion prior beyond this fails")
     max_jump_deg: float = Field(45.0, gt=0, description="deg; likewise for rotation")
     weak_share: float = Field(

@@ -2,8 +2,8 @@
 
 Layout, one row per slot of the pool:
     moments (C, 10) float64 : n, sum x y z, sum xx xy xz yy yz zz, relative to the voxel centre
-    planes (C, 8) float64 : mean x y z (world), normal x y z, variance along the normal, kind (EMPTY, BLOB, PLANE);
-        one cache line, all that a residual needs
+    planes (C, 8) float64 : mean x y z (world), normal x y z, variance along the normal, tilt: the variance of the normal's
+        direction, rad2, or BLOB or EMPTY; one cache line, all that a residual needs
     keys (C,) int64 : packed voxel, FREE when the slot is unused
     refreshed (C,) float64 : n when `planes` was computed last
     table (E,) int32 : open addressing, slot or -1
@@ -25,7 +25,7 @@ Longs = NDArray[np.int64]
 Ints = NDArray[np.int32]
 
 FREE = -1
-EMPTY, BLOB, PLANE = 0.0, 1.0, 2.0
+EMPTY, BLOB = -2.0, -1.0
 USED, FREED, HAND, LIVE = 0, 1, 2, 3
 
 
@@ -62,7 +62,7 @@ def _claim(key: int, moments: Floats, planes: Floats, keys: Longs, refreshed: Fl
     table[h] = slot
     keys[slot] = key
     moments[slot] = 0.0
-    planes[slot] = 0.0
+    planes[slot, 7] = EMPTY
     refreshed[slot] = 0.0
     state[LIVE] += 1
     return slot
@@ -85,7 +85,7 @@ def _release(slot: int, keys: Longs, table: Ints, state: Longs, free: Ints, plan
         h = (h + 1) & mask
     table[hole] = -1
     keys[slot] = FREE
-    planes[slot] = 0.0
+    planes[slot, 7] = EMPTY
     free[state[FREED]] = slot
     state[FREED] += 1
     state[LIVE] -= 1
@@ -115,7 +115,8 @@ def _refresh(slot: int, size: float, moments: Floats, planes: Floats, keys: Long
     if l1 - l0 >= planarity * max(l2, 1e-12):
         p[3], p[4], p[5] = nx, ny, nz
         p[6] = max(l0, 0.0) + floor
-        p[7] = PLANE
+        # A strip of few points fixes its own height but hardly its slope across.
+        p[7] = p[6] / (n * max(l1, 1e-12))
     else:
         p[6] = max((l0 + l1 + l2) / 3.0, 0.0) + floor
         p[7] = BLOB

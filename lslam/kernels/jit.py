@@ -7,6 +7,7 @@ on the machine; no `parallel`, because results must not depend on the number of 
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import logging
 import os
 import sys
@@ -35,8 +36,17 @@ def cache_folder() -> Path:
     return Path(tempfile.mkdtemp(prefix="lslam-cache-"))
 
 
-# Numba reads the variable when it is imported; a value set by the user wins.
-os.environ.setdefault("NUMBA_CACHE_DIR", str(cache_folder() / "numba"))
+def source_digest() -> str:
+    """Digest of all kernel sources: numba looks at a kernel's own file only, not at the files of what it calls."""
+    digest = hashlib.sha256()
+    for path in sorted(Path(__file__).parent.glob("*.py")):
+        digest.update(path.read_bytes())
+    return digest.hexdigest()[:12]
+
+
+# Numba reads the variable when it is imported; a folder set by the user is kept, below it each version has its own.
+_base = Path(os.environ.get("NUMBA_CACHE_DIR") or cache_folder() / "numba")
+os.environ["NUMBA_CACHE_DIR"] = str(_base / source_digest())
 
 import numba  # noqa: E402
 

@@ -10,11 +10,14 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.kernels.gaussians import EMPTY, PLANE, find
+from lslam.kernels.gaussians import BLOB, find
 from lslam.kernels.jit import inline, kernel
 from lslam.kernels.voxel import index_of, pack
 
 Floats = NDArray[np.float64]
+
+# Four sigma-squared of tilt: neighbouring points of one ring err together.
+TILT = 4.0
 
 
 @inline
@@ -46,7 +49,7 @@ def linearise(source: Floats, scatter: Floats, R: Floats, t: Floats, size: float
     """Fill H (6, 6), g (6,) and facts from all source points (S, 3), LiDAR frame, with scatter (S, 6) around each.
 
     Each point takes the nearest plane voxel of the eight around it: residual n . (R s + t - mean), variance = map
-    eigenvalue + source scatter along the normal + sigma2, Geman-McClure weight of width `scale`. Without a plane the nearest
+    eigenvalue + source scatter along the normal + sigma2 + tilt at that distance from the mean, Geman-McClure weight of width `scale`. Without a plane the nearest
     blob stands in: isotropic, its mean variance, times `blob_weight`. `facts`: sum of information, weighted squared
     residuals (m2), inliers within `scale`, matched, sum of squared lever arms, sum of robust weights.
     """
@@ -69,11 +72,10 @@ def linearise(source: Floats, scatter: Floats, R: Floats, t: Floats, size: float
             if s < 0:
                 continue
             p = planes[s]
-            kind = p[7]
-            if kind == EMPTY:
+            if p[7] < BLOB:
                 continue
             d = (x - p[0]) ** 2 + (y - p[1]) ** 2 + (z - p[2]) ** 2
-            if kind == PLANE:
+            if p[7] >= 0.0:
                 if d < best_d:
                     best_d, best = d, s
             elif d < blob_d:
@@ -93,7 +95,7 @@ def linearise(source: Floats, scatter: Floats, R: Floats, t: Floats, size: float
             )  # fmt: skip
             robust = c2 / (c2 + r * r)
             robust *= robust
-            w = robust / (p[6] + max(spread, 0.0) + sigma2)
+            w = robust / (p[6] + max(spread, 0.0) + sigma2 + TILT * p[7] * (best_d - r * r))
             j3, j4, j5 = ry * nz - rz * ny, rz * nx - rx * nz, rx * ny - ry * nx
             _add(H, g, w, r, nx, ny, nz, j3, j4, j5)
             facts[0] += w

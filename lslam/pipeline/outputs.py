@@ -15,7 +15,7 @@ from lslam.formats.trajectory_files import write_kitti, write_tum
 from lslam.geometry import se3
 from lslam.maps.merge import MergedMap
 from lslam.pipeline.run_folder import RunFolder
-from lslam.reports.evaluation_json import evaluation_to_dict
+from lslam.reports.evaluation_json import to_document
 from lslam.reports.facts import stage_matrix
 from lslam.types.calibration import Calibration
 from lslam.types.run_record import RunRecord
@@ -78,7 +78,7 @@ def write_map(folder: RunFolder, merged: MergedMap, config: MapConfig) -> None:
 def write_evaluation(folder: RunFolder, evaluation: Evaluation | None) -> None:
     """evaluation.json, when ground truth is known."""
     if evaluation is not None:
-        text = json.dumps(evaluation_to_dict(evaluation), indent=2, allow_nan=False, ensure_ascii=False)
+        text = json.dumps(to_document(evaluation), indent=2, allow_nan=False, ensure_ascii=False)
         folder.write_text("evaluation.json", text + "\n")
 
 

@@ -95,14 +95,17 @@ class Registration:
         self._index += 1
 
     def _coarse_to_fine(self, points: PreparedPoints, T_prior: NDArray[np.float64]) -> RegistrationResult:
-        """Coarse planes, annealed slowly, catch what fine voxels lose: metres per scan instead of decimetres."""
+        """Coarse planes, annealed slowly, catch what fine voxels lose: metres per scan instead of decimetres.
+
+        Few scans of a sparse sensor put single rings into fine voxels, whose planes then tilt: the coarse planes keep the
+        last word until most points find a fine one.
+        """
         c = self.config
-        slow = Annealing(c.coarse_kernel, 0.1 * c.coarse_kernel, 0.9, c.start_iterations)
+        slow = Annealing(c.coarse_kernel, c.kernel_min, c.coarse_decay, c.start_iterations)
         coarse = self._solve(points, T_prior, slow, self.map.coarsen(c.coarse_factor))
         start = coarse.T_world_lidar if coarse.ok else T_prior
         fine = self._solve(points, start, Annealing(c.kernel_max, c.kernel_min, c.kernel_decay, c.start_iterations))
-        # A sparse sensor's first scans leave too few points in fine voxels: then the coarse planes have the last word.
-        best = fine if fine.ok and (fine.overlap >= c.min_overlap or fine.matched >= coarse.matched) else coarse
+        best = fine if fine.ok and (fine.overlap >= c.start_overlap or fine.matched > coarse.matched) else coarse
         return replace(best, iterations=coarse.iterations + fine.iterations)
 
     def _solve(
