@@ -46,7 +46,9 @@ def read_pcd(path: Path) -> PointCloud:
         raise InputError(f"{path} cannot be read: {error.strerror or error}") from None
     header = _read_header(path, data)
     body = memoryview(data)[header.size :]
-    if header.encoding == "ascii":
+    if header.points == 0:
+        columns: dict[str, NDArray[Any]] = {n: np.zeros(0, d) for n, d in zip(header.names, header.dtypes, strict=True)}
+    elif header.encoding == "ascii":
         columns = _ascii_columns(path, header, body)
     elif header.encoding == "binary":
         columns = _binary_columns(path, header, body)
@@ -141,8 +143,6 @@ def _ascii_columns(path: Path, header: _Header, body: memoryview) -> dict[str, N
         lines.pop()
     if len(lines) < header.points:
         raise InputError(f"{path}: PCD header says {header.points} points, the file holds {len(lines)} lines of them")
-    if not header.points:
-        return {name: np.zeros(0, d) for name, d in zip(header.names, header.dtypes, strict=True)}
     try:
         table = np.loadtxt([line.decode("ascii") for line in lines[: header.points]], np.float64, ndmin=2)
     except ValueError as error:
@@ -173,8 +173,6 @@ def _binary_columns(path: Path, header: _Header, body: memoryview) -> dict[str, 
 
 
 def _compressed_columns(path: Path, header: _Header, body: memoryview) -> dict[str, NDArray[Any]]:
-    if header.points == 0:
-        return {name: np.zeros(0, d) for name, d in zip(header.names, header.dtypes, strict=True)}
     if len(body) < 8:
         raise InputError(f"{path}: PCD compressed data end before their two sizes")
     packed, plain = struct.unpack("<II", body[:8])

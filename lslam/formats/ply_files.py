@@ -46,6 +46,8 @@ def read_ply(path: Path) -> PointCloud:
         if "list" in codes and (element.name == "vertex" or encoding != "ascii"):
             raise InputError(f"{path}: PLY element {element.name!r} has a list property where points are expected")
         if element.name == "vertex":
+            if element.count == 0:
+                return cloud_from_fields(path, {name: np.zeros(0, code) for name, code in element.properties})
             if encoding == "ascii":
                 return cloud_from_fields(path, _ascii_columns(path, element, body, skipped))
             return cloud_from_fields(path, _binary_columns(path, element, body, order, skipped))
@@ -100,8 +102,6 @@ def _read_header(path: Path, data: bytes) -> tuple[str, list[_Element], int]:
 
 
 def _ascii_columns(path: Path, element: _Element, body: memoryview, skipped: int) -> dict[str, NDArray[Any]]:
-    if not element.count:
-        return {name: np.zeros(0, code) for name, code in element.properties}
     lines = [line for line in bytes(body).split(b"\n") if line.strip()][skipped : skipped + element.count]
     if len(lines) < element.count:
         raise InputError(f"{path}: PLY header says {element.count} points, the file holds {len(lines)}")

@@ -1,0 +1,72 @@
+"""Local frames: known distances on the ellipsoid, inverse, and the KITTI devkit's projection against its ground truth."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from lslam.geometry import geodesy, se3, so3, umeyama
+
+KARLSRUHE = np.array([49.0112, 8.4229, 112.8])
+
+
+@given(
+    lat=st.floats(-80, 80),
+    lon=st.floats(-179, 179),
+    dn=st.floats(-0.02, 0.02),
+    de=st.floats(-0.02, 0.02),
+    h=st.floats(-100, 4000),
+)
+@settings(max_examples=50, deadline=None)
+def test_there_and_back(lat: float, lon: float, dn: float, de: float, h: float) -> None:
+    origin = np.array([lat, lon, h])
+    fix = origin + np.array([dn, de, 12.5])
+    back = geodesy.from_local(geodesy.to_local(fix[None], origin), origin)[0]
+    np.testing.assert_allclose(back, fix, atol=1e-9)
+
+
+def test_metres_are_metres_east_and_north() -> None:
+    """Against the radii of curvature of the WGS84 ellipsoid: an independent formula."""
+    a, e2 = 6378137.0, 6.69437999014e-3
+    s = np.sin(np.radians(KARLSRUHE[0]))
+    east_radius = a / np.sqrt(1 - e2 * s * s)
+    north_radius = a * (1 - e2) / (1 - e2 * s * s) ** 1.5
+    step = np.array([[0.001, 0, 0], [0, 0.001, 0], [0, 0, 7.0]])
+    enu = geodesy.to_local(KARLSRUHE + step, KARLSRUHE)
+    np.testing.assert_allclose(enu[0], [0, np.radians(0.001) * north_radius, 0], atol=1e-3)
+    east = np.radians(0.001) * east_radius * np.cos(np.radians(KARLSRUHE[0]))
+    np.testing.assert_allclose(enu[1, 0], east, atol=1e-3)
+    np.testing.assert_allclose(enu[2], [0, 0, 7], atol=1e-9)
+
+
+def test_the_devkit_projection_is_the_documented_amount_off() -> None:
+    step = np.array([[0.001, 0, 0], [0, 0.001, 0]])
+    true = geodesy.to_local(KARLSRUHE + step, KARLSRUHE)
+    devkit = geodesy.to_kitti_mercator(KARLSRUHE + step, KARLSRUHE)
+    assert abs(devkit[0, 1] / true[0, 1] - 1.0011) < 2e-4
+    assert abs(devkit[1, 0] / true[1, 0] - 0.9981) < 2e-4
+
+
+def test_devkit_projection_gives_the_official_ground_truth(recordings: Callable[[str], Path]) -> None:
+    """OXTS of sequence 07, carried to camera 0 through the extrinsics of another day, lies within 0.1 m of the truth."""
+    from lslam.formats.kitti_calib import read_raw_cam0_lidar, read_rigid
+    from lslam.formats.oxts_files import ROLL, YAW, read_oxts
+
+    oxts = read_oxts(recordings("kitti_raw_oxts_0027") / "kitti_raw_oxts" / "2011_09_30_drive_0027_oxts")
+    day = recordings("kitti_raw_0048") / "2011_09_26"
+    truth = np.loadtxt(recordings("kitti_poses") / "kitti_poses" / "ground_truth" / "07.txt").reshape(-1, 3, 4)[:, :, 3]
+    assert oxts is not None
+    positions = geodesy.to_kitti_mercator(oxts.values[:, :3], oxts.values[0, :3])
+    T_imu_cam0 = se3.inverse(read_raw_cam0_lidar(day) @ read_rigid(day / "calib_imu_to_velo.txt"))
+    estimate = (se3.make(so3.from_euler_rpy(oxts.values[:, ROLL : YAW + 1]), positions) @ T_imu_cam0)[
+        : len(truth), :3, 3
+    ]
+    T, _, determined = umeyama.align(estimate, truth)
+    assert determined
+    error = np.linalg.norm(se3.apply(T, estimate) - truth, axis=1)
+    assert error.mean() < 0.06
+    assert error.max() < 0.15
