@@ -1,0 +1,85 @@
+"""`lslam info` as a user calls it."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "readers"))
+from sequence_builders import cloud, kitti_root, raw_drive
+
+from lslam.pipeline.inspect import inspect
+from lslam.readers import open_sequence
+
+
+def lslam(*words: str | Path) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "lslam", *map(str, words)], capture_output=True, text=True, check=False
+    )
+
+
+def test_page_and_json(tmp_path: Path) -> None:
+    folder = kitti_root(tmp_path)
+    (folder / "velodyne" / "000002.bin").write_bytes(bytes(1001))
+    (folder / "velodyne" / "000003.bin").write_bytes(b"")
+    page = lslam("info", "seq07", "--data-root", tmp_path)
+    assert (page.returncode, page.stderr) == (0, "")
+    for line in ("kitti-odometry", "6 in 0.50 s, 10 Hz", "6 (1 unreadable, 1 empty)", "path 5.00 m", "000002.bin"):
+        assert line in page.stdout
+    facts = json.loads(lslam("info", folder, "--json").stdout)
+    assert (facts["schema"], facts["scans"], facts["format"]) == (1, 6, "kitti-odometry")
+    assert facts["points"]["scans_unreadable"] == 1
+    assert abs(facts["ground_truth"]["path_length_m"] - 5) < 1e-3
+
+
+def test_what_is_missing_is_one_sentence_and_exit_3(tmp_path: Path) -> None:
+    (tmp_path / "empty").mkdir()
+    for words, part in (
+        ((tmp_path / "empty",), "is empty"),
+        ((tmp_path / "none",), "does not exist"),
+        (("seq07", "--data-root", tmp_path), "no sequence 'seq07'"),
+    ):
+        result = lslam("info", *words)
+        assert (result.returncode, result.stdout) == (3, "")
+        assert part in result.stderr
+        assert result.stderr.startswith("error: ")
+        assert result.stderr.count("\n") == 1
+
+
+def test_numbers_are_counted_right(tmp_path: Path) -> None:
+    folder = kitti_root(tmp_path, 4)
+    table = cloud(1)
+    table[:30, :3], table[30:45, 1] = 0, np.nan
+    table.tofile(folder / "velodyne" / "000001.bin")
+    points = inspect(open_sequence(folder))["points"]
+    assert points["share_zero"] == 30 / 1200
+    assert points["share_nan"] == 15 / 1200
+    assert points["count"] == {"min": 300, "median": 300.0, "max": 300}
+    assert 5 <= points["range_m"]["min"] < points["range_m"]["max"] <= 50.001
+    assert -24 < points["elevation_deg"][0] < points["elevation_deg"][1] < 2.3
+
+
+def test_gaps_and_imu_units(tmp_path: Path) -> None:
+    drive = raw_drive(tmp_path, 8)
+    for k in (3, 4):
+        (drive / "velodyne_points" / "data" / f"{k:010d}.bin").unlink()
+    facts = inspect(open_sequence(drive))
+    assert [(g["after_scan"], round(g["seconds"], 9)) for g in facts["time"]["gaps"]] == [(2, 0.3)]
+    assert any("1 gap in the scans, the longest 0.300 s after scan 2" in p for p in facts["problems"])
+    assert (facts["imu"]["gravity_unit"], round(facts["imu"]["gravity_norm"], 2)) == ("m/s2", 9.81)
+    imu = drive / "imu.csv"
+    imu.write_text("t,ax,ay,az,gx,gy,gz\n" + "".join(f"{1317042272 + k / 100},0,0,1.0,0,0,0\n" for k in range(50)))
+    facts = inspect(open_sequence(drive))
+    assert facts["imu"]["gravity_unit"] == "g"
+    assert any("multiply by 9.80665" in p for p in facts["problems"])
+
+
+def test_help_is_light() -> None:
+    code = (
+        "import sys, lslam.cli.info; sys.exit(any(m in sys.modules for m in ('numpy', 'numba', 'scipy', 'pydantic')))"
+    )
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -1,0 +1,167 @@
+"""KITTI raw drives: OXTS as truth, IMU and GNSS, and what shared excerpts leave out."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parent))
+from sequence_builders import cloud, raw_drive
+
+from lslam.errors import InputError
+from lslam.formats.sequence_toml import SequenceInfo, write_sequence_toml
+from lslam.geometry import se3, so3
+from lslam.readers import open_sequence
+
+
+def said(sentences: list[str], part: str) -> bool:
+    return any(part in s for s in sentences)
+
+
+def test_an_excerpt_without_velodyne_stamps(tmp_path: Path) -> None:
+    s = open_sequence(raw_drive(tmp_path))
+    assert (s.name, s.kind, len(s), s.motion_compensated) == ("2011_09_26_drive_0005_sync", "kitti-raw", 6, True)
+    assert s.stamps_ns[0] == 1317042272_000000000
+    assert said(s.notes, "scan i goes with OXTS sample i")
+    assert s.problems == []
+    assert s.calibration.T_lidar_imu is not None
+    assert s.calibration.T_cam0_lidar is not None
+    assert s.imu is not None
+    assert s.gnss is not None
+    np.testing.assert_allclose(s.imu.accel[0], [0, 0, 9.81])
+    assert s.gnss.sigma[0] == 0.05
+
+
+def test_truth_is_the_lidar_going_forward(tmp_path: Path) -> None:
+    """Yaw 0 is east: 1.3670e-5 deg of longitude at 49 N are 1.0003 m, along the LiDAR's x."""
+    s = open_sequence(raw_drive(tmp_path))
+    assert s.ground_truth is not None
+    np.testing.assert_allclose(s.ground_truth.poses[0], np.eye(4), atol=1e-12)
+    np.testing.assert_allclose(s.ground_truth.positions[5], [5.0015, 0, 0], atol=2e-3)
+
+
+def test_velodyne_stamps_are_used_when_they_are_there(tmp_path: Path) -> None:
+    folder = raw_drive(tmp_path)
+    lines = "".join(f"2011-09-26 13:04:32.{k * 100 + 3:03d}000001\n" for k in range(6))
+    (folder / "velodyne_points" / "timestamps.txt").write_text(lines)
+    s = open_sequence(folder)
+    assert s.stamps_ns[1] == 1317042272_103000001
+    assert s.ground_truth is not None
+    assert s.ground_truth.stamps_ns[1] == 1317042272_100000000
+
+
+def test_missing_scans_keep_their_stamps(tmp_path: Path) -> None:
+    folder = raw_drive(tmp_path)
+    (folder / "velodyne_points" / "data" / "0000000002.bin").unlink()
+    s = open_sequence(folder)
+    assert (s.stamps_ns - s.stamps_ns[0]).tolist() == [0, 10**8, 3 * 10**8, 4 * 10**8, 5 * 10**8]
+    assert said(s.problems, "6 stamps for 5 scans")
+
+
+def test_poor_positions_are_a_problem(tmp_path: Path) -> None:
+    assert said(
+        open_sequence(raw_drive(tmp_path, pos_acc=0.4)).problems, "OXTS positions are poor (pos_acc median 0.40 m)"
+    )
+
+
+def test_without_oxts_or_calibration(tmp_path: Path) -> None:
+    folder = raw_drive(tmp_path)
+    (folder.parent / "calib_imu_to_velo.txt").unlink()
+    s = open_sequence(folder)
+    assert s.ground_truth is None
+    assert said(s.problems, "calib_imu_to_velo.txt is missing")
+    for path in (folder / "oxts" / "data").iterdir():
+        path.unlink()
+    s = open_sequence(folder)
+    assert (s.imu, s.gnss, s.ground_truth) == (None, None, None)
+    assert said(s.problems, "no samples")
+    assert said(s.problems, "stamped at 10 Hz")
+
+
+def test_oxts_that_is_broken_or_goes_back(tmp_path: Path) -> None:
+    folder = raw_drive(tmp_path)
+    stamps = folder / "oxts" / "timestamps.txt"
+    lines = stamps.read_text().splitlines()
+    lines[3] = lines[1]
+    stamps.write_text("\n".join(lines))
+    s = open_sequence(folder)
+    assert (np.diff(s.stamps_ns) > 0).all()
+    assert said(s.problems, "at line 4")
+    (folder / "oxts" / "data" / "0000000004.txt").write_text("1 2 3")
+    s = open_sequence(folder)
+    assert said(s.problems, "0000000004.txt is no OXTS sample")
+    assert len(s) == 6
+
+
+def test_extract_drives_are_distorted_text(tmp_path: Path) -> None:
+    folder = raw_drive(tmp_path, name="2011_09_26_drive_0005_extract")
+    data = folder / "velodyne_points" / "data"
+    for k, path in enumerate(sorted(data.iterdir())):
+        path.unlink()
+        np.savetxt(path.with_suffix(".txt"), cloud(k), fmt="%.9g")
+    for name, shift in (("start", 0), ("end", 90)):
+        lines = "".join(f"2011-09-26 13:04:32.{k * 100 + shift:03d}000000\n" for k in range(6))
+        (folder / "velodyne_points" / f"timestamps_{name}.txt").write_text(lines)
+    s = open_sequence(folder)
+    assert s.motion_compensated is False
+    scan = s.scan(2)
+    assert scan.times is not None
+    behind = np.argmin(np.abs(np.arctan2(scan.points[:, 1], -scan.points[:, 0])))
+    front = np.argmin(np.abs(np.arctan2(scan.points[:, 1], scan.points[:, 0])))
+    left = np.argmin(np.abs(np.arctan2(-scan.points[:, 0], scan.points[:, 1])))
+    assert min(scan.times[behind], 0.09 - scan.times[behind]) < 2e-3
+    assert abs(scan.times[front] - 0.045) < 2e-3
+    # Clockwise from behind: the left side comes before the front.
+    assert abs(scan.times[left] - 0.0225) < 2e-3
+    assert s.stamps_ns[2] == 1317042272_200000000
+
+
+def test_sequence_toml_names_other_truth(tmp_path: Path) -> None:
+    folder = raw_drive(tmp_path)
+    stamps = [f"{1317042272 + k / 10:.9f}" for k in range(6)]
+    (folder / "reference.tum").write_text("".join(f"{t} {k} 0 0 0 0 0 1\n" for k, t in enumerate(stamps)))
+    info = SequenceInfo(ground_truth="reference.tum", ground_truth_frame="lidar")
+    write_sequence_toml(folder / "sequence.toml", info)
+    s = open_sequence(folder)
+    assert s.ground_truth is not None
+    assert s.ground_truth.positions[5, 0] == 5
+
+
+def test_days_and_drives_without_scans(tmp_path: Path) -> None:
+    folder = raw_drive(tmp_path)
+    assert open_sequence(folder.parent).name == folder.name
+    raw_drive(tmp_path, name="2011_09_26_drive_0048_sync")
+    with pytest.raises(InputError, match="2 drives"):
+        open_sequence(folder.parent)
+    for path in (folder / "velodyne_points" / "data").iterdir():
+        path.unlink()
+    with pytest.raises(InputError, match="holds no scans"):
+        open_sequence(folder)
+    (folder / "velodyne_points" / "data").rmdir()
+    (folder / "velodyne_points").rmdir()
+    with pytest.raises(InputError, match="without velodyne_points"):
+        open_sequence(folder)
+
+
+def test_real_drive_against_its_reference(recordings: Callable[[str], Path]) -> None:
+    """The OXTS truth agrees with the independent reference: attitude to 0.1 deg, positions to the accuracy they claim."""
+    folder = recordings("kitti_raw_0048") / "2011_09_26" / "2011_09_26_drive_0048_sync"
+    s = open_sequence(folder)
+    reference = np.loadtxt(folder / "reference_lidar.tum")
+    assert s.ground_truth is not None
+    assert (len(s), len(s.ground_truth)) == (22, 22)
+    R_ref = so3.from_quaternion(reference[:, 4:8])
+    R = s.ground_truth.poses[:, :3, :3]
+    assert np.degrees(so3.angle(np.swapaxes(R_ref, 1, 2) @ R)).max() < 0.1
+    assert np.linalg.norm(s.ground_truth.positions - reference[:, 1:4], axis=1).max() < 0.35
+    # Two scans a metre apart overlap under the truth: the transform is not inverted.
+    from scipy.spatial import cKDTree
+
+    a, b = s.scan(0).points[::3], s.scan(4).points[::40]
+    moved = se3.apply(se3.relative(s.ground_truth.poses[0], s.ground_truth.poses[4]), b)
+    tree = cKDTree(a)
+    assert np.median(tree.query(moved)[0]) < 0.5 * np.median(tree.query(b)[0])

@@ -1,0 +1,82 @@
+"""Names a user types, and the part of a sequence a user asks for."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parent))
+from sequence_builders import kitti_root, raw_drive
+
+from lslam.errors import InputError, UsageError
+from lslam.readers import open_sequence, select
+from lslam.readers.lookup import find_folder
+
+
+@pytest.mark.parametrize("name", ["seq07", "07", "7", "kitti/07"])
+@pytest.mark.parametrize("below", ["", "dataset", "kitti"])
+def test_sequence_names(name: str, below: str, tmp_path: Path) -> None:
+    folder = kitti_root(tmp_path / below, 1) if below else kitti_root(tmp_path, 1)
+    assert find_folder(name, tmp_path) == folder
+
+
+@pytest.mark.parametrize(
+    "name", ["2011_09_26_drive_0005_sync", "2011_09_26_drive_0005", "drive_0005", "0005", "0005_sync"]
+)
+@pytest.mark.parametrize("below", ["", "raw"])
+def test_drive_names(name: str, below: str, tmp_path: Path) -> None:
+    folder = raw_drive(tmp_path / below, 1) if below else raw_drive(tmp_path, 1)
+    assert find_folder(name, tmp_path) == folder
+
+
+def test_ambiguous_and_unknown_names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    raw_drive(tmp_path, 1)
+    raw_drive(tmp_path, 1, "2011_09_26_drive_0005_extract")
+    with pytest.raises(InputError, match="may be any of"):
+        find_folder("0005", tmp_path)
+    with pytest.raises(InputError, match="2011_09_26_drive_0005_sync"):
+        find_folder("2011_09_26_drive_0006_sync", tmp_path)
+    with pytest.raises(InputError, match=r"data root .*nowhere does not exist"):
+        find_folder("07", tmp_path / "nowhere")
+    monkeypatch.delenv("LSLAM_DATA", raising=False)
+    with pytest.raises(InputError, match="--data-root or LSLAM_DATA"):
+        find_folder("seq07")
+    file = tmp_path / "a.bag"
+    file.write_bytes(b"")
+    with pytest.raises(InputError, match="is a file"):
+        find_folder(file)
+
+
+def test_environment_names_the_data_root(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = kitti_root(tmp_path, 1)
+    monkeypatch.setenv("LSLAM_DATA", str(tmp_path))
+    assert find_folder("seq07") == folder
+
+
+def test_selection_keeps_indices_stamps_and_truth(tmp_path: Path) -> None:
+    s = open_sequence(kitti_root(tmp_path, 10))
+    part = select(s, start=2, count=3, skip_frames=3)
+    assert len(part) == 3
+    assert [part.scan(k).index for k in range(3)] == [2, 5, 8]
+    assert part.stamps_ns.tolist() == [part.scan(k).stamp_ns for k in range(3)]
+    assert part.ground_truth is s.ground_truth
+    assert (part.name, part.rate_hz) == (s.name, s.rate_hz)
+    with pytest.raises(IndexError):
+        part.scan(3)
+    with pytest.raises(IndexError):
+        part.scan(-1)
+
+
+def test_selection_of_everything_is_the_sequence(tmp_path: Path) -> None:
+    s = open_sequence(kitti_root(tmp_path, 3))
+    assert select(s) is s
+    assert select(s, count=99) is s
+
+
+@pytest.mark.parametrize("bad", [{"start": 3}, {"start": -1}, {"count": 0}, {"skip_frames": 0}])
+def test_selections_that_leave_nothing(bad: dict[str, int], tmp_path: Path) -> None:
+    s = open_sequence(kitti_root(tmp_path, 3))
+    with pytest.raises(UsageError):
+        select(s, **bad)
