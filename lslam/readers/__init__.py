@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -58,7 +59,15 @@ def open_sequence(
         motion_compensated=motion_compensated,
         vertical_correction_deg=vertical_correction_deg,
     )
-    folder = find_folder(name_or_path, data_root)
+    # Absolute, but links kept: `sequences/07` may be one, and its poses lie beside the link.
+    folder = Path(os.path.abspath(find_folder(name_or_path, data_root)))
+    try:
+        return _open(folder, overrides)
+    except OSError as error:
+        raise InputError(f"{error.filename or folder} cannot be read: {error.strerror or error}") from None
+
+
+def _open(folder: Path, overrides: SequenceInfo) -> Sequence:
     for dotted in READERS.values():
         reader: Any = import_module(dotted)
         located = reader.locate(folder)

@@ -81,6 +81,8 @@ class FolderSequence:
         rings = cloud.rings
         if self.per_point is not None:
             times, rings = _read_per_point(self.per_point / f"{path.stem}.npz", len(cloud))
+            # Compensated scans keep no times: nobody shall deskew them a second time.
+            times = None if self.motion_compensated else times
         elif self.time_rule is not None and cloud.times is not None:
             times, shift_ns = apply_rule(self.time_rule, cloud.times, stamp)
             stamp += shift_ns

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -36,7 +37,7 @@ class Voice:
 def find_ground_truth(folder: Path, info: SequenceInfo, voice: Voice) -> Path | None:
     """The file `sequence.toml` names, else the first of the usual names in `folder`."""
     if info.ground_truth is not None:
-        path = folder / info.ground_truth
+        path = Path(os.path.normpath(folder / info.ground_truth))
         if path.is_file():
             return path
         voice.problems.append(f"ground truth {path}, named by {FILE_NAME}, does not exist")

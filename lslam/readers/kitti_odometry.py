@@ -15,6 +15,7 @@ from lslam.readers.ground_truth import Voice, find_ground_truth, load_poses, to_
 from lslam.readers.listing import list_scans, rows_of
 from lslam.readers.sidecars import (
     calibration_over,
+    compensation_note,
     load_gnss,
     load_imu,
     per_point_folder,
@@ -53,8 +54,8 @@ def open_folder(folder: Path, overrides: SequenceInfo, why: str) -> FolderSequen
     files, left_out = list_scans(folder / "velodyne")
     if not files:
         raise InputError(f"{folder / 'velodyne'} holds no scans (*.bin): fetch the velodyne data of this sequence")
-    voice = Voice([f"format {KIND}: {why}", *left_out], [])
-    name = info.name or (f"seq{folder.name}" if folder.name.isdigit() else folder.resolve().name)
+    voice = Voice([f"format {KIND}: {why}", *left_out, *compensation_note(info)], [])
+    name = info.name or (f"seq{folder.name}" if folder.name.isdigit() else folder.name)
     files, stamps, rate = _stamps(folder, info, files, voice)
     calibration = calibration_over(info, Calibration(T_cam0_lidar=_tr(folder, voice)))
     compensated = True if info.motion_compensated is None and info.per_point is None else info.motion_compensated
@@ -126,7 +127,7 @@ def _ground_truth(
     calibration: Calibration,
     voice: Voice,
 ) -> Trajectory | None:
-    path: Path | None = folder.resolve().parent.parent / "poses" / f"{folder.resolve().name}.txt"
+    path: Path | None = folder.parent.parent / "poses" / f"{folder.name}.txt"
     if info.ground_truth is not None:
         path = find_ground_truth(folder, info, voice)
     elif path is not None and not path.is_file():

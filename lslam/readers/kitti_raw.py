@@ -20,6 +20,7 @@ from lslam.readers.listing import list_scans, rows_of
 from lslam.readers.oxts_truth import oxts_truth
 from lslam.readers.sidecars import (
     calibration_over,
+    compensation_note,
     load_gnss,
     load_imu,
     per_point_folder,
@@ -62,11 +63,11 @@ def open_folder(folder: Path, overrides: SequenceInfo, why: str) -> FolderSequen
     files, left_out = list_scans(data, (*SUFFIXES, ".txt")) if data.is_dir() else ([], [])
     if not files:
         raise InputError(f"{data} holds no scans (*.bin or *.txt): fetch the velodyne data of this drive")
-    voice = Voice([f"format {KIND}: {why}", *left_out], [])
-    is_extract = folder.resolve().name.endswith("_extract")
+    voice = Voice([f"format {KIND}: {why}", *left_out, *compensation_note(info)], [])
+    is_extract = folder.name.endswith("_extract")
     oxts = _oxts(folder, voice)
     files, stamps, rate = _stamps(folder, info, files, oxts, is_extract, voice)
-    calibration = calibration_over(info, _calibration(folder.resolve().parent, voice))
+    calibration = calibration_over(info, _calibration(folder.parent, voice))
     compensated = not is_extract if info.motion_compensated is None else info.motion_compensated
     per_point = per_point_folder(folder, info)
     sweep = None
@@ -76,7 +77,7 @@ def open_folder(folder: Path, overrides: SequenceInfo, why: str) -> FolderSequen
         drive = "extract drives are distorted" if is_extract else "sync drives are motion compensated"
         voice.notes.append(f"motion compensated: {'yes' if compensated else 'no'} (KITTI raw {drive})")
     return FolderSequence(
-        name=info.name or folder.resolve().name,
+        name=info.name or folder.name,
         path=folder,
         kind=KIND,
         files=files,

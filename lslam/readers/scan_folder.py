@@ -17,7 +17,7 @@ from lslam.readers.folder_sequence import FolderSequence
 from lslam.readers.ground_truth import Voice, find_ground_truth, load_poses, pair_by_number, to_lidar
 from lslam.readers.listing import list_scans, rows_of, stamps_in_names
 from lslam.readers.point_times import TimeRule, decide_rule
-from lslam.readers.sidecars import calibration_over, load_gnss, load_imu, per_point_folder, read_info
+from lslam.readers.sidecars import calibration_over, compensation_note, load_gnss, load_imu, per_point_folder, read_info
 from lslam.readers.stamps import DEFAULT_RATE_HZ, check_stamps, load_stamps, nominal_stamps
 from lslam.types.calibration import Calibration
 from lslam.types.trajectory import Trajectory
@@ -43,7 +43,7 @@ def open_folder(folder: Path, overrides: SequenceInfo, why: str) -> FolderSequen
     if scans is None:
         raise InputError(f"{folder} holds no scans ({', '.join('*' + s for s in SUFFIXES)})")
     _, files, left_out = scans
-    voice = Voice([f"format {KIND}: {why}", *left_out], [])
+    voice = Voice([f"format {KIND}: {why}", *left_out, *compensation_note(info)], [])
     calibration = calibration_over(info, Calibration(T_cam0_lidar=_tr(folder, voice)))
     files, stamps, rate, truth = _stamps_and_truth(folder, info, files, calibration, voice)
     correction = info.vertical_correction_deg or 0.0
@@ -53,7 +53,7 @@ def open_folder(folder: Path, overrides: SequenceInfo, why: str) -> FolderSequen
     if info.rows and info.cols:
         voice.notes.append(f"organised clouds of {info.rows} rows x {info.cols} columns: the row is the ring")
     return FolderSequence(
-        name=info.name or folder.resolve().name,
+        name=info.name or folder.name,
         path=folder,
         kind=KIND,
         files=files,

@@ -34,6 +34,16 @@ def read_info(folder: Path, overrides: SequenceInfo) -> tuple[SequenceInfo, bool
     return overrides.over(read_sequence_toml(path)), True
 
 
+def compensation_note(info: SequenceInfo) -> list[str]:
+    """What `sequence.toml` or the user says about motion compensation, as a sentence; empty when nothing is said."""
+    if info.motion_compensated is None:
+        return []
+    if not info.motion_compensated:
+        return ["scans are motion distorted, as stated"]
+    instant = f", to {info.compensated_to}: the stamp is taken as that instant" if info.compensated_to else ""
+    return [f"scans are motion compensated, as stated{instant}"]
+
+
 def vertical_correction(info: SequenceInfo, files: list[Path], notes: list[str]) -> float:
     """Degrees by which real KITTI HDL-64E points are lifted, 0 where something says otherwise; the reason goes to `notes`."""
     if info.vertical_correction_deg is not None:

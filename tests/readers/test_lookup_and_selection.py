@@ -55,6 +55,20 @@ def test_environment_names_the_data_root(tmp_path: Path, monkeypatch: pytest.Mon
     assert find_folder("seq07") == folder
 
 
+def test_relative_paths_and_links(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = kitti_root(tmp_path / "disk", 2)
+    monkeypatch.chdir(folder)
+    s = open_sequence(".")
+    assert (s.name, s.path) == ("seq07", folder)
+    assert s.ground_truth is not None
+    (tmp_path / "home" / "sequences").mkdir(parents=True)
+    (tmp_path / "home" / "sequences" / "07").symlink_to(folder)
+    (tmp_path / "home" / "poses").mkdir()
+    (tmp_path / "disk" / "poses" / "07.txt").rename(tmp_path / "home" / "poses" / "07.txt")
+    assert open_sequence(tmp_path / "home").ground_truth is not None
+    assert open_sequence(folder).ground_truth is None
+
+
 def test_selection_keeps_indices_stamps_and_truth(tmp_path: Path) -> None:
     s = open_sequence(kitti_root(tmp_path, 10))
     part = select(s, start=2, count=3, skip_frames=3)
