@@ -130,6 +130,28 @@ def test_pcd_keeps_ring_and_time_and_skips_padding(tmp_path: Path) -> None:
     assert back.rings.tolist() == [63, 62, 61, 60, 59]
 
 
+@pytest.mark.parametrize("kind", ["binary.pcd", "ascii.pcd", "binary_compressed.pcd", "a.ply", "a.npy", "a.bin"])
+@given(place=st.integers(0, 10_000), what=st.binary(max_size=6), cut=st.integers(0, 8), end=st.integers(0, 60))
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_damaged_files_are_read_or_refused(
+    kind: str, place: int, what: bytes, cut: int, end: int, tmp_path: Path
+) -> None:
+    """Bytes replaced, inserted, removed or cut off: a cloud comes out, or one sentence that names the file."""
+    path = tmp_path / f"damaged{Path(kind).suffix}"
+    points, intensity = cloud(20)
+    if kind.endswith(".pcd"):
+        write_pcd(path, points, intensity, kind.removesuffix(".pcd"))
+    else:
+        write_points(path, points, intensity)
+    data = path.read_bytes()
+    place %= len(data)
+    path.write_bytes((data[:place] + what + data[place + cut :])[: len(data) - end])
+    try:
+        assert read_points(path).points.shape[1] == 3
+    except InputError as error:
+        assert str(path) in str(error)
+
+
 def pcd(**changes: str) -> str:
     entries = {
         "FIELDS": "x y z", "SIZE": "4 4 4", "TYPE": "F F F", "COUNT": "1 1 1", "WIDTH": "2", "HEIGHT": "1",

@@ -107,6 +107,9 @@ def test_per_point_rings_and_times(tmp_path: Path) -> None:
         s.scan(1)
     with pytest.raises(InputError, match=r"000002\.npz"):
         s.scan(2)
+    (folder / "per_point" / "000003.npz").write_bytes(b"PK\x03\x04 this is no archive")
+    with pytest.raises(InputError, match=r"000003\.npz"):
+        s.scan(3)
     compensated = open_sequence(folder, motion_compensated=True).scan(0)
     assert compensated.times is None
     assert compensated.rings is not None
