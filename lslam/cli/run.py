@@ -5,6 +5,7 @@ from __future__ import annotations
 import signal
 import sys
 import threading
+from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,7 +17,7 @@ from lslam.cli.console import progress, setup_logging
 
 if TYPE_CHECKING:
     from lslam.config import Config
-    from lslam.pipeline.run import Watch
+    from lslam.pipeline.run import RunOutcome, Watch
     from lslam.types.sequence import Sequence
     from lslam.types.trajectory import Trajectory
 
@@ -66,11 +67,12 @@ def command(sequence: str, **given: Any) -> None:
         create_odometry(config)
         return _print_plan(chosen, config, out)
     with ExitStack() as stack:
-        outcome = run(
+        run(
             opened, config, out=out, ground_truth=truth, overwrite=given["overwrite"],
-            command=" ".join(["lslam", *sys.argv[1:]]), watch=_watch(stack),
+            command=" ".join(["lslam", *sys.argv[1:]]),
+            watch=_watch(stack, lambda outcome: _print_result(outcome, out, given["as_json"])),
         )  # fmt: skip
-    return _print_result(outcome, out, given["as_json"])
+    return None
 
 
 def _resolve(given: dict[str, Any]) -> Config:
@@ -104,7 +106,7 @@ def _read_truth(path: Path | None, sequence: Sequence) -> Trajectory | None:
     return truth
 
 
-def _watch(stack: ExitStack) -> Watch:
+def _watch(stack: ExitStack, show: Callable[[RunOutcome], None]) -> Watch:
     """Progress bars, and SIGINT and SIGTERM as a wish to stop after the scan at hand."""
     from lslam.pipeline.run import Watch
 
@@ -124,7 +126,12 @@ def _watch(stack: ExitStack) -> Watch:
     for number in (signal.SIGINT, signal.SIGTERM):
         previous = signal.signal(number, on_signal)
         stack.callback(signal.signal, number, previous)
-    return Watch(on_start, lambda: advance[0](), stop.is_set)
+
+    def on_end(outcome: RunOutcome) -> None:
+        bar.close()
+        show(outcome)
+
+    return Watch(on_start, lambda: advance[0](), on_end, stop.is_set)
 
 
 def _print_plan(sequence: Sequence, config: Config, out: Path) -> None:
@@ -135,7 +142,7 @@ def _print_plan(sequence: Sequence, config: Config, out: Path) -> None:
     click.echo(to_toml(config), nl=False)
 
 
-def _print_result(outcome: Any, out: Path, as_json: bool) -> None:
+def _print_result(outcome: RunOutcome, out: Path, as_json: bool) -> None:
     if not as_json:
         from lslam.reports.text import summary
 

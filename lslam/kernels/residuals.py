@@ -49,9 +49,10 @@ def linearise(source: Floats, scatter: Floats, R: Floats, t: Floats, size: float
     """Fill H (6, 6), g (6,) and facts from all source points (S, 3), LiDAR frame, with scatter (S, 6) around each.
 
     Each point takes the nearest plane voxel of the eight around it: residual n . (R s + t - mean), variance = map
-    eigenvalue + source scatter along the normal + sigma2 + tilt at that distance from the mean, Geman-McClure weight of width `scale`. Without a plane the nearest
-    blob stands in: isotropic, its mean variance, times `blob_weight`. `facts`: sum of information, weighted squared
-    residuals (m2), inliers within `scale`, matched, sum of squared lever arms, sum of robust weights.
+    eigenvalue + source scatter along the normal + sigma2 + tilt at that distance from the mean, Geman-McClure weight of
+    width `scale`. Without a plane the nearest blob stands in: isotropic, its mean variance, times `blob_weight`.
+    `facts`: sum of information, weighted squared residuals (m2), inliers within `scale`, matched, information times
+    squared lever arm, sum of robust weights.
     """
     inverse = 1.0 / size
     H[:] = 0.0

@@ -9,6 +9,7 @@ import numpy as np
 from lslam.config.config import Config
 from lslam.preprocessing.prepare import PreparedPoints, prepare_points
 from lslam.registration.registration import Registration
+from lslam.registration.uncertainty import PoseUncertainty
 from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan import Scan
 from lslam.types.scan_result import ScanResult
@@ -24,6 +25,7 @@ class Icp:
 
     def __init__(self, registration: Registration) -> None:
         self.registration = registration
+        self._uncertainty = PoseUncertainty()
 
     def prepare(self, scan: Scan) -> PreparedPoints:
         """Range gate and down-sampling."""
@@ -41,7 +43,8 @@ class Icp:
             T_world_lidar=result.T_world_lidar,
             status="ok" if result.ok else "bridged",
             reason=result.reason,
-            covariance=result.covariance,
+            covariance=self._uncertainty.add(result),
+            registration_covariance=result.covariance,
             converged=result.converged,
             iterations=result.iterations,
             source_points=result.source_points,

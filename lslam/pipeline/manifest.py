@@ -99,7 +99,8 @@ class Manifest:
                 "trajectory_kitti.txt": "camera 0 (Tr is known)" if has_camera else "LiDAR (no Tr is known)",
                 "pose_time": "scan_start",
                 "deskew": "none",
-                "covariances.npz": "of t' = t + d[:3], R' = exp(d[3:]) R in world axes, m2 and rad2",
+                "covariances.npz": "covariances: of the poses in the world; registration: against the local map (NaN: none); "
+                "both (N, 6, 6) of t' = t + d[:3], R' = exp(d[3:]) R in world axes, m2 and rad2",
             },
             "counts": dict(self.counts),
             **({"map_points": self.map_points} if self.map_points is not None else {}),

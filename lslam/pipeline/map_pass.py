@@ -39,5 +39,5 @@ def build_map(
             merger.add(loaded.scan.points, result.T_world_lidar, loaded.scan.intensity)
         on_step()
     merged = merger.result()
-    image, extent = top_view(merged.points)
+    image, extent = top_view(merged.points, pixel=max(0.2, config.map.voxel))
     return BuiltMap(merged, image, extent)

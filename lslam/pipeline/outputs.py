@@ -41,7 +41,14 @@ def write_trajectories(folder: RunFolder, record: RunRecord, calibration: Calibr
     write_kitti(folder.path / "trajectory_kitti.txt", _in_camera(trajectory, calibration))
     if trajectory.covariances is not None:
         stream = io.BytesIO()
-        np.savez_compressed(stream, stamps_ns=trajectory.stamps_ns, covariances=trajectory.covariances)
+        registration = [np.full((6, 6), np.nan) if r.registration_covariance is None else r.registration_covariance
+                        for r in record.results]  # fmt: skip
+        np.savez_compressed(
+            stream,
+            stamps_ns=trajectory.stamps_ns,
+            covariances=trajectory.covariances,
+            registration=np.stack(registration),
+        )
         folder.write_bytes("covariances.npz", stream.getvalue())
 
 

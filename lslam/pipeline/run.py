@@ -11,6 +11,7 @@ from lslam.config import Config
 from lslam.errors import GateError, InterruptedRunError, LslamError, OutputError, RunFailedError
 from lslam.evaluation.evaluate import Evaluation, evaluate
 from lslam.kernels import jit
+from lslam.maps import merge
 from lslam.odometry import create_odometry
 from lslam.odometry.base import Odometry
 from lslam.pipeline import outputs
@@ -42,10 +43,15 @@ class RunOutcome:
 
 @dataclass(frozen=True)
 class Watch:
-    """How a caller follows a run (`on_start(stage, scans)`, then `on_step()` per scan) and ends it early."""
+    """How a caller follows a run and ends it early.
+
+    on_start(stage, scans), then on_step() per scan; on_end(outcome) also when the run then raises because it diverged,
+    was interrupted or missed a gate
+    """
 
     on_start: Callable[[str, int], None] = lambda stage, total: None
     on_step: Callable[[], None] = lambda: None
+    on_end: Callable[[RunOutcome], None] = lambda outcome: None
     should_stop: Callable[[], bool] = lambda: False
 
 
@@ -97,8 +103,10 @@ def run(
                 _write_last(folder, manifest.as_dict(manifest.word_for(error), str(error)))
                 raise
             _write_last(folder, manifest.as_dict(manifest.outcome))
+    outcome = RunOutcome(record, evaluation)
+    watch.on_end(outcome)
     _raise_outcome(manifest, config)
-    return RunOutcome(record, evaluation)
+    return outcome
 
 
 def _estimate(
@@ -108,6 +116,8 @@ def _estimate(
     """Odometry over all scans, judged."""
     with manifest.timed("compile_s"), jit.compile_lock(), jit.announced(log):
         odometry.warm_up()
+        if config.map.write:
+            merge.warm_up()
 
     def seen(result: ScanResult) -> None:
         if result.status != "ok":

@@ -17,8 +17,10 @@ class ScanResult:
 
     status : `ok` registered; `bridged` registration failed and the motion prior stands in; `skipped` the scan could
         not be read or was empty, the motion prior stands in
-    T_world_lidar : (4, 4) pose at scan start; covariance : (6, 6) of the left twist (translation, rotation), m2, rad2;
-        None when the method has none
+    T_world_lidar : (4, 4) pose at scan start
+    covariance : (6, 6) of the pose in the world, t' = t + d[:3], R' = exp(d[3:]) R in world axes, m2 and rad2; grows with
+        the distance travelled. None when the method has none
+    registration_covariance : likewise, but relative to the local map the scan was registered on
     degenerate : (K, 6) unit twists along which the scan says nothing and the motion prior was kept
     prior_error : (translation m, rotation rad) between motion prior and result
     stages : seconds per stage, by name, in the order they ran
@@ -30,6 +32,7 @@ class ScanResult:
     status: Status = "ok"
     reason: str = ""
     covariance: NDArray[np.float64] | None = None
+    registration_covariance: NDArray[np.float64] | None = None
     converged: bool = True
     iterations: int = 0
     source_points: int = 0

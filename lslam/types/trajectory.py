@@ -15,7 +15,7 @@ class Trajectory:
 
     stamps_ns : (N,) int64; poses : (N, 4, 4) float64 T_world_body; frame : the body, `lidar`, `cam0`, `imu` or `unknown`
     has_stamps : False when the file format has no time and stamps merely count scans at 10 Hz
-    covariances : (N, 6, 6) float64 of left twists (translation, rotation) in the world frame, m2 and rad2, or None
+    covariances : (N, 6, 6) float64 of t' = t + d[:3], R' = exp(d[3:]) R in world axes, m2 and rad2, or None
     source : file or method the poses come from
     """
 
