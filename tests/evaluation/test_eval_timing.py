@@ -1,0 +1,56 @@
+"""Time per scan out of a run's timing.csv."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from lslam.errors import InputError
+from lslam.evaluation.timing import read_timing
+
+GOOD = "index,stamp_ns,read,register,total\n" + "".join(
+    f"{k},{k * 10**8},0.01,{0.001 * k},{0.01 + 0.001 * k}\n" for k in range(101)
+)
+
+
+def test_stages_and_limit(tmp_path: Path) -> None:
+    (tmp_path / "timing.csv").write_text(GOOD)
+    timing = read_timing(tmp_path / "timing.csv")
+    assert timing.scans == 101
+    assert list(timing.stages) == ["read", "register"]
+    assert timing.stages["register"].median == pytest.approx(0.05)
+    assert timing.stages["register"].p95 == pytest.approx(0.095)
+    assert timing.total.max == pytest.approx(0.11)
+    assert timing.stages["read"].share + timing.stages["register"].share == pytest.approx(1)
+    assert timing.period == pytest.approx(0.1)
+    assert timing.over_limit == 10
+
+
+def test_total_is_the_sum_when_absent(tmp_path: Path) -> None:
+    (tmp_path / "timing.csv").write_text("scan,a,b\n0,1,2\n1,3,4\n")
+    timing = read_timing(tmp_path / "timing.csv")
+    assert timing.total.mean == 5
+    assert timing.period is None
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("", "no scans"),
+        ("index,total\n", "no scans"),
+        ("index,total\n0,fast\n", "line 2: not a number"),
+        ("index,total\n0\n", "line 2: 1 columns"),
+        ("index,total\n0,nan\n", "NaN"),
+        ("index,stamp_ns\n0,1\n", "neither"),
+    ],
+)
+def test_what_is_wrong_is_said(text: str, sentence: str, tmp_path: Path) -> None:
+    (tmp_path / "timing.csv").write_text(text)
+    with pytest.raises(InputError, match=sentence):
+        read_timing(tmp_path / "timing.csv")
+
+
+def test_missing(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="cannot be read"):
+        read_timing(tmp_path / "timing.csv")
