@@ -44,6 +44,12 @@ def open_folder(folder: Path, overrides: SequenceInfo, why: str) -> FolderSequen
         raise InputError(f"{folder} holds no scans ({', '.join('*' + s for s in SUFFIXES)})")
     _, files, left_out = scans
     voice = Voice([f"format {KIND}: {why}", *left_out, *compensation_note(info)], [])
+    if folder.name == "velodyne" or folder.parts[-2:] == ("velodyne_points", "data"):
+        whole = folder.parent if folder.name == "velodyne" else folder.parent.parent
+        voice.problems.append(
+            f"{folder} is the inside of a KITTI sequence: give {whole} for its stamps, calibration, ground truth and the "
+            "vertical correction of its points"
+        )
     calibration = calibration_over(info, Calibration(T_cam0_lidar=_tr(folder, voice)))
     files, stamps, rate, truth = _stamps_and_truth(folder, info, files, calibration, voice)
     correction = info.vertical_correction_deg or 0.0

@@ -146,10 +146,12 @@ def test_damaged_files_are_read_or_refused(
     data = path.read_bytes()
     place %= len(data)
     path.write_bytes((data[:place] + what + data[place + cut :])[: len(data) - end])
+    sentence = None
     try:
         assert read_points(path).points.shape[1] == 3
     except InputError as error:
-        assert str(path) in str(error)
+        sentence = str(error)
+    assert sentence is None or str(path) in sentence
 
 
 def pcd(**changes: str) -> str:

@@ -161,6 +161,12 @@ def test_times_that_fit_no_unit_mean_no_deskew_and_say_so(tmp_path: Path) -> Non
     assert said(s.problems, "no deskew: per-point time field 'time' (float32, 0 to 2")
 
 
+def test_the_inside_of_a_kitti_sequence_is_noticed(tmp_path: Path) -> None:
+    s = open_sequence(scans(tmp_path / "07" / "velodyne", 2))
+    assert s.kind == "scan-folder"
+    assert said(s.problems, f"give {tmp_path / '07'} for its stamps")
+
+
 def test_empty_folders_and_folders_of_something_else(tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     with pytest.raises(InputError, match="empty is empty"):
