@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Iterable
-from decimal import ROUND_HALF_EVEN, Decimal, InvalidOperation
+from decimal import ROUND_HALF_EVEN, Decimal
 from pathlib import Path
 from typing import NamedTuple
 
@@ -86,12 +86,15 @@ def seconds_to_ns(text: str, path: Path, line: int, scale: int = 1_000_000_000) 
     """Exact integer ns of a decimal number in a unit of `scale` ns (seconds by default)."""
     try:
         value = Decimal(text) * scale
-        ns = int(value.to_integral_value(ROUND_HALF_EVEN))
-    except (InvalidOperation, ValueError, OverflowError):
-        raise InputError(f"{path}, line {line}: {text!r} is no time") from None
-    if abs(ns) > LARGEST_NS:
-        raise InputError(f"{path}, line {line}: time {text} is out of range (seconds expected)")
-    return ns
+        is_finite = value.is_finite()
+        # Compared before it becomes an integer: 1e999999 would have a million digits.
+        if is_finite and abs(value) <= LARGEST_NS:
+            return int(value.to_integral_value(ROUND_HALF_EVEN))
+    except (ArithmeticError, ValueError):
+        is_finite = False
+    if not is_finite:
+        raise InputError(f"{path}, line {line}: {text!r} is no time")
+    raise InputError(f"{path}, line {line}: time {text} is out of range (seconds expected)")
 
 
 def seconds_text(stamp_ns: int) -> str:

@@ -157,6 +157,8 @@ WRONG = {
     "twice.tum": (GOOD + GOOD, "line 2: .* repeats"),
     "quaternion.tum": (GOOD + "0.1 0 0 0 0 0 0 0\n", "line 2: quaternion of length 0"),
     "late.tum": (GOOD + "1e300 0 0 0 0 0 0 1\n", "line 2: .* out of range"),
+    "digits.csv": ("t,x,y,z,qx,qy,qz,qw\n1E999999999999999999,0,0,0,0,0,0,1\n", "line 2: .* is no time"),
+    "far.csv": ("t,x,y,z,qx,qy,qz,qw\n1e999999,0,0,0,0,0,0,1\n", "line 2: time 1e999999 is out of range"),
     "rotation.txt": ("1 0 0 0 0 1 0 0 0 0 2 0\n", "line 1: .* no rotation"),
     "mirror.txt": ("1 0 0 0 0 1 0 0 0 0 -1 0\n", "line 1: .* no rotation"),
     "columns.txt": ("1 2 3\n", "line 1: 3 columns are no trajectory format"),
