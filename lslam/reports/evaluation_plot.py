@@ -10,6 +10,7 @@ import numpy as np
 
 from lslam.errors import OutputError, UsageError, nearest
 from lslam.evaluation.results import AbsoluteError, Evaluation
+from lslam.reports.evaluation_table import short_names
 
 FORMATS = ("png", "svg", "pdf")
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")  # Okabe and Ito: safe for colour blindness
@@ -33,7 +34,7 @@ def write_plot(path: str | Path, evaluations: Sequence[Evaluation], names: Seque
 
     # Text stays text, and the same input gives the same bytes.
     with rc_context({"svg.hashsalt": "lslam", "svg.fonttype": "none", "font.size": 9}):
-        figure = _draw(evaluations, names or [Path(e.estimate).stem for e in evaluations])
+        figure = _draw(evaluations, names or short_names([e.estimate for e in evaluations]))
         kind = path.suffix.lstrip(".").lower()
         part = path.with_name(path.name + ".part")
         try:

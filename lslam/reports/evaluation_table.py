@@ -21,7 +21,7 @@ def render(evaluations: Sequence[Evaluation], timings: Sequence[Timing | None] =
     """
     padded = [*timings, *[None] * (len(evaluations) - len(timings))]
     rows = _rows(evaluations, padded)
-    names = _short_names([e.estimate for e in evaluations])
+    names = short_names([e.estimate for e in evaluations])
     if style == "text":
         return "\n".join([*_head(evaluations, names), "", *_text(rows, names), "", *_recipes(evaluations)])
     grid = [["metric", "unit", *names], *([label, unit, *cells] for label, unit, cells in rows)]
@@ -161,9 +161,9 @@ def _latex(grid: list[list[str]]) -> str:
     )
 
 
-def _short_names(names: list[str]) -> list[str]:
-    """The shortest path endings that tell the estimates apart."""
-    parts = [name.replace("\\", "/").split("/") for name in names]
+def short_names(names: list[str]) -> list[str]:
+    """The shortest path endings that tell the estimates apart; a run is called by its folder."""
+    parts = [name.replace("\\", "/").removesuffix("/trajectory.tum").split("/") for name in names]
     for depth in range(1, max(len(p) for p in parts) + 1):
         short = ["/".join(p[-depth:]) for p in parts]
         if len(set(short)) == len(short):

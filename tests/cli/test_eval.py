@@ -93,8 +93,7 @@ def test_several_estimates_and_a_run_folder_with_its_timing(folder: Path) -> Non
     assert second["timing"] is None
     assert second["ate"]["se3"]["rmse"] > 5 * first["ate"]["se3"]["rmse"]
     table = lslam(folder / "run", folder / "bad.csv", folder / "gt.tum", "--table", "md")
-    assert "trajectory.tum" in table.stdout
-    assert "bad.csv" in table.stdout
+    assert table.stdout.startswith("| metric | unit | run | bad.csv |")
 
 
 @pytest.mark.parametrize(

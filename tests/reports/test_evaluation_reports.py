@@ -112,8 +112,13 @@ def test_text_table_names_every_recipe(result: Evaluation) -> None:
 def test_table_of_several_tells_them_apart(result: Evaluation, unavailable: Evaluation) -> None:
     pair = [result, replace(unavailable, rpe=result.rpe)]
     text = evaluation_table.render(pair)
-    assert "a/trajectory.tum" in text
-    assert "b/trajectory.tum" in text
+    assert text.splitlines()[1].startswith("estimate      a: runs/a/trajectory.tum")
+    assert evaluation_table.short_names(["x/a.tum", "y/a.tum", "runs/b/trajectory.tum"]) == [
+        "x/a.tum",
+        "y/a.tum",
+        "runs/b",
+    ]
+    assert evaluation_table.short_names(["a.tum", "a.tum"]) == ["1: a.tum", "2: a.tum"]
     assert "n/a (collinear)" in text
     for style in ("md", "csv", "tex"):
         lines = evaluation_table.render(pair, style=style).splitlines()
