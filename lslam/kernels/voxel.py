@@ -93,7 +93,8 @@ def centroids(points: NDArray[np.float32], size: float) -> tuple[NDArray[np.floa
     for i in range(n):
         x, y, z = float(points[i, 0]), float(points[i, 1]), float(points[i, 2])
         key = pack(index_of(x, inverse), index_of(y, inverse), index_of(z, inverse))
-        if key != last_key:
+        # A coordinate beyond all voxels can give any key, the initial one too.
+        if count == 0 or key != last_key:
             h = hash_key(key, mask)
             while table[h] >= 0 and keys[table[h]] != key:
                 h = (h + 1) & mask
