@@ -40,8 +40,9 @@ def show(config_file: Path | None, settings: tuple[str, ...], describe: bool) ->
 @command.command(epilog="Example: lslam config check my.toml")
 @click.argument("file", type=click.Path(path_type=Path))
 def check(file: Path) -> None:
-    """Check a configuration file: exit 0 when every key and value is known."""
+    """Check a configuration file: exit 0 when every key, value and name in it is known."""
     from lslam.config import load_config
+    from lslam.pipeline.check import check_config
 
-    load_config(file)
+    check_config(load_config(file, environ={}))
     click.echo(f"{file}: ok")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import tomllib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -43,9 +44,11 @@ def to_toml(config: Config) -> str:
 
 def _read(path: Path) -> Tree:
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"configuration {path} cannot be read: {error}") from None
+        return tomllib.loads(path.read_text(encoding="utf-8-sig"))
+    except OSError as error:
+        raise InputError(f"configuration {path} cannot be read: {error.strerror or error}") from None
+    except UnicodeDecodeError:
+        raise InputError(f"configuration {path} cannot be read: it is not UTF-8 text") from None
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(f"configuration {path} is not valid TOML: {error}") from None
 
@@ -94,7 +97,18 @@ def _merge(tree: Tree, more: Tree, where: str) -> None:
 
 
 def _explain(error: ValidationError) -> str:
-    parts = []
+    """One part per key: what was given and what is wanted, with the nearest of the words that are allowed."""
+    parts: dict[str, str] = {}
     for e in error.errors():
-        parts.append(f"{'.'.join(str(p) for p in e['loc'] if not isinstance(p, int))} = {e['input']!r}: {e['msg']}")
-    return "configuration: " + "; ".join(parts)
+        key = ".".join([str(p) for p in e["loc"] if not isinstance(p, int)][:2])
+        wanted = e["msg"].removeprefix("Value error, ")
+        if e["type"] == "literal_error":
+            words = re.findall(r"'([^']*)'", e["ctx"]["expected"])
+            wanted += f"; {nearest(str(e['input']), words)}" if len(words) > 1 else ""
+        # What concerns several keys of a section names them itself; a choice of types complains once per type.
+        said = f"{key}: {wanted}" if isinstance(e["input"], dict) else f"{key} = {e['input']!r}: {wanted}"
+        if key not in parts:
+            parts[key] = said
+        elif wanted not in parts[key]:
+            parts[key] += f", or {wanted}"
+    return "configuration: " + "; ".join(parts.values())

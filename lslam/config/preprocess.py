@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Literal
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from lslam.config.section import Section
 
@@ -30,3 +30,12 @@ class PreprocessConfig(Section):
     source_points_max: int = Field(6000, ge=100, description="`target`: more points make the grid coarser")
     random_share: float = Field(0.3, gt=0, le=1, description="`random`: share of points kept")
     seed: int = Field(0, ge=0, description="`random`: seed")
+
+    @model_validator(mode="after")
+    def _check(self) -> PreprocessConfig:
+        self.require_order("range_min", "range_max")
+        self.require_order("source_points_min", "source_points_max")
+        box = self.ego_box
+        if box is not None and not (box[0] < box[1] and box[2] < box[3] and box[4] < box[5]):
+            raise ValueError(f"ego_box = {list(box)} must be x_min, x_max, y_min, y_max, z_min, z_max")
+        return self

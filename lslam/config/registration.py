@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from lslam.config.section import Section
 
@@ -41,3 +41,8 @@ class RegistrationConfig(Section):
     weak_share: float = Field(
         1e-3, ge=0, lt=1, description="share of the information below which a direction keeps the motion prior"
     )
+
+    @model_validator(mode="after")
+    def _check(self) -> RegistrationConfig:
+        self.require_order("kernel_min", "kernel_max")
+        return self

@@ -8,4 +8,10 @@ from pydantic import BaseModel, ConfigDict
 class Section(BaseModel):
     """A frozen section: unknown keys are errors, values are checked, and nothing changes after the start of a run."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, validate_default=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, validate_default=True, allow_inf_nan=False)
+
+    def require_order(self, low: str, high: str) -> None:
+        """Raise ValueError unless the value of key `low` lies below that of `high`."""
+        a, b = getattr(self, low), getattr(self, high)
+        if not a < b:
+            raise ValueError(f"{low} = {a} must be less than {high} = {b}")
