@@ -3,31 +3,60 @@
 from __future__ import annotations
 
 import logging
+import os
 import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Protocol
+from functools import cache
+from typing import TYPE_CHECKING, Protocol
+
+if TYPE_CHECKING:
+    from rich.console import Console
 
 log = logging.getLogger("lslam")
 
 
 def setup_logging(verbose: bool = False, quiet: bool = False) -> None:
-    """Send lslam's log to stderr."""
-    level = logging.DEBUG if verbose else logging.WARNING if quiet else logging.INFO
+    """Send lslam's log to stderr; a run's log.txt listens to the same logger and keeps more than `quiet` shows."""
     handler: logging.Handler
     if sys.stderr.isatty():
-        from rich.console import Console
         from rich.logging import RichHandler
 
-        handler = RichHandler(console=Console(stderr=True), show_path=False, show_time=False, markup=False)
+        handler = RichHandler(console=_console(), show_path=False, show_time=False, markup=False, highlighter=None)
         handler.setFormatter(logging.Formatter("%(message)s"))
     else:
         handler = logging.StreamHandler(sys.stderr)
         handler.setFormatter(logging.Formatter("%(levelname)s: %(message)s"))
+    handler.setLevel(logging.DEBUG if verbose else logging.WARNING if quiet else logging.INFO)
     log.handlers[:] = [handler]
-    log.setLevel(level)
+    log.setLevel(logging.DEBUG if verbose else logging.INFO)
     log.propagate = False
+    # A terminal or pipe that goes away must not end a run of hours with tracebacks of the log.
+    logging.raiseExceptions = False
+
+
+@cache
+def _console() -> Console:
+    """One console for log and bar, so that a warning does not tear the bar apart."""
+    from rich.console import Console
+
+    return Console(stderr=True)
+
+
+def show(text: str) -> None:
+    """Results on stdout. A reader that has left (`lslam ... | head`) has seen what it wanted: the rest goes nowhere."""
+    import click
+
+    try:
+        click.echo(text, nl=False)
+    except BrokenPipeError:
+        leave_stdout()
+
+
+def leave_stdout() -> None:
+    """Nobody reads our stdout any more: what is still written, also at exit, must not fail."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 class Advance(Protocol):
@@ -40,7 +69,10 @@ class Advance(Protocol):
 
 @contextmanager
 def progress(title: str, total: int, unit: str = "scans") -> Iterator[Advance]:
-    """A progress bar with rate and ETA on a terminal; a plain line at most every 10 s elsewhere."""
+    """A progress bar with rate and ETA on a terminal; elsewhere a plain line at most every 10 s and one at the end."""
+    if not any(handler.level <= logging.INFO for handler in log.handlers):
+        yield lambda note="": None
+        return
     if sys.stderr.isatty():
         with _bar(title, total, unit) as advance:
             yield advance
@@ -52,33 +84,25 @@ def progress(title: str, total: int, unit: str = "scans") -> Iterator[Advance]:
         nonlocal done, last
         done += 1
         now = time.monotonic()
-        if now - last >= 10:
-            last = now
-            rate = done / (now - began)
-            log.info(
-                "%s %d/%d, %.1f %s/s, %.0f s left %s",
-                title,
-                done,
-                total,
-                rate,
-                unit,
-                (total - done) / rate,
-                note,
-            )
+        if now - last < 10 and done < total:
+            return
+        last = now
+        rate = done / max(now - began, 1e-9)
+        left = f"{(total - done) / rate:.0f} s left" if done < total else f"{now - began:.1f} s"
+        log.info("%s %d/%d, %.1f %s/s, %s%s", title, done, total, rate, unit, left, note and f", {note}")
 
     yield plain
 
 
 @contextmanager
 def _bar(title: str, total: int, unit: str) -> Iterator[Advance]:
-    from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
     columns = (
         TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(),
         TextColumn("{task.fields[rate]}"), TimeRemainingColumn(),
     )  # fmt: skip
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+    with Progress(*columns, console=_console(), transient=True) as bar:
         task = bar.add_task(title, total=total, rate="")
         began = time.monotonic()
         done = 0

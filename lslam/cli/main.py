@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import io
+import signal
 import sys
 from importlib import import_module
 from typing import Any, NoReturn
@@ -51,10 +53,20 @@ class LazyGroup(click.Group):
         assert isinstance(command, click.Command)
         return command
 
+    def invoke(self, ctx: click.Context) -> Any:
+        """As click does, but a reader of stdout that has left (`lslam ... | head`) is no error."""
+        try:
+            return super().invoke(ctx)
+        except BrokenPipeError:
+            from lslam.cli.console import leave_stdout
+
+            leave_stdout()
+            return 0
+
     def resolve_command(self, ctx: click.Context, args: list[str]) -> Any:
         """As click does, but an unknown name is answered with the nearest one."""
         if args and args[0] not in COMMANDS and not args[0].startswith("-"):
-            raise click.UsageError(f"no command {args[0]!r}; {nearest(args[0], COMMANDS)}")
+            raise click.UsageError(f"no command {args[0]!r}; {nearest(args[0], COMMANDS)}", ctx)
         return super().resolve_command(ctx, args)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
@@ -92,22 +104,44 @@ def cli() -> None:
 
 def main() -> NoReturn:
     """Entry point: results on stdout, one sentence per error on stderr, documented exit codes."""
+    # SIGTERM ends lslam as Ctrl-C does, with 130 and nothing half-written.
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")  # an ASCII terminal shows ? for ±, instead of an error after hours
     try:
         code = cli(standalone_mode=False)
-        sys.exit(code if isinstance(code, int) else 0)
     except LslamError as error:
         _fail(str(error), error.exit_code)
     except click.ClickException as error:
-        error.show(file=sys.stderr)
-        sys.exit(2)
+        _fail_usage(error)
     except (click.Abort, KeyboardInterrupt):
         _fail("interrupted", 130)
-    except BrokenPipeError:
-        # The reader of our stdout left (`lslam ... | head`): not an error of ours.
-        sys.stderr.close()
-        sys.exit(0)
+    except OSError as error:
+        _fail(f"{error.filename or 'standard output'} cannot be used: {error.strerror or error}", 3)
+    except MemoryError:
+        _fail("out of memory: use fewer points (preprocess.range_max) or larger voxels (map.voxel)", 1)
+    except Exception as error:
+        _fail_unexpected(error)
+    sys.exit(code if isinstance(code, int) else 0)
 
 
 def _fail(sentence: str, code: int) -> NoReturn:
-    click.echo(f"error: {sentence}", err=True)
+    click.echo(sentence if code == 130 else f"error: {sentence}", err=True)
     sys.exit(code)
+
+
+def _fail_usage(error: click.ClickException) -> NoReturn:
+    ctx = getattr(error, "ctx", None)
+    if ctx is None or type(error).__name__ == "NoArgsIsHelpError":
+        error.show(file=sys.stderr)
+        sys.exit(2)
+    _fail(f"{error.format_message().rstrip('.')}; see {ctx.command_path} --help", 2)
+
+
+def _fail_unexpected(error: Exception) -> NoReturn:
+    """A mistake of ours: say so in one sentence, and show where only to those who ask."""
+    import logging
+
+    logging.getLogger("lslam").debug("traceback", exc_info=error)
+    _fail(f"lslam made a mistake ({type(error).__name__}: {error}): please report it with what -v shows", 1)

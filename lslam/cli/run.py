@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import signal
+import shlex
 import sys
-import threading
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
@@ -13,7 +12,8 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from lslam.cli import options
-from lslam.cli.console import progress, setup_logging
+from lslam.cli.console import progress, setup_logging, show
+from lslam.cli.signals import GentleStop, gentle_stop
 
 if TYPE_CHECKING:
     from lslam.config import Config
@@ -50,11 +50,13 @@ def command(sequence: str, **given: Any) -> None:
     SEQUENCE is a path, or a name under --data-root: seq07, 07, kitti/07, 2011_09_26_drive_0005_sync.
     """
     setup_logging(given["verbose"], given["quiet"])
+    from lslam.pipeline.check import check_config
     from lslam.pipeline.run import run
     from lslam.pipeline.run_folder import default_folder
     from lslam.readers import open_sequence, select
 
     config = _resolve(given)
+    check_config(config)
     opened = open_sequence(
         sequence, data_root=given["data_root"], vertical_correction_deg=config.input.vertical_correction_deg
     )
@@ -65,12 +67,12 @@ def command(sequence: str, **given: Any) -> None:
 
         chosen = select(opened, config.input.start, config.input.count, config.input.skip_frames)
         create_odometry(config)
-        return _print_plan(chosen, config, out)
-    with ExitStack() as stack:
+        return _print_plan(chosen, config, out, given["as_json"])
+    with gentle_stop() as stop, ExitStack() as stack:
         run(
             opened, config, out=out, ground_truth=truth, overwrite=given["overwrite"],
-            command=" ".join(["lslam", *sys.argv[1:]]),
-            watch=_watch(stack, lambda outcome: _print_result(outcome, out, given["as_json"])),
+            command=shlex.join(["lslam", *sys.argv[1:]]),
+            watch=_watch(stack, stop, lambda outcome: _print_result(outcome, out, given["as_json"])),
         )  # fmt: skip
     return None
 
@@ -106,51 +108,50 @@ def _read_truth(path: Path | None, sequence: Sequence) -> Trajectory | None:
     return truth
 
 
-def _watch(stack: ExitStack, show: Callable[[RunOutcome], None]) -> Watch:
-    """Progress bars, and SIGINT and SIGTERM as a wish to stop after the scan at hand."""
+def _watch(stack: ExitStack, stop: GentleStop, finish: Callable[[RunOutcome], None]) -> Watch:
+    """Progress bars, and signals as a wish to stop after the scan at hand."""
     from lslam.pipeline.run import Watch
 
-    stop = threading.Event()
     bar = stack.enter_context(ExitStack())
     advance: list[Any] = []
 
     def on_start(stage: str, total: int) -> None:
         bar.close()
         advance[:] = [bar.enter_context(progress(stage, total))]
-
-    def on_signal(number: int, _: object) -> None:
-        stop.set()
-        # A second signal means it: the default handler ends the process.
-        signal.signal(number, signal.SIG_DFL)
-
-    for number in (signal.SIGINT, signal.SIGTERM):
-        previous = signal.signal(number, on_signal)
-        stack.callback(signal.signal, number, previous)
+        stop.is_gentle = True
 
     def on_end(outcome: RunOutcome) -> None:
         bar.close()
-        show(outcome)
+        finish(outcome)
 
-    return Watch(on_start, lambda: advance[0](), on_end, stop.is_set)
+    return Watch(on_start, lambda: advance[0](), on_end, stop)
 
 
-def _print_plan(sequence: Sequence, config: Config, out: Path) -> None:
+def _print_plan(sequence: Sequence, config: Config, out: Path, as_json: bool) -> None:
     from lslam.config import to_toml
 
+    if as_json:
+        import json
+
+        facts = {"name": sequence.name, "path": str(sequence.path), "format": sequence.kind, "scans": len(sequence)}
+        facts |= {"decisions": sequence.notes, "problems": sequence.problems}
+        show(json.dumps({"folder": str(out), "sequence": facts, "config": config.model_dump(mode="json")}) + "\n")
+        return
     lines = [f"# {sequence.name}: {len(sequence)} scans, {sequence.kind}, {sequence.path}", f"# output: {out}"]
-    click.echo("\n".join([*lines, *(f"# {note}" for note in sequence.notes)]))
-    click.echo(to_toml(config), nl=False)
+    lines += [f"# {note}" for note in sequence.notes] + [f"# problem: {problem}" for problem in sequence.problems]
+    show("\n".join(lines) + "\n" + to_toml(config))
 
 
 def _print_result(outcome: RunOutcome, out: Path, as_json: bool) -> None:
     if not as_json:
         from lslam.reports.text import summary
 
-        click.echo(summary(outcome.record, outcome.evaluation), nl=False)
+        show(summary(outcome.record, outcome.evaluation))
         return
     import json
 
     from lslam.reports.evaluation_json import to_document
 
     score = None if outcome.evaluation is None else to_document(outcome.evaluation)
-    click.echo(json.dumps({"folder": str(out), "manifest": outcome.record.manifest, "evaluation": score}, default=str))
+    document = {"folder": str(out), "manifest": outcome.record.manifest, "evaluation": score}
+    show(json.dumps(document, default=str, allow_nan=False) + "\n")

@@ -65,7 +65,12 @@ class Manifest:
         if diverged:
             self._ended = "diverged"
         elif len(results) < expected:
-            self._ended = "interrupted"
+            self.interrupt(f"interrupted after {len(results)} of {expected} scans")
+
+    def interrupt(self, where: str) -> None:
+        """The run ends early because somebody asked for it."""
+        self._ended = "interrupted"
+        self.problems.append(where)
 
     def word_for(self, error: BaseException) -> str:
         """Status of a run that `error` ended."""
@@ -98,7 +103,7 @@ class Manifest:
                 "trajectory.tum": "T_world_lidar",
                 "trajectory_kitti.txt": "camera 0 (Tr is known)" if has_camera else "LiDAR (no Tr is known)",
                 "pose_time": "scan_start",
-                "deskew": "none",
+                "deskew": describe_deskew(s, self.config.odometry.method),
                 "covariances.npz": "covariances: of the poses in the world; registration: against the local map (NaN: none); "
                 "both (N, 6, 6) of t' = t + d[:3], R' = exp(d[3:]) R in world axes, m2 and rad2",
             },
@@ -114,6 +119,16 @@ class Manifest:
                 **{name: _version(name) for name in LIBRARIES},
             },
         }
+
+
+def describe_deskew(sequence: Sequence, method: str) -> str:
+    """What becomes of the motion within a scan; starts with `no deskew` when it stays in."""
+    if sequence.motion_compensated:
+        return "none needed: the scans are motion compensated"
+    if method == "kiss-icp":
+        return "by kiss-icp, in scans that have per-point times"
+    why = "is not known to be" if sequence.motion_compensated is None else "is not"
+    return f"no deskew: the recording {why} motion compensated, and {method} takes each scan as one instant"
 
 
 def peak_memory_mb() -> float | None:

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.config import Config
-from lslam.errors import InterruptedRunError
 from lslam.maps.merge import MapMerger, MergedMap
 from lslam.maps.top_view import top_view
 from lslam.pipeline.front_end import read_ahead
@@ -29,12 +28,15 @@ class BuiltMap:
 def build_map(
     sequence: Sequence, results: list[ScanResult], config: Config, on_step: Callable[[], None],
     should_stop: Callable[[], bool],
-) -> BuiltMap:  # fmt: skip
-    """Merge every scan that was registered; bridged scans would draw their error into the map and stay out."""
+) -> BuiltMap | None:  # fmt: skip
+    """Merge every scan that was registered; bridged scans would draw their error into the map and stay out.
+
+    None when `should_stop` said so before the last scan.
+    """
     merger = MapMerger(config.map.voxel, config.map.range_min, config.map.range_max)
     for loaded, result in zip(read_ahead(sequence, None, config.input.threads), results, strict=False):
         if should_stop():
-            raise InterruptedRunError("interrupted while the map was built; the trajectory is written")
+            return None
         if loaded.scan is not None and result.status == "ok":
             merger.add(loaded.scan.points, result.T_world_lidar, loaded.scan.intensity)
         on_step()

@@ -24,6 +24,13 @@ from lslam.version import __version__
 
 # Bytes per point of the map files: three doubles or floats and an intensity, with room for the header.
 BYTES_PER_POINT = 28
+# The 95 scans of sample_data make 220 kB without the map, half of it the report.
+BYTES_PER_SCAN, BYTES_OF_REPORT = 4000, 500_000
+
+
+def least_bytes(scans: int) -> int:
+    """What a run of so many scans writes, map aside."""
+    return BYTES_OF_REPORT + BYTES_PER_SCAN * scans
 
 
 def config_text(config: Config) -> str:

@@ -15,8 +15,9 @@ from lslam.maps import merge
 from lslam.odometry import create_odometry
 from lslam.odometry.base import Odometry
 from lslam.pipeline import outputs
+from lslam.pipeline.check import check_config
 from lslam.pipeline.front_end import estimate, is_diverged, to_trajectory
-from lslam.pipeline.manifest import Manifest
+from lslam.pipeline.manifest import Manifest, describe_deskew
 from lslam.pipeline.map_pass import build_map
 from lslam.pipeline.run_folder import RunFolder
 from lslam.readers import open_sequence, select
@@ -79,34 +80,51 @@ def run(
         is degraded. In all three, everything up to there is written. InputError, OutputError, UsageError : as named.
     """
     config, watch = config or Config(), watch or Watch()
+    check_config(config)
     if isinstance(sequence, (str, Path)):
         sequence = open_sequence(sequence)
     chosen = select(sequence, config.input.start, config.input.count, config.input.skip_frames)
-    truth = ground_truth or sequence.ground_truth
+    truth = sequence.ground_truth if ground_truth is None else ground_truth
     odometry = create_odometry(config)
     manifest = Manifest(command, chosen, config)
     if out is None:
+        _announce(chosen, config)
         record = _estimate(chosen, odometry, config, manifest, Path(), truth, watch)
         evaluation = _score(record, chosen, config)
     else:
         with RunFolder(Path(out), overwrite) as folder:
             try:
+                _announce(chosen, config)
+                folder.require_space(outputs.least_bytes(len(chosen)), "the result without its map")
                 folder.write_text("config.toml", outputs.config_text(config))
                 folder.write_manifest(manifest.as_dict("running"))
                 record = _estimate(chosen, odometry, config, manifest, folder.path, truth, watch)
                 outputs.write_trajectories(folder, record, chosen.calibration)
                 outputs.write_scans(folder, record)
                 evaluation = _score(record, chosen, config)
+                outputs.write_evaluation(folder, evaluation)
                 _map(folder, chosen, record, config, manifest, watch)
                 _report(folder, record, evaluation, config, manifest)
             except BaseException as error:
-                _write_last(folder, manifest.as_dict(manifest.word_for(error), str(error)))
+                _write_last(folder, manifest.as_dict(manifest.word_for(error), str(error) or type(error).__name__))
                 raise
-            _write_last(folder, manifest.as_dict(manifest.outcome))
+            folder.write_manifest(manifest.as_dict(manifest.outcome))
+            log.info("%s; results in %s", manifest.outcome, folder.path)
     outcome = RunOutcome(record, evaluation)
     watch.on_end(outcome)
     _raise_outcome(manifest, config)
     return outcome
+
+
+def _announce(sequence: Sequence, config: Config) -> None:
+    """Say what is about to be run and what the reader decided, once: the log keeps it beside the results."""
+    log.info("%s: %d scans of %s, method %s", sequence.name, len(sequence), sequence.path, config.odometry.method)
+    for note in sequence.notes:
+        log.info("%s", note)
+    for problem in sequence.problems:
+        log.warning("%s", problem)
+    deskew = describe_deskew(sequence, config.odometry.method)
+    log.log(logging.WARNING if deskew.startswith("no deskew") else logging.INFO, "deskew: %s", deskew)
 
 
 def _estimate(
@@ -164,6 +182,9 @@ def _map(
     watch.on_start("map", len(record.results))
     with manifest.timed("map_s"):
         built = build_map(sequence, record.results, config, watch.on_step, watch.should_stop)
+        if built is None:
+            manifest.interrupt("interrupted while the map was built: there is no map")
+            return
         record.map_image, record.map_extent = built.image, built.extent
         outputs.write_map(folder, built.merged, config.map)
     manifest.map_points = len(built.merged)
@@ -172,11 +193,10 @@ def _map(
 def _report(
     folder: RunFolder, record: RunRecord, evaluation: Evaluation | None, config: Config, manifest: Manifest
 ) -> None:
-    """evaluation.json and report.html."""
+    """report.html."""
     manifest.problems += record.problems
     record.manifest = manifest.as_dict(manifest.outcome)
     with manifest.timed("report_s"):
-        outputs.write_evaluation(folder, evaluation)
         if config.report.html:
             outputs.write_html(folder, record, evaluation)
 
@@ -192,7 +212,7 @@ def _write_last(folder: RunFolder, manifest: dict[str, object]) -> None:
 def _raise_outcome(manifest: Manifest, config: Config) -> None:
     why = "; ".join(manifest.problems)
     if manifest.outcome == "interrupted":
-        raise InterruptedRunError("interrupted; what was done is written")
+        raise InterruptedRunError(f"{why}; what was done is written")
     if manifest.outcome == "diverged":
         raise RunFailedError(f"the run diverged: {why}")
     if manifest.outcome == "degraded" and config.input.strict:

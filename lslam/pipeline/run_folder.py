@@ -1,12 +1,14 @@
-"""The folder of one run: created whole or not at all, every file written beside its name and renamed, status last."""
+"""The folder of one run: held by one process, every file written beside its name and renamed, status last."""
 
 from __future__ import annotations
 
+import contextlib
 import json
 import logging
+import os
+import re
 import shutil
 import time
-from collections.abc import Iterable
 from pathlib import Path
 from typing import IO, Any
 
@@ -17,6 +19,10 @@ log = logging.getLogger("lslam")
 
 MANIFEST = "manifest.json"
 LOCK = ".lock"
+OURS = (
+    MANIFEST, "config.toml", "log.txt", "trajectory.tum", "trajectory_kitti.txt", "covariances.npz", "map.ply",
+    "map.pcd", "evaluation.json", "timing.csv", "scans.csv", "report.html",
+)  # fmt: skip
 
 
 class RunFolder:
@@ -29,22 +35,14 @@ class RunFolder:
     def __init__(self, path: Path, overwrite: bool = False) -> None:
         self.path = path
         self._lock: IO[str] | None = None
-        self._log_handler: logging.Handler | None = None
-        exists = path.exists()
-        if exists and not path.is_dir():
-            raise OutputExistsError(f"output {path} is a file; name a folder with --out")
-        if exists and any(path.iterdir()) and not overwrite:
-            raise OutputExistsError(
-                f"output folder {path} exists; name another with --out or replace it with --overwrite"
-            )
-        if exists and any(path.iterdir()) and not (path / MANIFEST).exists() and not (path / LOCK).exists():
-            raise OutputExistsError(f"output folder {path} is not a run of lslam; --overwrite replaces runs only")
+        self._log_handler: _LogFile | None = None
         try:
+            _check_target(path, overwrite)
             path.mkdir(parents=True, exist_ok=True)
-            self._hold()
-            if exists:
-                self._clear()
+            self._lock = _hold(path)
+            self._clear()
         except OSError as error:
+            self._let_go()
             raise OutputError(f"output folder {path} cannot be written: {error.strerror or error}") from None
 
     def write_text(self, name: str, text: str) -> Path:
@@ -60,64 +58,138 @@ class RunFolder:
 
     def write_manifest(self, manifest: dict[str, Any]) -> None:
         """Write manifest.json."""
-        self.write_text(MANIFEST, json.dumps(manifest, indent=2, ensure_ascii=False, default=str) + "\n")
+        text = json.dumps(manifest, indent=2, ensure_ascii=False, default=str, allow_nan=False)
+        self.write_text(MANIFEST, text + "\n")
 
     def require_space(self, size: int, what: str) -> None:
         """Raise OutputError when the disk has not `size` bytes left for `what`."""
-        left = shutil.disk_usage(self.path).free
+        try:
+            left = shutil.disk_usage(self.path).free
+        except OSError as error:
+            raise OutputError(f"output folder {self.path} cannot be written: {error.strerror or error}") from None
         if left < size:
             raise OutputError(
-                f"the disk of {self.path} has {left / 1e6:.0f} MB left, {what} needs about {size / 1e6:.0f} MB; "
+                f"the disk of {self.path} has {left / 1e6:.1f} MB left, {what} needs about {size / 1e6:.1f} MB; "
                 "free some space or name another folder with --out"
             )
 
     def __enter__(self) -> RunFolder:
         """Copy lslam's log into log.txt while the folder is held."""
-        handler = logging.FileHandler(self.path / "log.txt", encoding="utf-8")
-        handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
-        logging.getLogger("lslam").addHandler(handler)
-        self._log_handler = handler
+        try:
+            self._log_handler = _LogFile(self.path / "log.txt")
+        except OSError as error:
+            self._let_go()
+            raise OutputError(f"{self.path / 'log.txt'} cannot be written: {error.strerror or error}") from None
+        self._log_handler.attach()
         return self
 
     def __exit__(self, *_: object) -> None:
         """Let go of the folder."""
         if self._log_handler is not None:
-            logging.getLogger("lslam").removeHandler(self._log_handler)
-            self._log_handler.close()
+            self._log_handler.detach()
+        self._let_go()
+
+    def _let_go(self) -> None:
         if self._lock is not None:
-            (self.path / LOCK).unlink(missing_ok=True)
+            with contextlib.suppress(OSError):
+                (self.path / LOCK).unlink(missing_ok=True)
             self._lock.close()
-
-    def _hold(self) -> None:
-        stream = (self.path / LOCK).open("a")
-        try:
-            import fcntl
-
-            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except ImportError:
-            pass
-        except OSError:
-            stream.close()
-            raise OutputExistsError(
-                f"output folder {self.path} is in use by another run; name another with --out"
-            ) from None
-        self._lock = stream
+            self._lock = None
 
     def _clear(self) -> None:
         """Remove an earlier run's files, nothing else."""
-        for name in _known_files(self.path):
+        for name in OURS:
             (self.path / name).unlink(missing_ok=True)
+            (self.path / f"{name}.part").unlink(missing_ok=True)
 
 
-def _known_files(path: Path) -> Iterable[str]:
-    known = (
-        MANIFEST, "config.toml", "log.txt", "trajectory.tum", "trajectory_kitti.txt", "covariances.npz", "map.ply",
-        "map.pcd", "map.json", "evaluation.json", "timing.csv", "scans.csv", "report.html",
-    )  # fmt: skip
-    return [*known, *(p.name for p in path.glob("*.part"))]
+class _LogFile(logging.FileHandler):
+    """log.txt: what the user sees and, also for Python callers who set up no logging, everything from INFO on."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path, encoding="utf-8")
+        self.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
+        self._level_before = log.level
+
+    def attach(self) -> None:
+        """Listen; lower the logger's level for as long as it takes."""
+        self._level_before = log.level
+        if log.getEffectiveLevel() > logging.INFO:
+            log.setLevel(logging.INFO)
+        log.addHandler(self)
+
+    def detach(self) -> None:
+        """Stop listening and put the level back."""
+        log.removeHandler(self)
+        log.setLevel(self._level_before)
+        with contextlib.suppress(OSError):  # a full disk shows up where results are written
+            self.close()
+
+    def handleError(self, record: logging.LogRecord) -> None:
+        """A full disk must not print a traceback per line: the results' own error follows."""
+
+
+def _check_target(path: Path, overwrite: bool) -> None:
+    if not path.exists():
+        return
+    if not path.is_dir():
+        raise OutputExistsError(f"output {path} is a file; name a folder with --out")
+    if not any(path.iterdir()):
+        return
+    if _is_held(path):
+        raise _in_use(path)
+    if not overwrite:
+        raise OutputExistsError(f"output folder {path} exists; name another with --out or replace it with --overwrite")
+    if not (path / MANIFEST).exists() and not (path / LOCK).exists():
+        raise OutputExistsError(f"output folder {path} is not a run of lslam; --overwrite replaces runs only")
+
+
+def _in_use(path: Path) -> OutputExistsError:
+    return OutputExistsError(f"output folder {path} is in use by another run; name another with --out")
+
+
+def _is_held(path: Path) -> bool:
+    try:
+        with (path / LOCK).open("r") as stream:
+            return not _flock(stream)
+    except OSError:
+        return False
+
+
+def _hold(path: Path) -> IO[str]:
+    """Lock the folder. The holder before us may have removed the file between our open and our lock: look again."""
+    while True:
+        stream = (path / LOCK).open("a")
+        if not _flock(stream):
+            stream.close()
+            raise _in_use(path)
+        with contextlib.suppress(FileNotFoundError):
+            if os.path.samestat(os.fstat(stream.fileno()), os.stat(path / LOCK)):
+                return stream
+        stream.close()
+
+
+def _flock(stream: IO[str]) -> bool:
+    """Whether the lock is ours now; where the system or the file system has no locks, always."""
+    try:
+        import fcntl
+
+        fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except (ImportError, OSError):
+        return True
+    return True
 
 
 def default_folder(sequence: str, method: str, now: float | None = None) -> Path:
-    """runs/<sequence>-<method>-<time>."""
+    """runs/<sequence>-<method>-<time>, with a number behind it when two runs start in the same second."""
     stamp = time.strftime("%Y%m%d-%H%M%S", time.localtime(now))
-    return Path("runs") / f"{sequence}-{method}-{stamp}"
+    # The name may come from sequence.toml: it shall not lead out of runs/.
+    name = re.sub(r"[^\w.+-]+", "_", sequence).lstrip(".") or "sequence"
+    folder = Path("runs") / f"{name}-{method}-{stamp}"
+    number = 2
+    while folder.exists():
+        folder = folder.with_name(f"{name}-{method}-{stamp}-{number}")
+        number += 1
+    return folder
