@@ -1,0 +1,130 @@
+"""The policy of compiling: flags, where machine code is kept, one process at a time."""
+
+from __future__ import annotations
+
+import importlib
+import logging
+import os
+import pkgutil
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import lslam.kernels
+from lslam.kernels import jit
+
+
+def all_kernels() -> list[tuple[str, Any]]:
+    found: dict[str, Any] = {}
+    for info in pkgutil.iter_modules(lslam.kernels.__path__):
+        module = importlib.import_module(f"lslam.kernels.{info.name}")
+        found |= {f"{info.name}.{n}": f for n, f in vars(module).items() if hasattr(f, "targetoptions")}
+    return sorted(found.items())
+
+
+@pytest.mark.parametrize(("name", "function"), all_kernels())
+def test_every_kernel_is_strict_about_sums_and_lets_other_threads_run(name: str, function: Any) -> None:
+    options = function.targetoptions
+    assert options["nogil"] is True
+    assert not options.get("fastmath")
+    assert not options.get("parallel")
+
+
+def folder_in_new_process(**environment: str) -> Path:
+    env = {k: v for k, v in os.environ.items() if k != "NUMBA_CACHE_DIR"} | environment
+    code = "import lslam.kernels.jit, numba; print(numba.config.CACHE_DIR)"
+    done = subprocess.run([sys.executable, "-c", code], env=env, capture_output=True, text=True, check=True)
+    return Path(done.stdout.strip())
+
+
+def test_machine_code_lives_in_the_users_cache_under_the_digest_of_the_sources(tmp_path: Path) -> None:
+    folder = folder_in_new_process(XDG_CACHE_HOME=str(tmp_path))
+    assert folder == tmp_path / "lslam" / "numba" / jit.source_digest()
+
+
+def test_a_folder_of_the_user_is_kept(tmp_path: Path) -> None:
+    assert folder_in_new_process(NUMBA_CACHE_DIR=str(tmp_path)) == tmp_path / jit.source_digest()
+
+
+def test_a_home_that_cannot_be_written_falls_back_to_the_temporary_folder(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("a file where the cache should be")
+    folder = folder_in_new_process(XDG_CACHE_HOME=str(tmp_path / "file"), TMPDIR=str(tmp_path))
+    assert folder.parent.parent.parent == tmp_path
+    assert folder.parent.parent.name.startswith("lslam-cache-")
+
+
+def test_importing_the_package_writes_nothing_and_loads_no_numba(tmp_path: Path) -> None:
+    code = "import lslam, sys; assert 'numba' not in sys.modules"
+    env = os.environ | {"XDG_CACHE_HOME": str(tmp_path)}
+    subprocess.run([sys.executable, "-c", code], env=env, check=True)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_compiled_kernels_are_found_again(tmp_path: Path) -> None:
+    code = (
+        "import numpy as np, lslam.kernels.voxel as v; v.first_points(np.zeros((3, 3), np.float32), 1.0);"
+        "print(sum(v.first_points.stats.cache_hits.values()))"
+    )
+    env = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
+    hits = [
+        subprocess.run([sys.executable, "-c", code], env=env, capture_output=True, text=True, check=True).stdout.strip()
+        for _ in range(2)
+    ]
+    assert hits == ["0", "1"]
+
+
+def test_the_digest_follows_every_source(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("jit.py", "other.py"):
+        (tmp_path / name).write_text("x = 1\n")
+    monkeypatch.setattr(jit, "__file__", str(tmp_path / "jit.py"))
+    before = jit.source_digest()
+    assert before == jit.source_digest()
+    (tmp_path / "other.py").write_text("x = 2\n")
+    assert before != jit.source_digest()
+
+
+def test_the_lock_makes_others_wait(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "new"))
+    order = []
+    inside = threading.Event()
+
+    def other() -> None:
+        inside.wait()
+        with jit.compile_lock():
+            order.append("second")
+
+    thread = threading.Thread(target=other)
+    thread.start()
+    with jit.compile_lock():
+        inside.set()
+        time.sleep(0.2)
+        order.append("first")
+    thread.join(10)
+    assert order == ["first", "second"]
+
+
+def test_a_cache_that_cannot_be_locked_does_not_stop_the_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "file" / "below"))
+    done = []
+    with jit.compile_lock():
+        done.append(1)
+    assert done
+
+
+def test_only_slow_compiling_is_announced(caplog: pytest.LogCaptureFixture) -> None:
+    log = logging.getLogger("lslam")
+    with caplog.at_level(logging.INFO, "lslam"):
+        with jit.announced(log, after_s=0.5):
+            pass
+        assert caplog.messages == []
+        with jit.announced(log, after_s=0.01):
+            time.sleep(0.3)
+    assert len(caplog.messages) == 1
+    assert "compiling kernels, once" in caplog.messages[0]
+    assert os.environ["NUMBA_CACHE_DIR"] in caplog.messages[0]

@@ -1,0 +1,178 @@
+"""The normal equations of scan points on Gaussian voxels: gradient, Hessian and correspondences."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from numpy_voxels import Match, VoxelMap, matches
+
+from lslam.geometry import so3
+from lslam.kernels import residuals
+from lslam.preprocessing.prepare import PreparedPoints
+from lslam.registration.gaussian_map import GaussianMap
+
+Floats = NDArray[np.float64]
+SIZE, SIGMA2, BLOB = 0.8, 9e-4, 0.5
+
+
+@dataclass
+class Scene:
+    """A map, the same in NumPy, and points that lie beside it at a pose that is a little off."""
+
+    target: GaussianMap
+    reference: VoxelMap
+    points: PreparedPoints
+    R: Floats
+    t: Floats
+
+    def matches(self, blob_weight: float = BLOB) -> list[Match]:
+        p = self.points
+        return matches(
+            self.reference, p.source, p.scatter, self.R, self.t, SIGMA2, blob_weight, residuals.TILT
+        )  # fmt: skip
+
+
+def surfaces(rng: np.random.Generator, n: int) -> Floats:
+    """Floor, two walls and a bush."""
+    return np.concatenate(
+        [
+            np.column_stack([rng.uniform(-6, 6, (n, 2)), rng.normal(-1.5, 0.01, n)]),
+            np.column_stack([rng.uniform(-6, 6, n), rng.normal(5.0, 0.02, n), rng.uniform(-1.5, 3, n)]),
+            np.column_stack([rng.normal(6.0, 0.02, n), rng.uniform(-6, 5, n), rng.uniform(-1.5, 3, n)]),
+            rng.normal(0, 0.5, (n // 3, 3)) + np.array([-4.0, -4.0, 0.5]),
+        ]
+    )
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    rng = np.random.default_rng(0)
+    cloud = surfaces(rng, 1500).astype(np.float32)
+    shift = np.array([40.0, -25.0, 3.0])
+    target, reference = GaussianMap(SIZE), VoxelMap(SIZE)
+    T = np.eye(4)
+    T[:3, 3] = shift
+    target.insert(cloud, T)
+    reference.insert(cloud, np.eye(3), shift)
+    R, t = so3.exp(np.array([0.01, -0.02, 0.05])), shift + np.array([0.1, -0.07, 0.05])
+    source = surfaces(rng, 60) @ R
+    source[::40] += 30.0
+    spread = rng.normal(0, 0.05, (len(source), 6, 3))
+    scatter = np.stack([np.cov(s.T)[np.triu_indices(3)] for s in spread])
+    return Scene(target, reference, PreparedPoints(cloud, source, scatter, len(cloud)), R, t)
+
+
+def linearise(
+    s: Scene, R: Floats, t: Floats, c: float, blob: float = BLOB, cache: tuple[NDArray[np.int64], NDArray[np.int32]] | None = None
+) -> tuple[Floats, Floats, Floats]:  # fmt: skip
+    n = len(s.points.source)
+    cells, slots = cache or (np.full(n, -1, np.int64), np.full((n, 8), -1, np.int32))
+    H, g, facts = np.full((6, 6), np.nan), np.full(6, np.nan), np.full(6, np.nan)
+    m = s.target
+    residuals.linearise(
+        s.points.source, s.points.scatter, R, t, m.size, c, SIGMA2, blob, m.planes, m.keys, m.table, cells, slots, H, g, facts
+    )  # fmt: skip
+    return H, g, facts
+
+
+def moved(R: Floats, t: Floats, d: Floats) -> tuple[Floats, Floats]:
+    return so3.exp(d[3:]) @ R, t + d[:3]
+
+
+@pytest.mark.parametrize("c", [0.05, 0.2, 1.0, 5.0])
+@pytest.mark.parametrize("blob", [0.0, BLOB])
+def test_gradient_is_that_of_the_robust_cost(scene: Scene, c: float, blob: float) -> None:
+    found = scene.matches(blob)
+    _, g, facts = linearise(scene, scene.R, scene.t, c, blob)
+    assert facts[3] == len(found)
+    assert {m.normal is None for m in found} == ({True, False} if blob else {False})
+    h = 1e-5
+    numeric = np.empty(6)
+    for k in range(6):
+        d = np.zeros(6)
+        d[k] = h
+        forward = sum(m.cost(*moved(scene.R, scene.t, d), c) for m in found)
+        backward = sum(m.cost(*moved(scene.R, scene.t, -d), c) for m in found)
+        numeric[k] = (forward - backward) / (2 * h)
+    np.testing.assert_allclose(g, numeric, atol=1e-6 * np.abs(numeric).max())
+
+
+@pytest.mark.parametrize("c", [0.05, 0.5, 5.0])
+def test_normal_equations_are_those_of_numpy(scene: Scene, c: float) -> None:
+    H, g, facts = linearise(scene, scene.R, scene.t, c)
+    expected_H, expected_g = np.zeros((6, 6)), np.zeros(6)
+    information, inliers, lever = 0.0, 0, 0.0
+    for m in scene.matches():
+        r, J = m.rows(scene.R, scene.t)
+        w = m.information(scene.R, scene.t, c)
+        expected_H += w * J.T @ J
+        expected_g += w * J.T @ r
+        information += w * len(r)
+        inliers += float(r @ r) < c * c
+        lever += w * len(r) * float(m.point @ m.point)
+    np.testing.assert_allclose(H, expected_H, rtol=1e-6, atol=1e-6 * np.abs(expected_H).max())
+    np.testing.assert_allclose(g, expected_g, atol=1e-6 * np.abs(expected_g).max())
+    np.testing.assert_array_equal(H, H.T)
+    assert facts[0] == pytest.approx(information, rel=1e-6)
+    assert facts[2] == inliers > 0
+    assert facts[4] == pytest.approx(lever, rel=1e-6)
+
+
+def test_rmse_facts_are_those_of_the_planes(scene: Scene) -> None:
+    _, _, facts = linearise(scene, scene.R, scene.t, 0.3)
+    planes = [m for m in scene.matches() if m.normal is not None]
+    r2 = np.array([m.distance2(scene.R, scene.t) for m in planes])
+    robust = (0.09 / (0.09 + r2)) ** 2
+    assert facts[1] == pytest.approx(float(robust @ r2), rel=1e-6)
+    assert facts[5] == pytest.approx(float(robust.sum()), rel=1e-6)
+
+
+def test_the_octant_cache_gives_the_same_as_none(scene: Scene) -> None:
+    n = len(scene.points.source)
+    cache = np.full(n, -1, np.int64), np.full((n, 8), -1, np.int32)
+    rng = np.random.default_rng(1)
+    R, t = scene.R, scene.t
+    kept = 0
+    for _ in range(12):
+        before = cache[0].copy()
+        cached = linearise(scene, R, t, 0.5, cache=cache)
+        kept += int((before == cache[0]).sum())
+        for a, b in zip(cached, linearise(scene, R, t, 0.5), strict=True):
+            np.testing.assert_array_equal(a, b)
+        R, t = moved(R, t, rng.normal(0, 0.05, 6))
+    assert 0 < kept < 12 * n
+
+
+def test_points_are_blind_in_the_plane() -> None:
+    rng = np.random.default_rng(0)
+    floor = np.column_stack([rng.uniform(-6, 6, (9000, 2)), np.full(9000, 0.3)]).astype(np.float32)
+    target = GaussianMap(SIZE)
+    target.insert(floor, np.eye(4))
+    source = floor[::50].astype(np.float64) + np.array([0.2, 0.1, 0.02])
+    s = Scene(
+        target, VoxelMap(SIZE), PreparedPoints(floor, source, np.zeros((len(source), 6)), 1), np.eye(3), np.zeros(3)
+    )
+    H, g, _ = linearise(s, s.R, s.t, 1.0, blob=0.0)
+    assert abs(g[2]) > 1.0
+    np.testing.assert_allclose(g[[0, 1, 5]], 0.0, atol=1e-6 * abs(g[2]))
+    np.testing.assert_allclose(H[[0, 1, 5]], 0.0, atol=1e-6 * H[2, 2])
+
+
+@pytest.mark.parametrize("where", [np.nan, np.inf, 1e9, -1e300])
+def test_a_pose_far_off_matches_nothing(scene: Scene, where: float) -> None:
+    H, g, facts = linearise(scene, scene.R, np.array([where, 0.0, 0.0]), 1.0)
+    np.testing.assert_array_equal(H, 0.0)
+    np.testing.assert_array_equal(g, 0.0)
+    np.testing.assert_array_equal(facts, 0.0)
+
+
+def test_an_empty_map_and_an_empty_scan_match_nothing(scene: Scene) -> None:
+    empty = Scene(GaussianMap(SIZE), VoxelMap(SIZE), scene.points, scene.R, scene.t)
+    assert linearise(empty, scene.R, scene.t, 1.0)[2].tolist() == [0.0] * 6
+    none = PreparedPoints(np.zeros((0, 3), np.float32), np.zeros((0, 3)), np.zeros((0, 6)), 0)
+    H, _, facts = linearise(Scene(scene.target, scene.reference, none, scene.R, scene.t), scene.R, scene.t, 1.0)
+    assert facts.tolist() == [0.0] * 6
+    np.testing.assert_array_equal(H, 0.0)
