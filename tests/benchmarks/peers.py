@@ -1,0 +1,119 @@
+"""The peers our registration is measured against, each as a function from scans to poses with its seconds per scan.
+
+Every peer gets the same arrays from the same reader and is timed around its whole register call: its own
+preprocessing, alignment and map update. kiss-icp runs with its defaults; small_gicp as GICP against a keyframe local map
+and as VGICP scan-to-model (its own example), with two threads.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable
+
+import numpy as np
+from numpy.typing import NDArray
+
+Register = Callable[[NDArray[np.float32]], NDArray[np.float64]]
+
+
+def icp() -> Register:
+    from lslam import Registration
+
+    registration = Registration()
+    return lambda points: registration.register(points).T_world_lidar
+
+
+def kiss_icp() -> Register:
+    from kiss_icp.config import load_config
+    from kiss_icp.kiss_icp import KissICP
+
+    config = load_config(None)
+    config.data.deskew = False
+    kiss = KissICP(config)
+
+    def register(points: NDArray[np.float32]) -> NDArray[np.float64]:
+        kiss.register_frame(points.astype(np.float64), np.zeros(len(points)))
+        return np.array(kiss.last_pose)
+
+    return register
+
+
+def gicp_keyframes(keyframes: int = 10, step_m: float = 2.0, step_deg: float = 15.0, leaf: float = 0.3) -> Register:
+    import small_gicp
+
+    poses: list[NDArray[np.float64]] = []
+    clouds: list[NDArray[np.float64]] = []
+    state: dict[str, object] = {}
+
+    def rebuild(cloud: NDArray[np.float64], pose: NDArray[np.float64]) -> None:
+        clouds.append(cloud @ pose[:3, :3].T + pose[:3, 3])
+        del clouds[:-keyframes]
+        target, tree = small_gicp.preprocess_points(np.concatenate(clouds), downsampling_resolution=leaf, num_threads=2)
+        state.update(target=target, tree=tree, pose=pose)
+
+    def register(points: NDArray[np.float32]) -> NDArray[np.float64]:
+        kept = points[(np.linalg.norm(points, axis=1) < 100.0)].astype(np.float64)
+        source, _ = small_gicp.preprocess_points(kept, downsampling_resolution=leaf, num_threads=2)
+        if not poses:
+            poses.append(np.eye(4))
+            rebuild(source.points()[:, :3], poses[0])
+            return poses[0]
+        prior = poses[-1] if len(poses) < 2 else poses[-1] @ np.linalg.inv(poses[-2]) @ poses[-1]
+        result = small_gicp.align(
+            state["target"], source, state["tree"], prior, max_correspondence_distance=1.0, num_threads=2
+        )
+        poses.append(np.array(result.T_target_source))
+        moved = np.linalg.inv(state["pose"]) @ poses[-1]
+        turn = np.degrees(np.arccos(np.clip((np.trace(moved[:3, :3]) - 1) / 2, -1, 1)))
+        if np.linalg.norm(moved[:3, 3]) > step_m or turn > step_deg:
+            rebuild(source.points()[:, :3], poses[-1])
+        return poses[-1]
+
+    return register
+
+
+def vgicp_model(leaf: float = 0.25, voxel: float = 1.0) -> Register:
+    import small_gicp
+
+    model = small_gicp.GaussianVoxelMap(voxel)
+    model.set_lru(horizon=100, clear_cycle=10)
+    poses: list[NDArray[np.float64]] = []
+
+    def register(points: NDArray[np.float32]) -> NDArray[np.float64]:
+        kept = points[(np.linalg.norm(points, axis=1) < 100.0)].astype(np.float64)
+        source, _ = small_gicp.preprocess_points(kept, downsampling_resolution=leaf, num_threads=2)
+        if not poses:
+            poses.append(np.eye(4))
+        else:
+            prior = poses[-1] if len(poses) < 2 else poses[-1] @ np.linalg.inv(poses[-2]) @ poses[-1]
+            result = small_gicp.align(model, source, prior, max_correspondence_distance=1.0, num_threads=2)
+            poses.append(np.array(result.T_target_source))
+        model.insert(source, poses[-1])
+        return poses[-1]
+
+    return register
+
+
+PEERS: dict[str, Callable[[], Register]] = {
+    "icp": icp,
+    "kiss-icp": kiss_icp,
+    "small-gicp": gicp_keyframes,
+    "small-vgicp": vgicp_model,
+}
+
+
+def drive(name: str, scans: Iterable[NDArray[np.float32]]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Poses (N, 4, 4) and seconds (N,) of one peer over all scans; compiling is not counted."""
+    if name == "icp":
+        from lslam.config import Config
+        from lslam.odometry import create_odometry
+
+        create_odometry(Config()).warm_up()
+    register = PEERS[name]()
+    poses, seconds = [], []
+    for points in scans:
+        began = time.perf_counter()
+        pose = register(points)
+        seconds.append(time.perf_counter() - began)
+        poses.append(pose)
+    return np.stack(poses), np.array(seconds)
