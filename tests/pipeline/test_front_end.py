@@ -1,0 +1,118 @@
+"""The front end: order, bridging, giving up, and the same results with and without reading ahead."""
+
+from __future__ import annotations
+
+import threading
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from stub_sequences import Standstill, Stub, noise, sample, with_points
+
+from lslam.config import Config
+from lslam.odometry import create_odometry
+from lslam.pipeline.front_end import DOUBT, estimate, is_diverged, read_ahead, to_trajectory
+from lslam.types.scan import Scan
+from lslam.types.scan_result import ScanResult, Status
+
+
+def outcomes(*statuses: Status) -> list[ScanResult]:
+    return [ScanResult(i, i, np.eye(4), status) for i, status in enumerate(statuses)]
+
+
+@pytest.mark.parametrize("threads", [1, 2, 5])
+def test_scans_come_in_order_and_not_far_ahead(threads: int) -> None:
+    stub = Stub([Scan(np.ones((3, 3), np.float32), i, i) for i in range(20)])
+    for expected, loaded in enumerate(read_ahead(stub, lambda scan: scan.index * 2, threads)):
+        assert (loaded.index, loaded.prepared) == (expected, 2 * expected)
+        assert len(stub.reads) <= expected + 5, "the whole recording must not pile up in memory"
+    assert stub.reads == list(range(20))
+
+
+def test_leaving_early_leaves_no_thread_behind() -> None:
+    stub = Stub([Scan(np.ones((3, 3), np.float32), i, i) for i in range(1000)])
+    ahead = read_ahead(stub, None, 2)
+    next(ahead)
+    ahead.close()  # type: ignore[attr-defined]
+    assert not any(thread.name.startswith("lslam-read") for thread in threading.enumerate())
+    assert len(stub.reads) < 10
+
+
+def test_reading_overlaps_registration() -> None:
+    stub = Stub([Scan(np.ones((3, 3), np.float32), i, i) for i in range(10)], on_read=lambda index: time.sleep(0.02))
+    began = time.monotonic()
+    for _ in read_ahead(stub, None, 2):
+        time.sleep(0.02)
+    assert time.monotonic() - began < 0.35, "20 ms of reading and 20 ms of work, ten times, in turn take 0.4 s"
+
+
+def test_what_cannot_be_read_is_bridged_by_the_motion_prior() -> None:
+    stub = sample(12)
+    stub.scans[6] = "000006.bin: 1001 bytes are not whole points"
+    stub.scans[9] = Scan(np.zeros((0, 3), np.float32), 900_000_000, 9)
+    results = estimate(stub, create_odometry(Config()))
+    assert [r.status for r in results] == ["ok"] * 6 + ["skipped"] + ["ok"] * 2 + ["skipped"] + ["ok"] * 2
+    assert results[6].reason.startswith("000006.bin")
+    assert "no points" in results[9].reason
+    assert stub.ground_truth is not None
+    off = np.linalg.norm([r.T_world_lidar[:3, 3] - p for r, p in zip(results, stub.ground_truth.positions)], axis=1)
+    assert off[[6, 9]].max() < 0.15, "constant velocity for one scan"
+    assert off[-1] < 0.05, "and back on the map afterwards"
+
+
+def test_noise_is_bridged_and_leaves_the_map_alone() -> None:
+    stub = with_points(sample(12), 6, noise(0))
+    clean, dirty = (estimate(s, create_odometry(Config())) for s in (sample(12), stub))
+    assert dirty[6].status == "bridged"
+    assert dirty[6].reason
+    assert [r.status for r in dirty[7:]] == ["ok"] * 5
+    assert np.linalg.norm(dirty[-1].T_world_lidar[:3, 3] - clean[-1].T_world_lidar[:3, 3]) < 0.02
+
+
+def test_points_that_are_none_do_not_hurt() -> None:
+    clean = sample(8)
+    dirty = replace(clean, scans=list(clean.scans))
+    for i, scan in enumerate(clean.scans):
+        assert isinstance(scan, Scan)
+        bad = np.array([[np.nan] * 3, [np.inf, 0, 0], [0, 0, 0], [-np.inf, np.nan, 1], [3e38, 3e38, 3e38]], np.float32)
+        dirty.scans[i] = Scan(np.concatenate([bad, scan.points, bad]), scan.stamp_ns, i)
+    a, b = (estimate(s, create_odometry(Config())) for s in (clean, dirty))
+    for one, other in zip(a, b, strict=True):
+        assert other.status == "ok"
+        np.testing.assert_allclose(one.T_world_lidar, other.T_world_lidar, atol=2e-3)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, 0.0])
+def test_a_scan_of_nothing_but_invalid_points_is_bridged(value: float) -> None:
+    results = estimate(with_points(sample(8), 5, np.full((500, 3), value, np.float32)), create_odometry(Config()))
+    assert [r.status for r in results] == ["ok"] * 5 + ["bridged"] + ["ok"] * 2
+    assert "0 usable points" in results[5].reason
+
+
+def test_gives_up_after_failures_in_a_row_and_stops_when_asked() -> None:
+    stub = Stub(["gone"] * 50)
+    results = estimate(stub, Standstill(), max_failures=7)
+    assert len(results) == 7
+    assert is_diverged(results, 7)
+    asked = estimate(sample(10), Standstill(), should_stop=lambda: True)
+    assert len(asked) == 1
+
+
+def test_diverged_means_given_up_or_hardly_anything_registered() -> None:
+    assert not is_diverged(outcomes("ok", "skipped", "ok", "bridged"), 20)
+    assert is_diverged(outcomes("ok", "skipped", "skipped", "skipped", "bridged"), 20)
+    assert is_diverged(outcomes(*["ok"] * 30, *["bridged"] * 5), 5)
+    assert not is_diverged(outcomes(*["ok"] * 30, *["bridged"] * 4), 5)
+    assert is_diverged(outcomes("skipped"), 20)
+
+
+def test_a_skipped_scan_is_more_doubtful_than_the_one_before() -> None:
+    known = ScanResult(0, 0, np.eye(4), covariance=np.eye(6) * 1e-4)
+    skipped = ScanResult(1, 100, np.eye(4), "skipped", "gone")
+    trajectory = to_trajectory([known, skipped, skipped, known], "icp")
+    assert trajectory.covariances is not None
+    one = np.eye(6) * 1e-4
+    np.testing.assert_allclose(trajectory.covariances, np.stack([one, one + DOUBT, one + 2 * DOUBT, one]))
+    assert to_trajectory([skipped], "kiss-icp").covariances is None
+    assert (trajectory.source, trajectory.stamps_ns.tolist()) == ("icp", [0, 100, 100, 0])

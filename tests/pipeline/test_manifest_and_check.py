@@ -1,0 +1,88 @@
+"""The manifest's words, and what is checked before a run."""
+
+from __future__ import annotations
+
+import json
+import re
+
+import numpy as np
+import pytest
+from stub_sequences import Stub
+
+from lslam.config import Config, load_config
+from lslam.errors import InterruptedRunError, OutputError, UsageError
+from lslam.pipeline.check import check_config
+from lslam.pipeline.manifest import Manifest, describe_deskew, peak_memory_mb
+from lslam.types.scan_result import ScanResult, Status
+
+
+def results(*statuses: Status) -> list[ScanResult]:
+    return [ScanResult(10 + i, i, np.eye(4), status, status and f"why {i}") for i, status in enumerate(statuses)]
+
+
+def judged(expected: int, diverged: bool, *statuses: Status) -> Manifest:
+    manifest = Manifest("lslam run x", Stub(["gone"] * expected), Config())
+    manifest.judge(results(*statuses), expected, diverged)
+    return manifest
+
+
+def test_outcome_in_one_word() -> None:
+    assert judged(3, False, "ok", "ok", "ok").outcome == "done"
+    assert judged(3, False, "ok", "bridged", "ok").outcome == "degraded"
+    assert judged(3, False, "ok", "ok").outcome == "interrupted"
+    assert judged(3, True, "ok", "bridged").outcome == "diverged"
+    assert judged(3, True, "bridged", "bridged", "bridged").outcome == "diverged"
+
+
+def test_problems_name_the_first_bad_scan_by_its_number_in_the_recording() -> None:
+    manifest = judged(4, False, "ok", "skipped", "bridged", "ok")
+    assert manifest.counts == {"scans": 4, "ok": 2, "bridged": 1, "skipped": 1, "degenerate": 0}
+    assert "2 of 4 scans" in manifest.problems[0]
+    assert "scan 11: why 1" in manifest.problems[0]
+
+
+def test_the_document_is_plain_and_strict_json() -> None:
+    manifest = judged(2, False, "ok", "ok")
+    with manifest.timed("map_s"), manifest.timed("map_s"):
+        pass
+    document = json.loads(json.dumps(manifest.as_dict("done"), allow_nan=False))
+    assert (document["schema"], document["status"], document["command"]) == (1, "done", "lslam run x")
+    assert document["timings"].keys() == {"map_s"}
+    assert "why" not in document
+    assert manifest.as_dict("failed", "the disk")["why"] == "the disk"
+    assert document["frames"]["pose_time"] == "scan_start"
+
+
+def test_what_ended_a_run() -> None:
+    manifest = judged(1, False, "ok")
+    assert manifest.word_for(KeyboardInterrupt()) == "interrupted"
+    assert manifest.word_for(InterruptedRunError("x")) == "interrupted"
+    assert manifest.word_for(OutputError("x")) == manifest.word_for(ValueError()) == "failed"
+
+
+@pytest.mark.parametrize(
+    ("compensated", "method", "words"),
+    [(True, "icp", "none needed"), (None, "icp", "no deskew: .*not known"), (False, "icp", "no deskew: .*is not motion"),
+     (None, "kiss-icp", "by kiss-icp")],
+)  # fmt: skip
+def test_deskew_is_stated(compensated: bool | None, method: str, words: str) -> None:
+    stub = Stub([], motion_compensated=compensated)
+    assert re.match(words, describe_deskew(stub, method))
+
+
+def test_peak_memory_is_in_megabytes() -> None:
+    peak = peak_memory_mb()
+    if peak is not None:
+        assert 20 < peak < 64_000
+
+
+def test_names_are_checked_with_a_way_out() -> None:
+    check_config(Config())
+    for setting, words in (
+        ("odometry.method=kis-icp", "did you mean 'kiss-icp'"),
+        ("odometry.method=zzz", "known: icp, kiss-icp"),
+        ("eval.delta=['ten metres']", "for example 10m/all"),
+        ("eval.delta=['1.5scan']", "whole numbers"),
+    ):
+        with pytest.raises(UsageError, match=words):
+            check_config(load_config(settings=[setting], environ={}))
