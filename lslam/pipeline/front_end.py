@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lslam.errors import InputError
 from lslam.odometry.base import Odometry
@@ -76,12 +77,16 @@ def is_diverged(results: list[ScanResult], max_failures: int) -> bool:
 
 
 def to_trajectory(results: list[ScanResult], method: str) -> Trajectory:
-    """The poses of all scans; covariances when the method has them, with `DOUBT` where a scan was skipped."""
+    """The poses of all scans; covariances when the method has them, where a scan was skipped the last one and `DOUBT`."""
     known = any(r.covariance is not None for r in results)
+    covariances: list[NDArray[np.float64]] = []
+    for result in results if known else ():
+        before = covariances[-1] if covariances else np.zeros((6, 6))
+        covariances.append(before + DOUBT if result.covariance is None else result.covariance)
     return Trajectory(
         stamps_ns=np.array([r.stamp_ns for r in results], np.int64),
         poses=np.stack([r.T_world_lidar for r in results]),
-        covariances=np.stack([DOUBT if r.covariance is None else r.covariance for r in results]) if known else None,
+        covariances=np.stack(covariances) if known else None,
         source=method,
     )
 
