@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.config.preprocess import PreprocessConfig
+from lslam.errors import InputError
 from lslam.kernels import voxel
 
 # A source grid never gets finer than the points it is made of, nor so coarse that walls merge.
@@ -34,8 +35,12 @@ def prepare_points(points: NDArray[Any], config: PreprocessConfig, index: int = 
     """Gate and down-sample points (N, 3), m, in the LiDAR frame. `index` seeds the random share, scan by scan.
 
     Centroids, not first points: the average of the points of a cell is nearer to the surface than any one of them.
+    Further columns are ignored. Raises InputError for arrays of another shape.
     """
-    cloud = np.ascontiguousarray(np.asarray(points)[:, :3], np.float32)
+    array = np.asarray(points)
+    if array.ndim != 2 or array.shape[1] < 3:
+        raise InputError(f"points of a scan have shape {array.shape}: (N, 3) is needed, x y z in metres")
+    cloud = np.ascontiguousarray(array[:, :3], np.float32)
     kept = cloud[gate_points(cloud, config)]
     map_points, _ = voxel.centroids(kept, config.map_leaf)
     source, scatter = _source_points(kept, map_points, config, index)
