@@ -36,6 +36,13 @@ class RegistrationConfig(Section):
     min_overlap: float = Field(
         0.2, ge=0, le=1, description="share of points that found a voxel below which a scan fails"
     )
+    min_agreement: float = Field(
+        0.5,
+        ge=0,
+        lt=1,
+        description="a scan fails when the share of its points on the map's surfaces drops below this part of what it "
+        "was lately, as when the sensor was carried elsewhere; 0 switches it off",
+    )
     max_jump_m: float = Field(6.0, gt=0, description="m; a correction of the motion prior beyond this fails")
     max_jump_deg: float = Field(45.0, gt=0, description="deg; likewise for rotation")
     weak_share: float = Field(

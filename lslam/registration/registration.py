@@ -14,7 +14,7 @@ from lslam.geometry import se3, so3
 from lslam.preprocessing.prepare import PreparedPoints, prepare_points
 from lslam.registration.gaussian_map import GaussianMap
 from lslam.registration.motion import ConstantVelocity
-from lslam.registration.robust import AdaptiveThreshold, Annealing
+from lslam.registration.robust import AdaptiveThreshold, Annealing, UsualAgreement
 from lslam.registration.solver import RegistrationResult, solve
 
 MIN_SOURCE_POINTS = 30
@@ -42,6 +42,7 @@ class Registration:
             reach=1.2 * self.preprocess.range_max,
         )
         self.threshold = AdaptiveThreshold(2 * self.config.kernel_min, self.config.kernel_max)
+        self.agreement = UsualAgreement(self.config.min_agreement)
         self._motion = ConstantVelocity()
         self._index = 0
         self._starting = self.config.start_scans
@@ -86,11 +87,13 @@ class Registration:
             self.map.insert(points.map_points, result.T_world_lidar)
             if not first:
                 self._starting = max(self._starting - 1, 0)
+                self.agreement.observe(result.agreement)
                 move, turn = result.prior_error
                 self.threshold.observe(move + turn * result.lever_arm)
         else:
             self._starting = max(self._starting, 1)
             self.threshold.widen()
+            self.agreement.relax()
         self._motion.correct(self._index, result.T_world_lidar)
         self._index += 1
 
@@ -131,6 +134,10 @@ class Registration:
             reason = f"only {result.overlap:.0%} of the points overlap the map"
         elif not reason and result.inlier_share < c.min_inliers:
             reason = f"only {result.inlier_share:.0%} of the matches agree"
+        elif not reason and self.agreement.is_collapse(result.agreement):
+            reason = (
+                f"only {result.agreement:.0%} of the points agree with the map, lately {self.agreement.usual:.0%} did"
+            )
         elif not reason and (move > c.max_jump_m or turn > np.deg2rad(c.max_jump_deg)):
             reason = f"impossible jump of {move:.1f} m and {np.rad2deg(turn):.0f} deg"
         if reason:

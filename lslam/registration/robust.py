@@ -1,4 +1,4 @@
-"""How wide the robust kernel opens."""
+"""How wide the robust kernel opens, and when a scan agrees with the map far less than scans have lately."""
 
 from __future__ import annotations
 
@@ -41,3 +41,29 @@ class AdaptiveThreshold:
     def widen(self) -> None:
         """Forget the confidence after a bad scan."""
         self._mean_square = (self.high / 3) ** 2
+
+
+class UsualAgreement:
+    """Remembers which share of its points each good scan had on the map's surfaces.
+
+    A sensor carried elsewhere still matches ground and walls: half the points agree with some plane, and no fixed bound
+    parts that from a sparse sensor's honest scan. The drop from one scan to the next does.
+    """
+
+    FORGETTING = 0.8
+
+    def __init__(self, drop: float) -> None:
+        self.drop = drop
+        self.usual = 0.0
+
+    def is_collapse(self, share: float) -> bool:
+        """Whether `share` is below `drop` times the usual one."""
+        return share < self.drop * self.usual
+
+    def observe(self, share: float) -> None:
+        """Learn from a good scan."""
+        self.usual = share if self.usual == 0.0 else self.FORGETTING * self.usual + (1 - self.FORGETTING) * share
+
+    def relax(self) -> None:
+        """Expect less after a bad scan, so that a place that has changed for good is accepted after a few."""
+        self.usual *= self.FORGETTING

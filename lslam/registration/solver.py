@@ -52,6 +52,11 @@ class RegistrationResult:
         """Share of the matched points within the final kernel."""
         return self.inliers / max(self.matched, 1)
 
+    @property
+    def agreement(self) -> float:
+        """Share of the source points within the final kernel."""
+        return self.inliers / max(self.source_points, 1)
+
 
 def solve(
     target: GaussianMap, points: PreparedPoints, T_prior: NDArray[np.float64], annealing: Annealing, *, sigma: float,
