@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from lslam.config.preprocess import PreprocessConfig
 from lslam.config.registration import RegistrationConfig
+from lslam.errors import InputError
 from lslam.geometry import se3, so3
 from lslam.preprocessing.prepare import PreparedPoints, prepare_points
 from lslam.registration.gaussian_map import GaussianMap
@@ -52,8 +53,13 @@ class Registration:
         return self.align(prepare_points(points, self.preprocess, self._index), prior)
 
     def align(self, points: PreparedPoints, prior: NDArray[np.float64] | None = None) -> RegistrationResult:
-        """As `register`, for points that are prepared already; aligns, judges, then updates the map."""
+        """As `register`, for points that are prepared already; aligns, judges, then updates the map.
+
+        Raises InputError for a prior that is no finite (4, 4).
+        """
         T_prior = self._motion.predict(self._index) if prior is None else np.asarray(prior, np.float64)
+        if T_prior.shape != (4, 4) or not np.isfinite(T_prior).all():
+            raise InputError(f"the motion prior has shape {T_prior.shape}: a finite (4, 4) pose is needed")
         result = self.locate(points, T_prior)
         self.update(points, result)
         return result
