@@ -1,0 +1,162 @@
+"""The command by itself: help at once, versions, completion, methods, configuration, names that are nearly right."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+import tomllib
+from pathlib import Path
+
+import pytest
+from calling import COMMAND, assert_one_sentence, environment, lslam
+
+from lslam.cli.main import COMMANDS
+
+HEAVY = (
+    "numba",
+    "numpy",
+    "scipy",
+    "open3d",
+    "gtsam",
+    "kiss_icp",
+    "rich",
+    "pydantic",
+    "matplotlib",
+    "shapely",
+    "pyproj",
+)
+
+
+def test_help_is_instant_and_imports_nothing_heavy() -> None:
+    seconds = []
+    for _ in range(5):
+        began = time.perf_counter()
+        done = subprocess.run([*COMMAND, "--help"], capture_output=True, text=True, check=True, env=environment())
+        seconds.append(time.perf_counter() - began)
+    assert min(seconds) < 0.3, "the best of five: other work on the machine is not meant"
+    for name in COMMANDS:
+        assert f"  {name} " in done.stdout
+    code = (
+        "import sys\nfrom lslam.cli.main import main\nsys.argv = ['lslam', '--help']\ntry:\n    main()\n"
+        f"finally:\n    print([m for m in {HEAVY} if m in sys.modules], file=sys.stderr)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stderr == "[]\n"
+
+
+def test_every_command_has_help_with_an_example() -> None:
+    for name in COMMANDS:
+        done = lslam(name, "--help")
+        assert done.returncode == 0
+        assert "Usage: " in done.stdout
+        assert f"lslam {name}" in done.stdout.split("Usage: ")[1].split("\n", 1)[1], f"{name} shows no example"
+
+
+def test_version_names_what_it_stands_on() -> None:
+    done = lslam("--version")
+    assert done.returncode == 0
+    assert done.stdout.startswith("lslam ")
+    for name in ("numpy", "numba", "kiss-icp"):
+        assert f"\n  {name} " in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("shell", "words"), [("bash", "complete -o"), ("zsh", "#compdef lslam"), ("fish", "complete ")]
+)
+def test_completion_scripts(shell: str, words: str) -> None:
+    done = lslam("completion", shell)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert words in done.stdout
+
+
+def test_completion_completes() -> None:
+    env = environment(_LSLAM_COMPLETE="bash_complete", COMP_WORDS="lslam ru", COMP_CWORD="1")
+    code = "import sys; sys.argv = ['lslam']; from lslam.cli.main import cli; cli(prog_name='lslam')"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, env=env)
+    assert done.stdout == "plain,run\n"
+
+
+def test_methods_are_listed() -> None:
+    done = lslam("methods")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert [line.split()[0] for line in done.stdout.splitlines()][:2] == ["icp", "kiss-icp"]
+
+
+def test_config_show_can_be_checked_and_shown_again(tmp_path: Path) -> None:
+    shown = lslam("config", "show", "--set", "map.voxel=0.1")
+    assert (shown.returncode, shown.stderr) == (0, "")
+    assert tomllib.loads(shown.stdout)["map"]["voxel"] == 0.1
+    (tmp_path / "my.toml").write_text(shown.stdout)
+    assert lslam("config", "check", tmp_path / "my.toml").stdout.endswith(": ok\n")
+    assert lslam("config", "show", "--config", tmp_path / "my.toml").stdout == shown.stdout
+    described = lslam("config", "show", "--describe").stdout
+    assert "one averaged point per voxel" in described
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("[map]\nvoxl = 1\n", "did you mean 'voxel'"),
+        ("[registratoin]\nsigma = 1\n", "did you mean 'registration'"),
+        ("[odometry]\nmethod = 'icpp'\n", "did you mean 'icp'"),
+        ("[eval]\ndelta = ['10 furlongs']\n", "10m/all"),
+        ("[map]\nvoxel = -1\n", "map.voxel = -1"),
+        ("not toml", "not valid TOML"),
+    ],
+)
+def test_config_check_says_what_is_wrong(tmp_path: Path, text: str, words: str) -> None:
+    (tmp_path / "my.toml").write_text(text)
+    done = lslam("config", "check", tmp_path / "my.toml")
+    assert (done.returncode, done.stdout) == (2, "")
+    assert_one_sentence(done.stderr)
+    assert words in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["runn", "x"], "no command 'runn'; did you mean 'run'?"),
+        (["run"], "Missing argument 'SEQUENCE'; see"),
+        (["run", "x", "--coutn", "3"], "'--count'"),
+        (["run", "x", "--count", "many"], "'many' is not a valid integer"),
+        (["--verzion"], "--version"),
+        (["completion", "tcsh"], "'bash', 'zsh', 'fish'"),
+    ],
+)
+def test_wrong_usage_is_one_sentence_and_exit_2(arguments: list[str], words: str) -> None:
+    done = lslam(*arguments)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert_one_sentence(done.stderr)
+    assert words in done.stderr
+
+
+def test_without_a_command_the_help_is_shown() -> None:
+    done = lslam()
+    assert done.returncode == 2
+    assert "Commands:" in done.stderr
+
+
+def test_a_reader_that_leaves_is_no_error() -> None:
+    first = subprocess.Popen([*COMMAND, "config", "show"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    assert first.stdout is not None
+    first.stdout.close()
+    assert first.stderr is not None
+    assert first.stderr.read() == ""
+    assert first.wait(60) == 0
+
+
+def test_a_stdout_that_is_full_is_exit_3() -> None:
+    if not Path("/dev/full").exists():
+        pytest.skip("no /dev/full on this system")
+    with Path("/dev/full").open("w") as full:
+        done = subprocess.run([*COMMAND, "methods"], stdout=full, stderr=subprocess.PIPE, text=True, check=False)
+    assert done.returncode == 3
+    assert "No space left" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_an_ascii_terminal_gets_question_marks_not_errors() -> None:
+    done = lslam("eval", "--help", env=environment(PYTHONIOENCODING="ascii"))
+    assert done.returncode == 0
+    assert "Traceback" not in done.stderr
