@@ -70,7 +70,8 @@ class Advance(Protocol):
 @contextmanager
 def progress(title: str, total: int, unit: str = "scans") -> Iterator[Advance]:
     """A progress bar with rate and ETA on a terminal; elsewhere a plain line at most every 10 s and one at the end."""
-    if not any(handler.level <= logging.INFO for handler in log.handlers):
+    # The first handler is the screen's; log.txt listens behind it.
+    if log.handlers and log.handlers[0].level > logging.INFO:
         yield lambda note="": None
         return
     if sys.stderr.isatty():
