@@ -1,0 +1,71 @@
+"""The motion prior of a method without an IMU."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.geometry import se3
+from lslam.registration.motion import ConstantVelocity
+
+TENTH = 100_000_000
+TWIST = np.array([1.2, 0.1, -0.05, 0.01, -0.02, 0.2])
+
+
+def poses(n: int) -> NDArray[np.float64]:
+    start = se3.exp(np.array([5.0, -3.0, 1.0, 0.3, -0.2, 2.0]))
+    return np.stack([start @ se3.exp(k * TWIST) for k in range(n)])
+
+
+def test_without_history_nothing_moves() -> None:
+    motion = ConstantVelocity()
+    np.testing.assert_array_equal(motion.predict(5), np.eye(4))
+    T = poses(1)[0]
+    motion.correct(5, T)
+    np.testing.assert_array_equal(motion.predict(10 * TENTH), T)
+
+
+def test_a_screw_motion_is_predicted_exactly() -> None:
+    motion = ConstantVelocity()
+    T = poses(6)
+    for k in range(5):
+        motion.correct(k * TENTH, T[k])
+    np.testing.assert_allclose(motion.predict(5 * TENTH), T[5], atol=1e-9)
+
+
+def test_the_step_follows_the_time_between_scans() -> None:
+    motion = ConstantVelocity()
+    T = poses(8)
+    motion.correct(0, T[0])
+    motion.correct(TENTH, T[1])
+    for gap in (0, 1, 3):
+        np.testing.assert_allclose(motion.predict((1 + gap) * TENTH), T[1 + gap], atol=1e-9)
+    half = T[1] @ se3.exp(0.5 * TWIST)
+    np.testing.assert_allclose(motion.predict(TENTH + TENTH // 2), half, atol=1e-9)
+
+
+def test_a_long_pause_is_not_stretched_beyond_reason() -> None:
+    motion = ConstantVelocity()
+    T = poses(2)
+    motion.correct(0, T[0])
+    motion.correct(TENTH, T[1])
+    np.testing.assert_allclose(motion.predict(1000 * TENTH), T[1] @ se3.exp(5.0 * TWIST), atol=1e-9)
+    np.testing.assert_allclose(motion.predict(-1000 * TENTH), T[1], atol=1e-9)
+
+
+def test_equal_or_backward_stamps_keep_the_last_velocity() -> None:
+    motion = ConstantVelocity()
+    T = poses(4)
+    motion.correct(0, T[0])
+    motion.correct(TENTH, T[1])
+    motion.correct(TENTH, T[2])
+    np.testing.assert_allclose(motion.predict(2 * TENTH), T[3], atol=1e-9)
+
+
+def test_predictions_are_rotations_after_thousands_of_steps() -> None:
+    motion = ConstantVelocity()
+    T = np.eye(4)
+    for k in range(3000):
+        motion.correct(k * TENTH, T)
+        T = motion.predict((k + 1) * TENTH) if k else se3.exp(TWIST)
+    np.testing.assert_allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-14)

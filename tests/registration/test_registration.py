@@ -1,0 +1,192 @@
+"""Registration on arrays in scenes whose answer is known: recovery, failure, memory of the map, determinism."""
+
+from __future__ import annotations
+
+import copy
+import hashlib
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import pytest
+from analytic_scenes import corridor, distance, is_near, pose_at, random_pose, room, seen_from
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from lslam.config.registration import RegistrationConfig
+from lslam.errors import InputError
+from lslam.registration.registration import MIN_SOURCE_POINTS, Registration
+
+Floats = NDArray[np.float64]
+
+
+def in_room(seed: int = 0, config: RegistrationConfig | None = None) -> Registration:
+    """A registration that has seen the room from its middle."""
+    registration = Registration(config)
+    registration.register(room(np.random.default_rng(seed)).astype(np.float32))
+    return registration
+
+
+def settled(scans: int = 8) -> tuple[Registration, np.random.Generator]:
+    """The same after a few scans of slow driving, past its careful start."""
+    registration, rng = in_room(), np.random.default_rng(100)
+    for k in range(1, scans):
+        assert registration.register(seen_from(room(rng), pose_at((0.1 * k, 0.0, 0.0), 0.5 * k))).ok
+    return registration, rng
+
+
+def test_the_first_scan_defines_the_world_or_takes_its_prior() -> None:
+    points = room(np.random.default_rng(0)).astype(np.float32)
+    np.testing.assert_array_equal(Registration().register(points).T_world_lidar, np.eye(4))
+    prior = random_pose(np.random.default_rng(1), 50.0, 90.0)
+    np.testing.assert_array_equal(Registration().register(points, prior).T_world_lidar, prior)
+
+
+@given(st.integers(0, 2**31), st.sampled_from([(0.3, 3.0), (1.0, 5.0), (2.5, 5.0)]))
+@settings(max_examples=12, deadline=None)
+def test_a_start_at_unknown_speed_is_found(seed: int, limits: tuple[float, float]) -> None:
+    rng = np.random.default_rng(seed)
+    T = random_pose(rng, *limits)
+    result = in_room(seed).register(seen_from(room(rng), T))
+    assert result.ok
+    assert result.converged
+    assert len(result.degenerate) == 0
+    assert is_near(T, result.T_world_lidar, 0.01, 0.05)
+    np.testing.assert_allclose(
+        result.prior_error, (np.linalg.norm(T[:3, 3]), np.deg2rad(distance(T, np.eye(4))[1])), atol=0.01
+    )
+
+
+@given(st.integers(0, 2**31))
+@settings(max_examples=10, deadline=None)
+def test_surprises_after_the_start_are_caught_coarse_to_fine(seed: int) -> None:
+    registration, _ = settled(6)
+    rng = np.random.default_rng(seed)
+    T = pose_at((0.5, 0.0, 0.0), 2.5) @ random_pose(rng, 2.0, 6.0)
+    result = registration.register(seen_from(room(rng), T))
+    assert result.ok
+    assert is_near(T, result.T_world_lidar, 0.01, 0.05)
+
+
+def test_a_corridor_keeps_the_prior_along_itself_scan_after_scan() -> None:
+    rng = np.random.default_rng(0)
+    registration = Registration()
+    for k in range(10):
+        x = 0.5 * k
+        prior = pose_at((x + 0.1, 0.05, 0.03), 0.5) if k else np.eye(4)
+        result = registration.register(seen_from(corridor(rng, along=x), pose_at((x, 0.0, 0.0))), prior)
+        assert result.ok
+        if k:
+            assert len(result.degenerate) == 1
+            assert abs(result.degenerate[0, 0]) > 0.99
+            assert result.T_world_lidar[0, 3] == pytest.approx(prior[0, 3], abs=1e-3)
+            assert np.abs(result.T_world_lidar[1:3, 3]).max() < 0.01
+
+
+@pytest.mark.parametrize("n", [0, 1, MIN_SOURCE_POINTS - 1])
+def test_too_few_points_keep_the_prior_and_say_so(n: int) -> None:
+    registration = in_room()
+    prior = pose_at((0.3, 0.0, 0.0))
+    result = registration.register(np.full((n, 3), 5.0) + np.arange(n)[:, None], prior)
+    assert not result.ok
+    assert not result.converged
+    assert f"{n} usable points, {MIN_SOURCE_POINTS} needed" in result.reason
+    np.testing.assert_array_equal(result.T_world_lidar, prior)
+    assert result.covariance is not None
+    assert np.sqrt(result.covariance[0, 0]) == pytest.approx(0.5)
+
+
+def bad_scan(kind: str) -> NDArray[np.float32]:
+    rng = np.random.default_rng(5)
+    if kind == "noise":
+        return rng.uniform(-40, 40, (20_000, 3)).astype(np.float32)
+    if kind == "a ball of noise":
+        return rng.normal(0, 8, (20_000, 3)).astype(np.float32)
+    if kind == "nan":
+        return np.full((500, 3), np.nan, np.float32)
+    if kind == "zeros":
+        return np.zeros((500, 3), np.float32)
+    return np.zeros((0, 3), np.float32)
+
+
+@pytest.mark.parametrize("kind", ["noise", "a ball of noise", "nan", "zeros", "empty"])
+def test_a_bad_scan_fails_touches_nothing_and_is_got_over(kind: str) -> None:
+    registration, rng = settled()
+    before = copy.deepcopy(registration.map)
+    result = registration.register(bad_scan(kind))
+    assert not result.ok
+    assert result.reason
+    # Constant velocity: 0.1 m and half a degree on.
+    assert is_near(result.T_world_lidar, pose_at((0.8, 0.0, 0.0), 4.0), 0.01, 0.1)
+    for name in ("moments", "planes", "keys", "table"):
+        np.testing.assert_array_equal(getattr(registration.map, name), getattr(before, name))
+    for k in (9, 10):
+        T = pose_at((0.1 * k, 0.0, 0.0), 0.5 * k)
+        good = registration.register(seen_from(room(rng), T))
+        assert good.ok
+        assert is_near(T, good.T_world_lidar, 0.01, 0.05)
+
+
+def test_a_jump_beyond_the_limit_fails() -> None:
+    T = pose_at((1.5, 0.0, 0.0))
+    points = seen_from(room(np.random.default_rng(1)), T)
+    assert in_room().register(points).ok
+    result = in_room(config=RegistrationConfig(max_jump_m=1.0)).register(points)
+    assert not result.ok
+    assert "impossible jump of 1.5 m" in result.reason
+    np.testing.assert_array_equal(result.T_world_lidar, np.eye(4))
+    turned = seen_from(room(np.random.default_rng(1)), pose_at((0.0, 0.0, 0.0), 5.0))
+    result = in_room(config=RegistrationConfig(max_jump_deg=4.0)).register(turned)
+    assert "5 deg" in result.reason
+
+
+def test_a_standing_sensor_neither_drifts_nor_grows_sure_of_itself() -> None:
+    rng = np.random.default_rng(0)
+    base = room(rng, 2500)
+    registration = Registration()
+    spread = []
+    for _ in range(200):
+        result = registration.register((base + rng.normal(0, 0.01, base.shape)).astype(np.float32))
+        assert result.ok
+        assert is_near(result.T_world_lidar, np.eye(4), 0.005, 0.05)
+        assert result.covariance is not None
+        spread.append(np.sqrt(np.diag(result.covariance)))
+    # As sure in the end as when the map had filled, not two hundred scans surer; a millimetre here.
+    assert (spread[-1] > 0.4 * spread[20]).all()
+    assert (np.array(spread)[1:, :3] > 2e-4).all()
+    assert registration.map.moments[:, 0].max() < 1.1 * registration.config.count_cap
+
+
+def digest(seed: int = 3) -> str:
+    registration = in_room(seed)
+    rng = np.random.default_rng(seed + 1)
+    out = hashlib.sha256()
+    for k in range(1, 6):
+        result = registration.register(seen_from(room(rng), pose_at((0.2 * k, 0.01 * k, 0.0), 1.0 * k)))
+        out.update(result.T_world_lidar.tobytes())
+        assert result.covariance is not None
+        out.update(result.covariance.tobytes())
+    out.update(registration.map.planes.tobytes())
+    return out.hexdigest()
+
+
+def test_the_same_scans_give_the_same_bytes_twice_in_threads_and_in_another_process() -> None:
+    expected = digest()
+    assert digest() == expected
+    with ThreadPoolExecutor(3) as pool:
+        found = list(pool.map(digest, [3, 4, 3, 4]))
+    assert found[0] == found[2] == expected
+    assert found[1] == found[3] != expected
+    code = f"import sys; sys.path.insert(0, {str(Path(__file__).parent)!r}); import test_registration as t; print(t.digest())"
+    other = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert other.stdout.strip() == expected
+
+
+@pytest.mark.parametrize("prior", [np.eye(3), np.full((4, 4), np.nan), np.zeros(6)])
+def test_a_prior_that_is_no_pose_is_refused(prior: Floats) -> None:
+    registration = in_room()
+    with pytest.raises(InputError, match="motion prior"):
+        registration.register(room(np.random.default_rng(1)).astype(np.float32), prior)

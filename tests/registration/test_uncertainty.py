@@ -1,0 +1,82 @@
+"""From one registration's covariance to that of a pose in the world."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from lslam.geometry import se3
+from lslam.registration.solver import RegistrationResult
+from lslam.registration.uncertainty import PoseUncertainty
+
+C = np.diag([1e-4, 2e-4, 3e-4, 1e-6, 2e-6, 3e-6])
+LEVER = 10.0
+
+
+def result(x: float, covariance: NDArray[np.float64] | None = C, ok: bool = True) -> RegistrationResult:
+    pose = se3.make(np.eye(3), np.array([x, 0.0, 0.0]))
+    return RegistrationResult(pose, ok=ok, covariance=covariance, lever_arm=LEVER)
+
+
+def test_a_standing_sensor_does_not_drift() -> None:
+    uncertainty = PoseUncertainty()
+    for _ in range(500):
+        now = uncertainty.add(result(3.0))
+        assert now is not None
+        np.testing.assert_allclose(now, C, atol=1e-18)
+
+
+def test_distance_adds_a_registration_per_lever_arm() -> None:
+    uncertainty = PoseUncertainty()
+    last = np.zeros((6, 6))
+    for k in range(1, 101):
+        now = uncertainty.add(result(0.5 * k))
+        assert now is not None
+        assert np.linalg.eigvalsh(now).min() > 0
+        assert np.trace(now) > np.trace(last)
+        last = now
+    # 49.5 m are 4.95 lever arms; along x nothing but these adds up.
+    assert last[0, 0] == pytest.approx(C[0, 0] * (1 + 4.95), rel=1e-9)
+    assert last[5, 5] == pytest.approx(C[5, 5] * (1 + 4.95), rel=1e-9)
+    # A yaw error at the start swings the end sideways.
+    assert last[1, 1] > C[1, 1] * 5.95 + 0.5 * 4.95 * C[5, 5] * 24.0**2
+
+
+def test_driving_equals_accumulating_a_random_walk() -> None:
+    """Draw the drift the model describes, scan by scan, and compare the spread of the end poses with the covariance."""
+    rng = np.random.default_rng(0)
+    runs, steps, step = 4000, 40, 1.0
+    uncertainty = PoseUncertainty()
+    found = None
+    for k in range(steps + 1):
+        found = uncertainty.add(result(step * k))
+    d = np.zeros((runs, 6))
+    for _ in range(steps):
+        swing = np.cross(d[:, 3:], [step, 0.0, 0.0])
+        d[:, :3] += swing
+        d += rng.multivariate_normal(np.zeros(6), C * step / LEVER, runs)
+    d += rng.multivariate_normal(np.zeros(6), C, runs)
+    assert found is not None
+    np.testing.assert_allclose(np.sqrt(np.diag(found)), d.std(0), rtol=0.06)
+    correlation = found[1, 5] / np.sqrt(found[1, 1] * found[5, 5])
+    assert correlation == pytest.approx(np.corrcoef(d[:, 1], d[:, 5])[0, 1], abs=0.05)
+
+
+def test_a_failed_scan_doubts_its_own_pose_only() -> None:
+    uncertainty, without = PoseUncertainty(), PoseUncertainty()
+    doubt = np.diag([0.25] * 3 + [1e-3] * 3)
+    for k in range(5):
+        uncertainty.add(result(0.0 + k))
+        without.add(result(0.0 + k))
+    bad = uncertainty.add(result(5.0, doubt, ok=False))
+    assert bad is not None
+    assert (np.diag(bad) > np.diag(doubt)).all()
+    after, expected = uncertainty.add(result(6.0)), without.add(result(6.0))
+    assert after is not None
+    assert expected is not None
+    np.testing.assert_allclose(np.diag(after), np.diag(expected), rtol=0.2)
+
+
+def test_no_covariance_gives_none() -> None:
+    assert PoseUncertainty().add(result(1.0, None)) is None
