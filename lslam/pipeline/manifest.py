@@ -25,6 +25,7 @@ class Manifest:
     """Gathers facts while the run goes on; `as_dict` is the file at any moment.
 
     outcome : done, degraded (a scan was bridged or skipped, or a problem arose), diverged or interrupted
+    problems : what went wrong in this run; what was wrong with the recording before is listed too, but degrades nothing
     """
 
     def __init__(self, command: str, sequence: Sequence, config: Config) -> None:
@@ -84,7 +85,7 @@ class Manifest:
             "schema": SCHEMA,
             "status": status,
             **({"why": why} if why else {}),
-            "problems": list(self.problems),
+            "problems": [*s.problems, *self.problems],
             "command": self.command,
             "lslam": __version__,
             "method": self.config.odometry.method,

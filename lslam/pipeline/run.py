@@ -166,11 +166,15 @@ def _score(record: RunRecord, sequence: Sequence, config: Config) -> Evaluation 
     if record.ground_truth is None:
         return None
     try:
-        return evaluate(record.trajectory, record.ground_truth, config.eval, calibration=sequence.calibration)
+        score = evaluate(record.trajectory, record.ground_truth, config.eval, calibration=sequence.calibration)
     except LslamError as error:
         record.problems.append(f"not scored: {error}")
         log.warning("not scored: %s", error)
+        if record.folder != Path():
+            log.info("score it with other recipes: lslam eval %s GT", record.folder / "trajectory.tum")
         return None
+    record.problems += [note for note in score.notes if "WRONG" in note]
+    return score
 
 
 def _map(

@@ -17,7 +17,8 @@ from lslam.types.scan import Scan
 from lslam.types.scan_result import ScanResult, Status
 
 
-def outcomes(*statuses: Status) -> list[ScanResult]:
+def outcomes(*runs: tuple[Status, int]) -> list[ScanResult]:
+    statuses = [status for status, times in runs for _ in range(times)]
     return [ScanResult(i, i, np.eye(4), status) for i, status in enumerate(statuses)]
 
 
@@ -56,7 +57,7 @@ def test_what_cannot_be_read_is_bridged_by_the_motion_prior() -> None:
     assert results[6].reason.startswith("000006.bin")
     assert "no points" in results[9].reason
     assert stub.ground_truth is not None
-    off = np.linalg.norm([r.T_world_lidar[:3, 3] - p for r, p in zip(results, stub.ground_truth.positions)], axis=1)
+    off = np.linalg.norm([r.T_world_lidar[:3, 3] for r in results] - stub.ground_truth.positions, axis=1)
     assert off[[6, 9]].max() < 0.15, "constant velocity for one scan"
     assert off[-1] < 0.05, "and back on the map afterwards"
 
@@ -100,11 +101,11 @@ def test_gives_up_after_failures_in_a_row_and_stops_when_asked() -> None:
 
 
 def test_diverged_means_given_up_or_hardly_anything_registered() -> None:
-    assert not is_diverged(outcomes("ok", "skipped", "ok", "bridged"), 20)
-    assert is_diverged(outcomes("ok", "skipped", "skipped", "skipped", "bridged"), 20)
-    assert is_diverged(outcomes(*["ok"] * 30, *["bridged"] * 5), 5)
-    assert not is_diverged(outcomes(*["ok"] * 30, *["bridged"] * 4), 5)
-    assert is_diverged(outcomes("skipped"), 20)
+    assert not is_diverged(outcomes(("ok", 2), ("skipped", 1), ("bridged", 1)), 20)
+    assert is_diverged(outcomes(("ok", 1), ("skipped", 3), ("bridged", 1)), 20)
+    assert is_diverged(outcomes(("ok", 30), ("bridged", 5)), 5)
+    assert not is_diverged(outcomes(("ok", 30), ("bridged", 4)), 5)
+    assert is_diverged(outcomes(("skipped", 1)), 20)
 
 
 def test_a_skipped_scan_is_more_doubtful_than_the_one_before() -> None:

@@ -263,7 +263,7 @@ def test_switched_off_outputs_are_not_written(tmp_path: Path) -> None:
 
 def test_threads_and_repetition_change_no_byte(tmp_path: Path) -> None:
     stub = with_points(sample(25), 12, noise(3))
-    seen = []
+    seen: list[dict[str, bytes]] = []
     for threads in (1, 2, 4, 2):
         out = tmp_path / f"run{len(seen)}"
         lslam.run(stub, config(f"input.threads={threads}"), out=out)

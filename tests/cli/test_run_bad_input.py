@@ -1,0 +1,209 @@
+"""`lslam run` on what users really have: one clear sentence, the documented exit code, nothing half-written."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from calling import SAMPLE, Done, assert_one_sentence, lslam, manifest, sample_copy
+
+from lslam.formats.point_files import write_points
+from lslam.formats.trajectory_files import write_tum
+from lslam.types.trajectory import Trajectory
+
+
+@pytest.fixture
+def sequence(tmp_path: Path) -> Path:
+    return sample_copy(tmp_path / "data", 12)
+
+
+def run(sequence: object, tmp_path: Path, *words: object) -> tuple[Done, Path]:
+    return lslam("run", sequence, "--out", tmp_path / "out", *words), tmp_path / "out"
+
+
+def refuse(sequence: object, tmp_path: Path, code: int, sentence: str, *words: object) -> None:
+    """Exit `code`, one sentence, nothing on stdout, no folder."""
+    done, out = run(sequence, tmp_path, *words)
+    assert (done.returncode, done.stdout) == (code, ""), done.stderr
+    assert_one_sentence(done.stderr)
+    assert sentence in done.stderr
+    assert not out.exists()
+
+
+def test_no_sequence_there(tmp_path: Path) -> None:
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "letters").mkdir()
+    (tmp_path / "letters" / "a.txt").write_text("dear")
+    refuse(tmp_path / "none", tmp_path, 3, "does not exist")
+    refuse(tmp_path / "empty", tmp_path, 3, "is empty")
+    refuse(tmp_path / "letters", tmp_path, 3, "holds no scans")
+    refuse(tmp_path / "letters" / "a.txt", tmp_path, 3, "is a file")
+
+
+def test_wrong_words(sequence: Path, tmp_path: Path) -> None:
+    refuse(sequence, tmp_path, 2, "did you mean 'kiss-icp'", "--method", "kissicp")
+    refuse(sequence, tmp_path, 2, "did you mean 'voxel'", "--set", "map.voxle=1")
+    refuse(sequence, tmp_path, 2, "beyond the last scan", "--start", "12")
+    refuse(sequence, tmp_path, 2, "input.threads = 0", "--threads", "0")
+    refuse(sequence, tmp_path, 3, "none.toml cannot be read", "--config", tmp_path / "none.toml")
+    refuse(sequence, tmp_path, 3, "gt.tum does not exist", "--gt", tmp_path / "gt.tum")
+
+
+def truncate(folder: Path) -> None:
+    scan = folder / "velodyne" / "000005.bin"
+    scan.write_bytes(scan.read_bytes()[:-5])
+
+
+def test_a_truncated_scan_is_skipped_bridged_and_counted(sequence: Path, tmp_path: Path) -> None:
+    truncate(sequence)
+    done, out = run(sequence, tmp_path)
+    assert done.returncode == 0
+    assert "Traceback" not in done.stderr
+    assert "000005.bin" in done.stderr
+    assert "status       degraded" in done.stdout
+    assert "11 of 12 registered, 1 skipped" in done.stdout
+    facts = manifest(out)
+    assert (facts["status"], facts["counts"]["skipped"]) == ("degraded", 1)
+    assert "000005.bin" in facts["problems"][0]
+    assert "000005.bin" in (out / "report.html").read_text()
+
+
+def test_strict_makes_it_exit_4_with_everything_written(sequence: Path, tmp_path: Path) -> None:
+    truncate(sequence)
+    done, out = run(sequence, tmp_path, "--strict")
+    assert done.returncode == 4
+    assert_one_sentence(done.stderr)
+    assert "status       degraded" in done.stdout
+    assert (out / "map.ply").exists()
+
+
+def empty_all(folder: Path) -> None:
+    for scan in (folder / "velodyne").iterdir():
+        scan.write_bytes(b"")
+
+
+def cut_all(folder: Path) -> None:
+    for scan in (folder / "velodyne").iterdir():
+        scan.write_bytes(b"abc")
+
+
+def unrelated_places(folder: Path) -> None:
+    rng = np.random.default_rng(0)
+    for k in range(12):
+        if k > 2:
+            centre = rng.uniform(-20, 20, 3)
+            write_points(folder / "velodyne" / f"{k:06d}.bin", centre + rng.normal(0, 9, (4000, 3)), np.zeros(4000))
+
+
+@pytest.mark.parametrize(
+    ("spoil", "words"),
+    [(empty_all, "no points"), (cut_all, "no multiple of 16"), (unrelated_places, "the first is scan 3")],
+)
+def test_nothing_to_register_is_exit_1_with_a_summary(
+    sequence: Path, tmp_path: Path, spoil: Callable[[Path], None], words: str
+) -> None:
+    spoil(sequence)
+    done, out = run(sequence, tmp_path)
+    assert done.returncode == 1
+    assert_one_sentence(done.stderr)
+    assert words in done.stderr.splitlines()[-1]
+    assert "status       diverged" in done.stdout
+    assert manifest(out)["status"] == "diverged"
+    assert {"trajectory.tum", "report.html", "log.txt"} <= {p.name for p in out.iterdir()}
+
+
+def shorten(name: str) -> Callable[[Path], None]:
+    def spoil(folder: Path) -> None:
+        file = (folder / name).resolve()
+        file.write_text("".join(file.read_text().splitlines(keepends=True)[:-3]))
+
+    return spoil
+
+
+def swap_times(folder: Path) -> None:
+    lines = (folder / "times.txt").read_text().splitlines()
+    lines[4], lines[5] = lines[5], lines[4]
+    (folder / "times.txt").write_text("\n".join(lines) + "\n")
+
+
+def drop_tr(folder: Path) -> None:
+    (folder / "calib.txt").write_text("P0: 1 0 0 0 0 1 0 0 0 0 1 0\n")
+    toml = folder / "sequence.toml"
+    toml.write_text(toml.read_text().split("[extrinsics]")[0])
+
+
+@pytest.mark.parametrize(
+    ("spoil", "scans", "words"),
+    [
+        (shorten("times.txt"), 9, "9 times for 12 scans"),
+        (shorten("../../poses/00.txt"), 12, "9 poses for 12 scans"),
+        (lambda folder: (folder / "velodyne" / "000005.bin").unlink(), 11, "12 times for 11 scans"),
+        (swap_times, 12, "time goes back at line 6"),
+        (drop_tr, 12, "has no Tr"),
+    ],
+)
+def test_contradictions_are_resolved_and_said(
+    sequence: Path, tmp_path: Path, spoil: Callable[[Path], None], scans: int, words: str
+) -> None:
+    spoil(sequence)
+    done, out = run(sequence, tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert words in done.stderr
+    assert words in done.stdout, "the summary says it too"
+    facts = manifest(out)
+    assert any(words in problem for problem in facts["problems"])
+    assert (facts["status"], facts["counts"]["ok"]) == ("done", scans)
+    if spoil is drop_tr:
+        assert facts["frames"]["trajectory_kitti.txt"].startswith("LiDAR")
+        assert "errors       not stated" in done.stdout
+
+
+def test_truth_in_the_wrong_frame_is_detected(sequence: Path, tmp_path: Path) -> None:
+    # KITTI's camera poses in a format that does not say so.
+    rows = np.loadtxt(SAMPLE / "poses" / "00.txt")[:12].reshape(-1, 3, 4)
+    poses = np.tile(np.eye(4), (12, 1, 1))
+    poses[:, :3] = rows
+    stamps = np.arange(12, dtype=np.int64) * 100_000_000
+    write_tum(tmp_path / "wrong.tum", Trajectory(stamps, poses), comment="poses")
+    done, out = run(sequence, tmp_path, "--gt", tmp_path / "wrong.tum")
+    assert done.returncode == 0
+    assert "WRONG FRAMES" in done.stdout
+    assert manifest(out)["status"] == "degraded"
+    assert "WRONG FRAMES" in manifest(out)["problems"][0]
+
+
+def test_truth_of_another_time_leaves_the_run_without_a_score(sequence: Path, tmp_path: Path) -> None:
+    stamps = 10**15 + np.arange(12, dtype=np.int64) * 100_000_000
+    write_tum(tmp_path / "late.tum", Trajectory(stamps, np.tile(np.eye(4), (12, 1, 1))), comment="poses")
+    done, out = run(sequence, tmp_path, "--gt", tmp_path / "late.tum")
+    assert done.returncode == 0
+    assert "they share no time" in done.stdout
+    assert "lslam eval" in done.stderr
+    assert not (out / "evaluation.json").exists()
+    assert "they share no time" in (out / "report.html").read_text()
+
+
+def test_truth_of_the_whole_sequence_fits_a_part(sequence: Path, tmp_path: Path) -> None:
+    done, out = run(sequence, tmp_path, "--gt", tmp_path / "data" / "poses" / "00.txt", "--start", 4)
+    assert done.returncode == 0
+    assert "8 of 8 poses" in done.stdout
+    assert manifest(out)["status"] == "done"
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_too_few_scans_for_a_score(sequence: Path, tmp_path: Path, count: int) -> None:
+    done, out = run(sequence, tmp_path, "--count", count)
+    assert done.returncode == 0
+    assert f"has {count} poses, 3 are needed" in done.stdout
+    assert len((out / "trajectory_kitti.txt").read_text().splitlines()) == count
+
+
+@pytest.mark.parametrize("place", ["file/run", "/proc/none/run"])
+def test_output_that_cannot_be_written(sequence: Path, tmp_path: Path, place: str) -> None:
+    (tmp_path / "file").write_text("")
+    done = lslam("run", sequence, "--out", tmp_path / place)
+    assert (done.returncode, done.stdout) == (3, "")
+    assert_one_sentence(done.stderr)
+    assert "cannot be written" in done.stderr
