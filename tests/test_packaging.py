@@ -294,3 +294,11 @@ def test_version_is_one() -> None:
     citation = re.search(r"^version: (\S+)$", (ROOT / "CITATION.cff").read_text(), re.MULTILINE)
     assert citation
     assert citation.group(1) == __version__ == distribution("lslam").version
+
+
+def test_files_the_readme_links_to_exist() -> None:
+    linked = re.findall(r"\]\(([^):]+)\)", README)
+    named = re.findall(r"`(sample_data\S*|LICENSE|CITATION\.cff)`", README)
+    assert linked
+    assert named
+    assert all((ROOT / name).is_file() for name in linked + named)
