@@ -6,6 +6,7 @@ import time
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lslam.config.config import Config
 from lslam.errors import InputError
@@ -13,6 +14,8 @@ from lslam.geometry import se3
 from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan import Scan
 from lslam.types.scan_result import ScanResult
+
+Floats = NDArray[np.float64]
 
 
 def create(config: Config) -> Kiss:
@@ -23,8 +26,8 @@ def create(config: Config) -> Kiss:
 class Kiss:
     """kiss-icp as its authors run it: it predicts, deskews and down-samples by itself and ignores the motion prior.
 
-    kiss-icp's pose belongs to the scan's end when it deskews: it is carried back to the start along the scan's own
-    motion (CONVENTIONS, "Trajectory files"). Compensated scans have one instant and are left alone.
+    kiss-icp's pose belongs to the scan's end when it deskews: it is carried back to the scan's start. Compensated scans
+    have one instant and are left alone.
     """
 
     def __init__(self, range_max: float, has_user_range: bool) -> None:
@@ -41,6 +44,8 @@ class Kiss:
         self._config, self._make = config, KissICP
         self._with_deskew: bool | None = None
         self._kiss: Any = None
+        self._registered = 0
+        self._half_step = np.eye(4)
 
     def prepare(self, scan: Scan) -> tuple[Any, Any]:
         """Points as float64 and their times scaled to 0..1 as kiss-icp wants them."""
@@ -66,11 +71,26 @@ class Kiss:
         _, source = self._kiss.register_frame(points, times if len(times) else np.zeros(len(points)))
         pose = np.asarray(self._kiss.last_pose, np.float64).copy()
         if self._with_deskew:
-            pose = pose @ se3.inverse(np.asarray(self._kiss.last_delta, np.float64))
+            pose = self._at_scan_start(pose, np.asarray(self._kiss.last_delta, np.float64))
         took = time.perf_counter() - began
         return ScanResult(
             scan.index, scan.stamp_ns, se3.normalise(pose), source_points=len(source), stages={"register": took}
         )
+
+    def _at_scan_start(self, pose: Floats, delta: Floats) -> Floats:
+        """Pose at the scan's start, in the world of the LiDAR at the start of the first scan.
+
+        `pose` is kiss-icp's newest, `delta` its motion since the one before: the start of a scan is the end of the one
+        before. But kiss-icp knows no motion to deskew its first two scans with: their poses belong to the middle, and its
+        world begins half a step late.
+        """
+        self._registered += 1
+        if self._registered == 1:
+            return pose
+        if self._registered == 2:
+            self._half_step = se3.exp(0.5 * se3.log(delta))
+        start = self._half_step @ pose @ se3.inverse(delta)
+        return np.asarray(start @ self._half_step if self._registered <= 3 else start)
 
     def warm_up(self) -> None:
         """Nothing to compile."""
