@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any, TypeVar, cast
 
 F = TypeVar("F", bound=Callable[..., Any])
+_log = logging.getLogger("lslam")
 
 
 def cache_folder() -> Path:
@@ -53,8 +54,31 @@ import numba  # noqa: E402
 
 def kernel(function: F) -> F:
     """Compile `function` on first use and keep the machine code in the cache."""
-    compiled = numba.njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)(function)
+    compiled: Any = numba.njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)(function)
+    _forgive(compiled._cache)
     return cast(F, compiled)
+
+
+def _forgive(cache: Any) -> None:
+    """Let a damaged or full cache cost time, not the run: numba passes on whatever unpickling or writing raises."""
+    load, save = cache.load_overload, cache.save_overload
+
+    def load_or_compile(*args: Any) -> Any:
+        try:
+            return load(*args)
+        except Exception as error:
+            _log.warning("the kernel cache is damaged (%s): compiling again", type(error).__name__)
+            with contextlib.suppress(OSError):
+                cache.flush()
+            return None
+
+    def save_if_possible(*args: Any) -> None:
+        try:
+            save(*args)
+        except Exception as error:
+            _log.debug("a kernel is not kept in the cache: %s", error)
+
+    cache.load_overload, cache.save_overload = load_or_compile, save_if_possible
 
 
 def inline(function: F) -> F:
