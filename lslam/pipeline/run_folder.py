@@ -87,7 +87,13 @@ class RunFolder:
         """Let go of the folder."""
         if self._log_handler is not None:
             self._log_handler.detach()
+        if not (self.path / MANIFEST).exists():
+            # Not even the status could be written: leave nothing that looks like a run.
+            with contextlib.suppress(OSError):
+                self._clear()
         self._let_go()
+        with contextlib.suppress(OSError):
+            self.path.rmdir()  # only when it is empty
 
     def _let_go(self) -> None:
         if self._lock is not None:

@@ -108,6 +108,7 @@ def test_space_is_asked_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
 
 def test_a_write_that_fails_leaves_the_old_file_and_no_part(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with RunFolder(tmp_path / "out") as folder:
+        folder.write_manifest({"status": "running"})
         folder.write_text("timing.csv", "old")
         with monkeypatch.context() as patched:
 
@@ -118,13 +119,20 @@ def test_a_write_that_fails_leaves_the_old_file_and_no_part(tmp_path: Path, monk
             with pytest.raises(OutputError, match=r"timing\.csv cannot be written: No space left"):
                 folder.write_text("timing.csv", "new")
         assert (folder.path / "timing.csv").read_text() == "old"
-    assert names(tmp_path / "out") == {"timing.csv", "log.txt"}
+    assert names(tmp_path / "out") == {MANIFEST, "timing.csv", "log.txt"}
+
+
+def test_a_folder_without_a_status_is_not_left_behind(tmp_path: Path) -> None:
+    with RunFolder(tmp_path / "out") as folder:
+        folder.write_text("config.toml", "a = 1\n")
+    assert not (tmp_path / "out").exists()
 
 
 def test_the_log_is_kept_also_for_callers_without_logging(tmp_path: Path) -> None:
     log = logging.getLogger("lslam")
     level = log.level
-    with RunFolder(tmp_path / "out"):
+    with RunFolder(tmp_path / "out") as folder:
+        folder.write_manifest({"status": "running"})
         log.info("a decision")
     log.info("after the run")
     text = (tmp_path / "out" / "log.txt").read_text()
