@@ -1,0 +1,86 @@
+"""`icp` on simulated drives: accuracy, starts at speed, honest covariances, and gates that let no sentinel pass."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from drives import ate, coasting, drive, nees_per_dof, poses_of, registered, standing
+from numpy.typing import NDArray
+
+from lslam.registration.solver import RegistrationResult
+
+CENTIMETRE = 0.01
+LONG = [("street", 1, 35), ("street", 2, 35), ("street", 3, 35), ("block", 0, 95), ("block", 1, 95), ("block", 2, 95)]
+
+
+@pytest.mark.parametrize(("scenario", "seed", "count"), LONG)
+def test_error_stays_under_a_centimetre(scenario: str, seed: int, count: int) -> None:
+    d = drive(scenario, seed, count)
+    results = registered(d.points)
+    assert all(r.ok and r.converged for r in results)
+    assert ate(poses_of(results), d.truth) < CENTIMETRE
+
+
+@pytest.mark.parametrize(("scenario", "seed", "count"), [LONG[0], LONG[3]])
+def test_no_sentinel_passes_the_gate(scenario: str, seed: int, count: int) -> None:
+    truth = drive(scenario, seed, count).truth
+    assert ate(truth, truth) < 1e-9
+    assert ate(standing(truth), truth) > 10 * CENTIMETRE
+    assert ate(coasting(truth), truth) > 10 * CENTIMETRE
+
+
+@pytest.mark.parametrize("lidar", ["hdl64", "vlp16"])
+@pytest.mark.parametrize("every", [1, 2, 3])
+def test_no_start_is_lost_at_up_to_two_and_a_half_metres_per_scan(every: int, lidar: str) -> None:
+    d = drive("street", 0, 4, every, lidar, 8.3)
+    step = np.linalg.norm(d.truth[1, :3, 3])
+    assert step == pytest.approx(0.83 * every, rel=0.02)
+    results = registered(d.points)
+    assert all(r.ok for r in results)
+    errors = np.linalg.norm((poses_of(results) - d.truth)[:, :3, 3], axis=1)
+    assert errors[1] < 0.1
+    assert errors.max() < 0.1
+    # Standing still would be a lost start.
+    assert step > 0.1
+
+
+def test_covariances_mean_something() -> None:
+    """Mean NEES per degree of freedom over runs with four LiDARs' worth of geometry; 1 is honest.
+
+    Without the VLP-16, whose pitch is doubted far too little: see the test below.
+    """
+    runs = [
+        *(drive("block", seed, 95) for seed in (0, 1, 2)),
+        *(drive("street", seed, 35) for seed in (1, 2)),
+        drive("street", 4, 30, lidar="os1-32"),
+    ]
+    means = [nees_per_dof(registered(d.points), d.truth).mean() for d in runs]
+    assert 0.3 < np.mean(means) < 3.0
+    assert max(means) < 10.0
+
+
+@pytest.mark.xfail(
+    strict=True,
+    reason="sixteen rings within 30 deg hold the pitch by few tilted planes: errors of 2 to 6 mrad, sigma 0.2 mrad",
+)
+def test_covariances_mean_something_for_sixteen_rings_within_thirty_degrees() -> None:
+    runs = [drive("street", seed, 10, lidar="vlp16") for seed in (4, 6, 7)]
+    assert np.mean([nees_per_dof(registered(d.points), d.truth).mean() for d in runs]) < 3.0
+
+
+def test_nees_sees_covariances_that_are_a_hundred_times_off() -> None:
+    d = drive("block", 0, 95)
+    results = registered(d.points)
+    honest = nees_per_dof(results, d.truth).mean()
+    for factor in (0.01, 100.0):
+        scaled = [replace(r, covariance=factor * covariance(r)) for r in results]
+        mean = nees_per_dof(scaled, d.truth).mean()
+        assert mean == pytest.approx(honest / factor, rel=1e-6)
+        assert not 0.3 < mean < 3.0
+
+
+def covariance(result: RegistrationResult) -> NDArray[np.float64]:
+    assert result.covariance is not None
+    return result.covariance
