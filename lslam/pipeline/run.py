@@ -132,7 +132,7 @@ def _estimate(
     watch: Watch,
 ) -> RunRecord:  # fmt: skip
     """Odometry over all scans, judged."""
-    with manifest.timed("compile_s"), jit.compile_lock(), jit.announced(log):
+    with manifest.timed("compile_s"), jit.announced(log), jit.compile_lock():
         odometry.warm_up()
         if config.map.write:
             merge.warm_up()

@@ -1,0 +1,103 @@
+"""`lslam run` on odd machines: nowhere to write but the output, many first runs at once, a damaged kernel cache."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import time
+from pathlib import Path
+
+import pytest
+from calling import COMMAND, SAMPLE, environment, lslam, manifest
+
+STARTS = 8
+
+
+@pytest.fixture(scope="module")
+def cold_starts(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[tuple[int, str]], Path, float]:
+    """Eight first runs at once on one empty kernel cache: the cache, (exit code, stderr) of each, folders, seconds."""
+    base = tmp_path_factory.mktemp("cold")
+    env = environment(NUMBA_CACHE_DIR=str(base / "cache"))
+    began = time.monotonic()
+    children = [
+        subprocess.Popen(
+            [*COMMAND, "run", str(SAMPLE), "--count", "5", "--out", str(base / f"run{k}")],
+            stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, env=env,
+        )
+        for k in range(STARTS)
+    ]  # fmt: skip
+    ended = [(child.communicate(timeout=300)[1], child.returncode) for child in children]
+    return base / "cache", [(code, stderr) for stderr, code in ended], base, time.monotonic() - began
+
+
+def test_eight_cold_starts_on_one_cache_all_succeed(
+    cold_starts: tuple[Path, list[tuple[int, str]], Path, float],
+) -> None:
+    _, ended, base, _ = cold_starts
+    assert [code for code, _ in ended] == [0] * STARTS
+    for _, stderr in ended:
+        assert "Traceback" not in stderr
+        assert "damaged" not in stderr
+        assert stderr.count("compiling kernels, once") <= 1
+    # Who finds them compiled while waiting has waited long enough to be told.
+    assert sum("compiling kernels, once" in stderr for _, stderr in ended) > STARTS // 2
+    trajectories = {(base / f"run{k}" / "trajectory.tum").read_bytes() for k in range(STARTS)}
+    assert len(trajectories) == 1
+    assert min(manifest(base / f"run{k}")["timings"]["compile_s"] for k in range(STARTS)) < 40
+
+
+def test_only_the_first_compiles(cold_starts: tuple[Path, list[tuple[int, str]], Path, float], tmp_path: Path) -> None:
+    cache, _, _, _ = cold_starts
+    warm = lslam("run", SAMPLE, "--count", 5, "--out", tmp_path / "out", env=environment(NUMBA_CACHE_DIR=str(cache)))
+    assert warm.returncode == 0
+    assert "compiling" not in warm.stderr
+    assert manifest(tmp_path / "out")["timings"]["compile_s"] < 3
+
+
+def test_a_damaged_cache_costs_time_not_the_run(
+    cold_starts: tuple[Path, list[tuple[int, str]], Path, float], tmp_path: Path
+) -> None:
+    cache, _, base, _ = cold_starts
+    # The smallest kernels, so that compiling them again is quick.
+    indices = sorted(cache.rglob("*voxel*.nbi"), key=lambda file: file.stat().st_size)
+    codes = sorted(cache.rglob("*voxel*.nbc"), key=lambda file: file.stat().st_size)
+    indices[0].write_bytes(b"no index")
+    codes[1].write_bytes(codes[1].read_bytes()[:100])
+    for number, said in ((1, True), (2, False)):
+        out = tmp_path / str(number)
+        done = lslam("run", SAMPLE, "--count", 5, "--out", out, env=environment(NUMBA_CACHE_DIR=str(cache)))
+        assert done.returncode == 0, done.stderr
+        assert ("kernel cache is damaged" in done.stderr) == said, "and it is repaired by that"
+        assert (out / "trajectory.tum").read_bytes() == (base / "run0" / "trajectory.tum").read_bytes()
+
+
+def test_a_home_that_cannot_be_written(
+    cold_starts: tuple[Path, list[tuple[int, str]], Path, float], tmp_path: Path
+) -> None:
+    cache, _, _, _ = cold_starts
+    (tmp_path / "file").write_text("")
+    # The temporary directory stands in; it has the kernels already, so finding them shows that it does.
+    stand_in = tmp_path / f"lslam-cache-{os.getuid()}"
+    shutil.copytree(cache, stand_in / "numba")
+    for home in ("/proc/none", str(tmp_path / "file")):
+        more = {"HOME": home, "XDG_CACHE_HOME": f"{home}/cache", "XDG_CONFIG_HOME": f"{home}/config"}
+        env = environment(TMPDIR=str(tmp_path), **more)
+        env.pop("NUMBA_CACHE_DIR", None)
+        done = lslam("run", SAMPLE, "--count", 4, "--out", tmp_path / home.replace("/", "_"), env=env)
+        assert done.returncode == 0, done.stderr
+        assert "Traceback" not in done.stderr
+        assert "compiling" not in done.stderr
+
+
+def test_nothing_is_written_beside_the_output_and_the_cache(
+    cold_starts: tuple[Path, list[tuple[int, str]], Path, float], tmp_path: Path
+) -> None:
+    cache, _, _, _ = cold_starts
+    home, work = tmp_path / "home", tmp_path / "work"
+    home.mkdir()
+    work.mkdir()
+    env = environment(HOME=str(home), XDG_CACHE_HOME=str(home / ".cache"), NUMBA_CACHE_DIR=str(cache))
+    assert lslam("run", SAMPLE, "--count", 4, "--out", tmp_path / "out", env=env, cwd=work).returncode == 0
+    assert list(work.iterdir()) == []
+    assert [p.name for p in home.iterdir()] in ([], [".cache"])
