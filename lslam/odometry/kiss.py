@@ -60,13 +60,13 @@ class Kiss:
     def register(self, scan: Scan, prepared: tuple[Any, Any], prior: MotionPrior) -> ScanResult:
         """One kiss-icp frame."""
         points, times = prepared
+        if len(points) == 0:
+            return ScanResult(scan.index, scan.stamp_ns, prior.start, "bridged", "no usable points", converged=False)
         if self._kiss is None:
             # The choice is made once: a sequence has per-point times or has not.
             self._with_deskew = len(times) > 0
             self._config.data.deskew = self._with_deskew
             self._kiss = self._make(self._config)
-        if len(points) == 0:
-            return ScanResult(scan.index, scan.stamp_ns, prior.start, "bridged", "no usable points", converged=False)
         began = time.perf_counter()
         _, source = self._kiss.register_frame(points, times if len(times) else np.zeros(len(points)))
         pose = np.asarray(self._kiss.last_pose, np.float64).copy()
