@@ -1,0 +1,135 @@
+"""Method `kiss-icp`: the package itself on compensated scans, and poses at the scan's start on distorted ones."""
+
+from __future__ import annotations
+
+import sys
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+from drives import ate
+from numpy.typing import NDArray
+
+from lslam.config.config import Config
+from lslam.errors import InputError
+from lslam.odometry.kiss import Kiss, create
+from lslam.simulation.scenarios import simulate
+from lslam.types.motion_prior import MotionPrior
+from lslam.types.scan import Scan
+
+pytest.importorskip("kiss_icp")
+Floats = NDArray[np.float64]
+PRIOR = MotionPrior(np.zeros(1), np.eye(4)[None])
+
+
+@cache
+def block(motion_compensated: bool, count: int = 40) -> tuple[tuple[Scan, ...], Floats]:
+    drive = simulate("block", seed=0, count=count, motion_compensated=motion_compensated)
+    assert drive.ground_truth is not None
+    return tuple(drive), drive.ground_truth.poses
+
+
+def adapter_poses(scans: tuple[Scan, ...], method: Kiss | None = None) -> Floats:
+    method = method or create(Config())
+    results = [method.register(scan, method.prepare(scan), PRIOR) for scan in scans]
+    assert all(r.status == "ok" and r.source_points > 0 for r in results)
+    return np.stack([r.T_world_lidar for r in results])
+
+
+def raw_poses(scans: tuple[Scan, ...], max_range: float = 100.0) -> Floats:
+    """What the package says when it is called as its own pipeline does."""
+    from kiss_icp.config import KISSConfig
+    from kiss_icp.kiss_icp import KissICP
+
+    config: Any = KISSConfig()
+    config.data.max_range = max_range
+    config.data.deskew = scans[0].times is not None
+    config.mapping.voxel_size = max_range / 100.0
+    kiss = KissICP(config)
+    poses = []
+    for scan in scans:
+        times = np.zeros(len(scan)) if scan.times is None else scan.times.astype(np.float64)
+        span = float(np.ptp(times)) or 1.0
+        kiss.register_frame(scan.points.astype(np.float64), (times - times.min()) / span)
+        poses.append(np.array(kiss.last_pose))
+    return np.stack(poses)
+
+
+def test_on_compensated_scans_it_is_the_package_itself() -> None:
+    scans, truth = block(True)
+    poses = adapter_poses(scans)
+    np.testing.assert_allclose(poses, raw_poses(scans), atol=1e-12)
+    assert ate(poses, truth) < 0.3
+
+
+def test_a_range_the_user_sets_reaches_the_package_and_no_other_does() -> None:
+    scans, _ = block(True)
+    user = Config.model_validate({"preprocess": {"range_max": 40.0}})
+    np.testing.assert_allclose(adapter_poses(scans[:10], create(user)), raw_poses(scans[:10], 40.0), atol=1e-12)
+    untouched = Config.model_validate({"preprocess": {"map_leaf": 0.5}, "registration": {"voxel_size": 2.0}})
+    np.testing.assert_allclose(adapter_poses(scans[:10], create(untouched)), raw_poses(scans[:10]), atol=1e-12)
+
+
+def test_with_point_times_poses_belong_to_the_start_of_the_scan() -> None:
+    scans, truth = block(False)
+    ours, raw = adapter_poses(scans), raw_poses(scans)
+
+    def off(poses: Floats) -> Floats:
+        return np.asarray(np.linalg.norm((poses - truth)[:, :3, 3], axis=1))
+
+    assert ate(ours, truth) < 0.7 * ate(raw, truth)
+    assert np.median(off(ours)) < 0.5 * np.median(off(raw))
+    # The first step is whole: neither missing nor doubled.
+    step = np.linalg.norm(truth[1, :3, 3])
+    assert np.linalg.norm(ours[1, :3, 3]) == pytest.approx(step, rel=0.1)
+    np.testing.assert_array_equal(ours[0], np.eye(4))
+    steps = np.linalg.norm(np.diff(ours[:, :3, 3], axis=0), axis=1)
+    true_steps = np.linalg.norm(np.diff(truth[:, :3, 3], axis=0), axis=1)
+    np.testing.assert_allclose(steps[1:6], true_steps[1:6], rtol=0.35)
+
+
+def test_points_that_are_not_finite_are_dropped_with_their_times() -> None:
+    scans, _ = block(False)
+    scan = scans[0]
+    points = scan.points.copy()
+    points[::7] = np.nan
+    method = create(Config())
+    kept, times = method.prepare(Scan(points, 0, 0, times=scan.times))
+    assert len(kept) == len(times) == np.isfinite(points).all(1).sum()
+    assert (times.min(), times.max()) == (0.0, 1.0)
+
+
+def test_an_empty_scan_is_bridged_and_the_next_one_registered() -> None:
+    scans, _ = block(True)
+    method = create(Config())
+    adapter_poses(scans[:5], method)
+    empty = Scan(np.zeros((0, 3), np.float32), 500, 5)
+    prior = MotionPrior(np.zeros(1), np.diag([1.0, 1.0, 1.0, 1.0])[None])
+    result = method.register(empty, method.prepare(empty), prior)
+    assert result.status == "bridged"
+    assert result.reason == "no usable points"
+    np.testing.assert_array_equal(result.T_world_lidar, prior.start)
+    assert method.register(scans[5], method.prepare(scans[5]), PRIOR).status == "ok"
+
+
+def test_an_empty_first_scan_does_not_stop_it() -> None:
+    scans, _ = block(True)
+    method = create(Config())
+    empty = Scan(np.full((3, 3), np.nan, np.float32), 0, 0)
+    assert method.register(empty, method.prepare(empty), PRIOR).status == "bridged"
+    assert method.register(scans[1], method.prepare(scans[1]), PRIOR).status == "ok"
+
+
+def test_an_empty_first_scan_does_not_switch_deskewing_off() -> None:
+    scans, _ = block(False)
+    method = create(Config())
+    empty = Scan(np.zeros((0, 3), np.float32), 0, 0, times=np.zeros(0, np.float32))
+    method.register(empty, method.prepare(empty), PRIOR)
+    np.testing.assert_allclose(adapter_poses(scans[:8], method), adapter_poses(scans[:8]), atol=1e-12)
+
+
+def test_a_missing_package_is_said_with_the_way_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "kiss_icp.kiss_icp", None)
+    with pytest.raises(InputError, match="pip install kiss-icp"):
+        create(Config())

@@ -1,0 +1,76 @@
+"""Methods by name, our own and those of other packages."""
+
+from __future__ import annotations
+
+from importlib.metadata import EntryPoint
+from typing import Any
+
+import pytest
+
+import lslam.odometry
+from lslam.config.config import Config
+from lslam.errors import UsageError
+from lslam.odometry import METHODS, create_odometry, known_methods
+
+
+def config(method: str) -> Config:
+    return Config.model_validate({"odometry": {"method": method}})
+
+
+class Foreign:
+    """What another package's factory returns."""
+
+    def __init__(self, made_from: Config) -> None:
+        self.made_from = made_from
+
+
+@pytest.fixture
+def foreign(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Two methods of another package, one of them under a name of ours; the groups that were asked for."""
+    asked: list[str] = []
+
+    def entry_points(group: str) -> list[EntryPoint]:
+        asked.append(group)
+        return [EntryPoint(name, f"{__name__}:Foreign", group) for name in ("their-icp", "icp")]
+
+    monkeypatch.setattr(lslam.odometry, "entry_points", entry_points)
+    return asked
+
+
+@pytest.mark.parametrize("name", sorted(METHODS))
+def test_every_method_can_be_made_and_says_what_it_is(name: str) -> None:
+    if name == "kiss-icp":
+        pytest.importorskip("kiss_icp")
+    method = create_odometry(config(name))
+    assert all(callable(getattr(method, verb)) for verb in ("prepare", "register", "warm_up"))
+    assert len(known_methods()[name]) > 10
+
+
+@pytest.mark.parametrize(
+    ("wrong", "hint"), [("ipc", "did you mean 'icp'?"), ("kis_icp", "did you mean 'kiss-icp'?"), ("zzz", "known: icp")]
+)
+def test_an_unknown_method_is_refused_with_the_nearest(wrong: str, hint: str) -> None:
+    with pytest.raises(UsageError) as caught:
+        create_odometry(config(wrong))
+    assert repr(wrong) in str(caught.value)
+    assert hint in str(caught.value)
+    assert caught.value.exit_code == 2
+
+
+def test_other_packages_add_methods_by_entry_point(foreign: list[str]) -> None:
+    wanted = config("their-icp")
+    made: Any = create_odometry(wanted)
+    assert type(made).__name__ == "Foreign"
+    assert made.made_from is wanted
+    assert known_methods()["their-icp"] == f"from {__name__}:Foreign"
+    assert set(foreign) == {"lslam.methods"}
+
+
+def test_a_foreign_method_cannot_take_the_place_of_ours(foreign: list[str]) -> None:
+    assert type(create_odometry(config("icp"))).__name__ == "Icp"
+    assert "Gaussian voxels" in known_methods()["icp"]
+
+
+def test_foreign_names_are_suggested_too(foreign: list[str]) -> None:
+    with pytest.raises(UsageError, match="did you mean 'their-icp'"):
+        create_odometry(config("their_icp"))
