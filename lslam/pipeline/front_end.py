@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from lslam.errors import InputError
 from lslam.odometry.base import Odometry
+from lslam.readers.selection import Selection
 from lslam.registration.motion import ConstantVelocity
 from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan import Scan
@@ -119,7 +120,9 @@ def _load(sequence: Sequence, i: int, prepare: Callable[[Scan], Any] | None) -> 
     try:
         scan = sequence.scan(i)
     except InputError as error:
-        return Loaded(i, stamp_ns, error=str(error), read_s=time.perf_counter() - began)
+        # A selection knows the scan's number in the recording, which no scan is there to tell.
+        index = int(sequence.indices[i]) if isinstance(sequence, Selection) else i
+        return Loaded(index, stamp_ns, error=str(error), read_s=time.perf_counter() - began)
     read = time.perf_counter()
     if len(scan) == 0:
         return Loaded(scan.index, stamp_ns, error="the scan has no points", read_s=read - began)

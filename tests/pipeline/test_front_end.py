@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-import time
 from dataclasses import replace
 
 import numpy as np
@@ -13,6 +12,7 @@ from stub_sequences import Standstill, Stub, noise, sample, with_points
 from lslam.config import Config
 from lslam.odometry import create_odometry
 from lslam.pipeline.front_end import DOUBT, estimate, is_diverged, read_ahead, to_trajectory
+from lslam.readers import select
 from lslam.types.scan import Scan
 from lslam.types.scan_result import ScanResult, Status
 
@@ -40,12 +40,17 @@ def test_leaving_early_leaves_no_thread_behind() -> None:
     assert len(stub.reads) < 10
 
 
-def test_reading_overlaps_registration() -> None:
-    stub = Stub([Scan(np.ones((3, 3), np.float32), i, i) for i in range(10)], on_read=lambda index: time.sleep(0.02))
-    began = time.monotonic()
-    for _ in read_ahead(stub, None, 2):
-        time.sleep(0.02)
-    assert time.monotonic() - began < 0.35, "20 ms of reading and 20 ms of work, ten times, in turn take 0.4 s"
+def test_the_next_scan_is_read_while_this_one_is_worked_on() -> None:
+    for threads, ahead in ((1, False), (2, True)):
+        read = threading.Event()
+        stub = Stub(
+            [Scan(np.ones((3, 3), np.float32), i, i) for i in range(10)],
+            on_read=lambda index, read=read: read.set() if index == 1 else None,  # type: ignore[misc]
+        )
+        scans = read_ahead(stub, None, threads)
+        next(scans)
+        assert read.wait(5.0 if ahead else 0.1) == ahead
+        scans.close()  # type: ignore[attr-defined]
 
 
 def test_what_cannot_be_read_is_bridged_by_the_motion_prior() -> None:
@@ -60,6 +65,14 @@ def test_what_cannot_be_read_is_bridged_by_the_motion_prior() -> None:
     off = np.linalg.norm([r.T_world_lidar[:3, 3] for r in results] - stub.ground_truth.positions, axis=1)
     assert off[[6, 9]].max() < 0.15, "constant velocity for one scan"
     assert off[-1] < 0.05, "and back on the map afterwards"
+
+
+def test_a_bad_scan_of_a_part_keeps_its_number_in_the_recording() -> None:
+    stub = sample(12)
+    stub.scans[7] = "gone"
+    results = estimate(select(stub, start=1, skip_frames=2), Standstill())
+    assert [r.index for r in results] == [1, 3, 5, 7, 9, 11]
+    assert results[3].status == "skipped"
 
 
 def test_noise_is_bridged_and_leaves_the_map_alone() -> None:
