@@ -68,6 +68,6 @@ def nearest(name: str, known: Iterable[str]) -> str:
     >>> nearest("zzz", ["icp", "kiss-icp"])
     'known: icp, kiss-icp'
     """
-    names = list(known)
-    close = difflib.get_close_matches(name, names, n=1, cutoff=0.5)
-    return f"did you mean {close[0]!r}?" if close else "known: " + ", ".join(names)
+    names = {known_name.lower(): known_name for known_name in known}
+    close = difflib.get_close_matches(name.lower(), names, n=1, cutoff=0.5)
+    return f"did you mean {names[close[0]]!r}?" if close else "known: " + ", ".join(names.values())

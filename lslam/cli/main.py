@@ -132,11 +132,12 @@ def _fail(sentence: str, code: int) -> NoReturn:
 
 
 def _fail_usage(error: click.ClickException) -> NoReturn:
-    ctx = getattr(error, "ctx", None)
-    if ctx is None or type(error).__name__ == "NoArgsIsHelpError":
+    if type(error).__name__ == "NoArgsIsHelpError":
         error.show(file=sys.stderr)
         sys.exit(2)
-    _fail(f"{error.format_message().rstrip('.')}; see {ctx.command_path} --help", 2)
+    ctx = getattr(error, "ctx", None)
+    command = "lslam" if ctx is None else ctx.command_path
+    _fail(f"{error.format_message().rstrip('.')}; see {command} --help", 2)
 
 
 def _fail_unexpected(error: Exception) -> NoReturn:

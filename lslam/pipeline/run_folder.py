@@ -46,8 +46,8 @@ class RunFolder:
             raise OutputError(f"output folder {path} cannot be written: {error.strerror or error}") from None
 
     def write_text(self, name: str, text: str) -> Path:
-        """Write one text file atomically."""
-        return self.write_bytes(name, text.encode())
+        r"""Write one text file atomically; bytes of file names that are no UTF-8 become \udcXX, as JSON writes them."""
+        return self.write_bytes(name, text.encode(errors="backslashreplace"))
 
     def write_bytes(self, name: str, data: bytes) -> Path:
         """Write one file atomically."""
@@ -113,7 +113,7 @@ class _LogFile(logging.FileHandler):
     """log.txt: what the user sees and, also for Python callers who set up no logging, everything from INFO on."""
 
     def __init__(self, path: Path) -> None:
-        super().__init__(path, encoding="utf-8")
+        super().__init__(path, encoding="utf-8", errors="backslashreplace")
         self.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
         self._level_before = log.level
 

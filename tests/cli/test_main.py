@@ -121,6 +121,8 @@ def test_config_check_says_what_is_wrong(tmp_path: Path, text: str, words: str) 
         (["run", "x", "--coutn", "3"], "'--count'"),
         (["run", "x", "--count", "many"], "'many' is not a valid integer"),
         (["--verzion"], "--version"),
+        (["run", "--out"], "requires an argument; see lslam"),
+        (["run", "x", "--method", "KISS-ICP"], "did you mean 'kiss-icp'"),
         (["completion", "tcsh"], "'bash', 'zsh', 'fish'"),
     ],
 )

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
-from calling import SAMPLE, Done, assert_one_sentence, lslam, manifest, sample_copy
+from calling import SAMPLE, Done, assert_one_sentence, lslam, manifest, sample_copy, strict_json
 
 from lslam.formats.point_files import write_points
 from lslam.formats.trajectory_files import write_tum
@@ -51,8 +52,8 @@ def test_wrong_words(sequence: Path, tmp_path: Path) -> None:
     refuse(sequence, tmp_path, 3, "gt.tum does not exist", "--gt", tmp_path / "gt.tum")
 
 
-def truncate(folder: Path) -> None:
-    scan = folder / "velodyne" / "000005.bin"
+def truncate(folder: Path, number: int = 5) -> None:
+    scan = folder / "velodyne" / f"{number:06d}.bin"
     scan.write_bytes(scan.read_bytes()[:-5])
 
 
@@ -207,3 +208,19 @@ def test_output_that_cannot_be_written(sequence: Path, tmp_path: Path, place: st
     assert (done.returncode, done.stdout) == (3, "")
     assert_one_sentence(done.stderr)
     assert "cannot be written" in done.stderr
+
+
+def test_a_name_that_is_no_utf8(tmp_path: Path) -> None:
+    folder = tmp_path / os.fsdecode(b"caf\xe9 \xff")
+    try:
+        folder.mkdir()
+    except OSError:
+        pytest.skip("this file system wants UTF-8 names")
+    sequence = sample_copy(folder, 5)
+    truncate(sequence, 3)
+    done, out = run(sequence, folder, "--json")
+    assert done.returncode == 0, done.stderr
+    assert "000003.bin" in done.stderr
+    assert "000003.bin" in (out / "log.txt").read_text()
+    assert manifest(out)["sequence"]["path"] == str(sequence)
+    assert strict_json(done.stdout)["manifest"]["counts"]["scans"] == 5
