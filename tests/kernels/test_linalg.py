@@ -113,6 +113,16 @@ def test_a_hundred_thousand_updates_stay_on_the_manifold() -> None:
     assert np.linalg.det(R) == pytest.approx(1.0, abs=1e-14)
 
 
+@pytest.mark.parametrize("row", [0, 1, 2])
+def test_one_update_puts_a_matrix_back_on_the_manifold(row: int) -> None:
+    R = so3.exp(np.array([0.3, -0.2, 0.9]))
+    R[row] = 1.01 * R[row] + 0.01 * R[(row + 1) % 3]
+    assert np.abs(R @ R.T - np.eye(3)).max() > 5e-3
+    linalg.rotate_left(R, 0.01, 0.02, -0.03)
+    np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-15)
+    assert np.linalg.det(R) == pytest.approx(1.0, abs=1e-14)
+
+
 def test_a_full_turn_in_small_steps_comes_back() -> None:
     axis = np.array([1.0, -2.0, 0.5]) / np.linalg.norm([1.0, -2.0, 0.5])
     R = np.eye(3)
