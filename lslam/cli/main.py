@@ -118,6 +118,10 @@ def main() -> NoReturn:
     except (click.Abort, KeyboardInterrupt):
         _fail("interrupted", 130)
     except OSError as error:
+        if error.filename is None:
+            from lslam.cli.console import leave_stdout
+
+            leave_stdout()  # what is still buffered would fail once more at exit, with a code of Python's own
         _fail(f"{error.filename or 'standard output'} cannot be used: {error.strerror or error}", 3)
     except MemoryError:
         _fail("out of memory: use fewer points (preprocess.range_max) or larger voxels (map.voxel)", 1)

@@ -22,7 +22,7 @@ def pack(cells: NDArray[np.float64]) -> NDArray[np.int64]:
 
 
 def test_a_recording_merges_as_in_numpy_and_quickly(recordings: Callable[[str], Path]) -> None:
-    drive = next(recordings("kitti_raw_0048").rglob("velodyne_points")).parent
+    drive = recordings("kitti_raw_0048") / "2011_09_26" / "2011_09_26_drive_0048_sync"
     poses = read_trajectory(drive / "reference_lidar.tum").poses
     files = sorted((drive / "velodyne_points" / "data").glob("*.bin"))
     scans = [np.fromfile(file, np.float32).reshape(-1, 4) for file in files]
