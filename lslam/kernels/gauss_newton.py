@@ -44,11 +44,14 @@ def solve_observed(H: Floats, g: Floats, facts: Floats, weak_share: float, d: Fl
 
 
 @kernel
-def align(source: Floats, scatter: Floats, R: Floats, t: Floats, size: float, scale_start: float, scale_end: float,
-          decay: float, max_iterations: int, step_m: float, step_rad: float, sigma2: float, blob_weight: float,
-          weak_share: float, planes: Floats, keys: NDArray[np.int64],
-          table: NDArray[np.int32]) -> tuple[Floats, Floats, Floats, int, bool, int, Floats]:  # fmt: skip
+def align(source: Floats, scatter: Floats, R: Floats, t: Floats, scale_start: float, scale_end: float, decay: float,
+          max_iterations: int, step_m: float, step_rad: float, sigma2: float, blob_weight: float, weak_share: float,
+          size: float, planes: Floats, keys: NDArray[np.int64], table: NDArray[np.int32],
+          has_coarse: bool, coarse_size: float, coarse_planes: Floats, coarse_keys: NDArray[np.int64],
+          coarse_table: NDArray[np.int32]) -> tuple[Floats, Floats, Floats, int, bool, int, Floats]:  # fmt: skip
     """Register source points on a map: R (3, 3) and t (3,) are updated in place.
+
+    With a coarse map, points that find no plane in the fine one are matched there; blobs serve the last map only.
 
     The robust width falls from `scale_start` by `decay` to `scale_end`; iterations stop when, at the end width, the update
     is under `step_m` and `step_rad`. Returns H (6, 6) and facts (6,) of the last linearisation, the last update (6,),
@@ -57,6 +60,9 @@ def align(source: Floats, scatter: Floats, R: Floats, t: Floats, size: float, sc
     n = len(source)
     cells = np.full(n, -1, np.int64)
     slots = np.full((n, 8), -1, np.int32)
+    coarse_cells = np.full(n if has_coarse else 0, -1, np.int64)
+    coarse_slots = np.full((len(coarse_cells), 8), -1, np.int32)
+    is_done = np.zeros(n, np.bool_)
     H, g, d, facts = np.empty((6, 6)), np.empty(6), np.zeros(6), np.zeros(6)
     weak = np.zeros((6, 6))
     scale = scale_start
@@ -64,9 +70,18 @@ def align(source: Floats, scatter: Floats, R: Floats, t: Floats, size: float, sc
     weak_count = 0
     iterations = 0
     for _ in range(max_iterations):
-        linearise(
-            source, scatter, R, t, size, scale, sigma2, blob_weight, planes, keys, table, cells, slots, H, g, facts
-        )
+        H[:] = 0.0
+        g[:] = 0.0
+        facts[:] = 0.0
+        is_done[:] = False
+        linearise(source, scatter, R, t, size, scale, sigma2, 0.0 if has_coarse else blob_weight, planes, keys, table,
+                  cells, slots, is_done, H, g, facts)  # fmt: skip
+        if has_coarse:
+            linearise(source, scatter, R, t, coarse_size, scale, sigma2, blob_weight, coarse_planes, coarse_keys,
+                      coarse_table, coarse_cells, coarse_slots, is_done, H, g, facts)  # fmt: skip
+        for i in range(6):
+            for j in range(i):
+                H[i, j] = H[j, i]
         iterations += 1
         if facts[3] < 6.0:
             break

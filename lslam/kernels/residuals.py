@@ -44,9 +44,11 @@ def octant_slots(x: float, y: float, z: float, i: int, inverse: float, cells: ND
 @kernel
 def linearise(source: Floats, scatter: Floats, R: Floats, t: Floats, size: float, scale: float, sigma2: float,
               blob_weight: float, planes: Floats, keys: NDArray[np.int64], table: NDArray[np.int32],
-              cells: NDArray[np.int64], slots: NDArray[np.int32], H: Floats, g: Floats,
+              cells: NDArray[np.int64], slots: NDArray[np.int32], is_done: NDArray[np.bool_], H: Floats, g: Floats,
               facts: Floats) -> None:  # fmt: skip
-    """Fill H (6, 6), g (6,) and facts from all source points (S, 3), LiDAR frame, with scatter (S, 6) around each.
+    """Add to H (6, 6), g (6,) and facts all source points (S, 3), LiDAR frame, with scatter (S, 6) around each.
+
+    Points that are done are left out, those that find a plane here become so: a coarser map can serve the rest.
 
     Each point takes the nearest plane voxel of the eight around it: residual n . (R s + t - mean), variance = map
     eigenvalue + source scatter along the normal + sigma2 + tilt at that distance from the mean, Geman-McClure weight of
@@ -55,11 +57,10 @@ def linearise(source: Floats, scatter: Floats, R: Floats, t: Floats, size: float
     squared lever arm, sum of robust weights.
     """
     inverse = 1.0 / size
-    H[:] = 0.0
-    g[:] = 0.0
-    facts[:] = 0.0
     c2 = scale * scale
     for i in range(len(source)):
+        if is_done[i]:
+            continue
         a, b, c = source[i, 0], source[i, 1], source[i, 2]
         rx = R[0, 0] * a + R[0, 1] * b + R[0, 2] * c
         ry = R[1, 0] * a + R[1, 1] * b + R[1, 2] * c
@@ -82,6 +83,7 @@ def linearise(source: Floats, scatter: Floats, R: Floats, t: Floats, size: float
             elif d < blob_d:
                 blob_d, blob = d, s
         if best >= 0:
+            is_done[i] = True
             p = planes[best]
             nx, ny, nz = p[3], p[4], p[5]
             r = nx * (x - p[0]) + ny * (y - p[1]) + nz * (z - p[2])
@@ -121,9 +123,6 @@ def linearise(source: Floats, scatter: Floats, R: Floats, t: Floats, size: float
             facts[4] += 3.0 * w * (rx * rx + ry * ry + rz * rz)
             if blob_d < c2:
                 facts[2] += 1.0
-    for i in range(6):
-        for j in range(i):
-            H[i, j] = H[j, i]
 
 
 @inline

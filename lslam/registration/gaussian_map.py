@@ -53,14 +53,17 @@ class GaussianMap:
         )  # fmt: skip
 
     def coarsen(self, factor: int) -> GaussianMap:
-        """The same points in voxels `factor` times larger, from the exact moments."""
+        """The same points in voxels `factor` times larger, from the exact moments.
+
+        A ring leaves `factor` times more points in such a voxel, so that many more make a plane: it takes as many rings.
+        """
         capacity = 1 << max(8, int(np.ceil(np.log2(len(self) + 1))))
         coarse = GaussianMap(
-            self.size * factor, min_points=self.min_points, planarity=self.planarity, count_cap=self.count_cap,
+            self.size * factor, min_points=self.min_points * factor, planarity=self.planarity, count_cap=self.count_cap,
             reach=self.reach, capacity=capacity,
         )  # fmt: skip
         gaussians.coarsen(
-            factor, coarse.size, float(self.min_points), self.planarity, FLOOR, self.moments, self.keys,
+            factor, coarse.size, float(coarse.min_points), self.planarity, FLOOR, self.moments, self.keys,
             int(self.state[gaussians.USED]), coarse.moments, coarse.planes, coarse.keys, coarse.refreshed,
             coarse.table, coarse.state, coarse.free,
         )  # fmt: skip

@@ -106,16 +106,17 @@ class Registration:
     def _coarse_to_fine(self, points: PreparedPoints, T_prior: NDArray[np.float64]) -> RegistrationResult:
         """Coarse planes, annealed slowly, catch what fine voxels lose: metres per scan instead of decimetres.
 
-        Few scans of a sparse sensor put single rings into fine voxels, whose planes then tilt: the coarse planes keep the
-        last word until most points find a fine one.
+        Few scans of a sparse sensor put single rings into fine voxels, which are no planes yet: the points there keep
+        their coarse plane, the others take a fine one.
         """
         c = self.config
+        coarse_map = self.map.coarsen(c.coarse_factor)
         slow = Annealing(c.coarse_kernel, c.kernel_min, c.coarse_decay, c.start_iterations)
-        coarse = self._solve(points, T_prior, slow, self.map.coarsen(c.coarse_factor))
+        coarse = self._solve(points, T_prior, slow, coarse_map)
         start = coarse.T_world_lidar if coarse.ok else T_prior
-        fine = self._solve(points, start, Annealing(c.kernel_max, c.kernel_min, c.kernel_decay, c.start_iterations))
-        best = fine if fine.ok and (fine.overlap >= c.start_overlap or fine.matched > coarse.matched) else coarse
-        return replace(best, iterations=coarse.iterations + fine.iterations)
+        quick = Annealing(c.kernel_max, c.kernel_min, c.kernel_decay, c.start_iterations)
+        fine = self._solve(points, start, quick, self.map, coarse_map)
+        return replace(fine, iterations=coarse.iterations + fine.iterations)
 
     def _solve(
         self,
@@ -123,11 +124,12 @@ class Registration:
         T_prior: NDArray[np.float64],
         annealing: Annealing,
         target: GaussianMap | None = None,
+        coarse: GaussianMap | None = None,
     ) -> RegistrationResult:
         c = self.config
         return solve(
-            target or self.map, points, T_prior, annealing,
-            sigma=c.sigma, blob_weight=c.blob_weight, weak_share=c.weak_share,
+            self.map if target is None else target, points, T_prior, annealing,
+            sigma=c.sigma, blob_weight=c.blob_weight, weak_share=c.weak_share, coarse=coarse,
         )  # fmt: skip
 
     def _judge(self, result: RegistrationResult, T_prior: NDArray[np.float64]) -> RegistrationResult:

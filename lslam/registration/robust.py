@@ -51,6 +51,7 @@ class UsualAgreement:
     """
 
     FORGETTING = 0.8
+    RELAXING = 0.9
 
     def __init__(self, drop: float) -> None:
         self.drop = drop
@@ -66,4 +67,4 @@ class UsualAgreement:
 
     def relax(self) -> None:
         """Expect less after a bad scan, so that a place that has changed for good is accepted after a few."""
-        self.usual *= self.FORGETTING
+        self.usual *= self.RELAXING

@@ -60,13 +60,18 @@ class RegistrationResult:
 
 def solve(
     target: GaussianMap, points: PreparedPoints, T_prior: NDArray[np.float64], annealing: Annealing, *, sigma: float,
-    blob_weight: float, weak_share: float,
+    blob_weight: float, weak_share: float, coarse: GaussianMap | None = None,
 ) -> RegistrationResult:  # fmt: skip
-    """Align the source points with the map by annealed Gauss-Newton, starting at `T_prior` (4, 4)."""
+    """Align the source points with the map by annealed Gauss-Newton, starting at `T_prior` (4, 4).
+
+    Points without a plane in `target` are matched in `coarse`, when given.
+    """
+    second = target if coarse is None else coarse
     R, t = np.ascontiguousarray(T_prior[:3, :3]).copy(), T_prior[:3, 3].copy()
     H, facts, step, iterations, converged, weak_count, weak = align(
-        points.source, points.scatter, R, t, target.size, annealing.start, annealing.end, annealing.decay,
-        annealing.steps, STEP_M, STEP_RAD, sigma**2, blob_weight, weak_share, target.planes, target.keys, target.table,
+        points.source, points.scatter, R, t, annealing.start, annealing.end, annealing.decay, annealing.steps,
+        STEP_M, STEP_RAD, sigma**2, blob_weight, weak_share, target.size, target.planes, target.keys, target.table,
+        coarse is not None, second.size, second.planes, second.keys, second.table,
     )  # fmt: skip
     pose = se3.make(R, t)
     finite = bool(np.isfinite(pose).all() and np.isfinite(step).all())

@@ -83,8 +83,8 @@ def align(
     m: GaussianMap, source: Floats, R: Floats, t: Floats, steps: int = STEPS, weak_share: float = 1e-3
 ) -> tuple[Floats, Floats, Floats, int, bool, int, Floats]:
     return gauss_newton.align(
-        source, np.zeros((len(source), 6)), R, t, m.size, 1.0, 0.1, 0.5, steps, 1e-3, 1e-4, 9e-4, 0.5, weak_share,
-        m.planes, m.keys, m.table,
+        source, np.zeros((len(source), 6)), R, t, 1.0, 0.1, 0.5, steps, 1e-3, 1e-4, 9e-4, 0.5, weak_share,
+        m.size, m.planes, m.keys, m.table, False, m.size, m.planes, m.keys, m.table,
     )  # fmt: skip
 
 

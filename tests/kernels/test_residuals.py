@@ -70,12 +70,14 @@ def linearise(
 ) -> tuple[Floats, Floats, Floats]:  # fmt: skip
     n = len(s.points.source)
     cells, slots = cache or (np.full(n, -1, np.int64), np.full((n, 8), -1, np.int32))
-    H, g, facts = np.full((6, 6), np.nan), np.full(6, np.nan), np.full(6, np.nan)
+    H, g, facts, is_done = np.zeros((6, 6)), np.zeros(6), np.zeros(6), np.zeros(n, np.bool_)
     m = s.target
     residuals.linearise(
-        s.points.source, s.points.scatter, R, t, m.size, c, SIGMA2, blob, m.planes, m.keys, m.table, cells, slots, H, g, facts
+        s.points.source, s.points.scatter, R, t, m.size, c, SIGMA2, blob, m.planes, m.keys, m.table, cells, slots, is_done,
+        H, g, facts,
     )  # fmt: skip
-    return H, g, facts
+    # The kernel fills the upper triangle.
+    return np.triu(H) + np.triu(H, 1).T, g, facts
 
 
 def moved(R: Floats, t: Floats, d: Floats) -> tuple[Floats, Floats]:
@@ -176,3 +178,23 @@ def test_an_empty_map_and_an_empty_scan_match_nothing(scene: Scene) -> None:
     H, _, facts = linearise(Scene(scene.target, scene.reference, none, scene.R, scene.t), scene.R, scene.t, 1.0)
     assert facts.tolist() == [0.0] * 6
     np.testing.assert_array_equal(H, 0.0)
+
+
+def test_a_coarser_map_serves_the_points_that_found_no_plane(scene: Scene) -> None:
+    """Two calls with one list of done points add up to each point matched once, at the finest map that has a plane."""
+    n = len(scene.points.source)
+    is_done = np.zeros(n, np.bool_)
+    H, g, facts = np.zeros((6, 6)), np.zeros(6), np.zeros(6)
+    fine, coarse = scene.target, scene.target.coarsen(3)
+    counts = []
+    for m in (fine, coarse):
+        cells, slots = np.full(n, -1, np.int64), np.full((n, 8), -1, np.int32)
+        residuals.linearise(
+            scene.points.source, scene.points.scatter, scene.R, scene.t, m.size, 0.5, SIGMA2, 0.0, m.planes, m.keys,
+            m.table, cells, slots, is_done, H, g, facts,
+        )  # fmt: skip
+        counts.append(facts[3])
+        assert is_done.sum() == facts[3]
+    _, _, alone = linearise(scene, scene.R, scene.t, 0.5, 0.0)
+    assert counts[0] == alone[3]
+    assert counts[1] > counts[0]
