@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 from lslam.config import Config
-from lslam.errors import GateError, InterruptedRunError, LslamError, OutputError, RunFailedError
+from lslam.errors import GateError, InputError, InterruptedRunError, LslamError, OutputError, RunFailedError
 from lslam.evaluation.evaluate import Evaluation, evaluate
 from lslam.kernels import jit
 from lslam.maps import merge
@@ -124,7 +125,10 @@ def _announce(sequence: Sequence, config: Config) -> None:
     for problem in sequence.problems:
         log.warning("%s", problem)
     deskew = describe_deskew(sequence, config.odometry.method)
-    log.log(logging.WARNING if deskew.startswith("no deskew") else logging.INFO, "deskew: %s", deskew)
+    if deskew.startswith("no deskew"):
+        log.warning("%s", deskew)
+    else:
+        log.info("deskew: %s", deskew)
 
 
 def _estimate(
@@ -136,6 +140,8 @@ def _estimate(
         odometry.warm_up()
         if config.map.write:
             merge.warm_up()
+        with suppress(InputError):
+            sequence.scan(0)  # the reader's kernels; what is wrong with the scan is said in its turn
 
     def seen(result: ScanResult) -> None:
         if result.status != "ok":
