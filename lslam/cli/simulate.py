@@ -19,6 +19,15 @@ from lslam.cli import console, options
 @click.option("--count", type=int, metavar="N", help="Number of scans [default: one lap, or the whole street].")
 @click.option("--speed", type=float, metavar="M/S", help="Cruising speed; bends may need less.")
 @click.option("--distorted", is_flag=True, help="Fire the rays while the sensor moves, with times per point.")
+@click.option("--imu/--no-imu", default=True, show_default=True, help="Record an ICM-20948 at 100 Hz.")
+@click.option("--imu-model", metavar="NAME", default="icm20948", show_default=True, help="Another IMU; see --list.")
+@click.option(
+    "--gnss-rate", type=float, default=1.0, show_default=True, metavar="HZ", help="Satellite fixes, 1 to 10; 0: none."
+)
+@click.option(
+    "--gnss-outage", type=(float, float), multiple=True, metavar="FROM TO", help="Seconds without fixes; repeatable."
+)
+@click.option("--static-start", type=float, default=0.0, metavar="S", help="Stand still for S seconds first.")
 @click.option("--overwrite", is_flag=True, help="Replace sequences/00 and poses/00.txt in an existing folder.")
 @click.option("--list", "show_list", is_flag=True, help="List scenarios and sensors.")
 @options.verbosity
@@ -30,6 +39,11 @@ def command(
     count: int | None,
     speed: float | None,
     distorted: bool,
+    imu: bool,
+    imu_model: str,
+    gnss_rate: float,
+    gnss_outage: tuple[tuple[float, float], ...],
+    static_start: float,
     overwrite: bool,
     show_list: bool,
     verbose: bool,
@@ -43,11 +57,22 @@ def command(
         missing = "SCENARIO" if scenario is None else "--out DIR"
         raise click.UsageError(f"{missing} is missing; for example: lslam simulate block --out town")
     console.setup_logging(verbose, quiet)
+    from lslam.simulation.gnss import GnssModel
     from lslam.simulation.record import check_target, record
     from lslam.simulation.scenarios import simulate
 
     check_target(out, overwrite)
-    drive = simulate(scenario, seed=seed, lidar=lidar, count=count, speed=speed, motion_compensated=not distorted)
+    drive = simulate(
+        scenario,
+        seed=seed,
+        lidar=lidar,
+        count=count,
+        speed=speed,
+        motion_compensated=not distorted,
+        imu=imu_model if imu else None,
+        gnss=GnssModel(gnss_rate, outages=gnss_outage) if gnss_rate else None,
+        static_start=static_start,
+    )
     with console.progress("simulating", len(drive)) as advance:
         done = record(drive, out, overwrite, on_scan=lambda _: advance())
     assert drive.ground_truth is not None
@@ -58,6 +83,7 @@ def command(
 
 
 def _print_list() -> None:
+    from lslam.simulation.imu import IMUS
     from lslam.simulation.lidar_models import LIDARS
     from lslam.simulation.scenarios import SCENARIOS
 
@@ -65,3 +91,5 @@ def _print_list() -> None:
         click.echo(f"scenario  {name:<8}  {scenario.summary}")
     for name, model in LIDARS.items():
         click.echo(f"lidar     {name:<8}  {model.rings} x {model.columns} rays, {model.range_max:g} m")
+    for name, imu in IMUS.items():
+        click.echo(f"imu       {name:<8}  {imu.rate_hz:g} Hz, {'without errors' if name == 'ideal' else 'MEMS'}")

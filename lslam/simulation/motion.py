@@ -21,7 +21,7 @@ STANDING_ACCELERATION = 2.0  # m/s2, the most that moving off from a standing st
 _EDGE = 1e-6  # s by which a query may overstep the ends: rounding of stamps to ns
 
 
-class Path(Protocol):
+class PosePath(Protocol):
     """Where a LiDAR is over `duration` s; what a vehicle, a drone or a walker has in common."""
 
     @property
@@ -107,7 +107,7 @@ class Motion:
 class StandingStart:
     """`path`, begun by standing at its start for `seconds` s and moving off smoothly over `ramp` s."""
 
-    path: Path
+    path: PosePath
     seconds: float
     ramp: float
 
@@ -129,7 +129,7 @@ class StandingStart:
         return np.asarray(self.ramp * grown + np.maximum(since - self.ramp, 0))
 
 
-def smooth_motion(path: Path, spacing: float = SPACING) -> Motion:
+def smooth_motion(path: PosePath, spacing: float = SPACING) -> Motion:
     """Make `path` differentiable: the motion meets it every `spacing` s and is smooth between."""
     from scipy.interpolate import make_interp_spline
 
@@ -145,7 +145,7 @@ def smooth_motion(path: Path, spacing: float = SPACING) -> Motion:
     )
 
 
-def standing_start(path: Path, seconds: float) -> StandingStart:
+def standing_start(path: PosePath, seconds: float) -> StandingStart:
     """Let `path` begin with `seconds` s of standing still; the faster it starts, the longer it takes to move off."""
     step = 1e-3
     first = path.poses(np.array([0.0, step]))[:, :3, 3]

@@ -20,6 +20,7 @@ from lslam.formats.sequence_toml import FILE_NAME, SequenceInfo, write_sequence_
 from lslam.formats.trajectory_files import write_kitti
 from lslam.geometry import se3
 from lslam.simulation.scenarios import SimulatedDrive
+from lslam.simulation.sensors import GNSS_FILE, IMU_FILE, TRUTH, write_readings, write_truth
 from lslam.types.scan import Scan
 from lslam.types.trajectory import Trajectory
 
@@ -64,6 +65,8 @@ def record(
         _check_space(out, drive)
         points = _write_scans(drive, part, on_scan)
         _write_texts(drive, part)
+        write_readings(part, drive.readings)
+        write_truth(part / TRUTH, drive.vehicle, drive.stamps_ns, drive.end, drive.readings)
         if sequence.exists():
             shutil.rmtree(sequence)
         os.replace(part, sequence)
@@ -142,7 +145,11 @@ def _write_texts(drive: SimulatedDrive, folder: Path) -> None:
         per_point=PER_POINT,
         ground_truth=f"../../poses/{NUMBER}.txt",
         ground_truth_frame="cam0",
+        imu=None if drive.imu is None else IMU_FILE,
+        gnss=None if drive.gnss is None else GNSS_FILE,
         T_cam0_lidar=T_cam0_lidar,
+        T_lidar_imu=drive.calibration.T_lidar_imu,
+        T_lidar_gnss=drive.calibration.T_lidar_gnss,
     )
     write_sequence_toml(folder / FILE_NAME, info)
 

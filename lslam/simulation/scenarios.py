@@ -14,8 +14,12 @@ from lslam.geometry import se3, so3
 from lslam.simulation import path as paths
 from lslam.simulation.city import City, Layout, build_city
 from lslam.simulation.curve import Curve, rounded_rectangle, smooth_curve, winding_line
+from lslam.simulation.gnss import GnssModel
+from lslam.simulation.imu import ImuModel, imu_named
 from lslam.simulation.lidar import RayScene, trace
 from lslam.simulation.lidar_models import LidarModel, lidar_named
+from lslam.simulation.motion import PosePath, smooth_motion, standing_start
+from lslam.simulation.sensors import Sensors, read_sensors
 from lslam.simulation.terrain import Terrain, rolling
 from lslam.types.calibration import Calibration
 from lslam.types.gnss import GnssStream
@@ -25,6 +29,7 @@ from lslam.types.trajectory import Trajectory
 
 LIDAR_HEIGHT = 1.73  # m above the ground, as on KITTI's car
 FASTEST = 40.0  # m/s
+LONGEST_STAND = 600.0  # s
 SPARE = 60.0  # m of street before the start and after the end of an open drive
 
 
@@ -89,27 +94,37 @@ class SimulatedDrive:
         self,
         scenario: Scenario,
         city: City,
-        path: paths.VehiclePath,
+        path: PosePath,
         lidar: LidarModel,
         count: int,
         seed: int,
         motion_compensated: bool,
+        sensors: Sensors | None = None,
     ) -> None:
-        self.scenario, self.city, self.vehicle, self.lidar = scenario, city, path, lidar
+        self.scenario, self.city, self.lidar = scenario, city, lidar
+        # One function of time for the rays, the truth and all other sensors.
+        self.vehicle = smooth_motion(path)
         self.seed = seed
         self.name = f"{scenario.name}-{seed}"
         self.path = Path(self.name)
         self.rate_hz = scenario.rate_hz
         self.motion_compensated: bool | None = motion_compensated
         self.stamps_ns: NDArray[np.int64] = np.round(np.arange(count) * (1e9 / self.rate_hz)).astype(np.int64)
-        poses = path.poses(self.stamps_ns / 1e9)
+        poses = self.vehicle.poses(self.stamps_ns / 1e9)
         self.T_city_world = poses[0]
         self.ground_truth: Trajectory | None = Trajectory(
             self.stamps_ns, se3.relative(poses[0], poses), "lidar", source=f"simulation of {self.name}"
         )
-        self.calibration = Calibration(T_cam0_lidar=kitti_like_cam0())
-        self.imu: ImuStream | None = None
-        self.gnss: GnssStream | None = None
+        self.end = self.stamps_ns[-1] / 1e9 + 1 / self.rate_hz
+        self.readings = read_sensors(self.vehicle, sensors or Sensors(), lidar.name, self.end, seed)
+        imu, gnss = self.readings.imu, self.readings.gnss
+        self.calibration = Calibration(
+            T_cam0_lidar=kitti_like_cam0(),
+            T_lidar_imu=None if imu is None else imu.T_lidar_imu,
+            T_lidar_gnss=None if gnss is None else gnss.T_lidar_gnss,
+        )
+        self.imu: ImuStream | None = None if imu is None else imu.stream
+        self.gnss: GnssStream | None = None if gnss is None else gnss.stream
         self.notes: list[str] = []
         self.problems: list[str] = []
         self._scene = RayScene(city.mesh)
@@ -141,6 +156,9 @@ def simulate(
     speed: float | None = None,
     start_speed: float | None = None,
     motion_compensated: bool = True,
+    imu: str | ImuModel | None = None,
+    gnss: GnssModel | None = None,
+    static_start: float = 0.0,
 ) -> SimulatedDrive:
     """Set up a drive: the city is built now, scans are traced later.
 
@@ -151,6 +169,8 @@ def simulate(
         more scans mean more laps)
     speed, start_speed : m/s, cruising and at the first scan (0: from rest); slower in bends that need it
     motion_compensated : False fires every column from its own pose and gives times per point
+    imu, gnss : an IMU (a name of `IMUS` or a model) and a receiver that ride along
+    static_start : s of standing still before the drive begins; its scans come on top of a default `count`
 
     Raises
     ------
@@ -162,14 +182,21 @@ def simulate(
     cruise = chosen.speed if speed is None else speed
     begin = min(chosen.start_speed, cruise) if start_speed is None else start_speed
     _check(seed, count, cruise, begin)
+    if not 0 <= static_start <= LONGEST_STAND:
+        raise UsageError(f"--static-start {static_start:g} is out of range: 0 to {LONGEST_STAND:g} s")
+    sensors = Sensors(imu_named(imu) if isinstance(imu, str) else imu, gnss)
     # One generator per part: another LiDAR or speed leaves the city as it is.
     place, build, shake = (np.random.default_rng([seed, k]) for k in (2**32 - 1, 2**32 - 2, 2**32 - 3))
     street, line = chosen.lines(place)
     terrain = rolling(place)
     profile = paths.SpeedProfile(cruise, begin, lateral=chosen.lateral)
     path, scans = _drive(chosen, line, terrain, profile, count, paths.suspension(shake))
+    moving: PosePath = path
+    if static_start > 0:
+        moving = standing_start(path, static_start)
+        scans += 0 if count is not None else int((moving.duration - path.duration) * chosen.rate_hz)
     city = build_city(street, terrain, chosen.layout, build)
-    return SimulatedDrive(chosen, city, path, model, scans, seed, motion_compensated)
+    return SimulatedDrive(chosen, city, moving, model, scans, seed, motion_compensated, sensors)
 
 
 def kitti_like_cam0() -> NDArray[np.float64]:

@@ -34,6 +34,7 @@ def test_list_names_scenarios_and_sensors() -> None:
     assert listed.returncode == 0
     assert [line.split()[1] for line in listed.stdout.splitlines()] == [
         "block", "street", "sample", "vlp16", "hdl64", "os1-32",
+        "icm20948", "icm20948-calibrated", "ideal",
     ]  # fmt: skip
 
 
