@@ -20,7 +20,6 @@ from lslam.types.building import Building, Footprint, footprint_polygon
 
 Floats = NDArray[np.float64]
 
-
 FARTHEST = 100e3  # m
 
 
