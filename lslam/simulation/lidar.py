@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -25,8 +27,11 @@ for _surface, _share in {
     Surface.POLE: 0.40,
     Surface.CAR: 0.35,
     Surface.FENCE: 0.35,
+    Surface.PERSON: 0.35,
 }.items():
     REFLECTIVITY[_surface] = _share
+
+SWEEP = 4.0  # m a body may get on during half a sweep: 80 m/s
 
 
 class RayScene:
@@ -49,6 +54,27 @@ class RayScene:
         return np.where(faces >= 0, hit["tfar"], np.float32(np.inf)), faces
 
 
+@dataclass(frozen=True)
+class MovingMesh:
+    """A body that moves while rays fly: its scene in its own frame, T_city_body at times (M,), s, and a circle round it.
+
+    radius : of a sphere round the body's origin that holds all of it, m
+    """
+
+    scene: RayScene
+    poses: Callable[[NDArray[Any]], NDArray[np.float64]]
+    radius: float
+
+
+@dataclass(frozen=True)
+class _Hits:
+    """What rays meet first: distance (N,), m, inf for nothing; cosine of incidence (N,); surface (N,)."""
+
+    distance: NDArray[np.float32]
+    cosine: NDArray[np.float32]
+    surface: NDArray[np.uint8]
+
+
 def trace(
     scene: RayScene,
     model: LidarModel,
@@ -57,6 +83,8 @@ def trace(
     index: int = 0,
     stamp_ns: int = 0,
     period: float = 0.1,
+    bodies: Sequence[MovingMesh] = (),
+    glass: float = 0.0,
 ) -> Scan:
     """One scan of `model`.
 
@@ -65,18 +93,23 @@ def trace(
     T_city_lidar : (4, 4) one pose for all rays (a motion-compensated scan, without times), or (columns, 4, 4) the pose at
         each firing (a distorted scan: points in the LiDAR frame of their own instant, times from 0 to `period` s)
     rng : source of noise and losses
+    bodies : what moves, each ray meets it where it is when that ray is fired (at `stamp_ns` in a compensated scan)
+    glass : share of the rays on a pane that pass it and go on to what is behind
 
     Returns
     -------
     The points that came back, with intensity 0..1 in steps of 0.01, rings and, for distorted scans, times.
     """
-    directions = _directions(model, rng)
+    directions = _directions(model, rng, index)
     poses = np.asarray(T_city_lidar, np.float64)
     moving = poses.ndim == 3
     origins, world = _into_city(directions, poses, moving)
-    distance, face = scene.cast(origins, world)
-    seen, distance, intensity = _detect(scene.mesh, model, world, distance, face, rng)
     column, ring = np.divmod(np.arange(model.rays), model.rings)
+    fired = stamp_ns / 1e9 + (column * (period / model.columns) if moving else np.zeros(model.rays))
+    hits = _meet(scene, origins, world, fired, bodies)
+    if glass > 0:
+        hits = _pass_glass(scene, origins, world, fired, bodies, hits, rng.random(model.rays) < glass)
+    seen, distance, intensity = _detect(model, hits, rng)
     if model.order == "ring":
         order = np.argsort(ring, kind="stable")
         kept = order[seen[order]]
@@ -87,13 +120,66 @@ def trace(
     return Scan(points, stamp_ns, index, intensity[kept], times, ring[kept].astype(np.uint16))
 
 
-def _directions(model: LidarModel, rng: np.random.Generator) -> NDArray[np.float32]:
+def _meet(
+    scene: RayScene,
+    origins: NDArray[np.float32],
+    directions: NDArray[np.float32],
+    fired: NDArray[np.float64],
+    bodies: Sequence[MovingMesh],
+) -> _Hits:
+    """First hits among what stands and what moves."""
+    distance, face = scene.cast(origins, directions)
+    cosine = np.abs(np.einsum("ij,ij->i", scene.mesh.normals[face], directions))
+    surface = scene.mesh.surfaces[face]
+    for body in bodies:
+        centre = body.poses(np.array([fired[len(fired) // 2]]))[0, :3, 3]
+        # Over a sweep the body gets on by a few metres at most.
+        to = (centre - origins).astype(np.float32)
+        along = np.einsum("ij,ij->i", to, directions)
+        aside = np.einsum("ij,ij->i", to, to) - along**2
+        rays = np.flatnonzero(
+            (along > -body.radius) & (aside < (body.radius + SWEEP) ** 2) & (along < distance + SWEEP)
+        )
+        if not len(rays):
+            continue
+        T = body.poses(fired[rays])
+        R, offset = T[:, :3, :3].astype(np.float32), (origins[rays] - T[:, :3, 3]).astype(np.float32)
+        local = np.einsum("nji,nj->ni", R, directions[rays])
+        far, part = body.scene.cast(np.einsum("nji,nj->ni", R, offset), local)
+        nearer = far < distance[rays]
+        at, part = rays[nearer], part[nearer]
+        distance[at] = far[nearer]
+        cosine[at] = np.abs(np.einsum("ij,ij->i", body.scene.mesh.normals[part], local[nearer]))
+        surface[at] = body.scene.mesh.surfaces[part]
+    return _Hits(distance, cosine, surface)
+
+
+def _pass_glass(
+    scene: RayScene,
+    origins: NDArray[np.float32],
+    directions: NDArray[np.float32],
+    fired: NDArray[np.float64],
+    bodies: Sequence[MovingMesh],
+    hits: _Hits,
+    lucky: NDArray[np.bool_],
+) -> _Hits:
+    """The `lucky` rays on glass go on; a second pane stops them."""
+    rays = np.flatnonzero(lucky & (hits.surface == Surface.GLASS) & np.isfinite(hits.distance))
+    start = hits.distance[rays] + np.float32(0.01)
+    onward = _meet(scene, origins[rays] + start[:, None] * directions[rays], directions[rays], fired[rays], bodies)
+    hits.distance[rays] = start + onward.distance
+    hits.cosine[rays] = onward.cosine
+    hits.surface[rays] = onward.surface
+    return hits
+
+
+def _directions(model: LidarModel, rng: np.random.Generator, index: int) -> NDArray[np.float32]:
     """(columns * rings, 3) unit rays in the LiDAR frame, column after column, with the noise of the angles."""
-    azimuth, elevation = model.angles
+    azimuth, elevation = model.beams(index)
     noise = rng.standard_normal((2, model.columns, model.rings), np.float32) * np.float32(
         np.radians(model.angle_noise_deg)
     )
-    a = azimuth.astype(np.float32)[:, None] + noise[0]
+    a = azimuth.astype(np.float32) + noise[0]
     e = elevation.astype(np.float32) + noise[1]
     flat = np.cos(e)
     return np.asarray(np.stack([flat * np.cos(a), flat * np.sin(a), np.sin(e)], axis=-1).reshape(-1, 3))
@@ -111,23 +197,18 @@ def _into_city(
 
 
 def _detect(
-    mesh: Mesh,
-    model: LidarModel,
-    directions: NDArray[np.float32],
-    distance: NDArray[np.float32],
-    face: NDArray[np.int32],
-    rng: np.random.Generator,
+    model: LidarModel, hits: _Hits, rng: np.random.Generator
 ) -> tuple[NDArray[np.bool_], NDArray[np.float32], NDArray[np.float32]]:
     """Which rays return, their measured ranges and intensities.
 
     The echo is that of a diffuse surface: reflectivity times the cosine of incidence over the range squared.
     """
-    noise = rng.standard_normal(len(face), np.float32) * np.float32(model.range_noise)
-    chance = rng.random(len(face), np.float32)
-    seen = (face >= 0) & (distance >= model.range_min) & (distance <= model.range_max)
+    distance = hits.distance
+    noise = rng.standard_normal(len(distance), np.float32) * np.float32(model.range_noise)
+    chance = rng.random(len(distance), np.float32)
+    seen = (distance >= model.range_min) & (distance <= model.range_max)
     r = np.where(seen, distance, np.float32(1))
-    square = np.abs(np.einsum("ij,ij->i", mesh.normals[face], directions))
-    colour = REFLECTIVITY[mesh.surfaces[face]] * square
+    colour = REFLECTIVITY[hits.surface] * hits.cosine
     echo = colour / np.float32(0.1) * (np.float32(model.range_10pct) / r) ** 2
     # Half of the echoes of a quarter of the reference strength are lost.
     seen &= chance < (1 - model.dropout) * echo**2 / (echo**2 + np.float32(0.0625))
