@@ -1,4 +1,4 @@
-"""A perturbed map from an exact one: buildings shifted, turned, simplified, merged, missing or not yet built, on record as JSON."""
+"""A perturbed map from an exact one: buildings moved, simplified, merged, missing or not yet built, on record as JSON."""
 
 from __future__ import annotations
 

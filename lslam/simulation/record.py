@@ -19,6 +19,7 @@ from lslam.formats.pose_rows import seconds_text
 from lslam.formats.sequence_toml import FILE_NAME, SequenceInfo, write_sequence_toml
 from lslam.formats.trajectory_files import write_kitti
 from lslam.geometry import se3
+from lslam.simulation.osm_extract import write_extracts
 from lslam.simulation.scenarios import SimulatedDrive
 from lslam.simulation.sensors import GNSS_FILE, IMU_FILE, TRUTH, write_readings, write_truth
 from lslam.types.scan import Scan
@@ -28,6 +29,7 @@ log = logging.getLogger("lslam")
 
 NUMBER = "00"  # of the one sequence in the folder
 PER_POINT = "per_point"
+_MAP_SEED = 2**32 - 9  # of the faults in the perturbed map
 
 
 @dataclass(frozen=True)
@@ -66,6 +68,8 @@ def record(
         points = _write_scans(drive, part, on_scan)
         _write_texts(drive, part)
         write_readings(part, drive.readings)
+        if drive.city.footprints:
+            write_extracts(part, drive.city, drive.readings.origin, np.random.default_rng([drive.seed, _MAP_SEED]))
         write_truth(part / TRUTH, drive.vehicle, drive.stamps_ns, drive.end, drive.readings)
         if sequence.exists():
             shutil.rmtree(sequence)
