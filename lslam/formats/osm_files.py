@@ -97,9 +97,11 @@ def read_osm(path: Path) -> OsmData:
             start = stream.read(64)
         if start[:2] == b"\x1f\x8b" or b"OSMHeader" in start:
             raise InputError(f"{path} is compressed: turn it into plain XML first (gunzip, or osmium cat -o map.osm)")
-        if start.removeprefix(b"\xef\xbb\xbf").lstrip()[:1] in (b"{", b"["):
-            return _read_json(path)
-        return _read_xml(path)
+        first = start.removeprefix(b"\xef\xbb\xbf").lstrip()[:1]
+        if first not in (b"<", b"{", b"["):
+            what = "is neither XML nor JSON" if first else "is empty"
+            raise InputError(f"{path} {what}, so it is no OpenStreetMap extract: {WAY_OUT}")
+        return _read_xml(path) if first == b"<" else _read_json(path)
     except OSError as error:
         raise InputError(f"{path} cannot be read: {error.strerror or error}") from None
 
@@ -169,8 +171,7 @@ def _read_xml(path: Path) -> OsmData:
     except DefusedXmlException:
         raise InputError(f"{path} declares entities, which no OpenStreetMap file does: {WAY_OUT}") from None
     except ParseError as error:
-        what = "is broken or cut short" if root is not None else "is neither XML nor JSON"
-        raise InputError(f"{path} {what} ({error}): {WAY_OUT}") from None
+        raise InputError(f"{path} is broken XML or cut short ({error}): {WAY_OUT}") from None
     except (KeyError, ValueError, LookupError) as error:
         raise InputError(f"{path} holds an element that makes no sense ({error}): {WAY_OUT}") from None
     return data
