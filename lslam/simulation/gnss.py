@@ -75,7 +75,7 @@ def simulate_gnss(
     The same generator state gives the same errors; outages only leave fixes out. Raises UsageError for a rate outside
     1..10 Hz, negative errors or an outage that ends before it starts.
     """
-    check(model)
+    check_gnss(model)
     count = int(np.floor(end * model.rate_hz + 1e-6)) + 1
     stamps = np.round(np.arange(count) * (1e9 / model.rate_hz)).astype(np.int64)
     times = stamps / 1e9
@@ -89,7 +89,7 @@ def simulate_gnss(
     return SimulatedGnss(stream, antenna[seen], error[seen], np.asarray(T_lidar_gnss, np.float64))
 
 
-def check(model: GnssModel) -> None:
+def check_gnss(model: GnssModel) -> None:
     """Raise UsageError when `model` is out of range."""
     if not 1 <= model.rate_hz <= 10:
         raise UsageError(f"--gnss-rate {model.rate_hz:g} is out of range: 1 to 10 fixes per second")

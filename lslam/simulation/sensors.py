@@ -14,7 +14,15 @@ from lslam.formats.imu_csv import write_imu_csv
 from lslam.formats.stamped_csv import write_stamped_csv
 from lslam.formats.trajectory_files import write_tum
 from lslam.geometry import se3
-from lslam.simulation.gnss import ORIGIN, T_CAR_ANTENNA, T_DRONE_ANTENNA, GnssModel, SimulatedGnss, simulate_gnss
+from lslam.simulation.gnss import (
+    ORIGIN,
+    T_CAR_ANTENNA,
+    T_DRONE_ANTENNA,
+    GnssModel,
+    SimulatedGnss,
+    check_gnss,
+    simulate_gnss,
+)
 from lslam.simulation.imu import GRAVITY, T_CAR_IMU, T_OUSTER_IMU, ImuModel, SimulatedImu, simulate_imu
 from lslam.simulation.motion import Motion
 from lslam.types.trajectory import Trajectory
@@ -28,10 +36,14 @@ _IMU_SEED, _GNSS_SEED = 2**32 - 11, 2**32 - 12  # of the generators; the scenari
 
 @dataclass(frozen=True)
 class Sensors:
-    """Which sensors ride along; None for one that does not."""
+    """Which sensors ride along; None for one that does not. Raises UsageError for an impossible one."""
 
     imu: ImuModel | None = None
     gnss: GnssModel | None = None
+
+    def __post_init__(self) -> None:
+        if self.gnss is not None:
+            check_gnss(self.gnss)
 
 
 @dataclass(frozen=True)
