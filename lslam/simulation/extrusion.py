@@ -145,8 +145,8 @@ def _gable(building: Building, footprint: Footprint, style: _Style) -> _Gable | 
     if sides[0] + sides[2] > sides[1] + sides[3]:
         corners, sides = np.roll(corners, -1, axis=0), np.roll(sides, -1)
     span, height = min(sides[0], sides[2]), (building.height or 0.0) - building.base
-    # Halls have no gables, and under the eaves people stand.
-    rise = min(span / 2 * style.pitch, height - 2.2)
+    # Halls have no gables; under the eaves people stand, and most of a house is wall.
+    rise = min(span / 2 * style.pitch, height - 2.2, 0.4 * height)
     return _Gable(corners, rise) if span < 16 and rise > 0.5 else None
 
 
