@@ -85,11 +85,11 @@ def command(
 def _print_list() -> None:
     from lslam.simulation.imu import IMUS
     from lslam.simulation.lidar_models import LIDARS
-    from lslam.simulation.scenarios import SCENARIOS
+    from lslam.simulation.scenario_files import scenario_named, scenario_names
 
-    for name, scenario in SCENARIOS.items():
-        click.echo(f"scenario  {name:<8}  {scenario.summary}")
+    for name in scenario_names():
+        click.echo(f"scenario  {name:<11}  {scenario_named(name).summary}")
     for name, model in LIDARS.items():
-        click.echo(f"lidar     {name:<8}  {model.rings} x {model.columns} rays, {model.range_max:g} m")
+        click.echo(f"lidar     {name:<11}  {model.rings} x {model.columns} rays, {model.range_max:g} m")
     for name, imu in IMUS.items():
-        click.echo(f"imu       {name:<8}  {imu.rate_hz:g} Hz, {'without errors' if name == 'ideal' else 'MEMS'}")
+        click.echo(f"imu       {name:<11}  {imu.rate_hz:g} Hz, {'without errors' if name == 'ideal' else 'MEMS'}")

@@ -8,7 +8,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field, model_validator
 
+from lslam.config.section import Section
 from lslam.simulation import furniture
 from lslam.simulation.curve import Curve
 from lslam.simulation.houses import house
@@ -21,8 +23,7 @@ KERB = 0.12  # m
 MARGIN = 60.0  # m of ground beyond the street on every side
 
 
-@dataclass(frozen=True)
-class Layout:
+class Layout(Section):
     """Measures of a street, m: half the road's width, the pavement's width, the second row's distance behind the first;
     ranges of what varies from house to house.
 
@@ -31,22 +32,30 @@ class Layout:
     poles, bins : whether there are any; identical : every house and pole is the same, at even distances
     """
 
-    road: float = 4.5
-    pavement: float = 2.0
-    second_row: float = 16.0
+    road: float = Field(4.5, ge=2, le=30)
+    pavement: float = Field(2.0, ge=0.5, le=10)
+    second_row: float = Field(16.0, ge=8, le=100)
     house_width: tuple[float, float] = (8.0, 15.0)
     house_depth: tuple[float, float] = (7.0, 11.0)
     gap: tuple[float, float] = (0.3, 4.5)
     setback: tuple[float, float] = (0.3, 5.0)
     storeys: tuple[int, int] = (2, 4)
-    parked: float = 0.42
-    trees: float = 0.6
-    openings: float = 0.08
-    gardens: float = 0.7
-    garden_trees: int = 3
+    parked: float = Field(0.42, ge=0, le=1)
+    trees: float = Field(0.6, ge=0, le=1)
+    openings: float = Field(0.08, ge=0, le=1)
+    gardens: float = Field(0.7, ge=0, le=1)
+    garden_trees: int = Field(3, ge=0, le=20)
     poles: bool = True
     bins: bool = True
     identical: bool = False
+
+    @model_validator(mode="after")
+    def _ranges_are_ordered(self) -> Layout:
+        for name, least in (("house_width", 3), ("house_depth", 3), ("gap", 0), ("setback", 0), ("storeys", 1)):
+            low, high = getattr(self, name)
+            if not least <= low <= high:
+                raise ValueError(f"layout.{name} = [{low:g}, {high:g}], expected two numbers from {least} up, in order")
+        return self
 
     @property
     def band(self) -> float:

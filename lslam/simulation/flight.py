@@ -54,16 +54,14 @@ class FreePath:
     """A LiDAR carried along `curve` by what does not stand on wheels.
 
     travelled : horizontal distance over time, a spline; duration : s it is defined for
-    heights : at the first scan and after `reach` m of curve, linear between, m above level ground or, when `terrain` is
-        given, above that ground
+    climb : height over distance, a spline as of `climb_spline`, m above level ground or, when `terrain` is given, that ground
     bank : share of the tilt that balances the turn, 1 for a coordinated one; swing : what shakes it
     """
 
     curve: Curve
     travelled: Any
     duration: float
-    heights: tuple[float, float]
-    reach: float
+    climb: Any
     bank: float
     swing: Swing
     terrain: Terrain | None = None
@@ -83,7 +81,7 @@ class FreePath:
         ahead -= np.sum(ahead * up, axis=1, keepdims=True) * up
         ahead /= np.linalg.norm(ahead, axis=1, keepdims=True)
         R = np.stack([ahead, np.cross(up, ahead), up], axis=-1)
-        z = self.heights[0] + (self.heights[1] - self.heights[0]) * s / self.reach
+        z = np.asarray(self.climb(np.mod(s, self.curve.length) if self.curve.closed else s))
         if self.terrain is not None:
             z = z + self.terrain.height(xy)
         shake = self.swing.at(times)
@@ -91,21 +89,37 @@ class FreePath:
         return np.asarray(T @ se3.make(so3.exp(shake[:, 3:]), shake[:, :3]))
 
 
+def climb_spline(curve: Curve, s: NDArray[Any], heights: NDArray[Any], smoothing: float) -> Any:
+    """Height over distance along `curve` through `heights` (N,), m, at distances `s` (N,), smoothed by `smoothing` m."""
+    from scipy.interpolate import make_interp_spline
+    from scipy.ndimage import gaussian_filter1d
+
+    along = np.linspace(0, curve.length, max(int(curve.length / 0.5), 64) + 1)
+    z, sigma = np.interp(along, s, heights), smoothing / along[1]
+    if curve.closed:
+        z = gaussian_filter1d(z[:-1], sigma, mode="wrap")
+        z = np.append(z, z[0])
+    else:
+        # Mirroring the differences keeps the ends and a constant slope.
+        reach = min(int(np.ceil(4 * sigma)), len(z) - 1)
+        z = np.concatenate([2 * z[0] - z[reach:0:-1], z, 2 * z[-1] - z[-2 : -reach - 2 : -1]])
+        z = gaussian_filter1d(z, sigma)[reach:-reach]
+    return make_interp_spline(along, z, k=5, bc_type="periodic" if curve.closed else None)
+
+
 def fly(
     curve: Curve,
     speed: SpeedProfile,
     distance: float,
-    heights: tuple[float, float],
+    climb: Any,
     bank: float,
     swing: Swing,
     terrain: Terrain | None = None,
 ) -> FreePath:
-    """Carry a LiDAR `distance` m along `curve`; on a climb `speed` counts along the slope."""
-    slope = (heights[1] - heights[0]) / curve.length
-    level = 1 / np.hypot(1.0, slope)
-    flat_speed = SpeedProfile(
-        speed.cruise * level, speed.start * level, speed.acceleration, speed.braking, speed.lateral
-    )
+    """Carry a LiDAR along `distance` m of `curve`; on a climb the speed counts along its mean slope."""
+    rise = float(climb(curve.length) - climb(0.0))
+    level = curve.length / float(np.hypot(curve.length, rise))
+    pace = SpeedProfile(speed.cruise * level, speed.start * level, speed.acceleration, speed.braking, speed.lateral)
     still = suspension(np.random.default_rng(0), 0.0, 0.0)
-    timed = drive(curve, flat(), flat_speed, distance, 0.0, still)
-    return FreePath(curve, timed.travelled, timed.duration, heights, curve.length, bank, swing, terrain)
+    timed = drive(curve, flat(), pace, distance, 0.0, still)
+    return FreePath(curve, timed.travelled, timed.duration, climb, bank, swing, terrain)

@@ -106,9 +106,10 @@ def trace(
     origins, world = _into_city(directions, poses, moving)
     column, ring = np.divmod(np.arange(model.rays), model.rings)
     fired = stamp_ns / 1e9 + (column * (period / model.columns) if moving else np.zeros(model.rays))
-    hits = _meet(scene, origins, world, fired, bodies)
+    hits = _meet(scene, origins, world)
+    _meet_bodies(bodies, origins, world, fired, model.rings, hits)
     if glass > 0:
-        hits = _pass_glass(scene, origins, world, fired, bodies, hits, rng.random(model.rays) < glass)
+        _pass_glass(scene, origins, world, hits, rng.random(model.rays) < glass)
     seen, distance, intensity = _detect(model, hits, rng)
     if model.order == "ring":
         order = np.argsort(ring, kind="stable")
@@ -120,57 +121,83 @@ def trace(
     return Scan(points, stamp_ns, index, intensity[kept], times, ring[kept].astype(np.uint16))
 
 
-def _meet(
-    scene: RayScene,
+def _meet(scene: RayScene, origins: NDArray[np.float32], directions: NDArray[np.float32]) -> _Hits:
+    """First hits on what stands."""
+    distance, face = scene.cast(origins, directions)
+    cosine = np.abs(np.einsum("ij,ij->i", scene.mesh.normals[face], directions))
+    return _Hits(distance, cosine, scene.mesh.surfaces[face])
+
+
+def _meet_bodies(
+    bodies: Sequence[MovingMesh],
     origins: NDArray[np.float32],
     directions: NDArray[np.float32],
     fired: NDArray[np.float64],
-    bodies: Sequence[MovingMesh],
-) -> _Hits:
-    """First hits among what stands and what moves."""
-    distance, face = scene.cast(origins, directions)
-    cosine = np.abs(np.einsum("ij,ij->i", scene.mesh.normals[face], directions))
-    surface = scene.mesh.surfaces[face]
+    rings: int,
+    hits: _Hits,
+) -> None:
+    """Put hits on what moves into `hits` where they are nearer."""
+    if not bodies:
+        return
+    # Bearings of whole columns first: a body is met by few of them.
+    bearing = np.arctan2(directions[:, 1], directions[:, 0]).reshape(-1, rings)
+    middle = bearing[:, rings // 2]
+    spread = np.abs(_turned(bearing - middle[:, None])).max(axis=1)
+    middle_time = fired[len(fired) // 2 : len(fired) // 2 + 1]
     for body in bodies:
-        centre = body.poses(np.array([fired[len(fired) // 2]]))[0, :3, 3]
-        # Over a sweep the body gets on by a few metres at most.
-        to = (centre - origins).astype(np.float32)
-        along = np.einsum("ij,ij->i", to, directions)
-        aside = np.einsum("ij,ij->i", to, to) - along**2
-        rays = np.flatnonzero(
-            (along > -body.radius) & (aside < (body.radius + SWEEP) ** 2) & (along < distance + SWEEP)
-        )
-        if not len(rays):
-            continue
-        T = body.poses(fired[rays])
-        R, offset = T[:, :3, :3].astype(np.float32), (origins[rays] - T[:, :3, 3]).astype(np.float32)
-        local = np.einsum("nji,nj->ni", R, directions[rays])
-        far, part = body.scene.cast(np.einsum("nji,nj->ni", R, offset), local)
-        nearer = far < distance[rays]
-        at, part = rays[nearer], part[nearer]
-        distance[at] = far[nearer]
-        cosine[at] = np.abs(np.einsum("ij,ij->i", body.scene.mesh.normals[part], local[nearer]))
-        surface[at] = body.scene.mesh.surfaces[part]
-    return _Hits(distance, cosine, surface)
+        centre = body.poses(middle_time)[0, :3, 3]
+        dx, dy, _ = (centre - origins[len(origins) // 2]).tolist()
+        reach = min((body.radius + SWEEP) / max(np.hypot(dx, dy), 1e-6), 1.0)
+        towards = np.abs(_turned(middle - np.float32(np.arctan2(dy, dx)))) <= np.arcsin(reach) + spread
+        if reach == 1.0:
+            towards[:] = True
+        columns = np.flatnonzero(towards)
+        rays = (columns[:, None] * rings + np.arange(rings)).ravel()
+        if len(rays):
+            _meet_body(body, rays, origins, directions, fired, hits)
+
+
+def _meet_body(
+    body: MovingMesh,
+    rays: NDArray[np.intp],
+    origins: NDArray[np.float32],
+    directions: NDArray[np.float32],
+    fired: NDArray[np.float64],
+    hits: _Hits,
+) -> None:
+    """Each of `rays` against the body where it is when that ray is fired."""
+    instants, which = np.unique(fired[rays], return_inverse=True)
+    T = body.poses(instants)
+    R, centre = T[which, :3, :3].astype(np.float32), T[which, :3, 3]
+    local = np.einsum("nji,nj->ni", R, directions[rays])
+    start = np.einsum("nji,nj->ni", R, (origins[rays] - centre).astype(np.float32))
+    far, face = body.scene.cast(start, local)
+    nearer = far < hits.distance[rays]
+    at, face = rays[nearer], face[nearer]
+    hits.distance[at] = far[nearer]
+    hits.cosine[at] = np.abs(np.einsum("ij,ij->i", body.scene.mesh.normals[face], local[nearer]))
+    hits.surface[at] = body.scene.mesh.surfaces[face]
+
+
+def _turned(angle: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Angles within half a turn of zero."""
+    return np.asarray(angle - np.float32(2 * np.pi) * np.round(angle / np.float32(2 * np.pi)), np.float32)
 
 
 def _pass_glass(
     scene: RayScene,
     origins: NDArray[np.float32],
     directions: NDArray[np.float32],
-    fired: NDArray[np.float64],
-    bodies: Sequence[MovingMesh],
     hits: _Hits,
     lucky: NDArray[np.bool_],
-) -> _Hits:
-    """The `lucky` rays on glass go on; a second pane stops them."""
+) -> None:
+    """The `lucky` rays on glass go on to what stands behind it; a second pane stops them."""
     rays = np.flatnonzero(lucky & (hits.surface == Surface.GLASS) & np.isfinite(hits.distance))
     start = hits.distance[rays] + np.float32(0.01)
-    onward = _meet(scene, origins[rays] + start[:, None] * directions[rays], directions[rays], fired[rays], bodies)
+    onward = _meet(scene, origins[rays] + start[:, None] * directions[rays], directions[rays])
     hits.distance[rays] = start + onward.distance
     hits.cosine[rays] = onward.cosine
     hits.surface[rays] = onward.surface
-    return hits
 
 
 def _directions(model: LidarModel, rng: np.random.Generator, index: int) -> NDArray[np.float32]:

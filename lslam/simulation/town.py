@@ -49,7 +49,6 @@ def build_town(
     rng: np.random.Generator,
     spacing: float = 80.0,
     levels: int = 1,
-    stretch: float = 0.0,
 ) -> City:
     """Build a town round the streets `main`. The same generator state gives the same town.
 
@@ -57,9 +56,7 @@ def build_town(
     ----------
     spacing : m between the side streets of a street, about; levels : 0 for no side streets, 1 for those of `main`, 2 for
         theirs as well
-    stretch : m of street added, straight on, before the start and after the end of each open main street
     """
-    main = [_stretched(street, stretch) for street in main]
     streets, newest = main, main
     for _ in range(levels):
         newest = _side_streets(newest, streets, layout, spacing, rng)
@@ -100,17 +97,6 @@ class _Places:
             return False
         self._taken = np.concatenate([self._taken, xy[None]])
         return True
-
-
-def _stretched(street: Curve, stretch: float) -> Curve:
-    """An open street made longer, straight on at both ends."""
-    if street.closed or stretch <= 0:
-        return street
-    ends = np.array([0.0, street.length])
-    at, along = street.position(ends), street.tangent(ends)
-    steps = np.arange(2.0, stretch, 2.0)[:, None]
-    before, after = at[0] - steps[::-1] * along[0], at[1] + steps * along[1]
-    return smooth_curve(np.concatenate([before, street.position(street.sample(1.0)), after]), closed=False)
 
 
 def _shortened(street: Curve, by: float) -> Curve:

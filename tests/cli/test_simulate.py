@@ -33,7 +33,8 @@ def test_list_names_scenarios_and_sensors() -> None:
     listed = lslam("--list")
     assert listed.returncode == 0
     assert [line.split()[1] for line in listed.stdout.splitlines()] == [
-        "block", "street", "sample", "vlp16", "hdl64", "os1-32",
+        "block", "climbing", "closed", "corridor", "identical", "large-eight", "motorway", "open", "residential",
+        "small-eight", "street", "urban", "walk", "sample", "vlp16", "hdl64", "os1-32", "os1-64", "livox",
         "icm20948", "icm20948-calibrated", "ideal",
     ]  # fmt: skip
 
