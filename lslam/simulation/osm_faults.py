@@ -18,7 +18,7 @@ class MapFaults:
 
     offset : m, shift of the whole map; shifted, turned, simplified, merged, missing : shares of buildings so changed
     new : not yet built buildings, as a share of the others; shift, turn, tolerance : greatest sizes, m, rad, m
-    gap : m, only neighbours this near are merged
+    swing : m, no corner moves farther than this by turning; gap : m, only neighbours this near are merged
 
     OpenStreetMap is often off by 1 to 3 m as a whole (ALGORITHMS, "OpenStreetMap prior").
     """
@@ -28,6 +28,7 @@ class MapFaults:
     shift: float = 1.5
     turned: float = 0.12
     turn: float = float(np.radians(4.0))
+    swing: float = 2.0
     simplified: float = 0.15
     tolerance: float = 2.0
     merged: float = 0.06
@@ -59,7 +60,9 @@ def draw_perturbation(
     for k in _pick(rng, loses, round(faults.simplified * len(buildings))):
         changes[k] = replace(changes[k], simplify_m=tolerances[k])
     for k in _pick(rng, present, len(_some(rng, len(buildings), faults.turned))):
-        turn = float(rng.uniform(0.25, 1.0) * faults.turn * rng.choice([-1, 1]))
+        # Whoever traced a long building saw when it was turned by much.
+        most = min(faults.turn, faults.swing / _radius(buildings[k]))
+        turn = float(rng.uniform(0.25, 1.0) * most * rng.choice([-1, 1]))
         changes[k] = replace(changes[k], turn_rad=turn)
     for k in _pick(rng, present, len(_some(rng, len(buildings), faults.shifted))):
         size, way = rng.uniform(0.3, 1.0) * faults.shift, rng.uniform(0, 2 * np.pi)
@@ -104,6 +107,12 @@ def _draw_merges(
             gone.add(j)
             used |= {j, k}
     return gone
+
+
+def _radius(building: Building) -> float:
+    """From the middle to the farthest corner, m."""
+    corners = np.concatenate([footprint.outer for footprint in building.footprints])
+    return float(np.linalg.norm(corners - building.middle, axis=1).max())
 
 
 def _corners(building: Building) -> int:

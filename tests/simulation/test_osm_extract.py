@@ -176,6 +176,14 @@ def test_turned_shifted_and_simplified_buildings_against_shapely() -> None:
         assert after[building.osm_id].symmetric_difference(expected).area < 1e-6
 
 
+def test_long_buildings_are_turned_by_less() -> None:
+    hall = Building("way/1", (Footprint(rectangle(0, 0, 200, 20)),), 9.0)
+    p = draw_perturbation([hall], replace(NONE, turned=1.0), np.random.default_rng(0))
+    (after,) = perturb([hall], p)
+    moved = np.linalg.norm(after.footprints[0].outer - hall.footprints[0].outer, axis=1)
+    assert 0.4 < moved.max() < 2.0
+
+
 def test_missing_and_merged_buildings_are_gone_and_their_ground_is_accounted_for() -> None:
     faults = replace(NONE, missing=0.2, merged=0.2)
     p = draw_perturbation(village(), faults, np.random.default_rng(0))
