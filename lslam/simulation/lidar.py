@@ -31,8 +31,6 @@ for _surface, _share in {
 }.items():
     REFLECTIVITY[_surface] = _share
 
-SWEEP = 4.0  # m a body may get on during half a sweep: 80 m/s
-
 
 class RayScene:
     """A mesh prepared for ray casting."""
@@ -58,12 +56,13 @@ class RayScene:
 class MovingMesh:
     """A body that moves while rays fly: its scene in its own frame, T_city_body at times (M,), s, and a circle round it.
 
-    radius : of a sphere round the body's origin that holds all of it, m
+    radius : of a sphere round the body's origin that holds all of it, m; speed : the most it gets on, m/s
     """
 
     scene: RayScene
     poses: Callable[[NDArray[Any]], NDArray[np.float64]]
     radius: float
+    speed: float
 
 
 @dataclass(frozen=True)
@@ -143,16 +142,20 @@ def _meet_bodies(
     bearing = np.arctan2(directions[:, 1], directions[:, 0]).reshape(-1, rings)
     middle = bearing[:, rings // 2]
     spread = np.abs(_turned(bearing - middle[:, None])).max(axis=1)
-    middle_time = fired[len(fired) // 2 : len(fired) // 2 + 1]
+    half = len(fired) // 2
     for body in bodies:
-        centre = body.poses(middle_time)[0, :3, 3]
-        dx, dy, _ = (centre - origins[len(origins) // 2]).tolist()
-        reach = min((body.radius + SWEEP) / max(np.hypot(dx, dy), 1e-6), 1.0)
-        towards = np.abs(_turned(middle - np.float32(np.arctan2(dy, dx)))) <= np.arcsin(reach) + spread
-        if reach == 1.0:
-            towards[:] = True
-        columns = np.flatnonzero(towards)
+        centre = body.poses(fired[half : half + 1])[0, :3, 3]
+        # Body and LiDAR both move while the sweep lasts.
+        reach = body.radius + body.speed * float(np.ptp(fired)) + float(np.abs(origins[-1] - origins[0]).sum())
+        dx, dy, _ = (centre - origins[half]).tolist()
+        share = reach / max(float(np.hypot(dx, dy)), reach)
+        towards = np.abs(_turned(middle - np.float32(np.arctan2(dy, dx)))) <= np.arcsin(share) + spread
+        columns = np.flatnonzero(towards | (share == 1.0))
         rays = (columns[:, None] * rings + np.arange(rings)).ravel()
+        to = (centre - origins[rays]).astype(np.float32)
+        along = np.einsum("ij,ij->i", to, directions[rays])
+        aside = np.einsum("ij,ij->i", to, to) - along**2
+        rays = rays[(along > -reach) & (aside < reach**2) & (along < hits.distance[rays] + reach)]
         if len(rays):
             _meet_body(body, rays, origins, directions, fired, hits)
 

@@ -110,7 +110,7 @@ def moving_meshes(movers: list[Mover], position: NDArray[Any], time: float, reac
     for mover in movers:
         at = mover.poses(np.array([time]))[0, :3, 3]
         if np.linalg.norm(at - position) < reach + mover.radius:
-            near.append(MovingMesh(mover.scene, mover.poses, mover.radius))
+            near.append(MovingMesh(mover.scene, mover.poses, mover.radius, abs(mover.speed)))
     return near
 
 

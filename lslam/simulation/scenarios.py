@@ -81,13 +81,18 @@ class SimulatedDrive:
         self.gnss: GnssStream | None = None if gnss is None else gnss.stream
         self.notes: list[str] = []
         self.problems: list[str] = []
-        self._scene = RayScene(city.mesh) if scene is None else scene
+        self.scene = RayScene(city.mesh) if scene is None else scene
 
     def __len__(self) -> int:
         return len(self.stamps_ns)
 
     def __iter__(self) -> Iterator[Scan]:
         return (self.scan(index) for index in range(len(self)))
+
+    @property
+    def city_poses(self) -> NDArray[np.float64]:
+        """(N, 4, 4) T_city_lidar at the scans' stamps."""
+        return self.vehicle.poses(self.stamps_ns / 1e9)
 
     def scan(self, index: int) -> Scan:
         """Trace scan `index`, 0 <= index < len."""
@@ -101,7 +106,7 @@ class SimulatedDrive:
         here = poses if poses.ndim == 2 else poses[len(poses) // 2]
         bodies = moving_meshes(self.movers, here[:3, 3], start, self.lidar.range_max + SPARE_REACH)
         return trace(
-            self._scene, self.lidar, poses, rng, index, int(self.stamps_ns[index]), period,
+            self.scene, self.lidar, poses, rng, index, int(self.stamps_ns[index]), period,
             bodies, self.scenario.world.glass,
         )  # fmt: skip
 
