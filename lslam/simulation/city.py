@@ -153,9 +153,14 @@ def _add_road(builder: MeshBuilder, street: Curve, terrain: Terrain, layout: Lay
 
 
 def add_ground(
-    builder: MeshBuilder, streets: list[Curve], terrain: Terrain, layout: Layout, rng: np.random.Generator
+    builder: MeshBuilder,
+    streets: list[Curve],
+    terrain: Terrain,
+    layout: Layout,
+    rng: np.random.Generator,
+    tucked: float = 0.1,
 ) -> None:
-    """Grass everywhere else, a little below the pavements so that their edge shows."""
+    """Grass everywhere else, a little below the pavements so that their edge shows; it reaches `tucked` m under them."""
     from scipy.spatial import cKDTree
 
     middle = np.concatenate([street.position(street.sample(0.5)) for street in streets])
@@ -164,7 +169,7 @@ def add_ground(
     xy = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1)
     z = terrain.height(xy) + KERB - 0.03 + rng.normal(0, 0.015, xy.shape[:2])
     nearest = np.asarray(cKDTree(middle).query(xy.reshape(-1, 2), distance_upper_bound=layout.band)[0])
-    under_road = nearest < layout.band - 0.1
+    under_road = nearest < layout.band - tucked
     faces = grid_faces(len(x), len(y))
     faces = faces[~under_road[faces].any(axis=1)]
     builder.add(np.concatenate([xy, z[..., None]], -1).reshape(-1, 3), faces, Surface.LAWN)

@@ -32,6 +32,22 @@ for _surface, _share in {
     REFLECTIVITY[_surface] = _share
 
 
+@dataclass(frozen=True)
+class Roof:
+    """The roof under a LiDAR, level in its frame, m: behind, ahead, to either side, and how far below."""
+
+    behind: float
+    ahead: float
+    aside: float
+    below: float
+
+    def blocks(self, directions: NDArray[np.float32]) -> NDArray[np.bool_]:
+        """Which rays (N, 3) from the LiDAR end on it."""
+        down = np.maximum(-directions[:, 2], np.float32(1e-6))
+        x, y = self.below * directions[:, 0] / down, self.below * directions[:, 1] / down
+        return np.asarray((x > -self.behind) & (x < self.ahead) & (np.abs(y) < self.aside))
+
+
 class RayScene:
     """A mesh prepared for ray casting."""
 
@@ -84,6 +100,7 @@ def trace(
     period: float = 0.1,
     bodies: Sequence[MovingMesh] = (),
     glass: float = 0.0,
+    roof: Roof | None = None,
 ) -> Scan:
     """One scan of `model`.
 
@@ -94,6 +111,7 @@ def trace(
     rng : source of noise and losses
     bodies : what moves, each ray meets it where it is when that ray is fired (at `stamp_ns` in a compensated scan)
     glass : share of the rays on a pane that pass it and go on to what is behind
+    roof : of the vehicle that carries the LiDAR; what it is in the way of gives nothing
 
     Returns
     -------
@@ -109,6 +127,8 @@ def trace(
     _meet_bodies(bodies, origins, world, fired, model.rings, hits)
     if glass > 0:
         _pass_glass(scene, origins, world, hits, rng.random(model.rays) < glass)
+    if roof is not None:
+        hits.distance[roof.blocks(directions)] = np.inf
     seen, distance, intensity = _detect(model, hits, rng)
     if model.order == "ring":
         order = np.argsort(ring, kind="stable")

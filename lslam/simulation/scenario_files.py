@@ -67,7 +67,8 @@ class Scenario(Section):
     """A kind of place and a way to move through it.
 
     carrier : what carries the LiDAR; speed, start_speed : m/s; lateral : greatest acceleration in bends, m/s2, to which a car
-    and a walker slow down and which a drone must not exceed; overlap : distance beyond one lap of a closed line, m
+    and a walker slow down and which a drone must not exceed; roof : m behind, ahead, aside and below the LiDAR that the car's
+    own roof takes up, or nothing; overlap : distance beyond one lap of a closed line, m
     """
 
     name: str
@@ -78,6 +79,7 @@ class Scenario(Section):
     speed: float = Field(gt=0, le=40)
     start_speed: float = Field(ge=0, le=40)
     lateral: float = Field(2.5, gt=0, le=30)
+    roof: tuple[float, float, float, float] | None = None
     rate_hz: float = Field(10.0, ge=1, le=100)
     overlap: float = Field(0.0, ge=0, le=1000)
     motion_compensated: bool = False

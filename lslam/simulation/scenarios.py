@@ -14,7 +14,7 @@ from lslam.simulation.city import City
 from lslam.simulation.clearance import check_path
 from lslam.simulation.gnss import GnssModel
 from lslam.simulation.imu import ImuModel, imu_named
-from lslam.simulation.lidar import RayScene, trace
+from lslam.simulation.lidar import RayScene, Roof, trace
 from lslam.simulation.lidar_models import LidarModel, lidar_named
 from lslam.simulation.motion import PosePath, smooth_motion, standing_start
 from lslam.simulation.moving import Mover, moving_meshes
@@ -81,6 +81,7 @@ class SimulatedDrive:
         self.gnss: GnssStream | None = None if gnss is None else gnss.stream
         self.notes: list[str] = []
         self.problems: list[str] = []
+        self._roof = None if scenario.roof is None else Roof(*scenario.roof)
         self.scene = RayScene(city.mesh) if scene is None else scene
 
     def __len__(self) -> int:
@@ -107,7 +108,7 @@ class SimulatedDrive:
         bodies = moving_meshes(self.movers, here[:3, 3], start, self.lidar.range_max + SPARE_REACH)
         return trace(
             self.scene, self.lidar, poses, rng, index, int(self.stamps_ns[index]), period,
-            bodies, self.scenario.world.glass,
+            bodies, self.scenario.world.glass, self._roof,
         )  # fmt: skip
 
 

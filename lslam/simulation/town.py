@@ -66,7 +66,9 @@ def build_town(
     for street in streets:
         _add_road(builder, street, network, terrain, layout, rng)
     # Grass closes the dead ends: their last metres do not count as road.
-    add_ground(builder, [_shortened(street, layout.band) for street in streets], terrain, layout, rng)
+    add_ground(
+        builder, [_shortened(street, layout.band) for street in streets], terrain, layout, rng, 0.75 * layout.pavement
+    )
     lots = Lots(streets, layout)
     for first in (True, False):
         for street in streets if first else main:
