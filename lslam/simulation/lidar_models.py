@@ -101,6 +101,10 @@ LIDARS = {
         LidarModel(
             "hdl64", (*_even(2.0, -8.33, 32), *_even(-8.83, -24.33, 32)), 2000, 0.9, 120.0, 0.02, 0.002, 0.01, 50.0, 0.03,
         ),
+        # As its recordings show it: up to 2,170 returns in a ring, roads seen to 50 m.
+        LidarModel(
+            "hdl64-kitti", (*_even(2.0, -8.33, 32), *_even(-8.83, -24.33, 32)), 2170, 0.9, 120.0, 0.02, 0.002, 0.01, 60.0, 0.015,
+        ),
         LidarModel(
             "os1-32", _even(22.5, -22.5, 32), 1024, 0.3, 100.0, 0.03, 0.01, 0.01, 45.0, 0.02, "column", 180.0, True
         ),
