@@ -117,10 +117,10 @@ def trace(
     -------
     The points that came back, with intensity 0..1 in steps of 0.01, rings and, for distorted scans, times.
     """
-    directions = _directions(model, rng, index)
+    directions, true = _directions(model, rng, index)
     poses = np.asarray(T_city_lidar, np.float64)
     moving = poses.ndim == 3
-    origins, world = _into_city(directions, poses, moving)
+    origins, world = _into_city(true, poses, moving)
     column, ring = np.divmod(np.arange(model.rays), model.rings)
     fired = stamp_ns / 1e9 + (column * (period / model.columns) if moving else np.zeros(model.rays))
     hits = _meet(scene, origins, world)
@@ -128,7 +128,7 @@ def trace(
     if glass > 0:
         _pass_glass(scene, origins, world, hits, rng.random(model.rays) < glass)
     if roof is not None:
-        hits.distance[roof.blocks(directions)] = np.inf
+        hits.distance[roof.blocks(true)] = np.inf
     seen, distance, intensity = _detect(model, hits, rng)
     if model.order == "ring":
         order = np.argsort(ring, kind="stable")
@@ -223,16 +223,24 @@ def _pass_glass(
     hits.surface[rays] = onward.surface
 
 
-def _directions(model: LidarModel, rng: np.random.Generator, index: int) -> NDArray[np.float32]:
-    """(columns * rings, 3) unit rays in the LiDAR frame, column after column, with the noise of the angles."""
+def _directions(
+    model: LidarModel, rng: np.random.Generator, index: int
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """(columns * rings, 3) unit rays in the LiDAR frame, column after column: as it reports them, and as they fly."""
     azimuth, elevation = model.beams(index)
     noise = rng.standard_normal((2, model.columns, model.rings), np.float32) * np.float32(
         np.radians(model.angle_noise_deg)
     )
     a = azimuth.astype(np.float32) + noise[0]
     e = elevation.astype(np.float32) + noise[1]
-    flat = np.cos(e)
-    return np.asarray(np.stack([flat * np.cos(a), flat * np.sin(a), np.sin(e)], axis=-1).reshape(-1, 3))
+    said = _unit(a, e)
+    return said, _unit(a, e + model.ring_errors[1].astype(np.float32)) if model.ring_tilt_deg else said
+
+
+def _unit(azimuth: NDArray[np.float32], elevation: NDArray[np.float32]) -> NDArray[np.float32]:
+    flat = np.cos(elevation)
+    both = np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)], axis=-1)
+    return np.asarray(both.reshape(-1, 3))
 
 
 def _into_city(
@@ -255,6 +263,7 @@ def _detect(
     """
     distance = hits.distance
     noise = rng.standard_normal(len(distance), np.float32) * np.float32(model.range_noise)
+    off = noise + np.tile(model.ring_errors[0].astype(np.float32), model.columns) if model.ring_bias else noise
     chance = rng.random(len(distance), np.float32)
     seen = (distance >= model.range_min) & (distance <= model.range_max)
     r = np.where(seen, distance, np.float32(1))
@@ -263,6 +272,6 @@ def _detect(
     # Half of the echoes of a quarter of the reference strength are lost.
     seen &= chance < (1 - model.dropout) * echo**2 / (echo**2 + np.float32(0.0625))
     step = np.float32(model.range_step)
-    measured = np.maximum(np.round((r + noise) / step) * step, np.float32(model.range_min))
+    measured = np.maximum(np.round((r + off) / step) * step, np.float32(model.range_min))
     intensity = np.clip(np.round(colour * (1 + 2 * noise) * 100) / 100, 0, 1).astype(np.float32)
     return seen, measured.astype(np.float32), intensity

@@ -45,6 +45,7 @@ class LidarModel:
     dropout : share of returns lost for no reason; order : of the points, ring after ring or column after column
     start_deg : azimuth of the first column, 0 forward, counter-clockwise; clockwise : sense of turning, from above
     rosette : when given, it does not spin but looks forward through two turning prisms
+    ring_bias, ring_tilt_deg : standard deviations over the rings of what calibration missed: range, m, and elevation
     """
 
     name: str
@@ -61,6 +62,8 @@ class LidarModel:
     start_deg: float = 0.0
     clockwise: bool = False
     rosette: Rosette | None = None
+    ring_bias: float = 0.0
+    ring_tilt_deg: float = 0.0
 
     @property
     def rings(self) -> int:
@@ -78,6 +81,12 @@ class LidarModel:
         turn = 2 * np.pi * np.arange(self.columns) / self.columns
         azimuth = np.radians(self.start_deg) + (-turn if self.clockwise else turn)
         return azimuth, np.radians(np.array(self.elevations_deg))
+
+    @cached_property
+    def ring_errors(self) -> tuple[Floats, Floats]:
+        """What calibration missed, of each ring and for good: range (rings,), m, and elevation (rings,), rad."""
+        bias, tilt = np.random.default_rng(self.rings).standard_normal((2, self.rings))
+        return self.ring_bias * bias, np.radians(self.ring_tilt_deg) * tilt
 
     def beams(self, index: int) -> tuple[Floats, Floats]:
         """Azimuth and elevation of every ray of scan `index`, rad, each broadcasting to (columns, rings)."""
@@ -104,12 +113,15 @@ LIDARS = {
         # As its recordings show it: up to 2,170 returns in a ring, roads seen to 50 m.
         LidarModel(
             "hdl64-kitti", (*_even(2.0, -8.33, 32), *_even(-8.83, -24.33, 32)), 2170, 0.9, 120.0, 0.02, 0.002, 0.01, 60.0, 0.015,
+            ring_bias=0.012, ring_tilt_deg=0.03,
         ),
         LidarModel(
-            "os1-32", _even(22.5, -22.5, 32), 1024, 0.3, 100.0, 0.03, 0.01, 0.01, 45.0, 0.02, "column", 180.0, True
+            "os1-32", _even(22.5, -22.5, 32), 1024, 0.3, 100.0, 0.03, 0.01, 0.01, 45.0, 0.02, "column", 180.0, True,
+            ring_bias=0.01, ring_tilt_deg=0.02,
         ),
         LidarModel(
-            "os1-64", _even(22.5, -22.5, 64), 1024, 0.3, 100.0, 0.03, 0.01, 0.01, 45.0, 0.02, "column", 180.0, True
+            "os1-64", _even(22.5, -22.5, 64), 1024, 0.3, 100.0, 0.03, 0.01, 0.01, 45.0, 0.02, "column", 180.0, True,
+            ring_bias=0.01, ring_tilt_deg=0.02,
         ),
         # Like an Avia: 240,000 rays/s in six lines through a round view of 70 degrees.
         LidarModel(
