@@ -47,7 +47,7 @@ def build_motorway(street: Curve, terrain: Terrain, layout: Layout, rng: np.rand
 
 
 def build_corridor(street: Curve, terrain: Terrain, layout: Layout, rng: np.random.Generator) -> City:
-    """A street between two plain walls, a thin post now and then: little tells how far along it one is."""
+    """A street between two plain walls, with flat piers: little tells how far along it one is."""
     builder = MeshBuilder()
     _add_strip(builder, street, terrain, [0.0, 2.0, layout.road, layout.band], rng)
     add_ground(builder, [street], terrain, layout, rng)
@@ -57,10 +57,10 @@ def build_corridor(street: Curve, terrain: Terrain, layout: Layout, rng: np.rand
         _add_wall(builder, street, terrain, s, side * (layout.band - 0.3), WALL_HEIGHT, Surface.WALL)
         near, far = street.beside(s, side * (layout.band - 0.3)), street.beside(s, side * (layout.band + 0.1))
         footprints.append(np.concatenate([near, far[::-1]]))
-        posts = np.cumsum(rng.uniform(15, 35, int(street.length / 15)))
-        for at in posts[posts < street.length] if layout.poles else ():
-            low, high = [-0.06, -0.06, -0.5], [0.06, 0.06, rng.uniform(2.5, 4.5)]
-            _put(builder, street, terrain, float(at), side * (layout.road + 0.3), low, high, Surface.POLE)
+        at = np.cumsum(rng.uniform(6, 16, int(street.length / 6)))
+        for s_pier in at[at < street.length] if layout.poles else ():
+            low, high = [-0.3, -0.2, -0.5], [0.3, 0.2, WALL_HEIGHT]
+            _put(builder, street, terrain, float(s_pier), side * (layout.band - 0.4), low, high, Surface.WALL)
     return City(builder.build(), terrain, street, footprints, [WALL_HEIGHT] * 2, [street])
 
 
