@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from lslam.cli import console, options
+
+if TYPE_CHECKING:
+    from lslam.simulation.scenarios import SimulatedDrive
 
 
 @click.command(epilog="Example: lslam simulate block --out town && lslam run town")
@@ -16,10 +20,45 @@ from lslam.cli import console, options
     "--seed", type=int, default=0, show_default=True, metavar="N", help="Of the town, the drive and the noise."
 )
 @click.option("--lidar", metavar="NAME", help="The sensor; see --list.")
-@click.option("--count", type=int, metavar="N", help="Number of scans [default: one lap, or the whole street].")
+@click.option(
+    "--scans",
+    "--count",
+    "count",
+    type=int,
+    metavar="N",
+    help="Number of scans [default: one lap, or the whole street].",
+)
 @click.option("--speed", type=float, metavar="M/S", help="Cruising speed; bends may need less.")
-@click.option("--distorted", is_flag=True, help="Fire the rays while the sensor moves, with times per point.")
+@click.option(
+    "--distorted/--compensated",
+    "distorted",
+    default=None,
+    help="Fire the rays while the sensor moves, with times per point, or all from one pose [default: the scenario's].",
+)
+@click.option(
+    "--path",
+    "path_file",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="Drive along way-points (.toml, .csv, .geojson) or a trajectory's shape [SCENARIO then is residential].",
+)
+@click.option(
+    "--set", "settings", multiple=True, metavar="KEY=VALUE", help="Change the scenario, as world.relief=1; repeatable."
+)
+@click.option(
+    "--plan", type=click.Path(path_type=Path), metavar="FILE.png", help="Draw the scene from above with a metric grid."
+)
+@click.option("--imu/--no-imu", default=True, show_default=True, help="Record an ICM-20948 at 100 Hz.")
+@click.option("--imu-model", metavar="NAME", default="icm20948", show_default=True, help="Another IMU; see --list.")
+@click.option(
+    "--gnss-rate", type=float, default=1.0, show_default=True, metavar="HZ", help="Satellite fixes, 1 to 10; 0: none."
+)
+@click.option(
+    "--gnss-outage", type=(float, float), multiple=True, metavar="FROM TO", help="Seconds without fixes; repeatable."
+)
+@click.option("--static-start", type=float, default=0.0, metavar="S", help="Stand still for S seconds first.")
 @click.option("--overwrite", is_flag=True, help="Replace sequences/00 and poses/00.txt in an existing folder.")
+@click.option("--resume", is_flag=True, help="Go on with a simulation that was interrupted.")
 @click.option("--list", "show_list", is_flag=True, help="List scenarios and sensors.")
 @options.verbosity
 def command(
@@ -29,27 +68,76 @@ def command(
     lidar: str | None,
     count: int | None,
     speed: float | None,
-    distorted: bool,
+    distorted: bool | None,
+    path_file: Path | None,
+    settings: tuple[str, ...],
+    plan: Path | None,
+    imu: bool,
+    imu_model: str,
+    gnss_rate: float,
+    gnss_outage: tuple[tuple[float, float], ...],
+    static_start: float,
     overwrite: bool,
+    resume: bool,
     show_list: bool,
     verbose: bool,
     quiet: bool,
 ) -> None:
-    """Simulate a drive with exact ground truth: SCENARIO is block or street."""
+    """Simulate a drive or a flight with exact ground truth; --list shows the SCENARIOs.
+
+    With --plan the scene is drawn, and recorded only when --out is given as well.
+    """
     if show_list:
         _print_list()
         return
-    if scenario is None or out is None:
+    if scenario is None and path_file is not None:
+        scenario = "residential"
+    if scenario is None or (out is None and plan is None):
         missing = "SCENARIO" if scenario is None else "--out DIR"
         raise click.UsageError(f"{missing} is missing; for example: lslam simulate block --out town")
+    if overwrite and resume:
+        raise click.UsageError("--overwrite begins anew and --resume goes on: give one of them")
     console.setup_logging(verbose, quiet)
-    from lslam.simulation.record import check_target, record
+    from lslam.simulation.gnss import GnssModel
+    from lslam.simulation.record import check_target
     from lslam.simulation.scenarios import simulate
+    from lslam.simulation.waypoints import read_way_points
 
-    check_target(out, overwrite)
-    drive = simulate(scenario, seed=seed, lidar=lidar, count=count, speed=speed, motion_compensated=not distorted)
-    with console.progress("simulating", len(drive)) as advance:
-        done = record(drive, out, overwrite, on_scan=lambda _: advance())
+    if out is not None:
+        check_target(out, overwrite, resume)
+    drive = simulate(
+        scenario,
+        seed=seed,
+        lidar=lidar,
+        count=count,
+        speed=speed,
+        motion_compensated=None if distorted is None else not distorted,
+        settings=settings,
+        way_points=None if path_file is None else read_way_points(path_file),
+        imu=imu_model if imu else None,
+        gnss=GnssModel(gnss_rate, outages=gnss_outage) if gnss_rate else None,
+        static_start=static_start,
+    )
+    if plan is not None:
+        _draw(drive, plan)
+    if out is not None:
+        _record(drive, out, overwrite, resume)
+
+
+def _draw(drive: SimulatedDrive, plan: Path) -> None:
+    from lslam.simulation.plan import write_plan
+
+    width, depth = write_plan(plan, drive.scene, drive.city, drive.city_poses[:, :3, 3])
+    click.echo(f"{plan}: {width:.0f} x {depth:.0f} m, a line every 10 m")
+
+
+def _record(drive: SimulatedDrive, out: Path, overwrite: bool, resume: bool) -> None:
+    from lslam.cli.signals import gentle_stop
+    from lslam.simulation.record import record
+
+    # SIGTERM ends it as Ctrl-C does: what is whole stays for --resume.
+    with gentle_stop(), console.progress("simulating", len(drive)) as advance:
+        done = record(drive, out, overwrite, on_scan=lambda _: advance(), resume=resume)
     assert drive.ground_truth is not None
     click.echo(
         f"{done.sequence}: {len(drive)} scans, {drive.ground_truth.path_lengths[-1]:.1f} m, "
@@ -58,10 +146,13 @@ def command(
 
 
 def _print_list() -> None:
+    from lslam.simulation.imu import IMUS
     from lslam.simulation.lidar_models import LIDARS
-    from lslam.simulation.scenarios import SCENARIOS
+    from lslam.simulation.scenario_files import scenario_named, scenario_names
 
-    for name, scenario in SCENARIOS.items():
-        click.echo(f"scenario  {name:<8}  {scenario.summary}")
+    for name in scenario_names():
+        click.echo(f"scenario  {name:<11}  {scenario_named(name).summary}")
     for name, model in LIDARS.items():
-        click.echo(f"lidar     {name:<8}  {model.rings} x {model.columns} rays, {model.range_max:g} m")
+        click.echo(f"lidar     {name:<11}  {model.rings} x {model.columns} rays, {model.range_max:g} m")
+    for name, imu in IMUS.items():
+        click.echo(f"imu       {name:<11}  {imu.rate_hz:g} Hz, {'without errors' if name == 'ideal' else 'MEMS'}")

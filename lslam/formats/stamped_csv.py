@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from decimal import Decimal, InvalidOperation
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +23,8 @@ def read_stamped_csv(
     """Stamps (N,) ns and values (N, K), one column per entry of `columns`, each entry its accepted names.
 
     Columns of `optional` follow and are NaN where the file has none. The header is the first line, a leading `#`, units
-    in brackets and case aside. Raises InputError naming file, line and what is missing.
+    in brackets and case aside. `stamp_ns` holds whole ns however small; what other time columns hold shows from the numbers
+    (`stamps_files`). Raises InputError naming file, line and what is missing.
     """
     try:
         lines = path.read_text(encoding="utf-8-sig").splitlines()
@@ -37,6 +39,7 @@ def read_stamped_csv(
     if missing:
         raise InputError(f"{path}, line 1: no column {', '.join(missing)}; the file has {', '.join(header)}")
     where += [_find(header, names) for names in optional]
+    parse = _nanoseconds if header[time] == "stamp_ns" else parse_stamp
     stamps: list[int] = []
     rows: list[list[float]] = []
     for number, line in enumerate(lines[1:], 2):
@@ -46,7 +49,7 @@ def read_stamped_csv(
         if len(cells) != len(header):
             raise InputError(f"{path}, line {number}: {len(cells)} columns where the header has {len(header)}")
         try:
-            stamps.append(parse_stamp(cells[time].strip()))
+            stamps.append(parse(cells[time].strip()))
             rows.append([float("nan") if k is None else float(cells[k]) for k in where])
         except ValueError:
             raise InputError(f"{path}, line {number}: {line[:60]!r} holds something that is no number") from None
@@ -62,6 +65,16 @@ def write_stamped_csv(
         rows.append(",".join([str(stamp), *map(repr, row)]))
     with atomic_write(path) as stream:
         stream.write(("\n".join(rows) + "\n").encode())
+
+
+def _nanoseconds(text: str) -> int:
+    try:
+        stamp = Decimal(text)
+    except InvalidOperation:
+        raise ValueError(f"no time: {text!r}") from None
+    if not stamp.is_finite() or abs(stamp) >= 2**63 or stamp != stamp.to_integral_value():
+        raise ValueError(f"no whole number of nanoseconds: {text!r}")
+    return int(stamp)
 
 
 def _plain(name: str) -> str:

@@ -161,7 +161,7 @@ def _imu(sequence: Sequence, problems: list[str]) -> Facts | None:
         problems.append(f"IMU: {bad} of {len(imu)} samples are not finite")
     if units != "m/s2":
         problems.append(
-            f"IMU: the mean specific force is {norm:.2f}, neither 9.0..10.5 (m/s2) nor usable as it is: "
+            f"IMU: the mean specific force is {norm:.2f}, not about 9.81 (m/s2), and not usable as it is: "
             + ("it seems to be in g, multiply by 9.80665" if units == "g" else "check its unit and its gravity")
         )
     if (steps <= 0).any():
@@ -184,10 +184,20 @@ def _imu(sequence: Sequence, problems: list[str]) -> Facts | None:
 
 
 def _gravity(imu: ImuStream) -> tuple[float, str | None]:
-    """Norm of the mean specific force over the whole stream, and the unit it speaks for (CONVENTIONS: 0.8..1.2 g)."""
+    """Norm of the mean specific force over the whole stream, and the unit gravity speaks for (CONVENTIONS: 0.8..1.2 g).
+
+    Half seconds are averaged and the calmest twentieth decides: long bends add up to more than gravity's tolerance.
+    """
     finite = imu.accel[np.isfinite(imu.accel).all(axis=1)]
-    norm = float(np.linalg.norm(finite.mean(axis=0))) if len(finite) else 0.0
-    return norm, "m/s2" if 9.0 <= norm <= 10.5 else "g" if 0.8 <= norm <= 1.2 else None
+    if not len(finite):
+        return 0.0, None
+    step = float(np.median(np.diff(imu.stamps_ns))) * 1e-9 if len(imu) > 1 else 0.0
+    width = min(max(round(0.5 / step), 1) if step > 0 else 1, len(finite))
+    whole = len(finite) // width * width
+    means = np.linalg.norm(finite[:whole].reshape(-1, width, 3).mean(axis=1), axis=1)
+    calm = float(np.percentile(means, 5))
+    unit = "m/s2" if 0.8 <= calm / GRAVITY <= 1.2 else "g" if 0.8 <= calm <= 1.2 else None
+    return float(np.linalg.norm(finite.mean(axis=0))), unit
 
 
 def _gnss(sequence: Sequence) -> Facts | None:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field, model_validator
 
+from lslam.config.section import Section
 from lslam.simulation import furniture
 from lslam.simulation.curve import Curve
 from lslam.simulation.houses import house
@@ -20,20 +23,39 @@ KERB = 0.12  # m
 MARGIN = 60.0  # m of ground beyond the street on every side
 
 
-@dataclass(frozen=True)
-class Layout:
+class Layout(Section):
     """Measures of a street, m: half the road's width, the pavement's width, the second row's distance behind the first;
     ranges of what varies from house to house.
+
+    parked, trees : share of the places beside the road that hold a car or a tree; openings : share of houses followed by a
+    wide gap; gardens : share of front gardens with a hedge or a wall; garden_trees : attempts per 5 m of street
+    poles, bins : whether there are any; identical : every house and pole is the same, at even distances
     """
 
-    road: float = 4.5
-    pavement: float = 2.0
-    second_row: float = 16.0
+    road: float = Field(4.5, ge=2, le=30)
+    pavement: float = Field(2.0, ge=0.5, le=10)
+    second_row: float = Field(16.0, ge=8, le=100)
     house_width: tuple[float, float] = (8.0, 15.0)
     house_depth: tuple[float, float] = (7.0, 11.0)
     gap: tuple[float, float] = (0.3, 4.5)
     setback: tuple[float, float] = (0.3, 5.0)
     storeys: tuple[int, int] = (2, 4)
+    parked: float = Field(0.42, ge=0, le=1)
+    trees: float = Field(0.6, ge=0, le=1)
+    openings: float = Field(0.08, ge=0, le=1)
+    gardens: float = Field(0.7, ge=0, le=1)
+    garden_trees: int = Field(3, ge=0, le=20)
+    poles: bool = True
+    bins: bool = True
+    identical: bool = False
+
+    @model_validator(mode="after")
+    def _ranges_are_ordered(self) -> Layout:
+        for name, least in (("house_width", 3), ("house_depth", 3), ("gap", 0), ("setback", 0), ("storeys", 1)):
+            low, high = getattr(self, name)
+            if not least <= low <= high:
+                raise ValueError(f"layout.{name} = [{low:g}, {high:g}], expected two numbers from {least} up, in order")
+        return self
 
     @property
     def band(self) -> float:
@@ -45,52 +67,71 @@ class Layout:
 class City:
     """A scene in one city frame (x, y level, z up, m).
 
-    footprints : outlines of the houses, each (4, 2)
+    street : the middle of the road along which it was built, when there is one; streets : all of them
+    footprints : outlines of the buildings, each (K, 2); heights : of their tops above the ground at the door, m
     """
 
     mesh: Mesh
     terrain: Terrain
-    street: Curve
+    street: Curve | None = None
     footprints: list[Floats] = field(default_factory=list)
+    heights: list[float] = field(default_factory=list)
+    streets: list[Curve] = field(default_factory=list)
 
 
 def build_city(street: Curve, terrain: Terrain, layout: Layout, rng: np.random.Generator) -> City:
     """Build a town along `street`. The same generator state gives the same town."""
     builder = MeshBuilder()
     _add_road(builder, street, terrain, layout, rng)
-    _add_ground(builder, street, terrain, layout, rng)
-    lots = _Lots(street, layout)
+    add_ground(builder, [street], terrain, layout, rng)
+    lots = Lots([street], layout)
     for side in (1, -1):
-        _add_row(builder, lots, terrain, layout, rng, side, first=True)
+        add_row(builder, lots, street, terrain, layout, rng, side, first=True)
     for side in (1, -1):
-        _add_row(builder, lots, terrain, layout, rng, side, first=False)
-        _add_street_furniture(builder, street, terrain, layout, rng, side)
-    _add_garden_trees(builder, lots, terrain, rng)
-    return City(builder.build(), terrain, street, lots.footprints)
+        add_row(builder, lots, street, terrain, layout, rng, side, first=False)
+        add_street_furniture(builder, street, terrain, layout, rng, side)
+    add_garden_trees(builder, lots, terrain, layout, rng)
+    return City(builder.build(), terrain, street, lots.footprints, lots.heights, [street])
 
 
-class _Lots:
-    """Which ground is taken: the street and the houses so far."""
+class Lots:
+    """Which ground is taken: the streets and the houses so far."""
 
-    def __init__(self, street: Curve, layout: Layout) -> None:
-        from shapely import LinearRing, LineString, Polygon, prepare
+    def __init__(self, streets: list[Curve], layout: Layout) -> None:
+        from shapely import LinearRing, LineString, Polygon, prepare, union_all
 
-        self.street = street
-        points = street.position(street.sample(1.0))
-        self.corridor = (LinearRing if street.closed else LineString)(points).buffer(layout.band + 0.2)
+        self.streets = streets
+        lines = [(LinearRing if s.closed else LineString)(s.position(s.sample(1.0))) for s in streets]
+        bands = [line.buffer(layout.band + 0.2) for line in lines]
+        self.corridor = bands[0] if len(bands) == 1 else union_all(bands)
         prepare(self.corridor)
         self.polygon = Polygon
         self.taken: list[Any] = []
         self.footprints: list[Floats] = []
+        self.heights: list[float] = []
+        self._circles = np.zeros((0, 3))
 
     def is_free(self, corners: Floats) -> bool:
-        """True when a polygon (K, 2) touches neither the street nor a house."""
+        """True when a polygon (K, 2) touches neither a street nor a house."""
         polygon = self.polygon(corners)
-        return not self.corridor.intersects(polygon) and not any(other.intersects(polygon) for other in self.taken)
+        if self.corridor.intersects(polygon):
+            return False
+        x, y, reach = _circle(corners)
+        near = np.hypot(self._circles[:, 0] - x, self._circles[:, 1] - y) <= self._circles[:, 2] + reach
+        return not any(self.taken[i].intersects(polygon) for i in np.flatnonzero(near))
 
-    def take(self, corners: Floats) -> None:
+    def take(self, corners: Floats, height: float) -> None:
+        """Put a building on this ground."""
         self.taken.append(self.polygon(corners))
         self.footprints.append(corners)
+        self.heights.append(height)
+        self._circles = np.concatenate([self._circles, [_circle(corners)]])
+
+
+def _circle(corners: Floats) -> tuple[float, float, float]:
+    """Middle and radius of a circle round a polygon (K, 2)."""
+    middle = corners.mean(axis=0)
+    return float(middle[0]), float(middle[1]), float(np.linalg.norm(corners - middle, axis=1).max())
 
 
 def _add_road(builder: MeshBuilder, street: Curve, terrain: Terrain, layout: Layout, rng: np.random.Generator) -> None:
@@ -111,27 +152,33 @@ def _add_road(builder: MeshBuilder, street: Curve, terrain: Terrain, layout: Lay
     builder.add(np.concatenate([xy, z[..., None]], -1).reshape(-1, 3), faces, np.repeat(kinds, 2 * (len(s) - 1)))
 
 
-def _add_ground(
-    builder: MeshBuilder, street: Curve, terrain: Terrain, layout: Layout, rng: np.random.Generator
+def add_ground(
+    builder: MeshBuilder,
+    streets: list[Curve],
+    terrain: Terrain,
+    layout: Layout,
+    rng: np.random.Generator,
+    tucked: float = 0.1,
 ) -> None:
-    """Grass everywhere else, a little below the pavements so that their edge shows."""
+    """Grass everywhere else, a little below the pavements so that their edge shows; it reaches `tucked` m under them."""
     from scipy.spatial import cKDTree
 
-    middle = street.position(street.sample(0.5))
+    middle = np.concatenate([street.position(street.sample(0.5)) for street in streets])
     low, high = middle.min(0) - MARGIN, middle.max(0) + MARGIN
     x, y = (np.arange(low[k], high[k] + 1.0, 1.0) for k in (0, 1))
     xy = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1)
     z = terrain.height(xy) + KERB - 0.03 + rng.normal(0, 0.015, xy.shape[:2])
     nearest = np.asarray(cKDTree(middle).query(xy.reshape(-1, 2), distance_upper_bound=layout.band)[0])
-    under_road = nearest < layout.band - 0.1
+    under_road = nearest < layout.band - tucked
     faces = grid_faces(len(x), len(y))
     faces = faces[~under_road[faces].any(axis=1)]
     builder.add(np.concatenate([xy, z[..., None]], -1).reshape(-1, 3), faces, Surface.LAWN)
 
 
-def _add_row(
+def add_row(
     builder: MeshBuilder,
-    lots: _Lots,
+    lots: Lots,
+    street: Curve,
     terrain: Terrain,
     layout: Layout,
     rng: np.random.Generator,
@@ -140,7 +187,7 @@ def _add_row(
 ) -> None:
     """Houses side by side along one side of the street (1 left, -1 right), where there is room."""
     s, setback = rng.uniform(0, 4), rng.uniform(*layout.setback)
-    while s < lots.street.length:
+    while s < street.length:
         width = rng.uniform(*layout.house_width)
         depth = rng.uniform(*layout.house_depth)
         if rng.random() < 0.35:
@@ -148,20 +195,22 @@ def _add_row(
         back = setback + (0.0 if first else layout.second_row + rng.uniform(0, 8))
         offset = layout.band + 0.3 + back
         # Outside a bend there is more frontage than street, inside less.
-        bend = float(lots.street.curvature(np.array([min(s, lots.street.length)]))[0])
+        bend = float(street.curvature(np.array([min(s, street.length)]))[0])
         along = 1 / np.clip(1 - side * offset * bend, 0.6, 3.0)
         placed = False
         for share in (1.0, 0.8, 0.65):
-            corners, position, yaw = _lot(lots.street, s + along * width / 2, side, offset, width, share * depth)
+            corners, position, yaw = _lot(street, s + along * width / 2, side, offset, width, share * depth)
             if lots.is_free(corners):
-                lots.take(corners)
                 ground = float(terrain.height(position)) + KERB
-                builder.add_mesh(house(rng, width, share * depth, layout.storeys), [*position, ground], yaw)
+                plan = np.random.default_rng(1) if layout.identical else rng
+                building = house(plan, width, share * depth, layout.storeys)
+                lots.take(corners, float(building.vertices[:, 2].max()))
+                builder.add_mesh(building, [*position, ground], yaw)
                 if first and setback > 1.8:
-                    _add_front_garden(builder, rng, width, setback, [*position, ground], yaw)
+                    _add_front_garden(builder, rng, layout, width, setback, [*position, ground], yaw)
                 placed = True
                 break
-        opening = 9.0 if first and rng.random() < 0.08 else rng.uniform(*layout.gap)
+        opening = 9.0 if first and rng.random() < layout.openings else rng.uniform(*layout.gap)
         s += along * (width + opening) if placed else 1.0
 
 
@@ -177,11 +226,17 @@ def _lot(street: Curve, s: float, side: int, offset: float, width: float, depth:
 
 
 def _add_front_garden(
-    builder: MeshBuilder, rng: np.random.Generator, width: float, setback: float, position: Any, yaw: float
+    builder: MeshBuilder,
+    rng: np.random.Generator,
+    layout: Layout,
+    width: float,
+    setback: float,
+    position: Any,
+    yaw: float,
 ) -> None:
     """A hedge or a low wall between garden and pavement."""
     kind = rng.random()
-    if kind > 0.7:
+    if kind > layout.gardens:
         return
     length, across = width * rng.uniform(0.5, 0.95), -(setback - 0.2)
     shift = rng.uniform(-0.5, 0.5) * (width - length)
@@ -191,35 +246,50 @@ def _add_front_garden(
     builder.add_mesh(part, place, yaw)
 
 
-def _add_street_furniture(
-    builder: MeshBuilder, street: Curve, terrain: Terrain, layout: Layout, rng: np.random.Generator, side: int
+def add_street_furniture(
+    builder: MeshBuilder,
+    street: Curve,
+    terrain: Terrain,
+    layout: Layout,
+    rng: np.random.Generator,
+    side: int,
+    allowed: Callable[[Floats, float], bool] | None = None,
 ) -> None:
-    """Parked cars, trees, poles and bins along one side."""
+    """Parked cars, trees, poles and bins along one side; `allowed` says of a place (2,) and its offset whether it is free."""
 
     def put(part: Mesh, s: float, offset: float, lift: float, turn: float = 0.0) -> None:
         at = np.array([s])
         xy, tangent = street.beside(at, side * offset)[0], street.tangent(at)[0] * side
+        if allowed is not None and not allowed(xy, offset):
+            return
         yaw = float(np.arctan2(tangent[1], tangent[0])) + turn
         builder.add_mesh(part, [*xy, float(terrain.height(xy)) + lift], yaw)
 
     for s in _stations(rng, street.length, 5.6, 8.0):
         # Nobody parks in a bend.
-        if rng.random() < 0.42 and abs(float(street.curvature(np.array([s]))[0])) < 0.06:
+        if rng.random() < layout.parked and abs(float(street.curvature(np.array([s]))[0])) < 0.06:
             turn = rng.normal(0, 0.02) + (np.pi if rng.random() < 0.2 else 0.0)
             put(furniture.parked_car(rng), s, layout.road - 1.05 + rng.uniform(-0.12, 0.12), 0.0, turn)
     for s in _stations(rng, street.length, 8.0, 15.0):
-        if rng.random() < 0.6:
+        if rng.random() < layout.trees:
             put(furniture.tree(rng), s, layout.road + 0.7, KERB)
-    for s in _stations(rng, street.length, 14.0, 30.0):
+    for s in _stations(rng, street.length, 14.0, 30.0) if layout.poles and not layout.identical else ():
         put(furniture.pole(rng), s, layout.road + 0.4, KERB, np.pi)
-    for s in _stations(rng, street.length, 18.0, 40.0):
+    for s in np.arange(7.0, street.length, 28.0) if layout.poles and layout.identical else ():
+        put(furniture.pole(np.random.default_rng(1)), float(s), layout.road + 0.4, KERB, np.pi)
+    for s in _stations(rng, street.length, 18.0, 40.0) if layout.bins else ():
         put(furniture.bins(rng), s, layout.band - 0.5, KERB)
 
 
-def _add_garden_trees(builder: MeshBuilder, lots: _Lots, terrain: Terrain, rng: np.random.Generator) -> None:
+def add_garden_trees(
+    builder: MeshBuilder, lots: Lots, terrain: Terrain, layout: Layout, rng: np.random.Generator
+) -> None:
     """Trees wherever a random place is free."""
-    middle = lots.street.position(lots.street.sample(5.0))
-    for place in middle.repeat(3, axis=0) + rng.uniform(-35, 35, (3 * len(middle), 2)):
+    if not layout.garden_trees:
+        return
+    middle = np.concatenate([street.position(street.sample(5.0)) for street in lots.streets])
+    count = layout.garden_trees
+    for place in middle.repeat(count, axis=0) + rng.uniform(-35, 35, (count * len(middle), 2)):
         corners = place + 1.2 * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
         if lots.is_free(corners):
             builder.add_mesh(furniture.tree(rng), [*place, float(terrain.height(place)) + KERB])

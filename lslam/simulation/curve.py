@@ -80,6 +80,17 @@ def smooth_curve(points: NDArray[Any], closed: bool, smoothing: float = 1.5) -> 
     return Curve(spline, float(knots[-1]), closed)
 
 
+def stretched(curve: Curve, by: float) -> Curve:
+    """An open curve made longer by `by` m, straight on, at both ends; a closed one as it is."""
+    if curve.closed or by <= 0:
+        return curve
+    ends = np.array([0.0, curve.length])
+    at, along = curve.position(ends), curve.tangent(ends)
+    steps = np.arange(2.0, by + 2.0, 2.0)[:, None]
+    before, after = at[0] - steps[::-1] * along[0], at[1] + steps * along[1]
+    return smooth_curve(np.concatenate([before, curve.position(curve.sample(1.0)), after]), closed=False)
+
+
 def _resample(points: Floats) -> tuple[Floats, float]:
     """The polyline at even distances near `SPACING`, and the distance."""
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])

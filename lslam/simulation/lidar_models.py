@@ -1,4 +1,4 @@
-"""Spinning LiDARs by their data sheets."""
+"""LiDARs by their data sheets: spinning ones, and one whose pattern does not repeat."""
 
 from __future__ import annotations
 
@@ -15,15 +15,37 @@ Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class LidarModel:
-    """A LiDAR that turns `columns` times a revolution and fires one ray per ring each time.
+class Rosette:
+    """Two prisms that turn against each other draw flowers that never close: a little more of the view with every scan.
 
-    elevations_deg : of each ring, from the top ring (0) downwards; columns : firings per revolution
+    half_view_deg : from the middle to the rim; turns : of the two prisms per scan, incommensurable
+    """
+
+    half_view_deg: float
+    turns: tuple[float, float]
+
+    def beams(self, index: int, columns: int, lines: Floats) -> tuple[Floats, Floats]:
+        """Azimuth and elevation (columns, rings) of scan `index`, rad; `lines` (rings,) fan out upright."""
+        scans = index + np.arange(columns) / columns
+        a, b = (2 * np.pi * np.mod(scans * turns, 1.0) for turns in self.turns)
+        half = np.radians(self.half_view_deg) / 2
+        azimuth = half * (np.cos(a) + np.cos(b))
+        elevation = half * (np.sin(a) + np.sin(b))
+        return np.broadcast_to(azimuth[:, None], (columns, len(lines))), elevation[:, None] + lines
+
+
+@dataclass(frozen=True)
+class LidarModel:
+    """A LiDAR that fires `columns` times per scan, one ray per ring each time, evenly round its axis.
+
+    elevations_deg : of each ring, from the top ring (0) downwards; columns : firings per scan, a revolution
     range_min, range_max : m; range_noise : standard deviation, m; range_step : resolution, m
     angle_noise_deg : standard deviation of azimuth and elevation
     range_10pct : m at which a surface of 10 % reflectivity, met squarely, is seen 94 % of the time
     dropout : share of returns lost for no reason; order : of the points, ring after ring or column after column
     start_deg : azimuth of the first column, 0 forward, counter-clockwise; clockwise : sense of turning, from above
+    rosette : when given, it does not spin but looks forward through two turning prisms
+    ring_bias, ring_tilt_deg : standard deviations over the rings of what calibration missed: range, m, and elevation
     """
 
     name: str
@@ -39,6 +61,9 @@ class LidarModel:
     order: Literal["ring", "column"] = "ring"
     start_deg: float = 0.0
     clockwise: bool = False
+    rosette: Rosette | None = None
+    ring_bias: float = 0.0
+    ring_tilt_deg: float = 0.0
 
     @property
     def rings(self) -> int:
@@ -57,6 +82,19 @@ class LidarModel:
         azimuth = np.radians(self.start_deg) + (-turn if self.clockwise else turn)
         return azimuth, np.radians(np.array(self.elevations_deg))
 
+    @cached_property
+    def ring_errors(self) -> tuple[Floats, Floats]:
+        """What calibration missed, of each ring and for good: range (rings,), m, and elevation (rings,), rad."""
+        bias, tilt = np.random.default_rng(self.rings).standard_normal((2, self.rings))
+        return self.ring_bias * bias, np.radians(self.ring_tilt_deg) * tilt
+
+    def beams(self, index: int) -> tuple[Floats, Floats]:
+        """Azimuth and elevation of every ray of scan `index`, rad, each broadcasting to (columns, rings)."""
+        if self.rosette is not None:
+            return self.rosette.beams(index, self.columns, np.radians(np.array(self.elevations_deg)))
+        azimuth, elevation = self.angles
+        return azimuth[:, None], elevation
+
 
 def _even(top_deg: float, bottom_deg: float, count: int) -> tuple[float, ...]:
     return tuple(float(e) for e in np.linspace(top_deg, bottom_deg, count))
@@ -72,8 +110,23 @@ LIDARS = {
         LidarModel(
             "hdl64", (*_even(2.0, -8.33, 32), *_even(-8.83, -24.33, 32)), 2000, 0.9, 120.0, 0.02, 0.002, 0.01, 50.0, 0.03,
         ),
+        # As its recordings show it: up to 2,170 returns in a ring, roads seen to 50 m.
         LidarModel(
-            "os1-32", _even(22.5, -22.5, 32), 1024, 0.3, 100.0, 0.03, 0.01, 0.01, 45.0, 0.02, "column", 180.0, True
+            "hdl64-kitti", (*_even(2.0, -8.33, 32), *_even(-8.83, -24.33, 32)), 2170, 0.9, 120.0, 0.02, 0.002, 0.01, 60.0, 0.015,
+            ring_bias=0.012, ring_tilt_deg=0.03,
+        ),
+        LidarModel(
+            "os1-32", _even(22.5, -22.5, 32), 1024, 0.3, 100.0, 0.03, 0.01, 0.01, 45.0, 0.02, "column", 180.0, True,
+            ring_bias=0.01, ring_tilt_deg=0.02,
+        ),
+        LidarModel(
+            "os1-64", _even(22.5, -22.5, 64), 1024, 0.3, 100.0, 0.03, 0.01, 0.01, 45.0, 0.02, "column", 180.0, True,
+            ring_bias=0.01, ring_tilt_deg=0.02,
+        ),
+        # Like an Avia: 240,000 rays/s in six lines through a round view of 70 degrees.
+        LidarModel(
+            "livox", _even(0.7, -0.7, 6), 4000, 1.0, 190.0, 0.02, 0.01, 0.05, 90.0, 0.02, "column",
+            rosette=Rosette(35.2, (123.37, -75.11)),
         ),
     )
 }  # fmt: skip

@@ -27,6 +27,7 @@ class Surface(IntEnum):
     POLE = 8
     CAR = 9
     FENCE = 10
+    PERSON = 11
 
 
 @dataclass(frozen=True)

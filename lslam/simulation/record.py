@@ -14,19 +14,20 @@ import numpy as np
 
 from lslam.errors import OutputError, OutputExistsError
 from lslam.formats.atomic import atomic_write
-from lslam.formats.point_files import write_points
 from lslam.formats.pose_rows import seconds_text
 from lslam.formats.sequence_toml import FILE_NAME, SequenceInfo, write_sequence_toml
 from lslam.formats.trajectory_files import write_kitti
 from lslam.geometry import se3
+from lslam.simulation.osm_extract import write_extracts
 from lslam.simulation.scenarios import SimulatedDrive
-from lslam.types.scan import Scan
+from lslam.simulation.sensors import GNSS_FILE, IMU_FILE, TRUTH, write_readings, write_truth
+from lslam.simulation.stream import MARK, PER_POINT, POINTS, fingerprint, read_mark, write_mark, write_scans
 from lslam.types.trajectory import Trajectory
 
 log = logging.getLogger("lslam")
 
 NUMBER = "00"  # of the one sequence in the folder
-PER_POINT = "per_point"
+_MAP_SEED = 2**32 - 9  # of the faults in the perturbed map
 
 
 @dataclass(frozen=True)
@@ -43,84 +44,109 @@ def record(
     drive: SimulatedDrive,
     out: Path,
     overwrite: bool = False,
-    on_scan: Callable[[Scan], None] | None = None,
+    on_scan: Callable[[int], None] | None = None,
+    resume: bool = False,
 ) -> Recorded:
     """Trace all scans of `drive` and write `out`/sequences/00 and `out`/poses/00.txt.
 
-    The poses are of camera 0, as KITTI's; everything else in `out` is left alone. `on_scan` is called after each scan.
+    The poses are of camera 0, as KITTI's; everything else in `out` is left alone. `on_scan` is called after each scan. What
+    is interrupted keeps its scans in `sequences/00.part`, and `resume` goes on there with the same bytes.
 
     Raises
     ------
-    OutputExistsError : `out` holds something and `overwrite` is not set
+    OutputExistsError : `out` holds something and neither `overwrite` nor `resume` is set, or what was begun is another drive
     OutputError : `out` cannot be written, or the disk is too small
     """
     sequence, poses = out / "sequences" / NUMBER, out / "poses" / f"{NUMBER}.txt"
-    check_target(out, overwrite)
-    part = sequence.with_name(NUMBER + ".part")
+    check_target(out, overwrite, resume)
+    part = _part(out)
+    done = False
     try:
-        shutil.rmtree(part, ignore_errors=True)
-        for folder in (part / "velodyne", part / PER_POINT, poses.parent):
+        if not resume or not part.is_dir():
+            shutil.rmtree(part, ignore_errors=True)
+        elif read_mark(part) != fingerprint(drive):
+            done = True
+            raise OutputExistsError(f"{part} was begun with other settings: give the same ones, or --overwrite it")
+        for folder in (part / POINTS, part / PER_POINT, poses.parent):
             folder.mkdir(parents=True, exist_ok=True)
-        _check_space(out, drive)
-        points = _write_scans(drive, part, on_scan)
-        _write_texts(drive, part)
+        _check_space(out, part, drive)
+        write_mark(part, drive)
+        points = write_scans(drive, part, on_scan)
+        _write_sides(drive, part)
+        (part / MARK).unlink()
         if sequence.exists():
             shutil.rmtree(sequence)
         os.replace(part, sequence)
+        done = True
         write_kitti(poses, _in_camera(drive))
     except OSError as error:
         raise OutputError(f"{error.filename or out} cannot be written: {error.strerror or error}") from None
     finally:
-        shutil.rmtree(part, ignore_errors=True)
-        _remove_empty(out)
+        if not done:
+            _keep_what_is_worth_it(out, part)
     size = sum(file.stat().st_size for file in sequence.rglob("*") if file.is_file())
     return Recorded(sequence, poses, points, size)
 
 
-def check_target(out: Path, overwrite: bool) -> None:
-    """Raise OutputExistsError when `out` is a file, or holds something and `overwrite` is not set."""
+def check_target(out: Path, overwrite: bool, resume: bool = False) -> None:
+    """Raise OutputExistsError when `out` is a file, or holds something and neither `overwrite` nor `resume` allows that."""
     try:
         if out.exists() and not out.is_dir():
             raise OutputExistsError(f"{out} is a file: give --out a folder that does not exist yet")
-        if not overwrite and out.is_dir() and any(out.iterdir()):
+        if overwrite or not out.is_dir() or not any(out.iterdir()):
+            return
+        begun = _part(out).is_dir()
+        if resume and begun:
+            return
+        if begun:
             raise OutputExistsError(
-                f"{out} exists already: choose another --out, or --overwrite to replace the sequence in it"
+                f"{out} holds a simulation that was interrupted: --resume goes on, --overwrite begins anew"
             )
+        raise OutputExistsError(
+            f"{out} exists already{' and nothing in it was interrupted' if resume else ''}: choose another --out, or "
+            "--overwrite to replace the sequence in it"
+        )
     except OSError as error:
         raise OutputError(f"{out} cannot be read: {error.strerror or error}") from None
 
 
-def _check_space(out: Path, drive: SimulatedDrive) -> None:
-    """Refuse at once what will not fit, instead of failing hours later."""
-    needed = len(drive) * drive.lidar.rays * (16 + 2)
+def _part(out: Path) -> Path:
+    return out / "sequences" / f"{NUMBER}.part"
+
+
+def _check_space(out: Path, part: Path, drive: SimulatedDrive) -> None:
+    """Say how much disk it takes, and refuse at once what will not fit, instead of failing hours later."""
+    left = len(drive) - sum(1 for _ in (part / PER_POINT).glob("*.npz"))
+    needed = left * drive.lidar.rays * (16 + 2)
     free = shutil.disk_usage(out).free
     if needed > free:
         raise OutputError(
-            f"{out} needs up to {needed / 1e9:.1f} GB, the disk has {free / 1e9:.1f} GB left: use fewer scans (--count)"
+            f"{out} needs up to {needed / 1e9:.1f} GB, the disk has {free / 1e9:.1f} GB left: use fewer scans (--scans)"
         )
-    log.info("%d scans of up to %d points, at most %.1f MB", len(drive), drive.lidar.rays, needed / 1e6)
+    kept = f", {len(drive) - left} of them are there already" if left < len(drive) else ""
+    log.info("%d scans of up to %d points%s: at most %.1f MB", len(drive), drive.lidar.rays, kept, needed / 1e6)
 
 
-def _remove_empty(out: Path) -> None:
-    """What failed leaves no folders behind, so that the same command can be given again."""
+def _keep_what_is_worth_it(out: Path, part: Path) -> None:
+    """Whole scans stay for --resume; where there are none, nothing is left behind, so that the command can be given again."""
+    with contextlib.suppress(OSError):
+        kept = sum(1 for _ in (part / PER_POINT).glob("*.npz"))
+        if kept and read_mark(part) is not None:
+            log.warning("%d scans are kept in %s: the same command with --resume goes on", kept, part)
+            return
+    shutil.rmtree(part, ignore_errors=True)
     for folder in (out / "sequences", out / "poses", out):
         with contextlib.suppress(OSError):
             folder.rmdir()
 
 
-def _write_scans(drive: SimulatedDrive, folder: Path, on_scan: Callable[[Scan], None] | None) -> int:
-    """Points as KITTI's .bin; times and rings beside them. Returns the number of points."""
-    total = 0
-    for scan in drive:
-        write_points(folder / "velodyne" / f"{scan.index:06d}.bin", scan.points, scan.intensity)
-        # All rays of a compensated scan were fired at its stamp.
-        times = np.zeros(len(scan), np.float32) if scan.times is None else scan.times
-        with atomic_write(folder / PER_POINT / f"{scan.index:06d}.npz") as stream:
-            np.savez_compressed(stream, t=times, ring=scan.rings)  # type: ignore[arg-type]
-        total += len(scan)
-        if on_scan is not None:
-            on_scan(scan)
-    return total
+def _write_sides(drive: SimulatedDrive, folder: Path) -> None:
+    """Everything beside the scans."""
+    _write_texts(drive, folder)
+    write_readings(folder, drive.readings)
+    if drive.city.footprints:
+        write_extracts(folder, drive.city, drive.readings.origin, np.random.default_rng([drive.seed, _MAP_SEED]))
+    write_truth(folder / TRUTH, drive.vehicle, drive.stamps_ns, drive.end, drive.readings)
 
 
 def _write_texts(drive: SimulatedDrive, folder: Path) -> None:
@@ -142,7 +168,11 @@ def _write_texts(drive: SimulatedDrive, folder: Path) -> None:
         per_point=PER_POINT,
         ground_truth=f"../../poses/{NUMBER}.txt",
         ground_truth_frame="cam0",
+        imu=None if drive.imu is None else IMU_FILE,
+        gnss=None if drive.gnss is None else GNSS_FILE,
         T_cam0_lidar=T_cam0_lidar,
+        T_lidar_imu=drive.calibration.T_lidar_imu,
+        T_lidar_gnss=drive.calibration.T_lidar_gnss,
     )
     write_sequence_toml(folder / FILE_NAME, info)
 

@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "readers"))
 from sequence_builders import cloud, kitti_root, raw_drive
@@ -76,6 +77,19 @@ def test_gaps_and_imu_units(tmp_path: Path) -> None:
     facts = inspect(open_sequence(drive))
     assert facts["imu"]["gravity_unit"] == "g"
     assert any("multiply by 9.80665" in p for p in facts["problems"])
+
+
+@pytest.mark.parametrize(("up", "bend", "unit"), [(9.81, 12.0, "m/s2"), (0.0, 3.0, None), (1.0, 1.2, "g")])
+def test_long_bends_do_not_hide_gravity_but_its_absence_shows(
+    up: float, bend: float, unit: str | None, tmp_path: Path
+) -> None:
+    """Nine tenths of the time in one bend: the calm rest tells the unit."""
+    drive = raw_drive(tmp_path, 8)
+    rows = (f"{1317042272 + k / 100},0,{bend if k % 1000 >= 100 else 0},{up},0,0,0\n" for k in range(2000))
+    (drive / "imu.csv").write_text("t,ax,ay,az,gx,gy,gz\n" + "".join(rows))
+    facts = inspect(open_sequence(drive))
+    assert facts["imu"]["gravity_unit"] == unit
+    assert any("mean specific force" in p for p in facts["problems"]) == (unit != "m/s2")
 
 
 def test_help_is_light() -> None:

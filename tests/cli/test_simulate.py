@@ -33,7 +33,9 @@ def test_list_names_scenarios_and_sensors() -> None:
     listed = lslam("--list")
     assert listed.returncode == 0
     assert [line.split()[1] for line in listed.stdout.splitlines()] == [
-        "block", "street", "sample", "vlp16", "hdl64", "os1-32",
+        "block", "climbing", "closed", "corridor", "identical", "large-eight", "motorway", "open", "residential",
+        "small-eight", "street", "urban", "walk", "sample", "vlp16", "hdl64", "hdl64-kitti", "os1-32", "os1-64", "livox",
+        "icm20948", "icm20948-calibrated", "ideal",
     ]  # fmt: skip
 
 
@@ -45,7 +47,7 @@ def test_list_names_scenarios_and_sensors() -> None:
         ([], "SCENARIO is missing"),
         (["street", "--out", "OUT", "--count", "5000"], "--speed"),
         (["block", "--out", "OUT", "--speed", "90"], "at most 40 m/s"),
-        (["block", "--out", "OUT", "--lidar", "livox"], "no LiDAR 'livox'"),
+        (["block", "--out", "OUT", "--lidar", "lidex"], "no LiDAR 'lidex'"),
     ],
 )
 def test_wrong_use_is_one_sentence_and_exit_code_2(arguments: list[str], sentence: str, tmp_path: Path) -> None:

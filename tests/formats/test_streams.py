@@ -85,8 +85,16 @@ def test_gnss_round_trip_and_unknown_sigma(tmp_path: Path) -> None:
     back = read_gnss_csv(tmp_path / "gnss.csv")
     np.testing.assert_array_equal(back.lat_lon_alt, stream.lat_lon_alt)
     np.testing.assert_array_equal(back.sigma, stream.sigma)
+    np.testing.assert_array_equal(back.stamps_ns, [1, 2])
     (tmp_path / "gnss.csv").write_text("t,lat,lon,alt\n0.5,49,8,100\n")
     assert np.isnan(read_gnss_csv(tmp_path / "gnss.csv").sigma[0])
+
+
+@pytest.mark.parametrize("stamps", [[0, 10_000_000], [9_220_000_000, 9_230_000_000], [0, 2**62], [-5, 5]])
+def test_stamps_in_ns_are_ns_however_small(stamps: list[int], tmp_path: Path) -> None:
+    """Recordings that count from zero: ten seconds are 10000000000, not three hundred years."""
+    write_imu_csv(tmp_path / "imu.csv", ImuStream(np.array(stamps), np.ones((2, 3)), np.zeros((2, 3))))
+    assert read_imu_csv(tmp_path / "imu.csv").stamps_ns.tolist() == stamps
 
 
 BAD_CSV = {
@@ -95,6 +103,8 @@ BAD_CSV = {
     "t,ax,ay,az,gx,gy\n": "no column gyro_z",
     "t,ax,ay,az,gx,gy,gz\n0,1,2,3,4,5\n": "line 2: 6 columns where the header has 7",
     "t,ax,ay,az,gx,gy,gz\n0,1,2,3,4,5,6\n1,1,2,x,4,5,6\n": "line 3",
+    "stamp_ns,ax,ay,az,gx,gy,gz\n0,1,2,3,4,5,6\n0.5,1,2,3,4,5,6\n": "line 3",
+    "stamp_ns,ax,ay,az,gx,gy,gz\nsoon,1,2,3,4,5,6\n": "line 2",
 }
 
 

@@ -1,0 +1,230 @@
+"""Buildings of an OpenStreetMap extract: which elements count, their outlines in metres, their heights; and the way back."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.errors import InputError
+from lslam.formats.osm_files import DECIMALS, Member, OsmData, Relation, Way, read_osm
+from lslam.formats.osm_rings import footprints_from_rings, join_rings
+from lslam.formats.osm_tags import base_of, height_of, is_underground
+from lslam.geometry.geodesy import from_local, to_local
+from lslam.types.building import Building, Footprint, footprint_polygon
+
+Floats = NDArray[np.float64]
+
+FARTHEST = 100e3  # m
+
+
+@dataclass(frozen=True)
+class BuildingExtract:
+    """The buildings of one extract, in the local frame at `origin`.
+
+    buildings : in the order of the file, ways first; skipped : why elements were left out -> how many
+    origin : (3,) lat, lon (deg), height (m) of x = y = 0; attribution : as `OsmData.attribution`; source : for messages
+    """
+
+    buildings: list[Building]
+    skipped: Mapping[str, int]
+    origin: Floats
+    attribution: str | None
+    source: str
+
+
+def read_buildings(path: Path, origin: NDArray[Any]) -> BuildingExtract:
+    """Read the buildings of `path` (OSM XML or Overpass JSON) into the local frame at `origin` (3,) lat, lon, height.
+
+    Raises InputError naming the file: unreadable (`read_osm`), or without one building.
+    """
+    data = read_osm(path)
+    extract = buildings_of(data, origin, str(path))
+    if not extract.buildings:
+        why = ", ".join(f"{count} x {reason}" for reason, count in extract.skipped.items())
+        raise InputError(
+            f"{path} holds no building outline ({len(data.ways)} ways, {len(data.relations)} relations"
+            f"{'; left out: ' + why if why else ''}): fetch an extract with the buildings of the place"
+        )
+    return extract
+
+
+def buildings_of(data: OsmData, origin: NDArray[Any], source: str = "the extract") -> BuildingExtract:
+    """Footprints of every building in `data`, by the rules of CONVENTIONS ("OSM and geodesy").
+
+    Closed ways and multipolygons count; `building=no`, what lies underground and what misses nodes does not.
+    Raises InputError when all nodes lie more than 100 km from the origin, where a local frame means nothing.
+    """
+    at = np.asarray(origin, np.float64)
+    where = _Positions(data, at)
+    if data.nodes and not (away := where.distance()) < FARTHEST:
+        far = "more than a continent" if not np.isfinite(away) else _far(away)
+        raise InputError(f"{source} lies {far} away from the origin: {_way_out(at)}")
+    skipped: Counter[str] = Counter()
+    of_relations: list[Building] = []
+    outlines: set[int] = set()
+    for relation in data.relations.values():
+        if relation.tags.get("type") != "multipolygon" or not _counts(relation.tags, skipped):
+            continue
+        footprints = _relation_footprints(relation, data, where, skipped)
+        if footprints:
+            of_relations.append(_building(f"relation/{relation.id}", footprints, relation.tags))
+            outlines |= {m.ref for m in relation.members if m.kind == "way" and m.role in ("", "outer")}
+    buildings: list[Building] = []
+    for way in data.ways.values():
+        if not _counts(way.tags, skipped):
+            continue
+        if way.id in outlines:
+            skipped["outline of a multipolygon already read"] += 1
+            continue
+        footprints = _way_footprints(way, where, skipped)
+        if footprints:
+            buildings.append(_building(f"way/{way.id}", footprints, way.tags))
+    return BuildingExtract(buildings + of_relations, dict(skipped), at, data.attribution, source)
+
+
+def buildings_near(extract: BuildingExtract, positions: NDArray[Any], reach: float) -> list[Building]:
+    """The buildings that come within `reach` m of one of the `positions` (N, 2), m in the extract's frame.
+
+    Raises InputError saying how far away the extract is when there are none.
+    """
+    from shapely import STRtree, points
+
+    shapes = [(k, footprint_polygon(f)) for k, b in enumerate(extract.buildings) for f in b.footprints]
+    tree = STRtree(points(np.asarray(positions, np.float64)[:, :2]))
+    (rows, _), distance = tree.query_nearest([shape for _, shape in shapes], return_distance=True, all_matches=False)
+    wanted = {shapes[row][0] for row, away in zip(rows, distance, strict=True) if away <= reach}
+    near = [building for k, building in enumerate(extract.buildings) if k in wanted]
+    if not near:
+        raise InputError(
+            f"{extract.source} has no building within {reach:g} m of the path, the nearest is "
+            f"{_far(float(distance.min()))} away: {_way_out(extract.origin)}"
+        )
+    return near
+
+
+def osm_from_buildings(buildings: Sequence[Building], origin: NDArray[Any], attribution: str | None) -> OsmData:
+    """An extract of `buildings` (local frame at `origin`), degrees rounded to 7 decimals: what a file of it reads back as.
+
+    One footprint without holes is a way, everything else a multipolygon. Nodes, and rings of multipolygons, get negative
+    numbers, which no element of OpenStreetMap has.
+    """
+    data = OsmData(attribution=attribution)
+    numbers = iter(range(-1, -(2**62), -1))
+    taken = {int(b.osm_id.split("/")[1]) for b in buildings}
+
+    def fresh() -> int:
+        return next(n for n in numbers if n not in taken)
+
+    def add_ring(ring: Floats, number: int, tags: Mapping[str, str]) -> int:
+        fixes = from_local(np.column_stack([ring, np.zeros(len(ring))]), origin)
+        ids = [fresh() for _ in ring]
+        for node, (lat, lon, _) in zip(ids, fixes.tolist(), strict=True):
+            data.add_node(node, round(lat, DECIMALS), round(lon, DECIMALS))
+        data.add_way(Way(number, (*ids, ids[0]), tags))
+        return number
+
+    for building in buildings:
+        kind, number = building.osm_id.split("/")
+        tags = _written_tags(building)
+        if kind == "way" and len(building.footprints) == 1 and not building.footprints[0].holes:
+            add_ring(building.footprints[0].outer, int(number), tags)
+            continue
+        members = []
+        for footprint in building.footprints:
+            members.append(Member("way", add_ring(footprint.outer, fresh(), {}), "outer"))
+            members += [Member("way", add_ring(hole, fresh(), {}), "inner") for hole in footprint.holes]
+        # A way that became several outlines cannot keep its number: relations have their own.
+        found = int(number) if kind == "relation" else fresh()
+        data.add_relation(Relation(found, tuple(members), {"type": "multipolygon", **tags}))
+    return data
+
+
+class _Positions:
+    """Rings of node numbers as corners in metres; every node is projected once."""
+
+    def __init__(self, data: OsmData, origin: Floats) -> None:
+        self.row = {number: k for k, number in enumerate(data.nodes)}
+        fixes = np.array([(lat, lon, 0.0) for lat, lon in data.nodes.values()]).reshape(-1, 3)
+        self.xy = to_local(fixes, origin)[:, :2]
+
+    def distance(self) -> float:
+        """From the origin to the nearest node, m; inf where the projection has no answer."""
+        return float(np.min(np.nan_to_num(np.linalg.norm(self.xy, axis=1), nan=np.inf)))
+
+    def has(self, nodes: Iterable[int]) -> bool:
+        return all(node in self.row for node in nodes)
+
+    def ring(self, nodes: Sequence[int]) -> Floats:
+        return np.asarray(self.xy[[self.row[node] for node in nodes[:-1]]])
+
+
+def _counts(tags: Mapping[str, str], skipped: Counter[str]) -> bool:
+    """True for a building above the ground; other buildings are counted in `skipped`."""
+    kind = tags.get("building")
+    if kind is None:
+        return False
+    if kind.strip().lower() == "no":
+        skipped["building=no"] += 1
+    elif is_underground(tags):
+        skipped["underground"] += 1
+    else:
+        return True
+    return False
+
+
+def _way_footprints(way: Way, where: _Positions, skipped: Counter[str]) -> tuple[Footprint, ...]:
+    if not where.has(way.nodes) or not way.nodes:
+        skipped["nodes missing"] += 1
+    elif not way.is_closed:
+        skipped["open way"] += 1
+    elif found := footprints_from_rings([where.ring(way.nodes)], []):
+        return found
+    else:
+        skipped["no area"] += 1
+    return ()
+
+
+def _relation_footprints(
+    relation: Relation, data: OsmData, where: _Positions, skipped: Counter[str]
+) -> tuple[Footprint, ...]:
+    members = [m for m in relation.members if m.kind == "way" and m.role in ("", "outer", "inner")]
+    ways = [data.ways.get(m.ref) for m in members]
+    if not all(way is not None and way.nodes and where.has(way.nodes) for way in ways):
+        skipped["nodes missing"] += 1
+        return ()
+    parts = [(m.role == "inner", way.nodes) for m, way in zip(members, ways, strict=True) if way is not None]
+    outer, inner = (join_rings([nodes for is_inner, nodes in parts if is_inner == wanted]) for wanted in (False, True))
+    if not outer or inner is None:
+        skipped["rings that do not close"] += 1
+        return ()
+    found = footprints_from_rings([where.ring(ring) for ring in outer], [where.ring(ring) for ring in inner])
+    if not found:
+        skipped["no area"] += 1
+    return found
+
+
+def _building(osm_id: str, footprints: tuple[Footprint, ...], tags: Mapping[str, str]) -> Building:
+    own = {key: value for key, value in tags.items() if key != "type"}
+    return Building(osm_id, footprints, height_of(tags), base_of(tags), own)
+
+
+def _written_tags(building: Building) -> dict[str, str]:
+    """The building's tags, its height among them where the tags say another or none."""
+    tags = {"building": "yes", **building.tags}
+    if building.height is not None and height_of(tags) != building.height:
+        tags["height"] = f"{building.height:.10g}"
+    return tags
+
+
+def _way_out(origin: Floats) -> str:
+    return f"check --origin ({origin[0]:.5f},{origin[1]:.5f}) or fetch the extract of that place"
+
+
+def _far(distance: float) -> str:
+    return f"{distance / 1000:.1f} km" if distance > 1000 else f"{distance:.0f} m"

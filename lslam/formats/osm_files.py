@@ -1,0 +1,238 @@
+"""OpenStreetMap files: nodes, ways and relations from XML or Overpass JSON, and back to XML.
+
+XML is parsed without entities or document types, so that a hostile file cannot grow in memory.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+from xml.etree.ElementTree import Element, ParseError
+from xml.sax.saxutils import quoteattr
+
+from lslam.errors import InputError
+from lslam.formats.atomic import atomic_write
+
+ATTRIBUTION = "© OpenStreetMap contributors, ODbL 1.0, openstreetmap.org/copyright"
+GENERATOR = "lslam"
+DECIMALS = 7  # of a degree, as in OpenStreetMap's own database: 1.1 cm
+WAY_OUT = "fetch the extract again"
+
+
+@dataclass(frozen=True)
+class Way:
+    """A line through nodes; closed when the first and the last are one."""
+
+    id: int
+    nodes: tuple[int, ...]
+    tags: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def is_closed(self) -> bool:
+        """True for a ring."""
+        return len(self.nodes) > 1 and self.nodes[0] == self.nodes[-1]
+
+
+@dataclass(frozen=True)
+class Member:
+    """What a relation holds: kind `node`, `way` or `relation`, its number, its role."""
+
+    kind: str
+    ref: int
+    role: str
+
+
+@dataclass(frozen=True)
+class Relation:
+    """Elements that belong together."""
+
+    id: int
+    members: tuple[Member, ...]
+    tags: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass
+class OsmData:
+    """An extract: nodes as (lat, lon) in deg, ways and relations by number.
+
+    attribution : the words every output made from it must carry; None for a simulated place, which nobody surveyed
+    """
+
+    nodes: dict[int, tuple[float, float]] = field(default_factory=dict)
+    ways: dict[int, Way] = field(default_factory=dict)
+    relations: dict[int, Relation] = field(default_factory=dict)
+    attribution: str | None = ATTRIBUTION
+
+    def add_node(self, number: int, lat: Any, lon: Any) -> None:
+        """Add a node; raises ValueError when it is not on the Earth."""
+        values = (float(lat), float(lon))
+        if not (
+            math.isfinite(values[0]) and abs(values[0]) <= 90 and math.isfinite(values[1]) and abs(values[1]) <= 180
+        ):
+            raise ValueError(f"node {number} at lat {lat}, lon {lon}")
+        self.nodes[number] = values
+
+    def add_way(self, way: Way) -> None:
+        """Add a way; a second copy without tags (Overpass' `out skel`) does not replace one with tags."""
+        if way.tags or way.id not in self.ways:
+            self.ways[way.id] = way
+
+    def add_relation(self, relation: Relation) -> None:
+        """Add a relation, as `add_way` does."""
+        if relation.tags or relation.id not in self.relations:
+            self.relations[relation.id] = relation
+
+
+def read_osm(path: Path) -> OsmData:
+    """Read an OSM XML file or a stored Overpass reply (JSON); the first character decides.
+
+    Raises InputError naming the file: missing, cut short, neither of the two, with entities, with positions off the Earth.
+    """
+    try:
+        with path.open("rb") as stream:
+            start = stream.read(64)
+        if start[:2] == b"\x1f\x8b" or b"OSMHeader" in start:
+            raise InputError(f"{path} is compressed: turn it into plain XML first (gunzip, or osmium cat -o map.osm)")
+        first = start.removeprefix(b"\xef\xbb\xbf").lstrip()[:1]
+        if first not in (b"<", b"{", b"["):
+            what = "is neither XML nor JSON" if first else "is empty"
+            raise InputError(f"{path} {what}, so it is no OpenStreetMap extract: {WAY_OUT}")
+        return _read_xml(path) if first == b"<" else _read_json(path)
+    except OSError as error:
+        raise InputError(f"{path} cannot be read: {error.strerror or error}") from None
+
+
+def from_overpass(tree: Any) -> OsmData:
+    """An Overpass reply (`[out:json]`), already parsed. Raises ValueError saying what is wrong with it."""
+    if not isinstance(tree, dict) or not isinstance(tree.get("elements"), list):
+        raise ValueError("no list of elements, so this is no Overpass reply")
+    if tree.get("remark"):
+        # Overpass says so when it ran out of time or memory: the reply is valid JSON but incomplete.
+        raise ValueError(f"the server gave up: {str(tree['remark'])[:200]}")
+    data = OsmData()
+    for element in tree["elements"]:
+        try:
+            _add_json(data, element)
+        except (AttributeError, KeyError, TypeError) as error:
+            raise ValueError(f"an element without {error}: {str(element)[:80]}") from None
+    return data
+
+
+def write_osm(path: Path, data: OsmData) -> None:
+    """Write `data` as OSM XML 0.6, atomically, degrees with 7 decimals; what it read, or rounded, reads back equal."""
+    with atomic_write(path) as stream:
+        stream.write("".join(_xml_lines(data)).encode("utf-8", "replace"))
+
+
+def _read_json(path: Path) -> OsmData:
+    try:
+        return from_overpass(json.loads(path.read_bytes()))
+    except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise InputError(f"{path} is broken JSON, perhaps cut short ({error}): {WAY_OUT}") from None
+    except ValueError as error:
+        raise InputError(f"{path} cannot be used, {error}: {WAY_OUT}") from None
+
+
+def _add_json(data: OsmData, element: dict[str, Any]) -> None:
+    kind, number = element["type"], int(element.get("id", 0))
+    tags = {str(key): str(value) for key, value in element.get("tags", {}).items()}
+    if kind == "node":
+        data.add_node(number, element["lat"], element["lon"])
+    elif kind == "way":
+        data.add_way(Way(number, tuple(int(n) for n in element.get("nodes", ())), tags))
+    elif kind == "relation":
+        members = element.get("members", ())
+        found = tuple(Member(str(m["type"]), int(m["ref"]), str(m.get("role", ""))) for m in members)
+        data.add_relation(Relation(number, found, tags))
+
+
+def _read_xml(path: Path) -> OsmData:
+    """Element by element, each forgotten once it is understood: a town's extract is large."""
+    from defusedxml import DefusedXmlException, DTDForbidden
+    from defusedxml.ElementTree import iterparse
+
+    data, root = OsmData(), None
+    try:
+        for event, element in iterparse(path, events=("start", "end"), forbid_dtd=True):
+            if root is None:
+                root = element
+                _check_root(path, root)
+                _take_attribution(data, root)
+            elif event == "end" and element.tag in ("node", "way", "relation"):
+                _add_xml(data, element)
+                root.clear()
+    except DTDForbidden as error:
+        what = "is a web page" if str(error.name).lower() == "html" else "declares a document type or entities"
+        raise InputError(f"{path} {what}, which no OpenStreetMap file does: {WAY_OUT}") from None
+    except DefusedXmlException:
+        raise InputError(f"{path} declares entities, which no OpenStreetMap file does: {WAY_OUT}") from None
+    except ParseError as error:
+        raise InputError(f"{path} is broken XML or cut short ({error}): {WAY_OUT}") from None
+    except (KeyError, ValueError, LookupError) as error:
+        raise InputError(f"{path} holds an element that makes no sense ({error}): {WAY_OUT}") from None
+    return data
+
+
+def _check_root(path: Path, root: Element) -> None:
+    if root.tag != "osm":
+        raise InputError(f"{path} is XML but no OpenStreetMap extract: it begins with <{root.tag}>, not with <osm>")
+
+
+def _take_attribution(data: OsmData, root: Element) -> None:
+    """Whatever does not say that lslam made it up comes from OpenStreetMap."""
+    if root.get("generator") == GENERATOR and not root.get("attribution"):
+        data.attribution = None
+
+
+def _add_xml(data: OsmData, element: Element) -> None:
+    # JOSM marks deletions, the history API hides old versions: neither is on the ground.
+    if element.get("action") == "delete" or element.get("visible") == "false":
+        return
+    number = int(element.attrib["id"])
+    if element.tag == "node":
+        data.add_node(number, element.attrib["lat"], element.attrib["lon"])
+        return
+    tags = {tag.attrib["k"]: tag.attrib["v"] for tag in element.iter("tag")}
+    if element.tag == "way":
+        data.add_way(Way(number, tuple(int(n.attrib["ref"]) for n in element.iter("nd")), tags))
+        return
+    members = (m.attrib for m in element.iter("member"))
+    found = tuple(Member(m["type"], int(m["ref"]), m.get("role", "")) for m in members)
+    data.add_relation(Relation(number, found, tags))
+
+
+def _xml_lines(data: OsmData) -> Iterator[str]:
+    yield "<?xml version='1.0' encoding='UTF-8'?>\n"
+    credit = f" attribution={quoteattr(data.attribution)}" if data.attribution else ""
+    yield f'<osm version="0.6" generator="{GENERATOR}"{credit}>\n'
+    if data.nodes:
+        lats, lons = zip(*data.nodes.values(), strict=True)
+        sides = zip(("minlat", "minlon", "maxlat", "maxlon"), (min(lats), min(lons), max(lats), max(lons)), strict=True)
+        yield " <bounds " + " ".join(f'{name}="{value:.{DECIMALS}f}"' for name, value in sides) + "/>\n"
+    for number, (lat, lon) in data.nodes.items():
+        yield f' <node id="{number}" version="1" lat="{lat:.{DECIMALS}f}" lon="{lon:.{DECIMALS}f}"/>\n'
+    for way in data.ways.values():
+        yield f' <way id="{way.id}" version="1">\n'
+        yield from (f'  <nd ref="{node}"/>\n' for node in way.nodes)
+        yield from _tag_lines(way.tags.items())
+        yield " </way>\n"
+    for relation in data.relations.values():
+        yield f' <relation id="{relation.id}" version="1">\n'
+        for m in relation.members:
+            yield f'  <member type="{m.kind}" ref="{m.ref}" role={_quoted(m.role)}/>\n'
+        yield from _tag_lines(relation.tags.items())
+        yield " </relation>\n"
+    yield "</osm>\n"
+
+
+def _tag_lines(tags: Iterable[tuple[str, str]]) -> Iterator[str]:
+    return (f"  <tag k={_quoted(key)} v={_quoted(value)}/>\n" for key, value in tags)
+
+
+def _quoted(text: str) -> str:
+    # XML has no way to write most control characters.
+    return quoteattr("".join(c for c in text if c.isprintable() or c in "\t\n\u00a0"))

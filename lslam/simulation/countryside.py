@@ -1,0 +1,161 @@
+"""Places where there is little to hold on to: a motorway through fields, and a corridor between plain walls."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.simulation import furniture
+from lslam.simulation.city import City, Layout, add_ground
+from lslam.simulation.curve import Curve
+from lslam.simulation.houses import house
+from lslam.simulation.mesh import MeshBuilder, Surface, grid_faces
+from lslam.simulation.terrain import Terrain
+
+Floats = NDArray[np.float64]
+
+RAIL = (0.45, 0.75)  # m, the lower and the upper edge of a guard rail
+WALL_HEIGHT = 6.0  # m, of a corridor
+
+
+def build_motorway(street: Curve, terrain: Terrain, layout: Layout, rng: np.random.Generator) -> City:
+    """Two carriageways with guard rails, delineators, gantries and a noise barrier; beyond, trees, bushes and a few farms."""
+    builder = MeshBuilder()
+    _add_strip(builder, street, terrain, [0.0, 3.0, 6.0, 9.0, layout.road, layout.band], rng)
+    add_ground(builder, [street], terrain, layout, rng)
+    for offset in (-layout.road - 0.6, 0.0, layout.road + 0.6):
+        _add_rail(builder, street, terrain, offset)
+    for s in np.arange(10.0, street.length, 50.0):
+        for side in (1, -1):
+            _put(
+                builder,
+                street,
+                terrain,
+                s,
+                side * (layout.road + 1.2),
+                [-0.06, -0.06, -0.3],
+                [0.06, 0.06, 1.0],
+                Surface.POLE,
+            )
+    for s in np.arange(90.0, street.length, 240.0):
+        _add_gantry(builder, street, terrain, s + rng.uniform(-40, 40), layout.road + 1.4)
+    barrier = rng.uniform(0.3, 0.5) * street.length
+    s = np.arange(barrier, min(barrier + 0.15 * street.length, street.length), 4.0)
+    _add_wall(builder, street, terrain, s, -layout.band - 2.5, rng.uniform(2.5, 4.0), Surface.FENCE)
+    footprints, heights = _add_country(builder, street, terrain, layout, rng)
+    return City(builder.build(), terrain, street, footprints, heights, [street])
+
+
+def build_corridor(street: Curve, terrain: Terrain, layout: Layout, rng: np.random.Generator) -> City:
+    """A street between two plain walls, with flat piers: little tells how far along it one is."""
+    builder = MeshBuilder()
+    _add_strip(builder, street, terrain, [0.0, 2.0, layout.road, layout.band], rng)
+    add_ground(builder, [street], terrain, layout, rng)
+    s = street.sample(2.0)
+    footprints = []
+    for side in (1, -1):
+        _add_wall(builder, street, terrain, s, side * (layout.band - 0.3), WALL_HEIGHT, Surface.WALL)
+        near, far = street.beside(s, side * (layout.band - 0.3)), street.beside(s, side * (layout.band + 0.1))
+        footprints.append(np.concatenate([near, far[::-1]]))
+        at = np.cumsum(rng.uniform(6, 16, int(street.length / 6)))
+        for s_pier in at[at < street.length] if layout.poles else ():
+            low, high = [-0.3, -0.2, -0.5], [0.3, 0.2, WALL_HEIGHT]
+            _put(builder, street, terrain, float(s_pier), side * (layout.band - 0.4), low, high, Surface.WALL)
+    return City(builder.build(), terrain, street, footprints, [WALL_HEIGHT] * 2, [street])
+
+
+def _add_strip(
+    builder: MeshBuilder, street: Curve, terrain: Terrain, half: list[float], rng: np.random.Generator
+) -> None:
+    """A road without kerbs, up to the last of `half` m on both sides."""
+    s = street.sample(1.0)
+    offsets = np.array([-d for d in half[:0:-1]] + half)
+    xy = np.stack([street.beside(s, d) for d in offsets])
+    z = terrain.height(xy) + rng.normal(0, 0.003, xy.shape[:2])
+    vertices = np.concatenate([xy, z[..., None]], -1).reshape(-1, 3)
+    builder.add(vertices, grid_faces(len(offsets), len(s)), Surface.ROAD)
+
+
+def _add_rail(builder: MeshBuilder, street: Curve, terrain: Terrain, offset: float) -> None:
+    """A guard rail: a band along the road and a post every 4 m."""
+    _add_wall(builder, street, terrain, street.sample(4.0), offset, RAIL[1], Surface.FENCE, RAIL[0], 0.1)
+    for s in street.sample(4.0):
+        _put(builder, street, terrain, s, offset, [-0.05, -0.05, -0.3], [0.05, 0.05, RAIL[1]], Surface.POLE)
+
+
+def _add_wall(
+    builder: MeshBuilder,
+    street: Curve,
+    terrain: Terrain,
+    s: Floats,
+    offset: float,
+    top: float,
+    surface: Surface,
+    bottom: float = -1.0,
+    thickness: float = 0.4,
+) -> None:
+    """A wall along the street at `offset` m to its left, from `bottom` to `top` m above the ground."""
+    rows = []
+    for side, edge in ((-0.5, bottom), (-0.5, top), (0.5, top), (0.5, bottom)):
+        xy = street.beside(s, offset + side * thickness)
+        rows.append(np.column_stack([xy, terrain.height(street.beside(s, offset)) + edge]))
+    builder.add(np.concatenate(rows), grid_faces(4, len(s)), surface)
+
+
+def _put(
+    builder: MeshBuilder,
+    street: Curve,
+    terrain: Terrain,
+    s: float,
+    offset: float,
+    low: list[float],
+    high: list[float],
+    surface: Surface,
+) -> None:
+    """A box in the street's frame at `s` m along and `offset` m to the left."""
+    part = MeshBuilder()
+    part.add_box(low, high, surface)
+    at = np.array([s])
+    xy, tangent = street.beside(at, offset)[0], street.tangent(at)[0]
+    yaw = float(np.arctan2(tangent[1], tangent[0]))
+    builder.add_mesh(part.build(), [*xy, float(terrain.height(xy))], yaw)
+
+
+def _add_gantry(builder: MeshBuilder, street: Curve, terrain: Terrain, s: float, reach: float) -> None:
+    """A bridge of signs over the right carriageway."""
+    for offset in (-reach, 0.0):
+        _put(builder, street, terrain, s, offset, [-0.2, -0.2, -0.5], [0.2, 0.2, 7.2], Surface.POLE)
+    _put(builder, street, terrain, s, 0.0, [-0.25, -reach, 6.6], [0.25, 0.0, 7.2], Surface.POLE)
+    _put(builder, street, terrain, s, -0.5 * reach, [-0.35, -3.0, 5.6], [-0.25, 3.0, 8.0], Surface.FENCE)
+
+
+def _add_country(
+    builder: MeshBuilder, street: Curve, terrain: Terrain, layout: Layout, rng: np.random.Generator
+) -> tuple[list[Floats], list[float]]:
+    """Clumps of trees, bushes, and a farm now and then. Returns outlines and heights of the farms."""
+    footprints, heights = [], []
+    for s in np.arange(5.0, street.length, 9.0):
+        if rng.random() < layout.trees:
+            for _ in range(int(rng.integers(1, 5))):
+                side = 1 if rng.random() < 0.5 else -1
+                xy = street.beside(
+                    np.array([s + rng.uniform(-6, 6)]), side * rng.uniform(layout.band + 6, layout.band + 38)
+                )[0]
+                part = furniture.tree(rng) if rng.random() < 0.7 else furniture.hedge(rng, rng.uniform(3, 12))
+                builder.add_mesh(part, [*xy, float(terrain.height(xy))], rng.uniform(0, np.pi))
+    for s in np.arange(60.0, street.length, 150.0):
+        side, width, depth = (
+            (1 if rng.random() < 0.5 else -1),
+            rng.uniform(*layout.house_width),
+            rng.uniform(*layout.house_depth),
+        )
+        at = np.array([s])
+        front, tangent = street.beside(at, side * rng.uniform(48, 58))[0], side * street.tangent(at)[0]
+        inward, half = np.array([-tangent[1], tangent[0]]), width / 2 * tangent
+        farm = house(rng, width, depth, layout.storeys)
+        builder.add_mesh(farm, [*front, float(terrain.height(front))], float(np.arctan2(tangent[1], tangent[0])))
+        footprints.append(
+            np.array([front - half, front + half, front + half + depth * inward, front - half + depth * inward])
+        )
+        heights.append(float(farm.vertices[:, 2].max()))
+    return footprints, heights

@@ -1,0 +1,125 @@
+"""How a drone flies and a walker carries a LiDAR: along a curve at a height, banking or swinging, with exact poses."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.geometry import se3, so3
+from lslam.simulation.curve import Curve
+from lslam.simulation.path import SpeedProfile, drive, suspension
+from lslam.simulation.terrain import Terrain, flat
+
+Floats = NDArray[np.float64]
+
+GRAVITY = 9.81  # m/s2, for the bank of a turn
+
+
+@dataclass(frozen=True)
+class Swing:
+    """Sines over time on (x, y, z, roll, pitch, yaw) of a carried sensor, m and rad, in its own frame.
+
+    amplitudes, frequencies, phases : (K, 6); Hz and rad
+    """
+
+    amplitudes: Floats
+    frequencies: Floats
+    phases: Floats
+
+    def at(self, times: NDArray[Any]) -> Floats:
+        """(M, 6) displacements at `times` (M,), s."""
+        angle = 2 * np.pi * np.asarray(times)[:, None, None] * self.frequencies + self.phases
+        return np.asarray(np.sum(self.amplitudes * np.sin(angle), axis=1))
+
+
+def gait(rng: np.random.Generator, strength: float = 1.0) -> Swing:
+    """A hand-held sensor at a walk: steps of 1.8 Hz, sways of half that, looks to both sides, up to about 110 deg/s."""
+    amplitudes = np.array([[0.015, 0.03, 0.03, 0.05, 0.05, 0.75], [0.01, 0.01, 0.006, 0.03, 0.03, 0.25]]) * strength
+    frequencies = np.array([[1.8, 0.9, 1.8, 0.45, 0.6, 0.3], [0.7, 1.8, 3.6, 0.9, 1.8, 0.8]])
+    return Swing(amplitudes, frequencies * rng.uniform(0.93, 1.07, (2, 6)), rng.uniform(0, 2 * np.pi, (2, 6)))
+
+
+def buffeting(rng: np.random.Generator, strength: float = 1.0) -> Swing:
+    """A drone in light wind: centimetres and a degree or so at 0.2 to 1.5 Hz; more with `strength`."""
+    size = np.array([0.05, 0.05, 0.04, *np.radians([0.8, 0.8, 1.0])]) * strength
+    frequencies = np.stack([rng.uniform(0.2, 0.5, 6), rng.uniform(0.6, 1.5, 6)])
+    return Swing(size * np.array([[1.0], [0.35]]), frequencies, rng.uniform(0, 2 * np.pi, (2, 6)))
+
+
+@dataclass(frozen=True)
+class FreePath:
+    """A LiDAR carried along `curve` by what does not stand on wheels.
+
+    travelled : horizontal distance over time, a spline; duration : s it is defined for
+    climb : height over distance, a spline as of `climb_spline`, m above level ground or, when `terrain` is given, that ground
+    bank : share of the tilt that balances the turn, 1 for a coordinated one; swing : what shakes it
+    """
+
+    curve: Curve
+    travelled: Any
+    duration: float
+    climb: Any
+    bank: float
+    swing: Swing
+    terrain: Terrain | None = None
+
+    def poses(self, times: NDArray[Any]) -> Floats:
+        """(M, 4, 4) exact T_city_lidar at `times` (M,), s since the start."""
+        times = np.asarray(times, np.float64)
+        s = np.asarray(self.travelled(times))
+        speed, gain = np.asarray(self.travelled(times, nu=1)), np.asarray(self.travelled(times, nu=2))
+        xy, tangent = self.curve.position(s), self.curve.tangent(s)
+        left = np.column_stack([-tangent[:, 1], tangent[:, 0]])
+        pull = gain[:, None] * tangent + (speed**2 * self.curve.curvature(s))[:, None] * left
+        # The rotors push against gravity and into the turn: that direction is up for the body.
+        up = np.column_stack([self.bank * pull, np.full(len(s), GRAVITY)])
+        up /= np.linalg.norm(up, axis=1, keepdims=True)
+        ahead = np.column_stack([tangent, np.zeros(len(s))])
+        ahead -= np.sum(ahead * up, axis=1, keepdims=True) * up
+        ahead /= np.linalg.norm(ahead, axis=1, keepdims=True)
+        R = np.stack([ahead, np.cross(up, ahead), up], axis=-1)
+        z = np.asarray(self.climb(np.mod(s, self.curve.length) if self.curve.closed else s))
+        if self.terrain is not None:
+            z = z + self.terrain.height(xy)
+        shake = self.swing.at(times)
+        T = se3.make(R, np.column_stack([xy, z]))
+        return np.asarray(T @ se3.make(so3.exp(shake[:, 3:]), shake[:, :3]))
+
+
+def climb_spline(curve: Curve, s: NDArray[Any], heights: NDArray[Any], smoothing: float) -> Any:
+    """Height over distance along `curve` through `heights` (N,), m, at distances `s` (N,), smoothed by `smoothing` m."""
+    from scipy.interpolate import make_interp_spline
+    from scipy.ndimage import gaussian_filter1d
+
+    along = np.linspace(0, curve.length, max(int(curve.length / 0.5), 64) + 1)
+    z, sigma = np.interp(along, s, heights), smoothing / along[1]
+    if curve.closed:
+        z = gaussian_filter1d(z[:-1], sigma, mode="wrap")
+        z = np.append(z, z[0])
+    else:
+        # Mirroring the differences keeps the ends and a constant slope.
+        reach = min(int(np.ceil(4 * sigma)), len(z) - 1)
+        z = np.concatenate([2 * z[0] - z[reach:0:-1], z, 2 * z[-1] - z[-2 : -reach - 2 : -1]])
+        z = gaussian_filter1d(z, sigma)[reach:-reach]
+    return make_interp_spline(along, z, k=5, bc_type="periodic" if curve.closed else None)
+
+
+def fly(
+    curve: Curve,
+    speed: SpeedProfile,
+    distance: float,
+    climb: Any,
+    bank: float,
+    swing: Swing,
+    terrain: Terrain | None = None,
+) -> FreePath:
+    """Carry a LiDAR along `distance` m of `curve`; on a climb the speed counts along its mean slope."""
+    rise = float(climb(curve.length) - climb(0.0))
+    level = curve.length / float(np.hypot(curve.length, rise))
+    pace = SpeedProfile(speed.cruise * level, speed.start * level, speed.acceleration, speed.braking, speed.lateral)
+    still = suspension(np.random.default_rng(0), 0.0, 0.0)
+    timed = drive(curve, flat(), pace, distance, 0.0, still)
+    return FreePath(curve, timed.travelled, timed.duration, climb, bank, swing, terrain)

@@ -1,0 +1,128 @@
+"""An IMU on a moving body: exact specific force and angular rate, and what a MEMS device makes of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.errors import UsageError, nearest
+from lslam.geometry import se3, so3
+from lslam.simulation.motion import Kinematics, Motion
+from lslam.types.imu import ImuStream
+
+Floats = NDArray[np.float64]
+
+GRAVITY = 9.80665  # m/s2, downwards along the city's -z
+
+# Inside an Ouster OS1 (its manual: 6.253, -11.775, 7.645 mm), and on KITTI's car, in the LiDAR frame.
+T_OUSTER_IMU = se3.make(np.eye(3), np.array([0.006253, -0.011775, 0.007645]))
+T_CAR_IMU = se3.make(so3.from_euler_rpy(np.radians([0.85, 0.12, 0.04])), np.array([-0.81, 0.32, -0.80]))
+
+
+@dataclass(frozen=True)
+class Triad:
+    """Three axes of one kind: an accelerometer (units m/s2) or a gyroscope (rad/s).
+
+    limit : largest reading either way; step : of one bit, 0 for none; bias : constant, on each axis
+    misalignment : share of every other axis that an axis feels, per cent
+    noise_density : white noise, unit/sqrt(Hz): N of the Allan deviation N / sqrt(tau)
+    bias_walk : random walk of the bias, unit/sqrt(s): K of the Allan deviation K sqrt(tau / 3)
+    """
+
+    limit: float = np.inf
+    step: float = 0.0
+    bias: float = 0.0
+    misalignment: float = 0.0
+    noise_density: float = 0.0
+    bias_walk: float = 0.0
+
+
+@dataclass(frozen=True)
+class ImuModel:
+    """A kind of IMU; the default has no errors."""
+
+    name: str
+    accel: Triad = field(default_factory=Triad)
+    gyro: Triad = field(default_factory=Triad)
+    rate_hz: float = 100.0
+
+
+@dataclass(frozen=True)
+class SimulatedImu:
+    """What was measured, and the truth behind it.
+
+    stream : the readings; accel_bias, gyro_bias : (M, 3) constant and walking bias at each reading, m/s2 and rad/s
+    truth : (M,) motion of the IMU in the city frame; T_lidar_imu : where it sits
+    """
+
+    stream: ImuStream
+    accel_bias: Floats
+    gyro_bias: Floats
+    truth: Kinematics
+    T_lidar_imu: Floats
+
+
+# First thesis, table 2.3 (from the data sheet). Neither states a bias random walk: it is that of Kalibr's example of a MEMS IMU.
+_ICM_ACCEL = Triad(19.62, 0.000598754, 0.4905, 2.0, 0.0022563, 2e-4)
+_ICM_GYRO = Triad(4.36332313, 0.000133231, 0.087266462, 2.0, 0.000261799, 4e-6)
+
+IMUS = {
+    model.name: model
+    for model in (
+        ImuModel("icm20948", _ICM_ACCEL, _ICM_GYRO),
+        # The same after a calibration that took out the constant bias and the misalignment.
+        ImuModel(
+            "icm20948-calibrated",
+            Triad(19.62, 0.000598754, 0.0, 0.0, 0.0022563, 2e-4),
+            Triad(4.36332313, 0.000133231, 0.0, 0.0, 0.000261799, 4e-6),
+        ),
+        ImuModel("ideal"),
+    )
+}
+
+
+def imu_named(name: str) -> ImuModel:
+    """The model of that name. Raises UsageError with the nearest name."""
+    if name not in IMUS:
+        raise UsageError(f"no IMU {name!r}; {nearest(name, IMUS)}")
+    return IMUS[name]
+
+
+def simulate_imu(
+    motion: Motion, model: ImuModel, T_lidar_imu: NDArray[np.float64], end: float, rng: np.random.Generator
+) -> SimulatedImu:
+    """Readings of `model` at `T_lidar_imu` (4, 4), from 0 to `end` s of `motion`.
+
+    The same generator state gives the same readings; a longer `end` only adds to them.
+    """
+    count = int(np.floor(end * model.rate_hz + 1e-6)) + 1
+    stamps = np.round(np.arange(count) * (1e9 / model.rate_hz)).astype(np.int64)
+    truth = motion.at(stamps / 1e9).carried(T_lidar_imu)
+    noise = rng.standard_normal((count, 4, 3))
+    accel, accel_bias = measure(model.accel, specific_force(truth), noise[:, :2], model.rate_hz)
+    gyro, gyro_bias = measure(model.gyro, truth.rate, noise[:, 2:], model.rate_hz)
+    return SimulatedImu(ImuStream(stamps, accel, gyro), accel_bias, gyro_bias, truth, np.asarray(T_lidar_imu))
+
+
+def specific_force(truth: Kinematics) -> Floats:
+    """(M, 3) what an exact accelerometer reads in the body frame, m/s2: +g upwards at rest (REP 145)."""
+    felt = truth.acceleration + np.array([0.0, 0.0, GRAVITY])
+    return np.asarray(np.einsum("nji,nj->ni", truth.poses[:, :3, :3], felt))
+
+
+def measure(triad: Triad, exact: Floats, noise: Floats, rate_hz: float) -> tuple[Floats, Floats]:
+    """Readings (M, 3) and biases (M, 3) of a triad that meets `exact` (M, 3).
+
+    noise : (M, 2, 3) standard normal numbers, for the white noise and for the steps of the bias. A white noise of density N
+    sampled at f has the deviation N sqrt(f), a random walk K steps of K / sqrt(f) (IEEE Std 952).
+    """
+    cross = np.full((3, 3), triad.misalignment / 100)
+    np.fill_diagonal(cross, 1.0)
+    walk = np.cumsum(noise[:, 1], axis=0) - noise[:1, 1]
+    bias = triad.bias + triad.bias_walk / np.sqrt(rate_hz) * walk
+    reading = exact @ cross.T + bias + triad.noise_density * np.sqrt(rate_hz) * noise[:, 0]
+    if triad.step > 0:
+        reading = np.round(reading / triad.step) * triad.step
+    return np.clip(reading, -triad.limit, triad.limit), np.asarray(bias)

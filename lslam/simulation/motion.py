@@ -1,0 +1,164 @@
+"""Exact kinematics: one smooth function of time whose value is the pose and whose derivatives are what sensors feel.
+
+Positions and unit quaternions of a path are interpolated by quintic B-splines, four times continuously differentiable. Their
+derivatives are analytic, so poses, velocities, accelerations and rates can never disagree with each other.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.geometry import se3, so3
+
+Floats = NDArray[np.float64]
+
+SPACING = 0.02  # s between the knots: scans at 10 Hz fall on knots, where the spline meets the path exactly
+STANDING_ACCELERATION = 2.0  # m/s2, the most that moving off from a standing start adds
+_EDGE = 1e-6  # s by which a query may overstep the ends: rounding of stamps to ns
+
+
+class PosePath(Protocol):
+    """Where a LiDAR is over `duration` s; what a vehicle, a drone or a walker has in common."""
+
+    @property
+    def duration(self) -> float:
+        """Seconds the path is defined for, from 0."""
+        ...
+
+    def poses(self, times: NDArray[Any]) -> Floats:
+        """(M, 4, 4) T_city_lidar at `times` (M,), s."""
+        ...
+
+
+@dataclass(frozen=True)
+class Kinematics:
+    """The motion of one body at M instants.
+
+    poses : (M, 4, 4) T_city_body; velocity, acceleration : (M, 3) of its origin in the city frame, m/s and m/s2
+    rate, rate_change : (M, 3) angular velocity and acceleration in the body frame, rad/s and rad/s2
+    """
+
+    poses: Floats
+    velocity: Floats
+    acceleration: Floats
+    rate: Floats
+    rate_change: Floats
+
+    def carried(self, T_body_sensor: NDArray[Any]) -> Kinematics:
+        """The motion of a sensor fixed to the body at `T_body_sensor` (4, 4), lever arm included."""
+        R_body_sensor, arm = np.asarray(T_body_sensor)[:3, :3], np.asarray(T_body_sensor)[:3, 3]
+        R = self.poses[:, :3, :3]
+        swing = np.cross(self.rate, arm)
+        pull = np.cross(self.rate_change, arm) + np.cross(self.rate, swing)
+        return Kinematics(
+            poses=self.poses @ np.asarray(T_body_sensor, np.float64),
+            velocity=self.velocity + _rotate(R, swing),
+            acceleration=self.acceleration + _rotate(R, pull),
+            rate=self.rate @ R_body_sensor,
+            rate_change=self.rate_change @ R_body_sensor,
+        )
+
+
+@dataclass(frozen=True)
+class Motion:
+    """A path as a function with derivatives; made by `smooth_motion`.
+
+    position, quaternion : splines of T_city_lidar over s; the quaternion (xyzw) is unit only after normalisation
+    duration : s, from 0
+    """
+
+    position: Any
+    quaternion: Any
+    duration: float
+
+    def poses(self, times: NDArray[Any]) -> Floats:
+        """(M, 4, 4) exact T_city_lidar at `times` (M,), s. Raises ValueError outside 0..duration."""
+        at = self._inside(times)
+        return se3.make(so3.from_quaternion(self.quaternion(at)), self.position(at))
+
+    def at(self, times: NDArray[Any]) -> Kinematics:
+        """Kinematics of the LiDAR at `times` (M,), s. Raises ValueError outside 0..duration."""
+        at = self._inside(times)
+        q, dq, ddq = (np.asarray(self.quaternion(at, nu=k)) for k in range(3))
+        # The length of q cancels: only the part of conj(q) dq that turns is left in its vector part.
+        square = np.sum(q * q, axis=1, keepdims=True)
+        rate = 2 * _conjugate_times(q, dq) / square
+        stretch = 2 * np.sum(q * dq, axis=1, keepdims=True) / square
+        return Kinematics(
+            poses=self.poses(at),
+            velocity=np.asarray(self.position(at, nu=1)),
+            acceleration=np.asarray(self.position(at, nu=2)),
+            rate=rate,
+            rate_change=2 * _conjugate_times(q, ddq) / square - stretch * rate,
+        )
+
+    def _inside(self, times: NDArray[Any]) -> Floats:
+        at = np.asarray(times, np.float64)
+        if len(at) and not (at.min() >= -_EDGE and at.max() <= self.duration + _EDGE):
+            raise ValueError(f"times {at.min():g}..{at.max():g} s leave the motion of 0..{self.duration:g} s")
+        return at
+
+
+@dataclass(frozen=True)
+class StandingStart:
+    """`path`, begun by standing at its start for `seconds` s and moving off smoothly over `ramp` s."""
+
+    path: PosePath
+    seconds: float
+    ramp: float
+
+    @property
+    def duration(self) -> float:
+        """Seconds, the standing included."""
+        return self.path.duration + self.seconds + self.ramp / 2
+
+    def poses(self, times: NDArray[Any]) -> Floats:
+        """(M, 4, 4) T_city_lidar at `times` (M,), s."""
+        return self.path.poses(self.path_time(times))
+
+    def path_time(self, times: NDArray[Any]) -> Floats:
+        """Time on `path` at `times` (M,), s: it stands still, then its pace grows from 0 to 1 as a smooth step."""
+        since = np.asarray(times, np.float64) - self.seconds
+        u = np.clip(since / self.ramp, 0, 1)
+        # The integral of 35 u^4 - 84 u^5 + 70 u^6 - 20 u^7, whose first three derivatives vanish at both ends.
+        grown = u**5 * (7 - 14 * u + 10 * u**2 - 2.5 * u**3)
+        return np.asarray(self.ramp * grown + np.maximum(since - self.ramp, 0))
+
+
+def smooth_motion(path: PosePath, spacing: float = SPACING) -> Motion:
+    """Make `path` differentiable: the motion meets it every `spacing` s and is smooth between."""
+    from scipy.interpolate import make_interp_spline
+
+    knots = np.arange(max(int(path.duration / spacing), 8) + 1) * spacing
+    # A last step that is shorter than half of the others would make the spline swing.
+    knots = np.append(knots[knots < path.duration - spacing / 2], path.duration)
+    poses = path.poses(knots)
+    q = so3.to_quaternion(poses[:, :3, :3])
+    flips = np.where(np.sum(q[1:] * q[:-1], axis=1) < 0, -1.0, 1.0)
+    q[1:] *= np.cumprod(flips)[:, None]
+    return Motion(
+        make_interp_spline(knots, poses[:, :3, 3], k=5), make_interp_spline(knots, q, k=5), float(path.duration)
+    )
+
+
+def standing_start(path: PosePath, seconds: float) -> StandingStart:
+    """Let `path` begin with `seconds` s of standing still; the faster it starts, the longer it takes to move off."""
+    step = 1e-3
+    first = path.poses(np.array([0.0, step]))[:, :3, 3]
+    speed = float(np.linalg.norm(first[1] - first[0])) / step
+    # The pace of the smooth step grows by at most 35/16 per ramp.
+    return StandingStart(path, seconds, max(2.0, 35 / 16 * speed / STANDING_ACCELERATION))
+
+
+def _rotate(R: Floats, v: Floats) -> Floats:
+    return np.asarray(np.einsum("nij,nj->ni", R, v))
+
+
+def _conjugate_times(q: Floats, p: Floats) -> Floats:
+    """Vector part (M, 3) of conj(q) p, quaternions xyzw (M, 4)."""
+    v, w = q[:, :3], q[:, 3:]
+    return np.asarray(w * p[:, :3] - p[:, 3:] * v - np.cross(v, p[:, :3]))

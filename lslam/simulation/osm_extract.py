@@ -1,0 +1,96 @@
+"""The OpenStreetMap extract of a scene: exact, and a perturbed copy as real maps are, with what was done to it on record."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.errors import InputError, OutputError
+from lslam.formats.osm_buildings import buildings_of, osm_from_buildings
+from lslam.formats.osm_files import write_osm
+from lslam.simulation.city import City
+from lslam.simulation.osm_city import PAVEMENT, OsmCity
+from lslam.simulation.osm_faults import MapFaults, draw_perturbation
+from lslam.simulation.osm_perturb import Perturbation, perturb, write_perturbation
+from lslam.types.building import Building, footprints_of
+
+EXACT, PERTURBED = "map.osm", "map_perturbed.osm"
+RECORD = "truth/map_perturbation.json"  # below truth/: no method may read it
+
+
+@dataclass(frozen=True)
+class Extracts:
+    """What was written: the two maps, the record, and the perturbation itself."""
+
+    exact: Path
+    perturbed: Path
+    record: Path
+    perturbation: Perturbation
+
+
+def write_extracts(
+    folder: Path,
+    city: City,
+    origin: NDArray[Any],
+    rng: np.random.Generator,
+    faults: MapFaults | None = None,
+) -> Extracts:
+    """Write `map.osm`, `map_perturbed.osm` and `truth/map_perturbation.json` below `folder`, each atomically.
+
+    Parameters
+    ----------
+    city : its x is east, its y north of `origin`
+    origin : (3,) lat, lon (deg), height (m) of the city frame's x = y = 0
+    faults : how wrong the perturbed copy is
+
+    Raises
+    ------
+    InputError : the city has no buildings; OutputError : `folder` cannot be written
+
+    The perturbation starts from the exact map as it reads back, rounded to 1e-7 deg, so `perturb` of that map and the record
+    give the perturbed file again, byte for byte.
+    """
+    attribution = city.attribution if isinstance(city, OsmCity) else None
+    buildings = city_buildings(city)
+    if not buildings:
+        raise InputError("a scene without buildings has no OpenStreetMap extract")
+    data = osm_from_buildings(buildings, origin, attribution)
+    exact = buildings_of(data, origin).buildings
+    drawn = draw_perturbation(exact, faults or MapFaults(), rng, _streets(city))
+    perturbation = replace(drawn, attribution=attribution)
+    extracts = Extracts(folder / EXACT, folder / PERTURBED, folder / RECORD, perturbation)
+    try:
+        extracts.record.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"{extracts.record.parent} cannot be made: {error.strerror or error}") from None
+    write_osm(extracts.exact, data)
+    write_osm(extracts.perturbed, osm_from_buildings(perturb(exact, perturbation), origin, attribution))
+    write_perturbation(extracts.record, perturbation)
+    return extracts
+
+
+def city_buildings(city: City) -> list[Building]:
+    """The buildings of a city, m in its frame; those of a generated one get numbers below zero and heights to 0.1 m."""
+    from shapely import Polygon
+
+    if isinstance(city, OsmCity):
+        return city.buildings
+    heights: list[float | None] = [round(height, 1) for height in city.heights]
+    heights = heights or [None] * len(city.footprints)
+    return [
+        Building(f"way/-{k}", footprints_of(Polygon(outline)), height, tags={"building": "house"})
+        for k, (outline, height) in enumerate(zip(city.footprints, heights, strict=True), 1)
+    ]
+
+
+def _streets(city: City) -> Any:
+    """The ground of all streets, None where there are none."""
+    from shapely import LineString, union_all
+
+    streets = city.streets or ([] if city.street is None else [city.street])
+    lines = [LineString(street.position(street.sample(2.0))).buffer(PAVEMENT + 0.5) for street in streets]
+    return union_all(lines) if lines else None

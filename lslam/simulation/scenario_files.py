@@ -1,0 +1,165 @@
+"""Scenarios as TOML: those that ship with the package, by name, and what `--set` changes in them."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Iterable
+from functools import cache
+from importlib import resources
+from typing import Any, Literal
+
+from pydantic import BaseModel, Field, ValidationError, model_validator
+
+from lslam.config.section import Section
+from lslam.errors import ConfigError, UsageError, nearest
+from lslam.simulation.city import Layout
+from lslam.simulation.lidar_models import LIDARS
+from lslam.simulation.shapes import SHAPES
+
+FOLDER = "ready"
+# `block` and `street` draw their lines from the seed; the other shapes are way-points.
+LINES = ("block", "street", *SHAPES)
+
+
+class PathSection(Section):
+    """The line that is driven or flown.
+
+    shape : a name of `LINES`, scaled to `length` m when that is given; smoothing : of its corners, m
+    lane : m to the right of the middle of the street
+    heights : of a drone's LiDAR at the start and the end, or of a walker's above the ground, m
+    bank : share of a coordinated turn's tilt; swing : strength of what shakes a carried LiDAR, 0 for nothing
+    clearance : whether crossing a building or the ground is an error
+    """
+
+    shape: str = "straight"
+    length: float | None = Field(None, gt=10, le=20_000)
+    smoothing: float = Field(1.5, ge=0.5, le=30)
+    lane: float = Field(0.0, ge=0, le=20)
+    heights: tuple[float, float] = (10.0, 10.0)
+    bank: float = Field(1.0, ge=0, le=1)
+    swing: float = Field(1.0, ge=0, le=10)
+    clearance: bool = True
+
+
+class WorldSection(Section):
+    """The place: its kind, side streets (see `build_town`), the ground's relief and bumps, m, the rays that pass a pane."""
+
+    kind: Literal["street", "town", "motorway", "corridor"] = "town"
+    spacing: float = Field(80.0, ge=30, le=1000)
+    levels: int = Field(1, ge=0, le=3)
+    relief: float = Field(0.35, ge=0, le=20)
+    unevenness: float = Field(0.012, ge=0, le=0.5)
+    glass: float = Field(0.0, ge=0, le=1)
+
+
+class TrafficSection(Section):
+    """What moves: cars and people per km of street; lanes : m to the left of the middle, cars come towards us there;
+    speed : of the cars, m/s.
+    """
+
+    cars: float = Field(0.0, ge=0, le=200)
+    people: float = Field(0.0, ge=0, le=500)
+    lanes: tuple[float, ...] = (1.7,)
+    speed: float = Field(9.0, gt=0, le=60)
+
+
+class Scenario(Section):
+    """A kind of place and a way to move through it.
+
+    carrier : what carries the LiDAR; speed, start_speed : m/s; lateral : greatest acceleration in bends, m/s2, to which a car
+    and a walker slow down and which a drone must not exceed; roof : m behind, ahead, aside and below the LiDAR that the car's
+    own roof takes up, or nothing; overlap : distance beyond one lap of a closed line, m
+    """
+
+    name: str
+    summary: str
+    carrier: Literal["car", "drone", "walker"] = "car"
+    lidar: str = "hdl64"
+    lidar_height: float = Field(1.73, gt=0.3, le=10)
+    speed: float = Field(gt=0, le=40)
+    start_speed: float = Field(ge=0, le=40)
+    lateral: float = Field(2.5, gt=0, le=30)
+    roof: tuple[float, float, float, float] | None = None
+    rate_hz: float = Field(10.0, ge=1, le=100)
+    overlap: float = Field(0.0, ge=0, le=1000)
+    motion_compensated: bool = False
+    path: PathSection = PathSection()
+    world: WorldSection = WorldSection()
+    layout: Layout = Layout()
+    traffic: TrafficSection = TrafficSection()
+
+    @model_validator(mode="after")
+    def _names_are_known(self) -> Scenario:
+        if self.path.shape not in LINES:
+            raise ValueError(f"path.shape = {self.path.shape!r}; {nearest(self.path.shape, LINES)}")
+        if self.lidar not in LIDARS:
+            raise ValueError(f"lidar = {self.lidar!r}; {nearest(self.lidar, LIDARS)}")
+        if self.carrier != "drone" and min(self.path.heights) < 0.3:
+            raise ValueError(f"path.heights = {list(self.path.heights)}: at least 0.3 m above the ground")
+        return self
+
+
+@cache
+def scenario_names() -> tuple[str, ...]:
+    """Names of the scenarios that ship with the package."""
+    files = resources.files(__package__).joinpath(FOLDER).iterdir()
+    return tuple(sorted(file.name.removesuffix(".toml") for file in files if file.name.endswith(".toml")))
+
+
+def scenario_named(name: str, settings: Iterable[str] = ()) -> Scenario:
+    """The ready scenario `name` with `settings` ("speed=8", "world.relief=1") applied.
+
+    Raises
+    ------
+    UsageError : no such scenario; ConfigError : a key that does not exist, or a value that does not fit
+    """
+    if name not in scenario_names():
+        raise UsageError(f"no scenario {name!r}; {nearest(name, scenario_names())}")
+    text = resources.files(__package__).joinpath(FOLDER, f"{name}.toml").read_text(encoding="utf-8")
+    return parse_scenario(name, tomllib.loads(text), settings)
+
+
+def parse_scenario(name: str, tree: dict[str, Any], settings: Iterable[str] = ()) -> Scenario:
+    """The scenario of a TOML tree; raises ConfigError naming the key and the nearest known one."""
+    merged: dict[str, Any] = {}
+    _merge(merged, tree, Scenario, f"scenario {name!r}", "")
+    for setting in settings:
+        key, equals, value = setting.partition("=")
+        if not equals:
+            raise ConfigError(f"--set {setting}: expected key=value, for example world.relief=1")
+        leaf: Any = _value(value.strip())
+        for part in reversed(key.strip().split(".")):
+            leaf = {part: leaf}
+        _merge(merged, leaf, Scenario, f"--set {setting}", "")
+    try:
+        return Scenario.model_validate({**merged, "name": name})
+    except ValidationError as error:
+        said = [
+            f"{'.'.join(str(p) for p in e['loc'][:2])}: {e['msg'].removeprefix('Value error, ')}"
+            for e in error.errors()
+        ]
+        raise ConfigError(f"scenario {name!r}: " + "; ".join(text.removeprefix(": ") for text in said)) from None
+
+
+def _merge(tree: dict[str, Any], more: dict[str, Any], model: type[BaseModel], where: str, prefix: str) -> None:
+    known = [key for key in model.model_fields if prefix or key != "name"]
+    for key, value in more.items():
+        if key not in known:
+            raise ConfigError(f"{where}: unknown key {prefix + key!r}; {nearest(key, known)}")
+        inner = model.model_fields[key].annotation
+        if isinstance(inner, type) and issubclass(inner, BaseModel):
+            if not isinstance(value, dict):
+                raise ConfigError(f"{where}: {key!r} is a section, write {key}.key = value")
+            _merge(tree.setdefault(key, {}), value, inner, where, f"{key}.")
+        elif isinstance(value, dict):
+            raise ConfigError(f"{where}: {prefix + key!r} is a value, not a section")
+        else:
+            tree[key] = value
+
+
+def _value(text: str) -> Any:
+    """A TOML value, or the text itself when it is none: `--set lidar=vlp16` needs no quotes."""
+    try:
+        return tomllib.loads(f"v = {text}")["v"]
+    except tomllib.TOMLDecodeError:
+        return text

@@ -1,0 +1,121 @@
+"""What rides along with the LiDAR: an IMU and a satellite receiver, where they sit, and what they recorded."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.formats.atomic import atomic_write
+from lslam.formats.gnss_csv import write_gnss_csv
+from lslam.formats.imu_csv import write_imu_csv
+from lslam.formats.stamped_csv import write_stamped_csv
+from lslam.formats.trajectory_files import write_tum
+from lslam.geometry import se3
+from lslam.simulation.gnss import (
+    ORIGIN,
+    T_CAR_ANTENNA,
+    T_DRONE_ANTENNA,
+    GnssModel,
+    SimulatedGnss,
+    check_gnss,
+    simulate_gnss,
+)
+from lslam.simulation.imu import GRAVITY, T_CAR_IMU, T_OUSTER_IMU, ImuModel, SimulatedImu, simulate_imu
+from lslam.simulation.motion import Motion
+from lslam.types.trajectory import Trajectory
+
+Floats = NDArray[np.float64]
+
+IMU_FILE, GNSS_FILE, TRUTH = "imu.csv", "gnss.csv", "truth"
+TRUTH_HZ = 100
+_IMU_SEED, _GNSS_SEED = 2**32 - 11, 2**32 - 12  # of the generators; the scenarios count down from 2**32 - 1
+
+
+@dataclass(frozen=True)
+class Sensors:
+    """Which sensors ride along; None for one that does not. Raises UsageError for an impossible one."""
+
+    imu: ImuModel | None = None
+    gnss: GnssModel | None = None
+
+    def __post_init__(self) -> None:
+        if self.gnss is not None:
+            check_gnss(self.gnss)
+
+
+@dataclass(frozen=True)
+class Readings:
+    """What the sensors recorded, with the truth behind it; origin : (3,) lat, lon (deg), height (m) of the city's origin."""
+
+    imu: SimulatedImu | None
+    gnss: SimulatedGnss | None
+    origin: Floats
+
+
+def read_sensors(
+    motion: Motion, sensors: Sensors, lidar: str, end: float, seed: int, origin: Floats = ORIGIN
+) -> Readings:
+    """Let `sensors` record from 0 to `end` s of `motion`, each with a generator of its own.
+
+    lidar : name of the LiDAR; an Ouster (`os...`) has its IMU inside and flies, anything else stands on a car
+    """
+    is_ouster = lidar.startswith("os")
+    imu = gnss = None
+    if sensors.imu is not None:
+        mount = T_OUSTER_IMU if is_ouster else T_CAR_IMU
+        imu = simulate_imu(motion, sensors.imu, mount, end, np.random.default_rng([seed, _IMU_SEED]))
+    if sensors.gnss is not None:
+        mount = T_DRONE_ANTENNA if is_ouster else T_CAR_ANTENNA
+        gnss = simulate_gnss(motion, sensors.gnss, mount, origin, end, np.random.default_rng([seed, _GNSS_SEED]))
+    return Readings(imu, gnss, np.asarray(origin, np.float64))
+
+
+def write_readings(folder: Path, readings: Readings) -> None:
+    """Write `imu.csv` and `gnss.csv` of the sensors that rode along."""
+    if readings.imu is not None:
+        write_imu_csv(folder / IMU_FILE, readings.imu.stream)
+    if readings.gnss is not None:
+        write_gnss_csv(folder / GNSS_FILE, readings.gnss.stream)
+
+
+def write_truth(
+    folder: Path, motion: Motion, scan_stamps_ns: NDArray[np.int64], end: float, readings: Readings
+) -> None:
+    """Write the exact truth into `folder`: nothing that reads the sequence needs it.
+
+    The world is the LiDAR at the first scan. `trajectory.tum` holds the LiDAR's poses at the scans' starts,
+    `trajectory_100hz.tum` at 100 Hz from 0 to `end` s; `motion.csv` its velocity in the world (m/s) and its rate in its own
+    frame (rad/s) at 100 Hz; `imu_bias.csv` the biases behind `imu.csv`; `world.toml` the world on the Earth.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    T_city_world = motion.poses(scan_stamps_ns[:1] / 1e9)[0]
+    note = "exact poses T_world_lidar, world = LiDAR at the first scan"
+    fine_ns = np.arange(int(np.floor(end * TRUTH_HZ + 1e-6)) + 1, dtype=np.int64) * (10**9 // TRUTH_HZ)
+    for name, stamps in (("trajectory.tum", scan_stamps_ns), ("trajectory_100hz.tum", fine_ns)):
+        poses = se3.relative(T_city_world, motion.poses(stamps / 1e9))
+        write_tum(folder / name, Trajectory(stamps, poses, "lidar"), note)
+    exact = motion.at(fine_ns / 1e9)
+    velocity = exact.velocity @ T_city_world[:3, :3]
+    names = [f"{what}_{axis}" for what in ("velocity", "rate") for axis in "xyz"]
+    write_stamped_csv(folder / "motion.csv", names, fine_ns, np.hstack([velocity, exact.rate]))
+    if readings.imu is not None:
+        names = [f"{what}_bias_{axis}" for what in ("accel", "gyro") for axis in "xyz"]
+        biases = np.hstack([readings.imu.accel_bias, readings.imu.gyro_bias])
+        write_stamped_csv(folder / "imu_bias.csv", names, readings.imu.stream.stamps_ns, biases)
+    _write_world(folder / "world.toml", T_city_world, readings.origin)
+
+
+def _write_world(path: Path, T_enu_world: Floats, origin: Floats) -> None:
+    import tomli_w
+
+    down = np.array([0.0, 0.0, -GRAVITY])
+    tree = {
+        "origin_lat_lon_alt": origin.tolist(),
+        "T_enu_world": T_enu_world.tolist(),
+        "gravity_world": (down @ T_enu_world[:3, :3]).tolist(),
+    }
+    with atomic_write(path) as stream:
+        stream.write(tomli_w.dumps(tree).encode())

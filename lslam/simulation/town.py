@@ -1,0 +1,174 @@
+"""A town of many streets round a given line: side streets that join, crossings with open kerbs, rows of houses along all."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.simulation.city import (
+    KERB,
+    City,
+    Layout,
+    Lots,
+    add_garden_trees,
+    add_ground,
+    add_row,
+    add_street_furniture,
+)
+from lslam.simulation.curve import Curve, smooth_curve
+from lslam.simulation.mesh import MeshBuilder, Surface, grid_faces
+from lslam.simulation.terrain import Terrain
+
+Floats = NDArray[np.float64]
+
+SHORTEST = 30.0  # m of a side street
+LONGEST = 110.0
+CAR_LENGTH = 5.2  # m kept between the middles of parked cars
+
+
+class Network:
+    """The middles of all roads, to ask how far a place is from the nearest."""
+
+    def __init__(self, streets: list[Curve]) -> None:
+        from scipy.spatial import cKDTree
+
+        self.streets = streets
+        self._tree = cKDTree(np.concatenate([street.position(street.sample(0.25)) for street in streets]))
+
+    def distance(self, xy: NDArray[Any]) -> Floats:
+        """Distance of (..., 2) places to the nearest middle of a road, m, shape (...)."""
+        return np.asarray(self._tree.query(xy)[0])
+
+
+def build_town(
+    main: list[Curve],
+    terrain: Terrain,
+    layout: Layout,
+    rng: np.random.Generator,
+    spacing: float = 80.0,
+    levels: int = 1,
+) -> City:
+    """Build a town round the streets `main`. The same generator state gives the same town.
+
+    Parameters
+    ----------
+    spacing : m between the side streets of a street, about; levels : 0 for no side streets, 1 for those of `main`, 2 for
+        theirs as well
+    """
+    streets, newest = main, main
+    for _ in range(levels):
+        newest = _side_streets(newest, streets, layout, spacing, rng)
+        streets = [*streets, *newest]
+    network = Network(streets)
+    builder = MeshBuilder()
+    for street in streets:
+        _add_road(builder, street, network, terrain, layout, rng)
+    # Grass closes the dead ends: their last metres do not count as road.
+    add_ground(
+        builder, [_shortened(street, layout.band) for street in streets], terrain, layout, rng, 0.75 * layout.pavement
+    )
+    lots = Lots(streets, layout)
+    for first in (True, False):
+        for street in streets if first else main:
+            for side in (1, -1):
+                add_row(builder, lots, street, terrain, layout, rng, side, first)
+    places = _Places(network, layout)
+    for street in streets:
+        for side in (1, -1):
+            add_street_furniture(builder, street, terrain, layout, rng, side, places)
+    add_garden_trees(builder, lots, terrain, layout, rng)
+    return City(builder.build(), terrain, main[0], lots.footprints, lots.heights, streets)
+
+
+class _Places:
+    """Whether a place beside a street is free: not on another road, and not where something stands already."""
+
+    def __init__(self, network: Network, layout: Layout) -> None:
+        self._network, self._road = network, layout.road
+        self._taken = np.zeros((0, 2))
+
+    def __call__(self, xy: Floats, offset: float) -> bool:
+        is_car = offset < self._road
+        # A car keeps its distance from the crossing, not only from the other road.
+        if self._network.distance(xy) < offset - (0.15 if is_car else 0.05):
+            return False
+        apart = CAR_LENGTH if is_car else 0.9
+        if len(self._taken) and np.hypot(*(self._taken - xy).T).min() < apart:
+            return False
+        self._taken = np.concatenate([self._taken, xy[None]])
+        return True
+
+
+def _shortened(street: Curve, by: float) -> Curve:
+    """An open street without its first and last metres; too short a one as it is."""
+    if street.closed or street.length < 2 * by + SHORTEST / 2:
+        return street
+    s = np.linspace(by, street.length - by, max(int(street.length), 12))
+    return smooth_curve(street.position(s), closed=False)
+
+
+def _side_streets(
+    main: list[Curve], streets: list[Curve], layout: Layout, spacing: float, rng: np.random.Generator
+) -> list[Curve]:
+    """Streets off `main` on both sides, each until it meets one of `streets` and those before it, or its own end."""
+    from scipy.spatial import cKDTree
+
+    taken = np.concatenate([street.position(street.sample(0.5)) for street in streets])
+    out: list[Curve] = []
+    for street in main:
+        for side in (1, -1):
+            s = rng.uniform(0.3, 0.8) * spacing
+            while s < street.length - 0.3 * spacing:
+                at = np.array([s])
+                s += spacing * rng.uniform(0.75, 1.3)
+                turn, length = rng.normal(0, 0.07), rng.uniform(0.5, 1.0) * LONGEST
+                if abs(float(street.curvature(at)[0])) > 0.02:
+                    continue
+                tangent = street.tangent(at)[0] * side
+                heading = np.arctan2(tangent[1], tangent[0]) + np.pi / 2 + turn
+                ray = np.array([np.cos(heading), np.sin(heading)])
+                line = _until_met(street.position(at)[0], ray, length, cKDTree(taken), layout)
+                if line is not None:
+                    out.append(line)
+                    taken = np.concatenate([taken, line.position(line.sample(0.5))])
+    return out
+
+
+def _until_met(start: Floats, ray: Floats, length: float, taken: Any, layout: Layout) -> Curve | None:
+    """A straight street from `start` along `ray` (2,) until it meets another; None when it would run too near to one."""
+    steps = np.arange(0.0, length, 0.5)
+    points = start + steps[:, None] * ray
+    away = np.asarray(taken.query(points)[0])
+    clear = steps > 2.5 * layout.band
+    met = np.flatnonzero(clear & (away < 0.5))
+    end = int(met[0]) + 1 if len(met) else len(steps)
+    # Beside another street for long, the two roads would become one.
+    beside = clear[:end] & (away[:end] < 2 * layout.band)
+    if steps[end - 1] < SHORTEST or np.count_nonzero(beside) * 0.5 > 3.5 * layout.band:
+        return None
+    if not len(met) and away[end - 1] < 2 * layout.band:
+        return None
+    return smooth_curve(points[[0, end - 1]], closed=False)
+
+
+def _add_road(
+    builder: MeshBuilder, street: Curve, network: Network, terrain: Terrain, layout: Layout, rng: np.random.Generator
+) -> None:
+    """Road, kerbs and pavements as one strip along the street; no kerb where another road passes."""
+    s = street.sample(0.75)
+    if street.closed:
+        s = np.append(s, 0.0)
+    half = [0.0, 1.5, 3.0, layout.road, layout.road + 0.02, 0.5 * (layout.road + layout.band), layout.band]
+    offsets = np.array([-d for d in half[:0:-1]] + half)
+    xy = np.stack([street.beside(s, d) for d in offsets])
+    beyond = np.abs(offsets)[:, None] > layout.road + 0.01
+    raised = beyond & (network.distance(xy) > layout.road + 0.005)
+    rough = rng.normal(0, 0.003, xy.shape[:2])
+    if street.closed:
+        rough[:, -1] = rough[:, 0]
+    z = terrain.height(xy) + KERB * raised + rough
+    faces = grid_faces(len(offsets), len(s))
+    kinds = np.where(raised.ravel()[faces].any(axis=1), Surface.PAVEMENT, Surface.ROAD).astype(np.uint8)
+    builder.add(np.concatenate([xy, z[..., None]], -1).reshape(-1, 3), faces, kinds)
