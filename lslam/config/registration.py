@@ -33,6 +33,9 @@ class RegistrationConfig(Section):
     min_overlap: float = Field(
         0.2, ge=0, le=1, description="share of points that found a voxel below which a scan fails"
     )
+    start_overlap: float = Field(
+        0.05, ge=0, le=1, description="likewise while the map stands on the first scans alone and has few planes"
+    )
     min_agreement: float = Field(
         0.5,
         ge=0,

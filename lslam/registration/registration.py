@@ -47,6 +47,7 @@ class Registration:
         self._motion = ConstantVelocity()
         self._index = 0
         self._starting = self.config.start_scans
+        self._inserted = 0
 
     def register(self, points: NDArray[Any], prior: NDArray[np.float64] | None = None) -> RegistrationResult:
         """Pose of points (N, 3), m, LiDAR frame; without `prior` (4, 4) the velocity is taken as constant."""
@@ -91,6 +92,7 @@ class Registration:
         if result.ok:
             first = len(self.map) == 0
             self.map.insert(points.map_points, result.T_world_lidar)
+            self._inserted += 1
             if not first:
                 self._starting = max(self._starting - 1, 0)
                 self.agreement.observe(result.agreement)
@@ -138,7 +140,9 @@ class Registration:
         delta = se3.relative(T_prior, result.T_world_lidar)
         move, turn = float(np.linalg.norm(delta[:3, 3])), float(so3.angle(delta[:3, :3]))
         reason = result.reason
-        if not reason and result.overlap < c.min_overlap:
+        # One scan of a sparse sensor makes few planes: what matches them may be right and yet a small share.
+        needed = c.min_overlap if self._inserted > c.start_scans else c.start_overlap
+        if not reason and result.overlap < needed:
             reason = f"only {result.overlap:.0%} of the points overlap the map"
         elif not reason and result.inlier_share < c.min_inliers:
             reason = f"only {result.inlier_share:.0%} of the matches agree"

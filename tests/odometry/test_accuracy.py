@@ -86,3 +86,12 @@ def test_nees_sees_covariances_that_are_a_hundred_times_off() -> None:
 def covariance(result: RegistrationResult) -> NDArray[np.float64]:
     assert result.covariance is not None
     return result.covariance
+
+
+@pytest.mark.parametrize("scenario", ["small-eight", "climbing"])
+def test_a_sparse_sensor_over_roofs_starts_although_few_of_its_points_find_a_plane(scenario: str) -> None:
+    """Ten metres up, one scan of 32 rings makes planes for a sixth of the next one's points; they are right."""
+    d = drive(scenario, 0, 12)
+    results = registered(d.points)
+    assert all(r.ok for r in results)
+    assert max(np.linalg.norm(r.T_world_lidar[:3, 3] - T[:3, 3]) for r, T in zip(results, d.truth, strict=True)) < 0.05
