@@ -24,17 +24,10 @@ def command() -> None:
 @click.option("--describe", is_flag=True, help="Say beside each key what it means.")
 def show(config_file: Path | None, settings: tuple[str, ...], describe: bool) -> None:
     """Print the resolved configuration as TOML."""
-    from lslam.config import load_config, to_toml
+    from lslam.config import load_config, to_described_toml, to_toml
 
     config = load_config(config_file, settings)
-    if not describe:
-        click.echo(to_toml(config), nl=False)
-        return
-    for section in type(config).model_fields:
-        click.echo(f"[{section}]")
-        values = getattr(config, section)
-        for key, field in type(values).model_fields.items():
-            click.echo(f"{key} = {getattr(values, key)!r}  # {field.description}")
+    click.echo(to_described_toml(config) if describe else to_toml(config), nl=False)
 
 
 @command.command(epilog="Example: lslam config check my.toml")

@@ -1,6 +1,6 @@
 """Configuration: one frozen section per file, TOML in, resolved TOML out, unknown keys answered with the nearest name."""
 
 from lslam.config.config import Config
-from lslam.config.load import load_config, to_toml
+from lslam.config.load import load_config, to_described_toml, to_toml
 
-__all__ = ["Config", "load_config", "to_toml"]
+__all__ = ["Config", "load_config", "to_described_toml", "to_toml"]

@@ -42,6 +42,24 @@ def to_toml(config: Config) -> str:
     return tomli_w.dumps(config.model_dump(mode="json", exclude_none=True))
 
 
+def to_described_toml(config: Config) -> str:
+    """As `to_toml`, every key on one line with its meaning; absent optional values are commented out."""
+    lines: list[str] = []
+    for section in type(config).model_fields:
+        values = getattr(config, section)
+        lines += [""] * bool(lines) + [f"[{section}]"]
+        for key, value in values.model_dump(mode="json").items():
+            text = f"# {key} =" if value is None else f"{key} = {_inline(value)}"
+            lines.append(f"{text}  # {type(values).model_fields[key].description}")
+    return "\n".join(lines) + "\n"
+
+
+def _inline(value: Any) -> str:
+    if isinstance(value, list):
+        return f"[{', '.join(_inline(v) for v in value)}]"
+    return tomli_w.dumps({"v": value}).removeprefix("v = ").strip()
+
+
 def _read(path: Path) -> Tree:
     try:
         return tomllib.loads(path.read_text(encoding="utf-8-sig"))

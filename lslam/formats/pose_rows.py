@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
 import re
-from collections.abc import Iterable
 from decimal import ROUND_HALF_EVEN, Decimal
 from pathlib import Path
 from typing import NamedTuple
@@ -12,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.errors import InputError, OutputError
+from lslam.errors import InputError
 from lslam.geometry import se3, so3
 
 Floats = NDArray[np.float64]
@@ -126,16 +124,3 @@ def frame_in(comments: list[str]) -> str | None:
         if found:
             return found.group(1)
     return None
-
-
-def write_atomically(path: str | Path, lines: Iterable[str]) -> None:
-    """Write text lines to `path`.part and rename; OutputError when that is impossible, and nothing is left behind."""
-    path = Path(path)
-    part = path.with_name(path.name + ".part")
-    try:
-        with part.open("w", encoding="utf-8", newline="\n") as stream:
-            stream.writelines(f"{line}\n" for line in lines)
-        os.replace(part, path)
-    except OSError as error:
-        part.unlink(missing_ok=True)
-        raise OutputError(f"{path} cannot be written: {error.strerror}") from None

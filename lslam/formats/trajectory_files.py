@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from lslam.errors import InputError, UsageError, nearest
 from lslam.formats import trajectory_csv
+from lslam.formats.atomic import atomic_write
 from lslam.formats.pose_rows import (
     Row,
     check_increasing,
@@ -30,7 +31,6 @@ from lslam.formats.pose_rows import (
     read_rows,
     seconds_text,
     seconds_to_ns,
-    write_atomically,
 )
 from lslam.geometry import so3
 from lslam.types.trajectory import Trajectory
@@ -96,13 +96,13 @@ def write_tum(path: str | Path, trajectory: Trajectory, comment: str = "") -> No
     for stamp, p, r in zip(trajectory.stamps_ns.tolist(), trajectory.positions.tolist(), q.tolist(), strict=True):
         pose = " ".join([*(f"{v:.9f}" for v in p), *(f"{v:.12f}" for v in r)])
         lines.append(f"{seconds_text(stamp)} {pose}")
-    write_atomically(path, lines)
+    _write_lines(path, lines)
 
 
 def write_kitti(path: str | Path, trajectory: Trajectory) -> None:
     """Write a KITTI file, atomically: the poses as they are; the caller brings them into camera 0 (`T_cam0_lidar`)."""
     rows = trajectory.poses[:, :3, :].reshape(-1, 12).tolist()
-    write_atomically(path, [" ".join(f"{v:.12e}" for v in row) for row in rows])
+    _write_lines(path, [" ".join(f"{v:.12e}" for v in row) for row in rows])
 
 
 def write_euroc(path: str | Path, trajectory: Trajectory) -> None:
@@ -114,7 +114,7 @@ def write_euroc(path: str | Path, trajectory: Trajectory) -> None:
     q = np.roll(so3.to_quaternion(trajectory.poses[:, :3, :3]), 1, axis=-1)
     for stamp, p, r in zip(trajectory.stamps_ns.tolist(), trajectory.positions.tolist(), q.tolist(), strict=True):
         lines.append(",".join([str(stamp), *(f"{v:.9f}" for v in p), *(f"{v:.12f}" for v in r)]))
-    write_atomically(path, lines)
+    _write_lines(path, lines)
 
 
 def read_times(path: str | Path) -> NDArray[np.int64]:
@@ -195,3 +195,8 @@ def _read_tum(path: Path, rows: list[Row], comments: list[str]) -> Trajectory:
         frame=frame_in(comments) or "unknown",
         source=str(path),
     )
+
+
+def _write_lines(path: str | Path, lines: list[str]) -> None:
+    with atomic_write(Path(path)) as stream:
+        stream.writelines(f"{line}\n".encode() for line in lines)

@@ -14,7 +14,6 @@ from lslam.types.sequence import Sequence
 from lslam.types.trajectory import Trajectory
 
 SCHEMA = 1
-GRAVITY = 9.80665
 
 Facts = dict[str, Any]
 

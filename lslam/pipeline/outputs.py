@@ -43,7 +43,7 @@ def write_trajectories(folder: RunFolder, record: RunRecord, calibration: Calibr
     trajectory = record.trajectory
     write_tum(
         folder.path / "trajectory.tum", trajectory,
-        comment=f"lslam {__version__}, {record.method}: T_world_lidar\nframe: lidar\npose_time: scan_start",
+        comment=f"lslam {__version__}, {record.method}: T_world_lidar\npose_time: scan_start",
     )  # fmt: skip
     write_kitti(folder.path / "trajectory_kitti.txt", _in_camera(trajectory, calibration))
     if trajectory.covariances is not None:

@@ -20,10 +20,8 @@ import json
 import math
 from collections.abc import Sequence
 from dataclasses import asdict
-from pathlib import Path
 from typing import Any
 
-from lslam.errors import OutputError
 from lslam.evaluation.results import AbsoluteError, Evaluation, KittiDrift, RelativeError
 from lslam.evaluation.statistics import Statistics
 from lslam.evaluation.timing import Timing
@@ -71,18 +69,6 @@ def to_json(evaluations: Sequence[Evaluation], timings: Sequence[Timing | None] 
     documents = [to_document(e, t) for e, t in zip(evaluations, padded, strict=True)]
     whole = documents[0] if len(documents) == 1 else {"schema": SCHEMA, "version": VERSION, "evaluations": documents}
     return json.dumps(whole, indent=2, allow_nan=False)
-
-
-def write_json(path: str | Path, evaluations: Sequence[Evaluation], timings: Sequence[Timing | None] = ()) -> None:
-    """Write `to_json` to `path`, atomically. Raises OutputError when that is impossible."""
-    path = Path(path)
-    part = path.with_name(path.name + ".part")
-    try:
-        part.write_text(to_json(evaluations, timings) + "\n", encoding="utf-8")
-        part.replace(path)
-    except OSError as error:
-        part.unlink(missing_ok=True)
-        raise OutputError(f"{path} cannot be written: {error.strerror}") from None
 
 
 def _absolute(error: AbsoluteError) -> Document:

@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from lslam.errors import OutputError, UsageError, nearest
+from lslam.errors import UsageError, nearest
 from lslam.evaluation.results import AbsoluteError, Evaluation
+from lslam.formats.atomic import atomic_write
 from lslam.reports.evaluation_table import short_names
 
 FORMATS = ("png", "svg", "pdf")
@@ -36,14 +37,9 @@ def write_plot(path: str | Path, evaluations: Sequence[Evaluation], names: Seque
     with rc_context({"svg.hashsalt": "lslam", "svg.fonttype": "none", "font.size": 9}):
         figure = _draw(evaluations, names or short_names([e.estimate for e in evaluations]))
         kind = path.suffix.lstrip(".").lower()
-        part = path.with_name(path.name + ".part")
-        try:
-            stamp: dict[str, Any] = {"svg": {"Date": None}, "pdf": {"CreationDate": None}, "png": {}}[kind]
-            figure.savefig(part, format=kind, dpi=120, metadata=stamp)
-            part.replace(path)
-        except OSError as error:
-            part.unlink(missing_ok=True)
-            raise OutputError(f"{path} cannot be written: {error.strerror}") from None
+        stamp: dict[str, Any] = {"svg": {"Date": None}, "pdf": {"CreationDate": None}, "png": {}}[kind]
+        with atomic_write(path) as stream:
+            figure.savefig(stream, format=kind, dpi=120, metadata=stamp)
 
 
 def _draw(evaluations: Sequence[Evaluation], names: Sequence[str]) -> Any:

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import csv
 import io
+import re
 from collections.abc import Callable, Sequence
 
 from lslam.evaluation.results import AbsoluteError, Evaluation, RelativeError
 from lslam.evaluation.statistics import Statistics
 from lslam.evaluation.timing import StageTime, Timing
+from lslam.reports.metrics import counted
 
 Row = tuple[str, str, list[str]]
 STYLES = ("text", "md", "csv", "tex")
@@ -24,11 +26,26 @@ def render(evaluations: Sequence[Evaluation], timings: Sequence[Timing | None] =
     names = short_names([e.estimate for e in evaluations])
     if style == "text":
         return "\n".join([*_head(evaluations, names), "", *_text(rows, names), "", *_recipes(evaluations)])
-    grid = [["metric", "unit", *names], *([label, unit, *cells] for label, unit, cells in rows)]
+    grid = [["metric", "unit", *names], *([label, unit, *cells] for label, unit, cells in _in_full(rows))]
     writers: dict[str, Callable[[list[list[str]]], str]] = {"md": _markdown, "csv": _csv, "tex": _latex}
     if style not in writers:
         raise ValueError(f"table style {style!r}: one of {', '.join(STYLES)}")
-    return writers[style](grid)
+    table = writers[style](grid)
+    # A CSV is for programs, which have no use for sentences; --json holds values and recipes.
+    how = {"md": "- {}", "tex": "% {}"}.get(style)
+    return "\n".join([table, "", *(how.format(line.strip()) for line in _recipes(evaluations)[1:])]) if how else table
+
+
+def _in_full(rows: list[Row]) -> list[Row]:
+    """The rows with labels that stand alone: an indented one is led by the number it belongs to."""
+    full, above = [], ""
+    for label, unit, cells in rows:
+        if label.startswith(" "):
+            label = f"{above}, {label.strip()}"
+        else:
+            above = re.sub(r"(:.*| rmse| thesis_rmse| planar ATE)$", "", label)
+        full.append((label, unit, cells))
+    return full
 
 
 def _rows(evaluations: Sequence[Evaluation], timings: Sequence[Timing | None]) -> list[Row]:
@@ -117,7 +134,7 @@ def _recipes(evaluations: Sequence[Evaluation]) -> list[str]:
     lines = [f"ATE {error.recipe if error.available else f'{name}: {error.note}'}" for name, error in e.ate.items()]
     lines += [f"RPE {error.name}: {error.rule}, no alignment" for error in e.rpe]
     drift = e.kitti_drift
-    lines.append(f"drift: {drift.recipe}; {f'{drift.segments} segments' if drift.available else drift.note}")
+    lines.append(f"drift: {drift.recipe}; {counted(drift.segments, 'segment') if drift.available else drift.note}")
     lines += [f"thesis1: {e.thesis1.recipe}", f"thesis2: {e.thesis2.recipe}; mean spacing {e.thesis2.spacing:.2f} m"]
     return ["how:", *(f"  {line}" for line in lines)]
 
@@ -150,8 +167,8 @@ def _csv(grid: list[list[str]]) -> str:
 
 def _latex(grid: list[list[str]]) -> str:
     def escape(cell: str) -> str:
-        for sign in "\\&%$#_{}":
-            cell = cell.replace(sign, "\\textbackslash{}" if sign == "\\" else f"\\{sign}")
+        signs = {sign: f"\\{sign}" for sign in "&%$#_{}"} | {"\\": "\\textbackslash{}"}
+        cell = cell.translate({ord(sign): word for sign, word in signs.items()})
         return cell.strip().replace("±", "$\\pm$")
 
     head, *body = [" & ".join(escape(cell) for cell in row) + r" \\" for row in grid]
@@ -172,7 +189,7 @@ def short_names(names: list[str]) -> list[str]:
 
 
 def _number(value: float | None) -> str:
-    """Four significant digits, and never an exponent for what people measure in metres."""
+    """Four significant digits; an exponent only below 0.0001."""
     if value is None or value != value:
         return "n/a"
     return f"{value:.4g}" if abs(value) < 1000 else f"{value:.1f}"

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from lslam.formats.atomic import atomic_write
 from lslam.reports import plots
 from lslam.reports.facts import RunFacts, run_facts
-from lslam.reports.metrics import metres, metric_tables
+from lslam.reports.metrics import counted, metres, metric_tables
 from lslam.reports.png import data_uri, density_png
 from lslam.types.run_record import RunRecord
 from lslam.version import __version__
@@ -127,7 +127,9 @@ def _cards(facts: RunFacts, evaluation: Evaluation | None) -> list[Card]:
                 cards.append(Card(metres(error.translation.rmse), "m", f"ATE rmse, {name}"))
         drift = evaluation.kitti_drift
         if drift.available:
-            cards.append(Card(f"{drift.translation_percent:.2f}", "%", f"KITTI drift, {drift.segments} segments"))
+            cards.append(
+                Card(f"{drift.translation_percent:.2f}", "%", f"KITTI drift, {counted(drift.segments, 'segment')}")
+            )
     if facts.total is not None:
         cards.append(Card(f"{1e3 * facts.total.median:.1f}", "ms", "median time per scan"))
         if facts.real_time_factor:

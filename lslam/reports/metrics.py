@@ -119,6 +119,11 @@ def metres(value: float) -> str:
     return f"{value:.3f}" if abs(value) >= 0.01 or value == 0 else f"{value:.4f}"
 
 
+def counted(number: int, noun: str) -> str:
+    """A number with its noun, in the plural unless it is one."""
+    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
+
+
 def fixed(value: float, decimals: int) -> str:
     """A number with fixed decimals, `n/a` when it is not finite."""
     return f"{value:.{decimals}f}" if np.isfinite(value) else "n/a"

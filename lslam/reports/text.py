@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from lslam.evaluation.results import ALIGNMENTS
 from lslam.reports.facts import Failure, RunFacts, run_facts
-from lslam.reports.metrics import fixed, metres
+from lslam.reports.metrics import counted, fixed, metres
 from lslam.types.run_record import RunRecord
 
 if TYPE_CHECKING:
@@ -62,7 +62,7 @@ def _score_rows(record: RunRecord, evaluation: Evaluation | None) -> list[tuple[
     if drift.available:
         value = (
             f"{drift.translation_percent:.3f} %, {drift.rotation_deg_per_100m:.4f} deg/100 m "
-            f"({drift.segments} segments of 100 to 800 m)"
+            f"({counted(drift.segments, 'segment')} of 100 to 800 m)"
         )
     else:
         value = drift.note or "n/a"

@@ -92,6 +92,9 @@ def test_config_show_can_be_checked_and_shown_again(tmp_path: Path) -> None:
     assert lslam("config", "show", "--config", tmp_path / "my.toml").stdout == shown.stdout
     described = lslam("config", "show", "--describe").stdout
     assert "one averaged point per voxel" in described
+    assert "# count =  # number of scans used" in described
+    (tmp_path / "described.toml").write_text(described)
+    assert lslam("config", "show", "--config", tmp_path / "described.toml").stdout == lslam("config", "show").stdout
 
 
 @pytest.mark.parametrize(
