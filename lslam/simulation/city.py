@@ -253,16 +253,16 @@ def add_street_furniture(
     layout: Layout,
     rng: np.random.Generator,
     side: int,
-    allowed: Callable[[Floats, float], bool] | None = None,
+    allowed: Callable[[Floats, float, float], bool] | None = None,
 ) -> None:
-    """Parked cars, trees, poles and bins along one side; `allowed` says of a place (2,) and its offset whether it is free."""
+    """Parked cars, trees, poles and bins along one side; `allowed` says whether a place (2,), offset and yaw are free."""
 
     def put(part: Mesh, s: float, offset: float, lift: float, turn: float = 0.0) -> None:
         at = np.array([s])
         xy, tangent = street.beside(at, side * offset)[0], street.tangent(at)[0] * side
-        if allowed is not None and not allowed(xy, offset):
-            return
         yaw = float(np.arctan2(tangent[1], tangent[0])) + turn
+        if allowed is not None and not allowed(xy, offset, yaw):
+            return
         builder.add_mesh(part, [*xy, float(terrain.height(xy)) + lift], yaw)
 
     for s in _stations(rng, street.length, 5.6, 8.0):
