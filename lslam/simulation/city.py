@@ -167,7 +167,9 @@ def add_ground(
     low, high = middle.min(0) - MARGIN, middle.max(0) + MARGIN
     x, y = (np.arange(low[k], high[k] + 1.0, 1.0) for k in (0, 1))
     xy = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1)
-    z = terrain.height(xy) + KERB - 0.03 + rng.normal(0, 0.015, xy.shape[:2])
+    # Under a pavement it must not come through.
+    sunk = 0.03 if tucked < 0.5 else 0.07
+    z = terrain.height(xy) + KERB - sunk + rng.normal(0, 0.015, xy.shape[:2])
     nearest = np.asarray(cKDTree(middle).query(xy.reshape(-1, 2), distance_upper_bound=layout.band)[0])
     under_road = nearest < layout.band - tucked
     faces = grid_faces(len(x), len(y))
