@@ -167,7 +167,9 @@ def add_ground(
     low, high = middle.min(0) - MARGIN, middle.max(0) + MARGIN
     x, y = (np.arange(low[k], high[k] + 1.0, 1.0) for k in (0, 1))
     xy = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1)
-    z = terrain.height(xy) + KERB - 0.03 + rng.normal(0, 0.015, xy.shape[:2])
+    # Under a pavement it must not come through.
+    sunk = 0.03 if tucked < 0.5 else 0.07
+    z = terrain.height(xy) + KERB - sunk + rng.normal(0, 0.015, xy.shape[:2])
     nearest = np.asarray(cKDTree(middle).query(xy.reshape(-1, 2), distance_upper_bound=layout.band)[0])
     under_road = nearest < layout.band - tucked
     faces = grid_faces(len(x), len(y))
@@ -253,16 +255,16 @@ def add_street_furniture(
     layout: Layout,
     rng: np.random.Generator,
     side: int,
-    allowed: Callable[[Floats, float], bool] | None = None,
+    allowed: Callable[[Floats, float, float], bool] | None = None,
 ) -> None:
-    """Parked cars, trees, poles and bins along one side; `allowed` says of a place (2,) and its offset whether it is free."""
+    """Parked cars, trees, poles and bins along one side; `allowed` says whether a place (2,), offset and yaw are free."""
 
     def put(part: Mesh, s: float, offset: float, lift: float, turn: float = 0.0) -> None:
         at = np.array([s])
         xy, tangent = street.beside(at, side * offset)[0], street.tangent(at)[0] * side
-        if allowed is not None and not allowed(xy, offset):
-            return
         yaw = float(np.arctan2(tangent[1], tangent[0])) + turn
+        if allowed is not None and not allowed(xy, offset, yaw):
+            return
         builder.add_mesh(part, [*xy, float(terrain.height(xy)) + lift], yaw)
 
     for s in _stations(rng, street.length, 5.6, 8.0):

@@ -22,7 +22,7 @@ def build_motorway(street: Curve, terrain: Terrain, layout: Layout, rng: np.rand
     """Two carriageways with guard rails, delineators, gantries and a noise barrier; beyond, trees, bushes and a few farms."""
     builder = MeshBuilder()
     _add_strip(builder, street, terrain, [0.0, 3.0, 6.0, 9.0, layout.road, layout.band], rng)
-    add_ground(builder, [street], terrain, layout, rng)
+    add_ground(builder, [street], terrain, layout, rng, 1.2)
     for offset in (-layout.road - 0.6, 0.0, layout.road + 0.6):
         _add_rail(builder, street, terrain, offset)
     for s in np.arange(10.0, street.length, 50.0):
@@ -50,7 +50,7 @@ def build_corridor(street: Curve, terrain: Terrain, layout: Layout, rng: np.rand
     """A street between two plain walls, with flat piers: little tells how far along it one is."""
     builder = MeshBuilder()
     _add_strip(builder, street, terrain, [0.0, 2.0, layout.road, layout.band], rng)
-    add_ground(builder, [street], terrain, layout, rng)
+    add_ground(builder, [street], terrain, layout, rng, 1.2)
     s = street.sample(2.0)
     footprints = []
     for side in (1, -1):

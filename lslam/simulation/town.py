@@ -89,10 +89,13 @@ class _Places:
         self._network, self._road = network, layout.road
         self._taken = np.zeros((0, 2))
 
-    def __call__(self, xy: Floats, offset: float) -> bool:
+    def __call__(self, xy: Floats, offset: float, yaw: float) -> bool:
         is_car = offset < self._road
-        # A car keeps its distance from the crossing, not only from the other road.
         if self._network.distance(xy) < offset - (0.15 if is_car else 0.05):
+            return False
+        # Nor may a car's ends reach into another road.
+        half = 0.5 * CAR_LENGTH * np.array([np.cos(yaw), np.sin(yaw)])
+        if is_car and self._network.distance(np.stack([xy - half, xy + half])).min() < offset - 0.7:
             return False
         apart = CAR_LENGTH if is_car else 0.9
         if len(self._taken) and np.hypot(*(self._taken - xy).T).min() < apart:

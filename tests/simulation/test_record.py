@@ -113,19 +113,92 @@ def test_an_empty_folder_is_fine_and_a_file_is_not(drive: SimulatedDrive, tmp_pa
         record(drive, tmp_path / "file" / "below")
 
 
-def test_a_failure_leaves_nothing(drive: SimulatedDrive, tmp_path: Path) -> None:
-    def stop(scan: Scan) -> None:
-        if scan.index == 2:
+def test_a_failure_before_the_first_scan_leaves_nothing(
+    drive: SimulatedDrive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(self: SimulatedDrive, index: int) -> Scan:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(SimulatedDrive, "scan", broken)
+    with pytest.raises(OutputError, match="No space left"):
+        record(drive, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_what_was_interrupted_goes_on_with_the_same_bytes(drive: SimulatedDrive, tmp_path: Path) -> None:
+    traced: list[int] = []
+
+    def stop(index: int) -> None:
+        if index == 1:
             raise KeyboardInterrupt
+
+    record(drive, tmp_path / "whole")
+    out = tmp_path / "out"
+    with pytest.raises(KeyboardInterrupt):
+        record(drive, out, on_scan=stop)
+    assert not (out / "sequences" / "00").exists()
+    part = out / "sequences" / "00.part"
+    assert sorted(p.name for p in (part / "per_point").iterdir()) == ["000000.npz", "000001.npz"]
+    # A .bin whose times are missing is half a scan.
+    (part / "velodyne" / "000002.bin").write_bytes(b"half")
+    with pytest.raises(OutputExistsError, match="--resume goes on"):
+        record(drive, out)
+    stamp = (part / "velodyne" / "000000.bin").stat().st_mtime_ns
+    done = record(drive, out, resume=True, on_scan=traced.append)
+    assert traced == [0, 1, 2, 3]
+    assert (done.sequence / "velodyne" / "000000.bin").stat().st_mtime_ns == stamp
+    assert files_of(out) == files_of(tmp_path / "whole")
+    assert done.points == sum(len(scan) for scan in drive)
+
+
+def test_another_drive_does_not_go_on(drive: SimulatedDrive, tmp_path: Path) -> None:
+    def stop(index: int) -> None:
+        raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
         record(drive, tmp_path / "out", on_scan=stop)
-    assert not (tmp_path / "out").exists()
+    begun = files_of(tmp_path / "out")
+    for other in (
+        simulate("block", seed=1, count=4, motion_compensated=False),
+        simulate("block", count=5, motion_compensated=False),
+        simulate("block", count=4),
+        simulate("block", count=4, motion_compensated=False, lidar="vlp16"),
+        simulate("block", count=4, motion_compensated=False, speed=5.0),
+    ):
+        with pytest.raises(OutputExistsError, match="begun with other settings"):
+            record(other, tmp_path / "out", resume=True)
+    assert files_of(tmp_path / "out") == begun
+    record(drive, tmp_path / "out", overwrite=True)
+    assert not (tmp_path / "out" / "sequences" / "00.part").exists()
+
+
+def test_there_is_nothing_to_resume_in_a_finished_or_foreign_folder(drive: SimulatedDrive, tmp_path: Path) -> None:
     record(drive, tmp_path / "out")
-    before = files_of(tmp_path / "out")
+    with pytest.raises(OutputExistsError, match="nothing in it was interrupted"):
+        record(drive, tmp_path / "out", resume=True)
+    # Where nothing was begun, there is just everything to do.
+    assert record(drive, tmp_path / "new", resume=True).sequence.is_dir()
+
+
+def test_an_interrupted_overwrite_leaves_the_old_sequence_whole(drive: SimulatedDrive, tmp_path: Path) -> None:
+    def stop(index: int) -> None:
+        if index == 2:
+            raise KeyboardInterrupt
+
+    out = tmp_path / "out"
+    record(drive, out)
+    before = files_of(out / "sequences" / "00")
     with pytest.raises(KeyboardInterrupt):
-        record(drive, tmp_path / "out", overwrite=True, on_scan=stop)
-    assert files_of(tmp_path / "out") == before
+        record(drive, out, overwrite=True, on_scan=stop)
+    assert files_of(out / "sequences" / "00") == before
+
+
+def test_scans_traced_ahead_by_threads_are_those_traced_one_by_one(tmp_path: Path) -> None:
+    drive = simulate("identical", count=6, settings=["traffic.cars=40"], lidar="vlp16")
+    record(drive, tmp_path / "out")
+    for index in range(6):
+        raw = read_bin(tmp_path / "out" / "sequences" / "00" / "velodyne" / f"{index:06d}.bin")
+        assert raw[:, :3].tobytes() == drive.scan(index).points.tobytes()
 
 
 def test_a_disk_too_small_is_said_before_the_first_scan(
