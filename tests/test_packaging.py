@@ -27,7 +27,7 @@ TEST_EXTRA = [Requirement(text) for text in PROJECT["optional-dependencies"]["te
 # Promised to the user though nothing imports them by name yet: the pose graph, OpenStreetMap, outlier removal.
 PROMISED = {"gtsam", "requests", "open3d", "open3d-cpu"}
 # Run as commands, not imported.
-TOOLS = {"mypy", "ruff", "scipy-stubs"}
+TOOLS = {"mypy", "ruff", "scipy-stubs", "types-defusedxml"}
 # Comes with pytest.
 WITH_PYTEST = {"packaging"}
 

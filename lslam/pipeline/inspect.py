@@ -13,6 +13,7 @@ from lslam.types.scan import Scan
 from lslam.types.sequence import Sequence
 from lslam.types.trajectory import Trajectory
 
+GRAVITY = 9.80665  # m/s2
 SCHEMA = 1
 
 Facts = dict[str, Any]
