@@ -229,5 +229,5 @@ def test_the_sample_is_what_the_command_in_its_readme_makes() -> None:
 
 def test_the_sample_is_small() -> None:
     size = sum(p.stat().st_size for p in SAMPLE.rglob("*") if p.is_file())
-    assert 1e6 < size < 8e6
+    assert 1e6 < size < 10_000_000
     assert len(read_trajectory(SAMPLE / "poses" / "00.txt")) == 95
