@@ -24,8 +24,9 @@ LIBRARIES = ("numpy", "numba", "scipy", "kiss-icp")
 class Manifest:
     """Gathers facts while the run goes on; `as_dict` is the file at any moment.
 
-    outcome : done, degraded (a scan was bridged or skipped, or a problem arose), diverged or interrupted
-    problems : what went wrong in this run; what was wrong with the recording before is listed too, but degrades nothing
+    outcome : done, degraded (a scan was bridged or skipped, or input was dropped, replaced or refused), diverged or
+        interrupted
+    problems : what went wrong in this run, beside what was wrong with the recording before
     """
 
     def __init__(self, command: str, sequence: Sequence, config: Config) -> None:
@@ -40,7 +41,7 @@ class Manifest:
     @property
     def outcome(self) -> str:
         """How the run ends if nothing else goes wrong."""
-        return self._ended or ("degraded" if self.problems else "done")
+        return self._ended or ("degraded" if self.problems or self.sequence.problems else "done")
 
     @contextmanager
     def timed(self, name: str) -> Iterator[None]:

@@ -155,6 +155,8 @@ def _estimate(
             sequence, odometry, threads=config.input.threads, max_failures=limit,
             should_stop=watch.should_stop, on_scan=seen,
         )  # fmt: skip
+    if all(r.status == "skipped" for r in results):
+        raise InputError(f"{sequence.path}: none of {len(results)} scans can be used, the first: {results[0].reason}")
     manifest.judge(results, len(sequence), is_diverged(results, limit))
     return RunRecord(
         name=sequence.name,
@@ -226,4 +228,6 @@ def _raise_outcome(manifest: Manifest, config: Config) -> None:
     if manifest.outcome == "diverged":
         raise RunFailedError(f"the run diverged: {why}")
     if manifest.outcome == "degraded" and config.input.strict:
-        raise GateError(f"--strict: the run is degraded: {why}")
+        raise GateError(
+            f"--strict: the run is degraded: {'; '.join([*manifest.sequence.problems, *manifest.problems])}"
+        )

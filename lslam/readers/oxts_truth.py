@@ -53,7 +53,7 @@ def oxts_truth(
         f"pos_acc: median {accuracy:.2f} m, worst {values[:, POS_ACC].max():.2f} m"
     )
     if accuracy > _POOR_M:
-        voice.problems.append(
+        voice.notes.append(
             f"OXTS positions are poor (pos_acc median {accuracy:.2f} m): position errors against them say more about GNSS than "
             "about SLAM, trust rotation and short relative errors"
         )

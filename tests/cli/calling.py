@@ -48,7 +48,8 @@ def sample_copy(folder: Path, count: int) -> Path:
     (target / "velodyne").mkdir(parents=True)
     for i in range(count):
         shutil.copy(source / "velodyne" / f"{i:06d}.bin", target / "velodyne")
-    shutil.copy(source / "calib.txt", target)
+    for name in ("calib.txt", "imu.csv", "gnss.csv"):
+        shutil.copy(source / name, target)
     for file, out in ((source / "times.txt", target / "times.txt"), (SAMPLE / "poses/00.txt", folder / "poses/00.txt")):
         out.parent.mkdir(exist_ok=True)
         out.write_text("".join(file.read_text().splitlines(keepends=True)[:count]))

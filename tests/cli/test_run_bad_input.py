@@ -98,18 +98,25 @@ def unrelated_places(folder: Path) -> None:
             write_points(folder / "velodyne" / f"{k:06d}.bin", centre + rng.normal(0, 9, (4000, 3)), np.zeros(4000))
 
 
-@pytest.mark.parametrize(
-    ("spoil", "words"),
-    [(empty_all, "no points"), (cut_all, "no multiple of 16"), (unrelated_places, "the first is scan 3")],
-)
-def test_nothing_to_register_is_exit_1_with_a_summary(
+@pytest.mark.parametrize(("spoil", "words"), [(empty_all, "no points"), (cut_all, "no multiple of 16")])
+def test_no_scan_that_can_be_used_is_exit_3_without_a_result(
     sequence: Path, tmp_path: Path, spoil: Callable[[Path], None], words: str
 ) -> None:
     spoil(sequence)
     done, out = run(sequence, tmp_path)
-    assert done.returncode == 1
+    assert (done.returncode, done.stdout) == (3, "")
     assert_one_sentence(done.stderr)
     assert words in done.stderr.splitlines()[-1]
+    assert manifest(out)["status"] == "failed"
+    assert not {"trajectory.tum", "map.ply", "report.html"} & {p.name for p in out.iterdir()}
+
+
+def test_scans_of_unrelated_places_are_exit_1_with_a_summary(sequence: Path, tmp_path: Path) -> None:
+    unrelated_places(sequence)
+    done, out = run(sequence, tmp_path)
+    assert done.returncode == 1
+    assert_one_sentence(done.stderr)
+    assert "the first is scan 3" in done.stderr.splitlines()[-1]
     assert "status       diverged" in done.stdout
     assert manifest(out)["status"] == "diverged"
     assert {"trajectory.tum", "report.html", "log.txt"} <= {p.name for p in out.iterdir()}
@@ -155,7 +162,10 @@ def test_contradictions_are_resolved_and_said(
     assert words in done.stdout, "the summary says it too"
     facts = manifest(out)
     assert any(words in problem for problem in facts["problems"])
-    assert (facts["status"], facts["counts"]["ok"]) == ("done", scans)
+    assert (facts["status"], facts["counts"]["ok"]) == ("degraded", scans)
+    done, _ = run(sequence, tmp_path, "--overwrite", "--strict")
+    assert done.returncode == 4, "--strict turns every degradation into a failed gate"
+    assert words in done.stderr.splitlines()[-1]
     if spoil is drop_tr:
         assert facts["frames"]["trajectory_kitti.txt"].startswith("LiDAR")
         assert "errors       not stated" in done.stdout

@@ -16,7 +16,7 @@ from stub_sequences import Standstill, Stub, noise, sample, with_points
 
 import lslam
 from lslam.config import Config, load_config
-from lslam.errors import GateError, InterruptedRunError, OutputError, RunFailedError, UsageError
+from lslam.errors import GateError, InputError, InterruptedRunError, OutputError, RunFailedError, UsageError
 from lslam.evaluation.evaluate import Evaluation
 from lslam.pipeline import run as recipe
 from lslam.pipeline.run import RunOutcome, Watch
@@ -133,12 +133,12 @@ def test_one_bad_scan_degrades_the_run_and_is_counted(
     assert names(tmp_path / "strict") == ALL
 
 
-def test_nothing_but_empty_scans_is_a_failure_that_leaves_a_readable_folder(tmp_path: Path) -> None:
+def test_nothing_but_empty_scans_is_bad_input_and_no_result(tmp_path: Path) -> None:
     stub = Stub([Scan(np.zeros((0, 3), np.float32), i * 100_000_000, i) for i in range(4)])
-    with pytest.raises(RunFailedError, match=r"diverged.*4 of 4 scans.*no points"):
+    with pytest.raises(InputError, match=r"none of 4 scans can be used.*no points"):
         lslam.run(stub, out=tmp_path / "out")
-    assert manifest(tmp_path / "out")["status"] == "diverged"
-    assert {"trajectory.tum", "report.html", "scans.csv"} <= names(tmp_path / "out")
+    assert manifest(tmp_path / "out")["status"] == "failed"
+    assert names(tmp_path / "out") == {"manifest.json", "config.toml", "log.txt"}
 
 
 def test_a_diverged_run_is_written_up_to_where_it_was_given_up(tmp_path: Path) -> None:
