@@ -54,8 +54,9 @@ def align(source: Floats, scatter: Floats, R: Floats, t: Floats, scale_start: fl
     With a coarse map, points that find no plane in the fine one are matched there; blobs serve the last map only.
 
     The robust width falls from `scale_start` by `decay` to `scale_end`; iterations stop when, at the end width, the update
-    is under `step_m` and `step_rad`. Returns H (6, 6) and facts (6,) of the last linearisation, the last update (6,),
-    iterations, whether they converged, the number of unobserved directions and these (6, 6).
+    is under `step_m` and `step_rad`. Returns H (6, 6) and facts (7,) of the last linearisation, the seventh being the
+    inliers in the fine map, the last update (6,), iterations, whether they converged, the number of unobserved directions
+    and these (6, 6).
     """
     n = len(source)
     cells = np.full(n, -1, np.int64)
@@ -63,7 +64,7 @@ def align(source: Floats, scatter: Floats, R: Floats, t: Floats, scale_start: fl
     coarse_cells = np.full(n if has_coarse else 0, -1, np.int64)
     coarse_slots = np.full((len(coarse_cells), 8), -1, np.int32)
     is_done = np.zeros(n, np.bool_)
-    H, g, d, facts = np.empty((6, 6)), np.empty(6), np.zeros(6), np.zeros(6)
+    H, g, d, facts = np.empty((6, 6)), np.empty(6), np.zeros(6), np.zeros(7)
     weak = np.zeros((6, 6))
     scale = scale_start
     converged = False
@@ -76,6 +77,7 @@ def align(source: Floats, scatter: Floats, R: Floats, t: Floats, scale_start: fl
         is_done[:] = False
         linearise(source, scatter, R, t, size, scale, sigma2, 0.0 if has_coarse else blob_weight, planes, keys, table,
                   cells, slots, is_done, H, g, facts)  # fmt: skip
+        facts[6] = facts[2]
         if has_coarse:
             linearise(source, scatter, R, t, coarse_size, scale, sigma2, blob_weight, coarse_planes, coarse_keys,
                       coarse_table, coarse_cells, coarse_slots, is_done, H, g, facts)  # fmt: skip

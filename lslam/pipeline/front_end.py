@@ -15,14 +15,12 @@ from lslam.errors import InputError
 from lslam.odometry.base import Odometry
 from lslam.readers.selection import Selection
 from lslam.registration.motion import ConstantVelocity
+from lslam.registration.registration import DOUBT
 from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan import Scan
 from lslam.types.scan_result import ScanResult
 from lslam.types.sequence import Sequence
 from lslam.types.trajectory import Trajectory
-
-# Half a metre and two degrees: what a pose that no scan supports may be wrong by, one sigma.
-DOUBT = np.diag([0.25] * 3 + [np.deg2rad(2.0) ** 2] * 3)
 
 
 @dataclass(frozen=True)

@@ -20,6 +20,9 @@ from lslam.registration.solver import RegistrationResult, solve
 
 MIN_SOURCE_POINTS = 30
 
+# Half a metre and two degrees: what a pose that no scan supports may be wrong by, one sigma.
+DOUBT = np.diag([0.25] * 3 + [np.deg2rad(2.0) ** 2] * 3)
+
 
 class Registration:
     """Registers scans one after the other against a local map that it keeps.
@@ -158,8 +161,7 @@ class Registration:
 
 
 def _failed(T_prior: NDArray[np.float64], source_points: int, reason: str) -> RegistrationResult:
-    """The motion prior with half a metre and two degrees of doubt."""
-    doubt = np.diag([0.25] * 3 + [np.deg2rad(2.0) ** 2] * 3)
+    """The motion prior, in doubt."""
     return RegistrationResult(
-        T_prior.copy(), ok=False, reason=reason, covariance=doubt, converged=False, source_points=source_points
+        T_prior.copy(), ok=False, reason=reason, covariance=DOUBT.copy(), converged=False, source_points=source_points
     )

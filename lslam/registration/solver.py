@@ -23,7 +23,8 @@ class RegistrationResult:
 
     T_world_lidar : (4, 4); covariance : (6, 6) of t' = t + d[:3], R' = exp(d[3:]) R in world axes, m2 and rad2
     ok : False when the pose is the motion prior because registration failed, `reason` says why
-    inliers : source points within the final kernel; matched : points that found a voxel; overlap : matched / source
+    inliers : source points within the final kernel; fine_inliers : those of them in fine voxels
+    matched : points that found a voxel; overlap : matched / source
     rmse : weighted distance to the planes, m; degenerate : (K, 6) unobserved unit directions (rotation scaled by lever arm)
     prior_error : correction of the motion prior, (m, rad)
     """
@@ -37,6 +38,7 @@ class RegistrationResult:
     source_points: int = 0
     matched: int = 0
     inliers: int = 0
+    fine_inliers: int = 0
     rmse: float = 0.0
     degenerate: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 6)))
     prior_error: tuple[float, float] = (0.0, 0.0)
@@ -54,8 +56,8 @@ class RegistrationResult:
 
     @property
     def agreement(self) -> float:
-        """Share of the source points within the final kernel."""
-        return self.inliers / max(self.source_points, 1)
+        """Share of the source points within the final kernel of the fine map, with or without a coarse one beside it."""
+        return self.fine_inliers / max(self.source_points, 1)
 
 
 def solve(
@@ -86,6 +88,7 @@ def solve(
         source_points=len(points.source),
         matched=int(facts[3]),
         inliers=int(facts[2]),
+        fine_inliers=int(facts[6]),
         rmse=float(np.sqrt(facts[1] / max(facts[5], 1e-12))),
         degenerate=weak[:weak_count].copy(),
         lever_arm=lever,
