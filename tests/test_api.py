@@ -19,7 +19,6 @@ from lslam.errors import InputError, UsageError
 from lslam.types.trajectory import Trajectory
 
 SAMPLE = Path(__file__).resolve().parents[1] / "sample_data"
-needs_sample = pytest.mark.skipif(not (SAMPLE / "sequences").is_dir(), reason="sample_data is not here")
 
 
 def few_scans(**sections: dict[str, object]) -> Config:
@@ -63,7 +62,6 @@ def test_registration_on_arrays_follows_a_moving_sensor() -> None:
         np.testing.assert_allclose(result.T_world_lidar[:3, 3], [0.4 * k, 0.0, 0.0], atol=0.01)
 
 
-@needs_sample
 def test_open_run_and_evaluate_without_writing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     sequence = lslam.open_sequence(SAMPLE)
@@ -82,7 +80,6 @@ def test_open_run_and_evaluate_without_writing(tmp_path: Path, monkeypatch: pyte
     assert outcome.evaluation.ate["origin"].translation == translation
 
 
-@needs_sample
 def test_run_takes_a_path_and_gives_the_same_every_time() -> None:
     first, second = (lslam.run(str(SAMPLE), few_scans()).trajectory for _ in range(2))
     one_thread = lslam.run(SAMPLE, few_scans(input={"count": 12, "threads": 1})).trajectory
@@ -92,7 +89,6 @@ def test_run_takes_a_path_and_gives_the_same_every_time() -> None:
     assert first.stamps_ns.tobytes() == second.stamps_ns.tobytes()
 
 
-@needs_sample
 def test_another_ground_truth_can_be_given() -> None:
     sequence = lslam.open_sequence(SAMPLE)
     assert sequence.ground_truth is not None
@@ -117,7 +113,6 @@ def test_errors_are_those_of_lslam(tmp_path: Path) -> None:
         lslam.evaluate(few, few)
 
 
-@needs_sample
 def test_an_unknown_method_is_refused_before_anything_is_written(tmp_path: Path) -> None:
     config = few_scans(odometry={"method": "icpp"})
     with pytest.raises(UsageError, match="did you mean 'icp'"):
