@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from lslam.config.eval import EvalConfig
 from lslam.config.input import InputConfig
+from lslam.config.loam import LoamConfig
 from lslam.config.map import MapConfig
 from lslam.config.odometry import OdometryConfig
 from lslam.config.preprocess import PreprocessConfig
@@ -19,6 +20,7 @@ class Config(Section):
     preprocess: PreprocessConfig = PreprocessConfig()
     odometry: OdometryConfig = OdometryConfig()
     registration: RegistrationConfig = RegistrationConfig()
+    loam: LoamConfig = LoamConfig()
     map: MapConfig = MapConfig()
     eval: EvalConfig = EvalConfig()
     report: ReportConfig = ReportConfig()

@@ -1,0 +1,47 @@
+"""Section `loam`: edges and planes along the rings, and how they are matched."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field, model_validator
+
+from lslam.config.section import Section
+
+
+class LoamConfig(Section):
+    """Features of LOAM and LeGO-LOAM. Numbers are the papers' own unless the description says more."""
+
+    regions: int = Field(6, ge=1, description="parts of a ring with equally many points, each with its own features")
+    max_edge_points: int = Field(2, ge=1, description="sharp edges per region")
+    max_less_edge_points: int = Field(20, ge=1, description="edges per region, the sharp ones included")
+    max_planar_points: int = Field(4, ge=1, description="planar points per region")
+    edge_curvature: float = Field(
+        1.0, gt=0, description="an edge's curvature, equation 2.21, over the angle between beams; a right angle has 2.7"
+    )
+    planar_curvature: float = Field(0.5, gt=0, description="likewise, above which nothing is planar")
+    edge_noise: float = Field(
+        4.0, gt=0, description="likewise, over what the noise of the ranges makes, which is measured in each scan"
+    )
+    occlusion: float = Field(0.3, gt=0, description="m; a jump in range from beam to beam that hides what is behind")
+    parallel_deg: float = Field(
+        80.0, gt=0, lt=90, description="angle of incidence above which a surface is parallel to the beam"
+    )
+    grid_step: float = Field(0.2, ge=0, description="m; grid of the less planar points, 0 keeps all")
+    feature_map_voxel: float = Field(1.0, gt=0, description="m; voxels of the feature map")
+    matching: Literal["one-to-many", "one-to-one"] = Field(
+        "one-to-many", description="whether several features may match the same one"
+    )
+
+    @model_validator(mode="after")
+    def _check(self) -> LoamConfig:
+        if self.max_less_edge_points < self.max_edge_points:
+            raise ValueError(
+                f"max_less_edge_points = {self.max_less_edge_points} must be at least max_edge_points = "
+                f"{self.max_edge_points}"
+            )
+        if self.planar_curvature > self.edge_curvature:
+            raise ValueError(
+                f"planar_curvature = {self.planar_curvature} must not exceed edge_curvature = {self.edge_curvature}"
+            )
+        return self
