@@ -61,13 +61,24 @@ class InterruptedRunError(LslamError):
 
 
 def nearest(name: str, known: Iterable[str]) -> str:
-    """Sentence fragment suggesting the known name nearest to `name`, or listing the known ones.
+    """Sentence fragment suggesting the known names nearest to `name`, or listing the known ones.
 
     >>> nearest("kis-icp", ["icp", "kiss-icp"])
     "did you mean 'kiss-icp'?"
+    >>> nearest("gcip", ["icp", "gicp", "vgicp"])
+    "did you mean 'gicp' or 'vgicp'?"
     >>> nearest("zzz", ["icp", "kiss-icp"])
     'known: icp, kiss-icp'
     """
     names = {known_name.lower(): known_name for known_name in known}
-    close = difflib.get_close_matches(name.lower(), names, n=1, cutoff=0.5)
-    return f"did you mean {names[close[0]]!r}?" if close else "known: " + ", ".join(names.values())
+    close = difflib.get_close_matches(name.lower(), names, n=3, cutoff=0.5)
+    if not close:
+        return "known: " + ", ".join(names.values())
+    best = _likeness(name, close[0])
+    *others, last = [repr(names[c]) for c in close if _likeness(name, c) > best - 0.1]
+    return f"did you mean {', '.join(others)} or {last}?" if others else f"did you mean {last}?"
+
+
+def _likeness(name: str, known: str) -> float:
+    """0 to 1, as `get_close_matches` counts it."""
+    return difflib.SequenceMatcher(None, known, name.lower()).ratio()

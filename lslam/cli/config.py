@@ -19,15 +19,29 @@ def command() -> None:
     """
 
 
-@command.command(epilog="Example: lslam config show --set map.voxel=0.1")
+@command.command(epilog="Example: lslam config show --preset thesis-icp --set map.voxel=0.1")
+@options.preset
 @options.configuration
 @click.option("--describe", is_flag=True, help="Say beside each key what it means.")
-def show(config_file: Path | None, settings: tuple[str, ...], describe: bool) -> None:
+def show(config_file: Path | None, preset: str | None, settings: tuple[str, ...], describe: bool) -> None:
     """Print the resolved configuration as TOML."""
     from lslam.config import load_config, to_described_toml, to_toml
+    from lslam.pipeline.check import check_config
 
-    config = load_config(config_file, settings)
+    config = load_config(config_file, options.with_preset(settings, preset))
+    check_config(config)
     click.echo(to_described_toml(config) if describe else to_toml(config), nl=False)
+
+
+@command.command(epilog="Example: lslam config presets")
+def presets() -> None:
+    """List the presets that `--preset` takes."""
+    from lslam.config.preset_files import known_presets
+
+    known = known_presets()
+    width = max(len(name) for name in known)
+    for name, summary in known.items():
+        click.echo(f"{name:<{width}}  {summary}")
 
 
 @command.command(epilog="Example: lslam config check my.toml")

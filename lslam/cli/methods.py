@@ -7,7 +7,7 @@ import click
 
 @click.command(epilog="Example: lslam methods")
 def command() -> None:
-    """List the odometry methods."""
+    """List the odometry methods. `lslam config presets` lists whole configurations, those of the theses among them."""
     from lslam.odometry import known_methods
 
     methods = known_methods()

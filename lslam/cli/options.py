@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import json
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -52,6 +53,18 @@ def configuration(function: F) -> F:
         metavar="FILE",
         help="Configuration, TOML.",
     )(function)
+
+
+def preset(function: F) -> F:
+    """--preset."""
+    return click.option(
+        "--preset", metavar="NAME|FILE", help="Configuration to start from, see `lslam config presets`."
+    )(function)
+
+
+def with_preset(settings: Iterable[str], preset: str | None) -> list[str]:
+    """The settings of --set and of the flag --preset, which beats them."""
+    return [*settings, *([] if preset is None else [f"odometry.preset={json.dumps(preset)}"])]
 
 
 def as_json(function: F) -> F:

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 )
 @click.argument("sequence")
 @click.option("--method", metavar="NAME", help="Odometry method, see `lslam methods` [default: icp].")
+@options.preset
 @click.option(
     "--gt", type=click.Path(path_type=Path), metavar="FILE", help="Ground truth instead of the sequence's own."
 )
@@ -78,7 +79,7 @@ def command(sequence: str, **given: Any) -> None:
 
 
 def _resolve(given: dict[str, Any]) -> Config:
-    """Flags over --set over environment over --config over defaults."""
+    """Flags over --set over environment over --config over --preset over defaults."""
     from lslam.config import load_config
 
     flags = {
@@ -89,9 +90,8 @@ def _resolve(given: dict[str, Any]) -> Config:
         "input.threads": given["threads"],
         "input.strict": "true" if given["strict"] else None,
     }
-    return load_config(
-        given["config_file"], [*given["settings"], *(f"{k}={v}" for k, v in flags.items() if v is not None)]
-    )
+    settings = options.with_preset(given["settings"], given["preset"])
+    return load_config(given["config_file"], [*settings, *(f"{k}={v}" for k, v in flags.items() if v is not None)])
 
 
 def _read_truth(path: Path | None, sequence: Sequence) -> Trajectory | None:

@@ -13,7 +13,8 @@ import tomli_w
 from pydantic import BaseModel, ValidationError
 
 from lslam.config.config import Config
-from lslam.errors import ConfigError, InputError, nearest
+from lslam.config.preset_files import known_presets, read_preset, read_toml
+from lslam.errors import ConfigError, nearest
 
 Tree = dict[str, Any]
 
@@ -23,18 +24,33 @@ def load_config(
 ) -> Config:
     """Resolve the configuration: `settings` ("a.b=v") over LSLAM_A_B variables over the TOML file over defaults.
 
-    Raises ConfigError naming the key and the nearest known one, InputError when the file is missing or not TOML.
+    Whoever of them names `odometry.preset` puts that preset between the file and the defaults. Raises ConfigError naming
+    the key and the nearest known one, UsageError for an unknown preset, InputError when a file is missing.
     """
     tree: Tree = {}
     if path is not None:
-        _merge(tree, _read(path), str(path))
+        _merge(tree, read_toml(path, "configuration"), str(path))
     _merge(tree, _from_environment(os.environ if environ is None else environ), "environment")
     for setting in settings:
         _merge(tree, _parse_setting(setting), f"--set {setting}")
     try:
-        return Config.model_validate(tree)
+        return Config.model_validate(_over_preset(tree))
     except ValidationError as error:
         raise ConfigError(_explain(error)) from None
+
+
+def _over_preset(tree: Tree) -> Tree:
+    """The tree laid over the preset it names; a preset's file is kept as a full path, so that a resolved copy finds it."""
+    name = str(tree.get("odometry", {}).get("preset", ""))
+    if not name:
+        return tree
+    under: Tree = {}
+    _merge(under, read_preset(name), f"preset {name}")
+    if "preset" in under.get("odometry", {}):
+        raise ConfigError(f"preset {name}: a preset cannot stand on another one, remove odometry.preset")
+    _merge(under, tree, "")
+    under["odometry"]["preset"] = name if name in known_presets() else str(Path(name).resolve())
+    return under
 
 
 def to_toml(config: Config) -> str:
@@ -58,17 +74,6 @@ def _inline(value: Any) -> str:
     if isinstance(value, list):
         return f"[{', '.join(_inline(v) for v in value)}]"
     return tomli_w.dumps({"v": value}).removeprefix("v = ").strip()
-
-
-def _read(path: Path) -> Tree:
-    try:
-        return tomllib.loads(path.read_text(encoding="utf-8-sig"))
-    except OSError as error:
-        raise InputError(f"configuration {path} cannot be read: {error.strerror or error}") from None
-    except UnicodeDecodeError:
-        raise InputError(f"configuration {path} cannot be read: it is not UTF-8 text") from None
-    except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"configuration {path} is not valid TOML: {error}") from None
 
 
 def _from_environment(environ: Mapping[str, str]) -> Tree:

@@ -1,0 +1,101 @@
+"""Presets: where their values stand among the others, and what is said about wrong ones."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from lslam.config import Config, load_config, to_toml
+from lslam.config.preset_files import known_presets, read_preset
+from lslam.errors import ConfigError, InputError, UsageError
+
+MINE = """summary = "ours"
+[preprocess]
+range_max = 40.0
+range_min = 2.0
+random_share = 0.5
+[odometry]
+method = "kiss-icp"
+[map]
+voxel = 0.5
+write = false
+"""
+
+
+@pytest.fixture
+def mine(tmp_path: Path) -> Path:
+    path = tmp_path / "mine.toml"
+    path.write_text(MINE)
+    return path
+
+
+def load(*settings: str, path: Path | None = None, **environ: str) -> Config:
+    return load_config(path, settings, environ)
+
+
+def test_a_preset_stands_under_everything_but_the_defaults(mine: Path, tmp_path: Path) -> None:
+    file = tmp_path / "c.toml"
+    file.write_text("[preprocess]\nrange_min = 3\n[map]\nvoxel = 0.3\n")
+    config = load(f"odometry.preset={mine}", "preprocess.random_share=0.7", path=file, LSLAM_MAP_VOXEL="0.4")
+    p = config.preprocess
+    assert (p.range_max, p.range_min, p.random_share) == (40.0, 3.0, 0.7)
+    assert (config.map.voxel, config.map.write, config.odometry.method) == (0.4, False, "kiss-icp")
+    assert p.map_leaf == Config().preprocess.map_leaf
+
+
+def test_file_environment_and_setting_may_name_it_and_the_highest_wins(mine: Path, tmp_path: Path) -> None:
+    other = tmp_path / "other.toml"
+    other.write_text("[map]\nvoxel = 0.9\n")
+    file = tmp_path / "c.toml"
+    file.write_text(f'[odometry]\npreset = "{mine}"\n')
+    assert load(path=file).map.voxel == 0.5
+    assert load(path=file, LSLAM_ODOMETRY_PRESET=str(other)).map.voxel == 0.9
+    assert load(f"odometry.preset={mine}", LSLAM_ODOMETRY_PRESET=str(other)).map.voxel == 0.5
+
+
+def test_a_resolved_configuration_repeats_itself_and_names_its_preset(
+    mine: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    before = load("odometry.preset=mine.toml", "map.voxel=0.25")
+    assert before.odometry.preset == str(mine.resolve())
+    resolved = tmp_path / "resolved.toml"
+    resolved.write_text(to_toml(before))
+    monkeypatch.chdir("/")
+    assert load(path=resolved) == before
+
+
+def test_an_unknown_preset_is_answered_with_the_nearest(monkeypatch: pytest.MonkeyPatch) -> None:
+    shipped = {"thesis-icp": "", "thesis-loam": ""}
+    monkeypatch.setattr("lslam.config.preset_files._shipped", lambda: shipped)
+    with pytest.raises(
+        UsageError, match=r"no preset 'thesis-ipc'; did you mean 'thesis-icp'.*or a TOML file"
+    ) as caught:
+        load("odometry.preset=thesis-ipc")
+    assert caught.value.exit_code == 2
+
+
+def test_wrong_files_and_keys_of_a_preset_are_named(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"preset none\.toml cannot be read: No such file"):
+        load("odometry.preset=none.toml")
+    for text, words in (
+        ("[map]\nvoxl = 1\n", r"preset .*p\.toml: unknown key map\.voxl; did you mean 'voxel'"),
+        ("[map\n", "not valid TOML"),
+        ("voxel = 1\n", "unknown section 'voxel'"),
+        ('[odometry]\npreset = "thesis-icp"\n', "cannot stand on another"),
+        ("[map]\nvoxel = 0\n", r"map\.voxel = 0"),
+    ):
+        (tmp_path / "p.toml").write_text(text)
+        with pytest.raises(ConfigError, match=words):
+            load(f"odometry.preset={tmp_path / 'p.toml'}")
+
+
+@pytest.mark.parametrize("name", sorted(known_presets()))
+def test_every_shipped_preset_loads_and_says_what_it_is(name: str) -> None:
+    assert len(known_presets()[name]) > 20
+    config = load(f"odometry.preset={name}")
+    assert config.odometry.preset == name
+    for section, values in read_preset(name).items():
+        for key, value in values.items():
+            assert getattr(getattr(config, section), key) == value
