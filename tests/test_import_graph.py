@@ -23,6 +23,7 @@ LAYERS = [
     ["types"],
     ["geometry"],
     ["kernels", "config"],
+    ["foreign"],
     ["errors", "version"],
 ]
 LEVEL = {name: level for level, names in enumerate(LAYERS) for name in names}

@@ -19,6 +19,8 @@ METHODS = {
         "scan to map of Gaussian voxels, point to plane; own, deterministic, with covariances",
     ),
     "kiss-icp": ("lslam.odometry.kiss", "the baseline: the kiss-icp package with its own preprocessing and defaults"),
+    "small-gicp": ("lslam.odometry.small_gicp", "baseline: GICP of the small_gicp package on a local map of keyframes"),
+    "open3d-gicp": ("lslam.odometry.open3d", "baseline: generalised ICP of Open3D, scan to scan"),
 }
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.config.config import Config
-from lslam.errors import InputError
+from lslam.foreign import importing
 from lslam.geometry import se3
 from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan import Scan
@@ -31,11 +31,9 @@ class Kiss:
     """
 
     def __init__(self, range_max: float, has_user_range: bool) -> None:
-        try:
+        with importing("kiss-icp", "install it with: pip install kiss-icp"):
             from kiss_icp.config import KISSConfig
             from kiss_icp.kiss_icp import KissICP
-        except ImportError as error:
-            raise InputError(f"kiss-icp cannot be imported: {error}; install it with: pip install kiss-icp") from None
         config = KISSConfig()
         if has_user_range:
             config.data.max_range = range_max

@@ -37,14 +37,22 @@ def prepare_points(points: NDArray[Any], config: PreprocessConfig, index: int = 
     Centroids, not first points: the average of the points of a cell is nearer to the surface than any one of them.
     Further columns are ignored. Raises InputError for arrays of another shape.
     """
+    kept = clean_points(points, config)
+    map_points, _ = voxel.centroids(kept, config.map_leaf)
+    source, scatter = _source_points(kept, map_points, config, index)
+    return PreparedPoints(map_points, source.astype(np.float64), scatter.astype(np.float64), len(kept))
+
+
+def clean_points(points: NDArray[Any], config: PreprocessConfig) -> NDArray[np.float32]:
+    """The points (N, 3), m, LiDAR frame, that a method may use: (M, 3), in their order.
+
+    Further columns are ignored. Raises InputError for arrays of another shape.
+    """
     array = np.asarray(points)
     if array.ndim != 2 or array.shape[1] < 3:
         raise InputError(f"points of a scan have shape {array.shape}: (N, 3) is needed, x y z in metres")
     cloud = np.ascontiguousarray(array[:, :3], np.float32)
-    kept = cloud[gate_points(cloud, config)]
-    map_points, _ = voxel.centroids(kept, config.map_leaf)
-    source, scatter = _source_points(kept, map_points, config, index)
-    return PreparedPoints(map_points, source.astype(np.float64), scatter.astype(np.float64), len(kept))
+    return cloud[gate_points(cloud, config)]
 
 
 def gate_points(points: NDArray[np.float32], config: PreprocessConfig) -> NDArray[np.int64]:

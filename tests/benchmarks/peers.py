@@ -38,36 +38,23 @@ def kiss_icp() -> Register:
     return register
 
 
-def gicp_keyframes(keyframes: int = 10, step_m: float = 2.0, step_deg: float = 15.0, leaf: float = 0.3) -> Register:
-    import small_gicp
+def gicp_keyframes() -> Register:
+    """The method `small-gicp` itself, its preprocessing timed with it."""
+    from lslam.config import Config
+    from lslam.odometry.small_gicp import create
+    from lslam.registration.motion import ConstantVelocity
+    from lslam.types.motion_prior import MotionPrior
+    from lslam.types.scan import Scan
 
-    poses: list[NDArray[np.float64]] = []
-    clouds: list[NDArray[np.float64]] = []
-    state: dict[str, object] = {}
-
-    def rebuild(cloud: NDArray[np.float64], pose: NDArray[np.float64]) -> None:
-        clouds.append(cloud @ pose[:3, :3].T + pose[:3, 3])
-        del clouds[:-keyframes]
-        target, tree = small_gicp.preprocess_points(np.concatenate(clouds), downsampling_resolution=leaf, num_threads=2)
-        state.update(target=target, tree=tree, pose=pose)
+    method, motion, count = create(Config()), ConstantVelocity(), iter(range(1_000_000))
 
     def register(points: NDArray[np.float32]) -> NDArray[np.float64]:
-        kept = points[(np.linalg.norm(points, axis=1) < 100.0)].astype(np.float64)
-        source, _ = small_gicp.preprocess_points(kept, downsampling_resolution=leaf, num_threads=2)
-        if not poses:
-            poses.append(np.eye(4))
-            rebuild(source.points()[:, :3], poses[0])
-            return poses[0]
-        prior = poses[-1] if len(poses) < 2 else poses[-1] @ np.linalg.inv(poses[-2]) @ poses[-1]
-        result = small_gicp.align(
-            state["target"], source, state["tree"], prior, max_correspondence_distance=1.0, num_threads=2
-        )
-        poses.append(np.array(result.T_target_source))
-        moved = np.linalg.inv(state["pose"]) @ poses[-1]
-        turn = np.degrees(np.arccos(np.clip((np.trace(moved[:3, :3]) - 1) / 2, -1, 1)))
-        if np.linalg.norm(moved[:3, 3]) > step_m or turn > step_deg:
-            rebuild(source.points()[:, :3], poses[-1])
-        return poses[-1]
+        index = next(count)
+        scan = Scan(points, index * 100_000_000, index)
+        prior = MotionPrior(np.zeros(1), motion.predict(scan.stamp_ns)[None])
+        pose = method.register(scan, method.prepare(scan), prior).T_world_lidar
+        motion.correct(scan.stamp_ns, pose)
+        return pose
 
     return register
 

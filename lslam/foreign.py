@@ -1,0 +1,44 @@
+"""Importing what not every machine has: one clear sentence instead of a traceback."""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+from collections.abc import Iterator
+from importlib.util import find_spec
+from pathlib import Path
+
+from lslam.errors import InputError
+
+
+@contextlib.contextmanager
+def importing(library: str, way_out: str) -> Iterator[None]:
+    """Turn a failing import inside the block into an InputError that names the library and the way out.
+
+    >>> with importing("kiss-icp", "install it with: pip install kiss-icp"):
+    ...     import kiss_icp
+    """
+    try:
+        yield
+    except (ImportError, OSError) as error:
+        # A compiled module whose shared library is missing raises OSError, or ImportError with the loader's words.
+        raise InputError(f"{library} cannot be imported: {error}; {way_out}") from None
+
+
+@contextlib.contextmanager
+def importing_open3d() -> Iterator[None]:
+    """As `importing`, for Open3D: it needs libusb, libGL and libX11, which a bare machine lacks.
+
+    The libusb of the wheel `libusb-package` is loaded first where that is installed: Open3D then finds it.
+    """
+    spec = find_spec("libusb_package")
+    for folder in spec.submodule_search_locations or () if spec is not None else ():
+        for path in sorted(Path(folder).glob("libusb-1.0*.so*")):
+            with contextlib.suppress(OSError):
+                ctypes.CDLL(str(path), mode=ctypes.RTLD_GLOBAL)
+    way_out = (
+        "install it with: pip install open3d-cpu (Linux x86-64) or pip install open3d; on a bare Linux also: "
+        "apt install libusb-1.0-0 libgl1 libegl1 libx11-6 libgomp1 (without root: pip install libusb-package)"
+    )
+    with importing("Open3D", way_out):
+        yield

@@ -1,0 +1,88 @@
+"""Method `open3d-gicp`: generalised ICP of Open3D, scan to scan."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.config.config import Config
+from lslam.config.preprocess import PreprocessConfig
+from lslam.config.registration import RegistrationConfig
+from lslam.foreign import importing_open3d
+from lslam.geometry import se3
+from lslam.odometry.outcome import Alignment, judged
+from lslam.preprocessing.prepare import clean_points
+from lslam.registration.registration import MIN_SOURCE_POINTS
+from lslam.types.motion_prior import MotionPrior
+from lslam.types.scan import Scan
+from lslam.types.scan_result import ScanResult
+
+Floats = NDArray[np.float64]
+
+# Centroids of this grid, covariances of this many neighbours, correspondences within this distance, m.
+LEAF = 0.3
+NEIGHBOURS = 20
+REACH = 1.0
+
+
+@dataclass
+class Reference:
+    """The last scan that was registered: what the next one is aligned with."""
+
+    cloud: Any
+    T_world_lidar: Floats
+
+
+def create(config: Config) -> Open3dGicp:
+    """The baseline; the range gate follows `preprocess`."""
+    return Open3dGicp(config.preprocess, config.registration)
+
+
+class Open3dGicp:
+    """Open3D's generalised ICP (Segal 2009) with its own defaults. It keeps no map: its drift adds up scan by scan."""
+
+    def __init__(self, preprocess: PreprocessConfig, limits: RegistrationConfig) -> None:
+        with importing_open3d():
+            import open3d
+        self._package: Any = open3d
+        self._preprocess, self._limits = preprocess, limits
+        self._last: Reference | None = None
+
+    def prepare(self, scan: Scan) -> Any:
+        """Open3D's point cloud: gated, down-sampled, with a covariance per point."""
+        kept = clean_points(scan.points, self._preprocess).astype(np.float64)
+        package = self._package
+        cloud = package.geometry.PointCloud(package.utility.Vector3dVector(kept)).voxel_down_sample(LEAF)
+        if len(cloud.points) >= MIN_SOURCE_POINTS:
+            cloud.estimate_covariances(package.geometry.KDTreeSearchParamKNN(NEIGHBOURS))
+        return cloud
+
+    def register(self, scan: Scan, prepared: Any, prior: MotionPrior) -> ScanResult:
+        """Align with the last scan that was registered."""
+        began = time.perf_counter()
+        found = self._align(prepared, prior.start)
+        result = judged(scan, found, prior.start, self._limits, {})
+        if result.status == "ok":
+            self._last = Reference(prepared, result.T_world_lidar)
+        result.stages["register"] = time.perf_counter() - began
+        return result
+
+    def warm_up(self) -> None:
+        """Nothing to compile."""
+
+    def _align(self, cloud: Any, T_prior: Floats) -> Alignment:
+        count = len(cloud.points)
+        if self._last is None or count < MIN_SOURCE_POINTS:
+            return Alignment(T_prior, count, count)
+        registration = self._package.pipelines.registration
+        found = registration.registration_generalized_icp(
+            cloud, self._last.cloud, REACH, se3.relative(self._last.T_world_lidar, T_prior),
+            registration.TransformationEstimationForGeneralizedICP(),
+        )  # fmt: skip
+        pose = self._last.T_world_lidar @ np.asarray(found.transformation, np.float64)
+        inliers = len(found.correspondence_set)
+        return Alignment(pose, count, inliers, rmse=float(found.inlier_rmse))

@@ -1,0 +1,94 @@
+"""Method `small-gicp`: GICP of the small_gicp package (Koide 2024) on a local map of keyframes."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.config.config import Config
+from lslam.config.preprocess import PreprocessConfig
+from lslam.config.registration import RegistrationConfig
+from lslam.foreign import importing
+from lslam.geometry import se3, so3
+from lslam.odometry.outcome import Alignment, judged
+from lslam.preprocessing.prepare import clean_points
+from lslam.registration.registration import MIN_SOURCE_POINTS
+from lslam.types.motion_prior import MotionPrior
+from lslam.types.scan import Scan
+from lslam.types.scan_result import ScanResult
+
+Floats = NDArray[np.float64]
+
+# The recipe: the package's own centroids and covariances, correspondences within a metre, and a map of the last ten
+# keyframes, a new one every 2 m or 15 deg.
+LEAF = 0.3
+REACH = 1.0
+KEYFRAMES = 10
+STEP_M, STEP_DEG = 2.0, 15.0
+
+
+def create(config: Config) -> SmallGicp:
+    """The baseline; the range gate follows `preprocess`, the number of threads `input.threads`."""
+    return SmallGicp(config.preprocess, config.registration, config.input.threads)
+
+
+class SmallGicp:
+    """GICP, scan to keyframe map. Not ours: with several threads its sums may differ in the last digits."""
+
+    def __init__(self, preprocess: PreprocessConfig, limits: RegistrationConfig, threads: int = 2) -> None:
+        with importing("small_gicp", "install it with: pip install 'lslam[small-gicp]'"):
+            import small_gicp
+        self._package: Any = small_gicp
+        self._preprocess, self._limits, self._threads = preprocess, limits, threads
+        self._clouds: list[Floats] = []
+        self._target: tuple[Any, Any] | None = None
+        self._T_world_keyframe = np.eye(4)
+
+    def prepare(self, scan: Scan) -> Any:
+        """The package's point cloud: gated, down-sampled, with a covariance per point; None without usable points."""
+        kept = clean_points(scan.points, self._preprocess)
+        return self._covered(kept.astype(np.float64))[0] if len(kept) >= MIN_SOURCE_POINTS else None
+
+    def register(self, scan: Scan, prepared: Any, prior: MotionPrior) -> ScanResult:
+        """Align with the local map; enter a keyframe when the sensor has moved on."""
+        began = time.perf_counter()
+        found = self._align(prepared, prior.start)
+        aligned = time.perf_counter()
+        result = judged(scan, found, prior.start, self._limits, {})
+        if result.status == "ok" and self._has_moved_on(result.T_world_lidar):
+            self._insert(np.asarray(prepared.points())[:, :3], result.T_world_lidar)
+        result.stages.update(register=aligned - began, update=time.perf_counter() - aligned)
+        return result
+
+    def warm_up(self) -> None:
+        """Nothing to compile."""
+
+    def _align(self, source: Any, T_prior: Floats) -> Alignment:
+        count = 0 if source is None else source.size()
+        if self._target is None or count < MIN_SOURCE_POINTS:
+            return Alignment(T_prior, count, count)
+        target, tree = self._target
+        found = self._package.align(
+            target, source, tree, T_prior, max_correspondence_distance=REACH, num_threads=self._threads
+        )
+        pose = np.asarray(found.T_target_source, np.float64)
+        return Alignment(pose, count, int(found.num_inliers), bool(found.converged), int(found.iterations))
+
+    def _has_moved_on(self, pose: Floats) -> bool:
+        moved = se3.relative(self._T_world_keyframe, pose)
+        is_far = float(np.linalg.norm(moved[:3, 3])) > STEP_M
+        return self._target is None or is_far or float(np.rad2deg(so3.angle(moved[:3, :3]))) > STEP_DEG
+
+    def _insert(self, points: Floats, pose: Floats) -> None:
+        self._clouds.append(se3.apply(pose, points))
+        del self._clouds[:-KEYFRAMES]
+        self._target = self._covered(np.concatenate(self._clouds))
+        self._T_world_keyframe = pose.copy()
+
+    def _covered(self, points: Floats) -> tuple[Any, Any]:
+        """Cloud with covariances, and its tree."""
+        cloud, tree = self._package.preprocess_points(points, downsampling_resolution=LEAF, num_threads=self._threads)
+        return cloud, tree

@@ -1,0 +1,57 @@
+"""Libraries that are missing, or whose shared libraries are: one sentence with the way out."""
+
+from __future__ import annotations
+
+import sys
+from importlib.abc import MetaPathFinder
+from typing import Any
+
+import pytest
+
+from lslam.config import load_config
+from lslam.errors import InputError
+from lslam.foreign import importing
+from lslam.odometry import create_odometry
+
+
+def made(method: str) -> Any:
+    return create_odometry(load_config(None, [f"odometry.method={method}"], {}))
+
+
+@pytest.mark.parametrize(
+    ("method", "module", "way_out"),
+    [
+        ("kiss-icp", "kiss_icp.kiss_icp", "pip install kiss-icp"),
+        ("small-gicp", "small_gicp", r"pip install 'lslam\[small-gicp\]'"),
+        ("open3d-gicp", "open3d", "pip install open3d-cpu"),
+    ],
+)
+def test_a_missing_package_is_said_with_the_way_out(
+    method: str, module: str, way_out: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(InputError, match=f"cannot be imported: .*{way_out}") as caught:
+        made(method)
+    assert caught.value.exit_code == 3
+    assert "\n" not in str(caught.value)
+
+
+class Bare(MetaPathFinder):
+    """A machine without libusb, as seen by `import open3d`."""
+
+    def find_spec(self, fullname: str, path: object, target: object = None) -> None:
+        if fullname == "open3d":
+            raise OSError("libusb-1.0.so.0: cannot open shared object file: No such file or directory")
+
+
+def test_shared_libraries_open3d_misses_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in [m for m in sys.modules if m == "open3d" or m.startswith("open3d.")]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setattr(sys, "meta_path", [Bare(), *sys.meta_path])
+    with pytest.raises(InputError, match=r"libusb-1\.0\.so\.0.*apt install libusb-1\.0-0 libgl1.*libusb-package"):
+        made("open3d-gicp")
+
+
+def test_other_errors_pass() -> None:
+    with pytest.raises(ZeroDivisionError), importing("x", "y"):
+        _ = 1 / 0
