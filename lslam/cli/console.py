@@ -90,9 +90,13 @@ def progress(title: str, total: int, unit: str = "scans") -> Iterator[Advance]:
         last = now
         rate = done / max(now - began, 1e-9)
         left = f"{(total - done) / rate:.0f} s left" if done < total else f"{now - began:.1f} s"
-        log.info("%s %d/%d, %.1f %s/s, %s%s", title, done, total, rate, unit, left, note and f", {note}")
+        log.info("%s %d/%d, %s, %s%s", title, done, total, _pace(rate, unit), left, note and f", {note}")
 
     yield plain
+
+
+def _pace(rate: float, unit: str) -> str:
+    return f"{rate:.1f} {unit}/s" if rate >= 1 else f"{1 / rate:.1f} s each"
 
 
 @contextmanager
@@ -112,6 +116,6 @@ def _bar(title: str, total: int, unit: str) -> Iterator[Advance]:
             nonlocal done
             done += 1
             rate = done / max(time.monotonic() - began, 1e-9)
-            bar.update(task, advance=1, rate=f"{rate:.1f} {unit}/s {note}")
+            bar.update(task, advance=1, rate=f"{_pace(rate, unit)} {note}")
 
         yield advance

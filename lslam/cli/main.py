@@ -17,6 +17,7 @@ from lslam.version import __version__
 COMMANDS = {
     "run": "Estimate a trajectory and build a map from a recorded sequence.",
     "eval": "Score estimated trajectories against ground truth.",
+    "compare": "Compare methods on the same sequences.",
     "simulate": "Simulate a drive with exact ground truth.",
     "info": "Show what is in a sequence and what is wrong with it.",
     "methods": "List the odometry methods.",

@@ -61,7 +61,7 @@ def command(sequence: str, **given: Any) -> None:
     opened = open_sequence(
         sequence, data_root=given["data_root"], vertical_correction_deg=config.input.vertical_correction_deg
     )
-    truth = _read_truth(given["gt"], opened)
+    truth = read_truth(given["gt"], opened)
     out = given["out"] or default_folder(opened.name, config.odometry.method)
     if given["dry_run"]:
         from lslam.odometry import create_odometry
@@ -94,7 +94,7 @@ def _resolve(given: dict[str, Any]) -> Config:
     return load_config(given["config_file"], [*settings, *(f"{k}={v}" for k, v in flags.items() if v is not None)])
 
 
-def _read_truth(path: Path | None, sequence: Sequence) -> Trajectory | None:
+def read_truth(path: Path | None, sequence: Sequence) -> Trajectory | None:
     """Ground truth of --gt; a file without stamps takes those of the sequence, line by line."""
     if path is None:
         return None

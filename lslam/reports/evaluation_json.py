@@ -58,9 +58,9 @@ def to_document(evaluation: Evaluation, timing: Timing | None = None) -> Documen
         "thesis2": t2,
         "timing": None if timing is None else {"recipe": "s per scan, from timing.csv", **asdict(timing)},
     }
-    strict = _strict(document)
-    assert isinstance(strict, dict)
-    return strict
+    plain = strict(document)
+    assert isinstance(plain, dict)
+    return plain
 
 
 def to_json(evaluations: Sequence[Evaluation], timings: Sequence[Timing | None] = ()) -> str:
@@ -113,11 +113,12 @@ def _statistics(values: Statistics | None) -> Document:
     return asdict(values)
 
 
-def _strict(value: Any) -> Any:
+def strict(value: Any) -> Any:
+    """The value with None for every number that JSON has not: NaN and the infinities."""
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     if isinstance(value, dict):
-        return {key: _strict(item) for key, item in value.items()}
+        return {key: strict(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_strict(item) for item in value]
+        return [strict(item) for item in value]
     return value

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import re
 from collections.abc import Callable, Sequence
 
 from lslam.evaluation.results import AbsoluteError, Evaluation, RelativeError
 from lslam.evaluation.statistics import Statistics
 from lslam.evaluation.timing import StageTime, Timing
+from lslam.reports.grid_text import comma_separated, latex, markdown
 from lslam.reports.metrics import counted
 
 Row = tuple[str, str, list[str]]
@@ -27,10 +26,10 @@ def render(evaluations: Sequence[Evaluation], timings: Sequence[Timing | None] =
     if style == "text":
         return "\n".join([*_head(evaluations, names), "", *_text(rows, names), "", *_recipes(evaluations)])
     grid = [["metric", "unit", *names], *([label, unit, *cells] for label, unit, cells in _in_full(rows))]
-    writers: dict[str, Callable[[list[list[str]]], str]] = {"md": _markdown, "csv": _csv, "tex": _latex}
+    writers: dict[str, Callable[[list[list[str]], int], str]] = {"md": markdown, "csv": comma_separated, "tex": latex}
     if style not in writers:
         raise ValueError(f"table style {style!r}: one of {', '.join(STYLES)}")
-    table = writers[style](grid)
+    table = writers[style](grid, 2)
     # A CSV is for programs, which have no use for sentences; --json holds values and recipes.
     how = {"md": "- {}", "tex": "% {}"}.get(style)
     return "\n".join([table, "", *(how.format(line.strip()) for line in _recipes(evaluations)[1:])]) if how else table
@@ -151,31 +150,6 @@ def _text(rows: list[Row], names: list[str]) -> list[str]:
 
     head = [line("", "", names)] if len(names) > 1 else []
     return [*head, *(line(*row) for row in rows)]
-
-
-def _markdown(grid: list[list[str]]) -> str:
-    head, *body = [[cell.strip().replace("|", "\\|") for cell in row] for row in grid]
-    rule = ["---", "---", *["---:"] * (len(head) - 2)]
-    return "\n".join(f"| {' | '.join(row)} |" for row in [head, rule, *body])
-
-
-def _csv(grid: list[list[str]]) -> str:
-    out = io.StringIO()
-    csv.writer(out, lineterminator="\n").writerows([[cell.strip() for cell in row] for row in grid])
-    return out.getvalue().rstrip("\n")
-
-
-def _latex(grid: list[list[str]]) -> str:
-    def escape(cell: str) -> str:
-        signs = {sign: f"\\{sign}" for sign in "&%$#_{}"} | {"\\": "\\textbackslash{}"}
-        cell = cell.translate({ord(sign): word for sign, word in signs.items()})
-        return cell.strip().replace("±", "$\\pm$")
-
-    head, *body = [" & ".join(escape(cell) for cell in row) + r" \\" for row in grid]
-    columns = "ll" + "r" * (len(grid[0]) - 2)
-    return "\n".join(
-        [rf"\begin{{tabular}}{{{columns}}}", r"\hline", head, r"\hline", *body, r"\hline", r"\end{tabular}"]
-    )
 
 
 def short_names(names: list[str]) -> list[str]:

@@ -16,6 +16,8 @@ from lslam.types.run_record import RunRecord
 from lslam.version import __version__
 
 if TYPE_CHECKING:
+    from jinja2 import Template
+
     from lslam.evaluation.results import Evaluation
 
 MOST_ROWS = 100
@@ -49,18 +51,8 @@ def write_report(path: Path, record: RunRecord, evaluation: Evaluation | None) -
 
 def render_report(record: RunRecord, evaluation: Evaluation | None) -> str:
     """The page as text."""
-    from jinja2 import Environment, PackageLoader, StrictUndefined
-
     facts = run_facts(record)
-    environment = Environment(
-        loader=PackageLoader("lslam", "reports"),
-        autoescape=True,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        keep_trailing_newline=True,
-        undefined=StrictUndefined,
-    )
-    return environment.get_template("report.html.j2").render(
+    return template("report.html.j2").render(
         record=record,
         facts=facts,
         version=__version__,
@@ -80,6 +72,21 @@ def render_report(record: RunRecord, evaluation: Evaluation | None) -> str:
         facts_of_input=flatten(record.manifest),
         config_text=_config_text(record.folder),
     )
+
+
+def template(name: str) -> Template:
+    """A template of this package; everything it shows is escaped, and a name it does not know is an error."""
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+
+    environment = Environment(
+        loader=PackageLoader("lslam", "reports"),
+        autoescape=True,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+        undefined=StrictUndefined,
+    )
+    return environment.get_template(name)
 
 
 def _map_figure(record: RunRecord) -> plots.Figure | None:

@@ -31,13 +31,14 @@ ALIGNED = {
 
 @dataclass(frozen=True)
 class Figure:
-    """One chart of the page: SVG text, legend of (style, label), a caption that says the recipe."""
+    """One chart of the page: SVG text, legend of (style, label) as lines or areas, a caption that says the recipe."""
 
     title: str
     svg: str
     legend: tuple[tuple[str, str], ...] = ()
     caption: str = ""
     wide: bool = False
+    is_area: bool = False
 
 
 def trajectory_figures(record: RunRecord, evaluation: Evaluation | None) -> list[Figure]:
@@ -109,7 +110,7 @@ def time_figure(record: RunRecord, facts: RunFacts) -> Figure | None:
     chart, remark = stage_chart(index, seconds * 1e3, record.real_time_limit * 1e3, "time per scan and stage")
     caption = "Stages stacked; reading and preprocessing may overlap registration, so a scan takes at most this long."
     legend = tuple((f"s{i % 6 + 1}", name) for i, name in enumerate(names))
-    return Figure("Time per scan", chart, legend, f"{caption} {remark}".strip())
+    return Figure("Time per scan", chart, legend, f"{caption} {remark}".strip(), is_area=True)
 
 
 def map_figure(record: RunRecord, png_uri: str) -> Figure:

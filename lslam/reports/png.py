@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 LEVELS = 16  # four bits per pixel
 
 
-def density_png(image: NDArray[Any]) -> bytes:
+def density_png(image: NDArray[Any], top: float | None = None) -> bytes:
     """PNG of a density image (H, W): black whose opacity grows with the logarithm of the density.
 
-    The palette has 16 levels; the 99.5th percentile of the occupied pixels and what lies above is opaque. Empty and
-    non-finite pixels are transparent, so the page's paper shows through in light and dark.
+    The palette has 16 levels; `top`, or else the 99.5th percentile of the occupied pixels, and what lies above is opaque.
+    Empty and non-finite pixels are transparent, so the page's paper shows through in light and dark.
     """
-    levels = _levels(np.nan_to_num(np.asarray(image, np.float32), nan=0.0, posinf=0.0, neginf=0.0))
+    levels = _levels(np.nan_to_num(np.asarray(image, np.float32), nan=0.0, posinf=0.0, neginf=0.0), top)
     height, width = levels.shape
     even = np.zeros((height, width + width % 2), np.uint8)
     even[:, :width] = levels
@@ -45,12 +45,13 @@ def data_uri(png: bytes) -> str:
     return "data:image/png;base64," + base64.b64encode(png).decode("ascii")
 
 
-def _levels(image: NDArray[np.float32]) -> NDArray[np.uint8]:
+def _levels(image: NDArray[np.float32], top: float | None) -> NDArray[np.uint8]:
     occupied = image[image > 0]
     if not len(occupied):
         return np.zeros(image.shape, np.uint8)
-    rank = int(np.ceil(0.995 * (len(occupied) - 1)))
-    top = np.log1p(np.partition(occupied, rank)[rank])
-    share = np.log1p(np.maximum(image, 0)) / top
+    if top is None:
+        rank = int(np.ceil(0.995 * (len(occupied) - 1)))
+        top = float(np.partition(occupied, rank)[rank])
+    share = np.log1p(np.maximum(image, 0)) / np.log1p(top)
     # Anything occupied is seen: the faintest level of a point is 2.
     return np.where(image > 0, np.clip(np.rint(share * (LEVELS - 1)), 2, LEVELS - 1), 0).astype(np.uint8)

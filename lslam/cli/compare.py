@@ -1,0 +1,180 @@
+"""`lslam compare`: methods against each other on the same scans."""
+
+from __future__ import annotations
+
+import json
+import shlex
+import sys
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from lslam.cli import options
+from lslam.cli.console import progress, setup_logging, show
+
+if TYPE_CHECKING:
+    from lslam.studies.plan import Follow, Plan
+    from lslam.types.comparison import Comparison
+    from lslam.types.trajectory import Trajectory
+
+
+@click.command(
+    epilog="\b\nExamples: lslam compare sample_data --methods icp,kiss-icp\n"
+    "          lslam compare street block --methods icp,kiss-icp --seeds 0,1,2 --count 100\n"
+    "          lslam compare seq07 --data-root ~/kitti --methods icp,kiss-icp --count 300 --out runs/two --resume"
+)
+@click.argument("sequences", metavar="SEQUENCE...", nargs=-1, required=True)
+@click.option(
+    "--methods", required=True, metavar="A,B,...", help="Names of `lslam methods`; the first is the reference."
+)
+@click.option(
+    "--seeds", default="0", show_default=True, metavar="N,N,...", help="Of simulations, and of methods that draw."
+)
+@click.option("--gt", type=click.Path(path_type=Path), metavar="FILE", help="Ground truth of the one sequence.")
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path),
+    metavar="DIR",
+    help="Folder of the comparison [default: runs/compare-TIME].",
+)
+@click.option("--resume", is_flag=True, help="Keep finished runs of the same input and configuration, run the others.")
+@click.option("--overwrite", is_flag=True, help="Run everything anew in an existing folder.")
+@click.option(
+    "--jobs", type=int, default=1, show_default=True, metavar="N", help="Runs at once; with several, times mean little."
+)
+@options.scan_range
+@click.option("--crop", metavar="X,Y,SIZE", help="Map crop shown on the page, m; chosen by itself otherwise.")
+@click.option("--strict", is_flag=True, help="Exit 4 when any run failed.")
+@click.option(
+    "--table", type=click.Choice(["text", "md", "csv", "tex"]), default="text", help="Form; csv: a row per run."
+)
+@options.data_root
+@options.configuration
+@options.as_json
+@options.verbosity
+def command(sequences: tuple[str, ...], **given: Any) -> None:
+    """Run methods on the same sequences, one table and one page for all.
+
+    SEQUENCE is what `lslam run` takes, or a scenario of `lslam simulate --list`, which is simulated once per seed.
+    """
+    setup_logging(given["verbose"], given["quiet"])
+    from lslam.errors import GateError, RunFailedError
+    from lslam.studies.compare import compare
+
+    plan = _plan(sequences, given)
+    with ExitStack() as stack:
+        comparison = compare(plan, _follow(stack))
+    _print(comparison, given["table"], given["as_json"])
+    click.echo(f"page: {plan.out / 'compare.html'}", err=True)
+    failed = comparison.failed
+    said = "; ".join(f"{run.sequence} {run.method} seed {run.seed}: {run.reason}" for run in failed[:3])
+    if len(failed) == len(comparison.runs):
+        raise RunFailedError(f"all {len(failed)} runs failed: {said}")
+    if failed and given["strict"]:
+        raise GateError(f"--strict: {len(failed)} of {len(comparison.runs)} runs failed: {said}")
+
+
+def _plan(sequences: tuple[str, ...], given: dict[str, Any]) -> Plan:
+    from lslam.config import load_config
+    from lslam.studies.grid import check_methods
+    from lslam.studies.plan import Plan
+    from lslam.studies.subjects import find_subjects
+
+    flags = {f"input.{key}": given[key] for key in ("start", "count", "skip_frames") if given[key] is not None}
+    config = load_config(given["config_file"], [*given["settings"], *(f"{k}={v}" for k, v in flags.items())])
+    methods = tuple(name.strip() for name in given["methods"].split(",") if name.strip())
+    check_methods(methods, config)
+    return Plan(
+        subjects=tuple(find_subjects(sequences, given["data_root"])),
+        methods=methods,
+        seeds=_numbers("--seeds", given["seeds"], int),
+        config=config,
+        out=given["out"] or Path("runs") / time.strftime("compare-%Y%m%d-%H%M%S"),
+        jobs=given["jobs"],
+        truth=_truth(given["gt"], sequences, given["data_root"]),
+        crop=_crop(given["crop"]),
+        overwrite=given["overwrite"],
+        resume=given["resume"],
+        command=shlex.join(["lslam", *sys.argv[1:]]),
+    )
+
+
+def _numbers(flag: str, text: str, kind: Callable[[str], Any]) -> tuple[Any, ...]:
+    from lslam.errors import UsageError
+
+    try:
+        return tuple(kind(part) for part in text.split(",") if part.strip())
+    except ValueError:
+        raise UsageError(f"{flag} {text}: numbers with commas between them") from None
+
+
+def _crop(text: str | None) -> tuple[float, float, float] | None:
+    from lslam.errors import UsageError
+
+    if text is None:
+        return None
+    numbers = _numbers("--crop", text, float)
+    if len(numbers) != 3:
+        raise UsageError(f"--crop {text}: x, y and size in metres, for example 12,-40,20")
+    return numbers
+
+
+def _truth(path: Path | None, sequences: tuple[str, ...], data_root: Path | None) -> Trajectory | None:
+    from lslam.cli.run import read_truth
+    from lslam.readers import open_sequence
+
+    if path is None or len(sequences) > 1:
+        return None
+    return read_truth(path, open_sequence(sequences[0], data_root=data_root))
+
+
+def _follow(stack: ExitStack) -> Follow:
+    """One progress bar after the other."""
+    from lslam.studies.plan import Follow
+
+    bar = stack.enter_context(ExitStack())
+    advance: list[Any] = []
+
+    def on_start(stage: str, total: int, unit: str) -> None:
+        bar.close()
+        advance[:] = [bar.enter_context(progress(stage, total, unit))]
+
+    return Follow(on_start, lambda note: advance[0](note))
+
+
+def _print(comparison: Comparison, style: str, as_json: bool) -> None:
+    from lslam.reports import compare_json, compare_table
+
+    if as_json:
+        show(json.dumps(compare_json.to_document(comparison), allow_nan=False) + "\n")
+    elif style == "text" and sys.stdout.isatty():
+        _print_rich(comparison)
+    else:
+        show(compare_table.render(comparison, style) + "\n")
+
+
+def _print_rich(comparison: Comparison) -> None:
+    """Tables as wide as the terminal, the best of each sequence in bold."""
+    from rich import box
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    from lslam.reports.compare_table import recipes, tables
+
+    console = Console()
+    for table in tables(comparison, console.width):
+        shown = Table(
+            title=table.title or None, title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1), pad_edge=False
+        )
+        for k, name in enumerate(table.header):
+            shown.add_column(name, justify="left" if k < table.names else "right")
+        for i, row in enumerate(table.rows):
+            shown.add_row(*(Text(cell, "bold" if (i, k) in table.best else "") for k, cell in enumerate(row)))
+        console.print(shown)
+    for line in (*comparison.notes, *recipes(comparison)):
+        console.print(Text(f"  {line}", "dim"))

@@ -1,0 +1,187 @@
+"""A comparison as tables: on the terminal, in Markdown, CSV (one row per run) and LaTeX."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from lslam.formats.atomic import atomic_write
+from lslam.reports.grid_text import Grid, aligned, comma_separated, latex, markdown
+from lslam.reports.metrics import counted, fixed, metres
+from lslam.types.comparison import Comparison, Metric, Spread, SummaryRow
+
+STYLES = ("md", "csv", "tex")
+HEALTH = ("bridged", "skipped", "degenerate")
+
+
+@dataclass(frozen=True)
+class CompareTable:
+    """A titled grid of texts; the first `names` columns are names, `best` holds the (row, column) worth showing in bold."""
+
+    title: str
+    header: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    names: int
+    best: frozenset[tuple[int, int]] = frozenset()
+
+    @property
+    def grid(self) -> Grid:
+        """Header and rows."""
+        return [list(self.header), *(list(row) for row in self.rows)]
+
+    @property
+    def width(self) -> int:
+        """Columns of the terminal it takes."""
+        return max(len(line) for line in aligned(self.grid, self.names).splitlines())
+
+
+def tables(comparison: Comparison, width: int | None = None) -> list[CompareTable]:
+    """The methods' table, split in errors and times when it is wider than `width`; pairs, differences, failures."""
+    whole = _methods_table(comparison, ("error", "time", "health"), "")
+    out = [whole]
+    if width is not None and whole.width > width:
+        out = [_methods_table(comparison, ("error",), "errors"), _methods_table(comparison, ("time", "health"), "time")]
+    return out + [
+        table for table in (_paired(comparison), _differences(comparison), _failures(comparison)) if table.rows
+    ]
+
+
+def recipes(comparison: Comparison) -> list[str]:
+    """How the numbers are made, one sentence each."""
+    shown = [
+        m
+        for m in comparison.metrics
+        if m.is_main and m.recipe and not m.key.startswith("time.") and m.key not in HEALTH
+    ]
+    lines = [f"{m.label}: {m.recipe}" for m in shown]
+    lines.append(
+        "ms: median over scans of each stage, then of all stages together (total), and its 95th percentile (p95)"
+    )
+    if any(row.runs > 1 for row in comparison.rows):
+        lines.append("over seeds: mean ± sample standard deviation (n - 1) of the runs that did not fail")
+    if len(comparison.methods) > 1:
+        lines.append(
+            f"pairs: one per sequence and seed; ratio: geometric mean of ATE (se3, else origin) over that of "
+            f"{comparison.methods[0]}; a tie is within {100 * comparison.tie:g} cm; a run that failed where the "
+            "other did not is a loss; p: Wilcoxon signed-rank of the log ratios, two-sided"
+        )
+    return lines
+
+
+def render(comparison: Comparison, style: str = "text") -> str:
+    """All tables as text; `style` is `text` or one of STYLES. Ends without a line break. Raises ValueError otherwise."""
+    if style == "csv":
+        return comma_separated(_runs_grid(comparison))
+    writers: dict[str, Callable[[Grid, int], str]] = {"text": aligned, "md": markdown, "tex": latex}
+    if style not in writers:
+        raise ValueError(f"table style {style!r}: text or one of {', '.join(STYLES)}")
+    prefix = {"text": "  ", "md": "- ", "tex": "% "}[style]
+    title = {"text": "{}", "md": "### {}\n", "tex": "% {}"}[style]
+    parts = []
+    for table in tables(comparison):
+        text = writers[style](table.grid, table.names)
+        parts.append(f"{title.format(table.title)}\n{text}" if table.title else text)
+    parts += ["\n".join(prefix + note for note in comparison.notes)] if comparison.notes else []
+    parts.append("\n".join(prefix + line for line in recipes(comparison)))
+    return "\n\n".join(parts)
+
+
+def write_files(out: Path, comparison: Comparison) -> None:
+    """compare.csv and compare.tex, atomically; raises OutputError."""
+    for style in ("csv", "tex"):
+        with atomic_write(out / f"compare.{style}") as stream:
+            stream.write((render(comparison, style) + "\n").encode("utf-8", "backslashreplace"))
+
+
+def _methods_table(comparison: Comparison, groups: Sequence[str], title: str) -> CompareTable:
+    metrics = [m for m in comparison.metrics if m.is_main and m.group in groups and m.key not in HEALTH]
+    header = ["sequence", "method", *(f"{m.label}, {m.unit}" if m.unit != "x" else f"x {m.label}" for m in metrics)]
+    header += ["bridged/skipped/degenerate", "runs"] if "health" in groups else []
+    rows, best = [], set()
+    for i, row in enumerate(comparison.rows):
+        cells = [_cell(metric, row) for metric in metrics]
+        if "error" in groups and row.note and row.failed != row.runs:
+            cells[0] = row.note if len(row.note) <= 20 else "not scored"
+        if row.failed == row.runs:
+            cells = ["failed"] + ["-"] * (len(cells) - 1)
+        rival = [other for other in comparison.rows if other.sequence == row.sequence]
+        best |= {(i, 2 + k) for k, metric in enumerate(metrics) if _is_best(metric, row, rival)}
+        health = [_health(row), f"{row.runs - row.failed}/{row.runs}"] if "health" in groups else []
+        rows.append((row.sequence, row.method, *cells, *health))
+    return CompareTable(title, tuple(header), tuple(rows), 2, frozenset(best))
+
+
+def _cell(metric: Metric, row: SummaryRow) -> str:
+    value = row.values.get(metric.key)
+    if value is None:
+        return "-"
+    if metric.group == "error":
+        text = _metre_spread(value) if metric.unit == "m" else _percent_spread(value)
+    else:
+        text = f"{value.mean:.1f}"
+    return text if metric.group != "time" or row.is_timed_alone else f"~{text}"
+
+
+def _metre_spread(value: Spread) -> str:
+    return metres(value.mean) if value.n < 2 else f"{metres(value.mean)} ± {metres(value.std)}"
+
+
+def _percent_spread(value: Spread) -> str:
+    return fixed(value.mean, 3) if value.n < 2 else f"{fixed(value.mean, 3)} ± {fixed(value.std, 3)}"
+
+
+def _health(row: SummaryRow) -> str:
+    """Mean counts per run; a row without a usable run has none."""
+    values = [row.values.get(key) for key in HEALTH]
+    return "/".join("-" if v is None else f"{v.mean:.3g}" for v in values)
+
+
+def _is_best(metric: Metric, row: SummaryRow, rivals: Sequence[SummaryRow]) -> bool:
+    """Whether no method on the sequence is better; times compare only among runs that were alone on the machine."""
+    known = [r.values[metric.key].mean for r in rivals if metric.key in r.values]
+    if not metric.best or metric.key not in row.values or len(known) < 2:
+        return False
+    if metric.group == "time" and not all(r.is_timed_alone for r in rivals):
+        return False
+    return row.values[metric.key].mean == (min(known) if metric.best == "low" else max(known))
+
+
+def _paired(comparison: Comparison) -> CompareTable:
+    header = ("method", "against", "pairs", "ratio of ATE", "wins/ties/losses", "p")
+    rows = []
+    for pair in comparison.paired:
+        p = pair.note if math.isnan(pair.p) else f"{pair.p:.3g}"
+        ratio = fixed(pair.ratio, 3) if pair.n else "-"
+        score = f"{pair.wins}/{pair.ties}/{pair.losses}"
+        rows.append((pair.method, pair.reference, str(pair.n), ratio, score, p))
+    return CompareTable("pairs", header, tuple(rows), 2)
+
+
+def _differences(comparison: Comparison) -> CompareTable:
+    rows = []
+    for d in comparison.differences:
+        rows.append((d.sequence, d.method, d.reference, str(d.seed), metres(d.origin), metres(d.se3)))
+    header = ("sequence", "method", "against", "seed", "rmse from the same start, m", "rmse after se3, m")
+    return CompareTable("distance between trajectories, without ground truth", header, tuple(rows), 3)
+
+
+def _failures(comparison: Comparison) -> CompareTable:
+    rows = tuple((r.sequence, r.method, str(r.seed), r.status, r.reason) for r in comparison.failed)
+    title = f"{counted(len(rows), 'run')} failed"
+    return CompareTable(title, ("sequence", "method", "seed", "outcome", "reason"), rows, 5)
+
+
+def _runs_grid(comparison: Comparison) -> Grid:
+    """One row per run, numbers in full, empty where unknown."""
+    head = ["sequence", "method", "seed", "status", "reason", "jobs"]
+    head += [f"{m.key} ({m.unit})" for m in comparison.metrics]
+    grid = [head]
+    for run in comparison.runs:
+        known = [run.values.get(m.key) for m in comparison.metrics]
+        numbers = ["" if v is None or not math.isfinite(v) else f"{v:.9g}" for v in known]
+        grid.append(
+            [run.sequence, run.method, str(run.seed), run.status, run.reason or run.note, str(run.jobs), *numbers]
+        )
+    return grid

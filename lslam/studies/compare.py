@@ -1,0 +1,104 @@
+"""The comparison of methods in order: simulate what is a scenario, run the grid, collect, weigh, write."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+
+from lslam.errors import InterruptedRunError
+from lslam.evaluation.relative import parse_delta
+from lslam.readers import open_sequence
+from lslam.reports import compare_html, compare_json, compare_table
+from lslam.studies.collect import collect_run, metrics_of
+from lslam.studies.drawings import draw
+from lslam.studies.grid import Cell, Job, expand
+from lslam.studies.identity import input_digest
+from lslam.studies.jobs import finished, run_jobs
+from lslam.studies.paired import TIE_M, compare_pairs, summarise
+from lslam.studies.plan import RESULT, Follow, Plan, check_plan, claim
+from lslam.studies.subjects import scans_needed, simulate_once
+from lslam.types.comparison import Comparison, Drawing, RunScore
+
+# More than this many busy cores before the first run, and its times are somebody else's too.
+BUSY = 0.5
+
+
+def compare(plan: Plan, follow: Follow | None = None) -> Comparison:
+    """Run every method on every sequence and seed, and write compare.csv, .tex, .json and .html into `plan.out`.
+
+    Raises
+    ------
+    UsageError : methods or numbers that make no sense, before anything runs; OutputExistsError : `out` holds something and
+        neither `overwrite` nor `resume` is set; OutputError; InputError : a sequence that cannot be opened
+    InterruptedRunError : Ctrl-C or SIGTERM; finished runs are kept, and `resume` goes on
+    """
+    follow = follow or Follow()
+    check_plan(plan)
+    claim(plan)
+    jobs: list[Job] = []
+    try:
+        jobs = expand(_cells(plan, follow), plan.methods, plan.seeds, plan.config, plan.out, plan.command)
+        kept = set() if plan.overwrite else finished(jobs)
+        run_jobs([job for job in jobs if job.folder not in kept], plan.jobs, follow)
+    except KeyboardInterrupt:
+        raise InterruptedRunError(
+            f"interrupted; {len(finished(jobs))} of {len(jobs) or 'all'} runs are finished in {plan.out}: the same command with "
+            "--resume goes on"
+        ) from None
+    scores = [collect_run(job, job.folder in kept) for job in jobs]
+    comparison, drawings = _weigh(plan, jobs, scores)
+    compare_table.write_files(plan.out, comparison)
+    compare_html.write_page(plan.out / "compare.html", comparison, drawings, plan.crop)
+    compare_json.write_result(plan.out / RESULT, comparison)
+    return comparison
+
+
+def _cells(plan: Plan, follow: Follow) -> list[Cell]:
+    """Recordings as they are, scenarios simulated once per seed."""
+    cells = []
+    for subject in plan.subjects:
+        if subject.path is not None:
+            sequence = open_sequence(subject.path)
+            digest = input_digest(sequence, plan.truth)
+            cells.append(Cell(subject.label, subject.path, None, digest, plan.truth))
+            continue
+        assert subject.scenario is not None
+        for seed in plan.seeds:
+            path = simulate_once(
+                subject.scenario, seed, scans_needed(plan.config.input), plan.out / "simulated",
+                lambda stage, total: follow.on_start(stage, total, "scans"), lambda: follow.on_step(""),
+            )  # fmt: skip
+            cells.append(Cell(subject.label, path, seed, input_digest(open_sequence(path), None)))
+    return cells
+
+
+def _notes(scores: Sequence[RunScore]) -> list[str]:
+    """What the reader of the times must know."""
+    notes = []
+    if any(score.jobs > 1 for score in scores if score.is_usable):
+        notes.append("times marked ~ are not comparable: several runs shared the machine (--jobs)")
+    load = max((score.load for score in scores if score.is_usable), default=0.0)
+    if load > BUSY:
+        cores = os.cpu_count() or 1
+        notes.append(
+            f"others were using the machine before the runs (load {load:.1f}, {cores} cores): times are too long"
+        )
+    return notes
+
+
+def _weigh(plan: Plan, jobs: Sequence[Job], scores: Sequence[RunScore]) -> tuple[Comparison, list[Drawing]]:
+    drawings, differences = draw(jobs, scores)
+    deltas = [parse_delta(delta) for delta in plan.config.eval.delta]
+    return Comparison(
+        command=plan.command,
+        methods=plan.methods,
+        sequences=tuple(subject.label for subject in plan.subjects),
+        metrics=tuple(metrics_of(plan.config.eval.align, deltas, scores)),
+        runs=tuple(scores),
+        rows=tuple(summarise(scores)),
+        paired=tuple(compare_pairs(scores, plan.methods)),
+        differences=tuple(differences),
+        notes=tuple(_notes(scores)),
+        config=plan.config.model_dump(mode="json"),
+        tie=TIE_M,
+    ), drawings

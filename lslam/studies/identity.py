@@ -1,0 +1,53 @@
+"""When two runs are the same run: the digest of configuration, input and version."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+from lslam.config import Config
+from lslam.errors import InputError
+from lslam.types.sequence import Sequence
+from lslam.types.trajectory import Trajectory
+from lslam.version import __version__
+
+
+def input_digest(sequence: Sequence, truth: Trajectory | None) -> str:
+    """Digest of a recording without reading its scans: path, number of scans, size and time of every file, the truth's poses.
+
+    Raises InputError when the folder cannot be listed.
+    """
+    digest = hashlib.sha256(f"{sequence.path}\0{len(sequence)}\0".encode(errors="surrogateescape"))
+    try:
+        for path, stat in _files(sequence.path):
+            line = f"{path}\0{stat.st_size}\0{stat.st_mtime_ns}\n"
+            digest.update(line.encode(errors="surrogateescape"))
+    except OSError as error:
+        raise InputError(f"{error.filename or sequence.path} cannot be read: {error.strerror or error}") from None
+    truth = sequence.ground_truth if truth is None else truth
+    if truth is not None:
+        digest.update(truth.stamps_ns.tobytes())
+        digest.update(truth.poses.tobytes())
+    return digest.hexdigest()
+
+
+def job_digest(config: Config, of_input: str) -> str:
+    """Digest of a run: its resolved configuration, its input and lslam's version."""
+    said = {"config": config.model_dump(mode="json"), "input": of_input, "lslam": __version__}
+    return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()
+
+
+def _files(path: Path) -> Iterator[tuple[str, os.stat_result]]:
+    """Every file of a recording in a fixed order, links followed: KITTI's velodyne folders often are links."""
+    if path.is_file():
+        yield path.name, path.stat()
+        return
+    for folder, inner, names in os.walk(path, followlinks=True):
+        inner.sort()
+        for name in sorted(names):
+            file = Path(folder) / name
+            if file.is_file():
+                yield os.fspath(file.relative_to(path)), file.stat()

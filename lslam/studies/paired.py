@@ -1,0 +1,111 @@
+"""Over seeds and sequences: means with their spread, and methods against a reference pair by pair."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from lslam.types.comparison import Paired, RunScore, Spread, SummaryRow
+
+TIE_M = 0.01
+FEWEST_PAIRS = 6
+ALIGNMENTS = ("se3", "origin", "posyaw", "sim3", "none")
+_LEAST_M = 1e-6  # an exact trajectory has no logarithm
+
+
+def summarise(runs: Sequence[RunScore]) -> list[SummaryRow]:
+    """One row per sequence and method in the order they appear; only usable runs count in the values."""
+    groups: dict[tuple[str, str], list[RunScore]] = {}
+    for run in runs:
+        groups.setdefault((run.sequence, run.method), []).append(run)
+    rows = []
+    for (sequence, method), members in groups.items():
+        usable = [run for run in members if run.is_usable]
+        keys = dict.fromkeys(key for run in usable for key in run.values)
+        values = {key: spread([run.values[key] for run in usable if key in run.values]) for key in keys}
+        note = next((run.note for run in usable if run.note), "")
+        alone = all(run.jobs == 1 for run in usable)
+        rows.append(SummaryRow(sequence, method, len(members), len(members) - len(usable), values, note, alone))
+    return rows
+
+
+def spread(values: Sequence[float]) -> Spread:
+    """Mean and sample standard deviation of at least one value.
+
+    >>> spread([1.0, 3.0])
+    Spread(mean=2.0, std=1.4142135623730951, n=2)
+    """
+    array = np.asarray(values, np.float64)
+    std = float(np.std(array, ddof=1)) if len(array) > 1 else float("nan")
+    return Spread(float(np.mean(array)), std, len(array))
+
+
+def compare_pairs(runs: Sequence[RunScore], methods: Sequence[str]) -> list[Paired]:
+    """Every method but the first against the first, over runs of the same sequence and seed that have a ground truth.
+
+    A method that does not depend on the seed of a recording has one run there, which meets every seed of the other.
+    """
+    if not methods:
+        return []
+    table = {(run.sequence, run.method, run.seed): run for run in runs}
+    seeds = {(run.sequence, run.seed): None for run in runs}
+    out = []
+    for method in methods[1:]:
+        pairs = []
+        for sequence, seed in seeds:
+            a, b = (_run_of(table, sequence, name, seed) for name in (methods[0], method))
+            # One run each that meets all seeds: count it once.
+            if a is not None and b is not None and seed in (a.seed, b.seed):
+                pairs.append((a, b))
+        out.append(_judge(method, methods[0], pairs))
+    return out
+
+
+def _run_of(table: dict[tuple[str, str, int], RunScore], sequence: str, method: str, seed: int) -> RunScore | None:
+    own = table.get((sequence, method, seed))
+    if own is not None:
+        return own
+    others = [run for (s, m, _), run in table.items() if (s, m) == (sequence, method)]
+    return others[0] if len(others) == 1 else None
+
+
+def _judge(method: str, reference: str, pairs: list[tuple[RunScore, RunScore]]) -> Paired:
+    wins = ties = losses = 0
+    logs = []
+    for of_reference, of_method in pairs:
+        if not (of_reference.is_usable and of_method.is_usable):
+            wins += of_method.is_usable
+            losses += of_reference.is_usable
+            continue
+        errors = _errors(of_reference, of_method)
+        if errors is None:
+            continue
+        a, b = errors
+        logs.append(np.log(max(b, _LEAST_M) / max(a, _LEAST_M)))
+        ties += abs(a - b) <= TIE_M
+        wins += b < a - TIE_M
+        losses += b > a + TIE_M
+    ratio = float(np.exp(np.mean(logs))) if logs else float("nan")
+    p, note = _signed_rank(np.array(logs))
+    return Paired(method, reference, len(logs), ratio, wins, ties, losses, p, note)
+
+
+def _errors(a: RunScore, b: RunScore) -> tuple[float, float] | None:
+    """ATE rmse of both under the first alignment that both have; None without ground truth."""
+    for name in ALIGNMENTS:
+        key = f"ate.{name}"
+        if key in a.values and key in b.values:
+            return a.values[key], b.values[key]
+    return None
+
+
+def _signed_rank(logs: np.ndarray) -> tuple[float, str]:
+    """Two-sided p of the log ratios being symmetric about zero; nan with the reason when there are too few pairs."""
+    if len(logs) < FEWEST_PAIRS:
+        return float("nan"), "n too small"
+    if not np.any(logs):
+        return 1.0, "all equal"
+    from scipy.stats import wilcoxon
+
+    return float(wilcoxon(logs).pvalue), ""

@@ -1,0 +1,53 @@
+"""How a job ended, in a small file beside its run folder; written last, so that what it says is there."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from lslam.formats.atomic import atomic_write
+
+# What a repetition would end with again; everything else is tried anew.
+FINAL = ("done", "degraded", "diverged")
+
+
+@dataclass(frozen=True)
+class State:
+    """status : `done`, `degraded`, `diverged`, `interrupted`, `failed` or `crashed`; reason : one sentence, empty when done.
+
+    digest : of the job; jobs : runs that shared the machine; load : of the machine before the first run of the study
+    seconds : of the whole run
+    """
+
+    digest: str
+    status: str
+    reason: str = ""
+    jobs: int = 1
+    load: float = 0.0
+    seconds: float = 0.0
+
+
+def write_state(path: Path, state: State) -> None:
+    """Write the file atomically; raises OutputError."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with atomic_write(path) as stream:
+        stream.write((json.dumps(asdict(state), indent=1) + "\n").encode(errors="backslashreplace"))
+
+
+def read_state(path: Path) -> State | None:
+    """The state; None when there is none that can be read."""
+    try:
+        tree = json.loads(path.read_text(encoding="utf-8"))
+        texts = [str(tree[name]) for name in ("digest", "status", "reason")]
+        return State(*texts, int(tree["jobs"]), float(tree["load"]), float(tree["seconds"]))
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+
+
+def is_reusable(path: Path, folder: Path, digest: str) -> bool:
+    """Whether the job was finished before, by the same configuration, input and version, and its folder is still there."""
+    state = read_state(path)
+    return (
+        state is not None and state.digest == digest and state.status in FINAL and (folder / "manifest.json").is_file()
+    )

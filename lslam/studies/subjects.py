@@ -1,0 +1,115 @@
+"""What a study runs on: recordings found on disk, and scenarios that are simulated once per seed."""
+
+from __future__ import annotations
+
+import logging
+import os
+import re
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from lslam.config.input import InputConfig
+from lslam.errors import InputError, OutputExistsError, UsageError, nearest
+from lslam.readers import open_sequence
+from lslam.readers.lookup import find_folder
+from lslam.simulation.scenario_files import scenario_names
+
+log = logging.getLogger("lslam")
+
+
+@dataclass(frozen=True)
+class Subject:
+    """A recording (`path`) or a scenario (`scenario`); `label` names it in tables and folders and is unique in a study."""
+
+    label: str
+    path: Path | None = None
+    scenario: str | None = None
+
+
+def find_subjects(words: Iterable[str], data_root: Path | None = None) -> list[Subject]:
+    """What the user named, in that order: paths and names of recordings, else names of scenarios.
+
+    Raises UsageError for what is named twice, InputError for what is neither, or cannot be opened.
+    """
+    subjects: list[Subject] = []
+    for word in words:
+        subject = _find(word, data_root)
+        if any((s.path, s.scenario) == (subject.path, subject.scenario) for s in subjects):
+            raise UsageError(f"sequence {word!r} is named twice: a comparison needs it once")
+        subjects.append(subject)
+    return _with_unique_labels(subjects)
+
+
+def _find(word: str, data_root: Path | None) -> Subject:
+    is_scenario = word in scenario_names()
+    try:
+        # Absolute, but links kept: `sequences/07` may be one, and its poses lie beside the link.
+        path = Path(os.path.abspath(find_folder(word, data_root)))
+    except InputError as error:
+        if is_scenario:
+            return Subject(word, scenario=word)
+        raise InputError(f"{error}; no scenario either, {nearest(word, scenario_names())}") from None
+    if is_scenario:
+        log.warning(
+            "%s is a recording in %s and also a scenario: the recording is taken; rename it for the scenario",
+            word, path,
+        )  # fmt: skip
+    return Subject(file_safe(open_sequence(path).name), path=path)
+
+
+def file_safe(name: str) -> str:
+    """A name that can be a folder's: it may come from `sequence.toml` and shall not lead elsewhere.
+
+    >>> file_safe("../street 0")
+    '_street_0'
+    """
+    return re.sub(r"[^\w.+-]+", "_", name).lstrip(".") or "sequence"
+
+
+def _with_unique_labels(subjects: list[Subject]) -> list[Subject]:
+    """Recordings of one name are told apart by the part of their paths in which all of them differ, or by a number."""
+    taken: dict[str, list[int]] = {}
+    for i, subject in enumerate(subjects):
+        taken.setdefault(subject.label, []).append(i)
+    out = list(subjects)
+    for label, indices in taken.items():
+        if len(indices) < 2:
+            continue
+        parts = [((s.path and s.path.parts) or ("simulated",))[::-1] for s in (subjects[i] for i in indices)]
+        columns = [column for column in zip(*parts, strict=False) if len(set(column)) == len(column)]
+        names = [file_safe(part) for part in columns[0]] if columns else [str(k + 1) for k in range(len(indices))]
+        for i, name in zip(indices, names, strict=True):
+            out[i] = replace(subjects[i], label=f"{label}-{name}")
+    return out
+
+
+def scans_needed(config: InputConfig) -> int | None:
+    """Scans a simulation must have for --start, --count and --skip-frames; None is all it has by itself."""
+    return None if config.count is None else config.start + (config.count - 1) * config.skip_frames + 1
+
+
+def simulate_once(
+    scenario: str, seed: int, scans: int | None, parent: Path, on_start: Callable[[str, int], None],
+    on_step: Callable[[], None],
+) -> Path:  # fmt: skip
+    """The folder of the scenario simulated with `seed` below `parent`; made now unless it is there already.
+
+    It holds what `lslam simulate` writes by default. An interrupted simulation goes on. Raises what `simulate` and `record`
+    raise.
+    """
+    from lslam.simulation.gnss import GnssModel
+    from lslam.simulation.record import record
+    from lslam.simulation.scenarios import simulate
+
+    folder = parent / f"{scenario}-{seed}{'' if scans is None else f'-{scans}'}"
+    sequence = folder / "sequences" / "00"
+    if sequence.is_dir() and (folder / "poses" / "00.txt").is_file():
+        return sequence
+    drive = simulate(scenario, seed=seed, count=scans, imu="icm20948", gnss=GnssModel())
+    on_start(f"simulating {scenario}, seed {seed}", len(drive))
+    try:
+        record(drive, folder, on_scan=lambda _: on_step(), resume=True)
+    except OutputExistsError:
+        record(drive, folder, overwrite=True, on_scan=lambda _: on_step())
+    return sequence
