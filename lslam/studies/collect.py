@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ from lslam.errors import InputError
 from lslam.evaluation.results import ALIGNMENTS
 from lslam.evaluation.timing import Timing, read_timing
 from lslam.studies.grid import Job
-from lslam.studies.states import read_state
+from lslam.studies.states import FINAL, State, read_state
 from lslam.types.comparison import Metric, RunScore
 
 COUNTS = ("bridged", "skipped", "degenerate")
@@ -23,27 +24,28 @@ def collect_run(job: Job, is_reused: bool = False) -> RunScore:
     state = read_state(job.state_file)
     if state is None:
         return RunScore(job.sequence, job.method, job.seed, job.folder, "crashed", "the process left no state behind")
-    values: dict[str, float] = {}
-    stages: dict[str, float] = {}
-    status, reason, note, limit, machine = state.status, state.reason, "", None, {}
+    score = RunScore(
+        job.sequence, job.method, job.seed, job.folder, state.status, state.reason, jobs=state.jobs, load=state.load,
+        is_reused=is_reused,
+    )  # fmt: skip
+    if state.status not in FINAL:
+        return score  # what lies in the folder may be an earlier run's
     try:
-        manifest = _read_json(job.folder / "manifest.json")
-        machine = {"lslam": manifest["lslam"], **manifest["machine"]}
-        values |= {key: float(n) for key, n in manifest["counts"].items()}
-        if manifest["peak_memory_mb"] is not None:
-            values["memory"] = float(manifest["peak_memory_mb"])
-        timing = read_timing(job.folder / "timing.csv")
-        values |= _times(timing)
-        stages = {name: stage.mean for name, stage in timing.stages.items()}
-        limit = timing.period
-        note = _add_errors(job.folder / "evaluation.json", manifest, values)
-    except (InputError, KeyError) as error:
-        if status in ("done", "degraded"):
-            status, reason = "failed", f"its results cannot be read: {error}"
-    values["run_s"] = state.seconds
-    return RunScore(
-        job.sequence, job.method, job.seed, job.folder, status, reason, values, stages, limit, note, state.jobs,
-        state.load, is_reused, machine,
+        return _filled(score, state)
+    except (InputError, KeyError, TypeError) as error:
+        return replace(score, status="failed", reason=f"its results cannot be read: {error}")
+
+
+def _filled(score: RunScore, state: State) -> RunScore:
+    manifest = _read_json(score.folder / "manifest.json")
+    timing = read_timing(score.folder / "timing.csv")
+    values = {key: float(n) for key, n in manifest["counts"].items()} | _times(timing) | {"run_s": state.seconds}
+    if manifest["peak_memory_mb"] is not None:
+        values["memory"] = float(manifest["peak_memory_mb"])
+    note = _add_errors(score.folder / "evaluation.json", manifest, values)
+    return replace(
+        score, values=values, stages={name: stage.mean for name, stage in timing.stages.items()}, limit=timing.period,
+        note=note, machine={"lslam": manifest["lslam"], **manifest["machine"]},
     )  # fmt: skip
 
 

@@ -39,8 +39,8 @@ def read_state(path: Path) -> State | None:
     """The state; None when there is none that can be read."""
     try:
         tree = json.loads(path.read_text(encoding="utf-8"))
-        texts = [str(tree[name]) for name in ("digest", "status", "reason")]
-        return State(*texts, int(tree["jobs"]), float(tree["load"]), float(tree["seconds"]))
+        numbers = float(tree["load"]), float(tree["seconds"])
+        return State(str(tree["digest"]), str(tree["status"]), str(tree["reason"]), int(tree["jobs"]), *numbers)
     except (OSError, ValueError, KeyError, TypeError):
         return None
 

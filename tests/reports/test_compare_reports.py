@@ -1,0 +1,173 @@
+"""A comparison as text, CSV, LaTeX, JSON and page."""
+
+from __future__ import annotations
+
+import base64
+import csv
+import io
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from comparisons import comparison, drawing, row, walls
+from test_html import parse
+
+from lslam.reports.compare_crops import Crop, choose_crops, crop_images
+from lslam.reports.compare_html import render_page
+from lslam.reports.compare_json import to_document
+from lslam.reports.compare_table import recipes, render, tables
+from lslam.types.comparison import Spread
+
+
+def test_one_row_per_method_with_spread_failures_and_words_for_what_is_missing(tmp_path: Path) -> None:
+    main, pairs, differences, failures = tables(comparison(tmp_path))
+    cells = [dict(zip(main.header, line, strict=True)) for line in main.rows]
+    assert cells[0]["ATE se3, m"] == "0.100 ± 0.020"
+    assert cells[1]["bridged/skipped/degenerate"] == "1.5/-/-"
+    assert cells[2]["ATE se3, m"] == "no ground truth"
+    assert cells[3]["ATE se3, m"] == "failed"
+    assert [c["runs"] for c in cells] == ["2/2", "2/2", "1/1", "0/1"]
+    assert pairs.rows == (("kiss-icp", "icp", "1", "3.000", "0/0/2", "n too small"),)
+    assert differences.rows[0][-2:] == ("1.500", "0.500")
+    assert failures.rows == (("dark", "kiss-icp", "0", "crashed", "killed & gone_by 100%"),)
+
+
+def test_the_best_of_each_sequence_is_marked_and_only_against_a_rival(tmp_path: Path) -> None:
+    main = tables(comparison(tmp_path))[0]
+    column = main.header.index
+    assert {cell for cell in main.best if cell[1] in (column("ATE se3, m"), column("total, ms"))} == {
+        (0, column("ATE se3, m")), (0, column("total, ms")),
+    }  # fmt: skip
+    assert not [cell for cell in main.best if cell[0] > 1]
+
+
+def test_times_of_shared_machines_are_marked_and_never_best(tmp_path: Path) -> None:
+    slow = row("drive", "b", {"time.total": Spread(2.0, 0.0, 1)}, is_timed_alone=False)
+    fast = row("drive", "a", {"time.total": Spread(1.0, 0.0, 1)})
+    main = tables(comparison(tmp_path, rows=(fast, slow)))[0]
+    assert [line[main.header.index("total, ms")] for line in main.rows] == ["1.0", "~2.0"]
+    assert not main.best
+
+
+def test_a_narrow_terminal_gets_errors_and_times_apart(tmp_path: Path) -> None:
+    c = comparison(tmp_path)
+    whole = tables(c)[0]
+    assert tables(c, whole.width)[0].header == whole.header
+    errors, times = tables(c, whole.width - 1)[:2]
+    assert (errors.title, times.title) == ("errors", "time")
+    assert [*errors.header, *times.header[2:]] == list(whole.header)
+
+
+def test_csv_has_a_row_per_run_and_numbers_in_full(tmp_path: Path) -> None:
+    rows = list(csv.DictReader(io.StringIO(render(comparison(tmp_path), "csv"))))
+    assert [r["status"] for r in rows] == ["done", "degraded", "done", "crashed"]
+    assert [r["ate.se3 (m)"] for r in rows] == ["0.1", "0.3", "", ""]
+    assert rows[3]["reason"] == "killed & gone_by 100%"
+
+
+def test_latex_is_escaped_and_balanced(tmp_path: Path) -> None:
+    text = render(comparison(tmp_path), "tex")
+    assert r"killed \& gone\_by 100\%" in text
+    assert r"0.100 $\pm$ 0.020" in text
+    assert text.count(r"\begin{tabular}") == text.count(r"\end{tabular}") == 4
+    for line in text.splitlines():
+        assert line.startswith(("%", "\\")) or not line or line.endswith(r"\\")
+
+
+def test_every_table_of_markdown_has_equal_rows(tmp_path: Path) -> None:
+    for block in re.findall(r"(?:^\|.*\n?)+", render(comparison(tmp_path), "md"), re.MULTILINE):
+        assert len({line.count("|") for line in block.strip().splitlines()}) == 1
+
+
+def test_json_is_strict_and_carries_recipes(tmp_path: Path) -> None:
+    document = json.loads(json.dumps(to_document(comparison(tmp_path)), allow_nan=False))
+    assert document["paired"][0]["p"] is None
+    assert document["runs"][0]["stages_s"]["register"] == 0.01
+    assert document["recipes"] == recipes(comparison(tmp_path))
+    assert any("Wilcoxon" in line for line in document["recipes"])
+
+
+def test_the_page_nests_shows_everything_and_needs_nothing_else(tmp_path: Path) -> None:
+    c = comparison(tmp_path)
+    (tmp_path / "a").mkdir()
+    (tmp_path / "a" / "report.html").write_text("")
+    parsed = parse(render_page(tmp_path, c, [drawing(tmp_path)]))
+    assert not parsed.open
+    assert "script" not in parsed.tags
+    assert not parsed.handlers
+    assert all(a.startswith("data:image/png;base64,") or a == "a/report.html" for a in parsed.addresses)
+    assert "a/report.html" in parsed.addresses
+    for word in (
+        "killed & gone_by 100%",
+        "no ground truth",
+        "kiss-icp: 1.0 ms",
+        "icp: 12.0 ms",
+        "others were using",
+        "1 failed",
+    ):
+        assert word.lower() in parsed.text.lower()
+
+
+def test_the_page_of_a_comparison_in_which_all_failed_says_so(tmp_path: Path) -> None:
+    c = comparison(tmp_path)
+    c = replace(c, runs=c.failed, rows=c.rows[3:], sequences=("dark",), paired=(), differences=())
+    parsed = parse(render_page(tmp_path, c, []))
+    assert "No run on this sequence has a result" in parsed.text
+
+
+def test_without_ground_truth_no_errors_are_drawn(tmp_path: Path) -> None:
+    page = render_page(tmp_path, comparison(tmp_path), [drawing(tmp_path, has_truth=False)])
+    assert "Position error" not in page
+    assert "Trajectories from above" in page
+
+
+def test_crops_lie_on_structure_and_never_on_bare_ground() -> None:
+    crops = choose_crops(walls(), size=20.0)
+    assert len(crops) == 1
+    x0, x1, y0, y1 = crops[0].extent
+    assert x0 <= 26
+    assert x1 >= 34
+    assert y0 <= 7
+    assert y1 >= 13
+    assert choose_crops(walls()[:10]) == []
+    assert choose_crops(np.zeros((0, 3))) == []
+
+
+def test_several_crops_do_not_overlap() -> None:
+    many = np.concatenate([walls(shift) for shift in (0.0, 35.0, 70.0)])
+    centres = [(c.x, c.y) for c in choose_crops(many, size=20.0)]
+    assert len(centres) == 3
+    assert all(max(abs(a[0] - b[0]), abs(a[1] - b[1])) >= 20 for i, a in enumerate(centres) for b in centres[:i])
+
+
+def test_maps_are_compared_at_the_same_place_in_one_world_and_one_grey(tmp_path: Path) -> None:
+    """The second map lies 5 m off in its own world and is moved there by T_drawing_world: the pictures are equal."""
+    page = render_page(tmp_path, comparison(tmp_path), [drawing(tmp_path)], (30.04, 10.03, 20.0))
+    images = re.findall(r"data:image/png;base64,([^\"]+)", page)
+    assert len(images) == 2
+    assert base64.b64decode(images[0]) == base64.b64decode(images[1])
+    faint = walls()[::3]
+    (dark, light, absent), top = crop_images([walls(), faint, None], Crop(30.0, 10.0, 20.0))
+    assert absent is None
+    assert dark is not None
+    assert light is not None
+    assert dark.max() >= top > light.max()
+    assert dark[:, 100:].sum() > 0
+
+
+def test_rows_of_a_crop_are_y_downwards() -> None:
+    (image,), _ = crop_images([np.array([[1.0, 9.0, 0.0]])], Crop(0.0, 0.0, 20.0))
+    assert image is not None
+    assert np.argwhere(image).tolist() == [[9, 110]]
+
+
+@pytest.mark.parametrize("style", ["text", "md", "tex"])
+def test_notes_and_recipes_stand_under_the_tables(tmp_path: Path, style: str) -> None:
+    text = render(comparison(tmp_path), style)
+    assert "others were using the machine" in text
+    assert "alignment se3" in text
+    with pytest.raises(ValueError, match="table style"):
+        render(comparison(tmp_path), "pdf")

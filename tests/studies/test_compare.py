@@ -1,0 +1,177 @@
+"""A whole comparison: with ground truth, without, and on a recording nothing can be made of."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import shutil
+import signal
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from lslam.config import Config, load_config
+from lslam.errors import OutputExistsError, UsageError
+from lslam.evaluation.evaluate import evaluate
+from lslam.formats.trajectory_files import read_trajectory
+from lslam.readers import open_sequence
+from lslam.simulation.record import record
+from lslam.simulation.scenarios import simulate
+from lslam.studies.compare import compare
+from lslam.studies.grid import Job, with_method
+from lslam.studies.jobs import finished, run_jobs
+from lslam.studies.plan import Follow, Plan, check_plan
+from lslam.studies.states import read_state
+from lslam.studies.subjects import Subject
+from lslam.types.comparison import Comparison, RunScore
+
+SCANS = 14
+
+
+@pytest.fixture(scope="module")
+def subjects(tmp_path_factory: pytest.TempPathFactory) -> tuple[Subject, ...]:
+    """`good`, the same recording without ground truth as `silent`, and `broken`, whose scans are all torn."""
+    folder = tmp_path_factory.mktemp("recordings")
+    good = record(simulate("block", count=SCANS, lidar="sample"), folder / "good").sequence
+    silent, broken = folder / "silent", folder / "broken"
+    for copy in (silent, broken):
+        shutil.copytree(good, copy)
+    toml = silent / "sequence.toml"
+    toml.write_text("".join(line for line in toml.read_text().splitlines(True) if "ground_truth" not in line))
+    for scan in (broken / "velodyne").iterdir():
+        scan.write_bytes(b"torn")
+    return tuple(Subject(path.name if path != good else "good", path) for path in (good, silent, broken))
+
+
+@pytest.fixture(scope="module")
+def plan(subjects: tuple[Subject, ...], tmp_path_factory: pytest.TempPathFactory) -> Plan:
+    out = tmp_path_factory.mktemp("comparison") / "out"
+    return Plan(subjects, ("icp", "kiss-icp"), (0,), Config(), out, command="lslam compare good silent broken")
+
+
+@pytest.fixture(scope="module")
+def made(plan: Plan) -> Comparison:
+    return compare(plan)
+
+
+def one(comparison: Comparison, sequence: str, method: str) -> RunScore:
+    (run,) = [r for r in comparison.runs if (r.sequence, r.method) == (sequence, method)]
+    return run
+
+
+def test_every_cell_is_a_run_folder_with_the_numbers_of_its_own_files(made: Comparison, plan: Plan) -> None:
+    for method in plan.methods:
+        run = one(made, "good", method)
+        assert run.folder == plan.out / "runs" / "good" / f"{method}-s0"
+        sequence = open_sequence(plan.subjects[0].path or "")
+        assert sequence.ground_truth is not None
+        score = evaluate(read_trajectory(run.folder), sequence.ground_truth, calibration=sequence.calibration)
+        for name, error in score.ate.items():
+            assert error.translation is not None
+            assert run.values[f"ate.{name}"] == pytest.approx(error.translation.rmse, rel=1e-5)
+        with (run.folder / "timing.csv").open() as stream:
+            rows = list(csv.DictReader(stream))
+        totals = [1e3 * float(row["total"]) for row in rows]
+        assert len(totals) == SCANS
+        assert run.values["time.total"] == pytest.approx(np.median(totals))
+        assert run.values["factor"] == pytest.approx(100.0 * SCANS / sum(totals), rel=1e-6)
+        assert sum(run.stages.values()) * 1e3 == pytest.approx(np.mean(totals), rel=1e-3)
+        assert run.values["bridged"] == run.values["skipped"] == 0
+
+
+def test_without_ground_truth_there_are_times_maps_and_the_distance_between_methods(made: Comparison) -> None:
+    run = one(made, "silent", "kiss-icp")
+    assert run.note == "no ground truth"
+    assert run.is_usable
+    assert not [key for key in run.values if key.startswith(("ate", "rpe", "drift"))]
+    assert run.values["time.total"] > 0
+    (difference,) = made.differences
+    assert (difference.sequence, difference.method, difference.reference) == ("silent", "kiss-icp", "icp")
+    a, b = (read_trajectory(one(made, "silent", m).folder).positions for m in ("icp", "kiss-icp"))
+    assert difference.origin == pytest.approx(np.sqrt(np.mean(np.sum((a - b) ** 2, axis=1))), abs=1e-3)
+    assert 0 < difference.se3 <= difference.origin + 1e-9
+
+
+def test_what_fails_is_a_row_with_its_reason_and_no_pair(made: Comparison) -> None:
+    assert [(r.sequence, r.method, r.status) for r in made.failed] == [
+        ("broken", "icp", "failed"), ("broken", "kiss-icp", "failed"),
+    ]  # fmt: skip
+    assert all("none of 14 scans can be used" in r.reason and not r.values for r in made.failed)
+    assert made.paired[0].n == 1
+
+
+def test_files_are_there_and_agree(made: Comparison, plan: Plan) -> None:
+    document: dict[str, Any] = json.loads((plan.out / "compare.json").read_text())
+    assert (document["schema"], document["status"]) == ("lslam-compare", "done")
+    assert [r["values"].get("ate.se3") for r in document["runs"]] == [r.values.get("ate.se3") for r in made.runs]
+    with (plan.out / "compare.csv").open() as stream:
+        rows = list(csv.DictReader(stream))
+    assert len(rows) == 6
+    assert float(rows[0]["ate.se3 (m)"]) == pytest.approx(made.runs[0].values["ate.se3"])
+    assert rows[2]["ate.se3 (m)"] == ""
+    assert "silent & kiss-icp & no ground truth" in (plan.out / "compare.tex").read_text()
+    page = (plan.out / "compare.html").read_text()
+    assert page.count("data:image/png") >= 4
+    assert "runs/good/icp-s0/report.html" in page
+
+
+def test_resume_runs_only_what_is_missing_or_changed(made: Comparison, plan: Plan, tmp_path: Path) -> None:
+    out = tmp_path / "copy"
+    shutil.copytree(plan.out, out)
+    with pytest.raises(OutputExistsError, match="--resume"):
+        compare(replace(plan, out=out))
+    two = replace(plan, out=out, subjects=plan.subjects[:2], resume=True)
+    (out / "runs" / "good" / "icp-s0.json").unlink()
+    seen: list[str] = []
+    again = compare(two, Follow(on_step=seen.append))
+    assert seen == ["good icp seed 0"]
+    assert [r.is_reused for r in again.runs] == [False, True, True, True]
+    assert one(again, "good", "icp").values["ate.se3"] == one(made, "good", "icp").values["ate.se3"]
+    anew = replace(two, methods=("icp",), subjects=plan.subjects[:1], overwrite=True, resume=False)
+    assert not compare(anew).runs[0].is_reused
+
+
+def test_a_folder_that_is_something_else_is_left_alone(plan: Plan, tmp_path: Path) -> None:
+    (tmp_path / "thesis.tex").write_text("years")
+    with pytest.raises(OutputExistsError, match="not a comparison"):
+        compare(replace(plan, out=tmp_path, overwrite=True))
+    assert [p.name for p in tmp_path.iterdir()] == ["thesis.tex"]
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        ({"seeds": (0, 0)}, "--seeds"),
+        ({"seeds": ()}, "--seeds"),
+        ({"jobs": 0}, "--jobs 0"),
+        ({"overwrite": True, "resume": True}, "give one of them"),
+        ({"crop": (0.0, 0.0, -1.0)}, "--crop"),
+        ({"crop": (0.0, 0.0, 9.0), "config": load_config(None, ["map.write=false"], {})}, "map.write is off"),
+        ({"methods": ("icp", "loma")}, "no method 'loma'"),
+    ],
+)
+def test_what_cannot_be_compared_is_said_before_anything_runs(
+    plan: Plan, change: dict[str, Any], sentence: str
+) -> None:
+    with pytest.raises(UsageError, match=sentence):
+        check_plan(replace(plan, **change))
+
+
+def die(job: Job, at_once: int, load: float) -> None:
+    os.kill(os.getpid(), signal.SIGSEGV)
+
+
+def test_a_process_that_dies_is_a_crashed_job_that_is_tried_again(plan: Plan, tmp_path: Path) -> None:
+    path = plan.subjects[0].path
+    assert path is not None
+    job = Job("good", "icp", 0, path, with_method(Config(), "icp"), tmp_path / "runs" / "icp-s0", "digest", "")
+    run_jobs([job], 1, Follow(), die)
+    state = read_state(job.state_file)
+    assert state is not None
+    assert state.status == "crashed"
+    assert state.reason.startswith("the process was killed by SIGSEGV")
+    assert finished([job]) == set()

@@ -1,0 +1,99 @@
+"""Processes that end well, badly and not at all."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import time
+from functools import partial
+from pathlib import Path
+
+import pytest
+
+from lslam.studies.runner import Task, run_tasks
+
+
+def write_environment(path: Path) -> None:
+    path.write_text(f"{os.getpid()} {os.environ['NUMBA_NUM_THREADS']} {os.environ.get('OMP_NUM_THREADS')}")
+
+
+def kill_itself() -> None:
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def fail() -> None:
+    raise ValueError("the cat sat on it")
+
+
+def chatter() -> None:
+    print("on stdout", flush=True)
+    os.write(2, b"on stderr\n")
+
+
+def meet(own: Path, other: Path) -> None:
+    """Come to an end only beside another one."""
+    own.write_text("here")
+    end = time.monotonic() + 60
+    while not other.exists():
+        if time.monotonic() > end:
+            sys.exit(3)
+        time.sleep(0.01)
+
+
+def wait_to_be_ended(own: Path) -> None:
+    own.write_text(str(os.getpid()))
+    try:
+        time.sleep(120)
+    except KeyboardInterrupt:
+        own.write_text("ended")
+        raise
+
+
+def go(folder: Path, *works: object, at_once: int = 1) -> dict[int, str]:
+    tasks = [Task(f"task {i}", work, folder / f"{i}.out") for i, work in enumerate(works)]  # type: ignore[arg-type]
+    ended: dict[int, str] = {}
+    run_tasks(tasks, at_once, lambda index: None, lambda index, cause: ended.update({index: cause}))
+    return ended
+
+
+def test_each_task_has_a_process_one_that_dies_takes_nothing_with_it_and_stdout_stays_clean(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    before = dict(os.environ)
+    first, last = tmp_path / "first", tmp_path / "last"
+    works = [partial(write_environment, first), kill_itself, fail, chatter, partial(write_environment, last)]
+    ended = go(tmp_path, *works)
+    assert [ended[i] for i in (0, 3, 4)] == ["", "", ""]
+    assert ended[1] == "the process was killed by SIGKILL (often: out of memory)"
+    assert ended[2] == "the process ended with exit code 1: ValueError: the cat sat on it"
+    (pid, *threads), (other, *_) = first.read_text().split(), last.read_text().split()
+    assert len({pid, other, str(os.getpid())}) == 3
+    assert threads == ["1", str(before.get("OMP_NUM_THREADS"))]
+    assert os.environ == before
+    assert (tmp_path / "3.out").read_text() == "on stdout\non stderr\n"
+    assert not (tmp_path / "0.out").exists()
+    assert capfd.readouterr() == ("", "")
+
+
+def test_several_at_once_meet_and_one_at_a_time_do_not(tmp_path: Path) -> None:
+    a, b = tmp_path / "a", tmp_path / "b"
+    assert go(tmp_path, partial(meet, a, b), partial(meet, b, a), at_once=2) == {0: "", 1: ""}
+
+
+def test_an_interruption_ends_what_runs(tmp_path: Path) -> None:
+    mark = tmp_path / "mark"
+
+    def interrupt_when_started(index: int) -> None:
+        if index == 1:
+            end = time.monotonic() + 60
+            while not mark.exists() and time.monotonic() < end:
+                time.sleep(0.01)
+            raise KeyboardInterrupt
+
+    tasks = [Task(f"{i}", partial(wait_to_be_ended, mark), tmp_path / f"{i}.out") for i in range(2)]
+    began = time.monotonic()
+    with pytest.raises(KeyboardInterrupt):
+        run_tasks(tasks, 2, interrupt_when_started, lambda index, cause: None)
+    assert mark.read_text() == "ended"
+    assert time.monotonic() - began < 60
