@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from lslam.config.preprocess import PreprocessConfig
 from lslam.errors import InputError
 from lslam.kernels import voxel
+from lslam.preprocessing.ground import above_ground
 
 # A source grid never gets finer than the points it is made of, nor so coarse that walls merge.
 COARSEST_SOURCE = 3.0
@@ -56,9 +57,20 @@ def clean_points(points: NDArray[Any], config: PreprocessConfig) -> NDArray[np.f
 
 
 def gate_points(points: NDArray[np.float32], config: PreprocessConfig) -> NDArray[np.int64]:
-    """Indices of the points (N, 3) that are finite, non-zero, within range and outside the ego box."""
+    """Indices of the points (N, 3), m, that are finite, non-zero, within range and outside the ego box.
+
+    With `remove_ground` and `denoise` also neither on the ground nor, among the rest, an outlier. Every method's points
+    pass here.
+    """
     box = np.array(config.ego_box if config.ego_box is not None else (), np.float64)
-    return voxel.gate(points, config.range_min, config.range_max, config.range_shape == "cylinder", box)
+    kept = voxel.gate(points, config.range_min, config.range_max, config.range_shape == "cylinder", box)
+    if config.remove_ground:
+        kept = kept[above_ground(points[kept], config.ground_slope, config.ground_tolerance)]
+    if config.denoise:
+        from lslam.preprocessing.denoise import dense_points
+
+        kept = kept[dense_points(points[kept], config.denoise_neighbours, config.denoise_deviations)]
+    return kept
 
 
 def _source_points(
