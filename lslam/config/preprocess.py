@@ -31,6 +31,7 @@ class PreprocessConfig(Section):
     denoise_deviations: float = Field(
         2.0, ge=0, description="`denoise`: standard deviations above the mean distance that are still allowed"
     )
+    deskew: bool = Field(True, description="take the motion within a scan out of it, where points have times")
     map_leaf: float = Field(0.3, gt=0, description="m; centroids of this grid feed the local map")
     downsample: Literal["target", "grid", "first", "random", "none"] = Field(
         "target",

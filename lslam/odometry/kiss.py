@@ -34,6 +34,8 @@ class Kiss:
     have one instant and are left alone.
     """
 
+    deskew = "by kiss-icp, in scans that have per-point times"
+
     def __init__(self, preprocess: PreprocessConfig, has_user_range: bool) -> None:
         with importing("kiss-icp", "install it with: pip install kiss-icp"):
             from kiss_icp.config import KISSConfig
