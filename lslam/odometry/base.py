@@ -12,6 +12,7 @@ from lslam.types.scan_result import ScanResult
 class Odometry(Protocol):
     """Scan + motion prior -> pose, scan after scan.
 
+    A method with an attribute `needs_rings` that is true gets scans whose `rings` are filled in (`input.rings`).
     `prepare` knows nothing of earlier scans, so the front end runs it for the next scan while `register` works on this one.
     A method that deskews has an attribute `deskew` that says how, in words.
     """

@@ -17,11 +17,12 @@ from lslam.odometry import create_odometry
 from lslam.odometry.base import Odometry
 from lslam.pipeline import outputs
 from lslam.pipeline.check import check_config
+from lslam.pipeline.choose import choose_scans
 from lslam.pipeline.front_end import estimate, has_point_times, is_diverged, to_trajectory
 from lslam.pipeline.manifest import Manifest, describe_deskew
 from lslam.pipeline.map_pass import build_map
 from lslam.pipeline.run_folder import RunFolder
-from lslam.readers import open_sequence, select
+from lslam.readers import open_sequence
 from lslam.types.run_record import RunRecord
 from lslam.types.scan_result import ScanResult
 from lslam.types.sequence import Sequence
@@ -84,9 +85,9 @@ def run(
     check_config(config)
     if isinstance(sequence, (str, Path)):
         sequence = open_sequence(sequence)
-    chosen = select(sequence, config.input.start, config.input.count, config.input.skip_frames)
     truth = sequence.ground_truth if ground_truth is None else ground_truth
     odometry = create_odometry(config)
+    chosen = choose_scans(sequence, odometry, config)
     manifest = Manifest(command, chosen, config)
     if out is None:
         _announce(chosen, odometry, config, manifest)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -24,6 +24,8 @@ _LEAST_PER_RING = 20
 _BACKWARD = np.radians(5.0)
 # From ring to ring elevation jumps by more than this at least.
 _TILT = np.radians(0.08)
+# Beams of any LiDAR are farther apart than this.
+_CLOSEST = np.radians(0.05)
 # Of points stored ring after ring this share goes a little further than the one before.
 _AHEAD = 0.8
 
@@ -39,7 +41,7 @@ class RingRule:
     kind: Kind
     count: int
     columns: bool = False
-    borders: Floats = field(default_factory=lambda: np.zeros(0))
+    borders: tuple[float, ...] = ()
 
     def __str__(self) -> str:
         how = {
@@ -136,7 +138,9 @@ def _is_staircase(values: Floats) -> bool:
     """Whether nearly each of the values (M,) lies clearly below, or each above, the one before."""
     gaps = np.diff(values)
     gaps *= np.sign(np.median(gaps))
-    return bool((gaps > 0.25 * np.median(np.abs(gaps))).mean() > 0.9)
+    usual = float(np.median(np.abs(gaps)))
+    falls_through = gaps.sum() > 0.9 * np.abs(gaps).sum()
+    return bool(falls_through and usual > _CLOSEST and (gaps > 0.25 * usual).mean() > 0.9)
 
 
 def _stab(start: Floats, end: Floats) -> float:
@@ -202,7 +206,7 @@ def _decide_elevation(scans: list[Scan], count: int | None, known: int | None) -
     borders = elevation_borders(pooled[np.isfinite(pooled)].astype(np.float64), count)
     if borders is None or (known is not None and count is None and len(borders) + 1 > known):
         return None
-    return RingRule("elevation", len(borders) + 1, borders=borders)
+    return RingRule("elevation", len(borders) + 1, borders=tuple(borders.tolist()))
 
 
 def _refusal(kind: str, count: int | None, scan: Scan) -> str:
