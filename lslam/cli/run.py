@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 @click.argument("sequence")
 @click.option("--method", metavar="NAME", help="Odometry method, see `lslam methods` [default: icp].")
 @options.preset
+@click.option("--residual", metavar="NAME", help="Of --method icp: point, plane, gicp, vgicp or ndt [default: plane].")
 @click.option(
     "--gt", type=click.Path(path_type=Path), metavar="FILE", help="Ground truth instead of the sequence's own."
 )
@@ -39,7 +40,6 @@ if TYPE_CHECKING:
 @click.option("--overwrite", is_flag=True, help="Replace an earlier run in the folder.")
 @options.scan_range
 @click.option("--threads", type=int, metavar="N", help="1: one thread; 2 and more: the next scan is read meanwhile.")
-@click.option("--rings", metavar="RULE", help="How rings are found: auto, field, order, rows[:N], elevation[:N].")
 @click.option("--strict", is_flag=True, help="Exit 4 when anything was degraded: a scan skipped or bridged.")
 @click.option("--dry-run", is_flag=True, help="Resolve everything, write nothing.")
 @options.data_root
@@ -55,7 +55,7 @@ def command(sequence: str, **given: Any) -> None:
     from lslam.pipeline.check import check_config
     from lslam.pipeline.run import run
     from lslam.pipeline.run_folder import default_folder
-    from lslam.readers import open_sequence
+    from lslam.readers import open_sequence, select
 
     config = _resolve(given)
     check_config(config)
@@ -66,9 +66,10 @@ def command(sequence: str, **given: Any) -> None:
     out = given["out"] or default_folder(opened.name, config.odometry.method)
     if given["dry_run"]:
         from lslam.odometry import create_odometry
-        from lslam.pipeline.choose import choose_scans
 
-        return _print_plan(choose_scans(opened, create_odometry(config), config), config, out, given["as_json"])
+        chosen = select(opened, config.input.start, config.input.count, config.input.skip_frames)
+        create_odometry(config)
+        return _print_plan(chosen, config, out, given["as_json"])
     with gentle_stop() as stop, ExitStack() as stack:
         run(
             opened, config, out=out, ground_truth=truth, overwrite=given["overwrite"],
@@ -81,18 +82,22 @@ def command(sequence: str, **given: Any) -> None:
 def _resolve(given: dict[str, Any]) -> Config:
     """Flags over --set over environment over --config over --preset over defaults."""
     from lslam.config import load_config
+    from lslam.pipeline.check import check_residual
 
     flags = {
         "odometry.method": given["method"],
+        "registration.residual": given["residual"],
         "input.start": given["start"],
         "input.count": given["count"],
         "input.skip_frames": given["skip_frames"],
         "input.threads": given["threads"],
-        "input.rings": given["rings"],
         "input.strict": "true" if given["strict"] else None,
     }
     settings = options.with_preset(given["settings"], given["preset"])
-    return load_config(given["config_file"], [*settings, *(f"{k}={v}" for k, v in flags.items() if v is not None)])
+    config = load_config(given["config_file"], [*settings, *(f"{k}={v}" for k, v in flags.items() if v is not None)])
+    if given["residual"] is not None:
+        check_residual(config)
+    return config
 
 
 def read_truth(path: Path | None, sequence: Sequence) -> Trajectory | None:

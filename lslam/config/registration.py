@@ -2,14 +2,37 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 from pydantic import Field, model_validator
 
 from lslam.config.section import Section
+
+Residual = Literal["point", "plane", "gicp", "vgicp", "ndt"]
 
 
 class RegistrationConfig(Section):
     """The local map of Gaussian voxels and the robust Gauss-Newton solver."""
 
+    residual: Residual | None = Field(
+        None,
+        description="how a point is measured against the map: point to point, point to plane, plane to plane, "
+        "distribution to distribution, NDT score; absent: what the method is named after, of icp the plane",
+    )
+    target: Literal["map", "keyframe", "scan"] = Field(
+        "map",
+        description="registered against a map of all scans near by, of the last keyframes, or the last scan alone",
+    )
+    keyframes: int = Field(10, ge=1, description="`target = keyframe`: how many; a new one each 2 m or 15 deg")
+    inlier_distance: float | None = Field(
+        None,
+        gt=0,
+        description="m; correspondences beyond are rejected and the kernel stays this wide; absent: it opens as wide as "
+        "the motion prior was lately wrong and narrows from step to step",
+    )
+    inlier_ratio: float = Field(
+        1.0, gt=0, le=1, description="share of the correspondences kept, nearest first (trimmed ICP); 1 keeps all"
+    )
     voxel_size: float = Field(0.8, gt=0, description="m; voxels of the local map, eight are searched per point")
     min_points: int = Field(6, ge=4, description="points a voxel needs before it is matched")
     planarity: float = Field(0.3, gt=0, lt=1, description="(l1 - l0) / l2 above which a voxel is a plane")

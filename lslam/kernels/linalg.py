@@ -121,3 +121,35 @@ def rotate_left(R: NDArray[np.float64], wx: float, wy: float, wz: float) -> None
     R[2, 0] = R[0, 1] * R[1, 2] - R[0, 2] * R[1, 1]
     R[2, 1] = R[0, 2] * R[1, 0] - R[0, 0] * R[1, 2]
     R[2, 2] = R[0, 0] * R[1, 1] - R[0, 1] * R[1, 0]
+
+
+@inline
+def invert_symmetric(
+    xx: float, xy: float, xz: float, yy: float, yz: float, zz: float
+) -> tuple[float, float, float, float, float, float]:
+    """Inverse of a symmetric positive definite 3x3 matrix, by cofactors: xx, xy, xz, yy, yz, zz."""
+    a, b, c = yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy
+    w = 1.0 / (xx * a + xy * b + xz * c)
+    return w * a, w * b, w * c, w * (xx * zz - xz * xz), w * (xy * xz - xx * yz), w * (xx * yy - xy * xy)
+
+
+@inline
+def rotate_symmetric(R: NDArray[np.float64], q: NDArray[np.float64]) -> tuple[float, float, float, float, float, float]:
+    """R C R^T of a symmetric matrix given by its six entries: xx, xy, xz, yy, yz, zz."""
+    a00 = R[0, 0] * q[0] + R[0, 1] * q[1] + R[0, 2] * q[2]
+    a01 = R[0, 0] * q[1] + R[0, 1] * q[3] + R[0, 2] * q[4]
+    a02 = R[0, 0] * q[2] + R[0, 1] * q[4] + R[0, 2] * q[5]
+    a10 = R[1, 0] * q[0] + R[1, 1] * q[1] + R[1, 2] * q[2]
+    a11 = R[1, 0] * q[1] + R[1, 1] * q[3] + R[1, 2] * q[4]
+    a12 = R[1, 0] * q[2] + R[1, 1] * q[4] + R[1, 2] * q[5]
+    a20 = R[2, 0] * q[0] + R[2, 1] * q[1] + R[2, 2] * q[2]
+    a21 = R[2, 0] * q[1] + R[2, 1] * q[3] + R[2, 2] * q[4]
+    a22 = R[2, 0] * q[2] + R[2, 1] * q[4] + R[2, 2] * q[5]
+    return (
+        a00 * R[0, 0] + a01 * R[0, 1] + a02 * R[0, 2],
+        a00 * R[1, 0] + a01 * R[1, 1] + a02 * R[1, 2],
+        a00 * R[2, 0] + a01 * R[2, 1] + a02 * R[2, 2],
+        a10 * R[1, 0] + a11 * R[1, 1] + a12 * R[1, 2],
+        a10 * R[2, 0] + a11 * R[2, 1] + a12 * R[2, 2],
+        a20 * R[2, 0] + a21 * R[2, 1] + a22 * R[2, 2],
+    )

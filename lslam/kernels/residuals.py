@@ -41,11 +41,33 @@ def octant_slots(x: float, y: float, z: float, i: int, inverse: float, cells: ND
                 k += 1
 
 
+@inline
+def nearest(x: float, y: float, z: float, i: int, slots: NDArray[np.int32],
+            planes: Floats) -> tuple[int, float, int, float]:  # fmt: skip
+    """Nearest plane and nearest blob among the slots of point i: slot or -1, and squared distance of its mean, m2."""
+    best, blob = -1, -1
+    best_d, blob_d = 1e300, 1e300
+    for k in range(8):
+        s = slots[i, k]
+        if s < 0:
+            continue
+        p = planes[s]
+        if p[7] < BLOB:
+            continue
+        d = (x - p[0]) ** 2 + (y - p[1]) ** 2 + (z - p[2]) ** 2
+        if p[7] >= 0.0:
+            if d < best_d:
+                best_d, best = d, s
+        elif d < blob_d:
+            blob_d, blob = d, s
+    return best, best_d, blob, blob_d
+
+
 @kernel
 def linearise(source: Floats, scatter: Floats, R: Floats, t: Floats, size: float, scale: float, sigma2: float,
-              blob_weight: float, planes: Floats, keys: NDArray[np.int64], table: NDArray[np.int32],
-              cells: NDArray[np.int64], slots: NDArray[np.int32], is_done: NDArray[np.bool_], H: Floats, g: Floats,
-              facts: Floats) -> None:  # fmt: skip
+              blob_weight: float, gate2: float, planes: Floats, keys: NDArray[np.int64], table: NDArray[np.int32],
+              cells: NDArray[np.int64], slots: NDArray[np.int32], is_done: NDArray[np.bool_], away2: Floats, H: Floats,
+              g: Floats, facts: Floats) -> None:  # fmt: skip
     """Add to H (6, 6), g (6,) and facts all source points (S, 3), LiDAR frame, with scatter (S, 6) around each.
 
     Points that are done are left out, those that find a plane here become so: a coarser map can serve the rest.
@@ -53,6 +75,8 @@ def linearise(source: Floats, scatter: Floats, R: Floats, t: Floats, size: float
     Each point takes the nearest plane voxel of the eight around it: residual n . (R s + t - mean), variance = map
     eigenvalue + source scatter along the normal + sigma2 + tilt at that distance from the mean, Geman-McClure weight of
     width `scale`. Without a plane the nearest blob stands in: isotropic, its mean variance, times `blob_weight`.
+    `away2` (S,) takes the squared distance of each matched point to its plane, or mean; those beyond `gate2` are
+    rejected: counted, without a say.
     `facts`: sum of information, weighted squared residuals (m2), inliers within `scale`, matched, information times
     squared lever arm, sum of robust weights.
     """
@@ -67,26 +91,18 @@ def linearise(source: Floats, scatter: Floats, R: Floats, t: Floats, size: float
         rz = R[2, 0] * a + R[2, 1] * b + R[2, 2] * c
         x, y, z = rx + t[0], ry + t[1], rz + t[2]
         octant_slots(x, y, z, i, inverse, cells, slots, keys, table)
-        best, blob = -1, -1
-        best_d, blob_d = 1e300, 1e300
-        for k in range(8):
-            s = slots[i, k]
-            if s < 0:
-                continue
-            p = planes[s]
-            if p[7] < BLOB:
-                continue
-            d = (x - p[0]) ** 2 + (y - p[1]) ** 2 + (z - p[2]) ** 2
-            if p[7] >= 0.0:
-                if d < best_d:
-                    best_d, best = d, s
-            elif d < blob_d:
-                blob_d, blob = d, s
+        best, best_d, blob, blob_d = nearest(x, y, z, i, slots, planes)
         if best >= 0:
             is_done[i] = True
             p = planes[best]
             nx, ny, nz = p[3], p[4], p[5]
             r = nx * (x - p[0]) + ny * (y - p[1]) + nz * (z - p[2])
+            away2[i] = r * r
+            facts[3] += 1.0
+            if abs(r) < scale:
+                facts[2] += 1.0
+            if r * r > gate2:
+                continue
             # The normal seen from the scan, to read the source scatter along it.
             lx = R[0, 0] * nx + R[1, 0] * ny + R[2, 0] * nz
             ly = R[0, 1] * nx + R[1, 1] * ny + R[2, 1] * nz
@@ -100,33 +116,33 @@ def linearise(source: Floats, scatter: Floats, R: Floats, t: Floats, size: float
             robust *= robust
             w = robust / (p[6] + max(spread, 0.0) + sigma2 + TILT * p[7] * (best_d - r * r))
             j3, j4, j5 = ry * nz - rz * ny, rz * nx - rx * nz, rx * ny - ry * nx
-            _add(H, g, w, r, nx, ny, nz, j3, j4, j5)
+            add_row(H, g, w, r, nx, ny, nz, j3, j4, j5)
             facts[0] += w
             facts[1] += robust * r * r
-            facts[3] += 1.0
             facts[4] += w * (rx * rx + ry * ry + rz * rz)
             facts[5] += robust
-            if abs(r) < scale:
-                facts[2] += 1.0
         elif blob >= 0 and blob_weight > 0.0:
             p = planes[blob]
+            away2[i] = blob_d
+            facts[3] += 1.0
+            if blob_d < c2:
+                facts[2] += 1.0
+            if blob_d > gate2:
+                continue
             robust = c2 / (c2 + blob_d)
             robust *= robust
             q = scatter[i]
             w = blob_weight * robust / (p[6] + (q[0] + q[3] + q[5]) / 3.0 + sigma2)
             ex, ey, ez = x - p[0], y - p[1], z - p[2]
-            _add(H, g, w, ex, 1.0, 0.0, 0.0, 0.0, rz, -ry)
-            _add(H, g, w, ey, 0.0, 1.0, 0.0, -rz, 0.0, rx)
-            _add(H, g, w, ez, 0.0, 0.0, 1.0, ry, -rx, 0.0)
+            add_row(H, g, w, ex, 1.0, 0.0, 0.0, 0.0, rz, -ry)
+            add_row(H, g, w, ey, 0.0, 1.0, 0.0, -rz, 0.0, rx)
+            add_row(H, g, w, ez, 0.0, 0.0, 1.0, ry, -rx, 0.0)
             facts[0] += 3.0 * w
-            facts[3] += 1.0
             facts[4] += 3.0 * w * (rx * rx + ry * ry + rz * rz)
-            if blob_d < c2:
-                facts[2] += 1.0
 
 
 @inline
-def _add(H: Floats, g: Floats, w: float, r: float, j0: float, j1: float, j2: float, j3: float, j4: float,
+def add_row(H: Floats, g: Floats, w: float, r: float, j0: float, j1: float, j2: float, j3: float, j4: float,
          j5: float) -> None:  # fmt: skip
     """Upper triangle of H += w j j^T and g += w r j."""
     w0, w1, w2, w3, w4, w5 = w * j0, w * j1, w * j2, w * j3, w * j4, w * j5
@@ -157,6 +173,46 @@ def _add(H: Floats, g: Floats, w: float, r: float, j0: float, j1: float, j2: flo
     g[3] += w3 * r
     g[4] += w4 * r
     g[5] += w5 * r
+
+
+@inline
+def add_information(H: Floats, g: Floats, w: float, xx: float, xy: float, xz: float, yy: float, yz: float, zz: float,
+                    ex: float, ey: float, ez: float, rx: float, ry: float, rz: float) -> None:  # fmt: skip
+    """Upper triangle of H += w J^T M J and g += w J^T M e, with J = [I, -hat(r)] and M the symmetric matrix xx..zz."""
+    xx, xy, xz, yy, yz, zz = w * xx, w * xy, w * xz, w * yy, w * yz, w * zz
+    H[0, 0] += xx
+    H[0, 1] += xy
+    H[0, 2] += xz
+    H[1, 1] += yy
+    H[1, 2] += yz
+    H[2, 2] += zz
+    # B = -M hat(r), the block between translation and rotation.
+    b00, b01, b02 = xz * ry - xy * rz, xx * rz - xz * rx, xy * rx - xx * ry
+    b10, b11, b12 = yz * ry - yy * rz, xy * rz - yz * rx, yy * rx - xy * ry
+    b20, b21, b22 = zz * ry - yz * rz, xz * rz - zz * rx, yz * rx - xz * ry
+    H[0, 3] += b00
+    H[0, 4] += b01
+    H[0, 5] += b02
+    H[1, 3] += b10
+    H[1, 4] += b11
+    H[1, 5] += b12
+    H[2, 3] += b20
+    H[2, 4] += b21
+    H[2, 5] += b22
+    # hat(r) B
+    H[3, 3] += ry * b20 - rz * b10
+    H[3, 4] += ry * b21 - rz * b11
+    H[3, 5] += ry * b22 - rz * b12
+    H[4, 4] += rz * b01 - rx * b21
+    H[4, 5] += rz * b02 - rx * b22
+    H[5, 5] += rx * b12 - ry * b02
+    px, py, pz = xx * ex + xy * ey + xz * ez, xy * ex + yy * ey + yz * ez, xz * ex + yz * ey + zz * ez
+    g[0] += px
+    g[1] += py
+    g[2] += pz
+    g[3] += ry * pz - rz * py
+    g[4] += rz * px - rx * pz
+    g[5] += rx * py - ry * px
 
 
 @inline

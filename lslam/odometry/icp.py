@@ -1,60 +1,64 @@
-"""Method `icp`: our scan-to-map registration."""
+"""Method `icp` and those named after their residual: our registration against a local map."""
 
 from __future__ import annotations
 
 import time
-from dataclasses import replace
 
 import numpy as np
 
 from lslam.config.config import Config
-from lslam.preprocessing.deskew import deskew
-from lslam.preprocessing.prepare import PreparedPoints, prepare_points
+from lslam.config.registration import Residual
+from lslam.errors import UsageError
+from lslam.preprocessing.prepare import PreparedPoints
 from lslam.registration.registration import Registration
-from lslam.registration.solver import RegistrationResult
 from lslam.registration.uncertainty import PoseUncertainty
 from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan import Scan
 from lslam.types.scan_result import ScanResult
 
+# Methods named after their residual; `icp` is the plane unless told otherwise.
+RESIDUALS: dict[str, Residual] = {"icp-point": "point", "gicp": "gicp", "vgicp": "vgicp", "ndt": "ndt"}
+
 
 def create(config: Config) -> Icp:
-    """The method as the configuration wants it."""
-    return Icp(Registration(config.registration, config.preprocess))
+    """The method as the configuration wants it.
+
+    `icp` takes any residual; the others are named after theirs. Raises UsageError when one is asked for another.
+    """
+    method, chosen = config.odometry.method, config.registration.residual
+    own = RESIDUALS.get(method)
+    if own is not None and chosen not in (None, own):
+        raise UsageError(
+            f"method {method!r} measures by the residual {own!r}, registration.residual asks for {chosen!r}: "
+            f"choose one of them, or --method icp --residual {chosen}"
+        )
+    return Icp(Registration(config.registration.model_copy(update={"residual": own or chosen}), config.preprocess))
 
 
 class Icp:
     """Adapter from scans and motion priors to `Registration`."""
 
-    deskew = "by the motion prior, and again by the motion that registration finds"
-
     def __init__(self, registration: Registration) -> None:
         self.registration = registration
-        self._uncertainty = PoseUncertainty()
-        # What `register` saw and found last, for `update`.
-        self._points: PreparedPoints
-        self._located: RegistrationResult
+        self._uncertainty = PoseUncertainty(is_scan_to_scan=registration.config.target == "scan")
 
     def prepare(self, scan: Scan) -> PreparedPoints:
         """Range gate and down-sampling."""
-        config = self.registration.preprocess
-        return prepare_points(scan.points, config, scan.index, scan.times if config.deskew else None)
+        return self.registration.prepare(scan.points, scan.index)
 
     def register(self, scan: Scan, prepared: PreparedPoints, prior: MotionPrior) -> ScanResult:
-        """Align with the local map."""
+        """Align, then update the local map."""
         began = time.perf_counter()
-        self._points = deskew(prepared, prior)
-        deskewed = time.perf_counter()
-        self._located = result = self.registration.locate(self._points, prior.start)
-        stages = {"register": time.perf_counter() - deskewed}
-        if self._points is not prepared:
-            stages = {"deskew": deskewed - began, **stages}
+        result = self.registration.locate(prepared, prior.start)
+        aligned = time.perf_counter()
+        self.registration.update(prepared, result)
         return ScanResult(
             index=scan.index,
             stamp_ns=scan.stamp_ns,
             T_world_lidar=result.T_world_lidar,
             status="ok" if result.ok else "bridged",
             reason=result.reason,
+            covariance=self._uncertainty.add(result),
             registration_covariance=result.covariance,
             converged=result.converged,
             iterations=result.iterations,
@@ -64,21 +68,8 @@ class Icp:
             overlap=result.overlap,
             degenerate=result.degenerate,
             prior_error=result.prior_error,
-            stages=stages,
+            stages={"register": aligned - began, "update": time.perf_counter() - aligned},
         )
-
-    def update(self, scan: Scan, prepared: PreparedPoints, prior: MotionPrior, result: ScanResult) -> ScanResult:
-        """Enter the scan into the local map where `register` put it."""
-        began = time.perf_counter()
-        self.registration.update(self._points, self._located)
-        covariance = self._uncertainty.add(self._located)
-        stages = {**result.stages, "update": time.perf_counter() - began}
-        return replace(result, covariance=covariance, stages=stages)
-
-    def restart(self) -> None:
-        """An empty map."""
-        self.registration = Registration(self.registration.config, self.registration.preprocess)
-        self._uncertainty = PoseUncertainty()
 
     def warm_up(self) -> None:
         """Register a small room twice with a throw-away copy: every kernel is compiled or loaded."""

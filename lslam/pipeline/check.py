@@ -5,7 +5,7 @@ from __future__ import annotations
 from lslam.config import Config
 from lslam.errors import UsageError, nearest
 from lslam.evaluation.relative import parse_delta
-from lslam.odometry import known_methods
+from lslam.odometry import METHODS, known_methods
 
 
 def check_config(config: Config) -> None:
@@ -15,3 +15,12 @@ def check_config(config: Config) -> None:
         raise UsageError(f"no method {method!r}; {nearest(method, known)}")
     for delta in config.eval.delta:
         parse_delta(delta)
+
+
+def check_residual(config: Config) -> None:
+    """Raise UsageError when --residual is given with a method that measures in its own way."""
+    method = config.odometry.method
+    if METHODS.get(method, ("",))[0] != METHODS["icp"][0]:
+        raise UsageError(
+            f"--residual is for --method icp, not {method!r}, which measures in its own way: drop one of them"
+        )

@@ -9,14 +9,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.config.preprocess import PreprocessConfig
-from lslam.config.registration import RegistrationConfig
+from lslam.config.registration import RegistrationConfig, Residual
 from lslam.errors import InputError
 from lslam.geometry import se3, so3
 from lslam.preprocessing.prepare import PreparedPoints, prepare_points
 from lslam.registration.gaussian_map import GaussianMap
 from lslam.registration.motion import ConstantVelocity
+from lslam.registration.residuals import NEEDS_COVARIANCE
 from lslam.registration.robust import AdaptiveThreshold, Annealing, UsualAgreement
 from lslam.registration.solver import RegistrationResult, solve
+from lslam.registration.source_covariance import source_covariance
+from lslam.registration.target import make_target
 
 MIN_SOURCE_POINTS = 30
 
@@ -38,6 +41,8 @@ class Registration:
     def __init__(self, config: RegistrationConfig | None = None, preprocess: PreprocessConfig | None = None) -> None:
         self.config = config or RegistrationConfig()
         self.preprocess = preprocess or PreprocessConfig()
+        self.residual: Residual = self.config.residual or "plane"
+        self.target = make_target(self.config.target, self.config.keyframes)
         self.map = GaussianMap(
             self.config.voxel_size,
             min_points=self.config.min_points,
@@ -54,7 +59,15 @@ class Registration:
 
     def register(self, points: NDArray[Any], prior: NDArray[np.float64] | None = None) -> RegistrationResult:
         """Pose of points (N, 3), m, LiDAR frame; without `prior` (4, 4) the velocity is taken as constant."""
-        return self.align(prepare_points(points, self.preprocess, self._index), prior)
+        return self.align(self.prepare(points, self._index), prior)
+
+    def prepare(self, points: NDArray[Any], index: int) -> PreparedPoints:
+        """What can be made of points (N, 3), m, LiDAR frame, without the map; `index` is the scan's number."""
+        prepared = prepare_points(points, self.preprocess, index)
+        if self.residual not in NEEDS_COVARIANCE:
+            return prepared
+        covariance = source_covariance(prepared.source, prepared.map_points, self.config.sigma**2)
+        return replace(prepared, covariance=covariance)
 
     def align(self, points: PreparedPoints, prior: NDArray[np.float64] | None = None) -> RegistrationResult:
         """As `register`, for points that are prepared already; aligns, judges, then updates the map.
@@ -79,9 +92,9 @@ class Registration:
         if self._starting > 0:
             return self._judge(self._coarse_to_fine(points, T_prior), T_prior)
         c = self.config
-        fine = self._solve(
-            points, T_prior, Annealing(self.threshold.width, c.kernel_min, c.kernel_decay, c.max_iterations)
-        )
+        # One scan alone puts single rings into fine voxels; several fill them.
+        coarse_map = self.map.coarsen(c.coarse_factor) if c.target == "scan" else None
+        fine = self._refine(points, T_prior, self.threshold.width, c.max_iterations, coarse_map)
         fine = self._judge(fine, T_prior)
         move, turn = fine.prior_error
         if fine.ok and move < c.recover_m and turn < np.deg2rad(c.recover_deg):
@@ -94,7 +107,7 @@ class Registration:
         """Enter the scan into the map unless its registration failed, and learn from how wrong the prior was."""
         if result.ok:
             first = len(self.map) == 0
-            self.map.insert(points.map_points, result.T_world_lidar)
+            self.target.enter(self.map, points.map_points, result.T_world_lidar)
             self._inserted += 1
             if not first:
                 self._starting = max(self._starting - 1, 0)
@@ -117,24 +130,27 @@ class Registration:
         c = self.config
         coarse_map = self.map.coarsen(c.coarse_factor)
         slow = Annealing(c.coarse_kernel, c.kernel_min, c.coarse_decay, c.start_iterations)
-        coarse = self._solve(points, T_prior, slow, coarse_map)
+        coarse = solve(
+            coarse_map, points, T_prior, slow,
+            sigma=c.sigma, blob_weight=c.blob_weight, weak_share=c.weak_share, residual=self.residual,
+        )  # fmt: skip
         start = coarse.T_world_lidar if coarse.ok else T_prior
-        quick = Annealing(c.kernel_max, c.kernel_min, c.kernel_decay, c.start_iterations)
-        fine = self._solve(points, start, quick, self.map, coarse_map)
+        fine = self._refine(points, start, c.kernel_max, c.start_iterations, coarse_map)
         return replace(fine, iterations=coarse.iterations + fine.iterations)
 
-    def _solve(
-        self,
-        points: PreparedPoints,
-        T_prior: NDArray[np.float64],
-        annealing: Annealing,
-        target: GaussianMap | None = None,
-        coarse: GaussianMap | None = None,
+    def _refine(
+        self, points: PreparedPoints, start: NDArray[np.float64], width: float, steps: int, coarse: GaussianMap | None
     ) -> RegistrationResult:
+        """Align with the fine map from `start`, the kernel closing from `width`, or as the user wants it."""
         c = self.config
+        if c.inlier_distance is None:
+            annealing = Annealing(width, c.kernel_min, c.kernel_decay, steps)
+        else:
+            annealing = Annealing(c.inlier_distance, c.inlier_distance, c.kernel_decay, steps)
         return solve(
-            self.map if target is None else target, points, T_prior, annealing,
-            sigma=c.sigma, blob_weight=c.blob_weight, weak_share=c.weak_share, coarse=coarse,
+            self.map, points, start, annealing,
+            sigma=c.sigma, blob_weight=c.blob_weight, weak_share=c.weak_share, coarse=coarse, residual=self.residual,
+            inlier_distance=np.inf if c.inlier_distance is None else c.inlier_distance, inlier_ratio=c.inlier_ratio,
         )  # fmt: skip
 
     def _judge(self, result: RegistrationResult, T_prior: NDArray[np.float64]) -> RegistrationResult:
@@ -144,7 +160,8 @@ class Registration:
         move, turn = float(np.linalg.norm(delta[:3, 3])), float(so3.angle(delta[:3, :3]))
         reason = result.reason
         # One scan of a sparse sensor makes few planes: what matches them may be right and yet a small share.
-        needed = c.min_overlap if self._inserted > c.start_scans else c.start_overlap
+        is_filled = self._inserted > c.start_scans and c.target != "scan"
+        needed = c.min_overlap if is_filled else c.start_overlap
         if not reason and result.overlap < needed:
             reason = f"only {result.overlap:.0%} of the points overlap the map"
         elif not reason and result.inlier_share < c.min_inliers:

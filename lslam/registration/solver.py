@@ -7,11 +7,13 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.config.registration import Residual
 from lslam.geometry import se3
-from lslam.kernels.gauss_newton import align
 from lslam.preprocessing.prepare import PreparedPoints
 from lslam.registration.gaussian_map import GaussianMap
+from lslam.registration.residuals import NEEDS_COVARIANCE, kernel_of, voxels_of
 from lslam.registration.robust import Annealing
+from lslam.registration.source_covariance import source_covariance
 
 # A step below these ends the iteration: a tenth of the noise of a point, and what that is at 10 m.
 STEP_M, STEP_RAD = 1e-3, 1e-4
@@ -62,18 +64,24 @@ class RegistrationResult:
 
 def solve(
     target: GaussianMap, points: PreparedPoints, T_prior: NDArray[np.float64], annealing: Annealing, *, sigma: float,
-    blob_weight: float, weak_share: float, coarse: GaussianMap | None = None,
+    blob_weight: float, weak_share: float, coarse: GaussianMap | None = None, residual: Residual = "plane",
+    inlier_distance: float = np.inf, inlier_ratio: float = 1.0,
 ) -> RegistrationResult:  # fmt: skip
     """Align the source points with the map by annealed Gauss-Newton, starting at `T_prior` (4, 4).
 
-    Points without a plane in `target` are matched in `coarse`, when given.
+    Points without a plane in `target` are matched in `coarse`, when given. Correspondences beyond `inlier_distance`, m,
+    are rejected, and all but the nearest `inlier_ratio`.
     """
     second = target if coarse is None else coarse
     R, t = np.ascontiguousarray(T_prior[:3, :3]).copy(), T_prior[:3, 3].copy()
-    H, facts, step, iterations, converged, weak_count, weak = align(
-        points.source, points.scatter, R, t, annealing.start, annealing.end, annealing.decay, annealing.steps,
-        STEP_M, STEP_RAD, sigma**2, blob_weight, weak_share, target.size, target.planes, target.keys, target.table,
-        coarse is not None, second.size, second.planes, second.keys, second.table,
+    spread = points.scatter
+    if residual in NEEDS_COVARIANCE:
+        known = points.covariance
+        spread = source_covariance(points.source, points.map_points, sigma**2) if known is None else known
+    H, facts, step, iterations, converged, weak_count, weak = kernel_of(residual)(
+        points.source, spread, R, t, annealing.start, annealing.end, annealing.decay, annealing.steps,
+        STEP_M, STEP_RAD, inlier_distance, inlier_ratio, sigma**2, blob_weight, weak_share,
+        target.size, *voxels_of(residual, target), coarse is not None, second.size, *voxels_of(residual, second),
     )  # fmt: skip
     pose = se3.make(R, t)
     finite = bool(np.isfinite(pose).all() and np.isfinite(step).all())

@@ -19,9 +19,12 @@ class PoseUncertainty:
     more independent registration error has entered it. In between, registrations against the same map share its
     error. So per scan the map's covariance grows by (step / lever arm) times the registration's, and a rotation error
     moves all later positions. A sensor that stands still does not drift.
+
+    From scan to scan there is no such map: every registration's error enters in full.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, *, is_scan_to_scan: bool = False) -> None:
+        self.is_scan_to_scan = is_scan_to_scan
         self._map = np.zeros((6, 6))
         self._position: Floats | None = None
 
@@ -39,5 +42,6 @@ class PoseUncertainty:
         transport[:3, 3:] = -so3.hat(step)
         self._map = transport @ self._map @ transport.T
         if result.ok:
-            self._map += float(np.linalg.norm(step)) / max(result.lever_arm, 1.0) * result.covariance
+            renewed = float(np.linalg.norm(step)) / max(result.lever_arm, 1.0)
+            self._map += (1.0 if self.is_scan_to_scan else renewed) * result.covariance
         return np.asarray(self._map + result.covariance)

@@ -80,10 +80,17 @@ def target() -> GaussianMap:
 
 
 def align(
-    m: GaussianMap, source: Floats, R: Floats, t: Floats, steps: int = STEPS, weak_share: float = 1e-3
+    m: GaussianMap,
+    source: Floats,
+    R: Floats,
+    t: Floats,
+    steps: int = STEPS,
+    weak_share: float = 1e-3,
+    farthest: float = np.inf,
+    ratio: float = 1.0,
 ) -> tuple[Floats, Floats, Floats, int, bool, int, Floats]:
     return gauss_newton.align(
-        source, np.zeros((len(source), 6)), R, t, 1.0, 0.1, 0.5, steps, 1e-3, 1e-4, 9e-4, 0.5, weak_share,
+        source, np.zeros((len(source), 6)), R, t, 1.0, 0.1, 0.5, steps, 1e-3, 1e-4, farthest, ratio, 9e-4, 0.5, weak_share,
         m.size, m.planes, m.keys, m.table, False, m.size, m.planes, m.keys, m.table,
     )  # fmt: skip
 

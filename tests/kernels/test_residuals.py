@@ -66,15 +66,16 @@ def scene() -> Scene:
 
 
 def linearise(
-    s: Scene, R: Floats, t: Floats, c: float, blob: float = BLOB, cache: tuple[NDArray[np.int64], NDArray[np.int32]] | None = None
+    s: Scene, R: Floats, t: Floats, c: float, blob: float = BLOB, gate2: float = np.inf,
+    cache: tuple[NDArray[np.int64], NDArray[np.int32]] | None = None,
 ) -> tuple[Floats, Floats, Floats]:  # fmt: skip
     n = len(s.points.source)
     cells, slots = cache or (np.full(n, -1, np.int64), np.full((n, 8), -1, np.int32))
     H, g, facts, is_done = np.zeros((6, 6)), np.zeros(6), np.zeros(6), np.zeros(n, np.bool_)
-    m = s.target
+    m, away2 = s.target, np.empty(n)
     residuals.linearise(
-        s.points.source, s.points.scatter, R, t, m.size, c, SIGMA2, blob, m.planes, m.keys, m.table, cells, slots, is_done,
-        H, g, facts,
+        s.points.source, s.points.scatter, R, t, m.size, c, SIGMA2, blob, gate2, m.planes, m.keys, m.table, cells, slots,
+        is_done, away2, H, g, facts,
     )  # fmt: skip
     # The kernel fills the upper triangle.
     return np.triu(H) + np.triu(H, 1).T, g, facts
@@ -121,6 +122,18 @@ def test_normal_equations_are_those_of_numpy(scene: Scene, c: float) -> None:
     assert facts[0] == pytest.approx(information, rel=1e-6)
     assert facts[2] == inliers > 0
     assert facts[4] == pytest.approx(lever, rel=1e-6)
+
+
+@pytest.mark.parametrize("gate", [0.02, 0.1])
+def test_matches_beyond_the_gate_count_but_do_not_pull(scene: Scene, gate: float) -> None:
+    H, _, facts = linearise(scene, scene.R, scene.t, 0.5, gate2=gate**2)
+    expected = np.zeros((6, 6))
+    kept = [m for m in scene.matches() if m.distance2(scene.R, scene.t) <= gate**2]
+    for m in kept:
+        _, J = m.rows(scene.R, scene.t)
+        expected += m.information(scene.R, scene.t, 0.5) * J.T @ J
+    np.testing.assert_allclose(H, expected, rtol=1e-6, atol=1e-6 * np.abs(expected).max())
+    assert facts[3] == len(scene.matches()) > len(kept) > 0
 
 
 def test_rmse_facts_are_those_of_the_planes(scene: Scene) -> None:
@@ -190,8 +203,8 @@ def test_a_coarser_map_serves_the_points_that_found_no_plane(scene: Scene) -> No
     for m in (fine, coarse):
         cells, slots = np.full(n, -1, np.int64), np.full((n, 8), -1, np.int32)
         residuals.linearise(
-            scene.points.source, scene.points.scatter, scene.R, scene.t, m.size, 0.5, SIGMA2, 0.0, m.planes, m.keys,
-            m.table, cells, slots, is_done, H, g, facts,
+            scene.points.source, scene.points.scatter, scene.R, scene.t, m.size, 0.5, SIGMA2, 0.0, np.inf, m.planes, m.keys,
+            m.table, cells, slots, is_done, np.empty(n), H, g, facts,
         )  # fmt: skip
         counts.append(facts[3])
         assert is_done.sum() == facts[3]

@@ -12,6 +12,8 @@ from lslam.config.config import Config
 from lslam.errors import UsageError
 from lslam.odometry import METHODS, create_odometry, known_methods
 
+FAMILY = ("gicp", "vgicp", "ndt")
+
 
 def config(method: str) -> Config:
     return Config.model_validate({"odometry": {"method": method}})
@@ -47,7 +49,8 @@ def test_every_method_can_be_made_and_says_what_it_is(name: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("wrong", "hint"), [("ipc", "did you mean 'icp'?"), ("kis_icp", "did you mean 'kiss-icp'?"), ("zzz", "known: icp")]
+    ("wrong", "hint"),
+    [("ipc", "did you mean 'icp' or"), ("kis_icp", "did you mean 'kiss-icp'?"), ("zzz", "known: icp")],
 )
 def test_an_unknown_method_is_refused_with_the_nearest(wrong: str, hint: str) -> None:
     with pytest.raises(UsageError) as caught:
@@ -74,3 +77,21 @@ def test_a_foreign_method_cannot_take_the_place_of_ours(foreign: list[str]) -> N
 def test_foreign_names_are_suggested_too(foreign: list[str]) -> None:
     with pytest.raises(UsageError, match="did you mean 'their-icp'"):
         create_odometry(config("their_icp"))
+
+
+@pytest.mark.parametrize(("method", "residual"), [("icp", "plane"), ("icp-point", "point"), *((n, n) for n in FAMILY)])
+def test_methods_named_after_their_residual_use_it(method: str, residual: str) -> None:
+    made: Any = create_odometry(config(method))
+    assert made.registration.residual == residual
+    same = Config.model_validate({"odometry": {"method": method}, "registration": {"residual": residual}})
+    assert create_odometry(same).registration.residual == residual  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize("residual", ["point", "plane", *FAMILY])
+def test_icp_takes_any_residual_and_the_others_none_but_their_own(residual: str) -> None:
+    chosen = {"registration": {"residual": residual}}
+    made: Any = create_odometry(Config.model_validate(chosen))
+    assert made.registration.residual == residual
+    other = "ndt" if residual != "ndt" else "gicp"
+    with pytest.raises(UsageError, match=f"--method icp --residual {residual}"):
+        create_odometry(Config.model_validate({"odometry": {"method": other}, **chosen}))

@@ -1,0 +1,168 @@
+"""The normal distributions transform (Magnusson 2009, chapter 6): a score over the eight voxels around a point."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.kernels.gauss_newton import advance, clear, trimmed, workspace
+from lslam.kernels.gaussians import FREE
+from lslam.kernels.jit import inline, kernel
+from lslam.kernels.linalg import invert_symmetric, plane_of
+from lslam.kernels.residuals import add_information, octant_slots
+
+Floats = NDArray[np.float64]
+Longs = NDArray[np.int64]
+Ints = NDArray[np.int32]
+Flags = NDArray[np.bool_]
+
+# Eigenvalues below this share of the largest are raised to it (Magnusson, section 6.2.1).
+SMALLEST_SHARE = 0.01
+# A voxel whose second eigenvalue is below this share of the largest holds a line: one ring, or a few in a row. Across it
+# the Gaussian knows only where an earlier scan happened to be cut, and would hold the sensor there.
+LINE_SHARE = 0.1
+OUTLIER_RATIO = 0.55
+
+
+@inline
+def mixture(size: float) -> tuple[float, float]:
+    """Weights d1 (positive) and d2 of the score for voxels of `size`, m (Magnusson, equations 6.8)."""
+    c1, c2 = 10.0 * (1.0 - OUTLIER_RATIO), OUTLIER_RATIO / size**3
+    d3 = -math.log(c2)
+    d1 = -math.log(c1 + c2) - d3
+    d2 = -2.0 * math.log((-math.log(c1 * math.exp(-0.5) + c2) - d3) / d1)
+    return -d1, d2
+
+
+@kernel
+def describe(moments: Floats, planes: Floats, keys: Longs, refreshed: Floats, used: int, min_points: float, floor: float,
+             shapes: Floats) -> None:  # fmt: skip
+    """Bring shapes (C, 11) up to date: mean, inverse covariance xx..zz, smallest eigenvalue, count when it was computed.
+
+    Voxels that hold too few points, or a line, have a smallest eigenvalue of 0.
+    """
+    for slot in range(used):
+        p, q = planes[slot], shapes[slot]
+        if keys[slot] == FREE or (q[10] == refreshed[slot] and q[0] == p[0] and q[1] == p[1] and q[2] == p[2]):
+            continue
+        q[0], q[1], q[2] = p[0], p[1], p[2]
+        q[10] = refreshed[slot]
+        q[9] = 0.0
+        s = moments[slot]
+        if s[0] < min_points:
+            continue
+        w = 1.0 / s[0]
+        mx, my, mz = s[1] * w, s[2] * w, s[3] * w
+        xx, xy, xz = s[4] * w - mx * mx + floor, s[5] * w - mx * my, s[6] * w - mx * mz
+        yy, yz, zz = s[7] * w - my * my + floor, s[8] * w - my * mz, s[9] * w - mz * mz + floor
+        l0, l1, l2, nx, ny, nz = plane_of(xx, xy, xz, yy, yz, zz)
+        if l1 < LINE_SHARE * l2:
+            continue
+        lift = max(SMALLEST_SHARE * l2 - l0, 0.0)
+        q[3], q[4], q[5], q[6], q[7], q[8] = invert_symmetric(
+            xx + lift * nx * nx, xy + lift * nx * ny, xz + lift * nx * nz,
+            yy + lift * ny * ny, yz + lift * ny * nz, zz + lift * nz * nz,
+        )  # fmt: skip
+        q[9] = l0 + lift
+
+
+@kernel
+def linearise_ndt(source: Floats, R: Floats, t: Floats, size: float, scale: float, widening: float, gate2: float,
+                  shapes: Floats, keys: Longs, table: Ints, cells: Longs, slots: Ints, is_done: Flags, away2: Floats,
+                  H: Floats, g: Floats, facts: Floats) -> None:  # fmt: skip
+    """Add to H (6, 6), g (6,) and facts all source points (S, 3), LiDAR frame, that are not done.
+
+    The cost is the negative score: -d1 u exp(-d2 / (2 u) e^T C^-1 e) over the eight voxels around R s + t, where u =
+    `widening` is 1 but while annealing. g is its gradient. H is the Gauss-Newton Hessian, J^T C^-1 J times the weight d1
+    d2 exp(..) of the gradient: Newton's, which Magnusson steps with, also has the curvature of that weight and of the
+    rotation, is indefinite away from the optimum, and then has to be mended. `away2` and `facts` as in
+    `residuals.linearise`; the distance is e^T C^-1 e times the smallest eigenvalue of C, of the nearest voxel.
+    """
+    inverse = 1.0 / size
+    c2 = scale * scale
+    d1, d2 = mixture(size)
+    for i in range(len(source)):
+        if is_done[i]:
+            continue
+        a, b, c = source[i, 0], source[i, 1], source[i, 2]
+        rx = R[0, 0] * a + R[0, 1] * b + R[0, 2] * c
+        ry = R[1, 0] * a + R[1, 1] * b + R[1, 2] * c
+        rz = R[2, 0] * a + R[2, 1] * b + R[2, 2] * c
+        x, y, z = rx + t[0], ry + t[1], rz + t[2]
+        octant_slots(x, y, z, i, inverse, cells, slots, keys, table)
+        best, best_score = 1e300, 0.0
+        for k in range(8):
+            s = slots[i, k]
+            if s < 0:
+                continue
+            q = shapes[s]
+            if q[9] <= 0.0:
+                continue
+            ex, ey, ez = x - q[0], y - q[1], z - q[2]
+            m2 = (
+                q[3] * ex * ex + q[6] * ey * ey + q[8] * ez * ez
+                + 2.0 * (q[4] * ex * ey + q[5] * ex * ez + q[7] * ey * ez)
+            )  # fmt: skip
+            away = q[9] * m2
+            weight = math.exp(-0.5 * d2 * m2 / widening)
+            if away < best:
+                best, best_score = away, weight
+            if away > gate2:
+                continue
+            w = d1 * d2 * weight
+            add_information(H, g, w, q[3], q[4], q[5], q[6], q[7], q[8], ex, ey, ez, rx, ry, rz)
+            trace = w * (q[3] + q[6] + q[8])
+            facts[0] += trace
+            facts[4] += trace * (rx * rx + ry * ry + rz * rz)
+        if best < 1e300:
+            is_done[i] = True
+            away2[i] = best
+            facts[3] += 1.0
+            facts[1] += best_score * best
+            facts[5] += best_score
+            if best < c2:
+                facts[2] += 1.0
+
+
+@kernel
+def align_ndt(
+    source: Floats, scatter: Floats, R: Floats, t: Floats, scale_start: float, scale_end: float, decay: float,
+    max_iterations: int, step_m: float, step_rad: float, inlier_distance: float, inlier_ratio: float, sigma2: float,
+    blob_weight: float, weak_share: float, size: float, shapes: Floats, keys: Longs, table: Ints,
+    has_coarse: bool, coarse_size: float, coarse_shapes: Floats, coarse_keys: Longs,
+    coarse_table: Ints,
+) -> tuple[Floats, Floats, Floats, int, bool, int, Floats]:  # fmt: skip
+    """As `gauss_newton.align`, by the NDT score over `shapes` (C, 11), see `describe`.
+
+    While annealing the Gaussians are (scale / scale_end) times as wide; at the end they are themselves. The score brings
+    its own robustness: sigma2, scatter and blobs do not matter to it.
+    """
+    cells, slots, is_done, away2 = workspace(len(source))
+    coarse_cells, coarse_slots, _, _ = workspace(len(source) if has_coarse else 0)
+    H, g, d, facts, weak = np.empty((6, 6)), np.empty(6), np.zeros(6), np.zeros(7), np.zeros((6, 6))
+    farthest2 = inlier_distance * inlier_distance
+    gate2, scale = farthest2, scale_start
+    converged = False
+    weak_count = 0
+    iterations = 0
+    for _ in range(max_iterations):
+        clear(H, g, facts, is_done, away2)
+        widening = (scale / scale_end) ** 2
+        linearise_ndt(source, R, t, size, scale, widening, gate2, shapes, keys, table, cells, slots, is_done, away2, H, g,
+                      facts)  # fmt: skip
+        facts[6] = facts[2]
+        if has_coarse:
+            linearise_ndt(source, R, t, coarse_size, scale, widening, gate2, coarse_shapes, coarse_keys, coarse_table,
+                          coarse_cells, coarse_slots, is_done, away2, H, g, facts)  # fmt: skip
+        iterations += 1
+        moved, weak_count, move, turn = advance(H, g, facts, scale, weak_share, R, t, d, weak, weak_count)
+        if not moved:
+            break
+        if scale <= scale_end and move < step_m and turn < step_rad:
+            converged = True
+            break
+        scale = max(scale * decay, scale_end)
+        gate2 = trimmed(away2, inlier_ratio, farthest2)
+    return H, facts, d, iterations, converged, weak_count, weak

@@ -1,0 +1,72 @@
+"""What a scan is registered against: all scans near by, the last keyframes, or the last scan alone."""
+
+from __future__ import annotations
+
+from typing import Literal, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.geometry import se3, so3
+from lslam.registration.gaussian_map import GaussianMap
+
+Floats = NDArray[np.float64]
+Points = NDArray[np.float32]
+
+KEYFRAME_M, KEYFRAME_DEG = 2.0, 15.0
+
+
+class Target(Protocol):
+    """Enters registered scans into the local map, and takes out what no longer belongs there."""
+
+    def enter(self, target: GaussianMap, points: Points, T_world_lidar: Floats) -> None:
+        """Points (N, 3), m, LiDAR frame."""
+        ...
+
+
+class MapTarget:
+    """Every scan stays until the sensor has left it behind."""
+
+    def enter(self, target: GaussianMap, points: Points, T_world_lidar: Floats) -> None:
+        """Add to the map."""
+        target.insert(points, T_world_lidar)
+
+
+class ScanTarget:
+    """The last scan alone: scan-to-scan registration."""
+
+    def enter(self, target: GaussianMap, points: Points, T_world_lidar: Floats) -> None:
+        """Replace the map."""
+        target.clear()
+        target.insert(points, T_world_lidar)
+
+
+class KeyframeTarget:
+    """The last `count` keyframes, a new one where the sensor has moved 2 m or turned 15 deg since the newest."""
+
+    def __init__(self, count: int) -> None:
+        self.count = count
+        self.keyframes: list[tuple[Points, Floats]] = []
+
+    def enter(self, target: GaussianMap, points: Points, T_world_lidar: Floats) -> None:
+        """Add a keyframe when it is due; the map is built anew when an old one leaves."""
+        if self.keyframes:
+            step = se3.relative(self.keyframes[-1][1], T_world_lidar)
+            turn = float(so3.angle(step[:3, :3]))
+            if np.linalg.norm(step[:3, 3]) < KEYFRAME_M and turn < np.deg2rad(KEYFRAME_DEG):
+                return
+        self.keyframes.append((points, T_world_lidar.copy()))
+        if len(self.keyframes) <= self.count:
+            target.insert(points, T_world_lidar)
+            return
+        del self.keyframes[0]
+        target.clear()
+        for cloud, pose in self.keyframes:
+            target.insert(cloud, pose)
+
+
+def make_target(kind: Literal["map", "keyframe", "scan"], keyframes: int) -> Target:
+    """The target `registration.target` names."""
+    if kind == "keyframe":
+        return KeyframeTarget(keyframes)
+    return ScanTarget() if kind == "scan" else MapTarget()
