@@ -18,6 +18,7 @@ from lslam.cli.console import progress, setup_logging, show
 
 if TYPE_CHECKING:
     from lslam.studies.plan import Follow, Plan
+    from lslam.studies.subjects import Subject
     from lslam.types.comparison import Comparison
     from lslam.types.trajectory import Trajectory
 
@@ -29,8 +30,10 @@ if TYPE_CHECKING:
 )
 @click.argument("sequences", metavar="SEQUENCE...", nargs=-1, required=True)
 @click.option(
-    "--methods", required=True, metavar="A,B,...", help="Names of `lslam methods`; the first is the reference."
-)
+    "--methods", required=True, metavar="A,B,...",
+    help="Names of `lslam methods`, presets or configuration files; the first is the reference.",
+)  # fmt: skip
+@options.preset
 @click.option(
     "--seeds", default="0", show_default=True, metavar="N,N,...", help="Of simulations, and of methods that draw."
 )
@@ -79,23 +82,22 @@ def command(sequences: tuple[str, ...], **given: Any) -> None:
 
 
 def _plan(sequences: tuple[str, ...], given: dict[str, Any]) -> Plan:
-    from lslam.config import load_config
-    from lslam.studies.grid import check_methods
     from lslam.studies.plan import Plan
     from lslam.studies.subjects import find_subjects
+    from lslam.studies.variants import find_variants
 
     flags = {f"input.{key}": given[key] for key in ("start", "count", "skip_frames") if given[key] is not None}
-    config = load_config(given["config_file"], [*given["settings"], *(f"{k}={v}" for k, v in flags.items())])
-    methods = tuple(name.strip() for name in given["methods"].split(",") if name.strip())
-    check_methods(methods, config)
+    settings = options.with_preset(given["settings"], given["preset"])
+    methods = [name.strip() for name in given["methods"].split(",") if name.strip()]
+    variants = find_variants(methods, given["config_file"], [*settings, *(f"{k}={v}" for k, v in flags.items())])
+    subjects = find_subjects(sequences, given["data_root"])
     return Plan(
-        subjects=tuple(find_subjects(sequences, given["data_root"])),
-        methods=methods,
+        subjects=tuple(subjects),
+        variants=tuple(variants),
         seeds=_numbers("--seeds", given["seeds"], int),
-        config=config,
         out=given["out"] or Path("runs") / time.strftime("compare-%Y%m%d-%H%M%S"),
         jobs=given["jobs"],
-        truth=_truth(given["gt"], sequences, given["data_root"]),
+        truth=_truth(given["gt"], subjects),
         crop=_crop(given["crop"]),
         overwrite=given["overwrite"],
         resume=given["resume"],
@@ -123,13 +125,17 @@ def _crop(text: str | None) -> tuple[float, float, float] | None:
     return numbers
 
 
-def _truth(path: Path | None, sequences: tuple[str, ...], data_root: Path | None) -> Trajectory | None:
+def _truth(path: Path | None, subjects: list[Subject]) -> Trajectory | None:
     from lslam.cli.run import read_truth
+    from lslam.errors import UsageError
     from lslam.readers import open_sequence
+    from lslam.studies.plan import ONE_TRUTH
 
-    if path is None or len(sequences) > 1:
+    if path is None:
         return None
-    return read_truth(path, open_sequence(sequences[0], data_root=data_root))
+    if len(subjects) > 1 or subjects[0].path is None:
+        raise UsageError(ONE_TRUTH)
+    return read_truth(path, open_sequence(subjects[0].path))
 
 
 def _follow(stack: ExitStack) -> Follow:

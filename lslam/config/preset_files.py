@@ -50,5 +50,7 @@ def read_toml(path: Path, what: str) -> dict[str, Any]:
 def _shipped() -> dict[str, str]:
     """Text of each shipped preset by name, in alphabetical order."""
     folder = resources.files("lslam.config") / FOLDER
-    files = sorted((f for f in folder.iterdir() if f.name.endswith(".toml")), key=lambda f: f.name)
+    files = sorted(
+        (f for f in (folder.iterdir() if folder.is_dir() else ()) if f.name.endswith(".toml")), key=lambda f: f.name
+    )
     return {f.name.removesuffix(".toml"): f.read_text(encoding="utf-8") for f in files}

@@ -131,7 +131,7 @@ def _bars(bars: Sequence[tuple[str, dict[str, float]]], stages: Sequence[str], l
     frame.text((frame.left + frame.right) / 2, frame.height - 6, "time per scan, ms", "middle", "label")
     for i, (label, means) in enumerate(bars):
         y = frame.top + _ROW * i
-        frame.text(frame.left, y + 16, label, "start", "label")
+        frame.text(frame.left + 4, y + 15, label, "start", "label")
         below = 0.0
         for k, stage in enumerate(stages):
             x0, x1 = float(frame.px(below)), float(frame.px(below + means[stage]))

@@ -55,7 +55,7 @@ def render_page(
         sections=sections,
         styles={method: style_of(method, comparison.methods) for method in comparison.methods},
         machine=_machine(comparison),
-        config=flatten(comparison.config),
+        configs=_configs(comparison),
     )
 
 
@@ -84,6 +84,18 @@ def _machine(comparison: Comparison) -> list[tuple[str, list[str]]]:
         for name, value in run.machine.items():
             found.setdefault(name, {})[_text(value)] = None
     return [(name, list(values)) for name, values in found.items()]
+
+
+def _configs(comparison: Comparison) -> list[tuple[str, list[str], bool]]:
+    """Every key as (name, values, whether methods differ): one value where all have the same, else one per method."""
+    flat = {method: dict(flatten(config)) for method, config in comparison.configs.items()}
+    rows = []
+    for name in dict.fromkeys(name for keys in flat.values() for name in keys):
+        said = {method: ", ".join(keys.get(name, ["absent"])) for method, keys in flat.items()}
+        differ = len(set(said.values())) > 1
+        values = [f"{method}: {value}" for method, value in said.items()] if differ else [next(iter(said.values()))]
+        rows.append((name, values, differ))
+    return sorted(rows, key=lambda row: not row[2])
 
 
 def _text(value: Any) -> str:

@@ -3,7 +3,7 @@
 Version 1:
 
     schema, version, lslam, status (running, done), command
-    methods[], sequences[], notes[], recipes[], tie_m, timing_is_comparable, config{}
+    methods[], sequences[], notes[], recipes[], tie_m, timing_is_comparable, configs{method: {}}
     metrics[]      {key, label, unit, group, recipe}
     runs[]         {sequence, method, seed, folder, status, reason, note, jobs, load, reused, values{key: number}, stages_s{},
                     real_time_limit_s, machine{}}
@@ -38,7 +38,7 @@ def to_document(comparison: Comparison) -> dict[str, Any]:
         "recipes": recipes(c),
         "tie_m": c.tie,
         "timing_is_comparable": c.is_timing_comparable,
-        "config": c.config,
+        "configs": c.configs,
         "metrics": [asdict(metric) for metric in c.metrics],
         "runs": [_run(run) for run in c.runs],
         "rows": [asdict(row) for row in c.rows],

@@ -43,7 +43,7 @@ def plane_chart(
     if x_span is None or y_span is None:
         return ""
     frame = _fitted(x_span, y_span, width, tallest, 0.0 if backdrop else 0.05)
-    frame.axes("x, m", "y, m", x_ticks=6, y_ticks=max(2, round((frame.bottom - frame.top) / 60)))
+    frame.axes("x, m", "y, m", x_ticks=min(6, width // 80), y_ticks=max(2, round((frame.bottom - frame.top) / 60)))
     if backdrop is not None:
         x0, x1, y0, y1 = backdrop[1]
         left, right = float(frame.px(x0)), float(frame.px(x1))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 
-from lslam.errors import InterruptedRunError
+from lslam.errors import InterruptedRunError, LslamError
 from lslam.evaluation.relative import parse_delta
 from lslam.readers import open_sequence
 from lslam.reports import compare_html, compare_json, compare_table
@@ -15,7 +15,7 @@ from lslam.studies.grid import Cell, Job, expand
 from lslam.studies.identity import input_digest
 from lslam.studies.jobs import finished, run_jobs
 from lslam.studies.paired import TIE_M, compare_pairs, summarise
-from lslam.studies.plan import RESULT, Follow, Plan, check_plan, claim
+from lslam.studies.plan import RESULT, Follow, Plan, check_plan, claim, release
 from lslam.studies.subjects import scans_needed, simulate_once
 from lslam.types.comparison import Comparison, Drawing, RunScore
 
@@ -37,7 +37,7 @@ def compare(plan: Plan, follow: Follow | None = None) -> Comparison:
     claim(plan)
     jobs: list[Job] = []
     try:
-        jobs = expand(_cells(plan, follow), plan.methods, plan.seeds, plan.config, plan.out, plan.command)
+        jobs = expand(_cells(plan, follow), plan.variants, plan.seeds, plan.out, plan.command)
         kept = set() if plan.overwrite else finished(jobs)
         run_jobs([job for job in jobs if job.folder not in kept], plan.jobs, follow)
     except KeyboardInterrupt:
@@ -45,6 +45,9 @@ def compare(plan: Plan, follow: Follow | None = None) -> Comparison:
             f"interrupted; {len(finished(jobs))} of {len(jobs) or 'all'} runs are finished in {plan.out}: the same command with "
             "--resume goes on"
         ) from None
+    except LslamError:
+        release(plan)
+        raise
     scores = [collect_run(job, job.folder in kept) for job in jobs]
     comparison, drawings = _weigh(plan, jobs, scores)
     compare_table.write_files(plan.out, comparison)
@@ -65,7 +68,7 @@ def _cells(plan: Plan, follow: Follow) -> list[Cell]:
         assert subject.scenario is not None
         for seed in plan.seeds:
             path = simulate_once(
-                subject.scenario, seed, scans_needed(plan.config.input), plan.out / "simulated",
+                subject.scenario, seed, scans_needed([v.config.input for v in plan.variants]), plan.out / "simulated",
                 lambda stage, total: follow.on_start(stage, total, "scans"), lambda: follow.on_step(""),
             )  # fmt: skip
             cells.append(Cell(subject.label, path, seed, input_digest(open_sequence(path), None)))
@@ -88,17 +91,20 @@ def _notes(scores: Sequence[RunScore]) -> list[str]:
 
 def _weigh(plan: Plan, jobs: Sequence[Job], scores: Sequence[RunScore]) -> tuple[Comparison, list[Drawing]]:
     drawings, differences = draw(jobs, scores)
-    deltas = [parse_delta(delta) for delta in plan.config.eval.delta]
+    methods = tuple(variant.name for variant in plan.variants)
+    recipes = [variant.config.eval for variant in plan.variants]
+    alignments = list(dict.fromkeys(name for recipe in recipes for name in recipe.align))
+    deltas = list(dict.fromkeys(parse_delta(delta) for recipe in recipes for delta in recipe.delta))
     return Comparison(
         command=plan.command,
-        methods=plan.methods,
+        methods=methods,
         sequences=tuple(subject.label for subject in plan.subjects),
-        metrics=tuple(metrics_of(plan.config.eval.align, deltas, scores)),
+        metrics=tuple(metrics_of(alignments, deltas, scores)),
         runs=tuple(scores),
         rows=tuple(summarise(scores)),
-        paired=tuple(compare_pairs(scores, plan.methods)),
+        paired=tuple(compare_pairs(scores, methods)),
         differences=tuple(differences),
         notes=tuple(_notes(scores)),
-        config=plan.config.model_dump(mode="json"),
+        configs={v.name: v.config.model_dump(mode="json") for v in plan.variants},
         tie=TIE_M,
     ), drawings

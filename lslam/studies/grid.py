@@ -8,15 +8,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from lslam.config import Config
-from lslam.errors import UsageError
-from lslam.odometry import known_methods
-from lslam.pipeline.check import check_config
+from lslam.studies.identity import job_digest
+from lslam.studies.variants import Variant
 
 if TYPE_CHECKING:
     from lslam.types.trajectory import Trajectory
-
-# Methods that bring their own preprocessing and so never draw by `preprocess.seed`.
-DRAW_NOTHING = ("kiss-icp",)
 
 
 @dataclass(frozen=True)
@@ -38,6 +34,7 @@ class Cell:
 class Job:
     """One run: what a process needs to make it, and `state_file`, where it leaves how it ended.
 
+    method : the variant's name, the method of `config` or a preset that says more than a method
     digest : two jobs of one digest have the same result
     """
 
@@ -62,57 +59,29 @@ class Job:
         return self.folder.with_name(f"{self.folder.name}.json")
 
 
-def check_methods(methods: Sequence[str], config: Config) -> None:
-    """Raise UsageError for an empty list, an unknown name (with the nearest one) or a name given twice."""
-    if not methods:
-        raise UsageError(f"--methods is empty; known: {', '.join(known_methods())}")
-    for method in methods:
-        check_config(with_method(config, method))
-        if methods.count(method) > 1:
-            raise UsageError(f"--methods names {method!r} twice")
-
-
-def with_method(config: Config, method: str) -> Config:
-    """The same configuration with another method."""
-    return config.model_copy(update={"odometry": config.odometry.model_copy(update={"method": method})})
-
-
-def with_seed(config: Config, seed: int) -> Config:
-    """The same configuration with another seed of what it draws."""
-    return config.model_copy(update={"preprocess": config.preprocess.model_copy(update={"seed": seed})})
-
-
-def draws(config: Config) -> bool:
-    """Whether a run depends on `preprocess.seed`."""
-    return config.preprocess.downsample == "random" and config.odometry.method not in DRAW_NOTHING
-
-
 def run_folder(out: Path, sequence: str, method: str, seed: int) -> Path:
     """Where a run of the study lies."""
     return out / "runs" / sequence / f"{method}-s{seed}"
 
 
 def expand(
-    cells: Sequence[Cell], methods: Sequence[str], seeds: Sequence[int], config: Config, out: Path, command: str
+    cells: Sequence[Cell], variants: Sequence[Variant], seeds: Sequence[int], out: Path, command: str
 ) -> list[Job]:
     """All jobs, methods innermost, so that what slows the machine for a while meets all methods alike.
 
     A recording is run once per seed by a method that draws, and once by one that does not; a simulated cell has its seed.
     """
-    from lslam.studies.identity import job_digest
-
     jobs = []
     for cell in cells:
         for seed in seeds if cell.seed is None else [cell.seed]:
-            for method in methods:
-                own = with_method(config, method)
-                if cell.seed is None and draws(own):
-                    own = with_seed(own, seed)
+            for variant in variants:
+                config = variant.config
+                if cell.seed is None and variant.draws:
+                    config = variant.with_seed(seed)
                 elif cell.seed is None and seed != seeds[0]:
                     continue
-                folder = run_folder(out, cell.sequence, method, seed)
-                digest = job_digest(own, cell.digest)
-                jobs.append(
-                    Job(cell.sequence, method, seed, cell.path, own, folder, digest, command, cell.truth)
-                )  # fmt: skip
+                folder = run_folder(out, cell.sequence, variant.name, seed)
+                digest = job_digest(config, cell.digest)
+                job = Job(cell.sequence, variant.name, seed, cell.path, config, folder, digest, command, cell.truth)
+                jobs.append(job)
     return jobs

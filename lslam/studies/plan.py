@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from lslam.config import Config
 from lslam.errors import OutputError, OutputExistsError, UsageError
 from lslam.reports import compare_json
-from lslam.studies.grid import check_methods
 from lslam.studies.subjects import Subject
+from lslam.studies.variants import Variant
 from lslam.types.trajectory import Trajectory
 
 RESULT = "compare.json"
+ONE_TRUTH = "--gt belongs to one recorded sequence: a scenario has its own, and several need one each"
 
 
 @dataclass(frozen=True)
@@ -33,9 +34,8 @@ class Plan:
     """
 
     subjects: tuple[Subject, ...]
-    methods: tuple[str, ...]
+    variants: tuple[Variant, ...]
     seeds: tuple[int, ...]
-    config: Config
     out: Path
     jobs: int = 1
     truth: Trajectory | None = None
@@ -47,7 +47,8 @@ class Plan:
 
 def check_plan(plan: Plan) -> None:
     """Raise UsageError for what cannot be compared."""
-    check_methods(plan.methods, plan.config)
+    if not plan.variants:
+        raise UsageError("no method is named")
     if not plan.subjects:
         raise UsageError("no sequence is named")
     if len(set(plan.seeds)) < len(plan.seeds) or not plan.seeds or min(plan.seeds) < 0:
@@ -55,12 +56,12 @@ def check_plan(plan: Plan) -> None:
     if plan.jobs < 1:
         raise UsageError(f"--jobs {plan.jobs}: at least one run at a time")
     if plan.truth is not None and (len(plan.subjects) > 1 or plan.subjects[0].scenario):
-        raise UsageError("--gt belongs to one recorded sequence: a scenario has its own, and several need one each")
+        raise UsageError(ONE_TRUTH)
     if plan.overwrite and plan.resume:
         raise UsageError("--overwrite runs everything anew and --resume keeps what is finished: give one of them")
     if plan.crop is not None and not plan.crop[2] > 0:
         raise UsageError(f"--crop: the size of {plan.crop[2]:g} m must be above 0")
-    if plan.crop is not None and not plan.config.map.write:
+    if plan.crop is not None and not all(v.config.map.write for v in plan.variants):
         raise UsageError("--crop needs maps, and map.write is off")
 
 
@@ -83,3 +84,12 @@ def claim(plan: Plan) -> None:
         raise OutputError(f"output folder {out} cannot be used: {error.strerror or error}") from None
     if not (out / RESULT).is_file():
         compare_json.write_running(out / RESULT, plan.command)
+
+
+def release(plan: Plan) -> None:
+    """Leave nothing behind when nothing was begun, so that the command can be given again."""
+    with contextlib.suppress(OSError):
+        inside = [path.name for path in plan.out.iterdir()]
+        if inside == [RESULT]:
+            (plan.out / RESULT).unlink()
+            plan.out.rmdir()

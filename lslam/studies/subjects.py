@@ -84,9 +84,11 @@ def _with_unique_labels(subjects: list[Subject]) -> list[Subject]:
     return out
 
 
-def scans_needed(config: InputConfig) -> int | None:
-    """Scans a simulation must have for --start, --count and --skip-frames; None is all it has by itself."""
-    return None if config.count is None else config.start + (config.count - 1) * config.skip_frames + 1
+def scans_needed(configs: Iterable[InputConfig]) -> int | None:
+    """Scans a simulation must have for all of these `start`, `count` and `skip_frames`; None is all it has by itself."""
+    needed = [None if c.count is None else c.start + (c.count - 1) * c.skip_frames + 1 for c in configs]
+    known = [scans for scans in needed if scans is not None]
+    return max(known) if len(known) == len(needed) else None
 
 
 def simulate_once(

@@ -151,7 +151,10 @@ class Drawing:
 
 @dataclass(frozen=True)
 class Comparison:
-    """All of it; the first of `methods` is the reference of `paired` and `differences`. `tie` is in metres."""
+    """All of it; the first of `methods` is the reference of `paired` and `differences`.
+
+    configs : the resolved configuration of each method; tie : m
+    """
 
     command: str
     methods: tuple[str, ...]
@@ -162,7 +165,7 @@ class Comparison:
     paired: tuple[Paired, ...]
     differences: tuple[Difference, ...]
     notes: tuple[str, ...]
-    config: dict[str, Any]
+    configs: dict[str, dict[str, Any]]
     tie: float
 
     @property

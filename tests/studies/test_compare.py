@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lslam.config import Config, load_config
 from lslam.errors import OutputExistsError, UsageError
 from lslam.evaluation.evaluate import evaluate
 from lslam.formats.trajectory_files import read_trajectory
@@ -22,14 +21,16 @@ from lslam.readers import open_sequence
 from lslam.simulation.record import record
 from lslam.simulation.scenarios import simulate
 from lslam.studies.compare import compare
-from lslam.studies.grid import Job, with_method
+from lslam.studies.grid import Job
 from lslam.studies.jobs import finished, run_jobs
 from lslam.studies.plan import Follow, Plan, check_plan
 from lslam.studies.states import read_state
 from lslam.studies.subjects import Subject
+from lslam.studies.variants import find_variants
 from lslam.types.comparison import Comparison, RunScore
 
 SCANS = 14
+METHODS = ("icp", "kiss-icp")
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +51,7 @@ def subjects(tmp_path_factory: pytest.TempPathFactory) -> tuple[Subject, ...]:
 @pytest.fixture(scope="module")
 def plan(subjects: tuple[Subject, ...], tmp_path_factory: pytest.TempPathFactory) -> Plan:
     out = tmp_path_factory.mktemp("comparison") / "out"
-    return Plan(subjects, ("icp", "kiss-icp"), (0,), Config(), out, command="lslam compare good silent broken")
+    return Plan(subjects, tuple(find_variants(METHODS)), (0,), out, command="lslam compare good silent broken")
 
 
 @pytest.fixture(scope="module")
@@ -64,7 +65,7 @@ def one(comparison: Comparison, sequence: str, method: str) -> RunScore:
 
 
 def test_every_cell_is_a_run_folder_with_the_numbers_of_its_own_files(made: Comparison, plan: Plan) -> None:
-    for method in plan.methods:
+    for method in METHODS:
         run = one(made, "good", method)
         assert run.folder == plan.out / "runs" / "good" / f"{method}-s0"
         sequence = open_sequence(plan.subjects[0].path or "")
@@ -131,7 +132,7 @@ def test_resume_runs_only_what_is_missing_or_changed(made: Comparison, plan: Pla
     assert seen == ["good icp seed 0"]
     assert [r.is_reused for r in again.runs] == [False, True, True, True]
     assert one(again, "good", "icp").values["ate.se3"] == one(made, "good", "icp").values["ate.se3"]
-    anew = replace(two, methods=("icp",), subjects=plan.subjects[:1], overwrite=True, resume=False)
+    anew = replace(two, variants=plan.variants[:1], subjects=plan.subjects[:1], overwrite=True, resume=False)
     assert not compare(anew).runs[0].is_reused
 
 
@@ -150,8 +151,11 @@ def test_a_folder_that_is_something_else_is_left_alone(plan: Plan, tmp_path: Pat
         ({"jobs": 0}, "--jobs 0"),
         ({"overwrite": True, "resume": True}, "give one of them"),
         ({"crop": (0.0, 0.0, -1.0)}, "--crop"),
-        ({"crop": (0.0, 0.0, 9.0), "config": load_config(None, ["map.write=false"], {})}, "map.write is off"),
-        ({"methods": ("icp", "loma")}, "no method 'loma'"),
+        (
+            {"crop": (0.0, 0.0, 9.0), "variants": tuple(find_variants(METHODS, None, ["map.write=false"]))},
+            "map.write is off",
+        ),
+        ({"variants": ()}, "no method"),
     ],
 )
 def test_what_cannot_be_compared_is_said_before_anything_runs(
@@ -168,7 +172,7 @@ def die(job: Job, at_once: int, load: float) -> None:
 def test_a_process_that_dies_is_a_crashed_job_that_is_tried_again(plan: Plan, tmp_path: Path) -> None:
     path = plan.subjects[0].path
     assert path is not None
-    job = Job("good", "icp", 0, path, with_method(Config(), "icp"), tmp_path / "runs" / "icp-s0", "digest", "")
+    job = Job("good", "icp", 0, path, plan.variants[0].config, tmp_path / "runs" / "icp-s0", "digest", "")
     run_jobs([job], 1, Follow(), die)
     state = read_state(job.state_file)
     assert state is not None

@@ -13,17 +13,20 @@ from lslam.errors import InputError, UsageError
 from lslam.readers import open_sequence
 from lslam.simulation.record import record
 from lslam.simulation.scenarios import simulate
-from lslam.studies.grid import Cell, Job, check_methods, expand
+from lslam.studies.grid import Cell, Job, expand
 from lslam.studies.identity import input_digest, job_digest
 from lslam.studies.states import State, is_reusable, read_state, write_state
 from lslam.studies.subjects import file_safe, find_subjects, scans_needed, simulate_once
+from lslam.studies.variants import Variant, find_variants
 from lslam.types.trajectory import Trajectory
 
 
-def jobs(
-    config: Config, cells: list[Cell], seeds: tuple[int, ...] = (0, 1), methods: tuple[str, ...] = ("icp", "kiss-icp")
-) -> list[Job]:
-    return expand(cells, methods, seeds, config, Path("out"), "")
+def variants(*names: str, settings: tuple[str, ...] = ()) -> list[Variant]:
+    return find_variants(names or ("icp", "kiss-icp"), None, settings)
+
+
+def jobs(contenders: list[Variant], cells: list[Cell], seeds: tuple[int, ...] = (0, 1)) -> list[Job]:
+    return expand(cells, contenders, seeds, Path("out"), "")
 
 
 def recording(name: str = "drive") -> Cell:
@@ -31,19 +34,19 @@ def recording(name: str = "drive") -> Cell:
 
 
 def test_a_recording_is_run_once_by_methods_that_do_not_draw() -> None:
-    assert [(j.method, j.seed) for j in jobs(Config(), [recording()])] == [("icp", 0), ("kiss-icp", 0)]
+    assert [(j.method, j.seed) for j in jobs(variants(), [recording()])] == [("icp", 0), ("kiss-icp", 0)]
 
 
 def test_a_method_that_draws_runs_every_seed_of_a_recording() -> None:
-    config = load_config(None, ["preprocess.downsample=random"], {})
-    made = jobs(config, [recording()], (4, 7))
+    contenders = variants(settings=("preprocess.downsample=random",))
+    made = jobs(contenders, [recording()], (4, 7))
     assert [(j.method, j.seed) for j in made] == [("icp", 4), ("kiss-icp", 4), ("icp", 7)]
     assert [j.config.preprocess.seed for j in made if j.method == "icp"] == [4, 7]
     assert len({j.digest for j in made}) == 3
 
 
 def test_a_simulated_cell_is_run_once_per_method_and_folders_differ() -> None:
-    made = jobs(Config(), [Cell("block", Path(f"block-{s}"), s, f"{s}") for s in (0, 1)])
+    made = jobs(variants(), [Cell("block", Path(f"block-{s}"), s, f"{s}") for s in (0, 1)])
     assert len({j.folder for j in made}) == len(made) == 4
     assert Path("out/runs/block/kiss-icp-s1") in {j.folder for j in made}
     assert {j.config.odometry.method for j in made} == {"icp", "kiss-icp"}
@@ -55,7 +58,17 @@ def test_a_simulated_cell_is_run_once_per_method_and_folders_differ() -> None:
 )
 def test_methods_are_checked_before_anything_runs(methods: tuple[str, ...], sentence: str) -> None:
     with pytest.raises(UsageError, match=sentence):
-        check_methods(methods, Config())
+        find_variants(methods)
+
+
+def test_a_preset_or_a_file_is_a_contender_with_all_it_says(tmp_path: Path) -> None:
+    (tmp_path / "coarse.toml").write_text("[map]\nvoxel = 0.9\n")
+    plain, coarse = variants("icp", str(tmp_path / "coarse.toml"), settings=("input.count=5",))
+    assert (plain.name, coarse.name) == ("icp", "coarse")
+    assert (plain.config.map.voxel, coarse.config.map.voxel) == (0.2, 0.9)
+    assert plain.config.input.count == coarse.config.input.count == 5
+    with pytest.raises(UsageError, match="'coarse' twice"):
+        variants(str(tmp_path / "coarse.toml"), str(tmp_path / "coarse.toml"))
 
 
 @pytest.fixture(scope="module")
@@ -139,8 +152,9 @@ def test_names_stay_inside_the_folder() -> None:
 
 
 def test_a_simulation_has_the_scans_that_will_be_used() -> None:
-    assert scans_needed(load_config(None, ["input.start=5", "input.count=3", "input.skip_frames=4"], {}).input) == 14
-    assert scans_needed(Config().input) is None
+    short = load_config(None, ["input.start=5", "input.count=3", "input.skip_frames=4"], {}).input
+    assert scans_needed([short, load_config(None, ["input.count=9"], {}).input]) == 14
+    assert scans_needed([short, Config().input]) is None
 
 
 def test_a_scenario_is_simulated_once(tmp_path: Path) -> None:

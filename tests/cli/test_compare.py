@@ -1,0 +1,121 @@
+"""`lslam compare` as a user calls it."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+from calling import COMMAND, assert_one_sentence, environment, lslam, sample_copy, strict_json
+
+from lslam.cli.compare import command
+from lslam.errors import InputError, LslamError, UsageError
+
+
+def test_one_object_on_stdout_progress_on_stderr_and_a_crop_of_ones_own(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    done = lslam(
+        "compare", "block", "--methods", "icp", "--seeds", "5", "--count", "12", "--crop", "10,0,30", "--json", "--out", out
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    document = strict_json(done.stdout)
+    (run,) = document["runs"]
+    assert (run["sequence"], run["method"], run["seed"], run["status"]) == ("block", "icp", 5, "done")
+    assert run["values"]["scans"] == 12
+    assert document["command"].startswith("lslam compare block --methods icp --seeds 5")
+    assert document == strict_json((out / "compare.json").read_text())
+    assert (out / "simulated" / "block-5-12" / "sequences" / "00").is_dir()
+    page = (out / "compare.html").read_text()
+    assert "map of icp on block at 10, 0" in page
+    assert "comparing 1/1" in done.stderr
+
+
+@pytest.fixture(scope="module")
+def torn(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A recording whose scans cannot be read."""
+    sequence = sample_copy(tmp_path_factory.mktemp("torn"), 4)
+    for scan in (sequence / "velodyne").iterdir():
+        scan.write_bytes(b"no")
+    return sequence
+
+
+def test_all_runs_failed_is_exit_code_1_with_a_table_all_the_same(torn: Path, tmp_path: Path) -> None:
+    done = lslam("compare", torn, "--methods", "icp", "--out", tmp_path / "out", "-q")
+    assert done.returncode == 1
+    assert_one_sentence(done.stderr.replace("page: ", "INFO: "))
+    assert "all 1 runs failed" in done.stderr
+    assert "none of 4 scans can be used" in done.stdout
+    assert (tmp_path / "out" / "compare.html").is_file()
+
+
+def test_one_failed_run_is_exit_code_0_and_4_with_strict(torn: Path, tmp_path: Path) -> None:
+    call = ["compare", torn, "block", "--methods", "icp", "--count", "4", "--out", tmp_path / "out", "--table", "md"]
+    done = lslam(*call)
+    assert done.returncode == 0, done.stderr
+    assert "### 1 run failed" in done.stdout
+    strict = lslam(*call, "--strict", "--resume")
+    assert strict.returncode == 4
+    assert "--strict: 1 of 2 runs failed" in strict.stderr
+    document = json.loads((tmp_path / "out" / "compare.json").read_text())
+    assert [run["reused"] for run in document["runs"]] == [False, True]
+
+
+@pytest.mark.parametrize(
+    ("words", "error", "sentence"),
+    [
+        (["block", "--methods", "icp,kis-icp"], UsageError, "did you mean 'kiss-icp'"),
+        (["block", "--methods", ","], UsageError, "--methods is empty"),
+        (["block", "--methods", "icp,icp"], UsageError, "twice"),
+        (["block", "block", "--methods", "icp"], UsageError, "named twice"),
+        (["blokk", "--methods", "icp"], InputError, "did you mean 'block'"),
+        (["block", "--methods", "icp", "--seeds", "a"], UsageError, "--seeds a"),
+        (["block", "--methods", "icp", "--crop", "1,2"], UsageError, "x, y and size"),
+        (["block", "street", "--methods", "icp", "--gt", "truth.tum"], UsageError, "--gt belongs to one"),
+        (["block", "--methods", "icp", "--gt", "truth.tum"], UsageError, "--gt belongs to one"),
+        (["block", "--methods", "icp", "--jobs", "0"], UsageError, "--jobs 0"),
+        (["block", "--methods", "icp", "--set", "map.voxl=1"], UsageError, "did you mean .voxel"),
+        (["street", "--methods", "icp", "--count", "5000"], UsageError, "--speed"),
+    ],
+)
+def test_wrong_use_is_said_before_anything_runs(
+    words: list[str], error: type[LslamError], sentence: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("LSLAM_DATA", raising=False)
+    with pytest.raises(error, match=sentence):
+        command.main([*words, "--out", "out"], standalone_mode=False)
+    assert not (tmp_path / "out").exists()
+
+
+def test_an_interruption_keeps_what_is_finished_for_resume(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    call = ["compare", "block", "--methods", "icp", "--seeds", "0,1", "--count", "60", "--out", str(out)]
+    child = subprocess.Popen(
+        [*COMMAND, *call], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment(),
+        start_new_session=True,
+    )  # fmt: skip
+    try:
+        end = time.monotonic() + 120
+        while not (out / "runs" / "block" / "icp-s1" / "config.toml").exists():
+            assert child.poll() is None, child.communicate()
+            assert time.monotonic() < end
+            time.sleep(0.01)
+        os.killpg(child.pid, signal.SIGINT)  # as a terminal does: the whole group
+        printed, said = child.communicate(timeout=60)
+    finally:
+        child.kill()
+        child.wait()
+    assert (child.returncode, printed) == (130, ""), said
+    assert "Traceback" not in said
+    assert "1 of 2 runs are finished" in said
+    states: dict[str, Any] = {p.name: json.loads(p.read_text())["status"] for p in out.glob("runs/block/*.json")}
+    assert states["icp-s0.json"] == "done"
+    assert states.get("icp-s1.json") != "done"
+    again = lslam(*call, "--resume", "--json")
+    assert again.returncode == 0, again.stderr
+    assert [run["reused"] for run in strict_json(again.stdout)["runs"]] == [True, False]
