@@ -59,6 +59,7 @@ if TYPE_CHECKING:
 @click.option("--static-start", type=float, default=0.0, metavar="S", help="Stand still for S seconds first.")
 @click.option("--overwrite", is_flag=True, help="Replace sequences/00 and poses/00.txt in an existing folder.")
 @click.option("--resume", is_flag=True, help="Go on with a simulation that was interrupted.")
+@click.option("--show", is_flag=True, help="Print SCENARIO with all its keys as TOML, to --set or to write one's own.")
 @click.option("--list", "show_list", is_flag=True, help="List scenarios and sensors.")
 @options.verbosity
 def command(
@@ -79,11 +80,12 @@ def command(
     static_start: float,
     overwrite: bool,
     resume: bool,
+    show: bool,
     show_list: bool,
     verbose: bool,
     quiet: bool,
 ) -> None:
-    """Simulate a drive or a flight with exact ground truth; --list shows the SCENARIOs.
+    """Simulate a drive or a flight with exact ground truth; SCENARIO is a name of --list, or a .toml file of one's own.
 
     With --plan the scene is drawn, and recorded only when --out is given as well.
     """
@@ -92,6 +94,9 @@ def command(
         return
     if scenario is None and path_file is not None:
         scenario = "residential"
+    if show and scenario is not None:
+        _print_scenario(scenario, settings)
+        return
     if scenario is None or (out is None and plan is None):
         missing = "SCENARIO" if scenario is None else "--out DIR"
         raise click.UsageError(f"{missing} is missing; for example: lslam simulate block --out town")
@@ -143,6 +148,12 @@ def _record(drive: SimulatedDrive, out: Path, overwrite: bool, resume: bool) -> 
         f"{done.sequence}: {len(drive)} scans, {drive.ground_truth.path_lengths[-1]:.1f} m, "
         f"{done.points / len(drive):.0f} points per scan, {done.size / 1e6:.1f} MB"
     )
+
+
+def _print_scenario(name: str, settings: tuple[str, ...]) -> None:
+    from lslam.simulation.scenario_files import scenario_named, scenario_text
+
+    click.echo(scenario_text(scenario_named(name, settings)), nl=False)
 
 
 def _print_list() -> None:

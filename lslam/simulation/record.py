@@ -28,6 +28,7 @@ log = logging.getLogger("lslam")
 
 NUMBER = "00"  # of the one sequence in the folder
 _MAP_SEED = 2**32 - 9  # of the faults in the perturbed map
+_SIDES, _HOUSE = 80e3, 4e3  # bytes beside the scans: per second of readings and truth, and per building of the maps
 
 
 @dataclass(frozen=True)
@@ -117,14 +118,19 @@ def _part(out: Path) -> Path:
 def _check_space(out: Path, part: Path, drive: SimulatedDrive) -> None:
     """Say how much disk it takes, and refuse at once what will not fit, instead of failing hours later."""
     left = len(drive) - sum(1 for _ in (part / PER_POINT).glob("*.npz"))
-    needed = left * drive.lidar.rays * (16 + 2)
+    beside = _SIDES * drive.end + _HOUSE * len(drive.city.footprints)
+    needed = left * drive.lidar.rays * (16 + 2) + beside
     free = shutil.disk_usage(out).free
     if needed > free:
         raise OutputError(
-            f"{out} needs up to {needed / 1e9:.1f} GB, the disk has {free / 1e9:.1f} GB left: use fewer scans (--scans)"
+            f"{out} needs up to {_size(needed)}, the disk has {_size(free)} left: use fewer scans (--scans)"
         )
     kept = f", {len(drive) - left} of them are there already" if left < len(drive) else ""
     log.info("%d scans of up to %d points%s: at most %.1f MB", len(drive), drive.lidar.rays, kept, needed / 1e6)
+
+
+def _size(amount: float) -> str:
+    return f"{amount / 1e9:.1f} GB" if amount >= 1e9 else f"{amount / 1e6:.1f} MB"
 
 
 def _keep_what_is_worth_it(out: Path, part: Path) -> None:

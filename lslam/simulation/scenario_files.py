@@ -1,4 +1,4 @@
-"""Scenarios as TOML: those that ship with the package, by name, and what `--set` changes in them."""
+"""Scenarios as TOML: those that ship with the package, by name, files of one's own, and what `--set` changes in them."""
 
 from __future__ import annotations
 
@@ -6,12 +6,13 @@ import tomllib
 from collections.abc import Iterable
 from functools import cache
 from importlib import resources
+from pathlib import Path
 from typing import Any, Literal
 
 from pydantic import BaseModel, Field, ValidationError, model_validator
 
 from lslam.config.section import Section
-from lslam.errors import ConfigError, UsageError, nearest
+from lslam.errors import ConfigError, InputError, UsageError, nearest
 from lslam.simulation.city import Layout
 from lslam.simulation.lidar_models import LIDARS
 from lslam.simulation.shapes import SHAPES
@@ -107,22 +108,52 @@ def scenario_names() -> tuple[str, ...]:
 
 
 def scenario_named(name: str, settings: Iterable[str] = ()) -> Scenario:
-    """The ready scenario `name` with `settings` ("speed=8", "world.relief=1") applied.
+    """The ready scenario `name`, or that of the file `name`.toml, with `settings` ("speed=8", "world.relief=1") applied.
 
     Raises
     ------
     UsageError : no such scenario; ConfigError : a key that does not exist, or a value that does not fit
+    InputError : a file that is missing or no TOML
     """
+    if name.endswith(".toml"):
+        return parse_scenario(Path(name).stem, _read_toml(Path(name)), settings, name)
+    return parse_scenario(name, _ready(name), settings)
+
+
+def scenario_text(scenario: Scenario) -> str:
+    """The scenario as TOML with every key, as a file that `scenario_named` reads back."""
+    import tomli_w
+
+    return tomli_w.dumps(scenario.model_dump(mode="json", exclude={"name"}, exclude_none=True))
+
+
+def _ready(name: str) -> dict[str, Any]:
     if name not in scenario_names():
-        raise UsageError(f"no scenario {name!r}; {nearest(name, scenario_names())}")
-    text = resources.files(__package__).joinpath(FOLDER, f"{name}.toml").read_text(encoding="utf-8")
-    return parse_scenario(name, tomllib.loads(text), settings)
+        raise UsageError(f"no scenario {name!r}; {nearest(name, scenario_names())}, or a file of your own: NAME.toml")
+    return tomllib.loads(resources.files(__package__).joinpath(FOLDER, f"{name}.toml").read_text(encoding="utf-8"))
 
 
-def parse_scenario(name: str, tree: dict[str, Any], settings: Iterable[str] = ()) -> Scenario:
-    """The scenario of a TOML tree; raises ConfigError naming the key and the nearest known one."""
+def _read_toml(path: Path) -> dict[str, Any]:
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(f"{path} cannot be read: {error.strerror or error}") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InputError(f"{path} is not valid TOML: {error}") from None
+
+
+def parse_scenario(name: str, tree: dict[str, Any], settings: Iterable[str] = (), where: str | None = None) -> Scenario:
+    """The scenario of a TOML tree, which may stand on a ready one, `base = "urban"`, and say only what differs.
+
+    Raises ConfigError naming `where` it was found, the key and the nearest known one.
+    """
     merged: dict[str, Any] = {}
-    _merge(merged, tree, Scenario, f"scenario {name!r}", "")
+    where = where or f"scenario {name!r}"
+    tree = dict(tree)
+    base = tree.pop("base", None)
+    if base is not None:
+        _merge(merged, _ready(str(base)), Scenario, f"scenario {base!r}", "")
+    _merge(merged, tree, Scenario, where, "")
     for setting in settings:
         key, equals, value = setting.partition("=")
         if not equals:
@@ -138,7 +169,7 @@ def parse_scenario(name: str, tree: dict[str, Any], settings: Iterable[str] = ()
             f"{'.'.join(str(p) for p in e['loc'][:2])}: {e['msg'].removeprefix('Value error, ')}"
             for e in error.errors()
         ]
-        raise ConfigError(f"scenario {name!r}: " + "; ".join(text.removeprefix(": ") for text in said)) from None
+        raise ConfigError(f"{where}: " + "; ".join(text.removeprefix(": ") for text in said)) from None
 
 
 def _merge(tree: dict[str, Any], more: dict[str, Any], model: type[BaseModel], where: str, prefix: str) -> None:

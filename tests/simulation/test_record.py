@@ -208,7 +208,7 @@ def test_a_disk_too_small_is_said_before_the_first_scan(
         free = 1000
 
     monkeypatch.setattr(shutil, "disk_usage", lambda _: Small)
-    with pytest.raises(OutputError, match=r"needs up to 0\.\d GB, the disk has 0\.0 GB left"):
+    with pytest.raises(OutputError, match=r"needs up to \d\.\d MB, the disk has 0\.0 MB left"):
         record(drive, tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
