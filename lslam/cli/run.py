@@ -40,6 +40,7 @@ if TYPE_CHECKING:
 @click.option("--overwrite", is_flag=True, help="Replace an earlier run in the folder.")
 @options.scan_range
 @click.option("--threads", type=int, metavar="N", help="1: one thread; 2 and more: the next scan is read meanwhile.")
+@click.option("--rings", metavar="RULE", help="How rings are found: auto, field, order, rows[:N], elevation[:N].")
 @click.option("--strict", is_flag=True, help="Exit 4 when anything was degraded: a scan skipped or bridged.")
 @click.option("--dry-run", is_flag=True, help="Resolve everything, write nothing.")
 @options.data_root
@@ -55,7 +56,7 @@ def command(sequence: str, **given: Any) -> None:
     from lslam.pipeline.check import check_config
     from lslam.pipeline.run import run
     from lslam.pipeline.run_folder import default_folder
-    from lslam.readers import open_sequence, select
+    from lslam.readers import open_sequence
 
     config = _resolve(given)
     check_config(config)
@@ -66,10 +67,9 @@ def command(sequence: str, **given: Any) -> None:
     out = given["out"] or default_folder(opened.name, config.odometry.method)
     if given["dry_run"]:
         from lslam.odometry import create_odometry
+        from lslam.pipeline.choose import choose_scans
 
-        chosen = select(opened, config.input.start, config.input.count, config.input.skip_frames)
-        create_odometry(config)
-        return _print_plan(chosen, config, out, given["as_json"])
+        return _print_plan(choose_scans(opened, create_odometry(config), config), config, out, given["as_json"])
     with gentle_stop() as stop, ExitStack() as stack:
         run(
             opened, config, out=out, ground_truth=truth, overwrite=given["overwrite"],
@@ -91,6 +91,7 @@ def _resolve(given: dict[str, Any]) -> Config:
         "input.count": given["count"],
         "input.skip_frames": given["skip_frames"],
         "input.threads": given["threads"],
+        "input.rings": given["rings"],
         "input.strict": "true" if given["strict"] else None,
     }
     settings = options.with_preset(given["settings"], given["preset"])

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shlex
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -43,6 +45,17 @@ if TYPE_CHECKING:
     help="Drive along way-points (.toml, .csv, .geojson) or a trajectory's shape [SCENARIO then is residential].",
 )
 @click.option(
+    "--osm",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="Build the city of an OpenStreetMap extract (.osm or Overpass JSON) and drive along --path, else its streets.",
+)
+@click.option(
+    "--origin",
+    metavar="LAT,LON[,H]",
+    help="Where x = y = 0 of the city lies [default: the extract's middle, or a GeoJSON path's first point].",
+)
+@click.option(
     "--set", "settings", multiple=True, metavar="KEY=VALUE", help="Change the scenario, as world.relief=1; repeatable."
 )
 @click.option(
@@ -71,6 +84,8 @@ def command(
     speed: float | None,
     distorted: bool | None,
     path_file: Path | None,
+    osm: Path | None,
+    origin: str | None,
     settings: tuple[str, ...],
     plan: Path | None,
     imu: bool,
@@ -87,12 +102,12 @@ def command(
 ) -> None:
     """Simulate a drive or a flight with exact ground truth; SCENARIO is a name of --list, or a .toml file of one's own.
 
-    With --plan the scene is drawn, and recorded only when --out is given as well.
+    With --plan the scene is drawn, and recorded only when --out is given as well; of an --osm extract without --path all of it.
     """
     if show_list:
         _print_list()
         return
-    if scenario is None and path_file is not None:
+    if scenario is None and (path_file is not None or osm is not None):
         scenario = "residential"
     if show and scenario is not None:
         _print_scenario(scenario, settings)
@@ -106,10 +121,13 @@ def command(
     from lslam.simulation.gnss import GnssModel
     from lslam.simulation.record import check_target
     from lslam.simulation.scenarios import simulate
-    from lslam.simulation.waypoints import read_way_points
 
     if out is not None:
         check_target(out, overwrite, resume)
+    at = None if origin is None else _numbers(origin)
+    if plan is not None and out is None and osm is not None and path_file is None:
+        _draw_map(scenario, seed, settings, osm, at, plan)
+        return
     drive = simulate(
         scenario,
         seed=seed,
@@ -118,7 +136,9 @@ def command(
         speed=speed,
         motion_compensated=None if distorted is None else not distorted,
         settings=settings,
-        way_points=None if path_file is None else read_way_points(path_file),
+        way_points=path_file,
+        osm=osm,
+        origin=at,
         imu=imu_model if imu else None,
         gnss=GnssModel(gnss_rate, outages=gnss_outage) if gnss_rate else None,
         static_start=static_start,
@@ -129,10 +149,38 @@ def command(
         _record(drive, out, overwrite, resume)
 
 
+def _numbers(origin: str) -> list[float]:
+    try:
+        return [float(part) for part in origin.split(",")]
+    except ValueError:
+        raise click.UsageError(
+            f"--origin {origin}: expected LAT,LON or LAT,LON,HEIGHT, for example 49.0112,8.4229"
+        ) from None
+
+
 def _draw(drive: SimulatedDrive, plan: Path) -> None:
     from lslam.simulation.plan import write_plan
 
-    width, depth = write_plan(plan, drive.scene, drive.city, drive.city_poses[:, :3, 3])
+    _say_plan(plan, *write_plan(plan, drive.scene, drive.city, drive.city_poses[:, :3, 3]))
+
+
+def _draw_map(
+    scenario: str, seed: int, settings: tuple[str, ...], osm: Path, origin: list[float] | None, plan: Path
+) -> None:
+    """The whole extract, with the street that would be driven when there is one."""
+    from lslam.simulation.lidar import RayScene
+    from lslam.simulation.osm_place import read_extract
+    from lslam.simulation.places import whole_map
+    from lslam.simulation.plan import write_plan
+    from lslam.simulation.scenario_files import scenario_named
+    from lslam.simulation.scenarios import checked_origin
+
+    extract = read_extract(osm, None if origin is None else checked_origin(origin))
+    city, line = whole_map(scenario_named(scenario, settings), seed, extract)
+    _say_plan(plan, *write_plan(plan, RayScene(city.mesh), city, line))
+
+
+def _say_plan(plan: Path, width: float, depth: float) -> None:
     click.echo(f"{plan}: {width:.0f} x {depth:.0f} m, a line every 10 m")
 
 
@@ -142,7 +190,7 @@ def _record(drive: SimulatedDrive, out: Path, overwrite: bool, resume: bool) -> 
 
     # SIGTERM ends it as Ctrl-C does: what is whole stays for --resume.
     with gentle_stop(), console.progress("simulating", len(drive)) as advance:
-        done = record(drive, out, overwrite, on_scan=lambda _: advance(), resume=resume)
+        done = record(drive, out, overwrite, lambda _: advance(), resume, shlex.join(["lslam", *sys.argv[1:]]))
     assert drive.ground_truth is not None
     click.echo(
         f"{done.sequence}: {len(drive)} scans, {drive.ground_truth.path_lengths[-1]:.1f} m, "

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
-from pydantic import Field
+import re
+
+from pydantic import Field, field_validator
 
 from lslam.config.section import Section
+
+RINGS = re.compile(r"(auto|field|order)|(rows|elevation)(?::([1-9]\d{0,2}))?")
 
 
 class InputConfig(Section):
@@ -18,3 +22,13 @@ class InputConfig(Section):
     vertical_correction_deg: float | None = Field(
         None, description="rotation of KITTI HDL-64E points about p x z; absent: the reader knows"
     )
+    rings: str = Field(
+        "auto", description="how rings are found: auto, field, order (of the file), rows[:N] or elevation[:N]"
+    )
+
+    @field_validator("rings")
+    @classmethod
+    def _check_rings(cls, value: str) -> str:
+        if RINGS.fullmatch(value) is None:
+            raise ValueError("auto, field, order, rows[:N] or elevation[:N] is needed")
+        return value

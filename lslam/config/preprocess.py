@@ -10,7 +10,7 @@ from lslam.config.section import Section
 
 
 class PreprocessConfig(Section):
-    """Range gate and down-sampling."""
+    """Range gate, what is taken out, and down-sampling."""
 
     range_min: float = Field(1.0, ge=0, description="m; nearer points hit the vehicle")
     range_max: float = Field(100.0, gt=0, description="m; far points hold the yaw")
@@ -19,6 +19,19 @@ class PreprocessConfig(Section):
         None,
         description="x_min, x_max, y_min, y_max, z_min, z_max in the LiDAR frame, m: points inside are dropped",
     )
+    remove_ground: bool = Field(False, description="take out the points that lie on the ground")
+    ground_slope: float = Field(
+        0.2, gt=0, lt=1, description="m per m; steepest ground against the plane under the sensor"
+    )
+    ground_tolerance: float = Field(0.25, gt=0, description="m; what is lower above the ground counts as ground")
+    denoise: bool = Field(
+        False, description="take out points far from their neighbours (statistical outlier removal): distant ones first"
+    )
+    denoise_neighbours: int = Field(10, ge=2, description="`denoise`: nearest points asked, the point itself included")
+    denoise_deviations: float = Field(
+        2.0, ge=0, description="`denoise`: standard deviations above the mean distance that are still allowed"
+    )
+    deskew: bool = Field(True, description="take the motion within a scan out of it, where points have times")
     map_leaf: float = Field(0.3, gt=0, description="m; centroids of this grid feed the local map")
     downsample: Literal["target", "grid", "first", "random", "none"] = Field(
         "target",

@@ -43,7 +43,11 @@ def read_buildings(path: Path, origin: NDArray[Any]) -> BuildingExtract:
 
     Raises InputError naming the file: unreadable (`read_osm`), or without one building.
     """
-    data = read_osm(path)
+    return some_buildings_of(read_osm(path), origin, path)
+
+
+def some_buildings_of(data: OsmData, origin: NDArray[Any], path: Path) -> BuildingExtract:
+    """`buildings_of` what was read from `path`; raises InputError naming it when there is not one."""
     extract = buildings_of(data, origin, str(path))
     if not extract.buildings:
         why = ", ".join(f"{count} x {reason}" for reason, count in extract.skipped.items())

@@ -73,11 +73,15 @@ def table_size(n: int) -> int:
 
 
 @kernel
-def centroids(points: NDArray[np.float32], size: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """One centroid per voxel in order of first appearance: (M, 3) float32 and the scatter inside each voxel (M, 6).
+def centroids(
+    points: NDArray[np.float32], times: NDArray[np.float32], size: float
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+    """One centroid per voxel in order of first appearance: (M, 3) float32, its mean time (M,), its scatter (M, 6).
 
     The scatter is the covariance xx, xy, xz, yy, yz, zz of the voxel's points, m2. Sums run relative to the first point
-    of the voxel, so float32 input keeps its digits.
+    of the voxel, so float32 input keeps its digits. `times` (N,) may be empty, then the mean times are. Points of the
+    first and of the second half of the sweep never share a centroid: where the sweep closes they lie side by side, but
+    the sensor has moved in between.
     """
     n = len(points)
     entries = table_size(n)
@@ -86,6 +90,11 @@ def centroids(points: NDArray[np.float32], size: float) -> tuple[NDArray[np.floa
     keys = np.empty(n, np.int64)
     first = np.empty(n, np.int32)
     sums = np.zeros((n, 10))
+    is_timed = len(times) == n
+    half = np.float32(0.0)
+    if is_timed and n > 0:
+        half = np.float32(0.5) * (times.min() + times.max())
+    time_sums = np.zeros(n if is_timed else 0)
     inverse = 1.0 / size
     count = 0
     last_key = -1
@@ -93,6 +102,8 @@ def centroids(points: NDArray[np.float32], size: float) -> tuple[NDArray[np.floa
     for i in range(n):
         x, y, z = float(points[i, 0]), float(points[i, 1]), float(points[i, 2])
         key = pack(index_of(x, inverse), index_of(y, inverse), index_of(z, inverse))
+        if is_timed and times[i] > half:
+            key = ~key
         # A coordinate beyond all voxels can give any key, the initial one too.
         if count == 0 or key != last_key:
             h = hash_key(key, mask)
@@ -118,7 +129,10 @@ def centroids(points: NDArray[np.float32], size: float) -> tuple[NDArray[np.floa
         s[7] += dy * dy
         s[8] += dy * dz
         s[9] += dz * dz
+        if is_timed:
+            time_sums[slot] += times[i]
     out = np.empty((count, 3), np.float32)
+    mean_times = np.empty(count if is_timed else 0, np.float32)
     scatter = np.empty((count, 6), np.float32)
     for j in range(count):
         s = sums[j]
@@ -134,7 +148,9 @@ def centroids(points: NDArray[np.float32], size: float) -> tuple[NDArray[np.floa
         scatter[j, 3] = s[7] * w - my * my
         scatter[j, 4] = s[8] * w - my * mz
         scatter[j, 5] = s[9] * w - mz * mz
-    return out, scatter
+        if is_timed:
+            mean_times[j] = time_sums[j] * w
+    return out, mean_times, scatter
 
 
 @kernel

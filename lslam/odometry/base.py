@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan import Scan
@@ -12,7 +12,9 @@ from lslam.types.scan_result import ScanResult
 class Odometry(Protocol):
     """Scan + motion prior -> pose, scan after scan.
 
+    A method with an attribute `needs_rings` that is true gets scans whose `rings` are filled in (`input.rings`).
     `prepare` knows nothing of earlier scans, so the front end runs it for the next scan while `register` works on this one.
+    A method that deskews has an attribute `deskew` that says how, in words.
     """
 
     def prepare(self, scan: Scan) -> Any:
@@ -25,4 +27,21 @@ class Odometry(Protocol):
 
     def warm_up(self) -> None:
         """Compile or load what the first scan would otherwise wait for."""
+        ...
+
+
+@runtime_checkable
+class Deskewing(Odometry, Protocol):
+    """A method that takes the motion within a sweep from the prior.
+
+    Its `register` only aligns, so that the front end can call it again with the motion that the first alignment found;
+    `update` then takes the scan in.
+    """
+
+    def update(self, scan: Scan, prepared: Any, prior: MotionPrior, result: ScanResult) -> ScanResult:
+        """Learn from the scan as the last `register` placed it; the result with the time that took."""
+        ...
+
+    def restart(self) -> None:
+        """Forget all scans."""
         ...

@@ -9,8 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.config.config import Config
+from lslam.config.preprocess import PreprocessConfig
 from lslam.foreign import importing
 from lslam.geometry import se3
+from lslam.preprocessing.prepare import gate_points
 from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan import Scan
 from lslam.types.scan_result import ScanResult
@@ -19,8 +21,10 @@ Floats = NDArray[np.float64]
 
 
 def create(config: Config) -> Kiss:
-    """The baseline with kiss-icp's defaults; only its range gate follows `preprocess` when the user changed it."""
-    return Kiss(config.preprocess.range_max, has_user_range="range_max" in config.preprocess.model_fields_set)
+    """The baseline with kiss-icp's defaults; of `preprocess` it follows the farthest range when the user changed it, and
+    what takes points out: the ego box, `remove_ground`, `denoise`.
+    """
+    return Kiss(config.preprocess, has_user_range="range_max" in config.preprocess.model_fields_set)
 
 
 class Kiss:
@@ -30,16 +34,20 @@ class Kiss:
     have one instant and are left alone.
     """
 
-    def __init__(self, range_max: float, has_user_range: bool) -> None:
+    deskew = "by kiss-icp, in scans that have per-point times"
+
+    def __init__(self, preprocess: PreprocessConfig, has_user_range: bool) -> None:
         with importing("kiss-icp", "install it with: pip install kiss-icp"):
             from kiss_icp.config import KISSConfig
             from kiss_icp.kiss_icp import KissICP
         config = KISSConfig()
         if has_user_range:
-            config.data.max_range = range_max
+            config.data.max_range = preprocess.range_max
         if config.mapping.voxel_size is None:
             config.mapping.voxel_size = float(config.data.max_range / 100.0)
         self._config, self._make = config, KissICP
+        takes_out = preprocess.ego_box is not None or preprocess.remove_ground or preprocess.denoise
+        self._taking_out = preprocess if takes_out else None
         self._with_deskew: bool | None = None
         self._kiss: Any = None
         self._registered = 0
@@ -47,6 +55,8 @@ class Kiss:
 
     def prepare(self, scan: Scan) -> tuple[Any, Any]:
         """Points as float64 and their times scaled to 0..1 as kiss-icp wants them."""
+        if self._taking_out is not None:
+            scan = scan.select(gate_points(scan.points, self._taking_out))
         finite = np.isfinite(scan.points).all(axis=1)
         points = scan.points[finite].astype(np.float64)
         if scan.times is None or not len(points):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -12,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.errors import InputError
-from lslam.odometry.base import Odometry
+from lslam.geometry import se3, so3
+from lslam.odometry.base import Deskewing, Odometry
 from lslam.readers.selection import Selection
 from lslam.registration.motion import ConstantVelocity
 from lslam.registration.registration import DOUBT
@@ -21,6 +23,9 @@ from lslam.types.scan import Scan
 from lslam.types.scan_result import ScanResult
 from lslam.types.sequence import Sequence
 from lslam.types.trajectory import Trajectory
+
+# Half the points of a scan are nearer.
+LEVER_M = 10.0
 
 
 @dataclass(frozen=True)
@@ -49,23 +54,94 @@ def estimate(
 
     A scan that cannot be read, or is empty, is skipped: the motion prior stands in for its pose.
     """
-    motion = ConstantVelocity()
+    tracker = Tracker(odometry)
     results: list[ScanResult] = []
     failures = 0
     for loaded in read_ahead(sequence, odometry.prepare, threads):
-        prior = MotionPrior(np.zeros(1), motion.predict(loaded.stamp_ns)[None])
-        if loaded.scan is None:
-            result = ScanResult(loaded.index, loaded.stamp_ns, prior.start, "skipped", loaded.error, converged=False)
-        else:
-            result = odometry.register(loaded.scan, loaded.prepared, prior)
+        result = tracker.track(loaded)
         result = replace(result, stages={"read": loaded.read_s, "prepare": loaded.prepare_s, **result.stages})
-        motion.correct(result.stamp_ns, result.T_world_lidar)
         results.append(result)
         on_scan(result)
         failures = 0 if result.status == "ok" else failures + 1
         if failures >= max_failures or should_stop():
             break
     return results
+
+
+class Tracker:
+    """Predict, register, correct: the loop between motion prior and odometry."""
+
+    # A change of the motion within the sweep that moves no point by more is not worth a second registration.
+    REFINE_M = 0.01
+
+    def __init__(self, odometry: Odometry) -> None:
+        self.odometry = odometry
+        self.motion = ConstantVelocity()
+        self._first: tuple[Scan, Any, NDArray[np.float64]] | None = None
+
+    def track(self, loaded: Loaded) -> ScanResult:
+        """Pose of the next scan."""
+        scan = loaded.scan
+        span = sweep_seconds(scan)
+        prior = self.motion.sweep(loaded.stamp_ns, span)
+        if scan is None:
+            result = ScanResult(loaded.index, loaded.stamp_ns, prior.start, "skipped", loaded.error, converged=False)
+        elif isinstance(self.odometry, Deskewing):
+            result, prior = self._register(self.odometry, scan, loaded.prepared, prior)
+        else:
+            result = self.odometry.register(scan, loaded.prepared, prior)
+        self.motion.correct(result.stamp_ns, result.T_world_lidar, prior)
+        return result
+
+    def _register(
+        self, odometry: Deskewing, scan: Scan, prepared: Any, prior: MotionPrior
+    ) -> tuple[ScanResult, MotionPrior]:
+        """Register, and again with the motion within the sweep that this found; the prior that was right."""
+        result = odometry.register(scan, prepared, prior)
+        if result.status == "ok" and sweep_seconds(scan) > 0:
+            if self._first is None:
+                self._first = (scan, prepared, result.T_world_lidar)
+            elif not self.motion.is_known:
+                prior = self._begin_again(odometry, scan, result)
+                result = odometry.register(scan, prepared, prior)
+            else:
+                better = self.motion.refine(prior, scan.stamp_ns, result.T_world_lidar)
+                if _distance(prior, better) > self.REFINE_M:
+                    prior = better
+                    result = odometry.register(scan, prepared, prior)
+        return odometry.update(scan, prepared, prior, result), prior
+
+    def _begin_again(self, odometry: Deskewing, scan: Scan, result: ScanResult) -> MotionPrior:
+        """The first scan was taken at an unknown speed: now that it is known, deskew it and build the map anew."""
+        assert self._first is not None
+        first, prepared, pose = self._first
+        self.motion.correct(scan.stamp_ns, result.T_world_lidar)
+        prior = self.motion.steady(pose, sweep_seconds(first))
+        odometry.restart()
+        odometry.update(first, prepared, prior, odometry.register(first, prepared, prior))
+        start = self.motion.predict(scan.stamp_ns)
+        known, self.motion = self.motion, ConstantVelocity()
+        self.motion.correct(first.stamp_ns, pose, prior)
+        return known.steady(start, sweep_seconds(scan))
+
+
+def has_point_times(sequence: Sequence) -> bool:
+    """Whether the scans have per-point times: the first that can be read speaks for all."""
+    for i in range(min(len(sequence), 10)):
+        with suppress(InputError):
+            return sequence.scan(i).times is not None
+    return False
+
+
+def sweep_seconds(scan: Scan | None) -> float:
+    """How long the sensor took for the scan, s; 0 when its points belong to one instant."""
+    return 0.0 if scan is None or scan.times is None or len(scan) == 0 else max(float(scan.times.max()), 0.0)
+
+
+def _distance(before: MotionPrior, after: MotionPrior) -> float:
+    """How far the motion within a sweep differs at its end, m, at a lever arm of `LEVER_M`."""
+    change = se3.relative(se3.relative(before.start, before.poses[-1]), se3.relative(after.start, after.poses[-1]))
+    return float(np.linalg.norm(change[:3, 3]) + LEVER_M * so3.angle(change[:3, :3]))
 
 
 def is_diverged(results: list[ScanResult], max_failures: int) -> bool:

@@ -26,11 +26,13 @@ class Manifest:
 
     outcome : done, degraded (a scan was bridged or skipped, or input was dropped, replaced or refused), diverged or
         interrupted
+    deskew : what becomes of the motion within a scan, `describe_deskew`
     problems : what went wrong in this run, beside what was wrong with the recording before
     """
 
     def __init__(self, command: str, sequence: Sequence, config: Config) -> None:
         self.command, self.sequence, self.config = command, sequence, config
+        self.deskew = "not decided yet"
         self.started = datetime.now(UTC)
         self.timings: dict[str, float] = {}
         self.problems: list[str] = []
@@ -105,7 +107,7 @@ class Manifest:
                 "trajectory.tum": "T_world_lidar",
                 "trajectory_kitti.txt": "camera 0 (Tr is known)" if has_camera else "LiDAR (no Tr is known)",
                 "pose_time": "scan_start",
-                "deskew": describe_deskew(s, self.config.odometry.method),
+                "deskew": self.deskew,
                 "covariances.npz": "covariances: of the poses in the world; registration: against the local map (NaN: none); "
                 "both (N, 6, 6) of t' = t + d[:3], R' = exp(d[3:]) R in world axes, m2 and rad2",
             },
@@ -123,14 +125,19 @@ class Manifest:
         }
 
 
-def describe_deskew(sequence: Sequence, method: str) -> str:
-    """What becomes of the motion within a scan; starts with `no deskew` when it stays in."""
+def describe_deskew(sequence: Sequence, config: Config, has_times: bool, how: str) -> str:
+    """What becomes of the motion within a scan; starts with `no deskew` when it stays in.
+
+    has_times : whether the scans have per-point times; how : in words, how the method deskews, empty when it does not
+    """
     if sequence.motion_compensated:
         return "none needed: the scans are motion compensated"
-    if method == "kiss-icp":
-        return "by kiss-icp, in scans that have per-point times"
     why = "is not known to be" if sequence.motion_compensated is None else "is not"
-    return f"no deskew: the recording {why} motion compensated, and {method} takes each scan as one instant"
+    if not has_times:
+        return f"no deskew: the recording {why} motion compensated, and its points have no times"
+    if not config.preprocess.deskew:
+        return "no deskew: preprocess.deskew is off"
+    return how or f"no deskew: {config.odometry.method} takes each scan as one instant"
 
 
 def peak_memory_mb() -> float | None:

@@ -17,11 +17,12 @@ from lslam.odometry import create_odometry
 from lslam.odometry.base import Odometry
 from lslam.pipeline import outputs
 from lslam.pipeline.check import check_config
-from lslam.pipeline.front_end import estimate, is_diverged, to_trajectory
+from lslam.pipeline.choose import choose_scans
+from lslam.pipeline.front_end import estimate, has_point_times, is_diverged, to_trajectory
 from lslam.pipeline.manifest import Manifest, describe_deskew
 from lslam.pipeline.map_pass import build_map
 from lslam.pipeline.run_folder import RunFolder
-from lslam.readers import open_sequence, select
+from lslam.readers import open_sequence
 from lslam.types.run_record import RunRecord
 from lslam.types.scan_result import ScanResult
 from lslam.types.sequence import Sequence
@@ -84,19 +85,19 @@ def run(
     check_config(config)
     if isinstance(sequence, (str, Path)):
         sequence = open_sequence(sequence)
-    chosen = select(sequence, config.input.start, config.input.count, config.input.skip_frames)
     truth = sequence.ground_truth if ground_truth is None else ground_truth
     odometry = create_odometry(config)
+    chosen = choose_scans(sequence, odometry, config)
     manifest = Manifest(command, chosen, config)
     if out is None:
-        _announce(chosen, config)
+        _announce(chosen, odometry, config, manifest)
         record = _estimate(chosen, odometry, config, manifest, Path(), truth, watch)
         evaluation = _score(record, chosen, config)
     else:
         with RunFolder(Path(out), overwrite) as folder:
             try:
-                _announce(chosen, config)
                 folder.require_space(outputs.least_bytes(len(chosen)), "the result without its map")
+                _announce(chosen, odometry, config, manifest)
                 folder.write_text("config.toml", outputs.config_text(config))
                 folder.write_manifest(manifest.as_dict("running"))
                 record = _estimate(chosen, odometry, config, manifest, folder.path, truth, watch)
@@ -117,18 +118,18 @@ def run(
     return outcome
 
 
-def _announce(sequence: Sequence, config: Config) -> None:
+def _announce(sequence: Sequence, odometry: Odometry, config: Config, manifest: Manifest) -> None:
     """Say what is about to be run and what the reader decided, once: the log keeps it beside the results."""
     log.info("%s: %d scans of %s, method %s", sequence.name, len(sequence), sequence.path, config.odometry.method)
     for note in sequence.notes:
         log.info("%s", note)
     for problem in sequence.problems:
         log.warning("%s", problem)
-    deskew = describe_deskew(sequence, config.odometry.method)
-    if deskew.startswith("no deskew"):
-        log.warning("%s", deskew)
+    manifest.deskew = describe_deskew(sequence, config, has_point_times(sequence), getattr(odometry, "deskew", ""))
+    if manifest.deskew.startswith("no deskew"):
+        log.warning("%s", manifest.deskew)
     else:
-        log.info("deskew: %s", deskew)
+        log.info("deskew: %s", manifest.deskew)
 
 
 def _estimate(

@@ -11,9 +11,12 @@ from numpy.typing import NDArray
 from lslam.config.preprocess import PreprocessConfig
 from lslam.errors import InputError
 from lslam.kernels import voxel
+from lslam.preprocessing.ground import above_ground
 
 # A source grid never gets finer than the points it is made of, nor so coarse that walls merge.
 COARSEST_SOURCE = 3.0
+
+NO_TIMES = np.zeros(0, np.float32)
 
 
 @dataclass(frozen=True)
@@ -23,6 +26,8 @@ class PreparedPoints:
     map_points : (M, 3) float32, m, one centroid per small voxel
     source : (S, 3) float64, m; scatter : (S, 6) float64, m2, covariance xx xy xz yy yz zz of the points behind each
     used : points that passed the range gate
+    map_times (M,), source_times (S,) : float32, s since scan start, mean over the points behind each; None when the scan
+        has no times
     covariance : (S, 6) float64, m2, likewise, of the surface round each source point; None where no method asked for it
     """
 
@@ -30,19 +35,35 @@ class PreparedPoints:
     source: NDArray[np.float64]
     scatter: NDArray[np.float64]
     used: int
+    map_times: NDArray[np.float32] | None = None
+    source_times: NDArray[np.float32] | None = None
     covariance: NDArray[np.float64] | None = None
 
 
-def prepare_points(points: NDArray[Any], config: PreprocessConfig, index: int = 0) -> PreparedPoints:
+def prepare_points(
+    points: NDArray[Any], config: PreprocessConfig, index: int = 0, times: NDArray[np.float32] | None = None
+) -> PreparedPoints:
     """Gate and down-sample points (N, 3), m, in the LiDAR frame. `index` seeds the random share, scan by scan.
+
+    `times` (N,), s since scan start, are averaged along, so that the centroids can be deskewed instead of the points.
 
     Centroids, not first points: the average of the points of a cell is nearer to the surface than any one of them.
     Further columns are ignored. Raises InputError for arrays of another shape.
     """
-    kept = clean_points(points, config)
-    map_points, _ = voxel.centroids(kept, config.map_leaf)
-    source, scatter = _source_points(kept, map_points, config, index)
-    return PreparedPoints(map_points, source.astype(np.float64), scatter.astype(np.float64), len(kept))
+    cloud = as_cloud(points)
+    chosen = gate_points(cloud, config)
+    kept = cloud[chosen]
+    kept_times = NO_TIMES if times is None else np.ascontiguousarray(times, np.float32)[chosen]
+    map_points, map_times, _ = voxel.centroids(kept, kept_times, config.map_leaf)
+    source, source_times, scatter = _source_points(kept, kept_times, map_points, map_times, config, index)
+    return PreparedPoints(
+        map_points,
+        source.astype(np.float64),
+        scatter.astype(np.float64),
+        len(kept),
+        None if times is None else map_times,
+        None if times is None else source_times,
+    )
 
 
 def clean_points(points: NDArray[Any], config: PreprocessConfig) -> NDArray[np.float32]:
@@ -50,39 +71,58 @@ def clean_points(points: NDArray[Any], config: PreprocessConfig) -> NDArray[np.f
 
     Further columns are ignored. Raises InputError for arrays of another shape.
     """
-    array = np.asarray(points)
-    if array.ndim != 2 or array.shape[1] < 3:
-        raise InputError(f"points of a scan have shape {array.shape}: (N, 3) is needed, x y z in metres")
-    cloud = np.ascontiguousarray(array[:, :3], np.float32)
+    cloud = as_cloud(points)
     return cloud[gate_points(cloud, config)]
 
 
+def as_cloud(points: NDArray[Any]) -> NDArray[np.float32]:
+    """The first three columns as (N, 3) float32. Raises InputError for arrays of another shape."""
+    array = np.asarray(points)
+    if array.ndim != 2 or array.shape[1] < 3:
+        raise InputError(f"points of a scan have shape {array.shape}: (N, 3) is needed, x y z in metres")
+    return np.ascontiguousarray(array[:, :3], np.float32)
+
+
 def gate_points(points: NDArray[np.float32], config: PreprocessConfig) -> NDArray[np.int64]:
-    """Indices of the points (N, 3) that are finite, non-zero, within range and outside the ego box."""
+    """Indices of the points (N, 3), m, that are finite, non-zero, within range and outside the ego box.
+
+    With `remove_ground` and `denoise` also neither on the ground nor, among the rest, an outlier. Every method's points
+    pass here.
+    """
     box = np.array(config.ego_box if config.ego_box is not None else (), np.float64)
-    return voxel.gate(points, config.range_min, config.range_max, config.range_shape == "cylinder", box)
+    kept = voxel.gate(points, config.range_min, config.range_max, config.range_shape == "cylinder", box)
+    if config.remove_ground:
+        kept = kept[above_ground(points[kept], config.ground_slope, config.ground_tolerance)]
+    if config.denoise:
+        from lslam.preprocessing.denoise import dense_points
+
+        kept = kept[dense_points(points[kept], config.denoise_neighbours, config.denoise_deviations)]
+    return kept
+
+
+Down = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]
 
 
 def _source_points(
-    kept: NDArray[np.float32], map_points: NDArray[np.float32], config: PreprocessConfig, index: int
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    kept: NDArray[np.float32], kept_times: NDArray[np.float32], map_points: NDArray[np.float32],
+    map_times: NDArray[np.float32], config: PreprocessConfig, index: int,
+) -> Down:  # fmt: skip
     if config.downsample == "target":
-        return _target_count(map_points, config)
+        return _target_count(map_points, map_times, config)
     if config.downsample == "grid":
-        return voxel.centroids(map_points, config.source_voxel)
+        return voxel.centroids(map_points, map_times, config.source_voxel)
     if config.downsample == "first":
-        chosen = kept[voxel.first_points(kept, config.source_voxel)]
+        chosen = voxel.first_points(kept, config.source_voxel)
     elif config.downsample == "random":
         rng = np.random.default_rng((config.seed, index))
-        chosen = kept[np.sort(rng.permutation(len(kept))[: round(config.random_share * len(kept))])]
+        chosen = np.sort(rng.permutation(len(kept))[: round(config.random_share * len(kept))])
     else:
-        chosen = kept
-    return chosen, np.zeros((len(chosen), 6), np.float32)
+        chosen = np.arange(len(kept))
+    times = kept_times[chosen] if len(kept_times) else kept_times
+    return kept[chosen], times, np.zeros((len(chosen), 6), np.float32)
 
 
-def _target_count(
-    map_points: NDArray[np.float32], config: PreprocessConfig
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def _target_count(map_points: NDArray[np.float32], map_times: NDArray[np.float32], config: PreprocessConfig) -> Down:
     """Centroids of a grid whose size gives a count between the limits, where the scan has so many points.
 
     Surfaces fill a grid with the inverse square of its size. The search starts afresh for each scan, so that a scan's
@@ -90,16 +130,17 @@ def _target_count(
     """
     low, high = config.source_points_min, config.source_points_max
     size = config.source_voxel
-    source, scatter = voxel.centroids(map_points, size)
+    down = voxel.centroids(map_points, map_times, size)
     for _ in range(3):
-        if len(source) > high:
-            wanted = min(size * (len(source) / (0.5 * (low + high))) ** 0.5, COARSEST_SOURCE)
-        elif len(source) < low and len(map_points) > len(source):
-            wanted = max(size * (len(source) / (0.5 * (low + high))) ** 0.5, config.map_leaf)
+        found = len(down[0])
+        if found > high:
+            wanted = min(size * (found / (0.5 * (low + high))) ** 0.5, COARSEST_SOURCE)
+        elif found < low and len(map_points) > found:
+            wanted = max(size * (found / (0.5 * (low + high))) ** 0.5, config.map_leaf)
         else:
             break
         if wanted == size:
             break
         size = wanted
-        source, scatter = voxel.centroids(map_points, size)
-    return source, scatter
+        down = voxel.centroids(map_points, map_times, size)
+    return down

@@ -1,4 +1,4 @@
-"""Constant velocity: the motion prior of a method that has no IMU."""
+"""Constant velocity: the motion prior of a method that has no IMU, and the motion within a sweep."""
 
 from __future__ import annotations
 
@@ -6,33 +6,80 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.geometry import se3
+from lslam.preprocessing.deskew import KNOTS
+from lslam.types.motion_prior import MotionPrior
 
 Floats = NDArray[np.float64]
 
 
 class ConstantVelocity:
-    """Predicts the next pose from the last two, scaled to the time between scans."""
+    """Predicts the next pose from the last two, scaled to the time between scans.
+
+    A sweep's registration knows the pose at the middle of the sweep best: an error of the velocity that deskewed it pulls
+    start and end apart, but not the middle. So velocities are measured from middle to middle.
+    """
 
     # A longer pause says nothing about the speed at its end; the last step is not stretched beyond this factor.
     MAX_STRETCH = 5.0
 
     def __init__(self) -> None:
-        self._stamp_ns: int | None = None
+        self._instant_ns: int | None = None
         self._pose = np.eye(4)
         self._twist = np.zeros(6)
         self._step_s = 0.0
 
     def predict(self, stamp_ns: int) -> Floats:
         """(4, 4) T_world_lidar expected at `stamp_ns`; the identity before the first scan."""
-        if self._stamp_ns is None or self._step_s <= 0:
+        if self._instant_ns is None or self._step_s <= 0:
             return self._pose.copy()
-        stretch = min(max((stamp_ns - self._stamp_ns) * 1e-9 / self._step_s, 0.0), self.MAX_STRETCH)
+        stretch = min(max((stamp_ns - self._instant_ns) * 1e-9 / self._step_s, 0.0), self.MAX_STRETCH)
         return se3.normalise(self._pose @ se3.exp(stretch * self._twist))
 
-    def correct(self, stamp_ns: int, pose: Floats) -> None:
-        """Take the pose (4, 4) found at `stamp_ns` as the newest."""
-        if self._stamp_ns is not None:
-            step = (stamp_ns - self._stamp_ns) * 1e-9
+    @property
+    def is_known(self) -> bool:
+        """Whether there is a velocity yet."""
+        return self._step_s > 0
+
+    def sweep(self, stamp_ns: int, span_s: float) -> MotionPrior:
+        """Poses from scan start over the `span_s` seconds that the sweep takes; one pose when it takes none."""
+        return self.steady(self.predict(stamp_ns), span_s)
+
+    def steady(self, start: Floats, span_s: float) -> MotionPrior:
+        """As `sweep`, from the pose `start` (4, 4)."""
+        if span_s <= 0 or not self.is_known:
+            return MotionPrior(np.zeros(1), start[None])
+        return _steady(start, self._twist / self._step_s, span_s)
+
+    def refine(self, prior: MotionPrior, stamp_ns: int, start: Floats) -> MotionPrior:
+        """The sweep's motion again, now that registration gave the pose `start` (4, 4) for `prior`.
+
+        Continuing the change of velocity as well was tried: it amplifies jitter more than it follows bends.
+        """
+        span = float(prior.times[-1])
+        middle, instant_ns = _middle(prior, stamp_ns, start)
+        step = 0.0 if self._instant_ns is None else (instant_ns - self._instant_ns) * 1e-9
+        if span <= 0 or step <= 0:
+            return prior
+        velocity = se3.log(se3.relative(self._pose, middle)) / step
+        return _steady(middle @ se3.exp(-0.5 * span * velocity), velocity, span)
+
+    def correct(self, stamp_ns: int, pose: Floats, prior: MotionPrior | None = None) -> None:
+        """Take the pose (4, 4) found at `stamp_ns` as the newest; `prior` says how its sweep moved."""
+        middle, instant_ns = (pose, stamp_ns) if prior is None else _middle(prior, stamp_ns, pose)
+        if self._instant_ns is not None:
+            step = (instant_ns - self._instant_ns) * 1e-9
             if step > 0:
-                self._twist, self._step_s = se3.log(se3.relative(self._pose, pose)), step
-        self._stamp_ns, self._pose = stamp_ns, pose.copy()
+                self._twist, self._step_s = se3.log(se3.relative(self._pose, middle)), step
+        self._instant_ns, self._pose = instant_ns, middle.copy()
+
+
+def _steady(start: Floats, velocity: Floats, span: float) -> MotionPrior:
+    times = np.linspace(0.0, span, KNOTS)
+    return MotionPrior(times, se3.normalise(start @ se3.exp(times[:, None] * velocity)))
+
+
+def _middle(prior: MotionPrior, stamp_ns: int, start: Floats) -> tuple[Floats, int]:
+    """Pose and instant of the middle of a sweep that began at `start` and moved as `prior` says."""
+    k = len(prior.times) // 2
+    within = se3.relative(prior.start, prior.poses[k])
+    return np.asarray(start @ within), stamp_ns + round(1e9 * float(prior.times[k]))

@@ -59,15 +59,7 @@ class Registration:
 
     def register(self, points: NDArray[Any], prior: NDArray[np.float64] | None = None) -> RegistrationResult:
         """Pose of points (N, 3), m, LiDAR frame; without `prior` (4, 4) the velocity is taken as constant."""
-        return self.align(self.prepare(points, self._index), prior)
-
-    def prepare(self, points: NDArray[Any], index: int) -> PreparedPoints:
-        """What can be made of points (N, 3), m, LiDAR frame, without the map; `index` is the scan's number."""
-        prepared = prepare_points(points, self.preprocess, index)
-        if self.residual not in NEEDS_COVARIANCE:
-            return prepared
-        covariance = source_covariance(prepared.source, prepared.map_points, self.config.sigma**2)
-        return replace(prepared, covariance=covariance)
+        return self.align(prepare_points(points, self.preprocess, self._index), prior)
 
     def align(self, points: PreparedPoints, prior: NDArray[np.float64] | None = None) -> RegistrationResult:
         """As `register`, for points that are prepared already; aligns, judges, then updates the map.
@@ -89,6 +81,9 @@ class Registration:
             )
         if len(self.map) == 0:
             return RegistrationResult(T_prior, covariance=np.diag([1e-12] * 6), source_points=len(points.source))
+        if self.residual in NEEDS_COVARIANCE and points.covariance is None:
+            found = source_covariance(points.source, points.map_points, self.config.sigma**2)
+            points = replace(points, covariance=found)
         if self._starting > 0:
             return self._judge(self._coarse_to_fine(points, T_prior), T_prior)
         c = self.config

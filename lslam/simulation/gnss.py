@@ -17,9 +17,11 @@ Floats = NDArray[np.float64]
 # lat, lon (deg), height (m) of the city's origin unless a scenario has its own: open ground at Karlsruhe.
 ORIGIN = np.array([49.0, 8.4, 115.0])
 
-# Of the antenna in the LiDAR frame: on the roof of a car, on top of a drone.
+# Of the antenna in the LiDAR frame: on the roof of a car behind the LiDAR's mast, on top of a drone that carries the LiDAR
+# below its belly, on a rod above a hand-held LiDAR.
 T_CAR_ANTENNA = se3.make(np.eye(3), np.array([-0.9, 0.0, -0.15]))
-T_DRONE_ANTENNA = se3.make(np.eye(3), np.array([-0.1, 0.0, 0.15]))
+T_DRONE_ANTENNA = se3.make(np.eye(3), np.array([-0.1, 0.0, 0.35]))
+T_WALKER_ANTENNA = se3.make(np.eye(3), np.array([-0.05, 0.0, 0.25]))
 
 
 @dataclass(frozen=True)

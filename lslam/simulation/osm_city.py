@@ -1,30 +1,29 @@
-"""A city raised from the buildings of an OpenStreetMap extract, on uneven ground, along a street where one is driven."""
+"""A city raised from the buildings of a map, on uneven ground, with roads and what stands beside them."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lslam.errors import InputError
-from lslam.formats.osm_buildings import buildings_near, read_buildings
-from lslam.simulation.city import MARGIN, City
+from lslam.simulation.city import KERB, MARGIN, City, Layout, Lots, add_garden_trees, add_street_furniture
 from lslam.simulation.curve import Curve
 from lslam.simulation.extrusion import extrude, likely_height
 from lslam.simulation.mesh import MeshBuilder, Surface, grid_faces
 from lslam.simulation.terrain import Terrain
+from lslam.simulation.town import CAR_LENGTH, Network, Places, add_road
 from lslam.types.building import Building
 
 Floats = NDArray[np.float64]
 
-ROAD, PAVEMENT = 4.5, 6.5  # m from the middle of a street to their edges
 CELL = 1.0  # m, of the ground
 MOST_CELLS = 1_500_000
-REACH = 150.0  # m from the path: what stands farther away, no LiDAR here sees
+BESIDE_KERB = 0.05  # m that the grass ends below the pavement
+UNDER_ROAD = 0.2  # m that the ground lies lower where a road covers it
+AIR = {True: 1.0, False: 0.5}  # m between walls and a parked car, or anything else
 
 
 @dataclass(frozen=True)
@@ -32,28 +31,54 @@ class OsmCity(City):
     """A `City` that knows its buildings; x is east and y north of the extract's origin.
 
     buildings : as built, every one with a height; attribution : what outputs made from it must carry (ODbL), if anything
+    source : the file it was made from
     """
 
     buildings: list[Building] = field(default_factory=list)
     attribution: str | None = None
+    source: str = "a map"
 
 
 def build_osm_city(
     buildings: Sequence[Building],
     terrain: Terrain,
     rng: np.random.Generator,
-    street: Curve | None = None,
+    streets: Sequence[Curve] = (),
+    layout: Layout | None = None,
     attribution: str | None = None,
+    source: str = "a map",
 ) -> OsmCity:
     """Raise `buildings` (m, x east, y north) on `terrain`. The same generator state gives the same city.
 
     A building looks the same whichever others stand around it. Heights that the map does not know are drawn.
-    `street` : middle of the road to pave; else all ground is lawn. Raises InputError when there are no buildings.
+    `streets` : middles of the roads to pave and furnish by `layout`, the main one first; without, all ground is lawn.
+    Raises InputError when there are no buildings.
     """
     if not buildings:
         raise InputError("a city needs at least one building: the OpenStreetMap extract gives none here")
-    builder = MeshBuilder()
-    seed = int(rng.integers(2**32))
+    builder, layout, roads = MeshBuilder(), layout or Layout(), list(streets)
+    built = _raise_buildings(builder, buildings, terrain, int(rng.integers(2**32)))
+    network = Network(roads) if roads else None
+    _add_ground(builder, built, terrain, network, layout.band, rng)
+    outlines = [(footprint.outer, building.height or 0.0) for building in built for footprint in building.footprints]
+    if network is not None:
+        _furnish(builder, network, outlines, terrain, layout, rng)
+    return OsmCity(
+        builder.build(),
+        terrain,
+        roads[0] if roads else None,
+        [outer for outer, _ in outlines],
+        [height for _, height in outlines],
+        roads,
+        buildings=built,
+        attribution=attribution,
+        source=source,
+    )
+
+
+def _raise_buildings(
+    builder: MeshBuilder, buildings: Sequence[Building], terrain: Terrain, seed: int
+) -> list[Building]:
     built = []
     for building in buildings:
         kind, number = building.osm_id.split("/")
@@ -64,59 +89,68 @@ def build_osm_city(
         ground = terrain.height(corners)
         extrude(builder, building, float(ground.min()), float(ground.max()), own)
         built.append(building)
-    _add_ground(builder, built, terrain, street, rng)
-    outlines = [(footprint.outer, building.height or 0.0) for building in built for footprint in building.footprints]
-    return OsmCity(
-        builder.build(),
-        terrain,
-        street,
-        [outer for outer, _ in outlines],
-        [height for _, height in outlines],
-        [] if street is None else [street],
-        buildings=built,
-        attribution=attribution,
-    )
-
-
-def city_from_osm(
-    path: Path,
-    origin: NDArray[Any],
-    terrain: Terrain,
-    rng: np.random.Generator,
-    positions: NDArray[Any] | None = None,
-    street: Curve | None = None,
-) -> OsmCity:
-    """A city from the extract `path`, x = y = 0 at `origin` (3,) lat, lon (deg), height (m).
-
-    positions : (N, 2) m of the path; only buildings within 150 m of it are raised (default: all)
-
-    Raises InputError, one sentence naming the file: unreadable, without buildings, far from the origin or from the path.
-    """
-    extract = read_buildings(path, origin)
-    buildings = extract.buildings if positions is None else buildings_near(extract, positions, REACH)
-    return build_osm_city(buildings, terrain, rng, street, extract.attribution)
+    return built
 
 
 def _add_ground(
-    builder: MeshBuilder, buildings: list[Building], terrain: Terrain, street: Curve | None, rng: np.random.Generator
+    builder: MeshBuilder,
+    buildings: list[Building],
+    terrain: Terrain,
+    network: Network | None,
+    band: float,
+    rng: np.random.Generator,
 ) -> None:
-    """A grid of ground under everything and round it; cells grow where a whole district is built."""
+    """A grid of grass under everything and round it, lower where a road covers it; cells grow under a whole district."""
     places = [footprint.outer for building in buildings for footprint in building.footprints]
-    middle = None if street is None else street.position(street.sample(0.5))
-    everything = np.concatenate(places if middle is None else [*places, middle])
+    places += [street.position(street.sample(2.0)) for street in (network.streets if network else ())]
+    everything = np.concatenate(places)
     low, high = everything.min(0) - MARGIN, everything.max(0) + MARGIN
     cell = max(CELL, float(np.sqrt(np.prod(high - low) / MOST_CELLS)))
     x, y = (np.arange(low[k], high[k] + cell, cell) for k in (0, 1))
     xy = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1)
     z = terrain.height(xy) + rng.normal(0, 0.01, xy.shape[:2])
-    faces = grid_faces(len(x), len(y))
+    if network is not None:
+        # No hole is cut, so that no ray falls through where the strips of two roads meet at an angle.
+        z += KERB - BESIDE_KERB - UNDER_ROAD * (network.distance(xy) < band - 0.3)
     vertices = np.concatenate([xy, z[..., None]], -1).reshape(-1, 3)
-    kinds = np.full(len(faces), Surface.LAWN, np.uint8)
-    if middle is not None:
-        from scipy.spatial import cKDTree
+    builder.add(vertices, grid_faces(len(x), len(y)), Surface.LAWN)
 
-        centres = vertices[faces, :2].mean(axis=1)
-        beside = np.asarray(cKDTree(middle).query(centres, distance_upper_bound=PAVEMENT)[0])
-        kinds[beside < PAVEMENT] = Surface.PAVEMENT
-        kinds[beside < ROAD] = Surface.ROAD
-    builder.add(vertices, faces, kinds)
+
+def _furnish(
+    builder: MeshBuilder,
+    network: Network,
+    outlines: list[tuple[Floats, float]],
+    terrain: Terrain,
+    layout: Layout,
+    rng: np.random.Generator,
+) -> None:
+    """Roads with kerbs, and beside them cars, trees, poles and bins wherever no building is in the way."""
+    for street in network.streets:
+        add_road(builder, street, network, terrain, layout, rng)
+    allowed = _Gaps(network, layout, [outer for outer, _ in outlines])
+    for street in network.streets:
+        for side in (1, -1):
+            add_street_furniture(builder, street, terrain, layout, rng, side, allowed)
+    lots = Lots(network.streets, layout)
+    for outer, height in outlines:
+        lots.take(outer, height)
+    add_garden_trees(builder, lots, terrain, layout, rng)
+
+
+class _Gaps:
+    """Whether a place beside a road is free of other roads, of what stands there already, and of walls."""
+
+    def __init__(self, network: Network, layout: Layout, outlines: list[Floats]) -> None:
+        from shapely import Polygon, STRtree
+
+        self._places, self._road = Places(network, layout), layout.road
+        self._walls = STRtree([Polygon(outer) for outer in outlines])
+
+    def __call__(self, xy: Floats, offset: float, yaw: float) -> bool:
+        from shapely import points
+
+        is_car = offset < self._road
+        half = 0.5 * CAR_LENGTH * is_car * np.array([np.cos(yaw), np.sin(yaw)])
+        ends = points(np.stack([xy - half, xy, xy + half]))
+        near = self._walls.query(ends, predicate="dwithin", distance=AIR[is_car])
+        return near.size == 0 and self._places(xy, offset, yaw)

@@ -13,13 +13,14 @@ from lslam.errors import InputError, OutputError
 from lslam.formats.osm_buildings import buildings_of, osm_from_buildings
 from lslam.formats.osm_files import write_osm
 from lslam.simulation.city import City
-from lslam.simulation.osm_city import PAVEMENT, OsmCity
+from lslam.simulation.osm_city import OsmCity
 from lslam.simulation.osm_faults import MapFaults, draw_perturbation
 from lslam.simulation.osm_perturb import Perturbation, perturb, write_perturbation
 from lslam.types.building import Building, footprints_of
 
 EXACT, PERTURBED = "map.osm", "map_perturbed.osm"
 RECORD = "truth/map_perturbation.json"  # below truth/: no method may read it
+ROADSIDE = 7.0  # m from the middle of a street that stay free of houses not yet built
 
 
 @dataclass(frozen=True)
@@ -92,5 +93,5 @@ def _streets(city: City) -> Any:
     from shapely import LineString, union_all
 
     streets = city.streets or ([] if city.street is None else [city.street])
-    lines = [LineString(street.position(street.sample(2.0))).buffer(PAVEMENT + 0.5) for street in streets]
+    lines = [LineString(street.position(street.sample(2.0))).buffer(ROADSIDE) for street in streets]
     return union_all(lines) if lines else None

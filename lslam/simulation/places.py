@@ -13,21 +13,21 @@ from lslam.simulation import path as paths
 from lslam.simulation.city import City, build_city
 from lslam.simulation.clearance import check_bends
 from lslam.simulation.countryside import build_corridor, build_motorway
-from lslam.simulation.curve import Curve, rounded_rectangle, smooth_curve, stretched, winding_line
+from lslam.simulation.curve import Curve, stretched
 from lslam.simulation.flight import FreePath, buffeting, climb_spline, fly, gait
 from lslam.simulation.motion import PosePath
 from lslam.simulation.moving import Mover, add_traffic
+from lslam.simulation.osm_city import OsmCity
+from lslam.simulation.osm_place import MapExtract, city_of_map, keep_out_of_walls, route_in_map
+from lslam.simulation.routes import SPARE, TIGHTEST, Route, given_route, own_route
 from lslam.simulation.scenario_files import Scenario
-from lslam.simulation.shapes import SHAPES
 from lslam.simulation.terrain import Terrain, rolling
 from lslam.simulation.town import build_town
 from lslam.simulation.waypoints import WayPoints
 
 Floats = NDArray[np.float64]
 
-SPARE = 60.0  # m of street before the start and after the end of an open line
 CORRIDOR_SPARE = 130.0  # m, so that no LiDAR here sees an end of the corridor
-TIGHTEST = {"car": 3.0, "drone": 1.0, "walker": 0.3}  # m, radius of a bend
 
 
 @dataclass(frozen=True)
@@ -39,37 +39,55 @@ class Place:
     scans: int
 
 
-@dataclass(frozen=True)
-class Route:
-    """The middle of a street, the line along it, and heights of way-points over the distance along the line, if they have any."""
-
-    street: Curve
-    line: Curve
-    climb: tuple[Floats, Floats] | None = None
-
-
-def build_place(scenario: Scenario, seed: int, count: int | None = None, way_points: WayPoints | None = None) -> Place:
+def build_place(
+    scenario: Scenario,
+    seed: int,
+    count: int | None = None,
+    way_points: WayPoints | None = None,
+    extract: MapExtract | None = None,
+) -> Place:
     """Build the place of `scenario`; one generator per part, so that another LiDAR or speed leaves the city as it is.
 
-    `way_points` replace the scenario's own line. Raises UsageError for bends too tight and more scans than fit.
+    `way_points` replace the scenario's own line, `extract` its town. Raises UsageError for bends too tight and more scans
+    than fit, InputError for an extract that is far from the way-points.
     """
     place, build, shake = (np.random.default_rng([seed, 2**32 - k]) for k in (1, 2, 3))
-    route = _given(scenario, way_points) if way_points is not None else _route(scenario, place)
+    if extract is not None:
+        route = route_in_map(scenario, extract, way_points)
+    else:
+        route = given_route(scenario, way_points) if way_points is not None else own_route(scenario, place)
     terrain = rolling(place, scenario.world.relief, scenario.world.unevenness)
     _check_radius(scenario, route.line)
     path, scans = _move(scenario, route, terrain, count, shake)
-    city = _city(scenario, route.street, terrain, build)
-    return Place(city, path, scans)
+    if extract is not None:
+        return Place(city_of_map(scenario, extract, terrain, build, route), path, scans)
+    return Place(_city(scenario, route.street, terrain, build), path, scans)
+
+
+def whole_map(scenario: Scenario, seed: int, extract: MapExtract) -> tuple[OsmCity, Floats]:
+    """Everything in `extract`, and the line (N, 3) along its streets that would be taken, with no point where there is none.
+
+    It is what a plan to pick way-points from shows.
+    """
+    place, build = (np.random.default_rng([seed, 2**32 - k]) for k in (1, 2))
+    terrain = rolling(place, scenario.world.relief, scenario.world.unevenness)
+    try:
+        line = route_in_map(scenario, extract, None).line
+        xy = line.position(line.sample(1.0))
+    except UsageError:
+        xy = np.zeros((0, 2))
+    return city_of_map(scenario, extract, terrain, build, None), np.column_stack([xy, np.zeros(len(xy))])
 
 
 def populate(scenario: Scenario, city: City, path: PosePath, seed: int) -> list[Mover]:
     """What moves in `city` while the LiDAR is on `path`."""
     traffic = scenario.traffic
-    return add_traffic(
+    movers = add_traffic(
         city.streets, city.terrain, path.poses, path.duration, np.random.default_rng([seed, 2**32 - 4]),
         cars_per_km=traffic.cars, people_per_km=traffic.people, lanes=traffic.lanes,
         pavement=scenario.layout.road + 0.6 * scenario.layout.pavement, speed=traffic.speed,
     )  # fmt: skip
+    return keep_out_of_walls(movers, city, path.duration) if isinstance(city, OsmCity) else movers
 
 
 def _city(scenario: Scenario, street: Curve, terrain: Terrain, rng: np.random.Generator) -> City:
@@ -81,60 +99,6 @@ def _city(scenario: Scenario, street: Curve, terrain: Terrain, rng: np.random.Ge
     if world.kind == "corridor":
         return build_corridor(stretched(street, CORRIDOR_SPARE), terrain, scenario.layout, rng)
     return build_town([stretched(street, SPARE)], terrain, scenario.layout, rng, world.spacing, world.levels)
-
-
-def _route(scenario: Scenario, rng: np.random.Generator) -> Route:
-    """The scenario's own street and line, scaled to its length."""
-    path = scenario.path
-    if path.shape == "block":
-        return _block(rng)
-    if path.shape == "street":
-        return _street(rng)
-    shape, closed = SHAPES[path.shape]
-    points = shape(rng)
-    climb = path.heights[1] - path.heights[0] if scenario.carrier == "drone" else 0.0
-    if closed and climb:
-        raise UsageError(f"path.heights {list(path.heights)} of a closed path differ: its end would not meet its start")
-    wanted = None if path.length is None else float(np.sqrt(path.length**2 - climb**2))
-    scale = 1.0
-    while True:
-        street = smooth_curve(scale * points, closed, path.smoothing)
-        line = _beside(street, -path.lane)
-        if wanted is None or abs(line.length / wanted - 1) < 1e-4:
-            return Route(street, line)
-        scale *= wanted / line.length
-
-
-def _given(scenario: Scenario, way_points: WayPoints) -> Route:
-    """A line through way-points, in metres as they are, and a street on its left."""
-    points = way_points.points
-    line = smooth_curve(points[:, :2], way_points.closed, scenario.path.smoothing)
-    street = _beside(line, scenario.path.lane)
-    if points.shape[1] == 2:
-        return Route(street, line)
-    z = np.append(points[:, 2], points[0, 2]) if way_points.closed else points[:, 2]
-    xy = np.concatenate([points[:, :2], points[:1, :2]]) if way_points.closed else points[:, :2]
-    s = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(xy, axis=0), axis=1))])
-    return Route(street, line, (s * line.length / s[-1], z))
-
-
-def _beside(curve: Curve, offset: float) -> Curve:
-    return smooth_curve(curve.beside(curve.sample(0.5), offset), curve.closed) if offset else curve
-
-
-def _block(rng: np.random.Generator) -> Route:
-    """Round one block counter-clockwise, right of the middle of the street."""
-    size = rounded_rectangle(35.5 + rng.uniform(-0.5, 0.5), 28.0 + rng.uniform(-0.5, 0.5), 11.0)
-    street = smooth_curve(size, closed=True)
-    return Route(street, smooth_curve(street.beside(street.sample(0.5), -0.8), closed=True))
-
-
-def _street(rng: np.random.Generator) -> Route:
-    """Along a winding street, changing sides of the lane now and then."""
-    street = smooth_curve(winding_line(rng, 320 + 2 * SPARE), closed=False)
-    s = np.arange(SPARE, street.length - SPARE, 1.0)
-    sway = -0.4 + 0.5 * np.sin(2 * np.pi * s / rng.uniform(80, 120) + rng.uniform(0, 2 * np.pi))
-    return Route(street, smooth_curve(street.beside(s, sway), closed=False))
 
 
 def _check_radius(scenario: Scenario, line: Curve) -> None:

@@ -47,7 +47,7 @@ _GLYPHS = {
 
 
 def write_plan(path: Path, scene: RayScene, city: City, line: NDArray[np.float64]) -> tuple[float, float]:
-    """Write the top view of `city` with the path `line` (M, 3), m, in the city frame; its size, m.
+    """Write the top view of `city` with the path `line` (M, 3), m, in the city frame, or none (0, 3); its size, m.
 
     A line of the grid every 10 m, a labelled one every 50 m; x to the right, y up; the start is a square.
     """
@@ -55,7 +55,8 @@ def write_plan(path: Path, scene: RayScene, city: City, line: NDArray[np.float64
     pixel = max(float((high - low).max()) / LARGEST, FINEST)
     image = _view(scene, low, high, pixel)
     _draw_grid(image, low, pixel)
-    _draw_path(image, line[:, :2], low, pixel)
+    if len(line):
+        _draw_path(image, line[:, :2], low, pixel)
     _draw_labels(image, low, pixel)
     with atomic_write(path) as stream:
         stream.write(png(image))

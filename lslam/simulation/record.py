@@ -18,6 +18,7 @@ from lslam.formats.pose_rows import seconds_text
 from lslam.formats.sequence_toml import FILE_NAME, SequenceInfo, write_sequence_toml
 from lslam.formats.trajectory_files import write_kitti
 from lslam.geometry import se3
+from lslam.simulation.manifest import write_manifest
 from lslam.simulation.osm_extract import write_extracts
 from lslam.simulation.scenarios import SimulatedDrive
 from lslam.simulation.sensors import GNSS_FILE, IMU_FILE, TRUTH, write_readings, write_truth
@@ -47,11 +48,13 @@ def record(
     overwrite: bool = False,
     on_scan: Callable[[int], None] | None = None,
     resume: bool = False,
+    command: str = "",
 ) -> Recorded:
     """Trace all scans of `drive` and write `out`/sequences/00 and `out`/poses/00.txt.
 
     The poses are of camera 0, as KITTI's; everything else in `out` is left alone. `on_scan` is called after each scan. What
-    is interrupted keeps its scans in `sequences/00.part`, and `resume` goes on there with the same bytes.
+    is interrupted keeps its scans in `sequences/00.part`, and `resume` goes on there with the same bytes. Last comes the
+    sequence's `manifest.json`, with `command`, what was typed.
 
     Raises
     ------
@@ -74,18 +77,19 @@ def record(
         write_mark(part, drive)
         points = write_scans(drive, part, on_scan)
         _write_sides(drive, part)
+        write_kitti(poses, _in_camera(drive))
         (part / MARK).unlink()
         if sequence.exists():
             shutil.rmtree(sequence)
         os.replace(part, sequence)
         done = True
-        write_kitti(poses, _in_camera(drive))
     except OSError as error:
         raise OutputError(f"{error.filename or out} cannot be written: {error.strerror or error}") from None
     finally:
         if not done:
             _keep_what_is_worth_it(out, part)
-    size = sum(file.stat().st_size for file in sequence.rglob("*") if file.is_file())
+    size = poses.stat().st_size + sum(file.stat().st_size for file in sequence.rglob("*") if file.is_file())
+    write_manifest(sequence, drive, command, points, size)
     return Recorded(sequence, poses, points, size)
 
 

@@ -12,16 +12,17 @@ from lslam.errors import UsageError
 from lslam.geometry import se3, so3
 from lslam.simulation.city import City
 from lslam.simulation.clearance import check_path
-from lslam.simulation.gnss import GnssModel
+from lslam.simulation.gnss import ORIGIN, GnssModel
 from lslam.simulation.imu import ImuModel, imu_named
 from lslam.simulation.lidar import RayScene, Roof, trace
 from lslam.simulation.lidar_models import LidarModel, lidar_named
 from lslam.simulation.motion import PosePath, smooth_motion, standing_start
 from lslam.simulation.moving import Mover, moving_meshes
+from lslam.simulation.osm_place import read_extract
 from lslam.simulation.places import build_place, populate
 from lslam.simulation.scenario_files import Scenario, scenario_named
 from lslam.simulation.sensors import Sensors, read_sensors
-from lslam.simulation.waypoints import WayPoints
+from lslam.simulation.waypoints import WayPoints, read_way_points
 from lslam.types.calibration import Calibration
 from lslam.types.gnss import GnssStream
 from lslam.types.imu import ImuStream
@@ -54,6 +55,7 @@ class SimulatedDrive:
         sensors: Sensors | None = None,
         movers: Sequence[Mover] = (),
         scene: RayScene | None = None,
+        origin: NDArray[np.float64] = ORIGIN,
     ) -> None:
         self.scenario, self.city, self.lidar, self.movers = scenario, city, lidar, list(movers)
         # One function of time for the rays, the truth and all other sensors.
@@ -70,7 +72,8 @@ class SimulatedDrive:
             self.stamps_ns, se3.relative(poses[0], poses), "lidar", source=f"simulation of {self.name}"
         )
         self.end = self.stamps_ns[-1] / 1e9 + 1 / self.rate_hz
-        self.readings = read_sensors(self.vehicle, sensors or Sensors(), lidar.name, self.end, seed)
+        self.sensors = sensors or Sensors()
+        self.readings = read_sensors(self.vehicle, self.sensors, scenario.carrier, self.end, seed, origin)
         imu, gnss = self.readings.imu, self.readings.gnss
         self.calibration = Calibration(
             T_cam0_lidar=kitti_like_cam0(),
@@ -122,7 +125,9 @@ def simulate(
     start_speed: float | None = None,
     motion_compensated: bool | None = None,
     settings: Iterable[str] = (),
-    way_points: WayPoints | None = None,
+    way_points: WayPoints | Path | None = None,
+    osm: Path | None = None,
+    origin: Iterable[float] | None = None,
     imu: str | ImuModel | None = None,
     gnss: GnssModel | None = None,
     static_start: float = 0.0,
@@ -137,7 +142,11 @@ def simulate(
     speed, start_speed : m/s, cruising and at the first scan (0: from rest); slower in bends that need it
     motion_compensated : False fires every column from its own pose and gives times per point; None: as the scenario says
     settings : what to change in a scenario given by name, "world.relief=1"
-    way_points : a line to take instead of the scenario's; the city is built round it
+    way_points : a line, or a file of one, to take instead of the scenario's; the city is built round it
+    osm : an OpenStreetMap extract (XML or Overpass JSON) whose buildings are the city, x east and y north of the origin;
+        without `way_points` the drive goes along its streets
+    origin : lat, lon (deg) and perhaps height (m) of the city's x = y = 0 (default: the middle of the extract's buildings,
+        else the first point of GeoJSON way-points, else a place of no meaning)
     imu, gnss : an IMU (a name of `IMUS` or a model) and a receiver that ride along
     static_start : s of standing still before the drive begins; its scans come on top of a default `count`
 
@@ -145,6 +154,7 @@ def simulate(
     ------
     UsageError : unknown names and keys, numbers out of range, more scans than the street is long, a path that no body could
         take: through a building or the ground, or too sharp a bend
+    InputError : a file that is missing or broken, an extract without buildings or far from the path
     """
     chosen = scenario_named(scenario, settings) if isinstance(scenario, str) else scenario
     model = chosen.lidar if lidar is None else lidar
@@ -160,7 +170,17 @@ def simulate(
         raise UsageError(f"--static-start {static_start:g} is out of range: 0 to {LONGEST_STAND:g} s")
     sensors = Sensors(imu_named(imu) if isinstance(imu, str) else imu, gnss)
     chosen = chosen.model_copy(update={"speed": cruise, "start_speed": begin})
-    place = build_place(chosen, seed, count, way_points)
+    given = None if origin is None else checked_origin(origin)
+    extract = None if osm is None else read_extract(osm, given)
+    at = given if extract is None else extract.origin
+    line = read_way_points(way_points, at) if isinstance(way_points, Path) else way_points
+    if at is None:
+        at = line.origin if line is not None and line.origin is not None else ORIGIN
+    if osm is not None:
+        chosen = chosen.model_copy(
+            update={"name": osm.stem, "summary": f"As {chosen.name!r}, in the city of {osm.name}."}
+        )
+    place = build_place(chosen, seed, count, line, extract)
     scene = RayScene(place.city.mesh)
     if chosen.path.clearance:
         check_path(scene, place.city, place.path.poses, place.path.duration)
@@ -171,7 +191,20 @@ def simulate(
         scans += 0 if count is not None else int((path.duration - place.path.duration) * chosen.rate_hz)
     movers = populate(chosen, place.city, path, seed)
     still = chosen.motion_compensated if motion_compensated is None else motion_compensated
-    return SimulatedDrive(chosen, place.city, path, model, scans, seed, still, sensors, movers, scene)
+    return SimulatedDrive(chosen, place.city, path, model, scans, seed, still, sensors, movers, scene, at)
+
+
+def checked_origin(origin: Iterable[float]) -> NDArray[np.float64]:
+    """(3,) lat, lon (deg), height (m) of two or three numbers; raises UsageError when they are no place on the Earth."""
+    values = [float(value) for value in origin]
+    if len(values) not in (2, 3) or not np.isfinite(values).all():
+        raise UsageError(f"--origin {','.join(f'{v:g}' for v in values)}: expected LAT,LON or LAT,LON,HEIGHT")
+    lat, lon = values[:2]
+    if not (abs(lat) < 90 and abs(lon) <= 180):
+        raise UsageError(
+            f"--origin {lat:g},{lon:g} is out of range: latitude above -90 and below 90, longitude -180 to 180 degrees"
+        )
+    return np.array([*values, 0.0][:3])
 
 
 def kitti_like_cam0() -> NDArray[np.float64]:

@@ -18,6 +18,7 @@ from lslam.simulation.gnss import (
     ORIGIN,
     T_CAR_ANTENNA,
     T_DRONE_ANTENNA,
+    T_WALKER_ANTENNA,
     GnssModel,
     SimulatedGnss,
     check_gnss,
@@ -32,6 +33,22 @@ Floats = NDArray[np.float64]
 IMU_FILE, GNSS_FILE, TRUTH = "imu.csv", "gnss.csv", "truth"
 TRUTH_HZ = 100
 _IMU_SEED, _GNSS_SEED = 2**32 - 11, 2**32 - 12  # of the generators; the scenarios count down from 2**32 - 1
+
+
+@dataclass(frozen=True)
+class Mounts:
+    """Where sensors sit on a carrier, in the LiDAR frame, (4, 4)."""
+
+    T_lidar_imu: Floats
+    T_lidar_antenna: Floats
+
+
+# In a car's boot and on its roof; what flies or is carried is light and small: the IMU shares the LiDAR's board.
+MOUNTS = {
+    "car": Mounts(T_CAR_IMU, T_CAR_ANTENNA),
+    "drone": Mounts(T_OUSTER_IMU, T_DRONE_ANTENNA),
+    "walker": Mounts(T_OUSTER_IMU, T_WALKER_ANTENNA),
+}
 
 
 @dataclass(frozen=True)
@@ -56,20 +73,19 @@ class Readings:
 
 
 def read_sensors(
-    motion: Motion, sensors: Sensors, lidar: str, end: float, seed: int, origin: Floats = ORIGIN
+    motion: Motion, sensors: Sensors, carrier: str, end: float, seed: int, origin: Floats = ORIGIN
 ) -> Readings:
     """Let `sensors` record from 0 to `end` s of `motion`, each with a generator of its own.
 
-    lidar : name of the LiDAR; an Ouster (`os...`) has its IMU inside and flies, anything else stands on a car
+    carrier : a key of `MOUNTS`, which says where they sit
     """
-    is_ouster = lidar.startswith("os")
-    imu = gnss = None
+    mounts, imu, gnss = MOUNTS[carrier], None, None
     if sensors.imu is not None:
-        mount = T_OUSTER_IMU if is_ouster else T_CAR_IMU
-        imu = simulate_imu(motion, sensors.imu, mount, end, np.random.default_rng([seed, _IMU_SEED]))
+        generator = np.random.default_rng([seed, _IMU_SEED])
+        imu = simulate_imu(motion, sensors.imu, mounts.T_lidar_imu, end, generator)
     if sensors.gnss is not None:
-        mount = T_DRONE_ANTENNA if is_ouster else T_CAR_ANTENNA
-        gnss = simulate_gnss(motion, sensors.gnss, mount, origin, end, np.random.default_rng([seed, _GNSS_SEED]))
+        generator = np.random.default_rng([seed, _GNSS_SEED])
+        gnss = simulate_gnss(motion, sensors.gnss, mounts.T_lidar_antenna, origin, end, generator)
     return Readings(imu, gnss, np.asarray(origin, np.float64))
 
 

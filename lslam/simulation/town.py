@@ -64,7 +64,7 @@ def build_town(
     network = Network(streets)
     builder = MeshBuilder()
     for street in streets:
-        _add_road(builder, street, network, terrain, layout, rng)
+        add_road(builder, street, network, terrain, layout, rng)
     # Grass closes the dead ends: their last metres do not count as road.
     add_ground(
         builder, [_shortened(street, layout.band) for street in streets], terrain, layout, rng, 0.75 * layout.pavement
@@ -74,7 +74,7 @@ def build_town(
         for street in streets if first else main:
             for side in (1, -1):
                 add_row(builder, lots, street, terrain, layout, rng, side, first)
-    places = _Places(network, layout)
+    places = Places(network, layout)
     for street in streets:
         for side in (1, -1):
             add_street_furniture(builder, street, terrain, layout, rng, side, places)
@@ -82,7 +82,7 @@ def build_town(
     return City(builder.build(), terrain, main[0], lots.footprints, lots.heights, streets)
 
 
-class _Places:
+class Places:
     """Whether a place beside a street is free: not on another road, and not where something stands already."""
 
     def __init__(self, network: Network, layout: Layout) -> None:
@@ -90,6 +90,7 @@ class _Places:
         self._taken = np.zeros((0, 2))
 
     def __call__(self, xy: Floats, offset: float, yaw: float) -> bool:
+        """Take the place (2,) of a thing `offset` m from the middle of its street, unless it is not free."""
         is_car = offset < self._road
         if self._network.distance(xy) < offset - (0.15 if is_car else 0.05):
             return False
@@ -156,7 +157,7 @@ def _until_met(start: Floats, ray: Floats, length: float, taken: Any, layout: La
     return smooth_curve(points[[0, end - 1]], closed=False)
 
 
-def _add_road(
+def add_road(
     builder: MeshBuilder, street: Curve, network: Network, terrain: Terrain, layout: Layout, rng: np.random.Generator
 ) -> None:
     """Road, kerbs and pavements as one strip along the street; no kerb where another road passes."""

@@ -24,18 +24,24 @@ LONGEST = 50_000.0  # m between neighbours
 
 @dataclass(frozen=True)
 class WayPoints:
-    """Points (N, 2) or (N, 3), m, x and y level and z up when it is given; a closed line does not repeat its first point."""
+    """Points (N, 2) or (N, 3), m, x and y level and z up when it is given; a closed line does not repeat its first point.
+
+    origin : (3,) lat, lon (deg), height (m) of x = y = 0 where the points are positions on the Earth
+    is_placed : False for a mere shape, which may be turned and shifted
+    """
 
     points: Floats
     closed: bool = False
+    origin: Floats | None = None
+    is_placed: bool = True
 
 
-def read_way_points(path: Path) -> WayPoints:
+def read_way_points(path: Path, origin: NDArray[Any] | None = None) -> WayPoints:
     """Read way-points by the ending of the file: .toml, .csv, .geojson or .json; anything else is a trajectory.
 
     TOML has `points = [[x, y], ...]` and `closed = true`; CSV has x, y and perhaps z per line, m; GeoJSON has one LineString
-    or Polygon in degrees, whose first point becomes the origin, x east, y north. Of a trajectory (KITTI, TUM, EuRoC) the
-    level shape is taken, beginning along +x.
+    or Polygon in degrees, x east and y north of `origin` (3,) lat, lon (deg), height (m), else of its first point. Of a
+    trajectory (KITTI, TUM, EuRoC) the level shape is taken, beginning along +x.
 
     Raises
     ------
@@ -43,11 +49,12 @@ def read_way_points(path: Path) -> WayPoints:
     """
     if not path.is_file():
         raise InputError(f"{path} does not exist: --path takes a trajectory or a file of way-points")
-    readers = {".toml": _from_toml, ".geojson": _from_geojson, ".json": _from_geojson}
     if path.suffix == ".csv" and _is_table(path):
         found = _from_csv(path)
-    elif path.suffix in readers:
-        found = readers[path.suffix](path)
+    elif path.suffix == ".toml":
+        found = _from_toml(path)
+    elif path.suffix in (".geojson", ".json"):
+        found = _from_geojson(path, origin)
     else:
         found = _from_trajectory(path)
     return _checked(path, found)
@@ -103,7 +110,7 @@ def _is_number(text: str) -> bool:
     return True
 
 
-def _from_geojson(path: Path) -> WayPoints:
+def _from_geojson(path: Path, origin: NDArray[Any] | None) -> WayPoints:
     try:
         tree = json.loads(_text(path))
     except json.JSONDecodeError as error:
@@ -118,10 +125,11 @@ def _from_geojson(path: Path) -> WayPoints:
     if not ((np.abs(degrees[:, 0]) <= 180) & (np.abs(degrees[:, 1]) <= 90)).all():
         raise InputError(f"{path}: coordinates of GeoJSON are longitude and latitude in degrees")
     fixes = np.column_stack([degrees[:, 1], degrees[:, 0], np.zeros(len(degrees))])
-    local = to_local(fixes, fixes[0])[:, :2]
+    at = fixes[0] if origin is None else np.asarray(origin, np.float64)
+    local = to_local(fixes, at)[:, :2]
     points = np.column_stack([local, degrees[:, 2]]) if degrees.shape[1] == 3 else local
     closed = len(points) > 3 and bool(np.linalg.norm(local[0] - local[-1]) < 0.1)
-    return WayPoints(points[:-1] if closed else points, closed)
+    return WayPoints(points[:-1] if closed else points, closed, at)
 
 
 def _geometries(tree: Any) -> Any:
@@ -149,7 +157,7 @@ def _from_trajectory(path: Path) -> WayPoints:
     if len(xy) > 1:
         c, s = xy[1] / np.linalg.norm(xy[1])
         xy = xy @ np.array([[c, -s], [s, c]])
-    return WayPoints(xy)
+    return WayPoints(xy, is_placed=False)
 
 
 def _array(path: Path, values: Any) -> Floats:

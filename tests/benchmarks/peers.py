@@ -1,8 +1,8 @@
 """The peers our registration is measured against, each as a function from scans to poses with its seconds per scan.
 
 Every peer gets the same arrays from the same reader and is timed around its whole register call: its own
-preprocessing, alignment and map update. kiss-icp runs with its defaults; small_gicp as GICP against a keyframe local map
-and as VGICP scan-to-model (its own example), with two threads.
+preprocessing, alignment and map update. kiss-icp and genz-icp run with their defaults; small_gicp as GICP against
+a keyframe local map and as VGICP scan-to-model (its own example), with two threads.
 """
 
 from __future__ import annotations
@@ -34,6 +34,19 @@ def kiss_icp() -> Register:
     def register(points: NDArray[np.float32]) -> NDArray[np.float64]:
         kiss.register_frame(points.astype(np.float64), np.zeros(len(points)))
         return np.array(kiss.last_pose)
+
+    return register
+
+
+def genz_icp() -> Register:
+    from genz_icp.config import GenZConfig
+    from genz_icp.genz_icp import GenZICP
+
+    genz = GenZICP(GenZConfig())
+
+    def register(points: NDArray[np.float32]) -> NDArray[np.float64]:
+        genz.register_frame(points.astype(np.float64), np.zeros(0))
+        return np.array(genz.last_pose)
 
     return register
 
@@ -86,6 +99,7 @@ PEERS: dict[str, Callable[[], Register]] = {
     "kiss-icp": kiss_icp,
     "small-gicp": gicp_keyframes,
     "small-vgicp": vgicp_model,
+    "genz-icp": genz_icp,
 }
 
 

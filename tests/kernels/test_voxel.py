@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from lslam.kernels import voxel
 
+UNTIMED = np.zeros(0, np.float32)
 NO_BOX = np.zeros(0)
 
 
@@ -90,7 +91,7 @@ def test_gate_without_limits_drops_only_what_is_no_point() -> None:
 def test_centroids_and_scatter_are_those_of_numpy(size: float) -> None:
     points = cloud(1, spread=4.0)
     first, voxel_of = groups(points, size)
-    out, scatter = voxel.centroids(points, size)
+    out, _, scatter = voxel.centroids(points, UNTIMED, size)
     assert len(out) == len(first)
     counts = np.bincount(voxel_of)
     assert counts.max() > 1
@@ -105,7 +106,7 @@ def test_centroids_and_scatter_are_those_of_numpy(size: float) -> None:
 
 def test_centroids_far_from_the_origin_keep_their_digits() -> None:
     points = (cloud(2, 2000, 0.5) + np.array([90_000.0, -70_000.0, 300.0])).astype(np.float32)
-    out, scatter = voxel.centroids(points, 1.0)
+    out, _, scatter = voxel.centroids(points, UNTIMED, 1.0)
     _, voxel_of = groups(points, 1.0)
     p = points.astype(np.float64)
     for j in range(len(out)):
@@ -121,18 +122,18 @@ def test_first_points_are_those_of_numpy(size: float) -> None:
 
 def test_one_point_and_none() -> None:
     one = np.array([[1.0, 2.0, 3.0]], np.float32)
-    out, scatter = voxel.centroids(one, 0.5)
+    out, _, scatter = voxel.centroids(one, UNTIMED, 0.5)
     np.testing.assert_array_equal(out, one)
     np.testing.assert_array_equal(scatter, np.zeros((1, 6)))
     none = np.zeros((0, 3), np.float32)
-    assert voxel.centroids(none, 0.5)[0].shape == (0, 3)
+    assert voxel.centroids(none, UNTIMED, 0.5)[0].shape == (0, 3)
     assert voxel.first_points(none, 0.5).shape == (0,)
 
 
 def test_points_on_voxel_borders_belong_to_the_upper_voxel() -> None:
     points = np.array([[0.0, 0, 0], [1.0, 0, 0], [-1.0, 0, 0], [0.999, 0, 0], [-0.001, 0, 0]], np.float32)
     assert voxel.first_points(points, 1.0).tolist() == [0, 1, 2]
-    np.testing.assert_allclose(voxel.centroids(points, 1.0)[0][:, 0], [0.4995, 1.0, -0.5005], atol=1e-6)
+    np.testing.assert_allclose(voxel.centroids(points, UNTIMED, 1.0)[0][:, 0], [0.4995, 1.0, -0.5005], atol=1e-6)
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1e30, -314573.1])
@@ -140,8 +141,8 @@ def test_points_that_have_no_voxel_harm_nobody_else(bad: float) -> None:
     good = cloud(4, 300, 3.0)
     points = np.concatenate([np.array([[0.0, 0.0, bad]], np.float32), good])
     assert set(groups(good, 0.3)[0] + 1) <= set(voxel.first_points(points, 0.3).tolist())
-    out, scatter = voxel.centroids(points, 0.3)
-    expected, expected_scatter = voxel.centroids(good, 0.3)
+    out, _, scatter = voxel.centroids(points, UNTIMED, 0.3)
+    expected, _, expected_scatter = voxel.centroids(good, UNTIMED, 0.3)
     np.testing.assert_array_equal(out[-len(expected) :], expected)
     np.testing.assert_array_equal(scatter[-len(expected) :], expected_scatter)
     assert len(out) == len(expected) + 1
@@ -150,5 +151,24 @@ def test_points_that_have_no_voxel_harm_nobody_else(bad: float) -> None:
 def test_results_do_not_depend_on_the_memory_layout_of_the_caller() -> None:
     wide = np.random.default_rng(5).uniform(-5, 5, (4000, 4)).astype(np.float32)
     view, copy = wide[:, :3], np.ascontiguousarray(wide[:, :3])
-    assert voxel.centroids(view, 0.7)[0].tobytes() == voxel.centroids(copy, 0.7)[0].tobytes()
+    assert voxel.centroids(view, UNTIMED, 0.7)[0].tobytes() == voxel.centroids(copy, UNTIMED, 0.7)[0].tobytes()
     np.testing.assert_array_equal(voxel.first_points(view, 0.7), voxel.first_points(copy, 0.7))
+
+
+def test_mean_times_and_the_two_halves_of_a_sweep() -> None:
+    """A wall where the sweep closes: seen first and last, with the sensor elsewhere. Its centroids stay apart."""
+    points = cloud(6, 6000, 2.0)
+    times = np.random.default_rng(6).uniform(0.0, 0.1, len(points)).astype(np.float32)
+    times[:2] = [0.0, 0.1]
+    out, mean_times, scatter = voxel.centroids(points, times, 0.7)
+    is_late = times > 0.05
+    parts = [voxel.centroids(points[part], UNTIMED, 0.7) for part in (~is_late, is_late)]
+    together = np.concatenate([part[0] for part in parts])
+    assert len(out) == len(together) > len(voxel.centroids(points, UNTIMED, 0.7)[0])
+    order, wanted = np.lexsort(out.T), np.lexsort(together.T)
+    np.testing.assert_allclose(out[order], together[wanted], atol=1e-6)
+    np.testing.assert_allclose(scatter[order], np.concatenate([part[2] for part in parts])[wanted], atol=1e-6)
+    _, voxel_of = groups(points[is_late], 0.7)
+    means = np.bincount(voxel_of, times[is_late].astype(float)) / np.bincount(voxel_of)
+    np.testing.assert_allclose(mean_times[mean_times > 0.05], means, rtol=1e-5)
+    assert len(voxel.centroids(points, UNTIMED, 0.7)[1]) == 0

@@ -37,6 +37,11 @@ def block(seed: int = 0) -> tuple[tuple[Scan, ...], Floats]:
     return tuple(drive), drive.ground_truth.poses
 
 
+def feed(icp: Icp, scan: Scan, prior: MotionPrior) -> ScanResult:
+    prepared = icp.prepare(scan)
+    return icp.update(scan, prepared, prior, icp.register(scan, prepared, prior))
+
+
 class Driver:
     """The front end's loop with its odometry at hand: predict, prepare, register, correct."""
 
@@ -46,7 +51,7 @@ class Driver:
 
     def feed(self, scan: Scan) -> ScanResult:
         prior = MotionPrior(np.zeros(1), self.motion.predict(scan.stamp_ns)[None])
-        result = self.icp.register(scan, self.icp.prepare(scan), prior)
+        result = feed(self.icp, scan, prior)
         self.motion.correct(scan.stamp_ns, result.T_world_lidar)
         return result
 
@@ -162,7 +167,7 @@ def test_warming_up_leaves_no_trace() -> None:
     scans, _ = block()
     prior = MotionPrior(np.zeros(1), np.eye(4)[None])
     for k in (0, 1):
-        a, b = (icp.register(scans[k], icp.prepare(scans[k]), prior) for icp in (warm, cold))
+        a, b = (feed(icp, scans[k], prior) for icp in (warm, cold))
         assert a.T_world_lidar.tobytes() == b.T_world_lidar.tobytes()
 
 

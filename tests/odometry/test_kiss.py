@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from lslam.config.config import Config
 from lslam.errors import InputError
 from lslam.odometry.kiss import Kiss, create
+from lslam.preprocessing.prepare import gate_points
 from lslam.simulation.scenarios import simulate
 from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan import Scan
@@ -133,3 +134,18 @@ def test_a_missing_package_is_said_with_the_way_out(monkeypatch: pytest.MonkeyPa
     monkeypatch.setitem(sys.modules, "kiss_icp.kiss_icp", None)
     with pytest.raises(InputError, match="pip install kiss-icp"):
         create(Config())
+
+
+def test_what_the_user_takes_out_is_taken_out_of_kiss_too() -> None:
+    scans, _ = block(True)
+    everything, _ = create(Config()).prepare(scans[0])
+    options: tuple[dict[str, Any], ...] = (
+        {"remove_ground": True},
+        {"denoise": True},
+        {"ego_box": (-10.0, 10.0, -10.0, 10.0, -3.0, 3.0)},
+    )
+    for option in options:
+        config = Config.model_validate({"preprocess": option})
+        kept, _ = create(config).prepare(scans[0])
+        np.testing.assert_array_equal(kept, scans[0].points[gate_points(scans[0].points, config.preprocess)])
+        assert 0 < len(kept) < len(everything)

@@ -61,13 +61,21 @@ def test_what_ended_a_run() -> None:
 
 
 @pytest.mark.parametrize(
-    ("compensated", "method", "words"),
-    [(True, "icp", "none needed"), (None, "icp", "no deskew: .*not known"), (False, "icp", "no deskew: .*is not motion"),
-     (None, "kiss-icp", "by kiss-icp")],
+    ("compensated", "has_times", "how", "words"),
+    [(True, True, "twice", "none needed"), (None, False, "twice", "no deskew: .*not known.* no times"),
+     (False, False, "twice", "no deskew: .*is not motion"), (False, True, "twice", "twice$"), (None, True, "twice", "twice$"),
+     (False, True, "", "no deskew: icp takes each scan as one instant")],
 )  # fmt: skip
-def test_deskew_is_stated(compensated: bool | None, method: str, words: str) -> None:
+def test_deskew_is_stated(compensated: bool | None, has_times: bool, how: str, words: str) -> None:
     stub = Stub([], motion_compensated=compensated)
-    assert re.match(words, describe_deskew(stub, method))
+    assert re.match(words, describe_deskew(stub, Config(), has_times, how))
+
+
+def test_deskew_switched_off_is_stated() -> None:
+    off = load_config(None, ["preprocess.deskew=false"], {})
+    assert (
+        describe_deskew(Stub([], motion_compensated=False), off, True, "twice") == "no deskew: preprocess.deskew is off"
+    )
 
 
 def test_peak_memory_is_in_megabytes() -> None:

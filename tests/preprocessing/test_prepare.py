@@ -13,6 +13,8 @@ from lslam.errors import InputError
 from lslam.kernels import voxel
 from lslam.preprocessing.prepare import COARSEST_SOURCE, PreparedPoints, gate_points, prepare_points
 
+UNTIMED = np.zeros(0, np.float32)
+
 
 def street(n: int, seed: int = 0, length: float = 60.0) -> NDArray[np.float32]:
     """Ground and two house fronts."""
@@ -32,8 +34,8 @@ def test_map_points_are_centroids_and_source_points_centroids_of_these() -> None
     config = PreprocessConfig(range_max=50.0, downsample="grid", source_voxel=1.2)
     out = prepare_points(points, config)
     kept = points[gate_points(points, config)]
-    map_points, _ = voxel.centroids(kept, config.map_leaf)
-    source, scatter = voxel.centroids(map_points, 1.2)
+    map_points, _, _ = voxel.centroids(kept, UNTIMED, config.map_leaf)
+    source, _, scatter = voxel.centroids(map_points, UNTIMED, 1.2)
     np.testing.assert_array_equal(out.map_points, map_points)
     np.testing.assert_array_equal(out.source, source)
     np.testing.assert_array_equal(out.scatter, scatter)
@@ -53,7 +55,7 @@ def test_sparse_scans_keep_all_their_map_points_and_wide_ones_stop_at_the_coarse
     assert len(sparse.source) == pytest.approx(len(sparse.map_points), rel=0.05)
     wide = np.random.default_rng(0).uniform(-90, 90, (200_000, 3)).astype(np.float32)
     config = PreprocessConfig(range_max=200.0)
-    coarsest = voxel.centroids(prepare_points(wide, config).map_points, COARSEST_SOURCE)[0]
+    coarsest = voxel.centroids(prepare_points(wide, config).map_points, UNTIMED, COARSEST_SOURCE)[0]
     assert len(prepare_points(wide, config).source) == len(coarsest) > config.source_points_max
 
 

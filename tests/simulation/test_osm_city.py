@@ -14,13 +14,12 @@ from numpy.typing import NDArray
 from shapely import MultiPolygon, contains_xy, points
 
 from lslam.errors import InputError
-from lslam.formats.osm_buildings import osm_from_buildings
-from lslam.formats.osm_files import ATTRIBUTION, write_osm
 from lslam.simulation.curve import smooth_curve
 from lslam.simulation.extrusion import extrude
 from lslam.simulation.lidar import RayScene
 from lslam.simulation.mesh import MeshBuilder, Surface
-from lslam.simulation.osm_city import OsmCity, build_osm_city, city_from_osm
+from lslam.simulation.osm_city import OsmCity, build_osm_city
+from lslam.simulation.osm_place import read_extract
 from lslam.simulation.terrain import flat, rolling
 from lslam.types.building import Building, Footprint, footprint_polygon
 
@@ -177,7 +176,7 @@ def test_walls_reach_the_lowest_ground(city: OsmCity) -> None:
 
 def test_a_street_is_paved() -> None:
     street = smooth_curve(np.column_stack([np.arange(-40.0, 61, 5), np.full(21, -20.0)]), closed=False)
-    paved = build_osm_city(BUILDINGS, rolling(np.random.default_rng(1)), np.random.default_rng(3), street)
+    paved = build_osm_city(BUILDINGS, rolling(np.random.default_rng(1)), np.random.default_rng(3), [street])
     y = np.array([-20.0, -23.5, -25.5, -32.0])
     _, surface = shoot(paved, np.column_stack([np.zeros(4), y, np.full(4, 50.0)]), np.tile([0, 0, -1.0], (4, 1)))
     assert surface.tolist() == [Surface.ROAD, Surface.ROAD, Surface.PAVEMENT, Surface.LAWN]
@@ -195,32 +194,19 @@ def test_same_seed_same_city_and_neighbours_change_nothing(city: OsmCity) -> Non
     assert {tuple(row) for row in kept.tolist()} < {tuple(row) for row in walls.tolist()}
 
 
-def test_bad_input_gets_one_sentence(tmp_path: Path) -> None:
+def test_without_buildings_there_is_no_city() -> None:
     with pytest.raises(InputError, match="at least one building"):
         build([])
-    path = tmp_path / "map.osm"
-    write_osm(path, osm_from_buildings(BUILDINGS, ORIGIN, ATTRIBUTION))
-    rng = np.random.default_rng(0)
-    drive = np.array([[0.0, -10.0], [100, -10]])
-    near = city_from_osm(path, ORIGIN, flat(), rng, drive)
-    assert len(near.buildings) == len(BUILDINGS)
-    assert near.attribution == ATTRIBUTION
-    with pytest.raises(InputError, match=r"map\.osm has no building within 150 m of the path, the nearest is 4\.9 km"):
-        city_from_osm(path, ORIGIN, flat(), rng, drive - [0, 4900])
-    with pytest.raises(InputError, match=r"map\.osm lies .* away from the origin"):
-        city_from_osm(path, ORIGIN + np.array([2.0, 0, 0]), flat(), rng)
-    path.write_text("<osm></osm>")
-    with pytest.raises(InputError, match=r"map\.osm holds no building outline"):
-        city_from_osm(path, ORIGIN, flat(), rng)
     with pytest.raises(ValueError, match="no height"):
-        extrude(MeshBuilder(), replace(BUILDINGS[0], height=None), 0.0, 0.0, rng)
+        extrude(MeshBuilder(), replace(BUILDINGS[0], height=None), 0.0, 0.0, np.random.default_rng(0))
 
 
 def test_a_real_district_is_raised_in_seconds(recordings: Callable[[str], Path]) -> None:
     path = recordings("mcd_kth_day_06") / "mcd_kth_day_06" / "kth.osm"
     start = time.perf_counter()
     origin = np.array([59.348268650, 18.073204280, 0.0])
-    district = city_from_osm(path, origin, rolling(np.random.default_rng(0)), np.random.default_rng(1))
+    found = read_extract(path, origin).buildings.buildings
+    district = build_osm_city(found, rolling(np.random.default_rng(0)), np.random.default_rng(1))
     assert time.perf_counter() - start < 20
     assert len(district.buildings) == 72
     assert all(b.height is not None for b in district.buildings)

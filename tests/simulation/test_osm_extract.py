@@ -18,10 +18,11 @@ from lslam.formats.osm_buildings import buildings_of, osm_from_buildings
 from lslam.formats.osm_files import ATTRIBUTION, read_osm, write_osm
 from lslam.simulation.city import City
 from lslam.simulation.mesh import Surface
-from lslam.simulation.osm_city import build_osm_city, city_from_osm
+from lslam.simulation.osm_city import build_osm_city
 from lslam.simulation.osm_extract import Extracts, city_buildings, write_extracts
 from lslam.simulation.osm_faults import MapFaults, draw_perturbation
 from lslam.simulation.osm_perturb import Change, perturb, read_perturbation, write_perturbation
+from lslam.simulation.osm_place import read_extract
 from lslam.simulation.scenarios import simulate
 from lslam.simulation.terrain import flat, rolling
 from lslam.types.building import Building, Footprint, footprint_polygon
@@ -222,7 +223,10 @@ def test_buildings_not_yet_built_stand_on_free_ground(block: City, tmp_path: Pat
 def test_real_maps_are_credited_in_all_that_is_made_of_them(recordings: Callable[[str], Path], tmp_path: Path) -> None:
     source = recordings("mcd_kth_day_06") / "mcd_kth_day_06" / "kth.osm"
     origin = np.array([59.348268650, 18.073204280, 0.0])
-    city = city_from_osm(source, origin, rolling(np.random.default_rng(0)), np.random.default_rng(1))
+    read = read_extract(source, origin).buildings
+    city = build_osm_city(
+        read.buildings, rolling(np.random.default_rng(0)), np.random.default_rng(1), attribution=read.attribution
+    )
     extracts = write_extracts(tmp_path, city, origin, np.random.default_rng(0))
     assert json.loads(extracts.record.read_text(encoding="utf-8"))["attribution"] == ATTRIBUTION
     for path in (extracts.exact, extracts.perturbed):

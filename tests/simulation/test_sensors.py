@@ -111,6 +111,28 @@ def test_nothing_that_reads_the_sequence_needs_its_truth(folder: Path, tmp_path:
     np.testing.assert_array_equal(sequence.scan(3).points, open_sequence(folder).scan(3).points)
 
 
+def test_sensors_sit_where_the_carrier_has_room_for_them_whatever_the_lidar() -> None:
+    """A car's roof is below its LiDAR, a drone's belly above it; a hand holds less than an arm's length."""
+    for name, lidar in (("urban", "os1-32"), ("small-eight", "vlp16"), ("walk", "os1-64"), ("corridor", "hdl64")):
+        bare = ["world.levels=0", "traffic.cars=0", "traffic.people=0"]
+        made = simulate(name, lidar=lidar, count=2, imu="ideal", gnss=GnssModel(), settings=bare)
+        T_imu, T_antenna = made.calibration.T_lidar_imu, made.calibration.T_lidar_gnss
+        assert T_imu is not None
+        assert T_antenna is not None
+        imu, antenna = T_imu[:3, 3], T_antenna[:3, 3]
+        if made.scenario.carrier == "car":
+            behind, ahead, aside, below = made.scenario.roof or (0.95, 0.75, 0.53, 0.3)
+            assert -behind <= antenna[0] <= ahead
+            assert abs(antenna[1]) <= aside
+            assert -below <= antenna[2] <= 0, "on the roof, out of the LiDAR's level view"
+            assert imu[2] < -below, "inside the car"
+            assert imu[2] > -made.scenario.lidar_height, "above the ground"
+        else:
+            assert np.linalg.norm(imu) < 0.1
+            assert 0.2 < antenna[2] < 0.6, "above the LiDAR, under the sky"
+            assert np.hypot(*antenna[:2]) < 0.15
+
+
 def test_static_start_comes_on_top_of_the_drive() -> None:
     plain, waiting = simulate("street"), simulate("street", static_start=2.0)
     assert waiting.ground_truth is not None

@@ -1,0 +1,68 @@
+"""Points that lie on the ground, found by height alone: no rings, no mounting height, on slopes and under a tilted sensor.
+
+First the dominant plane: of all planes through three of the lowest points of a grid, the one with most lowest points
+near it and fewest below (RANSAC, Fischler and Bolles 1981). It levels the scan, so the tilt of a drone is no slope. Then the
+slope filter of Vosselman (2000): a point is no ground when another one lies so much lower that the ground between them
+would be steeper than `slope`. Mirrors and puddles put points under the ground: what no such slope joins to the plane
+under the sensor is not asked for its opinion.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.geometry import so3
+from lslam.kernels import ground
+
+Floats = NDArray[np.float64]
+
+# m; cells of the grid, and the farthest that ground is looked for.
+CELL = 0.5
+REACH = 150.0
+TRIPLES = 200
+# Planes steeper than 40 deg against the sensor are walls or roofs.
+UPRIGHT = float(np.cos(np.deg2rad(40.0)))
+
+
+def above_ground(points: NDArray[np.float32], slope: float, tolerance: float) -> NDArray[np.int64]:
+    """Indices of the points (N, 3), m, LiDAR frame, that do not lie on the ground, increasing.
+
+    slope : steepest ground, m per m, against the dominant plane; tolerance : height that still counts as ground, m.
+    Without a plane to be found nothing is levelled and the slope is that against the sensor's own horizontal.
+    """
+    if len(points) < 3:
+        return np.arange(len(points))
+    half = int(np.ceil(min(float(np.abs(points).max()) * np.sqrt(3.0), REACH) / CELL)) + 1
+    R, floor = levelling(points, tolerance, half)
+    index = ground.lowest(points, R, CELL, half)
+    low = points[index[index >= 0]].astype(np.float64) @ R.T
+    is_under = low[:, 2] < floor - tolerance - slope * np.hypot(low[:, 0], low[:, 1])
+    height = np.full(len(index), ground.EMPTY)
+    height[index >= 0] = np.where(is_under, ground.EMPTY, low[:, 2])
+    top = ground.envelope(height.reshape(2 * half, 2 * half), slope * CELL, tolerance)
+    return ground.above(points, R, CELL, half, top, tolerance)
+
+
+def levelling(points: NDArray[np.float32], tolerance: float, half: int) -> tuple[Floats, float]:
+    """(3, 3) rotation that makes the dominant plane of the lowest points horizontal, and its height then, m.
+
+    Without such a plane the identity and minus infinity.
+    """
+    index = ground.lowest(points, np.eye(3), CELL, half)
+    low = points[index[index >= 0]].astype(np.float64)
+    if len(low) < 3:
+        return np.eye(3), -np.inf
+    triples = np.random.default_rng(0).integers(0, len(low), (TRIPLES, 3))
+    plane = ground.best_plane(low, triples, tolerance, UPRIGHT)
+    if not plane.any():
+        return np.eye(3), -np.inf
+    near = low[np.abs(low @ plane[:3] + plane[3]) <= tolerance]
+    _, _, axes = np.linalg.svd(near - near.mean(0), full_matrices=False)
+    normal = axes[2] * (1.0 if axes[2, 2] > 0 else -1.0)
+    if normal[2] < UPRIGHT:
+        normal = plane[:3]
+    axis = np.cross(normal, [0.0, 0.0, 1.0])
+    sine = float(np.linalg.norm(axis))
+    R = np.eye(3) if sine < 1e-9 else so3.exp(axis / sine * np.arctan2(sine, normal[2]))
+    return R, float((near @ R[2]).mean())

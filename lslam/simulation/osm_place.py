@@ -1,0 +1,139 @@
+"""A scenario in a real place: the line through an OpenStreetMap extract, the city along it, and what may move there."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.errors import InputError, UsageError
+from lslam.formats.osm_buildings import BuildingExtract, buildings_near, some_buildings_of
+from lslam.formats.osm_files import OsmData, read_osm
+from lslam.simulation.curve import smooth_curve
+from lslam.simulation.moving import Mover
+from lslam.simulation.osm_city import OsmCity, build_osm_city
+from lslam.simulation.osm_fit import fit_shape
+from lslam.simulation.osm_streets import DRIVABLE, WALKABLE, find_route, highways, side_roads, solid_ground
+from lslam.simulation.routes import TIGHTEST, Route, beside, given_route
+from lslam.simulation.scenario_files import Scenario
+from lslam.simulation.terrain import Terrain
+from lslam.simulation.waypoints import WayPoints
+
+log = logging.getLogger("lslam")
+
+Floats = NDArray[np.float64]
+
+REACH = 150.0  # m from the path: what stands farther away, no LiDAR here sees
+SIDE_ROADS = 100.0  # m from the path
+FARTHEST = 10_000.0  # m from the origin: beyond, single precision would blur the walls
+ELBOW_ROOM = 1.3  # m between a street's lane and the walls beside it
+_PROBE = 0.2  # s
+
+
+@dataclass(frozen=True)
+class MapExtract:
+    """An OpenStreetMap file as read: everything in it, and its buildings in the local frame at their origin."""
+
+    data: OsmData
+    buildings: BuildingExtract
+
+    @property
+    def origin(self) -> Floats:
+        """(3,) lat, lon (deg), height (m) of x = y = 0."""
+        return self.buildings.origin
+
+
+def read_extract(path: Path, origin: NDArray[Any] | None = None) -> MapExtract:
+    """Read `path` (OSM XML or Overpass JSON) into the local frame at `origin` (3,) lat, lon (deg), height (m).
+
+    Without `origin` it is the middle of all buildings, at height 0. Raises InputError naming the file: unreadable, without
+    buildings, far from the origin.
+    """
+    data = read_osm(path)
+    extract = some_buildings_of(data, _middle(data) if origin is None else np.asarray(origin, np.float64), path)
+    corners = np.concatenate([footprint.outer for b in extract.buildings for footprint in b.footprints])
+    away = float(np.linalg.norm(corners, axis=1).min())
+    if away > FARTHEST:
+        lat, lon = extract.origin[:2]
+        raise InputError(
+            f"{path}: its nearest building is {away / 1000:.1f} km away from the origin ({lat:.5f},{lon:.5f}): check --origin"
+        )
+    return MapExtract(data, extract)
+
+
+def route_in_map(scenario: Scenario, extract: MapExtract, way_points: WayPoints | None) -> Route:
+    """The line through the extract: `way_points`, a shape laid where it fits, or along the streets of the map.
+
+    Raises UsageError when there is nothing to drive along, or no room for the shape.
+    """
+    buildings, margin = extract.buildings.buildings, scenario.path.lane + ELBOW_ROOM
+    if way_points is None:
+        return _along_streets(scenario, extract, margin)
+    if not way_points.is_placed:
+        way_points = fit_shape(way_points, buildings, margin, extract.buildings.source)
+    return given_route(scenario, way_points)
+
+
+def city_of_map(
+    scenario: Scenario, extract: MapExtract, terrain: Terrain, rng: np.random.Generator, route: Route | None
+) -> OsmCity:
+    """The city within 150 m of `route`, or the whole extract; raises InputError when no building is that near."""
+    found, layout, flies = extract.buildings, scenario.layout, scenario.carrier == "drone"
+    buildings = found.buildings
+    if route is not None:
+        buildings = buildings_near(found, route.line.position(route.line.sample(5.0)), REACH)
+    # Below a flight there are only the roads of the map: it may pass over anything.
+    driven = [] if route is None or flies else [route.street]
+    roads = side_roads(
+        highways(extract.data, extract.origin, DRIVABLE),
+        solid_ground(buildings, ELBOW_ROOM),
+        None if route is None else route.line if flies else route.street,
+        0.0 if flies else layout.road,
+        SIDE_ROADS,
+    )
+    return build_osm_city(
+        buildings, terrain, rng, [*driven, *roads], layout, found.attribution, Path(found.source).name
+    )
+
+
+def keep_out_of_walls(movers: list[Mover], city: OsmCity, duration: float) -> list[Mover]:
+    """Those of `movers` that meet no wall from 0 to `duration` s: the map's houses know nothing of our pavements."""
+    from shapely import contains_xy
+
+    solid = solid_ground(city.buildings, 0.4)
+    times = np.arange(0.0, duration, _PROBE)
+    return [mover for mover in movers if not contains_xy(solid, mover.poses(times)[:, :2, 3]).any()]
+
+
+def _along_streets(scenario: Scenario, extract: MapExtract, margin: float) -> Route:
+    """Right of the middle of the longest street there is."""
+    lane, kinds = scenario.path.lane, WALKABLE if scenario.carrier == "walker" else DRIVABLE
+    radius = TIGHTEST[scenario.carrier] + lane + 1.0
+    if scenario.carrier == "drone":
+        radius = max(radius, 1.1 * scenario.speed**2 / scenario.lateral + lane)
+    source = extract.buildings.source
+    ways = highways(extract.data, extract.origin, kinds)
+    found = find_route(ways, extract.buildings.buildings, margin, radius)
+    if found is None:
+        raise UsageError(
+            f"{source} has {'no street' if not ways else 'no 50 m of street clear of walls'} to go along: give --path FILE "
+            f"with way-points; --osm {source} --plan map.png without --path draws the place to read them from"
+        )
+    street = smooth_curve(found, closed=False)
+    log.info("going along %.0f m of the streets of %s: --path FILE takes another line", street.length, source)
+    return Route(street, beside(street, -lane))
+
+
+def _middle(data: OsmData) -> Floats:
+    """(3,) lat, lon (deg) of the middle of the box round all buildings' nodes, as --origin takes them; height 0."""
+    ways = [way for way in data.ways.values() if "building" in way.tags]
+    members = {m.ref for r in data.relations.values() if "building" in r.tags for m in r.members if m.kind == "way"}
+    ways += [way for number, way in data.ways.items() if number in members]
+    fixes = np.array([data.nodes[node] for way in ways for node in way.nodes if node in data.nodes])
+    if not len(fixes):
+        fixes = np.array([*data.nodes.values()] or [(0.0, 0.0)])
+    return np.append(np.round((fixes.min(axis=0) + fixes.max(axis=0)) / 2, 7), 0.0)

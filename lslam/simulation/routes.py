@@ -1,0 +1,83 @@
+"""The line that a LiDAR takes and the street it belongs to: a scenario's own shape, or given way-points."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.errors import UsageError
+from lslam.simulation.curve import Curve, rounded_rectangle, smooth_curve, winding_line
+from lslam.simulation.scenario_files import Scenario
+from lslam.simulation.shapes import SHAPES
+from lslam.simulation.waypoints import WayPoints
+
+Floats = NDArray[np.float64]
+
+SPARE = 60.0  # m of street before the start and after the end of an open line
+TIGHTEST = {"car": 3.0, "drone": 1.0, "walker": 0.3}  # m, radius of a bend
+
+
+@dataclass(frozen=True)
+class Route:
+    """The middle of a street, the line along it, and heights of way-points over the distance along the line, if they have any."""
+
+    street: Curve
+    line: Curve
+    climb: tuple[Floats, Floats] | None = None
+
+
+def own_route(scenario: Scenario, rng: np.random.Generator) -> Route:
+    """The scenario's own street and line, scaled to its length."""
+    path = scenario.path
+    if path.shape == "block":
+        return _block(rng)
+    if path.shape == "street":
+        return _street(rng)
+    shape, closed = SHAPES[path.shape]
+    points = shape(rng)
+    climb = path.heights[1] - path.heights[0] if scenario.carrier == "drone" else 0.0
+    if closed and climb:
+        raise UsageError(f"path.heights {list(path.heights)} of a closed path differ: its end would not meet its start")
+    wanted = None if path.length is None else float(np.sqrt(path.length**2 - climb**2))
+    scale = 1.0
+    while True:
+        street = smooth_curve(scale * points, closed, path.smoothing)
+        line = beside(street, -path.lane)
+        if wanted is None or abs(line.length / wanted - 1) < 1e-4:
+            return Route(street, line)
+        scale *= wanted / line.length
+
+
+def given_route(scenario: Scenario, way_points: WayPoints) -> Route:
+    """A line through way-points, in metres as they are, and a street on its left."""
+    points = way_points.points
+    line = smooth_curve(points[:, :2], way_points.closed, scenario.path.smoothing)
+    street = beside(line, scenario.path.lane)
+    if points.shape[1] == 2:
+        return Route(street, line)
+    z = np.append(points[:, 2], points[0, 2]) if way_points.closed else points[:, 2]
+    xy = np.concatenate([points[:, :2], points[:1, :2]]) if way_points.closed else points[:, :2]
+    s = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(xy, axis=0), axis=1))])
+    return Route(street, line, (s * line.length / s[-1], z))
+
+
+def beside(curve: Curve, offset: float) -> Curve:
+    """The curve `offset` m to the left of `curve`."""
+    return smooth_curve(curve.beside(curve.sample(0.5), offset), curve.closed) if offset else curve
+
+
+def _block(rng: np.random.Generator) -> Route:
+    """Round one block counter-clockwise, right of the middle of the street."""
+    size = rounded_rectangle(35.5 + rng.uniform(-0.5, 0.5), 28.0 + rng.uniform(-0.5, 0.5), 11.0)
+    street = smooth_curve(size, closed=True)
+    return Route(street, smooth_curve(street.beside(street.sample(0.5), -0.8), closed=True))
+
+
+def _street(rng: np.random.Generator) -> Route:
+    """Along a winding street, changing sides of the lane now and then."""
+    street = smooth_curve(winding_line(rng, 320 + 2 * SPARE), closed=False)
+    s = np.arange(SPARE, street.length - SPARE, 1.0)
+    sway = -0.4 + 0.5 * np.sin(2 * np.pi * s / rng.uniform(80, 120) + rng.uniform(0, 2 * np.pi))
+    return Route(street, smooth_curve(street.beside(s, sway), closed=False))
