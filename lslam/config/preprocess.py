@@ -31,6 +31,11 @@ class PreprocessConfig(Section):
     denoise_deviations: float = Field(
         2.0, ge=0, description="`denoise`: standard deviations above the mean distance that are still allowed"
     )
+    skip_standing: bool = Field(
+        False, description="while the sensor stands, repeat the pose instead of registering and mapping the scan"
+    )
+    standing_m: float = Field(0.02, gt=0, description="m; what has moved less since it was registered stands")
+    standing_deg: float = Field(0.1, gt=0, description="deg; likewise for rotation")
     deskew: bool = Field(True, description="take the motion within a scan out of it, where points have times")
     map_leaf: float = Field(0.3, gt=0, description="m; centroids of this grid feed the local map")
     downsample: Literal["target", "grid", "first", "random", "none"] = Field(

@@ -18,6 +18,7 @@ from lslam.odometry.base import Deskewing, Odometry
 from lslam.readers.selection import Selection
 from lslam.registration.motion import ConstantVelocity
 from lslam.registration.registration import DOUBT
+from lslam.registration.standing import Standing
 from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan import Scan
 from lslam.types.scan_result import ScanResult
@@ -47,14 +48,16 @@ def estimate(
     *,
     threads: int = 2,
     max_failures: int = 20,
+    standing: Standing | None = None,
     should_stop: Callable[[], bool] = lambda: False,
     on_scan: Callable[[ScanResult], None] = lambda result: None,
 ) -> list[ScanResult]:
     """Register every scan of the sequence; stops early on `should_stop` or after `max_failures` failures in a row.
 
-    A scan that cannot be read, or is empty, is skipped: the motion prior stands in for its pose.
+    A scan that cannot be read, or is empty, is skipped: the motion prior stands in for its pose. With `standing`, scans
+    during which the sensor stands are not registered.
     """
-    tracker = Tracker(odometry)
+    tracker = Tracker(odometry, standing)
     results: list[ScanResult] = []
     failures = 0
     for loaded in read_ahead(sequence, odometry.prepare, threads):
@@ -74,13 +77,32 @@ class Tracker:
     # A change of the motion within the sweep that moves no point by more is not worth a second registration.
     REFINE_M = 0.01
 
-    def __init__(self, odometry: Odometry) -> None:
-        self.odometry = odometry
+    def __init__(self, odometry: Odometry, standing: Standing | None = None) -> None:
+        self.odometry, self.standing = odometry, standing
         self.motion = ConstantVelocity()
         self._first: tuple[Scan, Any, NDArray[np.float64]] | None = None
 
     def track(self, loaded: Loaded) -> ScanResult:
         """Pose of the next scan."""
+        scan = loaded.scan
+        if scan is not None and self.standing is not None:
+            return self._stand_or_move(scan, loaded, self.standing)
+        return self._move(loaded)
+
+    def _stand_or_move(self, scan: Scan, loaded: Loaded, standing: Standing) -> ScanResult:
+        began = time.perf_counter()
+        result = standing.result_of(scan)
+        stages = {"standing": time.perf_counter() - began}
+        if result is not None:
+            self.motion.correct(result.stamp_ns, result.T_world_lidar)
+            return replace(result, stages=stages)
+        result = self._move(loaded)
+        began = time.perf_counter()
+        standing.observe(scan, result)
+        stages["standing"] += time.perf_counter() - began
+        return replace(result, stages=stages | result.stages)
+
+    def _move(self, loaded: Loaded) -> ScanResult:
         scan = loaded.scan
         span = sweep_seconds(scan)
         prior = self.motion.sweep(loaded.stamp_ns, span)

@@ -59,6 +59,7 @@ class Manifest:
         self.counts = {"scans": len(results)} | {
             status: sum(r.status == status for r in results) for status in ("ok", "bridged", "skipped")
         }
+        self.counts["standing"] = sum(r.is_standing for r in results)
         self.counts["degenerate"] = sum(len(r.degenerate) > 0 for r in results)
         bad = [r for r in results if r.status != "ok"]
         if bad:

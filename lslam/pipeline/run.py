@@ -23,6 +23,7 @@ from lslam.pipeline.manifest import Manifest, describe_deskew
 from lslam.pipeline.map_pass import build_map
 from lslam.pipeline.run_folder import RunFolder
 from lslam.readers import open_sequence
+from lslam.registration.standing import Standing
 from lslam.types.run_record import RunRecord
 from lslam.types.scan_result import ScanResult
 from lslam.types.sequence import Sequence
@@ -137,8 +138,11 @@ def _estimate(
     watch: Watch,
 ) -> RunRecord:  # fmt: skip
     """Odometry over all scans, judged."""
+    standing = Standing(config.preprocess, config.registration) if config.preprocess.skip_standing else None
     with manifest.timed("compile_s"), jit.announced(log), jit.compile_lock():
         odometry.warm_up()
+        if standing is not None:
+            standing.warm_up()
         if config.map.write:
             merge.warm_up()
         with suppress(InputError):
@@ -153,7 +157,7 @@ def _estimate(
     limit = config.odometry.max_failures
     with manifest.timed("odometry_s"):
         results = estimate(
-            sequence, odometry, threads=config.input.threads, max_failures=limit,
+            sequence, odometry, threads=config.input.threads, max_failures=limit, standing=standing,
             should_stop=watch.should_stop, on_scan=seen,
         )  # fmt: skip
     if all(r.status == "skipped" for r in results):

@@ -47,6 +47,8 @@ class RunFacts:
     """Numbers of a run.
 
     status : the manifest's word: `done`, `degraded`, `diverged`, `interrupted`, `failed`; reasons : why, one sentence each
+    registered, bridged, skipped, standing : scans that were registered, followed the motion prior, could not be read, and
+        were not registered because the sensor stood
     path_length : m; duration : s between the first and the last pose
     stages : in the order they ran; total : the sum of stages per scan
     over_limit : scans whose stages took longer than the real-time limit
@@ -59,6 +61,7 @@ class RunFacts:
     registered: int
     bridged: int
     skipped: int
+    standing: int
     failures: tuple[Failure, ...]
     degenerate: tuple[Degeneracy, ...]
     path_length: float
@@ -88,9 +91,10 @@ def run_facts(record: RunRecord) -> RunFacts:
         status=status,
         reasons=reasons,
         scans=len(results),
-        registered=sum(r.status == "ok" for r in results),
+        registered=sum(r.status == "ok" and not r.is_standing for r in results),
         bridged=sum(r.status == "bridged" for r in results),
         skipped=sum(r.status == "skipped" for r in results),
+        standing=sum(r.is_standing for r in results),
         failures=failures,
         degenerate=degenerate,
         path_length=_path_length(record),

@@ -37,7 +37,8 @@ def summary(record: RunRecord, evaluation: Evaluation | None) -> str:
 
 def _scan_rows(facts: RunFacts) -> list[tuple[str, str]]:
     parts = [f"{facts.registered} of {facts.scans} registered"]
-    parts += [f"{n} {word}" for n, word in ((facts.bridged, "bridged"), (facts.skipped, "skipped")) if n]
+    others = ((facts.standing, "standing"), (facts.bridged, "bridged"), (facts.skipped, "skipped"))
+    parts += [f"{n} {word}" for n, word in others if n]
     if facts.degenerate:
         parts.append(f"{len(facts.degenerate)} degenerate")
     rows = [("scans", ", ".join(parts))]

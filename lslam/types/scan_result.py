@@ -21,6 +21,7 @@ class ScanResult:
     covariance : (6, 6) of the pose in the world, t' = t + d[:3], R' = exp(d[3:]) R in world axes, m2 and rad2; grows with
         the distance travelled. None when the method has none
     registration_covariance : likewise, but relative to the local map the scan was registered on
+    is_standing : the sensor had not moved, so the scan was not registered and has the pose of the one before
     degenerate : (K, 6) unit twists along which the scan says nothing and the motion prior was kept
     prior_error : (translation m, rotation rad) between motion prior and result
     stages : seconds per stage, by name, in the order they ran
@@ -39,6 +40,7 @@ class ScanResult:
     inliers: int = 0
     rmse: float = 0.0
     overlap: float = 0.0
+    is_standing: bool = False
     degenerate: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 6)))
     prior_error: tuple[float, float] = (0.0, 0.0)
     stages: dict[str, float] = field(default_factory=dict)

@@ -36,7 +36,7 @@ def test_outcome_in_one_word() -> None:
 
 def test_problems_name_the_first_bad_scan_by_its_number_in_the_recording() -> None:
     manifest = judged(4, False, "ok", "skipped", "bridged", "ok")
-    assert manifest.counts == {"scans": 4, "ok": 2, "bridged": 1, "skipped": 1, "degenerate": 0}
+    assert manifest.counts == {"scans": 4, "ok": 2, "bridged": 1, "skipped": 1, "standing": 0, "degenerate": 0}
     assert "2 of 4 scans" in manifest.problems[0]
     assert "scan 11: why 1" in manifest.problems[0]
 
