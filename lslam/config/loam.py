@@ -23,6 +23,9 @@ class LoamConfig(Section):
     edge_noise: float = Field(
         4.0, gt=0, description="likewise, over what the noise of the ranges makes, which is measured in each scan"
     )
+    edge_sigma: float = Field(
+        0.15, gt=0, description="m; of an edge across itself: it lies anywhere between two beams, and silhouettes move"
+    )
     occlusion: float = Field(0.3, gt=0, description="m; a jump in range from beam to beam that hides what is behind")
     parallel_deg: float = Field(
         80.0, gt=0, lt=90, description="angle of incidence above which a surface is parallel to the beam"
@@ -30,7 +33,8 @@ class LoamConfig(Section):
     grid_step: float = Field(0.2, ge=0, description="m; grid of the less planar points, 0 keeps all")
     feature_map_voxel: float = Field(1.0, gt=0, description="m; voxels of the feature map")
     matching: Literal["one-to-many", "one-to-one"] = Field(
-        "one-to-many", description="whether several features may match the same one"
+        "one-to-many",
+        description="scan to scan: a feature matches the line or plane through several of the other scan's, or the nearest alone",
     )
 
     @model_validator(mode="after")

@@ -1,0 +1,143 @@
+"""Registration of a scan's edges and planar points in one call that holds no GIL: on the features of one earlier scan, or
+on a feature map of Gaussian voxels.
+
+Both are Gauss-Newton with new correspondences each step and a robust width that falls from `scale_start` by `decay` to
+`scale_end`, with the guard on unobserved directions of `gauss_newton`. `allowed` (6, 6) projects every step: the identity,
+or fewer directions, as LeGO-LOAM's two steps want. R (3, 3) and t (3,) are updated in place.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.kernels.feature_residuals import linearise_edges, linearise_planes
+from lslam.kernels.gauss_newton import solve_observed
+from lslam.kernels.jit import inline, kernel
+from lslam.kernels.linalg import rotate_left
+from lslam.kernels.lines import linearise_lines
+from lslam.kernels.residuals import linearise, step_norms
+
+Floats = NDArray[np.float64]
+Longs = NDArray[np.int64]
+Ints = NDArray[np.int32]
+Grid = tuple[Floats, NDArray[np.uint16], Ints, Longs, Ints]
+# H, facts of edges and of planes, last step, iterations, converged, unobserved directions and these as rows
+Aligned = tuple[Floats, Floats, Floats, Floats, int, bool, int, Floats]
+
+
+@inline
+def _step(H: Floats, g: Floats, facts: Floats, allowed: Floats, weak_share: float, scale: float, R: Floats, t: Floats,
+          d: Floats, weak: Floats) -> tuple[int, float, float]:  # fmt: skip
+    """One bounded step; returns the number of unobserved directions and the length of the step, m and rad (NaN: none)."""
+    for i in range(6):
+        for j in range(i):
+            H[i, j] = H[j, i]
+    A, b = np.zeros((6, 6)), np.zeros(6)
+    for i in range(6):
+        for k in range(6):
+            b[i] += allowed[i, k] * g[k]
+            for m in range(6):
+                for j in range(6):
+                    A[i, j] += allowed[i, k] * H[k, m] * allowed[m, j]
+    weak_count = solve_observed(A, b, facts, weak_share, d, weak)
+    move, turn = step_norms(d)
+    if not (np.isfinite(move) and np.isfinite(turn)):
+        d[:] = 0.0
+        return weak_count, np.nan, np.nan
+    # A step beyond the kernel's width leaves the region where its correspondences mean anything.
+    limit = 2.0 * max(scale, 0.5)
+    if move > limit:
+        for i in range(6):
+            d[i] *= limit / move
+    t[0] += d[0]
+    t[1] += d[1]
+    t[2] += d[2]
+    rotate_left(R, d[3], d[4], d[5])
+    return weak_count, move, turn
+
+
+@kernel
+def align_to_scan(edges: Floats, planes: Floats, R: Floats, t: Floats, scale_start: float, scale_end: float, decay: float,
+                  max_iterations: int, step_m: float, step_rad: float, edge_variance: float, plane_variance: float,
+                  weak_share: float, allowed: Floats, one_to_many: bool, size: float, reach: float,
+                  edge_grid: Grid, plane_grid: Grid) -> Aligned:  # fmt: skip
+    """Register edges (E, 3) and planar points (P, 3) on two grids of `feature_grid` with cells of `size`, m.
+
+    Features within `reach`, m, are matched: rings lie farther apart than the kernel is wide.
+    """
+    H, g, d, weak = np.empty((6, 6)), np.empty(6), np.zeros(6), np.zeros((6, 6))
+    edge_facts, plane_facts = np.zeros(6), np.zeros(6)
+    scale, converged, weak_count, iterations = scale_start, False, 0, 0
+    ep, er, es, ek, et = edge_grid
+    pp, pr, ps, pk, pt = plane_grid
+    for _ in range(max_iterations):
+        H[:] = 0.0
+        g[:] = 0.0
+        edge_facts[:] = 0.0
+        plane_facts[:] = 0.0
+        linearise_edges(
+            edges, R, t, size, reach, scale, edge_variance, one_to_many, ep, er, es, ek, et, H, g, edge_facts
+        )
+        linearise_planes(planes, R, t, size, reach, scale, plane_variance, one_to_many, pp, pr, ps, pk, pt, H, g,
+                         plane_facts)  # fmt: skip
+        iterations += 1
+        facts = edge_facts + plane_facts
+        if facts[3] < 6.0:
+            break
+        weak_count, move, turn = _step(H, g, facts, allowed, weak_share, scale, R, t, d, weak)
+        if not np.isfinite(move):
+            break
+        if scale <= scale_end and move < step_m and turn < step_rad:
+            converged = True
+            break
+        scale = max(scale * decay, scale_end)
+    return H, edge_facts, plane_facts, d, iterations, converged, weak_count, weak
+
+
+@kernel
+def align_to_map(edges: Floats, planes: Floats, scatter: Floats, R: Floats, t: Floats, scale_start: float,
+                 scale_end: float, decay: float, max_iterations: int, step_m: float, step_rad: float,
+                 edge_variance: float, plane_variance: float, weak_share: float, allowed: Floats, line_size: float,
+                 min_points: float, floor: float, edge_moments: Floats, edge_keys: Longs, edge_table: Ints,
+                 lines: Floats, line_keys: Longs, line_counts: Floats, size: float, plane_rows: Floats, plane_keys: Longs,
+                 plane_table: Ints, has_coarse: bool, coarse_size: float, coarse_rows: Floats, coarse_keys: Longs,
+                 coarse_table: Ints) -> Aligned:  # fmt: skip
+    """Register edges (E, 3) on line voxels of `line_size`, m, and planar points (P, 3) with scatter (P, 6) on
+    plane voxels of `size`.
+
+    With a coarse map, points that find no plane in the fine one are matched there.
+    """
+    H, g, d, weak = np.empty((6, 6)), np.empty(6), np.zeros(6), np.zeros((6, 6))
+    edge_facts, plane_facts = np.zeros(6), np.zeros(6)
+    edge_cells, edge_slots = np.full(len(edges), -1, np.int64), np.full((len(edges), 8), -1, np.int32)
+    cells, slots = np.full(len(planes), -1, np.int64), np.full((len(planes), 8), -1, np.int32)
+    coarse_cells = np.full(len(planes) if has_coarse else 0, -1, np.int64)
+    coarse_slots = np.full((len(coarse_cells), 8), -1, np.int32)
+    is_done, away2 = np.zeros(len(planes), np.bool_), np.empty(len(planes))
+    scale, converged, weak_count, iterations = scale_start, False, 0, 0
+    for _ in range(max_iterations):
+        H[:] = 0.0
+        g[:] = 0.0
+        edge_facts[:] = 0.0
+        plane_facts[:] = 0.0
+        is_done[:] = False
+        linearise_lines(edges, R, t, line_size, scale, edge_variance, min_points, floor, edge_moments, edge_keys, edge_table,
+                        lines, line_keys, line_counts, edge_cells, edge_slots, H, g, edge_facts)  # fmt: skip
+        linearise(planes, scatter, R, t, size, scale, plane_variance, 0.0, np.inf, plane_rows, plane_keys, plane_table,
+                  cells, slots, is_done, away2, H, g, plane_facts)  # fmt: skip
+        if has_coarse:
+            linearise(planes, scatter, R, t, coarse_size, scale, plane_variance, 0.0, np.inf, coarse_rows, coarse_keys,
+                      coarse_table, coarse_cells, coarse_slots, is_done, away2, H, g, plane_facts)  # fmt: skip
+        iterations += 1
+        facts = edge_facts + plane_facts
+        if facts[3] < 6.0:
+            break
+        weak_count, move, turn = _step(H, g, facts, allowed, weak_share, scale, R, t, d, weak)
+        if not np.isfinite(move):
+            break
+        if scale <= scale_end and move < step_m and turn < step_rad:
+            converged = True
+            break
+        scale = max(scale * decay, scale_end)
+    return H, edge_facts, plane_facts, d, iterations, converged, weak_count, weak

@@ -1,0 +1,146 @@
+"""Normal equations of edges and planar points against the features of one earlier scan (thesis, equation 2.24).
+
+Edge: distance to the line through the two nearest less sharp edges, on different rings. Planar point: distance to the
+plane through the three nearest less planar points, two of one ring and one of another (Zhang and Singh 2014). With
+one-to-one matching the distance to the nearest feature itself takes their place.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.kernels.feature_grid import nearest
+from lslam.kernels.jit import inline, kernel
+from lslam.kernels.lines import add_line
+from lslam.kernels.residuals import add_row
+
+Floats = NDArray[np.float64]
+Longs = NDArray[np.int64]
+Ints = NDArray[np.int32]
+Rings = NDArray[np.uint16]
+
+# Two rings up or down, as in LOAM. (Rings are unsigned: int() of them stays so, and a difference would wrap.)
+NEARBY_RINGS = 2
+# Three points that are nearly in line make no plane: sine of the angle at the nearest.
+LEAST_SINE = 0.1
+SHORTEST = 1e-3  # m, of a line or a side of a triangle
+
+
+@inline
+def _add_point(H: Floats, g: Floats, facts: Floats, ex: float, ey: float, ez: float, rx: float, ry: float, rz: float,
+               variance: float, c2: float) -> None:  # fmt: skip
+    """Point to point: all three components of e."""
+    d2 = ex * ex + ey * ey + ez * ez
+    robust = c2 / (c2 + d2)
+    robust *= robust
+    w = robust / variance
+    add_row(H, g, w, ex, 1.0, 0.0, 0.0, 0.0, rz, -ry)
+    add_row(H, g, w, ey, 0.0, 1.0, 0.0, -rz, 0.0, rx)
+    add_row(H, g, w, ez, 0.0, 0.0, 1.0, ry, -rx, 0.0)
+    facts[0] += 3.0 * w
+    facts[1] += robust * d2
+    facts[3] += 1.0
+    facts[4] += 3.0 * w * (rx * rx + ry * ry + rz * rz)
+    facts[5] += robust
+    if d2 < c2:
+        facts[2] += 1.0
+
+
+@inline
+def _add_plane(H: Floats, g: Floats, facts: Floats, e: float, nx: float, ny: float, nz: float, rx: float, ry: float,
+               rz: float, variance: float, c2: float) -> None:  # fmt: skip
+    """Point to plane: e along the unit normal n."""
+    robust = c2 / (c2 + e * e)
+    robust *= robust
+    w = robust / variance
+    add_row(H, g, w, e, nx, ny, nz, ry * nz - rz * ny, rz * nx - rx * nz, rx * ny - ry * nx)
+    facts[0] += w
+    facts[1] += robust * e * e
+    facts[3] += 1.0
+    facts[4] += w * (rx * rx + ry * ry + rz * rz)
+    facts[5] += robust
+    if abs(e) < math.sqrt(c2):
+        facts[2] += 1.0
+
+
+@kernel
+def linearise_edges(source: Floats, R: Floats, t: Floats, size: float, limit: float, scale: float, variance: float,
+                    with_lines: bool, points: Floats, rings: Rings, starts: Ints, keys: Longs, table: Ints, H: Floats,
+                    g: Floats, facts: Floats) -> None:  # fmt: skip
+    """Add to the upper triangle of H (6, 6), to g (6,) and facts (6,) all edges (S, 3), LiDAR frame; points in `limit`."""
+    c2 = scale * scale
+    for i in range(len(source)):
+        a, b, c = source[i, 0], source[i, 1], source[i, 2]
+        rx = R[0, 0] * a + R[0, 1] * b + R[0, 2] * c
+        ry = R[1, 0] * a + R[1, 1] * b + R[1, 2] * c
+        rz = R[2, 0] * a + R[2, 1] * b + R[2, 2] * c
+        x, y, z = rx + t[0], ry + t[1], rz + t[2]
+        j, _ = nearest(x, y, z, size, limit, 0, -1, -1, points, rings, starts, keys, table)
+        if j < 0:
+            continue
+        p = points[j]
+        ex, ey, ez = x - p[0], y - p[1], z - p[2]
+        if not with_lines:
+            _add_point(H, g, facts, ex, ey, ez, rx, ry, rz, variance, c2)
+            continue
+        k, _ = nearest(x, y, z, size, limit, np.int64(rings[j]), NEARBY_RINGS, -1, points, rings, starts, keys, table)
+        if k < 0:
+            continue
+        ux, uy, uz = points[k, 0] - p[0], points[k, 1] - p[1], points[k, 2] - p[2]
+        length = math.sqrt(ux * ux + uy * uy + uz * uz)
+        if length < SHORTEST:
+            continue
+        s = 1.0 / length
+        ux, uy, uz = ux * s, uy * s, uz * s
+        # What the two points' noise makes of the line beside, between or beyond them.
+        share = (ex * ux + ey * uy + ez * uz) * s
+        spread = variance * (1.0 + share * share + (1.0 - share) * (1.0 - share))
+        add_line(H, g, facts, ex, ey, ez, ux, uy, uz, rx, ry, rz, spread, c2)
+
+
+@kernel
+def linearise_planes(source: Floats, R: Floats, t: Floats, size: float, limit: float, scale: float, variance: float,
+                     with_planes: bool, points: Floats, rings: Rings, starts: Ints, keys: Longs, table: Ints, H: Floats,
+                     g: Floats, facts: Floats) -> None:  # fmt: skip
+    """As `linearise_edges`, of planar points."""
+    c2 = scale * scale
+    for i in range(len(source)):
+        a, b, c = source[i, 0], source[i, 1], source[i, 2]
+        rx = R[0, 0] * a + R[0, 1] * b + R[0, 2] * c
+        ry = R[1, 0] * a + R[1, 1] * b + R[1, 2] * c
+        rz = R[2, 0] * a + R[2, 1] * b + R[2, 2] * c
+        x, y, z = rx + t[0], ry + t[1], rz + t[2]
+        j, _ = nearest(x, y, z, size, limit, 0, -1, -1, points, rings, starts, keys, table)
+        if j < 0:
+            continue
+        p = points[j]
+        ex, ey, ez = x - p[0], y - p[1], z - p[2]
+        if not with_planes:
+            _add_point(H, g, facts, ex, ey, ez, rx, ry, rz, variance, c2)
+            continue
+        ring = np.int64(rings[j])
+        k, _ = nearest(x, y, z, size, limit, ring, 0, j, points, rings, starts, keys, table)
+        if k < 0:
+            continue
+        m, _ = nearest(x, y, z, size, limit, ring, NEARBY_RINGS, -1, points, rings, starts, keys, table)
+        if m < 0:
+            continue
+        ax, ay, az = points[k, 0] - p[0], points[k, 1] - p[1], points[k, 2] - p[2]
+        bx, by, bz = points[m, 0] - p[0], points[m, 1] - p[1], points[m, 2] - p[2]
+        nx, ny, nz = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+        area = math.sqrt(nx * nx + ny * ny + nz * nz)
+        aa, bb = ax * ax + ay * ay + az * az, bx * bx + by * by + bz * bz
+        if min(aa, bb) < SHORTEST * SHORTEST or area < LEAST_SINE * math.sqrt(aa * bb):
+            continue
+        s = 1.0 / area
+        nx, ny, nz = nx * s, ny * s, nz * s
+        e = nx * ex + ny * ey + nz * ez
+        # Barycentric coordinates: what the three points' noise makes of the plane at the foot of the source point.
+        ab = ax * bx + ay * by + az * bz
+        ea, eb = ex * ax + ey * ay + ez * az, ex * bx + ey * by + ez * bz
+        wa, wb = (ea * bb - eb * ab) * s * s, (eb * aa - ea * ab) * s * s
+        spread = variance * (1.0 + wa * wa + wb * wb + (1.0 - wa - wb) * (1.0 - wa - wb))
+        _add_plane(H, g, facts, e, nx, ny, nz, rx, ry, rz, spread, c2)

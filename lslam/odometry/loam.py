@@ -1,0 +1,129 @@
+"""Methods `loam-odom`, `loam` and `floam`: edges and planar points, scan to scan, on the feature map, or both."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from lslam.config.config import Config
+from lslam.preprocessing.deskew import deskew_points
+from lslam.preprocessing.features import FeaturePoints, Features, extract_features
+from lslam.registration.feature_registration import FeatureRegistration
+from lslam.registration.feature_steps import ScanStep, StageClock, joint_step
+from lslam.registration.solver import RegistrationResult
+from lslam.registration.uncertainty import PoseUncertainty
+from lslam.types.motion_prior import MotionPrior
+from lslam.types.scan import Scan
+from lslam.types.scan_result import ScanResult
+
+# name -> how a scan is registered on the one before, and whether there is a feature map
+VARIANTS: dict[str, tuple[ScanStep | None, bool]] = {
+    "loam-odom": (joint_step, False),
+    "loam": (joint_step, True),
+    "floam": (None, True),
+}
+
+
+def create(config: Config) -> Loam:
+    """The variant that `odometry.method` names."""
+    return Loam(config, *VARIANTS[config.odometry.method])
+
+
+class Loam:
+    """Adapter from scans and motion priors to `FeatureRegistration`."""
+
+    needs_rings = True
+    deskew = "features by the motion prior, and again by the motion that registration finds"
+
+    def __init__(self, config: Config, scan_step: ScanStep | None, with_map: bool) -> None:
+        self.config = config
+        self._scan_step, self._with_map = scan_step, with_map
+        self.restart()
+
+    def restart(self) -> None:
+        """No scan seen, an empty feature map."""
+        c = self.config
+        self.registration = FeatureRegistration(
+            c.registration,
+            c.loam,
+            scan_step=self._scan_step,
+            with_map=self._with_map,
+            reach=1.2 * c.preprocess.range_max,
+        )
+        self._uncertainty = PoseUncertainty(is_scan_to_scan=not self._with_map)
+        # What `register` saw and found last, for `update`.
+        self._features: Features
+        self._located: RegistrationResult
+
+    def prepare(self, scan: Scan) -> Features:
+        """Edges and planar points. Raises InputError for a scan without usable rings."""
+        return extract_features(scan, self.config.loam, self.config.preprocess)
+
+    def register(self, scan: Scan, prepared: Features, prior: MotionPrior) -> ScanResult:
+        """Align with the scan before, with the feature map, or with one after the other."""
+        clock = StageClock()
+        self._features = prepared
+        if self.config.preprocess.deskew and prepared.planes.times is not None and len(prior.times) > 1:
+            with clock.stage("deskew"):
+                self._features = _deskewed(prepared, prior)
+        self._located = result = self.registration.locate(self._features, prior.start, clock)
+        return ScanResult(
+            index=scan.index,
+            stamp_ns=scan.stamp_ns,
+            T_world_lidar=result.T_world_lidar,
+            status="ok" if result.ok else "bridged",
+            reason=result.reason,
+            registration_covariance=result.covariance,
+            converged=result.converged,
+            iterations=result.iterations,
+            source_points=result.source_points,
+            inliers=result.inliers,
+            rmse=result.rmse,
+            overlap=result.overlap,
+            degenerate=result.degenerate,
+            prior_error=result.prior_error,
+            stages=clock.seconds,
+        )
+
+    def update(self, scan: Scan, prepared: Features, prior: MotionPrior, result: ScanResult) -> ScanResult:
+        """Enter the scan where `register` put it: into the feature map, and as what the next one is registered on."""
+        clock = StageClock()
+        with clock.stage("update"):
+            self.registration.update(self._features, self._located)
+            covariance = self._uncertainty.add(self._located)
+        return replace(result, covariance=covariance, stages={**result.stages, **clock.seconds})
+
+    def warm_up(self) -> None:
+        """Register a small room with a throw-away copy, well and badly: every kernel is compiled or loaded."""
+        trial = type(self)(self.config, self._scan_step, self._with_map)
+        room = _room()
+        prior = MotionPrior(np.zeros(1), np.eye(4)[None])
+        for scan in (room, room, room.select(np.arange(0, len(room), 3))):
+            prepared = trial.prepare(scan)
+            trial.update(scan, prepared, prior, trial.register(scan, prepared, prior))
+
+
+def _deskewed(features: Features, prior: MotionPrior) -> Features:
+    """The features as seen from scan start."""
+
+    def moved(part: FeaturePoints) -> FeaturePoints:
+        return replace(part, points=deskew_points(part.points, part.times, prior))
+
+    return replace(
+        features,
+        edges=moved(features.edges),
+        less_edges=moved(features.less_edges),
+        planes=moved(features.planes),
+        less_planes=moved(features.less_planes),
+    )
+
+
+def _room() -> Scan:
+    """Sixteen rings in a box of a room with four corners, as a sensor in its middle sees it."""
+    azimuth, elevation = np.linspace(-np.pi, np.pi, 900, endpoint=False), np.linspace(-0.3, 0.3, 16)
+    a, e = np.meshgrid(azimuth, elevation)
+    beams = np.stack([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)], axis=-1).reshape(-1, 3)
+    reach = np.min(np.array([9.0, 7.0, 1.5]) / np.maximum(np.abs(beams), 1e-9), axis=1)
+    rings = np.repeat(np.arange(16, dtype=np.uint16), len(azimuth))
+    return Scan((beams * reach[:, None]).astype(np.float32), 0, 0, rings=rings)

@@ -1,0 +1,58 @@
+"""The feature map of the LOAM family: Gaussian voxels of edges, read as lines, and of planar points, read as planes."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.preprocessing.features import Features
+from lslam.registration.gaussian_map import GaussianMap
+
+# As LOAM fits its lines: five points at least.
+MIN_LINE_POINTS = 5
+
+
+class FeatureMap:
+    """Less sharp edges and less planar points of past scans, in voxels of one size around the sensor.
+
+    Parameters
+    ----------
+    size : m, edge of a voxel
+    min_points, planarity, count_cap, reach : of the plane voxels, as in `GaussianMap`
+    """
+
+    def __init__(
+        self, size: float, *, min_points: int = 6, planarity: float = 0.3, count_cap: float = 200.0, reach: float = 150.0,
+        capacity: int = 1 << 16,
+    ) -> None:  # fmt: skip
+        self.planes = GaussianMap(
+            size, min_points=min_points, planarity=planarity, count_cap=count_cap, reach=reach, capacity=capacity
+        )
+        self.edges = GaussianMap(size, count_cap=count_cap, reach=reach, capacity=capacity // 4)
+        self._lines = _lines_for(self.edges)
+
+    @property
+    def size(self) -> float:
+        """Edge of a voxel, m."""
+        return self.planes.size
+
+    @property
+    def lines(self) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64]]:
+        """Rows of `kernels.lines` for the edge voxels, the keys and counts they were computed at; kept up to date by it."""
+        if len(self._lines[0]) != len(self.edges.keys):
+            self._lines = _lines_for(self.edges)
+        return self._lines
+
+    def __len__(self) -> int:
+        """Voxels that hold points."""
+        return len(self.planes) + len(self.edges)
+
+    def insert(self, features: Features, T_world_lidar: NDArray[np.float64]) -> None:
+        """Add the less sharp edges and the less planar points of a scan."""
+        self.edges.insert(features.less_edges.points.astype(np.float32), T_world_lidar)
+        self.planes.insert(features.less_planes.points.astype(np.float32), T_world_lidar)
+
+
+def _lines_for(edges: GaussianMap) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64]]:
+    capacity = len(edges.keys)
+    return np.zeros((capacity, 8)), np.full(capacity, -1, np.int64), np.zeros(capacity)

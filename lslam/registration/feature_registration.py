@@ -1,0 +1,212 @@
+"""Registration of features, scan after scan: the engine of `loam-odom`, `loam`, `floam` and `lego-loam`."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.config.loam import LoamConfig
+from lslam.config.registration import RegistrationConfig
+from lslam.geometry import se3, so3
+from lslam.kernels import voxel
+from lslam.preprocessing.features import Features
+from lslam.preprocessing.prepare import NO_TIMES
+from lslam.registration.feature_map import FeatureMap
+from lslam.registration.feature_scan import FeatureScan, feature_scan
+from lslam.registration.feature_solver import NONE, FeatureNoise, solve_on_map
+from lslam.registration.feature_steps import ScanStep, StageClock
+from lslam.registration.registration import DOUBT
+from lslam.registration.robust import AdaptiveThreshold, Annealing, UsualAgreement
+from lslam.registration.solver import RegistrationResult
+
+Floats = NDArray[np.float64]
+
+# Fewer features than this many per direction of a pose decide nothing: chance has its say.
+MIN_FEATURES = 60
+# A scan that failed is no target; after this many in a row the last good one lies too far behind to be.
+PATIENCE = 3
+# m, grid of the less planar points when they stand in for the features: as `preprocess.source_voxel`.
+STAND_IN_GRID = 1.0
+
+
+class FeatureRegistration:
+    """Registers features on the scan before, on a feature map, or on one after the other: `locate`, then `update`.
+
+    Parameters
+    ----------
+    scan_step : how a scan is registered on the one before; None leaves that out
+    with_map : whether the pose is found, or refined, on the feature map
+    reach : m, how far from the sensor the map is kept
+    """
+
+    def __init__(
+        self, config: RegistrationConfig, loam: LoamConfig, *, scan_step: ScanStep | None, with_map: bool,
+        reach: float = 120.0,
+    ) -> None:  # fmt: skip
+        self.config, self.loam = config, loam
+        self._step, self._reach = scan_step, reach
+        self.map: FeatureMap | None = self._new_map(1 << 16) if with_map else None
+        self.target: FeatureScan | None = None
+        self.noise = FeatureNoise(loam.edge_sigma, config.sigma, config.weak_share)
+        self.threshold = AdaptiveThreshold(2 * config.kernel_min, config.kernel_max)
+        self.agreement = UsualAgreement(config.min_agreement)
+        self._starting = config.start_scans
+        self._failures = 0
+
+    def locate(self, features: Features, T_prior: Floats, clock: StageClock) -> RegistrationResult:
+        """Align with what is there; the result says whether to believe it, and when less planar points stood in."""
+        count = len(features.edges) + len(features.planes)
+        if len(features.less_planes) + len(features.less_edges) < MIN_FEATURES:
+            return _failed(T_prior, count, f"only {len(features.edges)} edges and {len(features.planes)} planar points")
+        if self.target is None:
+            return RegistrationResult(T_prior, covariance=np.diag([1e-12] * 6), source_points=count)
+        if self._starting > 0:
+            with clock.stage("start"):
+                start = self._capture(features, T_prior)
+            result = self._attempt(features, start, T_prior, clock)
+        else:
+            start = T_prior
+            result = self._attempt(features, T_prior, T_prior, clock)
+            move, turn = result.prior_error
+            if not result.ok or move > self.config.recover_m or turn > np.deg2rad(self.config.recover_deg):
+                with clock.stage("recover"):
+                    start = self._capture(features, T_prior)
+                again = self._attempt(features, start, T_prior, clock)
+                if again.ok and (not result.ok or again.inliers > result.inliers):
+                    result = again
+        if not result.ok or result.inliers < MIN_FEATURES or len(result.degenerate):
+            with clock.stage("stand-in"):
+                result = self._stand_in(features, start, T_prior, result)
+        return result
+
+    def update(self, features: Features, result: RegistrationResult) -> None:
+        """Enter the scan into map and target unless its registration failed, and learn from how wrong the prior was."""
+        if result.ok:
+            if self.map is not None:
+                self.map.insert(features, result.T_world_lidar)
+            if self.target is not None:
+                self._starting = max(self._starting - 1, 0)
+                self.agreement.observe(result.agreement)
+                move, turn = result.prior_error
+                self.threshold.observe(move + turn * result.lever_arm)
+            self._failures = 0
+        else:
+            self._failures += 1
+            self._starting = max(self._starting, 1)
+            self.threshold.widen()
+            self.agreement.relax()
+        if result.ok or self._failures >= PATIENCE:
+            self.target = feature_scan(features, result.T_world_lidar)
+
+    def _attempt(self, features: Features, T_start: Floats, T_prior: Floats, clock: StageClock) -> RegistrationResult:
+        """The method's own stages, judged."""
+        c = self.config
+        quick = Annealing(
+            c.kernel_max if self._starting else self.threshold.width, c.kernel_min, c.kernel_decay,
+            c.start_iterations if self._starting else c.max_iterations,
+        )  # fmt: skip
+        result, iterations = RegistrationResult(T_start, ok=False), 0
+        assert self.target is not None
+        if self._step is not None:
+            result = self._step(
+                self.target, features, T_start, quick, self.noise, self.loam.matching == "one-to-many", clock
+            )
+            result = self._judge(result, T_prior)
+            iterations = result.iterations
+        if self.map is not None:
+            start = result.T_world_lidar if result.ok else T_start
+            with clock.stage("map"):
+                result = solve_on_map(
+                    self.map, features.edges.points, features.planes.points, start, quick, self.noise,
+                    coarse=self.map.planes.coarsen(self._coarse_factor()) if self._starting else None,
+                )  # fmt: skip
+            result = self._judge(result, T_prior)
+        return replace(result, iterations=result.iterations + (iterations if self.map is not None else 0))
+
+    def _capture(self, features: Features, T_prior: Floats) -> Floats:
+        """A start that is metres nearer, where the prior may be metres off: less planar points on coarse planes."""
+        c = self.config
+        points, scatter = _thinned(features)
+        target = self._planes()
+        slow = Annealing(c.coarse_kernel, c.kernel_min, c.coarse_decay, c.start_iterations)
+        coarse = target.planes.coarsen(self._coarse_factor())
+        result = solve_on_map(
+            target, NONE, points, T_prior, slow, self.noise, scatter=scatter, coarse=coarse, is_coarse_only=True
+        )
+        return self._judge(result, T_prior).T_world_lidar
+
+    def _stand_in(
+        self, features: Features, T_start: Floats, T_prior: Floats, starved: RegistrationResult
+    ) -> RegistrationResult:
+        """Less planar points on planes in place of features that are too few or leave a direction open."""
+        c = self.config
+        points, scatter = _thinned(features)
+        target = self._planes()
+        quick = Annealing(c.kernel_max, c.kernel_min, c.kernel_decay, c.start_iterations)
+        result = solve_on_map(
+            target, features.edges.points, points, starved.T_world_lidar if starved.ok else T_start, quick, self.noise,
+            scatter=scatter, coarse=target.planes.coarsen(self._coarse_factor()),
+        )  # fmt: skip
+        result = self._judge(result, T_prior)
+        if not result.ok or (starved.ok and len(result.degenerate) >= max(len(starved.degenerate), 1)):
+            return starved
+        why = starved.reason or (
+            f"only {starved.inliers} features agree"
+            if starved.inliers < MIN_FEATURES
+            else "features leave a direction open"
+        )
+        return replace(result, reason=f"{why}: less planar points stood in")
+
+    def _planes(self) -> FeatureMap:
+        """The feature map, or one made of the target scan alone."""
+        if self.map is not None and len(self.map):
+            return self.map
+        assert self.target is not None
+        alone = self._new_map(1 << 14)
+        alone.insert(self.target.features, self.target.T_world_lidar)
+        return alone
+
+    def _new_map(self, capacity: int) -> FeatureMap:
+        c = self.config
+        return FeatureMap(
+            self.loam.feature_map_voxel, min_points=c.min_points, planarity=c.planarity, count_cap=c.count_cap,
+            reach=self._reach, capacity=capacity,
+        )  # fmt: skip
+
+    def _coarse_factor(self) -> int:
+        """Coarse voxels are as large as those of `icp`."""
+        c = self.config
+        return max(2, round(c.coarse_factor * c.voxel_size / self.loam.feature_map_voxel))
+
+    def _judge(self, result: RegistrationResult, T_prior: Floats) -> RegistrationResult:
+        """The result with its correction of the prior, or a failed one that keeps the prior and says why."""
+        c = self.config
+        delta = se3.relative(T_prior, result.T_world_lidar)
+        move, turn = float(np.linalg.norm(delta[:3, 3])), float(so3.angle(delta[:3, :3]))
+        reason = result.reason
+        if not reason and result.overlap < (c.start_overlap if self._starting else c.min_overlap):
+            reason = f"only {result.overlap:.0%} of the features have a counterpart"
+        elif not reason and result.inlier_share < c.min_inliers:
+            reason = f"only {result.inlier_share:.0%} of the matches agree"
+        elif not reason and self.agreement.is_collapse(result.agreement):
+            reason = f"only {result.agreement:.0%} of the features agree, lately {self.agreement.usual:.0%} did"
+        elif not reason and (move > c.max_jump_m or turn > np.deg2rad(c.max_jump_deg)):
+            reason = f"impossible jump of {move:.1f} m and {np.rad2deg(turn):.0f} deg"
+        if reason:
+            return replace(_failed(T_prior, result.source_points, reason), iterations=result.iterations)
+        return replace(result, prior_error=(move, turn))
+
+
+def _thinned(features: Features) -> tuple[Floats, Floats]:
+    """Centroids (S, 3) of the less planar points and the scatter (S, 6) behind each."""
+    points, _, scatter = voxel.centroids(features.less_planes.points.astype(np.float32), NO_TIMES, STAND_IN_GRID)
+    return points.astype(np.float64), scatter.astype(np.float64)
+
+
+def _failed(T_prior: Floats, source_points: int, reason: str) -> RegistrationResult:
+    """The motion prior, in doubt."""
+    return RegistrationResult(
+        T_prior.copy(), ok=False, reason=reason, covariance=DOUBT.copy(), converged=False, source_points=source_points
+    )

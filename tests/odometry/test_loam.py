@@ -1,0 +1,227 @@
+"""The LOAM family on simulated drives: accuracy, sentinels, starved scans, scans without rings, threads."""
+
+from __future__ import annotations
+
+import hashlib
+import threading
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from drives import ate, coasting, standing
+from numpy.typing import NDArray
+
+from lslam.config.config import Config
+from lslam.errors import InputError
+from lslam.odometry import create_odometry
+from lslam.odometry.loam import Loam
+from lslam.pipeline.front_end import Loaded, Tracker
+from lslam.registration.feature_registration import PATIENCE
+from lslam.simulation.scenarios import simulate
+from lslam.types.scan import Scan
+from lslam.types.scan_result import ScanResult
+
+Floats = NDArray[np.float64]
+
+# ATE, m, over 36 m of street with sixteen and 32 rings: the map holds, scan to scan drifts.
+GATES = {"loam-odom": 0.05, "loam": 0.025, "floam": 0.025}
+METHODS = sorted(GATES)
+
+
+@cache
+def street(
+    seed: int = 1, lidar: str = "vlp16", count: int = 40, compensated: bool = True, speed: float | None = None
+) -> tuple[list[Scan], Floats]:
+    drive = simulate(
+        "street", seed=seed, lidar=lidar, count=count, motion_compensated=compensated, speed=speed, start_speed=speed
+    )
+    assert drive.ground_truth is not None
+    return list(drive), drive.ground_truth.poses
+
+
+def config(method: str, **loam: object) -> Config:
+    return Config.model_validate({"odometry": {"method": method}, "loam": loam})
+
+
+class Driver:
+    """The front end's loop with its odometry at hand."""
+
+    def __init__(self, method: str, **loam: object) -> None:
+        odometry = create_odometry(config(method, **loam))
+        assert isinstance(odometry, Loam)
+        self.loam, self.tracker = odometry, Tracker(odometry)
+
+    def feed(self, scan: Scan) -> ScanResult:
+        return self.tracker.track(Loaded(scan.index, scan.stamp_ns, scan, self.loam.prepare(scan)))
+
+    def drive(self, scans: list[Scan]) -> list[ScanResult]:
+        return [self.feed(scan) for scan in scans]
+
+
+def poses_of(results: list[ScanResult]) -> Floats:
+    return np.stack([r.T_world_lidar for r in results])
+
+
+def metres(result: ScanResult, truth: Floats) -> float:
+    return float(np.linalg.norm(result.T_world_lidar[:3, 3] - truth[:3, 3]))
+
+
+@cache
+def driven(method: str, seed: int = 1, lidar: str = "vlp16") -> list[ScanResult]:
+    return Driver(method).drive(street(seed, lidar)[0])
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize(("seed", "lidar"), [(1, "vlp16"), (2, "os1-32")])
+def test_error_stays_under_the_gate(method: str, seed: int, lidar: str) -> None:
+    results = driven(method, seed, lidar)
+    assert all(r.status == "ok" and r.converged and r.reason == "" for r in results)
+    assert all(len(r.degenerate) == 0 for r in results)
+    assert ate(poses_of(results), street(seed, lidar)[1]) < GATES[method]
+
+
+def test_no_sentinel_passes_the_gate() -> None:
+    truth = street()[1]
+    for sentinel in (standing(truth), coasting(truth)):
+        assert ate(sentinel, truth) > 2 * max(GATES.values())
+    assert ate(truth, truth) < 1e-9
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_result_carries_the_facts_of_its_scan(method: str) -> None:
+    result = driven(method)[-1]
+    own = {"loam-odom": ["scan"], "loam": ["scan", "map"], "floam": ["map"]}[method]
+    assert list(result.stages) == [*own, "update"]
+    assert all(seconds > 0 for seconds in result.stages.values())
+    assert 100 < result.inliers <= result.source_points
+    assert 0.5 < result.overlap <= 1
+    assert 0 < result.rmse < 0.1
+    assert result.registration_covariance is not None
+    assert result.covariance is not None
+    assert np.linalg.eigvalsh(result.registration_covariance).min() > 0
+    assert np.linalg.eigvalsh(result.covariance - result.registration_covariance).min() > -1e-15
+
+
+def test_covariances_grow_faster_without_a_map() -> None:
+    def sigma(method: str) -> float:
+        covariance = driven(method)[-1].covariance
+        assert covariance is not None
+        return float(np.sqrt(np.trace(covariance[:3, :3])))
+
+    assert sigma("loam-odom") > 1.5 * sigma("loam")
+
+
+def starved(scan: Scan, kind: str) -> Scan:
+    """A scan that leaves LOAM without its features."""
+    if kind == "empty":
+        return scan.select(np.zeros(0, np.int64))
+    if kind == "nan":
+        return replace(scan, points=np.full_like(scan.points, np.nan))
+    rng = np.random.default_rng(0)
+    ranges = rng.uniform(2, 60, (len(scan), 1))
+    directions = scan.points / np.linalg.norm(scan.points, axis=1, keepdims=True)
+    return replace(scan, points=(ranges * directions).astype(np.float32))
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("kind", ["empty", "nan", "noise"])
+def test_a_scan_without_features_is_bridged_and_got_over(method: str, kind: str) -> None:
+    scans, truth = street()
+    driver = Driver(method)
+    driver.drive(scans[:12])
+    expected = driver.tracker.motion.predict(scans[12].stamp_ns)
+    bad = driver.feed(starved(scans[12], kind))
+    assert bad.status == "bridged"
+    assert bad.reason
+    assert not bad.converged
+    np.testing.assert_array_equal(bad.T_world_lidar, expected)
+    assert bad.covariance is not None
+    assert np.sqrt(bad.covariance[0, 0]) > 0.4
+    for k in (13, 14, 15):
+        good = driver.feed(scans[k])
+        assert good.status == "ok"
+        assert metres(good, truth[k]) < 0.08
+
+
+def test_after_a_row_of_failures_the_target_is_a_scan_at_hand() -> None:
+    scans, _ = street()
+    driver = Driver("loam-odom")
+    driver.drive(scans[:6])
+    before = driver.loam.registration.target
+    for k in range(6, 6 + PATIENCE):
+        assert driver.loam.registration.target is before
+        driver.feed(starved(scans[k], "noise"))
+    assert driver.loam.registration.target is not before
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_few_features_are_helped_by_less_planar_points(method: str) -> None:
+    """One region with one edge and one planar point per ring: too few to decide a pose; the scan says who stood in."""
+    scans, truth = street()
+    results = Driver(method, regions=1, max_edge_points=1, max_planar_points=1).drive(scans[:20])
+    assert all(r.status == "ok" for r in results)
+    assert all("less planar points stood in" in r.reason for r in results[1:])
+    assert ate(poses_of(results), truth[:20]) < GATES[method]
+
+
+def test_scans_without_rings_get_the_error_that_names_the_flag() -> None:
+    scan = replace(street()[0][0], rings=None)
+    with pytest.raises(InputError, match="--rings"):
+        Driver("loam").feed(scan)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_poses_and_covariances_are_the_same_whatever_thread_and_time(method: str) -> None:
+    digests: list[str] = []
+
+    def work() -> None:
+        digest = hashlib.sha256()
+        for result in Driver(method).drive(street()[0][:10]):
+            digest.update(result.T_world_lidar.tobytes())
+            assert result.covariance is not None
+            digest.update(result.covariance.tobytes())
+        digests.append(digest.hexdigest())
+
+    threads = [threading.Thread(target=work) for _ in range(2)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    work()
+    assert len(digests) == 3
+    assert len(set(digests)) == 1
+
+
+def test_one_to_one_matches_points_with_points_and_is_worse() -> None:
+    scans, truth = street()
+    one = Driver("loam-odom", matching="one-to-one").drive(scans[:20])
+    many = driven("loam-odom")[:20]
+    assert ate(poses_of(many), truth[:20]) < 0.5 * ate(poses_of(one), truth[:20]) < 1.0
+
+
+@pytest.mark.parametrize("method", ["loam", "floam"])
+def test_the_motion_within_a_sweep_is_taken_out(method: str) -> None:
+    scans, truth = street(seed=3, count=25, compensated=False, speed=12.0)
+    assert scans[0].times is not None
+    deskewed = Driver(method).drive(scans)
+    assert "deskew" in deskewed[-1].stages
+    as_they_are = Driver(method).drive([replace(s, times=None) for s in scans])
+    assert "deskew" not in as_they_are[-1].stages
+    assert ate(poses_of(deskewed), truth) < 0.5 * ate(poses_of(as_they_are), truth)
+
+
+def test_options_act_as_they_are_named() -> None:
+    scan = street()[0][10]
+    default = Driver("loam").loam.prepare(scan)
+    more = Driver("loam", max_edge_points=4, max_planar_points=8).loam.prepare(scan)
+    assert len(more.edges) > len(default.edges)
+    assert len(more.planes) > 1.5 * len(default.planes)
+    coarse = Driver("loam", grid_step=1.5).loam.prepare(scan)
+    assert len(coarse.less_planes) < 0.7 * len(default.less_planes)
+    fine, wide = (Driver("loam", feature_map_voxel=size) for size in (0.5, 2.0))
+    for driver in (fine, wide):
+        driver.drive(street()[0][:5])
+    assert fine.loam.registration.map is not None
+    assert wide.loam.registration.map is not None
+    assert len(fine.loam.registration.map) > 2 * len(wide.loam.registration.map)
