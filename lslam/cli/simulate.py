@@ -1,4 +1,4 @@
-"""`lslam simulate`: a drive through a generated town, with exact ground truth, in KITTI's layout."""
+"""`lslam simulate`: a drive through a generated town or that of a map, with exact ground truth, in KITTI's layout."""
 
 from __future__ import annotations
 
