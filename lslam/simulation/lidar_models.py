@@ -46,6 +46,8 @@ class LidarModel:
     start_deg : azimuth of the first column, 0 forward, counter-clockwise; clockwise : sense of turning, from above
     rosette : when given, it does not spin but looks forward through two turning prisms
     ring_bias, ring_tilt_deg : standard deviations over the rings of what calibration missed: range, m, and elevation
+    firing_us : microseconds from the start of a column until each ring fires, shorter than a column lasts; empty: all at once
+    ring_heights : m of each laser above the LiDAR's origin; empty: all rays leave from there
     """
 
     name: str
@@ -64,6 +66,14 @@ class LidarModel:
     rosette: Rosette | None = None
     ring_bias: float = 0.0
     ring_tilt_deg: float = 0.0
+    firing_us: tuple[float, ...] = ()
+    ring_heights: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        for name in ("firing_us", "ring_heights"):
+            given = len(getattr(self, name))
+            if given not in (0, self.rings):
+                raise ValueError(f"{name} of {self.name!r}: {given} values for {self.rings} rings")
 
     @property
     def rings(self) -> int:
@@ -83,17 +93,57 @@ class LidarModel:
         return azimuth, np.radians(np.array(self.elevations_deg))
 
     @cached_property
+    def firing(self) -> Floats:
+        """(rings,) s from the start of a column until each ring fires."""
+        return np.array(self.firing_us) * 1e-6 if self.firing_us else np.zeros(self.rings)
+
+    @cached_property
+    def heights(self) -> Floats:
+        """(rings,) m of each laser above the LiDAR's origin."""
+        return np.array(self.ring_heights) if self.ring_heights else np.zeros(self.rings)
+
+    @cached_property
+    def sequence(self) -> NDArray[np.intp]:
+        """(rays,) the order in which points are reported, as indices of rays counted column after column, ring after ring."""
+        if self.order == "ring":
+            return np.arange(self.rays).reshape(self.columns, self.rings).T.ravel()
+        # A column comes as it is fired.
+        fired = np.argsort(self.firing, kind="stable")
+        return np.asarray((np.arange(self.columns)[:, None] * self.rings + fired).ravel())
+
+    @cached_property
     def ring_errors(self) -> tuple[Floats, Floats]:
         """What calibration missed, of each ring and for good: range (rings,), m, and elevation (rings,), rad."""
         bias, tilt = np.random.default_rng(self.rings).standard_normal((2, self.rings))
         return self.ring_bias * bias, np.radians(self.ring_tilt_deg) * tilt
 
-    def beams(self, index: int) -> tuple[Floats, Floats]:
-        """Azimuth and elevation of every ray of scan `index`, rad, each broadcasting to (columns, rings)."""
+    def beams(self, index: int, period: float = 0.1) -> tuple[Floats, Floats]:
+        """Azimuth and elevation of every ray of scan `index`, which lasts `period` s: rad, broadcasting to (columns, rings)."""
         if self.rosette is not None:
             return self.rosette.beams(index, self.columns, np.radians(np.array(self.elevations_deg)))
         azimuth, elevation = self.angles
-        return azimuth[:, None], elevation
+        # It turns on while one ring fires after the other.
+        turned = (-2 if self.clockwise else 2) * np.pi / period * self.firing
+        return azimuth[:, None] + turned, elevation
+
+
+# A VLP-16 fires every 2.304 us (manual, "firing sequence"): -15, 1, -13, 3 ... -1, 15 deg; rings here run from the top.
+_VLP16_FIRING = tuple(2.304 * (15 - 2 * k if k < 8 else 2 * (15 - k)) for k in range(16))
+# An HDL-64E fires one laser of its upper and one of its lower block at once, every 0.728 us (S2 manual, appendix G: 23.3 us
+# for a block). Which laser looks where differs from unit to unit: taken as from the top down.
+_HDL64_FIRING = tuple(0.728 * (k % 32) for k in range(64))
+# Of the unit on KITTI's car: every ring of its recordings fits one elevation and one height of its laser to better than 0.1 deg.
+_KITTI_DEG = (
+    2.14, 1.78, 1.51, 1.08, 0.78, 0.39, 0.12, -0.25,
+    -0.60, -1.00, -1.29, -1.63, -2.00, -2.34, -2.67, -3.03,
+    -3.33, -3.73, -4.01, -4.38, -4.71, -5.05, -5.41, -5.75,
+    -6.12, -6.47, -6.79, -7.08, -7.47, -7.85, -8.11, -8.51,
+    -8.82, -9.37, -9.86, -10.27, -10.75, -11.39, -11.91, -12.36,
+    -12.84, -13.28, -13.84, -14.39, -14.98, -15.45, -15.97, -16.35,
+    -16.98, -17.53, -18.12, -18.59, -19.12, -19.53, -20.02, -20.58,
+    -21.11, -21.73, -22.23, -22.65, -23.12, -23.77, -24.30, -24.79,
+)  # fmt: skip
+_KITTI_HEIGHTS = (0.21,) * 10 + (0.20,) * 22 + (0.12,) * 32
 
 
 def _even(top_deg: float, bottom_deg: float, count: int) -> tuple[float, ...]:
@@ -105,15 +155,19 @@ LIDARS = {
     for model in (
         # Small on purpose: 6,400 rays, the sensor of sample_data.
         LidarModel("sample", _even(25.0, -20.0, 16), 400, 0.9, 80.0, 0.015, 0.005, 0.01, 45.0, 0.03),
-        LidarModel("vlp16", _even(15.0, -15.0, 16), 1800, 0.5, 100.0, 0.015, 0.002, 0.01, 50.0, 0.02, "column", 0.0, True),
+        LidarModel(
+            "vlp16", _even(15.0, -15.0, 16), 1800, 0.5, 100.0, 0.015, 0.002, 0.01, 50.0, 0.02, "column", 0.0, True,
+            firing_us=_VLP16_FIRING,
+        ),
         # KITTI's sensor: 32 lasers 1/3 deg apart above 32 lasers 1/2 deg apart; points ring after ring, from ahead to the left.
         LidarModel(
             "hdl64", (*_even(2.0, -8.33, 32), *_even(-8.83, -24.33, 32)), 2000, 0.9, 120.0, 0.02, 0.002, 0.01, 50.0, 0.03,
+            firing_us=_HDL64_FIRING,
         ),
         # As its recordings show it: up to 2,170 returns in a ring, roads seen to 50 m.
         LidarModel(
-            "hdl64-kitti", (*_even(2.0, -8.33, 32), *_even(-8.83, -24.33, 32)), 2170, 0.9, 120.0, 0.02, 0.002, 0.01, 60.0, 0.015,
-            ring_bias=0.012, ring_tilt_deg=0.03,
+            "hdl64-kitti", _KITTI_DEG, 2170, 0.9, 120.0, 0.02, 0.002, 0.01, 45.0, 0.015,
+            ring_bias=0.012, ring_tilt_deg=0.03, firing_us=_HDL64_FIRING, ring_heights=_KITTI_HEIGHTS,
         ),
         LidarModel(
             "os1-32", _even(22.5, -22.5, 32), 1024, 0.3, 100.0, 0.03, 0.01, 0.01, 45.0, 0.02, "column", 180.0, True,

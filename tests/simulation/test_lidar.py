@@ -136,7 +136,7 @@ def wall_at(x: float, surface: int = Surface.WALL) -> Mesh:
 
 def returned(mesh: Mesh, azimuth_deg: float = 0.0) -> float:
     """Share of rays near one azimuth that come back."""
-    model = replace(LIDARS["hdl64"], elevations_deg=(0.0,), columns=36000)
+    model = replace(LIDARS["hdl64"], elevations_deg=(0.0,), columns=36000, firing_us=())
     scan = trace(RayScene(mesh), model, np.eye(4), rng())
     azimuth = np.degrees(np.arctan2(scan.points[:, 1], scan.points[:, 0]))
     return float(np.sum(np.abs(azimuth - azimuth_deg) < 5) / 1000)
@@ -151,15 +151,79 @@ def test_far_grazing_and_dark_surfaces_return_less() -> None:
 
 
 def test_intensity_falls_with_incidence_and_differs_by_surface() -> None:
+    """By Oren and Nayar's model of a rough surface, written out anew, for light that returns to where it came from."""
     scan = trace(RayScene(wall_at(10)), LIDARS["hdl64"], np.eye(4), rng())
     assert scan.intensity is not None
     assert scan.intensity.min() >= 0
     assert scan.intensity.max() <= 1
-    azimuth = np.abs(np.degrees(np.arctan2(scan.points[:, 1], scan.points[:, 0])))
-    assert scan.intensity[azimuth > 60].mean() < 0.6 * scan.intensity[azimuth < 10].mean()
-    road = trace(RayScene(wall_at(10, Surface.ROAD)), LIDARS["hdl64"], np.eye(4), rng())
-    assert road.intensity is not None
-    assert road.intensity.mean() < 0.6 * scan.intensity.mean()
+    p = scan.points.astype(float)
+    incidence = np.arccos(p[:, 0] / np.linalg.norm(p, axis=1))
+    variance = 0.6**2
+    a, b = 1 - 0.5 * variance / (variance + 0.33), 0.45 * variance / (variance + 0.09)
+    for low, high in ((0, 10), (40, 50), (70, 80)):
+        here = (np.degrees(incidence) >= low) & (np.degrees(incidence) < high)
+        i = incidence[here]
+        brightness = (a + b * np.sin(i) * np.tan(i)) * np.cos(i) / a
+        assert scan.intensity[here].mean() == pytest.approx(0.45 * brightness.mean(), rel=0.03)
+    glass = trace(RayScene(wall_at(10, Surface.GLASS)), LIDARS["hdl64"], np.eye(4), rng())
+    assert glass.intensity is not None
+    assert glass.intensity.mean() < 0.1 * scan.intensity.mean()
+
+
+def test_a_vlp16_fires_one_laser_after_the_other() -> None:
+    """Elevations alternate between the halves, 2.304 us apart; the head turns on and the LiDAR moves meanwhile."""
+    model = replace(
+        LIDARS["vlp16"], range_noise=0.0, range_step=1e-6, angle_noise_deg=0.0, range_10pct=1e6, dropout=0.0
+    )
+    still = trace(RayScene(room(8.0)), model, np.tile(np.eye(4), (1800, 1, 1)), rng())
+    assert still.times is not None
+    times = still.times.reshape(1800, 16)
+    np.testing.assert_allclose(times - times[:, :1], np.tile(2.304e-6 * np.arange(16), (1800, 1)), atol=1e-8)
+    assert np.all(np.diff(still.times) > 0)
+    order = np.round(elevation(still.points[:16])).tolist()
+    assert order == [-15, 1, -13, 3, -11, 5, -9, 7, -7, 9, -5, 11, -3, 13, -1, 15]
+    azimuth = np.unwrap(np.arctan2(still.points[:, 1], still.points[:, 0]).astype(float))
+    np.testing.assert_allclose(azimuth, -2 * np.pi * still.times / 0.1, atol=1e-5)
+
+
+def test_points_of_one_column_lie_where_the_lidar_was_when_each_was_fired() -> None:
+    """Fast enough that a column smears by centimetres: each point carried by the pose at its own time is on the wall."""
+    model = replace(
+        LIDARS["vlp16"], range_noise=0.0, range_step=1e-6, angle_noise_deg=0.0, range_10pct=1e6, dropout=0.0
+    )
+    twist = np.array([15.0, 40.0, -9.0, 2.0, -4.0, 3.0])
+    scan = trace(RayScene(room(20.0)), model, se3.exp(np.arange(1800)[:, None] * (0.1 / 1800) * twist), rng())
+    assert scan.times is not None
+    exact, column = se3.exp(scan.times[:, None].astype(float) * twist), np.floor(scan.times * 18000 + 1e-3) / 18000
+    for times, bound in ((exact, 3e-5), (se3.exp(column[:, None] * twist), None)):
+        carried = np.einsum("nij,nj->ni", times[:, :3, :3], scan.points.astype(float)) + times[:, :3, 3]
+        off = np.abs(np.abs(carried).max(axis=1) - 20.0).max()
+        assert off < bound if bound is not None else off > 1e-3
+
+
+def test_lasers_at_different_heights_see_from_there() -> None:
+    """A laser 0.2 m above the origin meets the floor farther out; its points are given from the origin all the same."""
+    raised = replace(PERFECT, ring_heights=(0.2, 0.2, 0.2, 0.1, 0.1))
+    scan = trace(RayScene(floor(-1.73)), raised, np.eye(4), rng())
+    assert scan.rings is not None
+    np.testing.assert_allclose(scan.points[:, 2], -1.73, atol=1e-4)
+    out = np.hypot(scan.points[:, 0], scan.points[:, 1]).astype(float)
+    height, fall = (
+        np.array(raised.ring_heights)[scan.rings],
+        np.tan(np.radians(np.array(PERFECT.elevations_deg)[scan.rings])),
+    )
+    np.testing.assert_allclose(out, (1.73 + height) / -fall, rtol=1e-5)
+    with pytest.raises(ValueError, match="ring_heights of 'perfect': 2 values for 5 rings"):
+        replace(PERFECT, ring_heights=(0.1, 0.2))
+
+
+def test_the_lasers_of_an_ouster_fire_together_and_those_of_an_hdl64_in_pairs() -> None:
+    assert not LIDARS["os1-64"].firing.any()
+    pairs, counts = np.unique(LIDARS["hdl64-kitti"].firing, return_counts=True)
+    assert set(counts.tolist()) == {2}
+    np.testing.assert_allclose(np.diff(pairs), 0.728e-6)
+    for model in LIDARS.values():
+        assert model.firing.max() < 0.1 / model.columns
 
 
 def test_nothing_around_gives_an_empty_scan() -> None:

@@ -92,6 +92,35 @@ def test_a_share_of_the_rays_passes_a_pane_to_what_is_behind() -> None:
         assert behind.mean() == pytest.approx(share, abs=0.02)
 
 
+def test_what_moves_behind_a_pane_is_seen_through_it_and_what_moves_before_it_hides_it() -> None:
+    """A body passes at 100 m/s, behind a pane or before it: each ray meets it where it is when that ray is fired."""
+    builder = MeshBuilder()
+    for x, surface in ((5, Surface.GLASS), (12, Surface.WALL)):
+        builder.add_quads([[[x, -400, -400], [x, 400, -400], [x, 400, 400], [x, -400, 400]]], surface)
+    scene, bright = RayScene(builder.build()), replace(PERFECT, range_10pct=1e9)
+
+    def passing(x: float) -> MovingMesh:
+        def poses(times: NDArray[Any]) -> NDArray[np.float64]:
+            T = np.tile(np.eye(4), (len(times), 1, 1))
+            T[:, 0, 3], T[:, 1, 3] = x, 100.0 * (np.asarray(times) - 0.05)
+            return T
+
+        return MovingMesh(RayScene(cube(1.0)), poses, 1.8, 100.0)
+
+    bright, still = replace(bright, start_deg=-180.0), np.tile(np.eye(4), (PERFECT.columns, 1, 1))
+    for x in (8.0, 3.0):
+        scan = trace(scene, bright, still, np.random.default_rng(1), bodies=[passing(x)], glass=1.0)
+        assert scan.times is not None
+        on_body = np.isclose(scan.points[:, 0], x - 1.0, atol=1e-3)
+        assert on_body.sum() > 50
+        y = scan.points[on_body, 1] - 100.0 * (scan.times[on_body] - 0.05)
+        assert np.abs(y).max() < 1.001
+        assert np.ptp(scan.points[on_body, 1]) > 2.2, "it has moved while the scan was taken"
+        assert not np.isclose(scan.points[:, 0], 5.0, atol=1e-2).any(), "no ray stops at the pane"
+    shut = trace(scene, bright, still, np.random.default_rng(1), bodies=[passing(8.0)], glass=0.0)
+    assert not np.isclose(shut.points[:, 0], 7.0, atol=1e-2).any()
+
+
 def test_the_own_roof_shadows_what_is_low() -> None:
     down = replace(PERFECT, elevations_deg=(-10.0, -20.0, -30.0))
     scene, roof = RayScene(cube(50.0, Surface.WALL)), Roof(0.9, 0.75, 0.5, 0.3)
