@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -36,10 +36,27 @@ class Swing:
 
 
 def gait(rng: np.random.Generator, strength: float = 1.0) -> Swing:
-    """A hand-held sensor at a walk: steps of 1.8 Hz, sways of half that, looks to both sides, up to about 110 deg/s."""
-    amplitudes = np.array([[0.015, 0.03, 0.03, 0.05, 0.05, 0.75], [0.01, 0.01, 0.006, 0.03, 0.03, 0.25]]) * strength
-    frequencies = np.array([[1.8, 0.9, 1.8, 0.45, 0.6, 0.3], [0.7, 1.8, 3.6, 0.9, 1.8, 0.8]])
-    return Swing(amplitudes, frequencies * rng.uniform(0.93, 1.07, (2, 6)), rng.uniform(0, 2 * np.pi, (2, 6)))
+    """A hand-held sensor at a walk: steps of 1.9 Hz, sways of half that, and looks to both sides at up to 150 deg/s.
+
+    Two slow sweeps of the head that are nearly in step make it look about for a while and straight ahead for a while.
+    """
+    amplitudes = np.array(
+        [
+            [0.015, 0.03, 0.02, 0.04, 0.04, 0.45],
+            [0.01, 0.01, 0.004, 0.03, 0.03, 0.45],
+            [0.0, 0.0, 0.0, 0.01, 0.015, 0.16],
+        ]
+    )
+    frequencies = np.array(
+        [
+            [1.9, 0.95, 1.9, 0.45, 0.6, 0.28],
+            [0.7, 1.9, 3.8, 0.95, 1.9, 0.34],
+            [1.0, 1.0, 1.0, 1.9, 3.8, 0.8],
+        ]
+    )
+    return Swing(
+        strength * amplitudes, frequencies * rng.uniform(0.95, 1.05, (3, 6)), rng.uniform(0, 2 * np.pi, (3, 6))
+    )
 
 
 def buffeting(rng: np.random.Generator, strength: float = 1.0) -> Swing:
@@ -119,7 +136,7 @@ def fly(
     """Carry a LiDAR along `distance` m of `curve`; on a climb the speed counts along its mean slope."""
     rise = float(climb(curve.length) - climb(0.0))
     level = curve.length / float(np.hypot(curve.length, rise))
-    pace = SpeedProfile(speed.cruise * level, speed.start * level, speed.acceleration, speed.braking, speed.lateral)
+    pace = replace(speed, cruise=speed.cruise * level, start=speed.start * level)
     still = suspension(np.random.default_rng(0), 0.0, 0.0)
     timed = drive(curve, flat(), pace, distance, 0.0, still)
     return FreePath(curve, timed.travelled, timed.duration, climb, bank, swing, terrain)

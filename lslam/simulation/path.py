@@ -17,13 +17,22 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class SpeedProfile:
-    """What limits a vehicle: cruising speed and the speed at the start, m/s; accelerations along and across, m/s2."""
+    """What limits a vehicle: cruising speed and the speed at the start, m/s; accelerations along and across, m/s2; jerk, m/s3.
+
+    The defaults are what passengers of a car find comfortable.
+    """
 
     cruise: float
     start: float
-    acceleration: float = 3.0
-    braking: float = 4.0
+    acceleration: float = 2.0
+    braking: float = 2.5
     lateral: float = 4.0
+    jerk: float = 2.0
+
+    @property
+    def easing(self) -> float:
+        """Seconds it takes to go over from the strongest acceleration to the strongest braking."""
+        return (self.acceleration + self.braking) / self.jerk
 
 
 @dataclass(frozen=True)
@@ -84,23 +93,49 @@ def drive(
     curve: Curve, terrain: Terrain, speed: SpeedProfile, distance: float, height: float, shaking: Suspension
 ) -> VehiclePath:
     """Drive `distance` m along `curve`, lap after lap on a closed one."""
-    from scipy.interpolate import CubicSpline
+    from scipy.interpolate import make_interp_spline
 
     s = np.linspace(0, distance, int(np.ceil(distance / 0.25)) + 1)
     v = _speeds(curve, s, speed)
     t = np.concatenate([[0.0], np.cumsum(2 * np.diff(s) / (v[:-1] + v[1:]))])
-    travelled = CubicSpline(t, s, bc_type=((1, v[0]), (1, v[-1])))
-    return VehiclePath(curve, terrain, travelled, float(t[-1]), height, shaking)
+    times, travelled = _eased(t, s, v, speed.easing if speed.start > 0 else -speed.easing)
+    duration = float(np.interp(distance, travelled, times))
+    return VehiclePath(curve, terrain, make_interp_spline(times, travelled, k=5), duration, height, shaking)
 
 
 def _speeds(curve: Curve, s: Floats, speed: SpeedProfile) -> Floats:
     """Speed at each distance: the cruise, less in bends, reached with bounded acceleration and braking."""
     bend = np.maximum(np.abs(curve.curvature(s)), 1e-9)
     v = np.minimum(speed.cruise, np.sqrt(speed.lateral / bend))
-    step = np.diff(s)
-    v[0] = min(v[0], speed.start)
-    for i in range(len(step)):
-        v[i + 1] = min(v[i + 1], np.sqrt(v[i] ** 2 + 2 * speed.acceleration * step[i]))
-    for i in range(len(step) - 1, -1, -1):
-        v[i] = min(v[i], np.sqrt(v[i + 1] ** 2 + 2 * speed.braking * step[i]))
-    return np.asarray(v)
+    step, half = s[1] - s[0], speed.easing / 2
+    # Easing smears the profile: whatever is slow stays so a little before and after.
+    held = v.copy()
+    for k in range(1, min(int(speed.cruise * half / step), len(v) - 1) + 1):
+        lasting = np.where(k * step <= v * half, v, np.inf)
+        held[k:] = np.minimum(held[k:], lasting[:-k])
+        held[:-k] = np.minimum(held[:-k], lasting[k:])
+    held[0] = min(held[0], speed.start)
+    for i in range(len(s) - 1):
+        gain = speed.acceleration if s[i] >= speed.start * half else 0.0
+        held[i + 1] = min(held[i + 1], np.sqrt(held[i] ** 2 + 2 * gain * step))
+    for i in range(len(s) - 2, -1, -1):
+        held[i] = min(held[i], np.sqrt(held[i + 1] ** 2 + 2 * speed.braking * step))
+    return np.asarray(held)
+
+
+def _eased(t: Floats, s: Floats, v: Floats, easing: float) -> tuple[Floats, Floats]:
+    """Times from 0 in even steps and distances there: `s` over `t`, averaged over `easing` s, so that no acceleration steps.
+
+    A negative `easing` begins half of it earlier, standing at the start.
+    """
+    half, step = abs(easing) / 2, 0.05
+    # Beyond both ends it goes on evenly.
+    fine = np.arange(-2 * half - step, t[-1] + 2 * half + 2 * step, step / 5)
+    speeds = np.interp(fine, t, v)
+    at = np.concatenate([[0.0], np.cumsum((speeds[1:] + speeds[:-1]) * (step / 10))])
+    at += s[0] - np.interp(0.0, fine, at)
+    summed = np.concatenate([[0.0], np.cumsum((at[1:] + at[:-1]) * (step / 10))])
+    begin = -half if easing < 0 else 0.0
+    times = np.arange(0.0, t[-1] + half - begin, step)
+    ahead, behind = (np.interp(times + begin + sign * half, fine, summed) for sign in (1, -1))
+    return times, (ahead - behind) / (2 * half)

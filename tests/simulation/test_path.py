@@ -52,13 +52,35 @@ def test_winding_street_bends_gently() -> None:
         assert 1 / np.abs(line.curvature(line.sample(1.0))).max() > 50
 
 
-def test_start_from_rest_follows_half_a_t_squared() -> None:
-    path = drive(straight(), flat(), SpeedProfile(10.0, 0.0, acceleration=2.0), 150.0, 1.73, STILL)
-    t = np.array([0.0, 1.0, 2.0, 4.0])
-    np.testing.assert_allclose(path.poses(t)[:, 0, 3], t**2, atol=0.05)
+def test_start_from_rest_grows_into_half_a_t_squared() -> None:
+    """The acceleration a grows evenly over the easing T: s = a t^3 / 6T, and then a (t - T/2)^2 / 2 + a T^2 / 24."""
+    limits = SpeedProfile(10.0, 0.0, acceleration=2.0, braking=2.0, jerk=2.0)
+    path = drive(straight(), flat(), limits, 150.0, 1.73, STILL)
+    t = np.array([0.0, 1.0, 2.0, 3.0, 4.0])
+    grown = np.where(t < 2, t**3 / 6, (t - 1) ** 2 + 1 / 3)
+    np.testing.assert_allclose(path.poses(t)[:, 0, 3], grown, atol=0.02)
     np.testing.assert_allclose(path.poses(t)[:, 2, 3], 1.73, atol=1e-9)
     late = path.poses(np.array([8.0, 9.0]))
     assert late[1, 0, 3] - late[0, 0, 3] == pytest.approx(10.0, abs=1e-3)
+
+
+@pytest.mark.parametrize("start", [0.0, 6.0])
+def test_no_acceleration_steps_and_the_jerk_is_limited(start: float) -> None:
+    """Along winding way-points with sharp bends: what the seat feels along the road."""
+    line = smooth_curve(np.array([[0.0, 0], [60, 0], [60, 60], [140, 60], [150, 0]]), closed=False, smoothing=4.0)
+    limits = SpeedProfile(12.0, start)
+    path = drive(line, flat(), limits, line.length, 1.73, STILL)
+    t = np.arange(0.0, path.duration, 0.02)
+    v, a, jerk = (np.asarray(path.travelled(t, nu=k)) for k in (1, 2, 3))
+    assert np.abs(jerk).max() < 1.2 * limits.jerk
+    assert a.max() < limits.acceleration + 0.01
+    assert a.min() > -limits.braking - 0.01
+    assert a.min() < -1.0, "it does brake"
+    assert v[0] == pytest.approx(start, abs=0.02)
+    # Nor is any bend taken faster than it was to be.
+    across = v**2 * np.abs(line.curvature(np.asarray(path.travelled(t))))
+    assert across.max() < 1.1 * limits.lateral
+    assert float(path.travelled(path.duration)) == pytest.approx(line.length, abs=0.05)
 
 
 def test_constant_speed_is_exact() -> None:
