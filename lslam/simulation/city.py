@@ -83,7 +83,7 @@ def build_city(street: Curve, terrain: Terrain, layout: Layout, rng: np.random.G
     """Build a town along `street`. The same generator state gives the same town."""
     builder = MeshBuilder()
     _add_road(builder, street, terrain, layout, rng)
-    add_ground(builder, [street], terrain, layout, rng)
+    add_ground(builder, [street], terrain, layout, rng, 0.75 * layout.pavement)
     lots = Lots([street], layout)
     for side in (1, -1):
         add_row(builder, lots, street, terrain, layout, rng, side, first=True)
@@ -158,18 +158,20 @@ def add_ground(
     terrain: Terrain,
     layout: Layout,
     rng: np.random.Generator,
-    tucked: float = 0.1,
+    tucked: float,
+    level: float = KERB - 0.07,
 ) -> None:
-    """Grass everywhere else, a little below the pavements so that their edge shows; it reaches `tucked` m under them."""
+    """Grass everywhere else, `level` m above the terrain; it reaches `tucked` m under pavements, or roads without any.
+
+    The level is a little below them, so that their edge shows and the grass does not come through.
+    """
     from scipy.spatial import cKDTree
 
     middle = np.concatenate([street.position(street.sample(0.5)) for street in streets])
     low, high = middle.min(0) - MARGIN, middle.max(0) + MARGIN
     x, y = (np.arange(low[k], high[k] + 1.0, 1.0) for k in (0, 1))
     xy = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1)
-    # Under a pavement it must not come through.
-    sunk = 0.03 if tucked < 0.5 else 0.07
-    z = terrain.height(xy) + KERB - sunk + rng.normal(0, 0.015, xy.shape[:2])
+    z = terrain.height(xy) + level + rng.normal(0, 0.015, xy.shape[:2])
     nearest = np.asarray(cKDTree(middle).query(xy.reshape(-1, 2), distance_upper_bound=layout.band)[0])
     under_road = nearest < layout.band - tucked
     faces = grid_faces(len(x), len(y))

@@ -15,14 +15,17 @@ from lslam.simulation.terrain import Terrain
 Floats = NDArray[np.float64]
 
 RAIL = (0.45, 0.75)  # m, the lower and the upper edge of a guard rail
+VERGE = -0.06  # m, of grass beside a road without kerbs
 WALL_HEIGHT = 6.0  # m, of a corridor
+OPENINGS = (135.0, 155.0)  # m from the middle of one opening of a corridor to the next
+OPENING = 28.0  # m of an opening
 
 
 def build_motorway(street: Curve, terrain: Terrain, layout: Layout, rng: np.random.Generator) -> City:
     """Two carriageways with guard rails, delineators, gantries and a noise barrier; beyond, trees, bushes and a few farms."""
     builder = MeshBuilder()
     _add_strip(builder, street, terrain, [0.0, 3.0, 6.0, 9.0, layout.road, layout.band], rng)
-    add_ground(builder, [street], terrain, layout, rng, 1.2)
+    add_ground(builder, [street], terrain, layout, rng, 1.2, VERGE)
     for offset in (-layout.road - 0.6, 0.0, layout.road + 0.6):
         _add_rail(builder, street, terrain, offset)
     for s in np.arange(10.0, street.length, 50.0):
@@ -47,21 +50,71 @@ def build_motorway(street: Curve, terrain: Terrain, layout: Layout, rng: np.rand
 
 
 def build_corridor(street: Curve, terrain: Terrain, layout: Layout, rng: np.random.Generator) -> City:
-    """A street between two plain walls, with flat piers: little tells how far along it one is."""
+    """A street between two smooth noise barriers, bare for more than 100 m at a time.
+
+    Only at the openings between them, with houses, trees and lamps, is there anything that tells how far along one is.
+    """
     builder = MeshBuilder()
     _add_strip(builder, street, terrain, [0.0, 2.0, layout.road, layout.band], rng)
-    add_ground(builder, [street], terrain, layout, rng, 1.2)
-    s = street.sample(2.0)
-    footprints = []
+    add_ground(builder, [street], terrain, layout, rng, 1.2, VERGE)
+    inside = layout.band - 0.3
+    middles = rng.uniform(-10, 0) + np.cumsum(rng.uniform(*OPENINGS, int(street.length / OPENINGS[0]) + 1))
+    openings = middles[middles < street.length - OPENING] if layout.poles else middles[:0]
+    ends = np.concatenate([[0.0], np.sort(np.append(openings - OPENING / 2, openings + OPENING / 2)), [street.length]])
+    footprints, heights = [], []
     for side in (1, -1):
-        _add_wall(builder, street, terrain, s, side * (layout.band - 0.3), WALL_HEIGHT, Surface.WALL)
-        near, far = street.beside(s, side * (layout.band - 0.3)), street.beside(s, side * (layout.band + 0.1))
-        footprints.append(np.concatenate([near, far[::-1]]))
-        at = np.cumsum(rng.uniform(6, 16, int(street.length / 6)))
-        for s_pier in at[at < street.length] if layout.poles else ():
-            low, high = [-0.3, -0.2, -0.5], [0.3, 0.2, WALL_HEIGHT]
-            _put(builder, street, terrain, float(s_pier), side * (layout.band - 0.4), low, high, Surface.WALL)
-    return City(builder.build(), terrain, street, footprints, [WALL_HEIGHT] * 2, [street])
+        for start, end in ends.reshape(-1, 2):
+            s = np.append(np.arange(start, end - 1.0, 2.0), end)
+            _add_wall(builder, street, terrain, s, side * inside, WALL_HEIGHT, Surface.WALL)
+            near, far = street.beside(s, side * (inside - 0.2)), street.beside(s, side * (inside + 0.2))
+            footprints.append(np.concatenate([near, far[::-1]]))
+            heights.append(WALL_HEIGHT)
+            for s_end in (start + 0.2, end - 0.2):
+                low, high = [-0.25, -0.3, -0.5], [0.25, 0.3, WALL_HEIGHT + 0.1]
+                _put(builder, street, terrain, s_end, side * inside, low, high, Surface.WALL)
+        for middle in openings.tolist():
+            outline, height = _fill_opening(builder, street, terrain, layout, middle, side, rng)
+            footprints.append(outline)
+            heights.append(height)
+    return City(builder.build(), terrain, street, footprints, heights, [street])
+
+
+def _fill_opening(
+    builder: MeshBuilder, street: Curve, terrain: Terrain, layout: Layout, s: float, side: int, rng: np.random.Generator
+) -> tuple[Floats, float]:
+    """A house behind an opening of the barrier, before it lamps, a cabinet and two trees; the house's outline and height."""
+    for lamp in (s + rng.uniform(-12, -6), s + rng.uniform(6, 12)):
+        _put(builder, street, terrain, lamp, side * layout.band, [-0.08, -0.08, -0.3], [0.08, 0.08, 7.0], Surface.POLE)
+    low, high = [-0.6, -0.25, -0.3], [0.6, 0.25, 1.5]
+    _put(builder, street, terrain, s + rng.uniform(-4, 4), side * (layout.band + 0.5), low, high, Surface.FENCE)
+    for tree in (s + rng.uniform(-11, -3), s + rng.uniform(3, 11)):
+        xy = street.beside(np.array([tree]), side * (layout.band + rng.uniform(2.5, 4.0)))[0]
+        builder.add_mesh(furniture.tree(rng), [*xy, float(terrain.height(xy))])
+    width, depth = rng.uniform(*layout.house_width), rng.uniform(*layout.house_depth)
+    return _add_house(
+        builder, street, terrain, layout, s + rng.uniform(-5, 5), side * (layout.band + 7.0), width, depth, rng
+    )
+
+
+def _add_house(
+    builder: MeshBuilder,
+    street: Curve,
+    terrain: Terrain,
+    layout: Layout,
+    s: float,
+    offset: float,
+    width: float,
+    depth: float,
+    rng: np.random.Generator,
+) -> tuple[Floats, float]:
+    """A house whose front is `offset` m to the left of the street and faces it; its outline (4, 2) and its height."""
+    at, side = np.array([s]), np.sign(offset)
+    front, tangent = street.beside(at, offset)[0], side * street.tangent(at)[0]
+    inward, half = np.array([-tangent[1], tangent[0]]), width / 2 * tangent
+    building = house(rng, width, depth, layout.storeys)
+    builder.add_mesh(building, [*front, float(terrain.height(front))], float(np.arctan2(tangent[1], tangent[0])))
+    outline = np.array([front - half, front + half, front + half + depth * inward, front - half + depth * inward])
+    return outline, float(building.vertices[:, 2].max())
 
 
 def _add_strip(
@@ -149,13 +202,7 @@ def _add_country(
             rng.uniform(*layout.house_width),
             rng.uniform(*layout.house_depth),
         )
-        at = np.array([s])
-        front, tangent = street.beside(at, side * rng.uniform(48, 58))[0], side * street.tangent(at)[0]
-        inward, half = np.array([-tangent[1], tangent[0]]), width / 2 * tangent
-        farm = house(rng, width, depth, layout.storeys)
-        builder.add_mesh(farm, [*front, float(terrain.height(front))], float(np.arctan2(tangent[1], tangent[0])))
-        footprints.append(
-            np.array([front - half, front + half, front + half + depth * inward, front - half + depth * inward])
-        )
-        heights.append(float(farm.vertices[:, 2].max()))
+        outline, height = _add_house(builder, street, terrain, layout, s, side * rng.uniform(48, 58), width, depth, rng)
+        footprints.append(outline)
+        heights.append(height)
     return footprints, heights

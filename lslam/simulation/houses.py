@@ -16,6 +16,7 @@ Floats = NDArray[np.float64]
 Quad = list[list[float]]
 
 FOUNDATION = -1.5  # m, walls reach below uneven ground
+HIGHEST_ROOF = 5.0  # m from the eaves to the ridge
 
 
 @dataclass(frozen=True)
@@ -124,7 +125,9 @@ def _balcony(builder: MeshBuilder, middle: Floats, along: Floats, outward: Float
 def _gabled_roof(builder: MeshBuilder, width: float, depth: float, eaves: float, pitch: float, along: bool) -> None:
     """Two slopes that overhang by 0.4 m and two gables; the ridge runs along the street or across it."""
     w, half = (width / 2, depth / 2) if along else (depth / 2, width / 2)
-    rise, over = half * pitch, 0.4
+    # A wide house has a flatter roof.
+    rise, over = min(half * pitch, HIGHEST_ROOF), 0.4
+    pitch = rise / half
 
     def place(u: float, v: float, z: float) -> list[float]:
         """u along the ridge, v across it, both from the middle of the house."""

@@ -56,7 +56,7 @@ def build_place(
         route = route_in_map(scenario, extract, way_points)
     else:
         route = given_route(scenario, way_points) if way_points is not None else own_route(scenario, place)
-    terrain = rolling(place, scenario.world.relief, scenario.world.unevenness)
+    terrain = rolling(place, scenario.world.relief, scenario.world.unevenness, scenario.world.swell)
     _check_radius(scenario, route.line)
     path, scans = _move(scenario, route, terrain, count, shake)
     if extract is not None:
@@ -70,7 +70,7 @@ def whole_map(scenario: Scenario, seed: int, extract: MapExtract) -> tuple[OsmCi
     It is what a plan to pick way-points from shows.
     """
     place, build = (np.random.default_rng([seed, 2**32 - k]) for k in (1, 2))
-    terrain = rolling(place, scenario.world.relief, scenario.world.unevenness)
+    terrain = rolling(place, scenario.world.relief, scenario.world.unevenness, scenario.world.swell)
     try:
         line = route_in_map(scenario, extract, None).line
         xy = line.position(line.sample(1.0))

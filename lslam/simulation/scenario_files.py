@@ -43,12 +43,16 @@ class PathSection(Section):
 
 
 class WorldSection(Section):
-    """The place: its kind, side streets (see `build_town`), the ground's relief and bumps, m, the rays that pass a pane."""
+    """The place: its kind, side streets (see `build_town`), the share of rays that pass a pane.
+
+    relief, swell : m up and down over m; unevenness : m of bumps
+    """
 
     kind: Literal["street", "town", "motorway", "corridor"] = "town"
     spacing: float = Field(80.0, ge=30, le=1000)
     levels: int = Field(1, ge=0, le=3)
     relief: float = Field(0.35, ge=0, le=20)
+    swell: float = Field(100.0, ge=20, le=5000)
     unevenness: float = Field(0.012, ge=0, le=0.5)
     glass: float = Field(0.0, ge=0, le=1)
 

@@ -31,9 +31,9 @@ class Terrain:
         return np.asarray((np.cos(xy @ self.waves.T + self.phases) * self.amplitudes) @ self.waves)
 
 
-def rolling(rng: np.random.Generator, relief: float = 0.35, unevenness: float = 0.012) -> Terrain:
-    """Ground of a town: long swells of about `relief` m, bumps of about `unevenness` m over 7 to 20 m."""
-    lengths = np.concatenate([rng.uniform(60, 140, 4), rng.uniform(7, 20, 5)])
+def rolling(rng: np.random.Generator, relief: float = 0.35, unevenness: float = 0.012, swell: float = 100.0) -> Terrain:
+    """Uneven ground: about `relief` m up and down over about `swell` m, bumps of about `unevenness` m over 7 to 20 m."""
+    lengths = np.concatenate([rng.uniform(0.6, 1.4, 4) * swell, rng.uniform(7, 20, 5)])
     amplitudes = np.concatenate([rng.uniform(0.4, 1.0, 4) * relief, rng.uniform(0.4, 1.0, 5) * unevenness])
     heading = rng.uniform(0, 2 * np.pi, len(lengths))
     waves = (2 * np.pi / lengths)[:, None] * np.stack([np.cos(heading), np.sin(heading)], axis=1)

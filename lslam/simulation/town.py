@@ -25,6 +25,7 @@ Floats = NDArray[np.float64]
 
 SHORTEST = 30.0  # m of a side street
 LONGEST = 110.0
+ROW = 12.0  # m left between streets for a row of houses
 CAR_LENGTH = 5.2  # m kept between the middles of parked cars
 
 
@@ -145,14 +146,15 @@ def _until_met(start: Floats, ray: Floats, length: float, taken: Any, layout: La
     steps = np.arange(0.0, length, 0.5)
     points = start + steps[:, None] * ray
     away = np.asarray(taken.query(points)[0])
-    clear = steps > 2.5 * layout.band
+    room = 2 * layout.band + ROW
+    clear = steps > 1.25 * room
     met = np.flatnonzero(clear & (away < 0.5))
     end = int(met[0]) + 1 if len(met) else len(steps)
-    # Beside another street for long, the two roads would become one.
-    beside = clear[:end] & (away[:end] < 2 * layout.band)
-    if steps[end - 1] < SHORTEST or np.count_nonzero(beside) * 0.5 > 3.5 * layout.band:
+    if steps[end - 1] < SHORTEST:
         return None
-    if not len(met) and away[end - 1] < 2 * layout.band:
+    # Only where it meets another street may it come near to one: beside it there would be no room for houses.
+    near = np.count_nonzero(clear[:end] & (away[:end] < room)) * 0.5
+    if near > (1.25 * room if len(met) else 0.0):
         return None
     return smooth_curve(points[[0, end - 1]], closed=False)
 

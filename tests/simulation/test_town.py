@@ -15,6 +15,7 @@ from lslam.simulation.mesh import Surface
 from lslam.simulation.scenario_files import scenario_names
 from lslam.simulation.scenarios import SimulatedDrive, simulate
 from lslam.simulation.town import Network
+from lslam.types.scan import Scan
 
 GROUND = (Surface.ROAD, Surface.PAVEMENT, Surface.LAWN)
 
@@ -103,11 +104,45 @@ def test_identical_houses_are_identical() -> None:
     assert len(sides) == 1
 
 
+def edges(scan: Scan) -> int:
+    """Neighbours on a ring, within a degree of each other, between which the range jumps by more than half a metre."""
+    assert scan.rings is not None
+    azimuth = np.arctan2(scan.points[:, 1], scan.points[:, 0])
+    order = np.lexsort((azimuth, scan.rings))
+    ranges, azimuth, ring = np.linalg.norm(scan.points, axis=1)[order], azimuth[order], scan.rings[order]
+    beside = (np.diff(ring) == 0) & (np.diff(azimuth) < np.radians(1))
+    return int(np.sum(beside & (np.abs(np.diff(ranges)) > 0.5)))
+
+
 def test_features_become_scarce_with_height_on_the_climb() -> None:
     made = simulate("climbing")
-    low, high = (np.mean([len(made.scan(i)) for i in indices]) for indices in (range(0, 40, 10), range(500, 540, 10)))
-    assert high < 0.4 * low
-    assert high > 500
+    low, middle, high = ([made.scan(i) for i in range(first, first + 40, 10)] for first in (0, 250, 500))
+    points = [float(np.mean([len(scan) for scan in scans])) for scans in (low, middle, high)]
+    assert points[0] > points[1] > points[2] > 500
+    assert points[2] < 0.4 * points[0]
+    found = [float(np.mean([edges(scan) for scan in scans])) for scans in (low, middle, high)]
+    assert found[0] > found[1] > found[2] > 10
+    assert found[2] < 0.5 * found[0]
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_corridor_is_bare_for_long_and_then_opens(seed: int) -> None:
+    """Rays sideways along the line: smooth walls for 100 m and more, openings between; one of them at the start."""
+    made = simulate("corridor", seed=seed, count=1)
+    street = made.city.street
+    assert street is not None
+    s = np.arange(100.0, street.length - 100.0, 1.0)
+    start = np.column_stack([street.position(s), np.full(len(s), 5.0)]).astype(np.float32)
+    aside = np.column_stack([street.beside(s, 1.0) - street.position(s), np.zeros(len(s))]).astype(np.float32)
+    far, face = made.scene.cast(start, aside)
+    is_bare = (made.scene.mesh.surfaces[face] == Surface.WALL) & (far < 6)
+    changes = np.flatnonzero(np.diff(is_bare))
+    lengths = np.diff(changes)
+    assert np.all((lengths < 35) | (lengths > 95)), "an opening or a bare wall"
+    assert (lengths < 35).any()
+    assert (lengths > 95).any()
+    away = np.linalg.norm(street.position(s) - made.city_poses[0, :2, 3], axis=1)
+    assert not is_bare[np.argsort(away)[:20]].all(), "it begins where there is something to see"
 
 
 def test_a_path_through_a_building_is_refused() -> None:
