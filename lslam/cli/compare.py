@@ -9,12 +9,12 @@ import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
 from lslam.cli import options
-from lslam.cli.console import progress, setup_logging, show
+from lslam.cli.console import log, progress, setup_logging, show
 
 if TYPE_CHECKING:
     from lslam.studies.plan import Follow, Plan
@@ -72,7 +72,7 @@ def command(sequences: tuple[str, ...], **given: Any) -> None:
     with ExitStack() as stack:
         comparison = compare(plan, _follow(stack))
     _print(comparison, given["table"], given["as_json"])
-    click.echo(f"page: {plan.out / 'compare.html'}", err=True)
+    log.info("the page: %s", plan.out / "compare.html")
     failed = comparison.failed
     said = "; ".join(f"{run.sequence} {run.method} seed {run.seed}: {run.reason}" for run in failed[:3])
     if len(failed) == len(comparison.runs):
@@ -177,10 +177,20 @@ def _print_rich(comparison: Comparison) -> None:
         shown = Table(
             title=table.title or None, title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1), pad_edge=False
         )
-        for k, name in enumerate(table.header):
-            shown.add_column(name, justify="left" if k < table.names else "right")
+        for k, name in enumerate(table.folded):
+            side: Literal["left", "right"] = "left" if k < table.names else "right"
+            shown.add_column(name, justify=side, overflow="fold", no_wrap=k == 1, vertical="bottom")
+        room = max((len(row[0]) for row in table.rows), default=0) - max(table.width - console.width, 0)
         for i, row in enumerate(table.rows):
-            shown.add_row(*(Text(cell, "bold" if (i, k) in table.best else "") for k, cell in enumerate(row)))
+            if i and row[0] != table.rows[i - 1][0] and table.header[0] == "sequence":
+                shown.add_section()
+            cells = (_shortened(row[0], max(room, 9)), *row[1:])
+            shown.add_row(*(Text(cell, "bold" if (i, k) in table.best else "") for k, cell in enumerate(cells)))
         console.print(shown)
     for line in (*comparison.notes, *recipes(comparison)):
         console.print(Text(f"  {line}", "dim"))
+
+
+def _shortened(name: str, most: int) -> str:
+    """A name with its middle left out: recordings of one day differ at the end."""
+    return name if len(name) <= most else f"{name[: most // 2 - 2]}…{name[-(most // 2 + 1) :]}"

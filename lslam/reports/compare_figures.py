@@ -129,9 +129,8 @@ def _bars(bars: Sequence[tuple[str, dict[str, float]]], stages: Sequence[str], l
         frame.add(f'<path class="grid" d="M{x:.1f} {frame.top}V{frame.bottom}"/>')
         frame.text(x, frame.bottom + 16, svg.number(value, right), "middle")
     frame.text((frame.left + frame.right) / 2, frame.height - 6, "time per scan, ms", "middle", "label")
-    for i, (label, means) in enumerate(bars):
+    for i, (_, means) in enumerate(bars):
         y = frame.top + _ROW * i
-        frame.text(frame.left + 4, y + 15, label, "start", "label")
         below = 0.0
         for k, stage in enumerate(stages):
             x0, x1 = float(frame.px(below)), float(frame.px(below + means[stage]))
@@ -148,6 +147,8 @@ def _bars(bars: Sequence[tuple[str, dict[str, float]]], stages: Sequence[str], l
         frame.text(x - 4, frame.top - 8, f"real-time limit {limit:.0f} ms", "end", "limit-text")
     elif limit > 0:
         frame.text(frame.right, frame.top - 8, f"real-time limit {limit:.0f} ms →", "end", "limit-text")
+    for i, (label, _) in enumerate(bars):  # last, so that the limit does not cross them out
+        frame.text(frame.left + 4, frame.top + _ROW * i + 15, label, "start", "label over")
     return frame.svg(title)
 
 

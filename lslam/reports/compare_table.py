@@ -13,6 +13,7 @@ from lslam.reports.metrics import counted, fixed, metres
 from lslam.types.comparison import Comparison, Metric, Spread, SummaryRow
 
 STYLES = ("md", "csv", "tex")
+TITLES = {"error": "errors", "time": "time", "health": "scans and runs"}
 HEALTH = ("bridged", "skipped", "degenerate")
 
 
@@ -32,17 +33,28 @@ class CompareTable:
         return [list(self.header), *(list(row) for row in self.rows)]
 
     @property
+    def folded(self) -> tuple[str, ...]:
+        """The header on several lines: units and long lists below."""
+        return tuple(name.replace(", ", "\n").replace("/", "/\n") for name in self.header)
+
+    @property
     def width(self) -> int:
-        """Columns of the terminal it takes."""
-        return max(len(line) for line in aligned(self.grid, self.names).splitlines())
+        """Columns of the terminal it takes with the folded header and three spaces between columns."""
+        heads = [max(len(line) for line in name.split("\n")) for name in self.folded]
+        cells = [max((len(row[k]) for row in self.rows), default=0) for k in range(len(self.header))]
+        return sum(max(pair) + 3 for pair in zip(heads, cells, strict=True))
 
 
 def tables(comparison: Comparison, width: int | None = None) -> list[CompareTable]:
-    """The methods' table, split in errors and times when it is wider than `width`; pairs, differences, failures."""
-    whole = _methods_table(comparison, ("error", "time", "health"), "")
-    out = [whole]
-    if width is not None and whole.width > width:
-        out = [_methods_table(comparison, ("error",), "errors"), _methods_table(comparison, ("time", "health"), "time")]
+    """The methods' table, in as many parts (errors, time, health) as `width` asks for; pairs, differences, failures."""
+    splits: list[list[tuple[str, ...]]] = [
+        [("error", "time", "health")], [("error",), ("time", "health")], [("error",), ("time",), ("health",)],
+    ]  # fmt: skip
+    for split in splits:
+        titles = [TITLES[groups[0]] if len(split) > 1 else "" for groups in split]
+        out = [_methods_table(comparison, groups, title) for groups, title in zip(split, titles, strict=True)]
+        if width is None or all(table.width <= width for table in out):
+            break
     return out + [
         table for table in (_paired(comparison), _differences(comparison), _failures(comparison)) if table.rows
     ]
@@ -105,7 +117,7 @@ def _methods_table(comparison: Comparison, groups: Sequence[str], title: str) ->
         if "error" in groups and row.note and row.failed != row.runs:
             cells[0] = row.note if len(row.note) <= 20 else "not scored"
         if row.failed == row.runs:
-            cells = ["failed"] + ["-"] * (len(cells) - 1)
+            cells = ["failed"] * bool(cells) + ["-"] * (len(cells) - 1)
         rival = [other for other in comparison.rows if other.sequence == row.sequence]
         best |= {(i, 2 + k) for k, metric in enumerate(metrics) if _is_best(metric, row, rival)}
         health = [_health(row), f"{row.runs - row.failed}/{row.runs}"] if "health" in groups else []

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -37,6 +38,11 @@ def draw(jobs: Sequence[Job], scores: Sequence[RunScore]) -> tuple[list[Drawing]
 
     The reference is the first method that is there; what cannot be read is left out and said.
     """
+    with _only_warnings():  # what an evaluation remarks stands in the log of its run already
+        return _draw(jobs, scores)
+
+
+def _draw(jobs: Sequence[Job], scores: Sequence[RunScore]) -> tuple[list[Drawing], list[Difference]]:
     drawings, differences = [], []
     groups: dict[str, list[Finished]] = {}
     for job, score in zip(jobs, scores, strict=True):
@@ -56,6 +62,16 @@ def draw(jobs: Sequence[Job], scores: Sequence[RunScore]) -> tuple[list[Drawing]
         drawings.append(_in_own_world(sequence, seed, shown))
         differences += _differences(sequence, runs)
     return drawings, differences
+
+
+@contextmanager
+def _only_warnings() -> Iterator[None]:
+    before = log.level
+    log.setLevel(max(before, logging.WARNING))
+    try:
+        yield
+    finally:
+        log.setLevel(before)
 
 
 def _in_world_of_truth(
