@@ -130,18 +130,15 @@ def _cell(metric: Metric, row: SummaryRow) -> str:
     if value is None:
         return "-"
     if metric.group == "error":
-        text = _metre_spread(value) if metric.unit == "m" else _percent_spread(value)
+        text = _with_spread(metres(value.mean) if metric.unit == "m" else fixed(value.mean, 3), value)
     else:
         text = f"{value.mean:.1f}"
     return text if metric.group != "time" or row.is_timed_alone else f"~{text}"
 
 
-def _metre_spread(value: Spread) -> str:
-    return metres(value.mean) if value.n < 2 else f"{metres(value.mean)} ± {metres(value.std)}"
-
-
-def _percent_spread(value: Spread) -> str:
-    return fixed(value.mean, 3) if value.n < 2 else f"{fixed(value.mean, 3)} ± {fixed(value.std, 3)}"
+def _with_spread(mean: str, value: Spread) -> str:
+    """The mean's text with the deviation over seeds, in as many decimals."""
+    return mean if value.n < 2 else f"{mean} ± {fixed(value.std, len(mean.partition('.')[2]))}"
 
 
 def _health(row: SummaryRow) -> str:
