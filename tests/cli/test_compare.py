@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
+import pty
+import re
 import signal
 import subprocess
 import time
@@ -35,6 +38,25 @@ def test_one_object_on_stdout_progress_on_stderr_and_a_crop_of_ones_own(tmp_path
     assert "comparing 1/1" in done.stderr
 
 
+def on_a_terminal(words: list[str], columns: int) -> list[str]:
+    """What the command shows on a terminal of that width, without colours."""
+    ours, theirs = pty.openpty()
+    child = subprocess.Popen(
+        [*COMMAND, *words],
+        stdout=theirs,
+        stderr=subprocess.DEVNULL,
+        env=environment(COLUMNS=str(columns), TERM="xterm"),
+    )
+    os.close(theirs)
+    shown = b""
+    with contextlib.suppress(OSError):  # the end of a terminal is an error on Linux
+        while part := os.read(ours, 4096):
+            shown += part
+    os.close(ours)
+    assert child.wait(timeout=60) == 0
+    return re.sub(r"\x1b\[[0-9;]*m", "", shown.decode()).splitlines()
+
+
 @pytest.fixture(scope="module")
 def torn(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A recording whose scans cannot be read."""
@@ -61,6 +83,9 @@ def test_one_failed_run_is_exit_code_0_and_4_with_strict(torn: Path, tmp_path: P
     strict = lslam(*call, "--strict", "--resume")
     assert strict.returncode == 4
     assert "--strict: 1 of 2 runs failed" in strict.stderr
+    screen = on_a_terminal([*map(str, call[:-2]), "--resume"], columns=70)
+    assert max(len(line) for line in screen) <= 70
+    assert any(line.split()[:2] == ["block", "icp"] for line in screen)
     document = json.loads((tmp_path / "out" / "compare.json").read_text())
     assert [run["reused"] for run in document["runs"]] == [False, True]
 
