@@ -32,6 +32,15 @@ class LoamConfig(Section):
     )
     grid_step: float = Field(0.2, ge=0, description="m; grid of the less planar points, 0 keeps all")
     feature_map_voxel: float = Field(1.0, gt=0, description="m; voxels of the feature map")
+    ground_angle_deg: float = Field(
+        10.0, gt=0, lt=90, description="lego-loam: steepest ground against the dominant plane"
+    )
+    segment_angle_deg: float = Field(
+        60.0, gt=0, lt=90, description="lego-loam: neighbours whose line makes more with the beam belong together"
+    )
+    segment_points: int = Field(30, ge=1, description="lego-loam: smaller clusters are clutter, unless")
+    small_segment_points: int = Field(5, ge=1, description="lego-loam: they have so many points")
+    small_segment_rings: int = Field(3, ge=1, description="lego-loam: on so many rings, as poles have")
     matching: Literal["one-to-many", "one-to-one"] = Field(
         "one-to-many",
         description="scan to scan: a feature matches the line or plane through several of the other scan's, or the nearest alone",

@@ -98,8 +98,9 @@ def curvatures(
     jump: float,
     jump_slope: float,
     parallel_slope: float,
-) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Curvature (K,) of equation 2.21, NaN where a ring ends, or has a gap, within `SIDE` points; and what breaks (K,).
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
+    """Curvature (K,) of equation 2.21, NaN where a ring ends, or has a gap, within `SIDE` points; how much of it is a bend
+    (K,); and what breaks (K,).
 
     A point gets NaN as well, being no feature, next to an occlusion boundary on its far side, where the surface that is
     hidden begins, and where a surface is nearly parallel to the beam (Zhang and Singh 2014, section V.A).
@@ -107,10 +108,13 @@ def curvatures(
     gap : rad, angle between neighbours above which returns are missing
     jump, jump_slope : neighbours whose ranges differ by more than `jump` m and `jump_slope` * range are an occlusion
     parallel_slope : change of range over distance across, above which on both sides a surface is parallel to the beam
-    The second result tells whether the ring is broken, by a gap or a jump, between a point and the next.
+    On a plane that is sampled unevenly the curvature is not zero, but points along it: the bend is what is left across the
+    line from the first to the last neighbour, or all of it where a jump is among them.
+    The third result tells whether the ring is broken, by a gap or a jump, between a point and the next.
     """
     total = xyz.shape[0]
     curvature = np.full(total, np.nan)
+    bend = np.zeros(total)
     breaks = np.zeros(total, np.bool_)
     hidden = np.zeros(total, np.bool_)
     for k in range(starts.shape[0] - 1):
@@ -144,13 +148,26 @@ def curvatures(
                 sx += xyz[c, 0] - xyz[n, 0]
                 sy += xyz[c, 1] - xyz[n, 1]
                 sz += xyz[c, 2] - xyz[n, 2]
-            curvature[c] = np.sqrt(sx * sx + sy * sy + sz * sz) / ((2 * SIDE + 1) * r)
-    return curvature, breaks
+            square = sx * sx + sy * sy + sz * sz
+            scale = (2 * SIDE + 1) * r
+            curvature[c] = np.sqrt(square) / scale
+            jumps = False
+            for n in range(c - SIDE, c + SIDE):
+                jumps |= breaks[n]
+            if not jumps:
+                dx = xyz[c + SIDE, 0] - xyz[c - SIDE, 0]
+                dy = xyz[c + SIDE, 1] - xyz[c - SIDE, 1]
+                dz = xyz[c + SIDE, 2] - xyz[c - SIDE, 2]
+                along = sx * dx + sy * dy + sz * dz
+                square -= along * along / max(dx * dx + dy * dy + dz * dz, 1e-12)
+            bend[c] = np.sqrt(max(square, 0.0)) / scale
+    return curvature, bend, breaks
 
 
 @kernel
 def pick(
     curvature: NDArray[np.float64],
+    bend: NDArray[np.float64],
     ranges: NDArray[np.float64],
     breaks: NDArray[np.bool_],
     allowed: NDArray[np.uint8],
@@ -167,9 +184,9 @@ def pick(
     In each of `regions` parts of a ring with equally many points: the points of largest curvature are edges, of smallest
     planes; a point that is picked keeps its `SIDE` neighbours on either side, up to a break, from being picked likewise.
 
-    allowed : (K,) bit 1: may be an edge, bit 2: may be a plane; limits : per region, of edges, less sharp edges, planes
-    edge_curvature, edge_noise : an edge's curvature exceeds the one, and times its range, m, the other
-    plane_curvature, plane_noise : a plane's is less than the one, or times its range less than the other
+    allowed : (K,) bit 0: may be an edge, bit 1: less planar, bit 2: planar; limits : of edges, all edges, planes
+    edge_curvature, edge_noise : an edge's bend exceeds the one, and times its range, m, the other
+    plane_curvature, plane_noise : a plane's curvature is less than the one, or times its range less than the other
     """
     total = curvature.shape[0]
     labels = np.zeros(total, np.int8)
@@ -185,13 +202,14 @@ def pick(
                 for j in range(low, high):
                     c = curvature[j]
                     if sign > 0:
-                        fits = c > edge_curvature and c * ranges[j] > edge_noise and allowed[j] & 1
+                        fits = bend[j] > edge_curvature and bend[j] * ranges[j] > edge_noise and allowed[j] & 1
                     else:
                         fits = (
                             (c < plane_curvature or c * ranges[j] < plane_noise) and allowed[j] & 2 and labels[j] == 0
                         )
                         if fits:
                             labels[j] = LESS_PLANE
+                            fits = allowed[j] & 4 != 0
                     if fits and not taken[j]:
                         candidates[used] = j
                         used += 1

@@ -14,6 +14,8 @@ from lslam.kernels import curvature
 from lslam.preprocessing.prepare import gate_points
 from lslam.types.scan import Scan
 
+# What a point is allowed to become: an edge, a less planar point, a planar one (which is less planar as well).
+MAY_BE_EDGE, MAY_BE_FLAT, MAY_BE_PLANE = 1, 2, 4
 # Coarser than any spinning LiDAR: neighbours farther apart do not lie on one surface.
 WIDEST_STEP = np.radians(2.0)
 # A beam that turns back more often than this is not given in the order it was fired.
@@ -84,23 +86,28 @@ def extract_features(
     Parameters
     ----------
     gate : which points are used at all: range and ego box
-    allowed : (N,) of each point of the scan, bit 1: may be an edge, bit 2: may be planar; None allows both
+    allowed : (N,) of each point of the scan, a sum of MAY_BE_EDGE, MAY_BE_FLAT and MAY_BE_PLANE; None allows all
 
     Raises
     ------
     InputError : the scan has no rings, or neighbours on a ring are too far apart to lie on one surface
     """
-    config = config or LoamConfig()
-    walk = walk_rings(scan, gate or PreprocessConfig())
+    return features_along(scan, walk_rings(scan, gate or PreprocessConfig()), config or LoamConfig(), allowed)
+
+
+def features_along(
+    scan: Scan, walk: RingWalk, config: LoamConfig, allowed: NDArray[np.uint8] | None = None
+) -> Features:
+    """As `extract_features`, of a scan whose rings are walked already."""
     slope = np.tan(np.radians(config.parallel_deg))
-    curved, breaks = curvature.curvatures(
+    curved, bend, breaks = curvature.curvatures(
         walk.points, walk.ranges, walk.steps, walk.starts,
         _GAP_STEPS * walk.step, config.occlusion, slope * walk.step, slope,
     )  # fmt: skip
     noise = curvature_noise(walk.ranges)
-    both = np.full(len(scan), 3, np.uint8) if allowed is None else np.ascontiguousarray(allowed, np.uint8)
+    both = np.full(len(scan), 7, np.uint8) if allowed is None else np.ascontiguousarray(allowed, np.uint8)
     labels = curvature.pick(
-        curved, walk.ranges, breaks, both[walk.order], walk.starts, config.regions,
+        curved, bend, walk.ranges, breaks, both[walk.order], walk.starts, config.regions,
         (config.max_edge_points, config.max_less_edge_points, config.max_planar_points),
         config.edge_curvature * walk.step, config.planar_curvature * walk.step,
         config.edge_noise * noise, _PLANE_NOISE * noise,

@@ -18,6 +18,13 @@ def curvature_at(ring: Ring, i: int) -> float:
     return float(np.linalg.norm((ring[i] - around).sum(axis=0)) / (11 * np.linalg.norm(ring[i])))
 
 
+def bend_at(ring: Ring, i: int) -> float:
+    """The part of the curvature that is across the chord from the first to the last neighbour."""
+    total = (ring[i] - ring[i - 5 : i + 6]).sum(axis=0)
+    chord = (ring[i + 5] - ring[i - 5]) / np.linalg.norm(ring[i + 5] - ring[i - 5])
+    return float(np.linalg.norm(total - (total @ chord) * chord) / (11 * np.linalg.norm(ring[i])))
+
+
 def reference_labels(rings: list[Ring], step: float, config: LoamConfig) -> list[list[int]]:
     """Labels of each ring's points. `step` is the angle between beams, rad."""
     slope = math.tan(math.radians(config.parallel_deg))
@@ -42,6 +49,7 @@ def _one_ring(ring: Ring, r: Any, step: float, slope: float, noise: float, confi
         if jump[i]:
             hidden |= set(range(i + 1, i + 7)) if r[i + 1] > r[i] else set(range(i - 5, i + 1))
     c: dict[int, float] = {}
+    bend: dict[int, float] = {}
     for i in range(5, n - 5):
         if i in hidden or any(gap[i - 5 : i + 5]):
             continue
@@ -50,6 +58,7 @@ def _one_ring(ring: Ring, r: Any, step: float, slope: float, noise: float, confi
         if steep and before * after > 0:
             continue
         c[i] = curvature_at(ring, i)
+        bend[i] = c[i] if any(jump[i - 5 : i + 5]) else bend_at(ring, i)
     labels = [0] * n
     taken: set[int] = set()
 
@@ -66,7 +75,7 @@ def _one_ring(ring: Ring, r: Any, step: float, slope: float, noise: float, confi
         sharp = [
             i
             for i in part
-            if i in c and c[i] > config.edge_curvature * step and c[i] * r[i] > config.edge_noise * noise
+            if i in c and bend[i] > config.edge_curvature * step and bend[i] * r[i] > config.edge_noise * noise
         ]
         picked = 0
         for i in sorted(sharp, key=lambda i: (-c[i], i)):

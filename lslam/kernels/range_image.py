@@ -1,0 +1,191 @@
+"""A scan as a range image, ring by azimuth: its ground and its clusters (LeGO-LOAM, Shan and Englot 2018, section III).
+
+Pixel `row * columns + column`: row 0 is the lowest ring, columns count the azimuth and close upon themselves.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.kernels.jit import inline, kernel
+
+_REACH = 2  # pixels without a return that neighbours may have between them
+
+
+@kernel
+def row_slopes(points: NDArray[np.float64], starts: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Mean tangent of elevation (rings,) of points (K, 3) in ring order, NaN for rings without points."""
+    slopes = np.full(starts.shape[0] - 1, np.nan)
+    for k in range(slopes.shape[0]):
+        total = 0.0
+        for j in range(starts[k], starts[k + 1]):
+            total += points[j, 2] / np.sqrt(points[j, 0] ** 2 + points[j, 1] ** 2 + 1e-12)
+        if starts[k + 1] > starts[k]:
+            slopes[k] = total / (starts[k + 1] - starts[k])
+    return slopes
+
+
+@kernel
+def project(
+    points: NDArray[np.float64],
+    ranges: NDArray[np.float64],
+    starts: NDArray[np.int64],
+    row: NDArray[np.int64],
+    rows: int,
+    columns: int,
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Pixel (K,) of every point, and the nearest point of every pixel (rows * columns,), -1 for none.
+
+    points : (K, 3) and ranges (K,), m, ring k owning starts[k]..starts[k + 1]; row : (rings,) of each ring
+    """
+    pixel = np.empty(points.shape[0], np.int64)
+    nearest = np.full(rows * columns, -1, np.int64)
+    scale = columns / (2 * np.pi)
+    for k in range(starts.shape[0] - 1):
+        for j in range(starts[k], starts[k + 1]):
+            column = np.int64(np.floor((np.arctan2(points[j, 1], points[j, 0]) + np.pi) * scale)) % columns
+            p = row[k] * columns + column
+            pixel[j] = p
+            if nearest[p] < 0 or ranges[j] < ranges[nearest[p]]:
+                nearest[p] = j
+    return pixel, nearest
+
+
+@kernel
+def find_ground(
+    points: NDArray[np.float64],
+    nearest: NDArray[np.int64],
+    columns: int,
+    up: NDArray[np.float64],
+    floor: float,
+    slope: float,
+    baseline: float,
+    tolerance: float,
+) -> NDArray[np.bool_]:
+    """Pixels (rows * columns,) whose point lies on the ground.
+
+    Column by column from below: ground leads to ground over no more than `slope`, and is itself no steeper towards the next
+    pixel above that is `baseline` m farther out. Where a column starts it lies within `slope` and `tolerance` m of the floor.
+
+    points : (K, 3), m; up : (3,) unit vector; floor : height of the ground along it under the sensor, m
+    """
+    rows = nearest.shape[0] // columns
+    is_ground = np.zeros(nearest.shape[0], np.bool_)
+    out = np.empty(rows)
+    height = np.empty(rows)
+    for column in range(columns):
+        for r in range(rows):
+            j = nearest[r * columns + column]
+            out[r] = -1.0
+            if j >= 0:
+                x, y, z = points[j, 0], points[j, 1], points[j, 2]
+                height[r] = up[0] * x + up[1] * y + up[2] * z
+                out[r] = np.sqrt(max(x * x + y * y + z * z - height[r] * height[r], 0.0))
+        last_out, last_height = 0.0, floor
+        for r in range(rows):
+            if out[r] < 0:
+                continue
+            rise = height[r] - last_height
+            if abs(rise) > slope * abs(out[r] - last_out) + tolerance:
+                continue
+            for above in range(r + 1, rows):
+                if out[above] < 0 or (
+                    abs(out[above] - out[r]) < baseline and abs(height[above] - height[r]) < baseline
+                ):
+                    continue
+                if abs(height[above] - height[r]) <= slope * (out[above] - out[r]) + tolerance:
+                    is_ground[r * columns + column] = True
+                    # Where the ground was met last rises no more than it falls: a kerb is stepped over, a wall not climbed.
+                    last_out, last_height = out[r], height[r]
+                break
+    return is_ground
+
+
+@inline
+def _joined(a: float, b: float, sine: float, cosine: float, tangent: float) -> bool:
+    """Whether ranges a and b, m, seen under an angle of `sine` and `cosine` belong together: the line through both makes more
+    than the angle of `tangent` with the farther beam."""
+    far, near = max(a, b), min(a, b)
+    across, along = near * sine, far - near * cosine
+    return along <= 0.0 or across > tangent * along
+
+
+@kernel
+def cluster(
+    ranges: NDArray[np.float64],
+    nearest: NDArray[np.int64],
+    is_ground: NDArray[np.bool_],
+    columns: int,
+    elevation: NDArray[np.float64],
+    angle: float,
+    least: tuple[int, int, int],
+) -> NDArray[np.int32]:
+    """Label (rows * columns,) the pixels off the ground: 1, 2, ... of clusters, 0 of what belongs to none.
+
+    Neighbours belong together when the line through them makes more than `angle`, rad, with the beam. Clusters are filled
+    breadth first, in the order of their lowest, leftmost pixel.
+
+    ranges : (K,) m; elevation : (rows,) rad; least : a cluster has so many pixels, or so many over so many rows
+    """
+    total = nearest.shape[0]
+    rows = total // columns
+    labels = np.zeros(total, np.int32)
+    # What is empty or ground is done with from the start.
+    seen = np.ones(total, np.bool_)
+    image = np.zeros(total)
+    for p in range(total):
+        if nearest[p] >= 0:
+            image[p] = ranges[nearest[p]]
+            seen[p] = is_ground[p]
+    queue = np.empty(total, np.int64)
+    tangent = np.tan(angle)
+    sines = np.zeros((rows + 1, _REACH + 2))
+    cosines = np.zeros((rows + 1, _REACH + 2))
+    for step in range(1, _REACH + 2):
+        for r in range(rows - step):
+            sines[r, step], cosines[r, step] = (
+                np.sin(elevation[r + step] - elevation[r]),
+                np.cos(elevation[r + step] - elevation[r]),
+            )
+        sines[rows, step], cosines[rows, step] = np.sin(2 * np.pi / columns * step), np.cos(2 * np.pi / columns * step)
+    touched = np.zeros(rows, np.int64)
+    label = 0
+    for seed in range(total):
+        if seen[seed]:
+            continue
+        head, tail = 0, 1
+        queue[0] = seed
+        seen[seed] = True
+        rows_touched = 0
+        while head < tail:
+            p = queue[head]
+            head += 1
+            r, c = p // columns, p % columns
+            if touched[r] != seed + 1:
+                touched[r] = seed + 1
+                rows_touched += 1
+            here = image[p]
+            for side in range(4):
+                for step in range(1, _REACH + 2):
+                    other, column, angles = r, c, rows
+                    if side < 2:
+                        column = (c + (step if side else columns - step)) % columns
+                    else:
+                        other = r + (step if side == 2 else -step)
+                        if other < 0 or other >= rows:
+                            break
+                        angles = min(r, other)
+                    q = other * columns + column
+                    if image[q] == 0.0:
+                        continue
+                    if not seen[q] and _joined(here, image[q], sines[angles, step], cosines[angles, step], tangent):
+                        seen[q] = True
+                        queue[tail] = q
+                        tail += 1
+                    break
+        if tail >= least[0] or (tail >= least[1] and rows_touched >= least[2]):
+            label += 1
+            for n in range(tail):
+                labels[queue[n]] = label
+    return labels

@@ -1,0 +1,105 @@
+"""LeGO-LOAM's front half: what of a scan is ground, what belongs to something large enough, and features of both.
+
+Shan and Englot 2018, "LeGO-LOAM: Lightweight and ground-optimized lidar odometry and mapping on variable terrain".
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.config.loam import LoamConfig
+from lslam.config.preprocess import PreprocessConfig
+from lslam.kernels import range_image
+from lslam.preprocessing.features import (
+    MAY_BE_EDGE,
+    MAY_BE_FLAT,
+    MAY_BE_PLANE,
+    Features,
+    RingWalk,
+    features_along,
+    walk_rings,
+)
+from lslam.preprocessing.ground import CELL, levelling
+from lslam.types.scan import Scan
+
+# m; a ring's next neighbour on the ground is at least so far off, so that noise does not tilt the line between them.
+_BASELINE = 0.3
+# m; noise of height, and what a kerb may rise at once.
+_TOLERANCE = 0.1
+# m; points of one pixel that are so far apart are not the same thing.
+_SAME = 0.3
+
+# m; the floor is looked for this far, among one in so many points.
+_FLOOR_REACH = 25.0
+_FLOOR_SHARE = 4
+
+
+@dataclass(frozen=True)
+class Segments:
+    """What LeGO-LOAM keeps of a scan.
+
+    ground : (N,) bool, of each point of the scan; labels : (N,) int32, 1, 2, ... of its clusters off the ground, 0 for the
+    ground, for clusters that are too small, and for points outside the range gate
+    """
+
+    ground: NDArray[np.bool_]
+    labels: NDArray[np.int32]
+
+    @property
+    def count(self) -> int:
+        """Number of clusters."""
+        return int(self.labels.max(initial=0))
+
+
+def segment_scan(scan: Scan, config: LoamConfig | None = None, gate: PreprocessConfig | None = None) -> Segments:
+    """Ground and clusters of a scan that has rings. Raises InputError as `extract_features` does."""
+    return _segment(scan, walk_rings(scan, gate or PreprocessConfig()), config or LoamConfig())
+
+
+def lego_features(
+    scan: Scan, config: LoamConfig | None = None, gate: PreprocessConfig | None = None
+) -> tuple[Features, Segments]:
+    """Features as LeGO-LOAM takes them: edges off the ground, planes on it, less planar points of both, clutter left out.
+
+    Raises InputError as `extract_features` does.
+    """
+    config = config or LoamConfig()
+    walk = walk_rings(scan, gate or PreprocessConfig())
+    segments = _segment(scan, walk, config)
+    allowed = np.where(segments.labels > 0, MAY_BE_EDGE | MAY_BE_FLAT, 0)
+    allowed[segments.ground] = MAY_BE_PLANE | MAY_BE_FLAT
+    return features_along(scan, walk, config, allowed.astype(np.uint8)), segments
+
+
+def _segment(scan: Scan, walk: RingWalk, config: LoamConfig) -> Segments:
+    slopes = range_image.row_slopes(walk.points, walk.starts)
+    known = np.flatnonzero(np.isfinite(slopes))
+    row = np.zeros(len(slopes), np.int64)
+    row[known[np.argsort(slopes[known], kind="stable")]] = np.arange(len(known))
+    elevation = np.arctan(np.sort(slopes[known]))
+    columns = max(round(2 * np.pi / walk.step), 1)
+    pixel, nearest = range_image.project(walk.points, walk.ranges, walk.starts, row, len(known), columns)
+    up, floor = _floor(walk)
+    ground = range_image.find_ground(
+        walk.points, nearest, columns, up, floor, np.tan(np.radians(config.ground_angle_deg)), _BASELINE, _TOLERANCE
+    )
+    labels = range_image.cluster(
+        walk.ranges, nearest, ground, columns, elevation, np.radians(config.segment_angle_deg),
+        (config.segment_points, config.small_segment_points, config.small_segment_rings),
+    )  # fmt: skip
+    # Points that share a pixel are what its nearest point is, if they lie near it.
+    same = np.abs(walk.ranges - walk.ranges[nearest[pixel]]) < _SAME
+    out = Segments(np.zeros(len(scan), bool), np.zeros(len(scan), np.int32))
+    out.ground[walk.order] = ground[pixel] & same
+    out.labels[walk.order] = np.where(same, labels[pixel], 0)
+    return out
+
+
+def _floor(walk: RingWalk) -> tuple[NDArray[np.float64], float]:
+    """The upward direction (3,) and the height of the dominant plane along it, m, from some of the nearer points."""
+    near = np.flatnonzero(walk.ranges < _FLOOR_REACH)[::_FLOOR_SHARE]
+    R, floor = levelling(walk.points[near].astype(np.float32), _TOLERANCE, int(_FLOOR_REACH / CELL) + 1)
+    return np.ascontiguousarray(R[2]), floor
