@@ -66,7 +66,8 @@ def find_ground(
     """Pixels (rows * columns,) whose point lies on the ground.
 
     Column by column from below: ground leads to ground over no more than `slope`, and is itself no steeper towards the next
-    pixel above that is `baseline` m farther out. Where a column starts it lies within `slope` and `tolerance` m of the floor.
+    pixel above that is `baseline` m away; what lies as high as the ground before may have something standing behind it. Where
+    a column starts it lies within `slope` and `tolerance` m of the floor.
 
     points : (K, 3), m; up : (3,) unit vector; floor : height of the ground along it under the sensor, m
     """
@@ -86,17 +87,18 @@ def find_ground(
         for r in range(rows):
             if out[r] < 0:
                 continue
-            rise = height[r] - last_height
-            if abs(rise) > slope * abs(out[r] - last_out) + tolerance:
+            rise = abs(height[r] - last_height)
+            allowed = slope * abs(out[r] - last_out)
+            if rise > allowed + tolerance:
                 continue
             for above in range(r + 1, rows):
-                if out[above] < 0 or (
-                    abs(out[above] - out[r]) < baseline and abs(height[above] - height[r]) < baseline
-                ):
+                up_by, out_by = abs(height[above] - height[r]), out[above] - out[r]
+                if out[above] < 0 or (up_by < baseline and abs(out_by) < baseline):
                     continue
-                if abs(height[above] - height[r]) <= slope * (out[above] - out[r]) + tolerance:
+                if up_by <= slope * out_by + 0.5 * tolerance or (
+                    rise <= min(allowed, tolerance) and out_by >= baseline
+                ):
                     is_ground[r * columns + column] = True
-                    # Where the ground was met last rises no more than it falls: a kerb is stepped over, a wall not climbed.
                     last_out, last_height = out[r], height[r]
                 break
     return is_ground
