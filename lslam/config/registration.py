@@ -44,6 +44,9 @@ class RegistrationConfig(Section):
     kernel_decay: float = Field(0.5, gt=0, lt=1, description="factor of the width from step to step")
     max_iterations: int = Field(10, ge=1, description="Gauss-Newton steps per scan")
     start_scans: int = Field(5, ge=1, description="first scans, registered coarse to fine because the speed is unknown")
+    start_reach: float = Field(
+        9.0, ge=0, description="m; how far the sensor may have moved between the first two scans; 0: not searched for"
+    )
     start_iterations: int = Field(40, ge=1, description="steps of each stage while starting or recovering")
     coarse_factor: int = Field(3, ge=2, description="coarse voxels are this many times larger")
     coarse_kernel: float = Field(5.0, gt=0, description="m; where coarse annealing starts: the capture range")

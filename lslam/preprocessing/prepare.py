@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -63,6 +63,18 @@ def prepare_points(
         len(kept),
         None if times is None else map_times,
         None if times is None else source_times,
+    )
+
+
+def thin(points: PreparedPoints, step: int) -> PreparedPoints:
+    """Every `step`-th source point."""
+    times, covariance = points.source_times, points.covariance
+    return replace(
+        points,
+        source=np.ascontiguousarray(points.source[::step]),
+        scatter=np.ascontiguousarray(points.scatter[::step]),
+        source_times=None if times is None else times[::step],
+        covariance=None if covariance is None else np.ascontiguousarray(covariance[::step]),
     )
 
 

@@ -12,7 +12,7 @@ from lslam.config.preprocess import PreprocessConfig
 from lslam.config.registration import RegistrationConfig, Residual
 from lslam.errors import InputError
 from lslam.geometry import se3, so3
-from lslam.preprocessing.prepare import PreparedPoints, prepare_points
+from lslam.preprocessing.prepare import PreparedPoints, prepare_points, thin
 from lslam.registration.gaussian_map import GaussianMap
 from lslam.registration.motion import ConstantVelocity
 from lslam.registration.residuals import NEEDS_COVARIANCE
@@ -22,6 +22,13 @@ from lslam.registration.source_covariance import source_covariance
 from lslam.registration.target import make_target
 
 MIN_SOURCE_POINTS = 30
+
+# m; starts this far apart leave no gap between their capture ranges, not even between piers of a facade.
+START_STEP = 1.0
+# Every so many-th source point is enough to tell a good start from a bad one; so many of the best are looked at closely.
+SEARCH_SHARE, LOOKED_AT = 4, 3
+# A farther start must be supported by more than chance.
+CLEARLY = 1.01
 
 # Half a metre and two degrees: what a pose that no scan supports may be wrong by, one sigma.
 DOUBT = np.diag([0.25] * 3 + [np.deg2rad(2.0) ** 2] * 3)
@@ -84,6 +91,8 @@ class Registration:
         if self.residual in NEEDS_COVARIANCE and points.covariance is None:
             found = source_covariance(points.source, points.map_points, self.config.sigma**2)
             points = replace(points, covariance=found)
+        if self._inserted == 1:
+            return self._search(points, T_prior)
         if self._starting > 0:
             return self._judge(self._coarse_to_fine(points, T_prior), T_prior)
         c = self.config
@@ -115,6 +124,47 @@ class Registration:
             self.agreement.relax()
         self._motion.correct(self._index, result.T_world_lidar)
         self._index += 1
+
+    def _search(self, points: PreparedPoints, T_prior: NDArray[np.float64]) -> RegistrationResult:
+        """The best of several starts: nothing is known yet of how fast the sensor moves.
+
+        Posts and crash barriers repeat every few metres, so the nearest agreement may be a false one, and a true one
+        further on has smaller residuals. A few points on the coarse map tell which starts are worth a whole registration.
+        """
+        c = self.config
+        best = self._judge(self._coarse_to_fine(points, T_prior), T_prior)
+        if c.start_reach == 0:
+            return best
+        coarse_map, few = self.map.coarsen(c.coarse_factor), thin(points, SEARCH_SHARE)
+        slow = Annealing(2 * START_STEP, c.kernel_min, c.coarse_decay, c.start_iterations)
+        tried = [
+            solve(coarse_map, few, T_prior @ se3.make(np.eye(3), offset), slow, sigma=c.sigma, blob_weight=c.blob_weight,
+                  weak_share=c.weak_share, residual=self.residual)
+            for offset in start_offsets(c.start_reach, START_STEP)
+        ]  # fmt: skip
+        tried.sort(key=lambda found: (len(found.degenerate), -self._support(found)))
+        for promising in _distinct(tried, best.T_world_lidar):
+            start = promising.T_world_lidar
+            found = self._judge(self._coarse_to_fine(points, start), start)
+            if self._is_better(found, best):
+                best = replace(found, prior_error=_correction(T_prior, found.T_world_lidar))
+        return best
+
+    def _is_better(self, found: RegistrationResult, best: RegistrationResult) -> bool:
+        """Whether a start somewhere else led to a place that the scan clearly supports more."""
+        if not (found.ok and best.ok):
+            return found.ok
+        # Where nothing agrees across the road, nothing contradicts either: what observes more is asked for less.
+        gain = len(best.degenerate) - len(found.degenerate)
+        needed = CLEARLY if gain <= 0 else 1 / CLEARLY
+        return found.matched > 0.5 * best.matched and gain >= 0 and self._support(found) > needed * self._support(best)
+
+    def _support(self, result: RegistrationResult) -> float:
+        """Share of the matches that agree, the less the larger their residuals: the robust cost upside down.
+
+        Not of all points: what a sensor sees of bare ground moves along with it, and matches best where nothing moved.
+        """
+        return result.inlier_share * max(1 - (result.rmse / self.config.kernel_min) ** 2, 0.0)
 
     def _coarse_to_fine(self, points: PreparedPoints, T_prior: NDArray[np.float64]) -> RegistrationResult:
         """Coarse planes, annealed slowly, catch what fine voxels lose: metres per scan instead of decimetres.
@@ -151,8 +201,7 @@ class Registration:
     def _judge(self, result: RegistrationResult, T_prior: NDArray[np.float64]) -> RegistrationResult:
         """The result with its correction of the prior, or a failed one that keeps the prior and says why."""
         c = self.config
-        delta = se3.relative(T_prior, result.T_world_lidar)
-        move, turn = float(np.linalg.norm(delta[:3, 3])), float(so3.angle(delta[:3, :3]))
+        move, turn = _correction(T_prior, result.T_world_lidar)
         reason = result.reason
         # One scan of a sparse sensor makes few planes: what matches them may be right and yet a small share.
         is_filled = self._inserted > c.start_scans and c.target != "scan"
@@ -172,8 +221,34 @@ class Registration:
         return replace(result, prior_error=(move, turn))
 
 
+def _correction(T_prior: NDArray[np.float64], pose: NDArray[np.float64]) -> tuple[float, float]:
+    """How far (m, rad) the pose is from what was expected."""
+    delta = se3.relative(T_prior, pose)
+    return float(np.linalg.norm(delta[:3, 3])), float(so3.angle(delta[:3, :3]))
+
+
 def _failed(T_prior: NDArray[np.float64], source_points: int, reason: str) -> RegistrationResult:
     """The motion prior, in doubt."""
     return RegistrationResult(
         T_prior.copy(), ok=False, reason=reason, covariance=DOUBT.copy(), converged=False, source_points=source_points
     )
+
+
+def _distinct(results: list[RegistrationResult], known: NDArray[np.float64]) -> list[RegistrationResult]:
+    """The first `LOOKED_AT` places that lie at least half a step from the known one and from each other."""
+    places, chosen = [known[:3, 3]], []
+    for result in results:
+        place = result.T_world_lidar[:3, 3]
+        if min(float(np.linalg.norm(place - other)) for other in places) > START_STEP / 2:
+            places.append(place)
+            chosen.append(result)
+    return chosen[:LOOKED_AT]
+
+
+def start_offsets(reach: float, step: float) -> NDArray[np.float64]:
+    """(N, 3) m in the LiDAR frame, nearest first: ahead and back up to `reach`, sideways one step at most."""
+    count = int(np.ceil(reach / step - 1e-9))
+    ahead = [sign * min(k * step, reach) for k in range(1, count + 1) for sign in (1, -1)]
+    sideways = [sign * min(step, reach) for sign in (1, -1)] if count else []
+    offsets = np.array([(x, 0.0, 0.0) for x in ahead] + [(0.0, y, 0.0) for y in sideways]).reshape(-1, 3)
+    return offsets[np.argsort(np.linalg.norm(offsets, axis=1), kind="stable")]

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from lslam.config.registration import RegistrationConfig
 from lslam.errors import InputError
-from lslam.registration.registration import MIN_SOURCE_POINTS, Registration
+from lslam.registration.registration import MIN_SOURCE_POINTS, Registration, start_offsets
 
 Floats = NDArray[np.float64]
 
@@ -134,12 +134,12 @@ def test_a_jump_beyond_the_limit_fails() -> None:
     T = pose_at((1.5, 0.0, 0.0))
     points = seen_from(room(np.random.default_rng(1)), T)
     assert in_room().register(points).ok
-    result = in_room(config=RegistrationConfig(max_jump_m=1.0)).register(points)
+    result = in_room(config=RegistrationConfig(max_jump_m=1.0, start_reach=0.0)).register(points)
     assert not result.ok
     assert "impossible jump of 1.5 m" in result.reason
     np.testing.assert_array_equal(result.T_world_lidar, np.eye(4))
     turned = seen_from(room(np.random.default_rng(1)), pose_at((0.0, 0.0, 0.0), 5.0))
-    result = in_room(config=RegistrationConfig(max_jump_deg=4.0)).register(turned)
+    result = in_room(config=RegistrationConfig(max_jump_deg=4.0, start_reach=0.0)).register(turned)
     assert "5 deg" in result.reason
 
 
@@ -190,3 +190,39 @@ def test_a_prior_that_is_no_pose_is_refused(prior: Floats) -> None:
     registration = in_room()
     with pytest.raises(InputError, match="motion prior"):
         registration.register(room(np.random.default_rng(1)).astype(np.float32), prior)
+
+
+@pytest.mark.parametrize("metres", [0.0, 2.9, 8.9, -5.0])
+def test_the_first_step_is_found_beside_posts_that_repeat(metres: float) -> None:
+    """A road with a crash barrier on posts every 4 m and a few bridges: at 30 m/s the nearest agreement is a false one."""
+    rng = np.random.default_rng(0)
+
+    def view(x: float) -> NDArray[np.float32]:
+        """What a sensor at (x, 0, 1.7) sees, in its own frame."""
+        road = np.column_stack([rng.uniform(-60, 60, 20_000) + x, rng.uniform(-12, 12, 20_000), np.zeros(20_000)])
+        posts = np.arange(-80, 80, 4.0)
+        barrier = np.column_stack(
+            [
+                rng.choice(posts, 6000) + rng.uniform(-0.15, 0.15, 6000),
+                rng.choice([-8.0, 8.0], 6000),
+                rng.uniform(0, 1, 6000),
+            ]
+        )
+        bridge = np.column_stack([rng.choice([-33.0, 37.0], 3000), rng.uniform(-9, 9, 3000), rng.uniform(4, 6, 3000)])
+        points = np.concatenate([road, barrier, bridge]) + rng.normal(0, 0.02, (29_000, 3)) - [x, 0, 1.7]
+        return points[np.abs(points[:, 0]) < 60].astype(np.float32)
+
+    registration = Registration()
+    registration.register(view(0.0))
+    result = registration.register(view(metres))
+    assert result.ok
+    np.testing.assert_allclose(result.T_world_lidar[:3, 3], [metres, 0, 0], atol=0.03)
+
+
+def test_starts_reach_as_far_as_asked_nearest_first() -> None:
+    offsets = start_offsets(9.0, 3.0)
+    lengths = np.linalg.norm(offsets, axis=1)
+    assert lengths.max() == 9.0
+    assert (np.diff(lengths) >= 0).all()
+    assert len(start_offsets(0.0, 3.0)) == 0
+    assert np.abs(start_offsets(4.0, 3.0)).max() == 4.0
