@@ -191,3 +191,28 @@ def cluster(
             for n in range(tail):
                 labels[queue[n]] = label
     return labels
+
+
+@kernel
+def give_back(
+    ranges: NDArray[np.float64],
+    order: NDArray[np.int64],
+    pixel: NDArray[np.int64],
+    nearest: NDArray[np.int64],
+    is_ground: NDArray[np.bool_],
+    labels: NDArray[np.int32],
+    same: float,
+    count: int,
+) -> tuple[NDArray[np.bool_], NDArray[np.int32]]:
+    """Ground and labels (count,) of the points of a scan from those of their pixels.
+
+    Points that share a pixel are what its nearest point is when their ranges are within `same` m, else nothing.
+    """
+    ground_of = np.zeros(count, np.bool_)
+    labels_of = np.zeros(count, np.int32)
+    for j in range(order.shape[0]):
+        p = pixel[j]
+        if ranges[j] - ranges[nearest[p]] < same:
+            ground_of[order[j]] = is_ground[p]
+            labels_of[order[j]] = labels[p]
+    return ground_of, labels_of

@@ -69,9 +69,9 @@ def lego_features(
     config = config or LoamConfig()
     walk = walk_rings(scan, gate or PreprocessConfig())
     segments = _segment(scan, walk, config)
-    allowed = np.where(segments.labels > 0, MAY_BE_EDGE | MAY_BE_FLAT, 0)
-    allowed[segments.ground] = MAY_BE_PLANE | MAY_BE_FLAT
-    return features_along(scan, walk, config, allowed.astype(np.uint8)), segments
+    allowed = np.uint8(MAY_BE_EDGE | MAY_BE_FLAT) * (segments.labels > 0)
+    allowed += np.uint8(MAY_BE_PLANE | MAY_BE_FLAT) * segments.ground
+    return features_along(scan, walk, config, allowed), segments
 
 
 def _segment(scan: Scan, walk: RingWalk, config: LoamConfig) -> Segments:
@@ -90,12 +90,7 @@ def _segment(scan: Scan, walk: RingWalk, config: LoamConfig) -> Segments:
         walk.ranges, nearest, ground, columns, elevation, np.radians(config.segment_angle_deg),
         (config.segment_points, config.small_segment_points, config.small_segment_rings),
     )  # fmt: skip
-    # Points that share a pixel are what its nearest point is, if they lie near it.
-    same = np.abs(walk.ranges - walk.ranges[nearest[pixel]]) < _SAME
-    out = Segments(np.zeros(len(scan), bool), np.zeros(len(scan), np.int32))
-    out.ground[walk.order] = ground[pixel] & same
-    out.labels[walk.order] = np.where(same, labels[pixel], 0)
-    return out
+    return Segments(*range_image.give_back(walk.ranges, walk.order, pixel, nearest, ground, labels, _SAME, len(scan)))
 
 
 def _floor(walk: RingWalk) -> tuple[NDArray[np.float64], float]:

@@ -90,6 +90,17 @@ def test_a_file_in_ring_order_may_turn_either_way_start_anywhere_and_hold_empty_
         assert agreement(found[good], scan.rings[good]) >= 0.995
 
 
+def test_the_seam_is_found_where_all_rings_begin_though_the_first_one_begins_late() -> None:
+    scan = scans("street", "hdl64")[0]
+    assert scan.rings is not None
+    azimuth = np.arctan2(scan.points[:, 1], scan.points[:, 0]) % (2 * np.pi)
+    late = scan.select(~((scan.rings < 2) & (azimuth < 2.0)))
+    assert late.rings is not None
+    found = rings_by_order(late.points)
+    assert found is not None
+    assert agreement(found, late.rings) >= 0.995
+
+
 def test_organised_clouds_keep_their_rows_whichever_way_they_are_stored() -> None:
     rng = np.random.default_rng(3)
     rows, cols = 32, 600

@@ -36,8 +36,7 @@ def classed(monkeypatch: pytest.MonkeyPatch, scenario: str, model: str, index: i
     drive = simulate(scenario, seed=2, count=index + 1, lidar=model)
     scan = drive.scan(index)
     surface, seen = heard[-1]
-    rings = np.tile(np.arange(drive.lidar.rings), drive.lidar.columns)
-    order = np.argsort(rings, kind="stable") if drive.lidar.order == "ring" else np.arange(len(rings))
+    order = drive.lidar.sequence
     surface = surface[order[seen[order]]]
     assert len(surface) == len(scan)
     return scan, surface
