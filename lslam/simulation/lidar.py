@@ -35,6 +35,9 @@ for _surface, _share in {
 ROUGH_A, ROUGH_B = 1 - 0.5 * 0.36 / (0.36 + 0.33), 0.45 * 0.36 / (0.36 + 0.09)
 
 
+BODY_STEP = 0.004  # s between the poses of a moving body
+
+
 @dataclass(frozen=True)
 class Roof:
     """The roof under a LiDAR, level in its frame, m: behind, ahead, to either side, and how far below."""
@@ -189,9 +192,14 @@ def _meet_bodies(bodies: Sequence[MovingMesh], rays: _Rays, rings: int, hits: _H
 
 def _meet_body(body: MovingMesh, which: NDArray[np.intp], rays: _Rays, hits: _Hits) -> None:
     """The rays `which` against the body where it is when each of them is fired."""
-    instants, at = np.unique(rays.fired, return_inverse=True)
-    T = body.poses(instants)
-    R, centre = T[at, :3, :3].astype(np.float32), T[at, :3, 3]
+    # Between instants of a few milliseconds it moves on evenly, to micrometres.
+    first, last = float(rays.fired.min()), float(rays.fired.max())
+    steps = max(int(np.ceil((last - first) / BODY_STEP)), 1)
+    T = body.poses(np.linspace(first, last, steps + 1))
+    share = (rays.fired - first) * (steps / max(last - first, 1e-9))
+    at = np.minimum(share.astype(np.intp), steps - 1)
+    T = T[at] + (share - at)[:, None, None] * (T[at + 1] - T[at])
+    R, centre = T[:, :3, :3].astype(np.float32), T[:, :3, 3]
     local = np.einsum("nji,nj->ni", R, rays.directions)
     start = np.einsum("nji,nj->ni", R, (rays.origins - centre).astype(np.float32))
     far, face = body.scene.cast(start, local)
