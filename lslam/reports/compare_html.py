@@ -17,7 +17,7 @@ from lslam.reports.plots import Figure
 from lslam.types.comparison import Comparison, Drawing
 from lslam.version import __version__
 
-WIDEST = 110  # characters of a table that the page shows without scrolling
+WIDEST = 125  # characters of a table that the page shows without scrolling
 
 
 @dataclass(frozen=True)

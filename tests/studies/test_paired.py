@@ -34,9 +34,9 @@ def test_mean_and_sample_deviation_over_the_runs_that_count() -> None:
 
 
 def test_ratio_is_the_geometric_mean_and_a_centimetre_is_a_tie() -> None:
-    (pair,) = compare_pairs(both([(1.0, 2.0), (0.5, 0.25), (0.1, 0.109), (0.1, 0.111)]), ("a", "b"))
-    assert pair.ratio == pytest.approx((2 * 0.5 * 1.09 * 1.11) ** 0.25)
-    assert (pair.n, pair.wins, pair.ties, pair.losses) == (4, 1, 1, 2)
+    (pair,) = compare_pairs(both([(1.0, 2.0), (0.5, 0.25), (0.1, 0.109), (0.109, 0.1), (0.1, 0.111)]), ("a", "b"))
+    assert pair.ratio == pytest.approx((2 * 0.5 * 1.11) ** 0.2)
+    assert (pair.n, pair.wins, pair.ties, pair.losses) == (5, 1, 2, 2)
     assert math.isnan(pair.p)
     assert pair.note == "n too small"
 
