@@ -22,7 +22,7 @@ from lslam.preprocessing.features import (
     features_along,
     walk_rings,
 )
-from lslam.preprocessing.ground import CELL, levelling
+from lslam.preprocessing.ground import CELL, REACH, levelling
 from lslam.types.scan import Scan
 
 # m; a ring's next neighbour on the ground is at least so far off, so that noise does not tilt the line between them.
@@ -32,8 +32,9 @@ _TOLERANCE = 0.1
 # m; points of one pixel that are so far apart are not the same thing.
 _SAME = 0.3
 
-# m; the floor is looked for this far, among one in so many points.
-_FLOOR_REACH = 25.0
+# The floor is looked for up to so many times the range of the lowest rings, an eighth of all, in one of so many points.
+_FLOOR_REACH = 3.0
+_LOWEST = 8
 _FLOOR_SHARE = 4
 
 
@@ -78,11 +79,14 @@ def _segment(scan: Scan, walk: RingWalk, config: LoamConfig) -> Segments:
     slopes = range_image.row_slopes(walk.points, walk.starts)
     known = np.flatnonzero(np.isfinite(slopes))
     row = np.zeros(len(slopes), np.int64)
-    row[known[np.argsort(slopes[known], kind="stable")]] = np.arange(len(known))
+    upwards = known[np.argsort(slopes[known], kind="stable")]
+    if not len(upwards):
+        return Segments(np.zeros(len(scan), bool), np.zeros(len(scan), np.int32))
+    row[upwards] = np.arange(len(known))
     elevation = np.arctan(np.sort(slopes[known]))
     columns = max(round(2 * np.pi / walk.step), 1)
     pixel, nearest = range_image.project(walk.points, walk.ranges, walk.starts, row, len(known), columns)
-    up, floor = _floor(walk)
+    up, floor = _floor(walk, upwards[: max(1, len(upwards) // _LOWEST)])
     ground = range_image.find_ground(
         walk.points, nearest, columns, up, floor, np.tan(np.radians(config.ground_angle_deg)), _BASELINE, _TOLERANCE
     )
@@ -93,8 +97,16 @@ def _segment(scan: Scan, walk: RingWalk, config: LoamConfig) -> Segments:
     return Segments(*range_image.give_back(walk.ranges, walk.order, pixel, nearest, ground, labels, _SAME, len(scan)))
 
 
-def _floor(walk: RingWalk) -> tuple[NDArray[np.float64], float]:
-    """The upward direction (3,) and the height of the dominant plane along it, m, from some of the nearer points."""
-    near = np.flatnonzero(walk.ranges < _FLOOR_REACH)[::_FLOOR_SHARE]
-    R, floor = levelling(walk.points[near].astype(np.float32), _TOLERANCE, int(_FLOOR_REACH / CELL) + 1)
+def _floor(walk: RingWalk, lowest: NDArray[np.int64]) -> tuple[NDArray[np.float64], float]:
+    """The upward direction (3,) and the height of the dominant plane along it, m.
+
+    It is looked for where the vehicle stands or the drone hovers: within a few times the range at which the `lowest` rings
+    meet it. Without a plane the sensor counts as level and the floor lies where those rings end.
+    """
+    first = np.concatenate([np.arange(walk.starts[k], walk.starts[k + 1]) for k in lowest])
+    reach = min(_FLOOR_REACH * float(np.median(walk.ranges[first])), REACH)
+    near = np.flatnonzero(walk.ranges < reach)[::_FLOOR_SHARE]
+    R, floor = levelling(walk.points[near].astype(np.float32), _TOLERANCE, int(reach / CELL) + 1)
+    if floor == -np.inf:
+        floor = float(np.median(walk.points[first, 2]))
     return np.ascontiguousarray(R[2]), floor

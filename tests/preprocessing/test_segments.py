@@ -184,3 +184,18 @@ def test_a_steep_ramp_is_no_ground() -> None:
     assert ramp.sum() > 500
     assert segment_scan(scan).ground[ramp].mean() < 0.05
     assert segment_scan(scan, LoamConfig(ground_angle_deg=30)).ground[ramp].mean() > 0.9
+
+
+def test_the_ground_under_a_drone_is_found_where_its_beams_reach_it() -> None:
+    drive = simulate("open", seed=0, count=2)
+    scan = drive.scan(1)
+    down = scan.points[:, 2] < -7  # it flies 10 m high
+    assert np.linalg.norm(scan.points[down], axis=1).min() > 15
+    segments = segment_scan(scan)
+    assert segments.ground.sum() > 0.5 * (down & (scan.points[:, 2] < -9)).sum() > 50
+    assert (scan.points[segments.ground, 2] < -7).mean() > 0.9  # the rest are flat roofs
+
+
+def test_a_scan_of_nothing_has_no_segments() -> None:
+    segments = segment_scan(Scan(np.zeros((4, 3), np.float32), 0, 0, rings=np.zeros(4, np.uint16)))
+    assert (segments.count, segments.ground.any(), len(segments.labels)) == (0, False, 4)
