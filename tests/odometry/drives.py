@@ -34,11 +34,13 @@ class Drive:
 
 @cache
 def drive(
-    scenario: str, seed: int, count: int, every: int = 1, lidar: str | None = None, speed: float | None = None
-) -> Drive:
+    scenario: str, seed: int, count: int, every: int = 1, lidar: str | None = None, speed: float | None = None,
+    compensated: bool | None = None,
+) -> Drive:  # fmt: skip
     """`count` scans, each `every`-th of the simulated ones; with `speed` it starts at full speed."""
     simulated = simulate(
-        scenario, seed=seed, lidar=lidar, count=every * (count - 1) + 1, speed=speed, start_speed=speed
+        scenario, seed=seed, lidar=lidar, count=every * (count - 1) + 1, speed=speed, start_speed=speed,
+        motion_compensated=compensated,
     )  # fmt: skip
     assert simulated.ground_truth is not None
     return Drive(prepared(simulated, range(0, len(simulated), every)), simulated.ground_truth.poses[::every])
