@@ -33,7 +33,12 @@ class RegistrationConfig(Section):
     inlier_ratio: float = Field(
         1.0, gt=0, le=1, description="share of the correspondences kept, nearest first (trimmed ICP); 1 keeps all"
     )
-    voxel_size: float = Field(0.8, gt=0, description="m; voxels of the local map, eight are searched per point")
+    voxel_size: float = Field(
+        0.8,
+        gt=0,
+        description="m; voxels of the local map, eight are searched per point; for `point`, which is matched to "
+        "their means, 5/8 of it",
+    )
     min_points: int = Field(6, ge=4, description="points a voxel needs before it is matched")
     planarity: float = Field(0.3, gt=0, lt=1, description="(l1 - l0) / l2 above which a voxel is a plane")
     count_cap: float = Field(200, gt=10, description="points a voxel remembers; older ones fade")
@@ -42,7 +47,9 @@ class RegistrationConfig(Section):
     kernel_max: float = Field(1.0, gt=0, description="m; widest Geman-McClure kernel, where annealing starts")
     kernel_min: float = Field(0.15, gt=0, description="m; width at which annealing ends: five sigma")
     kernel_decay: float = Field(0.5, gt=0, lt=1, description="factor of the width from step to step")
-    max_iterations: int = Field(10, ge=1, description="Gauss-Newton steps per scan")
+    max_iterations: int = Field(
+        10, ge=1, description="Gauss-Newton steps per scan; three times as many for `point`, which converges slowly"
+    )
     start_scans: int = Field(5, ge=1, description="first scans, registered coarse to fine because the speed is unknown")
     start_reach: float = Field(
         9.0, ge=0, description="m; how far the sensor may have moved between the first two scans; 0: not searched for"

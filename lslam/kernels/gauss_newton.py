@@ -47,21 +47,18 @@ def solve_observed(H: Floats, g: Floats, facts: Floats, weak_share: float, d: Fl
 
 
 @inline
-def advance(H: Floats, g: Floats, facts: Floats, scale: float, weak_share: float, R: Floats, t: Floats, d: Floats,
-            weak: Floats, weak_count: int) -> tuple[bool, int, float, float]:  # fmt: skip
-    """Move R and t by one guarded step: whether there was one, the unobserved directions, its translation and rotation.
-
-    H comes with its upper triangle and leaves whole.
-    """
+def mirror(H: Floats) -> None:
+    """The lower triangle from the upper."""
     for i in range(6):
         for j in range(i):
             H[i, j] = H[j, i]
-    if facts[3] < 6.0:
-        return False, weak_count, 0.0, 0.0
-    weak_count = solve_observed(H, g, facts, weak_share, d, weak)
-    move, turn = step_norms(d)
+
+
+@inline
+def move_by(d: Floats, move: float, turn: float, scale: float, R: Floats, t: Floats) -> bool:
+    """Move R and t by the step d, whose translation and rotation are given; False when it is not finite."""
     if not (np.isfinite(move) and np.isfinite(turn)):
-        return False, weak_count, move, turn
+        return False
     # A step beyond the kernel's width leaves the region where its correspondences mean anything.
     limit = 2.0 * max(scale, 0.5)
     if move > limit:
@@ -71,7 +68,22 @@ def advance(H: Floats, g: Floats, facts: Floats, scale: float, weak_share: float
     t[1] += d[1]
     t[2] += d[2]
     rotate_left(R, d[3], d[4], d[5])
-    return True, weak_count, move, turn
+    return True
+
+
+@inline
+def advance(H: Floats, g: Floats, facts: Floats, scale: float, weak_share: float, R: Floats, t: Floats, d: Floats,
+            weak: Floats, weak_count: int) -> tuple[bool, int, float, float]:  # fmt: skip
+    """Move R and t by one guarded step: whether there was one, the unobserved directions, its translation and rotation.
+
+    H comes with its upper triangle and leaves whole.
+    """
+    mirror(H)
+    if facts[3] < 6.0:
+        return False, weak_count, 0.0, 0.0
+    weak_count = solve_observed(H, g, facts, weak_share, d, weak)
+    move, turn = step_norms(d)
+    return move_by(d, move, turn, scale, R, t), weak_count, move, turn
 
 
 @inline

@@ -6,10 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.kernels.discs import disc
-from lslam.kernels.gauss_newton import advance, clear, trimmed, workspace
+from lslam.kernels.gauss_newton import clear, trimmed, workspace
 from lslam.kernels.jit import kernel
 from lslam.kernels.linalg import invert_symmetric, rotate_symmetric
 from lslam.kernels.residuals import add_information, nearest, octant_slots
+from lslam.kernels.surface_information import add_surface, advance_on_surfaces, thin_information
 
 Floats = NDArray[np.float64]
 Longs = NDArray[np.int64]
@@ -20,15 +21,17 @@ Flags = NDArray[np.bool_]
 @kernel
 def linearise_gicp(source: Floats, covariance: Floats, R: Floats, t: Floats, size: float, scale: float, sigma2: float,
                    blob_weight: float, gate2: float, planes: Floats, keys: Longs, table: Ints, cells: Longs, slots: Ints,
-                   is_done: Flags, away2: Floats, H: Floats, g: Floats, facts: Floats) -> None:  # fmt: skip
-    """Add to H (6, 6), g (6,) and facts all source points (S, 3) with covariance (S, 6), LiDAR frame, that are not done.
+                   is_done: Flags, away2: Floats, H: Floats, S: Floats, g: Floats, facts: Floats) -> None:  # fmt: skip
+    """Add to H, S (6, 6), g (6,) and facts all source points (S, 3) with covariance (S, 6), LiDAR frame, not done yet.
 
     e = R s + t - mean of the nearest plane voxel of eight, M = inv(C_t + R C_s R^T) with the voxel's disc C_t, cost
     robust(thin e^T M e) / thin: `thin`, the variance of a pair along a common normal, makes metres of the Mahalanobis
     distance. Without a plane the nearest blob stands in, isotropic with its mean variance, times `blob_weight`.
-    Gauss-Newton holds M while the pose moves. `away2` and `facts` as in `residuals.linearise`.
+    Gauss-Newton holds M while the pose moves. S is the information along the normals
+    alone, with blobs. `away2` and `facts` as in `residuals.linearise`.
     """
     inverse = 1.0 / size
+    unused = np.zeros(6)
     c2 = scale * scale
     for i in range(len(source)):
         if is_done[i]:
@@ -72,6 +75,11 @@ def linearise_gicp(source: Floats, covariance: Floats, R: Floats, t: Floats, siz
         w = robust * share
         add_information(H, g, w, mxx, mxy, mxz, myy, myz, mzz, ex, ey, ez, rx, ry, rz)
         trace = w * (mxx + myy + mzz)
+        if p[7] >= 0.0:
+            along = w * thin_information(p, mxx, mxy, mxz, myy, myz, mzz)
+            add_surface(S, unused, along, p[3], p[4], p[5], rx, ry, rz)
+        else:
+            add_information(S, unused, w, mxx, mxy, mxz, myy, myz, mzz, 0.0, 0.0, 0.0, rx, ry, rz)
         facts[0] += trace
         facts[1] += robust * away
         facts[4] += trace * (rx * rx + ry * ry + rz * rz)
@@ -90,6 +98,7 @@ def align_gicp(
     cells, slots, is_done, away2 = workspace(len(source))
     coarse_cells, coarse_slots, _, _ = workspace(len(source) if has_coarse else 0)
     H, g, d, facts, weak = np.empty((6, 6)), np.empty(6), np.zeros(6), np.zeros(7), np.zeros((6, 6))
+    S = np.empty((6, 6))
     farthest2 = inlier_distance * inlier_distance
     gate2, scale = farthest2, scale_start
     converged = False
@@ -97,14 +106,17 @@ def align_gicp(
     iterations = 0
     for _ in range(max_iterations):
         clear(H, g, facts, is_done, away2)
+        S[:] = 0.0
         linearise_gicp(source, covariance, R, t, size, scale, sigma2, 0.0 if has_coarse else blob_weight, gate2, planes, keys,
-                       table, cells, slots, is_done, away2, H, g, facts)  # fmt: skip
+                       table, cells, slots, is_done, away2, H, S, g, facts)  # fmt: skip
         facts[6] = facts[2]
         if has_coarse:
             linearise_gicp(source, covariance, R, t, coarse_size, scale, sigma2, blob_weight, gate2, coarse_planes,
-                           coarse_keys, coarse_table, coarse_cells, coarse_slots, is_done, away2, H, g, facts)  # fmt: skip
+                           coarse_keys, coarse_table, coarse_cells, coarse_slots, is_done, away2, H, S, g, facts)  # fmt: skip
         iterations += 1
-        moved, weak_count, move, turn = advance(H, g, facts, scale, weak_share, R, t, d, weak, weak_count)
+        moved, weak_count, move, turn = advance_on_surfaces(
+            H, S, g, facts, scale, weak_share, R, t, d, weak, weak_count
+        )
         if not moved:
             break
         if scale <= scale_end and move < step_m and turn < step_rad:

@@ -6,10 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.kernels.discs import disc
-from lslam.kernels.gauss_newton import advance, clear, trimmed, workspace
+from lslam.kernels.gauss_newton import clear, trimmed, workspace
 from lslam.kernels.jit import inline, kernel
 from lslam.kernels.linalg import invert_symmetric, rotate_symmetric
 from lslam.kernels.residuals import add_information, nearest, octant_slots
+from lslam.kernels.surface_information import add_surface, advance_on_surfaces, thin_information
 
 Floats = NDArray[np.float64]
 Longs = NDArray[np.int64]
@@ -20,14 +21,15 @@ Flags = NDArray[np.bool_]
 @kernel
 def linearise_vgicp(source: Floats, covariance: Floats, R: Floats, t: Floats, size: float, scale: float, sigma2: float,
                     blob_weight: float, gate2: float, planes: Floats, counts: Floats, keys: Longs, table: Ints,
-                    cells: Longs, slots: Ints, is_done: Flags, away2: Floats, H: Floats, g: Floats,
+                    cells: Longs, slots: Ints, is_done: Flags, away2: Floats, H: Floats, S: Floats, g: Floats,
                     facts: Floats) -> None:  # fmt: skip
-    """Add to H (6, 6), g (6,) and facts all source points (S, 3) with covariance (S, 6), LiDAR frame, that are not done.
+    """Add to H, S (6, 6), g (6,) and facts all source points (S, 3) with covariance (S, 6), LiDAR frame, not done yet.
 
     As `linearise_gicp`, but on all plane voxels of the eight around R s + t, each times the number of points in it,
     counts (C,). Distances are those to the closest; the eighth of the facts is the sum of the counts.
     """
     inverse = 1.0 / size
+    unused = np.zeros(6)
     c2 = scale * scale
     for i in range(len(source)):
         if is_done[i]:
@@ -72,6 +74,11 @@ def linearise_vgicp(source: Floats, covariance: Floats, R: Floats, t: Floats, si
             w = n * robust
             add_information(H, g, w, mxx, mxy, mxz, myy, myz, mzz, ex, ey, ez, rx, ry, rz)
             trace = w * (mxx + myy + mzz)
+            if best >= 0:
+                along = w * thin_information(p, mxx, mxy, mxz, myy, myz, mzz)
+                add_surface(S, unused, along, p[3], p[4], p[5], rx, ry, rz)
+            else:
+                add_information(S, unused, w, mxx, mxy, mxz, myy, myz, mzz, 0.0, 0.0, 0.0, rx, ry, rz)
             facts[0] += trace
             facts[4] += trace * (rx * rx + ry * ry + rz * rz)
         away2[i] = closest
@@ -84,13 +91,14 @@ def linearise_vgicp(source: Floats, covariance: Floats, R: Floats, t: Floats, si
 
 
 @inline
-def scale_by_mean_count(H: Floats, g: Floats, facts: Floats) -> None:
+def scale_by_mean_count(H: Floats, S: Floats, g: Floats, facts: Floats) -> None:
     """Counts weigh points against each other; divided by their mean, the information stays that of the points."""
     w = facts[3] / max(facts[7], 1e-300)
     for i in range(6):
         g[i] *= w
         for j in range(6):
             H[i, j] *= w
+            S[i, j] *= w
     facts[0] *= w
     facts[4] *= w
 
@@ -107,6 +115,7 @@ def align_vgicp(
     cells, slots, is_done, away2 = workspace(len(source))
     coarse_cells, coarse_slots, _, _ = workspace(len(source) if has_coarse else 0)
     H, g, d, facts, weak = np.empty((6, 6)), np.empty(6), np.zeros(6), np.zeros(8), np.zeros((6, 6))
+    S = np.empty((6, 6))
     farthest2 = inlier_distance * inlier_distance
     gate2, scale = farthest2, scale_start
     converged = False
@@ -114,16 +123,19 @@ def align_vgicp(
     iterations = 0
     for _ in range(max_iterations):
         clear(H, g, facts, is_done, away2)
+        S[:] = 0.0
         linearise_vgicp(source, covariance, R, t, size, scale, sigma2, 0.0 if has_coarse else blob_weight, gate2, planes,
-                        counts, keys, table, cells, slots, is_done, away2, H, g, facts)  # fmt: skip
+                        counts, keys, table, cells, slots, is_done, away2, H, S, g, facts)  # fmt: skip
         facts[6] = facts[2]
         if has_coarse:
             linearise_vgicp(source, covariance, R, t, coarse_size, scale, sigma2, blob_weight, gate2, coarse_planes,
-                            coarse_counts, coarse_keys, coarse_table, coarse_cells, coarse_slots, is_done, away2, H, g,
+                            coarse_counts, coarse_keys, coarse_table, coarse_cells, coarse_slots, is_done, away2, H, S, g,
                             facts)  # fmt: skip
-        scale_by_mean_count(H, g, facts)
+        scale_by_mean_count(H, S, g, facts)
         iterations += 1
-        moved, weak_count, move, turn = advance(H, g, facts, scale, weak_share, R, t, d, weak, weak_count)
+        moved, weak_count, move, turn = advance_on_surfaces(
+            H, S, g, facts, scale, weak_share, R, t, d, weak, weak_count
+        )
         if not moved:
             break
         if scale <= scale_end and move < step_m and turn < step_rad:

@@ -34,7 +34,7 @@ class GaussianMap:
         self.table = np.full(4 * capacity, -1, np.int32)
         self.state = np.zeros(4, np.int64)
         self.free = np.zeros(capacity, np.int32)
-        self._shapes = np.zeros((0, 11))
+        self._shapes = np.zeros((0, 14))
 
     def __len__(self) -> int:
         """Voxels that hold points."""
@@ -58,14 +58,14 @@ class GaussianMap:
         self.keys[:] = gaussians.FREE
         self.table[:] = -1
         self.state[:] = 0
-        self._shapes[:, -1] = 0.0
+        self._shapes[:, 10] = 0.0
 
     def shapes(self) -> NDArray[np.float64]:
-        """(C, 11) full Gaussians of the voxels, for `ndt`: computed when asked for, where voxels have grown."""
+        """(C, 14) full Gaussians of the voxels, for `ndt`: computed when asked for, where voxels have grown."""
         from lslam.kernels.ndt_residual import describe
 
         if len(self._shapes) < len(self.keys):
-            self._shapes = np.zeros((len(self.keys), 11))
+            self._shapes = np.zeros((len(self.keys), 14))
         describe(
             self.moments, self.planes, self.keys, self.refreshed, int(self.state[gaussians.USED]),
             float(self.min_points), FLOOR, self._shapes,

@@ -29,6 +29,9 @@ START_STEP = 1.0
 SEARCH_SHARE, LOOKED_AT = 4, 3
 # A farther start must be supported by more than chance.
 CLEARLY = 1.01
+# Point to point: of the voxel size, because a voxel's mean stands for one point of its surface, its plane for all; and
+# times the steps, because a point is drawn to where its match is, not to where the surfaces meet.
+POINT_VOXEL, POINT_STEPS = 0.625, 3
 
 # Half a metre and two degrees: what a pose that no scan supports may be wrong by, one sigma.
 DOUBT = np.diag([0.25] * 3 + [np.deg2rad(2.0) ** 2] * 3)
@@ -51,7 +54,7 @@ class Registration:
         self.residual: Residual = self.config.residual or "plane"
         self.target = make_target(self.config.target, self.config.keyframes)
         self.map = GaussianMap(
-            self.config.voxel_size,
+            self.config.voxel_size * (POINT_VOXEL if self.residual == "point" else 1.0),
             min_points=self.config.min_points,
             planarity=self.config.planarity,
             count_cap=self.config.count_cap,
@@ -98,7 +101,8 @@ class Registration:
         c = self.config
         # One scan alone puts single rings into fine voxels; several fill them.
         coarse_map = self.map.coarsen(c.coarse_factor) if c.target == "scan" else None
-        fine = self._refine(points, T_prior, self.threshold.width, c.max_iterations, coarse_map)
+        steps = c.max_iterations * (POINT_STEPS if self.residual == "point" else 1)
+        fine = self._refine(points, T_prior, self.threshold.width, steps, coarse_map)
         fine = self._judge(fine, T_prior)
         move, turn = fine.prior_error
         if fine.ok and move < c.recover_m and turn < np.deg2rad(c.recover_deg):
@@ -164,7 +168,8 @@ class Registration:
 
         Not of all points: what a sensor sees of bare ground moves along with it, and matches best where nothing moved.
         """
-        return result.inlier_share * max(1 - (result.rmse / self.config.kernel_min) ** 2, 0.0)
+        width2 = self.config.kernel_min**2 + (self.map.size**2 if self.residual == "point" else 0.0)
+        return result.inlier_share * max(1 - result.rmse**2 / width2, 0.0)
 
     def _coarse_to_fine(self, points: PreparedPoints, T_prior: NDArray[np.float64]) -> RegistrationResult:
         """Coarse planes, annealed slowly, catch what fine voxels lose: metres per scan instead of decimetres.

@@ -24,6 +24,7 @@ class Pair:
     M: Floats
     metres2: float
     weight: float = 1.0
+    normal: Floats | None = None
 
     def error(self, R: Floats, t: Floats) -> Floats:
         return np.asarray(R @ self.point + t - self.mean)
@@ -34,6 +35,14 @@ class Pair:
 
     def distance2(self, R: Floats, t: Floats) -> float:
         return self.metres2 * self.mahalanobis2(R, t)
+
+    def surface(self, R: Floats) -> Floats:
+        """(6, 6) what the surface alone observes: the information along its normal, all of it where there is none."""
+        J = self.jacobian(R)
+        if self.normal is None:
+            return np.asarray(J.T @ self.M @ J)
+        row = self.normal @ J
+        return float(self.normal @ self.M @ self.normal) * np.outer(row, row)
 
     def jacobian(self, R: Floats) -> Floats:
         return np.hstack([np.eye(3), -so3.hat(R @ self.point)])
@@ -113,7 +122,8 @@ def disc_pairs(
             else:
                 C_t, metres2 = variance * np.eye(3), variance + sigma2
             M = np.linalg.inv(C_t + R @ symmetric(six) @ R.T)
-            out.append(Pair(i, s, mean, M, metres2, share if only_nearest else share * count))
+            weight = share if only_nearest else share * count
+            out.append(Pair(i, s, mean, M, metres2, weight, normal if kind == "plane" else None))
     return out
 
 
@@ -128,5 +138,5 @@ def ndt_pairs(target: VoxelMap, source: Floats, R: Floats, t: Floats) -> list[Pa
             if values[1] < 0.1 * values[2]:
                 continue
             values = np.maximum(values, 0.01 * values[2])
-            out.append(Pair(i, s, mean, (vectors / values) @ vectors.T, float(values[0])))
+            out.append(Pair(i, s, mean, (vectors / values) @ vectors.T, float(values[0]), normal=vectors[:, 0]))
     return out

@@ -150,3 +150,25 @@ def test_no_single_step_leaves_the_reach_of_the_correspondences() -> None:
     _, _, step, *_ = align(m, source, R, t, steps=1, weak_share=0.0)
     assert np.linalg.norm(step[:3]) <= 2.0 + 1e-12
     assert np.linalg.norm(t) == pytest.approx(np.linalg.norm(step[:3]))
+
+
+@pytest.mark.parametrize("share", [0.1, 0.5, 0.9])
+@pytest.mark.parametrize("bound", [np.inf, 0.3])
+def test_trimming_keeps_the_share_of_the_nearest(share: float, bound: float) -> None:
+    rng = np.random.default_rng(4)
+    away2 = np.where(rng.uniform(size=2000) < 0.2, -1.0, rng.exponential(0.2, 2000))
+    limit = gauss_newton.trimmed(away2, share, bound)
+    candidates = away2[(away2 >= 0) & (away2 <= bound)]
+    assert np.mean(candidates <= limit) == pytest.approx(share, abs=1.5 / len(candidates))
+    assert gauss_newton.trimmed(away2[::-1].copy(), share, bound) == limit
+    assert gauss_newton.trimmed(away2, 1.0, bound) == bound
+
+
+def test_a_bound_no_match_is_within_moves_nothing(target: GaussianMap) -> None:
+    floor = np.random.default_rng(2).uniform(-4, 4, (400, 3))
+    floor[:, 2] = -1.5 + 0.4
+    R, t = np.eye(3), np.zeros(3)
+    H, facts, *_ = align(target, floor, R, t, steps=1, farthest=0.3)
+    assert facts[3] > 300
+    np.testing.assert_array_equal(H, 0.0)
+    np.testing.assert_array_equal(t, 0.0)

@@ -44,6 +44,7 @@ class Sums:
     g: Floats
     facts: Floats
     away2: Floats
+    S: Floats
 
 
 def surfaces(rng: np.random.Generator, n: int) -> Floats:
@@ -80,10 +81,11 @@ def scene() -> Scene:
 def linearise(s: Scene, residual: str, c: float, gate2: float = np.inf, blob: float = BLOB) -> Sums:
     n, m = len(s.source), s.target
     H, g, facts, away2 = np.zeros((6, 6)), np.zeros(6), np.zeros(8), np.full(n, -1.0)
-    work = (np.full(n, -1, np.int64), np.full((n, 8), -1, np.int32), np.zeros(n, np.bool_), away2, H, g, facts)
+    S = np.zeros((6, 6))
+    work = (np.full(n, -1, np.int64), np.full((n, 8), -1, np.int32), np.zeros(n, np.bool_), away2, H, S, g, facts)
     pose = (s.R, s.t, m.size, c)
     if residual == "point":
-        linearise_point(s.source, *pose, SIGMA2, gate2, m.planes, m.keys, m.table, *work)
+        linearise_point(s.source, *pose, SIGMA2, gate2, m.planes, m.keys, m.table, *work[:5], *work[6:])
     elif residual == "gicp":
         linearise_gicp(s.source, s.covariance, *pose, SIGMA2, blob, gate2, m.planes, m.keys, m.table, *work)
     elif residual == "vgicp":
@@ -92,7 +94,7 @@ def linearise(s: Scene, residual: str, c: float, gate2: float = np.inf, blob: fl
         )  # fmt: skip
     else:
         linearise_ndt(s.source, *pose, (c / 0.15) ** 2, gate2, m.shapes(), m.keys, m.table, *work)
-    return Sums(np.triu(H) + np.triu(H, 1).T, g, facts, away2)
+    return Sums(np.triu(H) + np.triu(H, 1).T, g, facts, away2, np.triu(S) + np.triu(S, 1).T)
 
 
 def reference(s: Scene, residual: str, c: float, blob: float = BLOB) -> tuple[list[Pair], GemanMcClure | Magnusson]:
@@ -132,16 +134,19 @@ def test_gradient_is_that_of_the_cost(scene: Scene, residual: str, c: float, gat
 @pytest.mark.parametrize("gate2", GATES)
 def test_normal_equations_are_those_of_numpy(scene: Scene, residual: str, c: float, gate2: float) -> None:
     pairs, robust = reference(scene, residual, c)
-    H, g, information, lever = np.zeros((6, 6)), np.zeros(6), 0.0, 0.0
+    H, S, g, information, lever = np.zeros((6, 6)), np.zeros((6, 6)), np.zeros(6), 0.0, 0.0
     for p in close_to(scene, pairs, gate2):
         w, J, r = robust.weight(p, scene.R, scene.t), p.jacobian(scene.R), scene.R @ p.point
         H += w * J.T @ p.M @ J
+        S += w * p.surface(scene.R)
         g += w * J.T @ p.M @ p.error(scene.R, scene.t)
         information += w * float(np.trace(p.M))
         lever += w * float(np.trace(p.M)) * float(r @ r)
     found = linearise(scene, residual, c, gate2)
     np.testing.assert_allclose(found.H, H, rtol=1e-6, atol=1e-6 * np.abs(H).max())
     np.testing.assert_allclose(found.g, g, rtol=1e-6, atol=1e-6 * np.abs(g).max())
+    if residual != "point":
+        np.testing.assert_allclose(found.S, S, rtol=1e-6, atol=1e-6 * np.abs(S).max())
     assert found.facts[0] == pytest.approx(information, rel=1e-6)
     assert found.facts[4] == pytest.approx(lever, rel=1e-6)
     if residual == "vgicp":

@@ -1,0 +1,98 @@
+"""What the surfaces alone observe, beside residuals whose matrices are full.
+
+A Gaussian of a plane voxel also holds a point to where in the plane the voxel's points happen to be. That is little for
+each point, but it is all there is along a corridor, and it draws the sensor back to where the map was made. So the
+directions that no normal observes are found without it, and along them the motion prior stays.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.kernels.gauss_newton import mirror, move_by
+from lslam.kernels.jit import inline
+from lslam.kernels.linalg import eigen
+from lslam.kernels.residuals import add_information, step_norms
+
+Floats = NDArray[np.float64]
+
+
+@inline
+def add_surface(S: Floats, unused: Floats, w: float, nx: float, ny: float, nz: float, rx: float, ry: float,
+                rz: float) -> None:  # fmt: skip
+    """Upper triangle of S (6, 6) += w j j^T with j = [n, r x n]; `unused` (6,) takes no gradient."""
+    add_information(S, unused, w, nx * nx, nx * ny, nx * nz, ny * ny, ny * nz, nz * nz, 0.0, 0.0, 0.0, rx, ry, rz)
+
+
+@inline
+def thin_information(p: Floats, xx: float, xy: float, xz: float, yy: float, yz: float, zz: float) -> float:
+    """n^T M n along the normal of a plane voxel, a row of `planes`."""
+    nx, ny, nz = p[3], p[4], p[5]
+    along: float = xx * nx * nx + yy * ny * ny + zz * nz * nz + 2.0 * (xy * nx * ny + xz * nx * nz + yz * ny * nz)
+    return along
+
+
+@inline
+def solve_on_surfaces(H: Floats, S: Floats, g: Floats, facts: Floats, weak_share: float, d: Floats,
+                      weak: Floats) -> int:  # fmt: skip
+    """As `gauss_newton.solve_observed`, with S deciding which directions are observed: d solves H there.
+
+    Both matrices are whole, not triangles.
+    """
+    lever = math.sqrt(max(facts[4] / max(facts[0], 1e-300), 1e-6))
+    information = S[0, 0] + S[1, 1] + S[2, 2]
+    D = np.ones(6)
+    D[3:] = 1.0 / lever
+    A, B, P = np.empty((6, 6)), np.empty((6, 6)), np.zeros((6, 6))
+    for i in range(6):
+        for j in range(6):
+            A[i, j] = S[i, j] * D[i] * D[j]
+            B[i, j] = H[i, j] * D[i] * D[j]
+    values, vectors = eigen(A)
+    count = 0
+    for k in range(6):
+        if values[k] <= weak_share * information or values[k] <= 0.0:
+            for i in range(6):
+                weak[count, i] = vectors[i, k]
+            count += 1
+            continue
+        for i in range(6):
+            for j in range(6):
+                P[i, j] += vectors[i, k] * vectors[j, k]
+    for i in range(6):
+        for j in range(6):
+            A[i, j] = 0.0
+            for k in range(6):
+                for m in range(6):
+                    A[i, j] += P[i, k] * B[k, m] * P[m, j]
+    values, vectors = eigen(A)
+    largest = 0.0
+    for k in range(6):
+        largest = max(largest, values[k])
+    d[:] = 0.0
+    for k in range(6):
+        if values[k] <= 1e-12 * largest:
+            continue
+        dot = 0.0
+        for i in range(6):
+            for j in range(6):
+                dot += vectors[i, k] * P[i, j] * g[j] * D[j]
+        for i in range(6):
+            d[i] -= vectors[i, k] * dot / values[k] * D[i]
+    return count
+
+
+@inline
+def advance_on_surfaces(H: Floats, S: Floats, g: Floats, facts: Floats, scale: float, weak_share: float, R: Floats,
+                        t: Floats, d: Floats, weak: Floats, weak_count: int) -> tuple[bool, int, float, float]:  # fmt: skip
+    """As `gauss_newton.advance`, along the directions that S observes."""
+    mirror(H)
+    mirror(S)
+    if facts[3] < 6.0:
+        return False, weak_count, 0.0, 0.0
+    weak_count = solve_on_surfaces(H, S, g, facts, weak_share, d, weak)
+    move, turn = step_norms(d)
+    return move_by(d, move, turn, scale, R, t), weak_count, move, turn

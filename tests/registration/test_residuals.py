@@ -1,0 +1,161 @@
+"""Every residual in scenes whose answer is known, against every kind of target."""
+
+from __future__ import annotations
+
+import copy
+
+import numpy as np
+import pytest
+from analytic_scenes import corridor, distance, is_near, pose_at, random_pose, room, seen_from
+from numpy.typing import NDArray
+
+from lslam.config.registration import RegistrationConfig, Residual
+from lslam.registration.registration import Registration
+from lslam.registration.residuals import KERNELS
+from lslam.registration.uncertainty import PoseUncertainty
+
+Floats = NDArray[np.float64]
+RESIDUALS: list[Residual] = list(KERNELS)  # type: ignore[arg-type]
+# m, deg: a point finds the mean of a voxel, not the place where it lies, so its residual averages out only.
+ROOM = {"plane": (0.01, 0.05), "point": (0.06, 0.3), "gicp": (0.01, 0.05), "vgicp": (0.01, 0.05), "ndt": (0.01, 0.05)}
+
+
+def in_room(residual: Residual, seed: int = 0, **given: object) -> Registration:
+    """A registration that has seen the room from its middle."""
+    registration = Registration(RegistrationConfig.model_validate({"residual": residual, **given}))
+    registration.register(room(np.random.default_rng(seed)).astype(np.float32))
+    return registration
+
+
+@pytest.mark.parametrize("residual", RESIDUALS)
+def test_a_start_at_unknown_speed_is_found(residual: Residual) -> None:
+    for seed in range(4):
+        rng = np.random.default_rng(seed + 10)
+        T = random_pose(rng, 1.5, 5.0)
+        result = in_room(residual, seed).register(seen_from(room(rng), T))
+        assert result.ok
+        assert result.converged
+        assert len(result.degenerate) == 0
+        assert is_near(T, result.T_world_lidar, *ROOM[residual])
+        assert result.covariance is not None
+        assert np.linalg.eigvalsh(result.covariance).min() > 0
+        assert 0 < result.inliers <= result.matched <= result.source_points
+
+
+@pytest.mark.parametrize("residual", RESIDUALS)
+@pytest.mark.parametrize("target", ["map", "keyframe", "scan"])
+def test_a_drive_through_the_room_is_followed(residual: Residual, target: str) -> None:
+    """Twelve scans, 0.3 m and 2 deg apart; one that claims to stand still is 3.3 m off in the end."""
+    rng = np.random.default_rng(1)
+    registration = in_room(residual, target=target)
+    for k in range(1, 12):
+        T = pose_at((-0.3 * k, 0.1 * k, 0.0), 2.0 * k)
+        result = registration.register(seen_from(room(rng, 3000), T))
+        assert result.ok, result.reason
+    away, turned = distance(T, result.T_world_lidar)
+    slack = 4.0 if target == "scan" else 1.0
+    assert away < slack * ROOM[residual][0]
+    assert turned < slack * ROOM[residual][1]
+    assert not is_near(np.eye(4), T, 1.0, 10.0)
+
+
+@pytest.mark.parametrize("residual", RESIDUALS)
+@pytest.mark.parametrize("kind", ["noise", "nan", "far", "few"])
+def test_a_bad_scan_fails_says_why_and_leaves_the_map_alone(residual: Residual, kind: str) -> None:
+    rng = np.random.default_rng(2)
+    registration = in_room(residual)
+    for k in range(1, 7):
+        assert registration.register(seen_from(room(rng, 2000), pose_at((0.1 * k, 0.0, 0.0)))).ok
+    before = copy.deepcopy(registration.map)
+    points = {
+        "noise": rng.uniform(-40, 40, (20_000, 3)),
+        "nan": np.full((500, 3), np.nan),
+        "far": rng.uniform(1e6, 1e9, (500, 3)),
+        "few": rng.uniform(-5, 5, (20, 3)),
+    }[kind]
+    result = registration.register(points.astype(np.float32))
+    assert not result.ok
+    assert result.reason
+    assert result.covariance is not None
+    assert np.sqrt(result.covariance[0, 0]) == pytest.approx(0.5)
+    assert is_near(result.T_world_lidar, pose_at((0.7, 0.0, 0.0)), 0.05, 0.3)
+    for name in ("moments", "planes", "keys", "table"):
+        np.testing.assert_array_equal(getattr(registration.map, name), getattr(before, name))
+    T = pose_at((0.8, 0.0, 0.0))
+    assert is_near(T, registration.register(seen_from(room(rng), T)).T_world_lidar, *ROOM[residual])
+
+
+@pytest.mark.parametrize("residual", ["plane", "gicp", "vgicp", "ndt"])
+def test_a_corridor_keeps_the_prior_along_itself(residual: Residual) -> None:
+    rng = np.random.default_rng(3)
+    registration = Registration(RegistrationConfig(residual=residual))
+    for k in range(8):
+        x = 0.5 * k
+        prior = pose_at((x + 0.1, 0.05, 0.03), 0.5) if k else np.eye(4)
+        result = registration.register(seen_from(corridor(rng, along=x), pose_at((x, 0.0, 0.0))), prior)
+        assert result.ok
+        if k:
+            assert len(result.degenerate) == 1
+            assert abs(result.degenerate[0, 0]) > 0.99
+            assert result.T_world_lidar[0, 3] == pytest.approx(prior[0, 3], abs=2e-3)
+            assert np.abs(result.T_world_lidar[1:3, 3]).max() < 0.01
+
+
+def with_lorry(rng: np.random.Generator, y: float) -> NDArray[np.float32]:
+    """The room with the side of a lorry in it, 12 m long."""
+    side = np.column_stack([rng.uniform(-6, 6, 2000), rng.normal(y, 0.01, 2000), rng.uniform(-1.5, 2.0, 2000)])
+    return np.concatenate([room(rng, 3000), side]).astype(np.float32)
+
+
+def error_beside_a_lorry(residual: Residual, **given: object) -> float:
+    """Metres off when the lorry has moved by 0.25 m and the sensor has not."""
+    rng = np.random.default_rng(5)
+    registration = Registration(RegistrationConfig.model_validate({"residual": residual, **given}))
+    registration.register(with_lorry(rng, 3.0))
+    result = registration.register(with_lorry(rng, 3.25), np.eye(4))
+    assert result.ok, result.reason
+    return distance(np.eye(4), result.T_world_lidar)[0]
+
+
+# Not vgicp: by its counts the lorry, near and dense, outweighs the walls, and trimming then drops the walls.
+@pytest.mark.parametrize("residual", ["plane", "point", "gicp"])
+def test_a_wide_bound_sees_what_has_moved_and_trimming_leaves_it_out(residual: Residual) -> None:
+    everything = error_beside_a_lorry(residual, inlier_distance=2.0)
+    trimmed = error_beside_a_lorry(residual, inlier_distance=2.0, inlier_ratio=0.8)
+    assert everything > 0.03
+    assert trimmed < 0.5 * everything
+
+
+@pytest.mark.parametrize("residual", ["plane", "gicp", "vgicp", "ndt"])
+def test_a_narrow_bound_rejects_what_has_moved(residual: Residual) -> None:
+    assert error_beside_a_lorry(residual, inlier_distance=0.1) < 0.005
+
+
+@pytest.mark.parametrize("target", ["keyframe", "scan"])
+def test_the_map_holds_what_its_target_says(target: str) -> None:
+    """Along a corridor 20 m are driven: the map of the last scan ends with it, that of three keyframes a little earlier."""
+    rng = np.random.default_rng(6)
+    registration = Registration(RegistrationConfig.model_validate({"target": target, "keyframes": 3}))
+    behind = []
+    for k in range(21):
+        scan = seen_from(corridor(rng, 4000, along=float(k)), pose_at((float(k), 0.0, 0.0)))
+        registration.register(scan, pose_at((float(k), 0.0, 0.0)))
+        live = registration.map.keys >= 0
+        behind.append(k - float(registration.map.planes[live, 0].min()))
+    assert behind[0] == pytest.approx(25.0, abs=0.5)
+    # Keyframes are two metres apart, or three where an estimate falls short; the newest is up to as old.
+    low, high = (24.5, 25.5) if target == "scan" else (28.5, 33.5)
+    assert low < behind[20] < high
+
+
+def test_from_scan_to_scan_every_error_stays() -> None:
+    """The covariance of a pose grows by that of every registration; on a map only as the map is renewed."""
+    rng = np.random.default_rng(7)
+    result = in_room("plane").register(room(rng).astype(np.float32))
+    assert result.covariance is not None
+    for is_scan_to_scan, times in ((True, 11), (False, 1)):
+        uncertainty = PoseUncertainty(is_scan_to_scan=is_scan_to_scan)
+        for _ in range(10):
+            C = uncertainty.add(result)
+        assert C is not None
+        np.testing.assert_allclose(C, times * result.covariance, rtol=1e-9)
