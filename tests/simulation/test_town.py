@@ -154,6 +154,7 @@ def test_a_path_through_a_building_is_refused() -> None:
     def poses(times: np.ndarray) -> np.ndarray:
         T = np.tile(np.eye(4), (len(times), 1, 1))
         T[:, :3, 3] = away + (times / 5.0)[:, None] * (beyond - away)
+        T[:, 2, 3] = made.city.terrain.height(T[:, :2, 3]) + 1.7  # whatever hill lies between
         return T
 
     check_path(made.scene, made.city, made.vehicle.poses, made.end)
