@@ -25,6 +25,7 @@ METHODS = {
     "loam-odom": ("lslam.odometry.loam", "edges and planar points, scan to scan: LOAM without its map"),
     "loam": ("lslam.odometry.loam", "LOAM: scan to scan, then refined on the feature map at every scan"),
     "floam": ("lslam.odometry.loam", "F-LOAM: motion prior, then scan to feature map in one stage"),
+    "lego-loam": ("lslam.odometry.lego_loam", "LeGO-LOAM: ground, clusters, two steps scan to scan, then feature map"),
     "kiss-icp": ("lslam.odometry.kiss", "the baseline: the kiss-icp package with its own preprocessing and defaults"),
     "small-gicp": ("lslam.odometry.small_gicp", "baseline: GICP of the small_gicp package on a local map of keyframes"),
     "open3d-gicp": ("lslam.odometry.open3d", "baseline: generalised ICP of Open3D, scan to scan"),

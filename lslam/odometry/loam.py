@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -17,17 +17,31 @@ from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan import Scan
 from lslam.types.scan_result import ScanResult
 
-# name -> how a scan is registered on the one before, and whether there is a feature map
-VARIANTS: dict[str, tuple[ScanStep | None, bool]] = {
-    "loam-odom": (joint_step, False),
-    "loam": (joint_step, True),
-    "floam": (None, True),
+
+@dataclass(frozen=True)
+class Variant:
+    """What makes a method of the family.
+
+    scan_step : how a scan is registered on the one before; None leaves that out
+    with_map : whether the pose is found, or refined, on a feature map
+    with_less_planes : whether the map is matched with the less planar points in place of the planar ones
+    """
+
+    scan_step: ScanStep | None
+    with_map: bool
+    with_less_planes: bool = False
+
+
+VARIANTS = {
+    "loam-odom": Variant(joint_step, with_map=False),
+    "loam": Variant(joint_step, with_map=True),
+    "floam": Variant(None, with_map=True),
 }
 
 
 def create(config: Config) -> Loam:
     """The variant that `odometry.method` names."""
-    return Loam(config, *VARIANTS[config.odometry.method])
+    return Loam(config, VARIANTS[config.odometry.method])
 
 
 class Loam:
@@ -36,22 +50,18 @@ class Loam:
     needs_rings = True
     deskew = "features by the motion prior, and again by the motion that registration finds"
 
-    def __init__(self, config: Config, scan_step: ScanStep | None, with_map: bool) -> None:
-        self.config = config
-        self._scan_step, self._with_map = scan_step, with_map
+    def __init__(self, config: Config, variant: Variant) -> None:
+        self.config, self.variant = config, variant
         self.restart()
 
     def restart(self) -> None:
         """No scan seen, an empty feature map."""
-        c = self.config
+        c, v = self.config, self.variant
         self.registration = FeatureRegistration(
-            c.registration,
-            c.loam,
-            scan_step=self._scan_step,
-            with_map=self._with_map,
+            c.registration, c.loam, scan_step=v.scan_step, with_map=v.with_map, with_less_planes=v.with_less_planes,
             reach=1.2 * c.preprocess.range_max,
-        )
-        self._uncertainty = PoseUncertainty(is_scan_to_scan=not self._with_map)
+        )  # fmt: skip
+        self._uncertainty = PoseUncertainty(is_scan_to_scan=not v.with_map)
         # What `register` saw and found last, for `update`.
         self._features: Features
         self._located: RegistrationResult
@@ -96,7 +106,7 @@ class Loam:
 
     def warm_up(self) -> None:
         """Register a small room with a throw-away copy, well and badly: every kernel is compiled or loaded."""
-        trial = type(self)(self.config, self._scan_step, self._with_map)
+        trial = type(self)(self.config, self.variant)
         room = _room()
         prior = MotionPrior(np.zeros(1), np.eye(4)[None])
         for scan in (room, room, room.select(np.arange(0, len(room), 3))):

@@ -38,15 +38,16 @@ class FeatureRegistration:
     ----------
     scan_step : how a scan is registered on the one before; None leaves that out
     with_map : whether the pose is found, or refined, on the feature map
+    with_less_planes : whether the map is matched with centroids of the less planar points in place of the planar points
     reach : m, how far from the sensor the map is kept
     """
 
     def __init__(
         self, config: RegistrationConfig, loam: LoamConfig, *, scan_step: ScanStep | None, with_map: bool,
-        reach: float = 120.0,
+        with_less_planes: bool = False, reach: float = 120.0,
     ) -> None:  # fmt: skip
         self.config, self.loam = config, loam
-        self._step, self._reach = scan_step, reach
+        self._step, self._with_less_planes, self._reach = scan_step, with_less_planes, reach
         self.map: FeatureMap | None = self._new_map(1 << 16) if with_map else None
         self.target: FeatureScan | None = None
         self.noise = FeatureNoise(loam.edge_sigma, config.sigma, config.weak_share)
@@ -76,7 +77,9 @@ class FeatureRegistration:
                 again = self._attempt(features, start, T_prior, clock)
                 if again.ok and (not result.ok or again.inliers > result.inliers):
                     result = again
-        if not result.ok or result.inliers < MIN_FEATURES or len(result.degenerate):
+        # One scan's planes hold no more than its features do: only a map can close a direction that these leave open.
+        is_open = len(result.degenerate) > 0 and self.map is not None
+        if not result.ok or result.inliers < MIN_FEATURES or is_open:
             with clock.stage("stand-in"):
                 result = self._stand_in(features, start, T_prior, result)
         return result
@@ -118,8 +121,9 @@ class FeatureRegistration:
         if self.map is not None:
             start = result.T_world_lidar if result.ok else T_start
             with clock.stage("map"):
+                points, scatter = _thinned(features) if self._with_less_planes else (features.planes.points, None)
                 result = solve_on_map(
-                    self.map, features.edges.points, features.planes.points, start, quick, self.noise,
+                    self.map, features.edges.points, points, start, quick, self.noise, scatter=scatter,
                     coarse=self.map.planes.coarsen(self._coarse_factor()) if self._starting else None,
                 )  # fmt: skip
             result = self._judge(result, T_prior)

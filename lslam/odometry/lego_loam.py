@@ -1,0 +1,31 @@
+"""Method `lego-loam`: ground and clusters first, then scan to scan in two steps, then the feature map.
+
+Shan and Englot 2018, "LeGO-LOAM: Lightweight and ground-optimized lidar odometry and mapping on variable terrain". Edges
+come from clusters off the ground, planar points from the ground; z, roll and pitch are found from these, then x, y and yaw
+from those. Its mapping takes the less planar points of ground and clusters, as the paper's does.
+"""
+
+from __future__ import annotations
+
+from lslam.config.config import Config
+from lslam.odometry.loam import Loam, Variant
+from lslam.preprocessing.features import Features
+from lslam.preprocessing.segments import lego_features
+from lslam.registration.feature_steps import two_steps
+from lslam.types.scan import Scan
+
+LEGO = Variant(two_steps, with_map=True, with_less_planes=True)
+
+
+def create(config: Config) -> LegoLoam:
+    """The method as the configuration wants it."""
+    return LegoLoam(config, LEGO)
+
+
+class LegoLoam(Loam):
+    """LOAM on what the segmentation of the range image leaves."""
+
+    def prepare(self, scan: Scan) -> Features:
+        """Edges off the ground, planar points on it, clutter left out. Raises InputError for a scan without usable rings."""
+        features, _ = lego_features(scan, self.config.loam, self.config.preprocess)
+        return features
