@@ -41,6 +41,7 @@ if TYPE_CHECKING:
 @options.scan_range
 @click.option("--threads", type=int, metavar="N", help="1: one thread; 2 and more: the next scan is read meanwhile.")
 @click.option("--rings", metavar="RULE", help="How rings are found: auto, field, order, rows[:N], elevation[:N].")
+@click.option("--save-feature-map", is_flag=True, help="Write feature_map.ply; for the LOAM family.")
 @click.option("--strict", is_flag=True, help="Exit 4 when anything was degraded: a scan skipped or bridged.")
 @click.option("--dry-run", is_flag=True, help="Resolve everything, write nothing.")
 @options.data_root
@@ -92,6 +93,7 @@ def _resolve(given: dict[str, Any]) -> Config:
         "input.skip_frames": given["skip_frames"],
         "input.threads": given["threads"],
         "input.rings": given["rings"],
+        "map.write_features": "true" if given["save_feature_map"] else None,
         "input.strict": "true" if given["strict"] else None,
     }
     settings = options.with_preset(given["settings"], given["preset"])

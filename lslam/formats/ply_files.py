@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -56,13 +57,17 @@ def read_ply(path: Path) -> PointCloud:
     raise InputError(f"{path}: PLY header has no element 'vertex'")
 
 
-def write_ply(path: Path, points: NDArray[Any], intensity: NDArray[Any] | None = None, comment: str = "") -> None:
-    """Write points (N, 3), m, and intensity (N,) as float32, binary little endian, atomically."""
-    names = ["x", "y", "z"] if intensity is None else ["x", "y", "z", "intensity"]
+def write_ply(
+    path: Path, points: NDArray[Any], intensity: NDArray[Any] | None = None, comment: str = "", *,
+    scalars: Mapping[str, NDArray[Any]] | None = None,
+) -> None:  # fmt: skip
+    """Write points (N, 3), m, intensity (N,) and further `scalars` (N,) by name as float32, binary little endian, atomically."""
+    columns = {**({} if intensity is None else {"intensity": intensity}), **(scalars or {})}
+    names = ["x", "y", "z", *columns]
     table = np.empty((len(points), len(names)), "<f4")
     table[:, :3] = points
-    if intensity is not None:
-        table[:, 3] = intensity
+    for k, values in enumerate(columns.values()):
+        table[:, 3 + k] = values
     comments = "".join(f"comment {line}\n" for line in comment.splitlines())
     properties = "".join(f"property float {name}\n" for name in names)
     header = f"ply\nformat binary_little_endian 1.0\n{comments}element vertex {len(table)}\n{properties}end_header\n"

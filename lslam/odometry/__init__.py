@@ -32,6 +32,10 @@ METHODS = {
 }
 
 
+# Those whose scans have features, and so a feature map to write.
+FEATURE_METHODS = ("loam-odom", "loam", "floam", "lego-loam")
+
+
 def known_methods() -> dict[str, str]:
     """Names and one-line summaries, those of other packages included."""
     own = {name: summary for name, (_, summary) in METHODS.items()}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any, Protocol, runtime_checkable
 
+from lslam.preprocessing.features import Features
 from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan import Scan
 from lslam.types.scan_result import ScanResult
@@ -27,6 +28,15 @@ class Odometry(Protocol):
 
     def warm_up(self) -> None:
         """Compile or load what the first scan would otherwise wait for."""
+        ...
+
+
+@runtime_checkable
+class FeatureSource(Odometry, Protocol):
+    """A method that sees features, of which a map can be made."""
+
+    def features_of(self, prepared: Any, motion: MotionPrior) -> Features:
+        """What `prepare` made of a scan, as seen from scan start when the sensor moved as `motion` says."""
         ...
 
 

@@ -70,13 +70,18 @@ class Loam:
         """Edges and planar points. Raises InputError for a scan without usable rings."""
         return extract_features(scan, self.config.loam, self.config.preprocess)
 
+    def features_of(self, prepared: Features, motion: MotionPrior) -> Features:
+        """The features as seen from scan start, the sensor having moved as `motion` says."""
+        is_swept = self.config.preprocess.deskew and prepared.planes.times is not None and len(motion.times) > 1
+        return _deskewed(prepared, motion) if is_swept else prepared
+
     def register(self, scan: Scan, prepared: Features, prior: MotionPrior) -> ScanResult:
         """Align with the scan before, with the feature map, or with one after the other."""
         clock = StageClock()
-        self._features = prepared
-        if self.config.preprocess.deskew and prepared.planes.times is not None and len(prior.times) > 1:
-            with clock.stage("deskew"):
-                self._features = _deskewed(prepared, prior)
+        with clock.stage("deskew"):
+            self._features = self.features_of(prepared, prior)
+        if self._features is prepared:
+            del clock.seconds["deskew"]
         self._located = result = self.registration.locate(self._features, prior.start, clock)
         return ScanResult(
             index=scan.index,

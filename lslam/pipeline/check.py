@@ -5,7 +5,7 @@ from __future__ import annotations
 from lslam.config import Config
 from lslam.errors import UsageError, nearest
 from lslam.evaluation.relative import parse_delta
-from lslam.odometry import METHODS, known_methods
+from lslam.odometry import FEATURE_METHODS, METHODS, known_methods
 
 
 def check_config(config: Config) -> None:
@@ -13,6 +13,8 @@ def check_config(config: Config) -> None:
     method = config.odometry.method
     if method not in (known := known_methods()):
         raise UsageError(f"no method {method!r}; {nearest(method, known)}")
+    if config.map.write_features and method not in FEATURE_METHODS:
+        raise UsageError(f"method {method} has no feature map to save; these have: {', '.join(FEATURE_METHODS)}")
     for delta in config.eval.delta:
         parse_delta(delta)
 

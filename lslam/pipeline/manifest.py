@@ -60,6 +60,8 @@ class Manifest:
             status: sum(r.status == status for r in results) for status in ("ok", "bridged", "skipped")
         }
         self.counts["standing"] = sum(r.is_standing for r in results)
+        # Registered, but by points that stood in for the method's own.
+        self.counts["stand_in"] = sum(r.status == "ok" and bool(r.reason) and not r.is_standing for r in results)
         self.counts["degenerate"] = sum(len(r.degenerate) > 0 for r in results)
         bad = [r for r in results if r.status != "ok"]
         if bad:

@@ -10,10 +10,12 @@ import numpy as np
 from lslam.config import Config, to_toml
 from lslam.config.map import MapConfig
 from lslam.evaluation.evaluate import Evaluation
+from lslam.formats.ply_files import write_ply
 from lslam.formats.point_files import write_points
 from lslam.formats.trajectory_files import write_kitti, write_tum
 from lslam.geometry import se3
 from lslam.maps.merge import MergedMap
+from lslam.pipeline.feature_pass import FeatureCloud
 from lslam.pipeline.run_folder import RunFolder
 from lslam.reports.evaluation_json import to_document
 from lslam.reports.facts import stage_matrix
@@ -85,6 +87,15 @@ def write_map(folder: RunFolder, merged: MergedMap, config: MapConfig) -> None:
     write_points(
         path, merged.points, merged.intensity, comment="lslam map, not georeferenced, world = LiDAR at first scan"
     )
+
+
+def write_feature_map(folder: RunFolder, features: FeatureCloud) -> None:
+    """feature_map.ply, world frame of the trajectory; the scalar `class` is 1 on edges and 0 on planes."""
+    folder.require_space(BYTES_PER_POINT * len(features), "the feature map")
+    write_ply(
+        folder.path / "feature_map.ply", features.points, scalars={"class": features.kinds},
+        comment="lslam feature map, class 1 = edge, 0 = plane; world = LiDAR at first scan",
+    )  # fmt: skip
 
 
 def write_evaluation(folder: RunFolder, evaluation: Evaluation | None) -> None:

@@ -14,10 +14,11 @@ from lslam.evaluation.evaluate import Evaluation, evaluate
 from lslam.kernels import jit
 from lslam.maps import merge
 from lslam.odometry import create_odometry
-from lslam.odometry.base import Odometry
+from lslam.odometry.base import FeatureSource, Odometry
 from lslam.pipeline import outputs
 from lslam.pipeline.check import check_config
 from lslam.pipeline.choose import choose_scans
+from lslam.pipeline.feature_pass import build_feature_map
 from lslam.pipeline.front_end import estimate, has_point_times, is_diverged, to_trajectory
 from lslam.pipeline.manifest import Manifest, describe_deskew
 from lslam.pipeline.map_pass import build_map
@@ -107,6 +108,7 @@ def run(
                 evaluation = _score(record, chosen, config)
                 outputs.write_evaluation(folder, evaluation)
                 _map(folder, chosen, record, config, manifest, watch)
+                _feature_map(folder, chosen, odometry, record, config, manifest, watch)
                 _report(folder, record, evaluation, config, manifest)
             except BaseException as error:
                 _write_last(folder, manifest.as_dict(manifest.word_for(error), str(error) or type(error).__name__))
@@ -205,6 +207,23 @@ def _map(
         record.map_image, record.map_extent = built.image, built.extent
         outputs.write_map(folder, built.merged, config.map)
     manifest.map_points = len(built.merged)
+
+
+def _feature_map(
+    folder: RunFolder, sequence: Sequence, odometry: Odometry, record: RunRecord, config: Config, manifest: Manifest,
+    watch: Watch,
+) -> None:  # fmt: skip
+    """The feature map, likewise, when it was asked for."""
+    if not config.map.write_features or manifest.outcome == "interrupted" or not isinstance(odometry, FeatureSource):
+        return
+    watch.on_start("feature map", len(record.results))
+    with manifest.timed("feature_map_s"):
+        built = build_feature_map(sequence, odometry, record.results, config, watch.on_step, watch.should_stop)
+        if built is None:
+            manifest.interrupt("interrupted while the feature map was built: there is none")
+            return
+        outputs.write_feature_map(folder, built)
+    log.info("feature map: %d points in %s", len(built), folder.path / "feature_map.ply")
 
 
 def _report(

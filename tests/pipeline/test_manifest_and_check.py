@@ -17,7 +17,10 @@ from lslam.types.scan_result import ScanResult, Status
 
 
 def results(*statuses: Status) -> list[ScanResult]:
-    return [ScanResult(10 + i, i, np.eye(4), status, status and f"why {i}") for i, status in enumerate(statuses)]
+    return [
+        ScanResult(10 + i, i, np.eye(4), status, "" if status == "ok" else f"why {i}")
+        for i, status in enumerate(statuses)
+    ]
 
 
 def judged(expected: int, diverged: bool, *statuses: Status) -> Manifest:
@@ -36,7 +39,15 @@ def test_outcome_in_one_word() -> None:
 
 def test_problems_name_the_first_bad_scan_by_its_number_in_the_recording() -> None:
     manifest = judged(4, False, "ok", "skipped", "bridged", "ok")
-    assert manifest.counts == {"scans": 4, "ok": 2, "bridged": 1, "skipped": 1, "standing": 0, "degenerate": 0}
+    assert manifest.counts == {
+        "scans": 4,
+        "ok": 2,
+        "bridged": 1,
+        "skipped": 1,
+        "standing": 0,
+        "stand_in": 0,
+        "degenerate": 0,
+    }
     assert "2 of 4 scans" in manifest.problems[0]
     assert "scan 11: why 1" in manifest.problems[0]
 

@@ -72,7 +72,15 @@ def test_a_good_run_writes_everything_and_ends_done(tmp_path: Path) -> None:
     assert names(tmp_path / "out") == ALL
     facts = manifest(tmp_path / "out")
     assert (facts["status"], facts["problems"]) == ("done", [])
-    assert facts["counts"] == {"scans": 15, "ok": 15, "bridged": 0, "skipped": 0, "standing": 0, "degenerate": 0}
+    assert facts["counts"] == {
+        "scans": 15,
+        "ok": 15,
+        "bridged": 0,
+        "skipped": 0,
+        "standing": 0,
+        "stand_in": 0,
+        "degenerate": 0,
+    }
     assert facts["sequence"]["decisions"] == ["a note of the reader"]
     assert facts["frames"]["trajectory_kitti.txt"].startswith("camera 0")
     assert len(outcome.trajectory) == 15
