@@ -19,6 +19,7 @@ from lslam.cli import options
 @click.option("--all", "all_scans", is_flag=True, help="Look at the points of every scan.")
 @click.option("--rows", type=int, metavar="N", help="Organised clouds: rows (rings).")
 @click.option("--cols", type=int, metavar="N", help="Organised clouds: columns.")
+@options.reading
 @options.as_json
 def command(
     sequence: str,
@@ -28,12 +29,13 @@ def command(
     rows: int | None,
     cols: int | None,
     as_json: bool,
+    **given: Any,
 ) -> None:
-    """Show what is in SEQUENCE: a folder, or a name under the data root."""
+    """Show what is in SEQUENCE: a folder, a bag, or a name under the data root."""
     from lslam.pipeline.inspect import inspect
     from lslam.readers import open_sequence
 
-    opened = open_sequence(sequence, data_root=data_root, rows=rows, cols=cols)
+    opened = open_sequence(sequence, data_root=data_root, rows=rows, cols=cols, **options.reading_of(given))
     facts = inspect(opened, None if all_scans else scans)
     if as_json:
         import json

@@ -37,6 +37,21 @@ def scan_range(function: F) -> F:
     return function
 
 
+def reading(function: F) -> F:
+    """--lidar-topic, --imu-topic, --gnss-topic and --extrinsics."""
+    function = click.option(
+        "--extrinsics", metavar="T|FILE", help="The IMU in the LiDAR's frame: 12, 16 or 7 numbers, or a file with them."
+    )(function)
+    for name, text in (("gnss", "satellite fixes"), ("imu", "the IMU"), ("lidar", "the scans")):
+        function = click.option(f"--{name}-topic", metavar="TOPIC", help=f"Of a bag: the topic of {text}.")(function)
+    return function
+
+
+def reading_of(given: dict[str, Any]) -> dict[str, Any]:
+    """What `open_sequence` takes of the options of `reading`."""
+    return {name: given[name] for name in ("lidar_topic", "imu_topic", "gnss_topic", "extrinsics")}
+
+
 def configuration(function: F) -> F:
     """--config and --set."""
     function = click.option(

@@ -44,6 +44,7 @@ if TYPE_CHECKING:
 @click.option("--save-feature-map", is_flag=True, help="Write feature_map.ply; for the LOAM family.")
 @click.option("--strict", is_flag=True, help="Exit 4 when anything was degraded: a scan skipped or bridged.")
 @click.option("--dry-run", is_flag=True, help="Resolve everything, write nothing.")
+@options.reading
 @options.data_root
 @options.configuration
 @options.as_json
@@ -51,7 +52,7 @@ if TYPE_CHECKING:
 def command(sequence: str, **given: Any) -> None:
     """Estimate a trajectory and build a map.
 
-    SEQUENCE is a path, or a name under --data-root: seq07, 07, kitti/07, 2011_09_26_drive_0005_sync.
+    SEQUENCE is a path (a folder or a bag), or a name under --data-root: seq07, 07, kitti/07, 2011_09_26_drive_0005_sync.
     """
     setup_logging(given["verbose"], given["quiet"])
     from lslam.pipeline.check import check_config
@@ -62,8 +63,9 @@ def command(sequence: str, **given: Any) -> None:
     config = _resolve(given)
     check_config(config)
     opened = open_sequence(
-        sequence, data_root=given["data_root"], vertical_correction_deg=config.input.vertical_correction_deg
-    )
+        sequence, data_root=given["data_root"], vertical_correction_deg=config.input.vertical_correction_deg,
+        **options.reading_of(given),
+    )  # fmt: skip
     truth = read_truth(given["gt"], opened)
     out = given["out"] or default_folder(opened.name, config.odometry.method)
     if given["dry_run"]:

@@ -33,6 +33,7 @@ class SequenceInfo:
     per_point : folder of `<scan>.npz` with `t` (float32 s since scan start) and `ring` (uint16)
     stamps, imu, gnss, ground_truth : files, relative to the sequence folder
     ground_truth_frame : the body whose poses `ground_truth` holds, one of `FRAMES`
+    lidar_topic, imu_topic, gnss_topic : which topics of a bag are read
     T_cam0_lidar, T_lidar_imu, T_lidar_gnss : (4, 4) extrinsics, written in the table `[extrinsics]`
     """
 
@@ -51,6 +52,9 @@ class SequenceInfo:
     gnss: str | None = None
     ground_truth: str | None = None
     ground_truth_frame: str | None = None
+    lidar_topic: str | None = None
+    imu_topic: str | None = None
+    gnss_topic: str | None = None
     T_cam0_lidar: Matrix | None = None
     T_lidar_imu: Matrix | None = None
     T_lidar_gnss: Matrix | None = None
@@ -67,8 +71,17 @@ def read_sequence_toml(path: Path) -> SequenceInfo:
     Raises InputError naming the file, the key and the nearest known key or the values allowed.
     """
     try:
-        tree = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path} cannot be read as TOML: {error}") from None
+    return parse_sequence_toml(text, path)
+
+
+def parse_sequence_toml(text: str, path: Path | str) -> SequenceInfo:
+    """The same from text that was found at `path`."""
+    try:
+        tree = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
         raise InputError(f"{path} cannot be read as TOML: {error}") from None
     extrinsics = tree.pop("extrinsics", {})
     if not isinstance(extrinsics, dict):
@@ -89,6 +102,12 @@ def read_sequence_toml(path: Path) -> SequenceInfo:
 
 def write_sequence_toml(path: Path, info: SequenceInfo) -> None:
     """Write `info` to `path` atomically, leaving out what is None; it reads back equal."""
+    with atomic_write(path) as stream:
+        stream.write(sequence_toml_text(info).encode())
+
+
+def sequence_toml_text(info: SequenceInfo) -> str:
+    """`info` as TOML, without what is None."""
     import tomli_w
 
     tree = {f.name: getattr(info, f.name) for f in fields(info) if f.name not in EXTRINSICS}
@@ -97,8 +116,7 @@ def write_sequence_toml(path: Path, info: SequenceInfo) -> None:
     matrices = {key: np.asarray(T, np.float64).tolist() for key, T in known.items() if T is not None}
     if matrices:
         tree["extrinsics"] = matrices
-    with atomic_write(path) as stream:
-        stream.write(tomli_w.dumps(tree).encode())
+    return tomli_w.dumps(tree)
 
 
 def _is_text(value: Any) -> bool:
@@ -128,18 +146,21 @@ _CHECKS: dict[str, tuple[Callable[[Any], bool], str]] = {
     "imu": (_is_text, "a file"),
     "gnss": (_is_text, "a file"),
     "ground_truth": (_is_text, "a file"),
+    "lidar_topic": (_is_text, "a topic"),
+    "imu_topic": (_is_text, "a topic"),
+    "gnss_topic": (_is_text, "a topic"),
     "ground_truth_frame": (lambda v: v in FRAMES, "one of " + ", ".join(FRAMES)),
 }
 
 
-def _checked(path: Path, key: str, value: Any) -> Any:
+def _checked(path: Path | str, key: str, value: Any) -> Any:
     check, expected = _CHECKS[key]
     if not check(value):
         raise InputError(f"{path}: {key} = {value!r}, expected {expected}")
     return float(value) if key in ("rate_hz", "vertical_correction_deg") else value
 
 
-def _transform(path: Path, key: str, value: Any) -> Matrix:
+def _transform(path: Path | str, key: str, value: Any) -> Matrix:
     """3x4 or 4x4 rows, or the same numbers in one list, to a checked (4, 4) transform."""
     try:
         numbers = np.asarray(value, np.float64).ravel()

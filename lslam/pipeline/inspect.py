@@ -169,8 +169,11 @@ def _imu(sequence: Sequence, problems: list[str]) -> Facts | None:
     gaps = int((steps > 0.1 + 0.5 * float(np.median(steps))).sum()) if len(steps) else 0
     if gaps:
         problems.append(f"IMU: {gaps} gaps, the longest {steps.max():.3f} s")
-    if imu.stamps_ns[0] > sequence.stamps_ns[-1] or imu.stamps_ns[-1] < sequence.stamps_ns[0]:
-        problems.append("IMU: it shares no time with the scans")
+    apart = "IMU: it shares no time with the scans"
+    if apart not in problems and (
+        imu.stamps_ns[0] > sequence.stamps_ns[-1] or imu.stamps_ns[-1] < sequence.stamps_ns[0]
+    ):
+        problems.append(apart)
     median_step = float(np.median(steps)) if len(steps) else 0.0
     return {
         "samples": len(imu),

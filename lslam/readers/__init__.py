@@ -9,6 +9,7 @@ from typing import Any
 
 from lslam.errors import InputError, UsageError
 from lslam.formats.sequence_toml import SequenceInfo
+from lslam.formats.transform_text import read_transform
 from lslam.readers.lookup import find_folder
 from lslam.readers.selection import select
 from lslam.types.sequence import Sequence
@@ -17,6 +18,7 @@ __all__ = ["READERS", "open_sequence", "select"]
 
 # Tried in this order: a KITTI layout is also a folder with scans somewhere in it.
 READERS = {
+    "bag": "lslam.readers.bag",
     "kitti-odometry": "lslam.readers.kitti_odometry",
     "kitti-raw": "lslam.readers.kitti_raw",
     "scan-folder": "lslam.readers.scan_folder",
@@ -32,17 +34,23 @@ def open_sequence(
     rate_hz: float | None = None,
     motion_compensated: bool | None = None,
     vertical_correction_deg: float | None = None,
+    lidar_topic: str | None = None,
+    imu_topic: str | None = None,
+    gnss_topic: str | None = None,
+    extrinsics: str | None = None,
 ) -> Sequence:
     """Open a recorded sequence without reading its scans.
 
     Parameters
     ----------
-    name_or_path : a folder, or a name looked up under `data_root` (or LSLAM_DATA): `seq07`, `07`, a raw drive
+    name_or_path : a folder, a bag, or a name looked up under `data_root` (or LSLAM_DATA): `seq07`, `07`, a raw drive
     rows, cols : organised clouds: point r * cols + c is of ring r
     rate_hz : nominal scan rate, where stamps are missing
     motion_compensated : whether scans are free of motion distortion
     vertical_correction_deg : rotation of every point about p x z; None leaves it to the reader
-        These five win over `sequence.toml`, which wins over what the layout implies.
+    lidar_topic, imu_topic, gnss_topic : which topics of a bag are read, where it has several
+    extrinsics : T_lidar_imu, as numbers or a file (see `transform_text`)
+        What is given wins over `sequence.toml`, which wins over what the layout implies.
 
     Raises
     ------
@@ -58,13 +66,22 @@ def open_sequence(
         rate_hz=rate_hz,
         motion_compensated=motion_compensated,
         vertical_correction_deg=vertical_correction_deg,
+        T_lidar_imu=None if extrinsics is None else read_transform(extrinsics),
+        lidar_topic=lidar_topic,
+        imu_topic=imu_topic,
+        gnss_topic=gnss_topic,
     )
     # Absolute, but links kept: `sequences/07` may be one, and its poses lie beside the link.
     folder = Path(os.path.abspath(find_folder(name_or_path, data_root)))
     try:
-        return _open(folder, overrides)
+        sequence = _open(folder, overrides)
     except OSError as error:
         raise InputError(f"{error.filename or folder} cannot be read: {error.strerror or error}") from None
+    flags = {"--lidar-topic": lidar_topic, "--imu-topic": imu_topic, "--gnss-topic": gnss_topic}
+    given = [flag for flag, topic in flags.items() if topic is not None]
+    if given and sequence.kind != "bag":
+        raise UsageError(f"{', '.join(given)} is for bags: {folder} is {sequence.kind}")
+    return sequence
 
 
 def _open(folder: Path, overrides: SequenceInfo) -> Sequence:
@@ -83,6 +100,6 @@ def _nothing_in(folder: Path) -> str:
         return f"{folder} is empty: there is no sequence in it"
     shown = ", ".join(inside[:8]) + (", ..." if len(inside) > 8 else "")
     return (
-        f"{folder} holds no scans: looked for velodyne/, sequences/, velodyne_points/ and *.bin, *.pcd, *.ply, *.npy "
+        f"{folder} holds no scans: looked for velodyne/, sequences/, velodyne_points/, bags and *.bin, *.pcd, *.ply, *.npy "
         f"here and in data/, found {shown}"
     )

@@ -8,6 +8,7 @@ import re
 from pathlib import Path
 
 from lslam.errors import InputError
+from lslam.formats.bag_files import SUFFIXES, list_bag_files
 
 _SEQUENCE = re.compile(r"(?:.*/)?(?:seq)?(\d{1,2})$")
 _DRIVE_NAME = re.compile(r"(?:(?P<date>\d{4}_\d\d_\d\d)_)?(?:drive_)?(?P<number>\d{4})(?P<kind>_sync|_extract)?$")
@@ -16,18 +17,19 @@ _ROOTS = ("", "dataset", "kitti", "kitti/dataset", "raw", "kitti_raw", "kitti/ra
 
 
 def find_folder(name_or_path: str | Path, data_root: Path | None = None) -> Path:
-    """The folder of a sequence: `name_or_path` itself when it exists, else the name looked up under `data_root`.
+    """The folder or bag of a sequence: `name_or_path` itself when it exists, else the name looked up under `data_root`.
 
     `data_root` is LSLAM_DATA when None. `seq07`, `07` and `kitti/07` find `sequences/07`; a drive is found by its name, by
     `drive_0005` or `0005` when only one has it. Raises InputError naming where it looked and names that are near.
     """
     text = str(name_or_path)
     path = Path(name_or_path).expanduser()
-    if path.is_dir():
+    if path.is_dir() or list_bag_files(path):
         return path
     if path.exists():
         raise InputError(
-            f"{path} is a file: give the folder of the sequence (a KITTI sequence, a raw drive, or its scans)"
+            f"{path} is a file: give a bag ({', '.join('*' + s for s in SUFFIXES)}) or the folder of the sequence (a KITTI "
+            "sequence, a raw drive, or its scans)"
         )
     if data_root is None and os.environ.get("LSLAM_DATA"):
         data_root = Path(os.environ["LSLAM_DATA"])
@@ -38,7 +40,7 @@ def find_folder(name_or_path: str | Path, data_root: Path | None = None) -> Path
     root = data_root.expanduser()
     if not root.is_dir():
         raise InputError(f"no sequence {text!r}: the data root {root} does not exist")
-    if (root / text).is_dir():
+    if (root / text).is_dir() or list_bag_files(root / text):
         return root / text
     found = _sequences(root, text) or _drives(root, text)
     if len(found) == 1:

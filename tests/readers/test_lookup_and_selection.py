@@ -43,7 +43,7 @@ def test_ambiguous_and_unknown_names(tmp_path: Path, monkeypatch: pytest.MonkeyP
     monkeypatch.delenv("LSLAM_DATA", raising=False)
     with pytest.raises(InputError, match="--data-root or LSLAM_DATA"):
         find_folder("seq07")
-    file = tmp_path / "a.bag"
+    file = tmp_path / "a.pcd"
     file.write_bytes(b"")
     with pytest.raises(InputError, match="is a file"):
         find_folder(file)

@@ -1,0 +1,176 @@
+"""Recordings read piece by piece: the index of a topic, and the chunks that ROS 1 bags and MCAP files keep messages in."""
+
+from __future__ import annotations
+
+import bz2
+import os
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+from zlib import crc32
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.errors import InputError
+
+_BLOCK = 1 << 18  # compressed bytes read at a time when only the beginning of a chunk is wanted
+IN_FILE = -1  # chunk number of a message that lies in the file itself
+
+Pairs = NDArray[np.int64]
+
+
+class CutOffError(Exception):
+    """The file ends where there should be more of it."""
+
+
+@dataclass(frozen=True)
+class Chunk:
+    """A run of records within a file.
+
+    position, size : of its bytes in the file; length : of its records, once decompressed
+    compression : empty, bz2, lz4 or zstd; crc : of the records, 0 when there is none
+    """
+
+    position: int
+    size: int
+    length: int
+    compression: str = ""
+    crc: int = 0
+
+
+@dataclass
+class Topic:
+    """One topic of one file.
+
+    type : as ROS 2 writes it, `sensor_msgs/msg/Imu`; empty when the file does not say
+    encoding : how messages are serialised, `cdr` or `ros1`
+    stamps_ns : (N,) int64, when they were recorded; where : (N, 2) int64, chunk number and offset, or row number
+    """
+
+    name: str
+    type: str
+    encoding: str
+    stamps_ns: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+    where: Pairs = field(default_factory=lambda: np.zeros((0, 2), np.int64))
+
+    def __len__(self) -> int:
+        return len(self.stamps_ns)
+
+
+class ChunkFile:
+    """Random access to a file and to its chunks, from any thread; one decompressed chunk is kept."""
+
+    def __init__(self, path: Path) -> None:
+        try:
+            self._file = path.open("rb")
+        except OSError as error:
+            raise InputError(f"{path} cannot be read: {error.strerror or error}") from None
+        self.path = path
+        self.size = os.fstat(self._file.fileno()).st_size
+        self._kept: tuple[int, bytes] = (-1, b"")
+
+    def read(self, position: int, size: int) -> bytes:
+        """`size` bytes from `position`. Raises CutOffError when the file ends before."""
+        if size < 0 or position + size > self.size:
+            raise CutOffError
+        data = os.pread(self._file.fileno(), size, position)
+        while len(data) < size:  # a signal, or more than the 2 GB one call reads
+            more = os.pread(self._file.fileno(), size - len(data), position + len(data))
+            if not more:
+                raise CutOffError
+            data += more
+        return data
+
+    def part(self, chunk: Chunk | None, offset: int, size: int) -> bytes:
+        """At most `size` bytes of the records of `chunk` from `offset`; None is the file itself.
+
+        Raises InputError when the chunk cannot be decompressed.
+        """
+        if chunk is None:
+            return self.read(offset, max(min(size, self.size - offset), 0))
+        if not chunk.compression:
+            return self.read(chunk.position + offset, max(min(size, chunk.length - offset), 0))
+        return self._unpacked(chunk, min(offset + size, chunk.length))[offset : offset + size]
+
+    def _unpacked(self, chunk: Chunk, least: int) -> bytes:
+        """The records of a chunk, `least` bytes of them at the least: headers alone need only the beginning."""
+        kept, records = self._kept
+        if kept == chunk.position and len(records) >= least:
+            return records
+        try:
+            records = self._unpack_beginning(chunk, least) if least < chunk.length // 2 else self._unpack(chunk)
+        except _damage() as error:
+            raise InputError(
+                f"{self.path}: the chunk at byte {chunk.position} is damaged and its messages are lost: {error}"
+            ) from None
+        self._kept = (chunk.position, records)
+        return records
+
+    def _unpack(self, chunk: Chunk) -> bytes:
+        records: bytes = _codec(chunk.compression).decompress(self.read(chunk.position, chunk.size))
+        if len(records) != chunk.length or (chunk.crc and crc32(records) != chunk.crc):
+            raise ValueError("its length or its checksum is not what the file says")
+        return records
+
+    def _unpack_beginning(self, chunk: Chunk, least: int) -> bytes:
+        engine = _codec(chunk.compression).start()
+        records, used = bytearray(), 0
+        while len(records) < least and not engine.eof:
+            data = b""
+            if engine.needs_input:
+                if used == chunk.size:
+                    raise EOFError("it ends too early")
+                data = self.read(chunk.position + used, min(_BLOCK, chunk.size - used))
+                used += len(data)
+            records += engine.decompress(data, max_length=least - len(records))
+        return bytes(records)
+
+
+@dataclass(frozen=True)
+class _Codec:
+    decompress: Callable[[bytes], Any]
+    start: Callable[[], Any]
+
+
+def check_compression(path: Path, name: str) -> None:
+    """Raise InputError for a compression lslam does not know."""
+    if name not in ("", "bz2", "lz4", "zstd"):
+        raise InputError(f"{path}: compression {name!r} of its chunks is not known: bz2, lz4 and zstd are")
+
+
+def _codec(name: str) -> _Codec:
+    if name == "bz2":
+        return _Codec(bz2.decompress, bz2.BZ2Decompressor)
+    if name == "lz4":
+        import lz4.frame
+
+        return _Codec(lz4.frame.decompress, lz4.frame.LZ4FrameDecompressor)
+    from backports import zstd
+
+    return _Codec(zstd.decompress, zstd.ZstdDecompressor)
+
+
+def _damage() -> tuple[type[Exception], ...]:
+    """What the decompressors raise."""
+    from backports import zstd
+
+    return (OSError, EOFError, ValueError, RuntimeError, zstd.ZstdError)
+
+
+def gather(topic: Topic, stamps: list[NDArray[np.int64]], where: list[Pairs]) -> None:
+    """Fill the index of `topic` from pieces, in the order the messages were recorded."""
+    if not stamps:
+        return
+    topic.stamps_ns, topic.where = np.concatenate(stamps), np.concatenate(where)
+    order = np.argsort(topic.stamps_ns, kind="stable")
+    topic.stamps_ns, topic.where = topic.stamps_ns[order], topic.where[order]
+
+
+def describe_loss(path: Path, position: int, size: int, what: str = "record") -> str:
+    """What a file lost that was cut off after `position` of its `size` bytes."""
+    return (
+        f"{path} is cut off: the last {size - position} of its {size} bytes ({(size - position) / size:.1%}) hold no whole "
+        f"{what} and are lost, everything before is read"
+    )

@@ -1,0 +1,276 @@
+"""Bags of ROS 1 and ROS 2, read and written without ROS. What rosbags knows of message types is used nowhere else.
+
+Reading goes through an index of our own: any message can be read at any time, the files are never loaded, and recordings that
+were cut off or never indexed are read as far as they are whole.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import shutil
+import struct
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
+from types import TracebackType
+from typing import Any, NamedTuple, Protocol
+
+from lslam.errors import InputError, OutputError, UsageError
+from lslam.formats.bag_chunks import Topic
+from lslam.formats.bag_sqlite import SqliteBag
+from lslam.formats.mcap_records import McapFile
+from lslam.formats.ros1_records import Ros1Bag
+
+SUFFIXES = (".bag", ".mcap", ".db3")
+KINDS = ("bag", "mcap", "sqlite")
+_ENCODINGS = ("cdr", "ros1")
+_ZSTD = b"\x28\xb5\x2f\xfd"  # ROS 2 can compress every message by itself
+_TRANSFORMS = "tf2_msgs/msg/TFMessage"
+_OLD_NAMES = {"tf/msg/tfMessage": _TRANSFORMS}
+
+
+class Recording(Protocol):
+    """One file of a bag."""
+
+    path: Path
+    topics: list[Topic]
+    loss: str
+
+    def read(self, topic: Topic, k: int, limit: int | None = None) -> bytes:
+        """Message `k` of `topic`, its first `limit` bytes at the least when only these are wanted."""
+        ...
+
+
+READERS: dict[str, Callable[[Path], Recording]] = {
+    ".bag": Ros1Bag,
+    ".bag.active": Ros1Bag,
+    ".mcap": McapFile,
+    ".db3": SqliteBag,
+}
+
+
+@dataclass
+class BagTopic:
+    """One topic over all files of a bag; `encoding` is `cdr` or `ros1`."""
+
+    name: str
+    type: str
+    encoding: str
+    parts: list[tuple[Recording, Topic]] = field(default_factory=list)
+
+    def __len__(self) -> int:
+        return sum(len(topic) for _, topic in self.parts)
+
+
+class Header(NamedTuple):
+    """Beginning of a stamped message: its stamp (ns), its frame, where the rest begins, and the byte order, `<` or `>`."""
+
+    stamp_ns: int
+    frame: str
+    end: int
+    order: str
+
+
+class Bag:
+    """The files of one recording, as one bag; messages are read when they are asked for, from any thread."""
+
+    def __init__(self, path: Path, files: list[Path]) -> None:
+        self.path, self.files = path, files
+        recordings: list[Recording] = [READERS[_suffix(file)](file) for file in files]
+        self.losses = [recording.loss for recording in recordings if recording.loss]
+        topics: dict[tuple[str, str, str], BagTopic] = {}
+        for recording in recordings:
+            for topic in recording.topics:
+                kind = _OLD_NAMES.get(topic.type, topic.type)
+                key = (topic.name, kind, topic.encoding)
+                topics.setdefault(key, BagTopic(*key)).parts.append((recording, topic))
+        self.topics = sorted(topics.values(), key=lambda t: t.name)
+
+    def of_type(self, *names: str) -> list[BagTopic]:
+        """Topics with messages that lslam can decode, of the types whose names (`Imu`, `PointCloud2`) are given."""
+        return [t for t in self.topics if len(t) and t.encoding in _ENCODINGS and t.type.rsplit("/", 1)[-1] in names]
+
+    def recorded_ns(self, topic: BagTopic) -> list[int]:
+        """When each message of `topic` was recorded, ns."""
+        return [int(stamp) for _, part in topic.parts for stamp in part.stamps_ns]
+
+    def message(self, topic: BagTopic, k: int, limit: int | None = None) -> bytes:
+        """Message `k` of `topic` as it was serialised, or its first `limit` bytes at the least.
+
+        Raises InputError when it is damaged.
+        """
+        for recording, part in topic.parts:
+            if k < len(part):
+                data = recording.read(part, k, limit)
+                return _unpacked(recording, part, k) if data[:4] == _ZSTD else data
+            k -= len(part)
+        raise IndexError(k)
+
+    def messages(self, topic: BagTopic, broken: list[str]) -> Iterator[bytes]:
+        """All messages of `topic`; of those that are damaged the reason goes to `broken`."""
+        for k in range(len(topic)):
+            try:
+                yield self.message(topic, k)
+            except InputError as error:
+                broken.append(str(error))
+
+    def decode(self, topic: BagTopic, data: bytes) -> Any:
+        """A message as an object with the fields of its type. Raises InputError when it does not fit the type."""
+        from rosbags.serde import SerdeError
+
+        store = _store(topic.encoding)
+        try:
+            if topic.encoding == "ros1":
+                return store.deserialize_ros1(data, topic.type)
+            return store.deserialize_cdr(memoryview(data), topic.type)
+        except (SerdeError, KeyError, AssertionError) as error:
+            raise InputError(f"{self.path}: a message of {topic.name} is no {topic.type}: {error}") from None
+
+
+def list_bag_files(path: Path) -> list[Path]:
+    """The file itself, or the bag files of a folder in natural order; empty when there are none.
+
+    Raises InputError for a folder whose files are compressed as a whole.
+    """
+    if path.is_file():
+        return [path] if _suffix(path) else []
+    if not path.is_dir():
+        return []
+    files = [p for p in path.iterdir() if p.is_file() and not p.name.startswith(".")]
+    kinds = {_suffix(p) for p in files} - {""}
+    packed = [p for p in files if p.name.endswith((".mcap.zstd", ".db3.zstd"))]
+    if packed and not kinds:
+        raise InputError(
+            f"{packed[0]} is compressed as a whole: `zstd -d {packed[0].name}` in {path} makes it readable"
+        )
+    if not kinds:
+        return []
+    kind = max(kinds, key=lambda k: sum(_suffix(p) == k for p in files))
+    return sorted((p for p in files if _suffix(p) == kind), key=_natural)
+
+
+def open_bag(path: Path) -> Bag:
+    """Open a ROS 1 bag, an MCAP or SQLite file, or a folder of them. Raises InputError when there is none or it is unreadable."""
+    files = list_bag_files(path)
+    if not files:
+        raise InputError(f"{path} holds no bag: {', '.join('*' + s for s in READERS)} are read")
+    return Bag(path, files)
+
+
+def read_header(topic: BagTopic, data: bytes) -> Header:
+    """The header that begins messages of stamped types. Raises InputError when there is none."""
+    try:
+        if topic.encoding == "ros1":
+            _, seconds, nanoseconds, length = struct.unpack_from("<4I", data)
+            at, order = 16, "<"
+        else:
+            order = "<" if data[1] else ">"
+            seconds, nanoseconds, length = struct.unpack_from(order + "iII", data, 4)
+            at = 16
+        frame = data[at : at + length].split(b"\0", 1)[0].decode(errors="replace")
+    except (struct.error, IndexError):
+        raise InputError(f"a message of {topic.name} has no header: {len(data)} bytes") from None
+    return Header(seconds * 10**9 + nanoseconds, frame.lstrip("/"), at + length, order)
+
+
+class BagWriter:
+    """Writes a bag, whole or not at all: a ROS 1 `.bag`, or a ROS 2 folder, or a single file when `path` ends in .mcap or .db3.
+
+    Raises OutputError when it cannot be written, UsageError for a compression the kind does not have.
+    """
+
+    def __init__(self, path: Path, kind: str, is_zstd: bool = False) -> None:
+        if is_zstd and kind == "bag":
+            raise UsageError("--zstd is for mcap and sqlite: ROS 1 does not know it")
+        self.path, self.kind = path, kind
+        self.store = _store("ros1" if kind == "bag" else "cdr")
+        self._part = path.with_name(path.name + ".part")
+        self._connections: dict[str, Any] = {}
+        try:
+            shutil.rmtree(self._part, ignore_errors=True)
+            self._part.mkdir(parents=True)
+            self._writer = _writer(self._part / path.name, kind, is_zstd)
+        except OSError as error:
+            raise OutputError(f"{path} cannot be written: {error.strerror or error}") from None
+
+    def __enter__(self) -> BagWriter:
+        return self
+
+    def write(self, topic: str, stamp_ns: int, message: Any) -> None:
+        """Write a message, an object of `store.types`. Raises OutputError for a full disk or a time before 1970."""
+        if stamp_ns < 0:
+            raise OutputError(f"{self.path} cannot hold the time {stamp_ns} ns: times of bags begin in 1970")
+        kind = message.__msgtype__
+        try:
+            if topic not in self._connections:
+                self._connections[topic] = self._writer.add_connection(topic, kind, typestore=self.store)
+            serialise = self.store.serialize_ros1 if self.kind == "bag" else self.store.serialize_cdr
+            self._writer.write(self._connections[topic], stamp_ns, serialise(message, kind))
+        except OSError as error:
+            raise OutputError(f"{self.path} cannot be written: {error.strerror or error}") from None
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        try:
+            if kind is not None:
+                with contextlib.suppress(Exception):
+                    self._writer.abort()
+                return
+            self._writer.close()
+            made = self._part / self.path.name
+            if made.is_dir() and self.path.suffix in (".mcap", ".db3"):
+                made = next(p for p in made.iterdir() if p.suffix == self.path.suffix)
+            os.replace(made, self.path)
+        except OSError as failure:
+            raise OutputError(f"{self.path} cannot be written: {failure.strerror or failure}") from None
+        finally:
+            shutil.rmtree(self._part, ignore_errors=True)
+
+
+def _writer(path: Path, kind: str, is_zstd: bool) -> Any:
+    from rosbags.rosbag1 import Writer as Writer1
+    from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
+    from rosbags.rosbag2 import Writer as Writer2
+
+    writer: Any = Writer1(path)
+    if kind != "bag":
+        plugin = StoragePlugin.MCAP if kind == "mcap" else StoragePlugin.SQLITE3
+        writer = Writer2(path, version=9, storage_plugin=plugin)
+        if is_zstd:
+            mode = CompressionMode.STORAGE if kind == "mcap" else CompressionMode.MESSAGE
+            writer.set_compression(mode, CompressionFormat.ZSTD)
+    writer.open()
+    return writer
+
+
+@cache
+def _store(encoding: str) -> Any:
+    """The standard message types: their layout never changed, so what a bag says about them is not needed."""
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    store = get_typestore(Stores.ROS1_NOETIC if encoding == "ros1" else Stores.ROS2_HUMBLE)
+    if _TRANSFORMS not in store.types:
+        store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", _TRANSFORMS))
+    return store
+
+
+def _unpacked(recording: Recording, topic: Topic, k: int) -> bytes:
+    from backports import zstd
+
+    try:
+        return zstd.decompress(recording.read(topic, k))
+    except zstd.ZstdError as error:
+        raise InputError(f"{recording.path}: message {k} of {topic.name} is damaged: {error}") from None
+
+
+def _suffix(path: Path) -> str:
+    return next((s for s in READERS if path.name.lower().endswith(s)), "")
+
+
+def _natural(path: Path) -> list[tuple[int, str]]:
+    """Sort key with numbers compared as numbers: part_2 before part_10."""
+    return [(int(p), "") if p.isdigit() else (-1, p) for p in re.split(r"(\d+)", path.name)]

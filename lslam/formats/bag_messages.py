@@ -1,0 +1,130 @@
+"""Arrays to messages: what `BagWriter` is given. `store` is the writer's own, with the message types of its ROS."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.formats.pointcloud2 import encode_fields
+from lslam.geometry import so3
+from lslam.types.scan import Scan
+
+Floats = NDArray[np.float64]
+
+_UNKNOWN = np.r_[-1.0, np.zeros(8)]  # sensor_msgs/Imu: a first covariance of -1 means that there is no such reading
+_DIAGONAL_KNOWN, _NO_COVARIANCE = 2, 0  # sensor_msgs/NavSatFix
+
+
+def cloud(store: Any, scan: Scan, frame: str) -> Any:
+    """PointCloud2 of a scan: x, y, z, and as far as they are known intensity, ring and `time`, s since the header's stamp."""
+    columns: dict[str, NDArray[Any]] = {axis: scan.points[:, k] for k, axis in enumerate("xyz")}
+    optional = {"intensity": scan.intensity, "ring": scan.rings, "time": scan.times}
+    columns |= {name: values for name, values in optional.items() if values is not None}
+    fields, step, data = encode_fields(columns)
+    field = store.types["sensor_msgs/msg/PointField"]
+    return store.types["sensor_msgs/msg/PointCloud2"](
+        header=header(store, scan.stamp_ns, frame, scan.index),
+        height=1,
+        width=len(scan),
+        fields=[field(name=name, offset=offset, datatype=code, count=1) for name, offset, code in fields],
+        is_bigendian=False,
+        point_step=step,
+        row_step=step * len(scan),
+        data=data,
+        is_dense=bool(np.isfinite(scan.points).all()),
+    )
+
+
+def imu(store: Any, stamp_ns: int, accel: Floats, gyro: Floats, frame: str) -> Any:
+    """Imu: specific force (3,), m/s2, and angular rate (3,), rad/s; no orientation."""
+    return store.types["sensor_msgs/msg/Imu"](
+        header=header(store, stamp_ns, frame),
+        orientation=_quaternion(store, [0, 0, 0, 1]),
+        orientation_covariance=_UNKNOWN,
+        angular_velocity=_vector(store, gyro),
+        angular_velocity_covariance=np.zeros(9),
+        linear_acceleration=_vector(store, accel),
+        linear_acceleration_covariance=np.zeros(9),
+    )
+
+
+def fix(store: Any, stamp_ns: int, lat_lon_alt: Floats, sigma: float, frame: str) -> Any:
+    """NavSatFix: latitude, longitude (deg) and height (m), with a one-sigma error, m, NaN when it is unknown."""
+    is_known = bool(np.isfinite(sigma))
+    latitude, longitude, altitude = (float(v) for v in lat_lon_alt)
+    return store.types["sensor_msgs/msg/NavSatFix"](
+        header=header(store, stamp_ns, frame),
+        status=store.types["sensor_msgs/msg/NavSatStatus"](status=0, service=1),
+        latitude=latitude,
+        longitude=longitude,
+        altitude=altitude,
+        position_covariance=np.eye(3).ravel() * (sigma**2 if is_known else 0.0),
+        position_covariance_type=_DIAGONAL_KNOWN if is_known else _NO_COVARIANCE,
+    )
+
+
+def odometry(store: Any, stamp_ns: int, T_world_body: Floats, frame: str, body: str) -> Any:
+    """Odometry: a pose (4, 4) of `body` in `frame`, without velocity."""
+    types = store.types
+    pose = types["geometry_msgs/msg/Pose"](
+        position=types["geometry_msgs/msg/Point"](**_xyz(T_world_body[:3, 3])),
+        orientation=_rotation(store, T_world_body),
+    )
+    zero = types["geometry_msgs/msg/Twist"](linear=_vector(store, np.zeros(3)), angular=_vector(store, np.zeros(3)))
+    return types["nav_msgs/msg/Odometry"](
+        header=header(store, stamp_ns, frame),
+        child_frame_id=body,
+        pose=types["geometry_msgs/msg/PoseWithCovariance"](pose=pose, covariance=np.zeros(36)),
+        twist=types["geometry_msgs/msg/TwistWithCovariance"](twist=zero, covariance=np.zeros(36)),
+    )
+
+
+def static_transforms(store: Any, stamp_ns: int, transforms: Mapping[tuple[str, str], Floats]) -> Any:
+    """TFMessage of `T_parent_child` (4, 4) by (parent, child)."""
+    types = store.types
+    return types["tf2_msgs/msg/TFMessage"](
+        transforms=[
+            types["geometry_msgs/msg/TransformStamped"](
+                header=header(store, stamp_ns, parent),
+                child_frame_id=child,
+                transform=types["geometry_msgs/msg/Transform"](
+                    translation=_vector(store, T[:3, 3]), rotation=_rotation(store, T)
+                ),
+            )
+            for (parent, child), T in transforms.items()
+        ]
+    )
+
+
+def text(store: Any, words: str) -> Any:
+    """String."""
+    return store.types["std_msgs/msg/String"](data=words)
+
+
+def header(store: Any, stamp_ns: int, frame: str, number: int = 0) -> Any:
+    """Header with a stamp, a frame and, in ROS 1, a number."""
+    kind = store.types["std_msgs/msg/Header"]
+    seconds, nanoseconds = divmod(int(stamp_ns), 10**9)
+    stamp = store.types["builtin_interfaces/msg/Time"](sec=seconds, nanosec=nanoseconds)
+    counted = {"seq": number} if "seq" in kind.__dataclass_fields__ else {}
+    return kind(stamp=stamp, frame_id=frame, **counted)
+
+
+def _vector(store: Any, v: Floats) -> Any:
+    return store.types["geometry_msgs/msg/Vector3"](**_xyz(v))
+
+
+def _xyz(v: Floats) -> dict[str, float]:
+    return dict(zip("xyz", (float(c) for c in v), strict=True))
+
+
+def _rotation(store: Any, T: Floats) -> Any:
+    return _quaternion(store, so3.to_quaternion(T[:3, :3]).tolist())
+
+
+def _quaternion(store: Any, q: list[float]) -> Any:
+    x, y, z, w = (float(v) for v in q)
+    return store.types["geometry_msgs/msg/Quaternion"](x=x, y=y, z=z, w=w)

@@ -1,0 +1,70 @@
+"""ROS 2 bags in SQLite (`.db3`), every version of their tables; messages are read by row, one at a time."""
+
+from __future__ import annotations
+
+import sqlite3
+import threading
+from pathlib import Path
+from urllib.parse import quote
+
+import numpy as np
+
+from lslam.errors import InputError
+from lslam.formats.bag_chunks import Topic
+
+_TABLES = {"topics", "messages"}
+
+
+class SqliteBag:
+    """One `.db3` file: `topics`, and `loss`, a sentence when it was cut off."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.loss = ""
+        self._lock = threading.Lock()
+        try:
+            # Nothing is written beside the file, neither a lock nor a journal.
+            self._db = sqlite3.connect(
+                f"file:{quote(str(path.resolve()))}?immutable=1", uri=True, check_same_thread=False
+            )
+            names = {name for (name,) in self._db.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
+            if not names >= _TABLES:
+                raise InputError(f"{path} is no ROS 2 bag: its tables are {', '.join(sorted(names)) or 'none'}")
+            rows = self._db.execute("SELECT id, name, type, serialization_format FROM topics ORDER BY id").fetchall()
+        except sqlite3.Error as error:
+            raise InputError(f"{path} cannot be read as a ROS 2 bag in SQLite: {error}") from None
+        self._topics = {number: Topic(name, kind, encoding) for number, name, kind, encoding in rows}
+        self._index()
+        self.topics = list(self._topics.values())
+        if path.with_name(path.name + "-wal").is_file():
+            self.loss = self.loss or f"{path}-wal holds messages that were never merged: `ros2 bag reindex` does that"
+
+    def read(self, topic: Topic, k: int, limit: int | None = None) -> bytes:
+        """Message `k` of `topic`, its first `limit` bytes at the least when only these are wanted."""
+        row = int(topic.where[k, 0])
+        try:
+            with self._lock, self._db.blobopen("messages", "data", row, readonly=True) as blob:
+                return blob.read(-1 if limit is None else limit)
+        except sqlite3.Error as error:
+            raise InputError(f"{self.path}: message {k} of {topic.name} is damaged: {error}") from None
+
+    def _index(self) -> None:
+        """Stamps and rows of all messages; the data itself stays on disk."""
+        found: dict[int, list[tuple[int, int]]] = {number: [] for number in self._topics}
+        try:
+            for row, topic, stamp in self._db.execute("SELECT id, topic_id, timestamp FROM messages ORDER BY id"):
+                if topic in found:
+                    found[topic].append((stamp, row))
+        except sqlite3.Error as error:
+            size = self.path.stat().st_size
+            (stated,) = self._db.execute(
+                "SELECT page_count * page_size FROM pragma_page_count, pragma_page_size"
+            ).fetchone()
+            self.loss = (
+                f"{self.path} is cut off or damaged ({error}): it has {size} of {max(stated, size)} bytes; the "
+                f"{sum(map(len, found.values()))} messages up to there are read"
+            )
+        for number, entries in found.items():
+            table = np.array(sorted(entries), np.int64).reshape(-1, 2)
+            self._topics[number].stamps_ns = table[:, 0].copy()
+            self._topics[number].where = np.column_stack([table[:, 1], np.zeros(len(table), np.int64)])

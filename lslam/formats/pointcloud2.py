@@ -1,0 +1,111 @@
+"""Clouds in messages, `sensor_msgs/PointCloud2` and Livox's `CustomMsg`, as arrays: no loop over points."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.errors import InputError
+from lslam.formats.point_cloud import RING_NAMES, PointCloud, cloud_from_fields
+
+# sensor_msgs/PointField
+_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
+_CODES = {np.dtype(name): code for code, name in _TYPES.items()}
+_LIVOX = {
+    "names": ["offset_time", "x", "y", "z", "reflectivity", "tag", "line"],
+    "formats": ["u4", "f4", "f4", "f4", "u1", "u1", "u1"],
+    "offsets": [0, 4, 8, 12, 16, 17, 18],
+}
+_LIVOX_BYTES = 19
+
+
+def decode_pointcloud2(message: Any, where: Path) -> PointCloud:
+    """Points of a PointCloud2, those that are not finite left out together with their time and ring.
+
+    Rows may be padded and numbers big-endian. An organised cloud without a ring field gets its rows (its columns, where there
+    are fewer of them) as rings. Raises InputError naming `where` when fields and data contradict each other.
+    """
+    height, width, step = int(message.height), int(message.width), int(message.point_step)
+    if not height * width:
+        return PointCloud(np.zeros((0, 3), np.float32))
+    dtype = _dtype(message, where)
+    row_step = max(int(message.row_step), width * step) if height > 1 else width * step
+    needed = (height - 1) * row_step + width * step
+    if len(message.data) < needed:
+        raise InputError(
+            f"{where}: a cloud of {height} x {width} points of {step} bytes needs {needed} bytes and has {len(message.data)}"
+        )
+    table = np.ndarray((height, width), dtype, np.ascontiguousarray(message.data).data, 0, (row_step, step)).reshape(-1)
+    columns: dict[str, NDArray[Any]] = {name: _native(table[name]) for name in dtype.names or ()}
+    if height > 1 and not any(name.lower() in RING_NAMES for name in columns):
+        rows, cols = np.divmod(np.arange(height * width), width)
+        columns["ring"] = (rows if height <= width else cols).astype(np.uint16)
+    return _finite(cloud_from_fields(where, columns))
+
+
+def decode_livox(data: bytes, start: int, is_ros1: bool, order: str, where: Path) -> tuple[PointCloud, int]:
+    """Points of a Livox CustomMsg whose header ends at `start`, and its `timebase`, ns. Raises InputError when it is cut."""
+    origin = 0 if is_ros1 else 4  # numbers of CDR are aligned from behind its first four bytes
+    at = start if is_ros1 else origin + -(-(start - origin) // 8) * 8
+    try:
+        timebase = int(np.frombuffer(data, f"{order}u8", 1, at)[0])
+        count = int(np.frombuffer(data, f"{order}u4", 1, at + 16)[0])
+        stride = _LIVOX_BYTES if is_ros1 else _LIVOX_BYTES + 1
+        dtype = np.dtype({**_LIVOX, "itemsize": stride}).newbyteorder(order)  # type: ignore[call-overload]
+        padded = data[at + 20 :] + bytes(stride - _LIVOX_BYTES)  # behind the last point there is no padding
+        table = np.frombuffer(padded, dtype, count)
+    except ValueError:
+        raise InputError(f"{where}: a Livox message of {len(data)} bytes is cut off") from None
+    columns = {name: _native(table[name]) for name in ("x", "y", "z", "offset_time", "line")}
+    columns["intensity"] = table["reflectivity"].astype(np.float32)
+    return _finite(cloud_from_fields(where, columns)), timebase
+
+
+def encode_fields(columns: Mapping[str, NDArray[Any]]) -> tuple[list[tuple[str, int, int]], int, NDArray[np.uint8]]:
+    """Fields as (name, offset, type code), bytes per point and the data of a PointCloud2 with these columns, packed."""
+    dtype = np.dtype([(name, values.dtype.newbyteorder("<")) for name, values in columns.items()])
+    table = np.empty(len(next(iter(columns.values()))), dtype)
+    for name, values in columns.items():
+        table[name] = values
+    assert dtype.fields is not None
+    fields = [(name, int(dtype.fields[name][1]), _CODES[values.dtype]) for name, values in columns.items()]
+    return fields, dtype.itemsize, table.view(np.uint8).reshape(-1)
+
+
+def _dtype(message: Any, where: Path) -> np.dtype[Any]:
+    order = ">" if message.is_bigendian else "<"
+    known = [f for f in message.fields if f.datatype in _TYPES]
+    step = int(message.point_step)
+    wrong = [f.name for f in known if f.offset + np.dtype(_TYPES[f.datatype]).itemsize > step]
+    if wrong:
+        raise InputError(f"{where}: field {wrong[0]!r} of the cloud lies beyond its {step} bytes per point")
+    unique = {f.name: f for f in known}
+    return np.dtype(
+        {
+            "names": list(unique),
+            "formats": [order + _TYPES[f.datatype] for f in unique.values()],
+            "offsets": [int(f.offset) for f in unique.values()],
+            "itemsize": step,
+        }
+    )
+
+
+def _native(values: NDArray[Any]) -> NDArray[Any]:
+    return values.astype(values.dtype.newbyteorder("="), copy=False)
+
+
+def _finite(cloud: PointCloud) -> PointCloud:
+    good = np.isfinite(cloud.points).all(axis=1)
+    if good.all():
+        return cloud
+    return PointCloud(
+        cloud.points[good],
+        None if cloud.intensity is None else cloud.intensity[good],
+        None if cloud.rings is None else cloud.rings[good],
+        None if cloud.times is None else cloud.times[good],
+        cloud.time_field,
+    )

@@ -1,0 +1,178 @@
+"""Bags of ROS 1 and ROS 2 as sequences: topics chosen, stamps put in order, extrinsics found; scans are read one at a time."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.errors import InputError
+from lslam.formats import bag_streams
+from lslam.formats.bag_files import Bag, BagTopic, list_bag_files, open_bag, read_header
+from lslam.formats.point_cloud import TIME_NAMES, PointCloud
+from lslam.formats.pointcloud2 import decode_livox, decode_pointcloud2
+from lslam.formats.sequence_toml import FILE_NAME, SequenceInfo, parse_sequence_toml, read_sequence_toml
+from lslam.readers.bag_extrinsics import find_extrinsics, find_truth
+from lslam.readers.bag_topics import choose_clouds, index_scans, load_fixes, load_imu
+from lslam.readers.ground_truth import Voice
+from lslam.readers.point_times import TimeRule, apply_rule, decide_rule
+from lslam.readers.sidecars import compensation_note
+from lslam.readers.stamps import measured_rate
+from lslam.types.calibration import Calibration
+from lslam.types.gnss import GnssStream
+from lslam.types.imu import ImuStream
+from lslam.types.scan import Scan
+from lslam.types.trajectory import Trajectory
+
+KIND = "bag"
+# Where lslam's own bags keep what else is known of a sequence, as `sequence.toml`.
+INFO_TOPIC = "/lslam/sequence"
+_LAYOUTS = ("velodyne", "velodyne_points", "sequences")
+_LOOKED_AT = 5
+
+
+@dataclass
+class BagSequence:
+    """A `Sequence` over a bag. See `lslam.types.sequence` for the attributes every sequence has.
+
+    messages : (N,) int64, which message of `topic` each scan is; headers_ns : (N,) int64, stamps of their headers
+    time_rule : how per-point times are understood, None when there are none or they are not to be used
+    """
+
+    name: str
+    path: Path
+    bag: Bag
+    topic: BagTopic
+    messages: NDArray[np.int64]
+    headers_ns: NDArray[np.int64]
+    stamps_ns: NDArray[np.int64]
+    rate_hz: float
+    kind: str = KIND
+    motion_compensated: bool | None = None
+    calibration: Calibration = field(default_factory=Calibration)
+    ground_truth: Trajectory | None = None
+    imu: ImuStream | None = None
+    gnss: GnssStream | None = None
+    notes: list[str] = field(default_factory=list)
+    problems: list[str] = field(default_factory=list)
+    time_rule: TimeRule | None = None
+    rings: int | None = None
+    sensor: str | None = None
+
+    def __len__(self) -> int:
+        return len(self.messages)
+
+    def scan(self, index: int) -> Scan:
+        """Read scan `index`; a cloud without points gives an empty scan.
+
+        Raises InputError naming bag, topic and message when it is damaged, IndexError beyond the end.
+        """
+        if not 0 <= index < len(self.messages):
+            raise IndexError(f"scan {index} of {len(self.messages)}")
+        stamp = int(self.headers_ns[index])
+        cloud, shift = self.cloud(index)
+        stamp += shift
+        times: NDArray[np.float32] | None = None
+        if self.time_rule is not None and cloud.times is not None:
+            times, shift = apply_rule(self.time_rule, cloud.times, stamp)
+            stamp += shift
+        return Scan(cloud.points, stamp, index, cloud.intensity, times, cloud.rings)
+
+    def cloud(self, index: int) -> tuple[PointCloud, int]:
+        """The points of scan `index` as the message holds them, and ns from its header's stamp to the base of their times."""
+        k = int(self.messages[index])
+        where = Path(f"{self.path}, {self.topic.name}, message {k}")
+        data = self.bag.message(self.topic, k)
+        if not self.topic.type.endswith("CustomMsg"):
+            return decode_pointcloud2(self.bag.decode(self.topic, data), where), 0
+        header = read_header(self.topic, data)
+        cloud, timebase = decode_livox(data, header.end, self.topic.encoding == "ros1", header.order, where)
+        shift = timebase - header.stamp_ns
+        return cloud, shift if abs(shift) < 10**9 else 0
+
+
+def locate(path: Path) -> tuple[Path, str] | None:
+    """The bag at or in `path` and why it is one; None when there is none, or when it lies in one of KITTI's layouts."""
+    if path.is_dir() and any((path / name).is_dir() for name in _LAYOUTS):
+        return None
+    files = list_bag_files(path)
+    if not files:
+        return None
+    if path.is_file():
+        return path, f"{path.name} is a bag"
+    return path, f"it holds {len(files)} bag file{'s' if len(files) > 1 else ''}, {files[0].name} first"
+
+
+def open_folder(path: Path, overrides: SequenceInfo, why: str) -> BagSequence:
+    """Open the bag file, or the folder of them, at `path`.
+
+    Raises InputError when it is unreadable or holds no clouds, UsageError for topics that are ambiguous or do not exist.
+    """
+    bag = open_bag(path)
+    info = _info(path, bag, overrides)
+    voice = Voice([f"format {KIND}: {why}", *compensation_note(info)], list(bag.losses))
+    topic = choose_clouds(bag, info.lidar_topic)
+    voice.notes.append(f"scans from {topic.name} ({topic.type}, {len(topic)} messages)")
+    messages, stamps, frame = index_scans(bag, topic, voice)
+    rate = info.rate_hz or measured_rate(stamps)
+    sequence = BagSequence(
+        info.name or re.sub(r"\.(bag|mcap|db3|bag\.active)$", "", path.name), path, bag, topic, messages, stamps, stamps, rate,
+        motion_compensated=info.motion_compensated, rings=info.rings, sensor=info.sensor,
+        notes=voice.notes, problems=voice.problems,
+    )  # fmt: skip
+    if not info.motion_compensated:
+        _decide_times(sequence)
+    imu, gnss = load_imu(bag, info.imu_topic, voice), load_fixes(bag, info.gnss_topic, voice)
+    for what, stream in (("IMU", imu), ("GNSS", gnss)):
+        if stream is not None and (stream.stamps_ns[0] > stamps[-1] or stream.stamps_ns[-1] < stamps[0]):
+            voice.problems.append(f"{what}: it shares no time with the scans")
+    transforms = bag_streams.read_static_transforms(bag, voice.problems)
+    sequence.calibration = find_extrinsics(transforms, frame, imu, gnss, info, voice)
+    sequence.ground_truth = find_truth(bag, transforms, frame, voice)
+    if imu is not None:
+        sequence.imu = ImuStream(imu.stamps_ns, imu.values[:, :3].copy(), imu.values[:, 3:].copy())
+    if gnss is not None:
+        sequence.gnss = GnssStream(gnss.stamps_ns, gnss.values[:, :3].copy(), gnss.values[:, 3].copy())
+    return sequence
+
+
+def _info(path: Path, bag: Bag, overrides: SequenceInfo) -> SequenceInfo:
+    """What the user says, over a `sequence.toml` beside the bag, over what the bag says itself."""
+    beside = (path if path.is_dir() else path.parent) / FILE_NAME
+    said = overrides.over(read_sequence_toml(beside)) if beside.is_file() else overrides
+    text = bag_streams.read_text(bag, INFO_TOPIC)
+    return said if text is None else said.over(parse_sequence_toml(text, f"{path}, {INFO_TOPIC}"))
+
+
+def _decide_times(sequence: BagSequence) -> None:
+    """Find out on the first scans how per-point times are meant; stamps move to the scans' starts."""
+    cloud = PointCloud(np.zeros((0, 3), np.float32))
+    for index in range(min(len(sequence), _LOOKED_AT)):
+        try:
+            cloud, shift = sequence.cloud(index)
+        except InputError:
+            continue
+        if len(cloud):
+            break
+    if cloud.times is None or not len(cloud):
+        sequence.notes.append(
+            f"the points of {sequence.topic.name} have no times (looked for {', '.join(TIME_NAMES[:4])} and the like)"
+        )
+        return
+    stamp = int(sequence.headers_ns[index]) + shift
+    try:
+        rule = decide_rule(cloud.time_field, cloud.times, stamp, sequence.rate_hz)
+    except InputError as error:
+        sequence.problems.append(f"no deskew: {error}")
+        return
+    shift += apply_rule(rule, cloud.times, stamp)[1]
+    sequence.time_rule = rule
+    sequence.notes.append(rule.sentence)
+    if shift:
+        sequence.notes.append(
+            f"stamps of the scans moved by {shift * 1e-9:.6f} s, to where their first points were measured"
+        )
+        sequence.stamps_ns = sequence.headers_ns + shift

@@ -1,0 +1,181 @@
+"""Which topics of a bag are read, and their messages in the order of their stamps."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.errors import InputError, UsageError
+from lslam.formats.bag_files import Bag, BagTopic, read_header
+from lslam.formats.bag_streams import Stream, read_fixes, read_imu
+from lslam.readers.ground_truth import Voice
+
+CLOUDS = ("PointCloud2", "CustomMsg")
+_HEADER = 512  # bytes of a message that hold its header
+_LATE_NS = 10**9  # stamps that go back further are no jitter
+_SAID = 3  # damaged messages that are named one by one
+
+Stamps = NDArray[np.int64]
+
+
+def choose_clouds(bag: Bag, wanted: str | None) -> BagTopic:
+    """The topic `wanted`, or the only one with clouds.
+
+    Raises UsageError listing the flags when there are several or `wanted` is not among them, InputError when there is none.
+    """
+    clouds = bag.of_type(*CLOUDS)
+    if wanted is not None:
+        return _named(bag, clouds, wanted, "--lidar-topic", "clouds")
+    if len(clouds) == 1:
+        return clouds[0]
+    if clouds:
+        raise UsageError(
+            f"{bag.path} has clouds on {len(clouds)} topics, choose one:\n{_flags(clouds, '--lidar-topic')}"
+        )
+    packets = [t for t in bag.topics if "acket" in t.type or t.type.endswith("VelodyneScan")]
+    nameless = [t for t in bag.topics if len(t) and not t.type]
+    if packets:
+        raise InputError(
+            f"{bag.path} holds raw packets ({packets[0].name}, {packets[0].type}) and no clouds: the sensor's driver turns them "
+            "into PointCloud2"
+        )
+    if nameless:
+        raise InputError(
+            f"{bag.path} lacks the type definition of {', '.join(t.name for t in nameless)} and has no other clouds: record it "
+            "again, or add the schemas, with the sensor's message package installed"
+        )
+    raise InputError(f"{bag.path} holds no clouds (PointCloud2 or Livox CustomMsg); {_listing(bag)}")
+
+
+def load_imu(bag: Bag, wanted: str | None, voice: Voice) -> Stream | None:
+    """The IMU on topic `wanted`, or on the only one that has one; None, said in `voice`, when there are several."""
+    return _load(bag, wanted, voice, "IMU", "--imu-topic", "Imu", read_imu)
+
+
+def load_fixes(bag: Bag, wanted: str | None, voice: Voice) -> Stream | None:
+    """The satellite fixes on topic `wanted`, or on the only one that has some; None, said in `voice`, when there are several."""
+    return _load(bag, wanted, voice, "GNSS", "--gnss-topic", "NavSatFix", read_fixes)
+
+
+def index_scans(bag: Bag, topic: BagTopic, voice: Voice) -> tuple[Stamps, Stamps, str]:
+    """Which messages are scans, (N,), their header stamps, (N,) ns increasing, and the frame of the first.
+
+    Only headers are read. Raises InputError when not a single one can be.
+    """
+    kept, stamps, broken = [], [], []
+    frame = ""
+    for k in range(len(topic)):
+        try:
+            header = read_header(topic, bag.message(topic, k, _HEADER))
+        except InputError as error:
+            broken.append(str(error))
+            continue
+        kept.append(k)
+        stamps.append(header.stamp_ns)
+        frame = frame or header.frame
+    say_broken(broken, topic.name, voice)
+    if not kept:
+        raise InputError(f"{bag.path}: none of the {len(topic)} messages of {topic.name} can be read")
+    recorded = np.array(bag.recorded_ns(topic), np.int64)[kept]
+    order, ordered = put_in_order(np.array(stamps, np.int64), recorded, f"{topic.name}: scans", voice)
+    return np.array(kept, np.int64)[order], ordered, frame
+
+
+def put_in_order(stamps: Stamps, recorded: Stamps, what: str, voice: Voice) -> tuple[Stamps, Stamps]:
+    """Which messages stay, in order, and their stamps, which then increase; what was wrong goes to the problems.
+
+    Stamps that are all zero give way to the times of recording. What is late by up to a second is sorted in; what goes back
+    further comes from a clock that was set back, and is dropped, as repeated stamps are.
+    """
+    if len(stamps) and not stamps.any() and recorded.any():
+        voice.problems.append(
+            f"{what} have no stamps in their headers: the times of recording are used, late as they are"
+        )
+        stamps = recorded
+    index = np.arange(len(stamps), dtype=np.int64)
+    late = np.maximum.accumulate(stamps) - stamps if len(stamps) else stamps
+    dropped = late > _LATE_NS
+    if dropped.any():
+        first = int(np.flatnonzero(dropped)[0])
+        voice.problems.append(
+            f"{what} go back in time by {late[dropped].max() * 1e-9:.3f} s at message {first}: {int(dropped.sum())} of "
+            f"{len(stamps)} are dropped until time goes on"
+        )
+    index = index[~dropped]
+    jitter = int((late[index] > 0).sum())
+    if jitter:
+        voice.problems.append(
+            f"{what} are out of order in {jitter} places, by up to {late[index].max() * 1e-9:.3f} s: sorted"
+        )
+    index = index[np.argsort(stamps[index], kind="stable")]
+    repeats = np.concatenate([[False], np.diff(stamps[index]) == 0]) if len(index) else np.zeros(0, bool)
+    if repeats.any():
+        voice.problems.append(f"{what} repeat a stamp {int(repeats.sum())} times: the first one of each counts")
+    index = index[~repeats]
+    return index, stamps[index]
+
+
+def say_broken(broken: Sequence[str], topic: str, voice: Voice) -> None:
+    """The first damaged messages one by one, the others by their number."""
+    voice.problems.extend(broken[:_SAID])
+    if len(broken) > _SAID:
+        voice.problems.append(f"{len(broken) - _SAID} more messages of {topic} are damaged")
+
+
+def _load(
+    bag: Bag,
+    wanted: str | None,
+    voice: Voice,
+    what: str,
+    flag: str,
+    kind: str,
+    read: Callable[[Bag, BagTopic, list[str]], Stream],
+) -> Stream | None:
+    topics = bag.of_type(kind)
+    if wanted is not None:
+        topic = _named(bag, topics, wanted, flag, f"{kind} messages")
+    elif len(topics) == 1:
+        topic = topics[0]
+    else:
+        if topics:
+            voice.problems.append(
+                f"{what}: {len(topics)} topics have one, none is used until one is chosen:\n{_flags(topics, flag)}"
+            )
+        return None
+    broken: list[str] = []
+    stream = read(bag, topic, broken)
+    say_broken(broken, topic.name, voice)
+    if not len(stream.stamps_ns):
+        voice.problems.append(f"{what}: {topic.name} holds {len(topic)} messages and none that can be used")
+        return None
+    recorded = np.array(bag.recorded_ns(topic), np.int64)
+    # Where messages were left out, it is not known which: no time of recording stands in then.
+    recorded = recorded if len(recorded) == len(stream.stamps_ns) else np.zeros(len(stream.stamps_ns), np.int64)
+    order, stamps = put_in_order(stream.stamps_ns, recorded, f"{what}: samples", voice)
+    voice.notes.append(f"{what} from {topic.name} ({len(topic)} messages, frame {stream.frame or 'unnamed'})")
+    return Stream(stamps, stream.values[order], stream.frame)
+
+
+def _named(bag: Bag, topics: list[BagTopic], wanted: str, flag: str, what: str) -> BagTopic:
+    for topic in topics:
+        if topic.name.strip("/") == wanted.strip("/"):
+            return topic
+    there = next((t for t in bag.topics if t.name.strip("/") == wanted.strip("/")), None)
+    fact = (
+        "is not there" if there is None else f"holds {len(there)} messages of type {there.type or 'unknown'}, no {what}"
+    )
+    if topics:
+        raise UsageError(f"{flag} {wanted}: the topic {fact} in {bag.path}; choose one:\n{_flags(topics, flag)}")
+    raise UsageError(f"{flag} {wanted}: the topic {fact} in {bag.path}; {_listing(bag)}")
+
+
+def _flags(topics: list[BagTopic], flag: str) -> str:
+    width = max(len(t.name) for t in topics)
+    return "\n".join(f"  {flag} {t.name:<{width}}  ({len(t)} messages, {t.type})" for t in topics)
+
+
+def _listing(bag: Bag) -> str:
+    topics = [f"{t.name} ({t.type or 'unknown type'}, {len(t)})" for t in bag.topics]
+    return f"its topics are {', '.join(topics)}" if topics else "it has no topics at all"
