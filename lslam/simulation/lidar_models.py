@@ -170,6 +170,10 @@ LIDARS = {
             ring_bias=0.012, ring_tilt_deg=0.03, firing_us=_HDL64_FIRING, ring_heights=_KITTI_HEIGHTS,
         ),
         LidarModel(
+            "os1-16", _even(22.5, -22.5, 16), 1024, 0.3, 100.0, 0.03, 0.01, 0.01, 45.0, 0.02, "column", 180.0, True,
+            ring_bias=0.01, ring_tilt_deg=0.02,
+        ),
+        LidarModel(
             "os1-32", _even(22.5, -22.5, 32), 1024, 0.3, 100.0, 0.03, 0.01, 0.01, 45.0, 0.02, "column", 180.0, True,
             ring_bias=0.01, ring_tilt_deg=0.02,
         ),
