@@ -1,0 +1,132 @@
+"""Method `icp-svd`: the classic ICP of Besl and McKay (1992), point to point, scan to scan, in closed form."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from lslam.config.config import Config
+from lslam.config.preprocess import PreprocessConfig
+from lslam.config.registration import RegistrationConfig
+from lslam.geometry import se3, so3, umeyama
+from lslam.odometry.outcome import Alignment, judged
+from lslam.preprocessing.prepare import PreparedPoints, prepare_points
+from lslam.registration.registration import MIN_SOURCE_POINTS
+from lslam.registration.solver import STEP_M, STEP_RAD
+from lslam.types.motion_prior import MotionPrior
+from lslam.types.scan import Scan
+from lslam.types.scan_result import ScanResult
+
+Floats = NDArray[np.float64]
+
+# Distances beyond the median plus this many median deviations are outliers (the X84 rule, Hampel et al. 1986).
+X84 = 5.2
+
+
+@dataclass(frozen=True)
+class Partners:
+    """The last scan that was registered: its points (M, 3), m, in its own LiDAR frame, their tree, and its pose."""
+
+    points: Floats
+    tree: cKDTree
+    T_world_lidar: Floats
+
+
+def create(config: Config) -> IcpSvd:
+    """The method as the configuration wants it."""
+    return IcpSvd(config.preprocess, config.registration)
+
+
+class IcpSvd:
+    """Nearest neighbours, trimmed, then the transform that fits them best, until it no longer changes.
+
+    Of `registration` it takes `inlier_ratio`, `inlier_distance`, `max_iterations` and the limits beyond which a result is
+    not believed; it gives no covariance. It follows the sensor's start only when that is slow, and on sparse rings it lags:
+    a ring's nearest neighbour is the ring of the scan before. Trimming makes that worse.
+    """
+
+    def __init__(self, preprocess: PreprocessConfig, registration: RegistrationConfig) -> None:
+        self._preprocess, self._config = preprocess, registration
+        self._last: Partners | None = None
+        self._failed = 0
+
+    def prepare(self, scan: Scan) -> PreparedPoints:
+        """Range gate and down-sampling."""
+        return prepare_points(scan.points, self._preprocess, scan.index)
+
+    def register(self, scan: Scan, prepared: PreparedPoints, prior: MotionPrior) -> ScanResult:
+        """Align with the last scan that was registered; after two failures in a row this scan takes its place."""
+        began = time.perf_counter()
+        c = self._config
+        if self._last is None or len(prepared.source) < MIN_SOURCE_POINTS:
+            found = Alignment(prior.start, len(prepared.source), len(prepared.source))
+        else:
+            found = align_closed_form(
+                prepared.source, self._last, prior.start, inlier_ratio=c.inlier_ratio,
+                inlier_distance=c.inlier_distance, max_iterations=c.max_iterations,
+            )  # fmt: skip
+        aligned = time.perf_counter()
+        result = judged(scan, found, prior.start, c, {})
+        self._failed = 0 if result.status == "ok" else self._failed + 1
+        if len(prepared.source) >= MIN_SOURCE_POINTS and self._failed in (0, 2):
+            self._last = as_partners(prepared.map_points, result.T_world_lidar)
+        result.stages.update(register=aligned - began, update=time.perf_counter() - aligned)
+        return result
+
+    def warm_up(self) -> None:
+        """Compile or load the kernels of preprocessing."""
+        room = np.random.default_rng(0).uniform(-8, 8, (3000, 3)).astype(np.float32)
+        self.prepare(Scan(room, 0, 0))
+
+
+def as_partners(points: NDArray[np.float32], T_world_lidar: Floats) -> Partners:
+    """Points (M, 3), m, LiDAR frame, ready to be asked for neighbours."""
+    cloud = points.astype(np.float64)
+    return Partners(cloud, cKDTree(cloud, balanced_tree=False, compact_nodes=False), T_world_lidar)
+
+
+def align_closed_form(
+    source: Floats, last: Partners, T_prior: Floats, *,
+    inlier_ratio: float = 1.0, inlier_distance: float | None = None, max_iterations: int = 50,
+) -> Alignment:  # fmt: skip
+    """Pose of the source points (S, 3), m, LiDAR frame, by equations 2.17 to 2.20 of the first thesis.
+
+    Each round pairs every point with its nearest in the last scan, keeps the pairs within `inlier_distance`, m (None: those
+    the X84 rule does not call outliers), of these the nearest `inlier_ratio`, and takes the transform of least squares:
+    centroids removed (2.18, 2.19), rotation by SVD of the covariance (2.20).
+    """
+    T = se3.relative(last.T_world_lidar, T_prior)
+    converged, rounds, kept = False, 0, np.zeros(0, np.int64)
+    distance = np.zeros(len(source))
+    for rounds in range(1, max_iterations + 1):
+        moved = se3.apply(T, source)
+        reach = np.inf if inlier_distance is None else inlier_distance
+        distance, partner = (np.asarray(a) for a in last.tree.query(moved, distance_upper_bound=reach))
+        kept = keep_pairs(distance, inlier_ratio, inlier_distance)
+        step, _, is_determined = (
+            umeyama.align(moved[kept], last.points[partner[kept]]) if len(kept) else (T, 1.0, False)
+        )
+        if not is_determined:
+            return Alignment(T_prior, len(source), 0, converged=False, iterations=rounds)
+        T = step @ T
+        if np.linalg.norm(step[:3, 3]) < STEP_M and so3.angle(step[:3, :3]) < STEP_RAD:
+            converged = True
+            break
+    rmse = float(np.sqrt(np.mean(distance[kept] ** 2))) if len(kept) else 0.0
+    return Alignment(last.T_world_lidar @ se3.normalise(T), len(source), len(kept), converged, rounds, rmse)
+
+
+def keep_pairs(distance: Floats, inlier_ratio: float, inlier_distance: float | None) -> NDArray[np.int64]:
+    """Indices of the pairs to believe by their distance (S,), m, infinite where there is none; increasing."""
+    near = np.flatnonzero(np.isfinite(distance))
+    if inlier_distance is None and len(near):
+        middle = float(np.median(distance[near]))
+        spread = float(np.median(np.abs(distance[near] - middle)))
+        near = near[distance[near] <= middle + X84 * max(spread, 1e-6)]
+    count = int(np.ceil(inlier_ratio * len(near)))
+    order = np.argsort(distance[near], kind="stable")[:count]
+    return np.sort(near[order])
