@@ -119,7 +119,7 @@ class Registration:
             self._inserted += 1
             if not first:
                 self._starting = max(self._starting - 1, 0)
-                self.agreement.observe(result.agreement)
+                self.agreement.observe(self._agreement(result))
                 move, turn = result.prior_error
                 self.threshold.observe(move + turn * result.lever_arm)
         else:
@@ -203,6 +203,11 @@ class Registration:
             inlier_distance=np.inf if c.inlier_distance is None else c.inlier_distance, inlier_ratio=c.inlier_ratio,
         )  # fmt: skip
 
+    def _agreement(self, result: RegistrationResult) -> float:
+        """Share of the points on the map's surfaces; those of a single scan are coarse ones where its rings lie apart."""
+        coarse_too = result.inliers / max(result.source_points, 1)
+        return coarse_too if self.config.target == "scan" else result.agreement
+
     def _judge(self, result: RegistrationResult, T_prior: NDArray[np.float64]) -> RegistrationResult:
         """The result with its correction of the prior, or a failed one that keeps the prior and says why."""
         c = self.config
@@ -215,10 +220,8 @@ class Registration:
             reason = f"only {result.overlap:.0%} of the points overlap the map"
         elif not reason and result.inlier_share < c.min_inliers:
             reason = f"only {result.inlier_share:.0%} of the matches agree"
-        elif not reason and self.agreement.is_collapse(result.agreement):
-            reason = (
-                f"only {result.agreement:.0%} of the points agree with the map, lately {self.agreement.usual:.0%} did"
-            )
+        elif not reason and self.agreement.is_collapse(self._agreement(result)):
+            reason = f"only {self._agreement(result):.0%} of the points agree with the map, lately {self.agreement.usual:.0%} did"
         elif not reason and (move > c.max_jump_m or turn > np.deg2rad(c.max_jump_deg)):
             reason = f"impossible jump of {move:.1f} m and {np.rad2deg(turn):.0f} deg"
         if reason:

@@ -99,3 +99,25 @@ def test_every_shipped_preset_loads_and_says_what_it_is(name: str) -> None:
     for section, values in read_preset(name).items():
         for key, value in values.items():
             assert getattr(getattr(config, section), key) == value
+
+
+def test_the_first_thesis_presets_are_what_it_prints() -> None:
+    icp, loam, loam_map = (load(f"odometry.preset={name}") for name in ("thesis-icp", "thesis-loam", "thesis-loam-map"))
+    for config, method, far in ((icp, "gicp", 70.0), (loam, "loam-odom", 50.0), (loam_map, "loam", 50.0)):
+        p = config.preprocess
+        assert (p.range_shape, p.range_min, p.range_max) == ("cylinder", 2.0, far)
+        assert (config.input.skip_frames, config.odometry.method) == (4, method)
+    assert (icp.registration.target, icp.registration.inlier_ratio) == ("scan", 0.2)
+    assert (icp.preprocess.downsample, icp.preprocess.random_share) == ("random", 0.3)
+    for config in (loam, loam_map):
+        feature = config.loam
+        assert (feature.regions, feature.max_planar_points, feature.grid_step) == (6, 8, 1.5)
+        assert feature.matching == "one-to-many"
+    assert loam_map.loam.feature_map_voxel == 1.5
+
+
+def test_methods_of_the_presets_exist() -> None:
+    from lslam.odometry import create_odometry
+
+    for name in known_presets():
+        assert callable(create_odometry(load(f"odometry.preset={name}")).register)

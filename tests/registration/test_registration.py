@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from lslam.config.registration import RegistrationConfig
 from lslam.errors import InputError
 from lslam.registration.registration import MIN_SOURCE_POINTS, Registration, start_offsets
+from lslam.registration.solver import RegistrationResult
 
 Floats = NDArray[np.float64]
 
@@ -226,3 +227,10 @@ def test_starts_reach_as_far_as_asked_nearest_first() -> None:
     assert (np.diff(lengths) >= 0).all()
     assert len(start_offsets(0.0, 3.0)) == 0
     assert np.abs(start_offsets(4.0, 3.0)).max() == 4.0
+
+
+def test_agreement_with_a_single_scan_counts_its_coarse_surfaces_too() -> None:
+    result = RegistrationResult(np.eye(4), source_points=100, matched=90, inliers=60, fine_inliers=10)
+    for target, expected in (("scan", 0.6), ("map", 0.1), ("keyframe", 0.1)):
+        registration = Registration(RegistrationConfig.model_validate({"target": target}))
+        assert registration._agreement(result) == expected
