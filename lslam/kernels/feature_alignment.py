@@ -33,14 +33,14 @@ def _step(H: Floats, g: Floats, facts: Floats, allowed: Floats, weak_share: floa
     for i in range(6):
         for j in range(i):
             H[i, j] = H[j, i]
-    A, b = np.zeros((6, 6)), np.zeros(6)
+    A = np.zeros((6, 6))
     for i in range(6):
         for k in range(6):
-            b[i] += allowed[i, k] * g[k]
             for m in range(6):
                 for j in range(6):
                     A[i, j] += allowed[i, k] * H[k, m] * allowed[m, j]
-    weak_count = solve_observed(A, b, facts, weak_share, d, weak)
+    # What the projector takes away has no eigenvalue left, so that the step never looks along it in g.
+    weak_count = solve_observed(A, g, facts, weak_share, d, weak)
     move, turn = step_norms(d)
     if not (np.isfinite(move) and np.isfinite(turn)):
         d[:] = 0.0

@@ -1,0 +1,131 @@
+"""A box room with pillars, seen ring by ring: the engine of the LOAM family finds the motion that was made."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from analytic_scenes import distance, random_pose
+from numpy.typing import NDArray
+
+from lslam.config.config import Config
+from lslam.geometry import se3
+from lslam.preprocessing.features import Features, extract_features
+from lslam.registration.feature_registration import FeatureRegistration
+from lslam.registration.feature_scan import feature_scan
+from lslam.registration.feature_solver import NONE, FeatureNoise, solve_on_scan
+from lslam.registration.feature_steps import ScanStep, StageClock, joint_step, two_steps, upright_directions
+from lslam.registration.robust import Annealing
+from lslam.types.scan import Scan
+
+Floats = NDArray[np.float64]
+
+HALF = np.array([9.0, 7.0, 2.0])  # m, of the room
+PILLARS = np.array([[4.0, 3.0], [-5.0, 2.0], [3.0, -4.0], [-4.0, -4.5], [0.5, 5.0]])
+PILLAR = 0.4  # m, half a side
+ANNEALING = Annealing(1.0, 0.15, 0.5, 30)
+NOISE = FeatureNoise(0.15, 0.03, 1e-3)
+
+
+def scan_of_room(pose: Floats, seed: int = 0, with_pillars: bool = True) -> Scan:
+    """What 32 rings see from `pose` (4, 4) in the room, ranges with 1 cm of noise."""
+    azimuth, elevation = np.linspace(-np.pi, np.pi, 900, endpoint=False), np.linspace(-0.4, 0.4, 32)
+    a, e = np.meshgrid(azimuth, elevation)
+    beams = np.stack([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)], axis=-1).reshape(-1, 3)
+    rays, origin = beams @ pose[:3, :3].T, pose[:3, 3]
+    ranges = np.min(np.where(rays > 0, HALF - origin, -HALF - origin) / np.where(rays == 0, 1e-12, rays), axis=1)
+    for x, y in PILLARS if with_pillars else ():
+        sides = np.array([[x, y]]) + np.array([[-PILLAR], [PILLAR]])
+        near, far = np.sort((sides[:, None] - origin[:2]) / np.where(rays[:, :2] == 0, 1e-12, rays[:, :2]), axis=0)
+        enter, leave = near.max(axis=1), far.min(axis=1)
+        ranges = np.where((enter < leave) & (enter > 0), np.minimum(ranges, enter), ranges)
+    ranges += np.random.default_rng(seed).normal(0, 0.01, len(ranges))
+    rings = np.repeat(np.arange(32, dtype=np.uint16), len(azimuth))
+    return Scan((beams * ranges[:, None]).astype(np.float32), 0, 0, rings=rings)
+
+
+def features_at(pose: Floats, seed: int = 0, with_pillars: bool = True) -> Features:
+    return extract_features(scan_of_room(pose, seed, with_pillars))
+
+
+def engine(step: ScanStep | None, with_map: bool) -> FeatureRegistration:
+    config = Config()
+    return FeatureRegistration(config.registration, config.loam, scan_step=step, with_map=with_map)
+
+
+VARIANTS = [(joint_step, False), (joint_step, True), (None, True), (two_steps, True)]
+
+
+@pytest.mark.parametrize(("step", "with_map"), VARIANTS)
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_a_known_motion_is_recovered(step: ScanStep | None, with_map: bool, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    registration = engine(step, with_map)
+    first = features_at(np.eye(4))
+    registration.update(first, registration.locate(first, np.eye(4), StageClock()))
+    way, axis = rng.normal(size=(2, 3))
+    truth = se3.exp(np.concatenate([0.4 * way / np.linalg.norm(way), np.deg2rad(3.0) * axis / np.linalg.norm(axis)]))
+    features = features_at(truth, seed)
+    result = registration.locate(features, np.eye(4), StageClock())
+    assert result.ok
+    assert result.converged
+    assert len(result.degenerate) == 0
+    metres, degrees = distance(result.T_world_lidar, truth)
+    assert metres < 0.02
+    assert degrees < 0.15
+    # That nothing moved would be no answer.
+    assert distance(np.eye(4), truth)[0] > 0.3
+
+
+def test_edges_alone_find_the_plan_and_planes_the_upright_directions() -> None:
+    """Each step of two moves only its own directions, in the sensor's axes at the prior, and both together arrive."""
+    prior = random_pose(np.random.default_rng(7), 0.5, 20.0)
+    truth = prior @ se3.exp(np.array([0.1, -0.08, 0.06, 0.01, -0.015, 0.02]))
+    target = feature_scan(features_at(prior), prior)
+    features = features_at(truth, 1)
+    upright = upright_directions(prior)
+    ground = solve_on_scan(target, NONE, features.planes.points, prior, ANNEALING, NOISE, allowed=upright)
+    moved = se3.relative(prior, ground.T_world_lidar)
+    np.testing.assert_allclose(moved[:2, 3], 0.0, atol=1e-3)
+    assert abs(np.arctan2(moved[1, 0], moved[0, 0])) < 1e-3
+    assert abs(moved[2, 3] - 0.06) < 0.02
+    np.testing.assert_allclose(upright @ upright, upright, atol=1e-12)
+    assert np.trace(upright) == pytest.approx(3.0)
+    clock = StageClock()
+    both = two_steps(target, features, prior, ANNEALING, NOISE, True, clock)
+    assert list(clock.seconds) == ["ground", "edges"]
+    assert distance(both.T_world_lidar, truth)[0] < distance(ground.T_world_lidar, truth)[0] < distance(prior, truth)[0]
+    assert distance(both.T_world_lidar, truth)[0] < 0.05
+
+
+def test_planes_of_two_walls_leave_their_direction_open_and_the_prior_there() -> None:
+    """Only floor and the two long walls: nothing is known along x, and the result says which direction that is."""
+    prior = se3.exp(np.array([0.3, 0.0, 0.0, 0.0, 0.0, 0.0]))
+    target = feature_scan(features_at(np.eye(4), with_pillars=False), np.eye(4))
+    seen = features_at(se3.exp(np.array([0.3, 0.05, 0.03, 0, 0, 0])), 1, with_pillars=False).planes.points
+    flat = seen[np.abs(seen[:, 0]) < 5.0]
+    strict = FeatureNoise(NOISE.edge, NOISE.plane, 0.03)
+    result = solve_on_scan(target, NONE, flat, prior, ANNEALING, strict)
+    assert len(result.degenerate) == 1
+    along = result.degenerate[0, :3] / np.linalg.norm(result.degenerate[0, :3])
+    assert abs(along[0]) > np.cos(np.deg2rad(10))
+    assert abs(result.T_world_lidar[0, 3] - 0.3) < 5e-3
+    assert abs(result.T_world_lidar[1, 3] - 0.05) < 0.02
+    assert result.covariance is not None
+    assert result.covariance[0, 0] > 0.5
+    assert result.covariance[1, 1] < 0.01
+
+
+@pytest.mark.parametrize(("step", "with_map"), VARIANTS)
+def test_no_features_at_all_keep_the_prior_in_doubt(step: ScanStep | None, with_map: bool) -> None:
+    registration = engine(step, with_map)
+    first = features_at(np.eye(4))
+    registration.update(first, registration.locate(first, np.eye(4), StageClock()))
+    none = extract_features(scan_of_room(np.eye(4)).select(np.arange(8)))
+    prior = se3.exp(np.array([0.1, 0, 0, 0, 0, 0]))
+    result = registration.locate(none, prior, StageClock())
+    assert not result.ok
+    assert "0 edges and 0 planar points" in result.reason
+    np.testing.assert_array_equal(result.T_world_lidar, prior)
+    before = registration.target
+    registration.update(none, result)
+    assert registration.target is before
