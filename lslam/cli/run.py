@@ -42,6 +42,7 @@ if TYPE_CHECKING:
 @click.option("--threads", type=int, metavar="N", help="1: one thread; 2 and more: the next scan is read meanwhile.")
 @click.option("--rings", metavar="RULE", help="How rings are found: auto, field, order, rows[:N], elevation[:N].")
 @click.option("--save-feature-map", is_flag=True, help="Write feature_map.ply; for the LOAM family.")
+@click.option("--imu/--no-imu", default=None, help="Predict and deskew with the IMU [default: no].")
 @click.option("--strict", is_flag=True, help="Exit 4 when anything was degraded: a scan skipped or bridged.")
 @click.option("--dry-run", is_flag=True, help="Resolve everything, write nothing.")
 @options.reading
@@ -66,6 +67,10 @@ def command(sequence: str, **given: Any) -> None:
         sequence, data_root=given["data_root"], vertical_correction_deg=config.input.vertical_correction_deg,
         **options.reading_of(given),
     )  # fmt: skip
+    if config.imu.use:
+        from lslam.readers.raw_drive import with_imu
+
+        opened = with_imu(opened, given["data_root"])
     truth = read_truth(given["gt"], opened)
     out = given["out"] or default_folder(opened.name, config.odometry.method)
     if given["dry_run"]:
@@ -96,6 +101,7 @@ def _resolve(given: dict[str, Any]) -> Config:
         "input.threads": given["threads"],
         "input.rings": given["rings"],
         "map.write_features": "true" if given["save_feature_map"] else None,
+        "imu.use": None if given["imu"] is None else str(given["imu"]).lower(),
         "input.strict": "true" if given["strict"] else None,
     }
     settings = options.with_preset(given["settings"], given["preset"])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from lslam.config.eval import EvalConfig
+from lslam.config.imu import ImuConfig
 from lslam.config.input import InputConfig
 from lslam.config.loam import LoamConfig
 from lslam.config.map import MapConfig
@@ -21,6 +22,7 @@ class Config(Section):
     odometry: OdometryConfig = OdometryConfig()
     registration: RegistrationConfig = RegistrationConfig()
     loam: LoamConfig = LoamConfig()
+    imu: ImuConfig = ImuConfig()
     map: MapConfig = MapConfig()
     eval: EvalConfig = EvalConfig()
     report: ReportConfig = ReportConfig()

@@ -16,7 +16,7 @@ from lslam.errors import InputError
 from lslam.geometry import se3, so3
 from lslam.odometry.base import Deskewing, Odometry
 from lslam.readers.selection import Selection
-from lslam.registration.motion import ConstantVelocity
+from lslam.registration.motion import ConstantVelocity, MotionModel
 from lslam.registration.registration import DOUBT
 from lslam.registration.standing import Standing
 from lslam.types.motion_prior import MotionPrior
@@ -49,15 +49,16 @@ def estimate(
     threads: int = 2,
     max_failures: int = 20,
     standing: Standing | None = None,
+    motion: MotionModel | None = None,
     should_stop: Callable[[], bool] = lambda: False,
     on_scan: Callable[[ScanResult], None] = lambda result: None,
 ) -> list[ScanResult]:
     """Register every scan of the sequence; stops early on `should_stop` or after `max_failures` failures in a row.
 
     A scan that cannot be read, or is empty, is skipped: the motion prior stands in for its pose. With `standing`, scans
-    during which the sensor stands are not registered.
+    during which the sensor stands are not registered. `motion` predicts the scans, constant velocity when None.
     """
-    tracker = Tracker(odometry, standing)
+    tracker = Tracker(odometry, standing, motion)
     results: list[ScanResult] = []
     failures = 0
     for loaded in read_ahead(sequence, odometry.prepare, threads):
@@ -77,9 +78,9 @@ class Tracker:
     # A change of the motion within the sweep that moves no point by more is not worth a second registration.
     REFINE_M = 0.01
 
-    def __init__(self, odometry: Odometry, standing: Standing | None = None) -> None:
+    def __init__(self, odometry: Odometry, standing: Standing | None = None, motion: MotionModel | None = None) -> None:
         self.odometry, self.standing = odometry, standing
-        self.motion = ConstantVelocity()
+        self.motion: MotionModel = ConstantVelocity() if motion is None else motion
         self._first: tuple[Scan, Any, NDArray[np.float64]] | None = None
 
     def track(self, loaded: Loaded) -> ScanResult:
@@ -105,15 +106,15 @@ class Tracker:
     def _move(self, loaded: Loaded) -> ScanResult:
         scan = loaded.scan
         span = sweep_seconds(scan)
-        prior = self.motion.sweep(loaded.stamp_ns, span)
+        prior = expected = self.motion.sweep(loaded.stamp_ns, span)
         if scan is None:
             result = ScanResult(loaded.index, loaded.stamp_ns, prior.start, "skipped", loaded.error, converged=False)
         elif isinstance(self.odometry, Deskewing):
             result, prior = self._register(self.odometry, scan, loaded.prepared, prior)
         else:
             result = self.odometry.register(scan, loaded.prepared, prior)
-        self.motion.correct(result.stamp_ns, result.T_world_lidar, prior)
-        return result
+        self.motion.correct(result.stamp_ns, result.T_world_lidar, prior, result.status == "ok")
+        return replace(result, prior_norm=_matrix_norm(expected.start, result.T_world_lidar))
 
     def _register(
         self, odometry: Deskewing, scan: Scan, prepared: Any, prior: MotionPrior
@@ -123,8 +124,8 @@ class Tracker:
         if result.status == "ok" and sweep_seconds(scan) > 0:
             if self._first is None:
                 self._first = (scan, prepared, result.T_world_lidar)
-            elif not self.motion.is_known:
-                prior = self._begin_again(odometry, scan, result)
+            elif isinstance(self.motion, ConstantVelocity) and not self.motion.is_known:
+                prior = self._begin_again(odometry, self.motion, scan, result)
                 result = odometry.register(scan, prepared, prior)
             else:
                 better = self.motion.refine(prior, scan.stamp_ns, result.T_world_lidar)
@@ -133,18 +134,19 @@ class Tracker:
                     result = odometry.register(scan, prepared, prior)
         return odometry.update(scan, prepared, prior, result), prior
 
-    def _begin_again(self, odometry: Deskewing, scan: Scan, result: ScanResult) -> MotionPrior:
+    def _begin_again(
+        self, odometry: Deskewing, motion: ConstantVelocity, scan: Scan, result: ScanResult
+    ) -> MotionPrior:
         """The first scan was taken at an unknown speed: now that it is known, deskew it and build the map anew."""
         assert self._first is not None
         first, prepared, pose = self._first
-        self.motion.correct(scan.stamp_ns, result.T_world_lidar)
-        prior = self.motion.steady(pose, sweep_seconds(first))
+        motion.correct(scan.stamp_ns, result.T_world_lidar)
+        prior = motion.steady(pose, sweep_seconds(first))
         odometry.restart()
         odometry.update(first, prepared, prior, odometry.register(first, prepared, prior))
-        start = self.motion.predict(scan.stamp_ns)
-        known, self.motion = self.motion, ConstantVelocity()
+        self.motion = ConstantVelocity()
         self.motion.correct(first.stamp_ns, pose, prior)
-        return known.steady(start, sweep_seconds(scan))
+        return motion.steady(motion.predict(scan.stamp_ns), sweep_seconds(scan))
 
 
 def has_point_times(sequence: Sequence) -> bool:
@@ -158,6 +160,14 @@ def has_point_times(sequence: Sequence) -> bool:
 def sweep_seconds(scan: Scan | None) -> float:
     """How long the sensor took for the scan, s; 0 when its points belong to one instant."""
     return 0.0 if scan is None or scan.times is None or len(scan) == 0 else max(float(scan.times.max()), 0.0)
+
+
+def _matrix_norm(prior: NDArray[np.float64], pose: NDArray[np.float64]) -> float:
+    """Error of the motion prior, (4, 4), against registration: the largest singular value of inv(prior) pose - I.
+
+    First thesis, equation 5.1.
+    """
+    return float(np.linalg.norm(se3.relative(prior, pose) - np.eye(4), 2))
 
 
 def _distance(before: MotionPrior, after: MotionPrior) -> float:

@@ -27,6 +27,7 @@ class Manifest:
     outcome : done, degraded (a scan was bridged or skipped, or input was dropped, replaced or refused), diverged or
         interrupted
     deskew : what becomes of the motion within a scan, `describe_deskew`
+    imu : what became of the IMU, empty without `--imu`
     problems : what went wrong in this run, beside what was wrong with the recording before
     """
 
@@ -38,6 +39,7 @@ class Manifest:
         self.problems: list[str] = []
         self.counts: dict[str, int] = {}
         self.map_points: int | None = None
+        self.imu: dict[str, Any] = {}
         self._ended = ""
 
     @property
@@ -114,6 +116,7 @@ class Manifest:
                 "covariances.npz": "covariances: of the poses in the world; registration: against the local map (NaN: none); "
                 "both (N, 6, 6) of t' = t + d[:3], R' = exp(d[3:]) R in world axes, m2 and rad2",
             },
+            **({"imu": dict(self.imu)} if self.imu else {}),
             "counts": dict(self.counts),
             **({"map_points": self.map_points} if self.map_points is not None else {}),
             "timings": {name: round(seconds, 3) for name, seconds in self.timings.items()},

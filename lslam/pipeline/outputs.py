@@ -69,12 +69,12 @@ def write_scans(folder: RunFolder, record: RunRecord) -> None:
         rows.append(",".join([str(result.index), str(result.stamp_ns), *(f"{v:.6f}" for v in (*row, row.sum()))]))
     folder.write_text("timing.csv", "\n".join(rows) + "\n")
     columns = "index,stamp_ns,status,standing,converged,iterations,source_points,inliers,overlap,rmse_m,degenerate"
-    rows = [columns + ",prior_m,prior_deg"]
+    rows = [columns + ",prior_m,prior_deg,prior_norm"]
     for r in record.results:
         values = (
             r.index, r.stamp_ns, r.status, int(r.is_standing), int(r.converged), r.iterations, r.source_points, r.inliers,
             f"{r.overlap:.4f}", f"{r.rmse:.5f}", len(r.degenerate), f"{r.prior_error[0]:.5f}",
-            f"{np.rad2deg(r.prior_error[1]):.5f}",
+            f"{np.rad2deg(r.prior_error[1]):.5f}", f"{r.prior_norm:.5f}",
         )  # fmt: skip
         rows.append(",".join(str(v) for v in values))
     folder.write_text("scans.csv", "\n".join(rows) + "\n")

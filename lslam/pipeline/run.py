@@ -20,10 +20,12 @@ from lslam.pipeline.check import check_config
 from lslam.pipeline.choose import choose_scans
 from lslam.pipeline.feature_pass import build_feature_map
 from lslam.pipeline.front_end import estimate, has_point_times, is_diverged, to_trajectory
+from lslam.pipeline.inertial_start import Inertial, begin_inertial, close_inertial
 from lslam.pipeline.manifest import Manifest, describe_deskew
 from lslam.pipeline.map_pass import build_map
 from lslam.pipeline.run_folder import RunFolder
 from lslam.readers import open_sequence
+from lslam.readers.raw_drive import with_imu
 from lslam.registration.standing import Standing
 from lslam.types.run_record import RunRecord
 from lslam.types.scan_result import ScanResult
@@ -89,7 +91,7 @@ def run(
         sequence = open_sequence(sequence)
     truth = sequence.ground_truth if ground_truth is None else ground_truth
     odometry = create_odometry(config)
-    chosen = choose_scans(sequence, odometry, config)
+    chosen = choose_scans(with_imu(sequence) if config.imu.use else sequence, odometry, config)
     manifest = Manifest(command, chosen, config)
     if out is None:
         _announce(chosen, odometry, config, manifest)
@@ -157,13 +159,20 @@ def _estimate(
 
     watch.on_start("odometry", len(sequence))
     limit = config.odometry.max_failures
+    inertial = Inertial(None)
+    if config.imu.use:
+        with manifest.timed("imu_start_s"):
+            inertial = begin_inertial(sequence, config)
     with manifest.timed("odometry_s"):
         results = estimate(
             sequence, odometry, threads=config.input.threads, max_failures=limit, standing=standing,
-            should_stop=watch.should_stop, on_scan=seen,
+            motion=inertial.motion, should_stop=watch.should_stop, on_scan=seen,
         )  # fmt: skip
     if all(r.status == "skipped" for r in results):
         raise InputError(f"{sequence.path}: none of {len(results)} scans can be used, the first: {results[0].reason}")
+    if config.imu.use:
+        manifest.imu = close_inertial(inertial, results)
+        manifest.problems += inertial.problems
     manifest.judge(results, len(sequence), is_diverged(results, limit))
     return RunRecord(
         name=sequence.name,

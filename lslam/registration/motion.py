@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Protocol
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -10,6 +12,29 @@ from lslam.preprocessing.deskew import KNOTS
 from lslam.types.motion_prior import MotionPrior
 
 Floats = NDArray[np.float64]
+
+
+class MotionModel(Protocol):
+    """What predicts a scan and the motion within it, and learns from where registration put it."""
+
+    @property
+    def is_known(self) -> bool:
+        """Whether there is a velocity yet."""
+        ...
+
+    def sweep(self, stamp_ns: int, span_s: float) -> MotionPrior:
+        """Poses from scan start over the `span_s` seconds that the sweep takes; one pose when it takes none."""
+        ...
+
+    def refine(self, prior: MotionPrior, stamp_ns: int, start: Floats) -> MotionPrior:
+        """The sweep's motion again, now that registration gave the pose `start` (4, 4) for `prior`."""
+        ...
+
+    def correct(
+        self, stamp_ns: int, pose: Floats, prior: MotionPrior | None = None, is_registered: bool = True
+    ) -> None:
+        """Take the pose (4, 4) found at `stamp_ns` as the newest; `prior` says how its sweep moved."""
+        ...
 
 
 class ConstantVelocity:
@@ -56,16 +81,21 @@ class ConstantVelocity:
         Continuing the change of velocity as well was tried: it amplifies jitter more than it follows bends.
         """
         span = float(prior.times[-1])
-        middle, instant_ns = _middle(prior, stamp_ns, start)
+        middle, instant_ns = middle_of(prior, stamp_ns, start)
         step = 0.0 if self._instant_ns is None else (instant_ns - self._instant_ns) * 1e-9
         if span <= 0 or step <= 0:
             return prior
         velocity = se3.log(se3.relative(self._pose, middle)) / step
         return _steady(middle @ se3.exp(-0.5 * span * velocity), velocity, span)
 
-    def correct(self, stamp_ns: int, pose: Floats, prior: MotionPrior | None = None) -> None:
-        """Take the pose (4, 4) found at `stamp_ns` as the newest; `prior` says how its sweep moved."""
-        middle, instant_ns = (pose, stamp_ns) if prior is None else _middle(prior, stamp_ns, pose)
+    def correct(
+        self, stamp_ns: int, pose: Floats, prior: MotionPrior | None = None, is_registered: bool = True
+    ) -> None:
+        """Take the pose (4, 4) found at `stamp_ns` as the newest; `prior` says how its sweep moved.
+
+        A pose that no registration stands behind (`is_registered`) continues the motion just as well.
+        """
+        middle, instant_ns = (pose, stamp_ns) if prior is None else middle_of(prior, stamp_ns, pose)
         if self._instant_ns is not None:
             step = (instant_ns - self._instant_ns) * 1e-9
             if step > 0:
@@ -78,7 +108,7 @@ def _steady(start: Floats, velocity: Floats, span: float) -> MotionPrior:
     return MotionPrior(times, se3.normalise(start @ se3.exp(times[:, None] * velocity)))
 
 
-def _middle(prior: MotionPrior, stamp_ns: int, start: Floats) -> tuple[Floats, int]:
+def middle_of(prior: MotionPrior, stamp_ns: int, start: Floats) -> tuple[Floats, int]:
     """Pose and instant of the middle of a sweep that began at `start` and moved as `prior` says."""
     k = len(prior.times) // 2
     within = se3.relative(prior.start, prior.poses[k])

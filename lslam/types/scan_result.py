@@ -24,6 +24,7 @@ class ScanResult:
     is_standing : the sensor had not moved, so the scan was not registered and has the pose of the one before
     degenerate : (K, 6) unit twists along which the scan says nothing and the motion prior was kept
     prior_error : (translation m, rotation rad) between motion prior and result
+    prior_norm : 2-norm of inv(prior) pose - I, of the prior before the scan was looked at (first thesis, equation 5.1)
     stages : seconds per stage, by name, in the order they ran
     """
 
@@ -43,4 +44,5 @@ class ScanResult:
     is_standing: bool = False
     degenerate: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 6)))
     prior_error: tuple[float, float] = (0.0, 0.0)
+    prior_norm: float = 0.0
     stages: dict[str, float] = field(default_factory=dict)

@@ -1,0 +1,34 @@
+"""Section `imu`: the loosely coupled inertial measurement unit."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from lslam.config.section import Section
+
+Three = Annotated[tuple[float, ...], Field(min_length=3, max_length=3)]
+
+
+class ImuConfig(Section):
+    """Whether and how the IMU predicts the motion between scans and within them."""
+
+    use: bool = Field(False, description="predict and deskew with the IMU; `--imu`")
+    velocity: Literal["registration", "integrated"] = Field(
+        "registration",
+        description="where a prediction's velocity comes from: what registration found, or integration alone since the "
+        "start (first thesis, methods 2 and 1)",
+    )
+    gyro_bias: Three | None = Field(None, description="rad/s, IMU axes; absent: estimated")
+    accel_bias: Three | None = Field(None, description="m/s2, IMU axes; absent: estimated")
+    initial_velocity: Three | None = Field(
+        None, description="m/s, LiDAR axes at the first scan; absent: estimated from the first scans"
+    )
+    time_offset_s: float | None = Field(
+        None, ge=-10, le=10, description="s to add to the IMU's stamps; absent: estimated from the rotation rates"
+    )
+    start_s: float = Field(
+        5.0, ge=0.5, le=60, description="s at the start that are registered once without the IMU, to check and align it"
+    )
+    gap_s: float = Field(0.1, gt=0, description="s without samples beyond which a scan falls back to constant velocity")

@@ -1,0 +1,1 @@
+"""Loosely coupled IMU: it predicts, registration corrects."""

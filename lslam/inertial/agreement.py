@@ -1,0 +1,156 @@
+"""Do gyroscope and registration tell of the same turns? Units, axes and clocks are wrong where they do not."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.geometry import so3
+from lslam.inertial.stream import ImuRefusedError
+from lslam.types.imu import ImuStream
+
+Floats = NDArray[np.float64]
+
+# Turns that vary less than this (rms, rad/s) are registration's own noise: nothing can be told from them.
+LEAST_TURNING = np.deg2rad(0.6)
+LEAST_CORRELATION = 0.5
+# Rates in deg/s are 57.3 times too large; a good gyroscope is right to some per cent.
+LIKELY_DEGREES, MOST_SCALE = (30.0, 110.0), 2.0
+# s: clocks of one machine differ by less; what differs by more is looked for only to say so.
+NEAR_S, FAR_S, STEP_S = 0.25, 10.0, 0.005
+# An offset smaller than this is of no use, and one that may be chance is none.
+LEAST_OFFSET_S, SIGNIFICANT = 0.002, 3.0
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """How a gyroscope fits registration.
+
+    is_judged : whether the sensor turned enough to tell; correlation : -1..1 at the best offset
+    offset_s : s to add to the IMU's stamps, 0 when it is not clearly another; offset_sigma_s : its standard deviation
+    """
+
+    is_judged: bool
+    correlation: float = 0.0
+    offset_s: float = 0.0
+    offset_sigma_s: float = 0.0
+
+
+def check_agreement(
+    imu: ImuStream, T_lidar_imu: Floats, stamps_ns: NDArray[np.int64], poses: Floats, offset_s: float | None
+) -> Agreement:
+    """Compare turns between the poses (N, 4, 4) of the LiDAR with those the gyroscope felt; biases are of no account.
+
+    offset_s : s to add to the IMU's stamps; None looks for it
+
+    Raises ImuRefusedError saying what is likely wrong: unit, axes, extrinsics, or stamps.
+    """
+    if len(stamps_ns) < 5:
+        return Agreement(False)
+    felt = _Felt(imu, T_lidar_imu, stamps_ns)
+    seconds = np.diff(stamps_ns)[:, None] * 1e-9
+    seen = so3.log(np.swapaxes(poses[:-1, :3, :3], -1, -2) @ poses[1:, :3, :3]) / seconds
+    offsets = np.arange(-NEAR_S, NEAR_S + STEP_S / 2, STEP_S) if offset_s is None else np.array([offset_s])
+    scores = np.array([_compare(seen, felt.rates(t))[0] for t in offsets])
+    best = int(np.argmax(scores))
+    correlation, ratio, turning = _compare(seen, felt.rates(float(offsets[best])))
+    if turning < LEAST_TURNING:
+        return _hardly_turning(felt.rates(0.0 if offset_s is None else offset_s))
+    _refuse_scale(ratio)
+    if correlation < LEAST_CORRELATION:
+        raise ImuRefusedError(_why_not(felt, seen, correlation))
+    if offset_s is not None:
+        return Agreement(True, correlation, offset_s)
+    offset, sigma = _refined(felt, seen, float(offsets[best]))
+    is_sure = abs(offset) > max(LEAST_OFFSET_S, SIGNIFICANT * sigma)
+    return Agreement(True, correlation, offset if is_sure else 0.0, sigma)
+
+
+class _Felt:
+    """Mean angular rates between the stamps of scans, in LiDAR axes, for any offset of the clocks."""
+
+    def __init__(self, imu: ImuStream, T_lidar_imu: Floats, stamps_ns: NDArray[np.int64]) -> None:
+        self.origin = int(stamps_ns[0])
+        self.times = (imu.stamps_ns - self.origin) * 1e-9
+        self.query = (stamps_ns - self.origin) * 1e-9
+        gyro = imu.gyro @ T_lidar_imu[:3, :3].T
+        steps = 0.5 * (gyro[1:] + gyro[:-1]) * np.diff(self.times)[:, None]
+        self.turned = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
+
+    def rates(self, offset_s: float) -> Floats:
+        """(N - 1, 3) rad/s, NaN where the stream does not reach."""
+        query = self.query - offset_s
+        at = np.stack([np.interp(query, self.times, self.turned[:, k], np.nan, np.nan) for k in range(3)], axis=-1)
+        return np.asarray(np.diff(at, axis=0) / np.diff(query)[:, None])
+
+
+def _centred(seen: Floats, felt: Floats) -> tuple[Floats, Floats]:
+    known = np.isfinite(felt).all(axis=1)
+    if known.sum() < max(5, len(felt) // 2):
+        return np.zeros((0, 3)), np.zeros((0, 3))
+    a, b = seen[known], felt[known]
+    return a - a.mean(axis=0), b - b.mean(axis=0)
+
+
+def _compare(seen: Floats, felt: Floats) -> tuple[float, float, float]:
+    """Correlation of the rates about their means, how many times larger the felt ones are, and the rms of the seen ones."""
+    a, b = _centred(seen, felt)
+    if not len(a):
+        return 0.0, 1.0, 0.0
+    aa, bb, ab = (float(np.sum(x * y)) for x, y in ((a, a), (b, b), (a, b)))
+    return ab / max(np.sqrt(aa * bb), 1e-12), float(np.sqrt(bb / max(aa, 1e-12))), float(np.sqrt(aa / len(a)))
+
+
+def _hardly_turning(felt: Floats) -> Agreement:
+    """Nothing turned, so nothing can be compared, unless the gyroscope says something else."""
+    varied = float(np.nanstd(felt, axis=0).max()) if np.isfinite(felt).any() else 0.0
+    if varied > 20 * LEAST_TURNING:
+        raise ImuRefusedError(
+            f"its rates vary by {np.rad2deg(varied):.1f} deg/s while the scans show that nothing turns: "
+            "check its unit (rad/s), its axes and its stamps"
+        )
+    return Agreement(False)
+
+
+def _refuse_scale(ratio: float) -> None:
+    if LIKELY_DEGREES[0] < ratio < LIKELY_DEGREES[1]:
+        raise ImuRefusedError(
+            f"its rates are {ratio:.0f} times those of the scans: they seem to be in deg/s, convert them to rad/s"
+        )
+    if not 1 / MOST_SCALE < ratio < MOST_SCALE:
+        raise ImuRefusedError(
+            f"its rates vary {ratio:.2g} times as much as those of the scans: check its unit (rad/s), axes and stamps"
+        )
+
+
+def _why_not(felt: _Felt, seen: Floats, correlation: float) -> str:
+    """What would make the turns agree, as a sentence."""
+    said = f"its turns do not fit those of the scans (correlation {correlation:.2f}, {LEAST_CORRELATION} needed): "
+    far = np.arange(-FAR_S, FAR_S, 4 * STEP_S)
+    scores = [_compare(seen, felt.rates(float(t)))[0] for t in far]
+    best = int(np.argmax(scores))
+    if scores[best] > 0.9:
+        return said + f"with its stamps moved by {far[best]:.2f} s they would, set imu.time_offset_s"
+    a, b = _centred(seen, felt.rates(0.0))
+    if len(a):
+        u, _, vt = np.linalg.svd(a.T @ b)
+        R = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
+        if _compare(a, b @ R.T)[0] > 0.9:
+            return said + f"turned by {np.rad2deg(float(so3.angle(R))):.0f} deg they would, correct T_lidar_imu"
+    return said + "check its axes, T_lidar_imu and its stamps"
+
+
+def _refined(felt: _Felt, seen: Floats, near: float) -> tuple[float, float]:
+    """The offset at which the rates differ least, and its standard deviation, by a parabola through the squared error."""
+    costs = []
+    for t in (near - STEP_S, near, near + STEP_S):
+        a, b = _centred(seen, felt.rates(t))
+        costs.append(float(np.sum((a - b) ** 2)) if len(a) else np.inf)
+    bend = (costs[0] - 2 * costs[1] + costs[2]) / STEP_S**2
+    if not np.isfinite(bend) or bend <= 0:
+        return 0.0, np.inf
+    shift = float(np.clip(0.5 * (costs[0] - costs[2]) / STEP_S / bend, -STEP_S, STEP_S))
+    variance = costs[1] / max(3 * len(seen) - 4, 1)
+    return near + shift, float(np.sqrt(2 * variance / bend))

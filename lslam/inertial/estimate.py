@@ -1,0 +1,117 @@
+"""What is known of an IMU besides the poses: velocity, gravity and biases, as Gaussians that every registered scan narrows.
+
+Rotation and translation are two small linear filters: registration gives rotations far better than tilt from accelerations,
+so the rotations along the way are taken as known when forces are integrated.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.geometry import so3
+from lslam.inertial.integrate import Increments, integrate
+from lslam.types.imu import ImuStream
+
+Floats = NDArray[np.float64]
+
+GRAVITY = 9.80665
+# Registration from scan to scan: m and rad, one sigma.
+PLACE_SIGMA, TURN_SIGMA = 0.007, np.deg2rad(0.05)
+# Force and rate that no bias explains (vibration, misaligned axes, readings cut at the rate): per sqrt(Hz).
+FORCE_NOISE, RATE_NOISE = 0.1, np.deg2rad(0.02)
+# Biases and the direction of gravity wander: per sqrt(s).
+GRAVITY_WALK, ACCEL_WALK, GYRO_WALK = 5e-3, 2e-3, np.deg2rad(0.03)
+GRAVITY_SIGMA = 0.03  # m/s2, over the Earth
+# Innovations beyond so many sigma are outliers and count accordingly less.
+OUTLIER = 4.0
+
+VELOCITY, DOWN, BIAS = slice(0, 3), slice(3, 6), slice(6, 9)
+
+
+@dataclass(frozen=True)
+class ImuEstimate:
+    """Velocity of the IMU and gravity in the world, biases in IMU axes; SI units.
+
+    covariance : (9, 9) of velocity, gravity and accelerometer bias; gyro_covariance : (3, 3)
+    """
+
+    velocity: Floats
+    gravity: Floats
+    accel_bias: Floats
+    gyro_bias: Floats
+    covariance: Floats = field(repr=False)
+    gyro_covariance: Floats = field(repr=False)
+
+    def over(self, imu: ImuStream, instants_ns: NDArray[np.int64]) -> Increments:
+        """What the IMU felt between increasing instants, biases taken off."""
+        return integrate(imu, instants_ns, self.gyro_bias, self.accel_bias)
+
+    def carried(self, step: Increments, R: Floats) -> ImuEstimate:
+        """The estimate at the last instant of `step`, with nothing but the IMU to go by; R (3, 3) of the IMU at the first."""
+        x, P = _propagate(self, step, R)
+        return self._with(x[3:], P[3:, 3:], step)
+
+    def corrected(
+        self, imu: ImuStream, instants_ns: NDArray[np.int64], R: Floats, R_end: Floats, moved: Floats
+    ) -> ImuEstimate:
+        """The estimate at the last instant, now that registration says how the IMU got there.
+
+        R, R_end : (3, 3) of the IMU in the world at the first and the last instant; moved : (3,) m in between
+        """
+        step = self.over(imu, instants_ns)
+        rest = so3.log((R @ step.rotations[-1]).T @ R_end)
+        arm = step.rotations[-1].T @ step.velocity_arms[-1]
+        turned = self._turned(rest, arm, float(step.seconds[-1]))
+        # The shape of the turn is the gyroscope's, its sum is registration's.
+        step = integrate(imu, instants_ns, self.gyro_bias - np.linalg.solve(arm, rest), self.accel_bias)
+        x, P = _propagate(self, step, R)
+        H = np.zeros((3, 12))
+        H[:, :3] = np.eye(3)
+        x, P = _update(x, P, H, moved - x[:3], 2 * PLACE_SIGMA**2 * np.eye(3))
+        down = x[6:9]
+        norm = float(np.linalg.norm(down))
+        H = np.zeros((1, 12))
+        H[0, 6:9] = down / norm
+        x, P = _update(x, P, H, np.array([GRAVITY - norm]), np.array([[GRAVITY_SIGMA**2]]))
+        return turned._with(x[3:], P[3:, 3:], step)
+
+    def _turned(self, rest: Floats, arm: Floats, seconds: float) -> ImuEstimate:
+        """With the gyroscope's bias learnt from the turn `rest` (3,) that its readings leave open after `seconds`."""
+        noise = (2 * TURN_SIGMA**2 + RATE_NOISE**2 * seconds) * np.eye(3)
+        P = self.gyro_covariance + GYRO_WALK**2 * seconds * np.eye(3)
+        bias, P = _update(self.gyro_bias, P, -arm, rest, noise)
+        return replace(self, gyro_bias=bias, gyro_covariance=P)
+
+    def _with(self, x: Floats, P: Floats, step: Increments) -> ImuEstimate:
+        walk = np.zeros((9, 9))
+        np.fill_diagonal(walk, np.repeat([0.0, GRAVITY_WALK**2, ACCEL_WALK**2], 3) * step.seconds[-1])
+        return replace(self, velocity=x[VELOCITY], gravity=x[DOWN], accel_bias=x[BIAS], covariance=P + walk)
+
+
+def _propagate(estimate: ImuEstimate, step: Increments, R: Floats) -> tuple[Floats, Floats]:
+    """Mean (12,) and covariance (12, 12) of displacement, velocity, gravity and accelerometer bias at the end of `step`."""
+    t = float(step.seconds[-1])
+    _, velocities, moved = step.motion(0, R, estimate.velocity, estimate.gravity)
+    F = np.zeros((12, 9))
+    F[0:3] = np.hstack([t * np.eye(3), 0.5 * t**2 * np.eye(3), -R @ step.position_arms[-1]])
+    F[3:6] = np.hstack([np.eye(3), t * np.eye(3), -R @ step.velocity_arms[-1]])
+    F[6:, 3:] = np.eye(6)
+    P = F @ estimate.covariance @ F.T
+    noise = FORCE_NOISE**2 * np.array([[t**3 / 3, t**2 / 2], [t**2 / 2, t]])
+    P[:6, :6] += np.kron(noise, np.eye(3))
+    return np.concatenate([moved[-1], velocities[-1], estimate.gravity, estimate.accel_bias]), P
+
+
+def _update(x: Floats, P: Floats, H: Floats, rest: Floats, noise: Floats) -> tuple[Floats, Floats]:
+    """One Kalman update by the innovation `rest`; an outlier's noise is raised to what it shows."""
+    S = H @ P @ H.T + noise
+    surprise = float(rest @ np.linalg.solve(S, rest)) / (len(rest) * OUTLIER**2)
+    if surprise > 1:
+        noise = noise * surprise
+        S = H @ P @ H.T + noise
+    K = np.linalg.solve(S, H @ P).T
+    left = np.eye(len(x)) - K @ H
+    return x + K @ rest, left @ P @ left.T + K @ noise @ K.T

@@ -1,0 +1,167 @@
+"""The IMU as a motion model: it predicts scans and the motion within them, and learns from where registration put them."""
+
+from __future__ import annotations
+
+import logging
+from collections import deque
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.config.imu import ImuConfig
+from lslam.geometry import se3, so3
+from lslam.inertial.estimate import ImuEstimate
+from lslam.inertial.stream import gaps
+from lslam.preprocessing.deskew import KNOTS
+from lslam.registration.motion import ConstantVelocity, middle_of
+from lslam.types.imu import ImuStream
+from lslam.types.motion_prior import MotionPrior
+
+Floats = NDArray[np.float64]
+log = logging.getLogger("lslam")
+
+# Half the points of a scan are nearer: what a wrong turn moves them by.
+LEVER_M = 10.0
+
+
+class InertialMotion:
+    """Predicts with the IMU where it has samples, and with constant velocity where it has none.
+
+    imu : cleaned, on the clock of the scans; T_lidar_imu : (4, 4); estimate : at the first scan, in the LiDAR frame there
+    """
+
+    # Of so many scans the IMU must predict the typical one not clearly worse than constant velocity does.
+    JUDGED, WORSE, SLACK_M = 30, 2.0, 0.02
+
+    def __init__(self, imu: ImuStream, T_lidar_imu: Floats, estimate: ImuEstimate, config: ImuConfig) -> None:
+        self.imu, self.T_lidar_imu, self.config = imu, T_lidar_imu, config
+        self.T_imu_lidar = se3.inverse(T_lidar_imu)
+        self.estimate = estimate
+        self.coasting = ConstantVelocity()
+        self.refusal = ""
+        self.gap_scans = 0
+        self._gaps = gaps(imu, config.gap_s)
+        self._instant_ns: int | None = None
+        self._pose = np.eye(4)
+        self._errors: deque[tuple[float, float]] = deque(maxlen=self.JUDGED)
+
+    @property
+    def is_known(self) -> bool:
+        """Whether there is a velocity: from the start on."""
+        return self.coasting.is_known if self.refusal else True
+
+    def sweep(self, stamp_ns: int, span_s: float) -> MotionPrior:
+        """Poses from scan start over the `span_s` seconds that the sweep takes; one pose when it takes none."""
+        if self.refusal:
+            return self.coasting.sweep(stamp_ns, span_s)
+        anchor_ns, anchor = (stamp_ns, self._pose) if self._instant_ns is None else (self._instant_ns, self._pose)
+        if not self._covers(anchor_ns, stamp_ns + round(1e9 * span_s)):
+            return self.coasting.sweep(stamp_ns, span_s)
+        return self._prior(self.estimate, anchor_ns, anchor, stamp_ns, span_s)
+
+    def refine(self, prior: MotionPrior, stamp_ns: int, start: Floats) -> MotionPrior:
+        """The sweep's motion again, now that registration gave the pose `start` (4, 4) for `prior`."""
+        span = float(prior.times[-1])
+        middle, instant_ns = middle_of(prior, stamp_ns, start)
+        end_ns = stamp_ns + round(1e9 * span)
+        if self.refusal or span <= 0 or self._instant_ns is None or not self._covers(self._instant_ns, end_ns):
+            return self.coasting.refine(prior, stamp_ns, start)
+        if self.config.velocity == "integrated":
+            return prior
+        return self._prior(self._corrected(instant_ns, middle), instant_ns, middle, stamp_ns, span)
+
+    def correct(
+        self, stamp_ns: int, pose: Floats, prior: MotionPrior | None = None, is_registered: bool = True
+    ) -> None:
+        """Take the pose (4, 4) found at `stamp_ns` as the newest; `prior` says how its sweep moved.
+
+        Where no registration stands behind it (`is_registered`), it teaches nothing.
+        """
+        middle, instant_ns = (pose, stamp_ns) if prior is None else middle_of(prior, stamp_ns, pose)
+        if not self.refusal:
+            if self._instant_ns is not None and not self._covers(self._instant_ns, instant_ns):
+                self.gap_scans += 1
+                self._restart(instant_ns, middle)
+            elif self._instant_ns is not None and instant_ns > self._instant_ns:
+                if is_registered:
+                    self._judge(stamp_ns, pose)
+                    self.estimate = self._corrected(instant_ns, middle)
+                else:
+                    self.estimate = self._carried(instant_ns)
+            elif self._instant_ns is None:
+                self.estimate = self._advanced(stamp_ns, instant_ns)
+        self.coasting.correct(stamp_ns, pose, prior)
+        self._instant_ns, self._pose = instant_ns, middle.copy()
+
+    def _prior(
+        self, estimate: ImuEstimate, anchor_ns: int, anchor: Floats, stamp_ns: int, span_s: float
+    ) -> MotionPrior:
+        times = np.linspace(0.0, span_s, KNOTS) if span_s > 0 else np.zeros(1)
+        wanted = stamp_ns + np.round(1e9 * times).astype(np.int64)
+        instants = np.unique(np.append(wanted, anchor_ns))
+        T_world_imu = anchor @ self.T_lidar_imu
+        k = int(np.searchsorted(instants, anchor_ns))
+        step = estimate.over(self.imu, instants)
+        R, _, moved = step.motion(k, T_world_imu[:3, :3], estimate.velocity, estimate.gravity)
+        poses = se3.make(R, T_world_imu[:3, 3] + moved) @ self.T_imu_lidar
+        return MotionPrior(times, se3.normalise(poses[np.searchsorted(instants, wanted)]))
+
+    def _corrected(self, instant_ns: int, middle: Floats) -> ImuEstimate:
+        """The estimate at `instant_ns`, where registration put the LiDAR at `middle` (4, 4)."""
+        if self.config.velocity == "integrated":
+            return self._carried(instant_ns)
+        assert self._instant_ns is not None
+        a, b = self._pose @ self.T_lidar_imu, middle @ self.T_lidar_imu
+        instants = np.array([self._instant_ns, instant_ns])
+        return self.estimate.corrected(self.imu, instants, a[:3, :3], b[:3, :3], b[:3, 3] - a[:3, 3])
+
+    def _carried(self, instant_ns: int) -> ImuEstimate:
+        assert self._instant_ns is not None
+        step = self.estimate.over(self.imu, np.array([self._instant_ns, instant_ns]))
+        return self.estimate.carried(step, (self._pose @ self.T_lidar_imu)[:3, :3])
+
+    def _advanced(self, stamp_ns: int, instant_ns: int) -> ImuEstimate:
+        """The estimate of the first scan's start at the middle of its sweep."""
+        if instant_ns <= stamp_ns or not self._covers(stamp_ns, instant_ns):
+            return self.estimate
+        step = self.estimate.over(self.imu, np.array([stamp_ns, instant_ns]))
+        return self.estimate.carried(step, self.T_lidar_imu[:3, :3])
+
+    def _restart(self, instant_ns: int, middle: Floats) -> None:
+        """After a gap the velocity is what registration says over the gap, and doubtful."""
+        assert self._instant_ns is not None
+        moved = (middle @ self.T_lidar_imu)[:3, 3] - (self._pose @ self.T_lidar_imu)[:3, 3]
+        covariance = self.estimate.covariance.copy()
+        covariance[:3, :] = covariance[:, :3] = 0.0
+        covariance[:3, :3] = np.eye(3)
+        e = self.estimate
+        seconds = max(1e-9 * (instant_ns - self._instant_ns), 1e-3)
+        self.estimate = ImuEstimate(
+            moved / seconds, e.gravity, e.accel_bias, e.gyro_bias, covariance, e.gyro_covariance
+        )
+
+    def _judge(self, stamp_ns: int, pose: Floats) -> None:
+        """Refuse an IMU that predicts scans clearly worse than constant velocity does."""
+        assert self._instant_ns is not None
+        if not self.coasting.is_known or self.config.velocity == "integrated":
+            return
+        mine = self._prior(self.estimate, self._instant_ns, self._pose, stamp_ns, 0.0).start
+        self._errors.append((_distance(mine, pose), _distance(self.coasting.predict(stamp_ns), pose)))
+        if len(self._errors) < self.JUDGED:
+            return
+        own, steady = (float(v) for v in np.median(np.array(self._errors), axis=0))
+        if own > self.WORSE * steady + self.SLACK_M:
+            self.refusal = (
+                f"it predicts scans {own:.3f} m wrong where constant velocity is {steady:.3f} m wrong (turns counted at "
+                f"{LEVER_M:.0f} m): check its axes, T_lidar_imu and its stamps"
+            )
+            log.warning("the IMU is refused from here on: %s", self.refusal)
+
+    def _covers(self, begin_ns: int, end_ns: int) -> bool:
+        """Whether there are samples without a gap from one instant to the other."""
+        return not bool(((self._gaps[:, 0] < end_ns) & (self._gaps[:, 1] > begin_ns)).any())
+
+
+def _distance(a: Floats, b: Floats) -> float:
+    delta = se3.relative(a, b)
+    return float(np.linalg.norm(delta[:3, 3]) + LEVER_M * so3.angle(delta[:3, :3]))

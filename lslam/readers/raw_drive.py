@@ -1,0 +1,116 @@
+"""The IMU of a KITTI odometry sequence: the benchmark leaves it out, the raw drive it was cut from has it."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from lslam.errors import InputError
+from lslam.formats.kitti_calib import read_rigid
+from lslam.formats.oxts_files import ACCEL, GYRO, Oxts, read_oxts
+from lslam.formats.stamps_files import read_stamps
+from lslam.readers.folder_sequence import FolderSequence
+from lslam.readers.kitti_odometry import KIND
+from lslam.types.imu import ImuStream
+from lslam.types.sequence import Sequence
+
+# Sequence -> drive and its first frame (KITTI odometry development kit).
+DRIVES = {
+    "00": ("2011_10_03", 27, 0),
+    "01": ("2011_10_03", 42, 0),
+    "02": ("2011_10_03", 34, 0),
+    "03": ("2011_09_26", 67, 0),
+    "04": ("2011_09_30", 16, 0),
+    "05": ("2011_09_30", 18, 0),
+    "06": ("2011_09_30", 20, 0),
+    "07": ("2011_09_30", 27, 0),
+    "08": ("2011_09_30", 28, 1100),
+    "09": ("2011_09_30", 33, 0),
+    "10": ("2011_09_30", 34, 0),
+}
+CALIBRATION = "calib_imu_to_velo.txt"
+# The sequence lies so many folders below the data root at most: kitti/dataset/sequences/NN.
+_UPWARDS = 4
+
+
+def with_imu(sequence: Sequence, data_root: Path | None = None) -> Sequence:
+    """The sequence with an IMU: its own, else, for a KITTI odometry sequence, that of its raw drive.
+
+    The drive is looked for below `data_root`, LSLAM_DATA and the folders the sequence lies in, as
+    `raw/<date>/<drive>_extract` (100 Hz) or `_sync` (10 Hz), with `calib_imu_to_velo.txt` beside it.
+
+    Raises InputError naming the paths looked at.
+    """
+    if sequence.imu is not None:
+        return sequence
+    number = sequence.path.name
+    if not isinstance(sequence, FolderSequence) or sequence.kind != KIND or number not in DRIVES:
+        raise InputError(
+            f"{sequence.path} has no IMU: looked for {sequence.path / 'imu.csv'} and `imu` in sequence.toml there; "
+            "add it, or run without --imu"
+        )
+    date, drive, first = DRIVES[number]
+    folders = [
+        root / date / f"{date}_drive_{drive:04d}_{kind}"
+        for kind in ("extract", "sync")
+        for root in _raw_roots(sequence.path, data_root)
+    ]
+    found = next((f for f in folders if (f / "oxts" / "data").is_dir()), None)
+    if found is None:
+        looked = ", ".join(str(f / "oxts") for f in folders)
+        raise InputError(
+            f"{sequence.path} has no IMU, as in KITTI odometry: looked for {sequence.path / 'imu.csv'} and the raw drive in "
+            f"{looked}; fetch {date}_drive_{drive:04d}_sync or _extract, or run without --imu"
+        )
+    return _joined(sequence, found, first)
+
+
+def _joined(sequence: FolderSequence, drive: Path, first: int) -> FolderSequence:
+    calibration = drive.parent / CALIBRATION
+    if not calibration.is_file():
+        raise InputError(f"{calibration} is missing: it says how the IMU sits, fetch the calibration of that day")
+    T_lidar_imu = read_rigid(calibration)
+    oxts = read_oxts(drive / "oxts")
+    if oxts is None or oxts.stamps_ns is None or not len(oxts.stamps_ns):
+        raise InputError(f"{drive / 'oxts'} holds no samples with stamps (data/*.txt and timestamps.txt)")
+    begin_ns, clock = _begin(drive, oxts, first)
+    stamps = oxts.stamps_ns - begin_ns + int(sequence.stamps_ns[0])
+    imu = ImuStream(stamps, oxts.values[:, ACCEL].copy(), oxts.values[:, GYRO].copy())
+    rate = 1e9 / float(np.median(np.diff(stamps))) if len(stamps) > 1 else 0.0
+    note = f"IMU of {drive} at {rate:.0f} Hz, its frame {first} by {clock} taken as the first scan"
+    return replace(
+        sequence, imu=imu, calibration=replace(sequence.calibration, T_lidar_imu=T_lidar_imu),
+        notes=[*sequence.notes, note], problems=[*sequence.problems, *oxts.problems],
+    )  # fmt: skip
+
+
+def _begin(drive: Path, oxts: Oxts, first: int) -> tuple[int, str]:
+    """When the first scan was taken, ns, and which file says so: camera 0 is what KITTI's times.txt counts from."""
+    assert oxts.stamps_ns is not None
+    sync = drive.with_name(drive.name.replace("_extract", "_sync"))
+    for path in (sync / "image_00" / "timestamps.txt", sync / "velodyne_points" / "timestamps.txt"):
+        if path.is_file():
+            stamps = read_stamps(path)
+            if len(stamps) > first:
+                return int(stamps[first]), f"{path.parent.name}/{path.name}"
+    if drive == sync:
+        k = int(np.searchsorted(oxts.numbers, first))
+        if k < len(oxts.numbers):
+            return int(oxts.stamps_ns[k]), "oxts/timestamps.txt"
+    if sync != drive and (sync / "oxts" / "timestamps.txt").is_file():
+        stamps = read_stamps(sync / "oxts" / "timestamps.txt")
+        if len(stamps) > first:
+            return int(stamps[first]), f"{sync.name}/oxts/timestamps.txt"
+    raise InputError(
+        f"{drive} does not say when its frame {first} was taken: image_00/timestamps.txt of {sync} is needed"
+    )
+
+
+def _raw_roots(sequence: Path, data_root: Path | None) -> list[Path]:
+    """`raw` folders that may hold the drive, the most likely first."""
+    roots = [p for p in (data_root, os.environ.get("LSLAM_DATA")) if p]
+    places = [Path(p).expanduser() for p in roots] + list(sequence.parents)[1 : 1 + _UPWARDS]
+    return list(dict.fromkeys(place / "raw" for place in places))

@@ -1,0 +1,170 @@
+"""What is found out about an IMU at the start, and which ones are refused, with true poses for registration's."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from imu_drives import ACCEL_BIAS, GYRO_BIAS, drone, extrinsics_of, late, stream_of, truth_of, walk
+
+from lslam.config.imu import ImuConfig
+from lslam.geometry import se3, so3
+from lslam.inertial.initialise import Start, start, vertical
+from lslam.inertial.stream import ImuRefusedError, clean, gaps
+from lslam.simulation.scenarios import SimulatedDrive
+from lslam.types.imu import ImuStream
+
+
+def begun(drive: SimulatedDrive, imu: ImuStream | None = None, *, T_lidar_imu: object = None, **keys: object) -> Start:
+    """The start after five seconds of true poses with the noise of a registration."""
+    stamps, poses = truth_of(drive, 50)
+    rng = np.random.default_rng(3)
+    noisy = poses @ se3.exp(rng.normal(0, [0.002] * 3 + [2e-4] * 3, (len(poses), 6)))
+    return start(
+        stream_of(drive) if imu is None else imu,
+        extrinsics_of(drive) if T_lidar_imu is None else np.asarray(T_lidar_imu),
+        stamps, noisy, int(drive.stamps_ns[-1]), ImuConfig.model_validate(keys),
+    )  # fmt: skip
+
+
+def spoilt(imu: ImuStream, **values: object) -> ImuStream:
+    return dataclasses.replace(imu, **values)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("make", [walk, drone])
+def test_a_moving_start_finds_speed_biases_and_gravity(make: object) -> None:
+    drive: SimulatedDrive = make()  # type: ignore[operator]
+    found = begun(drive)
+    assert drive.readings.imu is not None
+    truth, T_world_city = drive.readings.imu.truth, np.linalg.inv(drive.T_city_world)
+    assert not found.is_static
+    # Axes that feel 2 % of each other add 0.2 m/s2 of gravity to two biases, and 2 % of any turn.
+    assert np.abs(found.estimate.gyro_bias - GYRO_BIAS).max() < 0.012
+    down = T_world_city[:3, :3] @ [0, 0, -9.80665]
+    felt = found.estimate.accel_bias - extrinsics_of(drive)[:3, :3].T @ found.estimate.gravity
+    meant = ACCEL_BIAS + np.array([0.02, 0.02, 0]) * 9.8 - extrinsics_of(drive)[:3, :3].T @ down
+    assert np.abs(felt - meant).max() < 0.25
+    velocity = T_world_city[:3, :3] @ truth.velocity[0]
+    assert np.linalg.norm(found.estimate.velocity - velocity) < 0.1
+
+
+def test_a_static_start_is_seen_and_levels_to_half_a_degree() -> None:
+    drive = walk("icm20948-calibrated", static_start=2.0)
+    found = begun(drive)
+    assert found.is_static
+    assert np.linalg.norm(found.estimate.velocity) < 0.02
+    assert np.abs(found.estimate.gyro_bias).max() < 5e-4
+    upright = vertical(found.estimate) @ np.linalg.inv(drive.T_city_world)[:3, :3]
+    assert np.rad2deg(np.arccos(upright[2, 2])) < 0.5
+
+
+def test_stamps_that_are_late_are_moved_back() -> None:
+    drive = walk()
+    for wrong in (0.02, -0.035):
+        found = begun(drive, late(stream_of(drive), wrong))
+        assert found.offset_s == pytest.approx(-wrong, abs=2e-3)
+        assert any("stamps moved" in note for note in found.notes)
+    assert begun(drive).offset_s == pytest.approx(0.0, abs=2e-3)
+
+
+def test_a_given_offset_and_given_values_are_taken() -> None:
+    drive = drone()
+    found = begun(
+        drive, late(stream_of(drive), 3.0), time_offset_s=-3.0, gyro_bias=(GYRO_BIAS,) * 3, initial_velocity=(9.0, 0, 0)
+    )
+    assert found.offset_s == -3.0
+    assert np.abs(found.estimate.gyro_bias - GYRO_BIAS).max() < 6e-3
+    assert np.linalg.norm(found.estimate.velocity - [9.0, 0, 0]) < 0.1
+
+
+def test_g_is_converted_and_said() -> None:
+    drive = walk()
+    imu = stream_of(drive)
+    found = begun(drive, spoilt(imu, accel=imu.accel / 9.80665))
+    assert np.linalg.norm(found.estimate.gravity) == pytest.approx(9.81, abs=0.1)
+    assert any("in g" in note for note in found.notes)
+
+
+def test_a_slow_imu_says_what_it_cannot_do() -> None:
+    drive = walk()
+    imu = stream_of(drive)
+    found = begun(drive, ImuStream(imu.stamps_ns[::10], imu.accel[::10], imu.gyro[::10]))
+    assert any("10 Hz" in note for note in found.notes)
+
+
+ROLLED = np.roll(np.eye(3), 1, axis=0)
+
+
+@pytest.mark.parametrize(
+    ("kind", "says"),
+    [
+        ("zeros", "repeats one reading"),
+        ("degrees", "deg/s"),
+        ("no gravity", "neither in m/s2"),
+        ("axes", "T_lidar_imu"),
+        ("sign", "do not fit"),
+        ("seconds late", "imu.time_offset_s"),
+        ("hours late", "imu.time_offset_s"),
+        ("noise", "check"),
+        ("not finite", "not finite"),
+        ("going back", "go back"),
+        ("empty", "0 usable"),
+    ],
+)
+def test_garbage_is_refused_with_a_reason(kind: str, says: str) -> None:
+    drive = walk()
+    imu = stream_of(drive)
+    rng = np.random.default_rng(0)
+    nan = imu.gyro.copy()
+    nan[::4] = np.nan
+    bad = {
+        "zeros": lambda: spoilt(imu, accel=imu.accel * 0, gyro=imu.gyro * 0),
+        "degrees": lambda: spoilt(imu, gyro=np.rad2deg(imu.gyro)),
+        "no gravity": lambda: spoilt(imu, accel=imu.accel - imu.accel.mean(axis=0)),
+        "axes": lambda: spoilt(imu, gyro=imu.gyro @ ROLLED.T),
+        "sign": lambda: spoilt(imu, gyro=-imu.gyro),
+        "seconds late": lambda: late(imu, 1.5),
+        "hours late": lambda: late(imu, 3600.0),
+        "noise": lambda: spoilt(imu, gyro=rng.normal(0, imu.gyro.std(), imu.gyro.shape)),
+        "not finite": lambda: spoilt(imu, gyro=nan),
+        "going back": lambda: spoilt(imu, stamps_ns=imu.stamps_ns[::-1].copy()),
+        "empty": lambda: ImuStream(imu.stamps_ns[:0], imu.accel[:0], imu.gyro[:0]),
+    }[kind]()
+    with pytest.raises(ImuRefusedError, match=says):
+        begun(drive, bad)
+
+
+def test_wrong_extrinsics_are_named_with_the_turn_that_would_mend_them() -> None:
+    drive = walk()
+    with pytest.raises(ImuRefusedError, match=r"turned by 1[12]\d deg"):
+        begun(drive, T_lidar_imu=se3.make(ROLLED, np.zeros(3)))
+
+
+def test_few_bad_samples_are_left_out_and_counted() -> None:
+    imu = stream_of(walk())
+    accel, stamps = imu.accel.copy(), imu.stamps_ns.copy()
+    accel[7, 1] = np.inf
+    stamps[20:23] -= 200_000_000
+    cleaned = clean(ImuStream(stamps, accel, imu.gyro), 0, int(stamps[-1]))
+    assert len(cleaned.imu) == len(imu) - 4
+    assert (np.diff(cleaned.imu.stamps_ns) > 0).all()
+    assert [note.split(" of ")[0] for note in cleaned.notes] == ["IMU: 1", "IMU: 3"]
+
+
+def test_gaps_are_longer_than_the_limit_and_than_a_slow_rate() -> None:
+    fast = ImuStream(np.array([0, 10, 20, 170, 180]) * 1_000_000, np.zeros((5, 3)), np.zeros((5, 3)))
+    assert gaps(fast, 0.1)[1:-1].tolist() == [[20_000_000, 170_000_000]]
+    slow = ImuStream(np.arange(9) * 101_000_000, np.zeros((9, 3)), np.zeros((9, 3)))
+    assert len(gaps(slow, 0.1)) == 2
+    assert gaps(slow, 0.1)[0, 1] < 0
+    assert gaps(slow, 0.1)[-1, 0] > 808_000_000
+
+
+def test_vertical_turns_any_gravity_downwards() -> None:
+    estimate = begun(walk()).estimate
+    for direction in (np.array([0, 0, -1.0]), np.array([0, 0, 1.0]), np.array([1.0, 2, 3]), np.array([0.01, 0, -1])):
+        R = vertical(dataclasses.replace(estimate, gravity=9.8 * direction))
+        np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-9)
+        np.testing.assert_allclose(R @ direction / np.linalg.norm(direction), [0, 0, -1], atol=1e-6)
+    assert so3.angle(vertical(dataclasses.replace(estimate, gravity=np.array([0, 0.1, -1])))) < 0.11
