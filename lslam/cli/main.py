@@ -19,6 +19,7 @@ COMMANDS = {
     "eval": "Score estimated trajectories against ground truth.",
     "compare": "Compare methods on the same sequences.",
     "simulate": "Simulate a drive with exact ground truth.",
+    "convert": "Convert a sequence to a bag or KITTI's layout, or a trajectory to another format.",
     "info": "Show what is in a sequence and what is wrong with it.",
     "methods": "List the odometry methods.",
     "config": "Show or check a configuration.",

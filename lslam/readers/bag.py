@@ -40,6 +40,7 @@ class BagSequence:
 
     messages : (N,) int64, which message of `topic` each scan is; headers_ns : (N,) int64, stamps of their headers
     time_rule : how per-point times are understood, None when there are none or they are not to be used
+    has_assumed_extrinsics : nothing says where the IMU sits, the identity stands in
     """
 
     name: str
@@ -61,6 +62,7 @@ class BagSequence:
     time_rule: TimeRule | None = None
     rings: int | None = None
     sensor: str | None = None
+    has_assumed_extrinsics: bool = False
 
     def __len__(self) -> int:
         return len(self.messages)
@@ -130,7 +132,7 @@ def open_folder(path: Path, overrides: SequenceInfo, why: str) -> BagSequence:
         if stream is not None and (stream.stamps_ns[0] > stamps[-1] or stream.stamps_ns[-1] < stamps[0]):
             voice.problems.append(f"{what}: it shares no time with the scans")
     transforms = bag_streams.read_static_transforms(bag, voice.problems)
-    sequence.calibration = find_extrinsics(transforms, frame, imu, gnss, info, voice)
+    sequence.calibration, sequence.has_assumed_extrinsics = find_extrinsics(transforms, frame, imu, gnss, info, voice)
     sequence.ground_truth = find_truth(bag, transforms, frame, voice)
     if imu is not None:
         sequence.imu = ImuStream(imu.stamps_ns, imu.values[:, :3].copy(), imu.values[:, 3:].copy())

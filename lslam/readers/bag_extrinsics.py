@@ -25,13 +25,14 @@ _TRUTH = re.compile(r"(^|[/_])(ground_?truth|gt)([/_]|$)", re.IGNORECASE)
 
 def find_extrinsics(
     transforms: Transforms, lidar: str, imu: Stream | None, gnss: Stream | None, info: SequenceInfo, voice: Voice
-) -> Calibration:
-    """Extrinsics that the user or the recording states, else from /tf_static, else the identity with a warning.
+) -> tuple[Calibration, bool]:
+    """Extrinsics that the user or the recording states, else from /tf_static, else the identity with a warning (True).
 
     transforms : `T_parent_child` of /tf_static; lidar : the frame of the scans
     """
     T_cam0_lidar = chain(transforms, CAMERA, lidar) if info.T_cam0_lidar is None else info.T_cam0_lidar
     T_lidar_imu, T_lidar_gnss = info.T_lidar_imu, info.T_lidar_gnss
+    is_assumed = False
     if imu is not None and T_lidar_imu is None:
         T_lidar_imu = _find(transforms, lidar, imu.frame, "IMU", voice)
         if T_lidar_imu is None:
@@ -39,14 +40,14 @@ def find_extrinsics(
                 f"extrinsics: {_why_not(transforms, lidar, imu.frame)}, so the IMU is taken to sit in the LiDAR, axes alike; "
                 "--extrinsics states T_lidar_imu"
             )
-            T_lidar_imu = np.eye(4)
+            T_lidar_imu, is_assumed = np.eye(4), True
     if gnss is not None and T_lidar_gnss is None:
         T_lidar_gnss = _find(transforms, lidar, gnss.frame, "GNSS", voice)
         if T_lidar_gnss is None:
             voice.notes.append(
                 f"extrinsics: {_why_not(transforms, lidar, gnss.frame)}: the place of the antenna is unknown"
             )
-    return Calibration(T_cam0_lidar, T_lidar_imu, T_lidar_gnss)
+    return Calibration(T_cam0_lidar, T_lidar_imu, T_lidar_gnss), is_assumed
 
 
 def find_truth(bag: Bag, transforms: Transforms, lidar: str, voice: Voice) -> Trajectory | None:

@@ -13,17 +13,14 @@ from pathlib import Path
 import numpy as np
 
 from lslam.errors import OutputError, OutputExistsError
-from lslam.formats.atomic import atomic_write
-from lslam.formats.pose_rows import seconds_text
+from lslam.formats.kitti_layout import PER_POINT, POINTS, in_camera, write_calib, write_times
 from lslam.formats.sequence_toml import FILE_NAME, SequenceInfo, write_sequence_toml
 from lslam.formats.trajectory_files import write_kitti
-from lslam.geometry import se3
 from lslam.simulation.manifest import write_manifest
 from lslam.simulation.osm_extract import write_extracts
 from lslam.simulation.scenarios import SimulatedDrive
 from lslam.simulation.sensors import GNSS_FILE, IMU_FILE, TRUTH, write_readings, write_truth
-from lslam.simulation.stream import MARK, PER_POINT, POINTS, fingerprint, read_mark, write_mark, write_scans
-from lslam.types.trajectory import Trajectory
+from lslam.simulation.stream import MARK, fingerprint, read_mark, write_mark, write_scans
 
 log = logging.getLogger("lslam")
 
@@ -77,7 +74,10 @@ def record(
         write_mark(part, drive)
         points = write_scans(drive, part, on_scan)
         _write_sides(drive, part)
-        write_kitti(poses, _in_camera(drive))
+        truth, T_cam0_lidar = drive.ground_truth, drive.calibration.T_cam0_lidar
+        assert truth is not None
+        assert T_cam0_lidar is not None
+        write_kitti(poses, in_camera(truth, T_cam0_lidar))
         (part / MARK).unlink()
         if sequence.exists():
             shutil.rmtree(sequence)
@@ -163,10 +163,8 @@ def _write_texts(drive: SimulatedDrive, folder: Path) -> None:
     """times.txt, calib.txt and sequence.toml."""
     T_cam0_lidar = drive.calibration.T_cam0_lidar
     assert T_cam0_lidar is not None
-    with atomic_write(folder / "times.txt") as stream:
-        stream.write("".join(f"{seconds_text(int(stamp))}\n" for stamp in drive.stamps_ns).encode())
-    with atomic_write(folder / "calib.txt") as stream:
-        stream.write(("Tr: " + " ".join(f"{v:.12e}" for v in T_cam0_lidar[:3].ravel()) + "\n").encode())
+    write_times(folder, drive.stamps_ns)
+    write_calib(folder, T_cam0_lidar)
     info = SequenceInfo(
         name=drive.name,
         sensor=f"simulated {drive.lidar.name}",
@@ -185,12 +183,3 @@ def _write_texts(drive: SimulatedDrive, folder: Path) -> None:
         T_lidar_gnss=drive.calibration.T_lidar_gnss,
     )
     write_sequence_toml(folder / FILE_NAME, info)
-
-
-def _in_camera(drive: SimulatedDrive) -> Trajectory:
-    """The ground truth as KITTI has it: camera 0 in camera 0 at the start."""
-    truth, T_cam0_lidar = drive.ground_truth, drive.calibration.T_cam0_lidar
-    assert truth is not None
-    assert T_cam0_lidar is not None
-    poses = T_cam0_lidar @ truth.poses @ se3.inverse(T_cam0_lidar)
-    return Trajectory(truth.stamps_ns, poses, "cam0", source=truth.source)

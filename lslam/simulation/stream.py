@@ -13,12 +13,11 @@ from pathlib import Path
 import numpy as np
 
 from lslam.formats.atomic import atomic_write
-from lslam.formats.point_files import write_points
+from lslam.formats.kitti_layout import scan_files, write_scan
 from lslam.simulation.scenarios import SimulatedDrive
 from lslam.types.scan import Scan
 from lslam.version import __version__
 
-POINTS, PER_POINT = "velodyne", "per_point"
 MARK = "simulation.json"
 TRACERS = 2  # threads; Embree and NumPy let each other run
 AHEAD = 4  # scans traced and not yet written, at most
@@ -61,29 +60,22 @@ def write_scans(drive: SimulatedDrive, folder: Path, on_scan: Callable[[int], No
 
     `on_scan` is called with the index of every scan, in order, when it is on disk.
     """
-    missing = [index for index in range(len(drive)) if not _files(folder, index)[1].is_file()]
+    missing = [index for index in range(len(drive)) if not scan_files(folder, index)[1].is_file()]
     fresh = _traced(drive, missing)
     total = 0
     for index in range(len(drive)):
-        points, beside = _files(folder, index)
+        points, beside = scan_files(folder, index)
         if beside.is_file():
             total += points.stat().st_size // 16
         else:
             scan = next(fresh)
             total += len(scan)
-            write_points(points, scan.points, scan.intensity)
             # All rays of a compensated scan were fired at its stamp.
             times = np.zeros(len(scan), np.float32) if scan.times is None else scan.times
-            # This file comes last: where it is, the scan is whole.
-            with atomic_write(beside) as stream:
-                np.savez_compressed(stream, t=times, ring=scan.rings)  # type: ignore[arg-type]
+            write_scan(folder, index, scan.points, scan.intensity, times, scan.rings)
         if on_scan is not None:
             on_scan(index)
     return total
-
-
-def _files(folder: Path, index: int) -> tuple[Path, Path]:
-    return folder / POINTS / f"{index:06d}.bin", folder / PER_POINT / f"{index:06d}.npz"
 
 
 def _traced(drive: SimulatedDrive, indices: list[int]) -> Iterator[Scan]:

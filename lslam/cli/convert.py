@@ -1,0 +1,142 @@
+"""`lslam convert`: a sequence in another layout, a trajectory in another format."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from lslam.cli import options
+
+if TYPE_CHECKING:
+    from lslam.types.calibration import Calibration
+    from lslam.types.sequence import Sequence
+    from lslam.types.trajectory import Trajectory
+
+SEQUENCES, TRAJECTORIES = ("bag", "mcap", "sqlite", "kitti"), ("kitti", "tum", "euroc")
+EPILOG = """\b
+Examples:
+  lslam convert seq07 --data-root ~/kitti --to mcap --zstd --out seq07.mcap
+  lslam convert drive.bag --to kitti --out drive
+  lslam convert runs/first --to euroc --frame lidar --out first.csv
+  lslam convert drive.bag --deskewed runs/drive --to kitti --out drive_deskewed
+"""
+
+
+@click.command(epilog=EPILOG)
+@click.argument("source")
+@click.option(
+    "--to", "kind", required=True, type=click.Choice(list(dict.fromkeys(SEQUENCES + TRAJECTORIES))),
+    help="bag is ROS 1, mcap and sqlite are ROS 2; tum and euroc are for trajectories, kitti for both.",
+)  # fmt: skip
+@click.option("--out", required=True, type=click.Path(path_type=Path), metavar="PATH", help="What is written.")
+@click.option("--overwrite", is_flag=True, help="Replace what is there.")
+@click.option("--zstd", "is_zstd", is_flag=True, help="Compress (mcap, sqlite).")
+@click.option(
+    "--deskewed",
+    type=click.Path(path_type=Path),
+    metavar="RUN|TRAJ",
+    help="Take the motion of this run out of the scans.",
+)
+@options.scan_range
+@click.option(
+    "--frame", metavar="BODY", help="Trajectory: lidar, cam0 or imu [default: what the format usually holds]."
+)
+@click.option("--from-frame", metavar="BODY", help="Trajectory: whose poses SOURCE holds, where it does not say.")
+@click.option("--calib", type=click.Path(path_type=Path), metavar="FILE", help="Trajectory: KITTI calibration with Tr.")
+@click.option("--times", type=click.Path(path_type=Path), metavar="FILE", help="Trajectory: stamps of a KITTI file.")
+@options.reading
+@options.data_root
+@options.verbosity
+def command(source: str, kind: str, out: Path, **given: Any) -> None:
+    """Convert SOURCE, a sequence (path or name) or a trajectory (file or run folder).
+
+    Points, per-point times, rings, IMU, fixes, extrinsics and ground truth go along; what was written reads back the same.
+    """
+    from lslam.cli.console import setup_logging
+
+    setup_logging(given["verbose"], given["quiet"])
+    if kind in ("tum", "euroc") or _is_trajectory(source):
+        _convert_trajectory(source, kind, out, given)
+    else:
+        _convert_sequence(source, kind, out, given)
+
+
+def _is_trajectory(source: str) -> bool:
+    """A run folder, or a file that is no bag."""
+    from lslam.formats.bag_files import list_bag_files
+
+    path = Path(source).expanduser()
+    return (path / "trajectory.tum").is_file() or (path.is_file() and not list_bag_files(path))
+
+
+def _open(source: str, given: dict[str, Any]) -> Sequence:
+    from lslam.readers import open_sequence, select
+
+    sequence = open_sequence(source, data_root=given["data_root"], **options.reading_of(given))
+    return select(sequence, given["start"] or 0, given["count"], given["skip_frames"] or 1)
+
+
+def _convert_sequence(source: str, kind: str, out: Path, given: dict[str, Any]) -> None:
+    import logging
+
+    from lslam.cli.console import progress, show
+    from lslam.formats.trajectory_files import read_trajectory
+    from lslam.pipeline.convert import check_output, convert_sequence
+
+    check_output(kind, out, given["is_zstd"], given["overwrite"])
+    sequence = _open(source, given)
+    log = logging.getLogger("lslam")
+    for note in sequence.notes:
+        log.info("%s", note)
+    for problem in sequence.problems:
+        log.warning("%s", problem)
+    trajectory = None if given["deskewed"] is None else read_trajectory(given["deskewed"])
+    with progress("convert", len(sequence)) as advance:
+        done = convert_sequence(
+            sequence, kind, out,
+            is_zstd=given["is_zstd"], overwrite=given["overwrite"], trajectory=trajectory, on_scan=advance,
+        )  # fmt: skip
+    left = f", {done.skipped} that could not be read left out" if done.skipped else ""
+    show(f"{done.path}: {done.scans} scans{left}\n")
+
+
+def _convert_trajectory(source: str, kind: str, out: Path, given: dict[str, Any]) -> None:
+    from lslam.cli.console import show
+    from lslam.pipeline.convert_trajectory import convert_trajectory
+
+    for flag, name in (("--zstd", "is_zstd"), ("--deskewed", "deskewed")):
+        if given[name]:
+            raise click.UsageError(f"{flag} is for sequences, and {source} to {kind} is a trajectory")
+    trajectory, calibration = _read_trajectory(source, kind, given)
+    moved = convert_trajectory(
+        trajectory, kind, out, calibration, frame=given["frame"], overwrite=given["overwrite"]
+    )  # fmt: skip
+    show(f"{out}: {len(moved)} poses of {moved.frame}\n")
+
+
+def _read_trajectory(source: str, kind: str, given: dict[str, Any]) -> tuple[Trajectory, Calibration]:
+    """The file, or the ground truth of a sequence, and what is known of the bodies."""
+    from lslam.errors import InputError
+    from lslam.formats.kitti_calib import read_cam0_lidar
+    from lslam.formats.trajectory_files import read_trajectory
+    from lslam.formats.transform_text import read_transform
+    from lslam.types.calibration import Calibration
+
+    if _is_trajectory(source):
+        trajectory = read_trajectory(Path(source).expanduser(), times=given["times"])
+        calibration = Calibration()
+    else:
+        sequence = _open(source, given)
+        if sequence.ground_truth is None:
+            raise InputError(f"{sequence.path} has no ground truth, which is what --to {kind} takes from a sequence")
+        trajectory, calibration = sequence.ground_truth, sequence.calibration
+    if given["from_frame"] is not None:
+        trajectory = replace(trajectory, frame=given["from_frame"])
+    if given["calib"] is not None:
+        calibration = replace(calibration, T_cam0_lidar=read_cam0_lidar(given["calib"]))
+    if given["extrinsics"] is not None:
+        calibration = replace(calibration, T_lidar_imu=read_transform(given["extrinsics"]))
+    return trajectory, calibration

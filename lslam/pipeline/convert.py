@@ -1,0 +1,251 @@
+"""A sequence in another layout: to a bag of ROS 1 or ROS 2, or to KITTI's folders. What is read back is what was there."""
+
+from __future__ import annotations
+
+import heapq
+import logging
+import os
+import shutil
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lslam.errors import InputError, OutputError, OutputExistsError, UsageError
+from lslam.formats import bag_messages
+from lslam.formats.bag_files import KINDS, BagWriter
+from lslam.formats.gnss_csv import write_gnss_csv
+from lslam.formats.imu_csv import write_imu_csv
+from lslam.formats.kitti_layout import PER_POINT, POINTS, in_camera, write_calib, write_scan, write_times
+from lslam.formats.sequence_toml import FILE_NAME, SequenceInfo, sequence_toml_text, write_sequence_toml
+from lslam.formats.trajectory_files import write_kitti, write_tum
+from lslam.geometry import se3
+from lslam.pipeline.map_pass import motion_within
+from lslam.preprocessing.deskew import deskew_points
+from lslam.readers.bag import INFO_TOPIC
+from lslam.types.calibration import Calibration
+from lslam.types.scan import Scan
+from lslam.types.sequence import Sequence
+from lslam.types.trajectory import Trajectory
+
+log = logging.getLogger("lslam")
+
+SUFFIXES = {"bag": ".bag", "mcap": ".mcap", "sqlite": ".db3"}
+NUMBER = "00"  # of the one sequence in KITTI's layout
+TRUTH_FILE, IMU_FILE, GNSS_FILE = "ground_truth.tum", "imu.csv", "gnss.csv"
+
+
+@dataclass(frozen=True)
+class Converted:
+    """What was written: where, how many scans, and how many could not be read."""
+
+    path: Path
+    scans: int
+    skipped: int
+
+
+def convert_sequence(
+    sequence: Sequence,
+    kind: str,
+    out: Path,
+    *,
+    is_zstd: bool = False,
+    overwrite: bool = False,
+    trajectory: Trajectory | None = None,
+    on_scan: Callable[[], None] = lambda: None,
+) -> Converted:
+    """Write `sequence` to `out`, whole or not at all.
+
+    Parameters
+    ----------
+    kind : `bag` (ROS 1, one file), `mcap` or `sqlite` (ROS 2, a folder, or a file when `out` ends in .mcap or .db3), `kitti`
+    is_zstd : compress mcap and sqlite
+    trajectory : LiDAR poses along which scans with per-point times are deskewed on the way; None leaves them as they are
+
+    Raises
+    ------
+    OutputExistsError, OutputError : as named. UsageError : `out` does not suit `kind`. InputError : no scan can be read.
+    """
+    check_output(kind, out, is_zstd, overwrite)
+    source = _Source(sequence, trajectory, on_scan)
+    here, there = sequence.path.resolve(), out.resolve()
+    if there == here or there in here.parents:
+        raise UsageError(f"--out {out} holds the sequence itself: choose another")
+    stage = out.with_name(out.name + ".new")
+    try:
+        shutil.rmtree(stage, ignore_errors=True)
+        stage.mkdir(parents=True)
+        made = stage / out.name
+        if kind == "kitti":
+            _write_kitti(source, made)
+        else:
+            _write_bag(source, made, kind, is_zstd)
+        if out.exists():
+            out.rename(stage / "old")
+        os.replace(made, out)
+    except OSError as error:
+        raise OutputError(f"{error.filename or out} cannot be written: {error.strerror or error}") from None
+    finally:
+        shutil.rmtree(stage, ignore_errors=True)
+    return Converted(out, source.written, source.skipped)
+
+
+def check_output(kind: str, out: Path, is_zstd: bool, overwrite: bool) -> None:
+    """Raise UsageError when `out` does not suit `kind`, OutputExistsError when it is there already."""
+    if kind not in (*KINDS, "kitti"):
+        raise UsageError(f"no layout {kind!r} for sequences: {', '.join(KINDS)} and kitti are")
+    if is_zstd and kind in ("bag", "kitti"):
+        raise UsageError(f"--zstd is for mcap and sqlite, not for {kind}")
+    fitting = SUFFIXES.get(kind, "")
+    if out.suffix in SUFFIXES.values() and out.suffix != fitting:
+        raise UsageError(f"--out {out}: a name in {out.suffix} is not for --to {kind}")
+    if kind == "bag" and out.suffix != ".bag":
+        raise UsageError(f"--out {out}: a ROS 1 bag is one file, its name ends in .bag")
+    if out.exists() and not overwrite:
+        raise OutputExistsError(f"{out} exists already: choose another --out, or --overwrite it")
+
+
+class _Source:
+    """Scans of a sequence in order, deskewed when asked for, counted, those that are damaged left out and said."""
+
+    def __init__(self, sequence: Sequence, trajectory: Trajectory | None, on_scan: Callable[[], None]) -> None:
+        self.sequence, self.trajectory, self.on_scan = sequence, trajectory, on_scan
+        self.written = self.skipped = 0
+
+    def scans(self) -> Iterator[Scan]:
+        for k in range(len(self.sequence)):
+            try:
+                scan = self._deskewed(self.sequence.scan(k))
+            except InputError as error:
+                log.warning("left out: %s", error)
+                self.skipped += 1
+            else:
+                self.written += 1
+                yield scan
+            self.on_scan()
+        if not self.written:
+            raise InputError(f"{self.sequence.path}: none of its {len(self.sequence)} scans can be read")
+
+    def _deskewed(self, scan: Scan) -> Scan:
+        if self.trajectory is None or scan.times is None:
+            return scan
+        if not self.trajectory.stamps_ns[0] <= scan.stamp_ns <= self.trajectory.stamps_ns[-1]:
+            raise InputError(
+                f"scan {scan.index} at {scan.stamp_ns} ns lies outside the trajectory it is deskewed along"
+            )
+        motion = motion_within(scan, self.trajectory.stamps_ns, self.trajectory.poses)
+        return replace(scan, points=deskew_points(scan.points, scan.times, motion), times=None)
+
+    @property
+    def calibration(self) -> Calibration:
+        """Extrinsics that are known; those a reader had to assume are not written down as facts."""
+        known = self.sequence.calibration
+        return replace(known, T_lidar_imu=None) if getattr(self.sequence, "has_assumed_extrinsics", False) else known
+
+    def info(self) -> SequenceInfo:
+        is_deskewed = self.trajectory is not None
+        return SequenceInfo(
+            name=self.sequence.name,
+            sensor=getattr(self.sequence, "sensor", None),
+            rings=getattr(self.sequence, "rings", None),
+            rate_hz=self.sequence.rate_hz,
+            motion_compensated=True if is_deskewed else self.sequence.motion_compensated,
+            compensated_to="scan_start" if is_deskewed else None,
+            T_cam0_lidar=self.calibration.T_cam0_lidar,
+            T_lidar_imu=self.calibration.T_lidar_imu,
+            T_lidar_gnss=self.calibration.T_lidar_gnss,
+        )
+
+
+def _write_bag(source: _Source, out: Path, kind: str, is_zstd: bool) -> None:
+    sequence = source.sequence
+    with BagWriter(out, kind, is_zstd) as writer:
+        begin = _first_stamp(sequence)
+        writer.write(INFO_TOPIC, begin, bag_messages.text(writer.store, sequence_toml_text(source.info())))
+        transforms = _transforms(source.calibration)
+        if transforms:
+            writer.write("/tf_static", begin, bag_messages.static_transforms(writer.store, begin, transforms))
+        for stamp, _, topic, message in heapq.merge(*_messages(source, writer.store), key=lambda m: m[:2]):
+            writer.write(topic, stamp, message())
+
+
+def _messages(source: _Source, store: Any) -> list[Iterator[tuple[int, int, str, Callable[[], Any]]]]:
+    """Per topic: stamp, rank among equal stamps, topic, and how the message is made."""
+    sequence, make = source.sequence, bag_messages
+    imu, gnss, truth = sequence.imu, sequence.gnss, sequence.ground_truth
+    topics: list[Iterator[tuple[int, int, str, Callable[[], Any]]]] = [
+        (
+            (scan.stamp_ns, 3, "/points", lambda scan=scan: make.cloud(store, scan, "lidar"))  # type: ignore[misc]
+            for scan in source.scans()
+        )
+    ]
+    if imu is not None:
+        rows = zip(imu.stamps_ns.tolist(), imu.accel, imu.gyro, strict=True)
+        topics.append((t, 0, "/imu", lambda t=t, a=a, g=g: make.imu(store, t, a, g, "imu")) for t, a, g in rows)  # type: ignore[misc]
+    if gnss is not None:
+        fixes = zip(gnss.stamps_ns.tolist(), gnss.lat_lon_alt, gnss.sigma.tolist(), strict=True)
+        topics.append((t, 1, "/gnss", lambda t=t, p=p, s=s: make.fix(store, t, p, s, "gnss")) for t, p, s in fixes)  # type: ignore[misc]
+    if truth is not None:
+        poses = zip(truth.stamps_ns.tolist(), truth.poses, strict=True)
+        topics.append(
+            (t, 2, "/ground_truth", lambda t=t, T=T: make.odometry(store, t, T, "world", "lidar"))  # type: ignore[misc]
+            for t, T in poses
+        )
+    return topics
+
+
+def _first_stamp(sequence: Sequence) -> int:
+    streams = (sequence.imu, sequence.gnss, sequence.ground_truth)
+    starts = [int(s.stamps_ns[0]) for s in streams if s is not None and len(s)]
+    return min([int(sequence.stamps_ns[0]), *starts])
+
+
+def _transforms(calibration: Calibration) -> dict[tuple[str, str], Any]:
+    """The tree of frames below the LiDAR."""
+    T_cam0_lidar = calibration.T_cam0_lidar
+    below = {
+        "imu": calibration.T_lidar_imu,
+        "gnss": calibration.T_lidar_gnss,
+        "cam0": None if T_cam0_lidar is None else se3.inverse(T_cam0_lidar),
+    }
+    return {("lidar", frame): T for frame, T in below.items() if T is not None}
+
+
+def _write_kitti(source: _Source, out: Path) -> None:
+    folder = out / "sequences" / NUMBER
+    for inside in (folder / POINTS, folder / PER_POINT, out / "poses"):
+        inside.mkdir(parents=True)
+    stamps = []
+    for number, scan in enumerate(source.scans()):
+        write_scan(folder, number, scan.points, scan.intensity, scan.times, scan.rings)
+        stamps.append(scan.stamp_ns)
+    _write_sides(source, folder, out / "poses", np.array(stamps, np.int64))
+
+
+def _write_sides(source: _Source, folder: Path, poses: Path, stamps: Any) -> None:
+    """Everything beside the scans."""
+    sequence, calibration, info = source.sequence, source.calibration, source.info()
+    write_times(folder, stamps)
+    if calibration.T_cam0_lidar is not None:
+        write_calib(folder, calibration.T_cam0_lidar)
+    if sequence.imu is not None:
+        write_imu_csv(folder / IMU_FILE, sequence.imu)
+        info = replace(info, imu=IMU_FILE)
+    if sequence.gnss is not None:
+        write_gnss_csv(folder / GNSS_FILE, sequence.gnss)
+        info = replace(info, gnss=GNSS_FILE)
+    truth, T_cam0_lidar = sequence.ground_truth, calibration.T_cam0_lidar
+    if truth is not None and T_cam0_lidar is not None and np.array_equal(truth.stamps_ns, stamps):
+        write_kitti(poses / f"{NUMBER}.txt", in_camera(truth, T_cam0_lidar))
+        info = replace(info, ground_truth=f"../../poses/{NUMBER}.txt", ground_truth_frame="cam0")
+    elif truth is not None:
+        # KITTI's poses have no stamps and are of a camera: neither would do here.
+        write_tum(folder / TRUTH_FILE, truth)
+        info = replace(info, ground_truth=TRUTH_FILE, ground_truth_frame="lidar")
+    # Without a word, KITTI's layout means scans that are compensated and need the HDL-64E's vertical correction.
+    info = replace(
+        info, per_point=PER_POINT, vertical_correction_deg=0.0, motion_compensated=bool(info.motion_compensated)
+    )
+    write_sequence_toml(folder / FILE_NAME, info)
