@@ -1,0 +1,165 @@
+"""What is converted reads back the same, whichever way it went; nothing is half-written."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from stub_sequences import sample
+
+from lslam.errors import InputError, OutputExistsError, UsageError
+from lslam.formats import bag_messages
+from lslam.formats.bag_files import BagWriter
+from lslam.geometry import se3
+from lslam.pipeline.convert import convert_sequence
+from lslam.readers import open_sequence
+from lslam.simulation.gnss import GnssModel
+from lslam.simulation.scenarios import SimulatedDrive, simulate
+from lslam.types.calibration import Calibration
+from lslam.types.sequence import Sequence
+
+NAMES = {"bag": "a.bag", "mcap": "a.mcap", "sqlite": "a"}
+
+
+@pytest.fixture(scope="module")
+def distorted() -> SimulatedDrive:
+    """Sweeps with times and rings, an IMU, fixes, a camera and the truth."""
+    drive = simulate("block", count=4, motion_compensated=False, imu="icm20948", gnss=GnssModel(5.0))
+    assert drive.imu is not None
+    assert drive.gnss is not None
+    return drive
+
+
+def assert_same(want: Sequence, got: Sequence) -> None:
+    assert len(got) == len(want)
+    assert got.name == want.name
+    assert got.rate_hz == want.rate_hz
+    assert bool(got.motion_compensated) == bool(want.motion_compensated)
+    for k in range(len(want)):
+        a, b = want.scan(k), got.scan(k)
+        assert a.stamp_ns == b.stamp_ns == got.stamps_ns[k]
+        for name in ("points", "intensity", "times", "rings"):
+            np.testing.assert_array_equal(getattr(a, name), getattr(b, name), err_msg=name)
+    for name in ("stamps_ns", "accel", "gyro"):
+        np.testing.assert_array_equal(getattr(want.imu, name), getattr(got.imu, name))
+    for name in ("stamps_ns", "lat_lon_alt", "sigma"):
+        np.testing.assert_array_equal(getattr(want.gnss, name), getattr(got.gnss, name))
+    for name, T in vars(want.calibration).items():
+        np.testing.assert_array_equal(T, getattr(got.calibration, name))
+    assert want.ground_truth is not None
+    assert got.ground_truth is not None
+    np.testing.assert_array_equal(want.ground_truth.stamps_ns, got.ground_truth.stamps_ns)
+    np.testing.assert_allclose(want.ground_truth.poses, got.ground_truth.poses, atol=1e-11)
+
+
+@pytest.mark.parametrize(("kind", "is_zstd"), [("bag", 0), ("mcap", 0), ("mcap", 1), ("sqlite", 0), ("sqlite", 1)])
+def test_to_a_bag_and_on_to_kitti_and_back(distorted: Sequence, tmp_path: Path, kind: str, is_zstd: bool) -> None:
+    done = convert_sequence(distorted, kind, tmp_path / NAMES[kind], is_zstd=bool(is_zstd))
+    assert (done.scans, done.skipped) == (4, 0)
+    through_bag = open_sequence(done.path)
+    assert through_bag.kind == "bag"
+    assert not through_bag.problems
+    assert_same(distorted, through_bag)
+    kitti = convert_sequence(through_bag, "kitti", tmp_path / "k")
+    through_kitti = open_sequence(kitti.path)
+    assert through_kitti.kind == "kitti-odometry"
+    assert not through_kitti.problems
+    assert_same(distorted, through_kitti)
+    assert sorted(p.name for p in tmp_path.iterdir()) == sorted([NAMES[kind], "k"]), "nothing stays beside"
+
+
+def test_a_truth_denser_than_the_scans_and_without_a_camera_keeps_its_stamps(tmp_path: Path) -> None:
+    whole = sample(6)
+    part = replace(whole, scans=whole.scans[:3], calibration=Calibration())
+    back = open_sequence(convert_sequence(part, "kitti", tmp_path / "k").path)
+    assert back.ground_truth is not None
+    assert part.ground_truth is not None
+    np.testing.assert_array_equal(back.ground_truth.stamps_ns, part.ground_truth.stamps_ns)
+    np.testing.assert_allclose(back.ground_truth.poses, part.ground_truth.poses, atol=2e-9)
+    assert back.motion_compensated is True
+
+
+def test_extrinsics_a_reader_assumed_do_not_become_facts(distorted: Sequence, tmp_path: Path) -> None:
+    with BagWriter(tmp_path / "a.bag", "bag") as writer:
+        for k in range(2):
+            scan = distorted.scan(k)
+            writer.write("/points", scan.stamp_ns, bag_messages.cloud(writer.store, scan, "velodyne"))
+            zero = np.zeros(3)
+            writer.write("/imu", scan.stamp_ns, bag_messages.imu(writer.store, scan.stamp_ns, zero, zero, "imu"))
+    first = open_sequence(tmp_path / "a.bag")
+    assert first.calibration.T_lidar_imu is not None
+    back = open_sequence(convert_sequence(first, "kitti", tmp_path / "k").path)
+    assert back.calibration.T_lidar_imu is None
+
+
+def test_deskewed_scans_put_every_point_where_the_exact_motion_does(distorted: SimulatedDrive, tmp_path: Path) -> None:
+    done = convert_sequence(distorted, "bag", tmp_path / "a.bag", trajectory=distorted.ground_truth)
+    back = open_sequence(done.path)
+    assert back.motion_compensated is True
+    before, after = distorted.scan(1), back.scan(1)
+    assert before.times is not None
+    assert after.times is None
+    np.testing.assert_array_equal(after.rings, before.rings)
+    start = before.stamp_ns / 1e9
+    T_start_point = se3.relative(
+        distorted.vehicle.poses(np.array([start])), distorted.vehicle.poses(start + before.times)
+    )
+    wanted = np.einsum("nij,nj->ni", T_start_point[:, :3, :3], before.points) + T_start_point[:, :3, 3]
+    off = np.linalg.norm(after.points - wanted, axis=1)
+    assert np.linalg.norm(before.points - wanted, axis=1).max() > 0.5
+    assert off.max() < 0.03, "poses 0.1 s apart are all there is between"
+
+
+def test_damaged_scans_are_left_out_and_counted(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    stub = sample(4)
+    stub.scans[1] = "scan 1 is damaged"
+    done = convert_sequence(stub, "mcap", tmp_path / "a.mcap")
+    assert (done.scans, done.skipped) == (3, 1)
+    assert "scan 1 is damaged" in caplog.text
+    np.testing.assert_array_equal(open_sequence(done.path).stamps_ns, [0, 200_000_000, 300_000_000])
+
+
+def test_nothing_is_left_of_a_conversion_that_fails_and_the_old_one_stays(tmp_path: Path) -> None:
+    out = tmp_path / "a.bag"
+    convert_sequence(sample(2), "bag", out)
+    before = out.read_bytes()
+    for kind, name in (("bag", "a.bag"), ("kitti", "k"), ("sqlite", "s")):
+        with pytest.raises(InputError, match="none of its 1 scans"):
+            convert_sequence(sample_of_damage(), kind, tmp_path / name, overwrite=True)
+    assert out.read_bytes() == before
+    assert [p.name for p in tmp_path.iterdir()] == ["a.bag"]
+
+
+def sample_of_damage() -> Sequence:
+    stub = sample(1)
+    stub.scans[0] = "damaged"
+    return stub
+
+
+REFUSED: list[tuple[str, str, bool, type[Exception], str]] = [
+    ("bag", "a", False, UsageError, "ends in .bag"),
+    ("bag", "a.mcap", False, UsageError, "not for --to bag"),
+    ("mcap", "a.db3", False, UsageError, "not for --to mcap"),
+    ("kitti", "k", True, UsageError, "--zstd is for mcap and sqlite"),
+    ("pcap", "k", False, UsageError, "no layout 'pcap'"),
+    ("mcap", "there", False, OutputExistsError, "--overwrite"),
+]
+
+
+@pytest.mark.parametrize(("kind", "name", "is_zstd", "error", "words"), REFUSED)
+def test_what_cannot_be_is_refused_before_anything_is_written(
+    tmp_path: Path, kind: str, name: str, is_zstd: bool, error: type[Exception], words: str
+) -> None:
+    (tmp_path / "there").mkdir()
+    with pytest.raises(error, match=words):
+        convert_sequence(sample(1), kind, tmp_path / name, is_zstd=is_zstd)
+    assert [p.name for p in tmp_path.iterdir()] == ["there"]
+
+
+def test_a_sequence_is_not_written_over_itself(tmp_path: Path) -> None:
+    done = convert_sequence(sample(2), "bag", tmp_path / "a.bag")
+    with pytest.raises(UsageError, match="holds the sequence itself"):
+        convert_sequence(open_sequence(done.path), "bag", done.path, overwrite=True)
+    assert len(open_sequence(done.path)) == 2
