@@ -27,6 +27,8 @@ class SqliteBag:
             self._db = sqlite3.connect(
                 f"file:{quote(str(path.resolve()))}?immutable=1", uri=True, check_same_thread=False
             )
+            # SQLite then opens files that are shorter than their header says; nothing can be changed all the same.
+            self._db.execute("PRAGMA writable_schema = ON")
             names = {name for (name,) in self._db.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
             if not names >= _TABLES:
                 raise InputError(f"{path} is no ROS 2 bag: its tables are {', '.join(sorted(names)) or 'none'}")
@@ -56,15 +58,23 @@ class SqliteBag:
                 if topic in found:
                     found[topic].append((stamp, row))
         except sqlite3.Error as error:
-            size = self.path.stat().st_size
-            (stated,) = self._db.execute(
-                "SELECT page_count * page_size FROM pragma_page_count, pragma_page_size"
-            ).fetchone()
             self.loss = (
-                f"{self.path} is cut off or damaged ({error}): it has {size} of {max(stated, size)} bytes; the "
-                f"{sum(map(len, found.values()))} messages up to there are read"
+                f"{self.path} is damaged ({error}): {sum(map(len, found.values()))} messages up to there are read"
+            )
+        size, stated = self._sizes()
+        if size < stated:
+            self.loss = (
+                f"{self.path} is cut off: it has {size} of {stated} bytes, {(stated - size) / stated:.1%} are lost; "
+                f"{sum(map(len, found.values()))} messages are listed, those that reach beyond the cut cannot be read"
             )
         for number, entries in found.items():
             table = np.array(sorted(entries), np.int64).reshape(-1, 2)
             self._topics[number].stamps_ns = table[:, 0].copy()
             self._topics[number].where = np.column_stack([table[:, 1], np.zeros(len(table), np.int64)])
+
+    def _sizes(self) -> tuple[int, int]:
+        """Bytes of the file, and how many its header states (SQLite's file format, 1.3)."""
+        with self.path.open("rb") as file:
+            header = file.read(100)
+        page, pages = int.from_bytes(header[16:18], "big"), int.from_bytes(header[28:32], "big")
+        return self.path.stat().st_size, pages * (65536 if page == 1 else page)

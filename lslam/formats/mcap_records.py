@@ -80,6 +80,9 @@ class McapFile:
                 op, length = struct.unpack("<BQ", self._file.read(position, _PREFIX))
                 content = position + _PREFIX
                 if content + length > size:
+                    self._index_by_hand(unindexed)
+                    unindexed = None
+                    position = self._salvage(op, content, position)
                     raise CutOffError
                 if op != _INDEX:
                     self._index_by_hand(unindexed)
@@ -98,9 +101,22 @@ class McapFile:
                     self._add_names(op, self._file.read(content, length))
             except (CutOffError, struct.error, ValueError):
                 self._index_by_hand(unindexed)
-                self.loss = self.loss or describe_loss(self.path, position, size)
+                self.loss = describe_loss(self.path, position, size)
                 return
             position = content + length
+
+    def _salvage(self, op: int, content: int, position: int) -> int:
+        """Note the whole messages of a chunk that was cut off, where it is not compressed; the end of the last one."""
+        if op != _CHUNK:
+            return position
+        number = self._add_chunk(content, self._file.size - content)
+        chunk = self._chunks[number]
+        if chunk.compression:
+            self._chunks.pop()
+            return position
+        kept = self._file.size - chunk.position
+        self._chunks[number] = Chunk(chunk.position, kept, kept)
+        return chunk.position + self._index_by_hand(number)
 
     def _add_chunk(self, position: int, length: int) -> int:
         head = self._file.read(position, min(length, 64))
@@ -142,17 +158,20 @@ class McapFile:
         gather(topic, *self._pieces.get(channel, ([], [])))
         return topic
 
-    def _index_by_hand(self, number: int | None) -> None:
-        """The messages of a chunk that no index follows."""
+    def _index_by_hand(self, number: int | None) -> int:
+        """Note the messages of a chunk that no index follows; the end of the last record."""
+        end = 0
         if number is None:
-            return
+            return end
         found: dict[int, tuple[list[int], list[int]]] = {}
         for op, offset, length in self._records_of(self._chunks[number]):
+            end = offset + _PREFIX + length
             if op == _MESSAGE and length >= _STAMPS:
                 channel, _, stamp = struct.unpack("<HIQ", self._file.part(self._chunks[number], offset + _PREFIX, 14))
                 self._note(found, channel, stamp, offset)
         for channel, (stamps, offsets) in found.items():
             self._add(channel, number, np.array(stamps, np.int64), np.array(offsets, np.int64))
+        return end
 
     @staticmethod
     def _note(found: dict[int, tuple[list[int], list[int]]], channel: int, stamp: int, offset: int) -> None:
@@ -178,6 +197,8 @@ class McapFile:
         try:
             while offset < chunk.length:
                 op, length = struct.unpack("<BQ", self._file.part(chunk, offset, _PREFIX))
+                if offset + _PREFIX + length > chunk.length:
+                    raise CutOffError
                 yield op, offset, length
                 offset += _PREFIX + length
         except (InputError, CutOffError, struct.error):

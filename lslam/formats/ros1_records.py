@@ -85,6 +85,7 @@ class Ros1Bag:
             try:
                 record = self._record(None, position)
                 if record.end > size:
+                    position = self._salvage(record, position)
                     raise CutOffError
                 if record.op == _CHUNK:
                     self._index_by_hand(unindexed)
@@ -99,6 +100,14 @@ class Ros1Bag:
                 break
             position = record.end
         self._index_by_hand(unindexed)
+
+    def _salvage(self, record: _Record, position: int) -> int:
+        """Note the whole messages of a chunk that was cut off, where it is not compressed; the end of the last one."""
+        if record.op != _CHUNK or record.fields[b"compression"] != b"none":
+            return position
+        kept = self._file.size - record.data
+        self._chunks.append(Chunk(record.data, kept, kept))
+        return record.data + self._index_by_hand(len(self._chunks) - 1)
 
     def _record(self, chunk: Chunk | None, offset: int) -> _Record:
         head = self._file.part(chunk, offset, _HEADER)
@@ -132,12 +141,14 @@ class Ros1Bag:
             number, Topic(record.fields[b"topic"].decode(), f"{package}/msg/{name}" if name else "", "ros1")
         )
 
-    def _index_by_hand(self, number: int | None) -> None:
-        """The messages of a chunk that has no index, because the recorder was stopped before it wrote one."""
+    def _index_by_hand(self, number: int | None) -> int:
+        """Note the messages of a chunk that has no index, because the recorder was stopped before; the end of the last."""
+        end = 0
         if number is None:
-            return
+            return end
         found: dict[int, tuple[list[int], list[int]]] = {}
         for record, offset in self._records_of(self._chunks[number]):
+            end = record.end
             if record.op == _MESSAGE:
                 seconds, nanoseconds = struct.unpack("<II", record.fields[b"time"])
                 stamps, offsets = found.setdefault(_u32(record.fields[b"conn"]), ([], []))
@@ -145,6 +156,7 @@ class Ros1Bag:
                 offsets.append(offset)
         for connection, (stamps, offsets) in found.items():
             self._add(connection, np.array(stamps, np.int64), np.array(offsets, np.int64))
+        return end
 
     def _find_missing_connections(self) -> None:
         """Connections stand at the end of the file and, where the end is lost, in the chunk of their first message."""
@@ -161,6 +173,8 @@ class Ros1Bag:
         try:
             while offset < chunk.length:
                 record = self._record(chunk, offset)
+                if record.end > chunk.length:
+                    raise CutOffError
                 yield record, offset
                 offset = record.end
         except (InputError, CutOffError, struct.error, KeyError):
