@@ -17,7 +17,7 @@ from lslam.registration.feature_map import FeatureMap
 from lslam.registration.feature_scan import FeatureScan, feature_scan
 from lslam.registration.feature_solver import NONE, FeatureNoise, solve_on_map
 from lslam.registration.feature_steps import ScanStep, StageClock
-from lslam.registration.registration import DOUBT
+from lslam.registration.registration import DOUBT, Registration
 from lslam.registration.robust import AdaptiveThreshold, Annealing, UsualAgreement
 from lslam.registration.solver import RegistrationResult
 
@@ -54,6 +54,8 @@ class FeatureRegistration:
         self.threshold = AdaptiveThreshold(2 * config.kernel_min, config.kernel_max)
         self.agreement = UsualAgreement(config.min_agreement)
         self._starting = config.start_scans
+        self._first: tuple[Features, Floats] | None = None
+        self._inserted = 0
         self._failures = 0
 
     def locate(self, features: Features, T_prior: Floats, clock: StageClock) -> RegistrationResult:
@@ -87,6 +89,8 @@ class FeatureRegistration:
     def update(self, features: Features, result: RegistrationResult) -> None:
         """Enter the scan into map and target unless its registration failed, and learn from how wrong the prior was."""
         if result.ok:
+            self._inserted += 1
+            self._first = (features, result.T_world_lidar) if self._inserted == 1 else None
             if self.map is not None:
                 self.map.insert(features, result.T_world_lidar)
             if self.target is not None:
@@ -132,6 +136,8 @@ class FeatureRegistration:
     def _capture(self, features: Features, T_prior: Floats) -> Floats:
         """A start that is metres nearer, where the prior may be metres off: less planar points on coarse planes."""
         c = self.config
+        if self._first is not None and c.start_reach > 0:
+            return self._first_step(features, *self._first, T_prior)
         points, scatter = _thinned(features)
         target = self._planes()
         slow = Annealing(c.coarse_kernel, c.kernel_min, c.coarse_decay, c.start_iterations)
@@ -140,6 +146,17 @@ class FeatureRegistration:
             target, NONE, points, T_prior, slow, self.noise, scatter=scatter, coarse=coarse, is_coarse_only=True
         )
         return self._judge(result, T_prior).T_world_lidar
+
+    def _first_step(self, features: Features, first: Features, T_first: Floats, T_prior: Floats) -> Floats:
+        """The search for the first step that `icp` makes, on all features: the speed is unknown.
+
+        A plane takes six points: voxels are as large as the grid that thinned the features needs for that.
+        """
+        size = max(self.config.voxel_size, 1.5 * self.loam.grid_step)
+        plain = {"residual": None, "target": "map", "inlier_distance": None, "inlier_ratio": 1.0, "voxel_size": size}
+        search = Registration(self.config.model_copy(update=plain))
+        search.register(_all_points(first), T_first)
+        return search.register(_all_points(features), T_prior).T_world_lidar
 
     def _stand_in(
         self, features: Features, T_start: Floats, T_prior: Floats, starved: RegistrationResult
@@ -214,3 +231,7 @@ def _failed(T_prior: Floats, source_points: int, reason: str) -> RegistrationRes
     return RegistrationResult(
         T_prior.copy(), ok=False, reason=reason, covariance=DOUBT.copy(), converged=False, source_points=source_points
     )
+
+
+def _all_points(features: Features) -> Floats:
+    return np.concatenate([part.points for part in (features.less_planes, features.planes, features.less_edges)])
