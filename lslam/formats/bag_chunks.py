@@ -83,8 +83,10 @@ class ChunkFile:
             data += more
         return data
 
-    def part(self, chunk: Chunk | None, offset: int, size: int) -> bytes:
+    def part(self, chunk: Chunk | None, offset: int, size: int, is_head: bool = False) -> bytes:
         """At most `size` bytes of the records of `chunk` from `offset`; None is the file itself.
+
+        is_head : no more of the chunk will be wanted than the beginnings of its messages
 
         Raises InputError when the chunk cannot be decompressed.
         """
@@ -92,10 +94,12 @@ class ChunkFile:
             return self.read(offset, max(min(size, self.size - offset), 0))
         if not chunk.compression:
             return self.read(chunk.position + offset, max(min(size, chunk.length - offset), 0))
-        return self._unpacked(chunk, min(offset + size, chunk.length))[offset : offset + size]
+        return self._unpacked(chunk, min(offset + size, chunk.length) if is_head else chunk.length)[
+            offset : offset + size
+        ]
 
     def _unpacked(self, chunk: Chunk, least: int) -> bytes:
-        """The records of a chunk, `least` bytes of them at the least: headers alone need only the beginning."""
+        """The records of a chunk, `least` bytes of them at the least."""
         kept, records = self._kept
         if kept == chunk.position and len(records) >= least:
             return records

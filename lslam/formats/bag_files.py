@@ -28,6 +28,7 @@ SUFFIXES = (".bag", ".mcap", ".db3")
 KINDS = ("bag", "mcap", "sqlite")
 _ENCODINGS = ("cdr", "ros1")
 _ZSTD = b"\x28\xb5\x2f\xfd"  # ROS 2 can compress every message by itself
+_ZSTD_BLOCK = 1 << 18  # more than the largest block of zstd
 _TRANSFORMS = "tf2_msgs/msg/TFMessage"
 _OLD_NAMES = {"tf/msg/tfMessage": _TRANSFORMS}
 
@@ -105,7 +106,7 @@ class Bag:
         for recording, part in topic.parts:
             if k < len(part):
                 data = recording.read(part, k, limit)
-                return _unpacked(recording, part, k) if data[:4] == _ZSTD else data
+                return _unpacked(recording, part, k, limit) if data[:4] == _ZSTD else data
             k -= len(part)
         raise IndexError(k)
 
@@ -258,11 +259,14 @@ def _store(encoding: str) -> Any:
     return store
 
 
-def _unpacked(recording: Recording, topic: Topic, k: int) -> bytes:
+def _unpacked(recording: Recording, topic: Topic, k: int, limit: int | None) -> bytes:
+    """A message that was compressed by itself; what is wanted of its beginning lies in the first block."""
     from backports import zstd
 
     try:
-        return zstd.decompress(recording.read(topic, k))
+        if limit is None:
+            return zstd.decompress(recording.read(topic, k))
+        return zstd.ZstdDecompressor().decompress(recording.read(topic, k, _ZSTD_BLOCK), max_length=limit)
     except zstd.ZstdError as error:
         raise InputError(f"{recording.path}: message {k} of {topic.name} is damaged: {error}") from None
 

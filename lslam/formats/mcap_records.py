@@ -52,11 +52,12 @@ class McapFile:
         number, offset = (int(v) for v in topic.where[k])
         chunk = None if number == IN_FILE else self._chunks[number]
         try:
-            op, length = struct.unpack("<BQ", self._file.part(chunk, offset, _PREFIX))
+            is_head = limit is not None
+            op, length = struct.unpack("<BQ", self._file.part(chunk, offset, _PREFIX, is_head))
             if op != _MESSAGE:
                 raise CutOffError
             size = length - _STAMPS if limit is None else min(limit, length - _STAMPS)
-            data = self._file.part(chunk, offset + _PREFIX + _STAMPS, size)
+            data = self._file.part(chunk, offset + _PREFIX + _STAMPS, size, is_head)
             if len(data) < size:
                 raise CutOffError
         except (CutOffError, struct.error):

@@ -99,9 +99,10 @@ def _native(values: NDArray[Any]) -> NDArray[Any]:
 
 
 def _finite(cloud: PointCloud) -> PointCloud:
-    good = np.isfinite(cloud.points).all(axis=1)
-    if good.all():
+    finite = np.isfinite(cloud.points)
+    if finite.all():
         return cloud
+    good = finite.all(axis=1)
     return PointCloud(
         cloud.points[good],
         None if cloud.intensity is None else cloud.intensity[good],

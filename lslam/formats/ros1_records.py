@@ -61,10 +61,15 @@ class Ros1Bag:
         number, offset = (int(v) for v in topic.where[k])
         chunk = self._chunks[number]
         try:
-            record = self._record(chunk, offset)
+            is_head = limit is not None
+            record = self._record(chunk, offset, is_head)
             while record.op == _CONNECTION:  # indices may point at the connection that comes before
-                record = self._record(chunk, record.end)
-            return self._file.part(chunk, record.data, record.size if limit is None else min(limit, record.size))
+                record = self._record(chunk, record.end, is_head)
+            size = record.size if limit is None else min(limit, record.size)
+            data = self._file.part(chunk, record.data, size, is_head)
+            if record.op != _MESSAGE or len(data) < size:
+                raise CutOffError
+            return data
         except (CutOffError, struct.error, KeyError):
             raise InputError(f"{self.path}: message {k} of {topic.name} is damaged") from None
 
@@ -109,11 +114,11 @@ class Ros1Bag:
         self._chunks.append(Chunk(record.data, kept, kept))
         return record.data + self._index_by_hand(len(self._chunks) - 1)
 
-    def _record(self, chunk: Chunk | None, offset: int) -> _Record:
-        head = self._file.part(chunk, offset, _HEADER)
+    def _record(self, chunk: Chunk | None, offset: int, is_head: bool = False) -> _Record:
+        head = self._file.part(chunk, offset, _HEADER, is_head)
         (length,) = struct.unpack_from("<I", head)
         if length + 8 > len(head):
-            head = self._file.part(chunk, offset, length + 8)
+            head = self._file.part(chunk, offset, length + 8, is_head)
         fields = _fields(head[4 : 4 + length])
         (size,) = struct.unpack_from("<I", head, 4 + length)
         return _Record(fields[b"op"][0], fields, offset + length + 8, size)

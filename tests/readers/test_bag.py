@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -149,3 +150,17 @@ def test_an_imu_that_shares_no_time_is_said(tmp_path: Path) -> None:
     for start in (START_NS - 10**10, START_NS + 10**10):
         path = bag(tmp_path / f"{start}.bag", together(clouds(3), imu(10, start)))
         assert "IMU: it shares no time with the scans" in open_sequence(path).problems
+
+
+@pytest.mark.parametrize(("kind", "is_zstd"), [("bag", False), ("mcap", False), ("mcap", True), ("sqlite", True)])
+def test_memory_does_not_grow_with_the_bag(tmp_path: Path, kind: str, is_zstd: bool) -> None:
+    """Opening and reading 40 scans of half a megabyte never holds more than a chunk and some scans."""
+    path = bag(tmp_path / f"a{SUFFIX[kind]}", clouds(40, n=20_000), kind, is_zstd)
+    open_sequence(path).scan(0)  # imports
+    tracemalloc.start()
+    sequence = open_sequence(path)
+    for k in range(40):
+        assert len(sequence.scan(k)) == 20_000
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 7e6
