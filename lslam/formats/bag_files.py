@@ -10,6 +10,7 @@ import contextlib
 import os
 import re
 import shutil
+import sqlite3
 import struct
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
@@ -210,8 +211,8 @@ class BagWriter:
                 self._connections[topic] = self._writer.add_connection(topic, kind, typestore=self.store)
             serialise = self.store.serialize_ros1 if self.kind == "bag" else self.store.serialize_cdr
             self._writer.write(self._connections[topic], stamp_ns, serialise(message, kind))
-        except OSError as error:
-            raise OutputError(f"{self.path} cannot be written: {error.strerror or error}") from None
+        except (OSError, sqlite3.Error) as error:
+            raise OutputError(f"{self.path} cannot be written: {getattr(error, 'strerror', None) or error}") from None
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
@@ -226,8 +227,10 @@ class BagWriter:
             if made.is_dir() and self.path.suffix in (".mcap", ".db3"):
                 made = next(p for p in made.iterdir() if p.suffix == self.path.suffix)
             os.replace(made, self.path)
-        except OSError as failure:
-            raise OutputError(f"{self.path} cannot be written: {failure.strerror or failure}") from None
+        except (OSError, sqlite3.Error) as failure:
+            raise OutputError(
+                f"{self.path} cannot be written: {getattr(failure, 'strerror', None) or failure}"
+            ) from None
         finally:
             shutil.rmtree(self._part, ignore_errors=True)
 

@@ -19,9 +19,11 @@ from lslam.formats.bag_files import KINDS, BagWriter
 from lslam.formats.gnss_csv import write_gnss_csv
 from lslam.formats.imu_csv import write_imu_csv
 from lslam.formats.kitti_layout import PER_POINT, POINTS, in_camera, write_calib, write_scan, write_times
-from lslam.formats.sequence_toml import FILE_NAME, SequenceInfo, sequence_toml_text, write_sequence_toml
+from lslam.formats.sequence_toml import FILE_NAME, FRAMES, SequenceInfo, sequence_toml_text, write_sequence_toml
 from lslam.formats.trajectory_files import write_kitti, write_tum
 from lslam.geometry import se3
+from lslam.pipeline.convert_trajectory import change_frame
+from lslam.pipeline.front_end import has_point_times
 from lslam.pipeline.map_pass import motion_within
 from lslam.preprocessing.deskew import deskew_points
 from lslam.readers.bag import INFO_TOPIC
@@ -113,6 +115,8 @@ class _Source:
     def __init__(self, sequence: Sequence, trajectory: Trajectory | None, on_scan: Callable[[], None]) -> None:
         self.sequence, self.trajectory, self.on_scan = sequence, trajectory, on_scan
         self.written = self.skipped = 0
+        if trajectory is not None:
+            self.trajectory = self._check(trajectory)
 
     def scans(self) -> Iterator[Scan]:
         for k in range(len(self.sequence)):
@@ -127,6 +131,15 @@ class _Source:
             self.on_scan()
         if not self.written:
             raise InputError(f"{self.sequence.path}: none of its {len(self.sequence)} scans can be read")
+
+    def _check(self, trajectory: Trajectory) -> Trajectory:
+        """The trajectory as LiDAR poses. Raises InputError when there is nothing to deskew, or nothing to deskew along."""
+        if not has_point_times(self.sequence):
+            raise InputError(f"{self.sequence.path} has no per-point times: there is nothing to deskew")
+        if len(trajectory) < 2 or not trajectory.has_stamps:
+            raise InputError(f"{trajectory.source} has no stamped poses to deskew along")
+        is_known = trajectory.frame in FRAMES
+        return change_frame(trajectory, "lidar", self.calibration) if is_known else trajectory
 
     def _deskewed(self, scan: Scan) -> Scan:
         if self.trajectory is None or scan.times is None:

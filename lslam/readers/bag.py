@@ -16,7 +16,7 @@ from lslam.formats.point_cloud import TIME_NAMES, PointCloud
 from lslam.formats.pointcloud2 import decode_livox, decode_pointcloud2
 from lslam.formats.sequence_toml import FILE_NAME, SequenceInfo, parse_sequence_toml, read_sequence_toml
 from lslam.readers.bag_extrinsics import find_extrinsics, find_truth
-from lslam.readers.bag_topics import choose_clouds, index_scans, load_fixes, load_imu
+from lslam.readers.bag_topics import check_parts, choose_clouds, index_scans, load_fixes, load_imu
 from lslam.readers.ground_truth import Voice
 from lslam.readers.point_times import TimeRule, apply_rule, decide_rule
 from lslam.readers.sidecars import compensation_note
@@ -78,7 +78,9 @@ class BagSequence:
         cloud, shift = self.cloud(index)
         stamp += shift
         times: NDArray[np.float32] | None = None
-        if self.time_rule is not None and cloud.times is not None:
+        if self.time_rule is not None and not len(cloud):
+            times = np.zeros(0, np.float32)  # an empty scan must not look like one of a sensor without times
+        elif self.time_rule is not None and cloud.times is not None:
             times, shift = apply_rule(self.time_rule, cloud.times, stamp)
             stamp += shift
         return Scan(cloud.points, stamp, index, cloud.intensity, times, cloud.rings)
@@ -118,6 +120,7 @@ def open_folder(path: Path, overrides: SequenceInfo, why: str) -> BagSequence:
     voice = Voice([f"format {KIND}: {why}", *compensation_note(info)], list(bag.losses))
     topic = choose_clouds(bag, info.lidar_topic)
     voice.notes.append(f"scans from {topic.name} ({topic.type}, {len(topic)} messages)")
+    check_parts(bag, topic)
     messages, stamps, frame = index_scans(bag, topic, voice)
     rate = info.rate_hz or measured_rate(stamps)
     sequence = BagSequence(

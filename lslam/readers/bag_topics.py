@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +16,7 @@ from lslam.readers.ground_truth import Voice
 CLOUDS = ("PointCloud2", "CustomMsg")
 _HEADER = 512  # bytes of a message that hold its header
 _LATE_NS = 10**9  # stamps that go back further are no jitter
+_APART_NS = 60 * 10**9  # parts of one recording follow each other sooner
 _SAID = 3  # damaged messages that are named one by one
 
 Stamps = NDArray[np.int64]
@@ -47,6 +49,17 @@ def choose_clouds(bag: Bag, wanted: str | None) -> BagTopic:
             "again, or add the schemas, with the sensor's message package installed"
         )
     raise InputError(f"{bag.path} holds no clouds (PointCloud2 or Livox CustomMsg); {_listing(bag)}")
+
+
+def check_parts(bag: Bag, topic: BagTopic) -> None:
+    """Raise UsageError when the files of a folder are no parts of one recording: the next begins long after one has ended."""
+    parts = sorted((int(p.stamps_ns[0]), int(p.stamps_ns[-1]), r.path) for r, p in topic.parts if len(p))
+    for (_, end, path), (start, _, following) in pairwise(parts):
+        if start - end > _APART_NS:
+            raise UsageError(
+                f"{bag.path} holds {len(bag.files)} bags that are no parts of one recording: {following.name} begins "
+                f"{(start - end) * 1e-9:.0f} s after {path.name} has ended; name one of them, for example {path}"
+            )
 
 
 def load_imu(bag: Bag, wanted: str | None, voice: Voice) -> Stream | None:

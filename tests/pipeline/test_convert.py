@@ -112,6 +112,19 @@ def test_deskewed_scans_put_every_point_where_the_exact_motion_does(distorted: S
     assert off.max() < 0.03, "poses 0.1 s apart are all there is between"
 
 
+def test_deskewing_needs_times_and_a_motion(distorted: SimulatedDrive, tmp_path: Path) -> None:
+    truth = distorted.ground_truth
+    assert truth is not None
+    with pytest.raises(InputError, match="no per-point times"):
+        convert_sequence(sample(2), "bag", tmp_path / "a.bag", trajectory=truth)
+    with pytest.raises(InputError, match="no stamped poses"):
+        convert_sequence(distorted, "bag", tmp_path / "a.bag", trajectory=replace(truth, has_stamps=False))
+    outside = replace(truth, stamps_ns=truth.stamps_ns + 10**12)
+    with pytest.raises(InputError, match="none of its 4 scans"):
+        convert_sequence(distorted, "bag", tmp_path / "a.bag", trajectory=outside)
+    assert not list(tmp_path.iterdir())
+
+
 def test_damaged_scans_are_left_out_and_counted(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     stub = sample(4)
     stub.scans[1] = "scan 1 is damaged"

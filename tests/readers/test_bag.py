@@ -15,6 +15,7 @@ from lslam.formats.bag_files import BagWriter
 from lslam.geometry import se3
 from lslam.readers import open_sequence
 from lslam.readers.bag import BagSequence
+from lslam.types.scan import Scan
 from lslam.types.sequence import Sequence
 
 T_BASE_LIDAR = se3.exp(np.array([0.5, -0.1, 1.8, 0.01, -0.02, 1.5]))
@@ -72,9 +73,8 @@ def test_a_split_bag_is_one_recording_in_natural_order(tmp_path: Path) -> None:
     for part in (0, 2, 10):
         one = scan(part)
 
-        def fill(writer: BagWriter, one: object = one) -> None:
-            assert hasattr(one, "stamp_ns")
-            writer.write("/points", one.stamp_ns, bag_messages.cloud(writer.store, one, "lidar"))  # type: ignore[arg-type]
+        def fill(writer: BagWriter, one: Scan = one) -> None:
+            writer.write("/points", one.stamp_ns, bag_messages.cloud(writer.store, one, "lidar"))
 
         bag(tmp_path / f"drive_{part}.bag", fill)
     sequence = open_sequence(tmp_path)
@@ -82,6 +82,19 @@ def test_a_split_bag_is_one_recording_in_natural_order(tmp_path: Path) -> None:
     assert [p.name for p in sequence.bag.files] == ["drive_0.bag", "drive_2.bag", "drive_10.bag"]
     np.testing.assert_array_equal(sequence.stamps_ns, START_NS + np.array([0, 2, 10]) * STEP_NS)
     np.testing.assert_array_equal(sequence.scan(2).points, scan(10).points)
+
+
+def test_bags_of_different_days_are_not_taken_for_one_recording(tmp_path: Path) -> None:
+    for name, first in (("monday", 0), ("tuesday", 864_000)):
+        one = scan(first)
+
+        def fill(writer: BagWriter, one: Scan = one) -> None:
+            writer.write("/points", one.stamp_ns, bag_messages.cloud(writer.store, one, "lidar"))
+
+        bag(tmp_path / f"{name}.bag", fill)
+    with pytest.raises(UsageError, match=r"tuesday\.bag begins 86400 s after monday\.bag has ended; name one"):
+        open_sequence(tmp_path)
+    assert len(open_sequence(tmp_path / "monday.bag")) == 1
 
 
 def test_several_clouds_ask_for_a_choice(tmp_path: Path) -> None:

@@ -17,6 +17,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from lslam.errors import InputError
 from lslam.formats import bag_messages
 from lslam.formats.bag_files import BagWriter
+from lslam.pipeline.front_end import has_point_times
 from lslam.readers import open_sequence
 from lslam.types.scan import Scan
 from lslam.types.sequence import Sequence
@@ -158,6 +159,7 @@ def test_clouds_without_points_are_empty_scans_and_the_rule_waits_for_points(tmp
 
     sequence = open_sequence(bag(tmp_path / "a.bag", fill))
     assert [len(sequence.scan(k)) for k in range(3)] == [0, N, 0]
+    assert has_point_times(sequence)
     np.testing.assert_array_equal(sequence.scan(1).times, rows["time"])
 
 
