@@ -28,6 +28,9 @@ class ImuConfig(Section):
     time_offset_s: float | None = Field(
         None, ge=-10, le=10, description="s to add to the IMU's stamps; absent: estimated from the rotation rates"
     )
+    inlier_distance: float | None = Field(
+        None, gt=0, description="m; takes the place of registration.inlier_distance when the IMU is used"
+    )
     start_s: float = Field(
         5.0, ge=0.5, le=60, description="s at the start that are registered once without the IMU, to check and align it"
     )

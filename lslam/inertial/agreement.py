@@ -30,12 +30,14 @@ class Agreement:
 
     is_judged : whether the sensor turned enough to tell; correlation : -1..1 at the best offset
     offset_s : s to add to the IMU's stamps, 0 when it is not clearly another; offset_sigma_s : its standard deviation
+    gyro_bias : (3,) rad/s in IMU axes, by how much more the gyroscope turns on the mean; None when that is not known
     """
 
     is_judged: bool
     correlation: float = 0.0
     offset_s: float = 0.0
     offset_sigma_s: float = 0.0
+    gyro_bias: Floats | None = None
 
 
 def check_agreement(
@@ -57,15 +59,16 @@ def check_agreement(
     best = int(np.argmax(scores))
     correlation, ratio, turning = _compare(seen, felt.rates(float(offsets[best])))
     if turning < LEAST_TURNING:
-        return _hardly_turning(felt.rates(0.0 if offset_s is None else offset_s))
+        return _hardly_turning(felt.rates(0.0 if offset_s is None else offset_s), seen, T_lidar_imu)
     _refuse_scale(ratio)
     if correlation < LEAST_CORRELATION:
         raise ImuRefusedError(_why_not(felt, seen, correlation))
+    bias = _mean_excess(felt.rates(float(offsets[best])), seen, T_lidar_imu)
     if offset_s is not None:
-        return Agreement(True, correlation, offset_s)
+        return Agreement(True, correlation, offset_s, gyro_bias=bias)
     offset, sigma = _refined(felt, seen, float(offsets[best]))
     is_sure = abs(offset) > max(LEAST_OFFSET_S, SIGNIFICANT * sigma)
-    return Agreement(True, correlation, offset if is_sure else 0.0, sigma)
+    return Agreement(True, correlation, offset if is_sure else 0.0, sigma, bias)
 
 
 class _Felt:
@@ -103,7 +106,14 @@ def _compare(seen: Floats, felt: Floats) -> tuple[float, float, float]:
     return ab / max(np.sqrt(aa * bb), 1e-12), float(np.sqrt(bb / max(aa, 1e-12))), float(np.sqrt(aa / len(a)))
 
 
-def _hardly_turning(felt: Floats) -> Agreement:
+def _mean_excess(felt: Floats, seen: Floats, T_lidar_imu: Floats) -> Floats | None:
+    """(3,) rad/s in IMU axes: a mean over both, so turns at the start do not count as bias."""
+    if not np.isfinite(felt).all(axis=1).any():
+        return None
+    return np.asarray(np.nanmean(felt - seen, axis=0) @ T_lidar_imu[:3, :3])
+
+
+def _hardly_turning(felt: Floats, seen: Floats, T_lidar_imu: Floats) -> Agreement:
     """Nothing turned, so nothing can be compared, unless the gyroscope says something else."""
     varied = float(np.nanstd(felt, axis=0).max()) if np.isfinite(felt).any() else 0.0
     if varied > 20 * LEAST_TURNING:
@@ -111,7 +121,7 @@ def _hardly_turning(felt: Floats) -> Agreement:
             f"its rates vary by {np.rad2deg(varied):.1f} deg/s while the scans show that nothing turns: "
             "check its unit (rad/s), its axes and its stamps"
         )
-    return Agreement(False)
+    return Agreement(False, gyro_bias=_mean_excess(felt, seen, T_lidar_imu))
 
 
 def _refuse_scale(ratio: float) -> None:

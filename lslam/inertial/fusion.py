@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from collections import deque
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,7 +42,7 @@ class InertialMotion:
         self._gaps = gaps(imu, config.gap_s)
         self._instant_ns: int | None = None
         self._pose = np.eye(4)
-        self._errors: deque[tuple[float, float]] = deque(maxlen=self.JUDGED)
+        self._errors: list[tuple[float, float]] = []
 
     @property
     def is_known(self) -> bool:
@@ -92,6 +91,13 @@ class InertialMotion:
                 self.estimate = self._advanced(stamp_ns, instant_ns)
         self.coasting.correct(stamp_ns, pose, prior)
         self._instant_ns, self._pose = instant_ns, middle.copy()
+
+    def prior_errors(self) -> tuple[float, float] | None:
+        """Medians, m, of how wrong the IMU and constant velocity predicted the scans, turns counted at `LEVER_M`."""
+        if not self._errors:
+            return None
+        own, steady = np.median(np.array(self._errors), axis=0)
+        return float(own), float(steady)
 
     def _prior(
         self, estimate: ImuEstimate, anchor_ns: int, anchor: Floats, stamp_ns: int, span_s: float
@@ -143,13 +149,13 @@ class InertialMotion:
     def _judge(self, stamp_ns: int, pose: Floats) -> None:
         """Refuse an IMU that predicts scans clearly worse than constant velocity does."""
         assert self._instant_ns is not None
-        if not self.coasting.is_known or self.config.velocity == "integrated":
+        if not self.coasting.is_known:
             return
         mine = self._prior(self.estimate, self._instant_ns, self._pose, stamp_ns, 0.0).start
         self._errors.append((_distance(mine, pose), _distance(self.coasting.predict(stamp_ns), pose)))
-        if len(self._errors) < self.JUDGED:
+        if len(self._errors) < self.JUDGED or self.config.velocity == "integrated":
             return
-        own, steady = (float(v) for v in np.median(np.array(self._errors), axis=0))
+        own, steady = (float(v) for v in np.median(np.array(self._errors[-self.JUDGED :]), axis=0))
         if own > self.WORSE * steady + self.SLACK_M:
             self.refusal = (
                 f"it predicts scans {own:.3f} m wrong where constant velocity is {steady:.3f} m wrong (turns counted at "

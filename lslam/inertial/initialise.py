@@ -10,27 +10,33 @@ from numpy.typing import NDArray
 from lslam.config.imu import ImuConfig
 from lslam.geometry import so3
 from lslam.inertial.agreement import check_agreement
-from lslam.inertial.estimate import BIAS, GRAVITY, ImuEstimate
+from lslam.inertial.estimate import BIAS, DOWN, GRAVITY, ImuEstimate
 from lslam.inertial.integrate import integrate
 from lslam.inertial.stream import clean
 from lslam.types.imu import ImuStream
 
 Floats = NDArray[np.float64]
 
-# One sigma before anything is known: any vehicle's speed; consumer devices' biases; gravity from forces while moving.
-ANY_SPEED, ANY_ACCEL_BIAS, ANY_GYRO_BIAS, MOVING_GRAVITY = 50.0, 0.5, 0.1, 1.5
+# One sigma before anything is known: any vehicle's speed; consumer devices' biases; a bias by the mean turn.
+ANY_SPEED, ANY_ACCEL_BIAS, ANY_GYRO_BIAS, MEAN_GYRO_BIAS = 50.0, 0.5, 0.1, 0.02
 GIVEN_ACCEL_BIAS, GIVEN_GYRO_BIAS, GIVEN_SPEED = 0.05, 2e-3, 0.3
+# A given bias may differ from the mean rate error of the first seconds by so much, rad/s: misaligned axes add to that.
+MOST_BIAS_ERROR = 0.03
 # A standing sensor: spread of rates (rad/s) and forces (m/s2) over a second, and how far registration moves it (m).
 STILL_RATE, STILL_FORCE, STILL_MOVE = 0.02, 0.3, 0.05
-STILL_GRAVITY = 0.1
+# What gravity may be off beyond what a bias explains, m/s2.
+LEVEL_SIGMA = 0.3
 # The speed at the first scan is read off so many seconds: longer, and errors of the force add up.
 SPEED_S = 0.8
+# Gravity is read off so many seconds: shorter, and swings of the sensor take its place.
+GRAVITY_S = 3.0
 
 
 @dataclass(frozen=True)
 class Start:
     """A usable IMU: its stream on the clock of the scans, the estimate at the first of them, and what was decided.
 
+    problems : what was given and could not be used
     offset_s : what was added to its stamps; is_checked : whether its turns could be compared with those of the scans
     """
 
@@ -41,6 +47,7 @@ class Start:
     is_checked: bool
     is_static: bool
     notes: list[str]
+    problems: list[str]
 
 
 def start(
@@ -72,48 +79,64 @@ def start(
         notes.append(
             "IMU: the sensor hardly turns at the start, so axes and clock of the IMU could not be checked there"
         )
+    problems: list[str] = []
+    config = _without_wrong_bias(config, agreement.gyro_bias, problems)
     moved = round(1e9 * agreement.offset_s)
     usable = replace(cleaned.imu, stamps_ns=cleaned.imu.stamps_ns + moved)
-    first, is_static = _first_guess(usable, T_lidar_imu, stamps_ns, poses, config)
+    first, is_static = _first_guess(usable, T_lidar_imu, stamps_ns, poses, config, agreement.gyro_bias)
     estimate = _learnt(usable, T_lidar_imu, first, stamps_ns, poses, config)
     notes.append("IMU aligned " + ("while standing" if is_static else "while moving"))
-    return Start(usable, T_lidar_imu, estimate, offset, agreement.is_judged, is_static, notes)
+    return Start(usable, T_lidar_imu, estimate, offset, agreement.is_judged, is_static, notes, problems)
+
+
+def _without_wrong_bias(config: ImuConfig, seen: Floats | None, problems: list[str]) -> ImuConfig:
+    """A given bias that the scans contradict is another device's: a preset's, say."""
+    if config.gyro_bias is None or seen is None:
+        return config
+    off = float(np.abs(np.array(config.gyro_bias) - seen).max())
+    if off < MOST_BIAS_ERROR:
+        return config
+    problems.append(
+        f"imu.gyro_bias {config.gyro_bias} and imu.accel_bias are not used, they are estimated: the scans show a rate bias "
+        f"that differs by {off:.3f} rad/s"
+    )
+    return config.model_copy(update={"gyro_bias": None, "accel_bias": None})
 
 
 def _first_guess(
-    imu: ImuStream, T_lidar_imu: Floats, stamps_ns: NDArray[np.int64], poses: Floats, config: ImuConfig
-) -> tuple[ImuEstimate, bool]:
-    """Gravity from the mean force of the first second, the rate's bias too when the sensor stands."""
-    i, j = np.searchsorted(imu.stamps_ns, [stamps_ns[0], stamps_ns[0] + 1_000_000_000])
-    j = min(max(int(j), int(i) + 1), len(imu))
-    i = min(int(i), j - 1)
-    force, rates = imu.accel[i:j], imu.gyro[i:j]
-    within = stamps_ns < stamps_ns[0] + 1_000_000_000
-    stands = (
-        float(np.std(rates, axis=0).max()) < STILL_RATE
-        and float(np.std(force, axis=0).max()) < STILL_FORCE
-        and within.sum() > 2
-        and float(np.linalg.norm(poses[within, :3, 3] - poses[0, :3, 3], axis=1).max()) < STILL_MOVE
-    )
-    gyro_bias, gyro_sigma = (rates.mean(axis=0), GIVEN_GYRO_BIAS) if stands else (np.zeros(3), ANY_GYRO_BIAS)
+    imu: ImuStream, T_lidar_imu: Floats, stamps_ns: NDArray[np.int64], poses: Floats, config: ImuConfig,
+    mean_bias: Floats | None,
+) -> tuple[ImuEstimate, bool]:  # fmt: skip
+    """Biases as given, or of a standing sensor, or by the mean turn; gravity as the scans' path and the forces need it."""
+    stands, rates = _is_standing(imu, stamps_ns, poses)
+    gyro_bias, gyro_sigma = (np.zeros(3), ANY_GYRO_BIAS) if mean_bias is None else (mean_bias, MEAN_GYRO_BIAS)
+    if stands:
+        gyro_bias, gyro_sigma = rates, GIVEN_GYRO_BIAS
     accel_bias, accel_sigma = np.zeros(3), ANY_ACCEL_BIAS
     if config.gyro_bias is not None:
         gyro_bias, gyro_sigma = np.array(config.gyro_bias), GIVEN_GYRO_BIAS
     if config.accel_bias is not None:
         accel_bias, accel_sigma = np.array(config.accel_bias), GIVEN_ACCEL_BIAS
-    mean = (force - accel_bias).mean(axis=0)
-    gravity = -GRAVITY * (T_lidar_imu[:3, :3] @ mean) / max(float(np.linalg.norm(mean)), 1e-9)
-    # Standing, force and gravity only say their difference: a bias tilts what is taken for vertical.
+    # Force and gravity only say their difference at first: a bias tilts what is taken for vertical.
+    R, shared = T_lidar_imu[:3, :3], accel_sigma**2
     covariance = np.zeros((9, 9))
-    sigmas = np.repeat([ANY_SPEED, MOVING_GRAVITY, accel_sigma], 3)
-    np.fill_diagonal(covariance, sigmas**2)
-    if stands:
-        R = T_lidar_imu[:3, :3]
-        covariance[3:6, 3:6] = (STILL_GRAVITY**2 + accel_sigma**2) * np.eye(3)
-        covariance[3:6, BIAS] = accel_sigma**2 * R
-        covariance[BIAS, 3:6] = accel_sigma**2 * R.T
-    guess = ImuEstimate(np.zeros(3), gravity, accel_bias, gyro_bias, covariance, gyro_sigma**2 * np.eye(3))
-    return guess, stands
+    np.fill_diagonal(covariance, np.repeat([ANY_SPEED**2, LEVEL_SIGMA**2 + shared, shared], 3))
+    covariance[DOWN, BIAS], covariance[BIAS, DOWN] = shared * R, shared * R.T
+    guess = ImuEstimate(np.zeros(3), np.zeros(3), accel_bias, gyro_bias, covariance, gyro_sigma**2 * np.eye(3))
+    gravity = _path_of_force(imu, poses @ T_lidar_imu, stamps_ns, guess, GRAVITY_S)[1]
+    return replace(guess, gravity=GRAVITY * gravity / max(float(np.linalg.norm(gravity)), 1e-9)), stands
+
+
+def _is_standing(imu: ImuStream, stamps_ns: NDArray[np.int64], poses: Floats) -> tuple[bool, Floats]:
+    """Whether the first second is one of standing still, and the mean rates (3,) in it."""
+    end_ns = stamps_ns[0] + 1_000_000_000
+    i, j = (int(k) for k in np.searchsorted(imu.stamps_ns, [stamps_ns[0], end_ns]))
+    within = stamps_ns < end_ns
+    if j - i < 5 or within.sum() < 3:
+        return False, np.zeros(3)
+    moved = float(np.linalg.norm(poses[within, :3, 3] - poses[0, :3, 3], axis=1).max())
+    varies = float(np.std(imu.gyro[i:j], axis=0).max()), float(np.std(imu.accel[i:j], axis=0).max())
+    return moved < STILL_MOVE and varies[0] < STILL_RATE and varies[1] < STILL_FORCE, imu.gyro[i:j].mean(axis=0)
 
 
 def _learnt(
@@ -132,30 +155,36 @@ def _learnt(
         learnt = learnt.corrected(imu, stamps_ns[k : k + 2], T[k, :3, :3], T[k + 1, :3, :3], moved)
     covariance = learnt.covariance.copy()
     covariance[:3, :] = covariance[:, :3] = 0.0
-    velocity, sigma = _first_velocity(imu, T, stamps_ns, learnt)
+    velocity, _, spread = _path_of_force(imu, T, stamps_ns, learnt, SPEED_S)
+    sigma = max(spread, 0.1)
     if config.initial_velocity is not None:
-        lever = T_lidar_imu[:3, 3]
         i = min(int(np.searchsorted(imu.stamps_ns, stamps_ns[0])), len(imu) - 1)
         rate = T_lidar_imu[:3, :3] @ (imu.gyro[i] - learnt.gyro_bias)
-        velocity, sigma = np.array(config.initial_velocity) + np.cross(rate, lever), GIVEN_SPEED
+        velocity, sigma = np.array(config.initial_velocity) + np.cross(rate, T_lidar_imu[:3, 3]), GIVEN_SPEED
     covariance[:3, :3] = sigma**2 * np.eye(3)
     return replace(learnt, velocity=velocity, covariance=covariance)
 
 
-def _first_velocity(
-    imu: ImuStream, T_world_imu: Floats, stamps_ns: NDArray[np.int64], learnt: ImuEstimate
-) -> tuple[Floats, float]:
-    """Velocity of the IMU at the first pose, m/s, from the displacements that forces do not explain, and its sigma."""
-    count = max(int(np.searchsorted(stamps_ns, stamps_ns[0] + round(1e9 * SPEED_S))), min(3, len(stamps_ns)))
-    if count < 2:
-        return np.zeros(3), ANY_SPEED
-    step = integrate(imu, stamps_ns[:count], learnt.gyro_bias, learnt.accel_bias)
-    _, _, moved = step.motion(0, T_world_imu[0, :3, :3], np.zeros(3), learnt.gravity)
+def _path_of_force(
+    imu: ImuStream, T_world_imu: Floats, stamps_ns: NDArray[np.int64], known: ImuEstimate, seconds: float
+) -> tuple[Floats, Floats, float]:
+    """Velocity at the first pose (3,), gravity (3,) and the velocity's sigma that lead along the poses of some seconds.
+
+    Where `known` has a gravity, it is kept and only the velocity is looked for.
+    """
+    count = max(int(np.searchsorted(stamps_ns, stamps_ns[0] + round(1e9 * seconds))), min(4, len(stamps_ns)))
+    has_gravity = bool(known.gravity.any())
+    if count < 4:
+        step = integrate(imu, stamps_ns[0] + np.array([0, 500_000_000]), known.gyro_bias, known.accel_bias)
+        return np.zeros(3), known.gravity if has_gravity else -T_world_imu[0, :3, :3] @ step.velocities[-1], ANY_SPEED
+    step = integrate(imu, stamps_ns[:count], known.gyro_bias, known.accel_bias)
+    _, _, moved = step.motion(0, T_world_imu[0, :3, :3], np.zeros(3), known.gravity)
     rest = T_world_imu[:count, :3, 3] - T_world_imu[0, :3, 3] - moved
-    t = step.seconds
-    velocity = np.asarray((t @ rest) / (t @ t))
-    spread = float(np.sqrt(np.mean(np.sum((rest - t[:, None] * velocity) ** 2, axis=1)) / (t @ t)))
-    return velocity, max(spread, 0.1)
+    t = step.seconds[:, None]
+    A = t if has_gravity else np.hstack([t, 0.5 * t**2])
+    x = np.linalg.lstsq(A, rest, rcond=None)[0]
+    spread = float(np.sqrt(np.mean(np.sum((rest - A @ x) ** 2, axis=1)) / float(np.sum(t**2))))
+    return x[0], known.gravity if has_gravity else x[1], spread
 
 
 def vertical(estimate: ImuEstimate) -> Floats:

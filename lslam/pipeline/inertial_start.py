@@ -57,10 +57,19 @@ def begin_inertial(sequence: Sequence, config: Config) -> Inertial:
         log.warning("%s", part.problems[-1])
         return part
     part.start, part.notes = begun, list(begun.notes)
+    part.problems += begun.problems
     part.motion = InertialMotion(begun.imu, T_lidar_imu, begun.estimate, config.imu)
     for note in part.notes:
         log.info("%s", note)
     return part
+
+
+def with_imu_settings(config: Config) -> Config:
+    """The configuration of a run that the IMU predicts: better priors want a narrower search."""
+    if not config.imu.use or config.imu.inlier_distance is None:
+        return config
+    narrow = config.registration.model_copy(update={"inlier_distance": config.imu.inlier_distance})
+    return config.model_copy(update={"registration": narrow})
 
 
 def _first_poses(sequence: Sequence, config: Config) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
@@ -91,6 +100,7 @@ def close_inertial(part: Inertial, results: list[ScanResult]) -> dict[str, Any]:
     if motion.refusal:
         part.problems.append(f"the IMU was refused on the way, the run went on without it: {motion.refusal}")
     last = motion.estimate
+    errors = motion.prior_errors()
     norms = [r.prior_norm for r in results[1:] if r.status == "ok"]
     return {
         "used": not motion.refusal,
@@ -103,7 +113,9 @@ def close_inertial(part: Inertial, results: list[ScanResult]) -> dict[str, Any]:
         "accel_bias_m_s2": _rounded(last.accel_bias, 4),
         "gravity_in_world_m_s2": _rounded(last.gravity, 4),
         "scans_in_gaps": motion.gap_scans,
-        "median_prior_norm": float(np.median(norms)) if norms else None,
+        "median_prior_norm": round(float(np.median(norms)), 5) if norms else None,
+        "prior_error_m": None if errors is None else round(errors[0], 5),
+        "constant_velocity_error_m": None if errors is None else round(errors[1], 5),
     }
 
 

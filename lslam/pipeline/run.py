@@ -20,7 +20,7 @@ from lslam.pipeline.check import check_config
 from lslam.pipeline.choose import choose_scans
 from lslam.pipeline.feature_pass import build_feature_map
 from lslam.pipeline.front_end import estimate, has_point_times, is_diverged, to_trajectory
-from lslam.pipeline.inertial_start import Inertial, begin_inertial, close_inertial
+from lslam.pipeline.inertial_start import Inertial, begin_inertial, close_inertial, with_imu_settings
 from lslam.pipeline.manifest import Manifest, describe_deskew
 from lslam.pipeline.map_pass import build_map
 from lslam.pipeline.run_folder import RunFolder
@@ -90,7 +90,7 @@ def run(
     if isinstance(sequence, (str, Path)):
         sequence = open_sequence(sequence)
     truth = sequence.ground_truth if ground_truth is None else ground_truth
-    odometry = create_odometry(config)
+    odometry = create_odometry(with_imu_settings(config))
     chosen = choose_scans(with_imu(sequence) if config.imu.use else sequence, odometry, config)
     manifest = Manifest(command, chosen, config)
     if out is None:

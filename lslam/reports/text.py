@@ -28,6 +28,7 @@ def summary(record: RunRecord, evaluation: Evaluation | None) -> str:
     rows = [("status", facts.status), *(("", reason) for reason in facts.reasons)]
     rows += _scan_rows(facts)
     rows.append(("path", f"{facts.path_length:.1f} m in {facts.duration:.1f} s"))
+    rows += _imu_rows(record)
     rows += _score_rows(record, evaluation)
     rows += _time_rows(record, facts)
     rows += [(name, str(record.folder / file)) for name, file in FILES if (record.folder / file).is_file()]
@@ -47,6 +48,23 @@ def _scan_rows(facts: RunFacts) -> list[tuple[str, str]]:
     if len(facts.failures) > len(shown):
         rows.append(("", f"and {len(facts.failures) - len(shown)} more: see the report"))
     return rows
+
+
+def _imu_rows(record: RunRecord) -> list[tuple[str, str]]:
+    """What the IMU was good for, when there was one."""
+    imu = record.manifest.get("imu")
+    if not imu:
+        return []
+    if imu.get("prior_error_m") is None:
+        return [("imu", "used" if imu["used"] else "refused")]
+    own, steady = imu["prior_error_m"], imu["constant_velocity_error_m"]
+    used = "used" if imu["used"] else "refused on the way"
+    return [
+        (
+            "imu",
+            f"{used}; predicts scans to {metres(own)} m, constant velocity to {metres(steady)} m (medians, turns at 10 m)",
+        )
+    ]
 
 
 def _failure(failure: Failure) -> str:
