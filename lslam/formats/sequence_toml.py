@@ -16,6 +16,8 @@ from lslam.formats.atomic import atomic_write
 
 FILE_NAME = "sequence.toml"
 INSTANTS = ("scan_start", "scan_middle", "scan_end")
+UNITS = ("s", "ms", "us", "ns")
+REFERENCES = ("start", "end", "absolute")
 FRAMES = ("lidar", "cam0", "imu")
 EXTRINSICS = ("T_cam0_lidar", "T_lidar_imu", "T_lidar_gnss")
 
@@ -31,6 +33,8 @@ class SequenceInfo:
     motion_compensated : scans are free of motion distortion; compensated_to : the instant, one of `INSTANTS`
     vertical_correction_deg : rotation of every point about p x z that the scans still need, 0 for none
     per_point : folder of `<scan>.npz` with `t` (float32 s since scan start) and `ring` (uint16)
+    point_time_unit, point_time_reference : of the points' own time field, where it does not show, one of `UNITS` and of
+        `REFERENCES`: the scan's start or end, which is its stamp then, or absolute
     stamps, imu, gnss, ground_truth : files, relative to the sequence folder
     ground_truth_frame : the body whose poses `ground_truth` holds, one of `FRAMES`
     lidar_topic, imu_topic, gnss_topic : which topics of a bag are read
@@ -47,6 +51,8 @@ class SequenceInfo:
     compensated_to: str | None = None
     vertical_correction_deg: float | None = None
     per_point: str | None = None
+    point_time_unit: str | None = None
+    point_time_reference: str | None = None
     stamps: str | None = None
     imu: str | None = None
     gnss: str | None = None
@@ -142,6 +148,8 @@ _CHECKS: dict[str, tuple[Callable[[Any], bool], str]] = {
     "compensated_to": (lambda v: v in INSTANTS, "one of " + ", ".join(INSTANTS)),
     "vertical_correction_deg": (_is_number, "a number, degrees"),
     "per_point": (_is_text, "a folder"),
+    "point_time_unit": (lambda v: v in UNITS, "one of " + ", ".join(UNITS)),
+    "point_time_reference": (lambda v: v in REFERENCES, "one of " + ", ".join(REFERENCES)),
     "stamps": (_is_text, "a file"),
     "imu": (_is_text, "a file"),
     "gnss": (_is_text, "a file"),

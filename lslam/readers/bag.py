@@ -129,7 +129,7 @@ def open_folder(path: Path, overrides: SequenceInfo, why: str) -> BagSequence:
         notes=voice.notes, problems=voice.problems,
     )  # fmt: skip
     if not info.motion_compensated:
-        _decide_times(sequence)
+        _decide_times(sequence, info)
     imu, gnss = load_imu(bag, info.imu_topic, voice), load_fixes(bag, info.gnss_topic, voice)
     for what, stream in (("IMU", imu), ("GNSS", gnss)):
         if stream is not None and (stream.stamps_ns[0] > stamps[-1] or stream.stamps_ns[-1] < stamps[0]):
@@ -152,7 +152,7 @@ def _info(path: Path, bag: Bag, overrides: SequenceInfo) -> SequenceInfo:
     return said if text is None else said.over(parse_sequence_toml(text, f"{path}, {INFO_TOPIC}"))
 
 
-def _decide_times(sequence: BagSequence) -> None:
+def _decide_times(sequence: BagSequence, info: SequenceInfo) -> None:
     """Find out on the first scans how per-point times are meant; stamps move to the scans' starts."""
     cloud = PointCloud(np.zeros((0, 3), np.float32))
     for index in range(min(len(sequence), _LOOKED_AT)):
@@ -169,7 +169,9 @@ def _decide_times(sequence: BagSequence) -> None:
         return
     stamp = int(sequence.headers_ns[index]) + shift
     try:
-        rule = decide_rule(cloud.time_field, cloud.times, stamp, sequence.rate_hz)
+        rule = decide_rule(
+            cloud.time_field, cloud.times, stamp, sequence.rate_hz, info.point_time_unit, info.point_time_reference
+        )
     except InputError as error:
         sequence.problems.append(f"no deskew: {error}")
         return

@@ -30,8 +30,17 @@ class TimeRule:
     sentence: str
 
 
-def decide_rule(name: str, values: NDArray[Any], stamp_ns: int, rate_hz: float) -> TimeRule:
-    """Find unit and reference of a time field from one scan.
+def decide_rule(
+    name: str,
+    values: NDArray[Any],
+    stamp_ns: int,
+    rate_hz: float,
+    unit: str | None = None,
+    reference: str | None = None,
+) -> TimeRule:
+    """Find unit and reference of a time field from one scan, unless they are stated.
+
+    unit : s, ms, us or ns; reference : `start` or `end` of the scan, or `absolute`; None finds out
 
     The unit is the one in which the scan lasts about 1 / `rate_hz`; integers are ns when that fits too. Offsets that are
     negative refer to the scan's end, values near the stamp or beyond 1e9 s are clock readings (CONVENTIONS).
@@ -41,21 +50,27 @@ def decide_rule(name: str, values: NDArray[Any], stamp_ns: int, rate_hz: float) 
     low, high = (float(finite.min()), float(finite.max())) if len(finite) else (0.0, 0.0)
     period_ns = 1e9 / rate_hz
     fitting = [u for u, ns in _UNITS_NS.items() if 0.05 <= (high - low) * ns / period_ns <= 3]
+    if unit is not None:
+        fitting = [unit]
     if not fitting or values.dtype.kind not in "fiu":
         raise InputError(
             f"per-point time field {name!r} ({values.dtype}, {low:.9g} to {high:.9g}, scan stamp {stamp_ns} ns) spans no "
-            f"scan of {1 / rate_hz:.3g} s in s, ms, us or ns; state rate_hz in sequence.toml or convert the field"
+            f"scan of {1 / rate_hz:.3g} s in s, ms, us or ns; state rate_hz, or point_time_unit and point_time_reference, "
+            "in sequence.toml"
         )
+    how = ", as stated" if unit or reference else ""
     unit = "ns" if values.dtype.kind in "iu" and "ns" in fitting else fitting[0]
     scale = _UNITS_NS[unit]
     is_absolute = low * scale > 1e18 or (low * scale > _NEAR_NS and abs(low * scale - stamp_ns) < _NEAR_NS)
     is_before_stamp = not is_absolute and low < 0
-    reference = "absolute" if is_absolute else "relative to the scan's end" if is_before_stamp else "since scan start"
+    if reference is not None:
+        is_absolute, is_before_stamp = reference == "absolute", reference == "end"
+    words = "absolute" if is_absolute else "relative to the scan's end" if is_before_stamp else "since scan start"
     return TimeRule(
         scale,
         is_absolute,
         is_before_stamp,
-        f"per-point times from field {name!r} ({values.dtype}), {unit}, {reference}",
+        f"per-point times from field {name!r} ({values.dtype}), {unit}, {words}{how}",
     )
 
 
@@ -69,7 +84,9 @@ def apply_rule(rule: TimeRule, values: NDArray[Any], stamp_ns: int) -> tuple[NDA
     # The difference is taken in the field's own type first: absolute ns do not fit a float.
     times = ((values - first).astype(np.float64) * (rule.ns_per_unit * 1e-9)).astype(np.float32)
     if rule.is_before_stamp:
-        return times, round(float(first) * rule.ns_per_unit)
+        # Offsets that count up to a stamp at the end, where that is stated, begin at 0.
+        offset = float(first) if first < 0 else -float(values[np.isfinite(values)].max() - first)
+        return times, round(offset * rule.ns_per_unit)
     start_ns = (
         int(first) if values.dtype.kind in "iu" and rule.ns_per_unit == 1 else round(float(first) * rule.ns_per_unit)
     )

@@ -55,7 +55,7 @@ def open_folder(folder: Path, overrides: SequenceInfo, why: str) -> FolderSequen
     correction = info.vertical_correction_deg or 0.0
     if correction:
         voice.notes.append(f"vertical correction {correction:g} deg, as stated")
-    rule = None if info.motion_compensated else _time_rule(files, stamps, rate, voice)
+    rule = None if info.motion_compensated else _time_rule(files, stamps, rate, info, voice)
     if info.rows and info.cols:
         voice.notes.append(f"organised clouds of {info.rows} rows x {info.cols} columns: the row is the ring")
     return FolderSequence(
@@ -195,7 +195,9 @@ def _mcd_extrinsics(folder: Path, voice: Voice) -> NDArray[np.float64] | None:
     return None
 
 
-def _time_rule(files: list[Path], stamps: NDArray[np.int64], rate: float, voice: Voice) -> TimeRule | None:
+def _time_rule(
+    files: list[Path], stamps: NDArray[np.int64], rate: float, info: SequenceInfo, voice: Voice
+) -> TimeRule | None:
     """How per-point times of the files are read, decided on the first scan that has any."""
     if files[0].suffix.lower() == ".bin":
         return None
@@ -206,7 +208,9 @@ def _time_rule(files: list[Path], stamps: NDArray[np.int64], rate: float, voice:
             continue
         if cloud.times is not None and len(cloud):
             try:
-                rule = decide_rule(cloud.time_field, cloud.times, int(stamp), rate)
+                rule = decide_rule(
+                    cloud.time_field, cloud.times, int(stamp), rate, info.point_time_unit, info.point_time_reference
+                )
             except InputError as error:
                 voice.problems.append(f"no deskew: {error}")
                 return None

@@ -15,7 +15,8 @@ from lslam.geometry import se3
 FULL = SequenceInfo(
     name="block", sensor="OS1-32", rings=32, rows=32, cols=1024, rate_hz=10.0, motion_compensated=False,
     compensated_to="scan_start", vertical_correction_deg=0.0, per_point="per_point", stamps="times.txt", imu="imu.csv",
-    gnss="gnss.csv", ground_truth="gt.tum", ground_truth_frame="lidar",
+    gnss="gnss.csv", ground_truth="gt.tum", ground_truth_frame="lidar", point_time_unit="us", point_time_reference="end",
+    lidar_topic="/points", imu_topic="/imu", gnss_topic="/fix",
     T_cam0_lidar=se3.exp(np.array([1, 2, 3, 0.1, 0.2, 0.3])), T_lidar_imu=se3.exp(np.array([0, 0, 0.1, 0, 0, 3.0])),
     T_lidar_gnss=np.eye(4),
 )  # fmt: skip
@@ -42,6 +43,8 @@ BAD = {
     "motion_compensated = 'yes'": "expected true or false",
     "compensated_to = 'noon'": "one of scan_start, scan_middle, scan_end",
     "ground_truth_frame = 'frame'": "one of lidar, cam0, imu",
+    "point_time_unit = 'min'": "one of s, ms, us, ns",
+    "point_time_reference = 1": "one of start, end, absolute",
     "rows = 64": "go together",
     "extrinsics = 3": "extrinsics is a table",
     "[extrinsics]\nT_lidar_imuu = [1]": "did you mean 'T_lidar_imu'?",

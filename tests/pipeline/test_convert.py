@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from rosbags.highlevel import AnyReader
 from stub_sequences import sample
 
 from lslam.errors import InputError, OutputExistsError, UsageError
@@ -68,6 +70,40 @@ def test_to_a_bag_and_on_to_kitti_and_back(distorted: Sequence, tmp_path: Path, 
     assert not through_kitti.problems
     assert_same(distorted, through_kitti)
     assert sorted(p.name for p in tmp_path.iterdir()) == sorted([NAMES[kind], "k"]), "nothing stays beside"
+
+
+# What ROS 1 nodes compare before they listen (`rosmsg md5`).
+MD5 = {
+    "sensor_msgs/msg/PointCloud2": "1158d486dd51d683ce2f1be655c3c181",
+    "sensor_msgs/msg/Imu": "6a62c6daae103f4ff57a132d6f95cec2",
+    "sensor_msgs/msg/NavSatFix": "2d3a8cd499b9b4a0249fb98fd05cfa48",
+    "nav_msgs/msg/Odometry": "cd5e73d190d741a2f92e81eda573aca7",
+    "tf2_msgs/msg/TFMessage": "94810edda583a504dfda3829e70d7eec",
+    "std_msgs/msg/String": "992ce8a1687cec8c8bd883ec73ca41d1",
+}
+
+
+@pytest.mark.parametrize("kind", NAMES)
+def test_another_reader_finds_what_ros_expects(distorted: SimulatedDrive, tmp_path: Path, kind: str) -> None:
+    """rosbags' own reader: types with their definitions, messages in the order of time, headers that say the same."""
+    done = convert_sequence(distorted, kind, tmp_path / NAMES[kind])
+    with AnyReader([done.path]) as reader:
+        types = {c.topic: c.msgtype for c in reader.connections}
+        assert sorted(types.values()) == sorted(MD5)
+        if kind == "bag":
+            assert {c.msgtype: c.digest for c in reader.connections} == MD5
+        stamps = []
+        for connection, stamp, data in reader.messages():
+            message: Any = reader.deserialize(data, connection.msgtype)
+            stamps.append(stamp)
+            if hasattr(message, "header"):
+                assert message.header.stamp.sec * 10**9 + message.header.stamp.nanosec == stamp
+            if connection.topic == "/points":
+                names = [field.name for field in message.fields]
+                assert names == ["x", "y", "z", "intensity", "ring", "time"]
+                assert message.row_step == message.width * message.point_step == len(message.data)
+        assert stamps == sorted(stamps)
+        assert types["/tf_static"] == "tf2_msgs/msg/TFMessage"
 
 
 def test_a_truth_denser_than_the_scans_and_without_a_camera_keeps_its_stamps(tmp_path: Path) -> None:

@@ -118,6 +118,28 @@ def test_times_that_make_no_sense_are_said_and_not_used(tmp_path: Path) -> None:
         assert part in problem
 
 
+STATED: list[tuple[NDArray[Any], str, int, str]] = [
+    # what the field holds, sequence.toml, header - scan start in ns, what is said
+    (SECONDS * 1e4, "point_time_unit = 'us'", 0, "us, since scan start, as stated"),
+    (SECONDS, "point_time_reference = 'end'", 99_900_000, "s, relative to the scan's end, as stated"),
+    (SECONDS - SECONDS[-1], "point_time_reference = 'end'", 99_900_000, "s, relative to the scan's end, as stated"),
+]
+
+
+@pytest.mark.parametrize(("values", "toml", "late_ns", "words"), STATED)
+def test_what_is_stated_about_times_is_believed(
+    tmp_path: Path, values: NDArray[Any], toml: str, late_ns: int, words: str
+) -> None:
+    (tmp_path / "sequence.toml").write_text(toml)
+    rows = table([*XYZI, ("time", "<f4")], time=values)
+    sequence = opened(tmp_path, rows, headers=[START_NS + late_ns, START_NS + late_ns + STEP_NS])
+    assert any(words in note for note in sequence.notes), sequence.notes
+    scan = sequence.scan(0)
+    assert abs(scan.stamp_ns - START_NS) < 100
+    assert scan.times is not None
+    np.testing.assert_allclose(scan.times, SECONDS * (0.01 if "us" in toml else 1), atol=1e-7)
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_big_endian_clouds_in_padded_rows(tmp_path: Path, kind: str) -> None:
     dtype = [("x", ">f4"), ("y", ">f4"), ("z", ">f8"), ("time", ">f4"), ("ring", ">u2")]
