@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import re
 import shutil
 import sqlite3
 import struct
@@ -21,11 +20,14 @@ from typing import Any, NamedTuple, Protocol
 
 from lslam.errors import InputError, OutputError, UsageError
 from lslam.formats.bag_chunks import Topic
+from lslam.formats.bag_listing import SUFFIXES, list_bag_files, suffix_of
 from lslam.formats.bag_sqlite import SqliteBag
 from lslam.formats.mcap_records import McapFile
 from lslam.formats.ros1_records import Ros1Bag
 
-SUFFIXES = (".bag", ".mcap", ".db3")
+# Said once, at the beginning: where lslam's own bags keep what else is known of a sequence, as `sequence.toml`.
+INFO_TOPIC = "/lslam/sequence"
+LATCHED = ("/tf_static", INFO_TOPIC)
 KINDS = ("bag", "mcap", "sqlite")
 _ENCODINGS = ("cdr", "ros1")
 _ZSTD = b"\x28\xb5\x2f\xfd"  # ROS 2 can compress every message by itself
@@ -81,7 +83,7 @@ class Bag:
 
     def __init__(self, path: Path, files: list[Path]) -> None:
         self.path, self.files = path, files
-        recordings: list[Recording] = [READERS[_suffix(file)](file) for file in files]
+        recordings: list[Recording] = [READERS[suffix_of(file)](file) for file in files]
         self.losses = [recording.loss for recording in recordings if recording.loss]
         topics: dict[tuple[str, str, str], BagTopic] = {}
         for recording in recordings:
@@ -132,33 +134,11 @@ class Bag:
             raise InputError(f"{self.path}: a message of {topic.name} is no {topic.type}: {error}") from None
 
 
-def list_bag_files(path: Path) -> list[Path]:
-    """The file itself, or the bag files of a folder in natural order; empty when there are none.
-
-    Raises InputError for a folder whose files are compressed as a whole.
-    """
-    if path.is_file():
-        return [path] if _suffix(path) else []
-    if not path.is_dir():
-        return []
-    files = [p for p in path.iterdir() if p.is_file() and not p.name.startswith(".")]
-    kinds = {_suffix(p) for p in files} - {""}
-    packed = [p for p in files if p.name.endswith((".mcap.zstd", ".db3.zstd"))]
-    if packed and not kinds:
-        raise InputError(
-            f"{packed[0]} is compressed as a whole: `zstd -d {packed[0].name}` in {path} makes it readable"
-        )
-    if not kinds:
-        return []
-    kind = max(kinds, key=lambda k: sum(_suffix(p) == k for p in files))
-    return sorted((p for p in files if _suffix(p) == kind), key=_natural)
-
-
 def open_bag(path: Path) -> Bag:
     """Open a ROS 1 bag, an MCAP or SQLite file, or a folder of them. Raises InputError when there is none or it is unreadable."""
     files = list_bag_files(path)
     if not files:
-        raise InputError(f"{path} holds no bag: {', '.join('*' + s for s in READERS)} are read")
+        raise InputError(f"{path} holds no bag: {', '.join('*' + s for s in SUFFIXES)} are read")
     return Bag(path, files)
 
 
@@ -208,7 +188,8 @@ class BagWriter:
         kind = message.__msgtype__
         try:
             if topic not in self._connections:
-                self._connections[topic] = self._writer.add_connection(topic, kind, typestore=self.store)
+                more = _latched(self.kind) if topic in LATCHED else {}
+                self._connections[topic] = self._writer.add_connection(topic, kind, typestore=self.store, **more)
             serialise = self.store.serialize_ros1 if self.kind == "bag" else self.store.serialize_cdr
             self._writer.write(self._connections[topic], stamp_ns, serialise(message, kind))
         except (OSError, sqlite3.Error) as error:
@@ -242,13 +223,28 @@ def _writer(path: Path, kind: str, is_zstd: bool) -> Any:
 
     writer: Any = Writer1(path)
     if kind != "bag":
+        # The newest metadata with the notation of QoS that ROS 2 had before Jazzy.
         plugin = StoragePlugin.MCAP if kind == "mcap" else StoragePlugin.SQLITE3
-        writer = Writer2(path, version=9, storage_plugin=plugin)
+        writer = Writer2(path, version=8, storage_plugin=plugin)
         if is_zstd:
             mode = CompressionMode.STORAGE if kind == "mcap" else CompressionMode.MESSAGE
             writer.set_compression(mode, CompressionFormat.ZSTD)
     writer.open()
     return writer
+
+
+def _latched(kind: str) -> dict[str, Any]:
+    """What makes nodes that come late hear the last message of a topic."""
+    if kind == "bag":
+        return {"latching": 1}
+    from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
+
+    never = QosTime(2147483647, 4294967295)
+    quality = Qos(
+        QosHistory.KEEP_LAST, 1, QosReliability.RELIABLE, QosDurability.TRANSIENT_LOCAL, never, never,
+        QosLiveliness.AUTOMATIC, never, False,
+    )  # fmt: skip
+    return {"offered_qos_profiles": [quality]}
 
 
 @cache
@@ -272,12 +268,3 @@ def _unpacked(recording: Recording, topic: Topic, k: int, limit: int | None) -> 
         return zstd.ZstdDecompressor().decompress(recording.read(topic, k, _ZSTD_BLOCK), max_length=limit)
     except zstd.ZstdError as error:
         raise InputError(f"{recording.path}: message {k} of {topic.name} is damaged: {error}") from None
-
-
-def _suffix(path: Path) -> str:
-    return next((s for s in READERS if path.name.lower().endswith(s)), "")
-
-
-def _natural(path: Path) -> list[tuple[int, str]]:
-    """Sort key with numbers compared as numbers: part_2 before part_10."""
-    return [(int(p), "") if p.isdigit() else (-1, p) for p in re.split(r"(\d+)", path.name)]

@@ -15,7 +15,7 @@ import numpy as np
 
 from lslam.errors import InputError, OutputError, OutputExistsError, UsageError
 from lslam.formats import bag_messages
-from lslam.formats.bag_files import KINDS, BagWriter
+from lslam.formats.bag_files import INFO_TOPIC, KINDS, BagWriter
 from lslam.formats.gnss_csv import write_gnss_csv
 from lslam.formats.imu_csv import write_imu_csv
 from lslam.formats.kitti_layout import PER_POINT, POINTS, in_camera, write_calib, write_scan, write_times
@@ -26,7 +26,6 @@ from lslam.pipeline.convert_trajectory import change_frame
 from lslam.pipeline.front_end import has_point_times
 from lslam.pipeline.map_pass import motion_within
 from lslam.preprocessing.deskew import deskew_points
-from lslam.readers.bag import INFO_TOPIC
 from lslam.types.calibration import Calibration
 from lslam.types.scan import Scan
 from lslam.types.sequence import Sequence

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from lslam.errors import InputError
 from lslam.formats import bag_streams
-from lslam.formats.bag_files import Bag, BagTopic, list_bag_files, open_bag, read_header
+from lslam.formats.bag_files import INFO_TOPIC, Bag, BagTopic, open_bag, read_header
+from lslam.formats.bag_listing import list_bag_files
 from lslam.formats.point_cloud import TIME_NAMES, PointCloud
 from lslam.formats.pointcloud2 import decode_livox, decode_pointcloud2
 from lslam.formats.sequence_toml import FILE_NAME, SequenceInfo, parse_sequence_toml, read_sequence_toml
@@ -28,8 +29,6 @@ from lslam.types.scan import Scan
 from lslam.types.trajectory import Trajectory
 
 KIND = "bag"
-# Where lslam's own bags keep what else is known of a sequence, as `sequence.toml`.
-INFO_TOPIC = "/lslam/sequence"
 _LAYOUTS = ("velodyne", "velodyne_points", "sequences")
 _LOOKED_AT = 5
 

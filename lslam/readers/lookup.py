@@ -8,7 +8,7 @@ import re
 from pathlib import Path
 
 from lslam.errors import InputError
-from lslam.formats.bag_files import SUFFIXES, list_bag_files
+from lslam.formats.bag_listing import SUFFIXES, list_bag_files
 
 _SEQUENCE = re.compile(r"(?:.*/)?(?:seq)?(\d{1,2})$")
 _DRIVE_NAME = re.compile(r"(?:(?P<date>\d{4}_\d\d_\d\d)_)?(?:drive_)?(?P<number>\d{4})(?P<kind>_sync|_extract)?$")

@@ -104,6 +104,8 @@ def test_another_reader_finds_what_ros_expects(distorted: SimulatedDrive, tmp_pa
                 assert message.row_step == message.width * message.point_step == len(message.data)
         assert stamps == sorted(stamps)
         assert types["/tf_static"] == "tf2_msgs/msg/TFMessage"
+        latched = [getattr(c.ext, "latching", None) == 1 or "TRANSIENT_LOCAL" in str(c.ext) for c in reader.connections]
+        assert sum(latched) == 2
 
 
 def test_a_truth_denser_than_the_scans_and_without_a_camera_keeps_its_stamps(tmp_path: Path) -> None:

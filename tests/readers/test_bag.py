@@ -77,9 +77,11 @@ def test_a_split_bag_is_one_recording_in_natural_order(tmp_path: Path) -> None:
             writer.write("/points", one.stamp_ns, bag_messages.cloud(writer.store, one, "lidar"))
 
         bag(tmp_path / f"drive_{part}.bag", fill)
+    (tmp_path / "drive_10.bag").rename(tmp_path / "drive_10.bag.active")
+    (tmp_path / "notes.txt").write_text("sunny")
     sequence = open_sequence(tmp_path)
     assert isinstance(sequence, BagSequence)
-    assert [p.name for p in sequence.bag.files] == ["drive_0.bag", "drive_2.bag", "drive_10.bag"]
+    assert [p.name for p in sequence.bag.files] == ["drive_0.bag", "drive_2.bag", "drive_10.bag.active"]
     np.testing.assert_array_equal(sequence.stamps_ns, START_NS + np.array([0, 2, 10]) * STEP_NS)
     np.testing.assert_array_equal(sequence.scan(2).points, scan(10).points)
 
