@@ -20,8 +20,8 @@ LEAST_CORRELATION = 0.5
 LIKELY_DEGREES, MOST_SCALE = (30.0, 110.0), 2.0
 # s: clocks of one machine differ by less; what differs by more is looked for only to say so.
 NEAR_S, FAR_S, STEP_S = 0.25, 10.0, 0.005
-# An offset smaller than this is of no use, and one that may be chance is none.
-LEAST_OFFSET_S, SIGNIFICANT = 0.002, 3.0
+# A clock that is off by less is not worth a doubt, and what may be chance is no offset.
+LEAST_OFFSET_S, SIGNIFICANT = 0.005, 3.0
 
 
 @dataclass(frozen=True)
@@ -41,11 +41,16 @@ class Agreement:
 
 
 def check_agreement(
-    imu: ImuStream, T_lidar_imu: Floats, stamps_ns: NDArray[np.int64], poses: Floats, offset_s: float | None
+    imu: ImuStream,
+    T_lidar_imu: Floats,
+    stamps_ns: NDArray[np.int64],
+    poses: Floats,
+    offset_s: float | None,
+    least_offset_s: float = LEAST_OFFSET_S,
 ) -> Agreement:
     """Compare turns between the poses (N, 4, 4) of the LiDAR with those the gyroscope felt; biases are of no account.
 
-    offset_s : s to add to the IMU's stamps; None looks for it
+    offset_s : s to add to the IMU's stamps; None looks for it, and takes none below `least_offset_s`
 
     Raises ImuRefusedError saying what is likely wrong: unit, axes, extrinsics, or stamps.
     """
@@ -67,7 +72,7 @@ def check_agreement(
     if offset_s is not None:
         return Agreement(True, correlation, offset_s, gyro_bias=bias)
     offset, sigma = _refined(felt, seen, float(offsets[best]))
-    is_sure = abs(offset) > max(LEAST_OFFSET_S, SIGNIFICANT * sigma)
+    is_sure = abs(offset) > max(least_offset_s, SIGNIFICANT * sigma)
     return Agreement(True, correlation, offset if is_sure else 0.0, sigma, bias)
 
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from lslam.config.imu import ImuConfig
 from lslam.geometry import so3
-from lslam.inertial.agreement import check_agreement
+from lslam.inertial.agreement import LEAST_OFFSET_S, check_agreement
 from lslam.inertial.estimate import BIAS, DOWN, GRAVITY, ImuEstimate
 from lslam.inertial.integrate import integrate
 from lslam.inertial.stream import clean
@@ -33,6 +33,20 @@ GRAVITY_S = 3.0
 
 
 @dataclass(frozen=True)
+class FirstPoses:
+    """What registration found about the first seconds by itself.
+
+    stamps_ns (N,), poses (N, 4, 4) : at the starts of the scans, the first scan's first
+    instants_ns (M,), middles (M, 4, 4) : in the middle of sweeps, where turns are known best
+    """
+
+    stamps_ns: NDArray[np.int64]
+    poses: Floats
+    instants_ns: NDArray[np.int64]
+    middles: Floats
+
+
+@dataclass(frozen=True)
 class Start:
     """A usable IMU: its stream on the clock of the scans, the estimate at the first of them, and what was decided.
 
@@ -53,28 +67,26 @@ class Start:
 def start(
     imu: ImuStream,
     T_lidar_imu: Floats,
-    stamps_ns: NDArray[np.int64],
-    poses: Floats,
+    first: FirstPoses,
     last_ns: int,
     config: ImuConfig,
+    least_offset_s: float = LEAST_OFFSET_S,
 ) -> Start:
-    """Check the stream against the first poses (N, 4, 4) that registration found by itself, and align it with them.
+    """Check the stream against the first poses that registration found, and align it with them.
 
-    stamps_ns (N,) : of the poses, the first scan's first; last_ns : stamp of the recording's last scan
+    last_ns : stamp of the recording's last scan; least_offset_s : differences of the clocks below it are none
 
     Raises ImuRefusedError with the reason when the stream cannot be of this sensor's motion.
     """
+    stamps_ns, poses = first.stamps_ns, first.poses
     given = config.time_offset_s
     shift = 0 if given is None else round(1e9 * given)
     cleaned = clean(replace(imu, stamps_ns=imu.stamps_ns + shift), int(stamps_ns[0]), last_ns)
     notes = list(cleaned.notes)
-    agreement = check_agreement(cleaned.imu, T_lidar_imu, stamps_ns, poses, None if given is None else 0.0)
+    agreement = check_agreement(
+        cleaned.imu, T_lidar_imu, first.instants_ns, first.middles, None if given is None else 0.0, least_offset_s
+    )
     offset = agreement.offset_s if given is None else given
-    if agreement.offset_s:
-        notes.append(
-            f"IMU stamps moved by {1e3 * agreement.offset_s:+.1f} ms (sigma {1e3 * agreement.offset_sigma_s:.1f}): its turns "
-            "then fit those of the scans best"
-        )
     if not agreement.is_judged:
         notes.append(
             "IMU: the sensor hardly turns at the start, so axes and clock of the IMU could not be checked there"
@@ -83,8 +95,8 @@ def start(
     config = _without_wrong_bias(config, agreement.gyro_bias, problems)
     moved = round(1e9 * agreement.offset_s)
     usable = replace(cleaned.imu, stamps_ns=cleaned.imu.stamps_ns + moved)
-    first, is_static = _first_guess(usable, T_lidar_imu, stamps_ns, poses, config, agreement.gyro_bias)
-    estimate = _learnt(usable, T_lidar_imu, first, stamps_ns, poses, config)
+    guess, is_static = _first_guess(usable, T_lidar_imu, stamps_ns, poses, config, agreement.gyro_bias)
+    estimate = _learnt(usable, T_lidar_imu, guess, stamps_ns, poses, config)
     notes.append("IMU aligned " + ("while standing" if is_static else "while moving"))
     return Start(usable, T_lidar_imu, estimate, offset, agreement.is_judged, is_static, notes, problems)
 

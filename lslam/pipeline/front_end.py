@@ -16,7 +16,7 @@ from lslam.errors import InputError
 from lslam.geometry import se3, so3
 from lslam.odometry.base import Deskewing, Odometry
 from lslam.readers.selection import Selection
-from lslam.registration.motion import ConstantVelocity, MotionModel
+from lslam.registration.motion import ConstantVelocity, MotionModel, middle_of
 from lslam.registration.registration import DOUBT
 from lslam.registration.standing import Standing
 from lslam.types.motion_prior import MotionPrior
@@ -81,6 +81,8 @@ class Tracker:
     def __init__(self, odometry: Odometry, standing: Standing | None = None, motion: MotionModel | None = None) -> None:
         self.odometry, self.standing = odometry, standing
         self.motion: MotionModel = ConstantVelocity() if motion is None else motion
+        # Instant, ns, and pose of the middle of the last sweep: what its registration knows best.
+        self.middle = (0, np.eye(4))
         self._first: tuple[Scan, Any, NDArray[np.float64]] | None = None
 
     def track(self, loaded: Loaded) -> ScanResult:
@@ -114,6 +116,8 @@ class Tracker:
         else:
             result = self.odometry.register(scan, loaded.prepared, prior)
         self.motion.correct(result.stamp_ns, result.T_world_lidar, prior, result.status == "ok")
+        pose, instant_ns = middle_of(prior, result.stamp_ns, result.T_world_lidar)
+        self.middle = (instant_ns, pose)
         return replace(result, prior_norm=_matrix_norm(expected.start, result.T_world_lidar))
 
     def _register(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -12,12 +12,13 @@ from numpy.typing import NDArray
 from lslam.config import Config
 from lslam.errors import InputError
 from lslam.inertial.fusion import InertialMotion
-from lslam.inertial.initialise import Start, start
+from lslam.inertial.initialise import FirstPoses, Start, start
 from lslam.inertial.stream import ImuRefusedError
 from lslam.odometry import create_odometry
-from lslam.pipeline.front_end import estimate
+from lslam.pipeline.front_end import Tracker, read_ahead
 from lslam.readers import select
 from lslam.readers.selection import Selection
+from lslam.types.imu import ImuStream
 from lslam.types.scan_result import ScanResult
 from lslam.types.sequence import Sequence
 
@@ -49,9 +50,8 @@ def begin_inertial(sequence: Sequence, config: Config) -> Inertial:
     if T_lidar_imu is None:
         part.problems.append("T_lidar_imu is not known: the IMU is taken to sit in the LiDAR with the same axes")
         T_lidar_imu = np.eye(4)
-    stamps, poses = _first_poses(sequence, config)
     try:
-        begun = start(sequence.imu, T_lidar_imu, stamps, poses, int(sequence.stamps_ns[-1]), config.imu)
+        begun = _begin(sequence, sequence.imu, T_lidar_imu, config)
     except ImuRefusedError as error:
         part.problems.append(f"the IMU is refused, the run goes on without it: {error}")
         log.warning("%s", part.problems[-1])
@@ -64,6 +64,19 @@ def begin_inertial(sequence: Sequence, config: Config) -> Inertial:
     return part
 
 
+def _begin(sequence: Sequence, imu: ImuStream, T_lidar_imu: NDArray[np.float64], config: Config) -> Start:
+    """The start by scans registered without the IMU; where clocks differ, again by scans that it then deskewed."""
+    last_ns = int(sequence.stamps_ns[-1])
+    begun = start(imu, T_lidar_imu, _first_poses(sequence, config, None), last_ns, config.imu)
+    if begun.offset_s == 0 or config.imu.time_offset_s is not None:
+        return begun
+    motion = InertialMotion(begun.imu, T_lidar_imu, begun.estimate, config.imu)
+    again = start(begun.imu, T_lidar_imu, _first_poses(sequence, config, motion), last_ns, config.imu, 0.0)
+    offset = begun.offset_s + again.offset_s
+    said = f"IMU stamps moved by {1e3 * offset:+.1f} ms: its turns then fit those of the scans best"
+    return replace(again, offset_s=offset, notes=[*begun.notes, said])
+
+
 def with_imu_settings(config: Config) -> Config:
     """The configuration of a run that the IMU predicts: better priors want a narrower search."""
     if not config.imu.use or config.imu.inlier_distance is None:
@@ -72,20 +85,32 @@ def with_imu_settings(config: Config) -> Config:
     return config.model_copy(update={"registration": narrow})
 
 
-def _first_poses(sequence: Sequence, config: Config) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Stamps and poses of the first seconds, every scan of them, by `icp` in its defaults."""
+def _first_poses(sequence: Sequence, config: Config, motion: InertialMotion | None) -> FirstPoses:
+    """The first seconds, every scan of them, by `icp` in its defaults, up to the first that fails."""
     whole, first = (sequence.whole, int(sequence.indices[0])) if isinstance(sequence, Selection) else (sequence, 0)
-    count = max(
-        int(np.searchsorted(whole.stamps_ns[first:], whole.stamps_ns[first] + round(1e9 * config.imu.start_s))), 1
-    )
+    end_ns = whole.stamps_ns[first] + round(1e9 * config.imu.start_s)
+    few = select(whole, first, max(int(np.searchsorted(whole.stamps_ns[first:], end_ns)), 1))
     gate = config.preprocess.model_dump(include={"range_min", "range_max", "deskew"})
-    plain = Config.model_validate({"preprocess": gate})
-    results = estimate(select(whole, first, count), create_odometry(plain), threads=config.input.threads)
-    bad = [k for k, r in enumerate(results) if r.status != "ok"]
-    good = results[: bad[0]] if bad else results
-    if not good:
-        return whole.stamps_ns[first : first + 1], np.eye(4)[None]
-    return np.array([r.stamp_ns for r in good], np.int64), np.stack([r.T_world_lidar for r in good])
+    odometry = create_odometry(Config.model_validate({"preprocess": gate}))
+    tracker = Tracker(odometry, motion=motion)
+    stamps, poses = [int(whole.stamps_ns[first])], [np.eye(4)]
+    instants: list[int] = []
+    middles: list[NDArray[np.float64]] = []
+    for loaded in read_ahead(few, odometry.prepare, config.input.threads):
+        result = tracker.track(loaded)
+        if result.status != "ok":
+            break
+        if instants:
+            stamps.append(result.stamp_ns)
+            poses.append(result.T_world_lidar)
+        instants.append(tracker.middle[0])
+        middles.append(tracker.middle[1])
+    # The sweep of the first scan is not known before the second without an IMU.
+    turns = slice(1 if motion is None else 0, None)
+    return FirstPoses(
+        np.array(stamps, np.int64), np.stack(poses), np.array(instants[turns], np.int64),
+        np.array(middles[turns]).reshape(-1, 4, 4),
+    )  # fmt: skip
 
 
 def close_inertial(part: Inertial, results: list[ScanResult]) -> dict[str, Any]:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from lslam.config.imu import ImuConfig
 from lslam.geometry import se3, so3
 from lslam.inertial.fusion import InertialMotion
-from lslam.inertial.initialise import start
+from lslam.inertial.initialise import FirstPoses, start
 from lslam.registration.motion import ConstantVelocity, MotionModel
 from lslam.simulation.scenarios import SimulatedDrive
 from lslam.types.imu import ImuStream
@@ -26,7 +26,13 @@ def motion_of(
     stamps, poses = truth_of(drive, 50)
     config = ImuConfig.model_validate(keys)
     T = extrinsics_of(drive) if T is None else T
-    begun = start(stream_of(drive), extrinsics_of(drive), stamps, poses, int(drive.stamps_ns[-1]), config)
+    begun = start(
+        stream_of(drive),
+        extrinsics_of(drive),
+        FirstPoses(stamps, poses, stamps, poses),
+        int(drive.stamps_ns[-1]),
+        config,
+    )
     return InertialMotion(begun.imu if imu is None else imu, T, begun.estimate, config)
 
 
@@ -141,7 +147,7 @@ def test_the_lever_arm_counts() -> None:
 
     far = simulate_imu(drive.vehicle, IMUS["ideal"], arm, drive.end, np.random.default_rng(0))
     stamps, poses = truth_of(drive, 50)
-    begun = start(far.stream, arm, stamps, poses, int(drive.stamps_ns[-1]), ImuConfig())
+    begun = start(far.stream, arm, FirstPoses(stamps, poses, stamps, poses), int(drive.stamps_ns[-1]), ImuConfig())
     own, _ = errors(InertialMotion(far.stream, arm, begun.estimate, ImuConfig()), drive, span=0.0)
     assert np.median(own[10:, 0]) < 0.002
     mistaken = dataclasses.replace(begun, T_lidar_imu=se3.make(arm[:3, :3], np.zeros(3)))

@@ -1,0 +1,188 @@
+"""Runs with an IMU on distorted scans: what it gains, what happens to garbage, gaps, and what the run folder says."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from stub_sequences import Standstill, Stub
+
+from lslam.config import Config, load_config
+from lslam.errors import GateError, InputError
+from lslam.formats.trajectory_files import read_trajectory
+from lslam.odometry import create_odometry
+from lslam.pipeline.front_end import estimate
+from lslam.pipeline.inertial_start import begin_inertial, close_inertial
+from lslam.pipeline.run import RunOutcome, run
+from lslam.readers import select
+from lslam.simulation.scenarios import simulate
+from lslam.types.imu import ImuStream
+from lslam.types.scan_result import ScanResult
+
+COUNT = 60
+
+
+@cache
+def walk() -> Stub:
+    """A hand-held walk, looking about at up to 110 deg/s, rays fired on the way."""
+    drive = simulate("walk", lidar="vlp16", count=COUNT, imu="icm20948", motion_compensated=False)
+    return Stub(
+        [drive.scan(i) for i in range(COUNT)],
+        drive.ground_truth,
+        drive.calibration,
+        motion_compensated=False,
+        imu=drive.imu,
+    )
+
+
+def imu_of(stub: Stub) -> ImuStream:
+    assert stub.imu is not None
+    return stub.imu
+
+
+def with_imu(imu: ImuStream | None) -> Stub:
+    whole = walk()
+    return dataclasses.replace(whole, imu=imu, scans=list(whole.scans), problems=[], reads=[])
+
+
+def config_of(*settings: str, use: bool = True) -> Config:
+    return load_config(None, [f"imu.use={str(use).lower()}", "map.write=false", "report.html=false", *settings], {})
+
+
+def rmse(results: list[ScanResult]) -> float:
+    """Position error, m, both trajectories starting at the same pose."""
+    truth = walk().ground_truth
+    assert truth is not None
+    off = [np.linalg.norm(r.T_world_lidar[:3, 3] - truth.poses[r.index][:3, 3]) for r in results]
+    return float(np.sqrt(np.mean(np.square(off))))
+
+
+@cache
+def runs() -> tuple[RunOutcome, RunOutcome]:
+    """Without and with the IMU."""
+    without, with_it = (run(with_imu(imu_of(walk())), config_of(use=use)) for use in (False, True))
+    return without, with_it
+
+
+def test_the_imu_gains_accuracy_and_iterations_on_a_walk() -> None:
+    without, with_it = (outcome.record.results for outcome in runs())
+    assert all(r.status == "ok" for r in with_it)
+    assert rmse(with_it) < 0.7 * rmse(without)
+    iterations = [float(np.mean([r.iterations for r in results[5:]])) for results in (without, with_it)]
+    assert iterations[1] < 0.8 * iterations[0]
+    norms = [float(np.median([r.prior_norm for r in results[5:]])) for results in (without, with_it)]
+    assert norms[1] < 0.5 * norms[0]
+
+
+def test_a_method_that_registers_nothing_does_not_pass_for_accurate() -> None:
+    """The sentinel must fail the gate that the test above sets."""
+    stub = with_imu(imu_of(walk()))
+    motion = begin_inertial(stub, config_of()).motion
+    assert rmse(estimate(stub, Standstill(), motion=motion)) > 5 * rmse(runs()[1].record.results)
+
+
+def test_the_same_twice() -> None:
+    again = run(with_imu(imu_of(walk())), config_of("input.threads=1"))
+    np.testing.assert_array_equal(again.trajectory.poses, runs()[1].trajectory.poses)
+
+
+def test_the_manifest_says_what_was_found(tmp_path: Path) -> None:
+    outcome = run(with_imu(imu_of(walk())), config_of("report.html=true", "input.count=40"), out=tmp_path / "run")
+    manifest = json.loads((tmp_path / "run" / "manifest.json").read_text())
+    imu = manifest["imu"]
+    assert (manifest["status"], imu["used"], imu["is_checked_by_turns"]) == ("done", True, True)
+    assert np.abs(np.array(imu["gyro_bias_rad_s"]) - 0.0873).max() < 0.02
+    assert imu["prior_error_m"] < imu["constant_velocity_error_m"]
+    header, *rows = (tmp_path / "run" / "scans.csv").read_text().splitlines()
+    column = header.split(",").index("prior_norm")
+    assert float(rows[20].split(",")[column]) == pytest.approx(outcome.record.results[20].prior_norm, abs=1e-5)
+    assert "Motion prior" in (tmp_path / "run" / "report.html").read_text()
+
+
+def gyro_by(factor: NDArray[np.float64]) -> ImuStream:
+    imu = imu_of(walk())
+    return dataclasses.replace(imu, gyro=imu.gyro @ factor)
+
+
+@pytest.mark.parametrize("kind", ["zeros", "degrees", "axes"])
+def test_garbage_is_refused(kind: str) -> None:
+    imu = imu_of(walk())
+    bad = {
+        "zeros": ImuStream(imu.stamps_ns, imu.accel * 0, imu.gyro * 0),
+        "degrees": gyro_by(np.rad2deg(np.eye(3))),
+        "axes": gyro_by(np.roll(np.eye(3), 1, axis=0)),
+    }[kind]
+    part = begin_inertial(with_imu(bad), config_of("imu.start_s=3"))
+    assert part.motion is None
+    assert part.problems[0].startswith("the IMU is refused, the run goes on without it: ")
+    assert not close_inertial(part, [])["used"]
+
+
+def test_refused_means_degraded_and_a_failed_gate_when_strict(tmp_path: Path) -> None:
+    stub = with_imu(gyro_by(-np.eye(3)))
+    with pytest.raises(GateError, match="the IMU is refused"):
+        run(stub, config_of("input.strict=true", "input.count=40"), out=tmp_path / "run")
+    manifest = json.loads((tmp_path / "run" / "manifest.json").read_text())
+    assert (manifest["status"], manifest["imu"]["used"]) == ("degraded", False)
+    poses = read_trajectory(tmp_path / "run" / "trajectory.tum").poses
+    np.testing.assert_allclose(poses, runs()[0].trajectory.poses[:40], atol=1e-6)
+
+
+def test_a_gap_is_bridged_said_and_counted() -> None:
+    imu = imu_of(walk())
+    keep = (imu.stamps_ns < 3_000_000_000) | (imu.stamps_ns > 3_250_000_000)
+    stub = with_imu(ImuStream(imu.stamps_ns[keep], imu.accel[keep], imu.gyro[keep]))
+    config = config_of()
+    part = begin_inertial(stub, config)
+    results = estimate(stub, create_odometry(config), motion=part.motion)
+    facts = close_inertial(part, results)
+    assert facts["used"]
+    assert 2 <= facts["scans_in_gaps"] <= 6
+    assert any("gaps of the IMU" in problem for problem in part.problems)
+    assert rmse(results) < 1.5 * rmse(runs()[1].record.results) + 0.005
+
+
+def test_late_stamps_are_found_and_the_imu_still_helps() -> None:
+    imu = imu_of(walk())
+    stub = with_imu(dataclasses.replace(imu, stamps_ns=imu.stamps_ns + 20_000_000))
+    config = config_of()
+    part = begin_inertial(stub, config)
+    results = estimate(stub, create_odometry(config), motion=part.motion)
+    assert close_inertial(part, results)["time_offset_s"] == pytest.approx(-0.02, abs=0.002)
+    assert any("stamps moved" in note for note in part.notes)
+    assert rmse(results) < 0.8 * rmse(runs()[0].record.results)
+
+
+def test_scans_that_cannot_be_read_are_bridged_by_the_imu() -> None:
+    stub = with_imu(imu_of(walk()))
+    for k in range(40, 44):
+        stub.scans[k] = "gone"
+    off = {}
+    for use in (False, True):
+        motion = begin_inertial(stub, config_of()).motion if use else None
+        results = estimate(stub, create_odometry(Config()), motion=motion)
+        truth = stub.ground_truth
+        assert truth is not None
+        off[use] = float(np.linalg.norm(results[43].T_world_lidar[:3, 3] - truth.poses[43][:3, 3]))
+    assert off[True] < 0.05
+    assert off[True] < 0.5 * off[False]
+
+
+def test_a_part_of_a_recording_is_aligned_where_it_begins() -> None:
+    part = select(with_imu(imu_of(walk())), start=10, skip_frames=5)
+    config = config_of()
+    motion = begin_inertial(part, config).motion
+    results = estimate(part, create_odometry(config), motion=motion)
+    assert all(r.status == "ok" for r in results)
+    assert [r.index for r in results][:3] == [10, 15, 20]
+    assert max(r.prior_norm for r in results[1:]) < 0.1
+
+
+def test_a_sequence_without_an_imu_is_missing_input() -> None:
+    with pytest.raises(InputError, match="has no IMU"):
+        run(with_imu(None), config_of("input.count=5"))
