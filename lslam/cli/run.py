@@ -72,7 +72,7 @@ def command(sequence: str, **given: Any) -> None:
 
         opened = with_imu(opened, given["data_root"])
     truth = read_truth(given["gt"], opened)
-    out = given["out"] or default_folder(opened.name, config.odometry.method)
+    out = given["out"] or default_folder(opened.name, config.odometry.method + ("-imu" if config.imu.use else ""))
     if given["dry_run"]:
         from lslam.odometry import create_odometry
         from lslam.pipeline.choose import choose_scans

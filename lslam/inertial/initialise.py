@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.config.imu import ImuConfig
-from lslam.geometry import so3
 from lslam.inertial.agreement import LEAST_OFFSET_S, check_agreement
 from lslam.inertial.estimate import BIAS, DOWN, GRAVITY, ImuEstimate
 from lslam.inertial.integrate import integrate
@@ -197,13 +196,3 @@ def _path_of_force(
     x = np.linalg.lstsq(A, rest, rcond=None)[0]
     spread = float(np.sqrt(np.mean(np.sum((rest - A @ x) ** 2, axis=1)) / float(np.sum(t**2))))
     return x[0], known.gravity if has_gravity else x[1], spread
-
-
-def vertical(estimate: ImuEstimate) -> Floats:
-    """(3, 3) smallest rotation that turns the world so that gravity points along -z."""
-    down = estimate.gravity / np.linalg.norm(estimate.gravity)
-    axis = np.cross(down, [0.0, 0.0, -1.0])
-    sine, cosine = float(np.linalg.norm(axis)), -float(down[2])
-    if sine < 1e-9:
-        return np.eye(3) if cosine > 0 else np.diag([1.0, -1.0, -1.0])
-    return so3.exp(axis * (np.arctan2(sine, cosine) / sine))

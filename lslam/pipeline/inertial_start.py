@@ -38,6 +38,11 @@ class Inertial:
     problems: list[str] = field(default_factory=list)
 
 
+def warm_up() -> None:
+    """Compile what the scans before the run need."""
+    create_odometry(Config()).warm_up()
+
+
 def begin_inertial(sequence: Sequence, config: Config) -> Inertial:
     """Check and align the sequence's IMU; a refused one leaves the run to constant velocity.
 

@@ -15,7 +15,7 @@ from lslam.kernels import jit
 from lslam.maps import merge
 from lslam.odometry import create_odometry
 from lslam.odometry.base import FeatureSource, Odometry
-from lslam.pipeline import outputs
+from lslam.pipeline import inertial_start, outputs
 from lslam.pipeline.check import check_config
 from lslam.pipeline.choose import choose_scans
 from lslam.pipeline.feature_pass import build_feature_map
@@ -149,6 +149,8 @@ def _estimate(
             standing.warm_up()
         if config.map.write:
             merge.warm_up()
+        if config.imu.use:
+            inertial_start.warm_up()
         with suppress(InputError):
             sequence.scan(0)  # the reader's kernels; what is wrong with the scan is said in its turn
 
