@@ -19,6 +19,7 @@ from lslam.cli import options
 @click.option("--all", "all_scans", is_flag=True, help="Look at the points of every scan.")
 @click.option("--rows", type=int, metavar="N", help="Organised clouds: rows (rings).")
 @click.option("--cols", type=int, metavar="N", help="Organised clouds: columns.")
+@click.option("--quick", is_flag=True, help="Register no scans: the IMU's clock and axes are not checked.")
 @options.reading
 @options.as_json
 def command(
@@ -28,15 +29,19 @@ def command(
     all_scans: bool,
     rows: int | None,
     cols: int | None,
+    quick: bool,
     as_json: bool,
     **given: Any,
 ) -> None:
-    """Show what is in SEQUENCE: a folder, a bag, or a name under the data root."""
+    """Show what is in SEQUENCE, a folder, a bag, or a name under the data root, and what is wrong with it.
+
+    Each finding says what to do. The first scans are registered to compare their turns with the IMU's.
+    """
     from lslam.pipeline.inspect import inspect
     from lslam.readers import open_sequence
 
     opened = open_sequence(sequence, data_root=data_root, rows=rows, cols=cols, **options.reading_of(given))
-    facts = inspect(opened, None if all_scans else scans)
+    facts = inspect(opened, None if all_scans else scans, quick)
     if as_json:
         import json
 
@@ -44,13 +49,13 @@ def command(
         return
     for label, value in _lines(facts):
         click.echo(f"{label:<18} {value}".rstrip())
-    for title in ("notes", "problems"):
-        if facts[title]:
+    for title, key in (("notes", "notes"), ("findings", "problems")):
+        if facts[key]:
             click.echo(f"\n{title}")
-            for sentence in facts[title]:
+            for sentence in facts[key]:
                 click.echo(f"  - {sentence}")
     if not facts["problems"]:
-        click.echo("\nno problems found")
+        click.echo("\nnothing wrong found")
 
 
 def _lines(facts: dict[str, Any]) -> Iterator[tuple[str, str]]:
@@ -80,11 +85,14 @@ def _lines(facts: dict[str, Any]) -> Iterator[tuple[str, str]]:
         yield "elevation", f"{low:.1f} .. {high:.1f} deg (98 % of the points)"
     yield "intensity", _limits(points["intensity"], "")
     yield "per-point times", _limits(points["per_point_times"], " s since scan start")
-    yield "rings", _limits(points["rings"], "")
+    reconstructed = points["rings"] is None and facts["rings_rule"]
+    yield "rings", f"by {facts['rings_rule']}" if reconstructed else _limits(points["rings"], "")
     yield "compensated", {True: "yes", False: "no", None: "unknown"}[facts["motion_compensated"]]
     known = [key for key, T in facts["extrinsics"].items() if T is not None]
     yield "extrinsics", ", ".join(known) or "none"
     yield "IMU", _imu(facts["imu"])
+    if facts["imu"]:
+        yield "IMU and scans turn", _turns(facts["imu"]["turns"])
     yield "GNSS", _gnss(facts["gnss"])
     yield "ground truth", _ground_truth(facts["ground_truth"])
 
@@ -108,9 +116,22 @@ def _imu(imu: dict[str, Any] | None) -> str:
         return "none"
     rate = f"{imu['rate_hz']:.1f} Hz, " if imu["rate_hz"] else ""
     unit = imu["gravity_unit"] or "of unknown unit"
+    up = "" if imu["tilt_deg"] is None else f", {imu['tilt_deg']:.0f} deg from the LiDAR's z"
     return (
-        f"{imu['samples']} samples, {rate}mean specific force {imu['gravity_norm']:.3f} {unit}, "
+        f"{imu['samples']} samples, {rate}mean specific force {imu['gravity_norm']:.3f} {unit}{up}, "
         f"turning {imu['gyro_median_deg_s']:.1f} deg/s (median)"
+    )
+
+
+def _turns(turns: dict[str, Any] | None) -> str:
+    if turns is None:
+        return "not compared"
+    if turns["correlation"] is None:
+        return "they do not fit" if turns["is_judged"] else f"too few in the first {turns['scans']} scans to compare"
+    axes = ", ".join("-" if c is None else f"{c:.2f}" for c in turns["correlation_xyz"] or [])
+    return (
+        f"correlation {turns['correlation']:.3f} (x, y, z: {axes}) over {turns['scans']} scans, stamps off by "
+        f"{1e3 * turns['time_offset_s']:+.1f} ms (sigma {1e3 * turns['time_offset_sigma_s']:.1f})"
     )
 
 
@@ -120,7 +141,11 @@ def _gnss(gnss: dict[str, Any] | None) -> str:
     lat, lon, alt = gnss["first"]
     sigma = gnss["sigma_m"]
     accuracy = f", sigma {sigma['median']:.2f} m median, {sigma['max']:.2f} m worst" if sigma else ", accuracy unknown"
-    return f"{gnss['fixes']} fixes from {lat:.7f}, {lon:.7f}, {alt:.1f} m{accuracy}"
+    rate = f", {gnss['rate_hz']:.1f} Hz" if gnss["rate_hz"] else ""
+    north, east = gnss["hemisphere"]
+    return (
+        f"{gnss['fixes']} fixes{rate}, map origin {abs(lat):.7f} {north}, {abs(lon):.7f} {east}, {alt:.1f} m{accuracy}"
+    )
 
 
 def _ground_truth(truth: dict[str, Any] | None) -> str:

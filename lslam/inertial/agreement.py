@@ -56,9 +56,7 @@ def check_agreement(
     """
     if len(stamps_ns) < 5:
         return Agreement(False)
-    felt = _Felt(imu, T_lidar_imu, stamps_ns)
-    seconds = np.diff(stamps_ns)[:, None] * 1e-9
-    seen = so3.log(np.swapaxes(poses[:-1, :3, :3], -1, -2) @ poses[1:, :3, :3]) / seconds
+    felt, seen = _Felt(imu, T_lidar_imu, stamps_ns), _seen(stamps_ns, poses)
     offsets = np.arange(-NEAR_S, NEAR_S + STEP_S / 2, STEP_S) if offset_s is None else np.array([offset_s])
     scores = np.array([_compare(seen, felt.rates(t))[0] for t in offsets])
     best = int(np.argmax(scores))
@@ -74,6 +72,23 @@ def check_agreement(
     offset, sigma = _refined(felt, seen, float(offsets[best]))
     is_sure = abs(offset) > max(least_offset_s, SIGNIFICANT * sigma)
     return Agreement(True, correlation, offset if is_sure else 0.0, sigma, bias)
+
+
+def turns(
+    imu: ImuStream, T_lidar_imu: Floats, stamps_ns: NDArray[np.int64], poses: Floats, offset_s: float
+) -> tuple[Floats, Floats]:
+    """What registration saw and the gyroscope felt, (M, 3) rad/s in LiDAR axes, each about its mean.
+
+    stamps_ns : (N,) of the poses (N, 4, 4) of the LiDAR; offset_s : s added to the IMU's stamps. M is 0 where the stream
+    tells of less than half of the poses.
+    """
+    return _centred(_seen(stamps_ns, poses), _Felt(imu, T_lidar_imu, stamps_ns).rates(offset_s))
+
+
+def _seen(stamps_ns: NDArray[np.int64], poses: Floats) -> Floats:
+    """(N - 1, 3) rad/s in LiDAR axes."""
+    seconds = np.diff(stamps_ns)[:, None] * 1e-9
+    return np.asarray(so3.log(np.swapaxes(poses[:-1, :3, :3], -1, -2) @ poses[1:, :3, :3]) / seconds)
 
 
 class _Felt:

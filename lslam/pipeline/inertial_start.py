@@ -72,11 +72,11 @@ def begin_inertial(sequence: Sequence, config: Config) -> Inertial:
 def _begin(sequence: Sequence, imu: ImuStream, T_lidar_imu: NDArray[np.float64], config: Config) -> Start:
     """The start by scans registered without the IMU; where clocks differ, again by scans that it then deskewed."""
     last_ns = int(sequence.stamps_ns[-1])
-    begun = start(imu, T_lidar_imu, _first_poses(sequence, config, None), last_ns, config.imu)
+    begun = start(imu, T_lidar_imu, first_poses(sequence, config, None), last_ns, config.imu)
     if begun.offset_s == 0 or config.imu.time_offset_s is not None:
         return begun
     motion = InertialMotion(begun.imu, T_lidar_imu, begun.estimate, config.imu)
-    again = start(begun.imu, T_lidar_imu, _first_poses(sequence, config, motion), last_ns, config.imu, 0.0)
+    again = start(begun.imu, T_lidar_imu, first_poses(sequence, config, motion), last_ns, config.imu, 0.0)
     offset = begun.offset_s + again.offset_s
     said = f"IMU stamps moved by {1e3 * offset:+.1f} ms: its turns then fit those of the scans best"
     return replace(again, offset_s=offset, notes=[*begun.notes, said])
@@ -90,7 +90,7 @@ def with_imu_settings(config: Config) -> Config:
     return config.model_copy(update={"registration": narrow})
 
 
-def _first_poses(sequence: Sequence, config: Config, motion: InertialMotion | None) -> FirstPoses:
+def first_poses(sequence: Sequence, config: Config, motion: InertialMotion | None) -> FirstPoses:
     """The first seconds, every scan of them, by `icp` in its defaults, up to the first that fails."""
     whole, first = (sequence.whole, int(sequence.indices[0])) if isinstance(sequence, Selection) else (sequence, 0)
     end_ns = whole.stamps_ns[first] + round(1e9 * config.imu.start_s)

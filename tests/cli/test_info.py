@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -13,8 +15,12 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parents[1] / "readers"))
 from sequence_builders import cloud, kitti_root, raw_drive
 
+from lslam.formats.imu_csv import read_imu_csv, write_imu_csv
 from lslam.pipeline.inspect import inspect
 from lslam.readers import open_sequence
+from lslam.types.imu import ImuStream
+
+SAMPLE = Path(__file__).parents[2] / "sample_data"
 
 
 def lslam(*words: str | Path) -> subprocess.CompletedProcess[str]:
@@ -32,7 +38,7 @@ def test_page_and_json(tmp_path: Path) -> None:
     for line in ("kitti-odometry", "6 in 0.50 s, 10 Hz", "6 (1 unreadable, 1 empty)", "path 5.00 m", "000002.bin"):
         assert line in page.stdout
     facts = json.loads(lslam("info", folder, "--json").stdout)
-    assert (facts["schema"], facts["scans"], facts["format"]) == (1, 6, "kitti-odometry")
+    assert (facts["schema"], facts["scans"], facts["format"]) == (2, 6, "kitti-odometry")
     assert facts["points"]["scans_unreadable"] == 1
     assert abs(facts["ground_truth"]["path_length_m"] - 5) < 1e-3
 
@@ -68,13 +74,13 @@ def test_gaps_and_imu_units(tmp_path: Path) -> None:
     drive = raw_drive(tmp_path, 8)
     for k in (3, 4):
         (drive / "velodyne_points" / "data" / f"{k:010d}.bin").unlink()
-    facts = inspect(open_sequence(drive))
+    facts = inspect(open_sequence(drive), is_quick=True)
     assert [(g["after_scan"], round(g["seconds"], 9)) for g in facts["time"]["gaps"]] == [(2, 0.3)]
     assert any("1 gap in the scans, the longest 0.300 s after scan 2" in p for p in facts["problems"])
     assert (facts["imu"]["gravity_unit"], round(facts["imu"]["gravity_norm"], 2)) == ("m/s2", 9.81)
     imu = drive / "imu.csv"
     imu.write_text("t,ax,ay,az,gx,gy,gz\n" + "".join(f"{1317042272 + k / 100},0,0,1.0,0,0,0\n" for k in range(50)))
-    facts = inspect(open_sequence(drive))
+    facts = inspect(open_sequence(drive), is_quick=True)
     assert facts["imu"]["gravity_unit"] == "g"
     assert any("multiply by 9.80665" in p for p in facts["problems"])
 
@@ -87,7 +93,7 @@ def test_long_bends_do_not_hide_gravity_but_its_absence_shows(
     drive = raw_drive(tmp_path, 8)
     rows = (f"{1317042272 + k / 100},0,{bend if k % 1000 >= 100 else 0},{up},0,0,0\n" for k in range(2000))
     (drive / "imu.csv").write_text("t,ax,ay,az,gx,gy,gz\n" + "".join(rows))
-    facts = inspect(open_sequence(drive))
+    facts = inspect(open_sequence(drive), is_quick=True)
     assert facts["imu"]["gravity_unit"] == unit
     assert any("mean specific force" in p for p in facts["problems"]) == (unit != "m/s2")
 
@@ -97,3 +103,24 @@ def test_help_is_light() -> None:
         "import sys, lslam.cli.info; sys.exit(any(m in sys.modules for m in ('numpy', 'numba', 'scipy', 'pydantic')))"
     )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_a_healthy_and_a_broken_copy_at_the_terminal(tmp_path: Path) -> None:
+    """Findings are results: they stand on stdout, with their way out, and the exit code stays 0."""
+    copy = tmp_path / "sample"
+    shutil.copytree(SAMPLE, copy)
+    page = lslam("info", copy)
+    assert page.returncode == 0
+    assert "nothing wrong found" in page.stdout
+    assert "findings" not in page.stdout
+    folder = copy / "sequences" / "00"
+    imu = read_imu_csv(folder / "imu.csv")
+    write_imu_csv(folder / "imu.csv", ImuStream(imu.stamps_ns + 60_000_000, imu.accel / 9.80665, imu.gyro))
+    page = lslam("info", copy)
+    assert page.returncode == 0
+    findings = page.stdout.split("\nfindings\n")[1].splitlines()
+    assert len(findings) == 2
+    assert findings[0].startswith("  - IMU: the mean specific force is 1.")
+    late = re.search(r"its stamps are ([\d.]+) ms late .* --set imu.time_offset_s=-0.0", findings[1])
+    assert late is not None
+    assert abs(float(late.group(1)) - 60) < 5

@@ -1,0 +1,143 @@
+"""The IMU of a recording by itself: time, units, gravity and its direction, extrinsics."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.inertial.stream import GRAVITY, LEAST_RATE_HZ, gravity_unit
+from lslam.pipeline.findings import Facts, Finding, plural
+from lslam.types.imu import ImuStream
+from lslam.types.sequence import Sequence
+
+Floats = NDArray[np.float64]
+
+# No carrier of a LiDAR turns at such a rate (290 deg/s) half of the time; one that reads deg/s soon does.
+_TURNING = 5.0
+# LiDARs are mounted tilted, and roads are steep, by less.
+_TILT_DEG = 35.0
+_GAP_S = 0.1
+
+
+def examine_imu(sequence: Sequence, findings: list[Finding]) -> Facts | None:
+    """Facts of the IMU, None when there is none."""
+    imu = sequence.imu
+    if imu is None or not len(imu):
+        return None
+    finite = np.isfinite(np.hstack([imu.accel, imu.gyro])).all(axis=1)
+    if not finite.all():
+        what = f"IMU: {int((~finite).sum())} of {len(imu)} samples are not finite"
+        findings.append(Finding("imu-finite", what, "lslam leaves out a tenth at most and refuses the IMU beyond"))
+    steps = np.diff(imu.stamps_ns) * 1e-9
+    median = float(np.median(steps)) if len(steps) else 0.0
+    facts: Facts = {
+        "samples": len(imu),
+        "rate_hz": 1 / median if median > 0 else None,
+        "gaps": _examine_time(sequence, imu, steps, median, findings),
+        "longest_step_s": float(steps.max()) if len(steps) else None,
+    }
+    usable = ImuStream(imu.stamps_ns[finite], imu.accel[finite], imu.gyro[finite])
+    _examine_extrinsics(sequence, findings)
+    return (
+        facts | _examine_gravity(usable, sequence.calibration.T_lidar_imu, findings) | _examine_gyro(usable, findings)
+    )
+
+
+def _examine_time(
+    sequence: Sequence, imu: ImuStream, steps: Floats, median: float, findings: list[Finding]
+) -> int:  # fmt: skip
+    """Rate, order, gaps and overlap; the number of gaps."""
+    if median > 0 and 1 / median < LEAST_RATE_HZ:
+        what = f"IMU: {1 / median:.1f} Hz, too slow to see shaking within a scan ({LEAST_RATE_HZ:.0f} Hz would do)"
+        findings.append(Finding("imu-rate", what, "record it faster, of KITTI raw take the `_extract` drive (100 Hz)"))
+    back = int((steps <= 0).sum())
+    if back:
+        what = f"IMU: time repeats or goes back {plural(back, 'time')}"
+        findings.append(
+            Finding("imu-rewinds", what, "lslam leaves those samples out; correct the stamps if they are many")
+        )
+    gaps = int((steps > _GAP_S + 0.5 * median).sum())
+    if gaps:
+        what = f"IMU: {plural(gaps, 'gap')}, the longest {steps.max():.3f} s"
+        findings.append(Finding("imu-gaps", what, "scans within them are predicted by constant velocity (imu.gap_s)"))
+    apart = "IMU: it shares no time with the scans"
+    first, last = sequence.stamps_ns[0], sequence.stamps_ns[-1]
+    if not any(f.what == apart for f in findings) and (imu.stamps_ns[0] > last or imu.stamps_ns[-1] < first):
+        ahead = (imu.stamps_ns[0] - first) * 1e-9
+        findings.append(
+            Finding(
+                "imu-apart",
+                f"{apart}, it begins {ahead:+.3f} s from the first",
+                "correct its stamps or set imu.time_offset_s",
+            )
+        )
+    return gaps
+
+
+def _examine_extrinsics(sequence: Sequence, findings: list[Finding]) -> None:
+    """Extrinsics that are missing, or that the reader of a bag had to assume."""
+    if sequence.calibration.T_lidar_imu is None:
+        findings.append(
+            Finding(
+                "imu-extrinsics",
+                "IMU: T_lidar_imu is not known, it is taken to sit in the LiDAR with the same axes",
+                "give --extrinsics, or T_lidar_imu below [extrinsics] in sequence.toml",
+            )
+        )
+
+
+def _examine_gravity(imu: ImuStream, T_lidar_imu: Floats | None, findings: list[Finding]) -> Facts:
+    """Unit of the specific force, and where up is in the LiDAR's frame: +z, when unit, sign and extrinsics are right."""
+    if not len(imu):
+        return {"gravity_norm": 0.0, "gravity_unit": None, "up_in_lidar": None, "tilt_deg": None}
+    calm, unit = gravity_unit(imu) if len(imu) > 1 else (float(np.linalg.norm(imu.accel[0])), None)
+    norm = float(np.linalg.norm(imu.accel.mean(axis=0)))
+    if unit != "m/s2":
+        findings.append(
+            Finding(
+                "imu-accel-unit",
+                f"IMU: the mean specific force is {norm:.2f} ({calm:.2f} when calm), not about 9.81 (m/s2)",
+                f"it seems to be in g, multiply by {GRAVITY} (a run does, and says so)"
+                if unit == "g"
+                else "not usable as it is, check its unit and that gravity was not taken off",
+            )
+        )
+    if unit is None:
+        return {"gravity_norm": norm, "gravity_unit": None, "up_in_lidar": None, "tilt_deg": None}
+    up = (np.eye(3) if T_lidar_imu is None else T_lidar_imu[:3, :3]) @ _calm_direction(imu)
+    tilt = float(np.degrees(np.arccos(np.clip(up[2], -1, 1))))
+    if tilt > _TILT_DEG:
+        findings.append(_tilted(up, tilt))
+    return {"gravity_norm": norm, "gravity_unit": unit, "up_in_lidar": [float(v) for v in up], "tilt_deg": tilt}
+
+
+def _calm_direction(imu: ImuStream) -> Floats:
+    """Unit vector (3,) of the specific force in the calmest tenth of the half seconds: bends tilt the others."""
+    step = max(float(np.median(np.diff(imu.stamps_ns))) * 1e-9, 1e-6)
+    width = min(max(round(0.5 / step), 1), len(imu))
+    means = imu.accel[: len(imu) // width * width].reshape(-1, width, 3).mean(axis=1)
+    calm = np.argsort(np.linalg.norm(means, axis=1), kind="stable")[: max(1, len(means) // 10)]
+    force = means[calm].mean(axis=0)
+    return np.asarray(force / max(float(np.linalg.norm(force)), 1e-12))
+
+
+def _tilted(up: Floats, tilt: float) -> Finding:
+    axis = int(np.argmax(np.abs(up)))
+    name = ("-" if up[axis] < 0 else "+") + "xyz"[axis]
+    what = f"IMU: specific force points along {name} of the LiDAR, {tilt:.0f} deg from up (+z)"
+    if tilt > 180 - _TILT_DEG:
+        way = "at rest it is +g up: change its sign, or T_lidar_imu, unless the LiDAR hangs upside down"
+    else:
+        way = (
+            "correct the rotation of T_lidar_imu (sequence.toml, --extrinsics), unless the LiDAR is mounted on its side"
+        )
+    return Finding("imu-gravity", what, way)
+
+
+def _examine_gyro(imu: ImuStream, findings: list[Finding]) -> Facts:
+    rates = np.linalg.norm(imu.gyro, axis=1)
+    median = float(np.median(rates)) if len(rates) else 0.0
+    if median > _TURNING:
+        what = f"IMU: half of the rates are above {median:.1f} rad/s ({np.degrees(median):.0f} deg/s)"
+        findings.append(Finding("imu-gyro-unit", what, "they seem to be in deg/s, convert them to rad/s"))
+    return {"gyro_median_deg_s": float(np.degrees(median))}

@@ -1,0 +1,171 @@
+"""The IMU of a recording against its scans: unit of the rates, clock, axes and extrinsic rotation."""
+
+from __future__ import annotations
+
+import logging
+from itertools import permutations, product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.config import Config
+from lslam.geometry import so3
+from lslam.inertial.agreement import LEAST_TURNING, Agreement, check_agreement, turns
+from lslam.inertial.stream import Cleaned, ImuRefusedError, clean
+from lslam.pipeline.findings import Facts, Finding
+from lslam.pipeline.inertial_start import first_poses
+from lslam.types.sequence import Sequence
+
+log = logging.getLogger("lslam")
+
+Floats = NDArray[np.float64]
+
+_SCANS = 60
+# s: less moves a point 20 m away by 5 cm at 30 deg/s.
+_LEAST_OFFSET_S = 0.005
+# Correlation about an axis: below the first it does not fit, from the second on it does.
+_BAD, _GOOD = 0.5, 0.8
+# Axes are a little askew in any housing, and registration is not exact.
+_LEAST_ANGLE = np.deg2rad(8.0)
+# Faults found by now that leave nothing to compare.
+_HOPELESS = {"imu-accel-unit", "imu-apart", "imu-finite"}
+
+
+def examine_turns(sequence: Sequence, findings: list[Finding]) -> Facts | None:
+    """Register the first scans with `icp` and compare their turns with the gyroscope's; None without an IMU."""
+    imu, stamps_ns = sequence.imu, sequence.stamps_ns
+    if imu is None or not len(imu) or len(sequence) < 5:
+        return None
+    try:
+        cleaned = clean(imu, int(stamps_ns[0]), int(stamps_ns[-1]))
+    except ImuRefusedError as error:
+        if not _HOPELESS & {f.code for f in findings}:
+            findings.append(Finding.of_sentence("imu-refused", "IMU", str(error)))
+        return None
+    log.info("registering the first %d scans to compare their turns with the IMU's", min(_SCANS, len(sequence)))
+    seconds = float(np.clip(_SCANS / sequence.rate_hz, 0.5, 60))
+    first = first_poses(sequence, Config.model_validate({"imu": {"start_s": seconds}}), None)
+    if len(first.instants_ns) < 5:
+        return None
+    known = sequence.calibration.T_lidar_imu
+    return compare(cleaned, np.eye(4) if known is None else known, first.instants_ns, first.middles, findings)
+
+
+def compare(
+    cleaned: Cleaned, T_lidar_imu: Floats, stamps_ns: NDArray[np.int64], poses: Floats, findings: list[Finding]
+) -> Facts:
+    """Compare the gyroscope with the poses (N, 4, 4) of the LiDAR at `stamps_ns` (N,)."""
+    agreement, refusal = Agreement(False), ""
+    try:
+        agreement = check_agreement(cleaned.imu, T_lidar_imu, stamps_ns, poses, None)
+    except ImuRefusedError as error:
+        refusal = str(error)
+    offset = _examine_clock(agreement, cleaned.rate_hz, findings)
+    seen, felt = turns(cleaned.imu, T_lidar_imu, stamps_ns, poses, agreement.offset_s)
+    # In the axes of the IMU, which its user can name.
+    R = T_lidar_imu[:3, :3]
+    found = _examine_axes(seen @ R, felt @ R, R) if len(seen) and (agreement.is_judged or refusal) else None
+    if found is not None:
+        findings.append(found)
+    elif refusal and not any(f.code == "imu-gyro-unit" for f in findings):
+        code = "imu-gyro-unit" if "deg/s, convert" in refusal else "imu-turns"
+        findings.append(Finding.of_sentence(code, "IMU", refusal))
+    return {
+        "scans": len(stamps_ns),
+        "is_judged": bool(agreement.is_judged or refusal),
+        "correlation": float(agreement.correlation) if agreement.is_judged else None,
+        "correlation_xyz": _by_axis(seen @ R, felt @ R),
+        "time_offset_s": offset,
+        "time_offset_sigma_s": float(agreement.offset_sigma_s) if agreement.is_judged else None,
+    }
+
+
+def _examine_clock(agreement: Agreement, rate_hz: float, findings: list[Finding]) -> float | None:
+    """s to add to the IMU's stamps; a finding when it matters and is more than half a step of the IMU."""
+    if not agreement.is_judged:
+        return None
+    offset, sigma = float(agreement.offset_s), float(agreement.offset_sigma_s)
+    if abs(offset) > max(_LEAST_OFFSET_S, 0.5 / rate_hz):
+        findings.append(
+            Finding(
+                "imu-time-offset",
+                f"IMU: its stamps are {1e3 * abs(offset):.1f} ms {'late' if offset < 0 else 'early'} (sigma "
+                f"{1e3 * sigma:.1f} ms, by the turns)",
+                f"run --imu finds and mends it, --set imu.time_offset_s={offset:.4f} states it",
+            )
+        )
+    return offset
+
+
+def _examine_axes(seen: Floats, felt: Floats, R_lidar_imu: Floats) -> Finding | None:
+    """Axes swapped or the other way round, or turned by an angle; (M, 3) rates in the IMU's axes."""
+    rms = np.sqrt(np.mean(seen**2, axis=0))
+    judged = rms > LEAST_TURNING
+    norms = np.maximum(np.sqrt(np.outer(np.sum(seen**2, axis=0), np.sum(felt**2, axis=0))), 1e-12)
+    correlation = (seen.T @ felt) / norms
+    given = np.diag(correlation)[judged]
+    if not len(given):
+        return None
+    P = _best_axes(correlation, judged)
+    better = np.sum(P * correlation, axis=1)[judged]
+    if given.min() < _BAD and better.min() >= _GOOD:
+        return _swapped(P, float(given.min()), float(better.min()), int(judged.sum()), R_lidar_imu)
+    return _turned(seen, felt, R_lidar_imu) if judged.sum() > 1 else None
+
+
+def _best_axes(correlation: Floats, judged: NDArray[np.bool_]) -> Floats:
+    """The signed permutation (3, 3), seen = P felt, that correlates best; as given where nothing turned."""
+    weight = correlation * judged[:, None] + 0.01 * np.eye(3)
+    best, score = np.eye(3), -np.inf
+    for order, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3)):
+        P = np.zeros((3, 3))
+        P[np.arange(3), order] = signs
+        value = float(np.sum(P * weight))
+        if value > score:
+            best, score = P, value
+    return best
+
+
+def _swapped(P: Floats, before: float, after: float, judged: int, R_lidar_imu: Floats) -> Finding:
+    names = ", ".join(("-" if row.sum() < 0 else "") + "xyz"[int(np.argmax(np.abs(row)))] for row in P)
+    what = f"IMU: its axes do not fit the scans' turns, ({names}) for (x, y, z) would (correlation {after:.2f}, not {before:.2f})"
+    if judged < 2:
+        way = "check the signs of its axes, and the rotation of T_lidar_imu"
+    elif np.linalg.det(P) < 0:
+        way = "an axis is mirrored, which no rotation mends: correct the signs in the recording of the IMU"
+    else:
+        way = f"correct its axes, or the rotation of T_lidar_imu to {_rows(R_lidar_imu @ P)}"
+    return Finding("imu-axes", what, way)
+
+
+def _turned(seen: Floats, felt: Floats, R_lidar_imu: Floats) -> Finding | None:
+    """By which rotation the felt turns would fit, when that halves what is left of them."""
+    spread = np.sqrt(np.maximum(np.linalg.eigvalsh(seen.T @ seen / len(seen)), 0.0))
+    if spread[1] < LEAST_TURNING:
+        return None  # turns about one axis say nothing of a turn about that axis
+    u, _, vt = np.linalg.svd(seen.T @ felt)
+    rotation = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
+    angle = float(so3.angle(rotation))
+    left, before = float(np.sum((seen - felt @ rotation.T) ** 2)), float(np.sum((seen - felt) ** 2))
+    if angle < _LEAST_ANGLE or left > 0.5 * before or left > 0.36 * float(np.sum(seen**2)):
+        return None
+    return Finding(
+        "imu-rotation",
+        f"IMU: T_lidar_imu is about {np.rad2deg(angle):.0f} deg off by the turns of the scans",
+        f"correct its rotation to about {_rows(R_lidar_imu @ rotation)}",
+    )
+
+
+def _by_axis(seen: Floats, felt: Floats) -> list[float | None] | None:
+    """Correlation about x, y, z of the IMU; None about an axis that hardly turned."""
+    if not len(seen):
+        return None
+    pairs = zip(seen.T, felt.T, strict=True)
+    return [
+        float(a @ b / max(np.sqrt((a @ a) * (b @ b)), 1e-12)) if np.sqrt(np.mean(a**2)) > LEAST_TURNING else None
+        for a, b in pairs
+    ]
+
+
+def _rows(R: Floats) -> str:
+    return "[" + ", ".join("[" + ", ".join(f"{v:.3g}" if abs(v) > 5e-4 else "0" for v in row) + "]" for row in R) + "]"

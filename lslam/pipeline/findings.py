@@ -1,0 +1,34 @@
+"""What is wrong with a recording, one finding at a time, each with its way out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+Facts = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that is wrong.
+
+    code : for scripts, for example `imu-accel-unit`; what : the fault with its numbers; way_out : what to do about it
+    """
+
+    code: str
+    what: str
+    way_out: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.what}: {self.way_out}" if self.way_out else self.what
+
+    @classmethod
+    def of_sentence(cls, code: str, subject: str, sentence: str) -> Finding:
+        """From a sentence of another part of the house, whose last colon stands before the way out."""
+        what, _, way_out = sentence.rpartition(": ")
+        return cls(code, f"{subject}: {what or way_out}", way_out if what else "")
+
+
+def plural(count: int, noun: str, several: str = "") -> str:
+    """`1 gap`, `2 gaps`."""
+    return f"{count} {noun if count == 1 else several or noun + 's'}"
