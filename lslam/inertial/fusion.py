@@ -74,8 +74,10 @@ class InertialMotion:
     ) -> None:
         """Take the pose (4, 4) found at `stamp_ns` as the newest; `prior` says how its sweep moved.
 
-        Where no registration stands behind it (`is_registered`), it teaches nothing.
+        Where no registration stands behind it (`is_registered`), it teaches nothing; the world begins with the first that has.
         """
+        if self._instant_ns is None and not is_registered:
+            return
         middle, instant_ns = (pose, stamp_ns) if prior is None else middle_of(prior, stamp_ns, pose)
         if not self.refusal:
             if self._instant_ns is not None and not self._covers(self._instant_ns, instant_ns):

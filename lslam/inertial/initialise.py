@@ -87,9 +87,7 @@ def start(
     )
     offset = agreement.offset_s if given is None else given
     if not agreement.is_judged:
-        notes.append(
-            "IMU: the sensor hardly turns at the start, so axes and clock of the IMU could not be checked there"
-        )
+        notes.append("IMU: the first scans show too few turns to check its axes and its clock")
     problems: list[str] = []
     config = _without_wrong_bias(config, agreement.gyro_bias, problems)
     moved = round(1e9 * agreement.offset_s)

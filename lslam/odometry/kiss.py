@@ -35,6 +35,7 @@ class Kiss:
     """
 
     deskew = "by kiss-icp, in scans that have per-point times"
+    ignores_prior = True
 
     def __init__(self, preprocess: PreprocessConfig, has_user_range: bool) -> None:
         with importing("kiss-icp", "install it with: pip install kiss-icp"):

@@ -98,18 +98,22 @@ def first_poses(sequence: Sequence, config: Config, motion: InertialMotion | Non
     gate = config.preprocess.model_dump(include={"range_min", "range_max", "deskew"})
     odometry = create_odometry(Config.model_validate({"preprocess": gate}))
     tracker = Tracker(odometry, motion=motion)
-    stamps, poses = [int(whole.stamps_ns[first])], [np.eye(4)]
+    stamps: list[int] = []
+    poses: list[NDArray[np.float64]] = []
     instants: list[int] = []
     middles: list[NDArray[np.float64]] = []
     for loaded in read_ahead(few, odometry.prepare, config.input.threads):
         result = tracker.track(loaded)
+        if result.status == "skipped":
+            continue
         if result.status != "ok":
             break
-        if instants:
-            stamps.append(result.stamp_ns)
-            poses.append(result.T_world_lidar)
+        stamps.append(result.stamp_ns)
+        poses.append(result.T_world_lidar)
         instants.append(tracker.middle[0])
         middles.append(tracker.middle[1])
+    if not stamps:
+        stamps, poses = [int(whole.stamps_ns[first])], [np.eye(4)]
     # The sweep of the first scan is not known before the second without an IMU.
     turns = slice(1 if motion is None else 0, None)
     return FirstPoses(

@@ -165,6 +165,10 @@ def _estimate(
     if config.imu.use:
         with manifest.timed("imu_start_s"):
             inertial = begin_inertial(sequence, config)
+        if getattr(odometry, "ignores_prior", False):
+            inertial.problems.append(
+                f"{config.odometry.method} predicts by itself: the IMU only bridges scans that fail"
+            )
     with manifest.timed("odometry_s"):
         results = estimate(
             sequence, odometry, threads=config.input.threads, max_failures=limit, standing=standing,

@@ -186,3 +186,21 @@ def test_a_part_of_a_recording_is_aligned_where_it_begins() -> None:
 def test_a_sequence_without_an_imu_is_missing_input() -> None:
     with pytest.raises(InputError, match="has no IMU"):
         run(with_imu(None), config_of("input.count=5"))
+
+
+@pytest.mark.parametrize("lost", [[0], [1], [0, 1, 2]])
+def test_a_start_with_scans_that_cannot_be_read_is_aligned_all_the_same(lost: list[int]) -> None:
+    stub = with_imu(imu_of(walk()))
+    for k in lost:
+        stub.scans[k] = "gone"
+    part = begin_inertial(select(stub, count=30), config_of())
+    assert not part.problems
+    results = estimate(select(stub, count=30), create_odometry(Config()), motion=part.motion)
+    assert [r.index for r in results if r.status != "ok"] == lost
+    assert float(np.median([r.prior_norm for r in results[5:]])) < 0.03
+
+
+def test_a_method_that_predicts_by_itself_is_named() -> None:
+    settings = ("odometry.method=kiss-icp", "input.count=12", "imu.start_s=1", "input.strict=true")
+    with pytest.raises(GateError, match="predicts by itself"):
+        run(with_imu(imu_of(walk())), config_of(*settings))
