@@ -29,13 +29,15 @@ class SqliteBag:
             )
             # SQLite then opens files that are shorter than their header says; nothing can be changed all the same.
             self._db.execute("PRAGMA writable_schema = ON")
-            names = {name for (name,) in self._db.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
+            names = {str(name) for (name,) in self._db.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
             if not names >= _TABLES:
                 raise InputError(f"{path} is no ROS 2 bag: its tables are {', '.join(sorted(names)) or 'none'}")
             rows = self._db.execute("SELECT id, name, type, serialization_format FROM topics ORDER BY id").fetchall()
         except sqlite3.Error as error:
             raise InputError(f"{path} cannot be read as a ROS 2 bag in SQLite: {error}") from None
-        self._topics = {number: Topic(name, kind, encoding) for number, name, kind, encoding in rows}
+        self._topics = {
+            number: Topic(_word(name), _word(kind), _word(encoding)) for number, name, kind, encoding in rows
+        }
         self._index()
         self.topics = list(self._topics.values())
         if path.with_name(path.name + "-wal").is_file():
@@ -55,7 +57,7 @@ class SqliteBag:
         found: dict[int, list[tuple[int, int]]] = {number: [] for number in self._topics}
         try:
             for row, topic, stamp in self._db.execute("SELECT id, topic_id, timestamp FROM messages ORDER BY id"):
-                if topic in found:
+                if topic in found and isinstance(stamp, int) and isinstance(row, int):
                     found[topic].append((stamp, row))
         except sqlite3.Error as error:
             self.loss = (
@@ -78,3 +80,8 @@ class SqliteBag:
             header = file.read(100)
         page, pages = int.from_bytes(header[16:18], "big"), int.from_bytes(header[28:32], "big")
         return self.path.stat().st_size, pages * (65536 if page == 1 else page)
+
+
+def _word(value: object) -> str:
+    """A column that should hold text."""
+    return value if isinstance(value, str) else ""

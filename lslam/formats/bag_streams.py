@@ -17,6 +17,8 @@ Floats = NDArray[np.float64]
 # sensor_msgs/Imu behind its header, float64: orientation 4, covariance 9, angular velocity 3, covariance 9, acceleration 3.
 _IMU_BYTES, _GYRO, _ACCEL = 37 * 8, 13 * 8, 25 * 8
 
+_LARGEST = 1e9  # m, no pose on this planet; NaN is not less either
+
 
 @dataclass(frozen=True)
 class Stream:
@@ -85,13 +87,14 @@ def read_poses(bag: Bag, topic: BagTopic, broken: list[str]) -> tuple[NDArray[np
     for data in bag.messages(topic, broken):
         try:
             message = bag.decode(topic, data)
+            pose = message.pose.pose if hasattr(message.pose, "pose") else message.pose
+            row = _numbers(topic, pose.position, pose.orientation)
         except InputError as error:
             broken.append(str(error))
             continue
-        pose = message.pose.pose if hasattr(message.pose, "pose") else message.pose
         body = body or getattr(message, "child_frame_id", "").lstrip("/")
         stamps.append(stamp_of(message))
-        rows.append(_numbers(pose.position, pose.orientation))
+        rows.append(row)
     return np.array(stamps, np.int64), _poses(rows), body
 
 
@@ -103,13 +106,11 @@ def read_static_transforms(bag: Bag, broken: list[str]) -> dict[tuple[str, str],
             continue
         for data in bag.messages(topic, broken):
             try:
-                transforms = bag.decode(topic, data).transforms
+                for t in bag.decode(topic, data).transforms:
+                    pair = (t.header.frame_id.lstrip("/"), t.child_frame_id.lstrip("/"))
+                    found[pair] = _poses([_numbers(topic, t.transform.translation, t.transform.rotation)])[0]
             except InputError as error:
                 broken.append(str(error))
-                continue
-            for t in transforms:
-                pair = (t.header.frame_id.lstrip("/"), t.child_frame_id.lstrip("/"))
-                found[pair] = _poses([_numbers(t.transform.translation, t.transform.rotation)])[0]
     return found
 
 
@@ -146,8 +147,11 @@ def stamp_of(message: Any) -> int:
     return int(stamp.sec) * 10**9 + int(stamp.nanosec)
 
 
-def _numbers(p: Any, q: Any) -> list[float]:
-    return [p.x, p.y, p.z, q.x, q.y, q.z, q.w]
+def _numbers(topic: BagTopic, p: Any, q: Any) -> list[float]:
+    row = [p.x, p.y, p.z, q.x, q.y, q.z, q.w]
+    if not all(abs(v) < _LARGEST for v in row):
+        raise InputError(f"a message of {topic.name} holds no pose: {row}")
+    return row
 
 
 def _poses(rows: list[list[float]]) -> Floats:

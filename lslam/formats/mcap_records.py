@@ -131,6 +131,8 @@ class McapFile:
     def _add_index(self, position: int, length: int) -> None:
         data = self._file.read(position, length)
         (channel,) = struct.unpack_from("<H", data)
+        if not self._chunks:
+            return  # an index of nothing
         entries = np.frombuffer(data, "<u8", offset=6).reshape(-1, 2).astype(np.int64)
         self._add(channel, len(self._chunks) - 1, entries[:, 0], entries[:, 1])
 
@@ -211,4 +213,4 @@ class McapFile:
 def _text(data: bytes, at: int) -> tuple[str, int]:
     (length,) = struct.unpack_from("<I", data, at)
     end = at + 4 + length
-    return data[at + 4 : end].decode(), end
+    return data[at + 4 : end].decode(errors="replace"), end

@@ -24,7 +24,7 @@ _LIVOX_BYTES = 19
 
 
 def decode_pointcloud2(message: Any, where: Path) -> PointCloud:
-    """Points of a PointCloud2, those that are not finite left out together with their time and ring.
+    """Points of a PointCloud2, those without a finite place and time left out with all their fields.
 
     Rows may be padded and numbers big-endian. An organised cloud without a ring field gets its rows (its columns, where there
     are fewer of them) as rings. Raises InputError naming `where` when fields and data contradict each other.
@@ -32,13 +32,13 @@ def decode_pointcloud2(message: Any, where: Path) -> PointCloud:
     height, width, step = int(message.height), int(message.width), int(message.point_step)
     if not height * width:
         return PointCloud(np.zeros((0, 3), np.float32))
-    dtype = _dtype(message, where)
     row_step = max(int(message.row_step), width * step) if height > 1 else width * step
     needed = (height - 1) * row_step + width * step
     if len(message.data) < needed:
         raise InputError(
             f"{where}: a cloud of {height} x {width} points of {step} bytes needs {needed} bytes and has {len(message.data)}"
         )
+    dtype = _dtype(message, where)
     table = np.ndarray((height, width), dtype, np.ascontiguousarray(message.data).data, 0, (row_step, step)).reshape(-1)
     columns: dict[str, NDArray[Any]] = {name: _native(table[name]) for name in dtype.names or ()}
     if height > 1 and not any(name.lower() in RING_NAMES for name in columns):
@@ -100,9 +100,10 @@ def _native(values: NDArray[Any]) -> NDArray[Any]:
 
 def _finite(cloud: PointCloud) -> PointCloud:
     finite = np.isfinite(cloud.points)
-    if finite.all():
+    timed = True if cloud.times is None else np.isfinite(cloud.times)
+    if finite.all() and np.all(timed):
         return cloud
-    good = finite.all(axis=1)
+    good = finite.all(axis=1) & timed
     return PointCloud(
         cloud.points[good],
         None if cloud.intensity is None else cloud.intensity[good],

@@ -24,6 +24,7 @@ from lslam.formats.bag_chunks import (
 
 MAGIC = b"#ROSBAG V2.0\n"
 _MESSAGE, _INDEX, _CHUNK, _CONNECTION = 2, 4, 5, 7
+_BROKEN = (CutOffError, struct.error, LookupError, ValueError)  # what reading a damaged record ends in
 _HEADER = 4096  # more than any record header but one with a message definition
 
 
@@ -70,7 +71,7 @@ class Ros1Bag:
             if record.op != _MESSAGE or len(data) < size:
                 raise CutOffError
             return data
-        except (CutOffError, struct.error, KeyError):
+        except _BROKEN:
             raise InputError(f"{self.path}: message {k} of {topic.name} is damaged") from None
 
     def _check_magic(self) -> None:
@@ -100,7 +101,7 @@ class Ros1Bag:
                     unindexed = None
                 elif record.op == _CONNECTION:
                     self._add_connection(None, record)
-            except (CutOffError, struct.error, KeyError, ValueError):
+            except _BROKEN:
                 self.loss = describe_loss(self.path, position, size)
                 break
             position = record.end
@@ -124,7 +125,7 @@ class Ros1Bag:
         return _Record(fields[b"op"][0], fields, offset + length + 8, size)
 
     def _add_chunk(self, record: _Record) -> int:
-        compression = record.fields[b"compression"].decode().replace("none", "")
+        compression = record.fields[b"compression"].decode(errors="replace").replace("none", "")
         check_compression(self.path, compression)
         self._chunks.append(Chunk(record.data, record.size, _u32(record.fields[b"size"]), compression))
         return len(self._chunks) - 1
@@ -134,6 +135,8 @@ class Ros1Bag:
         self._add(_u32(record.fields[b"conn"]), entries[:, 0] * 10**9 + entries[:, 1], entries[:, 2])
 
     def _add(self, connection: int, stamps: NDArray[np.int64], offsets: NDArray[np.int64]) -> None:
+        if not self._chunks:
+            return  # an index of nothing
         pieces = self._pieces.setdefault(connection, ([], []))
         pieces[0].append(stamps)
         pieces[1].append(np.column_stack([np.full(len(offsets), len(self._chunks) - 1, np.int64), offsets]))
@@ -141,9 +144,10 @@ class Ros1Bag:
     def _add_connection(self, chunk: Chunk | None, record: _Record) -> None:
         number = _u32(record.fields[b"conn"])
         inner = _fields(self._file.part(chunk, record.data, record.size))
-        package, _, name = inner.get(b"type", b"").decode().partition("/")
+        package, _, name = inner.get(b"type", b"").decode(errors="replace").partition("/")
         self._connections.setdefault(
-            number, Topic(record.fields[b"topic"].decode(), f"{package}/msg/{name}" if name else "", "ros1")
+            number,
+            Topic(record.fields[b"topic"].decode(errors="replace"), f"{package}/msg/{name}" if name else "", "ros1"),
         )
 
     def _index_by_hand(self, number: int | None) -> int:
@@ -182,7 +186,7 @@ class Ros1Bag:
                     raise CutOffError
                 yield record, offset
                 offset = record.end
-        except (InputError, CutOffError, struct.error, KeyError):
+        except (InputError, *_BROKEN):
             self.loss = (
                 self.loss or f"{self.path}: the chunk at byte {chunk.position} is damaged and its messages are lost"
             )

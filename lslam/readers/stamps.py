@@ -57,4 +57,7 @@ def measured_rate(stamps: Stamps) -> float:
     """Scan rate in Hz from the median of the positive steps, 10 when there is none."""
     steps = np.diff(stamps)
     steps = steps[steps > 0]
-    return float(round(1e9 / float(np.median(steps)), 3)) if len(steps) else DEFAULT_RATE_HZ
+    if not len(steps):
+        return DEFAULT_RATE_HZ
+    rate = 1e9 / float(np.median(steps))
+    return float(round(rate, 3)) or rate

@@ -163,7 +163,8 @@ def test_organised_clouds_without_a_ring_field_have_rings_all_the_same(
 def test_points_that_are_not_finite_leave_with_their_time_and_ring(tmp_path: Path) -> None:
     rows = table([*XYZI, ("ring", "<u2"), ("time", "<f4")], ring=RING, time=SECONDS, intensity=np.arange(N))
     rows["x"][::3], rows["z"][1] = np.nan, np.inf
-    good = np.isfinite(rows["x"]) & np.isfinite(rows["z"])
+    rows["time"][5] = np.nan
+    good = np.isfinite(rows["x"]) & np.isfinite(rows["z"]) & np.isfinite(rows["time"])
     scan = opened(tmp_path, rows).scan(0)
     assert len(scan) == good.sum() < N
     np.testing.assert_array_equal(scan.rings, RING[good])

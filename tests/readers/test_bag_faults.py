@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import sqlite3
 import struct
 from collections.abc import Callable
@@ -11,11 +12,11 @@ from typing import Any
 import lz4.frame
 import numpy as np
 import pytest
-from bag_builders import KINDS, START_NS, STEP_NS, SUFFIX, bag, clouds, imu, scan, together
+from bag_builders import KINDS, START_NS, STEP_NS, SUFFIX, bag, clouds, imu, scan, together, transforms
 from rosbags.rosbag1 import Writer
 from rosbags.typesys import Stores, get_typestore
 
-from lslam.errors import InputError
+from lslam.errors import InputError, LslamError
 from lslam.formats import bag_messages
 from lslam.formats.bag_files import BagWriter
 from lslam.readers import open_sequence
@@ -293,3 +294,26 @@ def test_what_is_no_bag_is_one_sentence(tmp_path: Path) -> None:
         db.execute("CREATE TABLE birds(name TEXT)")
     with pytest.raises(InputError, match="its tables are birds"):
         open_sequence(database)
+
+
+@pytest.mark.parametrize(("kind", "is_zstd"), [("bag", False), ("mcap", False), ("mcap", True), ("sqlite", False)])
+def test_flipped_bytes_are_errors_of_ours_or_nothing_at_all(tmp_path: Path, kind: str, is_zstd: bool) -> None:
+    parts = (transforms({("lidar", "imu"): np.eye(4)}), clouds(6, n=60), imu(10))
+    path = bag(tmp_path / f"a{SUFFIX[kind]}", together(*parts), kind, is_zstd)
+    whole = np.frombuffer(path.read_bytes(), np.uint8)
+    rng = np.random.default_rng(5)
+    opened = 0
+    for k in range(200):
+        broken = whole.copy()
+        where = rng.integers(0, len(whole) if k % 2 else min(len(whole), 6000), 4)
+        broken[where] = rng.integers(0, 256, 4) if k % 3 else 255
+        path.write_bytes(broken.tobytes())
+        try:
+            sequence = open_sequence(path)
+        except LslamError:
+            continue
+        opened += 1
+        for index in range(len(sequence)):
+            with contextlib.suppress(InputError):
+                sequence.scan(index)
+    assert opened > 20
