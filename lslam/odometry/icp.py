@@ -45,7 +45,7 @@ class Icp:
 
     def __init__(self, registration: Registration) -> None:
         self.registration = registration
-        self._uncertainty = PoseUncertainty(is_scan_to_scan=registration.config.target == "scan")
+        self._uncertainty = self._fresh_uncertainty()
         # What `register` saw and found last, for `update`.
         self._points: PreparedPoints
         self._located: RegistrationResult
@@ -93,7 +93,10 @@ class Icp:
     def restart(self) -> None:
         """An empty map."""
         self.registration = Registration(self.registration.config, self.registration.preprocess)
-        self._uncertainty = PoseUncertainty()
+        self._uncertainty = self._fresh_uncertainty()
+
+    def _fresh_uncertainty(self) -> PoseUncertainty:
+        return PoseUncertainty(is_scan_to_scan=self.registration.config.target == "scan")
 
     def warm_up(self) -> None:
         """Register a small room twice with a throw-away copy: every kernel is compiled or loaded."""

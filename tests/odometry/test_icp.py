@@ -215,3 +215,20 @@ def test_world_covariance_grows_with_the_way_driven() -> None:
     assert last is not None
     assert np.trace(last[3:, 3:]) > 1.2 * np.trace(first[3:, 3:])
     assert np.linalg.norm(se3.relative(np.eye(4), driver.motion.predict(0))[:3, 3]) > 10.0
+
+
+def test_beginning_again_keeps_how_errors_add_up() -> None:
+    """From scan to scan every registration's error enters in full, before a restart and after it."""
+    scans, _ = block()
+    traces = []
+    for is_restarted in (False, True):
+        icp = create(Config.model_validate({"registration": {"target": "scan"}}))
+        if is_restarted:
+            icp.restart()
+        motion = ConstantVelocity()
+        for scan in scans[:6]:
+            result = feed(icp, scan, MotionPrior(np.zeros(1), motion.predict(scan.stamp_ns)[None]))
+            motion.correct(scan.stamp_ns, result.T_world_lidar)
+        assert result.covariance is not None
+        traces.append(float(np.trace(result.covariance)))
+    assert traces[0] == traces[1]
