@@ -90,7 +90,6 @@ def command(sequence: str, **given: Any) -> None:
 def _resolve(given: dict[str, Any]) -> Config:
     """Flags over --set over environment over --config over --preset over defaults."""
     from lslam.config import load_config
-    from lslam.pipeline.check import check_residual
 
     flags = {
         "odometry.method": given["method"],
@@ -105,10 +104,7 @@ def _resolve(given: dict[str, Any]) -> Config:
         "input.strict": "true" if given["strict"] else None,
     }
     settings = options.with_preset(given["settings"], given["preset"])
-    config = load_config(given["config_file"], [*settings, *(f"{k}={v}" for k, v in flags.items() if v is not None)])
-    if given["residual"] is not None:
-        check_residual(config)
-    return config
+    return load_config(given["config_file"], [*settings, *(f"{k}={v}" for k, v in flags.items() if v is not None)])
 
 
 def read_truth(path: Path | None, sequence: Sequence) -> Trajectory | None:

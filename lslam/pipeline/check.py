@@ -7,22 +7,38 @@ from lslam.errors import UsageError, nearest
 from lslam.evaluation.relative import parse_delta
 from lslam.odometry import FEATURE_METHODS, METHODS, known_methods
 
+# Methods that match a scan against Gaussian voxels, and what of `registration` only some methods look at.
+ON_GAUSSIANS = tuple(name for name, (module, _) in METHODS.items() if module == METHODS["icp"][0])
+HEEDED = {
+    "residual": ON_GAUSSIANS,
+    "target": ON_GAUSSIANS,
+    "inlier_distance": (*ON_GAUSSIANS, "icp-svd"),
+    "inlier_ratio": (*ON_GAUSSIANS, "icp-svd"),
+}
+
 
 def check_config(config: Config) -> None:
-    """Raise UsageError for a method or an RPE distance that does not exist: before hours of work, not after."""
+    """Raise UsageError for names that do not exist and keys that do nothing: before hours of work, not after."""
     method = config.odometry.method
     if method not in (known := known_methods()):
         raise UsageError(f"no method {method!r}; {nearest(method, known)}")
     if config.map.write_features and method not in FEATURE_METHODS:
         raise UsageError(f"method {method} has no feature map to save; these have: {', '.join(FEATURE_METHODS)}")
+    _check_heeded(config)
     for delta in config.eval.delta:
         parse_delta(delta)
 
 
-def check_residual(config: Config) -> None:
-    """Raise UsageError when --residual is given with a method that measures in its own way."""
-    method = config.odometry.method
-    if METHODS.get(method, ("",))[0] != METHODS["icp"][0]:
-        raise UsageError(
-            f"--residual is for --method icp, not {method!r}, which measures in its own way: drop one of them"
-        )
+def _check_heeded(config: Config) -> None:
+    """Raise UsageError for a registration key that was changed and that the method would pass over in silence."""
+    method, section = config.odometry.method, config.registration
+    if method not in METHODS:
+        return  # of another package: it knows what it takes
+    for key, methods in HEEDED.items():
+        value, default = getattr(section, key), type(section).model_fields[key].default
+        is_so_anyway = key == "target" and value == "scan" and method == "icp-svd"
+        if value != default and method not in methods and not is_so_anyway:
+            raise UsageError(
+                f"registration.{key} = {value!r} does nothing with method {method}: drop it, or use one that heeds it "
+                f"({', '.join(methods)})"
+            )
