@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from lslam.errors import UsageError, nearest
 from lslam.evaluation.results import ALIGNMENTS, AbsoluteError
-from lslam.evaluation.statistics import describe
+from lslam.evaluation.statistics import describe, percent_of_length
 from lslam.geometry import se3, so3, umeyama
 
 Floats = NDArray[np.float64]
@@ -31,7 +31,6 @@ def absolute_error(estimate: Floats, truth: Floats, alignment: str) -> AbsoluteE
     # Printed matrices are rotations to six digits only; the angle of the nearest rotation is what is meant.
     angles = np.rad2deg(so3.angle(so3.normalise(turned)))
     translation = describe(np.linalg.norm(errors, axis=1))
-    length = float(np.linalg.norm(np.diff(truth[:, :3, 3], axis=0), axis=1).sum())
     return AbsoluteError(
         alignment=alignment,
         available=True,
@@ -40,7 +39,7 @@ def absolute_error(estimate: Floats, truth: Floats, alignment: str) -> AbsoluteE
         rotation_deg=describe(angles),
         horizontal=describe(np.linalg.norm(errors[:, :2], axis=1)),
         vertical=describe(np.abs(errors[:, 2])),
-        percent_of_length=100 * translation.rmse / length if translation and length > 0 else float("nan"),
+        percent_of_length=percent_of_length(translation.rmse, truth) if translation else float("nan"),
         T_gt_est=T,
         scale=scale,
         errors=errors,

@@ -8,6 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+# A path this short, m, is the rounding of poses that do not move.
+STANDS_M = 1e-3
+
 
 @dataclass(frozen=True)
 class Statistics:
@@ -39,3 +42,9 @@ def describe(errors: NDArray[Any]) -> Statistics | None:
         sse=float(np.sum(squares)),
         n=len(e),
     )
+
+
+def percent_of_length(rmse: float, truth: NDArray[np.float64]) -> float:
+    """An error, m, in % of the path of the poses `truth` (N, 4, 4); NaN for a sensor that stood still."""
+    length = float(np.linalg.norm(np.diff(truth[:, :3, 3], axis=0), axis=1).sum())
+    return 100 * rmse / length if length > STANDS_M else float("nan")

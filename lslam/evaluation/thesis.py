@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from lslam.evaluation.absolute import align
 from lslam.evaluation.results import AxisErrors, Planar
+from lslam.evaluation.statistics import percent_of_length
 from lslam.geometry import so3
 
 Floats = NDArray[np.float64]
@@ -21,14 +22,13 @@ def axis_errors(estimate: Floats, truth: Floats) -> AxisErrors:
     rpy = so3.euler_rpy(R_est) - so3.euler_rpy(R_gt)
     rpy_deg = np.rad2deg((rpy + np.pi) % (2 * np.pi) - np.pi)
     angular = np.rad2deg(so3.angle(R_est @ np.swapaxes(R_gt, -1, -2)))
-    length = float(np.linalg.norm(np.diff(truth[:, :3, 3], axis=0), axis=1).sum())
     rmse = _rms(np.linalg.norm(e, axis=1))
     return AxisErrors(
         alignment="origin",
         thesis_rmse=_rms(e),
         rmse=rmse,
         max_error=float(np.linalg.norm(e, axis=1).max()),
-        percent_of_length=100 * rmse / length if length > 0 else float("nan"),
+        percent_of_length=percent_of_length(rmse, truth),
         xyz_rmse=(_rms(e[:, 0]), _rms(e[:, 1]), _rms(e[:, 2])),
         rpy_rmse_deg=(_rms(rpy_deg[:, 0]), _rms(rpy_deg[:, 1]), _rms(rpy_deg[:, 2])),
         angular_rmse_deg=_rms(angular),

@@ -12,6 +12,7 @@ from hypothesis.extra.numpy import arrays
 from lslam.errors import UsageError
 from lslam.evaluation.absolute import absolute_error
 from lslam.evaluation.statistics import describe
+from lslam.evaluation.thesis import axis_errors
 from lslam.geometry import se3, so3
 from lslam.types.trajectory import Trajectory
 
@@ -29,6 +30,23 @@ def test_identical_is_zero(alignment: str, truth: Trajectory) -> None:
     assert error.translation.max < 1e-9
     assert error.rotation_deg.max < 1e-6
     assert error.percent_of_length < 1e-9
+
+
+def test_a_sensor_that_stood_still_has_no_length_to_be_a_share_of() -> None:
+    """Poses read back from text differ by rounding: that is no path."""
+    still = np.tile(np.eye(4), (5, 1, 1))
+    still[::2, 0, 3] = 1e-12
+    estimate = still.copy()
+    estimate[:, 1, 3] = np.linspace(0, 0.02, 5)
+    error = absolute_error(estimate, still, "origin")
+    assert error.translation is not None
+    assert error.translation.max == pytest.approx(0.02)
+    assert np.isnan(error.percent_of_length)
+    assert np.isnan(axis_errors(estimate, still).percent_of_length)
+    still[:, 0, 3] = np.arange(5)
+    assert absolute_error(
+        still @ se3.exp(np.array([0, 0.1, 0, 0, 0, 0])), still, "none"
+    ).percent_of_length == pytest.approx(2.5)
 
 
 @given(twists)
