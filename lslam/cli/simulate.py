@@ -117,6 +117,8 @@ def command(
         raise click.UsageError(f"{missing} is missing; for example: lslam simulate block --out town")
     if overwrite and resume:
         raise click.UsageError("--overwrite begins anew and --resume goes on: give one of them")
+    if plan is not None and plan.suffix.lower() != ".png":
+        raise click.UsageError(f"--plan {plan}: the scene is drawn as PNG, name a file FILE.png")
     console.setup_logging(verbose, quiet)
     from lslam.simulation.gnss import GnssModel
     from lslam.simulation.record import check_target

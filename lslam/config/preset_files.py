@@ -30,7 +30,7 @@ def read_preset(name: str) -> dict[str, Any]:
     elif name.endswith(".toml") or Path(name).is_file():
         tree = read_toml(Path(name), "preset")
     else:
-        raise UsageError(f"no preset {name!r}; {nearest(name, shipped)}, or a TOML file")
+        raise UsageError(f"no preset {name!r} and no TOML file; {nearest(name, shipped)}")
     tree.pop(SUMMARY, None)
     return tree
 

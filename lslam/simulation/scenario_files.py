@@ -133,7 +133,7 @@ def scenario_text(scenario: Scenario) -> str:
 
 def _ready(name: str) -> dict[str, Any]:
     if name not in scenario_names():
-        raise UsageError(f"no scenario {name!r}; {nearest(name, scenario_names())}, or a file of your own: NAME.toml")
+        raise UsageError(f"no scenario {name!r} and no file NAME.toml; {nearest(name, scenario_names())}")
     return tomllib.loads(resources.files(__package__).joinpath(FOLDER, f"{name}.toml").read_text(encoding="utf-8"))
 
 

@@ -174,8 +174,12 @@ def _checked(path: Path, found: WayPoints) -> WayPoints:
     points = found.points
     ring = np.concatenate([points, points[:1]]) if found.closed else points
     steps = np.linalg.norm(np.diff(ring[:, :2], axis=0), axis=1)
-    if len(points) < (3 if found.closed else 2) or steps.sum() < 15:
-        raise InputError(f"{path} holds {len(points)} way-points over {steps.sum():.1f} m: at least 15 m are needed")
+    needed = 3 if found.closed else 2
+    if len(points) < needed:
+        what = "a closed path" if found.closed else "a path"
+        raise InputError(f"{path} holds too few way-points: {len(points)}, {what} needs {needed}")
+    if steps.sum() < 15:
+        raise InputError(f"{path} holds a path of {steps.sum():.1f} m: at least 15 m are needed")
     if steps.min() < 1e-6:
         raise InputError(f"{path}: way-point {int(np.argmin(steps)) + 2} is the same as the one before")
     if steps.max() > LONGEST:

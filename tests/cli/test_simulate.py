@@ -37,8 +37,8 @@ def test_list_names_scenarios_and_sensors() -> None:
     assert listed.returncode == 0
     assert [line.split()[1] for line in listed.stdout.splitlines()] == [
         "block", "climbing", "closed", "corridor", "identical", "large-eight", "motorway", "open", "residential",
-        "small-eight", "street", "urban", "walk", "sample", "vlp16", "hdl64", "hdl64-kitti", "os1-32", "os1-64", "livox",
-        "icm20948", "icm20948-calibrated", "ideal",
+        "small-eight", "street", "urban", "walk", "sample", "vlp16", "hdl64", "hdl64-kitti", "os1-16", "os1-32", "os1-64",
+        "livox", "icm20948", "icm20948-calibrated", "ideal",
     ]  # fmt: skip
 
 
@@ -81,6 +81,13 @@ def test_a_path_file_that_is_absent_is_exit_code_3(tmp_path: Path) -> None:
     assert "07.txt does not exist" in done.stderr
     assert "Traceback" not in done.stderr
     assert not (tmp_path / "out").exists()
+
+
+def test_a_plan_is_a_png_and_nothing_else(tmp_path: Path) -> None:
+    done = lslam("block", "--plan", str(tmp_path / "plan.svg"))
+    assert done.returncode == 2
+    assert "name a file FILE.png" in done.stderr
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_plan_of_own_way_points_needs_no_out(tmp_path: Path) -> None:
