@@ -179,3 +179,41 @@ def test_memory_does_not_grow_with_the_bag(tmp_path: Path, kind: str, is_zstd: b
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 7e6
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_fixes_without_a_fix_are_left_out_and_unknown_errors_are_nan(tmp_path: Path, kind: str) -> None:
+    def fill(writer: BagWriter) -> None:
+        for k, (sigma, status) in enumerate([(0.3, 0), (np.nan, 0), (0.1, -1), (0.7, 2)]):
+            stamp = START_NS + k * STEP_NS
+            fix = bag_messages.fix(writer.store, stamp, np.array([49.0, 8.0 + k, 110.0]), sigma, "antenna")
+            fix.status.status = status
+            writer.write("/fix", stamp, fix)
+
+    T = se3.make(np.eye(3), np.array([0.0, 0, 1.5]))
+    more = transforms({("antenna", "lidar"): T})
+    sequence = open_sequence(bag(tmp_path / f"a{SUFFIX[kind]}", together(clouds(4), more, fill), kind))
+    assert sequence.gnss is not None
+    np.testing.assert_array_equal(sequence.gnss.lat_lon_alt[:, 1], [8, 9, 11])
+    np.testing.assert_array_equal(sequence.gnss.sigma, [0.3, np.nan, 0.7])
+    np.testing.assert_array_equal(sequence.gnss.stamps_ns, START_NS + np.array([0, 1, 3]) * STEP_NS)
+    np.testing.assert_allclose(sequence.calibration.T_lidar_gnss, se3.inverse(T))
+
+
+def test_truth_of_another_body_is_carried_to_the_lidar_and_odometry_is_no_truth(tmp_path: Path) -> None:
+    poses = [se3.exp(np.array([k, 0.1 * k, 0, 0, 0, 0.2 * k])) for k in range(4)]
+
+    def fill(writer: BagWriter) -> None:
+        for k, T in enumerate(poses):
+            stamp = START_NS + k * STEP_NS
+            for topic, off in (("/odom", 9.0), ("/robot/ground_truth/pose", 0.0)):
+                moved = T.copy()
+                moved[0, 3] += off
+                writer.write(topic, stamp, bag_messages.odometry(writer.store, stamp, moved, "map", "base"))
+
+    path = bag(tmp_path / "a.bag", together(clouds(4), transforms({("base", "lidar"): T_BASE_LIDAR}), fill))
+    truth = open_sequence(path).ground_truth
+    assert truth is not None
+    assert truth.frame == "lidar"
+    np.testing.assert_allclose(truth.poses, [T @ T_BASE_LIDAR for T in poses], atol=1e-12)
+    np.testing.assert_array_equal(truth.stamps_ns, START_NS + np.arange(4) * STEP_NS)
