@@ -129,9 +129,10 @@ def _turns(turns: dict[str, Any] | None) -> str:
     if turns["correlation"] is None:
         return "they do not fit" if turns["is_judged"] else f"too few in the first {turns['scans']} scans to compare"
     axes = ", ".join("-" if c is None else f"{c:.2f}" for c in turns["correlation_xyz"] or [])
+    sigma = "unknown" if turns["time_offset_sigma_s"] is None else f"{1e3 * turns['time_offset_sigma_s']:.1f}"
     return (
         f"correlation {turns['correlation']:.3f} (x, y, z: {axes}) over {turns['scans']} scans, stamps off by "
-        f"{1e3 * turns['time_offset_s']:+.1f} ms (sigma {1e3 * turns['time_offset_sigma_s']:.1f})"
+        f"{1e3 * turns['time_offset_s']:+.1f} ms (sigma {sigma})"
     )
 
 

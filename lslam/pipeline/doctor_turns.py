@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 from itertools import permutations, product
 
 import numpy as np
@@ -10,7 +11,7 @@ from numpy.typing import NDArray
 
 from lslam.config import Config
 from lslam.geometry import so3
-from lslam.inertial.agreement import LEAST_TURNING, Agreement, check_agreement, turns
+from lslam.inertial.agreement import FAR_S, LEAST_TURNING, NEAR_S, STEP_S, Agreement, check_agreement, turns
 from lslam.inertial.stream import Cleaned, ImuRefusedError, clean
 from lslam.pipeline.findings import Facts, Finding
 from lslam.pipeline.inertial_start import first_poses
@@ -25,6 +26,8 @@ _SCANS = 60
 _LEAST_OFFSET_S = 0.005
 # Correlation about an axis: below the first it does not fit, from the second on it does.
 _BAD, _GOOD = 0.5, 0.8
+# Turns that correlate less may fit better where a run does not look for them, and do where they correlate so much.
+_SURE, _CLEAR = 0.95, 0.9
 # Axes are a little askew in any housing, and registration is not exact.
 _LEAST_ANGLE = np.deg2rad(8.0)
 # Faults found by now that leave nothing to compare.
@@ -40,7 +43,9 @@ def examine_turns(sequence: Sequence, findings: list[Finding]) -> Facts | None:
         cleaned = clean(imu, int(stamps_ns[0]), int(stamps_ns[-1]))
     except ImuRefusedError as error:
         if not _HOPELESS & {f.code for f in findings}:
-            findings.append(Finding.of_sentence("imu-refused", "IMU", str(error)))
+            found = Finding.of_sentence("imu-refused", "IMU", str(error))
+            way_out = found.way_out or "it holds no measurements; look at its driver, and run without --imu"
+            findings.append(replace(found, way_out=way_out))
         return None
     log.info("registering the first %d scans to compare their turns with the IMU's", min(_SCANS, len(sequence)))
     seconds = float(np.clip(_SCANS / sequence.rate_hz, 0.5, 60))
@@ -60,7 +65,12 @@ def compare(
         agreement = check_agreement(cleaned.imu, T_lidar_imu, stamps_ns, poses, None)
     except ImuRefusedError as error:
         refusal = str(error)
+    if refusal or (agreement.is_judged and agreement.correlation < _SURE):
+        far = _far_off(cleaned, T_lidar_imu, stamps_ns, poses, agreement)
+        if far is not None:
+            agreement, refusal = far, ""
     offset = _examine_clock(agreement, cleaned.rate_hz, findings)
+    sigma = float(agreement.offset_sigma_s)
     seen, felt = turns(cleaned.imu, T_lidar_imu, stamps_ns, poses, agreement.offset_s)
     # In the axes of the IMU, which its user can name.
     R = T_lidar_imu[:3, :3]
@@ -76,8 +86,29 @@ def compare(
         "correlation": float(agreement.correlation) if agreement.is_judged else None,
         "correlation_xyz": _by_axis(seen @ R, felt @ R),
         "time_offset_s": offset,
-        "time_offset_sigma_s": float(agreement.offset_sigma_s) if agreement.is_judged else None,
+        "time_offset_sigma_s": sigma if agreement.is_judged and np.isfinite(sigma) else None,
     }
+
+
+def _far_off(
+    cleaned: Cleaned, T_lidar_imu: Floats, stamps_ns: NDArray[np.int64], poses: Floats, near: Agreement
+) -> Agreement | None:
+    """The agreement at an offset beyond those that a run looks at, where that is clearly better than `near`, else None."""
+    best, at = 0.0, 0.0
+    for offset in np.arange(-FAR_S, FAR_S, 4 * STEP_S):
+        seen, felt = turns(cleaned.imu, T_lidar_imu, stamps_ns, poses, float(offset))
+        both = float(np.sqrt(np.sum(seen**2) * np.sum(felt**2)))
+        value = float(np.sum(seen * felt)) / max(both, 1e-12)
+        if value > best:
+            best, at = value, float(offset)
+    if abs(at) < NEAR_S or best < _CLEAR or best < near.correlation + 0.1:
+        return None
+    shifted = replace(cleaned.imu, stamps_ns=cleaned.imu.stamps_ns + round(1e9 * at))
+    try:
+        fine = check_agreement(shifted, T_lidar_imu, stamps_ns, poses, None)
+    except ImuRefusedError:
+        return None
+    return replace(fine, offset_s=at + fine.offset_s)
 
 
 def _examine_clock(agreement: Agreement, rate_hz: float, findings: list[Finding]) -> float | None:
@@ -91,7 +122,9 @@ def _examine_clock(agreement: Agreement, rate_hz: float, findings: list[Finding]
                 "imu-time-offset",
                 f"IMU: its stamps are {1e3 * abs(offset):.1f} ms {'late' if offset < 0 else 'early'} (sigma "
                 f"{1e3 * sigma:.1f} ms, by the turns)",
-                f"run --imu finds and mends it, --set imu.time_offset_s={offset:.4f} states it",
+                f"run --imu finds and mends it, --set imu.time_offset_s={offset:.4f} states it"
+                if abs(offset) < NEAR_S
+                else f"correct them, or --set imu.time_offset_s={offset:.4f}; a run does not look so far",
             )
         )
     return offset

@@ -98,6 +98,17 @@ def test_long_bends_do_not_hide_gravity_but_its_absence_shows(
     assert any("mean specific force" in p for p in facts["problems"]) == (unit != "m/s2")
 
 
+@pytest.mark.parametrize(("third", "said"), [("1.000000e-01", "repeats"), ("5.000000e-02", "goes back")])
+def test_stamps_that_repeat_or_go_back(third: str, said: str, tmp_path: Path) -> None:
+    folder = kitti_root(tmp_path)
+    lines = (folder / "times.txt").read_text().splitlines()
+    lines[2] = third
+    (folder / "times.txt").write_text("\n".join(lines) + "\n")
+    facts = inspect(open_sequence(folder), is_quick=True)
+    [found] = [f for f in facts["findings"] if f["code"] == "recording"]
+    assert f"time {said} at line 3" in found["what"]
+
+
 def test_help_is_light() -> None:
     code = (
         "import sys, lslam.cli.info; sys.exit(any(m in sys.modules for m in ('numpy', 'numba', 'scipy', 'pydantic')))"

@@ -5,10 +5,10 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Callable
+from copy import copy
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,7 +19,7 @@ from lslam.inertial.stream import clean
 from lslam.pipeline.doctor_gnss import examine_gnss
 from lslam.pipeline.doctor_imu import examine_imu
 from lslam.pipeline.doctor_scans import examine_stamps, examine_times
-from lslam.pipeline.doctor_turns import compare
+from lslam.pipeline.doctor_turns import compare, examine_turns
 from lslam.pipeline.findings import Facts, Finding
 from lslam.pipeline.inspect import inspect
 from lslam.readers import open_sequence
@@ -39,7 +39,10 @@ def healthy() -> Sequence:
 
 def spoilt(sequence: Sequence, **changes: Any) -> Sequence:
     """The sequence with other streams, stamps or calibration."""
-    return cast(Sequence, SimpleNamespace(**{**vars(sequence), **changes}))
+    other = copy(sequence)
+    for name, value in changes.items():
+        setattr(other, name, value)
+    return other
 
 
 def imu_of(sequence: Sequence) -> ImuStream:
@@ -82,13 +85,14 @@ def test_recordings_give_true_findings_only(recordings: Callable[[str], Path]) -
     assert facts["imu"]["tilt_deg"] < 10
 
 
-@pytest.mark.parametrize("late_s", [0.02, -0.05, 0.1, 0.2])
+@pytest.mark.parametrize("late_s", [0.02, -0.05, 0.1, 0.2, 1.5])
 def test_clocks_that_differ(healthy: Sequence, late_s: float) -> None:
     imu = imu_of(healthy)
     findings, turns = against_truth(healthy, replace(imu, stamps_ns=imu.stamps_ns + round(late_s * 1e9)))
     assert codes(findings) == ["imu-time-offset"]
     assert abs(turns["time_offset_s"] + late_s) < 0.003
     assert ("late" if late_s > 0 else "early") in findings[0].what
+    assert ("does not look so far" in findings[0].way_out) == (late_s > 0.25)
 
 
 def test_degrees_per_second(healthy: Sequence) -> None:
@@ -169,6 +173,15 @@ def test_faults_of_the_imu_itself(healthy: Sequence, spoil: Spoil, code: str, sa
     examine_imu(spoilt(healthy, imu=spoil(imu_of(healthy))), findings)
     assert codes(findings) == [code]
     assert said in str(findings[0])
+    assert findings[0].way_out
+
+
+def test_an_imu_that_measures_nothing(healthy: Sequence) -> None:
+    imu = imu_of(healthy)
+    findings: list[Finding] = []
+    assert examine_turns(spoilt(healthy, imu=replace(imu, gyro=0 * imu.gyro)), findings) is None
+    assert codes(findings) == ["imu-refused"]
+    assert "repeats one reading" in findings[0].what
     assert findings[0].way_out
 
 
