@@ -47,7 +47,9 @@ def with_imu(sequence: Sequence, data_root: Path | None = None) -> Sequence:
     if sequence.imu is not None:
         return sequence
     number = sequence.path.name
-    if not isinstance(sequence, FolderSequence) or sequence.kind != KIND or number not in DRIVES:
+    if not isinstance(sequence, FolderSequence):
+        raise InputError(f"{sequence.path} ({sequence.kind}) has no IMU: run without --imu")
+    if sequence.kind != KIND or number not in DRIVES:
         raise InputError(
             f"{sequence.path} has no IMU: looked for {sequence.path / 'imu.csv'} and `imu` in sequence.toml there; "
             "add it, or run without --imu"
