@@ -69,25 +69,35 @@ def compare(
         far = _far_off(cleaned, T_lidar_imu, stamps_ns, poses, agreement)
         if far is not None:
             agreement, refusal = far, ""
-    offset = _examine_clock(agreement, cleaned.rate_hz, findings)
-    sigma = float(agreement.offset_sigma_s)
     seen, felt = turns(cleaned.imu, T_lidar_imu, stamps_ns, poses, agreement.offset_s)
     # In the axes of the IMU, which its user can name.
     R = T_lidar_imu[:3, :3]
     found = _examine_axes(seen @ R, felt @ R, R) if len(seen) and (agreement.is_judged or refusal) else None
     if found is not None:
-        findings.append(found)
+        findings.append(found[0])
+        agreement = _with_axes(cleaned, found[1], stamps_ns, poses)
     elif refusal and not any(f.code == "imu-gyro-unit" for f in findings):
         code = "imu-gyro-unit" if "deg/s, convert" in refusal else "imu-turns"
         findings.append(Finding.of_sentence(code, "IMU", refusal))
+    offset, sigma = _examine_clock(agreement, cleaned.rate_hz, findings), float(agreement.offset_sigma_s)
     return {
         "scans": len(stamps_ns),
-        "is_judged": bool(agreement.is_judged or refusal),
-        "correlation": float(agreement.correlation) if agreement.is_judged else None,
+        "is_judged": bool(agreement.is_judged or refusal or found),
+        "correlation": float(agreement.correlation) if agreement.is_judged and found is None else None,
         "correlation_xyz": _by_axis(seen @ R, felt @ R),
         "time_offset_s": offset,
         "time_offset_sigma_s": sigma if agreement.is_judged and np.isfinite(sigma) else None,
     }
+
+
+def _with_axes(cleaned: Cleaned, R: Floats, stamps_ns: NDArray[np.int64], poses: Floats) -> Agreement:
+    """The agreement once the axes are put right: clocks cannot be told before. R may mirror."""
+    T = np.eye(4)
+    T[:3, :3] = R
+    try:
+        return check_agreement(cleaned.imu, T, stamps_ns, poses, None)
+    except ImuRefusedError:
+        return Agreement(False)
 
 
 def _far_off(
@@ -130,8 +140,11 @@ def _examine_clock(agreement: Agreement, rate_hz: float, findings: list[Finding]
     return offset
 
 
-def _examine_axes(seen: Floats, felt: Floats, R_lidar_imu: Floats) -> Finding | None:
-    """Axes swapped or the other way round, or turned by an angle; (M, 3) rates in the IMU's axes."""
+def _examine_axes(seen: Floats, felt: Floats, R_lidar_imu: Floats) -> tuple[Finding, Floats] | None:
+    """Axes swapped or the other way round, or turned by an angle, and what (3, 3) to put for `R_lidar_imu`.
+
+    seen, felt : (M, 3) rates in the IMU's axes
+    """
     rms = np.sqrt(np.mean(seen**2, axis=0))
     judged = rms > LEAST_TURNING
     norms = np.maximum(np.sqrt(np.outer(np.sum(seen**2, axis=0), np.sum(felt**2, axis=0))), 1e-12)
@@ -142,7 +155,7 @@ def _examine_axes(seen: Floats, felt: Floats, R_lidar_imu: Floats) -> Finding | 
     P = _best_axes(correlation, judged)
     better = np.sum(P * correlation, axis=1)[judged]
     if given.min() < _BAD and better.min() >= _GOOD:
-        return _swapped(P, float(given.min()), float(better.min()), int(judged.sum()), R_lidar_imu)
+        return _swapped(P, float(given.min()), float(better.min()), int(judged.sum()), R_lidar_imu), R_lidar_imu @ P
     return _turned(seen, felt, R_lidar_imu) if judged.sum() > 1 else None
 
 
@@ -171,7 +184,7 @@ def _swapped(P: Floats, before: float, after: float, judged: int, R_lidar_imu: F
     return Finding("imu-axes", what, way)
 
 
-def _turned(seen: Floats, felt: Floats, R_lidar_imu: Floats) -> Finding | None:
+def _turned(seen: Floats, felt: Floats, R_lidar_imu: Floats) -> tuple[Finding, Floats] | None:
     """By which rotation the felt turns would fit, when that halves what is left of them."""
     spread = np.sqrt(np.maximum(np.linalg.eigvalsh(seen.T @ seen / len(seen)), 0.0))
     if spread[1] < LEAST_TURNING:
@@ -182,11 +195,9 @@ def _turned(seen: Floats, felt: Floats, R_lidar_imu: Floats) -> Finding | None:
     left, before = float(np.sum((seen - felt @ rotation.T) ** 2)), float(np.sum((seen - felt) ** 2))
     if angle < _LEAST_ANGLE or left > 0.5 * before or left > 0.36 * float(np.sum(seen**2)):
         return None
-    return Finding(
-        "imu-rotation",
-        f"IMU: T_lidar_imu is about {np.rad2deg(angle):.0f} deg off by the turns of the scans",
-        f"correct its rotation to about {_rows(R_lidar_imu @ rotation)}",
-    )
+    R = R_lidar_imu @ rotation
+    what = f"IMU: T_lidar_imu is about {np.rad2deg(angle):.0f} deg off by the turns of the scans"
+    return Finding("imu-rotation", what, f"correct its rotation to about {_rows(R)}"), R
 
 
 def _by_axis(seen: Floats, felt: Floats) -> list[float | None] | None:

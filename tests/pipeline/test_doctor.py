@@ -125,6 +125,15 @@ def test_axes_swapped_and_flipped(
     assert way in findings[0].way_out
 
 
+def test_axes_and_clock_at_once(healthy: Sequence) -> None:
+    """Clocks are told apart by turns whose axes were put right."""
+    imu = imu_of(healthy)
+    spoilt_imu = replace(imu, gyro=(imu.gyro * (-1, 1, 1))[:, [1, 0, 2]], stamps_ns=imu.stamps_ns + 40_000_000)
+    findings, turns = against_truth(healthy, spoilt_imu)
+    assert codes(findings) == ["imu-axes", "imu-time-offset"]
+    assert abs(turns["time_offset_s"] + 0.04) < 0.003
+
+
 def test_extrinsics_turned_by_an_angle(healthy: Sequence) -> None:
     """The rotation that is proposed is the one that was spoilt."""
     T = healthy.calibration.T_lidar_imu
