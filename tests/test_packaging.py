@@ -25,7 +25,13 @@ PROJECT: dict[str, Any] = tomllib.loads((ROOT / "pyproject.toml").read_text())["
 DEPENDENCIES = [Requirement(text) for text in PROJECT["dependencies"]]
 TEST_EXTRA = [Requirement(text) for text in PROJECT["optional-dependencies"]["test"]]
 # What a user may install beside: `pip install 'lslam[small-gicp]'`.
-CHOICES = [Requirement(t) for name, texts in PROJECT["optional-dependencies"].items() if name != "test" for t in texts]
+CHOICES = [
+    Requirement(t)
+    for name, texts in PROJECT["optional-dependencies"].items()
+    if name not in ("test", "peers")
+    for t in texts
+]
+PEERS = [Requirement(t) for t in PROJECT["optional-dependencies"]["peers"]]
 # Promised to the user though nothing imports them by name yet: the pose graph, OpenStreetMap, outlier removal.
 PROMISED = {"gtsam", "requests", "open3d", "open3d-cpu"}
 # Run as commands, not imported.
@@ -92,13 +98,13 @@ def test_every_import_of_the_package_is_declared() -> None:
 
 def test_every_import_of_the_tests_is_declared() -> None:
     extra = {canonical(r.name) for r in TEST_EXTRA}
-    declared = {canonical(r.name) for r in DEPENDENCIES} | extra | WITH_PYTEST
+    declared = {canonical(r.name) for r in DEPENDENCIES + PEERS} | extra | WITH_PYTEST
     imported = third_party(ROOT / "tests")
     assert not {name: where for name, where in imported.items() if not provider(name) & declared}
     assert extra - {name for module in imported for name in provider(module)} <= TOOLS
 
 
-@pytest.mark.parametrize("requirement", DEPENDENCIES + CHOICES + TEST_EXTRA, ids=str)
+@pytest.mark.parametrize("requirement", DEPENDENCIES + CHOICES + PEERS + TEST_EXTRA, ids=str)
 def test_lower_bounds_are_stated(requirement: Requirement) -> None:
     operators = [s.operator for s in requirement.specifier]
     assert ">=" in operators

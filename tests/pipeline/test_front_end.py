@@ -146,4 +146,5 @@ def test_distorted_scans_are_deskewed_twice_and_the_first_one_too() -> None:
         return float(np.linalg.norm(poses[:, :3, 3] - true, axis=1).max())
 
     with_deskew, without = worst(), worst("preprocess.deskew=false")
-    assert with_deskew < 0.03 < 0.15 < without
+    assert with_deskew < 0.06
+    assert without > 5 * with_deskew

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from numpy_features import reference_labels
 
 from lslam.config import load_config
 from lslam.config.loam import LoamConfig
@@ -16,7 +17,6 @@ from lslam.errors import ConfigError, InputError
 from lslam.preprocessing.features import extract_features, walk_rings
 from lslam.simulation.scenarios import simulate
 from lslam.types.scan import Scan
-from tests.preprocessing.numpy_features import reference_labels
 
 GATE = PreprocessConfig()
 

@@ -227,5 +227,5 @@ def test_a_drive_carries_it_only_when_asked(laps: SimulatedDrive) -> None:
     drive = simulate("block", count=20, imu="icm20948", lidar="os1-32")
     assert isinstance(drive.imu, ImuStream)
     assert drive.calibration.T_lidar_imu is not None
-    assert np.linalg.norm(drive.calibration.T_lidar_imu[:3, 3]) < 0.02, "an Ouster has its IMU inside"
+    assert 0.5 < np.linalg.norm(drive.calibration.T_lidar_imu[:3, 3]) < 2.0, "a car has its IMU below the roof"
     assert drive.imu.stamps_ns[-1] == 2_000_000_000, "to the end of the last scan"
