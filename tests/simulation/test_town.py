@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import cache
+from typing import cast
 
 import numpy as np
 import pytest
@@ -11,9 +12,10 @@ from lslam.errors import UsageError
 from lslam.simulation.city import KERB, City
 from lslam.simulation.clearance import check_bends, check_path
 from lslam.simulation.lidar import RayScene
-from lslam.simulation.mesh import Surface
+from lslam.simulation.mesh import MeshBuilder, Surface
 from lslam.simulation.scenario_files import scenario_names
 from lslam.simulation.scenarios import SimulatedDrive, simulate
+from lslam.simulation.terrain import Terrain
 from lslam.simulation.town import Network
 from lslam.types.scan import Scan
 
@@ -160,6 +162,35 @@ def test_a_path_through_a_building_is_refused() -> None:
     check_path(made.scene, made.city, made.vehicle.poses, made.end)
     with pytest.raises(UsageError, match=r"crosses a building, \d+ m along at x = .*: move its way-points"):
         check_path(made.scene, made.city, poses, 5.0)
+
+
+class Flat:
+    """Ground at z = 0."""
+
+    def height(self, xy: np.ndarray) -> np.ndarray:
+        return np.zeros(xy.shape[:-1])
+
+
+@pytest.mark.parametrize("side", [1, -1])
+def test_a_body_is_wider_than_its_path(side: int) -> None:
+    """A wall 0.5 m beside the path is scraped, one 0.9 m away is not."""
+
+    def poses(times: np.ndarray) -> np.ndarray:
+        T = np.tile(np.eye(4), (len(times), 1, 1))
+        T[:, 0, 3], T[:, 2, 3] = 10.0 * times, 1.7
+        return T
+
+    for gap, is_free in ((0.9, True), (0.5, False)):
+        builder = MeshBuilder()
+        near, far = sorted((side * gap, side * 6.0))
+        builder.add_box([8.0, near, -1.0], [12.0, far, 5.0], Surface.WALL)
+        mesh = builder.build()
+        scene, city = RayScene(mesh), City(mesh, cast(Terrain, Flat()))
+        if is_free:
+            check_path(scene, city, poses, 2.0)
+            continue
+        with pytest.raises(UsageError, match=r"crosses a building, [78] m along at x = [78]\.\d, y = 0\.0"):
+            check_path(scene, city, poses, 2.0)
 
 
 def test_a_flight_into_the_ground_is_refused() -> None:
