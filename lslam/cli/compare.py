@@ -76,7 +76,7 @@ def command(sequences: tuple[str, ...], **given: Any) -> None:
     failed = comparison.failed
     said = "; ".join(f"{run.sequence} {run.method} seed {run.seed}: {run.reason}" for run in failed[:3])
     if len(failed) == len(comparison.runs):
-        raise RunFailedError(f"all {len(failed)} runs failed: {said}")
+        raise RunFailedError(f"{'the run' if len(failed) == 1 else f'all {len(failed)} runs'} failed: {said}")
     if failed and given["strict"]:
         raise GateError(f"--strict: {len(failed)} of {len(comparison.runs)} runs failed: {said}")
 
