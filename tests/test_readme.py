@@ -40,7 +40,7 @@ def lslam_calls() -> list[list[str]]:
     """Each `lslam ...` of the README: its shell blocks, and its text in backticks."""
     quoted = re.findall(r"`(lslam [^`]+)`", re.sub(r"^```.*?^```$", "", README, flags=re.MULTILINE | re.DOTALL))
     steps = [step.strip() for line in [*shell_lines(), *quoted] for step in line.split("&&")]
-    return [shlex.split(step)[1:] for step in steps if step.startswith("lslam ")]
+    return [shlex.split(step.partition(" > ")[0])[1:] for step in steps if step.startswith("lslam ")]
 
 
 @pytest.mark.parametrize("call", lslam_calls(), ids=" ".join)
