@@ -79,7 +79,11 @@ class RegistrationConfig(Section):
     max_jump_m: float = Field(6.0, gt=0, description="m; a correction of the motion prior beyond this fails")
     max_jump_deg: float = Field(45.0, gt=0, description="deg; likewise for rotation")
     weak_share: float = Field(
-        1e-3, ge=0, lt=1, description="share of the information below which a direction keeps the motion prior"
+        1e-3,
+        ge=0,
+        lt=1,
+        description="share of the information below which a direction counts as unobserved; below a third of it (in LOAM "
+        "methods: at once) it keeps the motion prior",
     )
 
     @model_validator(mode="after")

@@ -40,7 +40,7 @@ def _step(H: Floats, g: Floats, facts: Floats, allowed: Floats, weak_share: floa
                 for j in range(6):
                     A[i, j] += allowed[i, k] * H[k, m] * allowed[m, j]
     # What the projector takes away has no eigenvalue left, so that the step never looks along it in g.
-    weak_count = solve_observed(A, g, facts, weak_share, d, weak)
+    weak_count = solve_observed(A, g, facts, weak_share, 1.0, d, weak)
     move, turn = step_norms(d)
     if not (np.isfinite(move) and np.isfinite(turn)):
         d[:] = 0.0

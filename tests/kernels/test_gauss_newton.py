@@ -18,7 +18,7 @@ def solve(H: Floats, g: Floats, lever: float = 1.0, weak_share: float = 1e-3) ->
     d, weak = np.full(6, np.nan), np.zeros((6, 6))
     information = float(np.trace(H[:3, :3]))
     facts = np.array([information, 0, 0, 0, information * lever**2, 0])
-    count = gauss_newton.solve_observed(H, g, facts, weak_share, d, weak)
+    count = gauss_newton.solve_observed(H, g, facts, weak_share, gauss_newton.UNSEEN, d, weak)
     return d, weak[:count]
 
 
@@ -51,10 +51,10 @@ def test_unobserved_directions_get_none(rank: int) -> None:
 
 def test_the_share_of_information_draws_the_line() -> None:
     H = np.diag([1.0, 1.0, 1e-3, 1.0, 1.0, 1.0])
-    for share, expected in [(1e-4, 0), (1e-3, 1)]:
+    for share, expected, is_followed in [(1e-4, 0, True), (4e-4, 1, True), (1e-3, 1, False)]:
         d, weak = solve(H, np.ones(6), weak_share=share)
         assert len(weak) == expected
-        assert d[2] == pytest.approx(-1e3 if expected == 0 else 0.0)
+        assert d[2] == pytest.approx(-1e3 if is_followed else 0.0)
 
 
 def test_no_information_gives_no_step() -> None:

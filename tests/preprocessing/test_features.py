@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from numpy_features import reference_labels
+from numpy_labels import reference_labels
 
 from lslam.config import load_config
 from lslam.config.loam import LoamConfig
