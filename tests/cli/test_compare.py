@@ -123,6 +123,8 @@ def test_an_interruption_keeps_what_is_finished_for_resume(tmp_path: Path) -> No
     child = subprocess.Popen(
         [*COMMAND, *call], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment(),
         start_new_session=True,
+        # A shell that runs the tests in the background has switched the signal off, for all its children.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )  # fmt: skip
     try:
         end = time.monotonic() + 120
