@@ -83,7 +83,7 @@ def _forgive(cache: Any) -> None:
 
 def inline(function: F) -> F:
     """A small helper of kernels, compiled into its callers and not cached by itself."""
-    compiled = numba.njit(nogil=True, error_model="numpy")(function)
+    compiled = numba.njit(nogil=True, error_model="numpy", forceinline=True)(function)
     return cast(F, compiled)
 
 
