@@ -5,6 +5,7 @@ from __future__ import annotations
 from lslam.config.eval import EvalConfig
 from lslam.config.imu import ImuConfig
 from lslam.config.input import InputConfig
+from lslam.config.keyframes import KeyframesConfig
 from lslam.config.loam import LoamConfig
 from lslam.config.map import MapConfig
 from lslam.config.odometry import OdometryConfig
@@ -23,6 +24,7 @@ class Config(Section):
     registration: RegistrationConfig = RegistrationConfig()
     loam: LoamConfig = LoamConfig()
     imu: ImuConfig = ImuConfig()
+    keyframes: KeyframesConfig = KeyframesConfig()
     map: MapConfig = MapConfig()
     eval: EvalConfig = EvalConfig()
     report: ReportConfig = ReportConfig()

@@ -1,0 +1,49 @@
+"""What the back end knows beside odometry: relations between keyframes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+ConstraintKind = Literal["odometry", "loop"]
+Verdict = Literal["accepted", "rejected"]
+
+
+@dataclass(frozen=True)
+class Constraint:
+    """Pose of keyframe `b` seen from keyframe `a`, as something measured it.
+
+    T_a_b : (4, 4); covariance : (6, 6) of t' = t + d[:3], R' = exp(d[3:]) R in the axes of keyframe a, m2 and rad2
+    """
+
+    a: int
+    b: int
+    T_a_b: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+    kind: ConstraintKind = "loop"
+
+
+@dataclass(frozen=True)
+class LoopCandidate:
+    """Two keyframes that may show the same place, and what became of them: a row of loops.csv.
+
+    a : the older keyframe; b : the newer one
+    distance : m between their odometry positions; descriptor_distance : 0 (alike) to 1, of Scan Context; NaN without
+    stage : what decided: `descriptor`, `gate`, `registration`, `overlap`, `agreement`, `consistency`, `graph`, `thinned`
+    reason : why it was rejected, one clause; empty when accepted
+    constraint : the measured loop closure, also of one that was rejected after registration
+    """
+
+    a: int
+    b: int
+    distance: float
+    descriptor_distance: float
+    verdict: Verdict
+    stage: str
+    reason: str = ""
+    rmse: float = float("nan")
+    overlap: float = float("nan")
+    constraint: Constraint | None = None
