@@ -1,0 +1,51 @@
+"""Covariances of poses, from this house's order into gtsam's and back.
+
+Here a pose is disturbed as t' = t + d[:3], R' = exp(d[3:]) R: translation first, in the axes of the parent frame.
+gtsam disturbs it as T' = T exp(xi): rotation first, in the axes of the body. To first order xi = J d.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.geometry import so3
+
+Floats = NDArray[np.float64]
+
+
+def to_body(covariance: NDArray[Any], T: NDArray[Any]) -> Floats:
+    """(..., 6, 6) covariances of poses `T` (..., 4, 4) as gtsam wants them: rotation first, body axes."""
+    J = _into_body(T)
+    return np.asarray(J @ np.asarray(covariance, np.float64) @ np.swapaxes(J, -1, -2))
+
+
+def from_body(covariance: NDArray[Any], T: NDArray[Any]) -> Floats:
+    """The inverse of `to_body`."""
+    J = np.swapaxes(_into_body(T), -1, -2)  # orthogonal: the transpose is the inverse
+    return np.asarray(J @ np.asarray(covariance, np.float64) @ np.swapaxes(J, -1, -2))
+
+
+def transported(covariance: NDArray[Any], step: NDArray[Any]) -> Floats:
+    """(..., 6, 6) covariance of a pose, carried to one that is `step` (..., 3), m, further: a turn moves what lies ahead."""
+    F = np.zeros((*np.asarray(step).shape[:-1], 6, 6))
+    F[...] = np.eye(6)
+    F[..., :3, 3:] = -so3.hat(step)
+    return np.asarray(F @ np.asarray(covariance, np.float64) @ np.swapaxes(F, -1, -2))
+
+
+def rotated(covariance: NDArray[Any], R: NDArray[Any]) -> Floats:
+    """(..., 6, 6) covariances with both halves turned by `R` (..., 3, 3), from one frame's axes into another's."""
+    R = np.asarray(R, np.float64)
+    B = np.zeros((*R.shape[:-2], 6, 6))
+    B[..., :3, :3] = B[..., 3:, 3:] = R
+    return np.asarray(B @ np.asarray(covariance, np.float64) @ np.swapaxes(B, -1, -2))
+
+
+def _into_body(T: NDArray[Any]) -> Floats:
+    Rt = np.swapaxes(np.asarray(T, np.float64)[..., :3, :3], -1, -2)
+    J = np.zeros((*Rt.shape[:-2], 6, 6))
+    J[..., :3, 3:] = J[..., 3:, :3] = Rt
+    return J
