@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 @click.command(
     epilog="\b\nExamples: lslam compare sample_data --methods icp,kiss-icp\n"
     "          lslam compare street block --methods icp,kiss-icp --seeds 0,1,2 --count 100\n"
+    "          lslam compare walk open --methods icp,loam --imu both --seeds 0,1,2\n"
     "          lslam compare seq07 --data-root ~/kitti --methods icp,kiss-icp --count 300 --out runs/two --resume"
 )
 @click.argument("sequences", metavar="SEQUENCE...", nargs=-1, required=True)
@@ -36,6 +37,11 @@ if TYPE_CHECKING:
 @options.preset
 @click.option(
     "--seeds", default="0", show_default=True, metavar="N,N,...", help="Of simulations, and of methods that draw."
+)
+@click.option(
+    "--imu",
+    type=click.Choice(["off", "on", "both"]),
+    help="Without or with the IMU, or each method both ways, the second named icp+imu.",
 )
 @click.option("--gt", type=click.Path(path_type=Path), metavar="FILE", help="Ground truth of the one sequence.")
 @click.option(
@@ -89,7 +95,9 @@ def _plan(sequences: tuple[str, ...], given: dict[str, Any]) -> Plan:
     flags = {f"input.{key}": given[key] for key in ("start", "count", "skip_frames") if given[key] is not None}
     settings = options.with_preset(given["settings"], given["preset"])
     methods = [name.strip() for name in given["methods"].split(",") if name.strip()]
-    variants = find_variants(methods, given["config_file"], [*settings, *(f"{k}={v}" for k, v in flags.items())])
+    variants = find_variants(
+        methods, given["config_file"], [*settings, *(f"{k}={v}" for k, v in flags.items())], given["imu"]
+    )
     subjects = find_subjects(sequences, given["data_root"])
     return Plan(
         subjects=tuple(subjects),
@@ -101,6 +109,7 @@ def _plan(sequences: tuple[str, ...], given: dict[str, Any]) -> Plan:
         crop=_crop(given["crop"]),
         overwrite=given["overwrite"],
         resume=given["resume"],
+        data_root=given["data_root"],
         command=shlex.join(["lslam", *sys.argv[1:]]),
     )
 

@@ -76,7 +76,7 @@ def recipes(comparison: Comparison) -> list[str]:
     if len(comparison.methods) > 1:
         lines.append(
             f"pairs: one per sequence and seed; ratio: geometric mean of ATE (se3, else origin) over that of "
-            f"{comparison.methods[0]}; a tie is within {100 * comparison.tie:g} cm; a run that failed where the "
+            f"what it stands against; a tie is within {100 * comparison.tie:g} cm; a run that failed where the "
             "other did not is a loss; p: Wilcoxon signed-rank of the log ratios, two-sided"
         )
     return lines

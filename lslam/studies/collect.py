@@ -16,6 +16,7 @@ from lslam.studies.states import FINAL, State, read_state
 from lslam.types.comparison import Metric, RunScore
 
 COUNTS = ("bridged", "skipped", "degenerate")
+IMU = "imu_used"
 NO_TRUTH = "no ground truth"
 
 
@@ -42,6 +43,8 @@ def _filled(score: RunScore, state: State) -> RunScore:
     values = {key: float(n) for key, n in manifest["counts"].items()} | _times(timing) | {"run_s": state.seconds}
     if manifest["peak_memory_mb"] is not None:
         values["memory"] = float(manifest["peak_memory_mb"])
+    if "imu" in manifest:
+        values[IMU] = float(manifest["imu"]["used"])
     note = _add_errors(score.folder / "evaluation.json", manifest, values)
     return replace(
         score, values=values, stages={name: stage.mean for name, stage in timing.stages.items()}, limit=timing.period,
@@ -145,5 +148,5 @@ def _for_programs(
     metrics += [more("drift.rotation", "deg/100m"), more("thesis_rmse", "m"), more("path", "m")]
     metrics += [more(f"time.{name}.p95", "ms", "time") for name in stages]
     metrics += [more(key, unit, "time") for key, unit in (("time.mean", "ms"), ("time.max", "ms"), ("run_s", "s"))]
-    counts = (("scans", "scans"), ("ok", "scans"), ("over_limit", "scans"), ("memory", "MB"))
+    counts = (("scans", "scans"), ("ok", "scans"), ("over_limit", "scans"), ("memory", "MB"), (IMU, "0 or 1"))
     return metrics + [more(key, unit, "health") for key, unit in counts]

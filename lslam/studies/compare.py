@@ -4,20 +4,23 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
+from pathlib import Path
 
 from lslam.errors import InterruptedRunError, LslamError
 from lslam.evaluation.relative import parse_delta
 from lslam.readers import open_sequence
+from lslam.readers.raw_drive import with_imu
 from lslam.reports import compare_html, compare_json, compare_table
-from lslam.studies.collect import collect_run, metrics_of
+from lslam.studies.collect import IMU, collect_run, metrics_of
 from lslam.studies.drawings import draw
 from lslam.studies.grid import Cell, Job, expand
-from lslam.studies.identity import input_digest
+from lslam.studies.identity import imu_digest, input_digest
 from lslam.studies.jobs import finished, run_jobs
 from lslam.studies.paired import TIE_M, compare_pairs, summarise
 from lslam.studies.plan import RESULT, Follow, Plan, check_plan, claim, release
 from lslam.studies.subjects import scans_needed, simulate_once
 from lslam.types.comparison import Comparison, Drawing, RunScore
+from lslam.types.sequence import Sequence as Recording
 
 # More than this many busy cores before the first run, and its times are somebody else's too.
 BUSY = 0.5
@@ -58,21 +61,36 @@ def compare(plan: Plan, follow: Follow | None = None) -> Comparison:
 
 def _cells(plan: Plan, follow: Follow) -> list[Cell]:
     """Recordings as they are, scenarios simulated once per seed."""
+    # What cannot be opened, or has no IMU though one is asked for, is said before anything is simulated.
+    recorded = {s.label: _recorded(s.label, s.path, plan) for s in plan.subjects if s.path is not None}
     cells = []
     for subject in plan.subjects:
-        if subject.path is not None:
-            sequence = open_sequence(subject.path)
-            digest = input_digest(sequence, plan.truth)
-            cells.append(Cell(subject.label, subject.path, None, digest, plan.truth))
+        if subject.scenario is None:
+            cells.append(recorded[subject.label])
             continue
-        assert subject.scenario is not None
         for seed in plan.seeds:
             path = simulate_once(
                 subject.scenario, seed, scans_needed([v.config.input for v in plan.variants]), plan.out / "simulated",
                 lambda stage, total: follow.on_start(stage, total, "scans"), lambda: follow.on_step(""),
             )  # fmt: skip
-            cells.append(Cell(subject.label, path, seed, input_digest(open_sequence(path), None)))
+            simulated = open_sequence(path)
+            cells.append(
+                Cell(subject.label, path, seed, input_digest(simulated, None), imu=_imu_of(simulated, plan))
+            )  # fmt: skip
     return cells
+
+
+def _recorded(label: str, path: Path, plan: Plan) -> Cell:
+    sequence = open_sequence(path)
+    digest = input_digest(sequence, plan.truth)
+    return Cell(label, path, None, digest, plan.truth, _imu_of(sequence, plan), plan.data_root)
+
+
+def _imu_of(sequence: Recording, plan: Plan) -> str:
+    """Digest of the IMU, empty when no run asks for it. Raises InputError when there is none."""
+    if not any(variant.config.imu.use for variant in plan.variants):
+        return ""
+    return imu_digest(with_imu(sequence, plan.data_root))
 
 
 def _notes(scores: Sequence[RunScore]) -> list[str]:
@@ -80,6 +98,9 @@ def _notes(scores: Sequence[RunScore]) -> list[str]:
     notes = []
     if any(score.jobs > 1 for score in scores if score.is_usable):
         notes.append("times marked ~ are not comparable: several runs shared the machine (--jobs)")
+    refused = [f"{score.sequence} {score.method}" for score in scores if score.values.get(IMU) == 0]
+    if refused:
+        notes.append(f"went on without the IMU, which was refused: {', '.join(refused)}; each run's report says why")
     load = max((score.load for score in scores if score.is_usable), default=0.0)
     if load > BUSY:
         cores = os.cpu_count() or 1
@@ -102,7 +123,7 @@ def _weigh(plan: Plan, jobs: Sequence[Job], scores: Sequence[RunScore]) -> tuple
         metrics=tuple(metrics_of(alignments, deltas, scores)),
         runs=tuple(scores),
         rows=tuple(summarise(scores)),
-        paired=tuple(compare_pairs(scores, methods)),
+        paired=tuple(compare_pairs(scores, methods, ((v.name, v.without) for v in plan.variants if v.without))),
         differences=tuple(differences),
         notes=tuple(_notes(scores)),
         configs={v.name: v.config.model_dump(mode="json") for v in plan.variants},

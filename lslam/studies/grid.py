@@ -20,7 +20,8 @@ class Cell:
     """One recording of a study: of a subject, and of a seed when it was simulated with one.
 
     seed : of the simulation, None for a recording; truth : what replaces the recording's own ground truth
-    digest : of the input
+    digest : of the input; imu : likewise of its IMU, empty when no run asks for it
+    data_root : where the IMU of a KITTI odometry sequence is looked for
     """
 
     sequence: str
@@ -28,6 +29,8 @@ class Cell:
     seed: int | None
     digest: str
     truth: Trajectory | None = None
+    imu: str = ""
+    data_root: Path | None = None
 
 
 @dataclass(frozen=True)
@@ -47,6 +50,7 @@ class Job:
     digest: str
     command: str
     truth: Trajectory | None = None
+    data_root: Path | None = None
 
     @property
     def name(self) -> str:
@@ -81,7 +85,11 @@ def expand(
                 elif cell.seed is None and seed != seeds[0]:
                     continue
                 folder = run_folder(out, cell.sequence, variant.name, seed)
-                digest = job_digest(config, cell.digest)
-                job = Job(cell.sequence, variant.name, seed, cell.path, config, folder, digest, command, cell.truth)
-                jobs.append(job)
+                digest = job_digest(config, cell.digest, cell.imu)
+                jobs.append(
+                    Job(
+                        cell.sequence, variant.name, seed, cell.path, config, folder, digest, command, cell.truth,
+                        cell.data_root,
+                    )
+                )  # fmt: skip
     return jobs

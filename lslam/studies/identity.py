@@ -7,6 +7,9 @@ import json
 import os
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from lslam.config import Config
 from lslam.errors import InputError
@@ -34,9 +37,21 @@ def input_digest(sequence: Sequence, truth: Trajectory | None) -> str:
     return digest.hexdigest()
 
 
-def job_digest(config: Config, of_input: str) -> str:
-    """Digest of a run: its resolved configuration, its input and lslam's version."""
-    said = {"config": config.model_dump(mode="json"), "input": of_input, "lslam": __version__}
+def imu_digest(sequence: Sequence) -> str:
+    """Digest of what the IMU measured and where it sits: for KITTI odometry that lies outside of the recording's folder."""
+    digest = hashlib.sha256()
+    imu, T_lidar_imu = sequence.imu, sequence.calibration.T_lidar_imu
+    for values in () if imu is None else (imu.stamps_ns, imu.accel, imu.gyro):
+        digest.update(np.ascontiguousarray(values).tobytes())
+    digest.update(b"" if T_lidar_imu is None else np.ascontiguousarray(T_lidar_imu).tobytes())
+    return digest.hexdigest()
+
+
+def job_digest(config: Config, of_input: str, of_imu: str = "") -> str:
+    """Digest of a run: its resolved configuration, its input, the IMU if it uses one, and lslam's version."""
+    said: dict[str, Any] = {"config": config.model_dump(mode="json"), "input": of_input, "lslam": __version__}
+    if config.imu.use:
+        said["imu"] = of_imu
     return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
@@ -41,24 +41,28 @@ def spread(values: Sequence[float]) -> Spread:
     return Spread(float(np.mean(array)), std, len(array))
 
 
-def compare_pairs(runs: Sequence[RunScore], methods: Sequence[str]) -> list[Paired]:
+def compare_pairs(
+    runs: Sequence[RunScore], methods: Sequence[str], more: Iterable[tuple[str, str]] = ()
+) -> list[Paired]:
     """Every method but the first against the first, over runs of the same sequence and seed that have a ground truth.
 
+    more : further pairs (method, reference), such as a method with and without the IMU
     A method that does not depend on the seed of a recording has one run there, which meets every seed of the other.
     """
     if not methods:
         return []
+    sides = dict.fromkeys([*((method, methods[0]) for method in methods[1:]), *more])
     table = {(run.sequence, run.method, run.seed): run for run in runs}
     seeds = {(run.sequence, run.seed): None for run in runs}
     out = []
-    for method in methods[1:]:
+    for method, reference in sides:
         pairs = []
         for sequence, seed in seeds:
-            a, b = (_run_of(table, sequence, name, seed) for name in (methods[0], method))
+            a, b = (_run_of(table, sequence, name, seed) for name in (reference, method))
             # One run each that meets all seeds: count it once.
             if a is not None and b is not None and seed in (a.seed, b.seed):
                 pairs.append((a, b))
-        out.append(_judge(method, methods[0], pairs))
+        out.append(_judge(method, reference, pairs))
     return out
 
 

@@ -31,6 +31,7 @@ class Plan:
 
     truth : replaces the ground truth of the only sequence; jobs : runs at once, with more than one times cannot be compared
     crop : (x, y, size) of the map crop, m, None to choose; overwrite : run everything anew; resume : keep finished runs
+    data_root : where the IMU of a KITTI odometry sequence is looked for
     """
 
     subjects: tuple[Subject, ...]
@@ -42,6 +43,7 @@ class Plan:
     crop: tuple[float, float, float] | None = None
     overwrite: bool = False
     resume: bool = False
+    data_root: Path | None = None
     command: str = ""
 
 

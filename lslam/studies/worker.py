@@ -46,9 +46,12 @@ def _run(job: Job) -> tuple[str, str]:
     """Status and reason of a run that came to its end."""
     from lslam.pipeline.run import RunOutcome, Watch, run
     from lslam.readers import open_sequence
+    from lslam.readers.raw_drive import with_imu
 
     ended: list[RunOutcome] = []
     sequence = open_sequence(job.path, vertical_correction_deg=job.config.input.vertical_correction_deg)
+    if job.config.imu.use:
+        sequence = with_imu(sequence, job.data_root)
     watch = Watch(on_end=ended.append)
     # A gate of the run's own (input.strict): it is done all the same.
     with contextlib.suppress(GateError):

@@ -151,8 +151,9 @@ class Drawing:
 
 @dataclass(frozen=True)
 class Comparison:
-    """All of it; the first of `methods` is the reference of `paired` and `differences`.
+    """All of it; the first of `methods` is the reference of `differences` and of `paired`.
 
+    paired : also each method with the IMU against itself without, when both were asked for
     configs : the resolved configuration of each method; tie : m
     """
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lslam.errors import OutputExistsError, UsageError
+from lslam.errors import InputError, OutputExistsError, UsageError
 from lslam.evaluation.evaluate import evaluate
 from lslam.formats.trajectory_files import read_trajectory
 from lslam.readers import open_sequence
@@ -134,6 +134,28 @@ def test_resume_runs_only_what_is_missing_or_changed(made: Comparison, plan: Pla
     assert one(again, "good", "icp").values["ate.se3"] == one(made, "good", "icp").values["ate.se3"]
     anew = replace(two, variants=plan.variants[:1], subjects=plan.subjects[:1], overwrite=True, resume=False)
     assert not compare(anew).runs[0].is_reused
+
+
+def test_with_and_without_the_imu_are_runs_and_pairs_of_their_own(
+    subjects: tuple[Subject, ...], tmp_path: Path
+) -> None:
+    variants = tuple(find_variants(("icp",), None, ["map.write=false", "report.html=false"], imu="both"))
+    with pytest.raises(InputError, match=r"silent has no IMU.*imu\.csv.*run without --imu"):
+        compare(Plan(subjects[1:2], variants, (0,), tmp_path / "none"))
+    assert not (tmp_path / "none").exists()
+    folder = record(simulate("block", count=30, lidar="sample", imu="icm20948"), tmp_path / "good").sequence
+    plan = Plan((Subject("good", folder),), variants, (0,), tmp_path / "out")
+    made = compare(plan)
+    assert [(r.method, r.status, r.values.get("imu_used")) for r in made.runs] == [
+        ("icp", "done", None), ("icp+imu", "done", 1.0),
+    ]  # fmt: skip
+    assert [(p.method, p.reference, p.n) for p in made.paired] == [("icp+imu", "icp", 1)]
+    measured = (folder / "imu.csv").read_text().splitlines()
+    still = [line.split(",")[0] + ",0" * 6 for line in measured[1:]]
+    (folder / "imu.csv").write_text("\n".join([measured[0], *still]) + "\n")
+    again = compare(replace(plan, resume=True))
+    assert one(again, "good", "icp+imu").values["imu_used"] == 0.0
+    assert [note for note in again.notes if "refused: good icp+imu;" in note]
 
 
 def test_a_folder_that_is_something_else_is_left_alone(plan: Plan, tmp_path: Path) -> None:

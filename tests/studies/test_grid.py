@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -69,6 +70,29 @@ def test_a_preset_or_a_file_is_a_contender_with_all_it_says(tmp_path: Path) -> N
     assert plain.config.input.count == coarse.config.input.count == 5
     with pytest.raises(UsageError, match="'coarse' twice"):
         variants(str(tmp_path / "coarse.toml"), str(tmp_path / "coarse.toml"))
+
+
+def test_both_makes_two_of_each_method_and_one_of_what_ignores_the_imu() -> None:
+    made = find_variants(("icp", "kiss-icp", "thesis-icp"), imu="both")
+    assert [(v.name, v.config.imu.use, v.without) for v in made] == [
+        ("icp", False, ""), ("icp+imu", True, "icp"), ("kiss-icp", False, ""), ("thesis-icp", False, ""),
+        ("thesis-icp+imu", True, "thesis-icp"),
+    ]  # fmt: skip
+    assert [v.name for v in find_variants(("icp", "kiss-icp"), imu="on")] == ["icp+imu", "kiss-icp+imu"]
+    (without,) = find_variants(("icp",), None, ["imu.use=true"], imu="off")
+    assert (without.name, without.config.imu.use) == ("icp", False)
+    with pytest.raises(UsageError, match="twice"):
+        find_variants(("icp", "icp"), imu="on")
+
+
+def test_jobs_with_and_without_the_imu_are_others_and_only_one_depends_on_what_it_measured() -> None:
+    both = find_variants(("icp",), imu="both")
+    first, again = (
+        expand([replace(recording(), imu=imu)], both, (0,), Path("out"), "") for imu in ("measured", "otherwise")
+    )
+    assert first[0].folder != first[1].folder
+    assert first[0].digest != first[1].digest
+    assert [a.digest == b.digest for a, b in zip(first, again, strict=True)] == [True, False]
 
 
 @pytest.fixture(scope="module")

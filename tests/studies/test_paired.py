@@ -89,6 +89,16 @@ def test_a_method_that_does_not_draw_meets_every_seed_of_one_that_does() -> None
     assert compare_pairs(runs, ("b", "a"))[0].n == 3
 
 
+def test_a_method_with_the_imu_is_also_held_against_itself_without() -> None:
+    runs = [run("s", m, 0, e) for m, e in (("a", 1.0), ("b", 8.0), ("b+imu", 2.0))]
+    against = compare_pairs(runs, ("a", "b", "b+imu"), [("b+imu", "b")])
+    assert [(p.method, p.reference, p.ratio) for p in against] == [
+        ("b", "a", pytest.approx(8.0)), ("b+imu", "a", pytest.approx(2.0)), ("b+imu", "b", pytest.approx(0.25)),
+    ]  # fmt: skip
+    # Where the reference is the method itself, once is enough.
+    assert len(compare_pairs(runs, ("b", "b+imu"), [("b+imu", "b")])) == 1
+
+
 def test_pairs_are_of_one_alignment() -> None:
     straight = RunScore("s", "b", 0, Path(), "done", values={"ate.origin": 3.0})
     of_a = RunScore("s", "a", 0, Path(), "done", values={"ate.se3": 100.0, "ate.origin": 1.0})
