@@ -45,6 +45,15 @@ class ImuEstimate:
     covariance: Floats = field(repr=False)
     gyro_covariance: Floats = field(repr=False)
 
+    @property
+    def down(self) -> tuple[Floats, float]:
+        """Direction of gravity in the world, (3,) unit, and one sigma of the larger of its two tilts, rad."""
+        norm = float(np.linalg.norm(self.gravity))
+        direction = self.gravity / norm
+        across = np.eye(3) - np.outer(direction, direction)
+        values = np.linalg.eigvalsh(across @ self.covariance[DOWN, DOWN] @ across)
+        return direction, float(np.sqrt(max(values[-1], 0.0))) / norm
+
     def over(self, imu: ImuStream, instants_ns: NDArray[np.int64]) -> Increments:
         """What the IMU felt between increasing instants, biases taken off."""
         return integrate(imu, instants_ns, self.gyro_bias, self.accel_bias)

@@ -13,6 +13,7 @@ from lslam.inertial.estimate import ImuEstimate
 from lslam.inertial.stream import gaps
 from lslam.preprocessing.deskew import KNOTS
 from lslam.registration.motion import ConstantVelocity, middle_of
+from lslam.types.gravity import GravityDirection
 from lslam.types.imu import ImuStream
 from lslam.types.motion_prior import MotionPrior
 
@@ -39,6 +40,7 @@ class InertialMotion:
         self.coasting = ConstantVelocity()
         self.refusal = ""
         self.gap_scans = 0
+        self._has_gap = False
         self._gaps = gaps(imu, config.gap_s)
         self._instant_ns: int | None = None
         self._pose = np.eye(4)
@@ -80,7 +82,8 @@ class InertialMotion:
             return
         middle, instant_ns = (pose, stamp_ns) if prior is None else middle_of(prior, stamp_ns, pose)
         if not self.refusal:
-            if self._instant_ns is not None and not self._covers(self._instant_ns, instant_ns):
+            self._has_gap = self._instant_ns is not None and not self._covers(self._instant_ns, instant_ns)
+            if self._has_gap:
                 self.gap_scans += 1
                 self._restart(instant_ns, middle)
             elif self._instant_ns is not None and instant_ns > self._instant_ns:
@@ -93,6 +96,16 @@ class InertialMotion:
                 self.estimate = self._advanced(stamp_ns, instant_ns)
         self.coasting.correct(stamp_ns, pose, prior)
         self._instant_ns, self._pose = instant_ns, middle.copy()
+
+    def gravity_at(self, pose: Floats) -> GravityDirection | None:
+        """Which way is down for a LiDAR at `pose` (4, 4) in the world, as of the last scan; None where that is not known.
+
+        The filter knows gravity in a world that registration lets drift; a LiDAR that turned with it sees the true one.
+        """
+        if self.refusal or self._has_gap or self._instant_ns is None or self.config.velocity == "integrated":
+            return None
+        direction, sigma = self.estimate.down
+        return GravityDirection(pose[:3, :3].T @ direction, sigma)
 
     def prior_errors(self) -> tuple[float, float] | None:
         """Medians, m, of how wrong the IMU and constant velocity predicted the scans, turns counted at `LEVER_M`."""

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from lslam.errors import InputError
 from lslam.geometry import se3, so3
+from lslam.inertial.fusion import InertialMotion
 from lslam.odometry.base import Deskewing, Odometry
 from lslam.readers.selection import Selection
 from lslam.registration.motion import ConstantVelocity, MotionModel, middle_of
@@ -109,6 +110,8 @@ class Tracker:
         scan = loaded.scan
         span = sweep_seconds(scan)
         prior = expected = self.motion.sweep(loaded.stamp_ns, span)
+        inertial = self.motion if isinstance(self.motion, InertialMotion) else None
+        steady = None if inertial is None else inertial.coasting.predict(loaded.stamp_ns)
         if scan is None:
             result = ScanResult(loaded.index, loaded.stamp_ns, prior.start, "skipped", loaded.error, converged=False)
         elif isinstance(self.odometry, Deskewing):
@@ -118,7 +121,13 @@ class Tracker:
         self.motion.correct(result.stamp_ns, result.T_world_lidar, prior, result.status == "ok")
         pose, instant_ns = middle_of(prior, result.stamp_ns, result.T_world_lidar)
         self.middle = (instant_ns, pose)
-        return replace(result, prior_norm=_matrix_norm(expected.start, result.T_world_lidar))
+        found = result.T_world_lidar
+        return replace(
+            result,
+            prior_norm=_matrix_norm(expected.start, found),
+            steady_norm=None if steady is None else _matrix_norm(steady, found),
+            gravity=inertial.gravity_at(found) if inertial is not None and result.status == "ok" else None,
+        )
 
     def _register(
         self, odometry: Deskewing, scan: Scan, prepared: Any, prior: MotionPrior

@@ -8,6 +8,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.types.gravity import GravityDirection
+
 Status = Literal["ok", "bridged", "skipped"]
 
 
@@ -25,6 +27,8 @@ class ScanResult:
     degenerate : (K, 6) unit twists along which the scan says nothing and the motion prior was kept
     prior_error : (translation m, rotation rad) between motion prior and result
     prior_norm : 2-norm of inv(prior) pose - I, of the prior before the scan was looked at (first thesis, equation 5.1)
+    steady_norm : likewise of constant velocity, which an IMU took the place of; None without an IMU
+    gravity : which way is down, when an IMU says so; None where the scan is bridged or the IMU has a gap
     stages : seconds per stage, by name, in the order they ran
     """
 
@@ -45,4 +49,6 @@ class ScanResult:
     degenerate: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 6)))
     prior_error: tuple[float, float] = (0.0, 0.0)
     prior_norm: float = 0.0
+    steady_norm: float | None = None
+    gravity: GravityDirection | None = None
     stages: dict[str, float] = field(default_factory=dict)

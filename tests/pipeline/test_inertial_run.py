@@ -77,6 +77,11 @@ def test_the_imu_gains_accuracy_and_iterations_on_a_walk() -> None:
     assert iterations[1] < 0.8 * iterations[0]
     norms = [float(np.median([r.prior_norm for r in results[5:]])) for results in (without, with_it)]
     assert norms[1] < 0.5 * norms[0]
+    steady = [r.steady_norm for r in with_it[5:]]
+    assert norms[1] < 0.5 * float(np.median([norm for norm in steady if norm is not None]))
+    assert len(steady) == len([norm for norm in steady if norm is not None])
+    assert all((r.steady_norm, r.gravity) == (None, None) for r in without)
+    assert all(r.gravity is not None for r in with_it)
 
 
 def test_a_method_that_registers_nothing_does_not_pass_for_accurate() -> None:
