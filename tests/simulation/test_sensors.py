@@ -25,7 +25,7 @@ from lslam.simulation.scenarios import SimulatedDrive, simulate
 @pytest.fixture(scope="module")
 def drive() -> SimulatedDrive:
     gnss = GnssModel(5.0, outages=((0.5, 1.0),))
-    return simulate("block", count=25, motion_compensated=False, imu="icm20948", gnss=gnss, static_start=1.0)
+    return simulate("block", count=30, motion_compensated=False, imu="icm20948", gnss=gnss, static_start=1.0)
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +40,7 @@ def test_a_reader_finds_the_streams_and_where_the_sensors_sit(drive: SimulatedDr
     assert sequence.gnss is not None
     assert drive.imu is not None
     assert drive.gnss is not None
-    assert (len(sequence.imu), len(sequence.gnss)) == (251, 13 - 3)
+    assert (len(sequence.imu), len(sequence.gnss)) == (301, 16 - 3)
     for name in ("stamps_ns", "accel", "gyro"):
         np.testing.assert_array_equal(getattr(sequence.imu, name), getattr(drive.imu, name))
     for name in ("stamps_ns", "lat_lon_alt", "sigma"):
@@ -60,8 +60,8 @@ def test_truth_agrees_with_itself_and_with_the_ground_truth(drive: SimulatedDriv
     assert scans.frame == fine.frame == "lidar"
     np.testing.assert_array_equal(scans.stamps_ns, drive.stamps_ns)
     np.testing.assert_allclose(scans.poses, drive.ground_truth.poses, atol=1e-8)
-    np.testing.assert_array_equal(fine.stamps_ns, np.arange(251) * 10_000_000)
-    np.testing.assert_allclose(fine.poses[::10][:25], scans.poses, atol=1e-8)
+    np.testing.assert_array_equal(fine.stamps_ns, np.arange(301) * 10_000_000)
+    np.testing.assert_allclose(fine.poses[::10][:30], scans.poses, atol=1e-8)
     names = [(f"{what}_{axis}",) for what in ("velocity", "rate") for axis in "xyz"]
     stamps, motion = read_stamped_csv(truth / "motion.csv", names)
     np.testing.assert_array_equal(stamps, fine.stamps_ns)
@@ -70,7 +70,7 @@ def test_truth_agrees_with_itself_and_with_the_ground_truth(drive: SimulatedDriv
     turn = so3.log(se3.relative(fine.poses[:-2], fine.poses[2:])[:, :3, :3]) / 0.02
     np.testing.assert_allclose(motion[1:-1, 3:], turn, atol=0.01)
     assert np.linalg.norm(motion[0]) < 1e-6
-    assert np.linalg.norm(motion[-1, :3]) > 0.05
+    assert np.linalg.norm(motion[-1, :3]) > 0.1
 
 
 def test_true_biases_are_those_of_the_readings(drive: SimulatedDrive, folder: Path) -> None:
