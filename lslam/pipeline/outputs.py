@@ -12,6 +12,7 @@ from lslam.config.map import MapConfig
 from lslam.evaluation.evaluate import Evaluation
 from lslam.formats.ply_files import write_ply
 from lslam.formats.point_files import write_points
+from lslam.formats.timing_csv import timing_text
 from lslam.formats.trajectory_files import write_kitti, write_tum
 from lslam.geometry import se3
 from lslam.maps.merge import MergedMap
@@ -64,10 +65,8 @@ def write_trajectories(folder: RunFolder, record: RunRecord, calibration: Calibr
 def write_scans(folder: RunFolder, record: RunRecord) -> None:
     """timing.csv, seconds per stage, and scans.csv, what became of each scan."""
     names, seconds = stage_matrix(record.results)
-    rows = [",".join(["index", "stamp_ns", *names, "total"])]
-    for result, row in zip(record.results, seconds, strict=True):
-        rows.append(",".join([str(result.index), str(result.stamp_ns), *(f"{v:.6f}" for v in (*row, row.sum()))]))
-    folder.write_text("timing.csv", "\n".join(rows) + "\n")
+    indices, stamps = [r.index for r in record.results], [r.stamp_ns for r in record.results]
+    folder.write_text("timing.csv", timing_text(indices, stamps, names, seconds))
     columns = "index,stamp_ns,status,standing,converged,iterations,source_points,inliers,overlap,rmse_m,degenerate"
     rows = [columns + ",prior_m,prior_deg,prior_norm"]
     for r in record.results:

@@ -8,21 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.evaluation.timing import StageTime, summarise
 from lslam.types.run_record import RunRecord
 from lslam.types.scan_result import ScanResult
 
 DIRECTIONS = ("along x", "along y", "along z", "about x", "about y", "about z")
-
-
-@dataclass(frozen=True)
-class StageTime:
-    """Seconds of one stage over all scans; `share` of the sum of all stages."""
-
-    name: str
-    median: float
-    p95: float
-    max: float
-    share: float
 
 
 @dataclass(frozen=True)
@@ -66,7 +56,7 @@ class RunFacts:
     degenerate: tuple[Degeneracy, ...]
     path_length: float
     duration: float
-    stages: tuple[StageTime, ...]
+    stages: dict[str, StageTime]
     total: StageTime | None
     over_limit: int
     real_time_factor: float
@@ -101,8 +91,8 @@ def run_facts(record: RunRecord) -> RunFacts:
         duration=float(record.trajectory.stamps_ns[-1] - record.trajectory.stamps_ns[0]) * 1e-9
         if len(record.trajectory)
         else 0.0,
-        stages=tuple(_stage(name, seconds[:, i], spent) for i, name in enumerate(names)),
-        total=_stage("all stages", totals, spent) if names else None,
+        stages={name: summarise(seconds[:, i], spent) for i, name in enumerate(names)},
+        total=summarise(totals, spent) if names else None,
         over_limit=int((totals > limit).sum()) if limit > 0 else 0,
         real_time_factor=limit * len(results) / spent if spent > 0 and limit > 0 else 0.0,
     )
@@ -147,8 +137,3 @@ def _status(record: RunRecord, failed: bool) -> tuple[str, tuple[str, ...]]:
 def _path_length(record: RunRecord) -> float:
     steps = np.linalg.norm(np.diff(record.trajectory.positions, axis=0), axis=1)
     return float(steps[np.isfinite(steps)].sum())
-
-
-def _stage(name: str, seconds: NDArray[np.float64], spent: float) -> StageTime:
-    median, p95 = (float(v) for v in np.percentile(seconds, [50, 95]))
-    return StageTime(name, median, p95, float(seconds.max()), float(seconds.sum()) / spent if spent > 0 else 0.0)

@@ -205,9 +205,9 @@ def share_bar(facts: RunFacts) -> str:
     """Shares of the stages as one horizontal bar."""
     frame = svg.Frame((0, 1), (0, 1), 480, 34)
     x = 0.0
-    for i, stage in enumerate(facts.stages):
+    for i, (stage_name, stage) in enumerate(facts.stages.items()):
         width = 480 * stage.share
-        name = escape(f"{stage.name}: {100 * stage.share:.1f} %")
+        name = escape(f"{stage_name}: {100 * stage.share:.1f} %")
         frame.add(
             f'<rect class="area s{i % 6 + 1}" x="{x:.1f}" y="2" width="{width:.1f}" height="30"><title>{name}</title></rect>'
         )

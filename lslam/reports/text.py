@@ -117,7 +117,7 @@ def _time_rows(record: RunRecord, facts: RunFacts) -> list[tuple[str, str]]:
         (
             "time",
             f"{1e3 * total.median:.1f} ms per scan (median), p95 {1e3 * total.p95:.1f}, max {1e3 * total.max:.1f}: "
-            + ", ".join(f"{s.name} {1e3 * s.median:.1f}" for s in facts.stages),
+            + ", ".join(f"{name} {1e3 * stage.median:.1f}" for name, stage in facts.stages.items()),
         )
     ]
     if facts.real_time_factor:
