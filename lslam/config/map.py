@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Literal
 
 from pydantic import Field, model_validator
@@ -20,8 +21,32 @@ class MapConfig(Section):
     format: Literal["ply", "pcd"] = Field("ply", description="file format")
     range_min: float = Field(2.0, ge=0, description="m; nearer points are left out")
     range_max: float = Field(80.0, gt=0, description="m; farther points are left out")
+    ego_box: tuple[float, float, float, float, float, float] | None = Field(
+        None,
+        description="x_min, x_max, y_min, y_max, z_min, z_max in the LiDAR frame, m: points inside are left out; "
+        "`preprocess.ego_box` where absent",
+    )
+    crop: tuple[float, ...] | None = Field(
+        None,
+        description="x_min, x_max, y_min, y_max and perhaps z_min, z_max of the world, m: points outside are left out",
+    )
 
     @model_validator(mode="after")
     def _check(self) -> MapConfig:
         self.require_order("range_min", "range_max")
+        require_box("ego_box", self.ego_box)
+        if self.crop is not None and len(self.crop) not in (4, 6):
+            raise ValueError(f"crop = {list(self.crop)} must be x_min, x_max, y_min, y_max and perhaps z_min, z_max")
+        require_box("crop", self.crop)
         return self
+
+    @property
+    def crop_box(self) -> tuple[float, ...] | None:
+        """`crop` with heights, whatever was given."""
+        return self.crop if self.crop is None or len(self.crop) == 6 else (*self.crop, -math.inf, math.inf)
+
+
+def require_box(name: str, box: tuple[float, ...] | None) -> None:
+    """Raise ValueError unless every minimum of a box lies below its maximum."""
+    if box is not None and not all(low < high for low, high in zip(box[::2], box[1::2], strict=True)):
+        raise ValueError(f"{name} = {list(box)} must be pairs of a smaller and a larger number")

@@ -1,7 +1,8 @@
 """Voxel averages of transformed scans: an open-addressing hash of packed voxel indices over rows of integer sums.
 
-A row is (key, sum x, sum y, sum z, count), int64. The sums are offsets from the voxel's centre in units of
-voxel / 2**24, so they are exact whatever the coordinates, and equal for any order of the points.
+A row is (key, sum x, sum y, sum z, count) and perhaps (sum of intensities), int64. The sums are offsets from the voxel's
+centre in units of voxel / 2**24, and intensities in units of 2**-20, so they are exact whatever the coordinates and equal
+for any order of the points; rows of one voxel that were summed apart are simply added.
 """
 
 from __future__ import annotations
@@ -15,6 +16,8 @@ from lslam.kernels.jit import inline, kernel
 
 AXIS_BITS = 21
 UNITS = float(2**24)  # 2**39 points fit into one voxel's sum
+INTENSITY_UNITS = float(2**20)
+_BRIGHTEST = float(2**24)  # of such points a voxel's sum holds 2**19
 _HALF = 1 << (AXIS_BITS - 1)
 _MIX = -7046029254386353131  # 0x9E3779B97F4A7C15 as int64: Fibonacci hashing
 
@@ -33,18 +36,19 @@ def accumulate(
     range_min: float,
     range_max: float,
     voxel: float,
+    crop: NDArray[np.float64],
     origin: NDArray[np.int64],
     slots: NDArray[np.int32],
     rows: NDArray[np.int64],
-    intensity_sums: NDArray[np.float64],
     used: int,
 ) -> tuple[int, int, int]:
     """Add one scan's points to the voxel sums.
 
     points : (N, 3) sensor frame, m; intensity : (N,) or (0,); T : (4, 4) world from sensor
+    crop : (6,) x_min, x_max, y_min, y_max, z_min, z_max of the world, m: points outside count as gated
     origin : (3,) voxel index in the middle of the key range, which reaches 2**20 voxels to each side
     slots : (S,) row of each hash slot or -1, S a power of two above used + N
-    rows : (R, 5) with R >= used + N; intensity_sums : (R,) or (0,), written when `intensity` is given
+    rows : (R, 5), or (R, 6) when `intensity` is given, with R >= used + N
 
     Returns the rows used now, the points refused by the range gate (NaN, Inf and zero points included) and the points
     outside the key range.
@@ -63,9 +67,13 @@ def accumulate(
         if not (r2 >= near and r2 <= far and r2 > 0.0):
             gated += 1
             continue
-        x = (T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz + T[0, 3]) * inverse
-        y = (T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3]) * inverse
-        z = (T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz + T[2, 3]) * inverse
+        x = T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz + T[0, 3]
+        y = T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3]
+        z = T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz + T[2, 3]
+        if x < crop[0] or x > crop[1] or y < crop[2] or y > crop[3] or z < crop[4] or z > crop[5]:
+            gated += 1
+            continue
+        x, y, z = x * inverse, y * inverse, z * inverse
         fx, fy, fz = np.floor(x), np.floor(y), np.floor(z)
         ix = np.int64(fx) - origin[0] + _HALF
         iy = np.int64(fy) - origin[1] + _HALF
@@ -87,15 +95,15 @@ def accumulate(
                 slots[slot] = row
                 rows[row, 0] = key
                 rows[row, 1:] = 0
-                if with_intensity:
-                    intensity_sums[row] = 0.0
             last_key = key
         rows[row, 1] += np.int64(np.rint((x - fx - 0.5) * UNITS))
         rows[row, 2] += np.int64(np.rint((y - fy - 0.5) * UNITS))
         rows[row, 3] += np.int64(np.rint((z - fz - 0.5) * UNITS))
         rows[row, 4] += 1
         if with_intensity and np.isfinite(intensity[i]):
-            intensity_sums[row] += np.float64(intensity[i])
+            rows[row, 5] += np.int64(
+                np.rint(min(max(np.float64(intensity[i]), -_BRIGHTEST), _BRIGHTEST) * INTENSITY_UNITS)
+            )
     return used, gated, outside
 
 
@@ -111,7 +119,7 @@ def rebuild(slots: NDArray[np.int32], rows: NDArray[np.int64], used: int) -> Non
 
 
 def unpack(rows: NDArray[np.int64], origin: NDArray[np.int64], voxel: float) -> NDArray[Any]:
-    """(M, 3) float64 mean positions, m, of finished rows (M, 5)."""
+    """(M, 3) float64 mean positions, m, of finished rows (M, 5 or 6)."""
     axis_mask = (1 << AXIS_BITS) - 1
     points = np.empty((len(rows), 3))
     for axis in range(3):

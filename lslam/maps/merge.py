@@ -1,58 +1,105 @@
-"""The merged map: one averaged point per voxel, streamed scan by scan."""
+"""The merged map: one averaged point per voxel, streamed scan by scan, out of core when it grows large."""
 
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
+from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lslam.errors import ConfigError, InputError
+from lslam.maps.sorted_runs import SortedRuns, StoredRows
+from lslam.types.cloud import BLOCK, CloudBlock, in_memory
 
 log = logging.getLogger("lslam")
 
 _START_ROWS = 1 << 17
+_MOST_ROWS = 4_000_000  # some 250 MB with the slots; what is more goes to disk
 _NO_INTENSITY = np.zeros(0, np.float32)
-_NO_SUMS = np.zeros(0)
+_EVERYWHERE = np.array([-np.inf, np.inf] * 3)
 
 
-@dataclass(frozen=True)
 class MergedMap:
-    """Averaged points in the world frame, sorted by voxel (x, then y, then z).
+    """Averaged points in the world frame, sorted by voxel (x, then y, then z); satisfies `Cloud`.
 
+    Large ones lie in a temporary folder that goes when the map does, and are read in blocks; the arrays below read all.
+
+    Attributes
+    ----------
     points : (M, 3) float64, m; intensity : (M,) float32 mean of the voxel's points, or None; counts : (M,) int64 points
-    averaged
+        averaged
     """
 
-    points: NDArray[np.float64]
-    intensity: NDArray[np.float32] | None
-    counts: NDArray[np.int64]
+    def __init__(
+        self, rows: NDArray[np.int64] | StoredRows, origin: NDArray[np.int64], voxel: float, has_intensity: bool
+    ) -> None:
+        self._rows, self._origin, self.voxel = rows, origin, voxel
+        self._has_intensity = has_intensity
 
     def __len__(self) -> int:
-        return len(self.points)
+        return len(self._rows)
+
+    @property
+    def has_intensity(self) -> bool:
+        """Whether every scan had intensities."""
+        return self._has_intensity
+
+    @property
+    def points(self) -> NDArray[np.float64]:
+        """All points, (M, 3)."""
+        return in_memory(self).points
+
+    @property
+    def intensity(self) -> NDArray[np.float32] | None:
+        """All intensities, (M,), or None."""
+        return in_memory(self).intensity
+
+    @property
+    def counts(self) -> NDArray[np.int64]:
+        """How many points were averaged, (M,)."""
+        return np.concatenate([rows[:, 4] for rows in self._pieces()] or [np.zeros(0, np.int64)])
+
+    def blocks(self) -> Iterator[CloudBlock]:
+        """The points, `BLOCK` at a time."""
+        from lslam.kernels.voxel_average import INTENSITY_UNITS, unpack
+
+        for rows in self._pieces():
+            intensity = (
+                (rows[:, 5] / (rows[:, 4] * INTENSITY_UNITS)).astype(np.float32) if self._has_intensity else None
+            )
+            yield CloudBlock(unpack(rows, self._origin, self.voxel), intensity)
+
+    def _pieces(self) -> Iterator[NDArray[np.int64]]:
+        for start in range(0, len(self), BLOCK):
+            stop = min(start + BLOCK, len(self))
+            yield self._rows.read(start, stop) if isinstance(self._rows, StoredRows) else self._rows[start:stop]
 
 
 class MapMerger:
-    """Averages scans into voxels, in about 50 bytes per voxel and independent of the order of points and scans.
+    """Averages scans into voxels, in about 60 bytes per voxel and independent of the order of points and scans.
 
     The sums are kept relative to each voxel's centre, so coordinates far from the origin lose nothing; the voxels reach
-    2**20 voxels (210 km at 0.2 m) from the first scan in every direction.
+    2**20 voxels (210 km at 0.2 m) from the first scan in every direction. Beyond `most` voxels in memory they go to a file
+    sorted, and `result` adds up what belongs to one voxel: sums are exact, so the map is the same bytes either way.
 
     Parameters
     ----------
     voxel : edge of a voxel, m
     range_min, range_max : m from the sensor; points outside, and NaN, Inf and zero points, are left out
+    crop : x_min, x_max, y_min, y_max, z_min, z_max of the world, m; points outside are left out
+    spool : folder beside which large maps are kept meanwhile; None: the system's temporary one
 
     Attributes
     ----------
-    scans : scans added; gated : points left out by range or for being no measurement; outside : points too far
+    scans : scans added; gated : points left out by range, crop or for being no measurement; outside : points too far
         from the first scan to have a voxel; refused : scans left out because their pose is not finite
 
     Raises
     ------
-    ConfigError : a voxel or range that makes no sense
+    ConfigError : a voxel or range that makes no sense. OutputError : the spool cannot be written
 
     Examples
     --------
@@ -62,7 +109,10 @@ class MapMerger:
     [[0.5, 0.5, 0.5], [5.0, 0.5, 0.5]]
     """
 
-    def __init__(self, voxel: float = 0.2, range_min: float = 2.0, range_max: float = 80.0) -> None:
+    def __init__(
+        self, voxel: float = 0.2, range_min: float = 2.0, range_max: float = 80.0, *,
+        crop: Any = None, spool: Path | None = None, most: int = _MOST_ROWS,
+    ) -> None:  # fmt: skip
         if not (np.isfinite(voxel) and voxel > 0):
             raise ConfigError(f"map.voxel = {voxel}: the voxel must be a positive number of metres, for example 0.2")
         if not 0 <= range_min < range_max:
@@ -75,13 +125,12 @@ class MapMerger:
         self._origin: NDArray[np.int64] | None = None
         self._rows = np.empty((_START_ROWS, 5), np.int64)
         self._slots = np.full(2 * _START_ROWS, -1, np.int32)
-        self._intensity = _NO_SUMS
+        self._crop = _EVERYWHERE if crop is None else np.asarray(crop, np.float64).reshape(6)
+        self._spool, self._most = spool, most
+        self._runs: SortedRuns | None = None
         self._with_intensity: bool | None = None
         self._used = 0
         self.scans = self.gated = self.outside = self.refused = 0
-
-    def __len__(self) -> int:
-        return self._used
 
     def add(
         self, points: NDArray[Any], T_world_lidar: NDArray[np.float64], intensity: NDArray[Any] | None = None
@@ -109,48 +158,55 @@ class MapMerger:
             self.scans += 1
             return
         self._settle_intensity(intensity is not None)
+        if self._used + len(cloud) > self._most and self._used:
+            self._spill()
         self._reserve(self._used + len(cloud))
         self._used, gated, outside = accumulate(
-            cloud,
-            values if self._with_intensity else _NO_INTENSITY,
-            T,
-            self._range_min,
-            self._range_max,
-            self._voxel,
-            self._origin,
-            self._slots,
-            self._rows,
-            self._intensity,
-            self._used,
-        )
+            cloud, values if self._with_intensity else _NO_INTENSITY, T, self._range_min, self._range_max, self._voxel,
+            self._crop, self._origin, self._slots, self._rows, self._used,
+        )  # fmt: skip
         self.scans += 1
         self.gated += int(gated)
         self.outside += int(outside)
 
     def result(self) -> MergedMap:
-        """The map so far, sorted by voxel: the same scans give the same bytes."""
-        from lslam.kernels.voxel_average import unpack
-
+        """The map of all scans, sorted by voxel: the same scans give the same bytes. The merger is empty then."""
         if self.outside:
             log.warning(
                 "merged map: %d points lie more than %.0f km from the first scan and are left out",
                 self.outside,
                 self._voxel * 2**20 / 1000,
             )
-        order = np.argsort(self._rows[: self._used, 0])
-        rows = self._rows[order]
         origin = np.zeros(3, np.int64) if self._origin is None else self._origin
-        counts = np.ascontiguousarray(rows[:, 4])
-        intensity = (self._intensity[order] / counts).astype(np.float32) if self._with_intensity else None
-        return MergedMap(unpack(rows, origin, self._voxel), intensity, counts)
+        rows: NDArray[np.int64] | StoredRows
+        if self._runs is None:
+            rows = self._take()
+        else:
+            self._spill()
+            rows = self._runs.combined(_add_up)
+            self._runs = None
+        return MergedMap(rows, origin, self._voxel, bool(self._with_intensity))
+
+    def _take(self) -> NDArray[np.int64]:
+        """The rows in memory, sorted; none are left."""
+        rows = self._rows[: self._used]
+        rows = rows[np.argsort(rows[:, 0])]
+        self._rows, self._used = np.empty((_START_ROWS, self._rows.shape[1]), np.int64), 0
+        self._slots = np.full(2 * _START_ROWS, -1, np.int32)
+        return rows
+
+    def _spill(self) -> None:
+        if self._runs is None:
+            self._runs = SortedRuns(self._spool)
+        self._runs.add(self._take())
 
     def _settle_intensity(self, given: bool) -> None:
         if self._with_intensity is None:
             self._with_intensity = given
-            self._intensity = np.zeros(len(self._rows)) if given else _NO_SUMS
+            self._rows = np.empty((len(self._rows), 6 if given else 5), np.int64)
         elif self._with_intensity and not given:
             log.warning("merged map: a scan has no intensity, so the map has none")
-            self._with_intensity, self._intensity = False, _NO_SUMS
+            self._with_intensity, self._rows = False, np.ascontiguousarray(self._rows[:, :5])
 
     def _reserve(self, rows: int) -> None:
         """Room for `rows` rows; the slots stay at most two thirds full."""
@@ -158,13 +214,19 @@ class MapMerger:
 
         if rows > len(self._rows):
             more = max(rows, len(self._rows) * 3 // 2) - len(self._rows)
-            self._rows = np.concatenate([self._rows, np.empty((more, 5), np.int64)])
-            if self._with_intensity:
-                self._intensity = np.concatenate([self._intensity, np.zeros(more)])
+            self._rows = np.concatenate([self._rows, np.empty((more, self._rows.shape[1]), np.int64)])
         if rows * 3 > len(self._slots) * 2:
             size = 1 << int(np.ceil(np.log2(rows * 2)))
             self._slots = np.full(size, -1, np.int32)
             rebuild(self._slots, self._rows, self._used)
+
+
+def _add_up(rows: NDArray[np.int64]) -> NDArray[np.int64]:
+    """One row per key of sorted rows: the sums added."""
+    first = np.flatnonzero(np.diff(rows[:, 0], prepend=rows[0, 0] - 1))
+    summed = np.add.reduceat(rows, first, axis=0)
+    summed[:, 0] = rows[first, 0]
+    return summed
 
 
 def warm_up() -> None:

@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-Extent = tuple[float, float, float, float]
+from lslam.types.cloud import ArrayCloud, Cloud
 
-_CHUNK = 1_000_000
+Extent = tuple[float, float, float, float]
 
 
 def top_view(
-    points: NDArray[Any], pixel: float = 0.2, longest: int = 1600, trim: float = 0.001
+    cloud: Cloud | NDArray[Any], pixel: float = 0.2, longest: int = 1600, trim: float = 0.001
 ) -> tuple[NDArray[np.float32], Extent]:
     """Density image of a map: how many of its points lie in each column.
 
@@ -21,7 +21,7 @@ def top_view(
 
     Parameters
     ----------
-    points : (M, 3) world frame, m; rows that are not finite are ignored
+    cloud : points in the world frame, m, or an array (M, 3) of them; those that are not finite are ignored
     pixel : smallest edge of a pixel, m, not under the map's voxel (empty lines would appear); larger when the long side
         would exceed `longest` pixels
     trim : share of points that may fall off each side, so that a few far points do not shrink the rest
@@ -31,16 +31,16 @@ def top_view(
     image : (H, W) float32 points per pixel, row 0 at the largest y; (1, 1) zero without points
     extent : x_min, x_max, y_min, y_max of the image's edges, m
     """
-    xy = np.asarray(points)[:, :2]
-    low, high = _bounds(xy, trim)
+    cloud = ArrayCloud.of(cloud) if isinstance(cloud, np.ndarray) else cloud
+    low, high = _bounds(cloud, trim)
     if not np.all(np.isfinite([*low, *high])):
         return np.zeros((1, 1), np.float32), (0.0, 1.0, 0.0, 1.0)
     # One pixel to spare, because the upper edge belongs to the last pixel.
     size = max(pixel, float(np.max(high - low)) / max(longest - 1, 1))
     width, height = (int(n) + 1 for n in (high - low) / size)
     counts = np.zeros(width * height, np.int64)
-    for start in range(0, len(xy), _CHUNK):
-        part = np.asarray(xy[start : start + _CHUNK], np.float64)
+    for block in cloud.blocks():
+        part = block.points[:, :2]
         part = part[np.isfinite(part).all(1)]
         cell = np.floor((part - low) / size)
         inside = (cell[:, 0] >= 0) & (cell[:, 1] >= 0) & (cell[:, 0] < width) & (cell[:, 1] < height)
@@ -50,9 +50,14 @@ def top_view(
     return counts.reshape(height, width).astype(np.float32), extent
 
 
-def _bounds(xy: NDArray[Any], trim: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _bounds(cloud: Cloud, trim: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Quantiles of a regular sample of some 100,000 points: cheap, deterministic, blind to stray points."""
-    sample = np.asarray(xy[:: max(1, len(xy) // 100_000)], np.float64)
+    step, seen = max(1, len(cloud) // 100_000), 0
+    parts = [np.zeros((0, 2))]
+    for block in cloud.blocks():
+        parts.append(block.points[-seen % step :: step, :2])
+        seen += len(block)
+    sample = np.concatenate(parts)
     sample = sample[np.isfinite(sample).all(1)]
     if not len(sample):
         return np.full(2, np.nan), np.full(2, np.nan)

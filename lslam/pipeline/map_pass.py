@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,26 +32,39 @@ class BuiltMap:
 
 def build_map(
     sequence: Sequence, results: list[ScanResult], config: Config, on_step: Callable[[], None],
-    should_stop: Callable[[], bool],
+    should_stop: Callable[[], bool], spool: Path | None = None,
 ) -> BuiltMap | None:  # fmt: skip
     """Merge every scan that was registered; bridged scans would draw their error into the map and stay out.
 
-    None when `should_stop` said so before the last scan.
+    A map too large for memory is kept in a temporary folder in `spool` meanwhile. None when `should_stop` said so before
+    the last scan.
     """
-    merger = MapMerger(config.map.voxel, config.map.range_min, config.map.range_max)
+    section = config.map
+    merger = MapMerger(section.voxel, section.range_min, section.range_max, crop=section.crop_box, spool=spool)
+    ego_box = section.ego_box or config.preprocess.ego_box
     stamps = np.array([r.stamp_ns for r in results], np.int64)
     poses = np.stack([r.T_world_lidar for r in results])
     for loaded, result in zip(read_ahead(sequence, None, config.input.threads), results, strict=False):
         if should_stop():
             return None
         if loaded.scan is not None and result.status == "ok":
-            scan = loaded.scan
+            scan = loaded.scan if ego_box is None else without_box(loaded.scan, ego_box)
             motion = motion_within(scan, stamps, poses)
             merger.add(deskew_points(scan.points, scan.times, motion), result.T_world_lidar, scan.intensity)
         on_step()
     merged = merger.result()
-    image, extent = top_view(merged.points, pixel=max(0.2, config.map.voxel))
+    image, extent = top_view(merged, pixel=max(0.2, config.map.voxel))
     return BuiltMap(merged, image, extent)
+
+
+def without_box(scan: Scan, box: tuple[float, ...]) -> Scan:
+    """The scan without what lies in a box of the LiDAR frame (x_min, x_max, y_min, y_max, z_min, z_max), m.
+
+    To be done before deskewing: what rides along does not move against the sensor.
+    """
+    low, high = np.array(box[::2], np.float32), np.array(box[1::2], np.float32)
+    inside = np.all((scan.points >= low) & (scan.points <= high), axis=1)
+    return scan.select(np.flatnonzero(~inside))
 
 
 def motion_within(scan: Scan, stamps_ns: NDArray[np.int64], poses: NDArray[np.float64]) -> MotionPrior:

@@ -215,7 +215,7 @@ def _map(
         return
     watch.on_start("map", len(record.results))
     with manifest.timed("map_s"):
-        built = build_map(sequence, record.results, config, watch.on_step, watch.should_stop)
+        built = build_map(sequence, record.results, config, watch.on_step, watch.should_stop, folder.path)
         if built is None:
             manifest.interrupt("interrupted while the map was built: there is no map")
             return

@@ -107,6 +107,8 @@ class RunFolder:
         for name in OURS:
             (self.path / name).unlink(missing_ok=True)
             (self.path / f"{name}.part").unlink(missing_ok=True)
+        for folder in self.path.glob(".lslam-map-*"):  # of a run that was killed
+            shutil.rmtree(folder, ignore_errors=True)
 
 
 class _LogFile(logging.FileHandler):

@@ -52,7 +52,7 @@ def test_result_equals_numpy() -> None:
     assert np.array_equal(result.counts, counts)
     np.testing.assert_allclose(result.points, points, atol=1e-6)
     assert result.intensity is not None
-    np.testing.assert_allclose(result.intensity, intensity, rtol=1e-5)
+    np.testing.assert_allclose(result.intensity, intensity, rtol=1e-6, atol=1e-6)
 
 
 def test_order_of_points_and_scans_does_not_matter() -> None:
@@ -124,7 +124,7 @@ def test_a_pose_that_is_no_pose_is_refused(bad: float) -> None:
     T = np.eye(4)
     T[0, 3] = bad
     merger.add(np.array([[5, 5, 5]], np.float32), T)
-    assert (merger.refused, merger.scans, len(merger)) == (1, 0, 0)
+    assert (merger.refused, merger.scans, len(merger.result())) == (1, 0, 0)
 
 
 def test_intensity_missing_once_is_missing_in_the_map() -> None:

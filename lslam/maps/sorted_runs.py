@@ -1,0 +1,126 @@
+"""Tables of int64 rows that outgrow memory: sorted runs on disk, brought together key range by key range."""
+
+from __future__ import annotations
+
+import tempfile
+from bisect import bisect_left
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.errors import OutputError
+
+Rows = NDArray[np.int64]
+Combine = Callable[[Rows], Rows]
+
+# Rows brought together at a time, about: 50 MB of them.
+PART = 1 << 20
+_SAMPLE = 4096
+
+
+class SortedRuns:
+    """Runs of rows (n, k), int64, each sorted by its first column, in files of a temporary folder.
+
+    Parameters
+    ----------
+    beside : the folder the temporary one is made in; None: the system's
+
+    Raises
+    ------
+    OutputError : the folder or a file in it cannot be written
+    """
+
+    def __init__(self, beside: Path | None = None) -> None:
+        try:
+            # Its finaliser removes it when nobody needs the rows any more.
+            self._folder = tempfile.TemporaryDirectory(prefix=".lslam-map-", dir=beside, ignore_cleanup_errors=True)
+        except OSError as error:
+            raise OutputError(f"{beside or tempfile.gettempdir()} cannot be written: {error.strerror}") from None
+        self._runs: list[StoredRows] = []
+
+    def __len__(self) -> int:
+        return len(self._runs)
+
+    def add(self, rows: Rows) -> None:
+        """Store one more run."""
+        stored = StoredRows(Path(self._folder.name) / f"run-{len(self._runs)}", rows.shape[1], self._folder)
+        stored.append(rows)
+        self._runs.append(stored)
+
+    def combined(self, combine: Combine) -> StoredRows:
+        """All runs as one table, sorted by key; the runs themselves are gone then.
+
+        combine : given rows sorted by key, those of one key in the order of the runs, gives one row per key
+        """
+        columns = min(run.columns for run in self._runs)
+        whole = StoredRows(Path(self._folder.name) / "all", columns, self._folder)
+        cuts = self._cuts()
+        begins = [0] * len(self._runs)
+        for cut in [*cuts, None]:
+            parts = []
+            for k, run in enumerate(self._runs):
+                end = len(run) if cut is None else run.first_not_below(cut)
+                parts.append(run.read(begins[k], end)[:, :columns])
+                begins[k] = end
+            rows = np.concatenate(parts)
+            if len(rows):
+                whole.append(combine(rows[np.argsort(rows[:, 0], kind="stable")]))
+        for run in self._runs:
+            run.remove()
+        self._runs = []
+        return whole
+
+    def _cuts(self) -> list[int]:
+        """Keys that divide all rows into parts of about `PART`, from every 4096th key of each run."""
+        keys = np.sort(np.concatenate([run.keys[::_SAMPLE] for run in self._runs]))
+        step = max(PART // _SAMPLE, 1)
+        return [int(key) for key in np.unique(keys[step::step])]
+
+
+class StoredRows:
+    """Rows in a file, with their keys in a second one for searching."""
+
+    def __init__(self, path: Path, columns: int, owner: object) -> None:
+        self.columns = columns
+        self._path, self._count = path, 0
+        self._owner = owner  # the folder stays for as long as somebody reads from it
+
+    def __len__(self) -> int:
+        return self._count
+
+    @property
+    def keys(self) -> NDArray[np.int64]:
+        """(n,) first column, mapped from the file."""
+        return np.memmap(self._path.with_suffix(".keys"), np.int64, "r") if self._count else np.zeros(0, np.int64)
+
+    def append(self, rows: Rows) -> None:
+        """Write rows behind those that are there."""
+        try:
+            with self._path.open("ab") as stream, self._path.with_suffix(".keys").open("ab") as keys:
+                stream.write(np.ascontiguousarray(rows).data)
+                keys.write(np.ascontiguousarray(rows[:, 0]).data)
+        except OSError as error:
+            raise OutputError(f"{self._path} cannot be written: {error.strerror or error}") from None
+        self._count += len(rows)
+
+    def read(self, begin: int, end: int) -> Rows:
+        """Rows from `begin` to before `end`."""
+        try:
+            flat = np.fromfile(
+                self._path, np.int64, max(end - begin, 0) * self.columns, offset=8 * self.columns * begin
+            )
+        except OSError as error:
+            raise OutputError(f"{self._path} cannot be read back: {error.strerror or error}") from None
+        return flat.reshape(-1, self.columns)
+
+    def first_not_below(self, key: int) -> int:
+        """Number of rows with a smaller key."""
+        return bisect_left(self.keys, key)
+
+    def remove(self) -> None:
+        """Delete the files."""
+        for path in (self._path, self._path.with_suffix(".keys")):
+            path.unlink(missing_ok=True)
+        self._count = 0
