@@ -109,7 +109,8 @@ def worker(path: Path, truth_file: str, method: str) -> None:
     sequence = open_sequence(path)
     given = read_trajectory(Path(truth_file)) if truth_file else sequence.ground_truth
     assert given is not None
-    truth = se3.relative(given.poses[0], given.poses)
+    truth = given.poses[_nearest(given.stamps_ns, sequence)]
+    truth = se3.relative(truth[0], truth)
     row: dict[str, Any] = {"method": method, "n": len(sequence)}
     if method in BESIDE:
         scans = Kept(sequence)
@@ -118,7 +119,8 @@ def worker(path: Path, truth_file: str, method: str) -> None:
     else:
         poses, seconds, facts = of_ours(sequence, method)
         row |= facts
-    matched = se3.relative(truth[0], truth)[_indices(given.stamps_ns, sequence, method)][: len(poses)]
+    step = configured(method).input.skip_frames if method not in BESIDE else 1
+    matched = truth[::step][: len(poses)]
     row |= scores(poses, matched) | {
         "ms": 1e3 * float(np.median(seconds)),
         "p95": 1e3 * float(np.percentile(seconds, 95)),
@@ -128,10 +130,11 @@ def worker(path: Path, truth_file: str, method: str) -> None:
     print(json.dumps(row))
 
 
-def _indices(stamps_ns: NDArray[np.int64], sequence: Sequence, method: str) -> NDArray[np.int64]:
-    """Of the true pose of each scan that the method uses."""
-    step = configured(method).input.skip_frames if method not in BESIDE else 1
-    used = sequence.stamps_ns[::step]
+def _nearest(stamps_ns: NDArray[np.int64], sequence: Sequence) -> NDArray[np.int64]:
+    """Index of the true pose of each scan."""
+    if len(stamps_ns) == len(sequence):
+        return np.arange(len(sequence))  # a reference counts from its own start
+    used = sequence.stamps_ns
     after = np.clip(np.searchsorted(stamps_ns, used), 1, len(stamps_ns) - 1)
     return np.where(used - stamps_ns[after - 1] < stamps_ns[after] - used, after - 1, after)
 
@@ -167,12 +170,13 @@ def of_ours(sequence: Sequence, method: str) -> tuple[NDArray[np.float64], NDArr
 def scores(poses: NDArray[np.float64], truth: NDArray[np.float64]) -> dict[str, float]:
     """Errors in m and deg; `thesis_rmse` after equation 2.14 of the first thesis."""
     e = poses[:, :3, 3] - truth[:, :3, 3]
-    straight = np.linalg.svd(truth[:, :3, 3] - truth[:, :3, 3].mean(0), compute_uv=False)[1] < 0.5 * np.sqrt(len(truth))
+    spread = np.linalg.svd(truth[:, :3, 3] - truth[:, :3, 3].mean(0), compute_uv=False)
     origin = float(np.sqrt(np.mean(np.sum(e**2, axis=1))))
     along = float(np.linalg.norm(np.diff(truth[:, :3, 3], axis=0), axis=1).sum())
     return {
         # About a straight line the alignment may roll as it likes.
-        "ate": origin if straight else ate(poses, truth), "origin": origin, "rot_rpe": rotation_rpe(poses, truth),
+        "ate": origin if spread[1] < 0.01 * spread[0] else ate(poses, truth), "origin": origin,
+        "rot_rpe": rotation_rpe(poses, truth),
         "thesis_rmse": float(np.sqrt(np.mean(e**2))), "length": along, "first": float(np.linalg.norm(e[1])),
     }  # fmt: skip
 
