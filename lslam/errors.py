@@ -22,6 +22,12 @@ class RunFailedError(LslamError):
     exit_code = 1
 
 
+class GraphError(LslamError):
+    """A pose graph that cannot be optimised: in pieces, singular, or not finite."""
+
+    exit_code = 1
+
+
 class UsageError(LslamError):
     """Wrong arguments, names or combinations."""
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from lslam.config.eval import EvalConfig
+from lslam.config.gnss import GnssConfig
+from lslam.config.graph import GraphConfig
 from lslam.config.imu import ImuConfig
 from lslam.config.input import InputConfig
 from lslam.config.keyframes import KeyframesConfig
@@ -25,6 +27,8 @@ class Config(Section):
     loam: LoamConfig = LoamConfig()
     imu: ImuConfig = ImuConfig()
     keyframes: KeyframesConfig = KeyframesConfig()
+    graph: GraphConfig = GraphConfig()
+    gnss: GnssConfig = GnssConfig()
     map: MapConfig = MapConfig()
     eval: EvalConfig = EvalConfig()
     report: ReportConfig = ReportConfig()

@@ -1,0 +1,103 @@
+"""A pose graph and its solution as plain values; nothing here knows gtsam."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.types.constraint import Constraint
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class PositionFix:
+    """A position that was measured: `keyframe`'s point `arm` (3,), m, in its own axes, lies at `position` (3,), m.
+
+    sigma : (3,) m; the arm is the antenna at the instant of the fix, as seen from the keyframe by odometry
+    """
+
+    keyframe: int
+    position: Floats
+    sigma: Floats
+    arm: Floats
+
+
+@dataclass(frozen=True)
+class UpDirection:
+    """Which way is up (3,), unit, in the axes of `keyframe`; sigma : rad."""
+
+    keyframe: int
+    up: Floats
+    sigma: float
+
+
+@dataclass(frozen=True)
+class Turn:
+    """Rotation R_a_b (3, 3) between keyframes, as a gyroscope measured it; sigma : rad."""
+
+    a: int
+    b: int
+    R_a_b: Floats
+    sigma: float
+
+
+@dataclass(frozen=True)
+class FloorPlane:
+    """The floor seen from `keyframe`: normal . p + offset = 0 in its axes, normal (3,) up; sigmas : rad, m."""
+
+    keyframe: int
+    normal: Floats
+    offset: float
+    sigma_rad: float
+    sigma_m: float
+
+
+@dataclass(frozen=True)
+class PoseGraph:
+    """Everything known of K keyframes.
+
+    poses : (K, 4, 4) where they are now
+    distances : (K,) m travelled up to each, for what odometry may have drifted
+    world_up : (3,) unit, up in the world of `poses`, needed where there are `ups`
+    is_anchored : whether the first pose is held where it is; else the fixes hold the graph
+    """
+
+    poses: Floats
+    odometry: Sequence[Constraint]
+    loops: Sequence[Constraint] = ()
+    fixes: Sequence[PositionFix] = ()
+    ups: Sequence[UpDirection] = ()
+    turns: Sequence[Turn] = ()
+    floors: Sequence[FloorPlane] = ()
+    distances: Floats = field(default_factory=lambda: np.zeros(0))
+    world_up: Floats = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
+    is_anchored: bool = True
+
+    def __len__(self) -> int:
+        return len(self.poses)
+
+
+@dataclass(frozen=True)
+class Solution:
+    """Optimised keyframes.
+
+    poses : (K, 4, 4); covariances : (K, 6, 6) marginal, of t' = t + d[:3], R' = exp(d[3:]) R in world axes, m2 and rad2
+    loop_reasons : per loop of the graph, empty when it was believed, else why not
+    loop_stages : per loop, what decided: `consistency` or `graph`
+    fix_believed : (F,) bool per fix
+    odometry_scale : the factor odometry's covariances were too small by, 1 when loops bear them out
+    rounds : solutions it took; error : half the sum of squared whitened residuals at the end
+    """
+
+    poses: Floats
+    covariances: Floats
+    loop_reasons: list[str]
+    loop_stages: list[str]
+    fix_believed: NDArray[np.bool_]
+    odometry_scale: float
+    rounds: int
+    error: float
