@@ -32,7 +32,7 @@ LEVEL = {name: level for level, names in enumerate(LAYERS) for name in names}
 HOMES = {
     "gtsam": ["graph/"],
     "rosbags": ["formats/bag_files.py"],
-    "laspy": ["formats/point_files.py"],
+    "laspy": ["formats/las_files.py"],
     "small_gicp": ["odometry/small_gicp.py"],
     "rerun": ["reports/"],
     "kiss_icp": ["odometry/kiss.py"],

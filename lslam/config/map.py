@@ -18,7 +18,9 @@ class MapConfig(Section):
         False, description="write feature_map.ply, edges and planar points, of methods that have features"
     )
     voxel: float = Field(0.2, ge=0.01, description="m; one averaged point per voxel")
-    format: Literal["ply", "pcd"] = Field("ply", description="file format")
+    format: Literal["ply", "pcd", "las", "laz"] = Field(
+        "ply", description="file format; las and laz are in map coordinates when the run is georeferenced"
+    )
     range_min: float = Field(2.0, ge=0, description="m; nearer points are left out")
     range_max: float = Field(80.0, gt=0, description="m; farther points are left out")
     ego_box: tuple[float, float, float, float, float, float] | None = Field(

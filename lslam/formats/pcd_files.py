@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import struct
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -68,20 +69,24 @@ def write_pcd(
     table[:, :3] = points
     if intensity is not None:
         table[:, 3] = intensity
-    n, k = table.shape
-    header = (
-        "# .PCD v0.7 - Point Cloud Data file format\n"
-        f"VERSION 0.7\nFIELDS {' '.join(names)}\nSIZE {' '.join(['4'] * k)}\nTYPE {' '.join(['F'] * k)}\n"
-        f"COUNT {' '.join(['1'] * k)}\nWIDTH {n}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {n}\nDATA {encoding}\n"
-    )
     with atomic_write(path) as stream:
-        stream.write(header.encode())
+        stream.write(pcd_header(len(table), names, encoding))
         if encoding == "binary":
             stream.write(table.data)
         elif encoding == "ascii":
             np.savetxt(stream, table, fmt="%.9g")
         else:
             stream.write(_compress(np.ascontiguousarray(table.T).view(np.uint8).ravel()))
+
+
+def pcd_header(count: int, names: Sequence[str], encoding: str = "binary") -> bytes:
+    """Header of `count` points of float32 fields."""
+    k = len(names)
+    return (
+        "# .PCD v0.7 - Point Cloud Data file format\n"
+        f"VERSION 0.7\nFIELDS {' '.join(names)}\nSIZE {' '.join(['4'] * k)}\nTYPE {' '.join(['F'] * k)}\n"
+        f"COUNT {' '.join(['1'] * k)}\nWIDTH {count}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {count}\nDATA {encoding}\n"
+    ).encode()
 
 
 def _read_header(path: Path, data: bytes) -> _Header:

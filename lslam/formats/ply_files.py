@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -68,12 +68,16 @@ def write_ply(
     table[:, :3] = points
     for k, values in enumerate(columns.values()):
         table[:, 3 + k] = values
+    with atomic_write(path) as stream:
+        stream.write(ply_header(len(table), names, comment))
+        stream.write(table.data)
+
+
+def ply_header(count: int, names: Sequence[str], comment: str = "") -> bytes:
+    """Header of `count` binary little-endian vertices of float32 properties."""
     comments = "".join(f"comment {line}\n" for line in comment.splitlines())
     properties = "".join(f"property float {name}\n" for name in names)
-    header = f"ply\nformat binary_little_endian 1.0\n{comments}element vertex {len(table)}\n{properties}end_header\n"
-    with atomic_write(path) as stream:
-        stream.write(header.encode())
-        stream.write(table.data)
+    return f"ply\nformat binary_little_endian 1.0\n{comments}element vertex {count}\n{properties}end_header\n".encode()
 
 
 def _read_header(path: Path, data: bytes) -> tuple[str, list[_Element], int]:

@@ -16,7 +16,7 @@ _DEVKIT_RADIUS = 6378137.0
 def local_crs(lat_lon: NDArray[Any]) -> str:
     """PROJ string of the transverse Mercator projection with scale 1 at (lat, lon), deg, WGS84."""
     lat, lon = (float(v) for v in np.asarray(lat_lon)[:2])
-    return f"+proj=tmerc +lat_0={lat!r} +lon_0={lon!r} +k=1 +x_0=0 +y_0=0 +ellps=WGS84 +units=m +no_defs"
+    return f"+proj=tmerc +lat_0={lat!r} +lon_0={lon!r} +k=1 +x_0=0 +y_0=0 +datum=WGS84 +units=m +no_defs"
 
 
 def to_local(lat_lon_alt: NDArray[Any], origin: NDArray[Any]) -> Floats:

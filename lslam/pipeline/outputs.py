@@ -11,22 +11,24 @@ from lslam.config import Config, to_toml
 from lslam.config.map import MapConfig
 from lslam.evaluation.evaluate import Evaluation
 from lslam.formats.ply_files import write_ply
-from lslam.formats.point_files import write_points
 from lslam.formats.timing_csv import timing_text
 from lslam.formats.trajectory_files import write_kitti, write_tum
 from lslam.geometry import se3
 from lslam.maps.merge import MergedMap
+from lslam.pipeline import map_files
 from lslam.pipeline.feature_pass import FeatureCloud
+from lslam.pipeline.map_files import MapNote
 from lslam.pipeline.run_folder import RunFolder
 from lslam.reports.evaluation_json import to_document
 from lslam.reports.facts import stage_matrix
 from lslam.types.calibration import Calibration
+from lslam.types.georeference import Georeference
 from lslam.types.run_record import RunRecord
 from lslam.types.trajectory import Trajectory
 from lslam.version import __version__
 
-# Bytes per point of the map files: three doubles or floats and an intensity, with room for the header.
-BYTES_PER_POINT = 28
+# Bytes per point of the map files: 16 in PLY and PCD, 30 in LAS, with room for the header.
+BYTES_PER_POINT = 32
 # The 95 scans of sample_data make 220 kB without the map, half of it the report.
 BYTES_PER_SCAN, BYTES_OF_REPORT = 4000, 500_000
 
@@ -79,13 +81,12 @@ def write_scans(folder: RunFolder, record: RunRecord) -> None:
     folder.write_text("scans.csv", "\n".join(rows) + "\n")
 
 
-def write_map(folder: RunFolder, merged: MergedMap, config: MapConfig) -> None:
-    """map.ply or map.pcd, world frame of the trajectory."""
+def write_map(
+    folder: RunFolder, merged: MergedMap, config: MapConfig, sequence: str, georeference: Georeference | None = None
+) -> None:
+    """map.ply, .pcd, .las or .laz with map.json beside."""
     folder.require_space(BYTES_PER_POINT * len(merged), "the map")
-    path = folder.path / f"map.{config.format}"
-    write_points(
-        path, merged.points, merged.intensity, comment="lslam map, not georeferenced, world = LiDAR at first scan"
-    )
+    map_files.write_map(folder.path / f"map.{config.format}", merged, MapNote(sequence, config.voxel), georeference)
 
 
 def write_feature_map(folder: RunFolder, features: FeatureCloud) -> None:

@@ -220,7 +220,7 @@ def _map(
             manifest.interrupt("interrupted while the map was built: there is no map")
             return
         record.map_image, record.map_extent = built.image, built.extent
-        outputs.write_map(folder, built.merged, config.map)
+        outputs.write_map(folder, built.merged, config.map, sequence.name)
     manifest.map_points = len(built.merged)
 
 

@@ -21,7 +21,8 @@ MANIFEST = "manifest.json"
 LOCK = ".lock"
 OURS = (
     MANIFEST, "config.toml", "log.txt", "trajectory.tum", "trajectory_kitti.txt", "covariances.npz", "map.ply",
-    "map.pcd", "evaluation.json", "timing.csv", "scans.csv", "report.html",
+    "map.pcd", "map.las", "map.laz", "map.json", "trajectory.geojson", "evaluation.json",
+    "timing.csv", "scans.csv", "report.html",
 )  # fmt: skip
 
 

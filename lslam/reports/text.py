@@ -17,6 +17,8 @@ FILES = (
     ("trajectory", "trajectory.tum"),
     ("map", "map.ply"),
     ("map", "map.pcd"),
+    ("map", "map.las"),
+    ("map", "map.laz"),
     ("evaluation", "evaluation.json"),
     ("report", "report.html"),
 )

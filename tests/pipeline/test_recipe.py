@@ -23,7 +23,7 @@ from lslam.pipeline.run import RunOutcome, Watch
 from lslam.types.scan import Scan
 
 ALL = {
-    "trajectory.tum", "trajectory_kitti.txt", "covariances.npz", "map.ply", "timing.csv", "scans.csv", "manifest.json",
+    "trajectory.tum", "trajectory_kitti.txt", "covariances.npz", "map.ply", "map.json", "timing.csv", "scans.csv", "manifest.json",
     "config.toml", "log.txt", "evaluation.json", "report.html",
 }  # fmt: skip
 Usage = namedtuple("Usage", "total used free")
@@ -170,7 +170,7 @@ def test_an_interrupted_run_writes_what_was_done(tmp_path: Path, stage: str) -> 
         lslam.run(sample(15), out=out, watch=stopper.watch)
     facts = manifest(out)
     assert facts["status"] == "interrupted"
-    assert names(out) == ALL - {"map.ply"}
+    assert names(out) == ALL - {"map.ply", "map.json"}
     assert len((out / "trajectory_kitti.txt").read_text().splitlines()) == (6 if stage == "odometry" else 15)
     assert stopper.outcomes
 
@@ -264,7 +264,7 @@ def test_unknown_motion_within_scans_is_said_loudly(tmp_path: Path) -> None:
 
 def test_switched_off_outputs_are_not_written(tmp_path: Path) -> None:
     lslam.run(sample(5), config("map.write=false", "report.html=false"), out=tmp_path / "out")
-    assert names(tmp_path / "out") == ALL - {"map.ply", "report.html"}
+    assert names(tmp_path / "out") == ALL - {"map.ply", "map.json", "report.html"}
     lslam.run(sample(5), config("map.format=pcd"), out=tmp_path / "pcd")
     assert "map.pcd" in names(tmp_path / "pcd")
 

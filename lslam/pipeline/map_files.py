@@ -1,0 +1,92 @@
+"""A map on disk: the points, in map coordinates when it is known where they are, and a note that says what they are."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from lslam.formats.atomic import atomic_write
+from lslam.formats.cloud_files import write_cloud
+from lslam.formats.geojson import write_line
+from lslam.maps.georeference import ProjectedCloud, Projection, to_lat_lon
+from lslam.types.cloud import Cloud
+from lslam.types.georeference import Georeference
+from lslam.types.trajectory import Trajectory
+from lslam.version import __version__
+
+LOCAL = "world of trajectory.tum"
+
+
+@dataclass(frozen=True)
+class MapNote:
+    """What a map file cannot say of itself: the sequence it was made of, the edge of its voxels, m, what was done to it."""
+
+    sequence: str
+    voxel: float
+    done: tuple[str, ...] = ()
+
+
+def write_map(path: Path, cloud: Cloud, note: MapNote, georeference: Georeference | None = None) -> None:
+    """Write the cloud, world frame, m, in the format of the suffix, and `<stem>.json` beside it.
+
+    LAS and LAZ of a georeferenced run are in its coordinate reference system; PLY and PCD hold float32, which is too coarse
+    for that: they stay in the run's world, and the note says how to go on. Raises as `write_cloud`, and UsageError when the
+    coordinate reference system is not one of metres.
+    """
+    projection = None if georeference is None else Projection(georeference)
+    projected = projection is not None and path.suffix.lower() in (".las", ".laz")
+    where = "not georeferenced" if projection is None else f"EPSG:{projection.epsg}" if projected else "local"
+    comment = f"lslam {__version__} map, {where}; {LOCAL}"
+    if projection is not None and projected:
+        projection.check()
+        write_cloud(path, ProjectedCloud(cloud, projection), wkt=projection.wkt)
+    else:
+        write_cloud(path, cloud, comment=comment)
+    about = {
+        "schema": "lslam-map",
+        "version": 1,
+        "file": path.name,
+        "points": len(cloud),
+        "unit": "m",
+        "intensity": cloud.has_intensity,
+        "frame": f"EPSG:{projection.epsg}, heights above the WGS84 ellipsoid"
+        if projection is not None and projected
+        else LOCAL,
+        "crs": f"EPSG:{projection.epsg}" if projection is not None and projected else None,
+        "georeference": None if georeference is None else _plain(georeference),
+        "voxel": note.voxel,
+        "done": list(note.done),
+        "sequence": note.sequence,
+        "lslam": __version__,
+    }
+    write_json(path.with_suffix(".json"), about)
+
+
+def write_geojson(path: Path, trajectory: Trajectory, georeference: Georeference, sequence: str) -> None:
+    """The trajectory as a line on the Earth."""
+    about = {
+        "sequence": sequence,
+        "lslam": __version__,
+        "stamp_first_ns": int(trajectory.stamps_ns[0]),
+        "stamp_last_ns": int(trajectory.stamps_ns[-1]),
+        "heights": "m above the WGS84 ellipsoid",
+    }
+    write_line(path, to_lat_lon(trajectory.positions, georeference), about)
+
+
+def write_json(path: Path, document: dict[str, Any]) -> None:
+    """Strict JSON, indented, atomically."""
+    with atomic_write(path) as stream:
+        stream.write((json.dumps(document, indent=2, allow_nan=False, ensure_ascii=False) + "\n").encode())
+
+
+def _plain(georeference: Georeference) -> dict[str, Any]:
+    return {
+        "origin_lat_lon_height": [float(v) for v in georeference.origin],
+        "T_enu_world": georeference.T_enu_world.tolist(),
+        "enu": "transverse Mercator at the origin, scale 1, WGS84: east, north, height above the origin, m",
+        "epsg": Projection(georeference).epsg,
+        "method": georeference.method,
+    }
