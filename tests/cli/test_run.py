@@ -17,8 +17,8 @@ from lslam.formats.point_files import read_points
 from lslam.formats.trajectory_files import read_trajectory
 
 ALL = {
-    "trajectory.tum", "trajectory_kitti.txt", "covariances.npz", "map.ply", "map.json", "timing.csv", "scans.csv", "manifest.json",
-    "config.toml", "log.txt", "evaluation.json", "report.html",
+    "trajectory.tum", "trajectory_kitti.txt", "covariances.npz", "map.ply", "map.json", "timing.csv", "scans.csv",
+    "manifest.json", "config.toml", "log.txt", "evaluation.json", "report.html",
 }  # fmt: skip
 SAME = ("trajectory.tum", "trajectory_kitti.txt", "covariances.npz", "map.ply", "evaluation.json")
 

@@ -23,8 +23,8 @@ from lslam.pipeline.run import RunOutcome, Watch
 from lslam.types.scan import Scan
 
 ALL = {
-    "trajectory.tum", "trajectory_kitti.txt", "covariances.npz", "map.ply", "map.json", "timing.csv", "scans.csv", "manifest.json",
-    "config.toml", "log.txt", "evaluation.json", "report.html",
+    "trajectory.tum", "trajectory_kitti.txt", "covariances.npz", "map.ply", "map.json", "timing.csv", "scans.csv",
+    "manifest.json", "config.toml", "log.txt", "evaluation.json", "report.html",
 }  # fmt: skip
 Usage = namedtuple("Usage", "total used free")
 
