@@ -79,12 +79,14 @@ class MovingMesh:
     """A body that moves while rays fly: its scene in its own frame, T_city_body at times (M,), s, and a circle round it.
 
     radius : of a sphere round the body's origin that holds all of it, m; speed : the most it gets on, m/s
+    centre : (3,) of its origin at the stamp of the scan, in the city
     """
 
     scene: RayScene
     poses: Callable[[NDArray[Any]], NDArray[np.float64]]
     radius: float
     speed: float
+    centre: NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -141,9 +143,9 @@ def trace(
     column, ring = np.divmod(np.arange(model.rays), model.rings)
     since = column * (period / model.columns) + model.firing[ring] if moving else np.zeros(model.rays)
     rays = _into_city(model, true, poses, period, stamp_ns / 1e9 + since)
-    hits = _meet(scene, rays, bodies, model.rings)
+    hits = _meet(scene, rays, bodies, model.rings, stamp_ns / 1e9)
     if glass > 0:
-        _pass_glass(scene, rays, bodies, hits, rng.random(model.rays) < glass)
+        _pass_glass(scene, rays, bodies, hits, rng.random(model.rays) < glass, stamp_ns / 1e9)
     heights = model.heights.astype(np.float32)[ring]
     if roof is not None:
         hits.distance[roof.blocks(true, heights)] = np.inf
@@ -155,28 +157,28 @@ def trace(
     return Scan(points, stamp_ns, index, intensity[kept], times, ring[kept].astype(np.uint16))
 
 
-def _meet(scene: RayScene, rays: _Rays, bodies: Sequence[MovingMesh], rings: int) -> _Hits:
+def _meet(scene: RayScene, rays: _Rays, bodies: Sequence[MovingMesh], rings: int, stamp: float) -> _Hits:
     """First hits on what stands and what moves; the rays come in columns of `rings`."""
     distance, face = scene.cast(rays.origins, rays.directions)
     cosine = np.abs(np.einsum("ij,ij->i", scene.mesh.normals[face], rays.directions))
     hits = _Hits(distance, cosine, scene.mesh.surfaces[face])
     if bodies and len(distance):
-        _meet_bodies(bodies, rays, rings, hits)
+        _meet_bodies(bodies, rays, rings, hits, stamp)
     return hits
 
 
-def _meet_bodies(bodies: Sequence[MovingMesh], rays: _Rays, rings: int, hits: _Hits) -> None:
-    """Put hits on what moves into `hits` where they are nearer."""
+def _meet_bodies(bodies: Sequence[MovingMesh], rays: _Rays, rings: int, hits: _Hits, stamp: float) -> None:
+    """Put hits on what moves into `hits` where they are nearer; `stamp`, s, is that of the bodies' centres."""
     # Bearings of whole columns first: a body is met by few of them.
     bearing = np.arctan2(rays.directions[:, 1], rays.directions[:, 0]).reshape(-1, rings)
     middle = bearing[:, rings // 2]
     spread = np.abs(_turned(bearing - middle[:, None])).max(axis=1)
     half = len(rays.fired) // 2
-    apart = np.ptp(rays.origins, axis=0)
+    apart, lasting = sum(float(np.ptp(axis)) for axis in rays.origins.T), float(rays.fired.max()) - stamp
     for body in bodies:
-        centre = body.poses(rays.fired[half : half + 1])[0, :3, 3]
+        centre = body.centre
         # Body and LiDAR both move while the sweep lasts.
-        reach = body.radius + body.speed * float(np.ptp(rays.fired)) + float(apart.sum())
+        reach = body.radius + body.speed * lasting + apart
         dx, dy, _ = (centre - rays.origins[half]).tolist()
         share = reach / max(float(np.hypot(dx, dy)), reach)
         towards = np.abs(_turned(middle - np.float32(np.arctan2(dy, dx)))) <= np.arcsin(share) + spread
@@ -185,20 +187,21 @@ def _meet_bodies(bodies: Sequence[MovingMesh], rays: _Rays, rings: int, hits: _H
         to = (centre - rays.origins[near]).astype(np.float32)
         along = np.einsum("ij,ij->i", to, rays.directions[near])
         aside = np.einsum("ij,ij->i", to, to) - along**2
-        near = near[(along > -reach) & (aside < reach**2) & (along < hits.distance[near] + reach)]
+        # Each ray knows where it starts and when; a millimetre for the rounding.
+        reached = (body.radius + 1e-3 + body.speed * (rays.fired[near] - stamp)).astype(np.float32)
+        near = near[(along > -reached) & (aside < reached**2) & (along < hits.distance[near] + reached)]
         if len(near):
-            _meet_body(body, near, rays[near], hits)
+            _meet_body(body, near, rays[near], hits, stamp)
 
 
-def _meet_body(body: MovingMesh, which: NDArray[np.intp], rays: _Rays, hits: _Hits) -> None:
+def _meet_body(body: MovingMesh, which: NDArray[np.intp], rays: _Rays, hits: _Hits, stamp: float) -> None:
     """The rays `which` against the body where it is when each of them is fired."""
-    # Between instants of a few milliseconds it moves on evenly, to micrometres.
-    first, last = float(rays.fired.min()), float(rays.fired.max())
-    steps = max(int(np.ceil((last - first) / BODY_STEP)), 1)
-    T = body.poses(np.linspace(first, last, steps + 1))
-    share = (rays.fired - first) * (steps / max(last - first, 1e-9))
-    at = np.minimum(share.astype(np.intp), steps - 1)
-    T = T[at] + (share - at)[:, None, None] * (T[at + 1] - T[at])
+    # Between instants of a few milliseconds it moves on evenly, to micrometres; they do not hang on which rays are tried.
+    share = (rays.fired - stamp) / BODY_STEP
+    at = share.astype(np.intp)
+    first = int(at.min())
+    T = body.poses(stamp + BODY_STEP * np.arange(first, int(at.max()) + 2))
+    T = T[at - first] + (share - at)[:, None, None] * (T[at - first + 1] - T[at - first])
     R, centre = T[:, :3, :3].astype(np.float32), T[:, :3, 3]
     local = np.einsum("nji,nj->ni", R, rays.directions)
     start = np.einsum("nji,nj->ni", R, (rays.origins - centre).astype(np.float32))
@@ -216,14 +219,14 @@ def _turned(angle: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def _pass_glass(
-    scene: RayScene, rays: _Rays, bodies: Sequence[MovingMesh], hits: _Hits, lucky: NDArray[np.bool_]
+    scene: RayScene, rays: _Rays, bodies: Sequence[MovingMesh], hits: _Hits, lucky: NDArray[np.bool_], stamp: float
 ) -> None:
     """The `lucky` rays on glass go on to what stands or moves behind it; a second pane stops them."""
     through = np.flatnonzero(lucky & (hits.surface == Surface.GLASS) & np.isfinite(hits.distance))
     start = hits.distance[through] + np.float32(0.01)
     beyond = rays[through]
     beyond = _Rays(beyond.origins + start[:, None] * beyond.directions, beyond.directions, beyond.fired)
-    onward = _meet(scene, beyond, bodies, 1)
+    onward = _meet(scene, beyond, bodies, 1, stamp)
     hits.distance[through] = start + onward.distance
     hits.cosine[through] = onward.cosine
     hits.surface[through] = onward.surface

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -26,7 +28,14 @@ def cube(half: float, surface: int = Surface.CAR) -> Mesh:
     return builder.build()
 
 
-def passing(speed: float) -> MovingMesh:
+def body_of(
+    mesh: Mesh, poses: Callable[[NDArray[Any]], NDArray[np.float64]], radius: float, speed: float = 0.0, at: float = 0.0
+) -> MovingMesh:
+    """The body as a scan stamped `at` s is told of it."""
+    return MovingMesh(RayScene(mesh), poses, radius, speed, poses(np.array([at]))[0, :3, 3])
+
+
+def passing(speed: float, at: float = 0.0) -> MovingMesh:
     """A cube of 2 m, 10 m to the left, that drives along +x and is beside us at 0.05 s."""
 
     def poses(times: NDArray[Any]) -> NDArray[np.float64]:
@@ -34,7 +43,11 @@ def passing(speed: float) -> MovingMesh:
         T[:, 0, 3], T[:, 1, 3] = speed * (np.asarray(times) - 0.05), 10.0
         return T
 
-    return MovingMesh(RayScene(cube(1.0)), poses, np.sqrt(3.0), speed)
+    return body_of(cube(1.0), poses, np.sqrt(3.0), speed, at)
+
+
+def standing_at(place: NDArray[np.float64], times: NDArray[Any]) -> NDArray[np.float64]:
+    return np.tile(place, (len(times), 1, 1))
 
 
 def test_a_body_is_met_where_it_is_when_the_ray_is_fired() -> None:
@@ -53,7 +66,7 @@ def test_a_body_is_met_where_it_is_when_the_ray_is_fired() -> None:
 
 def test_a_compensated_scan_meets_it_at_the_stamp() -> None:
     scan = trace(RayScene(cube(100.0, Surface.WALL)), PERFECT, np.eye(4), np.random.default_rng(0),
-                 stamp_ns=80_000_000, bodies=[passing(20.0)])  # fmt: skip
+                 stamp_ns=80_000_000, bodies=[passing(20.0, 0.08)])  # fmt: skip
     x = scan.points[np.abs(scan.points[:, 1] - 9.0) < 0.01, 0]
     assert x.mean() == pytest.approx(20.0 * 0.03, abs=0.01)
 
@@ -70,11 +83,11 @@ def test_what_stands_in_front_hides_a_body_and_all_else_is_as_without_it() -> No
 
 def test_a_body_behind_us_and_one_all_round_us_are_met() -> None:
     for x in (-20.0, 20.0):
-        body = MovingMesh(RayScene(cube(1.0)), lambda t, x=x: np.tile(  # type: ignore[misc]
-            np.array([[1, 0, 0, x], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1.0]]), (len(t), 1, 1)), 2.0, 0.0)  # fmt: skip
+        place = np.array([[1, 0, 0, x], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1.0]])
+        body = body_of(cube(1.0), partial(standing_at, place), 2.0)
         scan = trace(RayScene(cube(100.0)), PERFECT, np.eye(4), np.random.default_rng(0), bodies=[body])
         assert np.sum(np.abs(scan.points[:, 0] - np.sign(x) * 19.0) < 0.01) > 50
-    shell = MovingMesh(RayScene(cube(5.0)), lambda t: np.tile(np.eye(4), (len(t), 1, 1)), 9.0, 0.0)
+    shell = body_of(cube(5.0), partial(standing_at, np.eye(4)), 9.0)
     scan = trace(RayScene(cube(100.0)), PERFECT, np.eye(4), np.random.default_rng(0), bodies=[shell])
     np.testing.assert_allclose(np.abs(scan.points).max(axis=1), 5.0, atol=1e-3)
 
@@ -105,7 +118,7 @@ def test_what_moves_behind_a_pane_is_seen_through_it_and_what_moves_before_it_hi
             T[:, 0, 3], T[:, 1, 3] = x, 100.0 * (np.asarray(times) - 0.05)
             return T
 
-        return MovingMesh(RayScene(cube(1.0)), poses, 1.8, 100.0)
+        return body_of(cube(1.0), poses, 1.8, 100.0)
 
     bright, still = replace(bright, start_deg=-180.0), np.tile(np.eye(4), (PERFECT.columns, 1, 1))
     for x in (8.0, 3.0):
@@ -179,6 +192,33 @@ def test_movers_drive_on_the_ground_at_their_speed() -> None:
     assert T[2, 2, 3] < -1000, "it has left the street"
     assert len(moving_meshes([mover], np.array([140.0, 0, 0]), 0.0, 20.0)) == 1
     assert not moving_meshes([mover], np.array([100.0, 0, 0]), 0.0, 20.0)
+
+
+def test_bodies_are_told_with_the_places_their_poses_say_and_the_far_ones_not_at_all() -> None:
+    drive = simulate("urban", seed=2, count=10)
+    here, time = drive.city_poses[4, :3, 3], 0.4
+    near = moving_meshes(drive.movers, here, time, 60.0)
+    at = [mover.poses(np.array([time]))[0, :3, 3] for mover in drive.movers]
+    expected = [p for p, m in zip(at, drive.movers, strict=True) if np.linalg.norm(p - here) < 60.0 + m.radius]
+    assert 5 < len(near) == len(expected) < len(drive.movers)
+    for body, p in zip(near, expected, strict=True):
+        np.testing.assert_allclose(body.centre, p, atol=1e-9)
+
+
+def test_a_body_that_no_ray_comes_near_is_not_asked_where_it_is() -> None:
+    asked: list[float] = []
+
+    def poses(times: NDArray[Any]) -> NDArray[np.float64]:
+        asked.extend(times)
+        T = np.tile(np.eye(4), (len(times), 1, 1))
+        T[:, 0, 3] = 200.0
+        return T
+
+    hidden = MovingMesh(RayScene(cube(1.0)), poses, 2.0, 10.0, np.array([200.0, 0.0, 0.0]))
+    trace(RayScene(cube(100.0, Surface.WALL)), PERFECT, np.eye(4), np.random.default_rng(0), bodies=[hidden])
+    assert not asked
+    trace(RayScene(cube(400.0, Surface.WALL)), PERFECT, np.eye(4), np.random.default_rng(0), bodies=[hidden])
+    assert asked
 
 
 def test_traffic_keeps_clear_of_the_line() -> None:
