@@ -17,7 +17,7 @@ from lslam.cli.signals import GentleStop, gentle_stop
 
 if TYPE_CHECKING:
     from lslam.config import Config
-    from lslam.pipeline.run import RunOutcome, Watch
+    from lslam.pipeline.watch import RunOutcome, Watch
     from lslam.types.sequence import Sequence
     from lslam.types.trajectory import Trajectory
 
@@ -123,7 +123,7 @@ def read_truth(path: Path | None, sequence: Sequence) -> Trajectory | None:
 
 def _watch(stack: ExitStack, stop: GentleStop, finish: Callable[[RunOutcome], None]) -> Watch:
     """Progress bars, and signals as a wish to stop after the scan at hand."""
-    from lslam.pipeline.run import Watch
+    from lslam.pipeline.watch import Watch
 
     bar = stack.enter_context(ExitStack())
     advance: list[Any] = []

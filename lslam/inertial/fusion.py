@@ -107,6 +107,13 @@ class InertialMotion:
         direction, sigma = self.estimate.down
         return GravityDirection(pose[:3, :3].T @ direction, sigma)
 
+    def rewind(self, stamp_ns: int, start: Floats, span_s: float) -> MotionPrior:
+        """Forget all scans but the first, taken at `stamp_ns` and `start` (4, 4); its sweep by what is known of the speed.
+
+        The IMU knows the speed from the start: only one that was refused is ever asked.
+        """
+        return self.coasting.rewind(stamp_ns, start, span_s)
+
     def prior_errors(self) -> tuple[float, float] | None:
         """Medians, m, of how wrong the IMU and constant velocity predicted the scans, turns counted at `LEVER_M`."""
         if not self._errors:

@@ -15,7 +15,8 @@ from lslam.inertial.fusion import InertialMotion
 from lslam.inertial.initialise import FirstPoses, Start, start
 from lslam.inertial.stream import ImuRefusedError
 from lslam.odometry import create_odometry
-from lslam.pipeline.front_end import Tracker, read_ahead
+from lslam.pipeline.front_end import read_ahead
+from lslam.pipeline.tracker import Tracker
 from lslam.readers import select
 from lslam.readers.selection import Selection
 from lslam.types.imu import ImuStream

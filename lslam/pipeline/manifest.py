@@ -27,7 +27,7 @@ class Manifest:
     outcome : done, degraded (a scan was bridged or skipped, or input was dropped, replaced or refused), diverged or
         interrupted
     deskew : what becomes of the motion within a scan, `describe_deskew`
-    imu : what became of the IMU, empty without `--imu`
+    imu : what became of the IMU, empty without `--imu`; keyframes : how many and how large
     problems : what went wrong in this run, beside what was wrong with the recording before
     """
 
@@ -40,6 +40,7 @@ class Manifest:
         self.counts: dict[str, int] = {}
         self.map_points: int | None = None
         self.imu: dict[str, Any] = {}
+        self.keyframes: dict[str, Any] = {}
         self._ended = ""
 
     @property
@@ -118,6 +119,7 @@ class Manifest:
             },
             **({"imu": dict(self.imu)} if self.imu else {}),
             "counts": dict(self.counts),
+            **({"keyframes": dict(self.keyframes)} if self.keyframes else {}),
             **({"map_points": self.map_points} if self.map_points is not None else {}),
             "timings": {name: round(seconds, 3) for name, seconds in self.timings.items()},
             "peak_memory_mb": peak_memory_mb(),

@@ -13,7 +13,8 @@ from lslam.config import Config
 from lslam.geometry.interpolate import poses_at
 from lslam.maps.merge import MapMerger, MergedMap
 from lslam.maps.top_view import top_view
-from lslam.pipeline.front_end import read_ahead, sweep_seconds
+from lslam.pipeline.front_end import read_ahead
+from lslam.pipeline.tracker import sweep_seconds
 from lslam.preprocessing.deskew import KNOTS, deskew_points
 from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan import Scan

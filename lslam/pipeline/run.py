@@ -3,63 +3,32 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
-from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 
 from lslam.config import Config
-from lslam.errors import GateError, InputError, InterruptedRunError, LslamError, OutputError, RunFailedError
+from lslam.errors import GateError, InterruptedRunError, LslamError, OutputError, RunFailedError
 from lslam.evaluation.evaluate import Evaluation, evaluate
-from lslam.kernels import jit
-from lslam.maps import merge
+from lslam.keyframes.store import KeyframeStore
 from lslam.odometry import create_odometry
 from lslam.odometry.base import FeatureSource, Odometry
-from lslam.pipeline import inertial_start, outputs
+from lslam.pipeline import outputs
 from lslam.pipeline.check import check_config
 from lslam.pipeline.choose import choose_scans
 from lslam.pipeline.feature_pass import build_feature_map
-from lslam.pipeline.front_end import estimate, has_point_times, is_diverged, to_trajectory
-from lslam.pipeline.inertial_start import Inertial, begin_inertial, close_inertial, with_imu_settings
+from lslam.pipeline.front_end import has_point_times
+from lslam.pipeline.inertial_start import with_imu_settings
 from lslam.pipeline.manifest import Manifest, describe_deskew
 from lslam.pipeline.map_pass import build_map
-from lslam.pipeline.run_folder import RunFolder
+from lslam.pipeline.odometry_pass import estimate_poses
+from lslam.pipeline.run_folder import KEYFRAMES, RunFolder
+from lslam.pipeline.watch import RunOutcome, Watch
 from lslam.readers import open_sequence
 from lslam.readers.raw_drive import with_imu
-from lslam.registration.standing import Standing
 from lslam.types.run_record import RunRecord
-from lslam.types.scan_result import ScanResult
 from lslam.types.sequence import Sequence
 from lslam.types.trajectory import Trajectory
 
 log = logging.getLogger("lslam")
-
-
-@dataclass(frozen=True)
-class RunOutcome:
-    """What a run gives back to Python: the record the report is written from, and the score when truth is known."""
-
-    record: RunRecord
-    evaluation: Evaluation | None
-
-    @property
-    def trajectory(self) -> Trajectory:
-        """T_world_lidar per scan, at scan start."""
-        return self.record.trajectory
-
-
-@dataclass(frozen=True)
-class Watch:
-    """How a caller follows a run and ends it early.
-
-    on_start(stage, scans), then on_step() per scan; on_end(outcome) also when the run then raises because it diverged,
-    was interrupted or missed a gate
-    """
-
-    on_start: Callable[[str, int], None] = lambda stage, total: None
-    on_step: Callable[[], None] = lambda: None
-    on_end: Callable[[RunOutcome], None] = lambda outcome: None
-    should_stop: Callable[[], bool] = lambda: False
 
 
 def run(
@@ -95,7 +64,8 @@ def run(
     manifest = Manifest(command, chosen, config)
     if out is None:
         _announce(chosen, odometry, config, manifest)
-        record = _estimate(chosen, odometry, config, manifest, Path(), truth, watch)
+        store = KeyframeStore()
+        record = estimate_poses(chosen, odometry, config, manifest, Path(), truth, watch, store)
         evaluation = _score(record, chosen, config)
     else:
         with RunFolder(Path(out), overwrite) as folder:
@@ -104,7 +74,8 @@ def run(
                 _announce(chosen, odometry, config, manifest)
                 folder.write_text("config.toml", outputs.config_text(config))
                 folder.write_manifest(manifest.as_dict("running"))
-                record = _estimate(chosen, odometry, config, manifest, folder.path, truth, watch)
+                store = KeyframeStore(folder.path / KEYFRAMES)
+                record = estimate_poses(chosen, odometry, config, manifest, folder.path, truth, watch, store)
                 outputs.write_trajectories(folder, record, chosen.calibration)
                 outputs.write_scans(folder, record)
                 evaluation = _score(record, chosen, config)
@@ -135,60 +106,6 @@ def _announce(sequence: Sequence, odometry: Odometry, config: Config, manifest: 
         log.warning("%s", manifest.deskew)
     else:
         log.info("deskew: %s", manifest.deskew)
-
-
-def _estimate(
-    sequence: Sequence, odometry: Odometry, config: Config, manifest: Manifest, folder: Path, truth: Trajectory | None,
-    watch: Watch,
-) -> RunRecord:  # fmt: skip
-    """Odometry over all scans, judged."""
-    standing = Standing(config.preprocess, config.registration) if config.preprocess.skip_standing else None
-    with manifest.timed("compile_s"), jit.announced(log), jit.compile_lock():
-        odometry.warm_up()
-        if standing is not None:
-            standing.warm_up()
-        if config.map.write:
-            merge.warm_up()
-        if config.imu.use:
-            inertial_start.warm_up()
-        with suppress(InputError):
-            sequence.scan(0)  # the reader's kernels; what is wrong with the scan is said in its turn
-
-    def seen(result: ScanResult) -> None:
-        if result.status != "ok":
-            log.warning("scan %d %s: %s", result.index, result.status, result.reason)
-        watch.on_step()
-
-    watch.on_start("odometry", len(sequence))
-    limit = config.odometry.max_failures
-    inertial = Inertial(None)
-    if config.imu.use:
-        with manifest.timed("imu_start_s"):
-            inertial = begin_inertial(sequence, config)
-        if getattr(odometry, "ignores_prior", False):
-            inertial.problems.append(
-                f"{config.odometry.method} predicts by itself: the IMU only bridges scans that fail"
-            )
-    with manifest.timed("odometry_s"):
-        results = estimate(
-            sequence, odometry, threads=config.input.threads, max_failures=limit, standing=standing,
-            motion=inertial.motion, should_stop=watch.should_stop, on_scan=seen,
-        )  # fmt: skip
-    if all(r.status == "skipped" for r in results):
-        raise InputError(f"{sequence.path}: none of {len(results)} scans can be used, the first: {results[0].reason}")
-    if config.imu.use:
-        manifest.imu = close_inertial(inertial, results)
-        manifest.problems += inertial.problems
-    manifest.judge(results, len(sequence), is_diverged(results, limit))
-    return RunRecord(
-        name=sequence.name,
-        method=config.odometry.method,
-        folder=folder,
-        results=results,
-        trajectory=to_trajectory(results, config.odometry.method),
-        ground_truth=truth,
-        real_time_limit=config.input.skip_frames / sequence.rate_hz,
-    )
 
 
 def _score(record: RunRecord, sequence: Sequence, config: Config) -> Evaluation | None:

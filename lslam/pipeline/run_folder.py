@@ -19,9 +19,10 @@ log = logging.getLogger("lslam")
 
 MANIFEST = "manifest.json"
 LOCK = ".lock"
+KEYFRAMES = "keyframes"
 OURS = (
     MANIFEST, "config.toml", "log.txt", "trajectory.tum", "trajectory_kitti.txt", "covariances.npz", "map.ply",
-    "map.pcd", "map.las", "map.laz", "map.json", "trajectory.geojson", "evaluation.json",
+    "map.pcd", "map.las", "map.laz", "map.json", "feature_map.ply", "trajectory.geojson", "evaluation.json",
     "timing.csv", "scans.csv", "report.html",
 )  # fmt: skip
 
@@ -110,6 +111,16 @@ class RunFolder:
             (self.path / f"{name}.part").unlink(missing_ok=True)
         for folder in self.path.glob(".lslam-map-*"):  # of a run that was killed
             shutil.rmtree(folder, ignore_errors=True)
+        _clear_arrays(self.path / KEYFRAMES)
+
+
+def _clear_arrays(folder: Path) -> None:
+    """Remove the arrays that a run keeps in a folder of its own, and the folder when nothing else is in it."""
+    for pattern in ("*.npz", "*.npz.part"):
+        for file in folder.glob(pattern):
+            file.unlink()
+    with contextlib.suppress(OSError):
+        folder.rmdir()
 
 
 class _LogFile(logging.FileHandler):

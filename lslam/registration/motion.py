@@ -36,6 +36,10 @@ class MotionModel(Protocol):
         """Take the pose (4, 4) found at `stamp_ns` as the newest; `prior` says how its sweep moved."""
         ...
 
+    def rewind(self, stamp_ns: int, start: Floats, span_s: float) -> MotionPrior:
+        """Forget all scans but the first, taken at `stamp_ns` and `start` (4, 4); its sweep by what is known of the speed."""
+        ...
+
 
 class ConstantVelocity:
     """Predicts the next pose from the last two, scaled to the time between scans.
@@ -101,6 +105,13 @@ class ConstantVelocity:
             if step > 0:
                 self._twist, self._step_s = se3.log(se3.relative(self._pose, middle)), step
         self._instant_ns, self._pose = instant_ns, middle.copy()
+
+    def rewind(self, stamp_ns: int, start: Floats, span_s: float) -> MotionPrior:
+        """Forget all scans but the first, taken at `stamp_ns` and `start` (4, 4); its sweep by what is known of the speed."""
+        prior = self.steady(start, span_s)
+        self._instant_ns, self._step_s = None, 0.0
+        self.correct(stamp_ns, start, prior)
+        return prior
 
 
 def _steady(start: Floats, velocity: Floats, span: float) -> MotionPrior:

@@ -44,7 +44,8 @@ def execute(job: Job, at_once: int, load: float) -> None:
 
 def _run(job: Job) -> tuple[str, str]:
     """Status and reason of a run that came to its end."""
-    from lslam.pipeline.run import RunOutcome, Watch, run
+    from lslam.pipeline.run import run
+    from lslam.pipeline.watch import RunOutcome, Watch
     from lslam.readers import open_sequence
     from lslam.readers.raw_drive import with_imu
 

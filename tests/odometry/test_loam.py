@@ -16,7 +16,7 @@ from lslam.config.config import Config
 from lslam.errors import InputError
 from lslam.odometry import create_odometry
 from lslam.odometry.loam import Loam
-from lslam.pipeline.front_end import Loaded, Tracker
+from lslam.pipeline.tracker import Loaded, Tracker
 from lslam.registration.feature_registration import PATIENCE
 from lslam.simulation.scenarios import simulate
 from lslam.types.scan import Scan

@@ -18,7 +18,8 @@ from lslam.formats.trajectory_files import read_trajectory
 from lslam.odometry import create_odometry
 from lslam.pipeline.front_end import estimate
 from lslam.pipeline.inertial_start import begin_inertial, close_inertial
-from lslam.pipeline.run import RunOutcome, run
+from lslam.pipeline.run import run
+from lslam.pipeline.watch import RunOutcome
 from lslam.readers import select
 from lslam.simulation.scenarios import simulate
 from lslam.types.imu import ImuStream

@@ -19,12 +19,12 @@ from lslam.config import Config, load_config
 from lslam.errors import GateError, InputError, InterruptedRunError, OutputError, RunFailedError, UsageError
 from lslam.evaluation.evaluate import Evaluation
 from lslam.pipeline import run as recipe
-from lslam.pipeline.run import RunOutcome, Watch
+from lslam.pipeline.watch import RunOutcome, Watch
 from lslam.types.scan import Scan
 
 ALL = {
     "trajectory.tum", "trajectory_kitti.txt", "covariances.npz", "map.ply", "map.json", "timing.csv", "scans.csv",
-    "manifest.json", "config.toml", "log.txt", "evaluation.json", "report.html",
+    "manifest.json", "config.toml", "log.txt", "evaluation.json", "report.html", "keyframes",
 }  # fmt: skip
 Usage = namedtuple("Usage", "total used free")
 

@@ -1,0 +1,50 @@
+"""Named arrays in one .npz file: same arrays, same bytes; read without ever running what the file holds."""
+
+from __future__ import annotations
+
+import zipfile
+import zlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.errors import InputError
+from lslam.formats.atomic import atomic_write
+
+# Of a zip member: numpy's own writer gives this date too.
+_DATE = (1980, 1, 1, 0, 0, 0)
+
+
+def write_npz(path: Path, arrays: Mapping[str, NDArray[Any]], level: int = 1) -> None:
+    """Write the arrays atomically; `level` 0 stores them, 1 (fast) to 9 (small) deflates. Raises OutputError."""
+    with atomic_write(path) as stream:
+        pack_npz(stream, arrays, level)
+
+
+def pack_npz(stream: BinaryIO, arrays: Mapping[str, NDArray[Any]], level: int = 1) -> None:
+    """As `write_npz`, into an open stream."""
+    method = zipfile.ZIP_DEFLATED if level else zipfile.ZIP_STORED
+    with zipfile.ZipFile(stream, "w", method, compresslevel=level or None) as archive:
+        for name, array in arrays.items():
+            info = zipfile.ZipInfo(f"{name}.npy", _DATE)
+            info.compress_type = method
+            with archive.open(info, "w", force_zip64=True) as member:
+                np.lib.format.write_array(member, np.asanyarray(array), allow_pickle=False)
+
+
+def read_npz(source: Path | BinaryIO) -> dict[str, NDArray[Any]]:
+    """All arrays of a file, checked against its checksums. Raises InputError naming a file that is damaged or missing."""
+    try:
+        with np.load(source, allow_pickle=False) as archive:
+            return {name: archive[name] for name in archive.files}
+    except OSError as error:
+        raise InputError(f"{_name(source)} cannot be read: {error.strerror or error}") from None
+    except (ValueError, KeyError, EOFError, TypeError, AttributeError, zipfile.BadZipFile, zlib.error) as error:
+        raise InputError(f"{_name(source)} is damaged: {error}") from None
+
+
+def _name(source: Path | BinaryIO) -> str:
+    return str(source) if isinstance(source, Path) else "an archive"

@@ -1,0 +1,1 @@
+"""When a scan becomes a keyframe; the clouds of keyframes on disk; submaps."""

@@ -1,0 +1,59 @@
+"""Which scans become keyframes."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.config.keyframes import KeyframesConfig
+from lslam.geometry import se3, so3
+from lslam.types.keyframe import Keyframe
+from lslam.types.scan_result import ScanResult
+from lslam.types.state import State
+
+
+class KeyframeSelector:
+    """Takes a registered scan when the sensor has travelled `distance`, or turned by `angle_deg`, since the last taken.
+
+    The first registered scan is one. Scans that were bridged or skipped never are: nobody knows where they belong.
+    """
+
+    def __init__(self, config: KeyframesConfig) -> None:
+        self._distance, self._angle = config.distance, float(np.deg2rad(config.angle_deg))
+        self._count = 0
+        self._travelled = 0.0
+        self._here: NDArray[np.float64] | None = None
+        self._last: NDArray[np.float64] | None = None
+
+    def consider(self, scan: int, result: ScanResult) -> Keyframe | None:
+        """The keyframe that scan number `scan` of the run becomes, or None; every scan of the run, in order."""
+        pose = result.T_world_lidar
+        if self._here is not None:
+            self._travelled += float(np.linalg.norm(pose[:3, 3] - self._here[:3, 3]))
+        self._here = pose
+        if result.status != "ok" or not self._is_due(pose):
+            return None
+        self._last = pose
+        self._count += 1
+        return Keyframe(self._count - 1, scan, result.stamp_ns, pose, result.covariance, self._travelled)
+
+    def state(self) -> State:
+        """What `restore` needs to go on from here."""
+        poses = [pose for pose in (self._here, self._last) if pose is not None]
+        counts = np.array([self._count, self._here is not None, self._last is not None], np.int64)
+        return {"counts": counts, "travelled": np.array(self._travelled), "poses": np.array(poses).reshape(-1, 4, 4)}
+
+    def restore(self, state: State) -> None:
+        """Go on where `state` was taken."""
+        count, has_here, has_last = (int(v) for v in state["counts"])
+        poses = list(state["poses"])
+        self._count, self._travelled = count, float(state["travelled"])
+        self._here = poses.pop(0) if has_here else None
+        self._last = poses.pop(0) if has_last else None
+
+    def _is_due(self, pose: NDArray[np.float64]) -> bool:
+        if self._last is None:
+            return True
+        step = se3.relative(self._last, pose)
+        is_far = float(np.linalg.norm(step[:3, 3])) >= self._distance
+        return is_far or float(so3.angle(step[:3, :3])) >= self._angle

@@ -1,0 +1,36 @@
+"""Submaps: the clouds of neighbouring keyframes in one frame."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.geometry import se3
+from lslam.kernels import voxel as voxels
+from lslam.keyframes.store import KeyframeStore
+from lslam.preprocessing.prepare import NO_TIMES
+
+
+def neighbours(count: int, number: int, size: int) -> range:
+    """Numbers of the `size` keyframes about `number` out of `count`; fewer where the run begins or ends.
+
+    >>> neighbours(10, 4, 5), neighbours(10, 0, 5), neighbours(10, 9, 4)
+    (range(2, 7), range(0, 3), range(7, 10))
+    """
+    return range(max(number - size // 2, 0), min(number + (size + 1) // 2, count))
+
+
+def submap(
+    store: KeyframeStore, poses: NDArray[np.float64], number: int, size: int, voxel: float | None = None
+) -> NDArray[np.float32]:
+    """Points (M, 3), m, of the `size` keyframes about keyframe `number`, in its LiDAR frame.
+
+    poses : (K, 4, 4) T_world_lidar of all keyframes, odometry's or optimised ones
+    voxel : m, one averaged point per voxel is left; None leaves all
+    """
+    clouds = [
+        se3.apply(se3.relative(poses[number], poses[k]), store.points(k).astype(np.float64)).astype(np.float32)
+        for k in neighbours(len(store), number, size)
+    ]
+    points = np.concatenate(clouds)
+    return points if voxel is None else voxels.centroids(points, NO_TIMES, voxel)[0]

@@ -1,0 +1,155 @@
+"""Predict, register, correct: the loop between motion prior and odometry."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.geometry import se3, so3
+from lslam.inertial.fusion import InertialMotion
+from lslam.odometry.base import Deskewing, Odometry
+from lslam.registration.motion import ConstantVelocity, MotionModel, middle_of
+from lslam.registration.standing import Standing
+from lslam.types.motion_prior import MotionPrior
+from lslam.types.scan import Scan
+from lslam.types.scan_result import ScanResult
+
+# Half the points of a scan are nearer.
+LEVER_M = 10.0
+
+
+@dataclass(frozen=True)
+class Loaded:
+    """One scan as the background thread leaves it; `error` says why there is none."""
+
+    index: int
+    stamp_ns: int
+    scan: Scan | None = None
+    prepared: Any = None
+    error: str = ""
+    read_s: float = 0.0
+    prepare_s: float = 0.0
+
+
+class Tracker:
+    """Poses of scans, one after the other.
+
+    sweep : how the sensor moved within the last scan, as far as its registration knew
+    middle : instant, ns, and pose of the middle of the last sweep: what its registration knows best
+    """
+
+    # A change of the motion within the sweep that moves no point by more is not worth a second registration.
+    REFINE_M = 0.01
+
+    def __init__(self, odometry: Odometry, standing: Standing | None = None, motion: MotionModel | None = None) -> None:
+        self.odometry, self.standing = odometry, standing
+        self.motion: MotionModel = ConstantVelocity() if motion is None else motion
+        self.sweep = MotionPrior(np.zeros(1), np.eye(4)[None])
+        self.middle = (0, np.eye(4))
+        # The first scan, until a second one tells how fast it was taken.
+        self._first: tuple[Scan, Any, NDArray[np.float64]] | None = None
+
+    def track(self, loaded: Loaded) -> ScanResult:
+        """Pose of the next scan."""
+        scan = loaded.scan
+        if scan is not None and self.standing is not None:
+            result = self._stand_or_move(scan, loaded, self.standing)
+        else:
+            result = self._move(loaded)
+        if self.motion.is_known:
+            self._first = None
+        return result
+
+    def _stand_or_move(self, scan: Scan, loaded: Loaded, standing: Standing) -> ScanResult:
+        began = time.perf_counter()
+        result = standing.result_of(scan)
+        stages = {"standing": time.perf_counter() - began}
+        if result is not None:
+            self.motion.correct(result.stamp_ns, result.T_world_lidar)
+            self.sweep = MotionPrior(np.zeros(1), result.T_world_lidar[None])
+            return replace(result, stages=stages)
+        result = self._move(loaded)
+        began = time.perf_counter()
+        standing.observe(scan, result)
+        stages["standing"] += time.perf_counter() - began
+        return replace(result, stages=stages | result.stages)
+
+    def _move(self, loaded: Loaded) -> ScanResult:
+        scan = loaded.scan
+        span = sweep_seconds(scan)
+        prior = expected = self.motion.sweep(loaded.stamp_ns, span)
+        inertial = self.motion if isinstance(self.motion, InertialMotion) else None
+        steady = None if inertial is None else inertial.coasting.predict(loaded.stamp_ns)
+        if scan is None:
+            result = ScanResult(loaded.index, loaded.stamp_ns, prior.start, "skipped", loaded.error, converged=False)
+        elif isinstance(self.odometry, Deskewing):
+            result, prior = self._register(self.odometry, scan, loaded.prepared, prior)
+        else:
+            result = self.odometry.register(scan, loaded.prepared, prior)
+        is_blind = result.status == "ok" and not isinstance(self.odometry, Deskewing)
+        self.sweep = self.motion.refine(prior, result.stamp_ns, result.T_world_lidar) if is_blind else prior
+        self.motion.correct(result.stamp_ns, result.T_world_lidar, prior, result.status == "ok")
+        pose, instant_ns = middle_of(prior, result.stamp_ns, result.T_world_lidar)
+        self.middle = (instant_ns, pose)
+        found = result.T_world_lidar
+        return replace(
+            result,
+            prior_norm=_matrix_norm(expected.start, found),
+            steady_norm=None if steady is None else _matrix_norm(steady, found),
+            gravity=inertial.gravity_at(found) if inertial is not None and result.status == "ok" else None,
+        )
+
+    def _register(
+        self, odometry: Deskewing, scan: Scan, prepared: Any, prior: MotionPrior
+    ) -> tuple[ScanResult, MotionPrior]:
+        """Register, and again with the motion within the sweep that this found; the prior that was right."""
+        result = odometry.register(scan, prepared, prior)
+        if result.status == "ok" and sweep_seconds(scan) > 0:
+            if self.motion.is_known:
+                better = self.motion.refine(prior, scan.stamp_ns, result.T_world_lidar)
+                if _distance(prior, better) > self.REFINE_M:
+                    prior = better
+                    result = odometry.register(scan, prepared, prior)
+            elif self._first is None:
+                self._first = (scan, prepared, result.T_world_lidar)
+            else:
+                prior = self._begin_again(odometry, *self._first, scan, result)
+                result = odometry.register(scan, prepared, prior)
+        return odometry.update(scan, prepared, prior, result), prior
+
+    def _begin_again(
+        self, odometry: Deskewing, first: Scan, prepared: Any, pose: NDArray[np.float64], scan: Scan, result: ScanResult
+    ) -> MotionPrior:
+        """The first scan was taken at an unknown speed: now that it is known, deskew it and build the map anew.
+
+        The prior of the second scan, whose registration told the speed.
+        """
+        self.motion.correct(scan.stamp_ns, result.T_world_lidar)
+        again = self.motion.sweep(scan.stamp_ns, sweep_seconds(scan))
+        prior = self.motion.rewind(first.stamp_ns, pose, sweep_seconds(first))
+        odometry.restart()
+        odometry.update(first, prepared, prior, odometry.register(first, prepared, prior))
+        return again
+
+
+def sweep_seconds(scan: Scan | None) -> float:
+    """How long the sensor took for the scan, s; 0 when its points belong to one instant."""
+    return 0.0 if scan is None or scan.times is None or len(scan) == 0 else max(float(scan.times.max()), 0.0)
+
+
+def _matrix_norm(prior: NDArray[np.float64], pose: NDArray[np.float64]) -> float:
+    """Error of the motion prior, (4, 4), against registration: the largest singular value of inv(prior) pose - I.
+
+    First thesis, equation 5.1.
+    """
+    return float(np.linalg.norm(se3.relative(prior, pose) - np.eye(4), 2))
+
+
+def _distance(before: MotionPrior, after: MotionPrior) -> float:
+    """How far the motion within a sweep differs at its end, m, at a lever arm of `LEVER_M`."""
+    change = se3.relative(se3.relative(before.start, before.poses[-1]), se3.relative(after.start, after.poses[-1]))
+    return float(np.linalg.norm(change[:3, 3]) + LEVER_M * so3.angle(change[:3, :3]))
