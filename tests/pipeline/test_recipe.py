@@ -183,7 +183,7 @@ def test_a_second_signal_ends_at_once_and_still_says_so(tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt):
         lslam.run(replace(sample(15), on_read=hurry), config("input.threads=1"), out=tmp_path / "out")
     assert manifest(tmp_path / "out")["status"] == "interrupted"
-    assert names(tmp_path / "out") == {"manifest.json", "config.toml", "log.txt"}
+    assert names(tmp_path / "out") == {"manifest.json", "config.toml", "log.txt", "keyframes"}
 
 
 def test_a_disk_that_will_not_hold_the_result(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
