@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from lslam.config.debug import DebugConfig
 from lslam.config.eval import EvalConfig
 from lslam.config.gnss import GnssConfig
 from lslam.config.graph import GraphConfig
@@ -32,3 +33,4 @@ class Config(Section):
     map: MapConfig = MapConfig()
     eval: EvalConfig = EvalConfig()
     report: ReportConfig = ReportConfig()
+    debug: DebugConfig = DebugConfig()

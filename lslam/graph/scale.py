@@ -34,7 +34,14 @@ def accumulated(poses: Floats, odometry: Sequence[Constraint]) -> Floats:
 
 
 def odometry_scale(graph: PoseGraph, loops: Sequence[Constraint]) -> float:
-    """The factor, at least 1, on odometry's covariances with which the median loop is where it should be."""
+    """The factor, at least 1, on odometry's covariances with which the median loop and fix are where they should be."""
+    if not loops and len(graph.fixes) < 2:
+        return 1.0
+    chain = accumulated(graph.poses, graph.odometry)
+    return max(_of_loops(graph, loops, chain), _of_fixes(graph, chain))
+
+
+def _of_loops(graph: PoseGraph, loops: Sequence[Constraint], chain: Floats) -> float:
     if not loops:
         return 1.0
     few = [loops[i] for i in np.unique(np.linspace(0, len(loops) - 1, MOST).round().astype(int))]
@@ -44,11 +51,31 @@ def odometry_scale(graph: PoseGraph, loops: Sequence[Constraint]) -> float:
     odometry = se3.relative(graph.poses[a], graph.poses[b])
     turn = so3.log(T[:, :3, :3] @ np.swapaxes(odometry[:, :3, :3], -1, -2))
     error = np.concatenate([T[:, :3, 3] - odometry[:, :3, 3], turn], axis=1)
-    chain = accumulated(graph.poses, graph.odometry)
     grown = chain[b] - noise.transported(chain[a], graph.poses[b, :3, 3] - graph.poses[a, :3, 3])
     grown = noise.rotated(grown, np.swapaxes(R_a, -1, -2))
-    own = np.stack([c.covariance for c in few])
-    typical = float(chi2.median(6))
+    return _fitting(error, grown, np.stack([c.covariance for c in few]))
+
+
+def _of_fixes(graph: PoseGraph, chain: Floats) -> float:
+    """By pairs of fixes, half the fixes apart: how the way between them differs from odometry's."""
+    half = len(graph.fixes) // 2
+    if not half:
+        return 1.0
+    first = np.unique(np.linspace(0, len(graph.fixes) - half - 1, MOST).round().astype(int))
+    k = np.array([f.keyframe for f in graph.fixes])
+    arms = np.stack([f.arm for f in graph.fixes])
+    antenna = np.einsum("fij,fj->fi", graph.poses[k, :3, :3], arms) + graph.poses[k, :3, 3]
+    off = np.stack([f.position for f in graph.fixes]) - antenna
+    own = np.stack([f.sigma for f in graph.fixes]) ** 2
+    a, b = k[first], k[first + half]
+    grown = chain[b] - noise.transported(chain[a], graph.poses[b, :3, 3] - graph.poses[a, :3, 3])
+    noise_of_pair = (own[first] + own[first + half])[:, :, None] * np.eye(3)
+    return _fitting(off[first + half] - off[first], grown[:, :3, :3], noise_of_pair)
+
+
+def _fitting(error: Floats, grown: Floats, own: Floats) -> float:
+    """The factor on `grown` (P, n, n) with which the median error (P, n) is as large as it should be."""
+    typical = float(chi2.median(error.shape[1]))
 
     def median(scale: float) -> float:
         solved = np.linalg.solve(scale * grown + own, error[..., None])[..., 0]

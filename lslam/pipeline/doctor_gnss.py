@@ -7,7 +7,6 @@ from numpy.typing import NDArray
 
 from lslam.geometry.geodesy import to_local
 from lslam.pipeline.findings import Facts, Finding, plural
-from lslam.types.gnss import GnssStream
 from lslam.types.sequence import Sequence
 
 # No carrier of a LiDAR accelerates more, m/s2; a fix that does not state its sigma is taken to be so good, m.
@@ -19,7 +18,7 @@ def examine_gnss(sequence: Sequence, findings: list[Finding]) -> Facts | None:
     gnss = sequence.gnss
     if gnss is None or not len(gnss):
         return None
-    known = _on_earth(gnss)
+    known = gnss.is_place
     if not known.all():
         what = f"GNSS: {int((~known).sum())} of {len(gnss)} fixes are 0, not finite or not on the Earth"
         findings.append(Finding("gnss-invalid", what, "leave them out; the columns are lat, lon (deg), alt (m)"))
@@ -46,13 +45,6 @@ def examine_gnss(sequence: Sequence, findings: list[Finding]) -> Facts | None:
         "hemisphere": ("N" if fixes[0, 0] >= 0 else "S") + ("E" if fixes[0, 1] >= 0 else "W"),
         "sigma_m": {"median": float(np.median(finite)), "max": float(finite.max())} if len(finite) else None,
     }
-
-
-def _on_earth(gnss: GnssStream) -> NDArray[np.bool_]:
-    """(M,) whether each fix is a place; receivers without one write zeros."""
-    lat, lon = gnss.lat_lon_alt[:, 0], gnss.lat_lon_alt[:, 1]
-    finite = np.isfinite(gnss.lat_lon_alt).all(axis=1)
-    return np.asarray(finite & (np.abs(lat) <= 90) & (np.abs(lon) <= 180) & ((lat != 0) | (lon != 0)))
 
 
 def _examine_jumps(

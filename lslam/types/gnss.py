@@ -21,3 +21,10 @@ class GnssStream:
 
     def __len__(self) -> int:
         return len(self.stamps_ns)
+
+    @property
+    def is_place(self) -> NDArray[np.bool_]:
+        """(M,) whether each fix is a place on the Earth; receivers without one write zeros."""
+        lat, lon = self.lat_lon_alt[:, 0], self.lat_lon_alt[:, 1]
+        finite = np.isfinite(self.lat_lon_alt).all(axis=1)
+        return np.asarray(finite & (np.abs(lat) <= 90) & (np.abs(lon) <= 180) & ((lat != 0) | (lon != 0)))

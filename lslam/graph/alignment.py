@@ -1,0 +1,115 @@
+"""Where a trajectory lies on the Earth: one rigid transform to satellite fixes, most of which are right.
+
+A path on flat ground does not tell its roll about a straight street, and a short one not its tilt: the world's up
+direction is a measurement beside the fixes, which those outweigh as soon as the geometry allows it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+from scipy.stats import chi2
+
+from lslam.geometry import se3, so3
+
+Floats = NDArray[np.float64]
+
+# Pairs of fixes that are tried, and how far apart they have to be at least, as a share of the farthest.
+TRIALS, APART_SHARE = 500, 0.5
+# Fixes that agree, at least: one direction for half of them may be chance.
+MAJORITY = 0.5
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """T_enu_world (4, 4); believed : (F,) bool; residuals : (F, 3) m, east, north, up, of fixes minus trajectory."""
+
+    T_enu_world: Floats
+    believed: NDArray[np.bool_]
+    residuals: Floats
+
+
+def align(
+    antenna: Floats, fixes: Floats, sigmas: Floats, slack: Floats, up: Floats, up_sigma: float, min_fixes: int
+) -> Alignment | None:
+    """Fit the antenna's positions in the world to its fixes; None when fewer than `min_fixes` or half of them agree.
+
+    Parameters
+    ----------
+    antenna : (F, 3) m, in the world of the trajectory; fixes : (F, 3) m, east, north, up; sigmas : (F, 3) m
+    slack : (F,) m that odometry may have drifted by at each, when it is judged
+    up : (3,) unit, up in the world of the trajectory; up_sigma : rad
+    """
+    if len(antenna) < max(min_fixes, 2):
+        return None
+    level = _rotation_between(up, np.array([0.0, 0.0, 1.0]))
+    a = antenna @ level.T
+    tilt = np.linalg.norm(a - np.median(a, axis=0), axis=1) * up_sigma
+    judged = np.sqrt(sigmas**2 + (slack**2 + tilt**2)[:, None])
+    T = _consensus(a, fixes, judged)
+    if T is None:
+        return None
+    # Again: what the first fit, tilted as it may be, leaves out may belong to it after all.
+    for _ in range(3):
+        believed = _fits(T, a, fixes, judged)
+        if believed.sum() < max(min_fixes, MAJORITY * len(a)):
+            return None
+        T = _refined(T, a[believed], fixes[believed], judged[believed], up_sigma)
+    T_enu_world = T @ se3.make(level, np.zeros(3))
+    return Alignment(T_enu_world, believed, fixes - se3.apply(T_enu_world, antenna))
+
+
+def _consensus(a: Floats, fixes: Floats, sigmas: Floats) -> Floats | None:
+    """The heading and place, from two fixes, that most fixes agree with (RANSAC, 4 degrees of freedom)."""
+    rng = np.random.default_rng(0)
+    reach = float(np.linalg.norm(a[:, :2] - np.median(a[:, :2], axis=0), axis=1).max())
+    best: Floats | None = None
+    most = (0, 0.0)
+    for i, j in rng.integers(0, len(a), (TRIALS, 2)):
+        own, seen = a[j] - a[i], fixes[j] - fixes[i]
+        away = float(np.hypot(own[0], own[1]))
+        if away < max(APART_SHARE * reach, 0.5) or not np.isfinite(seen).all():
+            continue
+        R = so3.exp(np.array([0.0, 0.0, np.arctan2(seen[1], seen[0]) - np.arctan2(own[1], own[0])]))
+        T = se3.make(R, 0.5 * (fixes[i] + fixes[j]) - R @ (0.5 * (a[i] + a[j])))
+        # Place and heading come of two noisy fixes about as far apart as the others are from them.
+        count = int(_fits(T, a, fixes, np.sqrt(3) * sigmas).sum())
+        # Of equals the farther pair: its heading is the better one.
+        if (count, away) > most:
+            best, most = T, (count, away)
+    return best
+
+
+def _fits(T: Floats, a: Floats, fixes: Floats, sigmas: Floats) -> NDArray[np.bool_]:
+    with np.errstate(invalid="ignore"):
+        whitened = ((fixes - se3.apply(T, a)) / sigmas) ** 2
+    return np.asarray(np.nan_to_num(whitened.sum(1), nan=np.inf) <= chi2.ppf(0.999, 3))
+
+
+def _refined(T: Floats, a: Floats, fixes: Floats, sigmas: Floats, up_sigma: float) -> Floats:
+    """Least squares over all six degrees of freedom, tilt held by what is known of up."""
+    centre = a.mean(0)
+
+    def moved(x: Floats) -> Floats:
+        R = so3.exp(x[3:]) @ T[:3, :3]
+        t = se3.apply(T, centre[None])[0] + x[:3] - R @ centre
+        return se3.make(R, t)
+
+    def errors(x: Floats) -> Floats:
+        M = moved(x)
+        tilt = M[:2, :3] @ np.array([0.0, 0.0, 1.0]) / up_sigma
+        return np.concatenate([((fixes - se3.apply(M, a)) / sigmas).ravel(), tilt])
+
+    return moved(np.asarray(least_squares(errors, np.zeros(6), loss="soft_l1").x))
+
+
+def _rotation_between(a: Floats, b: Floats) -> Floats:
+    """(3, 3) the smallest turn that takes unit vector `a` to `b`."""
+    axis, cosine = np.cross(a, b), float(a @ b)
+    sine = float(np.linalg.norm(axis))
+    if sine < 1e-12:
+        return np.eye(3) if cosine > 0 else np.diag([1.0, -1.0, -1.0])
+    return so3.exp(axis / sine * np.arctan2(sine, cosine))

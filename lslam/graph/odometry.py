@@ -1,0 +1,122 @@
+"""Odometry as constraints between keyframes, and optimised keyframes as poses of all scans."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.config.graph import GraphConfig
+from lslam.geometry import noise, se3, so3
+from lslam.types.constraint import Constraint
+from lslam.types.keyframe import Keyframe
+from lslam.types.scan_result import ScanResult
+
+Floats = NDArray[np.float64]
+
+# m and rad; what a step is wrong by at the least when a method states no covariance.
+LEAST_M, LEAST_RAD = 1e-3, 1e-4
+
+
+def odometry_constraints(
+    keyframes: Sequence[Keyframe], results: Sequence[ScanResult], config: GraphConfig
+) -> list[Constraint]:
+    """From each keyframe to the next, with what odometry's uncertainty grew by on the way.
+
+    A scan's covariance is that of the local map and that of its registration on it; only the former accumulates
+    (`registration.uncertainty`). Methods without covariances are taken to drift as `config` says of drift.
+    """
+    constraints = []
+    for before, after in pairwise(keyframes):
+        a, b = results[before.scan], results[after.scan]
+        T = se3.relative(a.T_world_lidar, b.T_world_lidar)
+        if config.information == "fitness":
+            covariance = fitness_covariance(b.rmse, config)
+        else:
+            grown = growth(a, b, after.distance - before.distance, config)
+            covariance = noise.rotated(grown, a.T_world_lidar[:3, :3].T)
+        constraints.append(Constraint(before.number, after.number, T, covariance, "odometry"))
+    return constraints
+
+
+def fitness_covariance(rmse: float, config: GraphConfig) -> Floats:
+    """(6, 6) covariance of a registration from its rmse, m, as hdl_graph_slam has it.
+
+    Its fitness score is the mean squared distance; sigma rises from the smaller of two values to the larger with it.
+    """
+    score = min(rmse**2, config.fitness_limit)
+    share = (1 - np.exp(-config.fitness_gain * score)) / (1 - np.exp(-config.fitness_gain * config.fitness_limit))
+    (near_m, far_m), (near_rad, far_rad) = config.fitness_sigma_m, config.fitness_sigma_rad
+    sigma_m, sigma_rad = near_m + (far_m - near_m) * share, near_rad + (far_rad - near_rad) * share
+    return np.diag(np.repeat([sigma_m**2, sigma_rad**2], 3))
+
+
+def growth(a: ScanResult, b: ScanResult, way: float, config: GraphConfig) -> Floats:
+    """(6, 6) covariance, world axes, of what odometry's error grew by from scan `a` to scan `b`, `way` m on."""
+    of_a, of_b = _of_map(a), _of_map(b)
+    if of_a is None or of_b is None:
+        turn = np.deg2rad(config.drift_deg_per_100m) / 100 * way + LEAST_RAD
+        sigma = 0.01 * config.drift_percent * way + LEAST_M
+        return np.diag(np.repeat([sigma**2, turn**2], 3))
+    return positive(of_b - noise.transported(of_a, b.T_world_lidar[:3, 3] - a.T_world_lidar[:3, 3]))
+
+
+def corrected(
+    results: Sequence[ScanResult], keyframes: Sequence[Keyframe], poses: Floats, covariances: Floats, scale: float,
+    config: GraphConfig,
+) -> list[ScanResult]:  # fmt: skip
+    """All scans where the optimised keyframes `poses` (K, 4, 4) put them, with covariances.
+
+    Between two keyframes the correction is interpolated on SE(3) over time, so that no seam shows.
+    covariances : (K, 6, 6) of the keyframes in the world; scale : what odometry's own are multiplied by
+    """
+    scans = np.array([k.scan for k in keyframes])
+    stamps = np.array([k.stamp_ns for k in keyframes], np.int64)
+    moved = np.stack([r.T_world_lidar for r in results])
+    left = np.clip(np.searchsorted(scans, np.arange(len(results)), side="right") - 1, 0, max(len(scans) - 2, 0))
+    right = np.minimum(left + 1, len(scans) - 1)
+    from_left = poses[left] @ se3.relative(moved[scans[left]], moved)
+    from_right = poses[right] @ se3.relative(moved[scans[right]], moved)
+    span = np.maximum((stamps[right] - stamps[left]).astype(np.float64), 1.0)
+    own = np.array([r.stamp_ns for r in results], np.int64)
+    share = np.clip((own - stamps[left]).astype(np.float64) / span, 0.0, 1.0)
+    twist = se3.log(se3.relative(from_left, from_right))
+    final = se3.normalise(from_left @ se3.exp(share[:, None] * twist))
+    out = []
+    for i, result in enumerate(results):
+        k = int(left[i] if share[i] < 0.5 else right[i])
+        S = _covariance(result, results[scans[k]], final[i], moved[i], poses[k], covariances[k], scale, config)
+        out.append(replace(result, T_world_lidar=final[i], covariance=S))
+    return out
+
+
+def positive(covariance: Floats) -> Floats:
+    """The nearest covariance (6, 6) without negative eigenvalues: a difference of two estimates may have some."""
+    scaled = np.array([1.0, 1, 1, 10, 10, 10])
+    values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T) * np.outer(scaled, scaled))
+    return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T / np.outer(scaled, scaled))
+
+
+def _covariance(
+    result: ScanResult, keyframe: ScanResult, final: Floats, moved: Floats, pose: Floats, covariance: Floats,
+    scale: float, config: GraphConfig,
+) -> Floats:  # fmt: skip
+    """(6, 6) of a scan's pose: its keyframe's, what odometry adds between them, and its own registration."""
+    step = final[:3, 3] - pose[:3, 3]
+    first, last = (keyframe, result) if keyframe.stamp_ns <= result.stamp_ns else (result, keyframe)
+    grown = scale * growth(first, last, float(np.linalg.norm(step)), config)
+    if result.registration_covariance is not None:
+        grown = grown + result.registration_covariance
+    turned = noise.rotated(grown, so3.normalise(final[:3, :3] @ moved[:3, :3].T))
+    return np.asarray(noise.transported(covariance, step) + turned)
+
+
+def _of_map(result: ScanResult) -> Floats | None:
+    if result.covariance is None:
+        return None
+    if result.registration_covariance is None:
+        return result.covariance
+    return np.asarray(result.covariance - result.registration_covariance)

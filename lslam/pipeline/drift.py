@@ -1,0 +1,66 @@
+"""`debug.drift`: odometry that runs away on purpose.
+
+A direction fixed in the world, as a tilted start or slipping would give it, and a heading that turns steadily. A scale error
+would be neither seen nor repaired: a loop that is 1 % too large closes as well.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.config.debug import DebugConfig
+from lslam.geometry import noise, se3, so3
+from lslam.types.keyframe import Keyframe
+from lslam.types.scan_result import ScanResult
+
+Floats = NDArray[np.float64]
+
+
+def with_drift(results: Sequence[ScanResult], config: DebugConfig) -> list[ScanResult]:
+    """The results with poses that run away over the way travelled; covariances are turned along, and not enlarged."""
+    poses = np.stack([r.T_world_lidar for r in results])
+    steps = se3.relative(poses[:-1], poses[1:])
+    way = np.linalg.norm(steps[:, :3, 3], axis=1)
+    rng = np.random.default_rng(config.drift_seed)
+    direction = rng.normal(size=3)
+    direction /= np.linalg.norm(direction)
+    side = float(rng.choice([-1.0, 1.0]))
+    turn = side * np.deg2rad(config.drift_deg_per_100m) / 100 * way
+    drifted = [poses[0]]
+    for step, m, rad in zip(steps, way, turn, strict=True):
+        pose = drifted[-1] @ step
+        pose[:3, :3] = so3.exp(np.array([0.0, 0.0, rad])) @ pose[:3, :3]
+        pose[:3, 3] += 0.01 * config.drift_percent * m * direction
+        drifted.append(se3.normalise(pose))
+    return [_moved(result, pose) for result, pose in zip(results, drifted, strict=True)]
+
+
+def moved_keyframes(keyframes: Sequence[Keyframe], results: Sequence[ScanResult]) -> list[Keyframe]:
+    """The keyframes where their scans are now."""
+    return [
+        replace(k, T_world_lidar=results[k.scan].T_world_lidar, covariance=results[k.scan].covariance)
+        for k in keyframes
+    ]
+
+
+def describe(config: DebugConfig) -> str:
+    """For the manifest and the log."""
+    return (
+        f"debug.drift: odometry was made to drift by {config.drift_percent:g} % of the way and "
+        f"{config.drift_deg_per_100m:g} deg/100 m (seed {config.drift_seed}); this run is an experiment"
+    )
+
+
+def _moved(result: ScanResult, pose: Floats) -> ScanResult:
+    R = so3.normalise(pose[:3, :3] @ result.T_world_lidar[:3, :3].T)
+    own, total = result.registration_covariance, result.covariance
+    return replace(
+        result,
+        T_world_lidar=pose,
+        covariance=None if total is None else noise.rotated(total, R),
+        registration_covariance=None if own is None else noise.rotated(own, R),
+    )

@@ -1,0 +1,164 @@
+"""Satellite fixes of a run: where its world lies on the Earth, and positions for the pose graph."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence as Many
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.config.gnss import GnssConfig
+from lslam.config.graph import GraphConfig
+from lslam.errors import InputError
+from lslam.geometry import geodesy, se3, so3
+from lslam.geometry.interpolate import poses_at
+from lslam.graph.alignment import Alignment, align
+from lslam.graph.problem import PositionFix
+from lslam.types.georeference import Georeference
+from lslam.types.gnss import GnssStream
+from lslam.types.keyframe import Keyframe
+from lslam.types.scan_result import ScanResult
+from lslam.types.sequence import Sequence
+
+log = logging.getLogger("lslam")
+Floats = NDArray[np.float64]
+
+# m; of a fix that does not state its sigma.
+UNSTATED = 5.0
+# rad; how far the z axis of a world that nothing levelled may be from up, and of one that an IMU did.
+UNLEVELLED, LEVELLED = np.deg2rad(10.0), np.deg2rad(1.0)
+# A fix so many times farther away than its noise and odometry's drift allow is no measurement that a graph could weigh.
+ABSURD = 20.0
+
+
+@dataclass(frozen=True)
+class Fixes:
+    """The usable fixes of a run, m, and where its odometry has the antenna.
+
+    stamps_ns : (F,); positions : (F, 3) east, north, up from `origin` (3,) lat, lon, height; sigmas : (F, 3)
+    antenna : (F, 3) in the world of odometry; slack : (F,) what odometry may have drifted by
+    """
+
+    stamps_ns: NDArray[np.int64]
+    positions: Floats
+    sigmas: Floats
+    antenna: Floats
+    slack: Floats
+    origin: Floats
+    given: int
+
+
+@dataclass(frozen=True)
+class Placement:
+    """A georeference and, for the graph, the fixes as positions; `problem` says why there is none."""
+
+    georeference: Georeference | None = None
+    fixes: tuple[PositionFix, ...] = ()
+    problem: str = ""
+
+
+def require_gnss(sequence: Sequence, config: GnssConfig) -> None:
+    """Raise InputError when fixes are wanted of a sequence that has none: before odometry, not after."""
+    if config.mode != "off" and (sequence.gnss is None or not len(sequence.gnss)):
+        flag = "--gnss" if config.mode == "graph" else "--georeference"
+        raise InputError(
+            f"{sequence.path} has no satellite fixes: name their file with `gnss` in sequence.toml, or run without {flag}"
+        )
+
+
+def place(
+    sequence: Sequence, results: Many[ScanResult], keyframes: Many[Keyframe], up: Floats | None, config: GnssConfig,
+    drift: GraphConfig,
+) -> Placement:  # fmt: skip
+    """Fit the run's trajectory to its fixes.
+
+    up : (3,) up in the world of the trajectory as an IMU has it, or None; drift : what odometry may be wrong by
+    """
+    stream = sequence.gnss
+    assert stream is not None
+    T_lidar_gnss = sequence.calibration.T_lidar_gnss
+    arm = np.zeros(3) if T_lidar_gnss is None else T_lidar_gnss[:3, 3]
+    fixes = _usable(stream, results, arm, config, drift)
+    if isinstance(fixes, str):
+        return Placement(problem=fixes)
+    direction, sigma = (np.array([0.0, 0, 1.0]), UNLEVELLED) if up is None else (up, LEVELLED)
+    found = align(fixes.antenna, fixes.positions, fixes.sigmas, fixes.slack, direction, sigma, config.min_fixes)
+    if found is None:
+        return Placement(
+            problem=f"GNSS: no place and heading on the Earth fits half of {fixes.given} fixes: all rejected"
+        )
+    georeference, shift = _at_first(found, fixes, config)
+    log.info(
+        "GNSS: %d of %d fixes believed, %.2f m rms from the antenna horizontally, %.2f m vertically",
+        georeference.used, georeference.fixes, georeference.rmse_horizontal, georeference.rmse_vertical,
+    )  # fmt: skip
+    return Placement(georeference, _as_factors(fixes, found, shift, results, keyframes, arm))
+
+
+def _usable(
+    stream: GnssStream, results: Many[ScanResult], arm: Floats, config: GnssConfig, drift: GraphConfig
+) -> Fixes | str:
+    """The fixes taken during the run that are places and claim to be good; why there are too few."""
+    stamps = np.array([r.stamp_ns for r in results], np.int64)
+    stated = np.full(len(stream), config.sigma) if config.sigma is not None else stream.sigma
+    stated = np.maximum(np.where(np.isfinite(stated) & (stated > 0), stated, UNSTATED), config.min_sigma)
+    inside = (stream.stamps_ns >= stamps[0]) & (stream.stamps_ns <= stamps[-1])
+    good = inside & stream.is_place & (stated <= config.max_sigma)
+    given = int(inside.sum())
+    if len(stamps) < 2 or good.sum() < config.min_fixes:
+        return (
+            f"GNSS: {int(good.sum())} of {len(stream)} fixes were taken during the run, are places and state at most "
+            f"{config.max_sigma:g} m; {config.min_fixes} are needed"
+        )
+    poses = np.stack([r.T_world_lidar for r in results])
+    at = poses_at(stamps, poses, stream.stamps_ns[good])
+    origin = np.median(stream.lat_lon_alt[good], axis=0)
+    # Where the projection ends there is no position: far from where most fixes are.
+    with np.errstate(all="ignore"):
+        positions = geodesy.to_local(stream.lat_lon_alt[good], origin)
+    positions[~np.isfinite(positions).all(1)] = 1e9
+    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1))])
+    travelled = np.interp(stream.stamps_ns[good], stamps, way)
+    slack = 0.01 * drift.drift_percent * np.abs(travelled - 0.5 * way[-1])
+    sigmas = stated[good, None] * [1.0, 1.0, config.vertical]
+    antenna = np.einsum("fij,j->fi", at[:, :3, :3], arm) + at[:, :3, 3]
+    return Fixes(stream.stamps_ns[good], positions, sigmas, antenna, slack, origin, given)
+
+
+def _at_first(found: Alignment, fixes: Fixes, config: GnssConfig) -> tuple[Georeference, Floats]:
+    """The georeference with its origin at the first fix that is believed, and the shift that this is, (4, 4)."""
+    first = fixes.positions[int(np.argmax(found.believed))]
+    origin = geodesy.from_local(first[None], fixes.origin)[0]
+    # Meridians converge: the two frames' norths differ by a little turn about up.
+    ahead = geodesy.to_local(geodesy.from_local(first[None] + [[0.0, 1000.0, 0.0]], fixes.origin), origin)[0]
+    R = so3.exp(np.array([0.0, 0.0, np.arctan2(-ahead[0], ahead[1])]))
+    shift = se3.make(R, -R @ first)
+    residuals = found.residuals[found.believed]
+    return Georeference(
+        origin=origin,
+        T_enu_world=shift @ found.T_enu_world,
+        epsg=config.crs,
+        method="graph" if config.mode == "graph" else "fit",
+        fixes=fixes.given,
+        used=int(found.believed.sum()),
+        rmse_horizontal=float(np.sqrt((residuals[:, :2] ** 2).sum(1).mean())),
+        rmse_vertical=float(np.sqrt((residuals[:, 2] ** 2).mean())),
+    ), shift
+
+
+def _as_factors(
+    fixes: Fixes, found: Alignment, shift: Floats, results: Many[ScanResult], keyframes: Many[Keyframe], arm: Floats
+) -> tuple[PositionFix, ...]:
+    """Positions of the antenna as seen from the keyframe before each fix, the absurd ones left out."""
+    near = np.linalg.norm(found.residuals / np.hypot(fixes.sigmas, fixes.slack[:, None]), axis=1) < ABSURD
+    stamps = np.array([k.stamp_ns for k in keyframes], np.int64)
+    owners = np.clip(np.searchsorted(stamps, fixes.stamps_ns, side="right") - 1, 0, None)
+    positions = se3.apply(shift, fixes.positions)
+    out = []
+    for i in np.flatnonzero(near).tolist():
+        keyframe = keyframes[int(owners[i])]
+        seen = se3.apply(se3.inverse(results[keyframe.scan].T_world_lidar), fixes.antenna[i][None])[0]
+        out.append(PositionFix(keyframe.number, positions[i], fixes.sigmas[i], seen))
+    return tuple(out)

@@ -1,0 +1,78 @@
+"""Trajectories fitted to satellite fixes: noise, jumps, mirrors, and paths that say little."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from graph_builders import truth
+
+from lslam.geometry import se3, so3
+from lslam.graph.alignment import align
+
+PATH = truth(200, 2, radius=80.0)[:, :3, 3]
+T_ENU_WORLD = se3.make(so3.from_euler_rpy(np.array([0.04, -0.05, 2.1])), np.array([300.0, -40.0, 7.0]))
+UP = T_ENU_WORLD[2, :3]  # up, in the world of the path
+SIGMAS = np.array([1.0, 1.0, 1.8])
+
+
+def fit(path: np.ndarray, fixes: np.ndarray, up: np.ndarray = UP, up_sigma: float = 0.01):
+    n = len(path)
+    return align(path, fixes, np.tile(SIGMAS, (n, 1)), np.full(n, 0.1), up, up_sigma, 5)
+
+
+def noisy(path: np.ndarray, seed: int = 0) -> np.ndarray:
+    return se3.apply(T_ENU_WORLD, path) + SIGMAS * np.random.default_rng(seed).normal(size=path.shape)
+
+
+def test_noise_averages_out() -> None:
+    found = fit(PATH, noisy(PATH))
+    off = se3.apply(found.T_enu_world, PATH) - se3.apply(T_ENU_WORLD, PATH)
+    assert np.linalg.norm(off[:, :2], axis=1).max() < 0.5
+    assert np.abs(off[:, 2]).max() < 0.8
+    assert found.believed.mean() > 0.98
+
+
+@pytest.mark.parametrize("share", [0.2, 0.45])
+def test_jumps_are_left_out(share: float) -> None:
+    fixes = noisy(PATH, 1)
+    bad = np.arange(200) < 200 * share
+    fixes[bad] += [40.0, -25.0, 3.0]
+    found = fit(PATH, fixes)
+    np.testing.assert_array_equal(found.believed[bad], False)
+    assert found.believed[~bad].mean() > 0.97
+    off = se3.apply(found.T_enu_world, PATH) - se3.apply(T_ENU_WORLD, PATH)
+    assert np.linalg.norm(off[:, :2], axis=1).max() < 1.0
+
+
+def test_tilt_of_a_wide_path_is_found_without_knowing_up() -> None:
+    tilted = se3.make(so3.exp(np.array([0.08, -0.05, 0.0])), np.zeros(3))
+    found = fit(se3.apply(se3.inverse(tilted), PATH), noisy(PATH, 2), np.array([0.0, 0, 1]), np.deg2rad(10))
+    error = so3.angle(found.T_enu_world[:3, :3].T @ T_ENU_WORLD[:3, :3] @ tilted[:3, :3])
+    assert error < np.deg2rad(1.0)
+
+
+def test_a_straight_path_keeps_the_roll_that_up_gives() -> None:
+    line = np.column_stack([np.linspace(0, 150, 100), np.zeros(100), np.zeros(100)])
+    found = fit(line, noisy(line, 3))
+    assert so3.angle(found.T_enu_world[:3, :3].T @ T_ENU_WORLD[:3, :3]) < np.deg2rad(1.5)
+
+
+def test_no_rotation_undoes_a_mirror() -> None:
+    """Fixes with a wrong sign of latitude run the other way round."""
+    assert fit(PATH, noisy(PATH, 4) * [1, -1, 1]) is None
+
+
+@pytest.mark.parametrize("fixes", ["random", "few", "nowhere"])
+def test_fixes_that_agree_on_nothing_fit_nothing(fixes: str) -> None:
+    rng = np.random.default_rng(5)
+    if fixes == "few":
+        assert fit(PATH[:4], noisy(PATH[:4])) is None
+    elif fixes == "random":
+        assert fit(PATH, rng.uniform(-200, 200, PATH.shape)) is None
+    else:
+        assert fit(PATH, np.full(PATH.shape, 1e9)) is None
+
+
+def test_a_sensor_that_stood_has_no_heading() -> None:
+    still = np.zeros((50, 3))
+    assert fit(still, noisy(still, 6)) is None

@@ -1,0 +1,127 @@
+"""From fixes and odometry to a place on the Earth, through pyproj and back."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from stub_sequences import Stub
+
+from lslam.config.gnss import GnssConfig
+from lslam.config.graph import GraphConfig
+from lslam.errors import InputError
+from lslam.geometry import geodesy, se3, so3
+from lslam.pipeline.georeferencing import place, require_gnss
+from lslam.types.calibration import Calibration
+from lslam.types.gnss import GnssStream
+from lslam.types.keyframe import Keyframe
+from lslam.types.scan_result import ScanResult
+
+ORIGIN = np.array([49.0, 8.4, 115.0])
+ARM = np.array([-0.9, 0.1, 0.6])
+COUNT = 400
+PHASE = np.linspace(0, 2 * np.pi, COUNT)
+# A lap of 380 m about a point of the city, and where odometry's world has it: at the first scan.
+POSES = se3.make(
+    so3.from_euler_rpy(np.column_stack([0 * PHASE, 0 * PHASE, PHASE + 0.5 * np.pi])),
+    np.column_stack([60 * np.cos(PHASE) + 200, 60 * np.sin(PHASE) - 90, 0 * PHASE + 3]),
+)
+STAMPS = np.arange(COUNT, dtype=np.int64) * 100_000_000
+RESULTS = [ScanResult(i, int(STAMPS[i]), T) for i, T in enumerate(se3.inverse(POSES[0]) @ POSES)]
+KEYFRAMES = [Keyframe(n, i, int(STAMPS[i]), RESULTS[i].T_world_lidar) for n, i in enumerate(range(0, COUNT, 10))]
+
+
+def recording(noise: float, seed: int = 0) -> Stub:
+    """Fixes at 5 Hz, between scans."""
+    stamps = STAMPS[:-1:2] + 37_000_000
+    share = 0.37
+    middle = POSES[:-1:2, :3, 3] * (1 - share) + POSES[1::2, :3, 3] * share
+    antenna = middle + POSES[:-1:2, :3, :3] @ ARM
+    error = noise * np.random.default_rng(seed).normal(size=antenna.shape) * [1, 1, 1.8]
+    fixes = geodesy.from_local(antenna + error, ORIGIN)
+    calibration = Calibration(T_lidar_gnss=se3.make(np.eye(3), ARM))
+    stream = GnssStream(stamps, fixes, np.full(len(stamps), max(noise, 0.02)))
+    return Stub(["none"] * COUNT, calibration=calibration, gnss=stream)
+
+
+def error_on_earth(found, points: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """(N, 3) m, of points of odometry's world carried to lat, lon, height and back to the city's frame."""
+    world = geodesy.from_local(se3.apply(found.T_enu_world, points), found.origin)
+    return geodesy.to_local(world, ORIGIN) - truth
+
+
+def fit(sequence: Stub, up: np.ndarray | None = None, **settings: object):
+    config = GnssConfig.model_validate({"mode": "fit", **settings})
+    return place(sequence, RESULTS, KEYFRAMES, up, config, GraphConfig())
+
+
+def test_perfect_fixes_give_the_place_to_millimetres() -> None:
+    found = fit(recording(0.0), crs=25832).georeference
+    own = np.stack([r.T_world_lidar[:3, 3] for r in RESULTS])
+    assert np.abs(error_on_earth(found, own, POSES[:, :3, 3])).max() < 5e-3
+    assert (found.fixes, found.used, found.epsg, found.method) == (200, 200, 25832, "fit")
+    # The origin is the first fix: nothing lies far from it.
+    assert np.linalg.norm(geodesy.to_local(found.origin[None], ORIGIN)[0] - POSES[0, :3, 3]) < 2
+
+
+def test_noise_of_a_metre_gives_the_place_to_decimetres() -> None:
+    found = fit(recording(1.0), np.array([0.0, 0, 1])).georeference
+    own = np.stack([r.T_world_lidar[:3, 3] for r in RESULTS])
+    off = error_on_earth(found, own, POSES[:, :3, 3])
+    assert np.sqrt((off[:, :2] ** 2).sum(1).mean()) < 0.3
+    assert 1.2 < found.rmse_horizontal < 1.6  # two axes of 1 m each
+
+
+def test_factors_place_the_antenna_from_their_keyframe() -> None:
+    """Position minus arm, by the true pose of the keyframe, is nothing but the fix's noise."""
+    placement = fit(recording(0.0), mode="graph")
+    T = placement.georeference.T_enu_world
+    assert len(placement.fixes) == 200
+    for fix in placement.fixes:
+        seen = se3.apply(T @ KEYFRAMES[fix.keyframe].T_world_lidar, fix.arm[None])[0]
+        np.testing.assert_allclose(seen, fix.position, atol=1e-2)
+
+
+def bad(name: str) -> Stub:
+    sequence = recording(0.5)
+    stream = sequence.gnss
+    places, sigma = stream.lat_lon_alt.copy(), stream.sigma.copy()
+    if name == "zeros":
+        places[:] = 0
+    elif name == "hemisphere":
+        places[:, 0] *= -1
+    elif name == "sigma":
+        sigma[:] = 500.0
+    elif name == "random":
+        places[:, :2] += np.random.default_rng(1).normal(size=(len(places), 2)) * 0.01
+    elif name == "apart":
+        return replace(sequence, gnss=replace(stream, stamps_ns=stream.stamps_ns + 10**12))
+    return replace(sequence, gnss=replace(stream, lat_lon_alt=places, sigma=sigma))
+
+
+@pytest.mark.parametrize("name", ["zeros", "hemisphere", "sigma", "random", "apart"])
+def test_fixes_that_are_all_bad_are_refused_with_a_reason(name: str) -> None:
+    placement = fit(bad(name))
+    assert placement.georeference is None
+    assert placement.problem.startswith("GNSS: ")
+
+
+def test_some_bad_fixes_do_not_matter() -> None:
+    """Zeros, another hemisphere, a jump of 50 m: an eighth of all each."""
+    sequence = recording(0.3)
+    places = sequence.gnss.lat_lon_alt.copy()
+    places[::8] = 0
+    places[1::8, 0] *= -1
+    places[25:50, 1] += 7e-4
+    found = fit(replace(sequence, gnss=replace(sequence.gnss, lat_lon_alt=places))).georeference
+    own = np.stack([r.T_world_lidar[:3, 3] for r in RESULTS])
+    off = error_on_earth(found, own, POSES[:, :3, 3])
+    assert np.sqrt((off[:, :2] ** 2).sum(1).mean()) < 0.3
+    assert found.used < 0.7 * found.fixes
+
+
+def test_a_recording_without_fixes_is_told_before_the_run() -> None:
+    with pytest.raises(InputError, match="--georeference"):
+        require_gnss(replace(recording(0.1), gnss=None), GnssConfig(mode="fit"))
+    require_gnss(replace(recording(0.1), gnss=None), GnssConfig())
