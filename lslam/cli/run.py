@@ -163,8 +163,8 @@ def _print_result(outcome: RunOutcome, out: Path, as_json: bool) -> None:
         return
     import json
 
-    from lslam.reports.evaluation_json import to_document
+    from lslam.reports.evaluation_json import run_document
 
-    score = None if outcome.evaluation is None else to_document(outcome.evaluation)
+    score = run_document(outcome.record, outcome.evaluation)
     document = {"folder": str(out), "manifest": outcome.record.manifest, "evaluation": score}
     show(json.dumps(document, default=str, allow_nan=False) + "\n")

@@ -10,7 +10,7 @@ from lslam.config import Config
 from lslam.errors import InputError
 from lslam.kernels import jit
 from lslam.keyframes.store import KeyframeStore
-from lslam.maps import merge
+from lslam.maps import crispness, merge
 from lslam.odometry.base import Odometry
 from lslam.pipeline import inertial_start
 from lslam.pipeline.front_end import estimate, is_diverged, to_trajectory
@@ -77,6 +77,7 @@ def _warm_up(
             standing.warm_up()
         if config.map.write:
             merge.warm_up()
+            crispness.warm_up()
         if config.imu.use:
             inertial_start.warm_up()
         with suppress(InputError):

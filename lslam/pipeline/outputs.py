@@ -19,7 +19,7 @@ from lslam.pipeline import map_files
 from lslam.pipeline.feature_pass import FeatureCloud
 from lslam.pipeline.map_files import MapNote
 from lslam.pipeline.run_folder import RunFolder
-from lslam.reports.evaluation_json import to_document
+from lslam.reports.evaluation_json import run_document
 from lslam.reports.facts import stage_matrix
 from lslam.types.calibration import Calibration
 from lslam.types.georeference import Georeference
@@ -98,10 +98,11 @@ def write_feature_map(folder: RunFolder, features: FeatureCloud) -> None:
     )  # fmt: skip
 
 
-def write_evaluation(folder: RunFolder, evaluation: Evaluation | None) -> None:
-    """evaluation.json, when ground truth is known."""
-    if evaluation is not None:
-        text = json.dumps(to_document(evaluation), indent=2, allow_nan=False, ensure_ascii=False)
+def write_evaluation(folder: RunFolder, record: RunRecord, evaluation: Evaluation | None) -> None:
+    """evaluation.json, when ground truth or a map is known."""
+    document = run_document(record, evaluation)
+    if document is not None:
+        text = json.dumps(document, indent=2, allow_nan=False, ensure_ascii=False)
         folder.write_text("evaluation.json", text + "\n")
 
 

@@ -9,6 +9,7 @@ from lslam.config import Config
 from lslam.errors import GateError, InterruptedRunError, LslamError, OutputError, RunFailedError
 from lslam.evaluation.evaluate import Evaluation, evaluate
 from lslam.keyframes.store import KeyframeStore
+from lslam.maps.crispness import crispness
 from lslam.odometry import create_odometry
 from lslam.odometry.base import FeatureSource, Odometry
 from lslam.pipeline import outputs
@@ -79,8 +80,9 @@ def run(
                 outputs.write_trajectories(folder, record, chosen.calibration)
                 outputs.write_scans(folder, record)
                 evaluation = _score(record, chosen, config)
-                outputs.write_evaluation(folder, evaluation)
+                outputs.write_evaluation(folder, record, evaluation)
                 _map(folder, chosen, record, config, manifest, watch)
+                outputs.write_evaluation(folder, record, evaluation)  # now with the map's crispness
                 _feature_map(folder, chosen, odometry, record, config, manifest, watch)
                 _report(folder, record, evaluation, config, manifest)
             except BaseException as error:
@@ -137,6 +139,7 @@ def _map(
             manifest.interrupt("interrupted while the map was built: there is no map")
             return
         record.map_image, record.map_extent = built.image, built.extent
+        record.crispness = crispness(built.merged)
         outputs.write_map(folder, built.merged, config.map, sequence.name)
     manifest.map_points = len(built.merged)
 

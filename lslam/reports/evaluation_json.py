@@ -10,6 +10,8 @@ Version 1, one estimate:
     rpe[]         {recipe, delta, unit, pairs, n_pairs, note, translation{..} (m), rotation_deg{..}}
     kitti_drift   {recipe, available, note, translation_percent, rotation_deg_per_100m, segments, by_length.<m>{..}}
     thesis1, thesis2, timing
+    map           {recipe, entropy (nats), plane_variance (m2), plane_thickness_m, ..}, of runs with a map; without ground truth
+                  it stands alone behind schema, version, lslam and estimate
 
 Several estimates: {schema, version, evaluations: [the above, ...]}.
 """
@@ -25,6 +27,8 @@ from typing import Any
 from lslam.evaluation.results import AbsoluteError, Evaluation, KittiDrift, RelativeError
 from lslam.evaluation.statistics import Statistics
 from lslam.evaluation.timing import Timing
+from lslam.types.map_score import Crispness
+from lslam.types.run_record import RunRecord
 from lslam.version import __version__
 
 SCHEMA, VERSION = "lslam-evaluation", 1
@@ -59,6 +63,26 @@ def to_document(evaluation: Evaluation, timing: Timing | None = None) -> Documen
         "timing": None if timing is None else {"recipe": "s per scan, from timing.csv", **asdict(timing)},
     }
     plain = strict(document)
+    assert isinstance(plain, dict)
+    return plain
+
+
+def run_document(record: RunRecord, evaluation: Evaluation | None) -> Document | None:
+    """What a run says of itself: the evaluation, and how crisp its map is; None when neither is known."""
+    if evaluation is None and record.crispness is None:
+        return None
+    document: Document = {"schema": SCHEMA, "version": VERSION, "lslam": __version__, "estimate": record.method}
+    if evaluation is not None:
+        document = to_document(evaluation)
+    if record.crispness is not None:
+        document["map"] = crispness_document(record.crispness)
+    return document
+
+
+def crispness_document(score: Crispness) -> Document:
+    """The crispness of a map as plain values."""
+    thickness = None if score.plane_variance is None else math.sqrt(score.plane_variance)
+    plain = strict({"recipe": score.recipe, **asdict(score), "plane_thickness_m": thickness})
     assert isinstance(plain, dict)
     return plain
 

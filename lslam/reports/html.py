@@ -12,6 +12,7 @@ from lslam.reports import plots
 from lslam.reports.facts import RunFacts, run_facts
 from lslam.reports.metrics import counted, metres, metric_tables
 from lslam.reports.png import data_uri, density_png
+from lslam.types.map_score import Crispness
 from lslam.types.run_record import RunRecord
 from lslam.version import __version__
 
@@ -56,7 +57,7 @@ def render_report(record: RunRecord, evaluation: Evaluation | None) -> str:
         record=record,
         facts=facts,
         version=__version__,
-        cards=_cards(facts, evaluation),
+        cards=_cards(facts, evaluation, record.crispness),
         failures=facts.failures[:MOST_ROWS],
         degenerate=facts.degenerate[:MOST_ROWS],
         evaluation=evaluation,
@@ -123,7 +124,7 @@ def _plain(value: Any) -> str:
     return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
-def _cards(facts: RunFacts, evaluation: Evaluation | None) -> list[Card]:
+def _cards(facts: RunFacts, evaluation: Evaluation | None, crispness: Crispness | None = None) -> list[Card]:
     cards = [
         Card(f"{facts.registered}/{facts.scans}", "", "scans registered"),
         Card(f"{facts.path_length:.1f}", "m", f"path in {facts.duration:.1f} s"),
@@ -137,6 +138,10 @@ def _cards(facts: RunFacts, evaluation: Evaluation | None) -> list[Card]:
             cards.append(
                 Card(f"{drift.translation_percent:.2f}", "%", f"KITTI drift, {counted(drift.segments, 'segment')}")
             )
+    if crispness is not None and crispness.entropy is not None:
+        cards.append(Card(f"{crispness.entropy:.2f}", "", "map entropy: lower is crisper"))
+    if crispness is not None and crispness.plane_variance is not None:
+        cards.append(Card(f"{100 * crispness.plane_variance**0.5:.1f}", "cm", "thickness of planes in the map"))
     if facts.total is not None:
         cards.append(Card(f"{1e3 * facts.total.median:.1f}", "ms", "median time per scan"))
         if facts.real_time_factor:

@@ -32,6 +32,7 @@ def summary(record: RunRecord, evaluation: Evaluation | None) -> str:
     rows.append(("path", f"{facts.path_length:.1f} m in {facts.duration:.1f} s"))
     rows += _imu_rows(record)
     rows += _score_rows(record, evaluation)
+    rows += _map_rows(record)
     rows += _time_rows(record, facts)
     rows += [(name, str(record.folder / file)) for name, file in FILES if (record.folder / file).is_file()]
     lines = [f"{record.name}, {record.method}"] + [f"  {name:<12} {value}" for name, value in rows]
@@ -92,6 +93,15 @@ def _score_rows(record: RunRecord, evaluation: Evaluation | None) -> list[tuple[
     rows.append(("thesis1", f"{metres(first.thesis_rmse)} m (thesis_rmse, sqrt(sum|e|²/3N), origin alignment)"))
     rows.append(("thesis2", f"ATE {metres(second.ate_mean)} ± {metres(second.ate_std)} m (planar, mean ± std)"))
     return rows
+
+
+def _map_rows(record: RunRecord) -> list[tuple[str, str]]:
+    """How crisp the map is: what tells methods apart where no truth is known."""
+    score = record.crispness
+    if score is None or score.entropy is None or score.plane_variance is None:
+        return []
+    thickness = f"planes {metres(score.plane_variance**0.5)} m thick (root of the mean plane variance)"
+    return [("crispness", f"map entropy {score.entropy:.3f}, {thickness}; {score.radius:g} m, lower is crisper")]
 
 
 def _absolute(error: AbsoluteError, evaluation: Evaluation) -> str:

@@ -76,10 +76,13 @@ def _times(timing: Timing) -> dict[str, float]:
 
 def _add_errors(path: Path, manifest: dict[str, Any], values: dict[str, float]) -> str:
     """Errors of evaluation.json into `values`; the reason when there are none."""
-    if not path.is_file():
+    score = _read_json(path) if path.is_file() else {}
+    for key in ("entropy", "plane_variance"):
+        if score.get("map", {}).get(key) is not None:
+            values[f"map.{key}"] = float(score["map"][key])
+    if "ate" not in score:
         said = [str(p) for p in manifest.get("problems", []) if str(p).startswith("not scored")]
         return said[0] if said else NO_TRUTH
-    score = _read_json(path)
     for name, error in score["ate"].items():
         if error["available"]:
             values[f"ate.{name}"] = error["rmse"]
@@ -146,6 +149,7 @@ def _for_programs(
     ]
     metrics += [more(f"{rpe_key(*delta)}.rotation", "deg") for delta in deltas]
     metrics += [more("drift.rotation", "deg/100m"), more("thesis_rmse", "m"), more("path", "m")]
+    metrics += [more("map.entropy", "nats"), more("map.plane_variance", "m2")]
     metrics += [more(f"time.{name}.p95", "ms", "time") for name in stages]
     metrics += [more(key, unit, "time") for key, unit in (("time.mean", "ms"), ("time.max", "ms"), ("run_s", "s"))]
     counts = (("scans", "scans"), ("ok", "scans"), ("over_limit", "scans"), ("memory", "MB"), (IMU, "0 or 1"))

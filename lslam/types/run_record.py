@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.types.map_score import Crispness
 from lslam.types.scan_result import ScanResult
 from lslam.types.trajectory import Trajectory
 
@@ -18,7 +19,7 @@ class RunRecord:
     """One run, for reports. `manifest` is the dictionary written as manifest.json.
 
     map_image : (H, W) float32 density of the merged map seen from above, row 0 at the largest y, or None
-    map_extent : (x_min, x_max, y_min, y_max), m
+    map_extent : (x_min, x_max, y_min, y_max), m; crispness : of the merged map, None without one
     real_time_limit : seconds one scan may take: skip_frames / rate
     """
 
@@ -32,4 +33,5 @@ class RunRecord:
     manifest: dict[str, Any] = field(default_factory=dict)
     map_image: NDArray[np.float32] | None = None
     map_extent: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
+    crispness: Crispness | None = None
     problems: list[str] = field(default_factory=list)

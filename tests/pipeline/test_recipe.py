@@ -22,6 +22,7 @@ from lslam.pipeline import run as recipe
 from lslam.pipeline.watch import RunOutcome, Watch
 from lslam.types.scan import Scan
 
+ONLY_MAP = {"schema", "version", "lslam", "estimate", "map"}  # of evaluation.json without ground truth
 ALL = {
     "trajectory.tum", "trajectory_kitti.txt", "covariances.npz", "map.ply", "map.json", "timing.csv", "scans.csv",
     "manifest.json", "config.toml", "log.txt", "evaluation.json", "report.html", "keyframes",
@@ -222,7 +223,8 @@ def test_fewer_poses_than_a_score_needs(tmp_path: Path, count: int) -> None:
     assert facts["status"] == "degraded"
     assert "not scored" in facts["problems"][0]
     assert f"{count} poses" in facts["problems"][0]
-    assert names(tmp_path / "out") == ALL - {"evaluation.json"}
+    assert names(tmp_path / "out") == ALL
+    assert set(json.loads((tmp_path / "out" / "evaluation.json").read_text())) == ONLY_MAP
     assert "not scored" in (tmp_path / "out" / "report.html").read_text()
 
 
@@ -233,7 +235,7 @@ def test_truth_that_shares_no_time_leaves_the_run_done_without_a_score(tmp_path:
     outcome = lslam.run(stub, out=tmp_path / "out", ground_truth=late)
     assert outcome.evaluation is None
     assert "1000.000" in manifest(tmp_path / "out")["problems"][0], "both time ranges are named"
-    assert "evaluation.json" not in names(tmp_path / "out")
+    assert set(json.loads((tmp_path / "out" / "evaluation.json").read_text())) == ONLY_MAP
 
 
 def test_values_are_checked_before_any_scan_is_read(tmp_path: Path) -> None:

@@ -109,3 +109,22 @@ def test_stages_differ_between_scans(make_record: MakeRecord) -> None:
 
 def test_degenerate_directions_are_named() -> None:
     assert describe(np.array([[0, 0, -1.0, 0, 0, 0], [0, 0.1, 0, 0.9, 0, 0]])) == "along z, about x"
+
+
+def test_crispness_is_stated_with_and_without_truth(make_record: MakeRecord) -> None:
+    from lslam.reports.evaluation_json import run_document
+    from lslam.types.map_score import Crispness
+
+    record = make_record(5)
+    assert run_document(record, None) is None
+    assert "crispness" not in summary(record, None)
+    record = replace(record, crispness=Crispness(-4.21, 0.0009, 480, 500, 1000, 0.5, 10))
+    assert "map entropy -4.210, planes 0.030" in summary(record, None)
+    document = run_document(record, None)
+    assert document is not None
+    assert "ate" not in document
+    assert document["map"]["entropy"] == -4.21
+    assert abs(document["map"]["plane_thickness_m"] - 0.03) < 1e-12
+    assert "480 neighbourhoods of 0.5 m" in document["map"]["recipe"]
+    empty = replace(record, crispness=Crispness(None, None, 0, 0, 0, 0.5, 10))
+    assert "crispness" not in summary(empty, None)

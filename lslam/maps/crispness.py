@@ -1,0 +1,86 @@
+"""Map crispness without ground truth: mean map entropy and mean plane variance, computed slab by slab."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.errors import UsageError
+from lslam.maps.merge import MergedMap
+from lslam.types.cloud import ArrayCloud, Cloud, in_memory
+from lslam.types.map_score import Crispness
+
+Floats = NDArray[np.float64]
+
+RADIUS = 0.5  # m
+LEAST = 10  # points in a neighbourhood
+SAMPLES = 50_000
+
+
+def crispness(cloud: Cloud, radius: float = RADIUS, least: int = LEAST, samples: int = SAMPLES) -> Crispness:
+    """Score a map; a merged one of any size in little memory, any other is sorted in memory first.
+
+    Parameters
+    ----------
+    radius : of a neighbourhood, m; least : points it must have, at least 4
+    samples : about so many points, evenly spread over the cloud, are asked for their neighbourhoods
+
+    Raises
+    ------
+    UsageError : a radius or numbers that make no sense
+
+    Examples
+    --------
+    >>> crispness(ArrayCloud.of([[0, 0, 0]])).entropy is None
+    True
+    """
+    from lslam.kernels.crispness import cell_keys, shapes
+
+    if not (np.isfinite(radius) and radius > 0) or least < 4 or samples < 1:
+        raise UsageError(f"radius {radius} and at least {least} points: a radius above 0 m and 4 points or more")
+    step = max(1, -(-len(cloud) // samples))
+    total, used, sampled = np.zeros(2), 0, 0
+    for points, queries in _slabs(cloud, radius, step):
+        low = points.min(0)
+        keys = cell_keys(points, low, radius)
+        order = np.argsort(keys, kind="stable")
+        found = shapes(points[order], keys[order], queries, low, radius, least)
+        good = found[np.isfinite(found[:, 0])]
+        total += good.sum(0)
+        used += len(good)
+        sampled += len(queries)
+    entropy, variance = (float(v) / used for v in total) if used else (None, None)
+    return Crispness(entropy, variance, used, sampled, len(cloud), radius, least)
+
+
+def _slabs(cloud: Cloud, radius: float, step: int) -> Iterator[tuple[Floats, Floats]]:
+    """Every `step`-th point of the cloud once, with all points of a slab of x that holds its neighbourhood."""
+    slack = 0.0
+    if isinstance(cloud, MergedMap):
+        slack = cloud.voxel  # its points are sorted by the voxel of x
+    else:
+        points = in_memory(cloud).points
+        points = points[np.isfinite(points).all(1)]
+        cloud = ArrayCloud(points[np.argsort(points[:, 0], kind="stable")])
+    kept, waiting, seen = np.zeros((0, 3)), np.zeros((0, 3)), 0
+    for block in cloud.blocks():
+        kept = np.concatenate([kept, block.points])
+        waiting = np.concatenate([waiting, block.points[-seen % step :: step]])
+        seen += len(block)
+        # What comes after this block lies beyond `edge`.
+        edge = float(block.points[-1, 0]) - slack
+        ready = waiting[:, 0] <= edge - radius
+        if seen == len(cloud):
+            ready[:] = True
+        if ready.any():
+            yield kept, waiting[ready]
+            waiting = waiting[~ready]
+            first = min(float(waiting[:, 0].min()), edge) if len(waiting) else edge
+            kept = kept[kept[:, 0] >= first - radius - slack]
+
+
+def warm_up() -> None:
+    """Compile or load the kernels, so that a caller can do it under the compile lock."""
+    crispness(ArrayCloud.of(np.random.default_rng(0).random((8, 3))), least=4)
