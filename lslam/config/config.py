@@ -10,6 +10,7 @@ from lslam.config.imu import ImuConfig
 from lslam.config.input import InputConfig
 from lslam.config.keyframes import KeyframesConfig
 from lslam.config.loam import LoamConfig
+from lslam.config.loops import LoopsConfig
 from lslam.config.map import MapConfig
 from lslam.config.odometry import OdometryConfig
 from lslam.config.preprocess import PreprocessConfig
@@ -28,6 +29,7 @@ class Config(Section):
     loam: LoamConfig = LoamConfig()
     imu: ImuConfig = ImuConfig()
     keyframes: KeyframesConfig = KeyframesConfig()
+    loops: LoopsConfig = LoopsConfig()
     graph: GraphConfig = GraphConfig()
     gnss: GnssConfig = GnssConfig()
     map: MapConfig = MapConfig()

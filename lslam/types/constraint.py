@@ -32,7 +32,7 @@ class LoopCandidate:
 
     a : the older keyframe; b : the newer one
     distance : m between their odometry positions; descriptor_distance : 0 (alike) to 1, of Scan Context; NaN without
-    stage : what decided: `descriptor`, `gate`, `registration`, `overlap`, `agreement`, `consistency`, `graph`, `thinned`
+    stage : what decided: `thinned`, `registration`, `overlap`, `ambiguity`, `agreement`, `gate`, `consistency`, `graph`
     reason : why it was rejected, one clause; empty when accepted
     constraint : the measured loop closure, also of one that was rejected after registration
     """

@@ -1,0 +1,54 @@
+"""Section `loops`: when a place counts as seen before."""
+
+from __future__ import annotations
+
+from pydantic import Field
+
+from lslam.config.section import Section
+
+
+class LoopsConfig(Section):
+    """Candidates by Scan Context and odometry, verified by registration of submap to submap."""
+
+    use: bool = Field(True, description="look for places seen before and close loops there")
+    radius: float | None = Field(
+        None,
+        gt=0,
+        description="m; keyframes within this distance by odometry are candidates; absent: within 8 m and what odometry "
+        "may be wrong by",
+    )
+    sigmas: float = Field(
+        3.0, gt=0, description="odometry is trusted to be wrong by at most so many standard deviations"
+    )
+    drift_percent: float = Field(
+        0.5,
+        ge=0,
+        description="% of the distance travelled that odometry may be wrong by, one standard deviation, beside its own "
+        "covariance, which knows of no systematic errors",
+    )
+    drift_deg: float = Field(0.25, ge=0, description="deg per 100 m, likewise for rotation")
+    min_travel: float = Field(30.0, gt=0, description="m travelled before a keyframe can be seen again")
+    spacing: float = Field(8.0, ge=0, description="m travelled between one loop closure that is tried and the next")
+    rings: int = Field(20, ge=4, description="Scan Context: rings of the polar image (Kim and Kim 2018)")
+    sectors: int = Field(60, ge=8, description="Scan Context: sectors of the polar image")
+    reach: float = Field(80.0, gt=0, description="m; Scan Context: radius of the polar image")
+    max_descriptor_distance: float = Field(
+        0.4, gt=0, le=1, description="Scan Context distance, 0 alike to 1, above which two places are different"
+    )
+    max_iterations: int = Field(30, ge=1, description="Gauss-Newton steps of a verification")
+    max_rmse: float = Field(0.3, gt=0, description="m; distance of the points to the other submap's surfaces, at most")
+    min_overlap: float = Field(
+        0.5, ge=0, le=1, description="share of each submap's points that must lie on surfaces of the other"
+    )
+    max_ambiguity: float = Field(
+        0.75,
+        gt=0,
+        le=1,
+        description="a place elsewhere that odometry allows and that fits this much as well makes a closure ambiguous",
+    )
+    max_disagreement_m: float = Field(
+        0.2, gt=0, description="m; registration of old to new may differ from that of new to old by so much"
+    )
+    max_disagreement_deg: float = Field(0.5, gt=0, description="deg; likewise for rotation")
+    sigma_m: float = Field(0.01, gt=0, description="m; a loop closure is never more certain than this")
+    sigma_deg: float = Field(0.02, gt=0, description="deg; likewise for rotation")

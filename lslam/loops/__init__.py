@@ -1,0 +1,1 @@
+"""Places seen before: candidates, verification, loop closures."""

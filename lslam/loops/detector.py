@@ -1,0 +1,211 @@
+"""Loop closures of a run: which keyframes may show the same place, and which do."""
+
+from __future__ import annotations
+
+import logging
+from collections import OrderedDict
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.config.loops import LoopsConfig
+from lslam.config.registration import RegistrationConfig
+from lslam.geometry import se3, so3
+from lslam.keyframes.store import KeyframeStore
+from lslam.keyframes.submaps import submap
+from lslam.loops.doubt import Doubt, OdometryDoubt
+from lslam.loops.place import Place, make_place
+from lslam.loops.scan_context import PlaceIndex, PlaceMatch
+from lslam.loops.verify import Comparison, Verifier
+from lslam.types.constraint import Constraint, LoopCandidate
+from lslam.types.keyframe import Keyframe
+
+log = logging.getLogger("lslam")
+
+Floats = NDArray[np.float64]
+Points = NDArray[np.float32]
+
+# m; two passes of a street lie so far apart at most.
+NEAR = 8.0
+# m and rad that odometry may be wrong by at the least: what two registrations of the same place differ by.
+LEAST_REACH, LEAST_TURN = 1.0, np.deg2rad(2.0)
+# rad between the turns that are searched; beyond the widest, those round the descriptor's own are.
+TURN_STEP, WIDEST_TURN = np.deg2rad(2.0), np.deg2rad(20.0)
+# Candidates that are registered per keyframe, and places kept ready.
+TRIED, KEPT = 2, 16
+
+
+def find_loops(
+    store: KeyframeStore, config: LoopsConfig, registration: RegistrationConfig, submap_size: int = 5
+) -> list[LoopCandidate]:
+    """Loop candidates of a run in the order of the newer keyframe, with verdicts.
+
+    store : the run's keyframes with odometry's poses, their covariances and the distance travelled
+    submap_size : keyframes whose clouds make one submap (`keyframes.submap_size`)
+
+    An accepted candidate carries its constraint, T_a_b between LiDAR frames.
+    """
+    poses = np.array([keyframe.T_world_lidar for keyframe in store.keyframes]).reshape(-1, 4, 4)
+    detector = Detector(
+        store.keyframes, lambda number: submap(store, poses, number, submap_size), config, registration
+    )  # fmt: skip
+    candidates = detector.find()
+    accepted = sum(c.verdict == "accepted" for c in candidates)
+    tried = sum(c.stage != "thinned" for c in candidates)
+    log.info("loops: %d closed of %d candidates, %d keyframes", accepted, tried, len(store))
+    return candidates
+
+
+class Detector:
+    """Looks for loop closures among keyframes.
+
+    keyframes : all of the run, in order
+    cloud : gives the submap about a keyframe, (M, 3) m, in its LiDAR frame
+    """
+
+    def __init__(
+        self,
+        keyframes: Sequence[Keyframe],
+        cloud: Callable[[int], Points],
+        config: LoopsConfig,
+        registration: RegistrationConfig,
+    ) -> None:
+        self.keyframes, self.cloud, self.config, self.registration = keyframes, cloud, config, registration
+        self.doubt = OdometryDoubt(keyframes, config.drift_percent, config.drift_deg)
+        self.index = PlaceIndex(config.rings, config.sectors, config.reach)
+        self.verifier = Verifier(config, registration)
+        self._places: OrderedDict[int, Place] = OrderedDict()
+
+    def find(self) -> list[LoopCandidate]:
+        """All candidates in the order of the newer keyframe, with verdicts."""
+        candidates: list[LoopCandidate] = []
+        tried_at = -np.inf
+        for b, keyframe in enumerate(self.keyframes):
+            older = self._gated(b)
+            if len(older) == 0:
+                continue
+            if keyframe.distance - tried_at < self.config.spacing:
+                candidates.append(self._thinned(older, b))
+                continue
+            tried_at = keyframe.distance
+            for match in self._choose(b, older):
+                candidates.append(self._examine(match, b))
+                if candidates[-1].verdict == "accepted":
+                    break
+        return candidates
+
+    def _gated(self, b: int) -> NDArray[np.int64]:
+        """Older keyframes that odometry allows to be the same place as `b`: near it, but not on the way just travelled."""
+        travelled = self.doubt.distances[b] - self.doubt.distances[:b]
+        older: NDArray[np.int64] = np.flatnonzero(travelled >= self.config.min_travel)
+        if len(older) == 0:
+            return older
+        away = np.linalg.norm(self.doubt.positions[older] - self.doubt.positions[b], axis=1)
+        if self.config.radius is not None:
+            return np.asarray(older[away <= self.config.radius])
+        limit = NEAR + self.config.sigmas * self.doubt.between(b, older[:1]).reach[0]
+        older, away = older[away <= limit], away[away <= limit]
+        reach = self.doubt.between(b, older).reach
+        return np.asarray(older[away <= NEAR + self.config.sigmas * reach])
+
+    def _thinned(self, older: NDArray[np.int64], b: int) -> LoopCandidate:
+        a = self._nearest(older, b)
+        said = f"the last one tried was less than {self.config.spacing:g} m ago"
+        return LoopCandidate(a, b, self._away(a, b), float("nan"), "rejected", "thinned", said)
+
+    def _nearest(self, older: NDArray[np.int64], b: int) -> int:
+        away = np.linalg.norm(self.doubt.positions[older] - self.doubt.positions[b], axis=1)
+        return int(older[away.argmin()])
+
+    def _away(self, a: int, b: int) -> float:
+        return float(np.linalg.norm(self.doubt.positions[b] - self.doubt.positions[a]))
+
+    def _choose(self, b: int, older: NDArray[np.int64]) -> list[PlaceMatch]:
+        """The candidates worth a registration: what looks alike, and what odometry says is nearest.
+
+        Where odometry is nearly certain, its nearest comes first.
+        """
+        for number in (b, *older):
+            if int(number) not in self.index:
+                self.index.add(int(number), self._level(int(number)))
+        turn = self._turn(self.doubt.between(b, older[:1]))
+        matches = self.index.nearest(b, older, turn)
+        near = self._nearest(older, b)
+        by_odometry = next((m for m in matches if m.number == near), PlaceMatch(near, float("nan"), 0.0))
+        alike = [m for m in matches[:1] if m.distance <= self.config.max_descriptor_distance]
+        is_certain = self._reach(self.doubt.between(b, np.array([near]))) < NEAR
+        ordered = [by_odometry, *alike] if is_certain else [*alike, by_odometry]
+        apart = [m for m in ordered[1:] if self._away(m.number, ordered[0].number) > NEAR / 2]
+        return [ordered[0], *apart][:TRIED]
+
+    def _examine(self, match: PlaceMatch, b: int) -> LoopCandidate:
+        """Register keyframe `b` on the match and judge what comes of it."""
+        a = match.number
+        doubt = self.doubt.between(b, np.array([a]))
+        expected = self.doubt.positions[b] - self.doubt.positions[a]
+        yaws = self._yaws(match, self._turn(doubt))
+        found = self.verifier.compare(self._place(a), self._place(b), expected, self._reach(doubt), yaws)
+        stage, reason = found.stage, found.reason
+        if not reason:
+            reason = self._beyond(found, expected, doubt)
+            stage = "gate" if reason else stage
+        return LoopCandidate(
+            a, b, self._away(a, b), match.distance, "rejected" if reason else "accepted", stage, reason, found.rmse,
+            found.overlap, self._constraint(a, b, found),
+        )  # fmt: skip
+
+    def _reach(self, doubt: Doubt) -> float:
+        """m that the place may lie from where odometry has it."""
+        if self.config.radius is not None:
+            return self.config.radius
+        return max(self.config.sigmas * float(doubt.reach[0]), LEAST_REACH)
+
+    def _turn(self, doubt: Doubt) -> float:
+        """rad that odometry's heading may be wrong by."""
+        return max(self.config.sigmas * float(doubt.turn[0]), float(LEAST_TURN))
+
+    def _yaws(self, match: PlaceMatch, turn: float) -> Floats:
+        """rad, turns of the newer place in the older worth a try."""
+        centre, spread = (0.0, turn) if turn <= WIDEST_TURN else (match.yaw, np.pi / self.config.sectors + TURN_STEP)
+        count = int(np.ceil(spread / TURN_STEP))
+        return np.asarray(centre + TURN_STEP * np.arange(-count, count + 1))
+
+    def _beyond(self, found: Comparison, expected: Floats, doubt: Doubt) -> str:
+        """Why odometry does not allow the pose that registration found, or nothing."""
+        assert found.T_a_b is not None
+        shift = found.T_a_b[:3, 3] - expected
+        turn = float(so3.angle(found.T_a_b[:3, :3]))
+        if turn > self._turn(doubt):
+            return f"odometry would be wrong by {np.rad2deg(turn):.1f} deg"
+        if self.config.radius is not None:
+            sigmas = self.config.sigmas * float(np.linalg.norm(shift)) / self.config.radius
+        else:
+            least = (LEAST_REACH / self.config.sigmas) ** 2 * np.eye(3)
+            sigmas = float(np.sqrt(shift @ np.linalg.solve(doubt.position[0] + least, shift)))
+        if sigmas > self.config.sigmas:
+            return f"odometry would be wrong by {np.linalg.norm(shift):.1f} m"
+        return ""
+
+    def _constraint(self, a: int, b: int, found: Comparison) -> Constraint | None:
+        """The pose that was found and covariance, from level axes to those of the keyframes."""
+        if found.T_a_b is None or found.covariance is None:
+            return None
+        R_a, R_b = (self.keyframes[k].T_world_lidar[:3, :3] for k in (a, b))
+        T = se3.make(R_a.T @ found.T_a_b[:3, :3] @ R_b, R_a.T @ found.T_a_b[:3, 3])
+        turn = np.kron(np.eye(2), R_a.T)
+        return Constraint(a, b, T, turn @ found.covariance @ turn.T)
+
+    def _place(self, number: int) -> Place:
+        """The submap about a keyframe, ready to be compared; the last few are kept."""
+        if number not in self._places:
+            self._places[number] = make_place(self._level(number), self.registration)
+            if len(self._places) > KEPT:
+                self._places.popitem(last=False)
+        self._places.move_to_end(number)
+        return self._places[number]
+
+    def _level(self, number: int) -> Points:
+        """The submap about a keyframe in the axes of the world."""
+        R = self.keyframes[number].T_world_lidar[:3, :3]
+        return np.ascontiguousarray(self.cloud(number) @ R.T.astype(np.float32))

@@ -1,0 +1,143 @@
+"""Whether two submaps show the same place: registration both ways, from every start that fits."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.config.loops import LoopsConfig
+from lslam.config.registration import RegistrationConfig
+from lslam.geometry import se3, so3
+from lslam.loops.place import Place
+from lslam.loops.search import SHARED, cells_of, find_starts, seen_cells
+from lslam.preprocessing.prepare import PreparedPoints, thin
+from lslam.registration.robust import Annealing
+from lslam.registration.solver import RegistrationResult, solve
+
+Floats = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+
+# Every so many-th point tells the good starts from the bad ones.
+FEW = 4
+# m; widths of the kernel: where starts are caught, and within which residuals are judged.
+CATCH, JUDGED = 2.5, 1.0
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """What came of comparing two places.
+
+    stage : that decided; reason : why it was rejected, empty when accepted
+    T_a_b : (4, 4) in level axes; covariance : (6, 6), level axes of a; None when nothing was registered
+    """
+
+    stage: str
+    reason: str = ""
+    T_a_b: Floats | None = None
+    covariance: Floats | None = None
+    rmse: float = float("nan")
+    overlap: float = float("nan")
+
+    def rejected(self, stage: str, reason: str) -> Comparison:
+        """The same, refused."""
+        return replace(self, stage=stage, reason=reason)
+
+
+class Verifier:
+    """Compares places as `loops` and `registration` of the configuration say."""
+
+    def __init__(self, config: LoopsConfig, registration: RegistrationConfig) -> None:
+        self.config, self.registration = config, registration
+
+    def compare(self, a: Place, b: Place, expected: Floats, reach: float, yaws: Iterable[float]) -> Comparison:
+        """Register b in a: T_a_b in level axes, within `reach` m of `expected` (3,), at one of `yaws` (rad) or near it."""
+        starts = find_starts(a, b, expected, reach, yaws)
+        if not starts:
+            return Comparison("overlap", "nothing stands up there")
+        seen = seen_cells(a).ravel()
+        tried = sorted((self._try(a, b, seen, start.T_a_b) for start in starts), key=lambda found: -found[0])
+        support, rough = tried[0]
+        rivals = [(s, T) for s, T in tried[1:] if _is_elsewhere(rough, T)]
+        forward = self._refine(a, b, rough)
+        facts = self._judge(a, b, forward)
+        if facts.reason:
+            return facts
+        if rivals and rivals[0][0] > self.config.max_ambiguity * support:
+            away = float(np.linalg.norm(rivals[0][1][:3, 3] - rough[:3, 3]))
+            return facts.rejected("ambiguity", f"{away:.1f} m away it fits {rivals[0][0] / support:.0%} as well")
+        backward = self._refine(b, a, se3.inverse(rough))
+        return self._agree(facts, forward, backward)
+
+    def _try(self, a: Place, b: Place, seen: Flags, start: Floats) -> tuple[float, Floats]:
+        """Where registration leads from a start, and how much of what stands up lies on surfaces then, 0 to 1."""
+        r = self.registration
+        few = thin(b.source, FEW)
+        slow = Annealing(CATCH, r.kernel_max / 2, r.coarse_decay, self.config.max_iterations)
+        coarse = self._solve(a, few, start, slow, coarse_only=True)
+        fine = self._solve(a, few, coarse.T_world_lidar, Annealing(r.kernel_max, r.kernel_min, 0.7, 15))
+        return self._support(a, b.upright, seen, fine.T_world_lidar), fine.T_world_lidar
+
+    def _refine(self, a: Place, b: Place, start: Floats) -> RegistrationResult:
+        r = self.registration
+        annealing = Annealing(r.kernel_max, r.kernel_min, r.kernel_decay, self.config.max_iterations)
+        return self._solve(a, b.source, start, annealing)
+
+    def _solve(
+        self, a: Place, points: PreparedPoints, start: Floats, annealing: Annealing, *, coarse_only: bool = False
+    ) -> RegistrationResult:
+        r = self.registration
+        return solve(
+            a.coarse if coarse_only else a.fine, points, start, annealing,
+            sigma=r.sigma, blob_weight=r.blob_weight, weak_share=r.weak_share,
+        )  # fmt: skip
+
+    def _support(self, a: Place, upright: PreparedPoints, seen: Flags, T_a_b: Floats) -> float:
+        """Of the points in cells of a that were seen: their number depends on the shift, their share does not."""
+        cells, inside = cells_of(se3.apply(T_a_b, upright.source))
+        comparable = int((inside & seen[cells]).sum())
+        width = 2 * self.registration.kernel_min
+        inliers = self._solve(a, upright, T_a_b, Annealing(width, width, 0.5, 1)).inliers
+        return 0.0 if comparable < SHARED * len(upright.source) else inliers / comparable
+
+    def _judge(self, a: Place, b: Place, found: RegistrationResult) -> Comparison:
+        """Of a registration by itself: rmse, what it observes, overlap both ways."""
+        c = self.config
+        if not found.ok or found.covariance is None:
+            return Comparison("registration", found.reason or "nothing matches")
+        T = found.T_world_lidar
+        there = self._solve(a, b.source, T, Annealing(JUDGED, JUDGED, 0.5, 1))
+        back = self._solve(b, a.source, se3.inverse(T), Annealing(JUDGED, JUDGED, 0.5, 1))
+        overlap = min(there.overlap, back.overlap)
+        rmse = max(there.rmse, back.rmse)
+        facts = Comparison("registration", "", T, found.covariance, rmse, overlap)
+        if len(found.degenerate):
+            return facts.rejected("registration", "the surfaces do not hold it in every direction")
+        if rmse > c.max_rmse:
+            return facts.rejected("registration", f"rmse {rmse:.2f} m, {c.max_rmse:g} m allowed")
+        if overlap < c.min_overlap:
+            return facts.rejected("overlap", f"overlap {overlap:.0%}, {c.min_overlap:.0%} needed")
+        return facts
+
+    def _agree(self, facts: Comparison, forward: RegistrationResult, backward: RegistrationResult) -> Comparison:
+        """Forward and backward must meet; the closure is no more certain than they differ."""
+        c = self.config
+        gap = se3.log(forward.T_world_lidar @ backward.T_world_lidar)
+        move, turn = float(np.linalg.norm(gap[:3])), float(np.linalg.norm(gap[3:]))
+        if not backward.ok or move > c.max_disagreement_m or np.rad2deg(turn) > c.max_disagreement_deg:
+            said = f"old to new and new to old differ by {move:.2f} m and {np.rad2deg(turn):.2f} deg"
+            return facts.rejected("agreement", said)
+        floor = np.diag([c.sigma_m**2] * 3 + [np.deg2rad(c.sigma_deg) ** 2] * 3)
+        assert forward.covariance is not None
+        doubt = np.diag([move**2 / 12] * 3 + [turn**2 / 12] * 3)
+        covariance = forward.covariance + floor + doubt
+        # Half way between what the two say.
+        T = se3.exp(-0.5 * gap) @ forward.T_world_lidar
+        return Comparison("agreement", "", se3.normalise(T), covariance, facts.rmse, facts.overlap)
+
+
+def _is_elsewhere(T: Floats, other: Floats) -> bool:
+    delta = se3.relative(T, other)
+    return float(np.linalg.norm(delta[:3, 3])) > 1.0 or float(so3.angle(delta[:3, :3])) > np.deg2rad(5)

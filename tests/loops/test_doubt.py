@@ -1,0 +1,65 @@
+"""How far odometry may have drifted: covariances of a chain, and systematic drift against the drift itself."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from known_town import keyframes_of, round_the_square
+from numpy.typing import NDArray
+
+from lslam.geometry import se3, so3
+from lslam.loops.doubt import OdometryDoubt
+
+
+def chain(poses: NDArray[np.float64], step: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+    """Covariance of each pose when every step adds `step` (6, 6) and a turn moves what comes later."""
+    covariances = [np.zeros((6, 6))]
+    for before, after in pairwise(poses):
+        A = np.eye(6)
+        A[:3, 3:] = -so3.hat(after[:3, 3] - before[:3, 3])
+        covariances.append(A @ covariances[-1] @ A.T + step)
+    return covariances
+
+
+def test_doubt_between_is_that_of_the_way_between() -> None:
+    poses = np.array([round_the_square(d) for d in np.arange(0, 200, 5.0)])
+    step = np.diag([1e-3, 2e-3, 1e-3, 1e-6, 1e-6, 4e-6])
+    whole = chain(poses, step)
+    keyframes = [replace(k, covariance=C) for k, C in zip(keyframes_of(poses), whole, strict=True)]
+    doubt = OdometryDoubt(keyframes, 0.0, 0.0).between(39, np.array([0, 17]))
+    part = chain(poses[17:], step)[-1]
+    assert np.allclose(doubt.position, [whole[39][:3, :3], part[:3, :3]], rtol=1e-9)
+    assert doubt.turn == pytest.approx(np.sqrt([whole[39][5, 5], part[5, 5]]))
+
+
+def test_never_negative_when_estimates_contradict() -> None:
+    poses = np.array([round_the_square(d) for d in (0.0, 40.0, 80.0)])
+    keyframes = [
+        replace(k, covariance=C * np.eye(6)) for k, C in zip(keyframes_of(poses), (0.5, 0.3, 0.1), strict=True)
+    ]
+    doubt = OdometryDoubt(keyframes, 0.0, 0.0).between(2, np.array([0, 1]))
+    assert np.isfinite(doubt.reach).all()
+    assert (doubt.turn >= 0).all()
+
+
+@pytest.mark.parametrize(("scale", "turn"), [(0.5, 0.0), (0.0, 0.25), (-0.5, -0.25)])
+def test_three_sigmas_hold_the_drift_they_are_named_after(scale: float, turn: float) -> None:
+    true = np.array([round_the_square(d) for d in np.arange(0, 720, 4.0)])
+    drifted = [true[0]]
+    for before, after in pairwise(true):
+        step = se3.relative(before, after)
+        length = float(np.linalg.norm(step[:3, 3]))
+        step[:3, 3] *= 1 + scale / 100
+        bend = se3.make(so3.exp(np.array([0, 0, np.deg2rad(turn) * length / 100])), np.zeros(3))
+        drifted.append(drifted[-1] @ step @ bend)
+    doubt = OdometryDoubt(keyframes_of(np.array(drifted)), 0.5, 0.25)
+    b, older = 179, np.arange(0, 170, 10)
+    errors = [
+        se3.relative(drifted[a], drifted[b])[:3, 3] - se3.relative(true[a], true[b])[:3, 3] for a in older
+    ]  # fmt: skip
+    sigmas = np.linalg.norm(errors, axis=1) / doubt.between(b, older).reach
+    assert (sigmas < 3).all()
+    assert doubt.between(b, np.array([0])).reach[0] < 0.03 * 720

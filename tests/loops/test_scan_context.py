@@ -1,0 +1,89 @@
+"""Scan Context: rotation is a column shift, height of the sensor is nothing, places are told apart."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from known_town import pose, seen, town
+from numpy.typing import NDArray
+
+from lslam.geometry import so3
+from lslam.loops.scan_context import PlaceIndex, describe, distances
+
+SECTORS = 60
+WIDTH = 2 * np.pi / SECTORS
+
+
+def turned(points: NDArray[np.float32], angle: float) -> NDArray[np.float32]:
+    return (points @ so3.exp(np.array([0, 0, angle])).T).astype(np.float32)
+
+
+@pytest.fixture(scope="module")
+def cloud() -> NDArray[np.float32]:
+    """Seen in the street; kept off the borders of sectors, so that rounding moves no point to the next."""
+    points = seen(town(), pose(10, -45), np.random.default_rng(1))
+    place = np.arctan2(points[:, 1], points[:, 0]) / WIDTH % 1
+    return points[(place > 1e-3) & (place < 1 - 1e-3)]
+
+
+@pytest.mark.parametrize("shift", [1, 17, 30, 59])
+def test_turning_by_whole_sectors_shifts_columns(cloud: NDArray[np.float32], shift: int) -> None:
+    before, after = (describe(c, 20, SECTORS, 80.0) for c in (cloud, turned(cloud, shift * WIDTH)))
+    assert np.allclose(np.roll(before, shift, axis=1), after, atol=1e-5)
+    found = distances(before, after[None])[0]
+    assert found.argmin() == shift
+    assert found[shift] == pytest.approx(0.0, abs=1e-6)
+
+
+def test_distances_equal_the_definition() -> None:
+    rng = np.random.default_rng(3)
+    images = (rng.uniform(0, 5, (3, 6, 12)) * (rng.random((3, 6, 12)) < 0.3)).astype(np.float32)
+    images[:, :, 2] = 0
+    for n in range(12):
+        for image in images[1:]:
+            terms = []
+            for j in range(12):
+                q, c = images[0][:, j], image[:, (j + n) % 12]
+                if q.any() or c.any():
+                    both = q.any() and c.any()
+                    terms.append(1 - q @ c / (np.linalg.norm(q) * np.linalg.norm(c)) if both else 1.0)
+            expected = np.mean(terms)
+            assert distances(images[0], image[None])[0, n] == pytest.approx(expected, abs=1e-6)
+
+
+def test_height_of_the_sensor_does_not_matter(cloud: NDArray[np.float32]) -> None:
+    drone = cloud - np.array([0, 0, 10], np.float32)
+    assert np.allclose(describe(cloud, 20, SECTORS, 80.0), describe(drone, 20, SECTORS, 80.0), atol=1e-5)
+
+
+def test_finds_the_place_among_many_and_the_turn() -> None:
+    world, rng = town(), np.random.default_rng(5)
+    index = PlaceIndex(20, SECTORS, 80.0)
+    places = [(x, -45.0) for x in range(-40, 41, 8)] + [(45.0, y) for y in range(-40, 41, 8)]
+    for k, (x, y) in enumerate(places):
+        index.add(k, seen(world, pose(x, y), rng))
+    index.add(100, seen(world, pose(9.0, -44.0, yaw_deg=-90.0), rng))
+    best = index.nearest(100, np.arange(len(places)))[0]
+    assert places[best.number] == (8.0, -45.0)
+    assert np.rad2deg(best.yaw) == pytest.approx(-90.0, abs=6.0)
+    # A heading that odometry excludes is not found; what is then best looks less alike.
+    limited = index.nearest(100, np.arange(len(places)), turn=np.deg2rad(20))[0]
+    assert abs(limited.yaw) <= np.deg2rad(24)
+    assert limited.distance > best.distance
+
+
+def test_nothing_seen_is_like_nothing() -> None:
+    empty = describe(np.zeros((0, 3), np.float32), 20, SECTORS, 80.0)
+    assert not empty.any()
+    assert (distances(empty, empty[None]) == 1).all()
+    index = PlaceIndex()
+    index.add(0, np.zeros((0, 3), np.float32))
+    assert index.nearest(0, np.zeros(0, np.int64)) == []
+
+
+def test_grows_beyond_its_first_room(cloud: NDArray[np.float32]) -> None:
+    index = PlaceIndex()
+    for k in range(130):
+        index.add(k, cloud[k::7])
+    assert len(index) == 130
+    assert index.nearest(129, np.arange(0, 129))[0].distance < 0.3

@@ -1,0 +1,112 @@
+"""Places compared: known transforms found from afar, and everything refused that is no such thing."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from known_town import NOISE, box, pose, seen, terrace, town
+from numpy.typing import NDArray
+
+from lslam.config.loops import LoopsConfig
+from lslam.config.registration import RegistrationConfig
+from lslam.geometry import se3
+from lslam.loops.place import Place, make_place
+from lslam.loops.verify import Comparison, Verifier
+
+Floats = NDArray[np.float64]
+YAWS = np.deg2rad(np.arange(-10, 11, 2.0))
+
+
+def place(world: Floats, at: Floats, seed: int, reach: float = 40.0) -> Place:
+    """What is seen from a pose, in level axes with the heading kept: the yaw is what registration has to find."""
+    return make_place(seen(world, at, np.random.default_rng(seed), reach), RegistrationConfig())
+
+
+def compare(a: Place, b: Place, expected: Floats, reach: float, **settings: float) -> Comparison:
+    config = LoopsConfig.model_validate(settings)
+    return Verifier(config, RegistrationConfig()).compare(a, b, expected, reach, YAWS)
+
+
+@pytest.mark.parametrize(("dx", "dy", "yaw_deg", "climb"), [(0, 0, 0, 0), (5, -3, 7, 0.5), (-8, 2, -9, -1.5)])
+def test_finds_a_known_transform_from_afar(dx: float, dy: float, yaw_deg: float, climb: float) -> None:
+    world = town()
+    T_a, T_b = pose(5, -45), pose(5 + dx, -45 + dy, yaw_deg)
+    T_b[2, 3] += climb
+    found = compare(place(world, T_a, 1), place(world, T_b, 2), np.zeros(3), 12.0)
+    assert found.reason == ""
+    assert found.T_a_b is not None
+    assert found.covariance is not None
+    error = se3.log(found.T_a_b @ se3.inverse(se3.relative(T_a, T_b)))
+    assert np.linalg.norm(error[:3]) < 0.03
+    assert np.rad2deg(np.linalg.norm(error[3:])) < 0.05
+    assert error @ np.linalg.solve(found.covariance, error) / 6 < 4
+    assert found.rmse < 0.1
+    assert found.overlap > 0.5
+
+
+def test_refuses_another_place() -> None:
+    found = compare(place(town(0), pose(0, -45), 1), place(town(7), pose(0, -45), 2), np.zeros(3), 8.0)
+    assert found.reason
+    assert found.stage in ("overlap", "registration", "ambiguity", "agreement")
+
+
+def test_refuses_what_hardly_overlaps() -> None:
+    world = town()
+    a, b = place(world, pose(-25, -45), 1, reach=25), place(world, pose(10, -45), 2, reach=25)
+    found = compare(a, b, np.array([35.0, 0.0, 0.0]), 3.0)
+    assert found.stage == "overlap"
+    assert found.reason
+
+
+def test_refuses_a_terrace_that_odometry_does_not_tell_apart_and_takes_it_where_it_does() -> None:
+    world = terrace()
+    T_a, T_b = pose(70, 0), pose(73, 0.5)
+    a, b = place(world, T_a, 1), place(world, T_b, 2)
+    lost = compare(a, b, np.zeros(3), 25.0)
+    assert lost.stage == "ambiguity"
+    assert lost.reason
+    sure = compare(a, b, np.array([3.5, 0.0, 0.0]), 5.0)
+    assert sure.reason == ""
+    assert sure.T_a_b is not None
+    assert np.linalg.norm(sure.T_a_b[:3, 3] - [3, 0.5, 0]) < 0.03
+
+
+def test_refuses_a_corridor_along_which_nothing_tells() -> None:
+    x, up = np.arange(-60, 60, 0.2), np.arange(0, 3, 0.2)
+    line = np.stack(np.meshgrid(x, up), axis=-1).reshape(-1, 2)
+    walls = [np.column_stack([line[:, 0], np.full(len(line), y), line[:, 1]]) for y in (-3.0, 3.0)]
+    ground = np.stack(np.meshgrid(x, np.arange(-3, 3, 0.2)), axis=-1).reshape(-1, 2)
+    world = np.concatenate([*walls, np.column_stack([ground, np.zeros(len(ground))])])
+    found = compare(place(world, pose(0, 0), 1), place(world, pose(4, 0), 2), np.array([3.0, 0, 0]), 6.0)
+    assert found.reason
+    assert found.stage in ("registration", "ambiguity", "agreement")
+
+
+@pytest.mark.parametrize("points", [0, 3, 200])
+def test_survives_places_without_surfaces(points: int) -> None:
+    world = town()
+    few = make_place(np.random.default_rng(0).normal(0, 10, (points, 3)).astype(np.float32), RegistrationConfig())
+    whole = place(world, pose(0, -45), 1)
+    for a, b in ((few, whole), (whole, few), (few, few)):
+        assert compare(a, b, np.zeros(3), 5.0).reason
+
+
+def test_max_rmse_and_overlap_are_heeded() -> None:
+    world = town()
+    a, b = place(world, pose(5, -45), 1), place(world, pose(7, -45), 2)
+    assert compare(a, b, np.zeros(3), 5.0, max_rmse=0.001).stage == "registration"
+    assert compare(a, b, np.zeros(3), 5.0, min_overlap=0.999).stage == "overlap"
+
+
+def test_a_place_knows_what_stands_up() -> None:
+    flat = np.mgrid[-20:20:0.3, -20:20:0.3].reshape(2, -1).T
+    world = np.concatenate([box(5, 5, 8, 8, 6), np.column_stack([flat, np.zeros(len(flat))])])
+    at = pose(0, 0)
+    made = place(world, at, 1)
+    assert np.abs(made.floor[:, 2] + at[2, 3]).max() < 0.1
+    upright = se3.apply(at, made.upright.source)
+    assert (np.abs(upright[:, :2] - 9).max(axis=1) < 5).mean() > 0.8
+    assert (upright[:, 2] > 5).any()
+    # Across a wall the scatter of a voxel is the noise of a point.
+    thinnest = np.sqrt(made.upright.scatter[:, [0, 3]].min(axis=1))
+    assert np.median(thinnest) == pytest.approx(NOISE, rel=0.5)
