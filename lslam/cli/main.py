@@ -21,6 +21,7 @@ COMMANDS = {
     "simulate": "Simulate a drive with exact ground truth.",
     "convert": "Convert a sequence to a bag or KITTI's layout, or a trajectory to another format.",
     "info": "Show what is in a sequence and what is wrong with it.",
+    "map": "Build a run's map anew with other settings, or score a map.",
     "methods": "List the odometry methods.",
     "config": "Show or check a configuration.",
     "completion": "Print the completion script of a shell.",

@@ -20,7 +20,7 @@ SAMPLES = 50_000
 
 
 def crispness(cloud: Cloud, radius: float = RADIUS, least: int = LEAST, samples: int = SAMPLES) -> Crispness:
-    """Score a map; a merged one of any size in little memory, any other is sorted in memory first.
+    """Score a map; a merged one of any size in little memory, any other in memory.
 
     Parameters
     ----------
@@ -57,13 +57,13 @@ def crispness(cloud: Cloud, radius: float = RADIUS, least: int = LEAST, samples:
 
 def _slabs(cloud: Cloud, radius: float, step: int) -> Iterator[tuple[Floats, Floats]]:
     """Every `step`-th point of the cloud once, with all points of a slab of x that holds its neighbourhood."""
-    slack = 0.0
-    if isinstance(cloud, MergedMap):
-        slack = cloud.voxel  # its points are sorted by the voxel of x
-    else:
+    if not isinstance(cloud, MergedMap):
         points = in_memory(cloud).points
         points = points[np.isfinite(points).all(1)]
-        cloud = ArrayCloud(points[np.argsort(points[:, 0], kind="stable")])
+        if len(points):
+            yield points, points[::step]
+        return
+    slack = cloud.voxel  # its points are sorted by the voxel of x
     kept, waiting, seen = np.zeros((0, 3)), np.zeros((0, 3)), 0
     for block in cloud.blocks():
         kept = np.concatenate([kept, block.points])

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from lslam.formats.atomic import atomic_write
 from lslam.formats.cloud_files import write_cloud
 from lslam.formats.geojson import write_line
@@ -55,7 +57,7 @@ def write_map(path: Path, cloud: Cloud, note: MapNote, georeference: Georeferenc
         if projection is not None and projected
         else LOCAL,
         "crs": f"EPSG:{projection.epsg}" if projection is not None and projected else None,
-        "georeference": None if georeference is None else _plain(georeference),
+        "georeference": None if georeference is None else georeference_note(georeference),
         "voxel": note.voxel,
         "done": list(note.done),
         "sequence": note.sequence,
@@ -82,7 +84,8 @@ def write_json(path: Path, document: dict[str, Any]) -> None:
         stream.write((json.dumps(document, indent=2, allow_nan=False, ensure_ascii=False) + "\n").encode())
 
 
-def _plain(georeference: Georeference) -> dict[str, Any]:
+def georeference_note(georeference: Georeference) -> dict[str, Any]:
+    """A georeference as plain values, for JSON."""
     return {
         "origin_lat_lon_height": [float(v) for v in georeference.origin],
         "T_enu_world": georeference.T_enu_world.tolist(),
@@ -90,3 +93,16 @@ def _plain(georeference: Georeference) -> dict[str, Any]:
         "epsg": Projection(georeference).epsg,
         "method": georeference.method,
     }
+
+
+def georeference_of(note: Any) -> Georeference | None:
+    """The inverse of `georeference_note`; None for anything else."""
+    try:
+        return Georeference(
+            np.array(note["origin_lat_lon_height"], np.float64).reshape(3),
+            np.array(note["T_enu_world"], np.float64).reshape(4, 4),
+            int(note["epsg"]),
+            note["method"],
+        )
+    except (KeyError, TypeError, ValueError):
+        return None

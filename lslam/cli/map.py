@@ -1,0 +1,145 @@
+"""`lslam map`: a run's map anew with other settings, and numbers about any map."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from lslam.cli import options
+from lslam.cli.console import progress, setup_logging, show
+from lslam.cli.signals import gentle_stop
+
+if TYPE_CHECKING:
+    from lslam.types.map_score import Crispness
+
+EPILOG = """\b
+Examples:
+  lslam map runs/first --voxel 0.1 --format laz
+  lslam map runs/first --crop -50,50,-50,50 --out square.ply
+  lslam map runs/first --against survey.laz --threshold 0.1
+  lslam map somebody-elses.ply --score
+"""
+
+
+@click.command(epilog=EPILOG)
+@click.argument("target", metavar="RUN|FILE", type=click.Path(path_type=Path))
+@click.option("--voxel", type=float, metavar="M", help="Edge of a voxel  [as the run].")
+@click.option("--format", "file_format", metavar="NAME", help="ply, pcd, las or laz  [--out's suffix, or as the run].")
+@click.option("--crop", metavar="BOX", help="Keep x_min,x_max,y_min,y_max[,z_min,z_max] of the world, m.")
+@click.option("--crs", metavar="EPSG:N", help="Coordinates of las and laz of a georeferenced run  [its UTM zone].")
+@click.option("--out", type=click.Path(path_type=Path), metavar="FILE", help="Map file  [RUN/map.FORMAT].")
+@click.option("--overwrite", is_flag=True, help="Replace files that are there.")
+@click.option("--sequence", type=click.Path(path_type=Path), metavar="PATH", help="Where the raw scans are now.")
+@click.option("--score", "is_scored", is_flag=True, help="Only say how crisp the map of RUN, or FILE, is.")
+@click.option("--against", type=click.Path(path_type=Path), metavar="CLOUD", help="Only compare with this cloud.")
+@click.option("--threshold", type=float, metavar="M", help="--against: nearest points that count as equal  [0.2].")
+@click.option("--radius", type=float, metavar="M", help="--score: neighbourhoods  [0.5].")
+@options.reading
+@click.option("--set", "settings", multiple=True, metavar="map.KEY=VALUE", help="Set one key of the map; repeatable.")
+@options.as_json
+@options.verbosity
+def command(target: Path, **given: Any) -> None:
+    """Build the map of a run anew from its raw scans and poses, with other settings and without odometry.
+
+    With --score or --against a map, of RUN or FILE, is only measured: crispness without truth, F1 and Chamfer distance
+    against a reference in the same frame.
+    """
+    setup_logging(given["verbose"], given["quiet"])
+    if given["is_scored"] or given["against"] is not None:
+        _measure(target, given)
+    else:
+        _rebuild(target, given)
+
+
+def _measure(target: Path, given: dict[str, Any]) -> None:
+    from lslam.formats.cloud_files import read_cloud
+    from lslam.maps.compare import THRESHOLD, compare
+    from lslam.maps.crispness import RADIUS, crispness
+    from lslam.pipeline.rebuild import map_of
+    from lslam.reports.evaluation_json import crispness_document, strict
+
+    path = map_of(target)
+    cloud = read_cloud(path)
+    document: dict[str, Any] = {"file": str(path)}
+    rows = [("map", str(path))]
+    if given["is_scored"]:
+        score = crispness(cloud, given["radius"] or RADIUS)
+        document["crispness"] = crispness_document(score)
+        rows += crispness_rows(score)
+    if given["against"] is not None:
+        found = compare(
+            cloud, read_cloud(given["against"]), THRESHOLD if given["threshold"] is None else given["threshold"]
+        )
+        document["against"] = strict({"file": str(given["against"]), "recipe": found.recipe, **asdict(found)})
+        rows += [
+            ("against", str(given["against"])),
+            ("F1", f"{found.f1:.4f} (precision {found.precision:.4f}, recall {found.recall:.4f})"),
+            ("Chamfer", f"{found.chamfer:.4f} m (to it {found.mean_to_reference:.4f}, from it {found.mean_from_reference:.4f})"),
+            ("", found.recipe),
+        ]  # fmt: skip
+    _print(rows, document, given["as_json"])
+
+
+def _rebuild(target: Path, given: dict[str, Any]) -> None:
+    from lslam.errors import UsageError
+    from lslam.maps.georeference import parse_crs
+    from lslam.pipeline.rebuild import check_output, open_scans, read_run, rebuild
+    from lslam.reports.evaluation_json import crispness_document
+
+    for flag in ("threshold", "radius"):
+        if given[flag] is not None:
+            raise UsageError(f"--{flag} belongs to {'--against' if flag == 'threshold' else '--score'}")
+    out: Path | None = given["out"]
+    crs = None if given["crs"] is None else parse_crs(given["crs"])
+    run = read_run(target, _settings(given))
+    check_output(out or target / f"map.{run.config.map.format}", given["overwrite"])
+    sequence = open_scans(run, given["sequence"], **options.reading_of(given))
+    with gentle_stop() as stop, progress("map", len(run.trajectory)) as advance:
+        stop.is_gentle = True
+        built = rebuild(run, sequence, out, overwrite=given["overwrite"], crs=crs, on_step=advance, should_stop=stop)
+    rows = [("map", f"{built.path}: {built.points} points of {built.scans} scans"), *crispness_rows(built.crispness)]
+    document = {"file": str(built.path), "points": built.points, "scans": built.scans}
+    _print(rows, {**document, "crispness": crispness_document(built.crispness)}, given["as_json"])
+
+
+def _settings(given: dict[str, Any]) -> list[str]:
+    """Flags over --set, as settings of the section `map`."""
+    from lslam.errors import UsageError
+
+    out: Path | None = given["out"]
+    suffix = None if out is None else out.suffix.lower().lstrip(".")
+    file_format = given["file_format"]
+    if file_format is not None and suffix is not None and file_format != suffix:
+        raise UsageError(f"--format {file_format} contradicts --out {out}: leave one out")
+    for setting in given["settings"]:
+        if not setting.startswith("map."):
+            raise UsageError(f"--set {setting}: only keys of the map can be changed after the run")
+    flags = {
+        "voxel": given["voxel"],
+        "format": file_format
+        if file_format is not None
+        else suffix
+        if suffix in ("ply", "pcd", "las", "laz")
+        else None,
+        "crop": None if given["crop"] is None else f"[{given['crop']}]",
+    }
+    return [*given["settings"], *(f"map.{key}={value}" for key, value in flags.items() if value is not None)]
+
+
+def crispness_rows(score: Crispness) -> list[tuple[str, str]]:
+    """What is said of a map's crispness, as rows."""
+    if score.entropy is None or score.plane_variance is None:
+        return [("crispness", f"n/a: {score.recipe}")]
+    return [
+        ("entropy", f"{score.entropy:.4f} nats (mean map entropy, lower is crisper)"),
+        ("planes", f"{score.plane_variance:.3e} m2 mean plane variance, {score.plane_variance**0.5:.4f} m thick"),
+        ("", score.recipe),
+    ]
+
+
+def _print(rows: list[tuple[str, str]], document: dict[str, Any], as_json: bool) -> None:
+    show(json.dumps(document, allow_nan=False) + "\n" if as_json else "".join(f"{n:<10} {v}\n" for n, v in rows))

@@ -1,0 +1,174 @@
+"""The map of an earlier run built anew, from the raw scans and the poses the run found: no odometry."""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lslam.config import Config, load_config
+from lslam.errors import InputError, InterruptedRunError, OutputError, OutputExistsError, UsageError
+from lslam.formats.cloud_files import SUFFIXES
+from lslam.formats.trajectory_files import read_trajectory
+from lslam.maps.crispness import crispness
+from lslam.pipeline.map_files import MapNote, georeference_of, write_geojson, write_map
+from lslam.pipeline.map_pass import build_map
+from lslam.pipeline.run_folder import MANIFEST
+from lslam.readers import open_sequence
+from lslam.readers.selection import select
+from lslam.types.georeference import Georeference
+from lslam.types.map_score import Crispness
+from lslam.types.scan_result import ScanResult, Status
+from lslam.types.sequence import Sequence
+from lslam.types.trajectory import Trajectory
+
+log = logging.getLogger("lslam")
+
+
+@dataclass(frozen=True)
+class EarlierRun:
+    """What a run folder says: its configuration with new settings over it, its poses, which scans were registered."""
+
+    folder: Path
+    manifest: dict[str, Any]
+    config: Config
+    trajectory: Trajectory
+    statuses: tuple[Status, ...]
+    georeference: Georeference | None
+
+    @property
+    def sequence_path(self) -> str:
+        """Where the raw scans lay."""
+        return str(self.manifest.get("sequence", {}).get("path", ""))
+
+
+@dataclass(frozen=True)
+class RebuiltMap:
+    """What `rebuild` wrote."""
+
+    path: Path
+    points: int
+    scans: int
+    crispness: Crispness
+
+
+def read_run(folder: Path, settings: Iterable[str] = ()) -> EarlierRun:
+    """Read a run folder; `settings` ("map.voxel=0.1") beat its configuration.
+
+    Raises InputError naming the file that is missing or broken, ConfigError for settings that make no sense.
+    """
+    if not folder.is_dir():
+        raise InputError(f"{folder} is no folder of a run: name what `lslam run` wrote")
+    try:
+        manifest = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(f"{folder} is no folder of a run: {MANIFEST} cannot be read: {error.strerror}") from None
+    except ValueError as error:
+        raise InputError(f"{folder / MANIFEST}: {error}; run the sequence again") from None
+    if not isinstance(manifest, dict):
+        raise InputError(f"{folder / MANIFEST} holds no manifest; run the sequence again")
+    config = load_config(folder / "config.toml", settings)
+    if not (folder / "trajectory.tum").is_file():
+        raise InputError(f"{folder} has no trajectory.tum: the run ended before it; run the sequence again")
+    trajectory = read_trajectory(folder / "trajectory.tum", "tum")
+    statuses = _statuses(folder / "scans.csv", len(trajectory))
+    return EarlierRun(folder, manifest, config, trajectory, statuses, georeference_of(manifest.get("georeference")))
+
+
+def open_scans(run: EarlierRun, sequence: Path | None = None, **reading: Any) -> Sequence:
+    """The scans the run worked on; `sequence` names them where they have moved, `reading` goes to `open_sequence`.
+
+    Raises InputError naming the path when the raw scans are gone, or are others than those of the run.
+    """
+    path = Path(run.sequence_path) if sequence is None else sequence
+    if sequence is None and not path.exists():
+        raise InputError(
+            f"the raw scans of {run.folder} are gone: {path} does not exist; say where they are with --sequence"
+        )
+    section = run.config.input
+    opened = open_sequence(path, vertical_correction_deg=section.vertical_correction_deg, **reading)
+    chosen = select(opened, section.start, section.count, section.skip_frames)
+    count = len(run.trajectory)
+    if len(chosen) < count or np.any(np.abs(chosen.stamps_ns[:count] - run.trajectory.stamps_ns) > 1000):
+        raise InputError(
+            f"{path} does not fit {run.folder}: its {len(chosen)} scans have other stamps than the {count} poses"
+        )
+    return chosen
+
+
+def rebuild(
+    run: EarlierRun, sequence: Sequence, out: Path | None = None, *, overwrite: bool = False, crs: int | None = None,
+    on_step: Callable[[], None] = lambda: None, should_stop: Callable[[], bool] = lambda: False,
+) -> RebuiltMap:  # fmt: skip
+    """Build the map with the run's configuration and write it to `out`, by default map.<format> in the run folder.
+
+    Raises OutputExistsError when the file is there, OutputError when it cannot be written, UsageError for a `crs` without
+    a georeference, InterruptedRunError when `should_stop` said so.
+    """
+    path = run.folder / f"map.{run.config.map.format}" if out is None else out
+    check_output(path, overwrite)
+    georeference = run.georeference
+    if crs is not None:
+        if georeference is None:
+            raise UsageError(
+                f"--crs: {run.folder} is not georeferenced; run the sequence with --georeference or --gnss"
+            )
+        georeference = replace(georeference, epsg=crs)
+    built = build_map(sequence, results_of(run), run.config, on_step, should_stop, path.parent)
+    if built is None:
+        raise InterruptedRunError("interrupted while the map was built: nothing is written")
+    write_map(path, built.merged, MapNote(sequence.name, run.config.map.voxel), georeference)
+    if georeference is not None:
+        write_geojson(path.parent / "trajectory.geojson", run.trajectory, georeference, sequence.name)
+    log.info("%d points in %s", len(built.merged), path)
+    return RebuiltMap(path, len(built.merged), sum(s == "ok" for s in run.statuses), crispness(built.merged))
+
+
+def check_output(path: Path, overwrite: bool) -> None:
+    """Raise UsageError, OutputExistsError or OutputError before any work is done for a file that will not do."""
+    if path.suffix.lower() not in SUFFIXES:
+        raise UsageError(f"{path}: no map file lslam writes; known suffixes: {', '.join(SUFFIXES)}")
+    if not path.parent.is_dir():
+        raise OutputError(f"{path} cannot be written: the folder {path.parent} does not exist")
+    if path.exists() and not overwrite:
+        raise OutputExistsError(f"{path} exists; name another file with --out or replace it with --overwrite")
+
+
+def results_of(run: EarlierRun) -> list[ScanResult]:
+    """The poses and what became of the scans, as a run hands them to its map."""
+    return [
+        ScanResult(k, int(stamp), T, status)
+        for k, (stamp, T, status) in enumerate(
+            zip(run.trajectory.stamps_ns, run.trajectory.poses, run.statuses, strict=True)
+        )
+    ]
+
+
+def map_of(target: Path) -> Path:
+    """A map file, or the one in a run folder; raises InputError when there is none."""
+    if not target.is_dir():
+        return target
+    found = [target / f"map{suffix}" for suffix in SUFFIXES if (target / f"map{suffix}").is_file()]
+    if not found:
+        raise InputError(f"{target} has no map file; build one with: lslam map {target}")
+    return found[0]
+
+
+def _statuses(path: Path, count: int) -> tuple[Status, ...]:
+    """What became of each scan; scans of a run that left no table count as registered."""
+    known: dict[str, Status] = {"ok": "ok", "bridged": "bridged", "skipped": "skipped"}
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except OSError:
+        log.warning("%s cannot be read: every scan counts as registered", path)
+        return tuple(known["ok"] for _ in range(count))
+    column = lines[0].split(",").index("status") if lines and "status" in lines[0].split(",") else -1
+    words = [line.split(",")[column] for line in lines[1:]]
+    if column < 0 or len(words) != count or not set(words) <= set(known):
+        raise InputError(f"{path} does not list the {count} scans of trajectory.tum; run the sequence again")
+    return tuple(known[word] for word in words)

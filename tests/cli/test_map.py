@@ -1,0 +1,165 @@
+"""`lslam map` as a user calls it."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import laspy
+import numpy as np
+import pytest
+from calling import assert_one_sentence, lslam, sample_copy, strict_json
+
+from lslam.cli.main import cli
+from lslam.errors import LslamError
+from lslam.formats.cloud_files import read_cloud
+from lslam.geometry.geodesy import from_local
+from lslam.pipeline.map_files import georeference_note
+from lslam.types.georeference import Georeference
+
+COUNT = 10
+
+
+@pytest.fixture(scope="module")
+def ran(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run whose scans lie in a folder of their own; tests copy it before they change it."""
+    root = tmp_path_factory.mktemp("map")
+    done = lslam("run", sample_copy(root / "data", COUNT), "--out", root / "run", "-q")
+    assert done.returncode == 0, done.stderr
+    return root / "run"
+
+
+@pytest.fixture
+def run(ran: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(ran, tmp_path / "run"))
+
+
+def test_the_same_settings_give_the_same_map(run: Path, tmp_path: Path) -> None:
+    done = lslam("map", run, "--out", tmp_path / "again.ply", "--json")
+    assert done.returncode == 0, done.stderr
+    document = strict_json(done.stdout)
+    before, after = read_cloud(run / "map.ply"), read_cloud(tmp_path / "again.ply")
+    assert (document["points"], document["scans"]) == (len(before), COUNT)
+    assert len(before) == len(after)
+    # trajectory.tum rounds to nanometres.
+    np.testing.assert_allclose(after.points, before.points, atol=1e-5)
+    score = strict_json((run / "evaluation.json").read_text())["map"]
+    assert document["crispness"]["entropy"] == pytest.approx(score["entropy"], abs=1e-3)
+    assert {p.name for p in tmp_path.iterdir()} == {"run", "again.ply", "again.json"}
+
+
+def test_other_settings(run: Path, tmp_path: Path) -> None:
+    out = tmp_path / "part.laz"
+    done = lslam("map", run, "--voxel", 0.5, "--crop", "-8,8,-5,5,-3,1", "--out", out, "--set", "map.range_max=20")
+    assert done.returncode == 0, done.stderr
+    assert f"{out}: " in done.stdout
+    part, whole = read_cloud(out).points, read_cloud(run / "map.ply").points
+    assert ((part >= [-8, -5, -3]) & (part <= [8, 5, 1])).all()
+    cells = np.unique(np.floor(part / 0.5), axis=0)
+    assert 0.9 * len(part) < len(cells) <= len(part) < len(whole) / 4
+    about = json.loads((tmp_path / "part.json").read_text())
+    assert (about["voxel"], about["crs"], about["points"]) == (0.5, None, len(part))
+
+
+def test_a_bridged_scan_stays_out(run: Path, tmp_path: Path) -> None:
+    table = (run / "scans.csv").read_text().replace(",ok,", ",bridged,", COUNT - 1)
+    (run / "scans.csv").write_text(table)
+    done = lslam("map", run, "--out", tmp_path / "one.ply", "--json", "-q")
+    assert strict_json(done.stdout)["scans"] == 1
+    assert len(read_cloud(tmp_path / "one.ply")) < 0.7 * len(read_cloud(run / "map.ply"))
+
+
+def test_a_georeferenced_run_lies_at_its_place(run: Path) -> None:
+    manifest = json.loads((run / "manifest.json").read_text())
+    origin = np.array([48.2, 16.4, 171.0])
+    manifest["georeference"] = georeference_note(Georeference(origin, np.eye(4)))
+    (run / "manifest.json").write_text(json.dumps(manifest))
+    assert lslam("map", run, "--format", "laz", "-q").returncode == 0
+    assert lslam("map", run, "--out", run / "austria.las", "--crs", "EPSG:31256", "-q").returncode == 0
+    from pyproj import Transformer
+
+    world = read_cloud(run / "map.ply").points
+    lat_lon = from_local(world, origin)
+    for name, epsg in (("map.laz", 32633), ("austria.las", 31256)):
+        x, y = Transformer.from_crs(4326, epsg, always_xy=True).transform(lat_lon[:, 1], lat_lon[:, 0])
+        np.testing.assert_allclose(laspy.read(run / name).xyz, np.column_stack([x, y, lat_lon[:, 2]]), atol=0.01)
+    line = json.loads((run / "trajectory.geojson").read_text())["features"][0]["geometry"]["coordinates"]
+    assert len(line) == COUNT
+    np.testing.assert_allclose(line[0], [16.4, 48.2, 171.0], atol=1e-6)
+
+
+def test_scores_and_comparisons(run: Path, tmp_path: Path) -> None:
+    done = lslam("map", run, "--score", "--against", run / "map.ply", "--json")
+    assert done.returncode == 0, done.stderr
+    document = strict_json(done.stdout)
+    # The file holds float32, the run scored float64.
+    score = strict_json((run / "evaluation.json").read_text())["map"]
+    assert document["crispness"]["entropy"] == pytest.approx(score["entropy"], abs=1e-4)
+    assert (document["against"]["f1"], document["against"]["chamfer"]) == (1.0, 0.0)
+    text = lslam("map", run / "map.ply", "--score", "--radius", 1.0, "--against", run / "map.ply").stdout
+    assert "neighbourhoods of 1 m" in text
+    assert "precision 1.0000" in text
+    assert lslam("map", "--help").stdout.count("lslam map runs/first") >= 2
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "part"),
+    [
+        ([], 2, "map.ply exists; name another file with --out or replace it with --overwrite"),
+        (["--out", "no/where.ply"], 3, "the folder no does not exist"),
+        (["--out", "map.xyz"], 2, "known suffixes: .ply"),
+        (["--out", "a.ply", "--format", "laz"], 2, "contradicts"),
+        (["--out", "a.ply", "--voxel", "0"], 2, "map.voxel"),
+        (["--out", "a.ply", "--crop", "5,-5,0,1"], 2, "pairs of a smaller and a larger"),
+        (["--out", "a.ply", "--crop", "1,2,3"], 2, "x_min, x_max, y_min, y_max"),
+        (["--out", "a.ply", "--format", "obj"], 2, "contradicts"),
+        (["--out", "a.laz", "--crs", "EPSG:25832"], 2, "is not georeferenced"),
+        (["--out", "a.laz", "--crs", "25832"], 2, "expected EPSG and a number"),
+        (["--out", "a.ply", "--set", "odometry.method=icp"], 2, "only keys of the map"),
+        (["--out", "a.ply", "--threshold", "1"], 2, "belongs to --against"),
+        (["--against", "none.ply"], 3, "none.ply cannot be read"),
+    ],
+)  # fmt: skip
+def test_what_will_not_do_is_one_sentence(
+    ran: Path, monkeypatch: pytest.MonkeyPatch, words: list[str], code: int, part: str
+) -> None:
+    """In this process: `main` makes an error line and an exit code of every LslamError."""
+    before = sorted(ran.iterdir())
+    monkeypatch.chdir(ran)
+    with pytest.raises(LslamError) as caught:
+        cli(["map", str(ran), "-q", *words], standalone_mode=False)
+    assert part in str(caught.value)
+    assert caught.value.exit_code == code
+    assert sorted(ran.iterdir()) == before
+
+
+def test_what_is_gone_is_named(run: Path, ran: Path, tmp_path: Path) -> None:
+    scans = ran.parent / "data"
+    scans.rename(tmp_path / "moved")
+    try:
+        done = lslam("map", run, "--out", run / "a.ply")
+        assert done.returncode == 3
+        assert str(scans / "sequences" / "00") in done.stderr
+        assert "--sequence" in done.stderr
+        assert_one_sentence(done.stderr)
+        there = tmp_path / "moved" / "sequences" / "00"
+        assert lslam("map", run, "--out", run / "a.ply", "--sequence", there, "-q").returncode == 0
+        other = sample_copy(tmp_path / "other", COUNT - 3)
+        done = lslam("map", run, "--out", run / "b.ply", "--sequence", other)
+        assert (done.returncode, "does not fit" in done.stderr) == (3, True)
+    finally:
+        (tmp_path / "moved").rename(scans)
+    (run / "trajectory.tum").unlink()
+    for target, part in (
+        (run, "no trajectory.tum"),
+        (tmp_path / "none", "no folder of a run"),
+        (tmp_path, "manifest.json"),
+    ):
+        done = lslam("map", target)
+        assert (done.returncode, part in done.stderr) == (3, True), done.stderr
+        assert_one_sentence(done.stderr)
+    for path in run.glob("map.*"):
+        path.unlink()
+    done = lslam("map", run, "--score")
+    assert (done.returncode, "has no map file" in done.stderr) == (3, True)
