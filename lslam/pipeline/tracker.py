@@ -113,7 +113,7 @@ class Tracker:
                 better = self.motion.refine(prior, scan.stamp_ns, result.T_world_lidar)
                 if _distance(prior, better) > self.REFINE_M:
                     prior = better
-                    result = odometry.register(scan, prepared, prior)
+                    result = _both(result, odometry.register(scan, prepared, prior))
             elif self._first is None:
                 self._first = (scan, prepared, result.T_world_lidar)
             else:
@@ -139,6 +139,12 @@ class Tracker:
 def sweep_seconds(scan: Scan | None) -> float:
     """How long the sensor took for the scan, s; 0 when its points belong to one instant."""
     return 0.0 if scan is None or scan.times is None or len(scan) == 0 else max(float(scan.times.max()), 0.0)
+
+
+def _both(first: ScanResult, second: ScanResult) -> ScanResult:
+    """The second registration of a scan, at the cost of both."""
+    stages = {name: first.stages.get(name, 0.0) + second.stages.get(name, 0.0) for name in first.stages | second.stages}
+    return replace(second, iterations=first.iterations + second.iterations, stages=stages)
 
 
 def _matrix_norm(prior: NDArray[np.float64], pose: NDArray[np.float64]) -> float:

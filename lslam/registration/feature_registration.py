@@ -51,7 +51,7 @@ class FeatureRegistration:
         self.map: FeatureMap | None = self._new_map(1 << 16) if with_map else None
         self.target: FeatureScan | None = None
         self.noise = FeatureNoise(loam.edge_sigma, config.sigma, config.weak_share)
-        self.threshold = AdaptiveThreshold(2 * config.kernel_min, config.kernel_max)
+        self.threshold = AdaptiveThreshold(config.kernel_min, config.kernel_max)
         self.agreement = UsualAgreement(config.min_agreement)
         self._starting = config.start_scans
         self._first: tuple[Features, Floats] | None = None

@@ -60,7 +60,7 @@ class Registration:
             count_cap=self.config.count_cap,
             reach=1.2 * self.preprocess.range_max,
         )
-        self.threshold = AdaptiveThreshold(2 * self.config.kernel_min, self.config.kernel_max)
+        self.threshold = AdaptiveThreshold(self.config.kernel_min, self.config.kernel_max)
         self.agreement = UsualAgreement(self.config.min_agreement)
         self._motion = ConstantVelocity()
         self._index = 0
