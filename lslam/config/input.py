@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from typing import Literal
 
 from pydantic import Field, field_validator
 
@@ -21,6 +22,11 @@ class InputConfig(Section):
     strict: bool = Field(False, description="every degradation is a failed gate: exit 4")
     vertical_correction_deg: float | None = Field(
         None, description="rotation of KITTI HDL-64E points about p x z; absent: the reader knows"
+    )
+    level: Literal["auto", "gravity", "ground", "none"] = Field(
+        "auto",
+        description="what makes z of the world up: gravity as an IMU measures it, the ground under the first scan, or "
+        "nothing; auto: gravity with the IMU, else nothing",
     )
     rings: str = Field(
         "auto", description="how rings are found: auto, field, order (of the file), rows[:N] or elevation[:N]"

@@ -27,13 +27,14 @@ class Manifest:
     outcome : done, degraded (a scan was bridged or skipped, or input was dropped, replaced or refused), diverged or
         interrupted
     deskew : what becomes of the motion within a scan, `describe_deskew`
+    world : where the coordinates begin and whether z is up
     imu : what became of the IMU, empty without `--imu`; keyframes : how many and how large
     problems : what went wrong in this run, beside what was wrong with the recording before
     """
 
     def __init__(self, command: str, sequence: Sequence, config: Config) -> None:
         self.command, self.sequence, self.config = command, sequence, config
-        self.deskew = "not decided yet"
+        self.deskew = self.world = "not decided yet"
         self.started = datetime.now(UTC)
         self.timings: dict[str, float] = {}
         self.problems: list[str] = []
@@ -109,7 +110,7 @@ class Manifest:
                 "problems": list(s.problems),
             },
             "frames": {
-                "world": "LiDAR at the first scan, not levelled",
+                "world": self.world,
                 "trajectory.tum": "T_world_lidar",
                 "trajectory_kitti.txt": "camera 0 (Tr is known)" if has_camera else "LiDAR (no Tr is known)",
                 "pose_time": "scan_start",

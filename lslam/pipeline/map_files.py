@@ -23,11 +23,15 @@ LOCAL = "world of trajectory.tum"
 
 @dataclass(frozen=True)
 class MapNote:
-    """What a map file cannot say of itself: the sequence it was made of, the edge of its voxels, m, what was done to it."""
+    """What a map file cannot say of itself: the sequence it was made of, the edge of its voxels, m, what was done to it.
+
+    world : its coordinates in words, where they are those of the trajectory
+    """
 
     sequence: str
     voxel: float
     done: tuple[str, ...] = ()
+    world: str = LOCAL
 
 
 def write_map(path: Path, cloud: Cloud, note: MapNote, georeference: Georeference | None = None) -> None:
@@ -40,7 +44,7 @@ def write_map(path: Path, cloud: Cloud, note: MapNote, georeference: Georeferenc
     projection = None if georeference is None else Projection(georeference)
     projected = projection is not None and path.suffix.lower() in (".las", ".laz")
     where = "not georeferenced" if projection is None else f"EPSG:{projection.epsg}" if projected else "local"
-    comment = f"lslam {__version__} map, {where}; {LOCAL}"
+    comment = f"lslam {__version__} map, {where}; {note.world}"
     if projection is not None and projected:
         projection.check()
         write_cloud(path, ProjectedCloud(cloud, projection), wkt=projection.wkt)
@@ -55,7 +59,7 @@ def write_map(path: Path, cloud: Cloud, note: MapNote, georeference: Georeferenc
         "intensity": cloud.has_intensity,
         "frame": f"EPSG:{projection.epsg}, heights above the WGS84 ellipsoid"
         if projection is not None and projected
-        else LOCAL,
+        else note.world,
         "crs": f"EPSG:{projection.epsg}" if projection is not None and projected else None,
         "georeference": None if georeference is None else georeference_note(georeference),
         "voxel": note.voxel,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+from dataclasses import replace
 
 import numpy as np
 
@@ -17,7 +18,7 @@ from lslam.geometry import se3
 from lslam.maps.merge import MergedMap
 from lslam.pipeline import map_files
 from lslam.pipeline.feature_pass import FeatureCloud
-from lslam.pipeline.map_files import MapNote
+from lslam.pipeline.map_files import LOCAL, MapNote
 from lslam.pipeline.run_folder import RunFolder
 from lslam.reports.evaluation_json import run_document
 from lslam.reports.facts import stage_matrix
@@ -48,7 +49,7 @@ def write_trajectories(folder: RunFolder, record: RunRecord, calibration: Calibr
     trajectory = record.trajectory
     write_tum(
         folder.path / "trajectory.tum", trajectory,
-        comment=f"lslam {__version__}, {record.method}: T_world_lidar\npose_time: scan_start",
+        comment=f"lslam {__version__}, {record.method}: T_world_lidar\nworld: {record.world}\npose_time: scan_start",
     )  # fmt: skip
     write_kitti(folder.path / "trajectory_kitti.txt", _in_camera(trajectory, calibration))
     if trajectory.covariances is not None:
@@ -82,11 +83,16 @@ def write_scans(folder: RunFolder, record: RunRecord) -> None:
 
 
 def write_map(
-    folder: RunFolder, merged: MergedMap, config: MapConfig, sequence: str, georeference: Georeference | None = None
+    folder: RunFolder, merged: MergedMap, config: MapConfig, record: RunRecord, georeference: Georeference | None = None
 ) -> None:
     """map.ply, .pcd, .las or .laz with map.json beside."""
     folder.require_space(BYTES_PER_POINT * len(merged), "the map")
-    map_files.write_map(folder.path / f"map.{config.format}", merged, MapNote(sequence, config.voxel), georeference)
+    map_files.write_map(
+        folder.path / f"map.{config.format}",
+        merged,
+        MapNote(record.name, config.voxel, world=f"{LOCAL}: {record.world}"),
+        georeference,
+    )
 
 
 def write_feature_map(folder: RunFolder, features: FeatureCloud) -> None:
@@ -94,7 +100,7 @@ def write_feature_map(folder: RunFolder, features: FeatureCloud) -> None:
     folder.require_space(BYTES_PER_POINT * len(features), "the feature map")
     write_ply(
         folder.path / "feature_map.ply", features.points, scalars={"class": features.kinds},
-        comment="lslam feature map, class 1 = edge, 0 = plane; world = LiDAR at first scan",
+        comment=f"lslam feature map, class 1 = edge, 0 = plane; {LOCAL}",
     )  # fmt: skip
 
 
@@ -114,10 +120,9 @@ def write_html(folder: RunFolder, record: RunRecord, evaluation: Evaluation | No
 
 
 def _in_camera(trajectory: Trajectory, calibration: Calibration) -> Trajectory:
-    """Poses of camera 0 in camera 0 at the start, or unchanged when no Tr is known."""
+    """Poses of camera 0 in camera 0 at the start, of the LiDAR likewise when no Tr is known: the file's first is the identity."""
+    poses = se3.relative(trajectory.poses[:1], trajectory.poses)
     T = calibration.T_cam0_lidar
     if T is None:
-        return trajectory
-    return Trajectory(
-        trajectory.stamps_ns, T @ trajectory.poses @ se3.inverse(T), frame="cam0", source=trajectory.source
-    )
+        return replace(trajectory, poses=poses)
+    return Trajectory(trajectory.stamps_ns, T @ poses @ se3.inverse(T), frame="cam0", source=trajectory.source)

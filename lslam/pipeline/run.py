@@ -16,8 +16,9 @@ from lslam.pipeline import outputs
 from lslam.pipeline.check import check_config
 from lslam.pipeline.choose import choose_scans
 from lslam.pipeline.feature_pass import build_feature_map
-from lslam.pipeline.front_end import has_point_times
+from lslam.pipeline.front_end import has_point_times, to_trajectory
 from lslam.pipeline.inertial_start import with_imu_settings
+from lslam.pipeline.levelling import find_level, level_results
 from lslam.pipeline.manifest import Manifest, describe_deskew
 from lslam.pipeline.map_pass import build_map
 from lslam.pipeline.odometry_pass import estimate_poses
@@ -67,6 +68,7 @@ def run(
         _announce(chosen, odometry, config, manifest)
         store = KeyframeStore()
         record = estimate_poses(chosen, odometry, config, manifest, Path(), truth, watch, store)
+        _level(record, chosen, config, manifest)
         evaluation = _score(record, chosen, config)
     else:
         with RunFolder(Path(out), overwrite) as folder:
@@ -77,6 +79,7 @@ def run(
                 folder.write_manifest(manifest.as_dict("running"))
                 store = KeyframeStore(folder.path / KEYFRAMES)
                 record = estimate_poses(chosen, odometry, config, manifest, folder.path, truth, watch, store)
+                _level(record, chosen, config, manifest)
                 outputs.write_trajectories(folder, record, chosen.calibration)
                 outputs.write_scans(folder, record)
                 evaluation = _score(record, chosen, config)
@@ -110,6 +113,17 @@ def _announce(sequence: Sequence, odometry: Odometry, config: Config, manifest: 
         log.info("deskew: %s", manifest.deskew)
 
 
+def _level(record: RunRecord, sequence: Sequence, config: Config, manifest: Manifest) -> None:
+    """Make the world level: the last of all that moves poses, so keyframes on disk stay where odometry put them."""
+    level = find_level(sequence, record.results, config)
+    record.results = level_results(record.results, level)
+    record.trajectory = to_trajectory(record.results, record.method)
+    record.world = manifest.world = level.world
+    if level.problem:
+        manifest.problems.append(level.problem)
+        log.warning("%s", level.problem)
+
+
 def _score(record: RunRecord, sequence: Sequence, config: Config) -> Evaluation | None:
     """The evaluation, or None with the reason among the record's problems."""
     if record.ground_truth is None:
@@ -140,7 +154,7 @@ def _map(
             return
         record.map_image, record.map_extent = built.image, built.extent
         record.crispness = crispness(built.merged)
-        outputs.write_map(folder, built.merged, config.map, sequence.name)
+        outputs.write_map(folder, built.merged, config.map, record)
     manifest.map_points = len(built.merged)
 
 

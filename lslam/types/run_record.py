@@ -21,6 +21,7 @@ class RunRecord:
     map_image : (H, W) float32 density of the merged map seen from above, row 0 at the largest y, or None
     map_extent : (x_min, x_max, y_min, y_max), m; crispness : of the merged map, None without one
     real_time_limit : seconds one scan may take: skip_frames / rate
+    world : where the coordinates of trajectory and map begin and whether z is up, in words
     """
 
     name: str
@@ -34,4 +35,5 @@ class RunRecord:
     map_image: NDArray[np.float32] | None = None
     map_extent: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
     crispness: Crispness | None = None
+    world: str = "LiDAR at the first scan, not levelled"
     problems: list[str] = field(default_factory=list)

@@ -21,7 +21,7 @@ from lslam.pipeline.inertial_start import begin_inertial, close_inertial
 from lslam.pipeline.run import run
 from lslam.pipeline.watch import RunOutcome
 from lslam.readers import select
-from lslam.simulation.scenarios import simulate
+from lslam.simulation.scenarios import SimulatedDrive, simulate
 from lslam.types.imu import ImuStream
 from lslam.types.scan_result import ScanResult
 
@@ -29,9 +29,15 @@ COUNT = 60
 
 
 @cache
-def walk() -> Stub:
+def walk_drive() -> SimulatedDrive:
     """A hand-held walk, looking about at up to 110 deg/s, rays fired on the way."""
-    drive = simulate("walk", lidar="vlp16", count=COUNT, imu="icm20948", motion_compensated=False)
+    return simulate("walk", lidar="vlp16", count=COUNT, imu="icm20948", motion_compensated=False)
+
+
+@cache
+def walk() -> Stub:
+    """Its scans in memory."""
+    drive = walk_drive()
     return Stub(
         [drive.scan(i) for i in range(COUNT)],
         drive.ground_truth,
@@ -107,6 +113,13 @@ def test_the_manifest_says_what_was_found(tmp_path: Path) -> None:
     header, *rows = (tmp_path / "run" / "scans.csv").read_text().splitlines()
     column = header.split(",").index("prior_norm")
     assert float(rows[20].split(",")[column]) == pytest.approx(outcome.record.results[20].prior_norm, abs=1e-5)
+    world = manifest["frames"]["world"]
+    assert "levelled by gravity" in world
+    assert f"# world: {world}" in (tmp_path / "run" / "trajectory.tum").read_text()
+    up = outcome.trajectory.poses[0][2, :3] @ walk_drive().city_poses[0][2, :3]
+    assert np.rad2deg(np.arccos(up)) < 2
+    first = np.loadtxt(tmp_path / "run" / "trajectory_kitti.txt")[0]
+    np.testing.assert_allclose(first, np.eye(4)[:3].ravel(), atol=1e-9, err_msg="KITTI's world is the start")
     assert "Motion prior" in (tmp_path / "run" / "report.html").read_text()
 
 
@@ -203,7 +216,7 @@ def test_a_start_with_scans_that_cannot_be_read_is_aligned_all_the_same(lost: li
     assert not part.problems
     results = estimate(select(stub, count=30), create_odometry(Config()), motion=part.motion)
     assert [r.index for r in results if r.status != "ok"] == lost
-    assert float(np.median([r.prior_norm for r in results[5:]])) < 0.03
+    assert float(np.median([r.prior_norm for r in results[5:]])) < 0.04
 
 
 def test_a_method_that_predicts_by_itself_is_named() -> None:

@@ -1,0 +1,121 @@
+"""The world of a run made level: up becomes z, the origin and the heading stay the first scan's.
+
+Nothing else changes: every pose is turned by one rotation, so that relative motions, aligned errors and the map's shape are
+those of a run that is not levelled.
+"""
+
+from __future__ import annotations
+
+import logging
+from contextlib import suppress
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.config import Config
+from lslam.errors import InputError
+from lslam.geometry import se3, so3
+from lslam.kernels import jit
+from lslam.preprocessing.ground import levelling
+from lslam.types.scan_result import ScanResult
+from lslam.types.sequence import Sequence
+
+log = logging.getLogger("lslam")
+Floats = NDArray[np.float64]
+
+ORIGIN = "LiDAR at the first scan"
+UP = np.array([0.0, 0.0, 1.0])
+# The ground under the sensor: so many cells of half a metre to each side.
+CELLS = 80
+
+
+@dataclass(frozen=True)
+class Level:
+    """The rotation that makes a world level, and where it comes from.
+
+    R : (3, 3) from the world as it was; world : in words, for files; problem : what was asked for and could not be had
+    """
+
+    R: Floats
+    world: str
+    problem: str = ""
+
+    @property
+    def is_turned(self) -> bool:
+        """Whether there is anything to turn."""
+        return not np.array_equal(self.R, np.eye(3))
+
+
+def find_level(sequence: Sequence, results: list[ScanResult], config: Config) -> Level:
+    """What `input.level` asks for: gravity when an IMU measured it, the ground under the first scan, or nothing."""
+    wanted = config.input.level
+    if wanted == "auto":
+        wanted = "gravity" if config.imu.use else "none"
+    if wanted == "none":
+        return Level(np.eye(3), f"{ORIGIN}, not levelled")
+    if wanted == "gravity":
+        up = _up_by_gravity(results)
+        what, why = "gravity", "no scan has a direction of gravity: it takes --imu, and an IMU that is not refused"
+    else:
+        up = _up_by_ground(sequence, results, config)
+        what, why = "the ground under the first scan", "no ground plane is seen there"
+    if up is None:
+        problem = "" if config.input.level == "auto" else f"input.level = {wanted}: {why}; the world is not levelled"
+        return Level(np.eye(3), f"{ORIGIN}, not levelled", problem)
+    R = least_rotation(up, UP)
+    tilt = np.rad2deg(float(so3.angle(R)))
+    log.info("the world is levelled by %s: turned by %.2f deg", what, tilt)
+    return Level(R, f"{ORIGIN}, levelled by {what} (turned by {tilt:.2f} deg)")
+
+
+def level_results(results: list[ScanResult], level: Level) -> list[ScanResult]:
+    """The results in the level world: poses, covariances and weak directions; all else is as it was."""
+    if not level.is_turned:
+        return results
+    T = se3.make(level.R, np.zeros(3))
+    B = np.kron(np.eye(2), level.R)
+
+    def turned(covariance: Floats | None) -> Floats | None:
+        return None if covariance is None else np.asarray(B @ covariance @ B.T)
+
+    return [
+        replace(
+            r,
+            T_world_lidar=se3.normalise(T @ r.T_world_lidar),
+            covariance=turned(r.covariance),
+            registration_covariance=turned(r.registration_covariance),
+            degenerate=r.degenerate @ B.T,
+        )
+        for r in results
+    ]
+
+
+def least_rotation(a: Floats, b: Floats) -> Floats:
+    """(3, 3) smallest rotation that takes the unit vector `a` (3,) to `b` (3,); about x when they are opposite."""
+    axis, cosine = np.cross(a, b), float(a @ b)
+    sine = float(np.linalg.norm(axis))
+    if sine < 1e-12:
+        return np.eye(3) if cosine > 0 else np.diag([1.0, -1.0, -1.0])
+    return np.asarray(so3.exp(axis / sine * np.arctan2(sine, cosine)))
+
+
+def _up_by_gravity(results: list[ScanResult]) -> Floats | None:
+    """Mean over the run, by their sigmas: what tells a bias from a tilt comes with the bends of the way."""
+    up = np.zeros(3)
+    for r in results:
+        if r.gravity is not None:
+            up -= r.T_world_lidar[:3, :3] @ r.gravity.direction / r.gravity.sigma**2
+    norm = float(np.linalg.norm(up))
+    return up / norm if norm > 0 else None
+
+
+def _up_by_ground(sequence: Sequence, results: list[ScanResult], config: Config) -> Floats | None:
+    """The dominant plane below the first scan that was registered."""
+    for number, result in enumerate(results):
+        if result.status != "ok":
+            continue
+        with suppress(InputError), jit.announced(log), jit.compile_lock():
+            R, height = levelling(sequence.scan(number).points, config.preprocess.ground_tolerance, CELLS)
+            return np.asarray(result.T_world_lidar[:3, :3] @ R[2]) if np.isfinite(height) else None
+    return None
