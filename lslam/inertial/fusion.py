@@ -16,6 +16,7 @@ from lslam.registration.motion import ConstantVelocity, middle_of
 from lslam.types.gravity import GravityDirection
 from lslam.types.imu import ImuStream
 from lslam.types.motion_prior import MotionPrior
+from lslam.types.state import State, Stateful
 
 Floats = NDArray[np.float64]
 log = logging.getLogger("lslam")
@@ -24,7 +25,7 @@ log = logging.getLogger("lslam")
 LEVER_M = 10.0
 
 
-class InertialMotion:
+class InertialMotion(Stateful):
     """Predicts with the IMU where it has samples, and with constant velocity where it has none.
 
     imu : cleaned, on the clock of the scans; T_lidar_imu : (4, 4); estimate : at the first scan, in the LiDAR frame there
@@ -32,6 +33,7 @@ class InertialMotion:
 
     # Of so many scans the IMU must predict the typical one not clearly worse than constant velocity does.
     JUDGED, WORSE, SLACK_M = 30, 2.0, 0.02
+    STATE = ("estimate", "coasting", "refusal", "gap_scans", "_has_gap", "_instant_ns", "_pose")
 
     def __init__(self, imu: ImuStream, T_lidar_imu: Floats, estimate: ImuEstimate, config: ImuConfig) -> None:
         self.imu, self.T_lidar_imu, self.config = imu, T_lidar_imu, config
@@ -113,6 +115,15 @@ class InertialMotion:
         The IMU knows the speed from the start: only one that was refused is ever asked.
         """
         return self.coasting.rewind(stamp_ns, start, span_s)
+
+    def state(self) -> State:
+        """What `restore` needs to go on from here; not the stream."""
+        return {**super().state(), "errors": np.array(self._errors).reshape(-1, 2)}
+
+    def restore(self, state: State) -> None:
+        """Go on where `state` was taken."""
+        super().restore(state)
+        self._errors = [(float(own), float(steady)) for own, steady in state["errors"]]
 
     def prior_errors(self) -> tuple[float, float] | None:
         """Medians, m, of how wrong the IMU and constant velocity predicted the scans, turns counted at `LEVER_M`."""

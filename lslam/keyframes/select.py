@@ -9,14 +9,16 @@ from lslam.config.keyframes import KeyframesConfig
 from lslam.geometry import se3, so3
 from lslam.types.keyframe import Keyframe
 from lslam.types.scan_result import ScanResult
-from lslam.types.state import State
+from lslam.types.state import Stateful
 
 
-class KeyframeSelector:
+class KeyframeSelector(Stateful):
     """Takes a registered scan when the sensor has travelled `distance`, or turned by `angle_deg`, since the last taken.
 
     The first registered scan is one. Scans that were bridged or skipped never are: nobody knows where they belong.
     """
+
+    STATE = ("_count", "_travelled", "_here", "_last")
 
     def __init__(self, config: KeyframesConfig) -> None:
         self._distance, self._angle = config.distance, float(np.deg2rad(config.angle_deg))
@@ -36,20 +38,6 @@ class KeyframeSelector:
         self._last = pose
         self._count += 1
         return Keyframe(self._count - 1, scan, result.stamp_ns, pose, result.covariance, self._travelled)
-
-    def state(self) -> State:
-        """What `restore` needs to go on from here."""
-        poses = [pose for pose in (self._here, self._last) if pose is not None]
-        counts = np.array([self._count, self._here is not None, self._last is not None], np.int64)
-        return {"counts": counts, "travelled": np.array(self._travelled), "poses": np.array(poses).reshape(-1, 4, 4)}
-
-    def restore(self, state: State) -> None:
-        """Go on where `state` was taken."""
-        count, has_here, has_last = (int(v) for v in state["counts"])
-        poses = list(state["poses"])
-        self._count, self._travelled = count, float(state["travelled"])
-        self._here = poses.pop(0) if has_here else None
-        self._last = poses.pop(0) if has_last else None
 
     def _is_due(self, pose: NDArray[np.float64]) -> bool:
         if self._last is None:

@@ -5,8 +5,9 @@ from __future__ import annotations
 import io
 import threading
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +15,6 @@ from numpy.typing import NDArray
 from lslam.errors import InputError, OutputError
 from lslam.formats.npz_files import pack_npz, read_npz, write_npz
 from lslam.types.keyframe import Keyframe
-from lslam.types.state import State
 
 Points = NDArray[np.float32]
 
@@ -87,11 +87,11 @@ class KeyframeStore:
         if self.folder is not None and self.keyframes:
             write_npz(self.folder / INDEX, self.state())
 
-    def state(self) -> State:
+    def state(self) -> dict[str, NDArray[Any]]:
         """Everything but the clouds, as arrays."""
         return keyframe_arrays(self.keyframes)
 
-    def restore(self, state: State) -> None:
+    def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
         """Hold the keyframes of `state`; raises InputError when a cloud of theirs is not there."""
         keyframes = keyframes_of(state)
         for keyframe in keyframes:
@@ -122,7 +122,7 @@ class KeyframeStore:
         return cloud
 
 
-def keyframe_arrays(keyframes: Sequence[Keyframe]) -> State:
+def keyframe_arrays(keyframes: Sequence[Keyframe]) -> dict[str, NDArray[Any]]:
     """Keyframes as arrays; a covariance that is not known is NaN."""
     none = np.full((6, 6), np.nan)
     return {
@@ -136,7 +136,7 @@ def keyframe_arrays(keyframes: Sequence[Keyframe]) -> State:
     }
 
 
-def keyframes_of(state: State) -> list[Keyframe]:
+def keyframes_of(state: Mapping[str, NDArray[Any]]) -> list[Keyframe]:
     """The keyframes of `keyframe_arrays`; raises InputError when they are not."""
     try:
         columns = [state[name] for name in ("scans", "stamps_ns", "poses", "covariances", "distances")]

@@ -8,6 +8,7 @@ from lslam.preprocessing.features import Features
 from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan import Scan
 from lslam.types.scan_result import ScanResult
+from lslam.types.state import State
 
 
 class Odometry(Protocol):
@@ -55,4 +56,17 @@ class Deskewing(Odometry, Protocol):
 
     def restart(self) -> None:
         """Forget all scans."""
+        ...
+
+
+@runtime_checkable
+class Resumable(Odometry, Protocol):
+    """A method that can leave off after any scan and go on later as if nothing had been, to the last bit."""
+
+    def state(self) -> State:
+        """All that earlier scans left behind, in plain values and arrays that no one changes until they are written."""
+        ...
+
+    def restore(self, state: State) -> None:
+        """Go on where `state` was taken, in an object made by the same configuration."""
         ...

@@ -18,6 +18,7 @@ from lslam.registration.uncertainty import PoseUncertainty
 from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan import Scan
 from lslam.types.scan_result import ScanResult
+from lslam.types.state import Stateful
 
 # Methods named after their residual; `icp` is the plane unless told otherwise.
 RESIDUALS: dict[str, Residual] = {"icp-point": "point", "gicp": "gicp", "vgicp": "vgicp", "ndt": "ndt"}
@@ -38,10 +39,11 @@ def create(config: Config) -> Icp:
     return Icp(Registration(config.registration.model_copy(update={"residual": own or chosen}), config.preprocess))
 
 
-class Icp:
+class Icp(Stateful):
     """Adapter from scans and motion priors to `Registration`."""
 
     deskew = "by the motion prior, and again by the motion that registration finds"
+    STATE = ("registration", "_uncertainty")
 
     def __init__(self, registration: Registration) -> None:
         self.registration = registration

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +21,7 @@ from lslam.registration.solver import STEP_M, STEP_RAD
 from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan import Scan
 from lslam.types.scan_result import ScanResult
+from lslam.types.state import State, Stateful
 
 Floats = NDArray[np.float64]
 
@@ -41,7 +43,7 @@ def create(config: Config) -> IcpSvd:
     return IcpSvd(config.preprocess, config.registration)
 
 
-class IcpSvd:
+class IcpSvd(Stateful):
     """Nearest neighbours, trimmed, then the transform that fits them best, until it no longer changes.
 
     Of `registration` it takes `inlier_ratio`, `inlier_distance`, `max_iterations` and the limits beyond which a result is
@@ -77,13 +79,23 @@ class IcpSvd:
         result.stages.update(register=aligned - began, update=time.perf_counter() - aligned)
         return result
 
+    def state(self) -> State:
+        """What `restore` needs to go on from here; the tree grows again from its points."""
+        last = self._last
+        return {"last": None if last is None else (last.points, last.T_world_lidar), "failed": self._failed}
+
+    def restore(self, state: State) -> None:
+        """Go on where `state` was taken."""
+        self._last = None if state["last"] is None else as_partners(*state["last"])
+        self._failed = state["failed"]
+
     def warm_up(self) -> None:
         """Compile or load the kernels of preprocessing."""
         room = np.random.default_rng(0).uniform(-8, 8, (3000, 3)).astype(np.float32)
         self.prepare(Scan(room, 0, 0))
 
 
-def as_partners(points: NDArray[np.float32], T_world_lidar: Floats) -> Partners:
+def as_partners(points: NDArray[Any], T_world_lidar: Floats) -> Partners:
     """Points (M, 3), m, LiDAR frame, ready to be asked for neighbours."""
     cloud = points.astype(np.float64)
     return Partners(cloud, cKDTree(cloud, balanced_tree=False, compact_nodes=False), T_world_lidar)

@@ -16,6 +16,7 @@ from lslam.registration.uncertainty import PoseUncertainty
 from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan import Scan
 from lslam.types.scan_result import ScanResult
+from lslam.types.state import Stateful
 
 
 @dataclass(frozen=True)
@@ -44,11 +45,12 @@ def create(config: Config) -> Loam:
     return Loam(config, VARIANTS[config.odometry.method])
 
 
-class Loam:
+class Loam(Stateful):
     """Adapter from scans and motion priors to `FeatureRegistration`."""
 
     needs_rings = True
     deskew = "features by the motion prior, and again by the motion that registration finds"
+    STATE = ("registration", "_uncertainty")
 
     def __init__(self, config: Config, variant: Variant) -> None:
         self.config, self.variant = config, variant

@@ -17,7 +17,7 @@ from lslam.types.keyframe import Keyframe
 from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan import Scan
 from lslam.types.scan_result import ScanResult
-from lslam.types.state import State, joined, part_of
+from lslam.types.state import State
 
 # Scans that wait for their cloud at most, so that a slow disk does not fill the memory.
 WAITING = 3
@@ -74,12 +74,12 @@ class Keyframing:
     def state(self) -> State:
         """What `restore` needs to go on from here; waits for the clouds on their way."""
         self._wait(0)
-        return joined(selector=self._selector.state(), store=self.store.state())
+        return {"selector": self._selector.state(), "store": self.store.state()}
 
     def restore(self, state: State) -> None:
         """Go on where `state` was taken; raises InputError when a cloud is missing."""
-        self._selector.restore(part_of(state, "selector"))
-        self.store.restore(part_of(state, "store"))
+        self._selector.restore(state["selector"])
+        self.store.restore(state["store"])
 
     def __enter__(self) -> Keyframing:
         """Nothing to begin."""

@@ -11,12 +11,13 @@ from numpy.typing import NDArray
 
 from lslam.geometry import se3, so3
 from lslam.inertial.fusion import InertialMotion
-from lslam.odometry.base import Deskewing, Odometry
+from lslam.odometry.base import Deskewing, Odometry, Resumable
 from lslam.registration.motion import ConstantVelocity, MotionModel, middle_of
 from lslam.registration.standing import Standing
 from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan import Scan
 from lslam.types.scan_result import ScanResult
+from lslam.types.state import State
 
 # Half the points of a scan are nearer.
 LEVER_M = 10.0
@@ -63,6 +64,29 @@ class Tracker:
         if self.motion.is_known:
             self._first = None
         return result
+
+    @property
+    def is_settled(self) -> bool:
+        """Whether nothing waits for the next scan, so that `state` says all."""
+        return self._first is None
+
+    def state(self) -> State:
+        """What `restore` needs to go on from here; of a method that is not `Resumable`, only what is around it."""
+        return {
+            "odometry": self.odometry.state() if isinstance(self.odometry, Resumable) else None,
+            "motion": self.motion.state(),
+            "standing": None if self.standing is None else self.standing.state(),
+            "middle": self.middle,
+        }
+
+    def restore(self, state: State) -> None:
+        """Go on where `state` was taken."""
+        if isinstance(self.odometry, Resumable) and state["odometry"] is not None:
+            self.odometry.restore(state["odometry"])
+        self.motion.restore(state["motion"])
+        if self.standing is not None:
+            self.standing.restore(state["standing"])
+        self.middle = state["middle"]
 
     def _stand_or_move(self, scan: Scan, loaded: Loaded, standing: Standing) -> ScanResult:
         began = time.perf_counter()

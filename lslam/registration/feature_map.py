@@ -5,14 +5,16 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.kernels.gaussians import USED
 from lslam.preprocessing.features import Features
 from lslam.registration.gaussian_map import GaussianMap
+from lslam.types.state import State, Stateful
 
 # As LOAM fits its lines: five points at least.
 MIN_LINE_POINTS = 5
 
 
-class FeatureMap:
+class FeatureMap(Stateful):
     """Less sharp edges and less planar points of past scans, in voxels of one size around the sensor.
 
     Parameters
@@ -20,6 +22,8 @@ class FeatureMap:
     size : m, edge of a voxel
     min_points, planarity, count_cap, reach : of the plane voxels, as in `GaussianMap`
     """
+
+    STATE = ("planes", "edges")
 
     def __init__(
         self, size: float, *, min_points: int = 6, planarity: float = 0.3, count_cap: float = 200.0, reach: float = 150.0,
@@ -51,6 +55,18 @@ class FeatureMap:
         """Add the less sharp edges and the less planar points of a scan."""
         self.edges.insert(features.less_edges.points.astype(np.float32), T_world_lidar)
         self.planes.insert(features.less_planes.points.astype(np.float32), T_world_lidar)
+
+    def state(self) -> State:
+        """The voxels, and the lines that were computed of them: a line stays until its voxel's count has changed."""
+        used = int(self.edges.pool[USED])
+        return {**super().state(), "lines": [part[:used] for part in self.lines]}
+
+    def restore(self, state: State) -> None:
+        """Go on with the voxels of `state`."""
+        super().restore(state)
+        self._lines = _lines_for(self.edges)
+        for part, known in zip(self._lines, state["lines"], strict=True):
+            part[: len(known)] = known
 
 
 def _lines_for(edges: GaussianMap) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64]]:

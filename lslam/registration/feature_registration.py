@@ -20,6 +20,7 @@ from lslam.registration.feature_steps import ScanStep, StageClock
 from lslam.registration.registration import DOUBT, Registration
 from lslam.registration.robust import AdaptiveThreshold, Annealing, UsualAgreement
 from lslam.registration.solver import RegistrationResult
+from lslam.types.state import Stateful
 
 Floats = NDArray[np.float64]
 
@@ -31,7 +32,7 @@ PATIENCE = 3
 STAND_IN_GRID = 1.0
 
 
-class FeatureRegistration:
+class FeatureRegistration(Stateful):
     """Registers features on the scan before, on a feature map, or on one after the other: `locate`, then `update`.
 
     Parameters
@@ -41,6 +42,8 @@ class FeatureRegistration:
     with_less_planes : whether the map is matched with centroids of the less planar points in place of the planar points
     reach : m, how far from the sensor the map is kept
     """
+
+    STATE = ("map", "target", "threshold", "agreement", "_starting", "_first", "_inserted", "_failures")
 
     def __init__(
         self, config: RegistrationConfig, loam: LoamConfig, *, scan_step: ScanStep | None, with_map: bool,

@@ -5,13 +5,15 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.errors import InputError
 from lslam.kernels import gaussians
+from lslam.types.state import State, Stateful
 
 # Variance added to every voxel, (1 cm)2: a standing sensor would otherwise collapse the Gaussians.
 FLOOR = 1e-4
 
 
-class GaussianMap:
+class GaussianMap(Stateful):
     """Voxels of one size around the sensor.
 
     Parameters
@@ -32,13 +34,13 @@ class GaussianMap:
         self.keys = np.full(capacity, gaussians.FREE, np.int64)
         self.refreshed = np.zeros(capacity)
         self.table = np.full(4 * capacity, -1, np.int32)
-        self.state = np.zeros(4, np.int64)
+        self.pool = np.zeros(4, np.int64)
         self.free = np.zeros(capacity, np.int32)
         self._shapes = np.zeros((0, 14))
 
     def __len__(self) -> int:
         """Voxels that hold points."""
-        return int(self.state[gaussians.LIVE])
+        return int(self.pool[gaussians.LIVE])
 
     def insert(self, points: NDArray[np.float32], T_world_lidar: NDArray[np.float64]) -> int:
         """Add points (N, 3), m, LiDAR frame; returns how many lie too far from the origin to have a voxel.
@@ -50,14 +52,14 @@ class GaussianMap:
         R, t = np.ascontiguousarray(T_world_lidar[:3, :3]), np.ascontiguousarray(T_world_lidar[:3, 3])
         return gaussians.insert(
             points, R, t, self.size, self.count_cap, float(self.min_points), self.planarity, FLOOR, self.reach,
-            self.moments, self.planes, self.keys, self.refreshed, self.table, self.state, self.free,
+            self.moments, self.planes, self.keys, self.refreshed, self.table, self.pool, self.free,
         )  # fmt: skip
 
     def clear(self) -> None:
         """Forget everything; the room is kept."""
         self.keys[:] = gaussians.FREE
         self.table[:] = -1
-        self.state[:] = 0
+        self.pool[:] = 0
         self._shapes[:, 10] = 0.0
 
     def shapes(self) -> NDArray[np.float64]:
@@ -67,7 +69,7 @@ class GaussianMap:
         if len(self._shapes) < len(self.keys):
             self._shapes = np.zeros((len(self.keys), 14))
         describe(
-            self.moments, self.planes, self.keys, self.refreshed, int(self.state[gaussians.USED]),
+            self.moments, self.planes, self.keys, self.refreshed, int(self.pool[gaussians.USED]),
             float(self.min_points), FLOOR, self._shapes,
         )  # fmt: skip
         return self._shapes
@@ -84,18 +86,52 @@ class GaussianMap:
         )  # fmt: skip
         gaussians.coarsen(
             factor, coarse.size, float(coarse.min_points), self.planarity, FLOOR, self.moments, self.keys,
-            int(self.state[gaussians.USED]), coarse.moments, coarse.planes, coarse.keys, coarse.refreshed,
-            coarse.table, coarse.state, coarse.free,
+            int(self.pool[gaussians.USED]), coarse.moments, coarse.planes, coarse.keys, coarse.refreshed,
+            coarse.table, coarse.pool, coarse.free,
         )  # fmt: skip
         return coarse
 
+    def state(self) -> State:
+        """The voxels: all of the pool that was ever used."""
+        used, freed = int(self.pool[gaussians.USED]), int(self.pool[gaussians.FREED])
+        return {
+            "capacity": len(self.keys),
+            "moments": self.moments[:used], "planes": self.planes[:used], "keys": self.keys[:used],
+            "refreshed": self.refreshed[:used], "free": self.free[:freed], "pool": self.pool,
+            "shapes": self._shapes[:used] if len(self._shapes) else None,
+        }  # fmt: skip
+
+    def restore(self, state: State) -> None:
+        """Go on with the voxels of `state`; raises InputError when they do not fit together."""
+        capacity, numbers = int(state["capacity"]), np.asarray(state["pool"], np.int64)
+        used, freed, hand, live = (int(v) for v in numbers)
+        if not (0 <= freed <= used <= capacity <= 1 << 26 and 0 <= hand <= used and live == used - freed):
+            raise InputError("a local map's voxels do not add up")
+        pads = {"moments": 0, "planes": 0, "keys": gaussians.FREE, "refreshed": 0, "free": 0}
+        for name, pad in pads.items():
+            old = getattr(self, name)
+            new = np.full((capacity, *old.shape[1:]), pad, old.dtype)
+            new[: freed if name == "free" else used] = state[name]
+            setattr(self, name, new)
+        if np.count_nonzero(self.keys != gaussians.FREE) != live:
+            raise InputError("a local map's voxels do not add up")
+        if freed and not 0 <= self.free[:freed].min() <= self.free[:freed].max() < used:
+            raise InputError("a local map gives back voxels that it does not have")
+        self.pool = numbers.copy()
+        self._shapes = np.zeros((0 if state["shapes"] is None else capacity, 14))
+        if state["shapes"] is not None:
+            self._shapes[:used] = state["shapes"]
+        self._rehash()
+
     def _grow(self) -> None:
         capacity = 2 * len(self.keys)
-        used = int(self.state[gaussians.USED])
         for name in ("moments", "planes", "keys", "refreshed", "free"):
             old = getattr(self, name)
             new = np.full((capacity, *old.shape[1:]), gaussians.FREE if name == "keys" else 0, old.dtype)
             new[: len(old)] = old
             setattr(self, name, new)
-        self.table = np.full(4 * capacity, -1, np.int32)
-        gaussians.rehash(self.keys, self.table, used)
+        self._rehash()
+
+    def _rehash(self) -> None:
+        self.table = np.full(4 * len(self.keys), -1, np.int32)
+        gaussians.rehash(self.keys, self.table, int(self.pool[gaussians.USED]))

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from lslam.geometry import se3
 from lslam.preprocessing.deskew import KNOTS
 from lslam.types.motion_prior import MotionPrior
+from lslam.types.state import State, Stateful
 
 Floats = NDArray[np.float64]
 
@@ -40,8 +41,16 @@ class MotionModel(Protocol):
         """Forget all scans but the first, taken at `stamp_ns` and `start` (4, 4); its sweep by what is known of the speed."""
         ...
 
+    def state(self) -> State:
+        """What `restore` needs to go on from here."""
+        ...
 
-class ConstantVelocity:
+    def restore(self, state: State) -> None:
+        """Go on where `state` was taken."""
+        ...
+
+
+class ConstantVelocity(Stateful):
     """Predicts the next pose from the last two, scaled to the time between scans.
 
     A sweep's registration knows the pose at the middle of the sweep best: an error of the velocity that deskewed it pulls
@@ -50,6 +59,7 @@ class ConstantVelocity:
 
     # A longer pause says nothing about the speed at its end; the last step is not stretched beyond this factor.
     MAX_STRETCH = 5.0
+    STATE = ("_instant_ns", "_pose", "_twist", "_step_s")
 
     def __init__(self) -> None:
         self._instant_ns: int | None = None

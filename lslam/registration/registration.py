@@ -20,6 +20,7 @@ from lslam.registration.robust import AdaptiveThreshold, Annealing, UsualAgreeme
 from lslam.registration.solver import RegistrationResult, solve
 from lslam.registration.source_covariance import source_covariance
 from lslam.registration.target import make_target
+from lslam.types.state import Stateful
 
 MIN_SOURCE_POINTS = 30
 
@@ -37,7 +38,7 @@ POINT_VOXEL, POINT_STEPS = 0.625, 3
 DOUBT = np.diag([0.25] * 3 + [np.deg2rad(2.0) ** 2] * 3)
 
 
-class Registration:
+class Registration(Stateful):
     """Registers scans one after the other against a local map that it keeps.
 
     >>> import numpy as np
@@ -47,6 +48,8 @@ class Registration:
     >>> result.T_world_lidar.shape
     (4, 4)
     """
+
+    STATE = ("map", "target", "threshold", "agreement", "_motion", "_index", "_starting", "_inserted")
 
     def __init__(self, config: RegistrationConfig | None = None, preprocess: PreprocessConfig | None = None) -> None:
         self.config = config or RegistrationConfig()

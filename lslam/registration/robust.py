@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from lslam.types.state import Stateful
+
 
 @dataclass(frozen=True)
 class Annealing:
@@ -16,7 +18,7 @@ class Annealing:
     steps: int
 
 
-class AdaptiveThreshold:
+class AdaptiveThreshold(Stateful):
     """Opens the kernel as wide as the motion prior has lately been wrong, between `low` and `high`, m.
 
     The prediction error of a scan is its correction in metres at the rms lever arm (KISS-ICP, section III-C, measures
@@ -24,6 +26,7 @@ class AdaptiveThreshold:
     """
 
     FORGETTING = 0.8
+    STATE = ("_mean_square",)
 
     def __init__(self, low: float, high: float) -> None:
         self.low, self.high = low, high
@@ -43,7 +46,7 @@ class AdaptiveThreshold:
         self._mean_square = (self.high / 3) ** 2
 
 
-class UsualAgreement:
+class UsualAgreement(Stateful):
     """Remembers which share of its points each good scan had on the map's surfaces.
 
     A sensor carried elsewhere still matches ground and walls: half the points agree with some plane, and no fixed bound
@@ -52,6 +55,7 @@ class UsualAgreement:
 
     FORGETTING = 0.8
     RELAXING = 0.9
+    STATE = ("usual",)
 
     def __init__(self, drop: float) -> None:
         self.drop = drop

@@ -16,6 +16,7 @@ from lslam.registration.robust import Annealing
 from lslam.registration.solver import RegistrationResult, solve
 from lslam.types.scan import Scan
 from lslam.types.scan_result import ScanResult
+from lslam.types.state import State, Stateful
 
 Floats = NDArray[np.float64]
 
@@ -33,7 +34,7 @@ class Reference:
     T_own: Floats
 
 
-class Standing:
+class Standing(Stateful):
     """Compares scans with the last one that was registered, its reference.
 
     Rao's score test in the words of registration: one Gauss-Newton step of point to plane against the reference, from
@@ -70,6 +71,20 @@ class Standing:
         is_slow = float(np.linalg.norm(step[:3, 3])) < SLOW_M and turn < SLOW_DEG
         self._reference = self._reference_of(scan) if is_slow else None
 
+    def state(self) -> State:
+        """What `restore` needs to go on from here."""
+        reference = self._reference
+        of_it = None if reference is None else {"planes": reference.planes.state(), "T_own": reference.T_own}
+        return {"reference": of_it, "last": self._last}
+
+    def restore(self, state: State) -> None:
+        """Go on where `state` was taken."""
+        of_it, self._last = state["reference"], state["last"]
+        self._reference = None
+        if of_it is not None:
+            self._reference = Reference(self._new_planes(), of_it["T_own"])
+            self._reference.planes.restore(of_it["planes"])
+
     def warm_up(self) -> None:
         """Compile or load the kernels with a small room."""
         room = np.random.default_rng(0).uniform(-8, 8, (3000, 3)).astype(np.float32)
@@ -79,14 +94,17 @@ class Standing:
 
     def _reference_of(self, scan: Scan) -> Reference:
         """Planes of one scan alone. Its voxels are coarse, as those of a map's first scans: a ring is no plane."""
-        c = self._config
-        planes = GaussianMap(
-            c.voxel_size * c.coarse_factor, min_points=c.min_points, planarity=c.planarity, count_cap=c.count_cap,
-            reach=1.2 * self._preprocess.range_max,
-        )  # fmt: skip
+        planes = self._new_planes()
         points = prepare_points(scan.points, self._preprocess, scan.index)
         planes.insert(points.map_points, np.eye(4))
         return Reference(planes, self._step(points, planes).T_world_lidar)
+
+    def _new_planes(self) -> GaussianMap:
+        c = self._config
+        return GaussianMap(
+            c.voxel_size * c.coarse_factor, min_points=c.min_points, planarity=c.planarity, count_cap=c.count_cap,
+            reach=1.2 * self._preprocess.range_max,
+        )  # fmt: skip
 
     def _step(self, points: PreparedPoints, planes: GaussianMap) -> RegistrationResult:
         c = self._config

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from lslam.geometry import se3, so3
 from lslam.registration.gaussian_map import GaussianMap
+from lslam.types.state import Stateful
 
 Floats = NDArray[np.float64]
 Points = NDArray[np.float32]
@@ -24,7 +25,7 @@ class Target(Protocol):
         ...
 
 
-class MapTarget:
+class MapTarget(Stateful):
     """Every scan stays until the sensor has left it behind."""
 
     def enter(self, target: GaussianMap, points: Points, T_world_lidar: Floats) -> None:
@@ -32,7 +33,7 @@ class MapTarget:
         target.insert(points, T_world_lidar)
 
 
-class ScanTarget:
+class ScanTarget(Stateful):
     """The last scan alone: scan-to-scan registration."""
 
     def enter(self, target: GaussianMap, points: Points, T_world_lidar: Floats) -> None:
@@ -41,8 +42,10 @@ class ScanTarget:
         target.insert(points, T_world_lidar)
 
 
-class KeyframeTarget:
+class KeyframeTarget(Stateful):
     """The last `count` keyframes, a new one where the sensor has moved 2 m or turned 15 deg since the newest."""
+
+    STATE = ("keyframes",)
 
     def __init__(self, count: int) -> None:
         self.count = count

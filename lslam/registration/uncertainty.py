@@ -7,11 +7,12 @@ from numpy.typing import NDArray
 
 from lslam.geometry import so3
 from lslam.registration.solver import RegistrationResult
+from lslam.types.state import Stateful
 
 Floats = NDArray[np.float64]
 
 
-class PoseUncertainty:
+class PoseUncertainty(Stateful):
     """Accumulates the drift of scan-to-map odometry.
 
     A registration's covariance is relative to the local map, whose own error grows only as the map is renewed: after
@@ -22,6 +23,8 @@ class PoseUncertainty:
 
     From scan to scan there is no such map: every registration's error enters in full.
     """
+
+    STATE = ("_map", "_position")
 
     def __init__(self, *, is_scan_to_scan: bool = False) -> None:
         self.is_scan_to_scan = is_scan_to_scan

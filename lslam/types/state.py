@@ -1,24 +1,35 @@
-"""What an object needs to go on where it was: named arrays and nothing else, so that a file of them cannot run code."""
+"""What an object needs to go on where it was: numbers, text, arrays, and nothing else, so that a file of it cannot run code."""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, ClassVar
 
-from numpy.typing import NDArray
-
-State = dict[str, NDArray[Any]]
-
-
-def joined(**parts: State) -> State:
-    """The states of several parts as one; names become `part.name`."""
-    return {f"{part}.{name}": array for part, state in parts.items() for name, array in state.items()}
+# Attribute -> None, bool, int, float, str, array, a dataclass of such, a list, tuple or dict of such, or another State.
+State = dict[str, Any]
 
 
-def part_of(state: State, part: str) -> State:
-    """The state of one part that `joined` put in; empty when there is none.
+class Stateful:
+    """An object whose attributes named in `STATE` are all that changes while it works.
 
-    >>> import numpy as np
-    >>> part_of(joined(a={"x": np.zeros(1)}, b={"y": np.ones(1)}), "b")
-    {'y': array([1.])}
+    `state` refers to the live object: it is to be written before the object goes on. `restore` is for an object made by the
+    same arguments.
     """
-    return {name.removeprefix(f"{part}."): array for name, array in state.items() if name.startswith(f"{part}.")}
+
+    STATE: ClassVar[tuple[str, ...]] = ()
+
+    def state(self) -> State:
+        """What `restore` needs to go on from here."""
+        return {name: _state_of(getattr(self, name)) for name in self.STATE}
+
+    def restore(self, state: State) -> None:
+        """Go on where `state` was taken. Raises KeyError when it is of something else."""
+        for name in self.STATE:
+            part = getattr(self, name)
+            if isinstance(part, Stateful):
+                part.restore(state[name])
+            else:
+                setattr(self, name, state[name])
+
+
+def _state_of(value: Any) -> Any:
+    return value.state() if isinstance(value, Stateful) else value

@@ -183,7 +183,7 @@ def test_old_ground_is_forgotten_by_distance() -> None:
     # The hand passes the whole pool every few scans: stragglers are a few scans behind.
     assert away.max() < 30.0 + 40.0
     assert max(sizes[75:]) < 1.2 * np.mean(sizes[75:])
-    assert int(m.state[gaussians.USED]) < 1.5 * max(sizes)
+    assert int(m.pool[gaussians.USED]) < 1.5 * max(sizes)
     np.testing.assert_array_equal(find_all(m.keys[slots], m.keys, m.table), slots)
 
 
@@ -215,7 +215,7 @@ def test_lookups_survive_any_order_of_insertion_and_eviction(seed: int, steps: i
         slots = live_slots(m)
         assert len(m) == len(slots) == (m.table >= 0).sum()
         np.testing.assert_array_equal(find_all(m.keys[slots], m.keys, m.table), slots)
-        used, freed = int(m.state[gaussians.USED]), int(m.state[gaussians.FREED])
+        used, freed = int(m.pool[gaussians.USED]), int(m.pool[gaussians.FREED])
         assert used - freed == len(slots)
         assert set(m.free[:freed].tolist()) | set(slots.tolist()) == set(range(used))
     absent = np.array([pack(500 + i, 7, -3) for i in range(50)])

@@ -1,0 +1,15 @@
+"""The records that a run's state may hold: nothing else is ever made of a file."""
+
+from __future__ import annotations
+
+from lslam.inertial.estimate import ImuEstimate
+from lslam.inertial.initialise import Start
+from lslam.preprocessing.features import FeaturePoints, Features
+from lslam.registration.feature_scan import FeatureScan
+from lslam.types.gravity import GravityDirection
+from lslam.types.imu import ImuStream
+from lslam.types.scan_result import ScanResult
+
+STATE_CLASSES = (
+    FeaturePoints, Features, FeatureScan, GravityDirection, ImuEstimate, ImuStream, ScanResult, Start,
+)  # fmt: skip
