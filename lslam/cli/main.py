@@ -20,6 +20,7 @@ COMMANDS = {
     "compare": "Compare methods on the same sequences.",
     "simulate": "Simulate a drive with exact ground truth.",
     "convert": "Convert a sequence to a bag or KITTI's layout, or a trajectory to another format.",
+    "osm": "Fetch buildings from OpenStreetMap, or show what is in an extract.",
     "info": "Show what is in a sequence and what is wrong with it.",
     "map": "Build a run's map anew with other settings, or score a map.",
     "methods": "List the odometry methods.",

@@ -13,6 +13,7 @@ from lslam.config.loam import LoamConfig
 from lslam.config.loops import LoopsConfig
 from lslam.config.map import MapConfig
 from lslam.config.odometry import OdometryConfig
+from lslam.config.osm import OsmConfig
 from lslam.config.preprocess import PreprocessConfig
 from lslam.config.registration import RegistrationConfig
 from lslam.config.report import ReportConfig
@@ -32,6 +33,7 @@ class Config(Section):
     loops: LoopsConfig = LoopsConfig()
     graph: GraphConfig = GraphConfig()
     gnss: GnssConfig = GnssConfig()
+    osm: OsmConfig = OsmConfig()
     map: MapConfig = MapConfig()
     eval: EvalConfig = EvalConfig()
     report: ReportConfig = ReportConfig()

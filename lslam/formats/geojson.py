@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.errors import InputError
 from lslam.formats.atomic import atomic_write
 
 
@@ -30,3 +31,35 @@ def write_line(path: Path, lat_lon_alt: NDArray[Any], properties: Mapping[str, A
     text = json.dumps({"type": "FeatureCollection", "features": [feature]}, allow_nan=False, ensure_ascii=False)
     with atomic_write(path) as stream:
         stream.write(text.encode() + b"\n")
+
+
+def read_line(path: Path) -> NDArray[np.float64]:
+    """The one way of a file as (N, 3) lat, lon (deg), height (m, 0 where unknown), WGS84; a point is a way of one position.
+
+    Raises InputError naming the file: unreadable, no GeoJSON, without exactly one line, with positions off the Earth.
+    """
+    try:
+        tree = json.loads(path.read_bytes())
+        lines = [shape["coordinates"] for shape in _shapes(tree) if shape.get("type") in ("LineString", "Point")]
+        rows = lines[0] if len(lines) == 1 and np.ndim(lines[0][0]) else lines
+        places = np.array([[*row, 0.0][:3] for row in rows], np.float64)[:, [1, 0, 2]]
+    except OSError as error:
+        raise InputError(f"{path} cannot be read: {error.strerror or error}") from None
+    except (ValueError, TypeError, KeyError, IndexError, RecursionError):
+        raise InputError(f"{path} is no GeoJSON of one line in longitude and latitude") from None
+    if not (np.isfinite(places).all() and (np.abs(places[:, :2]) <= [90, 180]).all()):
+        raise InputError(
+            f"{path} is no GeoJSON of one line in longitude and latitude: some of its numbers are no degrees"
+        )
+    return places
+
+
+def _shapes(tree: Any) -> Iterator[Any]:
+    """The geometries of a document."""
+    if tree.get("type") == "FeatureCollection":
+        for feature in tree["features"]:
+            yield from _shapes(feature)
+    elif tree.get("type") == "Feature":
+        yield from _shapes(tree.get("geometry") or {})
+    else:
+        yield tree

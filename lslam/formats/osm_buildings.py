@@ -149,6 +149,19 @@ def osm_from_buildings(buildings: Sequence[Building], origin: NDArray[Any], attr
     return data
 
 
+def middle_of(data: OsmData) -> Floats:
+    """(3,) lat, lon (deg) of the middle of the box round all buildings' nodes, as --origin takes them; height 0."""
+    ways = [way for way in data.ways.values() if "building" in way.tags]
+    members = {m.ref for r in data.relations.values() if "building" in r.tags for m in r.members if m.kind == "way"}
+    ways += [way for number, way in data.ways.items() if number in members]
+    fixes = np.array([data.nodes[node] for way in ways for node in way.nodes if node in data.nodes])
+    if not len(fixes):
+        fixes = np.array([*data.nodes.values()] or [(0.0, 0.0)])
+    first = fixes[0, 1]
+    fixes[:, 1] = first + (fixes[:, 1] - first + 180) % 360 - 180  # a place on the antimeridian is in one piece
+    return np.append(np.round((fixes.min(axis=0) + fixes.max(axis=0)) / 2, 7), 0.0)
+
+
 class _Positions:
     """Rings of node numbers as corners in metres; every node is projected once."""
 

@@ -1,4 +1,4 @@
-"""OpenStreetMap files: nodes, ways and relations from XML or Overpass JSON, and back to XML.
+"""OpenStreetMap files: nodes, ways and relations from XML, Overpass JSON or GeoJSON, and back to XML.
 
 XML is parsed without entities or document types, so that a hostile file cannot grow in memory.
 """
@@ -16,6 +16,7 @@ from xml.sax.saxutils import quoteattr
 
 from lslam.errors import InputError
 from lslam.formats.atomic import atomic_write
+from lslam.formats.osm_geojson import elements_of, is_geojson
 
 ATTRIBUTION = "© OpenStreetMap contributors, ODbL 1.0, openstreetmap.org/copyright"
 GENERATOR = "lslam"
@@ -88,9 +89,9 @@ class OsmData:
 
 
 def read_osm(path: Path) -> OsmData:
-    """Read an OSM XML file or a stored Overpass reply (JSON); the first character decides.
+    """Read an OSM XML file, a stored Overpass reply (JSON) or outlines in GeoJSON; the content decides, not the name.
 
-    Raises InputError naming the file: missing, cut short, neither of the two, with entities, with positions off the Earth.
+    Raises InputError naming the file: missing, cut short, none of the three, with entities, with positions off the Earth.
     """
     try:
         with path.open("rb") as stream:
@@ -130,7 +131,12 @@ def write_osm(path: Path, data: OsmData) -> None:
 
 def _read_json(path: Path) -> OsmData:
     try:
-        return from_overpass(json.loads(path.read_bytes()))
+        tree = json.loads(path.read_bytes())
+        if not is_geojson(tree):
+            return from_overpass(tree)
+        data = from_overpass({"elements": elements_of(tree)})
+        data.attribution = tree.get("attribution", ATTRIBUTION) or None
+        return data
     except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise InputError(f"{path} is broken JSON, perhaps cut short ({error}): {WAY_OUT}") from None
     except ValueError as error:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.errors import InputError, UsageError
-from lslam.formats.osm_buildings import BuildingExtract, buildings_near, some_buildings_of
+from lslam.formats.osm_buildings import BuildingExtract, buildings_near, middle_of, some_buildings_of
 from lslam.formats.osm_files import OsmData, read_osm
 from lslam.simulation.curve import smooth_curve
 from lslam.simulation.moving import Mover
@@ -54,7 +54,7 @@ def read_extract(path: Path, origin: NDArray[Any] | None = None) -> MapExtract:
     buildings, far from the origin.
     """
     data = read_osm(path)
-    extract = some_buildings_of(data, _middle(data) if origin is None else np.asarray(origin, np.float64), path)
+    extract = some_buildings_of(data, middle_of(data) if origin is None else np.asarray(origin, np.float64), path)
     corners = np.concatenate([footprint.outer for b in extract.buildings for footprint in b.footprints])
     away = float(np.linalg.norm(corners, axis=1).min())
     if away > FARTHEST:
@@ -126,14 +126,3 @@ def _along_streets(scenario: Scenario, extract: MapExtract, margin: float) -> Ro
     street = smooth_curve(found, closed=False)
     log.info("going along %.0f m of the streets of %s: --path FILE takes another line", street.length, source)
     return Route(street, beside(street, -lane))
-
-
-def _middle(data: OsmData) -> Floats:
-    """(3,) lat, lon (deg) of the middle of the box round all buildings' nodes, as --origin takes them; height 0."""
-    ways = [way for way in data.ways.values() if "building" in way.tags]
-    members = {m.ref for r in data.relations.values() if "building" in r.tags for m in r.members if m.kind == "way"}
-    ways += [way for number, way in data.ways.items() if number in members]
-    fixes = np.array([data.nodes[node] for way in ways for node in way.nodes if node in data.nodes])
-    if not len(fixes):
-        fixes = np.array([*data.nodes.values()] or [(0.0, 0.0)])
-    return np.append(np.round((fixes.min(axis=0) + fixes.max(axis=0)) / 2, 7), 0.0)

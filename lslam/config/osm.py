@@ -1,0 +1,36 @@
+"""Section `osm`: OpenStreetMap buildings, where they come from and how much of them is looked at."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field, model_validator
+
+from lslam.config.section import Section
+
+
+class OsmConfig(Section):
+    """Fetching buildings from an Overpass server, and the circles of the buffer (second thesis, section 3.1)."""
+
+    server: str = Field(
+        "https://overpass-api.de/api/interpreter",
+        pattern=r"^https?://\S+$",
+        description="address of an Overpass server",
+    )
+    timeout: float = Field(180.0, gt=0, le=900, description="s; longest wait for one reply")
+    connect_timeout: float = Field(10.0, gt=0, description="s; longest wait for a connection")
+    attempts: int = Field(4, ge=1, le=10, description="how often one request is tried while the server is busy")
+    backoff: float = Field(5.0, gt=0, description="s; wait after the first refusal, doubled after each further one")
+    cache: Literal["use", "refresh", "only"] = Field(
+        "use", description="use: what was fetched before is not asked for again; refresh: ask again; only: no network"
+    )
+    fetch_radius: float = Field(120.0, gt=0, description="m; buildings so far round a place are fetched")
+    renew_radius: float = Field(60.0, gt=0, description="m; so far from the last request's place a new one is made")
+    use_radius: float = Field(35.0, gt=0, description="m; buildings so far from the estimate are matched")
+
+    @model_validator(mode="after")
+    def _check(self) -> OsmConfig:
+        self.require_order("renew_radius", "fetch_radius")
+        if not self.use_radius < self.fetch_radius:
+            raise ValueError(f"use_radius = {self.use_radius} must be less than fetch_radius = {self.fetch_radius}")
+        return self

@@ -1,0 +1,226 @@
+"""Buildings from an Overpass server, politely: one request at a time, never twice for one place, patient when it is busy.
+
+Replies are kept in the user's cache as the server sent them; a box that lies inside a kept one needs no network.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import logging
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lslam.config.osm import OsmConfig
+from lslam.errors import InputError, OutputError, UsageError
+from lslam.formats.atomic import atomic_write
+from lslam.formats.osm_files import from_overpass
+from lslam.priors.bounds import Bounds
+from lslam.version import __version__
+
+log = logging.getLogger("lslam")
+
+USER_AGENT = f"lslam/{__version__} (batch LiDAR SLAM; buildings around a recorded trajectory)"
+LONGEST_REPLY = 512 * 1024 * 1024  # bytes
+LONGEST_WAIT = 120.0  # s; whoever says "retry later than that" is not waited for
+FAR_OUT = 1000.0  # m; a long building reaches that far out of a box
+_BUSY = (429, 502, 503, 504)
+_one_at_a_time = threading.Lock()
+
+
+class _TryAgainError(Exception):
+    """The server is busy, or the line broke: `wait` s as it asked for, None when it did not say."""
+
+    def __init__(self, why: str, wait: float | None = None) -> None:
+        super().__init__(why)
+        self.wait = wait
+
+
+def query(bounds: Bounds, timeout: float) -> str:
+    """Overpass QL for all building outlines that touch `bounds`."""
+    box = str(bounds)
+    return (
+        f'[out:json][timeout:{round(timeout)}];(way["building"]({box});'
+        f'relation["building"]["type"="multipolygon"]({box}););out body;>;out skel qt;'
+    )
+
+
+def fetch_buildings(
+    bounds: Bounds, config: OsmConfig, folder: Path, sleep: Callable[[float], None] = time.sleep
+) -> dict[str, Any]:
+    """The Overpass reply for `bounds`, from `folder` when it or a larger one is kept there, else from `config.server`.
+
+    The tree is checked (`osm_files.from_overpass` takes it) and kept when it is whole. `sleep` waits between attempts.
+
+    Raises InputError with one sentence: server unreachable or busy to the end, a web page, a reply that is cut short, gave
+    up, is of another place or endless; nothing in the cache where `config.cache` is `only`.
+    """
+    kept = kept_reply(bounds, folder) if config.cache != "refresh" else None
+    if kept is not None:
+        return kept
+    if config.cache == "only":
+        raise InputError(f"no reply for {bounds} is in {folder}: fetch it with the network, osm.cache = use")
+    try:
+        tree = _ask_patiently(bounds, config, folder, sleep)
+    except InputError as error:
+        # An old reply is better than none, and the world of buildings changes slowly.
+        kept = kept_reply(bounds, folder)
+        if kept is None:
+            raise
+        log.warning("%s; using what was fetched before", error)
+        return kept
+    with contextlib.suppress(OutputError, OSError):
+        folder.mkdir(parents=True, exist_ok=True)
+        with atomic_write(folder / _file_name(bounds)) as stream:
+            stream.write(json.dumps(tree, ensure_ascii=False, separators=(",", ":")).encode())
+    return tree
+
+
+def kept_reply(bounds: Bounds, folder: Path) -> dict[str, Any] | None:
+    """The kept reply for `bounds`, or for the smallest kept box round it; None without one that can be read."""
+    exact = folder / _file_name(bounds)
+    larger = [(box.area_km2, path) for path in folder.glob("*.json") if (box := _bounds_of(path)) and box.holds(bounds)]
+    for path in [exact, *(path for _, path in sorted(larger))]:
+        try:
+            return _checked(json.loads(path.read_bytes()), bounds, is_own=path == exact)
+        except (OSError, ValueError):
+            continue
+    return None
+
+
+def _file_name(bounds: Bounds) -> str:
+    """The box for people and for `holds`, a digest of the query for a change of the query."""
+    return f"{bounds}-{hashlib.sha256(query(bounds, 180).encode()).hexdigest()[:16]}.json"
+
+
+def _bounds_of(path: Path) -> Bounds | None:
+    with contextlib.suppress(ValueError, TypeError, UsageError):
+        bounds = Bounds(*(float(v) for v in path.name.rsplit("-", 1)[0].split(",")))
+        return bounds if _file_name(bounds) == path.name else None
+    return None
+
+
+def _ask_patiently(bounds: Bounds, config: OsmConfig, folder: Path, sleep: Callable[[float], None]) -> dict[str, Any]:
+    wait = config.backoff
+    with _one_at_a_time, _alone(folder):
+        for attempt in range(1, config.attempts + 1):
+            try:
+                return _ask(bounds, config)
+            except _TryAgainError as error:
+                wanted = wait if error.wait is None else error.wait
+                if attempt == config.attempts or wanted > LONGEST_WAIT:
+                    times = f"after {attempt} attempts" if attempt > 1 else "and asks for a long break"
+                    raise InputError(
+                        f"{config.server} gave no buildings {times}: {error}; try later, or another server (osm.server)"
+                    ) from None
+                log.info("%s: %s, again in %.3g s", config.server, error, wanted)
+                sleep(wanted)
+                wait *= 2
+    raise AssertionError("the last attempt returns or raises")
+
+
+@contextlib.contextmanager
+def _alone(folder: Path) -> Iterator[None]:
+    """Hold the cache against other processes: many runs at once are still one polite client."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        stream = (folder / "request.lock").open("a")
+    except OSError:
+        yield
+        return
+    with stream:
+        if sys.platform != "win32":
+            import fcntl
+
+            fcntl.flock(stream, fcntl.LOCK_EX)
+        yield
+
+
+def _ask(bounds: Bounds, config: OsmConfig) -> dict[str, Any]:
+    """One request; InputError when asking again is no use, _TryAgainError when it may be."""
+    import requests
+
+    server = config.server
+    try:
+        with requests.post(
+            server,
+            data={"data": query(bounds, config.timeout)},
+            headers={"User-Agent": USER_AGENT, "Accept": "application/json"},
+            timeout=(config.connect_timeout, config.timeout),
+            allow_redirects=False,
+            stream=True,
+        ) as reply:
+            _check_status(reply, server)
+            body = _read(reply, config.timeout)
+    except requests.exceptions.Timeout as error:
+        # Nobody waits for that a second time; a server with too much to do says so itself.
+        is_connecting = isinstance(error, requests.exceptions.ConnectTimeout)
+        limit = config.connect_timeout if is_connecting else config.timeout
+        raise InputError(f"{server} did not answer within {limit:g} s: try later, or name another osm.server") from None
+    except requests.exceptions.ConnectionError as error:
+        reason = getattr(error.args[0] if error.args else None, "reason", None)
+        if type(reason).__name__ in ("NewConnectionError", "NameResolutionError"):
+            raise InputError(f"{server} cannot be reached: check the network, or name another osm.server") from None
+        raise _TryAgainError("the connection broke") from None
+    except requests.exceptions.RequestException as error:
+        if isinstance(error, requests.exceptions.ChunkedEncodingError | requests.exceptions.ContentDecodingError):
+            raise _TryAgainError("the connection broke") from None
+        raise InputError(f"{server} cannot be asked: {error}") from None
+    return _parsed(body, bounds, server)
+
+
+def _check_status(reply: Any, server: str) -> None:
+    status = reply.status_code
+    if status in _BUSY:
+        said = reply.headers.get("Retry-After", "")
+        raise _TryAgainError(f"it is busy (HTTP {status})", float(said) if said.isdigit() else None)
+    if 300 <= status < 400:
+        to = reply.headers.get("Location", "nowhere")
+        raise InputError(f"{server} redirects to {to[:120]}: set osm.server to an Overpass server's own address")
+    if status != 200:
+        raise InputError(f"{server} refused the request (HTTP {status}): check osm.server")
+
+
+def _read(reply: Any, timeout: float) -> bytes:
+    """The body, but neither for ever nor without end."""
+    parts, size, end = [], 0, time.monotonic() + timeout
+    for part in reply.iter_content(4096):
+        parts.append(part)
+        size += len(part)
+        if size > LONGEST_REPLY:
+            raise InputError(f"the reply grows beyond {LONGEST_REPLY >> 20} MB: ask for a smaller place")
+        if time.monotonic() > end:
+            raise _TryAgainError(f"the reply was not complete within {timeout:g} s")
+    return b"".join(parts)
+
+
+def _parsed(body: bytes, bounds: Bounds, server: str) -> dict[str, Any]:
+    try:
+        tree = json.loads(body)
+    except (json.JSONDecodeError, UnicodeDecodeError, RecursionError):
+        if body.lstrip()[:1] == b"<":
+            raise InputError(f"{server} answered with a web page, not with data: check osm.server") from None
+        raise _TryAgainError("the reply was cut short") from None
+    if isinstance(tree, dict) and tree.get("remark"):
+        raise _TryAgainError(f"it gave up ({str(tree['remark'])[:120]})")
+    try:
+        return _checked(tree, bounds)
+    except ValueError as error:
+        raise InputError(f"the reply of {server} cannot be used, {error}: check osm.server") from None
+
+
+def _checked(tree: Any, bounds: Bounds, is_own: bool = True) -> dict[str, Any]:
+    """The tree; raises ValueError when it is no reply, or, of its own request, one from elsewhere."""
+    data = from_overpass(tree)
+    places = np.array([*data.nodes.values()]).reshape(-1, 2)
+    if is_own and bounds.share_inside(places, FAR_OUT) < 0.5:
+        lat, lon = np.median(places, axis=0)
+        raise ValueError(f"most of it lies elsewhere, about {lat:.4f},{lon:.4f}")
+    return dict(tree)
