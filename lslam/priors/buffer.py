@@ -1,0 +1,190 @@
+"""Buildings along a way nobody knows beforehand: the next circle is asked for in the background, before it is needed.
+
+Second thesis, section 3.1: a circle of `fetch_radius` about the estimate is asked for at once; when the estimate leaves the
+circle of `renew_radius` about that place, the next one is. The caller never waits, so a slow server costs nothing, and a
+dead one nothing but buildings.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import queue
+import threading
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.config.osm import OsmConfig
+from lslam.errors import InputError, LslamError
+from lslam.formats.atomic import atomic_write
+from lslam.formats.osm_buildings import buildings_of
+from lslam.formats.osm_files import from_overpass
+from lslam.geometry.geodesy import from_local
+from lslam.priors.bounds import Bounds, around
+from lslam.types.building import Building
+
+log = logging.getLogger("lslam")
+
+Fetch = Callable[[Bounds], dict[str, Any]]
+
+
+@dataclass(frozen=True)
+class _Circle:
+    """A finished request: its place (2,), m, and its buildings; why there are none, else None."""
+
+    centre: NDArray[np.float64]
+    buildings: list[Building]
+    problem: str | None = None
+
+
+class OsmBuffer:
+    """Buildings near an estimate that moves, from replies that arrive when they do.
+
+    Parameters
+    ----------
+    fetch : gives the Overpass reply for a box (`overpass.fetch_buildings`); called in a thread of the buffer's own
+    origin : (3,) lat, lon (deg), height (m) of the local frame, x east and y north, in which everything here is
+    config : the radii
+    folder : where replies are kept, `000000.json` and so on; what lies there already is used instead of the network,
+        so that a second run sees the same buildings at once. None keeps nothing
+
+    Use it as a context manager, or `close` it.
+    """
+
+    def __init__(self, fetch: Fetch, origin: NDArray[Any], config: OsmConfig, folder: Path | None = None) -> None:
+        self._fetch = fetch
+        self._origin = np.asarray(origin, np.float64)
+        self._config = config
+        self._folder = folder
+        self._wishes: queue.SimpleQueue[NDArray[np.float64] | None] = queue.SimpleQueue()
+        self._done: queue.SimpleQueue[_Circle] = queue.SimpleQueue()
+        self._open: list[NDArray[np.float64]] = []
+        self._centres: list[NDArray[np.float64]] = []
+        self._buildings: dict[str, tuple[Building, NDArray[np.float64]]] = {}
+        self.problems: list[str] = []
+        self._thread: threading.Thread | None = None
+        self._kept = 0
+        self._is_replay = self._load()
+
+    def near(self, position: NDArray[Any]) -> list[Building]:
+        """Buildings that come within `use_radius` of `position` (2,), m, as far as they are here; returns at once.
+
+        Asks for the circle about `position` when it lies outside all circles of `renew_radius` asked for before; where a
+        request failed, nothing is asked again before that circle is left.
+        """
+        at = np.asarray(position, np.float64)[:2]
+        self._collect()
+        asked = [*self._centres, *self._open]
+        if not self._is_replay and not any(np.linalg.norm(at - c) <= self._config.renew_radius for c in asked):
+            self._ask(at)
+        reach = self._config.use_radius
+        return [building for building, box in self._buildings.values() if _distance(box, at) <= reach]
+
+    def wait(self, seconds: float) -> bool:
+        """Wait for what is asked for, at most `seconds`: for the first place of a run. True when nothing is open any more."""
+        while self._open and seconds > 0:
+            try:
+                self._take(self._done.get(timeout=min(seconds, 0.05)))
+            except queue.Empty:
+                seconds -= 0.05
+        return not self._open
+
+    @property
+    def is_waiting(self) -> bool:
+        """True while a request is open."""
+        self._collect()
+        return bool(self._open)
+
+    @property
+    def requests(self) -> int:
+        """Requests that were answered or refused so far."""
+        return len(self._centres)
+
+    def close(self) -> None:
+        """Let the thread end; a request that is under way is not waited for."""
+        self._collect()
+        self._wishes.put(None)
+
+    def __enter__(self) -> OsmBuffer:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _ask(self, at: NDArray[np.float64]) -> None:
+        self._open.append(at)
+        if self._thread is None:
+            # A thread that waits for a dead server must not keep the program from ending.
+            self._thread = threading.Thread(target=self._work, name="osm-buffer", daemon=True)
+            self._thread.start()
+        self._wishes.put(at)
+
+    def _work(self) -> None:
+        while (at := self._wishes.get()) is not None:
+            self._done.put(self._circle(at))
+
+    def _circle(self, at: NDArray[np.float64]) -> _Circle:
+        try:
+            fix = from_local(np.array([[*at, 0.0]]), self._origin)[:, :2]
+            reply = self._fetch(around(fix, self._config.fetch_radius))
+            found = self._read(reply)
+            if self._folder is not None:
+                self._keep(at, reply, self._folder)
+        except LslamError as error:
+            return _Circle(at, [], str(error))
+        except Exception as error:
+            # Whatever a server sends, the run goes on without it.
+            log.debug("traceback", exc_info=error)
+            return _Circle(at, [], f"the reply cannot be used ({type(error).__name__}: {error})")
+        return _Circle(at, found)
+
+    def _read(self, reply: dict[str, Any]) -> list[Building]:
+        return buildings_of(from_overpass(reply), self._origin, "the reply").buildings
+
+    def _keep(self, at: NDArray[np.float64], reply: dict[str, Any], folder: Path) -> None:
+        folder.mkdir(parents=True, exist_ok=True)
+        with atomic_write(folder / f"{self._kept:06d}.json") as stream:
+            stream.write(json.dumps({"lslam_centre": at.tolist(), **reply}, ensure_ascii=False).encode())
+        self._kept += 1
+
+    def _load(self) -> bool:
+        """Take what an earlier run kept; True when there was something."""
+        if self._folder is None:
+            return False
+        for path in sorted(self._folder.glob("*.json")):
+            try:
+                tree = json.loads(path.read_bytes())
+                at = np.array(tree["lslam_centre"], np.float64)
+                self._take(_Circle(at, self._read(tree)))
+            except (OSError, ValueError, KeyError, TypeError) as error:
+                raise InputError(f"{path} is no reply kept by an earlier run ({error}): remove it") from None
+        return bool(self._centres)
+
+    def _collect(self) -> None:
+        while not self._done.empty():
+            self._take(self._done.get())
+
+    def _take(self, circle: _Circle) -> None:
+        self._open = [at for at in self._open if not np.array_equal(at, circle.centre)]
+        self._centres.append(circle.centre)
+        if circle.problem is not None:
+            self.problems.append(circle.problem)
+            log.warning("no buildings from OpenStreetMap here: %s", circle.problem)
+        for building in circle.buildings:
+            self._buildings.setdefault(building.osm_id, (building, _box(f.outer for f in building.footprints)))
+
+
+def _box(rings: Iterable[NDArray[np.float64]]) -> NDArray[np.float64]:
+    """(2, 2) lowest and highest corner."""
+    corners = np.concatenate(list(rings))
+    return np.array([corners.min(0), corners.max(0)])
+
+
+def _distance(box: NDArray[np.float64], at: NDArray[np.float64]) -> float:
+    """From a box to a place, m; 0 inside."""
+    return float(np.linalg.norm(np.maximum(np.maximum(box[0] - at, at - box[1]), 0.0)))

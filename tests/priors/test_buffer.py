@@ -1,0 +1,145 @@
+"""The buffer never waits: slow, dead and lying servers cost the caller nothing, and a second run repeats the first."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from overpass_server import FakeOverpass, house, running
+
+from lslam.config.osm import OsmConfig
+from lslam.errors import InputError
+from lslam.priors.bounds import Bounds
+from lslam.priors.buffer import OsmBuffer
+from lslam.priors.overpass import fetch_buildings
+
+ORIGIN = np.array([49.0112, 8.4229, 112.8])
+DRIVE = np.column_stack([np.arange(0.0, 400.0, 2.0), np.zeros(200)])
+
+
+def street(bounds: Bounds) -> dict[str, Any]:
+    """A house every 10 m or so along the line of latitude of the origin, those inside the box."""
+    step = 2e-4
+    first, last = int(np.ceil(bounds.west / step)), int(np.floor(bounds.east / step))
+    return {"elements": [e for k in range(first, last + 1) for e in house(k, ORIGIN[0] + 1e-4, k * step)]}
+
+
+class Server:
+    """A fetch whose replies are let go one by one."""
+
+    def __init__(self, reply: Callable[[Bounds], dict[str, Any]] = street) -> None:
+        self.reply = reply
+        self.asked: list[Bounds] = []
+        self.gate = threading.Semaphore(0)
+
+    def __call__(self, bounds: Bounds) -> dict[str, Any]:
+        self.asked.append(bounds)
+        self.gate.acquire()
+        return self.reply(bounds)
+
+    def let_go(self, buffer: OsmBuffer) -> None:
+        self.gate.release()
+        assert buffer.wait(5.0)
+
+
+@pytest.fixture
+def server() -> Iterator[FakeOverpass]:
+    with running() as fake:
+        yield fake
+
+
+def test_nothing_is_there_before_the_reply_and_everything_near_after_it() -> None:
+    server = Server()
+    with OsmBuffer(server, ORIGIN, OsmConfig()) as buffer:
+        assert buffer.near(np.zeros(2)) == []
+        server.let_go(buffer)
+        near = buffer.near(np.zeros(2))
+        corners = np.array([np.linalg.norm(b.footprints[0].outer, axis=1).min() for b in near])
+        assert 3 <= len(near) <= 6
+        assert corners.max() <= 35.0 + 8.0
+        west = [b.middle[0] for b in buffer.near(np.array([-50.0, 0.0]))]
+        assert max(west) < -10.0
+        assert min(west) > -95.0
+
+
+def test_a_new_circle_is_asked_for_only_outside_the_sixty_metres() -> None:
+    server = Server()
+    with OsmBuffer(server, ORIGIN, OsmConfig()) as buffer:
+        for position in DRIVE:
+            buffer.near(position)
+            if buffer.is_waiting:
+                server.let_go(buffer)
+            assert len(buffer.near(position)) >= 3, "within 60 m of 120 m there is always something to use"
+        for position in DRIVE[::-1]:
+            buffer.near(position)
+        buffer.wait(5.0)
+    assert len(server.asked) == 7, "at 0, 62, 124, ... m, and nothing on the way back"
+    widths = [box.width * 111_320 * np.cos(np.radians(49)) for box in server.asked]
+    np.testing.assert_allclose(widths, 240, rtol=0.01)
+
+
+def test_a_server_that_sleeps_costs_the_caller_nothing() -> None:
+    server = Server()
+    began = time.perf_counter()
+    with OsmBuffer(server, ORIGIN, OsmConfig()) as buffer:
+        for position in DRIVE:
+            assert buffer.near(position) == []
+        spent = time.perf_counter() - began
+        assert not buffer.wait(0.1)
+    assert spent < 0.5
+    server.gate.release(100)
+
+
+def test_a_dead_or_lying_server_is_named_once_a_circle(
+    server: FakeOverpass, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    server.script = ["html", "elsewhere", "redirect", "cut"]
+    config = OsmConfig(server=server.url, attempts=1)
+    with (
+        caplog.at_level("WARNING", logger="lslam"),
+        OsmBuffer(lambda box: fetch_buildings(box, config, tmp_path / "cache"), ORIGIN, config, tmp_path / "run") as b,
+    ):
+        for position in DRIVE[:120]:
+            assert b.near(position) == []
+            b.wait(5.0)
+    assert len(server.requests) == 4
+    assert [p.split(": ")[-1] for p in b.problems[:2]] == ["check osm.server", "check osm.server"]
+    assert "web page" in b.problems[0]
+    assert len(b.problems) == 4
+    assert not (tmp_path / "run").exists()
+    assert len(caplog.records) == 4
+
+
+def test_what_no_server_should_send_ends_nothing() -> None:
+    server = Server(lambda _: {"elements": [{"type": "way", "id": 1, "nodes": [{}], "tags": {"building": "yes"}}]})
+    with OsmBuffer(server, ORIGIN, OsmConfig()) as buffer:
+        buffer.near(np.zeros(2))
+        server.let_go(buffer)
+        assert buffer.near(np.zeros(2)) == []
+    assert len(buffer.problems) == 1
+
+
+def test_a_second_run_uses_the_replies_of_the_first_and_no_network(tmp_path: Path) -> None:
+    server = Server()
+    with OsmBuffer(server, ORIGIN, OsmConfig(), tmp_path) as first:
+        for position in DRIVE[:60]:
+            first.near(position)
+            if first.is_waiting:
+                server.let_go(first)
+        seen = [b.osm_id for b in first.near(DRIVE[59])]
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["000000.json", "000001.json"]
+    asked = len(server.asked)
+    with OsmBuffer(server, ORIGIN, OsmConfig(), tmp_path) as second:
+        assert [b.osm_id for b in second.near(DRIVE[59])] == seen
+        second.near(np.array([5000.0, 0.0]))
+        assert second.wait(0.1)
+    assert len(server.asked) == asked
+    (tmp_path / "000000.json").write_text(json.dumps({"elements": []}))
+    with pytest.raises(InputError, match=r"000000.json is no reply kept by an earlier run"):
+        OsmBuffer(server, ORIGIN, OsmConfig(), tmp_path)
