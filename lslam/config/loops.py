@@ -28,7 +28,12 @@ class LoopsConfig(Section):
     )
     drift_deg: float = Field(0.25, ge=0, description="deg per 100 m, likewise for rotation")
     min_travel: float = Field(30.0, gt=0, description="m travelled before a keyframe can be seen again")
-    spacing: float = Field(8.0, ge=0, description="m travelled between one loop closure that is tried and the next")
+    spacing: float = Field(
+        4.0,
+        ge=0,
+        description="m travelled between one candidate that is registered and the next; up to three times as far after "
+        "several that came out alike",
+    )
     rings: int = Field(20, ge=4, description="Scan Context: rings of the polar image (Kim and Kim 2018)")
     sectors: int = Field(60, ge=8, description="Scan Context: sectors of the polar image")
     reach: float = Field(80.0, gt=0, description="m; Scan Context: radius of the polar image")
@@ -38,7 +43,7 @@ class LoopsConfig(Section):
     max_iterations: int = Field(30, ge=1, description="Gauss-Newton steps of a verification")
     max_rmse: float = Field(0.3, gt=0, description="m; distance of the points to the other submap's surfaces, at most")
     min_overlap: float = Field(
-        0.5, ge=0, le=1, description="share of each submap's points that must lie on surfaces of the other"
+        0.3, ge=0, le=1, description="share of each submap's points that must lie on surfaces of the other"
     )
     max_ambiguity: float = Field(
         0.75,

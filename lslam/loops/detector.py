@@ -57,6 +57,37 @@ def find_loops(
     return candidates
 
 
+class Pace:
+    """How far to travel from one try to the next: `spacing` where things change, up to three times it while they do not.
+
+    A closure after a row of closures adds little, and so does a refusal after a row of refusals.
+    """
+
+    LONGEST = 3
+
+    def __init__(self, spacing: float) -> None:
+        self.spacing = spacing
+        self.reset()
+
+    def reset(self) -> None:
+        """Try at once: there were no candidates."""
+        self._tried_at, self._row, self._last = -np.inf, 0, ""
+
+    @property
+    def wait(self) -> float:
+        """m between the last try and the next."""
+        return self.spacing * min(self._row, self.LONGEST)
+
+    def is_due(self, distance: float) -> bool:
+        """Whether to try after so many metres since the start."""
+        return distance - self._tried_at >= self.wait
+
+    def observe(self, distance: float, verdict: str) -> None:
+        """A try, and what came of it."""
+        self._row = self._row + 1 if verdict == self._last else 1
+        self._tried_at, self._last = distance, verdict
+
+
 class Detector:
     """Looks for loop closures among keyframes.
 
@@ -76,23 +107,27 @@ class Detector:
         self.index = PlaceIndex(config.rings, config.sectors, config.reach)
         self.verifier = Verifier(config, registration)
         self._places: OrderedDict[int, Place] = OrderedDict()
+        # Submaps overlap: the first keyframe of every few metres stands for those after it.
+        steps = np.floor(self.doubt.distances / (NEAR / 2))
+        self._is_described = np.diff(steps, prepend=-1.0) > 0
 
     def find(self) -> list[LoopCandidate]:
         """All candidates in the order of the newer keyframe, with verdicts."""
         candidates: list[LoopCandidate] = []
-        tried_at = -np.inf
+        pace = Pace(self.config.spacing)
         for b, keyframe in enumerate(self.keyframes):
             older = self._gated(b)
             if len(older) == 0:
+                pace.reset()
                 continue
-            if keyframe.distance - tried_at < self.config.spacing:
-                candidates.append(self._thinned(older, b))
+            if not pace.is_due(keyframe.distance):
+                candidates.append(self._thinned(older, b, pace.wait))
                 continue
-            tried_at = keyframe.distance
             for match in self._choose(b, older):
                 candidates.append(self._examine(match, b))
                 if candidates[-1].verdict == "accepted":
                     break
+            pace.observe(keyframe.distance, candidates[-1].verdict)
         return candidates
 
     def _gated(self, b: int) -> NDArray[np.int64]:
@@ -109,9 +144,9 @@ class Detector:
         reach = self.doubt.between(b, older).reach
         return np.asarray(older[away <= NEAR + self.config.sigmas * reach])
 
-    def _thinned(self, older: NDArray[np.int64], b: int) -> LoopCandidate:
+    def _thinned(self, older: NDArray[np.int64], b: int, wait: float) -> LoopCandidate:
         a = self._nearest(older, b)
-        said = f"the last one tried was less than {self.config.spacing:g} m ago"
+        said = f"the last one tried was less than {wait:g} m ago"
         return LoopCandidate(a, b, self._away(a, b), float("nan"), "rejected", "thinned", said)
 
     def _nearest(self, older: NDArray[np.int64], b: int) -> int:
@@ -126,15 +161,20 @@ class Detector:
 
         Where odometry is nearly certain, its nearest comes first.
         """
+        near = self._nearest(older, b)
+        reach = self._reach(self.doubt.between(b, np.array([near])))
+        is_certain = reach < NEAR
+        if is_certain:
+            away = np.linalg.norm(self.doubt.positions[older] - self.doubt.positions[b], axis=1)
+            older = older[away <= away.min() + reach]
+        older = older[self._is_described[older] | (older == near)]
         for number in (b, *older):
             if int(number) not in self.index:
                 self.index.add(int(number), self._level(int(number)))
         turn = self._turn(self.doubt.between(b, older[:1]))
         matches = self.index.nearest(b, older, turn)
-        near = self._nearest(older, b)
         by_odometry = next((m for m in matches if m.number == near), PlaceMatch(near, float("nan"), 0.0))
         alike = [m for m in matches[:1] if m.distance <= self.config.max_descriptor_distance]
-        is_certain = self._reach(self.doubt.between(b, np.array([near]))) < NEAR
         ordered = [by_odometry, *alike] if is_certain else [*alike, by_odometry]
         apart = [m for m in ordered[1:] if self._away(m.number, ordered[0].number) > NEAR / 2]
         return [ordered[0], *apart][:TRIED]

@@ -17,6 +17,8 @@ Points = NDArray[np.float32]
 
 # Voxels of a submap that are registered on another, at most.
 SOURCE_POINTS = 4000
+# Voxels there is room for at first; a map must have room for as many more as points are added at once.
+CAPACITY = 1 << 15
 # Planes within 25 degrees of level are ground and ceilings: they fit wherever one is.
 LEVEL = float(np.cos(np.deg2rad(25)))
 
@@ -45,9 +47,10 @@ def make_place(points: Points, config: RegistrationConfig) -> Place:
     """
     fine = GaussianMap(
         config.voxel_size, min_points=config.min_points, planarity=config.planarity, count_cap=config.count_cap,
-        reach=np.inf, capacity=1 << max(10, int(np.ceil(np.log2(len(points) + 1)))),
+        reach=np.inf, capacity=CAPACITY,
     )  # fmt: skip
-    fine.insert(points, np.eye(4))
+    for first in range(0, len(points), CAPACITY // 4):
+        fine.insert(points[first : first + CAPACITY // 4], np.eye(4))
     kind = fine.planes[:, 7]
     solid = np.flatnonzero((fine.keys != gaussians.FREE) & (kind > gaussians.EMPTY))
     is_level = (kind[solid] >= 0) & (np.abs(fine.planes[solid, 5]) > LEVEL)

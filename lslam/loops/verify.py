@@ -12,7 +12,7 @@ from lslam.config.loops import LoopsConfig
 from lslam.config.registration import RegistrationConfig
 from lslam.geometry import se3, so3
 from lslam.loops.place import Place
-from lslam.loops.search import SHARED, cells_of, find_starts, seen_cells
+from lslam.loops.search import LARGE, SHARED, find_starts
 from lslam.preprocessing.prepare import PreparedPoints, thin
 from lslam.registration.robust import Annealing
 from lslam.registration.solver import RegistrationResult, solve
@@ -57,7 +57,7 @@ class Verifier:
         starts = find_starts(a, b, expected, reach, yaws)
         if not starts:
             return Comparison("overlap", "nothing stands up there")
-        seen = seen_cells(a).ravel()
+        seen = LARGE.cover(a.standing, a.floor).ravel() > 0
         tried = sorted((self._try(a, b, seen, start.T_a_b) for start in starts), key=lambda found: -found[0])
         support, rough = tried[0]
         rivals = [(s, T) for s, T in tried[1:] if _is_elsewhere(rough, T)]
@@ -96,7 +96,7 @@ class Verifier:
 
     def _support(self, a: Place, upright: PreparedPoints, seen: Flags, T_a_b: Floats) -> float:
         """Of the points in cells of a that were seen: their number depends on the shift, their share does not."""
-        cells, inside = cells_of(se3.apply(T_a_b, upright.source))
+        cells, inside = LARGE.cells_of(se3.apply(T_a_b, upright.source))
         comparable = int((inside & seen[cells]).sum())
         width = 2 * self.registration.kernel_min
         inliers = self._solve(a, upright, T_a_b, Annealing(width, width, 0.5, 1)).inliers

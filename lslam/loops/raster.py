@@ -1,0 +1,71 @@
+"""Places from above: what stands in each cell, what was seen, and the correlation of two such images."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft, ndimage
+
+Floats = NDArray[np.float64]
+Image = NDArray[np.float32]
+Spectrum = NDArray[np.complex64]
+
+# m; a wall stays in its cell or the next when the heading is off by the half of a step of the search.
+CELL = 1.0
+# Voxels in a column of a cell that count; what is taller is no more telling.
+TALLEST = 6.0
+
+
+@dataclass(frozen=True)
+class Raster:
+    """A square of `size` x `size` cells round the origin, x along rows."""
+
+    size: int
+
+    def cells_of(self, points: Floats) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+        """Flat cell of each point (N, 3), m, 0 outside, and whether it lies inside."""
+        cells = np.floor(points[:, :2] / CELL).astype(np.int64) + self.size // 2
+        inside = np.asarray(((cells >= 0) & (cells < self.size)).all(axis=1))
+        return np.where(inside, cells[:, 0] * self.size + cells[:, 1], 0), inside
+
+    def heights(self, points: Floats) -> Image:
+        """(size, size) how tall things stand in a cell: points in it, which are means of voxels, up to `TALLEST`."""
+        cells, inside = self.cells_of(points)
+        counts = np.bincount(cells[inside], minlength=self.size**2)
+        return np.minimum(counts, TALLEST).astype(np.float32).reshape(self.size, self.size)
+
+    def cover(self, *clouds: Floats) -> Image:
+        """(size, size) 1 in the cells that hold a point, and in those next to them, else 0."""
+        seen = np.zeros(self.size**2, np.float32)
+        for points in clouds:
+            cells, inside = self.cells_of(points)
+            seen[cells[inside]] = 1
+        return (blurred(seen.reshape(self.size, self.size)) > 1e-3).astype(np.float32)
+
+    def lowest(self, points: Floats) -> Floats:
+        """(size * size,) least z per cell, m, inf where there is none."""
+        cells, inside = self.cells_of(points)
+        lowest = np.full(self.size**2, np.inf)
+        np.minimum.at(lowest, cells[inside], points[inside, 2])
+        return lowest
+
+    def shifts(self) -> Floats:
+        """(size,) m that row or column k of a correlation stands for."""
+        return np.asarray(fft.fftfreq(self.size, 1 / (self.size * CELL)))
+
+
+def blurred(image: Image) -> Image:
+    """Mean over a cell and the eight round it."""
+    return np.asarray(ndimage.uniform_filter(image, 3, mode="constant"))
+
+
+def spectrum(image: Image) -> Spectrum:
+    """Fourier transform of an image, for `correlate`."""
+    return np.asarray(fft.rfft2(image))
+
+
+def correlate(a: Spectrum, b: Spectrum, size: int) -> Image:
+    """(size, size) sum over the cells of image a times image b shifted, for all shifts."""
+    return np.asarray(fft.irfft2(a * np.conj(b), s=(size, size)))
