@@ -142,7 +142,7 @@ class Registration(Stateful):
         best = self._judge(self._coarse_to_fine(points, T_prior), T_prior)
         if c.start_reach == 0:
             return best
-        coarse_map, few = self.map.coarsen(c.coarse_factor), thin(points, SEARCH_SHARE)
+        coarse_map, few = self._coarse_map(points, T_prior), thin(points, SEARCH_SHARE)
         slow = Annealing(2 * START_STEP, c.kernel_min, c.coarse_decay, c.start_iterations)
         tried = [
             solve(coarse_map, few, T_prior @ se3.make(np.eye(3), offset), slow, sigma=c.sigma, blob_weight=c.blob_weight,
@@ -181,7 +181,7 @@ class Registration(Stateful):
         their coarse plane, the others take a fine one.
         """
         c = self.config
-        coarse_map = self.map.coarsen(c.coarse_factor)
+        coarse_map = self._coarse_map(points, T_prior)
         slow = Annealing(c.coarse_kernel, c.kernel_min, c.coarse_decay, c.start_iterations)
         coarse = solve(
             coarse_map, points, T_prior, slow,
@@ -191,13 +191,32 @@ class Registration(Stateful):
         fine = self._refine(points, start, c.kernel_max, c.start_iterations, coarse_map)
         return replace(fine, iterations=coarse.iterations + fine.iterations)
 
+    def _coarse_map(self, points: PreparedPoints, T_prior: NDArray[np.float64]) -> GaussianMap:
+        """The map in coarse voxels: so large that planes lie under enough of the points.
+
+        From thirty metres above the ground the rings of one scan lie metres apart.
+        """
+        c = self.config
+        once = Annealing(c.coarse_kernel, c.coarse_kernel, c.coarse_decay, 1)
+        for factor in (c.coarse_factor, 2 * c.coarse_factor, 4 * c.coarse_factor):
+            coarse_map = self.map.coarsen(factor)
+            found = solve(
+                coarse_map, points, T_prior, once,
+                sigma=c.sigma, blob_weight=c.blob_weight, weak_share=c.weak_share, residual=self.residual,
+            )  # fmt: skip
+            if found.overlap >= c.start_overlap:
+                break
+        return coarse_map
+
     def _refine(
         self, points: PreparedPoints, start: NDArray[np.float64], width: float, steps: int, coarse: GaussianMap | None
     ) -> RegistrationResult:
         """Align with the fine map from `start`, the kernel closing from `width`, or as the user wants it."""
         c = self.config
         if c.inlier_distance is None:
-            annealing = Annealing(width, c.kernel_min, c.kernel_decay, steps)
+            # The larger the planes, the farther their surface may be from them.
+            widest = 1.0 if coarse is None else coarse.size / (c.coarse_factor * self.map.size)
+            annealing = Annealing(max(width, widest * c.kernel_min), widest * c.kernel_min, c.kernel_decay, steps)
         else:
             annealing = Annealing(c.inlier_distance, c.inlier_distance, c.kernel_decay, steps)
         return solve(

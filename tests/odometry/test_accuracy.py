@@ -9,8 +9,10 @@ import pytest
 from drives import ate, coasting, drive, nees_per_dof, poses_of, registered, standing
 from numpy.typing import NDArray
 
-from lslam.geometry import so3
+from lslam import Registration
+from lslam.geometry import se3, so3
 from lslam.registration.solver import RegistrationResult
+from lslam.simulation.scenarios import simulate
 
 CENTIMETRE = 0.01
 LONG = [("street", 1, 35), ("street", 2, 35), ("street", 3, 35), ("block", 0, 95), ("block", 1, 95), ("block", 2, 95)]
@@ -95,3 +97,15 @@ def test_a_sparse_sensor_over_roofs_starts_although_few_of_its_points_find_a_pla
     results = registered(d.points)
     assert all(r.ok for r in results)
     assert max(np.linalg.norm(r.T_world_lidar[:3, 3] - T[:3, 3]) for r, T in zip(results, d.truth, strict=True)) < 0.05
+
+
+def test_a_start_forty_metres_up_takes_larger_planes() -> None:
+    """There the rings lie so far apart that a twentieth of the points finds a plane in coarse voxels; it was lost."""
+    climb = simulate("climbing", count=300)
+    assert climb.ground_truth is not None
+    first, second = climb.ground_truth.poses[[290, 291]]
+    registration = Registration()
+    registration.register(climb.scan(290).points, np.eye(4))
+    result = registration.register(climb.scan(291).points, np.eye(4))
+    assert result.ok
+    assert np.linalg.norm(result.T_world_lidar[:3, 3] - se3.relative(first, second)[:3, 3]) < 0.1
