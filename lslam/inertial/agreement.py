@@ -20,6 +20,8 @@ LEAST_CORRELATION = 0.5
 LIKELY_DEGREES, MOST_SCALE = (30.0, 110.0), 2.0
 # s: clocks of one machine differ by less; what differs by more is looked for only to say so.
 NEAR_S, FAR_S, STEP_S = 0.25, 10.0, 0.005
+# A correlation that is larger by less is the same.
+CLEARLY = 0.02
 # A clock that is off by less is not worth a doubt, and what may be chance is no offset.
 LEAST_OFFSET_S, SIGNIFICANT = 0.005, 3.0
 
@@ -66,6 +68,12 @@ def check_agreement(
     _refuse_scale(ratio)
     if correlation < LEAST_CORRELATION:
         raise ImuRefusedError(_why_not(felt, seen, correlation))
+    if offset_s is None and best in (0, len(offsets) - 1):
+        at_zero = float(scores[len(offsets) // 2])
+        if correlation > at_zero + CLEARLY:
+            raise ImuRefusedError(_beyond(felt, seen, float(offsets[best]), at_zero, correlation))
+        # Long even bends fit at any offset: nothing is told of the clock.
+        best = len(offsets) // 2
     bias = _mean_excess(felt.rates(float(offsets[best])), seen, T_lidar_imu)
     if offset_s is not None:
         return Agreement(True, correlation, offset_s, gyro_bias=bias)
@@ -158,11 +166,9 @@ def _refuse_scale(ratio: float) -> None:
 def _why_not(felt: _Felt, seen: Floats, correlation: float) -> str:
     """What would make the turns agree, as a sentence."""
     said = f"its turns do not fit those of the scans (correlation {correlation:.2f}, {LEAST_CORRELATION} needed): "
-    far = np.arange(-FAR_S, FAR_S, 4 * STEP_S)
-    scores = [_compare(seen, felt.rates(float(t)))[0] for t in far]
-    best = int(np.argmax(scores))
-    if scores[best] > 0.9:
-        return said + f"with its stamps moved by {far[best]:.2f} s they would, set imu.time_offset_s"
+    far, score = _best_far(felt, seen)
+    if score > 0.9:
+        return said + f"with its stamps moved by {far:.2f} s they would, set imu.time_offset_s"
     a, b = _centred(seen, felt.rates(0.0))
     if len(a):
         u, _, vt = np.linalg.svd(a.T @ b)
@@ -170,6 +176,26 @@ def _why_not(felt: _Felt, seen: Floats, correlation: float) -> str:
         if _compare(a, b @ R.T)[0] > 0.9:
             return said + f"turned by {np.rad2deg(float(so3.angle(R))):.0f} deg they would, correct T_lidar_imu"
     return said + "check its axes, T_lidar_imu and its stamps"
+
+
+def _beyond(felt: _Felt, seen: Floats, edge_s: float, at_zero: float, at_edge: float) -> str:
+    """What to do about turns that fit the better the farther the stamps are moved, as a sentence."""
+    said = (
+        f"its turns fit those of the scans the better the farther its stamps are moved (correlation {at_zero:.2f}, moved by "
+        f"{edge_s:+.2f} s {at_edge:.2f}): "
+    )
+    far, score = _best_far(felt, seen)
+    if score > max(at_edge, 0.9):
+        return said + f"best by {far:+.2f} s; set imu.time_offset_s"
+    return said + "check its stamps, and set imu.time_offset_s when the clocks are known to differ"
+
+
+def _best_far(felt: _Felt, seen: Floats) -> tuple[float, float]:
+    """Offset, s, within `FAR_S` at which the turns agree best, and their correlation there."""
+    far = np.arange(-FAR_S, FAR_S, 4 * STEP_S)
+    scores = [_compare(seen, felt.rates(float(t)))[0] for t in far]
+    best = int(np.argmax(scores))
+    return float(far[best]), scores[best]
 
 
 def _refined(felt: _Felt, seen: Floats, near: float) -> tuple[float, float]:

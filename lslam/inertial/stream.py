@@ -10,8 +10,10 @@ from numpy.typing import NDArray
 from lslam.types.imu import ImuStream
 
 GRAVITY = 9.80665
-# Mean specific force over half seconds, in g: bends and a poor accelerometer's bias included.
+# Mean specific force over whole seconds, in g: bends and a poor accelerometer's bias included.
 PLAUSIBLE_G = (0.8, 1.2)
+# s over which a vehicle's heave (1 to 2 Hz) averages out and a straight stretch between bends does not.
+CALM_S = 1.0
 # A stream slower than this cannot tell how the sensor moves within a sweep of 0.1 s.
 LEAST_RATE_HZ = 50.0
 MOST_BAD = 0.1
@@ -65,15 +67,18 @@ def clean(imu: ImuStream, first_ns: int, last_ns: int) -> Cleaned:
 def gravity_unit(imu: ImuStream) -> tuple[float, str | None]:
     """Norm of the calmest specific force, as measured, and the unit in which that is gravity; None when in none.
 
-    Half seconds are averaged and the calmest twentieth decides: long bends add up to more than gravity's tolerance.
+    The calmest twentieth decides: long bends add up to more than gravity's tolerance.
     """
-    step = float(np.median(np.diff(imu.stamps_ns))) * 1e-9
-    width = min(max(round(0.5 / step), 1) if step > 0 else 1, len(imu))
-    whole = len(imu) // width * width
-    means = np.linalg.norm(imu.accel[:whole].reshape(-1, width, 3).mean(axis=1), axis=1)
-    calm = float(np.percentile(means, 5))
+    calm = float(np.percentile(np.linalg.norm(mean_forces(imu), axis=1), 5))
     lo, hi = PLAUSIBLE_G
     return calm, "m/s2" if lo <= calm / GRAVITY <= hi else "g" if lo <= calm <= hi else None
+
+
+def mean_forces(imu: ImuStream) -> NDArray[np.float64]:
+    """(W, 3) specific force averaged over `CALM_S` each, W >= 1: what shakes does not look like more or less gravity."""
+    step = float(np.median(np.diff(imu.stamps_ns))) * 1e-9
+    width = min(max(round(CALM_S / step), 1) if step > 0 else 1, len(imu))
+    return np.asarray(imu.accel[: len(imu) // width * width].reshape(-1, width, 3).mean(axis=1))
 
 
 def gaps(imu: ImuStream, longest_s: float) -> NDArray[np.int64]:

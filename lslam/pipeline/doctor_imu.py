@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.inertial.stream import GRAVITY, LEAST_RATE_HZ, gravity_unit
+from lslam.inertial.stream import GRAVITY, LEAST_RATE_HZ, gravity_unit, mean_forces
 from lslam.pipeline.findings import Facts, Finding, plural
 from lslam.types.imu import ImuStream
 from lslam.types.sequence import Sequence
@@ -112,10 +112,8 @@ def _examine_gravity(imu: ImuStream, T_lidar_imu: Floats | None, findings: list[
 
 
 def _calm_direction(imu: ImuStream) -> Floats:
-    """Unit vector (3,) of the specific force in the calmest tenth of the half seconds: bends tilt the others."""
-    step = max(float(np.median(np.diff(imu.stamps_ns))) * 1e-9, 1e-6)
-    width = min(max(round(0.5 / step), 1), len(imu))
-    means = imu.accel[: len(imu) // width * width].reshape(-1, width, 3).mean(axis=1)
+    """Unit vector (3,) of the specific force in the calmest tenth of the seconds: bends tilt the others."""
+    means = mean_forces(imu)
     calm = np.argsort(np.linalg.norm(means, axis=1), kind="stable")[: max(1, len(means) // 10)]
     force = means[calm].mean(axis=0)
     return np.asarray(force / max(float(np.linalg.norm(force)), 1e-12))

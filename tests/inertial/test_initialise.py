@@ -11,7 +11,7 @@ from imu_drives import ACCEL_BIAS, GYRO_BIAS, drone, extrinsics_of, late, stream
 from lslam.config.imu import ImuConfig
 from lslam.geometry import se3
 from lslam.inertial.initialise import FirstPoses, Start, start
-from lslam.inertial.stream import ImuRefusedError, clean, gaps
+from lslam.inertial.stream import ImuRefusedError, clean, gaps, gravity_unit
 from lslam.simulation.scenarios import SimulatedDrive
 from lslam.types.imu import ImuStream
 
@@ -133,6 +133,26 @@ def test_garbage_is_refused_with_a_reason(kind: str, says: str) -> None:
     }[kind]()
     with pytest.raises(ImuRefusedError, match=says):
         begun(drive, bad)
+
+
+def test_a_clock_just_beyond_the_near_search_is_named_not_called_its_edge() -> None:
+    """At 0.25 s a slow turner's rates still correlate above the limit of a refusal."""
+    drive = drone()
+    shake = walk()
+    for made, wrong in ((drive, 0.6), (shake, 0.33)):
+        with pytest.raises(ImuRefusedError, match=r"imu\.time_offset_s") as refused:
+            begun(made, late(stream_of(made), wrong))
+        assert f"{-wrong:.2f}"[:4] in str(refused.value)
+
+
+def test_a_rough_road_does_not_hide_gravity() -> None:
+    """Heave of 0.6 g at 1.3 Hz: its calmest half seconds weigh a quarter less than gravity."""
+    t = np.arange(0, 60, 0.01)
+    up = 9.80665 + 6.0 * np.sin(2 * np.pi * 1.3 * t)
+    rough = ImuStream((t * 1e9).astype(np.int64), np.outer(up, [0, 0, 1.0]), np.zeros((len(t), 3)))
+    assert gravity_unit(rough)[1] == "m/s2"
+    assert gravity_unit(spoilt(rough, accel=rough.accel / 9.80665))[1] == "g"
+    assert gravity_unit(spoilt(rough, accel=rough.accel - [0, 0, 9.80665]))[1] is None
 
 
 def test_wrong_extrinsics_are_named_with_the_turn_that_would_mend_them() -> None:
