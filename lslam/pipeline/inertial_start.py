@@ -137,6 +137,8 @@ def close_inertial(part: Inertial, results: list[ScanResult]) -> dict[str, Any]:
     last = motion.estimate
     errors = motion.prior_errors()
     norms = [r.prior_norm for r in results[1:] if r.status == "ok"]
+    steady = [r.steady_norm for r in results[1:] if r.status == "ok" and r.steady_norm is not None]
+    iterations = [r.iterations for r in results[1:] if r.status == "ok" and not r.is_standing]
     return {
         "used": not motion.refusal,
         "decisions": part.notes,
@@ -149,6 +151,8 @@ def close_inertial(part: Inertial, results: list[ScanResult]) -> dict[str, Any]:
         "gravity_in_world_m_s2": _rounded(last.gravity, 4),
         "scans_in_gaps": motion.gap_scans,
         "median_prior_norm": round(float(np.median(norms)), 5) if norms else None,
+        "median_constant_velocity_norm": round(float(np.median(steady)), 5) if steady else None,
+        "mean_iterations": round(float(np.mean(iterations)), 2) if iterations else None,
         "prior_error_m": None if errors is None else round(errors[0], 5),
         "constant_velocity_error_m": None if errors is None else round(errors[1], 5),
     }

@@ -62,12 +62,17 @@ def _imu_rows(record: RunRecord) -> list[tuple[str, str]]:
         return [("imu", "used" if imu["used"] else "refused")]
     own, steady = imu["prior_error_m"], imu["constant_velocity_error_m"]
     used = "used" if imu["used"] else "refused on the way"
-    return [
+    rows = [
         (
             "imu",
             f"{used}; predicts scans to {metres(own)} m, constant velocity to {metres(steady)} m (medians, turns at 10 m)",
         )
     ]
+    if imu.get("mean_iterations"):
+        rows.append(
+            ("", f"{imu['mean_iterations']:.1f} iterations per scan; lslam compare --imu both tells what that saves")
+        )
+    return rows
 
 
 def _failure(failure: Failure) -> str:

@@ -21,6 +21,7 @@ from lslam.pipeline.inertial_start import begin_inertial, close_inertial
 from lslam.pipeline.run import run
 from lslam.pipeline.watch import RunOutcome
 from lslam.readers import select
+from lslam.reports.text import summary
 from lslam.simulation.scenarios import SimulatedDrive, simulate
 from lslam.types.imu import ImuStream
 from lslam.types.scan_result import ScanResult
@@ -113,6 +114,12 @@ def test_the_manifest_says_what_was_found(tmp_path: Path) -> None:
     header, *rows = (tmp_path / "run" / "scans.csv").read_text().splitlines()
     column = header.split(",").index("prior_norm")
     assert float(rows[20].split(",")[column]) == pytest.approx(outcome.record.results[20].prior_norm, abs=1e-5)
+    steady = float(rows[20].split(",")[header.split(",").index("steady_norm")])
+    assert steady == pytest.approx(outcome.record.results[20].steady_norm, abs=1e-5)
+    assert imu["median_prior_norm"] < imu["median_constant_velocity_norm"]
+    assert imu["mean_iterations"] == pytest.approx(
+        np.mean([r.iterations for r in outcome.record.results[1:]]), abs=0.01
+    )
     world = manifest["frames"]["world"]
     assert "levelled by gravity" in world
     assert f"# world: {world}" in (tmp_path / "run" / "trajectory.tum").read_text()
@@ -120,7 +127,10 @@ def test_the_manifest_says_what_was_found(tmp_path: Path) -> None:
     assert np.rad2deg(np.arccos(up)) < 2
     first = np.loadtxt(tmp_path / "run" / "trajectory_kitti.txt")[0]
     np.testing.assert_allclose(first, np.eye(4)[:3].ravel(), atol=1e-9, err_msg="KITTI's world is the start")
-    assert "Motion prior" in (tmp_path / "run" / "report.html").read_text()
+    page = (tmp_path / "run" / "report.html").read_text()
+    assert "Motion prior" in page
+    assert "constant velocity, for comparison" in page
+    assert "iterations per scan" in summary(outcome.record, outcome.evaluation)
 
 
 def gyro_by(factor: NDArray[np.float64]) -> ImuStream:
