@@ -9,6 +9,8 @@ from typing import Any, TypeVar
 
 import click
 
+from lslam.errors import UsageError
+
 F = TypeVar("F", bound=Callable[..., Any])
 
 
@@ -80,6 +82,14 @@ def preset(function: F) -> F:
 def with_preset(settings: Iterable[str], preset: str | None) -> list[str]:
     """The settings of --set and of the flag --preset, which beats them."""
     return [*settings, *([] if preset is None else [f"odometry.preset={json.dumps(preset)}"])]
+
+
+def epsg(text: str) -> int:
+    """The number of `EPSG:25832` or `25832`; raises UsageError for anything else."""
+    number = text.upper().removeprefix("EPSG:")
+    if not number.isdigit():
+        raise UsageError(f"--crs {text} is no EPSG code: EPSG:25832 is one")
+    return int(number)
 
 
 def as_json(function: F) -> F:

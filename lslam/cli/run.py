@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shlex
 import sys
 from collections.abc import Callable
@@ -14,6 +15,7 @@ import click
 from lslam.cli import options
 from lslam.cli.console import progress, setup_logging, show
 from lslam.cli.signals import GentleStop, gentle_stop
+from lslam.errors import UsageError
 
 if TYPE_CHECKING:
     from lslam.config import Config
@@ -43,6 +45,13 @@ if TYPE_CHECKING:
 @click.option("--rings", metavar="RULE", help="How rings are found: auto, field, order, rows[:N], elevation[:N].")
 @click.option("--save-feature-map", is_flag=True, help="Write feature_map.ply; for the LOAM family.")
 @click.option("--imu/--no-imu", default=None, help="Predict and deskew with the IMU [default: no].")
+@click.option("--loops/--no-loops", default=None, help="Close loops where a place is seen again [default: yes].")
+@click.option("--gnss", "gnss", flag_value="graph", default=None, help="Satellite fixes hold the trajectory.")
+@click.option("--georeference", "gnss", flag_value="fit", help="Satellite fixes only say where on the Earth it lies.")
+@click.option("--crs", metavar="EPSG:N", help="Coordinates of georeferenced maps [default: the UTM zone].")
+@click.option(
+    "--poses", type=click.Path(path_type=Path), metavar="FILE", help="Somebody else's trajectory instead of odometry."
+)
 @click.option("--strict", is_flag=True, help="Exit 4 when anything was degraded: a scan skipped or bridged.")
 @click.option("--dry-run", is_flag=True, help="Resolve everything, write nothing.")
 @options.reading
@@ -102,7 +111,14 @@ def _resolve(given: dict[str, Any]) -> Config:
         "map.write_features": "true" if given["save_feature_map"] else None,
         "imu.use": None if given["imu"] is None else str(given["imu"]).lower(),
         "input.strict": "true" if given["strict"] else None,
+        "loops.use": None if given["loops"] is None else str(given["loops"]).lower(),
+        "gnss.mode": given["gnss"],
+        "gnss.crs": None if given["crs"] is None else options.epsg(given["crs"]),
     }
+    if given["poses"] is not None:
+        if given["method"] not in (None, "poses"):
+            raise UsageError(f"--poses replaces odometry: drop --method {given['method']}")
+        flags |= {"odometry.method": "poses", "odometry.poses": json.dumps(str(given["poses"]))}
     settings = options.with_preset(given["settings"], given["preset"])
     return load_config(given["config_file"], [*settings, *(f"{k}={v}" for k, v in flags.items() if v is not None)])
 
@@ -144,8 +160,6 @@ def _print_plan(sequence: Sequence, config: Config, out: Path, as_json: bool) ->
     from lslam.config import to_toml
 
     if as_json:
-        import json
-
         facts = {"name": sequence.name, "path": str(sequence.path), "format": sequence.kind, "scans": len(sequence)}
         facts |= {"decisions": sequence.notes, "problems": sequence.problems}
         show(json.dumps({"folder": str(out), "sequence": facts, "config": config.model_dump(mode="json")}) + "\n")
@@ -161,8 +175,6 @@ def _print_result(outcome: RunOutcome, out: Path, as_json: bool) -> None:
 
         show(summary(outcome.record, outcome.evaluation))
         return
-    import json
-
     from lslam.reports.evaluation_json import run_document
 
     score = run_document(outcome.record, outcome.evaluation)

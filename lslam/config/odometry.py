@@ -11,5 +11,6 @@ class OdometryConfig(Section):
     """Which method estimates the trajectory."""
 
     method: str = Field("icp", description="a name of `lslam methods`")
+    poses: str = Field("", description="trajectory file whose poses method `poses` takes")
     preset: str = Field("", description="a name of `lslam config presets` or a TOML file: what the other keys stand on")
     max_failures: int = Field(20, ge=1, description="failed scans in a row after which the run counts as diverged")

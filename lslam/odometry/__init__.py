@@ -29,6 +29,7 @@ METHODS = {
     "lego-loam": ("lslam.odometry.lego_loam", "LeGO-LOAM: ground, clusters, two steps scan to scan, then feature map"),
     "kiss-icp": ("lslam.odometry.kiss", "the baseline: the kiss-icp package with its own preprocessing and defaults"),
     "small-gicp": ("lslam.odometry.small_gicp", "baseline: GICP of the small_gicp package on a local map of keyframes"),
+    "poses": ("lslam.odometry.given", "somebody else's: the poses of a trajectory file, see `lslam run --poses`"),
     "open3d-gicp": ("lslam.odometry.open3d", "baseline: generalised ICP of Open3D, scan to scan"),
 }
 

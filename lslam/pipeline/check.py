@@ -24,6 +24,12 @@ def check_config(config: Config) -> None:
         raise UsageError(f"no method {method!r}; {nearest(method, known)}")
     if config.map.write_features and method not in FEATURE_METHODS:
         raise UsageError(f"method {method} has no feature map to save; these have: {', '.join(FEATURE_METHODS)}")
+    if (method == "poses") != bool(config.odometry.poses):
+        raise UsageError(
+            f"odometry.poses = {config.odometry.poses!r} and method {method} do not go together: --poses FILE sets both"
+        )
+    if method == "poses" and config.imu.use:
+        raise UsageError("--imu does nothing with --poses, whose motion is given: drop one of them")
     _check_heeded(config)
     for delta in config.eval.delta:
         parse_delta(delta)

@@ -29,6 +29,7 @@ class Manifest:
     deskew : what becomes of the motion within a scan, `describe_deskew`
     world : where the coordinates begin and whether z is up
     imu : what became of the IMU, empty without `--imu`; keyframes : how many and how large
+    graph, georeference : what the back end did and where on the Earth the world lies, empty where it did nothing
     problems : what went wrong in this run, beside what was wrong with the recording before
     """
 
@@ -42,6 +43,8 @@ class Manifest:
         self.map_points: int | None = None
         self.imu: dict[str, Any] = {}
         self.keyframes: dict[str, Any] = {}
+        self.graph: dict[str, Any] = {}
+        self.georeference: dict[str, Any] = {}
         self._ended = ""
 
     @property
@@ -121,6 +124,8 @@ class Manifest:
             **({"imu": dict(self.imu)} if self.imu else {}),
             "counts": dict(self.counts),
             **({"keyframes": dict(self.keyframes)} if self.keyframes else {}),
+            **({"graph": dict(self.graph)} if self.graph else {}),
+            **({"georeference": dict(self.georeference)} if self.georeference else {}),
             **({"map_points": self.map_points} if self.map_points is not None else {}),
             "timings": {name: round(seconds, 3) for name, seconds in self.timings.items()},
             "peak_memory_mb": peak_memory_mb(),

@@ -12,6 +12,7 @@ from lslam.kernels import jit
 from lslam.keyframes.store import KeyframeStore
 from lslam.maps import crispness, merge
 from lslam.odometry.base import Odometry
+from lslam.odometry.given import GivenPoses
 from lslam.pipeline import inertial_start
 from lslam.pipeline.front_end import estimate, is_diverged, to_trajectory
 from lslam.pipeline.inertial_start import Inertial, begin_inertial, close_inertial
@@ -43,10 +44,11 @@ def estimate_poses(
     watch.on_start("odometry", len(sequence))
     limit = config.odometry.max_failures
     inertial = _begin_imu(sequence, odometry, config, manifest)
+    motion = odometry.motion if isinstance(odometry, GivenPoses) else inertial.motion
     with manifest.timed("odometry_s"), Keyframing(store, config) as keyframing:
         results = estimate(
             sequence, odometry, threads=config.input.threads, max_failures=limit, standing=standing,
-            motion=inertial.motion, should_stop=watch.should_stop, on_scan=seen, keyframing=keyframing,
+            motion=motion, should_stop=watch.should_stop, on_scan=seen, keyframing=keyframing,
         )  # fmt: skip
         keyframing.settle()
     manifest.keyframes = {"count": len(store), "bytes": store.size}

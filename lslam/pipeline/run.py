@@ -12,13 +12,16 @@ from lslam.keyframes.store import KeyframeStore
 from lslam.maps.crispness import crispness
 from lslam.odometry import create_odometry
 from lslam.odometry.base import FeatureSource, Odometry
+from lslam.odometry.given import GivenPoses
 from lslam.pipeline import outputs
+from lslam.pipeline.back_end_pass import level_world, optimise_poses, write_back_end
 from lslam.pipeline.check import check_config
 from lslam.pipeline.choose import choose_scans
 from lslam.pipeline.feature_pass import build_feature_map
-from lslam.pipeline.front_end import has_point_times, to_trajectory
+from lslam.pipeline.front_end import has_point_times
+from lslam.pipeline.georeferencing import require_gnss
+from lslam.pipeline.given_poses import bind
 from lslam.pipeline.inertial_start import with_imu_settings
-from lslam.pipeline.levelling import find_level, level_results
 from lslam.pipeline.manifest import Manifest, describe_deskew
 from lslam.pipeline.map_pass import build_map
 from lslam.pipeline.odometry_pass import estimate_poses
@@ -60,15 +63,19 @@ def run(
     check_config(config)
     if isinstance(sequence, (str, Path)):
         sequence = open_sequence(sequence)
+    require_gnss(sequence, config.gnss)
     truth = sequence.ground_truth if ground_truth is None else ground_truth
     odometry = create_odometry(with_imu_settings(config))
+    if isinstance(odometry, GivenPoses):
+        sequence.notes.extend(bind(odometry, sequence))
     chosen = choose_scans(with_imu(sequence) if config.imu.use else sequence, odometry, config)
     manifest = Manifest(command, chosen, config)
     if out is None:
         _announce(chosen, odometry, config, manifest)
         store = KeyframeStore()
         record = estimate_poses(chosen, odometry, config, manifest, Path(), truth, watch, store)
-        _level(record, chosen, config, manifest)
+        optimise_poses(chosen, record, store, config, manifest)
+        level_world(record, chosen, config, manifest)
         evaluation = _score(record, chosen, config)
     else:
         with RunFolder(Path(out), overwrite) as folder:
@@ -79,7 +86,9 @@ def run(
                 folder.write_manifest(manifest.as_dict("running"))
                 store = KeyframeStore(folder.path / KEYFRAMES)
                 record = estimate_poses(chosen, odometry, config, manifest, folder.path, truth, watch, store)
-                _level(record, chosen, config, manifest)
+                done = optimise_poses(chosen, record, store, config, manifest)
+                level_world(record, chosen, config, manifest)
+                write_back_end(folder.path, record, store, done)
                 outputs.write_trajectories(folder, record, chosen.calibration)
                 outputs.write_scans(folder, record)
                 evaluation = _score(record, chosen, config)
@@ -111,17 +120,6 @@ def _announce(sequence: Sequence, odometry: Odometry, config: Config, manifest: 
         log.warning("%s", manifest.deskew)
     else:
         log.info("deskew: %s", manifest.deskew)
-
-
-def _level(record: RunRecord, sequence: Sequence, config: Config, manifest: Manifest) -> None:
-    """Make the world level: the last of all that moves poses, so keyframes on disk stay where odometry put them."""
-    level = find_level(sequence, record.results, config)
-    record.results = level_results(record.results, level)
-    record.trajectory = to_trajectory(record.results, record.method)
-    record.world = manifest.world = level.world
-    if level.problem:
-        manifest.problems.append(level.problem)
-        log.warning("%s", level.problem)
 
 
 def _score(record: RunRecord, sequence: Sequence, config: Config) -> Evaluation | None:

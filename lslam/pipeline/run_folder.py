@@ -23,6 +23,7 @@ KEYFRAMES = "keyframes"
 OURS = (
     MANIFEST, "config.toml", "log.txt", "trajectory.tum", "trajectory_kitti.txt", "covariances.npz", "map.ply",
     "map.pcd", "map.las", "map.laz", "map.json", "feature_map.ply", "trajectory.geojson", "evaluation.json",
+    "trajectory_odometry.tum", "loops.csv", "graph.g2o",
     "timing.csv", "scans.csv", "report.html",
 )  # fmt: skip
 

@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.types.constraint import LoopCandidate
+from lslam.types.georeference import Georeference
 from lslam.types.map_score import Crispness
 from lslam.types.scan_result import ScanResult
 from lslam.types.trajectory import Trajectory
@@ -22,6 +24,9 @@ class RunRecord:
     map_extent : (x_min, x_max, y_min, y_max), m; crispness : of the merged map, None without one
     real_time_limit : seconds one scan may take: skip_frames / rate
     world : where the coordinates of trajectory and map begin and whether z is up, in words
+    odometry : the trajectory before the pose graph, in its own world, None when there was no back end; T_final_odometry
+        : (4, 4) from that world into the trajectory's
+    loops : candidates with verdicts, between keyframes; keyframe_scans : (K,) position of each one's scan in `results`
     """
 
     name: str
@@ -37,3 +42,8 @@ class RunRecord:
     crispness: Crispness | None = None
     world: str = "LiDAR at the first scan, not levelled"
     problems: list[str] = field(default_factory=list)
+    odometry: Trajectory | None = None
+    T_final_odometry: NDArray[np.float64] = field(default_factory=lambda: np.eye(4))
+    loops: list[LoopCandidate] = field(default_factory=list)
+    keyframe_scans: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+    georeference: Georeference | None = None

@@ -1,0 +1,110 @@
+"""Somebody else's odometry: the poses of a trajectory file, so that loops, graph, map and report can be had of it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.errors import UsageError
+from lslam.formats.trajectory_files import read_trajectory
+from lslam.geometry.interpolate import poses_at
+from lslam.preprocessing.deskew import KNOTS
+from lslam.types.motion_prior import MotionPrior
+from lslam.types.scan import Scan
+from lslam.types.scan_result import ScanResult
+from lslam.types.trajectory import Trajectory
+
+if TYPE_CHECKING:
+    from lslam.config.config import Config
+
+Floats = NDArray[np.float64]
+
+# Between poses farther apart than so many typical steps there is a gap; beyond the ends one scan's sweep may reach.
+GAP_STEPS, GAP_S = 2.5, 0.25
+
+
+class GivenMotion:
+    """A `MotionModel` that reads the motion off a trajectory."""
+
+    def __init__(self, trajectory: Trajectory) -> None:
+        self.trajectory = trajectory
+        step = float(np.median(np.diff(trajectory.stamps_ns)))
+        self._gap_ns = max(GAP_STEPS * step, 1e9 * GAP_S)
+
+    @property
+    def is_known(self) -> bool:
+        """From the first scan on."""
+        return True
+
+    def covers(self, stamp_ns: int) -> bool:
+        """Whether the trajectory has poses about that instant."""
+        stamps = self.trajectory.stamps_ns
+        right = int(np.searchsorted(stamps, stamp_ns))
+        if right < len(stamps) and stamps[right] == stamp_ns:
+            return True
+        if 0 < right < len(stamps):
+            return bool(stamps[right] - stamps[right - 1] <= self._gap_ns)
+        # A millisecond: stamps of files are rounded.
+        return bool(min(abs(int(stamps[0]) - stamp_ns), abs(int(stamps[-1]) - stamp_ns)) <= 1_000_000)
+
+    def sweep(self, stamp_ns: int, span_s: float) -> MotionPrior:
+        """Poses from scan start over the `span_s` seconds that the sweep takes; one pose when it takes none."""
+        times = np.linspace(0.0, span_s, KNOTS) if span_s > 0 else np.zeros(1)
+        instants = stamp_ns + np.round(1e9 * times).astype(np.int64)
+        return MotionPrior(times, poses_at(self.trajectory.stamps_ns, self.trajectory.poses, instants))
+
+    def refine(self, prior: MotionPrior, stamp_ns: int, start: Floats) -> MotionPrior:
+        """The same: nothing was registered."""
+        return prior
+
+    def rewind(self, stamp_ns: int, start: Floats, span_s: float) -> MotionPrior:
+        """The same: there is nothing to forget."""
+        return self.sweep(stamp_ns, span_s)
+
+    def correct(
+        self, stamp_ns: int, pose: Floats, prior: MotionPrior | None = None, is_registered: bool = True
+    ) -> None:
+        """Nothing to learn."""
+
+
+class GivenPoses:
+    """Scan by scan the pose of a trajectory, which has to be of the LiDAR: `pipeline.given_poses` sees to it."""
+
+    deskew = "by the motion of the given trajectory"
+    ignores_prior = True
+
+    def __init__(self, trajectory: Trajectory) -> None:
+        self.trajectory = trajectory
+        self.motion = GivenMotion(trajectory)
+
+    def prepare(self, scan: Scan) -> None:
+        """Nothing to be made of a scan."""
+
+    def register(self, scan: Scan, prepared: None, prior: MotionPrior) -> ScanResult:
+        """The trajectory's pose at scan start; `bridged` where it has a gap."""
+        covered = self.motion.covers(scan.stamp_ns)
+        return ScanResult(
+            index=scan.index,
+            stamp_ns=scan.stamp_ns,
+            T_world_lidar=self.motion.sweep(scan.stamp_ns, 0.0).start,
+            status="ok" if covered else "bridged",
+            reason="" if covered else "the given trajectory has no pose at this time",
+            source_points=len(scan),
+        )
+
+    def warm_up(self) -> None:
+        """Nothing to compile."""
+
+
+def create(config: Config) -> GivenPoses:
+    """The poses of `odometry.poses`. Raises UsageError without a file, InputError for one that cannot be read."""
+    if not config.odometry.poses:
+        raise UsageError("method poses needs a trajectory: name its file with --poses")
+    path = Path(config.odometry.poses)
+    trajectory = read_trajectory(path)
+    if len(trajectory) < 2:
+        raise UsageError(f"{path} holds {len(trajectory)} pose; a trajectory for --poses needs two")
+    return GivenPoses(trajectory)

@@ -1,0 +1,112 @@
+"""Second pass, over keyframes: what odometry gave is made consistent, and the run's record says what was done."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lslam.config import Config
+from lslam.formats.g2o import write_g2o
+from lslam.formats.loops_csv import write_loops
+from lslam.formats.trajectory_files import write_tum
+from lslam.geometry import se3
+from lslam.keyframes.store import KeyframeStore
+from lslam.loops.detector import find_loops
+from lslam.pipeline import drift
+from lslam.pipeline.back_end import BackEnd, run_back_end
+from lslam.pipeline.front_end import to_trajectory
+from lslam.pipeline.levelling import find_level, level_results
+from lslam.pipeline.manifest import Manifest
+from lslam.types.constraint import LoopCandidate
+from lslam.types.georeference import Georeference
+from lslam.types.run_record import RunRecord
+from lslam.types.sequence import Sequence
+from lslam.version import __version__
+
+log = logging.getLogger("lslam")
+
+
+def optimise_poses(
+    sequence: Sequence, record: RunRecord, store: KeyframeStore, config: Config, manifest: Manifest
+) -> BackEnd:
+    """Put the final poses into `record`, and what the graph did into the manifest.
+
+    A run that was interrupted, or whose odometry is lost, keeps what it has.
+    """
+    if config.debug.drift:
+        manifest.problems.append(drift.describe(config.debug))
+        log.warning("%s", manifest.problems[-1])
+        record.results = drift.with_drift(record.results, config.debug)
+        store.keyframes = drift.moved_keyframes(store.keyframes, record.results)
+        record.trajectory = to_trajectory(record.results, record.method)
+    if manifest.outcome in ("interrupted", "diverged"):
+        return BackEnd(record.results)
+    with manifest.timed("back_end_s"):
+        candidates: list[LoopCandidate] = []
+        if config.loops.use:
+            with manifest.timed("loops_s"):
+                candidates = find_loops(store, config.loops, config.registration, config.keyframes.submap_size)
+        done = run_back_end(sequence, record.results, store, config, candidates)
+    record.odometry = record.trajectory
+    if done.is_optimised:
+        record.results = done.results
+        record.trajectory = to_trajectory(done.results, record.method)
+    record.loops, record.keyframe_scans = done.candidates, np.array([k.scan for k in store.keyframes], np.int64)
+    record.georeference, record.T_final_odometry = done.georeference, done.T_final_odometry
+    manifest.problems += done.problems
+    manifest.graph = dict(done.facts)
+    return done
+
+
+def level_world(record: RunRecord, sequence: Sequence, config: Config, manifest: Manifest) -> None:
+    """Make the world level, unless it is east, north, up already; the georeference is of the final world.
+
+    The last of all that moves poses, so keyframes on disk stay where odometry put them.
+    """
+    place = record.georeference
+    if place is not None and place.method == "graph":
+        record.world = "east, north, up from the origin of the georeference"
+    else:
+        level = find_level(sequence, record.results, config)
+        T = se3.make(level.R, np.zeros(3))
+        was_odometry = record.odometry is record.trajectory
+        record.results = level_results(record.results, level)
+        record.trajectory = to_trajectory(record.results, record.method)
+        if record.odometry is not None and level.is_turned:
+            turned = replace(record.odometry, poses=se3.normalise(T @ record.odometry.poses), covariances=None)
+            record.odometry = record.trajectory if was_odometry else turned
+        if place is not None:
+            record.georeference = replace(place, T_enu_world=place.T_enu_world @ se3.inverse(T))
+        if level.problem:
+            manifest.problems.append(level.problem)
+            log.warning("%s", level.problem)
+        record.world = level.world
+    manifest.world = record.world
+    if record.georeference is not None:
+        manifest.georeference = describe(record.georeference)
+
+
+def write_back_end(folder: Path, record: RunRecord, store: KeyframeStore, done: BackEnd) -> None:
+    """trajectory_odometry.tum, loops.csv and, when there is a graph, graph.g2o."""
+    if record.odometry is None:
+        return
+    write_tum(
+        folder / "trajectory_odometry.tum", record.odometry,
+        comment=f"lslam {__version__}, {record.method}: T_world_lidar of odometry, before the pose graph\npose_time: scan_start",
+    )  # fmt: skip
+    write_loops(folder / "loops.csv", done.candidates, store.keyframes)
+    if done.is_optimised:
+        write_g2o(folder / "graph.g2o", done.keyframes, done.constraints)
+
+
+def describe(georeference: Georeference) -> dict[str, Any]:
+    """For the manifest: plain values, angles in deg, distances in m."""
+    plain = asdict(georeference)
+    plain["origin_lat_lon_height"] = [float(v) for v in plain.pop("origin")]
+    plain["T_enu_world"] = georeference.T_enu_world.tolist()
+    plain["projection"] = "transverse Mercator at the origin, scale 1, WGS84"
+    return {k: round(v, 4) if isinstance(v, float) else v for k, v in plain.items()}

@@ -1,0 +1,62 @@
+"""What the pose graph is told beside odometry, loops and fixes: which way is up, and where the floor is."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.config.graph import GraphConfig
+from lslam.graph.problem import FloorPlane, UpDirection
+from lslam.keyframes.store import KeyframeStore
+from lslam.preprocessing.ground import levelling
+from lslam.types.keyframe import Keyframe
+from lslam.types.scan_result import ScanResult
+
+Floats = NDArray[np.float64]
+
+# s over which errors of the IMU's up direction are nearly the same error.
+MEMORY_S = 20.0
+# Floors are looked for within so many cells of half a metre, with so much roughness, m.
+CELLS, ROUGHNESS = 80, 0.15
+# rad; a floor this much steeper than the world's horizon is a ramp or a roof (hdl_graph_slam takes 10 deg).
+STEEPEST = np.deg2rad(10.0)
+
+
+def up_directions(
+    keyframes: Sequence[Keyframe], results: Sequence[ScanResult], config: GraphConfig
+) -> list[UpDirection]:
+    """One per keyframe at which an IMU knows which way is down; those of one stretch count as one measurement."""
+    known = [(k, g) for k in keyframes if (g := results[k.scan].gravity) is not None]
+    stamps = np.array([k.stamp_ns for k, _ in known], np.int64)
+    half = round(0.5e9 * MEMORY_S)
+    alike = np.searchsorted(stamps, stamps + half, side="right") - np.searchsorted(stamps, stamps - half)
+    least = np.deg2rad(config.gravity_deg)
+    return [
+        UpDirection(k.number, -g.direction, float(max(g.sigma, least) * np.sqrt(count)))
+        for (k, g), count in zip(known, alike, strict=True)
+    ]
+
+
+def world_up(ups: Sequence[UpDirection], keyframes: Sequence[Keyframe]) -> Floats | None:
+    """(3,) up in the world of odometry, by the first stretch in which the IMU knows it; None when it never does."""
+    if not ups:
+        return None
+    begin = keyframes[ups[0].keyframe].stamp_ns
+    first = [u for u in ups if keyframes[u.keyframe].stamp_ns <= begin + 1e9 * MEMORY_S]
+    turned = np.stack([keyframes[u.keyframe].T_world_lidar[:3, :3] @ u.up for u in first])
+    mean = (turned / np.array([[u.sigma**2] for u in first])).sum(0)
+    return np.asarray(mean / np.linalg.norm(mean))
+
+
+def floor_planes(store: KeyframeStore, config: GraphConfig) -> list[FloorPlane]:
+    """The floor under each keyframe, where one is seen that lies level in the world."""
+    planes = []
+    for keyframe in store.keyframes:
+        R, height = levelling(store.points(keyframe.number), ROUGHNESS, CELLS)
+        normal = R[2]
+        if not np.isfinite(height) or (keyframe.T_world_lidar[:3, :3] @ normal)[2] < np.cos(STEEPEST):
+            continue
+        planes.append(FloorPlane(keyframe.number, normal, -height, float(np.deg2rad(config.floor_deg)), config.floor_m))
+    return planes
