@@ -119,12 +119,16 @@ def _voted_out(graph: PoseGraph, ends: Ends, drift: Drift, limit: float) -> list
     _, found = cKDTree(where).query(where, k + 1, p=1)
     others = np.array([row[row != i][:k] for i, row in enumerate(np.asarray(found))])
     first = np.repeat(np.arange(len(where)), k)
-    agrees = (_cycle_errors(graph, ends, drift, first, others.ravel()) <= limit).reshape(others.shape)
+    errors, sharpness = _cycle_errors(graph, ends, drift, first, others.ravel())
+    agrees = (errors <= limit).reshape(others.shape)
+    # Far neighbours agree with anything: odometry may have drifted as far between.
+    votes = sharpness.reshape(others.shape)
     alive = np.ones(len(where), bool)
     gone: list[tuple[int, float]] = []
     while True:
-        asked = alive[others]
-        share = np.where(asked.any(1), (agrees & asked).sum(1) / np.maximum(asked.sum(1), 1), 1.0)
+        asked = np.where(alive[others], votes, 0.0)
+        total = asked.sum(1)
+        share = np.where(total > 0, (agrees * asked).sum(1) / np.where(total > 0, total, 1.0), 1.0)
         share[~alive] = 1.0
         worst = float(share.min())
         if worst >= SHARE:
@@ -134,15 +138,22 @@ def _voted_out(graph: PoseGraph, ends: Ends, drift: Drift, limit: float) -> list
         alive[out] = False
 
 
-def _cycle_errors(graph: PoseGraph, ends: Ends, drift: Drift, i: NDArray[Any], j: NDArray[Any]) -> Floats:
-    """(P,) squared Mahalanobis distances from the identity of a_i -> b_i -> b_j -> a_j -> a_i."""
+def _cycle_errors(
+    graph: PoseGraph, ends: Ends, drift: Drift, i: NDArray[Any], j: NDArray[Any]
+) -> tuple[Floats, Floats]:
+    """(P,) squared Mahalanobis distances from the identity of a_i -> b_i -> b_j -> a_j -> a_i.
+
+    Beside them how sharp each question is: one over the variance, m2, that drift has on the way.
+    """
     ahead = se3.relative(graph.poses[ends.b[i]], graph.poses[ends.b[j]])
     home = se3.relative(graph.poses[ends.a[j]], graph.poses[ends.a[i]])
     to_bi, to_bj = ends.T[i], ends.T[i] @ ahead
     to_aj = to_bj @ se3.inverse(ends.T[j])
-    S = ends.covariances[i] + _carried(drift.covariance(ends.b[i], ends.b[j]), ahead, to_bi)
-    S += _moved(ends.covariances[j], to_aj) + _carried(drift.covariance(ends.a[j], ends.a[i]), home, to_aj)
-    return _squared(se3.log(to_aj @ home), S + _slack(len(i)))
+    by_b, by_a = drift.covariance(ends.b[i], ends.b[j]), drift.covariance(ends.a[j], ends.a[i])
+    S = ends.covariances[i] + _carried(by_b, ahead, to_bi)
+    S += _moved(ends.covariances[j], to_aj) + _carried(by_a, home, to_aj)
+    sharpness = 1.0 / (SLACK_M**2 + by_b[:, 0, 0] + by_a[:, 0, 0])
+    return _squared(se3.log(to_aj @ home), S + _slack(len(i))), sharpness
 
 
 def _carried(covariance: Floats, T: Floats, to: Floats) -> Floats:

@@ -38,12 +38,12 @@ def odometry_scale(graph: PoseGraph, loops: Sequence[Constraint]) -> float:
     if not loops and len(graph.fixes) < 2:
         return 1.0
     chain = accumulated(graph.poses, graph.odometry)
-    return max(_of_loops(graph, loops, chain), _of_fixes(graph, chain))
+    by_loops = _fitting(*_against_loops(graph, loops, chain)) if loops else 1.0
+    return max(by_loops, _of_fixes(graph, chain))
 
 
-def _of_loops(graph: PoseGraph, loops: Sequence[Constraint], chain: Floats) -> float:
-    if not loops:
-        return 1.0
+def _against_loops(graph: PoseGraph, loops: Sequence[Constraint], chain: Floats) -> tuple[Floats, Floats, Floats]:
+    """(P, 6) where loops put b against odometry, in the axes of a; covariances of loop and odometry there."""
     few = [loops[i] for i in np.unique(np.linspace(0, len(loops) - 1, MOST).round().astype(int))]
     a, b = np.array([c.a for c in few]), np.array([c.b for c in few])
     T = np.stack([c.T_a_b for c in few])
@@ -53,7 +53,7 @@ def _of_loops(graph: PoseGraph, loops: Sequence[Constraint], chain: Floats) -> f
     error = np.concatenate([T[:, :3, 3] - odometry[:, :3, 3], turn], axis=1)
     grown = chain[b] - noise.transported(chain[a], graph.poses[b, :3, 3] - graph.poses[a, :3, 3])
     grown = noise.rotated(grown, np.swapaxes(R_a, -1, -2))
-    return _fitting(error, grown, np.stack([c.covariance for c in few]))
+    return error, np.stack([c.covariance for c in few]), grown
 
 
 def _of_fixes(graph: PoseGraph, chain: Floats) -> float:
@@ -70,21 +70,22 @@ def _of_fixes(graph: PoseGraph, chain: Floats) -> float:
     a, b = k[first], k[first + half]
     grown = chain[b] - noise.transported(chain[a], graph.poses[b, :3, 3] - graph.poses[a, :3, 3])
     noise_of_pair = (own[first] + own[first + half])[:, :, None] * np.eye(3)
-    return _fitting(off[first + half] - off[first], grown[:, :3, :3], noise_of_pair)
+    return _fitting(off[first + half] - off[first], noise_of_pair, grown[:, :3, :3])
 
 
-def _fitting(error: Floats, grown: Floats, own: Floats) -> float:
+def _fitting(error: Floats, own: Floats, grown: Floats) -> float:
     """The factor on `grown` (P, n, n) with which the median error (P, n) is as large as it should be."""
+
     typical = float(chi2.median(error.shape[1]))
 
-    def median(scale: float) -> float:
+    def is_enough(scale: float) -> bool:
         solved = np.linalg.solve(scale * grown + own, error[..., None])[..., 0]
-        return float(np.median(np.einsum("ij,ij->i", error, solved)))
+        return bool(np.median(np.einsum("ij,ij->i", error, solved)) <= typical)
 
-    if median(1.0) <= typical:
+    if is_enough(1.0):
         return 1.0
-    low, high = 0.0, np.log(LARGEST)
+    low, high = 0.0, float(np.log(LARGEST))
     while high - low > 0.01:
         middle = 0.5 * (low + high)
-        low, high = (middle, high) if median(float(np.exp(middle))) > typical else (low, middle)
+        low, high = (low, middle) if is_enough(float(np.exp(middle))) else (middle, high)
     return float(np.exp(high))

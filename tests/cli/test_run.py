@@ -18,6 +18,7 @@ from lslam.formats.trajectory_files import read_trajectory
 
 ALL = {
     "trajectory.tum", "trajectory_kitti.txt", "covariances.npz", "map.ply", "map.json", "timing.csv", "scans.csv",
+    "trajectory_odometry.tum", "loops.csv",
     "manifest.json", "config.toml", "log.txt", "evaluation.json", "report.html", "keyframes",
 }  # fmt: skip
 SAME = ("trajectory.tum", "trajectory_kitti.txt", "covariances.npz", "map.ply", "evaluation.json")

@@ -25,6 +25,7 @@ from lslam.types.scan import Scan
 ONLY_MAP = {"schema", "version", "lslam", "estimate", "map"}  # of evaluation.json without ground truth
 ALL = {
     "trajectory.tum", "trajectory_kitti.txt", "covariances.npz", "map.ply", "map.json", "timing.csv", "scans.csv",
+    "trajectory_odometry.tum", "loops.csv",
     "manifest.json", "config.toml", "log.txt", "evaluation.json", "report.html", "keyframes",
 }  # fmt: skip
 Usage = namedtuple("Usage", "total used free")

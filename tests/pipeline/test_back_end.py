@@ -1,0 +1,213 @@
+"""Odometry that ran away, made consistent: what is repaired, what is refused, and what is left alone."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from stub_sequences import Stub
+
+from lslam.config import Config, load_config
+from lslam.geometry import geodesy, se3, so3
+from lslam.keyframes.store import KeyframeStore
+from lslam.pipeline import back_end
+from lslam.pipeline.back_end import BackEnd, run_back_end
+from lslam.pipeline.drift import with_drift
+from lslam.types.calibration import Calibration
+from lslam.types.constraint import Constraint, LoopCandidate
+from lslam.types.gnss import GnssStream
+from lslam.types.gravity import GravityDirection
+from lslam.types.keyframe import Keyframe
+from lslam.types.scan_result import ScanResult
+
+# Two laps of 400 m, a scan each metre, a keyframe every other scan.
+COUNT, LAP, EVERY = 800, 400, 2
+PHASE = 2 * np.pi * np.arange(COUNT) / LAP
+RADIUS = LAP / (2 * np.pi)
+CITY = se3.make(
+    so3.from_euler_rpy(np.column_stack([0 * PHASE, 0 * PHASE, PHASE + 0.5 * np.pi])),
+    np.column_stack([RADIUS * np.cos(PHASE), RADIUS * np.sin(PHASE), 2 * np.sin(PHASE)]),
+)
+REAL = se3.inverse(CITY[0]) @ CITY
+ORIGIN, ARM = np.array([49.0, 8.4, 115.0]), np.array([-0.9, 0.0, 0.5])
+OWN = np.diag([1e-4] * 3 + [1e-8] * 3)
+
+
+def config(*settings: str) -> Config:
+    return load_config(settings=settings, environ={})
+
+
+def drifted(*settings: str) -> list[ScanResult]:
+    results = [
+        ScanResult(i, i * 100_000_000, T, covariance=OWN * (1 + i), registration_covariance=OWN)
+        for i, T in enumerate(REAL)
+    ]
+    return with_drift(results, config(*settings).debug)
+
+
+def store_of(results: list[ScanResult]) -> KeyframeStore:
+    store = KeyframeStore()
+    for n, i in enumerate(range(0, COUNT, EVERY)):
+        keyframe = Keyframe(n, i, results[i].stamp_ns, results[i].T_world_lidar, results[i].covariance, float(i))
+        store.add(keyframe, np.zeros((1, 3), np.float32))
+    return store
+
+
+def candidate(a: int, b: int, off: float = 0.0, seed: int = 0) -> LoopCandidate:
+    """Keyframe b seen from a to a centimetre, or wrong by `off` metres."""
+    d = np.random.default_rng([seed, a, b]).normal(size=6) * [0.01, 0.01, 0.01, 5e-4, 5e-4, 5e-4]
+    T = se3.exp(d) @ se3.relative(REAL[a * EVERY], REAL[b * EVERY])
+    T[0, 3] += off
+    S = np.diag([1e-4] * 3 + [2.5e-7] * 3)
+    return LoopCandidate(a, b, 0.0, 0.1, "accepted", "agreement", "", 0.05, 0.9, Constraint(a, b, T, S))
+
+
+LOOPS = [candidate(a, a + LAP // EVERY) for a in range(5, 190, 20)]
+
+
+def error(done: BackEnd, real: np.ndarray = REAL) -> float:
+    p = np.stack([r.T_world_lidar[:3, 3] for r in done.results])
+    return float(np.sqrt(((p - real[:, :3, 3]) ** 2).sum(1).mean()))
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_loops_take_the_drift_away(seed: int) -> None:
+    results = drifted(f"debug.drift_seed={seed}")
+    done = run_back_end(Stub([]), results, store_of(results), config(), LOOPS)
+    assert error(done) < 0.3 * error(BackEnd(results))
+    assert done.facts["loops"] == len(LOOPS)
+    assert done.problems == []
+    # Loops and what odometry knows are both in the graph that is written.
+    assert len(done.constraints) == len(LOOPS) + COUNT // EVERY - 1
+    for result in done.results[::50]:
+        assert np.linalg.eigvalsh(result.covariance).min() > 0
+
+
+def test_wrong_loops_are_refused_and_say_so() -> None:
+    results = drifted()
+    wrong = [candidate(a, a + 160, off=15.0) for a in (10, 60, 110, 160)]
+    mixed = sorted([*LOOPS, *wrong], key=lambda c: c.b)
+    done = run_back_end(Stub([]), results, store_of(results), config(), mixed)
+    assert error(done) < 1.2 * error(run_back_end(Stub([]), results, store_of(results), config(), LOOPS))
+    refused = [c for c in done.candidates if c.verdict == "rejected"]
+    assert [(c.a, c.b) for c in refused] == [(c.a, c.b) for c in sorted(wrong, key=lambda c: c.b)]
+    assert all(c.reason and c.stage in ("consistency", "graph") for c in refused)
+
+
+@pytest.mark.parametrize("loops", ["none", "rejected", "refused"])
+def test_without_a_loop_that_is_believed_nothing_moves(loops: str) -> None:
+    results = drifted()
+    given = {
+        "none": [],
+        "rejected": [replace(c, verdict="rejected") for c in LOOPS],
+        "refused": [candidate(10, 170, off=60.0)],
+    }[loops]
+    done = run_back_end(Stub([]), results, store_of(results), config(), given)
+    assert done.results is results
+    assert not done.is_optimised
+    assert all(c.verdict == "rejected" for c in done.candidates)
+
+
+def test_a_graph_that_cannot_be_solved_leaves_odometry(monkeypatch: pytest.MonkeyPatch) -> None:
+    results = drifted()
+    lost = back_end.odometry_constraints
+    monkeypatch.setattr(back_end, "odometry_constraints", lambda *given: lost(*given)[:50])
+    done = run_back_end(Stub([]), results, store_of(results), config(), LOOPS)
+    assert done.results is results
+    assert "in pieces" in done.problems[0]
+
+
+def test_one_keyframe_is_no_graph() -> None:
+    results = drifted()[:1]
+    store = KeyframeStore()
+    store.add(Keyframe(0, 0, 0, np.eye(4)), np.zeros((1, 3), np.float32))
+    assert run_back_end(Stub([]), results, store, config(), []).results is results
+    assert run_back_end(Stub([]), results, store, config("gnss.mode=fit"), []).problems
+
+
+def recording(noise: float = 1.0, outage: tuple[int, int] = (300, 500), seed: int = 0) -> Stub:
+    """A fix every fifth scan, none between the scans of the outage."""
+    scans = np.array([i for i in range(0, COUNT - 1, 5) if not outage[0] <= i < outage[1]])
+    antenna = (CITY[scans] @ se3.make(np.eye(3), ARM))[:, :3, 3]
+    antenna = antenna + noise * np.random.default_rng(seed).normal(size=antenna.shape) * [1, 1, 1.8]
+    stream = GnssStream(scans * 100_000_000, geodesy.from_local(antenna, ORIGIN), np.full(len(scans), max(noise, 0.05)))
+    return Stub(["none"] * COUNT, calibration=Calibration(T_lidar_gnss=se3.make(np.eye(3), ARM)), gnss=stream)
+
+
+def on_earth(done: BackEnd) -> np.ndarray:
+    """(N, 3) m, of the results in the frame of the city, through lat, lon and height."""
+    place = done.georeference
+    p = np.stack([r.T_world_lidar[:3, 3] for r in done.results])
+    return geodesy.to_local(geodesy.from_local(se3.apply(place.T_enu_world, p), place.origin), ORIGIN)
+
+
+@pytest.mark.parametrize("loops", [[], LOOPS])
+def test_fixes_of_a_metre_hold_the_trajectory_through_an_outage(loops: list[LoopCandidate]) -> None:
+    """200 m without fixes, drift of 0.5 %: horizontally within half a metre of the Earth's truth."""
+    results = drifted("debug.drift_percent=0.5", "debug.drift_deg_per_100m=0.25")
+    done = run_back_end(recording(), results, store_of(results), config("gnss.mode=graph"), loops)
+    assert done.georeference.method == "graph"
+    off = (on_earth(done) - CITY[:, :3, 3])[:, :2]
+    assert np.sqrt((off**2).sum(1).mean()) < 0.5
+    before = (on_earth(run_back_end(recording(), results, store_of(results), config("gnss.mode=fit"), []))) - CITY[
+        :, :3, 3
+    ]
+    assert np.sqrt((off**2).sum(1).mean()) < 0.7 * np.sqrt((before[:, :2] ** 2).sum(1).mean())
+
+
+def test_georeferencing_only_leaves_the_trajectory_alone() -> None:
+    results = drifted("debug.drift_percent=0.05", "debug.drift_deg_per_100m=0.02")
+    done = run_back_end(recording(), results, store_of(results), config("gnss.mode=fit", "gnss.crs=25832"), [])
+    assert done.results is results
+    assert (done.georeference.method, done.georeference.epsg) == ("fit", 25832)
+    off = (on_earth(done) - CITY[:, :3, 3])[:, :2]
+    assert np.sqrt((off**2).sum(1).mean()) < 0.5
+
+
+def test_fixes_that_are_all_bad_leave_odometry_and_its_loops() -> None:
+    sequence = recording()
+    places = sequence.gnss.lat_lon_alt.copy()
+    places[:, 0] *= -1
+    south = replace(sequence, gnss=replace(sequence.gnss, lat_lon_alt=places))
+    results = drifted()
+    alone = run_back_end(south, results, store_of(results), config("gnss.mode=graph"), [])
+    assert alone.results is results
+    assert "rejected" in alone.problems[0]
+    closed = run_back_end(south, results, store_of(results), config("gnss.mode=graph"), LOOPS)
+    assert error(closed) < 0.3 * error(BackEnd(results))
+    assert closed.georeference is None
+
+
+def test_a_receiver_that_jumps_is_left_out_where_it_does() -> None:
+    sequence = recording(0.5)
+    places = sequence.gnss.lat_lon_alt.copy()
+    places[30:50, 1] += 4e-4  # 29 m
+    results = drifted("debug.drift_percent=0.2", "debug.drift_deg_per_100m=0.1")
+    jumped = replace(sequence, gnss=replace(sequence.gnss, lat_lon_alt=places))
+    done = run_back_end(jumped, results, store_of(results), config("gnss.mode=graph"), [])
+    assert done.georeference.used <= done.georeference.fixes - 20
+    off = (on_earth(done) - CITY[:, :3, 3])[:, :2]
+    assert np.sqrt((off**2).sum(1).mean()) < 0.5
+
+
+def test_gravity_keeps_it_level_beside_loops() -> None:
+    """A roll that grows to 4 deg: the few loops of one place cannot tell where it came from, the IMU can."""
+    roll = np.deg2rad(4) * np.arange(COUNT) / COUNT
+    rolled = REAL @ se3.make(so3.exp(np.column_stack([roll, 0 * roll, 0 * roll])), np.zeros((COUNT, 3)))
+    down = -REAL[:, 2, :3]
+    results = [
+        ScanResult(i, i * 100_000_000, rolled[i], covariance=OWN * (1 + i), registration_covariance=OWN,
+                   gravity=GravityDirection(down[i], 0.003))
+        for i in range(COUNT)
+    ]  # fmt: skip
+    done = run_back_end(Stub([]), results, store_of(results), config(), LOOPS[:1])
+    blind = run_back_end(Stub([]), results, store_of(results), config("graph.gravity=false"), LOOPS[:1])
+
+    def tilt(results: list[ScanResult]) -> float:
+        return max(
+            float(np.arccos(np.clip(r.T_world_lidar[2, :3] @ -d, -1, 1))) for r, d in zip(results, down, strict=True)
+        )
+
+    assert np.rad2deg(tilt(done.results)) < 1.5
+    assert tilt(done.results) < 0.5 * tilt(blind.results)
