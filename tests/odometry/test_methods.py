@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from importlib.metadata import EntryPoint
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -15,8 +16,12 @@ from lslam.odometry import METHODS, create_odometry, known_methods
 FAMILY = ("gicp", "vgicp", "ndt")
 
 
+SAMPLE_POSES = Path(__file__).resolve().parents[2] / "sample_data" / "poses" / "00.txt"
+
+
 def config(method: str) -> Config:
-    return Config.model_validate({"odometry": {"method": method}})
+    poses = str(SAMPLE_POSES) if method == "poses" else ""
+    return Config.model_validate({"odometry": {"method": method, "poses": poses}})
 
 
 class Foreign:
