@@ -15,6 +15,7 @@ from lslam.preprocessing.deskew import KNOTS
 from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan import Scan
 from lslam.types.scan_result import ScanResult
+from lslam.types.state import Stateful
 from lslam.types.trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -26,7 +27,7 @@ Floats = NDArray[np.float64]
 GAP_STEPS, GAP_S = 2.5, 0.25
 
 
-class GivenMotion:
+class GivenMotion(Stateful):
     """A `MotionModel` that reads the motion off a trajectory."""
 
     def __init__(self, trajectory: Trajectory) -> None:
@@ -70,7 +71,7 @@ class GivenMotion:
         """Nothing to learn."""
 
 
-class GivenPoses:
+class GivenPoses(Stateful):
     """Scan by scan the pose of a trajectory, which has to be of the LiDAR: `pipeline.given_poses` sees to it."""
 
     deskew = "by the motion of the given trajectory"
