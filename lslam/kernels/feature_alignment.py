@@ -12,11 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.kernels.feature_residuals import linearise_edges, linearise_planes
-from lslam.kernels.gauss_newton import solve_observed
+from lslam.kernels.gauss_newton import mirror, move_by, solve_observed
 from lslam.kernels.jit import inline, kernel
-from lslam.kernels.linalg import rotate_left
 from lslam.kernels.lines import linearise_lines
 from lslam.kernels.residuals import linearise, step_norms
+from lslam.kernels.surface_information import solve_on_surfaces
 
 Floats = NDArray[np.float64]
 Longs = NDArray[np.int64]
@@ -27,46 +27,28 @@ Aligned = tuple[Floats, Floats, Floats, Floats, int, bool, int, Floats]
 
 
 @inline
-def _step(H: Floats, g: Floats, facts: Floats, allowed: Floats, weak_share: float, scale: float, R: Floats, t: Floats,
-          d: Floats, weak: Floats) -> tuple[int, float, float]:  # fmt: skip
-    """One bounded step; returns the number of unobserved directions and the length of the step, m and rad (NaN: none)."""
-    for i in range(6):
-        for j in range(i):
-            H[i, j] = H[j, i]
+def _within(allowed: Floats, H: Floats) -> Floats:
+    """H, an upper triangle, as seen by the directions that are allowed; H leaves whole."""
+    mirror(H)
     A = np.zeros((6, 6))
     for i in range(6):
         for k in range(6):
             for m in range(6):
                 for j in range(6):
                     A[i, j] += allowed[i, k] * H[k, m] * allowed[m, j]
-    # What the projector takes away has no eigenvalue left, so that the step never looks along it in g.
-    weak_count = solve_observed(A, g, facts, weak_share, 1.0, d, weak)
-    move, turn = step_norms(d)
-    if not (np.isfinite(move) and np.isfinite(turn)):
-        d[:] = 0.0
-        return weak_count, np.nan, np.nan
-    # A step beyond the kernel's width leaves the region where its correspondences mean anything.
-    limit = 2.0 * max(scale, 0.5)
-    if move > limit:
-        for i in range(6):
-            d[i] *= limit / move
-    t[0] += d[0]
-    t[1] += d[1]
-    t[2] += d[2]
-    rotate_left(R, d[3], d[4], d[5])
-    return weak_count, move, turn
+    return A
 
 
 @kernel
 def align_to_scan(edges: Floats, planes: Floats, R: Floats, t: Floats, scale_start: float, scale_end: float, decay: float,
                   max_iterations: int, step_m: float, step_rad: float, edge_variance: float, plane_variance: float,
                   weak_share: float, allowed: Floats, one_to_many: bool, size: float, reach: float,
-                  edge_grid: Grid, plane_grid: Grid) -> Aligned:  # fmt: skip
+                  edge_grid: Grid, plane_grid: Grid, normals: Floats) -> Aligned:  # fmt: skip
     """Register edges (E, 3) and planar points (P, 3) on two grids of `feature_grid` with cells of `size`, m.
 
     Features within `reach`, m, are matched: rings lie farther apart than the kernel is wide.
     """
-    H, g, d, weak = np.empty((6, 6)), np.empty(6), np.zeros(6), np.zeros((6, 6))
+    H, S, g, d, weak = np.empty((6, 6)), np.empty((6, 6)), np.empty(6), np.zeros(6), np.zeros((6, 6))
     edge_facts, plane_facts = np.zeros(6), np.zeros(6)
     scale, converged, weak_count, iterations = scale_start, False, 0, 0
     ep, er, es, ek, et = edge_grid
@@ -79,14 +61,18 @@ def align_to_scan(edges: Floats, planes: Floats, R: Floats, t: Floats, scale_sta
         linearise_edges(
             edges, R, t, size, reach, scale, edge_variance, one_to_many, ep, er, es, ek, et, H, g, edge_facts
         )
+        # Lines are what they are; of the planes, those that are sure of themselves.
+        S[:] = H
         linearise_planes(planes, R, t, size, reach, scale, plane_variance, one_to_many, pp, pr, ps, pk, pt, H, g,
-                         plane_facts)  # fmt: skip
+                         plane_facts, normals, S)  # fmt: skip
         iterations += 1
         facts = edge_facts + plane_facts
         if facts[3] < 6.0:
             break
-        weak_count, move, turn = _step(H, g, facts, allowed, weak_share, scale, R, t, d, weak)
-        if not np.isfinite(move):
+        # What the projector takes away has no eigenvalue left, so that the step never looks along it in g.
+        weak_count = solve_on_surfaces(_within(allowed, H), _within(allowed, S), g, facts, weak_share, d, weak)
+        move, turn = step_norms(d)
+        if not move_by(d, move, turn, scale, R, t):
             break
         if scale <= scale_end and move < step_m and turn < step_rad:
             converged = True
@@ -133,8 +119,9 @@ def align_to_map(edges: Floats, planes: Floats, scatter: Floats, R: Floats, t: F
         facts = edge_facts + plane_facts
         if facts[3] < 6.0:
             break
-        weak_count, move, turn = _step(H, g, facts, allowed, weak_share, scale, R, t, d, weak)
-        if not np.isfinite(move):
+        weak_count = solve_observed(_within(allowed, H), g, facts, weak_share, 1.0, d, weak)
+        move, turn = step_norms(d)
+        if not move_by(d, move, turn, scale, R, t):
             break
         if scale <= scale_end and move < step_m and turn < step_rad:
             converged = True

@@ -13,9 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.kernels.feature_grid import nearest
+from lslam.kernels.gaussians import find
 from lslam.kernels.jit import inline, kernel
 from lslam.kernels.lines import add_line
 from lslam.kernels.residuals import add_row
+from lslam.kernels.surface_information import add_surface
+from lslam.kernels.voxel import index_of, pack
 
 Floats = NDArray[np.float64]
 Longs = NDArray[np.int64]
@@ -26,6 +29,8 @@ Rings = NDArray[np.uint16]
 NEARBY_RINGS = 2
 # Three points that are nearly in line make no plane: sine of the angle at the nearest.
 LEAST_SINE = 0.1
+# rad2, of a normal that nothing around confirms: four degrees.
+UNSURE = 5e-3
 SHORTEST = 1e-3  # m, of a line or a side of a triangle
 
 
@@ -51,8 +56,8 @@ def _add_point(H: Floats, g: Floats, facts: Floats, ex: float, ey: float, ez: fl
 
 @inline
 def _add_plane(H: Floats, g: Floats, facts: Floats, e: float, nx: float, ny: float, nz: float, rx: float, ry: float,
-               rz: float, variance: float, c2: float) -> None:  # fmt: skip
-    """Point to plane: e along the unit normal n."""
+               rz: float, variance: float, c2: float) -> float:  # fmt: skip
+    """Point to plane: e along the unit normal n; returns its weight."""
     robust = c2 / (c2 + e * e)
     robust *= robust
     w = robust / variance
@@ -64,6 +69,7 @@ def _add_plane(H: Floats, g: Floats, facts: Floats, e: float, nx: float, ny: flo
     facts[5] += robust
     if abs(e) < math.sqrt(c2):
         facts[2] += 1.0
+    return w
 
 
 @kernel
@@ -102,11 +108,37 @@ def linearise_edges(source: Floats, R: Floats, t: Floats, size: float, limit: fl
 
 
 @kernel
+def add_normals(points: Floats, size: float, thick: float, waver: float, rows: Floats, keys: Longs, table: Ints,
+                normals: Floats) -> None:  # fmt: skip
+    """Fill in `normals` (N, 3), where they are zero, from the plane voxels of `size`, m, in which points (N, 3) lie.
+
+    thick : m2, variance along the normal above which a voxel holds more than one surface
+    waver : rad2, variance of the normal's direction above which it is not known
+    """
+    inverse = 1.0 / size
+    for i in range(len(points)):
+        if normals[i, 0] != 0.0 or normals[i, 1] != 0.0 or normals[i, 2] != 0.0:
+            continue
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        slot = find(pack(index_of(x, inverse), index_of(y, inverse), index_of(z, inverse)), keys, table)
+        if slot >= 0 and 0.0 <= rows[slot, 7] < waver and rows[slot, 6] < thick:
+            normals[i] = rows[slot, 3:6]
+
+
+@kernel
 def linearise_planes(source: Floats, R: Floats, t: Floats, size: float, limit: float, scale: float, variance: float,
                      with_planes: bool, points: Floats, rings: Rings, starts: Ints, keys: Longs, table: Ints, H: Floats,
-                     g: Floats, facts: Floats) -> None:  # fmt: skip
-    """As `linearise_edges`, of planar points."""
+                     g: Floats, facts: Floats, normals: Floats,
+                     S: Floats) -> None:  # fmt: skip
+    """As `linearise_edges`, of planar points.
+
+    normals : (N, 3) of the surface around each point of the grid, zero where it is not known. Three points a few
+        decimetres apart make a normal that wavers by ten degrees and more, and a sum of wavering normals seems to observe
+        every direction, that along a corridor too. So the distance is that to the plane through the three points, but it
+        moves the pose along the surface's normal: an instrumental variable, whose error has nothing to do with theirs.
+    """
     c2 = scale * scale
+    unused = np.zeros(6)
     for i in range(len(source)):
         a, b, c = source[i, 0], source[i, 1], source[i, 2]
         rx = R[0, 0] * a + R[0, 1] * b + R[0, 2] * c
@@ -143,4 +175,12 @@ def linearise_planes(source: Floats, R: Floats, t: Floats, size: float, limit: f
         ea, eb = ex * ax + ey * ay + ez * az, ex * bx + ey * by + ez * bz
         wa, wb = (ea * bb - eb * ab) * s * s, (eb * aa - ea * ab) * s * s
         spread = variance * (1.0 + wa * wa + wb * wb + (1.0 - wa - wb) * (1.0 - wa - wb))
-        _add_plane(H, g, facts, e, nx, ny, nz, rx, ry, rz, spread, c2)
+        ux, uy, uz = normals[j, 0], normals[j, 1], normals[j, 2]
+        towards = nx * ux + ny * uy + nz * uz
+        if towards != 0.0:
+            sign = 1.0 if towards > 0.0 else -1.0
+            nx, ny, nz = sign * ux, sign * uy, sign * uz
+        w = _add_plane(H, g, facts, e, nx, ny, nz, rx, ry, rz, spread, c2)
+        # Waver of the normal, rad2, that the noise of three points makes; what is around them has confirmed it or not.
+        if towards != 0.0 or 2.0 * variance * (aa + bb - ab) * s * s < UNSURE:
+            add_surface(S, unused, w, nx, ny, nz, rx, ry, rz)

@@ -8,7 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.kernels.feature_grid import build
+from lslam.kernels.feature_residuals import add_normals
 from lslam.preprocessing.features import FeaturePoints, Features
+from lslam.registration.gaussian_map import GaussianMap
 
 Grid = tuple[
     NDArray[np.float64], NDArray[np.uint16], NDArray[np.int32], NDArray[np.int64], NDArray[np.int32]
@@ -17,6 +19,13 @@ Grid = tuple[
 CELL = 1.0  # m
 # m, how far a counterpart may lie: the rings of sixteen beams are that far apart on the ground at 10 m.
 REACH = 2.0
+# m, voxels whose planes tell how the surface around a point lies, and voxels twice as large, for two rings of a sparse
+# sensor, which go first.
+AROUND = 1.0
+# rad, one sigma: a normal that wavers more is not known.
+WAVER = 0.03
+# m, one sigma: what is thicker is no surface, but two that meet.
+THICK = 0.1
 
 
 @dataclass(frozen=True)
@@ -27,6 +36,7 @@ class FeatureScan:
     T_world_lidar: NDArray[np.float64]
     edges: Grid
     planes: Grid
+    normals: NDArray[np.float64]
     size: float = CELL
 
 
@@ -37,4 +47,16 @@ def feature_scan(features: Features, T_world_lidar: NDArray[np.float64]) -> Feat
     def grid(part: FeaturePoints) -> Grid:
         return build(part.points, part.rings, R, t, CELL)
 
-    return FeatureScan(features, T_world_lidar, grid(features.less_edges), grid(features.less_planes))
+    planes = grid(features.less_planes)
+    return FeatureScan(features, T_world_lidar, grid(features.less_edges), planes, _normals(planes[0]))
+
+
+def _normals(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(N, 3) normals of the surfaces around points (N, 3), zero where none is found."""
+    fine, normals = GaussianMap(AROUND, capacity=1 << 12), np.zeros_like(points)
+    fine.insert(points.astype(np.float32), np.eye(4))
+    for around in (fine.coarsen(2), fine):
+        add_normals(
+            points, around.size, THICK**2, WAVER**2, around.planes, around.keys, around.table, normals
+        )  # fmt: skip
+    return normals

@@ -43,7 +43,7 @@ def solve_on_scan(
     H, edge_facts, plane_facts, step, iterations, converged, count, weak = align_to_scan(
         edges, planes, R, t, annealing.start, annealing.end, annealing.decay, annealing.steps, STEP_M, STEP_RAD,
         noise.edge**2, noise.plane**2, noise.weak_share, projector, one_to_many, target.size, REACH,
-        target.edges, target.planes,
+        target.edges, target.planes, target.normals,
     )  # fmt: skip
     facts = edge_facts + plane_facts
     return _result(

@@ -14,12 +14,16 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Match:
-    """Residual A (R s + t - p) of a source point s, of one variance."""
+    """Residual A (R s + t - p) of a source point s, of one variance.
+
+    waver : rad2, of the normal of a plane through three points with that noise
+    """
 
     s: Floats
     p: Floats
     A: Floats
     variance: float
+    waver: float = 0.0
 
     def residual(self, R: Floats, t: Floats) -> Floats:
         return np.asarray(self.A @ (R @ self.s + t - self.p))
@@ -101,7 +105,12 @@ def match_plane(s: Floats, x: Floats, points: Floats, rings: NDArray[np.int64], 
     normal /= np.linalg.norm(normal)
     foot = x - normal * float(normal @ (x - corners[0]))
     weights = np.linalg.lstsq(np.vstack([corners.T, np.ones(3)]), np.append(foot, 1.0), rcond=None)[0]
-    return Match(s, corners[0], normal[None], v * (1 + float(weights @ weights)))
+    # How the heights of the corners over their plane tilt it: in its own two axes.
+    across = np.cross(normal, corners[1] - corners[0])
+    axes = np.stack([corners[1] - corners[0], across])
+    axes /= np.linalg.norm(axes, axis=1)[:, None]
+    tilt = np.linalg.inv(np.column_stack([corners @ axes.T, np.ones(3)]))[:2]
+    return Match(s, corners[0], normal[None], v * (1 + float(weights @ weights)), v * float(np.sum(tilt**2)))
 
 
 def match_point(s: Floats, x: Floats, points: Floats, limit: float, v: float) -> Match | None:

@@ -13,6 +13,7 @@ from lslam.geometry import se3, so3
 from lslam.kernels import feature_grid, feature_residuals
 from lslam.kernels.jit import kernel
 from lslam.kernels.voxel import OFFSET
+from lslam.registration.gaussian_map import GaussianMap
 
 Floats = NDArray[np.float64]
 SIZE, REACH, VARIANCE = 1.0, 2.0, 4e-4
@@ -39,10 +40,24 @@ class Scene:
         return [m for m in found if m is not None]
 
     def linearise(self, kind: str, c: float) -> tuple[Floats, Floats, Floats]:
+        if kind == "plane":
+            return self.linearise_planes(c, np.zeros_like(self.world))[:3]
         H, g, facts = np.zeros((6, 6)), np.zeros(6), np.zeros(6)
-        call = feature_residuals.linearise_planes if kind == "plane" else feature_residuals.linearise_edges
-        call(self.source, self.R, self.t, SIZE, REACH, c, VARIANCE, kind != "point", *self.grid, H, g, facts)
-        return np.triu(H) + np.triu(H, 1).T, g, facts
+        feature_residuals.linearise_edges(
+            self.source, self.R, self.t, SIZE, REACH, c, VARIANCE, kind != "point", *self.grid, H, g, facts
+        )
+        return whole(H), g, facts
+
+    def linearise_planes(self, c: float, normals: Floats) -> tuple[Floats, Floats, Floats, Floats]:
+        H, S, g, facts = np.zeros((6, 6)), np.zeros((6, 6)), np.zeros(6), np.zeros(6)
+        feature_residuals.linearise_planes(
+            self.source, self.R, self.t, SIZE, REACH, c, VARIANCE, True, *self.grid, H, g, facts, normals, S
+        )
+        return whole(H), g, facts, whole(S)
+
+
+def whole(H: Floats) -> Floats:
+    return np.asarray(np.triu(H) + np.triu(H, 1).T)
 
 
 def make_scene(seed: int, n: int = 700) -> Scene:
@@ -127,6 +142,57 @@ def test_gradient_is_that_of_the_robust_cost(scene: Scene, kind: str, c: float) 
     _, g, _ = scene.linearise(kind, c)
     numeric = gradient(scene.matches(kind), scene.R, scene.t, c)
     np.testing.assert_allclose(g, numeric, atol=1e-6 * np.abs(numeric).max())
+
+
+def test_a_plane_moves_the_pose_along_the_normal_of_its_surface_where_that_is_known(scene: Scene) -> None:
+    rng = np.random.default_rng(5)
+    normals = rng.normal(size=scene.world.shape)
+    normals /= np.linalg.norm(normals, axis=1)[:, None]
+    unknown = rng.random(len(normals)) < 0.4
+    normals[unknown] = 0.0
+    H, g, facts, S = scene.linearise_planes(0.4, normals)
+    expected_H, expected_g, expected_S = np.zeros((6, 6)), np.zeros(6), np.zeros((6, 6))
+    seen = set()
+    for m in scene.matches("plane"):
+        u = normals[np.flatnonzero((scene.world == m.p).all(axis=1))[0]]
+        n = m.A[0]
+        along = n if not u.any() else np.sign(n @ u) * u
+        rotated = scene.R @ m.s
+        j = np.concatenate([along, np.cross(rotated, along)])
+        w = m.robust(scene.R, scene.t, 0.4) / m.variance
+        expected_H += w * np.outer(j, j)
+        expected_g += w * j * m.residual(scene.R, scene.t)[0]
+        is_sure = bool(u.any()) or m.waver < feature_residuals.UNSURE
+        expected_S += w * np.outer(j, j) * is_sure
+        seen.add((bool(u.any()), is_sure))
+    assert seen == {(True, True), (False, True), (False, False)}
+    np.testing.assert_allclose(H, expected_H, atol=1e-6 * np.abs(expected_H).max())
+    np.testing.assert_allclose(g, expected_g, atol=1e-6 * np.abs(expected_g).max())
+    np.testing.assert_allclose(S, expected_S, atol=1e-6 * np.abs(expected_S).max())
+    np.testing.assert_allclose(facts, scene.linearise("plane", 0.4)[2], rtol=1e-12)
+
+
+def normals_around(points: Floats, voxels: GaussianMap, thick: float, waver: float) -> Floats:
+    normals = np.zeros_like(points)
+    feature_residuals.add_normals(points, voxels.size, thick, waver, voxels.planes, voxels.keys, voxels.table, normals)
+    return normals
+
+
+def test_normals_around_points_are_those_of_flat_voxels_alone() -> None:
+    rng = np.random.default_rng(2)
+    floor = np.column_stack([rng.uniform(0.1, 1.9, (60, 2)), rng.normal(1.0, 0.01, 60)])
+    wall = floor[:20, [2, 1, 0]]
+    corner = np.concatenate([floor[20:], wall]) + np.array([4.0, 0.0, 0.0])
+    line = np.column_stack([np.linspace(8.1, 9.9, 30), np.full(30, 1.0), rng.normal(1.0, 0.01, 30)])
+    points = np.concatenate([floor, corner, line, [[20.0, 1.0, 1.0]]])
+    voxels = GaussianMap(2.0)
+    voxels.insert(points.astype(np.float32), np.eye(4))
+    normals = normals_around(points, voxels, 0.1**2, 1.0)
+    np.testing.assert_allclose(np.abs(normals[:60, 2]), 1.0, atol=1e-3)
+    assert not normals[60:].any()
+    thick = normals_around(points, voxels, 9.0, 1.0)
+    assert thick[60:120].any(), "two surfaces in one voxel would pass for one, were it not for their thickness"
+    assert not normals_around(points, voxels, 0.1**2, 1e-9).any(), "no normal is as sure as that"
 
 
 def test_points_in_line_make_no_plane_and_points_of_one_ring_no_line() -> None:

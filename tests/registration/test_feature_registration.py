@@ -103,8 +103,7 @@ def test_planes_of_two_walls_leave_their_direction_open_and_the_prior_there() ->
     target = feature_scan(features_at(np.eye(4), with_pillars=False), np.eye(4))
     seen = features_at(se3.exp(np.array([0.3, 0.05, 0.03, 0, 0, 0])), 1, with_pillars=False).planes.points
     flat = seen[np.abs(seen[:, 0]) < 5.0]
-    strict = FeatureNoise(NOISE.edge, NOISE.plane, 0.03)
-    result = solve_on_scan(target, NONE, flat, prior, ANNEALING, strict)
+    result = solve_on_scan(target, NONE, flat, prior, ANNEALING, NOISE)
     assert len(result.degenerate) == 1
     along = result.degenerate[0, :3] / np.linalg.norm(result.degenerate[0, :3])
     assert abs(along[0]) > np.cos(np.deg2rad(10))
