@@ -60,6 +60,12 @@ class GateError(LslamError):
     exit_code = 4
 
 
+class RunFinishedError(LslamError):
+    """A run that shall go on has come to its end before: nothing was done."""
+
+    exit_code = 0
+
+
 class InterruptedRunError(LslamError):
     """SIGINT or SIGTERM ended the run; what was done is written."""
 

@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from lslam.cli import options
-from lslam.cli.console import progress, setup_logging, show
+from lslam.cli.console import log, progress, setup_logging, show
 from lslam.cli.signals import GentleStop, gentle_stop
-from lslam.errors import UsageError
+from lslam.errors import RunFinishedError, UsageError
 
 if TYPE_CHECKING:
     from lslam.config import Config
@@ -39,6 +39,7 @@ if TYPE_CHECKING:
 @click.option(
     "--out", type=click.Path(path_type=Path), metavar="DIR", help="Run folder [default: runs/NAME-METHOD-TIME]."
 )
+@click.option("--resume", is_flag=True, help="Go on with a run that was killed or interrupted; needs its --out.")
 @click.option("--overwrite", is_flag=True, help="Replace an earlier run in the folder.")
 @options.scan_range
 @click.option("--threads", type=int, metavar="N", help="1: one thread; 2 and more: the next scan is read meanwhile.")
@@ -70,6 +71,7 @@ def command(sequence: str, **given: Any) -> None:
     from lslam.pipeline.run_folder import default_folder
     from lslam.readers import open_sequence
 
+    _check_folder(given)
     config = _resolve(given)
     check_config(config)
     opened = open_sequence(
@@ -87,13 +89,25 @@ def command(sequence: str, **given: Any) -> None:
         from lslam.pipeline.choose import choose_scans
 
         return _print_plan(choose_scans(opened, create_odometry(config), config), config, out, given["as_json"])
-    with gentle_stop() as stop, ExitStack() as stack:
-        run(
-            opened, config, out=out, ground_truth=truth, overwrite=given["overwrite"],
-            command=shlex.join(["lslam", *sys.argv[1:]]),
-            watch=_watch(stack, stop, lambda outcome: _print_result(outcome, out, given["as_json"])),
-        )  # fmt: skip
+    try:
+        with gentle_stop() as stop, ExitStack() as stack:
+            run(
+                opened, config, out=out, ground_truth=truth, overwrite=given["overwrite"], resume=given["resume"],
+                command=shlex.join(["lslam", *sys.argv[1:]]),
+                watch=_watch(stack, stop, lambda outcome: _print_result(outcome, out, given["as_json"])),
+            )  # fmt: skip
+    except RunFinishedError as finished:
+        log.info("%s", finished)
+        _print_finished(out, given["as_json"])
     return None
+
+
+def _check_folder(given: dict[str, Any]) -> None:
+    """Raise UsageError for flags about the folder that contradict each other."""
+    if given["overwrite"] and given["resume"]:
+        raise UsageError("--overwrite runs everything anew and --resume keeps what is done: give one of them")
+    if given["resume"] and given["out"] is None:
+        raise UsageError("--resume needs --out: the folder of the run that shall go on")
 
 
 def _resolve(given: dict[str, Any]) -> Config:
@@ -167,6 +181,22 @@ def _print_plan(sequence: Sequence, config: Config, out: Path, as_json: bool) ->
     lines = [f"# {sequence.name}: {len(sequence)} scans, {sequence.kind}, {sequence.path}", f"# output: {out}"]
     lines += [f"# {note}" for note in sequence.notes] + [f"# problem: {problem}" for problem in sequence.problems]
     show("\n".join(lines) + "\n" + to_toml(config))
+
+
+def _print_finished(out: Path, as_json: bool) -> None:
+    """The result that is there, for scripts that read it; people are told on stderr that nothing was done."""
+    if not as_json:
+        return
+    import json
+
+    evaluation = out / "evaluation.json"
+    score = json.loads(evaluation.read_text(encoding="utf-8")) if evaluation.exists() else None
+    document = {
+        "folder": str(out),
+        "manifest": json.loads((out / "manifest.json").read_text("utf-8")),
+        "evaluation": score,
+    }
+    show(json.dumps(document, allow_nan=False) + "\n")
 
 
 def _print_result(outcome: RunOutcome, out: Path, as_json: bool) -> None:

@@ -13,4 +13,7 @@ class OdometryConfig(Section):
     method: str = Field("icp", description="a name of `lslam methods`")
     poses: str = Field("", description="trajectory file whose poses method `poses` takes")
     preset: str = Field("", description="a name of `lslam config presets` or a TOML file: what the other keys stand on")
+    checkpoint_s: float = Field(
+        30.0, ge=0, description="s; a run that is killed goes on (--resume) from a checkpoint at most so old; 0: none"
+    )
     max_failures: int = Field(20, ge=1, description="failed scans in a row after which the run counts as diverged")

@@ -82,6 +82,14 @@ class KeyframeStore:
         values = np.ascontiguousarray(planes.transpose(1, 2, 0)).view(np.float32)[..., 0]
         return self._keep(number, np.ascontiguousarray(values.T))
 
+    def clear(self) -> None:
+        """Forget all keyframes, and remove those that the folder holds, of an earlier run too."""
+        self.keyframes, self._memory = [], {}
+        with self._lock:
+            self._recent.clear()
+        for file in [] if self.folder is None else self.folder.glob("*.npz"):
+            file.unlink(missing_ok=True)
+
     def save(self) -> None:
         """Write the index, so that the folder can be opened again; no keyframes leave no folder."""
         if self.folder is not None and self.keyframes:

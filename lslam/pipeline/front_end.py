@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from lslam.errors import InputError
 from lslam.odometry.base import Odometry
+from lslam.pipeline.checkpoints import OdometryCheckpoints
 from lslam.pipeline.keyframing import Keyframing
 from lslam.pipeline.tracker import Loaded, Tracker
 from lslam.readers.selection import Selection
@@ -37,17 +38,23 @@ def estimate(
     should_stop: Callable[[], bool] = lambda: False,
     on_scan: Callable[[ScanResult], None] = lambda result: None,
     keyframing: Keyframing | None = None,
+    checkpoints: OdometryCheckpoints | None = None,
 ) -> list[ScanResult]:
     """Register every scan of the sequence; stops early on `should_stop` or after `max_failures` failures in a row.
 
     A scan that cannot be read, or is empty, is skipped: the motion prior stands in for its pose. With `standing`, scans
     during which the sensor stands are not registered. `motion` predicts the scans, constant velocity when None.
-    `keyframing` sees every scan and how the sensor moved within it.
+    `keyframing` sees every scan and how the sensor moved within it. `checkpoints`, which need keyframing, say where an
+    earlier run left off and keep what this one does.
     """
     tracker = Tracker(odometry, standing, motion)
     results: list[ScanResult] = []
-    failures = 0
-    for loaded in read_ahead(sequence, odometry.prepare, threads):
+    if checkpoints is not None and keyframing is not None:
+        results = checkpoints.begin(tracker, keyframing)
+    failures = _failures_at_end(results)
+    for loaded in read_ahead(sequence, odometry.prepare, threads, first=len(results)):
+        if failures >= max_failures:
+            break
         result = tracker.track(loaded)
         stages = {"read": loaded.read_s, "prepare": loaded.prepare_s, **result.stages}
         if keyframing is not None:
@@ -60,7 +67,17 @@ def estimate(
         failures = 0 if result.status == "ok" else failures + 1
         if failures >= max_failures or should_stop():
             break
+        if checkpoints is not None and keyframing is not None:
+            checkpoints.offer(results, tracker, keyframing)
+    if checkpoints is not None and keyframing is not None:
+        is_over = len(results) == len(sequence) or failures >= max_failures
+        checkpoints.close(results, tracker, keyframing, is_over)
     return results
+
+
+def _failures_at_end(results: list[ScanResult]) -> int:
+    """How many scans in a row were not registered before the last one and with it."""
+    return next((k for k, result in enumerate(reversed(results)) if result.status == "ok"), len(results))
 
 
 def has_point_times(sequence: Sequence) -> bool:
@@ -94,17 +111,17 @@ def to_trajectory(results: list[ScanResult], method: str) -> Trajectory:
 
 
 def read_ahead(
-    sequence: Sequence, prepare: Callable[[Scan], Any] | None, threads: int, depth: int = 2
+    sequence: Sequence, prepare: Callable[[Scan], Any] | None, threads: int, depth: int = 2, first: int = 0
 ) -> Iterator[Loaded]:
-    """The scans in order, read (and prepared) by one background thread while the caller works on earlier ones."""
+    """The scans from `first` on, read (and prepared) by one background thread while the caller works on earlier ones."""
     if threads < 2:
-        for i in range(len(sequence)):
+        for i in range(first, len(sequence)):
             yield _load(sequence, i, prepare)
         return
     pending: list[Future[Loaded]] = []
     with ThreadPoolExecutor(1, "lslam-read") as pool:
         try:
-            for i in range(len(sequence)):
+            for i in range(first, len(sequence)):
                 pending.append(pool.submit(_load, sequence, i, prepare))
                 if len(pending) > depth:
                     yield pending.pop(0).result()

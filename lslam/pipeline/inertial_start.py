@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,11 +12,13 @@ from numpy.typing import NDArray
 
 from lslam.config import Config
 from lslam.errors import InputError
+from lslam.formats.state_files import read_state, write_state
 from lslam.inertial.fusion import InertialMotion
 from lslam.inertial.initialise import FirstPoses, Start, start
 from lslam.inertial.stream import ImuRefusedError
 from lslam.odometry import create_odometry
 from lslam.pipeline.front_end import read_ahead
+from lslam.pipeline.state_classes import STATE_CLASSES
 from lslam.pipeline.tracker import Tracker
 from lslam.readers import select
 from lslam.readers.selection import Selection
@@ -67,6 +70,26 @@ def begin_inertial(sequence: Sequence, config: Config) -> Inertial:
     part.motion = InertialMotion(begun.imu, T_lidar_imu, begun.estimate, config.imu)
     for note in part.notes:
         log.info("%s", note)
+    return part
+
+
+def save_start(path: Path, part: Inertial) -> None:
+    """Keep what `begin_inertial` found, for `load_start`. Raises OutputError."""
+    write_state(path, {"start": part.start, "notes": part.notes, "problems": part.problems})
+
+
+def load_start(path: Path, config: Config) -> Inertial | None:
+    """What `begin_inertial` found in an earlier run; None when that is not there, or cannot be read."""
+    try:
+        known = read_state(path, STATE_CLASSES) if path.is_file() else None
+    except InputError as error:
+        log.warning("the IMU is aligned again: %s", error)
+        known = None
+    if known is None:
+        return None
+    part = Inertial(None, known["start"], known["notes"], known["problems"])
+    if part.start is not None:
+        part.motion = InertialMotion(part.start.imu, part.start.T_lidar_imu, part.start.estimate, config.imu)
     return part
 
 

@@ -78,8 +78,8 @@ class Keyframing:
 
     def restore(self, state: State) -> None:
         """Go on where `state` was taken; raises InputError when a cloud is missing."""
-        self._selector.restore(state["selector"])
         self.store.restore(state["store"])
+        self._selector.restore(state["selector"])
 
     def __enter__(self) -> Keyframing:
         """Nothing to begin."""

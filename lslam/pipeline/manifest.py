@@ -30,6 +30,7 @@ class Manifest:
     world : where the coordinates begin and whether z is up
     imu : what became of the IMU, empty without `--imu`; keyframes : how many and how large
     graph, georeference : what the back end did and where on the Earth the world lies, empty where it did nothing
+    identity : digests that a run and its resumption share; resumed_after : scans that were done when it was resumed
     problems : what went wrong in this run, beside what was wrong with the recording before
     """
 
@@ -45,6 +46,8 @@ class Manifest:
         self.keyframes: dict[str, Any] = {}
         self.graph: dict[str, Any] = {}
         self.georeference: dict[str, Any] = {}
+        self.identity: dict[str, str] = {}
+        self.resumed_after: list[int] = []
         self._ended = ""
 
     @property
@@ -101,6 +104,7 @@ class Manifest:
             "problems": [*s.problems, *self.problems],
             "command": self.command,
             "lslam": __version__,
+            **({"identity": dict(self.identity)} if self.identity else {}),
             "method": self.config.odometry.method,
             "sequence": {
                 "name": s.name,
@@ -123,6 +127,7 @@ class Manifest:
             },
             **({"imu": dict(self.imu)} if self.imu else {}),
             "counts": dict(self.counts),
+            **({"resumed_after_scans": list(self.resumed_after)} if self.resumed_after else {}),
             **({"keyframes": dict(self.keyframes)} if self.keyframes else {}),
             **({"graph": dict(self.graph)} if self.graph else {}),
             **({"georeference": dict(self.georeference)} if self.georeference else {}),

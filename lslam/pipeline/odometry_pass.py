@@ -14,10 +14,12 @@ from lslam.maps import crispness, merge
 from lslam.odometry.base import Odometry
 from lslam.odometry.given import GivenPoses
 from lslam.pipeline import inertial_start
+from lslam.pipeline.checkpoints import Checkpoints, OdometryCheckpoints
 from lslam.pipeline.front_end import estimate, is_diverged, to_trajectory
-from lslam.pipeline.inertial_start import Inertial, begin_inertial, close_inertial
+from lslam.pipeline.inertial_start import Inertial, begin_inertial, close_inertial, load_start, save_start
 from lslam.pipeline.keyframing import Keyframing
 from lslam.pipeline.manifest import Manifest
+from lslam.pipeline.run_folder import CHECKPOINT, RunFolder
 from lslam.pipeline.watch import Watch
 from lslam.registration.standing import Standing
 from lslam.types.run_record import RunRecord
@@ -30,27 +32,35 @@ log = logging.getLogger("lslam")
 
 def estimate_poses(
     sequence: Sequence, odometry: Odometry, config: Config, manifest: Manifest, folder: Path, truth: Trajectory | None,
-    watch: Watch, store: KeyframeStore,
+    watch: Watch, store: KeyframeStore, checkpoints: OdometryCheckpoints | None = None,
 ) -> RunRecord:  # fmt: skip
-    """Odometry over all scans, judged; its keyframes go to `store`. Raises InputError when no scan can be used."""
+    """Odometry over all scans, judged; its keyframes go to `store`, and `checkpoints` say where an earlier run left off.
+
+    Raises InputError when no scan can be used.
+    """
     standing = Standing(config.preprocess, config.registration) if config.preprocess.skip_standing else None
-    _warm_up(sequence, odometry, standing, config, manifest)
+    is_over = checkpoints is not None and checkpoints.is_over
+    _warm_up(sequence, odometry, standing, config, manifest, is_over)
 
     def seen(result: ScanResult) -> None:
         if result.status != "ok":
             log.warning("scan %d %s: %s", result.index, result.status, result.reason)
         watch.on_step()
 
-    watch.on_start("odometry", len(sequence))
+    watch.on_start("odometry", len(sequence) - (0 if checkpoints is None else checkpoints.scans))
     limit = config.odometry.max_failures
-    inertial = _begin_imu(sequence, odometry, config, manifest)
+    inertial = _begin_imu(sequence, odometry, config, manifest, checkpoints)
     motion = odometry.motion if isinstance(odometry, GivenPoses) else inertial.motion
     with manifest.timed("odometry_s"), Keyframing(store, config) as keyframing:
         results = estimate(
             sequence, odometry, threads=config.input.threads, max_failures=limit, standing=standing,
             motion=motion, should_stop=watch.should_stop, on_scan=seen, keyframing=keyframing,
+            checkpoints=checkpoints,
         )  # fmt: skip
         keyframing.settle()
+    if checkpoints is not None and checkpoints.resumed_after:
+        manifest.resumed_after = checkpoints.resumed_after
+        manifest.timings["odometry_s"] += checkpoints.seconds
     manifest.keyframes = {"count": len(store), "bytes": store.size}
     if all(r.status == "skipped" for r in results):
         raise InputError(f"{sequence.path}: none of {len(results)} scans can be used, the first: {results[0].reason}")
@@ -69,29 +79,48 @@ def estimate_poses(
     )
 
 
+def odometry_checkpoints(folder: RunFolder, config: Config, goes_on: bool) -> OdometryCheckpoints | None:
+    """Checkpoints in a run folder; None when they are not wanted. Says so when an earlier run left none to go on from."""
+    every_s = config.odometry.checkpoint_s
+    if every_s == 0:
+        return None
+    checkpoints = OdometryCheckpoints(Checkpoints(folder.path / CHECKPOINT, "odometry", every_s))
+    if goes_on and not checkpoints.scans:
+        log.info("there is no checkpoint of %s to go on from: it begins at the first scan", config.odometry.method)
+    return checkpoints
+
+
 def _warm_up(
-    sequence: Sequence, odometry: Odometry, standing: Standing | None, config: Config, manifest: Manifest
+    sequence: Sequence, odometry: Odometry, standing: Standing | None, config: Config, manifest: Manifest, is_over: bool
 ) -> None:
-    """Compile or load what the scans would otherwise wait for."""
+    """Compile or load what the scans would otherwise wait for, less of it when odometry is over."""
     with manifest.timed("compile_s"), jit.announced(log), jit.compile_lock():
-        odometry.warm_up()
+        if not is_over:
+            odometry.warm_up()
         if standing is not None:
             standing.warm_up()
         if config.map.write:
             merge.warm_up()
             crispness.warm_up()
-        if config.imu.use:
+        if config.imu.use and not is_over:
             inertial_start.warm_up()
         with suppress(InputError):
             sequence.scan(0)  # the reader's kernels; what is wrong with the scan is said in its turn
 
 
-def _begin_imu(sequence: Sequence, odometry: Odometry, config: Config, manifest: Manifest) -> Inertial:
-    """The IMU's part, empty without one."""
+def _begin_imu(
+    sequence: Sequence, odometry: Odometry, config: Config, manifest: Manifest, checkpoints: OdometryCheckpoints | None
+) -> Inertial:
+    """The IMU's part, empty without one; as an earlier run found it, when that left off on the way."""
     if not config.imu.use:
         return Inertial(None)
+    path = None if checkpoints is None else checkpoints.folder / "imu.npz"
     with manifest.timed("imu_start_s"):
-        inertial = begin_inertial(sequence, config)
+        known = None if path is None else load_start(path, config)
+        inertial = begin_inertial(sequence, config) if known is None else known
+        if path is not None and known is None:
+            path.parent.mkdir(exist_ok=True)
+            save_start(path, inertial)
     if getattr(odometry, "ignores_prior", False):
         inertial.problems.append(f"{config.odometry.method} predicts by itself: the IMU only bridges scans that fail")
     return inertial

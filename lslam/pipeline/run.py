@@ -24,7 +24,8 @@ from lslam.pipeline.given_poses import bind
 from lslam.pipeline.inertial_start import with_imu_settings
 from lslam.pipeline.manifest import Manifest, describe_deskew
 from lslam.pipeline.map_pass import build_map
-from lslam.pipeline.odometry_pass import estimate_poses
+from lslam.pipeline.odometry_pass import estimate_poses, odometry_checkpoints
+from lslam.pipeline.resume import may_go_on, run_identity
 from lslam.pipeline.run_folder import KEYFRAMES, RunFolder
 from lslam.pipeline.watch import RunOutcome, Watch
 from lslam.readers import open_sequence
@@ -43,6 +44,7 @@ def run(
     out: Path | str | None = None,
     ground_truth: Trajectory | None = None,
     overwrite: bool = False,
+    resume: bool = False,
     command: str = "",
     watch: Watch | None = None,
 ) -> RunOutcome:
@@ -53,11 +55,13 @@ def run(
     sequence : an open sequence, or what `open_sequence` takes
     out : the run folder; None writes nothing and builds no map
     ground_truth : replaces the sequence's own
+    overwrite : replace an earlier run in `out`; resume : go on where it was killed or interrupted, if there is one
 
     Raises
     ------
-    RunFailedError : diverged. InterruptedRunError : `watch.should_stop` said so. GateError : `input.strict` and the run
-        is degraded. In all three, everything up to there is written. InputError, OutputError, UsageError : as named.
+    RunFinishedError : `resume`, and nothing is left to do. RunFailedError : diverged. InterruptedRunError :
+        `watch.should_stop` said so. GateError : `input.strict` and the run is degraded. In these three, everything up to
+        there is written. InputError, OutputError, UsageError : as named.
     """
     config, watch = config or Config(), watch or Watch()
     check_config(config)
@@ -66,8 +70,10 @@ def run(
     require_gnss(sequence, config.gnss)
     truth = sequence.ground_truth if ground_truth is None else ground_truth
     odometry = create_odometry(with_imu_settings(config))
+    given: Trajectory | None = None
     if isinstance(odometry, GivenPoses):
         sequence.notes.extend(bind(odometry, sequence))
+        given = odometry.trajectory
     chosen = choose_scans(with_imu(sequence) if config.imu.use else sequence, odometry, config)
     manifest = Manifest(command, chosen, config)
     if out is None:
@@ -78,14 +84,19 @@ def run(
         level_world(record, chosen, config, manifest)
         evaluation = _score(record, chosen, config)
     else:
-        with RunFolder(Path(out), overwrite) as folder:
+        manifest.identity = run_identity(chosen, truth, config, given)
+        goes_on = resume and may_go_on(Path(out), manifest.identity, config)
+        with RunFolder(Path(out), overwrite or resume, goes_on) as folder:
             try:
                 folder.require_space(outputs.least_bytes(len(chosen)), "the result without its map")
                 _announce(chosen, odometry, config, manifest)
                 folder.write_text("config.toml", outputs.config_text(config))
                 folder.write_manifest(manifest.as_dict("running"))
                 store = KeyframeStore(folder.path / KEYFRAMES)
-                record = estimate_poses(chosen, odometry, config, manifest, folder.path, truth, watch, store)
+                checkpoints = odometry_checkpoints(folder, config, goes_on)
+                record = estimate_poses(
+                    chosen, odometry, config, manifest, folder.path, truth, watch, store, checkpoints
+                )
                 done = optimise_poses(chosen, record, store, config, manifest)
                 level_world(record, chosen, config, manifest)
                 write_back_end(folder.path, record, store, done)
@@ -101,10 +112,12 @@ def run(
                 _write_last(folder, manifest.as_dict(manifest.word_for(error), str(error) or type(error).__name__))
                 raise
             folder.write_manifest(manifest.as_dict(manifest.outcome))
+            if manifest.outcome != "interrupted":
+                folder.drop_checkpoint()
             log.info("%s; results in %s", manifest.outcome, folder.path)
     outcome = RunOutcome(record, evaluation)
     watch.on_end(outcome)
-    _raise_outcome(manifest, config)
+    _raise_outcome(manifest, config, "" if out is None else ", and --resume goes on")
     return outcome
 
 
@@ -192,10 +205,10 @@ def _write_last(folder: RunFolder, manifest: dict[str, object]) -> None:
         log.error("%s", error)
 
 
-def _raise_outcome(manifest: Manifest, config: Config) -> None:
+def _raise_outcome(manifest: Manifest, config: Config, way_out: str) -> None:
     why = "; ".join(manifest.problems)
     if manifest.outcome == "interrupted":
-        raise InterruptedRunError(f"{why}; what was done is written")
+        raise InterruptedRunError(f"{why}; what was done is written{way_out}")
     if manifest.outcome == "diverged":
         raise RunFailedError(f"the run diverged: {why}")
     if manifest.outcome == "degraded" and config.input.strict:

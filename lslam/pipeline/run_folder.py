@@ -9,6 +9,7 @@ import os
 import re
 import shutil
 import time
+from collections.abc import Collection
 from pathlib import Path
 from typing import IO, Any
 
@@ -20,6 +21,9 @@ log = logging.getLogger("lslam")
 MANIFEST = "manifest.json"
 LOCK = ".lock"
 KEYFRAMES = "keyframes"
+CHECKPOINT = "checkpoint"
+# What a run that goes on needs of what the one before left.
+_NEEDED = (MANIFEST, "config.toml", "log.txt")
 OURS = (
     MANIFEST, "config.toml", "log.txt", "trajectory.tum", "trajectory_kitti.txt", "covariances.npz", "map.ply",
     "map.pcd", "map.las", "map.laz", "map.json", "feature_map.ply", "trajectory.geojson", "evaluation.json",
@@ -31,19 +35,21 @@ OURS = (
 class RunFolder:
     """A run's output folder, held by this process while it is open.
 
-    Raises OutputExistsError when the folder is there and `overwrite` is False, when it is there and is no run folder, or
+    overwrite : clear what an earlier run left; goes_on : keep its checkpoint and keyframes, clear its results
+
+    Raises OutputExistsError when the folder is there and neither is set, when it is there and is no run folder, or
     when another run holds it; OutputError when it cannot be written.
     """
 
-    def __init__(self, path: Path, overwrite: bool = False) -> None:
+    def __init__(self, path: Path, overwrite: bool = False, goes_on: bool = False) -> None:
         self.path = path
         self._lock: IO[str] | None = None
         self._log_handler: _LogFile | None = None
         try:
-            _check_target(path, overwrite)
+            _check_target(path, overwrite or goes_on)
             path.mkdir(parents=True, exist_ok=True)
             self._lock = _hold(path)
-            self._clear()
+            self._clear(_NEEDED if goes_on else ())
         except OSError as error:
             self._let_go()
             raise OutputError(f"output folder {path} cannot be written: {error.strerror or error}") from None
@@ -76,6 +82,10 @@ class RunFolder:
                 "free some space or name another folder with --out"
             )
 
+    def drop_checkpoint(self) -> None:
+        """The run is over: what it would have gone on with is of no use any more."""
+        shutil.rmtree(self.path / CHECKPOINT, ignore_errors=True)
+
     def __enter__(self) -> RunFolder:
         """Copy lslam's log into log.txt while the folder is held."""
         try:
@@ -105,14 +115,18 @@ class RunFolder:
             self._lock.close()
             self._lock = None
 
-    def _clear(self) -> None:
-        """Remove an earlier run's files, nothing else."""
+    def _clear(self, needed: Collection[str] = ()) -> None:
+        """Remove an earlier run's files, nothing else; what is `needed` stays, and what was kept to go on with it."""
         for name in OURS:
+            if name in needed:
+                continue
             (self.path / name).unlink(missing_ok=True)
             (self.path / f"{name}.part").unlink(missing_ok=True)
         for folder in self.path.glob(".lslam-map-*"):  # of a run that was killed
             shutil.rmtree(folder, ignore_errors=True)
-        _clear_arrays(self.path / KEYFRAMES)
+        if not needed:
+            _clear_arrays(self.path / KEYFRAMES)
+            self.drop_checkpoint()
 
 
 def _clear_arrays(folder: Path) -> None:
@@ -160,7 +174,10 @@ def _check_target(path: Path, overwrite: bool) -> None:
     if _is_held(path):
         raise _in_use(path)
     if not overwrite:
-        raise OutputExistsError(f"output folder {path} exists; name another with --out or replace it with --overwrite")
+        raise OutputExistsError(
+            f"output folder {path} exists; --resume goes on with a run that was interrupted, --overwrite replaces it, or "
+            "name another with --out"
+        )
     if not (path / MANIFEST).exists() and not (path / LOCK).exists():
         raise OutputExistsError(f"output folder {path} is not a run of lslam; --overwrite replaces runs only")
 

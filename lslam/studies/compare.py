@@ -8,13 +8,13 @@ from pathlib import Path
 
 from lslam.errors import InterruptedRunError, LslamError
 from lslam.evaluation.relative import parse_delta
+from lslam.pipeline.identity import imu_digest, input_digest
 from lslam.readers import open_sequence
 from lslam.readers.raw_drive import with_imu
 from lslam.reports import compare_html, compare_json, compare_table
 from lslam.studies.collect import IMU, collect_run, metrics_of
 from lslam.studies.drawings import draw
 from lslam.studies.grid import Cell, Job, expand
-from lslam.studies.identity import imu_digest, input_digest
 from lslam.studies.jobs import finished, run_jobs
 from lslam.studies.paired import TIE_M, compare_pairs, summarise
 from lslam.studies.plan import RESULT, Follow, Plan, check_plan, claim, release

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from lslam.config import Config
-from lslam.studies.identity import job_digest
+from lslam.pipeline.identity import job_digest
 from lslam.studies.variants import Variant
 
 if TYPE_CHECKING:

@@ -1,0 +1,125 @@
+"""Whether a run may go on in a folder that an earlier one began: same input, same configuration, same version."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import tomllib
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lslam.config import Config
+from lslam.errors import GateError, OutputExistsError, RunFailedError, RunFinishedError
+from lslam.pipeline.identity import imu_digest, input_digest
+from lslam.pipeline.run_folder import MANIFEST
+from lslam.types.sequence import Sequence
+from lslam.types.trajectory import Trajectory
+from lslam.version import __version__
+
+# Keys that change no byte of the result.
+FREE = ("input.threads", "odometry.checkpoint_s")
+
+
+def run_identity(
+    sequence: Sequence, truth: Trajectory | None, config: Config, given: Trajectory | None = None
+) -> dict[str, str]:
+    """What a run and its resumption must share beside the configuration; for manifest.json.
+
+    given : the poses of --poses
+
+    Raises InputError when the recording cannot be listed.
+    """
+    reading = hashlib.sha256(np.ascontiguousarray(sequence.stamps_ns).tobytes())
+    for name, T in sorted(vars(sequence.calibration).items()):
+        reading.update(f"{name} {None if T is None else np.asarray(T).tolist()}".encode())
+    reading.update(repr((sequence.kind, sequence.motion_compensated, sequence.notes)).encode(errors="surrogateescape"))
+    gnss = sequence.gnss if config.gnss.mode != "off" else None
+    return {
+        "input": input_digest(sequence, truth),
+        "reading": reading.hexdigest(),
+        "imu": imu_digest(sequence) if config.imu.use else "",
+        "gnss": _digest(() if gnss is None else vars(gnss).values()),
+        "poses": _digest(() if given is None else (given.stamps_ns, given.poses)),
+    }
+
+
+def _digest(values: Iterable[Any]) -> str:
+    digest = hashlib.sha256()
+    for value in values:
+        array = None if value is None else np.ascontiguousarray(value)
+        digest.update(
+            f"{None if array is None else array.dtype}".encode() + (b"" if array is None else array.tobytes())
+        )
+    return digest.hexdigest()
+
+
+def may_go_on(folder: Path, identity: dict[str, str], config: Config) -> bool:
+    """Whether there is something to go on with; False when nothing was begun in `folder`.
+
+    Raises
+    ------
+    RunFinishedError : the run is finished. RunFailedError, GateError : likewise, and it ended so
+    OutputExistsError : what was begun is another run, or does not say what it is
+    """
+    if not (folder / MANIFEST).is_file():
+        return False
+    try:
+        manifest = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
+        begun = tomllib.loads((folder / "config.toml").read_text(encoding="utf-8"))
+        status, version, known = str(manifest["status"]), str(manifest["lslam"]), dict(manifest["identity"])
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise OutputExistsError(
+            f"the run in {folder} does not say what it was ({type(error).__name__}: {error}): --overwrite replaces it"
+        ) from None
+    why = _difference(known, version, begun, identity, config)
+    if why:
+        raise OutputExistsError(f"the run in {folder} cannot go on: {why}; --overwrite runs it anew")
+    _refuse_finished(folder, status, manifest, config)
+    return True
+
+
+def _difference(
+    known: dict[str, Any], version: str, begun: dict[str, Any], identity: dict[str, str], config: Config
+) -> str:
+    """What differs between the run that was begun and this one, in words; empty when nothing does."""
+    if version != __version__:
+        return f"it was begun by lslam {version}, this is {__version__}"
+    before, now = (_flat(tree) for tree in (begun, config.model_dump(mode="json")))
+    changed = [key for key in sorted(before | now) if before.get(key) != now.get(key) and key not in FREE]
+    if changed:
+        said = [f"{key} was {before.get(key)!r} and is {now.get(key)!r}" for key in changed[:3]]
+        return f"the configuration differs: {', '.join(said)}{', ...' if len(changed) > 3 else ''}"
+    named = {
+        "input": "the recording or its ground truth is another or was changed",
+        "reading": "the recording is read in another way (times, extrinsics, topic)",
+        "imu": "the IMU's samples are others",
+        "gnss": "the satellite fixes are others",
+        "poses": "the poses of --poses are others",
+    }
+    return "; ".join(text for name, text in named.items() if known.get(name) != identity[name])
+
+
+def _refuse_finished(folder: Path, status: str, manifest: dict[str, Any], config: Config) -> None:
+    """Raise what a finished run ended with."""
+    why = "; ".join(str(problem) for problem in manifest.get("problems", []))
+    said = f"the run in {folder} is finished"
+    if status == "diverged":
+        raise RunFailedError(f"{said}, it diverged: {why}; --overwrite runs it anew")
+    if status == "degraded" and config.input.strict:
+        raise GateError(f"--strict: {said} and degraded: {why}")
+    if status in ("done", "degraded"):
+        raise RunFinishedError(f"{said} ({status}): nothing is left to do")
+
+
+def _flat(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """`section.key` -> value; what TOML cannot say (null) is left out."""
+    flat: dict[str, Any] = {}
+    for key, value in tree.items():
+        if isinstance(value, dict):
+            flat |= _flat(value, f"{prefix}{key}.")
+        elif value is not None:
+            flat[prefix + key] = value
+    return flat
