@@ -154,6 +154,8 @@ class OdometryCheckpoints:
             self._write(results, tracker, keyframing, is_over)
 
     def _write(self, results: list[ScanResult], tracker: Tracker, keyframing: Keyframing, is_over: bool) -> None:
+        if all(result.status == "skipped" for result in results):
+            return  # bad input: nothing to go on with
         if not is_over and (keyframing.is_waiting or not tracker.is_settled):
             return  # the next scan is needed to say what the first one was
         if is_over:
