@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 EPILOG = """\b
 Examples:
   lslam map runs/first --voxel 0.1 --format laz
-  lslam map runs/first --crop -50,50,-50,50 --out square.ply
+  lslam map runs/first --clean --crop -50,50,-50,50 --out square.ply
   lslam map runs/first --against survey.laz --threshold 0.1
   lslam map somebody-elses.ply --score
 """
@@ -30,6 +30,7 @@ Examples:
 @click.option("--voxel", type=float, metavar="M", help="Edge of a voxel  [as the run].")
 @click.option("--format", "file_format", metavar="NAME", help="ply, pcd, las or laz  [--out's suffix, or as the run].")
 @click.option("--crop", metavar="BOX", help="Keep x_min,x_max,y_min,y_max[,z_min,z_max] of the world, m.")
+@click.option("--clean", is_flag=True, help="Take out what moves: cars and people on their way.")
 @click.option("--crs", metavar="EPSG:N", help="Coordinates of las and laz of a georeferenced run  [its UTM zone].")
 @click.option("--out", type=click.Path(path_type=Path), metavar="FILE", help="Map file  [RUN/map.FORMAT].")
 @click.option("--overwrite", is_flag=True, help="Replace files that are there.")
@@ -126,6 +127,7 @@ def _settings(given: dict[str, Any]) -> list[str]:
         if suffix in ("ply", "pcd", "las", "laz")
         else None,
         "crop": None if given["crop"] is None else f"[{given['crop']}]",
+        "clean": "true" if given["clean"] else None,
     }
     return [*given["settings"], *(f"map.{key}={value}" for key, value in flags.items() if value is not None)]
 

@@ -23,6 +23,7 @@ class MapConfig(Section):
     )
     range_min: float = Field(2.0, ge=0, description="m; nearer points are left out")
     range_max: float = Field(80.0, gt=0, description="m; farther points are left out")
+    clean: bool = Field(False, description="take out what moves: points that other scans see through")
     ego_box: tuple[float, float, float, float, float, float] | None = Field(
         None,
         description="x_min, x_max, y_min, y_max, z_min, z_max in the LiDAR frame, m: points inside are left out; "

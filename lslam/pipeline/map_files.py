@@ -100,13 +100,13 @@ def georeference_note(georeference: Georeference) -> dict[str, Any]:
 
 
 def georeference_of(note: Any) -> Georeference | None:
-    """The inverse of `georeference_note`; None for anything else."""
+    """What `georeference_note`, or a manifest, says; None when that is nothing."""
     try:
         return Georeference(
             np.array(note["origin_lat_lon_height"], np.float64).reshape(3),
             np.array(note["T_enu_world"], np.float64).reshape(4, 4),
-            int(note["epsg"]),
+            None if note.get("epsg") is None else int(note["epsg"]),
             note["method"],
         )
-    except (KeyError, TypeError, ValueError):
+    except (AttributeError, KeyError, TypeError, ValueError):
         return None

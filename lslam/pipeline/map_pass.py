@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import logging
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,7 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.config import Config
+from lslam.config.map import MapConfig
 from lslam.geometry.interpolate import poses_at
+from lslam.maps.clean import Cleaner, PosedScan
 from lslam.maps.merge import MapMerger, MergedMap
 from lslam.maps.top_view import top_view
 from lslam.pipeline.front_end import read_ahead
@@ -21,14 +24,17 @@ from lslam.types.scan import Scan
 from lslam.types.scan_result import ScanResult
 from lslam.types.sequence import Sequence
 
+log = logging.getLogger("lslam")
+
 
 @dataclass(frozen=True)
 class BuiltMap:
-    """The merged map and its view from above."""
+    """The merged map, its view from above, and what was done to it, in words."""
 
     merged: MergedMap
     image: NDArray[np.float32]
     extent: tuple[float, float, float, float]
+    done: tuple[str, ...] = ()
 
 
 def build_map(
@@ -45,17 +51,34 @@ def build_map(
     ego_box = section.ego_box or config.preprocess.ego_box
     stamps = np.array([r.stamp_ns for r in results], np.int64)
     poses = np.stack([r.T_world_lidar for r in results])
+    cleaner = Cleaner() if section.clean else None
+
+    def merge(scans: Iterable[PosedScan]) -> None:
+        for posed in scans:
+            merger.add(posed.points, posed.T_world_lidar, posed.intensity)
+
     for loaded, result in zip(read_ahead(sequence, None, config.input.threads), results, strict=False):
         if should_stop():
             return None
         if loaded.scan is not None and result.status == "ok":
             scan = loaded.scan if ego_box is None else without_box(loaded.scan, ego_box)
             motion = motion_within(scan, stamps, poses)
-            merger.add(deskew_points(scan.points, scan.times, motion), result.T_world_lidar, scan.intensity)
+            posed = PosedScan(deskew_points(scan.points, scan.times, motion), result.T_world_lidar, scan.intensity)
+            merge([posed] if cleaner is None else cleaner.add(posed))
         on_step()
+    if cleaner is not None:
+        merge(cleaner.finish())
+        log.info("map: %d of %d points moved and are left out", cleaner.removed, cleaner.seen)
     merged = merger.result()
     image, extent = top_view(merged, pixel=max(0.2, config.map.voxel))
-    return BuiltMap(merged, image, extent)
+    return BuiltMap(merged, image, extent, _done(section, cleaner))
+
+
+def _done(section: MapConfig, cleaner: Cleaner | None) -> tuple[str, ...]:
+    done = [] if section.crop is None else [f"cropped to {list(section.crop)}"]
+    if cleaner is not None:
+        done.append(f"cleaned: {cleaner.removed} of {cleaner.seen} points moved")
+    return tuple(done)
 
 
 def without_box(scan: Scan, box: tuple[float, ...]) -> Scan:

@@ -15,10 +15,10 @@ from lslam.formats.ply_files import write_ply
 from lslam.formats.timing_csv import timing_text
 from lslam.formats.trajectory_files import write_kitti, write_tum
 from lslam.geometry import se3
-from lslam.maps.merge import MergedMap
 from lslam.pipeline import map_files
 from lslam.pipeline.feature_pass import FeatureCloud
 from lslam.pipeline.map_files import LOCAL, MapNote
+from lslam.pipeline.map_pass import BuiltMap
 from lslam.pipeline.run_folder import RunFolder
 from lslam.reports.evaluation_json import run_document
 from lslam.reports.facts import stage_matrix
@@ -83,17 +83,13 @@ def write_scans(folder: RunFolder, record: RunRecord) -> None:
     folder.write_text("scans.csv", "\n".join(rows) + "\n")
 
 
-def write_map(
-    folder: RunFolder, merged: MergedMap, config: MapConfig, record: RunRecord, georeference: Georeference | None = None
-) -> None:
-    """map.ply, .pcd, .las or .laz with map.json beside."""
-    folder.require_space(BYTES_PER_POINT * len(merged), "the map")
-    map_files.write_map(
-        folder.path / f"map.{config.format}",
-        merged,
-        MapNote(record.name, config.voxel, world=f"{LOCAL}: {record.world}"),
-        georeference,
-    )
+def write_map(folder: RunFolder, built: BuiltMap, config: MapConfig, record: RunRecord) -> None:
+    """map.ply, .pcd, .las or .laz with map.json beside, in map coordinates where the run knows where it is."""
+    folder.require_space(BYTES_PER_POINT * len(built.merged), "the map")
+    note = MapNote(record.name, config.voxel, built.done, f"{LOCAL}: {record.world}")
+    map_files.write_map(folder.path / f"map.{config.format}", built.merged, note, record.georeference)
+    if record.georeference is not None:
+        map_files.write_geojson(folder.path / "trajectory.geojson", record.trajectory, record.georeference, record.name)
 
 
 def write_feature_map(folder: RunFolder, features: FeatureCloud) -> None:

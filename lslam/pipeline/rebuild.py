@@ -16,7 +16,7 @@ from lslam.errors import InputError, InterruptedRunError, OutputError, OutputExi
 from lslam.formats.cloud_files import SUFFIXES
 from lslam.formats.trajectory_files import read_trajectory
 from lslam.maps.crispness import crispness
-from lslam.pipeline.map_files import MapNote, georeference_of, write_geojson, write_map
+from lslam.pipeline.map_files import LOCAL, MapNote, georeference_of, write_geojson, write_map
 from lslam.pipeline.map_pass import build_map
 from lslam.pipeline.run_folder import MANIFEST
 from lslam.readers import open_sequence
@@ -45,6 +45,11 @@ class EarlierRun:
     def sequence_path(self) -> str:
         """Where the raw scans lay."""
         return str(self.manifest.get("sequence", {}).get("path", ""))
+
+    @property
+    def world(self) -> str:
+        """Where its coordinates begin and whether z is up, in words."""
+        return str(self.manifest.get("frames", {}).get("world", "LiDAR at the first scan"))
 
 
 @dataclass(frozen=True)
@@ -122,7 +127,8 @@ def rebuild(
     built = build_map(sequence, results_of(run), run.config, on_step, should_stop, path.parent)
     if built is None:
         raise InterruptedRunError("interrupted while the map was built: nothing is written")
-    write_map(path, built.merged, MapNote(sequence.name, run.config.map.voxel), georeference)
+    note = MapNote(sequence.name, run.config.map.voxel, built.done, f"{LOCAL}: {run.world}")
+    write_map(path, built.merged, note, georeference)
     if georeference is not None:
         write_geojson(path.parent / "trajectory.geojson", run.trajectory, georeference, sequence.name)
     log.info("%d points in %s", len(built.merged), path)

@@ -165,7 +165,7 @@ def _map(
             return
         record.map_image, record.map_extent = built.image, built.extent
         record.crispness = crispness(built.merged)
-        outputs.write_map(folder, built.merged, config.map, record)
+        outputs.write_map(folder, built, config.map, record)
     manifest.map_points = len(built.merged)
 
 

@@ -1,0 +1,158 @@
+"""Moving objects taken out of a map: a point that other scans, a little earlier or later, look through, has moved."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.geometry import se3
+
+# Scans before and after that are asked: at 10 Hz a pedestrian has left its place after 0.3 s, a lorry after 2.5 s.
+OFFSETS = (3, 6, 10, 15, 25)
+# How far behind a point must lie what another scan sees there: m, and m per m of range, as a pose that is 3 cm too low
+# moves the ground 20 m away by 0.4 m along the beam.
+MARGIN, SLOPE = 0.3, 0.02
+# One vote that a point is free holds against two that something was there: what stands is hit by nearly every scan.
+FREE_PER_HIT = 0.5
+# Where this share of the points in a cube of so many m moves, the rest of them moves, too.
+CUBE, SHARE = 0.5, 0.3
+
+# Sizes of pixels that are tried, finest first, until a scan fills so many of them.
+COLUMNS_DEG, ROWS_DEG, FILLED = (0.4, 0.8, 1.6, 3.2), 0.3 * 1.15 ** np.arange(18), 0.85
+
+
+@dataclass(frozen=True)
+class PosedScan:
+    """A deskewed scan and where it was taken.
+
+    points : (N, 3) float32, m, LiDAR frame at scan start; T_world_lidar : (4, 4); intensity : (N,) float32 or None
+    """
+
+    points: NDArray[np.float32]
+    T_world_lidar: NDArray[np.float64]
+    intensity: NDArray[np.float32] | None = None
+
+
+@dataclass(frozen=True)
+class _Grid:
+    """Pixels of range images: `low` elevation of the lowest row's lower edge, rad; `size` of a row, rad."""
+
+    low: float
+    size: float
+    rows: int
+    columns: int
+
+
+class Cleaner:
+    """Takes scans in and gives them back, `OFFSETS[-1]` scans later, without the points that moved.
+
+    Visibility between scans, as in Pomerleau et al. (ICRA 2014) and Removert (Kim and Kim, IROS 2020), but scan against
+    scan, so that neither the map nor its length has to fit into memory.
+
+    Attributes
+    ----------
+    removed, seen : points taken out, of so many
+    """
+
+    def __init__(self) -> None:
+        self._scans: deque[PosedScan] = deque()
+        self._images: deque[tuple[NDArray[np.float64], NDArray[np.float32]]] = deque()
+        self._grid: _Grid | None = None
+        self._begin = self._decided = self._count = 0
+        self.removed = self.seen = 0
+
+    def add(self, scan: PosedScan) -> list[PosedScan]:
+        """One more scan; those that can be decided now."""
+        from lslam.kernels.see_through import nearest_ranges
+
+        points = np.ascontiguousarray(scan.points, np.float32)
+        scan = replace(scan, points=points)
+        if self._grid is None:
+            self._grid = _grid_of(points)
+        image = np.full((1, 1), np.inf, np.float32)
+        if self._grid is not None:
+            g = self._grid
+            image = nearest_ranges(points, g.rows, g.columns, g.low, 1 / g.size)
+        self._scans.append(scan)
+        self._images.append((scan.T_world_lidar, image))
+        self._count += 1
+        return [self._decide()] if self._count - self._decided > OFFSETS[-1] else []
+
+    def finish(self) -> list[PosedScan]:
+        """The scans that are left."""
+        return [self._decide() for _ in range(self._count - self._decided)]
+
+    def _decide(self) -> PosedScan:
+        """The oldest scan, without what moved."""
+        scan = self._scans.popleft()
+        moves = self._moves(scan, self._decided)
+        self._decided += 1
+        while self._begin < self._decided - OFFSETS[-1]:
+            self._images.popleft()
+            self._begin += 1
+        self.seen += len(moves)
+        self.removed += int(moves.sum())
+        kept = ~moves
+        intensity = None if scan.intensity is None else scan.intensity[kept]
+        return replace(scan, points=scan.points[kept], intensity=intensity)
+
+    def _moves(self, scan: PosedScan, number: int) -> NDArray[np.bool_]:
+        from lslam.kernels.see_through import vote
+
+        free, hit = np.zeros(len(scan.points), np.int16), np.zeros(len(scan.points), np.int16)
+        for other in (number + sign * offset for offset in OFFSETS for sign in (-1, 1)):
+            if self._grid is not None and self._begin <= other < self._count:
+                T_world_other, image = self._images[other - self._begin]
+                T = se3.relative(T_world_other, scan.T_world_lidar)
+                vote(scan.points, T, image, self._grid.low, 1 / self._grid.size, MARGIN, SLOPE, free, hit)
+        return spread((free >= 1) & (free >= FREE_PER_HIT * hit), scan.points)
+
+
+def spread(moves: NDArray[np.bool_], points: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """The mask (N,), and all points (N, 3), m, of cubes in which a good share is masked: wheels, and what hides behind."""
+    if not moves.any():
+        return moves
+    # Only cubes with a masked point matter.
+    cells = np.floor(np.clip(points / CUBE, -1e6, 1e6)).astype(np.int64) + (1 << 20)
+    keys = (cells[:, 0] << 42) | (cells[:, 1] << 21) | cells[:, 2]
+    cubes, moving = np.unique(keys[moves], return_counts=True)
+    at = np.minimum(np.searchsorted(cubes, keys), len(cubes) - 1)
+    inside = cubes[at] == keys
+    total = np.bincount(at[inside], minlength=len(cubes))
+    chosen = (moving >= 2) & (moving >= SHARE * total)
+    return np.asarray(moves | (inside & chosen[at]))
+
+
+def _grid_of(points: NDArray[np.float32]) -> _Grid | None:
+    """The finest pixels that this scan nearly fills; None when it is empty.
+
+    Rings are farther apart than the points on them: a row must be as high as the gap between two rings, a column need not
+    be as wide.
+    """
+    good = points[np.isfinite(points).all(1) & (np.abs(points).sum(1) > 0)].astype(np.float64)
+    if not len(good):
+        return None
+    elevation = np.arctan2(good[:, 2], np.hypot(good[:, 0], good[:, 1]))
+    azimuth = np.arctan2(good[:, 1], good[:, 0]) + np.pi
+    low, high = np.quantile(elevation, [0.001, 0.999])
+    for width in COLUMNS_DEG:
+        for size in np.radians(ROWS_DEG):
+            grid = _Grid(float(low - size / 2), float(size), int((high - low) / size) + 2, int(360 / width))
+            if _filled(grid, elevation, azimuth) >= FILLED:
+                return grid
+    return grid
+
+
+def _filled(grid: _Grid, elevation: NDArray[np.float64], azimuth: NDArray[np.float64]) -> float:
+    """Share of pixels with a point, in each column between its lowest and its highest."""
+    row = ((elevation - grid.low) / grid.size).astype(np.int64)
+    column = np.minimum((azimuth / (2 * np.pi) * grid.columns).astype(np.int64), grid.columns - 1)
+    inside = (row >= 0) & (row < grid.rows)
+    image = np.zeros((grid.rows, grid.columns), np.bool_)
+    image[row[inside], column[inside]] = True
+    used = image[:, image.any(0)]
+    span = grid.rows - used[::-1].argmax(0) - used.argmax(0)
+    return float(used.sum() / max(span.sum(), 1))
