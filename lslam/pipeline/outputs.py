@@ -23,7 +23,6 @@ from lslam.pipeline.run_folder import RunFolder
 from lslam.reports.evaluation_json import run_document
 from lslam.reports.facts import stage_matrix
 from lslam.types.calibration import Calibration
-from lslam.types.georeference import Georeference
 from lslam.types.run_record import RunRecord
 from lslam.types.trajectory import Trajectory
 from lslam.version import __version__
