@@ -1,4 +1,4 @@
-"""Section `osm`: OpenStreetMap buildings, where they come from and how much of them is looked at."""
+"""Section `osm`: OpenStreetMap buildings, where they come from, and how walls are seen in clouds."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from lslam.config.section import Section
 
 
 class OsmConfig(Section):
-    """Fetching buildings from an Overpass server, and the circles of the buffer (second thesis, section 3.1)."""
+    """Fetching buildings from an Overpass server, the circles of the buffer, and walls (second thesis, 3.1 and 3.2)."""
 
     server: str = Field(
         "https://overpass-api.de/api/interpreter",
@@ -27,6 +27,15 @@ class OsmConfig(Section):
     fetch_radius: float = Field(120.0, gt=0, description="m; buildings so far round a place are fetched")
     renew_radius: float = Field(60.0, gt=0, description="m; so far from the last request's place a new one is made")
     use_radius: float = Field(35.0, gt=0, description="m; buildings so far from the estimate are matched")
+    wall_height: float = Field(
+        1.6, ge=0, description="m above the ground; what is lower is clutter: cars, fences, hedges, people"
+    )
+    wall_range: float = Field(60.0, gt=0, le=150, description="m; walls are looked for so far from the sensor")
+    wall_tilt_deg: float = Field(15.0, gt=0, lt=45, description="deg; largest tilt of a wall's surface")
+    wall_tolerance: float = Field(0.15, gt=0, description="m; points so far from a line are of its wall")
+    wall_gap: float = Field(1.0, gt=0, description="m; a wider gap parts two walls on one line")
+    min_cluster: int = Field(20, ge=3, description="points a wall has at least")
+    min_length: float = Field(2.0, gt=0, description="m; shorter walls are left out")
 
     @model_validator(mode="after")
     def _check(self) -> OsmConfig:

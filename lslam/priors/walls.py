@@ -1,0 +1,133 @@
+"""Walls as directed segments on level ground: those a cloud shows, and those a map says.
+
+Second thesis, section 3.2: what is low is cut off, what is no upright plane left out, the rest flattened, and lines found by
+RANSAC. Height is counted from the ground below each point and not from the sensor, which may fly. All segments are directed
+so that the outside, where a wall is seen from, lies to the right; so a wall's back is never taken for its front.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.config.osm import OsmConfig
+from lslam.kernels import ground, segments
+from lslam.types.building import Building, Footprint, footprint_polygon, is_canopy
+
+Floats = NDArray[np.float64]
+
+CELL = 2.0  # m; of the grid in which the ground is looked for
+SLOPE = 0.3  # m per m; no street is steeper
+NEIGHBOURHOOD = 0.6  # m; half a window of a wall has to look like a plane in
+THICKNESS = 0.1  # m; standard deviation across such a window
+STEP = 0.5  # m; three of them lead from the last window of a wall to its corner
+THIN = 0.25  # m; points above one another count as one, with their number
+AGREEMENT = np.cos(np.radians(20.0))  # of a point's own plane with the line's
+TRIES = 12  # lines tried for each segment
+MOST = 200  # segments looked for
+STRAIGHT = 0.1  # m; corners of a footprint that lie so near the line through their neighbours are none
+
+
+@dataclass(frozen=True)
+class Walls:
+    """Segments seen in a cloud, in its frame.
+
+    segments : (S, 2, 2) float64, m, both ends, the outside to the right of the way from first to second
+    counts : (S,) int64 points of each; rms : (S,) float64, m, of its points about the line
+    """
+
+    segments: Floats
+    counts: NDArray[np.int64]
+    rms: Floats
+
+    def __len__(self) -> int:
+        return len(self.segments)
+
+    @property
+    def lengths(self) -> Floats:
+        """(S,) m."""
+        return np.asarray(np.linalg.norm(self.segments[:, 1] - self.segments[:, 0], axis=1))
+
+
+def find_walls(points: NDArray[Any], config: OsmConfig | None = None, views: NDArray[Any] | None = None) -> Walls:
+    """Walls in the points (N, 3), m, of a scan or of a submap, in a frame whose z points up.
+
+    views : (V, 2) or (V, 3) where the sensor was, m, so that walls can be directed; the origin by default
+    The result is the same for the same input, whatever else runs. Without walls it is empty.
+    """
+    config = config or OsmConfig()
+    cloud = np.asarray(points, np.float32).reshape(-1, 3)
+    is_near = np.abs(cloud[:, :2]).max(axis=1, initial=0.0) < config.wall_range
+    cloud = np.ascontiguousarray(cloud[is_near & np.isfinite(cloud).all(1) & (np.abs(cloud[:, 2]) < 1e4)])
+    if len(cloud) < config.min_cluster:
+        return Walls(np.zeros((0, 2, 2)), np.zeros(0, np.int64), np.zeros(0))
+    flat, every = segments.flat_walls(
+        cloud,
+        _high(cloud, config.wall_height),
+        NEIGHBOURHOOD,
+        np.sin(np.radians(config.wall_tilt_deg)),
+        THICKNESS,
+        THIN,
+    )
+    tries = np.random.default_rng(0).integers(0, 2**31, (MOST, TRIES))
+    found = segments.find_segments(
+        flat, every, tries, config.wall_tolerance, AGREEMENT, config.wall_gap, float(config.min_cluster),
+        config.min_length, STEP,
+    )  # fmt: skip
+    seen_from = np.zeros((1, 2)) if views is None else np.asarray(views, np.float64)[:, :2]
+    return Walls(_directed(found[:, :4].reshape(-1, 2, 2), seen_from), found[:, 4].astype(np.int64), found[:, 5])
+
+
+def walls_of(buildings: Iterable[Building]) -> tuple[Floats, NDArray[np.int64]]:
+    """Walls (T, 2, 2), m, of the footprints of `buildings`, the outside to the right, and the building (T,) each is of.
+
+    Corners that are none, because an outline was drawn with more nodes than it has, are left out; canopies have no walls.
+    """
+    rows: list[Floats] = []
+    owners: list[int] = []
+    for number, building in enumerate(buildings):
+        if is_canopy(building):
+            continue
+        for footprint in building.footprints:
+            for ring in _simplified(footprint).rings:
+                rows.append(np.stack([ring, np.roll(ring, -1, axis=0)], axis=1))
+                owners += [number] * len(ring)
+    found = np.concatenate(rows) if rows else np.zeros((0, 2, 2))
+    return np.asarray(found, np.float64), np.array(owners, np.int64)
+
+
+def _high(cloud: NDArray[np.float32], height: float) -> NDArray[np.int64]:
+    """Indices of the points more than `height` m above the ground."""
+    half = int(np.ceil(float(np.abs(cloud[:, :2]).max()) / CELL)) + 1
+    lowest = ground.lowest(cloud, np.eye(3), CELL, half)
+    level = np.full(len(lowest), ground.EMPTY)
+    level[lowest >= 0] = cloud[lowest[lowest >= 0], 2]
+    top = ground.envelope(level.reshape(2 * half, 2 * half), SLOPE * CELL, 0.3)
+    return ground.above(cloud, np.eye(3), CELL, half, top, height)
+
+
+def _directed(found: Floats, views: Floats) -> Floats:
+    """Turned so that the side that filled more of the `views` lies to the right: height over it, by distance cubed."""
+    to_view = views[None] - found.mean(axis=1)[:, None]
+    along = (found[:, 1] - found[:, 0])[:, None]
+    left = along[..., 0] * to_view[..., 1] - along[..., 1] * to_view[..., 0]
+    share = left / np.maximum(np.linalg.norm(to_view, axis=2), 1.0) ** 3
+    return np.where((share.sum(axis=1) > 0)[:, None, None], found[:, ::-1], found)
+
+
+def _simplified(footprint: Footprint) -> Footprint:
+    """Without corners on straight walls; as it is where nothing would be left."""
+    from shapely import Polygon
+
+    polygon = footprint_polygon(footprint)
+    rings = []
+    for ring in (polygon.exterior, *polygon.interiors):
+        # The first corner stays whatever it is: begin at one that is surely a corner, far out.
+        corners = np.asarray(ring.coords, np.float64)[:-1]
+        corners = np.roll(corners, -int(np.argmax(np.linalg.norm(corners - corners.mean(0), axis=1))), axis=0)
+        rings.append(np.asarray(Polygon(corners).simplify(STRAIGHT).exterior.coords, np.float64)[:-1])
+    return Footprint(rings[0], tuple(rings[1:])) if all(len(ring) >= 3 for ring in rings) else footprint
