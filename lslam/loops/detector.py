@@ -15,7 +15,9 @@ from lslam.geometry import se3, so3
 from lslam.keyframes.store import KeyframeStore
 from lslam.keyframes.submaps import submap
 from lslam.loops.doubt import Doubt, OdometryDoubt
+from lslam.loops.pace import Pace
 from lslam.loops.place import Place, make_place
+from lslam.loops.rivals import settle
 from lslam.loops.scan_context import PlaceIndex, PlaceMatch
 from lslam.loops.verify import Comparison, Verifier
 from lslam.types.constraint import Constraint, LoopCandidate
@@ -32,8 +34,10 @@ NEAR = 8.0
 LEAST_REACH, LEAST_TURN = 1.0, np.deg2rad(2.0)
 # rad between the turns that are searched; beyond the widest, those round the descriptor's own are.
 TURN_STEP, WIDEST_TURN = np.deg2rad(2.0), np.deg2rad(20.0)
-# Candidates that are registered per keyframe, and places kept ready.
-TRIED, KEPT = 2, 16
+# Places this much less alike than the best are its rivals, so many at most; different ones of a town differ twice as much.
+RIVAL, RIVALS = 1.5, 3
+# Places kept ready.
+KEPT = 16
 
 
 def find_loops(
@@ -55,37 +59,6 @@ def find_loops(
     tried = sum(c.stage != "thinned" for c in candidates)
     log.info("loops: %d closed of %d candidates, %d keyframes", accepted, tried, len(store))
     return candidates
-
-
-class Pace:
-    """How far to travel from one try to the next: `spacing` where things change, up to three times it while they do not.
-
-    A closure after a row of closures adds little, and so does a refusal after a row of refusals.
-    """
-
-    LONGEST = 3
-
-    def __init__(self, spacing: float) -> None:
-        self.spacing = spacing
-        self.reset()
-
-    def reset(self) -> None:
-        """Try at once: there were no candidates."""
-        self._tried_at, self._row, self._last = -np.inf, 0, ""
-
-    @property
-    def wait(self) -> float:
-        """m between the last try and the next."""
-        return self.spacing * min(self._row, self.LONGEST)
-
-    def is_due(self, distance: float) -> bool:
-        """Whether to try after so many metres since the start."""
-        return distance - self._tried_at >= self.wait
-
-    def observe(self, distance: float, verdict: str) -> None:
-        """A try, and what came of it."""
-        self._row = self._row + 1 if verdict == self._last else 1
-        self._tried_at, self._last = distance, verdict
 
 
 class Detector:
@@ -123,11 +96,14 @@ class Detector:
             if not pace.is_due(keyframe.distance):
                 candidates.append(self._thinned(older, b, pace.wait))
                 continue
-            for match in self._choose(b, older):
-                candidates.append(self._examine(match, b))
-                if candidates[-1].verdict == "accepted":
-                    break
-            pace.observe(keyframe.distance, candidates[-1].verdict)
+            alike, fallback = self._choose(b, older)
+            examined = settle([self._examine(match, b) for match in alike], self.keyframes, self._reach_between)
+            if fallback is not None and not any(c.verdict == "accepted" or c.stage == "ambiguity" for c in examined):
+                examined.append(self._examine(fallback, b))
+            candidates += examined
+            pace.observe(
+                keyframe.distance, "accepted" if any(c.verdict == "accepted" for c in examined) else "rejected"
+            )
         return candidates
 
     def _gated(self, b: int) -> NDArray[np.int64]:
@@ -156,13 +132,14 @@ class Detector:
     def _away(self, a: int, b: int) -> float:
         return float(np.linalg.norm(self.doubt.positions[b] - self.doubt.positions[a]))
 
-    def _choose(self, b: int, older: NDArray[np.int64]) -> list[PlaceMatch]:
-        """The candidates worth a registration: what looks alike, and what odometry says is nearest.
+    def _choose(self, b: int, older: NDArray[np.int64]) -> tuple[list[PlaceMatch], PlaceMatch | None]:
+        """The candidates worth a registration, and one more to fall back on.
 
-        Where odometry is nearly certain, its nearest comes first.
+        Where odometry is nearly certain, its nearest is the one, and what looks alike the other. Elsewhere it is the other
+        way round, and all that look nearly as much alike must be asked, lest they fit as well.
         """
         near = self._nearest(older, b)
-        reach = self._reach(self.doubt.between(b, np.array([near])))
+        reach = self._reach_between(near, b)
         is_certain = reach < NEAR
         if is_certain:
             away = np.linalg.norm(self.doubt.positions[older] - self.doubt.positions[b], axis=1)
@@ -174,10 +151,19 @@ class Detector:
         turn = self._turn(self.doubt.between(b, older[:1]))
         matches = self.index.nearest(b, older, turn)
         by_odometry = next((m for m in matches if m.number == near), PlaceMatch(near, float("nan"), 0.0))
-        alike = [m for m in matches[:1] if m.distance <= self.config.max_descriptor_distance]
-        ordered = [by_odometry, *alike] if is_certain else [*alike, by_odometry]
-        apart = [m for m in ordered[1:] if self._away(m.number, ordered[0].number) > NEAR / 2]
-        return [ordered[0], *apart][:TRIED]
+        limit = min(self.config.max_descriptor_distance, RIVAL * matches[0].distance)
+        alike = self._apart([m for m in matches if m.distance <= limit])
+        chosen, others = ([by_odometry], alike[:1]) if is_certain or not alike else (alike, [by_odometry])
+        far = [m for m in others if all(self._away(m.number, c.number) > NEAR / 2 for c in chosen)]
+        return chosen, far[0] if far else None
+
+    def _apart(self, matches: list[PlaceMatch]) -> list[PlaceMatch]:
+        """The first few of which none lies near another."""
+        kept: list[PlaceMatch] = []
+        for match in matches:
+            if len(kept) < RIVALS and all(self._away(match.number, k.number) > NEAR for k in kept):
+                kept.append(match)
+        return kept
 
     def _examine(self, match: PlaceMatch, b: int) -> LoopCandidate:
         """Register keyframe `b` on the match and judge what comes of it."""
@@ -194,6 +180,10 @@ class Detector:
             a, b, self._away(a, b), match.distance, "rejected" if reason else "accepted", stage, reason, found.rmse,
             found.overlap, self._constraint(a, b, found),
         )  # fmt: skip
+
+    def _reach_between(self, older: int, newer: int) -> float:
+        """m that odometry may be wrong by between two keyframes."""
+        return self._reach(self.doubt.between(newer, np.array([older])))
 
     def _reach(self, doubt: Doubt) -> float:
         """m that the place may lie from where odometry has it."""

@@ -15,6 +15,8 @@ from lslam.registration.gaussian_map import GaussianMap
 Floats = NDArray[np.float64]
 Points = NDArray[np.float32]
 
+# m; larger voxels are for single scans, which are sparse; a submap is not.
+LARGEST = 0.8
 # Voxels of a submap that are registered on another, at most.
 SOURCE_POINTS = 4000
 # Voxels there is room for at first; a map must have room for as many more as points are added at once.
@@ -46,7 +48,7 @@ def make_place(points: Points, config: RegistrationConfig) -> Place:
     Voxels with too few points to be matched are no source either: what is seen so thinly will be seen elsewhere next time.
     """
     fine = GaussianMap(
-        config.voxel_size, min_points=config.min_points, planarity=config.planarity, count_cap=config.count_cap,
+        min(config.voxel_size, LARGEST), min_points=config.min_points, planarity=config.planarity, count_cap=config.count_cap,
         reach=np.inf, capacity=CAPACITY,
     )  # fmt: skip
     for first in range(0, len(points), CAPACITY // 4):

@@ -114,6 +114,8 @@ def test_the_first_thesis_presets_are_what_it_prints() -> None:
         assert (feature.regions, feature.max_planar_points, feature.grid_step) == (6, 8, 1.5)
         assert feature.matching == "one-to-many"
     assert loam_map.loam.feature_map_voxel == 1.5
+    printed = [(c.loops.radius, c.loops.max_rmse, c.loops.max_iterations) for c in (icp, loam, loam_map)]
+    assert printed == [(8.0, 0.8, 50), (5.0, 0.9, 50), (3.0, 0.6, 50)]
 
 
 def test_methods_of_the_presets_exist() -> None:

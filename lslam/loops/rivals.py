@@ -1,0 +1,52 @@
+"""Older keyframes that look equally alike to a new one: it can be at one place only."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.types.constraint import LoopCandidate
+from lslam.types.keyframe import Keyframe
+
+
+def settle(
+    examined: list[LoopCandidate], keyframes: Sequence[Keyframe], reach: Callable[[int, int], float]
+) -> list[LoopCandidate]:
+    """Candidates of one newer keyframe, the most alike first, with at most one closure left among them.
+
+    reach : m that odometry may be wrong by between an older and a newer keyframe
+
+    None is left when two put the keyframe at different places, or when one of them was ambiguous by itself: where places
+    repeat, the one that fits is no better than the one that fits twice.
+    """
+    accepted = [c for c in examined if c.verdict == "accepted"]
+    doubtful = next((c for c in examined if c.stage == "ambiguity"), None)
+    if accepted and doubtful is not None:
+        return [_ambiguous(c, f"keyframe {doubtful.a} looks as much alike, and is ambiguous") for c in examined]
+    if len(accepted) < 2:
+        return examined
+    first = accepted[0]
+    for other in accepted[1:]:
+        gap = float(np.linalg.norm(_put(other, keyframes) - _put(first, keyframes)))
+        if gap > reach(min(first.a, other.a), max(first.a, other.a)):
+            said = f"keyframes {first.a} and {other.a} fit, at places {gap:.1f} m apart"
+            return [_ambiguous(c, said) for c in examined]
+    said = f"closed with keyframe {first.a} already"
+    extra = {c.a for c in accepted[1:]}
+    return [replace(c, verdict="rejected", stage="thinned", reason=said) if c.a in extra else c for c in examined]
+
+
+def _put(candidate: LoopCandidate, keyframes: Sequence[Keyframe]) -> NDArray[np.float64]:
+    """(3,) m in the world, where a closure puts the newer keyframe if the older one is where odometry has it."""
+    assert candidate.constraint is not None
+    return np.asarray((keyframes[candidate.a].T_world_lidar @ candidate.constraint.T_a_b)[:3, 3])
+
+
+def _ambiguous(candidate: LoopCandidate, reason: str) -> LoopCandidate:
+    """Refused, unless it was already."""
+    if candidate.verdict == "rejected":
+        return candidate
+    return replace(candidate, verdict="rejected", stage="ambiguity", reason=reason)

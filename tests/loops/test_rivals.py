@@ -1,0 +1,64 @@
+"""Rivals and the pace of tries: at most one closure per keyframe, none where places repeat."""
+
+from __future__ import annotations
+
+import numpy as np
+from known_town import keyframes_of, pose
+
+from lslam.loops.pace import Pace
+from lslam.loops.rivals import settle
+from lslam.types.constraint import Constraint, LoopCandidate, Verdict
+
+KEYFRAMES = keyframes_of(np.array([pose(10.0 * k, 0) for k in range(9)]))
+
+
+def candidate(a: int, x: float, verdict: Verdict = "accepted", stage: str = "agreement") -> LoopCandidate:
+    """That puts keyframe 8 at x = `x` m."""
+    T = np.linalg.inv(KEYFRAMES[a].T_world_lidar) @ pose(x, 0)
+    reason = "" if verdict == "accepted" else "as the test wants"
+    return LoopCandidate(a, 8, 1.0, 0.1, verdict, stage, reason, constraint=Constraint(a, 8, T, np.eye(6)))
+
+
+def settled(*candidates: LoopCandidate, reach: float = 2.0) -> list[tuple[str, str]]:
+    return [(c.verdict, c.stage) for c in settle(list(candidates), KEYFRAMES, lambda older, newer: reach)]
+
+
+def test_rivals_that_agree_leave_the_most_alike() -> None:
+    assert settled(candidate(2, 21.0), candidate(4, 22.0)) == [("accepted", "agreement"), ("rejected", "thinned")]
+
+
+def test_rivals_that_contradict_leave_none() -> None:
+    assert settled(candidate(2, 21.0), candidate(4, 35.0)) == [("rejected", "ambiguity")] * 2
+    # Where odometry may be as wrong between the two old keyframes, they do not.
+    assert settled(candidate(2, 21.0), candidate(4, 35.0), reach=20.0)[0] == ("accepted", "agreement")
+
+
+def test_a_rival_that_is_ambiguous_takes_the_closure_with_it() -> None:
+    both = settled(candidate(4, 35.0, "rejected", "ambiguity"), candidate(2, 21.0))
+    assert both == [("rejected", "ambiguity")] * 2
+
+
+def test_a_rival_that_is_refused_otherwise_does_not() -> None:
+    both = settled(candidate(4, 35.0, "rejected", "overlap"), candidate(2, 21.0))
+    assert both == [("rejected", "overlap"), ("accepted", "agreement")]
+    assert settled(candidate(2, 21.0)) == [("accepted", "agreement")]
+    assert settled() == []
+
+
+def test_pace_slows_down_while_nothing_changes() -> None:
+    pace, tried = Pace(4.0), []
+    for distance in np.arange(0, 60, 1.0):
+        if pace.is_due(distance):
+            tried.append(float(distance))
+            pace.observe(distance, "rejected" if distance < 30 else "accepted")
+    assert tried == [0, 4, 12, 24, 36, 40, 48]
+    assert not pace.is_due(59)
+    pace.reset()
+    assert pace.is_due(59)
+
+
+def test_no_spacing_tries_everything() -> None:
+    pace = Pace(0.0)
+    for distance in (0.0, 0.0, 1.0):
+        assert pace.is_due(distance)
+        pace.observe(distance, "accepted")
