@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from lslam.config import Config
+from lslam.config.preset_files import read_preset
 from lslam.errors import UsageError, nearest
 from lslam.evaluation.relative import parse_delta
 from lslam.odometry import FEATURE_METHODS, METHODS, known_methods
@@ -44,6 +45,12 @@ def _check_heeded(config: Config) -> None:
         value, default = getattr(section, key), type(section).model_fields[key].default
         is_so_anyway = key == "target" and value == "scan" and method == "icp-svd"
         if value != default and method not in methods and not is_so_anyway:
+            preset = config.odometry.preset
+            if preset and read_preset(preset).get("registration", {}).get(key) == value:
+                raise UsageError(
+                    f"preset {preset} sets registration.{key} = {value!r}, which does nothing with method {method}: leave out "
+                    "--method, or the preset"
+                )
             raise UsageError(
                 f"registration.{key} = {value!r} does nothing with method {method}: drop it, or use one that heeds it "
                 f"({', '.join(methods)})"

@@ -125,3 +125,13 @@ def test_a_key_that_the_method_would_pass_over_is_refused(method: str, setting: 
         UsageError, match=rf"registration\.{key} = .* does nothing with method {method}.*\(icp, icp-point"
     ):
         check_config(config)
+
+
+def test_what_a_preset_says_and_its_method_only_heeds_is_said_to_be_the_presets() -> None:
+    preset = "odometry.preset=thesis-icp"
+    with pytest.raises(UsageError, match=r"preset thesis-icp sets registration\.target = 'scan', which .* method loam"):
+        check_config(load_config(None, [preset, "odometry.method=loam"], {}))
+    own = [preset, "odometry.method=loam", "registration.target=keyframe"]
+    with pytest.raises(UsageError, match=r"^registration\.target = 'keyframe' does nothing with method loam"):
+        check_config(load_config(None, own, {}))
+    check_config(load_config(None, [preset, "odometry.method=icp-svd"], {}))
