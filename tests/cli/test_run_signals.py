@@ -55,13 +55,13 @@ def wait_for(condition: Callable[[], bool], child: Child, seconds: float = 60) -
 
 
 def in_odometry(out: Path, child: Child) -> None:
-    wait_for(lambda: (out / "manifest.json").exists(), child)
-    time.sleep(2.0)  # kernels are loaded, scans are being registered
+    # Kernels are loaded, scans are being registered.
+    wait_for(lambda: any(out.glob("checkpoint/odometry-*.npz")), child, 120)
     assert not (out / "trajectory.tum").exists()
 
 
 def in_map(out: Path, child: Child) -> None:
-    wait_for(lambda: (out / "scans.csv").exists(), child)
+    wait_for(lambda: (out / "scans.csv").exists(), child, 120)
 
 
 def assert_whole(out: Path) -> None:
