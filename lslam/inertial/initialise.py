@@ -18,8 +18,8 @@ Floats = NDArray[np.float64]
 
 # One sigma before anything is known: any vehicle's speed; consumer devices' biases; a bias by the mean turn.
 ANY_SPEED, ANY_ACCEL_BIAS, ANY_GYRO_BIAS, MEAN_GYRO_BIAS = 50.0, 0.5, 0.1, 0.02
-# Given biases: axes that are 2 % askew (a consumer device's data sheet) show a fiftieth of gravity as one more.
-GIVEN_ACCEL_BIAS, GIVEN_GYRO_BIAS, GIVEN_SPEED = 0.2, 2e-3, 0.3
+# Given biases: axes up to 2 % askew (a consumer device's data sheet) show as much of gravity as one more: two sigma.
+GIVEN_ACCEL_BIAS, GIVEN_GYRO_BIAS, GIVEN_SPEED = 0.1, 2e-3, 0.3
 # A given bias may differ from the mean rate error of the first seconds by so much, rad/s: misaligned axes add to that.
 MOST_BIAS_ERROR = 0.03
 # A standing sensor: spread of rates (rad/s) and forces (m/s2) over a second, and how far registration moves it (m).

@@ -1,0 +1,150 @@
+"""Deskew and IMU on distorted scans beside the peers': ATE and time per scan of each on the same sequence.
+
+python tests/benchmarks/inertial_peers.py SEQUENCE [SEQUENCE ...] [--scans 300] [--compensated FOLDER]
+
+Ours are `icp` with and without the IMU; kiss-icp and genz-icp deskew by constant velocity; rko-lio (pip install rko-lio)
+takes the IMU. All in their defaults. The instant that a peer's pose is valid for is the scan's start, middle or end,
+whichever scores best. `--compensated` names a folder with the same sequences free of distortion: icp is run there too.
+"""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.config import load_config
+from lslam.errors import LslamError
+from lslam.evaluation.evaluate import evaluate
+from lslam.formats.trajectory_files import read_trajectory
+from lslam.pipeline.run import run
+from lslam.readers import open_sequence
+from lslam.types.sequence import Sequence
+from lslam.types.trajectory import Trajectory
+
+Floats = NDArray[np.float64]
+# Poses (N, 4, 4) in any world, and seconds per scan (N,).
+Outcome = tuple[Floats, Floats]
+
+
+def ours(sequence: Sequence, scans: int, method: str, use_imu: bool) -> Outcome:
+    """A method of the house."""
+    settings = [f"odometry.method={method}", f"imu.use={str(use_imu).lower()}", f"input.count={scans}"]
+    results = run(sequence, load_config(None, settings, {})).record.results
+    seconds = [sum(v for name, v in r.stages.items() if name != "read") for r in results]
+    return np.stack([r.T_world_lidar for r in results]), np.array(seconds)
+
+
+def genz_icp(sequence: Sequence, scans: int) -> Outcome:
+    """genz-icp with its deskew switched on."""
+    from genz_icp.config import GenZConfig
+    from genz_icp.genz_icp import GenZICP
+
+    config = GenZConfig()
+    config.data.deskew = True
+    genz = GenZICP(config)
+    poses, seconds = [], []
+    for i in range(scans):
+        scan = sequence.scan(i)
+        assert scan.times is not None
+        began = time.perf_counter()
+        genz.register_frame(scan.points.astype(np.float64), scan.times.astype(np.float64) / float(scan.times.max()))
+        seconds.append(time.perf_counter() - began)
+        poses.append(np.array(genz.last_pose))
+    return np.stack(poses), np.array(seconds)
+
+
+def rko_lio(sequence: Sequence, scans: int) -> Outcome:
+    """rko-lio with the IMU; its first scan only begins the map."""
+    from rko_lio.config import LIOConfig
+    from rko_lio.lio import LIO
+
+    imu, T_lidar_imu = sequence.imu, sequence.calibration.T_lidar_imu
+    assert imu is not None
+    assert T_lidar_imu is not None
+    lio, told = LIO(LIOConfig()), 0
+    poses, seconds = [], []
+    for i in range(scans):
+        scan = sequence.scan(i)
+        assert scan.times is not None
+        stamps = scan.stamp_ns + np.round(1e9 * scan.times.astype(np.float64)).astype(np.int64)
+        began = time.perf_counter()
+        while told < len(imu) and imu.stamps_ns[told] <= stamps.max():
+            lio.add_imu_measurement(imu.accel[told], imu.gyro[told], int(imu.stamps_ns[told]), T_lidar_imu)
+            told += 1
+        lio.register_scan(scan.points.astype(np.float64), stamps, np.eye(4))
+        seconds.append(time.perf_counter() - began)
+        poses.append(lio.pose().copy())
+    return np.stack(poses), np.array(seconds)
+
+
+METHODS: dict[str, tuple[bool, Callable[[Sequence, int], Outcome]]] = {
+    # Whether the instant of the poses is known to be the start, and the method.
+    "icp": (True, lambda s, n: ours(s, n, "icp", False)),
+    "icp --imu": (True, lambda s, n: ours(s, n, "icp", True)),
+    "kiss-icp": (False, lambda s, n: ours(s, n, "kiss-icp", False)),
+    "genz-icp": (False, genz_icp),
+    "rko-lio": (False, rko_lio),
+}
+
+
+def score(sequence: Sequence, truth: Trajectory, poses: Floats, is_at_start: bool) -> tuple[float, float]:
+    """ATE rmse, m, under se3 and origin."""
+    found = []
+    for part in (0.0,) if is_at_start else (0.0, 0.5, 1.0):
+        stamps = sequence.stamps_ns[: len(poses)] + round(1e9 * part / sequence.rate_hz)
+        within = stamps <= truth.stamps_ns[-1]
+        ate = evaluate(Trajectory(stamps[within], poses[within]), truth).ate
+        found.append([t.rmse if (t := ate[name].translation) else float("nan") for name in ("se3", "origin")])
+    best = np.nanmin(np.array(found), axis=0)
+    return float(best[0]), float(best[1])
+
+
+def truth_of(sequence: Sequence) -> Trajectory:
+    """A simulation's own at 100 Hz, else the sequence's."""
+    dense = sequence.path / "truth" / "trajectory_100hz.tum"
+    truth = read_trajectory(dense) if dense.is_file() else sequence.ground_truth
+    if truth is None:
+        raise SystemExit(f"{sequence.path} has no ground truth")
+    return truth
+
+
+def rows(path: str, scans: int, names: list[str], label: str = "") -> None:
+    """One printed row per method."""
+    sequence = open_sequence(path)
+    count = min(scans, len(sequence))
+    truth = truth_of(sequence)
+    for name in names:
+        is_at_start, method = METHODS[name]
+        head = f"{sequence.name:16} {name + label:22} {count:4d}"
+        try:
+            poses, seconds = method(open_sequence(path), count)
+        except (LslamError, ImportError, ValueError) as error:
+            print(f"{head} failed: {error}"[:120], flush=True)
+            continue
+        se3, origin = score(sequence, truth, poses, is_at_start)
+        print(f"{head} {se3:9.4f} {origin:9.4f} {1e3 * np.median(seconds):8.1f}", flush=True)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("sequences", nargs="+")
+    parser.add_argument("--scans", type=int, default=300)
+    parser.add_argument("--methods", default=",".join(METHODS))
+    parser.add_argument("--compensated", type=Path)
+    given = parser.parse_args()
+    logging.getLogger("lslam").setLevel(logging.ERROR)
+    print(f"{'sequence':16} {'method':22} {'n':>4} {'ATE se3':>9} {'origin':>9} {'ms':>8}")
+    for path in given.sequences:
+        rows(path, given.scans, given.methods.split(","))
+        if given.compensated is not None and (given.compensated / Path(path).name).is_dir():
+            rows(str(given.compensated / Path(path).name), given.scans, ["icp"], ", compensated")
+
+
+if __name__ == "__main__":
+    main()
