@@ -124,7 +124,7 @@ def rows(path: str, scans: int, names: list[str], label: str = "") -> None:
         head = f"{sequence.name:16} {name + label:22} {count:4d}"
         try:
             poses, seconds = method(open_sequence(path), count)
-        except (LslamError, ImportError, ValueError) as error:
+        except (LslamError, ImportError, ValueError, RuntimeError) as error:
             print(f"{head} failed: {error}"[:120], flush=True)
             continue
         se3, origin = score(sequence, truth, poses, is_at_start)
