@@ -46,6 +46,7 @@ if TYPE_CHECKING:
 @click.option("--rings", metavar="RULE", help="How rings are found: auto, field, order, rows[:N], elevation[:N].")
 @click.option("--save-feature-map", is_flag=True, help="Write feature_map.ply; for the LOAM family.")
 @click.option("--clean", is_flag=True, help="Take what moves out of the map.")
+@click.option("--occupancy", is_flag=True, help="Write occupied and free cells, and a floor plan.")
 @click.option("--imu/--no-imu", default=None, help="Predict and deskew with the IMU [default: no].")
 @click.option("--loops/--no-loops", default=None, help="Close loops where a place is seen again [default: yes].")
 @click.option("--gnss", "gnss", flag_value="graph", default=None, help="Satellite fixes hold the trajectory.")
@@ -125,6 +126,7 @@ def _resolve(given: dict[str, Any]) -> Config:
         "input.rings": given["rings"],
         "map.write_features": "true" if given["save_feature_map"] else None,
         "map.clean": "true" if given["clean"] else None,
+        "map.occupancy": "true" if given["occupancy"] else None,
         "imu.use": None if given["imu"] is None else str(given["imu"]).lower(),
         "input.strict": "true" if given["strict"] else None,
         "loops.use": None if given["loops"] is None else str(given["loops"]).lower(),

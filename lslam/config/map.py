@@ -24,6 +24,12 @@ class MapConfig(Section):
     range_min: float = Field(2.0, ge=0, description="m; nearer points are left out")
     range_max: float = Field(80.0, gt=0, description="m; farther points are left out")
     clean: bool = Field(False, description="take out what moves: points that other scans see through")
+    occupancy: bool = Field(
+        False,
+        description="write occupancy.npz and .ply, cells that beams ended in or passed, and floor_plan.png and .yaml",
+    )
+    occupancy_voxel: float = Field(0.4, ge=0.02, description="m; edge of an occupancy cell")
+    occupancy_range: float = Field(40.0, gt=0, description="m; beams are followed so far")
     ego_box: tuple[float, float, float, float, float, float] | None = Field(
         None,
         description="x_min, x_max, y_min, y_max, z_min, z_max in the LiDAR frame, m: points inside are left out; "
@@ -37,6 +43,7 @@ class MapConfig(Section):
     @model_validator(mode="after")
     def _check(self) -> MapConfig:
         self.require_order("range_min", "range_max")
+        self.require_order("range_min", "occupancy_range")
         require_box("ego_box", self.ego_box)
         if self.crop is not None and len(self.crop) not in (4, 6):
             raise ValueError(f"crop = {list(self.crop)} must be x_min, x_max, y_min, y_max and perhaps z_min, z_max")

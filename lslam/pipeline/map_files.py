@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +13,11 @@ import numpy as np
 from lslam.formats.atomic import atomic_write
 from lslam.formats.cloud_files import write_cloud
 from lslam.formats.geojson import write_line
+from lslam.formats.ply_files import write_ply
+from lslam.maps.floor_plan import floor_plan
 from lslam.maps.georeference import ProjectedCloud, Projection, to_lat_lon
+from lslam.maps.occupancy import OccupancyGrid
+from lslam.reports.png import grey_png
 from lslam.types.cloud import Cloud
 from lslam.types.georeference import Georeference
 from lslam.types.trajectory import Trajectory
@@ -80,6 +85,26 @@ def write_geojson(path: Path, trajectory: Trajectory, georeference: Georeference
         "heights": "m above the WGS84 ellipsoid",
     }
     write_line(path, to_lat_lon(trajectory.positions, georeference), about)
+
+
+def write_occupancy(folder: Path, grid: OccupancyGrid, world: str) -> None:
+    """occupancy.npz and .ply, every cell that was seen, and floor_plan.png with floor_plan.yaml for ROS' map_server.
+
+    The PLY holds the middles of the cells, m, with `log_odds` in hundredths: above 0 occupied, below free.
+    """
+    stream = io.BytesIO()
+    np.savez_compressed(
+        stream, cells=grid.cells, log_odds=grid.log_odds, voxel=np.float64(grid.voxel), frame=np.array(world)
+    )
+    with atomic_write(folder / "occupancy.npz") as target:
+        target.write(stream.getbuffer())
+    comment = f"lslam {__version__} occupancy, cells of {grid.voxel:g} m; {world}"
+    write_ply(folder / "occupancy.ply", grid.centres, scalars={"log_odds": grid.log_odds}, comment=comment)
+    plan = floor_plan(grid)
+    with atomic_write(folder / "floor_plan.png") as target:
+        target.write(grey_png(plan.image))
+    with atomic_write(folder / "floor_plan.yaml") as target:
+        target.write(plan.yaml("floor_plan.png").encode())
 
 
 def write_json(path: Path, document: dict[str, Any]) -> None:

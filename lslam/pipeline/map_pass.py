@@ -15,6 +15,7 @@ from lslam.config.map import MapConfig
 from lslam.geometry.interpolate import poses_at
 from lslam.maps.clean import Cleaner, PosedScan
 from lslam.maps.merge import MapMerger, MergedMap
+from lslam.maps.occupancy import OccupancyGrid, OccupancyMapper
 from lslam.maps.top_view import top_view
 from lslam.pipeline.front_end import read_ahead
 from lslam.pipeline.tracker import sweep_seconds
@@ -29,12 +30,13 @@ log = logging.getLogger("lslam")
 
 @dataclass(frozen=True)
 class BuiltMap:
-    """The merged map, its view from above, and what was done to it, in words."""
+    """The merged map, its view from above, what was done to it, in words, and the occupancy when it was asked for."""
 
     merged: MergedMap
     image: NDArray[np.float32]
     extent: tuple[float, float, float, float]
     done: tuple[str, ...] = ()
+    occupancy: OccupancyGrid | None = None
 
 
 def build_map(
@@ -53,9 +55,15 @@ def build_map(
     poses = np.stack([r.T_world_lidar for r in results])
     cleaner = Cleaner() if section.clean else None
 
+    occupancy = None
+    if section.occupancy:
+        occupancy = OccupancyMapper(section.occupancy_voxel, section.range_min, section.occupancy_range, spool=spool)
+
     def merge(scans: Iterable[PosedScan]) -> None:
         for posed in scans:
             merger.add(posed.points, posed.T_world_lidar, posed.intensity)
+            if occupancy is not None:
+                occupancy.add(posed.points, posed.T_world_lidar)
 
     for loaded, result in zip(read_ahead(sequence, None, config.input.threads), results, strict=False):
         if should_stop():
@@ -71,7 +79,7 @@ def build_map(
         log.info("map: %d of %d points moved and are left out", cleaner.removed, cleaner.seen)
     merged = merger.result()
     image, extent = top_view(merged, pixel=max(0.2, config.map.voxel))
-    return BuiltMap(merged, image, extent, _done(section, cleaner))
+    return BuiltMap(merged, image, extent, _done(section, cleaner), None if occupancy is None else occupancy.result())
 
 
 def _done(section: MapConfig, cleaner: Cleaner | None) -> tuple[str, ...]:

@@ -16,7 +16,7 @@ from lslam.errors import InputError, InterruptedRunError, OutputError, OutputExi
 from lslam.formats.cloud_files import SUFFIXES
 from lslam.formats.trajectory_files import read_trajectory
 from lslam.maps.crispness import crispness
-from lslam.pipeline.map_files import LOCAL, MapNote, georeference_of, write_geojson, write_map
+from lslam.pipeline.map_files import LOCAL, MapNote, georeference_of, write_geojson, write_map, write_occupancy
 from lslam.pipeline.map_pass import build_map
 from lslam.pipeline.run_folder import MANIFEST
 from lslam.readers import open_sequence
@@ -129,6 +129,8 @@ def rebuild(
         raise InterruptedRunError("interrupted while the map was built: nothing is written")
     note = MapNote(sequence.name, run.config.map.voxel, built.done, f"{LOCAL}: {run.world}")
     write_map(path, built.merged, note, georeference)
+    if built.occupancy is not None:
+        write_occupancy(path.parent, built.occupancy, note.world)
     if georeference is not None:
         write_geojson(path.parent / "trajectory.geojson", run.trajectory, georeference, sequence.name)
     log.info("%d points in %s", len(built.merged), path)

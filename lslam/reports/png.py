@@ -27,13 +27,27 @@ def density_png(image: NDArray[Any], top: float | None = None) -> bytes:
     raw = np.zeros((height, 1 + packed.shape[1]), np.uint8)  # column 0: filter type none
     raw[:, 1:] = packed
     alpha = bytes(round(255 * (i / (LEVELS - 1)) ** 0.8) for i in range(LEVELS))
-    chunks = [
-        (b"IHDR", struct.pack(">IIBBBBB", width, height, 4, 3, 0, 0, 0)),
-        (b"PLTE", bytes(3 * LEVELS)),
-        (b"tRNS", alpha),
-        (b"IDAT", zlib.compress(raw.tobytes(), 6)),
-        (b"IEND", b""),
-    ]
+    return _png(
+        [
+            (b"IHDR", struct.pack(">IIBBBBB", width, height, 4, 3, 0, 0, 0)),
+            (b"PLTE", bytes(3 * LEVELS)),
+            (b"tRNS", alpha),
+            (b"IDAT", zlib.compress(raw.tobytes(), 6)),
+            (b"IEND", b""),
+        ]
+    )
+
+
+def grey_png(image: NDArray[np.uint8]) -> bytes:
+    """PNG of grey values (H, W), 0 black to 255 white."""
+    height, width = image.shape
+    raw = np.zeros((height, 1 + width), np.uint8)  # column 0: filter type none
+    raw[:, 1:] = image
+    header = struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)
+    return _png([(b"IHDR", header), (b"IDAT", zlib.compress(raw.tobytes(), 6)), (b"IEND", b"")])
+
+
+def _png(chunks: list[tuple[bytes, bytes]]) -> bytes:
     body = b"".join(
         struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data)) for kind, data in chunks
     )

@@ -1,0 +1,188 @@
+"""Occupancy by rays: cells a beam ends in are hit, cells it crosses are missed, over a hash of packed cell indices.
+
+A row is (key, a, low, high, stamp), int64. What a cell has seen is the function x -> clamp(x + a, low, high) of the log-odds
+x it had before: clamped updates, as OctoMap's (Hornung et al. 2013), are closed under composition, so parts of a
+recording that were summed apart can be put one after the other without loss.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.kernels.jit import inline, kernel
+
+AXIS_BITS = 21
+HALF = 1 << (AXIS_BITS - 1)
+COLUMNS = 5
+_MIX = -7046029254386353131
+
+
+@inline
+def _slot(key: int, mask: int) -> int:
+    mixed = key * _MIX
+    return (mixed ^ (mixed >> 29) ^ (mixed >> 43)) & mask
+
+
+@inline
+def _row_of(key: int, slots: NDArray[np.int32], rows: NDArray[np.int64], used: int) -> int:
+    """Row of a key; `used` when it has none yet, entered in `slots` then."""
+    mask = slots.shape[0] - 1
+    slot = _slot(key, mask)
+    row = slots[slot]
+    while row >= 0 and rows[row, 0] != key:
+        slot = (slot + 1) & mask
+        row = slots[slot]
+    if row < 0:
+        row = used
+        slots[slot] = row
+        rows[row, 0] = key
+        rows[row, 1] = 0
+        rows[row, 2] = -(1 << 40)
+        rows[row, 3] = 1 << 40
+        rows[row, 4] = -1
+    return int(row)
+
+
+@inline
+def _update(rows: NDArray[np.int64], row: int, change: int, low: int, high: int) -> None:
+    rows[row, 1] += change
+    rows[row, 2] = min(max(rows[row, 2] + change, low), high)
+    rows[row, 3] = min(max(rows[row, 3] + change, low), high)
+
+
+@kernel
+def mark_ends(
+    points: NDArray[np.float32],
+    T: NDArray[np.float64],
+    range_min: float,
+    range_max: float,
+    voxel: float,
+    origin: NDArray[np.int64],
+    slots: NDArray[np.int32],
+    rows: NDArray[np.int64],
+    used: int,
+    stamp: int,
+    model: NDArray[np.int64],
+) -> tuple[int, NDArray[np.float64]]:
+    """Update the cells that beams end in, once each; rows used now, and the ends (E, 3) to be cast to, in cells.
+
+    points : (N, 3) sensor frame, m; T : (4, 4) world from sensor; origin : (3,) cell in the middle of the key range
+    stamp : number of the scan; model : hit, miss, lowest, highest log-odds
+    Beams longer than `range_max` end there without a hit. One beam per end cell is cast.
+    """
+    ends = np.empty((len(points), 3))
+    count = 0
+    inverse = 1.0 / voxel
+    near = range_min * range_min
+    for far in range(2):  # hits first: they beat whatever else a scan says of a cell
+        for i in range(len(points)):
+            x, y, z = float(points[i, 0]), float(points[i, 1]), float(points[i, 2])
+            r2 = x * x + y * y + z * z
+            if not (r2 >= near and r2 > 0.0 and np.isfinite(r2)):
+                continue
+            r = math.sqrt(r2)
+            if (r > range_max) != (far == 1):
+                continue
+            if far:
+                s = range_max / r
+                x, y, z = x * s, y * s, z * s
+            cx = (T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3]) * inverse
+            cy = (T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3]) * inverse
+            cz = (T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3]) * inverse
+            ix = np.int64(np.floor(cx)) - origin[0] + HALF
+            iy = np.int64(np.floor(cy)) - origin[1] + HALF
+            iz = np.int64(np.floor(cz)) - origin[2] + HALF
+            if (ix | iy | iz) >> AXIS_BITS != 0:
+                continue
+            row = _row_of((ix << (2 * AXIS_BITS)) | (iy << AXIS_BITS) | iz, slots, rows, used)
+            used += row == used
+            if rows[row, 4] == stamp:
+                continue
+            rows[row, 4] = stamp
+            _update(rows, row, model[1] if far else model[0], model[2], model[3])
+            ends[count, 0], ends[count, 1], ends[count, 2] = cx, cy, cz
+            count += 1
+    return used, ends[:count]
+
+
+@kernel
+def carve(
+    ends: NDArray[np.float64],
+    begin: int,
+    start: NDArray[np.float64],
+    longest: int,
+    origin: NDArray[np.int64],
+    slots: NDArray[np.int32],
+    rows: NDArray[np.int64],
+    used: int,
+    stamp: int,
+    model: NDArray[np.int64],
+) -> tuple[int, int]:
+    """Miss every cell that the beams from `start` (3,) cross before they end, once each (Amanatides and Woo 1987).
+
+    ends, start : in cells; longest : no beam crosses more cells
+    Returns the rows used now, and the beam to go on with when `rows` has no room for another, else len(ends).
+    """
+    cell = np.empty(3, np.int64)
+    last = np.empty(3, np.int64)
+    step = np.empty(3, np.int64)
+    due = np.empty(3)
+    each = np.empty(3)
+    for i in range(begin, len(ends)):
+        if used + longest > rows.shape[0]:
+            return used, i
+        for k in range(3):
+            d = ends[i, k] - start[k]
+            cell[k] = np.int64(np.floor(start[k]))
+            last[k] = np.int64(np.floor(ends[i, k]))
+            step[k] = 1 if d > 0 else -1
+            each[k] = abs(1.0 / d) if d != 0.0 else np.inf
+            edge = cell[k] + 1.0 - start[k] if d > 0 else start[k] - cell[k]
+            due[k] = edge * each[k] if d != 0.0 else np.inf
+        for _ in range(longest):
+            if cell[0] == last[0] and cell[1] == last[1] and cell[2] == last[2]:
+                break
+            ix, iy, iz = cell[0] - origin[0] + HALF, cell[1] - origin[1] + HALF, cell[2] - origin[2] + HALF
+            if (ix | iy | iz) >> AXIS_BITS == 0:
+                row = _row_of((ix << (2 * AXIS_BITS)) | (iy << AXIS_BITS) | iz, slots, rows, used)
+                used += row == used
+                if rows[row, 4] != stamp:
+                    rows[row, 4] = stamp
+                    _update(rows, row, model[1], model[2], model[3])
+            k = 0 if due[0] <= due[1] and due[0] <= due[2] else 1 if due[1] <= due[2] else 2
+            if due[k] > 1.0:
+                break
+            cell[k] += step[k]
+            due[k] += each[k]
+    return used, len(ends)
+
+
+@kernel
+def enter(slots: NDArray[np.int32], rows: NDArray[np.int64], used: int) -> None:
+    """Enter the first `used` rows into `slots`, which are all -1 and a power of two above `used`."""
+    mask = slots.shape[0] - 1
+    for row in range(used):
+        slot = _slot(rows[row, 0], mask)
+        while slots[slot] >= 0:
+            slot = (slot + 1) & mask
+        slots[slot] = row
+
+
+@kernel
+def compose(rows: NDArray[np.int64]) -> NDArray[np.int64]:
+    """One row per key of rows (N, 5) sorted by key, those of one key in the order they happened."""
+    out = np.empty_like(rows)
+    count = 0
+    for i in range(len(rows)):
+        if count and out[count - 1, 0] == rows[i, 0]:
+            a, low, high = rows[i, 1], rows[i, 2], rows[i, 3]
+            out[count - 1, 1] += a
+            out[count - 1, 2] = min(max(out[count - 1, 2] + a, low), high)
+            out[count - 1, 3] = min(max(out[count - 1, 3] + a, low), high)
+        else:
+            out[count] = rows[i]
+            count += 1
+    return out[:count]

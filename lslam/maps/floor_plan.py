@@ -1,0 +1,77 @@
+"""A floor plan: what stands in the way of somebody on the ground, from an occupancy map."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.maps.occupancy import OccupancyGrid
+
+OCCUPIED, UNKNOWN, FREE = 0, 205, 254  # the grey values of ROS' map_server
+LOWEST, HIGHEST = 0.3, 2.0  # m above the floor: kerbs are walked over, canopies walked under
+_AROUND = 4.0  # m; what is narrower than twice that is no floor
+_LONGEST = 4000  # pixels
+
+
+@dataclass(frozen=True)
+class FloorPlan:
+    """Seen from above: image (H, W) uint8, row 0 at the largest y, of `OCCUPIED`, `UNKNOWN` and `FREE`.
+
+    resolution : m per pixel; x, y : world coordinates of the lower left corner of the lower left pixel, m
+    """
+
+    image: NDArray[np.uint8]
+    resolution: float
+    x: float
+    y: float
+
+    def yaml(self, image_name: str) -> str:
+        """What ROS' map_server loads beside the image."""
+        return (
+            f"image: {image_name}\nresolution: {self.resolution:.6g}\norigin: [{self.x:.6g}, {self.y:.6g}, 0.0]\n"
+            "negate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.196\n"
+        )
+
+
+def floor_plan(grid: OccupancyGrid) -> FloorPlan:
+    """Occupied: something stands `LOWEST` to `HIGHEST` above the floor; free: seen through there, or nothing but floor.
+
+    The floor follows the ground, and what is narrower than some metres stands on it; one cell more or less is no step, so
+    cells should be half as high as what matters. One unknown pixel without cells.
+    """
+    from scipy.ndimage import maximum_filter, minimum_filter
+
+    if not len(grid):
+        return FloorPlan(np.full((1, 1), UNKNOWN, np.uint8), grid.voxel, 0.0, 0.0)
+    low = grid.cells[:, :2].min(0)
+    size = grid.cells[:, :2].max(0) - low + 1
+    step = int(np.ceil(size.max() / _LONGEST))
+    columns = ((grid.cells[:, :2] - low) // step).astype(np.int64)
+    width, height = (int(n) for n in columns.max(0) + 1)
+    at = columns[:, 1] * width + columns[:, 0]
+    z = grid.cells[:, 2].astype(np.int64)
+    occupied = grid.is_occupied
+    nowhere = np.iinfo(np.int32).max
+    lowest = np.full(width * height, nowhere, np.int32)
+    np.minimum.at(lowest, at[occupied], z[occupied].astype(np.int32))
+    around = 2 * max(1, round(_AROUND / (grid.voxel * step))) + 1
+    # An opening: it follows slopes, and what is narrower stands on it.
+    eroded = minimum_filter(lowest.reshape(height, width), around, mode="nearest")
+    floor = maximum_filter(np.where(eroded == nowhere, -nowhere, eroded), around, mode="nearest").ravel()
+    above = (z - floor[at]) * grid.voxel
+    inside = (floor[at] != -nowhere) & (above >= max(LOWEST, 1.5 * grid.voxel)) & (above <= HIGHEST)
+    image = np.full(width * height, UNKNOWN, np.uint8)
+    image[lowest < nowhere] = FREE
+    image[at[inside & ~occupied]] = FREE
+    # Higher up only: neither ground nor way has been seen under it.
+    hidden = (lowest < nowhere) & ((lowest - floor) * grid.voxel > HIGHEST)
+    hidden[at[inside & ~occupied]] = False
+    image[hidden] = UNKNOWN
+    image[at[inside & occupied]] = OCCUPIED
+    resolution = grid.voxel * step
+    return FloorPlan(
+        np.ascontiguousarray(image.reshape(height, width)[::-1]), resolution, float(low[0] * grid.voxel),
+        float(low[1] * grid.voxel),
+    )  # fmt: skip

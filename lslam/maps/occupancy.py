@@ -1,0 +1,154 @@
+"""3D occupancy: where beams ended, where they passed, and what nobody has seen."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.errors import ConfigError
+from lslam.maps.sorted_runs import SortedRuns
+
+# Log-odds in hundredths: hit 0.7, miss 0.4, clamped to 0.12 and 0.97 (OctoMap's): what has left is free after some ten scans.
+MODEL = np.array([85, -41, -200, 350], np.int64)
+_START_ROWS = 1 << 17
+_MOST_ROWS = 4_000_000
+
+
+@dataclass(frozen=True)
+class OccupancyGrid:
+    """Cells that were seen, sorted by x, then y, then z; all others are unknown.
+
+    cells : (M, 3) int32, cell i covers [i, i + 1) * voxel of the world, m; log_odds : (M,) int16, hundredths
+    """
+
+    cells: NDArray[np.int32]
+    log_odds: NDArray[np.int16]
+    voxel: float
+
+    def __len__(self) -> int:
+        return len(self.cells)
+
+    @property
+    def is_occupied(self) -> NDArray[np.bool_]:
+        """(M,) more likely occupied than free."""
+        return np.asarray(self.log_odds > 0)
+
+    @property
+    def centres(self) -> NDArray[np.float64]:
+        """(M, 3) middles of the cells, m."""
+        return np.asarray((self.cells + 0.5) * self.voxel)
+
+
+class OccupancyMapper:
+    """Casts scans into cells; a scan says one thing about a cell, and a hit beats a miss.
+
+    Parameters
+    ----------
+    voxel : edge of a cell, m; range_min, range_max : m; farther points only free the cells up to there
+    spool : folder beside which large maps are kept meanwhile; None: the system's temporary one
+
+    Raises
+    ------
+    ConfigError : a cell or range that makes no sense. OutputError : the spool cannot be written
+
+    Examples
+    --------
+    >>> mapper = OccupancyMapper(1.0, range_min=0.0)
+    >>> mapper.add(np.array([[2.5, 0.5, 0.5]], np.float32), np.eye(4))
+    >>> grid = mapper.result()
+    >>> grid.cells.tolist(), grid.is_occupied.tolist()
+    ([[0, 0, 0], [1, 0, 0], [2, 0, 0]], [False, False, True])
+    """
+
+    def __init__(
+        self, voxel: float = 0.4, range_min: float = 1.0, range_max: float = 40.0, *, spool: Path | None = None,
+        most: int = _MOST_ROWS,
+    ) -> None:  # fmt: skip
+        if not (np.isfinite([voxel, range_max]).all() and voxel > 0 and 0 <= range_min < range_max):
+            raise ConfigError(
+                f"map.occupancy_voxel = {voxel}, ranges {range_min} to {range_max}: a cell above 0 m, a range_max above "
+                "range_min"
+            )
+        self._voxel, self._range = float(voxel), (float(range_min), float(range_max))
+        self._longest = int(3 * range_max / voxel) + 4
+        self._spool, self._most = spool, most
+        self._origin: NDArray[np.int64] | None = None
+        self._runs: SortedRuns | None = None
+        self._rows = np.empty((0, 5), np.int64)
+        self._slots = np.empty(0, np.int32)
+        self._used = 0
+        self.scans = 0
+        self._reserve(_START_ROWS)
+
+    def add(self, points: NDArray[Any], T_world_lidar: NDArray[np.float64]) -> None:
+        """One deskewed scan: points (N, 3) m in the LiDAR frame, its pose (4, 4); poses that are not finite are left out."""
+        from lslam.kernels.ray_cells import carve, mark_ends
+
+        T = np.ascontiguousarray(T_world_lidar, np.float64)
+        if not np.isfinite(T).all() or np.abs(T[:3, 3]).max() / self._voxel > 2.0**52:
+            return
+        cloud = np.ascontiguousarray(points, np.float32).reshape(-1, 3)
+        start = T[:3, 3] / self._voxel
+        if self._origin is None:
+            self._origin = np.floor(start).astype(np.int64)
+        if self._used > self._most:
+            self._spill()
+        self._reserve(self._used + len(cloud) + self._longest)
+        stamp = self.scans
+        self.scans += 1
+        self._used, ends = mark_ends(
+            cloud, T, *self._range, self._voxel, self._origin, self._slots, self._rows, self._used, stamp, MODEL
+        )
+        done = 0
+        while done < len(ends):
+            self._reserve(self._used + self._longest)
+            self._used, done = carve(
+                ends, done, start, self._longest, self._origin, self._slots, self._rows, self._used, stamp, MODEL
+            )
+
+    def result(self) -> OccupancyGrid:
+        """The cells seen so far; the mapper is empty then."""
+        from lslam.kernels.ray_cells import AXIS_BITS, HALF, compose
+
+        if self._runs is None:
+            rows = self._take()
+        else:
+            self._spill()
+            stored = self._runs.combined(compose)
+            rows = stored.read(0, len(stored))
+            self._runs = None
+        origin = np.zeros(3, np.int64) if self._origin is None else self._origin
+        cells = np.empty((len(rows), 3), np.int32)
+        for axis in range(3):
+            cells[:, axis] = ((rows[:, 0] >> (AXIS_BITS * (2 - axis))) & (2 * HALF - 1)) - HALF + origin[axis]
+        return OccupancyGrid(cells, np.clip(rows[:, 1], rows[:, 2], rows[:, 3]).astype(np.int16), self._voxel)
+
+    def _take(self) -> NDArray[np.int64]:
+        rows = self._rows[: self._used]
+        rows = rows[np.argsort(rows[:, 0])]
+        self._used = 0
+        self._slots[:] = -1
+        return rows
+
+    def _spill(self) -> None:
+        if self._runs is None:
+            self._runs = SortedRuns(self._spool)
+        self._runs.add(self._take())
+
+    def _reserve(self, rows: int) -> None:
+        """Room for `rows` rows; the slots stay at most two thirds full."""
+        from lslam.kernels.ray_cells import COLUMNS, enter
+
+        if rows > len(self._rows):
+            more = max(rows, len(self._rows) * 3 // 2)
+            grown = np.empty((more, COLUMNS), np.int64)
+            grown[: self._used] = self._rows[: self._used]
+            self._rows = grown
+        # The kernel fills rows to the last one.
+        if len(self._rows) * 3 > len(self._slots) * 2:
+            self._slots = np.full(1 << int(np.ceil(np.log2(len(self._rows) * 2))), -1, np.int32)
+            enter(self._slots, self._rows, self._used)
