@@ -15,6 +15,7 @@ from lslam.geometry import se3, so3
 from lslam.keyframes.store import KeyframeStore
 from lslam.keyframes.submaps import submap
 from lslam.loops.doubt import Doubt, OdometryDoubt
+from lslam.loops.level import find_up, levelled
 from lslam.loops.pace import Pace
 from lslam.loops.place import Place, make_place
 from lslam.loops.rivals import settle
@@ -36,8 +37,8 @@ LEAST_REACH, LEAST_TURN = 1.0, np.deg2rad(2.0)
 TURN_STEP, WIDEST_TURN = np.deg2rad(2.0), np.deg2rad(20.0)
 # Places this much less alike than the best are its rivals, so many at most; different ones of a town differ twice as much.
 RIVAL, RIVALS = 1.5, 3
-# Places kept ready.
-KEPT = 16
+# Places kept ready, and how many are looked at to find out which way is up.
+KEPT, LOOKS = 16, 8
 
 
 def find_loops(
@@ -88,8 +89,10 @@ class Detector:
         """All candidates in the order of the newer keyframe, with verdicts."""
         candidates: list[LoopCandidate] = []
         pace = Pace(self.config.spacing)
-        for b, keyframe in enumerate(self.keyframes):
-            older = self._gated(b)
+        gated = [self._gated(b) for b in range(len(self.keyframes))]
+        if any(len(older) for older in gated):
+            self._level_world()
+        for b, (keyframe, older) in enumerate(zip(self.keyframes, gated, strict=True)):
             if len(older) == 0:
                 pace.reset()
                 continue
@@ -105,6 +108,13 @@ class Detector:
                 keyframe.distance, "accepted" if any(c.verdict == "accepted" for c in examined) else "rejected"
             )
         return candidates
+
+    def _level_world(self) -> None:
+        """Turn the world so that z is up: places are compared from above. Relative poses stay as they are."""
+        shown = np.unique(np.linspace(0, len(self.keyframes) - 1, LOOKS).round().astype(int))
+        up = find_up([make_place(self._level(int(number)), self.registration).fine for number in shown])
+        self.keyframes = levelled(self.keyframes, up)
+        self.doubt = OdometryDoubt(self.keyframes, self.config.drift_percent, self.config.drift_deg)
 
     def _gated(self, b: int) -> NDArray[np.int64]:
         """Older keyframes that odometry allows to be the same place as `b`: near it, but not on the way just travelled."""

@@ -1,0 +1,45 @@
+"""Which way is up, where the world of odometry is as tilted as the sensor was at the first scan."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.geometry import se3, so3
+from lslam.registration.gaussian_map import GaussianMap
+from lslam.types.keyframe import Keyframe
+
+Floats = NDArray[np.float64]
+
+# Cosines: surfaces tilted by less against what is known of up so far are taken for ground, floors and flat roofs.
+ROUNDS = tuple(float(np.cos(np.deg2rad(limit))) for limit in (45.0, 30.0, 20.0, 15.0, 15.0))
+
+
+def find_up(maps: Iterable[GaussianMap]) -> Floats:
+    """(3,) unit vector: the mean normal of what lies nearly level, closer from round to round; z when nothing does."""
+    planes = [m.planes[m.planes[:, 7] >= 0, 3:6] for m in maps]
+    normals = np.concatenate([*planes, np.zeros((0, 3))])
+    up = np.array([0.0, 0.0, 1.0])
+    for limit in ROUNDS:
+        along = normals @ up
+        near = normals[np.abs(along) > limit] * np.sign(along[np.abs(along) > limit, None])
+        if len(near) == 0:
+            break
+        up = near.mean(axis=0)
+        up /= np.linalg.norm(up)
+    return up
+
+
+def levelled(keyframes: Sequence[Keyframe], up: Floats) -> list[Keyframe]:
+    """The keyframes in a world turned by the least rotation that makes the unit vector `up` (3,) its z axis."""
+    axis = np.cross(up, [0.0, 0.0, 1.0])
+    sine = float(np.linalg.norm(axis))
+    R = np.eye(3) if sine < 1e-12 else so3.exp(axis / sine * np.arctan2(sine, up[2]))
+    T, turn = se3.make(R, np.zeros(3)), np.kron(np.eye(2), R)
+    return [
+        replace(k, T_world_lidar=T @ k.T_world_lidar, covariance=None if k.covariance is None else turn @ k.covariance @ turn.T)
+        for k in keyframes
+    ]  # fmt: skip

@@ -1,0 +1,44 @@
+"""Which way is up: found of a tilted world, and the turned keyframes are the same keyframes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from known_town import keyframes_of, pose, round_the_square, seen, town
+
+from lslam.config.registration import RegistrationConfig
+from lslam.geometry import se3, so3
+from lslam.loops.level import find_up, levelled
+from lslam.loops.place import make_place
+
+
+@pytest.mark.parametrize("tilt", [(0, 0), (25, 0), (-15, 30)])
+def test_finds_up_in_a_tilted_world(tilt: tuple[float, float]) -> None:
+    R = pose(0, 0, roll_deg=tilt[0], pitch_deg=tilt[1])[:3, :3]
+    world, rng = town(), np.random.default_rng(0)
+    clouds = [seen(world, pose(x, -45), rng) for x in (-20.0, 15.0)]
+    maps = [make_place((cloud @ R.T).astype(np.float32), RegistrationConfig()).fine for cloud in clouds]
+    assert np.rad2deg(np.arccos(find_up(maps) @ R[:, 2])) < 1.0
+
+
+def test_up_stays_z_where_nothing_is_level() -> None:
+    assert (find_up([]) == (0, 0, 1)).all()
+    empty = make_place(np.zeros((0, 3), np.float32), RegistrationConfig()).fine
+    assert (find_up([empty]) == (0, 0, 1)).all()
+
+
+def test_levelled_keyframes_have_the_same_relative_poses_and_turned_covariances() -> None:
+    keyframes = [replace(k, covariance=np.diag([1.0, 2, 3, 4, 5, 6])) for k in
+                 keyframes_of(np.array([round_the_square(d) for d in (0.0, 30.0, 120.0)]))]  # fmt: skip
+    up = so3.exp(np.array([0.3, -0.2, 0.0]))[:, 2]
+    turned = levelled(keyframes, up)
+    for before, after in zip(keyframes, turned, strict=True):
+        relative = se3.relative(turned[0].T_world_lidar, after.T_world_lidar)
+        assert np.allclose(relative, se3.relative(keyframes[0].T_world_lidar, before.T_world_lidar))
+        R = after.T_world_lidar[:3, :3] @ before.T_world_lidar[:3, :3].T
+        assert np.allclose(R @ up, [0, 0, 1])
+        assert after.covariance is not None
+        assert np.allclose(after.covariance[:3, :3], R @ np.diag([1.0, 2, 3]) @ R.T)
+        assert np.allclose(after.covariance[3:, 3:], R @ np.diag([4.0, 5, 6]) @ R.T)
