@@ -32,6 +32,8 @@ Examples:
 @click.option("--crop", metavar="BOX", help="Keep x_min,x_max,y_min,y_max[,z_min,z_max] of the world, m.")
 @click.option("--clean", is_flag=True, help="Take out what moves: cars and people on their way.")
 @click.option("--occupancy", is_flag=True, help="Write occupied and free cells too, and a floor plan.")
+@click.option("--denoise", is_flag=True, help="Take out points far from their neighbours (Open3D).")
+@click.option("--mesh", is_flag=True, help="Write a surface too, FILE_mesh.ply (Open3D).")
 @click.option("--crs", metavar="EPSG:N", help="Coordinates of las and laz of a georeferenced run  [its UTM zone].")
 @click.option("--out", type=click.Path(path_type=Path), metavar="FILE", help="Map file  [RUN/map.FORMAT].")
 @click.option("--overwrite", is_flag=True, help="Replace files that are there.")
@@ -128,8 +130,7 @@ def _settings(given: dict[str, Any]) -> list[str]:
         if suffix in ("ply", "pcd", "las", "laz")
         else None,
         "crop": None if given["crop"] is None else f"[{given['crop']}]",
-        "clean": "true" if given["clean"] else None,
-        "occupancy": "true" if given["occupancy"] else None,
+        **{name: "true" if given[name] else None for name in ("clean", "occupancy", "denoise", "mesh")},
     }
     return [*given["settings"], *(f"map.{key}={value}" for key, value in flags.items() if value is not None)]
 

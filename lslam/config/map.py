@@ -30,6 +30,8 @@ class MapConfig(Section):
     )
     occupancy_voxel: float = Field(0.4, ge=0.02, description="m; edge of an occupancy cell")
     occupancy_range: float = Field(40.0, gt=0, description="m; beams are followed so far")
+    denoise: bool = Field(False, description="take out points far from their neighbours (statistical outlier removal)")
+    mesh: bool = Field(False, description="write map_mesh.ply, a surface through the points (Poisson)")
     ego_box: tuple[float, float, float, float, float, float] | None = Field(
         None,
         description="x_min, x_max, y_min, y_max, z_min, z_max in the LiDAR frame, m: points inside are left out; "

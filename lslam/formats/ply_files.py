@@ -73,6 +73,18 @@ def write_ply(
         stream.write(table.data)
 
 
+def write_ply_mesh(path: Path, vertices: NDArray[Any], triangles: NDArray[Any], comment: str = "") -> None:
+    """Write a surface of vertices (V, 3), m, as float32 and triangles (F, 3), binary little endian, atomically."""
+    faces = np.empty(len(triangles), np.dtype([("n", "u1"), ("v", "<i4", 3)]))
+    faces["n"], faces["v"] = 3, triangles
+    element = f"element face {len(faces)}\nproperty list uchar int vertex_indices\nend_header\n".encode()
+    header = ply_header(len(vertices), ["x", "y", "z"], comment).replace(b"end_header\n", element)
+    with atomic_write(path) as stream:
+        stream.write(header)
+        stream.write(np.ascontiguousarray(vertices, "<f4").data)
+        stream.write(faces.tobytes())
+
+
 def ply_header(count: int, names: Sequence[str], comment: str = "") -> bytes:
     """Header of `count` binary little-endian vertices of float32 properties."""
     comments = "".join(f"comment {line}\n" for line in comment.splitlines())

@@ -6,6 +6,7 @@ from lslam.config import Config
 from lslam.config.preset_files import read_preset
 from lslam.errors import UsageError, nearest
 from lslam.evaluation.relative import parse_delta
+from lslam.maps.mesh import require_open3d
 from lslam.odometry import FEATURE_METHODS, METHODS, known_methods
 
 # Methods that match a scan against Gaussian voxels, and what of `registration` only some methods look at.
@@ -19,7 +20,10 @@ HEEDED = {
 
 
 def check_config(config: Config) -> None:
-    """Raise UsageError for names that do not exist and keys that do nothing: before hours of work, not after."""
+    """Raise UsageError for names that do not exist and keys that do nothing: before hours of work, not after.
+
+    Raises InputError when the map asks for Open3D and it is missing.
+    """
     method = config.odometry.method
     if method not in (known := known_methods()):
         raise UsageError(f"no method {method!r}; {nearest(method, known)}")
@@ -31,6 +35,8 @@ def check_config(config: Config) -> None:
         )
     if method == "poses" and config.imu.use:
         raise UsageError("--imu does nothing with --poses, whose motion is given: drop one of them")
+    if config.map.write and (config.map.denoise or config.map.mesh):
+        require_open3d()
     _check_heeded(config)
     for delta in config.eval.delta:
         parse_delta(delta)

@@ -13,12 +13,13 @@ import numpy as np
 from lslam.formats.atomic import atomic_write
 from lslam.formats.cloud_files import write_cloud
 from lslam.formats.geojson import write_line
-from lslam.formats.ply_files import write_ply
+from lslam.formats.ply_files import write_ply, write_ply_mesh
 from lslam.maps.floor_plan import floor_plan
 from lslam.maps.georeference import ProjectedCloud, Projection, to_lat_lon
+from lslam.maps.mesh import surface
 from lslam.maps.occupancy import OccupancyGrid
 from lslam.reports.png import grey_png
-from lslam.types.cloud import Cloud
+from lslam.types.cloud import Cloud, in_memory
 from lslam.types.georeference import Georeference
 from lslam.types.trajectory import Trajectory
 from lslam.version import __version__
@@ -105,6 +106,12 @@ def write_occupancy(folder: Path, grid: OccupancyGrid, world: str) -> None:
         target.write(grey_png(plan.image))
     with atomic_write(folder / "floor_plan.yaml") as target:
         target.write(plan.yaml("floor_plan.png").encode())
+
+
+def write_mesh(path: Path, cloud: Cloud, note: MapNote, trajectory: Trajectory) -> None:
+    """A surface through the map as PLY, world frame, m."""
+    made = surface(in_memory(cloud), note.voxel, trajectory.positions)
+    write_ply_mesh(path, made.vertices, made.triangles, f"lslam {__version__} map surface; {note.world}")
 
 
 def write_json(path: Path, document: dict[str, Any]) -> None:

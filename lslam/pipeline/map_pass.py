@@ -14,12 +14,14 @@ from lslam.config import Config
 from lslam.config.map import MapConfig
 from lslam.geometry.interpolate import poses_at
 from lslam.maps.clean import Cleaner, PosedScan
-from lslam.maps.merge import MapMerger, MergedMap
+from lslam.maps.merge import MapMerger
+from lslam.maps.mesh import denoise
 from lslam.maps.occupancy import OccupancyGrid, OccupancyMapper
 from lslam.maps.top_view import top_view
 from lslam.pipeline.front_end import read_ahead
 from lslam.pipeline.tracker import sweep_seconds
 from lslam.preprocessing.deskew import KNOTS, deskew_points
+from lslam.types.cloud import Cloud, in_memory
 from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan import Scan
 from lslam.types.scan_result import ScanResult
@@ -32,7 +34,7 @@ log = logging.getLogger("lslam")
 class BuiltMap:
     """The merged map, its view from above, what was done to it, in words, and the occupancy when it was asked for."""
 
-    merged: MergedMap
+    merged: Cloud
     image: NDArray[np.float32]
     extent: tuple[float, float, float, float]
     done: tuple[str, ...] = ()
@@ -77,9 +79,13 @@ def build_map(
     if cleaner is not None:
         merge(cleaner.finish())
         log.info("map: %d of %d points moved and are left out", cleaner.removed, cleaner.seen)
-    merged = merger.result()
+    merged: Cloud = merger.result()
+    done = _done(section, cleaner)
+    if section.denoise:
+        before, merged = len(merged), denoise(in_memory(merged))
+        done = (*done, f"denoised: {before - len(merged)} of {before} points were far from their neighbours")
     image, extent = top_view(merged, pixel=max(0.2, config.map.voxel))
-    return BuiltMap(merged, image, extent, _done(section, cleaner), None if occupancy is None else occupancy.result())
+    return BuiltMap(merged, image, extent, done, None if occupancy is None else occupancy.result())
 
 
 def _done(section: MapConfig, cleaner: Cleaner | None) -> tuple[str, ...]:

@@ -87,6 +87,8 @@ def write_map(folder: RunFolder, built: BuiltMap, config: MapConfig, record: Run
     folder.require_space(BYTES_PER_POINT * len(built.merged), "the map")
     note = MapNote(record.name, config.voxel, built.done, f"{LOCAL}: {record.world}")
     map_files.write_map(folder.path / f"map.{config.format}", built.merged, note, record.georeference)
+    if config.mesh:
+        map_files.write_mesh(folder.path / "map_mesh.ply", built.merged, note, record.trajectory)
     if built.occupancy is not None:
         folder.require_space(BYTES_PER_POINT * len(built.occupancy), "the occupancy map")
         map_files.write_occupancy(folder.path, built.occupancy, note.world)

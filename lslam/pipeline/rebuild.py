@@ -16,7 +16,16 @@ from lslam.errors import InputError, InterruptedRunError, OutputError, OutputExi
 from lslam.formats.cloud_files import SUFFIXES
 from lslam.formats.trajectory_files import read_trajectory
 from lslam.maps.crispness import crispness
-from lslam.pipeline.map_files import LOCAL, MapNote, georeference_of, write_geojson, write_map, write_occupancy
+from lslam.maps.mesh import require_open3d
+from lslam.pipeline.map_files import (
+    LOCAL,
+    MapNote,
+    georeference_of,
+    write_geojson,
+    write_map,
+    write_mesh,
+    write_occupancy,
+)
 from lslam.pipeline.map_pass import build_map
 from lslam.pipeline.run_folder import MANIFEST
 from lslam.readers import open_sequence
@@ -117,6 +126,8 @@ def rebuild(
     """
     path = run.folder / f"map.{run.config.map.format}" if out is None else out
     check_output(path, overwrite)
+    if run.config.map.denoise or run.config.map.mesh:
+        require_open3d()
     georeference = run.georeference
     if crs is not None:
         if georeference is None:
@@ -129,6 +140,8 @@ def rebuild(
         raise InterruptedRunError("interrupted while the map was built: nothing is written")
     note = MapNote(sequence.name, run.config.map.voxel, built.done, f"{LOCAL}: {run.world}")
     write_map(path, built.merged, note, georeference)
+    if run.config.map.mesh:
+        write_mesh(path.with_name(f"{path.stem}_mesh.ply"), built.merged, note, run.trajectory)
     if built.occupancy is not None:
         write_occupancy(path.parent, built.occupancy, note.world)
     if georeference is not None:

@@ -7,6 +7,7 @@ import numpy as np
 from lslam.config import load_config
 from lslam.pipeline.map_pass import build_map, without_box
 from lslam.simulation.scenarios import simulate
+from lslam.types.cloud import in_memory
 from lslam.types.scan import Scan
 from lslam.types.scan_result import ScanResult
 
@@ -31,7 +32,7 @@ def test_settings_of_the_map_reach_it() -> None:
     def points(*settings: str) -> np.ndarray:
         built = build_map(drive, results, load_config(None, settings), lambda: None, lambda: False)
         assert built is not None
-        return built.merged.points
+        return in_memory(built.merged).points
 
     whole = points("map.range_max=30")
     cropped = points("map.range_max=30", "map.crop=[-3.0, 9.0, 0.0, 50.0]")
