@@ -13,8 +13,8 @@ from lslam.types.constraint import Constraint
 
 Floats = NDArray[np.float64]
 
-# The first pose, m and rad, when it is held, and when the fixes hold it.
-HELD, FREE = (1e-4, 1e-4), (1e3, 3.0)
+# The first pose, m and rad, when it is held, and when the fixes hold it; its tilt while up in its world is not known well.
+HELD, FREE, TILTING = (1e-4, 1e-4), (1e3, 3.0), 0.2
 # A gyroscope says nothing of positions, m.
 ANYWHERE = 1e4
 # No constraint is known better than this, m and rad: the optimiser's arithmetic.
@@ -48,16 +48,19 @@ def position(fix: PositionFix, scale: float = 1.0, kernel: Any = None) -> Any:
     return gtsam.GPSFactorArm(fix.keyframe, fix.position, fix.arm, _robust(model, kernel))
 
 
-def fixed_part(graph: PoseGraph, scale: float) -> Any:
-    """The factor graph of all that is never doubted; odometry's covariances times `scale`."""
+def fixed_part(graph: PoseGraph, may_tilt: bool = False) -> Any:
+    """The factor graph of all that is never doubted; with `may_tilt` the first pose holds but its heading and place."""
     import gtsam
 
     factors = gtsam.NonlinearFactorGraph()
     sigma_m, sigma_rad = HELD if graph.is_anchored else FREE
-    start = gtsam.noiseModel.Diagonal.Sigmas(np.array([sigma_rad] * 3 + [sigma_m] * 3))
+    held = np.diag(np.repeat([sigma_m**2, sigma_rad**2], 3))
+    if may_tilt:
+        held[3:, 3:] += TILTING**2 * (np.eye(3) - np.outer(graph.world_up, graph.world_up))
+    start = gtsam.noiseModel.Gaussian.Covariance(noise.to_body(held, graph.poses[0]))
     factors.add(gtsam.PriorFactorPose3(0, gtsam.Pose3(graph.poses[0]), start))
     for constraint in graph.odometry:
-        factors.add(between(constraint, scale))
+        factors.add(between(constraint))
     for up in graph.ups:
         model = gtsam.noiseModel.Isotropic.Sigma(2, up.sigma)
         factors.add(gtsam.AttitudeFactorPose3(up.keyframe, gtsam.Unit3(graph.world_up), model, gtsam.Unit3(up.up)))

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from lslam.config.graph import GraphConfig
 from lslam.geometry import noise, se3, so3
+from lslam.graph.drift import drift_covariance
 from lslam.types.constraint import Constraint
 from lslam.types.keyframe import Keyframe
 from lslam.types.scan_result import ScanResult
@@ -65,13 +66,13 @@ def growth(a: ScanResult, b: ScanResult, way: float, config: GraphConfig) -> Flo
 
 
 def corrected(
-    results: Sequence[ScanResult], keyframes: Sequence[Keyframe], poses: Floats, covariances: Floats, scale: float,
+    results: Sequence[ScanResult], keyframes: Sequence[Keyframe], poses: Floats, covariances: Floats, drift: float,
     config: GraphConfig,
 ) -> list[ScanResult]:  # fmt: skip
     """All scans where the optimised keyframes `poses` (K, 4, 4) put them, with covariances.
 
     Between two keyframes the correction is interpolated on SE(3) over time, so that no seam shows.
-    covariances : (K, 6, 6) of the keyframes in the world; scale : what odometry's own are multiplied by
+    covariances : (K, 6, 6) of the keyframes in the world; drift : how much odometry drifts beside its own, `Solution.drift`
     """
     scans = np.array([k.scan for k in keyframes])
     stamps = np.array([k.stamp_ns for k in keyframes], np.int64)
@@ -88,7 +89,7 @@ def corrected(
     out = []
     for i, result in enumerate(results):
         k = int(left[i] if share[i] < 0.5 else right[i])
-        S = _covariance(result, results[scans[k]], final[i], moved[i], poses[k], covariances[k], scale, config)
+        S = _covariance(result, results[scans[k]], final[i], moved[i], poses[k], covariances[k], drift, config)
         out.append(replace(result, T_world_lidar=final[i], covariance=S))
     return out
 
@@ -102,12 +103,13 @@ def positive(covariance: Floats) -> Floats:
 
 def _covariance(
     result: ScanResult, keyframe: ScanResult, final: Floats, moved: Floats, pose: Floats, covariance: Floats,
-    scale: float, config: GraphConfig,
+    drift: float, config: GraphConfig,
 ) -> Floats:  # fmt: skip
     """(6, 6) of a scan's pose: its keyframe's, what odometry adds between them, and its own registration."""
     step = final[:3, 3] - pose[:3, 3]
     first, last = (keyframe, result) if keyframe.stamp_ns <= result.stamp_ns else (result, keyframe)
-    grown = scale * growth(first, last, float(np.linalg.norm(step)), config)
+    way = float(np.linalg.norm(step))
+    grown = growth(first, last, way, config) + drift * drift_covariance(way, config)
     if result.registration_covariance is not None:
         grown = grown + result.registration_covariance
     turned = noise.rotated(grown, so3.normalise(final[:3, :3] @ moved[:3, :3].T))

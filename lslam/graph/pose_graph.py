@@ -15,9 +15,9 @@ from lslam.errors import GraphError
 from lslam.geometry import se3
 from lslam.graph import factors
 from lslam.graph.consistency import judge_loops
+from lslam.graph.drift import drift_factor, with_drift
 from lslam.graph.problem import PoseGraph, Solution
-from lslam.graph.robust import Doubted, settle
-from lslam.graph.scale import odometry_scale
+from lslam.graph.robust import Doubted, joined, settle
 from lslam.graph.solve import marginals, solve_incrementally
 
 Floats = NDArray[np.float64]
@@ -26,7 +26,7 @@ Floats = NDArray[np.float64]
 def optimise(graph: PoseGraph, config: GraphConfig) -> Solution:
     """Poses and covariances of all keyframes, and which loops and fixes were believed.
 
-    Loops that contradict each other or odometry go first; odometry's covariances are scaled to what the loops left show;
+    Loops that contradict each other or odometry go first; odometry's covariances grow by the drift that the loops left show;
     then everything is solved together, loops and fixes that still do not fit being given up on the way.
 
     Raises GraphError when the graph is in pieces, singular or not finite.
@@ -37,33 +37,51 @@ def optimise(graph: PoseGraph, config: GraphConfig) -> Solution:
     stages = ["consistency" if reason else "graph" for reason in reasons]
     kept = [i for i, reason in enumerate(reasons) if not reason]
     loops = [graph.loops[i] for i in kept]
-    scale = odometry_scale(graph, loops)
-    fixed = factors.fixed_part(graph, scale)
+    drift = drift_factor(graph, loops, config)
+    graph = replace(graph, odometry=with_drift(graph.odometry, drift, config))
+    may_tilt = graph.is_anchored and len(graph.ups) > 0
+    fixed = factors.fixed_part(graph, may_tilt)
     doubted = [Doubted(partial(factors.between, loop), 6) for loop in loops]
     doubted += [Doubted(partial(factors.position, fix), 3) for fix in graph.fixes]
     values = factors.start_values(graph, graph.poses)
     if config.incremental:
-        everything = factors.fixed_part(graph, scale)
-        for item in doubted:
-            everything.add(item.make(1.0, None))
+        everything = joined(fixed, [item.make(1.0, None) for item in doubted])
         values = solve_incrementally(everything, values, len(graph))
     settled = settle(fixed, doubted, values, config)
     poses = se3.normalise(factors.poses_of(settled.values, len(graph)))
     if not np.isfinite(poses).all():
         raise GraphError("the pose graph cannot be optimised: its poses are not finite")
+    if may_tilt:
+        poses, covariances = _upright(
+            graph, poses, [d for d, w in zip(doubted, settled.weights, strict=True) if w >= 0.5]
+        )
+    else:
+        covariances = marginals(settled.factors, settled.values, poses)
     for i, weight, squared, limit in zip(kept, settled.weights, settled.squared, settled.limits, strict=False):
         if weight < 0.5:
             reasons[i] = f"{np.sqrt(squared / limit):.1f} times as far as it may be from where all others put it"
     return Solution(
         poses=poses,
-        covariances=marginals(settled.factors, settled.values, poses),
+        covariances=covariances,
         loop_reasons=reasons,
         loop_stages=stages,
         fix_believed=settled.weights[len(loops) :] >= 0.5,
-        odometry_scale=scale,
+        drift=drift,
         rounds=settled.rounds,
         error=float(settled.factors.error(settled.values)),
     )
+
+
+def _upright(graph: PoseGraph, poses: Floats, believed: list[Doubted]) -> tuple[Floats, Floats]:
+    """The solution with its first pose where it was, and its covariances as seen from there.
+
+    Which way is up in the world came out of the solution: gravity bends no trajectory to a first guess of it.
+    """
+    back = graph.poses[0] @ se3.inverse(poses[0])
+    poses = se3.normalise(back @ poses)
+    turned = replace(graph, world_up=back[:3, :3] @ graph.world_up)
+    whole = joined(factors.fixed_part(turned), [item.make(1.0, None) for item in believed])
+    return poses, marginals(whole, factors.start_values(turned, poses), poses)
 
 
 def check_graph(graph: PoseGraph) -> None:

@@ -89,7 +89,7 @@ class Solution:
     loop_reasons : per loop of the graph, empty when it was believed, else why not
     loop_stages : per loop, what decided: `consistency` or `graph`
     fix_believed : (F,) bool per fix
-    odometry_scale : the factor odometry's covariances were too small by, 1 when loops bear them out
+    drift : factor on `graph.drift.drift_covariance` that odometry's covariances were short of, 0 when loops bear them out
     rounds : solutions it took; error : half the sum of squared whitened residuals at the end
     """
 
@@ -98,6 +98,6 @@ class Solution:
     loop_reasons: list[str]
     loop_stages: list[str]
     fix_believed: NDArray[np.bool_]
-    odometry_scale: float
+    drift: float
     rounds: int
     error: float

@@ -56,7 +56,7 @@ def settle(fixed: Any, doubted: Sequence[Doubted], values: Any, config: GraphCon
     plain = [d.make(1.0, None) for d in doubted]
     if config.robust == "gnc":
         return _graduated(fixed, doubted, plain, limits, values, config)
-    factors = _joined(fixed, [d.make(1.0, _kernel(config.robust, d.dim)) for d in doubted])
+    factors = joined(fixed, [d.make(1.0, _kernel(config.robust, d.dim)) for d in doubted])
     values = solve(factors, values, config)
     squared = _squared(plain, values)
     believed = (squared <= limits) | (config.robust == "none")
@@ -67,7 +67,7 @@ def _graduated(
     fixed: Any, doubted: Sequence[Doubted], plain: list[Any], limits: Floats, values: Any, config: GraphConfig
 ) -> Settled:
     weights = np.ones(len(plain))
-    factors = _joined(fixed, plain)
+    factors = joined(fixed, plain)
     values = solve(factors, values, config)
     squared = _squared(plain, values)
     rounds = 1
@@ -77,7 +77,7 @@ def _graduated(
     mu = 1.0 / (2.0 * ratio - 1.0)
     while rounds < ROUNDS:
         weights = _weights(squared / limits, mu)
-        factors = _joined(fixed, _weighted(doubted, plain, weights))
+        factors = joined(fixed, _weighted(doubted, plain, weights))
         values = solve(factors, values, config)
         squared = _squared(plain, values)
         rounds += 1
@@ -87,7 +87,7 @@ def _graduated(
     # The last word: what fits is in, with its own covariance, what does not is out.
     believed = squared <= limits
     weights = believed.astype(float)
-    factors = _joined(fixed, [f for f, b in zip(plain, believed, strict=True) if b])
+    factors = joined(fixed, [f for f, b in zip(plain, believed, strict=True) if b])
     values = solve(factors, values, config)
     return Settled(factors, values, weights, _squared(plain, values), limits, rounds + 1)
 
@@ -107,7 +107,8 @@ def _weighted(doubted: Sequence[Doubted], plain: list[Any], weights: Floats) -> 
     return chosen
 
 
-def _joined(fixed: Any, more: list[Any]) -> Any:
+def joined(fixed: Any, more: list[Any]) -> Any:
+    """The factor graph `fixed` and more factors; `fixed` stays as it is."""
     import gtsam
 
     factors = gtsam.NonlinearFactorGraph(fixed)

@@ -109,8 +109,8 @@ def _solved(
         return None
     judged, believed = _verdicts(candidates, graph, solution)
     log.info(
-        "pose graph: %d keyframes, %d of %d loops believed, covariances of odometry times %.1f, %d rounds",
-        len(graph), len(believed), len(graph.loops), solution.odometry_scale, solution.rounds,
+        "pose graph: %d keyframes, %d of %d loops believed, drift beside odometry's covariances %.3g, %d rounds",
+        len(graph), len(believed), len(graph.loops), solution.drift, solution.rounds,
     )  # fmt: skip
     facts = _facts(solution, graph, candidates, believed)
     if not (believed or graph.fixes or graph.floors):
@@ -119,9 +119,7 @@ def _solved(
     if georeference is not None:
         T = georeference.T_enu_world
         georeference = _scored(georeference, graph, solution)
-    moved = corrected(
-        results, store.keyframes, solution.poses, solution.covariances, solution.odometry_scale, config.graph
-    )
+    moved = corrected(results, store.keyframes, solution.poses, solution.covariances, solution.drift, config.graph)
     return BackEnd(moved, judged, solution.poses, [*graph.odometry, *believed], georeference, T, facts)
 
 
@@ -202,7 +200,7 @@ def _facts(
         "fixes": int(solution.fix_believed.sum()),
         "gravity_factors": len(graph.ups),
         "floor_factors": len(graph.floors),
-        "odometry_covariance_scale": round(solution.odometry_scale, 2),
+        "drift_factor": round(solution.drift, 4),
         "rounds": solution.rounds,
         "largest_correction_m": round(float(np.linalg.norm(moved, axis=1).max()), 4),
     }

@@ -76,7 +76,7 @@ def test_a_correction_that_is_rigid_moves_all_scans_alike() -> None:
     keyframes = keyframes_of(results)
     D = se3.exp(np.array([3.0, -2.0, 1.0, 0.02, -0.01, 0.3]))
     poses = np.stack([D @ k.T_world_lidar for k in keyframes])
-    final = corrected(results, keyframes, poses, np.zeros((12, 6, 6)), 1.0, GraphConfig())
+    final = corrected(results, keyframes, poses, np.zeros((12, 6, 6)), 0.0, GraphConfig())
     np.testing.assert_allclose(np.stack([r.T_world_lidar for r in final]), D @ POSES, atol=1e-9)
 
 
@@ -85,7 +85,7 @@ def test_between_keyframes_corrections_blend_without_a_seam() -> None:
     results = results_of(POSES)
     keyframes = keyframes_of(results, 6)
     poses = measured(np.stack([k.T_world_lidar for k in keyframes]), 10 * STEP_SIGMAS, rng)
-    final = corrected(results, keyframes, poses, np.zeros((len(keyframes), 6, 6)), 1.0, GraphConfig())
+    final = corrected(results, keyframes, poses, np.zeros((len(keyframes), 6, 6)), 0.0, GraphConfig())
     for keyframe, pose in zip(keyframes, poses, strict=True):
         np.testing.assert_allclose(final[keyframe.scan].T_world_lidar, pose, atol=1e-12)
     before = se3.relative(POSES[:-1], POSES[1:])

@@ -1,0 +1,120 @@
+"""How much odometry drifts beyond what its covariances say, as loops and fixes reveal it.
+
+A registration knows its noise, not what makes every scan wrong alike (a range bias, a bent calibration), and the latter adds
+up. Loops see the sum: the drift is that with which the typical loop is as far from odometry as it should be.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from lslam.config.graph import GraphConfig
+from lslam.geometry import noise, se3, so3
+from lslam.graph.problem import PoseGraph
+from lslam.types.constraint import Constraint
+
+Floats = NDArray[np.float64]
+
+# Loops that are looked at, evenly spread, and the factors between which the drift's variance is looked for.
+MOST, SMALLEST, LARGEST = 300, 1e-8, 1e8
+
+
+def drift_covariance(way: float, config: GraphConfig) -> Floats:
+    """(6, 6) of random drift over `way` m, in proportion `drift_percent` per m to `drift_deg_per_100m`, at factor 1.
+
+    A walk: its variance grows with the way, so that a path in many steps and in few drifts alike.
+    """
+    turn = np.deg2rad(config.drift_deg_per_100m) / 100
+    return np.diag(np.repeat([(0.01 * config.drift_percent) ** 2 * way, turn**2 * way], 3))
+
+
+def with_drift(odometry: Sequence[Constraint], factor: float, config: GraphConfig) -> list[Constraint]:
+    """Odometry's constraints with `factor` times the drift over their length."""
+    if factor == 0:
+        return list(odometry)
+    return [replace(c, covariance=c.covariance + factor * drift_covariance(_length(c), config)) for c in odometry]
+
+
+def drift_factor(graph: PoseGraph, loops: Sequence[Constraint], config: GraphConfig) -> float:
+    """The factor on `drift_covariance`, 0 where none is needed, with which median loop and fix are where they should be."""
+    if not loops and len(graph.fixes) < 2:
+        return 0.0
+    known = _accumulated(graph.poses, graph.odometry)
+    drift = _accumulated(
+        graph.poses, [replace(c, covariance=drift_covariance(_length(c), config)) for c in graph.odometry]
+    )
+    by_loops = _of_loops(graph, loops, known, drift) if loops else 0.0
+    return max(by_loops, _of_fixes(graph, known, drift))
+
+
+def _accumulated(poses: Floats, odometry: Sequence[Constraint]) -> Floats:
+    """(K, 6, 6) of each pose in the world when only odometry, from each keyframe to the next, is known."""
+    total = np.zeros((len(poses), 6, 6))
+    steps = {c.b: c for c in odometry if c.b == c.a + 1}
+    for k in range(1, len(poses)):
+        moved = noise.transported(total[k - 1], poses[k, :3, 3] - poses[k - 1, :3, 3])
+        added = noise.rotated(steps[k].covariance, poses[k - 1, :3, :3]) if k in steps else 0.0
+        total[k] = moved + added
+    return total
+
+
+def _between(chain: Floats, poses: Floats, a: NDArray[np.intp], b: NDArray[np.intp]) -> Floats:
+    """(P, 6, 6) of keyframes `b` seen from `a`, world axes."""
+    return np.asarray(chain[b] - noise.transported(chain[a], poses[b, :3, 3] - poses[a, :3, 3]))
+
+
+def _of_loops(graph: PoseGraph, loops: Sequence[Constraint], known: Floats, drift: Floats) -> float:
+    few = [loops[i] for i in np.unique(np.linspace(0, len(loops) - 1, MOST).round().astype(int))]
+    a, b = np.array([c.a for c in few]), np.array([c.b for c in few])
+    T = np.stack([c.T_a_b for c in few])
+    R_a = graph.poses[a, :3, :3]
+    odometry = se3.relative(graph.poses[a], graph.poses[b])
+    turn = so3.log(T[:, :3, :3] @ np.swapaxes(odometry[:, :3, :3], -1, -2))
+    error = np.concatenate([T[:, :3, 3] - odometry[:, :3, 3], turn], axis=1)
+    own, grown = (
+        noise.rotated(_between(chain, graph.poses, a, b), np.swapaxes(R_a, -1, -2)) for chain in (known, drift)
+    )
+    return _fitting(error, own + np.stack([c.covariance for c in few]), grown)
+
+
+def _of_fixes(graph: PoseGraph, known: Floats, drift: Floats) -> float:
+    """By pairs of fixes, half the fixes apart: how the way between them differs from odometry's."""
+    half = len(graph.fixes) // 2
+    if not half:
+        return 0.0
+    first = np.unique(np.linspace(0, len(graph.fixes) - half - 1, MOST).round().astype(int))
+    k = np.array([f.keyframe for f in graph.fixes])
+    arms = np.stack([f.arm for f in graph.fixes])
+    antenna = np.einsum("fij,fj->fi", graph.poses[k, :3, :3], arms) + graph.poses[k, :3, 3]
+    off = np.stack([f.position for f in graph.fixes]) - antenna
+    own = np.stack([f.sigma for f in graph.fixes]) ** 2
+    a, b = k[first], k[first + half]
+    noise_of_pair = (own[first] + own[first + half])[:, :, None] * np.eye(3)
+    moved, grown = (_between(chain, graph.poses, a, b)[:, :3, :3] for chain in (known, drift))
+    return _fitting(off[first + half] - off[first], moved + noise_of_pair, grown)
+
+
+def _fitting(error: Floats, own: Floats, grown: Floats) -> float:
+    """The factor on `grown` (P, n, n), beside `own`, with which the median error (P, n) is as large as it should be."""
+    typical = float(chi2.median(error.shape[1]))
+
+    def is_enough(factor: float) -> bool:
+        solved = np.linalg.solve(factor * grown + own, error[..., None])[..., 0]
+        return bool(np.median(np.einsum("ij,ij->i", error, solved)) <= typical)
+
+    if is_enough(0.0):
+        return 0.0
+    low, high = np.log(SMALLEST), np.log(LARGEST)
+    while high - low > 0.01:
+        middle = 0.5 * (low + high)
+        low, high = (low, middle) if is_enough(float(np.exp(middle))) else (middle, high)
+    return float(np.exp(high))
+
+
+def _length(constraint: Constraint) -> float:
+    return float(np.linalg.norm(constraint.T_a_b[:3, 3]))
