@@ -36,6 +36,19 @@ class OsmConfig(Section):
     wall_gap: float = Field(1.0, gt=0, description="m; a wider gap parts two walls on one line")
     min_cluster: int = Field(20, ge=3, description="points a wall has at least")
     min_length: float = Field(2.0, gt=0, description="m; shorter walls are left out")
+    wall_sigma: float = Field(0.3, gt=0, description="m; one sigma of a wall of the map, drawn by hand from the air")
+    max_distance: float = Field(1.0, gt=0, description="m; mean distance of walls that counts as no match (eq. 3.1)")
+    distance_weight: float = Field(1.0, ge=0, description="A of equation 3.1")
+    coverage_weight: float = Field(1.0, ge=0, description="B of equation 3.2")
+    translation_weight: float = Field(0.1, ge=0, description="C of equation 3.3, of the way to the edge of the window")
+    line_weight: float = Field(
+        0.25, gt=0, le=1, description="information of a match of parallel walls only, against one with corners"
+    )
+    min_coverage: float = Field(0.4, ge=0, le=1, description="share of the walls seen that must lie on the map")
+    min_building_coverage: float = Field(0.1, ge=0, le=1, description="share of a building's walls that must be seen")
+    rival_margin: float = Field(
+        15.0, ge=0, description="another pose with so little less fitness makes a match a guess"
+    )
 
     @model_validator(mode="after")
     def _check(self) -> OsmConfig:
