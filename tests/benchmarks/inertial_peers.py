@@ -24,6 +24,7 @@ from lslam.evaluation.evaluate import evaluate
 from lslam.formats.trajectory_files import read_trajectory
 from lslam.pipeline.run import run
 from lslam.readers import open_sequence
+from lslam.types.scan import Scan
 from lslam.types.sequence import Sequence
 from lslam.types.trajectory import Trajectory
 
@@ -40,20 +41,27 @@ def ours(sequence: Sequence, scans: int, method: str, use_imu: bool) -> Outcome:
     return np.stack([r.T_world_lidar for r in results]), np.array(seconds)
 
 
+def times_of(scan: Scan, sequence: Sequence) -> Floats:
+    """Seconds since scan start; evenly over the sweep where points have none."""
+    if scan.times is None:
+        return np.linspace(0.0, 1.0 / sequence.rate_hz, len(scan))
+    return scan.times.astype(np.float64)
+
+
 def genz_icp(sequence: Sequence, scans: int) -> Outcome:
-    """genz-icp with its deskew switched on."""
+    """genz-icp with its deskew switched on where there is something to deskew."""
     from genz_icp.config import GenZConfig
     from genz_icp.genz_icp import GenZICP
 
     config = GenZConfig()
-    config.data.deskew = True
+    config.data.deskew = not sequence.motion_compensated
     genz = GenZICP(config)
     poses, seconds = [], []
     for i in range(scans):
         scan = sequence.scan(i)
-        assert scan.times is not None
+        times = times_of(scan, sequence)
         began = time.perf_counter()
-        genz.register_frame(scan.points.astype(np.float64), scan.times.astype(np.float64) / float(scan.times.max()))
+        genz.register_frame(scan.points.astype(np.float64), times / float(times.max()))
         seconds.append(time.perf_counter() - began)
         poses.append(np.array(genz.last_pose))
     return np.stack(poses), np.array(seconds)
@@ -67,12 +75,11 @@ def rko_lio(sequence: Sequence, scans: int) -> Outcome:
     imu, T_lidar_imu = sequence.imu, sequence.calibration.T_lidar_imu
     assert imu is not None
     assert T_lidar_imu is not None
-    lio, told = LIO(LIOConfig()), 0
+    lio, told = LIO(LIOConfig(deskew=not sequence.motion_compensated)), 0
     poses, seconds = [], []
     for i in range(scans):
         scan = sequence.scan(i)
-        assert scan.times is not None
-        stamps = scan.stamp_ns + np.round(1e9 * scan.times.astype(np.float64)).astype(np.int64)
+        stamps = scan.stamp_ns + np.round(1e9 * times_of(scan, sequence)).astype(np.int64)
         began = time.perf_counter()
         while told < len(imu) and imu.stamps_ns[told] <= stamps.max():
             lio.add_imu_measurement(imu.accel[told], imu.gyro[told], int(imu.stamps_ns[told]), T_lidar_imu)
