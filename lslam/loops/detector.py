@@ -62,6 +62,15 @@ def find_loops(
     return candidates
 
 
+def warm_up() -> None:
+    """Compile or load every kernel that loops need, by comparing a small room with itself."""
+    room = np.random.default_rng(0).uniform(-8, 8, (3000, 3)).astype(np.float32)
+    room[np.arange(3000), np.arange(3000) % 3] = 8.0
+    PlaceIndex().add(0, room)
+    place = make_place(room, RegistrationConfig())
+    Verifier(LoopsConfig(), RegistrationConfig()).compare(place, place, np.zeros(3), LEAST_REACH, [0.0])
+
+
 class Detector:
     """Looks for loop closures among keyframes.
 

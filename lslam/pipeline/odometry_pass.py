@@ -10,6 +10,7 @@ from lslam.config import Config
 from lslam.errors import InputError
 from lslam.kernels import jit
 from lslam.keyframes.store import KeyframeStore
+from lslam.loops import detector
 from lslam.maps import crispness, merge
 from lslam.odometry.base import Odometry
 from lslam.odometry.given import GivenPoses
@@ -99,6 +100,8 @@ def _warm_up(
             odometry.warm_up()
         if standing is not None:
             standing.warm_up()
+        if config.loops.use:
+            detector.warm_up()
         if config.map.write:
             merge.warm_up()
             crispness.warm_up()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,8 +14,9 @@ from numpy.typing import NDArray
 from lslam.config.loops import LoopsConfig
 from lslam.config.registration import RegistrationConfig
 from lslam.geometry import se3, so3
+from lslam.kernels import gauss_newton, gaussians, polar_image
 from lslam.keyframes.store import KeyframeStore
-from lslam.loops.detector import Detector, find_loops
+from lslam.loops.detector import Detector, find_loops, warm_up
 from lslam.types.constraint import LoopCandidate
 
 Floats = NDArray[np.float64]
@@ -170,3 +172,13 @@ def test_joins_the_clouds_of_a_store() -> None:
     closures = accepted(find_loops(store, LoopsConfig(), RegistrationConfig()))
     assert len(closures) >= 3
     assert (errors(closures, true) < (0.1, 0.1)).all()
+
+
+def test_after_a_warm_start_nothing_is_left_to_compile() -> None:
+    warm_up()
+    kernels: list[Any] = [polar_image.polar_image, gaussians.insert, gaussians.coarsen, gauss_newton.align]
+    before = [len(kernel.signatures) for kernel in kernels]
+    assert all(before)
+    true = np.array([round_the_square(d) for d in np.arange(0, 380, 10.0)])
+    assert accepted(detect(town(), true, drifted(true)))
+    assert [len(kernel.signatures) for kernel in kernels] == before
