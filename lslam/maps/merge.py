@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from lslam.errors import ConfigError, InputError
 from lslam.maps.sorted_runs import SortedRuns, StoredRows
 from lslam.types.cloud import BLOCK, CloudBlock, in_memory
+from lslam.types.state import State
 
 log = logging.getLogger("lslam")
 
@@ -91,6 +92,7 @@ class MapMerger:
     range_min, range_max : m from the sensor; points outside, and NaN, Inf and zero points, are left out
     crop : x_min, x_max, y_min, y_max, z_min, z_max of the world, m; points outside are left out
     spool : folder beside which large maps are kept meanwhile; None: the system's temporary one
+    keep : folder in which they stay instead, so that `state` and `restore` work
 
     Attributes
     ----------
@@ -111,7 +113,8 @@ class MapMerger:
 
     def __init__(
         self, voxel: float = 0.2, range_min: float = 2.0, range_max: float = 80.0, *,
-        crop: Any = None, spool: Path | None = None, most: int = _MOST_ROWS,
+        crop: Any = None, spool: Path | None = None, keep: Path | None = None,
+        most: int = _MOST_ROWS,
     ) -> None:  # fmt: skip
         if not (np.isfinite(voxel) and voxel > 0):
             raise ConfigError(f"map.voxel = {voxel}: the voxel must be a positive number of metres, for example 0.2")
@@ -126,7 +129,7 @@ class MapMerger:
         self._rows = np.empty((_START_ROWS, 5), np.int64)
         self._slots = np.full(2 * _START_ROWS, -1, np.int32)
         self._crop = _EVERYWHERE if crop is None else np.asarray(crop, np.float64).reshape(6)
-        self._spool, self._most = spool, most
+        self._spool, self._keep, self._most = spool, keep, most
         self._runs: SortedRuns | None = None
         self._with_intensity: bool | None = None
         self._used = 0
@@ -187,6 +190,26 @@ class MapMerger:
             self._runs = None
         return MergedMap(rows, origin, self._voxel, bool(self._with_intensity))
 
+    def state(self) -> State:
+        """What `restore` needs to go on from here; the voxels go to `keep`, only those that changed since the last time."""
+        if self._used:
+            self._spill()
+        counts = (self.scans, self.gated, self.outside, self.refused)
+        runs = None if self._runs is None else self._runs.state()
+        return {"origin": self._origin, "with_intensity": self._with_intensity, "counts": counts, "runs": runs}
+
+    def restore(self, state: State) -> None:
+        """Go on where `state` was taken, in an empty merger of the same kind; raises InputError when voxels are missing."""
+        if state["runs"] is not None:
+            runs = SortedRuns(self._spool, self._keep)
+            runs.restore(state["runs"])
+            self._runs = runs
+        self._origin = state["origin"]
+        self.scans, self.gated, self.outside, self.refused = state["counts"]
+        if state["with_intensity"] is not None:
+            self._with_intensity = bool(state["with_intensity"])
+            self._rows = np.empty((_START_ROWS, 6 if self._with_intensity else 5), np.int64)
+
     def _take(self) -> NDArray[np.int64]:
         """The rows in memory, sorted; none are left."""
         rows = self._rows[: self._used]
@@ -197,7 +220,7 @@ class MapMerger:
 
     def _spill(self) -> None:
         if self._runs is None:
-            self._runs = SortedRuns(self._spool)
+            self._runs = SortedRuns(self._spool, self._keep)
         self._runs.add(self._take())
 
     def _settle_intensity(self, given: bool) -> None:

@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.errors import OutputError
+from lslam.errors import InputError, OutputError
+from lslam.types.state import State
 
 Rows = NDArray[np.int64]
 Combine = Callable[[Rows], Rows]
@@ -26,18 +27,26 @@ class SortedRuns:
     Parameters
     ----------
     beside : the folder the temporary one is made in; None: the system's
+    folder : one that stays instead, and the runs in it with it, for `restore`
 
     Raises
     ------
     OutputError : the folder or a file in it cannot be written
     """
 
-    def __init__(self, beside: Path | None = None) -> None:
+    def __init__(self, beside: Path | None = None, folder: Path | None = None) -> None:
+        self._owner: tempfile.TemporaryDirectory[str] | None = None
         try:
-            # Its finaliser removes it when nobody needs the rows any more.
-            self._folder = tempfile.TemporaryDirectory(prefix=".lslam-map-", dir=beside, ignore_cleanup_errors=True)
+            if folder is not None:
+                folder.mkdir(parents=True, exist_ok=True)
+                self._folder = folder
+            else:
+                # Its finaliser removes it when nobody needs the rows any more.
+                self._owner = tempfile.TemporaryDirectory(prefix=".lslam-map-", dir=beside, ignore_cleanup_errors=True)
+                self._folder = Path(self._owner.name)
         except OSError as error:
-            raise OutputError(f"{beside or tempfile.gettempdir()} cannot be written: {error.strerror}") from None
+            place = folder or beside or tempfile.gettempdir()
+            raise OutputError(f"{place} cannot be written: {error.strerror}") from None
         self._runs: list[StoredRows] = []
 
     def __len__(self) -> int:
@@ -45,17 +54,34 @@ class SortedRuns:
 
     def add(self, rows: Rows) -> None:
         """Store one more run."""
-        stored = StoredRows(Path(self._folder.name) / f"run-{len(self._runs)}", rows.shape[1], self._folder)
+        stored = self._stored(f"run-{len(self._runs)}", rows.shape[1])
+        stored.remove()  # what a process that was killed may have left
         stored.append(rows)
         self._runs.append(stored)
 
+    def state(self) -> State:
+        """What `restore` needs to find the runs again."""
+        return {"runs": [(len(run), run.columns) for run in self._runs]}
+
+    def restore(self, state: State) -> None:
+        """Hold the runs that lie in the folder; raises InputError when they do not."""
+        self._runs = []
+        for k, (count, columns) in enumerate(state["runs"]):
+            stored = self._stored(f"run-{k}", columns)
+            stored.find(count)
+            self._runs.append(stored)
+
+    def _stored(self, name: str, columns: int) -> StoredRows:
+        return StoredRows(self._folder / name, columns, self._owner)
+
     def combined(self, combine: Combine) -> StoredRows:
-        """All runs as one table, sorted by key; the runs themselves are gone then.
+        """All runs as one table, sorted by key; the runs themselves are gone then, but in a folder that stays.
 
         combine : given rows sorted by key, those of one key in the order of the runs, gives one row per key
         """
         columns = min(run.columns for run in self._runs)
-        whole = StoredRows(Path(self._folder.name) / "all", columns, self._folder)
+        whole = self._stored("all", columns)
+        whole.remove()
         cuts = self._cuts()
         begins = [0] * len(self._runs)
         for cut in [*cuts, None]:
@@ -67,7 +93,7 @@ class SortedRuns:
             rows = np.concatenate(parts)
             if len(rows):
                 whole.append(combine(rows[np.argsort(rows[:, 0], kind="stable")]))
-        for run in self._runs:
+        for run in self._runs if self._owner is not None else ():
             run.remove()
         self._runs = []
         return whole
@@ -118,6 +144,13 @@ class StoredRows:
     def first_not_below(self, key: int) -> int:
         """Number of rows with a smaller key."""
         return bisect_left(self.keys, key)
+
+    def find(self, count: int) -> None:
+        """Take `count` rows that are there already; raises InputError when there are not so many."""
+        for path, columns in ((self._path, self.columns), (self._path.with_suffix(".keys"), 1)):
+            if not path.is_file() or path.stat().st_size < 8 * columns * count:
+                raise InputError(f"{path} does not hold the {count} rows that it should")
+        self._count = count
 
     def remove(self) -> None:
         """Delete the files."""

@@ -81,6 +81,11 @@ class Checkpoints:
                     path.unlink()
         return None
 
+    def clear(self) -> None:
+        """Forget them all: what begins again counts its scans from 0, and must not be mistaken for older."""
+        for path in self._files():
+            path.unlink(missing_ok=True)
+
     def _files(self) -> list[Path]:
         return sorted(self.folder.glob(f"{self._stage}-*.npz"))
 
@@ -129,6 +134,7 @@ class OdometryCheckpoints:
                 log.warning("%s: the run begins again", error)
                 self._latest = latest = None
         if latest is None:
+            self._checkpoints.clear()
             keyframing.store.clear()
             return []
         try:

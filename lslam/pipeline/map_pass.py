@@ -19,6 +19,7 @@ from lslam.maps.mesh import denoise
 from lslam.maps.occupancy import OccupancyGrid, OccupancyMapper
 from lslam.maps.top_view import top_view
 from lslam.pipeline.front_end import read_ahead
+from lslam.pipeline.map_checkpoints import MapCheckpoints
 from lslam.pipeline.tracker import sweep_seconds
 from lslam.preprocessing.deskew import KNOTS, deskew_points
 from lslam.types.cloud import Cloud, in_memory
@@ -43,15 +44,21 @@ class BuiltMap:
 
 def build_map(
     sequence: Sequence, results: list[ScanResult], config: Config, on_step: Callable[[], None],
-    should_stop: Callable[[], bool], spool: Path | None = None,
+    should_stop: Callable[[], bool], spool: Path | None = None, checkpoints: MapCheckpoints | None = None,
 ) -> BuiltMap | None:  # fmt: skip
     """Merge every scan that was registered; bridged scans would draw their error into the map and stay out.
 
     A map too large for memory is kept in a temporary folder in `spool` meanwhile. None when `should_stop` said so before
-    the last scan.
+    the last scan. `checkpoints` are of the merger alone: where anything else is made of the scans (`map.clean`), a map that
+    was interrupted begins again.
     """
     section = config.map
-    merger = MapMerger(section.voxel, section.range_min, section.range_max, crop=section.crop_box, spool=spool)
+    if section.clean:
+        checkpoints = None
+    merger = MapMerger(
+        section.voxel, section.range_min, section.range_max, crop=section.crop_box, spool=spool,
+        keep=None if checkpoints is None else checkpoints.spool,
+    )  # fmt: skip
     ego_box = section.ego_box or config.preprocess.ego_box
     stamps = np.array([r.stamp_ns for r in results], np.int64)
     poses = np.stack([r.T_world_lidar for r in results])
@@ -67,8 +74,15 @@ def build_map(
             if occupancy is not None:
                 occupancy.add(posed.points, posed.T_world_lidar)
 
-    for loaded, result in zip(read_ahead(sequence, None, config.input.threads), results, strict=False):
-        if should_stop():
+    done = 0 if checkpoints is None else checkpoints.begin(merger, poses)
+    for _ in range(done):
+        on_step()
+    ahead = read_ahead(sequence, None, config.input.threads, first=done)
+    for k, (loaded, result) in enumerate(zip(ahead, results[done:], strict=False), done):
+        is_last = should_stop()
+        if checkpoints is not None:
+            checkpoints.offer(k, merger, is_last)
+        if is_last:
             return None
         if loaded.scan is not None and result.status == "ok":
             scan = loaded.scan if ego_box is None else without_box(loaded.scan, ego_box)

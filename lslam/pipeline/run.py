@@ -23,6 +23,7 @@ from lslam.pipeline.georeferencing import require_gnss
 from lslam.pipeline.given_poses import bind
 from lslam.pipeline.inertial_start import with_imu_settings
 from lslam.pipeline.manifest import Manifest, describe_deskew
+from lslam.pipeline.map_checkpoints import map_checkpoints
 from lslam.pipeline.map_pass import build_map
 from lslam.pipeline.odometry_pass import estimate_poses, odometry_checkpoints
 from lslam.pipeline.resume import may_go_on, run_identity
@@ -159,7 +160,15 @@ def _map(
         return
     watch.on_start("map", len(record.results))
     with manifest.timed("map_s"):
-        built = build_map(sequence, record.results, config, watch.on_step, watch.should_stop, folder.path)
+        built = build_map(
+            sequence,
+            record.results,
+            config,
+            watch.on_step,
+            watch.should_stop,
+            folder.path,
+            map_checkpoints(folder, config),
+        )
         if built is None:
             manifest.interrupt("interrupted while the map was built: there is no map")
             return

@@ -139,6 +139,29 @@ def test_it_goes_on_where_it_was_killed(scan: int, tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("at_every_scan")
+@pytest.mark.parametrize("lost", ["nothing", "voxels"])
+def test_the_map_goes_on_where_it_was_killed(lost: str, tmp_path: Path) -> None:
+    config, out = config_of("input.threads=1", "map.voxel=0.1"), tmp_path / "out"
+    lslam.run(drive(), config, out=tmp_path / "whole")
+    first = drive()
+
+    def die(index: int) -> None:
+        if index == 9 and first.reads.count(9) == 2:
+            raise KeyboardInterrupt
+
+    first.on_read = die
+    with pytest.raises(KeyboardInterrupt):
+        lslam.run(first, config, out=out)
+    if lost == "voxels":
+        (out / "checkpoint" / "map" / "run-3").unlink()
+    again = drive()
+    again.reads.clear()
+    lslam.run(again, config, out=out, resume=True)
+    assert again.reads == [0, 0, *range(8 if lost == "nothing" else 0, COUNT)]
+    assert result_of(out) == result_of(tmp_path / "whole")
+
+
+@pytest.mark.usefixtures("at_every_scan")
 @pytest.mark.parametrize("damage", ["newest", "both", "cloud"])
 def test_damaged_checkpoints_cost_time_only(damage: str, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     config, out = config_of("input.threads=1", "map.write=false"), tmp_path / "out"
