@@ -49,11 +49,11 @@ def build_map(
     """Merge every scan that was registered; bridged scans would draw their error into the map and stay out.
 
     A map too large for memory is kept in a temporary folder in `spool` meanwhile. None when `should_stop` said so before
-    the last scan. `checkpoints` are of the merger alone: where anything else is made of the scans (`map.clean`), a map that
-    was interrupted begins again.
+    the last scan. `checkpoints` are of the merger alone: where anything else is made of the scans (`map.clean`,
+    `map.occupancy`), a map that was interrupted begins again.
     """
     section = config.map
-    if section.clean:
+    if section.clean or section.occupancy:
         checkpoints = None
     merger = MapMerger(
         section.voxel, section.range_min, section.range_max, crop=section.crop_box, spool=spool,
@@ -74,11 +74,11 @@ def build_map(
             if occupancy is not None:
                 occupancy.add(posed.points, posed.T_world_lidar)
 
-    done = 0 if checkpoints is None else checkpoints.begin(merger, poses)
-    for _ in range(done):
+    first = 0 if checkpoints is None else checkpoints.begin(merger, poses)
+    for _ in range(first):
         on_step()
-    ahead = read_ahead(sequence, None, config.input.threads, first=done)
-    for k, (loaded, result) in enumerate(zip(ahead, results[done:], strict=False), done):
+    ahead = read_ahead(sequence, None, config.input.threads, first=first)
+    for k, (loaded, result) in enumerate(zip(ahead, results[first:], strict=False), first):
         is_last = should_stop()
         if checkpoints is not None:
             checkpoints.offer(k, merger, is_last)
