@@ -23,6 +23,7 @@ COMMANDS = {
     "osm": "Fetch buildings from OpenStreetMap, or show what is in an extract.",
     "info": "Show what is in a sequence and what is wrong with it.",
     "map": "Build a run's map anew with other settings, or score a map.",
+    "view": "Write a run as a recording for the rerun viewer.",
     "methods": "List the odometry methods.",
     "config": "Show or check a configuration.",
     "completion": "Print the completion script of a shell.",

@@ -55,6 +55,15 @@ class Projection:
         x, y = self._transformer.transform(enu[:, 0], enu[:, 1])
         return np.column_stack([x, y, enu[:, 2] + float(self.georeference.origin[2])])
 
+    def invert(self, points: NDArray[Any]) -> Floats:
+        """The inverse of `apply`: easting, northing, height, m, to the run's world, m."""
+        from pyproj.enums import TransformDirection
+
+        there = np.asarray(points, np.float64).reshape(-1, 3)
+        x, y = self._transformer.transform(there[:, 0], there[:, 1], direction=TransformDirection.INVERSE)
+        enu = np.column_stack([x, y, there[:, 2] - float(self.georeference.origin[2])])
+        return se3.apply(se3.inverse(self.georeference.T_enu_world), enu)
+
     def check(self) -> None:
         """Raise UsageError unless the coordinate reference system is known and counts in metres."""
         units = {axis.unit_name for axis in self._crs.axis_info[:2]}

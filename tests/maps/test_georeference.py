@@ -60,6 +60,12 @@ def test_the_origin_itself_is_at_the_origin() -> None:
     np.testing.assert_allclose(Projection(g).apply(np.zeros((1, 3)))[0], [x, y, KARLSRUHE[2]], atol=1e-4)
 
 
+def test_back_from_the_map_to_the_run() -> None:
+    points = np.random.default_rng(4).uniform(-800, 800, (50, 3))
+    projection = Projection(reference(31467))
+    np.testing.assert_allclose(projection.invert(projection.apply(points)), points, atol=1e-3)
+
+
 def test_zones() -> None:
     assert [utm_epsg(*p) for p in ((0, -180), (0, 179.9), (-1, 0), (59, 10), (0, 180))] == [
         32601, 32660, 32731, 32632, 32601,

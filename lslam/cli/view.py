@@ -1,0 +1,42 @@
+"""`lslam view`: a run as a recording for the rerun viewer."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from lslam.cli import options
+from lslam.cli.console import setup_logging, show
+
+EPILOG = """\b
+Examples:
+  lslam view runs/first
+  rerun runs/first/run.rrd
+"""
+
+
+@click.command(epilog=EPILOG)
+@click.argument("run", metavar="RUN", type=click.Path(path_type=Path))
+@click.option("--out", type=click.Path(path_type=Path), metavar="FILE", help="Recording  [RUN/run.rrd].")
+@click.option("--overwrite", is_flag=True, help="Replace a recording that is there.")
+@options.verbosity
+def command(run: Path, out: Path | None, overwrite: bool, verbose: bool, quiet: bool) -> None:
+    """Write trajectory, odometry before the pose graph, and map of a run as a recording for the rerun viewer.
+
+    It needs rerun: pip install 'lslam[view]'.
+    """
+    setup_logging(verbose, quiet)
+    from lslam.errors import OutputError, OutputExistsError
+    from lslam.pipeline.view import viewed_run
+    from lslam.reports.recording import require_rerun, write_recording
+
+    require_rerun()
+    path = run / "run.rrd" if out is None else out
+    if path.exists() and not overwrite:
+        raise OutputExistsError(f"{path} exists; name another file with --out or replace it with --overwrite")
+    viewed = viewed_run(run)
+    if not path.parent.is_dir():
+        raise OutputError(f"{path} cannot be written: the folder {path.parent} does not exist")
+    write_recording(path, viewed)
+    show(f"{path}\n")
