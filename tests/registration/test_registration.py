@@ -72,6 +72,19 @@ def test_surprises_after_the_start_are_caught_coarse_to_fine(seed: int) -> None:
     assert is_near(T, result.T_world_lidar, 0.01, 0.05)
 
 
+def test_where_priors_are_right_the_kernel_begins_where_it_ends() -> None:
+    """And a surprise of a decimetre is found all the same, in a step or two more."""
+    registration, rng = settled(16)
+    assert registration.threshold.width == registration.config.kernel_min
+    usual = registration.register(seen_from(room(rng), pose_at((1.6, 0.0, 0.0), 8.0)))
+    assert usual.iterations <= 2
+    T = pose_at((1.82, 0.0, 0.0), 8.5)
+    surprised = registration.register(seen_from(room(rng), T))
+    assert surprised.iterations <= 4
+    assert is_near(T, surprised.T_world_lidar, 0.01, 0.05)
+    assert registration.threshold.width > registration.config.kernel_min
+
+
 def test_a_corridor_keeps_the_prior_along_itself_scan_after_scan() -> None:
     rng = np.random.default_rng(0)
     registration = Registration()
