@@ -9,6 +9,8 @@ from typing import Any
 from lslam.config.registration import Residual
 from lslam.registration.gaussian_map import GaussianMap
 
+# The loop of steps stands once in each: with the residual as its argument, one loop would be compiled anew for every
+# residual that is handed to it and kept by no cache. What the loops share is inlined from `gauss_newton`.
 KERNELS = {
     "plane": ("lslam.kernels.gauss_newton", "align"),
     "point": ("lslam.kernels.point_residual", "align_point"),
