@@ -37,7 +37,7 @@ class OsmConfig(Section):
     min_cluster: int = Field(20, ge=3, description="points a wall has at least")
     min_length: float = Field(2.0, gt=0, description="m; shorter walls are left out")
     wall_sigma: float = Field(0.3, gt=0, description="m; one sigma of a wall of the map, drawn by hand from the air")
-    max_distance: float = Field(1.0, gt=0, description="m; mean distance of walls that counts as no match (eq. 3.1)")
+    max_distance: float = Field(2.0, gt=0, description="m; mean distance of walls that counts as no match (eq. 3.1)")
     distance_weight: float = Field(1.0, ge=0, description="A of equation 3.1")
     coverage_weight: float = Field(1.0, ge=0, description="B of equation 3.2")
     translation_weight: float = Field(0.1, ge=0, description="C of equation 3.3, of the way to the edge of the window")
