@@ -45,6 +45,7 @@ class OsmConfig(Section):
         0.25, gt=0, le=1, description="information of a match of parallel walls only, against one with corners"
     )
     min_coverage: float = Field(0.4, ge=0, le=1, description="share of the walls seen that must lie on the map")
+    min_start_coverage: float = Field(0.6, ge=0, le=1, description="the same where any heading is possible")
     min_building_coverage: float = Field(0.1, ge=0, le=1, description="share of a building's walls that must be seen")
     rival_margin: float = Field(
         15.0, ge=0, description="another pose with so little less fitness makes a match a guess"

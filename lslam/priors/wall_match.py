@@ -97,7 +97,9 @@ def find_heading(
     The start without GNSS. Returns None when nothing fits, when it is only walls that leave a direction free, or fewer than
     `START_WALLS`; when several poses fit alike the match `is_ambiguous` and must not be used.
     """
-    config = (config or OsmConfig()).model_copy(update={"translation_weight": 0.0})
+    config = config or OsmConfig()
+    # Nobody said which way it is: more has to fit, and nothing is near or far.
+    config = config.model_copy(update={"translation_weight": 0.0, "min_coverage": config.min_start_coverage})
     at = np.append(np.asarray(place, np.float64)[:2], 0.0)
     found = _best(
         _rows(source), _rows(target), at, np.array([radius, radius, np.pi]), np.zeros(3), config, by_coverage=False

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from pathlib import Path
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -12,7 +15,8 @@ from lslam.config.osm import OsmConfig
 from lslam.formats.osm_buildings import read_buildings
 from lslam.kernels import wall_matching
 from lslam.priors.wall_match import LIKENESS, WallMatch, find_heading, match_walls
-from lslam.priors.walls import walls_of
+from lslam.priors.walls import find_walls, walls_of
+from lslam.readers import open_sequence
 from lslam.types.building import Building, Footprint
 
 SIGMA = np.array([1.5, 1.5, np.radians(4.0)])
@@ -118,6 +122,40 @@ def test_a_simulated_town_is_found_on_its_map_with_houses_missing() -> None:
         away, turn = off(start, (pose[0], pose[1], heading))
         assert away < 0.1
         assert turn < 0.5
+
+
+@pytest.mark.parametrize("number", [4, 24, 44])
+def test_a_real_scan_is_found_on_the_real_map(recordings: Callable[[str], Path], number: int) -> None:
+    folder = recordings("mcd_kth_day_06") / "mcd_kth_day_06"
+    sequence = open_sequence(folder)
+    assert sequence.ground_truth is not None
+    T = sequence.ground_truth.poses[number]
+    # The recording's README says where the world lies; houses of this map are a metre off against each other.
+    heading = float(np.arctan2(T[1, 0], T[0, 0]))
+    pose = (float(T[0, 3] - 64.3932532565158), float(T[1, 3] - 66.4832330946657), heading)
+    c, s = np.cos(heading), np.sin(heading)
+    level = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]) @ T[:3, :3]
+    walls = find_walls(sequence.scan(number).points @ level.T)
+    target, _ = walls_of(read_buildings(folder / "kth.osm", np.array([59.348268650, 18.073204280, 0.0])).buildings)
+    off_by_three = np.array(pose) + np.array([1.8, -2.4, np.radians(10)])
+    near = match_walls(walls.segments, target, off_by_three, np.array([2, 2, np.radians(5)]))
+    start = find_heading(walls.segments, target, np.array(pose[:2]) + np.array([6.0, -5.0]), 15.0)
+    for match in (near, start):
+        away, turn = off(match, pose)
+        assert away < 1.7
+        assert turn < 4.0
+        assert match is not None
+        assert match.rank == 3
+        assert not match.is_ambiguous
+
+
+def test_the_map_of_another_town_is_no_start() -> None:
+    extract = read_buildings(SAMPLE / "sequences" / "00" / "map.osm", np.array([49.0, 8.4, 115.0]))
+    target, _ = walls_of(extract.buildings)
+    for seed in range(6):
+        source, _, _ = scene(seed)
+        match = find_heading(source, target, np.array([3.0 * seed, -10.0]), 15.0)
+        assert match is None or match.is_ambiguous
 
 
 def test_what_looks_alike_from_two_headings_is_refused() -> None:
