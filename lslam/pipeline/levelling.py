@@ -28,6 +28,8 @@ ORIGIN = "LiDAR at the first scan"
 UP = np.array([0.0, 0.0, 1.0])
 # The ground under the sensor: so many cells of half a metre to each side.
 CELLS = 80
+# A tilt of fewer sigmas may be none: most sensors are mounted level, and a bias looks like a tilt before the first bends.
+SIGNIFICANT = 2.0
 
 
 @dataclass(frozen=True)
@@ -54,8 +56,9 @@ def find_level(sequence: Sequence, results: list[ScanResult], config: Config) ->
         wanted = "gravity" if config.imu.use else "none"
     if wanted == "none":
         return Level(np.eye(3), f"{ORIGIN}, not levelled")
+    sigma = 0.0
     if wanted == "gravity":
-        up = _up_by_gravity(results)
+        up, sigma = _up_by_gravity(results)
         what, why = "gravity", "no scan has a direction of gravity: it takes --imu, and an IMU that is not refused"
     else:
         up = _up_by_ground(sequence, results, config)
@@ -64,7 +67,11 @@ def find_level(sequence: Sequence, results: list[ScanResult], config: Config) ->
         problem = "" if config.input.level == "auto" else f"input.level = {wanted}: {why}; the world is not levelled"
         return Level(np.eye(3), f"{ORIGIN}, not levelled", problem)
     R = least_rotation(up, UP)
-    tilt = np.rad2deg(float(so3.angle(R)))
+    tilt, known = np.rad2deg(float(so3.angle(R))), np.rad2deg(sigma)
+    if tilt < SIGNIFICANT * known:
+        return Level(
+            np.eye(3), f"{ORIGIN}, not levelled: its tilt of {tilt:.2f} deg is none to {what}, known to {known:.2f} deg"
+        )
     log.info("the world is levelled by %s: turned by %.2f deg", what, tilt)
     return Level(R, f"{ORIGIN}, levelled by {what} (turned by {tilt:.2f} deg)")
 
@@ -100,14 +107,18 @@ def least_rotation(a: Floats, b: Floats) -> Floats:
     return np.asarray(so3.exp(axis / sine * np.arctan2(sine, cosine)))
 
 
-def _up_by_gravity(results: list[ScanResult]) -> Floats | None:
-    """Mean over the run, by their sigmas: what tells a bias from a tilt comes with the bends of the way."""
+def _up_by_gravity(results: list[ScanResult]) -> tuple[Floats | None, float]:
+    """Mean over the run, by their sigmas: what tells a bias from a tilt comes with the bends of the way.
+
+    Its sigma, rad, is that of the best: errors of the others are not independent of its own.
+    """
     up = np.zeros(3)
     for r in results:
         if r.gravity is not None:
             up -= r.T_world_lidar[:3, :3] @ r.gravity.direction / r.gravity.sigma**2
     norm = float(np.linalg.norm(up))
-    return up / norm if norm > 0 else None
+    sigmas = [r.gravity.sigma for r in results if r.gravity is not None]
+    return (up / norm, min(sigmas)) if norm > 0 else (None, 0.0)
 
 
 def _up_by_ground(sequence: Sequence, results: list[ScanResult], config: Config) -> Floats | None:

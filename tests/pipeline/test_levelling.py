@@ -80,6 +80,19 @@ def test_what_is_known_better_counts_for_more() -> None:
     assert np.rad2deg(np.arccos(up[2])) < 0.1
 
 
+def test_a_tilt_that_may_be_a_bias_is_left_alone() -> None:
+    """A level sensor whose accelerometer says 2.5 deg, known to 2 deg: turning would tilt the map."""
+    poses = bend() @ se3.make(TILT.T, np.zeros(3))
+    poses = se3.inverse(poses[0]) @ poses
+    wrong = so3.exp(np.array([np.deg2rad(2.5), 0, 0]))
+    sigma = {True: 2.0, False: 0.5}
+    for is_doubtful in (True, False):
+        gravity = GravityDirection(wrong @ np.array([0, 0, -1.0]), np.deg2rad(sigma[is_doubtful]))
+        level = find_level(empty(), [ScanResult(0, 0, poses[0], gravity=gravity)], config("imu.use=true"))
+        assert level.is_turned != is_doubtful
+        assert ("not levelled: its tilt of 2.50 deg" in level.world) == is_doubtful
+
+
 def test_only_the_world_turns() -> None:
     results = results_of(bend())
     level = find_level(empty(), results, config("imu.use=true"))
