@@ -131,7 +131,7 @@ class Verifier:
             return facts.rejected("agreement", said)
         floor = np.diag([c.sigma_m**2] * 3 + [np.deg2rad(c.sigma_deg) ** 2] * 3)
         assert forward.covariance is not None
-        doubt = np.diag([move**2 / 12] * 3 + [turn**2 / 12] * 3)
+        doubt = np.diag([move**2 / 3] * 3 + [turn**2 / 3] * 3)
         covariance = forward.covariance + floor + doubt
         # Half way between what the two say.
         T = se3.exp(-0.5 * gap) @ forward.T_world_lidar
