@@ -198,6 +198,18 @@ def test_along_lone_parallel_walls_nothing_is_claimed(turn: float) -> None:
     np.testing.assert_allclose(match.information, 0.25 * full.information, rtol=1e-9, atol=1e-9)
 
 
+def test_walls_that_are_nearly_parallel_do_not_slide_along_each_other() -> None:
+    street = np.array([[[30.0, 5.0], [-30.0, 5.0]], [[-30.0, -7.0], [30.0, -3.0]]])
+    seen_there = street.copy()
+    seen_there[1, :, 1] -= 0.15  # as if one house were drawn that much too near: 2.2 m along, for 4 deg between them
+    match = match_walls(seen_there, street, np.array([0.4, 0.3, 0.01]), SIGMA)
+    assert match is not None
+    assert match.rank == 2
+    assert match.pose[0] == pytest.approx(0.4, abs=0.1)
+    assert abs(match.pose[1]) < 0.15
+    assert np.linalg.eigvalsh(match.information)[0] == pytest.approx(0.0, abs=1e-9)
+
+
 def test_information_turns_with_the_map_and_speaks_of_the_sensors_place() -> None:
     source, target, pose = scene(3)
     one = match_walls(source, target, np.array(pose), SIGMA)
