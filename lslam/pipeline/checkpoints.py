@@ -60,11 +60,11 @@ class Checkpoints:
         self.folder, self._stage = folder, stage
         self.pace = Pace(every_s)
 
-    def write(self, scans: int, content: State) -> None:
-        """Write what is known after `scans` scans. Raises OutputError."""
+    def write(self, scans: int, content: Callable[[], State]) -> None:
+        """Write what is known after `scans` scans; to gather it counts as time for the pace. Raises OutputError."""
         began = time.perf_counter()
         self.folder.mkdir(exist_ok=True)
-        write_state(self.folder / f"{self._stage}-{scans:07d}.npz", content)
+        write_state(self.folder / f"{self._stage}-{scans:07d}.npz", content())
         for old in self._files()[:-KEPT]:
             with contextlib.suppress(OSError):
                 old.unlink()
@@ -166,12 +166,15 @@ class OdometryCheckpoints:
             return  # the next scan is needed to say what the first one was
         if is_over:
             keyframing.settle()
-        content = {
-            "results": Records(results),
-            "tracker": tracker.state() | ({"odometry": None} if is_over else {}),
-            "keyframes": keyframing.state(),
-            "is_over": is_over,
-            "seconds": self._seconds + time.monotonic() - self._began,
-            "resumed_after": self.resumed_after,
-        }
+
+        def content() -> State:
+            return {
+                "results": Records(results),
+                "tracker": tracker.state() | ({"odometry": None} if is_over else {}),
+                "keyframes": keyframing.state(),
+                "is_over": is_over,
+                "seconds": self._seconds + time.monotonic() - self._began,
+                "resumed_after": self.resumed_after,
+            }
+
         self._checkpoints.write(len(results), content)

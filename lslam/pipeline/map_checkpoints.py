@@ -49,7 +49,7 @@ class MapCheckpoints:
     def offer(self, scans: int, merger: MapMerger, is_last: bool = False) -> None:
         """Write a checkpoint after `scans` scans when one is due, or when it is the last."""
         if scans and (is_last or self._checkpoints.pace.is_due):
-            self._checkpoints.write(scans, {"poses": self._poses, "scans": scans, "merger": merger.state()})
+            self._checkpoints.write(scans, lambda: {"poses": self._poses, "scans": scans, "merger": merger.state()})
 
 
 def map_checkpoints(folder: RunFolder, config: Config) -> MapCheckpoints | None:
