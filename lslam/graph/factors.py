@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.geometry import noise
-from lslam.graph.problem import FloorPlane, PoseGraph, PositionFix, Turn
-from lslam.types.constraint import Constraint
+from lslam.graph.problem import FloorPlane, PoseGraph, PositionFix
+from lslam.types.constraint import Constraint, Turn
 
 Floats = NDArray[np.float64]
 

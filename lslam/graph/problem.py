@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.types.constraint import Constraint
+from lslam.types.constraint import Constraint, Turn
 
 Floats = NDArray[np.float64]
 
@@ -32,16 +32,6 @@ class UpDirection:
 
     keyframe: int
     up: Floats
-    sigma: float
-
-
-@dataclass(frozen=True)
-class Turn:
-    """Rotation R_a_b (3, 3) between keyframes, as a gyroscope measured it; sigma : rad."""
-
-    a: int
-    b: int
-    R_a_b: Floats
     sigma: float
 
 

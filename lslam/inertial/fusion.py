@@ -125,6 +125,14 @@ class InertialMotion(Stateful):
         super().restore(state)
         self._errors = [(float(own), float(steady)) for own, steady in state["errors"]]
 
+    def turn(self, begin_ns: int, end_ns: int) -> Floats | None:
+        """Rotation (3, 3) of the LiDAR from one instant to the other by the gyroscope; None over a gap or when refused."""
+        if self.refusal or not self._covers(begin_ns, end_ns):
+            return None
+        R_lidar_imu = self.T_lidar_imu[:3, :3]
+        rotation = self.estimate.over(self.imu, np.array([begin_ns, end_ns])).rotations[-1]
+        return np.asarray(R_lidar_imu @ rotation @ R_lidar_imu.T)
+
     def prior_errors(self) -> tuple[float, float] | None:
         """Medians, m, of how wrong the IMU and constant velocity predicted the scans, turns counted at `LEVER_M`."""
         if not self._errors:

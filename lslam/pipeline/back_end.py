@@ -6,6 +6,7 @@ Where nothing but odometry is known, or the graph cannot be solved, odometry's p
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence as Many
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -21,7 +22,7 @@ from lslam.graph.problem import PoseGraph, Solution
 from lslam.keyframes.store import KeyframeStore
 from lslam.pipeline.georeferencing import Placement, place
 from lslam.pipeline.graph_inputs import floor_planes, up_directions, world_up
-from lslam.types.constraint import Constraint, LoopCandidate
+from lslam.types.constraint import Constraint, LoopCandidate, Turn
 from lslam.types.georeference import Georeference
 from lslam.types.scan_result import ScanResult
 from lslam.types.sequence import Sequence
@@ -58,7 +59,7 @@ class BackEnd:
 
 def run_back_end(
     sequence: Sequence, results: list[ScanResult], store: KeyframeStore, config: Config,
-    candidates: list[LoopCandidate],
+    candidates: list[LoopCandidate], turns: Many[Turn] = (),
 ) -> BackEnd:  # fmt: skip
     """Close loops, take in fixes, optimise, and place all scans accordingly; odometry's poses where that fails."""
     keyframes = store.keyframes
@@ -67,7 +68,7 @@ def run_back_end(
         if config.gnss.mode != "off":
             problems.append("GNSS: fewer than two keyframes have no heading on the Earth")
         return BackEnd(results, candidates, problems=problems)
-    graph = _graph(results, store, config, candidates)
+    graph = replace(_graph(results, store, config, candidates), turns=turns)
     up = graph.world_up if graph.ups else None
     out = None
     if config.gnss.mode == "graph":
@@ -199,6 +200,7 @@ def _facts(
         "loops": len(believed),
         "fixes": int(solution.fix_believed.sum()),
         "gravity_factors": len(graph.ups),
+        "imu_orientation_factors": len(graph.turns),
         "floor_factors": len(graph.floors),
         "drift_factor": round(solution.drift, 4),
         "rounds": solution.rounds,

@@ -50,7 +50,7 @@ def optimise_poses(
         if config.loops.use:
             with manifest.timed("loops_s"):
                 candidates = find_loops(store, config.loops, config.registration, config.keyframes.submap_size)
-        done = run_back_end(sequence, record.results, store, config, candidates)
+        done = run_back_end(sequence, record.results, store, config, candidates, record.turns)
     record.odometry = record.trajectory
     if done.is_optimised:
         record.results = done.results
@@ -76,9 +76,10 @@ def level_world(record: RunRecord, sequence: Sequence, config: Config, manifest:
         was_odometry = record.odometry is record.trajectory
         record.results = level_results(record.results, level)
         record.trajectory = to_trajectory(record.results, record.method)
-        if record.odometry is not None and level.is_turned:
-            turned = replace(record.odometry, poses=se3.normalise(T @ record.odometry.poses), covariances=None)
-            record.odometry = record.trajectory if was_odometry else turned
+        if was_odometry:
+            record.odometry = record.trajectory
+        elif record.odometry is not None and level.is_turned:
+            record.odometry = replace(record.odometry, poses=se3.normalise(T @ record.odometry.poses), covariances=None)
         if place is not None:
             record.georeference = replace(place, T_enu_world=place.T_enu_world @ se3.inverse(T))
         if level.problem:

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import logging
 from contextlib import suppress
+from itertools import pairwise
 from pathlib import Path
+
+import numpy as np
 
 from lslam.config import Config
 from lslam.errors import InputError
@@ -23,6 +26,7 @@ from lslam.pipeline.manifest import Manifest
 from lslam.pipeline.run_folder import CHECKPOINT, RunFolder
 from lslam.pipeline.watch import Watch
 from lslam.registration.standing import Standing
+from lslam.types.constraint import Turn
 from lslam.types.run_record import RunRecord
 from lslam.types.scan_result import ScanResult
 from lslam.types.sequence import Sequence
@@ -77,7 +81,21 @@ def estimate_poses(
         trajectory=to_trajectory(results, config.odometry.method),
         ground_truth=truth,
         real_time_limit=config.input.skip_frames / sequence.rate_hz,
+        turns=_turns(inertial, store, config),
     )
+
+
+def _turns(inertial: Inertial, store: KeyframeStore, config: Config) -> list[Turn]:
+    """The gyroscope's turns from each keyframe to the next, when the graph is to have them."""
+    if inertial.motion is None or not config.graph.imu_orientation:
+        return []
+    sigma = float(np.deg2rad(config.graph.imu_orientation_deg))
+    found = []
+    for a, b in pairwise(store.keyframes):
+        R = inertial.motion.turn(a.stamp_ns, b.stamp_ns)
+        if R is not None:
+            found.append(Turn(a.number, b.number, R, sigma))
+    return found
 
 
 def odometry_checkpoints(folder: RunFolder, config: Config, goes_on: bool) -> OdometryCheckpoints | None:

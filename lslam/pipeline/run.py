@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 from pathlib import Path
 
 from lslam.config import Config
@@ -142,6 +143,9 @@ def _score(record: RunRecord, sequence: Sequence, config: Config) -> Evaluation 
         return None
     try:
         score = evaluate(record.trajectory, record.ground_truth, config.eval, calibration=sequence.calibration)
+        if record.odometry is not None and record.odometry is not record.trajectory:
+            before = evaluate(record.odometry, record.ground_truth, config.eval, calibration=sequence.calibration)
+            score = replace(score, odometry=before)
     except LslamError as error:
         record.problems.append(f"not scored: {error}")
         log.warning("not scored: %s", error)

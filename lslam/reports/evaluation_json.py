@@ -10,6 +10,7 @@ Version 1, one estimate:
     rpe[]         {recipe, delta, unit, pairs, n_pairs, note, translation{..} (m), rotation_deg{..}}
     kitti_drift   {recipe, available, note, translation_percent, rotation_deg_per_100m, segments, by_length.<m>{..}}
     thesis1, thesis2, timing
+    odometry      {recipe, and association to thesis2 as above}, of a run whose poses a pose graph moved: the poses before
     map           {recipe, entropy (nats), plane_variance (m2), plane_thickness_m, ..}, of runs with a map; without ground truth
                   it stands alone behind schema, version, lslam and estimate
 
@@ -62,6 +63,10 @@ def to_document(evaluation: Evaluation, timing: Timing | None = None) -> Documen
         "thesis2": t2,
         "timing": None if timing is None else {"recipe": "s per scan, from timing.csv", **asdict(timing)},
     }
+    if e.odometry is not None:
+        whole = to_document(e.odometry)
+        kept = ("association", "path_length_m", "ate", "rpe", "kitti_drift", "thesis1", "thesis2")
+        document["odometry"] = {"recipe": "of the poses before the pose graph"} | {name: whole[name] for name in kept}
     plain = strict(document)
     assert isinstance(plain, dict)
     return plain

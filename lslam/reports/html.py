@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from lslam.formats.atomic import atomic_write
 from lslam.reports import plots
+from lslam.reports.back_end import back_end_figures
 from lslam.reports.facts import RunFacts, run_facts
 from lslam.reports.metrics import counted, metres, metric_tables
 from lslam.reports.png import data_uri, density_png
@@ -62,7 +63,7 @@ def render_report(record: RunRecord, evaluation: Evaluation | None) -> str:
         degenerate=facts.degenerate[:MOST_ROWS],
         evaluation=evaluation,
         has_truth=record.ground_truth is not None,
-        trajectory=plots.trajectory_figures(record, evaluation),
+        trajectory=plots.trajectory_figures(record, evaluation) + back_end_figures(record, evaluation),
         errors=plots.error_figures(evaluation) if evaluation is not None else [],
         tables=metric_tables(evaluation) if evaluation is not None else [],
         map_figure=_map_figure(record),

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from lslam.evaluation.results import ALIGNMENTS
+from lslam.reports.back_end import back_end_rows
 from lslam.reports.facts import Failure, RunFacts, run_facts
 from lslam.reports.metrics import counted, fixed, metres
 from lslam.types.run_record import RunRecord
@@ -31,6 +32,7 @@ def summary(record: RunRecord, evaluation: Evaluation | None) -> str:
     rows += _scan_rows(facts)
     rows.append(("path", f"{facts.path_length:.1f} m in {facts.duration:.1f} s"))
     rows += _imu_rows(record)
+    rows += back_end_rows(record, evaluation)
     rows += _score_rows(record, evaluation)
     rows += _map_rows(record)
     rows += _time_rows(record, facts)

@@ -27,6 +27,16 @@ class Constraint:
 
 
 @dataclass(frozen=True)
+class Turn:
+    """Rotation R_a_b (3, 3) between keyframes, as a gyroscope measured it; sigma : rad."""
+
+    a: int
+    b: int
+    R_a_b: NDArray[np.float64]
+    sigma: float
+
+
+@dataclass(frozen=True)
 class LoopCandidate:
     """Two keyframes that may show the same place, and what became of them: a row of loops.csv.
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.types.constraint import LoopCandidate
+from lslam.types.constraint import LoopCandidate, Turn
 from lslam.types.georeference import Georeference
 from lslam.types.map_score import Crispness
 from lslam.types.scan_result import ScanResult
@@ -26,6 +26,7 @@ class RunRecord:
     world : where the coordinates of trajectory and map begin and whether z is up, in words
     odometry : the trajectory before the pose graph, in its own world, None when there was no back end; T_final_odometry
         : (4, 4) from that world into the trajectory's
+    turns : of the IMU between keyframes, when the graph is to have them
     loops : candidates with verdicts, between keyframes; keyframe_scans : (K,) position of each one's scan in `results`
     """
 
@@ -44,6 +45,7 @@ class RunRecord:
     problems: list[str] = field(default_factory=list)
     odometry: Trajectory | None = None
     T_final_odometry: NDArray[np.float64] = field(default_factory=lambda: np.eye(4))
+    turns: list[Turn] = field(default_factory=list)
     loops: list[LoopCandidate] = field(default_factory=list)
     keyframe_scans: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
     georeference: Georeference | None = None

@@ -12,8 +12,8 @@ from lslam.config.graph import GraphConfig
 from lslam.errors import GraphError
 from lslam.geometry import se3, so3
 from lslam.graph.pose_graph import optimise
-from lslam.graph.problem import FloorPlane, PoseGraph, PositionFix, Turn, UpDirection
-from lslam.types.constraint import Constraint
+from lslam.graph.problem import FloorPlane, PoseGraph, PositionFix, UpDirection
+from lslam.types.constraint import Constraint, Turn
 
 LAPS = 6
 REAL = truth(240, LAPS)

@@ -1,0 +1,103 @@
+"""What the pose graph did, for the summary and the report: loops, fixes, errors before and after, uncertainty on the plan."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.geometry import se3
+from lslam.reports.metrics import counted, metres
+from lslam.reports.plane import Track, plane_chart
+from lslam.reports.plots import Figure, first_available
+from lslam.types.run_record import RunRecord
+
+if TYPE_CHECKING:
+    from lslam.evaluation.results import Evaluation
+
+Floats = NDArray[np.float64]
+
+# Ellipses on the plan, their sigmas, and how large the largest is drawn at least, as a share of the plan.
+ELLIPSES, SIGMAS, SEEN = 16, 3.0, 0.02
+
+
+def back_end_rows(record: RunRecord, evaluation: Evaluation | None) -> list[tuple[str, str]]:
+    """Names and values for the summary; nothing of a run without a back end."""
+    rows = []
+    if record.loops or record.manifest.get("graph", {}).get("loops"):
+        closed = sum(c.verdict == "accepted" for c in record.loops)
+        tried = sum(c.stage != "thinned" for c in record.loops)
+        text = f"{closed} closed of {tried} tried"
+        if evaluation is not None and evaluation.odometry is not None:
+            text += f"; {_before_and_after(evaluation, evaluation.odometry)}"
+        rows.append(("loops", text))
+    place = record.georeference
+    if place is not None:
+        lat, lon, height = (float(v) for v in place.origin)
+        what = "GNSS in the graph" if place.method == "graph" else "GNSS fitted afterwards"
+        rows.append((
+            "georeference",
+            f"origin {lat:.7f}, {lon:.7f}, {height:.1f} m; {what}: {place.used} of {place.fixes} fixes, "
+            f"{metres(place.rmse_horizontal)} m rms horizontally",
+        ))  # fmt: skip
+    return rows
+
+
+def back_end_figures(record: RunRecord, evaluation: Evaluation | None) -> list[Figure]:
+    """The plan before and after the pose graph, with loops and uncertainty; nothing where the graph moved nothing."""
+    odometry = record.odometry
+    if odometry is None or odometry is record.trajectory:
+        return []
+    before = se3.apply(record.T_final_odometry, odometry.positions)[:, :2]
+    after = record.trajectory.positions[:, :2]
+    tracks, legend = [], []
+    absolute = first_available(evaluation)
+    if evaluation is not None and absolute is not None and absolute.scale == 1.0:
+        truth = se3.apply(se3.inverse(absolute.T_gt_est), evaluation.gt_positions)
+        tracks.append(Track("ground truth", truth[:, :2], "gt"))
+        legend.append(("gt", "ground truth"))
+    tracks += [Track("before", before, "s2"), Track("after", after, "s1", ends=True)]
+    legend += [("s2", "odometry"), ("s1", "after the pose graph")]
+    closed = [c for c in record.loops if c.verdict == "accepted"]
+    for loop in closed:
+        ends = record.keyframe_scans[[loop.a, loop.b]]
+        tracks.append(Track("loop", after[ends], "s3"))
+    legend += [("s3", f"{counted(len(closed), 'loop')} closed")] if closed else []
+    ellipses, factor = _ellipses(record)
+    tracks += [Track("uncertainty", ellipse, "s4") for ellipse in ellipses]
+    caption = (
+        "Estimate in its own world; ground truth moved to it." if len(tracks) > 2 else "Estimate in its own world."
+    )
+    if ellipses:
+        legend.append(("s4", f"{SIGMAS:g} sigma, drawn {factor:g} times as large"))
+    chart = plane_chart(tracks, "before and after the pose graph", width=720, tallest=760)
+    return [Figure("Before and after the pose graph", chart, tuple(legend), caption, wide=True)]
+
+
+def _before_and_after(after: Evaluation, before: Evaluation) -> str:
+    """ATE of both by the first alignment that both have."""
+    for name, error in after.ate.items():
+        other = before.ate.get(name)
+        if error.translation is not None and other is not None and other.translation is not None:
+            was, now = metres(other.translation.rmse), metres(error.translation.rmse)
+            return f"ATE {name} {was} m before the pose graph, {now} m after"
+    return "ATE n/a"
+
+
+def _ellipses(record: RunRecord) -> tuple[list[Floats], float]:
+    """Outlines (33, 2) of horizontal uncertainty at some poses, and the power of ten that makes them visible."""
+    covariances, positions = record.trajectory.covariances, record.trajectory.positions
+    if covariances is None or len(positions) < 2:
+        return [], 1.0
+    some = np.unique(np.linspace(0, len(positions) - 1, ELLIPSES).round().astype(int))
+    circle = np.linspace(0, 2 * np.pi, 33)
+    ring = np.column_stack([np.cos(circle), np.sin(circle)])
+    values, vectors = np.linalg.eigh(covariances[some, :2, :2])
+    axes = SIGMAS * np.sqrt(np.maximum(values, 0.0))
+    size, largest = float(np.ptp(positions[:, :2], axis=0).max()), float(axes.max(initial=0.0))
+    if not (np.isfinite(largest) and largest > 0 and size > 0):
+        return [], 1.0
+    factor = 10.0 ** max(int(np.ceil(np.log10(SEEN * size / largest))), 0)
+    outlines = [positions[i, :2] + factor * (ring * a) @ v.T for i, a, v in zip(some, axes, vectors, strict=True)]
+    return outlines, factor
