@@ -12,7 +12,7 @@ import pytest
 from calling import assert_one_sentence, lslam, sample_copy, strict_json
 
 from lslam.cli.main import cli
-from lslam.errors import LslamError
+from lslam.errors import InputError, LslamError
 from lslam.formats.cloud_files import read_cloud
 from lslam.geometry.geodesy import from_local
 from lslam.pipeline.map_files import georeference_note
@@ -146,20 +146,16 @@ def test_what_is_gone_is_named(run: Path, ran: Path, tmp_path: Path) -> None:
         there = tmp_path / "moved" / "sequences" / "00"
         assert lslam("map", run, "--out", run / "a.ply", "--sequence", there, "-q").returncode == 0
         other = sample_copy(tmp_path / "other", COUNT - 3)
-        done = lslam("map", run, "--out", run / "b.ply", "--sequence", other)
-        assert (done.returncode, "does not fit" in done.stderr) == (3, True)
+        with pytest.raises(InputError, match="does not fit"):
+            cli(["map", str(run), "--out", str(run / "b.ply"), "--sequence", str(other), "-q"], standalone_mode=False)
     finally:
         (tmp_path / "moved").rename(scans)
     (run / "trajectory.tum").unlink()
-    for target, part in (
-        (run, "no trajectory.tum"),
-        (tmp_path / "none", "no folder of a run"),
-        (tmp_path, "manifest.json"),
-    ):
-        done = lslam("map", target)
-        assert (done.returncode, part in done.stderr) == (3, True), done.stderr
-        assert_one_sentence(done.stderr)
+    nothing = tmp_path / "none"
+    for target, part in ((run, "no trajectory.tum"), (nothing, "no folder of a run"), (tmp_path, "manifest.json")):
+        with pytest.raises(InputError, match=part):
+            cli(["map", str(target), "-q"], standalone_mode=False)
     for path in run.glob("map.*"):
         path.unlink()
-    done = lslam("map", run, "--score")
-    assert (done.returncode, "has no map file" in done.stderr) == (3, True)
+    with pytest.raises(InputError, match="has no map file"):
+        cli(["map", str(run), "--score"], standalone_mode=False)
