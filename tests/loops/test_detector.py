@@ -182,3 +182,18 @@ def test_after_a_warm_start_nothing_is_left_to_compile() -> None:
     true = np.array([round_the_square(d) for d in np.arange(0, 380, 10.0)])
     assert accepted(detect(town(), true, drifted(true)))
     assert [len(kernel.signatures) for kernel in kernels] == before
+
+
+def test_compares_places_in_a_level_world() -> None:
+    mounting = pose(0, 0, roll_deg=20, pitch_deg=25)
+    mounting[:3, 3] = 0
+    level = np.array([round_the_square(d) for d in np.arange(0, 380, 10.0)]) @ mounting
+    world, true = se3.apply(se3.inverse(level[0]), town()), se3.relative(level[0], level)
+
+    def cloud(number: int) -> Points:
+        return seen(world, true[number], np.random.default_rng(number))
+
+    detector = Detector(keyframes_of(true), cloud, LoopsConfig(), RegistrationConfig())
+    assert accepted(detector.find())
+    for keyframe, expected in zip(detector.keyframes, level, strict=True):
+        assert np.rad2deg(np.arccos(keyframe.T_world_lidar[2, :3] @ expected[2, :3])) < 1.5

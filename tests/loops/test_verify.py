@@ -11,6 +11,7 @@ from lslam.config.loops import LoopsConfig
 from lslam.config.registration import RegistrationConfig
 from lslam.geometry import se3
 from lslam.loops.place import Place, make_place
+from lslam.loops.search import find_starts
 from lslam.loops.verify import Comparison, Verifier
 
 Floats = NDArray[np.float64]
@@ -96,6 +97,20 @@ def test_max_rmse_and_overlap_are_heeded() -> None:
     a, b = place(world, pose(5, -45), 1), place(world, pose(7, -45), 2)
     assert compare(a, b, np.zeros(3), 5.0, max_rmse=0.001).stage == "registration"
     assert compare(a, b, np.zeros(3), 5.0, min_overlap=0.999).stage == "overlap"
+    assert compare(a, b, np.zeros(3), 5.0, max_disagreement_m=1e-6).stage == "agreement"
+
+
+def test_the_search_from_above_tells_shift_turn_and_climb() -> None:
+    world = town()
+    T_a, T_b = pose(5, -45), pose(11, -48, 8)
+    T_b[2, 3] += 4.0
+    a, b = place(world, T_a, 1), place(world, T_b, 2)
+    start = find_starts(a, b, np.zeros(3), 12.0, YAWS)[0].T_a_b
+    assert np.linalg.norm(start[:2, 3] - [6, -3]) < 1.0
+    assert abs(start[2, 3] - 4.0) < 0.3
+    assert np.rad2deg(np.arctan2(start[1, 0], start[0, 0])) == pytest.approx(8, abs=2.1)
+    near = find_starts(a, b, np.zeros(3), 3.0, YAWS)
+    assert all(np.linalg.norm(found.T_a_b[:2, 3]) <= 3.0 for found in near)
 
 
 def test_a_place_knows_what_stands_up() -> None:
