@@ -10,10 +10,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
-from scipy.stats import chi2
 
 from lslam.geometry import se3, so3
+from lslam.graph.chi_square import quantile
 
 Floats = NDArray[np.float64]
 
@@ -86,11 +85,13 @@ def _consensus(a: Floats, fixes: Floats, sigmas: Floats) -> Floats | None:
 def _fits(T: Floats, a: Floats, fixes: Floats, sigmas: Floats) -> NDArray[np.bool_]:
     with np.errstate(invalid="ignore"):
         whitened = ((fixes - se3.apply(T, a)) / sigmas) ** 2
-    return np.asarray(np.nan_to_num(whitened.sum(1), nan=np.inf) <= chi2.ppf(0.999, 3))
+    return np.asarray(np.nan_to_num(whitened.sum(1), nan=np.inf) <= quantile(0.999, 3))
 
 
 def _refined(T: Floats, a: Floats, fixes: Floats, sigmas: Floats, up_sigma: float) -> Floats:
     """Least squares over all six degrees of freedom, tilt held by what is known of up."""
+    from scipy.optimize import least_squares
+
     centre = a.mean(0)
 
     def moved(x: Floats) -> Floats:

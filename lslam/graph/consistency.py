@@ -12,11 +12,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
-from scipy.stats import chi2
 
 from lslam.config.graph import GraphConfig
 from lslam.geometry import noise, se3, so3
+from lslam.graph.chi_square import quantile
 from lslam.graph.problem import PoseGraph
 from lslam.types.constraint import Constraint
 
@@ -67,7 +66,7 @@ def judge_loops(graph: PoseGraph, config: GraphConfig) -> list[str]:
         return reasons
     ends = Ends(graph.loops)
     drift = drift_of(graph, config)
-    limit = float(chi2.ppf(config.probability, 6))
+    limit = quantile(config.probability, 6)
     twists, covariances = _against_odometry(graph, ends, drift)
     errors = _squared(twists, covariances)
     near = errors <= limit
@@ -114,6 +113,8 @@ def _against_odometry(graph: PoseGraph, ends: Ends, drift: Drift) -> tuple[Float
 
 def _voted_out(graph: PoseGraph, ends: Ends, drift: Drift, limit: float) -> list[tuple[int, float]]:
     """Loops that most of their neighbours contradict, with the share that agreed."""
+    from scipy.spatial import cKDTree
+
     where = np.column_stack([drift.distances[ends.a], drift.distances[ends.b]])
     k = min(NEIGHBOURS, len(where) - 1)
     _, found = cKDTree(where).query(where, k + 1, p=1)

@@ -11,10 +11,10 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
 from lslam.config.graph import GraphConfig
 from lslam.geometry import noise, se3, so3
+from lslam.graph.chi_square import quantile
 from lslam.graph.problem import PoseGraph
 from lslam.types.constraint import Constraint
 
@@ -101,7 +101,7 @@ def _of_fixes(graph: PoseGraph, known: Floats, drift: Floats) -> float:
 
 def _fitting(error: Floats, own: Floats, grown: Floats) -> float:
     """The factor on `grown` (P, n, n), beside `own`, with which the median error (P, n) is as large as it should be."""
-    typical = float(chi2.median(error.shape[1]))
+    typical = quantile(0.5, error.shape[1])
 
     def is_enough(factor: float) -> bool:
         solved = np.linalg.solve(factor * grown + own, error[..., None])[..., 0]

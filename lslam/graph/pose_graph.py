@@ -7,8 +7,6 @@ from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 
 from lslam.config.graph import GraphConfig
 from lslam.errors import GraphError
@@ -86,6 +84,9 @@ def _upright(graph: PoseGraph, poses: Floats, believed: list[Doubted]) -> tuple[
 
 def check_graph(graph: PoseGraph) -> None:
     """Raise GraphError for a graph that has no solution: numbers that are not finite, keyframes that hang on nothing."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
     count = len(graph)
     if not count or not np.isfinite(graph.poses).all():
         raise GraphError("the pose graph has no keyframes" if not count else "a keyframe's pose is not finite")

@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
 from lslam.config.graph import GraphConfig
+from lslam.graph.chi_square import quantile
 from lslam.graph.solve import solve
 
 Floats = NDArray[np.float64]
@@ -52,7 +52,7 @@ class Settled:
 
 def settle(fixed: Any, doubted: Sequence[Doubted], values: Any, config: GraphConfig) -> Settled:
     """Solve, deciding what to believe as `config.robust` says."""
-    limits = np.array([chi2.ppf(config.probability, d.dim) for d in doubted])
+    limits = np.array([quantile(config.probability, d.dim) for d in doubted])
     plain = [d.make(1.0, None) for d in doubted]
     if config.robust == "gnc":
         return _graduated(fixed, doubted, plain, limits, values, config)
@@ -126,7 +126,7 @@ def _kernel(name: str, dim: int) -> Any:
     """M-estimators whose bend lies where 95 % of right residuals are below."""
     import gtsam
 
-    bend = float(np.sqrt(chi2.ppf(0.95, dim)))
+    bend = float(np.sqrt(quantile(0.95, dim)))
     estimators = gtsam.noiseModel.mEstimator
     kernels: dict[str, Any] = {"huber": estimators.Huber, "cauchy": estimators.Cauchy}
     return kernels[name].Create(bend) if name in kernels else None
