@@ -35,7 +35,7 @@ PEERS = [Requirement(t) for t in PROJECT["optional-dependencies"]["peers"]]
 # One module by two names: a machine has one of them.
 EITHER = {"open3d", "open3d-cpu"}
 # Run as commands, not imported.
-TOOLS = {"mypy", "pytest-xdist", "ruff", "scipy-stubs", "types-defusedxml"}
+TOOLS = {"mypy", "pytest-xdist", "ruff", "scipy-stubs", "types-defusedxml", "types-requests"}
 # Comes with pytest.
 WITH_PYTEST = {"packaging"}
 
