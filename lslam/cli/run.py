@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 @click.command(
     epilog="\b\nExamples: lslam run sample_data --out runs/first\n"
     "          lslam run seq07 --data-root ~/kitti --method kiss-icp\n"
+    "          lslam run sample_data --gnss --crs EPSG:25832 --set map.format=laz\n"
+    "          lslam run my_scans --poses theirs.tum --out runs/theirs\n"
     "          lslam run 2011_09_26_drive_0005_sync --set map.voxel=0.1 --json"
 )
 @click.argument("sequence")
