@@ -22,6 +22,8 @@ MEMORY_S = 20.0
 CELLS, ROUGHNESS = 80, 0.15
 # rad; a floor this much steeper than the world's horizon is a ramp or a roof (hdl_graph_slam takes 10 deg).
 STEEPEST = np.deg2rad(10.0)
+# m; what lies higher or lower under the sensor than its floor usually does is a roof or a hole (height_clip_range there).
+CLIP_M = 1.0
 
 
 def up_directions(
@@ -51,7 +53,7 @@ def world_up(ups: Sequence[UpDirection], keyframes: Sequence[Keyframe]) -> Float
 
 
 def floor_planes(store: KeyframeStore, config: GraphConfig) -> list[FloorPlane]:
-    """The floor under each keyframe, where one is seen that lies level in the world."""
+    """The floor under each keyframe, where one is seen that lies level, as far below as usual."""
     planes = []
     for keyframe in store.keyframes:
         R, height = levelling(store.points(keyframe.number), ROUGHNESS, CELLS)
@@ -59,4 +61,5 @@ def floor_planes(store: KeyframeStore, config: GraphConfig) -> list[FloorPlane]:
         if not np.isfinite(height) or (keyframe.T_world_lidar[:3, :3] @ normal)[2] < np.cos(STEEPEST):
             continue
         planes.append(FloorPlane(keyframe.number, normal, -height, float(np.deg2rad(config.floor_deg)), config.floor_m))
-    return planes
+    usual = float(np.median([p.offset for p in planes])) if planes else 0.0
+    return [p for p in planes if abs(p.offset - usual) <= CLIP_M]
