@@ -1,0 +1,50 @@
+"""What summary and report say of loops and fixes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from lslam.geometry import se3
+from lslam.reports.back_end import back_end_figures, back_end_rows
+from lslam.types.constraint import LoopCandidate
+from lslam.types.georeference import Georeference
+from lslam.types.run_record import RunRecord
+
+
+def test_a_run_without_a_back_end_says_nothing(make_record: Callable[..., RunRecord]) -> None:
+    record = make_record(40)
+    assert back_end_rows(record, None) == []
+    assert back_end_figures(record, None) == []
+
+
+def test_loops_and_fixes_are_counted_and_drawn(make_record: Callable[..., RunRecord]) -> None:
+    record = make_record(40)
+    shift = se3.make(np.eye(3), np.array([0.5, 0.0, 0.0]))
+    record.odometry = replace(record.trajectory, poses=shift @ record.trajectory.poses)
+    record.trajectory = replace(record.trajectory, covariances=np.tile(1e-4 * np.eye(6), (40, 1, 1)))
+    record.keyframe_scans = np.arange(0, 40, 2)
+    record.loops = [
+        LoopCandidate(0, 15, 1.0, 0.1, "accepted", "agreement"),
+        LoopCandidate(1, 16, 1.0, 0.1, "rejected", "overlap", "too little"),
+        LoopCandidate(1, 17, 1.0, 0.1, "rejected", "thinned", "another is near"),
+    ]
+    record.georeference = Georeference(np.array([49.0, 8.4, 115.0]), np.eye(4), fixes=10, used=9, rmse_horizontal=0.5)
+    rows = dict(back_end_rows(record, None))
+    assert rows["loops"] == "1 closed of 2 tried"
+    assert "9 of 10 fixes" in rows["georeference"]
+    assert "49.0000000, 8.4000000" in rows["georeference"]
+    (figure,) = back_end_figures(record, None)
+    labels = [label for _, label in figure.legend]
+    assert "1 loop closed" in labels
+    assert any(label.startswith("3 sigma, drawn") for label in labels)
+    # Before, after, one loop and sixteen ellipses.
+    assert figure.svg.count('class="line') == 19
+
+
+def test_a_graph_that_moved_nothing_draws_nothing(make_record: Callable[..., RunRecord]) -> None:
+    record = make_record(40)
+    record.odometry = record.trajectory
+    assert back_end_figures(record, None) == []
