@@ -6,9 +6,10 @@ import platform
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
 from typing import Any
 
 from lslam.config import Config
@@ -161,6 +162,11 @@ def describe_deskew(sequence: Sequence, config: Config, has_times: bool, how: st
 
 def peak_memory_mb() -> float | None:
     """Largest resident memory of this process so far, MB; None where the system does not say."""
+    # Linux's rusage begins with what the process had that started this one.
+    with suppress(OSError, ValueError):
+        lines = Path("/proc/self/status").read_text().splitlines()
+        (peak_kb,) = [line.split()[1] for line in lines if line.startswith("VmHWM:")]
+        return round(int(peak_kb) * 1024 / 1e6, 1)
     try:
         import resource
     except ImportError:

@@ -204,7 +204,7 @@ def shapes_after(change: Callable[[GaussianMap], None]) -> Floats:
     m.shapes()
     change(m)
     shapes, fresh = m.shapes().copy(), GaussianMap(SIZE)
-    for name in ("moments", "planes", "keys", "refreshed", "table", "state"):
+    for name in ("moments", "planes", "keys", "refreshed", "table", "pool"):
         setattr(fresh, name, getattr(m, name))
     expected, live = fresh.shapes(), m.keys >= 0
     np.testing.assert_array_equal(shapes[live][:, [0, 1, 2, 9, 10]], expected[live][:, [0, 1, 2, 9, 10]])
