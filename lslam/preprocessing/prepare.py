@@ -52,7 +52,7 @@ def prepare_points(
     """
     cloud = as_cloud(points)
     chosen = gate_points(cloud, config)
-    kept = cloud[chosen]
+    kept = voxel.take(cloud, chosen)
     kept_times = NO_TIMES if times is None else np.ascontiguousarray(times, np.float32)[chosen]
     map_points, map_times, _ = voxel.centroids(kept, kept_times, config.map_leaf)
     source, source_times, scatter = _source_points(kept, kept_times, map_points, map_times, config, index)

@@ -172,3 +172,11 @@ def test_mean_times_and_the_two_halves_of_a_sweep() -> None:
     means = np.bincount(voxel_of, times[is_late].astype(float)) / np.bincount(voxel_of)
     np.testing.assert_allclose(mean_times[mean_times > 0.05], means, rtol=1e-5)
     assert len(voxel.centroids(points, UNTIMED, 0.7)[1]) == 0
+
+
+def test_take_gives_the_rows_in_the_order_asked_for() -> None:
+    rng = np.random.default_rng(5)
+    points = rng.normal(size=(200, 3)).astype(np.float32)
+    index = rng.integers(0, 200, 333)
+    np.testing.assert_array_equal(voxel.take(points, index), points[index])
+    assert voxel.take(points, index[:0]).shape == (0, 3)
