@@ -86,6 +86,10 @@ def command(sequence: str, **given: Any) -> None:
         from lslam.readers.raw_drive import with_imu
 
         opened = with_imu(opened, given["data_root"])
+    if config.gnss.mode != "off":
+        from lslam.readers.raw_drive import with_gnss
+
+        opened = with_gnss(opened, given["data_root"])
     truth = read_truth(given["gt"], opened)
     out = given["out"] or default_folder(opened.name, config.odometry.method + ("-imu" if config.imu.use else ""))
     if given["dry_run"]:

@@ -31,7 +31,7 @@ from lslam.pipeline.resume import may_go_on, run_identity
 from lslam.pipeline.run_folder import KEYFRAMES, RunFolder
 from lslam.pipeline.watch import RunOutcome, Watch
 from lslam.readers import open_sequence
-from lslam.readers.raw_drive import with_imu
+from lslam.readers.raw_drive import with_gnss, with_imu
 from lslam.types.run_record import RunRecord
 from lslam.types.sequence import Sequence
 from lslam.types.trajectory import Trajectory
@@ -69,6 +69,8 @@ def run(
     check_config(config)
     if isinstance(sequence, (str, Path)):
         sequence = open_sequence(sequence)
+    if config.gnss.mode != "off":
+        sequence = with_gnss(sequence)
     require_gnss(sequence, config.gnss)
     truth = sequence.ground_truth if ground_truth is None else ground_truth
     odometry = create_odometry(with_imu_settings(config))

@@ -1,4 +1,4 @@
-"""The IMU of a KITTI odometry sequence: the benchmark leaves it out, the raw drive it was cut from has it."""
+"""IMU and GNSS of a KITTI odometry sequence: the benchmark leaves them out, the raw drive it was cut from has them."""
 
 from __future__ import annotations
 
@@ -7,13 +7,15 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lslam.errors import InputError
 from lslam.formats.kitti_calib import read_rigid
-from lslam.formats.oxts_files import ACCEL, GYRO, Oxts, read_oxts
+from lslam.formats.oxts_files import ACCEL, GYRO, POS_ACC, Oxts, read_oxts
 from lslam.formats.stamps_files import read_stamps
 from lslam.readers.folder_sequence import FolderSequence
 from lslam.readers.kitti_odometry import KIND
+from lslam.types.gnss import GnssStream
 from lslam.types.imu import ImuStream
 from lslam.types.sequence import Sequence
 
@@ -54,6 +56,28 @@ def with_imu(sequence: Sequence, data_root: Path | None = None) -> Sequence:
             f"{sequence.path} has no IMU: looked for {sequence.path / 'imu.csv'} and `imu` in sequence.toml there; "
             "add it, or run without --imu"
         )
+    return _with_imu(sequence, *_drive_of(sequence, number, data_root, "IMU", "imu.csv", "--imu"))
+
+
+def with_gnss(sequence: Sequence, data_root: Path | None = None) -> Sequence:
+    """The sequence with satellite fixes: its own, else, for a KITTI odometry sequence, those of its raw drive, as `with_imu`.
+
+    Other sequences come back as they are. Raises InputError naming the paths looked at.
+    """
+    number = sequence.path.name
+    if sequence.gnss is not None or not isinstance(sequence, FolderSequence):
+        return sequence
+    if sequence.kind != KIND or number not in DRIVES:
+        return sequence
+    return _with_gnss(
+        sequence, *_drive_of(sequence, number, data_root, "GNSS", "gnss.csv", "--gnss and --georeference")
+    )
+
+
+def _drive_of(
+    sequence: FolderSequence, number: str, data_root: Path | None, what: str, file: str, flags: str
+) -> tuple[Path, int]:
+    """Folder of the raw drive, and the frame in it that is the first scan."""
     date, drive, first = DRIVES[number]
     folders = [
         root / date / f"{date}_drive_{drive:04d}_{kind}"
@@ -64,13 +88,39 @@ def with_imu(sequence: Sequence, data_root: Path | None = None) -> Sequence:
     if found is None:
         looked = ", ".join(str(f / "oxts") for f in folders)
         raise InputError(
-            f"{sequence.path} has no IMU, as in KITTI odometry: looked for {sequence.path / 'imu.csv'} and the raw drive in "
-            f"{looked}; fetch {date}_drive_{drive:04d}_sync or _extract, or run without --imu"
+            f"{sequence.path} has no {what}, as in KITTI odometry: looked for {sequence.path / file} and the raw drive in "
+            f"{looked}; fetch {date}_drive_{drive:04d}_sync or _extract, or run without {flags}"
         )
-    return _joined(sequence, found, first)
+    return found, first
 
 
-def _joined(sequence: FolderSequence, drive: Path, first: int) -> FolderSequence:
+def _with_imu(sequence: FolderSequence, drive: Path, first: int) -> FolderSequence:
+    oxts, stamps, T_lidar_imu, when = _samples(sequence, drive, first)
+    imu = ImuStream(stamps, oxts.values[:, ACCEL].copy(), oxts.values[:, GYRO].copy())
+    return replace(
+        sequence, imu=imu, calibration=replace(sequence.calibration, T_lidar_imu=T_lidar_imu),
+        notes=[*sequence.notes, f"IMU of {when}"], problems=_all_problems(sequence, oxts),
+    )  # fmt: skip
+
+
+def _with_gnss(sequence: FolderSequence, drive: Path, first: int) -> FolderSequence:
+    oxts, stamps, T_lidar_imu, when = _samples(sequence, drive, first)
+    gnss = GnssStream(stamps, oxts.values[:, :3].copy(), oxts.values[:, POS_ACC].copy())
+    # The position that OXTS gives is that of the IMU's origin (devkit readme).
+    return replace(
+        sequence, gnss=gnss, calibration=replace(sequence.calibration, T_lidar_gnss=T_lidar_imu),
+        notes=[*sequence.notes, f"GNSS of {when}"], problems=_all_problems(sequence, oxts),
+    )  # fmt: skip
+
+
+def _all_problems(sequence: FolderSequence, oxts: Oxts) -> list[str]:
+    return list(dict.fromkeys([*sequence.problems, *oxts.problems]))
+
+
+def _samples(
+    sequence: FolderSequence, drive: Path, first: int
+) -> tuple[Oxts, NDArray[np.int64], NDArray[np.float64], str]:
+    """OXTS of the drive, its stamps (N,), ns, on the sequence's clock, T_lidar_imu (4, 4), and in words where from."""
     calibration = drive.parent / CALIBRATION
     if not calibration.is_file():
         raise InputError(f"{calibration} is missing: it says how the IMU sits, fetch the calibration of that day")
@@ -80,13 +130,9 @@ def _joined(sequence: FolderSequence, drive: Path, first: int) -> FolderSequence
         raise InputError(f"{drive / 'oxts'} holds no samples with stamps (data/*.txt and timestamps.txt)")
     begin_ns, clock = _begin(drive, oxts, first)
     stamps = oxts.stamps_ns - begin_ns + int(sequence.stamps_ns[0])
-    imu = ImuStream(stamps, oxts.values[:, ACCEL].copy(), oxts.values[:, GYRO].copy())
     rate = 1e9 / float(np.median(np.diff(stamps))) if len(stamps) > 1 else 0.0
-    note = f"IMU of {drive} at {rate:.0f} Hz, its frame {first} by {clock} taken as the first scan"
-    return replace(
-        sequence, imu=imu, calibration=replace(sequence.calibration, T_lidar_imu=T_lidar_imu),
-        notes=[*sequence.notes, note], problems=[*sequence.problems, *oxts.problems],
-    )  # fmt: skip
+    when = f"{drive} at {rate:.0f} Hz, its frame {first} by {clock} taken as the first scan"
+    return oxts, stamps, T_lidar_imu, when
 
 
 def _begin(drive: Path, oxts: Oxts, first: int) -> tuple[int, str]:

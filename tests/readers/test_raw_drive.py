@@ -16,7 +16,7 @@ from lslam.formats.imu_csv import write_imu_csv
 from lslam.formats.trajectory_files import read_trajectory
 from lslam.geometry import se3, so3
 from lslam.readers import open_sequence
-from lslam.readers.raw_drive import with_imu
+from lslam.readers.raw_drive import with_gnss, with_imu
 from lslam.types.imu import ImuStream
 
 DRIVE = "2011_09_30_drive_0027"
@@ -29,6 +29,7 @@ def oxts(folder: Path, count: int, rate_hz: float, begin: float = 0.0) -> None:
     lines = []
     for k in range(count):
         values = np.zeros(30)
+        values[:3], values[23] = (49.0 + 1e-6 * k, 8.4, 115.0), 0.5
         values[13], values[19] = 9.81, k / 1000
         (folder / "data" / f"{k:010d}.txt").write_text(" ".join(map(str, values)))
         at = epoch + timedelta(seconds=begin + k / rate_hz)
@@ -53,6 +54,27 @@ def test_the_sync_drive_is_found_and_begins_with_the_first_scan(tmp_path: Path) 
     np.testing.assert_allclose(sequence.calibration.T_lidar_imu[:3, 3], [-0.81, 0.32, -0.8])
     assert sequence.calibration.T_cam0_lidar is not None
     assert "10 Hz" in sequence.notes[-1]
+
+
+def test_satellite_fixes_come_from_the_same_drive(tmp_path: Path) -> None:
+    folder = kitti_root(tmp_path / "kitti", 20)
+    with pytest.raises(InputError, match=r"has no GNSS.*gnss\.csv.*2011_09_30_drive_0027_sync or _extract.*--gnss"):
+        with_gnss(open_sequence(folder))
+    oxts(tmp_path / "raw" / "2011_09_30" / f"{DRIVE}_sync" / "oxts", 20, 10.0)
+    calibration(tmp_path / "raw" / "2011_09_30")
+    sequence = with_gnss(open_sequence(folder))
+    assert sequence.gnss is not None
+    assert sequence.imu is None
+    np.testing.assert_array_equal(sequence.gnss.stamps_ns, sequence.stamps_ns)
+    np.testing.assert_allclose(sequence.gnss.lat_lon_alt[7], [49.000007, 8.4, 115.0])
+    np.testing.assert_allclose(sequence.gnss.sigma, 0.5)
+    assert sequence.calibration.T_lidar_gnss is not None
+    np.testing.assert_allclose(sequence.calibration.T_lidar_gnss[:3, 3], [-0.81, 0.32, -0.8])
+    both = with_imu(sequence)
+    assert both.imu is not None
+    assert both.gnss is sequence.gnss
+    other = open_sequence(kitti_root(tmp_path / "more", 5, "21"))
+    assert with_gnss(other) is other
 
 
 def test_the_faster_extract_drive_is_preferred_and_timed_by_the_camera(tmp_path: Path) -> None:
