@@ -70,7 +70,7 @@ def with_gnss(sequence: Sequence, data_root: Path | None = None) -> Sequence:
     if sequence.kind != KIND or number not in DRIVES:
         return sequence
     return _with_gnss(
-        sequence, *_drive_of(sequence, number, data_root, "GNSS", "gnss.csv", "--gnss and --georeference")
+        sequence, *_drive_of(sequence, number, data_root, "satellite fixes", "gnss.csv", "--gnss and --georeference")
     )
 
 

@@ -58,7 +58,9 @@ def test_the_sync_drive_is_found_and_begins_with_the_first_scan(tmp_path: Path) 
 
 def test_satellite_fixes_come_from_the_same_drive(tmp_path: Path) -> None:
     folder = kitti_root(tmp_path / "kitti", 20)
-    with pytest.raises(InputError, match=r"has no GNSS.*gnss\.csv.*2011_09_30_drive_0027_sync or _extract.*--gnss"):
+    with pytest.raises(
+        InputError, match=r"has no satellite fixes.*gnss\.csv.*2011_09_30_drive_0027_sync or _extract.*--gnss"
+    ):
         with_gnss(open_sequence(folder))
     oxts(tmp_path / "raw" / "2011_09_30" / f"{DRIVE}_sync" / "oxts", 20, 10.0)
     calibration(tmp_path / "raw" / "2011_09_30")
