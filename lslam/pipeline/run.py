@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from lslam.config import Config
@@ -15,8 +15,10 @@ from lslam.odometry import create_odometry
 from lslam.odometry.base import FeatureSource, Odometry
 from lslam.odometry.given import GivenPoses
 from lslam.pipeline import outputs
+from lslam.pipeline.back_end import BackEnd
 from lslam.pipeline.back_end_pass import level_world, optimise_poses, write_back_end
 from lslam.pipeline.check import check_config
+from lslam.pipeline.checkpoints import OdometryCheckpoints
 from lslam.pipeline.choose import choose_scans
 from lslam.pipeline.feature_pass import build_feature_map
 from lslam.pipeline.front_end import has_point_times
@@ -69,74 +71,104 @@ def run(
     check_config(config)
     if isinstance(sequence, (str, Path)):
         sequence = open_sequence(sequence)
+    job = _prepare(sequence, config, ground_truth, command, watch)
+    if out is None:
+        record, _, evaluation = _solve(job, KeyframeStore())
+    else:
+        job.manifest.identity = run_identity(job.sequence, job.truth, config, job.given)
+        goes_on = resume and may_go_on(Path(out), job.manifest.identity, config)
+        with RunFolder(Path(out), overwrite or resume, goes_on) as folder:
+            try:
+                record, evaluation = _fill(folder, job, goes_on)
+            except BaseException as error:
+                status = job.manifest.word_for(error)
+                _write_last(folder, job.manifest.as_dict(status, str(error) or type(error).__name__))
+                raise
+            folder.write_manifest(record.manifest)
+            if job.manifest.outcome != "interrupted":
+                folder.drop_checkpoint()
+            log.info("%s; results in %s", job.manifest.outcome, folder.path)
+    outcome = RunOutcome(record, evaluation)
+    watch.on_end(outcome)
+    _raise_outcome(job.manifest, config, "" if out is None else ", and --resume goes on")
+    return outcome
+
+
+@dataclass(frozen=True)
+class _Job:
+    """What is to be done, resolved: the chosen scans, the method and the truth; `given` are the poses of --poses."""
+
+    sequence: Sequence
+    odometry: Odometry
+    config: Config
+    truth: Trajectory | None
+    given: Trajectory | None
+    manifest: Manifest
+    watch: Watch
+
+
+def _prepare(sequence: Sequence, config: Config, truth: Trajectory | None, command: str, watch: Watch) -> _Job:
+    """Find what the configuration asks for beside the scans: fixes, an IMU, poses; and choose the scans."""
     if config.gnss.mode != "off":
         sequence = with_gnss(sequence)
     require_gnss(sequence, config.gnss)
-    truth = sequence.ground_truth if ground_truth is None else ground_truth
+    truth = sequence.ground_truth if truth is None else truth
     odometry = create_odometry(with_imu_settings(config))
     given: Trajectory | None = None
     if isinstance(odometry, GivenPoses):
         sequence.notes.extend(bind(odometry, sequence))
         given = odometry.trajectory
     chosen = choose_scans(with_imu(sequence) if config.imu.use else sequence, odometry, config)
-    manifest = Manifest(command, chosen, config)
-    if out is None:
-        _announce(chosen, odometry, config, manifest)
-        store = KeyframeStore()
-        record = estimate_poses(chosen, odometry, config, manifest, Path(), truth, watch, store)
-        optimise_poses(chosen, record, store, config, manifest)
-        level_world(record, chosen, config, manifest)
-        evaluation = _score(record, chosen, config)
-    else:
-        manifest.identity = run_identity(chosen, truth, config, given)
-        goes_on = resume and may_go_on(Path(out), manifest.identity, config)
-        with RunFolder(Path(out), overwrite or resume, goes_on) as folder:
-            try:
-                folder.require_space(outputs.least_bytes(len(chosen)), "the result without its map")
-                _announce(chosen, odometry, config, manifest)
-                folder.write_text("config.toml", outputs.config_text(config))
-                folder.write_manifest(manifest.as_dict("running"))
-                store = KeyframeStore(folder.path / KEYFRAMES)
-                checkpoints = odometry_checkpoints(folder, config, goes_on)
-                record = estimate_poses(
-                    chosen, odometry, config, manifest, folder.path, truth, watch, store, checkpoints
-                )
-                done = optimise_poses(chosen, record, store, config, manifest)
-                level_world(record, chosen, config, manifest)
-                write_back_end(folder.path, record, store, done)
-                outputs.write_trajectories(folder, record, chosen.calibration)
-                outputs.write_scans(folder, record)
-                evaluation = _score(record, chosen, config)
-                outputs.write_evaluation(folder, record, evaluation)
-                _map(folder, chosen, record, config, manifest, watch)
-                outputs.write_evaluation(folder, record, evaluation)  # now with the map's crispness
-                _feature_map(folder, chosen, odometry, record, config, manifest, watch)
-                _report(folder, record, evaluation, config, manifest)
-            except BaseException as error:
-                _write_last(folder, manifest.as_dict(manifest.word_for(error), str(error) or type(error).__name__))
-                raise
-            folder.write_manifest(manifest.as_dict(manifest.outcome))
-            if manifest.outcome != "interrupted":
-                folder.drop_checkpoint()
-            log.info("%s; results in %s", manifest.outcome, folder.path)
-    outcome = RunOutcome(record, evaluation)
-    watch.on_end(outcome)
-    _raise_outcome(manifest, config, "" if out is None else ", and --resume goes on")
-    return outcome
+    return _Job(chosen, odometry, config, truth, given, Manifest(command, chosen, config), watch)
 
 
-def _announce(sequence: Sequence, odometry: Odometry, config: Config, manifest: Manifest) -> None:
+def _solve(
+    job: _Job, store: KeyframeStore, folder: Path = Path(), checkpoints: OdometryCheckpoints | None = None
+) -> tuple[RunRecord, BackEnd, Evaluation | None]:
+    """The poses of all scans, made consistent and level, and their score."""
+    _announce(job)
+    record = estimate_poses(
+        job.sequence, job.odometry, job.config, job.manifest, folder, job.truth, job.watch, store, checkpoints
+    )
+    done = optimise_poses(job.sequence, record, store, job.config, job.manifest)
+    level_world(record, job.sequence, job.config, job.manifest)
+    return record, done, _score(record, job.sequence, job.config)
+
+
+def _fill(folder: RunFolder, job: _Job, goes_on: bool) -> tuple[RunRecord, Evaluation | None]:
+    """The whole result in a run folder, the last word of its manifest aside."""
+    folder.require_space(outputs.least_bytes(len(job.sequence)), "the result without its map")
+    folder.write_text("config.toml", outputs.config_text(job.config))
+    folder.write_manifest(job.manifest.as_dict("running"))
+    store = KeyframeStore(folder.path / KEYFRAMES)
+    checkpoints = odometry_checkpoints(folder, job.config, goes_on)
+    record, done, evaluation = _solve(job, store, folder.path, checkpoints)
+    write_back_end(folder.path, record, store, done)
+    outputs.write_trajectories(folder, record, job.sequence.calibration)
+    outputs.write_scans(folder, record)
+    try:
+        _map(folder, job, record)
+    finally:  # with the map's crispness, and whatever becomes of the map
+        outputs.write_evaluation(folder, record, evaluation)
+    _feature_map(folder, job, record)
+    _report(folder, job, record, evaluation)
+    return record, evaluation
+
+
+def _announce(job: _Job) -> None:
     """Say what is about to be run and what the reader decided, once: the log keeps it beside the results."""
+    sequence, config = job.sequence, job.config
     log.info("%s: %d scans of %s, method %s", sequence.name, len(sequence), sequence.path, config.odometry.method)
     for note in sequence.notes:
         log.info("%s", note)
     for problem in sequence.problems:
         log.warning("%s", problem)
-    manifest.deskew = describe_deskew(sequence, config, has_point_times(sequence), getattr(odometry, "deskew", ""))
-    if manifest.deskew.startswith("no deskew"):
-        log.warning("%s", manifest.deskew)
+    deskew = describe_deskew(sequence, config, has_point_times(sequence), getattr(job.odometry, "deskew", ""))
+    job.manifest.deskew = deskew
+    if deskew.startswith("no deskew"):
+        log.warning("%s", deskew)
     else:
-        log.info("deskew: %s", manifest.deskew)
+        log.info("deskew: %s", deskew)
 
 
 def _score(record: RunRecord, sequence: Sequence, config: Config) -> Evaluation | None:
@@ -158,23 +190,17 @@ def _score(record: RunRecord, sequence: Sequence, config: Config) -> Evaluation 
     return score
 
 
-def _map(
-    folder: RunFolder, sequence: Sequence, record: RunRecord, config: Config, manifest: Manifest, watch: Watch
-) -> None:
+def _map(folder: RunFolder, job: _Job, record: RunRecord) -> None:
     """The merged map, from the raw scans and the final poses."""
+    config, watch, manifest = job.config, job.watch, job.manifest
     if not config.map.write or manifest.outcome == "interrupted":
         return
     watch.on_start("map", len(record.results))
     with manifest.timed("map_s"):
         built = build_map(
-            sequence,
-            record.results,
-            config,
-            watch.on_step,
-            watch.should_stop,
-            folder.path,
+            job.sequence, record.results, config, watch.on_step, watch.should_stop, folder.path,
             map_checkpoints(folder, config),
-        )
+        )  # fmt: skip
         if built is None:
             manifest.interrupt("interrupted while the map was built: there is no map")
             return
@@ -184,16 +210,14 @@ def _map(
     manifest.map_points = len(built.merged)
 
 
-def _feature_map(
-    folder: RunFolder, sequence: Sequence, odometry: Odometry, record: RunRecord, config: Config, manifest: Manifest,
-    watch: Watch,
-) -> None:  # fmt: skip
+def _feature_map(folder: RunFolder, job: _Job, record: RunRecord) -> None:
     """The feature map, likewise, when it was asked for."""
+    config, watch, manifest, odometry = job.config, job.watch, job.manifest, job.odometry
     if not config.map.write_features or manifest.outcome == "interrupted" or not isinstance(odometry, FeatureSource):
         return
     watch.on_start("feature map", len(record.results))
     with manifest.timed("feature_map_s"):
-        built = build_feature_map(sequence, odometry, record.results, config, watch.on_step, watch.should_stop)
+        built = build_feature_map(job.sequence, odometry, record.results, config, watch.on_step, watch.should_stop)
         if built is None:
             manifest.interrupt("interrupted while the feature map was built: there is none")
             return
@@ -201,15 +225,15 @@ def _feature_map(
     log.info("feature map: %d points in %s", len(built), folder.path / "feature_map.ply")
 
 
-def _report(
-    folder: RunFolder, record: RunRecord, evaluation: Evaluation | None, config: Config, manifest: Manifest
-) -> None:
-    """report.html."""
+def _report(folder: RunFolder, job: _Job, record: RunRecord, evaluation: Evaluation | None) -> None:
+    """report.html; the record's manifest is the run's last word, with the report's own time."""
+    manifest = job.manifest
     manifest.problems += record.problems
     record.manifest = manifest.as_dict(manifest.outcome)
     with manifest.timed("report_s"):
-        if config.report.html:
+        if job.config.report.html:
             outputs.write_html(folder, record, evaluation)
+    record.manifest = manifest.as_dict(manifest.outcome)
 
 
 def _write_last(folder: RunFolder, manifest: dict[str, object]) -> None:

@@ -87,6 +87,8 @@ def test_a_good_run_writes_everything_and_ends_done(tmp_path: Path) -> None:
     }
     assert facts["sequence"]["decisions"] == ["a note of the reader"]
     assert facts["frames"]["trajectory_kitti.txt"].startswith("camera 0")
+    assert outcome.record.manifest == facts, "`run --json` prints what the file says"
+    assert facts["timings"]["report_s"] > 0
     assert len(outcome.trajectory) == 15
     log = (tmp_path / "out" / "log.txt").read_text()
     assert "a note of the reader" in log
