@@ -1,0 +1,127 @@
+"""results.csv: one row per run of a study.
+
+The first column is the version of the file. Studied parameters are columns named by their configuration key, `input.skip_frames`;
+stages are columns `stage_ms.NAME`. An empty cell is a number that is not there, or a parameter that the run was not given.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+from lslam.errors import InputError
+from lslam.formats.atomic import atomic_write
+from lslam.types.study import StudyRow, Value
+
+VERSION = 1
+SCHEMA = "study_version"
+STAGE = "stage_ms."
+# Worked out from the others, for those who read the table elsewhere.
+DERIVED = ("is_diverged", "time_per_scan_ms")
+_PLAIN = {f.name: str(f.type) for f in fields(StudyRow) if f.name not in ("parameters", "stages_ms")}
+
+
+def study_columns(rows: Sequence[StudyRow]) -> dict[str, list[Value | None]]:
+    """The table by column, parameters after `method` and stages last; None where a cell is empty."""
+    parameters = list(dict.fromkeys(key for row in rows for key in row.parameters))
+    stages = list(dict.fromkeys(key for row in rows for key in row.stages_ms))
+    names = list(_PLAIN)
+    place = names.index("method") + 1
+    table: dict[str, list[Value | None]] = {SCHEMA: [VERSION] * len(rows)}
+    for name in names[:place]:
+        table[name] = [getattr(row, name) for row in rows]
+    for name in parameters:
+        table[name] = [row.parameters.get(name) for row in rows]
+    for name in (*names[place:], *DERIVED):
+        table[name] = [_known(getattr(row, name)) for row in rows]
+    for name in stages:
+        table[STAGE + name] = [row.stages_ms.get(name) for row in rows]
+    return table
+
+
+def write_study_csv(path: Path, rows: Sequence[StudyRow]) -> None:
+    """Write all rows atomically; numbers read back exactly. Raises OutputError."""
+    table = study_columns(rows)
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(table)
+    writer.writerows(zip(*([_text(value) for value in column] for column in table.values()), strict=True))
+    with atomic_write(path) as stream:
+        stream.write(text.getvalue().encode("utf-8", "backslashreplace"))
+
+
+def read_study_csv(path: Path) -> list[StudyRow]:
+    """All rows. Raises InputError naming file and line for what is missing, of another version or not what it should be."""
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as stream:
+            lines = [line for line in csv.reader(stream) if line]
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise InputError(f"study {path} cannot be read: {error}") from None
+    header = lines[0] if lines else []
+    if SCHEMA not in header:
+        raise InputError(f"{path} is no results.csv of a study: it has no column {SCHEMA}")
+    if other := next((cells[0] for cells in lines[1:] if cells[0] != str(VERSION)), None):
+        raise InputError(
+            f"{path} was written by another version of lslam (study version {other}, this one reads {VERSION}): run the "
+            "study again, finished runs of this version are kept"
+        )
+    if missing := [name for name in _PLAIN if name not in header]:
+        raise InputError(f"{path} is not complete: column {', '.join(missing)} is missing")
+    rows = []
+    for number, cells in enumerate(lines[1:], 2):
+        if len(cells) != len(header):
+            raise InputError(f"{path}, line {number}: {len(cells)} columns where the header has {len(header)}")
+        try:
+            rows.append(_row(dict(zip(header, cells, strict=True))))
+        except ValueError as error:
+            raise InputError(f"{path}, line {number}: {error}") from None
+    return rows
+
+
+def _row(cells: dict[str, str]) -> StudyRow:
+    values: dict[str, Any] = {name: _READ[kind](cells[name]) for name, kind in _PLAIN.items()}
+    stages = {name.removeprefix(STAGE): float(text) for name, text in cells.items() if name.startswith(STAGE) and text}
+    parameters = {
+        name: _value(text) for name, text in cells.items() if "." in name and not name.startswith(STAGE) and text
+    }
+    return StudyRow(**values, parameters=parameters, stages_ms=stages)
+
+
+def _known(value: Value) -> Value | None:
+    return None if isinstance(value, float) and math.isnan(value) else value
+
+
+def _text(value: Value | None) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    return "" if value is None else str(value)
+
+
+def _truth(text: str) -> bool:
+    if text not in ("true", "false"):
+        raise ValueError(f"{text!r} is neither true nor false")
+    return text == "true"
+
+
+def _number(text: str) -> float:
+    return float(text) if text else math.nan
+
+
+def _value(text: str) -> Value:
+    """A parameter as it was: a whole number stays one."""
+    if text in ("true", "false"):
+        return text == "true"
+    for kind in (int, float):
+        try:
+            return kind(text)
+        except ValueError:
+            continue
+    return text
+
+
+_READ: dict[str, Callable[[str], Value]] = {"str": str, "int": int, "float": _number, "bool": _truth}

@@ -1,0 +1,67 @@
+"""What a sensitivity study holds: one plain row per run, failures included."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from math import nan
+
+from lslam.types.comparison import USABLE
+
+Value = bool | int | float | str
+
+
+@dataclass(frozen=True)
+class StudyRow:
+    """One run of a study.
+
+    run : names it within the study; study : its name; seed : of the simulation, or of what the method draws
+    method : of the method or preset, without its IMU; uses_imu : whether it was to use it
+    parameters : what is studied, by configuration key; empty for a run beside the study, at its own values (`is_beside`)
+    status : `done`, `degraded`, `diverged`, `failed` or `crashed`; reason : why it is not done
+    thesis_rmse : m, origin alignment, sqrt(sum |e|^2 / 3N); ate_se3, ate_origin : m, rmse; angular_rmse_deg : equation 2.15 of
+        the first thesis; nan where there is none
+    scans : processed; stages_ms : mean ms per scan by stage, in the order they are passed; total_time_s : of all stages over
+        all scans; run_s : of the whole run with its reading and writing
+    bridged_share : of the scans, 0..1; is_timing_comparable : nothing else ran on the machine that the study knows of
+    digest : of the resolved configuration, the input and lslam's version; machine : name of the host
+    folder : of the run, from the study's
+    """
+
+    run: str
+    study: str
+    sequence: str
+    seed: int
+    method: str
+    uses_imu: bool = False
+    parameters: dict[str, Value] = field(default_factory=dict)
+    is_beside: bool = False
+    status: str = "failed"
+    reason: str = ""
+    thesis_rmse: float = nan
+    ate_se3: float = nan
+    ate_origin: float = nan
+    angular_rmse_deg: float = nan
+    scans: int = 0
+    stages_ms: dict[str, float] = field(default_factory=dict)
+    total_time_s: float = nan
+    run_s: float = nan
+    bridged_share: float = nan
+    is_timing_comparable: bool = True
+    digest: str = ""
+    machine: str = ""
+    folder: str = ""
+
+    @property
+    def is_usable(self) -> bool:
+        """Whether its numbers count: a diverged run has numbers that mean nothing."""
+        return self.status in USABLE
+
+    @property
+    def is_diverged(self) -> bool:
+        """Whether the method lost the motion; a run that failed otherwise says nothing about its parameters."""
+        return self.status == "diverged"
+
+    @property
+    def time_per_scan_ms(self) -> float:
+        """Of all stages, mean; nan without any."""
+        return sum(self.stages_ms.values()) if self.stages_ms else nan
