@@ -73,8 +73,8 @@ def perturb(buildings: Sequence[Building], perturbation: Perturbation) -> list[B
         if change.turn_rad == 0:
             # Nothing but the shift, to the last bit.
             R, middle = np.eye(2), np.zeros(2)
-        found.append(_moved(building, R, middle - R @ middle + np.array(change.shift_m) + common))
-    return found + [_moved(building, np.eye(2), common) for building in perturbation.not_yet_built]
+        found.append(building.moved(R, middle - R @ middle + np.array(change.shift_m) + common))
+    return found + [building.moved(np.eye(2), common) for building in perturbation.not_yet_built]
 
 
 def join_outlines(building: Building, change: Change, known: dict[str, Building]) -> Building:
@@ -139,7 +139,3 @@ def read_perturbation(path: Path) -> Perturbation:
 def _pair(values: Any) -> tuple[float, float]:
     x, y = values
     return float(x), float(y)
-
-
-def _moved(building: Building, rotation: Floats, shift: Floats) -> Building:
-    return replace(building, footprints=tuple(f.moved(rotation, shift) for f in building.footprints))

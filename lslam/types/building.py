@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -62,6 +62,21 @@ class Building:
         """(2,) middle of the box round all outlines, m: what the building is turned about."""
         corners = np.concatenate([footprint.outer for footprint in self.footprints])
         return np.asarray((corners.min(0) + corners.max(0)) / 2)
+
+    def moved(self, rotation: Floats, shift: Floats) -> Building:
+        """Every corner p at `rotation` (2, 2) p + `shift` (2,)."""
+        return replace(self, footprints=tuple(footprint.moved(rotation, shift) for footprint in self.footprints))
+
+    def displaced(self, displacement: Floats) -> Building:
+        """Turned by displacement[2], rad, about its middle, then shifted by displacement[:2], m."""
+        return self.moved(*about(self.middle, displacement))
+
+
+def about(middle: Floats, displacement: Floats) -> tuple[Floats, Floats]:
+    """Rotation (2, 2) and shift (2,) of a `displacement` (3,) x, y, yaw, m and rad, that turns about `middle` (2,)."""
+    c, s = np.cos(displacement[2]), np.sin(displacement[2])
+    R = np.array([[c, -s], [s, c]])
+    return R, middle - R @ middle + displacement[:2]
 
 
 def is_canopy(building: Building) -> bool:
