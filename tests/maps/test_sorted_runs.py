@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import gc
-import os
 from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from resident import resident_mb
 
 from lslam.errors import OutputError
 from lslam.geometry import se3
@@ -103,25 +103,21 @@ def test_rows_are_divided_into_parts_that_fit(tmp_path: Path, monkeypatch: pytes
     assert np.all(np.diff(keys) >= 0)
 
 
-@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="resident memory is read from /proc")
 def test_memory_does_not_grow_with_the_map(tmp_path: Path) -> None:
     """Twenty times the voxels that are kept in memory, written out block by block."""
-
-    def resident() -> float:
-        return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
 
     rng = np.random.default_rng(1)
     merger = MapMerger(0.1, 0.0, 100.0, most=200_000, spool=tmp_path)
     highest = []
     for i in range(60):
         merger.add(rng.uniform(-30, 30, (60_000, 3)).astype(np.float32), se3.make(np.eye(3), np.array([5.0 * i, 0, 0])))
-        highest.append(resident())
+        highest.append(resident_mb())
     result = merger.result()
     assert len(result) > 3_000_000
     total = 0
     for block in result.blocks():
         total += len(block)
-        highest.append(resident())
+        highest.append(resident_mb())
     assert total == len(result)
     # All rows are 150 MB and the points of the map 80 MB more; a part being combined takes about 130.
     assert max(highest[30:60]) - highest[10] < 20

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import numpy as np
 import pytest
+from resident import resident_mb
 
 from lslam.config import load_config
 from lslam.keyframes.store import KeyframeStore
@@ -14,19 +14,8 @@ from lslam.odometry import create_odometry
 from lslam.pipeline.checkpoints import Checkpoints, OdometryCheckpoints
 from lslam.pipeline.front_end import estimate
 from lslam.pipeline.keyframing import Keyframing
-from lslam.pipeline.manifest import peak_memory_mb
 from lslam.simulation.scenarios import simulate
 from lslam.types.scan_result import ScanResult
-
-STATM = Path("/proc/self/statm")
-
-
-def resident_mb() -> float:
-    """Memory this process holds, or has held at most where the system says no more."""
-    if STATM.exists():
-        return int(STATM.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
-    return peak_memory_mb() or 0.0
-
 
 # A stand-in for the promise (50 MB from scan 500 to scan 2,000) that takes seconds: a fifth of the scans, a fifth of
 # the room. By hand, over all 2,000 scans, 3 MB were measured; keeping the points of one scan in ten would break it.
