@@ -23,7 +23,7 @@ LAYERS = [
     ["types"],
     ["geometry"],
     ["kernels", "config"],
-    ["foreign"],
+    ["foreign", "locks"],
     ["errors", "version"],
 ]
 LEVEL = {name: level for level, names in enumerate(LAYERS) for name in names}

@@ -10,7 +10,6 @@ import contextlib
 import hashlib
 import logging
 import os
-import sys
 import tempfile
 import threading
 from collections.abc import Callable, Iterator
@@ -87,22 +86,9 @@ def inline(function: F) -> F:
     return cast(F, compiled)
 
 
-@contextlib.contextmanager
-def compile_lock() -> Iterator[None]:
-    """Hold the cache for this process: others wait instead of compiling the same kernels into the same files."""
-    folder = Path(os.environ["NUMBA_CACHE_DIR"])
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        stream = (folder / "compile.lock").open("a")
-    except OSError:
-        yield
-        return
-    with stream:
-        if sys.platform != "win32":
-            import fcntl
-
-            fcntl.flock(stream, fcntl.LOCK_EX)
-        yield
+def lock_file() -> Path:
+    """Who compiles holds it (`lslam.locks`): others wait instead of compiling the same kernels into the same files."""
+    return Path(os.environ["NUMBA_CACHE_DIR"]) / "compile.lock"
 
 
 @contextlib.contextmanager

@@ -13,37 +13,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.kernels.jit import inline, kernel
+from lslam.kernels.row_table import pack, row_of
 
-AXIS_BITS = 21
-HALF = 1 << (AXIS_BITS - 1)
 COLUMNS = 5
-_MIX = -7046029254386353131
 
 
 @inline
-def _slot(key: int, mask: int) -> int:
-    mixed = key * _MIX
-    return (mixed ^ (mixed >> 29) ^ (mixed >> 43)) & mask
-
-
-@inline
-def _row_of(key: int, slots: NDArray[np.int32], rows: NDArray[np.int64], used: int) -> int:
-    """Row of a key; `used` when it has none yet, entered in `slots` then."""
-    mask = slots.shape[0] - 1
-    slot = _slot(key, mask)
-    row = slots[slot]
-    while row >= 0 and rows[row, 0] != key:
-        slot = (slot + 1) & mask
-        row = slots[slot]
-    if row < 0:
-        row = used
-        slots[slot] = row
-        rows[row, 0] = key
+def _seen_row(key: int, slots: NDArray[np.int32], rows: NDArray[np.int64], used: int) -> int:
+    """Row of a key; `used` when it has none yet: one that nothing is known of then."""
+    row = row_of(key, slots, rows, used)
+    if row == used:
         rows[row, 1] = 0
         rows[row, 2] = -(1 << 40)
         rows[row, 3] = 1 << 40
         rows[row, 4] = -1
-    return int(row)
+    return row
 
 
 @inline
@@ -92,12 +76,11 @@ def mark_ends(
             cx = (T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3]) * inverse
             cy = (T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3]) * inverse
             cz = (T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3]) * inverse
-            ix = np.int64(np.floor(cx)) - origin[0] + HALF
-            iy = np.int64(np.floor(cy)) - origin[1] + HALF
-            iz = np.int64(np.floor(cz)) - origin[2] + HALF
-            if (ix | iy | iz) >> AXIS_BITS != 0:
+            ix, iy, iz = np.int64(np.floor(cx)), np.int64(np.floor(cy)), np.int64(np.floor(cz))
+            key = pack(ix - origin[0], iy - origin[1], iz - origin[2])
+            if key < 0:
                 continue
-            row = _row_of((ix << (2 * AXIS_BITS)) | (iy << AXIS_BITS) | iz, slots, rows, used)
+            row = _seen_row(key, slots, rows, used)
             used += row == used
             if rows[row, 4] == stamp:
                 continue
@@ -145,9 +128,9 @@ def carve(
         for _ in range(longest):
             if cell[0] == last[0] and cell[1] == last[1] and cell[2] == last[2]:
                 break
-            ix, iy, iz = cell[0] - origin[0] + HALF, cell[1] - origin[1] + HALF, cell[2] - origin[2] + HALF
-            if (ix | iy | iz) >> AXIS_BITS == 0:
-                row = _row_of((ix << (2 * AXIS_BITS)) | (iy << AXIS_BITS) | iz, slots, rows, used)
+            key = pack(cell[0] - origin[0], cell[1] - origin[1], cell[2] - origin[2])
+            if key >= 0:
+                row = _seen_row(key, slots, rows, used)
                 used += row == used
                 if rows[row, 4] != stamp:
                     rows[row, 4] = stamp
@@ -158,17 +141,6 @@ def carve(
             cell[k] += step[k]
             due[k] += each[k]
     return used, len(ends)
-
-
-@kernel
-def enter(slots: NDArray[np.int32], rows: NDArray[np.int64], used: int) -> None:
-    """Enter the first `used` rows into `slots`, which are all -1 and a power of two above `used`."""
-    mask = slots.shape[0] - 1
-    for row in range(used):
-        slot = _slot(rows[row, 0], mask)
-        while slots[slot] >= 0:
-            slot = (slot + 1) & mask
-        slots[slot] = row
 
 
 @kernel

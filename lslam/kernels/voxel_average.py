@@ -12,20 +12,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.kernels.jit import inline, kernel
+from lslam.kernels import row_table
+from lslam.kernels.jit import kernel
+from lslam.kernels.row_table import pack, row_of
 
-AXIS_BITS = 21
 UNITS = float(2**24)  # 2**39 points fit into one voxel's sum
 INTENSITY_UNITS = float(2**20)
 _BRIGHTEST = float(2**24)  # of such points a voxel's sum holds 2**19
-_HALF = 1 << (AXIS_BITS - 1)
-_MIX = -7046029254386353131  # 0x9E3779B97F4A7C15 as int64: Fibonacci hashing
-
-
-@inline
-def _slot(key: int, mask: int) -> int:
-    mixed = key * _MIX
-    return (mixed ^ (mixed >> 29) ^ (mixed >> 43)) & mask
 
 
 @kernel
@@ -53,13 +46,12 @@ def accumulate(
     Returns the rows used now, the points refused by the range gate (NaN, Inf and zero points included) and the points
     outside the key range.
     """
-    mask = slots.shape[0] - 1
     inverse = 1.0 / voxel
     near, far = range_min * range_min, range_max * range_max
     with_intensity = intensity.shape[0] > 0
     gated = 0
     outside = 0
-    last_key = np.int64(-1)
+    last_key = -1
     row = 0
     for i in range(points.shape[0]):
         px, py, pz = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
@@ -75,25 +67,15 @@ def accumulate(
             continue
         x, y, z = x * inverse, y * inverse, z * inverse
         fx, fy, fz = np.floor(x), np.floor(y), np.floor(z)
-        ix = np.int64(fx) - origin[0] + _HALF
-        iy = np.int64(fy) - origin[1] + _HALF
-        iz = np.int64(fz) - origin[2] + _HALF
-        if (ix | iy | iz) >> AXIS_BITS != 0:  # negative or too large on some axis
+        key = pack(np.int64(fx) - origin[0], np.int64(fy) - origin[1], np.int64(fz) - origin[2])
+        if key < 0:
             outside += 1
             continue
-        key = (ix << (2 * AXIS_BITS)) | (iy << AXIS_BITS) | iz
         # Neighbouring points of a ring mostly fall into one voxel: the table is not asked again.
         if key != last_key:
-            slot = _slot(key, mask)
-            row = slots[slot]
-            while row >= 0 and rows[row, 0] != key:
-                slot = (slot + 1) & mask
-                row = slots[slot]
-            if row < 0:
-                row = used
+            row = row_of(key, slots, rows, used)
+            if row == used:
                 used += 1
-                slots[slot] = row
-                rows[row, 0] = key
                 rows[row, 1:] = 0
             last_key = key
         rows[row, 1] += np.int64(np.rint((x - fx - 0.5) * UNITS))
@@ -107,22 +89,8 @@ def accumulate(
     return used, gated, outside
 
 
-@kernel
-def rebuild(slots: NDArray[np.int32], rows: NDArray[np.int64], used: int) -> None:
-    """Enter the first `used` rows into `slots`, which are all -1 and a power of two above `used`."""
-    mask = slots.shape[0] - 1
-    for row in range(used):
-        slot = _slot(rows[row, 0], mask)
-        while slots[slot] >= 0:
-            slot = (slot + 1) & mask
-        slots[slot] = row
-
-
 def unpack(rows: NDArray[np.int64], origin: NDArray[np.int64], voxel: float) -> NDArray[Any]:
     """(M, 3) float64 mean positions, m, of finished rows (M, 5 or 6)."""
-    axis_mask = (1 << AXIS_BITS) - 1
-    points = np.empty((len(rows), 3))
-    for axis in range(3):
-        index = ((rows[:, 0] >> (AXIS_BITS * (2 - axis))) & axis_mask) - _HALF + origin[axis]
-        points[:, axis] = (index + 0.5 + rows[:, 1 + axis] / (rows[:, 4] * UNITS)) * voxel
-    return points
+    cells = row_table.unpack(rows[:, 0], origin)
+    points = (cells + 0.5 + rows[:, 1:4] / (rows[:, 4:5] * UNITS)) * voxel
+    return np.asarray(points)

@@ -233,7 +233,7 @@ class MapMerger:
 
     def _reserve(self, rows: int) -> None:
         """Room for `rows` rows; the slots stay at most two thirds full."""
-        from lslam.kernels.voxel_average import rebuild
+        from lslam.kernels.row_table import enter
 
         if rows > len(self._rows):
             more = max(rows, len(self._rows) * 3 // 2) - len(self._rows)
@@ -241,7 +241,7 @@ class MapMerger:
         if rows * 3 > len(self._slots) * 2:
             size = 1 << int(np.ceil(np.log2(rows * 2)))
             self._slots = np.full(size, -1, np.int32)
-            rebuild(self._slots, self._rows, self._used)
+            enter(self._slots, self._rows, self._used)
 
 
 def _add_up(rows: NDArray[np.int64]) -> NDArray[np.int64]:

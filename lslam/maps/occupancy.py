@@ -112,7 +112,8 @@ class OccupancyMapper:
 
     def result(self) -> OccupancyGrid:
         """The cells seen so far; the mapper is empty then."""
-        from lslam.kernels.ray_cells import AXIS_BITS, HALF, compose
+        from lslam.kernels.ray_cells import compose
+        from lslam.kernels.row_table import unpack
 
         if self._runs is None:
             rows = self._take()
@@ -122,9 +123,7 @@ class OccupancyMapper:
             rows = stored.read(0, len(stored))
             self._runs = None
         origin = np.zeros(3, np.int64) if self._origin is None else self._origin
-        cells = np.empty((len(rows), 3), np.int32)
-        for axis in range(3):
-            cells[:, axis] = ((rows[:, 0] >> (AXIS_BITS * (2 - axis))) & (2 * HALF - 1)) - HALF + origin[axis]
+        cells = unpack(rows[:, 0], origin).astype(np.int32)
         return OccupancyGrid(cells, np.clip(rows[:, 1], rows[:, 2], rows[:, 3]).astype(np.int16), self._voxel)
 
     def _take(self) -> NDArray[np.int64]:
@@ -141,7 +140,8 @@ class OccupancyMapper:
 
     def _reserve(self, rows: int) -> None:
         """Room for `rows` rows; the slots stay at most two thirds full."""
-        from lslam.kernels.ray_cells import COLUMNS, enter
+        from lslam.kernels.ray_cells import COLUMNS
+        from lslam.kernels.row_table import enter
 
         if rows > len(self._rows):
             more = max(rows, len(self._rows) * 3 // 2)

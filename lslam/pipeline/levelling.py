@@ -17,6 +17,7 @@ from lslam.config import Config
 from lslam.errors import InputError
 from lslam.geometry import se3, so3
 from lslam.kernels import jit
+from lslam.locks import one_at_a_time
 from lslam.preprocessing.ground import levelling
 from lslam.types.scan_result import ScanResult
 from lslam.types.sequence import Sequence
@@ -126,7 +127,7 @@ def _up_by_ground(sequence: Sequence, results: list[ScanResult], config: Config)
     for number, result in enumerate(results):
         if result.status != "ok":
             continue
-        with suppress(InputError), jit.announced(log), jit.compile_lock():
+        with suppress(InputError), jit.announced(log), one_at_a_time(jit.lock_file()):
             R, height = levelling(sequence.scan(number).points, config.preprocess.ground_tolerance, CELLS)
             return np.asarray(result.T_world_lidar[:3, :3] @ R[2]) if np.isfinite(height) else None
     return None

@@ -13,6 +13,7 @@ from lslam.config import Config
 from lslam.errors import InputError
 from lslam.kernels import jit
 from lslam.keyframes.store import KeyframeStore
+from lslam.locks import one_at_a_time
 from lslam.loops import detector
 from lslam.maps import crispness, merge
 from lslam.odometry.base import Odometry
@@ -113,7 +114,7 @@ def _warm_up(
     sequence: Sequence, odometry: Odometry, standing: Standing | None, config: Config, manifest: Manifest, is_over: bool
 ) -> None:
     """Compile or load what the scans would otherwise wait for, less of it when odometry is over."""
-    with manifest.timed("compile_s"), jit.announced(log), jit.compile_lock():
+    with manifest.timed("compile_s"), jit.announced(log), one_at_a_time(jit.lock_file()):
         if not is_over:
             odometry.warm_up()
         if standing is not None:

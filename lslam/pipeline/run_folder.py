@@ -15,6 +15,7 @@ from typing import IO, Any
 
 from lslam.errors import OutputError, OutputExistsError
 from lslam.formats.atomic import atomic_write
+from lslam.locks import lock
 
 log = logging.getLogger("lslam")
 
@@ -190,7 +191,7 @@ def _in_use(path: Path) -> OutputExistsError:
 def _is_held(path: Path) -> bool:
     try:
         with (path / LOCK).open("r") as stream:
-            return not _flock(stream)
+            return not lock(stream)
     except OSError:
         return False
 
@@ -199,26 +200,13 @@ def _hold(path: Path) -> IO[str]:
     """Lock the folder. The holder before us may have removed the file between our open and our lock: look again."""
     while True:
         stream = (path / LOCK).open("a")
-        if not _flock(stream):
+        if not lock(stream):
             stream.close()
             raise _in_use(path)
         with contextlib.suppress(FileNotFoundError):
             if os.path.samestat(os.fstat(stream.fileno()), os.stat(path / LOCK)):
                 return stream
         stream.close()
-
-
-def _flock(stream: IO[str]) -> bool:
-    """Whether the lock is ours now; where the system or the file system has no locks, always."""
-    try:
-        import fcntl
-
-        fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    except (ImportError, OSError):
-        return True
-    return True
 
 
 def default_folder(sequence: str, method: str, now: float | None = None) -> Path:

@@ -9,10 +9,9 @@ import contextlib
 import hashlib
 import json
 import logging
-import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +21,7 @@ from lslam.config.osm import OsmConfig
 from lslam.errors import InputError, OutputError, UsageError
 from lslam.formats.atomic import atomic_write
 from lslam.formats.osm_files import from_overpass
+from lslam.locks import one_at_a_time
 from lslam.priors.bounds import Bounds
 from lslam.version import __version__
 
@@ -32,7 +32,7 @@ LONGEST_REPLY = 512 * 1024 * 1024  # bytes
 LONGEST_WAIT = 120.0  # s; whoever says "retry later than that" is not waited for
 FAR_OUT = 1000.0  # m; a long building reaches that far out of a box
 _BUSY = (429, 502, 503, 504)
-_one_at_a_time = threading.Lock()
+_one_thread_at_a_time = threading.Lock()
 
 
 class _TryAgainError(Exception):
@@ -109,7 +109,8 @@ def _bounds_of(path: Path) -> Bounds | None:
 
 def _ask_patiently(bounds: Bounds, config: OsmConfig, folder: Path, sleep: Callable[[float], None]) -> dict[str, Any]:
     wait = config.backoff
-    with _one_at_a_time, _alone(folder):
+    # Many runs at once, threads or processes, are still one polite client.
+    with _one_thread_at_a_time, one_at_a_time(folder / "request.lock"):
         for attempt in range(1, config.attempts + 1):
             try:
                 return _ask(bounds, config)
@@ -124,23 +125,6 @@ def _ask_patiently(bounds: Bounds, config: OsmConfig, folder: Path, sleep: Calla
                 sleep(wanted)
                 wait *= 2
     raise AssertionError("the last attempt returns or raises")
-
-
-@contextlib.contextmanager
-def _alone(folder: Path) -> Iterator[None]:
-    """Hold the cache against other processes: many runs at once are still one polite client."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        stream = (folder / "request.lock").open("a")
-    except OSError:
-        yield
-        return
-    with stream:
-        if sys.platform != "win32":
-            import fcntl
-
-            fcntl.flock(stream, fcntl.LOCK_EX)
-        yield
 
 
 def _ask(bounds: Bounds, config: OsmConfig) -> dict[str, Any]:

@@ -8,7 +8,6 @@ import os
 import pkgutil
 import subprocess
 import sys
-import threading
 import time
 from pathlib import Path
 from typing import Any
@@ -86,35 +85,6 @@ def test_the_digest_follows_every_source(tmp_path: Path, monkeypatch: pytest.Mon
     assert before == jit.source_digest()
     (tmp_path / "other.py").write_text("x = 2\n")
     assert before != jit.source_digest()
-
-
-def test_the_lock_makes_others_wait(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "new"))
-    order = []
-    inside = threading.Event()
-
-    def other() -> None:
-        inside.wait()
-        with jit.compile_lock():
-            order.append("second")
-
-    thread = threading.Thread(target=other)
-    thread.start()
-    with jit.compile_lock():
-        inside.set()
-        time.sleep(0.2)
-        order.append("first")
-    thread.join(10)
-    assert order == ["first", "second"]
-
-
-def test_a_cache_that_cannot_be_locked_does_not_stop_the_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "file").write_text("")
-    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "file" / "below"))
-    done = []
-    with jit.compile_lock():
-        done.append(1)
-    assert done
 
 
 def test_only_slow_compiling_is_announced(caplog: pytest.LogCaptureFixture) -> None:

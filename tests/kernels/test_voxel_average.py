@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from lslam.kernels.voxel_average import AXIS_BITS, accumulate, rebuild, unpack
+from lslam.kernels.row_table import AXIS_BITS, enter
+from lslam.kernels.voxel_average import accumulate, unpack
 
 NO_INTENSITY = np.zeros(0, np.float32)
 ORIGIN = np.zeros(3, np.int64)
@@ -68,10 +69,10 @@ def test_a_crowded_table_gives_the_same_rows(cloud: NDArray[np.float32]) -> None
     assert np.array_equal(roomy, crowded)
 
 
-def test_rebuild_finds_every_row_again(cloud: NDArray[np.float32]) -> None:
+def test_enter_finds_every_row_again(cloud: NDArray[np.float32]) -> None:
     rows, _, *_ = run(cloud, pose(), 0.5)
     slots = np.full(1 << 16, -1, np.int32)
-    rebuild(slots, rows, len(rows))
+    enter(slots, rows, len(rows))
     assert np.array_equal(np.sort(slots[slots >= 0]), np.arange(len(rows)))
     # Adding the same scan to the rebuilt table opens no new row and doubles every sum.
     room = np.concatenate([rows, np.empty((len(cloud), 5), np.int64)])

@@ -168,11 +168,12 @@ def test_other_layouts_and_types_are_accepted() -> None:
 
 
 def test_warm_up_compiles_all_that_a_run_needs() -> None:
-    from lslam.kernels.voxel_average import accumulate, rebuild
+    from lslam.kernels.row_table import enter
+    from lslam.kernels.voxel_average import accumulate
 
     warm_up()
     scans = make_scans(2, 200_000)
-    signatures = len(accumulate.signatures), len(rebuild.signatures)  # type: ignore[attr-defined]
+    signatures = len(accumulate.signatures), len(enter.signatures)  # type: ignore[attr-defined]
     merge(scans, voxel=0.1)
     assert signatures == (1, 1)
-    assert (len(accumulate.signatures), len(rebuild.signatures)) == (1, 1)  # type: ignore[attr-defined]
+    assert (len(accumulate.signatures), len(enter.signatures)) == (1, 1)  # type: ignore[attr-defined]

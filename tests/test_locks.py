@@ -1,0 +1,45 @@
+"""Files that one process at a time holds; two open files of one process are as strange to each other."""
+
+from __future__ import annotations
+
+import threading
+import time
+from pathlib import Path
+
+from lslam.locks import lock, one_at_a_time
+
+
+def test_the_lock_makes_others_wait(tmp_path: Path) -> None:
+    path = tmp_path / "new" / "some.lock"
+    order = []
+    inside = threading.Event()
+
+    def other() -> None:
+        inside.wait()
+        with one_at_a_time(path):
+            order.append("second")
+
+    thread = threading.Thread(target=other)
+    thread.start()
+    with one_at_a_time(path):
+        inside.set()
+        time.sleep(0.2)
+        order.append("first")
+    thread.join(10)
+    assert order == ["first", "second"]
+
+
+def test_what_cannot_be_locked_does_not_stop_the_work(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    done = []
+    with one_at_a_time(tmp_path / "file" / "below" / "some.lock"):
+        done.append(1)
+    assert done
+
+
+def test_who_does_not_wait_is_told(tmp_path: Path) -> None:
+    with (tmp_path / "a").open("a") as first, (tmp_path / "a").open("a") as second:
+        assert lock(first)
+        assert not lock(second)
+        first.close()
+        assert lock(second)
