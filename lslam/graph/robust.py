@@ -76,7 +76,7 @@ def _graduated(
         return Settled(factors, values, weights, squared, limits, rounds)
     mu = 1.0 / (2.0 * ratio - 1.0)
     while rounds < ROUNDS:
-        weights = _weights(squared / limits, mu)
+        weights = truncated_weights(squared / limits, mu)
         factors = joined(fixed, _weighted(doubted, plain, weights))
         values = solve(factors, values, config)
         squared = _squared(plain, values)
@@ -92,7 +92,7 @@ def _graduated(
     return Settled(factors, values, weights, _squared(plain, values), limits, rounds + 1)
 
 
-def _weights(ratio: Floats, mu: float) -> Floats:
+def truncated_weights(ratio: Floats, mu: float) -> Floats:
     """Weights of truncated least squares at `mu` (Yang et al. 2020, equation 14), of squared residuals per limit."""
     low, high = mu / (mu + 1), (mu + 1) / mu
     middle = np.sqrt(mu * (mu + 1) / np.maximum(ratio, 1e-12)) - mu

@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.geometry import se2
+
 Floats = NDArray[np.float64]
 
 
@@ -74,8 +76,7 @@ class Building:
 
 def about(middle: Floats, displacement: Floats) -> tuple[Floats, Floats]:
     """Rotation (2, 2) and shift (2,) of a `displacement` (3,) x, y, yaw, m and rad, that turns about `middle` (2,)."""
-    c, s = np.cos(displacement[2]), np.sin(displacement[2])
-    R = np.array([[c, -s], [s, c]])
+    R = se2.rotation(float(displacement[2]))
     return R, middle - R @ middle + displacement[:2]
 
 

@@ -1,0 +1,120 @@
+"""Buildings held to the walls seen along a trajectory that is not moved any more: the second of two levels.
+
+Second thesis, section 3.4: mapping never harms localisation. A building's displacement is x, y, yaw about its middle; every
+match measures some directions of it, and the map itself says, weakly, that it stands where all others stand: displaced by the
+map's common shift. So the problem is linear, and a direction that no wall fixes follows the shift and nothing else.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.geometry import se2
+from lslam.graph.chi_square import quantile
+from lslam.graph.robust import truncated_weights
+from lslam.types.building_match import BuildingMatch
+
+Floats = NDArray[np.float64]
+
+GROWTH, ROUNDS = 2.0, 30  # of graduated non-convexity, as in `graph.robust`
+PROBABILITY = 0.999  # a match within this quantile of its own distribution is right
+
+
+@dataclass(frozen=True)
+class MapBelief:
+    """What a map is trusted with before anything is seen.
+
+    shift : (2,) m, real minus map, that the map is thought to be off by as a whole, and shift_sigma (2,), m, how well
+    sigma : (3,) m, m, rad; by which a building is off beside that
+    """
+
+    shift: Floats
+    shift_sigma: Floats
+    sigma: Floats
+
+
+@dataclass(frozen=True)
+class BuildingSolution:
+    """Where buildings stand.
+
+    displacements : (B, 3) x, y (m), yaw (rad) about each middle, real minus map; covariances : (B, 3, 3)
+    shift : (2,) m, of the map as a whole; believed : (M,) which matches were
+    """
+
+    displacements: Floats
+    covariances: Floats
+    shift: Floats
+    believed: NDArray[np.bool_]
+
+
+def solve_buildings(
+    middles: NDArray[np.float64],
+    matches: Sequence[BuildingMatch],
+    poses: Mapping[int, Floats],
+    belief: MapBelief,
+) -> BuildingSolution:
+    """Displacements of the buildings with `middles` (B, 2), m, from `matches`, with each keyframe at `poses` (3,) of the map.
+
+    Matches that contradict the others are given up: graduated non-convexity with truncated least squares (`graph.robust`).
+    Of the map's own belief nothing is ever given up.
+    """
+    owners = np.array([m.building for m in matches], np.intp)
+    measured = np.array([m.displacement(poses[m.keyframe], middles[m.building]) for m in matches]).reshape(-1, 3)
+    weights = np.array([_in_map(m.information, poses[m.keyframe][2]) for m in matches]).reshape(-1, 3, 3)
+    limits = np.array([quantile(PROBABILITY, max(m.rank, 1)) for m in matches])
+    trust = np.ones(len(matches))
+    solution = _linear(len(middles), owners, measured, weights, belief)
+    ratio = _squared(solution, owners, measured, weights) / limits
+    mu = 1.0 / (2.0 * float(ratio.max(initial=1.0)) - 1.0)
+    for _ in range(ROUNDS if (ratio > 1).any() else 0):
+        trust = truncated_weights(ratio, mu)
+        solution = _linear(len(middles), owners, measured, trust[:, None, None] * weights, belief)
+        ratio = _squared(solution, owners, measured, weights) / limits
+        if bool(np.all((trust < 1e-3) | (trust > 0.999))):
+            break
+        mu *= GROWTH
+    believed = ratio <= 1
+    if not believed.all():
+        solution = _linear(len(middles), owners, measured, believed[:, None, None] * weights, belief)
+    return BuildingSolution(*solution, believed)
+
+
+def _in_map(information: Floats, yaw: float) -> Floats:
+    """Information in the level axes of a keyframe with heading `yaw`, in those of the map."""
+    turn = np.eye(3)
+    turn[:2, :2] = se2.rotation(yaw)
+    return turn @ information @ turn.T
+
+
+def _linear(
+    count: int, owners: NDArray[np.intp], measured: Floats, weights: Floats, belief: MapBelief
+) -> tuple[Floats, Floats, Floats]:
+    """Displacements, covariances and shift by least squares; each building is eliminated, the shift is what is left."""
+    own = np.diag(1.0 / belief.sigma**2)
+    normal, pull = np.tile(own, (count, 1, 1)), np.zeros((count, 3))
+    np.add.at(normal, owners, weights)
+    np.add.at(pull, owners, (weights @ measured[:, :, None])[:, :, 0])
+    covariances = np.linalg.inv(normal)
+    # d_i = C_i (pull_i + own (shift, 0)), so the shift sees each building through what it is known by beside the map.
+    through = own[:2, :2]
+    common = np.diag(1.0 / belief.shift_sigma**2)
+    seen = through @ (np.linalg.inv(through) - covariances[:, :2, :2]) @ through
+    told = (through @ (covariances @ pull[:, :, None])[:, :2])[:, :, 0]
+    spread = np.linalg.inv(common + seen.sum(axis=0))
+    shift = spread @ (common @ belief.shift + told.sum(axis=0))
+    found = (covariances @ (pull + own[:, :2] @ shift)[:, :, None])[:, :, 0]
+    by_shift = covariances @ own[:, :2]
+    return found, covariances + by_shift @ spread @ np.swapaxes(by_shift, -1, -2), shift
+
+
+def _squared(
+    solution: tuple[Floats, Floats, Floats], owners: NDArray[np.intp], measured: Floats, weights: Floats
+) -> Floats:
+    """(M,) whitened squared residuals of the matches."""
+    away = measured - solution[0][owners]
+    away[:, 2] = se2.wrapped(away[:, 2])
+    return np.asarray(np.einsum("mi,mij,mj->m", away, weights, away))
