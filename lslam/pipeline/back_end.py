@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from lslam.config import Config
 from lslam.errors import GraphError
 from lslam.geometry import se3
+from lslam.graph.floors import on_one_plane
 from lslam.graph.odometry import corrected, fitness_covariance, odometry_constraints
 from lslam.graph.pose_graph import optimise
 from lslam.graph.problem import PoseGraph, Solution
@@ -68,7 +69,7 @@ def run_back_end(
         if config.gnss.mode != "off":
             problems.append("GNSS: fewer than two keyframes have no heading on the Earth")
         return BackEnd(results, candidates, problems=problems)
-    graph = replace(_graph(results, store, config, candidates), turns=turns)
+    graph = replace(_graph(results, store, config, candidates, problems), turns=turns)
     up = graph.world_up if graph.ups else None
     out = None
     if config.gnss.mode == "graph":
@@ -131,7 +132,11 @@ def _up_after(out: BackEnd, graph: PoseGraph) -> Floats:
 
 
 def _graph(
-    results: list[ScanResult], store: KeyframeStore, config: Config, candidates: list[LoopCandidate]
+    results: list[ScanResult],
+    store: KeyframeStore,
+    config: Config,
+    candidates: list[LoopCandidate],
+    problems: list[str],
 ) -> PoseGraph:
     loops = [c.constraint for c in candidates if c.verdict == "accepted" and c.constraint is not None]
     if config.graph.information == "fitness":
@@ -139,12 +144,21 @@ def _graph(
         loops = [replace(loop, covariance=fitness_covariance(rmse[loop.a, loop.b], config.graph)) for loop in loops]
     ups = up_directions(store.keyframes, results, config.graph) if config.graph.gravity else []
     up = world_up(ups, store.keyframes)
+    poses = np.stack([k.T_world_lidar for k in store.keyframes])
+    distances = np.array([k.distance for k in store.keyframes])
+    seen = floor_planes(store, config.graph) if config.graph.floor else []
+    floors = on_one_plane(seen, poses, distances, config.graph)
+    if seen and not floors:
+        problems.append(
+            f"floor: the ground seen from {len(seen)} keyframes is not one plane: it holds no pose "
+            "(graph.floor = false looks for none)"
+        )
     return PoseGraph(
-        poses=np.stack([k.T_world_lidar for k in store.keyframes]),
+        poses=poses,
         odometry=odometry_constraints(store.keyframes, results, config.graph),
         loops=loops,
-        floors=floor_planes(store, config.graph) if config.graph.floor else (),
-        distances=np.array([k.distance for k in store.keyframes]),
+        floors=floors,
+        distances=distances,
         ups=ups,
         world_up=np.array([0.0, 0.0, 1.0]) if up is None else up,
     )

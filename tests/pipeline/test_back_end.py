@@ -212,3 +212,29 @@ def test_gravity_keeps_it_level_beside_loops() -> None:
     assert tilt(done.results) < 0.6 * tilt(blind.results)
     # The start stays where it was: the world's up is found, not forced on it.
     np.testing.assert_allclose(done.results[0].T_world_lidar, results[0].T_world_lidar, atol=1e-9)
+
+
+@pytest.mark.parametrize("steepness", [0.0, 0.06])
+def test_only_flat_ground_holds_poses(steepness: float) -> None:
+    """A hill under the wheels is said and left out; a flat floor keeps from climbing what drifts upwards."""
+    x = 2.0 * np.arange(40)
+    pitch = -np.arctan(steepness * np.sin(x / 8))
+    z = np.cumsum(2.0 * steepness * np.sin(x / 8)) + 0.005 * x
+    poses = se3.make(so3.from_euler_rpy(np.column_stack([0 * x, pitch, 0 * x])), np.column_stack([x, 0 * x, z]))
+    results = [
+        ScanResult(i, i * 200_000_000, T, covariance=0.01 * OWN * (1 + i), registration_covariance=0.01 * OWN)
+        for i, T in enumerate(poses)
+    ]
+    rng = np.random.default_rng(0)
+    floor = np.column_stack([rng.uniform(-15, 15, (3000, 2)), np.full(3000, -1.7)]).astype(np.float32)
+    store = KeyframeStore()
+    for i, result in enumerate(results):
+        store.add(Keyframe(i, i, result.stamp_ns, result.T_world_lidar, result.covariance, float(x[i])), floor)
+    done = run_back_end(Stub([]), results, store, config("graph.floor=true", "graph.information=fitness"), [])
+    if steepness:
+        assert done.results is results
+        assert "the ground seen from 40 keyframes is not one plane" in done.problems[0]
+    else:
+        assert done.problems == []
+        assert done.facts["floor_factors"] == 40
+        assert abs(done.results[-1].T_world_lidar[2, 3]) < 0.5 * z[-1]
