@@ -39,6 +39,7 @@ class Finding(Section):
     kind: Kind = Field(description="what is expected, which says how it is judged")
     values: tuple[float, ...] = Field((), description="numbers of the kind, for example the two ends of a range")
     of: Quantity = Field("efficiency", description="what is best, largest or matters little")
+    parameter: str = Field("", description="of several studied one at a time, the one it speaks of")
     method: str = Field("", description="judge runs of this method or preset only; empty: every one")
     imu: bool | None = Field(None, description="judge runs with, or without, the IMU only")
     at: dict[str, float] = Field(

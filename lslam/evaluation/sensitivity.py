@@ -1,0 +1,113 @@
+"""A sensitivity study evaluated: means over seeds, divergence, optimum, laws and verdicts (first thesis, section 5.3)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from lslam.evaluation.curves import curves_of, lost_above
+from lslam.evaluation.efficiency import over_seeds
+from lslam.evaluation.landmarks import divergence, optimum
+from lslam.evaluation.laws import FEWEST, fit_law
+from lslam.evaluation.verdicts import judge
+from lslam.types.sensitivity import Curve, CurveResult, Floats, Law, LawKind, StudyResult
+from lslam.types.study import StudyRow
+
+if TYPE_CHECKING:
+    from lslam.config.finding import Finding
+
+SKIP = "input.skip_frames"
+EFFICIENCIES = ("efficiency", "total_efficiency")
+
+
+def evaluate_study(rows: Sequence[StudyRow], findings: Sequence[Finding] = ()) -> list[StudyResult]:
+    """One result per study, sequence and studied parameter, in the order they appear in `rows`; runs beside belong to all."""
+    groups: dict[tuple[str, str, str], list[StudyRow]] = {}
+    for row in rows:
+        if not row.is_beside:
+            groups.setdefault((row.study, row.sequence, next(iter(row.parameters), "")), []).append(row)
+    out = []
+    for (study, sequence, parameter), group in groups.items():
+        beside = [row for row in rows if row.is_beside and (row.study, row.sequence) == (study, sequence)]
+        mine = [finding for finding in findings if finding.parameter in ("", parameter)]
+        out.append(_evaluate(group, beside, mine))
+    return out
+
+
+def _evaluate(rows: Sequence[StudyRow], beside: Sequence[StudyRow], findings: Sequence[Finding]) -> StudyResult:
+    limit = lost_above(rows)
+    results = tuple(_result(curve) for curve in curves_of(rows, limit))
+    products = _products(results)
+    return StudyResult(
+        study=rows[0].study,
+        sequence=rows[0].sequence,
+        parameters=tuple(dict.fromkeys(name for row in rows for name in row.parameters)),
+        results=results,
+        products=products,
+        verdicts=tuple(judge(finding, results, products) for finding in findings),
+        beside=tuple(row for row in beside if row.is_usable),
+        failed=tuple(row for row in (*rows, *beside) if not row.is_usable),
+        lost_above=limit,
+    )
+
+
+def _result(curve: Curve) -> CurveResult:
+    means = {
+        name: over_seeds(table if name in EFFICIENCIES else np.where(curve.lost, np.nan, table))
+        for name, table in curve.quantities.items()
+    }
+    law, no_law = _law_of(curve)
+    return CurveResult(
+        curve=curve,
+        means=means,
+        stage_means={name: over_seeds(table) for name, table in curve.stages.items()},
+        divergence=divergence(curve),
+        optimum=optimum(curve.values, means["efficiency"].mean),
+        law=law,
+        no_law=no_law,
+    )
+
+
+def _law_of(curve: Curve) -> tuple[Law | None, str]:
+    """The law of total time: inverse over skipped scans, a line over any other number."""
+    if curve.words:
+        return None, f"{curve.parameter} is not a number"
+    kind: LawKind = "inverse" if curve.parameter == SKIP else "linear"
+    points, times, runs = _times(curve)
+    law = fit_law(kind, (curve.parameter,), points, times, runs)
+    return law, "" if law else f"no law from {len(times)} values, {FEWEST} are needed"
+
+
+def _times(curve: Curve) -> tuple[Floats, Floats, Floats]:
+    """Values, mean total time in s and number of runs, where a run has come to its end, lost or not: it took its time."""
+    over = over_seeds(curve.quantities["total_time"])
+    known = over.n > 0
+    return curve.values[known], over.mean[known], over.n[known].astype(np.float64)
+
+
+def _products(results: Sequence[CurveResult]) -> dict[str, Law]:
+    """Laws a y / x by series, of studies of skipped scans (x) and another number (y)."""
+    groups: dict[str, list[tuple[Floats, Floats, Floats]]] = {}
+    names: tuple[str, str] | None = None
+    for result in results:
+        curve = result.curve
+        if len(curve.at) != 1 or curve.words or SKIP not in (curve.parameter, curve.at[0][0]):
+            continue
+        key, other = curve.at[0]
+        if isinstance(other, (bool, str)):
+            continue
+        values, times, runs = _times(curve)
+        second = np.full(len(values), float(other))
+        is_skip = curve.parameter == SKIP
+        names = (SKIP, key) if is_skip else (SKIP, curve.parameter)
+        points = np.stack([values, second] if is_skip else [second, values], 1)
+        groups.setdefault(curve.series, []).append((points, times, runs))
+    laws: dict[str, Law] = {}
+    for series, parts in groups.items():
+        points, times, runs = (np.concatenate(column) for column in zip(*parts, strict=True))
+        law = fit_law("product", names or (), points, times, runs)
+        if law is not None:
+            laws[series] = law
+    return laws

@@ -1,0 +1,205 @@
+"""Findings judged by the results of a study: confirmed, refuted or undecided, with the numbers that say so."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+
+import numpy as np
+
+from lslam.config.finding import Finding
+from lslam.evaluation.efficiency import over_seeds
+from lslam.evaluation.landmarks import elbow, optimum
+from lslam.evaluation.laws import FEWEST, fit_law
+from lslam.types.sensitivity import CurveResult, Floats, Law, LawKind, Outcome, Verdict
+
+R2 = 0.95
+OWN_SHARE = 0.8  # of the change of all stages, for a parameter that acts on one of them
+LEAST_CHANGE = 0.1  # of the time per scan: below it nothing was acted on
+UNITS = {"translation": "m", "angular": "deg", "time_per_scan": "ms", "total_time": "s"}
+_OF_TIME = ("time_per_scan", "total_time")
+_LAWS: tuple[LawKind, ...] = ("linear", "inverse", "product")
+
+Judged = tuple[Outcome, str]
+
+
+def judge(finding: Finding, results: Sequence[CurveResult], products: Mapping[str, Law]) -> Verdict:
+    """The verdict over all curves that the finding speaks of: where they disagree it is undecided."""
+    mine = [result for result in results if _speaks_of(finding, result)]
+    if not mine:
+        return Verdict(finding.text, "undecided", "no run of that kind was made", finding.source)
+    mine = [result for result in mine if result.curve.ran.any()]
+    if not mine:
+        return Verdict(finding.text, "undecided", "no run of that kind came to an end", finding.source)
+    if finding.kind == "product":
+        judged = {result.curve.series: _law(finding, result, products.get(result.curve.series)) for result in mine}
+    else:
+        judged = {result.curve.label: _JUDGES[finding.kind](finding, result) for result in mine}
+    outcomes = {outcome for outcome, _ in judged.values()}
+    outcome: Outcome = outcomes.pop() if len(outcomes) == 1 else "undecided"
+    told = [f"{name}: {said}" if len(judged) > 1 else said for name, (_, said) in judged.items()]
+    is_of_time = finding.kind in (*_LAWS, "acts_only_on") or finding.of in _OF_TIME
+    if is_of_time and not all(result.curve.is_timed_alone for result in mine):
+        outcome = "undecided"
+        told.append("runs shared the machine, so times cannot be compared")
+    return Verdict(finding.text, outcome, "; ".join(told), finding.source)
+
+
+def _speaks_of(finding: Finding, result: CurveResult) -> bool:
+    curve = result.curve
+    return (
+        finding.method in ("", curve.method)
+        and finding.imu in (None, curve.uses_imu)
+        and all(dict(curve.at).get(key) == value for key, value in finding.at.items())
+    )
+
+
+def _diverges_beyond(finding: Finding, result: CurveResult) -> Judged:
+    """Confirmed when the last value that works is the expected one or a neighbour of it."""
+    values, found = result.curve.values, result.divergence
+    expected = finding.values[0]
+    if found.first_bad is None:
+        outcome: Outcome = "refuted" if values[-1] > expected else "undecided"
+        return outcome, f"nothing diverges up to {values[-1]:g}, the largest value{_alone(result)}"
+    if found.last_good is None:
+        return "refuted", f"everything diverges, from {found.first_bad:g} on"
+    is_near = abs(_place(values, found.last_good) - _place(values, expected)) <= 1
+    return "confirmed" if is_near else "refuted", f"{found.last_good:g} is the last value that works{_alone(result)}"
+
+
+def _holds_up_to(finding: Finding, result: CurveResult) -> Judged:
+    values, found = result.curve.values, result.divergence
+    expected = finding.values[0]
+    if found.first_bad is not None and found.first_bad <= expected:
+        return "refuted", f"it diverges from {found.first_bad:g} on{_alone(result)}"
+    if values[-1] < expected:
+        return "undecided", f"{values[-1]:g} is the largest value that was run"
+    if any(value <= expected for value in found.alone):
+        return "undecided", f"nothing diverges for good{_alone(result)}"
+    return "confirmed", f"nothing diverges up to {min(expected, values[-1]):g}"
+
+
+def _between(finding: Finding, result: CurveResult, *, is_highest: bool) -> Judged:
+    """Confirmed when the extreme lies between and most seeds agree, refuted when nothing as good lies there."""
+    low, high = finding.values
+    means = np.where(result.curve.is_lost, np.nan, result.means[finding.of].mean)
+    best = optimum(result.curve.values, means, is_highest_best=is_highest)
+    word = "largest" if finding.kind == "largest_between" else "best"
+    if best is None or np.isfinite(means).sum() < 3:
+        return "undecided", "fewer than 3 values have a result"
+    said = (
+        f"{finding.of.replace('_', ' ')} is {word} at {best.value:g} (within 10 % from {best.low:g} to {best.high:g})"
+    )
+    if low <= best.value <= high:
+        own = _best_by_seed(finding, result, is_highest)
+        agree = int(np.sum((own >= low) & (own <= high)))
+        if 2 * agree > len(own):
+            return "confirmed", said
+        return "undecided", f"{said}, but so in {agree} of {len(own)} seeds only"
+    return "refuted" if best.high < low or best.low > high else "undecided", said
+
+
+def _best_by_seed(finding: Finding, result: CurveResult, is_highest: bool) -> Floats:
+    """(S,) the value at which each seed alone is best, of seeds that have any result."""
+    table = np.where(result.curve.lost, np.nan, result.curve.quantities[finding.of])
+    found = [optimum(result.curve.values, column, is_highest_best=is_highest) for column in table.T]
+    return np.array([best.value for best in found if best is not None])
+
+
+def _elbow_at(finding: Finding, result: CurveResult) -> Judged:
+    """Confirmed when the error comes to its plateau at the expected value or a neighbour of it."""
+    values, expected = result.curve.values, finding.values[0]
+    found = _elbow(result)
+    if found is None:
+        return "refuted", "the error comes to no plateau"
+    if found == values[0]:
+        outcome: Outcome = "undecided" if expected <= values[0] else "refuted"
+        return outcome, f"there is no elbow: {found:g}, the smallest value, is as good as the others"
+    is_near = abs(_place(values, found) - _place(values, expected)) <= 1
+    return "confirmed" if is_near else "refuted", f"the error is on its plateau from {found:g} on"
+
+
+def _good_from(finding: Finding, result: CurveResult) -> Judged:
+    found = _elbow(result)
+    if found is None:
+        return "refuted", "the error comes to no plateau"
+    if finding.values[0] < result.curve.values[0]:
+        return "undecided", f"{result.curve.values[0]:g} is the smallest value that was run"
+    outcome: Outcome = "confirmed" if found <= finding.values[0] else "refuted"
+    return outcome, f"the error is on its plateau from {found:g} on"
+
+
+def _matters_little(finding: Finding, result: CurveResult) -> Judged:
+    means = result.means[finding.of].mean
+    known = means[np.isfinite(means) & (means > 0)]
+    if len(known) < 3:
+        return "undecided", "fewer than 3 values have a result"
+    ratio = float(known.max() / known.min())
+    name, unit = finding.of.replace("_", " "), UNITS.get(finding.of, "")
+    said = f"{name} goes from {known.min():.3g} to {known.max():.3g} {unit}".rstrip() + f", a factor of {ratio:.2f}"
+    if result.curve.is_lost.any():
+        return "refuted", f"{said}, and it diverges at {_list(result.curve.values[result.curve.is_lost])}"
+    return "confirmed" if ratio < finding.values[0] else "refuted", said
+
+
+def _law_of(finding: Finding, result: CurveResult) -> Judged:
+    law = result.law
+    if law is None or law.kind != finding.kind:
+        assert finding.kind in ("linear", "inverse")
+        times = over_seeds(result.curve.quantities["total_time"])
+        law = fit_law(finding.kind, (result.curve.parameter,), result.curve.values, times.mean, times.n.astype(float))
+    return _law(finding, result, law)
+
+
+def _law(finding: Finding, result: CurveResult, law: Law | None) -> Judged:
+    if law is None:
+        return "undecided", f"no law is fitted to fewer than {FEWEST} values"
+    least = finding.values[0] if finding.values else R2
+    outcome: Outcome = "confirmed" if law.r2 >= least else "refuted"
+    worst = 100 * float(np.abs(law.residuals).max())
+    return outcome, f"{law.text} s with R2 {law.r2:.3f}, off by {worst:.0f} % at most"
+
+
+def _acts_only_on(finding: Finding, result: CurveResult) -> Judged:
+    """Confirmed when the named stages make up at least 80 % of the change, stage by stage, of the time per scan."""
+    change = {name: float(np.ptp(m.mean[m.n > 0])) if m.n.any() else 0.0 for name, m in result.stage_means.items()}
+    if missing := [name for name in finding.stages if name not in change]:
+        return "undecided", f"no stage {', '.join(missing)} was timed"
+    whole, own = sum(change.values()), sum(change[name] for name in finding.stages)
+    level = sum(float(np.mean(m.mean[m.n > 0])) for m in result.stage_means.values() if m.n.any())
+    if not level or whole < LEAST_CHANGE * level:
+        return "undecided", f"the time per scan changes by {whole:.2g} of {level:.3g} ms only"
+    said = ", ".join(f"{name} by {ms:.3g}" for name, ms in sorted(change.items(), key=lambda item: -item[1])[:3])
+    outcome: Outcome = "confirmed" if own >= OWN_SHARE * whole else "refuted"
+    return outcome, f"{' and '.join(finding.stages)}: {100 * own / whole:.0f} % of the change ({said} ms)"
+
+
+def _elbow(result: CurveResult) -> float | None:
+    return elbow(result.curve.values, result.means["translation"].mean, result.curve.is_lost)
+
+
+def _place(values: Floats, value: float) -> int:
+    """Index of the nearest value."""
+    return int(np.argmin(np.abs(values - value)))
+
+
+def _alone(result: CurveResult) -> str:
+    alone = result.divergence.alone
+    return f", though runs at {_list(alone)} are lost" if alone else ""
+
+
+def _list(values: Sequence[float] | Floats) -> str:
+    return ", ".join(f"{value:g}" for value in values)
+
+
+_JUDGES: dict[str, Callable[[Finding, CurveResult], Judged]] = {
+    "diverges_beyond": _diverges_beyond,
+    "holds_up_to": _holds_up_to,
+    "best_between": lambda f, r: _between(f, r, is_highest=f.of.endswith("efficiency")),
+    "largest_between": lambda f, r: _between(f, r, is_highest=True),
+    "elbow_at": _elbow_at,
+    "good_from": _good_from,
+    "matters_little": _matters_little,
+    "linear": _law_of,
+    "inverse": _law_of,
+    "acts_only_on": _acts_only_on,
+}

@@ -1,0 +1,109 @@
+"""Laws against truths with noise, the thesis' own laws, and too few points."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from lslam.evaluation.laws import band, fit_law
+from lslam.types.sensitivity import Floats, LawKind
+
+SKIPS = np.arange(1.0, 21.0)
+SHARES = np.arange(0.1, 1.01, 0.1)
+
+
+def grid() -> Floats:
+    return np.array([(skip, share) for skip in (1.0, 2.0, 4.0, 8.0) for share in (0.1, 0.3, 0.6, 1.0)])
+
+
+@pytest.mark.parametrize(
+    ("kind", "points", "truth"),
+    [
+        ("inverse", SKIPS, 46.82 / SKIPS),
+        ("linear", SHARES, 36.81 * SHARES + 0.3373),
+        ("product", grid(), 152.2 * grid()[:, 1] / grid()[:, 0]),
+    ],
+)
+def test_true_law_lies_in_the_stated_band_as_often_as_stated(kind: LawKind, points: Floats, truth: Floats) -> None:
+    draw = np.random.default_rng(5)
+    inside = []
+    for _ in range(400):
+        times = (truth * (1 + 0.05 * draw.standard_normal((3, len(truth))))).mean(0)
+        law = fit_law(kind, ("x", "y"), points, times, np.full(len(truth), 3.0), level=0.9)
+        assert law is not None
+        line, half = band(law, points)
+        inside.append(np.abs(line - truth) <= half)
+    # 400 draws of a share of 0.9 have a standard deviation of 0.015.
+    assert np.mean(inside) == pytest.approx(0.9, abs=0.05)
+
+
+@pytest.mark.parametrize(
+    ("kind", "x", "times", "coefficients"),
+    [
+        ("inverse", SKIPS, 46.82 / SKIPS, [46.82]),
+        ("linear", SHARES, 36.81 * SHARES + 0.3373, [36.81, 0.3373]),
+        ("product", grid(), 152.2 * grid()[:, 1] / grid()[:, 0], [152.2]),
+    ],
+)
+def test_laws_of_the_thesis_come_back_exactly(
+    kind: LawKind, x: Floats, times: Floats, coefficients: list[float]
+) -> None:
+    law = fit_law(kind, ("input.skip_frames", "preprocess.random_share"), x, times)
+    assert law is not None
+    assert law.coefficients == pytest.approx(coefficients)
+    assert law.r2 == pytest.approx(1.0)
+    assert np.abs(law.residuals).max() < 1e-9
+
+
+def test_weights_follow_the_runs_behind_a_mean() -> None:
+    # Six points on 10 / x and a seventh far off it: a mean over ever more runs pulls the law towards it.
+    x = np.array([1.0, 2, 3, 4, 5, 6, 8])
+    times = 10 / x
+    times[-1] *= 2
+    one, many = (fit_law("inverse", ("x",), x, times, np.array([1.0] * 6 + [n])) for n in (1.0, 100.0))
+    assert one is not None
+    assert many is not None
+    # By hand: weighted mean of 10 and 20 under weights n / expected^2, which the fit iterates to.
+    assert 10 < one.coefficients[0] < 12.5
+    assert many.coefficients[0] > 18
+
+
+def test_band_is_that_of_an_independent_fit_by_scipy() -> None:
+    from scipy.optimize import curve_fit
+    from scipy.stats import t as student
+
+    draw = np.random.default_rng(1)
+    times = (20 * SHARES + 3) * (1 + 0.03 * draw.standard_normal(len(SHARES)))
+    law = fit_law("linear", ("x",), SHARES, times)
+    assert law is not None
+    best, covariance = curve_fit(lambda x, a, b: a * x + b, SHARES, times, sigma=law.fitted)
+    assert law.coefficients == pytest.approx(best, rel=1e-4)
+    margins = student.ppf(0.995, len(times) - 2) * np.sqrt(np.diag(covariance))
+    assert law.margins == pytest.approx(margins, rel=1e-3)
+
+
+@pytest.mark.parametrize("kind", ["linear", "inverse"])
+def test_five_points_make_no_law_and_six_do(kind: LawKind) -> None:
+    x = np.arange(1.0, 7.0)
+    assert fit_law(kind, ("x",), x[:5], 10 / x[:5]) is None
+    assert fit_law(kind, ("x",), x, 10 / x) is not None
+
+
+@pytest.mark.parametrize("spoilt", [np.nan, 0.0])
+def test_what_has_no_time_or_is_the_same_point_again_does_not_count(spoilt: float) -> None:
+    x = np.arange(1.0, 7.0)
+    times = 10 / x
+    times[2] = spoilt
+    assert fit_law("inverse", ("x",), x, times) is None
+    assert fit_law("inverse", ("x",), np.array([1.0, 1, 2, 3, 4, 5]), np.ones(6)) is None
+
+
+def test_r2_says_when_the_law_is_wrong() -> None:
+    rising: dict[str, Any] = {"names": ("x",), "points": SKIPS, "times": 5 + 2 * SKIPS}
+    wrong, right = fit_law("inverse", **rising), fit_law("linear", **rising)
+    assert wrong is not None
+    assert right is not None
+    assert wrong.r2 < 0.5 < right.r2
+    assert right.text == "T = 2 x + 5"

@@ -1,0 +1,160 @@
+"""Verdicts on studies of known truth: each turns when the data does, and says undecided where the data says nothing."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+from study_rows import rows_of
+
+from lslam.config.finding import Finding
+from lslam.evaluation.sensitivity import evaluate_study
+from lslam.types.sensitivity import Verdict
+from lslam.types.study import StudyRow
+
+SKIPS = range(1, 21)
+DISTANCES = (0.1, 0.2, 0.3, 0.5, 0.7, 1.0, 1.5)
+GRID = (0.1, 0.3, 0.5, 0.8, 1.0, 1.5, 2.0, 3.0, 5.0)
+
+
+def verdict(rows: list[StudyRow], kind: str, *values: float, **more: Any) -> Verdict:
+    finding = Finding.model_validate({"text": "So it is.", "kind": kind, "values": values, **more})
+    return evaluate_study(rows, [finding])[0].verdicts[0]
+
+
+def outcome(rows: list[StudyRow], kind: str, *values: float, **more: Any) -> str:
+    return verdict(rows, kind, *values, **more).outcome
+
+
+def test_divergence() -> None:
+    at_8 = rows_of(SKIPS, diverges=lambda v: v > 7)
+    assert outcome(at_8, "diverges_beyond", 7) == "confirmed"
+    assert outcome(at_8, "diverges_beyond", 12) == "refuted"
+    assert outcome(rows_of(SKIPS), "diverges_beyond", 7) == "refuted"
+    assert outcome(rows_of(range(1, 7)), "diverges_beyond", 7) == "undecided"
+    assert "everything diverges" in verdict(rows_of(SKIPS, diverges=lambda v: True), "diverges_beyond", 7).measured
+
+
+def test_holding_up() -> None:
+    assert outcome(rows_of(SKIPS), "holds_up_to", 20) == "confirmed"
+    assert outcome(rows_of(SKIPS, diverges=lambda v: v > 17), "holds_up_to", 20) == "refuted"
+    assert outcome(rows_of(SKIPS, diverges=lambda v: v > 17), "holds_up_to", 15) == "confirmed"
+    assert outcome(rows_of(range(1, 10)), "holds_up_to", 20) == "undecided"
+    once = verdict(rows_of(SKIPS, diverges=lambda v: v == 5), "holds_up_to", 20)
+    assert once.outcome == "undecided"
+    assert "runs at 5 are lost" in once.measured
+
+
+def test_best_value() -> None:
+    valley = rows_of(GRID, "loam.grid_step", error=lambda v: 0.2 + (v - 1.5) ** 2)
+    assert outcome(valley, "best_between", 1, 2) == "confirmed"
+    assert outcome(valley, "best_between", 3, 5) == "refuted"
+    assert outcome(valley, "best_between", 1, 2, of="translation") == "confirmed"
+    nearly = rows_of(GRID, "loam.grid_step", error=lambda v: 0.2 if v == 0.8 else 0.21 if 1 <= v <= 2 else 0.9)
+    assert outcome(nearly, "best_between", 1, 2) == "undecided"
+    assert outcome(rows_of((1, 2)), "best_between", 1, 2) == "undecided"
+
+
+def test_best_value_of_one_lucky_seed_is_not_confirmed() -> None:
+    rows = rows_of(GRID, "loam.grid_step", error=lambda v: 1 / (1 + v))
+    lucky = [replace(r, thesis_rmse=0.01) if r.seed == 0 and r.parameters["loam.grid_step"] == 1 else r for r in rows]
+    found = verdict(lucky, "best_between", 1, 2)
+    assert found.outcome == "undecided"
+    assert "in 1 of 3 seeds only" in found.measured
+
+
+def test_largest_value() -> None:
+    rising = rows_of([0.2, 0.4, 0.6, 0.8, 1.0], "icp.ratio", total=lambda v: 10 * v)
+    assert outcome(rising, "largest_between", 1, 1, of="total_time") == "confirmed"
+    falling = rows_of([0.2, 0.4, 0.6, 0.8, 1.0], "icp.ratio", total=lambda v: 10 / v)
+    assert outcome(falling, "largest_between", 1, 1, of="total_time") == "refuted"
+
+
+def test_elbow() -> None:
+    at_02 = rows_of(DISTANCES, "imu.inlier_distance", error=lambda v: 0.5 if v >= 0.2 else 1.9, noise=0.02)
+    assert outcome(at_02, "elbow_at", 0.2) == "confirmed"
+    assert outcome(at_02, "elbow_at", 1.0) == "refuted"
+    assert outcome(at_02, "good_from", 0.5) == "confirmed"
+    assert outcome(at_02, "good_from", 0.1) == "refuted"
+    assert outcome(at_02, "good_from", 0.05) == "undecided"
+    flat = rows_of(DISTANCES, "imu.inlier_distance")
+    assert outcome(flat, "elbow_at", 0.2) == "refuted"
+    assert outcome(flat, "elbow_at", 0.1) == "undecided"
+    unsteady = rows_of(DISTANCES, "imu.inlier_distance", error=lambda v: 0.5 if v < 1.5 else 2)
+    assert {outcome(unsteady, "elbow_at", 0.2), outcome(unsteady, "good_from", 0.2)} == {"refuted"}
+
+
+def test_little_influence() -> None:
+    flat = rows_of(SKIPS, error=lambda v: 0.5 + 0.005 * v)
+    assert outcome(flat, "matters_little", 1.5, of="translation") == "confirmed"
+    assert outcome(rows_of(SKIPS, error=lambda v: 0.1 * v), "matters_little", 1.5, of="translation") == "refuted"
+    lost = verdict(rows_of(SKIPS, diverges=lambda v: v == 5), "matters_little", 1.5, of="translation")
+    assert lost.outcome == "refuted"
+    assert "diverges at 5" in lost.measured
+    assert outcome(rows_of([1, 2]), "matters_little", 1.5) == "undecided"
+
+
+def test_laws() -> None:
+    hyperbola = rows_of(SKIPS, total=lambda v: 46.82 / v, noise=0.02)
+    line = rows_of(SKIPS, total=lambda v: 5 + 2 * v, noise=0.02)
+    assert outcome(hyperbola, "inverse") == "confirmed"
+    assert outcome(hyperbola, "linear") == "refuted"
+    assert outcome(line, "inverse") == "refuted"
+    assert outcome(line, "linear") == "confirmed"
+    assert outcome(hyperbola[:15], "inverse") == "undecided"
+    assert "R2 1.000" in verdict(rows_of(SKIPS, total=lambda v: 46.82 / v), "inverse", 0.99).measured
+
+
+def test_product_law() -> None:
+    rows, sums = [], []
+    for share in (0.1, 0.5, 1.0):
+        more: dict[str, Any] = {"at": {"preprocess.random_share": share}, "noise": 0.02}
+        rows += rows_of([1, 2, 4], total=lambda v, ds=share: 152 * ds / v, **more)
+        sums += rows_of([1, 2, 4], total=lambda v, ds=share: 5 + ds + v, **more)
+    assert outcome(rows, "product") == "confirmed"
+    assert outcome(sums, "product") == "refuted"
+    assert outcome(rows[:9], "product") == "undecided"
+
+
+def test_stage_that_a_parameter_acts_on() -> None:
+    on_scan = rows_of(GRID, "loam.grid_step", stages=lambda v: {"scan": 50 / v, "map": 20.0})
+    on_both = rows_of(GRID, "loam.grid_step", stages=lambda v: {"scan": 50 / v, "map": 50 / v})
+    assert outcome(on_scan, "acts_only_on", stages=["scan"]) == "confirmed"
+    assert outcome(on_scan, "acts_only_on", stages=["map"]) == "refuted"
+    assert outcome(on_both, "acts_only_on", stages=["scan"]) == "refuted"
+    assert outcome(rows_of(GRID, "loam.grid_step"), "acts_only_on", stages=["register"]) == "undecided"
+    assert "no stage maps was timed" in verdict(on_scan, "acts_only_on", stages=["maps"]).measured
+
+
+def test_times_of_runs_that_shared_the_machine_decide_nothing() -> None:
+    rows = rows_of(SKIPS, total=lambda v: 46.82 / v, is_timing_comparable=False)
+    found = verdict(rows, "inverse")
+    assert found.outcome == "undecided"
+    assert "shared the machine" in found.measured
+    assert outcome(rows, "matters_little", 1.5, of="translation") == "confirmed"
+
+
+def test_curves_that_disagree_leave_it_undecided_unless_the_finding_names_one() -> None:
+    rows = rows_of(SKIPS, diverges=lambda v: v > 7) + rows_of(SKIPS, uses_imu=True)
+    both = verdict(rows, "holds_up_to", 20)
+    assert both.outcome == "undecided"
+    assert both.sentence == (
+        "undecided: So it is; here thesis-icp: it diverges from 8 on; thesis-icp + IMU: nothing diverges up to 20"
+    )
+    assert outcome(rows, "holds_up_to", 20, imu=True) == "confirmed"
+    assert outcome(rows, "holds_up_to", 20, imu=False) == "refuted"
+    assert outcome(rows, "holds_up_to", 20, method="loam") == "undecided"
+
+
+def test_finding_at_a_value_of_the_other_parameter() -> None:
+    near = rows_of(DISTANCES, "imu.inlier_distance", at={"input.skip_frames": 4}, error=lambda v: 0.5 + 2 * (v < 0.2))
+    far = rows_of(DISTANCES, "imu.inlier_distance", at={"input.skip_frames": 20}, error=lambda v: 0.5 + 2 * (v < 1))
+    assert outcome(near + far, "elbow_at", 1.0, at={"input.skip_frames": 20}) == "confirmed"
+    assert outcome(near + far, "elbow_at", 1.0, at={"input.skip_frames": 4}) == "refuted"
+
+
+@pytest.mark.parametrize("kind", ["diverges_beyond", "holds_up_to", "good_from"])
+def test_study_without_a_usable_run_decides_nothing(kind: str) -> None:
+    rows = [replace(row, status="failed", reason="no data", stages_ms={}) for row in rows_of(SKIPS)]
+    assert outcome(rows, kind, 5) == "undecided"
