@@ -61,12 +61,21 @@ class OsmData:
     """An extract: nodes as (lat, lon) in deg, ways and relations by number.
 
     attribution : the words every output made from it must carry; None for a simulated place, which nobody surveyed
+    versions : by (kind, number), of elements that were edited before, which the database asks for; all others have 1
+    modified : (kind, number) of elements that differ from the database, as JOSM marks them in its files
     """
 
     nodes: dict[int, tuple[float, float]] = field(default_factory=dict)
     ways: dict[int, Way] = field(default_factory=dict)
     relations: dict[int, Relation] = field(default_factory=dict)
     attribution: str | None = ATTRIBUTION
+    versions: dict[tuple[str, int], int] = field(default_factory=dict)
+    modified: set[tuple[str, int]] = field(default_factory=set)
+
+    def add_version(self, kind: str, number: int, version: Any) -> None:
+        """Remember an element's version where it says another than 1."""
+        if version is not None and int(version) != 1:
+            self.versions[kind, number] = int(version)
 
     def add_node(self, number: int, lat: Any, lon: Any) -> None:
         """Add a node; raises ValueError when it is not on the Earth."""
@@ -145,6 +154,7 @@ def _read_json(path: Path) -> OsmData:
 
 def _add_json(data: OsmData, element: dict[str, Any]) -> None:
     kind, number = element["type"], int(element.get("id", 0))
+    data.add_version(kind, number, element.get("version"))
     tags = {str(key): str(value) for key, value in element.get("tags", {}).items()}
     if kind == "node":
         data.add_node(number, element["lat"], element["lon"])
@@ -199,6 +209,9 @@ def _add_xml(data: OsmData, element: Element) -> None:
     if element.get("action") == "delete" or element.get("visible") == "false":
         return
     number = int(element.attrib["id"])
+    data.add_version(element.tag, number, element.get("version"))
+    if element.get("action") == "modify":
+        data.modified.add((element.tag, number))
     if element.tag == "node":
         data.add_node(number, element.attrib["lat"], element.attrib["lon"])
         return
@@ -220,19 +233,24 @@ def _xml_lines(data: OsmData) -> Iterator[str]:
         sides = zip(("minlat", "minlon", "maxlat", "maxlon"), (min(lats), min(lons), max(lats), max(lons)), strict=True)
         yield " <bounds " + " ".join(f'{name}="{value:.{DECIMALS}f}"' for name, value in sides) + "/>\n"
     for number, (lat, lon) in data.nodes.items():
-        yield f' <node id="{number}" version="1" lat="{lat:.{DECIMALS}f}" lon="{lon:.{DECIMALS}f}"/>\n'
+        yield f' <node {_identity(data, "node", number)} lat="{lat:.{DECIMALS}f}" lon="{lon:.{DECIMALS}f}"/>\n'
     for way in data.ways.values():
-        yield f' <way id="{way.id}" version="1">\n'
+        yield f" <way {_identity(data, 'way', way.id)}>\n"
         yield from (f'  <nd ref="{node}"/>\n' for node in way.nodes)
         yield from _tag_lines(way.tags.items())
         yield " </way>\n"
     for relation in data.relations.values():
-        yield f' <relation id="{relation.id}" version="1">\n'
+        yield f" <relation {_identity(data, 'relation', relation.id)}>\n"
         for m in relation.members:
             yield f'  <member type="{m.kind}" ref="{m.ref}" role={_quoted(m.role)}/>\n'
         yield from _tag_lines(relation.tags.items())
         yield " </relation>\n"
     yield "</osm>\n"
+
+
+def _identity(data: OsmData, kind: str, number: int) -> str:
+    action = ' action="modify"' if (kind, number) in data.modified else ""
+    return f'id="{number}" version="{data.versions.get((kind, number), 1)}"{action}'
 
 
 def _tag_lines(tags: Iterable[tuple[str, str]]) -> Iterator[str]:
