@@ -52,7 +52,10 @@ class RegistrationConfig(Section):
     )
     start_scans: int = Field(5, ge=1, description="first scans, registered coarse to fine because the speed is unknown")
     start_reach: float = Field(
-        9.0, ge=0, description="m; how far the sensor may have moved between the first two scans; 0: not searched for"
+        12.0,
+        ge=0,
+        description="m; how far the sensor may have moved between the first two scans, 40 m/s at every third scan of "
+        "10 Hz; 0: not searched for",
     )
     start_iterations: int = Field(40, ge=1, description="steps of each stage while starting or recovering")
     coarse_factor: int = Field(3, ge=2, description="coarse voxels are this many times larger")

@@ -19,17 +19,12 @@ from lslam.registration.residuals import NEEDS_COVARIANCE
 from lslam.registration.robust import AdaptiveThreshold, Annealing, UsualAgreement
 from lslam.registration.solver import RegistrationResult, solve
 from lslam.registration.source_covariance import source_covariance
+from lslam.registration.start_search import CLEARLY, SEARCH_SHARE, START_STEP, StandingPoints, distinct, start_offsets
 from lslam.registration.target import make_target
 from lslam.types.state import Stateful
 
 MIN_SOURCE_POINTS = 30
 
-# m; starts this far apart leave no gap between their capture ranges, not even between piers of a facade.
-START_STEP = 1.0
-# Every so many-th source point is enough to tell a good start from a bad one; so many of the best are looked at closely.
-SEARCH_SHARE, LOOKED_AT = 4, 3
-# A farther start must be supported by more than chance.
-CLEARLY = 1.01
 # Point to point: of the voxel size, because a voxel's mean stands for one point of its surface, its plane for all; and
 # times the steps, because a point is drawn to where its match is, not to where the surfaces meet.
 POINT_VOXEL, POINT_STEPS = 0.625, 3
@@ -49,7 +44,7 @@ class Registration(Stateful):
     (4, 4)
     """
 
-    STATE = ("map", "target", "threshold", "agreement", "_motion", "_index", "_starting", "_inserted")
+    STATE = ("map", "target", "threshold", "agreement", "_motion", "_index", "_starting", "_inserted", "_first")
 
     def __init__(self, config: RegistrationConfig | None = None, preprocess: PreprocessConfig | None = None) -> None:
         self.config = config or RegistrationConfig()
@@ -69,6 +64,8 @@ class Registration(Stateful):
         self._index = 0
         self._starting = self.config.start_scans
         self._inserted = 0
+        # Points and pose of the only scan in the map, until there is a second.
+        self._first: tuple[NDArray[np.float32], NDArray[np.float64]] | None = None
 
     def register(self, points: NDArray[Any], prior: NDArray[np.float64] | None = None) -> RegistrationResult:
         """Pose of points (N, 3), m, LiDAR frame; without `prior` (4, 4) the velocity is taken as constant."""
@@ -120,6 +117,7 @@ class Registration(Stateful):
             first = len(self.map) == 0
             self.target.enter(self.map, points.map_points, result.T_world_lidar)
             self._inserted += 1
+            self._first = (points.map_points, result.T_world_lidar) if self._inserted == 1 else None
             if not first:
                 self._starting = max(self._starting - 1, 0)
                 self.agreement.observe(self._agreement(result))
@@ -135,13 +133,15 @@ class Registration(Stateful):
     def _search(self, points: PreparedPoints, T_prior: NDArray[np.float64]) -> RegistrationResult:
         """The best of several starts: nothing is known yet of how fast the sensor moves.
 
-        Posts and crash barriers repeat every few metres, so the nearest agreement may be a false one, and a true one
-        further on has smaller residuals. A few points on the coarse map tell which starts are worth a whole registration.
+        Posts and crash barriers repeat every few metres, so the nearest agreement may be a false one; what stands on the
+        ground tells. A few points on the coarse map show which starts are worth a whole registration.
         """
         c = self.config
         best = self._judge(self._coarse_to_fine(points, T_prior), T_prior)
-        if c.start_reach == 0:
+        if c.start_reach == 0 or self._first is None:
             return best
+        first = StandingPoints(*self._first, self.preprocess)
+        seen = first.seen_in(points.map_points)
         coarse_map, few = self._coarse_map(points, T_prior), thin(points, SEARCH_SHARE)
         slow = Annealing(2 * START_STEP, c.kernel_min, c.coarse_decay, c.start_iterations)
         tried = [
@@ -149,30 +149,14 @@ class Registration(Stateful):
                   weak_share=c.weak_share, residual=self.residual)
             for offset in start_offsets(c.start_reach, START_STEP)
         ]  # fmt: skip
-        tried.sort(key=lambda found: (len(found.degenerate), -self._support(found)))
-        for promising in _distinct(tried, best.T_world_lidar):
+        tried.sort(key=lambda found: -first.share(seen, found.T_world_lidar))
+        for promising in distinct(tried, best.T_world_lidar):
             start = promising.T_world_lidar
             found = self._judge(self._coarse_to_fine(points, start), start)
-            if self._is_better(found, best):
+            needed = CLEARLY * first.share(seen, best.T_world_lidar) if best.ok else 0.0
+            if found.ok and first.share(seen, found.T_world_lidar) > needed:
                 best = replace(found, prior_error=_correction(T_prior, found.T_world_lidar))
         return best
-
-    def _is_better(self, found: RegistrationResult, best: RegistrationResult) -> bool:
-        """Whether a start somewhere else led to a place that the scan clearly supports more."""
-        if not (found.ok and best.ok):
-            return found.ok
-        # Where nothing agrees across the road, nothing contradicts either: what observes more is asked for less.
-        gain = len(best.degenerate) - len(found.degenerate)
-        needed = CLEARLY if gain <= 0 else 1 / CLEARLY
-        return found.matched > 0.5 * best.matched and gain >= 0 and self._support(found) > needed * self._support(best)
-
-    def _support(self, result: RegistrationResult) -> float:
-        """Share of the matches that agree, the less the larger their residuals: the robust cost upside down.
-
-        Not of all points: what a sensor sees of bare ground moves along with it, and matches best where nothing moved.
-        """
-        width2 = self.config.kernel_min**2 + (self.map.size**2 if self.residual == "point" else 0.0)
-        return result.inlier_share * max(1 - result.rmse**2 / width2, 0.0)
 
     def _coarse_to_fine(self, points: PreparedPoints, T_prior: NDArray[np.float64]) -> RegistrationResult:
         """Coarse planes, annealed slowly, catch what fine voxels lose: metres per scan instead of decimetres.
@@ -262,23 +246,3 @@ def _failed(T_prior: NDArray[np.float64], source_points: int, reason: str) -> Re
     return RegistrationResult(
         T_prior.copy(), ok=False, reason=reason, covariance=DOUBT.copy(), converged=False, source_points=source_points
     )
-
-
-def _distinct(results: list[RegistrationResult], known: NDArray[np.float64]) -> list[RegistrationResult]:
-    """The first `LOOKED_AT` places that lie at least half a step from the known one and from each other."""
-    places, chosen = [known[:3, 3]], []
-    for result in results:
-        place = result.T_world_lidar[:3, 3]
-        if min(float(np.linalg.norm(place - other)) for other in places) > START_STEP / 2:
-            places.append(place)
-            chosen.append(result)
-    return chosen[:LOOKED_AT]
-
-
-def start_offsets(reach: float, step: float) -> NDArray[np.float64]:
-    """(N, 3) m in the LiDAR frame, nearest first: ahead and back up to `reach`, sideways one step at most."""
-    count = int(np.ceil(reach / step - 1e-9))
-    ahead = [sign * min(k * step, reach) for k in range(1, count + 1) for sign in (1, -1)]
-    sideways = [sign * min(step, reach) for sign in (1, -1)] if count else []
-    offsets = np.array([(x, 0.0, 0.0) for x in ahead] + [(0.0, y, 0.0) for y in sideways]).reshape(-1, 3)
-    return offsets[np.argsort(np.linalg.norm(offsets, axis=1), kind="stable")]

@@ -107,9 +107,9 @@ def _times(grid: Grid, keys: list[Key]) -> Iterator[str]:
     tails = {k: grid.rows[k, "icp"]["p95"] / grid.ms(k, "icp") for k in keys}
     yield _all_within("icp's p95 over its median", tails, 1.8)
     lost = {k: grid.rows[k, "icp"].get("lost_starts", 0) for k in keys}
-    yield _said(
-        "icp loses no start at every 3rd scan", not any(lost.values()), f"{sum(lost.values())} lost {_worst(lost)}"
-    )
+    blind = sum(grid.rows[k, "icp"].get("blind_starts", 0) for k in keys)
+    how = f"{sum(lost.values())} lost {_worst(lost)}; {blind} of them flagged as unobserved"
+    yield _said("icp loses no start at every 3rd scan", not any(lost.values()), how)
 
 
 def _divergence(grid: Grid) -> Iterator[str]:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from lslam.config.registration import RegistrationConfig
 from lslam.errors import InputError
-from lslam.registration.registration import MIN_SOURCE_POINTS, Registration, start_offsets
+from lslam.registration.registration import MIN_SOURCE_POINTS, Registration
 from lslam.registration.solver import RegistrationResult
 
 Floats = NDArray[np.float64]
@@ -231,15 +231,6 @@ def test_the_first_step_is_found_beside_posts_that_repeat(metres: float) -> None
     result = registration.register(view(metres))
     assert result.ok
     np.testing.assert_allclose(result.T_world_lidar[:3, 3], [metres, 0, 0], atol=0.03)
-
-
-def test_starts_reach_as_far_as_asked_nearest_first() -> None:
-    offsets = start_offsets(9.0, 3.0)
-    lengths = np.linalg.norm(offsets, axis=1)
-    assert lengths.max() == 9.0
-    assert (np.diff(lengths) >= 0).all()
-    assert len(start_offsets(0.0, 3.0)) == 0
-    assert np.abs(start_offsets(4.0, 3.0)).max() == 4.0
 
 
 def test_agreement_with_a_single_scan_counts_its_coarse_surfaces_too() -> None:

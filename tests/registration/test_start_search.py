@@ -1,0 +1,81 @@
+"""The search for a first step: what stands on the ground decides between places that look alike."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from analytic_scenes import pose_at
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from lslam.config.preprocess import PreprocessConfig
+from lslam.geometry import se3
+from lslam.registration.registration import Registration
+from lslam.registration.start_search import CLEARLY, NEAR, StandingPoints, start_offsets
+from lslam.simulation.scenarios import simulate
+
+Floats = NDArray[np.float64]
+
+STRIDE = 3
+
+
+def at_every_third(scenario: str, seed: int, first: int, prior: Floats | None) -> tuple[float, int]:
+    """Error of the first step, m, and how many directions nothing observes, with a prior or without one."""
+    drive = simulate(scenario, seed=seed, motion_compensated=True)
+    truth = se3.relative(drive.ground_truth.poses[first], drive.ground_truth.poses[first + STRIDE])
+    registration = Registration()
+    registration.register(drive.scan(first).points)
+    result = registration.register(drive.scan(first + STRIDE).points, truth if prior is None else prior)
+    assert result.ok
+    return float(np.linalg.norm(result.T_world_lidar[:3, 3] - truth[:3, 3])), len(result.degenerate)
+
+
+@pytest.mark.parametrize(("seed", "first"), [(0, 0), (0, 217), (1, 72), (2, 145)])
+def test_nine_metres_a_scan_are_found_among_posts_and_cars_that_keep_pace(seed: int, first: int) -> None:
+    error, _ = at_every_third("motorway", seed, first, np.eye(4))
+    assert error < 0.1
+
+
+def test_between_bare_walls_the_prior_stays_though_rings_match_best_where_nothing_moved() -> None:
+    error, blind = at_every_third("corridor", 0, 145, None)
+    assert blind == 1
+    assert error < 0.02
+
+
+def street(rng: np.random.Generator, x: float) -> NDArray[np.float32]:
+    """Flat ground and irregular poles as seen from (x, 0, 1.7)."""
+    ground = np.column_stack([rng.uniform(-30, 30, (4000, 2)), np.zeros(4000)])
+    poles = np.random.default_rng(9).uniform(-25, 25, (40, 2)).repeat(20, axis=0)
+    standing = np.column_stack([poles, np.tile(np.linspace(0.6, 3.0, 20), 40)])
+    return (np.concatenate([ground, standing]) - [x, 0, 1.7]).astype(np.float32)
+
+
+def test_the_share_is_that_of_points_with_a_neighbour_and_leaves_the_ground_out() -> None:
+    rng = np.random.default_rng(0)
+    first = StandingPoints(street(rng, 0.0), pose_at((5.0, 0.0, 0.0), 30.0), PreprocessConfig())
+    seen = first.seen_in(street(rng, 2.0))
+    assert len(seen.source) == 800
+    tree = cKDTree(se3.apply(pose_at((5.0, 0.0, 0.0), 30.0), street(rng, 0.0)[4000:].astype(float)))
+    true = pose_at((5.0, 0.0, 0.0), 30.0) @ pose_at((2.0, 0.0, 0.0))
+    for off in np.arange(0.0, 6.0, 0.75):
+        pose = true @ pose_at((off, 0.1, 0.0))
+        away, _ = tree.query(se3.apply(pose, seen.source))
+        # Cells stand for their points: their mean lies up to half a cell from any of them.
+        assert (away < NEAR / 2).mean() - 0.02 <= first.share(seen, pose) <= (away < 1.5 * NEAR).mean() + 0.02
+    assert first.share(seen, true) == 1.0
+    assert first.share(seen, true) > CLEARLY * first.share(seen, true @ pose_at((1.0, 0.0, 0.0)))
+
+
+def test_bare_ground_says_nothing() -> None:
+    ground = street(np.random.default_rng(1), 0.0)[:4000]
+    first = StandingPoints(ground, np.eye(4), PreprocessConfig())
+    assert first.share(first.seen_in(ground), np.eye(4)) == 0.0
+
+
+def test_starts_reach_as_far_as_asked_nearest_first() -> None:
+    offsets = start_offsets(9.0, 3.0)
+    lengths = np.linalg.norm(offsets, axis=1)
+    assert lengths.max() == 9.0
+    assert (np.diff(lengths) >= 0).all()
+    assert len(start_offsets(0.0, 3.0)) == 0
+    assert np.abs(start_offsets(4.0, 3.0)).max() == 4.0
