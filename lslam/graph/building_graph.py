@@ -60,7 +60,8 @@ def solve_buildings(
     """Displacements of the buildings with `middles` (B, 2), m, from `matches`, with each keyframe at `poses` (3,) of the map.
 
     Matches that contradict the others are given up: graduated non-convexity with truncated least squares (`graph.robust`).
-    Of the map's own belief nothing is ever given up.
+    Of the map's own belief nothing is ever given up. Who drew a house wrong did so for every keyframe that sees it, so the
+    covariances are those of one match as good as the mean, while the displacements take all of them at their word.
     """
     owners = np.array([m.building for m in matches], np.intp)
     measured = np.array([m.displacement(poses[m.keyframe], middles[m.building]) for m in matches]).reshape(-1, 3)
@@ -80,7 +81,10 @@ def solve_buildings(
     believed = ratio <= 1
     if not believed.all():
         solution = _linear(len(middles), owners, measured, believed[:, None, None] * weights, belief)
-    return BuildingSolution(*solution, believed)
+    counts = np.bincount(owners[believed], minlength=len(middles))
+    shared = np.where(believed, 1.0 / np.maximum(counts[owners], 1), 0.0)
+    _, covariances, _ = _linear(len(middles), owners, measured, shared[:, None, None] * weights, belief)
+    return BuildingSolution(solution[0], covariances, solution[2], believed)
 
 
 def _in_map(information: Floats, yaw: float) -> Floats:

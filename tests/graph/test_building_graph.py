@@ -84,7 +84,9 @@ def test_the_solution_is_that_of_all_rows_in_one_least_squares_problem(seed: int
     values.append(belief.shift / belief.shift_sigma)
     A = np.concatenate(rows)
     answer = np.linalg.lstsq(A, np.concatenate(values), rcond=None)[0]
-    covariance = np.linalg.inv(A.T @ A)
+    counts = np.bincount([m.building for m in matches])
+    shared = np.repeat([counts[m.building] ** -0.5 for m in matches] + [1.0] * 6, [3] * (len(matches) + 5) + [2])
+    covariance = np.linalg.inv((shared[:, None] * A).T @ (shared[:, None] * A))
     np.testing.assert_allclose(found.displacements.ravel(), answer[:15], atol=1e-9)
     np.testing.assert_allclose(found.shift, answer[15:], atol=1e-9)
     for b in range(5):
@@ -105,7 +107,7 @@ def test_buildings_seen_from_two_sides_end_where_they_are(seed: int) -> None:
     assert np.abs(away[:, 2]).max() < np.radians(1.2)
     assert np.linalg.norm(found.shift - truth[:, :2].mean(axis=0)) < 0.25
     nees = np.array([a @ np.linalg.solve(c, a) for a, c in zip(away, found.covariances, strict=True)])
-    assert nees.mean() < 6
+    assert nees.max() < 6
 
 
 def test_a_lone_wall_moves_its_building_across_and_not_along() -> None:
@@ -121,7 +123,7 @@ def test_a_lone_wall_moves_its_building_across_and_not_along() -> None:
     assert found.displacements[5, :2] @ along == pytest.approx(sure.shift @ along, abs=1e-3)
     spread = found.covariances[5, :2, :2]
     assert along @ spread @ along == pytest.approx(1.0, rel=0.01)
-    assert n @ spread @ n < 0.05
+    assert n @ spread @ n < 0.1
     np.testing.assert_allclose(found.displacements[0], [1.0, -2.0, 0.0], atol=1e-3)
 
 

@@ -1,0 +1,94 @@
+"""The second level: with the trajectory done, every building of the map is put where the walls seen say it stands."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.graph.building_graph import BuildingSolution, MapBelief, solve_buildings
+from lslam.priors.map_changes import absent_buildings, new_walls
+from lslam.priors.overlap import Untangled, remove_overlaps
+from lslam.types.building_correction import BuildingCorrection, BuildingStatus, CorrectedMap
+from lslam.types.building_match import BuildingMatch, OsmMatches
+
+log = logging.getLogger("lslam")
+Floats = NDArray[np.float64]
+
+# m and rad; by which a building moves that may only move with all others.
+TOGETHER = np.array([1e-3, 1e-3, 1e-5])
+
+
+def correct_buildings(
+    matches: OsmMatches, poses: NDArray[np.float64], covariances: NDArray[np.float64], mode: str, belief: MapBelief
+) -> CorrectedMap:
+    """The buildings of `matches` at their real places.
+
+    Parameters
+    ----------
+    poses : (K, 3) x, y (m), yaw (rad) of all keyframes in the map frame; covariances : (K, 3, 3) of them
+    mode : `prior` trusts the map and moves nothing, `rigid` moves all buildings together, others each by itself
+    belief : what the map is trusted with
+
+    Absent buildings follow the others, as those nobody saw do.
+    """
+    place = dict(enumerate(poses))
+    local = [m for m in matches.local if m.verdict == "accepted" and m.keyframe in place]
+    middles = np.array([b.middle for b in matches.buildings]).reshape(-1, 2)
+    if mode == "rigid":
+        belief = MapBelief(belief.shift, belief.shift_sigma, TOGETHER)
+    solution = solve_buildings(middles, local, place, belief)
+    untangled = Untangled(solution.displacements, (), ())
+    if mode == "prior":
+        untangled = Untangled(np.zeros_like(solution.displacements), (), ())
+    elif mode != "rigid":
+        information = np.asarray(np.linalg.inv(solution.covariances), np.float64)
+        untangled = remove_overlaps(matches.buildings, solution.displacements, information)
+    displacements = untangled.displacements
+    standing = [b.displaced(d) for b, d in zip(matches.buildings, displacements, strict=True)]
+    gone = absent_buildings(standing, matches.keyframes, place)
+    own = _with_trajectory(solution, local, covariances)
+    used, rejected = _counts(matches, local, solution)
+    found = tuple(
+        BuildingCorrection(b, displacements[k], own[k], _status(used[k], bool(gone[k])), used[k], rejected[k])
+        for k, b in enumerate(matches.buildings)
+    )
+    here = [b for b, is_gone in zip(standing, gone, strict=True) if not is_gone]
+    shift = np.zeros(2) if mode == "prior" else solution.shift
+    new = new_walls(here, matches.keyframes, place)
+    corrected = CorrectedMap(matches.origin, found, mode, shift, new, untangled.left, matches.attribution)
+    counts = {status: sum(c.status == status for c in found) for status in ("seen", "unseen", "absent")}
+    log.info(
+        "OSM: %d buildings seen, %d not, %d absent; %d walls that no building has",
+        counts["seen"], counts["unseen"], counts["absent"], len(corrected.new_walls),
+    )  # fmt: skip
+    return corrected
+
+
+def _status(used: int, is_gone: bool) -> BuildingStatus:
+    if used:
+        return "seen"
+    return "absent" if is_gone else "unseen"
+
+
+def _counts(
+    matches: OsmMatches, local: Sequence[BuildingMatch], solution: BuildingSolution
+) -> tuple[list[int], list[int]]:
+    """Per building, how many matches hold it and how many were given up."""
+    owners = np.array([m.building for m in local], np.intp)
+    size = len(matches.buildings)
+    used = np.bincount(owners[solution.believed], minlength=size)
+    tried = np.bincount(np.array([m.building for m in matches.local], np.intp), minlength=size)
+    return used.tolist(), (tried - used).tolist()
+
+
+def _with_trajectory(solution: BuildingSolution, local: Sequence[BuildingMatch], covariances: Floats) -> Floats:
+    """(B, 3, 3) covariances with the mean of those of the keyframes that saw each: these are wrong together."""
+    found = solution.covariances.copy()
+    for building in {m.building for m in local}:
+        own = [m.keyframe for m, kept in zip(local, solution.believed, strict=True) if kept and m.building == building]
+        if own:
+            found[building] += covariances[own].mean(axis=0)
+    return found
