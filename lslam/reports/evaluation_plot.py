@@ -12,9 +12,7 @@ from lslam.errors import UsageError, nearest
 from lslam.evaluation.results import AbsoluteError, Evaluation
 from lslam.formats.atomic import atomic_write
 from lslam.reports.evaluation_table import short_names
-
-FORMATS = ("png", "svg", "pdf")
-COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")  # Okabe and Ito: safe for colour blindness
+from lslam.reports.picture import COLOURS, FORMATS, house_style, label, picture
 
 
 def check_plot_path(path: Path) -> None:
@@ -31,15 +29,10 @@ def write_plot(path: str | Path, evaluations: Sequence[Evaluation], names: Seque
     """
     path = Path(path)
     check_plot_path(path)
-    from matplotlib import rc_context
-
-    # Text stays text, and the same input gives the same bytes.
-    with rc_context({"svg.hashsalt": "lslam", "svg.fonttype": "none", "font.size": 9}):
+    with house_style():
         figure = _draw(evaluations, names or short_names([e.estimate for e in evaluations]))
-        kind = path.suffix.lstrip(".").lower()
-        stamp: dict[str, Any] = {"svg": {"Date": None}, "pdf": {"CreationDate": None}, "png": {}}[kind]
         with atomic_write(path) as stream:
-            figure.savefig(stream, format=kind, dpi=120, metadata=stamp)
+            stream.write(picture(figure, path.suffix.lstrip(".").lower()))
 
 
 def _draw(evaluations: Sequence[Evaluation], names: Sequence[str]) -> Any:
@@ -61,8 +54,8 @@ def _draw(evaluations: Sequence[Evaluation], names: Sequence[str]) -> Any:
     rmse = ", ".join(f"{error.translation.rmse:.3f} m" for error in shown if error.translation)
     position.set_title(f"position error, alignment {shown[0].alignment}: rmse {rmse}", fontsize=9)
     rotation.set_title("rotation error, same alignment", fontsize=9)
-    _label(position, "", "m")
-    _label(rotation, "distance along ground truth, m", "deg")
+    label(position, "", "m")
+    label(rotation, "distance along ground truth, m", "deg")
     _axis_errors(axes, evaluations[0], names[0])
     _drift_axes(drift, evaluations)
     return figure
@@ -82,8 +75,8 @@ def _trajectories(
     above.set_aspect("equal", adjustable="datalim")
     above.legend(loc="best", frameon=False)
     above.set_title(f"seen from above; {first.matched} poses, {first.path_length:.1f} m", fontsize=9)
-    _label(above, "x, m", "y, m")
-    _label(height, "distance along ground truth, m", "z, m")
+    label(above, "x, m", "y, m")
+    label(height, "distance along ground truth, m", "z, m")
 
 
 def _axis_errors(plot: Any, evaluation: Evaluation, name: str) -> None:
@@ -91,14 +84,14 @@ def _axis_errors(plot: Any, evaluation: Evaluation, name: str) -> None:
         plot.plot(evaluation.distance, evaluation.thesis1.xyz[:, k], lw=1.0, color=COLOURS[k], label=axis)
     plot.legend(loc="best", ncol=3, frameon=False)
     plot.set_title(f"error per axis, alignment origin: {name}", fontsize=9)
-    _label(plot, "distance along ground truth, m", "m")
+    label(plot, "distance along ground truth, m", "m")
 
 
 def _drift_axes(plot: Any, evaluations: Sequence[Evaluation]) -> None:
     if any(e.kitti_drift.available for e in evaluations):
         plot.set_title("KITTI drift over segment length", fontsize=9)
         plot.set_ylim(bottom=0)
-        _label(plot, "segment, m", "%")
+        label(plot, "segment, m", "%")
         return
     plot.set_axis_off()
     plot.text(0.5, 0.5, f"KITTI drift: {evaluations[0].kitti_drift.note}", ha="center", va="center")
@@ -114,10 +107,3 @@ def _best_alignment(evaluation: Evaluation) -> AbsoluteError:
 
 def _colours(count: int) -> list[str]:
     return [COLOURS[k % len(COLOURS)] for k in range(count)]
-
-
-def _label(plot: Any, x: str, y: str) -> None:
-    plot.set_xlabel(x)
-    plot.set_ylabel(y)
-    plot.grid(alpha=0.25)
-    plot.spines[["top", "right"]].set_visible(False)

@@ -1,0 +1,227 @@
+"""The figures of a sensitivity study, those of the first thesis' section 5.3: errors, times, stages, laws, efficiency."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from lslam.evaluation.curves import NOT_REGISTRATION, registration_ms
+from lslam.evaluation.efficiency import normalise
+from lslam.evaluation.landmarks import FLAT
+from lslam.reports.picture import COLOURS, house_style, label, picture
+from lslam.reports.study_law_figure import draw_laws
+from lslam.types.sensitivity import CurveResult, Floats, StudyResult
+from lslam.types.study import StudyRow
+
+# Of section 5.3, by studied parameter and figure.
+THESIS = {
+    "input.skip_frames": {"errors": "5.16 and 5.21", "zoom": "5.17", "times": "5.18 and 5.22", "stages": "5.22",
+                          "law": "5.19 and 5.28", "efficiency": "5.20"},
+    "imu.inlier_distance": {"errors": "5.23a", "times": "5.23b"},
+    "registration.inlier_ratio": {"errors": "5.24", "times": "5.24"},
+    "preprocess.random_share": {"errors": "5.25", "times": "5.26", "law": "5.27a and 5.28", "efficiency": "5.27b"},
+    "loam.grid_step": {"errors": "5.29", "times": "5.30b", "stages": "5.30a", "efficiency": "5.31"},
+    "loam.feature_map_voxel": {"times": "5.32b", "stages": "5.32a", "efficiency": "5.33"},
+    "loam.max_planar_points": {"errors": "5.35", "times": "5.34b", "stages": "5.34a", "efficiency": "5.35"},
+}  # fmt: skip
+_SEEDS = (
+    "Mean over the seeds whose run was not lost, bars: 95 % interval (Student's t). Crosses above: more than half of the "
+    "runs were lost there."
+)
+_LAW = "Lines: weighted least squares, shaded: 99 % confidence; below: residuals in % of the law."
+_EFFICIENCY = "Each curve over its own largest mean; a lost run counts as 0; squares: within 10 % of the largest."
+_STAGE_PANELS = 6
+_LOG_RATIO = 30.0  # of the largest to the smallest error, above which the axis is logarithmic
+
+
+@dataclass(frozen=True)
+class StudyFigure:
+    """One figure as files: `name` is that of the files; `caption` says how it is made and which of the thesis it repeats."""
+
+    name: str
+    title: str
+    caption: str
+    png: bytes
+    svg: bytes
+
+
+def study_figures(result: StudyResult) -> Iterator[StudyFigure]:
+    """All figures that the study has numbers for."""
+    from matplotlib.figure import Figure
+
+    known = [r for r in result.results if r.curve.ran.any()]
+    for name, title, caption, draw in _FIGURES:
+        with house_style():
+            figure = Figure(figsize=(10, 4.2), layout="constrained")
+            if not known or not draw(figure, result, known):
+                continue
+            of_thesis = THESIS.get(result.parameters[0], {}).get(name, "")
+            more = f" Of the first thesis: figure {of_thesis}." if of_thesis else ""
+            yield StudyFigure(name, title, caption + more, picture(figure, "png"), picture(figure, "svg"))
+
+
+def _errors(figure: Any, result: StudyResult, shown: Sequence[CurveResult]) -> bool:
+    left, right = figure.subplots(1, 2)
+    _quantity(left, result, shown, "translation", "rmse of translation, m", lambda row: row.thesis_rmse)
+    _quantity(right, result, shown, "angular", "rmse of rotation, deg", lambda row: row.angular_rmse_deg)
+    for plot, name in ((left, "translation"), (right, "angular")):
+        values = np.concatenate([r.means[name].mean for r in shown])
+        values = values[np.isfinite(values)]
+        if len(values) and values.min() > 0 and values.max() > _LOG_RATIO * values.min():
+            plot.set_yscale("log")
+    _legend(figure, left)
+    return any(r.means["translation"].n.any() for r in shown)
+
+
+def _zoom(figure: Any, result: StudyResult, shown: Sequence[CurveResult]) -> bool:
+    """Only where some curves are lost somewhere and others nowhere."""
+    steady = [r for r in shown if not r.curve.is_lost.any()]
+    return len(steady) < len(shown) and bool(steady) and _errors(figure, result, steady)
+
+
+def _times(figure: Any, result: StudyResult, shown: Sequence[CurveResult]) -> bool:
+    left, right = figure.subplots(1, 2)
+    _quantity(left, result, shown, "time_per_scan", "registration per scan, ms", registration_ms)
+    _quantity(right, result, shown, "total_time", "total time, s", lambda row: row.total_time_s)
+    _legend(figure, left)
+    return any(r.means["total_time"].n.any() for r in shown)
+
+
+def _stages(figure: Any, result: StudyResult, shown: Sequence[CurveResult]) -> bool:
+    """A panel per curve with a line per stage of registration; none where registration has a single stage."""
+    own = [[name for name, m in r.stage_means.items() if name not in NOT_REGISTRATION and m.n.any()] for r in shown]
+    if max(len(names) for names in own) < 2:
+        return False
+    panels = list(zip(shown, own, strict=True))[:_STAGE_PANELS]
+    names = list(dict.fromkeys(name for _, stages in panels for name in stages))
+    plots = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
+    for plot, (r, stages) in zip(plots, panels, strict=True):
+        for name in stages:
+            means = r.stage_means[name]
+            plot.plot(r.curve.values, means.mean, ".-", color=COLOURS[names.index(name) % len(COLOURS)], label=name)
+        plot.set_title(r.curve.label, fontsize=9)
+        _abscissa(plot, r)
+        label(plot, result.parameters[0], "ms per scan" if plot is plots[0] else "")
+        plot.set_ylim(bottom=0)
+    _legend(figure, *plots)
+    return True
+
+
+def _efficiency(figure: Any, result: StudyResult, shown: Sequence[CurveResult]) -> bool:
+    """Each curve over its own largest value; a bar below it where it is within a tenth of that."""
+    names = ("efficiency", "total_efficiency")
+    for plot, name in zip(figure.subplots(1, 2), names, strict=True):
+        for k, (r, look) in enumerate(_with_looks(result, shown)):
+            values = normalise(r.means[name].mean)
+            plot.plot(r.curve.values, values, label=r.curve.label, **look)
+            flat = np.flatnonzero(values >= 1 - FLAT)
+            if len(shown) <= len(COLOURS):
+                plot.plot(r.curve.values[flat], np.full(len(flat), -0.04 * (k + 1)), "s", ms=3.5, color=look["color"])
+        plot.set_yticks(np.linspace(0, 1, 6))
+        _abscissa(plot, shown[0])
+        title = "E, per scan (equation 5.2)" if name == "efficiency" else "E tot, in all (equation 5.3)"
+        label(plot, result.parameters[0], f"{title}, over the largest")
+    _legend(figure, figure.axes[0])
+    return any(r.optimum is not None for r in shown)
+
+
+def _quantity(
+    plot: Any, result: StudyResult, shown: Sequence[CurveResult], name: str, words: str,
+    of_row: Callable[[StudyRow], float],
+) -> None:  # fmt: skip
+    """Means with their intervals; crosses at the top where a curve is lost; runs beside as dotted lines."""
+    tops = []
+    rows_of_crosses = 0
+    for r, look in _with_looks(result, shown):
+        means, values = r.means[name], r.curve.values
+        if r.curve.is_lost.any():
+            lost, height = values[r.curve.is_lost], 1.0 + 0.03 * rows_of_crosses
+            rows_of_crosses += 1
+            above = {"transform": plot.get_xaxis_transform(), "clip_on": False}
+            plot.plot(lost, np.full(len(lost), height), "x", ms=4, color=look["color"], **above)
+        half = np.nan_to_num(means.high - means.mean)
+        # Below zero there is nothing, and a logarithmic axis could not draw it.
+        below = np.minimum(half, 0.999 * np.nan_to_num(means.mean))
+        plot.errorbar(values, means.mean, [below, half], label=r.curve.label, elinewidth=0.7, capsize=1.5, **look)
+        tops.append(means.mean)
+    for row, colour in _beside(result, of_row):
+        plot.axhline(of_row(row), color=colour, ls=":", lw=1.2, label=f"{row.method}{' + IMU' * row.uses_imu}, beside")
+        tops.append(np.array([of_row(row)]))
+    top = np.nan_to_num(np.concatenate(tops)).max()
+    # Three seeds make intervals that would press the means flat.
+    plot.set_ylim(0, 1.15 * top if top > 0 else 1.0)
+    _abscissa(plot, shown[0])
+    label(plot, result.parameters[0], words)
+
+
+def _beside(result: StudyResult, of_row: Callable[[StudyRow], float]) -> Iterator[tuple[StudyRow, str]]:
+    """The first seed of each method beside the study that has the number, with its grey."""
+    seen: dict[tuple[str, bool], StudyRow] = {}
+    for row in result.beside:
+        if np.isfinite(of_row(row)):
+            seen.setdefault((row.method, row.uses_imu), row)
+    for k, row in enumerate(seen.values()):
+        yield row, ("0.25", "0.5", "0.7")[k % 3]
+
+
+def _with_looks(result: StudyResult, shown: Sequence[CurveResult]) -> Iterator[tuple[CurveResult, dict[str, Any]]]:
+    """What is shown with how it is drawn: the same in all figures of a study.
+
+    Colour by curve while there are few; where there are many, by second parameter in order, with a dash per series.
+    """
+    curves = [r.curve for r in result.results]
+    if len(curves) <= len(COLOURS):
+        looks = [{"color": colour, "marker": "o", "ms": 3, "lw": 1.2} for colour in COLOURS]
+    else:
+        from matplotlib import colormaps
+
+        others = list(dict.fromkeys(curve.at for curve in curves))
+        with suppress(TypeError):  # words beside numbers have no order but that of the study
+            others.sort()
+        series = list(dict.fromkeys(curve.series for curve in curves))
+        shades, dashes = colormaps["viridis"](np.linspace(0.0, 0.88, len(others))), ("-", "--", ":", "-.")
+        looks = [
+            {"color": tuple(shades[others.index(curve.at)]), "ls": dashes[series.index(curve.series) % 4], "marker": "o",
+             "ms": 2.5, "lw": 1.1}
+            for curve in curves
+        ]  # fmt: skip
+    by_label = {curve.label: look for curve, look in zip(curves, looks, strict=False)}
+    return ((r, by_label[r.curve.label]) for r in shown)
+
+
+def _abscissa(plot: Any, result: CurveResult) -> None:
+    """Logarithmic where most values crowd at the low end; words where they are words."""
+    values: Floats = result.curve.values
+    if result.curve.words:
+        plot.set_xticks(values, result.curve.words)
+    elif len(values) > 4 and values[0] > 0 and np.median(values) - values[0] < 0.25 * (values[-1] - values[0]):
+        plot.set_xscale("log")
+        marks = [
+            v for k, v in enumerate(values) if k in (0, len(values) - 1) or f"{v:g}".strip("0.") in ("1", "2", "5")
+        ]
+        plot.set_xticks(marks, [f"{v:g}" for v in marks])
+        plot.minorticks_off()
+    elif (values == values.round()).all():
+        plot.xaxis.get_major_locator().set_params(integer=True)
+
+
+def _legend(figure: Any, *plots: Any) -> None:
+    """Each name once, below everything."""
+    found = {name: handle for plot in plots for handle, name in zip(*plot.get_legend_handles_labels(), strict=True)}
+    figure.legend(
+        found.values(), found.keys(), loc="outside lower center", ncols=min(len(found), 4) or 1, frameon=False
+    )
+
+
+_FIGURES: tuple[tuple[str, str, str, Callable[[Any, StudyResult, Sequence[CurveResult]], bool]], ...] = (
+    ("errors", "Errors", _SEEDS, _errors),
+    ("zoom", "Errors of what is nowhere lost", _SEEDS, _zoom),
+    ("times", "Computing time", _SEEDS, _times),
+    ("stages", "Stages of registration", "Mean over seeds and scans.", _stages),
+    ("law", "Laws of total time", _LAW, draw_laws),
+    ("efficiency", "Efficiency", _EFFICIENCY, _efficiency),
+)  # fmt: skip
