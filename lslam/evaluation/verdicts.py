@@ -10,7 +10,7 @@ from lslam.config.finding import Finding
 from lslam.evaluation.efficiency import over_seeds
 from lslam.evaluation.landmarks import elbow, optimum
 from lslam.evaluation.laws import FEWEST, fit_law
-from lslam.types.sensitivity import CurveResult, Floats, Law, LawKind, Outcome, Verdict
+from lslam.types.sensitivity import CurveResult, Floats, Law, LawKind, Optimum, Outcome, Verdict
 
 R2 = 0.95
 OWN_SHARE = 0.8  # of the change of all stages, for a parameter that acts on one of them
@@ -91,18 +91,18 @@ def _between(finding: Finding, result: CurveResult, *, is_highest: bool) -> Judg
     )
     if low <= best.value <= high:
         own = _best_by_seed(finding, result, is_highest)
-        agree = int(np.sum((own >= low) & (own <= high)))
+        agree = sum(seed.low <= high and seed.high >= low for seed in own)
         if 2 * agree > len(own):
             return "confirmed", said
         return "undecided", f"{said}, but so in {agree} of {len(own)} seeds only"
     return "refuted" if best.high < low or best.low > high else "undecided", said
 
 
-def _best_by_seed(finding: Finding, result: CurveResult, is_highest: bool) -> Floats:
-    """(S,) the value at which each seed alone is best, of seeds that have any result."""
+def _best_by_seed(finding: Finding, result: CurveResult, is_highest: bool) -> list[Optimum]:
+    """Where each seed alone is best, of seeds that have any result."""
     table = np.where(result.curve.lost, np.nan, result.curve.quantities[finding.of])
     found = [optimum(result.curve.values, column, is_highest_best=is_highest) for column in table.T]
-    return np.array([best.value for best in found if best is not None])
+    return [best for best in found if best is not None]
 
 
 def _elbow_at(finding: Finding, result: CurveResult) -> Judged:

@@ -86,18 +86,24 @@ def render(comparison: Comparison, style: str = "text") -> str:
     """All tables as text; `style` is `text` or one of STYLES. Ends without a line break. Raises ValueError otherwise."""
     if style == "csv":
         return comma_separated(_runs_grid(comparison))
-    writers: dict[str, Callable[[Grid, int], str]] = {"text": aligned, "md": markdown, "tex": latex}
-    if style not in writers:
-        raise ValueError(f"table style {style!r}: text or one of {', '.join(STYLES)}")
+    parts = as_text(tables(comparison), style)
     prefix = {"text": "  ", "md": "- ", "tex": "% "}[style]
-    title = {"text": "{}", "md": "### {}\n", "tex": "% {}"}[style]
-    parts = []
-    for table in tables(comparison):
-        text = writers[style](table.grid, table.names)
-        parts.append(f"{title.format(table.title)}\n{text}" if table.title else text)
     parts += ["\n".join(prefix + note for note in comparison.notes)] if comparison.notes else []
     parts.append("\n".join(prefix + line for line in recipes(comparison)))
     return "\n\n".join(parts)
+
+
+def as_text(shown: Sequence[CompareTable], style: str) -> list[str]:
+    """One text per table under its title; `style` is `text`, `md` or `tex`. Raises ValueError otherwise."""
+    writers: dict[str, Callable[[Grid, int], str]] = {"text": aligned, "md": markdown, "tex": latex}
+    if style not in writers:
+        raise ValueError(f"table style {style!r}: text or one of {', '.join(STYLES)}")
+    title = {"text": "{}", "md": "### {}\n", "tex": "% {}"}[style]
+    parts = []
+    for table in shown:
+        text = writers[style](table.grid, table.names)
+        parts.append(f"{title.format(table.title)}\n{text}" if table.title else text)
+    return parts
 
 
 def write_files(out: Path, comparison: Comparison) -> None:

@@ -1,0 +1,83 @@
+"""report.html of a sensitivity study: one self-contained page, its figures beside it as PNG and SVG, its tables as text."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from lslam.errors import OutputError
+from lslam.formats.atomic import atomic_write
+from lslam.reports.compare_table import CompareTable, as_text
+from lslam.reports.grid_text import comma_separated
+from lslam.reports.html import template
+from lslam.reports.study_figures import StudyFigure, study_figures
+from lslam.reports.study_table import means_grid, study_recipes, study_tables
+from lslam.types.sensitivity import StudyResult
+from lslam.types.study import StudyRow
+from lslam.version import __version__
+
+NOT_ALONE = "Several runs shared the machine: times of this study, and what is made of them, cannot be compared."
+
+
+@dataclass(frozen=True)
+class Section:
+    """One studied parameter on one sequence: its figures with their data, its tables."""
+
+    result: StudyResult
+    figures: list[tuple[StudyFigure, str]]
+    tables: list[CompareTable]
+    recipes: list[str]
+
+
+def write_study_files(folder: Path, results: Sequence[StudyResult], rows: Sequence[StudyRow], title: str) -> None:
+    """Write report.html, report.md, report.tex, report.csv and figures/*.png and *.svg, each atomically.
+
+    rows : all of the study, for its head. Raises OutputError.
+    """
+    try:
+        (folder / "figures").mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"folder {folder / 'figures'} cannot be made: {error.strerror or error}") from None
+    sections = []
+    for result in results:
+        figures = list(study_figures(result))
+        for figure in figures:
+            stem = "-".join([*_words(result), figure.name])
+            _write(folder / "figures" / f"{stem}.png", figure.png)
+            _write(folder / "figures" / f"{stem}.svg", figure.svg)
+        data = [f"data:image/svg+xml;base64,{base64.b64encode(figure.svg).decode('ascii')}" for figure in figures]
+        shown = list(zip(figures, data, strict=True))
+        sections.append(Section(result, shown, study_tables(result), study_recipes(result)))
+    page = template("study.html.j2").render(
+        title=title,
+        version=__version__,
+        rows=rows,
+        failed=sum(not row.is_usable for row in rows),
+        notes=[] if all(row.is_timing_comparable for row in rows if row.is_usable) else [NOT_ALONE],
+        sections=sections,
+    )
+    _write(folder / "report.html", page.encode("utf-8", "replace"))
+    for style, heading, item in (("md", "## {}", "- {}"), ("tex", "% {}", "% {}")):
+        parts = [part for section in sections for part in _as_text(section, style, heading, item)]
+        _write(folder / f"report.{style}", ("\n\n".join(parts) + "\n").encode("utf-8", "backslashreplace"))
+    _write(folder / "report.csv", (comma_separated(means_grid(results)) + "\n").encode())
+
+
+def _as_text(section: Section, style: str, heading: str, item: str) -> list[str]:
+    result = section.result
+    title = heading.format(f"{result.study}: {' and '.join(result.parameters)} on {result.sequence}")
+    recipes = "\n".join(item.format(line) for line in section.recipes)
+    return [title, *as_text(section.tables, style), recipes]
+
+
+def _words(result: StudyResult) -> list[str]:
+    """What tells the files of one result from those of another, in characters that any file system takes."""
+    words = (result.study, result.sequence, result.parameters[0].rpartition(".")[2])
+    return ["".join(c if c.isalnum() or c in "._" else "_" for c in word) for word in words]
+
+
+def _write(path: Path, content: bytes) -> None:
+    with atomic_write(path) as stream:
+        stream.write(content)

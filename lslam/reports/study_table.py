@@ -1,0 +1,165 @@
+"""A sensitivity study as tables: verdicts, landmarks, laws, all means, failures."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+
+from lslam.evaluation.efficiency import normalise
+from lslam.reports.compare_table import CompareTable
+from lslam.reports.grid_text import Grid
+from lslam.reports.metrics import counted, fixed, metres
+from lslam.types.sensitivity import CurveResult, Interval, Law, StudyResult
+from lslam.types.study import StudyRow
+
+UNKNOWN = "-"
+# Columns of the table for programs, by quantity.
+_UNITS = {
+    "translation": "m", "angular": "deg", "time_per_scan": "ms", "total_time": "s",
+    "efficiency": "1/(m deg s)", "total_efficiency": "1/(m deg s)",
+}  # fmt: skip
+
+
+def study_tables(result: StudyResult) -> list[CompareTable]:
+    """All tables that hold anything."""
+    tables = [_verdicts(result), _landmarks(result), _laws(result), _means(result), _beside(result), _failures(result)]
+    return [table for table in tables if table.rows]
+
+
+def means_grid(results: Sequence[StudyResult]) -> Grid:
+    """One row per curve and value with numbers in full: mean, low and high end of the 95 % interval; empty where unknown."""
+    head = ["study", "sequence", "method", "imu", "parameter", "value", "at", "runs", "lost"]
+    head += [f"{name}{end} ({unit})" for name, unit in _UNITS.items() for end in ("", "_low", "_high")]
+    grid = [head]
+    for result in results:
+        for r in result.results:
+            curve = r.curve
+            at = "; ".join(f"{key}={value}" for key, value in curve.at)
+            for v, value in enumerate(curve.values):
+                row = [result.study, result.sequence, curve.method, str(curve.uses_imu).lower(), curve.parameter]
+                row += [curve.name_of(value), at, str(int(curve.ran[v].sum())), str(int(curve.lost[v].sum()))]
+                for name in _UNITS:
+                    m = r.means[name]
+                    row += [f"{x:.9g}" if math.isfinite(x) else "" for x in (m.mean[v], m.low[v], m.high[v])]
+                grid.append(row)
+    return grid
+
+
+def study_recipes(result: StudyResult) -> list[str]:
+    """How the numbers are made, one sentence each."""
+    return [
+        "translation: rmse over the 3N coordinates with the first poses put on each other, as the first thesis counts it "
+        "(equation 2.14 over the root of 3); rotation: its equation 2.15",
+        "registration: all stages of a scan but reading, preparing, standing still and keyframes",
+        "E: 1 over translation, rotation and registration time per scan (equation 5.2); E tot: with the total time (5.3); both "
+        "over the largest of the curve, a lost run counts as 0",
+        f"lost: a run that says so, or whose error is above {result.lost_above:.3g} m: 10 times the best of the study, and not "
+        "less than the thesis takes for a result (2.2 m)",
+        "diverges: the first value, lost in more than half of its runs, from which on more than half of the values are",
+        "laws: weighted least squares over the means, scatter in proportion to the time, from 6 values on; ± and bands at 99 %",
+        "±: half of the 95 % interval over seeds (Student's t), of runs that were not lost",
+        "verdicts: a range holds the best value confirmed, one that does not and is nowhere within 10 % of it refuted",
+    ]
+
+
+def _verdicts(result: StudyResult) -> CompareTable:
+    rows = tuple((v.outcome, v.text, v.measured, v.source or UNKNOWN) for v in result.verdicts)
+    return CompareTable("findings", ("verdict", "finding", "here", "source"), rows, 4)
+
+
+def _landmarks(result: StudyResult) -> CompareTable:
+    header = ("method", "diverges from", "last good value", "best E at", "within 10 %", "least error at", "lost/runs")
+    rows = []
+    for r in result.results:
+        curve, found = r.curve, r.divergence
+        name = curve.name_of
+        least = np.where(curve.is_lost, np.nan, r.means["translation"].mean)
+        cells = ["no result" if not curve.ran.any() else "nowhere", UNKNOWN]
+        if found.first_bad is not None:
+            cells = [name(found.first_bad), UNKNOWN if found.last_good is None else name(found.last_good)]
+        cells += [UNKNOWN] * 2 if r.optimum is None else [name(r.optimum.value), _range(r)]
+        cells.append(name(curve.values[np.nanargmin(least)]) if np.isfinite(least).any() else UNKNOWN)
+        rows.append((curve.label, *cells, f"{curve.lost.sum()}/{curve.ran.sum()}"))
+    return CompareTable(f"landmarks of {result.parameters[0]}", header, tuple(rows), 1)
+
+
+def _laws(result: StudyResult) -> CompareTable:
+    header = ("method", "total time, s", "coefficients at 99 %", "R2", "largest residual", "points")
+    rows = [_law_row(series, law) for series, law in result.products.items()]
+    for r in result.results:
+        if r.law is not None:
+            rows.append(_law_row(r.curve.label, r.law))
+        elif r.curve.ran.any():
+            rows.append((r.curve.label, r.no_law, *[UNKNOWN] * 4))
+    return CompareTable("laws of total time", header, tuple(rows), 2)
+
+
+def _law_row(name: str, law: Law) -> tuple[str, ...]:
+    pairs = zip(law.coefficients, law.margins, strict=True)
+    coefficients = ", ".join(f"{value:.4g} ± {margin:.2g}" for value, margin in pairs)
+    worst = f"{100 * np.abs(law.residuals).max():.1f} %"
+    return name, law.text, coefficients, f"{law.r2:.4f}", worst, str(len(law.observed))
+
+
+def _means(result: StudyResult) -> CompareTable:
+    head = (
+        "method", result.parameters[0].rpartition(".")[2], "translation, m", "rotation, deg", "registration, ms", "total, s",
+        "E", "E tot", "lost/runs",
+    )  # fmt: skip
+    rows: list[tuple[str, ...]] = []
+    best = set()
+    for r in result.results:
+        curve, share = r.curve, [normalise(r.means[name].mean) for name in ("efficiency", "total_efficiency")]
+        for v, value in enumerate(curve.values):
+            cells = [_mean(r.means[name], v, name) for name in _UNITS if not name.endswith("efficiency")]
+            cells += [fixed(e[v], 2) if math.isfinite(e[v]) else UNKNOWN for e in share]
+            best |= {(len(rows), 6 + k) for k, e in enumerate(share) if e[v] == 1}
+            rows.append((curve.label, curve.name_of(value), *cells, f"{curve.lost[v].sum()}/{curve.ran[v].sum()}"))
+    return CompareTable("means over seeds", head, tuple(rows), 1, frozenset(best))
+
+
+def _beside(result: StudyResult) -> CompareTable:
+    rows = tuple((_series(row), str(row.seed), *_numbers(row)) for row in result.beside)
+    header = ("method", "seed", "translation, m", "rotation, deg", "per scan, ms", "total, s")
+    return CompareTable("beside, at its own values", header, rows, 1)
+
+
+def _failures(result: StudyResult) -> CompareTable:
+    rows = tuple(
+        (_series(row), ", ".join(f"{key.rpartition('.')[2]} {value}" for key, value in row.parameters.items()) or "beside",
+         str(row.seed), row.status, row.reason)
+        for row in result.failed
+    )  # fmt: skip
+    title = f"{counted(len(rows), 'run')} without a result"
+    return CompareTable(title, ("method", "at", "seed", "outcome", "reason"), rows, 5)
+
+
+def _series(row: StudyRow) -> str:
+    return f"{row.method} + IMU" if row.uses_imu else row.method
+
+
+def _numbers(row: StudyRow) -> Iterable[str]:
+    yield metres(row.thesis_rmse) if math.isfinite(row.thesis_rmse) else UNKNOWN
+    for value, decimals in ((row.angular_rmse_deg, 3), (row.time_per_scan_ms, 1), (row.total_time_s, 2)):
+        yield fixed(value, decimals) if math.isfinite(value) else UNKNOWN
+
+
+def _mean(means: Interval, v: int, name: str) -> str:
+    mean = float(means.mean[v])
+    if not math.isfinite(mean):
+        return UNKNOWN
+    text = (
+        metres(mean)
+        if name == "translation"
+        else fixed(mean, {"angular": 3, "time_per_scan": 1, "total_time": 2}[name])
+    )
+    half = float(means.high[v] - mean)
+    return f"{text} ± {fixed(half, len(text.partition('.')[2]))}" if math.isfinite(half) else text
+
+
+def _range(result: CurveResult) -> str:
+    assert result.optimum is not None
+    low, high = (result.curve.name_of(value) for value in (result.optimum.low, result.optimum.high))
+    return low if low == high else f"{low} to {high}"

@@ -1,0 +1,173 @@
+"""The report of a study written from rows of known truth: files, tables, page; failures appear."""
+
+from __future__ import annotations
+
+import csv
+import io
+import re
+import xml.etree.ElementTree as ET
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from lslam.config.finding import Finding
+from lslam.evaluation.sensitivity import evaluate_study
+from lslam.reports.study_figures import StudyFigure, study_figures
+from lslam.reports.study_html import NOT_ALONE, write_study_files
+from lslam.reports.study_table import means_grid, study_tables
+from lslam.types.sensitivity import StudyResult
+from lslam.types.study import StudyRow
+
+SKIP, SHARE = "input.skip_frames", "preprocess.random_share"
+
+
+def row(value: float, seed: int, method: str, uses_imu: bool = False, **more: object) -> StudyRow:
+    """Error 0.5 m, 2 deg and 100 ms per scan in two stages at any value, total time 40 / value."""
+    plain = StudyRow(
+        f"{method}-{uses_imu}-{value}-{seed}", "skip", "open", seed, method, uses_imu, {SKIP: value}, status="done",
+        thesis_rmse=0.5, angular_rmse_deg=2.0, scans=100, stages_ms={"read": 5.0, "scan": 60.0, "map": 40.0},
+        total_time_s=40.0 / value,
+    )  # fmt: skip
+    return replace(plain, **more)  # type: ignore[arg-type]
+
+
+@pytest.fixture(scope="module")
+def rows() -> list[StudyRow]:
+    """Two methods over 8 values and 2 seeds, the first lost from 6 on; one run failed, one lies beside."""
+    out = []
+    for value in range(1, 9):
+        for seed in (0, 1):
+            lost = {"status": "diverged", "reason": "lost <the> motion"} if value > 5 else {}
+            out += [row(value, seed, "icp", **lost), row(value, seed, "loam", uses_imu=True)]
+    out.append(row(9, 0, "loam", uses_imu=True, status="crashed", reason="killed & gone_by 100%"))
+    return [*out, row(1, 0, "kiss-icp", parameters={}, is_beside=True, thesis_rmse=0.25)]
+
+
+@pytest.fixture(scope="module")
+def results(rows: list[StudyRow]) -> list[StudyResult]:
+    finding = Finding(text="holds <up> to 5", kind="holds_up_to", values=(5,), source="figure 5.16")
+    return evaluate_study(rows, [finding, finding.model_copy(update={"values": (8.0,), "method": "icp"})])
+
+
+@pytest.fixture(scope="module")
+def figures(results: list[StudyResult]) -> dict[str, StudyFigure]:
+    return {figure.name: figure for figure in study_figures(results[0])}
+
+
+@pytest.fixture(scope="module")
+def folder(rows: list[StudyRow], results: list[StudyResult], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("study") / "report"
+    write_study_files(out, results, rows, "Skipped & counted")
+    return out
+
+
+def test_every_figure_is_written_as_png_and_svg(folder: Path) -> None:
+    names = {path.stem for path in (folder / "figures").glob("*.png")}
+    figures = ("errors", "zoom", "times", "stages", "law", "efficiency")
+    assert names == {f"skip-open-skip_frames-{name}" for name in figures}
+    for name in names:
+        assert (folder / "figures" / f"{name}.png").read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
+        ET.fromstring((folder / "figures" / f"{name}.svg").read_text())
+
+
+def test_figures_show_what_they_are_named_after(figures: dict[str, StudyFigure]) -> None:
+    text = {name: figure.svg.decode() for name, figure in figures.items()}
+    assert "rmse of translation, m" in text["errors"]
+    assert {"kiss-icp, beside", "icp", "loam + IMU"} <= set(re.findall(r">([^<>]+)</text>", text["errors"]))
+    # icp is lost somewhere, so the zoom is of the other.
+    assert "loam + IMU" in text["zoom"]
+    assert ">icp<" not in text["zoom"]
+    assert "loam + IMU: T = 40 / skip_frames s, R2 1.000" in text["law"]
+    # Five values of icp make no law.
+    assert "icp: T" not in text["law"]
+    assert {"scan", "map"} <= set(re.findall(r">(\w+)</text>", text["stages"]))
+    assert ">read<" not in text["stages"]
+    assert "figure 5.20" in figures["efficiency"].caption
+
+
+def test_figures_are_the_same_bytes_again(figures: dict[str, StudyFigure], folder: Path) -> None:
+    for name, figure in figures.items():
+        assert (folder / "figures" / f"skip-open-skip_frames-{name}.svg").read_bytes() == figure.svg
+
+
+def test_page_is_whole_escaped_and_needs_no_other_file(folder: Path) -> None:
+    page = (folder / "report.html").read_text()
+    assert page.count("<img ") == 6
+    assert not re.search(r'(?:src|href)="(?!data:)', page)
+    assert "Skipped &amp; counted" in page
+    assert "holds &lt;up&gt; to 5" in page
+    assert '<span class="badge undecided">' not in page
+    assert page.count('<span class="badge confirmed">') == 1
+    assert page.count('<span class="badge refuted">') == 1
+    assert '<span class="badge failed">7 without a result</span>' in page
+    assert "killed &amp; gone_by 100%" in page
+    assert NOT_ALONE not in page
+
+
+def test_page_says_when_times_cannot_be_compared(rows: list[StudyRow], tmp_path: Path) -> None:
+    shared = [replace(r, is_timing_comparable=False) for r in rows[:4]]
+    write_study_files(tmp_path, evaluate_study(shared), shared, "study")
+    assert NOT_ALONE in (tmp_path / "report.html").read_text()
+
+
+def test_tables_hold_landmarks_laws_and_failures(results: list[StudyResult]) -> None:
+    tables = {table.title: table for table in study_tables(results[0])}
+    landmarks = {r[0]: r[1:] for r in tables["landmarks of input.skip_frames"].rows}
+    assert landmarks["icp"] == ("6", "5", "1", "1 to 5", "1", "6/16")
+    assert landmarks["loam + IMU"] == ("nowhere", "-", "1", "1 to 8", "1", "0/16")
+    laws = {r[0]: r[1:] for r in tables["laws of total time"].rows}
+    assert laws["icp"][0] == "no law from 5 values, 6 are needed"
+    assert laws["loam + IMU"][0] == "T = 40 / skip_frames"
+    assert tables["beside, at its own values"].rows[0][:3] == ("kiss-icp", "0", "0.250")
+    failed = tables["7 runs without a result"].rows
+    assert failed[-1] == ("loam + IMU", "skip_frames 9", "0", "crashed", "killed & gone_by 100%")
+    assert {r[3] for r in failed} == {"crashed", "diverged"}
+
+
+def test_means_stand_in_all_tables_alike(folder: Path, results: list[StudyResult]) -> None:
+    grid = list(csv.reader(io.StringIO((folder / "report.csv").read_text())))
+    assert grid == means_grid(results)
+    head, first = grid[0], grid[1]
+    said = dict(zip(head, first, strict=True))
+    assert (said["method"], said["value"], said["runs"], said["lost"]) == ("icp", "1", "2", "0")
+    # 1 / (0.5 m x 2 deg x 0.1 s) and 1 / (0.5 m x 2 deg x 40 s).
+    assert float(said["efficiency (1/(m deg s))"]) == pytest.approx(10)
+    assert float(said["total_efficiency (1/(m deg s))"]) == pytest.approx(0.025)
+    assert float(said["time_per_scan (ms)"]) == pytest.approx(100)
+    text = (folder / "report.md").read_text()
+    assert "| icp | 1 | 0.500 ± 0.000 | 2.000 ± 0.000 | 100.0 ± 0.0 | 40.00 ± 0.00 | 1.00 | 0.20 | 0/2 |" in text
+    assert "| loam + IMU | 9 | - | - | - | - | - | - | 0/0 |" in text
+    latex = (folder / "report.tex").read_text()
+    assert latex.count(r"\begin{tabular}") == latex.count(r"\end{tabular}") == 6
+    assert r"gone\_by 100\%" in latex
+
+
+def test_study_of_two_parameters_draws_the_product_law_and_many_curves() -> None:
+    shares = (0.1, 0.2, 0.3, 0.4, 0.5, 0.7, 1.0)
+    rows = [
+        row(v, 0, "icp", parameters={SKIP: v, SHARE: share}, total_time_s=152.2 * share / v)
+        for share in shares
+        for v in (1, 2, 4, 8, 16)
+    ]
+    results = evaluate_study(rows)
+    svg = {figure.name: figure.svg.decode() for figure in study_figures(results[0])}
+    assert "icp: T = 152.2 random_share / skip_frames s, R2 1.000" in svg["law"]
+    assert all(f"random_share {share:g}" in svg["errors"] for share in shares)
+    laws = next(table for table in study_tables(results[0]) if table.title == "laws of total time")
+    assert laws.rows[0][:2] == ("icp", "T = 152.2 random_share / skip_frames")
+
+
+def test_words_are_ticks_of_their_own() -> None:
+    rows = [row(1, 0, "icp", parameters={"preprocess.downsample": word}) for word in ("random", "grid", "voxel")]
+    errors = next(iter(study_figures(evaluate_study(rows)[0]))).svg.decode()
+    assert {"random", "grid", "voxel"} <= set(re.findall(r">(\w+)</text>", errors))
+
+
+def test_study_whose_runs_all_failed_has_a_page_that_says_why(tmp_path: Path) -> None:
+    rows = [row(v, 0, "icp", status="failed", reason="no scan could be read", thesis_rmse=float("nan")) for v in (1, 2)]
+    write_study_files(tmp_path, evaluate_study(rows), rows, "dark")
+    page = (tmp_path / "report.html").read_text()
+    assert "No run of this study has a result to draw." in page
+    assert page.count("no scan could be read") == 2
+    assert not list((tmp_path / "figures").iterdir())

@@ -1,0 +1,29 @@
+"""A study's report from its rows alone, as `lslam sweep --report` writes it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from lslam.config.finding import Finding
+from lslam.formats.study_csv import read_study_csv, write_study_csv
+from lslam.studies.study_report import write_study_report
+from lslam.types.study import StudyRow
+
+
+def test_report_of_rows_read_back_is_that_of_the_rows(tmp_path: Path) -> None:
+    rows = [
+        StudyRow(
+            f"r{v}", "skip", "open", 0, "icp", False, {"input.skip_frames": v}, status="diverged" if v > 3 else "done",
+            thesis_rmse=0.1 * v, angular_rmse_deg=1.0, stages_ms={"register": 10.0}, total_time_s=10.0 / v,
+        )
+        for v in range(1, 6)
+    ]  # fmt: skip
+    write_study_csv(tmp_path / "results.csv", rows)
+    finding = Finding(text="up to 3", kind="diverges_beyond", values=(3,))
+    first = write_study_report(tmp_path / "a", rows, [finding], "skipped scans")
+    write_study_report(tmp_path / "b", read_study_csv(tmp_path / "results.csv"), [finding], "skipped scans")
+    assert first[0].verdicts[0].outcome == "confirmed"
+    names = sorted(path.relative_to(tmp_path / "a") for path in (tmp_path / "a").rglob("*.*"))
+    assert len(names) > 8
+    for name in names:
+        assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
