@@ -1,0 +1,140 @@
+"""The building pages of the report: the map before and after with the walls seen, displacements, and what held what."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.geometry import se2
+from lslam.reports.metrics import Table, counted
+from lslam.reports.plane import MOST_POINTS, Track, plane_chart
+from lslam.reports.plots import Figure
+from lslam.types.building import Building
+from lslam.types.building_correction import BuildingCorrection, CorrectedMap
+from lslam.types.building_match import KeyframeMatch, OsmMatches
+
+Floats = NDArray[np.float64]
+
+MOST_WALLS = 2500  # drawn; the page stays small
+MOST_ROWS = 60
+AROUND = 30.0  # m round the way that are drawn
+
+
+def building_figures(found: CorrectedMap, matches: OsmMatches, poses: NDArray[np.float64]) -> list[Figure]:
+    """Plans: buildings before and after with the walls seen, and where the map held the trajectory.
+
+    poses : (K, 3) x, y (m), yaw (rad) of all keyframes in the map frame
+    """
+    near = [c for c in found.buildings if _is_near(c.building, poses[:, :2])]
+    walls = _seen_walls(matches.keyframes, poses)
+    gone = [c for c in near if c.status == "absent"]
+    drawn = [
+        ("s5", "walls seen", _segments(walls)),
+        ("gt", "buildings on the map", _outlines(c.building for c in near)),
+        ("s1", "where they stand", _outlines(c.corrected for c in near if c.status != "absent")),
+        ("s2", "absent in the scans", _outlines(c.corrected for c in gone)),
+        ("s4", "new: walls without a building", _segments(found.new_walls)),
+    ]
+    tracks = [Track(label, part, style) for style, label, lines in drawn for part in _parts(lines)]
+    legend = tuple((style, label) for style, label, lines in drawn if len(lines))
+    caption = f"x east, y north of the run's origin. Mode {found.mode}. {found.attribution or 'A map nobody surveyed.'}"
+    plan = plane_chart(tracks, "buildings from above, before and after", width=720, tallest=760)
+    return [Figure("Buildings before and after, from above", plan, legend, caption, wide=True), _holds(matches, poses)]
+
+
+def building_tables(found: CorrectedMap, matches: OsmMatches) -> list[Table]:
+    """Displacements, largest first, and why matches were not used."""
+    order = sorted(found.buildings, key=lambda c: (c.status == "unseen", -float(np.linalg.norm(c.displacement[:2]))))
+    rows = tuple(_row(c) for c in order[:MOST_ROWS])
+    counts = Counter(c.status for c in found.buildings)
+    east, north = found.shift
+    recipe = (
+        f"Real minus map, about the middle of each building; {counted(len(found.buildings), 'building')}: {counts['seen']} seen, "
+        f"{counts['unseen']} not, {counts['absent']} absent; the map as a whole is off by {east:+.2f} m east, {north:+.2f} m "
+        f"north; {counted(len(found.left), 'pair')} still overlap. Confidence: to stand within 0.5 m of there."
+    )
+    header = ("building", "status", "east, m", "north, m", "turn, deg", "confidence", "matches", "given up")
+    tables = [Table("Displacement of buildings", header, rows, recipe)]
+    reasons: Counter[tuple[str, str]] = Counter()
+    for kind, held in (("keyframe on the map", matches.keyframes), ("building on the walls seen", matches.local)):
+        reasons.update((kind, "used" if match.verdict == "accepted" else _plain(match.reason)) for match in held)
+    rows = tuple((kind, reason, str(number)) for (kind, reason), number in reasons.most_common())
+    recipe = "A keyframe's match holds the trajectory, a building's only moves that building."
+    return [*tables, Table("Matches of walls", ("match", "what became of it", "how many"), rows, recipe)]
+
+
+def _row(correction: BuildingCorrection) -> tuple[str, ...]:
+    east, north, yaw = correction.displacement
+    name = correction.building.tags.get("name", "")
+    return (
+        f"{correction.building.osm_id} {name}".strip(), correction.status, f"{east:+.2f}", f"{north:+.2f}",
+        f"{np.degrees(yaw):+.2f}", f"{correction.confidence:.2f}", str(correction.used), str(correction.rejected),
+    )  # fmt: skip
+
+
+def _plain(reason: str) -> str:
+    """The reason without its number, so that like ones are counted together."""
+    return re.sub(r"^[\d.]+ times", "… times", reason) or "given up"
+
+
+def _holds(matches: OsmMatches, poses: Floats) -> Figure:
+    """Where along the way the map held the trajectory."""
+    at = {match.keyframe: match for match in matches.keyframes}
+    used = np.array([k for k, match in at.items() if match.verdict == "accepted"], np.intp)
+    kinds = [
+        ("s1", "held by walls of two directions", [k for k in used if at[int(k)].rank == 3]),
+        ("s3", "held across parallel walls only", [k for k in used if at[int(k)].rank < 3]),
+    ]
+    refused = [k for k, match in at.items() if match.verdict != "accepted" and match.kind != "none"]
+    tracks = [Track("way", poses[:, :2], "gt", ends=True)]
+    tracks += [Track(label, _dots(poses[keys, :2]), style) for style, label, keys in kinds if len(keys)]
+    legend = [("gt", "way"), *((style, label) for style, label, keys in kinds if len(keys))]
+    legend += [("bad", "match not used")] if refused else []
+    chart = plane_chart(tracks, "matches along the way", points=poses[refused, :2], width=720, tallest=560)
+    caption = f"{len(used)} of {counted(len(at), 'keyframe')} held by the map."
+    return Figure("Where the map held the trajectory, from above", chart, tuple(legend), caption, wide=True)
+
+
+def _dots(xy: Floats) -> Floats:
+    """Points that are not joined by a line."""
+    return np.stack([xy, np.full_like(xy, np.nan)], axis=1).reshape(-1, 2)
+
+
+def _is_near(building: Building, way: Floats) -> bool:
+    low, high = way.min(axis=0) - AROUND, way.max(axis=0) + AROUND
+    return bool(((building.middle >= low) & (building.middle <= high)).all())
+
+
+def _seen_walls(sights: Sequence[KeyframeMatch], poses: Floats) -> Floats:
+    """(S, 2, 2) walls of so many keyframes, evenly chosen, that the page stays small."""
+    total = sum(len(s.walls) for s in sights)
+    every = max(1, -(-total // MOST_WALLS))
+    found = [se2.apply(poses[s.keyframe], s.walls) for s in sights[::every] if len(s.walls)]
+    return np.concatenate(found) if found else np.zeros((0, 2, 2))
+
+
+def _segments(walls: Floats) -> list[Floats]:
+    return [np.asarray(wall) for wall in walls]
+
+
+def _outlines(buildings: Iterable[Building]) -> list[Floats]:
+    rings = (ring for building in buildings for footprint in building.footprints for ring in footprint.rings)
+    return [np.concatenate([ring, ring[:1]]) for ring in rings]
+
+
+def _parts(lines: list[Floats]) -> list[Floats]:
+    """Lines in a row, parted by NaN, in pieces that the chart draws point for point."""
+    gap = np.full((1, 2), np.nan)
+    parts: list[list[Floats]] = [[]]
+    size = 0
+    for line in lines:
+        if size + len(line) + 1 > MOST_POINTS:
+            parts.append([])
+            size = 0
+        parts[-1] += [line, gap]
+        size += len(line) + 1
+    return [np.concatenate(part) for part in parts if part]

@@ -1,0 +1,105 @@
+"""The building pages: every outline, wall and refusal is drawn or counted, and the picture keeps the corners."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.reports.buildings import MOST_ROWS, building_figures, building_tables
+from lslam.types.building import Building, Footprint
+from lslam.types.building_correction import BuildingCorrection, CorrectedMap
+from lslam.types.building_match import BuildingMatch, KeyframeMatch, OsmMatches
+
+Floats = NDArray[np.float64]
+
+SQUARE = np.array([[0.0, 0.0], [10, 0], [10, 8], [0, 8]])
+
+
+def scene(houses: int = 4) -> tuple[CorrectedMap, OsmMatches, Floats]:
+    buildings = tuple(
+        Building(
+            f"way/{k}", (Footprint(SQUARE + np.array([14.0 * k, 5])),), tags={"name": "Town hall"} if k == 1 else {}
+        )
+        for k in range(houses)
+    )
+    status = ["seen", "seen", "absent", "unseen"]
+    corrected = tuple(
+        BuildingCorrection(b, np.array([0.1 * k, -0.2, 0.01]), 0.01 * np.eye(3), status[k % 4], 5 - k % 4, k % 2)  # type: ignore[arg-type]
+        for k, b in enumerate(buildings)
+    )
+    poses = np.column_stack([np.linspace(0, 50, 6), np.zeros(6), np.zeros(6)])
+    wall = np.array([[[2.0, 5.0], [8.0, 5.0]]])
+    keyframes = tuple(
+        KeyframeMatch(k, wall, np.zeros((1, 2)), poses[k], np.ones(3), poses[k], np.eye(3), rank=3 if k < 3 else 2,
+                      kind="edges" if k < 3 else "lines", verdict="accepted" if k != 5 else "rejected",
+                      reason="" if k != 5 else "7.1 times as far from odometry as it may have drifted")
+        for k in range(6)
+    )  # fmt: skip
+    local = (
+        BuildingMatch(0, 0, np.zeros(3), np.eye(3), 3, "edges", 50.0, 0.5, 0.1, np.zeros((1, 2), np.int64)),
+        BuildingMatch(1, 0, np.zeros(3), np.eye(3), 3, "edges", 50.0, 0.5, 0.1, np.zeros((1, 2), np.int64), "rejected",
+                      "another place fits nearly as well"),
+    )  # fmt: skip
+    matches = OsmMatches(np.zeros(3), buildings, np.zeros((0, 2, 2)), np.zeros(0, np.int64), keyframes, local)
+    new = np.array([[[0.0, -9.0], [6.0, -9.0]]])
+    return (
+        CorrectedMap(np.zeros(3), corrected, "two-level", np.array([0.3, -0.1]), new, ((0, 1),), "© OSM"),
+        matches,
+        poses,
+    )
+
+
+def paths(svg: str, style: str) -> int:
+    return len(re.findall(rf'class="line {style}"', svg))
+
+
+def test_the_plan_shows_each_building_before_and_after_with_the_walls_seen() -> None:
+    found, matches, poses = scene()
+    plan, holds = building_figures(found, matches, poses)
+    drawn = {style: paths(plan.svg, style) for style in ("gt", "s1", "s2", "s4", "s5")}
+    assert drawn == {"gt": 4, "s1": 3, "s2": 1, "s4": 1, "s5": 6}
+    assert "© OSM" in plan.caption
+    assert "5 of 6 keyframes" in holds.caption
+    assert [label for _, label in holds.legend][1:] == [
+        "held by walls of two directions", "held across parallel walls only", "match not used",
+    ]  # fmt: skip
+    assert holds.svg.count("cross") == 1
+
+
+def test_a_large_map_keeps_its_corners_and_the_page_its_size() -> None:
+    found, matches, poses = scene(1200)
+    way = np.column_stack([np.linspace(0, 17000, 6), np.zeros(6), np.zeros(6)])
+    plan, _ = building_figures(found, matches, way)
+    assert paths(plan.svg, "gt") == 1200
+    far = building_figures(found, matches, poses)[0]
+    assert paths(far.svg, "gt") == 6
+
+
+def test_the_tables_name_displacements_and_refusals() -> None:
+    found, matches, _ = scene()
+    moves, verdicts = building_tables(found, matches)
+    assert [row[:2] for row in moves.rows] == [
+        ("way/2", "absent"), ("way/1 Town hall", "seen"), ("way/0", "seen"), ("way/3", "unseen"),
+    ]  # fmt: skip
+    assert moves.rows[1][2:] == ("+0.10", "-0.20", "+0.57", "1.00", "4", "1")
+    assert "4 buildings: 2 seen, 1 not, 1 absent" in moves.recipe
+    assert "+0.30 m east, -0.10 m north; 1 pair still overlap" in moves.recipe
+    assert ("keyframe on the map", "… times as far from odometry as it may have drifted", "1") in verdicts.rows
+    assert ("building on the walls seen", "another place fits nearly as well", "1") in verdicts.rows
+    assert sum(int(row[2]) for row in verdicts.rows) == 8
+    many, matches, _ = scene(200)
+    assert len(building_tables(many, matches)[0].rows) == MOST_ROWS
+
+
+def test_an_empty_map_draws_the_way() -> None:
+    found = CorrectedMap(np.zeros(3), (), "two-level")
+    _, matches, poses = scene()
+    nothing = OsmMatches(np.zeros(3), (), np.zeros((0, 2, 2)), np.zeros(0, np.int64), (), ())
+    plan, holds = building_figures(found, nothing, poses)
+    assert plan.svg == ""
+    assert paths(holds.svg, "gt") == 1
+    moves, verdicts = building_tables(found, nothing)
+    assert moves.rows == verdicts.rows == ()
+    assert matches.accepted
