@@ -95,3 +95,22 @@ def epsg(text: str) -> int:
 def as_json(function: F) -> F:
     """--json."""
     return click.option("--json", "as_json", is_flag=True, help="Print one JSON object on stdout.")(function)
+
+
+def numbers(flag: str, text: str, counts: tuple[int, ...], example: str) -> list[float]:
+    """The comma-separated numbers of a flag; raises UsageError when they are not so many."""
+    try:
+        values = [float(part) for part in text.split(",")]
+    except ValueError:
+        values = []
+    if len(values) not in counts:
+        raise click.UsageError(f"{flag} {text}: expected {example}")
+    return values
+
+
+def place(flag: str, text: str) -> list[float]:
+    """Latitude, longitude (deg) and perhaps height (m) of a flag; raises UsageError when they are no place."""
+    at = numbers(flag, text, (2, 3), "LAT,LON, for example 49.0112,8.4229")
+    if not (abs(at[0]) <= 90 and abs(at[1]) <= 180):
+        raise click.UsageError(f"{flag} {text} is no place on the Earth: latitude first, in degrees")
+    return at

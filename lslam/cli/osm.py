@@ -109,11 +109,11 @@ def _bounds(
     from lslam.priors import bounds
 
     if bbox is not None:
-        return bounds.Bounds(*_numbers("--bbox", bbox, (4,), "S,W,N,E, for example 49.00,8.40,49.01,8.42"))
+        return bounds.Bounds(*options.numbers("--bbox", bbox, (4,), "S,W,N,E, for example 49.00,8.40,49.01,8.42"))
     if around is not None:
-        return bounds.around(np.array(_place("--around", around)[:2]), radius)
+        return bounds.around(np.array(options.place("--around", around)[:2]), radius)
     assert along is not None
-    at = None if origin is None else np.array([*_place("--origin", origin), 0.0][:3])
+    at = None if origin is None else np.array([*options.place("--origin", origin), 0.0][:3])
     return bounds.around(positions_along(along, data_root, at), radius)
 
 
@@ -146,7 +146,7 @@ def show(file: Path, png: Path | None, origin: str | None, overwrite: bool, as_j
     """Show what is in FILE: OSM XML, a stored Overpass reply, or GeoJSON outlines."""
     if png is not None and png.suffix.lower() != ".png":
         raise click.UsageError(f"--png {png}: end the name with .png")
-    at = None if origin is None else [*_place("--origin", origin), 0.0][:3]
+    at = None if origin is None else [*options.place("--origin", origin), 0.0][:3]
     import numpy as np
 
     from lslam.errors import OutputExistsError
@@ -221,20 +221,3 @@ def _print(facts: dict[str, Any], png: Path | None) -> None:
     lines += [("picture", str(png))] if png is not None else []
     for label, value in lines:
         click.echo(f"{label:<10} {value}")
-
-
-def _numbers(flag: str, text: str, counts: tuple[int, ...], example: str) -> list[float]:
-    try:
-        values = [float(part) for part in text.split(",")]
-    except ValueError:
-        values = []
-    if len(values) not in counts:
-        raise click.UsageError(f"{flag} {text}: expected {example}")
-    return values
-
-
-def _place(flag: str, text: str) -> list[float]:
-    place = _numbers(flag, text, (2, 3), "LAT,LON, for example 49.0112,8.4229")
-    if not (abs(place[0]) <= 90 and abs(place[1]) <= 180):
-        raise click.UsageError(f"{flag} {text} is no place on the Earth: latitude first, in degrees")
-    return place

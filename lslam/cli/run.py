@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     "          lslam run seq07 --data-root ~/kitti --method kiss-icp\n"
     "          lslam run sample_data --gnss --crs EPSG:25832 --set map.format=laz\n"
     "          lslam run my_scans --poses theirs.tum --out runs/theirs\n"
+    "          lslam run my_scans --osm town.osm --origin 49.0112,8.4229\n"
     "          lslam run 2011_09_26_drive_0005_sync --set map.voxel=0.1 --json"
 )
 @click.argument("sequence")
@@ -53,6 +54,11 @@ if TYPE_CHECKING:
 @click.option("--loops/--no-loops", default=None, help="Close loops where a place is seen again [default: yes].")
 @click.option("--gnss", "gnss", flag_value="graph", default=None, help="Satellite fixes hold the trajectory.")
 @click.option("--georeference", "gnss", flag_value="fit", help="Satellite fixes only say where on the Earth it lies.")
+@click.option("--osm", metavar="FILE|auto", help="Buildings of OpenStreetMap hold the trajectory; auto fetches them.")
+@click.option("--origin", metavar="LAT,LON[,H]", help="With --osm: where the first scan is, where no fix says it.")
+@click.option(
+    "--heading", type=float, metavar="DEG", help="With --osm: of the first scan, clockwise from north [sought]."
+)
 @click.option("--crs", metavar="EPSG:N", help="Coordinates of georeferenced maps [default: the UTM zone].")
 @click.option(
     "--poses", type=click.Path(path_type=Path), metavar="FILE", help="Somebody else's trajectory instead of odometry."
@@ -91,7 +97,7 @@ def command(sequence: str, **given: Any) -> None:
 
         opened = with_gnss(opened, given["data_root"])
     truth = read_truth(given["gt"], opened)
-    out = given["out"] or default_folder(opened.name, config.odometry.method + ("-imu" if config.imu.use else ""))
+    out = given["out"] or default_folder(opened.name, _variant(config))
     if given["dry_run"]:
         from lslam.odometry import create_odometry
         from lslam.pipeline.choose import choose_scans
@@ -108,6 +114,11 @@ def command(sequence: str, **given: Any) -> None:
         log.info("%s", finished)
         _print_finished(out, given["as_json"])
     return None
+
+
+def _variant(config: Config) -> str:
+    """Of the default folder's name."""
+    return config.odometry.method + ("-imu" if config.imu.use else "") + ("-osm" if config.osm.extract else "")
 
 
 def _check_folder(given: dict[str, Any]) -> None:
@@ -137,6 +148,11 @@ def _resolve(given: dict[str, Any]) -> Config:
         "input.strict": "true" if given["strict"] else None,
         "loops.use": None if given["loops"] is None else str(given["loops"]).lower(),
         "gnss.mode": given["gnss"],
+        "osm.extract": None if given["osm"] is None else json.dumps(given["osm"]),
+        "osm.origin": None
+        if given["origin"] is None
+        else json.dumps([*options.place("--origin", given["origin"]), 0.0][:3]),
+        "osm.heading_deg": given["heading"],
         "gnss.crs": None if given["crs"] is None else options.epsg(given["crs"]),
     }
     if given["poses"] is not None:

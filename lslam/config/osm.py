@@ -1,4 +1,4 @@
-"""Section `osm`: OpenStreetMap buildings, where they come from, and how walls are seen in clouds."""
+"""Section `osm`: OpenStreetMap buildings, where they come from, how walls are seen in clouds, and what they hold."""
 
 from __future__ import annotations
 
@@ -12,6 +12,31 @@ from lslam.config.section import Section
 class OsmConfig(Section):
     """Fetching buildings from an Overpass server, the circles of the buffer, and walls (second thesis, 3.1 and 3.2)."""
 
+    extract: str = Field(
+        "",
+        description="buildings that hold the trajectory: a file (.osm, .json, .geojson), auto to fetch them, empty: none",
+    )
+    origin: tuple[float, float, float] | None = Field(
+        None, description="lat, lon (deg), height (m) of the first pose, where no satellite fix says it"
+    )
+    heading_deg: float | None = Field(
+        None,
+        ge=-360,
+        le=360,
+        description="deg clockwise from north, of the LiDAR's x axis at the first pose; none: sought",
+    )
+    start_radius: float = Field(10.0, gt=0, le=100, description="m; so far off the origin may be")
+    start_heading_deg: float = Field(20.0, gt=0, le=180, description="deg; so far off the heading may be")
+    mode: Literal["prior", "rigid", "non-rigid", "two-level"] = Field(
+        "two-level",
+        description="prior: buildings stay; rigid: they move together per scan; non-rigid: each moves with the trajectory; "
+        "two-level: first the trajectory, then each building",
+    )
+    shift_sigma: float = Field(2.0, ge=0, description="m; one sigma by which a map may be off as a whole; 0 holds it")
+    map_sigma: float = Field(0.5, gt=0, description="m; one sigma by which a neighbourhood of the map is off by itself")
+    map_sigma_deg: float = Field(1.0, gt=0, description="deg; likewise of its heading")
+    building_sigma: float = Field(1.0, gt=0, description="m; one sigma by which a building of the map is off")
+    building_sigma_deg: float = Field(2.0, gt=0, description="deg; likewise of its heading")
     server: str = Field(
         "https://overpass-api.de/api/interpreter",
         pattern=r"^https?://\S+$",

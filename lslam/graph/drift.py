@@ -15,13 +15,15 @@ from numpy.typing import NDArray
 from lslam.config.graph import GraphConfig
 from lslam.geometry import noise, se3, so3
 from lslam.graph.chi_square import quantile
-from lslam.graph.problem import PoseGraph
+from lslam.graph.problem import PoseGraph, PositionFix
 from lslam.types.constraint import Constraint
 
 Floats = NDArray[np.float64]
 
 # Loops that are looked at, evenly spread, and the factors between which the drift's variance is looked for.
 MOST, SMALLEST, LARGEST = 300, 1e-8, 1e8
+# m; of a height that nothing says, and what all walls about one place are off by together.
+ANY_HEIGHT, MAP_ERROR = 1e4, 0.25
 
 
 def drift_covariance(way: float, config: GraphConfig) -> Floats:
@@ -42,6 +44,7 @@ def with_drift(odometry: Sequence[Constraint], factor: float, config: GraphConfi
 
 def drift_factor(graph: PoseGraph, loops: Sequence[Constraint], config: GraphConfig) -> float:
     """The factor on `drift_covariance`, 0 where none is needed, with which median loop and fix are where they should be."""
+    graph = replace(graph, fixes=[*graph.fixes, *_as_fixes(graph)])
     if not loops and len(graph.fixes) < 2:
         return 0.0
     known = _accumulated(graph.poses, graph.odometry)
@@ -50,6 +53,18 @@ def drift_factor(graph: PoseGraph, loops: Sequence[Constraint], config: GraphCon
     )
     by_loops = _of_loops(graph, loops, known, drift) if loops else 0.0
     return max(by_loops, _of_fixes(graph, known, drift))
+
+
+def _as_fixes(graph: PoseGraph) -> list[PositionFix]:
+    """Planar priors that fix both coordinates, as positions of unknown height."""
+    found = []
+    for prior in graph.map_priors:
+        if prior.rank == 3:
+            sigma = np.sqrt(np.diag(np.linalg.inv(prior.information)) + MAP_ERROR**2)
+            height = graph.poses[prior.keyframe, 2, 3]
+            place = np.array([*prior.pose[:2], height])
+            found.append(PositionFix(prior.keyframe, place, np.array([*sigma[:2], ANY_HEIGHT]), np.zeros(3)))
+    return found
 
 
 def _accumulated(poses: Floats, odometry: Sequence[Constraint]) -> Floats:

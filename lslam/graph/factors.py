@@ -1,4 +1,4 @@
-"""From plain values to factors of gtsam. Keyframe k has the key k, the floor the key K."""
+"""From plain values to factors of gtsam. Of K keyframes k has the key k, the floor the key K, the map the key K + 1."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.geometry import noise
-from lslam.graph.problem import FloorPlane, PoseGraph, PositionFix
+from lslam.geometry import noise, se2, se3
+from lslam.graph.problem import FloorPlane, PlanarPrior, PoseGraph, PositionFix
 from lslam.types.constraint import Constraint, Turn
 
 Floats = NDArray[np.float64]
@@ -17,6 +17,8 @@ Floats = NDArray[np.float64]
 HELD, FREE, TILTING = (1e-4, 1e-4), (1e3, 3.0), 0.2
 # A gyroscope says nothing of positions, m.
 ANYWHERE = 1e4
+# x, y and yaw among the six of a pose in this house's order.
+PLANAR = [0, 1, 5]
 # No constraint is known better than this, m and rad: the optimiser's arithmetic.
 SMALLEST = np.array([1e-4, 1e-4, 1e-4, 1e-5, 1e-5, 1e-5])
 
@@ -48,6 +50,30 @@ def position(fix: PositionFix, scale: float = 1.0, kernel: Any = None) -> Any:
     return gtsam.GPSFactorArm(fix.keyframe, fix.position, fix.arm, _robust(model, kernel))
 
 
+def planar(prior: PlanarPrior, pose: Floats, key: int, scale: float = 1.0, kernel: Any = None) -> Any:
+    """Where the map `key` puts a keyframe, seen from above: height, roll and pitch stay free, and what the walls leave free.
+
+    pose : (4, 4) of the keyframe now, whose height and tilt are those at which the error is looked at
+    """
+    import gtsam
+
+    now = se2.of_se3(pose)
+    turn = se2.to_se3(np.array([0.0, 0.0, prior.pose[2] - now[2]]))[:3, :3]
+    T = se3.make(turn @ pose[:3, :3], np.array([*prior.pose[:2], pose[2, 3]]))
+    information = np.zeros((6, 6))
+    information[np.ix_(PLANAR, PLANAR)] = prior.information * (prior.share / scale)
+    values, axes = np.linalg.eigh(noise.to_body(information, T))
+    # Rows of the root, one per direction that is not free: what is free says nothing, not little.
+    root = np.sqrt(np.maximum(values, 0.0))[:, None] * axes.T
+    model = gtsam.noiseModel.Gaussian.SqrtInformation(root, False)
+    return gtsam.BetweenFactorPose3(key, prior.keyframe, gtsam.Pose3(T), _robust(model, kernel))
+
+
+def map_key(graph: PoseGraph) -> int:
+    """The key of the map's frame."""
+    return len(graph) + 1
+
+
 def fixed_part(graph: PoseGraph, may_tilt: bool = False) -> Any:
     """The factor graph of all that is never doubted; with `may_tilt` the first pose holds but its heading and place."""
     import gtsam
@@ -55,6 +81,8 @@ def fixed_part(graph: PoseGraph, may_tilt: bool = False) -> Any:
     factors = gtsam.NonlinearFactorGraph()
     sigma_m, sigma_rad = HELD if graph.is_anchored else FREE
     held = np.diag(np.repeat([sigma_m**2, sigma_rad**2], 3))
+    if graph.start_sigma is not None:
+        held[PLANAR, PLANAR] = graph.start_sigma**2
     if may_tilt:
         held[3:, 3:] += TILTING**2 * (np.eye(3) - np.outer(graph.world_up, graph.world_up))
     start = gtsam.noiseModel.Gaussian.Covariance(noise.to_body(held, graph.poses[0]))
@@ -68,6 +96,11 @@ def fixed_part(graph: PoseGraph, may_tilt: bool = False) -> Any:
         factors.add(_turn(turn))
     for floor in graph.floors:
         factors.add(_floor(floor, len(graph)))
+    if graph.map_priors:
+        shift = gtsam.noiseModel.Diagonal.Sigmas(
+            np.array([HELD[1]] * 3 + [max(graph.shift_sigma, HELD[0])] * 2 + [HELD[0]])
+        )
+        factors.add(gtsam.PriorFactorPose3(map_key(graph), gtsam.Pose3(), shift))
     return factors
 
 
@@ -80,6 +113,8 @@ def start_values(graph: PoseGraph, poses: Floats) -> Any:
         values.insert(k, gtsam.Pose3(pose))
     if graph.floors:
         values.insert(len(poses), gtsam.OrientedPlane3(_floor_in_world(graph.floors, poses)))
+    if graph.map_priors:
+        values.insert(map_key(graph), gtsam.Pose3())
     return values
 
 

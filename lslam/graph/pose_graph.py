@@ -10,22 +10,22 @@ from numpy.typing import NDArray
 
 from lslam.config.graph import GraphConfig
 from lslam.errors import GraphError
-from lslam.geometry import se3
+from lslam.geometry import noise, se3
 from lslam.graph import factors
 from lslam.graph.consistency import judge_loops
 from lslam.graph.drift import drift_factor, with_drift
 from lslam.graph.problem import PoseGraph, Solution
-from lslam.graph.robust import Doubted, joined, settle
-from lslam.graph.solve import marginals, solve_incrementally
+from lslam.graph.robust import Doubted, Settled, joined, settle
+from lslam.graph.solve import marginal_blocks, marginals, solve_incrementally
 
 Floats = NDArray[np.float64]
 
 
 def optimise(graph: PoseGraph, config: GraphConfig) -> Solution:
-    """Poses and covariances of all keyframes, and which loops and fixes were believed.
+    """Poses and covariances of all keyframes, and which loops, fixes and planar priors were believed.
 
     Loops that contradict each other or odometry go first; odometry's covariances grow by the drift that the loops left show;
-    then everything is solved together, loops and fixes that still do not fit being given up on the way.
+    then everything is solved together, loops, fixes and planar priors that still do not fit being given up on the way.
 
     Raises GraphError when the graph is in pieces, singular or not finite.
     """
@@ -38,9 +38,15 @@ def optimise(graph: PoseGraph, config: GraphConfig) -> Solution:
     drift = drift_factor(graph, loops, config)
     graph = replace(graph, odometry=with_drift(graph.odometry, drift, config))
     may_tilt = graph.is_anchored and len(graph.ups) > 0
+    is_placed = graph.start_sigma is not None or not graph.is_anchored
     fixed = factors.fixed_part(graph, may_tilt)
     doubted = [Doubted(partial(factors.between, loop), 6) for loop in loops]
     doubted += [Doubted(partial(factors.position, fix), 3) for fix in graph.fixes]
+    key = factors.map_key(graph)
+    doubted += [
+        Doubted(partial(factors.planar, prior, graph.poses[prior.keyframe], key), prior.rank)
+        for prior in graph.map_priors
+    ]
     values = factors.start_values(graph, graph.poses)
     if config.incremental:
         everything = joined(fixed, [item.make(1.0, None) for item in doubted])
@@ -49,25 +55,45 @@ def optimise(graph: PoseGraph, config: GraphConfig) -> Solution:
     poses = se3.normalise(factors.poses_of(settled.values, len(graph)))
     if not np.isfinite(poses).all():
         raise GraphError("the pose graph cannot be optimised: its poses are not finite")
-    if may_tilt:
+    if may_tilt and not is_placed:
         poses, covariances = _upright(
             graph, poses, [d for d, w in zip(doubted, settled.weights, strict=True) if w >= 0.5]
         )
     else:
         covariances = marginals(settled.factors, settled.values, poses)
-    for i, weight, squared, limit in zip(kept, settled.weights, settled.squared, settled.limits, strict=False):
-        if weight < 0.5:
-            reasons[i] = f"{np.sqrt(squared / limit):.1f} times as far as it may be from where all others put it"
+    doubts = [
+        ""
+        if weight >= 0.5
+        else f"{np.sqrt(squared / limit):.1f} times as far as it may be from where all others put it"
+        for weight, squared, limit in zip(settled.weights, settled.squared, settled.limits, strict=True)
+    ]
+    for i, doubt in zip(kept, doubts, strict=False):
+        reasons[i] = reasons[i] or doubt
+    rest = len(loops) + len(graph.fixes)
+    shift, shift_sigma = _map_shift(graph, settled)
     return Solution(
         poses=poses,
         covariances=covariances,
         loop_reasons=reasons,
         loop_stages=stages,
-        fix_believed=settled.weights[len(loops) :] >= 0.5,
+        fix_believed=settled.weights[len(loops) : rest] >= 0.5,
+        map_reasons=doubts[rest:],
+        shift=shift,
+        shift_sigma=shift_sigma,
         drift=drift,
         rounds=settled.rounds,
         error=float(settled.factors.error(settled.values)),
     )
+
+
+def _map_shift(graph: PoseGraph, settled: Settled) -> tuple[Floats, Floats]:
+    """(2,) m by which the map is off as a whole, and its sigma; zero and infinity without a map."""
+    if not graph.map_priors:
+        return np.zeros(2), np.full(2, np.inf)
+    key = factors.map_key(graph)
+    frame = settled.values.atPose3(key).matrix()
+    covariance = noise.from_body(marginal_blocks(settled.factors, settled.values, [key]), frame[None])[0]
+    return frame[:2, 3], np.sqrt(np.diag(covariance)[:2])
 
 
 def _upright(graph: PoseGraph, poses: Floats, believed: list[Doubted]) -> tuple[Floats, Floats]:

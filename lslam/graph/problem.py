@@ -47,13 +47,30 @@ class FloorPlane:
 
 
 @dataclass(frozen=True)
+class PlanarPrior:
+    """Where the map puts `keyframe`, seen from above: `pose` (3,) x, y (m), yaw (rad) in the frame of the map.
+
+    information : (3, 3) in its axes, 1/m2 and 1/rad2, singular along what is free; rank : directions that are not
+    share : what of it counts beside all others, since those that look at the same walls make the same error
+    """
+
+    keyframe: int
+    pose: Floats
+    information: Floats
+    rank: int
+    share: float = 1.0
+
+
+@dataclass(frozen=True)
 class PoseGraph:
     """Everything known of K keyframes.
 
     poses : (K, 4, 4) where they are now
     distances : (K,) m travelled up to each, for what odometry may have drifted
     world_up : (3,) unit, up in the world of `poses`, needed where there are `ups`
+    map_priors : planar priors in the frame of a map that is off as a whole by `shift_sigma` m
     is_anchored : whether the first pose is held where it is; else the fixes hold the graph
+    start_sigma : (3,) x, y (m), yaw (rad), how well these are known of a first pose that is held only otherwise
     """
 
     poses: Floats
@@ -65,7 +82,10 @@ class PoseGraph:
     floors: Sequence[FloorPlane] = ()
     distances: Floats = field(default_factory=lambda: np.zeros(0))
     world_up: Floats = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
+    map_priors: Sequence[PlanarPrior] = ()
+    shift_sigma: float = 0.0
     is_anchored: bool = True
+    start_sigma: Floats | None = None
 
     def __len__(self) -> int:
         return len(self.poses)
@@ -79,6 +99,8 @@ class Solution:
     loop_reasons : per loop of the graph, empty when it was believed, else why not
     loop_stages : per loop, what decided: `consistency` or `graph`
     fix_believed : (F,) bool per fix
+    map_reasons : per planar prior, empty when it was believed, else why not
+    shift, shift_sigma : (2,) m by which the map is off as a whole (true minus map), and how well that is known
     drift : factor on `graph.drift.drift_covariance` that odometry's covariances were short of, 0 when loops bear them out
     rounds : solutions it took; error : half the sum of squared whitened residuals at the end
     """
@@ -88,6 +110,9 @@ class Solution:
     loop_reasons: list[str]
     loop_stages: list[str]
     fix_believed: NDArray[np.bool_]
+    map_reasons: list[str]
+    shift: Floats
+    shift_sigma: Floats
     drift: float
     rounds: int
     error: float

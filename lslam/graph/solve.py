@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -46,12 +47,10 @@ def solve_incrementally(factors: Any, values: Any, count: int) -> Any:
     import gtsam
 
     due: list[list[Any]] = [[] for _ in range(count)]
-    names = values.keys()
-    landmarks = [key for key in names if key >= count]
     for i in range(factors.size()):
         factor = factors.at(i)
         names = factor.keys()
-        due[max(key for key in names if key < count)].append(factor)
+        due[max((key for key in names if key < count), default=0)].append(factor)
     params = gtsam.ISAM2Params()
     params.relinearizeSkip = 1
     solver = gtsam.ISAM2(params)
@@ -62,11 +61,13 @@ def solve_incrementally(factors: Any, values: Any, count: int) -> Any:
                 start.insert(k, values.atPose3(k))
                 for factor in due[k]:
                     part.add(factor)
-            for key in landmarks if begin == 0 else ():
-                start.insert(key, values.atOrientedPlane3(key))
-                part.add(gtsam.OrientedPlane3DirectionPrior(
-                    key, values.atOrientedPlane3(key).planeCoefficients(), gtsam.noiseModel.Isotropic.Sigma(2, 3.0)
-                ))  # fmt: skip
+            if begin == 0 and values.exists(count + 1):
+                start.insert(count + 1, values.atPose3(count + 1))
+            if begin == 0 and values.exists(count):
+                floor = values.atOrientedPlane3(count)
+                start.insert(count, floor)
+                loose = gtsam.noiseModel.Isotropic.Sigma(2, 3.0)
+                part.add(gtsam.OrientedPlane3DirectionPrior(count, floor.planeCoefficients(), loose))
             solver.update(part, start)
         return solver.calculateBestEstimate()
     except RuntimeError as failure:
@@ -74,20 +75,53 @@ def solve_incrementally(factors: Any, values: Any, count: int) -> Any:
 
 
 def marginals(factors: Any, values: Any, poses: Floats) -> Floats:
-    """(K, 6, 6) covariances of all poses, t' = t + d[:3], R' = exp(d[3:]) R in world axes, m2 and rad2.
+    """(K, 6, 6) covariances of the poses with the keys 0..K-1, t' = t + d[:3], R' = exp(d[3:]) R in world axes, m2 and rad2.
+
+    Raises GraphError when the graph is singular.
+    """
+    bodies = marginal_blocks(factors, values, range(len(poses)))
+    world = noise.from_body(bodies, poses)
+    # d of this house is in the parent's axes: the world's.
+    return 0.5 * (world + np.swapaxes(world, -1, -2))
+
+
+def marginal_blocks(factors: Any, values: Any, keys: Iterable[int]) -> Floats:
+    """(K, 6, 6) covariances of the poses with these keys, in gtsam's order and axes.
 
     Raises GraphError when the graph is singular.
     """
     import gtsam
 
+    wanted = list(keys)
     try:
         known = gtsam.Marginals(factors, values)
-        bodies = np.stack([known.marginalCovariance(k) for k in range(len(poses))])
+        return np.stack([known.marginalCovariance(key) for key in wanted])
+    except RuntimeError:
+        # It gives up where neighbouring unknowns are known very differently well, as the roll of a straight path is.
+        return scaled_blocks(factors.linearize(values), values.dim(), wanted)
+
+
+def scaled_blocks(linear: Any, columns: int, keys: list[int]) -> Floats:
+    """What `marginal_blocks` gives, by normal equations in `columns` unknowns, scaled so that each counts alike."""
+    from scipy.sparse import csc_array, diags_array
+    from scipy.sparse.linalg import splu
+
+    rows, cols, entries = linear.sparseJacobian_()
+    A = csc_array((entries, (rows.astype(np.intp) - 1, cols.astype(np.intp) - 1)))[:, :columns]
+    H = (A.T @ A).tocsc()
+    scale = 1.0 / np.sqrt(H.diagonal())
+    try:
+        factor = splu((diags_array(scale) @ H @ diags_array(scale)).tocsc())
     except RuntimeError as failure:
         raise GraphError(f"the pose graph has no covariances: {_first_line(failure)}") from None
-    world = noise.from_body(bodies, poses)
-    # d of this house is in the parent's axes: the world's.
-    return 0.5 * (world + np.swapaxes(world, -1, -2))
+    blocks = []
+    for key in keys:
+        # Only the floor has less than six unknowns, and only the frame of the map comes after it.
+        begin = min(6 * key, columns - 6)
+        units = np.zeros((columns, 6))
+        units[begin : begin + 6] = np.diag(scale[begin : begin + 6])
+        blocks.append(scale[begin : begin + 6, None] * factor.solve(units)[begin : begin + 6])
+    return np.stack(blocks)
 
 
 def _first_line(failure: RuntimeError) -> str:

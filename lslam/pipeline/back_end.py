@@ -23,6 +23,9 @@ from lslam.graph.problem import PoseGraph, Solution
 from lslam.keyframes.store import KeyframeStore
 from lslam.pipeline.georeferencing import Placement, place
 from lslam.pipeline.graph_inputs import floor_planes, up_directions, world_up
+from lslam.pipeline.osm_pass import Located, finish, locate
+from lslam.pipeline.osm_source import OsmSource
+from lslam.types.building_match import OsmMatches
 from lslam.types.constraint import Constraint, LoopCandidate, Turn
 from lslam.types.georeference import Georeference
 from lslam.types.scan_result import ScanResult
@@ -40,6 +43,8 @@ class BackEnd:
     keyframes : (K, 4, 4) final poses; constraints : odometry's and the loops that were believed, empty without a graph
     georeference : where the world of `results` lies on the Earth, None when that is not known
     T_final_odometry : (4, 4) from the world of odometry into that of `results`
+    solution : the graph's, None where the poses are not its own
+    osm : what walls and buildings had to do with each other, None without a map that could be used
     facts : for the manifest; problems : what could not be done, one sentence each
     """
 
@@ -49,6 +54,8 @@ class BackEnd:
     constraints: list[Constraint] = field(default_factory=list)
     georeference: Georeference | None = None
     T_final_odometry: Floats = field(default_factory=lambda: np.eye(4))
+    solution: Solution | None = None
+    osm: OsmMatches | None = None
     facts: dict[str, Any] = field(default_factory=dict)
     problems: list[str] = field(default_factory=list)
 
@@ -60,9 +67,9 @@ class BackEnd:
 
 def run_back_end(
     sequence: Sequence, results: list[ScanResult], store: KeyframeStore, config: Config,
-    candidates: list[LoopCandidate], turns: Many[Turn] = (),
+    candidates: list[LoopCandidate], turns: Many[Turn] = (), osm: OsmSource | None = None,
 ) -> BackEnd:  # fmt: skip
-    """Close loops, take in fixes, optimise, and place all scans accordingly; odometry's poses where that fails."""
+    """Close loops, take in fixes and buildings, optimise, and place all scans accordingly; odometry's poses where that fails."""
     keyframes = store.keyframes
     problems: list[str] = []
     if len(keyframes) < 2:
@@ -71,27 +78,54 @@ def run_back_end(
         return BackEnd(results, candidates, problems=problems)
     graph = replace(_graph(results, store, config, candidates, problems), turns=turns)
     up = graph.world_up if graph.ups else None
-    out = None
-    if config.gnss.mode == "graph":
+    out, placement = None, Placement()
+    if config.gnss.mode == "graph" or (config.gnss.mode == "fit" and osm is not None and config.osm.origin is None):
         placement = place(sequence, results, keyframes, up, config.gnss, config.graph)
-        if placement.georeference is None:
-            problems.append(placement.problem)
-        else:
-            out = _solved(
-                _on_earth(graph, placement), candidates, results, store, config, problems, placement.georeference
-            )
+        problems += [placement.problem] if placement.problem else []
+    if osm is not None:
+        out = _on_buildings(osm, graph, placement, candidates, results, store, config, problems)
+    if out is None and config.gnss.mode == "graph" and placement.georeference is not None:
+        out = _solved(_on_earth(graph, placement), candidates, results, store, config, problems, placement.georeference)
     if out is None and (graph.loops or graph.floors):
         out = _solved(graph, candidates, results, store, config, problems, None)
     if out is None:
         out = BackEnd(results, candidates, np.stack([k.T_world_lidar for k in keyframes]))
-    if config.gnss.mode == "fit":
+    if config.gnss.mode == "fit" and out.georeference is None:
         turned = None if up is None else _up_after(out, graph)
         placement = place(sequence, out.results, keyframes, turned, config.gnss, config.graph)
-        problems += [placement.problem] if placement.problem else []
+        problems += [placement.problem] if placement.problem and placement.problem not in problems else []
         out = replace(out, georeference=placement.georeference)
     for problem in problems:
         log.warning("%s", problem)
     return replace(out, problems=problems, facts={"keyframes": len(keyframes)} | out.facts)
+
+
+def _on_buildings(
+    osm: OsmSource, graph: PoseGraph, placement: Placement, candidates: list[LoopCandidate], results: list[ScanResult],
+    store: KeyframeStore, config: Config, problems: list[str],
+) -> BackEnd | None:  # fmt: skip
+    """The run held by the buildings of a map, and by fixes where it has some; None, and why, where they hold nothing."""
+    known = placement.georeference
+    origin = known.origin if known is not None else config.osm.origin
+    if origin is None:
+        problems.append("OSM: without its fixes the run has no place on the map: it goes on without the buildings")
+        return None
+    extract = osm.extract(np.asarray(origin, np.float64))
+    up = graph.world_up if graph.ups else None
+    located = locate(extract, store, up, config, None if known is None else known.T_enu_world)
+    if located.problem:
+        problems.append(located.problem)
+        return None
+    if config.gnss.mode == "graph" and known is not None:
+        graph, georeference = _on_earth(graph, placement), known
+    else:
+        georeference = Georeference(
+            extract.origin, located.T_enu_odometry, config.gnss.crs, "osm", used=len(located.priors)
+        )
+    out = _solved(_on_map(graph, located, config), candidates, results, store, config, problems, georeference)
+    if out is None or out.solution is None:
+        return None
+    return replace(out, osm=finish(located, extract, out.keyframes, out.solution, config.osm))
 
 
 def _solved(
@@ -115,14 +149,16 @@ def _solved(
         len(graph), len(believed), len(graph.loops), solution.drift, solution.rounds,
     )  # fmt: skip
     facts = _facts(solution, graph, candidates, believed)
-    if not (believed or graph.fixes or graph.floors):
+    if not (believed or graph.fixes or graph.floors or graph.map_priors):
         return BackEnd(results, judged, graph.poses, facts=facts)
     T = np.eye(4)
     if georeference is not None:
         T = georeference.T_enu_world
-        georeference = _scored(georeference, graph, solution)
+        georeference = replace(_scored(georeference, graph, solution), T_enu_world=np.eye(4))
     moved = corrected(results, store.keyframes, solution.poses, solution.covariances, solution.drift, config.graph)
-    return BackEnd(moved, judged, solution.poses, [*graph.odometry, *believed], georeference, T, facts)
+    return BackEnd(
+        moved, judged, solution.poses, [*graph.odometry, *believed], georeference, T, solution=solution, facts=facts
+    )  # fmt: skip
 
 
 def _up_after(out: BackEnd, graph: PoseGraph) -> Floats:
@@ -173,6 +209,18 @@ def _on_earth(graph: PoseGraph, placement: Placement) -> PoseGraph:
     )
 
 
+def _on_map(graph: PoseGraph, located: Located, config: Config) -> PoseGraph:
+    """The graph in the frame of the map, held by its walls, and by its fixes where it has some."""
+    return replace(
+        graph,
+        poses=graph.poses if graph.fixes else located.T_enu_odometry @ graph.poses,
+        map_priors=located.priors,
+        shift_sigma=config.osm.shift_sigma,
+        world_up=np.array([0.0, 0.0, 1.0]),
+        start_sigma=None if graph.fixes else located.start_sigma,
+    )
+
+
 def _verdicts(
     candidates: list[LoopCandidate], graph: PoseGraph, solution: Solution
 ) -> tuple[list[LoopCandidate], list[Constraint]]:
@@ -191,7 +239,9 @@ def _verdicts(
 
 
 def _scored(georeference: Georeference, graph: PoseGraph, solution: Solution) -> Georeference:
-    """The georeference with the residuals of the fixes that the graph believed."""
+    """The georeference with the residuals of the fixes that the graph believed; as it is without fixes."""
+    if not graph.fixes:
+        return georeference
     k = np.array([f.keyframe for f in graph.fixes])
     arms, positions = np.stack([f.arm for f in graph.fixes]), np.stack([f.position for f in graph.fixes])
     antenna = np.einsum("fij,fj->fi", solution.poses[k, :3, :3], arms) + solution.poses[k, :3, 3]
@@ -200,7 +250,6 @@ def _scored(georeference: Georeference, graph: PoseGraph, solution: Solution) ->
         georeference,
         rmse_horizontal=float(np.sqrt((off[:, :2] ** 2).sum(1).mean())),
         rmse_vertical=float(np.sqrt((off[:, 2] ** 2).mean())),
-        T_enu_world=np.eye(4),
         used=int(solution.fix_believed.sum()),
     )
 
@@ -216,6 +265,7 @@ def _facts(
         "gravity_factors": len(graph.ups),
         "imu_orientation_factors": len(graph.turns),
         "floor_factors": len(graph.floors),
+        "map_priors": sum(not reason for reason in solution.map_reasons),
         "drift_factor": round(solution.drift, 4),
         "rounds": solution.rounds,
         "largest_correction_m": round(float(np.linalg.norm(moved, axis=1).max()), 4),

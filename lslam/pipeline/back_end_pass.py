@@ -12,8 +12,9 @@ import numpy as np
 from lslam.config import Config
 from lslam.formats.g2o import write_g2o
 from lslam.formats.loops_csv import write_loops
+from lslam.formats.osm_matches_csv import write_osm_matches
 from lslam.formats.trajectory_files import write_tum
-from lslam.geometry import se3
+from lslam.geometry import se2, se3
 from lslam.keyframes.store import KeyframeStore
 from lslam.loops.detector import find_loops
 from lslam.pipeline import drift
@@ -21,6 +22,7 @@ from lslam.pipeline.back_end import BackEnd, run_back_end
 from lslam.pipeline.front_end import to_trajectory
 from lslam.pipeline.levelling import find_level, level_results
 from lslam.pipeline.manifest import Manifest
+from lslam.pipeline.osm_source import OsmSource
 from lslam.types.constraint import LoopCandidate
 from lslam.types.georeference import Georeference
 from lslam.types.run_record import RunRecord
@@ -31,8 +33,9 @@ log = logging.getLogger("lslam")
 
 
 def optimise_poses(
-    sequence: Sequence, record: RunRecord, store: KeyframeStore, config: Config, manifest: Manifest
-) -> BackEnd:
+    sequence: Sequence, record: RunRecord, store: KeyframeStore, config: Config, manifest: Manifest,
+    osm: OsmSource | None = None,
+) -> BackEnd:  # fmt: skip
     """Put the final poses into `record`, and what the graph did into the manifest.
 
     A run that was interrupted, or whose odometry is lost, keeps what it has.
@@ -50,13 +53,14 @@ def optimise_poses(
         if config.loops.use:
             with manifest.timed("loops_s"):
                 candidates = find_loops(store, config.loops, config.registration, config.keyframes.submap_size)
-        done = run_back_end(sequence, record.results, store, config, candidates, record.turns)
+        done = run_back_end(sequence, record.results, store, config, candidates, record.turns, osm)
     record.odometry = record.trajectory
     if done.is_optimised:
         record.results = done.results
         record.trajectory = to_trajectory(done.results, record.method)
     record.loops, record.keyframe_scans = done.candidates, np.array([k.scan for k in store.keyframes], np.int64)
     record.georeference, record.T_final_odometry = done.georeference, done.T_final_odometry
+    record.osm = done.osm
     manifest.problems += done.problems
     manifest.graph = dict(done.facts)
     return done
@@ -68,7 +72,7 @@ def level_world(record: RunRecord, sequence: Sequence, config: Config, manifest:
     The last of all that moves poses, so keyframes on disk stay where odometry put them.
     """
     place = record.georeference
-    if place is not None and place.method == "graph":
+    if place is not None and place.method in ("graph", "osm"):
         record.world = "east, north, up from the origin of the georeference"
     else:
         level = find_level(sequence, record.results, config)
@@ -92,13 +96,15 @@ def level_world(record: RunRecord, sequence: Sequence, config: Config, manifest:
 
 
 def write_back_end(folder: Path, record: RunRecord, store: KeyframeStore, done: BackEnd) -> None:
-    """trajectory_odometry.tum, loops.csv and, when there is a graph, graph.g2o."""
+    """trajectory_odometry.tum, loops.csv and, where there are such, osm_matches.csv and graph.g2o."""
     if record.odometry is None:
         return
     write_tum(
         folder / "trajectory_odometry.tum", record.odometry,
         comment=f"lslam {__version__}, {record.method}: T_world_lidar of odometry, before the pose graph\npose_time: scan_start",
     )  # fmt: skip
+    if done.osm is not None:
+        write_osm_matches(folder / "osm_matches.csv", done.osm, store.keyframes, se2.of_se3(done.keyframes))
     write_loops(folder / "loops.csv", done.candidates, store.keyframes)
     if done.is_optimised:
         write_g2o(folder / "graph.g2o", done.keyframes, done.constraints)
@@ -110,4 +116,5 @@ def describe(georeference: Georeference) -> dict[str, Any]:
     plain["origin_lat_lon_height"] = [float(v) for v in plain.pop("origin")]
     plain["T_enu_world"] = georeference.T_enu_world.tolist()
     plain["projection"] = "transverse Mercator at the origin, scale 1, WGS84"
-    return {k: round(v, 4) if isinstance(v, float) else v for k, v in plain.items()}
+    known = {k: v for k, v in plain.items() if not (isinstance(v, float) and np.isnan(v))}
+    return {k: round(v, 4) if isinstance(v, float) else v for k, v in known.items()}

@@ -38,6 +38,8 @@ def check_config(config: Config) -> None:
     if config.map.write and (config.map.denoise or config.map.mesh):
         require_open3d()
     _check_heeded(config)
+    if not config.osm.extract and (config.osm.origin is not None or config.osm.heading_deg is not None):
+        raise UsageError("--origin and --heading do nothing without --osm FILE: give it, or drop them")
     for delta in config.eval.delta:
         parse_delta(delta)
 

@@ -14,6 +14,7 @@ import numpy as np
 from lslam.config import Config
 from lslam.errors import GateError, OutputExistsError, RunFailedError, RunFinishedError
 from lslam.pipeline.identity import imu_digest, input_digest
+from lslam.pipeline.osm_source import extract_digest
 from lslam.pipeline.run_folder import MANIFEST
 from lslam.types.sequence import Sequence
 from lslam.types.trajectory import Trajectory
@@ -42,6 +43,7 @@ def run_identity(
         "reading": reading.hexdigest(),
         "imu": imu_digest(sequence) if config.imu.use else "",
         "gnss": _digest(() if gnss is None else vars(gnss).values()),
+        "osm": extract_digest(config.osm),
         "poses": _digest(() if given is None else (given.stamps_ns, given.poses)),
     }
 
@@ -97,6 +99,7 @@ def _difference(
         "reading": "the recording is read in another way (times, extrinsics, topic)",
         "imu": "the IMU's samples are others",
         "gnss": "the satellite fixes are others",
+        "osm": "the extract of OpenStreetMap is another",
         "poses": "the poses of --poses are others",
     }
     return "; ".join(text for name, text in named.items() if known.get(name) != identity[name])

@@ -29,6 +29,7 @@ from lslam.pipeline.manifest import Manifest, describe_deskew
 from lslam.pipeline.map_checkpoints import map_checkpoints
 from lslam.pipeline.map_pass import build_map
 from lslam.pipeline.odometry_pass import estimate_poses, odometry_checkpoints
+from lslam.pipeline.osm_source import OsmSource, open_osm
 from lslam.pipeline.resume import may_go_on, run_identity
 from lslam.pipeline.run_folder import KEYFRAMES, RunFolder
 from lslam.pipeline.watch import RunOutcome, Watch
@@ -96,7 +97,7 @@ def run(
 
 @dataclass(frozen=True)
 class _Job:
-    """What is to be done, resolved: the chosen scans, the method and the truth; `given` are the poses of --poses."""
+    """What is to be done, resolved: the chosen scans, the method, the truth and the map; `given` are the poses of --poses."""
 
     sequence: Sequence
     odometry: Odometry
@@ -105,10 +106,11 @@ class _Job:
     given: Trajectory | None
     manifest: Manifest
     watch: Watch
+    osm: OsmSource | None = None
 
 
 def _prepare(sequence: Sequence, config: Config, truth: Trajectory | None, command: str, watch: Watch) -> _Job:
-    """Find what the configuration asks for beside the scans: fixes, an IMU, poses; and choose the scans."""
+    """Find what the configuration asks for beside the scans: fixes, an IMU, poses, a map; and choose the scans."""
     if config.gnss.mode != "off":
         sequence = with_gnss(sequence)
     require_gnss(sequence, config.gnss)
@@ -119,7 +121,8 @@ def _prepare(sequence: Sequence, config: Config, truth: Trajectory | None, comma
         sequence.notes.extend(bind(odometry, sequence))
         given = odometry.trajectory
     chosen = choose_scans(with_imu(sequence) if config.imu.use else sequence, odometry, config)
-    return _Job(chosen, odometry, config, truth, given, Manifest(command, chosen, config), watch)
+    osm = open_osm(sequence, config)
+    return _Job(chosen, odometry, config, truth, given, Manifest(command, chosen, config), watch, osm)
 
 
 def _solve(
@@ -130,7 +133,7 @@ def _solve(
     record = estimate_poses(
         job.sequence, job.odometry, job.config, job.manifest, folder, job.truth, job.watch, store, checkpoints
     )
-    done = optimise_poses(job.sequence, record, store, job.config, job.manifest)
+    done = optimise_poses(job.sequence, record, store, job.config, job.manifest, job.osm)
     level_world(record, job.sequence, job.config, job.manifest)
     return record, done, _score(record, job.sequence, job.config)
 

@@ -36,10 +36,16 @@ def back_end_rows(record: RunRecord, evaluation: Evaluation | None) -> list[tupl
     if place is not None:
         lat, lon, height = (float(v) for v in place.origin)
         what = "GNSS in the graph" if place.method == "graph" else "GNSS fitted afterwards"
+        said = f"{what}: {place.used} of {place.fixes} fixes, {metres(place.rmse_horizontal)} m rms horizontally"
+        if place.method == "osm":
+            said = "by the buildings of OpenStreetMap"
+        rows.append(("georeference", f"origin {lat:.7f}, {lon:.7f}, {height:.1f} m; {said}"))
+    if record.osm is not None:
+        east, north = record.osm.shift
         rows.append((
-            "georeference",
-            f"origin {lat:.7f}, {lon:.7f}, {height:.1f} m; {what}: {place.used} of {place.fixes} fixes, "
-            f"{metres(place.rmse_horizontal)} m rms horizontally",
+            "OpenStreetMap",
+            f"{len(record.osm.accepted)} of {len(record.osm.keyframes)} keyframes held by {len(record.osm.buildings)} buildings, "
+            f"which lie {east:+.2f} m east and {north:+.2f} m north of the run",
         ))  # fmt: skip
     return rows
 

@@ -17,7 +17,8 @@ class Georeference:
         projection there with scale 1 (`geometry.geodesy`)
     T_enu_world : (4, 4) from the run's world into that frame; the identity when the run's world is that frame
     epsg : the code outputs are to be written in; None leaves it to the writer, which takes the UTM zone of the origin
-    method : `fit` one rigid transform of the finished trajectory to all fixes; `graph` fixes were factors
+    method : `fit` one rigid transform of the finished trajectory to all fixes; `graph` fixes were factors; `osm` the
+        buildings of OpenStreetMap were
     fixes, used : fixes that were given, and those that were believed
     rmse_horizontal, rmse_vertical : m, of the believed fixes against the trajectory's antenna
     """
@@ -25,7 +26,7 @@ class Georeference:
     origin: NDArray[np.float64]
     T_enu_world: NDArray[np.float64]
     epsg: int | None = None
-    method: Literal["fit", "graph"] = "fit"
+    method: Literal["fit", "graph", "osm"] = "fit"
     fixes: int = 0
     used: int = 0
     rmse_horizontal: float = float("nan")

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.types.building_match import OsmMatches
 from lslam.types.constraint import LoopCandidate, Turn
 from lslam.types.georeference import Georeference
 from lslam.types.map_score import Crispness
@@ -27,6 +28,7 @@ class RunRecord:
     odometry : the trajectory before the pose graph, in its own world, None when there was no back end; T_final_odometry
         : (4, 4) from that world into the trajectory's
     turns : of the IMU between keyframes, when the graph is to have them
+    osm : what walls seen and buildings of a map had to do with each other, None without a map that could be used
     loops : candidates with verdicts, between keyframes; keyframe_scans : (K,) position of each one's scan in `results`
     """
 
@@ -49,3 +51,4 @@ class RunRecord:
     loops: list[LoopCandidate] = field(default_factory=list)
     keyframe_scans: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
     georeference: Georeference | None = None
+    osm: OsmMatches | None = None

@@ -1,0 +1,127 @@
+"""A pose graph held by a map: x, y and yaw only, only along what walls fix, and the map itself may be off as a whole."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from graph_builders import graph_of, truth
+
+from lslam.config.graph import GraphConfig
+from lslam.geometry import se2, se3
+from lslam.graph import factors
+from lslam.graph.pose_graph import optimise
+from lslam.graph.problem import PlanarPrior, PoseGraph, PositionFix
+from lslam.graph.robust import joined
+from lslam.graph.solve import marginal_blocks, scaled_blocks
+from lslam.types.constraint import Constraint
+
+REAL = truth(120, 1)
+SHARP = np.diag([100.0, 100.0, 1e4])  # 0.1 m, 0.01 rad
+ANYWHERE = np.array([10.0, 10.0, 0.5])
+
+
+def held(seed: int, every: int = 2, information: np.ndarray = SHARP, rank: int = 3) -> PoseGraph:
+    """Noisy odometry from the true start, and the true place of every second keyframe."""
+    graph = graph_of(REAL, 0, 0, np.random.default_rng(seed), 1)
+    priors = [PlanarPrior(k, se2.of_se3(REAL[k]), information, rank) for k in range(0, len(REAL), every)]
+    return replace(graph, map_priors=priors, start_sigma=ANYWHERE)
+
+
+def off(poses: np.ndarray, real: np.ndarray = REAL) -> np.ndarray:
+    error = se2.of_se3(poses) - se2.of_se3(real)
+    error[:, 2] = se2.wrapped(error[:, 2])
+    return np.abs(error)
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_the_map_holds_the_plan(seed: int) -> None:
+    graph = held(seed)
+    solution = optimise(graph, GraphConfig())
+    assert off(graph.poses)[:, :2].max() > 0.4
+    assert off(solution.poses)[:, :2].max() < 0.15
+    assert off(solution.poses)[:, 2].max() < 0.01
+    assert solution.map_reasons == [""] * len(graph.map_priors)
+
+
+def test_the_map_knows_neither_height_nor_tilt() -> None:
+    """Twenty metres up everything is the same but the height; a tilt of the whole stays, where the plan allows it."""
+    graph = held(4)
+    low = optimise(graph, GraphConfig()).poses
+    up = np.array([0.0, 0.0, 20.0])
+    lifted = se3.make(np.eye(3), up) @ graph.poses
+    high = optimise(replace(graph, poses=lifted), GraphConfig()).poses
+    np.testing.assert_allclose(high[:, :3, 3] - up, low[:, :3, 3], atol=1e-4)
+    np.testing.assert_allclose(high[:, :3, :3], low[:, :3, :3], atol=1e-6)
+    tilted = optimise(replace(graph, poses=se3.exp(np.array([0, 0, 0, 0.05, 0, 0])) @ graph.poses), GraphConfig()).poses
+    assert abs(tilted[0, 2, 1] - np.sin(0.05)) < 1e-3
+
+
+def test_a_lone_wall_leaves_the_way_along_it_free() -> None:
+    """Walls that run east fix the northing and the heading; nothing pulls on the easting, whatever the match said."""
+    graph = held(5)
+    east = np.array([1.0, 0.0, 0.0])
+    wall = np.diag([0.0, 100.0, 1e4])
+    priors = [PlanarPrior(k, se2.of_se3(REAL[k]) + 5 * east, wall, 2) for k in range(0, 120, 2)]
+    solution = optimise(replace(graph, map_priors=priors, start_sigma=np.array([1e-3, 10.0, 0.5])), GraphConfig())
+    assert off(solution.poses)[:, 1].max() < 0.15
+    assert off(solution.poses)[:, 0].max() < 1.5
+    assert abs(solution.poses[0, 0, 3] - graph.poses[0, 0, 3]) < 1e-3
+
+
+def test_a_map_that_is_off_as_a_whole_does_not_move_a_start_that_is_known() -> None:
+    graph = held(6)
+    shift = np.array([1.5, -2.0])
+    priors = [replace(p, pose=p.pose - [*shift, 0.0]) for p in graph.map_priors]
+    known = replace(graph, map_priors=priors, start_sigma=np.full(3, 1e-3))
+    free = optimise(replace(known, shift_sigma=2.0), GraphConfig())
+    assert np.abs(free.shift - shift).max() < 0.2
+    assert (free.shift_sigma < 0.2).all()
+    assert off(free.poses)[:, :2].max() < 0.3
+    rigid = optimise(replace(known, shift_sigma=0.0), GraphConfig())
+    assert np.abs(rigid.shift).max() < 1e-3
+    assert off(rigid.poses)[60:, :2].max() > 1.0
+
+
+def test_a_match_with_the_wrong_house_is_given_up() -> None:
+    graph = held(7)
+    wrong = [5, 20, 41]
+    priors = [
+        replace(p, pose=p.pose + np.array([4.0, 0.0, 0.1])) if i in wrong else p for i, p in enumerate(graph.map_priors)
+    ]
+    solution = optimise(replace(graph, map_priors=priors), GraphConfig())
+    assert [i for i, reason in enumerate(solution.map_reasons) if reason] == wrong
+    assert off(solution.poses)[:, :2].max() < 0.15
+
+
+def test_it_comes_to_the_same_keyframe_by_keyframe() -> None:
+    graph = held(8)
+    at_once = optimise(graph, GraphConfig())
+    in_turn = optimise(graph, GraphConfig(incremental=True))
+    np.testing.assert_allclose(in_turn.poses, at_once.poses, atol=2e-3)
+
+
+def test_covariances_do_not_depend_on_how_they_are_had() -> None:
+    """The scaled normal equations against gtsam's elimination; the frame of the map is the last of the unknowns."""
+    graph = held(9)
+    values = factors.start_values(graph, graph.poses)
+    whole = joined(
+        factors.fixed_part(replace(graph, start_sigma=np.full(3, 0.1), shift_sigma=1.0)),
+        [factors.planar(p, graph.poses[p.keyframe], factors.map_key(graph)) for p in graph.map_priors],
+    )
+    keys = [0, 40, 119, factors.map_key(graph)]
+    by_gtsam = marginal_blocks(whole, values, keys)
+    by_scaling = scaled_blocks(whole.linearize(values), values.dim(), keys)
+    np.testing.assert_allclose(by_scaling, by_gtsam, rtol=1e-4, atol=1e-9)
+
+
+def test_a_straight_path_has_covariances_though_nothing_tells_its_roll() -> None:
+    """gtsam's elimination gives up here: odometry to 0.1 mm, and a first pose of which little is known."""
+    poses = np.tile(np.eye(4), (20, 1, 1))
+    poses[:, 0, 3] = 2.0 * np.arange(20)
+    covariance = np.diag(np.repeat([1e-8, 4e-10], 3))
+    steps = [Constraint(k, k + 1, se3.relative(poses[k], poses[k + 1]), covariance, "odometry") for k in range(19)]
+    fixes = [PositionFix(k, poses[k, :3, 3], np.full(3, 1.0), np.zeros(3)) for k in range(0, 20, 3)]
+    solution = optimise(PoseGraph(poses, steps, fixes=fixes, is_anchored=False), GraphConfig())
+    sigma = np.sqrt(np.diagonal(solution.covariances, axis1=1, axis2=2))
+    assert (np.abs(sigma[:, 3] - 3.0) < 0.1).all()  # as it was held
+    assert (sigma[:, 1] < 1.0).all()

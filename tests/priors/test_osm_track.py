@@ -1,0 +1,60 @@
+"""The running estimate on the map: its uncertainty grows with the way and shrinks by what a match fixes, nothing else."""
+
+import numpy as np
+
+from lslam.geometry import se2
+from lslam.priors.osm_track import OsmTrack
+
+MAP = np.array([0.5, 0.5, 0.02])
+
+
+def track(sigma: tuple[float, float, float] = (0.1, 0.1, 0.01)) -> OsmTrack:
+    return OsmTrack(np.array([10.0, 5.0, np.pi / 2]), np.array(sigma), 1.0, np.radians(0.5) / 100, MAP)
+
+
+def test_it_follows_odometry_and_doubts_it_by_a_percent_of_a_hundred_metres() -> None:
+    one = track((0.0, 0.0, 0.0))
+    for _ in range(50):
+        one.move(np.array([2.0, 0.0, 0.0]), 2.0)
+    np.testing.assert_allclose(one.pose, [10.0, 105.0, np.pi / 2], atol=1e-9)
+    sigma = np.sqrt(np.diag(one.covariance))
+    assert abs(sigma[1] - 1.0) < 1e-6  # along: its drift alone
+    assert 1.0 < sigma[0] < 1.3  # across: what the heading adds
+    assert abs(np.degrees(sigma[2]) - 0.5) < 1e-6
+
+
+def test_a_match_of_one_direction_moves_that_direction_only() -> None:
+    one = track((2.0, 2.0, 0.0))
+    before = one.covariance.copy()
+    one.take(np.array([11.0, 99.0, np.pi / 2]), np.diag([400.0, 0.0, 0.0]))
+    assert 10.8 < one.pose[0] < 11.0
+    assert one.pose[1] == 5.0
+    assert one.covariance[0, 0] < 0.1 * before[0, 0]
+    assert one.covariance[1, 1] == before[1, 1]
+
+
+def test_the_gate_counts_directions_that_are_seen_and_wraps_the_heading() -> None:
+    one = OsmTrack(np.array([0.0, 0.0, np.pi - 0.01]), np.array([0.1, 0.1, 0.02]), 1.0, 1e-4, MAP)
+    near, rank = one.squared(np.array([0.0, 0.0, -np.pi + 0.01]), np.diag([100.0, 100.0, 1e4]))
+    assert rank == 3
+    assert near < 1.0
+    far, rank = one.squared(np.array([3.0, 50.0, np.pi - 0.01]), np.diag([100.0, 0.0, 1e4]))
+    assert rank == 2
+    # 3 m against 0.1 m of the track, 0.1 m of the match and half a metre of the map; the 50 m are along the wall.
+    np.testing.assert_allclose(far, 9.0 / (0.01 + 0.01 + 0.25), rtol=1e-6)
+
+
+def test_many_matches_never_make_it_surer_than_the_map() -> None:
+    one = track()
+    for _ in range(200):
+        one.take(one.pose, np.diag([1e4, 1e4, 1e6]))
+    assert (one.sigma >= MAP).all()
+
+
+def test_it_begins_anew_at_a_match() -> None:
+    one = track()
+    one.begin(np.array([1.0, 2.0, 3.0]), np.diag([100.0, 100.0, 1e4]))
+    np.testing.assert_array_equal(one.pose, [1.0, 2.0, 3.0])
+    np.testing.assert_allclose(one.covariance, np.diag([0.26, 0.26, 5e-4]))
+    one.move(np.array([0.0, 0.0, 1.0]), 0.0)
+    assert abs(one.pose[2] - se2.wrapped(4.0)) < 1e-12
