@@ -47,7 +47,7 @@ class OsmTrack:
     def begin(self, pose: Floats, information: Floats) -> None:
         """Be where a match that fixes everything says, and nowhere else."""
         self.pose = np.asarray(pose, np.float64)
-        self.covariance = np.linalg.inv(information) + np.diag(self._map)
+        self.covariance = np.asarray(np.linalg.inv(information) + np.diag(self._map))
 
     def squared(self, pose: Floats, information: Floats) -> tuple[float, int]:
         """Squared Mahalanobis distance of a match from the track, of the directions it fixes, and how many these are."""
