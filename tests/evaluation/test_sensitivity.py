@@ -48,6 +48,15 @@ def test_run_is_lost_by_its_status_or_by_its_error() -> None:
     assert (found.last_good, found.first_bad, found.alone) == (8, 9, (5,))
 
 
+def test_mean_is_of_the_runs_that_were_not_lost_but_a_lost_run_has_no_efficiency() -> None:
+    rows = [replace(row, thesis_rmse=40.0) if row.seed == 1 else row for row in rows_of([1, 2, 3])]
+    means = evaluate_study(rows)[0].results[0].means
+    assert means["translation"].mean == pytest.approx([0.5] * 3)
+    assert list(means["total_time"].n) == [2, 2, 2]
+    # Two of three runs have 1 / (0.5 m x 1 deg x 0.05 s), the lost one 0.
+    assert means["efficiency"].mean == pytest.approx([40 * 2 / 3] * 3)
+
+
 def test_divergence_needs_more_than_half_of_the_seeds() -> None:
     rows = rows_of(SKIPS)
     one = [replace(r, status="diverged") if r.parameters["input.skip_frames"] > 7 and r.seed == 0 else r for r in rows]
