@@ -1,0 +1,119 @@
+"""Buildings and trajectory in one graph: walls mend a drifting way and a wrong map together; the baseline believes them all."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from graph_builders import STEP_SIGMAS, measured
+from numpy.typing import NDArray
+from test_building_graph import across
+
+from lslam.config.graph import GraphConfig
+from lslam.errors import GraphError
+from lslam.geometry import se2, se3, so3
+from lslam.graph.building_graph import MapBelief
+from lslam.graph.joint import optimise_jointly
+from lslam.graph.problem import PoseGraph
+from lslam.types.building_match import BuildingMatch
+from lslam.types.constraint import Constraint
+
+Floats = NDArray[np.float64]
+
+FULL = np.diag([1 / 0.1**2, 1 / 0.1**2, 1 / 0.01**2])
+BELIEF = MapBelief(np.zeros(2), np.full(2, 1e-3), np.array([0.3, 0.3, np.radians(1.0)]))
+
+
+def drive(seed: int) -> tuple[PoseGraph, Floats, Floats, Floats, list[BuildingMatch]]:
+    """A hilly ring road whose odometry drifts: graph, true poses, middles on the map, real displacements, matches."""
+    rng = np.random.default_rng(seed)
+    phase = np.linspace(0, 2 * np.pi, 60, endpoint=False)
+    real = se3.make(
+        so3.from_euler_rpy(np.column_stack([0.02 * np.sin(phase), 0.03 * np.cos(phase), phase + np.pi / 2])),
+        np.column_stack([40 * np.cos(phase), 40 * np.sin(phase), 2 * np.sin(phase)]),
+    )
+    sigmas = 3 * STEP_SIGMAS
+    steps = measured(se3.relative(real[:-1], real[1:]), sigmas, rng)
+    chain = [real[0]]
+    for step in steps:
+        chain.append(se3.normalise(chain[-1] @ step))
+    odometry = [Constraint(k, k + 1, steps[k], np.diag(sigmas**2), "odometry") for k in range(59)]
+    angle = np.linspace(0, 2 * np.pi, 14, endpoint=False)
+    middles = 55 * np.column_stack([np.cos(angle), np.sin(angle)])
+    off = np.column_stack([rng.normal(0, 0.3, (14, 2)), rng.normal(0, np.radians(1.0), 14)])
+    off[0] = 0.0
+    planar = se2.of_se3(real)
+    matches = []
+    for b, middle in enumerate(middles):
+        where = np.append(middle, 0.0) + off[b]
+        for k in range(60):
+            if np.linalg.norm(planar[k, :2] - middle) < 28:
+                pose = se2.relative(planar[k], where) + rng.normal(0, [0.03, 0.03, 0.003])
+                matches.append(BuildingMatch(k, b, pose, FULL, 3, "edges", 50.0, 0.5, 0.1, np.zeros((1, 2), np.int64)))
+    return PoseGraph(np.stack(chain), odometry), real, middles, off, matches
+
+
+def off_the_way(poses: Floats, real: Floats) -> float:
+    """Root mean square distance in the plane, m: walls say nothing of heights."""
+    return float(np.sqrt(np.mean(np.sum((poses[:, :2, 3] - real[:, :2, 3]) ** 2, axis=1))))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_walls_mend_the_way_and_the_map_together(seed: int) -> None:
+    graph, real, middles, off, matches = drive(seed)
+    found = optimise_jointly(graph, middles, matches, BELIEF, GraphConfig())
+    assert off_the_way(found.poses, real) < max(0.5 * off_the_way(graph.poses, real), 0.2)
+    assert found.buildings.believed.mean() > 0.98
+    away = np.linalg.norm(found.buildings.displacements[:, :2] - off[:, :2], axis=1)
+    assert np.median(away) < 0.3
+    assert (np.linalg.eigvalsh(found.covariances) > 0).all()
+    errors = found.buildings.displacements - off
+    nees = [e @ np.linalg.solve(c, e) for e, c in zip(errors, found.buildings.covariances, strict=True)]
+    assert np.mean(nees) < 8
+
+
+def test_only_what_is_seen_from_above_is_touched() -> None:
+    graph, _, middles, _, matches = drive(1)
+    alone = optimise_jointly(graph, middles, [], BELIEF, GraphConfig())
+    found = optimise_jointly(graph, middles, matches, BELIEF, GraphConfig())
+    np.testing.assert_allclose(found.poses[:, 2, 3], alone.poses[:, 2, 3], atol=0.15)
+    np.testing.assert_allclose(found.poses[:, 2, :2], alone.poses[:, 2, :2], atol=0.03)
+
+
+def test_matches_with_the_wrong_wall_are_given_up_but_not_by_the_baseline() -> None:
+    graph, real, middles, _, matches = drive(2)
+    wrong = [replace(m, pose=np.add(m.pose, [4.0, -3.0, 0.1])) for m in matches[::12]]
+    found = optimise_jointly(graph, middles, [*matches, *wrong], BELIEF, GraphConfig())
+    assert not found.buildings.believed[len(matches) :].any()
+    assert found.buildings.believed[: len(matches)].mean() > 0.95
+    baseline = optimise_jointly(graph, middles, [*matches, *wrong], None, GraphConfig())
+    assert baseline.buildings.believed.all()
+    assert off_the_way(baseline.poses, real) > 2 * off_the_way(found.poses, real)
+
+
+def test_the_baseline_holds_its_first_building_and_no_other() -> None:
+    graph, _, middles, _, matches = drive(0)
+    found = optimise_jointly(graph, middles, matches, None, GraphConfig())
+    first = matches[0].building
+    np.testing.assert_allclose(found.buildings.displacements[first], 0.0, atol=1e-3)
+    assert np.abs(np.delete(found.buildings.displacements, first, axis=0)).max() > 0.1
+
+
+def test_a_lone_wall_leaves_its_building_free_along_it() -> None:
+    graph, _, middles, _, matches = drive(0)
+    planar = se2.of_se3(graph.poses)
+    n = np.array([1.0, 0.0])
+    walls = [replace(m, information=across(n, planar[m.keyframe]), rank=2) for m in matches if m.building == 3]
+    rest = [m for m in matches if m.building != 3]
+    sure = replace(graph, odometry=[replace(c, covariance=1e-6 * np.eye(6)) for c in graph.odometry])
+    found = optimise_jointly(sure, middles, [*rest, *walls], BELIEF, GraphConfig(robust="none"))
+    spread = np.sqrt(np.diag(found.buildings.covariances[3]))
+    assert spread[1] == pytest.approx(0.3, rel=0.1)
+    assert spread[0] < 0.15
+
+
+def test_a_graph_in_pieces_is_refused() -> None:
+    graph, _, middles, _, matches = drive(0)
+    with pytest.raises(GraphError, match="in pieces"):
+        optimise_jointly(replace(graph, odometry=graph.odometry[:-3]), middles, matches, BELIEF, GraphConfig())
