@@ -40,7 +40,9 @@ HOMES = {
     "open3d": ["maps/", "odometry/open3d.py"],
     "requests": ["priors/overpass.py"],
     "pyproj": ["geometry/geodesy.py", "maps/georeference.py"],
-    "dask": ["studies/runner.py"],
+    "dask": ["studies/cluster.py"],
+    "distributed": ["studies/cluster.py"],
+    "pyarrow": ["formats/study_parquet.py"],
     "numba": ["kernels/"],
     "matplotlib": ["reports/"],
 }

@@ -6,7 +6,6 @@ import json
 import shlex
 import sys
 import time
-from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -14,10 +13,10 @@ from typing import TYPE_CHECKING, Any, Literal
 import click
 
 from lslam.cli import options
-from lslam.cli.console import log, progress, setup_logging, show
+from lslam.cli.console import log, setup_logging, show
 
 if TYPE_CHECKING:
-    from lslam.studies.plan import Follow, Plan
+    from lslam.studies.plan import Plan
     from lslam.studies.subjects import Subject
     from lslam.types.comparison import Comparison
     from lslam.types.trajectory import Trajectory
@@ -71,12 +70,13 @@ def command(sequences: tuple[str, ...], **given: Any) -> None:
     SEQUENCE is what `lslam run` takes, or a scenario of `lslam simulate --list`, which is simulated once per seed.
     """
     setup_logging(given["verbose"], given["quiet"])
+    from lslam.cli.study_screen import bars
     from lslam.errors import GateError, RunFailedError
     from lslam.studies.compare import compare
 
     plan = _plan(sequences, given)
     with ExitStack() as stack:
-        comparison = compare(plan, _follow(stack))
+        comparison = compare(plan, bars(stack))
     _print(comparison, given["table"], given["as_json"])
     log.info("the page: %s", plan.out / "compare.html")
     failed = comparison.failed
@@ -102,7 +102,7 @@ def _plan(sequences: tuple[str, ...], given: dict[str, Any]) -> Plan:
     return Plan(
         subjects=tuple(subjects),
         variants=tuple(variants),
-        seeds=_numbers("--seeds", given["seeds"], int),
+        seeds=options.numbers("--seeds", given["seeds"], int),
         out=given["out"] or Path("runs") / time.strftime("compare-%Y%m%d-%H%M%S"),
         jobs=given["jobs"],
         truth=_truth(given["gt"], subjects),
@@ -114,21 +114,12 @@ def _plan(sequences: tuple[str, ...], given: dict[str, Any]) -> Plan:
     )
 
 
-def _numbers(flag: str, text: str, kind: Callable[[str], Any]) -> tuple[Any, ...]:
-    from lslam.errors import UsageError
-
-    try:
-        return tuple(kind(part) for part in text.split(",") if part.strip())
-    except ValueError:
-        raise UsageError(f"{flag} {text}: numbers with commas between them") from None
-
-
 def _crop(text: str | None) -> tuple[float, float, float] | None:
     from lslam.errors import UsageError
 
     if text is None:
         return None
-    numbers = _numbers("--crop", text, float)
+    numbers = options.numbers("--crop", text, float)
     if len(numbers) != 3:
         raise UsageError(f"--crop {text}: x, y and size in metres, for example 12,-40,20")
     return numbers
@@ -145,20 +136,6 @@ def _truth(path: Path | None, subjects: list[Subject]) -> Trajectory | None:
     if len(subjects) > 1 or subjects[0].path is None:
         raise UsageError(ONE_TRUTH)
     return read_truth(path, open_sequence(subjects[0].path))
-
-
-def _follow(stack: ExitStack) -> Follow:
-    """One progress bar after the other."""
-    from lslam.studies.plan import Follow
-
-    bar = stack.enter_context(ExitStack())
-    advance: list[Any] = []
-
-    def on_start(stage: str, total: int, unit: str) -> None:
-        bar.close()
-        advance[:] = [bar.enter_context(progress(stage, total, unit))]
-
-    return Follow(on_start, lambda note: advance[0](note))
 
 
 def _print(comparison: Comparison, style: str, as_json: bool) -> None:

@@ -23,7 +23,7 @@ def setup_logging(verbose: bool = False, quiet: bool = False) -> None:
     if sys.stderr.isatty():
         from rich.logging import RichHandler
 
-        handler = RichHandler(console=_console(), show_path=False, show_time=False, markup=False, highlighter=None)
+        handler = RichHandler(console=terminal(), show_path=False, show_time=False, markup=False, highlighter=None)
         handler.setFormatter(logging.Formatter("%(message)s"))
     else:
         handler = logging.StreamHandler(sys.stderr)
@@ -37,7 +37,7 @@ def setup_logging(verbose: bool = False, quiet: bool = False) -> None:
 
 
 @cache
-def _console() -> Console:
+def terminal() -> Console:
     """One console for log and bar, so that a warning does not tear the bar apart."""
     from rich.console import Console
 
@@ -107,7 +107,7 @@ def _bar(title: str, total: int, unit: str) -> Iterator[Advance]:
         TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(),
         TextColumn("{task.fields[rate]}"), TimeRemainingColumn(),
     )  # fmt: skip
-    with Progress(*columns, console=_console(), transient=True) as bar:
+    with Progress(*columns, console=terminal(), transient=True) as bar:
         task = bar.add_task(title, total=total, rate="")
         began = time.monotonic()
         done = 0

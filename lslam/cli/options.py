@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable
+import os
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
 from lslam.errors import UsageError
+
+if TYPE_CHECKING:
+    from lslam.studies.engines import Engine
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -90,6 +95,49 @@ def epsg(text: str) -> int:
     if not number.isdigit():
         raise UsageError(f"--crs {text} is no EPSG code: EPSG:25832 is one")
     return int(number)
+
+
+def engine(function: F) -> F:
+    """--jobs, --scheduler and --cluster."""
+    for name, kind, metavar, text in (
+        ("--cluster", str, "local:N", "Make the runs with N workers of Dask on this machine."),
+        (
+            "--scheduler",
+            str,
+            "tcp://HOST:PORT",
+            "Make the runs on the Dask cluster of this scheduler (lslam[cluster]).",
+        ),
+        ("--jobs", int, "N", "Runs at once on this machine, each on a core of its own [default: one per core]."),
+    ):
+        function = click.option(name, type=kind, metavar=metavar, help=text)(function)
+    return function
+
+
+@contextmanager
+def engine_of(given: dict[str, Any], title: str) -> Iterator[Engine]:
+    """What makes the runs, as the options of `engine` say; raises UsageError for what does not go together."""
+    from lslam.studies.engines import Local
+
+    jobs, scheduler, cluster = given["jobs"], given["scheduler"], given["cluster"]
+    if sum(value is not None for value in (jobs, scheduler, cluster)) > 1:
+        raise UsageError("--jobs, --scheduler and --cluster are three ways to make the runs: give one of them")
+    if jobs is not None and jobs < 1:
+        raise UsageError(f"--jobs {jobs}: at least one run at a time")
+    if scheduler is None and cluster is None:
+        yield Local(jobs or os.cpu_count() or 1, title=title)
+        return
+    from lslam.studies.cluster import connected
+
+    with connected(scheduler, cluster, title) as engine:
+        yield engine
+
+
+def numbers(flag: str, text: str, kind: Callable[[str], Any]) -> tuple[Any, ...]:
+    """Numbers with commas between them; raises UsageError naming the flag."""
+    try:
+        return tuple(kind(part) for part in text.split(",") if part.strip())
+    except ValueError:
+        raise UsageError(f"{flag} {text}: numbers with commas between them") from None
 
 
 def as_json(function: F) -> F:

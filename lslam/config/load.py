@@ -36,7 +36,7 @@ def load_config(
     try:
         return Config.model_validate(_over_preset(tree))
     except ValidationError as error:
-        raise ConfigError(_explain(error)) from None
+        raise ConfigError(explain(error)) from None
 
 
 def _over_preset(tree: Tree) -> Tree:
@@ -119,7 +119,7 @@ def _merge(tree: Tree, more: Tree, where: str) -> None:
             tree.setdefault(section, {})[key] = value
 
 
-def _explain(error: ValidationError) -> str:
+def explain(error: ValidationError, where: str = "configuration") -> str:
     """One part per key: what was given and what is wanted, with the nearest of the words that are allowed."""
     parts: dict[str, str] = {}
     for e in error.errors():
@@ -134,4 +134,4 @@ def _explain(error: ValidationError) -> str:
             parts[key] = said
         elif wanted not in parts[key]:
             parts[key] += f", or {wanted}"
-    return "configuration: " + "; ".join(parts.values())
+    return f"{where}: " + "; ".join(parts.values())

@@ -96,6 +96,7 @@ def _add_errors(path: Path, manifest: dict[str, Any], values: dict[str, float]) 
     if drift["available"]:
         values["drift"], values["drift.rotation"] = drift["translation_percent"], drift["rotation_deg_per_100m"]
     values["thesis_rmse"] = score["thesis1"]["thesis_rmse"]
+    values["thesis_angular"] = score["thesis1"]["angular_rmse_deg"]
     values["path"] = score["path_length_m"]
     for key in [key for key, value in values.items() if value is None]:
         del values[key]
@@ -148,7 +149,8 @@ def _for_programs(
         more(f"ate.{name}.{what}", unit) for name in alignments for what, unit in (("max", "m"), ("rotation", "deg"))
     ]
     metrics += [more(f"{rpe_key(*delta)}.rotation", "deg") for delta in deltas]
-    metrics += [more("drift.rotation", "deg/100m"), more("thesis_rmse", "m"), more("path", "m")]
+    metrics += [more("drift.rotation", "deg/100m"), more("thesis_rmse", "m"), more("thesis_angular", "deg")]
+    metrics += [more("path", "m")]
     metrics += [more("map.entropy", "nats"), more("map.plane_variance", "m2")]
     metrics += [more(f"time.{name}.p95", "ms", "time") for name in stages]
     metrics += [more(key, unit, "time") for key, unit in (("time.mean", "ms"), ("time.max", "ms"), ("run_s", "s"))]

@@ -4,23 +4,20 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from pathlib import Path
 
 from lslam.errors import InterruptedRunError, LslamError
 from lslam.evaluation.relative import parse_delta
-from lslam.pipeline.identity import imu_digest, input_digest
-from lslam.readers import open_sequence
-from lslam.readers.raw_drive import with_imu
 from lslam.reports import compare_html, compare_json, compare_table
+from lslam.studies.cells import recorded_cell
 from lslam.studies.collect import IMU, collect_run, metrics_of
 from lslam.studies.drawings import draw
 from lslam.studies.grid import Cell, Job, expand
-from lslam.studies.jobs import finished, run_jobs
+from lslam.studies.jobs import crew_of, finished, run_jobs
 from lslam.studies.paired import TIE_M, compare_pairs, summarise
-from lslam.studies.plan import RESULT, Follow, Plan, check_plan, claim, release
-from lslam.studies.subjects import scans_needed, simulate_once
+from lslam.studies.plan import RESULT, SIMULATED, Follow, Plan, check_plan, claim, release
+from lslam.studies.scenes import Scene, simulate_once
+from lslam.studies.subjects import scans_needed
 from lslam.types.comparison import Comparison, Drawing, RunScore
-from lslam.types.sequence import Sequence as Recording
 
 # More than this many busy cores before the first run, and its times are somebody else's too.
 BUSY = 0.5
@@ -37,19 +34,22 @@ def compare(plan: Plan, follow: Follow | None = None) -> Comparison:
     """
     follow = follow or Follow()
     check_plan(plan)
-    claim(plan)
+    claim(plan.out, RESULT, "comparison", plan.overwrite, plan.resume)
+    if not (plan.out / RESULT).is_file():
+        compare_json.write_running(plan.out / RESULT, plan.command)
     jobs: list[Job] = []
     try:
         jobs = expand(_cells(plan, follow), plan.variants, plan.seeds, plan.out, plan.command)
         kept = set() if plan.overwrite else finished(jobs)
-        run_jobs([job for job in jobs if job.folder not in kept], plan.jobs, follow)
+        left = [job for job in jobs if job.folder not in kept]
+        run_jobs(left, crew_of(plan.jobs, len(left)), follow)
     except KeyboardInterrupt:
         raise InterruptedRunError(
             f"interrupted; {len(finished(jobs))} of {len(jobs) or 'all'} runs are finished in {plan.out}: the same command with "
             "--resume goes on"
         ) from None
     except LslamError:
-        release(plan)
+        release(plan.out, RESULT)
         raise
     scores = [collect_run(job, job.folder in kept) for job in jobs]
     comparison, drawings = _weigh(plan, jobs, scores)
@@ -61,8 +61,13 @@ def compare(plan: Plan, follow: Follow | None = None) -> Comparison:
 
 def _cells(plan: Plan, follow: Follow) -> list[Cell]:
     """Recordings as they are, scenarios simulated once per seed."""
+    needs_imu = any(variant.config.imu.use for variant in plan.variants)
     # What cannot be opened, or has no IMU though one is asked for, is said before anything is simulated.
-    recorded = {s.label: _recorded(s.label, s.path, plan) for s in plan.subjects if s.path is not None}
+    recorded = {
+        s.label: recorded_cell(s.label, s.path, needs_imu=needs_imu, truth=plan.truth, data_root=plan.data_root)
+        for s in plan.subjects
+        if s.path is not None
+    }
     cells = []
     for subject in plan.subjects:
         if subject.scenario is None:
@@ -70,27 +75,11 @@ def _cells(plan: Plan, follow: Follow) -> list[Cell]:
             continue
         for seed in plan.seeds:
             path = simulate_once(
-                subject.scenario, seed, scans_needed([v.config.input for v in plan.variants]), plan.out / "simulated",
+                Scene(subject.scenario, scans_needed([v.config.input for v in plan.variants])), seed, plan.out / SIMULATED,
                 lambda stage, total: follow.on_start(stage, total, "scans"), lambda: follow.on_step(""),
             )  # fmt: skip
-            simulated = open_sequence(path)
-            cells.append(
-                Cell(subject.label, path, seed, input_digest(simulated, None), imu=_imu_of(simulated, plan))
-            )  # fmt: skip
+            cells.append(recorded_cell(subject.label, path, seed, needs_imu=needs_imu))
     return cells
-
-
-def _recorded(label: str, path: Path, plan: Plan) -> Cell:
-    sequence = open_sequence(path)
-    digest = input_digest(sequence, plan.truth)
-    return Cell(label, path, None, digest, plan.truth, _imu_of(sequence, plan), plan.data_root)
-
-
-def _imu_of(sequence: Recording, plan: Plan) -> str:
-    """Digest of the IMU, empty when no run asks for it. Raises InputError when there is none."""
-    if not any(variant.config.imu.use for variant in plan.variants):
-        return ""
-    return imu_digest(with_imu(sequence, plan.data_root))
 
 
 def _notes(scores: Sequence[RunScore]) -> list[str]:

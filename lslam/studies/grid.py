@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from lslam.config import Config
 from lslam.pipeline.identity import job_digest
+from lslam.studies.scenes import Scene
 from lslam.studies.variants import Variant
 
 if TYPE_CHECKING:
@@ -22,6 +23,7 @@ class Cell:
     seed : of the simulation, None for a recording; truth : what replaces the recording's own ground truth
     digest : of the input; imu : likewise of its IMU, empty when no run asks for it
     data_root : where the IMU of a KITTI odometry sequence is looked for
+    scene : what is simulated with `seed` when nothing lies in `path` yet
     """
 
     sequence: str
@@ -31,6 +33,7 @@ class Cell:
     truth: Trajectory | None = None
     imu: str = ""
     data_root: Path | None = None
+    scene: Scene | None = None
 
 
 @dataclass(frozen=True)
@@ -38,7 +41,7 @@ class Job:
     """One run: what a process needs to make it, and `state_file`, where it leaves how it ended.
 
     method : the variant's name, the method of `config` or a preset that says more than a method
-    digest : two jobs of one digest have the same result
+    digest : two jobs of one digest have the same result; scene : as of the cell
     """
 
     sequence: str
@@ -51,6 +54,7 @@ class Job:
     command: str
     truth: Trajectory | None = None
     data_root: Path | None = None
+    scene: Scene | None = None
 
     @property
     def name(self) -> str:
@@ -89,7 +93,7 @@ def expand(
                 jobs.append(
                     Job(
                         cell.sequence, variant.name, seed, cell.path, config, folder, digest, command, cell.truth,
-                        cell.data_root,
+                        cell.data_root, cell.scene,
                     )
                 )  # fmt: skip
     return jobs

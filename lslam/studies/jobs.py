@@ -11,9 +11,9 @@ from pathlib import Path
 
 from lslam.studies.grid import Job
 from lslam.studies.plan import Follow
-from lslam.studies.runner import Task, run_tasks
+from lslam.studies.runner import Crew, Task, run_tasks
 from lslam.studies.states import State, is_reusable, read_state, write_state
-from lslam.studies.worker import execute
+from lslam.studies.worker import Bench, execute
 
 log = logging.getLogger("lslam")
 
@@ -23,44 +23,58 @@ def finished(jobs: Sequence[Job]) -> set[Path]:
     return {job.folder for job in jobs if is_reusable(job.state_file, job.folder, job.digest)}
 
 
-def run_jobs(
-    jobs: Sequence[Job], most_at_once: int, follow: Follow, work: Callable[[Job, int, float], None] = execute
-) -> None:
-    """Run jobs, each in a process of its own, at most `most_at_once` and no more than there are cores.
-
-    Every job then has a state file; a process that died is `crashed`. KeyboardInterrupt ends all that run.
-    """
-    if not jobs:
-        return
+def crew_of(most_at_once: int, count: int, *, is_kept: bool = False, tries: int = 1) -> Crew:
+    """Who makes `count` runs when the user asks for `most_at_once`: no more than there are cores."""
     cores = os.cpu_count() or 1
-    at_once = min(most_at_once, cores, len(jobs))
+    at_once = max(1, min(most_at_once, cores, count))
     if most_at_once > cores:
         log.info(
             "%d jobs are asked for: this machine has %d cores, so %d runs go at once", most_at_once, cores, at_once
         )
+    return Crew(at_once, is_kept, tries)
+
+
+def run_jobs(
+    jobs: Sequence[Job],
+    crew: Crew,
+    follow: Follow,
+    title: str = "comparing",
+    on_done: Callable[[Job], None] = lambda job: None,
+    work: Callable[[Job, Bench], None] = execute,
+) -> None:
+    """Run jobs in processes beside this one; on_done(job) is called here once per job, when its state is there.
+
+    Every job then has a state file; one whose process died is `crashed`. KeyboardInterrupt ends all that run.
+    """
+    if not jobs:
+        return
     load = round(os.getloadavg()[0], 2) if hasattr(os, "getloadavg") else 0.0
+    bench = Bench(crew.at_once, load, crew.at_once == 1 or bool(crew.cores), crew.is_kept)
     for job in jobs:
-        _make_room(job)
-    tasks = [
-        Task(job.name, partial(work, job, at_once, load), job.folder.with_name(f"{job.folder.name}.out"))
-        for job in jobs
-    ]
+        make_room(job)
+    tasks = [Task(job.name, partial(work, job, bench), job.folder.with_name(f"{job.folder.name}.out")) for job in jobs]
 
     def on_end(index: int, cause: str) -> None:
-        job = jobs[index]
-        state = read_state(job.state_file)
-        if state is None:
-            state = State(job.digest, "crashed", cause or "the process left no result", at_once, load)
-            write_state(job.state_file, state)
-        if state.status not in ("done", "degraded"):
-            log.warning("%s %s: %s", job.name, state.status, state.reason)
-        follow.on_step(job.name)
+        settle(jobs[index], cause, bench)
+        on_done(jobs[index])
+        follow.on_step(jobs[index].name)
 
-    follow.on_start("comparing", len(jobs), "runs")
-    run_tasks(tasks, at_once, lambda index: log.debug("%s begins", jobs[index].name), on_end)
+    follow.on_start(title, len(jobs), "runs")
+    run_tasks(tasks, crew, lambda index: log.debug("%s begins", jobs[index].name), on_end)
 
 
-def _make_room(job: Job) -> None:
+def settle(job: Job, cause: str, bench: Bench) -> None:
+    """See to it that a job that was run has a state, and say so when it went wrong."""
+    state = read_state(job.state_file)
+    if state is None:
+        reason = cause or "the process left no result"
+        state = State(job.digest, "crashed", reason, bench.at_once, bench.load, is_alone=bench.is_alone)
+        write_state(job.state_file, state)
+    if state.status not in ("done", "degraded"):
+        log.warning("%s %s: %s", job.name, state.status, state.reason)
+
+
+def make_room(job: Job) -> None:
     """What an earlier attempt left may be no run at all: a folder without a manifest must not stand in the way."""
     if job.folder.is_dir() and not (job.folder / "manifest.json").is_file():
         shutil.rmtree(job.folder, ignore_errors=True)

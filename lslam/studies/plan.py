@@ -1,4 +1,4 @@
-"""What is to be compared, checked before anything runs, and the folder it is written to."""
+"""What is to be compared, checked before anything runs, and the folder a study of any kind is written to."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lslam.errors import OutputError, OutputExistsError, UsageError
-from lslam.reports import compare_json
 from lslam.studies.subjects import Subject
 from lslam.studies.variants import Variant
 from lslam.types.trajectory import Trajectory
 
 RESULT = "compare.json"
+SIMULATED = "simulated"
 ONE_TRUTH = "--gt belongs to one recorded sequence: a scenario has its own, and several need one each"
 
 
@@ -59,24 +59,27 @@ def check_plan(plan: Plan) -> None:
         raise UsageError(f"--jobs {plan.jobs}: at least one run at a time")
     if plan.truth is not None and (len(plan.subjects) > 1 or plan.subjects[0].scenario):
         raise UsageError(ONE_TRUTH)
-    if plan.overwrite and plan.resume:
-        raise UsageError("--overwrite runs everything anew and --resume keeps what is finished: give one of them")
     if plan.crop is not None and not plan.crop[2] > 0:
         raise UsageError(f"--crop: the size of {plan.crop[2]:g} m must be above 0")
     if plan.crop is not None and not all(v.config.map.write for v in plan.variants):
         raise UsageError("--crop needs maps, and map.write is off")
 
 
-def claim(plan: Plan) -> None:
-    """Take the output folder, or say why not; from now on it is a comparison, whatever happens."""
-    out = plan.out
+def claim(out: Path, mark: str, what: str, overwrite: bool, resume: bool) -> None:
+    """Take the output folder, or say why not; the file `mark` tells `what` it is, and is the caller's to write.
+
+    Raises OutputExistsError for a file, a folder of something else, or one that holds runs and neither `overwrite` nor `resume`
+    is set; OutputError when it cannot be used.
+    """
+    if overwrite and resume:
+        raise UsageError("--overwrite runs everything anew and --resume keeps what is finished: give one of them")
     if out.exists() and not out.is_dir():
         raise OutputExistsError(f"output {out} is a file; name a folder with --out")
     try:
         has_something = out.is_dir() and any(out.iterdir())
-        if has_something and not (out / RESULT).is_file():
-            raise OutputExistsError(f"output folder {out} is not a comparison of lslam; name another with --out")
-        if has_something and not (plan.overwrite or plan.resume):
+        if has_something and not (out / mark).is_file():
+            raise OutputExistsError(f"output folder {out} is not a {what} of lslam; name another with --out")
+        if has_something and not (overwrite or resume):
             raise OutputExistsError(
                 f"output folder {out} exists; --resume keeps its finished runs, --overwrite runs all anew, or name "
                 "another with --out"
@@ -84,14 +87,12 @@ def claim(plan: Plan) -> None:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise OutputError(f"output folder {out} cannot be used: {error.strerror or error}") from None
-    if not (out / RESULT).is_file():
-        compare_json.write_running(out / RESULT, plan.command)
 
 
-def release(plan: Plan) -> None:
+def release(out: Path, mark: str) -> None:
     """Leave nothing behind when nothing was begun, so that the command can be given again."""
     with contextlib.suppress(OSError):
-        inside = [path.name for path in plan.out.iterdir()]
-        if inside == [RESULT]:
-            (plan.out / RESULT).unlink()
-            plan.out.rmdir()
+        inside = [path.name for path in out.iterdir()]
+        if inside == [mark]:
+            (out / mark).unlink()
+            out.rmdir()

@@ -1,4 +1,4 @@
-"""Tasks in processes of their own, a few at once: one that dies takes nothing with it but itself."""
+"""Tasks in processes beside this one, a few at once: one that dies takes nothing with it but its task."""
 
 from __future__ import annotations
 
@@ -8,9 +8,11 @@ import os
 import signal
 import sys
 import threading
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from multiprocessing import connection, get_context, parent_process
+from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 
@@ -23,50 +25,113 @@ class Task:
     """work : called without arguments in the process, so it must be picklable; said : file for what the process prints."""
 
     name: str
-    work: Callable[[], None]
+    work: Callable[[], object]
     said: Path
 
 
+@dataclass(frozen=True)
+class Crew:
+    """Which processes do the work.
+
+    at_once : tasks together; is_kept : a process goes on with the next task, on a core of its own where there are enough, so
+        that its kernels stay compiled and its data read; otherwise each task has a new process
+    tries : how often a task is begun whose process died
+    """
+
+    at_once: int
+    is_kept: bool = False
+    tries: int = 1
+
+    @property
+    def cores(self) -> list[int]:
+        """The core of each process; empty when they go where the system puts them."""
+        if not self.is_kept or not hasattr(os, "sched_getaffinity"):
+            return []
+        known = sorted(os.sched_getaffinity(0))
+        return known[: self.at_once] if self.at_once <= len(known) else []
+
+
+@dataclass
+class _Worker:
+    process: BaseProcess
+    pipe: Connection
+    core: int | None
+    index: int = -1
+
+
 def run_tasks(
-    tasks: Sequence[Task], at_once: int, on_start: Callable[[int], None], on_end: Callable[[int, str], None]
+    tasks: Sequence[Task], crew: Crew, on_start: Callable[[int], None], on_end: Callable[[int, str], None]
 ) -> None:
-    """Run every task, at most `at_once` together; on_start(index) and on_end(index, how it died or "") are called here.
+    """Run every task; on_start(index) and, once per task, on_end(index, how its process died or "") are called here.
 
     Processes are spawned, not forked: a fork of a process whose kernels have run is a process that may hang. An exception,
     KeyboardInterrupt included, ends those that run, politely first.
     """
-    waiting = list(range(len(tasks)))[::-1]
-    running: dict[int, tuple[int, BaseProcess]] = {}
+    waiting = deque((index, 1) for index in range(len(tasks)))
+    tries: dict[int, int] = {}
+    idle: list[_Worker] = []
+    busy: list[_Worker] = []
+    cores = deque(crew.cores)
     try:
-        while waiting or running:
-            while waiting and len(running) < at_once:
-                index = waiting.pop()
+        while waiting or busy:
+            while waiting and len(busy) < crew.at_once:
+                index, tries[index] = waiting.popleft()
                 on_start(index)
-                process = _start(tasks[index], at_once)
-                running[process.sentinel] = (index, process)
-            for sentinel in connection.wait(list(running)):
-                assert isinstance(sentinel, int)
-                index, process = running.pop(sentinel)
-                process.join()
-                on_end(index, _cause(process.exitcode, tasks[index].said))
-                process.close()
+                worker = idle.pop() if idle else _hire(crew, cores)
+                worker.index = index
+                busy.append(worker)
+                with contextlib.suppress(OSError):  # it died while it was idle: its pipe says so below
+                    worker.pipe.send(tasks[index])
+            for pipe in connection.wait([worker.pipe for worker in busy]):
+                worker = next(worker for worker in busy if worker.pipe is pipe)
+                busy.remove(worker)
+                cause = _ending(worker, tasks[worker.index].said, crew.is_kept)
+                if cause is None:
+                    idle.append(worker)
+                elif worker.core is not None:
+                    cores.append(worker.core)
+                if cause and tries[worker.index] < crew.tries:
+                    log.warning("%s is begun anew: %s", tasks[worker.index].name, cause)
+                    waiting.append((worker.index, tries[worker.index] + 1))
+                else:
+                    on_end(worker.index, cause or "")
     finally:
-        _end([process for _, process in running.values()])
+        _end([worker.process for worker in [*busy, *idle]])
 
 
-def _start(task: Task, at_once: int) -> BaseProcess:
-    process = get_context("spawn").Process(target=_child, args=(task,), name=f"lslam {task.name}", daemon=False)
-    with _thread_limits(at_once):
+def _hire(crew: Crew, cores: deque[int]) -> _Worker:
+    core = cores.popleft() if cores else None
+    context = get_context("spawn")
+    ours, theirs = context.Pipe()
+    process = context.Process(target=_child, args=(theirs, core), name="lslam worker", daemon=False)
+    with _thread_limits(crew.at_once, core is not None):
         process.start()
-    return process
+    theirs.close()
+    return _Worker(process, ours, core)
+
+
+def _ending(worker: _Worker, said: Path, is_kept: bool) -> str | None:
+    """None when the process is ready for more; otherwise it is gone, and how: empty when it came to its end."""
+    try:
+        worker.pipe.recv()
+        if is_kept:
+            return None
+        worker.pipe.send(None)
+    except (EOFError, OSError):
+        pass  # gone in the middle of its task
+    worker.process.join()
+    cause = _cause(worker.process.exitcode, said)
+    worker.process.close()
+    worker.pipe.close()
+    return cause
 
 
 @contextlib.contextmanager
-def _thread_limits(at_once: int) -> Iterator[None]:
+def _thread_limits(at_once: int, has_core: bool) -> Iterator[None]:
     """What a process that starts now shall know before it imports anything: its share of the cores."""
-    share = str(max(1, (os.cpu_count() or 1) // at_once))
+    share = "1" if has_core else str(max(1, (os.cpu_count() or 1) // at_once))
     limits = {"NUMBA_NUM_THREADS": "1"}
-    if at_once > 1:
+    if at_once > 1 or has_core:
         limits |= dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), share)
     before = {name: os.environ.get(name) for name in limits}
     os.environ.update(limits)
@@ -79,19 +144,29 @@ def _thread_limits(at_once: int) -> Iterator[None]:
                 os.environ[name] = value
 
 
-def _child(task: Task) -> None:
+def _child(pipe: Connection, core: int | None) -> None:
     """In the new process: Ctrl-C is the parent's, which then asks with SIGTERM; results on stdout are the parent's too."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     threading.Thread(target=_follow_parent, daemon=True).start()
+    if core is not None:
+        os.sched_setaffinity(0, {core})
+    try:
+        while (task := pipe.recv()) is not None:
+            _do(task)
+            pipe.send(True)
+    except (KeyboardInterrupt, EOFError):
+        sys.exit(130)
+
+
+def _do(task: Task) -> None:
     task.said.parent.mkdir(parents=True, exist_ok=True)
     with task.said.open("wb") as stream:
         for number in (1, 2):
             os.dup2(stream.fileno(), number)
-    try:
-        task.work()
-    except KeyboardInterrupt:
-        sys.exit(130)
+    task.work()
+    for printed in (sys.stdout, sys.stderr):
+        printed.flush()
     if not task.said.stat().st_size:
         task.said.unlink()
 

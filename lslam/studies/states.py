@@ -17,7 +17,8 @@ class State:
     """status : `done`, `degraded`, `diverged`, `interrupted`, `failed` or `crashed`; reason : one sentence, empty when done.
 
     digest : of the job; jobs : runs that shared the machine; load : of the machine before the first run of the study
-    seconds : of the whole run
+    seconds : of the whole run; is_alone : whether it had a core to itself, as far as the study knows; waited : share of the
+        seconds in which it had none; machine : name of the host
     """
 
     digest: str
@@ -26,6 +27,9 @@ class State:
     jobs: int = 1
     load: float = 0.0
     seconds: float = 0.0
+    is_alone: bool = True
+    waited: float = 0.0
+    machine: str = ""
 
 
 def write_state(path: Path, state: State) -> None:
@@ -39,8 +43,10 @@ def read_state(path: Path) -> State | None:
     """The state; None when there is none that can be read."""
     try:
         tree = json.loads(path.read_text(encoding="utf-8"))
-        numbers = float(tree["load"]), float(tree["seconds"])
-        return State(str(tree["digest"]), str(tree["status"]), str(tree["reason"]), int(tree["jobs"]), *numbers)
+        return State(
+            str(tree["digest"]), str(tree["status"]), str(tree["reason"]), int(tree["jobs"]), float(tree["load"]),
+            float(tree["seconds"]), bool(tree["is_alone"]), float(tree["waited"]), str(tree["machine"]),
+        )  # fmt: skip
     except (OSError, ValueError, KeyError, TypeError):
         return None
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 import logging
 import os
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from lslam.config.input import InputConfig
-from lslam.errors import InputError, OutputExistsError, UsageError, nearest
+from lslam.errors import InputError, UsageError, nearest
 from lslam.readers import open_sequence
 from lslam.readers.lookup import find_folder
 from lslam.simulation.scenario_files import scenario_names
@@ -89,29 +89,3 @@ def scans_needed(configs: Iterable[InputConfig]) -> int | None:
     needed = [None if c.count is None else c.start + (c.count - 1) * c.skip_frames + 1 for c in configs]
     known = [scans for scans in needed if scans is not None]
     return max(known) if len(known) == len(needed) else None
-
-
-def simulate_once(
-    scenario: str, seed: int, scans: int | None, parent: Path, on_start: Callable[[str, int], None],
-    on_step: Callable[[], None],
-) -> Path:  # fmt: skip
-    """The folder of the scenario simulated with `seed` below `parent`; made now unless it is there already.
-
-    It holds what `lslam simulate` writes by default. An interrupted simulation goes on. Raises what `simulate` and `record`
-    raise.
-    """
-    from lslam.simulation.gnss import GnssModel
-    from lslam.simulation.record import record
-    from lslam.simulation.scenarios import simulate
-
-    folder = parent / f"{scenario}-{seed}{'' if scans is None else f'-{scans}'}"
-    sequence = folder / "sequences" / "00"
-    if sequence.is_dir() and (folder / "poses" / "00.txt").is_file():
-        return sequence
-    drive = simulate(scenario, seed=seed, count=scans, imu="icm20948", gnss=GnssModel())
-    on_start(f"simulating {scenario}, seed {seed}", len(drive))
-    try:
-        record(drive, folder, on_scan=lambda _: on_step(), resume=True)
-    except OutputExistsError:
-        record(drive, folder, overwrite=True, on_scan=lambda _: on_step())
-    return sequence

@@ -1,31 +1,55 @@
-"""One job in a process of its own: everything it can end with becomes a state."""
+"""One job in a process beside the study's: everything it can end with becomes a state."""
 
 from __future__ import annotations
 
 import contextlib
 import logging
+import platform
 import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 from lslam.errors import GateError, InterruptedRunError, LslamError, RunFailedError
 from lslam.studies.grid import Job
 from lslam.studies.states import State, write_state
 
+if TYPE_CHECKING:
+    from lslam.studies.kept import KeptSequences
+    from lslam.types.sequence import Sequence
 
-def execute(job: Job, at_once: int, load: float) -> None:
+
+@dataclass(frozen=True)
+class Bench:
+    """What the reader of the times must know.
+
+    at_once : runs that share the machine; load : of the machine before them; is_alone : whether no other run shares its core
+    is_kept : whether the process goes on with other runs of the same data, which it then keeps
+    """
+
+    at_once: int = 1
+    load: float = 0.0
+    is_alone: bool = True
+    is_kept: bool = False
+
+
+def execute(job: Job, bench: Bench) -> None:
     """Run the job into its folder, replacing what is there, and leave its state behind.
 
-    at_once, load : how many runs share the machine, and its load before them, for the reader of the times
     Raises nothing of the run's; KeyboardInterrupt after the state is written, so that the process ends.
     """
     # What the run says is in its log.txt; the screen belongs to the study.
     log = logging.getLogger("lslam")
-    log.addHandler(logging.NullHandler())
+    if not log.handlers:
+        log.addHandler(logging.NullHandler())
     log.propagate = False
     job.state_file.unlink(missing_ok=True)
-    began = time.monotonic()
+    began, waited = time.monotonic(), _waited_s()
     status, reason = "failed", ""
     try:
-        status, reason = _run(job)
+        status, reason = _run(job, bench.is_kept)
     except (KeyboardInterrupt, InterruptedRunError):
         status, reason = "interrupted", "interrupted before its end"
         raise KeyboardInterrupt from None
@@ -38,21 +62,32 @@ def execute(job: Job, at_once: int, load: float) -> None:
     except Exception as error:
         reason = f"lslam made a mistake ({type(error).__name__}: {error})"
     finally:
-        seconds = round(time.monotonic() - began, 3)
-        write_state(job.state_file, State(job.digest, status, reason, at_once, load, seconds))
+        seconds = time.monotonic() - began
+        state = State(
+            job.digest, status, reason, bench.at_once, bench.load, round(seconds, 3), bench.is_alone,
+            round((_waited_s() - waited) / max(seconds, 1e-9), 4), platform.node(),
+        )  # fmt: skip
+        write_state(job.state_file, state)
 
 
-def _run(job: Job) -> tuple[str, str]:
+def _waited_s() -> float:
+    """Seconds that threads of this process were ready to go and had no core; 0 where the system does not say."""
+    waited = 0
+    for path in Path("/proc/self/task").glob("*/schedstat"):
+        with contextlib.suppress(OSError, ValueError, IndexError):  # a thread may end meanwhile
+            waited += int(path.read_text().split()[1])
+    return waited / 1e9
+
+
+def _run(job: Job, is_kept: bool) -> tuple[str, str]:
     """Status and reason of a run that came to its end."""
     from lslam.pipeline.run import run
     from lslam.pipeline.watch import RunOutcome, Watch
-    from lslam.readers import open_sequence
-    from lslam.readers.raw_drive import with_imu
 
     ended: list[RunOutcome] = []
-    sequence = open_sequence(job.path, vertical_correction_deg=job.config.input.vertical_correction_deg)
-    if job.config.imu.use:
-        sequence = with_imu(sequence, job.data_root)
+    correction_deg = job.config.input.vertical_correction_deg
+    key = (job.path, job.data_root, correction_deg, job.config.imu.use, job.config.gnss.mode != "off")
+    sequence = _kept_sequences().get(key, _opening(job)) if is_kept else _opening(job)()
     watch = Watch(on_end=ended.append)
     # A gate of the run's own (input.strict): it is done all the same.
     with contextlib.suppress(GateError):
@@ -62,3 +97,26 @@ def _run(job: Job) -> tuple[str, str]:
         )  # fmt: skip
     manifest = ended[-1].record.manifest
     return str(manifest["status"]), "; ".join(manifest["problems"])
+
+
+def _opening(job: Job) -> Callable[[], Sequence]:
+    from lslam.readers import open_sequence
+    from lslam.readers.raw_drive import with_gnss, with_imu
+    from lslam.studies.scenes import simulate_once
+
+    def opening() -> Sequence:
+        if job.scene is not None:
+            simulate_once(job.scene, job.seed, job.path.parents[2])
+        sequence = open_sequence(job.path, vertical_correction_deg=job.config.input.vertical_correction_deg)
+        if job.config.imu.use:
+            sequence = with_imu(sequence, job.data_root)
+        return sequence if job.config.gnss.mode == "off" else with_gnss(sequence, job.data_root)
+
+    return opening
+
+
+@cache
+def _kept_sequences() -> KeptSequences:
+    from lslam.studies.kept import KeptSequences, ScanStore, memory_bound
+
+    return KeptSequences(ScanStore(memory_bound()))

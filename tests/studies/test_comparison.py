@@ -24,9 +24,11 @@ from lslam.studies.compare import compare
 from lslam.studies.grid import Job
 from lslam.studies.jobs import finished, run_jobs
 from lslam.studies.plan import Follow, Plan, check_plan
+from lslam.studies.runner import Crew
 from lslam.studies.states import read_state
 from lslam.studies.subjects import Subject
 from lslam.studies.variants import find_variants
+from lslam.studies.worker import Bench
 from lslam.types.comparison import Comparison, RunScore
 
 SCANS = 14
@@ -163,6 +165,8 @@ def test_a_folder_that_is_something_else_is_left_alone(plan: Plan, tmp_path: Pat
     with pytest.raises(OutputExistsError, match="not a comparison"):
         compare(replace(plan, out=tmp_path, overwrite=True))
     assert [p.name for p in tmp_path.iterdir()] == ["thesis.tex"]
+    with pytest.raises(UsageError, match="give one of them"):
+        compare(replace(plan, out=tmp_path, overwrite=True, resume=True))
 
 
 @pytest.mark.parametrize(
@@ -171,7 +175,6 @@ def test_a_folder_that_is_something_else_is_left_alone(plan: Plan, tmp_path: Pat
         ({"seeds": (0, 0)}, "--seeds"),
         ({"seeds": ()}, "--seeds"),
         ({"jobs": 0}, "--jobs 0"),
-        ({"overwrite": True, "resume": True}, "give one of them"),
         ({"crop": (0.0, 0.0, -1.0)}, "--crop"),
         (
             {"crop": (0.0, 0.0, 9.0), "variants": tuple(find_variants(METHODS, None, ["map.write=false"]))},
@@ -187,7 +190,7 @@ def test_what_cannot_be_compared_is_said_before_anything_runs(
         check_plan(replace(plan, **change))
 
 
-def die(job: Job, at_once: int, load: float) -> None:
+def die(job: Job, bench: Bench) -> None:
     os.kill(os.getpid(), signal.SIGSEGV)
 
 
@@ -195,7 +198,7 @@ def test_a_process_that_dies_is_a_crashed_job_that_is_tried_again(plan: Plan, tm
     path = plan.subjects[0].path
     assert path is not None
     job = Job("good", "icp", 0, path, plan.variants[0].config, tmp_path / "runs" / "icp-s0", "digest", "")
-    run_jobs([job], 1, Follow(), die)
+    run_jobs([job], Crew(1), Follow(), work=die)
     state = read_state(job.state_file)
     assert state is not None
     assert state.status == "crashed"

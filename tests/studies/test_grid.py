@@ -16,8 +16,9 @@ from lslam.readers import open_sequence
 from lslam.simulation.record import record
 from lslam.simulation.scenarios import simulate
 from lslam.studies.grid import Cell, Job, expand
+from lslam.studies.scenes import Scene, simulate_once
 from lslam.studies.states import State, is_reusable, read_state, write_state
-from lslam.studies.subjects import file_safe, find_subjects, scans_needed, simulate_once
+from lslam.studies.subjects import file_safe, find_subjects, scans_needed
 from lslam.studies.variants import Variant, find_variants
 from lslam.types.trajectory import Trajectory
 
@@ -184,7 +185,9 @@ def test_a_simulation_has_the_scans_that_will_be_used() -> None:
 def test_a_scenario_is_simulated_once(tmp_path: Path) -> None:
     steps: list[str] = []
     made = [
-        simulate_once("block", 3, 2, tmp_path, lambda stage, n: steps.append(stage), lambda: steps.append("scan"))
+        simulate_once(
+            Scene("block", 2), 3, tmp_path, lambda stage, n: steps.append(stage), lambda: steps.append("scan")
+        )
         for _ in range(2)
     ]
     assert made[0] == made[1]

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from lslam.studies.runner import Task, run_tasks
+from lslam.studies.runner import Crew, Task, run_tasks
 
 
 def write_environment(path: Path) -> None:
@@ -53,7 +53,7 @@ def wait_to_be_ended(own: Path) -> None:
 def go(folder: Path, *works: object, at_once: int = 1) -> dict[int, str]:
     tasks = [Task(f"task {i}", work, folder / f"{i}.out") for i, work in enumerate(works)]  # type: ignore[arg-type]
     ended: dict[int, str] = {}
-    run_tasks(tasks, at_once, lambda index: None, lambda index, cause: ended.update({index: cause}))
+    run_tasks(tasks, Crew(at_once), lambda index: None, lambda index, cause: ended.update({index: cause}))
     return ended
 
 
@@ -94,6 +94,49 @@ def test_an_interruption_ends_what_runs(tmp_path: Path) -> None:
     tasks = [Task(f"{i}", partial(wait_to_be_ended, mark), tmp_path / f"{i}.out") for i in range(2)]
     began = time.monotonic()
     with pytest.raises(KeyboardInterrupt):
-        run_tasks(tasks, 2, interrupt_when_started, lambda index, cause: None)
+        run_tasks(tasks, Crew(2), interrupt_when_started, lambda index, cause: None)
     assert mark.read_text() == "ended"
     assert time.monotonic() - began < 60
+
+
+def note(path: Path) -> None:
+    with path.open("a") as stream:
+        stream.write(f"{os.getpid()}\n")
+
+
+def die_the_first_time(path: Path) -> None:
+    note(path)
+    if len(path.read_text().splitlines()) == 1:
+        os.kill(os.getpid(), signal.SIGKILL)
+
+
+def keep(folder: Path, *works: object, tries: int = 2) -> list[tuple[int, str]]:
+    tasks = [Task(f"task {i}", work, folder / f"{i}.out") for i, work in enumerate(works)]  # type: ignore[arg-type]
+    ended: list[tuple[int, str]] = []
+    crew = Crew(1, is_kept=True, tries=tries)
+    run_tasks(tasks, crew, lambda index: None, lambda index, cause: ended.append((index, cause)))
+    return ended
+
+
+def test_a_kept_process_does_one_task_after_the_other(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    assert keep(tmp_path, partial(note, tmp_path / "pids"), chatter, partial(note, tmp_path / "pids")) == [
+        (0, ""), (1, ""), (2, ""),
+    ]  # fmt: skip
+    first, second = (tmp_path / "pids").read_text().split()
+    assert first == second != str(os.getpid())
+    assert (tmp_path / "1.out").read_text() == "on stdout\non stderr\n"
+    assert not (tmp_path / "2.out").exists()
+    assert capfd.readouterr() == ("", "")
+
+
+def test_a_task_whose_process_died_is_begun_once_more_and_ends_once(tmp_path: Path) -> None:
+    ended = keep(tmp_path, partial(die_the_first_time, tmp_path / "a"), kill_itself, partial(note, tmp_path / "b"))
+    assert sorted(ended) == [(0, ""), (1, "the process was killed by SIGKILL (often: out of memory)"), (2, "")]
+    assert len((tmp_path / "a").read_text().split()) == 2
+
+
+def test_kept_processes_have_a_core_each_as_long_as_there_are_enough() -> None:
+    known = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
+    assert Crew(len(known), is_kept=True).cores == known
+    assert Crew(1, is_kept=True).cores == known[:1]
+    assert Crew(len(known) + 1, is_kept=True).cores == Crew(1).cores == []

@@ -1,0 +1,130 @@
+"""`lslam sweep`: sensitivity studies."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+import time
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from lslam.cli import options
+from lslam.cli.console import log, setup_logging, show
+
+if TYPE_CHECKING:
+    from lslam.studies.sweep import Sweep
+    from lslam.types.study import StudyRow
+
+
+@click.command(
+    epilog="\b\nExamples: lslam sweep --list\n"
+    "          lslam sweep skip-frames --dry-run\n"
+    "          lslam sweep STUDY.toml --out runs/shares --jobs 2\n"
+    "          lslam sweep STUDY.toml --out runs/shares --scheduler tcp://node1:8786 --resume"
+)
+@click.argument("study", required=False)
+@click.option("--list", "show_list", is_flag=True, help="List the studies that ship with lslam.")
+@click.option(
+    "--dry-run", is_flag=True, help="List and count the runs, estimate the time by a few short ones, and stop."
+)
+@click.option(
+    "--out", type=click.Path(path_type=Path), metavar="DIR", help="Folder of the study [default: runs/STUDY-TIME]."
+)
+@click.option("--resume", is_flag=True, help="Keep finished runs of the same input and configuration, run the others.")
+@click.option("--overwrite", is_flag=True, help="Run everything anew in an existing folder.")
+@options.engine
+@click.option("--seeds", metavar="N,N,...", help="Instead of the study's.")
+@click.option(
+    "--scenes", type=click.Path(path_type=Path), metavar="DIR",
+    help="Keep simulations here, for other studies of the same scenarios [default: simulated/ in --out].",
+)  # fmt: skip
+@options.data_root
+@click.option(
+    "--set", "settings", multiple=True, metavar="SECTION.KEY=VALUE", help="Set one key in all runs; repeatable."
+)
+@click.option("--strict", is_flag=True, help="Exit 4 when any run failed or diverged.")
+@options.verbosity
+def command(study: str | None, **given: Any) -> None:
+    """Vary parameters over sequences, methods and seeds; every run is a row of results.csv and results.parquet.
+
+    STUDY is a file, or a name of --list. What fails or diverges is a row with its reason.
+    """
+    if given["show_list"]:
+        _print_list()
+        return
+    if study is None:
+        raise click.UsageError("STUDY is missing; for example: lslam sweep skip-frames --dry-run")
+    setup_logging(given["verbose"], given["quiet"])
+    from lslam.errors import GateError
+    from lslam.studies.sweep import run_sweep
+
+    sweep = _sweep(study, given)
+    with options.engine_of(given, "studying") as engine, ExitStack() as stack:
+        from lslam.cli.study_screen import bars, best_so_far
+
+        if given["dry_run"]:
+            _print_plan(sweep, engine.at_once, stack)
+            return
+        on_rows = stack.enter_context(best_so_far())
+        rows = run_sweep(sweep, engine, bars(stack), on_rows)
+    _print(rows)
+    log.info("every run: %s", sweep.out / "results.csv")
+    failed = [row for row in rows if not row.is_usable]
+    if failed and given["strict"]:
+        raise GateError(f"--strict: {len(failed)} of {len(rows)} runs failed, the first one: {failed[0].reason}")
+
+
+def _sweep(word: str, given: dict[str, Any]) -> Sweep:
+    from lslam.config.study import parse_study
+    from lslam.studies.study_files import find_study
+    from lslam.studies.sweep import Sweep
+
+    study = find_study(word)
+    if given["seeds"] is not None:
+        seeds = options.numbers("--seeds", given["seeds"], int)
+        study = parse_study(study.model_dump(exclude_unset=True) | {"seeds": seeds}, "--seeds", study.name)
+    return Sweep(
+        study,
+        given["out"] or Path("runs") / time.strftime(f"{study.name}-%Y%m%d-%H%M%S"),
+        given["settings"],
+        given["overwrite"],
+        given["resume"],
+        given["scenes"],
+        given["data_root"],
+        shlex.join(["lslam", *sys.argv[1:]]),
+    )
+
+
+def _print(rows: list[StudyRow]) -> None:
+    from lslam.reports.grid_text import aligned
+    from lslam.reports.study_best import best_table
+
+    show(aligned(best_table(rows), 2) + "\n")
+
+
+def _print_list() -> None:
+    from lslam.studies.study_files import find_study, study_names
+
+    for name in study_names():
+        show(f"{name:<22}  {find_study(name).summary}\n")
+
+
+def _print_plan(sweep: Sweep, at_once: int, stack: ExitStack) -> None:
+    """Every run, how many there are, and how long those will take that are not finished."""
+    from lslam.cli.study_screen import bars
+    from lslam.studies.estimate import estimate
+    from lslam.studies.sweep import expand_study, left_to_do
+
+    expanded = expand_study(sweep)
+    for job in expanded.jobs:
+        show(f"{job.name}\n")
+    left = left_to_do(sweep, expanded.jobs)
+    many = f"{len(expanded.jobs)} runs, {len(left)} left to do"
+    if not left:
+        show(f"{many}\n")
+        return
+    guess = estimate(left, expanded.contenders, at_once, bars(stack))
+    show(f"{many}: about {guess.text}, {at_once} at once ({guess.pilots} pilot runs)\n")

@@ -1,0 +1,172 @@
+"""A study file: which runs a sensitivity study is made of, and what it is expected to find."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from itertools import product
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import BaseModel, Field, ValidationError, field_validator, model_validator
+
+from lslam.config.finding import Finding
+from lslam.config.load import explain
+from lslam.config.preset_files import read_toml
+from lslam.config.section import Section
+from lslam.errors import ConfigError, nearest
+
+Value = bool | int | float | str
+Point = dict[str, Value]
+# Decimals of a range's values: 0.1 + 0.2 shall be 0.3.
+_DIGITS = 12
+
+
+class Range(Section):
+    """Values from `start` to `stop`, both included, `step` apart or `num` of them."""
+
+    start: int | float = Field(description="first value")
+    stop: int | float = Field(description="last value, reached when a step falls on it")
+    step: int | float | None = Field(None, gt=0, description="distance of two values")
+    num: int | None = Field(None, ge=2, description="number of values, instead of a step")
+    log: bool = Field(False, description="equal ratios instead of equal distances, with `num`")
+
+    @model_validator(mode="after")
+    def _check(self) -> Range:
+        if self.stop < self.start:
+            raise ValueError(f"the range from {self.start} to {self.stop} is empty: stop lies below start")
+        if (self.step is None) == (self.num is None):
+            raise ValueError(f"the range from {self.start} to {self.stop} needs a step or num, one of them")
+        if self.log and (self.num is None or self.start <= 0):
+            raise ValueError(f"the range from {self.start} to {self.stop}: log needs num and a start above 0")
+        return self
+
+    def values(self) -> tuple[int | float, ...]:
+        """All of them; whole numbers when both ends are.
+
+        >>> Range(start=0.1, stop=0.3, step=0.1).values()
+        (0.1, 0.2, 0.3)
+        >>> Range(start=1, stop=100, num=3, log=True).values()
+        (1, 10, 100)
+        """
+        if self.step is not None:
+            count = math.floor((self.stop - self.start) / self.step + 1e-9) + 1
+            values = [self.start + k * self.step for k in range(count)]
+        else:
+            assert self.num is not None
+            shares = [k / (self.num - 1) for k in range(self.num)]
+            if self.log:
+                values = [self.start * (self.stop / self.start) ** share for share in shares]
+            else:
+                values = [self.start + (self.stop - self.start) * share for share in shares]
+        values = [round(value, _DIGITS) for value in values]
+        is_whole = isinstance(self.start, int) and isinstance(self.stop, int)
+        return tuple(int(value) if is_whole and value == int(value) else value for value in values)
+
+
+class StudySequence(Section):
+    """A recording (`path`) or a scenario that is simulated once per seed."""
+
+    path: str = Field("", description="a recording: what `lslam run` takes")
+    scenario: str = Field("", description="or a scenario: a name of `lslam simulate --list` or a .toml file")
+    lidar: str | None = Field(None, description="scenario: the sensor, absent: the scenario's")
+    columns: int | None = Field(None, ge=16, le=8192, description="scenario: firings per scan, absent: the sensor's")
+    count: int | None = Field(None, ge=1, description="scenario: scans, absent: all of its way, or as many as are used")
+    speed: float | None = Field(None, gt=0, description="scenario: m/s, absent: the scenario's")
+    compensated: bool | None = Field(None, description="scenario: scans without motion in them, absent: the scenario's")
+    imu: str = Field("icm20948", description="scenario: the IMU that rides along")
+    settings: tuple[str, ...] = Field((), description='scenario: what else to change, "world.relief=1"')
+
+    @model_validator(mode="after")
+    def _check(self) -> StudySequence:
+        if bool(self.path) == bool(self.scenario):
+            raise ValueError("a sequence is a path or a scenario: give one of them")
+        if self.path and self.model_fields_set - {"path"}:
+            more = ", ".join(sorted(self.model_fields_set - {"path", "scenario"}))
+            raise ValueError(f"{more} belong to a scenario: the recording {self.path} is as it is")
+        return self
+
+
+class StudyConfig(Section):
+    """What is run: sequences x seeds x methods x points of the parameters, and methods beside at their own values."""
+
+    name: str = Field(min_length=1, pattern=r"^[\w.+ -]+$", description="of the study and its folder")
+    summary: str = Field("", description="what is studied, in a line")
+    sequences: tuple[StudySequence, ...] = Field(min_length=1, description="recordings and scenarios")
+    methods: tuple[str, ...] = Field(min_length=1, description="methods, presets or configuration files")
+    beside: tuple[str, ...] = Field((), description="likewise, run once at their own values")
+    imu: Literal["off", "on", "both"] = Field("off", description="without the IMU, with it, or each method both ways")
+    seeds: tuple[int, ...] = Field((0,), min_length=1, description="of simulations, and of methods that draw")
+    grid: Literal["full", "one-way"] = Field(
+        "full", description="all combinations of the parameters' values, or one parameter at a time"
+    )
+    parameters: dict[str, Range | tuple[Value, ...]] = Field(
+        min_length=1, description="by configuration key: a list of values or a range {start, stop, step | num, log}"
+    )
+    config: dict[str, dict[str, Any]] = Field({}, description="sections that hold for all runs, over the presets")
+    finding: tuple[Finding, ...] = Field((), description="what is expected")
+
+    @field_validator("parameters", mode="before")
+    @classmethod
+    def _flatten(cls, tree: Any) -> Any:
+        """`input.skip_frames = [...]` is a table in a table for TOML."""
+        if not isinstance(tree, dict):
+            return tree
+        flat: dict[str, Any] = {}
+        for name, inner in tree.items():
+            if "." not in name and isinstance(inner, dict):
+                flat |= {f"{name}.{key}": values for key, values in inner.items()}
+            else:
+                flat[name] = inner
+        return flat
+
+    @field_validator("parameters")
+    @classmethod
+    def _has_values(cls, parameters: dict[str, Range | tuple[Value, ...]]) -> dict[str, Range | tuple[Value, ...]]:
+        for key, values in parameters.items():
+            listed = values.values() if isinstance(values, Range) else values
+            if not listed:
+                raise ValueError(f"{key} has no values: list at least one")
+            if len(set(listed)) < len(listed):
+                raise ValueError(f"{key} has a value twice")
+        return parameters
+
+    @field_validator("seeds")
+    @classmethod
+    def _differ(cls, seeds: tuple[int, ...]) -> tuple[int, ...]:
+        if len(set(seeds)) < len(seeds) or min(seeds, default=0) < 0:
+            raise ValueError("different whole numbers from 0 are needed")
+        return seeds
+
+    def points(self) -> list[Point]:
+        """Values of the studied parameters, a point per run of a method."""
+        lists = {key: v.values() if isinstance(v, Range) else v for key, v in self.parameters.items()}
+        if self.grid == "one-way":
+            return [{key: value} for key, values in lists.items() for value in values]
+        return [dict(zip(lists, values, strict=True)) for values in product(*lists.values())]
+
+
+def read_study(path: Path) -> StudyConfig:
+    """The study of a file. Raises InputError when it cannot be read, ConfigError naming the key and the nearest known one."""
+    return parse_study(read_toml(path, "study"), str(path), path.stem)
+
+
+def parse_study(tree: dict[str, Any], where: str, name: str) -> StudyConfig:
+    """The study of a TOML tree found in `where`; `name` is what it is called when it does not say."""
+    _check_keys(tree, StudyConfig, where)
+    for sequence in _tables(tree.get("sequences")):
+        _check_keys(sequence, StudySequence, f"{where}: sequences")
+    try:
+        return StudyConfig.model_validate({"name": name, **tree})
+    except ValidationError as error:
+        raise ConfigError(explain(error, where)) from None
+
+
+def _tables(value: Any) -> Sequence[dict[str, Any]]:
+    return [item for item in value if isinstance(item, dict)] if isinstance(value, list) else []
+
+
+def _check_keys(tree: dict[str, Any], model: type[BaseModel], where: str) -> None:
+    for key in tree:
+        if key not in model.model_fields:
+            raise ConfigError(f"{where}: unknown key {key!r}; {nearest(key, model.model_fields)}")

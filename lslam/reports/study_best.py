@@ -1,0 +1,77 @@
+"""The best point of each method so far: what a study shows while it runs and when it ends."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import inf
+
+from lslam.reports.grid_text import Grid
+from lslam.types.study import StudyRow
+
+HEADER = ["sequence", "method", "runs", "failed", "best at", "thesis_rmse, m", "angular, deg", "total, s"]
+
+
+@dataclass(frozen=True)
+class Best:
+    """One method on one sequence: how many runs have ended and failed, and the point with the least mean thesis_rmse.
+
+    point : rows of that point, one per seed; empty when no point is without a failed run
+    """
+
+    sequence: str
+    method: str
+    runs: int
+    failed: int
+    point: tuple[StudyRow, ...]
+
+    def mean(self, name: str) -> float:
+        """Of a number over the seeds."""
+        return float(sum(getattr(row, name) for row in self.point)) / len(self.point)
+
+
+def best_points(rows: Sequence[StudyRow]) -> list[Best]:
+    """One per sequence and method, with and without IMU and beside apart, in the order of the rows."""
+    groups: dict[tuple[str, str], list[StudyRow]] = {}
+    for row in rows:
+        groups.setdefault((row.sequence, label(row)), []).append(row)
+    return [
+        Best(sequence, method, len(group), sum(not row.is_usable for row in group), _best(group))
+        for (sequence, method), group in groups.items()
+    ]
+
+
+def label(row: StudyRow) -> str:
+    """The method as people read it.
+
+    >>> label(StudyRow("", "", "open", 0, "icp", uses_imu=True, is_beside=True))
+    'icp+imu (beside)'
+    """
+    return f"{row.method}{'+imu' if row.uses_imu else ''}{' (beside)' if row.is_beside else ''}"
+
+
+def best_table(rows: Sequence[StudyRow]) -> Grid:
+    """Header and a line per method."""
+    return [HEADER, *(_line(best) for best in best_points(rows))]
+
+
+def _best(rows: Sequence[StudyRow]) -> tuple[StudyRow, ...]:
+    points: dict[str, list[StudyRow]] = {}
+    for row in rows:
+        points.setdefault(repr(row.parameters), []).append(row)
+    best: tuple[StudyRow, ...] = ()
+    least = inf
+    for point in points.values():
+        error = sum(row.thesis_rmse if row.is_usable else inf for row in point) / len(point)
+        if error < least:  # never with nan, without ground truth
+            best, least = tuple(point), error
+    return best
+
+
+def _line(best: Best) -> list[str]:
+    head = [best.sequence, best.method, str(best.runs), str(best.failed)]
+    if not best.point:
+        return [*head, "-", "-", "-", "-"]
+    at = ", ".join(f"{key.partition('.')[2]} {value}" for key, value in best.point[0].parameters.items())
+    errors = [f"{best.mean('thesis_rmse'):.3f}", f"{best.mean('angular_rmse_deg'):.2f}"]
+    return [*head, at or "its own values", *errors, f"{best.mean('total_time_s'):.2f}"]

@@ -1,0 +1,194 @@
+"""Runs on a Dask cluster: workers need lslam and the recordings, or simulate scenarios by themselves; run folders come home."""
+
+from __future__ import annotations
+
+import io
+import logging
+import os
+import shutil
+import tarfile
+import tempfile
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from lslam.errors import InputError, OutputError, RunFailedError, UsageError
+from lslam.studies.engines import simulate_scenes
+from lslam.studies.grid import Job
+from lslam.studies.jobs import make_room, settle
+from lslam.studies.plan import Follow
+from lslam.studies.worker import Bench, execute
+from lslam.version import __version__
+
+log = logging.getLogger("lslam")
+_ANSWER_S, _WORKERS_S = 10, 30
+_LOCAL = "local:"
+# A worker may have several threads, but a run is to have its process alone.
+_ALONE = threading.Lock()
+
+
+@contextmanager
+def connected(scheduler: str | None, local: str | None, title: str) -> Iterator[Cluster]:
+    """The cluster of a scheduler "tcp://host:port", or one of this machine, "local:N".
+
+    Raises UsageError when Dask is missing or `local` is no number of workers; InputError when the scheduler does not answer.
+    """
+    try:
+        import dask
+        from distributed import Client, LocalCluster
+    except ImportError:
+        raise UsageError("--scheduler and --cluster need Dask: pip install 'lslam[cluster]'") from None
+    logging.getLogger("distributed").setLevel(logging.ERROR)
+    if local is not None:
+        count = _count(local)
+        env = {"NUMBA_NUM_THREADS": "1"}
+        with (
+            LocalCluster(
+                count, threads_per_worker=1, dashboard_address=None, silence_logs=logging.CRITICAL, env=env
+            ) as made,
+            Client(made) as client,
+        ):
+            yield Cluster(client, made.scheduler_address, title, is_here=True)
+        return
+    assert scheduler is not None
+    try:
+        with dask.config.set({"distributed.comm.timeouts.connect": f"{_ANSWER_S}s"}):
+            client = Client(scheduler, timeout=_ANSWER_S)
+    except (OSError, ValueError) as error:
+        raise InputError(
+            f"the scheduler {scheduler} does not answer within {_ANSWER_S} s ({type(error).__name__}): is `dask scheduler` "
+            "running there, and its port open?"
+        ) from None
+    with client:
+        yield Cluster(client, scheduler, title)
+
+
+@dataclass(frozen=True)
+class Cluster:
+    """The workers of a scheduler; is_here : they share this machine's disk."""
+
+    client: Any
+    address: str
+    title: str
+    is_here: bool = False
+
+    @property
+    def at_once(self) -> int:
+        """One run per worker."""
+        return max(1, len(self._workers()))
+
+    def prepare(self, jobs: Sequence[Job], follow: Follow) -> None:
+        """See whether the workers can do it, and simulate here what they all can read here.
+
+        Raises InputError naming the worker that lacks lslam, this version of it, or a recording; RunFailedError without any.
+        """
+        try:
+            self.client.wait_for_workers(1, timeout=_WORKERS_S)
+        except TimeoutError:
+            raise RunFailedError(
+                f"the scheduler {self.address} has no workers: start some, `dask worker {self.address} --nthreads 1`"
+            ) from None
+        paths = sorted({str(job.path) for job in jobs if job.scene is None})
+        for worker, answer in self.client.run(_inspect, paths, on_error="return").items():
+            if isinstance(answer, BaseException):
+                raise InputError(f"worker {worker} cannot run lslam: {answer}; install it there")
+            version, missing = answer
+            if version != __version__:
+                raise InputError(f"worker {worker} has lslam {version}, this is {__version__}: install the same there")
+            if missing:
+                raise InputError(
+                    f"worker {worker} does not have {missing[0]}: the recordings must lie there as they do here"
+                )
+        if self.is_here:
+            simulate_scenes(jobs, self.at_once, follow)
+
+    def run(self, jobs: Sequence[Job], follow: Follow, on_done: Callable[[Job], None]) -> None:
+        """Make every run on some worker; the scheduler begins anew what a worker that died had in hand.
+
+        Raises RunFailedError when the scheduler goes away.
+        """
+        from distributed import as_completed
+
+        if not jobs:
+            return
+        for job in jobs:
+            make_room(job)
+        bench = Bench(self.at_once, is_alone=False, is_kept=True)
+        follow.on_start(self.title, len(jobs), "runs")
+        futures = {
+            self.client.submit(perform, job, bench, key=f"lslam-{k}-{job.digest}", pure=False): job
+            for k, job in enumerate(jobs)
+        }
+        try:
+            for number, future in enumerate(as_completed(futures)):
+                job, error = futures[future], future.exception()
+                if future.cancelled() or self.client.status != "running":
+                    raise RunFailedError(
+                        f"the scheduler {self.address} went away after {number} of {len(jobs)} runs: start it, and the same "
+                        "command with --resume goes on"
+                    )
+                if error is None:
+                    unpack(future.result(), job)
+                settle(job, "" if error is None else f"its worker failed: {error}", bench)
+                on_done(job)
+                follow.on_step(job.name)
+                future.release()
+        finally:
+            self.client.cancel(list(futures), force=True)
+
+    def _workers(self) -> dict[str, Any]:
+        return dict(self.client.scheduler_info(n_workers=-1)["workers"])
+
+
+def perform(job: Job, bench: Bench) -> bytes:
+    """On a worker: make the run in a folder of the worker's, which comes home as an archive with its state."""
+    from distributed import get_worker
+
+    own = Path(get_worker().local_directory)
+    path = job.path
+    if job.scene is not None and not path.is_dir():
+        path = own / "scenes" / path.relative_to(path.parents[2])
+    with _ALONE, tempfile.TemporaryDirectory(dir=own) as scratch:
+        execute(replace(job, path=path, folder=Path(scratch) / "run"), bench)
+        return pack(Path(scratch))
+
+
+def pack(folder: Path) -> bytes:
+    """All files of a folder as one archive."""
+    stream = io.BytesIO()
+    with tarfile.open(fileobj=stream, mode="w:gz", compresslevel=1) as archive:
+        for path in sorted(folder.iterdir()):
+            archive.add(path, path.name)
+    return stream.getvalue()
+
+
+def unpack(archive: bytes, job: Job) -> None:
+    """Run folder and state to where the job has them, the state last; raises OutputError."""
+    part = job.folder.with_name(f"{job.folder.name}.part")
+    try:
+        shutil.rmtree(part, ignore_errors=True)
+        part.mkdir(parents=True)
+        with tarfile.open(fileobj=io.BytesIO(archive)) as stream:
+            stream.extractall(part, filter="data")
+        shutil.rmtree(job.folder, ignore_errors=True)
+        if (part / "run").is_dir():
+            os.replace(part / "run", job.folder)
+        os.replace(part / "run.json", job.state_file)
+        shutil.rmtree(part)
+    except OSError as error:
+        raise OutputError(f"{error.filename or job.folder} cannot be written: {error.strerror or error}") from None
+
+
+def _inspect(paths: list[str]) -> tuple[str, list[str]]:
+    """On a worker: its version of lslam, and which paths it does not have."""
+    return __version__, [path for path in paths if not Path(path).exists()]
+
+
+def _count(local: str) -> int:
+    number = local.removeprefix(_LOCAL)
+    if not local.startswith(_LOCAL) or not number.isdigit() or int(number) < 1:
+        raise UsageError(f"--cluster {local}: local:N with N workers, for example local:2")
+    return int(number)

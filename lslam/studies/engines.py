@@ -1,0 +1,85 @@
+"""What makes the runs of a study: processes of this machine, or the workers of a cluster (`cluster`)."""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Protocol
+
+from lslam.studies.grid import Job
+from lslam.studies.jobs import crew_of, run_jobs
+from lslam.studies.plan import Follow
+from lslam.studies.runner import Task, run_tasks
+from lslam.studies.scenes import simulate_once
+
+log = logging.getLogger("lslam")
+
+
+class Engine(Protocol):
+    """Makes runs somewhere, `at_once` of them together."""
+
+    @property
+    def at_once(self) -> int:
+        """Runs made together, at most."""
+        ...
+
+    def prepare(self, jobs: Sequence[Job], follow: Follow) -> None:
+        """Do what several jobs need, once."""
+        ...
+
+    def run(self, jobs: Sequence[Job], follow: Follow, on_done: Callable[[Job], None]) -> None:
+        """Make every run; on_done(job) is called here, once per job, when its state is beside its folder on this machine."""
+        ...
+
+
+@dataclass(frozen=True)
+class Local:
+    """Processes of this machine, `most_at_once` of them, each on a core of its own.
+
+    is_kept : they go on with one run after the other, with kernels compiled and data read; title : of the progress bar
+    """
+
+    most_at_once: int = 1
+    is_kept: bool = True
+    title: str = "studying"
+
+    @property
+    def at_once(self) -> int:
+        """As many as are asked for and there are cores."""
+        return min(self.most_at_once, os.cpu_count() or 1)
+
+    def prepare(self, jobs: Sequence[Job], follow: Follow) -> None:
+        """Simulate what is not there yet, scenarios side by side."""
+        simulate_scenes(jobs, self.most_at_once, follow)
+
+    def run(self, jobs: Sequence[Job], follow: Follow, on_done: Callable[[Job], None]) -> None:
+        """As `run_jobs`; a run whose process died is begun once more."""
+        run_jobs(
+            jobs, crew_of(self.most_at_once, len(jobs), is_kept=self.is_kept, tries=2), follow, self.title, on_done
+        )
+
+
+def simulate_scenes(jobs: Sequence[Job], most_at_once: int, follow: Follow) -> None:
+    """Simulate the scenes of jobs that are not there yet, each in a process of its own.
+
+    What cannot be simulated is tried again by its runs, which then say why they failed.
+    """
+    missing = {job.path: job for job in jobs if job.scene is not None and not job.path.is_dir()}
+    if not missing:
+        return
+    tasks = []
+    for path, job in missing.items():
+        assert job.scene is not None
+        said = path.parents[1].with_name(f"{path.parents[1].name}.out")
+        parent = path.parents[2]
+        tasks.append(Task(f"{job.scene.name} {job.seed}", partial(simulate_once, job.scene, job.seed, parent), said))
+    follow.on_start("simulating", len(tasks), "scenarios")
+
+    def on_end(index: int, cause: str) -> None:
+        log.debug("%s: %s", tasks[index].name, cause or "simulated")
+        follow.on_step(tasks[index].name)
+
+    run_tasks(tasks, crew_of(most_at_once, len(tasks)), lambda index: None, on_end)

@@ -1,0 +1,206 @@
+"""How long a study will take, from short pilot runs of its methods at a few points of their parameters."""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.config.input import InputConfig
+from lslam.errors import RunFailedError
+from lslam.readers import open_sequence
+from lslam.studies.engines import Local
+from lslam.studies.grid import Job
+from lslam.studies.plan import Follow
+from lslam.studies.points import Contender
+from lslam.studies.scenes import drive_of, simulate_once
+from lslam.studies.states import FINAL, read_state
+
+Floats = NDArray[np.float64]
+# Scans of the shorter and the longer pilot: what they differ by is what scans cost, the rest what a run costs by itself.
+_SHORT, _LONG = 12, 36
+# Scans of a recording that are simulated for pilots, at most.
+_SIMULATED = 160
+# A process starts and imports.
+_START_S = 3.0
+
+
+@dataclass(frozen=True)
+class Guess:
+    """seconds : of all runs and simulations; pilots : runs it was made from."""
+
+    seconds: float
+    pilots: int
+
+    @property
+    def text(self) -> str:
+        """For people.
+
+        >>> Guess(5400, 1).text, Guess(200, 1).text, Guess(8.2, 1).text
+        ('1.5 h', '3.3 min', '8 s')
+        """
+        s = self.seconds
+        return f"{s / 3600:.1f} h" if s >= 3600 else f"{s / 60:.1f} min" if s >= 90 else f"{s:.0f} s"
+
+
+@dataclass(frozen=True)
+class _Place:
+    """A recording for pilots; `whole` : scans of the one the study uses; simulation_s : of all its scans."""
+
+    path: Path
+    scans: int
+    whole: int
+    simulation_s: float
+
+
+@dataclass(frozen=True)
+class _Pilot:
+    """A run of the first `scans` scans it uses."""
+
+    job: Job
+    scans: int
+
+
+def estimate(
+    jobs: Sequence[Job], contenders: dict[str, Contender], at_once: int, follow: Follow | None = None
+) -> Guess:
+    """Time that `jobs` will take with `at_once` together; pilots go to a temporary folder.
+
+    Raises RunFailedError when no pilot of a method comes to its end, and what simulating raises.
+    """
+    follow = follow or Follow()
+    seconds, warming_s, pilots = 0.0, 0.0, 0
+    with tempfile.TemporaryDirectory(prefix="lslam-pilots-") as folder:
+        places = _places(jobs, Path(folder), follow)
+        for number, members in enumerate(_groups(jobs, contenders)):
+            place = places[members[0].sequence]
+            names = list(dict.fromkeys(job.method for job in members))
+            X = _coordinates([contenders[name] for name in names])
+            first = {job.method: job for job in members}
+            made = [
+                _pilots(first[names[k]], place, Path(folder) / f"{number}-{k}") for k in _chosen(X)
+            ]  # fmt: skip
+            flat = [made[0][0], *(pilot for pair in made for pilot in pair)]
+            times = _run(flat, follow)
+            pilots += len(flat)
+            warming_s += max(times[0] - times[1], 0.0)
+            base, per_scan = _costs(made, times[1:])
+            for name, cost in zip(names, _at(X, X[_chosen(X)], base, per_scan), strict=True):
+                scans = used(place.whole, first[name].config.input)
+                seconds += sum(job.method == name for job in members) * float(cost[0] + cost[1] * scans)
+        simulation_s = sum(places[job.sequence].simulation_s for job in _to_simulate(jobs))
+    # One simulation already keeps two cores busy.
+    simulation_s /= max(1, at_once // 2)
+    return Guess(_START_S + simulation_s + warming_s + seconds / at_once, pilots)
+
+
+def used(scans: int, config: InputConfig) -> int:
+    """Scans of a recording that a run uses.
+
+    >>> used(20, InputConfig(start=1, skip_frames=4)), used(20, InputConfig(count=3))
+    (5, 3)
+    """
+    left = len(range(config.start, scans, config.skip_frames))
+    return left if config.count is None else min(left, config.count)
+
+
+def _groups(jobs: Sequence[Job], contenders: dict[str, Contender]) -> list[list[Job]]:
+    """Runs that differ in parameters and seeds alone."""
+    groups: dict[object, list[Job]] = {}
+    for job in jobs:
+        c = contenders[job.method]
+        groups.setdefault((job.sequence, c.method, c.uses_imu, c.is_beside), []).append(job)
+    return list(groups.values())
+
+
+def _to_simulate(jobs: Sequence[Job]) -> list[Job]:
+    """One job per scene that is not there yet."""
+    return list({job.path: job for job in jobs if job.scene is not None and not job.path.is_dir()}.values())
+
+
+def _places(jobs: Sequence[Job], folder: Path, follow: Follow) -> dict[str, _Place]:
+    places: dict[str, _Place] = {}
+    for job in jobs:
+        if job.sequence in places:
+            continue
+        if job.scene is None or job.path.is_dir():
+            scans = len(open_sequence(job.path))
+            places[job.sequence] = _Place(job.path, scans, scans, 0.0)
+            continue
+        whole = len(drive_of(job.scene, job.seed))
+        part = replace(job.scene, scans=min(whole, _SIMULATED))
+        began = time.monotonic()
+        path = simulate_once(
+            part, job.seed, folder, lambda stage, total: follow.on_start(stage, total, "scans"),
+            lambda: follow.on_step(""),
+        )  # fmt: skip
+        assert part.scans is not None
+        places[job.sequence] = _Place(path, part.scans, whole, (time.monotonic() - began) * whole / part.scans)
+    return places
+
+
+def _coordinates(points: Sequence[Contender]) -> Floats:
+    """(P, K) studied values from 0 to 1; of what is no number, its place in the list."""
+    columns = []
+    for key in points[0].parameters:
+        values = [point.parameters.get(key, 0) for point in points]
+        if not all(isinstance(value, (int, float)) for value in values):
+            values = [list(dict.fromkeys(values)).index(value) for value in values]
+        x = np.array(values, np.float64)
+        columns.append((x - x.min()) / max(float(np.ptp(x)), 1e-12))
+    return np.column_stack(columns) if columns else np.zeros((len(points), 0))
+
+
+def _chosen(X: Floats) -> list[int]:
+    """Points nearest to the corners and the middle, each once."""
+    wanted = [*product((0.0, 1.0), repeat=X.shape[1]), (0.5,) * X.shape[1]]
+    return list(dict.fromkeys(int(np.argmin(np.sum((X - np.array(w)) ** 2, axis=1))) for w in wanted))
+
+
+def _pilots(job: Job, place: _Place, folder: Path) -> list[_Pilot]:
+    """The short one and the long one."""
+    most = used(place.scans, job.config.input)
+    long = min(_LONG, most)
+    pilots = []
+    for scans in (max(1, min(_SHORT, long // 2)), long):
+        config = job.config.model_copy(
+            update={"input": job.config.input.model_copy(update={"count": scans})}
+        )  # fmt: skip
+        pilot = replace(job, path=place.path, config=config, scene=None, folder=folder / str(scans))
+        pilots.append(_Pilot(pilot, scans))
+    return pilots
+
+
+def _run(pilots: Sequence[_Pilot], follow: Follow) -> list[float]:
+    """Seconds of each; the first one pays for what is loaded and compiled."""
+    jobs = [replace(p.job, folder=p.job.folder.with_name(f"{k}-{p.scans}")) for k, p in enumerate(pilots)]
+    Local(title="pilot runs").run(jobs, follow, lambda job: None)
+    states = [read_state(job.state_file) for job in jobs]
+    failed = next((state for state in states if state is None or state.status not in FINAL), None)
+    if failed is not None:
+        raise RunFailedError(f"a pilot run of {jobs[0].name} failed, so the time is not known: {failed.reason}")
+    return [state.seconds for state in states if state is not None]
+
+
+def _costs(made: Sequence[Sequence[_Pilot]], times: Sequence[float]) -> tuple[Floats, Floats]:
+    """(P,) s per run and (P,) s per scan of the pairs of pilots."""
+    t = np.array(times).reshape(len(made), 2)
+    n = np.array([[pilot.scans for pilot in pair] for pair in made], np.float64)
+    per_scan = (t[:, 1] - t[:, 0]) / np.maximum(n[:, 1] - n[:, 0], 1)
+    # A pause of the machine may hide what scans cost, but they are never free.
+    per_scan = np.maximum(per_scan, 0.3 * t[:, 1] / n[:, 1])
+    return np.maximum(t[:, 1] - per_scan * n[:, 1], 0), per_scan
+
+
+def _at(X: Floats, known: Floats, base: Floats, per_scan: Floats) -> Floats:
+    """(N, 2) costs at points X, linear in the studied values and within what was measured."""
+    values = np.column_stack([base, per_scan])
+    ones = [np.column_stack([np.ones(len(x)), x]) for x in (known, X)]
+    fitted = ones[1] @ np.linalg.lstsq(ones[0], values, rcond=None)[0]
+    return np.asarray(np.clip(fitted, values.min(axis=0), values.max(axis=0)))

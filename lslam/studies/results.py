@@ -1,0 +1,84 @@
+"""The rows of a study on their way to results.csv and results.parquet."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import nan
+from pathlib import Path
+
+from lslam.formats.study_csv import read_study_csv, write_study_csv
+from lslam.formats.study_parquet import write_study_parquet
+from lslam.studies.collect import collect_run
+from lslam.studies.grid import Job
+from lslam.studies.points import Contender
+from lslam.studies.states import State, read_state
+from lslam.types.study import StudyRow
+
+RESULTS = "results.csv"
+PARQUET = "results.parquet"
+# Data stay read from one run to the next, so reading is no part of a run's time.
+_NOT_TIMED = ("read",)
+# A run that waited longer for its core was held up by somebody.
+_MOST_WAITED = 0.05
+
+
+class Results:
+    """Rows of finished runs in the order of the study; the files are whole at any moment."""
+
+    def __init__(self, study: str, out: Path, jobs: Sequence[Job], contenders: dict[str, Contender]) -> None:
+        self.study, self.out, self.contenders = study, out, contenders
+        self._order = {job.folder: k for k, job in enumerate(jobs)}
+        self._rows: dict[int, StudyRow] = {}
+
+    @property
+    def rows(self) -> list[StudyRow]:
+        """Of all runs that have ended."""
+        return [self._rows[k] for k in sorted(self._rows)]
+
+    def check(self) -> None:
+        """Raise InputError when the files are there and another version of lslam wrote them."""
+        if (self.out / RESULTS).is_file():
+            read_study_csv(self.out / RESULTS)
+
+    def add(self, jobs: Sequence[Job]) -> None:
+        """Take up the runs of jobs that have ended and write the files; raises OutputError."""
+        for job in jobs:
+            self._rows[self._order[job.folder]] = self._row(job)
+        write_study_csv(self.out / RESULTS, self.rows)
+        write_study_parquet(self.out / PARQUET, self.rows)
+
+    def _row(self, job: Job) -> StudyRow:
+        score, contender = collect_run(job), self.contenders[job.method]
+        state = read_state(job.state_file) or State(job.digest, score.status)
+        values, scans = score.values, int(score.values.get("scans", 0))
+        stages_ms = {name: 1e3 * seconds for name, seconds in score.stages.items() if name not in _NOT_TIMED}
+        return StudyRow(
+            run=f"{job.sequence}/{job.folder.name}",
+            study=self.study,
+            sequence=job.sequence,
+            seed=job.seed,
+            method=contender.method,
+            uses_imu=contender.uses_imu,
+            parameters=contender.parameters,
+            is_beside=contender.is_beside,
+            status=score.status,
+            reason=score.reason or score.note,
+            thesis_rmse=values.get("thesis_rmse", nan),
+            ate_se3=values.get("ate.se3", nan),
+            ate_origin=values.get("ate.origin", nan),
+            angular_rmse_deg=values.get("thesis_angular", nan),
+            scans=scans,
+            stages_ms=stages_ms,
+            total_time_s=sum(stages_ms.values()) * scans / 1e3 if stages_ms else nan,
+            run_s=state.seconds,
+            bridged_share=values["bridged"] / scans if scans else nan,
+            is_timing_comparable=is_comparable(state),
+            digest=job.digest,
+            machine=state.machine,
+            folder=job.folder.relative_to(self.out).as_posix(),
+        )
+
+
+def is_comparable(state: State) -> bool:
+    """Whether the times of a run are its own: a core to itself, which nobody else took away."""
+    return state.is_alone and state.waited <= _MOST_WAITED

@@ -1,0 +1,98 @@
+"""Study files: what they expand to, and what is wrong with them in one sentence."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from lslam.config.study import Range, StudyConfig, parse_study, read_study
+from lslam.errors import ConfigError, InputError
+
+TEXT = """
+methods = ["icp"]
+sequences = [{ scenario = "block", columns = 512 }, { path = "seq07" }]
+[parameters]
+input.skip_frames = { start = 1, stop = 5, step = 2 }
+"preprocess.random_share" = [0.3, 1]
+"""
+
+
+def study(tmp_path: Path, text: str = TEXT) -> StudyConfig:
+    path = tmp_path / "mine.toml"
+    path.write_text(text)
+    return read_study(path)
+
+
+def test_parameters_make_a_full_grid_the_last_one_innermost(tmp_path: Path) -> None:
+    points = study(tmp_path).points()
+    assert points[:2] == [
+        {"input.skip_frames": 1, "preprocess.random_share": 0.3}, {"input.skip_frames": 1, "preprocess.random_share": 1},
+    ]  # fmt: skip
+    assert len(points) == 6
+    assert [p["input.skip_frames"] for p in points[::2]] == [1, 3, 5]
+
+
+def test_one_way_varies_one_parameter_at_a_time(tmp_path: Path) -> None:
+    points = study(tmp_path, 'grid = "one-way"\n' + TEXT).points()
+    assert [list(point) for point in points] == [["input.skip_frames"]] * 3 + [["preprocess.random_share"]] * 2
+
+
+def test_a_study_is_called_like_its_file_unless_it_has_a_name(tmp_path: Path) -> None:
+    assert study(tmp_path).name == "mine"
+    assert study(tmp_path, 'name = "yours"\n' + TEXT).name == "yours"
+
+
+@pytest.mark.parametrize(
+    ("given", "values"),
+    [
+        ({"start": 0.1, "stop": 1.0, "step": 0.1}, [0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0]),
+        ({"start": 1, "stop": 6, "step": 2}, [1, 3, 5]),
+        ({"start": 0.0, "stop": 1.0, "num": 3}, [0.0, 0.5, 1.0]),
+        ({"start": 0.1, "stop": 10.0, "num": 3, "log": True}, [0.1, 1.0, 10.0]),
+        ({"start": 1, "stop": 1, "step": 1}, [1]),
+    ],
+)
+def test_ranges_hold_both_ends_and_round_numbers(given: dict[str, Any], values: list[float]) -> None:
+    made = Range(**given).values()
+    assert list(made) == values
+    assert [type(v) for v in made] == [type(v) for v in values]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "sentence"),
+    [
+        ("stop = 5", "stop = 0", r"mine\.toml.*from 1 to 0 is empty: stop lies below start"),
+        ("step = 2", "log = true, step = 1", "log needs num"),
+        ("step = 2", "step = 2, num = 3", "a step or num, one of them"),
+        ("step = 2", "step = 0", "greater than 0"),
+        ("[0.3, 1]", "[]", r"preprocess\.random_share has no values"),
+        ("[0.3, 1]", "[0.3, 0.3]", "has a value twice"),
+        ('["icp"]', "[]", "methods"),
+        ("methods =", "method =", "unknown key 'method'; did you mean 'methods'"),
+        ("columns = 512", "colums = 512", "sequences: unknown key 'colums'; did you mean 'columns'"),
+        ('path = "seq07"', 'path = "seq07", speed = 3', "speed belong to a scenario"),
+        ('path = "seq07"', "speed = 3.0", "a path or a scenario"),
+        ("methods =", "seeds = [1, 1]\nmethods =", "different whole numbers from 0"),
+        ("methods =", 'name = "a/b"\nmethods =', "name"),
+        ("methods =", "parameters = 3\nmethods =", "not valid TOML"),
+    ],
+)
+def test_what_is_no_study_is_said_in_one_sentence(tmp_path: Path, old: str, new: str, sentence: str) -> None:
+    assert old in TEXT
+    with pytest.raises(ConfigError, match=sentence) as caught:
+        study(tmp_path, TEXT.replace(old, new))
+    assert "\n" not in str(caught.value).split("not valid TOML")[0]
+
+
+def test_parameters_are_a_table_with_something_in_it() -> None:
+    tree = {"methods": ["icp"], "sequences": [{"path": "x"}]}
+    for parameters in (3, {}):
+        with pytest.raises(ConfigError, match="mine: parameters"):
+            parse_study({**tree, "parameters": parameters}, "mine", "mine")
+
+
+def test_a_file_that_is_not_there_is_said(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"study .*none\.toml cannot be read"):
+        read_study(tmp_path / "none.toml")

@@ -1,0 +1,58 @@
+"""Data that stay read: read once, forgotten within bounds, and never another run's notes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from lslam.simulation.scenarios import SimulatedDrive, simulate
+from lslam.studies.kept import KeptSequences, ScanStore, memory_bound, size_of
+from lslam.types.scan import Scan
+
+
+@pytest.fixture(scope="module")
+def drive() -> SimulatedDrive:
+    return simulate("block", count=4, lidar="sample")
+
+
+def test_a_scan_is_read_once_until_it_must_make_room(drive: SimulatedDrive, monkeypatch: pytest.MonkeyPatch) -> None:
+    scans = [drive.scan(i) for i in range(4)]
+    read: list[int] = []
+
+    def scan(index: int) -> Scan:
+        read.append(index)
+        return scans[index]
+
+    monkeypatch.setattr(drive, "scan", scan)
+    store = ScanStore(sum(size_of(s) for s in scans[:3]) + 10)
+    sequence = KeptSequences(store).get("drive", lambda: drive)
+    assert [sequence.scan(i) is scans[i] for i in (0, 1, 0, 2, 0)] == [True] * 5
+    assert read == [0, 1, 2]
+    sequence.scan(3)  # 1 was used least lately
+    sequence.scan(0)
+    sequence.scan(1)
+    assert read == [0, 1, 2, 3, 1]
+    assert store.bytes <= store.most_bytes
+
+
+def test_a_sequence_is_opened_once_and_each_run_has_notes_of_its_own(drive: SimulatedDrive) -> None:
+    kept = KeptSequences(ScanStore(10**9))
+    opened: list[int] = []
+
+    def opening() -> SimulatedDrive:
+        opened.append(1)
+        return drive
+
+    first = kept.get("drive", opening)
+    first.notes.append("about this run")
+    second = kept.get("drive", opening)
+    other = kept.get("another", opening)
+    assert len(opened) == 2
+    assert second.notes == drive.notes == []
+    assert len(second) == 4
+    assert np.array_equal(second.scan(1).points, drive.scan(1).points)
+    assert other.scan(1) is not second.scan(1)
+
+
+def test_memory_is_bounded_by_what_is_free() -> None:
+    assert 0 < memory_bound() <= 2 * 10**9

@@ -1,0 +1,56 @@
+"""The studies that ship: the first thesis' chapter 5.3, each as package data and as a copy to start from."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from lslam.errors import UsageError
+from lslam.studies.study_files import find_study, study_names
+from lslam.studies.sweep import Expanded, Sweep, expand_study
+
+ROOT = Path(__file__).resolve().parents[2]
+# Points of each study x (without and with the IMU), beside ones aside.
+RUNS = {
+    "grid-step": 15 * 2, "inlier-distance": 10 * 4, "inlier-ratio": 10, "map-voxel": 15 * 2, "planar-points": 20 * 2,
+    "share": 10 * 2, "share-skip": 4 * 4, "skip-frames": 20 * 2 * 2,
+}  # fmt: skip
+
+
+def expanded(name: str) -> Expanded:
+    return expand_study(Sweep(find_study(name), Path("out")))
+
+
+@pytest.mark.parametrize("name", RUNS)
+def test_each_study_has_its_runs_on_the_open_flight_and_the_defaults_beside(name: str) -> None:
+    found = expanded(name)
+    stand = {c.variant.name: c for c in found.contenders.values()}
+    studied = [job for job in found.jobs if not stand[job.method].is_beside]
+    assert len(studied) == 3 * RUNS[name]
+    assert len(found.jobs) > len(studied)
+    assert len({job.digest for job in found.jobs}) == len(found.jobs)
+    for job in found.jobs:
+        assert job.scene is not None
+        assert (job.scene.scenario, job.scene.columns, job.config.map.write) == ("open", 512, False)
+        assert bool(job.config.odometry.preset) is not stand[job.method].is_beside
+
+
+def test_every_study_states_what_the_thesis_found() -> None:
+    assert study_names() == tuple(sorted(RUNS))
+    for name in study_names():
+        study = find_study(name)
+        assert study.summary.startswith("first thesis, 5.3.")
+        assert study.finding
+        assert all(finding.source.startswith("first thesis") for finding in study.finding)
+
+
+def test_copies_to_start_from_are_the_same() -> None:
+    for name in study_names():
+        shipped = ROOT / "lslam" / "studies" / "ready" / f"{name}.toml"
+        assert (ROOT / "sample_data" / "studies" / f"{name}.toml").read_bytes() == shipped.read_bytes()
+
+
+def test_a_name_that_is_nothing_is_answered_with_the_nearest() -> None:
+    with pytest.raises(UsageError, match="did you mean 'skip-frames'"):
+        find_study("skip-frame")

@@ -1,0 +1,183 @@
+"""A small study from its file to its rows: run, kept, resumed after a kill, failing in parts and as a whole."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from lslam.config.study import StudyConfig, parse_study
+from lslam.errors import ConfigError, InputError, OutputExistsError, RunFailedError, UsageError
+from lslam.formats.study_csv import read_study_csv
+from lslam.studies.engines import Local
+from lslam.studies.estimate import estimate, used
+from lslam.studies.plan import Follow
+from lslam.studies.results import is_comparable
+from lslam.studies.states import State
+from lslam.studies.study_files import find_study
+from lslam.studies.sweep import Expanded, Sweep, expand_study, run_sweep
+from lslam.types.study import StudyRow
+
+TREE: dict[str, Any] = {
+    "sequences": [{"scenario": "block", "lidar": "sample", "columns": 256, "count": 16}],
+    "methods": ["icp"],
+    "beside": ["kiss-icp"],
+    "seeds": [3],
+    "parameters": {"input": {"skip_frames": [1, 2]}, "preprocess.source_voxel": [0.8, 1.2]},
+    "config": {"loops": {"use": False}, "preprocess": {"downsample": "grid"}},
+}
+NAMES = [
+    "icp-skip_frames_1-source_voxel_0.8", "icp-skip_frames_1-source_voxel_1.2", "icp-skip_frames_2-source_voxel_0.8",
+    "icp-skip_frames_2-source_voxel_1.2", "beside-kiss-icp",
+]  # fmt: skip
+
+
+def study(**changes: Any) -> StudyConfig:
+    return parse_study(TREE | changes, "tiny.toml", "tiny")
+
+
+@pytest.fixture(scope="module")
+def scenes(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("scenes")
+
+
+@pytest.fixture(scope="module")
+def sweep(tmp_path_factory: pytest.TempPathFactory, scenes: Path) -> Sweep:
+    return Sweep(study(), tmp_path_factory.mktemp("study") / "out", scenes=scenes)
+
+
+@pytest.fixture(scope="module")
+def made(sweep: Sweep) -> list[StudyRow]:
+    seen: list[int] = []
+    rows = run_sweep(sweep, Local(1), on_rows=lambda rows: seen.append(len(rows)))
+    assert seen == [0, 1, 2, 3, 4, 5], "rows come one by one"
+    return rows
+
+
+def test_every_point_is_a_row_with_its_values_and_numbers(made: list[StudyRow], sweep: Sweep) -> None:
+    assert [row.run for row in made] == [f"block/{name}-s3" for name in NAMES]
+    assert [(row.method, row.is_beside, row.seed) for row in made] == [("icp", False, 3)] * 4 + [("kiss-icp", True, 3)]
+    assert made[2].parameters == {"input.skip_frames": 2, "preprocess.source_voxel": 0.8}
+    assert made[4].parameters == {}
+    assert [row.scans for row in made] == [16, 16, 8, 8, 16]
+    for row in made:
+        assert row.status in ("done", "degraded"), row.reason
+        assert 0 < row.thesis_rmse < row.ate_origin < 1
+        assert "read" not in row.stages_ms
+        assert row.total_time_s == pytest.approx(row.time_per_scan_ms * row.scans / 1e3)
+        assert row.total_time_s < row.run_s
+        assert (sweep.out / row.folder / "manifest.json").is_file()
+        assert not list((sweep.out / row.folder).glob("map.*"))
+
+
+def test_files_hold_the_same_rows(made: list[StudyRow], sweep: Sweep) -> None:
+    assert [repr(row) for row in read_study_csv(sweep.out / "results.csv")] == [repr(row) for row in made]
+    assert (sweep.out / "results.parquet").stat().st_size > 0
+    again = find_study(str(sweep.out / "study.toml"))
+    assert again == sweep.study
+
+
+def test_kept_data_and_processes_change_nothing(made: list[StudyRow], sweep: Sweep, tmp_path: Path) -> None:
+    """The last of the runs, made anew in a process of its own."""
+    one = replace(sweep, out=tmp_path / "one", study=study(parameters={"input.skip_frames": [2]}, beside=[]))
+    one = replace(one, settings=("preprocess.source_voxel=1.2",))
+    (row,) = run_sweep(one, Local(1, is_kept=False))
+    assert row.digest == made[3].digest
+    first, second = (out / r.folder / "trajectory.tum" for out, r in ((one.out, row), (sweep.out, made[3])))
+    assert first.read_bytes() == second.read_bytes()
+
+
+def test_a_study_that_grew_runs_only_what_is_new(made: list[StudyRow], sweep: Sweep, tmp_path: Path) -> None:
+    out = tmp_path / "copy"
+    shutil.copytree(sweep.out, out)
+    with pytest.raises(OutputExistsError, match="--resume keeps"):
+        run_sweep(replace(sweep, out=out), Local(1))
+    grown = study(parameters={"input.skip_frames": [1, 2, 4], "preprocess.source_voxel": [0.8]})
+    steps: list[str] = []
+    rows = run_sweep(replace(sweep, study=grown, out=out, resume=True), Local(1), Follow(on_step=steps.append))
+    assert steps == ["block icp-skip_frames_4-source_voxel_0.8 seed 3"]
+    assert [row.parameters.get("input.skip_frames") for row in rows] == [1, 2, 4, None]
+    assert repr(rows[0]) == repr(made[0])
+
+
+def test_what_fails_is_a_row_with_its_reason(sweep: Sweep, tmp_path: Path) -> None:
+    """The first scan of the second run lies beyond the recording."""
+    partly = study(parameters={"input.start": [0, 99]}, beside=[])
+    rows = run_sweep(replace(sweep, study=partly, out=tmp_path / "out"), Local(1))
+    assert [(row.status, row.is_diverged) for row in rows] == [("done", False), ("failed", False)]
+    assert "beyond the last scan" in rows[1].reason
+    wholly = study(parameters={"input.start": [98, 99]}, beside=[])
+    with pytest.raises(RunFailedError, match=r"all 2 runs failed, the first one: .*--start 98 is beyond the last scan"):
+        run_sweep(replace(sweep, study=wholly, out=tmp_path / "none"), Local(1))
+    assert len(read_study_csv(tmp_path / "none" / "results.csv")) == 2
+
+
+def test_results_of_another_version_are_not_mixed(sweep: Sweep, made: list[StudyRow], tmp_path: Path) -> None:
+    shutil.copytree(sweep.out, tmp_path / "out")
+    file = tmp_path / "out" / "results.csv"
+    file.write_text(file.read_text().replace("\n1,", "\n0,"))
+    with pytest.raises(InputError, match="written by another version of lslam"):
+        run_sweep(replace(sweep, out=tmp_path / "out", resume=True), Local(1))
+
+
+@pytest.mark.parametrize(
+    ("changes", "error", "sentence"),
+    [
+        ({"parameters": {"input.skip_frame": [1]}}, ConfigError, "study tiny, input.skip_frame = 1: .*mean 'skip_frames'"),
+        ({"parameters": {"preprocess.random_share": [0.5, 2]}}, ConfigError, "random_share = 2: .*less than or equal to 1"),
+        ({"methods": ["ipc"]}, UsageError, "no method or preset 'ipc'; did you mean 'icp'"),
+        ({"beside": ["lom"]}, UsageError, "did you mean 'loam'"),
+        ({"methods": ["loam"], "parameters": {"registration.inlier_ratio": [0.5]}}, UsageError, "does nothing with method loam"),
+        ({"sequences": [{"scenario": "opn"}]}, UsageError, "did you mean 'open'"),
+        ({"sequences": [{"path": "nowhere"}]}, InputError, "nowhere"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_studied_is_said_before_anything_runs(
+    changes: dict[str, Any], error: type[Exception], sentence: str, tmp_path: Path
+) -> None:
+    with pytest.raises(error, match=sentence):
+        run_sweep(Sweep(study(**changes), tmp_path / "out"), Local(1))
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_same_scenario_seen_otherwise_is_another_sequence(tmp_path: Path) -> None:
+    two = study(sequences=[{"scenario": "block", "columns": n} for n in (256, 512)], imu="both", beside=[])
+    expanded: Expanded = expand_study(Sweep(two, tmp_path / "out"))
+    assert {job.sequence for job in expanded.jobs} == {"block", "block-2"}
+    assert (
+        len({job.folder for job in expanded.jobs})
+        == len({job.digest for job in expanded.jobs})
+        == len(expanded.jobs)
+        == 16
+    )
+    assert {(c.method, c.uses_imu) for c in expanded.contenders.values()} == {("icp", False), ("icp", True)}
+
+
+def test_the_time_is_estimated_from_short_runs(sweep: Sweep, tmp_path: Path) -> None:
+    jobs = expand_study(replace(sweep, study=study(beside=[], parameters={"input.skip_frames": [1, 2]})))
+    guess = estimate(jobs.jobs, jobs.contenders, 1)
+    assert guess.pilots == 5
+    assert 0.1 < guess.seconds < 120
+    twice = estimate(jobs.jobs * 40, jobs.contenders, 1)
+    assert twice.seconds > 5 * (guess.seconds - 3)
+
+
+def test_an_estimate_says_what_no_pilot_survives(sweep: Sweep) -> None:
+    jobs = expand_study(replace(sweep, study=study(beside=[], parameters={"input.start": [99]})))
+    with pytest.raises(RunFailedError, match=r"a pilot run of .* failed, so the time is not known: .*beyond the last"):
+        estimate(jobs.jobs, jobs.contenders, 1)
+
+
+@pytest.mark.parametrize(
+    ("is_alone", "waited", "expected"), [(True, 0.0, True), (True, 0.2, False), (False, 0.0, False)]
+)
+def test_times_are_comparable_of_runs_that_had_a_core(is_alone: bool, waited: float, expected: bool) -> None:
+    assert is_comparable(State("", "done", is_alone=is_alone, waited=waited)) is expected
+
+
+def test_scans_used_are_those_a_run_counts(made: list[StudyRow], sweep: Sweep) -> None:
+    for job, row in zip(expand_study(sweep).jobs, made, strict=True):
+        assert used(16, job.config.input) == row.scans
