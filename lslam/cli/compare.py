@@ -102,7 +102,7 @@ def _plan(sequences: tuple[str, ...], given: dict[str, Any]) -> Plan:
     return Plan(
         subjects=tuple(subjects),
         variants=tuple(variants),
-        seeds=options.numbers("--seeds", given["seeds"], int),
+        seeds=options.seeds_of(given["seeds"]),
         out=given["out"] or Path("runs") / time.strftime("compare-%Y%m%d-%H%M%S"),
         jobs=given["jobs"],
         truth=_truth(given["gt"], subjects),
@@ -115,14 +115,10 @@ def _plan(sequences: tuple[str, ...], given: dict[str, Any]) -> Plan:
 
 
 def _crop(text: str | None) -> tuple[float, float, float] | None:
-    from lslam.errors import UsageError
-
     if text is None:
         return None
-    numbers = options.numbers("--crop", text, float)
-    if len(numbers) != 3:
-        raise UsageError(f"--crop {text}: x, y and size in metres, for example 12,-40,20")
-    return numbers
+    x, y, size = options.numbers("--crop", text, (3,), "x, y and size in metres, for example 12,-40,20")
+    return x, y, size
 
 
 def _truth(path: Path | None, subjects: list[Subject]) -> Trajectory | None:

@@ -132,12 +132,12 @@ def engine_of(given: dict[str, Any], title: str) -> Iterator[Engine]:
         yield engine
 
 
-def numbers(flag: str, text: str, kind: Callable[[str], Any]) -> tuple[Any, ...]:
-    """Numbers with commas between them; raises UsageError naming the flag."""
+def seeds_of(text: str) -> tuple[int, ...]:
+    """The numbers of --seeds; raises UsageError when they are none."""
     try:
-        return tuple(kind(part) for part in text.split(",") if part.strip())
+        return tuple(int(part) for part in text.split(",") if part.strip())
     except ValueError:
-        raise UsageError(f"{flag} {text}: numbers with commas between them") from None
+        raise UsageError(f"--seeds {text}: whole numbers with commas between them") from None
 
 
 def as_json(function: F) -> F:

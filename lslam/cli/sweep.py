@@ -84,7 +84,7 @@ def _sweep(word: str, given: dict[str, Any]) -> Sweep:
 
     study = find_study(word)
     if given["seeds"] is not None:
-        seeds = options.numbers("--seeds", given["seeds"], int)
+        seeds = options.seeds_of(given["seeds"])
         study = parse_study(study.model_dump(exclude_unset=True) | {"seeds": seeds}, "--seeds", study.name)
     return Sweep(
         study,

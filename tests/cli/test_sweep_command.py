@@ -92,7 +92,7 @@ def test_strict_makes_a_failed_run_exit_4(file: Path, tmp_path: Path) -> None:
         (("FILE", "--jobs", "0"), 2, "--jobs 0: at least one run"),
         (("FILE", "--jobs", "1", "--cluster", "local:2"), 2, "give one of them"),
         (("FILE", "--cluster", "two"), 2, "local:N with N workers"),
-        (("FILE", "--seeds", "a"), 2, "--seeds a: numbers with commas"),
+        (("FILE", "--seeds", "a"), 2, "--seeds a: whole numbers with commas"),
         (("FILE", "--seeds", "1,1"), 2, "different whole numbers from 0"),
         (("FILE", "--overwrite", "--resume"), 2, "give one of them"),
         (("FILE", "--set", "input.skip=3"), 2, "unknown key input.skip"),
