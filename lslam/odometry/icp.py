@@ -72,7 +72,6 @@ class Icp(Stateful):
             T_world_lidar=result.T_world_lidar,
             status="ok" if result.ok else "bridged",
             reason=result.reason,
-            registration_covariance=result.covariance,
             converged=result.converged,
             iterations=result.iterations,
             source_points=result.source_points,
@@ -88,9 +87,8 @@ class Icp(Stateful):
         """Enter the scan into the local map where `register` put it."""
         began = time.perf_counter()
         self.registration.update(self._points, self._located)
-        covariance = self._uncertainty.add(self._located)
-        stages = {**result.stages, "update": time.perf_counter() - began}
-        return replace(result, covariance=covariance, stages=stages)
+        result = self._uncertainty.stamped(result, self._located, prior)
+        return replace(result, stages={**result.stages, "update": time.perf_counter() - began})
 
     def restart(self) -> None:
         """An empty map."""

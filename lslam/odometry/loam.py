@@ -91,7 +91,6 @@ class Loam(Stateful):
             T_world_lidar=result.T_world_lidar,
             status="ok" if result.ok else "bridged",
             reason=result.reason,
-            registration_covariance=result.covariance,
             converged=result.converged,
             iterations=result.iterations,
             source_points=result.source_points,
@@ -108,8 +107,8 @@ class Loam(Stateful):
         clock = StageClock()
         with clock.stage("update"):
             self.registration.update(self._features, self._located)
-            covariance = self._uncertainty.add(self._located)
-        return replace(result, covariance=covariance, stages={**result.stages, **clock.seconds})
+            result = self._uncertainty.stamped(result, self._located, prior)
+        return replace(result, stages={**result.stages, **clock.seconds})
 
     def warm_up(self) -> None:
         """Register a small room with a throw-away copy, well and badly: every kernel is compiled or loaded."""

@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.geometry import so3
+from lslam.geometry import noise
 from lslam.registration.solver import RegistrationResult
+from lslam.registration.sweep_doubt import MEMORY, SweepDoubt
+from lslam.types.motion_prior import MotionPrior
+from lslam.types.scan_result import ScanResult
 from lslam.types.state import Stateful
 
 Floats = NDArray[np.float64]
+
+# The first sweep is deskewed by the velocity at its end, off by a T: twice as far as the later ones (`sweep_doubt`), squared.
+FIRST = 4.0
 
 
 class PoseUncertainty(Stateful):
@@ -22,29 +30,47 @@ class PoseUncertainty(Stateful):
     moves all later positions. A sensor that stands still does not drift.
 
     From scan to scan there is no such map: every registration's error enters in full.
+
+    Scans that were deskewed carry the doubt about their motion into the map likewise; that of the first scan, at whose start
+    the world begins, is in all others.
     """
 
-    STATE = ("_map", "_position")
+    STATE = ("_map", "_position", "_start", "_sweep")
 
     def __init__(self, *, is_scan_to_scan: bool = False) -> None:
         self.is_scan_to_scan = is_scan_to_scan
         self._map = np.zeros((6, 6))
         self._position: Floats | None = None
+        # Where the world begins, until it is known how wrong the first sweep was.
+        self._start: Floats | None = None
+        self._sweep = SweepDoubt()
 
-    def add(self, result: RegistrationResult) -> Floats | None:
+    def stamped(self, result: ScanResult, located: RegistrationResult, prior: MotionPrior) -> ScanResult:
+        """The result of a scan that `prior` deskewed, with the covariances of its pose in the world and on the map."""
+        sweep = self._sweep.observe(prior, result.stamp_ns, located.T_world_lidar, located.ok)
+        own = None if located.covariance is None else located.covariance + sweep
+        return replace(result, covariance=self.add(located, sweep), registration_covariance=own)
+
+    def add(self, result: RegistrationResult, sweep: Floats | None = None) -> Floats | None:
         """(6, 6) covariance of the pose, t' = t + d[:3], R' = exp(d[3:]) R in world axes, m2 and rad2.
 
+        sweep : (6, 6) of it that comes from the motion within the sweep, none when absent
         A failed registration adds its own doubt to its own pose only: the next good one is tied to the map again.
         """
         if result.covariance is None:
             return None
+        sweep = np.zeros((6, 6)) if sweep is None else sweep
+        own = result.covariance + sweep
         position = result.T_world_lidar[:3, 3]
-        step = np.zeros(3) if self._position is None else position - self._position
+        if self._position is None:
+            self._position = self._start = position.copy()
+        step = position - self._position
         self._position = position.copy()
-        transport = np.eye(6)
-        transport[:3, 3:] = -so3.hat(step)
-        self._map = transport @ self._map @ transport.T
+        self._map = noise.transported(self._map, step)
         if result.ok:
             renewed = float(np.linalg.norm(step)) / max(result.lever_arm, 1.0)
-            self._map += (1.0 if self.is_scan_to_scan else renewed) * result.covariance
-        return np.asarray(self._map + result.covariance)
+            self._map += (1.0 if self.is_scan_to_scan else renewed) * own
+        begun = np.zeros((6, 6)) if self._start is None else noise.transported(FIRST * sweep, position - self._start)
+        if self._sweep.scans == MEMORY and self._start is not None:
+            self._map, self._start, begun = self._map + begun, None, np.zeros((6, 6))
+        return np.asarray(self._map + begun + own)

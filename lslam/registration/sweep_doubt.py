@@ -1,0 +1,69 @@
+"""How far the pose at scan start may be off because nobody knows how the sensor moved within the sweep.
+
+A sweep of T seconds is deskewed by one velocity, that of the way to it, and registration finds its middle. Under a constant
+acceleration `a` the start is then off by a T^2 / 6 (half the sweep at a velocity that is wrong by a T / 2, less what the
+bend of the true motion gives back), and the points by as much (rms). The next scan tells how wrong the velocity was: it lies
+a T^2 / 2 from where the sweep's motion leads. A rattling car changes its velocity from scan to scan, so it is the mean
+square over the last scans that says what the next is worth.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.geometry import noise, se3
+from lslam.types.motion_prior import MotionPrior
+from lslam.types.state import Stateful
+
+Floats = NDArray[np.float64]
+
+# Scans over which the change of the motion is averaged: a second.
+MEMORY = 10
+# m/s2 and rad/s2, what a sensor is taken to do before anything is known: a car brakes, a hand turns.
+USUAL = np.repeat([3.0, 1.0], 3)
+# Lessons that outweigh the assumption that no direction is special: there are six of them.
+DIRECTIONS = 6
+
+
+class SweepDoubt(Stateful):
+    """Learns from successive scans how wrong the motion is by which they were deskewed."""
+
+    STATE = ("_mean", "scans", "_stamp_ns", "_pose", "_within", "_span_s")
+
+    def __init__(self) -> None:
+        self.scans = 0  # that said something, `MEMORY` at most
+        self._mean = np.zeros((6, 6))
+        self._stamp_ns: int | None = None
+        self._pose = np.eye(4)
+        self._within = np.eye(4)
+        self._span_s = 0.0
+
+    def observe(self, prior: MotionPrior, stamp_ns: int, pose: Floats, is_registered: bool) -> Floats:
+        """(6, 6) covariance, world axes, of the pose (4, 4) found at `stamp_ns` for the scan that `prior` deskewed.
+
+        Zero for scans of one instant. A pose that no registration stands behind teaches nothing, nor does the one after it.
+        """
+        step_s = 0.0 if self._stamp_ns is None else 1e-9 * (stamp_ns - self._stamp_ns)
+        if is_registered and self._span_s > 0 and step_s > 0:
+            self._learn(se3.relative(self._pose, pose), step_s)
+        # The first sweep was deskewed by where the second scan was found: that agrees by itself.
+        self._span_s = float(prior.times[-1]) if is_registered and self._stamp_ns is not None else 0.0
+        self._stamp_ns, self._pose = stamp_ns, pose.copy()
+        self._within = se3.relative(prior.start, prior.poses[-1])
+        if len(prior.times) < 2:
+            return np.zeros((6, 6))
+        if self.scans == 0:
+            return np.diag((USUAL * float(prior.times[-1]) ** 2 / 6.0) ** 2)
+        alike = np.repeat([np.trace(self._mean[:3, :3]) / 3, np.trace(self._mean[3:, 3:]) / 3], 3)
+        share = self.scans / (self.scans + DIRECTIONS)
+        return noise.rotated(share * self._mean + (1.0 - share) * np.diag(alike), pose[:3, :3])
+
+    def _learn(self, moved: Floats, step_s: float) -> None:
+        """From the motion (4, 4) found over `step_s` seconds since the last scan."""
+        expected = se3.exp(se3.log(self._within) * step_s / self._span_s)
+        share = min(self._span_s / step_s, 1.0)
+        # Of a dt^2 - a T dt / 2, by which the next scan is missed, the part a (T dt / 4 - T^2 / 12).
+        off = share * (3.0 - share) / (12.0 - 6.0 * share) * se3.log(se3.relative(expected, moved))
+        self.scans = min(self.scans + 1, MEMORY)
+        self._mean = self._mean + (np.outer(off, off) - self._mean) / self.scans
