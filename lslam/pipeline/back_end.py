@@ -15,16 +15,19 @@ from numpy.typing import NDArray
 
 from lslam.config import Config
 from lslam.errors import GraphError
-from lslam.geometry import se3
+from lslam.geometry import se2, se3
+from lslam.graph.factors import PLANAR
 from lslam.graph.floors import on_one_plane
 from lslam.graph.odometry import corrected, fitness_covariance, odometry_constraints
 from lslam.graph.pose_graph import optimise
 from lslam.graph.problem import PoseGraph, Solution
 from lslam.keyframes.store import KeyframeStore
+from lslam.pipeline.building_pass import correct_buildings
 from lslam.pipeline.georeferencing import Placement, place
 from lslam.pipeline.graph_inputs import floor_planes, up_directions, world_up
 from lslam.pipeline.osm_pass import Located, finish, locate
 from lslam.pipeline.osm_source import OsmSource
+from lslam.types.building_correction import CorrectedMap
 from lslam.types.building_match import OsmMatches
 from lslam.types.constraint import Constraint, LoopCandidate, Turn
 from lslam.types.georeference import Georeference
@@ -44,7 +47,8 @@ class BackEnd:
     georeference : where the world of `results` lies on the Earth, None when that is not known
     T_final_odometry : (4, 4) from the world of odometry into that of `results`
     solution : the graph's, None where the poses are not its own
-    osm : what walls and buildings had to do with each other, None without a map that could be used
+    osm : what walls and buildings had to do with each other, None without a map that could be used; buildings : of that map,
+        where they really stand
     facts : for the manifest; problems : what could not be done, one sentence each
     """
 
@@ -56,6 +60,7 @@ class BackEnd:
     T_final_odometry: Floats = field(default_factory=lambda: np.eye(4))
     solution: Solution | None = None
     osm: OsmMatches | None = None
+    buildings: CorrectedMap | None = None
     facts: dict[str, Any] = field(default_factory=dict)
     problems: list[str] = field(default_factory=list)
 
@@ -125,7 +130,10 @@ def _on_buildings(
     out = _solved(_on_map(graph, located, config), candidates, results, store, config, problems, georeference)
     if out is None or out.solution is None:
         return None
-    return replace(out, osm=finish(located, extract, out.keyframes, out.solution, config.osm))
+    matches = finish(located, extract, out.keyframes, out.solution, config.osm)
+    covariances = out.solution.covariances[:, PLANAR][:, :, PLANAR]
+    buildings = correct_buildings(matches, se2.of_se3(out.keyframes), covariances, config.osm)
+    return replace(out, osm=matches, buildings=buildings)
 
 
 def _solved(

@@ -60,7 +60,7 @@ def optimise_poses(
         record.trajectory = to_trajectory(done.results, record.method)
     record.loops, record.keyframe_scans = done.candidates, np.array([k.scan for k in store.keyframes], np.int64)
     record.georeference, record.T_final_odometry = done.georeference, done.T_final_odometry
-    record.osm = done.osm
+    record.osm, record.buildings = done.osm, done.buildings
     manifest.problems += done.problems
     manifest.graph = dict(done.facts)
     return done

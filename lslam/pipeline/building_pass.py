@@ -4,10 +4,15 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.config.osm import OsmConfig
+from lslam.formats.buildings_geojson import write_corrected
+from lslam.formats.osm_corrections import corrected_osm
+from lslam.formats.osm_files import OsmData, write_osm
 from lslam.graph.building_graph import BuildingSolution, MapBelief, solve_buildings
 from lslam.priors.map_changes import absent_buildings, new_walls
 from lslam.priors.overlap import Untangled, remove_overlaps
@@ -17,23 +22,25 @@ from lslam.types.building_match import BuildingMatch, OsmMatches
 log = logging.getLogger("lslam")
 Floats = NDArray[np.float64]
 
+BUILDINGS_GEOJSON, BUILDINGS_OSM = "buildings.geojson", "buildings.osm"
+
 # m and rad; by which a building moves that may only move with all others.
 TOGETHER = np.array([1e-3, 1e-3, 1e-5])
 
 
 def correct_buildings(
-    matches: OsmMatches, poses: NDArray[np.float64], covariances: NDArray[np.float64], mode: str, belief: MapBelief
+    matches: OsmMatches, poses: NDArray[np.float64], covariances: NDArray[np.float64], config: OsmConfig
 ) -> CorrectedMap:
     """The buildings of `matches` at their real places.
 
     Parameters
     ----------
     poses : (K, 3) x, y (m), yaw (rad) of all keyframes in the map frame; covariances : (K, 3, 3) of them
-    mode : `prior` trusts the map and moves nothing, `rigid` moves all buildings together, others each by itself
-    belief : what the map is trusted with
+    config : `mode` says what moves: nothing (`prior`), all buildings together (`rigid`), each by itself (the others)
 
     Absent buildings follow the others, as those nobody saw do.
     """
+    mode, belief = config.mode, map_belief(matches, config)
     place = dict(enumerate(poses))
     local = [m for m in matches.local if m.verdict == "accepted" and m.keyframe in place]
     middles = np.array([b.middle for b in matches.buildings]).reshape(-1, 2)
@@ -65,6 +72,22 @@ def correct_buildings(
         counts["seen"], counts["unseen"], counts["absent"], len(corrected.new_walls),
     )  # fmt: skip
     return corrected
+
+
+def map_belief(matches: OsmMatches, config: OsmConfig) -> MapBelief:
+    """What the map is trusted with: its shift as the trajectory has it, its buildings as the configuration says."""
+    sigma = np.array([config.building_sigma, config.building_sigma, np.radians(config.building_sigma_deg)])
+    common = np.minimum(matches.shift_sigma, max(config.shift_sigma, float(TOGETHER[0])))
+    return MapBelief(matches.shift, np.maximum(common, TOGETHER[:2]), sigma)
+
+
+def write_buildings(folder: Path, found: CorrectedMap, data: OsmData) -> None:
+    """buildings.geojson, and buildings.osm to open in an editor: the elements of `data` at their real places.
+
+    Raises OutputError when they cannot be written.
+    """
+    write_corrected(folder / BUILDINGS_GEOJSON, found)
+    write_osm(folder / BUILDINGS_OSM, corrected_osm(data, found))
 
 
 def _status(used: int, is_gone: bool) -> BuildingStatus:

@@ -14,7 +14,7 @@ from lslam.config import Config
 from lslam.config.osm import OsmConfig
 from lslam.errors import InputError, UsageError
 from lslam.formats.osm_buildings import BuildingExtract, some_buildings_of
-from lslam.formats.osm_files import read_osm
+from lslam.formats.osm_files import OsmData, read_osm
 from lslam.priors.osm_map import OsmMap
 from lslam.types.sequence import Sequence
 
@@ -27,7 +27,11 @@ ANOTHER_TOWN = 10e3
 
 
 class OsmSource(Protocol):
-    """Gives the buildings of a run once its place on the Earth is known."""
+    """Gives the buildings of a run once its place on the Earth is known; `data` is what they were read from."""
+
+    @property
+    def data(self) -> OsmData:
+        """Nodes, ways and relations."""
 
     def extract(self, origin: Floats) -> BuildingExtract:
         """The buildings in the local frame at `origin` (3,) lat, lon (deg), height (m)."""
@@ -37,7 +41,7 @@ class OsmFile:
     """The buildings of one file; another town's are refused before odometry begins."""
 
     def __init__(self, path: Path, origin: Floats) -> None:
-        self._path, self._data = path, read_osm(path)
+        self._path, self.data = path, read_osm(path)
         away = OsmMap(self.extract(origin).buildings).distance(np.zeros(2))
         if away > ANOTHER_TOWN:
             raise InputError(
@@ -47,7 +51,7 @@ class OsmFile:
 
     def extract(self, origin: Floats) -> BuildingExtract:
         """Its buildings in the local frame at `origin` (3,)."""
-        return some_buildings_of(self._data, origin, self._path)
+        return some_buildings_of(self.data, origin, self._path)
 
 
 def start_of(sequence: Sequence, config: Config) -> Floats:

@@ -17,6 +17,7 @@ from lslam.odometry.given import GivenPoses
 from lslam.pipeline import outputs
 from lslam.pipeline.back_end import BackEnd
 from lslam.pipeline.back_end_pass import level_world, optimise_poses, write_back_end
+from lslam.pipeline.building_pass import write_buildings
 from lslam.pipeline.check import check_config
 from lslam.pipeline.checkpoints import OdometryCheckpoints
 from lslam.pipeline.choose import choose_scans
@@ -147,6 +148,8 @@ def _fill(folder: RunFolder, job: _Job, goes_on: bool) -> tuple[RunRecord, Evalu
     checkpoints = odometry_checkpoints(folder, job.config, goes_on)
     record, done, evaluation = _solve(job, store, folder.path, checkpoints)
     write_back_end(folder.path, record, store, done)
+    if job.osm is not None and record.buildings is not None:
+        write_buildings(folder.path, record.buildings, job.osm.data)
     outputs.write_trajectories(folder, record, job.sequence.calibration)
     outputs.write_scans(folder, record)
     try:

@@ -29,7 +29,7 @@ OURS = (
     MANIFEST, "config.toml", "log.txt", "trajectory.tum", "trajectory_kitti.txt", "covariances.npz", "map.ply",
     "map.pcd", "map.las", "map.laz", "map.json", "map_mesh.ply", "feature_map.ply", "trajectory.geojson",
     "occupancy.npz", "occupancy.ply", "floor_plan.png", "floor_plan.yaml", "evaluation.json",
-    "trajectory_odometry.tum", "loops.csv", "graph.g2o",
+    "trajectory_odometry.tum", "loops.csv", "graph.g2o", "osm_matches.csv", "buildings.geojson", "buildings.osm",
     "timing.csv", "scans.csv", "report.html",
 )  # fmt: skip
 

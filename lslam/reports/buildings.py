@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,12 +17,31 @@ from lslam.reports.plots import Figure
 from lslam.types.building import Building
 from lslam.types.building_correction import BuildingCorrection, CorrectedMap
 from lslam.types.building_match import KeyframeMatch, OsmMatches
+from lslam.types.run_record import RunRecord
 
 Floats = NDArray[np.float64]
 
 MOST_WALLS = 2500  # drawn; the page stays small
 MOST_ROWS = 60
 AROUND = 30.0  # m round the way that are drawn
+
+
+@dataclass(frozen=True)
+class BuildingPages:
+    """Figures and tables of the section."""
+
+    figures: list[Figure]
+    tables: list[Table]
+
+
+def building_pages(record: RunRecord) -> BuildingPages | None:
+    """The section of a run that was held by a map; None of others."""
+    if record.osm is None or record.buildings is None:
+        return None
+    poses = se2.of_se3(record.trajectory.poses[record.keyframe_scans])
+    return BuildingPages(
+        building_figures(record.buildings, record.osm, poses), building_tables(record.buildings, record.osm)
+    )
 
 
 def building_figures(found: CorrectedMap, matches: OsmMatches, poses: NDArray[np.float64]) -> list[Figure]:

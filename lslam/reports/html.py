@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from lslam.formats.atomic import atomic_write
 from lslam.reports import plots
 from lslam.reports.back_end import back_end_figures
+from lslam.reports.buildings import building_pages
 from lslam.reports.facts import RunFacts, run_facts
 from lslam.reports.metrics import counted, metres, metric_tables
 from lslam.reports.png import data_uri, density_png
@@ -67,6 +68,7 @@ def render_report(record: RunRecord, evaluation: Evaluation | None) -> str:
         errors=plots.error_figures(evaluation) if evaluation is not None else [],
         tables=metric_tables(evaluation) if evaluation is not None else [],
         map_figure=_map_figure(record),
+        buildings=building_pages(record),
         time=plots.time_figure(record, facts) if facts.stages else None,
         share_bar=plots.share_bar(facts) if facts.stages else "",
         registration=plots.registration_figures(record),

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.types.building_correction import CorrectedMap
 from lslam.types.building_match import OsmMatches
 from lslam.types.constraint import LoopCandidate, Turn
 from lslam.types.georeference import Georeference
@@ -28,7 +29,8 @@ class RunRecord:
     odometry : the trajectory before the pose graph, in its own world, None when there was no back end; T_final_odometry
         : (4, 4) from that world into the trajectory's
     turns : of the IMU between keyframes, when the graph is to have them
-    osm : what walls seen and buildings of a map had to do with each other, None without a map that could be used
+    osm : what walls seen and buildings of a map had to do with each other, None without a map that could be used; buildings :
+        of that map, where they really stand
     loops : candidates with verdicts, between keyframes; keyframe_scans : (K,) position of each one's scan in `results`
     """
 
@@ -52,3 +54,4 @@ class RunRecord:
     keyframe_scans: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
     georeference: Georeference | None = None
     osm: OsmMatches | None = None
+    buildings: CorrectedMap | None = None

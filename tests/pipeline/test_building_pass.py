@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -9,7 +11,6 @@ from shapely import Polygon
 
 from lslam.config.osm import OsmConfig
 from lslam.geometry import se2
-from lslam.graph.building_graph import MapBelief
 from lslam.pipeline.building_pass import correct_buildings
 from lslam.priors.wall_match import match_walls
 from lslam.priors.walls import walls_of
@@ -18,8 +19,9 @@ from lslam.types.building_correction import CorrectedMap
 from lslam.types.building_match import BuildingMatch, KeyframeMatch, OsmMatches
 
 Floats = NDArray[np.float64]
+Mode = Literal["prior", "rigid", "non-rigid", "two-level"]
 
-BELIEF = MapBelief(np.zeros(2), np.full(2, 2.0), np.array([1.0, 1.0, np.radians(2.0)]))
+SIGMA = np.array([1.0, 1.0, np.radians(2.0)])
 
 
 def house(k: int, x: float, y: float, width: float, depth: float) -> Building:
@@ -57,7 +59,7 @@ def scene(seed: int, shift: tuple[float, float] = (1.0, -0.6)) -> tuple[OsmMatch
                 continue
             outline = walls_of([building])[0] - building.middle
             prior = se2.relative(pose, np.append(building.middle + shift, 0.0))
-            found = match_walls(outline, sight.walls, prior, BELIEF.sigma, OsmConfig(), by_coverage=True)
+            found = match_walls(outline, sight.walls, prior, SIGMA, OsmConfig(), by_coverage=True)
             if found is not None:
                 local.append(BuildingMatch(
                     k, number, found.pose, found.information, found.rank, found.kind, found.fitness, found.coverage,
@@ -71,10 +73,10 @@ def scene(seed: int, shift: tuple[float, float] = (1.0, -0.6)) -> tuple[OsmMatch
     return matches, poses, [*real, far, gone, hall], np.array([*off, [*shift, 0], [*shift, 0], [0, 0, 0]])
 
 
-def solved(seed: int, mode: str = "two-level") -> tuple[CorrectedMap, Floats, list[Building], OsmMatches]:
+def solved(seed: int, mode: Mode = "two-level") -> tuple[CorrectedMap, Floats, list[Building], OsmMatches]:
     matches, poses, real, off = scene(seed)
     covariances = np.tile(np.diag([0.01, 0.01, 1e-5]), (len(poses), 1, 1))
-    return correct_buildings(matches, poses, covariances, mode, BELIEF), off, real, matches
+    return correct_buildings(matches, poses, covariances, OsmConfig(mode=mode)), off, real, matches
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -124,7 +126,7 @@ def test_neighbours_that_were_drawn_into_each_other_are_parted() -> None:
     more = OsmMatches(
         matches.origin, (*matches.buildings, copy), matches.map_walls, matches.owners, matches.keyframes, matches.local
     )
-    found = correct_buildings(more, poses, np.zeros((len(poses), 3, 3)), "two-level", BELIEF)
+    found = correct_buildings(more, poses, np.zeros((len(poses), 3, 3)), OsmConfig())
     shapes = [Polygon(c.corrected.footprints[0].outer).buffer(-0.01) for c in found.buildings]
     assert not shapes[0].intersects(shapes[-1])
     assert found.left == ()
@@ -132,8 +134,16 @@ def test_neighbours_that_were_drawn_into_each_other_are_parted() -> None:
 
 def test_without_matches_the_map_stays_where_it_is_thought_to_be() -> None:
     matches, poses, _, _ = scene(0)
-    blind = OsmMatches(matches.origin, matches.buildings, matches.map_walls, matches.owners, (), ())
-    belief = MapBelief(np.array([0.5, 0.5]), np.full(2, 0.1), BELIEF.sigma)
-    found = correct_buildings(blind, poses, np.zeros((len(poses), 3, 3)), "two-level", belief)
+    blind = OsmMatches(
+        matches.origin,
+        matches.buildings,
+        matches.map_walls,
+        matches.owners,
+        (),
+        (),
+        np.array([0.5, 0.5]),
+        np.full(2, 0.1),
+    )
+    found = correct_buildings(blind, poses, np.zeros((len(poses), 3, 3)), OsmConfig())
     assert {c.status for c in found.buildings} == {"unseen"}
     np.testing.assert_allclose([c.displacement[:2] for c in found.buildings], 0.5, atol=0.02)
