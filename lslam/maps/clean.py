@@ -9,16 +9,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.geometry import se3
+from lslam.maps.things import Floor, floor_of, things_in, whole
 
 # Scans before and after that are asked: at 10 Hz a pedestrian has left its place after 0.3 s, a lorry after 2.5 s.
 OFFSETS = (3, 6, 10, 15, 25)
-# How far behind a point must lie what another scan sees there: m, and m per m of range, as a pose that is 3 cm too low
-# moves the ground 20 m away by 0.4 m along the beam.
-MARGIN, SLOPE = 0.3, 0.02
-# One vote that a point is free holds against two that something was there: what stands is hit by nearly every scan.
-FREE_PER_HIT = 0.5
-# Where this share of the points in a cube of so many m moves, the rest of them moves, too.
+# How far behind a point must lie what another scan sees there: m, and m per m of range for poses that are turned.
+MARGIN, SLOPE = 0.15, 0.01
+# Votes that a point is free, against each that something was there.
+FREE_PER_HIT = 1.0
+# Where this share of the points in a cube of so many m moves, the rest of them moves, too, ...
 CUBE, SHARE = 0.5, 0.3
+# ... and where this share of a thing does, and so many points, all of it: few beams seldom look through where one was.
+MOST, LEAST = 0.4, 3
 
 # Sizes of pixels that are tried, finest first, until a scan fills so many of them.
 COLUMNS_DEG, ROWS_DEG, FILLED = (0.4, 0.8, 1.6, 3.2), 0.3 * 1.15 ** np.arange(18), 0.85
@@ -46,11 +48,21 @@ class _Grid:
     columns: int
 
 
+@dataclass(frozen=True)
+class _Look:
+    """What is kept of a scan for the others: its pose, its range image and its floor."""
+
+    T_world_lidar: NDArray[np.float64]
+    image: NDArray[np.float32]
+    floor: Floor
+
+
 class Cleaner:
     """Takes scans in and gives them back, `OFFSETS[-1]` scans later, without the points that moved.
 
     Visibility between scans, as in Pomerleau et al. (ICRA 2014) and Removert (Kim and Kim, IROS 2020), but scan against
-    scan, so that neither the map nor its length has to fit into memory.
+    scan, so that neither the map nor its length has to fit into memory. The ground never moves: beams that graze it say
+    little, and only what stands on it (`things`) is asked about.
 
     Attributes
     ----------
@@ -59,7 +71,7 @@ class Cleaner:
 
     def __init__(self) -> None:
         self._scans: deque[PosedScan] = deque()
-        self._images: deque[tuple[NDArray[np.float64], NDArray[np.float32]]] = deque()
+        self._looks: deque[_Look] = deque()
         self._grid: _Grid | None = None
         self._begin = self._decided = self._count = 0
         self.removed = self.seen = 0
@@ -76,8 +88,9 @@ class Cleaner:
         if self._grid is not None:
             g = self._grid
             image = nearest_ranges(points, g.rows, g.columns, g.low, 1 / g.size)
+        T = scan.T_world_lidar
         self._scans.append(scan)
-        self._images.append((scan.T_world_lidar, image))
+        self._looks.append(_Look(T, image, floor_of(_upright(scan), T[:3, 3])))
         self._count += 1
         return [self._decide()] if self._count - self._decided > OFFSETS[-1] else []
 
@@ -91,7 +104,7 @@ class Cleaner:
         moves = self._moves(scan, self._decided)
         self._decided += 1
         while self._begin < self._decided - OFFSETS[-1]:
-            self._images.popleft()
+            self._looks.popleft()
             self._begin += 1
         self.seen += len(moves)
         self.removed += int(moves.sum())
@@ -103,12 +116,24 @@ class Cleaner:
         from lslam.kernels.see_through import vote
 
         free, hit = np.zeros(len(scan.points), np.int16), np.zeros(len(scan.points), np.int16)
+        floors = [self._looks[number - self._begin].floor]
         for other in (number + sign * offset for offset in OFFSETS for sign in (-1, 1)):
             if self._grid is not None and self._begin <= other < self._count:
-                T_world_other, image = self._images[other - self._begin]
-                T = se3.relative(T_world_other, scan.T_world_lidar)
-                vote(scan.points, T, image, self._grid.low, 1 / self._grid.size, MARGIN, SLOPE, free, hit)
-        return spread((free >= 1) & (free >= FREE_PER_HIT * hit), scan.points)
+                look = self._looks[other - self._begin]
+                T = se3.relative(look.T_world_lidar, scan.T_world_lidar)
+                vote(scan.points, T, look.image, self._grid.low, 1 / self._grid.size, MARGIN, SLOPE, free, hit)
+                floors.append(look.floor)
+        labels = things_in(_upright(scan), scan.T_world_lidar[:3, 3], floors)
+        stands = np.flatnonzero(labels)
+        moves = np.zeros(len(labels), np.bool_)
+        voted = (free >= 1) & (free >= FREE_PER_HIT * hit)
+        moves[stands] = spread(voted[stands], scan.points[stands])
+        return whole(moves, labels, MOST, LEAST)
+
+
+def _upright(scan: PosedScan) -> NDArray[np.float32]:
+    """Its points (N, 3) as seen from the sensor, m, along the world's axes."""
+    return scan.points @ scan.T_world_lidar[:3, :3].T.astype(np.float32)
 
 
 def spread(moves: NDArray[np.bool_], points: NDArray[np.float32]) -> NDArray[np.bool_]:

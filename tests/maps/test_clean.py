@@ -17,10 +17,15 @@ from lslam.simulation.scenarios import simulate
 from lslam.types.scan_result import ScanResult
 
 
-@pytest.mark.parametrize(("scenario", "count"), [("motorway", 45), ("walk", 50)])
-def test_moving_points_go_and_static_ones_stay(scenario: str, count: int, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("scenario", "sensor", "count"),
+    [("motorway", None, 45), ("walk", None, 50), ("motorway", "os1-32", 55), ("walk", "vlp16", 50)],
+)
+def test_moving_points_go_and_static_ones_stay(
+    scenario: str, sensor: str | None, count: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Issue 6: at least 90 % of moving points gone, at most 2 % of static ones; poses are 1 cm wrong."""
-    drive = simulate(scenario, count=count)
+    drive = simulate(scenario, lidar=sensor, count=count)
     truth, gt = MovingTruth(drive, monkeypatch), drive.ground_truth
     assert gt is not None
     cleaner, rng = Cleaner(), np.random.default_rng(0)
