@@ -149,7 +149,7 @@ def _quantity(
         plot.errorbar(values, means.mean, [below, half], label=r.curve.label, elinewidth=0.7, capsize=1.5, **look)
         tops.append(means.mean)
     for row, colour in _beside(result, of_row):
-        plot.axhline(of_row(row), color=colour, ls=":", lw=1.2, label=f"{row.method}{' + IMU' * row.uses_imu}, beside")
+        plot.axhline(of_row(row), color=colour, ls=":", lw=1.2, label=f"{row.series}, beside")
         tops.append(np.array([of_row(row)]))
     top = np.nan_to_num(np.concatenate(tops)).max()
     # Three seeds make intervals that would press the means flat.
@@ -160,10 +160,10 @@ def _quantity(
 
 def _beside(result: StudyResult, of_row: Callable[[StudyRow], float]) -> Iterator[tuple[StudyRow, str]]:
     """The first seed of each method beside the study that has the number, with its grey."""
-    seen: dict[tuple[str, bool], StudyRow] = {}
+    seen: dict[str, StudyRow] = {}
     for row in result.beside:
         if np.isfinite(of_row(row)):
-            seen.setdefault((row.method, row.uses_imu), row)
+            seen.setdefault(row.series, row)
     for k, row in enumerate(seen.values()):
         yield row, ("0.25", "0.5", "0.7")[k % 3]
 

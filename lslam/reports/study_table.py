@@ -121,23 +121,19 @@ def _means(result: StudyResult) -> CompareTable:
 
 
 def _beside(result: StudyResult) -> CompareTable:
-    rows = tuple((_series(row), str(row.seed), *_numbers(row)) for row in result.beside)
+    rows = tuple((row.series, str(row.seed), *_numbers(row)) for row in result.beside)
     header = ("method", "seed", "translation, m", "rotation, deg", "per scan, ms", "total, s")
     return CompareTable("beside, at its own values", header, rows, 1)
 
 
 def _failures(result: StudyResult) -> CompareTable:
     rows = tuple(
-        (_series(row), ", ".join(f"{key.rpartition('.')[2]} {value}" for key, value in row.parameters.items()) or "beside",
+        (row.series, ", ".join(f"{key.rpartition('.')[2]} {value}" for key, value in row.parameters.items()) or "beside",
          str(row.seed), row.status, row.reason)
         for row in result.failed
     )  # fmt: skip
     title = f"{counted(len(rows), 'run')} without a result"
     return CompareTable(title, ("method", "at", "seed", "outcome", "reason"), rows, 5)
-
-
-def _series(row: StudyRow) -> str:
-    return f"{row.method} + IMU" if row.uses_imu else row.method
 
 
 def _numbers(row: StudyRow) -> Iterable[str]:

@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.types.study import StudyRow, Value
+from lslam.types.study import StudyRow, Value, series_of
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -45,7 +45,7 @@ class Curve:
     @property
     def series(self) -> str:
         """The method for people, with its IMU."""
-        return f"{self.method} + IMU" if self.uses_imu else self.method
+        return series_of(self.method, self.uses_imu)
 
     @property
     def label(self) -> str:

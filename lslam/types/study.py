@@ -52,6 +52,11 @@ class StudyRow:
     folder: str = ""
 
     @property
+    def series(self) -> str:
+        """The method as people read it, with its IMU."""
+        return series_of(self.method, self.uses_imu)
+
+    @property
     def is_usable(self) -> bool:
         """Whether its numbers count: a diverged run has numbers that mean nothing."""
         return self.status in USABLE
@@ -65,3 +70,12 @@ class StudyRow:
     def time_per_scan_ms(self) -> float:
         """Of all stages, mean; nan without any."""
         return sum(self.stages_ms.values()) if self.stages_ms else nan
+
+
+def series_of(method: str, uses_imu: bool) -> str:
+    """A method as people read it.
+
+    >>> series_of("icp", uses_imu=True)
+    'icp+imu'
+    """
+    return f"{method}+imu" if uses_imu else method

@@ -25,7 +25,7 @@ def test_curves_are_one_per_method_imu_and_second_parameter_in_order() -> None:
     rows += [replace(rows[0], parameters={}, is_beside=True)]
     curves = curves_of(rows)
     assert [curve.label for curve in curves] == [
-        "thesis-icp, random_share 0.1", "thesis-icp, random_share 0.3", "thesis-icp + IMU, random_share 0.1",
+        "thesis-icp, random_share 0.1", "thesis-icp, random_share 0.3", "thesis-icp+imu, random_share 0.1",
     ]  # fmt: skip
     assert list(curves[0].values) == [1, 2, 3]
     assert curves[0].quantities["translation"].shape == (3, 3)

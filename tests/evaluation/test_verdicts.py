@@ -140,7 +140,7 @@ def test_curves_that_disagree_leave_it_undecided_unless_the_finding_names_one() 
     both = verdict(rows, "holds_up_to", 20)
     assert both.outcome == "undecided"
     assert both.sentence == (
-        "undecided: So it is; here thesis-icp: it diverges from 8 on; thesis-icp + IMU: nothing diverges up to 20"
+        "undecided: So it is; here thesis-icp: it diverges from 8 on; thesis-icp+imu: nothing diverges up to 20"
     )
     assert outcome(rows, "holds_up_to", 20, imu=True) == "confirmed"
     assert outcome(rows, "holds_up_to", 20, imu=False) == "refuted"
