@@ -23,7 +23,8 @@ if TYPE_CHECKING:
     epilog="\b\nExamples: lslam sweep --list\n"
     "          lslam sweep skip-frames --dry-run\n"
     "          lslam sweep STUDY.toml --out runs/shares --jobs 2\n"
-    "          lslam sweep STUDY.toml --out runs/shares --scheduler tcp://node1:8786 --resume"
+    "          lslam sweep STUDY.toml --out runs/shares --scheduler tcp://node1:8786 --resume\n"
+    "          lslam sweep --report runs/shares"
 )
 @click.argument("study", required=False)
 @click.option("--list", "show_list", is_flag=True, help="List the studies that ship with lslam.")
@@ -35,6 +36,10 @@ if TYPE_CHECKING:
 )
 @click.option("--resume", is_flag=True, help="Keep finished runs of the same input and configuration, run the others.")
 @click.option("--overwrite", is_flag=True, help="Run everything anew in an existing folder.")
+@click.option(
+    "--report", type=click.Path(path_type=Path), metavar="DIR",
+    help="Write the report of the study in DIR anew from its results.csv, run nothing.",
+)  # fmt: skip
 @options.engine
 @click.option("--seeds", metavar="N,N,...", help="Instead of the study's.")
 @click.option(
@@ -48,16 +53,22 @@ if TYPE_CHECKING:
 @click.option("--strict", is_flag=True, help="Exit 4 when any run failed or diverged.")
 @options.verbosity
 def command(study: str | None, **given: Any) -> None:
-    """Vary parameters over sequences, methods and seeds; every run is a row of results.csv and results.parquet.
+    """Vary parameters over sequences, methods and seeds; every run is a row of results.csv and results.parquet, and
+    report.html shows what was found.
 
     STUDY is a file, or a name of --list. What fails or diverges is a row with its reason.
     """
     if given["show_list"]:
         _print_list()
         return
+    setup_logging(given["verbose"], given["quiet"])
+    if given["report"] is not None:
+        if study is not None:
+            raise click.UsageError(f"--report writes the report of a folder and runs nothing: leave out {study}")
+        _report(given["report"])
+        return
     if study is None:
         raise click.UsageError("STUDY is missing; for example: lslam sweep skip-frames --dry-run")
-    setup_logging(given["verbose"], given["quiet"])
     from lslam.errors import GateError
     from lslam.studies.sweep import run_sweep
 
@@ -72,6 +83,7 @@ def command(study: str | None, **given: Any) -> None:
         rows = run_sweep(sweep, engine, bars(stack), on_rows)
     _print(rows)
     log.info("every run: %s", sweep.out / "results.csv")
+    _report(sweep.out)
     failed = [row for row in rows if not row.is_usable]
     if failed and given["strict"]:
         raise GateError(f"--strict: {len(failed)} of {len(rows)} runs failed, the first one: {failed[0].reason}")
@@ -103,6 +115,16 @@ def _print(rows: list[StudyRow]) -> None:
     from lslam.reports.study_best import best_table
 
     show(aligned(best_table(rows), 2) + "\n")
+
+
+def _report(folder: Path) -> None:
+    """Write the report and print its verdicts."""
+    from lslam.studies.study_report import report_folder
+
+    for result in report_folder(folder):
+        for verdict in result.verdicts:
+            show(f"{verdict.sentence}\n")
+    log.info("report: %s", folder / "report.html")
 
 
 def _print_list() -> None:

@@ -12,7 +12,7 @@ from lslam.evaluation.efficiency import over_seeds
 from lslam.evaluation.landmarks import divergence, optimum
 from lslam.evaluation.laws import FEWEST, fit_law
 from lslam.evaluation.verdicts import judge
-from lslam.types.sensitivity import Curve, CurveResult, Floats, Law, LawKind, StudyResult
+from lslam.types.sensitivity import Curve, CurveResult, Floats, Interval, Law, LawKind, StudyResult
 from lslam.types.study import StudyRow
 
 if TYPE_CHECKING:
@@ -58,7 +58,7 @@ def _result(curve: Curve) -> CurveResult:
         name: over_seeds(table if name in EFFICIENCIES else np.where(curve.lost, np.nan, table))
         for name, table in curve.quantities.items()
     }
-    law, no_law = _law_of(curve)
+    law, no_law = _law_of(curve, means["total_time"])
     return CurveResult(
         curve=curve,
         means=means,
@@ -70,27 +70,19 @@ def _result(curve: Curve) -> CurveResult:
     )
 
 
-def _law_of(curve: Curve) -> tuple[Law | None, str]:
+def _law_of(curve: Curve, times: Interval) -> tuple[Law | None, str]:
     """The law of total time: inverse over skipped scans, a line over any other number."""
     if curve.words:
         return None, f"{curve.parameter} is not a number"
     kind: LawKind = "inverse" if curve.parameter == SKIP else "linear"
-    points, times, runs = _times(curve)
-    law = fit_law(kind, (curve.parameter,), points, times, runs)
-    return law, "" if law else f"no law from {len(times)} values, {FEWEST} are needed"
-
-
-def _times(curve: Curve) -> tuple[Floats, Floats, Floats]:
-    """Values, mean total time in s and number of runs, where a run has come to its end, lost or not: it took its time."""
-    over = over_seeds(curve.quantities["total_time"])
-    known = over.n > 0
-    return curve.values[known], over.mean[known], over.n[known].astype(np.float64)
+    law = fit_law(kind, (curve.parameter,), curve.values, times.mean, times.n.astype(np.float64))
+    return law, "" if law else f"no law from {int((times.n > 0).sum())} values, {FEWEST} are needed"
 
 
 def _products(results: Sequence[CurveResult]) -> dict[str, Law]:
     """Laws a y / x by series, of studies of skipped scans (x) and another number (y)."""
     groups: dict[str, list[tuple[Floats, Floats, Floats]]] = {}
-    names: tuple[str, str] | None = None
+    names: tuple[str, ...] = ()
     for result in results:
         curve = result.curve
         if len(curve.at) != 1 or curve.words or SKIP not in (curve.parameter, curve.at[0][0]):
@@ -98,16 +90,13 @@ def _products(results: Sequence[CurveResult]) -> dict[str, Law]:
         key, other = curve.at[0]
         if isinstance(other, (bool, str)):
             continue
-        values, times, runs = _times(curve)
-        second = np.full(len(values), float(other))
+        over, second = result.means["total_time"], np.full(len(curve.values), float(other))
         is_skip = curve.parameter == SKIP
         names = (SKIP, key) if is_skip else (SKIP, curve.parameter)
-        points = np.stack([values, second] if is_skip else [second, values], 1)
-        groups.setdefault(curve.series, []).append((points, times, runs))
-    laws: dict[str, Law] = {}
+        points = np.stack([curve.values, second] if is_skip else [second, curve.values], 1)
+        groups.setdefault(curve.series, []).append((points, over.mean, over.n.astype(np.float64)))
+    laws = {}
     for series, parts in groups.items():
         points, times, runs = (np.concatenate(column) for column in zip(*parts, strict=True))
-        law = fit_law("product", names or (), points, times, runs)
-        if law is not None:
-            laws[series] = law
-    return laws
+        laws[series] = fit_law("product", names, points, times, runs)
+    return {series: law for series, law in laws.items() if law is not None}

@@ -7,7 +7,6 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 
 from lslam.config.finding import Finding
-from lslam.evaluation.efficiency import over_seeds
 from lslam.evaluation.landmarks import elbow, optimum
 from lslam.evaluation.laws import FEWEST, fit_law
 from lslam.types.sensitivity import CurveResult, Floats, Law, LawKind, Optimum, Outcome, Verdict
@@ -86,9 +85,10 @@ def _between(finding: Finding, result: CurveResult, *, is_highest: bool) -> Judg
     word = "largest" if finding.kind == "largest_between" else "best"
     if best is None or np.isfinite(means).sum() < 3:
         return "undecided", "fewer than 3 values have a result"
-    said = (
-        f"{finding.of.replace('_', ' ')} is {word} at {best.value:g} (within 10 % from {best.low:g} to {best.high:g})"
+    flat = (
+        f"within 10 % from {best.low:g} to {best.high:g}" if best.low < best.high else "no value beside it within 10 %"
     )
+    said = f"{finding.of.replace('_', ' ')} is {word} at {best.value:g} ({flat})"
     if low <= best.value <= high:
         own = _best_by_seed(finding, result, is_highest)
         agree = sum(seed.low <= high and seed.high >= low for seed in own)
@@ -145,7 +145,7 @@ def _law_of(finding: Finding, result: CurveResult) -> Judged:
     law = result.law
     if law is None or law.kind != finding.kind:
         assert finding.kind in ("linear", "inverse")
-        times = over_seeds(result.curve.quantities["total_time"])
+        times = result.means["total_time"]
         law = fit_law(finding.kind, (result.curve.parameter,), result.curve.values, times.mean, times.n.astype(float))
     return _law(finding, result, law)
 

@@ -58,7 +58,8 @@ def study_recipes(result: StudyResult) -> list[str]:
         f"lost: a run that says so, or whose error is above {result.lost_above:.3g} m: 10 times the best of the study, and not "
         "less than the thesis takes for a result (2.2 m)",
         "diverges: the first value, lost in more than half of its runs, from which on more than half of the values are",
-        "laws: weighted least squares over the means, scatter in proportion to the time, from 6 values on; ± and bands at 99 %",
+        "laws: weighted least squares over means of the runs that were not lost, scatter in proportion to the time, from 6 "
+        "values on; ± and bands at 99 %",
         "±: half of the 95 % interval over seeds (Student's t), of runs that were not lost",
         "verdicts: a range holds the best value confirmed, one that does not and is nowhere within 10 % of it refuted",
     ]

@@ -6,8 +6,13 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from lslam.config.finding import Finding
+from lslam.config.study import read_study
+from lslam.errors import InputError
 from lslam.evaluation.sensitivity import evaluate_study
+from lslam.formats.study_csv import read_study_csv
 from lslam.reports.study_html import write_study_files
+from lslam.studies.results import RESULTS
+from lslam.studies.sweep import MARK
 from lslam.types.sensitivity import StudyResult
 from lslam.types.study import StudyRow
 
@@ -23,3 +28,17 @@ def write_study_report(
     results = evaluate_study(rows, findings)
     write_study_files(folder, results, rows, title or ", ".join(dict.fromkeys(row.study for row in rows)))
     return results
+
+
+def report_folder(folder: Path) -> list[StudyResult]:
+    """The report of a study from its results.csv, with the findings of its study.toml when that is there.
+
+    Raises InputError for a folder without runs and what cannot be read, ConfigError for findings that make no sense, OutputError.
+    """
+    rows = read_study_csv(folder / RESULTS)
+    if not rows:
+        raise InputError(f"study {folder} has no finished run yet: lslam sweep with --out {folder} --resume makes them")
+    if not (folder / MARK).is_file():
+        return write_study_report(folder, rows)
+    study = read_study(folder / MARK)
+    return write_study_report(folder, rows, study.finding, study.summary or study.name)
