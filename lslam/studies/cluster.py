@@ -47,7 +47,7 @@ def connected(scheduler: str | None, local: str | None, title: str) -> Iterator[
         env = {"NUMBA_NUM_THREADS": "1"}
         with (
             LocalCluster(
-                count, threads_per_worker=1, dashboard_address=None, silence_logs=logging.CRITICAL, env=env
+                n_workers=count, threads_per_worker=1, dashboard_address=None, silence_logs=logging.CRITICAL, env=env
             ) as made,
             Client(made) as client,
         ):

@@ -1,0 +1,151 @@
+"""A Dask cluster on loopback: a worker that is killed costs time, and what the cluster lacks is said in one sentence."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from distributed import LocalCluster
+
+from lslam.config.study import parse_study
+from lslam.errors import InputError, RunFailedError, UsageError
+from lslam.formats.study_csv import read_study_csv
+from lslam.studies import cluster
+from lslam.studies.cluster import connected, pack, unpack
+from lslam.studies.grid import Job
+from lslam.studies.plan import Follow
+from lslam.studies.states import State, read_state, write_state
+from lslam.studies.sweep import Sweep, expand_study, run_sweep
+from lslam.types.study import StudyRow
+
+TREE = {
+    "sequences": [{"scenario": "block", "lidar": "sample", "columns": 256, "count": 12}],
+    "methods": ["icp"],
+    "parameters": {"preprocess.source_voxel": [0.6, 0.7, 0.8, 0.9, 1.0, 1.1]},
+    "config": {"loops": {"use": False}, "preprocess": {"downsample": "grid"}},
+}
+
+
+@pytest.fixture(scope="module")
+def workers() -> Iterator[LocalCluster]:
+    with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs=50) as made:
+        yield made
+
+
+def job(tmp_path: Path) -> Job:
+    """Of a recording that lies nowhere."""
+    sweep = Sweep(parse_study(TREE, "tiny", "tiny"), tmp_path / "out")
+    return replace(expand_study(sweep).jobs[0], scene=None, path=Path("/nowhere/00"))
+
+
+def test_a_worker_killed_in_the_middle_loses_nothing_and_counts_nothing_twice(
+    workers: LocalCluster, tmp_path: Path
+) -> None:
+    sweep = Sweep(parse_study(TREE, "tiny", "tiny"), tmp_path / "out")
+    victim = next(iter(workers.workers.values())).pid
+    steps: list[str] = []
+
+    def kill_one(rows: list[StudyRow]) -> None:
+        if len(rows) == 1:
+            os.kill(victim, signal.SIGKILL)
+
+    with connected(workers.scheduler_address, None, "studying") as engine:
+        assert engine.at_once == 2
+        rows = run_sweep(sweep, engine, Follow(on_step=steps.append), kill_one)  # type: ignore[arg-type]
+    assert len(steps) == len(set(steps)) == 6
+    assert [row.parameters["preprocess.source_voxel"] for row in rows] == [0.6, 0.7, 0.8, 0.9, 1.0, 1.1]
+    assert {row.status for row in rows} == {"done"}
+    assert not any(row.is_timing_comparable for row in rows), "others may share the worker's machine"
+    assert not (sweep.out / "simulated").exists(), "workers simulate by themselves"
+    for row in rows:
+        assert (sweep.out / row.folder / "trajectory.tum").is_file(), "run folders come home"
+    assert [repr(row) for row in read_study_csv(sweep.out / "results.csv")] == [repr(row) for row in rows]
+
+
+def test_workers_without_the_recording_are_named(workers: LocalCluster, tmp_path: Path) -> None:
+    with (
+        connected(workers.scheduler_address, None, "studying") as engine,
+        pytest.raises(InputError, match=r"worker tcp://.* does not have /nowhere/00: the recordings must lie there"),
+    ):
+        engine.prepare([job(tmp_path)], Follow())
+
+
+def test_workers_of_another_version_are_named(
+    workers: LocalCluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(cluster, "__version__", "9.9")
+    with (
+        connected(workers.scheduler_address, None, "studying") as engine,
+        pytest.raises(InputError, match=r"worker tcp://.* has lslam .*, this is 9\.9: install the same"),
+    ):
+        engine.prepare([job(tmp_path)], Follow())
+
+
+def test_workers_without_lslam_are_named(
+    workers: LocalCluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(paths: list[str]) -> None:
+        raise ModuleNotFoundError("No module named 'lslam'")
+
+    monkeypatch.setattr(cluster, "_inspect", fail)
+    with (
+        connected(workers.scheduler_address, None, "studying") as engine,
+        pytest.raises(InputError, match=r"worker tcp://.* cannot run lslam: No module named 'lslam'; install it there"),
+    ):
+        engine.prepare([job(tmp_path)], Follow())
+
+
+def test_a_scheduler_without_workers_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cluster, "_WORKERS_S", 1)
+    with (
+        LocalCluster(n_workers=0, threads_per_worker=1, dashboard_address=None, silence_logs=50) as empty,
+        connected(empty.scheduler_address, None, "studying") as engine,
+        pytest.raises(RunFailedError, match=r"has no workers: start some, `dask worker tcp://"),
+    ):
+        engine.prepare([job(tmp_path)], Follow())
+
+
+def test_a_scheduler_that_does_not_answer_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cluster, "_ANSWER_S", 1)
+    for address in ("tcp://127.0.0.1:9", "nonsense://there"):
+        with (
+            pytest.raises(InputError, match=f"the scheduler {address} does not answer within 1 s"),
+            connected(address, None, "studying"),
+        ):
+            pass
+
+
+def test_without_dask_the_way_to_it_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(UsageError, match=r"pip install 'lslam\[cluster\]'"), connected("tcp://127.0.0.1:9", None, ""):
+        pass
+
+
+def test_a_run_that_comes_home_replaces_what_was_there(tmp_path: Path) -> None:
+    there, here = tmp_path / "there", job(tmp_path)
+    (there / "run" / "keyframes").mkdir(parents=True)
+    (there / "run" / "manifest.json").write_text("new")
+    (there / "run" / "keyframes" / "0.npz").write_text("cloud")
+    write_state(there / "run.json", State("digest", "done"))
+    here.folder.mkdir(parents=True)
+    (here.folder / "old").write_text("old")
+    unpack(pack(there), here)
+    assert sorted(p.name for p in here.folder.iterdir()) == ["keyframes", "manifest.json"]
+    assert read_state(here.state_file) == State("digest", "done")
+    assert sorted(p.name for p in here.folder.parent.iterdir()) == [here.folder.name, here.state_file.name]
+
+
+def test_workers_of_this_machine_read_what_is_simulated_here(tmp_path: Path) -> None:
+    sweep = Sweep(parse_study(TREE, "tiny", "tiny"), tmp_path / "out")
+    scenes: list[str] = []
+    with connected(None, "local:1", "studying") as engine:
+        assert engine.at_once == 1
+        jobs = expand_study(sweep).jobs
+        engine.prepare(jobs, Follow(on_step=scenes.append))
+    assert scenes == ["block 0"]
+    assert jobs[0].path.is_dir()
