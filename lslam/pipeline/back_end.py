@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.config import Config
-from lslam.errors import GraphError
+from lslam.errors import GraphError, InputError
 from lslam.geometry import se2, se3
 from lslam.graph.factors import PLANAR
 from lslam.graph.floors import on_one_plane
@@ -115,7 +115,11 @@ def _on_buildings(
     if origin is None:
         problems.append("OSM: without its fixes the run has no place on the map: it goes on without the buildings")
         return None
-    extract = osm.extract(np.asarray(origin, np.float64))
+    try:
+        extract = osm.extract(np.asarray(origin, np.float64))
+    except InputError as error:
+        problems.append(f"OSM: {error}; the run goes on without the buildings")
+        return None
     up = graph.world_up if graph.ups else None
     located = locate(extract, store, up, config, None if known is None else known.T_enu_world)
     if located.problem:

@@ -111,7 +111,12 @@ class OdometryCheckpoints:
     @property
     def scans(self) -> int:
         """After how many scans an earlier run left off; 0 when there is nothing to go on from."""
-        return 0 if self._latest is None else len(self._latest["results"])
+        return len(self.results)
+
+    @property
+    def results(self) -> list[ScanResult]:
+        """What an earlier run found until there."""
+        return [] if self._latest is None else list(self._latest["results"])
 
     @property
     def folder(self) -> Path:

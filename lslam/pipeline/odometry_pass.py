@@ -24,6 +24,7 @@ from lslam.pipeline.front_end import estimate, is_diverged, to_trajectory
 from lslam.pipeline.inertial_start import Inertial, begin_inertial, close_inertial, load_start, save_start
 from lslam.pipeline.keyframing import Keyframing
 from lslam.pipeline.manifest import Manifest
+from lslam.pipeline.osm_source import OsmSource
 from lslam.pipeline.run_folder import CHECKPOINT, RunFolder
 from lslam.pipeline.watch import Watch
 from lslam.registration.standing import Standing
@@ -38,7 +39,7 @@ log = logging.getLogger("lslam")
 
 def estimate_poses(
     sequence: Sequence, odometry: Odometry, config: Config, manifest: Manifest, folder: Path, truth: Trajectory | None,
-    watch: Watch, store: KeyframeStore, checkpoints: OdometryCheckpoints | None = None,
+    watch: Watch, store: KeyframeStore, checkpoints: OdometryCheckpoints | None = None, osm: OsmSource | None = None,
 ) -> RunRecord:  # fmt: skip
     """Odometry over all scans, judged; its keyframes go to `store`, and `checkpoints` say where an earlier run left off.
 
@@ -48,9 +49,15 @@ def estimate_poses(
     is_over = checkpoints is not None and checkpoints.is_over
     _warm_up(sequence, odometry, standing, config, manifest, is_over)
 
+    if osm is not None and checkpoints is not None:
+        for result in checkpoints.results:
+            osm.see(result.stamp_ns, result.T_world_lidar)
+
     def seen(result: ScanResult) -> None:
         if result.status != "ok":
             log.warning("scan %d %s: %s", result.index, result.status, result.reason)
+        if osm is not None:
+            osm.see(result.stamp_ns, result.T_world_lidar)
         watch.on_step()
 
     watch.on_start("odometry", len(sequence) - (0 if checkpoints is None else checkpoints.scans))

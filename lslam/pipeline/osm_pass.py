@@ -116,8 +116,7 @@ def _up_by_ground(store: KeyframeStore, config: Config) -> Floats:
 
 def _start(store: KeyframeStore, poses: Floats, osm: OsmMap, config: Config, placed: Floats | None) -> Start:
     if placed is not None:
-        known = known_start(config.osm.model_copy(update={"heading_deg": 0.0}))
-        return replace(known, pose=se2.of_se3(poses[0]))
+        return replace(known_start(config.osm), pose=se2.of_se3(poses[0]))
     if config.osm.heading_deg is not None:
         return known_start(config.osm)
     return sought_start(store, poses, osm, config.osm, config.keyframes.submap_size)

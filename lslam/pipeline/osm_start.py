@@ -11,6 +11,7 @@ from lslam.config.osm import OsmConfig
 from lslam.geometry import se2
 from lslam.keyframes.store import KeyframeStore
 from lslam.keyframes.submaps import neighbours, submap
+from lslam.pipeline.osm_source import first_pose
 from lslam.priors.osm_map import OsmMap
 from lslam.priors.wall_match import WINDOW, find_heading
 from lslam.priors.walls import find_walls
@@ -50,10 +51,8 @@ def see_walls(store: KeyframeStore, poses: Floats, number: int, size: int, confi
 
 def known_start(config: OsmConfig) -> Start:
     """The start that the configuration gives, with its heading."""
-    assert config.heading_deg is not None
-    yaw = float(se2.wrapped(np.radians(90.0 - config.heading_deg)))
     radius, turn = config.start_radius / WINDOW, np.radians(config.start_heading_deg) / WINDOW
-    return Start(np.array([0.0, 0.0, yaw]), np.array([radius, radius, turn]))
+    return Start(first_pose(config), np.array([radius, radius, turn]))
 
 
 def sought_start(store: KeyframeStore, poses: Floats, osm: OsmMap, config: OsmConfig, submap_size: int) -> Start:

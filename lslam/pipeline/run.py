@@ -32,7 +32,7 @@ from lslam.pipeline.map_pass import build_map
 from lslam.pipeline.odometry_pass import estimate_poses, odometry_checkpoints
 from lslam.pipeline.osm_source import OsmSource, open_osm
 from lslam.pipeline.resume import may_go_on, run_identity
-from lslam.pipeline.run_folder import KEYFRAMES, RunFolder
+from lslam.pipeline.run_folder import KEYFRAMES, REPLIES, RunFolder
 from lslam.pipeline.watch import RunOutcome, Watch
 from lslam.readers import open_sequence
 from lslam.readers.raw_drive import with_gnss, with_imu
@@ -131,8 +131,10 @@ def _solve(
 ) -> tuple[RunRecord, BackEnd, Evaluation | None]:
     """The poses of all scans, made consistent and level, and their score."""
     _announce(job)
+    if job.osm is not None:
+        job.osm.begin(None if folder == Path() else folder / REPLIES)
     record = estimate_poses(
-        job.sequence, job.odometry, job.config, job.manifest, folder, job.truth, job.watch, store, checkpoints
+        job.sequence, job.odometry, job.config, job.manifest, folder, job.truth, job.watch, store, checkpoints, job.osm
     )
     done = optimise_poses(job.sequence, record, store, job.config, job.manifest, job.osm)
     level_world(record, job.sequence, job.config, job.manifest)

@@ -23,6 +23,7 @@ MANIFEST = "manifest.json"
 LOCK = ".lock"
 KEYFRAMES = "keyframes"
 CHECKPOINT = "checkpoint"
+REPLIES = "osm_replies"
 # What a run that goes on needs of what the one before left.
 _NEEDED = (MANIFEST, "config.toml", "log.txt")
 OURS = (
@@ -127,15 +128,15 @@ class RunFolder:
         for folder in self.path.glob(".lslam-map-*"):  # of a run that was killed
             shutil.rmtree(folder, ignore_errors=True)
         if not needed:
-            _clear_arrays(self.path / KEYFRAMES)
+            _clear_own(self.path / KEYFRAMES, "*.npz")
+            _clear_own(self.path / REPLIES, "*.json")
             self.drop_checkpoint()
 
 
-def _clear_arrays(folder: Path) -> None:
-    """Remove the arrays that a run keeps in a folder of its own, and the folder when nothing else is in it."""
-    for pattern in ("*.npz", "*.npz.part"):
-        for file in folder.glob(pattern):
-            file.unlink()
+def _clear_own(folder: Path, names: str) -> None:
+    """Remove the files that a run keeps in a folder of its own, and the folder when nothing else is in it."""
+    for file in (*folder.glob(names), *folder.glob(f"{names}.part")):
+        file.unlink()
     with contextlib.suppress(OSError):
         folder.rmdir()
 

@@ -34,10 +34,22 @@ Fetch = Callable[[Bounds], dict[str, Any]]
 
 
 @dataclass(frozen=True)
-class _Circle:
-    """A finished request: its place (2,), m, and its buildings; why there are none, else None."""
+class _Wish:
+    """A circle to be asked for: its place (2,) and radius, m."""
 
     centre: NDArray[np.float64]
+    radius: float
+
+    def is_at(self, place: NDArray[np.float64], radius: float) -> bool:
+        return float(np.linalg.norm(place - self.centre)) <= radius
+
+
+@dataclass(frozen=True)
+class _Circle:
+    """A finished request: the reply and its buildings; why there are none, else None."""
+
+    wish: _Wish
+    reply: dict[str, Any]
     buildings: list[Building]
     problem: str | None = None
 
@@ -50,8 +62,8 @@ class OsmBuffer:
     fetch : gives the Overpass reply for a box (`overpass.fetch_buildings`); called in a thread of the buffer's own
     origin : (3,) lat, lon (deg), height (m) of the local frame, x east and y north, in which everything here is
     config : the radii
-    folder : where replies are kept, `000000.json` and so on; what lies there already is used instead of the network,
-        so that a second run sees the same buildings at once. None keeps nothing
+    folder : where replies are kept, `000000.json` and so on; what lies there already is not asked for again, so that a run
+        that was killed goes on with the same buildings. None keeps nothing
 
     Use it as a context manager, or `close` it.
     """
@@ -61,15 +73,15 @@ class OsmBuffer:
         self._origin = np.asarray(origin, np.float64)
         self._config = config
         self._folder = folder
-        self._wishes: queue.SimpleQueue[NDArray[np.float64] | None] = queue.SimpleQueue()
+        self._wishes: queue.SimpleQueue[_Wish | None] = queue.SimpleQueue()
         self._done: queue.SimpleQueue[_Circle] = queue.SimpleQueue()
-        self._open: list[NDArray[np.float64]] = []
-        self._centres: list[NDArray[np.float64]] = []
+        self._open: list[_Wish] = []
+        self._answered: list[_Wish] = []
+        self.replies: list[dict[str, Any]] = []
         self._buildings: dict[str, tuple[Building, NDArray[np.float64]]] = {}
         self.problems: list[str] = []
         self._thread: threading.Thread | None = None
-        self._kept = 0
-        self._is_replay = self._load()
+        self._load()
 
     def near(self, position: NDArray[Any]) -> list[Building]:
         """Buildings that come within `use_radius` of `position` (2,), m, as far as they are here; returns at once.
@@ -78,12 +90,26 @@ class OsmBuffer:
         request failed, nothing is asked again before that circle is left.
         """
         at = np.asarray(position, np.float64)[:2]
-        self._collect()
-        asked = [*self._centres, *self._open]
-        if not self._is_replay and not any(np.linalg.norm(at - c) <= self._config.renew_radius for c in asked):
-            self._ask(at)
+        self.ask(at)
         reach = self._config.use_radius
         return [building for building, box in self._buildings.values() if _distance(box, at) <= reach]
+
+    def ask(self, position: NDArray[Any], radius: float | None = None) -> None:
+        """Ask for the circle about `position`, as `near` does; of another `radius`, m, when a larger one is not asked for yet."""
+        at = np.asarray(position, np.float64)[:2]
+        self._collect()
+        asked = [*self._answered, *self._open]
+        wish = _Wish(at, self._config.fetch_radius if radius is None else radius)
+        if any(
+            w.radius >= wish.radius and w.is_at(at, self._config.renew_radius + w.radius - wish.radius) for w in asked
+        ):
+            return
+        self._open.append(wish)
+        if self._thread is None:
+            # A thread that waits for a dead server must not keep the program from ending.
+            self._thread = threading.Thread(target=self._work, name="osm-buffer", daemon=True)
+            self._thread.start()
+        self._wishes.put(wish)
 
     def wait(self, seconds: float) -> bool:
         """Wait for what is asked for, at most `seconds`: for the first place of a run. True when nothing is open any more."""
@@ -103,7 +129,7 @@ class OsmBuffer:
     @property
     def requests(self) -> int:
         """Requests that were answered or refused so far."""
-        return len(self._centres)
+        return len(self._answered)
 
     def close(self) -> None:
         """Let the thread end; a request that is under way is not waited for."""
@@ -116,65 +142,60 @@ class OsmBuffer:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _ask(self, at: NDArray[np.float64]) -> None:
-        self._open.append(at)
-        if self._thread is None:
-            # A thread that waits for a dead server must not keep the program from ending.
-            self._thread = threading.Thread(target=self._work, name="osm-buffer", daemon=True)
-            self._thread.start()
-        self._wishes.put(at)
-
     def _work(self) -> None:
-        while (at := self._wishes.get()) is not None:
-            self._done.put(self._circle(at))
+        while (wish := self._wishes.get()) is not None:
+            self._done.put(self._circle(wish))
 
-    def _circle(self, at: NDArray[np.float64]) -> _Circle:
+    def _circle(self, wish: _Wish) -> _Circle:
         try:
-            fix = from_local(np.array([[*at, 0.0]]), self._origin)[:, :2]
-            reply = self._fetch(around(fix, self._config.fetch_radius))
-            found = self._read(reply)
-            if self._folder is not None:
-                self._keep(at, reply, self._folder)
+            fix = from_local(np.array([[*wish.centre, 0.0]]), self._origin)[:, :2]
+            reply = self._fetch(around(fix, wish.radius))
+            return _Circle(wish, reply, self._read(reply))
         except LslamError as error:
-            return _Circle(at, [], str(error))
+            return _Circle(wish, {}, [], str(error))
         except Exception as error:
             # Whatever a server sends, the run goes on without it.
             log.debug("traceback", exc_info=error)
-            return _Circle(at, [], f"the reply cannot be used ({type(error).__name__}: {error})")
-        return _Circle(at, found)
+            return _Circle(wish, {}, [], f"the reply cannot be used ({type(error).__name__}: {error})")
 
     def _read(self, reply: dict[str, Any]) -> list[Building]:
         return buildings_of(from_overpass(reply), self._origin, "the reply").buildings
 
-    def _keep(self, at: NDArray[np.float64], reply: dict[str, Any], folder: Path) -> None:
+    def _keep(self, circle: _Circle, folder: Path) -> None:
+        """What is used is kept, and nothing else: not what a server sends when nobody waits any more."""
         folder.mkdir(parents=True, exist_ok=True)
-        with atomic_write(folder / f"{self._kept:06d}.json") as stream:
-            stream.write(json.dumps({"lslam_centre": at.tolist(), **reply}, ensure_ascii=False).encode())
-        self._kept += 1
+        asked = {"lslam_centre": circle.wish.centre.tolist(), "lslam_radius": circle.wish.radius}
+        with atomic_write(folder / f"{len(self.replies):06d}.json") as stream:
+            stream.write(json.dumps({**asked, **circle.reply}, ensure_ascii=False).encode())
 
-    def _load(self) -> bool:
-        """Take what an earlier run kept; True when there was something."""
-        if self._folder is None:
-            return False
-        for path in sorted(self._folder.glob("*.json")):
+    def _load(self) -> None:
+        """Take what an earlier run kept."""
+        for path in [] if self._folder is None else sorted(self._folder.glob("*.json")):
             try:
                 tree = json.loads(path.read_bytes())
-                at = np.array(tree["lslam_centre"], np.float64)
-                self._take(_Circle(at, self._read(tree)))
+                wish = _Wish(np.array(tree["lslam_centre"], np.float64), float(tree["lslam_radius"]))
+                self._use(_Circle(wish, tree, self._read(tree)))
             except (OSError, ValueError, KeyError, TypeError) as error:
                 raise InputError(f"{path} is no reply kept by an earlier run ({error}): remove it") from None
-        return bool(self._centres)
 
     def _collect(self) -> None:
         while not self._done.empty():
             self._take(self._done.get())
 
     def _take(self, circle: _Circle) -> None:
-        self._open = [at for at in self._open if not np.array_equal(at, circle.centre)]
-        self._centres.append(circle.centre)
+        self._open = [wish for wish in self._open if wish is not circle.wish]
         if circle.problem is not None:
+            self._answered.append(circle.wish)
             self.problems.append(circle.problem)
             log.warning("no buildings from OpenStreetMap here: %s", circle.problem)
+            return
+        if self._folder is not None:
+            self._keep(circle, self._folder)
+        self._use(circle)
+
+    def _use(self, circle: _Circle) -> None:
+        self._answered.append(circle.wish)
+        self.replies.append(circle.reply)
         for building in circle.buildings:
             self._buildings.setdefault(building.osm_id, (building, _box(f.outer for f in building.footprints)))
 

@@ -125,7 +125,7 @@ def test_what_no_server_should_send_ends_nothing() -> None:
     assert len(buffer.problems) == 1
 
 
-def test_a_second_run_uses_the_replies_of_the_first_and_no_network(tmp_path: Path) -> None:
+def test_a_run_that_goes_on_uses_the_replies_it_has_and_asks_only_for_others(tmp_path: Path) -> None:
     server = Server()
     with OsmBuffer(server, ORIGIN, OsmConfig(), tmp_path) as first:
         for position in DRIVE[:60]:
@@ -137,9 +137,37 @@ def test_a_second_run_uses_the_replies_of_the_first_and_no_network(tmp_path: Pat
     asked = len(server.asked)
     with OsmBuffer(server, ORIGIN, OsmConfig(), tmp_path) as second:
         assert [b.osm_id for b in second.near(DRIVE[59])] == seen
-        second.near(np.array([5000.0, 0.0]))
         assert second.wait(0.1)
-    assert len(server.asked) == asked
+        assert len(server.asked) == asked
+        for position in DRIVE:
+            second.near(position)
+            if second.is_waiting:
+                server.let_go(second)
+        assert [tree["elements"] for tree in second.replies[:asked]] == [tree["elements"] for tree in first.replies]
+    assert len(server.asked) == 7, "as one that was not killed"
     (tmp_path / "000000.json").write_text(json.dumps({"elements": []}))
     with pytest.raises(InputError, match=r"000000.json is no reply kept by an earlier run"):
         OsmBuffer(server, ORIGIN, OsmConfig(), tmp_path)
+
+
+def test_what_comes_too_late_is_not_kept_as_if_it_had_been_used(tmp_path: Path) -> None:
+    server = Server()
+    with OsmBuffer(server, ORIGIN, OsmConfig(), tmp_path) as buffer:
+        buffer.near(np.zeros(2))
+        server.let_go(buffer)
+        buffer.near(np.array([70.0, 0.0]))
+    server.gate.release()
+    time.sleep(0.2)
+    assert [p.name for p in tmp_path.iterdir()] == ["000000.json"]
+    assert len(buffer.replies) == 1
+
+
+def test_a_larger_circle_is_asked_for_once() -> None:
+    server = Server()
+    with OsmBuffer(server, ORIGIN, OsmConfig()) as buffer:
+        for radius in (None, 120.0, 240.0, 240.0, 200.0):
+            buffer.ask(np.zeros(2), radius)
+            if buffer.is_waiting:
+                server.let_go(buffer)
+        assert len(buffer.near(np.array([170.0, 0.0]))) >= 3
+    assert len(server.asked) == 2

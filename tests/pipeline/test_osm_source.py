@@ -1,0 +1,146 @@
+"""Buildings of a run: from a file, from a server that is asked on the way, from the replies an earlier run has kept."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from lslam.config.osm import OsmConfig
+from lslam.errors import InputError
+from lslam.geometry import geodesy, se2
+from lslam.pipeline import osm_source
+from lslam.pipeline.osm_source import OsmFile, OsmServer
+from lslam.priors.bounds import Bounds
+from lslam.types.gnss import GnssStream
+
+ORIGIN = np.array([49.0, 8.4, 115.0])
+
+
+def street(bounds: Bounds) -> dict[str, Any]:
+    """A house of 10 m at each thousandth of a degree, those inside the box."""
+    elements: list[dict[str, Any]] = []
+    for i in range(int(np.ceil(bounds.south * 1e3)), int(np.floor(bounds.north * 1e3)) + 1):
+        for j in range(int(np.ceil(bounds.west * 1e3)), int(np.floor(bounds.east * 1e3)) + 1):
+            number = 100_000 * i + j
+            ring = [(0.0, 0.0), (0.0, 1e-4), (1e-4, 1e-4), (1e-4, 0.0)]
+            ids = [10 * number + k for k in range(4)]
+            elements += [
+                {"type": "node", "id": n, "lat": i / 1e3 + a, "lon": j / 1e3 + b}
+                for n, (a, b) in zip(ids, ring, strict=True)
+            ]
+            elements.append({"type": "way", "id": number, "nodes": [*ids, ids[0]], "tags": {"building": "yes"}})
+    return {"elements": elements}
+
+
+def drive(server: OsmServer, yaw: float = 0.0, length: float = 300.0) -> None:
+    """Straight ahead in the world of odometry, a pose every 3 m."""
+    for k, x in enumerate(np.arange(0.0, length, 3.0)):
+        server.see(int(k * 3e8), se2.to_se3(np.array([x + 7.0, 5.0, 0.0])) @ se2.to_se3(np.array([0.0, 0.0, yaw])))
+
+
+def asked_round(boxes: list[Bounds]) -> np.ndarray:
+    """(R, 2) middles of the boxes, m east and north of the origin."""
+    middles = [[(b.south + b.north) / 2, b.west + b.width / 2, 115.0] for b in boxes]
+    return geodesy.to_local(np.array(middles), ORIGIN)[:, :2]
+
+
+class Fetch:
+    """Notes what is asked for."""
+
+    def __init__(self) -> None:
+        self.boxes: list[Bounds] = []
+
+    def __call__(self, bounds: Bounds) -> dict[str, Any]:
+        self.boxes.append(bounds)
+        return street(bounds)
+
+
+def test_with_a_heading_it_asks_along_the_way(tmp_path: Path) -> None:
+    fetch = Fetch()
+    server = OsmServer(ORIGIN, None, OsmConfig(heading_deg=0.0), fetch)
+    server.begin(tmp_path / "replies")
+    drive(server)
+    found = server.extract(ORIGIN)
+    middles = asked_round(fetch.boxes)
+    assert np.abs(middles[:, 0]).max() < 1.0
+    np.testing.assert_allclose(np.diff(middles[:, 1]), 63.0, atol=1.0)
+    north = [b.middle[1] for b in found.buildings]
+    assert max(north) > 300.0
+    assert len({b.osm_id for b in found.buildings}) == len(found.buildings)
+    again = OsmFile(tmp_path / "replies", ORIGIN).extract(ORIGIN)
+    assert [b.osm_id for b in again.buildings] == [b.osm_id for b in found.buildings]
+
+
+def test_fixes_say_the_way_better_than_a_heading() -> None:
+    fetch = Fetch()
+    east = np.array([[d, 0.0, 0.0] for d in (0.0, 150.0, 300.0)])
+    fixes = GnssStream(
+        np.array([0, 15, 30], np.int64) * 10**9, geodesy.from_local(east, ORIGIN), np.ones(3)
+    )  # fmt: skip
+    server = OsmServer(ORIGIN, fixes, OsmConfig(heading_deg=0.0), fetch)
+    server.begin(None)
+    drive(server)
+    server.extract(ORIGIN)
+    middles = asked_round(fetch.boxes)
+    assert np.abs(middles[:, 1]).max() < 1.0
+    assert middles[:, 0].max() > 240.0
+
+
+def test_without_a_heading_the_circle_grows() -> None:
+    fetch = Fetch()
+    server = OsmServer(ORIGIN, None, OsmConfig(), fetch)
+    server.begin(None)
+    drive(server, yaw=1.0)
+    assert max(np.linalg.norm(b.middle) for b in server.extract(ORIGIN).buildings) > 300.0 + 35.0
+    assert np.abs(asked_round(fetch.boxes)).max() < 1.0
+    assert len(fetch.boxes) == 4
+
+
+def test_a_dead_server_costs_nothing_and_is_named() -> None:
+    def fetch(bounds: Bounds) -> dict[str, Any]:
+        raise InputError("the line is dead")
+
+    server = OsmServer(ORIGIN, None, OsmConfig(heading_deg=0.0), fetch)
+    began = time.perf_counter()
+    server.begin(None)
+    drive(server)
+    with pytest.raises(InputError, match=r"no buildings from https://overpass-api\.de.*: the line is dead"):
+        server.extract(ORIGIN)
+    assert time.perf_counter() - began < 3.0
+
+
+def test_a_sleeping_server_is_waited_for_once(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """The first reply comes, no other does; half a second later the run goes on with what it has."""
+    gate = threading.Semaphore(1)
+
+    def fetch(bounds: Bounds) -> dict[str, Any]:
+        gate.acquire()
+        return street(bounds)
+
+    server = OsmServer(ORIGIN, None, OsmConfig(heading_deg=0.0), fetch)
+    server.begin(tmp_path)
+    drive(server)
+    began = time.perf_counter()
+    found = server.extract(ORIGIN)
+    assert time.perf_counter() - began < 1.0
+    assert max(b.middle[1] for b in found.buildings) < 140.0
+    assert [p.name for p in tmp_path.iterdir()] == ["000000.json"]
+    monkeypatch.setattr(osm_source, "FIRST_REPLY_S", 0.2)
+    silent = OsmServer(ORIGIN, None, OsmConfig(heading_deg=0.0), fetch)
+    silent.begin(None)
+    with pytest.raises(InputError, match="no reply came in time"):
+        silent.extract(ORIGIN)
+
+
+def test_a_folder_without_replies_and_one_with_a_broken_one(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"holds no replies"):
+        OsmFile(tmp_path, ORIGIN)
+    (tmp_path / "000000.json").write_text(json.dumps([1]))
+    with pytest.raises(InputError, match=r"holds a reply that cannot be read"):
+        OsmFile(tmp_path, ORIGIN)
