@@ -116,8 +116,7 @@ class OsmServer:
     def extract(self, origin: Floats) -> BuildingExtract:
         """What has come, in the local frame at `origin` (3,): for the first reply the run waits, for others hardly."""
         assert self._buffer is not None
-        if not self._buffer.requests:
-            self._buffer.wait(FIRST_REPLY_S)
+        self._buffer.wait(FIRST_REPLY_S, requests=1)
         self._buffer.wait(LATER_REPLY_S)
         self._buffer.close()
         if not self._buffer.replies:

@@ -111,9 +111,9 @@ class OsmBuffer:
             self._thread.start()
         self._wishes.put(wish)
 
-    def wait(self, seconds: float) -> bool:
-        """Wait for what is asked for, at most `seconds`: for the first place of a run. True when nothing is open any more."""
-        while self._open and seconds > 0:
+    def wait(self, seconds: float, requests: int | None = None) -> bool:
+        """Wait for what is asked for, or for so many `requests` in all, at most `seconds`. True when nothing is open any more."""
+        while self._open and seconds > 0 and (requests is None or self.requests < requests):
             try:
                 self._take(self._done.get(timeout=min(seconds, 0.05)))
             except queue.Empty:
