@@ -1,0 +1,90 @@
+"""Real runs with a part of their loops replaced by wrong ones: what the result loses.
+
+    python tests/benchmarks/wrong_loops.py SEQUENCE... [--share 0.3] [--seeds 3] [--set KEY=VALUE]
+
+Odometry is run once per sequence; per seed it drifts (debug.drift), its loops are found anew, and `share` of them are put
+metres away. ATE is that of the keyframes, se3; `kept` counts wrong loops that were believed, `lost` right ones that were not.
+"""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import sys
+from pathlib import Path
+
+import numpy as np
+from accuracy import ate
+
+from lslam.config import Config, load_config
+from lslam.evaluation.associate import associate
+from lslam.keyframes.store import KeyframeStore
+from lslam.loops.detector import find_loops
+from lslam.odometry import create_odometry
+from lslam.pipeline import drift
+from lslam.pipeline.back_end import BackEnd, run_back_end
+from lslam.pipeline.choose import choose_scans
+from lslam.pipeline.front_end import to_trajectory
+from lslam.pipeline.manifest import Manifest
+from lslam.pipeline.odometry_pass import estimate_poses
+from lslam.pipeline.watch import Watch
+from lslam.readers import open_sequence
+from lslam.types.scan_result import ScanResult
+from lslam.types.trajectory import Trajectory
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "graph"))
+
+from false_loops import with_false_loops
+
+
+def error(results: list[ScanResult], truth: Trajectory) -> float:
+    matches = associate(to_trajectory(results, ""), truth, 0.01, 0)
+    return ate(matches.estimate, matches.truth)
+
+
+def believed(done: BackEnd) -> set[tuple[int, int]]:
+    return {(c.a, c.b) for c in done.candidates if c.verdict == "accepted"}
+
+
+def measure(path: str, config: Config, share: float, seeds: int) -> None:
+    sequence = choose_scans(open_sequence(path), create_odometry(config), config)
+    truth = sequence.ground_truth
+    if truth is None:
+        sys.exit(f"{path} has no ground truth")
+    store = KeyframeStore()
+    manifest = Manifest("", sequence, config)
+    record = estimate_poses(sequence, create_odometry(config), config, manifest, Path(), truth, Watch(), store)
+    print(f"{path}: {len(record.results)} scans, {len(store)} keyframes")
+    for seed in range(seeds):
+        results = drift.with_drift(record.results, config.debug.model_copy(update={"drift_seed": seed}))
+        store.keyframes = drift.moved_keyframes(store.keyframes, results)
+        candidates = find_loops(store, config.loops, config.registration, config.keyframes.submap_size)
+        right = run_back_end(sequence, results, store, config, candidates)
+        mixed, wrong = with_false_loops(candidates, share, np.random.default_rng(seed))
+        done = run_back_end(sequence, results, store, config, mixed)
+        before, best, after = (error(r, truth) for r in (results, right.results, done.results))
+        kept, lost = believed(done) & wrong, believed(right) - believed(done) - wrong
+        print(
+            f"{seed:4} {before:9.3f} {best:9.4f} {after:9.4f} {after / best:6.2f} {len(believed(right)):6} {len(wrong):6} "
+            f"{len(kept):5} {len(lost):5}",
+            flush=True,
+        )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("sequences", nargs="+")
+    parser.add_argument("--share", type=float, default=0.3)
+    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--set", action="append", default=[], dest="settings")
+    args = parser.parse_args()
+    logging.getLogger("lslam").setLevel(logging.ERROR)
+    print(
+        f"{'seed':>4} {'odometry':>9} {'right':>9} {'mixed':>9} {'ratio':>6} {'loops':>6} {'wrong':>6} {'kept':>5} {'lost':>5}"
+    )
+    for path in args.sequences:
+        measure(path, load_config(None, args.settings, {}), args.share, args.seeds)
+
+
+if __name__ == "__main__":
+    main()
