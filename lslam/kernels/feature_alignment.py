@@ -25,6 +25,10 @@ Grid = tuple[Floats, NDArray[np.uint16], Ints, Longs, Ints]
 # H, facts of edges and of planes, last step, iterations, converged, unobserved directions and these as rows
 Aligned = tuple[Floats, Floats, Floats, Floats, int, bool, int, Floats]
 
+# What all features together hold no better than one planar point holds its surface is unobserved: a few false edges do as
+# much. From scan to scan no map takes an error back, and it goes on as velocity: half a point's noise is asked for there.
+LEAST_ON_MAP, LEAST_ON_SCAN = 1.0, 4.0
+
 
 @inline
 def _within(allowed: Floats, H: Floats) -> Floats:
@@ -70,7 +74,9 @@ def align_to_scan(edges: Floats, planes: Floats, R: Floats, t: Floats, scale_sta
         if facts[3] < 6.0:
             break
         # What the projector takes away has no eigenvalue left, so that the step never looks along it in g.
-        weak_count = solve_on_surfaces(_within(allowed, H), _within(allowed, S), g, facts, weak_share, d, weak)
+        weak_count = solve_on_surfaces(
+            _within(allowed, H), _within(allowed, S), g, facts, weak_share, LEAST_ON_SCAN / plane_variance, d, weak
+        )
         move, turn = step_norms(d)
         if not move_by(d, move, turn, scale, R, t):
             break
@@ -119,7 +125,9 @@ def align_to_map(edges: Floats, planes: Floats, scatter: Floats, R: Floats, t: F
         facts = edge_facts + plane_facts
         if facts[3] < 6.0:
             break
-        weak_count = solve_observed(_within(allowed, H), g, facts, weak_share, 1.0, d, weak)
+        weak_count = solve_observed(
+            _within(allowed, H), g, facts, weak_share, LEAST_ON_MAP / plane_variance, 1.0, d, weak
+        )
         move, turn = step_norms(d)
         if not move_by(d, move, turn, scale, R, t):
             break

@@ -23,12 +23,13 @@ UNSEEN = 0.3
 
 
 @inline
-def solve_observed(H: Floats, g: Floats, facts: Floats, weak_share: float, unseen: float, d: Floats,
+def solve_observed(H: Floats, g: Floats, facts: Floats, weak_share: float, least: float, unseen: float, d: Floats,
                    weak: Floats) -> int:  # fmt: skip
     """Step d = -inv(H) g in the directions the points observe; returns how many they do not, as unit rows of `weak`.
 
     Rotations are scaled by the rms lever arm, which makes the six eigenvalues comparable; a direction is unobserved when
-    it holds less than `weak_share` of the total information, and not followed below `unseen` times that.
+    it holds less than `weak_share` of the total information or less than `least`, 1/m2, and not followed below `unseen`
+    times that.
     """
     lever = math.sqrt(max(facts[4] / max(facts[0], 1e-300), 1e-6))
     A = np.empty((6, 6))
@@ -38,12 +39,13 @@ def solve_observed(H: Floats, g: Floats, facts: Floats, weak_share: float, unsee
     values, vectors = eigen(A)
     d[:] = 0.0
     count = 0
+    needed = max(weak_share * facts[0], least)
     for k in range(6):
-        if values[k] <= weak_share * facts[0] or values[k] <= 0.0:
+        if values[k] <= needed or values[k] <= 0.0:
             for i in range(6):
                 weak[count, i] = vectors[i, k]
             count += 1
-            if values[k] <= unseen * weak_share * facts[0] or values[k] <= 0.0:
+            if values[k] <= unseen * needed or values[k] <= 0.0:
                 continue
         dot = 0.0
         for i in range(6):
@@ -88,7 +90,7 @@ def advance(H: Floats, g: Floats, facts: Floats, scale: float, weak_share: float
     mirror(H)
     if facts[3] < 6.0:
         return False, weak_count, 0.0, 0.0
-    weak_count = solve_observed(H, g, facts, weak_share, UNSEEN, d, weak)
+    weak_count = solve_observed(H, g, facts, weak_share, 0.0, UNSEEN, d, weak)
     move, turn = step_norms(d)
     return move_by(d, move, turn, scale, R, t), weak_count, move, turn
 

@@ -36,14 +36,14 @@ def thin_information(p: Floats, xx: float, xy: float, xz: float, yy: float, yz: 
 
 
 @inline
-def solve_on_surfaces(H: Floats, S: Floats, g: Floats, facts: Floats, weak_share: float, d: Floats,
+def solve_on_surfaces(H: Floats, S: Floats, g: Floats, facts: Floats, weak_share: float, least: float, d: Floats,
                       weak: Floats) -> int:  # fmt: skip
-    """As `gauss_newton.solve_observed`, with S deciding which directions are observed: d solves H there.
+    """As `gauss_newton.solve_observed`, with S deciding by its share which directions are observed: d solves H there.
 
-    Both matrices are whole, not triangles.
+    `least` is asked of H. Both matrices are whole, not triangles.
     """
     lever = math.sqrt(max(facts[4] / max(facts[0], 1e-300), 1e-6))
-    information = S[0, 0] + S[1, 1] + S[2, 2]
+    needed = weak_share * (S[0, 0] + S[1, 1] + S[2, 2])
     D = np.ones(6)
     D[3:] = 1.0 / lever
     A, B, P = np.empty((6, 6)), np.empty((6, 6)), np.zeros((6, 6))
@@ -54,7 +54,11 @@ def solve_on_surfaces(H: Floats, S: Floats, g: Floats, facts: Floats, weak_share
     values, vectors = eigen(A)
     count = 0
     for k in range(6):
-        if values[k] <= weak_share * information or values[k] <= 0.0:
+        held = 0.0
+        for i in range(6):
+            for j in range(6):
+                held += vectors[i, k] * B[i, j] * vectors[j, k]
+        if values[k] <= needed or held <= least or values[k] <= 0.0:
             for i in range(6):
                 weak[count, i] = vectors[i, k]
             count += 1
@@ -93,6 +97,6 @@ def advance_on_surfaces(H: Floats, S: Floats, g: Floats, facts: Floats, scale: f
     mirror(S)
     if facts[3] < 6.0:
         return False, weak_count, 0.0, 0.0
-    weak_count = solve_on_surfaces(H, S, g, facts, weak_share, d, weak)
+    weak_count = solve_on_surfaces(H, S, g, facts, weak_share, 0.0, d, weak)
     move, turn = step_norms(d)
     return move_by(d, move, turn, scale, R, t), weak_count, move, turn

@@ -9,15 +9,14 @@ from numpy.typing import NDArray
 
 from lslam.config.loam import LoamConfig
 from lslam.config.registration import RegistrationConfig
-from lslam.geometry import se3, so3
 from lslam.kernels import voxel
 from lslam.preprocessing.features import Features
 from lslam.preprocessing.prepare import NO_TIMES
 from lslam.registration.feature_map import FeatureMap
 from lslam.registration.feature_scan import FeatureScan, feature_scan
-from lslam.registration.feature_solver import NONE, FeatureNoise, solve_on_map
+from lslam.registration.feature_solver import NONE, FeatureNoise, kept_where_blind, solve_on_map
 from lslam.registration.feature_steps import ScanStep, StageClock
-from lslam.registration.registration import DOUBT, Registration
+from lslam.registration.registration import DOUBT, Registration, correction
 from lslam.registration.robust import AdaptiveThreshold, Annealing, UsualAgreement
 from lslam.registration.solver import RegistrationResult
 from lslam.types.state import Stateful
@@ -87,6 +86,10 @@ class FeatureRegistration(Stateful):
         if not result.ok or result.inliers < MIN_FEATURES or is_open:
             with clock.stage("stand-in"):
                 result = self._stand_in(features, start, T_prior, result)
+        if result.ok and len(result.degenerate):
+            # The first step's prior is no more than a guess, which the search has replaced.
+            expected = T_prior if self._first is None else start
+            result = self._judge(kept_where_blind(result, expected), T_prior)
         return result
 
     def update(self, features: Features, result: RegistrationResult) -> None:
@@ -207,8 +210,7 @@ class FeatureRegistration(Stateful):
     def _judge(self, result: RegistrationResult, T_prior: Floats) -> RegistrationResult:
         """The result with its correction of the prior, or a failed one that keeps the prior and says why."""
         c = self.config
-        delta = se3.relative(T_prior, result.T_world_lidar)
-        move, turn = float(np.linalg.norm(delta[:3, 3])), float(so3.angle(delta[:3, :3]))
+        move, turn = correction(T_prior, result.T_world_lidar)
         reason = result.reason
         if not reason and result.overlap < (c.start_overlap if self._starting else c.min_overlap):
             reason = f"only {result.overlap:.0%} of the features have a counterpart"

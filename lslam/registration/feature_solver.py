@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.geometry import se3
+from lslam.geometry import se3, so3
 from lslam.kernels.feature_alignment import align_to_map, align_to_scan
 from lslam.registration.feature_map import MIN_LINE_POINTS, FeatureMap
 from lslam.registration.feature_scan import REACH, FeatureScan
@@ -76,6 +76,19 @@ def solve_on_map(
     )  # fmt: skip
     facts = edge_facts + plane_facts
     return _result(T_prior, R, t, H, facts, step, iterations, converged, weak[:count], len(edges) + len(planes), None)
+
+
+def kept_where_blind(result: RegistrationResult, T_expected: Floats) -> RegistrationResult:
+    """The result with the pose expected, (4, 4), along the directions that it does not observe, whatever led it there.
+
+    Zhang, Kaess and Singh (2016), solution remapping. To leave such a direction out of the last step alone does not do:
+    the ones before it, with a wider kernel, observed more, and falsely so. The error would go on as velocity.
+    """
+    R, arm = result.T_world_lidar[:3, :3], result.lever_arm
+    moved = np.concatenate([result.T_world_lidar[:3, 3] - T_expected[:3, 3], arm * so3.log(R @ T_expected[:3, :3].T)])
+    false = result.degenerate.T @ (result.degenerate @ moved)
+    pose = se3.make(so3.exp(-false[3:] / arm) @ R, result.T_world_lidar[:3, 3] - false[:3])
+    return replace(result, T_world_lidar=se3.normalise(pose))
 
 
 def _start(T_prior: Floats, allowed: Floats | None) -> tuple[Floats, Floats, Floats]:

@@ -155,7 +155,7 @@ class Registration(Stateful):
             found = self._judge(self._coarse_to_fine(points, start), start)
             needed = CLEARLY * first.share(seen, best.T_world_lidar) if best.ok else 0.0
             if found.ok and first.share(seen, found.T_world_lidar) > needed:
-                best = replace(found, prior_error=_correction(T_prior, found.T_world_lidar))
+                best = replace(found, prior_error=correction(T_prior, found.T_world_lidar))
         return best
 
     def _coarse_to_fine(self, points: PreparedPoints, T_prior: NDArray[np.float64]) -> RegistrationResult:
@@ -217,7 +217,7 @@ class Registration(Stateful):
     def _judge(self, result: RegistrationResult, T_prior: NDArray[np.float64]) -> RegistrationResult:
         """The result with its correction of the prior, or a failed one that keeps the prior and says why."""
         c = self.config
-        move, turn = _correction(T_prior, result.T_world_lidar)
+        move, turn = correction(T_prior, result.T_world_lidar)
         reason = result.reason
         # One scan of a sparse sensor makes few planes: what matches them may be right and yet a small share.
         is_filled = self._inserted > c.start_scans and c.target != "scan"
@@ -235,7 +235,7 @@ class Registration(Stateful):
         return replace(result, prior_error=(move, turn))
 
 
-def _correction(T_prior: NDArray[np.float64], pose: NDArray[np.float64]) -> tuple[float, float]:
+def correction(T_prior: NDArray[np.float64], pose: NDArray[np.float64]) -> tuple[float, float]:
     """How far (m, rad) the pose is from what was expected."""
     delta = se3.relative(T_prior, pose)
     return float(np.linalg.norm(delta[:3, 3])), float(so3.angle(delta[:3, :3]))

@@ -14,11 +14,13 @@ Floats = NDArray[np.float64]
 STEPS = 30
 
 
-def solve(H: Floats, g: Floats, lever: float = 1.0, weak_share: float = 1e-3) -> tuple[Floats, Floats]:
+def solve(
+    H: Floats, g: Floats, lever: float = 1.0, weak_share: float = 1e-3, least: float = 0.0
+) -> tuple[Floats, Floats]:
     d, weak = np.full(6, np.nan), np.zeros((6, 6))
     information = float(np.trace(H[:3, :3]))
     facts = np.array([information, 0, 0, 0, information * lever**2, 0])
-    count = gauss_newton.solve_observed(H, g, facts, weak_share, gauss_newton.UNSEEN, d, weak)
+    count = gauss_newton.solve_observed(H, g, facts, weak_share, least, gauss_newton.UNSEEN, d, weak)
     return d, weak[:count]
 
 
@@ -55,6 +57,14 @@ def test_the_share_of_information_draws_the_line() -> None:
         d, weak = solve(H, np.ones(6), weak_share=share)
         assert len(weak) == expected
         assert d[2] == pytest.approx(-1e3 if is_followed else 0.0)
+
+
+def test_so_does_the_least_that_is_asked_for() -> None:
+    H = np.diag([1.0, 1.0, 1e-2, 1.0, 1.0, 1.0])
+    for least, expected, is_followed in [(5e-3, 0, True), (2e-2, 1, True), (5e-2, 1, False)]:
+        d, weak = solve(H, np.ones(6), least=least)
+        assert len(weak) == expected
+        assert d[2] == pytest.approx(-1e2 if is_followed else 0.0)
 
 
 def test_no_information_gives_no_step() -> None:

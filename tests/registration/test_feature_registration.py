@@ -12,9 +12,10 @@ from lslam.geometry import se3
 from lslam.preprocessing.features import Features, extract_features
 from lslam.registration.feature_registration import FeatureRegistration
 from lslam.registration.feature_scan import feature_scan
-from lslam.registration.feature_solver import NONE, FeatureNoise, solve_on_scan
+from lslam.registration.feature_solver import NONE, FeatureNoise, kept_where_blind, solve_on_scan
 from lslam.registration.feature_steps import ScanStep, StageClock, joint_step, two_steps, upright_directions
 from lslam.registration.robust import Annealing
+from lslam.registration.solver import RegistrationResult
 from lslam.types.scan import Scan
 
 Floats = NDArray[np.float64]
@@ -112,6 +113,25 @@ def test_planes_of_two_walls_leave_their_direction_open_and_the_prior_there() ->
     assert result.covariance is not None
     assert result.covariance[0, 0] > 0.5
     assert result.covariance[1, 1] < 0.01
+
+
+def test_what_led_astray_where_nothing_is_observed_is_taken_back_and_nothing_else() -> None:
+    """In coordinates whose rotation is scaled by the lever arm, as those of the unobserved directions are."""
+    rng, arm = np.random.default_rng(4), 12.0
+    for _ in range(20):
+        weak = np.linalg.qr(rng.normal(size=(6, 6)))[0][:2]
+        expected = random_pose(rng, 5.0, 90.0)
+        moved = rng.normal(0, 0.05, 6)
+
+        def after(step: Floats, start: Floats = expected) -> Floats:
+            turned = se3.exp(np.r_[np.zeros(3), step[3:] / arm])[:3, :3] @ start[:3, :3]
+            return se3.make(turned, start[:3, 3] + step[:3])
+
+        astray = RegistrationResult(after(moved), degenerate=weak, lever_arm=arm)
+        kept = kept_where_blind(astray, expected)
+        right = after(moved - weak.T @ (weak @ moved))
+        # Small rotations add up but for the product of two of them.
+        np.testing.assert_allclose(kept.T_world_lidar, right, atol=2e-4)
 
 
 @pytest.mark.parametrize(("step", "with_map"), VARIANTS)
