@@ -20,6 +20,10 @@ class ImuConfig(Section):
         description="where a prediction's velocity comes from: what registration found, or integration alone since the "
         "start (first thesis, methods 2 and 1)",
     )
+    weigh: bool = Field(
+        True,
+        description="weigh each registered motion against what the IMU felt by their covariances; false: it predicts only",
+    )
     gyro_bias: Three | None = Field(None, description="rad/s, IMU axes; absent: estimated")
     accel_bias: Three | None = Field(None, description="m/s2, IMU axes; absent: estimated")
     initial_velocity: Three | None = Field(

@@ -12,7 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.geometry import so3
+from lslam.inertial.gyroscope import Gyroscope
 from lslam.inertial.integrate import Increments, integrate
+from lslam.inertial.kalman import update
 from lslam.types.imu import ImuStream
 
 Floats = NDArray[np.float64]
@@ -20,30 +22,27 @@ Floats = NDArray[np.float64]
 GRAVITY = 9.80665
 # Registration from scan to scan: m and rad, one sigma.
 PLACE_SIGMA, TURN_SIGMA = 0.007, np.deg2rad(0.05)
-# Force and rate that no bias explains (vibration, misaligned axes, readings cut at the rate): per sqrt(Hz).
-FORCE_NOISE, RATE_NOISE = 0.1, np.deg2rad(0.02)
-# Biases and the direction of gravity wander: per sqrt(s).
-GRAVITY_WALK, ACCEL_WALK, GYRO_WALK = 5e-3, 2e-3, np.deg2rad(0.03)
+# Force that no bias explains (vibration, misaligned axes, readings cut at the rate): per sqrt(Hz).
+FORCE_NOISE = 0.1
+# Bias and the direction of gravity wander: per sqrt(s).
+GRAVITY_WALK, ACCEL_WALK = 5e-3, 2e-3
 GRAVITY_SIGMA = 0.03  # m/s2, over the Earth
-# Innovations beyond so many sigma are outliers and count accordingly less.
-OUTLIER = 4.0
 
 VELOCITY, DOWN, BIAS = slice(0, 3), slice(3, 6), slice(6, 9)
 
 
 @dataclass(frozen=True)
 class ImuEstimate:
-    """Velocity of the IMU and gravity in the world, biases in IMU axes; SI units.
+    """Velocity of the IMU and gravity in the world, bias of its forces in IMU axes; SI units.
 
-    covariance : (9, 9) of velocity, gravity and accelerometer bias; gyro_covariance : (3, 3)
+    covariance : (9, 9) of velocity, gravity and accelerometer bias
     """
 
     velocity: Floats
     gravity: Floats
     accel_bias: Floats
-    gyro_bias: Floats
+    gyroscope: Gyroscope
     covariance: Floats = field(repr=False)
-    gyro_covariance: Floats = field(repr=False)
 
     @property
     def down(self) -> tuple[Floats, float]:
@@ -56,43 +55,57 @@ class ImuEstimate:
 
     def over(self, imu: ImuStream, instants_ns: NDArray[np.int64]) -> Increments:
         """What the IMU felt between increasing instants, biases taken off."""
-        return integrate(imu, instants_ns, self.gyro_bias, self.accel_bias)
+        return integrate(imu, instants_ns, self.gyroscope.bias, self.accel_bias, self.gyroscope.axes)
+
+    def displacement(self, step: Increments, R: Floats) -> tuple[Floats, Floats]:
+        """Mean (3,) and covariance (3, 3) of how far `step` leads, m, world axes; R (3, 3) of the IMU at its beginning."""
+        x, P = _propagate(self, step, R)
+        return x[:3], P[:3, :3]
 
     def carried(self, step: Increments, R: Floats) -> ImuEstimate:
         """The estimate at the last instant of `step`, with nothing but the IMU to go by; R (3, 3) of the IMU at the first."""
         x, P = _propagate(self, step, R)
         return self._with(x[3:], P[3:, 3:], step)
 
+    def taught(
+        self, imu: ImuStream, instants_ns: NDArray[np.int64], R: Floats, R_end: Floats, noise: Floats | None = None
+    ) -> Gyroscope:
+        """The gyroscope, now that registration turned the IMU from R to R_end (3, 3) between two instants.
+
+        noise : (3, 3) rad2, world axes, of either rotation; None where a registration says nothing of its quality
+        """
+        step = self.over(imu, instants_ns)
+        R_felt = R @ step.rotations[-1]
+        if noise is None:
+            noise = TURN_SIGMA**2 * np.eye(3)
+        return self.gyroscope.learnt(step, so3.log(R_felt.T @ R_end), 2 * R_felt.T @ noise @ R_felt)
+
     def corrected(
-        self, imu: ImuStream, instants_ns: NDArray[np.int64], R: Floats, R_end: Floats, moved: Floats
-    ) -> ImuEstimate:
+        self, imu: ImuStream, instants_ns: NDArray[np.int64], R: Floats, R_end: Floats, moved: Floats,
+        gyroscope: Gyroscope,
+    ) -> ImuEstimate:  # fmt: skip
         """The estimate at the last instant, now that registration says how the IMU got there.
 
         R, R_end : (3, 3) of the IMU in the world at the first and the last instant; moved : (3,) m in between
+        gyroscope : as the turn has `taught`
         """
         step = self.over(imu, instants_ns)
         rest = so3.log((R @ step.rotations[-1]).T @ R_end)
-        arm = step.rotations[-1].T @ step.velocity_arms[-1]
-        turned = self._turned(rest, arm, float(step.seconds[-1]))
         # The shape of the turn is the gyroscope's, its sum is registration's.
-        step = integrate(imu, instants_ns, self.gyro_bias - np.linalg.solve(arm, rest), self.accel_bias)
+        arm = step.rotations[-1].T @ step.velocity_arms[-1]
+        axes = self.gyroscope.axes
+        bias = self.gyroscope.bias - np.linalg.solve(arm @ axes, rest)
+        step = integrate(imu, instants_ns, bias, self.accel_bias, axes)
         x, P = _propagate(self, step, R)
         H = np.zeros((3, 12))
         H[:, :3] = np.eye(3)
-        x, P = _update(x, P, H, moved - x[:3], 2 * PLACE_SIGMA**2 * np.eye(3))
+        x, P = update(x, P, H, moved - x[:3], 2 * PLACE_SIGMA**2 * np.eye(3))
         down = x[6:9]
         norm = float(np.linalg.norm(down))
         H = np.zeros((1, 12))
         H[0, 6:9] = down / norm
-        x, P = _update(x, P, H, np.array([GRAVITY - norm]), np.array([[GRAVITY_SIGMA**2]]))
-        return turned._with(x[3:], P[3:, 3:], step)
-
-    def _turned(self, rest: Floats, arm: Floats, seconds: float) -> ImuEstimate:
-        """With the gyroscope's bias learnt from the turn `rest` (3,) that its readings leave open after `seconds`."""
-        noise = (2 * TURN_SIGMA**2 + RATE_NOISE**2 * seconds) * np.eye(3)
-        P = self.gyro_covariance + GYRO_WALK**2 * seconds * np.eye(3)
-        bias, P = _update(self.gyro_bias, P, -arm, rest, noise)
-        return replace(self, gyro_bias=bias, gyro_covariance=P)
+        x, P = update(x, P, H, np.array([GRAVITY - norm]), np.array([[GRAVITY_SIGMA**2]]))
+        return replace(self, gyroscope=gyroscope)._with(x[3:], P[3:, 3:], step)
 
     def _with(self, x: Floats, P: Floats, step: Increments) -> ImuEstimate:
         walk = np.zeros((9, 9))
@@ -112,15 +125,3 @@ def _propagate(estimate: ImuEstimate, step: Increments, R: Floats) -> tuple[Floa
     noise = FORCE_NOISE**2 * np.array([[t**3 / 3, t**2 / 2], [t**2 / 2, t]])
     P[:6, :6] += np.kron(noise, np.eye(3))
     return np.concatenate([moved[-1], velocities[-1], estimate.gravity, estimate.accel_bias]), P
-
-
-def _update(x: Floats, P: Floats, H: Floats, rest: Floats, noise: Floats) -> tuple[Floats, Floats]:
-    """One Kalman update by the innovation `rest`; an outlier's noise is raised to what it shows."""
-    S = H @ P @ H.T + noise
-    surprise = float(rest @ np.linalg.solve(S, rest)) / (len(rest) * OUTLIER**2)
-    if surprise > 1:
-        noise = noise * surprise
-        S = H @ P @ H.T + noise
-    K = np.linalg.solve(S, H @ P).T
-    left = np.eye(len(x)) - K @ H
-    return x + K @ rest, left @ P @ left.T + K @ noise @ K.T

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,12 +11,15 @@ from numpy.typing import NDArray
 from lslam.config.imu import ImuConfig
 from lslam.geometry import se3, so3
 from lslam.inertial.estimate import ImuEstimate
+from lslam.inertial.gyroscope import Gyroscope
+from lslam.inertial.kalman import surprise
 from lslam.inertial.stream import gaps
 from lslam.preprocessing.deskew import KNOTS
 from lslam.registration.motion import ConstantVelocity, middle_of
 from lslam.types.gravity import GravityDirection
 from lslam.types.imu import ImuStream
 from lslam.types.motion_prior import MotionPrior
+from lslam.types.scan_result import ScanResult
 from lslam.types.state import State, Stateful
 
 Floats = NDArray[np.float64]
@@ -46,6 +50,8 @@ class InertialMotion(Stateful):
         self._gaps = gaps(imu, config.gap_s)
         self._instant_ns: int | None = None
         self._pose = np.eye(4)
+        # What `weigh` learnt of the gyroscope at an instant, ns, for `correct`.
+        self._taught: tuple[int, Gyroscope] | None = None
         self._errors: list[tuple[float, float]] = []
 
     @property
@@ -72,6 +78,37 @@ class InertialMotion(Stateful):
         if self.config.velocity == "integrated":
             return prior
         return self._prior(self._corrected(instant_ns, middle), instant_ns, middle, stamp_ns, span)
+
+    def weigh(self, result: ScanResult, prior: MotionPrior) -> ScanResult:
+        """The registered motion since the last scan weighed against what the IMU felt, each by its covariance.
+
+        Where they contradict each other, it stays registration's. prior : of the registration, says how the sweep moved
+        """
+        C = result.registration_covariance
+        if C is None or result.status != "ok" or not self.config.weigh or self.config.velocity == "integrated":
+            return result
+        middle, instant_ns = middle_of(prior, result.stamp_ns, result.T_world_lidar)
+        before = self._instant_ns
+        if self.refusal or before is None or instant_ns <= before or not self._covers(before, instant_ns):
+            return result
+        e = self.estimate
+        instants = np.array([before, instant_ns])
+        step = e.over(self.imu, instants)
+        begin, end = self._pose @ self.T_lidar_imu, middle @ self.T_lidar_imu
+        R_felt = begin[:3, :3] @ step.rotations[-1]
+        moved, felt = e.displacement(step, begin[:3, :3])
+        P = np.zeros((6, 6))
+        P[:3, :3], P[3:, 3:] = felt, R_felt @ e.gyroscope.turn_covariance(step) @ R_felt.T
+        rest = np.concatenate([end[:3, 3] - begin[:3, 3] - moved, R_felt @ so3.log(R_felt.T @ end[:3, :3])])
+        self._taught = instant_ns, e.taught(self.imu, instants, begin[:3, :3], end[:3, :3], C[3:, 3:])
+        if surprise(rest, P + 2 * C) > 1:
+            return result
+        # A pose that is wrong moves the map by one part in its age only, the scans before hold it: random errors of both
+        # then add up to the least drift when those of the IMU count as many times.
+        K = np.linalg.solve(C + result.map_age * P, C).T
+        d = -K @ rest
+        pose = se3.make(so3.exp(d[3:]) @ result.T_world_lidar[:3, :3], result.T_world_lidar[:3, 3] + d[:3])
+        return replace(result, T_world_lidar=se3.normalise(pose), registration_covariance=C - K @ C)
 
     def correct(
         self, stamp_ns: int, pose: Floats, prior: MotionPrior | None = None, is_registered: bool = True
@@ -160,7 +197,13 @@ class InertialMotion(Stateful):
         assert self._instant_ns is not None
         a, b = self._pose @ self.T_lidar_imu, middle @ self.T_lidar_imu
         instants = np.array([self._instant_ns, instant_ns])
-        return self.estimate.corrected(self.imu, instants, a[:3, :3], b[:3, :3], b[:3, 3] - a[:3, 3])
+        if self._taught is not None and self._taught[0] == instant_ns:
+            gyroscope = self._taught[1]
+        else:
+            gyroscope = self.estimate.taught(self.imu, instants, a[:3, :3], b[:3, :3])
+        return self.estimate.corrected(
+            self.imu, instants, a[:3, :3], b[:3, :3], b[:3, 3] - a[:3, 3], gyroscope
+        )  # fmt: skip
 
     def _carried(self, instant_ns: int) -> ImuEstimate:
         assert self._instant_ns is not None
@@ -183,9 +226,7 @@ class InertialMotion(Stateful):
         covariance[:3, :3] = np.eye(3)
         e = self.estimate
         seconds = max(1e-9 * (instant_ns - self._instant_ns), 1e-3)
-        self.estimate = ImuEstimate(
-            moved / seconds, e.gravity, e.accel_bias, e.gyro_bias, covariance, e.gyro_covariance
-        )
+        self.estimate = ImuEstimate(moved / seconds, e.gravity, e.accel_bias, e.gyroscope, covariance)
 
     def _judge(self, stamp_ns: int, pose: Floats) -> None:
         """Refuse an IMU that predicts scans clearly worse than constant velocity does."""

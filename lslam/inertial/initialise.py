@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from lslam.config.imu import ImuConfig
 from lslam.inertial.agreement import LEAST_OFFSET_S, check_agreement
 from lslam.inertial.estimate import BIAS, DOWN, GRAVITY, ImuEstimate
-from lslam.inertial.integrate import integrate
+from lslam.inertial.gyroscope import Gyroscope
 from lslam.inertial.stream import clean
 from lslam.types.imu import ImuStream
 
@@ -38,12 +38,14 @@ class FirstPoses:
 
     stamps_ns (N,), poses (N, 4, 4) : at the starts of the scans, the first scan's first
     instants_ns (M,), middles (M, 4, 4) : in the middle of sweeps, where turns are known best
+    covariances : (M, 6, 6) of the registrations, world axes; None when they say nothing of their quality
     """
 
     stamps_ns: NDArray[np.int64]
     poses: Floats
     instants_ns: NDArray[np.int64]
     middles: Floats
+    covariances: Floats | None = None
 
 
 @dataclass(frozen=True)
@@ -94,7 +96,7 @@ def start(
     moved = round(1e9 * agreement.offset_s)
     usable = replace(cleaned.imu, stamps_ns=cleaned.imu.stamps_ns + moved)
     guess, is_static = _first_guess(usable, T_lidar_imu, stamps_ns, poses, config, agreement.gyro_bias)
-    estimate = _learnt(usable, T_lidar_imu, guess, stamps_ns, poses, config)
+    estimate = _learnt(usable, T_lidar_imu, guess, first, config)
     notes.append("IMU aligned " + ("while standing" if is_static else "while moving"))
     return Start(usable, T_lidar_imu, estimate, offset, agreement.is_judged, is_static, notes, problems)
 
@@ -132,7 +134,7 @@ def _first_guess(
     covariance = np.zeros((9, 9))
     np.fill_diagonal(covariance, np.repeat([ANY_SPEED**2, LEVEL_SIGMA**2 + shared, shared], 3))
     covariance[DOWN, BIAS], covariance[BIAS, DOWN] = shared * R, shared * R.T
-    guess = ImuEstimate(np.zeros(3), np.zeros(3), accel_bias, gyro_bias, covariance, gyro_sigma**2 * np.eye(3))
+    guess = ImuEstimate(np.zeros(3), np.zeros(3), accel_bias, Gyroscope.of_bias(gyro_bias, gyro_sigma), covariance)
     gravity = _path_of_force(imu, poses @ T_lidar_imu, stamps_ns, guess, GRAVITY_S)[1]
     return replace(guess, gravity=GRAVITY * gravity / max(float(np.linalg.norm(gravity)), 1e-9)), stands
 
@@ -150,26 +152,23 @@ def _is_standing(imu: ImuStream, stamps_ns: NDArray[np.int64], poses: Floats) ->
 
 
 def _learnt(
-    imu: ImuStream,
-    T_lidar_imu: Floats,
-    guess: ImuEstimate,
-    stamps_ns: NDArray[np.int64],
-    poses: Floats,
-    config: ImuConfig,
+    imu: ImuStream, T_lidar_imu: Floats, guess: ImuEstimate, first: FirstPoses, config: ImuConfig
 ) -> ImuEstimate:
-    """The guess after all the poses, brought back to the first of them."""
-    T = poses @ T_lidar_imu
+    """The guess after all the sweeps, brought back to the first pose."""
+    T = first.middles @ T_lidar_imu
     learnt = guess
     for k in range(len(T) - 1):
-        moved = T[k + 1, :3, 3] - T[k, :3, 3]
-        learnt = learnt.corrected(imu, stamps_ns[k : k + 2], T[k, :3, :3], T[k + 1, :3, :3], moved)
+        step, R, R_end = first.instants_ns[k : k + 2], T[k, :3, :3], T[k + 1, :3, :3]
+        noise = None if first.covariances is None else first.covariances[k + 1, 3:, 3:]
+        gyroscope = learnt.taught(imu, step, R, R_end, noise)
+        learnt = learnt.corrected(imu, step, R, R_end, T[k + 1, :3, 3] - T[k, :3, 3], gyroscope)
     covariance = learnt.covariance.copy()
     covariance[:3, :] = covariance[:, :3] = 0.0
-    velocity, _, spread = _path_of_force(imu, T, stamps_ns, learnt, SPEED_S)
+    velocity, _, spread = _path_of_force(imu, first.poses @ T_lidar_imu, first.stamps_ns, learnt, SPEED_S)
     sigma = max(spread, 0.1)
     if config.initial_velocity is not None:
-        i = min(int(np.searchsorted(imu.stamps_ns, stamps_ns[0])), len(imu) - 1)
-        rate = T_lidar_imu[:3, :3] @ (imu.gyro[i] - learnt.gyro_bias)
+        i = min(int(np.searchsorted(imu.stamps_ns, first.stamps_ns[0])), len(imu) - 1)
+        rate = T_lidar_imu[:3, :3] @ learnt.gyroscope.rates(imu.gyro[i])
         velocity, sigma = np.array(config.initial_velocity) + np.cross(rate, T_lidar_imu[:3, 3]), GIVEN_SPEED
     covariance[:3, :3] = sigma**2 * np.eye(3)
     return replace(learnt, velocity=velocity, covariance=covariance)
@@ -185,9 +184,9 @@ def _path_of_force(
     count = max(int(np.searchsorted(stamps_ns, stamps_ns[0] + round(1e9 * seconds))), min(4, len(stamps_ns)))
     has_gravity = bool(known.gravity.any())
     if count < 4:
-        step = integrate(imu, stamps_ns[0] + np.array([0, 500_000_000]), known.gyro_bias, known.accel_bias)
+        step = known.over(imu, stamps_ns[0] + np.array([0, 500_000_000]))
         return np.zeros(3), known.gravity if has_gravity else -T_world_imu[0, :3, :3] @ step.velocities[-1], ANY_SPEED
-    step = integrate(imu, stamps_ns[:count], known.gyro_bias, known.accel_bias)
+    step = known.over(imu, stamps_ns[:count])
     _, _, moved = step.motion(0, T_world_imu[0, :3, :3], np.zeros(3), known.gravity)
     rest = T_world_imu[:count, :3, 3] - T_world_imu[0, :3, 3] - moved
     t = step.seconds[:, None]

@@ -46,8 +46,13 @@ class Increments:
         )
 
 
-def integrate(imu: ImuStream, instants_ns: NDArray[np.int64], gyro_bias: Floats, accel_bias: Floats) -> Increments:
+def integrate(
+    imu: ImuStream, instants_ns: NDArray[np.int64], gyro_bias: Floats, accel_bias: Floats,
+    gyro_axes: Floats | None = None,
+) -> Increments:  # fmt: skip
     """Integrate the stream over increasing `instants_ns` (K,), K >= 1, with the biases (3,) taken off.
+
+    gyro_axes : (3, 3) that makes true rates of the gyroscope's readings less their bias; None takes them as they are
 
     Readings are linear between samples and constant beyond the ends of the stream, so the result does not depend on how the
     instants lie among the samples (midpoint rule: exact for a constant rate and force).
@@ -60,6 +65,8 @@ def integrate(imu: ImuStream, instants_ns: NDArray[np.int64], gyro_bias: Floats,
     middles = 0.5 * (grid[:-1] + grid[1:] - 2 * lo)
     gyro, accel = _sampled(imu, i, j, lo, middles)
     gyro, accel = gyro - gyro_bias, accel - accel_bias
+    if gyro_axes is not None:
+        gyro = gyro @ gyro_axes.T
     R = np.empty((len(grid), 3, 3))
     R[0] = np.eye(3)
     steps = so3.exp(gyro * dt[:, None])

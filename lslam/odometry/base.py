@@ -51,7 +51,7 @@ class Deskewing(Odometry, Protocol):
     """
 
     def update(self, scan: Scan, prepared: Any, prior: MotionPrior, result: ScanResult) -> ScanResult:
-        """Learn from the scan as the last `register` placed it; the result with the time that took."""
+        """Learn from the scan of the last `register`, at the pose of `result`; the result with the time that took."""
         ...
 
     def restart(self) -> None:

@@ -72,6 +72,8 @@ class Icp(Stateful):
             T_world_lidar=result.T_world_lidar,
             status="ok" if result.ok else "bridged",
             reason=result.reason,
+            registration_covariance=result.covariance,
+            map_age=self._uncertainty.map_age,
             converged=result.converged,
             iterations=result.iterations,
             source_points=result.source_points,
@@ -86,8 +88,9 @@ class Icp(Stateful):
     def update(self, scan: Scan, prepared: PreparedPoints, prior: MotionPrior, result: ScanResult) -> ScanResult:
         """Enter the scan into the local map where `register` put it."""
         began = time.perf_counter()
-        self.registration.update(self._points, self._located)
-        result = self._uncertainty.stamped(result, self._located, prior)
+        located = self._located.moved(result.T_world_lidar, result.registration_covariance)
+        self.registration.update(self._points, located)
+        result = self._uncertainty.stamped(result, located, prior)
         return replace(result, stages={**result.stages, "update": time.perf_counter() - began})
 
     def restart(self) -> None:

@@ -91,6 +91,8 @@ class Loam(Stateful):
             T_world_lidar=result.T_world_lidar,
             status="ok" if result.ok else "bridged",
             reason=result.reason,
+            registration_covariance=result.covariance,
+            map_age=self._uncertainty.map_age,
             converged=result.converged,
             iterations=result.iterations,
             source_points=result.source_points,
@@ -106,8 +108,9 @@ class Loam(Stateful):
         """Enter the scan where `register` put it: into the feature map, and as what the next one is registered on."""
         clock = StageClock()
         with clock.stage("update"):
-            self.registration.update(self._features, self._located)
-            result = self._uncertainty.stamped(result, self._located, prior)
+            located = self._located.moved(result.T_world_lidar, result.registration_covariance)
+            self.registration.update(self._features, located)
+            result = self._uncertainty.stamped(result, located, prior)
         return replace(result, stages={**result.stages, **clock.seconds})
 
     def warm_up(self) -> None:

@@ -94,13 +94,20 @@ def load_start(path: Path, config: Config) -> Inertial | None:
 
 
 def _begin(sequence: Sequence, imu: ImuStream, T_lidar_imu: NDArray[np.float64], config: Config) -> Start:
-    """The start by scans registered without the IMU; where clocks differ, again by scans that it then deskewed."""
+    """The start by scans registered without the IMU; again by scans that it then deskewed, where that matters."""
     last_ns = int(sequence.stamps_ns[-1])
-    begun = start(imu, T_lidar_imu, first_poses(sequence, config, None), last_ns, config.imu)
-    if begun.offset_s == 0 or config.imu.time_offset_s is not None:
+    first = first_poses(sequence, config, None)
+    begun = start(imu, T_lidar_imu, first, last_ns, config.imu)
+    is_moved = begun.offset_s != 0 and config.imu.time_offset_s is None
+    if not is_moved and first.covariances is not None:
         return begun
     motion = InertialMotion(begun.imu, T_lidar_imu, begun.estimate, config.imu)
-    again = start(begun.imu, T_lidar_imu, first_poses(sequence, config, motion), last_ns, config.imu, 0.0)
+    better = first_poses(sequence, config, motion)
+    if not is_moved:
+        on_time = config.imu.model_copy(update={"time_offset_s": 0.0})
+        again = start(begun.imu, T_lidar_imu, better, last_ns, on_time)
+        return replace(again, offset_s=begun.offset_s, notes=begun.notes, problems=begun.problems)
+    again = start(begun.imu, T_lidar_imu, better, last_ns, config.imu, 0.0)
     offset = begun.offset_s + again.offset_s
     said = f"IMU stamps moved by {1e3 * offset:+.1f} ms: its turns then fit those of the scans best"
     return replace(again, offset_s=offset, notes=[*begun.notes, said])
@@ -126,6 +133,7 @@ def first_poses(sequence: Sequence, config: Config, motion: InertialMotion | Non
     poses: list[NDArray[np.float64]] = []
     instants: list[int] = []
     middles: list[NDArray[np.float64]] = []
+    covariances: list[NDArray[np.float64]] = []
     for loaded in read_ahead(few, odometry.prepare, config.input.threads):
         result = tracker.track(loaded)
         if result.status == "skipped":
@@ -136,13 +144,16 @@ def first_poses(sequence: Sequence, config: Config, motion: InertialMotion | Non
         poses.append(result.T_world_lidar)
         instants.append(tracker.middle[0])
         middles.append(tracker.middle[1])
+        # Where constant velocity deskews, poses are worse than a registration can know.
+        if result.registration_covariance is not None and (motion is not None or len(tracker.sweep.times) == 1):
+            covariances.append(result.registration_covariance)
     if not stamps:
         stamps, poses = [int(whole.stamps_ns[first])], [np.eye(4)]
     # The sweep of the first scan is not known before the second without an IMU.
     turns = slice(1 if motion is None else 0, None)
     return FirstPoses(
         np.array(stamps, np.int64), np.stack(poses), np.array(instants[turns], np.int64),
-        np.array(middles[turns]).reshape(-1, 4, 4),
+        np.array(middles[turns]).reshape(-1, 4, 4), np.stack(covariances)[turns] if len(covariances) == len(poses) else None,
     )  # fmt: skip
 
 
@@ -169,7 +180,7 @@ def close_inertial(part: Inertial, results: list[ScanResult]) -> dict[str, Any]:
         "time_offset_s": round(begun.offset_s, 5),
         "is_checked_by_turns": begun.is_checked,
         "is_static_start": begun.is_static,
-        "gyro_bias_rad_s": _rounded(last.gyro_bias, 5),
+        "gyro_bias_rad_s": _rounded(last.gyroscope.bias, 5),
         "accel_bias_m_s2": _rounded(last.accel_bias, 4),
         "gravity_in_world_m_s2": _rounded(last.gravity, 4),
         "scans_in_gaps": motion.gap_scans,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from lslam.inertial.estimate import ImuEstimate
+from lslam.inertial.gyroscope import Gyroscope
 from lslam.inertial.initialise import Start
 from lslam.preprocessing.features import FeaturePoints, Features
 from lslam.registration.feature_scan import FeatureScan
@@ -11,5 +12,5 @@ from lslam.types.imu import ImuStream
 from lslam.types.scan_result import ScanResult
 
 STATE_CLASSES = (
-    FeaturePoints, Features, FeatureScan, GravityDirection, ImuEstimate, ImuStream, ScanResult, Start,
+    FeaturePoints, Features, FeatureScan, GravityDirection, Gyroscope, ImuEstimate, ImuStream, ScanResult, Start,
 )  # fmt: skip

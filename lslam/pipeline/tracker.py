@@ -143,6 +143,8 @@ class Tracker:
             else:
                 prior = self._begin_again(odometry, *self._first, scan, result)
                 result = odometry.register(scan, prepared, prior)
+        if isinstance(self.motion, InertialMotion):
+            result = self.motion.weigh(result, prior)
         return odometry.update(scan, prepared, prior, result), prior
 
     def _begin_again(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,6 +45,10 @@ class RegistrationResult:
     degenerate: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 6)))
     prior_error: tuple[float, float] = (0.0, 0.0)
     lever_arm: float = 1.0
+
+    def moved(self, T_world_lidar: NDArray[np.float64], covariance: NDArray[np.float64] | None) -> RegistrationResult:
+        """The same registration, where more than the map was asked for the pose."""
+        return replace(self, T_world_lidar=T_world_lidar, covariance=covariance)
 
     @property
     def overlap(self) -> float:

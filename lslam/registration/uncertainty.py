@@ -33,9 +33,11 @@ class PoseUncertainty(Stateful):
 
     Scans that were deskewed carry the doubt about their motion into the map likewise; that of the first scan, at whose start
     the world begins, is in all others.
+
+    map_age : how many scans ago, on the mean, the points of the map were taken on which the next scan is registered
     """
 
-    STATE = ("_map", "_position", "_start", "_sweep")
+    STATE = ("_map", "_position", "_start", "_sweep", "_scans", "map_age")
 
     def __init__(self, *, is_scan_to_scan: bool = False) -> None:
         self.is_scan_to_scan = is_scan_to_scan
@@ -44,6 +46,8 @@ class PoseUncertainty(Stateful):
         # Where the world begins, until it is known how wrong the first sweep was.
         self._start: Floats | None = None
         self._sweep = SweepDoubt()
+        self._scans = 0
+        self.map_age = 1.0
 
     def stamped(self, result: ScanResult, located: RegistrationResult, prior: MotionPrior) -> ScanResult:
         """The result of a scan that `prior` deskewed, with the covariances of its pose in the world and on the map."""
@@ -68,8 +72,11 @@ class PoseUncertainty(Stateful):
         self._position = position.copy()
         self._map = noise.transported(self._map, step)
         if result.ok:
-            renewed = float(np.linalg.norm(step)) / max(result.lever_arm, 1.0)
-            self._map += (1.0 if self.is_scan_to_scan else renewed) * own
+            renewed = 1.0 if self.is_scan_to_scan else float(np.linalg.norm(step)) / max(result.lever_arm, 1.0)
+            self._map += renewed * own
+            self._scans += 1
+            share = min(max(renewed, 1 / self._scans), 1.0)
+            self.map_age = 1 + (1 - share) * self.map_age
         begun = np.zeros((6, 6)) if self._start is None else noise.transported(FIRST * sweep, position - self._start)
         if self._sweep.scans == MEMORY and self._start is not None:
             self._map, self._start, begun = self._map + begun, None, np.zeros((6, 6))

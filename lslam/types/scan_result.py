@@ -23,6 +23,7 @@ class ScanResult:
     covariance : (6, 6) of the pose in the world, t' = t + d[:3], R' = exp(d[3:]) R in world axes, m2 and rad2; grows with
         the distance travelled. None when the method has none
     registration_covariance : likewise, but relative to the local map the scan was registered on
+    map_age : how many scans ago that local map was taken, on the mean; 1 from scan to scan
     is_standing : the sensor had not moved, so the scan was not registered and has the pose of the one before
     degenerate : (K, 6) unit twists along which the scan says nothing and the motion prior was kept
     prior_error : (translation m, rotation rad) between motion prior and result
@@ -39,6 +40,7 @@ class ScanResult:
     reason: str = ""
     covariance: NDArray[np.float64] | None = None
     registration_covariance: NDArray[np.float64] | None = None
+    map_age: float = 1.0
     converged: bool = True
     iterations: int = 0
     source_points: int = 0

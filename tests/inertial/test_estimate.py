@@ -9,6 +9,7 @@ import pytest
 
 from lslam.geometry import so3
 from lslam.inertial.estimate import ImuEstimate, _propagate
+from lslam.inertial.gyroscope import Gyroscope
 from lslam.types.imu import ImuStream
 
 
@@ -21,7 +22,7 @@ def test_errors_travel_as_the_covariance_says(direction: int) -> None:
     R = so3.exp(np.array([0.3, -0.5, 1.1]))
     nothing = np.zeros((9, 9))
     state = ImuEstimate(
-        np.array([3.0, -1, 0.2]), np.array([0.1, 0.2, -9.8]), np.zeros(3), np.zeros(3), nothing, np.eye(3)
+        np.array([3.0, -1, 0.2]), np.array([0.1, 0.2, -9.8]), np.zeros(3), Gyroscope(np.zeros(3)), nothing
     )
     error = np.zeros(9)
     error[direction] = 0.1

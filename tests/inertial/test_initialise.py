@@ -40,7 +40,7 @@ def test_a_moving_start_finds_speed_biases_and_gravity(make: object) -> None:
     truth, T_world_city = drive.readings.imu.truth, np.linalg.inv(drive.T_city_world)
     assert not found.is_static
     # Axes that feel 2 % of each other add 0.2 m/s2 of gravity to two biases, and 2 % of any turn.
-    assert np.abs(found.estimate.gyro_bias - GYRO_BIAS).max() < 0.012
+    assert np.abs(found.estimate.gyroscope.bias - GYRO_BIAS).max() < 0.012
     down = T_world_city[:3, :3] @ [0, 0, -9.80665]
     felt = found.estimate.accel_bias - extrinsics_of(drive)[:3, :3].T @ found.estimate.gravity
     meant = ACCEL_BIAS + np.array([0.02, 0.02, 0]) * 9.8 - extrinsics_of(drive)[:3, :3].T @ down
@@ -54,7 +54,7 @@ def test_a_static_start_is_seen_and_levels_to_half_a_degree() -> None:
     found = begun(drive)
     assert found.is_static
     assert np.linalg.norm(found.estimate.velocity) < 0.02
-    assert np.abs(found.estimate.gyro_bias).max() < 5e-4
+    assert np.abs(found.estimate.gyroscope.bias).max() < 5e-4
     down = -np.linalg.inv(drive.T_city_world)[:3, 2]
     cosine = found.estimate.gravity @ down / np.linalg.norm(found.estimate.gravity)
     assert np.rad2deg(np.arccos(cosine)) < 0.5
@@ -74,7 +74,7 @@ def test_a_given_offset_and_given_values_are_taken() -> None:
         drive, late(stream_of(drive), 3.0), time_offset_s=-3.0, gyro_bias=(GYRO_BIAS,) * 3, initial_velocity=(9.0, 0, 0)
     )
     assert found.offset_s == -3.0
-    assert np.abs(found.estimate.gyro_bias - GYRO_BIAS).max() < 6e-3
+    assert np.abs(found.estimate.gyroscope.bias - GYRO_BIAS).max() < 6e-3
     assert np.linalg.norm(found.estimate.velocity - [9.0, 0, 0]) < 0.1
 
 

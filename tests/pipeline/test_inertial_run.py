@@ -109,7 +109,7 @@ def test_the_manifest_says_what_was_found(tmp_path: Path) -> None:
     manifest = json.loads((tmp_path / "run" / "manifest.json").read_text())
     imu = manifest["imu"]
     assert (manifest["status"], imu["used"], imu["is_checked_by_turns"]) == ("done", True, True)
-    assert np.abs(np.array(imu["gyro_bias_rad_s"]) - 0.0873).max() < 0.02
+    assert np.abs(np.array(imu["gyro_bias_rad_s"]) - 0.0873).max() < 0.005
     assert imu["prior_error_m"] < imu["constant_velocity_error_m"]
     header, *rows = (tmp_path / "run" / "scans.csv").read_text().splitlines()
     column = header.split(",").index("prior_norm")

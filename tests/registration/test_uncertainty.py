@@ -80,3 +80,18 @@ def test_a_failed_scan_doubts_its_own_pose_only() -> None:
 
 def test_no_covariance_gives_none() -> None:
     assert PoseUncertainty().add(result(1.0, None)) is None
+
+
+def test_a_map_is_as_old_as_the_way_over_which_it_is_seen() -> None:
+    """One scan makes a new one, a standing sensor's is the mean of all; on the way it is renewed over a lever arm."""
+    standing, driving, jumping = PoseUncertainty(), PoseUncertainty(), PoseUncertainty(is_scan_to_scan=True)
+    for k in range(1, 400):
+        standing.add(result(0.0))
+        driving.add(result(0.5 * k))
+        jumping.add(result(0.5 * k))
+        assert standing.map_age == pytest.approx((k + 1) / 2)
+        assert jumping.map_age == 1
+    assert driving.map_age == pytest.approx(LEVER / 0.5, rel=1e-3)
+    before = driving.map_age
+    driving.add(result(200.0, ok=False))
+    assert driving.map_age == before, "a scan that failed is not in the map"

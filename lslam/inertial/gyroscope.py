@@ -1,0 +1,78 @@
+"""A gyroscope's constant errors, learnt from the turns that registration finds, and how far its own turns can be trusted.
+
+The axes of a consumer device are some per cent askew, and its mounting is known to a degree or two: while the sensor turns,
+that is worth more than its bias wanders, and no noise at all but the same error at every turn.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.geometry import so3
+from lslam.inertial.integrate import Increments
+from lslam.inertial.kalman import OUTLIER, update
+
+Floats = NDArray[np.float64]
+
+# One sigma of scale, misalignment and mounting together: a data sheet's 2 % across the axes, a degree of mounting.
+AXES_SIGMA = 0.025
+# rad/s per sqrt(Hz) that no constant error explains, at the least; rad/s per sqrt(s) by which the bias wanders.
+RATE_NOISE, BIAS_WALK = np.deg2rad(0.02), np.deg2rad(0.01)
+# The noise is learnt over so many scans.
+MEMORY = 20
+
+
+@dataclass(frozen=True)
+class Gyroscope:
+    """From readings to rates: axes @ (reading - bias), rad/s.
+
+    bias : (3,) rad/s; axes : (3, 3), the identity for a perfect device
+    covariance : (12, 12) of the bias and of the rows of `axes`
+    rate_variance : (rad/s)^2 per Hz, of what is left
+    """
+
+    bias: Floats
+    axes: Floats = field(default_factory=lambda: np.eye(3))
+    covariance: Floats = field(default_factory=lambda: np.zeros((12, 12)), repr=False)
+    rate_variance: float = float(RATE_NOISE**2)
+
+    @classmethod
+    def of_bias(cls, bias: Floats, sigma: float) -> Gyroscope:
+        """What is known of a device before it was seen to turn: its bias (3,), to `sigma` rad/s."""
+        return cls(bias, covariance=np.diag(np.repeat([sigma**2, AXES_SIGMA**2], [3, 9])))
+
+    def rates(self, readings: Floats) -> Floats:
+        """(..., 3) rad/s from `readings` (..., 3)."""
+        return np.asarray((readings - self.bias) @ self.axes.T)
+
+    def turn_covariance(self, step: Increments) -> Floats:
+        """(3, 3) rad2 of the turn over `step`, in IMU axes at its end."""
+        H = self._columns(step)
+        return np.asarray(H @ self.covariance @ H.T + self.rate_variance * step.seconds[-1] * np.eye(3))
+
+    def learnt(self, step: Increments, rest: Floats, noise: Floats) -> Gyroscope:
+        """After registration found the turn over `step` larger by `rest` (3,) rad, itself known to `noise` (3, 3), rad2.
+
+        `rest` and `noise` are in IMU axes at the end of the step.
+        """
+        seconds = float(step.seconds[-1])
+        walk = np.diag(np.repeat([BIAS_WALK**2 * seconds, 0.0], [3, 9]))
+        before = replace(self, covariance=self.covariance + walk)
+        expected = before.turn_covariance(step) + noise
+        allowed = float(np.trace(expected))
+        excess = (min(float(rest @ rest), OUTLIER**2 * allowed) - allowed) / (3 * seconds)
+        x, P = update(
+            np.concatenate([self.bias, self.axes.ravel()]), before.covariance, self._columns(step), rest,
+            noise + self.rate_variance * seconds * np.eye(3),
+        )  # fmt: skip
+        variance = max(self.rate_variance + excess / MEMORY, float(RATE_NOISE**2))
+        return Gyroscope(x[:3], x[3:].reshape(3, 3), P, variance)
+
+    def _columns(self, step: Increments) -> Floats:
+        """(3, 12) by which the turn over `step` grows with bias and axes; the rate is taken for constant."""
+        arm = step.rotations[-1].T @ step.velocity_arms[-1]
+        reading = np.linalg.solve(self.axes, so3.log(step.rotations[-1])) / step.seconds[-1]
+        return np.hstack([-arm @ self.axes, arm @ np.kron(np.eye(3), reading)])

@@ -1,0 +1,131 @@
+"""A gyroscope whose axes are askew: what its turns teach, and how far they are trusted."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from lslam.geometry import so3
+from lslam.inertial.gyroscope import RATE_NOISE, Gyroscope
+from lslam.inertial.integrate import Increments, integrate
+from lslam.inertial.kalman import update
+from lslam.types.imu import ImuStream
+
+Floats = NDArray[np.float64]
+
+BIAS = np.array([0.08, -0.05, 0.03])
+SKEW = np.eye(3) + np.array([[0.01, -0.02, 0.015], [0.02, -0.01, 0.02], [-0.015, 0.02, 0.005]])
+STEP_NS, SAMPLE_NS = 200_000_000, 5_000_000
+
+
+def readings_of(rates: Floats) -> Floats:
+    return np.asarray(np.linalg.solve(SKEW, rates.T).T + BIAS)
+
+
+def tumbling(count: int, seed: int = 0) -> Floats:
+    """(count, 3) rad/s of a body that turns about changing axes, one per sample."""
+    t = np.arange(count) * SAMPLE_NS * 1e-9
+    phase = np.random.default_rng(seed).uniform(0, 6, 3)
+    return np.asarray(np.sin(np.outer(t, [0.9, 1.3, 0.7]) + phase) * [0.5, 0.4, 0.8])
+
+
+def stream(readings: Floats) -> ImuStream:
+    return ImuStream(np.arange(len(readings)) * SAMPLE_NS, np.zeros_like(readings), readings)
+
+
+def turns(imu: ImuStream, gyroscope: Gyroscope, steps: int) -> list[Increments]:
+    return [
+        integrate(imu, np.array([k, k + 1]) * STEP_NS, gyroscope.bias, np.zeros(3), gyroscope.axes)
+        for k in range(steps)
+    ]
+
+
+def taught(noise_of_rates: float, steps: int = 150, seen_to: float = 1e-4) -> tuple[Gyroscope, ImuStream, ImuStream]:
+    """What registrations that are right to `seen_to` rad teach; the stream as read, and the true one."""
+    rng = np.random.default_rng(3)
+    rates = tumbling(steps * STEP_NS // SAMPLE_NS + 1)
+    true = stream(rates)
+    per_sample = noise_of_rates / np.sqrt(SAMPLE_NS * 1e-9)
+    read = stream(readings_of(rates) + rng.normal(0, per_sample, rates.shape))
+    perfect = Gyroscope(np.zeros(3))
+    gyroscope = Gyroscope.of_bias(np.zeros(3), 0.1)
+    for k, truth in enumerate(turns(true, perfect, steps)):
+        step = integrate(read, np.array([k, k + 1]) * STEP_NS, gyroscope.bias, np.zeros(3), gyroscope.axes)
+        seen = truth.rotations[-1] @ so3.exp(rng.normal(0, seen_to, 3))
+        rest = np.asarray(so3.log(step.rotations[-1].T @ seen))
+        gyroscope = gyroscope.learnt(step, rest, seen_to**2 * np.eye(3))
+    return gyroscope, read, true
+
+
+def test_axes_and_bias_are_learnt_while_it_turns() -> None:
+    gyroscope, read, true = taught(RATE_NOISE)
+    np.testing.assert_allclose(gyroscope.axes, SKEW, atol=4e-3)
+    np.testing.assert_allclose(gyroscope.bias, BIAS, atol=2e-3)
+    np.testing.assert_allclose(gyroscope.rates(readings_of(true.gyro)), true.gyro, atol=5e-3)
+    before = Gyroscope.of_bias(BIAS, 2e-3)
+    off = [
+        [
+            float(so3.angle(a.rotations[-1].T @ b.rotations[-1]))
+            for a, b in zip(turns(read, g, 150), turns(true, Gyroscope(np.zeros(3)), 150), strict=True)
+        ]
+        for g in (before, gyroscope)
+    ]
+    assert np.median(off[1]) < 0.3 * np.median(off[0])
+
+
+@pytest.mark.parametrize("noise", [RATE_NOISE, 6 * RATE_NOISE])
+def test_its_turns_are_as_right_as_it_says(noise: float) -> None:
+    gyroscope, read, true = taught(noise)
+    perfect = Gyroscope(np.zeros(3))
+    ratios = []
+    for step, truth in zip(turns(read, gyroscope, 150), turns(true, perfect, 150), strict=True):
+        rest = np.asarray(so3.log(step.rotations[-1].T @ truth.rotations[-1]))
+        ratios.append(float(rest @ np.linalg.solve(gyroscope.turn_covariance(step), rest)) / 3)
+    assert 0.4 < np.mean(ratios) < 1.6
+    assert gyroscope.rate_variance >= RATE_NOISE**2
+
+
+def test_errors_turn_as_the_covariance_says() -> None:
+    """Each of bias and axes, against the turn integrated with that error; its rates are nearly constant over a step."""
+    read = stream(readings_of(tumbling(41)))
+    gyroscope = Gyroscope(BIAS, SKEW)
+    step = turns(read, gyroscope, 1)[0]
+    for k in range(12):
+        error = np.zeros(12)
+        error[k] = 1e-3
+        wrong = dataclasses.replace(gyroscope, bias=BIAS + error[:3], axes=SKEW + error[3:].reshape(3, 3))
+        moved = np.asarray(so3.log(step.rotations[-1].T @ turns(read, wrong, 1)[0].rotations[-1]))
+        doubtful = dataclasses.replace(gyroscope, covariance=np.outer(error, error), rate_variance=0.0)
+        np.testing.assert_allclose(
+            doubtful.turn_covariance(step), np.outer(moved, moved), atol=0.05 * float(moved @ moved) + 1e-13
+        )
+
+
+def test_a_turn_of_no_quality_teaches_nothing() -> None:
+    gyroscope, read, _ = taught(RATE_NOISE, steps=20)
+    step = turns(read, gyroscope, 1)[0]
+    again = gyroscope.learnt(step, np.array([0.01, 0.0, -0.01]), 1e6 * np.eye(3))
+    np.testing.assert_allclose(again.axes, gyroscope.axes, atol=1e-8)
+    np.testing.assert_allclose(again.bias, gyroscope.bias, atol=1e-8)
+
+
+def test_an_update_agrees_with_the_sum_of_informations() -> None:
+    rng = np.random.default_rng(4)
+    A, B = rng.normal(size=(5, 5)), rng.normal(size=(2, 2))
+    P, noise, H, x = A @ A.T, B @ B.T, rng.normal(size=(2, 5)), rng.normal(size=5)
+    rest = 0.5 * np.sqrt(np.diag(noise))
+    mean, covariance = update(x, P, H, rest, noise)
+    information = np.linalg.inv(P) + H.T @ np.linalg.solve(noise, H)
+    np.testing.assert_allclose(covariance, np.linalg.inv(information), rtol=1e-8, atol=1e-10)
+    gain = np.linalg.solve(information, H.T @ np.linalg.solve(noise, rest))
+    np.testing.assert_allclose(mean - x, gain, rtol=1e-8, atol=1e-10)
+
+
+def test_an_outlier_moves_the_mean_less_than_what_is_likely() -> None:
+    x, P, H, noise = np.zeros(1), np.eye(1), np.eye(1), np.eye(1)
+    likely = update(x, P, H, np.array([4.0]), noise)[0]
+    outlier = update(x, P, H, np.array([400.0]), noise)[0]
+    assert 0 < outlier[0] < likely[0]

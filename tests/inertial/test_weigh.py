@@ -1,0 +1,131 @@
+"""Registered poses weighed against what the IMU felt: the better of the two counts more."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from imu_drives import drone, extrinsics_of, stream_of, truth_of
+from numpy.typing import NDArray
+
+from lslam.config.imu import ImuConfig
+from lslam.geometry import se3, so3
+from lslam.inertial.fusion import InertialMotion
+from lslam.inertial.initialise import FirstPoses, start
+from lslam.types.imu import ImuStream
+from lslam.types.scan_result import ScanResult
+
+Floats = NDArray[np.float64]
+
+LEAST = np.diag([1e-6] * 3 + [1e-10] * 3)
+
+
+def motion_of(imu: ImuStream | None = None, **keys: object) -> InertialMotion:
+    drive, config = drone(), ImuConfig.model_validate(keys)
+    stamps, poses = truth_of(drive, 50)
+    first = FirstPoses(stamps, poses, stamps, poses, np.repeat(LEAST[None], 50, axis=0))
+    begun = start(stream_of(drive), extrinsics_of(drive), first, int(drive.stamps_ns[-1]), config)
+    return InertialMotion(begun.imu if imu is None else imu, begun.T_lidar_imu, begun.estimate, config)
+
+
+def result_of(index: int, stamp_ns: int, pose: Floats, covariance: Floats | None, **values: object) -> ScanResult:
+    whole = ScanResult(index, stamp_ns, pose, registration_covariance=covariance)
+    return replace(whole, **values)  # type: ignore[arg-type]
+
+
+def followed(
+    motion: InertialMotion, sigma_m: float, sigma_rad: float, seed: int, every: int = 4
+) -> tuple[Floats, Floats]:
+    """Errors of steps as registered and as weighed, (N, 2) m and rad, when scans are registered on the one before."""
+    rng = np.random.default_rng(seed)
+    stamps, poses = (values[::every] for values in truth_of(drone()))
+    C = np.diag([sigma_m**2] * 3 + [sigma_rad**2] * 3)
+    last, rows = poses[0], []
+    for k, (stamp, true) in enumerate(zip(stamps, poses, strict=True)):
+        prior = motion.sweep(int(stamp), 0.0)
+        if k:
+            step = se3.relative(poses[k - 1], true)
+            seen = last @ step
+            seen[:3, :3] = so3.exp(rng.normal(0, sigma_rad, 3)) @ seen[:3, :3]
+            seen[:3, 3] += rng.normal(0, sigma_m, 3)
+            out = motion.weigh(result_of(k, int(stamp), seen, C), prior)
+            for found in (seen, out.T_world_lidar):
+                off = se3.relative(last @ step, found)
+                rows.append((np.linalg.norm(off[:3, 3]), so3.angle(off[:3, :3])))
+            last = out.T_world_lidar
+        motion.correct(int(stamp), last, prior)
+    table = np.array(rows).reshape(-1, 2, 2)
+    return table[:, 0], table[:, 1]
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_turns_that_registration_hardly_sees_are_the_gyroscopes(seed: int) -> None:
+    seen, weighed = followed(motion_of(), 0.005, np.deg2rad(0.15), seed)
+    assert np.sqrt(np.mean(weighed[:, 1] ** 2)) < 0.35 * np.sqrt(np.mean(seen[:, 1] ** 2))
+    assert np.sqrt(np.mean(weighed[:, 0] ** 2)) < 1.1 * np.sqrt(np.mean(seen[:, 0] ** 2))
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_a_registration_that_is_better_than_the_imu_stays(seed: int) -> None:
+    seen, weighed = followed(motion_of(), 1e-3, np.deg2rad(2e-3), seed)
+    assert np.abs(weighed - seen).max() < 1e-3
+    assert np.sqrt(np.mean(weighed[:, 1] ** 2)) < 1.05 * np.sqrt(np.mean(seen[:, 1] ** 2))
+
+
+def begun(motion: InertialMotion, count: int = 3) -> tuple[int, Floats]:
+    """Some true poses taken in; stamp and true pose of the next scan."""
+    stamps, poses = truth_of(drone())
+    for stamp, pose in zip(stamps[:count], poses[:count], strict=True):
+        motion.correct(int(stamp), pose, motion.sweep(int(stamp), 0.0))
+    return int(stamps[count]), poses[count]
+
+
+def test_a_direction_that_registration_leaves_open_is_the_imus() -> None:
+    """A metre along x, tied to 0.1 rad of pitch, as a weak direction of both together is: neither may run away."""
+    motion = motion_of()
+    stamp, true = begun(motion)
+    weak = np.array([1.0, 0, 0, 0, 0.1, 0])
+    C = LEAST + np.outer(weak, weak)
+    off = 0.3 * weak
+    seen = se3.make(so3.exp(off[3:]) @ true[:3, :3], true[:3, 3] + off[:3])
+    out = motion.weigh(result_of(3, stamp, seen, C), motion.sweep(stamp, 0.0))
+    assert np.linalg.norm(out.T_world_lidar[:3, 3] - true[:3, 3]) < 0.03
+    assert so3.angle(se3.relative(out.T_world_lidar, true)[:3, :3]) < np.deg2rad(0.2)
+    assert out.registration_covariance is not None
+    assert out.registration_covariance[0, 0] < 1e-2
+
+
+def test_an_old_map_counts_for_more_than_one_scan() -> None:
+    motion = motion_of()
+    stamp, true = begun(motion)
+    seen = true @ se3.make(so3.exp(np.array([0, 0, 4e-4])), np.zeros(3))
+    C = np.diag([1e-6] * 3 + [1e-7] * 3)
+    moved = [
+        so3.angle(
+            se3.relative(
+                seen, motion.weigh(result_of(3, stamp, seen, C, map_age=age), motion.sweep(stamp, 0.0)).T_world_lidar
+            )[:3, :3]
+        )
+        for age in (1.0, 30.0)
+    ]
+    assert 0 < moved[1] < 0.4 * moved[0]
+
+
+@pytest.mark.parametrize("why", ["contradiction", "bridged", "no covariance", "switched off", "integrated", "gap"])
+def test_the_registered_pose_stays_where_nothing_can_be_weighed(why: str) -> None:
+    keys = {"switched off": {"weigh": False}, "integrated": {"velocity": "integrated"}}.get(why, {})
+    imu = motion_of().imu
+    keep = slice(None, int(np.searchsorted(imu.stamps_ns, drone().stamps_ns[2]))) if why == "gap" else slice(None)
+    motion = motion_of(ImuStream(imu.stamps_ns[keep], imu.accel[keep], imu.gyro[keep]), **keys)
+    stamp, true = begun(motion)
+    turn = 0.2 if why == "contradiction" else 2e-3
+    seen = true @ se3.make(so3.exp(np.array([0, turn, 0])), np.zeros(3))
+    C = None if why == "no covariance" else np.diag([1e-4] * 3 + [1e-6] * 3)
+    result = result_of(3, stamp, seen, C, status="bridged" if why == "bridged" else "ok")
+    np.testing.assert_array_equal(motion.weigh(result, motion.sweep(stamp, 0.0)).T_world_lidar, seen)
+    good = motion_of()
+    begun(good)
+    if why == "gap":
+        weighed = good.weigh(result, good.sweep(stamp, 0.0))
+        assert not np.array_equal(weighed.T_world_lidar, seen), "with samples it would have been"
