@@ -22,6 +22,11 @@ Floats = NDArray[np.float64]
 
 GROWTH, ROUNDS = 2.0, 30  # of graduated non-convexity, as in `graph.robust`
 PROBABILITY = 0.999  # a match within this quantile of its own distribution is right
+SUPPORT = 2  # other matches that have to say the same
+FREE, ALIKE = (
+    1e-9,
+    0.05,
+)  # shares of information below which a direction is free, and from which two matches know it alike
 
 
 @dataclass(frozen=True)
@@ -85,6 +90,31 @@ def solve_buildings(
     shared = np.where(believed, 1.0 / np.maximum(counts[owners], 1), 0.0)
     _, covariances, _ = _linear(len(middles), owners, measured, shared[:, None, None] * weights, belief)
     return BuildingSolution(solution[0], covariances, solution[2], believed)
+
+
+def agreeing(
+    middles: NDArray[np.float64], matches: Sequence[BuildingMatch], poses: Mapping[int, Floats]
+) -> NDArray[np.bool_]:
+    """(M,) true where `SUPPORT` other matches of the same building, which know the same directions, say the same.
+
+    One keyframe may take a hedge or the neighbour's wall for a building's; along a direction that nothing else speaks of,
+    nothing would contradict it.
+    """
+    measured = np.array([m.displacement(poses[m.keyframe], middles[m.building]) for m in matches]).reshape(-1, 3)
+    weights = np.array([_in_map(m.information, poses[m.keyframe][2]) for m in matches]).reshape(-1, 3, 3)
+    owners = np.array([m.building for m in matches], np.intp)
+    found = np.zeros(len(matches), bool)
+    for k, match in enumerate(matches):
+        values, axes = np.linalg.eigh(weights[k])
+        own = axes[:, values > FREE * values[-1]]
+        others = np.flatnonzero((owners == match.building) & (np.arange(len(matches)) != k))
+        away = measured[others] - measured[k]
+        away[:, 2] = se2.wrapped(away[:, 2])
+        is_near = np.einsum("mi,ij,mj->m", away, weights[k], away) <= quantile(PROBABILITY, max(match.rank, 1))
+        seen = np.einsum("ia,mij,ja->ma", own, weights[others], own)
+        knows = (seen >= ALIKE * np.einsum("ia,ij,ja->a", own, weights[k], own)).all(axis=1)
+        found[k] = (is_near & knows).sum() >= SUPPORT
+    return found
 
 
 def _in_map(information: Floats, yaw: float) -> Floats:

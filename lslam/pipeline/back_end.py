@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from lslam.config import Config
 from lslam.errors import GraphError, InputError
 from lslam.geometry import se2, se3
-from lslam.graph.factors import PLANAR
 from lslam.graph.floors import on_one_plane
 from lslam.graph.odometry import corrected, fitness_covariance, odometry_constraints
 from lslam.graph.pose_graph import optimise
@@ -135,8 +134,7 @@ def _on_buildings(
     if out is None or out.solution is None:
         return None
     matches = finish(located, extract, out.keyframes, out.solution, config.osm)
-    covariances = out.solution.covariances[:, PLANAR][:, :, PLANAR]
-    buildings = correct_buildings(matches, se2.of_se3(out.keyframes), covariances, config.osm)
+    buildings = correct_buildings(matches, se2.of_se3(out.keyframes), config.osm)
     return replace(out, osm=matches, buildings=buildings)
 
 

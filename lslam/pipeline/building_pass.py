@@ -13,7 +13,7 @@ from lslam.config.osm import OsmConfig
 from lslam.formats.buildings_geojson import write_corrected
 from lslam.formats.osm_corrections import corrected_osm
 from lslam.formats.osm_files import OsmData, write_osm
-from lslam.graph.building_graph import BuildingSolution, MapBelief, solve_buildings
+from lslam.graph.building_graph import BuildingSolution, MapBelief, agreeing, solve_buildings
 from lslam.priors.map_changes import absent_buildings, new_walls
 from lslam.priors.overlap import Untangled, remove_overlaps
 from lslam.types.building_correction import BuildingCorrection, BuildingStatus, CorrectedMap
@@ -28,22 +28,21 @@ BUILDINGS_GEOJSON, BUILDINGS_OSM = "buildings.geojson", "buildings.osm"
 TOGETHER = np.array([1e-3, 1e-3, 1e-5])
 
 
-def correct_buildings(
-    matches: OsmMatches, poses: NDArray[np.float64], covariances: NDArray[np.float64], config: OsmConfig
-) -> CorrectedMap:
+def correct_buildings(matches: OsmMatches, poses: NDArray[np.float64], config: OsmConfig) -> CorrectedMap:
     """The buildings of `matches` at their real places.
 
     Parameters
     ----------
-    poses : (K, 3) x, y (m), yaw (rad) of all keyframes in the map frame; covariances : (K, 3, 3) of them
+    poses : (K, 3) x, y (m), yaw (rad) of all keyframes in the map frame
     config : `mode` says what moves: nothing (`prior`), all buildings together (`rigid`), each by itself (the others)
 
-    Absent buildings follow the others, as those nobody saw do.
+    Absent buildings follow the others, as those nobody saw do. Covariances are those against the trajectory, which is given.
     """
     mode, belief = config.mode, map_belief(matches, config)
     place = dict(enumerate(poses))
     local = [m for m in matches.local if m.verdict == "accepted" and m.keyframe in place]
     middles = np.array([b.middle for b in matches.buildings]).reshape(-1, 2)
+    local = [m for m, agrees in zip(local, agreeing(middles, local, place), strict=True) if agrees]
     if mode == "rigid":
         belief = MapBelief(belief.shift, belief.shift_sigma, TOGETHER)
     solution = solve_buildings(middles, local, place, belief)
@@ -56,7 +55,7 @@ def correct_buildings(
     displacements = untangled.displacements
     standing = [b.displaced(d) for b, d in zip(matches.buildings, displacements, strict=True)]
     gone = absent_buildings(standing, matches.keyframes, place)
-    own = _with_trajectory(solution, local, covariances)
+    own = solution.covariances
     used, rejected = _counts(matches, local, solution)
     found = tuple(
         BuildingCorrection(b, displacements[k], own[k], _status(used[k], bool(gone[k])), used[k], rejected[k])
@@ -105,13 +104,3 @@ def _counts(
     used = np.bincount(owners[solution.believed], minlength=size)
     tried = np.bincount(np.array([m.building for m in matches.local], np.intp), minlength=size)
     return used.tolist(), (tried - used).tolist()
-
-
-def _with_trajectory(solution: BuildingSolution, local: Sequence[BuildingMatch], covariances: Floats) -> Floats:
-    """(B, 3, 3) covariances with the mean of those of the keyframes that saw each: these are wrong together."""
-    found = solution.covariances.copy()
-    for building in {m.building for m in local}:
-        own = [m.keyframe for m, kept in zip(local, solution.believed, strict=True) if kept and m.building == building]
-        if own:
-            found[building] += covariances[own].mean(axis=0)
-    return found

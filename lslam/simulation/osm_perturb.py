@@ -77,6 +77,23 @@ def perturb(buildings: Sequence[Building], perturbation: Perturbation) -> list[B
     return found + [building.moved(np.eye(2), common) for building in perturbation.not_yet_built]
 
 
+def map_errors(buildings: Sequence[Building], perturbation: Perturbation) -> dict[str, Floats]:
+    """By number, what moves each building of the perturbed map to where it really stands: x, y (m), yaw (rad) about its middle.
+
+    buildings : the exact map. Buildings that are not built yet stand nowhere, and missing ones are on no map.
+    """
+    known, on_map = {b.osm_id: b for b in buildings}, {b.osm_id: b for b in perturb(buildings, perturbation)}
+    found = {}
+    for change in perturbation.changes:
+        if change.id not in on_map:
+            continue
+        real, drawn = join_outlines(known[change.id], change, known), on_map[change.id]
+        real = simplify_outlines(real, change.simplify_m) if change.simplify_m > 0 else real
+        moved = drawn.displaced(np.array([0.0, 0.0, -change.turn_rad]))
+        found[change.id] = np.array([*(real.middle - moved.middle), -change.turn_rad])
+    return found
+
+
 def join_outlines(building: Building, change: Change, known: dict[str, Building]) -> Building:
     """The building with the outlines of those merged into it, gaps closed; `known` has all buildings by number."""
     from shapely import union_all

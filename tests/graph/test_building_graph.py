@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from lslam.geometry import se2
-from lslam.graph.building_graph import BuildingSolution, MapBelief, solve_buildings
+from lslam.graph.building_graph import SUPPORT, BuildingSolution, MapBelief, agreeing, solve_buildings
 from lslam.types.building_match import BuildingMatch
 
 Floats = NDArray[np.float64]
@@ -149,3 +149,18 @@ def test_matches_with_the_wrong_wall_are_given_up() -> None:
     assert not found.believed[len(good) :].any()
     expected: BuildingSolution = solve_buildings(middles, good, poses, BELIEF)
     np.testing.assert_allclose(found.displacements, expected.displacements, atol=1e-9)
+
+
+def test_what_no_other_keyframe_says_is_not_believed() -> None:
+    middles, poses, truth = town(4)
+    keyframes = near(poses, middles[5], 40.0)
+    n = np.array([0.0, 1.0])
+    lone = np.array([3.0, 0.0, 0.0])
+    walls = [match(k, 5, seen_from(poses[k], middles[5], truth[5]), across(n, poses[k])) for k in keyframes[1:]]
+    along = match(keyframes[0], 5, seen_from(poses[keyframes[0]], middles[5], truth[5] + lone))
+    other = [match(k, 4, seen_from(poses[k], middles[4], truth[4] + lone)) for k in keyframes[:SUPPORT]]
+    assert agreeing(middles, [*walls, along, *other], poses).tolist() == [True] * len(walls) + [False] * (1 + SUPPORT)
+    corners = [match(k, 5, seen_from(poses[k], middles[5], truth[5])) for k in keyframes[: SUPPORT + 1]]
+    assert agreeing(middles, [*walls, *corners], poses).all()
+    assert not agreeing(middles, corners[:SUPPORT], poses).any()
+    assert agreeing(middles, [], poses).shape == (0,)

@@ -75,8 +75,7 @@ def scene(seed: int, shift: tuple[float, float] = (1.0, -0.6)) -> tuple[OsmMatch
 
 def solved(seed: int, mode: Mode = "two-level") -> tuple[CorrectedMap, Floats, list[Building], OsmMatches]:
     matches, poses, real, off = scene(seed)
-    covariances = np.tile(np.diag([0.01, 0.01, 1e-5]), (len(poses), 1, 1))
-    return correct_buildings(matches, poses, covariances, OsmConfig(mode=mode)), off, real, matches
+    return correct_buildings(matches, poses, OsmConfig(mode=mode)), off, real, matches
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -126,7 +125,7 @@ def test_neighbours_that_were_drawn_into_each_other_are_parted() -> None:
     more = OsmMatches(
         matches.origin, (*matches.buildings, copy), matches.map_walls, matches.owners, matches.keyframes, matches.local
     )
-    found = correct_buildings(more, poses, np.zeros((len(poses), 3, 3)), OsmConfig())
+    found = correct_buildings(more, poses, OsmConfig())
     shapes = [Polygon(c.corrected.footprints[0].outer).buffer(-0.01) for c in found.buildings]
     assert not shapes[0].intersects(shapes[-1])
     assert found.left == ()
@@ -144,6 +143,6 @@ def test_without_matches_the_map_stays_where_it_is_thought_to_be() -> None:
         np.array([0.5, 0.5]),
         np.full(2, 0.1),
     )
-    found = correct_buildings(blind, poses, np.zeros((len(poses), 3, 3)), OsmConfig())
+    found = correct_buildings(blind, poses, OsmConfig())
     assert {c.status for c in found.buildings} == {"unseen"}
     np.testing.assert_allclose([c.displacement[:2] for c in found.buildings], 0.5, atol=0.02)

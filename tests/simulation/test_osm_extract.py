@@ -21,7 +21,7 @@ from lslam.simulation.mesh import Surface
 from lslam.simulation.osm_city import build_osm_city
 from lslam.simulation.osm_extract import Extracts, city_buildings, write_extracts
 from lslam.simulation.osm_faults import MapFaults, draw_perturbation
-from lslam.simulation.osm_perturb import Change, perturb, read_perturbation, write_perturbation
+from lslam.simulation.osm_perturb import Change, map_errors, perturb, read_perturbation, write_perturbation
 from lslam.simulation.osm_place import read_extract
 from lslam.simulation.scenarios import simulate
 from lslam.simulation.terrain import flat, rolling
@@ -175,6 +175,20 @@ def test_turned_shifted_and_simplified_buildings_against_shapely() -> None:
         expected = affinity.rotate(expected, change.turn_rad, origin="center", use_radians=True)
         expected = affinity.translate(expected, *change.shift_m)
         assert after[building.osm_id].symmetric_difference(expected).area < 1e-6
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_what_moves_a_drawn_building_back_moves_it_to_where_it_stands(seed: int) -> None:
+    exact = village()
+    drawn = draw_perturbation(exact, MapFaults(2.0, simplified=0, merged=0), np.random.default_rng(seed))
+    on_map, errors = {b.osm_id: b for b in perturb(exact, drawn)}, map_errors(exact, drawn)
+    assert set(errors) == {c.id for c in drawn.changes if not c.missing}
+    assert sum(abs(e[2]) > 0.001 for e in errors.values()) > 1
+    for building in exact:
+        if building.osm_id in errors:
+            back = on_map[building.osm_id].displaced(errors[building.osm_id])
+            for ring, wanted in zip(rings_of([back]), rings_of([building]), strict=True):
+                np.testing.assert_allclose(ring, wanted, atol=1e-9)
 
 
 def test_long_buildings_are_turned_by_less() -> None:

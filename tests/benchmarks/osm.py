@@ -1,0 +1,132 @@
+"""What OpenStreetMap brings, mode by mode, where everything is known: the ablation of issue 7 and of the thesis' table 4.2.
+
+    lslam simulate residential --seed 0 --out /tmp/drives/residential-0
+    lslam simulate residential --path poses/07.txt --out /tmp/drives/seq07
+    python tests/benchmarks/osm.py /tmp/drives/*/sequences/00 [--scans 300] [--map exact,perturbed] [--drift 1.0,0.5]
+        [--modes none,prior,rigid,non-rigid,two-level,baseline]
+
+Every run begins at the true start, without loops, with drift injected (% of the way, deg per 100 m). ATE is the thesis' (planar,
+origin, mean and standard deviation), RPE between consecutive keyframes; buildings with the run begun at its true start:
+median distance of their middles from the truth, of those held from two sides as on the map and corrected, across the wall of
+those held from one.
+"""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import tempfile
+import tomllib
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+import lslam
+from lslam.config import Config
+from lslam.evaluation.buildings import BuildingError, building_errors
+from lslam.evaluation.thesis import planar
+from lslam.formats.buildings_geojson import read_corrected
+from lslam.formats.osm_buildings import read_buildings
+from lslam.formats.trajectory_files import read_trajectory
+from lslam.geometry import geodesy, se2
+from lslam.pipeline.building_pass import BUILDINGS_GEOJSON
+from lslam.simulation.osm_perturb import map_errors, read_perturbation
+
+Floats = NDArray[np.float64]
+
+SPACING = 2.0  # m between keyframes
+MODES = ("none", "prior", "rigid", "non-rigid", "two-level", "baseline")
+
+
+def true_poses(drive: Path) -> tuple[Floats, Floats]:
+    """Poses T_enu_lidar of all scans of a simulated drive, and the origin of that frame."""
+    world = tomllib.loads((drive / "truth" / "world.toml").read_text())
+    poses = read_trajectory(drive / "truth" / "trajectory.tum").poses
+    return np.array(world["T_enu_world"]) @ poses, np.array(world["origin_lat_lon_alt"])
+
+
+def configured(drive: Path, args: argparse.Namespace, mode: str, which: str, seed: int) -> Config:
+    """The run of one line of the table."""
+    poses, origin = true_poses(drive)
+    start = geodesy.from_local(poses[:1, :3, 3], origin)[0]
+    percent, deg = (float(v) for v in args.drift.split(","))
+    sections = {
+        "input": {"count": args.scans},
+        "loops": {"use": False},
+        "map": {"write": False},
+        "debug": {"drift": percent > 0, "drift_percent": percent, "drift_deg_per_100m": deg, "drift_seed": seed},
+    }
+    if mode != "none":
+        sections["osm"] = {
+            "extract": str(drive / ("map.osm" if which == "exact" else "map_perturbed.osm")),
+            "origin": tuple(start),
+            "heading_deg": float(90.0 - np.degrees(se2.of_se3(poses[0])[2])),
+            "start_radius": 2.0,
+            "start_heading_deg": 5.0,
+        } | ({"matcher": "baseline"} if mode == "baseline" else {"mode": mode})
+    return Config.model_validate(sections)
+
+
+def buildings_of(folder: Path, drive: Path, which: str, found: Floats) -> list[BuildingError]:
+    """Errors of a run's buildings; of the exact map the truth is that nothing moves."""
+    if not (folder / BUILDINGS_GEOJSON).is_file():
+        return []
+    poses, origin = true_poses(drive)
+    corrected = read_corrected(folder / BUILDINGS_GEOJSON)
+    truth = {c.building.osm_id: np.zeros(3) for c in corrected.buildings}
+    if which != "exact":
+        exact = read_buildings(drive / "map.osm", origin).buildings
+        truth = map_errors(exact, read_perturbation(drive / "truth" / "map_perturbation.json"))
+    first = geodesy.to_local(geodesy.from_local(found[:1, :3, 3], corrected.origin), origin)[0]
+    return building_errors(corrected, truth, origin, (poses[0, :3, 3] - first)[:2])
+
+
+def line(name: str, folder: Path, drive: Path, which: str) -> str:
+    """One run as a row of the table."""
+    run = read_trajectory(folder / "trajectory.tum")
+    poses, _ = true_poses(drive)
+    real = poses[: len(run.poses)]
+    whole = planar(run.poses, real)
+    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(real[:, :2, 3], axis=0), axis=1))])
+    kept = np.unique(np.searchsorted(way, np.arange(0.0, way[-1], SPACING)))
+    steps = planar(run.poses[kept], real[kept])
+    errors = [e for e in buildings_of(folder, drive, which, run.poses) if e.status == "seen"]
+    two, one = [e for e in errors if e.sides == 2], [e for e in errors if e.sides == 1]
+    return (
+        f"{name:44s} {whole.ate_mean:6.3f} ± {whole.ate_std:5.3f} {steps.rpe_translation_mean:8.4f} "
+        f"{np.degrees(steps.rpe_rotation_std):8.4f}  {len(two):4d} {_median([e.before for e in two])} "
+        f"{_median([e.after for e in two])} {len(one):4d} {_median([e.across for e in one])}"
+    )
+
+
+def _median(values: list[float]) -> str:
+    return f"{np.median(values):7.3f}" if values else "      -"
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("drives", nargs="+", type=Path, help="folders of simulated sequences, with map.osm in them")
+    parser.add_argument("--scans", type=int, default=300)
+    parser.add_argument("--modes", default=",".join(MODES))
+    parser.add_argument("--map", default="exact,perturbed")
+    parser.add_argument("--drift", default="1.0,0.5", help="PERCENT,DEG_PER_100M; 0,0: none")
+    parser.add_argument("--keep", type=Path, help="folder for the runs")
+    args = parser.parse_args()
+    logging.getLogger("lslam").setLevel(logging.ERROR)
+    print(f"{'drive, map, mode':44s} {'ATE, m':>14s} {'RPE, m':>8s} {'RPE, deg':>8s}  {'two':>4s} {'map, m':>7s} {'run, m':>7s} "
+          f"{'one':>4s} {'run, m':>7s}")  # fmt: skip
+    with tempfile.TemporaryDirectory() as scratch:
+        for seed, drive in enumerate(args.drives):
+            for mode in args.modes.split(","):
+                for which in args.map.split(",") if mode != "none" else ["-"]:
+                    name = f"{drive.parent.parent.name}, {which}, {mode}"
+                    folder = (args.keep or Path(scratch)) / name.replace(", ", "_")
+                    config = configured(drive, args, mode, which, seed)
+                    lslam.run(str(drive), config, out=folder, overwrite=True)
+                    print(line(name, folder, drive, which), flush=True)
+
+
+if __name__ == "__main__":
+    main()
