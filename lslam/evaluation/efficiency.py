@@ -29,6 +29,14 @@ def normalise(values: Floats) -> Floats:
     return values / top if top > 0 else np.full_like(values, np.nan)
 
 
+def median_over_seeds(table: Floats) -> Floats:
+    """(V,) median over the seeds (V, S) that have a number: one lucky or unlucky seed of three does not move it."""
+    out = np.full(len(table), np.nan)
+    known = np.isfinite(table).any(1)
+    out[known] = np.nanmedian(table[known], axis=1)
+    return out
+
+
 def over_seeds(table: Floats, level: float = LEVEL) -> Interval:
     """Mean over the seeds (V, S) that have a number, with Student's t interval of `level`.
 

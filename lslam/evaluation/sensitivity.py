@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from lslam.evaluation.curves import curves_of, lost_above
-from lslam.evaluation.efficiency import over_seeds
+from lslam.evaluation.efficiency import median_over_seeds, over_seeds
 from lslam.evaluation.landmarks import divergence, optimum
 from lslam.evaluation.laws import FEWEST, fit_law
 from lslam.evaluation.verdicts import judge
@@ -54,17 +54,20 @@ def _evaluate(rows: Sequence[StudyRow], beside: Sequence[StudyRow], findings: Se
 
 
 def _result(curve: Curve) -> CurveResult:
-    means = {
-        name: over_seeds(table if name in EFFICIENCIES else np.where(curve.lost, np.nan, table))
+    tables = {
+        name: table if name in EFFICIENCIES else np.where(curve.lost, np.nan, table)
         for name, table in curve.quantities.items()
     }
+    means = {name: over_seeds(table) for name, table in tables.items()}
+    medians = {name: median_over_seeds(table) for name, table in tables.items()}
     law, no_law = _law_of(curve, means["total_time"])
     return CurveResult(
         curve=curve,
         means=means,
+        medians=medians,
         stage_means={name: over_seeds(table) for name, table in curve.stages.items()},
         divergence=divergence(curve),
-        optimum=optimum(curve.values, means["efficiency"].mean),
+        optimum=optimum(curve.values, medians["efficiency"]),
         law=law,
         no_law=no_law,
     )

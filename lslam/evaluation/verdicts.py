@@ -80,10 +80,10 @@ def _holds_up_to(finding: Finding, result: CurveResult) -> Judged:
 def _between(finding: Finding, result: CurveResult, *, is_highest: bool) -> Judged:
     """Confirmed when the extreme lies between and most seeds agree, refuted when nothing as good lies there."""
     low, high = finding.values
-    means = np.where(result.curve.is_lost, np.nan, result.means[finding.of].mean)
-    best = optimum(result.curve.values, means, is_highest_best=is_highest)
+    medians = np.where(result.curve.is_lost, np.nan, result.medians[finding.of])
+    best = optimum(result.curve.values, medians, is_highest_best=is_highest)
     word = "largest" if finding.kind == "largest_between" else "best"
-    if best is None or np.isfinite(means).sum() < 3:
+    if best is None or np.isfinite(medians).sum() < 3:
         return "undecided", "fewer than 3 values have a result"
     flat = (
         f"within 10 % from {best.low:g} to {best.high:g}" if best.low < best.high else "no value beside it within 10 %"
@@ -129,8 +129,8 @@ def _good_from(finding: Finding, result: CurveResult) -> Judged:
 
 
 def _matters_little(finding: Finding, result: CurveResult) -> Judged:
-    means = result.means[finding.of].mean
-    known = means[np.isfinite(means) & (means > 0)]
+    medians = result.medians[finding.of]
+    known = medians[np.isfinite(medians) & (medians > 0)]
     if len(known) < 3:
         return "undecided", "fewer than 3 values have a result"
     ratio = float(known.max() / known.min())
@@ -174,7 +174,7 @@ def _acts_only_on(finding: Finding, result: CurveResult) -> Judged:
 
 
 def _elbow(result: CurveResult) -> float | None:
-    return elbow(result.curve.values, result.means["translation"].mean, result.curve.is_lost)
+    return elbow(result.curve.values, result.medians["translation"], result.curve.is_lost)
 
 
 def _place(values: Floats, value: float) -> int:

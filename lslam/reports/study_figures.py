@@ -33,7 +33,9 @@ _SEEDS = (
     "runs were lost there."
 )
 _LAW = "Lines: weighted least squares, shaded: 99 % confidence; below: residuals in % of the law."
-_EFFICIENCY = "Each curve over its own largest mean; a lost run counts as 0; squares: within 10 % of the largest."
+_EFFICIENCY = (
+    "Median over seeds, each curve over its own largest; a lost run counts as 0; squares: within 10 % of the largest."
+)
 _STAGE_PANELS = 6
 _LOG_RATIO = 30.0  # of the largest to the smallest error, above which the axis is logarithmic
 
@@ -116,7 +118,7 @@ def _efficiency(figure: Any, result: StudyResult, shown: Sequence[CurveResult]) 
     names = ("efficiency", "total_efficiency")
     for plot, name in zip(figure.subplots(1, 2), names, strict=True):
         for k, (r, look) in enumerate(_with_looks(result, shown)):
-            values = normalise(r.means[name].mean)
+            values = normalise(r.medians[name])
             plot.plot(r.curve.values, values, label=r.curve.label, **look)
             flat = np.flatnonzero(values >= 1 - FLAT)
             if len(shown) <= len(COLOURS):

@@ -29,9 +29,9 @@ def study_tables(result: StudyResult) -> list[CompareTable]:
 
 
 def means_grid(results: Sequence[StudyResult]) -> Grid:
-    """One row per curve and value with numbers in full: mean, low and high end of the 95 % interval; empty where unknown."""
+    """One row per curve and value, numbers in full, empty where unknown: mean, ends of its 95 % interval, median."""
     head = ["study", "sequence", "method", "imu", "parameter", "value", "at", "runs", "lost"]
-    head += [f"{name}{end} ({unit})" for name, unit in _UNITS.items() for end in ("", "_low", "_high")]
+    head += [f"{name}{end} ({unit})" for name, unit in _UNITS.items() for end in ("", "_low", "_high", "_median")]
     grid = [head]
     for result in results:
         for r in result.results:
@@ -42,7 +42,8 @@ def means_grid(results: Sequence[StudyResult]) -> Grid:
                 row += [curve.name_of(value), at, str(int(curve.ran[v].sum())), str(int(curve.lost[v].sum()))]
                 for name in _UNITS:
                     m = r.means[name]
-                    row += [f"{x:.9g}" if math.isfinite(x) else "" for x in (m.mean[v], m.low[v], m.high[v])]
+                    numbers = (m.mean[v], m.low[v], m.high[v], r.medians[name][v])
+                    row += [f"{x:.9g}" if math.isfinite(x) else "" for x in numbers]
                 grid.append(row)
     return grid
 
@@ -54,13 +55,14 @@ def study_recipes(result: StudyResult) -> list[str]:
         "(equation 2.14 over the root of 3); rotation: its equation 2.15",
         "registration: all stages of a scan but reading, preparing, standing still and keyframes",
         "E: 1 over translation, rotation and registration time per scan (equation 5.2); E tot: with the total time (5.3); both "
-        "over the largest of the curve, a lost run counts as 0",
+        "over the largest of the curve; median over seeds, a lost run counts as 0",
         f"lost: a run that says so, or whose error is above {result.lost_above:.3g} m: 10 times the best of the study, and not "
         "less than the thesis takes for a result (2.2 m)",
         "diverges: the first value, lost in more than half of its runs, from which on more than half of the values are",
         "laws: weighted least squares over means of the runs that were not lost, scatter in proportion to the time, from 6 "
         "values on; ± and bands at 99 %",
         "±: half of the 95 % interval over seeds (Student's t), of runs that were not lost",
+        "best values, elbows and verdicts go by medians over seeds",
         "verdicts: a range holds the best value confirmed, one that does not and is nowhere within 10 % of it refuted",
     ]
 
@@ -76,7 +78,7 @@ def _landmarks(result: StudyResult) -> CompareTable:
     for r in result.results:
         curve, found = r.curve, r.divergence
         name = curve.name_of
-        least = np.where(curve.is_lost, np.nan, r.means["translation"].mean)
+        least = np.where(curve.is_lost, np.nan, r.medians["translation"])
         cells = ["no result" if not curve.ran.any() else "nowhere", UNKNOWN]
         if found.first_bad is not None:
             cells = [name(found.first_bad), UNKNOWN if found.last_good is None else name(found.last_good)]
@@ -112,7 +114,7 @@ def _means(result: StudyResult) -> CompareTable:
     rows: list[tuple[str, ...]] = []
     best = set()
     for r in result.results:
-        curve, share = r.curve, [normalise(r.means[name].mean) for name in ("efficiency", "total_efficiency")]
+        curve, share = r.curve, [normalise(r.medians[name]) for name in ("efficiency", "total_efficiency")]
         for v, value in enumerate(curve.values):
             cells = [_mean(r.means[name], v, name) for name in _UNITS if not name.endswith("efficiency")]
             cells += [fixed(e[v], 2) if math.isfinite(e[v]) else UNKNOWN for e in share]

@@ -134,14 +134,16 @@ class Law:
 
 @dataclass(frozen=True)
 class CurveResult:
-    """What was found on one curve; the optimum is that of `efficiency`, None where no run counts.
+    """What was found on one curve; the optimum is that of the median `efficiency`, None where no run counts.
 
-    means : by quantity, over the runs that were not lost; for the efficiencies a lost run counts as 0
+    means, medians : by quantity over the runs that were not lost, for the efficiencies a lost run counts as 0; means say how
+        sure a number is, medians what is best, because the mean efficiency is that of the luckiest seed
     law : None where there is none, and `no_law` says why
     """
 
     curve: Curve
     means: dict[str, Interval]
+    medians: dict[str, Floats]
     stage_means: dict[str, Interval]
     divergence: Divergence
     optimum: Optimum | None

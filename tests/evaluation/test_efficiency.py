@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lslam.evaluation.efficiency import efficiency, normalise, over_seeds
+from lslam.evaluation.efficiency import efficiency, median_over_seeds, normalise, over_seeds
 
 # Its open flight (tables 4.13 and 5.3): rmse m, angular rmse deg, s of registration per scan (LOAM and map added), s in all.
 OPEN = {
@@ -48,3 +48,9 @@ def test_interval_over_seeds_holds_the_truth_as_often_as_it_says() -> None:
     draw = np.random.default_rng(3)
     over = over_seeds(5 + draw.standard_normal((4000, 3)))
     assert np.mean((over.low <= 5) & (over.high >= 5)) == pytest.approx(0.95, abs=0.015)
+
+
+def test_median_over_seeds_leaves_out_what_is_unknown() -> None:
+    medians = median_over_seeds(np.array([[1.0, 9.0, 2.0], [4.0, np.nan, 6.0], [np.nan] * 3]))
+    assert medians[:2] == pytest.approx([2.0, 5.0])
+    assert np.isnan(medians[2])

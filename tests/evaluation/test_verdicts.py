@@ -56,12 +56,32 @@ def test_best_value() -> None:
     assert outcome(rows_of((1, 2)), "best_between", 1, 2) == "undecided"
 
 
-def test_best_value_of_one_lucky_seed_is_not_confirmed() -> None:
+def test_best_value_of_one_lucky_seed_changes_nothing() -> None:
     rows = rows_of(GRID, "loam.grid_step", error=lambda v: 1 / (1 + v))
     lucky = [replace(r, thesis_rmse=0.01) if r.seed == 0 and r.parameters["loam.grid_step"] == 1 else r for r in rows]
-    found = verdict(lucky, "best_between", 1, 2)
+    assert outcome(rows, "best_between", 1, 2) == outcome(lucky, "best_between", 1, 2) == "refuted"
+
+
+def test_best_value_that_is_best_in_no_seed_is_not_confirmed() -> None:
+    # 1.5 is every seed's second best, and each has another best.
+    best = {0: 0.1, 1: 3.0, 2: 5.0}
+    rows = [
+        replace(r, thesis_rmse=0.1 if v == best[r.seed] else 0.2 if v == 1.5 else 1.0)
+        for r in rows_of(GRID, "loam.grid_step")
+        for v in r.parameters.values()
+    ]
+    found = verdict(rows, "best_between", 1, 2)
     assert found.outcome == "undecided"
-    assert "in 1 of 3 seeds only" in found.measured
+    assert "best at 1.5" in found.measured
+    assert "in 0 of 3 seeds only" in found.measured
+
+
+def test_elbow_is_not_moved_by_one_unlucky_seed() -> None:
+    rows = rows_of(DISTANCES, "imu.inlier_distance", error=lambda v: 0.5 if v >= 0.2 else 1.9)
+    unlucky = [
+        replace(r, thesis_rmse=2.0) if r.seed == 1 and r.parameters["imu.inlier_distance"] == 1 else r for r in rows
+    ]
+    assert outcome(unlucky, "good_from", 0.2) == "confirmed"
 
 
 def test_largest_value() -> None:
