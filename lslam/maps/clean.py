@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lslam.geometry import se3
 from lslam.maps.things import Floor, floor_of, things_in, whole
+from lslam.types.state import State
 
 # Scans before and after that are asked: at 10 Hz a pedestrian has left its place after 0.3 s, a lorry after 2.5 s.
 OFFSETS = (3, 6, 10, 15, 25)
@@ -74,6 +75,7 @@ class Cleaner:
         self._looks: deque[_Look] = deque()
         self._grid: _Grid | None = None
         self._begin = self._decided = self._count = 0
+        self._known = 0  # scans that were given back before the state that was restored
         self.removed = self.seen = 0
 
     def add(self, scan: PosedScan) -> list[PosedScan]:
@@ -92,25 +94,42 @@ class Cleaner:
         self._scans.append(scan)
         self._looks.append(_Look(T, image, floor_of(_upright(scan), T[:3, 3])))
         self._count += 1
-        return [self._decide()] if self._count - self._decided > OFFSETS[-1] else []
+        return self._decide() if self._count - self._decided > OFFSETS[-1] else []
 
     def finish(self) -> list[PosedScan]:
         """The scans that are left."""
-        return [self._decide() for _ in range(self._count - self._decided)]
+        return [scan for _ in range(self._count - self._decided) for scan in self._decide()]
 
-    def _decide(self) -> PosedScan:
-        """The oldest scan, without what moved."""
-        scan = self._scans.popleft()
-        moves = self._moves(scan, self._decided)
+    def state(self) -> State:
+        """What `restore` needs to go on from here; the scans themselves are to be added again."""
+        grid = None if self._grid is None else astuple(self._grid)
+        return {"grid": grid, "decided": self._decided, "removed": self.removed, "seen": self.seen}
+
+    def restore(self, state: State) -> int:
+        """Go on where `state` was taken, in an empty cleaner: with which scan, counted from 0, adding has to begin again.
+
+        Scans that were given back already are not given back once more.
+        """
+        self._grid = None if state["grid"] is None else _Grid(*state["grid"])
+        self._known, self.removed, self.seen = state["decided"], state["removed"], state["seen"]
+        self._begin = self._decided = self._count = max(self._known - OFFSETS[-1], 0)
+        return self._count
+
+    def _decide(self) -> list[PosedScan]:
+        """The oldest scan, without what moved; nothing when it was given back before."""
+        scan, number = self._scans.popleft(), self._decided
+        moves = None if number < self._known else self._moves(scan, number)
         self._decided += 1
         while self._begin < self._decided - OFFSETS[-1]:
             self._looks.popleft()
             self._begin += 1
+        if moves is None:
+            return []
         self.seen += len(moves)
         self.removed += int(moves.sum())
         kept = ~moves
         intensity = None if scan.intensity is None else scan.intensity[kept]
-        return replace(scan, points=scan.points[kept], intensity=intensity)
+        return [replace(scan, points=scan.points[kept], intensity=intensity)]
 
     def _moves(self, scan: PosedScan, number: int) -> NDArray[np.bool_]:
         from lslam.kernels.see_through import vote

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from lslam.errors import ConfigError
 from lslam.maps.sorted_runs import SortedRuns
+from lslam.types.state import State
 
 # Log-odds in hundredths: hit 0.7, miss 0.4, clamped to 0.12 and 0.97 (OctoMap's): what has left is free after some ten scans.
 MODEL = np.array([85, -41, -200, 350], np.int64)
@@ -49,7 +50,8 @@ class OccupancyMapper:
     Parameters
     ----------
     voxel : edge of a cell, m; range_min, range_max : m; farther points only free the cells up to there
-    spool : folder beside which large maps are kept meanwhile; None: the system's temporary one
+    spool : folder beside which large maps are kept meanwhile; None: the system's temporary one; keep : one that stays
+        instead, for `restore`
 
     Raises
     ------
@@ -66,7 +68,7 @@ class OccupancyMapper:
 
     def __init__(
         self, voxel: float = 0.4, range_min: float = 1.0, range_max: float = 40.0, *, spool: Path | None = None,
-        most: int = _MOST_ROWS,
+        keep: Path | None = None, most: int = _MOST_ROWS,
     ) -> None:  # fmt: skip
         if not (np.isfinite([voxel, range_max]).all() and voxel > 0 and 0 <= range_min < range_max):
             raise ConfigError(
@@ -75,7 +77,7 @@ class OccupancyMapper:
             )
         self._voxel, self._range = float(voxel), (float(range_min), float(range_max))
         self._longest = int(3 * range_max / voxel) + 4
-        self._spool, self._most = spool, most
+        self._spool, self._keep, self._most = spool, keep, most
         self._origin: NDArray[np.int64] | None = None
         self._runs: SortedRuns | None = None
         self._rows = np.empty((0, 5), np.int64)
@@ -126,6 +128,21 @@ class OccupancyMapper:
         cells = unpack(rows[:, 0], origin).astype(np.int32)
         return OccupancyGrid(cells, np.clip(rows[:, 1], rows[:, 2], rows[:, 3]).astype(np.int16), self._voxel)
 
+    def state(self) -> State:
+        """What `restore` needs to go on from here; the cells go to `keep`, only those that changed since the last time."""
+        if self._used:
+            self._spill()
+        return {
+            "origin": self._origin, "scans": self.scans, "runs": None if self._runs is None else self._runs.state(),
+        }  # fmt: skip
+
+    def restore(self, state: State) -> None:
+        """Go on where `state` was taken, in an empty mapper of the same kind; raises InputError when cells are missing."""
+        if state["runs"] is not None:
+            self._runs = SortedRuns(self._spool, self._keep)
+            self._runs.restore(state["runs"])
+        self._origin, self.scans = state["origin"], state["scans"]
+
     def _take(self) -> NDArray[np.int64]:
         rows = self._rows[: self._used]
         rows = rows[np.argsort(rows[:, 0])]
@@ -135,7 +152,7 @@ class OccupancyMapper:
 
     def _spill(self) -> None:
         if self._runs is None:
-            self._runs = SortedRuns(self._spool)
+            self._runs = SortedRuns(self._spool, self._keep)
         self._runs.add(self._take())
 
     def _reserve(self, rows: int) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,9 +13,12 @@ from lslam.config import Config
 from lslam.maps.merge import MapMerger
 from lslam.odometry.base import FeatureSource
 from lslam.pipeline.front_end import read_ahead
+from lslam.pipeline.map_checkpoints import MapCheckpoints
 from lslam.pipeline.map_pass import motion_within
+from lslam.preprocessing.features import Features
 from lslam.types.scan_result import ScanResult
 from lslam.types.sequence import Sequence
+from lslam.types.state import State
 
 EDGE, PLANE = 1, 0
 
@@ -33,28 +37,63 @@ class FeatureCloud:
         return len(self.points)
 
 
+class FeatureMaker:
+    """Less sharp edges and less planar points in voxels; keep : folder for a map that is gone on with."""
+
+    def __init__(self, voxel: float, reach: float, keep: Path | None = None) -> None:
+        self._parts = {
+            name: MapMerger(voxel, 0.0, reach, keep=None if keep is None else keep / name)
+            for name in ("edges", "planes")
+        }
+
+    def add(self, features: Features, T_world_lidar: NDArray[np.float64]) -> None:
+        """Those of one more scan, and its pose (4, 4)."""
+        self._parts["edges"].add(features.less_edges.points, T_world_lidar)
+        self._parts["planes"].add(features.less_planes.points, T_world_lidar)
+
+    def finish(self) -> FeatureCloud:
+        """The map of all that was added."""
+        both = [part.result().points for part in self._parts.values()]
+        kinds = np.repeat(np.array([EDGE, PLANE], np.uint8), [len(points) for points in both])
+        return FeatureCloud(np.concatenate(both), kinds)
+
+    def state(self) -> State:
+        """What `restore` needs to go on from here; the voxels go to `keep`."""
+        return {name: part.state() for name, part in self._parts.items()}
+
+    def restore(self, state: State) -> None:
+        """Go on where `state` was taken, in an empty maker of the same kind; raises InputError when voxels are missing."""
+        for name, part in self._parts.items():
+            part.restore(state[name])
+
+
 def build_feature_map(
     sequence: Sequence, odometry: FeatureSource, results: list[ScanResult], config: Config, on_step: Callable[[], None],
-    should_stop: Callable[[], bool],
+    should_stop: Callable[[], bool], checkpoints: MapCheckpoints | None = None,
 ) -> FeatureCloud | None:  # fmt: skip
     """Less sharp edges and less planar points of every scan that was registered, in voxels of `loam.feature_map_voxel`.
 
-    None when `should_stop` said so before the last scan.
+    None when `should_stop` said so before the last scan; `checkpoints` know then where to go on.
     """
-    size, reach = config.loam.feature_map_voxel, config.preprocess.range_max
-    edges, planes = MapMerger(size, 0.0, reach), MapMerger(size, 0.0, reach)
     stamps = np.array([r.stamp_ns for r in results], np.int64)
     poses = np.stack([r.T_world_lidar for r in results])
-    for loaded, result in zip(read_ahead(sequence, odometry.prepare, config.input.threads), results, strict=False):
-        if should_stop():
+
+    def make() -> FeatureMaker:
+        keep = None if checkpoints is None else checkpoints.folder
+        return FeatureMaker(config.loam.feature_map_voxel, config.preprocess.range_max, keep)
+
+    maker, first = (make(), 0) if checkpoints is None else checkpoints.begin(make, poses)
+    for _ in range(first):
+        on_step()
+    ahead = read_ahead(sequence, odometry.prepare, config.input.threads, first=first)
+    for k, (loaded, result) in enumerate(zip(ahead, results[first:], strict=False), first):
+        is_last = should_stop()
+        if checkpoints is not None:
+            checkpoints.offer(k, maker, is_last)
+        if is_last:
             return None
         if loaded.scan is not None and result.status == "ok":
-            features = odometry.features_of(loaded.prepared, motion_within(loaded.scan, stamps, poses))
-            edges.add(features.less_edges.points, result.T_world_lidar)
-            planes.add(features.less_planes.points, result.T_world_lidar)
+            motion = motion_within(loaded.scan, stamps, poses)
+            maker.add(odometry.features_of(loaded.prepared, motion), result.T_world_lidar)
         on_step()
-    both = edges.result(), planes.result()
-    return FeatureCloud(
-        np.concatenate([part.points for part in both]),
-        np.repeat(np.array([EDGE, PLANE], np.uint8), [len(part) for part in both]),
-    )
+    return maker.finish()

@@ -27,6 +27,7 @@ from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan import Scan
 from lslam.types.scan_result import ScanResult
 from lslam.types.sequence import Sequence
+from lslam.types.state import State
 
 log = logging.getLogger("lslam")
 
@@ -49,57 +50,103 @@ def build_map(
     """Merge every scan that was registered; bridged scans would draw their error into the map and stay out.
 
     A map too large for memory is kept in a temporary folder in `spool` meanwhile. None when `should_stop` said so before
-    the last scan. `checkpoints` are of the merger alone: where anything else is made of the scans (`map.clean`,
-    `map.occupancy`), a map that was interrupted begins again.
+    the last scan; `checkpoints` know then where to go on.
     """
     section = config.map
-    if section.clean or section.occupancy:
-        checkpoints = None
-    merger = MapMerger(
-        section.voxel, section.range_min, section.range_max, crop=section.crop_box, spool=spool,
-        keep=None if checkpoints is None else checkpoints.spool,
-    )  # fmt: skip
     ego_box = section.ego_box or config.preprocess.ego_box
     stamps = np.array([r.stamp_ns for r in results], np.int64)
     poses = np.stack([r.T_world_lidar for r in results])
-    cleaner = Cleaner() if section.clean else None
 
-    occupancy = None
-    if section.occupancy:
-        occupancy = OccupancyMapper(section.occupancy_voxel, section.range_min, section.occupancy_range, spool=spool)
+    def make() -> MapMaker:
+        return MapMaker(section, spool, None if checkpoints is None else checkpoints.folder)
 
-    def merge(scans: Iterable[PosedScan]) -> None:
-        for posed in scans:
-            merger.add(posed.points, posed.T_world_lidar, posed.intensity)
-            if occupancy is not None:
-                occupancy.add(posed.points, posed.T_world_lidar)
-
-    first = 0 if checkpoints is None else checkpoints.begin(merger, poses)
-    for _ in range(first):
+    maker, done = (make(), 0) if checkpoints is None else checkpoints.begin(make, poses)
+    for _ in range(done):
         on_step()
+    first = maker.first_again(done)
     ahead = read_ahead(sequence, None, config.input.threads, first=first)
     for k, (loaded, result) in enumerate(zip(ahead, results[first:], strict=False), first):
         is_last = should_stop()
-        if checkpoints is not None:
-            checkpoints.offer(k, merger, is_last)
+        if checkpoints is not None and k >= done:
+            checkpoints.offer(k, maker, is_last)
         if is_last:
             return None
         if loaded.scan is not None and result.status == "ok":
             scan = loaded.scan if ego_box is None else without_box(loaded.scan, ego_box)
             motion = motion_within(scan, stamps, poses)
-            posed = PosedScan(deskew_points(scan.points, scan.times, motion), result.T_world_lidar, scan.intensity)
-            merge([posed] if cleaner is None else cleaner.add(posed))
-        on_step()
-    if cleaner is not None:
-        merge(cleaner.finish())
-        log.info("map: %d of %d points moved and are left out", cleaner.removed, cleaner.seen)
-    merged: Cloud = merger.result()
-    done = _done(section, cleaner)
-    if section.denoise:
-        before, merged = len(merged), denoise(in_memory(merged))
-        done = (*done, f"denoised: {before - len(merged)} of {before} points were far from their neighbours")
-    image, extent = top_view(merged, pixel=max(0.2, config.map.voxel))
-    return BuiltMap(merged, image, extent, done, None if occupancy is None else occupancy.result())
+            points = deskew_points(scan.points, scan.times, motion)
+            maker.add(k, PosedScan(points, result.T_world_lidar, scan.intensity))
+        if k >= done:
+            on_step()
+    return maker.finish()
+
+
+class MapMaker:
+    """What the scans of a run go through on their way into its map: cleaning, merging, the occupancy.
+
+    section : what is asked for; spool : folder for maps too large for memory; keep : for one that is gone on with
+    """
+
+    def __init__(self, section: MapConfig, spool: Path | None = None, keep: Path | None = None) -> None:
+        self._section = section
+        self._merger = MapMerger(
+            section.voxel, section.range_min, section.range_max, crop=section.crop_box, spool=spool,
+            keep=None if keep is None else keep / "map",
+        )  # fmt: skip
+        self._cleaner = Cleaner() if section.clean else None
+        self._occupancy = None
+        if section.occupancy:
+            self._occupancy = OccupancyMapper(
+                section.occupancy_voxel, section.range_min, section.occupancy_range, spool=spool,
+                keep=None if keep is None else keep / "occupancy",
+            )  # fmt: skip
+        self._given: list[int] = []
+
+    def add(self, number: int, scan: PosedScan) -> None:
+        """One more registered scan, and its number among all scans."""
+        self._given.append(number)
+        self._merge([scan] if self._cleaner is None else self._cleaner.add(scan))
+
+    def finish(self) -> BuiltMap:
+        """The map of all that was added."""
+        if self._cleaner is not None:
+            self._merge(self._cleaner.finish())
+            log.info("map: %d of %d points moved and are left out", self._cleaner.removed, self._cleaner.seen)
+        merged: Cloud = self._merger.result()
+        done = _done(self._section, self._cleaner)
+        if self._section.denoise:
+            before, merged = len(merged), denoise(in_memory(merged))
+            done = (*done, f"denoised: {before - len(merged)} of {before} points were far from their neighbours")
+        image, extent = top_view(merged, pixel=max(0.2, self._section.voxel))
+        return BuiltMap(merged, image, extent, done, None if self._occupancy is None else self._occupancy.result())
+
+    def state(self) -> State:
+        """What `restore` needs to go on from here; voxels and cells go to `keep`."""
+        parts = {"merger": self._merger, "cleaner": self._cleaner, "occupancy": self._occupancy}
+        return {name: part.state() for name, part in parts.items() if part is not None} | {
+            "given": np.array(self._given, np.int64)
+        }
+
+    def restore(self, state: State) -> None:
+        """Go on where `state` was taken, in an empty maker of the same kind; raises InputError when voxels are missing."""
+        self._merger.restore(state["merger"])
+        self._given = state["given"].tolist()
+        if self._occupancy is not None:
+            self._occupancy.restore(state["occupancy"])
+        if self._cleaner is not None:
+            del self._given[self._cleaner.restore(state["cleaner"]) :]
+
+    def first_again(self, done: int) -> int:
+        """With which scan reading has to begin, when `done` are done: the cleaner looks back."""
+        if self._cleaner is None or not done:
+            return done
+        return self._given[-1] + 1 if self._given else 0
+
+    def _merge(self, scans: Iterable[PosedScan]) -> None:
+        for posed in scans:
+            self._merger.add(posed.points, posed.T_world_lidar, posed.intensity)
+            if self._occupancy is not None:
+                self._occupancy.add(posed.points, posed.T_world_lidar)
 
 
 def _done(section: MapConfig, cleaner: Cleaner | None) -> tuple[str, ...]:

@@ -16,7 +16,7 @@ from lslam.keyframes.store import KeyframeStore
 from lslam.locks import one_at_a_time
 from lslam.loops import detector
 from lslam.maps import crispness, merge
-from lslam.odometry.base import Odometry
+from lslam.odometry.base import Odometry, Resumable
 from lslam.odometry.given import GivenPoses
 from lslam.pipeline import inertial_start
 from lslam.pipeline.checkpoints import Checkpoints, OdometryCheckpoints
@@ -106,14 +106,17 @@ def _turns(inertial: Inertial, store: KeyframeStore, config: Config) -> list[Tur
     return found
 
 
-def odometry_checkpoints(folder: RunFolder, config: Config, goes_on: bool) -> OdometryCheckpoints | None:
+def odometry_checkpoints(
+    folder: RunFolder, odometry: Odometry, config: Config, goes_on: bool
+) -> OdometryCheckpoints | None:
     """Checkpoints in a run folder; None when they are not wanted. Says so when an earlier run left none to go on from."""
     every_s = config.odometry.checkpoint_s
     if every_s == 0:
         return None
     checkpoints = OdometryCheckpoints(Checkpoints(folder.path / CHECKPOINT, "odometry", every_s))
     if goes_on and not checkpoints.scans:
-        log.info("there is no checkpoint of %s to go on from: it begins at the first scan", config.odometry.method)
+        why = "there is no checkpoint to go on from" if isinstance(odometry, Resumable) else "its state is its own"
+        log.info("%s begins again at the first scan: %s", config.odometry.method, why)
     return checkpoints
 
 

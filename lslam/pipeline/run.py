@@ -147,7 +147,7 @@ def _fill(folder: RunFolder, job: _Job, goes_on: bool) -> tuple[RunRecord, Evalu
     folder.write_text("config.toml", outputs.config_text(job.config))
     folder.write_manifest(job.manifest.as_dict("running"))
     store = KeyframeStore(folder.path / KEYFRAMES)
-    checkpoints = odometry_checkpoints(folder, job.config, goes_on)
+    checkpoints = odometry_checkpoints(folder, job.odometry, job.config, goes_on)
     record, done, evaluation = _solve(job, store, folder.path, checkpoints)
     write_back_end(folder.path, record, store, done)
     if job.osm is not None and record.buildings is not None:
@@ -225,7 +225,10 @@ def _feature_map(folder: RunFolder, job: _Job, record: RunRecord) -> None:
         return
     watch.on_start("feature map", len(record.results))
     with manifest.timed("feature_map_s"):
-        built = build_feature_map(job.sequence, odometry, record.results, config, watch.on_step, watch.should_stop)
+        built = build_feature_map(
+            job.sequence, odometry, record.results, config, watch.on_step, watch.should_stop,
+            map_checkpoints(folder, config, "feature map"),
+        )  # fmt: skip
         if built is None:
             manifest.interrupt("interrupted while the feature map was built: there is none")
             return

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from lslam.config import load_config
 from lslam.geometry import se3, so3
 from lslam.kernels.see_through import nearest_ranges, vote
+from lslam.maps import clean
 from lslam.maps.clean import CUBE, OFFSETS, SHARE, Cleaner, PosedScan, spread
 from lslam.pipeline.map_pass import build_map, motion_within
 from lslam.preprocessing.deskew import deskew_points
@@ -119,6 +120,29 @@ def test_scans_come_back_in_order_and_late() -> None:
     numbers += [int(scan.T_world_lidar[0, 3]) for scan in cleaner.finish()]
     assert numbers == list(range(40))
     assert Cleaner().finish() == []
+
+
+@pytest.mark.parametrize("stop", [1, 4, 9, 20])
+def test_restored_it_gives_back_the_rest_as_it_would_have(stop: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(clean, "OFFSETS", (1, 3))
+    rng = np.random.default_rng(7)
+    wall = rng.uniform([10, -20, -1], [11, 20, 3], (3000, 3))
+    scans = []
+    for k in range(20):
+        cart = rng.uniform([5, k - 10, -1], [6, k - 8, 1], (300, 3))
+        T = se3.make(np.eye(3), np.array([0.1 * k, 0.0, 0.0]))
+        scans.append(PosedScan((np.concatenate([wall, cart]) - T[:3, 3]).astype(np.float32), T))
+    whole, first, second = Cleaner(), Cleaner(), Cleaner()
+    expected = [back for scan in scans for back in whole.add(scan)] + whole.finish()
+    assert 0.5 < whole.removed / (300 * 20) < 1.0
+    found = [back for scan in scans[:stop] for back in first.add(scan)]
+    again = second.restore(first.state())
+    assert max(stop - 6, 0) <= again <= stop
+    found += [back for scan in scans[again:] for back in second.add(scan)] + second.finish()
+    assert len(found) == len(expected) == 20
+    for a, b in zip(found, expected, strict=True):
+        assert a.points.tobytes() == b.points.tobytes()
+    assert (second.removed, second.seen) == (whole.removed, whole.seen)
 
 
 def test_a_map_is_cleaned_when_asked() -> None:

@@ -17,6 +17,7 @@ import lslam
 from lslam.config import Config, load_config
 from lslam.errors import GateError, InterruptedRunError, OutputExistsError, RunFailedError, RunFinishedError, UsageError
 from lslam.formats.trajectory_files import read_trajectory
+from lslam.maps import clean
 from lslam.pipeline import checkpoints
 from lslam.pipeline.checkpoints import Pace
 from lslam.pipeline.watch import Watch
@@ -90,7 +91,7 @@ def die_at(scan: int) -> Callable[[int], None]:
 VARIANTS: list[tuple[Callable[[], Stub], tuple[str, ...]]] = [
     (drive, ()),
     (drive, ("input.threads=1", "preprocess.skip_standing=true")),
-    (drive, ("odometry.method=kiss-icp",)),
+    (drive, ("odometry.method=kiss-icp", "map.clean=true", "map.occupancy=true")),
     (rings, ("odometry.method=floam", "input.rings=elevation:16", "map.write_features=true")),
     (walk, ("imu.use=true", "imu.start_s=1")),
 ]
@@ -116,6 +117,8 @@ def test_interrupted_twice_it_ends_with_the_same_bytes(
         whole = {}
     for name, data in whole.items():
         assert parts[name] == data, name
+    said = (out / "log.txt").read_text()
+    assert said.count("kiss-icp begins again at the first scan: its state is its own") == ("kiss-icp" in said)
     facts, once = manifest(out), manifest(tmp_path / "whole")
     assert facts["problems"] == once["problems"]
     assert facts["counts"] == once["counts"]
@@ -138,12 +141,31 @@ def test_it_goes_on_where_it_was_killed(scan: int, tmp_path: Path) -> None:
     assert again.reads == [0, 0, *range(scan, COUNT)]
 
 
+FEATURES = ("odometry.method=floam", "input.rings=elevation:16", "map.write=false", "map.write_features=true")
+
+
 @pytest.mark.usefixtures("at_every_scan")
-@pytest.mark.parametrize("lost", ["nothing", "voxels"])
-def test_the_map_goes_on_where_it_was_killed(lost: str, tmp_path: Path) -> None:
-    config, out = config_of("input.threads=1", "map.voxel=0.1"), tmp_path / "out"
-    lslam.run(drive(), config, out=tmp_path / "whole")
-    first = drive()
+@pytest.mark.parametrize(
+    ("made", "settings", "lost", "again_from"),
+    [
+        (drive, (), "", 8),
+        (drive, (), "map/run-3", 0),
+        # Of scans 0 to 7 the sixth was not registered: four are decided, and the cleaner looks three back.
+        (drive, ("map.clean=true", "map.occupancy=true"), "", 1),
+        (drive, ("map.clean=true", "map.occupancy=true"), "occupancy/run-3", 0),
+        (rings, FEATURES, "", 8),
+        (rings, FEATURES, "planes/run-3", 0),
+    ],
+)
+def test_the_map_goes_on_where_it_was_killed(
+    made: Callable[[], Stub], settings: tuple[str, ...], lost: str, again_from: int, tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    monkeypatch.setattr(clean, "OFFSETS", (1, 3))
+    config, out = config_of("input.threads=1", "map.voxel=0.1", *settings), tmp_path / "out"
+    lslam.run(made(), config, out=tmp_path / "whole")
+    first = made()
+    first.reads.clear()
 
     def die(index: int) -> None:
         if index == 9 and first.reads.count(9) == 2:
@@ -152,12 +174,14 @@ def test_the_map_goes_on_where_it_was_killed(lost: str, tmp_path: Path) -> None:
     first.on_read = die
     with pytest.raises(KeyboardInterrupt):
         lslam.run(first, config, out=out)
-    if lost == "voxels":
-        (out / "checkpoint" / "map" / "run-3").unlink()
-    again = drive()
+    if lost:
+        (out / "checkpoint" / lost).unlink()
+    again = made()
     again.reads.clear()
     lslam.run(again, config, out=out, resume=True)
-    assert again.reads == [0, 0, *range(8 if lost == "nothing" else 0, COUNT)]
+    left = COUNT - again_from
+    assert again.reads[-left:] == [*range(again_from, COUNT)]
+    assert max(again.reads[:-left]) < 3, "only to see what the scans are like"
     assert result_of(out) == result_of(tmp_path / "whole")
 
 
