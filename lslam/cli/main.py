@@ -18,6 +18,7 @@ COMMANDS = {
     "run": "Estimate a trajectory and build a map from a recorded sequence.",
     "eval": "Score estimated trajectories against ground truth.",
     "compare": "Compare methods on the same sequences.",
+    "batch": "Make many runs, from a file or from lines of lslam run.",
     "sweep": "Study how results depend on parameters.",
     "simulate": "Simulate a drive with exact ground truth.",
     "convert": "Convert a sequence to a bag or KITTI's layout, or a trajectory to another format.",

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import json
 import os
+import shlex
+import sys
+import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,6 +18,7 @@ from lslam.errors import UsageError
 
 if TYPE_CHECKING:
     from lslam.studies.engines import Engine
+    from lslam.studies.expanded import Place
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -97,6 +101,30 @@ def epsg(text: str) -> int:
     return int(number)
 
 
+def studied(function: F) -> F:
+    """--out, --resume, --overwrite and --scenes."""
+    for name, metavar, text in (
+        ("--scenes", "DIR", "Keep simulations here, for others of the same scenarios [default: simulated/ in --out]."),
+        ("--out", "DIR", "Folder of all runs and results [default: runs/NAME-TIME]."),
+    ):
+        function = click.option(name, type=click.Path(path_type=Path), metavar=metavar, help=text)(function)
+    for name, text in (
+        ("--overwrite", "Run everything anew in an existing folder."),
+        ("--resume", "Keep finished runs of the same input and configuration, run the others."),
+    ):
+        function = click.option(name, is_flag=True, help=text)(function)
+    return function
+
+
+def place_of(given: dict[str, Any], name: str) -> Place:
+    """Where runs go, as the options of `studied` say."""
+    from lslam.studies.expanded import Place
+
+    out = given["out"] or Path("runs") / time.strftime(f"{name}-%Y%m%d-%H%M%S")
+    command = shlex.join(["lslam", *sys.argv[1:]])
+    return Place(out, given["overwrite"], given["resume"], given["scenes"], given["data_root"], command)
+
+
 def engine(function: F) -> F:
     """--jobs, --scheduler and --cluster."""
     for name, kind, metavar, text in (
@@ -114,8 +142,11 @@ def engine(function: F) -> F:
 
 
 @contextmanager
-def engine_of(given: dict[str, Any], title: str) -> Iterator[Engine]:
-    """What makes the runs, as the options of `engine` say; raises UsageError for what does not go together."""
+def engine_of(given: dict[str, Any], title: str, is_kept: bool = True) -> Iterator[Engine]:
+    """What makes the runs, as the options of `engine` say; raises UsageError for what does not go together.
+
+    is_kept : whether processes of this machine go on with one run after the other
+    """
     from lslam.studies.engines import Local
 
     jobs, scheduler, cluster = given["jobs"], given["scheduler"], given["cluster"]
@@ -124,7 +155,7 @@ def engine_of(given: dict[str, Any], title: str) -> Iterator[Engine]:
     if jobs is not None and jobs < 1:
         raise UsageError(f"--jobs {jobs}: at least one run at a time")
     if scheduler is None and cluster is None:
-        yield Local(jobs or os.cpu_count() or 1, title=title)
+        yield Local(jobs or os.cpu_count() or 1, is_kept, title)
         return
     from lslam.studies.cluster import connected
 

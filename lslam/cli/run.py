@@ -76,26 +76,11 @@ def command(sequence: str, **given: Any) -> None:
     SEQUENCE is a path (a folder or a bag), or a name under --data-root: seq07, 07, kitti/07, 2011_09_26_drive_0005_sync.
     """
     setup_logging(given["verbose"], given["quiet"])
-    from lslam.pipeline.check import check_config
     from lslam.pipeline.run import run
     from lslam.pipeline.run_folder import default_folder
-    from lslam.readers import open_sequence
 
     _check_folder(given)
-    config = _resolve(given)
-    check_config(config)
-    opened = open_sequence(
-        sequence, data_root=given["data_root"], vertical_correction_deg=config.input.vertical_correction_deg,
-        **options.reading_of(given),
-    )  # fmt: skip
-    if config.imu.use:
-        from lslam.readers.raw_drive import with_imu
-
-        opened = with_imu(opened, given["data_root"])
-    if config.gnss.mode != "off":
-        from lslam.readers.raw_drive import with_gnss
-
-        opened = with_gnss(opened, given["data_root"])
+    opened, config = opened_with({**given, "sequence": sequence})
     truth = read_truth(given["gt"], opened)
     out = given["out"] or default_folder(opened.name, _variant(config))
     if given["dry_run"]:
@@ -114,6 +99,28 @@ def command(sequence: str, **given: Any) -> None:
         log.info("%s", finished)
         _print_finished(out, given["as_json"])
     return None
+
+
+def opened_with(given: dict[str, Any]) -> tuple[Sequence, Config]:
+    """The sequence and the configuration that the words of a command line mean; raises what is wrong with them."""
+    from lslam.pipeline.check import check_config
+    from lslam.readers import open_sequence
+
+    config = _resolve(given)
+    check_config(config)
+    opened = open_sequence(
+        given["sequence"], data_root=given["data_root"],
+        vertical_correction_deg=config.input.vertical_correction_deg, **options.reading_of(given),
+    )  # fmt: skip
+    if config.imu.use:
+        from lslam.readers.raw_drive import with_imu
+
+        opened = with_imu(opened, given["data_root"])
+    if config.gnss.mode != "off":
+        from lslam.readers.raw_drive import with_gnss
+
+        opened = with_gnss(opened, given["data_root"])
+    return opened, config
 
 
 def _variant(config: Config) -> str:

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
-import sys
-import time
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -31,21 +28,9 @@ if TYPE_CHECKING:
 @click.option(
     "--dry-run", is_flag=True, help="List and count the runs, estimate the time by a few short ones, and stop."
 )
-@click.option(
-    "--out", type=click.Path(path_type=Path), metavar="DIR", help="Folder of the study [default: runs/STUDY-TIME]."
-)
-@click.option("--resume", is_flag=True, help="Keep finished runs of the same input and configuration, run the others.")
-@click.option("--overwrite", is_flag=True, help="Run everything anew in an existing folder.")
-@click.option(
-    "--report", type=click.Path(path_type=Path), metavar="DIR",
-    help="Write the report of the study in DIR anew from its results.csv, run nothing.",
-)  # fmt: skip
+@options.studied
 @options.engine
 @click.option("--seeds", metavar="N,N,...", help="Instead of the study's.")
-@click.option(
-    "--scenes", type=click.Path(path_type=Path), metavar="DIR",
-    help="Keep simulations here, for other studies of the same scenarios [default: simulated/ in --out].",
-)  # fmt: skip
 @options.data_root
 @click.option(
     "--set", "settings", multiple=True, metavar="SECTION.KEY=VALUE", help="Set one key in all runs; repeatable."
@@ -82,8 +67,8 @@ def command(study: str | None, **given: Any) -> None:
         on_rows = stack.enter_context(best_so_far())
         rows = run_sweep(sweep, engine, bars(stack), on_rows)
     _print(rows)
-    log.info("every run: %s", sweep.out / "results.csv")
-    _report(sweep.out)
+    log.info("every run: %s", sweep.place.out / "results.csv")
+    _report(sweep.place.out)
     failed = [row for row in rows if not row.is_usable]
     if failed and given["strict"]:
         raise GateError(f"--strict: {len(failed)} of {len(rows)} runs failed, the first one: {failed[0].reason}")
@@ -98,16 +83,7 @@ def _sweep(word: str, given: dict[str, Any]) -> Sweep:
     if given["seeds"] is not None:
         seeds = options.seeds_of(given["seeds"])
         study = parse_study(study.model_dump(exclude_unset=True) | {"seeds": seeds}, "--seeds", study.name)
-    return Sweep(
-        study,
-        given["out"] or Path("runs") / time.strftime(f"{study.name}-%Y%m%d-%H%M%S"),
-        given["settings"],
-        given["overwrite"],
-        given["resume"],
-        given["scenes"],
-        given["data_root"],
-        shlex.join(["lslam", *sys.argv[1:]]),
-    )
+    return Sweep(study, options.place_of(given, study.name), given["settings"])
 
 
 def _print(rows: list[StudyRow]) -> None:
@@ -138,12 +114,13 @@ def _print_plan(sweep: Sweep, at_once: int, stack: ExitStack) -> None:
     """Every run, how many there are, and how long those will take that are not finished."""
     from lslam.cli.study_screen import bars
     from lslam.studies.estimate import estimate
-    from lslam.studies.sweep import expand_study, left_to_do
+    from lslam.studies.expanded import left_to_do
+    from lslam.studies.sweep import expand_study
 
     expanded = expand_study(sweep)
     for job in expanded.jobs:
         show(f"{job.name}\n")
-    left = left_to_do(sweep, expanded.jobs)
+    left = left_to_do(sweep.place, expanded.jobs)
     many = f"{len(expanded.jobs)} runs, {len(left)} left to do"
     if not left:
         show(f"{many}\n")

@@ -134,9 +134,7 @@ class StudyConfig(Section):
     @field_validator("seeds")
     @classmethod
     def _differ(cls, seeds: tuple[int, ...]) -> tuple[int, ...]:
-        if len(set(seeds)) < len(seeds) or min(seeds, default=0) < 0:
-            raise ValueError("different whole numbers from 0 are needed")
-        return seeds
+        return distinct_seeds(seeds)
 
     def points(self) -> list[Point]:
         """Values of the studied parameters, a point per run of a method."""
@@ -146,6 +144,13 @@ class StudyConfig(Section):
         return [dict(zip(lists, values, strict=True)) for values in product(*lists.values())]
 
 
+def distinct_seeds(seeds: tuple[int, ...]) -> tuple[int, ...]:
+    """The seeds; raises ValueError when one is there twice or below 0."""
+    if len(set(seeds)) < len(seeds) or min(seeds, default=0) < 0:
+        raise ValueError("different whole numbers from 0 are needed")
+    return seeds
+
+
 def read_study(path: Path) -> StudyConfig:
     """The study of a file. Raises InputError when it cannot be read, ConfigError naming the key and the nearest known one."""
     return parse_study(read_toml(path, "study"), str(path), path.stem)
@@ -153,9 +158,9 @@ def read_study(path: Path) -> StudyConfig:
 
 def parse_study(tree: dict[str, Any], where: str, name: str) -> StudyConfig:
     """The study of a TOML tree found in `where`; `name` is what it is called when it does not say."""
-    _check_keys(tree, StudyConfig, where)
+    check_keys(tree, StudyConfig, where)
     for sequence in _tables(tree.get("sequences")):
-        _check_keys(sequence, StudySequence, f"{where}: sequences")
+        check_keys(sequence, StudySequence, f"{where}: sequences")
     try:
         return StudyConfig.model_validate({"name": name, **tree})
     except ValidationError as error:
@@ -166,7 +171,8 @@ def _tables(value: Any) -> Sequence[dict[str, Any]]:
     return [item for item in value if isinstance(item, dict)] if isinstance(value, list) else []
 
 
-def _check_keys(tree: dict[str, Any], model: type[BaseModel], where: str) -> None:
+def check_keys(tree: dict[str, Any], model: type[BaseModel], where: str) -> None:
+    """Raise ConfigError for a key that `model` does not have, naming the nearest one."""
     for key in tree:
         if key not in model.model_fields:
             raise ConfigError(f"{where}: unknown key {key!r}; {nearest(key, model.model_fields)}")

@@ -1,4 +1,4 @@
-"""The best point of each method so far: what a study shows while it runs and when it ends."""
+"""What a study shows while it runs and when it ends: the best point of each method so far; of a batch, every run."""
 
 from __future__ import annotations
 
@@ -53,6 +53,18 @@ def label(row: StudyRow) -> str:
 def best_table(rows: Sequence[StudyRow]) -> Grid:
     """Header and a line per method."""
     return [HEADER, *(_line(best) for best in best_points(rows))]
+
+
+def batch_table(rows: Sequence[StudyRow]) -> Grid:
+    """Header and a line per run of a batch: how it ended, its errors, and where it lies or why it failed."""
+    header = ["sequence", "method", "status", "scans", "ATE se3, m", "ms per scan", "total, s", "folder or reason"]
+    lines = []
+    for row in rows:
+        numbers = [f"{row.ate_se3:.3f}", f"{row.time_per_scan_ms:.1f}", f"{row.run_s:.1f}"]
+        shown = ["-" if number == "nan" else number for number in numbers]
+        end = row.folder if row.is_usable else row.reason
+        lines.append([row.sequence, label(row), row.status, str(row.scans), *shown, end])
+    return [header, *lines]
 
 
 def _best(rows: Sequence[StudyRow]) -> tuple[StudyRow, ...]:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from lslam.config import Config
 from lslam.pipeline.identity import job_digest
@@ -41,7 +41,7 @@ class Job:
     """One run: what a process needs to make it, and `state_file`, where it leaves how it ended.
 
     method : the variant's name, the method of `config` or a preset that says more than a method
-    digest : two jobs of one digest have the same result; scene : as of the cell
+    digest : two jobs of one digest have the same result; scene : as of the cell; reading : what else `open_sequence` is given
     """
 
     sequence: str
@@ -55,6 +55,7 @@ class Job:
     truth: Trajectory | None = None
     data_root: Path | None = None
     scene: Scene | None = None
+    reading: dict[str, Any] = field(default_factory=dict)
 
     @property
     def name(self) -> str:

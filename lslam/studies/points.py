@@ -36,7 +36,7 @@ def contenders(study: StudyConfig, settings: Sequence[str] = ()) -> list[Contend
 
     Raises ConfigError or UsageError naming the parameter, the value and the nearest known key; UsageError for unknown methods.
     """
-    common = [*_ALWAYS, *_settings(study.config), *settings]
+    common = [*_ALWAYS, *settings_of(study.config), *settings]
     found = []
     for point in study.points():
         said = ", ".join(f"{key} = {value}" for key, value in point.items())
@@ -54,7 +54,8 @@ def contenders(study: StudyConfig, settings: Sequence[str] = ()) -> list[Contend
     return found
 
 
-def _settings(sections: dict[str, dict[str, Any]]) -> list[str]:
+def settings_of(sections: dict[str, dict[str, Any]]) -> list[str]:
+    """Sections of a study file as settings "a.b=v"."""
     return [
         s for section, values in sections.items() for s in _setting({f"{section}.{k}": v for k, v in values.items()})
     ]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from math import nan
 from pathlib import Path
@@ -75,7 +76,7 @@ class Results:
             is_timing_comparable=is_comparable(state),
             digest=job.digest,
             machine=state.machine,
-            folder=job.folder.relative_to(self.out).as_posix(),
+            folder=Path(os.path.relpath(job.folder, self.out)).as_posix(),
         )
 
 

@@ -85,8 +85,8 @@ def _run(job: Job, is_kept: bool) -> tuple[str, str]:
     from lslam.pipeline.watch import RunOutcome, Watch
 
     ended: list[RunOutcome] = []
-    correction_deg = job.config.input.vertical_correction_deg
-    key = (job.path, job.data_root, correction_deg, job.config.imu.use, job.config.gnss.mode != "off")
+    config = job.config
+    key = (job.path, job.data_root, config.input.vertical_correction_deg, config.imu.use, config.gnss.mode != "off")
     sequence = _kept_sequences().get(key, _opening(job)) if is_kept else _opening(job)()
     watch = Watch(on_end=ended.append)
     # A gate of the run's own (input.strict): it is done all the same.
@@ -107,7 +107,8 @@ def _opening(job: Job) -> Callable[[], Sequence]:
     def opening() -> Sequence:
         if job.scene is not None:
             simulate_once(job.scene, job.seed, job.path.parents[2])
-        sequence = open_sequence(job.path, vertical_correction_deg=job.config.input.vertical_correction_deg)
+        correction_deg = job.config.input.vertical_correction_deg
+        sequence = open_sequence(job.path, vertical_correction_deg=correction_deg, **job.reading)
         if job.config.imu.use:
             sequence = with_imu(sequence, job.data_root)
         return sequence if job.config.gnss.mode == "off" else with_gnss(sequence, job.data_root)

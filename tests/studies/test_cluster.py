@@ -17,6 +17,7 @@ from lslam.errors import InputError, RunFailedError, UsageError
 from lslam.formats.study_csv import read_study_csv
 from lslam.studies import cluster
 from lslam.studies.cluster import connected, pack, unpack
+from lslam.studies.expanded import Place
 from lslam.studies.grid import Job
 from lslam.studies.plan import Follow
 from lslam.studies.states import State, read_state, write_state
@@ -39,14 +40,14 @@ def workers() -> Iterator[LocalCluster]:
 
 def job(tmp_path: Path) -> Job:
     """Of a recording that lies nowhere."""
-    sweep = Sweep(parse_study(TREE, "tiny", "tiny"), tmp_path / "out")
+    sweep = Sweep(parse_study(TREE, "tiny", "tiny"), Place(tmp_path / "out"))
     return replace(expand_study(sweep).jobs[0], scene=None, path=Path("/nowhere/00"))
 
 
 def test_a_worker_killed_in_the_middle_loses_nothing_and_counts_nothing_twice(
     workers: LocalCluster, tmp_path: Path
 ) -> None:
-    sweep = Sweep(parse_study(TREE, "tiny", "tiny"), tmp_path / "out")
+    sweep = Sweep(parse_study(TREE, "tiny", "tiny"), Place(tmp_path / "out"))
     victim = next(iter(workers.workers.values())).pid
     steps: list[str] = []
 
@@ -61,10 +62,10 @@ def test_a_worker_killed_in_the_middle_loses_nothing_and_counts_nothing_twice(
     assert [row.parameters["preprocess.source_voxel"] for row in rows] == [0.6, 0.7, 0.8, 0.9, 1.0, 1.1]
     assert {row.status for row in rows} == {"done"}
     assert not any(row.is_timing_comparable for row in rows), "others may share the worker's machine"
-    assert not (sweep.out / "simulated").exists(), "workers simulate by themselves"
+    assert not (sweep.place.out / "simulated").exists(), "workers simulate by themselves"
     for row in rows:
-        assert (sweep.out / row.folder / "trajectory.tum").is_file(), "run folders come home"
-    assert [repr(row) for row in read_study_csv(sweep.out / "results.csv")] == [repr(row) for row in rows]
+        assert (sweep.place.out / row.folder / "trajectory.tum").is_file(), "run folders come home"
+    assert [repr(row) for row in read_study_csv(sweep.place.out / "results.csv")] == [repr(row) for row in rows]
 
 
 def test_workers_without_the_recording_are_named(workers: LocalCluster, tmp_path: Path) -> None:
@@ -141,7 +142,7 @@ def test_a_run_that_comes_home_replaces_what_was_there(tmp_path: Path) -> None:
 
 
 def test_workers_of_this_machine_read_what_is_simulated_here(tmp_path: Path) -> None:
-    sweep = Sweep(parse_study(TREE, "tiny", "tiny"), tmp_path / "out")
+    sweep = Sweep(parse_study(TREE, "tiny", "tiny"), Place(tmp_path / "out"))
     scenes: list[str] = []
     with connected(None, "local:1", "studying") as engine:
         assert engine.at_once == 1

@@ -7,8 +7,9 @@ from pathlib import Path
 import pytest
 
 from lslam.errors import UsageError
+from lslam.studies.expanded import Expanded, Place
 from lslam.studies.study_files import find_study, study_names
-from lslam.studies.sweep import Expanded, Sweep, expand_study
+from lslam.studies.sweep import Sweep, expand_study
 
 ROOT = Path(__file__).resolve().parents[2]
 # Points of each study x (without and with the IMU), beside ones aside.
@@ -19,7 +20,7 @@ RUNS = {
 
 
 def expanded(name: str) -> Expanded:
-    return expand_study(Sweep(find_study(name), Path("out")))
+    return expand_study(Sweep(find_study(name), Place(Path("out"))))
 
 
 @pytest.mark.parametrize("name", RUNS)

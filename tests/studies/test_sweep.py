@@ -14,11 +14,12 @@ from lslam.errors import ConfigError, InputError, OutputExistsError, RunFailedEr
 from lslam.formats.study_csv import read_study_csv
 from lslam.studies.engines import Local
 from lslam.studies.estimate import estimate, used
+from lslam.studies.expanded import Expanded, Place
 from lslam.studies.plan import Follow
 from lslam.studies.results import is_comparable
 from lslam.studies.states import State
 from lslam.studies.study_files import find_study
-from lslam.studies.sweep import Expanded, Sweep, expand_study, run_sweep
+from lslam.studies.sweep import Sweep, expand_study, run_sweep
 from lslam.types.study import StudyRow
 
 TREE: dict[str, Any] = {
@@ -39,6 +40,11 @@ def study(**changes: Any) -> StudyConfig:
     return parse_study(TREE | changes, "tiny.toml", "tiny")
 
 
+def elsewhere(sweep: Sweep, out: Path, resume: bool = False, **changes: Any) -> Sweep:
+    """The same simulations in another folder, of a study with changes."""
+    return replace(sweep, study=study(**changes), place=replace(sweep.place, out=out, resume=resume))
+
+
 @pytest.fixture(scope="module")
 def scenes(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("scenes")
@@ -46,7 +52,7 @@ def scenes(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def sweep(tmp_path_factory: pytest.TempPathFactory, scenes: Path) -> Sweep:
-    return Sweep(study(), tmp_path_factory.mktemp("study") / "out", scenes=scenes)
+    return Sweep(study(), Place(tmp_path_factory.mktemp("study") / "out", scenes=scenes))
 
 
 @pytest.fixture(scope="module")
@@ -69,35 +75,35 @@ def test_every_point_is_a_row_with_its_values_and_numbers(made: list[StudyRow], 
         assert "read" not in row.stages_ms
         assert row.total_time_s == pytest.approx(row.time_per_scan_ms * row.scans / 1e3)
         assert row.total_time_s < row.run_s
-        assert (sweep.out / row.folder / "manifest.json").is_file()
-        assert not list((sweep.out / row.folder).glob("map.*"))
+        assert (sweep.place.out / row.folder / "manifest.json").is_file()
+        assert not list((sweep.place.out / row.folder).glob("map.*"))
 
 
 def test_files_hold_the_same_rows(made: list[StudyRow], sweep: Sweep) -> None:
-    assert [repr(row) for row in read_study_csv(sweep.out / "results.csv")] == [repr(row) for row in made]
-    assert (sweep.out / "results.parquet").stat().st_size > 0
-    again = find_study(str(sweep.out / "study.toml"))
+    assert [repr(row) for row in read_study_csv(sweep.place.out / "results.csv")] == [repr(row) for row in made]
+    assert (sweep.place.out / "results.parquet").stat().st_size > 0
+    again = find_study(str(sweep.place.out / "study.toml"))
     assert again == sweep.study
 
 
 def test_kept_data_and_processes_change_nothing(made: list[StudyRow], sweep: Sweep, tmp_path: Path) -> None:
     """The last of the runs, made anew in a process of its own."""
-    one = replace(sweep, out=tmp_path / "one", study=study(parameters={"input.skip_frames": [2]}, beside=[]))
+    one = elsewhere(sweep, tmp_path, parameters={"input.skip_frames": [2]}, beside=[])
     one = replace(one, settings=("preprocess.source_voxel=1.2",))
     (row,) = run_sweep(one, Local(1, is_kept=False))
     assert row.digest == made[3].digest
-    first, second = (out / r.folder / "trajectory.tum" for out, r in ((one.out, row), (sweep.out, made[3])))
+    first, second = (out / r.folder / "trajectory.tum" for out, r in ((one.place.out, row), (sweep.place.out, made[3])))
     assert first.read_bytes() == second.read_bytes()
 
 
 def test_a_study_that_grew_runs_only_what_is_new(made: list[StudyRow], sweep: Sweep, tmp_path: Path) -> None:
     out = tmp_path / "copy"
-    shutil.copytree(sweep.out, out)
+    shutil.copytree(sweep.place.out, out)
     with pytest.raises(OutputExistsError, match="--resume keeps"):
-        run_sweep(replace(sweep, out=out), Local(1))
-    grown = study(parameters={"input.skip_frames": [1, 2, 4], "preprocess.source_voxel": [0.8]})
+        run_sweep(elsewhere(sweep, out), Local(1))
+    grown = elsewhere(sweep, out, True, parameters={"input.skip_frames": [1, 2, 4], "preprocess.source_voxel": [0.8]})
     steps: list[str] = []
-    rows = run_sweep(replace(sweep, study=grown, out=out, resume=True), Local(1), Follow(on_step=steps.append))
+    rows = run_sweep(grown, Local(1), Follow(on_step=steps.append))
     assert steps == ["block icp-skip_frames_4-source_voxel_0.8 seed 3"]
     assert [row.parameters.get("input.skip_frames") for row in rows] == [1, 2, 4, None]
     assert repr(rows[0]) == repr(made[0])
@@ -105,22 +111,22 @@ def test_a_study_that_grew_runs_only_what_is_new(made: list[StudyRow], sweep: Sw
 
 def test_what_fails_is_a_row_with_its_reason(sweep: Sweep, tmp_path: Path) -> None:
     """The first scan of the second run lies beyond the recording."""
-    partly = study(parameters={"input.start": [0, 99]}, beside=[])
-    rows = run_sweep(replace(sweep, study=partly, out=tmp_path / "out"), Local(1))
+    partly = elsewhere(sweep, tmp_path / "out", parameters={"input.start": [0, 99]}, beside=[])
+    rows = run_sweep(partly, Local(1))
     assert [(row.status, row.is_diverged) for row in rows] == [("done", False), ("failed", False)]
     assert "beyond the last scan" in rows[1].reason
-    wholly = study(parameters={"input.start": [98, 99]}, beside=[])
+    wholly = elsewhere(sweep, tmp_path / "none", parameters={"input.start": [98, 99]}, beside=[])
     with pytest.raises(RunFailedError, match=r"all 2 runs failed, the first one: .*--start 98 is beyond the last scan"):
-        run_sweep(replace(sweep, study=wholly, out=tmp_path / "none"), Local(1))
+        run_sweep(wholly, Local(1))
     assert len(read_study_csv(tmp_path / "none" / "results.csv")) == 2
 
 
 def test_results_of_another_version_are_not_mixed(sweep: Sweep, made: list[StudyRow], tmp_path: Path) -> None:
-    shutil.copytree(sweep.out, tmp_path / "out")
+    shutil.copytree(sweep.place.out, Place(tmp_path / "out"))
     file = tmp_path / "out" / "results.csv"
     file.write_text(file.read_text().replace("\n1,", "\n0,"))
     with pytest.raises(InputError, match="written by another version of lslam"):
-        run_sweep(replace(sweep, out=tmp_path / "out", resume=True), Local(1))
+        run_sweep(elsewhere(sweep, tmp_path / "out", True), Local(1))
 
 
 @pytest.mark.parametrize(
@@ -139,13 +145,13 @@ def test_what_cannot_be_studied_is_said_before_anything_runs(
     changes: dict[str, Any], error: type[Exception], sentence: str, tmp_path: Path
 ) -> None:
     with pytest.raises(error, match=sentence):
-        run_sweep(Sweep(study(**changes), tmp_path / "out"), Local(1))
-    assert not (tmp_path / "out").exists()
+        run_sweep(Sweep(study(**changes), Place(tmp_path / "out")), Local(1))
+    assert not (Place(tmp_path / "out")).exists()
 
 
 def test_the_same_scenario_seen_otherwise_is_another_sequence(tmp_path: Path) -> None:
     two = study(sequences=[{"scenario": "block", "columns": n} for n in (256, 512)], imu="both", beside=[])
-    expanded: Expanded = expand_study(Sweep(two, tmp_path / "out"))
+    expanded: Expanded = expand_study(Sweep(two, Place(tmp_path / "out")))
     assert {job.sequence for job in expanded.jobs} == {"block", "block-2"}
     assert (
         len({job.folder for job in expanded.jobs})

@@ -1,0 +1,115 @@
+"""`lslam batch`: many runs, one table, one exit code."""
+
+from __future__ import annotations
+
+import sys
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from lslam.cli import options
+from lslam.cli.console import log, setup_logging, show
+from lslam.errors import GateError, LslamError, RunFailedError, UsageError
+
+if TYPE_CHECKING:
+    from lslam.studies.batch import Line
+    from lslam.studies.expanded import Expanded, Place
+    from lslam.types.study import StudyRow
+
+# What a line may not say, because the batch does.
+_OF_THE_BATCH = ("resume", "overwrite", "dry_run", "as_json")
+
+
+@click.command(
+    epilog="\b\nExamples: lslam batch JOBS.toml --out runs/tonight --resume\n"
+    "          lslam batch - --out runs/tonight < lines.txt"
+)
+@click.argument("jobs_file", metavar="JOBS.toml|-", type=click.Path(path_type=Path))
+@click.option("--dry-run", is_flag=True, help="List the runs, write nothing.")
+@options.studied
+@options.engine
+@options.data_root
+@click.option(
+    "--set", "settings", multiple=True, metavar="SECTION.KEY=VALUE", help="Set one key in all runs; repeatable."
+)
+@click.option("--strict", is_flag=True, help="Exit 4 when a run was degraded.")
+@options.verbosity
+def command(jobs_file: Path, **given: Any) -> None:
+    """Make many runs, each with its map and report, and a row of results.csv and results.parquet for each.
+
+    JOBS.toml lists sequences, methods and settings; - reads lines of `lslam run` from stdin. Exit 0: all are done; 1: some
+    failed or diverged.
+    """
+    setup_logging(given["verbose"], given["quiet"])
+    from lslam.cli.study_screen import bars
+    from lslam.studies.expanded import make_runs
+
+    place = options.place_of(given, "batch")
+    expanded = _expanded(jobs_file, place, given)
+    if given["dry_run"]:
+        show("".join(f"{job.name}  {job.folder}\n" for job in expanded.jobs))
+        return
+    with options.engine_of(given, "runs", is_kept=False) as engine, ExitStack() as stack:
+        rows = make_runs(expanded, place, engine, bars(stack))
+    _print(rows)
+    log.info("every run: %s", place.out / "results.csv")
+    _judge(rows, given["strict"])
+
+
+def _expanded(path: Path, place: Place, given: dict[str, Any]) -> Expanded:
+    from lslam.config.batch import read_batch
+    from lslam.studies.batch import expand_batch, expand_lines, run_words
+
+    if path != Path("-"):
+        return expand_batch(read_batch(path), place, given["settings"])
+    lines = [_line(number, words, given) for number, words in run_words(sys.stdin.read())]
+    if not lines:
+        raise UsageError("there is no line on stdin: write `lslam run SEQUENCE ...` on each")
+    return expand_lines(lines, place)
+
+
+def _line(number: int, words: list[str], given: dict[str, Any]) -> Line:
+    """One `lslam run`, understood as that command does; raises what it raises, naming the line."""
+    from lslam.cli.run import command as run_command
+    from lslam.cli.run import opened_with, read_truth
+    from lslam.studies.batch import Line
+
+    try:
+        said = run_command.make_context("run", list(words)).params
+        if wrong := [name for name in _OF_THE_BATCH if said[name]]:
+            raise UsageError(
+                f"--{wrong[0].removeprefix('as_').replace('_', '-')} is no option of a line: give it to lslam batch"
+            )
+        said["settings"] = (*said["settings"], *given["settings"])
+        said["data_root"] = said["data_root"] or given["data_root"]
+        sequence, config = opened_with(said)
+        return Line(
+            " ".join(words), sequence, config, read_truth(said["gt"], sequence), said["out"], options.reading_of(said)
+        )  # fmt: skip
+    except LslamError as error:
+        raise type(error)(f"line {number}: {error}") from None
+    except click.UsageError as error:
+        raise UsageError(f"line {number}: {error.format_message()}") from None
+
+
+def _print(rows: list[StudyRow]) -> None:
+    from lslam.reports.grid_text import aligned
+    from lslam.reports.study_best import batch_table
+
+    show(aligned(batch_table(rows), 3) + "\n")
+
+
+def _judge(rows: list[StudyRow], is_strict: bool) -> None:
+    """The exit code."""
+    failed = [row for row in rows if not row.is_usable]
+    if failed:
+        raise RunFailedError(
+            f"{len(failed)} of {len(rows)} runs failed, the first one, {failed[0].run}: {failed[0].reason}"
+        )
+    degraded = [row for row in rows if row.status == "degraded"]
+    if degraded and is_strict:
+        raise GateError(
+            f"--strict: {len(degraded)} of {len(rows)} runs are degraded, the first one: {degraded[0].reason}"
+        )

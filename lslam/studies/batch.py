@@ -1,0 +1,111 @@
+"""A batch: runs of many sequences and configurations, from a file of jobs or from lines of `lslam run`."""
+
+from __future__ import annotations
+
+import hashlib
+import shlex
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import tomli_w
+
+from lslam.config import Config
+from lslam.config.batch import BatchConfig
+from lslam.errors import UsageError
+from lslam.pipeline.identity import imu_digest, input_digest, job_digest
+from lslam.studies.expanded import Expanded, Place, cells_of
+from lslam.studies.grid import Job, expand, run_folder
+from lslam.studies.points import Contender, settings_of
+from lslam.studies.subjects import file_safe
+from lslam.studies.variants import WITH_IMU, Variant, find_variants
+from lslam.types.sequence import Sequence as Recording
+from lslam.types.trajectory import Trajectory
+
+MARK = "batch.toml"
+
+
+@dataclass(frozen=True)
+class Line:
+    """One `lslam run`, resolved: what it reads, how, and where it is written.
+
+    words : as they were typed; sequence : opened; reading : what else it was opened with; folder : None to choose
+    """
+
+    words: str
+    sequence: Recording
+    config: Config
+    truth: Trajectory | None = None
+    folder: Path | None = None
+    reading: dict[str, Any] = field(default_factory=dict)
+
+
+def expand_batch(batch: BatchConfig, place: Place, settings: Sequence[str] = ()) -> Expanded:
+    """All runs of a batch file; `settings` ("a.b=v") beat what it says.
+
+    Raises ConfigError, UsageError or InputError for methods, recordings and scenarios that make no sense.
+    """
+    jobs: list[Job] = []
+    found: dict[str, Contender] = {}
+    for number, entry in enumerate(batch.jobs, 1):
+        common = [*settings_of(batch.config), *settings_of(entry.config), *settings]
+        variants = []
+        for variant in find_variants(entry.methods, None, common, entry.imu):
+            method = variant.name.removesuffix(WITH_IMU)
+            # One method with two configurations is two folders.
+            name = file_safe(variant.name if variant.name not in found else f"{variant.name}-{number}")
+            variants.append(replace(variant, name=name, without=""))
+            found[name] = Contender(variants[-1], method, {})
+        cells = cells_of(entry.sequences, entry.seeds, [found[v.name] for v in variants], place)
+        jobs += expand(cells, variants, entry.seeds, place.out, place.command)
+    text = tomli_w.dumps(batch.model_dump(mode="json", exclude_none=True, exclude_defaults=True))
+    return Expanded("batch", "batch", MARK, text, jobs, found)
+
+
+def expand_lines(lines: Sequence[Line], place: Place) -> Expanded:
+    """All runs of a list of lines; those without a folder of their own are numbered in `place.out`.
+
+    Raises InputError for a recording that cannot be listed.
+    """
+    jobs: list[Job] = []
+    found: dict[str, Contender] = {}
+    for number, line in enumerate(lines, 1):
+        method = line.config.odometry.preset or line.config.odometry.method
+        name = f"{number:03d}-{file_safe(method)}{WITH_IMU if line.config.imu.use else ''}"
+        found[name] = Contender(Variant(name, line.config), method, {})
+        label = file_safe(line.sequence.name)
+        seed = line.config.preprocess.seed
+        how = hashlib.sha256(repr(sorted(line.reading.items())).encode()).hexdigest()
+        digest = job_digest(
+            line.config, input_digest(line.sequence, line.truth) + how,
+            imu_digest(line.sequence) if line.config.imu.use else "",
+        )  # fmt: skip
+        folder = run_folder(place.out, label, name, seed) if line.folder is None else line.folder
+        jobs.append(
+            Job(
+                label, name, seed, line.sequence.path, line.config, folder, digest, line.words, line.truth,
+                place.data_root, reading=line.reading,
+            )
+        )  # fmt: skip
+    text = tomli_w.dumps({"lines": [line.words for line in lines]})
+    return Expanded("batch", "batch", MARK, text, jobs, found)
+
+
+def run_words(text: str) -> list[tuple[int, list[str]]]:
+    """Number and words after `lslam run` of each line; empty lines and comments are none. Raises UsageError naming a line.
+
+    >>> run_words("# tonight\\nlslam run seq07 --imu\\n\\nseq08\\n")
+    [(2, ['seq07', '--imu']), (4, ['seq08'])]
+    """
+    found = []
+    for number, line in enumerate(text.splitlines(), 1):
+        try:
+            words = shlex.split(line, comments=True)
+        except ValueError as error:
+            raise UsageError(f"line {number}: {error}") from None
+        if words[:2] == ["lslam", "run"]:
+            words = words[2:]
+        if words:
+            found.append((number, words))
+    return found

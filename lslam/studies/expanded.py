@@ -1,0 +1,158 @@
+"""Every run of a sweep or a batch, made in order: keep what is finished, simulate, run, and write each row as it comes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import count
+from pathlib import Path
+
+from lslam.config.study import StudySequence
+from lslam.errors import InterruptedRunError, LslamError, OutputExistsError
+from lslam.formats.atomic import atomic_write
+from lslam.readers import open_sequence
+from lslam.readers.lookup import find_folder
+from lslam.studies.cells import recorded_cell, scene_cell
+from lslam.studies.engines import Engine
+from lslam.studies.grid import Cell, Job
+from lslam.studies.jobs import finished
+from lslam.studies.plan import SIMULATED, Follow, claim, release
+from lslam.studies.points import Contender
+from lslam.studies.results import Results
+from lslam.studies.scenes import Scene
+from lslam.studies.subjects import file_safe, scans_needed
+from lslam.types.study import StudyRow
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where runs go.
+
+    overwrite : run everything anew; resume : keep finished runs
+    scenes : where simulations lie, None for a folder in `out`; studies of the same scenarios can share them
+    data_root : where recordings by name and the IMU of a KITTI odometry sequence are looked for
+    """
+
+    out: Path
+    overwrite: bool = False
+    resume: bool = False
+    scenes: Path | None = None
+    data_root: Path | None = None
+    command: str = ""
+
+
+@dataclass(frozen=True)
+class Expanded:
+    """Every run, and what its variants stand for, by name.
+
+    name : of the study or batch, which `text` in the file `mark` describes; what : the word for it
+    """
+
+    name: str
+    what: str
+    mark: str
+    text: str
+    jobs: list[Job] = field(default_factory=list)
+    contenders: dict[str, Contender] = field(default_factory=dict)
+
+
+def left_to_do(place: Place, jobs: Sequence[Job]) -> list[Job]:
+    """Those that are not finished, or all unless `place.resume`."""
+    kept = finished(jobs) if place.resume else set()
+    return [job for job in jobs if job.folder not in kept]
+
+
+def make_runs(
+    expanded: Expanded,
+    place: Place,
+    engine: Engine,
+    follow: Follow | None = None,
+    on_rows: Callable[[Sequence[StudyRow]], None] = lambda rows: None,
+) -> list[StudyRow]:
+    """Make every run that is not finished yet; results.csv and results.parquet in `place.out` grow as they end.
+
+    on_rows : called with all rows so far
+
+    Raises
+    ------
+    LslamError : as `claim` and the engine; OutputExistsError : a run's own folder holds something else
+    InterruptedRunError : Ctrl-C or SIGTERM; finished runs are kept, and `resume` goes on
+    """
+    follow = follow or Follow()
+    jobs = expanded.jobs
+    results = Results(expanded.name, place.out, jobs, expanded.contenders)
+    claim(place.out, expanded.mark, expanded.what, place.overwrite, place.resume)
+    try:
+        if not place.overwrite:
+            results.check()
+        with atomic_write(place.out / expanded.mark) as stream:
+            stream.write(expanded.text.encode())
+        left = left_to_do(place, jobs)
+        begun = {job.folder for job in left}
+        _check_folders(left, place)
+        results.add([job for job in jobs if job.folder not in begun])
+        engine.prepare(left, follow)
+
+        def on_done(job: Job) -> None:
+            results.add([job])
+            on_rows(results.rows)
+
+        on_rows(results.rows)
+        engine.run(left, follow, on_done)
+    except KeyboardInterrupt:
+        raise InterruptedRunError(
+            f"interrupted; {len(finished(jobs))} of {len(jobs)} runs are finished in {place.out}: the same command with "
+            "--resume goes on"
+        ) from None
+    except LslamError:
+        release(place.out, expanded.mark)
+        raise
+    return results.rows
+
+
+def _check_folders(jobs: Sequence[Job], place: Place) -> None:
+    """Raise OutputExistsError for a run that was given a folder of its own, which no run of this place wrote."""
+    for job in jobs:
+        may_replace = place.overwrite or (place.resume and job.state_file.is_file())
+        if place.out not in job.folder.parents and job.folder.exists() and not may_replace:
+            raise OutputExistsError(
+                f"the folder {job.folder} of {job.name} exists: name another, or --overwrite replaces it"
+            )
+
+
+def cells_of(
+    sequences: Sequence[StudySequence], seeds: Sequence[int], found: Sequence[Contender], place: Place
+) -> list[Cell]:
+    """Recordings as they are, scenarios once per seed, every one with a label of its own.
+
+    Raises InputError for a recording that cannot be opened or lacks the IMU; UsageError or ConfigError for a scenario that is
+    none.
+    """
+    configs = [c.variant.config for c in found]
+    needed = scans_needed([config.input for config in configs])
+    needs_imu = any(config.imu.use for config in configs)
+    cells: list[Cell] = []
+    for sequence in sequences:
+        made = (
+            [_recorded(sequence.path, needs_imu, place)]
+            if sequence.path
+            else _simulated(sequence, needed, seeds, place)
+        )
+        # The same place with other settings is another sequence, with a folder of its own.
+        taken = {cell.sequence for cell in cells}
+        label = made[0].sequence
+        number = next(k for k in count(1) if (label if k == 1 else f"{label}-{k}") not in taken)
+        cells += made if number == 1 else [replace(cell, sequence=f"{label}-{number}") for cell in made]
+    return cells
+
+
+def _recorded(word: str, needs_imu: bool, place: Place) -> Cell:
+    path = find_folder(word, place.data_root).absolute()
+    label = file_safe(open_sequence(path).name)
+    return recorded_cell(label, path, needs_imu=needs_imu, data_root=place.data_root)
+
+
+def _simulated(s: StudySequence, needed: int | None, seeds: Sequence[int], place: Place) -> list[Cell]:
+    scans = needed if s.count is None else s.count
+    scene = Scene(s.scenario, scans, s.lidar, s.columns, s.speed, s.compensated, s.imu, s.settings)
+    return [scene_cell(scene, seed, place.scenes or place.out / SIMULATED) for seed in seeds]

@@ -1,0 +1,133 @@
+"""`lslam batch`: jobs of a file and lines of `lslam run`, with one table and an exit code for scripts."""
+
+from __future__ import annotations
+
+import subprocess
+from pathlib import Path
+
+import pytest
+from calling import COMMAND, Done, assert_one_sentence, environment, lslam, sample_copy
+
+from lslam.formats.study_csv import read_study_csv
+
+JOBS = """
+[config]
+map.write = false
+report.html = false
+
+[[jobs]]
+sequences = ["SAMPLE"]
+methods = ["icp", "kiss-icp"]
+
+[[jobs]]
+sequences = ["SAMPLE"]
+methods = ["icp"]
+config.input.start = 2
+"""
+
+
+@pytest.fixture(scope="module")
+def sample(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return sample_copy(tmp_path_factory.mktemp("sample"), 8)
+
+
+def piped(text: str, *words: object, cwd: Path | None = None) -> Done:
+    return subprocess.run(
+        [*COMMAND, "batch", "-", *map(str, words)], input=text, capture_output=True, text=True, timeout=180, check=False,
+        cwd=cwd, env=environment(),
+    )  # fmt: skip
+
+
+def test_every_job_of_a_file_is_a_run_and_a_row_and_is_kept(sample: Path, tmp_path: Path) -> None:
+    file, out = tmp_path / "jobs.toml", tmp_path / "out"
+    file.write_text(JOBS.replace("SAMPLE", str(sample)))
+    plan = lslam("batch", file, "--dry-run", "--out", out)
+    assert [line.split()[1] for line in plan.stdout.splitlines()] == ["icp", "kiss-icp", "icp-2"]
+    assert not out.exists()
+    done = lslam("batch", file, "--out", out, "--jobs", "1")
+    assert done.returncode == 0, done.stderr
+    assert [line.split()[1] for line in done.stdout.splitlines()] == ["method", "icp", "kiss-icp", "icp"]
+    rows = read_study_csv(out / "results.csv")
+    assert [(row.method, row.scans) for row in rows] == [("icp", 8), ("kiss-icp", 8), ("icp", 6)]
+    assert all((out / row.folder / "trajectory.tum").is_file() for row in rows)
+    again = lslam("batch", file, "--out", out, "--resume")
+    assert again.returncode == 0, again.stderr
+    assert again.stdout == done.stdout
+    assert [repr(row) for row in read_study_csv(out / "results.csv")] == [repr(row) for row in rows]
+
+
+def test_lines_are_understood_as_lslam_run_does_and_a_failure_is_exit_1(sample: Path, tmp_path: Path) -> None:
+    own = tmp_path / "own"
+    text = (
+        f"# tonight\nlslam run {sample} --count 5 --set map.write=false\n"
+        f"{sample} --method kiss-icp --count 4 --out {own}\nlslam run {sample} --start 8\n"
+    )
+    done = piped(text, "--out", tmp_path / "out", "--jobs", "1")
+    assert done.returncode == 1, done.stderr
+    assert "1 of 3 runs failed" in done.stderr
+    assert "--start 8 is beyond the last scan" in done.stderr
+    rows = read_study_csv(tmp_path / "out" / "results.csv")
+    assert [(row.method, row.status, row.scans) for row in rows] == [
+        ("icp", "done", 5), ("kiss-icp", "done", 4), ("icp", "failed", 0),
+    ]  # fmt: skip
+    assert (own / "map.ply").is_file()
+    assert not list((tmp_path / "out" / rows[0].folder).glob("map.*"))
+    assert rows[2].reason in done.stdout
+    twice = piped(text, "--out", tmp_path / "other")
+    assert twice.returncode == 2, "what lies in a folder of one's own is not lost"
+    assert f"the folder {own} of" in twice.stderr
+
+
+@pytest.mark.parametrize(
+    ("text", "code", "sentence"),
+    [
+        ("", 2, "there is no line on stdin"),
+        ("lslam run SAMPLE --methd icp", 2, "line 1: No such option"),
+        ("\nlslam run SAMPLE --method ipc", 2, "line 2: no method 'ipc'; did you mean 'icp'"),
+        ("lslam run nowhere", 3, "line 1: no sequence 'nowhere'"),
+        ("lslam run SAMPLE --resume --out x", 2, "line 1: --resume is no option of a line"),
+        ("lslam run SAMPLE --json", 2, "line 1: --json is no option of a line"),
+        ("lslam run 'SAMPLE", 2, "line 1: No closing quotation"),
+    ],
+)
+def test_a_wrong_line_is_named_before_anything_runs(
+    text: str, code: int, sentence: str, sample: Path, tmp_path: Path
+) -> None:
+    done = piped(text.replace("SAMPLE", str(sample)), "--out", "out", cwd=tmp_path)
+    assert done.returncode == code, done.stderr
+    assert_one_sentence(done.stderr)
+    assert sentence in done.stderr
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "code", "sentence"),
+    [
+        ("[[jobs]]", "[[job]]", 2, "unknown key 'job'; did you mean 'jobs'"),
+        ("methods =", "method =", 2, "jobs: unknown key 'method'; did you mean 'methods'"),
+        ("map.write", "map.wrote", 2, "unknown key map.wrote"),
+        ('["SAMPLE"]', "[]", 2, "jobs"),
+        ('["SAMPLE"]', '"SAMPLE"', 2, "jobs"),
+        ("methods =", "seeds = [0, 0]\nmethods =", 2, "different whole numbers"),
+    ],
+)
+def test_what_is_no_batch_is_said_in_one_sentence(
+    old: str, new: str, code: int, sentence: str, sample: Path, tmp_path: Path
+) -> None:
+    file = tmp_path / "jobs.toml"
+    file.write_text(JOBS.replace(old, new).replace("SAMPLE", str(sample)))
+    done = lslam("batch", file, "--out", tmp_path / "out")
+    assert done.returncode == code, done.stderr
+    assert_one_sentence(done.stderr)
+    assert sentence in done.stderr
+    assert not (tmp_path / "out").exists()
+
+
+def test_strict_counts_a_degraded_run_as_a_failed_gate(sample: Path, tmp_path: Path) -> None:
+    """A recording with a torn scan in it."""
+    torn = sample_copy(tmp_path, 6)
+    (torn / "velodyne" / "000003.bin").write_bytes(b"torn")
+    done = piped(f"lslam run {torn} --set map.write=false", "--out", tmp_path / "out", "--strict", "-q")
+    assert done.returncode == 4, done.stderr
+    assert_one_sentence(done.stderr)
+    assert "1 of 1 runs are degraded" in done.stderr
