@@ -252,3 +252,4 @@ def coarsen(factor: int, size: float, min_points: float, planarity: float, floor
         s[9] += m[9] + 2.0 * oz * m[3] + n * oz * oz
     for slot in range(state[USED]):
         _refresh(slot, size, moments, planes, keys, min_points, planarity, floor)
+        refreshed[slot] = moments[slot, 0]

@@ -232,6 +232,8 @@ def test_coarser_voxels_hold_the_exact_moments(factor: int) -> None:
     reference = VoxelMap(0.5 * factor, cap=1e9)
     reference.insert(points, np.eye(3), np.zeros(3))
     assert_same_voxels(coarse, reference)
+    used = coarse.keys >= 0
+    np.testing.assert_array_equal(coarse.refreshed[used], coarse.moments[used, 0])
 
 
 def test_coarsening_an_empty_map_gives_an_empty_map() -> None:

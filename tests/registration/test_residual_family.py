@@ -10,8 +10,11 @@ from analytic_scenes import corridor, distance, is_near, pose_at, random_pose, r
 from numpy.typing import NDArray
 
 from lslam.config.registration import RegistrationConfig, Residual
+from lslam.preprocessing.prepare import prepare_points
 from lslam.registration.registration import Registration
 from lslam.registration.residuals import KERNELS
+from lslam.registration.robust import Annealing
+from lslam.registration.solver import solve
 from lslam.registration.uncertainty import PoseUncertainty
 
 Floats = NDArray[np.float64]
@@ -40,6 +43,20 @@ def test_a_start_at_unknown_speed_is_found(residual: Residual) -> None:
         assert result.covariance is not None
         assert np.linalg.eigvalsh(result.covariance).min() > 0
         assert 0 < result.inliers <= result.matched <= result.source_points
+
+
+@pytest.mark.parametrize("residual", RESIDUALS)
+def test_the_coarse_map_alone_brings_a_start_near(residual: Residual) -> None:
+    """What the fine map corrects afterwards hides a residual that sees nothing in the coarse one."""
+    for seed in range(3):
+        rng = np.random.default_rng(seed + 20)
+        T = pose_at((0.8, 0.6, 0.0), 3.0)
+        registration = in_room(residual, seed)
+        points = prepare_points(seen_from(room(rng), T), registration.preprocess)
+        slow = Annealing(5.0, 0.15, 0.85, 40)
+        coarse = registration.map.coarsen(3)
+        found = solve(coarse, points, np.eye(4), slow, sigma=0.03, blob_weight=0.5, weak_share=1e-3, residual=residual)
+        assert distance(T, found.T_world_lidar)[0] < 0.1
 
 
 @pytest.mark.parametrize("residual", RESIDUALS)
