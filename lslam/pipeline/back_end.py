@@ -24,6 +24,7 @@ from lslam.keyframes.store import KeyframeStore
 from lslam.pipeline.building_pass import correct_buildings
 from lslam.pipeline.georeferencing import Placement, place
 from lslam.pipeline.graph_inputs import floor_planes, up_directions, world_up
+from lslam.pipeline.osm_joint import join_buildings, run_baseline
 from lslam.pipeline.osm_pass import Located, finish, locate
 from lslam.pipeline.osm_source import OsmSource
 from lslam.types.building_correction import CorrectedMap
@@ -130,12 +131,25 @@ def _on_buildings(
         georeference = Georeference(
             extract.origin, located.T_enu_odometry, config.gnss.crs, "osm", used=len(located.priors)
         )
-    out = _solved(_on_map(graph, located, config), candidates, results, store, config, problems, georeference)
+    held = _on_map(graph, located, config)
+    out = _solved(held, candidates, results, store, config, problems, georeference)
     if out is None or out.solution is None:
         return None
     matches = finish(located, extract, out.keyframes, out.solution, config.osm)
-    buildings = correct_buildings(matches, se2.of_se3(out.keyframes), config.osm)
-    return replace(out, osm=matches, buildings=buildings)
+    try:
+        if config.osm.matcher == "baseline":
+            joint, matches, buildings = run_baseline(held, out.solution, extract, store, config)
+        elif config.osm.mode == "non-rigid":
+            joint, buildings = join_buildings(held, out.solution, matches, config)
+        else:
+            return replace(
+                out, osm=matches, buildings=correct_buildings(matches, se2.of_se3(out.keyframes), config.osm)
+            )
+    except (GraphError, np.linalg.LinAlgError) as error:
+        problems.append(f"OSM: {error}; the run goes on with its buildings where the map has them")
+        return replace(out, osm=matches)
+    moved = corrected(results, store.keyframes, joint.poses, joint.covariances, out.solution.drift, config.graph)
+    return replace(out, results=moved, keyframes=joint.poses, osm=matches, buildings=buildings)
 
 
 def _solved(

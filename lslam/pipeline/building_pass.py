@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -38,18 +39,24 @@ def correct_buildings(matches: OsmMatches, poses: NDArray[np.float64], config: O
 
     Absent buildings follow the others, as those nobody saw do. Covariances are those against the trajectory, which is given.
     """
-    mode, belief = config.mode, map_belief(matches, config)
+    belief = map_belief(matches, config)
+    if config.mode == "rigid":
+        belief = replace(belief, sigma=TOGETHER)
+    local = agreed(matches, poses)
+    solution = solve_buildings(middles_of(matches), local, dict(enumerate(poses)), belief)
+    return place_buildings(matches, poses, local, solution, config)
+
+
+def place_buildings(
+    matches: OsmMatches, poses: Floats, local: Sequence[BuildingMatch], solution: BuildingSolution, config: OsmConfig
+) -> CorrectedMap:
+    """The map that a solution of `local` matches means: overlaps parted, what is absent and what is new."""
     place = dict(enumerate(poses))
-    local = [m for m in matches.local if m.verdict == "accepted" and m.keyframe in place]
-    middles = np.array([b.middle for b in matches.buildings]).reshape(-1, 2)
-    local = [m for m, agrees in zip(local, agreeing(middles, local, place), strict=True) if agrees]
-    if mode == "rigid":
-        belief = MapBelief(belief.shift, belief.shift_sigma, TOGETHER)
-    solution = solve_buildings(middles, local, place, belief)
+    mode = "baseline" if config.matcher == "baseline" else config.mode
     untangled = Untangled(solution.displacements, (), ())
     if mode == "prior":
         untangled = Untangled(np.zeros_like(solution.displacements), (), ())
-    elif mode != "rigid":
+    elif mode in ("non-rigid", "two-level"):
         information = np.asarray(np.linalg.inv(solution.covariances), np.float64)
         untangled = remove_overlaps(matches.buildings, solution.displacements, information)
     displacements = untangled.displacements
@@ -71,6 +78,18 @@ def correct_buildings(matches: OsmMatches, poses: NDArray[np.float64], config: O
         counts["seen"], counts["unseen"], counts["absent"], len(corrected.new_walls),
     )  # fmt: skip
     return corrected
+
+
+def middles_of(matches: OsmMatches) -> Floats:
+    """(B, 2) m, what the buildings of a run are turned about."""
+    return np.array([b.middle for b in matches.buildings]).reshape(-1, 2)
+
+
+def agreed(matches: OsmMatches, poses: Floats) -> list[BuildingMatch]:
+    """The local matches that are accepted and that others bear out, with the keyframes at `poses` (K, 3)."""
+    local = [m for m in matches.local if m.verdict == "accepted" and m.keyframe < len(poses)]
+    borne_out = agreeing(middles_of(matches), local, dict(enumerate(poses)))
+    return [m for m, is_so in zip(local, borne_out, strict=True) if is_so]
 
 
 def map_belief(matches: OsmMatches, config: OsmConfig) -> MapBelief:

@@ -29,12 +29,14 @@ NOISE = 0.1  # m
 LEAST_POINTS = 20
 LEAST_OVERLAP = 0.1  # share of the points that found a voxel
 FARTHEST = 5.0  # m from the prior; farther is no convergence
-FAR = 2.0  # m; a point without a partner counts as so far in the fitness score
+FAR = (
+    1.0  # m; points farther from their nearest one are not asked for the fitness score (the range of hdl_graph_slam's)
+)
 
 
 @dataclass(frozen=True)
 class FlatFit:
-    """A planar pose (3,) of the source in the target; rmse : m, of its points to their nearest ones, none above `FAR`."""
+    """A planar pose (3,) of the source in the target; rmse : m, of those of its points that have one within `FAR` m, to it."""
 
     pose: Floats
     rmse: float
@@ -85,8 +87,9 @@ def _align(
     pose = se2.of_se3(found.T_world_lidar)
     if not found.ok or found.overlap < LEAST_OVERLAP or np.linalg.norm(pose[:2] - prior[:2]) > FARTHEST:
         return None
-    away, _ = cKDTree(target).query(se2.apply(pose, source), distance_upper_bound=FAR)
-    return FlatFit(pose, float(np.sqrt(np.mean(np.minimum(away, FAR) ** 2))), found.overlap)
+    away = np.asarray(cKDTree(target).query(se2.apply(pose, source))[0])
+    near = away[away <= FAR]
+    return FlatFit(pose, float(np.sqrt(np.mean(near**2))), found.overlap) if len(near) else None
 
 
 def _upright(flat: Floats, heights: Sequence[float]) -> Floats:
