@@ -122,7 +122,7 @@ def test_what_fails_is_a_row_with_its_reason(sweep: Sweep, tmp_path: Path) -> No
 
 
 def test_results_of_another_version_are_not_mixed(sweep: Sweep, made: list[StudyRow], tmp_path: Path) -> None:
-    shutil.copytree(sweep.place.out, Place(tmp_path / "out"))
+    shutil.copytree(sweep.place.out, tmp_path / "out")
     file = tmp_path / "out" / "results.csv"
     file.write_text(file.read_text().replace("\n1,", "\n0,"))
     with pytest.raises(InputError, match="written by another version of lslam"):
@@ -146,7 +146,7 @@ def test_what_cannot_be_studied_is_said_before_anything_runs(
 ) -> None:
     with pytest.raises(error, match=sentence):
         run_sweep(Sweep(study(**changes), Place(tmp_path / "out")), Local(1))
-    assert not (Place(tmp_path / "out")).exists()
+    assert not (tmp_path / "out").exists()
 
 
 def test_the_same_scenario_seen_otherwise_is_another_sequence(tmp_path: Path) -> None:
