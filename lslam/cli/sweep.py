@@ -29,6 +29,10 @@ if TYPE_CHECKING:
     "--dry-run", is_flag=True, help="List and count the runs, estimate the time by a few short ones, and stop."
 )
 @options.studied
+@click.option(
+    "--report", type=click.Path(path_type=Path), metavar="DIR",
+    help="Write the report of the study in DIR anew from its results.csv, run nothing.",
+)  # fmt: skip
 @options.engine
 @click.option("--seeds", metavar="N,N,...", help="Instead of the study's.")
 @options.data_root

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import get_args
 
 import pytest
 
+from lslam.config.finding import Kind
 from lslam.errors import UsageError
 from lslam.studies.expanded import Expanded, Place
 from lslam.studies.study_files import find_study, study_names
@@ -44,6 +46,11 @@ def test_every_study_states_what_the_thesis_found() -> None:
         assert study.summary.startswith("first thesis, 5.3.")
         assert study.finding
         assert all(finding.source.startswith("first thesis") for finding in study.finding)
+
+
+def test_the_studies_have_an_example_of_every_kind_of_finding() -> None:
+    used = {finding.kind for name in study_names() for finding in find_study(name).finding}
+    assert used == set(get_args(Kind))
 
 
 def test_copies_to_start_from_are_the_same() -> None:
