@@ -31,6 +31,8 @@ UNSTATED = 5.0
 UNLEVELLED, LEVELLED = np.deg2rad(10.0), np.deg2rad(1.0)
 # A fix so many times farther away than its noise and odometry's drift allow is no measurement that a graph could weigh.
 ABSURD = 20.0
+# m; noise and multipath put no fix so far away, a lost sign does.
+ELSEWHERE = 1e5
 
 
 @dataclass(frozen=True)
@@ -52,7 +54,7 @@ class Fixes:
 
 @dataclass(frozen=True)
 class Placement:
-    """A georeference and, for the graph, the fixes as positions; `problem` says why there is none."""
+    """A georeference and, for the graph, the fixes as positions; `problem` says why there is none, or what was left out."""
 
     georeference: Georeference | None = None
     fixes: tuple[PositionFix, ...] = ()
@@ -94,7 +96,7 @@ def place(
         "GNSS: %d of %d fixes believed, %.2f m rms from the antenna horizontally, %.2f m vertically",
         georeference.used, georeference.fixes, georeference.rmse_horizontal, georeference.rmse_vertical,
     )  # fmt: skip
-    return Placement(georeference, _as_factors(fixes, found, shift, results, keyframes, arm))
+    return Placement(georeference, _as_factors(fixes, found, shift, results, keyframes, arm), _elsewhere(found))
 
 
 def _usable(
@@ -146,6 +148,17 @@ def _at_first(found: Alignment, fixes: Fixes, config: GnssConfig) -> tuple[Geore
         rmse_horizontal=float(np.sqrt((residuals[:, :2] ** 2).sum(1).mean())),
         rmse_vertical=float(np.sqrt((residuals[:, 2] ** 2).mean())),
     ), shift
+
+
+def _elsewhere(found: Alignment) -> str:
+    """Of fixes in another part of the world, or nothing."""
+    away = int((np.linalg.norm(found.residuals, axis=1) > ELSEWHERE).sum())
+    if not away:
+        return ""
+    return (
+        f"GNSS: {away} of {len(found.residuals)} fixes lie more than {ELSEWHERE / 1e3:g} km from the others and are left "
+        "out: has their latitude or longitude lost its sign?"
+    )
 
 
 def _as_factors(

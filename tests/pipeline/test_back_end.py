@@ -179,6 +179,30 @@ def test_fixes_that_are_all_bad_leave_odometry_and_its_loops() -> None:
     assert closed.georeference is None
 
 
+@pytest.mark.parametrize("mode", ["graph", "fit"])
+@pytest.mark.parametrize("axis", [0, 1])
+def test_fixes_that_lost_a_sign_are_said_and_left_out(axis: int, mode: str) -> None:
+    """A third of them in another hemisphere: the others place the run; nearly all: they are a mirror image, and none does."""
+    sequence = recording(0.5)
+    results = drifted("debug.drift_percent=0.2", "debug.drift_deg_per_100m=0.1")
+    count = len(sequence.gnss)
+    for share in (0.3, 0.9):
+        flipped = np.random.default_rng(axis).permutation(count) < round(share * count)
+        places = sequence.gnss.lat_lon_alt.copy()
+        places[flipped, axis] *= -1
+        lost = replace(sequence, gnss=replace(sequence.gnss, lat_lon_alt=places))
+        done = run_back_end(lost, results, store_of(results), config(f"gnss.mode={mode}"), [])
+        if share < 0.5:
+            assert f"{flipped.sum()} of {count} fixes lie more than 100 km from the others" in done.problems[0]
+            assert done.georeference.used <= count - flipped.sum()
+            off = (on_earth(done) - CITY[:, :3, 3])[:, :2]
+            assert np.sqrt((off**2).sum(1).mean()) < 0.5
+        else:
+            assert done.results is results
+            assert done.georeference is None
+            assert "all rejected" in done.problems[0]
+
+
 def test_a_receiver_that_jumps_is_left_out_where_it_does() -> None:
     sequence = recording(0.5)
     places = sequence.gnss.lat_lon_alt.copy()
