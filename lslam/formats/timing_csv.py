@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from lslam.errors import InputError
 
-NOT_STAGES = ("index", "scan", "stamp_ns", "stamp", "total")
+NOT_STAGES = ("index", "stamp_ns", "stamp", "total")
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,9 @@ def read_timing_rows(path: Path) -> TimingRows:
     Raises InputError naming file and line when it is missing, empty or holds no numbers.
     """
     header, values = _table(path)
-    stages = {name: values[:, k] for k, name in enumerate(header) if name not in NOT_STAGES}
+    # Others number their rows `scan`; beside an index that is LOAM's stage.
+    others = NOT_STAGES if "index" in header else (*NOT_STAGES, "scan")
+    stages = {name: values[:, k] for k, name in enumerate(header) if name not in others}
     if "total" in header:
         total = values[:, header.index("total")]
     elif stages:

@@ -27,6 +27,14 @@ def test_stages_and_limit(tmp_path: Path) -> None:
     assert timing.over_limit == 10
 
 
+def test_scan_is_a_stage_beside_an_index_and_a_number_without(tmp_path: Path) -> None:
+    (tmp_path / "timing.csv").write_text("index,scan,map,total\n0,0.25,0.5,0.75\n1,0.25,0.5,0.75\n")
+    timing = read_timing(tmp_path / "timing.csv")
+    assert {name: stage.mean for name, stage in timing.stages.items()} == {"scan": 0.25, "map": 0.5}
+    (tmp_path / "timing.csv").write_text("scan,map\n0,0.5\n1,0.5\n")
+    assert list(read_timing(tmp_path / "timing.csv").stages) == ["map"]
+
+
 def test_total_is_the_sum_when_absent(tmp_path: Path) -> None:
     (tmp_path / "timing.csv").write_text("scan,a,b\n0,1,2\n1,3,4\n")
     timing = read_timing(tmp_path / "timing.csv")
