@@ -89,7 +89,9 @@ class FeatureRegistration(Stateful):
         if result.ok and len(result.degenerate):
             # The first step's prior is no more than a guess, which the search has replaced.
             expected = T_prior if self._first is None else start
-            result = self._judge(kept_where_blind(result, expected), T_prior)
+            kept = self._judge(replace(kept_where_blind(result, expected), reason=""), T_prior)
+            # What a good result says is that less planar points stood in.
+            result = replace(kept, reason=kept.reason or result.reason)
         return result
 
     def update(self, features: Features, result: RegistrationResult) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from analytic_scenes import distance, random_pose
@@ -113,6 +115,35 @@ def test_planes_of_two_walls_leave_their_direction_open_and_the_prior_there() ->
     assert result.covariance is not None
     assert result.covariance[0, 0] > 0.5
     assert result.covariance[1, 1] < 0.01
+
+
+def test_less_planar_points_may_stand_in_and_leave_a_direction_open() -> None:
+    """Floor and long walls, hardly a feature on them: the pose across is found all the same, the prior kept along."""
+
+    def between_walls(pose: Floats, seed: int) -> Features:
+        whole = features_at(pose, seed, with_pillars=False)
+        few, all_less = whole.planes, whole.less_planes
+        flat, near = np.abs(all_less.points[:, 0]) < 5.0, np.flatnonzero(np.abs(few.points[:, 0]) < 5.0)[::20]
+        nothing = replace(whole.edges, points=NONE)
+        return replace(
+            whole, edges=nothing, less_edges=nothing, planes=replace(few, points=few.points[near]),
+            less_planes=replace(all_less, points=all_less.points[flat]),
+        )  # fmt: skip
+
+    registration = engine(None, True)
+    first = between_walls(np.eye(4), 0)
+    registration.update(first, registration.locate(first, np.eye(4), StageClock()))
+    for k in range(1, 8):
+        truth = se3.make(np.eye(3), np.array([0.2 * k, 0.03, 0.02]))
+        prior = se3.make(np.eye(3), np.array([0.2 * k, 0.0, 0.0]))
+        features = between_walls(truth, k)
+        result = registration.locate(features, prior, StageClock())
+        registration.update(features, result)
+    assert result.ok, result.reason
+    assert "less planar points stood in" in result.reason
+    assert len(result.degenerate) == 1
+    assert abs(result.T_world_lidar[0, 3] - prior[0, 3]) < 5e-3
+    assert np.abs(result.T_world_lidar[1:3, 3] - truth[1:3, 3]).max() < 0.01
 
 
 def test_what_led_astray_where_nothing_is_observed_is_taken_back_and_nothing_else() -> None:
