@@ -3,12 +3,12 @@
     lslam simulate residential --seed 0 --out /tmp/drives/residential-0
     lslam simulate residential --path poses/07.txt --out /tmp/drives/seq07
     python tests/benchmarks/osm.py /tmp/drives/*/sequences/00 [--scans 300] [--map exact,perturbed] [--drift 1.0,0.5]
-        [--modes none,prior,rigid,non-rigid,two-level,baseline]
+        [--modes none,hdl,baseline,prior,rigid,non-rigid,two-level]
 
-Every run begins at the true start, without loops, with drift injected (% of the way, deg per 100 m). ATE is the thesis' (planar,
-origin, mean and standard deviation), RPE between consecutive keyframes; buildings with the run begun at its true start:
-median distance of their middles from the truth, of those held from two sides as on the map and corrected, across the wall of
-those held from one.
+Every run begins at the true start, without loops and with drift injected (% of the way, deg per 100 m); hdl and the baseline,
+which stands on it, with `--preset hdl`, the rest with our odometry. ATE is the thesis' (planar, origin, mean and standard
+deviation), RPE between consecutive keyframes; buildings with the run begun at its true start: median distance of their middles
+from the truth, of those held from two sides as on the map and corrected, across the wall of those held from one.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 import lslam
 from lslam.config import Config
+from lslam.config.load import load_config
 from lslam.evaluation.buildings import BuildingError, building_errors
 from lslam.evaluation.thesis import planar
 from lslam.formats.buildings_geojson import read_corrected
@@ -36,7 +37,7 @@ from lslam.simulation.osm_perturb import map_errors, read_perturbation
 Floats = NDArray[np.float64]
 
 SPACING = 2.0  # m between keyframes
-MODES = ("none", "prior", "rigid", "non-rigid", "two-level", "baseline")
+MODES = ("none", "hdl", "baseline", "prior", "rigid", "non-rigid", "two-level")
 
 
 def true_poses(drive: Path) -> tuple[Floats, Floats]:
@@ -51,21 +52,18 @@ def configured(drive: Path, args: argparse.Namespace, mode: str, which: str, see
     poses, origin = true_poses(drive)
     start = geodesy.from_local(poses[:1, :3, 3], origin)[0]
     percent, deg = (float(v) for v in args.drift.split(","))
-    sections = {
-        "input": {"count": args.scans},
-        "loops": {"use": False},
-        "map": {"write": False},
-        "debug": {"drift": percent > 0, "drift_percent": percent, "drift_deg_per_100m": deg, "drift_seed": seed},
-    }
-    if mode != "none":
-        sections["osm"] = {
-            "extract": str(drive / ("map.osm" if which == "exact" else "map_perturbed.osm")),
-            "origin": tuple(start),
-            "heading_deg": float(90.0 - np.degrees(se2.of_se3(poses[0])[2])),
-            "start_radius": 2.0,
-            "start_heading_deg": 5.0,
-        } | ({"matcher": "baseline"} if mode == "baseline" else {"mode": mode})
-    return Config.model_validate(sections)
+    settings = [f"input.count={args.scans}", "loops.use=false", "map.write=false", f"debug.drift_seed={seed}",
+                f"debug.drift={str(percent > 0).lower()}", f"debug.drift_percent={percent}",
+                f"debug.drift_deg_per_100m={deg}"]  # fmt: skip
+    if mode in ("hdl", "baseline"):
+        settings += ["odometry.preset=hdl", "loops.use=false"]
+    if mode not in ("none", "hdl"):
+        extract = drive / ("map.osm" if which == "exact" else "map_perturbed.osm")
+        heading = 90.0 - np.degrees(se2.of_se3(poses[0])[2])
+        settings += [f"osm.extract={extract}", f"osm.origin={start.tolist()}", f"osm.heading_deg={heading}",
+                     "osm.start_radius=2.0", "osm.start_heading_deg=5.0"]  # fmt: skip
+        settings.append("osm.matcher=baseline" if mode == "baseline" else f"osm.mode={mode}")
+    return load_config(settings=settings)
 
 
 def buildings_of(folder: Path, drive: Path, which: str, found: Floats) -> list[BuildingError]:
@@ -120,7 +118,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as scratch:
         for seed, drive in enumerate(args.drives):
             for mode in args.modes.split(","):
-                for which in args.map.split(",") if mode != "none" else ["-"]:
+                for which in args.map.split(",") if mode not in ("none", "hdl") else ["-"]:
                     name = f"{drive.parent.parent.name}, {which}, {mode}"
                     folder = (args.keep or Path(scratch)) / name.replace(", ", "_")
                     config = configured(drive, args, mode, which, seed)

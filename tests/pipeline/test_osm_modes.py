@@ -1,0 +1,120 @@
+"""Whole runs held by a wrong map, mode by mode: what they write, what reads back, and where the buildings end."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+import lslam
+from lslam.config.load import load_config
+from lslam.evaluation.buildings import BuildingError, building_errors
+from lslam.formats.buildings_geojson import read_corrected
+from lslam.formats.osm_buildings import buildings_of, read_buildings
+from lslam.formats.osm_files import read_osm
+from lslam.formats.trajectory_files import read_trajectory
+from lslam.geometry import geodesy, se2
+from lslam.simulation.osm_perturb import map_errors, read_perturbation
+from lslam.types.building_correction import CorrectedMap
+
+Floats = NDArray[np.float64]
+
+DRIVE = Path(__file__).parents[2] / "sample_data" / "sequences" / "00"
+
+
+def true_poses() -> tuple[Floats, Floats]:
+    world = tomllib.loads((DRIVE / "truth" / "world.toml").read_text())
+    poses = np.array(world["T_enu_world"]) @ read_trajectory(DRIVE / "truth" / "trajectory.tum").poses
+    return poses, np.array(world["origin_lat_lon_alt"])
+
+
+def run(folder: Path, *more: str, scans: int = 45) -> Path:
+    poses, origin = true_poses()
+    start = geodesy.from_local(poses[:1, :3, 3], origin)[0].tolist()
+    settings = [
+        f"input.count={scans}", "loops.use=false", "map.write=false", f"osm.extract={DRIVE / 'map_perturbed.osm'}",
+        f"osm.origin={start}", f"osm.heading_deg={90 - np.degrees(se2.of_se3(poses[0])[2])}", *more,
+    ]  # fmt: skip
+    lslam.run(str(DRIVE), load_config(settings=settings), out=folder)
+    return folder
+
+
+def errors(folder: Path, corrected: CorrectedMap) -> list[BuildingError]:
+    poses, origin = true_poses()
+    record = read_perturbation(DRIVE / "truth" / "map_perturbation.json")
+    truth = map_errors(read_buildings(DRIVE / "map.osm", origin).buildings, record)
+    first = read_trajectory(folder / "trajectory.tum").poses[:1, :3, 3]
+    at = geodesy.to_local(geodesy.from_local(first, corrected.origin), origin)[0]
+    return [e for e in building_errors(corrected, truth, origin, (poses[0, :3, 3] - at)[:2]) if e.status == "seen"]
+
+
+@pytest.fixture(scope="module")
+def two_level(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return run(tmp_path_factory.mktemp("osm") / "two-level")
+
+
+def test_buildings_end_nearer_to_where_they_stand(two_level: Path) -> None:
+    found = errors(two_level, read_corrected(two_level / "buildings.geojson"))
+    assert len(found) >= 5
+    held = [e for e in found if e.sides == 2]
+    assert np.median([e.before for e in held]) > 1.0
+    assert np.median([e.after for e in held]) < 0.5
+    assert np.median([e.across for e in found]) < 0.3
+
+
+def test_the_change_file_holds_the_corrected_outlines(two_level: Path) -> None:
+    corrected = read_corrected(two_level / "buildings.geojson")
+    edited = read_osm(two_level / "buildings.osm")
+    assert edited.modified
+    assert {w for w in edited.ways if w < 0} <= set(read_osm(DRIVE / "map_perturbed.osm").ways)
+    outlines = {b.osm_id: b for b in buildings_of(edited, corrected.origin).buildings}
+    assert set(outlines) == {c.building.osm_id for c in corrected.buildings}
+    for c in corrected.buildings:
+        for one, other in zip(outlines[c.building.osm_id].footprints, c.corrected.footprints, strict=True):
+            # Neighbours may share a corner that they want some centimetres apart.
+            assert np.linalg.norm(one.outer - other.outer, axis=1).max() < 0.07
+
+
+def test_the_report_has_the_building_pages(two_level: Path) -> None:
+    page = (two_level / "report.html").read_text(encoding="utf-8")
+    for words in ("Buildings before and after", "Where the map held the trajectory", "Displacement of buildings",
+                  "Matches of walls"):  # fmt: skip
+        assert words in page
+
+
+def test_the_same_run_writes_the_same_bytes(two_level: Path, tmp_path: Path) -> None:
+    again = run(tmp_path / "again")
+    for name in ("buildings.geojson", "buildings.osm", "osm_matches.csv", "trajectory.tum"):
+        assert (again / name).read_bytes() == (two_level / name).read_bytes(), name
+
+
+@pytest.mark.parametrize("mode", ["prior", "rigid", "non-rigid"])
+def test_every_mode_moves_what_it_may(mode: str, tmp_path: Path) -> None:
+    folder = run(tmp_path / "run", f"osm.mode={mode}", scans=30)
+    corrected = read_corrected(folder / "buildings.geojson")
+    moves = np.array([c.displacement for c in corrected.buildings])
+    assert corrected.mode == mode
+    if mode == "prior":
+        assert not moves.any()
+    elif mode == "rigid":
+        np.testing.assert_allclose(moves[:, :2], np.tile(corrected.shift, (len(moves), 1)), atol=0.02)
+    else:
+        assert np.median([e.across for e in errors(folder, corrected)]) < 0.4
+        assert np.ptp(moves[:, 0]) > 0.2
+
+
+def test_the_baseline_runs_whole(tmp_path: Path) -> None:
+    folder = run(tmp_path / "run", "osm.matcher=baseline", "odometry.preset=hdl", "loops.use=false", scans=30)
+    corrected = read_corrected(folder / "buildings.geojson")
+    assert corrected.mode == "baseline"
+    seen = [c for c in corrected.buildings if c.status == "seen"]
+    assert len(seen) >= 3
+    first = min(seen, key=lambda c: float(np.linalg.norm(c.displacement)))
+    assert np.abs(first.displacement).max() < 0.001
+    poses, _ = true_poses()
+    found = read_trajectory(folder / "trajectory.tum").poses
+    length = np.linalg.norm(found[-1, :2, 3] - found[0, :2, 3])
+    assert length == pytest.approx(np.linalg.norm(poses[29, :2, 3] - poses[0, :2, 3]), abs=1.5)
