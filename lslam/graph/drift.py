@@ -22,8 +22,6 @@ Floats = NDArray[np.float64]
 
 # Loops that are looked at, evenly spread, and the factors between which the drift's variance is looked for.
 MOST, SMALLEST, LARGEST = 300, 1e-8, 1e8
-# m; of a height that nothing says, and what all walls about one place are off by together.
-ANY_HEIGHT, MAP_ERROR = 1e4, 0.25
 
 
 def drift_covariance(way: float, config: GraphConfig) -> Floats:
@@ -44,26 +42,26 @@ def with_drift(odometry: Sequence[Constraint], factor: float, config: GraphConfi
 
 def drift_factor(graph: PoseGraph, loops: Sequence[Constraint], config: GraphConfig) -> float:
     """The factor on `drift_covariance`, 0 where none is needed, with which median loop and fix are where they should be."""
-    graph = replace(graph, fixes=[*graph.fixes, *_as_fixes(graph)])
-    if not loops and len(graph.fixes) < 2:
+    on_map = _as_fixes(graph)
+    if not loops and max(len(graph.fixes), len(on_map)) < 2:
         return 0.0
     known = _accumulated(graph.poses, graph.odometry)
     drift = _accumulated(
         graph.poses, [replace(c, covariance=drift_covariance(_length(c), config)) for c in graph.odometry]
     )
     by_loops = _of_loops(graph, loops, known, drift) if loops else 0.0
-    return max(by_loops, _of_fixes(graph, known, drift))
+    by_fixes, by_map = (_of_fixes(graph.poses, *what, known, drift) for what in ((graph.fixes, 3), (on_map, 2)))
+    return max(by_loops, by_fixes, by_map)
 
 
 def _as_fixes(graph: PoseGraph) -> list[PositionFix]:
-    """Planar priors that fix both coordinates, as positions of unknown height."""
+    """Planar priors that fix both coordinates, as positions; their height is not known and means nothing."""
     found = []
     for prior in graph.map_priors:
         if prior.rank == 3:
-            sigma = np.sqrt(np.diag(np.linalg.inv(prior.information)) + MAP_ERROR**2)
-            height = graph.poses[prior.keyframe, 2, 3]
-            place = np.array([*prior.pose[:2], height])
-            found.append(PositionFix(prior.keyframe, place, np.array([*sigma[:2], ANY_HEIGHT]), np.zeros(3)))
+            sigma = np.sqrt(np.diag(np.linalg.inv(prior.information)) + graph.map_sigma**2)
+            place, spread = np.array([*prior.pose[:2], 0.0]), np.array([*sigma[:2], np.inf])
+            found.append(PositionFix(prior.keyframe, place, spread, np.zeros(3)))
     return found
 
 
@@ -97,20 +95,20 @@ def _of_loops(graph: PoseGraph, loops: Sequence[Constraint], known: Floats, drif
     return _fitting(error, own + np.stack([c.covariance for c in few]), grown)
 
 
-def _of_fixes(graph: PoseGraph, known: Floats, drift: Floats) -> float:
-    """By pairs of fixes, half the fixes apart: how the way between them differs from odometry's."""
-    half = len(graph.fixes) // 2
+def _of_fixes(poses: Floats, fixes: Sequence[PositionFix], dim: int, known: Floats, drift: Floats) -> float:
+    """By pairs of fixes, half the fixes apart: how the way between them differs from odometry's, along `dim` axes."""
+    half = len(fixes) // 2
     if not half:
         return 0.0
-    first = np.unique(np.linspace(0, len(graph.fixes) - half - 1, MOST).round().astype(int))
-    k = np.array([f.keyframe for f in graph.fixes])
-    arms = np.stack([f.arm for f in graph.fixes])
-    antenna = np.einsum("fij,fj->fi", graph.poses[k, :3, :3], arms) + graph.poses[k, :3, 3]
-    off = np.stack([f.position for f in graph.fixes]) - antenna
-    own = np.stack([f.sigma for f in graph.fixes]) ** 2
+    first = np.unique(np.linspace(0, len(fixes) - half - 1, MOST).round().astype(int))
+    k = np.array([f.keyframe for f in fixes])
+    arms = np.stack([f.arm for f in fixes])
+    antenna = np.einsum("fij,fj->fi", poses[k, :3, :3], arms) + poses[k, :3, 3]
+    off = (np.stack([f.position for f in fixes]) - antenna)[:, :dim]
+    own = np.stack([f.sigma for f in fixes])[:, :dim] ** 2
     a, b = k[first], k[first + half]
-    noise_of_pair = (own[first] + own[first + half])[:, :, None] * np.eye(3)
-    moved, grown = (_between(chain, graph.poses, a, b)[:, :3, :3] for chain in (known, drift))
+    noise_of_pair = (own[first] + own[first + half])[:, :, None] * np.eye(dim)
+    moved, grown = (_between(chain, poses, a, b)[:, :dim, :dim] for chain in (known, drift))
     return _fitting(off[first + half] - off[first], moved + noise_of_pair, grown)
 
 

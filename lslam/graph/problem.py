@@ -68,7 +68,8 @@ class PoseGraph:
     poses : (K, 4, 4) where they are now
     distances : (K,) m travelled up to each, for what odometry may have drifted
     world_up : (3,) unit, up in the world of `poses`, needed where there are `ups`
-    map_priors : planar priors in the frame of a map that is off as a whole by `shift_sigma` m
+    map_priors : planar priors in the frame of a map that is off as a whole by `shift_sigma` m, and one sigma by `map_sigma` m
+        about each place
     is_anchored : whether the first pose is held where it is; else the fixes hold the graph
     start_sigma : (3,) x, y (m), yaw (rad), how well these are known of a first pose that is held only otherwise
     """
@@ -84,6 +85,7 @@ class PoseGraph:
     world_up: Floats = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
     map_priors: Sequence[PlanarPrior] = ()
     shift_sigma: float = 0.0
+    map_sigma: float = 0.0
     is_anchored: bool = True
     start_sigma: Floats | None = None
 

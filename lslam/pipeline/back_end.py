@@ -240,6 +240,7 @@ def _on_map(graph: PoseGraph, located: Located, config: Config) -> PoseGraph:
         poses=graph.poses if graph.fixes else located.T_enu_odometry @ graph.poses,
         map_priors=located.priors,
         shift_sigma=config.osm.shift_sigma,
+        map_sigma=config.osm.map_sigma,
         world_up=np.array([0.0, 0.0, 1.0]),
         start_sigma=None if graph.fixes else located.start_sigma,
     )
