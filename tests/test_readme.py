@@ -60,7 +60,7 @@ def test_commands_of_the_readme_exist_with_their_options(call: list[str]) -> Non
 def test_flags_the_readme_mentions_exist() -> None:
     from lslam.cli.main import COMMANDS, cli
 
-    known = {"--help", "--version"}
+    known = {"--help", "--version", "--nworkers", "--nthreads"}  # the last two of `dask worker`
     for name in COMMANDS:
         command = cli.get_command(click.Context(cli), name)
         assert command is not None

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import platform
+import shutil
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -13,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from lslam.errors import GateError, InterruptedRunError, LslamError, RunFailedError
+from lslam.pipeline.run_folder import KEYFRAMES
 from lslam.studies.grid import Job
 from lslam.studies.states import State, write_state
 
@@ -26,7 +28,7 @@ class Bench:
     """What the reader of the times must know.
 
     at_once : runs that share the machine; load : of the machine before them; is_alone : whether no other run shares its core
-    is_kept : whether the process goes on with other runs of the same data, which it then keeps
+    is_kept : whether the process goes on with other runs of the same data, which it then keeps; keyframes are not
     """
 
     at_once: int = 1
@@ -63,6 +65,8 @@ def execute(job: Job, bench: Bench) -> None:
         reason = f"lslam made a mistake ({type(error).__name__}: {error})"
     finally:
         seconds = time.monotonic() - began
+        if bench.is_kept:  # one of hundreds: nothing asks for its clouds again
+            shutil.rmtree(job.folder / KEYFRAMES, ignore_errors=True)
         state = State(
             job.digest, status, reason, bench.at_once, bench.load, round(seconds, 3), bench.is_alone,
             round((_waited_s() - waited) / max(seconds, 1e-9), 4), platform.node(),

@@ -76,7 +76,7 @@ def test_every_point_is_a_row_with_its_values_and_numbers(made: list[StudyRow], 
         assert row.total_time_s == pytest.approx(row.time_per_scan_ms * row.scans / 1e3)
         assert row.total_time_s < row.run_s
         assert (sweep.place.out / row.folder / "manifest.json").is_file()
-        assert not list((sweep.place.out / row.folder).glob("map.*"))
+        assert not [*(sweep.place.out / row.folder).glob("map.*"), *(sweep.place.out / row.folder).glob("keyframes")]
 
 
 def test_files_hold_the_same_rows(made: list[StudyRow], sweep: Sweep) -> None:
