@@ -32,7 +32,7 @@ class Finding(Section):
     elbow_at v : below v the error rises; good_from v : from v on it does not
     matters_little r : the largest `of` is less than r times the smallest
     linear, inverse, product [r2] : total time is a x + b, a / x, a y / x with at least this R2 (0.95)
-    acts_only_on : of all stages the parameter changes the time of `stages` only
+    acts_only_on : of all stages of registration the parameter changes the time of `stages` only
     """
 
     text: str = Field(min_length=1, description="the finding in one sentence")

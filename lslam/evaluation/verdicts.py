@@ -7,13 +7,14 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 
 from lslam.config.finding import Finding
+from lslam.evaluation.curves import NOT_REGISTRATION
 from lslam.evaluation.landmarks import elbow, optimum
 from lslam.evaluation.laws import FEWEST, fit_law
 from lslam.types.sensitivity import CurveResult, Floats, Law, LawKind, Optimum, Outcome, Verdict
 
 R2 = 0.95
 OWN_SHARE = 0.8  # of the change of all stages, for a parameter that acts on one of them
-LEAST_CHANGE = 0.1  # of the time per scan: below it nothing was acted on
+LEAST_CHANGE = 0.1  # of registration's time: below it nothing was acted on
 UNITS = {"translation": "m", "angular": "deg", "time_per_scan": "ms", "total_time": "s"}
 _OF_TIME = ("time_per_scan", "total_time")
 _LAWS: tuple[LawKind, ...] = ("linear", "inverse", "product")
@@ -160,14 +161,17 @@ def _law(finding: Finding, result: CurveResult, law: Law | None) -> Judged:
 
 
 def _acts_only_on(finding: Finding, result: CurveResult) -> Judged:
-    """Confirmed when the named stages make up at least 80 % of the change, stage by stage, of the time per scan."""
-    change = {name: float(np.ptp(m.mean[m.n > 0])) if m.n.any() else 0.0 for name, m in result.stage_means.items()}
-    if missing := [name for name in finding.stages if name not in change]:
-        return "undecided", f"no stage {', '.join(missing)} was timed"
-    whole, own = sum(change.values()), sum(change[name] for name in finding.stages)
-    level = sum(float(np.mean(m.mean[m.n > 0])) for m in result.stage_means.values() if m.n.any())
+    """Confirmed when the named stages make up at least 80 % of the change, stage by stage, of registration."""
+    timed = {
+        name: m.mean[m.n > 0] for name, m in result.stage_means.items() if m.n.any() and name not in NOT_REGISTRATION
+    }
+    change = {name: float(np.ptp(means)) for name, means in timed.items()}
+    if not any(name in change for name in finding.stages):
+        return "undecided", f"no stage {', '.join(finding.stages)} was timed"
+    whole, own = sum(change.values()), sum(change.get(name, 0.0) for name in finding.stages)
+    level = sum(float(means.mean()) for means in timed.values())
     if not level or whole < LEAST_CHANGE * level:
-        return "undecided", f"the time per scan changes by {whole:.2g} of {level:.3g} ms only"
+        return "undecided", f"registration changes by {whole:.2g} of {level:.3g} ms only"
     said = ", ".join(f"{name} by {ms:.3g}" for name, ms in sorted(change.items(), key=lambda item: -item[1])[:3])
     outcome: Outcome = "confirmed" if own >= OWN_SHARE * whole else "refuted"
     return outcome, f"{' and '.join(finding.stages)}: {100 * own / whole:.0f} % of the change ({said} ms)"

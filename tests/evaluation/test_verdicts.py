@@ -138,9 +138,10 @@ def test_product_law() -> None:
 
 
 def test_stage_that_a_parameter_acts_on() -> None:
-    on_scan = rows_of(GRID, "loam.grid_step", stages=lambda v: {"scan": 50 / v, "map": 20.0})
+    on_scan = rows_of(GRID, "loam.grid_step", stages=lambda v: {"scan": 50 / v, "map": 20.0, "keyframe": 90 / v})
     on_both = rows_of(GRID, "loam.grid_step", stages=lambda v: {"scan": 50 / v, "map": 50 / v})
     assert outcome(on_scan, "acts_only_on", stages=["scan"]) == "confirmed"
+    assert outcome(on_scan, "acts_only_on", stages=["scan", "recover"]) == "confirmed"
     assert outcome(on_scan, "acts_only_on", stages=["map"]) == "refuted"
     assert outcome(on_both, "acts_only_on", stages=["scan"]) == "refuted"
     assert outcome(rows_of(GRID, "loam.grid_step"), "acts_only_on", stages=["register"]) == "undecided"
