@@ -37,6 +37,9 @@ class OsmConfig(Section):
         description="walls laid on walls; baseline: NDT and VGICP of flattened scans, buildings and trajectory in one graph, as "
         "in the second thesis, section 2.5 (the mode is not asked)",
     )
+    trust_poses: bool = Field(
+        True, description="with --poses: they are laid on the map as a whole and not bent; false: held like odometry"
+    )
     shift_sigma: float = Field(2.0, ge=0, description="m; one sigma by which a map may be off as a whole; 0 holds it")
     map_sigma: float = Field(0.5, gt=0, description="m; one sigma by which a neighbourhood of the map is off by itself")
     map_sigma_deg: float = Field(1.0, gt=0, description="deg; likewise of its heading")

@@ -72,6 +72,7 @@ class PoseGraph:
         about each place
     is_anchored : whether the first pose is held where it is; else the fixes hold the graph
     start_sigma : (3,) x, y (m), yaw (rad), how well these are known of a first pose that is held only otherwise
+    is_rigid : odometry is trusted: the whole moves, and nothing bends it
     """
 
     poses: Floats
@@ -88,6 +89,7 @@ class PoseGraph:
     map_sigma: float = 0.0
     is_anchored: bool = True
     start_sigma: Floats | None = None
+    is_rigid: bool = False
 
     def __len__(self) -> int:
         return len(self.poses)

@@ -243,6 +243,7 @@ def _on_map(graph: PoseGraph, located: Located, config: Config) -> PoseGraph:
         map_sigma=config.osm.map_sigma,
         world_up=np.array([0.0, 0.0, 1.0]),
         start_sigma=None if graph.fixes else located.start_sigma,
+        is_rigid=config.osm.trust_poses and config.odometry.method == "poses",
     )
 
 

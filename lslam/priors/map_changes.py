@@ -29,7 +29,7 @@ WIDE = 3.0  # m of wall that must be seen through a building
 DEPTH = 0.5  # m that a ray must pass inside an outline at least
 ONE_LINE = 0.5  # m; walls seen so near one line are one
 ONE_WAY = np.sin(np.radians(10.0))
-LONG = 4.0  # m; a shorter wall is a hedge, a van, a sign
+LONG = 6.0  # m; a shorter wall is a hedge, a van, a sign
 
 
 @dataclass(frozen=True)

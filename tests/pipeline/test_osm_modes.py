@@ -16,7 +16,7 @@ from lslam.formats.buildings_geojson import read_corrected
 from lslam.formats.osm_buildings import buildings_of, read_buildings
 from lslam.formats.osm_files import read_osm
 from lslam.formats.trajectory_files import read_trajectory
-from lslam.geometry import geodesy, se2
+from lslam.geometry import geodesy, se2, se3
 from lslam.simulation.osm_perturb import map_errors, read_perturbation
 from lslam.types.building_correction import CorrectedMap
 
@@ -104,6 +104,19 @@ def test_every_mode_moves_what_it_may(mode: str, tmp_path: Path) -> None:
     else:
         assert np.median([e.across for e in errors(folder, corrected)]) < 0.4
         assert np.ptp(moves[:, 0]) > 0.2
+
+
+@pytest.mark.parametrize("is_trusted", [True, False])
+def test_poses_that_are_trusted_are_not_bent(is_trusted: bool, tmp_path: Path) -> None:
+    given = DRIVE / "truth" / "trajectory.tum"
+    trust = f"osm.trust_poses={str(is_trusted).lower()}"
+    folder = run(tmp_path / "run", "odometry.method=poses", f"odometry.poses={given}", trust, scans=30)
+    real, found = read_trajectory(given).poses[:30], read_trajectory(folder / "trajectory.tum").poses
+    bent = se3.relative(se3.relative(real[:1], real), se3.relative(found[:1], found))
+    away = np.linalg.norm(bent[:, :3, 3], axis=1).max()
+    assert (away < 0.005) == is_trusted
+    corrected = read_corrected(folder / "buildings.geojson")
+    assert np.median([e.across for e in errors(folder, corrected)]) < 0.3
 
 
 def test_the_baseline_runs_whole(tmp_path: Path) -> None:
