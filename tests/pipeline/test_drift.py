@@ -30,6 +30,19 @@ def test_seeds_differ_and_repeat() -> None:
     assert np.linalg.norm(ends[0] - ends[2]) > 0.1
 
 
+def test_drift_that_forgets_is_a_random_walk() -> None:
+    """Its variance grows with the way, 2 L W (1 - L / W) times the squared rate for a memory L that is short beside W."""
+    memory, way = 5.0, 200.0
+    settings = [
+        DebugConfig(drift_memory=memory, drift_deg_per_100m=0, drift_percent=1.0, drift_seed=seed) for seed in range(60)
+    ]
+    ends = np.stack([with_drift(RESULTS[::4], config)[-1].T_world_lidar[:3, 3] for config in settings])
+    spread = np.sqrt(((ends - [way, 0, 0]) ** 2).sum(1).mean())
+    assert spread == pytest.approx(0.01 * np.sqrt(2 * memory * way * (1 - memory / way)), rel=0.15)
+    assert "anew after some 5 m" in describe(settings[0])
+    assert "steadily" in describe(DebugConfig())
+
+
 def test_keyframes_follow_their_scans() -> None:
     keyframes = [Keyframe(0, 0, 0, LINE[0]), Keyframe(1, 300, 0, LINE[300], distance=150.0)]
     drifted = with_drift(RESULTS, DebugConfig())
