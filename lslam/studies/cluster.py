@@ -41,7 +41,8 @@ def connected(scheduler: str | None, local: str | None, title: str) -> Iterator[
         from distributed import Client, LocalCluster
     except ImportError:
         raise UsageError("--scheduler and --cluster need Dask: pip install 'lslam[cluster]'") from None
-    logging.getLogger("distributed").setLevel(logging.ERROR)
+    for name in ("distributed", "distributed.client"):  # what goes wrong is said in one sentence, not in its tracebacks
+        logging.getLogger(name).setLevel(logging.CRITICAL)
     if local is not None:
         count = _count(local)
         env = {"NUMBA_NUM_THREADS": "1"}

@@ -8,6 +8,7 @@ import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 from distributed import LocalCluster
@@ -16,7 +17,7 @@ from lslam.config.study import parse_study
 from lslam.errors import InputError, RunFailedError, UsageError
 from lslam.formats.study_csv import read_study_csv
 from lslam.studies import cluster
-from lslam.studies.cluster import connected, pack, unpack
+from lslam.studies.cluster import Cluster, connected, pack, unpack
 from lslam.studies.expanded import Place
 from lslam.studies.grid import Job
 from lslam.studies.plan import Follow
@@ -125,6 +126,48 @@ def test_without_dask_the_way_to_it_is_said(monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(UsageError, match=r"pip install 'lslam\[cluster\]'"), connected("tcp://127.0.0.1:9", None, ""):
         pass
+
+
+class Gone:
+    """A client whose runs end as they are told to, and as many futures."""
+
+    def __init__(self, status: str, *errors: Exception | None) -> None:
+        self.status, self.errors = status, list(errors)
+
+    def scheduler_info(self, n_workers: int) -> dict[str, Any]:
+        return {"workers": {}}
+
+    def submit(self, work: object, *words: object, **more: object) -> Gone:
+        return Gone(self.status, self.errors.pop(0))
+
+    def exception(self) -> Exception | None:
+        return self.errors[0]
+
+    def cancelled(self) -> bool:
+        return self.status == "connecting"
+
+    def release(self) -> None:
+        """Nothing is held."""
+
+    def cancel(self, futures: list[Gone], force: bool) -> None:
+        """Likewise."""
+
+
+def test_a_scheduler_that_goes_away_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("distributed.as_completed", iter)
+    engine = Cluster(Gone("connecting", None), "tcp://there:1", "studying")
+    with pytest.raises(RunFailedError, match=r"tcp://there:1 went away after 0 of 1 runs: start it, and .*--resume"):
+        engine.run([job(tmp_path)], Follow(), lambda job: None)
+
+
+def test_a_run_whose_workers_all_died_is_a_row_with_its_reason(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("distributed.as_completed", iter)
+    engine = Cluster(Gone("running", MemoryError("three workers died")), "tcp://there:1", "studying")
+    run, done = job(tmp_path), []
+    engine.run([run], Follow(), done.append)
+    state = read_state(run.state_file)
+    assert state is not None
+    assert (state.status, state.reason, done) == ("crashed", "its worker failed: three workers died", [run])
 
 
 def test_a_run_that_comes_home_replaces_what_was_there(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from lslam.config.study import StudyConfig, parse_study
-from lslam.errors import ConfigError, InputError, OutputExistsError, RunFailedError, UsageError
+from lslam.errors import ConfigError, InputError, InterruptedRunError, OutputExistsError, RunFailedError, UsageError
 from lslam.formats.study_csv import read_study_csv
 from lslam.studies.engines import Local
 from lslam.studies.estimate import estimate, used
@@ -119,6 +119,17 @@ def test_what_fails_is_a_row_with_its_reason(sweep: Sweep, tmp_path: Path) -> No
     with pytest.raises(RunFailedError, match=r"all 2 runs failed, the first one: .*--start 98 is beyond the last scan"):
         run_sweep(wholly, Local(1))
     assert len(read_study_csv(tmp_path / "none" / "results.csv")) == 2
+
+
+def test_an_interruption_says_how_to_go_on(made: list[StudyRow], sweep: Sweep, tmp_path: Path) -> None:
+    class Interrupted(Local):
+        def run(self, jobs: object, follow: object, on_done: object) -> None:
+            raise KeyboardInterrupt
+
+    shutil.copytree(sweep.place.out, tmp_path / "out")
+    grown = elsewhere(sweep, tmp_path / "out", True, seeds=[3, 4])
+    with pytest.raises(InterruptedRunError, match=r"interrupted; 5 of 10 runs are finished in .*--resume goes on"):
+        run_sweep(grown, Interrupted(1))
 
 
 def test_results_of_another_version_are_not_mixed(sweep: Sweep, made: list[StudyRow], tmp_path: Path) -> None:
