@@ -125,9 +125,9 @@ def _start(store: KeyframeStore, poses: Floats, osm: OsmMap, config: Config, pla
 def _both_ways(
     store: KeyframeStore, poses: Floats, osm: OsmMap, track: OsmTrack, config: Config
 ) -> list[KeyframeMatch]:
-    """Forward from the first keyframe; then back from the first that was accepted."""
+    """Forward from the first keyframe; then back from the first that was accepted and that fixes everything."""
     found = _along(range(len(store)), store, poses, osm, track, config)
-    numbers = [m.keyframe for m in found if m.verdict == "accepted"]
+    numbers = [m.keyframe for m in found if m.verdict == "accepted" and m.rank == 3]
     if numbers and numbers[0] > 0:
         first = found[numbers[0]]
         back = copy.deepcopy(track)

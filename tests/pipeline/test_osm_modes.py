@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tomllib
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 import lslam
+from lslam.config import Config
 from lslam.config.load import load_config
 from lslam.evaluation.buildings import BuildingError, building_errors
 from lslam.formats.buildings_geojson import read_corrected
@@ -17,8 +19,11 @@ from lslam.formats.osm_buildings import buildings_of, read_buildings
 from lslam.formats.osm_files import read_osm
 from lslam.formats.trajectory_files import read_trajectory
 from lslam.geometry import geodesy, se2, se3
+from lslam.pipeline import osm_pass
+from lslam.priors.osm_track import OsmTrack
 from lslam.simulation.osm_perturb import map_errors, read_perturbation
 from lslam.types.building_correction import CorrectedMap
+from lslam.types.building_match import KeyframeMatch
 
 Floats = NDArray[np.float64]
 
@@ -104,6 +109,25 @@ def test_every_mode_moves_what_it_may(mode: str, tmp_path: Path) -> None:
     else:
         assert np.median([e.across for e in errors(folder, corrected)]) < 0.4
         assert np.ptp(moves[:, 0]) > 0.2
+
+
+def test_the_way_back_begins_where_walls_fix_everything(monkeypatch: pytest.MonkeyPatch) -> None:
+    def sight(number: int, rank: int) -> KeyframeMatch:
+        information = np.diag([9.0, 0.0 if rank < 3 else 9.0, 100.0])
+        return KeyframeMatch(number, np.zeros((0, 2, 2)), np.zeros((1, 2)), np.zeros(3), np.ones(3), np.zeros(3), information,
+                             rank, "edges" if rank == 3 else "lines", verdict="accepted" if rank else "rejected")  # fmt: skip
+
+    asked: list[list[int]] = []
+
+    def along(numbers: Iterable[int], *_: object) -> list[KeyframeMatch]:
+        asked.append(list(numbers))
+        return [sight(k, [0, 2, 0, 3][k]) for k in asked[-1]]
+
+    monkeypatch.setattr(osm_pass, "_along", along)
+    track = OsmTrack(np.zeros(3), np.ones(3), 1.0, 1e-4, np.ones(3))
+    found = osm_pass._both_ways([0] * 4, np.zeros((4, 4, 4)), None, track, Config())  # type: ignore[arg-type]
+    assert asked == [[0, 1, 2, 3], [3, 2, 1, 0]]
+    assert [m.keyframe for m in found] == [0, 1, 2, 3]
 
 
 @pytest.mark.parametrize("is_trusted", [True, False])
