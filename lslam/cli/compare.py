@@ -49,7 +49,9 @@ if TYPE_CHECKING:
     metavar="DIR",
     help="Folder of the comparison [default: runs/compare-TIME].",
 )
-@click.option("--resume", is_flag=True, help="Keep finished runs of the same input and configuration, run the others.")
+@click.option(
+    "--resume", is_flag=True, help="Keep finished runs of the same input and configuration, go on with the others."
+)
 @click.option("--overwrite", is_flag=True, help="Run everything anew in an existing folder.")
 @click.option(
     "--jobs", type=int, default=1, show_default=True, metavar="N", help="Runs at once; with several, times mean little."

@@ -110,7 +110,7 @@ def studied(function: F) -> F:
         function = click.option(name, type=click.Path(path_type=Path), metavar=metavar, help=text)(function)
     for name, text in (
         ("--overwrite", "Run everything anew in an existing folder."),
-        ("--resume", "Keep finished runs of the same input and configuration, run the others."),
+        ("--resume", "Keep finished runs of the same input and configuration, go on with the others."),
     ):
         function = click.option(name, is_flag=True, help=text)(function)
     return function

@@ -93,6 +93,7 @@ def command(sequence: str, **given: Any) -> None:
             run(
                 opened, config, out=out, ground_truth=truth, overwrite=given["overwrite"], resume=given["resume"],
                 command=shlex.join(["lslam", *sys.argv[1:]]),
+                reading={name: text for name, text in options.reading_of(given).items() if text is not None},
                 watch=_watch(stack, stop, lambda outcome: _print_result(outcome, out, given["as_json"])),
             )  # fmt: skip
     except RunFinishedError as finished:

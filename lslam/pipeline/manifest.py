@@ -27,6 +27,7 @@ class Manifest:
 
     outcome : done, degraded (a scan was bridged or skipped, or input was dropped, replaced or refused), diverged or
         interrupted
+    reading : what else than its path the sequence was opened with: topics, extrinsics
     deskew : what becomes of the motion within a scan, `describe_deskew`
     world : where the coordinates begin and whether z is up
     imu : what became of the IMU, empty without `--imu`; keyframes : how many and how large
@@ -39,6 +40,7 @@ class Manifest:
         self.command, self.sequence, self.config = command, sequence, config
         self.deskew = self.world = "not decided yet"
         self.started = datetime.now(UTC)
+        self.reading: dict[str, str] = {}
         self.timings: dict[str, float] = {}
         self.problems: list[str] = []
         self.counts: dict[str, int] = {}
@@ -111,6 +113,7 @@ class Manifest:
                 "name": s.name,
                 "path": str(s.path),
                 "format": s.kind,
+                **({"reading": self.reading} if self.reading else {}),
                 "scans": len(s),
                 "rate_hz": s.rate_hz,
                 "motion_compensated": s.motion_compensated,

@@ -56,6 +56,12 @@ class EarlierRun:
         return str(self.manifest.get("sequence", {}).get("path", ""))
 
     @property
+    def topics(self) -> dict[str, str]:
+        """Which topics of a bag were asked for; extrinsics are of no use to a map."""
+        reading = self.manifest.get("sequence", {}).get("reading", {})
+        return {name: str(text) for name, text in reading.items() if name.endswith("_topic")}
+
+    @property
     def world(self) -> str:
         """Where its coordinates begin and whether z is up, in words."""
         return str(self.manifest.get("frames", {}).get("world", "LiDAR at the first scan"))
@@ -95,7 +101,9 @@ def read_run(folder: Path, settings: Iterable[str] = ()) -> EarlierRun:
 
 
 def open_scans(run: EarlierRun, sequence: Path | None = None, **reading: Any) -> Sequence:
-    """The scans the run worked on; `sequence` names them where they have moved, `reading` goes to `open_sequence`.
+    """The scans the run worked on; `sequence` names them where they have moved.
+
+    reading : goes to `open_sequence`, over the topics that the run was told
 
     Raises InputError naming the path when the raw scans are gone, or are others than those of the run.
     """
@@ -105,7 +113,9 @@ def open_scans(run: EarlierRun, sequence: Path | None = None, **reading: Any) ->
             f"the raw scans of {run.folder} are gone: {path} does not exist; say where they are with --sequence"
         )
     section = run.config.input
-    opened = open_sequence(path, vertical_correction_deg=section.vertical_correction_deg, **reading)
+    known = run.topics if sequence is None else {}
+    given = {name: value for name, value in reading.items() if value is not None}
+    opened = open_sequence(path, vertical_correction_deg=section.vertical_correction_deg, **(known | given))
     chosen = select(opened, section.start, section.count, section.skip_frames)
     count = len(run.trajectory)
     if len(chosen) < count or np.any(np.abs(chosen.stamps_ns[:count] - run.trajectory.stamps_ns) > 1000):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -52,6 +53,7 @@ def run(
     overwrite: bool = False,
     resume: bool = False,
     command: str = "",
+    reading: Mapping[str, str] | None = None,
     watch: Watch | None = None,
 ) -> RunOutcome:
     """Estimate the trajectory of a sequence, build its map, score it when truth is known, and write the run folder.
@@ -61,6 +63,7 @@ def run(
     sequence : an open sequence, or what `open_sequence` takes
     out : the run folder; None writes nothing and builds no map
     ground_truth : replaces the sequence's own
+    reading : what `open_sequence` was told beside the path (topics, extrinsics), for the manifest: `lslam map` needs it
     overwrite : replace an earlier run in `out`; resume : go on where it was killed or interrupted, if there is one
 
     Raises
@@ -74,6 +77,7 @@ def run(
     if isinstance(sequence, (str, Path)):
         sequence = open_sequence(sequence)
     job = _prepare(sequence, config, ground_truth, command, watch)
+    job.manifest.reading = dict(reading or {})
     if out is None:
         record, _, evaluation = _solve(job, KeyframeStore())
     else:

@@ -40,7 +40,9 @@ def collect_run(job: Job, is_reused: bool = False) -> RunScore:
 def _filled(score: RunScore, state: State) -> RunScore:
     manifest = _read_json(score.folder / "manifest.json")
     timing = read_timing(score.folder / "timing.csv")
-    values = {key: float(n) for key, n in manifest["counts"].items()} | _times(timing) | {"run_s": state.seconds}
+    values = {key: float(n) for key, n in manifest["counts"].items()} | _times(timing)
+    if "resumed_after_scans" not in manifest:  # otherwise they are of the last attempt only
+        values["run_s"] = state.seconds
     if manifest["peak_memory_mb"] is not None:
         values["memory"] = float(manifest["peak_memory_mb"])
     if "imu" in manifest:

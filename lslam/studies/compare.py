@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
+from dataclasses import replace
 
 from lslam.errors import InterruptedRunError, LslamError
 from lslam.evaluation.relative import parse_delta
@@ -41,7 +42,7 @@ def compare(plan: Plan, follow: Follow | None = None) -> Comparison:
     try:
         jobs = expand(_cells(plan, follow), plan.variants, plan.seeds, plan.out, plan.command)
         kept = set() if plan.overwrite else finished(jobs)
-        left = [job for job in jobs if job.folder not in kept]
+        left = [replace(job, goes_on=plan.resume) for job in jobs if job.folder not in kept]
         run_jobs(left, crew_of(plan.jobs, len(left)), follow)
     except KeyboardInterrupt:
         raise InterruptedRunError(

@@ -28,7 +28,7 @@ from lslam.types.study import StudyRow
 class Place:
     """Where runs go.
 
-    overwrite : run everything anew; resume : keep finished runs
+    overwrite : run everything anew; resume : keep finished runs, go on with the others
     scenes : where simulations lie, None for a folder in `out`; studies of the same scenarios can share them
     data_root : where recordings by name and the IMU of a KITTI odometry sequence are looked for
     """
@@ -59,7 +59,7 @@ class Expanded:
 def left_to_do(place: Place, jobs: Sequence[Job]) -> list[Job]:
     """Those that are not finished, or all unless `place.resume`."""
     kept = finished(jobs) if place.resume else set()
-    return [job for job in jobs if job.folder not in kept]
+    return [replace(job, goes_on=place.resume) for job in jobs if job.folder not in kept]
 
 
 def make_runs(

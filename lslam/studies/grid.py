@@ -42,6 +42,7 @@ class Job:
 
     method : the variant's name, the method of `config` or a preset that says more than a method
     digest : two jobs of one digest have the same result; scene : as of the cell; reading : what else `open_sequence` is given
+    goes_on : where a run was begun and not finished, it is gone on with
     """
 
     sequence: str
@@ -56,6 +57,7 @@ class Job:
     data_root: Path | None = None
     scene: Scene | None = None
     reading: dict[str, Any] = field(default_factory=dict)
+    goes_on: bool = False
 
     @property
     def name(self) -> str:

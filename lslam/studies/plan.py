@@ -30,7 +30,8 @@ class Plan:
     """What is to be compared.
 
     truth : replaces the ground truth of the only sequence; jobs : runs at once, with more than one times cannot be compared
-    crop : (x, y, size) of the map crop, m, None to choose; overwrite : run everything anew; resume : keep finished runs
+    crop : (x, y, size) of the map crop, m, None to choose; overwrite : run everything anew; resume : keep finished runs, go
+        on with the others
     data_root : where the IMU of a KITTI odometry sequence is looked for
     """
 

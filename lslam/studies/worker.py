@@ -13,7 +13,14 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from lslam.errors import GateError, InterruptedRunError, LslamError, RunFailedError
+from lslam.errors import (
+    GateError,
+    InterruptedRunError,
+    LslamError,
+    OutputExistsError,
+    RunFailedError,
+    RunFinishedError,
+)
 from lslam.pipeline.run_folder import KEYFRAMES
 from lslam.studies.grid import Job
 from lslam.studies.states import State, write_state
@@ -38,7 +45,7 @@ class Bench:
 
 
 def execute(job: Job, bench: Bench) -> None:
-    """Run the job into its folder, replacing what is there, and leave its state behind.
+    """Run the job into its folder, replacing what is there unless it goes on with that, and leave its state behind.
 
     Raises nothing of the run's; KeyboardInterrupt after the state is written, so that the process ends.
     """
@@ -93,12 +100,21 @@ def _run(job: Job, is_kept: bool) -> tuple[str, str]:
     key = (job.path, job.data_root, config.input.vertical_correction_deg, config.imu.use, config.gnss.mode != "off")
     sequence = _kept_sequences().get(key, _opening(job)) if is_kept else _opening(job)()
     watch = Watch(on_end=ended.append)
-    # A gate of the run's own (input.strict): it is done all the same.
-    with contextlib.suppress(GateError):
-        run(
-            sequence, job.config, out=job.folder, ground_truth=job.truth, overwrite=True, command=job.command,
-            watch=watch,
-        )  # fmt: skip
+
+    def make(goes_on: bool) -> None:
+        # A gate of the run's own (input.strict): it is done all the same.
+        with contextlib.suppress(GateError):
+            run(
+                sequence, job.config, out=job.folder, ground_truth=job.truth, overwrite=True, resume=goes_on,
+                command=job.command, watch=watch,
+                reading={name: str(value) for name, value in job.reading.items() if value is not None},
+            )  # fmt: skip
+
+    # What lies there may be another run, or a finished one that left no state: it is replaced.
+    with contextlib.suppress(OutputExistsError, RunFinishedError):
+        make(job.goes_on)
+    if not ended:
+        make(False)
     manifest = ended[-1].record.manifest
     return str(manifest["status"]), "; ".join(manifest["problems"])
 

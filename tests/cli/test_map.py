@@ -9,13 +9,16 @@ from pathlib import Path
 import laspy
 import numpy as np
 import pytest
-from calling import assert_one_sentence, lslam, sample_copy, strict_json
+from calling import SAMPLE, assert_one_sentence, lslam, sample_copy, strict_json
 
 from lslam.cli.main import cli
 from lslam.errors import InputError, LslamError
+from lslam.formats import bag_messages
+from lslam.formats.bag_files import BagWriter
 from lslam.formats.cloud_files import read_cloud
 from lslam.geometry.geodesy import from_local
 from lslam.pipeline.map_files import georeference_note
+from lslam.readers import open_sequence
 from lslam.types.georeference import Georeference
 
 COUNT = 10
@@ -68,6 +71,25 @@ def test_a_bridged_scan_stays_out(run: Path, tmp_path: Path) -> None:
     done = lslam("map", run, "--out", tmp_path / "one.ply", "--json", "-q")
     assert strict_json(done.stdout)["scans"] == 1
     assert len(read_cloud(tmp_path / "one.ply")) < 0.7 * len(read_cloud(run / "map.ply"))
+
+
+def test_the_scans_of_a_bag_are_found_by_the_topic_of_the_run(tmp_path: Path) -> None:
+    sequence = open_sequence(SAMPLE)
+    with BagWriter(tmp_path / "two.bag", "bag") as writer:
+        for topic, scans in (("/front", (0, 1, 2, 3)), ("/rear", (40, 41))):
+            for scan in map(sequence.scan, scans):
+                writer.write(topic, scan.stamp_ns, bag_messages.cloud(writer.store, scan, "lidar"))
+    run, out = tmp_path / "run", tmp_path / "again.ply"
+    done = lslam("run", tmp_path / "two.bag", "--lidar-topic", "/front", "--out", run, "-q")
+    assert done.returncode == 0, done.stderr
+    assert json.loads((run / "manifest.json").read_text())["sequence"]["reading"] == {"lidar_topic": "/front"}
+    done = lslam("map", run, "--out", out, "--json")
+    assert done.returncode == 0, done.stderr
+    assert strict_json(done.stdout)["points"] == len(read_cloud(run / "map.ply"))
+    other = lslam("map", run, "--out", out, "--overwrite", "--lidar-topic", "/rear")
+    assert other.returncode == 3
+    assert_one_sentence(other.stderr)
+    assert "does not fit" in other.stderr
 
 
 def test_a_georeferenced_run_lies_at_its_place(run: Path) -> None:

@@ -14,9 +14,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lslam.errors import InputError, OutputExistsError, UsageError
+import lslam
+from lslam.errors import InputError, InterruptedRunError, OutputExistsError, UsageError
 from lslam.evaluation.evaluate import evaluate
 from lslam.formats.trajectory_files import read_trajectory
+from lslam.pipeline.watch import Watch
 from lslam.readers import open_sequence
 from lslam.simulation.record import record
 from lslam.simulation.scenarios import simulate
@@ -136,6 +138,27 @@ def test_resume_runs_only_what_is_missing_or_changed(made: Comparison, plan: Pla
     assert one(again, "good", "icp").values["ate.se3"] == one(made, "good", "icp").values["ate.se3"]
     anew = replace(two, variants=plan.variants[:1], subjects=plan.subjects[:1], overwrite=True, resume=False)
     assert not compare(anew).runs[0].is_reused
+
+
+def test_resume_goes_on_with_a_run_that_was_begun(made: Comparison, plan: Plan, tmp_path: Path) -> None:
+    out, path = tmp_path / "copy", plan.subjects[0].path
+    shutil.copytree(plan.out, out)
+    folder = out / "runs" / "good" / "icp-s0"
+    shutil.rmtree(folder)
+    (out / "runs" / "good" / "icp-s0.json").unlink()
+    assert path is not None
+    done: list[None] = []
+    stop_at_7 = Watch(on_step=lambda: done.append(None), should_stop=lambda: len(done) >= 7)
+    with pytest.raises(InterruptedRunError):
+        lslam.run(open_sequence(path), plan.variants[0].config, out=folder, watch=stop_at_7)
+    one_subject = replace(plan, out=out, subjects=plan.subjects[:1])
+    again = one(compare(replace(one_subject, resume=True)), "good", "icp")
+    assert json.loads((folder / "manifest.json").read_text())["resumed_after_scans"] == [7]
+    assert again.values["ate.se3"] == one(made, "good", "icp").values["ate.se3"]
+    assert "run_s" in one(made, "good", "icp").values
+    assert "run_s" not in again.values, "the seconds of its second half are not those of a run"
+    compare(replace(one_subject, overwrite=True))
+    assert "resumed_after_scans" not in json.loads((folder / "manifest.json").read_text())
 
 
 def test_with_and_without_the_imu_are_runs_and_pairs_of_their_own(
