@@ -146,7 +146,7 @@ class Registration(Stateful):
         slow = Annealing(2 * START_STEP, c.kernel_min, c.coarse_decay, c.start_iterations)
         tried = [
             solve(coarse_map, few, T_prior @ se3.make(np.eye(3), offset), slow, sigma=c.sigma, blob_weight=c.blob_weight,
-                  weak_share=c.weak_share, residual=self.residual)
+                  weak_share=c.weak_share)
             for offset in start_offsets(c.start_reach, START_STEP)
         ]  # fmt: skip
         tried.sort(key=lambda found: -first.share(seen, found.T_world_lidar))
@@ -161,6 +161,8 @@ class Registration(Stateful):
     def _coarse_to_fine(self, points: PreparedPoints, T_prior: NDArray[np.float64]) -> RegistrationResult:
         """Coarse planes, annealed slowly, catch what fine voxels lose: metres per scan instead of decimetres.
 
+        Planes whatever the residual: all others also hold a point to where the rings of earlier scans lie, and on flat
+        ground these agree with any speed that the map was once made with.
         Few scans of a sparse sensor put single rings into fine voxels, which are no planes yet: the points there keep
         their coarse plane, the others take a fine one.
         """
@@ -169,7 +171,7 @@ class Registration(Stateful):
         slow = Annealing(c.coarse_kernel, c.kernel_min, c.coarse_decay, c.start_iterations)
         coarse = solve(
             coarse_map, points, T_prior, slow,
-            sigma=c.sigma, blob_weight=c.blob_weight, weak_share=c.weak_share, residual=self.residual,
+            sigma=c.sigma, blob_weight=c.blob_weight, weak_share=c.weak_share,
         )  # fmt: skip
         start = coarse.T_world_lidar if coarse.ok else T_prior
         fine = self._refine(points, start, c.kernel_max, c.start_iterations, coarse_map)
@@ -186,7 +188,7 @@ class Registration(Stateful):
             coarse_map = self.map.coarsen(factor)
             found = solve(
                 coarse_map, points, T_prior, once,
-                sigma=c.sigma, blob_weight=c.blob_weight, weak_share=c.weak_share, residual=self.residual,
+                sigma=c.sigma, blob_weight=c.blob_weight, weak_share=c.weak_share,
             )  # fmt: skip
             if found.overlap >= c.start_overlap:
                 break

@@ -10,12 +10,14 @@ from analytic_scenes import corridor, distance, is_near, pose_at, random_pose, r
 from numpy.typing import NDArray
 
 from lslam.config.registration import RegistrationConfig, Residual
+from lslam.geometry import se3
 from lslam.preprocessing.prepare import prepare_points
 from lslam.registration.registration import Registration
 from lslam.registration.residuals import KERNELS
 from lslam.registration.robust import Annealing
 from lslam.registration.solver import solve
 from lslam.registration.uncertainty import PoseUncertainty
+from lslam.simulation.scenarios import simulate
 
 Floats = NDArray[np.float64]
 RESIDUALS: list[Residual] = list(KERNELS)  # type: ignore[arg-type]
@@ -74,6 +76,19 @@ def test_a_drive_through_the_room_is_followed(residual: Residual, target: str) -
     assert away < slack * ROOM[residual][0]
     assert turned < slack * ROOM[residual][1]
     assert not is_near(np.eye(4), T, 1.0, 10.0)
+
+
+@pytest.mark.parametrize("residual", ["point", "vgicp"])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_rings_on_flat_ground_do_not_teach_a_false_speed(residual: Residual, seed: int) -> None:
+    """3 m per scan on a motorway: what the first steps are short of would be kept at every later one."""
+    drive = simulate("motorway", seed=seed, count=10, motion_compensated=True)
+    registration = Registration(RegistrationConfig(residual=residual))
+    found = [registration.register(drive.scan(i).points).T_world_lidar for i in range(len(drive))]
+    truth = drive.ground_truth.poses
+    last = distance(se3.relative(truth[-4], truth[-1]), se3.relative(found[-4], found[-1]))[0]
+    assert last < 0.2
+    assert distance(se3.relative(truth[0], truth[-1]), found[-1])[0] < 0.8
 
 
 @pytest.mark.parametrize("residual", RESIDUALS)
