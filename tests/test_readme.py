@@ -85,10 +85,23 @@ def test_configuration_keys_of_the_readme_exist() -> None:
 def test_sequence_toml_of_the_readme_is_understood(tmp_path: Path) -> None:
     from lslam.formats.sequence_toml import read_sequence_toml
 
-    (text,) = [text for kind, text in BLOCKS if kind == "toml"]
+    (text,) = [text for kind, text in BLOCKS if kind == "toml" and "[parameters]" not in text]
     (tmp_path / "sequence.toml").write_text(text)
     info = read_sequence_toml(tmp_path / "sequence.toml")
     assert (info.rows, info.cols, info.ground_truth_frame) == (64, 1024, "lidar")
+
+
+def test_study_of_the_readme_is_understood_and_says_what_was_printed() -> None:
+    import tomllib
+
+    from lslam.config.study import parse_study
+
+    (text,) = [text for kind, text in BLOCKS if kind == "toml" and "[parameters]" in text]
+    study = parse_study(tomllib.loads(text), "README", "shares")
+    assert len(study.points()) == 8
+    (shown,) = [text for kind, text in BLOCKS if kind == "text" and "best at" in text]
+    assert all(finding.text in shown for finding in study.finding)
+    assert {f"{study.methods[0]}+imu", f"{study.beside[0]}+imu"} <= set(shown.split())
 
 
 def test_python_of_the_readme_runs(tmp_path: Path) -> None:
