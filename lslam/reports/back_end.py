@@ -47,6 +47,13 @@ def back_end_rows(record: RunRecord, evaluation: Evaluation | None) -> list[tupl
             f"{len(record.osm.accepted)} of {len(record.osm.keyframes)} keyframes held by {len(record.osm.buildings)} buildings, "
             f"which lie {east:+.2f} m east and {north:+.2f} m north of the run",
         ))  # fmt: skip
+    if record.buildings is not None:
+        found = record.buildings
+        moves = [float(np.linalg.norm(c.displacement[:2])) for c in found.buildings if c.status == "seen"]
+        gone = sum(c.status == "absent" for c in found.buildings)
+        said = f"{len(moves)} seen" + (f", moved by {np.median(moves):.2f} m (median)" if moves else "")
+        new = f"{counted(len(found.new_walls), 'wall')} without a building"
+        rows.append(("buildings", f"{said}; {gone} absent; {new}; {counted(len(found.left), 'overlap')} left"))
     return rows
 
 

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.reports.back_end import back_end_rows
 from lslam.reports.buildings import MOST_ROWS, building_figures, building_tables
 from lslam.types.building import Building, Footprint
 from lslam.types.building_correction import BuildingCorrection, CorrectedMap
 from lslam.types.building_match import BuildingMatch, KeyframeMatch, OsmMatches
+from lslam.types.run_record import RunRecord
 
 Floats = NDArray[np.float64]
 
@@ -103,3 +106,12 @@ def test_an_empty_map_draws_the_way() -> None:
     moves, verdicts = building_tables(found, nothing)
     assert moves.rows == verdicts.rows == ()
     assert matches.accepted
+
+
+def test_the_summary_counts_buildings(make_record: Callable[..., RunRecord]) -> None:
+    found, _, _ = scene()
+    rows = dict(back_end_rows(make_record(10, buildings=found), None))
+    assert rows["buildings"] == "2 seen, moved by 0.21 m (median); 1 absent; 1 wall without a building; 1 overlap left"
+    nothing = CorrectedMap(np.zeros(3), (), "prior")
+    rows = dict(back_end_rows(make_record(10, buildings=nothing), None))
+    assert rows["buildings"] == "0 seen; 0 absent; 0 walls without a building; 0 overlaps left"
