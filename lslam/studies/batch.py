@@ -84,7 +84,7 @@ def expand_lines(lines: Sequence[Line], place: Place) -> Expanded:
         folder = run_folder(place.out, label, name, seed) if line.folder is None else line.folder
         jobs.append(
             Job(
-                label, name, seed, line.sequence.path, line.config, folder, digest, line.words, line.truth,
+                label, name, seed, line.sequence.path.absolute(), line.config, folder, digest, line.words, line.truth,
                 place.data_root, reading=line.reading,
             )
         )  # fmt: skip
