@@ -27,6 +27,7 @@ from lslam.pipeline.front_end import has_point_times
 from lslam.pipeline.georeferencing import require_gnss
 from lslam.pipeline.given_poses import bind
 from lslam.pipeline.inertial_start import with_imu_settings
+from lslam.pipeline.loop_view import view_loop
 from lslam.pipeline.manifest import Manifest, describe_deskew
 from lslam.pipeline.map_checkpoints import map_checkpoints
 from lslam.pipeline.map_pass import build_map
@@ -142,6 +143,7 @@ def _solve(
     )
     done = optimise_poses(job.sequence, record, store, job.config, job.manifest, job.osm)
     level_world(record, job.sequence, job.config, job.manifest)
+    record.loop_view = view_loop(record, store)
     return record, done, _score(record, job.sequence, job.config)
 
 

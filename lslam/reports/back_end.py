@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.geometry import se3
+from lslam.reports.loop_view import loop_figures
 from lslam.reports.metrics import counted, metres
 from lslam.reports.plane import Track, plane_chart
 from lslam.reports.plots import Figure, first_available
@@ -58,7 +59,7 @@ def back_end_rows(record: RunRecord, evaluation: Evaluation | None) -> list[tupl
 
 
 def back_end_figures(record: RunRecord, evaluation: Evaluation | None) -> list[Figure]:
-    """The plan before and after the pose graph, with loops and uncertainty; nothing where the graph moved nothing."""
+    """Plan, with loops and uncertainty, and map at a loop before and after the pose graph; nothing where that moved nothing."""
     odometry = record.odometry
     if odometry is None or odometry is record.trajectory:
         return []
@@ -85,7 +86,8 @@ def back_end_figures(record: RunRecord, evaluation: Evaluation | None) -> list[F
     if ellipses:
         legend.append(("s4", f"{SIGMAS:g} sigma, drawn {factor:g} times as large"))
     chart = plane_chart(tracks, "before and after the pose graph", width=720, tallest=760)
-    return [Figure("Before and after the pose graph", chart, tuple(legend), caption, wide=True)]
+    whole = Figure("Before and after the pose graph", chart, tuple(legend), caption, wide=True)
+    return [whole, *loop_figures(record.loop_view)]
 
 
 def _before_and_after(after: Evaluation, before: Evaluation) -> str:

@@ -72,7 +72,7 @@ def execute(job: Job, bench: Bench) -> None:
         reason = f"lslam made a mistake ({type(error).__name__}: {error})"
     finally:
         seconds = time.monotonic() - began
-        if bench.is_kept:  # one of hundreds: nothing asks for its clouds again
+        if bench.is_kept and status != "interrupted":  # one of hundreds: nothing asks for its clouds again
             shutil.rmtree(job.folder / KEYFRAMES, ignore_errors=True)
         state = State(
             job.digest, status, reason, bench.at_once, bench.load, round(seconds, 3), bench.is_alone,

@@ -13,6 +13,7 @@ from lslam.types.building_correction import CorrectedMap
 from lslam.types.building_match import OsmMatches
 from lslam.types.constraint import LoopCandidate, Turn
 from lslam.types.georeference import Georeference
+from lslam.types.loop_view import LoopView
 from lslam.types.map_score import Crispness
 from lslam.types.scan_result import ScanResult
 from lslam.types.trajectory import Trajectory
@@ -32,6 +33,7 @@ class RunRecord:
     osm : what walls seen and buildings of a map had to do with each other, None without a map that could be used; buildings :
         of that map, where they really stand
     loops : candidates with verdicts, between keyframes; keyframe_scans : (K,) position of each one's scan in `results`
+    loop_view : the map at the loop that was corrected most, None without one
     """
 
     name: str
@@ -53,5 +55,6 @@ class RunRecord:
     loops: list[LoopCandidate] = field(default_factory=list)
     keyframe_scans: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
     georeference: Georeference | None = None
+    loop_view: LoopView | None = None
     osm: OsmMatches | None = None
     buildings: CorrectedMap | None = None

@@ -1,0 +1,45 @@
+"""The map at the loop that was corrected most, by odometry's poses and by the final ones: what closing it was good for."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.geometry import se3
+from lslam.keyframes.store import KeyframeStore
+from lslam.types.constraint import LoopCandidate
+from lslam.types.loop_view import LoopView, Place
+from lslam.types.run_record import RunRecord
+
+Floats = NDArray[np.float64]
+
+# Keyframes before and after each end of the loop whose clouds are shown.
+AROUND = 10
+
+
+def view_loop(record: RunRecord, store: KeyframeStore) -> LoopView | None:
+    """The view; None where no loop was closed, or the pose graph moved nothing."""
+    closed = [c for c in record.loops if c.verdict == "accepted"]
+    if record.odometry is None or record.odometry is record.trajectory or not closed:
+        return None
+    scans = record.keyframe_scans
+    before, after = record.T_final_odometry @ record.odometry.poses[scans], record.trajectory.poses[scans]
+
+    def correction(loop: LoopCandidate) -> float:
+        was, now = (se3.relative(poses[loop.a], poses[loop.b])[:3, 3] for poses in (before, after))
+        return float(np.linalg.norm(now - was))
+
+    loop = max(closed, key=correction)
+    return LoopView(
+        int(scans[loop.a]),
+        int(scans[loop.b]),
+        correction(loop),
+        _place(before, loop, store),
+        _place(after, loop, store),
+    )
+
+
+def _place(poses: Floats, loop: LoopCandidate, store: KeyframeStore) -> Place:
+    older, newer = (range(max(end - AROUND, 0), min(end + AROUND + 1, len(store))) for end in (loop.a, loop.b))
+    points = np.concatenate([se3.apply(poses[k], store.points(k)) for k in sorted({*older, *newer})])
+    return Place(points, poses[list(older), :2, 3], poses[list(newer), :2, 3], poses[loop.a, :2, 3])
