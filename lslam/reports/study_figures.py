@@ -70,11 +70,6 @@ def _errors(figure: Any, result: StudyResult, shown: Sequence[CurveResult]) -> b
     left, right = figure.subplots(1, 2)
     _quantity(left, result, shown, "translation", "rmse of translation, m", lambda row: row.thesis_rmse)
     _quantity(right, result, shown, "angular", "rmse of rotation, deg", lambda row: row.angular_rmse_deg)
-    for plot, name in ((left, "translation"), (right, "angular")):
-        values = np.concatenate([r.means[name].mean for r in shown])
-        values = values[np.isfinite(values)]
-        if len(values) and values.min() > 0 and values.max() > _LOG_RATIO * values.min():
-            plot.set_yscale("log")
     _legend(figure, left)
     return any(r.means["translation"].n.any() for r in shown)
 
@@ -145,17 +140,22 @@ def _quantity(
             rows_of_crosses += 1
             above = {"transform": plot.get_xaxis_transform(), "clip_on": False}
             plot.plot(lost, np.full(len(lost), height), "x", ms=4, color=look["color"], **above)
-        half = np.nan_to_num(means.high - means.mean)
+        half = means.high - means.mean
         # Below zero there is nothing, and a logarithmic axis could not draw it.
-        below = np.minimum(half, 0.999 * np.nan_to_num(means.mean))
+        below = np.minimum(half, 0.999 * means.mean)
         plot.errorbar(values, means.mean, [below, half], label=r.curve.label, elinewidth=0.7, capsize=1.5, **look)
         tops.append(means.mean)
     for row, colour in _beside(result, of_row):
         plot.axhline(of_row(row), color=colour, ls=":", lw=1.2, label=f"{row.series}, beside")
         tops.append(np.array([of_row(row)]))
-    top = np.nan_to_num(np.concatenate(tops)).max()
-    # Three seeds make intervals that would press the means flat.
-    plot.set_ylim(0, 1.15 * top if top > 0 else 1.0)
+    drawn = np.concatenate(tops)
+    drawn = drawn[np.isfinite(drawn) & (drawn > 0)]
+    # Limits are those of the means: three seeds make intervals that would press them flat.
+    if name in ("translation", "angular") and len(drawn) and drawn.max() > _LOG_RATIO * drawn.min():
+        plot.set_yscale("log")
+        plot.set_ylim(0.7 * drawn.min(), 1.5 * drawn.max())
+    else:
+        plot.set_ylim(0, 1.15 * drawn.max() if len(drawn) else 1.0)
     _abscissa(plot, shown[0])
     label(plot, result.parameters[0], words)
 

@@ -9,6 +9,7 @@ import xml.etree.ElementTree as ET
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from lslam.config.finding import Finding
@@ -156,6 +157,24 @@ def test_study_of_two_parameters_draws_the_product_law_and_many_curves() -> None
     assert all(f"random_share {share:g}" in svg["errors"] for share in shares)
     laws = next(table for table in study_tables(results[0]) if table.title == "laws of total time")
     assert laws.rows[0][:2] == ("icp", "T = 152.2 random_share / skip_frames")
+
+
+@pytest.mark.parametrize(("smallest", "is_logarithmic"), [(0.5, False), (0.02, True)])
+def test_errors_over_orders_of_magnitude_fill_a_logarithmic_axis(smallest: float, is_logarithmic: bool) -> None:
+    rows = [row(k + 1, 0, "icp", thesis_rmse=smallest * (2.0 / smallest) ** (k / 4)) for k in range(5)]
+    errors = ET.fromstring(next(iter(study_figures(evaluate_study(rows)[0]))).svg)
+    # Equal ratios are equal distances on a logarithmic axis only; the first axes' points are drawn first.
+    heights = [float(mark.get("y", "")) for mark in errors.iter("{http://www.w3.org/2000/svg}use") if _is_point(mark)][
+        :5
+    ]
+    steps = -np.diff(heights)
+    assert heights[0] - heights[-1] > 80
+    assert bool(np.ptp(steps) < 0.01 * steps.max()) is is_logarithmic
+
+
+def _is_point(mark: ET.Element) -> bool:
+    """Whether it is a point of the first curve, in its colour."""
+    return "#0072b2" in mark.get("style", "") and "stroke" in mark.get("style", "")
 
 
 def test_words_are_ticks_of_their_own() -> None:
