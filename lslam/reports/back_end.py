@@ -8,10 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.geometry import se3
+from lslam.reports import svg
 from lslam.reports.loop_view import loop_figures
 from lslam.reports.metrics import counted, metres
 from lslam.reports.plane import Track, plane_chart
-from lslam.reports.plots import Figure, first_available
+from lslam.reports.plots import ALIGNED, DISTANCE, Figure, first_available
 from lslam.types.run_record import RunRecord
 
 if TYPE_CHECKING:
@@ -59,7 +60,7 @@ def back_end_rows(record: RunRecord, evaluation: Evaluation | None) -> list[tupl
 
 
 def back_end_figures(record: RunRecord, evaluation: Evaluation | None) -> list[Figure]:
-    """Plan, with loops and uncertainty, and map at a loop before and after the pose graph; nothing where that moved nothing."""
+    """Plan, error and map at a loop before and after the pose graph; nothing where that moved nothing."""
     odometry = record.odometry
     if odometry is None or odometry is record.trajectory:
         return []
@@ -87,17 +88,44 @@ def back_end_figures(record: RunRecord, evaluation: Evaluation | None) -> list[F
         legend.append(("s4", f"{SIGMAS:g} sigma, drawn {factor:g} times as large"))
     chart = plane_chart(tracks, "before and after the pose graph", width=720, tallest=760)
     whole = Figure("Before and after the pose graph", chart, tuple(legend), caption, wide=True)
-    return [whole, *loop_figures(record.loop_view)]
+    return [whole, *_error_figures(evaluation), *loop_figures(record.loop_view)]
 
 
 def _before_and_after(after: Evaluation, before: Evaluation) -> str:
     """ATE of both by the first alignment that both have."""
+    name = _common_alignment(after, before)
+    if name is None:
+        return "ATE n/a"
+    was, now = (error.translation for error in (before.ate[name], after.ate[name]))
+    assert was is not None
+    assert now is not None
+    return f"ATE {name} {metres(was.rmse)} m before the pose graph, {metres(now.rmse)} m after"
+
+
+def _common_alignment(after: Evaluation, before: Evaluation) -> str | None:
     for name, error in after.ate.items():
         other = before.ate.get(name)
         if error.translation is not None and other is not None and other.translation is not None:
-            was, now = metres(other.translation.rmse), metres(error.translation.rmse)
-            return f"ATE {name} {was} m before the pose graph, {now} m after"
-    return "ATE n/a"
+            return name
+    return None
+
+
+def _error_figures(evaluation: Evaluation | None) -> list[Figure]:
+    """Position error before and after the pose graph over the way; nothing without ground truth."""
+    if evaluation is None or evaluation.odometry is None:
+        return []
+    before = evaluation.odometry
+    name = _common_alignment(evaluation, before)
+    if name is None:
+        return []
+    lines = [
+        svg.Line(word, part.distance, np.linalg.norm(part.ate[name].errors, axis=1), style)
+        for word, part, style in (("odometry", before, "s2"), ("after the pose graph", evaluation, "s1"))
+    ]
+    title = "Position error before and after the pose graph"
+    chart = svg.line_chart(lines, DISTANCE, "position error, m", title)
+    caption = f"{_before_and_after(evaluation, before)}; {ALIGNED.get(name, name)}."
+    return [Figure(title, chart, tuple((line.style, line.label) for line in lines), caption)] if chart else []
 
 
 def _ellipses(record: RunRecord) -> tuple[list[Floats], float]:

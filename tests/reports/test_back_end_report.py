@@ -7,6 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from lslam.config.eval import EvalConfig
+from lslam.evaluation.evaluate import evaluate
 from lslam.geometry import se3
 from lslam.reports.back_end import back_end_figures, back_end_rows
 from lslam.types.constraint import LoopCandidate
@@ -42,6 +44,25 @@ def test_loops_and_fixes_are_counted_and_drawn(make_record: Callable[..., RunRec
     assert any(label.startswith("3 sigma, drawn") for label in labels)
     # Before, after, one loop and sixteen ellipses.
     assert figure.svg.count('class="line') == 19
+
+
+def test_the_error_is_drawn_before_and_after(make_record: Callable[..., RunRecord]) -> None:
+    record = make_record(40)
+    assert record.ground_truth is not None
+    record.odometry = record.trajectory
+    halfway = record.ground_truth.poses.copy()
+    halfway[:, :3, 3] += 0.5 * (record.trajectory.positions - halfway[:, :3, 3])
+    record.trajectory = replace(record.trajectory, poses=halfway)
+    before, after = (evaluate(t, record.ground_truth, EvalConfig()) for t in (record.odometry, record.trajectory))
+    figures = back_end_figures(record, replace(after, odometry=before))
+    assert [f.title for f in figures][1:] == ["Position error before and after the pose graph"]
+    was, now = (e.ate["se3"].translation for e in (before, after))
+    assert was is not None
+    assert now is not None
+    assert now.rmse < 0.6 * was.rmse
+    assert f"ATE se3 {was.rmse:.3f} m before the pose graph, {now.rmse:.3f} m after" in figures[1].caption
+    assert figures[1].svg.count('class="line') == 2
+    assert len(back_end_figures(record, after)) == 1, "nothing is said of odometry that was not scored"
 
 
 def test_a_graph_that_moved_nothing_draws_nothing(make_record: Callable[..., RunRecord]) -> None:
