@@ -27,6 +27,7 @@ from lslam.pipeline.manifest import Manifest
 from lslam.pipeline.osm_source import OsmSource
 from lslam.pipeline.run_folder import CHECKPOINT, RunFolder
 from lslam.pipeline.watch import Watch
+from lslam.priors import osm_prior
 from lslam.registration.standing import Standing
 from lslam.types.constraint import Turn
 from lslam.types.run_record import RunRecord
@@ -131,6 +132,8 @@ def _warm_up(
             standing.warm_up()
         if config.loops.use:
             detector.warm_up()
+        if config.osm.extract:
+            osm_prior.warm_up()
         if config.map.write:
             merge.warm_up()
             crispness.warm_up()

@@ -16,9 +16,20 @@ from lslam.config.osm import OsmConfig
 from lslam.geometry import se2
 from lslam.priors.osm_map import OsmMap
 from lslam.priors.wall_match import WINDOW, WallMatch, match_walls
+from lslam.priors.walls import find_walls
 from lslam.types.building_match import BuildingMatch, KeyframeMatch
 
 Floats = NDArray[np.float64]
+
+
+def warm_up() -> None:
+    """Compile or load every kernel that a map needs, by laying two walls on themselves."""
+    s, z = (part.ravel() for part in np.meshgrid(np.arange(0.0, 8.0, 0.2), np.arange(2.0, 5.0, 0.2)))
+    corner = np.concatenate([np.column_stack([s, 0 * s + 8, z]), np.column_stack([0 * s + 8, s, z])])
+    floor = np.column_stack([s, s, 0 * z])
+    walls = find_walls(np.concatenate([corner, floor])).segments
+    for by_coverage in (False, True):
+        match_walls(walls, walls, np.zeros(3), np.ones(3), by_coverage=by_coverage)
 
 
 def match_keyframe(view: KeyframeMatch, osm: OsmMap, config: OsmConfig) -> KeyframeMatch:

@@ -43,11 +43,11 @@ def back_end_rows(record: RunRecord, evaluation: Evaluation | None) -> list[tupl
             said = "by the buildings of OpenStreetMap"
         rows.append(("georeference", f"origin {lat:.7f}, {lon:.7f}, {height:.1f} m; {said}"))
     if record.osm is not None:
-        east, north = record.osm.shift
+        (east, north), sigma = -record.osm.shift, float(record.osm.shift_sigma.max())
         rows.append((
             "OpenStreetMap",
             f"{len(record.osm.accepted)} of {len(record.osm.keyframes)} keyframes held by {len(record.osm.buildings)} buildings, "
-            f"which lie {east:+.2f} m east and {north:+.2f} m north of the run",
+            f"which lie {east:+.2f} m east and {north:+.2f} m north of the run (sigma {sigma:.2f} m)",
         ))  # fmt: skip
     if record.buildings is not None:
         found = record.buildings
