@@ -28,15 +28,19 @@ THESIS = {
     "loam.feature_map_voxel": {"times": "5.32b", "stages": "5.32a", "efficiency": "5.33"},
     "loam.max_planar_points": {"errors": "5.35", "times": "5.34b", "stages": "5.34a", "efficiency": "5.35"},
 }  # fmt: skip
+_STAGE_PANELS = 6
 _SEEDS = (
     "Mean over the seeds whose run was not lost, bars: 95 % interval (Student's t). Crosses above: more than half of the "
     "runs were lost there."
 )
-_LAW = "Lines: weighted least squares, shaded: 99 % confidence; below: residuals in % of the law."
+_STAGES = f"Mean over seeds and scans; {_STAGE_PANELS} curves at most."
+_LAW = (
+    f"Lines: weighted least squares, shaded: 99 % confidence; below: residuals in % of the law. {len(COLOURS)} laws at most, "
+    "the table has all."
+)
 _EFFICIENCY = (
     "Median over seeds, each curve over its own largest; a lost run counts as 0; squares: within 10 % of the largest."
 )
-_STAGE_PANELS = 6
 _LOG_RATIO = 30.0  # of the largest to the smallest error, above which the axis is logarithmic
 
 
@@ -223,7 +227,7 @@ _FIGURES: tuple[tuple[str, str, str, Callable[[Any, StudyResult, Sequence[CurveR
     ("errors", "Errors", _SEEDS, _errors),
     ("zoom", "Errors of what is nowhere lost", _SEEDS, _zoom),
     ("times", "Computing time", _SEEDS, _times),
-    ("stages", "Stages of registration", "Mean over seeds and scans.", _stages),
+    ("stages", "Stages of registration", _STAGES, _stages),
     ("law", "Laws of total time", _LAW, draw_laws),
     ("efficiency", "Efficiency", _EFFICIENCY, _efficiency),
 )  # fmt: skip
