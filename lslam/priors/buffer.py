@@ -11,7 +11,7 @@ import json
 import logging
 import queue
 import threading
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -26,7 +26,6 @@ from lslam.formats.osm_buildings import buildings_of
 from lslam.formats.osm_files import from_overpass
 from lslam.geometry.geodesy import from_local
 from lslam.priors.bounds import Bounds, around
-from lslam.types.building import Building
 
 log = logging.getLogger("lslam")
 
@@ -46,16 +45,15 @@ class _Wish:
 
 @dataclass(frozen=True)
 class _Circle:
-    """A finished request: the reply and its buildings; why there are none, else None."""
+    """A finished request: the reply, of which buildings can be read; why it is none, else None."""
 
     wish: _Wish
     reply: dict[str, Any]
-    buildings: list[Building]
     problem: str | None = None
 
 
 class OsmBuffer:
-    """Buildings near an estimate that moves, from replies that arrive when they do.
+    """Replies about the surroundings of an estimate that moves; `replies` has them in the order in which they were asked for.
 
     Parameters
     ----------
@@ -78,24 +76,15 @@ class OsmBuffer:
         self._open: list[_Wish] = []
         self._answered: list[_Wish] = []
         self.replies: list[dict[str, Any]] = []
-        self._buildings: dict[str, tuple[Building, NDArray[np.float64]]] = {}
         self.problems: list[str] = []
         self._thread: threading.Thread | None = None
         self._load()
 
-    def near(self, position: NDArray[Any]) -> list[Building]:
-        """Buildings that come within `use_radius` of `position` (2,), m, as far as they are here; returns at once.
-
-        Asks for the circle about `position` when it lies outside all circles of `renew_radius` asked for before; where a
-        request failed, nothing is asked again before that circle is left.
-        """
-        at = np.asarray(position, np.float64)[:2]
-        self.ask(at)
-        reach = self._config.use_radius
-        return [building for building, box in self._buildings.values() if _distance(box, at) <= reach]
-
     def ask(self, position: NDArray[Any], radius: float | None = None) -> None:
-        """Ask for the circle about `position`, as `near` does; of another `radius`, m, when a larger one is not asked for yet."""
+        """Ask for the circle about `position` (2,), m, unless what was asked for before reaches there; returns at once.
+
+        Where a request failed, nothing is asked again before that circle is left. radius : m, other than `fetch_radius`
+        """
         at = np.asarray(position, np.float64)[:2]
         self._collect()
         asked = [*self._answered, *self._open]
@@ -150,16 +139,18 @@ class OsmBuffer:
         try:
             fix = from_local(np.array([[*wish.centre, 0.0]]), self._origin)[:, :2]
             reply = self._fetch(around(fix, wish.radius))
-            return _Circle(wish, reply, self._read(reply))
+            self._check(reply)
+            return _Circle(wish, reply)
         except LslamError as error:
-            return _Circle(wish, {}, [], str(error))
+            return _Circle(wish, {}, str(error))
         except Exception as error:
             # Whatever a server sends, the run goes on without it.
             log.debug("traceback", exc_info=error)
-            return _Circle(wish, {}, [], f"the reply cannot be used ({type(error).__name__}: {error})")
+            return _Circle(wish, {}, f"the reply cannot be used ({type(error).__name__}: {error})")
 
-    def _read(self, reply: dict[str, Any]) -> list[Building]:
-        return buildings_of(from_overpass(reply), self._origin, "the reply").buildings
+    def _check(self, reply: dict[str, Any]) -> None:
+        """Raise what is wrong with a reply."""
+        buildings_of(from_overpass(reply), self._origin, "the reply")
 
     def _keep(self, circle: _Circle, folder: Path) -> None:
         """What is used is kept, and nothing else: not what a server sends when nobody waits any more."""
@@ -174,7 +165,8 @@ class OsmBuffer:
             try:
                 tree = json.loads(path.read_bytes())
                 wish = _Wish(np.array(tree["lslam_centre"], np.float64), float(tree["lslam_radius"]))
-                self._use(_Circle(wish, tree, self._read(tree)))
+                self._check(tree)
+                self._use(_Circle(wish, tree))
             except (OSError, ValueError, KeyError, TypeError) as error:
                 raise InputError(f"{path} is no reply kept by an earlier run ({error}): remove it") from None
 
@@ -196,16 +188,3 @@ class OsmBuffer:
     def _use(self, circle: _Circle) -> None:
         self._answered.append(circle.wish)
         self.replies.append(circle.reply)
-        for building in circle.buildings:
-            self._buildings.setdefault(building.osm_id, (building, _box(f.outer for f in building.footprints)))
-
-
-def _box(rings: Iterable[NDArray[np.float64]]) -> NDArray[np.float64]:
-    """(2, 2) lowest and highest corner."""
-    corners = np.concatenate(list(rings))
-    return np.array([corners.min(0), corners.max(0)])
-
-
-def _distance(box: NDArray[np.float64], at: NDArray[np.float64]) -> float:
-    """From a box to a place, m; 0 inside."""
-    return float(np.linalg.norm(np.maximum(np.maximum(box[0] - at, at - box[1]), 0.0)))

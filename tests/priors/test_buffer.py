@@ -15,9 +15,13 @@ from overpass_server import FakeOverpass, house, running
 
 from lslam.config.osm import OsmConfig
 from lslam.errors import InputError
+from lslam.formats.osm_buildings import buildings_of
+from lslam.formats.osm_files import from_overpass
 from lslam.priors.bounds import Bounds
 from lslam.priors.buffer import OsmBuffer
+from lslam.priors.osm_map import OsmMap
 from lslam.priors.overpass import fetch_buildings
+from lslam.types.building import Building
 
 ORIGIN = np.array([49.0112, 8.4229, 112.8])
 DRIVE = np.column_stack([np.arange(0.0, 400.0, 2.0), np.zeros(200)])
@@ -48,6 +52,14 @@ class Server:
         assert buffer.wait(5.0)
 
 
+def near(buffer: OsmBuffer, place: np.ndarray) -> list[Building]:
+    """Ask for the surroundings of a place; the buildings within 35 m of it that are here."""
+    buffer.ask(place)
+    data = from_overpass({"elements": [element for reply in buffer.replies for element in reply["elements"]]})
+    town = OsmMap(buildings_of(data, ORIGIN).buildings)
+    return [town.buildings[number] for number in town.near(place, 35.0)]
+
+
 @pytest.fixture
 def server() -> Iterator[FakeOverpass]:
     with running() as fake:
@@ -57,13 +69,13 @@ def server() -> Iterator[FakeOverpass]:
 def test_nothing_is_there_before_the_reply_and_everything_near_after_it() -> None:
     server = Server()
     with OsmBuffer(server, ORIGIN, OsmConfig()) as buffer:
-        assert buffer.near(np.zeros(2)) == []
+        assert near(buffer, np.zeros(2)) == []
         server.let_go(buffer)
-        near = buffer.near(np.zeros(2))
-        corners = np.array([np.linalg.norm(b.footprints[0].outer, axis=1).min() for b in near])
-        assert 3 <= len(near) <= 6
+        found = near(buffer, np.zeros(2))
+        corners = np.array([np.linalg.norm(b.footprints[0].outer, axis=1).min() for b in found])
+        assert 3 <= len(found) <= 6
         assert corners.max() <= 35.0 + 8.0
-        west = [b.middle[0] for b in buffer.near(np.array([-50.0, 0.0]))]
+        west = [b.middle[0] for b in near(buffer, np.array([-50.0, 0.0]))]
         assert max(west) < -10.0
         assert min(west) > -95.0
 
@@ -72,12 +84,12 @@ def test_a_new_circle_is_asked_for_only_outside_the_sixty_metres() -> None:
     server = Server()
     with OsmBuffer(server, ORIGIN, OsmConfig()) as buffer:
         for position in DRIVE:
-            buffer.near(position)
+            buffer.ask(position)
             if buffer.is_waiting:
                 server.let_go(buffer)
-            assert len(buffer.near(position)) >= 3, "within 60 m of 120 m there is always something to use"
+            assert len(near(buffer, position)) >= 3, "within 60 m of 120 m there is always something to use"
         for position in DRIVE[::-1]:
-            buffer.near(position)
+            buffer.ask(position)
         buffer.wait(5.0)
     assert len(server.asked) == 7, "at 0, 62, 124, ... m, and nothing on the way back"
     widths = [box.width * 111_320 * np.cos(np.radians(49)) for box in server.asked]
@@ -89,7 +101,7 @@ def test_a_server_that_sleeps_costs_the_caller_nothing() -> None:
     began = time.perf_counter()
     with OsmBuffer(server, ORIGIN, OsmConfig()) as buffer:
         for position in DRIVE:
-            assert buffer.near(position) == []
+            assert near(buffer, position) == []
         spent = time.perf_counter() - began
         assert not buffer.wait(0.1)
     assert spent < 0.5
@@ -106,7 +118,7 @@ def test_a_dead_or_lying_server_is_named_once_a_circle(
         OsmBuffer(lambda box: fetch_buildings(box, config, tmp_path / "cache"), ORIGIN, config, tmp_path / "run") as b,
     ):
         for position in DRIVE[:120]:
-            assert b.near(position) == []
+            assert near(b, position) == []
             b.wait(5.0)
     assert len(server.requests) == 4
     assert [p.split(": ")[-1] for p in b.problems[:2]] == ["check osm.server", "check osm.server"]
@@ -119,9 +131,9 @@ def test_a_dead_or_lying_server_is_named_once_a_circle(
 def test_what_no_server_should_send_ends_nothing() -> None:
     server = Server(lambda _: {"elements": [{"type": "way", "id": 1, "nodes": [{}], "tags": {"building": "yes"}}]})
     with OsmBuffer(server, ORIGIN, OsmConfig()) as buffer:
-        buffer.near(np.zeros(2))
+        buffer.ask(np.zeros(2))
         server.let_go(buffer)
-        assert buffer.near(np.zeros(2)) == []
+        assert near(buffer, np.zeros(2)) == []
     assert len(buffer.problems) == 1
 
 
@@ -129,18 +141,18 @@ def test_a_run_that_goes_on_uses_the_replies_it_has_and_asks_only_for_others(tmp
     server = Server()
     with OsmBuffer(server, ORIGIN, OsmConfig(), tmp_path) as first:
         for position in DRIVE[:60]:
-            first.near(position)
+            first.ask(position)
             if first.is_waiting:
                 server.let_go(first)
-        seen = [b.osm_id for b in first.near(DRIVE[59])]
+        seen = [b.osm_id for b in near(first, DRIVE[59])]
     assert sorted(p.name for p in tmp_path.iterdir()) == ["000000.json", "000001.json"]
     asked = len(server.asked)
     with OsmBuffer(server, ORIGIN, OsmConfig(), tmp_path) as second:
-        assert [b.osm_id for b in second.near(DRIVE[59])] == seen
+        assert [b.osm_id for b in near(second, DRIVE[59])] == seen
         assert second.wait(0.1)
         assert len(server.asked) == asked
         for position in DRIVE:
-            second.near(position)
+            second.ask(position)
             if second.is_waiting:
                 server.let_go(second)
         assert [tree["elements"] for tree in second.replies[:asked]] == [tree["elements"] for tree in first.replies]
@@ -153,9 +165,9 @@ def test_a_run_that_goes_on_uses_the_replies_it_has_and_asks_only_for_others(tmp
 def test_what_comes_too_late_is_not_kept_as_if_it_had_been_used(tmp_path: Path) -> None:
     server = Server()
     with OsmBuffer(server, ORIGIN, OsmConfig(), tmp_path) as buffer:
-        buffer.near(np.zeros(2))
+        buffer.ask(np.zeros(2))
         server.let_go(buffer)
-        buffer.near(np.array([70.0, 0.0]))
+        buffer.ask(np.array([70.0, 0.0]))
     server.gate.release()
     time.sleep(0.2)
     assert [p.name for p in tmp_path.iterdir()] == ["000000.json"]
@@ -169,5 +181,5 @@ def test_a_larger_circle_is_asked_for_once() -> None:
             buffer.ask(np.zeros(2), radius)
             if buffer.is_waiting:
                 server.let_go(buffer)
-        assert len(buffer.near(np.array([170.0, 0.0]))) >= 3
+        assert len(near(buffer, np.array([170.0, 0.0]))) >= 3
     assert len(server.asked) == 2
