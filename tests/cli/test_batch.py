@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import io
 import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 from calling import COMMAND, Done, assert_one_sentence, environment, lslam, sample_copy
 
+from lslam.cli.batch import command
+from lslam.errors import LslamError
 from lslam.formats.study_csv import read_study_csv
 
 JOBS = """
@@ -31,11 +35,21 @@ def sample(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return sample_copy(tmp_path_factory.mktemp("sample"), 8)
 
 
-def piped(text: str, *words: object, cwd: Path | None = None) -> Done:
+def piped(text: str, *words: object) -> Done:
     return subprocess.run(
         [*COMMAND, "batch", "-", *map(str, words)], input=text, capture_output=True, text=True, timeout=180, check=False,
-        cwd=cwd, env=environment(),
+        env=environment(),
     )  # fmt: skip
+
+
+def refusal(words: list[str], folder: Path, monkeypatch: pytest.MonkeyPatch) -> LslamError:
+    """What the command raises in `folder`, where it leaves nothing."""
+    monkeypatch.chdir(folder)
+    monkeypatch.setattr("lslam.cli.batch.setup_logging", lambda *_: None)
+    with pytest.raises(LslamError) as caught:
+        command.main(words, standalone_mode=False)
+    assert not list(folder.iterdir())
+    return caught.value
 
 
 def test_every_job_of_a_file_is_a_run_and_a_row_and_is_kept(sample: Path, tmp_path: Path) -> None:
@@ -91,13 +105,12 @@ def test_lines_are_understood_as_lslam_run_does_and_a_failure_is_exit_1(sample: 
     ],
 )
 def test_a_wrong_line_is_named_before_anything_runs(
-    text: str, code: int, sentence: str, sample: Path, tmp_path: Path
+    text: str, code: int, sentence: str, sample: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    done = piped(text.replace("SAMPLE", str(sample)), "--out", "out", cwd=tmp_path)
-    assert done.returncode == code, done.stderr
-    assert_one_sentence(done.stderr)
-    assert sentence in done.stderr
-    assert not list(tmp_path.iterdir())
+    monkeypatch.setattr(sys, "stdin", io.StringIO(text.replace("SAMPLE", str(sample))))
+    said = refusal(["-", "--out", "out"], tmp_path, monkeypatch)
+    assert said.exit_code == code
+    assert sentence in str(said)
 
 
 @pytest.mark.parametrize(
@@ -112,15 +125,13 @@ def test_a_wrong_line_is_named_before_anything_runs(
     ],
 )
 def test_what_is_no_batch_is_said_in_one_sentence(
-    old: str, new: str, code: int, sentence: str, sample: Path, tmp_path: Path
+    old: str, new: str, code: int, sentence: str, sample: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    file = tmp_path / "jobs.toml"
+    file = sample.parent / "jobs.toml"
     file.write_text(JOBS.replace(old, new).replace("SAMPLE", str(sample)))
-    done = lslam("batch", file, "--out", tmp_path / "out")
-    assert done.returncode == code, done.stderr
-    assert_one_sentence(done.stderr)
-    assert sentence in done.stderr
-    assert not (tmp_path / "out").exists()
+    said = refusal([str(file), "--out", "out"], tmp_path, monkeypatch)
+    assert said.exit_code == code
+    assert sentence in str(said)
 
 
 def test_strict_counts_a_degraded_run_as_a_failed_gate(sample: Path, tmp_path: Path) -> None:

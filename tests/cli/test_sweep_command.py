@@ -10,9 +10,12 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
+import click
 import pytest
 from calling import COMMAND, assert_one_sentence, environment, lslam
 
+from lslam.cli.sweep import command
+from lslam.errors import LslamError
 from lslam.formats.study_csv import read_study_csv
 from lslam.types.study import StudyRow
 
@@ -99,10 +102,12 @@ def test_strict_makes_a_failed_run_exit_4(file: Path, tmp_path: Path) -> None:
     ],
 )
 def test_wrong_calls_are_answered_in_one_sentence(
-    words: tuple[str, ...], code: int, sentence: str, file: Path, tmp_path: Path
+    words: tuple[str, ...], code: int, sentence: str, file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    done = lslam("sweep", *(str(file) if word == "FILE" else word for word in words), cwd=tmp_path)
-    assert done.returncode == code, done.stderr
-    assert_one_sentence(done.stderr)
-    assert sentence in done.stderr
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("lslam.cli.sweep.setup_logging", lambda *_: None)
+    with pytest.raises((LslamError, click.UsageError)) as caught:
+        command.main([str(file) if word == "FILE" else word for word in words], standalone_mode=False)
+    assert caught.value.exit_code == code
+    assert sentence in str(caught.value)
     assert not list(tmp_path.iterdir())
