@@ -135,7 +135,7 @@ def engine(function: F) -> F:
             "tcp://HOST:PORT",
             "Make the runs on the Dask cluster of this scheduler (lslam[cluster]).",
         ),
-        ("--jobs", int, "N", "Runs at once on this machine, each on a core of its own [default: one per core]."),
+        ("--jobs", int, "N", "Runs at once on this machine [default: one per core]."),
     ):
         function = click.option(name, type=kind, metavar=metavar, help=text)(function)
     return function

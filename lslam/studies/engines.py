@@ -37,9 +37,10 @@ class Engine(Protocol):
 
 @dataclass(frozen=True)
 class Local:
-    """Processes of this machine, `most_at_once` of them, each on a core of its own.
+    """Processes of this machine, `most_at_once` of them and no more than there are cores.
 
-    is_kept : they go on with one run after the other, with kernels compiled and data read; title : of the progress bar
+    is_kept : they go on with one run after the other, with kernels compiled, data read and one thread
+    title : of the progress bar
     """
 
     most_at_once: int = 1

@@ -49,7 +49,7 @@ def run_jobs(
     if not jobs:
         return
     load = round(os.getloadavg()[0], 2) if hasattr(os, "getloadavg") else 0.0
-    bench = Bench(crew.at_once, load, crew.at_once == 1 or bool(crew.cores), crew.is_kept)
+    bench = Bench(crew.at_once, load, crew.at_once == 1 or crew.is_kept, crew.is_kept)
     for job in jobs:
         make_room(job)
     tasks = [Task(job.name, partial(work, job, bench), job.folder.with_name(f"{job.folder.name}.out")) for job in jobs]

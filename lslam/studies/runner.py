@@ -33,8 +33,8 @@ class Task:
 class Crew:
     """Which processes do the work.
 
-    at_once : tasks together; is_kept : a process goes on with the next task, on a core of its own where there are enough, so
-        that its kernels stay compiled and its data read; otherwise each task has a new process
+    at_once : tasks together; is_kept : a process goes on with the next task, so that its kernels stay compiled and its data
+        read, and has one thread, so that it needs one core; otherwise each task has a new process
     tries : how often a task is begun whose process died
     """
 
@@ -42,20 +42,11 @@ class Crew:
     is_kept: bool = False
     tries: int = 1
 
-    @property
-    def cores(self) -> list[int]:
-        """The core of each process; empty when they go where the system puts them."""
-        if not self.is_kept or not hasattr(os, "sched_getaffinity"):
-            return []
-        known = sorted(os.sched_getaffinity(0))
-        return known[: self.at_once] if self.at_once <= len(known) else []
-
 
 @dataclass
 class _Worker:
     process: BaseProcess
     pipe: Connection
-    core: int | None
     index: int = -1
 
 
@@ -71,13 +62,12 @@ def run_tasks(
     tries: dict[int, int] = {}
     idle: list[_Worker] = []
     busy: list[_Worker] = []
-    cores = deque(crew.cores)
     try:
         while waiting or busy:
             while waiting and len(busy) < crew.at_once:
                 index, tries[index] = waiting.popleft()
                 on_start(index)
-                worker = idle.pop() if idle else _hire(crew, cores)
+                worker = idle.pop() if idle else _hire(crew)
                 worker.index = index
                 busy.append(worker)
                 with contextlib.suppress(OSError):  # it died while it was idle: its pipe says so below
@@ -88,8 +78,6 @@ def run_tasks(
                 cause = _ending(worker, tasks[worker.index].said, crew.is_kept)
                 if cause is None:
                     idle.append(worker)
-                elif worker.core is not None:
-                    cores.append(worker.core)
                 if cause and tries[worker.index] < crew.tries:
                     log.warning("%s is begun anew: %s", tasks[worker.index].name, cause)
                     waiting.append((worker.index, tries[worker.index] + 1))
@@ -99,15 +87,14 @@ def run_tasks(
         _end([worker.process for worker in [*busy, *idle]])
 
 
-def _hire(crew: Crew, cores: deque[int]) -> _Worker:
-    core = cores.popleft() if cores else None
+def _hire(crew: Crew) -> _Worker:
     context = get_context("spawn")
     ours, theirs = context.Pipe()
-    process = context.Process(target=_child, args=(theirs, core), name="lslam worker", daemon=False)
-    with _thread_limits(crew.at_once, core is not None):
+    process = context.Process(target=_child, args=(theirs,), name="lslam worker", daemon=False)
+    with _thread_limits(crew):
         process.start()
     theirs.close()
-    return _Worker(process, ours, core)
+    return _Worker(process, ours)
 
 
 def _ending(worker: _Worker, said: Path, is_kept: bool) -> str | None:
@@ -127,11 +114,11 @@ def _ending(worker: _Worker, said: Path, is_kept: bool) -> str | None:
 
 
 @contextlib.contextmanager
-def _thread_limits(at_once: int, has_core: bool) -> Iterator[None]:
+def _thread_limits(crew: Crew) -> Iterator[None]:
     """What a process that starts now shall know before it imports anything: its share of the cores."""
-    share = "1" if has_core else str(max(1, (os.cpu_count() or 1) // at_once))
+    share = "1" if crew.is_kept else str(max(1, (os.cpu_count() or 1) // crew.at_once))
     limits = {"NUMBA_NUM_THREADS": "1"}
-    if at_once > 1 or has_core:
+    if crew.at_once > 1 or crew.is_kept:
         limits |= dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), share)
     before = {name: os.environ.get(name) for name in limits}
     os.environ.update(limits)
@@ -144,13 +131,11 @@ def _thread_limits(at_once: int, has_core: bool) -> Iterator[None]:
                 os.environ[name] = value
 
 
-def _child(pipe: Connection, core: int | None) -> None:
+def _child(pipe: Connection) -> None:
     """In the new process: Ctrl-C is the parent's, which then asks with SIGTERM; results on stdout are the parent's too."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     threading.Thread(target=_follow_parent, daemon=True).start()
-    if core is not None:
-        os.sched_setaffinity(0, {core})
     try:
         while (task := pipe.recv()) is not None:
             _do(task)

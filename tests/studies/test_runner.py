@@ -135,8 +135,6 @@ def test_a_task_whose_process_died_is_begun_once_more_and_ends_once(tmp_path: Pa
     assert len((tmp_path / "a").read_text().split()) == 2
 
 
-def test_kept_processes_have_a_core_each_as_long_as_there_are_enough() -> None:
-    known = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
-    assert Crew(len(known), is_kept=True).cores == known
-    assert Crew(1, is_kept=True).cores == known[:1]
-    assert Crew(len(known) + 1, is_kept=True).cores == Crew(1).cores == []
+def test_kept_processes_have_one_thread_each(tmp_path: Path) -> None:
+    keep(tmp_path, partial(write_environment, tmp_path / "said"))
+    assert (tmp_path / "said").read_text().split()[1:] == ["1", "1"]
