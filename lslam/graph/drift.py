@@ -41,17 +41,28 @@ def with_drift(odometry: Sequence[Constraint], factor: float, config: GraphConfi
 
 
 def drift_factor(graph: PoseGraph, loops: Sequence[Constraint], config: GraphConfig) -> float:
-    """The factor on `drift_covariance`, 0 where none is needed, with which median loop and fix are where they should be."""
+    """The factor on `drift_covariance`, 0 where none is needed, with which median loop and fix are where they should be.
+
+    At least that of `tilt_factor`.
+    """
     on_map = _as_fixes(graph)
-    if not loops and max(len(graph.fixes), len(on_map)) < 2:
+    if not loops and max(len(graph.fixes), len(on_map)) < 2 and not graph.ups:
         return 0.0
-    known = _accumulated(graph.poses, graph.odometry)
-    drift = _accumulated(
-        graph.poses, [replace(c, covariance=drift_covariance(_length(c), config)) for c in graph.odometry]
-    )
+    known, drift = _chains(graph, config)
     by_loops = _of_loops(graph, loops, known, drift) if loops else 0.0
     by_fixes, by_map = (_of_fixes(graph.poses, *what, known, drift) for what in ((graph.fixes, 3), (on_map, 2)))
-    return max(by_loops, by_fixes, by_map)
+    return max(by_loops, by_fixes, by_map, _of_ups(graph, known, drift, config))
+
+
+def tilt_factor(graph: PoseGraph, config: GraphConfig) -> float:
+    """As `drift_factor` by the up directions alone: 0 unless they are sure that odometry tilts."""
+    return _of_ups(graph, *_chains(graph, config), config) if graph.ups else 0.0
+
+
+def _chains(graph: PoseGraph, config: GraphConfig) -> tuple[Floats, Floats]:
+    """What odometry says of its own errors, and drift of factor 1, both (K, 6, 6) accumulated."""
+    drifting = [replace(c, covariance=drift_covariance(_length(c), config)) for c in graph.odometry]
+    return _accumulated(graph.poses, graph.odometry), _accumulated(graph.poses, drifting)
 
 
 def _as_fixes(graph: PoseGraph) -> list[PositionFix]:
@@ -110,6 +121,44 @@ def _of_fixes(poses: Floats, fixes: Sequence[PositionFix], dim: int, known: Floa
     noise_of_pair = (own[first] + own[first + half])[:, :, None] * np.eye(dim)
     moved, grown = (_between(chain, poses, a, b)[:, :dim, :dim] for chain in (known, drift))
     return _fitting(off[first + half] - off[first], moved + noise_of_pair, grown)
+
+
+def _of_ups(graph: PoseGraph, known: Floats, drift: Floats, config: GraphConfig) -> float:
+    """By all that was measured of up: how it tilts in the world of odometry on the way from the first time.
+
+    Gravity is known to a part of a degree and mostly worse than odometry: only what can be no chance counts.
+    """
+    keyframes, ups, variances = _measurements(graph)
+    count = len(ups) - 1
+    if count < 1:
+        return 0.0
+    level = np.linalg.svd(graph.world_up[None])[2][1:]
+    tilt = (np.cross(ups[0], ups[1:]) @ level.T).reshape(1, -1)
+    shared = np.minimum.outer(np.arange(count), np.arange(count))
+
+    def together(chain: Floats) -> Floats:
+        """Of all tilts, (1, 2 M, 2 M): two of them have the way to the earlier one in common."""
+        single = level @ (chain[keyframes[1:], 3:, 3:] - chain[keyframes[0], 3:, 3:]) @ level.T
+        return np.asarray(single[shared].swapaxes(1, 2).reshape(1, 2 * count, 2 * count))
+
+    own = together(known) + np.kron(np.diag(variances[1:]) + variances[0], np.eye(2))
+    surprise = float(tilt[0] @ np.linalg.solve(own[0], tilt[0]))
+    return _fitting(tilt, own, together(drift)) if surprise > quantile(config.probability, 2 * count) else 0.0
+
+
+def _measurements(graph: PoseGraph) -> tuple[NDArray[np.intp], Floats, Floats]:
+    """Up directions that are one measurement each: keyframe, (M, 3) in the world of odometry, rad2."""
+    shares = np.array([u.share for u in graph.ups])
+    number = (np.cumsum(shares) - 0.5 * shares).astype(int)
+    keyframes, ups, variances = [], [], []
+    for n in np.unique(number):
+        stretch = [u for u, m in zip(graph.ups, number, strict=True) if m == n]
+        part = sum(u.share for u in stretch)
+        mean = np.sum([graph.poses[u.keyframe, :3, :3] @ u.up for u in stretch], axis=0)
+        keyframes.append(stretch[len(stretch) // 2].keyframe)
+        ups.append(mean / np.linalg.norm(mean))
+        variances.append(float(np.mean([u.sigma**2 for u in stretch])) / min(part, 1.0))
+    return np.array(keyframes, np.intp), np.array(ups).reshape(-1, 3), np.array(variances)
 
 
 def _fitting(error: Floats, own: Floats, grown: Floats) -> float:

@@ -90,7 +90,7 @@ def fixed_part(graph: PoseGraph, may_tilt: bool = False) -> Any:
     for constraint in graph.odometry:
         factors.add(between(constraint))
     for up in graph.ups:
-        model = gtsam.noiseModel.Isotropic.Sigma(2, up.sigma)
+        model = gtsam.noiseModel.Isotropic.Sigma(2, up.sigma / np.sqrt(up.share))
         factors.add(gtsam.AttitudeFactorPose3(up.keyframe, gtsam.Unit3(graph.world_up), model, gtsam.Unit3(up.up)))
     for turn in graph.turns:
         factors.add(_turn(turn))

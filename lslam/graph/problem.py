@@ -28,11 +28,15 @@ class PositionFix:
 
 @dataclass(frozen=True)
 class UpDirection:
-    """Which way is up (3,), unit, in the axes of `keyframe`; sigma : rad."""
+    """Which way is up (3,), unit, in the axes of `keyframe`.
+
+    sigma : rad; share : part of one measurement that it is, as errors of keyframes that follow each other are the same error
+    """
 
     keyframe: int
     up: Floats
     sigma: float
+    share: float = 1.0
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,7 @@
 """From odometry to a consistent trajectory: loops, satellite fixes, gravity and floor, made one in a pose graph.
 
-Where nothing but odometry is known, or the graph cannot be solved, odometry's poses stay as they are, byte for byte.
+Where nothing but odometry is known, or an IMU finds no tilt in it beyond its own doubt, or the graph cannot be solved,
+odometry's poses stay as they are, byte for byte.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 from lslam.config import Config
 from lslam.errors import GraphError, InputError
 from lslam.geometry import se2, se3
+from lslam.graph.drift import tilt_factor
 from lslam.graph.floors import on_one_plane
 from lslam.graph.odometry import corrected, fitness_covariance, odometry_constraints
 from lslam.graph.pose_graph import optimise
@@ -91,7 +93,7 @@ def run_back_end(
         out = _on_buildings(osm, graph, placement, candidates, results, store, config, problems)
     if out is None and config.gnss.mode == "graph" and placement.georeference is not None:
         out = _solved(_on_earth(graph, placement), candidates, results, store, config, problems, placement.georeference)
-    if out is None and (graph.loops or graph.floors):
+    if out is None and (graph.loops or graph.floors or tilt_factor(graph, config.graph) > 0):
         out = _solved(graph, candidates, results, store, config, problems, None)
     if out is None:
         out = BackEnd(results, candidates, np.stack([k.T_world_lidar for k in keyframes]))
@@ -173,7 +175,8 @@ def _solved(
         len(graph), len(believed), len(graph.loops), solution.drift, solution.rounds,
     )  # fmt: skip
     facts = _facts(solution, graph, candidates, believed)
-    if not (believed or graph.fixes or graph.floors or graph.map_priors):
+    tilts = not believed and tilt_factor(graph, config.graph) > 0
+    if not (believed or graph.fixes or graph.floors or graph.map_priors or tilts):
         return BackEnd(results, judged, graph.poses, facts=facts)
     T = np.eye(4)
     if georeference is not None:
@@ -187,7 +190,7 @@ def _solved(
 
 def _up_after(out: BackEnd, graph: PoseGraph) -> Floats:
     """(3,) up in the world of the optimised poses, by what the keyframes saw of it."""
-    turned = sum(out.keyframes[u.keyframe, :3, :3] @ u.up / u.sigma**2 for u in graph.ups)
+    turned = sum(out.keyframes[u.keyframe, :3, :3] @ u.up * u.share / u.sigma**2 for u in graph.ups)
     return np.asarray(turned / np.linalg.norm(turned))
 
 

@@ -1,7 +1,7 @@
 """`debug.drift`: odometry that runs away on purpose.
 
-A direction fixed in the world, as a tilted start or slipping would give it, and a heading that turns steadily. A scale error
-would be neither seen nor repaired: a loop that is 1 % too large closes as well.
+A direction fixed in the world, as a tilted start or slipping would give it, and a heading or a horizon that turns steadily. A
+scale error would be neither seen nor repaired: a loop that is 1 % too large closes as well.
 
 Steady drift is what loops repair best: spread evenly over the way it is gone, so covariances, which expect a random walk of
 that size, are cautious then (NEES per degree of freedom 0.03 to 0.1). With `debug.drift_memory` it becomes that walk, of
@@ -30,11 +30,15 @@ def with_drift(results: Sequence[ScanResult], config: DebugConfig) -> list[ScanR
     steps = se3.relative(poses[:-1], poses[1:])
     way = np.linalg.norm(steps[:, :3, 3], axis=1)
     directions, sides = _courses(way, config)
-    turn = sides * np.deg2rad(config.drift_deg_per_100m) / 100 * way
+    # The horizon sinks towards the direction.
+    across = np.stack([-directions[:, 1], directions[:, 0]], axis=1)
+    across /= np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-12)
+    degrees = np.column_stack([config.drift_tilt_deg_per_100m * across, config.drift_deg_per_100m * sides])
+    turns = np.deg2rad(degrees) / 100 * way[:, None]
     drifted = [poses[0]]
-    for step, m, rad, direction in zip(steps, way, turn, directions, strict=True):
+    for step, m, turn, direction in zip(steps, way, turns, directions, strict=True):
         pose = drifted[-1] @ step
-        pose[:3, :3] = so3.exp(np.array([0.0, 0.0, rad])) @ pose[:3, :3]
+        pose[:3, :3] = so3.exp(turn) @ pose[:3, :3]
         pose[:3, 3] += 0.01 * config.drift_percent * m * direction
         drifted.append(se3.normalise(pose))
     return [_moved(result, pose) for result, pose in zip(results, drifted, strict=True)]
@@ -71,7 +75,8 @@ def describe(config: DebugConfig) -> str:
     lasting = "steadily" if config.drift_memory is None else f"anew after some {config.drift_memory:g} m"
     return (
         f"debug.drift: odometry was made to drift by {config.drift_percent:g} % of the way and "
-        f"{config.drift_deg_per_100m:g} deg/100 m, {lasting} (seed {config.drift_seed}); this run is an experiment"
+        f"{config.drift_deg_per_100m:g} deg/100 m, and to tilt by {config.drift_tilt_deg_per_100m:g}, {lasting} "
+        f"(seed {config.drift_seed}); this run is an experiment"
     )
 
 

@@ -36,7 +36,7 @@ def up_directions(
     alike = np.searchsorted(stamps, stamps + half, side="right") - np.searchsorted(stamps, stamps - half)
     least = np.deg2rad(config.gravity_deg)
     return [
-        UpDirection(k.number, -g.direction, float(max(g.sigma, least) * np.sqrt(count)))
+        UpDirection(k.number, -g.direction, float(max(g.sigma, least)), 1 / float(count))
         for (k, g), count in zip(known, alike, strict=True)
     ]
 
@@ -48,7 +48,7 @@ def world_up(ups: Sequence[UpDirection], keyframes: Sequence[Keyframe]) -> Float
     begin = keyframes[ups[0].keyframe].stamp_ns
     first = [u for u in ups if keyframes[u.keyframe].stamp_ns <= begin + 1e9 * MEMORY_S]
     turned = np.stack([keyframes[u.keyframe].T_world_lidar[:3, :3] @ u.up for u in first])
-    mean = (turned / np.array([[u.sigma**2] for u in first])).sum(0)
+    mean = (turned / np.array([[u.sigma**2 / u.share] for u in first])).sum(0)
     return np.asarray(mean / np.linalg.norm(mean))
 
 

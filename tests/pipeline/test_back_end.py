@@ -48,7 +48,7 @@ def drifted(*settings: str) -> list[ScanResult]:
 
 def store_of(results: list[ScanResult]) -> KeyframeStore:
     store = KeyframeStore()
-    for n, i in enumerate(range(0, COUNT, EVERY)):
+    for n, i in enumerate(range(0, len(results), EVERY)):
         keyframe = Keyframe(n, i, results[i].stamp_ns, results[i].T_world_lidar, results[i].covariance, float(i))
         store.add(keyframe, np.zeros((1, 3), np.float32))
     return store
@@ -69,6 +69,12 @@ LOOPS = [candidate(a, a + LAP // EVERY) for a in range(5, 190, 20)]
 def error(done: BackEnd, real: np.ndarray = REAL) -> float:
     p = np.stack([r.T_world_lidar[:3, 3] for r in done.results])
     return float(np.sqrt(((p - real[:, :3, 3]) ** 2).sum(1).mean()))
+
+
+def tilt(done: BackEnd) -> float:
+    """The largest, rad, against the truth."""
+    turned = [r.T_world_lidar[2, :3] @ T[2, :3] for r, T in zip(done.results, REAL, strict=True)]
+    return float(np.arccos(np.clip(turned, -1, 1)).max())
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
@@ -228,14 +234,48 @@ def test_gravity_keeps_it_level_beside_loops() -> None:
     done = run_back_end(Stub([]), results, store_of(results), config(), LOOPS[:1])
     blind = run_back_end(Stub([]), results, store_of(results), config("graph.gravity=false"), LOOPS[:1])
 
-    def tilt(results: list[ScanResult]) -> float:
-        return max(
-            float(np.arccos(np.clip(r.T_world_lidar[2, :3] @ -d, -1, 1))) for r, d in zip(results, down, strict=True)
-        )
-
-    assert tilt(done.results) < 0.6 * tilt(blind.results)
+    assert tilt(done) < 0.6 * tilt(blind)
     # The start stays where it was: the world's up is found, not forced on it.
     np.testing.assert_allclose(done.results[0].T_world_lidar, results[0].T_world_lidar, atol=1e-9)
+
+
+def with_gravity(results: list[ScanResult], seed: int, sigma: float = np.deg2rad(0.3)) -> list[ScanResult]:
+    """Down as an IMU measures it there, wrong by `sigma` rad, alike over twenty seconds."""
+    rng = np.random.default_rng([seed, 5])
+    keep = np.exp(-0.1 / 20.0)
+    tilt, out = rng.normal(0, sigma, 3), []
+    for result, T in zip(results, REAL, strict=True):
+        tilt = keep * tilt + np.sqrt(1 - keep**2) * rng.normal(0, sigma, 3)
+        out.append(replace(result, gravity=GravityDirection(so3.exp(tilt) @ -T[2, :3], sigma)))
+    return out
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_gravity_takes_a_tilt_away_without_any_loop(seed: int) -> None:
+    """Half a degree per 100 m; the heading, of which gravity knows nothing, is odometry's own."""
+    tilting = ("debug.drift_percent=0", "debug.drift_deg_per_100m=0", "debug.drift_tilt_deg_per_100m=0.5")
+    results = with_gravity(drifted(*tilting, f"debug.drift_seed={seed}"), seed)
+    store = store_of(results)
+    done = run_back_end(Stub([]), results, store, config(), [])
+    blind = run_back_end(Stub([]), results, store, config("graph.gravity=false"), [])
+    assert blind.results is results
+    assert tilt(done) < 0.4 * tilt(blind)
+    assert error(done) < 0.85 * error(blind)
+    assert done.is_optimised
+    assert done.facts["drift_factor"] > 0
+    yaws = [so3.euler_rpy(d.results[-1].T_world_lidar[:3, :3].T @ REAL[-1, :3, :3])[2] for d in (done, blind)]
+    assert abs(yaws[0]) < abs(yaws[1]) + np.deg2rad(0.5)
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("count", [COUNT, 300])
+def test_gravity_that_is_no_better_than_odometry_moves_nothing(seed: int, count: int) -> None:
+    tilting = ("debug.drift_percent=0", "debug.drift_deg_per_100m=0", "debug.drift_tilt_deg_per_100m=0.03")
+    results = with_gravity(drifted(*tilting, f"debug.drift_seed={seed}"), seed)[:count]
+    store = store_of(results)
+    done = run_back_end(Stub([]), results, store, config(), [])
+    assert done.results is results
+    assert not done.is_optimised
 
 
 @pytest.mark.parametrize("steepness", [0.0, 0.06])

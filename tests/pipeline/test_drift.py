@@ -21,6 +21,13 @@ def test_it_drifts_by_what_was_asked_for(seed: int) -> None:
     assert np.linalg.norm(straight[-1].T_world_lidar[:3, 3] - [200, 0, 0]) == pytest.approx(2.0)
     turned = with_drift(RESULTS, DebugConfig(drift_percent=0, drift_seed=seed))
     assert np.rad2deg(so3.angle(turned[-1].T_world_lidar[:3, :3])) == pytest.approx(1.0)
+    tilted = with_drift(
+        RESULTS,
+        DebugConfig(drift_percent=0, drift_deg_per_100m=0, drift_tilt_deg_per_100m=0.5, drift_seed=seed),
+    )
+    off = so3.log(tilted[-1].T_world_lidar[:3, :3])
+    assert np.rad2deg(np.hypot(off[0], off[1])) == pytest.approx(1.0)
+    assert off[2] == pytest.approx(0.0, abs=1e-9)
     np.testing.assert_array_equal(turned[0].T_world_lidar, np.eye(4))
 
 

@@ -51,6 +51,6 @@ def test_ups_of_one_stretch_count_as_one_measurement() -> None:
     ups = up_directions(keyframes, results, GraphConfig())
     assert [u.keyframe for u in ups] == [i for i in range(60) if i != 30]
     middle = ups[15]
-    np.testing.assert_allclose(middle.sigma, 0.01 * np.sqrt(21))
+    np.testing.assert_allclose(middle.sigma / np.sqrt(middle.share), 0.01 * np.sqrt(21))
     np.testing.assert_allclose(world_up(ups, keyframes), [0, 0, 1], atol=1e-12)
     assert world_up([], keyframes) is None
