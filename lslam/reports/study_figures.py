@@ -41,6 +41,7 @@ _LAW = (
 _EFFICIENCY = (
     "Median over seeds, each curve over its own largest; a lost run counts as 0; squares: within 10 % of the largest."
 )
+_LEGEND_WIDTH = 130  # characters of a line, with six for each handle
 _LOG_RATIO = 30.0  # of the largest to the smallest error, above which the axis is logarithmic
 
 
@@ -107,7 +108,7 @@ def _stages(figure: Any, result: StudyResult, shown: Sequence[CurveResult]) -> b
         plot.set_title(r.curve.label, fontsize=9)
         _abscissa(plot, r)
         label(plot, result.parameters[0], "ms per scan" if plot is plots[0] else "")
-        plot.set_ylim(bottom=0)
+    plots[0].set_ylim(bottom=0)  # shared; before the last panel is drawn it would fix the top as well
     _legend(figure, *plots)
     return True
 
@@ -218,9 +219,8 @@ def _abscissa(plot: Any, result: CurveResult) -> None:
 def _legend(figure: Any, *plots: Any) -> None:
     """Each name once, below everything."""
     found = {name: handle for plot in plots for handle, name in zip(*plot.get_legend_handles_labels(), strict=True)}
-    figure.legend(
-        found.values(), found.keys(), loc="outside lower center", ncols=min(len(found), 4) or 1, frameon=False
-    )
+    columns = max(1, _LEGEND_WIDTH // (max((len(name) for name in found), default=0) + 6))
+    figure.legend(found.values(), found.keys(), loc="outside lower center", ncols=columns, frameon=False)
 
 
 _FIGURES: tuple[tuple[str, str, str, Callable[[Any, StudyResult, Sequence[CurveResult]], bool]], ...] = (

@@ -60,7 +60,7 @@ def study_recipes(result: StudyResult) -> list[str]:
         "less than the thesis takes for a result (2.2 m)",
         "diverges: the first value, lost in more than half of its runs, from which on more than half of the values are",
         "laws: weighted least squares over means of the runs that were not lost, scatter in proportion to the time, from 6 "
-        "values on; ± and bands at 99 %",
+        "values on; ± and bands at 99 %; R2 of those means in s, unweighted",
         "±: half of the 95 % interval over seeds (Student's t), of runs that were not lost",
         "best values, elbows and verdicts go by medians over seeds",
         "verdicts: a range holds the best value confirmed, one that does not and is nowhere within 10 % of it refuted",

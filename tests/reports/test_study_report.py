@@ -159,6 +159,17 @@ def test_study_of_two_parameters_draws_the_product_law_and_many_curves() -> None
     assert laws.rows[0][:2] == ("icp", "T = 152.2 random_share / skip_frames")
 
 
+def test_panels_of_stages_reach_the_longest_of_all() -> None:
+    rows = [
+        row(v, 0, method, stages_ms={"scan": top, "map": 1.0})
+        for v in (1, 2)
+        for method, top in (("a", 10.0), ("b", 90.0))
+    ]
+    stages = {f.name: f for f in study_figures(evaluate_study(rows)[0])}["stages"].svg.decode()
+    # The axis that both panels share has a tick near the larger of the two.
+    assert any(float(tick) >= 80 for tick in re.findall(r">(\d+)</text>", stages))
+
+
 @pytest.mark.parametrize(("smallest", "is_logarithmic"), [(0.5, False), (0.02, True)])
 def test_errors_over_orders_of_magnitude_fill_a_logarithmic_axis(smallest: float, is_logarithmic: bool) -> None:
     rows = [row(k + 1, 0, "icp", thesis_rmse=smallest * (2.0 / smallest) ** (k / 4)) for k in range(5)]
