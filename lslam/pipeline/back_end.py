@@ -18,6 +18,7 @@ from lslam.config import Config
 from lslam.errors import GraphError, InputError
 from lslam.geometry import se2, se3
 from lslam.graph.drift import tilt_factor
+from lslam.graph.factors import well_conditioned
 from lslam.graph.floors import on_one_plane
 from lslam.graph.odometry import corrected, fitness_covariance, odometry_constraints
 from lslam.graph.pose_graph import optimise
@@ -183,9 +184,9 @@ def _solved(
         T = georeference.T_enu_world
         georeference = replace(_scored(georeference, graph, solution), T_enu_world=np.eye(4))
     moved = corrected(results, store.keyframes, solution.poses, solution.covariances, solution.drift, config.graph)
-    return BackEnd(
-        moved, judged, solution.poses, [*graph.odometry, *believed], georeference, T, solution=solution, facts=facts
-    )  # fmt: skip
+    # As they were solved: the covariance of odometry may be singular, and no information can be written of that.
+    kept = [replace(c, covariance=well_conditioned(c.covariance)) for c in (*graph.odometry, *believed)]
+    return BackEnd(moved, judged, solution.poses, kept, georeference, T, solution=solution, facts=facts)
 
 
 def _up_after(out: BackEnd, graph: PoseGraph) -> Floats:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from stub_sequences import Stub
 
 from lslam.config import Config, load_config
+from lslam.formats.g2o import write_g2o
 from lslam.geometry import geodesy, se3, so3
 from lslam.keyframes.store import KeyframeStore
 from lslam.pipeline import back_end
@@ -122,6 +124,17 @@ def test_a_graph_that_cannot_be_solved_leaves_odometry(monkeypatch: pytest.Monke
     done = run_back_end(Stub([]), results, store_of(results), config(), LOOPS)
     assert done.results is results
     assert "in pieces" in done.problems[0]
+
+
+def test_odometry_that_claims_to_know_everything_can_be_written_down(tmp_path: Path) -> None:
+    """Covariances that do not grow say that nothing was added on the way: information without end."""
+    results = [replace(r, covariance=OWN) for r in drifted()]
+    done = run_back_end(Stub([]), results, store_of(results), config(), LOOPS)
+    assert done.is_optimised
+    write_g2o(tmp_path / "graph.g2o", done.keyframes, done.constraints)
+    edges = [line.split() for line in (tmp_path / "graph.g2o").read_text().splitlines() if line.startswith("EDGE")]
+    assert len(edges) == COUNT // EVERY - 1 + len(LOOPS)
+    assert np.isfinite(np.array([edge[3:] for edge in edges], float)).all()
 
 
 def test_one_keyframe_is_no_graph() -> None:
