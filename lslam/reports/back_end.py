@@ -85,7 +85,8 @@ def back_end_figures(record: RunRecord, evaluation: Evaluation | None) -> list[F
         "Estimate in its own world; ground truth moved to it." if len(tracks) > 2 else "Estimate in its own world."
     )
     if ellipses:
-        legend.append(("s4", f"{SIGMAS:g} sigma, drawn {factor:g} times as large"))
+        enlarged = f", drawn {factor:g} times as large" if factor > 1 else ""
+        legend.append(("s4", f"{SIGMAS:g} sigma{enlarged}"))
     chart = plane_chart(tracks, "before and after the pose graph", width=720, tallest=760)
     whole = Figure("Before and after the pose graph", chart, tuple(legend), caption, wide=True)
     return [whole, *_error_figures(evaluation), *loop_figures(record.loop_view)]

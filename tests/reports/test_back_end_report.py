@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from lslam.config.eval import EvalConfig
 from lslam.evaluation.evaluate import evaluate
@@ -44,6 +45,16 @@ def test_loops_and_fixes_are_counted_and_drawn(make_record: Callable[..., RunRec
     assert any(label.startswith("3 sigma, drawn") for label in labels)
     # Before, after, one loop and sixteen ellipses.
     assert figure.svg.count('class="line') == 19
+
+
+@pytest.mark.parametrize(("variance", "said"), [(1e-4, "3 sigma, drawn 100 times as large"), (100.0, "3 sigma")])
+def test_ellipses_are_enlarged_until_they_are_seen(
+    make_record: Callable[..., RunRecord], variance: float, said: str
+) -> None:
+    record = make_record(40)
+    record.odometry = replace(record.trajectory, poses=record.trajectory.poses + 0.1)
+    record.trajectory = replace(record.trajectory, covariances=np.tile(variance * np.eye(6), (40, 1, 1)))
+    assert said in [label for _, label in back_end_figures(record, None)[0].legend]
 
 
 def test_the_error_is_drawn_before_and_after(make_record: Callable[..., RunRecord]) -> None:
