@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import sys
 from contextlib import ExitStack
 from pathlib import Path
@@ -86,12 +87,14 @@ def _line(number: int, words: list[str], given: dict[str, Any]) -> Line:
         said["data_root"] = said["data_root"] or given["data_root"]
         sequence, config = opened_with(said)
         return Line(
-            " ".join(words), sequence, config, read_truth(said["gt"], sequence), said["out"], options.reading_of(said)
+            shlex.join(words), sequence, config, read_truth(said["gt"], sequence), said["out"], options.reading_of(said)
         )  # fmt: skip
     except LslamError as error:
         raise type(error)(f"line {number}: {error}") from None
     except click.UsageError as error:
         raise UsageError(f"line {number}: {error.format_message()}") from None
+    except click.exceptions.Exit:  # of --help, which has printed it
+        raise UsageError(f"line {number}: --help is no run, give it to lslam run") from None
 
 
 def _print(rows: list[StudyRow]) -> None:

@@ -30,7 +30,7 @@ MARK = "batch.toml"
 class Line:
     """One `lslam run`, resolved: what it reads, how, and where it is written.
 
-    words : as they were typed; sequence : opened; reading : what else it was opened with; folder : None to choose
+    words : of its command line; sequence : opened; reading : what else it was opened with; folder : None to choose
     """
 
     words: str
@@ -66,10 +66,11 @@ def expand_batch(batch: BatchConfig, place: Place, settings: Sequence[str] = ())
 def expand_lines(lines: Sequence[Line], place: Place) -> Expanded:
     """All runs of a list of lines; those without a folder of their own are numbered in `place.out`.
 
-    Raises InputError for a recording that cannot be listed.
+    Raises InputError for a recording that cannot be listed, UsageError for two lines that name one folder.
     """
     jobs: list[Job] = []
     found: dict[str, Contender] = {}
+    owners: dict[Path, int] = {}
     for number, line in enumerate(lines, 1):
         method = line.config.odometry.preset or line.config.odometry.method
         name = f"{number:03d}-{file_safe(method)}{WITH_IMU if line.config.imu.use else ''}"
@@ -82,6 +83,11 @@ def expand_lines(lines: Sequence[Line], place: Place) -> Expanded:
             imu_digest(line.sequence) if line.config.imu.use else "",
         )  # fmt: skip
         folder = run_folder(place.out, label, name, seed) if line.folder is None else line.folder
+        if owners.setdefault(folder.resolve(), number) != number:
+            raise UsageError(
+                f"run {owners[folder.resolve()]} and run {number} of the batch are both to be written to {folder}: give each "
+                "an --out of its own"
+            )
         jobs.append(
             Job(
                 label, name, seed, line.sequence.path.absolute(), line.config, folder, digest, line.words, line.truth,
