@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Sequence
+from collections.abc import Sequence, Set
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -41,10 +41,11 @@ def write_study_files(folder: Path, results: Sequence[StudyResult], rows: Sequen
     except OSError as error:
         raise OutputError(f"folder {folder / 'figures'} cannot be made: {error.strerror or error}") from None
     sections = []
+    keys = {result.parameters[0] for result in results}
     for result in results:
         figures = list(study_figures(result))
         for figure in figures:
-            stem = "-".join([*_words(result), figure.name])
+            stem = "-".join([*_words(result, keys), figure.name])
             _write(folder / "figures" / f"{stem}.png", figure.png)
             _write(folder / "figures" / f"{stem}.svg", figure.svg)
         data = [f"data:image/svg+xml;base64,{base64.b64encode(figure.svg).decode('ascii')}" for figure in figures]
@@ -72,9 +73,15 @@ def _as_text(section: Section, style: str, heading: str, item: str) -> list[str]
     return [title, *as_text(section.tables, style), recipes]
 
 
-def _words(result: StudyResult) -> list[str]:
-    """What tells the files of one result from those of another, in characters that any file system takes."""
-    words = (result.study, result.sequence, result.parameters[0].rpartition(".")[2])
+def _words(result: StudyResult, keys: Set[str]) -> list[str]:
+    """What tells the files of one result from those of another, in characters that any file system takes.
+
+    keys : of all results; the section is named where two have a key of the same name in it
+    """
+    key = result.parameters[0]
+    last = key.rpartition(".")[2]
+    is_clear = sum(other.rpartition(".")[2] == last for other in keys) == 1
+    words = (result.study, result.sequence, last if is_clear else key)
     return ["".join(c if c.isalnum() or c in "._" else "_" for c in word) for word in words]
 
 

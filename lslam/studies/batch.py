@@ -17,7 +17,7 @@ from lslam.errors import UsageError
 from lslam.pipeline.identity import imu_digest, input_digest, job_digest
 from lslam.studies.expanded import Expanded, Place, cells_of
 from lslam.studies.grid import Job, expand, run_folder
-from lslam.studies.points import Contender, settings_of
+from lslam.studies.points import Contender, free_name, settings_of
 from lslam.studies.subjects import file_safe
 from lslam.studies.variants import WITH_IMU, Variant, find_variants
 from lslam.types.sequence import Sequence as Recording
@@ -48,13 +48,14 @@ def expand_batch(batch: BatchConfig, place: Place, settings: Sequence[str] = ())
     """
     jobs: list[Job] = []
     found: dict[str, Contender] = {}
-    for number, entry in enumerate(batch.jobs, 1):
+    taken: set[str] = set()
+    for entry in batch.jobs:
         common = [*settings_of(batch.config), *settings_of(entry.config), *settings]
         variants = []
         for variant in find_variants(entry.methods, None, common, entry.imu):
             method = variant.name.removesuffix(WITH_IMU)
             # One method with two configurations is two folders.
-            name = file_safe(variant.name if variant.name not in found else f"{variant.name}-{number}")
+            name = free_name(variant.name, taken)
             variants.append(replace(variant, name=name, without=""))
             found[name] = Contender(variants[-1], method, {})
         cells = cells_of(entry.sequences, entry.seeds, [found[v.name] for v in variants], place)

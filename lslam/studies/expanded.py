@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import count
 from pathlib import Path
 
 from lslam.config.study import StudySequence
@@ -17,7 +16,7 @@ from lslam.studies.engines import Engine
 from lslam.studies.grid import Cell, Job
 from lslam.studies.jobs import finished
 from lslam.studies.plan import SIMULATED, Follow, claim, release
-from lslam.studies.points import Contender
+from lslam.studies.points import Contender, free_name
 from lslam.studies.results import Results
 from lslam.studies.scenes import Scene
 from lslam.studies.subjects import file_safe, scans_needed
@@ -132,6 +131,7 @@ def cells_of(
     needed = scans_needed([config.input for config in configs])
     needs_imu = any(config.imu.use for config in configs)
     cells: list[Cell] = []
+    taken: set[str] = set()
     for sequence in sequences:
         made = (
             [_recorded(sequence.path, needs_imu, place)]
@@ -139,10 +139,8 @@ def cells_of(
             else _simulated(sequence, needed, seeds, place)
         )
         # The same place with other settings is another sequence, with a folder of its own.
-        taken = {cell.sequence for cell in cells}
-        label = made[0].sequence
-        number = next(k for k in count(1) if (label if k == 1 else f"{label}-{k}") not in taken)
-        cells += made if number == 1 else [replace(cell, sequence=f"{label}-{number}") for cell in made]
+        label = free_name(made[0].sequence, taken)
+        cells += [replace(cell, sequence=label) for cell in made]
     return cells
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import count
 from typing import Any
 
 from lslam.config.study import Point, StudyConfig
@@ -37,7 +38,8 @@ def contenders(study: StudyConfig, settings: Sequence[str] = ()) -> list[Contend
     Raises ConfigError or UsageError naming the parameter, the value and the nearest known key; UsageError for unknown methods.
     """
     common = [*_ALWAYS, *settings_of(study.config), *settings]
-    found = []
+    found: list[Contender] = []
+    taken: set[str] = set()
     for point in study.points():
         said = ", ".join(f"{key} = {value}" for key, value in point.items())
         try:
@@ -45,13 +47,27 @@ def contenders(study: StudyConfig, settings: Sequence[str] = ()) -> list[Contend
         except (ConfigError, UsageError) as error:
             raise type(error)(f"study {study.name}, {said}: {error}") from None
         for variant in variants:
-            name = file_safe("-".join([variant.name, *(f"{k.partition('.')[2]}_{v}" for k, v in point.items())]))
+            values = (f"{key.partition('.')[2]}_{value}" for key, value in point.items())
+            name = free_name("-".join([variant.name, *values]), taken)
             method = variant.name.removesuffix(WITH_IMU)
             found.append(Contender(replace(variant, name=name, without=""), method, point))
     for variant in find_variants(study.beside, None, common, study.imu) if study.beside else []:
-        named = replace(variant, name=f"beside-{variant.name}", without="")
+        named = replace(variant, name=free_name(f"beside-{variant.name}", taken), without="")
         found.append(Contender(named, variant.name.removesuffix(WITH_IMU), {}, is_beside=True))
     return found
+
+
+def free_name(name: str, taken: set[str]) -> str:
+    """The name as a folder's, with a number when one in `taken` has it; it is taken then.
+
+    >>> taken = {"icp"}
+    >>> free_name("icp", taken), free_name("icp", taken)
+    ('icp-2', 'icp-3')
+    """
+    plain = file_safe(name)
+    free = next(made for k in count(1) if (made := plain if k == 1 else f"{plain}-{k}") not in taken)
+    taken.add(free)
+    return free
 
 
 def settings_of(sections: dict[str, dict[str, Any]]) -> list[str]:

@@ -72,6 +72,13 @@ def test_every_figure_is_written_as_png_and_svg(folder: Path) -> None:
         ET.fromstring((folder / "figures" / f"{name}.svg").read_text())
 
 
+def test_keys_of_one_name_in_two_sections_have_figures_of_their_own(tmp_path: Path) -> None:
+    keys = ("registration.inlier_distance", "imu.inlier_distance")
+    rows = [row(v, 0, "icp", parameters={key: v}) for key in keys for v in (1.0, 2.0, 3.0)]
+    write_study_files(tmp_path, evaluate_study(rows), rows, "two")
+    assert {f.name for f in (tmp_path / "figures").glob("*-errors.png")} == {f"skip-open-{key}-errors.png" for key in keys}
+
+
 def test_figures_show_what_they_are_named_after(figures: dict[str, StudyFigure]) -> None:
     text = {name: figure.svg.decode() for name, figure in figures.items()}
     assert "rmse of translation, m" in text["errors"]

@@ -173,6 +173,15 @@ def test_the_same_scenario_seen_otherwise_is_another_sequence(tmp_path: Path) ->
     assert {(c.method, c.uses_imu) for c in expanded.contenders.values()} == {("icp", False), ("icp", True)}
 
 
+def test_keys_of_one_name_in_two_sections_are_runs_of_their_own(tmp_path: Path) -> None:
+    keys = ("registration.inlier_distance", "imu.inlier_distance")
+    two = study(grid="one-way", parameters={key: [0.5, 1.0] for key in keys}, imu="on", beside=[])
+    expanded = expand_study(Sweep(two, Place(tmp_path / "out")))
+    said = [expanded.contenders[job.method].parameters for job in expanded.jobs]
+    assert said == [{key: value} for key in keys for value in (0.5, 1.0)]
+    assert len({job.folder for job in expanded.jobs}) == 4
+
+
 def test_the_time_is_estimated_from_short_runs(sweep: Sweep, tmp_path: Path) -> None:
     jobs = expand_study(replace(sweep, study=study(beside=[], parameters={"input.skip_frames": [1, 2]})))
     guess = estimate(jobs.jobs, jobs.contenders, 1)
