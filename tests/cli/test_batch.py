@@ -102,7 +102,7 @@ def test_lines_are_understood_as_lslam_run_does_and_a_failure_is_exit_1(sample: 
         ("lslam run SAMPLE --resume --out x", 2, "line 1: --resume is no option of a line"),
         ("lslam run SAMPLE --json", 2, "line 1: --json is no option of a line"),
         ("lslam run SAMPLE --help", 2, "line 1: --help is no run"),
-        ("lslam run SAMPLE --out x\nSAMPLE --count 3 --out ./x", 2, "run 1 and run 2 of the batch are both to be written to x"),
+        ("lslam run SAMPLE --out x\nSAMPLE --count 3 --out ./x", 2, "run 1 and run 2 of the batch are both"),
         ("lslam run 'SAMPLE", 2, "line 1: No closing quotation"),
     ],
 )

@@ -76,7 +76,9 @@ def test_keys_of_one_name_in_two_sections_have_figures_of_their_own(tmp_path: Pa
     keys = ("registration.inlier_distance", "imu.inlier_distance")
     rows = [row(v, 0, "icp", parameters={key: v}) for key in keys for v in (1.0, 2.0, 3.0)]
     write_study_files(tmp_path, evaluate_study(rows), rows, "two")
-    assert {f.name for f in (tmp_path / "figures").glob("*-errors.png")} == {f"skip-open-{key}-errors.png" for key in keys}
+    assert {f.name for f in (tmp_path / "figures").glob("*-errors.png")} == {
+        f"skip-open-{key}-errors.png" for key in keys
+    }
 
 
 def test_figures_show_what_they_are_named_after(figures: dict[str, StudyFigure]) -> None:
