@@ -98,15 +98,19 @@ def marginal_blocks(factors: Any, values: Any, keys: Iterable[int]) -> Floats:
         return np.stack([known.marginalCovariance(key) for key in wanted])
     except RuntimeError:
         # It gives up where neighbouring unknowns are known very differently well, as the roll of a straight path is.
-        return scaled_blocks(factors.linearize(values), values.dim(), wanted)
+        return scaled_blocks(factors, values, wanted)
 
 
-def scaled_blocks(linear: Any, columns: int, keys: list[int]) -> Floats:
-    """What `marginal_blocks` gives, by normal equations in `columns` unknowns, scaled so that each counts alike."""
+def scaled_blocks(factors: Any, values: Any, keys: list[int]) -> Floats:
+    """What `marginal_blocks` gives, by normal equations scaled so that each unknown counts alike."""
     from scipy.sparse import csc_array, diags_array
     from scipy.sparse.linalg import splu
 
-    rows, cols, entries = linear.sparseJacobian_()
+    # The columns of the Jacobian are in the order of the keys; a floor has less than six.
+    sizes = dict(sorted(values.dims().items()))
+    begins = dict(zip(sizes, np.cumsum([0, *sizes.values()]).tolist(), strict=False))
+    columns = values.dim()
+    rows, cols, entries = factors.linearize(values).sparseJacobian_()
     A = csc_array((entries, (rows.astype(np.intp) - 1, cols.astype(np.intp) - 1)))[:, :columns]
     H = (A.T @ A).tocsc()
     scale = 1.0 / np.sqrt(H.diagonal())
@@ -116,8 +120,7 @@ def scaled_blocks(linear: Any, columns: int, keys: list[int]) -> Floats:
         raise GraphError(f"the pose graph has no covariances: {_first_line(failure)}") from None
     blocks = []
     for key in keys:
-        # Only the floor has less than six unknowns, and only the frame of the map comes after it.
-        begin = min(6 * key, columns - 6)
+        begin = begins[key]
         units = np.zeros((columns, 6))
         units[begin : begin + 6] = np.diag(scale[begin : begin + 6])
         blocks.append(scale[begin : begin + 6, None] * factor.solve(units)[begin : begin + 6])
