@@ -33,11 +33,13 @@ def drift_covariance(way: float, config: GraphConfig) -> Floats:
     return np.diag(np.repeat([(0.01 * config.drift_percent) ** 2 * way, turn**2 * way], 3))
 
 
-def with_drift(odometry: Sequence[Constraint], factor: float, config: GraphConfig) -> list[Constraint]:
-    """Odometry's constraints with `factor` times the drift over their length."""
+def with_drift(graph: PoseGraph, factor: float, config: GraphConfig) -> list[Constraint]:
+    """The graph's odometry with `factor` times the drift over its length; without any error where the graph is rigid."""
+    if graph.is_rigid:
+        return [replace(c, covariance=np.zeros((6, 6))) for c in graph.odometry]
     if factor == 0:
-        return list(odometry)
-    return [replace(c, covariance=c.covariance + factor * drift_covariance(_length(c), config)) for c in odometry]
+        return list(graph.odometry)
+    return [replace(c, covariance=c.covariance + factor * drift_covariance(_length(c), config)) for c in graph.odometry]
 
 
 def drift_factor(graph: PoseGraph, loops: Sequence[Constraint], config: GraphConfig) -> float:

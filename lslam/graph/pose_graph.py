@@ -36,8 +36,7 @@ def optimise(graph: PoseGraph, config: GraphConfig) -> Solution:
     kept = [i for i, reason in enumerate(reasons) if not reason]
     loops = [graph.loops[i] for i in kept]
     drift = 0.0 if graph.is_rigid else drift_factor(graph, loops, config)
-    trusted = [replace(c, covariance=np.zeros((6, 6))) for c in graph.odometry] if graph.is_rigid else graph.odometry
-    graph = replace(graph, odometry=with_drift(trusted, drift, config))
+    graph = replace(graph, odometry=with_drift(graph, drift, config))
     may_tilt = graph.is_anchored and len(graph.ups) > 0
     is_placed = graph.start_sigma is not None or not graph.is_anchored
     fixed = factors.fixed_part(graph, may_tilt)

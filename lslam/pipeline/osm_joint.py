@@ -21,7 +21,6 @@ from lslam.priors.baseline import flatten_scan, lay_building, lay_scan
 from lslam.priors.osm_map import OsmMap
 from lslam.types.building_correction import CorrectedMap
 from lslam.types.building_match import BuildingMatch, KeyframeMatch, OsmMatches
-from lslam.types.constraint import Constraint
 
 Floats = NDArray[np.float64]
 
@@ -38,11 +37,9 @@ def join_buildings(
     Raises GraphError when it cannot be solved.
     """
     believed = replace(
-        graph,
+        _believed(graph, solution),
         poses=solution.poses,
-        odometry=with_drift(graph.odometry, solution.drift, config.graph),
-        loops=_believed(graph, solution),
-        fixes=[fix for fix, is_kept in zip(graph.fixes, solution.fix_believed, strict=True) if is_kept],
+        odometry=with_drift(graph, solution.drift, config.graph),
         map_priors=[prior for prior, why in zip(graph.map_priors, solution.map_reasons, strict=True) if not why],
     )
     local = agreed(matches, se2.of_se3(solution.poses))
@@ -55,11 +52,13 @@ def run_baseline(
 ) -> tuple[JointSolution, OsmMatches, CorrectedMap]:
     """The baseline, keyframe by keyframe: NDT on all buildings near, VGICP of each, edges to each, optimise, go on.
 
-    graph : in the frame of the map, at the start that is shared with every other mode; of `solution` its loops are taken
+    graph : in the frame of the map, at the start that is shared with every other mode; of `solution` its verdicts on loops
+        and fixes are taken
     Raises GraphError when it cannot be solved.
     """
     osm = OsmMap(extract.buildings)
-    graph = replace(graph, loops=_believed(graph, solution), map_priors=(), start_sigma=None)
+    odometry = with_drift(graph, 0.0, config.graph)
+    graph = replace(_believed(graph, solution), odometry=odometry, map_priors=(), start_sigma=None)
     middles = np.array([b.middle for b in osm.buildings]).reshape(-1, 2)
     poses, local, sights = graph.poses.copy(), list[BuildingMatch](), list[KeyframeMatch]()
     for k in range(len(store)):
@@ -79,8 +78,11 @@ def run_baseline(
     return joint, matches, placed
 
 
-def _believed(graph: PoseGraph, solution: Solution) -> list[Constraint]:
-    return [loop for loop, why in zip(graph.loops, solution.loop_reasons, strict=True) if not why]
+def _believed(graph: PoseGraph, solution: Solution) -> PoseGraph:
+    """The graph without the loops and fixes that `solution` gave up."""
+    loops = [loop for loop, why in zip(graph.loops, solution.loop_reasons, strict=True) if not why]
+    fixes = [fix for fix, is_kept in zip(graph.fixes, solution.fix_believed, strict=True) if is_kept]
+    return replace(graph, loops=loops, fixes=fixes)
 
 
 def _match(

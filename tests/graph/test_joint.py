@@ -13,9 +13,11 @@ from test_building_graph import across
 from lslam.config.graph import GraphConfig
 from lslam.errors import GraphError
 from lslam.geometry import se2, se3, so3
+from lslam.graph import joint, solve
 from lslam.graph.building_graph import MapBelief
+from lslam.graph.drift import with_drift
 from lslam.graph.joint import optimise_jointly
-from lslam.graph.problem import PoseGraph
+from lslam.graph.problem import FloorPlane, PoseGraph
 from lslam.types.building_match import BuildingMatch
 from lslam.types.constraint import Constraint
 
@@ -111,6 +113,31 @@ def test_a_lone_wall_leaves_its_building_free_along_it() -> None:
     spread = np.sqrt(np.diag(found.buildings.covariances[3]))
     assert spread[1] == pytest.approx(0.3, rel=0.1)
     assert spread[0] < 0.15
+
+
+def test_covariances_of_buildings_do_not_depend_on_how_they_are_had(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without and with a floor, whose unknowns are fewer, before the buildings'."""
+    graph, _, middles, _, matches = drive(0)
+    floors = [FloorPlane(k, np.array([0.0, 0.0, 1.0]), 1.7, 0.1, 1.0) for k in (0, 30)]
+    for known in (graph, replace(graph, floors=floors)):
+        config = GraphConfig(robust="none")
+        by_gtsam = optimise_jointly(known, middles, matches, BELIEF, config)
+        with monkeypatch.context() as without:
+            without.setattr(joint, "marginal_blocks", lambda f, v, keys: solve.scaled_blocks(f, v, list(keys)))
+            by_scaling = optimise_jointly(known, middles, matches, BELIEF, config)
+        np.testing.assert_allclose(
+            by_scaling.buildings.covariances, by_gtsam.buildings.covariances, rtol=1e-4, atol=1e-9
+        )
+
+
+def test_trusted_odometry_is_not_bent_by_walls() -> None:
+    graph, _, middles, _, matches = drive(1)
+    rigid = replace(graph, is_rigid=True, start_sigma=np.array([3.0, 3.0, 0.1]))
+    rigid = replace(rigid, odometry=with_drift(rigid, 4.0, GraphConfig()))
+    found = optimise_jointly(rigid, middles, matches, BELIEF, GraphConfig())
+    np.testing.assert_allclose(
+        se3.relative(found.poses[:1], found.poses), se3.relative(graph.poses[:1], graph.poses), atol=0.01
+    )
 
 
 def test_a_graph_in_pieces_is_refused() -> None:
