@@ -16,7 +16,7 @@ _ROUNDS = 5
 def fit_law(
     kind: LawKind, names: Sequence[str], points: Floats, times: Floats, runs: Floats | None = None, level: float = LEVEL
 ) -> Law | None:
-    """Fit a law to mean times; None from fewer than 6 different points.
+    """Fit a law to mean times; None from fewer than 6 different points at which it says something.
 
     Timings scatter in proportion to themselves, so the standard deviation of an observation is taken as proportional to the
     law over the root of its number of runs, and the fit is repeated with the weights of the law found before.
@@ -29,8 +29,8 @@ def fit_law(
     x, t = _columns(points), np.asarray(times, np.float64)
     n = np.ones(len(t)) if runs is None else np.asarray(runs, np.float64)
     known = np.isfinite(t) & (t > 0) & (n > 0) & np.isfinite(x).all(1)
-    if kind != "linear":
-        known &= x[:, 0] != 0
+    if kind != "linear":  # a time of infinity, or of zero, is no observation
+        known &= (x != 0).all(1)
     x, t, n = x[known], t[known], n[known]
     if len(np.unique(x, axis=0)) < FEWEST:
         return None

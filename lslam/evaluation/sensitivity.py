@@ -65,7 +65,7 @@ def _result(curve: Curve) -> CurveResult:
         curve=curve,
         means=means,
         medians=medians,
-        stage_means={name: over_seeds(table) for name, table in curve.stages.items()},
+        stage_means={name: over_seeds(np.where(curve.lost, np.nan, table)) for name, table in curve.stages.items()},
         divergence=divergence(curve),
         optimum=optimum(curve.values, medians["efficiency"]),
         law=law,

@@ -18,6 +18,7 @@ LEAST_CHANGE = 0.1  # of registration's time: below it nothing was acted on
 UNITS = {"translation": "m", "angular": "deg", "time_per_scan": "ms", "total_time": "s"}
 _OF_TIME = ("time_per_scan", "total_time")
 _LAWS: tuple[LawKind, ...] = ("linear", "inverse", "product")
+_OF_WORDS = ("matters_little", "acts_only_on")
 
 Judged = tuple[Outcome, str]
 
@@ -33,7 +34,7 @@ def judge(finding: Finding, results: Sequence[CurveResult], products: Mapping[st
     if finding.kind == "product":
         judged = {result.curve.series: _law(finding, result, products.get(result.curve.series)) for result in mine}
     else:
-        judged = {result.curve.label: _JUDGES[finding.kind](finding, result) for result in mine}
+        judged = {result.curve.label: _judge_one(finding, result) for result in mine}
     outcomes = {outcome for outcome, _ in judged.values()}
     outcome: Outcome = outcomes.pop() if len(outcomes) == 1 else "undecided"
     told = [f"{name}: {said}" if len(judged) > 1 else said for name, (_, said) in judged.items()]
@@ -42,6 +43,12 @@ def judge(finding: Finding, results: Sequence[CurveResult], products: Mapping[st
         outcome = "undecided"
         told.append("runs shared the machine, so times cannot be compared")
     return Verdict(finding.text, outcome, "; ".join(told), finding.source)
+
+
+def _judge_one(finding: Finding, result: CurveResult) -> Judged:
+    if result.curve.words and finding.kind not in _OF_WORDS:
+        return "undecided", f"{result.curve.parameter} is not a number"
+    return _JUDGES[finding.kind](finding, result)
 
 
 def _speaks_of(finding: Finding, result: CurveResult) -> bool:
@@ -55,7 +62,7 @@ def _speaks_of(finding: Finding, result: CurveResult) -> bool:
 
 def _diverges_beyond(finding: Finding, result: CurveResult) -> Judged:
     """Confirmed when the last value that works is the expected one or a neighbour of it."""
-    values, found = result.curve.values, result.divergence
+    values, found = _run_values(result), result.divergence
     expected = finding.values[0]
     if found.first_bad is None:
         outcome: Outcome = "refuted" if values[-1] > expected else "undecided"
@@ -67,7 +74,7 @@ def _diverges_beyond(finding: Finding, result: CurveResult) -> Judged:
 
 
 def _holds_up_to(finding: Finding, result: CurveResult) -> Judged:
-    values, found = result.curve.values, result.divergence
+    values, found = _run_values(result), result.divergence
     expected = finding.values[0]
     if found.first_bad is not None and found.first_bad <= expected:
         return "refuted", f"it diverges from {found.first_bad:g} on{_alone(result)}"
@@ -75,7 +82,7 @@ def _holds_up_to(finding: Finding, result: CurveResult) -> Judged:
         return "undecided", f"{values[-1]:g} is the largest value that was run"
     if any(value <= expected for value in found.alone):
         return "undecided", f"nothing diverges for good{_alone(result)}"
-    return "confirmed", f"nothing diverges up to {min(expected, values[-1]):g}"
+    return "confirmed", f"nothing diverges up to {expected:g}"
 
 
 def _between(finding: Finding, result: CurveResult, *, is_highest: bool) -> Judged:
@@ -108,7 +115,7 @@ def _best_by_seed(finding: Finding, result: CurveResult, is_highest: bool) -> li
 
 def _elbow_at(finding: Finding, result: CurveResult) -> Judged:
     """Confirmed when the error comes to its plateau at the expected value or a neighbour of it."""
-    values, expected = result.curve.values, finding.values[0]
+    values, expected = _run_values(result), finding.values[0]
     found = _elbow(result)
     if found is None:
         return "refuted", "the error comes to no plateau"
@@ -123,9 +130,10 @@ def _good_from(finding: Finding, result: CurveResult) -> Judged:
     found = _elbow(result)
     if found is None:
         return "refuted", "the error comes to no plateau"
-    if finding.values[0] < result.curve.values[0]:
-        return "undecided", f"{result.curve.values[0]:g} is the smallest value that was run"
-    outcome: Outcome = "confirmed" if found <= finding.values[0] else "refuted"
+    values, expected = _run_values(result), finding.values[0]
+    if not values[0] <= expected <= values[-1]:
+        return "undecided", f"values from {values[0]:g} to {values[-1]:g} were run"
+    outcome: Outcome = "confirmed" if found <= expected else "refuted"
     return outcome, f"the error is on its plateau from {found:g} on"
 
 
@@ -179,6 +187,11 @@ def _acts_only_on(finding: Finding, result: CurveResult) -> Judged:
 
 def _elbow(result: CurveResult) -> float | None:
     return elbow(result.curve.values, result.medians["translation"], result.curve.is_lost)
+
+
+def _run_values(result: CurveResult) -> Floats:
+    """Values at which some run says anything."""
+    return result.curve.values[result.curve.ran.any(1)]
 
 
 def _place(values: Floats, value: float) -> int:

@@ -138,6 +138,7 @@ class CurveResult:
 
     means, medians : by quantity over the runs that were not lost, for the efficiencies a lost run counts as 0; means say how
         sure a number is, medians what is best, because the mean efficiency is that of the luckiest seed
+    stage_means : ms per scan by stage, likewise of runs that were not lost
     law : None where there is none, and `no_law` says why
     """
 

@@ -100,6 +100,20 @@ def test_what_has_no_time_or_is_the_same_point_again_does_not_count(spoilt: floa
     assert fit_law("inverse", ("x",), np.array([1.0, 1, 2, 3, 4, 5]), np.ones(6)) is None
 
 
+@pytest.mark.parametrize("second", [0.0, 1.0])
+def test_points_at_which_a_product_is_zero_do_not_count(second: float) -> None:
+    """Six points with y = 0 make no law, and beside six others they change nothing."""
+    zero, other = (np.stack([np.arange(1.0, 7.0), np.full(6, y)], 1) for y in (0.0, second))
+    law = fit_law("product", ("x", "y"), np.concatenate([zero, other]), np.tile(10 / np.arange(1.0, 7.0), 2))
+    if second == 0:
+        assert law is None
+        return
+    assert law is not None
+    assert law.coefficients == pytest.approx([10.0])
+    assert law.r2 == pytest.approx(1.0)
+    assert np.abs(law.residuals).max() < 1e-9
+
+
 def test_r2_says_when_the_law_is_wrong() -> None:
     rising: dict[str, Any] = {"names": ("x",), "points": SKIPS, "times": 5 + 2 * SKIPS}
     wrong, right = fit_law("inverse", **rising), fit_law("linear", **rising)

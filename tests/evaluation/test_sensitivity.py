@@ -53,6 +53,7 @@ def test_mean_is_of_the_runs_that_were_not_lost_but_a_lost_run_has_no_efficiency
     means = evaluate_study(rows)[0].results[0].means
     assert means["translation"].mean == pytest.approx([0.5] * 3)
     assert list(means["total_time"].n) == [2, 2, 2]
+    assert list(evaluate_study(rows)[0].results[0].stage_means["register"].n) == [2, 2, 2]
     # Two of three runs have 1 / (0.5 m x 1 deg x 0.05 s), the lost one 0.
     assert means["efficiency"].mean == pytest.approx([40 * 2 / 3] * 3)
 

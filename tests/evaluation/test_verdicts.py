@@ -46,6 +46,27 @@ def test_holding_up() -> None:
     assert "runs at 5 are lost" in once.measured
 
 
+@pytest.mark.parametrize("kind", ["diverges_beyond", "holds_up_to", "good_from"])
+def test_value_whose_runs_all_failed_is_not_one_that_was_run(kind: str) -> None:
+    """They came to 12 scans at most, so nothing is known at 13 and from there on."""
+    failed = {"status": "failed", "reason": "disk full", "stages_ms": {}}
+    rows = [replace(r, **failed) if r.parameters["input.skip_frames"] > 12 else r for r in rows_of(SKIPS)]
+    found = verdict(rows, kind, 13)
+    assert found.outcome == "undecided"
+    assert "12" in found.measured
+
+
+@pytest.mark.parametrize(
+    ("kind", "values"), [("diverges_beyond", [1]), ("best_between", [0, 1]), ("good_from", [0]), ("linear", [])]
+)
+def test_words_are_no_places_on_an_axis(kind: str, values: list[float]) -> None:
+    words = rows_of(["a", "b", "c", "d", "e", "f", "g"], "preprocess.downsample", error=lambda v: 0.5)
+    found = verdict(words, kind, *values)
+    assert found.outcome == "undecided"
+    assert found.measured == "preprocess.downsample is not a number"
+    assert outcome(words, "matters_little", 1.5, of="translation") == "confirmed"
+
+
 def test_best_value() -> None:
     valley = rows_of(GRID, "loam.grid_step", error=lambda v: 0.2 + (v - 1.5) ** 2)
     assert outcome(valley, "best_between", 1, 2) == "confirmed"
