@@ -145,7 +145,7 @@ def engine(function: F) -> F:
 def engine_of(given: dict[str, Any], title: str, is_kept: bool = True) -> Iterator[Engine]:
     """What makes the runs, as the options of `engine` say; raises UsageError for what does not go together.
 
-    is_kept : whether processes of this machine go on with one run after the other
+    is_kept : whether data stay read from one run to the next, and keyframes do not stay
     """
     from lslam.studies.engines import Local
 
@@ -159,7 +159,7 @@ def engine_of(given: dict[str, Any], title: str, is_kept: bool = True) -> Iterat
         return
     from lslam.studies.cluster import connected
 
-    with connected(scheduler, cluster, title) as engine:
+    with connected(scheduler, cluster, title, is_kept=is_kept) as engine:
         yield engine
 
 

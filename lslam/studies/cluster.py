@@ -31,8 +31,8 @@ _ALONE = threading.Lock()
 
 
 @contextmanager
-def connected(scheduler: str | None, local: str | None, title: str) -> Iterator[Cluster]:
-    """The cluster of a scheduler "tcp://host:port", or one of this machine, "local:N".
+def connected(scheduler: str | None, local: str | None, title: str, *, is_kept: bool = True) -> Iterator[Cluster]:
+    """The cluster of a scheduler "tcp://host:port", or one of this machine, "local:N"; `is_kept` as of the cluster.
 
     Raises UsageError when Dask is missing or `local` is no number of workers; InputError when the scheduler does not answer.
     """
@@ -52,7 +52,7 @@ def connected(scheduler: str | None, local: str | None, title: str) -> Iterator[
             ) as made,
             Client(made) as client,
         ):
-            yield Cluster(client, made.scheduler_address, title, is_here=True)
+            yield Cluster(client, made.scheduler_address, title, is_here=True, is_kept=is_kept)
         return
     assert scheduler is not None
     try:
@@ -64,17 +64,21 @@ def connected(scheduler: str | None, local: str | None, title: str) -> Iterator[
             "running there, and its port open?"
         ) from None
     with client:
-        yield Cluster(client, scheduler, title)
+        yield Cluster(client, scheduler, title, is_kept=is_kept)
 
 
 @dataclass(frozen=True)
 class Cluster:
-    """The workers of a scheduler; is_here : they share this machine's disk."""
+    """The workers of a scheduler.
+
+    is_here : they share this machine's disk; is_kept : they keep data read from run to run, and no keyframes
+    """
 
     client: Any
     address: str
     title: str
     is_here: bool = False
+    is_kept: bool = True
 
     @property
     def at_once(self) -> int:
@@ -117,7 +121,7 @@ class Cluster:
             return
         for job in jobs:
             make_room(job)
-        bench = Bench(self.at_once, is_alone=False, is_kept=True)
+        bench = Bench(self.at_once, is_alone=False, is_kept=self.is_kept)
         follow.on_start(self.title, len(jobs), "runs")
         futures = {
             self.client.submit(perform, job, bench, key=f"lslam-{k}-{job.digest}", pure=False): job

@@ -34,8 +34,9 @@ class ScanStore:
                 return self._scans[key]
         scan = read()
         with self._lock:
-            self._scans[key] = scan
-            self.bytes += size_of(scan)
+            if key not in self._scans:  # another thread may have read it meanwhile
+                self._scans[key] = scan
+                self.bytes += size_of(scan)
             while self.bytes > self.most_bytes:
                 self.bytes -= size_of(self._scans.popitem(last=False)[1])
         return scan

@@ -97,7 +97,10 @@ def _run(job: Job, is_kept: bool) -> tuple[str, str]:
 
     ended: list[RunOutcome] = []
     config = job.config
-    key = (job.path, job.data_root, config.input.vertical_correction_deg, config.imu.use, config.gnss.mode != "off")
+    key = (
+        job.path, job.data_root, config.input.vertical_correction_deg, config.imu.use, config.gnss.mode != "off",
+        tuple(sorted(job.reading.items())),
+    )  # fmt: skip
     sequence = _kept_sequences().get(key, _opening(job)) if is_kept else _opening(job)()
     watch = Watch(on_end=ended.append)
 

@@ -6,6 +6,7 @@ import os
 import signal
 import sys
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ from typing import Any
 import pytest
 from distributed import LocalCluster
 
+from lslam.cli.options import engine_of
 from lslam.config.study import parse_study
 from lslam.errors import InputError, RunFailedError, UsageError
 from lslam.formats.study_csv import read_study_csv
@@ -23,6 +25,7 @@ from lslam.studies.grid import Job
 from lslam.studies.plan import Follow
 from lslam.studies.states import State, read_state, write_state
 from lslam.studies.sweep import Sweep, expand_study, run_sweep
+from lslam.studies.worker import Bench
 from lslam.types.study import StudyRow
 
 TREE = {
@@ -133,11 +136,13 @@ class Gone:
 
     def __init__(self, status: str, *errors: Exception | None) -> None:
         self.status, self.errors = status, list(errors)
+        self.given: list[tuple[object, ...]] = []
 
     def scheduler_info(self, n_workers: int) -> dict[str, Any]:
         return {"workers": {}}
 
     def submit(self, work: object, *words: object, **more: object) -> Gone:
+        self.given.append(words)
         return Gone(self.status, self.errors.pop(0))
 
     def exception(self) -> Exception | None:
@@ -168,6 +173,25 @@ def test_a_run_whose_workers_all_died_is_a_row_with_its_reason(tmp_path: Path, m
     state = read_state(run.state_file)
     assert state is not None
     assert (state.status, state.reason, done) == ("crashed", "its worker failed: three workers died", [run])
+
+
+@pytest.mark.parametrize("is_kept", [True, False])
+def test_workers_keep_data_between_runs_when_the_study_asks_for_it(
+    is_kept: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A batch does not: each of its runs keeps its keyframes, here as on one machine."""
+    monkeypatch.setattr("distributed.as_completed", iter)
+    client = Gone("running", MemoryError("three workers died"))
+
+    @contextmanager
+    def there(*words: object, is_kept: bool) -> Iterator[Cluster]:
+        yield Cluster(client, "tcp://there:1", "", is_kept=is_kept)
+
+    monkeypatch.setattr(cluster, "connected", there)
+    run = job(tmp_path)
+    with engine_of({"jobs": None, "scheduler": "tcp://there:1", "cluster": None}, "", is_kept) as engine:
+        engine.run([run], Follow(), lambda job: None)
+    assert client.given == [(run, Bench(1, is_alone=False, is_kept=is_kept))]
 
 
 def test_a_run_that_comes_home_replaces_what_was_there(tmp_path: Path) -> None:

@@ -2,11 +2,20 @@
 
 from __future__ import annotations
 
+import threading
+from pathlib import Path
+
 import numpy as np
 import pytest
 
+from lslam.config.load import load_config
 from lslam.simulation.scenarios import SimulatedDrive, simulate
+from lslam.studies.grid import Job
+from lslam.studies.jobs import run_jobs
 from lslam.studies.kept import KeptSequences, ScanStore, memory_bound, size_of
+from lslam.studies.plan import Follow
+from lslam.studies.runner import Crew
+from lslam.studies.states import read_state
 from lslam.types.scan import Scan
 
 
@@ -52,6 +61,38 @@ def test_a_sequence_is_opened_once_and_each_run_has_notes_of_its_own(drive: Simu
     assert len(second) == 4
     assert np.array_equal(second.scan(1).points, drive.scan(1).points)
     assert other.scan(1) is not second.scan(1)
+
+
+def test_a_scan_that_two_threads_read_at_once_counts_once(drive: SimulatedDrive) -> None:
+    scan, both = drive.scan(0), threading.Barrier(2, timeout=20)
+    store = ScanStore(2 * size_of(scan))
+
+    def read() -> Scan:
+        both.wait()
+        return scan
+
+    threads = [threading.Thread(target=store.get, args=((0, 0), read)) for _ in range(2)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert store.bytes == size_of(scan)
+
+
+def test_what_a_recording_is_opened_with_tells_it_from_others(tmp_path: Path) -> None:
+    """A topic is of bags only, so the second run fails unless it is given the first one's sequence."""
+    path = Path(__file__).resolve().parents[2] / "sample_data"
+    config = load_config(None, ["input.count=2", "map.write=false", "report.html=false", "loops.use=false"], {})
+    jobs = [
+        Job("sample", "icp", k, path, config, tmp_path / str(k), str(k), "", reading=reading)
+        for k, reading in enumerate([{}, {"lidar_topic": "/points"}])
+    ]
+    run_jobs(jobs, Crew(1, is_kept=True), Follow())
+    states = [read_state(job.state_file) for job in jobs]
+    assert states[0] is not None
+    assert states[1] is not None
+    assert states[0].status in ("done", "degraded")
+    assert (states[1].status, states[1].reason.partition(" is ")[0]) == ("failed", "--lidar-topic")
 
 
 def test_memory_is_bounded_by_what_is_free() -> None:
