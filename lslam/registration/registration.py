@@ -149,11 +149,12 @@ class Registration(Stateful):
                   weak_share=c.weak_share)
             for offset in start_offsets(c.start_reach, START_STEP)
         ]  # fmt: skip
-        tried.sort(key=lambda found: -first.share(seen, found.T_world_lidar))
+        # Where nothing stands, as in hills, what matches the ground is all that tells.
+        tried.sort(key=lambda found: (-first.share(seen, found.T_world_lidar), -found.inliers))
         for promising in distinct(tried, best.T_world_lidar):
             start = promising.T_world_lidar
             found = self._judge(self._coarse_to_fine(points, start), start)
-            needed = CLEARLY * first.share(seen, best.T_world_lidar) if best.ok else 0.0
+            needed = CLEARLY * first.share(seen, best.T_world_lidar) if best.ok else -1.0
             if found.ok and first.share(seen, found.T_world_lidar) > needed:
                 best = replace(found, prior_error=correction(T_prior, found.T_world_lidar))
         return best

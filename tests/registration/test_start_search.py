@@ -72,6 +72,24 @@ def test_bare_ground_says_nothing() -> None:
     assert first.share(first.seen_in(ground), np.eye(4)) == 0.0
 
 
+def hills(rng: np.random.Generator, at: float) -> NDArray[np.float32]:
+    """Waves of ground, too gentle for anything to stand on them, as seen from 5 m above (at, 0)."""
+    far, angle = 25 * np.sqrt(rng.uniform(0, 1, 20_000)), rng.uniform(-np.pi, np.pi, 20_000)
+    x, y = far * np.cos(angle) + at, far * np.sin(angle)
+    z = 0.25 * (np.sin(x / 2.3 + 0.5 * np.sin(y / 5)) + np.sin(y / 3.1 + np.sin(x / 7)))
+    return np.column_stack([x - at, y, z - 5 + rng.normal(0, 0.01, len(x))]).astype(np.float32)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_where_nothing_stands_the_ground_decides(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    registration = Registration()
+    registration.register(hills(rng, 0.0))
+    result = registration.register(hills(rng, 8.0), np.eye(4))
+    assert result.ok, result.reason
+    np.testing.assert_allclose(result.T_world_lidar[:3, 3], [8, 0, 0], atol=0.03)
+
+
 def test_starts_reach_as_far_as_asked_nearest_first() -> None:
     offsets = start_offsets(9.0, 3.0)
     lengths = np.linalg.norm(offsets, axis=1)
