@@ -152,7 +152,8 @@ class Cleaner:
 
 def _upright(scan: PosedScan) -> NDArray[np.float32]:
     """Its points (N, 3) as seen from the sensor, m, along the world's axes."""
-    return scan.points @ scan.T_world_lidar[:3, :3].T.astype(np.float32)
+    with np.errstate(invalid="ignore"):  # organised clouds mark what they did not see by infinity
+        return scan.points @ scan.T_world_lidar[:3, :3].T.astype(np.float32)
 
 
 def spread(moves: NDArray[np.bool_], points: NDArray[np.float32]) -> NDArray[np.bool_]:

@@ -122,6 +122,16 @@ def test_scans_come_back_in_order_and_late() -> None:
     assert Cleaner().finish() == []
 
 
+@pytest.mark.filterwarnings("error")
+def test_what_an_organised_cloud_did_not_see_is_no_thing() -> None:
+    rng, cleaner = np.random.default_rng(0), Cleaner()
+    cloud = rng.uniform(-20, 20, (2000, 3)).astype(np.float32)
+    cloud[:3] = [[np.inf] * 3, [np.nan] * 3, [0, -np.inf, 1]]
+    turned = se3.make(so3.exp(np.array([0.0, 0.0, 0.3])), np.zeros(3))
+    (back,) = cleaner.add(PosedScan(cloud, turned)) + cleaner.finish()
+    np.testing.assert_array_equal(back.points, cloud)
+
+
 @pytest.mark.parametrize("stop", [1, 4, 9, 20])
 def test_restored_it_gives_back_the_rest_as_it_would_have(stop: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(clean, "OFFSETS", (1, 3))
