@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from lslam.geometry import se3
 from lslam.keyframes.store import KeyframeStore
+from lslam.pipeline.back_end import BackEnd
 from lslam.types.constraint import LoopCandidate
 from lslam.types.loop_view import LoopView, Place
 from lslam.types.run_record import RunRecord
@@ -17,10 +18,10 @@ Floats = NDArray[np.float64]
 AROUND = 10
 
 
-def view_loop(record: RunRecord, store: KeyframeStore) -> LoopView | None:
+def view_loop(record: RunRecord, done: BackEnd, store: KeyframeStore) -> LoopView | None:
     """The view; None where no loop was closed, or the pose graph moved nothing."""
     closed = [c for c in record.loops if c.verdict == "accepted"]
-    if record.odometry is None or record.odometry is record.trajectory or not closed:
+    if record.odometry is None or not done.is_optimised or not closed:
         return None
     scans = record.keyframe_scans
     before, after = record.T_final_odometry @ record.odometry.poses[scans], record.trajectory.poses[scans]

@@ -39,7 +39,7 @@ log = logging.getLogger("lslam")
 
 
 def estimate_poses(
-    sequence: Sequence, odometry: Odometry, config: Config, manifest: Manifest, folder: Path, truth: Trajectory | None,
+    sequence: Sequence, odometry: Odometry, config: Config, manifest: Manifest, folder: Path | None, truth: Trajectory | None,
     watch: Watch, store: KeyframeStore, checkpoints: OdometryCheckpoints | None = None, osm: OsmSource | None = None,
 ) -> RunRecord:  # fmt: skip
     """Odometry over all scans, judged; its keyframes go to `store`, and `checkpoints` say where an earlier run left off.

@@ -132,18 +132,18 @@ def _prepare(sequence: Sequence, config: Config, truth: Trajectory | None, comma
 
 
 def _solve(
-    job: _Job, store: KeyframeStore, folder: Path = Path(), checkpoints: OdometryCheckpoints | None = None
+    job: _Job, store: KeyframeStore, folder: Path | None = None, checkpoints: OdometryCheckpoints | None = None
 ) -> tuple[RunRecord, BackEnd, Evaluation | None]:
     """The poses of all scans, made consistent and level, and their score."""
     _announce(job)
     if job.osm is not None:
-        job.osm.begin(None if folder == Path() else folder / REPLIES)
+        job.osm.begin(None if folder is None else folder / REPLIES)
     record = estimate_poses(
         job.sequence, job.odometry, job.config, job.manifest, folder, job.truth, job.watch, store, checkpoints, job.osm
     )
     done = optimise_poses(job.sequence, record, store, job.config, job.manifest, job.osm)
     level_world(record, job.sequence, job.config, job.manifest)
-    record.loop_view = view_loop(record, store)
+    record.loop_view = view_loop(record, done, store)
     return record, done, _score(record, job.sequence, job.config)
 
 
@@ -197,7 +197,7 @@ def _score(record: RunRecord, sequence: Sequence, config: Config) -> Evaluation 
     except LslamError as error:
         record.problems.append(f"not scored: {error}")
         log.warning("not scored: %s", error)
-        if record.folder != Path():
+        if record.folder is not None:
             log.info("score it with other recipes: lslam eval %s GT", record.folder / "trajectory.tum")
         return None
     record.problems += [note for note in score.notes if "WRONG" in note]

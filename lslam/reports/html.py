@@ -152,8 +152,10 @@ def _cards(facts: RunFacts, evaluation: Evaluation | None, crispness: Crispness 
     return cards
 
 
-def _config_text(folder: Path) -> str:
-    """The resolved configuration that lies in the run folder; empty when it does not."""
+def _config_text(folder: Path | None) -> str:
+    """The resolved configuration that lies in the run folder; empty when there is none."""
+    if folder is None:
+        return ""
     try:
         return (folder / "config.toml").read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError):

@@ -36,7 +36,8 @@ def summary(record: RunRecord, evaluation: Evaluation | None) -> str:
     rows += _score_rows(record, evaluation)
     rows += _map_rows(record)
     rows += _time_rows(record, facts)
-    rows += [(name, str(record.folder / file)) for name, file in FILES if (record.folder / file).is_file()]
+    if record.folder is not None:
+        rows += [(name, str(record.folder / file)) for name, file in FILES if (record.folder / file).is_file()]
     lines = [f"{record.name}, {record.method}"] + [f"  {name:<12} {value}" for name, value in rows]
     return "\n".join(lines) + "\n"
 

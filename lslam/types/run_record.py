@@ -23,12 +23,13 @@ from lslam.types.trajectory import Trajectory
 class RunRecord:
     """One run, for reports. `manifest` is the dictionary written as manifest.json.
 
+    folder : where its results are, None when nothing is written
     map_image : (H, W) float32 density of the merged map seen from above, row 0 at the largest y, or None
     map_extent : (x_min, x_max, y_min, y_max), m; crispness : of the merged map, None without one
     real_time_limit : seconds one scan may take: skip_frames / rate
     world : where the coordinates of trajectory and map begin and whether z is up, in words
-    odometry : the trajectory before the pose graph, in its own world, None when there was no back end; T_final_odometry
-        : (4, 4) from that world into the trajectory's
+    odometry : the trajectory before the pose graph, in its own world, None when there was no back end
+    T_final_odometry : (4, 4) from that world into the trajectory's
     turns : of the IMU between keyframes, when the graph is to have them
     osm : what walls seen and buildings of a map had to do with each other, None without a map that could be used; buildings :
         of that map, where they really stand
@@ -38,7 +39,7 @@ class RunRecord:
 
     name: str
     method: str
-    folder: Path
+    folder: Path | None
     results: list[ScanResult]
     trajectory: Trajectory
     ground_truth: Trajectory | None

@@ -75,7 +75,10 @@ def test_fetched_on_the_way_it_is_the_same_and_a_rerun_needs_no_network(
     by_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked = serve(monkeypatch)
-    lslam.run(SAMPLE, config("auto"), out=tmp_path / "auto")
+    (tmp_path / "auto").mkdir()
+    with monkeypatch.context() as inside:
+        inside.chdir(tmp_path / "auto")
+        lslam.run(SAMPLE, config("auto"), out=".")
     assert len(asked) == len(list((tmp_path / "auto" / "osm_replies").iterdir())) >= 1
     known = bytes_of(by_file)
     assert (tmp_path / "auto" / "trajectory.tum").read_bytes() == known["trajectory.tum"]

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from lslam.evaluation.evaluate import evaluate
 from lslam.reports.facts import describe, run_facts, stage_matrix
+from lslam.reports.html import render_report
 from lslam.reports.text import summary
 from lslam.types.run_record import RunRecord
 from lslam.types.trajectory import Trajectory
@@ -75,6 +77,17 @@ def test_only_files_that_exist_are_named(make_record: MakeRecord) -> None:
     found = lines(summary(record, None))
     assert found["map"] == str(record.folder / "map.pcd")
     assert "report" not in found
+
+
+def test_a_run_that_writes_nothing_names_no_file_of_another(
+    make_record: MakeRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "trajectory.tum").write_text("")
+    (tmp_path / "config.toml").write_text("an-other-run = 1")
+    monkeypatch.chdir(tmp_path)
+    record = make_record(5, folder=None)
+    assert "trajectory.tum" not in summary(record, None)
+    assert "an-other-run" not in render_report(record, None)
 
 
 @pytest.mark.parametrize("scans", [0, 1, 2])
