@@ -107,12 +107,11 @@ def _element(building: Building) -> tuple[str, int]:
 
 
 def _ways_of(data: OsmData, element: tuple[str, int]) -> set[int]:
-    """Numbers of the ways that the outlines of an element are made of."""
+    """Numbers of the ways of an element that are whole: no outline, as an extract's border may cut others."""
     kind, number = element
-    if kind == "way":
-        return {number} & set(data.ways)
-    members = data.relations[number].members if number in data.relations else ()
-    return {m.ref for m in members if m.kind == "way" and m.ref in data.ways}
+    members = data.relations[number].members if kind == "relation" and number in data.relations else ()
+    ways = {number} if kind == "way" else {m.ref for m in members if m.kind == "way"}
+    return {n for n in ways & set(data.ways) if all(node in data.nodes for node in data.ways[n].nodes)}
 
 
 def _held(data: OsmData, corrected: Iterable[tuple[str, int]]) -> set[int]:

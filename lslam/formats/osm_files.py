@@ -127,7 +127,7 @@ def from_overpass(tree: Any) -> OsmData:
     for element in tree["elements"]:
         try:
             _add_json(data, element)
-        except (AttributeError, KeyError, TypeError) as error:
+        except (AttributeError, KeyError, TypeError, OverflowError) as error:
             raise ValueError(f"an element without {error}: {str(element)[:80]}") from None
     return data
 

@@ -13,7 +13,7 @@ from osm_builders import ORIGIN, ExtractMaker, square_at
 from lslam.errors import InputError
 from lslam.formats.osm_buildings import buildings_of
 from lslam.formats.osm_corrections import corrected_osm
-from lslam.formats.osm_files import ATTRIBUTION, OsmData, from_overpass, read_osm, write_osm
+from lslam.formats.osm_files import ATTRIBUTION, Member, OsmData, Way, from_overpass, read_osm, write_osm
 from lslam.types.building import Building
 from lslam.types.building_correction import BuildingCorrection, CorrectedMap
 
@@ -96,6 +96,17 @@ def test_courtyards_move_with_their_building_and_relations_stay_whole() -> None:
     check_moved(data, after, "relation/7", d)
     assert after.relations == {7: data.relations[7]}
     assert set(after.ways) == {5, 6}
+
+
+def test_a_member_that_is_no_outline_and_that_the_border_cuts_is_left_out() -> None:
+    data, d = pair(), (-1.0, 0.5, 0.0)
+    data.add_way(Way(8, (next(iter(data.nodes)), 999), {"building:part": "yes"}))
+    members = (*data.relations[7].members, Member("way", 8, "part"), Member("way", 9, "part"))
+    data.relations[7] = replace(data.relations[7], members=members)
+    after = correct(data, {"relation/7": d})
+    check_moved(data, after, "relation/7", d)
+    assert set(after.ways) == {5, 6}
+    assert after.relations[7].members == members
 
 
 def test_what_stays_is_not_edited() -> None:
