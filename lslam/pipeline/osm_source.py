@@ -88,7 +88,7 @@ class OsmServer:
 
     def __init__(self, origin: Floats, gnss: GnssStream | None, config: OsmConfig, fetch: Fetch) -> None:
         self._origin, self._config, self._fetch = origin, config, fetch
-        self._fixes = None if gnss is None else (gnss.stamps_ns[gnss.is_place], _places(gnss, origin))
+        self._fixes = _places(gnss, origin) if gnss is not None and gnss.is_place.any() else None
         self._start: Floats | None = None
         self._buffer: OsmBuffer | None = None
 
@@ -139,8 +139,9 @@ def first_pose(config: OsmConfig) -> Floats:
     )
 
 
-def _places(gnss: GnssStream, origin: Floats) -> Floats:
-    return to_local(gnss.lat_lon_alt[gnss.is_place], origin)[:, :2]
+def _places(gnss: GnssStream, origin: Floats) -> tuple[NDArray[np.int64], Floats]:
+    """Stamps, ns, and places (F, 2), m, of the fixes that are some."""
+    return gnss.stamps_ns[gnss.is_place], to_local(gnss.lat_lon_alt[gnss.is_place], origin)[:, :2]
 
 
 def _merged(replies: list[dict[str, Any]]) -> OsmData:
@@ -157,7 +158,7 @@ def _kept_replies(folder: Path) -> OsmData:
         )
     try:
         return _merged([json.loads(file.read_bytes()) for file in files])
-    except (OSError, ValueError, AttributeError) as error:
+    except (OSError, ValueError, AttributeError, TypeError, RecursionError) as error:
         raise InputError(f"{folder} holds a reply that cannot be read ({error})") from None
 
 

@@ -58,7 +58,8 @@ def absent_buildings(
     if not len(seen) or not shapes:
         return found
     near, _ = STRtree(points(seen)).query([s.buffer(NEAR) for s in shapes], predicate="intersects")
-    doubted = [k for k in range(len(shapes)) if k not in set(near.tolist()) and not is_canopy(buildings[k])]
+    is_near = np.isin(np.arange(len(shapes)), near)
+    doubted = [k for k in range(len(shapes)) if not is_near[k] and not is_canopy(buildings[k])]
     cores = [shapes[k].buffer(-DEPTH / 2) for k in doubted]
     counts = np.zeros(len(doubted), np.int64)
     tree = STRtree(cores)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import threading
 import time
 from pathlib import Path
@@ -92,6 +91,16 @@ def test_fixes_say_the_way_better_than_a_heading() -> None:
     assert middles[:, 0].max() > 240.0
 
 
+def test_fixes_that_are_no_places_say_nothing_of_the_way() -> None:
+    fetch = Fetch()
+    blind = GnssStream(np.arange(3, dtype=np.int64), np.array([[0.0, 0.0, 0.0], [np.nan] * 3, [91.0, 8.0, 0.0]]), np.ones(3))
+    server = OsmServer(ORIGIN, blind, OsmConfig(heading_deg=0.0), fetch)
+    server.begin(None)
+    drive(server)
+    server.extract(ORIGIN)
+    assert asked_round(fetch.boxes)[:, 1].max() > 240.0
+
+
 def test_without_a_heading_the_circle_grows() -> None:
     fetch = Fetch()
     server = OsmServer(ORIGIN, None, OsmConfig(), fetch)
@@ -141,6 +150,7 @@ def test_a_sleeping_server_is_waited_for_once(monkeypatch: pytest.MonkeyPatch, t
 def test_a_folder_without_replies_and_one_with_a_broken_one(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"holds no replies"):
         OsmFile(tmp_path, ORIGIN)
-    (tmp_path / "000000.json").write_text(json.dumps([1]))
-    with pytest.raises(InputError, match=r"holds a reply that cannot be read"):
-        OsmFile(tmp_path, ORIGIN)
+    for broken in ("[1]", '{"elements": null}', '{"elements": 7}', '{"elements": [{"type": "node", "id": 1e999}]}', "[" * 100_000):
+        (tmp_path / "000000.json").write_text(broken)
+        with pytest.raises(InputError, match=r"holds a reply that cannot be read"):
+            OsmFile(tmp_path, ORIGIN)
