@@ -47,6 +47,19 @@ def angle(R: NDArray[Any]) -> Floats:
     return np.asarray(np.linalg.norm(log(R), axis=-1))
 
 
+def least_rotation(a: Floats, b: Floats) -> Floats:
+    """(3, 3) smallest rotation that takes the unit vector `a` (3,) to `b` (3,), half a turn square to them where opposite."""
+    axis, cosine = np.cross(a, b), float(a @ b)
+    sine = float(np.linalg.norm(axis))
+    if sine < 1e-12:
+        if cosine > 0:
+            return np.eye(3)
+        least = int(np.argmin(np.abs(a)))
+        axis = np.eye(3)[least] - a[least] * a
+        return exp(np.pi * axis / np.linalg.norm(axis))
+    return exp(axis / sine * np.arctan2(sine, cosine))
+
+
 def to_quaternion(R: NDArray[Any]) -> Floats:
     """(..., 3, 3) rotations to (..., 4) unit quaternions xyzw with w >= 0 (Shepperd's method: the largest term leads)."""
     R = np.asarray(R, np.float64)

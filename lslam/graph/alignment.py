@@ -44,7 +44,7 @@ def align(
     """
     if len(antenna) < max(min_fixes, 2):
         return None
-    level = _rotation_between(up, np.array([0.0, 0.0, 1.0]))
+    level = so3.least_rotation(up, np.array([0.0, 0.0, 1.0]))
     a = antenna @ level.T
     tilt = np.linalg.norm(a - np.median(a, axis=0), axis=1) * up_sigma
     judged = np.sqrt(sigmas**2 + (slack**2 + tilt**2)[:, None])
@@ -105,12 +105,3 @@ def _refined(T: Floats, a: Floats, fixes: Floats, sigmas: Floats, up_sigma: floa
         return np.concatenate([((fixes - se3.apply(M, a)) / sigmas).ravel(), tilt])
 
     return moved(np.asarray(least_squares(errors, np.zeros(6), loss="soft_l1").x))
-
-
-def _rotation_between(a: Floats, b: Floats) -> Floats:
-    """(3, 3) the smallest turn that takes unit vector `a` to `b`."""
-    axis, cosine = np.cross(a, b), float(a @ b)
-    sine = float(np.linalg.norm(axis))
-    if sine < 1e-12:
-        return np.eye(3) if cosine > 0 else np.diag([1.0, -1.0, -1.0])
-    return so3.exp(axis / sine * np.arctan2(sine, cosine))

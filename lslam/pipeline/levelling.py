@@ -67,7 +67,7 @@ def find_level(sequence: Sequence, results: list[ScanResult], config: Config) ->
     if up is None:
         problem = "" if config.input.level == "auto" else f"input.level = {wanted}: {why}; the world is not levelled"
         return Level(np.eye(3), f"{ORIGIN}, not levelled", problem)
-    R = least_rotation(up, UP)
+    R = so3.least_rotation(up, UP)
     tilt, known = np.rad2deg(float(so3.angle(R))), np.rad2deg(sigma)
     if tilt < SIGNIFICANT * known:
         return Level(
@@ -97,15 +97,6 @@ def level_results(results: list[ScanResult], level: Level) -> list[ScanResult]:
         )
         for r in results
     ]
-
-
-def least_rotation(a: Floats, b: Floats) -> Floats:
-    """(3, 3) smallest rotation that takes the unit vector `a` (3,) to `b` (3,); about x when they are opposite."""
-    axis, cosine = np.cross(a, b), float(a @ b)
-    sine = float(np.linalg.norm(axis))
-    if sine < 1e-12:
-        return np.eye(3) if cosine > 0 else np.diag([1.0, -1.0, -1.0])
-    return np.asarray(so3.exp(axis / sine * np.arctan2(sine, cosine)))
 
 
 def _up_by_gravity(results: list[ScanResult]) -> tuple[Floats | None, float]:

@@ -18,12 +18,12 @@ from lslam.config import Config
 from lslam.config.graph import GraphConfig
 from lslam.config.osm import OsmConfig
 from lslam.formats.osm_buildings import BuildingExtract
-from lslam.geometry import se2, se3
+from lslam.geometry import se2, se3, so3
 from lslam.graph.chi_square import quantile
 from lslam.graph.problem import PlanarPrior, Solution
 from lslam.keyframes.store import KeyframeStore
 from lslam.pipeline.graph_inputs import floor_planes
-from lslam.pipeline.levelling import UP, least_rotation
+from lslam.pipeline.levelling import UP
 from lslam.pipeline.osm_start import Start, known_start, see_walls, sought_start
 from lslam.priors.osm_map import OsmMap
 from lslam.priors.osm_prior import match_buildings, match_keyframe, shares
@@ -65,7 +65,7 @@ def locate(
     """
     osm = OsmMap(extract.buildings)
     up = _up_by_ground(store, config) if up is None else up
-    T_level = se3.make(least_rotation(up, UP), np.zeros(3)) if placed is None else placed
+    T_level = se3.make(so3.least_rotation(up, UP), np.zeros(3)) if placed is None else placed
     poses = T_level @ np.stack([k.T_world_lidar for k in store.keyframes])
     start = _start(store, poses, osm, config, placed)
     if start.problem:

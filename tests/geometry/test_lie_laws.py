@@ -95,3 +95,22 @@ def test_umeyama_finds_the_transform(xi: np.ndarray, scale: float) -> None:
 def test_umeyama_says_a_line_is_not_determined() -> None:
     line = np.outer(np.arange(5.0), [1, 2, 3])
     assert not umeyama.align(line, line)[2]
+
+
+def test_least_rotations() -> None:
+    x, up = np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0])
+    slanted = np.array([0.6, 0.0, 0.8])
+    for a, b in (
+        (up, up),
+        (-up, up),
+        (slanted, up),
+        (np.array([0.0, 1.0, 0.0]), up),
+        (-x, x),
+        (-slanted, slanted),
+        (x, slanted),
+    ):
+        R = so3.least_rotation(a, b)
+        np.testing.assert_allclose(R @ a, b, atol=1e-12)
+        np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
+        assert np.linalg.det(R) == pytest.approx(1)
+        assert so3.angle(R) == pytest.approx(np.arccos(a @ b), abs=1e-7)

@@ -14,7 +14,7 @@ from lslam.config import Config, load_config
 from lslam.evaluation.evaluate import evaluate
 from lslam.geometry import se3, so3
 from lslam.pipeline.front_end import to_trajectory
-from lslam.pipeline.levelling import find_level, least_rotation, level_results
+from lslam.pipeline.levelling import find_level, level_results
 from lslam.types.gravity import GravityDirection
 from lslam.types.scan import Scan
 from lslam.types.scan_result import ScanResult
@@ -151,12 +151,3 @@ def test_auto_without_an_imu_and_none_leave_the_world_alone() -> None:
     blind = [replace(r, gravity=None) for r in results]
     refused = find_level(empty(), blind, config("imu.use=true"))
     assert (refused.is_turned, refused.problem) == (False, ""), "the refused IMU is a problem of its own"
-
-
-def test_least_rotations() -> None:
-    up = np.array([0.0, 0.0, 1.0])
-    for a in (up, -up, np.array([0.6, 0.0, 0.8]), np.array([0.0, 1.0, 0.0])):
-        R = least_rotation(a, up)
-        np.testing.assert_allclose(R @ a, up, atol=1e-12)
-        np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
-        assert np.linalg.det(R) == pytest.approx(1)
