@@ -67,8 +67,8 @@ def read_study_csv(path: Path) -> list[StudyRow]:
         raise InputError(f"{path} is no results.csv of a study: it has no column {SCHEMA}")
     if other := next((cells[0] for cells in lines[1:] if cells[0] != str(VERSION)), None):
         raise InputError(
-            f"{path} was written by another version of lslam (study version {other}, this one reads {VERSION}): run the "
-            "study again, finished runs of this version are kept"
+            f"{path} was written by another version of lslam (study version {other}, this one reads {VERSION}): "
+            "--overwrite makes its runs anew, --out names another folder"
         )
     if missing := [name for name in _PLAIN if name not in header]:
         raise InputError(f"{path} is not complete: column {', '.join(missing)} is missing")

@@ -72,7 +72,7 @@ def estimate(
 ) -> Guess:
     """Time that `jobs` will take with `at_once` together; pilots go to a temporary folder.
 
-    Raises RunFailedError when no pilot of a method comes to its end, and what simulating raises.
+    Raises RunFailedError naming a pilot that does not come to its end, and what simulating raises.
     """
     follow = follow or Follow()
     seconds, warming_s, pilots = 0.0, 0.0, 0
@@ -181,11 +181,14 @@ def _run(pilots: Sequence[_Pilot], follow: Follow) -> list[float]:
     """Seconds of each; the first one pays for what is loaded and compiled."""
     jobs = [replace(p.job, folder=p.job.folder.with_name(f"{k}-{p.scans}")) for k, p in enumerate(pilots)]
     Local(title="pilot runs").run(jobs, follow, lambda job: None)
-    states = [read_state(job.state_file) for job in jobs]
-    failed = next((state for state in states if state is None or state.status not in FINAL), None)
-    if failed is not None:
-        raise RunFailedError(f"a pilot run of {jobs[0].name} failed, so the time is not known: {failed.reason}")
-    return [state.seconds for state in states if state is not None]
+    seconds = []
+    for job in jobs:
+        state = read_state(job.state_file)
+        if state is None or state.status not in FINAL:
+            reason = "it left no result" if state is None else state.reason
+            raise RunFailedError(f"a pilot run of {job.name} failed, so the time is not known: {reason}")
+        seconds.append(state.seconds)
+    return seconds
 
 
 def _costs(made: Sequence[Sequence[_Pilot]], times: Sequence[float]) -> tuple[Floats, Floats]:

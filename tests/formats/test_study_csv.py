@@ -56,7 +56,7 @@ def test_no_rows_are_a_file_too(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "sentence"),
     [
-        ("\n1,", "\n7,", "another version of lslam.*study version 7.*run the study again"),
+        ("\n1,", "\n7,", "another version of lslam.*study version 7.*--overwrite makes its runs anew"),
         ("study_version,", "version,", "no column study_version"),
         ("ate_se3", "ate", "column ate_se3 is missing"),
         (",0.2,", ",much,", "line 2: could not convert string to float: 'much'"),

@@ -138,6 +138,9 @@ def test_results_of_another_version_are_not_mixed(sweep: Sweep, made: list[Study
     file.write_text(file.read_text().replace("\n1,", "\n0,"))
     with pytest.raises(InputError, match="written by another version of lslam"):
         run_sweep(elsewhere(sweep, tmp_path / "out", True), Local(1))
+    anew = elsewhere(sweep, tmp_path / "out", parameters={"input.skip_frames": [2]}, beside=[])
+    rows = run_sweep(replace(anew, place=replace(anew.place, overwrite=True)), Local(1))
+    assert [repr(row) for row in read_study_csv(file)] == [repr(row) for row in rows]
 
 
 @pytest.mark.parametrize(
@@ -191,9 +194,9 @@ def test_the_time_is_estimated_from_short_runs(sweep: Sweep, tmp_path: Path) -> 
     assert twice.seconds > 5 * (guess.seconds - 3)
 
 
-def test_an_estimate_says_what_no_pilot_survives(sweep: Sweep) -> None:
-    jobs = expand_study(replace(sweep, study=study(beside=[], parameters={"input.start": [99]})))
-    with pytest.raises(RunFailedError, match=r"a pilot run of .* failed, so the time is not known: .*beyond the last"):
+def test_an_estimate_names_the_pilot_that_failed(sweep: Sweep) -> None:
+    jobs = expand_study(replace(sweep, study=study(beside=[], parameters={"input.start": [0, 99]})))
+    with pytest.raises(RunFailedError, match=r"a pilot run of block icp-start_99 seed 3 failed, .*: .*beyond the last"):
         estimate(jobs.jobs, jobs.contenders, 1)
 
 
