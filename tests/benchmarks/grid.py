@@ -37,7 +37,7 @@ from lslam.formats.trajectory_files import read_trajectory
 from lslam.geometry import se3
 from lslam.pipeline.run import RunOutcome, Watch, run
 from lslam.readers import open_sequence
-from lslam.simulation.record import record
+from lslam.simulation.record import NUMBER, record
 from lslam.simulation.scenario_files import scenario_names
 from lslam.simulation.scenarios import simulate
 from lslam.types.scan import Scan
@@ -217,7 +217,8 @@ def simulated(case: Case, scans: int, is_distorted: bool, out: Path) -> Path:
     if not length:
         given["count"] = min(scans, len(simulate(name, **given)))
     folder = out / "simulated" / f"{case.key('')}{'d' if is_distorted else 'c'}"
-    return record(simulate(name, **given), folder, resume=folder.is_dir()).sequence
+    recorded = folder / "sequences" / NUMBER
+    return recorded if recorded.is_dir() else record(simulate(name, **given), folder, resume=folder.is_dir()).sequence
 
 
 def fill(args: argparse.Namespace) -> None:
