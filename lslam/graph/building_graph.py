@@ -23,10 +23,8 @@ Floats = NDArray[np.float64]
 GROWTH, ROUNDS = 2.0, 30  # of graduated non-convexity, as in `graph.robust`
 PROBABILITY = 0.999  # a match within this quantile of its own distribution is right
 SUPPORT = 2  # other matches that have to say the same
-FREE, ALIKE = (
-    1e-9,
-    0.05,
-)  # shares of information below which a direction is free, and from which two matches know it alike
+# Shares of information below which a direction is free, and from which two matches know it alike.
+FREE, ALIKE = 1e-9, 0.05
 
 
 @dataclass(frozen=True)

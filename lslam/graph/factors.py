@@ -37,9 +37,7 @@ def between(constraint: Constraint, scale: float = 1.0, kernel: Any = None) -> A
 
     covariance = scale * well_conditioned(constraint.covariance)
     model = gtsam.noiseModel.Gaussian.Covariance(noise.to_body(covariance, constraint.T_a_b))
-    return gtsam.BetweenFactorPose3(
-        constraint.a, constraint.b, gtsam.Pose3(constraint.T_a_b), _robust(model, kernel)
-    )  # fmt: skip
+    return gtsam.BetweenFactorPose3(constraint.a, constraint.b, gtsam.Pose3(constraint.T_a_b), _robust(model, kernel))
 
 
 def position(fix: PositionFix, scale: float = 1.0, kernel: Any = None) -> Any:

@@ -29,9 +29,7 @@ NOISE = 0.1  # m
 LEAST_POINTS = 20
 LEAST_OVERLAP = 0.1  # share of the points that found a voxel
 FARTHEST = 5.0  # m from the prior; farther is no convergence
-FAR = (
-    1.0  # m; points farther from their nearest one are not asked for the fitness score (the range of hdl_graph_slam's)
-)
+FAR = 1.0  # m; points farther from their nearest one do not count in the fitness score (the range of hdl_graph_slam's)
 
 
 @dataclass(frozen=True)

@@ -21,9 +21,7 @@ Floats = NDArray[np.float64]
 ROUNDS = 20  # after which overlaps are left as they are
 STEPS = 10  # of Gauss-Newton
 HARD = 1e-4  # m; one sigma of a contact
-NESTED = (
-    0.5  # share of the smaller building's ground; a larger overlap on the map is meant so: a part of a building, a copy
-)
+NESTED = 0.5  # share of the smaller building's ground; if more overlaps on the map it is meant so: a part, a copy
 
 log = logging.getLogger("lslam")
 
@@ -77,13 +75,6 @@ def remove_overlaps(
     if left:
         log.warning("%d pairs of buildings overlap and no small move takes them apart", len(left))
     return Untangled(moved, tuple(c for held in contacts.values() for c in held), left)
-
-
-def contact_gap(contact: Contact, buildings: Sequence[Building], displacements: NDArray[np.float64]) -> float:
-    """Signed distance of a contact's point from its wall's line, m, positive outside."""
-    i, j = contact.owner, contact.other
-    value, _, _ = _residual(contact, buildings[i].middle, displacements[i], buildings[j].middle, displacements[j])
-    return value
 
 
 def _overlapping(solids: Sequence[Solid], displacements: Floats) -> list[tuple[int, int]]:
