@@ -163,4 +163,6 @@ def test_what_no_other_keyframe_says_is_not_believed() -> None:
     corners = [match(k, 5, seen_from(poses[k], middles[5], truth[5])) for k in keyframes[: SUPPORT + 1]]
     assert agreeing(middles, [*walls, *corners], poses).all()
     assert not agreeing(middles, corners[:SUPPORT], poses).any()
+    # Walls that lie as they should say nothing for what it claims along them.
+    assert agreeing(middles, [*walls, corners[0]], poses).tolist() == [True] * len(walls) + [False]
     assert agreeing(middles, [], poses).shape == (0,)

@@ -130,6 +130,35 @@ def test_covariances_of_buildings_do_not_depend_on_how_they_are_had(monkeypatch:
         )
 
 
+def test_what_nothing_was_matched_with_follows_the_others() -> None:
+    graph, _, middles, _, matches = drive(1)
+    more = np.vstack([middles, [[300.0, 0.0]]])
+    found = optimise_jointly(graph, more, matches, BELIEF, GraphConfig()).buildings
+    np.testing.assert_allclose(found.displacements[-1], [*found.displacements[:-1, :2].mean(axis=0), 0.0], atol=1e-9)
+    assert np.linalg.norm(found.shift) > 0.01
+    baseline = optimise_jointly(graph, more, matches, None, GraphConfig()).buildings
+    np.testing.assert_array_equal(baseline.displacements[-1], 0.0)
+
+
+def test_a_wall_that_fixes_less_is_judged_by_less() -> None:
+    """4.2 sigmas off are too much for the two directions of a lone wall, though not for six."""
+    graph, _, middles, off, matches = drive(0)
+    planar = se2.of_se3(graph.poses)
+    sure = replace(graph, odometry=[replace(c, covariance=1e-8 * np.eye(6)) for c in graph.odometry])
+    n = np.array([1.0, 0.0])
+    walls = [
+        replace(
+            m, rank=2, information=across(n, planar[m.keyframe]),
+            pose=se2.relative(planar[m.keyframe], np.append(middles[3], 0.0) + off[3]),
+        )
+        for m in matches if m.building == 3
+    ]  # fmt: skip
+    at, place = walls[0].keyframe, np.append(middles[3], 0.0) + off[3]
+    odd = replace(walls[0], pose=se2.relative(planar[at], np.add(place, [4.2 * 0.3, 0.0, 0.0])))
+    found = optimise_jointly(sure, middles, [*walls * 4, odd], BELIEF, GraphConfig())
+    assert found.buildings.believed.tolist() == [True] * (4 * len(walls)) + [False]
+
+
 def test_trusted_odometry_is_not_bent_by_walls() -> None:
     graph, _, middles, _, matches = drive(1)
     rigid = replace(graph, is_rigid=True, start_sigma=np.array([3.0, 3.0, 0.1]))

@@ -9,6 +9,7 @@ from graph_builders import graph_of, truth
 from lslam.config.graph import GraphConfig
 from lslam.geometry import se2, se3
 from lslam.graph import factors
+from lslam.graph.drift import drift_factor
 from lslam.graph.pose_graph import optimise
 from lslam.graph.problem import PlanarPrior, PoseGraph, PositionFix
 from lslam.graph.robust import joined
@@ -91,6 +92,29 @@ def test_a_match_with_the_wrong_house_is_given_up() -> None:
     solution = optimise(replace(graph, map_priors=priors), GraphConfig())
     assert [i for i, reason in enumerate(solution.map_reasons) if reason] == wrong
     assert off(solution.poses)[:, :2].max() < 0.15
+
+
+def test_a_share_of_a_match_counts_that_much() -> None:
+    pose = REAL[30]
+    whole = PlanarPrior(30, np.add(se2.of_se3(pose), [0.4, -0.3, 0.02]), SHARP, 3)
+    graph = replace(held(1), map_priors=[whole])
+    values = factors.start_values(graph, REAL)
+    errors = [
+        factors.planar(replace(whole, share=share), pose, factors.map_key(graph), scale).error(values)
+        for share, scale in ((1.0, 1.0), (0.25, 1.0), (1.0, 4.0))
+    ]
+    assert errors[0] == pytest.approx(0.5 * (0.4**2 * 100 + 0.3**2 * 100 + 0.02**2 * 1e4), rel=0.02)
+    np.testing.assert_allclose(errors[1:], errors[0] / 4, rtol=1e-9)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_what_the_map_is_off_by_is_not_odometrys_drift(seed: int) -> None:
+    graph = held(seed)
+    rng = np.random.default_rng(seed)
+    drawn = [replace(p, pose=np.add(p.pose, [*rng.normal(0, 0.5, 2), 0.0])) for p in graph.map_priors]
+    sure, doubtful = (replace(graph, map_priors=drawn, map_sigma=sigma) for sigma in (0.0, 0.7))
+    assert drift_factor(sure, [], GraphConfig()) > 0
+    assert drift_factor(doubtful, [], GraphConfig()) == 0
 
 
 def test_it_comes_to_the_same_keyframe_by_keyframe() -> None:

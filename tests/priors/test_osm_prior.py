@@ -60,6 +60,13 @@ def test_a_building_is_found_where_the_map_as_a_whole_is_off() -> None:
         np.testing.assert_allclose(moved, [*shift, 0.0], atol=1e-3)
 
 
+def test_buildings_are_sought_where_the_map_has_them() -> None:
+    """Ten metres about a place that is thirty metres away from the same place of the map."""
+    shift = np.array([30.0, -1.0])
+    found = match_buildings(view(TOWN.walls), np.append(shift, 0.0), shift, TOWN, OsmConfig(use_radius=10.0))
+    assert [one.building for one in found] == [0, 1, 2]
+
+
 def test_what_many_see_counts_once() -> None:
     one = view(TOWN.walls)
     pairs = [[[0, 0], [1, 1]], [[0, 0]], [[0, 0], [2, 5]], [[0, 0]]]
