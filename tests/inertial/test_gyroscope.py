@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from lslam.geometry import so3
-from lslam.inertial.gyroscope import RATE_NOISE, Gyroscope
+from lslam.inertial.gyroscope import BIAS_WALK, RATE_NOISE, Gyroscope
 from lslam.inertial.integrate import Increments, integrate
 from lslam.inertial.kalman import update
 from lslam.types.imu import ImuStream
@@ -110,6 +110,21 @@ def test_a_turn_of_no_quality_teaches_nothing() -> None:
     again = gyroscope.learnt(step, np.array([0.01, 0.0, -0.01]), 1e6 * np.eye(3))
     np.testing.assert_allclose(again.axes, gyroscope.axes, atol=1e-8)
     np.testing.assert_allclose(again.bias, gyroscope.bias, atol=1e-8)
+
+
+def test_a_bias_that_nobody_watches_wanders_and_axes_do_not() -> None:
+    still = integrate(stream(np.zeros((41, 3))), np.array([0, STEP_NS]), np.zeros(3), np.zeros(3))
+    gyroscope = Gyroscope(np.zeros(3))
+    for _ in range(3):
+        gyroscope = gyroscope.learnt(still, np.zeros(3), 1e6 * np.eye(3))
+    expected = np.diag(np.repeat([BIAS_WALK**2 * 3 * 0.2, 0.0], [3, 9]))
+    np.testing.assert_allclose(gyroscope.covariance, expected, rtol=1e-6, atol=1e-18)
+
+
+def test_one_absurd_turn_is_no_noise_of_the_device() -> None:
+    still = integrate(stream(np.zeros((41, 3))), np.array([0, STEP_NS]), np.zeros(3), np.zeros(3))
+    found = [Gyroscope(np.zeros(3)).learnt(still, np.array([turn, 0, 0]), 1e-8 * np.eye(3)) for turn in (0.1, 2.0)]
+    assert RATE_NOISE**2 < found[0].rate_variance == found[1].rate_variance
 
 
 def test_an_update_agrees_with_the_sum_of_informations() -> None:

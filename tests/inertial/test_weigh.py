@@ -96,6 +96,22 @@ def test_a_direction_that_registration_leaves_open_is_the_imus() -> None:
     assert out.registration_covariance[0, 0] < 1e-2
 
 
+def test_a_poor_registration_teaches_the_gyroscope_nothing() -> None:
+    """Neither by what it saw, nor by agreeing with the gyroscope once it was weighed against it."""
+    motion = motion_of()
+    stamp, true = begun(motion)
+    before = motion.estimate.gyroscope
+    seen = true @ se3.make(so3.exp(np.array([0, 0, 0.02])), np.zeros(3))
+    prior = motion.sweep(stamp, 0.0)
+    out = motion.weigh(result_of(3, stamp, seen, np.diag([1e-6] * 3 + [1.0] * 3)), prior)
+    assert so3.angle(se3.relative(out.T_world_lidar, true)[:3, :3]) < 2e-3
+    motion.correct(stamp, out.T_world_lidar, prior)
+    after = motion.estimate.gyroscope
+    np.testing.assert_allclose(after.bias, before.bias, atol=1e-6)
+    np.testing.assert_allclose(after.axes, before.axes, atol=1e-6)
+    assert (np.diag(after.covariance) > (1 - 1e-5) * np.diag(before.covariance)).all()
+
+
 def test_an_old_map_counts_for_more_than_one_scan() -> None:
     motion = motion_of()
     stamp, true = begun(motion)

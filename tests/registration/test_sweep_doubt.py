@@ -50,6 +50,30 @@ def test_a_steady_acceleration_is_told_to_its_last_millimetre(every: int) -> Non
     assert np.abs(S[3:, 3:]).max() < 1e-12
 
 
+def test_before_anything_is_known_a_car_may_brake_and_a_hand_turn() -> None:
+    """3 m/s2 and 1 rad/s2 over a sweep T put its start off by a T^2 / 6; the second scan cannot tell, the third can."""
+    doubt = SweepDoubt()
+    usual = (np.repeat([3.0, 1.0], 3) * SPAN**2 / 6) ** 2
+    for k in range(2):
+        S = doubt.observe(steady(k, 10.0), k * 10**8, at(k), is_registered=True)
+        np.testing.assert_allclose(S, np.diag(usual))
+    assert not doubt.observe(steady(2.0, 10.0), 2 * 10**8, at(2.0), is_registered=True).any()
+
+
+def test_doubt_lies_along_the_axes_of_the_world() -> None:
+    """The same motion in a world that is turned: the same doubt, turned."""
+    rng = np.random.default_rng(2)
+    turn = se3.make(so3.exp(np.array([0.4, -0.3, 1.5])), np.zeros(3))
+    straight, turned = SweepDoubt(), SweepDoubt()
+    for k in range(12):
+        prior, pose = steady(k, 10.0), at(k + 0.01 * rng.normal())
+        S = straight.observe(prior, k * 10**8, pose, is_registered=True)
+        found = turned.observe(MotionPrior(prior.times, turn @ prior.poses), k * 10**8, turn @ pose, is_registered=True)
+    R = np.kron(np.eye(2), turn[:3, :3])
+    np.testing.assert_allclose(found, R @ S @ R.T, atol=1e-15)
+    assert S[0, 0] > 2 * S[1, 1]
+
+
 def test_scans_of_one_instant_have_no_motion_to_doubt() -> None:
     doubt = SweepDoubt()
     for k in range(5):

@@ -78,6 +78,15 @@ def test_a_failed_scan_doubts_its_own_pose_only() -> None:
     np.testing.assert_allclose(np.diag(after), np.diag(expected), rtol=0.2)
 
 
+def test_doubt_about_sweeps_adds_up_like_that_of_registrations_and_that_of_the_first_stays() -> None:
+    """The first sweep's is twice as far off, so four times the covariance, in all poses."""
+    own, sweep = np.diag([1e-4, 2e-4, 3e-4, 0, 0, 0]), np.diag([7e-5, 0, 1e-5, 0, 0, 0])
+    uncertainty = PoseUncertainty()
+    for k in range(41):
+        now = uncertainty.add(result(0.5 * k, own), sweep)
+        np.testing.assert_allclose(now, (1 + 0.5 * k / LEVER) * (own + sweep) + 4 * sweep, atol=1e-16)
+
+
 def test_no_covariance_gives_none() -> None:
     assert PoseUncertainty().add(result(1.0, None)) is None
 
