@@ -70,6 +70,29 @@ def test_weights_follow_the_runs_behind_a_mean() -> None:
     assert many.coefficients[0] > 18
 
 
+def test_mean_over_four_runs_counts_as_four_means_over_one() -> None:
+    draw = np.random.default_rng(2)
+    times = (20 * SHARES + 3) * (1 + 0.05 * draw.standard_normal(len(SHARES)))
+    runs = np.array([4, 1, 1, 2, 1, 1, 3, 1, 1, 1])
+    means = fit_law("linear", ("x",), SHARES, times, runs.astype(float))
+    ones = fit_law("linear", ("x",), np.repeat(SHARES, runs), np.repeat(times, runs))
+    assert means is not None
+    assert ones is not None
+    assert means.coefficients == pytest.approx(ones.coefficients)
+
+
+def test_no_weight_is_above_that_of_the_shortest_time() -> None:
+    x, times = np.arange(1.0, 9.0), np.array([0.4, 0.5, 2, 4, 6, 8, 10, 12])
+    law = fit_law("linear", ("x",), x, times)
+    assert law is not None
+    assert law.fitted.min() < 0.9 * times.min()
+    # By hand: the law is the fit under the weights that it gives.
+    weights = 1 / np.maximum(law.fitted, 0.4)
+    columns = np.stack([x, np.ones(8)], 1) * weights[:, None]
+    by_hand = np.linalg.solve(columns.T @ columns, columns.T @ (times * weights))
+    assert law.coefficients == pytest.approx(by_hand, rel=2e-3)
+
+
 def test_band_is_that_of_an_independent_fit_by_scipy() -> None:
     from scipy.optimize import curve_fit
     from scipy.stats import t as student

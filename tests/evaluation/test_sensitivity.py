@@ -66,6 +66,15 @@ def test_divergence_needs_more_than_half_of_the_seeds() -> None:
     assert divergence(curves_of(two)[0]).last_good == 7
 
 
+def test_divergence_goes_by_most_of_the_values_that_were_run() -> None:
+    curve = curves_of(rows_of(range(1, 13), diverges=lambda v: v in (8, 10, 11, 12)))[0]
+    found = divergence(curve)
+    assert (found.last_good, found.first_bad, found.alone) == (7, 8, ())
+    rows = rows_of(range(1, 13), diverges=lambda v: v == 8)
+    rows = [replace(r, status="crashed") if r.parameters["input.skip_frames"] > 8 else r for r in rows]
+    assert divergence(curves_of(rows)[0]).first_bad == 8
+
+
 def test_run_that_failed_for_another_reason_says_nothing_about_its_value() -> None:
     rows = [replace(r, status="failed", reason="disk full") if r.seed else r for r in rows_of(SKIPS)]
     result = evaluate_study(rows)[0]
@@ -95,6 +104,8 @@ def test_elbow_is_where_the_plateau_begins() -> None:
     lost = np.array([True, False, False, False, False, False])
     assert elbow(values, np.array([np.nan, 1, 1, 1, 1, 1]), lost) == 0.2
     assert elbow(values, np.full(6, np.nan), np.ones(6, bool)) is None
+    lost = np.array([False, True, False, False, False, False])
+    assert elbow(values, np.array([1, np.nan, 1, 1, 1, 1]), lost) == 0.3
 
 
 def test_efficiency_of_a_study_peaks_where_error_times_time_is_least() -> None:
@@ -105,6 +116,17 @@ def test_efficiency_of_a_study_peaks_where_error_times_time_is_least() -> None:
     assert best is not None
     assert best.low <= 6 <= best.high
     assert 4 <= best.value <= 8
+
+
+def test_optimum_is_not_where_one_seed_was_lucky() -> None:
+    luck = {0: 0.01, 1: 0.9, 2: 0.9}
+    rows = [
+        replace(row, thesis_rmse=luck[row.seed]) if row.parameters["input.skip_frames"] == 3 else row
+        for row in rows_of([1, 2, 3, 4], error=lambda v: 0.5 if v != 2 else 0.4)
+    ]
+    best = evaluate_study(rows)[0].results[0].optimum
+    assert best is not None
+    assert best.value == 2
 
 
 def test_laws_of_total_time_follow_the_parameter() -> None:
@@ -135,6 +157,12 @@ def test_product_law_is_fitted_over_both_parameters_in_either_order(is_skip_firs
     law = evaluate_study(rows)[0].products["thesis-icp"]
     assert law.text == "T = 152.2 random_share / skip_frames"
     assert law.r2 == pytest.approx(1)
+
+
+@pytest.mark.parametrize("others", [("grid", "random", "voxel"), (False, True)])
+def test_second_parameter_that_is_no_number_makes_no_product(others: tuple[str | bool, ...]) -> None:
+    rows = [row for other in others for row in rows_of([1, 2, 4, 8], at={"preprocess.downsample": other})]
+    assert evaluate_study(rows)[0].products == {}
 
 
 def test_words_have_curves_and_no_law() -> None:
