@@ -19,8 +19,9 @@ Floats = NDArray[np.float64]
 
 # One sigma of scale, misalignment and mounting together: a data sheet's 2 % across the axes, a degree of mounting.
 AXES_SIGMA = 0.025
-# rad/s per sqrt(Hz) that no constant error explains, at the least; rad/s per sqrt(s) by which the bias wanders.
-RATE_NOISE, BIAS_WALK = np.deg2rad(0.02), np.deg2rad(0.01)
+# rad/s per sqrt(Hz) that no constant error explains, at the least; rad/s per sqrt(s) by which the bias wanders: that of Kalibr's
+# ADIS16448. Ten times more, and turns over more than some seconds were registration's again, with all its noise.
+RATE_NOISE, BIAS_WALK = np.deg2rad(0.01), np.deg2rad(0.001)
 # The noise is learnt over so many scans.
 MEMORY = 20
 

@@ -19,7 +19,8 @@ Floats = NDArray[np.float64]
 # One sigma before anything is known: any vehicle's speed; consumer devices' biases; a bias by the mean turn.
 ANY_SPEED, ANY_ACCEL_BIAS, ANY_GYRO_BIAS, MEAN_GYRO_BIAS = 50.0, 0.5, 0.1, 0.02
 # Given biases: axes up to 2 % askew (a consumer device's data sheet) show as much of gravity as one more: two sigma.
-GIVEN_ACCEL_BIAS, GIVEN_GYRO_BIAS, GIVEN_SPEED = 0.1, 2e-3, 0.3
+# A bias that is given was measured over minutes; one second that looks like standing may be a slow turn.
+GIVEN_ACCEL_BIAS, GIVEN_GYRO_BIAS, STANDING_GYRO_BIAS, GIVEN_SPEED = 0.1, 2e-4, 2e-3, 0.3
 # A given bias may differ from the mean rate error of the first seconds by so much, rad/s: misaligned axes add to that.
 MOST_BIAS_ERROR = 0.03
 # A standing sensor: spread of rates (rad/s) and forces (m/s2) over a second, and how far registration moves it (m).
@@ -97,6 +98,10 @@ def start(
     usable = replace(cleaned.imu, stamps_ns=cleaned.imu.stamps_ns + moved)
     guess, is_static = _first_guess(usable, T_lidar_imu, stamps_ns, poses, config, agreement.gyro_bias)
     estimate = _learnt(usable, T_lidar_imu, guess, first, config)
+    if config.gyro_bias is not None:
+        bias = np.array(config.gyro_bias)
+        known = Gyroscope.of_bias(bias, _doubt(bias, estimate.gyroscope))
+        estimate = _learnt(usable, T_lidar_imu, replace(guess, gyroscope=known), first, config)
     notes.append("IMU aligned " + ("while standing" if is_static else "while moving"))
     return Start(usable, T_lidar_imu, estimate, offset, agreement.is_judged, is_static, notes, problems)
 
@@ -115,6 +120,12 @@ def _without_wrong_bias(config: ImuConfig, seen: Floats | None, problems: list[s
     return config.model_copy(update={"gyro_bias": None, "accel_bias": None})
 
 
+def _doubt(given: Floats, seen: Gyroscope) -> float:
+    """One sigma of a given bias (3,), rad/s: as far as what was `seen` from a guess that hardly holds it contradicts it."""
+    beyond = np.abs(given - seen.bias) - 3 * np.sqrt(np.diag(seen.covariance)[:3])
+    return max(float(beyond.max()), GIVEN_GYRO_BIAS)
+
+
 def _first_guess(
     imu: ImuStream, T_lidar_imu: Floats, stamps_ns: NDArray[np.int64], poses: Floats, config: ImuConfig,
     mean_bias: Floats | None,
@@ -123,10 +134,10 @@ def _first_guess(
     stands, rates = _is_standing(imu, stamps_ns, poses)
     gyro_bias, gyro_sigma = (np.zeros(3), ANY_GYRO_BIAS) if mean_bias is None else (mean_bias, MEAN_GYRO_BIAS)
     if stands:
-        gyro_bias, gyro_sigma = rates, GIVEN_GYRO_BIAS
+        gyro_bias, gyro_sigma = rates, STANDING_GYRO_BIAS
     accel_bias, accel_sigma = np.zeros(3), ANY_ACCEL_BIAS
     if config.gyro_bias is not None:
-        gyro_bias, gyro_sigma = np.array(config.gyro_bias), GIVEN_GYRO_BIAS
+        gyro_bias, gyro_sigma = np.array(config.gyro_bias), MOST_BIAS_ERROR
     if config.accel_bias is not None:
         accel_bias, accel_sigma = np.array(config.accel_bias), GIVEN_ACCEL_BIAS
     # Force and gravity only say their difference at first: a bias tilts what is taken for vertical.

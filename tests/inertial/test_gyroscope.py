@@ -144,3 +144,16 @@ def test_an_outlier_moves_the_mean_less_than_what_is_likely() -> None:
     likely = update(x, P, H, np.array([4.0]), noise)[0]
     outlier = update(x, P, H, np.array([400.0]), noise)[0]
     assert 0 < outlier[0] < likely[0]
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_turns_over_many_steps_are_the_gyroscopes_not_the_noise_of_registration(seed: int) -> None:
+    """A minute against registrations wrong by a tenth of a degree: a bias that may wander fast follows their noise."""
+    rng = np.random.default_rng(seed)
+    read = stream(np.tile(BIAS, (int(60e9 / SAMPLE_NS) + 1, 1)))
+    gyroscope, seen_to, errors = Gyroscope.of_bias(BIAS, 2e-4), np.deg2rad(0.1), []
+    for step in turns(read, Gyroscope(BIAS), 300):
+        errors.append(gyroscope.bias - BIAS)
+        off = (gyroscope.bias - BIAS) * step.seconds[-1]
+        gyroscope = gyroscope.learnt(step, rng.normal(0, seen_to, 3) + off, seen_to**2 * np.eye(3))
+    assert np.sqrt(np.mean(np.square(errors))) < np.deg2rad(0.01)

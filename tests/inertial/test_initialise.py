@@ -78,6 +78,15 @@ def test_a_given_offset_and_given_values_are_taken() -> None:
     assert np.linalg.norm(found.estimate.velocity - [9.0, 0, 0]) < 0.1
 
 
+@pytest.mark.parametrize("make", [walk, drone])
+def test_a_given_bias_is_known_unless_the_first_scans_contradict_it(make: object) -> None:
+    drive: SimulatedDrive = make()  # type: ignore[operator]
+    right, wrong = (begun(drive, gyro_bias=(given,) * 3).estimate.gyroscope for given in (GYRO_BIAS, GYRO_BIAS - 0.025))
+    assert np.abs(right.bias - GYRO_BIAS).max() < 5e-4
+    assert np.sqrt(np.diag(right.covariance)[:3]).max() < 5e-4
+    assert np.abs(wrong.bias - GYRO_BIAS).max() < 0.004
+
+
 def test_g_is_converted_and_said() -> None:
     drive = walk()
     imu = stream_of(drive)

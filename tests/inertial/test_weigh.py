@@ -116,7 +116,7 @@ def test_an_old_map_counts_for_more_than_one_scan() -> None:
     motion = motion_of()
     stamp, true = begun(motion)
     seen = true @ se3.make(so3.exp(np.array([0, 0, 4e-4])), np.zeros(3))
-    C = np.diag([1e-6] * 3 + [1e-7] * 3)
+    C = np.diag([1e-6] * 3 + [1e-8] * 3)
     moved = [
         so3.angle(
             se3.relative(
