@@ -65,6 +65,13 @@ def test_a_gis_sees_corrected_outlines_with_the_attribution(tmp_path: Path) -> N
     tree = json.loads(path.read_text())
     assert "OpenStreetMap contributors, ODbL 1.0" in tree["attribution"]
     assert [f["properties"]["status"] for f in tree["features"]] == ["seen", "unseen", "absent", "new", "new"]
+    overlaps = {
+        f["properties"]["@id"]: f["properties"]["overlaps"] for f in tree["features"] if "@id" in f["properties"]
+    }
+    for i, j in found().left:
+        one, other = (found().buildings[k].building.osm_id for k in (i, j))
+        assert other in overlaps[one], "each names the other"
+        assert one in overlaps[other]
     extract = read_buildings(path, ORIGIN)
     assert [b.osm_id for b in extract.buildings] == ["way/12", "way/-3", "relation/5"]
     np.testing.assert_allclose(

@@ -93,6 +93,35 @@ def test_two_keyframes_are_not_enough() -> None:
     assert len(new_walls([on_map[0], *on_map[2:]], sights[4:6], poses)) == 0
 
 
+def thrice(walls: list[list[list[float]]], views: list[list[float]]) -> tuple[list[KeyframeMatch], dict[int, Floats]]:
+    """Three keyframes at the origin that saw these walls from these places."""
+    pose = np.zeros(3)
+    sight = KeyframeMatch(0, np.array(walls), np.array(views), pose, np.ones(3), pose, np.eye(3))
+    return [replace(sight, keyframe=k) for k in range(3)], dict.fromkeys(range(3), pose)
+
+
+def test_a_house_is_absent_only_if_every_way_to_what_is_seen_leads_well_through_it() -> None:
+    on_map = [house(0, FRONT)]
+    behind = [[[8.0, 30.0], [2.0, 30.0]]]
+    assert absent_buildings(on_map, *thrice(behind, [[5.0, 0.0], [4.0, 0.0]])).all()
+    assert not absent_buildings(on_map, *thrice(behind, [[5.0, 0.0], [-60.0, 0.0]])).any()
+    grazed = [[[0.1, 30.0], [0.1, 36.0]]]
+    assert not absent_buildings(on_map, *thrice(grazed, [[0.1, 0.0], [0.1, 2.0]])).any()
+
+
+def test_short_walls_and_those_inside_a_house_are_not_new() -> None:
+    on_map = [house(0, FRONT)]
+    front, hedge, room = ([[[x + n, y], [x, y]]] for x, y, n in ((30.0, 5.0, 8.0), (30.0, 5.0, 5.0), (1.5, 13.5, 7.0)))
+    assert len(new_walls(on_map, *thrice(front, [[0.0, 0.0]]))) == 1
+    assert len(new_walls(on_map, *thrice(hedge, [[0.0, 0.0]]))) == 0
+    assert len(new_walls(on_map, *thrice(room, [[0.0, 0.0]]))) == 0
+    assert len(new_walls([house(0, 100.0)], *thrice(room, [[0.0, 0.0]]))) == 1
+    for ends in ([[1.0, 8.0], [9.0, 8.0]], [[9.0, 8.0], [1.0, 8.0]]):
+        assert len(new_walls(on_map, *thrice([ends], [[0.0, 0.0]]))) == 0, (
+            "a metre before the front, whichever way it is told"
+        )
+
+
 def test_roofs_on_posts_are_looked_through_and_stay() -> None:
     on_map = street()
     on_map[1] = replace(on_map[1], tags={"building": "roof"})

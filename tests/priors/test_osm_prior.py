@@ -67,6 +67,16 @@ def test_buildings_are_sought_where_the_map_has_them() -> None:
     assert [one.building for one in found] == [0, 1, 2]
 
 
+def test_a_building_that_may_be_either_of_two_is_not_moved() -> None:
+    house = OsmMap(TOWN.buildings[:1])
+    off = np.array([1.6, 1.0])
+    twice = np.concatenate([house.walls + off, house.walls - off])
+    found = match_buildings(view(twice), np.zeros(3), np.zeros(2), house, OsmConfig())
+    assert [(one.verdict, one.reason) for one in found] == [("rejected", "another place fits nearly as well")]
+    alone = match_buildings(view(house.walls + off), np.zeros(3), np.zeros(2), house, OsmConfig())
+    assert [(one.verdict, one.reason) for one in alone] == [("accepted", "")]
+
+
 def test_what_many_see_counts_once() -> None:
     one = view(TOWN.walls)
     pairs = [[[0, 0], [1, 1]], [[0, 0]], [[0, 0], [2, 5]], [[0, 0]]]
