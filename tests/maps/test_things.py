@@ -79,10 +79,10 @@ def test_nothing_in_reach_is_nothing() -> None:
 
 
 def test_a_thing_goes_whole_when_enough_of_it_moves() -> None:
-    labels = np.repeat([0, 1, 2, 3], [10, 10, 10, 2])
-    moves = np.zeros(32, np.bool_)
+    labels = np.repeat([0, 1, 2, 3], [10, 10, 10, 4])
+    moves = np.zeros(34, np.bool_)
     moves[[0, 1, 2, 3, 4, 5]] = True  # of the ground
-    moves[10:14] = moves[20:23] = moves[30:] = True
+    moves[10:14] = moves[20:23] = moves[30:32] = True  # the last: half of it, but only two points
     expected = moves.copy()
     expected[10:20] = True
     assert whole(moves, labels, share=0.4, least=3).tolist() == expected.tolist()

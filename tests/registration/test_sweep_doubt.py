@@ -110,6 +110,22 @@ def test_the_first_sweep_is_in_all_poses() -> None:
     assert found.covariance[2, 2] > one.covariance[2, 2] + 90**2 * found.registration_covariance[4, 4]
 
 
+def test_a_calm_ride_later_says_nothing_of_the_first_sweep() -> None:
+    rng, C = np.random.default_rng(3), 1e-12 * np.eye(6)
+    uncertainty, doubts = PoseUncertainty(), []
+    for k in range(80):
+        pose = at(0.1 * k + (0.02 * rng.normal() if k < 12 else 0.0))
+        located = RegistrationResult(pose, covariance=C, lever_arm=1e5)
+        found = uncertainty.stamped(ScanResult(k, k * 10**8, pose), located, steady(pose[0, 3], 1.0))
+        assert found.covariance is not None
+        assert found.registration_covariance is not None
+        doubts.append((found.covariance[0, 0], found.registration_covariance[0, 0]))
+    shaken, calm = doubts[11], doubts[-1]
+    assert calm[1] < 0.05 * shaken[1]
+    # What is left of a shaken pose's doubt is that of the first sweep: four of five parts.
+    assert calm[0] == pytest.approx(0.8 * shaken[0], rel=0.1)
+
+
 def test_covariances_of_a_shaken_sensor_are_honest() -> None:
     """Carried by a walker, deskewed at constant velocity: registrations alone are a hundred times too sure (1600).
 
