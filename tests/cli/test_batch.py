@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -10,9 +11,12 @@ from pathlib import Path
 import pytest
 from calling import COMMAND, Done, assert_one_sentence, environment, lslam, sample_copy
 
-from lslam.cli.batch import command
+from lslam.cli.batch import _line, command
+from lslam.config.batch import BatchConfig
 from lslam.errors import LslamError
 from lslam.formats.study_csv import read_study_csv
+from lslam.studies.batch import expand_batch, run_words
+from lslam.studies.expanded import Place
 
 JOBS = """
 [config]
@@ -90,6 +94,24 @@ def test_lines_are_understood_as_lslam_run_does_and_a_failure_is_exit_1(sample: 
     twice = piped(text, "--out", tmp_path / "other")
     assert twice.returncode == 2, "what lies in a folder of one's own is not lost"
     assert f"the folder {own} of" in twice.stderr
+
+
+def test_a_path_with_a_space_is_one_word_of_the_command_it_is_remembered_by(tmp_path: Path) -> None:
+    path = sample_copy(tmp_path / "my recordings", 2)
+    (line,) = [
+        _line(*found, {"settings": (), "data_root": None}) for found in run_words(f"lslam run '{path}' --count 1")
+    ]
+    assert shlex.split(line.words) == [str(path), "--count", "1"]
+
+
+def test_presets_whose_names_differ_in_a_space_are_runs_of_their_own(sample: Path, tmp_path: Path) -> None:
+    files = [tmp_path / name for name in ("my voxel.toml", "my_voxel.toml")]
+    for file in files:
+        file.write_text("")
+    batch = BatchConfig.model_validate({"jobs": [{"sequences": [str(sample)], "methods": [str(f)]} for f in files]})
+    jobs = expand_batch(batch, Place(tmp_path / "out")).jobs
+    assert [job.method for job in jobs] == ["my_voxel", "my_voxel-2"]
+    assert jobs[0].folder != jobs[1].folder
 
 
 @pytest.mark.parametrize(
