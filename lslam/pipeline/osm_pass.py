@@ -54,6 +54,11 @@ class Located:
     start_sigma: Floats = field(default_factory=lambda: np.zeros(3))
     problem: str = ""
 
+    @property
+    def accepted(self) -> list[KeyframeMatch]:
+        """Those of `priors`."""
+        return [match for match in self.matches if match.verdict == "accepted"]
+
 
 def locate(
     extract: BuildingExtract, store: KeyframeStore, up: Floats | None, config: Config, placed: Floats | None = None
