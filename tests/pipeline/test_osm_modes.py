@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -128,6 +129,19 @@ def test_the_way_back_begins_where_walls_fix_everything(monkeypatch: pytest.Monk
     found = osm_pass._both_ways([0] * 4, np.zeros((4, 4, 4)), None, track, Config())  # type: ignore[arg-type]
     assert asked == [[0, 1, 2, 3], [3, 2, 1, 0]]
     assert [m.keyframe for m in found] == [0, 1, 2, 3]
+
+
+def test_a_match_far_from_odometry_is_refused() -> None:
+    config = Config()
+    track = OsmTrack(np.zeros(3), np.array([0.1, 0.1, 0.01]), 1.0, 1e-4, np.array([0.5, 0.5, 0.02]))
+    near = KeyframeMatch(
+        4, np.zeros((0, 2, 2)), np.zeros((1, 2)), np.zeros(3), np.ones(3), np.array([0.4, -0.3, 0.0]),
+        np.diag([100.0, 100.0, 1e4]), 3, "edges", pairs=np.zeros((5, 2), np.int64),
+    )  # fmt: skip
+    assert osm_pass._gated(near, track, config.osm, config.graph).verdict == "accepted"
+    far = osm_pass._gated(replace(near, pose=np.array([4.0, -3.0, 0.0])), track, config.osm, config.graph)
+    assert far.verdict == "rejected"
+    assert far.reason.endswith("times as far from odometry as it may have drifted")
 
 
 @pytest.mark.parametrize(
