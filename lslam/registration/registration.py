@@ -154,8 +154,9 @@ class Registration(Stateful):
         for promising in distinct(tried, best.T_world_lidar):
             start = promising.T_world_lidar
             found = self._judge(self._coarse_to_fine(points, start), start)
-            needed = CLEARLY * first.share(seen, best.T_world_lidar) if best.ok else -1.0
-            if found.ok and first.share(seen, found.T_world_lidar) > needed:
+            share, known = first.share(seen, found.T_world_lidar), first.share(seen, best.T_world_lidar)
+            # A failed one has the prior's pose: where less stands than there, nothing is found.
+            if found.ok and (share > CLEARLY * known if best.ok else share >= known):
                 best = replace(found, prior_error=correction(T_prior, found.T_world_lidar))
         return best
 
