@@ -25,9 +25,8 @@ Grid = tuple[Floats, NDArray[np.uint16], Ints, Longs, Ints]
 # H, facts of edges and of planes, last step, iterations, converged, unobserved directions and these as rows
 Aligned = tuple[Floats, Floats, Floats, Floats, int, bool, int, Floats]
 
-# What all features together hold no better than one planar point holds its surface is unobserved: a few false edges do as
-# much. From scan to scan no map takes an error back, and it goes on as velocity: half a point's noise is asked for there.
-LEAST_ON_MAP, LEAST_ON_SCAN = 1.0, 4.0
+# From scan to scan no map takes an error back, and it goes on as velocity: half a point's noise is asked for there.
+TIMES_ON_SCAN = 4.0
 
 
 @inline
@@ -46,10 +45,11 @@ def _within(allowed: Floats, H: Floats) -> Floats:
 @kernel
 def align_to_scan(edges: Floats, planes: Floats, R: Floats, t: Floats, scale_start: float, scale_end: float, decay: float,
                   max_iterations: int, step_m: float, step_rad: float, edge_variance: float, plane_variance: float,
-                  weak_share: float, allowed: Floats, one_to_many: bool, size: float, reach: float,
+                  weak_share: float, least: float, allowed: Floats, one_to_many: bool, size: float, reach: float,
                   edge_grid: Grid, plane_grid: Grid, normals: Floats) -> Aligned:  # fmt: skip
     """Register edges (E, 3) and planar points (P, 3) on two grids of `feature_grid` with cells of `size`, m.
 
+    A direction is observed when all hold it better than `least` planar points on a map would.
     Features within `reach`, m, are matched: rings lie farther apart than the kernel is wide.
     """
     H, S, g, d, weak = np.empty((6, 6)), np.empty((6, 6)), np.empty(6), np.zeros(6), np.zeros((6, 6))
@@ -75,7 +75,14 @@ def align_to_scan(edges: Floats, planes: Floats, R: Floats, t: Floats, scale_sta
             break
         # What the projector takes away has no eigenvalue left, so that the step never looks along it in g.
         weak_count = solve_on_surfaces(
-            _within(allowed, H), _within(allowed, S), g, facts, weak_share, LEAST_ON_SCAN / plane_variance, d, weak
+            _within(allowed, H),
+            _within(allowed, S),
+            g,
+            facts,
+            weak_share,
+            TIMES_ON_SCAN * least / plane_variance,
+            d,
+            weak,
         )
         move, turn = step_norms(d)
         if not move_by(d, move, turn, scale, R, t):
@@ -90,7 +97,7 @@ def align_to_scan(edges: Floats, planes: Floats, R: Floats, t: Floats, scale_sta
 @kernel
 def align_to_map(edges: Floats, planes: Floats, scatter: Floats, R: Floats, t: Floats, scale_start: float,
                  scale_end: float, decay: float, max_iterations: int, step_m: float, step_rad: float,
-                 edge_variance: float, plane_variance: float, weak_share: float, allowed: Floats, line_size: float,
+                 edge_variance: float, plane_variance: float, weak_share: float, least: float, allowed: Floats, line_size: float,
                  min_points: float, floor: float, edge_moments: Floats, edge_keys: Longs, edge_table: Ints,
                  lines: Floats, line_keys: Longs, line_counts: Floats, size: float, plane_rows: Floats, plane_keys: Longs,
                  plane_table: Ints, has_coarse: bool, coarse_size: float, coarse_rows: Floats, coarse_keys: Longs,
@@ -98,7 +105,8 @@ def align_to_map(edges: Floats, planes: Floats, scatter: Floats, R: Floats, t: F
     """Register edges (E, 3) on line voxels of `line_size`, m, and planar points (P, 3) with scatter (P, 6) on
     plane voxels of `size`.
 
-    With a coarse map, points that find no plane in the fine one are matched there.
+    A direction is observed when all hold it better than `least` planar points would. With a coarse map, points that find
+    no plane in the fine one are matched there.
     """
     H, g, d, weak = np.empty((6, 6)), np.empty(6), np.zeros(6), np.zeros((6, 6))
     edge_facts, plane_facts = np.zeros(6), np.zeros(6)
@@ -125,9 +133,7 @@ def align_to_map(edges: Floats, planes: Floats, scatter: Floats, R: Floats, t: F
         facts = edge_facts + plane_facts
         if facts[3] < 6.0:
             break
-        weak_count = solve_observed(
-            _within(allowed, H), g, facts, weak_share, LEAST_ON_MAP / plane_variance, 1.0, d, weak
-        )
+        weak_count = solve_observed(_within(allowed, H), g, facts, weak_share, least / plane_variance, 1.0, d, weak)
         move, turn = step_norms(d)
         if not move_by(d, move, turn, scale, R, t):
             break

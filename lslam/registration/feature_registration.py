@@ -52,13 +52,18 @@ class FeatureRegistration(Stateful):
         self._step, self._with_less_planes, self._reach = scan_step, with_less_planes, reach
         self.map: FeatureMap | None = self._new_map(1 << 16) if with_map else None
         self.target: FeatureScan | None = None
-        self.noise = FeatureNoise(loam.edge_sigma, config.sigma, config.weak_share)
+        self._usual = FeatureNoise(loam.edge_sigma, config.sigma, config.weak_share)
         self.threshold = AdaptiveThreshold(config.kernel_min, config.kernel_max)
         self.agreement = UsualAgreement(config.min_agreement)
         self._starting = config.start_scans
         self._first: tuple[Features, Floats] | None = None
         self._inserted = 0
         self._failures = 0
+
+    @property
+    def noise(self) -> FeatureNoise:
+        """While the speed is being learnt nothing better than the features' word is expected, however little it is."""
+        return replace(self._usual, least=0.0) if self._starting > 0 else self._usual
 
     def locate(self, features: Features, T_prior: Floats, clock: StageClock) -> RegistrationResult:
         """Align with what is there; the result says whether to believe it, and when less planar points stood in."""

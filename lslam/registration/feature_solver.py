@@ -24,11 +24,14 @@ class FeatureNoise:
     """Standard deviations of a feature's point, m: of an edge across it, of a planar point along the normal.
 
     weak_share : part of the information below which a direction counts as unobserved
+    least : planar points that hold a direction no better than all features do when it counts as unobserved: a few false
+        edges hold as much
     """
 
     edge: float
     plane: float
     weak_share: float
+    least: float = 1.0
 
 
 def solve_on_scan(
@@ -42,7 +45,7 @@ def solve_on_scan(
     R, t, projector = _start(T_prior, allowed)
     H, edge_facts, plane_facts, step, iterations, converged, count, weak = align_to_scan(
         edges, planes, R, t, annealing.start, annealing.end, annealing.decay, annealing.steps, STEP_M, STEP_RAD,
-        noise.edge**2, noise.plane**2, noise.weak_share, projector, one_to_many, target.size, REACH,
+        noise.edge**2, noise.plane**2, noise.weak_share, noise.least, projector, one_to_many, target.size, REACH,
         target.edges, target.planes, target.normals,
     )  # fmt: skip
     facts = edge_facts + plane_facts
@@ -69,7 +72,7 @@ def solve_on_map(
         fine = second
     H, edge_facts, plane_facts, step, iterations, converged, count, weak = align_to_map(
         edges, planes, scatter, R, t, annealing.start, annealing.end, annealing.decay,
-        annealing.steps, STEP_M, STEP_RAD, noise.edge**2, noise.plane**2, noise.weak_share, projector,
+        annealing.steps, STEP_M, STEP_RAD, noise.edge**2, noise.plane**2, noise.weak_share, noise.least, projector,
         lines.size, float(MIN_LINE_POINTS), FLOOR, lines.moments, lines.keys, lines.table, *target.lines,
         fine.size, fine.planes, fine.keys, fine.table,
         second is not fine, second.size, second.planes, second.keys, second.table,
