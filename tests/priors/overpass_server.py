@@ -7,7 +7,7 @@ import re
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 from urllib.parse import parse_qs
@@ -56,13 +56,8 @@ def running() -> Iterator[FakeOverpass]:
                 word = fake.script.pop(0) if fake.script else "ok"
                 fake.open += 1
                 fake.most_at_once = max(fake.most_at_once, fake.open)
-            try:
+            with suppress(OSError):  # the client has left
                 _answer(self, fake, word, fake.requests[-1][0])
-            except OSError:
-                pass  # the client has left
-            finally:
-                with fake.lock:
-                    fake.open -= 1
 
         def log_message(self, *_: Any) -> None:
             pass
@@ -84,6 +79,9 @@ def _answer(handler: BaseHTTPRequestHandler, fake: FakeOverpass, word: str, quer
     good = fake.reply(query)
     if kind == "slow":
         time.sleep(float(value))
+    # Before the first byte: a client that has its answer may ask again at once.
+    with fake.lock:
+        fake.open -= 1
     if kind == "drop":
         handler.close_connection = True
         return
