@@ -1,8 +1,8 @@
 """What OpenStreetMap brings, mode by mode, where everything is known: the ablation of issue 7 and of the thesis' table 4.2.
 
-    lslam simulate residential --seed 0 --out /tmp/drives/residential-0
-    lslam simulate residential --path poses/07.txt --out /tmp/drives/seq07
-    python tests/benchmarks/osm.py /tmp/drives/*/sequences/00 [--scans 300] [--map exact,perturbed] [--drift 1.0,0.5]
+    lslam simulate residential --seed 0 --out drives/residential-0
+    lslam simulate residential --path poses/07.txt --out drives/seq07
+    python tests/benchmarks/osm.py drives/*/sequences/00 [--scans 300] [--map exact,perturbed] [--drift 1.0,0.5]
         [--modes none,hdl,baseline,prior,rigid,non-rigid,two-level]
 
 Every run begins at the true start, without loops and with drift injected (% of the way, deg per 100 m); hdl and the baseline,
