@@ -25,8 +25,9 @@ Grid = tuple[Floats, NDArray[np.uint16], Ints, Longs, Ints]
 # H, facts of edges and of planes, last step, iterations, converged, unobserved directions and these as rows
 Aligned = tuple[Floats, Floats, Floats, Floats, int, bool, int, Floats]
 
-# From scan to scan no map takes an error back, and it goes on as velocity: half a point's noise is asked for there.
-TIMES_ON_SCAN = 4.0
+# From scan to scan no map takes an error back, and it goes on as velocity: twice as much is asked for there. More would doubt
+# sparse sensors, whose scans have few features, in every direction.
+TIMES_ON_SCAN = 2.0
 
 
 @inline
