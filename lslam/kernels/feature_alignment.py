@@ -56,6 +56,7 @@ def align_to_scan(edges: Floats, planes: Floats, R: Floats, t: Floats, scale_sta
     H, S, g, d, weak = np.empty((6, 6)), np.empty((6, 6)), np.empty(6), np.zeros(6), np.zeros((6, 6))
     edge_facts, plane_facts = np.zeros(6), np.zeros(6)
     scale, converged, weak_count, iterations = scale_start, False, 0, 0
+    needed = TIMES_ON_SCAN * least / plane_variance
     ep, er, es, ek, et = edge_grid
     pp, pr, ps, pk, pt = plane_grid
     for _ in range(max_iterations):
@@ -75,16 +76,7 @@ def align_to_scan(edges: Floats, planes: Floats, R: Floats, t: Floats, scale_sta
         if facts[3] < 6.0:
             break
         # What the projector takes away has no eigenvalue left, so that the step never looks along it in g.
-        weak_count = solve_on_surfaces(
-            _within(allowed, H),
-            _within(allowed, S),
-            g,
-            facts,
-            weak_share,
-            TIMES_ON_SCAN * least / plane_variance,
-            d,
-            weak,
-        )
+        weak_count = solve_on_surfaces(_within(allowed, H), _within(allowed, S), g, facts, weak_share, needed, d, weak)
         move, turn = step_norms(d)
         if not move_by(d, move, turn, scale, R, t):
             break

@@ -44,6 +44,14 @@ def test_bare_walls_do_not_lead_features_astray(method: str, seed: int) -> None:
     assert np.linalg.norm(results[-1].T_world_lidar[:3, 3] - truth[:3, 3]) < 0.02 * length
 
 
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_sparse_sensor_is_not_doubted_everywhere(seed: int) -> None:
+    """16 x 400 rays make few features, which hold every direction a little."""
+    results = by_features(simulate("block", seed=seed, motion_compensated=True), "loam-odom")
+    assert len(results) > 90
+    assert np.mean([len(r.degenerate) > 0 for r in results]) < 0.5
+
+
 @cache
 def between_walls(seed: int) -> SimulatedDrive:
     return simulate("corridor", seed=seed, count=90, speed=9.0, start_speed=9.0, motion_compensated=True)
