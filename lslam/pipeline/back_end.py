@@ -23,15 +23,14 @@ from lslam.graph.floors import on_one_plane
 from lslam.graph.odometry import corrected, fitness_covariance, odometry_constraints
 from lslam.graph.pose_graph import optimise
 from lslam.graph.problem import PoseGraph, Solution
-from lslam.graph.steady_drift import find_steady_drift, without_drift
 from lslam.keyframes.store import KeyframeStore
 from lslam.pipeline.building_pass import correct_buildings
 from lslam.pipeline.georeferencing import Placement, place
 from lslam.pipeline.graph_inputs import floor_planes, up_directions, world_up
+from lslam.pipeline.osm_graph import on_map, straightened
 from lslam.pipeline.osm_joint import join_buildings, run_baseline
-from lslam.pipeline.osm_pass import Located, finish, locate
+from lslam.pipeline.osm_pass import finish, locate
 from lslam.pipeline.osm_source import OsmSource
-from lslam.priors.osm_prior import likeness
 from lslam.types.building_correction import CorrectedMap
 from lslam.types.building_match import OsmMatches
 from lslam.types.constraint import Constraint, LoopCandidate, Turn
@@ -136,9 +135,9 @@ def _on_buildings(
         georeference = Georeference(
             extract.origin, located.T_enu_odometry, config.gnss.crs, "osm", used=len(located.priors)
         )
-    held = _on_map(graph, located, config)
+    held = on_map(graph, located, config)
     if config.osm.matcher == "walls" and not held.is_rigid:
-        held = _straight(held, located, config)
+        held = straightened(held, located, config)
     out = _solved(held, candidates, results, store, config, problems, georeference)
     if out is None or out.solution is None:
         return None
@@ -239,34 +238,6 @@ def _on_earth(graph: PoseGraph, placement: Placement) -> PoseGraph:
     return replace(
         graph, poses=T @ graph.poses, fixes=placement.fixes, world_up=np.array([0.0, 0.0, 1.0]), is_anchored=False
     )
-
-
-def _on_map(graph: PoseGraph, located: Located, config: Config) -> PoseGraph:
-    """The graph in the frame of the map, held by its walls, and by its fixes where it has some."""
-    return replace(
-        graph,
-        poses=graph.poses if graph.fixes else located.T_enu_odometry @ graph.poses,
-        map_priors=located.priors,
-        shift_sigma=config.osm.shift_sigma,
-        map_sigma=config.osm.map_sigma,
-        world_up=np.array([0.0, 0.0, 1.0]),
-        start_sigma=None if graph.fixes else located.start_sigma,
-        is_rigid=config.osm.trust_poses and config.odometry.method == "poses",
-    )
-
-
-def _straight(graph: PoseGraph, located: Located, config: Config) -> PoseGraph:
-    """The graph without the steady drift that the map reveals."""
-    sigma = np.array([config.osm.map_sigma, config.osm.map_sigma, np.radians(config.osm.map_sigma_deg)])
-    rates = find_steady_drift(graph, likeness(located.accepted, located.osm.owners), sigma, config.graph)
-    if rates is None:
-        return graph
-    percent, degrees = 100 * np.linalg.norm(rates[:, :2], axis=1), np.degrees(rates[:, 2]) * 100
-    log.info(
-        "OSM: odometry drifts steadily by %.1f %% and %.1f deg/100 m, and is set straight",
-        percent.mean(), -degrees.mean(),
-    )  # fmt: skip
-    return without_drift(graph, rates)
 
 
 def _verdicts(
