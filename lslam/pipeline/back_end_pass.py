@@ -18,8 +18,9 @@ from lslam.geometry import se2, se3
 from lslam.keyframes.store import KeyframeStore
 from lslam.loops.detector import find_loops
 from lslam.pipeline import drift
-from lslam.pipeline.back_end import BackEnd, run_back_end
+from lslam.pipeline.back_end import run_back_end
 from lslam.pipeline.front_end import to_trajectory
+from lslam.pipeline.graph_outcome import BackEnd
 from lslam.pipeline.levelling import find_level, level_results
 from lslam.pipeline.manifest import Manifest
 from lslam.pipeline.osm_source import OsmSource

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence as Many
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +15,7 @@ from lslam.errors import InputError
 from lslam.geometry import geodesy, se3, so3
 from lslam.geometry.interpolate import poses_at
 from lslam.graph.alignment import Alignment, align
-from lslam.graph.problem import PositionFix
+from lslam.graph.problem import PoseGraph, PositionFix
 from lslam.types.georeference import Georeference
 from lslam.types.gnss import GnssStream
 from lslam.types.keyframe import Keyframe
@@ -97,6 +97,15 @@ def place(
         georeference.used, georeference.fixes, georeference.rmse_horizontal, georeference.rmse_vertical,
     )  # fmt: skip
     return Placement(georeference, _as_factors(fixes, found, shift, results, keyframes, arm), _elsewhere(found))
+
+
+def on_earth(graph: PoseGraph, placement: Placement) -> PoseGraph:
+    """The graph in east, north, up, held by its fixes instead of its first pose."""
+    assert placement.georeference is not None
+    T = placement.georeference.T_enu_world
+    return replace(
+        graph, poses=T @ graph.poses, fixes=placement.fixes, world_up=np.array([0.0, 0.0, 1.0]), is_anchored=False
+    )
 
 
 def _usable(

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from lslam.geometry import se3
 from lslam.keyframes.store import KeyframeStore
-from lslam.pipeline.back_end import BackEnd
+from lslam.pipeline.graph_outcome import BackEnd
 from lslam.types.constraint import LoopCandidate
 from lslam.types.loop_view import LoopView, Place
 from lslam.types.run_record import RunRecord

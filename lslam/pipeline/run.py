@@ -16,7 +16,6 @@ from lslam.odometry import create_odometry
 from lslam.odometry.base import FeatureSource, Odometry
 from lslam.odometry.given import GivenPoses
 from lslam.pipeline import outputs
-from lslam.pipeline.back_end import BackEnd
 from lslam.pipeline.back_end_pass import level_world, optimise_poses, write_back_end
 from lslam.pipeline.building_pass import write_buildings
 from lslam.pipeline.check import check_config
@@ -26,6 +25,7 @@ from lslam.pipeline.feature_pass import build_feature_map
 from lslam.pipeline.front_end import has_point_times
 from lslam.pipeline.georeferencing import require_gnss
 from lslam.pipeline.given_poses import bind
+from lslam.pipeline.graph_outcome import BackEnd
 from lslam.pipeline.inertial_start import with_imu_settings
 from lslam.pipeline.loop_view import view_loop
 from lslam.pipeline.manifest import Manifest, describe_deskew

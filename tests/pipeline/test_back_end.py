@@ -14,8 +14,9 @@ from lslam.formats.g2o import write_g2o
 from lslam.geometry import geodesy, se3, so3
 from lslam.keyframes.store import KeyframeStore
 from lslam.pipeline import back_end
-from lslam.pipeline.back_end import BackEnd, run_back_end
+from lslam.pipeline.back_end import run_back_end
 from lslam.pipeline.drift import with_drift
+from lslam.pipeline.graph_outcome import BackEnd
 from lslam.types.calibration import Calibration
 from lslam.types.constraint import Constraint, LoopCandidate
 from lslam.types.gnss import GnssStream

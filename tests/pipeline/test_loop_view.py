@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from lslam.geometry import se3
 from lslam.keyframes.store import KeyframeStore
-from lslam.pipeline.back_end import BackEnd
+from lslam.pipeline.graph_outcome import BackEnd
 from lslam.pipeline.loop_view import AROUND, view_loop
 from lslam.reports.loop_view import loop_figures
 from lslam.types.constraint import Constraint, LoopCandidate, Verdict

@@ -1,0 +1,168 @@
+"""What becomes of a run in its pose graph: poses, verdicts on loops, and the numbers for the manifest."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.config import Config
+from lslam.errors import GraphError
+from lslam.geometry import se3
+from lslam.graph.drift import tilt_factor
+from lslam.graph.factors import well_conditioned
+from lslam.graph.odometry import corrected
+from lslam.graph.pose_graph import optimise
+from lslam.graph.problem import PoseGraph, Solution
+from lslam.keyframes.store import KeyframeStore
+from lslam.types.building_correction import CorrectedMap
+from lslam.types.building_match import OsmMatches
+from lslam.types.constraint import Constraint, LoopCandidate
+from lslam.types.georeference import Georeference
+from lslam.types.scan_result import ScanResult
+
+log = logging.getLogger("lslam")
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Given:
+    """What the back end has of a run.
+
+    results : of odometry, all scans; store : of the keyframes; candidates : all loop candidates with odometry's verdicts
+    problems : what could not be done so far, one sentence each: whoever finds one adds it
+    """
+
+    results: list[ScanResult]
+    store: KeyframeStore
+    config: Config
+    candidates: list[LoopCandidate]
+    problems: list[str] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class BackEnd:
+    """What became of a run's odometry.
+
+    results : all scans, where they belong; candidates : all loop candidates with verdicts
+    keyframes : (K, 4, 4) final poses; constraints : odometry's and the loops that were believed, empty without a graph
+    georeference : where the world of `results` lies on the Earth, None when that is not known
+    T_final_odometry : (4, 4) from the world of odometry into that of `results`
+    solution : the graph's, None where the poses are not its own
+    osm : what walls and buildings had to do with each other, None without a map that could be used; buildings : of that map,
+        where they really stand
+    facts : for the manifest; problems : what could not be done, one sentence each
+    """
+
+    results: list[ScanResult]
+    candidates: list[LoopCandidate] = field(default_factory=list)
+    keyframes: Floats = field(default_factory=lambda: np.zeros((0, 4, 4)))
+    constraints: list[Constraint] = field(default_factory=list)
+    georeference: Georeference | None = None
+    T_final_odometry: Floats = field(default_factory=lambda: np.eye(4))
+    solution: Solution | None = None
+    osm: OsmMatches | None = None
+    buildings: CorrectedMap | None = None
+    facts: dict[str, Any] = field(default_factory=dict)
+    problems: list[str] = field(default_factory=list)
+
+    @property
+    def is_optimised(self) -> bool:
+        """Whether the poses are the graph's and not odometry's."""
+        return bool(self.constraints)
+
+
+def solve(graph: PoseGraph, given: Given, georeference: Georeference | None = None) -> BackEnd | None:
+    """The run as the optimised graph has it; None, and one more of the problems, when it cannot be had.
+
+    georeference : of the graph's frame, None where that is odometry's
+    """
+    config = given.config
+    try:
+        solution = optimise(graph, config.graph)
+    except (GraphError, np.linalg.LinAlgError) as error:
+        given.problems.append(f"{error}; the run goes on without it")
+        return None
+    if graph.fixes and solution.fix_believed.sum() < config.gnss.min_fixes:
+        given.problems.append(
+            f"GNSS: the pose graph believes {solution.fix_believed.sum()} of {len(graph.fixes)} fixes: all rejected"
+        )
+        return None
+    judged, believed = _verdicts(given.candidates, graph, solution)
+    log.info(
+        "pose graph: %d keyframes, %d of %d loops believed, drift beside odometry's covariances %.3g, %d rounds",
+        len(graph), len(believed), len(graph.loops), solution.drift, solution.rounds,
+    )  # fmt: skip
+    facts = _facts(solution, graph, given.candidates, believed)
+    tilts = not believed and tilt_factor(graph, config.graph) > 0
+    if not (believed or graph.fixes or graph.floors or graph.map_priors or tilts):
+        return BackEnd(given.results, judged, graph.poses, facts=facts)
+    T = np.eye(4)
+    if georeference is not None:
+        T = georeference.T_enu_world
+        georeference = replace(_scored(georeference, graph, solution), T_enu_world=np.eye(4))
+    moved = corrected(
+        given.results, given.store.keyframes, solution.poses, solution.covariances, solution.drift, config.graph
+    )
+    # As they were solved: the covariance of odometry may be singular, and no information can be written of that.
+    kept = [replace(c, covariance=well_conditioned(c.covariance)) for c in (*graph.odometry, *believed)]
+    return BackEnd(moved, judged, solution.poses, kept, georeference, T, solution=solution, facts=facts)
+
+
+def unsolved(given: Given) -> BackEnd:
+    """The run as odometry has it."""
+    return BackEnd(given.results, given.candidates, np.stack([k.T_world_lidar for k in given.store.keyframes]))
+
+
+def _verdicts(
+    candidates: list[LoopCandidate], graph: PoseGraph, solution: Solution
+) -> tuple[list[LoopCandidate], list[Constraint]]:
+    """Candidates with the graph's verdicts on the accepted ones, and the constraints it believed."""
+    judged = iter(zip(graph.loops, solution.loop_reasons, solution.loop_stages, strict=True))
+    out, believed = [], []
+    for candidate in candidates:
+        if candidate.verdict == "accepted" and candidate.constraint is not None:
+            loop, reason, stage = next(judged)
+            if reason:
+                candidate = replace(candidate, verdict="rejected", stage=stage, reason=reason)
+            else:
+                believed.append(loop)
+        out.append(candidate)
+    return out, believed
+
+
+def _scored(georeference: Georeference, graph: PoseGraph, solution: Solution) -> Georeference:
+    """The georeference with the residuals of the fixes that the graph believed; as it is without fixes."""
+    if not graph.fixes:
+        return georeference
+    k = np.array([f.keyframe for f in graph.fixes])
+    arms, positions = np.stack([f.arm for f in graph.fixes]), np.stack([f.position for f in graph.fixes])
+    antenna = np.einsum("fij,fj->fi", solution.poses[k, :3, :3], arms) + solution.poses[k, :3, 3]
+    off = (positions - antenna)[solution.fix_believed]
+    return replace(
+        georeference,
+        rmse_horizontal=float(np.sqrt((off[:, :2] ** 2).sum(1).mean())),
+        rmse_vertical=float(np.sqrt((off[:, 2] ** 2).mean())),
+        used=int(solution.fix_believed.sum()),
+    )
+
+
+def _facts(
+    solution: Solution, graph: PoseGraph, candidates: list[LoopCandidate], believed: list[Constraint]
+) -> dict[str, Any]:
+    moved = se3.relative(graph.poses, solution.poses)[:, :3, 3]
+    return {
+        "loop_candidates": len(candidates),
+        "loops": len(believed),
+        "fixes": int(solution.fix_believed.sum()),
+        "gravity_factors": len(graph.ups),
+        "imu_orientation_factors": len(graph.turns),
+        "floor_factors": len(graph.floors),
+        "map_priors": sum(not reason for reason in solution.map_reasons),
+        "drift_factor": round(solution.drift, 4),
+        "rounds": solution.rounds,
+        "largest_correction_m": round(float(np.linalg.norm(moved, axis=1).max()), 4),
+    }

@@ -1,0 +1,67 @@
+"""A run held by the buildings of a map: found on it, optimised with it, and the buildings laid where they really stand."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from lslam.errors import GraphError, InputError
+from lslam.geometry import se2
+from lslam.graph.odometry import corrected
+from lslam.graph.problem import PoseGraph
+from lslam.pipeline.building_pass import correct_buildings
+from lslam.pipeline.georeferencing import Placement, on_earth
+from lslam.pipeline.graph_outcome import BackEnd, Given, solve
+from lslam.pipeline.osm_graph import on_map, straightened
+from lslam.pipeline.osm_joint import join_buildings, run_baseline
+from lslam.pipeline.osm_pass import finish, locate
+from lslam.pipeline.osm_source import OsmSource
+from lslam.types.georeference import Georeference
+
+
+def hold_by_buildings(osm: OsmSource, graph: PoseGraph, placement: Placement, given: Given) -> BackEnd | None:
+    """The run held by the buildings of a map, and by fixes where it has some; None, and why, where they hold nothing."""
+    config, store, problems = given.config, given.store, given.problems
+    known = placement.georeference
+    origin = known.origin if known is not None else config.osm.origin
+    if origin is None:
+        problems.append("OSM: without its fixes the run has no place on the map: it goes on without the buildings")
+        return None
+    try:
+        extract = osm.extract(np.asarray(origin, np.float64))
+    except InputError as error:
+        problems.append(f"OSM: {error}; the run goes on without the buildings")
+        return None
+    up = graph.world_up if graph.ups else None
+    located = locate(extract, store, up, config, None if known is None else known.T_enu_world)
+    if located.problem:
+        problems.append(located.problem)
+        return None
+    if config.gnss.mode == "graph" and known is not None:
+        graph, georeference = on_earth(graph, placement), known
+    else:
+        georeference = Georeference(
+            extract.origin, located.T_enu_odometry, config.gnss.crs, "osm", used=len(located.priors)
+        )
+    held = on_map(graph, located, config)
+    if config.osm.matcher == "walls" and not held.is_rigid:
+        held = straightened(held, located, config)
+    out = solve(held, given, georeference)
+    if out is None or out.solution is None:
+        return None
+    matches = finish(located, extract, out.keyframes, out.solution, config.osm)
+    try:
+        if config.osm.matcher == "baseline":
+            joint, matches, buildings = run_baseline(held, out.solution, extract, store, config)
+        elif config.osm.mode == "non-rigid":
+            joint, buildings = join_buildings(held, out.solution, matches, config)
+        else:
+            return replace(
+                out, osm=matches, buildings=correct_buildings(matches, se2.of_se3(out.keyframes), config.osm)
+            )
+    except (GraphError, np.linalg.LinAlgError) as error:
+        problems.append(f"OSM: {error}; the run goes on with its buildings where the map has them")
+        return replace(out, osm=matches)
+    moved = corrected(given.results, store.keyframes, joint.poses, joint.covariances, out.solution.drift, config.graph)
+    return replace(out, results=moved, keyframes=joint.poses, osm=matches, buildings=buildings)
