@@ -113,8 +113,14 @@ def solve(graph: PoseGraph, given: Given, georeference: Georeference | None = No
 
 
 def unsolved(given: Given) -> BackEnd:
-    """The run as odometry has it."""
-    return BackEnd(given.results, given.candidates, np.stack([k.T_world_lidar for k in given.store.keyframes]))
+    """The run as odometry has it; loops were accepted for a graph that cannot be had, and are rejected with it."""
+    candidates = [
+        replace(c, verdict="rejected", stage="graph", reason="the pose graph could not be solved")
+        if c.verdict == "accepted"
+        else c
+        for c in given.candidates
+    ]
+    return BackEnd(given.results, candidates, np.stack([k.T_world_lidar for k in given.store.keyframes]))
 
 
 def _verdicts(

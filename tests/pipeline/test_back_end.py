@@ -125,6 +125,9 @@ def test_a_graph_that_cannot_be_solved_leaves_odometry(monkeypatch: pytest.Monke
     done = run_back_end(Stub([]), results, store_of(results), config(), LOOPS)
     assert done.results is results
     assert "in pieces" in done.problems[0]
+    assert {(c.verdict, c.stage, c.reason) for c in done.candidates} == {
+        ("rejected", "graph", "the pose graph could not be solved")
+    }
 
 
 def test_odometry_that_claims_to_know_everything_can_be_written_down(tmp_path: Path) -> None:
