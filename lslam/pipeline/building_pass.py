@@ -53,8 +53,10 @@ def place_buildings(
     """The map that a solution of `local` matches means: overlaps parted, what is absent and what is new."""
     place = dict(enumerate(poses))
     mode = "baseline" if config.matcher == "baseline" else config.mode
-    untangled = Untangled(solution.displacements, (), ())
+    untangled, own = Untangled(solution.displacements, (), ()), solution.covariances
     if mode == "prior":
+        # What would move a building moves none, so the map is as good as before anything was seen.
+        own = solve_buildings(middles_of(matches), (), {}, _unseen(config)).covariances
         untangled = Untangled(np.zeros_like(solution.displacements), (), ())
     elif mode in ("non-rigid", "two-level"):
         information = np.asarray(np.linalg.inv(solution.covariances), np.float64)
@@ -62,7 +64,6 @@ def place_buildings(
     displacements = untangled.displacements
     standing = [b.displaced(d) for b, d in zip(matches.buildings, displacements, strict=True)]
     gone = absent_buildings(standing, matches.keyframes, place)
-    own = solution.covariances
     used, rejected = _counts(matches, local, solution)
     found = tuple(
         BuildingCorrection(b, displacements[k], own[k], _status(used[k], bool(gone[k])), used[k], rejected[k])
@@ -94,9 +95,15 @@ def agreed(matches: OsmMatches, poses: Floats) -> list[BuildingMatch]:
 
 def map_belief(matches: OsmMatches, config: OsmConfig) -> MapBelief:
     """What the map is trusted with: its shift as the trajectory has it, its buildings as the configuration says."""
+    unseen = _unseen(config)
+    common = np.minimum(matches.shift_sigma, unseen.shift_sigma)
+    return replace(unseen, shift=matches.shift, shift_sigma=np.maximum(common, TOGETHER[:2]))
+
+
+def _unseen(config: OsmConfig) -> MapBelief:
+    """The same before a scan is looked at."""
     sigma = np.array([config.building_sigma, config.building_sigma, np.radians(config.building_sigma_deg)])
-    common = np.minimum(matches.shift_sigma, max(config.shift_sigma, float(TOGETHER[0])))
-    return MapBelief(matches.shift, np.maximum(common, TOGETHER[:2]), sigma)
+    return MapBelief(np.zeros(2), np.maximum(np.full(2, config.shift_sigma), TOGETHER[:2]), sigma)
 
 
 def write_buildings(folder: Path, found: CorrectedMap, data: OsmData) -> None:

@@ -137,17 +137,17 @@ def _both_ways(
         first = found[numbers[0]]
         back = copy.deepcopy(track)
         back.begin(first.pose, first.information)
-        earlier = _along(range(numbers[0], -1, -1), store, poses, osm, back, config)[1:]
-        found[: numbers[0]] = earlier[::-1]
+        found[: numbers[0]] = _along(range(numbers[0] - 1, -1, -1), store, poses, osm, back, config, numbers[0])[::-1]
     return found
 
 
 def _along(
-    numbers: Iterable[int], store: KeyframeStore, poses: Floats, osm: OsmMap, track: OsmTrack, config: Config
-) -> list[KeyframeMatch]:
+    numbers: Iterable[int], store: KeyframeStore, poses: Floats, osm: OsmMap, track: OsmTrack, config: Config,
+    before: int | None = None,
+) -> list[KeyframeMatch]:  # fmt: skip
+    """Match the keyframes `numbers` in turn; the track stands at the keyframe `before`, None at the first of them."""
     planar = se2.of_se3(poses)
     matches: list[KeyframeMatch] = []
-    before: int | None = None
     for number in numbers:
         if before is not None:
             step = se2.relative(planar[before], planar[number])

@@ -37,7 +37,8 @@ WIDE = np.array([6.0, 4.5, 3.0])  # from the prior itself: far walls move with i
 FAINT = 1e-3  # of the prior's weight while the walls are fitted: it is for the graph to weigh the two
 START_WALLS = 4  # two walls make a corner, and a town has many
 SLACK = np.array([0.5, 0.5, 0.03])  # that refinement may leave the window by
-CELL_OF_RIVALS = np.array([1.5, 1.5, np.radians(6.0)])  # what differs less is the same answer
+NEAR_RIVAL, LIKE_RIVAL = 1.5, np.radians(6.0)  # m and rad; what differs less is the same answer
+BESIDE = 2.0  # m between places that are tried across parallel walls: the first gate of either kind is as wide
 ALIGNED = np.sin(np.radians(12.0)) ** 2  # a direction seen by less than this share of the best one is not seen
 LONGEST = 60.0  # m from the walls seen; the map beyond is not asked
 
@@ -117,11 +118,18 @@ def _best(
     gates = FINE_GATES if by_coverage else GATES
     starts = [(at, np.concatenate([WIDE, gates]))]
     starts += [(pose, gates) for pose in _proposals(seen, known, at, window, by_coverage)]
-    found = [_refined(seen, known, pose, gates, at, trust, window, config, by_coverage) for pose, gates in starts]
-    inside = [m for m in found if m is not None]
+
+    def laid(starts: list[tuple[Floats, Floats]]) -> list[WallMatch]:
+        found = [_refined(seen, known, pose, gates, at, trust, window, config, by_coverage) for pose, gates in starts]
+        return [m for m in found if m is not None]
+
+    inside = laid(starts)
     if not inside:
         return None
     best = max(inside, key=lambda m: m.fitness)
+    if best.rank < 3:
+        inside += laid([(pose, gates) for pose in _beside(best, at, window)])
+        best = max(inside, key=lambda m: m.fitness)
     if best.coverage < (config.min_building_coverage if by_coverage else config.min_coverage):
         return None
     pairs = np.column_stack([best.pairs[:, 0], numbers[best.pairs[:, 1]]])
@@ -159,6 +167,14 @@ def _proposals(seen: Floats, known: Floats, at: Floats, window: Floats, by_cover
     return np.asarray(poses[np.argsort(away, kind="stable")[:REFINED]])
 
 
+def _beside(best: WallMatch, at: Floats, window: Floats) -> Floats:
+    """(K, 3) poses across the parallel walls of `best`, which no corner proposes, all through the window."""
+    across = np.linalg.eigh(best.information[:2, :2])[1][:, 1]
+    reach = float(np.linalg.norm(across * window[:2]))
+    steps = np.arange(0.5 * BESIDE, reach, BESIDE)
+    return np.asarray(at + np.append(across, 0.0) * np.concatenate([-steps, steps])[:, None])
+
+
 def _refined(
     seen: Floats, known: Floats, pose: Floats, gates: Floats, at: Floats, trust: Floats, window: Floats,
     config: OsmConfig, by_coverage: bool,
@@ -174,6 +190,8 @@ def _refined(
     planar, free, rank = _deflated(normal / config.wall_sigma**2)
     pose[:2] -= free @ away[:2]
     distance, coverage, pair = wall_matching.fit(seen, known, pose, config.max_distance, LIKENESS, by_coverage)
+    if not (pair >= 0).any():
+        return None
     translation = float(np.linalg.norm(pose[:2] - at[:2]))
     farthest = float(np.linalg.norm(window[:2]))
     fitness = 100.0 * (
@@ -221,6 +239,6 @@ def _has_rival(best: WallMatch, found: list[WallMatch], config: OsmConfig) -> bo
             values, axes = np.linalg.eigh(best.information[:2, :2])
             free = axes[:, values < 1e-9 * max(values[1], 1e-12)]
             away[:2] -= free @ (free.T @ away[:2])
-        if (np.abs(away) > CELL_OF_RIVALS).any():
+        if np.hypot(away[0], away[1]) > NEAR_RIVAL or abs(away[2]) > LIKE_RIVAL:
             return True
     return False

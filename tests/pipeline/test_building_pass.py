@@ -112,6 +112,9 @@ def test_a_trusted_map_stays_and_a_rigid_one_moves_as_a_whole() -> None:
     fixed, _, _, _ = solved(1, "prior")
     assert not any(c.displacement.any() for c in fixed.buildings)
     assert not fixed.shift.any()
+    # Where nothing is applied that was seen, a building stands within the map's own errors: 1 m, and 2 m of the whole.
+    np.testing.assert_allclose([c.covariance[:2, :2] for c in fixed.buildings], np.tile(5.0 * np.eye(2), (13, 1, 1)))
+    assert max(c.confidence for c in fixed.buildings) < 0.05
     rigid, _, _, _ = solved(1, "rigid")
     moves = np.array([c.displacement for c in rigid.buildings])
     np.testing.assert_allclose(moves[:, :2], np.tile(rigid.shift, (len(moves), 1)), atol=0.01)

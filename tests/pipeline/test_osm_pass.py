@@ -7,12 +7,17 @@ import pytest
 from wall_scenes import box_at, plain, upright
 
 from lslam.config import Config, load_config
+from lslam.config.osm import OsmConfig
 from lslam.formats.osm_buildings import BuildingExtract
 from lslam.geometry import se2, se3, so3
 from lslam.graph.problem import Solution
 from lslam.keyframes.store import KeyframeStore
+from lslam.pipeline import osm_pass
 from lslam.pipeline.osm_pass import Located, finish, locate
+from lslam.priors.osm_map import OsmMap
+from lslam.priors.osm_prior import match_keyframe
 from lslam.types.building import Building, Footprint
+from lslam.types.building_match import KeyframeMatch
 from lslam.types.keyframe import Keyframe
 
 Outline = list[tuple[float, float]]
@@ -105,6 +110,26 @@ def test_odometry_that_runs_away_is_followed() -> None:
     told[:, 2] = way[:, 2] + np.radians(4) / 100 * way[:, 0]
     located = locate(extract_of(HOUSES), driven(HOUSES, way, told), None, config())
     assert len(located.priors) >= 16
+    assert (off(located, way) < [0.1, 0.1, 0.3]).all()
+
+
+def test_on_the_way_back_the_first_match_counts_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The houses begin 60 m ahead, so the first keyframes are laid on them only from the first match back."""
+    ahead = [[(x + 72.0, y) for x, y in ring] for ring in HOUSES]
+    way = 2.0 * street()
+    way[:, 2] = np.arctan2(np.gradient(way[:, 1]), np.gradient(way[:, 0]))
+    asked: list[int] = []
+
+    def counted(view: KeyframeMatch, osm: OsmMap, config: OsmConfig) -> KeyframeMatch:
+        asked.append(view.keyframe)
+        return match_keyframe(view, osm, config)
+
+    monkeypatch.setattr(osm_pass, "match_keyframe", counted)
+    located = locate(extract_of(ahead), driven(ahead, way), None, config())
+    first = next(m.keyframe for m in located.matches if m.verdict == "accepted" and m.rank == 3)
+    assert first > 2
+    assert asked == [*range(len(way)), *range(first - 1, -1, -1)]
+    assert [m.keyframe for m in located.matches] == list(range(len(way)))
     assert (off(located, way) < [0.1, 0.1, 0.3]).all()
 
 

@@ -175,6 +175,31 @@ def test_what_looks_alike_from_two_headings_is_refused() -> None:
     assert off(narrow, (0.0, 0.0, 0.0))[0] < 0.05
 
 
+@pytest.mark.parametrize(("period", "turn"), [(4.0, 0.0), (5.0, 0.8), (6.0, 2.0), (8.0, -0.4)])
+def test_equal_gables_shifted_by_one_house_are_bounded_by_the_window_or_refused(period: float, turn: float) -> None:
+    # One side of each house is seen, and no corner: across these walls the next house fits as well.
+    gables = turned(np.array([[[k * period, 6.0], [k * period, 14.0]] for k in range(-20, 21)]), (0.0, 0.0, turn))
+    rng = np.random.default_rng(int(period))
+    for count in (1, 3):
+        part = gables[20 - count // 2 : 21 + count // 2] + rng.normal(0, 0.03, (count, 2, 2))
+        for share in (-1.4, -0.6, 0.2, 1.0):
+            for sigma, is_refused in ((0.1 * period, False), (0.8 * period, True)):
+                prior = np.append(turned(np.array([share * sigma, 0.2]), (0.0, 0.0, turn)), 0.01)
+                match = match_walls(part, gables, prior, np.array([sigma, sigma, 0.03]))
+                assert match is not None
+                assert match.is_ambiguous == is_refused
+                across = np.array([np.cos(turn), np.sin(turn)])
+                assert is_refused or abs(across @ match.pose[:2]) < 0.2
+
+
+def test_a_wall_that_loses_its_partners_in_the_end_is_no_match() -> None:
+    wall, beside = (np.array([[[-8.0, y], [8.0, y]]]) for y in (4.0, 5.6))
+    between = np.concatenate([wall, beside])
+    known = np.array([[[-8.0, 4.8], [8.0, 4.8]]])
+    loose = OsmConfig(min_coverage=0.0, max_distance=0.5)
+    assert match_walls(between, known, np.zeros(3), SIGMA, loose) is None
+
+
 @pytest.mark.parametrize("turn", [0.0, 0.6, 2.2])
 def test_along_lone_parallel_walls_nothing_is_claimed(turn: float) -> None:
     street = np.array([[[-30, 5], [30, 5]], [[30, -5], [-30, -5]]], np.float64)[:, ::-1]
