@@ -9,6 +9,7 @@ from __future__ import annotations
 import csv
 import io
 import math
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import fields
 from pathlib import Path
@@ -23,6 +24,8 @@ SCHEMA = "study_version"
 STAGE = "stage_ms."
 # Worked out from the others, for those who read the table elsewhere.
 DERIVED = ("is_diverged", "time_per_scan_ms")
+# Python takes `1_000`, `nan` and `inf` for numbers too, and no parameter has such a value: they are words.
+_NUMBER = re.compile(r"-?(0|[1-9][0-9]*)(?P<rest>(\.[0-9]+)?([eE][+-]?[0-9]+)?)")
 _PLAIN = {f.name: str(f.type) for f in fields(StudyRow) if f.name not in ("parameters", "stages_ms")}
 
 
@@ -116,12 +119,10 @@ def _value(text: str) -> Value:
     """A parameter as it was: a whole number stays one."""
     if text in ("true", "false"):
         return text == "true"
-    for kind in (int, float):
-        try:
-            return kind(text)
-        except ValueError:
-            continue
-    return text
+    number = _NUMBER.fullmatch(text)
+    if number is None:
+        return text
+    return float(text) if number["rest"] else int(text)
 
 
 _READ: dict[str, Callable[[str], Value]] = {"str": str, "int": int, "float": _number, "bool": _truth}

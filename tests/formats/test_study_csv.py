@@ -11,7 +11,7 @@ import pytest
 
 from lslam.errors import InputError
 from lslam.formats.study_csv import read_study_csv, write_study_csv
-from lslam.types.study import StudyRow
+from lslam.types.study import StudyRow, Value
 
 DONE = StudyRow(
     "open-0/thesis-icp/1", "skip frames", "open", 0, "thesis-icp", True, {"input.skip_frames": 3, "map.voxel": 0.1 + 0.2},
@@ -37,6 +37,37 @@ def test_rows_come_back_exactly(tmp_path: Path) -> None:
     assert [same(a, b) for a, b in zip(again, ROWS, strict=True)] == [True] * 3
     assert isinstance(again[0].parameters["input.skip_frames"], int)
     assert isnan(again[1].ate_se3)
+
+
+@pytest.mark.parametrize(
+    "value",
+    [
+        "nan",
+        "inf",
+        "-inf",
+        "1_000",
+        "007",
+        "1.",
+        "+3",
+        " 3",
+        "\u0663",
+        "scan",
+        0,
+        -3,
+        10**20,
+        0.5,
+        -1e-9,
+        1e300,
+        1e22,
+        True,
+        False,
+    ],
+)
+def test_a_parameter_comes_back_as_it_was(tmp_path: Path, value: Value) -> None:
+    write_study_csv(tmp_path / "results.csv", [replace(DONE, parameters={"registration.target": value})])
+    (row,) = read_study_csv(tmp_path / "results.csv")
+    again = row.parameters["registration.target"]
+    assert (type(again), again) == (type(value), value)
 
 
 def test_others_find_columns_by_the_names_of_the_keys(tmp_path: Path) -> None:
