@@ -7,8 +7,9 @@ from dataclasses import dataclass
 
 import tomli_w
 
+from lslam.config.preset_files import read_toml
 from lslam.config.study import StudyConfig
-from lslam.errors import RunFailedError
+from lslam.errors import OutputExistsError, RunFailedError
 from lslam.studies.engines import Engine
 from lslam.studies.expanded import Expanded, Place, cells_of, make_runs
 from lslam.studies.grid import expand
@@ -32,9 +33,11 @@ class Sweep:
 def expand_study(sweep: Sweep) -> Expanded:
     """All runs, checked before any begins; nothing is simulated or written.
 
-    Raises ConfigError, UsageError or InputError for parameters, methods, recordings and scenarios that make no sense.
+    Raises ConfigError, UsageError or InputError for parameters, methods, recordings and scenarios that make no sense;
+    OutputExistsError when it is to go on in the folder of another study.
     """
     study, place = sweep.study, sweep.place
+    _check_same(study, place)
     found = contenders(study, sweep.settings)
     cells = cells_of(study.sequences, study.seeds, found, place)
     jobs = expand(cells, [c.variant for c in found], study.seeds, place.out, place.command)
@@ -56,3 +59,15 @@ def run_sweep(
     if rows and not any(row.is_usable for row in rows):
         raise RunFailedError(f"all {len(rows)} runs failed, the first one: {rows[0].reason}")
     return rows
+
+
+def _check_same(study: StudyConfig, place: Place) -> None:
+    """A study that changed reuses its runs by digest; rows of two studies in one table are of no use to either."""
+    if not place.resume or not (place.out / MARK).is_file():
+        return
+    theirs = read_toml(place.out / MARK, "study").get("name")
+    if theirs != study.name:
+        raise OutputExistsError(
+            f"output folder {place.out} holds study {theirs!r} and --resume would go on in it with study {study.name!r}: "
+            "name another folder with --out"
+        )

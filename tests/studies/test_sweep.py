@@ -109,6 +109,19 @@ def test_a_study_that_grew_runs_only_what_is_new(made: list[StudyRow], sweep: Sw
     assert repr(rows[0]) == repr(made[0])
 
 
+def test_another_study_does_not_go_on_in_the_folder_of_this_one(
+    made: list[StudyRow], sweep: Sweep, tmp_path: Path
+) -> None:
+    out = tmp_path / "copy"
+    shutil.copytree(sweep.place.out, out)
+    before = (out / "results.csv").read_bytes(), (out / "study.toml").read_bytes()
+    other = elsewhere(sweep, out, True, name="shares")
+    for go_on in (expand_study, lambda sweep: run_sweep(sweep, Local(1))):
+        with pytest.raises(OutputExistsError, match=r"holds study 'tiny' and .* with study 'shares': .*--out"):
+            go_on(other)
+    assert ((out / "results.csv").read_bytes(), (out / "study.toml").read_bytes()) == before
+
+
 def test_what_fails_is_a_row_with_its_reason(sweep: Sweep, tmp_path: Path) -> None:
     """The first scan of the second run lies beyond the recording."""
     partly = elsewhere(sweep, tmp_path / "out", parameters={"input.start": [0, 99]}, beside=[])
