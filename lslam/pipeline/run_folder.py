@@ -20,14 +20,15 @@ from lslam.locks import lock
 log = logging.getLogger("lslam")
 
 MANIFEST = "manifest.json"
+LOG = "log.txt"
 LOCK = ".lock"
 KEYFRAMES = "keyframes"
 CHECKPOINT = "checkpoint"
 REPLIES = "osm_replies"
 # What a run that goes on needs of what the one before left.
-_NEEDED = (MANIFEST, "config.toml", "log.txt")
+_NEEDED = (MANIFEST, "config.toml", LOG)
 OURS = (
-    MANIFEST, "config.toml", "log.txt", "trajectory.tum", "trajectory_kitti.txt", "covariances.npz", "map.ply",
+    MANIFEST, "config.toml", LOG, "trajectory.tum", "trajectory_kitti.txt", "covariances.npz", "map.ply",
     "map.pcd", "map.las", "map.laz", "map.json", "map_mesh.ply", "feature_map.ply", "trajectory.geojson",
     "occupancy.npz", "occupancy.ply", "floor_plan.png", "floor_plan.yaml", "evaluation.json",
     "trajectory_odometry.tum", "loops.csv", "graph.g2o", "osm_matches.csv", "buildings.geojson", "buildings.osm",
@@ -92,7 +93,7 @@ class RunFolder:
     def __enter__(self) -> RunFolder:
         """Copy lslam's log into log.txt while the folder is held."""
         try:
-            self._log_handler = _LogFile(self.path / "log.txt")
+            self._log_handler = _LogFile(self.path / LOG)
         except OSError as error:
             self._let_go()
             raise OutputError(f"{self.path / 'log.txt'} cannot be written: {error.strerror or error}") from None

@@ -7,6 +7,7 @@ import logging
 import platform
 import shutil
 import time
+import traceback
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
@@ -21,7 +22,7 @@ from lslam.errors import (
     RunFailedError,
     RunFinishedError,
 )
-from lslam.pipeline.run_folder import KEYFRAMES
+from lslam.pipeline.run_folder import KEYFRAMES, LOG
 from lslam.studies.grid import Job
 from lslam.studies.states import State, write_state
 
@@ -69,7 +70,8 @@ def execute(job: Job, bench: Bench) -> None:
     except MemoryError:
         reason = "out of memory: use fewer points (preprocess.range_max) or larger voxels (map.voxel)"
     except Exception as error:
-        reason = f"lslam made a mistake ({type(error).__name__}: {error})"
+        first, *_ = str(error).strip().splitlines() or [""]
+        reason = f"lslam made a mistake ({type(error).__name__}: {first}){_keep_traceback(job.folder, error)}"
     finally:
         seconds = time.monotonic() - began
         if bench.is_kept and status != "interrupted":  # one of hundreds: nothing asks for its clouds again
@@ -79,6 +81,17 @@ def execute(job: Job, bench: Bench) -> None:
             round((_waited_s() - waited) / max(seconds, 1e-9), 4), platform.node(),
         )  # fmt: skip
         write_state(job.state_file, state)
+
+
+def _keep_traceback(folder: Path, error: Exception) -> str:
+    """Put it behind what the run said, in its log.txt; the end of a sentence that says so, empty when it cannot be."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with (folder / LOG).open("a", encoding="utf-8", errors="backslashreplace") as stream:
+            stream.writelines(traceback.format_exception(error))
+    except OSError:
+        return ""
+    return f": its {LOG} says where"
 
 
 def _waited_s() -> float:

@@ -1,0 +1,76 @@
+"""What a run of a study leaves behind when lslam itself is wrong."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from lslam.config import load_config
+from lslam.formats.study_csv import read_study_csv
+from lslam.odometry.icp import Icp
+from lslam.studies import worker
+from lslam.studies.grid import Job
+from lslam.studies.points import Contender
+from lslam.studies.results import Results
+from lslam.studies.states import read_state
+from lslam.studies.variants import Variant
+from lslam.studies.worker import Bench, execute
+
+MOTHS = "moths\nin the relay"
+
+
+@pytest.fixture(autouse=True)
+def _log_of_the_study() -> Iterator[None]:
+    """`execute` silences the log of its process, which here is the tests'."""
+    log = logging.getLogger("lslam")
+    handlers, propagates = list(log.handlers), log.propagate
+    yield
+    log.handlers[:], log.propagate = handlers, propagates
+
+
+def job_in(out: Path) -> Job:
+    path = Path(__file__).resolve().parents[2] / "sample_data"
+    config = load_config(settings=["input.count=3"], environ={})
+    return Job("sample", "icp", 0, path, config, out / "runs" / "sample" / "icp-s0", "digest", "lslam sweep")
+
+
+def in_the_relay(*given: object) -> None:
+    raise RuntimeError(MOTHS)
+
+
+def test_a_mistake_within_a_run_ends_its_log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Icp, "register", in_the_relay)
+    job = job_in(tmp_path)
+    execute(job, Bench())
+    said = (job.folder / "log.txt").read_text()
+    assert said.index("3 scans of") < said.index("Traceback (most recent call last)") < said.index("in in_the_relay")
+    assert said.endswith(f"RuntimeError: {MOTHS}\n")
+    results = Results("moths", tmp_path, [job], {"icp": Contender(Variant("icp", job.config), "icp", {})})
+    results.add([job])
+    (row,) = read_study_csv(tmp_path / "results.csv")
+    assert row.status == "failed"
+    assert row.reason == "lslam made a mistake (RuntimeError: moths): its log.txt says where"
+
+
+def test_a_mistake_before_a_run_has_a_log_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(worker, "_run", in_the_relay)
+    job = job_in(tmp_path)
+    execute(job, Bench())
+    assert "in in_the_relay" in (job.folder / "log.txt").read_text()
+    state = read_state(job.state_file)
+    assert state is not None
+    assert state.reason.startswith("lslam made a mistake (RuntimeError: moths)")
+
+
+def test_a_log_that_cannot_be_written_is_not_promised(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(worker, "_run", in_the_relay)
+    job = job_in(tmp_path)
+    job.folder.parent.mkdir(parents=True)
+    job.folder.write_text("in the way")
+    execute(job, Bench())
+    state = read_state(job.state_file)
+    assert state is not None
+    assert state.reason == "lslam made a mistake (RuntimeError: moths)"
