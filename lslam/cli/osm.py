@@ -150,13 +150,11 @@ def show(file: Path, png: Path | None, origin: str | None, overwrite: bool, as_j
     import numpy as np
 
     from lslam.errors import OutputExistsError
-    from lslam.formats.osm_buildings import middle_of, some_buildings_of
-    from lslam.formats.osm_files import read_osm
+    from lslam.formats.osm_buildings import read_buildings
 
     if png is not None and png.exists() and not overwrite:
         raise OutputExistsError(f"{png} exists: give --overwrite to replace it, or another --png")
-    data = read_osm(file)
-    extract = some_buildings_of(data, middle_of(data) if at is None else np.array(at), file)
+    data, extract = read_buildings(file, None if at is None else np.array(at))
     facts = _facts(extract)
     facts["elements"] = {"nodes": len(data.nodes), "ways": len(data.ways), "relations": len(data.relations)}
     if png is not None:

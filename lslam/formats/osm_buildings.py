@@ -38,12 +38,14 @@ class BuildingExtract:
     source: str
 
 
-def read_buildings(path: Path, origin: NDArray[Any]) -> BuildingExtract:
-    """Read the buildings of `path` (OSM XML or Overpass JSON) into the local frame at `origin` (3,) lat, lon, height.
+def read_buildings(path: Path, origin: NDArray[Any] | None = None) -> tuple[OsmData, BuildingExtract]:
+    """All of `path` (OSM XML, Overpass JSON, GeoJSON), and its buildings in the local frame at `origin` (3,) lat, lon, height.
 
-    Raises InputError naming the file: unreadable (`read_osm`), or without one building.
+    Without `origin` it is the middle of all buildings, at height 0. Raises InputError naming the file: unreadable
+    (`read_osm`), without one building, far from the origin.
     """
-    return some_buildings_of(read_osm(path), origin, path)
+    data = read_osm(path)
+    return data, some_buildings_of(data, middle_of(data) if origin is None else origin, path)
 
 
 def some_buildings_of(data: OsmData, origin: NDArray[Any], path: Path) -> BuildingExtract:

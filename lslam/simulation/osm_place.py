@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.errors import InputError, UsageError
-from lslam.formats.osm_buildings import BuildingExtract, buildings_near, middle_of, some_buildings_of
-from lslam.formats.osm_files import OsmData, read_osm
+from lslam.formats.osm_buildings import BuildingExtract, buildings_near, read_buildings
+from lslam.formats.osm_files import OsmData
 from lslam.simulation.curve import smooth_curve
 from lslam.simulation.moving import Mover
 from lslam.simulation.osm_city import OsmCity, build_osm_city
@@ -53,8 +53,7 @@ def read_extract(path: Path, origin: NDArray[Any] | None = None) -> MapExtract:
     Without `origin` it is the middle of all buildings, at height 0. Raises InputError naming the file: unreadable, without
     buildings, far from the origin.
     """
-    data = read_osm(path)
-    extract = some_buildings_of(data, middle_of(data) if origin is None else np.asarray(origin, np.float64), path)
+    data, extract = read_buildings(path, origin)
     corners = np.concatenate([footprint.outer for b in extract.buildings for footprint in b.footprints])
     away = float(np.linalg.norm(corners, axis=1).min())
     if away > FARTHEST:

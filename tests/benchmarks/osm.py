@@ -74,7 +74,7 @@ def buildings_of(folder: Path, drive: Path, which: str, found: Floats) -> list[B
     corrected = read_corrected(folder / BUILDINGS_GEOJSON)
     truth = {c.building.osm_id: np.zeros(3) for c in corrected.buildings}
     if which != "exact":
-        exact = read_buildings(drive / "map.osm", origin).buildings
+        exact = read_buildings(drive / "map.osm", origin)[1].buildings
         truth = map_errors(exact, read_perturbation(drive / "truth" / "map_perturbation.json"))
     first = geodesy.to_local(geodesy.from_local(found[:1, :3, 3], corrected.origin), origin)[0]
     return building_errors(corrected, truth, origin, (poses[0, :3, 3] - first)[:2])

@@ -72,7 +72,7 @@ def test_a_gis_sees_corrected_outlines_with_the_attribution(tmp_path: Path) -> N
         one, other = (found().buildings[k].building.osm_id for k in (i, j))
         assert other in overlaps[one], "each names the other"
         assert one in overlaps[other]
-    extract = read_buildings(path, ORIGIN)
+    extract = read_buildings(path, ORIGIN)[1]
     assert [b.osm_id for b in extract.buildings] == ["way/12", "way/-3", "relation/5"]
     np.testing.assert_allclose(
         extract.buildings[0].footprints[0].outer, found().buildings[0].corrected.footprints[0].outer, atol=0.012

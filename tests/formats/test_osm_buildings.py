@@ -263,7 +263,7 @@ def test_buildings_written_and_read_come_back_within_a_centimetre(tmp_path: Path
 def test_the_real_extract_lies_where_its_readme_says(recordings: Callable[[str], Path]) -> None:
     """Walls of a real scan, placed by ground truth, lie on the outlines (1 deg and 0.5 m off at best, says the README)."""
     folder = recordings("mcd_kth_day_06") / "mcd_kth_day_06"
-    extract = read_buildings(folder / "kth.osm", np.array([59.348268650, 18.073204280, 0.0]))
+    extract = read_buildings(folder / "kth.osm", np.array([59.348268650, 18.073204280, 0.0]))[1]
     assert sum(b.osm_id.startswith("way/") for b in extract.buildings) == 71
     assert extract.attribution == ATTRIBUTION
     assert all(shape_of(b).is_valid for b in extract.buildings)

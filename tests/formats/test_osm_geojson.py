@@ -11,8 +11,8 @@ import pytest
 from osm_builders import ORIGIN, ExtractMaker, square_at
 
 from lslam.errors import InputError
-from lslam.formats.osm_buildings import buildings_of, middle_of, read_buildings
-from lslam.formats.osm_files import ATTRIBUTION, read_osm
+from lslam.formats.osm_buildings import read_buildings
+from lslam.formats.osm_files import ATTRIBUTION
 from lslam.geometry.geodesy import from_local
 
 
@@ -42,7 +42,7 @@ def test_geojson_and_osm_give_the_same_buildings(tmp_path: Path) -> None:
     maker.square(9, 24, 4, 3)
     maker.relation(5, [(8, "outer"), (9, "inner")], type="multipolygon", building="yes")
     maker.square(11, 50, 0, 10, leisure="pitch")
-    theirs = read_buildings(maker.write_xml(tmp_path / "a.osm"), ORIGIN)
+    theirs = read_buildings(maker.write_xml(tmp_path / "a.osm"), ORIGIN)[1]
     path = written(
         tmp_path / "a.geojson",
         feature(polygon(ring(0, 0, 10)), **{"@id": "way/7", "building": "house", "height": 6.5}),
@@ -50,7 +50,7 @@ def test_geojson_and_osm_give_the_same_buildings(tmp_path: Path) -> None:
         feature(polygon(ring(50, 0, 10)), leisure="pitch"),
         feature({"type": "Point", "coordinates": [8.4, 49.0]}, building="entrance"),
     )
-    ours = read_buildings(path, ORIGIN)
+    ours = read_buildings(path, ORIGIN)[1]
     assert [b.osm_id for b in ours.buildings] == [b.osm_id for b in theirs.buildings] == ["way/7", "relation/5"]
     assert ours.buildings[0].height == 6.5
     for a, b in zip(ours.buildings, theirs.buildings, strict=True):
@@ -66,28 +66,27 @@ def test_outlines_without_tags_are_all_buildings(tmp_path: Path) -> None:
     path = written(
         tmp_path / "footprints.json", feature(parts, id=3), feature(polygon(ring(60, 0, 5))), attribution="The city"
     )
-    extract = read_buildings(path, ORIGIN)
+    extract = read_buildings(path, ORIGIN)[1]
     assert sorted(len(b.footprints) for b in extract.buildings) == [1, 2]
     assert all(b.osm_id.split("/")[1].startswith("-") for b in extract.buildings)
     assert extract.attribution == "The city"
     bare = tmp_path / "bare.geojson"
     bare.write_text(json.dumps(polygon(ring(0, 0, 10))))
-    np.testing.assert_allclose(read_buildings(bare, ORIGIN).buildings[0].area, 100.0, rtol=1e-3)
+    np.testing.assert_allclose(read_buildings(bare, ORIGIN)[1].buildings[0].area, 100.0, rtol=1e-3)
 
 
 def test_one_number_for_two_outlines_is_kept_once(tmp_path: Path) -> None:
     path = written(
         tmp_path / "a.geojson", *(feature(polygon(ring(x, 0, 9)), building="yes", osm_id=4) for x in (0, 20))
     )
-    assert len({b.osm_id for b in read_buildings(path, ORIGIN).buildings}) == 2
+    assert len({b.osm_id for b in read_buildings(path, ORIGIN)[1].buildings}) == 2
 
 
 def test_a_building_on_the_antimeridian_is_in_one_piece(tmp_path: Path) -> None:
     across = [[179.9999, -17.0], [-179.9999, -17.0], [-179.9999, -16.9998], [179.9999, -16.9998], [179.9999, -17.0]]
-    data = read_osm(written(tmp_path / "a.geojson", feature(polygon(across), building="yes")))
-    at = middle_of(data)
-    (building,) = buildings_of(data, at).buildings
-    assert abs(abs(at[1]) - 180) < 1e-6
+    _, extract = read_buildings(written(tmp_path / "a.geojson", feature(polygon(across), building="yes")))
+    (building,) = extract.buildings
+    assert abs(abs(extract.origin[1]) - 180) < 1e-6
     np.testing.assert_allclose(building.area, 21.3 * 22.1, rtol=0.02)
 
 

@@ -51,7 +51,7 @@ def run(folder: Path, *more: str, scans: int = 45) -> Path:
 def errors(folder: Path, corrected: CorrectedMap) -> list[BuildingError]:
     poses, origin = true_poses()
     record = read_perturbation(DRIVE / "truth" / "map_perturbation.json")
-    truth = map_errors(read_buildings(DRIVE / "map.osm", origin).buildings, record)
+    truth = map_errors(read_buildings(DRIVE / "map.osm", origin)[1].buildings, record)
     first = read_trajectory(folder / "trajectory.tum").poses[:1, :3, 3]
     at = geodesy.to_local(geodesy.from_local(first, corrected.origin), origin)[0]
     return [e for e in building_errors(corrected, truth, origin, (poses[0, :3, 3] - at)[:2]) if e.status == "seen"]

@@ -106,7 +106,7 @@ def test_any_heading_is_found_from_ten_metres_off(seed: int) -> None:
 
 
 def test_a_simulated_town_is_found_on_its_map_with_houses_missing() -> None:
-    extract = read_buildings(SAMPLE / "sequences" / "00" / "map.osm", np.array([49.0, 8.4, 115.0]))
+    extract = read_buildings(SAMPLE / "sequences" / "00" / "map.osm", np.array([49.0, 8.4, 115.0]))[1]
     kept = [b for k, b in enumerate(extract.buildings) if k % 6]
     target, _ = walls_of(kept)
     rng = np.random.default_rng(0)
@@ -136,7 +136,7 @@ def test_a_real_scan_is_found_on_the_real_map(recordings: Callable[[str], Path],
     c, s = np.cos(heading), np.sin(heading)
     level = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]) @ T[:3, :3]
     walls = find_walls(sequence.scan(number).points @ level.T)
-    target, _ = walls_of(read_buildings(folder / "kth.osm", np.array([59.348268650, 18.073204280, 0.0])).buildings)
+    target, _ = walls_of(read_buildings(folder / "kth.osm", np.array([59.348268650, 18.073204280, 0.0]))[1].buildings)
     off_by_three = np.array(pose) + np.array([1.8, -2.4, np.radians(10)])
     near = match_walls(walls.segments, target, off_by_three, np.array([2, 2, np.radians(5)]))
     start = find_heading(walls.segments, target, np.array(pose[:2]) + np.array([6.0, -5.0]), 15.0)
@@ -150,7 +150,7 @@ def test_a_real_scan_is_found_on_the_real_map(recordings: Callable[[str], Path],
 
 
 def test_the_map_of_another_town_is_no_start() -> None:
-    extract = read_buildings(SAMPLE / "sequences" / "00" / "map.osm", np.array([49.0, 8.4, 115.0]))
+    extract = read_buildings(SAMPLE / "sequences" / "00" / "map.osm", np.array([49.0, 8.4, 115.0]))[1]
     target, _ = walls_of(extract.buildings)
     for seed in range(6):
         source, _, _ = scene(seed)
