@@ -62,8 +62,11 @@ class FeatureRegistration(Stateful):
 
     @property
     def noise(self) -> FeatureNoise:
-        """While the speed is being learnt nothing better than the features' word is expected, however little it is."""
-        return replace(self._usual, least=0.0) if self._starting > 0 else self._usual
+        """Features that hold a direction worse than the motion prior does have no say there: it is as good as it lately was.
+
+        No better than one planar point, though: a sensor on a straight way is not expected to stay on it.
+        """
+        return replace(self._usual, least=self.config.sigma**2 / max(self.threshold.mean_square, self.config.sigma**2))
 
     def locate(self, features: Features, T_prior: Floats, clock: StageClock) -> RegistrationResult:
         """Align with what is there; the result says whether to believe it, and when less planar points stood in."""
@@ -184,12 +187,12 @@ class FeatureRegistration(Stateful):
             scatter=scatter, coarse=target.planes.coarsen(self._coarse_factor()),
         )  # fmt: skip
         result = self._judge(result, T_prior)
-        if not result.ok or (starved.ok and len(result.degenerate) >= max(len(starved.degenerate), 1)):
+        are_few = starved.inliers < MIN_FEATURES
+        # They must close a direction; where features are too few to be sure of any, open none.
+        if not result.ok or (starved.ok and len(result.degenerate) > len(starved.degenerate) - (not are_few)):
             return starved
         why = starved.reason or (
-            f"only {starved.inliers} features agree"
-            if starved.inliers < MIN_FEATURES
-            else "features leave a direction open"
+            f"only {starved.inliers} features agree" if are_few else "features leave a direction open"
         )
         return replace(result, reason=f"{why}: less planar points stood in")
 

@@ -24,8 +24,8 @@ class FeatureNoise:
     """Standard deviations of a feature's point, m: of an edge across it, of a planar point along the normal.
 
     weak_share : part of the information below which a direction counts as unobserved
-    least : planar points that hold a direction no better than all features do when it counts as unobserved: a few false
-        edges hold as much
+    least : planar points that hold a direction no better than all features do when it counts as unobserved: one at most,
+        for a few false edges hold as much, and fewer where the motion prior is worse
     """
 
     edge: float

@@ -37,6 +37,11 @@ class AdaptiveThreshold(Stateful):
         """Kernel width for the next scan, m."""
         return min(max(3 * math.sqrt(self._mean_square), self.low), self.high)
 
+    @property
+    def mean_square(self) -> float:
+        """Of the recent prediction errors, m2."""
+        return self._mean_square
+
     def observe(self, error: float) -> None:
         """Learn from one registered scan's prediction error, m."""
         self._mean_square = self.FORGETTING * self._mean_square + (1 - self.FORGETTING) * error**2

@@ -7,7 +7,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from drives import drive, registered
+from drives import ate, drive, registered
 from numpy.typing import NDArray
 
 from lslam.config.config import Config
@@ -45,11 +45,13 @@ def test_bare_walls_do_not_lead_features_astray(method: str, seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", [0, 1])
-def test_a_sparse_sensor_is_not_doubted_everywhere(seed: int) -> None:
-    """16 x 400 rays make few features, which hold every direction a little."""
-    results = by_features(simulate("block", seed=seed, motion_compensated=True), "loam-odom")
+def test_a_sparse_sensor_holds_every_direction_as_it_turns(seed: int) -> None:
+    """16 x 400 rays make few features: they know the yaw by 2 cm at their distance, the last turn of it ten times worse."""
+    block = simulate("block", seed=seed, motion_compensated=True)
+    results = by_features(block, "loam-odom")
     assert len(results) > 90
-    assert np.mean([len(r.degenerate) > 0 for r in results]) < 0.5
+    assert np.mean([len(r.degenerate) > 0 for r in results]) < 0.02
+    assert ate(np.stack([r.T_world_lidar for r in results]), block.ground_truth.poses) < 0.3
 
 
 @cache

@@ -165,6 +165,15 @@ def test_what_led_astray_where_nothing_is_observed_is_taken_back_and_nothing_els
         np.testing.assert_allclose(kept.T_world_lidar, right, atol=2e-4)
 
 
+def test_features_are_asked_to_be_as_good_as_the_prior_and_no_better_than_one_planar_point() -> None:
+    """A prior that is wrong by 0.3 m knows a direction as one planar point in a hundred would: 3 cm over 0.3 m, squared."""
+    registration = engine(joint_step, False)
+    for error, least in [(0.3, 0.01), (0.06, 0.25), (0.03, 1.0), (0.001, 1.0), (0.0, 1.0)]:
+        for _ in range(4000):
+            registration.threshold.observe(error)
+        assert registration.noise.least == pytest.approx(least)
+
+
 @pytest.mark.parametrize(("step", "with_map"), VARIANTS)
 def test_no_features_at_all_keep_the_prior_in_doubt(step: ScanStep | None, with_map: bool) -> None:
     registration = engine(step, with_map)
