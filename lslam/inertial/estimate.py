@@ -20,7 +20,7 @@ from lslam.types.imu import ImuStream
 Floats = NDArray[np.float64]
 
 GRAVITY = 9.80665
-# Registration from scan to scan: m and rad, one sigma.
+# Registration from scan to scan, at the least: m and rad, one sigma.
 PLACE_SIGMA, TURN_SIGMA = 0.007, np.deg2rad(0.05)
 # Force that no bias explains (vibration, misaligned axes, readings cut at the rate): per sqrt(Hz).
 FORCE_NOISE = 0.1
@@ -82,12 +82,13 @@ class ImuEstimate:
 
     def corrected(
         self, imu: ImuStream, instants_ns: NDArray[np.int64], R: Floats, R_end: Floats, moved: Floats,
-        gyroscope: Gyroscope,
+        gyroscope: Gyroscope, noise: Floats | None = None,
     ) -> ImuEstimate:  # fmt: skip
         """The estimate at the last instant, now that registration says how the IMU got there.
 
         R, R_end : (3, 3) of the IMU in the world at the first and the last instant; moved : (3,) m in between
         gyroscope : as the turn has `taught`
+        noise : (3, 3) m2, world axes, of either place; None where a registration says nothing of its quality
         """
         step = self.over(imu, instants_ns)
         rest = so3.log((R @ step.rotations[-1]).T @ R_end)
@@ -99,7 +100,8 @@ class ImuEstimate:
         x, P = _propagate(self, step, R)
         H = np.zeros((3, 12))
         H[:, :3] = np.eye(3)
-        x, P = update(x, P, H, moved - x[:3], 2 * PLACE_SIGMA**2 * np.eye(3))
+        place = PLACE_SIGMA**2 * np.eye(3) + (0.0 if noise is None else noise)
+        x, P = update(x, P, H, moved - x[:3], 2 * place)
         down = x[6:9]
         norm = float(np.linalg.norm(down))
         H = np.zeros((1, 12))

@@ -50,8 +50,8 @@ class InertialMotion(Stateful):
         self._gaps = gaps(imu, config.gap_s)
         self._instant_ns: int | None = None
         self._pose = np.eye(4)
-        # What `weigh` learnt of the gyroscope at an instant, ns, for `correct`.
-        self._taught: tuple[int, Gyroscope] | None = None
+        # What `weigh` learnt at an instant, ns, for `correct`: the gyroscope, and how well registration knows the place, m2.
+        self._taught: tuple[int, Gyroscope, Floats] | None = None
         self._errors: list[tuple[float, float]] = []
 
     @property
@@ -100,7 +100,8 @@ class InertialMotion(Stateful):
         P = np.zeros((6, 6))
         P[:3, :3], P[3:, 3:] = felt, R_felt @ e.gyroscope.turn_covariance(step) @ R_felt.T
         rest = np.concatenate([end[:3, 3] - begin[:3, 3] - moved, R_felt @ so3.log(R_felt.T @ end[:3, :3])])
-        self._taught = instant_ns, e.taught(self.imu, instants, begin[:3, :3], end[:3, :3], C[3:, 3:])
+        gyroscope = e.taught(self.imu, instants, begin[:3, :3], end[:3, :3], C[3:, 3:])
+        self._taught = instant_ns, gyroscope, C[:3, :3]
         if surprise(rest, P + 2 * C) > 1:
             return result
         # A pose that is wrong moves the map by one part in its age only, the scans before hold it: random errors of both
@@ -198,11 +199,11 @@ class InertialMotion(Stateful):
         a, b = self._pose @ self.T_lidar_imu, middle @ self.T_lidar_imu
         instants = np.array([self._instant_ns, instant_ns])
         if self._taught is not None and self._taught[0] == instant_ns:
-            gyroscope = self._taught[1]
+            _, gyroscope, noise = self._taught
         else:
-            gyroscope = self.estimate.taught(self.imu, instants, a[:3, :3], b[:3, :3])
+            gyroscope, noise = self.estimate.taught(self.imu, instants, a[:3, :3], b[:3, :3]), None
         return self.estimate.corrected(
-            self.imu, instants, a[:3, :3], b[:3, :3], b[:3, 3] - a[:3, 3], gyroscope
+            self.imu, instants, a[:3, :3], b[:3, :3], b[:3, 3] - a[:3, 3], gyroscope, noise
         )  # fmt: skip
 
     def _carried(self, instant_ns: int) -> ImuEstimate:

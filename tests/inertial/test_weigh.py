@@ -112,6 +112,44 @@ def test_a_poor_registration_teaches_the_gyroscope_nothing() -> None:
     assert (np.diag(after.covariance) > (1 - 1e-5) * np.diag(before.covariance)).all()
 
 
+def test_a_place_that_registration_hardly_sees_along_one_axis_teaches_the_velocity_nothing_there() -> None:
+    """Agreeing with the IMU once it was weighed against it is no proof of the velocity either."""
+    motion = motion_of()
+    stamp, true = begun(motion)
+    seen = true.copy()
+    seen[0, 3] += 0.5
+    prior = motion.sweep(stamp, 0.0)
+    out = motion.weigh(result_of(3, stamp, seen, np.diag([1.0, 1e-6, 1e-6] + [1e-10] * 3)), prior)
+    before = motion.estimate.covariance.copy()
+    motion.correct(stamp, out.T_world_lidar, prior)
+    after = motion.estimate.covariance
+    assert after[0, 0] > before[0, 0]
+    assert (np.diag(after)[1:3] < np.diag(before)[1:3]).all()
+    np.testing.assert_allclose(
+        motion.sweep(stamp + 100_000_000, 0.0).start[:3, 3], truth_of(drone())[1][4, :3, 3], atol=0.03
+    )
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_the_velocity_is_as_sure_as_it_says_whatever_registration_is(seed: int) -> None:
+    """Places known to decimetres: the velocity's error is within its own covariance, not within a good registration's."""
+    motion = motion_of()
+    rng = np.random.default_rng(seed)
+    stamps, poses = truth_of(drone())
+    C = np.diag([0.1**2] * 3 + [1e-8] * 3)
+    squared = []
+    for k in range(1, 60):
+        prior = motion.sweep(int(stamps[k]), 0.0)
+        seen = poses[k].copy()
+        seen[:3, 3] += rng.normal(0, 0.1, 3)
+        out = motion.weigh(result_of(k, int(stamps[k]), seen, C, map_age=1e3), prior)
+        motion.correct(int(stamps[k]), out.T_world_lidar, prior)
+        true = (poses[k + 1, :3, 3] - poses[k - 1, :3, 3]) / (1e-9 * float(stamps[k + 1] - stamps[k - 1]))
+        off = motion.estimate.velocity - true
+        squared.append(off @ np.linalg.solve(motion.estimate.covariance[:3, :3], off) / 3)
+    assert np.mean(squared[10:]) < 1
+
+
 def test_an_old_map_counts_for_more_than_one_scan() -> None:
     motion = motion_of()
     stamp, true = begun(motion)
