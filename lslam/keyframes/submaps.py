@@ -21,15 +21,17 @@ def neighbours(count: int, number: int, size: int) -> range:
 
 
 def submap(
-    store: KeyframeStore, poses: NDArray[np.float64], number: int, size: int, voxel: float | None = None
-) -> NDArray[np.float32]:
-    """Points (M, 3), m, of the `size` keyframes about keyframe `number`, in its LiDAR frame.
+    store: KeyframeStore, poses: NDArray[np.float64], number: int, size: int, voxel: float | None = None,
+    T_world_frame: NDArray[np.float64] | None = None,
+) -> NDArray[np.float32]:  # fmt: skip
+    """Points (M, 3), m, of the `size` keyframes about keyframe `number`, in its LiDAR frame or in `T_world_frame` (4, 4).
 
     poses : (K, 4, 4) T_world_lidar of all keyframes, odometry's or optimised ones
     voxel : m, one averaged point per voxel is left; None leaves all
     """
+    frame = poses[number] if T_world_frame is None else T_world_frame
     clouds = [
-        se3.apply(se3.relative(poses[number], poses[k]), store.points(k).astype(np.float64)).astype(np.float32)
+        se3.apply(se3.relative(frame, poses[k]), store.points(k).astype(np.float64)).astype(np.float32)
         for k in neighbours(len(store), number, size)
     ]
     points = np.concatenate(clouds)

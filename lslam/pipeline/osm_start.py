@@ -42,8 +42,9 @@ class WallView:
 def see_walls(store: KeyframeStore, poses: Floats, number: int, size: int, config: OsmConfig) -> WallView:
     """Walls in the submap of `size` keyframes about keyframe `number`; `poses` (K, 4, 4) of all in a level world."""
     at = se2.of_se3(poses[number])
-    tilt = se2.to_se3(np.array([0.0, 0.0, -at[2]]))[:3, :3] @ poses[number, :3, :3]
-    cloud = submap(store, poses, number, size) @ tilt.T.astype(np.float32)
+    T_world_level = se2.to_se3(at)
+    T_world_level[2, 3] = poses[number, 2, 3]
+    cloud = submap(store, poses, number, size, T_world_frame=T_world_level)
     near = neighbours(len(store), number, size)
     views = se2.apply(se2.inverse(at), poses[near.start : near.stop, :2, 3])
     return WallView(find_walls(cloud, config, views).segments, views)

@@ -29,6 +29,7 @@ THIN = 0.25  # m; points above one another count as one, with their number
 AGREEMENT = np.cos(np.radians(20.0))  # of a point's own plane with the line's
 TRIES = 12  # lines tried for each segment
 MOST = 200  # segments looked for
+HIGHEST = 1e4  # m; nothing that is seen lies higher or lower, what is not finite included
 STRAIGHT = 0.1  # m; corners of a footprint that lie so near the line through their neighbours are none
 
 
@@ -61,8 +62,8 @@ def find_walls(points: NDArray[Any], config: OsmConfig | None = None, views: NDA
     """
     config = config or OsmConfig()
     cloud = np.asarray(points, np.float32).reshape(-1, 3)
-    is_near = np.abs(cloud[:, :2]).max(axis=1, initial=0.0) < config.wall_range
-    cloud = np.ascontiguousarray(cloud[is_near & np.isfinite(cloud).all(1) & (np.abs(cloud[:, 2]) < 1e4)])
+    x, y, z = np.abs(cloud.T)
+    cloud = cloud[(x < config.wall_range) & (y < config.wall_range) & (z < HIGHEST)]
     if len(cloud) < config.min_cluster:
         return Walls(np.zeros((0, 2, 2)), np.zeros(0, np.int64), np.zeros(0))
     flat, every = segments.flat_walls(

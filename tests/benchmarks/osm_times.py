@@ -1,0 +1,85 @@
+"""What a keyframe costs a run on a map: wall extraction, global match, local match (issue 7: 20, 50 and 1 ms at most).
+
+    lslam simulate residential --seed 0 --out drives/residential-0
+    python tests/benchmarks/osm_times.py drives/residential-0/sequences/00 [--keyframes 40] [--submap 5]
+
+Keyframes stand at their true poses, the prior of each global match is off by a sigma, and every building within reach has a local
+match. Milliseconds of this thread's CPU time, so that others at work on the machine hardly count: median, 95 %, largest.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from time import thread_time
+
+import numpy as np
+from osm import SPACING, true_poses
+
+from lslam.config.keyframes import KeyframesConfig
+from lslam.config.osm import OsmConfig
+from lslam.config.preprocess import PreprocessConfig
+from lslam.formats.osm_buildings import read_buildings
+from lslam.geometry import se2
+from lslam.keyframes.cloud import keyframe_cloud
+from lslam.keyframes.store import KeyframeStore
+from lslam.pipeline.osm_start import see_walls
+from lslam.priors.osm_map import OsmMap
+from lslam.priors.osm_prior import match_buildings, match_keyframe, warm_up
+from lslam.readers import open_sequence
+from lslam.types.building_match import KeyframeMatch
+from lslam.types.keyframe import Keyframe
+from lslam.types.motion_prior import MotionPrior
+
+SIGMA = np.array([0.7, 0.7, np.radians(1.5)])
+LIMITS = {"wall extraction": 20.0, "global match": 50.0, "local match": 1.0}
+
+
+def measured(drive: Path, count: int, size: int) -> dict[str, list[float]]:
+    """Milliseconds of each stage, keyframe by keyframe."""
+    poses, origin = true_poses(drive)
+    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1))])
+    scans = np.unique(np.searchsorted(way, SPACING * np.arange(count)).clip(max=len(poses) - 1))
+    sequence, store = open_sequence(drive), KeyframeStore()
+    for k, scan in enumerate(scans.tolist()):
+        still = MotionPrior(np.zeros(1), poses[scan][None])
+        cloud = keyframe_cloud(sequence.scan(scan), still, PreprocessConfig(), KeyframesConfig())
+        store.add(Keyframe(k, scan, scan, poses[scan], None, float(way[scan])), cloud)
+    config, osm = OsmConfig(), OsmMap(read_buildings(drive / "map.osm", origin).buildings)
+    warm_up()
+    rng, found = np.random.default_rng(0), {name: list[float]() for name in LIMITS}
+    for k in range(len(store)):
+        at = se2.of_se3(poses[scans[k]])
+        store.points(k)
+        begin = thread_time()
+        seen = see_walls(store, poses[scans], k, size, config)
+        walls = thread_time()
+        prior = at + SIGMA * rng.standard_normal(3)
+        view = match_keyframe(
+            KeyframeMatch(k, seen.walls, seen.views, prior, SIGMA, prior, np.zeros((3, 3))), osm, config
+        )
+        whole = thread_time()
+        match_buildings(view, at, np.zeros(2), osm, config)
+        local = (thread_time() - whole) / max(len(osm.near(at[:2], config.use_radius)), 1)
+        for name, spent in zip(LIMITS, (walls - begin, whole - walls, local), strict=True):
+            found[name].append(1e3 * spent)
+    return found
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("drives", nargs="+", type=Path, help="folders of simulated sequences, with map.osm in them")
+    parser.add_argument("--keyframes", type=int, default=40)
+    parser.add_argument("--submap", type=int, default=5, help="keyframes in the submap walls are seen in")
+    args = parser.parse_args()
+    print(f"{'ms per keyframe; local: per building':44s} {'median':>8s} {'95 %':>8s} {'largest':>8s} {'limit':>8s}")
+    for drive in args.drives:
+        for name, times in measured(drive, args.keyframes, args.submap).items():
+            row = (np.median(times), np.percentile(times, 95), max(times), LIMITS[name])
+            label = f"{drive.parent.parent.name}, {name}"
+            print(f"{label:44s} " + " ".join(f"{value:8.2f}" for value in row), flush=True)
+
+
+if __name__ == "__main__":
+    main()
