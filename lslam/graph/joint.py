@@ -76,7 +76,9 @@ def optimise_jointly(
     if seen:
         spread = noise.from_body(marginal_blocks(settled.factors, settled.values, keys.values()), places)
     buildings = _solution(middles, seen, places, spread, settled.weights >= 0.5, belief)
-    return JointSolution(poses, marginals(settled.factors, settled.values, poses), buildings)
+    covariances = marginals(settled.factors, settled.values, poses)
+    covariances = covariances if graph.spread is None else covariances + graph.spread
+    return JointSolution(poses, covariances, buildings)
 
 
 def _seen_from(match: BuildingMatch) -> PlanarPrior:

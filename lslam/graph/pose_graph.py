@@ -61,6 +61,7 @@ def optimise(graph: PoseGraph, config: GraphConfig) -> Solution:
         )
     else:
         covariances = marginals(settled.factors, settled.values, poses)
+    covariances = covariances if graph.spread is None else covariances + graph.spread
     doubts = [
         ""
         if weight >= 0.5

@@ -77,6 +77,7 @@ class PoseGraph:
     is_anchored : whether the first pose is held where it is; else the fixes hold the graph
     start_sigma : (3,) x, y (m), yaw (rad), how well these are known of a first pose that is held only otherwise
     is_rigid : odometry is trusted: the whole moves, and nothing bends it
+    spread : (K, 6, 6) what poses are unsure by beside all that, as the covariances of `Solution`; None for nothing
     """
 
     poses: Floats
@@ -94,6 +95,7 @@ class PoseGraph:
     is_anchored: bool = True
     start_sigma: Floats | None = None
     is_rigid: bool = False
+    spread: Floats | None = None
 
     def __len__(self) -> int:
         return len(self.poses)

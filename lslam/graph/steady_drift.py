@@ -1,94 +1,168 @@
 """Odometry that runs away steadily, as the buildings of a map reveal it, and that is set straight before the graph is solved.
 
 What makes every scan wrong alike (a bent calibration, a wheel that slips) turns and shifts a trajectory at a rate that lasts.
-The map errs about each place by far more than odometry does from keyframe to keyframe: a walk that may follow the one follows
-the other too, at the cost of every step, while a rate is told by all keyframes together and bends no step.
+A map has each wall wrong by far more than odometry errs from keyframe to keyframe, but wrong by the same from wherever it is
+seen: that a wall moves while the run passes it tells a rate, whatever the map is worth, and a rate bends no step.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lslam.config.graph import GraphConfig
-from lslam.geometry import se2, se3, so3
+from lslam.geometry import se3, so3
 from lslam.graph.chi_square import quantile
-from lslam.graph.problem import PlanarPrior, PoseGraph
+from lslam.graph.factors import PLANAR
+from lslam.graph.problem import PoseGraph
 
 Floats = NDArray[np.float64]
+Sizes = tuple[float, ...]
 
-# m over which a rate is about one and the same, and planar priors that are asked, evenly spread.
-MEMORY, MOST = 100.0, 100
-# Times the drift, and times the errors of the map, that the configuration believes in: those are taken that are likeliest.
-SIZES, SCALES = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0), (0.25, 0.5, 1.0, 2.0)
-# Directions with less than this share of the largest information are free.
-FREE = 1e-9
+MEMORY = 100.0  # m over which a rate is about one and the same
+# Times the errors of what is seen, of the map, and of odometry, that the configuration believes in: the likeliest are taken.
+SCALES: tuple[Sizes, ...] = (
+    (0.03125, 0.0625, 0.125, 0.25, 0.5, 1.0), (0.125, 0.25, 0.5, 1.0, 2.0), (0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
+)  # fmt: skip
+SWEEPS, ROUNDS = 3, 6
+# Degrees of freedom of what is seen (Student's t): among many walls some are taken for others.
+FREEDOM = 3.0
+
+
+@dataclass(frozen=True)
+class WallSightings:
+    """Walls of a map that were seen, one row per wall and keyframe.
+
+    keyframes, walls : (N,) numbers; normals : (N, 2) of the walls on the map
+    places : (N, 2) m, the middle of what was seen, as the graph has it; offsets : (N,) m, along the normal, from the wall
+    """
+
+    keyframes: NDArray[np.int64]
+    walls: NDArray[np.int64]
+    normals: Floats
+    places: Floats
+    offsets: Floats
+
+
+@dataclass(frozen=True)
+class SteadyDrift:
+    """What odometry has to be set right by.
+
+    rates : (K-1, 3) per m of the way from each keyframe to the next: m along x and y of the world, rad of heading
+    spread : (K, 6, 6) by how much each pose is unsure for that the rates are, as the covariances of `Solution`
+    """
+
+    rates: Floats
+    spread: Floats
 
 
 def find_steady_drift(
-    graph: PoseGraph, shared: NDArray[np.float64], map_sigma: NDArray[np.float64], config: GraphConfig
-) -> Floats | None:
-    """The rates at which odometry has to be set right to lie on the map; None when chance explains the map as well.
+    graph: PoseGraph, seen: WallSightings, seen_sigma: float, map_sigma: float, config: GraphConfig
+) -> SteadyDrift | None:
+    """The rates at which odometry has to be set right to see walls stand still; None when chance explains as much.
 
-    Rates at knots along the way and the errors of the map are both random, of sizes that are unknown: each is given that with
-    which what was seen is likeliest (empirical Bayes), and drift is what the map is likelier with than chance would have it.
+    Rates at knots along the way, what each wall of the map is off by, and the errors of what is seen are all random, of sizes
+    that are unknown: each is given that with which what was seen is likeliest (empirical Bayes), and drift is what this is
+    likelier with than chance would have it.
 
     graph : in the frame of the map, held by `start_sigma`, with `distances`
-    shared : (M, M) 0..1, how much two of its planar priors look at the same part of the map, so that they err alike
-    map_sigma : (3,) m, m, rad, of what stands about one place of the map
-
-    Returns (K-1, 3) per m of the way from each keyframe to the next: m along x and y of the world, rad of heading.
+    seen_sigma, map_sigma : m, of a wall that is seen, and of one of the map beside the shift of the whole
     """
-    chosen = np.unique(np.linspace(0, len(graph.map_priors) - 1, MOST).round().astype(int))
-    priors = [graph.map_priors[i] for i in chosen]
-    if len(priors) < 2 or graph.start_sigma is None or graph.distances[-1] <= 0:
+    if not len(seen.walls) or graph.start_sigma is None or graph.distances[-1] <= 0:
         return None
-    error, noise = _seen(graph, priors, shared[np.ix_(chosen, chosen)], map_sigma)
-    effects = _rows(_directions(priors), _effects(graph, [p.keyframe for p in priors]))
+    effects = _effects(graph)
     given = np.append(graph.start_sigma, np.full(2, graph.shift_sigma)) ** 2
-    fit = _Fit(error, noise, effects, given, _belief(graph.distances[-1], config))
-    steady, scale, size = min((fit.unlikeliness(scale, size), scale, size) for scale in SCALES for size in SIZES)
-    if min(fit.unlikeliness(scale, 0.0) for scale in SCALES) - steady <= quantile(config.probability, fit.count):
+    fit = _Fit(seen, _rows(graph, seen, effects), seen_sigma, map_sigma, given, _belief(graph.distances[-1], config))
+    sizes = fit.likeliest(SCALES)
+    for _ in range(ROUNDS):
+        fit.doubt(sizes)
+        sizes = fit.likeliest(SCALES)
+    without = fit.likeliest((*SCALES[:2], (0.0,)))
+    if fit.unlikeliness(without) - fit.unlikeliness(sizes) <= quantile(config.probability, fit.count):
         return None
-    return np.asarray(_hats(graph.distances) @ fit.rates(scale, size))
+    found, covariance = fit.rates(sizes)
+    moves = effects[:, :, 5:]
+    spread = np.zeros((len(graph), 6, 6))
+    spread[:, np.array(PLANAR)[:, None], PLANAR] = moves @ covariance @ np.swapaxes(moves, -1, -2)
+    return SteadyDrift(np.asarray(_hats(graph.distances) @ found.reshape(-1, 3)), spread)
 
 
 class _Fit:
-    """Start and map with variances `given` (5,), and rates with the covariance `believed` (P, P), on what was seen.
+    """Start and shift of the map with variances `given` (5,), rates with the covariance `believed` (P, P), on what was seen.
 
-    error (N,) with the covariance `noise` (N, N) comes of them by `effects` (N, 5 + P). All is brought to noise of unit size
-    once, so that other sizes of noise and rates cost next to nothing.
+    rows (N, 5 + P) : what they do to the offsets. What each wall is off by on the map is eliminated.
     """
 
-    def __init__(self, error: Floats, noise: Floats, effects: Floats, given: Floats, believed: Floats) -> None:
+    def __init__(
+        self, seen: WallSightings, rows: Floats, seen_sigma: float, map_sigma: float, given: Floats, believed: Floats
+    ) -> None:
         self.count = len(believed)
-        whitened = np.linalg.solve(np.linalg.cholesky(noise), np.column_stack([effects, error]))
-        self._rows, self._squared = len(error), float(whitened[:, -1] @ whitened[:, -1])
-        self._normal, self._pull = whitened[:, :-1].T @ whitened[:, :-1], whitened[:, :-1].T @ whitened[:, -1]
-        self._given, self._believed = given, believed
+        self._wall = np.unique(seen.walls, return_inverse=True)[1]
+        self._columns = np.column_stack([rows, seen.offsets])
+        self._seen, self._map, self._given, self._believed = seen_sigma**2, map_sigma**2, given, believed
+        self._believe(np.ones(len(rows)))
 
-    def unlikeliness(self, scale: float, size: float) -> float:
-        """Minus twice the logarithm of the likelihood, but for a constant, with noise and rates so many times as large."""
-        prior, found = self._solved(scale, size)
-        spread = np.linalg.slogdet(np.eye(len(prior)) + prior @ self._normal / scale**2)[1]
-        rest = (self._squared - self._pull @ found) / scale**2
-        return float(2 * self._rows * np.log(scale) + spread + rest)
+    def likeliest(self, choices: tuple[Sizes, ...]) -> Sizes:
+        """Of each of the `choices` of `SCALES` that with which what was seen is likeliest."""
+        best = tuple(choice[len(choice) // 2] for choice in choices)
+        for _ in range(SWEEPS):
+            for axis, choice in enumerate(choices):
+                best = min(((*best[:axis], c, *best[axis + 1 :]) for c in choice), key=self.unlikeliness)
+        return best
 
-    def rates(self, scale: float, size: float) -> Floats:
-        """(P / 3, 3) at the knots."""
-        return self._solved(scale, size)[1][len(self._given) :].reshape(-1, 3)
+    def unlikeliness(self, sizes: Sizes) -> float:
+        """Minus twice the logarithm of the likelihood, but for a constant."""
+        noise, own = self._variances(sizes)
+        normal, pull, squared = self._reduced(sizes)
+        system = np.eye(len(normal)) + self._prior(sizes) @ normal
+        found = np.linalg.solve(system, self._prior(sizes) @ pull)
+        spread = np.linalg.slogdet(system)[1] + np.log1p(own / noise * self._weight).sum()
+        return float(len(self._columns) * np.log(noise) + spread + squared - pull @ found)
 
-    def _solved(self, scale: float, size: float) -> tuple[Floats, Floats]:
-        """The covariance of everything unknown, and what it is found to be."""
+    def rates(self, sizes: Sizes) -> tuple[Floats, Floats]:
+        """(P,) at the knots, three each, and their covariance (P, P)."""
+        found, covariance = self._solved(sizes)
+        n = len(self._given)
+        return found[n:], covariance[n:, n:]
+
+    def doubt(self, sizes: Sizes) -> None:
+        """Believe what lies far from where all the rest has it less."""
+        noise, own = self._variances(sizes)
+        away = self._columns @ np.append(self._solved(sizes)[0], 1.0)
+        pulls = np.bincount(self._wall, self._weights * away)
+        away -= (pulls / (self._weight + noise / own))[self._wall]
+        self._believe((FREEDOM + 1.0) / (FREEDOM + away**2 / noise))
+
+    def _believe(self, weights: Floats) -> None:
+        self._weights, self._weight = weights, np.bincount(self._wall, weights)
+        weighted = weights[:, None] * self._columns
+        self._whole = self._columns.T @ weighted
+        self._by_wall = np.zeros((len(self._weight), self._columns.shape[1]))
+        np.add.at(self._by_wall, self._wall, weighted)
+
+    def _variances(self, sizes: Sizes) -> tuple[float, float]:
+        return sizes[0] ** 2 * self._seen, sizes[1] ** 2 * self._map
+
+    def _reduced(self, sizes: Sizes) -> tuple[Floats, Floats, float]:
+        """Normal matrix, right side and squared length of the offsets, with the errors of the map eliminated."""
+        noise, own = self._variances(sizes)
+        shares = self._by_wall / (self._weight + noise / own)[:, None]
+        whole = (self._whole - self._by_wall.T @ shares) / noise
+        return whole[:-1, :-1], -whole[:-1, -1], float(whole[-1, -1])
+
+    def _prior(self, sizes: Sizes) -> Floats:
         n = len(self._given)
         prior = np.zeros((n + self.count, n + self.count))
-        prior[:n, :n], prior[n:, n:] = np.diag(self._given), size**2 * self._believed
-        # Not by the inverse of the prior: without rates there is none.
-        found = np.linalg.solve(scale**2 * np.eye(len(prior)) + prior @ self._normal, prior @ self._pull)
-        return prior, np.asarray(found)
+        prior[:n, :n], prior[n:, n:] = np.diag(self._given), sizes[2] ** 2 * self._believed
+        return prior
+
+    def _solved(self, sizes: Sizes) -> tuple[Floats, Floats]:
+        """What all that is unknown is found to be, and its covariance; not by the inverse of the prior, which may be none."""
+        prior, (normal, pull, _) = self._prior(sizes), self._reduced(sizes)
+        covariance = np.linalg.solve(np.eye(len(normal)) + prior @ normal, prior)
+        return np.asarray(covariance @ pull), np.asarray(covariance)
 
 
 def without_drift(graph: PoseGraph, rates: NDArray[np.float64]) -> PoseGraph:
@@ -110,47 +184,27 @@ def without_drift(graph: PoseGraph, rates: NDArray[np.float64]) -> PoseGraph:
     return replace(graph, poses=moved, odometry=odometry)
 
 
-def _directions(priors: Sequence[PlanarPrior]) -> list[Floats]:
-    """Per prior (rank, 3), what it fixes."""
-    found = []
-    for prior in priors:
-        values, axes = np.linalg.eigh(prior.information)
-        found.append(axes[:, values > FREE * values[-1]].T)
-    return found
+def _rows(graph: PoseGraph, seen: WallSightings, effects: Floats) -> Floats:
+    """(N, 5 + 3 n) what start, shift and rates do to the offsets of what was seen."""
+    moves = effects[seen.keyframes]
+    about = seen.places - graph.poses[seen.keyframes, :2, 3]
+    turned = np.einsum("ni,ni->n", seen.normals, _across(about))
+    return np.asarray(np.einsum("ni,nip->np", seen.normals, moves[:, :2]) + turned[:, None] * moves[:, 2])
 
 
-def _rows(directions: list[Floats], blocks: Floats) -> Floats:
-    """(N, P) of (M, 3, P): only what the priors fix."""
-    return np.concatenate([axes @ block for axes, block in zip(directions, blocks, strict=True)])
-
-
-def _seen(graph: PoseGraph, priors: list[PlanarPrior], shared: Floats, map_sigma: Floats) -> tuple[Floats, Floats]:
-    """(N,) how far each prior lies from odometry along what it fixes, and the covariance (N, N) of that."""
-    directions = _directions(priors)
-    away = np.stack([p.pose for p in priors]) - se2.of_se3(graph.poses[[p.keyframe for p in priors]])
-    away[:, 2] = se2.wrapped(away[:, 2])
-    owners = np.repeat(np.arange(len(priors)), [len(axes) for axes in directions])
-    H = np.concatenate(directions)
-    own = np.concatenate(
-        [1.0 / np.einsum("ri,ij,rj->r", axes, p.information, axes) for axes, p in zip(directions, priors, strict=True)]
-    )
-    together = (H * map_sigma**2) @ H.T * shared[np.ix_(owners, owners)]
-    return np.einsum("ni,ni->n", H, away[owners]), together + np.diag(own)
-
-
-def _effects(graph: PoseGraph, keyframes: list[int]) -> Floats:
-    """(M, 3, 5 + 3 n) what start, shift of the map, and rates at the knots do to the planar poses of `keyframes`."""
+def _effects(graph: PoseGraph) -> Floats:
+    """(K, 3, 5 + 3 n) what start, shift of the map, and rates at the knots do to planar poses, as seen from the map."""
     place, way = graph.poses[:, :2, 3], np.diff(graph.distances)
     middle, hats = 0.5 * (place[1:] + place[:-1]), _hats(graph.distances)
-    start, rates = np.zeros((len(keyframes), 3, 5)), np.zeros((len(keyframes), 3, hats.shape[1], 3))
-    for row, k in enumerate(keyframes):
-        start[row, :2, 2] = _across(place[k] - place[0])
-        start[row, :, :3] += np.eye(3)
-        start[row, :2, 3:] = -np.eye(2)
+    start, rates = np.zeros((len(place), 3, 5)), np.zeros((len(place), 3, hats.shape[1], 3))
+    for k in range(len(place)):
+        start[k, :2, 2] = _across(place[k] - place[0])
+        start[k, :, :3] += np.eye(3)
+        start[k, :2, 3:] = -np.eye(2)
         passed = hats[:k] * way[:k, None]
-        rates[row] = np.eye(3)[:, None] * passed.sum(axis=0)[:, None]
-        rates[row, :2, :, 2] = _across(place[k] - middle[:k]).T @ passed
-    return np.concatenate([start, rates.reshape(len(keyframes), 3, -1)], axis=2)
+        rates[k] = np.eye(3)[:, None] * passed.sum(axis=0)[:, None]
+        rates[k, :2, :, 2] = _across(place[k] - middle[:k]).T @ passed
+    return np.concatenate([start, rates.reshape(len(place), 3, -1)], axis=2)
 
 
 def _across(away: Floats) -> Floats:

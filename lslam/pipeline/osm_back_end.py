@@ -13,9 +13,9 @@ from lslam.graph.problem import PoseGraph
 from lslam.pipeline.building_pass import correct_buildings
 from lslam.pipeline.georeferencing import Placement, on_earth
 from lslam.pipeline.graph_outcome import BackEnd, Given, solve
-from lslam.pipeline.osm_graph import on_map, straightened
+from lslam.pipeline.osm_graph import find_on_map
 from lslam.pipeline.osm_joint import join_buildings, run_baseline
-from lslam.pipeline.osm_pass import finish, locate
+from lslam.pipeline.osm_pass import finish
 from lslam.pipeline.osm_source import OsmSource
 from lslam.types.georeference import Georeference
 
@@ -34,19 +34,15 @@ def hold_by_buildings(osm: OsmSource, graph: PoseGraph, placement: Placement, gi
         problems.append(f"OSM: {error}; the run goes on without the buildings")
         return None
     up = graph.world_up if graph.ups else None
-    located = locate(extract, store, up, config, None if known is None else known.T_enu_world)
+    is_on_earth = config.gnss.mode == "graph" and known is not None
+    if is_on_earth:
+        graph = on_earth(graph, placement)
+    located, held = find_on_map(extract, graph, store, up, None if known is None else known.T_enu_world, config)
     if located.problem:
         problems.append(located.problem)
         return None
-    if config.gnss.mode == "graph" and known is not None:
-        graph, georeference = on_earth(graph, placement), known
-    else:
-        georeference = Georeference(
-            extract.origin, located.T_enu_odometry, config.gnss.crs, "osm", used=len(located.priors)
-        )
-    held = on_map(graph, located, config)
-    if config.osm.matcher == "walls" and not held.is_rigid:
-        held = straightened(held, located, config)
+    on_walls = Georeference(extract.origin, located.T_enu_odometry, config.gnss.crs, "osm", used=len(located.priors))
+    georeference = known if is_on_earth else on_walls
     out = solve(held, given, georeference)
     if out is None or out.solution is None:
         return None

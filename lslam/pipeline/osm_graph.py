@@ -6,14 +6,62 @@ import logging
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lslam.config import Config
+from lslam.formats.osm_buildings import BuildingExtract
+from lslam.geometry import se2, se3
 from lslam.graph.problem import PoseGraph
-from lslam.graph.steady_drift import find_steady_drift, without_drift
-from lslam.pipeline.osm_pass import Located
-from lslam.priors.osm_prior import likeness
+from lslam.graph.steady_drift import WallSightings, find_steady_drift, without_drift
+from lslam.keyframes.store import KeyframeStore
+from lslam.pipeline.osm_pass import Located, locate
+from lslam.priors.osm_prior import match_buildings
 
 log = logging.getLogger("lslam")
+Floats = NDArray[np.float64]
+
+# How often drift is looked for: a wall ahead is seen from the last keyframe of a submap and one behind from the first, so
+# that only the greater part of it shows.
+ROUNDS = 4
+
+
+def find_on_map(
+    extract: BuildingExtract,
+    graph: PoseGraph,
+    store: KeyframeStore,
+    up: Floats | None,
+    placed: Floats | None,
+    config: Config,
+) -> tuple[Located, PoseGraph]:
+    """Where the keyframes are on the map, and the graph in its frame, set straight where the map reveals a steady drift.
+
+    graph : of odometry, or where satellite fixes have it; up, placed : as of `locate`
+    """
+    located = locate(extract, store, up, config, placed)
+    held = on_map(graph, located, config)
+    if located.problem or config.osm.matcher != "walls" or held.is_rigid:
+        return located, held
+    rates = np.zeros((len(graph) - 1, 3))
+    for _ in range(ROUNDS):
+        seen = sightings(located, held.poses, config)
+        drift = find_steady_drift(held, seen, config.osm.wall_sigma, config.osm.building_sigma, config.graph)
+        if drift is None:
+            break
+        straight = without_drift(held, drift.rates)
+        odometry = se3.inverse(located.T_enu_odometry) @ straight.poses
+        again = locate(extract, store, up, config, placed, odometry)
+        if again.problem:
+            break
+        rates, located = rates + drift.rates, again
+        graph = replace(graph, poses=odometry, odometry=straight.odometry)
+        held = replace(on_map(graph, located, config), spread=drift.spread)
+    if rates.any():
+        percent, degrees = 100 * np.linalg.norm(rates[:, :2], axis=1), np.degrees(rates[:, 2]) * 100
+        log.info(
+            "OSM: odometry drifts steadily by %.1f %% and %.1f deg/100 m, and is set straight",
+            percent.mean(), -degrees.mean(),
+        )  # fmt: skip
+    return located, held
 
 
 def on_map(graph: PoseGraph, located: Located, config: Config) -> PoseGraph:
@@ -30,15 +78,21 @@ def on_map(graph: PoseGraph, located: Located, config: Config) -> PoseGraph:
     )
 
 
-def straightened(graph: PoseGraph, located: Located, config: Config) -> PoseGraph:
-    """The graph without the steady drift that the map reveals."""
-    sigma = np.array([config.osm.map_sigma, config.osm.map_sigma, np.radians(config.osm.map_sigma_deg)])
-    rates = find_steady_drift(graph, likeness(located.accepted, located.osm.owners), sigma, config.graph)
-    if rates is None:
-        return graph
-    percent, degrees = 100 * np.linalg.norm(rates[:, :2], axis=1), np.degrees(rates[:, 2]) * 100
-    log.info(
-        "OSM: odometry drifts steadily by %.1f %% and %.1f deg/100 m, and is set straight",
-        percent.mean(), -degrees.mean(),
-    )  # fmt: skip
-    return without_drift(graph, rates)
+def sightings(located: Located, poses: Floats, config: Config) -> WallSightings:
+    """Which walls of each building were seen from which keyframe, and where, with the keyframes at `poses` (K, 4, 4)."""
+    osm, planar = located.osm, se2.of_se3(poses)
+    rows: list[tuple[Floats, Floats]] = [(np.zeros((0, 2, 2)), np.zeros((0, 2), np.int64))]
+    for match in located.matches:
+        at = match.pose if match.verdict == "accepted" else match.prior
+        for one in match_buildings(match, at, np.zeros(2), osm, config.osm):
+            if one.verdict == "accepted":
+                walls = np.flatnonzero(osm.owners == one.building)[one.pairs[:, 0]]
+                seen = se2.apply(planar[match.keyframe], match.walls[one.pairs[:, 1]])
+                rows.append((seen, np.column_stack([np.full(len(walls), match.keyframe), walls])))
+    keyframes, walls = np.concatenate([numbers for _, numbers in rows]).T
+    places = np.concatenate([seen for seen, _ in rows]).mean(axis=1)
+    along = osm.walls[walls, 1] - osm.walls[walls, 0]
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    normals = np.column_stack([-along[:, 1], along[:, 0]])
+    offsets = np.einsum("ni,ni->n", normals, places - osm.walls[walls, 0])
+    return WallSightings(keyframes, walls, normals, places, offsets)

@@ -61,17 +61,20 @@ class Located:
 
 
 def locate(
-    extract: BuildingExtract, store: KeyframeStore, up: Floats | None, config: Config, placed: Floats | None = None
-) -> Located:
+    extract: BuildingExtract, store: KeyframeStore, up: Floats | None, config: Config, placed: Floats | None = None,
+    odometry: Floats | None = None,
+) -> Located:  # fmt: skip
     """Match all keyframes with the map.
 
     up : (3,) up in the world of odometry as an IMU has it, None takes that of the ground
     placed : (4, 4) from that world into the map frame, where satellite fixes say it
+    odometry : (K, 4, 4) of the keyframes in it, those of the store by default
     """
     osm = OsmMap(extract.buildings)
-    up = _up_by_ground(store, config) if up is None else up
+    odometry = np.stack([k.T_world_lidar for k in store.keyframes]) if odometry is None else odometry
+    up = _up_by_ground(store, odometry, config) if up is None else up
     T_level = se3.make(so3.least_rotation(up, UP), np.zeros(3)) if placed is None else placed
-    poses = T_level @ np.stack([k.T_world_lidar for k in store.keyframes])
+    poses = T_level @ odometry
     start = _start(store, poses, osm, config, placed)
     if start.problem:
         return Located(T_level, osm, problem=start.problem)
@@ -86,7 +89,7 @@ def locate(
     log.info("OSM: %d of %d keyframes lie on the map", len(accepted), len(matches))
     first = next((match for match in accepted if match.rank == 3), accepted[0])
     turn = se2.compose(first.pose, se2.inverse(se2.of_se3(poses[first.keyframe])))
-    T = _lowered(se2.to_se3(turn) @ T_level, store, placed)
+    T = _lowered(se2.to_se3(turn) @ T_level, odometry[0], placed)
     parts = shares(accepted, len(osm.walls))
     priors = [
         PlanarPrior(m.keyframe, m.pose, m.information, m.rank, part) for m, part in zip(accepted, parts, strict=True)
@@ -112,9 +115,9 @@ def finish(
     )  # fmt: skip
 
 
-def _up_by_ground(store: KeyframeStore, config: Config) -> Floats:
+def _up_by_ground(store: KeyframeStore, odometry: Floats, config: Config) -> Floats:
     """(3,) up in the world of odometry, by the ground under all keyframes: roads rise and fall; its z axis without any."""
-    normals = [store.keyframes[f.keyframe].T_world_lidar[:3, :3] @ f.normal for f in floor_planes(store, config.graph)]
+    normals = [odometry[f.keyframe, :3, :3] @ f.normal for f in floor_planes(store, config.graph)]
     up = np.median(normals, axis=0) if normals else UP
     return np.asarray(up / np.linalg.norm(up))
 
@@ -181,12 +184,12 @@ def _judged(match: KeyframeMatch, doubt: str) -> KeyframeMatch:
     return replace(match, verdict="rejected", reason=doubt) if doubt else match
 
 
-def _lowered(T: Floats, store: KeyframeStore, placed: Floats | None) -> Floats:
+def _lowered(T: Floats, first: Floats, placed: Floats | None) -> Floats:
     """With the first keyframe at height 0, where satellite fixes do not say its height."""
     if placed is not None:
         return T
     down = np.eye(4)
-    down[2, 3] = -(T @ store.keyframes[0].T_world_lidar)[2, 3]
+    down[2, 3] = -(T @ first)[2, 3]
     return np.asarray(down @ T)
 
 

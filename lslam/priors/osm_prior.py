@@ -96,15 +96,3 @@ def shares(matches: Sequence[KeyframeMatch], walls: int) -> list[float]:
     for match in matches:
         seen[np.unique(match.pairs[:, 1])] += 1
     return [float(np.mean(1.0 / seen[match.pairs[:, 1]])) for match in matches]
-
-
-def likeness(matches: Sequence[KeyframeMatch], owners: NDArray[np.int64]) -> Floats:
-    """(M, M) 0..1, how much two matches lie on walls of the same buildings, whose places in the map err as one.
-
-    owners : (T,) the building that each wall of the map is of
-    """
-    seen = np.zeros((len(matches), int(owners.max(initial=0)) + 1))
-    for row, match in zip(seen, matches, strict=True):
-        np.add.at(row, owners[match.pairs[:, 1]], 1.0)
-    seen /= np.linalg.norm(seen, axis=1, keepdims=True)
-    return np.asarray(seen @ seen.T)

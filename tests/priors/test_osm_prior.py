@@ -10,7 +10,7 @@ from wall_scenes import box_at
 from lslam.config.osm import OsmConfig
 from lslam.kernels import segments, wall_matching
 from lslam.priors.osm_map import OsmMap
-from lslam.priors.osm_prior import likeness, match_buildings, match_keyframe, shares, warm_up
+from lslam.priors.osm_prior import match_buildings, match_keyframe, shares, warm_up
 from lslam.types.building import Building, Footprint
 from lslam.types.building_match import KeyframeMatch
 
@@ -88,12 +88,3 @@ def test_warming_up_compiles_everything() -> None:
     warm_up()
     for kernel in (segments.flat_walls, segments.find_segments, wall_matching.fit, wall_matching.refine):
         assert kernel.signatures  # type: ignore[attr-defined]
-
-
-def test_matches_err_alike_as_far_as_they_lie_on_the_same_buildings() -> None:
-    one = view(TOWN.walls)
-    owners = np.array([0, 0, 1, 2])
-    matches = [replace(one, pairs=np.array(p)) for p in ([[0, 0], [1, 1]], [[0, 1]], [[0, 2]], [[0, 0], [1, 2]])]
-    half = np.sqrt(0.5)
-    alike = [[1, 1, 0, half], [1, 1, 0, half], [0, 0, 1, half], [half, half, half, 1]]
-    np.testing.assert_allclose(likeness(matches, owners), alike, atol=1e-12)

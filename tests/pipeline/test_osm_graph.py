@@ -1,0 +1,112 @@
+"""The pose graph on a map: a drift that its walls reveal is taken out, walls are found anew, and none is invented."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from test_osm_pass import HOUSES, Outline, config, driven, extract_of, street
+
+from lslam.config import Config
+from lslam.geometry import se2, se3
+from lslam.graph.problem import PoseGraph
+from lslam.keyframes.store import KeyframeStore
+from lslam.pipeline.osm_graph import find_on_map, on_map, sightings
+from lslam.pipeline.osm_pass import Located, locate
+from lslam.types.constraint import Constraint
+
+SURE = np.diag([1e-6] * 3 + [1e-8] * 3)
+
+
+def drawn_wrong(seed: int, size: float) -> list[Outline]:
+    """The houses, each off by some `size` m on the map."""
+    rng = np.random.default_rng(seed)
+    off = size * rng.standard_normal((len(HOUSES), 2))
+    return [[(x + dx, y + dy) for x, y in ring] for ring, (dx, dy) in zip(HOUSES, off, strict=True)]
+
+
+def graph_of(store: KeyframeStore) -> PoseGraph:
+    poses = np.stack([k.T_world_lidar for k in store.keyframes])
+    steps = se3.relative(poses[:-1], poses[1:])
+    links = [Constraint(k, k + 1, step, SURE, "odometry") for k, step in enumerate(steps)]
+    return PoseGraph(poses, links, distances=np.array([k.distance for k in store.keyframes]))
+
+
+def runaway(way: np.ndarray, percent: float, degrees: float) -> np.ndarray:
+    """Odometry that shifts to the north by so much of the way, and turns to the left by so much per 100 m."""
+    told = [way[0]]
+    for a, b in pairwise(way):
+        far = float(np.linalg.norm(b[:2] - a[:2]))
+        there = se2.compose(told[-1], se2.relative(a, b))
+        told.append(there + np.array([0.0, 0.01 * percent * far, np.radians(degrees) / 100 * far]))
+    return np.stack(told)
+
+
+def laid(store: KeyframeStore, outlines: list[Outline], given: Config | None = None) -> tuple[Located, PoseGraph]:
+    return find_on_map(extract_of(outlines), graph_of(store), store, None, None, given or config())
+
+
+def off(poses: np.ndarray, way: np.ndarray) -> float:
+    """m, mean distance of planar poses from the way when both begin at one place."""
+    planar = se2.of_se3(poses)
+    return float(np.linalg.norm(planar[:, :2] - planar[0, :2] - way[:, :2] + way[0, :2], axis=1).mean())
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_a_drift_is_taken_out_by_a_map_that_errs(seed: int) -> None:
+    way = street(60.0)
+    store = driven(HOUSES, way, runaway(way, 4.0, 3.0))
+    before = graph_of(store)
+    located, held = laid(store, drawn_wrong(seed, 0.3))
+    assert not located.problem
+    assert held.spread is not None
+    wrong = off(on_map(before, located, config()).poses, way)
+    assert wrong > 0.7
+    assert off(held.poses, way) < 0.2 * wrong
+    steps = se3.relative(held.poses[:-1], held.poses[1:])
+    np.testing.assert_allclose([c.T_a_b for c in held.odometry], steps, atol=1e-9)
+
+
+@pytest.mark.parametrize("size", [0.0, 0.5])
+def test_a_run_that_does_not_drift_stays_as_it_is(size: float) -> None:
+    way = street(60.0)
+    store = driven(HOUSES, way)
+    located, held = laid(store, drawn_wrong(3, size))
+    assert not located.problem
+    assert held.spread is None
+    given = graph_of(store)
+    np.testing.assert_array_equal([c.T_a_b for c in held.odometry], [c.T_a_b for c in given.odometry])
+    np.testing.assert_allclose(held.poses, located.T_enu_odometry @ given.poses, atol=1e-12)
+
+
+def test_trusted_poses_and_the_baseline_are_not_set_straight() -> None:
+    way = street(24.0)
+    store = driven(HOUSES, way, runaway(way, 4.0, 3.0))
+    for given in (config(90.0, "osm.matcher=baseline"), config(90.0, "odometry.method=poses")):
+        _, held = laid(store, HOUSES, given)
+        assert held.spread is None
+
+
+def test_each_wall_seen_is_measured_from_its_own_line_on_the_map() -> None:
+    """The map has all walls 0.4 m too far east, and the run stands where it does: walls that look east tell it, north none."""
+    way = street(24.0)
+    store = driven(HOUSES, way)
+    shifted = [[(x + 0.4, y) for x, y in ring] for ring in HOUSES]
+    located = locate(extract_of(shifted), store, None, config())
+    seen = sightings(located, np.stack([se2.to_se3(at) for at in way]), config())
+    assert len(np.unique(seen.walls)) > 8
+    np.testing.assert_allclose(np.median(seen.offsets + 0.4 * seen.normals[:, 0]), 0.0, atol=0.03)
+    assert np.percentile(np.abs(seen.offsets + 0.4 * seen.normals[:, 0]), 80) < 0.06
+    walls = located.osm.walls[seen.walls]
+    away = np.einsum("ni,ni->n", seen.normals, seen.places - walls[:, 1])
+    np.testing.assert_allclose(away, seen.offsets, atol=1e-9)
+    assert np.linalg.norm(seen.places - way[seen.keyframes, :2], axis=1).max() < 60.0
+
+
+def test_without_a_building_there_is_no_wall_to_see() -> None:
+    store = driven([], street(12.0))
+    located, held = laid(store, [[(x + 900.0, y) for x, y in ring] for ring in HOUSES])
+    assert located.problem
+    assert held.spread is None
+    assert not len(sightings(located, held.poses, config()).walls)
