@@ -15,22 +15,28 @@ MIN_LINE_POINTS = 5
 
 
 class FeatureMap(Stateful):
-    """Less sharp edges and less planar points of past scans, in voxels of one size around the sensor.
+    """Less sharp edges and less planar points of past scans, in voxels around the sensor.
 
     Parameters
     ----------
-    size : m, edge of a voxel
+    size : m, edge of a voxel of edges
+    plane_size : m, edge of a voxel of planar points; as `size` when absent
     min_points, planarity, count_cap, reach : of the plane voxels, as in `GaussianMap`
     """
 
     STATE = ("planes", "edges")
 
     def __init__(
-        self, size: float, *, min_points: int = 6, planarity: float = 0.3, count_cap: float = 200.0, reach: float = 150.0,
-        capacity: int = 1 << 16,
+        self, size: float, *, plane_size: float | None = None, min_points: int = 6, planarity: float = 0.3,
+        count_cap: float = 200.0, reach: float = 150.0, capacity: int = 1 << 16,
     ) -> None:  # fmt: skip
         self.planes = GaussianMap(
-            size, min_points=min_points, planarity=planarity, count_cap=count_cap, reach=reach, capacity=capacity
+            plane_size or size,
+            min_points=min_points,
+            planarity=planarity,
+            count_cap=count_cap,
+            reach=reach,
+            capacity=capacity,
         )
         self.edges = GaussianMap(size, count_cap=count_cap, reach=reach, capacity=capacity // 4)
         self._lines = _lines_for(self.edges)

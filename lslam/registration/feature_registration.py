@@ -78,15 +78,15 @@ class FeatureRegistration(Stateful):
         if self._starting > 0:
             with clock.stage("start"):
                 start = self._capture(features, T_prior)
-            result = self._attempt(features, start, T_prior, clock)
+            result = self._attempt(features, start.T_world_lidar, T_prior, clock)
         else:
-            start = T_prior
+            start = RegistrationResult(T_prior)
             result = self._attempt(features, T_prior, T_prior, clock)
             move, turn = result.prior_error
             if not result.ok or move > self.config.recover_m or turn > np.deg2rad(self.config.recover_deg):
                 with clock.stage("recover"):
                     start = self._capture(features, T_prior)
-                again = self._attempt(features, start, T_prior, clock)
+                again = self._attempt(features, start.T_world_lidar, T_prior, clock)
                 if again.ok and (not result.ok or again.inliers > result.inliers):
                     result = again
         # One scan's planes hold no more than its features do: only a map can close a direction that these leave open.
@@ -96,7 +96,7 @@ class FeatureRegistration(Stateful):
                 result = self._stand_in(features, start, T_prior, result)
         if result.ok and len(result.degenerate):
             # The first step's prior is no more than a guess, which the search has replaced.
-            expected = T_prior if self._first is None else start
+            expected = T_prior if self._first is None else start.T_world_lidar
             kept = self._judge(replace(kept_where_blind(result, expected), reason=""), T_prior)
             # What a good result says is that less planar points stood in.
             result = replace(kept, reason=kept.reason or result.reason)
@@ -149,10 +149,15 @@ class FeatureRegistration(Stateful):
             result = self._judge(result, T_prior)
         return replace(result, iterations=result.iterations + (iterations if self.map is not None else 0))
 
-    def _capture(self, features: Features, T_prior: Floats) -> Floats:
+    @property
+    def _is_searched(self) -> bool:
+        """Whether this is the first step, and where it led is searched for."""
+        return self._first is not None and self.config.start_reach > 0
+
+    def _capture(self, features: Features, T_prior: Floats) -> RegistrationResult:
         """A start that is metres nearer, where the prior may be metres off: less planar points on coarse planes."""
         c = self.config
-        if self._first is not None and c.start_reach > 0:
+        if self._first is not None and self._is_searched:
             return self._first_step(features, *self._first, T_prior)
         points, scatter = _thinned(features)
         target = self._planes()
@@ -161,32 +166,25 @@ class FeatureRegistration(Stateful):
         result = solve_on_map(
             target, NONE, points, T_prior, slow, self.noise, scatter=scatter, coarse=coarse, is_coarse_only=True
         )
-        return self._judge(result, T_prior).T_world_lidar
+        return self._judge(result, T_prior)
 
-    def _first_step(self, features: Features, first: Features, T_first: Floats, T_prior: Floats) -> Floats:
-        """The search for the first step that `icp` makes, on all features: the speed is unknown.
-
-        A plane takes six points: voxels are as large as the grid that thinned the features needs for that.
-        """
-        size = max(self.config.voxel_size, 1.5 * self.loam.grid_step)
+    def _first_step(self, features: Features, first: Features, T_first: Floats, T_prior: Floats) -> RegistrationResult:
+        """The search for the first step that `icp` makes, on all features: the speed is unknown."""
+        size = max(self.config.voxel_size, self._plane_size())
         plain = {"residual": None, "target": "map", "inlier_distance": None, "inlier_ratio": 1.0, "voxel_size": size}
         search = Registration(self.config.model_copy(update=plain))
         search.register(_all_points(first), T_first)
-        return search.register(_all_points(features), T_prior).T_world_lidar
+        return search.register(_all_points(features), T_prior)
 
     def _stand_in(
-        self, features: Features, T_start: Floats, T_prior: Floats, starved: RegistrationResult
+        self, features: Features, start: RegistrationResult, T_prior: Floats, starved: RegistrationResult
     ) -> RegistrationResult:
-        """Less planar points on planes in place of features that are too few or leave a direction open."""
-        c = self.config
-        points, scatter = _thinned(features)
-        target = self._planes()
-        quick = Annealing(c.kernel_max, c.kernel_min, c.kernel_decay, c.start_iterations)
-        result = solve_on_map(
-            target, features.edges.points, points, starved.T_world_lidar if starved.ok else T_start, quick, self.noise,
-            scatter=scatter, coarse=target.planes.coarsen(self._coarse_factor()),
-        )  # fmt: skip
-        result = self._judge(result, T_prior)
+        """Less planar points on planes in place of features that are too few or leave a direction open.
+
+        The search for the first step has asked them all already, and better than the planes of one scan can.
+        """
+        T_start = starved.T_world_lidar if starved.ok else start.T_world_lidar
+        result = start if self._is_searched else self._on_planes(features, T_start, T_prior)
         are_few = starved.inliers < MIN_FEATURES
         # They must close a direction; where features are too few to be sure of any, open none.
         if not result.ok or (starved.ok and len(result.degenerate) > len(starved.degenerate) - (not are_few)):
@@ -195,6 +193,18 @@ class FeatureRegistration(Stateful):
             f"only {starved.inliers} features agree" if are_few else "features leave a direction open"
         )
         return replace(result, reason=f"{why}: less planar points stood in")
+
+    def _on_planes(self, features: Features, T_start: Floats, T_prior: Floats) -> RegistrationResult:
+        """Edges, and centroids of the less planar points, on fine and coarse planes."""
+        c = self.config
+        points, scatter = _thinned(features)
+        target = self._planes()
+        quick = Annealing(c.kernel_max, c.kernel_min, c.kernel_decay, c.start_iterations)
+        result = solve_on_map(
+            target, features.edges.points, points, T_start, quick, self.noise, scatter=scatter,
+            coarse=target.planes.coarsen(self._coarse_factor()),
+        )  # fmt: skip
+        return self._judge(result, T_prior)
 
     def _planes(self) -> FeatureMap:
         """The feature map, or one made of the target scan alone."""
@@ -208,14 +218,18 @@ class FeatureRegistration(Stateful):
     def _new_map(self, capacity: int) -> FeatureMap:
         c = self.config
         return FeatureMap(
-            self.loam.feature_map_voxel, min_points=c.min_points, planarity=c.planarity, count_cap=c.count_cap,
-            reach=self._reach, capacity=capacity,
+            self.loam.feature_map_voxel, plane_size=self._plane_size(), min_points=c.min_points, planarity=c.planarity,
+            count_cap=c.count_cap, reach=self._reach, capacity=capacity,
         )  # fmt: skip
+
+    def _plane_size(self) -> float:
+        """A plane takes six points: no voxel of the map is smaller than the grid that has thinned them."""
+        return max(self.loam.feature_map_voxel, self.loam.grid_step)
 
     def _coarse_factor(self) -> int:
         """Coarse voxels are as large as those of `icp`."""
         c = self.config
-        return max(2, round(c.coarse_factor * c.voxel_size / self.loam.feature_map_voxel))
+        return max(2, round(c.coarse_factor * c.voxel_size / self._plane_size()))
 
     def _judge(self, result: RegistrationResult, T_prior: Floats) -> RegistrationResult:
         """The result with its correction of the prior, or a failed one that keeps the prior and says why."""
