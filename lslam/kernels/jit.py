@@ -44,9 +44,10 @@ def source_digest() -> str:
     return digest.hexdigest()[:12]
 
 
-# Numba reads the variable when it is imported; a folder set by the user is kept, below it each version has its own.
-_base = Path(os.environ.get("NUMBA_CACHE_DIR") or cache_folder() / "numba")
-os.environ["NUMBA_CACHE_DIR"] = str(_base / source_digest())
+# Numba reads the variable when it is imported; a folder set by the user is kept, below it each version has its own. The
+# processes of a study find the variable as this one leaves it, and the kernels compiled.
+_base, _own = Path(os.environ.get("NUMBA_CACHE_DIR") or cache_folder() / "numba"), source_digest()
+os.environ["NUMBA_CACHE_DIR"] = str(_base if _base.name == _own else _base / _own)
 
 import numba  # noqa: E402
 

@@ -50,6 +50,11 @@ def test_a_folder_of_the_user_is_kept(tmp_path: Path) -> None:
     assert folder_in_new_process(NUMBA_CACHE_DIR=str(tmp_path)) == tmp_path / jit.source_digest()
 
 
+def test_a_process_begun_by_another_shares_its_folder(tmp_path: Path) -> None:
+    parent = folder_in_new_process(NUMBA_CACHE_DIR=str(tmp_path))
+    assert folder_in_new_process(NUMBA_CACHE_DIR=str(parent)) == parent
+
+
 def test_a_home_that_cannot_be_written_falls_back_to_the_temporary_folder(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("a file where the cache should be")
     folder = folder_in_new_process(XDG_CACHE_HOME=str(tmp_path / "file"), TMPDIR=str(tmp_path))
