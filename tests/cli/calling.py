@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import json
+import logging
 import os
 import shutil
+import signal
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from unittest import mock
+
+from lslam.cli.main import main
 
 SAMPLE = Path(__file__).resolve().parents[2] / "sample_data"
 COMMAND = (sys.executable, "-m", "lslam")
@@ -21,11 +29,43 @@ def environment(**more: str) -> dict[str, str]:
     return clean | more
 
 
-def lslam(*words: object, env: dict[str, str] | None = None, cwd: Path | None = None) -> Done:
+def lslam(*words: object, cwd: Path | None = None) -> Done:
+    """The command from its words to its exit code, in this process: starting Python takes longer than most of them."""
+    argv = ["lslam", *map(str, words)]
+    # Bytes, as a pipe has them: what an encoding cannot hold shows.
+    out, err = (io.TextIOWrapper(io.BytesIO(), encoding="utf-8", write_through=True) for _ in range(2))
+    with (
+        _nothing_left_behind(), mock.patch.object(sys, "argv", argv),
+        contextlib.chdir(cwd or Path.cwd()), contextlib.redirect_stdout(out), contextlib.redirect_stderr(err),
+    ):  # fmt: skip
+        try:
+            main()
+        except SystemExit as ended:
+            code = ended.code
+    assert isinstance(code, int)
+    return Done(argv, code, *(stream.buffer.getvalue().decode() for stream in (out, err)))  # type: ignore[attr-defined]
+
+
+def lslam_process(*words: object, env: dict[str, str] | None = None, cwd: Path | None = None) -> Done:
+    """Likewise, in a process of its own: where its memory, its variables or what libraries print are looked at."""
     return subprocess.run(
         [*COMMAND, *map(str, words)], capture_output=True, text=True, timeout=180, check=False, cwd=cwd,
         env=environment() if env is None else env,
     )  # fmt: skip
+
+
+@contextlib.contextmanager
+def _nothing_left_behind() -> Iterator[None]:
+    """The variables of `environment`; what `main` sets for its process is put back: the log and the answer to SIGTERM."""
+    hidden = {name: os.environ.pop(name) for name in os.environ.keys() - environment()}
+    log, on_term = logging.getLogger("lslam"), signal.getsignal(signal.SIGTERM)
+    before, raises = (list(log.handlers), log.level, log.propagate), logging.raiseExceptions
+    try:
+        yield
+    finally:
+        (log.handlers[:], log.level, log.propagate), logging.raiseExceptions = before, raises
+        signal.signal(signal.SIGTERM, on_term)
+        os.environ.update(hidden)
 
 
 def manifest(folder: Path) -> dict[str, Any]:

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from calling import SAMPLE, lslam
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "readers"))
 from sequence_builders import cloud, kitti_root, raw_drive
@@ -19,14 +20,6 @@ from lslam.formats.imu_csv import read_imu_csv, write_imu_csv
 from lslam.pipeline.inspect import inspect
 from lslam.readers import open_sequence
 from lslam.types.imu import ImuStream
-
-SAMPLE = Path(__file__).parents[2] / "sample_data"
-
-
-def lslam(*words: str | Path) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "lslam", *map(str, words)], capture_output=True, text=True, check=False
-    )
 
 
 def test_page_and_json(tmp_path: Path) -> None:

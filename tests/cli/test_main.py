@@ -9,7 +9,7 @@ import tomllib
 from pathlib import Path
 
 import pytest
-from calling import COMMAND, assert_one_sentence, environment, lslam
+from calling import COMMAND, assert_one_sentence, environment, lslam, lslam_process
 
 from lslam.cli.main import COMMANDS
 
@@ -164,6 +164,6 @@ def test_a_stdout_that_takes_nothing_is_exit_3(tmp_path: Path) -> None:
 
 
 def test_an_ascii_terminal_gets_question_marks_not_errors() -> None:
-    done = lslam("eval", "--help", env=environment(PYTHONIOENCODING="ascii"))
+    done = lslam_process("eval", "--help", env=environment(PYTHONIOENCODING="ascii"))
     assert done.returncode == 0
     assert "Traceback" not in done.stderr

@@ -12,7 +12,7 @@ from typing import Any
 
 import click
 import pytest
-from calling import SAMPLE, assert_one_sentence, environment, lslam, strict_json
+from calling import SAMPLE, assert_one_sentence, environment, lslam, lslam_process, strict_json
 from click.testing import CliRunner
 
 from lslam.cli.main import cli
@@ -141,7 +141,7 @@ def test_what_goes_wrong_is_one_sentence_and_its_code(
 
 def test_a_dead_server_ends_the_command_as_any_error_does(tmp_path: Path) -> None:
     env = environment(LSLAM_OSM_SERVER="http://127.0.0.1:9/api", XDG_CACHE_HOME=str(tmp_path / "cache"))
-    done = lslam("osm", "fetch", "--bbox", "-0.3,160.1,-0.2,160.2", cwd=tmp_path, env=env)
+    done = lslam_process("osm", "fetch", "--bbox", "-0.3,160.1,-0.2,160.2", cwd=tmp_path, env=env)
     assert (done.returncode, done.stdout) == (3, "")
     assert_one_sentence(done.stderr)
     assert "127.0.0.1:9/api cannot be reached" in done.stderr

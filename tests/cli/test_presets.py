@@ -5,7 +5,7 @@ from __future__ import annotations
 import tomllib
 from pathlib import Path
 
-from calling import SAMPLE, environment, lslam
+from calling import SAMPLE, environment, lslam, lslam_process
 
 PRESET = (
     'summary = "mine"\n[odometry]\nmethod = "kiss-icp"\n[map]\nvoxel = 0.5\nwrite = false\n[input]\nskip_frames = 2\n'
@@ -14,7 +14,7 @@ PRESET = (
 
 def test_flags_beat_settings_beat_the_preset_and_the_run_records_it(tmp_path: Path) -> None:
     (tmp_path / "mine.toml").write_text(PRESET)
-    done = lslam(
+    done = lslam_process(
         "run", SAMPLE, "--preset", "mine.toml", "--method", "icp", "--set", "map.voxel=0.4", "--count", "6",
         "--out", "out", cwd=tmp_path, env=environment(LSLAM_MAP_VOXEL="0.3"),
     )  # fmt: skip

@@ -11,7 +11,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from calling import COMMAND, SAMPLE, Done, assert_one_sentence, environment, lslam, manifest, sample_copy, strict_json
+from calling import (
+    COMMAND,
+    SAMPLE,
+    Done,
+    assert_one_sentence,
+    environment,
+    lslam,
+    lslam_process,
+    manifest,
+    sample_copy,
+    strict_json,
+)
 
 from lslam.formats.point_files import read_points
 from lslam.formats.trajectory_files import read_trajectory
@@ -28,7 +39,7 @@ SAME = ("trajectory.tum", "trajectory_kitti.txt", "covariances.npz", "map.ply", 
 def first(tmp_path_factory: pytest.TempPathFactory) -> tuple[Done, Path]:
     """The README's command, once for all tests that look at its result."""
     out = tmp_path_factory.mktemp("run") / "first"
-    return lslam("run", SAMPLE, "--out", out), out
+    return lslam_process("run", SAMPLE, "--out", out), out
 
 
 def digests(folder: Path) -> dict[str, str]:

@@ -9,7 +9,7 @@ import time
 from pathlib import Path
 
 import pytest
-from calling import COMMAND, SAMPLE, environment, lslam, manifest
+from calling import COMMAND, SAMPLE, environment, lslam_process, manifest
 
 STARTS = 8
 
@@ -49,7 +49,9 @@ def test_eight_cold_starts_on_one_cache_all_succeed(
 
 def test_only_the_first_compiles(cold_starts: tuple[Path, list[tuple[int, str]], Path, float], tmp_path: Path) -> None:
     cache, _, _, _ = cold_starts
-    warm = lslam("run", SAMPLE, "--count", 5, "--out", tmp_path / "out", env=environment(NUMBA_CACHE_DIR=str(cache)))
+    warm = lslam_process(
+        "run", SAMPLE, "--count", 5, "--out", tmp_path / "out", env=environment(NUMBA_CACHE_DIR=str(cache))
+    )
     assert warm.returncode == 0
     assert "compiling" not in warm.stderr
     assert manifest(tmp_path / "out")["timings"]["compile_s"] < 3
@@ -66,7 +68,7 @@ def test_a_damaged_cache_costs_time_not_the_run(
     codes[1].write_bytes(codes[1].read_bytes()[:100])
     for number, said in ((1, True), (2, False)):
         out = tmp_path / str(number)
-        done = lslam("run", SAMPLE, "--count", 5, "--out", out, env=environment(NUMBA_CACHE_DIR=str(cache)))
+        done = lslam_process("run", SAMPLE, "--count", 5, "--out", out, env=environment(NUMBA_CACHE_DIR=str(cache)))
         assert done.returncode == 0, done.stderr
         assert ("kernel cache is damaged" in done.stderr) == said, "and it is repaired by that"
         assert (out / "trajectory.tum").read_bytes() == (base / "run0" / "trajectory.tum").read_bytes()
@@ -84,7 +86,7 @@ def test_a_home_that_cannot_be_written(
         more = {"HOME": home, "XDG_CACHE_HOME": f"{home}/cache", "XDG_CONFIG_HOME": f"{home}/config"}
         env = environment(TMPDIR=str(tmp_path), **more)
         env.pop("NUMBA_CACHE_DIR", None)
-        done = lslam("run", SAMPLE, "--count", 4, "--out", tmp_path / home.replace("/", "_"), env=env)
+        done = lslam_process("run", SAMPLE, "--count", 4, "--out", tmp_path / home.replace("/", "_"), env=env)
         assert done.returncode == 0, done.stderr
         assert "Traceback" not in done.stderr
         assert "compiling" not in done.stderr
@@ -98,6 +100,6 @@ def test_nothing_is_written_beside_the_output_and_the_cache(
     home.mkdir()
     work.mkdir()
     env = environment(HOME=str(home), XDG_CACHE_HOME=str(home / ".cache"), NUMBA_CACHE_DIR=str(cache))
-    assert lslam("run", SAMPLE, "--count", 4, "--out", tmp_path / "out", env=env, cwd=work).returncode == 0
+    assert lslam_process("run", SAMPLE, "--count", 4, "--out", tmp_path / "out", env=env, cwd=work).returncode == 0
     assert list(work.iterdir()) == []
     assert [p.name for p in home.iterdir()] in ([], [".cache"])
