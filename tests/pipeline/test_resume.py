@@ -63,6 +63,22 @@ def manifest(folder: Path) -> dict[str, Any]:
     return document
 
 
+Whole = Callable[..., dict[str, bytes]]
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Whole:
+    """`whole(made, *settings)`: what a run leaves that nothing interrupts, made once of each kind."""
+
+    @cache
+    def made_once(made: Callable[[], Stub], *settings: str) -> dict[str, bytes]:
+        out = tmp_path_factory.mktemp("whole") / "out"
+        lslam.run(made(), config_of(*settings), out=out)
+        return result_of(out)
+
+    return made_once
+
+
 @pytest.fixture
 def at_every_scan(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Pace, "is_due", True)
@@ -126,17 +142,19 @@ def test_interrupted_twice_it_ends_with_the_same_bytes(
     assert facts["resumed_after_scans"] == ([COUNT] if "odometry.method=kiss-icp" in settings else [7, COUNT])
 
 
+POSES = ("input.threads=1", "map.write=false")
+
+
 @pytest.mark.usefixtures("at_every_scan")
 @pytest.mark.parametrize("scan", [1, 2, 9, 15])
-def test_it_goes_on_where_it_was_killed(scan: int, tmp_path: Path) -> None:
-    config, out = config_of("input.threads=1", "map.write=false"), tmp_path / "out"
-    lslam.run(drive(), config, out=tmp_path / "whole")
+def test_it_goes_on_where_it_was_killed(scan: int, whole: Whole, tmp_path: Path) -> None:
+    config, out = config_of(*POSES), tmp_path / "out"
     with pytest.raises(KeyboardInterrupt):
         lslam.run(replace(drive(), on_read=die_at(scan)), config, out=out)
     again = drive()
     again.reads.clear()
     lslam.run(again, config, out=out, resume=True)
-    assert result_of(out) == result_of(tmp_path / "whole")
+    assert result_of(out) == whole(drive, *POSES)
     # The first is read twice more: to see whether it has times, and to load the reader's kernels.
     assert again.reads == [0, 0, *range(scan, COUNT)]
 
@@ -158,12 +176,12 @@ FEATURES = ("odometry.method=floam", "input.rings=elevation:16", "map.write=fals
     ],
 )
 def test_the_map_goes_on_where_it_was_killed(
-    made: Callable[[], Stub], settings: tuple[str, ...], lost: str, again_from: int, tmp_path: Path,
+    made: Callable[[], Stub], settings: tuple[str, ...], lost: str, again_from: int, whole: Whole, tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
     monkeypatch.setattr(clean, "OFFSETS", (1, 3))
-    config, out = config_of("input.threads=1", "map.voxel=0.1", *settings), tmp_path / "out"
-    lslam.run(made(), config, out=tmp_path / "whole")
+    words = ("input.threads=1", "map.voxel=0.1", *settings)
+    config, out = config_of(*words), tmp_path / "out"
     first = made()
     first.reads.clear()
 
@@ -182,14 +200,15 @@ def test_the_map_goes_on_where_it_was_killed(
     left = COUNT - again_from
     assert again.reads[-left:] == [*range(again_from, COUNT)]
     assert max(again.reads[:-left]) < 3, "only to see what the scans are like"
-    assert result_of(out) == result_of(tmp_path / "whole")
+    assert result_of(out) == whole(made, *words)
 
 
 @pytest.mark.usefixtures("at_every_scan")
 @pytest.mark.parametrize("damage", ["newest", "both", "cloud"])
-def test_damaged_checkpoints_cost_time_only(damage: str, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    config, out = config_of("input.threads=1", "map.write=false"), tmp_path / "out"
-    lslam.run(drive(), config, out=tmp_path / "whole")
+def test_damaged_checkpoints_cost_time_only(
+    damage: str, whole: Whole, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    config, out = config_of(*POSES), tmp_path / "out"
     with pytest.raises(KeyboardInterrupt):
         lslam.run(replace(drive(), on_read=die_at(12)), config, out=out)
     kept = sorted((out / "checkpoint").glob("odometry-*.npz"))
@@ -201,7 +220,7 @@ def test_damaged_checkpoints_cost_time_only(damage: str, tmp_path: Path, caplog:
     again = drive()
     again.reads.clear()
     lslam.run(again, config, out=out, resume=True)
-    assert result_of(out) == result_of(tmp_path / "whole")
+    assert result_of(out) == whole(drive, *POSES)
     assert again.reads[2] == (11 if damage == "newest" else 0)
     said = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
     assert any(("keyframe 1 is missing" if damage == "cloud" else "is damaged") in sentence for sentence in said)
