@@ -34,8 +34,8 @@ class LoopsConfig(Section):
         description="m travelled between one candidate that is registered and the next; up to three times as far after "
         "several that came out alike",
     )
-    rings: int = Field(20, ge=4, description="Scan Context: rings of the polar image (Kim and Kim 2018)")
-    sectors: int = Field(60, ge=8, description="Scan Context: sectors of the polar image")
+    rings: int = Field(20, ge=4, le=400, description="Scan Context: rings of the polar image (Kim and Kim 2018)")
+    sectors: int = Field(60, ge=8, le=360, description="Scan Context: sectors of the polar image")
     reach: float = Field(80.0, gt=0, description="m; Scan Context: radius of the polar image")
     max_descriptor_distance: float = Field(
         0.4, gt=0, le=1, description="Scan Context distance, 0 alike to 1, above which two places are different"

@@ -124,9 +124,11 @@ class Verifier:
     def _agree(self, facts: Comparison, forward: RegistrationResult, backward: RegistrationResult) -> Comparison:
         """Forward and backward must meet; the closure is no more certain than they differ."""
         c = self.config
+        if not backward.ok:
+            return facts.rejected("agreement", f"new to old: {backward.reason or 'nothing matches'}")
         gap = se3.log(forward.T_world_lidar @ backward.T_world_lidar)
         move, turn = float(np.linalg.norm(gap[:3])), float(np.linalg.norm(gap[3:]))
-        if not backward.ok or move > c.max_disagreement_m or np.rad2deg(turn) > c.max_disagreement_deg:
+        if move > c.max_disagreement_m or np.rad2deg(turn) > c.max_disagreement_deg:
             said = f"old to new and new to old differ by {move:.2f} m and {np.rad2deg(turn):.2f} deg"
             return facts.rejected("agreement", said)
         floor = np.diag([c.sigma_m**2] * 3 + [np.deg2rad(c.sigma_deg) ** 2] * 3)

@@ -63,3 +63,16 @@ def test_three_sigmas_hold_the_drift_they_are_named_after(scale: float, turn: fl
     sigmas = np.linalg.norm(errors, axis=1) / doubt.between(b, older).reach
     assert (sigmas < 3).all()
     assert doubt.between(b, np.array([0])).reach[0] < 0.03 * 720
+
+
+def test_drift_of_a_straight_way_is_its_scale_and_its_bend_at_the_lever() -> None:
+    """0.5 % and 0.25 deg per 100 m of n steps of h: the lever is the rms of 0, h, ..., n h."""
+    h, n = 2.0, 150
+    line = keyframes_of(np.array([se3.make(np.eye(3), np.array([k * h, 0.0, 0.0])) for k in range(n + 21)]))
+    older = np.array([20, 120])
+    doubt = OdometryDoubt(line, 0.5, 0.25).between(n + 20, older)
+    for reach, turn, steps in zip(doubt.reach, doubt.turn, (n, n - 100), strict=True):
+        bend = np.deg2rad(0.25) * steps * h / 100
+        lever = h * np.sqrt((np.arange(steps + 1) ** 2).mean())
+        assert turn == pytest.approx(bend)
+        assert reach == pytest.approx(np.hypot(0.005 * steps * h, bend * lever))

@@ -33,6 +33,17 @@ def test_rivals_that_contradict_leave_none() -> None:
     assert settled(candidate(2, 21.0), candidate(4, 35.0), reach=20.0)[0] == ("accepted", "agreement")
 
 
+def test_odometry_is_asked_for_its_doubt_between_the_two_old_keyframes() -> None:
+    asked: list[tuple[int, int]] = []
+
+    def reach(older: int, newer: int) -> float:
+        asked.append((older, newer))
+        return 2.0
+
+    settle([candidate(4, 35.0), candidate(2, 21.0)], KEYFRAMES, reach)
+    assert asked == [(2, 4)]
+
+
 def test_a_rival_that_is_ambiguous_takes_the_closure_with_it() -> None:
     both = settled(candidate(4, 35.0, "rejected", "ambiguity"), candidate(2, 21.0))
     assert both == [("rejected", "ambiguity")] * 2

@@ -8,7 +8,7 @@ from known_town import pose, seen, town
 from numpy.typing import NDArray
 
 from lslam.geometry import so3
-from lslam.loops.scan_context import PlaceIndex, describe, distances
+from lslam.loops.scan_context import COMPARED, PlaceIndex, describe, distances
 
 SECTORS = 60
 WIDTH = 2 * np.pi / SECTORS
@@ -87,3 +87,27 @@ def test_grows_beyond_its_first_room(cloud: NDArray[np.float32]) -> None:
         index.add(k, cloud[k::7])
     assert len(index) == 130
     assert index.nearest(129, np.arange(0, 129))[0].distance < 0.3
+
+
+def test_a_pit_does_not_lift_the_ground(cloud: NDArray[np.float32]) -> None:
+    """Three points from deep below, in cells of their own far out, change those cells only."""
+    pit = np.array([[75, 1, -12], [-70, 3, -9], [2, -78, -15]], np.float32)
+    before, after = (describe(c, 20, SECTORS, 80.0) for c in (cloud, np.concatenate([cloud, pit])))
+    assert before.max() == pytest.approx(after.max(), abs=0.05)
+    assert np.abs(before - after)[before > 0].max() < 0.05
+    assert ((after > 0) & (before == 0)).sum() == 3
+
+
+def test_the_place_is_found_among_more_than_are_compared(cloud: NDArray[np.float32]) -> None:
+    """Ring keys choose who is compared: places of other heights per ring are not."""
+    rng = np.random.default_rng(2)
+    index = PlaceIndex(20, SECTORS, 80.0)
+    others = 3 * COMPARED
+    for k in range(others):
+        index.add(k, rng.uniform([-70, -70, 0], [70, 70, 1 + k % 9], (2000, 3)).astype(np.float32))
+    index.add(others, cloud)
+    index.add(others + 1, turned(cloud, 7 * WIDTH))
+    best = index.nearest(others + 1, np.arange(others + 1))
+    assert len(best) == COMPARED
+    assert best[0].number == others
+    assert best[0].distance == pytest.approx(0.0, abs=1e-6)

@@ -1,0 +1,134 @@
+"""What a detector lets through: odometry's word on a pose that was found, the turns to try, and the axes of the constraint."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from known_town import keyframes_of, pose
+
+from lslam.config import load_config
+from lslam.config.loops import LoopsConfig
+from lslam.config.registration import RegistrationConfig
+from lslam.errors import ConfigError
+from lslam.geometry import se3, so3
+from lslam.loops.detector import LEAST_REACH, TURN_STEP, WIDEST_TURN, Detector
+from lslam.loops.doubt import Doubt
+from lslam.loops.scan_context import PlaceMatch
+from lslam.loops.verify import Comparison, Verifier, _is_elsewhere
+from lslam.registration.solver import RegistrationResult
+
+# Sigmas of odometry: 2 m along x, 0.5 m across, and three degrees.
+DOUBT = Doubt(np.diag([4.0, 0.25, 0.25])[None], np.deg2rad([3.0]))
+EXPECTED = np.array([10.0, 0.0, 0.0])
+
+
+def detector(**settings: float) -> Detector:
+    poses = np.array([pose(0, 0, 90), pose(10, 0, 90)])
+    return Detector(
+        keyframes_of(poses), lambda _: np.zeros((0, 3), np.float32), LoopsConfig(**settings), RegistrationConfig()
+    )  # type: ignore[arg-type]
+
+
+def found(shift: tuple[float, float], turn_deg: float = 0.0) -> Comparison:
+    R = so3.exp(np.array([0, 0, np.deg2rad(turn_deg)]))
+    return Comparison("agreement", "", se3.make(R, EXPECTED + np.array([*shift, 0.0])), np.diag([1.0, 2, 3, 4, 5, 6]))
+
+
+@pytest.mark.parametrize(
+    ("shift", "turn_deg", "said"),
+    [
+        ((5.9, 0.0), 0.0, ""),
+        ((6.2, 0.0), 0.0, "odometry would be wrong by 6.2 m"),
+        ((0.0, 1.7), 0.0, ""),
+        ((0.0, 1.9), 0.0, "odometry would be wrong by 1.9 m"),
+        ((0.0, 0.0), 8.9, ""),
+        ((0.0, 0.0), 9.1, "odometry would be wrong by 9.1 deg"),
+    ],
+)
+def test_a_pose_beyond_three_sigmas_of_odometry_is_none(shift: tuple[float, float], turn_deg: float, said: str) -> None:
+    """`LEAST_REACH` is 1 m at three sigmas: it adds 1/9 m2 to the variances."""
+    assert LEAST_REACH == 1.0
+    assert detector()._beyond(found(shift, turn_deg), EXPECTED, DOUBT) == said
+
+
+def test_a_radius_is_the_limit_in_every_direction() -> None:
+    gate = detector(radius=3.0)
+    assert gate._reach(DOUBT) == 3.0
+    for shift, said in (((0.0, 2.9), ""), ((2.9, 0.0), ""), ((3.1, 0.0), "odometry would be wrong by 3.1 m")):
+        assert gate._beyond(found(shift), EXPECTED, DOUBT) == said
+
+
+def test_turns_that_are_tried_are_odometrys_or_else_the_descriptors() -> None:
+    match = PlaceMatch(0, 0.1, yaw=2.0)
+    near, wide = detector()._yaws(match, np.deg2rad(5.0)), detector()._yaws(match, 1.01 * WIDEST_TURN)
+    for yaws, centre, spread in ((near, 0.0, np.deg2rad(5.0)), (wide, 2.0, np.pi / LoopsConfig().sectors)):
+        assert yaws.mean() == pytest.approx(centre)
+        assert np.diff(yaws) == pytest.approx(TURN_STEP)
+        assert spread <= yaws.max() - centre < spread + 2 * TURN_STEP
+
+
+def test_a_constraint_is_in_the_axes_of_the_keyframes() -> None:
+    """Both head north, so that 10 m east are 10 m to their right; what is uncertain along x is so across them."""
+    constraint = detector()._constraint(0, 1, found((0.0, 0.0)))
+    assert constraint is not None
+    np.testing.assert_allclose(constraint.T_a_b, se3.make(np.eye(3), np.array([0.0, -10.0, 0.0])), atol=1e-12)
+    np.testing.assert_allclose(constraint.covariance, np.diag([2.0, 1, 3, 5, 4, 6]), atol=1e-12)
+    assert detector()._constraint(0, 1, Comparison("overlap", "nothing stands up there")) is None
+
+
+FORWARD = RegistrationResult(pose(3, 1, 20), covariance=np.diag([1e-4] * 3 + [1e-6] * 3))
+
+
+def agree(gap: tuple[float, ...], **settings: float) -> Comparison:
+    """Two registrations that differ by the twist `gap`."""
+    backward = RegistrationResult(se3.inverse(se3.exp(-np.array(gap)) @ FORWARD.T_world_lidar))
+    return Verifier(LoopsConfig(**settings), RegistrationConfig())._agree(Comparison("overlap"), FORWARD, backward)  # type: ignore[arg-type]
+
+
+def test_a_closure_lies_half_way_and_is_no_surer_than_the_two_differ() -> None:
+    gap = (0.12, -0.06, 0.04, 0.0, 0.003, -0.004)
+    closure = agree(gap, sigma_m=0.03, sigma_deg=0.1)
+    assert (closure.stage, closure.reason) == ("agreement", "")
+    assert closure.T_a_b is not None
+    assert closure.covariance is not None
+    np.testing.assert_allclose(closure.T_a_b, se3.exp(-0.5 * np.array(gap)) @ FORWARD.T_world_lidar, rtol=0, atol=1e-12)
+    expected = [1e-4 + 0.03**2 + 0.14**2 / 3] * 3 + [1e-6 + np.deg2rad(0.1) ** 2 + 0.005**2 / 3] * 3
+    np.testing.assert_allclose(closure.covariance, np.diag(expected), rtol=1e-6, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("gap", "is_said"),
+    [
+        ((0.19, 0, 0, 0, 0, 0), False),
+        ((0, 0.21, 0, 0, 0, 0), True),
+        ((0, 0, 0, 0, 0, np.deg2rad(0.49)), False),
+        ((0, 0, 0, 0, np.deg2rad(0.51), 0), True),
+    ],
+)
+def test_registrations_that_differ_close_nothing(gap: tuple[float, ...], is_said: bool) -> None:
+    found = agree(gap)
+    assert found.stage == "agreement"
+    assert found.reason.startswith("old to new and new to old differ by ") == is_said
+
+
+def test_a_way_back_that_is_not_found_is_said() -> None:
+    verifier = Verifier(LoopsConfig(), RegistrationConfig())
+    lost = RegistrationResult(se3.inverse(FORWARD.T_world_lidar), ok=False, reason="only 3 points match")
+    assert verifier._agree(Comparison("overlap"), FORWARD, lost).reason == "new to old: only 3 points match"
+    mute = replace(lost, reason="")
+    assert verifier._agree(Comparison("overlap"), FORWARD, mute).reason == "new to old: nothing matches"
+
+
+@pytest.mark.parametrize(
+    ("x", "yaw_deg", "expected"), [(0.9, 0, False), (1.1, 0, True), (0.0, 4.5, False), (0.0, 5.5, True)]
+)
+def test_places_are_told_apart_from_a_metre_or_five_degrees(x: float, yaw_deg: float, expected: bool) -> None:
+    assert _is_elsewhere(pose(0, 0), pose(x, 0, yaw_deg)) == expected
+
+
+@pytest.mark.parametrize("key", ["sectors", "rings"])
+def test_an_image_that_no_machine_holds_is_refused(key: str) -> None:
+    with pytest.raises(ConfigError, match=rf"loops\.{key} = 5000: .*less than or equal to"):
+        load_config(settings=[f"loops.{key}=5000"], environ={})
