@@ -37,6 +37,8 @@ class InertialMotion(Stateful):
 
     # Of so many scans the IMU must predict the typical one not clearly worse than constant velocity does.
     JUDGED, WORSE, SLACK_M = 30, 2.0, 0.02
+    # One scan in so many is registered from constant velocity too, to tell what the IMU saves.
+    COMPARED = 20
     STATE = ("estimate", "coasting", "refusal", "gap_scans", "_has_gap", "_instant_ns", "_pose")
 
     def __init__(self, imu: ImuStream, T_lidar_imu: Floats, estimate: ImuEstimate, config: ImuConfig) -> None:
@@ -58,6 +60,11 @@ class InertialMotion(Stateful):
     def is_known(self) -> bool:
         """Whether there is a velocity: from the start on."""
         return self.coasting.is_known if self.refusal else True
+
+    @property
+    def is_compared(self) -> bool:
+        """Whether the next scan is one of the sample that shows what constant velocity would have cost."""
+        return not self.refusal and self.coasting.is_known and len(self._errors) % self.COMPARED == self.COMPARED - 1
 
     def sweep(self, stamp_ns: int, span_s: float) -> MotionPrior:
         """Poses from scan start over the `span_s` seconds that the sweep takes; one pose when it takes none."""

@@ -187,8 +187,23 @@ def close_inertial(part: Inertial, results: list[ScanResult]) -> dict[str, Any]:
         "median_prior_norm": round(float(np.median(norms)), 5) if norms else None,
         "median_constant_velocity_norm": round(float(np.median(steady)), 5) if steady else None,
         "mean_iterations": round(float(np.mean(iterations)), 2) if iterations else None,
+        **_savings(results),
         "prior_error_m": None if errors is None else round(errors[0], 5),
         "constant_velocity_error_m": None if errors is None else round(errors[1], 5),
+    }
+
+
+def _savings(results: list[ScanResult]) -> dict[str, Any]:
+    """What the IMU saved on the scans that were registered from constant velocity too; means over them."""
+    sample = [r for r in results if r.steady_iterations is not None and r.saved_s is not None]
+    if not sample:
+        return {"compared_scans": 0}
+    own, steady, saved = np.mean([(r.iterations, r.steady_iterations, r.saved_s) for r in sample], axis=0)
+    return {
+        "compared_scans": len(sample),
+        "compared_iterations": round(float(own), 2),
+        "constant_velocity_iterations": round(float(steady), 2),
+        "saved_ms_per_scan": round(1e3 * float(saved), 2),
     }
 
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from lslam.geometry import se3, so3
 from lslam.inertial.fusion import InertialMotion
 from lslam.odometry.base import Deskewing, Odometry, Resumable
+from lslam.registration.feature_steps import StageClock
 from lslam.registration.motion import ConstantVelocity, MotionModel, middle_of
 from lslam.registration.standing import Standing
 from lslam.types.motion_prior import MotionPrior
@@ -105,47 +106,68 @@ class Tracker:
     def _move(self, loaded: Loaded) -> ScanResult:
         scan = loaded.scan
         span = sweep_seconds(scan)
-        prior = expected = self.motion.sweep(loaded.stamp_ns, span)
         inertial = self.motion if isinstance(self.motion, InertialMotion) else None
+        clock = StageClock()
+        with clock.stage("imu"):
+            prior = expected = self.motion.sweep(loaded.stamp_ns, span)
         steady = None if inertial is None else inertial.coasting.predict(loaded.stamp_ns)
+        trial = None
         if scan is None:
             result = ScanResult(loaded.index, loaded.stamp_ns, prior.start, "skipped", loaded.error, converged=False)
         elif isinstance(self.odometry, Deskewing):
-            result, prior = self._register(self.odometry, scan, loaded.prepared, prior)
+            if inertial is not None and inertial.is_compared:
+                trial = self._without_imu(self.odometry, scan, loaded.prepared, inertial.coasting)
+            result, prior = self._register(self.odometry, scan, loaded.prepared, prior, clock)
         else:
             result = self.odometry.register(scan, loaded.prepared, prior)
         is_blind = result.status == "ok" and not isinstance(self.odometry, Deskewing)
-        self.sweep = self.motion.refine(prior, result.stamp_ns, result.T_world_lidar) if is_blind else prior
-        self.motion.correct(result.stamp_ns, result.T_world_lidar, prior, result.status == "ok")
+        with clock.stage("imu"):
+            self.sweep = self.motion.refine(prior, result.stamp_ns, result.T_world_lidar) if is_blind else prior
+            self.motion.correct(result.stamp_ns, result.T_world_lidar, prior, result.status == "ok")
         pose, instant_ns = middle_of(prior, result.stamp_ns, result.T_world_lidar)
         self.middle = (instant_ns, pose)
         found = result.T_world_lidar
-        return replace(
+        result = replace(
             result,
             prior_norm=_matrix_norm(expected.start, found),
             steady_norm=None if steady is None else _matrix_norm(steady, found),
             gravity=inertial.gravity_at(found) if inertial is not None and result.status == "ok" else None,
+            stages=result.stages if inertial is None else {**result.stages, **clock.seconds},
         )
+        return result if trial is None or "bridged" in (trial.status, result.status) else _compared(result, trial)
 
     def _register(
-        self, odometry: Deskewing, scan: Scan, prepared: Any, prior: MotionPrior
+        self, odometry: Deskewing, scan: Scan, prepared: Any, prior: MotionPrior, clock: StageClock
     ) -> tuple[ScanResult, MotionPrior]:
-        """Register, and again with the motion within the sweep that this found; the prior that was right."""
-        result = odometry.register(scan, prepared, prior)
-        if result.status == "ok" and sweep_seconds(scan) > 0:
-            if self.motion.is_known:
-                better = self.motion.refine(prior, scan.stamp_ns, result.T_world_lidar)
-                if _distance(prior, better) > self.REFINE_M:
-                    prior = better
-                    result = _both(result, odometry.register(scan, prepared, prior))
-            elif self._first is None:
+        """Register, weigh and enter the scan; the prior that was right."""
+        result, prior = self._align(odometry, scan, prepared, prior, self.motion)
+        if result.status == "ok" and sweep_seconds(scan) > 0 and not self.motion.is_known:
+            if self._first is None:
                 self._first = (scan, prepared, result.T_world_lidar)
             else:
                 prior = self._begin_again(odometry, *self._first, scan, result)
                 result = odometry.register(scan, prepared, prior)
         if isinstance(self.motion, InertialMotion):
-            result = self.motion.weigh(result, prior)
+            with clock.stage("imu"):
+                result = self.motion.weigh(result, prior)
         return odometry.update(scan, prepared, prior, result), prior
+
+    def _align(
+        self, odometry: Deskewing, scan: Scan, prepared: Any, prior: MotionPrior, motion: MotionModel
+    ) -> tuple[ScanResult, MotionPrior]:
+        """Register, and again with the motion within the sweep that this found; the prior that was right."""
+        result = odometry.register(scan, prepared, prior)
+        if result.status == "ok" and sweep_seconds(scan) > 0 and motion.is_known:
+            better = motion.refine(prior, scan.stamp_ns, result.T_world_lidar)
+            if _distance(prior, better) > self.REFINE_M:
+                prior = better
+                result = _both(result, odometry.register(scan, prepared, prior))
+        return result, prior
+
+    def _without_imu(self, odometry: Deskewing, scan: Scan, prepared: Any, coasting: ConstantVelocity) -> ScanResult:
+        """What constant velocity makes of the scan on the same map; nothing is learnt from it."""
+        prior = coasting.sweep(scan.stamp_ns, sweep_seconds(scan))
+        return self._align(odometry, scan, prepared, prior, coasting)[0]
 
     def _begin_again(
         self, odometry: Deskewing, first: Scan, prepared: Any, pose: NDArray[np.float64], scan: Scan, result: ScanResult
@@ -165,6 +187,12 @@ class Tracker:
 def sweep_seconds(scan: Scan | None) -> float:
     """How long the sensor took for the scan, s; 0 when its points belong to one instant."""
     return 0.0 if scan is None or scan.times is None or len(scan) == 0 else max(float(scan.times.max()), 0.0)
+
+
+def _compared(result: ScanResult, trial: ScanResult) -> ScanResult:
+    """The result beside what registration from constant velocity took; the map's update is no part of either."""
+    own = sum(seconds for name, seconds in result.stages.items() if name != "update")
+    return replace(result, steady_iterations=trial.iterations, saved_s=sum(trial.stages.values()) - own)
 
 
 def _both(first: ScanResult, second: ScanResult) -> ScanResult:

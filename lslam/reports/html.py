@@ -14,6 +14,7 @@ from lslam.reports.buildings import building_pages
 from lslam.reports.facts import RunFacts, run_facts
 from lslam.reports.metrics import counted, metres, metric_tables
 from lslam.reports.png import data_uri, density_png
+from lslam.reports.text import imu_rows
 from lslam.types.map_score import Crispness
 from lslam.types.run_record import RunRecord
 from lslam.version import __version__
@@ -72,6 +73,7 @@ def render_report(record: RunRecord, evaluation: Evaluation | None) -> str:
         time=plots.time_figure(record, facts) if facts.stages else None,
         share_bar=plots.share_bar(facts) if facts.stages else "",
         registration=plots.registration_figures(record),
+        imu=[said for _, said in imu_rows(record)],
         uncertainty=plots.uncertainty_figures(record),
         facts_of_input=flatten(record.manifest),
         config_text=_config_text(record.folder),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from lslam.evaluation.results import ALIGNMENTS
 from lslam.reports.back_end import back_end_rows
@@ -31,7 +31,7 @@ def summary(record: RunRecord, evaluation: Evaluation | None) -> str:
     rows = [("status", facts.status), *(("", reason) for reason in facts.reasons)]
     rows += _scan_rows(facts)
     rows.append(("path", f"{facts.path_length:.1f} m in {facts.duration:.1f} s"))
-    rows += _imu_rows(record)
+    rows += imu_rows(record)
     rows += back_end_rows(record, evaluation)
     rows += _score_rows(record, evaluation)
     rows += _map_rows(record)
@@ -56,7 +56,7 @@ def _scan_rows(facts: RunFacts) -> list[tuple[str, str]]:
     return rows
 
 
-def _imu_rows(record: RunRecord) -> list[tuple[str, str]]:
+def imu_rows(record: RunRecord) -> list[tuple[str, str]]:
     """What the IMU was good for, when there was one."""
     imu = record.manifest.get("imu")
     if not imu:
@@ -72,10 +72,21 @@ def _imu_rows(record: RunRecord) -> list[tuple[str, str]]:
         )
     ]
     if imu.get("mean_iterations"):
-        rows.append(
-            ("", f"{imu['mean_iterations']:.1f} iterations per scan; lslam compare --imu both tells what that saves")
-        )
+        rows.append(("", f"{imu['mean_iterations']:.1f} iterations per scan; {_saved(imu)}"))
     return rows
+
+
+def _saved(imu: dict[str, Any]) -> str:
+    """What registration from constant velocity took on a sample of the scans."""
+    if not imu.get("compared_scans"):
+        return "lslam compare --imu both tells what that saves"
+    saved = imu["saved_ms_per_scan"]
+    what = "saved" if saved >= 0 else "lost"
+    return (
+        f"on {counted(imu['compared_scans'], 'scan')} {imu['compared_iterations']:.1f} of the "
+        f"{imu['constant_velocity_iterations']:.1f} that constant velocity takes on the same map, "
+        f"{abs(saved):.1f} ms per scan {what} with the IMU's own work counted"
+    )
 
 
 def _failure(failure: Failure) -> str:

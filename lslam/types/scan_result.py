@@ -29,6 +29,9 @@ class ScanResult:
     prior_error : (translation m, rotation rad) between motion prior and result
     prior_norm : 2-norm of inv(prior) pose - I, of the prior before the scan was looked at (first thesis, equation 5.1)
     steady_norm : likewise of constant velocity, which an IMU took the place of; None without an IMU
+    steady_iterations : what registration from constant velocity took on the same map; None but for a sample of the scans
+        that an IMU predicted
+    saved_s : likewise, how much longer that took, s; the IMU's own part counted against it
     gravity : which way is down, when an IMU says so; None where the scan is bridged or the IMU has a gap
     stages : seconds per stage, by name, in the order they ran
     """
@@ -52,5 +55,7 @@ class ScanResult:
     prior_error: tuple[float, float] = (0.0, 0.0)
     prior_norm: float = 0.0
     steady_norm: float | None = None
+    steady_iterations: int | None = None
+    saved_s: float | None = None
     gravity: GravityDirection | None = None
     stages: dict[str, float] = field(default_factory=dict)

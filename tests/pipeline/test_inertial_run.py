@@ -15,6 +15,7 @@ from stub_sequences import Standstill, Stub
 from lslam.config import Config, load_config
 from lslam.errors import GateError, InputError
 from lslam.formats.trajectory_files import read_trajectory
+from lslam.inertial.fusion import InertialMotion
 from lslam.odometry import create_odometry
 from lslam.pipeline.front_end import estimate
 from lslam.pipeline.inertial_start import begin_inertial, close_inertial
@@ -99,7 +100,10 @@ def test_a_method_that_registers_nothing_does_not_pass_for_accurate() -> None:
     assert rmse(estimate(stub, Standstill(), motion=motion)) > 5 * rmse(runs()[1].record.results)
 
 
-def test_the_same_twice() -> None:
+def test_the_same_twice_and_without_comparing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What constant velocity would have taken is tried on the side: not a bit of the result depends on it."""
+    assert sum(r.saved_s is not None for r in runs()[1].record.results) >= 2
+    monkeypatch.setattr(InertialMotion, "COMPARED", 10**6)
     again = run(with_imu(imu_of(walk())), config_of("input.threads=1"))
     np.testing.assert_array_equal(again.trajectory.poses, runs()[1].trajectory.poses)
 
@@ -117,6 +121,12 @@ def test_the_manifest_says_what_was_found(tmp_path: Path) -> None:
     steady = float(rows[20].split(",")[header.split(",").index("steady_norm")])
     assert steady == pytest.approx(outcome.record.results[20].steady_norm, abs=1e-5)
     assert imu["median_prior_norm"] < imu["median_constant_velocity_norm"]
+    sample = [r for r in outcome.record.results if r.steady_iterations is not None]
+    assert imu["compared_scans"] == len(sample) > 0
+    at = header.split(",").index("steady_iterations")
+    assert [row.split(",")[at] for row in rows] == [str(r.steady_iterations or "") for r in outcome.record.results]
+    assert imu["compared_iterations"] == pytest.approx(np.mean([r.iterations for r in sample]), abs=0.01)
+    assert imu["constant_velocity_iterations"] > 1.2 * imu["compared_iterations"]
     assert imu["mean_iterations"] == pytest.approx(
         np.mean([r.iterations for r in outcome.record.results[1:]]), abs=0.01
     )
@@ -130,6 +140,9 @@ def test_the_manifest_says_what_was_found(tmp_path: Path) -> None:
     page = (tmp_path / "run" / "report.html").read_text()
     assert "Motion prior" in page
     assert "constant velocity, for comparison" in page
+    said = f"on {len(sample)} scan" + "s" * (len(sample) != 1)
+    assert said in summary(outcome.record, outcome.evaluation)
+    assert said in page
     assert "iterations per scan" in summary(outcome.record, outcome.evaluation)
 
 

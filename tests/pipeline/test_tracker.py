@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from lslam.config.imu import ImuConfig
 from lslam.geometry import se3
+from lslam.inertial.estimate import GRAVITY, ImuEstimate
+from lslam.inertial.fusion import InertialMotion
+from lslam.inertial.gyroscope import Gyroscope
 from lslam.pipeline.tracker import Loaded, Tracker
+from lslam.types.imu import ImuStream
 from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan import Scan
 from lslam.types.scan_result import ScanResult
@@ -65,3 +72,59 @@ def test_a_second_registration_costs_what_both_cost() -> None:
         assert result.stages["deskew"] == pytest.approx(0.001 * calls)
     assert oracle.calls.count(7) == 2, "the speed changed, so the sweep was deskewed wrongly at first"
     assert oracle.calls.count(5) == 1, "a steady drive needs none"
+
+
+class Priced(Oracle):
+    """True poses at a price of one step and 10 ms for each 5 cm that the prior is wrong; some scans are too far to find."""
+
+    lost_m = np.inf
+
+    def register(self, scan: Scan, prepared: Scan, prior: MotionPrior) -> ScanResult:
+        self.calls.append(scan.index)
+        off = float(np.linalg.norm(prior.start[:3, 3] - self.poses[scan.index][:3, 3]))
+        steps = 1 + int(off / 0.05)
+        pose, status = (self.poses[scan.index], "ok") if off < self.lost_m else (prior.start, "bridged")
+        return ScanResult(scan.index, scan.stamp_ns, pose, status, iterations=steps, stages={"register": 0.01 * steps})  # type: ignore[arg-type]
+
+    def update(self, scan: Scan, prepared: Scan, prior: MotionPrior, result: ScanResult) -> ScanResult:
+        return replace(result, stages={**result.stages, "update": 7.0})
+
+
+def braked(lost_m: float = np.inf) -> tuple[Priced, list[ScanResult]]:
+    """From 40 m/s by 8 m/s2 with an IMU that knows all: constant velocity is 8 cm wrong at each scan."""
+    count, brake = 45, -8.0
+    t = 0.1 * np.arange(count)
+    poses = se3.make(np.eye(3), np.column_stack([40 * t + 0.5 * brake * t**2, 0 * t, 0 * t]))
+    stamps = 10_000_000 * np.arange(10 * count, dtype=np.int64)
+    rng = np.random.default_rng(0)
+    accel = np.array([brake, 0.0, GRAVITY]) + rng.normal(0, 1e-9, (len(stamps), 3))
+    imu = ImuStream(stamps, accel, rng.normal(0, 1e-12, (len(stamps), 3)))
+    known = ImuEstimate(
+        np.array([40.0, 0, 0]),
+        np.array([0, 0, -GRAVITY]),
+        np.zeros(3),
+        Gyroscope.of_bias(np.zeros(3), 1e-6),
+        1e-8 * np.eye(9),
+    )
+    oracle = Priced(np.asarray(poses))
+    oracle.lost_m = lost_m
+    tracker = Tracker(oracle, motion=InertialMotion(imu, np.eye(4), known, ImuConfig(use=True)))
+    scans = [Scan(np.ones((3, 3), np.float32), int(1e9 * k * 0.1), k) for k in range(count)]
+    return oracle, [tracker.track(Loaded(k, scan.stamp_ns, scan, scan)) for k, scan in enumerate(scans)]
+
+
+def test_some_scans_tell_what_the_imu_saves() -> None:
+    oracle, results = braked()
+    sample = [r for r in results if r.steady_iterations is not None]
+    assert [r.index for r in sample] == [21, 41], "one in twenty of those after the first two"
+    assert all(oracle.calls.count(r.index) == (2 if r in sample else 1) for r in results[2:])
+    for r in sample:
+        assert (r.iterations, r.steady_iterations) == (1, 2), "8 cm take a step more"
+        assert r.saved_s == pytest.approx(0.01 - r.stages["imu"])
+        np.testing.assert_array_equal(r.T_world_lidar, oracle.poses[r.index])
+    assert all(r.stages["imu"] > 0 and r.saved_s is None for r in results[2:] if r not in sample)
+
+
+def test_a_scan_that_constant_velocity_loses_compares_with_nothing() -> None:
+    _, results = braked(lost_m=0.06)
+    assert [r.index for r in results[2:] if r.status != "ok" or r.steady_iterations is not None] == []

@@ -111,6 +111,21 @@ def test_status_falls_back_on_what_the_record_shows(make_record: MakeRecord) -> 
     assert not facts.is_flawless
 
 
+def test_what_the_imu_saved_is_told_with_its_sample(make_record: MakeRecord) -> None:
+    imu = {
+        "used": True, "prior_error_m": 0.01, "constant_velocity_error_m": 0.05, "mean_iterations": 2.2, "compared_scans": 3,
+        "compared_iterations": 2.0, "constant_velocity_iterations": 5.3, "saved_ms_per_scan": 4.2,
+    }  # fmt: skip
+
+    def said(**changes: object) -> str:
+        return summary(make_record(5, manifest={"imu": {**imu, **changes}}), None)
+
+    assert "2.2 iterations per scan; on 3 scans 2.0 of the 5.3 that constant velocity takes" in said()
+    assert "4.2 ms per scan saved with the IMU's own work counted" in said()
+    assert "1.5 ms per scan lost" in said(saved_ms_per_scan=-1.5)
+    assert "compare --imu both" in said(compared_scans=0)
+
+
 def test_stages_differ_between_scans(make_record: MakeRecord) -> None:
     results = make_record(3).results
     results[1] = replace(results[1], stages={"read": 0.5, "loops": 2.0})
