@@ -195,10 +195,14 @@ def close_inertial(part: Inertial, results: list[ScanResult]) -> dict[str, Any]:
 
 def _savings(results: list[ScanResult]) -> dict[str, Any]:
     """What the IMU saved on the scans that were registered from constant velocity too; means over them."""
-    sample = [r for r in results if r.steady_iterations is not None and r.saved_s is not None]
+    sample = [
+        (r.iterations, r.steady_iterations, r.saved_s)
+        for r in results
+        if r.steady_iterations is not None and r.saved_s is not None
+    ]
     if not sample:
         return {"compared_scans": 0}
-    own, steady, saved = np.mean([(r.iterations, r.steady_iterations, r.saved_s) for r in sample], axis=0)
+    own, steady, saved = np.mean(sample, axis=0)
     return {
         "compared_scans": len(sample),
         "compared_iterations": round(float(own), 2),

@@ -140,7 +140,7 @@ class Tracker:
         self, odometry: Deskewing, scan: Scan, prepared: Any, prior: MotionPrior, clock: StageClock
     ) -> tuple[ScanResult, MotionPrior]:
         """Register, weigh and enter the scan; the prior that was right."""
-        result, prior = self._align(odometry, scan, prepared, prior, self.motion)
+        result, prior = self._align(odometry, scan, prepared, prior, self.motion, clock)
         if result.status == "ok" and sweep_seconds(scan) > 0 and not self.motion.is_known:
             if self._first is None:
                 self._first = (scan, prepared, result.T_world_lidar)
@@ -153,12 +153,13 @@ class Tracker:
         return odometry.update(scan, prepared, prior, result), prior
 
     def _align(
-        self, odometry: Deskewing, scan: Scan, prepared: Any, prior: MotionPrior, motion: MotionModel
+        self, odometry: Deskewing, scan: Scan, prepared: Any, prior: MotionPrior, motion: MotionModel, clock: StageClock
     ) -> tuple[ScanResult, MotionPrior]:
         """Register, and again with the motion within the sweep that this found; the prior that was right."""
         result = odometry.register(scan, prepared, prior)
         if result.status == "ok" and sweep_seconds(scan) > 0 and motion.is_known:
-            better = motion.refine(prior, scan.stamp_ns, result.T_world_lidar)
+            with clock.stage("imu"):
+                better = motion.refine(prior, scan.stamp_ns, result.T_world_lidar)
             if _distance(prior, better) > self.REFINE_M:
                 prior = better
                 result = _both(result, odometry.register(scan, prepared, prior))
@@ -167,7 +168,7 @@ class Tracker:
     def _without_imu(self, odometry: Deskewing, scan: Scan, prepared: Any, coasting: ConstantVelocity) -> ScanResult:
         """What constant velocity makes of the scan on the same map; nothing is learnt from it."""
         prior = coasting.sweep(scan.stamp_ns, sweep_seconds(scan))
-        return self._align(odometry, scan, prepared, prior, coasting)[0]
+        return self._align(odometry, scan, prepared, prior, coasting, StageClock())[0]
 
     def _begin_again(
         self, odometry: Deskewing, first: Scan, prepared: Any, pose: NDArray[np.float64], scan: Scan, result: ScanResult
