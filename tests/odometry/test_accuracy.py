@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from drives import ate, coasting, drive, nees_per_dof, poses_of, registered, standing
+from drives import ate, coasting, drive, nees_per_dof, poses_of, standing
 from numpy.typing import NDArray
 
 from lslam import Registration
@@ -21,7 +21,7 @@ LONG = [("street", 1, 35), ("street", 2, 35), ("street", 3, 35), ("block", 0, 95
 @pytest.mark.parametrize(("scenario", "seed", "count"), LONG)
 def test_error_stays_under_a_centimetre(scenario: str, seed: int, count: int) -> None:
     d = drive(scenario, seed, count)
-    results = registered(d.points)
+    results = d.results
     assert all(r.ok and r.converged for r in results)
     assert ate(poses_of(results), d.truth) < CENTIMETRE
 
@@ -40,7 +40,7 @@ def test_no_start_is_lost_at_up_to_two_and_a_half_metres_per_scan(every: int, li
     d = drive("street", 0, 4, every, lidar, 8.3)
     step = np.linalg.norm(d.truth[1, :3, 3])
     assert step == pytest.approx(0.83 * every, rel=0.02)
-    results = registered(d.points)
+    results = d.results
     assert all(r.ok for r in results)
     errors = np.linalg.norm((poses_of(results) - d.truth)[:, :3, 3], axis=1)
     assert errors[1] < 0.1
@@ -56,7 +56,7 @@ def test_covariances_mean_something() -> None:
         *(drive("street", seed, 35) for seed in (1, 2)),
         drive("street", 4, 30, lidar="os1-32"),
     ]
-    means = [nees_per_dof(registered(d.points), d.truth).mean() for d in runs]
+    means = [nees_per_dof(d.results, d.truth).mean() for d in runs]
     assert 0.3 < np.mean(means) < 3.0
     assert max(means) < 10.0
 
@@ -66,7 +66,7 @@ def test_sixteen_rings_within_thirty_degrees_hold_the_pitch_from_the_start() -> 
     means, pitch = [], []
     for seed in (4, 6, 7):
         d = drive("street", seed, 10, lidar="vlp16")
-        results = registered(d.points)
+        results = d.results
         means.append(nees_per_dof(results, d.truth).mean())
         errors = [so3.log(r.T_world_lidar[:3, :3] @ T[:3, :3].T)[1] for r, T in zip(results, d.truth, strict=True)]
         pitch.append(np.abs(errors).max())
@@ -76,7 +76,7 @@ def test_sixteen_rings_within_thirty_degrees_hold_the_pitch_from_the_start() -> 
 
 def test_nees_sees_covariances_that_are_a_hundred_times_off() -> None:
     d = drive("block", 0, 95)
-    results = registered(d.points)
+    results = d.results
     honest = nees_per_dof(results, d.truth).mean()
     for factor in (0.01, 100.0):
         scaled = [replace(r, covariance=factor * covariance(r)) for r in results]
@@ -94,7 +94,7 @@ def covariance(result: RegistrationResult) -> NDArray[np.float64]:
 def test_a_sparse_sensor_over_roofs_starts_although_few_of_its_points_find_a_plane(scenario: str) -> None:
     """Ten metres up, one scan of 32 rings makes planes for a sixth of the next one's points; they are right."""
     d = drive(scenario, 0, 12)
-    results = registered(d.points)
+    results = d.results
     assert all(r.ok for r in results)
     assert max(np.linalg.norm(r.T_world_lidar[:3, 3] - T[:3, 3]) for r, T in zip(results, d.truth, strict=True)) < 0.05
 

@@ -7,7 +7,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from drives import ate, drive, registered
+from drives import ate, drive
 from numpy.typing import NDArray
 
 from lslam.config.config import Config
@@ -23,7 +23,7 @@ Floats = NDArray[np.float64]
 
 def test_the_weak_axis_of_a_corridor_is_its_length() -> None:
     d = drive("corridor", 0, 100, speed=9.0, compensated=True)
-    assert share_along(registered(d.points), d.truth) >= 0.95
+    assert share_along(d.results, d.truth) >= 0.95
 
 
 def test_it_is_so_for_loam_scan_to_scan_too() -> None:
@@ -76,7 +76,7 @@ def by_features(drive: SimulatedDrive, method: str) -> list[ScanResult]:
 @pytest.mark.parametrize("scenario", ["street", "urban"])
 def test_towns_hold_every_direction(scenario: str) -> None:
     d = drive(scenario, 0, 50, compensated=True)
-    flagged = [len(r.degenerate) > 0 for r in registered(d.points)]
+    flagged = [len(r.degenerate) > 0 for r in d.results]
     assert np.mean(flagged) < 0.02
 
 
