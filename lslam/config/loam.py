@@ -32,7 +32,7 @@ class LoamConfig(Section):
     )
     grid_step: float = Field(0.2, ge=0, description="m; grid of the less planar points, 0 keeps all")
     feature_map_voxel: float = Field(
-        1.0, gt=0, description="m; voxels of the feature map; those of planes are no smaller than `grid_step`"
+        1.0, gt=0, description="m; voxels of the feature map; those of planes are 1.5 times `grid_step` at least"
     )
     ground_angle_deg: float = Field(
         10.0, gt=0, lt=90, description="lego-loam: steepest ground against the dominant plane"

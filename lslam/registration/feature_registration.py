@@ -13,7 +13,7 @@ from lslam.kernels import voxel
 from lslam.preprocessing.features import Features
 from lslam.preprocessing.prepare import NO_TIMES
 from lslam.registration.feature_map import FeatureMap
-from lslam.registration.feature_scan import FeatureScan, feature_scan
+from lslam.registration.feature_scan import FeatureScan, feature_scan, surface_size
 from lslam.registration.feature_solver import NONE, FeatureNoise, kept_where_blind, solve_on_map
 from lslam.registration.feature_steps import ScanStep, StageClock
 from lslam.registration.registration import DOUBT, Registration, correction
@@ -121,7 +121,7 @@ class FeatureRegistration(Stateful):
             self.threshold.widen()
             self.agreement.relax()
         if result.ok or self._failures >= PATIENCE:
-            self.target = feature_scan(features, result.T_world_lidar)
+            self.target = feature_scan(features, result.T_world_lidar, self.loam.grid_step)
 
     def _attempt(self, features: Features, T_start: Floats, T_prior: Floats, clock: StageClock) -> RegistrationResult:
         """The method's own stages, judged."""
@@ -170,7 +170,7 @@ class FeatureRegistration(Stateful):
 
     def _first_step(self, features: Features, first: Features, T_first: Floats, T_prior: Floats) -> RegistrationResult:
         """The search for the first step that `icp` makes, on all features: the speed is unknown."""
-        size = max(self.config.voxel_size, self._plane_size())
+        size = surface_size(self.config.voxel_size, self.loam.grid_step)
         plain = {"residual": None, "target": "map", "inlier_distance": None, "inlier_ratio": 1.0, "voxel_size": size}
         search = Registration(self.config.model_copy(update=plain))
         search.register(_all_points(first), T_first)
@@ -223,8 +223,7 @@ class FeatureRegistration(Stateful):
         )  # fmt: skip
 
     def _plane_size(self) -> float:
-        """A plane takes six points: no voxel of the map is smaller than the grid that has thinned them."""
-        return max(self.loam.feature_map_voxel, self.loam.grid_step)
+        return surface_size(self.loam.feature_map_voxel, self.loam.grid_step)
 
     def _coarse_factor(self) -> int:
         """Coarse voxels are as large as those of `icp`."""

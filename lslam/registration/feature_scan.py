@@ -16,7 +16,6 @@ Grid = tuple[
     NDArray[np.float64], NDArray[np.uint16], NDArray[np.int32], NDArray[np.int64], NDArray[np.int32]
 ]  # fmt: skip
 
-CELL = 1.0  # m
 # m, how far a counterpart may lie: the rings of sixteen beams are that far apart on the ground at 10 m.
 REACH = 2.0
 # m, voxels whose planes tell how the surface around a point lies, and voxels twice as large, for two rings of a sparse
@@ -30,30 +29,42 @@ THICK = 0.1
 
 @dataclass(frozen=True)
 class FeatureScan:
-    """Less sharp edges and less planar points of a scan, world frame, in grids of cells of `size`, m."""
+    """Less sharp edges and less planar points of a scan, world frame, in grids of cells of `size`, m.
+
+    reach : m, how far a counterpart may lie
+    """
 
     features: Features
     T_world_lidar: NDArray[np.float64]
     edges: Grid
     planes: Grid
     normals: NDArray[np.float64]
-    size: float = CELL
+    size: float
+    reach: float
 
 
-def feature_scan(features: Features, T_world_lidar: NDArray[np.float64]) -> FeatureScan:
-    """Index the features of a scan at its pose (4, 4)."""
+def surface_size(size: float, grid_step: float) -> float:
+    """Edge of voxels, m, of `size` or as large as points of a grid of `grid_step`, m, need: a plane takes six of them."""
+    return max(size, 1.5 * grid_step)
+
+
+def feature_scan(features: Features, T_world_lidar: NDArray[np.float64], grid_step: float = 0.0) -> FeatureScan:
+    """Index the features of a scan, thinned by a grid of `grid_step`, m, at its pose (4, 4)."""
     R, t = np.ascontiguousarray(T_world_lidar[:3, :3]), np.ascontiguousarray(T_world_lidar[:3, 3])
+    reach = surface_size(REACH, grid_step)
+    size = reach / 2
 
     def grid(part: FeaturePoints) -> Grid:
-        return build(part.points, part.rings, R, t, CELL)
+        return build(part.points, part.rings, R, t, size)
 
     planes = grid(features.less_planes)
-    return FeatureScan(features, T_world_lidar, grid(features.less_edges), planes, _normals(planes[0]))
+    normals = _normals(planes[0], surface_size(AROUND, grid_step))
+    return FeatureScan(features, T_world_lidar, grid(features.less_edges), planes, normals, size, reach)
 
 
-def _normals(points: NDArray[np.float64]) -> NDArray[np.float64]:
+def _normals(points: NDArray[np.float64], size: float) -> NDArray[np.float64]:
     """(N, 3) normals of the surfaces around points (N, 3), zero where none is found."""
-    fine, normals = GaussianMap(AROUND, capacity=1 << 12), np.zeros_like(points)
+    fine, normals = GaussianMap(size, capacity=1 << 12), np.zeros_like(points)
     fine.insert(points.astype(np.float32), np.eye(4))
     for around in (fine.coarsen(2), fine):
         add_normals(

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from lslam.geometry import se3, so3
 from lslam.kernels.feature_alignment import align_to_map, align_to_scan
 from lslam.registration.feature_map import MIN_LINE_POINTS, FeatureMap
-from lslam.registration.feature_scan import REACH, FeatureScan
+from lslam.registration.feature_scan import FeatureScan
 from lslam.registration.gaussian_map import FLOOR, GaussianMap
 from lslam.registration.robust import Annealing
 from lslam.registration.solver import STEP_M, STEP_RAD, RegistrationResult, _covariance
@@ -45,7 +45,7 @@ def solve_on_scan(
     R, t, projector = _start(T_prior, allowed)
     H, edge_facts, plane_facts, step, iterations, converged, count, weak = align_to_scan(
         edges, planes, R, t, annealing.start, annealing.end, annealing.decay, annealing.steps, STEP_M, STEP_RAD,
-        noise.edge**2, noise.plane**2, noise.weak_share, noise.least, projector, one_to_many, target.size, REACH,
+        noise.edge**2, noise.plane**2, noise.weak_share, noise.least, projector, one_to_many, target.size, target.reach,
         target.edges, target.planes, target.normals,
     )  # fmt: skip
     facts = edge_facts + plane_facts

@@ -10,6 +10,7 @@ from analytic_scenes import distance, random_pose
 from numpy.typing import NDArray
 
 from lslam.config.config import Config
+from lslam.config.loam import LoamConfig
 from lslam.geometry import se3
 from lslam.preprocessing.features import Features, extract_features
 from lslam.registration.feature_registration import FeatureRegistration
@@ -50,9 +51,8 @@ def features_at(pose: Floats, seed: int = 0, with_pillars: bool = True) -> Featu
     return extract_features(scan_of_room(pose, seed, with_pillars))
 
 
-def engine(step: ScanStep | None, with_map: bool) -> FeatureRegistration:
-    config = Config()
-    return FeatureRegistration(config.registration, config.loam, scan_step=step, with_map=with_map)
+def engine(step: ScanStep | None, with_map: bool, loam: LoamConfig | None = None) -> FeatureRegistration:
+    return FeatureRegistration(Config().registration, loam or LoamConfig(), scan_step=step, with_map=with_map)
 
 
 VARIANTS = [(joint_step, False), (joint_step, True), (None, True), (two_steps, True)]
@@ -77,6 +77,27 @@ def test_a_known_motion_is_recovered(step: ScanStep | None, with_map: bool, seed
     assert degrees < 0.15
     # That nothing moved would be no answer.
     assert distance(np.eye(4), truth)[0] > 0.3
+
+
+@pytest.mark.parametrize(("grid_step", "voxel"), [(1.5, 0.1), (1.5, 1.5), (2.0, 0.5), (0.2, 0.1), (0.2, 3.0)])
+@pytest.mark.parametrize("step", [joint_step, None])
+def test_neither_a_coarse_grid_nor_a_fine_map_starves_the_registration(
+    step: ScanStep | None, grid_step: float, voxel: float
+) -> None:
+    """Six points make a plane, however far the grid that thinned them has set them apart."""
+    loam = LoamConfig(grid_step=grid_step, feature_map_voxel=voxel)
+    registration = engine(step, True, loam)
+    prior = np.eye(4)
+    for k in range(8):
+        truth = se3.exp(np.array([0.3 * k, -0.1 * k, 0.02 * k, 0, 0, np.deg2rad(k)]))
+        features = extract_features(scan_of_room(truth, k), loam)
+        result = registration.locate(features, prior, StageClock())
+        assert result.ok, result.reason
+        metres, degrees = distance(result.T_world_lidar, truth)
+        assert metres < 0.05
+        assert degrees < 0.3
+        registration.update(features, result)
+        prior = result.T_world_lidar
 
 
 def test_edges_alone_find_the_plan_and_planes_the_upright_directions() -> None:
