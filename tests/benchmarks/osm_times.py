@@ -45,7 +45,7 @@ def measured(drive: Path, count: int, size: int) -> dict[str, list[float]]:
         still = MotionPrior(np.zeros(1), poses[scan][None])
         cloud = keyframe_cloud(sequence.scan(scan), still, PreprocessConfig(), KeyframesConfig())
         store.add(Keyframe(k, scan, scan, poses[scan], None, float(way[scan])), cloud)
-    config, osm = OsmConfig(), OsmMap(read_buildings(drive / "map.osm", origin).buildings)
+    config, osm = OsmConfig(), OsmMap(read_buildings(drive / "map.osm", origin)[1].buildings)
     warm_up()
     rng, found = np.random.default_rng(0), {name: list[float]() for name in LIMITS}
     for k in range(len(store)):
