@@ -19,14 +19,14 @@ from lslam.graph.factors import PLANAR
 from lslam.graph.problem import PoseGraph
 
 Floats = NDArray[np.float64]
-Sizes = tuple[float, ...]
 
-MEMORY = 100.0  # m over which a rate is about one and the same
-# Times the errors of what is seen, of the map, and of odometry, that the configuration believes in: the likeliest are taken.
-SCALES: tuple[Sizes, ...] = (
-    (0.03125, 0.0625, 0.125, 0.25, 0.5, 1.0), (0.125, 0.25, 0.5, 1.0, 2.0), (0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
-)  # fmt: skip
-SWEEPS, ROUNDS = 3, 6
+# m over which a rate is about one and the same, and the share of its variance that is so for the whole run: a calibration.
+MEMORY, LASTING = 100.0, 0.5
+# Times the errors of what is seen, and times the drift, that the configuration believes in: the likeliest are taken. From far
+# and at a grazing angle a wall is seen elsewhere than from near, by some centimetres for many keyframes: none is seen better.
+SCALES, SIZES = (0.25, 0.5, 1.0), (0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
+ROUNDS = 6
+SETTLED = 0.1  # of the squared length that chance would give rates
 # Degrees of freedom of what is seen (Student's t): among many walls some are taken for others.
 FREEDOM = 3.0
 
@@ -37,6 +37,7 @@ class WallSightings:
 
     keyframes, walls : (N,) numbers; normals : (N, 2) of the walls on the map
     places : (N, 2) m, the middle of what was seen, as the graph has it; offsets : (N,) m, along the normal, from the wall
+    share : 0..1, what each counts: those from neighbouring keyframes are of the same scans and make the same error
     """
 
     keyframes: NDArray[np.int64]
@@ -44,6 +45,7 @@ class WallSightings:
     normals: Floats
     places: Floats
     offsets: Floats
+    share: float
 
 
 @dataclass(frozen=True)
@@ -52,20 +54,22 @@ class SteadyDrift:
 
     rates : (K-1, 3) per m of the way from each keyframe to the next: m along x and y of the world, rad of heading
     spread : (K, 6, 6) by how much each pose is unsure for that the rates are, as the covariances of `Solution`
+    is_sure : chance does not explain as much; is_settled : the rates are well below what they are unsure by
     """
 
     rates: Floats
     spread: Floats
+    is_sure: bool
+    is_settled: bool
 
 
 def find_steady_drift(
     graph: PoseGraph, seen: WallSightings, seen_sigma: float, map_sigma: float, config: GraphConfig
 ) -> SteadyDrift | None:
-    """The rates at which odometry has to be set right to see walls stand still; None when chance explains as much.
+    """The rates at which odometry has to be set right to see walls stand still; None where nothing tells any.
 
-    Rates at knots along the way, what each wall of the map is off by, and the errors of what is seen are all random, of sizes
-    that are unknown: each is given that with which what was seen is likeliest (empirical Bayes), and drift is what this is
-    likelier with than chance would have it.
+    Rates at knots along the way and the errors of what is seen are random, of sizes that are unknown: each is given that with
+    which what was seen is likeliest (empirical Bayes), and drift is what this is likelier with than chance would have it.
 
     graph : in the frame of the map, held by `start_sigma`, with `distances`
     seen_sigma, map_sigma : m, of a wall that is seen, and of one of the map beside the shift of the whole
@@ -75,18 +79,23 @@ def find_steady_drift(
     effects = _effects(graph)
     given = np.append(graph.start_sigma, np.full(2, graph.shift_sigma)) ** 2
     fit = _Fit(seen, _rows(graph, seen, effects), seen_sigma, map_sigma, given, _belief(graph.distances[-1], config))
-    sizes = fit.likeliest(SCALES)
+    scale, size = fit.likeliest()
     for _ in range(ROUNDS):
-        fit.doubt(sizes)
-        sizes = fit.likeliest(SCALES)
-    without = fit.likeliest((*SCALES[:2], (0.0,)))
-    if fit.unlikeliness(without) - fit.unlikeliness(sizes) <= quantile(config.probability, fit.count):
-        return None
-    found, covariance = fit.rates(sizes)
+        fit.doubt(scale, size)
+        scale, size = fit.likeliest()
+    found, _ = fit.rates(scale, size)
+    # What is found is the same when less of it counts, and not how sure it is.
+    fit.count_less(seen.share)
+    _, covariance = fit.rates(scale, size)
+    gain = min(fit.unlikeliness(s, 0.0) for s in SCALES) - fit.unlikeliness(scale, size)
     moves = effects[:, :, 5:]
     spread = np.zeros((len(graph), 6, 6))
     spread[:, np.array(PLANAR)[:, None], PLANAR] = moves @ covariance @ np.swapaxes(moves, -1, -2)
-    return SteadyDrift(np.asarray(_hats(graph.distances) @ found.reshape(-1, 3)), spread)
+    return SteadyDrift(
+        np.asarray(_hats(graph.distances) @ found.reshape(-1, 3)), spread,
+        is_sure=gain > quantile(config.probability, fit.count),
+        is_settled=float(found @ np.linalg.solve(covariance, found)) <= SETTLED * fit.count,
+    )  # fmt: skip
 
 
 class _Fit:
@@ -102,38 +111,40 @@ class _Fit:
         self._wall = np.unique(seen.walls, return_inverse=True)[1]
         self._columns = np.column_stack([rows, seen.offsets])
         self._seen, self._map, self._given, self._believed = seen_sigma**2, map_sigma**2, given, believed
+        self._rows = float(len(rows))
         self._believe(np.ones(len(rows)))
 
-    def likeliest(self, choices: tuple[Sizes, ...]) -> Sizes:
-        """Of each of the `choices` of `SCALES` that with which what was seen is likeliest."""
-        best = tuple(choice[len(choice) // 2] for choice in choices)
-        for _ in range(SWEEPS):
-            for axis, choice in enumerate(choices):
-                best = min(((*best[:axis], c, *best[axis + 1 :]) for c in choice), key=self.unlikeliness)
-        return best
+    def likeliest(self) -> tuple[float, float]:
+        """The scale and size with which what was seen is likeliest."""
+        return min(((scale, size) for scale in SCALES for size in SIZES), key=lambda chosen: self.unlikeliness(*chosen))
 
-    def unlikeliness(self, sizes: Sizes) -> float:
-        """Minus twice the logarithm of the likelihood, but for a constant."""
-        noise, own = self._variances(sizes)
-        normal, pull, squared = self._reduced(sizes)
-        system = np.eye(len(normal)) + self._prior(sizes) @ normal
-        found = np.linalg.solve(system, self._prior(sizes) @ pull)
-        spread = np.linalg.slogdet(system)[1] + np.log1p(own / noise * self._weight).sum()
-        return float(len(self._columns) * np.log(noise) + spread + squared - pull @ found)
+    def unlikeliness(self, scale: float, size: float) -> float:
+        """Minus twice the logarithm of the likelihood, but for a constant, with noise and rates so many times as large."""
+        noise, prior = scale**2 * self._seen, self._prior(size)
+        normal, pull, squared = self._reduced(noise)
+        system = np.eye(len(normal)) + prior @ normal
+        found = np.linalg.solve(system, prior @ pull)
+        spread = np.linalg.slogdet(system)[1] + np.log1p(self._map / noise * self._weight).sum()
+        return float(self._rows * np.log(noise) + spread + squared - pull @ found)
 
-    def rates(self, sizes: Sizes) -> tuple[Floats, Floats]:
+    def rates(self, scale: float, size: float) -> tuple[Floats, Floats]:
         """(P,) at the knots, three each, and their covariance (P, P)."""
-        found, covariance = self._solved(sizes)
+        found, covariance = self._solved(scale, size)
         n = len(self._given)
         return found[n:], covariance[n:, n:]
 
-    def doubt(self, sizes: Sizes) -> None:
+    def doubt(self, scale: float, size: float) -> None:
         """Believe what lies far from where all the rest has it less."""
-        noise, own = self._variances(sizes)
-        away = self._columns @ np.append(self._solved(sizes)[0], 1.0)
+        noise = scale**2 * self._seen
+        away = self._columns @ np.append(self._solved(scale, size)[0], 1.0)
         pulls = np.bincount(self._wall, self._weights * away)
-        away -= (pulls / (self._weight + noise / own))[self._wall]
+        away -= (pulls / (self._weight + noise / self._map))[self._wall]
         self._believe((FREEDOM + 1.0) / (FREEDOM + away**2 / noise))
+
+    def count_less(self, share: float) -> None:
+        """Take only so much of what was seen as new."""
+        self._rows *= share
+        self._believe(share * self._weights)
 
     def _believe(self, weights: Floats) -> None:
         self._weights, self._weight = weights, np.bincount(self._wall, weights)
@@ -142,25 +153,21 @@ class _Fit:
         self._by_wall = np.zeros((len(self._weight), self._columns.shape[1]))
         np.add.at(self._by_wall, self._wall, weighted)
 
-    def _variances(self, sizes: Sizes) -> tuple[float, float]:
-        return sizes[0] ** 2 * self._seen, sizes[1] ** 2 * self._map
-
-    def _reduced(self, sizes: Sizes) -> tuple[Floats, Floats, float]:
+    def _reduced(self, noise: float) -> tuple[Floats, Floats, float]:
         """Normal matrix, right side and squared length of the offsets, with the errors of the map eliminated."""
-        noise, own = self._variances(sizes)
-        shares = self._by_wall / (self._weight + noise / own)[:, None]
+        shares = self._by_wall / (self._weight + noise / self._map)[:, None]
         whole = (self._whole - self._by_wall.T @ shares) / noise
         return whole[:-1, :-1], -whole[:-1, -1], float(whole[-1, -1])
 
-    def _prior(self, sizes: Sizes) -> Floats:
+    def _prior(self, size: float) -> Floats:
         n = len(self._given)
         prior = np.zeros((n + self.count, n + self.count))
-        prior[:n, :n], prior[n:, n:] = np.diag(self._given), sizes[2] ** 2 * self._believed
+        prior[:n, :n], prior[n:, n:] = np.diag(self._given), size**2 * self._believed
         return prior
 
-    def _solved(self, sizes: Sizes) -> tuple[Floats, Floats]:
+    def _solved(self, scale: float, size: float) -> tuple[Floats, Floats]:
         """What all that is unknown is found to be, and its covariance; not by the inverse of the prior, which may be none."""
-        prior, (normal, pull, _) = self._prior(sizes), self._reduced(sizes)
+        prior, (normal, pull, _) = self._prior(size), self._reduced(scale**2 * self._seen)
         covariance = np.linalg.solve(np.eye(len(normal)) + prior @ normal, prior)
         return np.asarray(covariance @ pull), np.asarray(covariance)
 
@@ -225,6 +232,6 @@ def _hats(distances: Floats) -> Floats:
 def _belief(length: float, config: GraphConfig) -> Floats:
     """(3 n, 3 n) covariance of the rates at the knots before the map is asked."""
     knots = _knots(length)
-    alike = np.exp(-0.5 * ((knots[:, None] - knots) / MEMORY) ** 2)
+    alike = LASTING + (1.0 - LASTING) * np.exp(-0.5 * ((knots[:, None] - knots) / MEMORY) ** 2)
     percent, turn = 0.01 * config.drift_percent, np.radians(config.drift_deg_per_100m) / 100
     return np.asarray(np.kron(alike, np.diag(np.array([percent, percent, turn]) ** 2)), np.float64)

@@ -22,7 +22,7 @@ Floats = NDArray[np.float64]
 
 # How often drift is looked for: a wall ahead is seen from the last keyframe of a submap and one behind from the first, so
 # that only the greater part of it shows.
-ROUNDS = 4
+ROUNDS = 5
 
 
 def find_on_map(
@@ -42,19 +42,19 @@ def find_on_map(
     if located.problem or config.osm.matcher != "walls" or held.is_rigid:
         return located, held
     rates = np.zeros((len(graph) - 1, 3))
-    for _ in range(ROUNDS):
+    for last in range(ROUNDS):
         seen = sightings(located, held.poses, config)
         drift = find_steady_drift(held, seen, config.osm.wall_sigma, config.osm.building_sigma, config.graph)
-        if drift is None:
+        if drift is None or not (drift.is_sure or last):
             break
-        straight = without_drift(held, drift.rates)
-        odometry = se3.inverse(located.T_enu_odometry) @ straight.poses
-        again = locate(extract, store, up, config, placed, odometry)
-        if again.problem:
+        rates += drift.rates
+        held = replace(without_drift(held, drift.rates), spread=drift.spread)
+        odometry = se3.inverse(located.T_enu_odometry) @ held.poses
+        again = None if drift.is_settled else locate(extract, store, up, config, placed, odometry)
+        if again is None or again.problem:
             break
-        rates, located = rates + drift.rates, again
-        graph = replace(graph, poses=odometry, odometry=straight.odometry)
-        held = replace(on_map(graph, located, config), spread=drift.spread)
+        located = again
+        held = on_map(replace(held, poses=odometry), located, config)
     if rates.any():
         percent, degrees = 100 * np.linalg.norm(rates[:, :2], axis=1), np.degrees(rates[:, 2]) * 100
         log.info(
@@ -95,4 +95,4 @@ def sightings(located: Located, poses: Floats, config: Config) -> WallSightings:
     along /= np.linalg.norm(along, axis=1, keepdims=True)
     normals = np.column_stack([-along[:, 1], along[:, 0]])
     offsets = np.einsum("ni,ni->n", normals, places - osm.walls[walls, 0])
-    return WallSightings(keyframes, walls, normals, places, offsets)
+    return WallSightings(keyframes, walls, normals, places, offsets, 1.0 / config.keyframes.submap_size)

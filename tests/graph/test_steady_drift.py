@@ -55,7 +55,7 @@ def sighted(graph: PoseGraph, seed: int, size: float, facing: float | None = Non
         for p, r, place in zip(told, real, places[walls] + noise[:, None] * normals[walls], strict=True)
     ])  # fmt: skip
     off = np.einsum("ni,ni->n", normals[walls], seen - places[walls]) + drawn[walls]
-    return WallSightings(keyframes, walls, normals[walls], seen, off)
+    return WallSightings(keyframes, walls, normals[walls], seen, off, 1.0)
 
 
 def found(graph: PoseGraph, seen: WallSightings) -> SteadyDrift | None:
@@ -68,6 +68,8 @@ def test_drift_is_taken_out_though_the_map_errs(seed: int, size: float) -> None:
     graph = odometry(2.0, 1.0)
     drift = found(graph, sighted(graph, seed, size))
     assert drift is not None
+    assert drift.is_sure
+    assert not drift.is_settled
     straight = without_drift(graph, drift.rates)
     assert ate(straight.poses, REAL) < 0.1 * ate(graph.poses, REAL)
     # Odometry goes along: without the map it is what the poses say.
@@ -82,13 +84,33 @@ def test_what_is_told_are_the_rates_themselves() -> None:
     mean = drift.rates.mean(axis=0)
     np.testing.assert_allclose(mean[:2], [0.006, -0.008], atol=1e-3)
     assert mean[2] == pytest.approx(-np.radians(0.4) / 100, rel=0.15)
+    for _ in range(3):
+        graph = without_drift(graph, drift.rates)
+        drift = found(graph, sighted(graph, 0, 0.5))
+        assert drift is not None
+    assert drift.is_settled
+    assert not drift.is_sure
+
+
+def test_what_counts_less_is_as_far_off_and_less_sure() -> None:
+    graph = odometry(1.0, 0.4)
+    seen = sighted(graph, 0, 0.5)
+    once, fifth = found(graph, seen), found(graph, replace(seen, share=0.2))
+    assert once is not None
+    assert fifth is not None
+    np.testing.assert_array_equal(fifth.rates, once.rates)
+    ratio = fifth.spread[-1][[0, 1, 5], [0, 1, 5]] / once.spread[-1][[0, 1, 5], [0, 1, 5]]
+    assert (ratio > 2.0).all()
+    assert (ratio < 5.1).all()
 
 
 @pytest.mark.parametrize("size", [0.1, 0.5, 1.0])
 def test_errors_of_the_map_are_no_drift(size: float) -> None:
     graph = odometry(0.0, 0.0)
     for seed in range(20):
-        assert found(graph, sighted(graph, seed, size)) is None, seed
+        drift = found(graph, sighted(graph, seed, size))
+        assert drift is not None
+        assert not drift.is_sure, seed
 
 
 def test_walls_that_look_one_way_tell_no_drift_along_them() -> None:
@@ -103,7 +125,7 @@ def test_without_a_start_on_the_map_a_way_or_walls_nothing_is_told() -> None:
     seen = sighted(graph, 0, 0.1)
     assert found(replace(graph, start_sigma=None), seen) is None
     assert found(replace(graph, distances=np.zeros(COUNT)), seen) is None
-    none = WallSightings(seen.keyframes[:0], seen.walls[:0], seen.normals[:0], seen.places[:0], seen.offsets[:0])
+    none = WallSightings(seen.keyframes[:0], seen.walls[:0], seen.normals[:0], seen.places[:0], seen.offsets[:0], 1.0)
     assert found(graph, none) is None
 
 
