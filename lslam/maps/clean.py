@@ -9,19 +9,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.geometry import se3
-from lslam.maps.things import Floor, floor_of, things_in, whole
+from lslam.maps.things import Floor, floor_of, standing, things_of, whole
 from lslam.types.state import State
 
-# Scans before and after that are asked: at 10 Hz a pedestrian has left its place after 0.3 s, a lorry after 2.5 s.
-OFFSETS = (3, 6, 10, 15, 25)
+# Scans before and after that are asked: at 10 Hz a pedestrian has left its place after 0.3 s, a lorry after 2.5 s. Every
+# one between: of sparse beams most pass beside what is far.
+OFFSETS = tuple(range(3, 26))
 # How far behind a point must lie what another scan sees there: m, and m per m of range for poses that are turned.
 MARGIN, SLOPE = 0.15, 0.01
+# Share of that by which ground seen at a point's range may lie above or below it and still be it.
+STEP = 0.3
 # Votes that a point is free, against each that something was there.
 FREE_PER_HIT = 1.0
 # Where this share of the points in a cube of so many m moves, the rest of them moves, too, ...
 CUBE, SHARE = 0.5, 0.3
 # ... and where this share of a thing does, and so many points, all of it: few beams seldom look through where one was.
 MOST, LEAST = 0.4, 3
+# The same of what is left of a thing without the points at which others saw something, too.
+MOST_LEFT, LEAST_LEFT = 0.25, 2
 
 # Sizes of pixels that are tried, finest first, until a scan fills so many of them.
 COLUMNS_DEG, ROWS_DEG, FILLED = (0.4, 0.8, 1.6, 3.2), 0.3 * 1.15 ** np.arange(18), 0.85
@@ -86,13 +91,15 @@ class Cleaner:
         scan = replace(scan, points=points)
         if self._grid is None:
             self._grid = _grid_of(points)
-        image = np.full((1, 1), np.inf, np.float32)
+        T, upright = scan.T_world_lidar, _upright(scan)
+        floor = floor_of(upright, T[:3, 3])
+        image = np.full((1, 1, 2), np.inf, np.float32)
         if self._grid is not None:
             g = self._grid
-            image = nearest_ranges(points, g.rows, g.columns, g.low, 1 / g.size)
-        T = scan.T_world_lidar
+            stands = standing(upright, T[:3, 3], [floor])
+            image = nearest_ranges(points, stands, g.rows, g.columns, g.low, 1 / g.size)
         self._scans.append(scan)
-        self._looks.append(_Look(T, image, floor_of(_upright(scan), T[:3, 3])))
+        self._looks.append(_Look(T, image, floor))
         self._count += 1
         return self._decide() if self._count - self._decided > OFFSETS[-1] else []
 
@@ -132,22 +139,34 @@ class Cleaner:
         return [replace(scan, points=scan.points[kept], intensity=intensity)]
 
     def _moves(self, scan: PosedScan, number: int) -> NDArray[np.bool_]:
+        around = (number + sign * offset for offset in OFFSETS for sign in (-1, 1))
+        others = [self._looks[k - self._begin] for k in around if self._begin <= k < self._count]
+        floors = [look.floor for look in (self._looks[number - self._begin], *others)]
+        upright = _upright(scan)
+        stands = standing(upright, scan.T_world_lidar[:3, 3], floors)
+        points, upright = scan.points[stands], upright[stands]
+        free, hit = self._votes(points, scan.T_world_lidar, others)
+        moving = spread((free >= 1) & (free >= FREE_PER_HIT * hit), points)
+        # Somebody beside a wall is a thing once the wall, which others saw, is left aside; then the feet join.
+        moving = whole(moving, things_of(upright, moving | (hit <= free)), MOST_LEFT, LEAST_LEFT)
+        moving = whole(moving, things_of(upright, np.ones(len(points), np.bool_)), MOST, LEAST)
+        moves = np.zeros(len(stands), np.bool_)
+        moves[stands] = moving
+        return moves
+
+    def _votes(
+        self, points: NDArray[np.float32], T_world_lidar: NDArray[np.float64], others: list[_Look]
+    ) -> tuple[NDArray[np.int16], NDArray[np.int16]]:
+        """Of how many of the `others` each point (N, 3) was looked through, and by how many something was seen there."""
         from lslam.kernels.see_through import vote
 
-        free, hit = np.zeros(len(scan.points), np.int16), np.zeros(len(scan.points), np.int16)
-        floors = [self._looks[number - self._begin].floor]
-        for other in (number + sign * offset for offset in OFFSETS for sign in (-1, 1)):
-            if self._grid is not None and self._begin <= other < self._count:
-                look = self._looks[other - self._begin]
-                T = se3.relative(look.T_world_lidar, scan.T_world_lidar)
-                vote(scan.points, T, look.image, self._grid.low, 1 / self._grid.size, MARGIN, SLOPE, free, hit)
-                floors.append(look.floor)
-        labels = things_in(_upright(scan), scan.T_world_lidar[:3, 3], floors)
-        stands = np.flatnonzero(labels)
-        moves = np.zeros(len(labels), np.bool_)
-        voted = (free >= 1) & (free >= FREE_PER_HIT * hit)
-        moves[stands] = spread(voted[stands], scan.points[stands])
-        return whole(moves, labels, MOST, LEAST)
+        free, hit = np.zeros(len(points), np.int16), np.zeros(len(points), np.int16)
+        if self._grid is not None:
+            low, inverse = self._grid.low, 1 / self._grid.size
+            for look in others:
+                T = se3.relative(look.T_world_lidar, T_world_lidar)
+                vote(points, T, look.image, low, inverse, MARGIN, SLOPE, STEP, free, hit)
+        return free, hit
 
 
 def _upright(scan: PosedScan) -> NDArray[np.float32]:

@@ -48,14 +48,14 @@ def floor_of(points: NDArray[np.float32], sensor: NDArray[np.float64]) -> Floor:
     return Floor(first, lowest)
 
 
-def things_in(points: NDArray[np.float32], sensor: NDArray[np.float64], floors: Iterable[Floor]) -> Ints:
-    """Number of the thing that each point (N, 3) is of, from 1; 0 on the ground and out of reach.
+def standing(points: NDArray[np.float32], sensor: NDArray[np.float64], floors: Iterable[Floor]) -> NDArray[np.bool_]:
+    """(N,) whether a point is within reach and above the ground, as far as `floors` know it.
 
     points, sensor : as for `floor_of`; floors : of this scan and of others around it
     """
     from scipy import ndimage
 
-    labels = np.zeros(len(points), np.int64)
+    stands = np.zeros(len(points), np.bool_)
     within = np.flatnonzero(_within_reach(points))
     near = points[within]
     first, squares = _squares(near, sensor)
@@ -64,12 +64,23 @@ def things_in(points: NDArray[np.float32], sensor: NDArray[np.float64], floors: 
         floor.lower(ground, first)
     # A wheel hides the ground below: the squares around it know.
     ground = ndimage.minimum_filter(ground, 3, mode="constant", cval=np.inf)
-    stands = near[:, 2] + sensor[2] > ground.reshape(-1)[squares] + ABOVE
-    cells = np.floor((near[stands, :2] + REACH) / GAP).astype(np.int64)
+    stands[within] = near[:, 2] + sensor[2] > ground.reshape(-1)[squares] + ABOVE
+    return stands
+
+
+def things_of(points: NDArray[np.float32], chosen: NDArray[np.bool_]) -> Ints:
+    """Number of the thing that each point (N, 3) is of, from 1, were there only the `chosen`; 0 for the others.
+
+    points : as for `floor_of`; chosen : (N,), within reach
+    """
+    from scipy import ndimage
+
+    labels = np.zeros(len(points), np.int64)
+    x, y = np.floor((points[chosen, :2] + REACH) / GAP).astype(np.int64).T
     taken = np.zeros((int(2 * REACH / GAP) + 1,) * 2, np.bool_)
-    taken[cells[:, 0], cells[:, 1]] = True
+    taken[x, y] = True
     numbered, _ = ndimage.label(taken, np.ones((3, 3)))
-    labels[within[stands]] = numbered[cells[:, 0], cells[:, 1]]
+    labels[chosen] = numbered[x, y]
     return labels
 
 
@@ -77,7 +88,7 @@ def whole(moves: NDArray[np.bool_], labels: Ints, share: float, least: int) -> N
     """The mask (N,), and all of the things of which `share`, and `least` points, are masked."""
     total, moving = np.bincount(labels), np.bincount(labels, moves)
     chosen = (moving >= least) & (moving >= share * total)
-    chosen[:1] = False  # the ground is no thing
+    chosen[:1] = False  # 0 is no thing
     return np.asarray(moves | chosen[labels])
 
 

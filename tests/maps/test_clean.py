@@ -20,7 +20,13 @@ from lslam.types.scan_result import ScanResult
 
 @pytest.mark.parametrize(
     ("scenario", "sensor", "count"),
-    [("motorway", None, 45), ("walk", None, 50), ("motorway", "os1-32", 55), ("walk", "vlp16", 50)],
+    [
+        ("motorway", None, 45),
+        ("walk", None, 50),
+        ("motorway", "os1-32", 55),
+        ("walk", "vlp16", 50),
+        ("urban", "os1-32", 50),
+    ],
 )
 def test_moving_points_go_and_static_ones_stay(
     scenario: str, sensor: str | None, count: int, monkeypatch: pytest.MonkeyPatch
@@ -50,10 +56,11 @@ def test_moving_points_go_and_static_ones_stay(
 
 
 def reference(
-    points: NDArray[np.float64], T: NDArray[np.float64], image: NDArray[np.float32], low: float, inverse: float
+    points: NDArray[np.float64], T: NDArray[np.float64], seen: NDArray[np.float32], low: float, inverse: float
 ) -> tuple[list[int], list[int]]:
     """Plain Python, one point at a time: indices that are free, and that are hit."""
     free, hit = [], []
+    image, ground = seen[..., 0], seen[..., 1]
     rows, columns = image.shape
     for i, p in enumerate(se3.apply(T, points)):
         r = float(np.linalg.norm(p))
@@ -64,7 +71,8 @@ def reference(
         around = [image[row + a, (column + b) % columns] for a in (-1, 0, 1) for b in (-1, 0, 1) if row + a < rows]
         reach = 0.3 + 0.02 * r
         if abs(image[row, column] - r) <= reach:
-            hit.append(i)
+            if not (np.isfinite(ground[row, column]) and abs(ground[row, column] - p[2]) > 0.4 * reach):
+                hit.append(i)
         elif min(around) > r + reach and np.isfinite(around[:3]).any():
             free.append(i)
     return free, hit
@@ -75,19 +83,24 @@ def test_votes_equal_plain_python() -> None:
     seen = rng.normal(0, [10, 10, 1.5], (4000, 3)).astype(np.float32)
     seen[:3] = 0, np.nan, np.inf
     low, inverse = -0.4, 1 / 0.06
-    image = nearest_ranges(seen, 14, 90, low, inverse)
+    stands = seen[:, 2] > -0.5
+    image = nearest_ranges(seen, stands, 14, 90, low, inverse)
+    assert np.array_equal(np.isfinite(image[..., 1]), np.isin(image[..., 1], seen[~stands, 2]))
     for row, column in ((3, 7), (9, 45), (13, 89)):
         elevation = np.arctan2(seen[:, 2], np.hypot(seen[:, 0], seen[:, 1]))
         inside = (np.floor((elevation - low) * inverse) == row) & (
             np.floor((np.arctan2(seen[:, 1], seen[:, 0]) + np.pi) / (2 * np.pi) * 90) == column
         )
         ranges = np.linalg.norm(seen[inside], axis=1)
-        assert image[row, column] == pytest.approx(ranges.min() if len(ranges) else np.inf)
+        assert image[row, column, 0] == pytest.approx(ranges.min() if len(ranges) else np.inf)
+        below = seen[inside & ~stands & (np.linalg.norm(seen, axis=1) == ranges.min(initial=np.inf)), 2]
+        height = below[0] if len(below) else np.nan
+        assert image[row, column, 1] == pytest.approx(height, nan_ok=True)
     points = rng.normal(0, [6, 6, 1], (3000, 3)).astype(np.float32)
 
     T = se3.make(so3.exp(np.array([0.1, 0.02, -2.9])), np.array([1.0, -2.0, 0.3]))
     free, hit = np.zeros(3000, np.int16), np.zeros(3000, np.int16)
-    vote(points, T, image, low, inverse, 0.3, 0.02, free, hit)
+    vote(points, T, image, low, inverse, 0.3, 0.02, 0.4, free, hit)
     expected = reference(points.astype(np.float64), T, image, low, inverse)
     assert np.flatnonzero(free).tolist() == expected[0]
     assert np.flatnonzero(hit).tolist() == expected[1]

@@ -6,9 +6,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from lslam.maps.things import ABOVE, REACH, SQUARE, floor_of, things_in, whole
+from lslam.maps.things import ABOVE, GAP, REACH, SQUARE, Floor, floor_of, standing, things_of, whole
 
 SENSOR = np.array([1234.5, -987.25, 40.0])
+
+
+def things_in(points: NDArray[np.float32], sensor: NDArray[np.float64], floors: list[Floor]) -> NDArray[np.int64]:
+    return things_of(points, standing(points, sensor, floors))
 
 
 def ground(rng: np.random.Generator, slope: float = 0.0) -> NDArray[np.float32]:
@@ -70,6 +74,14 @@ def test_floors_are_the_lowest_of_each_square_whoever_saw_it() -> None:
         margin = float(p[2]) + SENSOR[2] - min(around) - ABOVE
         assert abs(margin) < 1e-4 or (label > 0) == (margin > 0)
     assert 100 < (labels > 0).sum() < 3000
+
+
+def test_two_things_are_one_only_by_what_is_chosen() -> None:
+    points = np.zeros((5, 3), np.float32)
+    points[:, 0] = np.arange(5) * GAP + 0.5 * GAP
+    points[4, 0] += 3 * GAP
+    assert things_of(points, np.ones(5, np.bool_)).tolist() == [1, 1, 1, 1, 2]
+    assert things_of(points, np.array([True, True, False, True, True])).tolist() == [1, 1, 0, 2, 3]
 
 
 def test_nothing_in_reach_is_nothing() -> None:
