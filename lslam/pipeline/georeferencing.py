@@ -89,7 +89,8 @@ def place(
     found = align(fixes.antenna, fixes.positions, fixes.sigmas, fixes.slack, direction, sigma, config.min_fixes)
     if found is None:
         return Placement(
-            problem=f"GNSS: no place and heading on the Earth fits half of {fixes.given} fixes: all rejected"
+            problem=f"GNSS: no place and heading on the Earth fits half of {fixes.given} fixes, and {config.min_fixes} at the "
+            "least (gnss.min_fixes): all rejected"
         )
     georeference, shift = _at_first(found, fixes, config)
     log.info(
