@@ -61,6 +61,15 @@ def off_the_way(poses: Floats, real: Floats) -> float:
     return float(np.sqrt(np.mean(np.sum((poses[:, :2, 3] - real[:, :2, 3]) ** 2, axis=1))))
 
 
+def test_poses_are_unsure_by_what_is_given_beside_the_graph() -> None:
+    graph, _, middles, _, matches = drive(0)
+    spread = np.tile(np.diag([0.04, 0.09, 0.0, 0.0, 0.0, 1e-4]), (len(graph), 1, 1))
+    known = optimise_jointly(graph, middles, matches, BELIEF, GraphConfig())
+    unsure = optimise_jointly(replace(graph, spread=spread), middles, matches, BELIEF, GraphConfig())
+    np.testing.assert_allclose(unsure.covariances - known.covariances, spread, atol=1e-12)
+    np.testing.assert_array_equal(unsure.poses, known.poses)
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_walls_mend_the_way_and_the_map_together(seed: int) -> None:
     graph, real, middles, off, matches = drive(seed)
