@@ -61,19 +61,20 @@ class InertialMotion(Stateful):
         """Whether there is a velocity: from the start on."""
         return self.coasting.is_known if self.refusal else True
 
-    @property
-    def is_compared(self) -> bool:
-        """Whether the next scan is one of the sample that shows what constant velocity would have cost."""
-        return not self.refusal and self.coasting.is_known and len(self._errors) % self.COMPARED == self.COMPARED - 1
+    def is_compared(self, stamp_ns: int, span_s: float) -> bool:
+        """Whether the scan to come is one of the sample that shows what constant velocity would have cost.
+
+        Where constant velocity predicts it anyway, over a gap of the IMU, there is nothing to compare.
+        """
+        is_due = self.coasting.is_known and len(self._errors) % self.COMPARED == self.COMPARED - 1
+        return is_due and self._feels(stamp_ns, span_s)
 
     def sweep(self, stamp_ns: int, span_s: float) -> MotionPrior:
         """Poses from scan start over the `span_s` seconds that the sweep takes; one pose when it takes none."""
-        if self.refusal:
+        if not self._feels(stamp_ns, span_s):
             return self.coasting.sweep(stamp_ns, span_s)
-        anchor_ns, anchor = (stamp_ns, self._pose) if self._instant_ns is None else (self._instant_ns, self._pose)
-        if not self._covers(anchor_ns, stamp_ns + round(1e9 * span_s)):
-            return self.coasting.sweep(stamp_ns, span_s)
-        return self._prior(self.estimate, anchor_ns, anchor, stamp_ns, span_s)
+        anchor_ns = stamp_ns if self._instant_ns is None else self._instant_ns
+        return self._prior(self.estimate, anchor_ns, self._pose, stamp_ns, span_s)
 
     def refine(self, prior: MotionPrior, stamp_ns: int, start: Floats) -> MotionPrior:
         """The sweep's motion again, now that registration gave the pose `start` (4, 4) for `prior`."""
@@ -252,6 +253,11 @@ class InertialMotion(Stateful):
                 f"{LEVER_M:.0f} m): check its axes, T_lidar_imu and its stamps"
             )
             log.warning("the IMU is refused from here on: %s", self.refusal)
+
+    def _feels(self, stamp_ns: int, span_s: float) -> bool:
+        """Whether the IMU, if it is believed, has samples from the newest pose to the end of a sweep."""
+        begin_ns = stamp_ns if self._instant_ns is None else self._instant_ns
+        return not self.refusal and self._covers(begin_ns, stamp_ns + round(1e9 * span_s))
 
     def _covers(self, begin_ns: int, end_ns: int) -> bool:
         """Whether there are samples without a gap from one instant to the other."""

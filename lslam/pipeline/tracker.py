@@ -115,7 +115,7 @@ class Tracker:
         if scan is None:
             result = ScanResult(loaded.index, loaded.stamp_ns, prior.start, "skipped", loaded.error, converged=False)
         elif isinstance(self.odometry, Deskewing):
-            if inertial is not None and inertial.is_compared:
+            if inertial is not None and inertial.is_compared(loaded.stamp_ns, span):
                 trial = self._without_imu(self.odometry, scan, loaded.prepared, inertial.coasting)
             result, prior = self._register(self.odometry, scan, loaded.prepared, prior, clock)
         else:

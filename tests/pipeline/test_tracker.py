@@ -90,15 +90,17 @@ class Priced(Oracle):
         return replace(result, stages={**result.stages, "update": 7.0})
 
 
-def braked(lost_m: float = np.inf) -> tuple[Priced, list[ScanResult]]:
-    """From 40 m/s by 8 m/s2 with an IMU that knows all: constant velocity is 8 cm wrong at each scan."""
+def braked(lost_m: float = np.inf, gap: tuple[float, float] = (0.0, 0.0)) -> tuple[Priced, list[ScanResult]]:
+    """From 40 m/s by 8 m/s2 with an IMU that knows all but in a `gap` (s): constant velocity is 8 cm wrong at each scan."""
     count, brake = 45, -8.0
     t = 0.1 * np.arange(count)
     poses = se3.make(np.eye(3), np.column_stack([40 * t + 0.5 * brake * t**2, 0 * t, 0 * t]))
     stamps = 10_000_000 * np.arange(10 * count, dtype=np.int64)
     rng = np.random.default_rng(0)
     accel = np.array([brake, 0.0, GRAVITY]) + rng.normal(0, 1e-9, (len(stamps), 3))
-    imu = ImuStream(stamps, accel, rng.normal(0, 1e-12, (len(stamps), 3)))
+    gyro = rng.normal(0, 1e-12, (len(stamps), 3))
+    kept = (stamps <= 1e9 * gap[0]) | (stamps >= 1e9 * gap[1])
+    imu = ImuStream(stamps[kept], accel[kept], gyro[kept])
     known = ImuEstimate(
         np.array([40.0, 0, 0]),
         np.array([0, 0, -GRAVITY]),
@@ -128,3 +130,10 @@ def test_some_scans_tell_what_the_imu_saves() -> None:
 def test_a_scan_that_constant_velocity_loses_compares_with_nothing() -> None:
     _, results = braked(lost_m=0.06)
     assert [r.index for r in results[2:] if r.status != "ok" or r.steady_iterations is not None] == []
+
+
+def test_over_a_gap_of_the_imu_nothing_is_compared() -> None:
+    """The 20th scan that it would predict lies in the gap, and so do the eleven after it: constant velocity does them all."""
+    oracle, results = braked(gap=(2.05, 3.15))
+    assert [r.index for r in results if r.steady_iterations is not None] == [33]
+    assert all(oracle.calls.count(r.index) == 1 for r in results[2:] if r.index != 33)
