@@ -67,36 +67,34 @@ class ImuEstimate:
         x, P = _propagate(self, step, R)
         return self._with(x[3:], P[3:, 3:], step)
 
-    def taught(
-        self, imu: ImuStream, instants_ns: NDArray[np.int64], R: Floats, R_end: Floats, noise: Floats | None = None
-    ) -> Gyroscope:
-        """The gyroscope, now that registration turned the IMU from R to R_end (3, 3) between two instants.
+    def taught(self, step: Increments, R: Floats, R_end: Floats, noise: Floats | None = None) -> Gyroscope:
+        """The gyroscope, now that registration turned the IMU from R to R_end (3, 3) in the course of `step`.
 
+        step : as this estimate finds it `over` the two instants
         noise : (3, 3) rad2, world axes, of either rotation; None where a registration says nothing of its quality
         """
-        step = self.over(imu, instants_ns)
         R_felt = R @ step.rotations[-1]
         if noise is None:
             noise = TURN_SIGMA**2 * np.eye(3)
         return self.gyroscope.learnt(step, so3.log(R_felt.T @ R_end), 2 * R_felt.T @ noise @ R_felt)
 
     def corrected(
-        self, imu: ImuStream, instants_ns: NDArray[np.int64], R: Floats, R_end: Floats, moved: Floats,
+        self, imu: ImuStream, step: Increments, R: Floats, R_end: Floats, moved: Floats,
         gyroscope: Gyroscope, noise: Floats | None = None,
     ) -> ImuEstimate:  # fmt: skip
-        """The estimate at the last instant, now that registration says how the IMU got there.
+        """The estimate at the last instant of `step`, now that registration says how the IMU got there.
 
+        step : as this estimate finds it `over` the two instants
         R, R_end : (3, 3) of the IMU in the world at the first and the last instant; moved : (3,) m in between
         gyroscope : as the turn has `taught`
         noise : (3, 3) m2, world axes, of either place; None where a registration says nothing of its quality
         """
-        step = self.over(imu, instants_ns)
         rest = so3.log((R @ step.rotations[-1]).T @ R_end)
         # The shape of the turn is the gyroscope's, its sum is registration's.
         arm = step.rotations[-1].T @ step.velocity_arms[-1]
         axes = self.gyroscope.axes
         bias = self.gyroscope.bias - np.linalg.solve(arm @ axes, rest)
-        step = integrate(imu, instants_ns, bias, self.accel_bias, axes)
+        step = integrate(imu, step.instants_ns, bias, self.accel_bias, axes)
         x, P = _propagate(self, step, R)
         H = np.zeros((3, 12))
         H[:, :3] = np.eye(3)

@@ -12,6 +12,7 @@ from lslam.config.imu import ImuConfig
 from lslam.geometry import se3, so3
 from lslam.inertial.estimate import ImuEstimate
 from lslam.inertial.gyroscope import Gyroscope
+from lslam.inertial.integrate import Increments
 from lslam.inertial.kalman import surprise
 from lslam.inertial.stream import gaps
 from lslam.preprocessing.deskew import KNOTS
@@ -54,6 +55,9 @@ class InertialMotion(Stateful):
         self._pose = np.eye(4)
         # What `weigh` learnt at an instant, ns, for `correct`: the gyroscope, and how well registration knows the place, m2.
         self._taught: tuple[int, Gyroscope, Floats] | None = None
+        # Until the next `correct`: what the IMU felt since the last scan, and where it expects the LiDAR at a stamp, ns.
+        self._felt: Increments | None = None
+        self._expected: tuple[int, Floats] | None = None
         self._errors: list[tuple[float, float]] = []
 
     @property
@@ -74,7 +78,9 @@ class InertialMotion(Stateful):
         if not self._feels(stamp_ns, span_s):
             return self.coasting.sweep(stamp_ns, span_s)
         anchor_ns = stamp_ns if self._instant_ns is None else self._instant_ns
-        return self._prior(self.estimate, anchor_ns, self._pose, stamp_ns, span_s)
+        prior = self._prior(self.estimate, anchor_ns, self._pose, stamp_ns, span_s)
+        self._expected = stamp_ns, prior.start
+        return prior
 
     def refine(self, prior: MotionPrior, stamp_ns: int, start: Floats) -> MotionPrior:
         """The sweep's motion again, now that registration gave the pose `start` (4, 4) for `prior`."""
@@ -100,15 +106,14 @@ class InertialMotion(Stateful):
         if self.refusal or before is None or instant_ns <= before or not self._covers(before, instant_ns):
             return result
         e = self.estimate
-        instants = np.array([before, instant_ns])
-        step = e.over(self.imu, instants)
+        step = self._since_last(instant_ns)
         begin, end = self._pose @ self.T_lidar_imu, middle @ self.T_lidar_imu
         R_felt = begin[:3, :3] @ step.rotations[-1]
         moved, felt = e.displacement(step, begin[:3, :3])
         P = np.zeros((6, 6))
         P[:3, :3], P[3:, 3:] = felt, R_felt @ e.gyroscope.turn_covariance(step) @ R_felt.T
         rest = np.concatenate([end[:3, 3] - begin[:3, 3] - moved, R_felt @ so3.log(R_felt.T @ end[:3, :3])])
-        gyroscope = e.taught(self.imu, instants, begin[:3, :3], end[:3, :3], C[3:, 3:])
+        gyroscope = e.taught(step, begin[:3, :3], end[:3, :3], C[3:, 3:])
         self._taught = instant_ns, gyroscope, C[:3, :3]
         if surprise(rest, P + 2 * C) > 1:
             return result
@@ -144,6 +149,7 @@ class InertialMotion(Stateful):
                 self.estimate = self._advanced(stamp_ns, instant_ns)
         self.coasting.correct(stamp_ns, pose, prior)
         self._instant_ns, self._pose = instant_ns, middle.copy()
+        self._taught = self._felt = self._expected = None
 
     def gravity_at(self, pose: Floats) -> GravityDirection | None:
         """Which way is down for a LiDAR at `pose` (4, 4) in the world, as of the last scan; None where that is not known.
@@ -169,6 +175,7 @@ class InertialMotion(Stateful):
     def restore(self, state: State) -> None:
         """Go on where `state` was taken."""
         super().restore(state)
+        self._taught = self._felt = self._expected = None
         self._errors = [(float(own), float(steady)) for own, steady in state["errors"]]
 
     def turn(self, begin_ns: int, end_ns: int) -> Floats | None:
@@ -203,21 +210,23 @@ class InertialMotion(Stateful):
         """The estimate at `instant_ns`, where registration put the LiDAR at `middle` (4, 4)."""
         if self.config.velocity == "integrated":
             return self._carried(instant_ns)
-        assert self._instant_ns is not None
         a, b = self._pose @ self.T_lidar_imu, middle @ self.T_lidar_imu
-        instants = np.array([self._instant_ns, instant_ns])
+        step = self._since_last(instant_ns)
         if self._taught is not None and self._taught[0] == instant_ns:
             _, gyroscope, noise = self._taught
         else:
-            gyroscope, noise = self.estimate.taught(self.imu, instants, a[:3, :3], b[:3, :3]), None
-        return self.estimate.corrected(
-            self.imu, instants, a[:3, :3], b[:3, :3], b[:3, 3] - a[:3, 3], gyroscope, noise
-        )  # fmt: skip
+            gyroscope, noise = self.estimate.taught(step, a[:3, :3], b[:3, :3]), None
+        return self.estimate.corrected(self.imu, step, a[:3, :3], b[:3, :3], b[:3, 3] - a[:3, 3], gyroscope, noise)
 
     def _carried(self, instant_ns: int) -> ImuEstimate:
+        return self.estimate.carried(self._since_last(instant_ns), (self._pose @ self.T_lidar_imu)[:3, :3])
+
+    def _since_last(self, instant_ns: int) -> Increments:
+        """What the IMU felt since the last scan, integrated once for all who ask before the next `correct`."""
         assert self._instant_ns is not None
-        step = self.estimate.over(self.imu, np.array([self._instant_ns, instant_ns]))
-        return self.estimate.carried(step, (self._pose @ self.T_lidar_imu)[:3, :3])
+        if self._felt is None or self._felt.instants_ns[-1] != instant_ns:
+            self._felt = self.estimate.over(self.imu, np.array([self._instant_ns, instant_ns]))
+        return self._felt
 
     def _advanced(self, stamp_ns: int, instant_ns: int) -> ImuEstimate:
         """The estimate of the first scan's start at the middle of its sweep."""
@@ -242,7 +251,10 @@ class InertialMotion(Stateful):
         assert self._instant_ns is not None
         if not self.coasting.is_known:
             return
-        mine = self._prior(self.estimate, self._instant_ns, self._pose, stamp_ns, 0.0).start
+        if self._expected is not None and self._expected[0] == stamp_ns:
+            mine = self._expected[1]
+        else:
+            mine = self._prior(self.estimate, self._instant_ns, self._pose, stamp_ns, 0.0).start
         self._errors.append((_distance(mine, pose), _distance(self.coasting.predict(stamp_ns), pose)))
         if len(self._errors) < self.JUDGED or self.config.velocity == "integrated":
             return

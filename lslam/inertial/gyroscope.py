@@ -6,7 +6,7 @@ that is worth more than its bias wanders, and no noise at all but the same error
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -60,15 +60,11 @@ class Gyroscope:
         `rest` and `noise` are in IMU axes at the end of the step.
         """
         seconds = float(step.seconds[-1])
-        walk = np.diag(np.repeat([BIAS_WALK**2 * seconds, 0.0], [3, 9]))
-        before = replace(self, covariance=self.covariance + walk)
-        expected = before.turn_covariance(step) + noise
-        allowed = float(np.trace(expected))
+        before = self.covariance + np.diag(np.repeat([BIAS_WALK**2 * seconds, 0.0], [3, 9]))
+        H, own = self._columns(step), self.rate_variance * seconds * np.eye(3)
+        allowed = float(np.trace(H @ before @ H.T + own + noise))
         excess = (min(float(rest @ rest), OUTLIER**2 * allowed) - allowed) / (3 * seconds)
-        x, P = update(
-            np.concatenate([self.bias, self.axes.ravel()]), before.covariance, self._columns(step), rest,
-            noise + self.rate_variance * seconds * np.eye(3),
-        )  # fmt: skip
+        x, P = update(np.concatenate([self.bias, self.axes.ravel()]), before, H, rest, noise + own)
         variance = max(self.rate_variance + excess / MEMORY, float(RATE_NOISE**2))
         return Gyroscope(x[:3], x[3:].reshape(3, 3), P, variance)
 

@@ -169,9 +169,9 @@ def _learnt(
     T = first.middles @ T_lidar_imu
     learnt = guess
     for k in range(len(T) - 1):
-        step, R, R_end = first.instants_ns[k : k + 2], T[k, :3, :3], T[k + 1, :3, :3]
+        step, R, R_end = learnt.over(imu, first.instants_ns[k : k + 2]), T[k, :3, :3], T[k + 1, :3, :3]
         noise = None if first.covariances is None else first.covariances[k + 1, 3:, 3:]
-        gyroscope = learnt.taught(imu, step, R, R_end, noise)
+        gyroscope = learnt.taught(step, R, R_end, noise)
         learnt = learnt.corrected(imu, step, R, R_end, T[k + 1, :3, 3] - T[k, :3, 3], gyroscope)
     covariance = learnt.covariance.copy()
     covariance[:3, :] = covariance[:, :3] = 0.0

@@ -18,24 +18,30 @@ Floats = NDArray[np.float64]
 class Increments:
     """What an IMU felt since the first of some instants, in its own axes at that instant, gravity not removed.
 
-    seconds : (K,) since the first instant; rotations : (K, 3, 3) from the IMU then to the IMU at the first instant
+    instants_ns : (K,) increasing; rotations : (K, 3, 3) from the IMU then to the IMU at the first instant
     velocities (K, 3), positions (K, 3) : the specific force integrated once and twice, m/s and m
     velocity_arms, position_arms : (K, 3, 3) likewise of the rotations: what a constant force in IMU axes adds
     """
 
-    seconds: Floats
+    instants_ns: NDArray[np.int64]
     rotations: Floats
     velocities: Floats
     positions: Floats
     velocity_arms: Floats
     position_arms: Floats
 
+    @property
+    def seconds(self) -> Floats:
+        """(K,) since the first instant."""
+        return np.asarray((self.instants_ns - self.instants_ns[0]) * 1e-9)
+
     def motion(self, anchor: int, R: Floats, velocity: Floats, gravity: Floats) -> tuple[Floats, Floats, Floats]:
         """Rotations (K, 3, 3), velocities (K, 3) and positions (K, 3) in the world, relative to the position at `anchor`.
 
         R (3, 3), velocity (3,) : of the IMU in the world at instant `anchor`; gravity : (3,) m/s2, downwards
         """
-        tau = (self.seconds - self.seconds[anchor])[:, None]
+        seconds = self.seconds
+        tau = (seconds - seconds[anchor])[:, None]
         R_first = R @ self.rotations[anchor].T
         gained = self.velocities - self.velocities[anchor]
         moved = self.positions - self.positions[anchor] - tau * self.velocities[anchor]
@@ -75,9 +81,8 @@ def integrate(
     halfway = R[:-1] @ so3.exp(0.5 * gyro * dt[:, None])
     velocities, positions = _twice(np.einsum("kij,kj->ki", halfway, accel), dt)
     velocity_arms, position_arms = _twice(halfway, dt)
-    seconds = (grid - lo) * 1e-9
     return Increments(
-        seconds[nodes], R[nodes], velocities[nodes], positions[nodes], velocity_arms[nodes], position_arms[nodes]
+        instants_ns, R[nodes], velocities[nodes], positions[nodes], velocity_arms[nodes], position_arms[nodes]
     )
 
 

@@ -13,6 +13,7 @@ from lslam.config.imu import ImuConfig
 from lslam.geometry import se3, so3
 from lslam.inertial.fusion import InertialMotion
 from lslam.inertial.initialise import FirstPoses, start
+from lslam.inertial.integrate import Increments, integrate
 from lslam.types.imu import ImuStream
 from lslam.types.scan_result import ScanResult
 
@@ -148,6 +149,46 @@ def test_the_velocity_is_as_sure_as_it_says_whatever_registration_is(seed: int) 
         off = motion.estimate.velocity - true
         squared.append(off @ np.linalg.solve(motion.estimate.covariance[:3, :3], off) / 3)
     assert np.mean(squared[10:]) < 1
+
+
+def test_no_interval_is_integrated_twice(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The sweep, the step from the last scan, either correction of it, and the refined sweep."""
+    motion = motion_of()
+    stamp, true = begun(motion)
+    calls = []
+
+    def counted(imu: ImuStream, instants_ns: NDArray[np.int64], bias: Floats, *rest: Floats) -> Increments:
+        calls.append((tuple(instants_ns), tuple(bias)))
+        return integrate(imu, instants_ns, bias, *rest)
+
+    monkeypatch.setattr("lslam.inertial.estimate.integrate", counted)
+    seen = true @ se3.make(so3.exp(np.array([0, 0, 4e-4])), np.zeros(3))
+    prior = motion.refine(motion.sweep(stamp, 0.1), stamp, seen)
+    out = motion.weigh(result_of(3, stamp, seen, np.diag([1e-6] * 3 + [1e-8] * 3)), prior)
+    assert not np.array_equal(out.T_world_lidar, seen)
+    motion.correct(stamp, out.T_world_lidar, prior)
+    assert len(calls) == len(set(calls)) == 5
+
+
+@pytest.mark.parametrize("why", ["another scan was expected", "restored"])
+def test_what_was_integrated_for_another_scan_is_not_taken(why: str) -> None:
+    motion, other = motion_of(), motion_of()
+    stamps, poses = truth_of(drone())
+    begun(motion)
+    begun(other)
+    C = np.diag([1e-6] * 3 + [1e-8] * 3)
+    if why == "restored":
+        before = motion.state()
+        motion.correct(int(stamps[3]), poses[3], motion.sweep(int(stamps[3]), 0.0))
+        motion.weigh(result_of(4, int(stamps[4]), poses[4], C), motion.sweep(int(stamps[4]), 0.0))
+        motion.restore(before)
+    else:
+        motion.weigh(result_of(5, int(stamps[5]), poses[5], C), motion.sweep(int(stamps[5]), 0.0))
+    for one in (motion, other):
+        one.correct(int(stamps[4]), poses[4])
+    np.testing.assert_array_equal(motion.estimate.velocity, other.estimate.velocity)
+    np.testing.assert_array_equal(motion.estimate.gyroscope.bias, other.estimate.gyroscope.bias)
+    assert motion.prior_errors() == other.prior_errors()
 
 
 def test_an_old_map_counts_for_more_than_one_scan() -> None:
