@@ -64,19 +64,17 @@ def to_quaternion(R: NDArray[Any]) -> Floats:
     """(..., 3, 3) rotations to (..., 4) unit quaternions xyzw with w >= 0 (Shepperd's method: the largest term leads)."""
     R = np.asarray(R, np.float64)
     r00, r11, r22 = R[..., 0, 0], R[..., 1, 1], R[..., 2, 2]
-    squares = np.stack([1 + r00 - r11 - r22, 1 - r00 + r11 - r22, 1 - r00 - r11 + r22, 1 + r00 + r11 + r22], axis=-1)
-    a, b, c = R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]
-    d, e, f = R[..., 1, 0] + R[..., 0, 1], R[..., 0, 2] + R[..., 2, 0], R[..., 2, 1] + R[..., 1, 2]
-    rows = np.stack(
-        [
-            np.stack([squares[..., 0], d, e, a], axis=-1),
-            np.stack([d, squares[..., 1], f, b], axis=-1),
-            np.stack([e, f, squares[..., 2], c], axis=-1),
-            np.stack([a, b, c, squares[..., 3]], axis=-1),
-        ],
-        axis=-2,
-    )
-    best = np.argmax(squares, axis=-1)
+    # 4 q q^T
+    rows = np.empty((*R.shape[:-2], 4, 4))
+    rows[..., 0, 0], rows[..., 1, 1] = 1 + r00 - r11 - r22, 1 - r00 + r11 - r22
+    rows[..., 2, 2], rows[..., 3, 3] = 1 - r00 - r11 + r22, 1 + r00 + r11 + r22
+    rows[..., 0, 1] = rows[..., 1, 0] = R[..., 1, 0] + R[..., 0, 1]
+    rows[..., 0, 2] = rows[..., 2, 0] = R[..., 0, 2] + R[..., 2, 0]
+    rows[..., 1, 2] = rows[..., 2, 1] = R[..., 2, 1] + R[..., 1, 2]
+    rows[..., 0, 3] = rows[..., 3, 0] = R[..., 2, 1] - R[..., 1, 2]
+    rows[..., 1, 3] = rows[..., 3, 1] = R[..., 0, 2] - R[..., 2, 0]
+    rows[..., 2, 3] = rows[..., 3, 2] = R[..., 1, 0] - R[..., 0, 1]
+    best = np.argmax(np.diagonal(rows, axis1=-2, axis2=-1), axis=-1)
     q = np.take_along_axis(rows, best[..., None, None], axis=-2)[..., 0, :]
     q = q / np.linalg.norm(q, axis=-1, keepdims=True)
     return np.asarray(np.where(q[..., 3:] < 0, -q, q))
