@@ -22,7 +22,7 @@ from lslam.errors import (
     RunFailedError,
     RunFinishedError,
 )
-from lslam.pipeline.run_folder import KEYFRAMES, LOG
+from lslam.pipeline.run_folder import KEYFRAMES, LOG, MANIFEST
 from lslam.studies.grid import Job
 from lslam.studies.states import State, write_state
 
@@ -56,6 +56,7 @@ def execute(job: Job, bench: Bench) -> None:
         log.addHandler(logging.NullHandler())
     log.propagate = False
     job.state_file.unlink(missing_ok=True)
+    _drop_lone_log(job.folder)
     began, waited = time.monotonic(), _waited_s()
     status, reason = "failed", ""
     try:
@@ -92,6 +93,13 @@ def _keep_traceback(folder: Path, error: Exception) -> str:
     except OSError:
         return ""
     return f": its {LOG} says where"
+
+
+def _drop_lone_log(folder: Path) -> None:
+    """A mistake before there was a run left its traceback in a folder that is none, and so would not be replaced."""
+    with contextlib.suppress(OSError):  # what is in the way is said when the run is made
+        if not (folder / MANIFEST).exists():
+            (folder / LOG).unlink(missing_ok=True)
 
 
 def _waited_s() -> float:

@@ -65,6 +65,20 @@ def test_a_mistake_before_a_run_has_a_log_too(tmp_path: Path, monkeypatch: pytes
     assert state.reason.startswith("lslam made a mistake (RuntimeError: moths)")
 
 
+def test_what_a_mistake_before_a_run_left_is_no_obstacle_to_the_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    job = job_in(tmp_path)
+    with monkeypatch.context() as broken:
+        broken.setattr(worker, "_run", in_the_relay)
+        execute(job, Bench())
+    execute(job, Bench())
+    state = read_state(job.state_file)
+    assert state is not None
+    assert (state.status, state.reason) == ("done", "")
+    assert "in_the_relay" not in (job.folder / "log.txt").read_text()
+
+
 def test_a_log_that_cannot_be_written_is_not_promised(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(worker, "_run", in_the_relay)
     job = job_in(tmp_path)
