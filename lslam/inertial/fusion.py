@@ -40,7 +40,7 @@ class InertialMotion(Stateful):
     JUDGED, WORSE, SLACK_M = 30, 2.0, 0.02
     # One scan in so many is registered from constant velocity too, to tell what the IMU saves.
     COMPARED = 20
-    STATE = ("estimate", "coasting", "refusal", "gap_scans", "_has_gap", "_instant_ns", "_pose")
+    STATE = ("estimate", "coasting", "refusal", "gap_scans", "_scans", "_has_gap", "_instant_ns", "_pose")
 
     def __init__(self, imu: ImuStream, T_lidar_imu: Floats, estimate: ImuEstimate, config: ImuConfig) -> None:
         self.imu, self.T_lidar_imu, self.config = imu, T_lidar_imu, config
@@ -49,6 +49,7 @@ class InertialMotion(Stateful):
         self.coasting = ConstantVelocity()
         self.refusal = ""
         self.gap_scans = 0
+        self._scans = 0
         self._has_gap = False
         self._gaps = gaps(imu, config.gap_s)
         self._instant_ns: int | None = None
@@ -70,7 +71,7 @@ class InertialMotion(Stateful):
 
         Where constant velocity predicts it anyway, over a gap of the IMU, there is nothing to compare.
         """
-        is_due = self.coasting.is_known and len(self._errors) % self.COMPARED == self.COMPARED - 1
+        is_due = self.coasting.is_known and self._scans % self.COMPARED == self.COMPARED - 1
         return is_due and self._feels(stamp_ns, span_s)
 
     def sweep(self, stamp_ns: int, span_s: float) -> MotionPrior:
@@ -150,6 +151,7 @@ class InertialMotion(Stateful):
         self.coasting.correct(stamp_ns, pose, prior)
         self._instant_ns, self._pose = instant_ns, middle.copy()
         self._taught = self._felt = self._expected = None
+        self._scans += 1
 
     def gravity_at(self, pose: Floats) -> GravityDirection | None:
         """Which way is down for a LiDAR at `pose` (4, 4) in the world, as of the last scan; None where that is not known.
