@@ -92,7 +92,7 @@ def align_to_map(edges: Floats, planes: Floats, scatter: Floats, R: Floats, t: F
                  scale_end: float, decay: float, max_iterations: int, step_m: float, step_rad: float,
                  edge_variance: float, plane_variance: float, weak_share: float, least: float, allowed: Floats, line_size: float,
                  min_points: float, floor: float, edge_moments: Floats, edge_keys: Longs, edge_table: Ints,
-                 lines: Floats, line_keys: Longs, line_counts: Floats, size: float, plane_rows: Floats, plane_keys: Longs,
+                 lines: Floats, line_keys: Longs, line_sums: Floats, size: float, plane_rows: Floats, plane_keys: Longs,
                  plane_table: Ints, has_coarse: bool, coarse_size: float, coarse_rows: Floats, coarse_keys: Longs,
                  coarse_table: Ints) -> Aligned:  # fmt: skip
     """Register edges (E, 3) on line voxels of `line_size`, m, and planar points (P, 3) with scatter (P, 6) on
@@ -116,7 +116,7 @@ def align_to_map(edges: Floats, planes: Floats, scatter: Floats, R: Floats, t: F
         plane_facts[:] = 0.0
         is_done[:] = False
         linearise_lines(edges, R, t, line_size, scale, edge_variance, min_points, floor, edge_moments, edge_keys, edge_table,
-                        lines, line_keys, line_counts, edge_cells, edge_slots, H, g, edge_facts)  # fmt: skip
+                        lines, line_keys, line_sums, edge_cells, edge_slots, H, g, edge_facts)  # fmt: skip
         linearise(planes, scatter, R, t, size, scale, plane_variance, 0.0, np.inf, plane_rows, plane_keys, plane_table,
                   cells, slots, is_done, away2, H, g, plane_facts)  # fmt: skip
         if has_coarse:

@@ -3,6 +3,7 @@
 A row of `lines` (C, 8) float64 belongs to a slot of the voxel pool: a point x y z on the line (the mean), its unit direction
 x y z (the largest eigenvector), the variance across it, and the variance of its direction, rad2, or NO_LINE. Rows are
 computed when a point asks for the voxel and kept until the voxel has changed: most voxels behind the sensor never are.
+A voxel has changed when the sum of its count and second moments has: the count of a full one stays what it is.
 """
 
 from __future__ import annotations
@@ -30,14 +31,15 @@ TILT = 4.0
 
 @inline
 def line_of(slot: int, size: float, min_points: float, floor: float, moments: Floats, keys: Longs, lines: Floats,
-            line_keys: Longs, line_counts: Floats) -> None:  # fmt: skip
+            line_keys: Longs, line_sums: Floats) -> None:  # fmt: skip
     """Bring the row of one slot up to date with the moments of its voxel."""
     s = moments[slot]
     key = keys[slot]
-    if line_keys[slot] == key and line_counts[slot] == s[0]:
+    known = s[0] + s[4] + s[7] + s[9]
+    if line_keys[slot] == key and line_sums[slot] == known:
         return
     line_keys[slot] = key
-    line_counts[slot] = s[0]
+    line_sums[slot] = known
     row = lines[slot]
     row[7] = NO_LINE
     if s[0] < min_points:
@@ -99,7 +101,7 @@ def add_line(H: Floats, g: Floats, facts: Floats, ex: float, ey: float, ez: floa
 @kernel
 def linearise_lines(source: Floats, R: Floats, t: Floats, size: float, scale: float, sigma2: float, min_points: float,
                     floor: float, moments: Floats, keys: Longs, table: Ints, lines: Floats, line_keys: Longs,
-                    line_counts: Floats, cells: Longs, slots: Ints, H: Floats, g: Floats, facts: Floats) -> None:  # fmt: skip
+                    line_sums: Floats, cells: Longs, slots: Ints, H: Floats, g: Floats, facts: Floats) -> None:  # fmt: skip
     """Add to the upper triangle of H (6, 6), to g (6,) and facts (6,) all edge points (S, 3), LiDAR frame.
 
     Each takes the line voxel, of the eight around it, whose line passes nearest: residual across the line, variance =
@@ -120,7 +122,7 @@ def linearise_lines(source: Floats, R: Floats, t: Floats, size: float, scale: fl
             s = slots[i, k]
             if s < 0:
                 continue
-            line_of(s, size, min_points, floor, moments, keys, lines, line_keys, line_counts)
+            line_of(s, size, min_points, floor, moments, keys, lines, line_keys, line_sums)
             p = lines[s]
             if p[7] < 0.0:
                 continue

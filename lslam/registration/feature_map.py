@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.kernels.gaussians import USED
 from lslam.preprocessing.features import Features
 from lslam.registration.gaussian_map import GaussianMap
 from lslam.types.state import State, Stateful
@@ -48,7 +47,7 @@ class FeatureMap(Stateful):
 
     @property
     def lines(self) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64]]:
-        """Rows of `kernels.lines` for the edge voxels, the keys and counts they were computed at; kept up to date by it."""
+        """Rows of `kernels.lines` for the edge voxels, the keys and sums they were computed at; kept up to date by it."""
         if len(self._lines[0]) != len(self.edges.keys):
             self._lines = _lines_for(self.edges)
         return self._lines
@@ -62,17 +61,10 @@ class FeatureMap(Stateful):
         self.edges.insert(features.less_edges.points.astype(np.float32), T_world_lidar)
         self.planes.insert(features.less_planes.points.astype(np.float32), T_world_lidar)
 
-    def state(self) -> State:
-        """The voxels, and the lines that were computed of them: a line stays until its voxel's count has changed."""
-        used = int(self.edges.pool[USED])
-        return {**super().state(), "lines": [part[:used] for part in self.lines]}
-
     def restore(self, state: State) -> None:
         """Go on with the voxels of `state`."""
         super().restore(state)
         self._lines = _lines_for(self.edges)
-        for part, known in zip(self._lines, state["lines"], strict=True):
-            part[: len(known)] = known
 
 
 def _lines_for(edges: GaussianMap) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64]]:

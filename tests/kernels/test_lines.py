@@ -132,6 +132,23 @@ def test_lines_follow_the_map_as_it_grows_and_as_slots_change_hands(scene: LineS
     assert not np.array_equal(kept[0], scene.linearise(0.3)[0])
 
 
+def test_a_line_follows_a_voxel_that_is_full() -> None:
+    """Its count comes back to the cap with every scan: what it held once is not all it will ever hold."""
+    scene = LineScene()
+    scene.target = GaussianMap(SIZE, count_cap=200)
+    scene.R, scene.t = np.eye(3), np.zeros(3)
+    scene.source = np.array([[0.5, 0.5, 0.5]])
+    offsets = []
+    for x in (0.5, 0.5, 0.6, 0.6):
+        pole = np.column_stack([np.full(200, x), np.full(200, 0.5), np.linspace(0.01, 0.99, 200)])
+        scene.target.insert(pole.astype(np.float32), np.eye(4))
+        H, g, _ = scene.linearise(1.0)
+        offsets.append(-g[0] / H[0, 0])
+    slot = scene.target.moments[:, 0].argmax()
+    assert scene.target.moments[slot, 0] == 200
+    np.testing.assert_allclose(offsets, [0, 0, 0.05, 0.075], atol=1e-3)
+
+
 def test_a_pose_that_is_not_finite_matches_nothing(scene: LineScene) -> None:
     t = scene.t
     scene.t = np.array([np.nan, 0.0, 0.0])
