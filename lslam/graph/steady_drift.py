@@ -193,10 +193,10 @@ def without_drift(graph: PoseGraph, rates: NDArray[np.float64]) -> PoseGraph:
 
 def _rows(graph: PoseGraph, seen: WallSightings, effects: Floats) -> Floats:
     """(N, 5 + 3 n) what start, shift and rates do to the offsets of what was seen."""
-    moves = effects[seen.keyframes]
     about = seen.places - graph.poses[seen.keyframes, :2, 3]
-    turned = np.einsum("ni,ni->n", seen.normals, _across(about))
-    return np.asarray(np.einsum("ni,nip->np", seen.normals, moves[:, :2]) + turned[:, None] * moves[:, 2])
+    axes = np.column_stack([seen.normals, np.einsum("ni,ni->n", seen.normals, _across(about))])
+    # One by one: all effects of all sightings at once would be three times what comes of them.
+    return np.stack([axis @ effects[k] for axis, k in zip(axes, seen.keyframes, strict=True)])
 
 
 def _effects(graph: PoseGraph) -> Floats:

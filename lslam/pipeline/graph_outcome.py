@@ -96,13 +96,12 @@ def solve(graph: PoseGraph, given: Given, georeference: Georeference | None = No
         "pose graph: %d keyframes, %d of %d loops believed, drift beside odometry's covariances %.3g, %d rounds",
         len(graph), len(believed), len(graph.loops), solution.drift, solution.rounds,
     )  # fmt: skip
-    facts = _facts(solution, graph, given.candidates, believed)
+    T = np.eye(4) if georeference is None else georeference.T_enu_world
+    facts = _facts(solution, graph, T @ _odometry(given), given.candidates, believed)
     tilts = not believed and tilt_factor(graph, config.graph) > 0
     if not (believed or graph.fixes or graph.floors or graph.map_priors or tilts):
         return BackEnd(given.results, judged, graph.poses, facts=facts)
-    T = np.eye(4)
     if georeference is not None:
-        T = georeference.T_enu_world
         georeference = replace(_scored(georeference, graph, solution), T_enu_world=np.eye(4))
     moved = corrected(
         given.results, given.store.keyframes, solution.poses, solution.covariances, solution.drift, config.graph
@@ -120,7 +119,12 @@ def unsolved(given: Given) -> BackEnd:
         else c
         for c in given.candidates
     ]
-    return BackEnd(given.results, candidates, np.stack([k.T_world_lidar for k in given.store.keyframes]))
+    return BackEnd(given.results, candidates, _odometry(given))
+
+
+def _odometry(given: Given) -> Floats:
+    """(K, 4, 4) poses of the keyframes."""
+    return np.stack([k.T_world_lidar for k in given.store.keyframes])
 
 
 def _verdicts(
@@ -157,9 +161,10 @@ def _scored(georeference: Georeference, graph: PoseGraph, solution: Solution) ->
 
 
 def _facts(
-    solution: Solution, graph: PoseGraph, candidates: list[LoopCandidate], believed: list[Constraint]
+    solution: Solution, graph: PoseGraph, before: Floats, candidates: list[LoopCandidate], believed: list[Constraint]
 ) -> dict[str, Any]:
-    moved = se3.relative(graph.poses, solution.poses)[:, :3, 3]
+    """For the manifest; before : (K, 4, 4) poses of the keyframes as odometry has them, in the frame of the graph."""
+    moved = se3.relative(before, solution.poses)[:, :3, 3]
     return {
         "loop_candidates": len(candidates),
         "loops": len(believed),

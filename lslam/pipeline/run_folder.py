@@ -96,7 +96,7 @@ class RunFolder:
             self._log_handler = _LogFile(self.path / LOG)
         except OSError as error:
             self._let_go()
-            raise OutputError(f"{self.path / 'log.txt'} cannot be written: {error.strerror or error}") from None
+            raise OutputError(f"{self.path / LOG} cannot be written: {error.strerror or error}") from None
         self._log_handler.attach()
         return self
 

@@ -6,15 +6,18 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from test_osm_pass import HOUSES, Outline, config, driven, extract_of, street
+from test_osm_pass import HOUSES, ORIGIN, Outline, config, driven, extract_of, street
 
 from lslam.config import Config
 from lslam.geometry import se2, se3
 from lslam.graph.problem import PoseGraph
 from lslam.keyframes.store import KeyframeStore
+from lslam.pipeline.graph_outcome import Given, solve
 from lslam.pipeline.osm_graph import find_on_map, on_map, sightings
 from lslam.pipeline.osm_pass import Located, locate
 from lslam.types.constraint import Constraint
+from lslam.types.georeference import Georeference
+from lslam.types.scan_result import ScanResult
 
 SURE = np.diag([1e-6] * 3 + [1e-8] * 3)
 
@@ -66,6 +69,14 @@ def test_a_drift_is_taken_out_by_a_map_that_errs(seed: int) -> None:
     assert off(held.poses, way) < 0.2 * wrong
     steps = se3.relative(held.poses[:-1], held.poses[1:])
     np.testing.assert_allclose([c.T_a_b for c in held.odometry], steps, atol=1e-9)
+    # What the manifest calls the largest correction is that of odometry, with what was set straight before the graph.
+    results = [ScanResult(k.scan, k.stamp_ns, k.T_world_lidar) for k in store.keyframes]
+    on_walls = Georeference(ORIGIN, located.T_enu_odometry, None, "osm")
+    done = solve(held, Given(results, store, config(), []), on_walls)
+    assert done is not None
+    moved = done.keyframes[:, :3, 3] - (located.T_enu_odometry @ before.poses)[:, :3, 3]
+    assert done.facts["largest_correction_m"] == pytest.approx(np.linalg.norm(moved, axis=1).max(), abs=1e-4)
+    assert done.facts["largest_correction_m"] > 2 * wrong
 
 
 @pytest.mark.parametrize("size", [0.0, 0.5])
