@@ -82,15 +82,16 @@ def mean_forces(imu: ImuStream) -> NDArray[np.float64]:
 
 
 def gaps(imu: ImuStream, longest_s: float) -> NDArray[np.int64]:
-    """(G, 2) ns: begin and end of every stretch without samples longer than `longest_s`, before and after all included.
+    """(G, 2) ns: begin and end of every stretch that no sample tells of, before and after all included.
 
-    Samples of a slow stream are not gaps: half a step more than usual is.
+    In a pause longer than `longest_s` half of that after the last sample and before the next is still known as well as in
+    one that is no longer. Pauses of a slow stream are not gaps: half a step more than usual is.
     """
     steps = np.diff(imu.stamps_ns)
     limit = max(1e9 * longest_s, 1.5 * float(np.median(steps)))
     found = np.flatnonzero(steps > limit)
-    inner = np.stack([imu.stamps_ns[found], imu.stamps_ns[found + 1]], axis=1)
-    far, slack = np.iinfo(np.int64), int(limit)
+    far, slack, half = np.iinfo(np.int64), int(limit), int(limit / 2)
+    inner = np.stack([imu.stamps_ns[found] + half, imu.stamps_ns[found + 1] - half], axis=1)
     before = np.array([[far.min, imu.stamps_ns[0] - slack]])
     after = np.array([[imu.stamps_ns[-1] + slack, far.max]])
     return np.concatenate([before, inner, after])

@@ -117,6 +117,20 @@ def test_gaps_fall_back_to_constant_velocity_and_are_counted() -> None:
     assert own[70:, 0].mean() < 1.5 * whole[70:, 0].mean() + 2e-3
 
 
+def test_scans_that_only_touch_a_gap_are_still_the_imus() -> None:
+    """The sweep before lacks its last samples, the step to the scan after its first ones: each less than half of `gap_s`."""
+    drive = walk()
+    imu = stream_of(drive)
+    keep = (imu.stamps_ns < 5_985_000_000) | (imu.stamps_ns > 6_275_000_000)
+    motion = motion_of(drive, ImuStream(imu.stamps_ns[keep], imu.accel[keep], imu.gyro[keep]))
+    own, own_sweep = errors(motion, drive)
+    whole, _ = errors(motion_of(drive), drive)
+    _, steady_sweep = errors(ConstantVelocity(), drive)
+    assert motion.gap_scans == 3
+    np.testing.assert_array_equal(own[:60], whole[:60])
+    assert (own_sweep[[59, 63]] < 0.1 * steady_sweep[[59, 63]]).all()
+
+
 def test_wrong_axes_that_slipped_through_are_refused_on_the_way() -> None:
     drive = walk()
     wrong = extrinsics_of(drive) @ se3.make(so3.exp(np.array([np.pi / 2, 0, 0])), np.zeros(3))
