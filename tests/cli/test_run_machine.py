@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import os
+import resource
 import shutil
 import subprocess
-import time
 from pathlib import Path
 
 import pytest
@@ -14,12 +14,18 @@ from calling import COMMAND, SAMPLE, environment, lslam_process, manifest
 STARTS = 8
 
 
+def cpu_of_children() -> float:
+    """Seconds that processes which have ended took, and theirs."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
+
+
 @pytest.fixture(scope="module")
 def cold_starts(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[tuple[int, str]], Path, float]:
-    """Eight first runs at once on one empty kernel cache: the cache, (exit code, stderr) of each, folders, seconds."""
+    """Eight first runs at once on one empty kernel cache: the cache, (exit code, stderr) of each, folders, CPU seconds."""
     base = tmp_path_factory.mktemp("cold")
     env = environment(NUMBA_CACHE_DIR=str(base / "cache"))
-    began = time.monotonic()
+    began = cpu_of_children()
     children = [
         subprocess.Popen(
             [*COMMAND, "run", str(SAMPLE), "--count", "5", "--out", str(base / f"run{k}")],
@@ -28,7 +34,7 @@ def cold_starts(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[tu
         for k in range(STARTS)
     ]  # fmt: skip
     ended = [(child.communicate(timeout=300)[1], child.returncode) for child in children]
-    return base / "cache", [(code, stderr) for stderr, code in ended], base, time.monotonic() - began
+    return base / "cache", [(code, stderr) for stderr, code in ended], base, cpu_of_children() - began
 
 
 def test_eight_cold_starts_on_one_cache_all_succeed(
@@ -44,17 +50,20 @@ def test_eight_cold_starts_on_one_cache_all_succeed(
     assert sum("compiling kernels, once" in stderr for _, stderr in ended) > STARTS // 2
     trajectories = {(base / f"run{k}" / "trajectory.tum").read_bytes() for k in range(STARTS)}
     assert len(trajectories) == 1
-    assert min(manifest(base / f"run{k}")["timings"]["compile_s"] for k in range(STARTS)) < 40
 
 
 def test_only_the_first_compiles(cold_starts: tuple[Path, list[tuple[int, str]], Path, float], tmp_path: Path) -> None:
-    cache, _, _, _ = cold_starts
+    cache, _, _, cold_s = cold_starts
+    began = cpu_of_children()
     warm = lslam_process(
         "run", SAMPLE, "--count", 5, "--out", tmp_path / "out", env=environment(NUMBA_CACHE_DIR=str(cache))
     )
+    warm_s = cpu_of_children() - began
     assert warm.returncode == 0
     assert "compiling" not in warm.stderr
     assert manifest(tmp_path / "out")["timings"]["compile_s"] < 3
+    # To compile takes 12 s of an idle core and more of a busy one, and all eight would have needed it.
+    assert cold_s - STARTS * warm_s < STARTS / 2 * 12
 
 
 def test_a_damaged_cache_costs_time_not_the_run(

@@ -50,7 +50,7 @@ def test_a_sensor_that_stood_still_has_no_length_to_be_a_share_of() -> None:
 
 
 @given(twists)
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 def test_moving_the_estimate_changes_nothing_under_se3_and_origin(xi: np.ndarray) -> None:
     T = se3.exp(xi * np.array([50, 50, 50, 1, 1, 1]))
     for alignment in ("origin", "se3", "sim3"):
@@ -62,7 +62,7 @@ def test_moving_the_estimate_changes_nothing_under_se3_and_origin(xi: np.ndarray
 
 
 @given(st.floats(-3, 3), arrays(np.float64, 3, elements=st.floats(-100, 100)))
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 def test_posyaw_forgives_what_gravity_leaves_open(yaw: float, t: np.ndarray) -> None:
     T = se3.make(so3.exp(np.array([0, 0, yaw])), t)
     here = absolute_error(ESTIMATE, TRUTH, "posyaw").translation

@@ -13,7 +13,7 @@ from lslam.formats.osm_rings import footprints_from_rings, join_rings
 
 
 @given(st.permutations(range(8)), st.lists(st.booleans(), min_size=8, max_size=8), st.integers(1, 7))
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=80)
 def test_rings_join_from_any_parts_in_any_order(order: list[int], flips: list[bool], cut: int) -> None:
     """Two octagons' edges, cut to parts, shuffled and turned round, give two rings of the same edges."""
     first = [tuple(range(cut + 1)), (*range(cut, 8), 0)]

@@ -31,7 +31,7 @@ def cloud(n: int = 500) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
 
 @pytest.mark.parametrize("suffix", [".bin", ".pcd", ".ply", ".npy"])
 @given(table=CLOUDS)
-@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_round_trip_is_exact(suffix: str, table: NDArray[np.float32], tmp_path: Path) -> None:
     path = tmp_path / f"scan{suffix}"
     write_points(path, table[:, :3], table[:, 3])
@@ -44,7 +44,7 @@ def test_round_trip_is_exact(suffix: str, table: NDArray[np.float32], tmp_path: 
 
 @pytest.mark.parametrize("encoding", ENCODINGS)
 @given(table=CLOUDS)
-@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_pcd_encodings_are_exact(encoding: str, table: NDArray[np.float32], tmp_path: Path) -> None:
     path = tmp_path / "scan.pcd"
     write_pcd(path, table[:, :3], table[:, 3], encoding)
@@ -132,7 +132,7 @@ def test_pcd_keeps_ring_and_time_and_skips_padding(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("kind", ["binary.pcd", "ascii.pcd", "binary_compressed.pcd", "a.ply", "a.npy", "a.bin"])
 @given(place=st.integers(0, 10_000), what=st.binary(max_size=6), cut=st.integers(0, 8), end=st.integers(0, 60))
-@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_damaged_files_are_read_or_refused(
     kind: str, place: int, what: bytes, cut: int, end: int, tmp_path: Path
 ) -> None:

@@ -21,7 +21,7 @@ KARLSRUHE = np.array([49.0112, 8.4229, 112.8])
     de=st.floats(-0.02, 0.02),
     h=st.floats(-100, 4000),
 )
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 def test_there_and_back(lat: float, lon: float, dn: float, de: float, h: float) -> None:
     origin = np.array([lat, lon, h])
     fix = origin + np.array([dn, de, 12.5])

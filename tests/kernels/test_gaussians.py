@@ -203,7 +203,7 @@ def test_eviction_looks_at_two_voxels_per_voxel_touched() -> None:
 
 
 @given(st.integers(0, 2**31), st.integers(20, 60))
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 def test_lookups_survive_any_order_of_insertion_and_eviction(seed: int, steps: int) -> None:
     """A table of 256 entries up to a quarter full, so that chains form; freed entries must not cut them."""
     rng = np.random.default_rng(seed)

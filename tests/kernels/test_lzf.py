@@ -43,7 +43,7 @@ def unpacked(data: bytes, size: int) -> bytes | None:
 
 # Few different bytes make repeats, which plain random bytes never have.
 @given(st.one_of(st.binary(max_size=3000), st.lists(st.sampled_from(b"abc"), max_size=3000).map(bytes)))
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 def test_round_trip_and_reference(data: bytes) -> None:
     small = packed(data)
     assert reference(small) == data

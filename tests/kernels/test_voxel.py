@@ -29,7 +29,7 @@ def groups(points: NDArray[np.float32], size: float) -> tuple[NDArray[np.int64],
 
 
 @given(st.tuples(*[st.integers(-(2**20), 2**20 - 1)] * 3), st.tuples(*[st.integers(-(2**20), 2**20 - 1)] * 3))
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 def test_keys_are_unique_positive_and_unpack(a: tuple[int, int, int], b: tuple[int, int, int]) -> None:
     key = int(voxel.pack(*a))
     assert 0 <= key < 2**63

@@ -40,7 +40,7 @@ def filled(folder: Path | None, count: int, cached: int = 2) -> KeyframeStore:
 
 
 @given(CLOUDS)
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 def test_every_bit_comes_back(clouds: list[NDArray[np.float32]]) -> None:
     with tempfile.TemporaryDirectory() as folder:
         for home in (None, Path(folder) / "keyframes"):

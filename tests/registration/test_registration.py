@@ -47,7 +47,7 @@ def test_the_first_scan_defines_the_world_or_takes_its_prior() -> None:
 
 
 @given(st.integers(0, 2**31), st.sampled_from([(0.3, 3.0), (1.0, 5.0), (2.5, 5.0)]))
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=12)
 def test_a_start_at_unknown_speed_is_found(seed: int, limits: tuple[float, float]) -> None:
     rng = np.random.default_rng(seed)
     T = random_pose(rng, *limits)
@@ -62,7 +62,7 @@ def test_a_start_at_unknown_speed_is_found(seed: int, limits: tuple[float, float
 
 
 @given(st.integers(0, 2**31))
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 def test_surprises_after_the_start_are_caught_coarse_to_fine(seed: int) -> None:
     registration, _ = settled(6)
     rng = np.random.default_rng(seed)
