@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -57,7 +59,8 @@ def off(poses: np.ndarray, way: np.ndarray) -> float:
 
 
 @pytest.mark.parametrize("seed", range(2))
-def test_a_drift_is_taken_out_by_a_map_that_errs(seed: int) -> None:
+def test_a_drift_is_taken_out_by_a_map_that_errs(seed: int, caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level("INFO", "lslam")
     way = street(60.0)
     store = driven(HOUSES, way, runaway(way, 4.0, 3.0))
     before = graph_of(store)
@@ -69,6 +72,10 @@ def test_a_drift_is_taken_out_by_a_map_that_errs(seed: int) -> None:
     assert off(held.poses, way) < 0.2 * wrong
     steps = se3.relative(held.poses[:-1], held.poses[1:])
     np.testing.assert_allclose([c.T_a_b for c in held.odometry], steps, atol=1e-9)
+    # All of it: submaps are smeared by the drift and show the greater part only, so it is looked for again.
+    said = re.search(r"drifts steadily by (\S+) % and (\S+) deg/100 m, and is set straight", caplog.text)
+    assert said is not None
+    assert [float(number) for number in said.groups()] == pytest.approx([4.0, 3.0], abs=0.15)
     # What the manifest calls the largest correction is that of odometry, with what was set straight before the graph.
     results = [ScanResult(k.scan, k.stamp_ns, k.T_world_lidar) for k in store.keyframes]
     on_walls = Georeference(ORIGIN, located.T_enu_odometry, None, "osm")
@@ -113,6 +120,23 @@ def test_each_wall_seen_is_measured_from_its_own_line_on_the_map() -> None:
     away = np.einsum("ni,ni->n", seen.normals, seen.places - walls[:, 1])
     np.testing.assert_allclose(away, seen.offsets, atol=1e-9)
     assert np.linalg.norm(seen.places - way[seen.keyframes, :2], axis=1).max() < 60.0
+
+
+def test_walls_are_sought_from_where_a_keyframe_was_laid_or_else_expected() -> None:
+    """What is not asked lies 9 m off, where no building would be found."""
+    given = config(90.0, "keyframes.submap_size=3")
+    located = locate(extract_of(HOUSES), driven(HOUSES, street(12.0)), None, given)
+    poses = np.stack([se2.to_se3(at) for at in street(12.0)])
+    away = np.array([9.0, -9.0, 0.3])
+    laid_out = [replace(m, verdict="accepted", prior=m.pose + away) for m in located.matches]
+    refused = [replace(m, verdict="rejected", prior=m.pose, pose=m.pose + away) for m in located.matches]
+    expected = sightings(located, poses, given)
+    assert len(expected.walls) > 20
+    assert expected.share == pytest.approx(1 / 3)
+    for matches in (laid_out, refused):
+        seen = sightings(replace(located, matches=matches), poses, given)
+        np.testing.assert_array_equal(seen.walls, expected.walls)
+        np.testing.assert_array_equal(seen.offsets, expected.offsets)
 
 
 def test_without_a_building_there_is_no_wall_to_see() -> None:
