@@ -58,13 +58,12 @@ def feature_scan(features: Features, T_world_lidar: NDArray[np.float64], grid_st
         return build(part.points, part.rings, R, t, size)
 
     planes = grid(features.less_planes)
-    normals = _normals(planes[0], surface_size(AROUND, grid_step))
-    return FeatureScan(features, T_world_lidar, grid(features.less_edges), planes, normals, size, reach)
+    return FeatureScan(features, T_world_lidar, grid(features.less_edges), planes, _normals(planes[0]), size, reach)
 
 
-def _normals(points: NDArray[np.float64], size: float) -> NDArray[np.float64]:
+def _normals(points: NDArray[np.float64]) -> NDArray[np.float64]:
     """(N, 3) normals of the surfaces around points (N, 3), zero where none is found."""
-    fine, normals = GaussianMap(size, capacity=1 << 12), np.zeros_like(points)
+    fine, normals = GaussianMap(AROUND, capacity=1 << 12), np.zeros_like(points)
     fine.insert(points.astype(np.float32), np.eye(4))
     for around in (fine.coarsen(2), fine):
         add_normals(

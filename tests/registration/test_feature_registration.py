@@ -100,6 +100,24 @@ def test_neither_a_coarse_grid_nor_a_fine_map_starves_the_registration(
         prior = result.T_world_lidar
 
 
+@pytest.mark.parametrize("grid_step", [0.2, 1.5, 3.0])
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_a_coarse_grid_takes_neither_counterparts_nor_normals_from_scan_to_scan(grid_step: float, seed: int) -> None:
+    """Points are sought as far as the grid has set them apart; where rings are dense it leaves enough for normals near by."""
+    loam = LoamConfig(grid_step=grid_step)
+    registration = engine(joint_step, False, loam)
+    first = extract_features(scan_of_room(np.eye(4)), loam)
+    registration.update(first, registration.locate(first, np.eye(4), StageClock()))
+    target = registration.target
+    assert target is not None
+    assert np.any(target.normals, axis=1).mean() > 0.6
+    truth = se3.exp(np.array([0.2, -0.1, 0.05, 0, 0, np.deg2rad(1)]))
+    result = registration.locate(extract_features(scan_of_room(truth, seed), loam), np.eye(4), StageClock())
+    assert not result.reason
+    assert result.matched > 0.95 * result.source_points
+    assert distance(result.T_world_lidar, truth)[0] < 0.02
+
+
 def test_edges_alone_find_the_plan_and_planes_the_upright_directions() -> None:
     """Each step of two moves only its own directions, in the sensor's axes at the prior, and both together arrive."""
     prior = random_pose(np.random.default_rng(7), 0.5, 20.0)
