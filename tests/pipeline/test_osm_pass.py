@@ -113,6 +113,16 @@ def test_odometry_that_runs_away_is_followed() -> None:
     assert (off(located, way) < [0.1, 0.1, 0.3]).all()
 
 
+def test_the_first_keyframe_is_at_height_zero_wherever_odometry_has_it() -> None:
+    way = street(12.0)
+    store = driven(HOUSES, way)
+    odometry = np.stack([k.T_world_lidar for k in store.keyframes])
+    odometry[:, 2, 3] += 7.0
+    located = locate(extract_of(HOUSES), store, None, config(), None, odometry)
+    assert (located.T_enu_odometry @ odometry[0])[2, 3] == pytest.approx(0.0, abs=1e-9)
+    assert (off(located, way) < [0.1, 0.1, 0.3]).all()
+
+
 def test_on_the_way_back_the_first_match_counts_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """The houses begin 60 m ahead, so the first keyframes are laid on them only from the first match back."""
     ahead = [[(x + 72.0, y) for x, y in ring] for ring in HOUSES]

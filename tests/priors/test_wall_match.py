@@ -192,6 +192,31 @@ def test_equal_gables_shifted_by_one_house_are_bounded_by_the_window_or_refused(
                 assert is_refused or abs(across @ match.pose[:2]) < 0.2
 
 
+def gables(*places: float) -> Floats:
+    return np.array([[[x, 6.0], [x, 14.0]] for x in places])
+
+
+@pytest.mark.parametrize("turn", [0.0, 0.8, 2.5])
+@pytest.mark.parametrize("beside", [2.0, 4.0, 5.5, -2.0, -4.0, -5.5, 10.0, -10.0])
+def test_one_gable_beside_is_a_rival_as_far_as_the_window_goes(beside: float, turn: float) -> None:
+    """The window is 6 m along each axis; what lies beyond it is no answer, on whichever side it is."""
+    known = turned(gables(0.0, beside), (0.0, 0.0, turn))
+    match = match_walls(gables(0.0), known, np.array([0.2, 0.1, turn]), np.array([2.0, 2.0, 0.03]))
+    assert match is not None
+    assert match.is_ambiguous == (abs(beside) < 6.0)
+
+
+@pytest.mark.parametrize("off_by", [-5.0, -3.0, 4.0])
+@pytest.mark.parametrize("gap", [2.5, 4.0, 5.0])
+def test_two_gables_are_laid_on_two_though_one_lies_nearer_the_prior(gap: float, off_by: float) -> None:
+    both = gables(0.0, gap)
+    match = match_walls(both, both, np.array([off_by, 0.1, 0.0]), np.array([2.0, 2.0, 0.03]))
+    assert match is not None
+    assert not match.is_ambiguous
+    assert abs(match.pose[0]) < 0.02
+    assert match.coverage > 0.95
+
+
 def test_a_wall_that_loses_its_partners_in_the_end_is_no_match() -> None:
     wall, beside = (np.array([[[-8.0, y], [8.0, y]]]) for y in (4.0, 5.6))
     between = np.concatenate([wall, beside])
