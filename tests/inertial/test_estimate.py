@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from lslam.geometry import so3
-from lslam.inertial.estimate import ImuEstimate, _propagate
+from lslam.inertial.estimate import FORCE_NOISE, GRAVITY, PLACE_SIGMA, ImuEstimate, _propagate
 from lslam.inertial.gyroscope import Gyroscope
 from lslam.types.imu import ImuStream
 
@@ -37,3 +37,22 @@ def test_errors_travel_as_the_covariance_says(direction: int) -> None:
     moved = x_wrong - x
     assert np.linalg.norm(moved) > 0.05
     np.testing.assert_allclose(P_doubtful - P, np.outer(moved, moved), atol=1e-9)
+
+
+@pytest.mark.parametrize("sigmas", [None, (0.1, 0.2, 0.3)])
+def test_two_places_teach_the_velocity_as_well_as_both_are_known(sigmas: tuple[float, float, float] | None) -> None:
+    """A step of `t` seconds at an unknown velocity: the scalar Kalman filter of displacement and velocity, axis by axis."""
+    t = 0.3
+    stamps = np.arange(0, 300_000_001, 10_000_000)
+    imu = ImuStream(stamps, np.tile([0.0, 0.0, GRAVITY], (31, 1)), np.zeros((31, 3)))
+    covariance = np.diag([1e4] * 3 + [0.0] * 6)
+    before = ImuEstimate(np.zeros(3), np.array([0, 0, -GRAVITY]), np.zeros(3), Gyroscope(np.zeros(3)), covariance)
+    moved = np.array([3.0, -0.6, 0.3])
+    noise = None if sigmas is None else np.diag(np.square(sigmas))
+    step = before.over(imu, stamps[[0, -1]])
+    after = before.corrected(imu, step, np.eye(3), np.eye(3), moved, before.gyroscope, noise)
+    places = 2 * (PLACE_SIGMA**2 + np.square(np.zeros(3) if sigmas is None else sigmas))
+    shared = 1e4 * t + FORCE_NOISE**2 * t**2 / 2
+    gain = shared / (1e4 * t**2 + FORCE_NOISE**2 * t**3 / 3 + places)
+    np.testing.assert_allclose(np.diag(after.covariance)[:3], 1e4 + FORCE_NOISE**2 * t - gain * shared, rtol=1e-6)
+    np.testing.assert_allclose(after.velocity, gain * moved, rtol=1e-6)

@@ -122,6 +122,12 @@ def test_another_study_does_not_go_on_in_the_folder_of_this_one(
     assert ((out / "results.csv").read_bytes(), (out / "study.toml").read_bytes()) == before
 
 
+def test_another_study_may_replace_the_one_in_a_folder(sweep: Sweep, tmp_path: Path) -> None:
+    (tmp_path / "study.toml").write_text('name = "tiny"\n')
+    other = elsewhere(sweep, tmp_path, name="shares")
+    assert expand_study(replace(other, place=replace(other.place, overwrite=True))).name == "shares"
+
+
 def test_what_fails_is_a_row_with_its_reason(sweep: Sweep, tmp_path: Path) -> None:
     """The first scan of the second run lies beyond the recording."""
     partly = elsewhere(sweep, tmp_path / "out", parameters={"input.start": [0, 99]}, beside=[])
