@@ -82,3 +82,5 @@ def test_a_submap_lies_in_the_frame_of_its_keyframe() -> None:
     np.testing.assert_allclose(found, np.tile(se3.apply(se3.inverse(poses[2]), world), (5, 1)), atol=1e-4)
     assert 400 <= len(submap(store, poses, 2, 5, voxel=0.1)) < 600
     np.testing.assert_array_equal(submap(store, poses, 0, 1), store.points(0))
+    in_the_world = submap(store, poses, 2, 5, T_world_frame=np.eye(4))
+    np.testing.assert_allclose(in_the_world, np.tile(world, (5, 1)), atol=1e-4)

@@ -185,6 +185,22 @@ def test_less_planar_points_may_stand_in_and_leave_a_direction_open() -> None:
     assert np.abs(result.T_world_lidar[1:3, 3] - truth[1:3, 3]).max() < 0.01
 
 
+@pytest.mark.parametrize(
+    ("inliers", "before", "after", "is_taken"),
+    [(200, 1, 0, True), (200, 2, 1, True), (200, 1, 1, False), (10, 0, 0, True), (10, 1, 1, True), (10, 0, 1, False)],
+)
+def test_who_stands_in_closes_a_direction_or_opens_none_where_features_are_few(
+    monkeypatch: pytest.MonkeyPatch, inliers: int, before: int, after: int, is_taken: bool
+) -> None:
+    registration = engine(None, True)
+    stand_in = RegistrationResult(se3.exp(np.full(6, 0.1)), degenerate=np.eye(6)[:after])
+    monkeypatch.setattr(registration, "_on_planes", lambda *_: stand_in)
+    starved = RegistrationResult(np.eye(4), degenerate=np.eye(6)[:before], inliers=inliers)
+    result = registration._stand_in(features_at(np.eye(4)), RegistrationResult(np.eye(4)), np.eye(4), starved)
+    assert (result.T_world_lidar is stand_in.T_world_lidar) == is_taken
+    assert ("less planar points stood in" in result.reason) == is_taken
+
+
 def test_what_led_astray_where_nothing_is_observed_is_taken_back_and_nothing_else() -> None:
     """In coordinates whose rotation is scaled by the lever arm, as those of the unobserved directions are."""
     rng, arm = np.random.default_rng(4), 12.0
