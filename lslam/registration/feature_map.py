@@ -41,11 +41,6 @@ class FeatureMap(Stateful):
         self._lines = _lines_for(self.edges)
 
     @property
-    def size(self) -> float:
-        """Edge of a voxel, m."""
-        return self.planes.size
-
-    @property
     def lines(self) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64]]:
         """Rows of `kernels.lines` for the edge voxels, the keys and sums they were computed at; kept up to date by it."""
         if len(self._lines[0]) != len(self.edges.keys):
