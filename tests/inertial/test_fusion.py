@@ -102,11 +102,16 @@ def test_two_seconds_between_scans_are_bridged_too() -> None:
     assert own[:, 1].max() < np.deg2rad(3)
 
 
+def motion_over_a_gap(drive: SimulatedDrive, last_ns: int, next_ns: int) -> InertialMotion:
+    """With an IMU that is silent from `last_ns` to `next_ns`."""
+    imu = stream_of(drive)
+    keep = (imu.stamps_ns < last_ns) | (imu.stamps_ns > next_ns)
+    return motion_of(drive, ImuStream(imu.stamps_ns[keep], imu.accel[keep], imu.gyro[keep]))
+
+
 def test_gaps_fall_back_to_constant_velocity_and_are_counted() -> None:
     drive = walk()
-    imu = stream_of(drive)
-    keep = (imu.stamps_ns < 6_020_000_000) | (imu.stamps_ns > 6_310_000_000)
-    motion = motion_of(drive, ImuStream(imu.stamps_ns[keep], imu.accel[keep], imu.gyro[keep]))
+    motion = motion_over_a_gap(drive, 6_020_000_000, 6_310_000_000)
     own, _ = errors(motion, drive)
     whole, _ = errors(motion_of(drive), drive)
     steady, _ = errors(ConstantVelocity(), drive)
@@ -120,9 +125,7 @@ def test_gaps_fall_back_to_constant_velocity_and_are_counted() -> None:
 def test_scans_that_only_touch_a_gap_are_still_the_imus() -> None:
     """The sweep before lacks its last samples, the step to the scan after its first ones: each less than half of `gap_s`."""
     drive = walk()
-    imu = stream_of(drive)
-    keep = (imu.stamps_ns < 5_985_000_000) | (imu.stamps_ns > 6_275_000_000)
-    motion = motion_of(drive, ImuStream(imu.stamps_ns[keep], imu.accel[keep], imu.gyro[keep]))
+    motion = motion_over_a_gap(drive, 5_985_000_000, 6_275_000_000)
     own, own_sweep = errors(motion, drive)
     whole, _ = errors(motion_of(drive), drive)
     _, steady_sweep = errors(ConstantVelocity(), drive)
