@@ -71,8 +71,8 @@ def execute(job: Job, bench: Bench) -> None:
     except MemoryError:
         reason = "out of memory: use fewer points (preprocess.range_max) or larger voxels (map.voxel)"
     except Exception as error:
-        first, *_ = str(error).strip().splitlines() or [""]
-        reason = f"lslam made a mistake ({type(error).__name__}: {first}){_keep_traceback(job.folder, error)}"
+        what = ": ".join([type(error).__name__, *str(error).strip().splitlines()[:1]])
+        reason = f"lslam made a mistake ({what}){_keep_traceback(job.folder, error)}"
     finally:
         seconds = time.monotonic() - began
         if bench.is_kept and status != "interrupted":  # one of hundreds: nothing asks for its clouds again

@@ -88,3 +88,15 @@ def test_a_log_that_cannot_be_written_is_not_promised(tmp_path: Path, monkeypatc
     state = read_state(job.state_file)
     assert state is not None
     assert state.reason == "lslam made a mistake (RuntimeError: moths)"
+
+
+def test_a_mistake_without_a_word_is_named_all_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def silent(*given: object) -> None:
+        raise AssertionError
+
+    monkeypatch.setattr(worker, "_run", silent)
+    job = job_in(tmp_path)
+    execute(job, Bench())
+    state = read_state(job.state_file)
+    assert state is not None
+    assert state.reason == "lslam made a mistake (AssertionError): its log.txt says where"
