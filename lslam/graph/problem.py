@@ -66,6 +66,20 @@ class PlanarPrior:
 
 
 @dataclass(frozen=True)
+class DriftClaim:
+    """A steady drift that odometry is said to have.
+
+    rates, sigma : (3,) per m, the mean over the way: m along x and y of the world, rad of heading, to the left
+    gain : how much lower minus twice the logarithm of the likelihood is with it; chance : what that stays below by chance
+    """
+
+    rates: Floats
+    sigma: Floats
+    gain: float
+    chance: float
+
+
+@dataclass(frozen=True)
 class PoseGraph:
     """Everything known of K keyframes.
 
@@ -78,6 +92,7 @@ class PoseGraph:
     start_sigma : (3,) x, y (m), yaw (rad), how well these are known of a first pose that is held only otherwise
     is_rigid : odometry is trusted: the whole moves, and nothing bends it
     spread : (K, 6, 6) what poses are unsure by beside all that, as the covariances of `Solution`; None for nothing
+    claim : the steady drift that odometry was set right by before it came here
     """
 
     poses: Floats
@@ -96,6 +111,7 @@ class PoseGraph:
     start_sigma: Floats | None = None
     is_rigid: bool = False
     spread: Floats | None = None
+    claim: DriftClaim | None = None
 
     def __len__(self) -> int:
         return len(self.poses)

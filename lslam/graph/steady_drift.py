@@ -16,7 +16,7 @@ from lslam.config.graph import GraphConfig
 from lslam.geometry import se3, so3
 from lslam.graph.chi_square import quantile
 from lslam.graph.factors import PLANAR
-from lslam.graph.problem import PoseGraph
+from lslam.graph.problem import DriftClaim, PoseGraph
 
 Floats = NDArray[np.float64]
 
@@ -54,13 +54,19 @@ class SteadyDrift:
 
     rates : (K-1, 3) per m of the way from each keyframe to the next: m along x and y of the world, rad of heading
     spread : (K, 6, 6) by how much each pose is unsure for that the rates are, as the covariances of `Solution`
-    is_sure : chance does not explain as much; is_settled : the rates are well below what they are unsure by
+    claim : the drift that these rates take out
+    is_settled : the rates are well below what they are unsure by
     """
 
     rates: Floats
     spread: Floats
-    is_sure: bool
+    claim: DriftClaim
     is_settled: bool
+
+    @property
+    def is_sure(self) -> bool:
+        """Whether chance does not explain as much."""
+        return self.claim.gain > self.claim.chance
 
 
 def find_steady_drift(
@@ -88,12 +94,16 @@ def find_steady_drift(
     fit.count_less(seen.share)
     _, covariance = fit.rates(scale, size)
     gain = min(fit.unlikeliness(s, 0.0) for s in SCALES) - fit.unlikeliness(scale, size)
+    hats, share = _hats(graph.distances), np.diff(graph.distances) / np.ptp(graph.distances)
+    rates = hats @ found.reshape(-1, 3)
+    mean = np.kron(share @ hats, np.eye(3))
+    sigma = np.sqrt(np.diag(mean @ covariance @ mean.T))
     moves = effects[:, :, 5:]
     spread = np.zeros((len(graph), 6, 6))
     spread[:, np.array(PLANAR)[:, None], PLANAR] = moves @ covariance @ np.swapaxes(moves, -1, -2)
     return SteadyDrift(
-        np.asarray(_hats(graph.distances) @ found.reshape(-1, 3)), spread,
-        is_sure=gain > quantile(config.probability, fit.count),
+        np.asarray(rates), spread,
+        DriftClaim(-(mean @ found), sigma, gain, quantile(config.probability, fit.count)),
         is_settled=float(found @ np.linalg.solve(covariance, found)) <= SETTLED * fit.count,
     )  # fmt: skip
 

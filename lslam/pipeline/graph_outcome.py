@@ -16,7 +16,7 @@ from lslam.graph.drift import tilt_factor
 from lslam.graph.factors import well_conditioned
 from lslam.graph.odometry import corrected
 from lslam.graph.pose_graph import optimise
-from lslam.graph.problem import PoseGraph, Solution
+from lslam.graph.problem import DriftClaim, PoseGraph, Solution
 from lslam.keyframes.store import KeyframeStore
 from lslam.types.building_correction import CorrectedMap
 from lslam.types.building_match import OsmMatches
@@ -176,4 +176,13 @@ def _facts(
         "drift_factor": round(solution.drift, 4),
         "rounds": solution.rounds,
         "largest_correction_m": round(float(np.linalg.norm(moved, axis=1).max()), 4),
+        **({} if graph.claim is None else {"steady_drift": _claimed(graph.claim)}),
     }
+
+
+def _claimed(claim: DriftClaim) -> dict[str, Any]:
+    names, units = ("east_percent", "north_percent", "left_deg_per_100m"), 100.0 * np.array([1.0, 1.0, np.degrees(1.0)])
+    return {
+        name: {"estimate": round(float(rate), 4), "sigma": round(float(sigma), 4)}
+        for name, rate, sigma in zip(names, units * claim.rates, units * claim.sigma, strict=True)
+    } | {"log_likelihood_gain": round(0.5 * claim.gain, 1), "gain_by_chance": round(0.5 * claim.chance, 1)}

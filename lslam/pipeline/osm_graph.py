@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from lslam.config import Config
 from lslam.formats.osm_buildings import BuildingExtract
 from lslam.geometry import se2, se3
-from lslam.graph.problem import PoseGraph
+from lslam.graph.problem import DriftClaim, PoseGraph
 from lslam.graph.steady_drift import WallSightings, find_steady_drift, without_drift
 from lslam.keyframes.store import KeyframeStore
 from lslam.pipeline.osm_pass import Located, locate
@@ -41,25 +41,26 @@ def find_on_map(
     held = on_map(graph, located, config)
     if located.problem or config.osm.matcher != "walls" or held.is_rigid:
         return located, held
-    rates = np.zeros((len(graph) - 1, 3))
-    for last in range(ROUNDS):
+    claim: DriftClaim | None = None
+    for _ in range(ROUNDS):
         seen = sightings(located, held.poses, config)
         drift = find_steady_drift(held, seen, config.osm.wall_sigma, config.osm.building_sigma, config.graph)
-        if drift is None or not (drift.is_sure or last):
+        if drift is None or not (drift.is_sure or claim):
             break
-        rates += drift.rates
-        held = replace(without_drift(held, drift.rates), spread=drift.spread)
+        # What is found at first is claimed; what is left of it then makes the claim better and not likelier.
+        rates = drift.claim.rates if claim is None else claim.rates + drift.claim.rates
+        claim = replace(claim or drift.claim, rates=rates, sigma=drift.claim.sigma)
+        held = replace(without_drift(held, drift.rates), spread=drift.spread, claim=claim)
         odometry = se3.inverse(located.T_enu_odometry) @ held.poses
         again = None if drift.is_settled else locate(extract, store, up, config, placed, odometry)
         if again is None or again.problem:
             break
         located = again
         held = on_map(replace(held, poses=odometry), located, config)
-    if rates.any():
-        percent, degrees = 100 * np.linalg.norm(rates[:, :2], axis=1), np.degrees(rates[:, 2]) * 100
+    if claim is not None:
         log.info(
             "OSM: odometry drifts steadily by %.1f %% and %.1f deg/100 m, and is set straight",
-            percent.mean(), -degrees.mean(),
+            100 * np.linalg.norm(claim.rates[:2]), 100 * np.degrees(claim.rates[2]),
         )  # fmt: skip
     return located, held
 

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from lslam.geometry import se3
 from lslam.reports import svg
+from lslam.reports.buildings import drift_tables
 from lslam.reports.loop_view import loop_figures
 from lslam.reports.metrics import counted, metres
 from lslam.reports.plane import Track, plane_chart
@@ -49,6 +50,13 @@ def back_end_rows(record: RunRecord, evaluation: Evaluation | None) -> list[tupl
             f"{len(record.osm.accepted)} of {len(record.osm.keyframes)} keyframes held by {len(record.osm.buildings)} buildings, "
             f"which lie {east:+.2f} m east and {north:+.2f} m north of the run (sigma {sigma:.2f} m)",
         ))  # fmt: skip
+    rows += [
+        (
+            "steady drift",
+            "; ".join(f"{word} {estimate} ± {sigma}" for word, estimate, sigma in table.rows) + ", set right",
+        )
+        for table in drift_tables(record)
+    ]
     if record.buildings is not None:
         found = record.buildings
         moves = [float(np.linalg.norm(c.displacement[:2])) for c in found.buildings if c.status == "seen"]

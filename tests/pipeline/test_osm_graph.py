@@ -84,6 +84,12 @@ def test_a_drift_is_taken_out_by_a_map_that_errs(seed: int, caplog: pytest.LogCa
     moved = done.keyframes[:, :3, 3] - (located.T_enu_odometry @ before.poses)[:, :3, 3]
     assert done.facts["largest_correction_m"] == pytest.approx(np.linalg.norm(moved, axis=1).max(), abs=1e-4)
     assert done.facts["largest_correction_m"] > 2 * wrong
+    # And the drift itself, each rate within what it is unsure by.
+    told = done.facts["steady_drift"]
+    for name, real in (("east_percent", 0.0), ("north_percent", 4.0), ("left_deg_per_100m", 3.0)):
+        assert 0.0 < told[name]["sigma"] < 0.5
+        assert abs(told[name]["estimate"] - real) < 4.0 * told[name]["sigma"], name
+    assert told["log_likelihood_gain"] > told["gain_by_chance"] > 5.0
 
 
 @pytest.mark.parametrize("size", [0.0, 0.5])
@@ -93,6 +99,7 @@ def test_a_run_that_does_not_drift_stays_as_it_is(size: float) -> None:
     located, held = laid(store, drawn_wrong(3, size))
     assert not located.problem
     assert held.spread is None
+    assert held.claim is None
     given = graph_of(store)
     np.testing.assert_array_equal([c.T_a_b for c in held.odometry], [c.T_a_b for c in given.odometry])
     np.testing.assert_allclose(held.poses, located.T_enu_odometry @ given.poses, atol=1e-12)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.reports.back_end import back_end_rows
-from lslam.reports.buildings import MOST_ROWS, building_figures, building_tables
+from lslam.reports.buildings import MOST_ROWS, building_figures, building_pages, building_tables
 from lslam.types.building import Building, Footprint
 from lslam.types.building_correction import BuildingCorrection, CorrectedMap
 from lslam.types.building_match import BuildingMatch, KeyframeMatch, OsmMatches
@@ -106,6 +106,32 @@ def test_an_empty_map_draws_the_way() -> None:
     moves, verdicts = building_tables(found, nothing)
     assert moves.rows == verdicts.rows == ()
     assert matches.accepted
+
+
+def test_a_drift_that_was_set_right_is_told_with_how_sure_it_is(make_record: Callable[..., RunRecord]) -> None:
+    found, matches, poses = scene()
+    record = make_record(len(poses), buildings=found, osm=matches)
+    record.keyframe_scans = np.arange(len(poses))
+    pages = building_pages(record)
+    assert pages is not None
+    assert "Steady drift of odometry" not in [table.title for table in pages.tables]
+    assert "steady drift" not in dict(back_end_rows(record, None))
+    claim = {
+        "east_percent": {"estimate": -2.4, "sigma": 0.1234}, "north_percent": {"estimate": 3.2, "sigma": 0.2},
+        "left_deg_per_100m": {"estimate": 1.5, "sigma": 0.03}, "log_likelihood_gain": 61.25, "gain_by_chance": 13.9,
+    }  # fmt: skip
+    record.manifest = {"graph": {"steady_drift": claim}}
+    pages = building_pages(record)
+    assert pages is not None
+    (table,) = [table for table in pages.tables if table.title == "Steady drift of odometry"]
+    assert table.rows == (
+        ("to the east, %", "-2.400", "0.123"), ("to the north, %", "+3.200", "0.200"),
+        ("turn to the left, deg/100 m", "+1.500", "0.030"),
+    )  # fmt: skip
+    assert "higher by 61.2; chance stays below 13.9" in table.recipe
+    said = dict(back_end_rows(record, None))["steady drift"]
+    assert said.startswith("to the east, % -2.400 ± 0.123; ")
+    assert said.endswith("+1.500 ± 0.030, set right")
 
 
 def test_the_summary_counts_buildings(make_record: Callable[..., RunRecord]) -> None:
