@@ -47,13 +47,17 @@ class BatchConfig(Section):
 
 def read_batch(path: Path) -> BatchConfig:
     """The batch of a file. Raises InputError when it cannot be read, ConfigError naming the key and the nearest known one."""
-    tree = read_toml(path, "batch")
-    check_keys(tree, BatchConfig, str(path))
+    return parse_batch(read_toml(path, "batch"), str(path))
+
+
+def parse_batch(tree: dict[str, Any], where: str) -> BatchConfig:
+    """The batch of a TOML tree found in `where`; raises ConfigError as `read_batch`."""
+    check_keys(tree, BatchConfig, where)
     jobs = tree.get("jobs")
     for job in jobs if isinstance(jobs, list) else []:
         if isinstance(job, dict):
-            check_keys(job, BatchJob, f"{path}: jobs")
+            check_keys(job, BatchJob, f"{where}: jobs")
     try:
         return BatchConfig.model_validate(tree)
     except ValidationError as error:
-        raise ConfigError(explain(error, str(path))) from None
+        raise ConfigError(explain(error, where)) from None

@@ -12,10 +12,10 @@ from typing import Any
 import tomli_w
 
 from lslam.config import Config
-from lslam.config.batch import BatchConfig
+from lslam.config.batch import BatchConfig, parse_batch
 from lslam.errors import UsageError
 from lslam.pipeline.identity import imu_digest, input_digest, job_digest
-from lslam.studies.expanded import Expanded, Place, cells_of
+from lslam.studies.expanded import Expanded, Place, cells_of, check_same
 from lslam.studies.grid import Job, expand, run_folder
 from lslam.studies.points import Contender, free_name, settings_of
 from lslam.studies.subjects import file_safe
@@ -44,8 +44,11 @@ class Line:
 def expand_batch(batch: BatchConfig, place: Place, settings: Sequence[str] = ()) -> Expanded:
     """All runs of a batch file; `settings` ("a.b=v") beat what it says.
 
-    Raises ConfigError, UsageError or InputError for methods, recordings and scenarios that make no sense.
+    Raises ConfigError, UsageError or InputError for methods, recordings and scenarios that make no sense; OutputExistsError
+    when it is to go on in the folder of another list.
     """
+    text = tomli_w.dumps(batch.model_dump(mode="json", exclude_none=True, exclude_defaults=True))
+    check_same(place, MARK, "batch", text, _names)
     jobs: list[Job] = []
     found: dict[str, Contender] = {}
     taken: set[str] = set()
@@ -60,15 +63,17 @@ def expand_batch(batch: BatchConfig, place: Place, settings: Sequence[str] = ())
             found[name] = Contender(variants[-1], method, {})
         cells = cells_of(entry.sequences, entry.seeds, [found[v.name] for v in variants], place)
         jobs += expand(cells, variants, entry.seeds, place.out, place.command)
-    text = tomli_w.dumps(batch.model_dump(mode="json", exclude_none=True, exclude_defaults=True))
     return Expanded("batch", "batch", MARK, text, jobs, found)
 
 
 def expand_lines(lines: Sequence[Line], place: Place) -> Expanded:
     """All runs of a list of lines; those without a folder of their own are numbered in `place.out`.
 
-    Raises InputError for a recording that cannot be listed, UsageError for two lines that name one folder.
+    Raises InputError for a recording that cannot be listed, UsageError for two lines that name one folder, OutputExistsError
+    when they are to go on in the folder of a list that has none of them.
     """
+    text = tomli_w.dumps({"lines": [line.words for line in lines]})
+    check_same(place, MARK, "batch", text, _names)
     jobs: list[Job] = []
     found: dict[str, Contender] = {}
     owners: dict[Path, int] = {}
@@ -95,8 +100,19 @@ def expand_lines(lines: Sequence[Line], place: Place) -> Expanded:
                 place.data_root, reading=line.reading,
             )
         )  # fmt: skip
-    text = tomli_w.dumps({"lines": [line.words for line in lines]})
     return Expanded("batch", "batch", MARK, text, jobs, found)
+
+
+def _names(tree: dict[str, Any]) -> list[str]:
+    """What the content of MARK goes by: its lines, or each recording and scenario of its jobs with each method."""
+    if "lines" in tree:
+        return [str(line) for line in tree["lines"]]
+    return [
+        f"{sequence.path or sequence.scenario} {method}"
+        for job in parse_batch(tree, MARK).jobs
+        for sequence in job.sequences
+        for method in job.methods
+    ]
 
 
 def run_words(text: str) -> list[tuple[int, list[str]]]:

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import tomllib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
+from lslam.config.preset_files import read_toml
 from lslam.config.study import StudySequence
 from lslam.errors import InterruptedRunError, LslamError, OutputExistsError
 from lslam.formats.atomic import atomic_write
@@ -53,6 +56,24 @@ class Expanded:
     text: str
     jobs: list[Job] = field(default_factory=list)
     contenders: dict[str, Contender] = field(default_factory=dict)
+
+
+def check_same(
+    place: Place, mark: str, what: str, text: str, names_of: Callable[[dict[str, Any]], Sequence[str]]
+) -> None:
+    """What changed since reuses its runs by digest; rows of two studies or batches in one table are of no use to either.
+
+    text : for the file `mark`; names_of : what its content goes by, the same if what is there and `text` share a name
+    Raises OutputExistsError when it is to go on in the folder of another one; ConfigError for a damaged `mark`.
+    """
+    if not place.resume or not (place.out / mark).is_file():
+        return
+    theirs, ours = names_of(read_toml(place.out / mark, what)), names_of(tomllib.loads(text))
+    if not set(theirs) & set(ours):
+        raise OutputExistsError(
+            f"output folder {place.out} holds {what} {theirs[0]!r} and --resume would go on in it with {what} {ours[0]!r}: "
+            "name another folder with --out"
+        )
 
 
 def left_to_do(place: Place, jobs: Sequence[Job]) -> list[Job]:

@@ -7,11 +7,10 @@ from dataclasses import dataclass
 
 import tomli_w
 
-from lslam.config.preset_files import read_toml
 from lslam.config.study import StudyConfig
-from lslam.errors import OutputExistsError, RunFailedError
+from lslam.errors import RunFailedError
 from lslam.studies.engines import Engine
-from lslam.studies.expanded import Expanded, Place, cells_of, make_runs
+from lslam.studies.expanded import Expanded, Place, cells_of, check_same, make_runs
 from lslam.studies.grid import expand
 from lslam.studies.plan import Follow
 from lslam.studies.points import contenders
@@ -37,11 +36,11 @@ def expand_study(sweep: Sweep) -> Expanded:
     OutputExistsError when it is to go on in the folder of another study.
     """
     study, place = sweep.study, sweep.place
-    _check_same(study, place)
+    text = tomli_w.dumps(study.model_dump(mode="json", exclude_none=True, exclude_defaults=True))
+    check_same(place, MARK, "study", text, lambda tree: [str(tree.get("name"))])
     found = contenders(study, sweep.settings)
     cells = cells_of(study.sequences, study.seeds, found, place)
     jobs = expand(cells, [c.variant for c in found], study.seeds, place.out, place.command)
-    text = tomli_w.dumps(study.model_dump(mode="json", exclude_none=True, exclude_defaults=True))
     return Expanded(study.name, "study", MARK, text, jobs, {c.variant.name: c for c in found})
 
 
@@ -59,15 +58,3 @@ def run_sweep(
     if rows and not any(row.is_usable for row in rows):
         raise RunFailedError(f"all {len(rows)} runs failed, the first one: {rows[0].reason}")
     return rows
-
-
-def _check_same(study: StudyConfig, place: Place) -> None:
-    """A study that changed reuses its runs by digest; rows of two studies in one table are of no use to either."""
-    if not place.resume or not (place.out / MARK).is_file():
-        return
-    theirs = read_toml(place.out / MARK, "study").get("name")
-    if theirs != study.name:
-        raise OutputExistsError(
-            f"output folder {place.out} holds study {theirs!r} and --resume would go on in it with study {study.name!r}: "
-            "name another folder with --out"
-        )

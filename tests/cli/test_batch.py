@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 import shlex
 import subprocess
 import sys
@@ -13,7 +14,7 @@ from calling import COMMAND, Done, assert_one_sentence, environment, lslam, samp
 
 from lslam.cli.batch import _line, command
 from lslam.config.batch import BatchConfig
-from lslam.errors import LslamError
+from lslam.errors import ConfigError, LslamError, OutputExistsError
 from lslam.formats.study_csv import read_study_csv
 from lslam.studies.batch import expand_batch, run_words
 from lslam.studies.expanded import Place
@@ -72,6 +73,41 @@ def test_every_job_of_a_file_is_a_run_and_a_row_and_is_kept(sample: Path, tmp_pa
     assert again.returncode == 0, again.stderr
     assert again.stdout == done.stdout
     assert [repr(row) for row in read_study_csv(out / "results.csv")] == [repr(row) for row in rows]
+
+
+@pytest.mark.parametrize(
+    "held", ["[[jobs]]\nsequences = ['street']\nmethods = ['icp']\n", "lines = ['street --imu']\n"]
+)
+def test_another_list_does_not_go_on_in_the_folder_of_this_one(
+    held: str, sample: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nor is it listed there by --dry-run; a list that has one run in common with what is there is the same, grown."""
+    monkeypatch.setattr("lslam.cli.batch.setup_logging", lambda *_: None)
+    file, mark = tmp_path / "jobs.toml", tmp_path / "out" / "batch.toml"
+    file.write_text(JOBS.replace("SAMPLE", str(sample)))
+    mark.parent.mkdir()
+    mark.write_text(held)
+    words = ["--out", str(mark.parent), "--resume", "--dry-run"]
+    theirs = held.split("'")[1] + (" icp" if "jobs" in held else "")
+    for source, ours in (([str(file)], f"{sample} icp"), (["-"], f"{sample} --count 2")):
+        monkeypatch.setattr(sys, "stdin", io.StringIO(f"lslam run {sample} --count 2"))
+        said = (
+            f"holds batch {theirs!r} and --resume would go on in it with batch {ours!r}: name another folder with --out"
+        )
+        with pytest.raises(OutputExistsError, match=re.escape(said)):
+            command.main([*source, *words], standalone_mode=False)
+        assert mark.read_text() == held
+    for grown, source in ((f"lines = ['{sample} --count 2', 'street']", "-"), (file.read_text(), str(file))):
+        mark.write_text(grown)
+        monkeypatch.setattr(sys, "stdin", io.StringIO(f"{sample}\nlslam run {sample} --count 2"))
+        command.main([source, *words], standalone_mode=False)
+
+
+def test_a_folder_whose_list_is_damaged_is_named(sample: Path, tmp_path: Path) -> None:
+    (tmp_path / "batch.toml").write_text("[[jobs]]\nsequence = ['street']\n")
+    batch = BatchConfig.model_validate({"jobs": [{"sequences": [str(sample)]}]})
+    with pytest.raises(ConfigError, match=r"batch\.toml: jobs: unknown key 'sequence'; did you mean 'sequences'"):
+        expand_batch(batch, Place(tmp_path, resume=True))
 
 
 def test_lines_are_understood_as_lslam_run_does_and_a_failure_is_exit_1(sample: Path, tmp_path: Path) -> None:
