@@ -128,7 +128,7 @@ def test_a_drift_that_was_set_right_is_told_with_how_sure_it_is(make_record: Cal
         ("to the east, %", "-2.400", "0.123"), ("to the north, %", "+3.200", "0.200"),
         ("turn to the left, deg/100 m", "+1.500", "0.030"),
     )  # fmt: skip
-    assert "higher by 61.2; chance stays below 13.9" in table.recipe
+    assert "higher with the drift by 61.2; chance stays below 13.9." in table.recipe
     said = dict(back_end_rows(record, None))["steady drift"]
     assert said.startswith("to the east, % -2.400 ± 0.123; ")
     assert said.endswith("+1.500 ± 0.030, set right")
