@@ -19,8 +19,6 @@ OFFSETS = tuple(range(3, 26))
 MARGIN, SLOPE = 0.15, 0.01
 # Share of that by which ground seen at a point's range may lie above or below it and still be it.
 STEP = 0.3
-# Votes that a point is free, against each that something was there.
-FREE_PER_HIT = 1.0
 # Where this share of the points in a cube of so many m moves, the rest of them moves, too, ...
 CUBE, SHARE = 0.5, 0.3
 # ... and where this share of a thing does, and so many points, all of it: few beams seldom look through where one was.
@@ -93,7 +91,7 @@ class Cleaner:
             self._grid = _grid_of(points)
         T, upright = scan.T_world_lidar, _upright(scan)
         floor = floor_of(upright, T[:3, 3])
-        image = np.full((1, 1, 2), np.inf, np.float32)
+        image = np.full((1, 1, 3), np.inf, np.float32)
         if self._grid is not None:
             g = self._grid
             stands = standing(upright, T[:3, 3], [floor])
@@ -146,9 +144,9 @@ class Cleaner:
         stands = standing(upright, scan.T_world_lidar[:3, 3], floors)
         points, upright = scan.points[stands], upright[stands]
         free, hit = self._votes(points, scan.T_world_lidar, others)
-        moving = spread((free >= 1) & (free >= FREE_PER_HIT * hit), points)
+        moving = spread((free >= 1) & (free >= hit), points)
         # Somebody beside a wall is a thing once the wall, which others saw, is left aside; then the feet join.
-        moving = whole(moving, things_of(upright, moving | (hit <= free)), MOST_LEFT, LEAST_LEFT)
+        moving = whole(moving, things_of(upright, moving | (free >= hit)), MOST_LEFT, LEAST_LEFT)
         moving = whole(moving, things_of(upright, np.ones(len(points), np.bool_)), MOST, LEAST)
         moves = np.zeros(len(stands), np.bool_)
         moves[stands] = moving
@@ -157,15 +155,18 @@ class Cleaner:
     def _votes(
         self, points: NDArray[np.float32], T_world_lidar: NDArray[np.float64], others: list[_Look]
     ) -> tuple[NDArray[np.int16], NDArray[np.int16]]:
-        """Of how many of the `others` each point (N, 3) was looked through, and by how many something was seen there."""
+        """Of how many of the `others` each point (N, 3) was looked through, and by how many something was seen there.
+
+        Where the latter are more, both are counted only until they are so for certain.
+        """
         from lslam.kernels.see_through import vote
 
         free, hit = np.zeros(len(points), np.int16), np.zeros(len(points), np.int16)
         if self._grid is not None:
             low, inverse = self._grid.low, 1 / self._grid.size
-            for look in others:
-                T = se3.relative(look.T_world_lidar, T_world_lidar)
-                vote(points, T, look.image, low, inverse, MARGIN, SLOPE, STEP, free, hit)
+            poses = np.array([look.T_world_lidar for look in others]).reshape(-1, 4, 4)
+            for k, (look, T) in enumerate(zip(others, se3.relative(poses, T_world_lidar), strict=True)):
+                vote(points, T, look.image, low, inverse, MARGIN, SLOPE, STEP, len(others) - k, free, hit)
         return free, hit
 
 
