@@ -13,4 +13,10 @@ class KeyframesConfig(Section):
     distance: float = Field(2.0, gt=0, description="m travelled since the last keyframe")
     angle_deg: float = Field(15.0, gt=0, description="deg turned since the last keyframe")
     voxel: float = Field(0.3, ge=0.05, description="m; one averaged point per voxel is kept of a keyframe's scan")
+    deflate: int = Field(
+        1,
+        ge=0,
+        le=9,
+        description="how much the clouds on disk are packed: 0 not at all, quickest, twice the size; 9 most",
+    )
     submap_size: int = Field(5, ge=1, description="keyframes whose clouds make one submap, about the one in the middle")

@@ -28,7 +28,8 @@ class KeyframeStore:
     The folder holds `index.npz`, everything but the clouds, once `save` was called, and `000000.npz`, `000001.npz`, ...
     for the clouds. A folder that has an index is opened with what it holds. Several threads may ask for points.
 
-    folder : created when the first cloud is added; None keeps the compressed clouds in memory
+    folder : created when the first cloud is added; None keeps the packed clouds in memory
+    deflate : how much clouds are packed, from 0, not at all, to 9
 
     Raises InputError for an index or a cloud that is damaged or missing, OutputError for what cannot be written.
 
@@ -38,11 +39,11 @@ class KeyframeStore:
     (1, [[1.0, 1.0, 1.0], [1.0, 1.0, 1.0]])
     """
 
-    def __init__(self, folder: Path | None = None, cached: int = CACHED) -> None:
+    def __init__(self, folder: Path | None = None, cached: int = CACHED, deflate: int = 1) -> None:
         self.folder = folder
         self.keyframes: list[Keyframe] = []
         self._memory: dict[int, bytes] = {}
-        self._cached = cached
+        self._cached, self._deflate = cached, deflate
         self._recent: OrderedDict[int, Points] = OrderedDict()
         self._lock = threading.Lock()
         if folder is not None and (folder / INDEX).exists():
@@ -61,11 +62,11 @@ class KeyframeStore:
         planes = np.ascontiguousarray(cloud.T).view(np.uint8).reshape(3, len(cloud), 4).transpose(2, 0, 1)
         if self.folder is None:
             stream = io.BytesIO()
-            pack_npz(stream, {"planes": planes})
+            pack_npz(stream, {"planes": planes}, self._deflate)
             self._memory[keyframe.number] = stream.getvalue()
         else:
             _make(self.folder)
-            write_npz(self._path(keyframe.number), {"planes": planes})
+            write_npz(self._path(keyframe.number), {"planes": planes}, self._deflate)
         self.keyframes.append(keyframe)
         self._keep(keyframe.number, cloud)
 

@@ -21,7 +21,7 @@ from lslam.types.trajectory import Trajectory
 from lslam.version import __version__
 
 # Keys that change no byte of the result.
-FREE = ("input.threads", "odometry.checkpoint_s")
+FREE = ("input.threads", "odometry.checkpoint_s", "keyframes.deflate")
 
 
 def run_identity(

@@ -80,7 +80,7 @@ def run(
     job = _prepare(sequence, config, ground_truth, command, watch)
     job.manifest.reading = dict(reading or {})
     if out is None:
-        record, _, evaluation = _solve(job, KeyframeStore())
+        record, _, evaluation = _solve(job, KeyframeStore(deflate=config.keyframes.deflate))
     else:
         job.manifest.identity = run_identity(job.sequence, job.truth, config, job.given)
         goes_on = resume and may_go_on(Path(out), job.manifest.identity, config)
@@ -152,7 +152,7 @@ def _fill(folder: RunFolder, job: _Job, goes_on: bool) -> tuple[RunRecord, Evalu
     folder.require_space(outputs.least_bytes(len(job.sequence)), "the result without its map")
     folder.write_text("config.toml", outputs.config_text(job.config))
     folder.write_manifest(job.manifest.as_dict("running"))
-    store = KeyframeStore(folder.path / KEYFRAMES)
+    store = KeyframeStore(folder.path / KEYFRAMES, deflate=job.config.keyframes.deflate)
     checkpoints = odometry_checkpoints(folder, job.odometry, job.config, goes_on)
     record, done, evaluation = _solve(job, store, folder.path, checkpoints)
     write_back_end(folder.path, record, store, done)

@@ -12,7 +12,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.config.input import InputConfig
 from lslam.errors import RunFailedError
 from lslam.readers import open_sequence
 from lslam.studies.engines import Local
@@ -21,6 +20,7 @@ from lslam.studies.plan import Follow
 from lslam.studies.points import Contender
 from lslam.studies.scenes import drive_of, simulate_once
 from lslam.studies.states import FINAL, read_state
+from lslam.studies.subjects import used
 
 Floats = NDArray[np.float64]
 # Scans of the shorter and the longer pilot: what they differ by is what scans cost, the rest what a run costs by itself.
@@ -98,16 +98,6 @@ def estimate(
     # One simulation already keeps two cores busy.
     simulation_s /= max(1, at_once // 2)
     return Guess(_START_S + simulation_s + warming_s + seconds / at_once, pilots)
-
-
-def used(scans: int, config: InputConfig) -> int:
-    """Scans of a recording that a run uses.
-
-    >>> used(20, InputConfig(start=1, skip_frames=4)), used(20, InputConfig(count=3))
-    (5, 3)
-    """
-    left = len(range(config.start, scans, config.skip_frames))
-    return left if config.count is None else min(left, config.count)
 
 
 def _groups(jobs: Sequence[Job], contenders: dict[str, Contender]) -> list[list[Job]]:

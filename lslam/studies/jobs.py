@@ -13,9 +13,12 @@ from lslam.studies.grid import Job
 from lslam.studies.plan import Follow
 from lslam.studies.runner import Crew, Task, run_tasks
 from lslam.studies.states import State, is_reusable, read_state, write_state
+from lslam.studies.subjects import used
 from lslam.studies.worker import Bench, execute
 
 log = logging.getLogger("lslam")
+# Scans of a recording, when only the order of its runs by length matters.
+_MANY = 10**6
 
 
 def finished(jobs: Sequence[Job]) -> set[Path]:
@@ -44,7 +47,8 @@ def run_jobs(
 ) -> None:
     """Run jobs in processes beside this one; on_done(job) is called here once per job, when its state is there.
 
-    Every job then has a state file; one whose process died is `crashed`. KeyboardInterrupt ends all that run.
+    Several at once begin with those that use most scans. Every job then has a state file; one whose process died is
+    `crashed`. KeyboardInterrupt ends all that run.
     """
     if not jobs:
         return
@@ -52,7 +56,12 @@ def run_jobs(
     bench = Bench(crew.at_once, load, crew.at_once == 1 or crew.is_kept, crew.is_kept)
     for job in jobs:
         make_room(job)
-    tasks = [Task(job.name, partial(work, job, bench), job.folder.with_name(f"{job.folder.name}.out")) for job in jobs]
+    if crew.at_once > 1:  # a long one begun last would keep one process busy while the others have no more to do
+        jobs = sorted(jobs, key=lambda job: used(_MANY, job.config.input), reverse=True)
+    tasks = [
+        Task(job.name, partial(work, job, bench), job.folder.with_name(f"{job.folder.name}.out"), str(job.path))
+        for job in jobs
+    ]
 
     def on_end(index: int, cause: str) -> None:
         settle(jobs[index], cause, bench)

@@ -13,8 +13,11 @@ from lslam.errors import ConfigError, UsageError
 from lslam.studies.subjects import file_safe
 from lslam.studies.variants import WITH_IMU, Variant, find_variants
 
-# One thread: a run then keeps one core busy, as many go at once as there are cores, and times mean the same.
-_ALWAYS = ("input.threads=1", "map.write=false", "map.write_features=false", "report.html=false")
+# One thread: a run then keeps one core busy, as many go at once as there are cores, and times mean the same. Keyframes go
+# with the run that made them, so they are not packed.
+_ALWAYS = (
+    "input.threads=1", "keyframes.deflate=0", "map.write=false", "map.write_features=false", "report.html=false",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -8,9 +8,8 @@ import os
 import signal
 import sys
 import threading
-from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from multiprocessing import connection, get_context, parent_process
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
@@ -22,11 +21,15 @@ _PATIENCE_S = 20.0
 
 @dataclass(frozen=True)
 class Task:
-    """work : called without arguments in the process, so it must be picklable; said : file for what the process prints."""
+    """work : called without arguments in the process, so it must be picklable; said : file for what the process prints.
+
+    data : what it reads, empty when a process that did something before is as good as a new one
+    """
 
     name: str
     work: Callable[[], object]
     said: Path
+    data: str = ""
 
 
 @dataclass(frozen=True)
@@ -48,6 +51,7 @@ class _Worker:
     process: BaseProcess
     pipe: Connection
     index: int = -1
+    has_read: set[str] = field(default_factory=set)
 
 
 def run_tasks(
@@ -55,20 +59,24 @@ def run_tasks(
 ) -> None:
     """Run every task; on_start(index) and, once per task, on_end(index, how its process died or "") are called here.
 
+    They begin in order, but for a process that goes on with what it has read as long as there is such a task.
     Processes are spawned, not forked: a fork of a process whose kernels have run is a process that may hang. An exception,
     KeyboardInterrupt included, ends those that run, politely first.
     """
-    waiting = deque((index, 1) for index in range(len(tasks)))
+    waiting = [(index, 1) for index in range(len(tasks))]
     tries: dict[int, int] = {}
     idle: list[_Worker] = []
     busy: list[_Worker] = []
     try:
         while waiting or busy:
             while waiting and len(busy) < crew.at_once:
-                index, tries[index] = waiting.popleft()
+                worker = idle.pop() if idle else None
+                data = [tasks[index].data for index, _ in waiting]
+                index, tries[index] = waiting.pop(_choice(data, worker, [*busy, *idle]))
                 on_start(index)
-                worker = idle.pop() if idle else _hire(crew)
+                worker = worker or _hire(crew)
                 worker.index = index
+                worker.has_read.add(tasks[index].data)
                 busy.append(worker)
                 with contextlib.suppress(OSError):  # it died while it was idle: its pipe says so below
                     worker.pipe.send(tasks[index])
@@ -85,6 +93,14 @@ def run_tasks(
                     on_end(worker.index, cause or "")
     finally:
         _end([worker.process for worker in [*busy, *idle]])
+
+
+def _choice(data: Sequence[str], worker: _Worker | None, others: Sequence[_Worker]) -> int:
+    """Which of the waiting tasks, by what they read: one whose data the worker has, else nobody, else the first."""
+    own = set() if worker is None else worker.has_read
+    of_others = {name for other in others for name in other.has_read}
+    wanted = (name in own for name in data), (name not in of_others for name in data)
+    return next((k for marks in wanted for k, is_wanted in enumerate(marks) if is_wanted), 0)
 
 
 def _hire(crew: Crew) -> _Worker:

@@ -84,6 +84,16 @@ def _with_unique_labels(subjects: list[Subject]) -> list[Subject]:
     return out
 
 
+def used(scans: int, config: InputConfig) -> int:
+    """Scans of a recording that a run uses.
+
+    >>> used(20, InputConfig(start=1, skip_frames=4)), used(20, InputConfig(count=3))
+    (5, 3)
+    """
+    left = len(range(config.start, scans, config.skip_frames))
+    return left if config.count is None else min(left, config.count)
+
+
 def scans_needed(configs: Iterable[InputConfig]) -> int | None:
     """Scans a simulation must have for all of these `start`, `count` and `skip_frames`; None is all it has by itself."""
     needed = [None if c.count is None else c.start + (c.count - 1) * c.skip_frames + 1 for c in configs]

@@ -73,6 +73,18 @@ def test_the_same_clouds_make_the_same_bytes(tmp_path: Path) -> None:
     assert len(list((tmp_path / "a").iterdir())) == 4
 
 
+def test_clouds_that_are_not_packed_are_larger_and_the_same(tmp_path: Path) -> None:
+    points = np.round(cloud(0) * 512) / 512
+    packed, plain, in_memory = (
+        KeyframeStore(home, cached=0, deflate=deflate)
+        for home, deflate in ((tmp_path / "packed", 1), (tmp_path / "plain", 0), (None, 0))
+    )
+    for store in (packed, plain, in_memory):
+        store.add(keyframe(0), points)
+        assert np.array_equal(store.points(0), points)
+    assert packed.size < points.nbytes < plain.size == in_memory.size
+
+
 def test_few_clouds_stay_in_memory(tmp_path: Path) -> None:
     store = filled(tmp_path / "keyframes", 6, cached=2)
     for file in (tmp_path / "keyframes").iterdir():

@@ -14,7 +14,7 @@ from lslam.studies.grid import Job
 from lslam.studies.jobs import run_jobs
 from lslam.studies.kept import KeptSequences, ScanStore, memory_bound, size_of
 from lslam.studies.plan import Follow
-from lslam.studies.runner import Crew
+from lslam.studies.runner import Crew, Task
 from lslam.studies.states import read_state
 from lslam.types.scan import Scan
 
@@ -93,6 +93,25 @@ def test_what_a_recording_is_opened_with_tells_it_from_others(tmp_path: Path) ->
     assert states[1] is not None
     assert states[0].status in ("done", "degraded")
     assert (states[1].status, states[1].reason.partition(" is ")[0]) == ("failed", "--lidar-topic")
+
+
+def test_several_at_once_begin_with_what_takes_longest_and_one_keeps_the_order(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    jobs = [
+        Job("sample", f"{k}", 0, tmp_path, load_config(None, [setting], {}), tmp_path / f"{k}", "", "")
+        for k, setting in enumerate(["input.skip_frames=3", "input.count=9", "input.skip_frames=2", "input.start=5"])
+    ]
+    begun: list[Task] = []
+
+    def fake(tasks: list[Task], *given: object) -> None:
+        begun[:] = tasks
+
+    monkeypatch.setattr("lslam.studies.jobs.run_tasks", fake)
+    for crew, order in ((Crew(2, is_kept=True), "3201"), (Crew(1, is_kept=True), "0123")):
+        run_jobs(jobs, crew, Follow())
+        assert [task.name for task in begun] == [f"sample {k} seed 0" for k in order]
+    assert {task.data for task in begun} == {str(tmp_path)}
 
 
 def test_memory_is_bounded_by_what_is_free() -> None:

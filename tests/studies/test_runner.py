@@ -81,6 +81,23 @@ def test_several_at_once_meet_and_one_at_a_time_do_not(tmp_path: Path) -> None:
     assert go(tmp_path, partial(meet, a, b), partial(meet, b, a), at_once=2) == {0: "", 1: ""}
 
 
+def test_a_process_goes_on_with_what_it_has_read_and_a_new_one_takes_what_nobody_has(tmp_path: Path) -> None:
+    a, b, c = tmp_path / "a", tmp_path / "b", tmp_path / "c"
+    works = [partial(meet, a, b), partial(note, c), partial(meet, b, a), partial(note, c)]
+    tasks = [
+        Task(f"{i}", work, tmp_path / f"{i}.out", data)
+        for i, (work, data) in enumerate(zip(works, "xxyx", strict=True))
+    ]
+    begun: list[int] = []
+    run_tasks(tasks, Crew(2, is_kept=True), begun.append, lambda index, cause: None)
+    assert begun[:2] == [0, 2]
+    assert sorted(begun) == [0, 1, 2, 3]
+    one_after_the_other: list[int] = []
+    again = [Task("", partial(note, c), tmp_path / "out", data) for data in "xyxzy"]
+    run_tasks(again, Crew(1, is_kept=True), one_after_the_other.append, lambda index, cause: None)
+    assert one_after_the_other == [0, 2, 1, 4, 3]
+
+
 def test_an_interruption_ends_what_runs(tmp_path: Path) -> None:
     mark = tmp_path / "mark"
 

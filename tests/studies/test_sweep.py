@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import tomllib
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,12 +14,13 @@ from lslam.config.study import StudyConfig, parse_study
 from lslam.errors import ConfigError, InputError, InterruptedRunError, OutputExistsError, RunFailedError, UsageError
 from lslam.formats.study_csv import read_study_csv
 from lslam.studies.engines import Local
-from lslam.studies.estimate import estimate, used
+from lslam.studies.estimate import estimate
 from lslam.studies.expanded import Expanded, Place
 from lslam.studies.plan import Follow
 from lslam.studies.results import is_comparable
 from lslam.studies.states import State
 from lslam.studies.study_files import find_study
+from lslam.studies.subjects import used
 from lslam.studies.sweep import Sweep, expand_study, run_sweep
 from lslam.types.study import StudyRow
 
@@ -77,6 +79,10 @@ def test_every_point_is_a_row_with_its_values_and_numbers(made: list[StudyRow], 
         assert row.total_time_s < row.run_s
         assert (sweep.place.out / row.folder / "manifest.json").is_file()
         assert not [*(sweep.place.out / row.folder).glob("map.*"), *(sweep.place.out / row.folder).glob("keyframes")]
+        config = tomllib.loads((sweep.place.out / row.folder / "config.toml").read_text())
+        assert (config["input"]["threads"], config["keyframes"]["deflate"]) == (1, 0), (
+            "one core, and no work for nothing"
+        )
 
 
 def test_files_hold_the_same_rows(made: list[StudyRow], sweep: Sweep) -> None:
