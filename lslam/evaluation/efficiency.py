@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
+from lslam.evaluation.student import two_sided
 from lslam.types.sensitivity import Floats, Interval
 
 LEVEL = 0.95
@@ -42,8 +43,6 @@ def over_seeds(table: Floats, level: float = LEVEL) -> Interval:
 
     Seeds are few, so the interval is wide: three of them stand for 4.3 standard errors either way. One has none.
     """
-    from scipy.stats import t as student
-
     known = np.isfinite(table)
     n = known.sum(1)
     total = np.where(known, table, 0.0).sum(1)
@@ -52,5 +51,5 @@ def over_seeds(table: Floats, level: float = LEVEL) -> Interval:
     several = n > 1
     error = np.full(len(n), np.nan)
     error[several] = np.sqrt(squares[several] / (n[several] - 1) / n[several])
-    error[several] *= student.ppf(0.5 + level / 2, n[several] - 1)
+    error[several] *= two_sided(level, n[several] - 1)
     return Interval(mean, mean - error, mean + error, n)

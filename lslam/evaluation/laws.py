@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from lslam.evaluation.student import two_sided
 from lslam.types.sensitivity import Floats, Law, LawKind
 
 FEWEST = 6
@@ -35,7 +36,6 @@ def fit_law(
     if len(np.unique(x, axis=0)) < FEWEST:
         return None
     from scipy.linalg import lstsq
-    from scipy.stats import t as student
 
     columns = design(kind, x)
     expected = t
@@ -49,7 +49,7 @@ def fit_law(
     weighted = columns * weights[:, None]
     variance = float(np.sum(((t - expected) * weights) ** 2) / freedom)
     covariance = np.asarray(variance * np.linalg.inv(weighted.T @ weighted), np.float64)
-    margins = float(student.ppf(0.5 + level / 2, freedom)) * np.sqrt(np.diag(covariance))
+    margins = float(two_sided(level, freedom)) * np.sqrt(np.diag(covariance))
     spread = float(np.sum((t - t.mean()) ** 2))
     r2 = 1 - float(np.sum((t - expected) ** 2)) / spread if spread > 0 else float("nan")
     return Law(kind, tuple(names), coefficients, margins, covariance, freedom, level, x, t, expected, r2)
@@ -65,11 +65,9 @@ def design(kind: LawKind, points: Floats) -> Floats:
 
 def band(law: Law, points: Floats) -> tuple[Floats, Floats]:
     """The law at points (N,) or (N, K) and the half width of its confidence band there, s."""
-    from scipy.stats import t as student
-
     columns = design(law.kind, _columns(points))
     deviation = np.sqrt(np.einsum("ni,ij,nj->n", columns, law.covariance, columns))
-    return columns @ law.coefficients, float(student.ppf(0.5 + law.level / 2, law.freedom)) * deviation
+    return columns @ law.coefficients, float(two_sided(law.level, law.freedom)) * deviation
 
 
 def _columns(points: Floats) -> Floats:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -18,6 +18,14 @@ def house_style() -> Iterator[None]:
 
     with rc_context({"svg.hashsalt": "lslam", "svg.fonttype": "none", "font.size": 9}):
         yield
+
+
+def pictures(figure: Any, kinds: Sequence[str]) -> list[bytes]:
+    """The files of a matplotlib figure without a layout of its own: found once, it takes longer than drawing."""
+    from matplotlib.layout_engine import ConstrainedLayoutEngine
+
+    ConstrainedLayoutEngine().execute(figure)
+    return [picture(figure, kind) for kind in kinds]
 
 
 def picture(figure: Any, kind: str) -> bytes:

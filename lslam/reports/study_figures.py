@@ -12,7 +12,7 @@ import numpy as np
 from lslam.evaluation.curves import NOT_REGISTRATION, registration_ms
 from lslam.evaluation.efficiency import normalise
 from lslam.evaluation.landmarks import FLAT
-from lslam.reports.picture import COLOURS, house_style, label, picture
+from lslam.reports.picture import COLOURS, house_style, label, pictures
 from lslam.reports.study_law_figure import draw_laws
 from lslam.types.sensitivity import CurveResult, Floats, StudyResult
 from lslam.types.study import StudyRow
@@ -63,12 +63,12 @@ def study_figures(result: StudyResult) -> Iterator[StudyFigure]:
     known = [r for r in result.results if r.curve.ran.any()]
     for name, title, caption, draw in _FIGURES:
         with house_style():
-            figure = Figure(figsize=(10, 4.2), layout="constrained")
+            figure = Figure(figsize=(10, 4.2))
             if not known or not draw(figure, result, known):
                 continue
             of_thesis = THESIS.get(result.parameters[0], {}).get(name, "")
             more = f" Of the first thesis: figure {of_thesis}." if of_thesis else ""
-            yield StudyFigure(name, title, caption + more, picture(figure, "png"), picture(figure, "svg"))
+            yield StudyFigure(name, title, caption + more, *pictures(figure, ("png", "svg")))
 
 
 def _errors(figure: Any, result: StudyResult, shown: Sequence[CurveResult]) -> bool:

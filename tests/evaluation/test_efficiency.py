@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from lslam.evaluation.efficiency import efficiency, median_over_seeds, normalise, over_seeds
+from lslam.evaluation.student import two_sided
 
 # Its open flight (tables 4.13 and 5.3): rmse m, angular rmse deg, s of registration per scan (LOAM and map added), s in all.
 OPEN = {
@@ -42,6 +43,14 @@ def test_interval_over_seeds_is_students() -> None:
     assert over.high[0] == pytest.approx(2 + 4.3027 / np.sqrt(3), abs=1e-4)
     assert np.isnan(over.low[1:]).all()
     assert np.isnan(over.mean[2])
+
+
+def test_students_quantiles_are_those_of_scipy() -> None:
+    from scipy.stats import t as student
+
+    freedom = np.array([1, 2, 3, 10, 1000])
+    for level in (0.5, 0.95, 0.99):
+        assert two_sided(level, freedom) == pytest.approx(student.ppf(0.5 + level / 2, freedom), rel=1e-9)
 
 
 def test_interval_over_seeds_holds_the_truth_as_often_as_it_says() -> None:

@@ -96,6 +96,13 @@ def test_figures_show_what_they_are_named_after(figures: dict[str, StudyFigure])
     assert "figure 5.20" in figures["efficiency"].caption
 
 
+def test_legends_lie_below_the_axes_and_within_the_picture(figures: dict[str, StudyFigure]) -> None:
+    for name in ("errors", "zoom", "times", "efficiency"):
+        texts = [t for t in ET.fromstring(figures[name].svg).iter("{http://www.w3.org/2000/svg}text") if t.get("y")]
+        height = {text.text: float(text.get("y", "")) for text in texts}
+        assert 250 < height[SKIP] + 10 < height["loam+imu"] < 302, name  # pt of 302.4, from above; a line is 9 high
+
+
 def test_figures_are_the_same_bytes_again(figures: dict[str, StudyFigure], folder: Path) -> None:
     for name, figure in figures.items():
         assert (folder / "figures" / f"skip-open-skip_frames-{name}.svg").read_bytes() == figure.svg
