@@ -1,4 +1,9 @@
-"""KITTI raw drives: `<date>/<date>_drive_NNNN_{sync,extract}` with `velodyne_points/` and `oxts/`."""
+"""KITTI raw drives: `<date>/<date>_drive_NNNN_{sync,extract}` with `velodyne_points/` and `oxts/`.
+
+Scans of both kinds are distorted, as KITTI's readme of the raw data says: only those of the odometry benchmark had the
+motion taken out. On drives 0005 and 0048 (`sync`) points lie nearest to the map's planes when all of a sweep's motion
+is taken out, neither more nor less: 46 mm for 56 in a bend.
+"""
 
 from __future__ import annotations
 
@@ -35,6 +40,8 @@ from lslam.types.trajectory import Trajectory
 
 KIND = "kitti-raw"
 DRIVE = re.compile(r"\d{4}_\d\d_\d\d_drive_\d{4}(_sync|_extract)?$")
+# OXTS measures every 10 ms: the sample nearest to a scan is no farther from it.
+_NEAREST_NS = 5_000_000
 
 
 def locate(folder: Path) -> tuple[Path, str] | None:
@@ -66,16 +73,17 @@ def open_folder(folder: Path, overrides: SequenceInfo, why: str) -> FolderSequen
     voice = Voice([f"format {KIND}: {why}", *left_out, *compensation_note(info)], [])
     is_extract = folder.name.endswith("_extract")
     oxts = _oxts(folder, voice)
-    files, stamps, rate = _stamps(folder, info, files, oxts, is_extract, voice)
+    files, stamps, rate, looks_ahead = _stamps(folder, info, files, oxts, is_extract, voice)
     calibration = calibration_over(info, _calibration(folder.parent, voice))
-    compensated = not is_extract if info.motion_compensated is None else info.motion_compensated
     per_point = per_point_folder(folder, info)
     sweep = None
-    if is_extract and not compensated and per_point is None:
+    if not info.motion_compensated and per_point is None:
         sweep = _sweeps(folder, files, rate, voice)
+        if looks_ahead:
+            stamps = stamps - np.round(0.5e9 * sweep).astype(np.int64)
+            voice.notes.append("these stamps are of the scanner looking ahead: each scan begins half a sweep earlier")
     if info.motion_compensated is None:
-        drive = "extract drives are distorted" if is_extract else "sync drives are motion compensated"
-        voice.notes.append(f"motion compensated: {'yes' if compensated else 'no'} (KITTI raw {drive})")
+        voice.notes.append("motion compensated: no (KITTI raw drives are distorted, sync ones too)")
     return FolderSequence(
         name=info.name or folder.name,
         path=folder,
@@ -83,7 +91,7 @@ def open_folder(folder: Path, overrides: SequenceInfo, why: str) -> FolderSequen
         files=files,
         stamps_ns=stamps,
         rate_hz=rate,
-        motion_compensated=compensated,
+        motion_compensated=bool(info.motion_compensated),
         calibration=calibration,
         ground_truth=_ground_truth(folder, info, files, stamps, oxts, calibration, voice),
         imu=load_imu(folder, info, voice.problems) or _imu(oxts),
@@ -122,31 +130,47 @@ def _oxts(folder: Path, voice: Voice) -> Oxts | None:
 
 def _stamps(
     folder: Path, info: SequenceInfo, files: list[Path], oxts: Oxts | None, is_extract: bool, voice: Voice
-) -> tuple[list[Path], NDArray[np.int64], float]:
-    """Stamps of the LiDAR; of OXTS by index where a shared excerpt leaves them out; else nominal."""
-    names = ("timestamps_start.txt", "timestamps.txt") if is_extract else ("timestamps.txt", "timestamps_start.txt")
-    paths = [folder / "velodyne_points" / name for name in names]
+) -> tuple[list[Path], NDArray[np.int64], float, bool]:
+    """Stamps of the LiDAR; of OXTS by index where a shared excerpt leaves them out; else nominal.
+
+    And whether they are of the instant at which the scanner looks ahead, to which KITTI ties cameras and OXTS.
+    """
+    names = ("timestamps.txt", "timestamps_start.txt")
+    paths = [folder / "velodyne_points" / name for name in (names if info.motion_compensated else names[::-1])]
     if info.stamps is not None:
         paths.insert(0, folder / info.stamps)
     path = next((p for p in paths if p.is_file()), None)
     stamps = load_stamps(path, voice.problems) if path else None
     if path is not None and stamps is not None:
         voice.notes.append(f"scan stamps from {path.name}")
-        return _common(files, stamps, path, info.rate_hz, voice)
+        is_own = info.stamps is None or path != paths[0]
+        return *_common(files, stamps, path, info.rate_hz, voice), is_own and path.name == names[0]
     if oxts is None or oxts.stamps_ns is None or not len(oxts.stamps_ns) or is_extract:
         rate = info.rate_hz or DEFAULT_RATE_HZ
         start = 0 if oxts is None or oxts.stamps_ns is None or not len(oxts.stamps_ns) else int(oxts.stamps_ns[0])
         voice.problems.append(
             f"no stamps of the scans in {folder / 'velodyne_points'}: they are stamped at {rate:g} Hz"
         )
-        return files, nominal_stamps(len(files), rate, start), rate
+        return files, nominal_stamps(len(files), rate, start), rate, False
     voice.notes.append("no velodyne_points/timestamps*.txt: scan i goes with OXTS sample i and takes its stamp")
+    even = _evened(oxts.numbers, oxts.stamps_ns, voice)
     full = np.full(int(oxts.numbers.max()) + 1, -1, np.int64)
-    full[oxts.numbers] = oxts.stamps_ns
+    full[oxts.numbers] = even
     source = folder / "oxts" / "timestamps.txt"
-    if (full < 0).any():
-        return _common(files, oxts.stamps_ns, source, info.rate_hz, voice)
-    return _common(files, full, source, info.rate_hz, voice)
+    return *_common(files, even if (full < 0).any() else full, source, info.rate_hz, voice), True
+
+
+def _evened(numbers: NDArray[np.int64], stamps_ns: NDArray[np.int64], voice: Voice) -> NDArray[np.int64]:
+    """Stamps of scans `numbers`, each that of the OXTS sample nearest to it, as a scanner that turns evenly takes them."""
+    if len(stamps_ns) < 3:
+        return stamps_ns
+    slope, start = np.polyfit(numbers, stamps_ns - stamps_ns[0], 1)
+    even: NDArray[np.int64] = stamps_ns[0] + np.round(start + slope * numbers).astype(np.int64)
+    off = int(np.abs(even - stamps_ns).max())
+    if not 0 < off <= _NEAREST_NS:
+        return stamps_ns
+    voice.notes.append(f"OXTS samples lie 10 ms apart: stamps are evened out, by {1e-6 * off:.1f} ms at most")
+    return even
 
 
 def _common(

@@ -35,6 +35,7 @@ from lslam.config.preset_files import known_presets
 from lslam.errors import RunFailedError
 from lslam.formats.trajectory_files import read_trajectory
 from lslam.geometry import se3
+from lslam.geometry.interpolate import poses_at
 from lslam.pipeline.run import RunOutcome, Watch, run
 from lslam.readers import open_sequence
 from lslam.simulation.record import NUMBER, record
@@ -42,6 +43,7 @@ from lslam.simulation.scenario_files import scenario_names
 from lslam.simulation.scenarios import simulate
 from lslam.types.scan import Scan
 from lslam.types.sequence import Sequence
+from lslam.types.trajectory import Trajectory
 
 OURS = ("icp", "icp-point", "gicp", "vgicp", "ndt", "loam", "loam-odom", "floam", "lego-loam")
 PEERS = ("kiss-icp", "small-gicp", "small-vgicp", "genz-icp")
@@ -57,6 +59,7 @@ RECORDINGS = {
     "mcd_kth_day_06": "mcd_kth_day_06",
 }
 STARTS, STRIDE = 5, 3
+DAY_NS = 86_400 * 10**9
 # The thesis widened the range of its LOAM on this flight, to what it does not print: that of its ICP.
 ON_THE_CLIMB = dict.fromkeys(("thesis-loam", "thesis-loam-map"), ("preprocess.range_max=70",))
 
@@ -110,9 +113,12 @@ def worker(path: Path, truth_file: str, method: str) -> None:
     """One run of one method: its row as JSON on stdout."""
     logging.getLogger("lslam").setLevel(logging.ERROR)
     sequence = open_sequence(path)
-    given = read_trajectory(Path(truth_file)) if truth_file else sequence.ground_truth
-    assert given is not None
-    truth = given.poses[_nearest(given.stamps_ns, sequence)]
+    if truth_file:
+        truth = of_reference(read_trajectory(Path(truth_file)), sequence, is_deskewed=method not in BESIDE)
+    else:
+        given = sequence.ground_truth
+        assert given is not None
+        truth = given.poses[_nearest(given.stamps_ns, sequence)]
     truth = se3.relative(truth[0], truth)
     row: dict[str, Any] = {"method": method, "n": len(sequence)}
     if method in BESIDE:
@@ -133,10 +139,15 @@ def worker(path: Path, truth_file: str, method: str) -> None:
     print(json.dumps(row))
 
 
+def of_reference(reference: Trajectory, sequence: Sequence, is_deskewed: bool) -> NDArray[np.float64]:
+    """Poses of a reference, whose clock begins at midnight, where the scans begin; in mid-sweep for those left distorted."""
+    times = sequence.scan(0).times
+    late = 0 if is_deskewed or times is None else round(0.5e9 * float(times.max()))
+    return poses_at(reference.stamps_ns, reference.poses, (sequence.stamps_ns + late) % DAY_NS)
+
+
 def _nearest(stamps_ns: NDArray[np.int64], sequence: Sequence) -> NDArray[np.int64]:
     """Index of the true pose of each scan."""
-    if len(stamps_ns) == len(sequence):
-        return np.arange(len(sequence))  # a reference counts from its own start
     used = sequence.stamps_ns
     after = np.clip(np.searchsorted(stamps_ns, used), 1, len(stamps_ns) - 1)
     return np.where(used - stamps_ns[after - 1] < stamps_ns[after] - used, after - 1, after)

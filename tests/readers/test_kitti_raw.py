@@ -14,7 +14,9 @@ from sequence_builders import cloud, raw_drive
 
 from lslam.errors import InputError
 from lslam.formats.sequence_toml import SequenceInfo, write_sequence_toml
+from lslam.formats.trajectory_files import read_trajectory
 from lslam.geometry import se3, so3
+from lslam.geometry.interpolate import poses_at
 from lslam.readers import open_sequence
 
 
@@ -24,8 +26,10 @@ def said(sentences: list[str], part: str) -> bool:
 
 def test_an_excerpt_without_velodyne_stamps(tmp_path: Path) -> None:
     s = open_sequence(raw_drive(tmp_path))
-    assert (s.name, s.kind, len(s), s.motion_compensated) == ("2011_09_26_drive_0005_sync", "kitti-raw", 6, True)
-    assert s.stamps_ns[0] == 1317042272_000000000
+    assert (s.name, s.kind, len(s), s.motion_compensated) == ("2011_09_26_drive_0005_sync", "kitti-raw", 6, False)
+    # OXTS goes with the scanner looking ahead, half a sweep after the scan began.
+    assert s.stamps_ns[0] == 1317042271_950000000
+    assert s.scan(0).times is not None
     assert said(s.notes, "scan i goes with OXTS sample i")
     assert s.problems == []
     assert s.calibration.T_lidar_imu is not None
@@ -49,11 +53,57 @@ def test_velodyne_stamps_are_used_when_they_are_there(tmp_path: Path) -> None:
     lines = "".join(f"2011-09-26 13:04:32.{k * 100 + 3:03d}000001\n" for k in range(6))
     (folder / "velodyne_points" / "timestamps.txt").write_text(lines)
     s = open_sequence(folder)
-    assert s.stamps_ns[1] == 1317042272_103000001
+    assert s.stamps_ns[1] == 1317042272_053000001
+    assert said(s.notes, "each scan begins half a sweep earlier")
     assert s.ground_truth is not None
     assert s.ground_truth.stamps_ns.tolist() == s.stamps_ns.tolist()
     np.testing.assert_allclose(s.ground_truth.positions[5], [5.0015, 0, 0], atol=2e-3)
     assert said(s.notes, "interpolated")
+
+
+def test_the_start_of_the_sweep_is_taken_where_it_is_known(tmp_path: Path) -> None:
+    folder = raw_drive(tmp_path)
+    for name, shift in (("timestamps", 3), ("timestamps_start", 0), ("timestamps_end", 96)):
+        lines = "".join(f"2011-09-26 13:04:32.{k * 100 + shift:03d}000000\n" for k in range(6))
+        (folder / "velodyne_points" / f"{name}.txt").write_text(lines)
+    s = open_sequence(folder)
+    assert s.stamps_ns[1] == 1317042272_100000000
+    assert not said(s.notes, "half a sweep")
+    times = s.scan(1).times
+    assert times is not None
+    assert 0.09 < times.max() <= np.float32(0.096)
+
+
+def test_scans_stated_as_compensated_keep_the_instant_of_their_stamps(tmp_path: Path) -> None:
+    folder = raw_drive(tmp_path)
+    s = open_sequence(folder, motion_compensated=True)
+    assert s.motion_compensated is True
+    assert s.stamps_ns[0] == 1317042272_000000000
+    assert s.scan(0).times is None
+    # Both files: the instant at which the scanner looks ahead is that of a compensated scan.
+    for name, shift in (("timestamps", 50), ("timestamps_start", 0)):
+        lines = "".join(f"2011-09-26 13:04:32.{k * 100 + shift:03d}000000\n" for k in range(6))
+        (folder / "velodyne_points" / f"{name}.txt").write_text(lines)
+    assert open_sequence(folder, motion_compensated=True).stamps_ns[1] == 1317042272_150000000
+
+
+@pytest.mark.parametrize(("late", "evened"), [(0.0, True), (0.02, False)])
+def test_stamps_of_the_nearest_oxts_samples_are_evened_out(tmp_path: Path, late: float, evened: bool) -> None:
+    """A scan each 103.3 ms, OXTS each 10 ms; a scan that came 20 ms late did come late."""
+    folder = raw_drive(tmp_path, count=30)
+    true = 32 + np.arange(30) * 0.1033
+    true[20] += late
+    nearest = np.round(true, 2)
+    assert 4e-3 < np.abs(nearest - true).max() < 5.1e-3
+    (folder / "oxts" / "timestamps.txt").write_text("".join(f"2011-09-26 13:04:{t:012.9f}\n" for t in nearest))
+    s = open_sequence(folder)
+    assert said(s.notes, "evened out") == evened
+    begun = s.stamps_ns - 1317042240_000000000 + 51_650_000
+    if evened:
+        assert s.rate_hz == pytest.approx(1 / 0.1033, rel=2e-3)
+        assert np.abs(begun * 1e-9 - true).max() < 1.5e-3
+    else:
+        np.testing.assert_allclose(np.diff(s.stamps_ns) * 1e-9, np.diff(nearest), atol=1e-8)
 
 
 def test_missing_scans_keep_their_stamps(tmp_path: Path) -> None:
@@ -153,13 +203,15 @@ def test_real_drive_against_its_reference(recordings: Callable[[str], Path]) -> 
     """The OXTS truth agrees with the independent reference: attitude to 0.1 deg, positions to the accuracy they claim."""
     folder = recordings("kitti_raw_0048") / "2011_09_26" / "2011_09_26_drive_0048_sync"
     s = open_sequence(folder)
-    reference = np.loadtxt(folder / "reference_lidar.tum")
+    given = read_trajectory(folder / "reference_lidar.tum")
     assert s.ground_truth is not None
     assert (len(s), len(s.ground_truth)) == (22, 22)
-    R_ref = so3.from_quaternion(reference[:, 4:8])
-    R = s.ground_truth.poses[:, :3, :3]
-    assert np.degrees(so3.angle(np.swapaxes(R_ref, 1, 2) @ R)).max() < 0.1
-    assert np.linalg.norm(s.ground_truth.positions - reference[:, 1:4], axis=1).max() < 0.35
+    # Its clock begins at midnight.
+    reference = poses_at(given.stamps_ns, given.poses, s.stamps_ns % (86400 * 10**9))
+    reference = se3.relative(reference[0], reference)
+    apart = se3.relative(reference, s.ground_truth.poses)
+    assert np.degrees(so3.angle(apart[:, :3, :3])).max() < 0.1
+    assert np.linalg.norm(s.ground_truth.positions - reference[:, :3, 3], axis=1).max() < 0.35
     # Two scans a metre apart overlap under the truth: the transform is not inverted.
     from scipy.spatial import cKDTree
 
