@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -129,5 +130,5 @@ def _print_plan(sweep: Sweep, at_once: int, stack: ExitStack) -> None:
     if not left:
         show(f"{many}\n")
         return
-    guess = estimate(left, expanded.contenders, at_once, bars(stack))
+    guess = estimate(left, expanded.contenders, at_once, bars(stack), time.process_time())
     show(f"{many}: about {guess.text}, {at_once} at once ({guess.pilots} pilot runs)\n")

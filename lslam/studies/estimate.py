@@ -18,8 +18,10 @@ from lslam.studies.engines import Local
 from lslam.studies.grid import Job
 from lslam.studies.plan import Follow
 from lslam.studies.points import Contender
+from lslam.studies.results import Results
 from lslam.studies.scenes import drive_of, simulate_once
 from lslam.studies.states import FINAL, read_state
+from lslam.studies.study_report import write_study_report
 from lslam.studies.subjects import used
 
 Floats = NDArray[np.float64]
@@ -27,16 +29,15 @@ Floats = NDArray[np.float64]
 _SHORT, _LONG = 12, 36
 # Scans of a recording that are simulated for pilots, at most.
 _SIMULATED = 160
-# A process starts and imports.
-_START_S = 3.0
 
 
 @dataclass(frozen=True)
 class Guess:
-    """seconds : of all runs and simulations; pilots : runs it was made from."""
+    """seconds : of everything; pilots : runs it was made from; around_s : of the seconds, those before and after the runs."""
 
     seconds: float
     pilots: int
+    around_s: float = 0.0
 
     @property
     def text(self) -> str:
@@ -68,14 +69,21 @@ class _Pilot:
 
 
 def estimate(
-    jobs: Sequence[Job], contenders: dict[str, Contender], at_once: int, follow: Follow | None = None
+    jobs: Sequence[Job],
+    contenders: dict[str, Contender],
+    at_once: int,
+    follow: Follow | None = None,
+    own_s: float = 0.0,
 ) -> Guess:
-    """Time that `jobs` will take with `at_once` together; pilots go to a temporary folder.
+    """Time that `jobs` will take with `at_once` together; pilots and their report go to a temporary folder.
+
+    own_s : what the caller took until here and will take again
 
     Raises RunFailedError naming a pilot that does not come to its end, and what simulating raises.
     """
     follow = follow or Follow()
-    seconds, warming_s, pilots = 0.0, 0.0, 0
+    seconds, warming_s, start_s = 0.0, 0.0, 0.0
+    pilots: list[Job] = []
     with tempfile.TemporaryDirectory(prefix="lslam-pilots-") as folder:
         places = _places(jobs, Path(folder), follow)
         for number, members in enumerate(_groups(jobs, contenders)):
@@ -86,18 +94,21 @@ def estimate(
             made = [
                 _pilots(first[names[k]], place, Path(folder) / f"{number}-{k}") for k in _chosen(X)
             ]  # fmt: skip
-            flat = [made[0][0], *(pilot for pair in made for pilot in pair)]
-            times = _run(flat, follow)
-            pilots += len(flat)
-            warming_s += max(times[0] - times[1], 0.0)
+            began = time.monotonic()
+            run, times = _run([made[0][1], *(pilot for pair in made for pilot in pair)], follow)
+            start_s = max(start_s, time.monotonic() - began - sum(times))
+            pilots += run
+            warming_s += max(times[0] - times[2], 0.0)
             base, per_scan = _costs(made, times[1:])
             for name, cost in zip(names, _at(X, X[_chosen(X)], base, per_scan), strict=True):
                 scans = used(place.whole, first[name].config.input)
                 seconds += sum(job.method == name for job in members) * float(cost[0] + cost[1] * scans)
         simulation_s = sum(places[job.sequence].simulation_s for job in _to_simulate(jobs))
+        report_s = _report_s(Path(folder), pilots, contenders)
     # One simulation already keeps two cores busy.
     simulation_s /= max(1, at_once // 2)
-    return Guess(_START_S + simulation_s + warming_s + seconds / at_once, pilots)
+    around_s = own_s + start_s + report_s
+    return Guess(around_s + simulation_s + warming_s + seconds / at_once, len(pilots), around_s)
 
 
 def _groups(jobs: Sequence[Job], contenders: dict[str, Contender]) -> list[list[Job]]:
@@ -167,8 +178,8 @@ def _pilots(job: Job, place: _Place, folder: Path) -> list[_Pilot]:
     return pilots
 
 
-def _run(pilots: Sequence[_Pilot], follow: Follow) -> list[float]:
-    """Seconds of each; the first one pays for what is loaded and compiled."""
+def _run(pilots: Sequence[_Pilot], follow: Follow) -> tuple[list[Job], list[float]]:
+    """The runs and the seconds of each; the first one pays for what is loaded and compiled."""
     jobs = [replace(p.job, folder=p.job.folder.with_name(f"{k}-{p.scans}")) for k, p in enumerate(pilots)]
     Local(title="pilot runs").run(jobs, follow, lambda job: None)
     seconds = []
@@ -178,7 +189,16 @@ def _run(pilots: Sequence[_Pilot], follow: Follow) -> list[float]:
             reason = "it left no result" if state is None else state.reason
             raise RunFailedError(f"a pilot run of {job.name} failed, so the time is not known: {reason}")
         seconds.append(state.seconds)
-    return seconds
+    return jobs, seconds
+
+
+def _report_s(folder: Path, pilots: Sequence[Job], contenders: dict[str, Contender]) -> float:
+    """Seconds of a report, tried on the pilots, which are of every sequence and every parameter."""
+    results = Results("pilots", folder, pilots, contenders)
+    results.add(pilots)
+    began = time.monotonic()
+    write_study_report(folder, results.rows)
+    return time.monotonic() - began
 
 
 def _costs(made: Sequence[Sequence[_Pilot]], times: Sequence[float]) -> tuple[Floats, Floats]:

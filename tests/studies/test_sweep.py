@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import shutil
+import time
 import tomllib
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -20,6 +22,7 @@ from lslam.studies.plan import Follow
 from lslam.studies.results import is_comparable
 from lslam.studies.states import State
 from lslam.studies.study_files import find_study
+from lslam.studies.study_report import write_study_report
 from lslam.studies.subjects import used
 from lslam.studies.sweep import Sweep, expand_study, run_sweep
 from lslam.types.study import StudyRow
@@ -210,13 +213,38 @@ def test_keys_of_one_name_in_two_sections_are_runs_of_their_own(tmp_path: Path) 
     assert len({job.folder for job in expanded.jobs}) == 4
 
 
-def test_the_time_is_estimated_from_short_runs(sweep: Sweep, tmp_path: Path) -> None:
+def test_the_time_is_estimated_from_short_runs_and_their_report(
+    sweep: Sweep, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    reported: list[Sequence[StudyRow]] = []
+
+    def report(folder: Path, rows: Sequence[StudyRow]) -> None:
+        write_study_report(folder, rows)
+        reported.append(rows)
+        time.sleep(2)
+
+    monkeypatch.setattr("lslam.studies.estimate.write_study_report", report)
     jobs = expand_study(replace(sweep, study=study(beside=[], parameters={"input.skip_frames": [1, 2]})))
-    guess = estimate(jobs.jobs, jobs.contenders, 1)
+    guess = estimate(jobs.jobs, jobs.contenders, 1, own_s=300.0)
     assert guess.pilots == 5
-    assert 0.1 < guess.seconds < 120
-    twice = estimate(jobs.jobs * 40, jobs.contenders, 1)
-    assert twice.seconds > 5 * (guess.seconds - 3)
+    assert 302 < guess.around_s + 0.1 < guess.seconds < 420
+    assert [row.parameters["input.skip_frames"] for row in reported[0]] == [1, 1, 1, 2, 2]
+    assert all(row.is_usable for row in reported[0])
+
+
+@pytest.mark.parametrize(("at_once", "times", "expected"), [(1, 1, 11.4), (2, 1, 9.7), (2, 40, 76.0)])
+def test_an_estimate_adds_up_what_is_told_apart(
+    at_once: int, times: int, expected: float, made: list[StudyRow], sweep: Sweep, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Pilots of 0.5 s and 0.1 s a scan, 5 s more for the first; a report of 3 s; runs of 16 and of 8 scans."""
+
+    def fake(pilots: Sequence[Any], follow: Follow) -> tuple[list[Any], list[float]]:
+        return [], [0.5 + 0.1 * pilot.scans + 5 * (k == 0) for k, pilot in enumerate(pilots)]
+
+    monkeypatch.setattr("lslam.studies.estimate._run", fake)
+    monkeypatch.setattr("lslam.studies.estimate._report_s", lambda *given: 3.0)
+    jobs = expand_study(replace(sweep, study=study(beside=[], parameters={"input.skip_frames": [1, 2]})))
+    assert estimate(jobs.jobs * times, jobs.contenders, at_once).seconds == pytest.approx(expected, abs=0.01)
 
 
 def test_an_estimate_names_the_pilot_that_failed(sweep: Sweep) -> None:
