@@ -12,13 +12,12 @@ from lslam.formats.atomic import atomic_write
 from lslam.reports.compare_table import CompareTable, as_text
 from lslam.reports.grid_text import comma_separated
 from lslam.reports.html import template
+from lslam.reports.metrics import counted
 from lslam.reports.study_figures import StudyFigure, study_figures
 from lslam.reports.study_table import means_grid, study_recipes, study_tables
 from lslam.types.sensitivity import StudyResult
 from lslam.types.study import StudyRow
 from lslam.version import __version__
-
-NOT_ALONE = "Several runs shared the machine: times of this study, and what is made of them, cannot be compared."
 
 
 @dataclass(frozen=True)
@@ -56,7 +55,7 @@ def write_study_files(folder: Path, results: Sequence[StudyResult], rows: Sequen
         version=__version__,
         rows=rows,
         failed=sum(not row.is_usable for row in rows),
-        notes=[] if all(row.is_timing_comparable for row in rows if row.is_usable) else [NOT_ALONE],
+        notes=timing_notes(rows),
         sections=sections,
     )
     _write(folder / "report.html", page.encode("utf-8", "replace"))
@@ -64,6 +63,19 @@ def write_study_files(folder: Path, results: Sequence[StudyResult], rows: Sequen
         parts = [part for section in sections for part in _as_text(section, style, heading, item)]
         _write(folder / f"report.{style}", ("\n\n".join(parts) + "\n").encode("utf-8", "backslashreplace"))
     _write(folder / "report.csv", (comma_separated(means_grid(results)) + "\n").encode())
+
+
+def timing_notes(rows: Sequence[StudyRow]) -> list[str]:
+    """Why findings about time are left undecided, and what has them judged; empty when they are."""
+    usable = [row for row in rows if row.is_usable]
+    shared = sum(not row.is_timing_comparable for row in usable)
+    if not shared:
+        return []
+    return [
+        f"{shared} of {counted(len(usable), 'run')} shared a core or ran on a cluster: times of this study cannot be compared, "
+        "and findings about time are left undecided. To have them judged, run it on an idle machine into another folder: "
+        "lslam sweep STUDY --jobs 1 --out DIR"
+    ]
 
 
 def _as_text(section: Section, style: str, heading: str, item: str) -> list[str]:

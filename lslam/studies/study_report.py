@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -10,11 +11,13 @@ from lslam.config.study import read_study
 from lslam.errors import InputError
 from lslam.evaluation.sensitivity import evaluate_study
 from lslam.formats.study_csv import read_study_csv
-from lslam.reports.study_html import write_study_files
+from lslam.reports.study_html import timing_notes, write_study_files
 from lslam.studies.results import RESULTS
 from lslam.studies.sweep import MARK
 from lslam.types.sensitivity import StudyResult
 from lslam.types.study import StudyRow
+
+log = logging.getLogger("lslam")
 
 
 def write_study_report(
@@ -33,11 +36,15 @@ def write_study_report(
 def report_folder(folder: Path) -> list[StudyResult]:
     """The report of a study from its results.csv, with the findings of its study.toml when that is there.
 
+    Says so in the log when its times cannot be compared.
+
     Raises InputError for a folder without runs and what cannot be read, ConfigError for findings that make no sense, OutputError.
     """
     rows = read_study_csv(folder / RESULTS)
     if not rows:
         raise InputError(f"study {folder} has no finished run yet: lslam sweep with --out {folder} --resume makes them")
+    for note in timing_notes(rows):
+        log.warning("%s", note)
     if not (folder / MARK).is_file():
         return write_study_report(folder, rows)
     study = read_study(folder / MARK)

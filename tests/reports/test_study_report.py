@@ -15,7 +15,7 @@ import pytest
 from lslam.config.finding import Finding
 from lslam.evaluation.sensitivity import evaluate_study
 from lslam.reports.study_figures import StudyFigure, study_figures
-from lslam.reports.study_html import NOT_ALONE, write_study_files
+from lslam.reports.study_html import timing_notes, write_study_files
 from lslam.reports.study_table import means_grid, study_tables
 from lslam.types.sensitivity import StudyResult
 from lslam.types.study import StudyRow
@@ -119,13 +119,19 @@ def test_page_is_whole_escaped_and_needs_no_other_file(folder: Path) -> None:
     assert page.count('<span class="badge refuted">') == 1
     assert '<span class="badge diverged">7 without a result</span>' in page
     assert "killed &amp; gone_by 100%" in page
-    assert NOT_ALONE not in page
+    assert "lslam sweep STUDY --jobs 1" not in page
 
 
 def test_page_says_when_times_cannot_be_compared(rows: list[StudyRow], tmp_path: Path) -> None:
-    shared = [replace(r, is_timing_comparable=False) for r in rows[:4]]
+    """Of runs that have a result."""
+    some = [replace(r, is_timing_comparable=k == 1) for k, r in enumerate(rows[:4])]
+    shared = [*some, replace(rows[-2], is_timing_comparable=False)]
+    (note,) = timing_notes(shared)
+    assert note.startswith("3 of 4 runs shared a core or ran on a cluster: times of this study cannot be compared")
+    assert note.endswith("lslam sweep STUDY --jobs 1 --out DIR")
     write_study_files(tmp_path, evaluate_study(shared), shared, "study")
-    assert NOT_ALONE in (tmp_path / "report.html").read_text()
+    assert note in (tmp_path / "report.html").read_text()
+    assert timing_notes(rows) == []
 
 
 def test_tables_hold_landmarks_laws_and_failures(results: list[StudyResult]) -> None:

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
+
 from lslam.config.finding import Finding
 from lslam.formats.study_csv import read_study_csv, write_study_csv
-from lslam.studies.study_report import write_study_report
+from lslam.studies.study_report import report_folder, write_study_report
 from lslam.types.study import StudyRow
 
 
@@ -27,3 +29,17 @@ def test_report_of_rows_read_back_is_that_of_the_rows(tmp_path: Path) -> None:
     assert len(names) > 8
     for name in names:
         assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
+
+
+def test_the_log_says_when_times_cannot_be_compared(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    for is_comparable, expected in ((True, 0), (False, 1)):
+        caplog.clear()
+        row = StudyRow(
+            "r", "skip", "open", 0, "icp", parameters={"input.skip_frames": 1}, status="done", thesis_rmse=0.1,
+            angular_rmse_deg=1.0, scans=9, stages_ms={"register": 10.0}, total_time_s=1.0, is_timing_comparable=is_comparable,
+        )  # fmt: skip
+        write_study_csv(tmp_path / "results.csv", [row])
+        report_folder(tmp_path)
+        said = [r.getMessage() for r in caplog.records if r.levelname == "WARNING"]
+        assert len(said) == expected
+        assert all(sentence.startswith("1 of 1 run shared a core") for sentence in said)
