@@ -9,7 +9,7 @@ from lslam.kernels.discs import disc
 from lslam.kernels.gauss_newton import clear, trimmed, workspace
 from lslam.kernels.jit import kernel
 from lslam.kernels.linalg import invert_symmetric, rotate_symmetric
-from lslam.kernels.residuals import add_information, nearest, octant_slots
+from lslam.kernels.residuals import add_information, nearest, octant_slots, variance_of
 from lslam.kernels.surface_information import add_surface, advance_on_surfaces, thin_information
 
 Floats = NDArray[np.float64]
@@ -24,7 +24,8 @@ def linearise_gicp(source: Floats, covariance: Floats, R: Floats, t: Floats, siz
                    is_done: Flags, away2: Floats, H: Floats, S: Floats, g: Floats, facts: Floats) -> None:  # fmt: skip
     """Add to H, S (6, 6), g (6,) and facts all source points (S, 3) with covariance (S, 6), LiDAR frame, not done yet.
 
-    e = R s + t - mean of the nearest plane voxel of eight, M = inv(C_t + R C_s R^T) with the voxel's disc C_t, cost
+    e = R s + t - mean of the nearest plane voxel of eight, M = inv(C_t + R C_s R^T) with the voxel's disc C_t, as thick as
+    its points and its tilt make it (Segal et al. take all alike, but theirs are planes of twenty neighbours), cost
     robust(thin e^T M e) / thin: `thin`, the variance of a pair along a common normal, makes metres of the Mahalanobis
     distance. Without a plane the nearest blob stands in, isotropic with its mean variance, times `blob_weight`.
     Gauss-Newton holds M while the pose moves. S is the information along the normals
@@ -42,7 +43,7 @@ def linearise_gicp(source: Floats, covariance: Floats, R: Floats, t: Floats, siz
         rz = R[2, 0] * a + R[2, 1] * b + R[2, 2] * c
         x, y, z = rx + t[0], ry + t[1], rz + t[2]
         octant_slots(x, y, z, i, inverse, cells, slots, keys, table)
-        best, _, blob, _ = nearest(x, y, z, i, slots, planes)
+        best, best_d, blob, _ = nearest(x, y, z, i, slots, planes)
         if best < 0:
             if blob < 0 or blob_weight <= 0.0:
                 continue
@@ -52,8 +53,10 @@ def linearise_gicp(source: Floats, covariance: Floats, R: Floats, t: Floats, siz
         p = planes[best]
         sxx, sxy, sxz, syy, syz, szz = rotate_symmetric(R, covariance[i])
         if p[7] >= 0.0:
-            dxx, dxy, dxz, dyy, dyz, dzz = disc(p[3], p[4], p[5], sigma2)
-            share, thin = 1.0, 2.0 * sigma2
+            off = p[3] * (x - p[0]) + p[4] * (y - p[1]) + p[5] * (z - p[2])
+            across = variance_of(p, off, best_d) + sigma2
+            dxx, dxy, dxz, dyy, dyz, dzz = disc(p[3], p[4], p[5], across)
+            share, thin = 1.0, across + sigma2
         else:
             dxx, dxy, dxz, dyy, dyz, dzz = p[6], 0.0, 0.0, p[6], 0.0, p[6]
             share, thin = blob_weight, p[6] + sigma2

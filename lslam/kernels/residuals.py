@@ -63,6 +63,17 @@ def nearest(x: float, y: float, z: float, i: int, slots: NDArray[np.int32],
     return best, best_d, blob, blob_d
 
 
+@inline
+def variance_of(p: Floats, off: float, d2: float) -> float:
+    """Variance, m2, of a plane voxel's surface, a row of `planes`, beneath a point.
+
+    Its thickness, and what the doubt in its normal makes of the way to the mean: the point is `off` from the plane and
+    the root of `d2` from the mean.
+    """
+    variance: float = p[6] + TILT * p[7] * (d2 - off * off)
+    return variance
+
+
 @kernel
 def linearise(source: Floats, scatter: Floats, R: Floats, t: Floats, size: float, scale: float, sigma2: float,
               blob_weight: float, gate2: float, planes: Floats, keys: NDArray[np.int64], table: NDArray[np.int32],
@@ -114,7 +125,7 @@ def linearise(source: Floats, scatter: Floats, R: Floats, t: Floats, size: float
             )  # fmt: skip
             robust = c2 / (c2 + r * r)
             robust *= robust
-            w = robust / (p[6] + max(spread, 0.0) + sigma2 + TILT * p[7] * (best_d - r * r))
+            w = robust / (variance_of(p, r, best_d) + max(spread, 0.0) + sigma2)
             j3, j4, j5 = ry * nz - rz * ny, rz * nx - rx * nz, rx * ny - ry * nx
             add_row(H, g, w, r, nx, ny, nz, j3, j4, j5)
             facts[0] += w

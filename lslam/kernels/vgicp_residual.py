@@ -9,7 +9,7 @@ from lslam.kernels.discs import disc
 from lslam.kernels.gauss_newton import clear, trimmed, workspace
 from lslam.kernels.jit import inline, kernel
 from lslam.kernels.linalg import invert_symmetric, rotate_symmetric
-from lslam.kernels.residuals import add_information, nearest, octant_slots
+from lslam.kernels.residuals import add_information, nearest, octant_slots, variance_of
 from lslam.kernels.surface_information import add_surface, advance_on_surfaces, thin_information
 
 Floats = NDArray[np.float64]
@@ -51,16 +51,18 @@ def linearise_vgicp(source: Floats, covariance: Floats, R: Floats, t: Floats, si
             if v < 0 or (v != blob if best < 0 else planes[v, 7] < 0.0):
                 continue
             p = planes[v]
+            ex, ey, ez = x - p[0], y - p[1], z - p[2]
             if best >= 0:
-                dxx, dxy, dxz, dyy, dyz, dzz = disc(p[3], p[4], p[5], sigma2)
-                n, thin = counts[v], 2.0 * sigma2
+                off = p[3] * ex + p[4] * ey + p[5] * ez
+                across = variance_of(p, off, ex * ex + ey * ey + ez * ez) + sigma2
+                dxx, dxy, dxz, dyy, dyz, dzz = disc(p[3], p[4], p[5], across)
+                n, thin = counts[v], across + sigma2
             else:
                 dxx, dxy, dxz, dyy, dyz, dzz = p[6], 0.0, 0.0, p[6], 0.0, p[6]
                 n, thin = blob_weight * counts[v], p[6] + sigma2
             mxx, mxy, mxz, myy, myz, mzz = invert_symmetric(
                 sxx + dxx, sxy + dxy, sxz + dxz, syy + dyy, syz + dyz, szz + dzz
             )
-            ex, ey, ez = x - p[0], y - p[1], z - p[2]
             away = thin * (
                 mxx * ex * ex + myy * ey * ey + mzz * ez * ez + 2.0 * (mxy * ex * ey + mxz * ex * ez + myz * ey * ez)
             )

@@ -11,7 +11,7 @@ from numpy_voxels import FLOOR, Cell, Voxel, VoxelMap, kind_of, symmetric
 from lslam.geometry import so3
 
 Floats = NDArray[np.float64]
-MIN_POINTS, PLANARITY, EXTENT2 = 6, 0.3, 1.0
+MIN_POINTS, PLANARITY, EXTENT2, TILT = 6, 0.3, 1.0, 4.0
 
 
 @dataclass
@@ -114,11 +114,14 @@ def disc_pairs(
         near.sort(key=lambda k: float(np.sum((world - k[1]) ** 2)))
         planes = [k for k in near if k[0] == "plane"]
         blobs = [k for k in near if k[0] == "blob"][: 1 if blob_weight > 0 else 0]
-        for kind, mean, normal, variance, _, count in (planes[:1] if only_nearest else planes) or blobs:
+        for kind, mean, normal, variance, slope, count in (planes[:1] if only_nearest else planes) or blobs:
             share = 1.0 if kind == "plane" else blob_weight
             if kind == "plane":
-                C_t = EXTENT2 * (np.eye(3) - np.outer(normal, normal)) + sigma2 * np.outer(normal, normal)
-                metres2 = 2 * sigma2
+                e = world - mean
+                beside2 = float(e @ e - (normal @ e) ** 2)
+                across = sigma2 + variance + TILT * slope * beside2
+                C_t = EXTENT2 * (np.eye(3) - np.outer(normal, normal)) + across * np.outer(normal, normal)
+                metres2 = across + sigma2
             else:
                 C_t, metres2 = variance * np.eye(3), variance + sigma2
             M = np.linalg.inv(C_t + R @ symmetric(six) @ R.T)
