@@ -42,7 +42,7 @@ LOST = 4.0
 class Located:
     """Where the keyframes of a run are on the map.
 
-    T_enu_odometry : (4, 4) from the world of odometry into the map frame, right at the first match
+    T_enu_odometry : (4, 4) from the world of odometry into the map frame, right about the first match
     matches : of all keyframes; priors : the accepted ones, for the pose graph; start_sigma : (3,) of the first pose
     problem : why there are none
     """
@@ -88,13 +88,15 @@ def locate(
         return Located(T_level, osm, matches, problem=_why_none(matches, osm, extract))
     log.info("OSM: %d of %d keyframes lie on the map", len(accepted), len(matches))
     first = next((match for match in accepted if match.rank == 3), accepted[0])
-    turn = se2.compose(first.pose, se2.inverse(se2.of_se3(poses[first.keyframe])))
-    T = _lowered(se2.to_se3(turn) @ T_level, odometry[0], placed)
+    sigma = np.maximum(start.sigma, track.sigma)
+    T = _lowered(
+        se2.to_se3(_turn(store, se2.of_se3(poses), first, accepted, track, sigma)) @ T_level, odometry[0], placed
+    )
     parts = shares(accepted, len(osm.walls))
     priors = [
         PlanarPrior(m.keyframe, m.pose, m.information, m.rank, part) for m, part in zip(accepted, parts, strict=True)
     ]
-    return Located(T, osm, matches, priors, np.maximum(start.sigma, track.sigma))
+    return Located(T, osm, matches, priors, sigma)
 
 
 def finish(
@@ -182,6 +184,24 @@ def _gated(match: KeyframeMatch, track: OsmTrack, config: OsmConfig, graph: Grap
 
 def _judged(match: KeyframeMatch, doubt: str) -> KeyframeMatch:
     return replace(match, verdict="rejected", reason=doubt) if doubt else match
+
+
+def _turn(
+    store: KeyframeStore,
+    poses: Floats,
+    first: KeyframeMatch,
+    accepted: list[KeyframeMatch],
+    track: OsmTrack,
+    sigma: Floats,
+) -> Floats:
+    """The pose (3,) of the world of `poses` (K, 3) in the map frame, by the `first` match and all that are `accepted`.
+
+    A house drawn askew is enough for a first match that turns the run by degrees.
+    """
+    numbers = [first.keyframe, *(m.keyframe for m in accepted)]
+    turn = se2.compose(first.pose, se2.inverse(poses[first.keyframe]))
+    ways = np.array([store.keyframes[k].distance for k in numbers])
+    return se2.compose(track.lay(se2.compose(turn, poses[numbers]), ways, [first, *accepted], sigma), turn)
 
 
 def _lowered(T: Floats, first: Floats, placed: Floats | None) -> Floats:

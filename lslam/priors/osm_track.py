@@ -5,10 +5,13 @@ Its uncertainty opens the window in which the next match is sought, and judges w
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
 from lslam.geometry import se2
+from lslam.types.building_match import KeyframeMatch
 
 Floats = NDArray[np.float64]
 
@@ -16,6 +19,8 @@ Floats = NDArray[np.float64]
 MEMORY = 100.0
 # Directions with less than this share of the largest information are free.
 FREE = 1e-9
+# A whole run laid on its matches: rounds, and degrees of freedom (Student's t), as some lie on the neighbour's walls.
+ROUNDS, FREEDOM = 10, 3.0
 
 
 class OsmTrack:
@@ -64,11 +69,48 @@ class OsmTrack:
         kept: Floats = np.eye(3) - gain @ H
         self.covariance = kept @ self.covariance @ kept.T + gain @ R @ gain.T
 
+    def lay(self, poses: Floats, ways: Floats, matches: Sequence[KeyframeMatch], sigma: Floats) -> Floats:
+        """The pose (3,) of the frame of `poses` (M, 3) in the map frame, with which they lie on their `matches`, one each.
+
+        They lie about right already, but for `sigma` (3,) about the first of them, which one match does not tell well; and
+        the more of the `ways` (M,), m travelled, odometry went since, the less a match says of it.
+        """
+        weights = np.stack([
+            self._weight(m.information, self._map + self._drift * abs(way - ways[0]) * MEMORY)
+            for m, way in zip(matches, ways, strict=True)
+        ])  # fmt: skip
+        real, pivot = np.stack([m.pose for m in matches]), np.append(poses[0, :2], 0.0)
+        about, moved = se2.relative(pivot, poses), np.zeros(3)
+        for _ in range(ROUNDS):
+            there = se2.compose(pivot + moved, about)
+            away = real - there
+            away[:, 2] = se2.wrapped(away[:, 2])
+            squared = np.einsum("mi,mij,mj->m", away, weights, away)
+            believed = (FREEDOM + 1.0) / (FREEDOM + squared)
+            effect = np.tile(np.eye(3), (len(there), 1, 1))
+            effect[:, 0, 2], effect[:, 1, 2] = pivot[1] + moved[1] - there[:, 1], there[:, 0] - pivot[0] - moved[0]
+            pulls = np.swapaxes(effect, -1, -2) @ (believed[:, None, None] * weights)
+            normal = np.diag(1.0 / sigma**2) + (pulls @ effect).sum(axis=0)
+            pull = (pulls @ away[:, :, None]).sum(axis=0)[:, 0] - moved / sigma**2
+            moved = moved + np.linalg.solve(normal, pull)
+        return se2.compose(pivot + moved, se2.inverse(pivot))
+
+    @staticmethod
+    def _weight(information: Floats, variance: Floats) -> Floats:
+        """(3, 3) information of a match that is off by `variance` (3,) as well; what it leaves free stays free."""
+        H, own = _seen(information)
+        return np.asarray(H.T @ np.linalg.solve(own + H @ np.diag(variance) @ H.T, H))
+
     def _innovation(self, pose: Floats, information: Floats) -> tuple[Floats, Floats, Floats]:
         """Error, directions and covariance of what the match fixes."""
-        values, axes = np.linalg.eigh(information)
-        is_seen = values > FREE * values[-1]
-        H = axes[:, is_seen].T
+        H, own = _seen(information)
         away = np.asarray(pose, np.float64) - self.pose
         away[2] = se2.wrapped(away[2])
-        return H @ away, H, np.diag(1.0 / values[is_seen]) + H @ np.diag(self._map) @ H.T
+        return H @ away, H, own + H @ np.diag(self._map) @ H.T
+
+
+def _seen(information: Floats) -> tuple[Floats, Floats]:
+    """Directions (R, 3) that a match does not leave free, and the covariance (R, R) along them."""
+    values, axes = np.linalg.eigh(information)
+    is_seen = values > FREE * values[-1]
+    return axes[:, is_seen].T, np.diag(1.0 / values[is_seen])

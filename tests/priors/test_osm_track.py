@@ -1,9 +1,11 @@
 """The running estimate on the map: its uncertainty grows with the way and shrinks by what a match fixes, nothing else."""
 
 import numpy as np
+import pytest
 
 from lslam.geometry import se2
 from lslam.priors.osm_track import OsmTrack
+from lslam.types.building_match import KeyframeMatch
 
 MAP = np.array([0.5, 0.5, 0.02])
 
@@ -58,3 +60,48 @@ def test_it_begins_anew_at_a_match() -> None:
     np.testing.assert_allclose(one.covariance, np.diag([0.26, 0.26, 5e-4]))
     one.move(np.array([0.0, 0.0, 1.0]), 0.0)
     assert abs(one.pose[2] - se2.wrapped(4.0)) < 1e-12
+
+
+SURE, WALL = np.diag([1e4, 1e4, 1e6]), np.diag([0.0, 1e4, 1e6])
+START = np.array([2.0, 2.0, np.radians(5.0)])
+
+
+def laid_on(told: np.ndarray, real: np.ndarray, information: list[np.ndarray], sigma: np.ndarray = START) -> np.ndarray:
+    """(M, 3) where the keyframes end that odometry has at `told` and matches at `real`, 5 m from one to the next."""
+    matches = [
+        KeyframeMatch(k, np.zeros((0, 2, 2)), np.zeros((1, 2)), pose, np.ones(3), pose, known, rank=3)
+        for k, (pose, known) in enumerate(zip(real, information, strict=True))
+    ]
+    return se2.compose(track().lay(told, 5.0 * np.arange(len(told)), matches, sigma), told)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_run_is_laid_on_all_its_matches_though_the_first_house_is_askew(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    way = se2.compose(np.array([30.0, -20.0, 2.0]), np.column_stack([5.0 * np.arange(20), np.zeros((20, 2))]))
+    real = way + rng.normal(0, [0.1, 0.1, 0.005], way.shape)
+    real[0] = way[0] + np.array([0.1, 0.1, np.radians(2.5)])
+    real[7] += np.array([3.0, -2.0, 0.2])  # another's walls
+    told = se2.compose(real[0], se2.relative(way[0], way))
+    assert np.linalg.norm(told[-1, :2] - way[-1, :2]) > 3.5
+    off = laid_on(told, real, [SURE] * 20) - way
+    assert np.linalg.norm(off[:, :2], axis=1).max() < 0.4
+    assert np.abs(np.degrees(off[:, 2])).max() < 0.35
+
+
+def test_what_no_wall_fixes_stays_where_the_first_match_has_it() -> None:
+    told = np.column_stack([5.0 * np.arange(10), np.zeros((10, 2))])
+    found = laid_on(told, told + np.array([9.0, 0.3, 0.0]), [WALL] * 10)
+    np.testing.assert_allclose(found[:, 0], told[:, 0], atol=1e-9)
+    assert 0.25 < found[0, 1] <= 0.3
+    # And all of it where the start is known well.
+    held = laid_on(told, told + np.array([9.0, 0.3, 0.0]), [WALL] * 10, np.full(3, 1e-3))
+    np.testing.assert_allclose(held, told, atol=0.01)
+
+
+def test_far_matches_count_less_by_what_odometry_may_have_drifted_since() -> None:
+    """Odometry that runs away to one side: the beginning is laid better than the end, 400 m on."""
+    way = np.column_stack([5.0 * np.arange(80), np.zeros((80, 2))])
+    told = way + np.column_stack([np.zeros(80), 2e-4 * way[:, 0] ** 2 / 2, 2e-4 * way[:, 0]])
+    found = laid_on(told, way, [SURE] * 80)
+    assert abs(found[0, 1]) < 0.5 * abs(found[-1, 1])
