@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 from lslam.config import Config
 from lslam.formats.osm_buildings import BuildingExtract
 from lslam.geometry import se2, se3
-from lslam.graph.problem import DriftClaim, PoseGraph
-from lslam.graph.steady_drift import WallSightings, find_steady_drift, without_drift
+from lslam.graph.drift_fit import WallSightings
+from lslam.graph.problem import PoseGraph
+from lslam.graph.steady_drift import SteadyDrift, find_steady_drift, without_drift
 from lslam.keyframes.store import KeyframeStore
 from lslam.pipeline.osm_pass import Located, locate
 from lslam.priors.osm_prior import match_buildings
@@ -41,26 +42,25 @@ def find_on_map(
     held = on_map(graph, located, config)
     if located.problem or config.osm.matcher != "walls" or held.is_rigid:
         return located, held
-    claim: DriftClaim | None = None
+    before: SteadyDrift | None = None
     for _ in range(ROUNDS):
         seen = sightings(located, held.poses, config)
-        drift = find_steady_drift(held, seen, config.osm.wall_sigma, config.osm.building_sigma, config.graph)
-        if drift is None or not (drift.is_sure or claim):
+        drift = find_steady_drift(held, seen, config.osm.wall_sigma, config.osm.building_sigma, config.graph, before)
+        if drift is None or not drift.is_sure:
             break
-        # What is found at first is claimed; what is left of it then makes the claim better and not likelier.
-        rates = drift.claim.rates if claim is None else claim.rates + drift.claim.rates
-        claim = replace(claim or drift.claim, rates=rates, sigma=drift.claim.sigma)
-        held = replace(without_drift(held, drift.rates), spread=drift.spread, claim=claim)
+        before = drift
+        held = replace(without_drift(held, drift.rates), spread=drift.spread, claim=drift.claim)
         odometry = se3.inverse(located.T_enu_odometry) @ held.poses
         again = None if drift.is_settled else locate(extract, store, up, config, placed, odometry)
         if again is None or again.problem:
             break
         located = again
         held = on_map(replace(held, poses=odometry), located, config)
-    if claim is not None:
+    if before is not None:
+        rates = before.claim.rates
         log.info(
             "OSM: odometry drifts steadily by %.1f %% and %.1f deg/100 m, and is set straight",
-            100 * np.linalg.norm(claim.rates[:2]), 100 * np.degrees(claim.rates[2]),
+            100 * np.linalg.norm(rates[:2]), 100 * np.degrees(rates[2]),
         )  # fmt: skip
     return located, held
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pytest
@@ -11,12 +13,15 @@ from scipy.stats import chi2
 from test_steady_drift import MAP, SEEN, WAY, odometry, sighted
 
 from lslam.config.graph import GraphConfig
-from lslam.graph import steady_drift
+from lslam.geometry import se2
+from lslam.graph import drift_fit
+from lslam.graph.drift_fit import DriftFit, Sizes, WallSightings
 from lslam.graph.problem import PoseGraph
-from lslam.graph.steady_drift import SCALES, SIZES, WallSightings, _belief, _effects, _Fit, _rows, find_steady_drift
+from lslam.graph.steady_drift import LASTING, SCALES, SIZES, _effects, _hats, _roots, find_steady_drift, without_drift
 
 Floats = NDArray[np.float64]
-CHOICES = [(0.25, 0.0), (0.25, 0.5), (0.5, 2.0), (1.0, 8.0)]
+CHOICES = [(0.25, 0.0, 0.5), (0.25, 0.5, 0.9), (0.5, 2.0, 0.99), (1.0, 8.0, 0.5)]
+ROOTS = dict(zip(LASTING, _roots(WAY[-1], GraphConfig()), strict=True))
 
 
 def some(seen: WallSightings, chosen: NDArray[np.int64] | NDArray[np.bool_]) -> WallSightings:
@@ -30,47 +35,69 @@ def scene(seed: int, percent: float = 0.5, count: int = 150) -> tuple[PoseGraph,
     return graph, some(seen, np.random.default_rng(seed).permutation(len(seen.walls))[:count])
 
 
+def believed(size: float, lasting: float) -> Floats:
+    """Covariance of three rates at each knot, 100 m apart at most."""
+    knots = np.linspace(0.0, WAY[-1], int(np.ceil(WAY[-1] / 100.0)) + 1)
+    alike = lasting + (1 - lasting) * np.exp(-0.5 * ((knots[:, None] - knots) / 100.0) ** 2)
+    return np.asarray(size**2 * np.kron(alike, np.diag([0.01**2, 0.01**2, np.radians(0.005) ** 2])))
+
+
 class Dense:
     """The offsets as one Gaussian: what is seen, what the walls are drawn wrong by, start and shift and rates."""
 
-    def __init__(self, graph: PoseGraph, seen: WallSightings) -> None:
-        self.seen, self.rows = seen, _rows(graph, seen, _effects(graph))
-        self.given = np.append(graph.start_sigma, [graph.shift_sigma] * 2) ** 2  # type: ignore[arg-type]
-        self.believed = _belief(WAY[-1], GraphConfig())
+    def __init__(self, graph: PoseGraph, seen: WallSightings, taken: Floats | None = None) -> None:
+        self.graph, self.seen = graph, seen
+        about = seen.places - graph.poses[seen.keyframes, :2, 3]
+        turned = seen.normals[:, 1] * about[:, 0] - seen.normals[:, 0] * about[:, 1]
+        self.effects = _effects(graph)
+        axes = np.column_stack([seen.normals, turned])
+        self.rows = np.stack([axis @ self.effects[k] for axis, k in zip(axes, seen.keyframes, strict=True)])
+        self.given = np.append(graph.start_sigma, [graph.shift_sigma] * 2)  # type: ignore[arg-type]
+        self.taken = np.zeros(self.rows.shape[1] - 5) if taken is None else taken
+        self.offsets = seen.offsets - self.rows[:, 5:] @ self.taken
         self.weights = np.ones(len(seen.walls))
 
-    def fit(self) -> _Fit:
-        return _Fit(self.seen, self.rows, SEEN, MAP, self.given, self.believed)
+    def fit(self) -> DriftFit:
+        return DriftFit(self.graph, self.seen, self.effects, self.taken, SEEN, MAP, self.given)
 
-    def parts(self, scale: float, size: float) -> tuple[Floats, Floats, Floats]:
+    def parts(self, scale: float, size: float, lasting: float) -> tuple[Floats, Floats, Floats]:
         """Covariances of what is seen, of all unknowns, and of the offsets."""
-        prior = np.zeros((5 + len(self.believed),) * 2)
-        prior[:5, :5], prior[5:, 5:] = np.diag(self.given), size**2 * self.believed
+        of_rates = believed(size, lasting)
+        prior = np.zeros((5 + len(of_rates),) * 2)
+        prior[:5, :5], prior[5:, 5:] = np.diag(self.given**2), of_rates
         noise = np.diag((scale * SEEN) ** 2 / self.weights)
         drawn = MAP**2 * (self.seen.walls[:, None] == self.seen.walls)
         return noise, prior, noise + drawn + self.rows @ prior @ self.rows.T
 
-    def unlikeliness(self, scale: float, size: float) -> float:
-        _, _, C = self.parts(scale, size)
-        return float(np.linalg.slogdet(C)[1] + self.seen.offsets @ np.linalg.solve(C, self.seen.offsets))
+    def unlikeliness(self, scale: float, size: float, lasting: float) -> float:
+        _, _, C = self.parts(scale, size, lasting)
+        return float(np.linalg.slogdet(C)[1] + self.offsets @ np.linalg.solve(C, self.offsets))
 
-    def rates(self, scale: float, size: float) -> tuple[Floats, Floats]:
-        _, prior, C = self.parts(scale, size)
+    def rates(self, scale: float, size: float, lasting: float) -> tuple[Floats, Floats]:
+        _, prior, C = self.parts(scale, size, lasting)
         gain = np.linalg.solve(C, self.rows @ prior).T
-        return -(gain @ self.seen.offsets)[5:], (prior - gain @ self.rows @ prior)[5:, 5:]
+        return -(gain @ self.offsets)[5:], (prior - gain @ self.rows @ prior)[5:, 5:]
 
-    def doubt(self, scale: float, size: float) -> None:
+    def doubt(self, scale: float, size: float, lasting: float) -> None:
         """Weights of Student's t with three degrees of freedom."""
-        noise, _, C = self.parts(scale, size)
-        missed = noise @ np.linalg.solve(C, self.seen.offsets)
+        noise, _, C = self.parts(scale, size, lasting)
+        missed = noise @ np.linalg.solve(C, self.offsets)
         self.weights = 4.0 / (3.0 + (missed / (scale * SEEN)) ** 2)
 
 
-def agree(fit: _Fit, dense: Dense) -> None:
-    base = fit.unlikeliness(1.0, 1.0) - dense.unlikeliness(1.0, 1.0)
+def unlikeliness(fit: DriftFit, scale: float, size: float, lasting: float) -> float:
+    return float(fit.unlikeliness(scale, ROOTS[lasting], (0.1, size))[1])
+
+
+def sizes(scale: float, size: float, lasting: float) -> Sizes:
+    return Sizes(scale, size * ROOTS[lasting])
+
+
+def agree(fit: DriftFit, dense: Dense) -> None:
+    base = unlikeliness(fit, 1.0, 1.0, 0.9) - dense.unlikeliness(1.0, 1.0, 0.9)
     for choice in CHOICES:
-        assert fit.unlikeliness(*choice) - dense.unlikeliness(*choice) == pytest.approx(base, abs=1e-4)
-        for found, expected in zip(fit.rates(*choice), dense.rates(*choice), strict=True):
+        assert unlikeliness(fit, *choice) - dense.unlikeliness(*choice) == pytest.approx(base, abs=1e-4)
+        for found, expected in zip(fit.rates(sizes(*choice)), dense.rates(*choice), strict=True):
             np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-5 * np.abs(expected).max() + 1e-15)
 
 
@@ -78,14 +105,19 @@ def agree(fit: _Fit, dense: Dense) -> None:
 def test_likelihood_and_rates_are_those_of_all_covariances_written_out(seed: int) -> None:
     dense = Dense(*scene(seed))
     agree(dense.fit(), dense)
+    for lasting, root in ROOTS.items():
+        np.testing.assert_allclose(root @ root.T, believed(1.0, lasting), rtol=1e-9)
+    # And where poses are without some rates already, what is found are all of them.
+    taken = 0.3 * ROOTS[0.5] @ np.random.default_rng(seed).standard_normal(len(dense.taken))
+    agree(Dense(*scene(seed), taken).fit(), Dense(*scene(seed), taken))
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_what_lies_far_off_is_believed_less(seed: int) -> None:
     dense = Dense(*scene(seed))
     fit = dense.fit()
-    fit.doubt(0.5, 1.0)
-    dense.doubt(0.5, 1.0)
+    fit.doubt(sizes(0.5, 1.0, 0.9))
+    dense.doubt(0.5, 1.0, 0.9)
     assert dense.weights.min() < 0.3 < 1.0 < dense.weights.max()
     agree(fit, dense)
 
@@ -95,19 +127,21 @@ def test_five_copies_that_count_a_fifth_are_one() -> None:
     once, fifths = Dense(graph, seen).fit(), Dense(graph, some(seen, np.repeat(np.arange(len(seen.walls)), 5))).fit()
     fifths.count_less(0.2)
     for choice in CHOICES:
-        assert fifths.unlikeliness(*choice) == pytest.approx(once.unlikeliness(*choice), abs=1e-6)
-        np.testing.assert_allclose(fifths.rates(*choice)[1], once.rates(*choice)[1], rtol=1e-8, atol=1e-18)
+        assert unlikeliness(fifths, *choice) == pytest.approx(unlikeliness(once, *choice), abs=1e-6)
+        np.testing.assert_allclose(
+            fifths.rates(sizes(*choice))[1], once.rates(sizes(*choice))[1], rtol=1e-8, atol=1e-18
+        )
 
 
 @pytest.mark.parametrize("seed", [0, 2])
 def test_a_drift_is_sure_when_it_explains_more_than_chance(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(steady_drift, "FREEDOM", 1e12)
+    monkeypatch.setattr(drift_fit, "FREEDOM", 1e12)
     graph, seen = scene(seed, 1.0, 60)
     dense = Dense(graph, seen)
-    best = min(dense.unlikeliness(scale, size) for scale in SCALES for size in SIZES)
-    gain = min(dense.unlikeliness(scale, 0.0) for scale in SCALES) - best
+    best = min(dense.unlikeliness(*choice) for choice in product(SCALES, SIZES, LASTING))
+    gain = min(dense.unlikeliness(scale, 0.0, 0.5) for scale in SCALES) - best
     for factor, is_sure in ((0.9, True), (1.1, False)):
-        level = float(chi2.cdf(factor * gain, len(dense.believed)))
+        level = float(chi2.cdf(factor * gain, len(dense.taken)))
         assert 0.5 < level < 1.0
         drift = find_steady_drift(graph, seen, SEEN, MAP, GraphConfig(probability=level))
         assert drift is not None
@@ -133,3 +167,74 @@ def test_where_no_wall_is_seen_half_of_the_drift_is_believed_to_last(seed: int) 
     assert drift is not None
     assert WAY[-1] > 350.0
     np.testing.assert_allclose(drift.rates[-5:, :2].mean(axis=0), 0.5 * drift.rates[:20, :2].mean(axis=0), atol=2e-3)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_drift_that_stays_the_same_for_long_is_believed_to_go_on(seed: int) -> None:
+    graph = odometry(1.0, 0.0)
+    seen = sighted(graph, seed, 0.3)
+    drift = find_steady_drift(graph, some(seen, WAY[seen.keyframes] < 200.0), SEEN, MAP, GraphConfig())
+    assert drift is not None
+    np.testing.assert_allclose(drift.rates[-5:, :2].mean(axis=0), drift.rates[:20, :2].mean(axis=0), atol=1e-3)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_what_is_left_of_a_drift_is_no_smaller_one_where_no_wall_is_seen(seed: int) -> None:
+    """The first 80 m are without walls, and are no surer for the rest being set right already."""
+    graph = odometry(2.5, 1.0)
+
+    def later(one: PoseGraph) -> WallSightings:
+        seen = sighted(one, seed, 0.3)
+        return some(seen, WAY[seen.keyframes] > 80.0)
+
+    first = find_steady_drift(graph, later(graph), SEEN, MAP, GraphConfig())
+    assert first is not None
+    straight = without_drift(graph, first.rates)
+    again = find_steady_drift(straight, later(straight), SEEN, MAP, GraphConfig(), first)
+    anew = find_steady_drift(straight, later(straight), SEEN, MAP, GraphConfig())
+    assert again is not None
+    assert anew is not None
+    assert again.is_sure
+    assert not anew.is_sure
+    np.testing.assert_allclose(again.claim.rates[:2], [-0.015, 0.02], rtol=0.1)
+    assert again.claim.rates[2] == pytest.approx(np.radians(1.0) / 100, rel=0.1)
+    np.testing.assert_allclose(first.rates + again.rates, _hats(WAY) @ again.knots, atol=1e-12)
+    at = int(np.searchsorted(WAY, 80.0))
+    sigma = [np.sqrt(np.diag(drift.spread[at])[[0, 1, 5]]) for drift in (first, again, anew)]
+    assert (sigma[1] > 0.5 * sigma[0]).all()
+    assert (sigma[1] > 1.1 * sigma[2]).all()
+
+
+def test_no_table_of_all_sightings_and_all_unknowns_is_written_out() -> None:
+    """Two kilometres, each wall seen from thirty keyframes."""
+    count, often = 1000, 30
+    rng = np.random.default_rng(0)
+    way = 2.0 * np.arange(count)
+    heading = 0.8 * np.sin(way / 150)
+    steps = 2.0 * np.column_stack([np.cos(heading), np.sin(heading)])
+    at = np.column_stack([np.cumsum(steps, axis=0) - steps[0], heading])
+    drift = 1e-3 * np.array([2.0, -1.0, 0.02])
+    told = at + drift * way[:, None]
+    graph = PoseGraph(
+        np.stack([se2.to_se3(pose) for pose in told]), [], distances=way, start_sigma=np.full(3, 0.1), shift_sigma=2.0
+    )
+    walls = np.repeat(np.arange(count), often)
+    keyframes = np.clip(walls + np.tile(np.arange(often), count), 0, count - 1)
+    places = (at[:, :2] + rng.uniform(-20, 20, (count, 2)))[walls]
+    angles = rng.uniform(-np.pi, np.pi, count)[walls]
+    normals = np.column_stack([np.cos(angles), np.sin(angles)])
+    about = places - at[keyframes, :2]
+    moved = way[keyframes, None] * (drift[:2] + drift[2] * np.column_stack([-about[:, 1], about[:, 0]]))
+    noise = 0.04 * rng.standard_normal(len(walls)) + (0.5 * rng.standard_normal(count))[walls]
+    offsets = np.einsum("ni,ni->n", normals, moved) + noise
+    seen = WallSightings(keyframes, walls, normals, places + moved, offsets, 0.2)
+    tracemalloc.start()
+    try:
+        found = find_steady_drift(graph, seen, SEEN, MAP, GraphConfig())
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert found is not None
+    assert found.is_sure
+    assert np.linalg.norm(found.claim.rates[:2]) > 1e-3
+    assert peak < 8 * len(walls) * (5 + found.knots.size)

@@ -8,9 +8,10 @@ from graph_builders import ate, truth
 
 from lslam.config.graph import GraphConfig
 from lslam.geometry import se2, se3, so3
+from lslam.graph.drift_fit import WallSightings
 from lslam.graph.pose_graph import optimise
 from lslam.graph.problem import PlanarPrior, PoseGraph
-from lslam.graph.steady_drift import SteadyDrift, WallSightings, find_steady_drift, without_drift
+from lslam.graph.steady_drift import SteadyDrift, find_steady_drift, without_drift
 from lslam.types.constraint import Constraint
 
 COUNT = 100
