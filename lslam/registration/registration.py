@@ -19,7 +19,15 @@ from lslam.registration.residuals import NEEDS_COVARIANCE
 from lslam.registration.robust import AdaptiveThreshold, Annealing, UsualAgreement
 from lslam.registration.solver import RegistrationResult, solve
 from lslam.registration.source_covariance import source_covariance
-from lslam.registration.start_search import CLEARLY, SEARCH_SHARE, START_STEP, StandingPoints, distinct, start_offsets
+from lslam.registration.start_search import (
+    CLEARLY,
+    SEARCH_SHARE,
+    START_STEP,
+    StandingPoints,
+    distinct,
+    is_much_more,
+    start_offsets,
+)
 from lslam.registration.target import make_target
 from lslam.types.state import Stateful
 
@@ -44,7 +52,7 @@ class Registration(Stateful):
     (4, 4)
     """
 
-    STATE = ("map", "target", "threshold", "agreement", "_motion", "_index", "_starting", "_inserted", "_first")
+    STATE = ("map", "target", "threshold", "agreement", "_motion", "_index", "_starting", "_inserted", "_recent")
 
     def __init__(self, config: RegistrationConfig | None = None, preprocess: PreprocessConfig | None = None) -> None:
         self.config = config or RegistrationConfig()
@@ -64,8 +72,8 @@ class Registration(Stateful):
         self._index = 0
         self._starting = self.config.start_scans
         self._inserted = 0
-        # Points and pose of the only scan in the map, until there is a second.
-        self._first: tuple[NDArray[np.float32], NDArray[np.float64]] | None = None
+        # Points and poses of the scans that entered the map last.
+        self._recent: tuple[tuple[NDArray[np.float32], NDArray[np.float64]], ...] = ()
 
     def register(self, points: NDArray[Any], prior: NDArray[np.float64] | None = None) -> RegistrationResult:
         """Pose of points (N, 3), m, LiDAR frame; without `prior` (4, 4) the velocity is taken as constant."""
@@ -94,10 +102,8 @@ class Registration(Stateful):
         if self.residual in NEEDS_COVARIANCE and points.covariance is None:
             found = source_covariance(points.source, points.map_points, self.config.sigma**2)
             points = replace(points, covariance=found)
-        if self._inserted == 1:
-            return self._search(points, T_prior)
         if self._starting > 0:
-            return self._judge(self._coarse_to_fine(points, T_prior), T_prior)
+            return self._start(points, T_prior)
         c = self.config
         # One scan alone puts single rings into fine voxels; several fill them.
         coarse_map = self.map.coarsen(c.coarse_factor) if c.target == "scan" else None
@@ -109,15 +115,18 @@ class Registration(Stateful):
             return fine
         coarse = self._judge(self._coarse_to_fine(points, T_prior), T_prior)
         coarse = replace(coarse, iterations=coarse.iterations + fine.iterations)
-        return coarse if not fine.ok or (coarse.ok and coarse.inliers > fine.inliers) else fine
+        best = coarse if not fine.ok or (coarse.ok and coarse.inliers > fine.inliers) else fine
+        is_far = best.ok and best.prior_error[0] >= c.recover_m
+        return self._held(points, T_prior, best) if is_far and c.start_reach > 0 else best
 
     def update(self, points: PreparedPoints, result: RegistrationResult) -> None:
         """Enter the scan into the map unless its registration failed, and learn from how wrong the prior was."""
+        c = self.config
         if result.ok:
             first = len(self.map) == 0
             self.target.enter(self.map, points.map_points, result.T_world_lidar)
             self._inserted += 1
-            self._first = (points.map_points, result.T_world_lidar) if self._inserted == 1 else None
+            self._recent = (*self._recent, (points.map_points, result.T_world_lidar))[-c.start_scans :]
             if not first:
                 self._starting = max(self._starting - 1, 0)
                 self.agreement.observe(self._agreement(result))
@@ -130,18 +139,26 @@ class Registration(Stateful):
         self._motion.correct(self._index, result.T_world_lidar)
         self._index += 1
 
-    def _search(self, points: PreparedPoints, T_prior: NDArray[np.float64]) -> RegistrationResult:
+    @property
+    def _is_begun(self) -> bool:
+        """Whether so few scans are in the map that what stands on the ground is asked too."""
+        return self.config.start_reach > 0 and self._inserted <= self.config.start_scans
+
+    def _start(self, points: PreparedPoints, T_prior: NDArray[np.float64]) -> RegistrationResult:
+        """Coarse to fine; while the map is made of a few scans, what stands on the ground has the last word."""
+        found = self._judge(self._coarse_to_fine(points, T_prior), T_prior)
+        return self._held(points, T_prior, found) if self._is_begun else found
+
+    def _search(
+        self, points: PreparedPoints, T_prior: NDArray[np.float64], best: RegistrationResult,
+        standing: StandingPoints, seen: PreparedPoints,
+    ) -> RegistrationResult:  # fmt: skip
         """The best of several starts: nothing is known yet of how fast the sensor moves.
 
         Posts and crash barriers repeat every few metres, so the nearest agreement may be a false one; what stands on the
         ground tells. A few points on the coarse map show which starts are worth a whole registration.
         """
         c = self.config
-        best = self._judge(self._coarse_to_fine(points, T_prior), T_prior)
-        if c.start_reach == 0 or self._first is None:
-            return best
-        first = StandingPoints(*self._first, self.preprocess)
-        seen = first.seen_in(points.map_points)
         coarse_map, few = self._coarse_map(points, T_prior), thin(points, SEARCH_SHARE)
         slow = Annealing(2 * START_STEP, c.kernel_min, c.coarse_decay, c.start_iterations)
         tried = [
@@ -150,15 +167,47 @@ class Registration(Stateful):
             for offset in start_offsets(c.start_reach, START_STEP)
         ]  # fmt: skip
         # Where nothing stands, as in hills, what matches the ground is all that tells.
-        tried.sort(key=lambda found: (-first.share(seen, found.T_world_lidar), -found.inliers))
+        tried.sort(key=lambda found: (-standing.share(seen, found.T_world_lidar), -found.inliers))
         for promising in distinct(tried, best.T_world_lidar):
             start = promising.T_world_lidar
             found = self._judge(self._coarse_to_fine(points, start), start)
-            share, known = first.share(seen, found.T_world_lidar), first.share(seen, best.T_world_lidar)
+            share, known = (standing.share(seen, result.T_world_lidar) for result in (found, best))
             # A failed one has the prior's pose: where less stands than there, nothing is found.
             if found.ok and (share > CLEARLY * known if best.ok else share >= known):
                 best = replace(found, prior_error=correction(T_prior, found.T_world_lidar))
         return best
+
+    def _held(
+        self, points: PreparedPoints, T_prior: NDArray[np.float64], found: RegistrationResult
+    ) -> RegistrationResult:
+        """What was found, unless much more of what stands on the ground agrees elsewhere.
+
+        The few rings of a sparse sensor make planes on the road that move with it, and most of its points lie there.
+        """
+        standing = StandingPoints(self._recent, self.preprocess)
+        seen = standing.seen_in(points.map_points)
+        starts = [T_prior]
+        if self._inserted == 1:
+            found = self._search(points, T_prior, found, standing, seen)
+            starts.append(standing.likeliest(seen, T_prior, self.config.start_reach))
+
+        def share(result: RegistrationResult) -> float:
+            return standing.share(seen, result.T_world_lidar)
+
+        stood = max((standing.align(seen, start) for start in starts), key=share)
+        if not is_much_more(share(stood), share(found), len(seen.source)):
+            return found
+        place = stood.T_world_lidar
+        near = self._refine(
+            points, place, 2 * self.config.kernel_min, self.config.start_iterations, self._coarse_map(points, place)
+        )
+        judged = self._judge(near, place)
+        if not judged.ok or is_much_more(share(stood), share(judged), len(seen.source)):
+            place = standing.place_on_ground(place, near.T_world_lidar, points.map_points)
+            judged = near.moved(place, stood.covariance)
+        return replace(
+            judged, iterations=found.iterations + near.iterations, prior_error=correction(T_prior, judged.T_world_lidar)
+        )
 
     def _coarse_to_fine(self, points: PreparedPoints, T_prior: NDArray[np.float64]) -> RegistrationResult:
         """Coarse planes, annealed slowly, catch what fine voxels lose: metres per scan instead of decimetres.

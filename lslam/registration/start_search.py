@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import numpy as np
 from numpy.typing import NDArray
 
 from lslam.config.preprocess import PreprocessConfig
-from lslam.preprocessing.ground import above_ground
+from lslam.geometry import se3
+from lslam.preprocessing.ground import CELL, above_ground, levelling
 from lslam.preprocessing.prepare import PreparedPoints
 from lslam.registration.gaussian_map import GaussianMap
 from lslam.registration.robust import Annealing
@@ -19,25 +22,26 @@ Points = NDArray[np.float32]
 START_STEP = 1.0
 # Every so many-th source point is enough to tell a good start from a bad one; so many of the best are looked at closely.
 SEARCH_SHARE, LOOKED_AT = 4, 3
-# Along a bare wall the rings repeat best where nothing moved, by four percent: a start elsewhere must have more.
-CLEARLY = 1.05
+# Along a bare wall the rings repeat best where nothing moved, by up to five percent: a start elsewhere must have more, and
+# twice as much where planes, the prior or both say otherwise.
+CLEARLY, MUCH = 1.05, 1.1
 # m; points this near belong together. Poles and leaves make no planes: their voxels are as large, one point is enough,
 # and none of them passes for a plane.
 NEAR, NO_PLANES = 0.4, 2.0
 
 
 class StandingPoints:
-    """The points of one scan (M, 3) at its pose (4, 4) that do not lie on the ground.
+    """The points of a few scans that do not lie on the ground: (points (M, 3), pose (4, 4)) of each.
 
     Bare ground, guard rails and walls look alike metres further on, and a sensor's own rings match best where nothing
     moved. Posts, trees, signs and the ends of walls repeat nowhere at once, though they make few planes or none.
     """
 
-    def __init__(self, points: Points, T_world_lidar: Floats, preprocess: PreprocessConfig) -> None:
+    def __init__(self, scans: Iterable[tuple[Points, Floats]], preprocess: PreprocessConfig) -> None:
         self._preprocess = preprocess
-        standing = self._standing(points)
-        self._cells = GaussianMap(NEAR, min_points=1, planarity=NO_PLANES, reach=np.inf, capacity=_room_for(standing))
-        self._cells.insert(standing, T_world_lidar)
+        self._cells = GaussianMap(NEAR, min_points=1, planarity=NO_PLANES, reach=np.inf, capacity=1 << 12)
+        for points, T_world_lidar in scans:
+            self._cells.insert(self._standing(points), T_world_lidar)
 
     def seen_in(self, points: Points) -> PreparedPoints:
         """What to look for at some pose: the standing points of another scan (N, 3), LiDAR frame."""
@@ -46,17 +50,43 @@ class StandingPoints:
 
     def share(self, seen: PreparedPoints, T_world_lidar: Floats) -> float:
         """Part of them that have one of these points near by when seen from `T_world_lidar` (4, 4)."""
-        as_is = Annealing(NEAR, NEAR, 0.5, 1)
-        found = solve(self._cells, seen, T_world_lidar, as_is, sigma=NEAR, blob_weight=1.0, weak_share=0.0)
-        return found.inliers / max(len(seen.source), 1)
+        return self._solve(seen, T_world_lidar, Annealing(NEAR, NEAR, 0.5, 1)).inliers / max(len(seen.source), 1)
+
+    def align(self, seen: PreparedPoints, T_start: Floats) -> RegistrationResult:
+        """Lay them on these points, point to point, from less than a step away."""
+        return self._solve(seen, T_start, Annealing(START_STEP, NEAR / 2, 0.7, 20))
+
+    def likeliest(self, seen: PreparedPoints, T_prior: Floats, reach: float) -> Floats:
+        """(4, 4) pose up to `reach`, m, from the prior at which most of them have a point near by."""
+        starts = [T_prior @ se3.make(np.eye(3), offset) for offset in start_offsets(reach, NEAR)]
+        return max(starts, key=lambda start: self.share(seen, start))
+
+    def place_on_ground(self, stood: Floats, planes: Floats, points: Points) -> Floats:
+        """(4, 4) pose with place and heading of `stood`, height and tilt of `planes`, both of the scan of `points`.
+
+        Two steps as in LeGO-LOAM (Shan and Englot 2018): few rings on a post say nothing of tilt, the ground does.
+        """
+        p = self._preprocess
+        R, _ = levelling(points, p.ground_tolerance, int(p.range_max / CELL) + 1)
+        between = se3.log(se3.relative(stood, planes)).reshape(2, 3) @ R.T
+        between[0, :2] = between[1, 2] = 0.0
+        return se3.normalise(stood @ se3.exp((between @ R).ravel()))
+
+    def _solve(self, seen: PreparedPoints, T_start: Floats, annealing: Annealing) -> RegistrationResult:
+        return solve(self._cells, seen, T_start, annealing, sigma=NEAR, blob_weight=1.0, weak_share=0.0)
 
     def _standing(self, points: Points) -> Points:
         p = self._preprocess
         return points[above_ground(points, p.ground_slope, p.ground_tolerance)]
 
 
-def _room_for(points: Points) -> int:
-    return 1 << max(8, int(np.ceil(np.log2(len(points) + 1))))
+def is_much_more(share: float, other: float, count: int) -> bool:
+    """Whether of `count` points a much larger share agrees at one pose than at the `other`, and not by chance.
+
+    McNemar's test of paired shares at two sigma, with as many points in dispute as there can be.
+    """
+    in_dispute = count * (2 - share - other)
+    return share > MUCH * other and count * (share - other) > 2 * np.sqrt(in_dispute)
 
 
 def distinct(results: list[RegistrationResult], known: Floats) -> list[RegistrationResult]:
