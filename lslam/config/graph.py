@@ -30,6 +30,9 @@ class GraphConfig(Section):
         1.0, gt=0, description="%; one sigma of what odometry may be wrong by over a distance, when loops are judged"
     )
     drift_deg_per_100m: float = Field(0.5, gt=0, description="deg/100 m; likewise of its heading, roll and pitch")
+    steady_drift: bool = Field(
+        True, description="set odometry straight where loops tell that it runs away at one rate, before they are closed"
+    )
     max_iterations: int = Field(100, ge=1, description="of the optimiser, per solution")
     gravity: bool = Field(True, description="with an IMU: hold each keyframe's up direction to what it measured")
     gravity_deg: float = Field(0.3, gt=0, description="deg; one sigma of that direction: 0.05 m/s2 of bias are 0.3 deg")

@@ -152,16 +152,17 @@ def _cycle_errors(
     to_aj = to_bj @ se3.inverse(ends.T[j])
     by_b, by_a = drift.covariance(ends.b[i], ends.b[j]), drift.covariance(ends.a[j], ends.a[i])
     S = ends.covariances[i] + _carried(by_b, ahead, to_bi)
-    S += _moved(ends.covariances[j], to_aj) + _carried(by_a, home, to_aj)
+    S += moved(ends.covariances[j], to_aj) + _carried(by_a, home, to_aj)
     sharpness = 1.0 / (SLACK_M**2 + by_b[:, 0, 0] + by_a[:, 0, 0])
     return _squared(se3.log(to_aj @ home), S + _slack(len(i))), sharpness
 
 
 def _carried(covariance: Floats, T: Floats, to: Floats) -> Floats:
-    return _moved(as_twists(covariance, T), to)
+    return moved(as_twists(covariance, T), to)
 
 
-def _moved(covariance: Floats, to: Floats) -> Floats:
+def moved(covariance: Floats, to: Floats) -> Floats:
+    """Covariances of twists before `to` (..., 4, 4) as those of twists after it."""
     A = se3.adjoint(to)
     return np.asarray(A @ covariance @ np.swapaxes(A, -1, -2))
 

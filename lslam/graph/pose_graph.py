@@ -30,12 +30,12 @@ def optimise(graph: PoseGraph, config: GraphConfig) -> Solution:
     Raises GraphError when the graph is in pieces, singular or not finite.
     """
     check_graph(graph)
-    graph = _with_distances(graph)
+    graph = with_distances(graph)
     reasons = judge_loops(graph, config) if config.is_pairwise else [""] * len(graph.loops)
     stages = ["consistency" if reason else "graph" for reason in reasons]
     kept = [i for i, reason in enumerate(reasons) if not reason]
     loops = [graph.loops[i] for i in kept]
-    drift = 0.0 if graph.is_rigid else drift_factor(graph, loops, config)
+    drift = 0.0 if graph.is_rigid else max(drift_factor(graph, loops, config), graph.walk)
     graph = replace(graph, odometry=with_drift(graph, drift, config))
     may_tilt = graph.is_anchored and len(graph.ups) > 0
     is_placed = graph.start_sigma is not None or not graph.is_anchored
@@ -131,7 +131,7 @@ def check_graph(graph: PoseGraph) -> None:
         raise GraphError(f"the pose graph is in pieces: odometry does not join keyframe {lost} to the first")
 
 
-def _with_distances(graph: PoseGraph) -> PoseGraph:
+def with_distances(graph: PoseGraph) -> PoseGraph:
     """The graph with the distances travelled along its poses, where nobody filled them in."""
     if len(graph.distances) == len(graph):
         return graph

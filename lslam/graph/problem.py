@@ -69,7 +69,8 @@ class PlanarPrior:
 class DriftClaim:
     """A steady drift that odometry is said to have.
 
-    rates, sigma : (3,) per m, the mean over the way: m along x and y of the world, rad of heading, to the left
+    rates, sigma : per m, the mean over the way: (3,) m along x and y of the world, rad of heading, to the left; or (6,) m along
+        x, y and z, rad about them
     gain : how much lower minus twice the logarithm of the likelihood is with it; chance : what that stays below by chance
     """
 
@@ -91,6 +92,7 @@ class PoseGraph:
     is_anchored : whether the first pose is held where it is; else the fixes hold the graph
     start_sigma : (3,) x, y (m), yaw (rad), how well these are known of a first pose that is held only otherwise
     is_rigid : odometry is trusted: the whole moves, and nothing bends it
+    walk : factor on `drift.drift_covariance` that odometry errs by at the least beside its covariances
     spread : (K, 6, 6) what poses are unsure by beside all that, as the covariances of `Solution`; None for nothing
     claim : the steady drift that odometry was set right by before it came here
     """
@@ -110,6 +112,7 @@ class PoseGraph:
     is_anchored: bool = True
     start_sigma: Floats | None = None
     is_rigid: bool = False
+    walk: float = 0.0
     spread: Floats | None = None
     claim: DriftClaim | None = None
 

@@ -8,28 +8,26 @@ seen: that a wall moves while the run passes it tells a rate, whatever the map i
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lslam.config.graph import GraphConfig
-from lslam.geometry import se3, so3
 from lslam.graph.chi_square import quantile
 from lslam.graph.drift_fit import DriftFit, Sizes, WallSightings
 from lslam.graph.factors import PLANAR
 from lslam.graph.problem import DriftClaim, PoseGraph
+from lslam.graph.rates import SIZES, hats, rate_roots, set_straight
 
 Floats = NDArray[np.float64]
 
-# m over which a rate is about one and the same.
-MEMORY = 100.0
-# Times the errors of what is seen, and times the drift, that the configuration believes in: the likeliest are taken. From far
-# and at a grazing angle a wall is seen elsewhere than from near, by some centimetres for many keyframes: none is seen better.
-SCALES, SIZES = (0.25, 0.5, 1.0), (0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
-# Shares of the variance of rates that last for the whole run, as a calibration does. The more, the farther drift is believed to
-# go on where no wall is seen, so more is believed only of what is likelier by so much that chance seldom explains it.
-LASTING, SELDOM = (0.5, 0.9, 0.99), 0.95
+# Times the errors of what is seen that the configuration believes in: the likeliest are taken. From far and at a grazing angle
+# a wall is seen elsewhere than from near, by some centimetres for many keyframes: none is seen better.
+SCALES = (0.25, 0.5, 1.0)
+# The more lasts, the farther drift is believed to go on where no wall is seen, so more is believed only of what is likelier by
+# so much that chance seldom explains it.
+SELDOM = 0.95
 ROUNDS = 6
 SETTLED = 0.1  # of the squared length that chance would give rates
 
@@ -73,12 +71,12 @@ def find_steady_drift(
     """
     if not len(seen.walls) or graph.start_sigma is None or graph.distances[-1] <= 0:
         return None
-    effects, hats = _effects(graph), _hats(graph.distances)
-    taken = np.zeros(3 * hats.shape[1]) if before is None else before.knots.ravel()
+    effects, at_knots = _effects(graph), hats(graph.distances)
+    taken = np.zeros(3 * at_knots.shape[1]) if before is None else before.knots.ravel()
     fit = DriftFit(
         graph, seen, effects, taken, seen_sigma, map_sigma, np.append(graph.start_sigma, [graph.shift_sigma] * 2)
     )
-    roots = _roots(graph.distances[-1], config)
+    roots = rate_roots(graph.distances[-1], config, PLANAR)
     sizes = _likeliest(fit, roots)
     for _ in range(ROUNDS):
         fit.doubt(sizes)
@@ -90,13 +88,13 @@ def find_steady_drift(
     without = min(float(fit.unlikeliness(noise, sizes.root, (0.0,))[0]) for noise in SCALES)
     gain = without - float(fit.unlikeliness(sizes.noise, sizes.root, (1.0,))[0])
     new = found - taken
-    mean = np.kron(np.diff(graph.distances) / np.ptp(graph.distances) @ hats, np.eye(3))
+    mean = np.kron(np.diff(graph.distances) / np.ptp(graph.distances) @ at_knots, np.eye(3))
     sigma = np.sqrt(np.diag(mean @ covariance @ mean.T))
     moves = effects[:, :, 5:]
     spread = np.zeros((len(graph), 6, 6))
     spread[:, np.array(PLANAR)[:, None], PLANAR] = moves @ covariance @ np.swapaxes(moves, -1, -2)
     return SteadyDrift(
-        found.reshape(-1, 3), np.asarray(hats @ new.reshape(-1, 3)), spread,
+        found.reshape(-1, 3), np.asarray(at_knots @ new.reshape(-1, 3)), spread,
         DriftClaim(-(mean @ found), sigma, gain, quantile(config.probability, len(found))),
         is_settled=float(new @ np.linalg.solve(covariance, new)) <= SETTLED * len(found),
     )  # fmt: skip
@@ -115,30 +113,18 @@ def _likeliest(fit: DriftFit, roots: Sequence[Floats]) -> Sizes:
 
 def without_drift(graph: PoseGraph, rates: NDArray[np.float64]) -> PoseGraph:
     """The graph with poses and odometry set right by `rates` of `find_steady_drift`."""
-    steps = se3.relative(graph.poses[:-1], graph.poses[1:])
-    poses = [graph.poses[0]]
-    for step, way, rate in zip(steps, np.diff(graph.distances), rates, strict=True):
-        pose = poses[-1] @ step
-        pose[:3, :3] = so3.exp(np.array([0.0, 0.0, rate[2] * way])) @ pose[:3, :3]
-        pose[:2, 3] += rate[:2] * way
-        poses.append(pose)
-    moved = se3.normalise(np.stack(poses))
-    odometry = [
-        replace(
-            c, T_a_b=se3.relative(moved[c.a], graph.poses[c.a] @ c.T_a_b @ se3.relative(graph.poses[c.b], moved[c.b]))
-        )
-        for c in graph.odometry
-    ]
-    return replace(graph, poses=moved, odometry=odometry)
+    whole = np.zeros((len(rates), 6))
+    whole[:, PLANAR] = rates
+    return set_straight(graph, whole)
 
 
 def _effects(graph: PoseGraph) -> Floats:
     """(K, 3, 5 + 3 n) what start, shift of the map, and rates at the knots do to planar poses, as seen from the map."""
-    place, way, hats = graph.poses[:, :2, 3], np.diff(graph.distances), _hats(graph.distances)
-    passed = way[:, None] * hats
+    place, way, at_knots = graph.poses[:, :2, 3], np.diff(graph.distances), hats(graph.distances)
+    passed = way[:, None] * at_knots
     about = _across(0.5 * (place[1:] + place[:-1]))[:, :, None] * passed[:, None]
     behind, turned = (np.concatenate([0 * part[:1], np.cumsum(part, axis=0)]) for part in (passed, about))
-    effects = np.zeros((len(place), 3, 5 + 3 * hats.shape[1]))
+    effects = np.zeros((len(place), 3, 5 + 3 * at_knots.shape[1]))
     effects[:, :, :3] = np.eye(3)
     effects[:, :2, 2] = _across(place - place[0])
     effects[:, :2, 3:5] = -np.eye(2)
@@ -151,22 +137,3 @@ def _effects(graph: PoseGraph) -> Floats:
 def _across(away: Floats) -> Floats:
     """Where a small turn moves what lies `away` (..., 2), per rad."""
     return np.stack([-away[..., 1], away[..., 0]], axis=-1)
-
-
-def _knots(length: float) -> Floats:
-    return np.linspace(0.0, length, int(np.ceil(length / MEMORY)) + 1)
-
-
-def _hats(distances: Floats) -> Floats:
-    """(K-1, n) how much each knot counts halfway between two keyframes."""
-    middle, knots = 0.5 * (distances[1:] + distances[:-1]), _knots(distances[-1])
-    return np.column_stack([np.interp(middle, knots, unit) for unit in np.eye(len(knots))])
-
-
-def _roots(length: float, config: GraphConfig) -> list[Floats]:
-    """(3 n, 3 n) each, roots of covariances of the rates at the knots, one for each of `LASTING`."""
-    knots = _knots(length)
-    alike = np.exp(-0.5 * ((knots[:, None] - knots) / MEMORY) ** 2)
-    percent, turn = 0.01 * config.drift_percent, np.radians(config.drift_deg_per_100m) / 100
-    size = np.diag([percent, percent, turn])
-    return [np.asarray(np.kron(np.linalg.cholesky(share + (1.0 - share) * alike), size)) for share in LASTING]

@@ -14,6 +14,7 @@ from lslam.errors import GraphError
 from lslam.geometry import se3
 from lslam.graph.drift import tilt_factor
 from lslam.graph.factors import well_conditioned
+from lslam.graph.loop_drift import without_loop_drift
 from lslam.graph.odometry import corrected
 from lslam.graph.pose_graph import optimise
 from lslam.graph.problem import DriftClaim, PoseGraph, Solution
@@ -26,6 +27,12 @@ from lslam.types.scan_result import ScanResult
 
 log = logging.getLogger("lslam")
 Floats = NDArray[np.float64]
+
+# What the rates of a claimed drift are called, by who told it.
+_OF_WALLS = ("east_percent", "north_percent", "left_deg_per_100m")
+_OF_LOOPS = (
+    "x_percent", "y_percent", "z_percent", "about_x_deg_per_100m", "about_y_deg_per_100m", "left_deg_per_100m"
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -82,6 +89,7 @@ def solve(graph: PoseGraph, given: Given, georeference: Georeference | None = No
     """
     config = given.config
     try:
+        graph = _set_straight(graph, config)
         solution = optimise(graph, config.graph)
     except (GraphError, np.linalg.LinAlgError) as error:
         given.problems.append(f"{error}; the run goes on without it")
@@ -109,6 +117,20 @@ def solve(graph: PoseGraph, given: Given, georeference: Georeference | None = No
     # As they were solved: the covariance of odometry may be singular, and no information can be written of that.
     kept = [replace(c, covariance=well_conditioned(c.covariance)) for c in (*graph.odometry, *believed)]
     return BackEnd(moved, judged, solution.poses, kept, georeference, T, solution=solution, facts=facts)
+
+
+def _set_straight(graph: PoseGraph, config: Config) -> PoseGraph:
+    """The graph without a steady drift that loops tell; as it is where fixes or walls hold it, which tell more of it."""
+    if not config.graph.steady_drift or graph.fixes or graph.map_priors or graph.is_rigid:
+        return graph
+    graph = without_loop_drift(graph, config.graph)
+    if graph.claim is not None:
+        shift, turn = (float(np.linalg.norm(part)) for part in np.split(graph.claim.rates, 2))
+        log.info(
+            "loops: odometry drifts steadily by %.1f %% and %.1f deg/100 m, and is set straight",
+            100 * shift, 100 * np.degrees(turn),
+        )  # fmt: skip
+    return graph
 
 
 def unsolved(given: Given) -> BackEnd:
@@ -181,7 +203,8 @@ def _facts(
 
 
 def _claimed(claim: DriftClaim) -> dict[str, Any]:
-    names, units = ("east_percent", "north_percent", "left_deg_per_100m"), 100.0 * np.array([1.0, 1.0, np.degrees(1.0)])
+    names = _OF_WALLS if len(claim.rates) == len(_OF_WALLS) else _OF_LOOPS
+    units = np.array([100.0 if name.endswith("percent") else np.degrees(100.0) for name in names])
     return {
         name: {"estimate": round(float(rate), 4), "sigma": round(float(sigma), 4)}
         for name, rate, sigma in zip(names, units * claim.rates, units * claim.sigma, strict=True)

@@ -66,17 +66,27 @@ def building_figures(found: CorrectedMap, matches: OsmMatches, poses: NDArray[np
 
 
 def drift_tables(record: RunRecord) -> list[Table]:
-    """The steady drift that walls told and that was taken out; none where none was claimed."""
+    """The steady drift that walls or loops told and that was taken out; none where none was claimed."""
     claim = record.manifest.get("graph", {}).get("steady_drift")
     if not claim:
         return []
-    words = (("east_percent", "to the east, %"), ("north_percent", "to the north, %"),
-             ("left_deg_per_100m", "turn to the left, deg/100 m"))  # fmt: skip
-    rows = tuple((word, f"{claim[name]['estimate']:+.3f}", f"{claim[name]['sigma']:.3f}") for name, word in words)
+    words = (
+        ("east_percent", "to the east, %"), ("north_percent", "to the north, %"), ("x_percent", "along x, %"),
+        ("y_percent", "along y, %"), ("z_percent", "along z, %"), ("about_x_deg_per_100m", "turn about x, deg/100 m"),
+        ("about_y_deg_per_100m", "turn about y, deg/100 m"), ("left_deg_per_100m", "turn to the left, deg/100 m"),
+    )  # fmt: skip
+    rows = tuple(
+        (word, f"{claim[name]['estimate']:+.3f}", f"{claim[name]['sigma']:.3f}")
+        for name, word in words
+        if name in claim
+    )
+    told, then = "walls moved while they were passed", "the map held it"
+    if "x_percent" in claim:
+        told, then = "loops over different ways tell one rate", "they were closed"
     recipe = (
-        "So odometry ran away, in the mean over the way: walls moved while they were passed. It was set right before the map "
-        f"held it. The logarithm of the likelihood is higher with the drift by {claim['log_likelihood_gain']:.1f}; chance stays "
-        f"below {claim['gain_by_chance']:.1f}."
+        f"So odometry ran away, in the mean over the way: {told}. It was set right before {then}. The logarithm of the "
+        f"likelihood is higher with the drift by {claim['log_likelihood_gain']:.1f}; chance stays below "
+        f"{claim['gain_by_chance']:.1f}."
     )
     return [Table("Steady drift of odometry", ("drift", "estimate", "sigma"), rows, recipe)]
 

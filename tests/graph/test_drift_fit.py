@@ -16,12 +16,14 @@ from lslam.config.graph import GraphConfig
 from lslam.geometry import se2
 from lslam.graph import drift_fit
 from lslam.graph.drift_fit import DriftFit, Sizes, WallSightings
+from lslam.graph.factors import PLANAR
 from lslam.graph.problem import PoseGraph
-from lslam.graph.steady_drift import LASTING, SCALES, SIZES, _effects, _hats, _roots, find_steady_drift, without_drift
+from lslam.graph.rates import LASTING, SIZES, hats, rate_roots
+from lslam.graph.steady_drift import SCALES, _effects, find_steady_drift, without_drift
 
 Floats = NDArray[np.float64]
 CHOICES = [(0.25, 0.0, 0.5), (0.25, 0.5, 0.9), (0.5, 2.0, 0.99), (1.0, 8.0, 0.5)]
-ROOTS = dict(zip(LASTING, _roots(WAY[-1], GraphConfig()), strict=True))
+ROOTS = dict(zip(LASTING, rate_roots(WAY[-1], GraphConfig(), PLANAR), strict=True))
 
 
 def some(seen: WallSightings, chosen: NDArray[np.int64] | NDArray[np.bool_]) -> WallSightings:
@@ -198,7 +200,7 @@ def test_what_is_left_of_a_drift_is_no_smaller_one_where_no_wall_is_seen(seed: i
     assert not anew.is_sure
     np.testing.assert_allclose(again.claim.rates[:2], [-0.015, 0.02], rtol=0.1)
     assert again.claim.rates[2] == pytest.approx(np.radians(1.0) / 100, rel=0.1)
-    np.testing.assert_allclose(first.rates + again.rates, _hats(WAY) @ again.knots, atol=1e-12)
+    np.testing.assert_allclose(first.rates + again.rates, hats(WAY) @ again.knots, atol=1e-12)
     at = int(np.searchsorted(WAY, 80.0))
     sigma = [np.sqrt(np.diag(drift.spread[at])[[0, 1, 5]]) for drift in (first, again, anew)]
     assert (sigma[1] > 0.5 * sigma[0]).all()

@@ -93,6 +93,34 @@ def test_loops_take_the_drift_away(seed: int) -> None:
         assert np.linalg.eigvalsh(result.covariance).min() > 0
 
 
+def test_drift_that_lasts_is_set_right_and_said() -> None:
+    results = drifted()
+    done = run_back_end(Stub([]), results, store_of(results), config(), LOOPS)
+    plain = run_back_end(Stub([]), results, store_of(results), config("graph.steady_drift=false"), LOOPS)
+    assert error(done) < 0.8 * error(plain)
+    assert "steady_drift" not in plain.facts
+    told = done.facts["steady_drift"]
+    shift = np.array([told[f"{axis}_percent"]["estimate"] for axis in "xyz"])
+    assert np.linalg.norm(shift) == pytest.approx(1.0, abs=0.1)
+    assert abs(told["left_deg_per_100m"]["estimate"]) == pytest.approx(0.5, abs=0.05)
+    assert told["log_likelihood_gain"] > told["gain_by_chance"] > 0
+    # The odometry that is written is the one that was solved.
+    steps = [c for c in done.constraints if c.b == c.a + 1]
+    ends = [se3.relative(done.keyframes[c.a], done.keyframes[c.b]) for c in steps]
+    assert max(np.linalg.norm(T[:3, 3] - c.T_a_b[:3, 3]) for T, c in zip(ends, steps, strict=True)) < 0.012
+
+
+def test_without_drift_nothing_is_set_right() -> None:
+    results = drifted("debug.drift_percent=0", "debug.drift_deg_per_100m=0")
+    dones = [
+        run_back_end(Stub([]), results, store_of(results), config(*words), LOOPS)
+        for words in ((), ("graph.steady_drift=false",))
+    ]
+    assert "steady_drift" not in dones[0].facts
+    for a, b in zip(*(done.results for done in dones), strict=True):
+        np.testing.assert_array_equal(a.T_world_lidar, b.T_world_lidar)
+
+
 def test_wrong_loops_are_refused_and_say_so() -> None:
     results = drifted()
     wrong = [candidate(a, a + 160, off=15.0) for a in (10, 60, 110, 160)]

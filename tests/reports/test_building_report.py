@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.reports.back_end import back_end_rows
-from lslam.reports.buildings import MOST_ROWS, building_figures, building_pages, building_tables
+from lslam.reports.buildings import MOST_ROWS, building_figures, building_pages, building_tables, drift_tables
 from lslam.types.building import Building, Footprint
 from lslam.types.building_correction import BuildingCorrection, CorrectedMap
 from lslam.types.building_match import BuildingMatch, KeyframeMatch, OsmMatches
@@ -132,6 +132,22 @@ def test_a_drift_that_was_set_right_is_told_with_how_sure_it_is(make_record: Cal
     said = dict(back_end_rows(record, None))["steady drift"]
     assert said.startswith("to the east, % -2.400 ± 0.123; ")
     assert said.endswith("+1.500 ± 0.030, set right")
+    assert "walls moved while they were passed" in table.recipe
+
+
+def test_a_drift_that_loops_told_is_told_along_the_axes_of_the_run(make_record: Callable[..., RunRecord]) -> None:
+    record = make_record(10)
+    told = {"estimate": 0.5, "sigma": 0.01}
+    names = ["x_percent", "y_percent", "z_percent", "about_x_deg_per_100m", "about_y_deg_per_100m", "left_deg_per_100m"]
+    claim = dict.fromkeys(names, told) | {"log_likelihood_gain": 60.0, "gain_by_chance": 11.2}
+    record.manifest = {"graph": {"steady_drift": claim}}
+    (table,) = drift_tables(record)
+    assert [word for word, _, _ in table.rows] == [
+        "along x, %", "along y, %", "along z, %", "turn about x, deg/100 m", "turn about y, deg/100 m",
+        "turn to the left, deg/100 m",
+    ]  # fmt: skip
+    assert "loops over different ways tell one rate" in table.recipe
+    assert dict(back_end_rows(record, None))["steady drift"].startswith("along x, % +0.500 ± 0.010; ")
 
 
 def test_the_summary_counts_buildings(make_record: Callable[..., RunRecord]) -> None:

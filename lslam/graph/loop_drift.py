@@ -1,0 +1,170 @@
+"""Odometry that runs away steadily, as loops reveal it, and that is set straight before the graph is solved.
+
+What odometry drifted by between the ends of a loop is a walk, of which each loop tells its own sum, or a rate, which one loop
+tells all the others. A graph knows walks only: it spreads what a loop is off by as well as it can, and is far too unsure where
+that was right. Which of the two it was is told by loops over different ways.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.config.graph import GraphConfig
+from lslam.geometry import noise, se3, so3
+from lslam.graph.chi_square import quantile
+from lslam.graph.consistency import Ends, as_twists, judge_loops, moved
+from lslam.graph.drift import drift_covariance
+from lslam.graph.drift_fit import FREEDOM
+from lslam.graph.pose_graph import check_graph, with_distances
+from lslam.graph.problem import DriftClaim, PoseGraph
+from lslam.graph.rates import LASTING, SIZES, hats, rate_roots, set_straight
+from lslam.types.constraint import Constraint
+
+Floats = NDArray[np.float64]
+
+# Loops that are looked at, evenly spread.
+MOST = 30
+# Times the drift of the configuration, as variance of a walk, that are believed in.
+WALKS = (0.0, 1e-4, 1e-3, 0.01, 0.1, 1.0, 10.0, 100.0)
+# Shares of the variance of rates that last: all of it, too, since loops are few and tell nothing of places between them.
+LASTS = (*LASTING, 0.9999)
+# How often the loops are asked, each time of what was set straight by the last answer, and doubting what did not fit it.
+ROUNDS = 4
+
+
+def without_loop_drift(graph: PoseGraph, config: GraphConfig) -> PoseGraph:
+    """The graph set straight by the drift that its loops tell, which it says as `claim`; as it is where they tell none.
+
+    Rates and a walk have unknown sizes. Rates are of that kind with which the loops are likeliest, and they are drift where
+    this is likelier than any walk alone by more than chance would have it; the walk is the mean of those that are likely then.
+
+    Raises GraphError when the graph is in pieces or not finite.
+    """
+    check_graph(graph)
+    graph = with_distances(graph)
+    reasons = judge_loops(graph, config)
+    loops = [loop for loop, reason in zip(graph.loops, reasons, strict=True) if not reason]
+    if not loops or graph.distances[-1] <= 0:
+        return graph
+    loops = [loops[i] for i in np.unique(np.linspace(0, len(loops) - 1, MOST).round().astype(int))]
+    at_knots = hats(graph.distances)
+    straight, found, weights = graph, np.zeros(6 * at_knots.shape[1]), np.ones(len(loops))
+    for _ in range(ROUNDS):
+        fit = _Fit(straight, loops, found, weights, config)
+        found, covariance, walk = fit.likeliest()
+        weights = fit.believable()
+        straight = set_straight(graph, at_knots @ found.reshape(-1, 6))
+    gain = float(fit.unlikeliness[:, 0].min() - fit.unlikeliness.min())
+    chance = quantile(config.probability, 6)
+    if gain <= chance:
+        return graph
+    share = np.diff(graph.distances) / np.ptp(graph.distances)
+    mean = np.kron(share @ at_knots, np.eye(6))
+    sigma = np.sqrt(np.diag(mean @ covariance @ mean.T)).astype(np.float64)
+    claim = DriftClaim(-np.asarray(mean @ found, np.float64), sigma, gain, chance)
+    return replace(straight, spread=fit.spread(covariance), walk=walk, claim=claim)
+
+
+class _Fit:
+    """What loops say of the odometry of `graph`, which was set straight by `found` (6 n,), rates at the knots, already.
+
+    Errors are twists of the world about the middle of the way: those of parts of the way add up there.
+    weights : (L,) what each loop counts
+    unlikeliness : (walks, 1 + LASTS * SIZES) minus twice the logarithm of the likelihood but for a constant; column 0 is that
+        without rates
+    """
+
+    def __init__(
+        self, graph: PoseGraph, loops: Sequence[Constraint], found: Floats, weights: Floats, config: GraphConfig
+    ) -> None:
+        self._poses = se3.make(np.eye(3), -graph.poses[:, :3, 3].mean(0)) @ graph.poses
+        ends, P, self._weights = Ends(loops), self._poses, weights
+        self._effects = _effects(P, graph.distances)
+        self._rows = (self._effects[ends.b] - self._effects[ends.a]).reshape(-1, len(found))
+        self._off = se3.log(P[ends.a] @ ends.T @ se3.inverse(P[ends.b])).ravel() + self._rows @ found
+        self._noise = moved(ends.covariances, P[ends.a])
+        lengths = np.linalg.norm([c.T_a_b[:3, 3] for c in graph.odometry], axis=1)
+        self._known, self._walk = (
+            _shared(_accumulated(P, graph.odometry, np.array(own)), ends)
+            for own in (
+                [c.covariance for c in graph.odometry], [drift_covariance(length, config) for length in lengths]
+            )
+        )  # fmt: skip
+        self._known += _on_diagonal(self._noise / weights[:, None, None])
+        roots = rate_roots(graph.distances[-1], config, list(range(6)), LASTS)
+        self._priors = [np.zeros_like(roots[0])] + [size**2 * root @ root.T for root in roots for size in SIZES]
+        drifted = [self._rows @ prior @ self._rows.T for prior in self._priors]
+        self.unlikeliness = np.array(
+            [[_unlikely(self._walked(walk) + D, self._off) for D in drifted] for walk in WALKS]
+        )
+
+    def likeliest(self) -> tuple[Floats, Floats, float]:
+        """(6 n,) rates at the knots, their covariance (6 n, 6 n), and the walk beside them."""
+        prior, walk = self._choice()
+        seen = self._rows @ prior
+        gain = np.linalg.solve(self._walked(walk) + seen @ self._rows.T, seen).T
+        return np.asarray(gain @ self._off), np.asarray(prior - gain @ seen), walk
+
+    def believable(self) -> Floats:
+        """(L,) what each loop should count: less when it lies far from where all the rest has it."""
+        prior, walk = self._choice()
+        told = np.linalg.solve(self._walked(walk) + self._rows @ prior @ self._rows.T, self._off).reshape(-1, 6, 1)
+        away = self._noise / self._weights[:, None, None] @ told
+        pulls = np.linalg.solve(self._noise, away)
+        return np.asarray((FREEDOM + 6.0) / (FREEDOM + (away * pulls).sum((1, 2))))
+
+    def spread(self, covariance: Floats) -> Floats:
+        """(K, 6, 6) what poses are unsure by when rates are by `covariance` (6 n, 6 n), as the covariances of `Solution`."""
+        about_middle = self._effects @ covariance @ np.swapaxes(self._effects, -1, -2)
+        return noise.transported(about_middle, self._poses[:, :3, 3])
+
+    def _choice(self) -> tuple[Floats, float]:
+        """The covariance of rates of the likeliest kind before any loop, and the walk."""
+        likely = np.exp(-0.5 * (self.unlikeliness[:, 1:] - self.unlikeliness[:, 1:].min()))
+        return self._priors[1 + int(likely.sum(0).argmax())], float(WALKS @ likely.sum(1) / likely.sum())
+
+    def _walked(self, walk: float) -> Floats:
+        return np.asarray(self._known + walk * self._walk)
+
+
+def _unlikely(S: Floats, off: Floats) -> float:
+    """Minus twice the logarithm of the likelihood of `off` (N,) with the covariance S, but for a constant."""
+    return float(np.linalg.slogdet(S)[1] + off @ np.linalg.solve(S, off))
+
+
+def _effects(poses: Floats, distances: Floats) -> Floats:
+    """(K, 6, 6 n) twist about the origin that rates at the knots have brought each pose."""
+    step = np.tile(np.eye(6), (len(poses) - 1, 1, 1))
+    step[:, :3, 3:] = so3.hat(poses[1:, :3, 3])
+    passed = np.diff(distances)[:, None] * hats(distances)
+    effects = np.zeros((len(poses), 6, passed.shape[1], 6))
+    np.cumsum(step[:, :, None] * passed[:, None, :, None], axis=0, out=effects[1:])
+    return effects.reshape(len(poses), 6, -1)
+
+
+def _accumulated(poses: Floats, odometry: Sequence[Constraint], covariances: Floats) -> Floats:
+    """(K, 6, 6) of the twist about the origin that errors of odometry have brought each pose."""
+    steps = [i for i, c in enumerate(odometry) if c.b == c.a + 1]
+    a, T = np.array([odometry[i].a for i in steps]), np.stack([odometry[i].T_a_b for i in steps])
+    total = np.zeros((len(poses), 6, 6))
+    total[a + 1] = moved(as_twists(covariances[steps], T), poses[a])
+    return np.cumsum(total, axis=0)
+
+
+def _shared(accumulated: Floats, ends: Ends) -> Floats:
+    """(6 L, 6 L) covariance of what loops are off by: two of them have the errors of the way in common that both go."""
+    first = np.maximum.outer(ends.a, ends.a)
+    last = np.maximum(np.minimum.outer(ends.b, ends.b), first)
+    return np.asarray((accumulated[last] - accumulated[first]).transpose(0, 2, 1, 3).reshape(6 * len(first), -1))
+
+
+def _on_diagonal(blocks: Floats) -> Floats:
+    """(6 L, 6 L) with blocks (L, 6, 6) on the diagonal."""
+    count = len(blocks)
+    whole = np.zeros((count, 6, count, 6))
+    whole[np.arange(count), :, np.arange(count)] = blocks
+    return whole.reshape(6 * count, 6 * count)

@@ -1,0 +1,233 @@
+"""Drift that lasts is told by loops, taken out before they are closed, and what is left is as unsure as it should be."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from graph_builders import ate, measured, truth
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from lslam.config.debug import DebugConfig
+from lslam.config.graph import GraphConfig
+from lslam.errors import GraphError
+from lslam.geometry import se3, so3
+from lslam.graph import loop_drift
+from lslam.graph.drift import drift_covariance
+from lslam.graph.loop_drift import LASTS, WALKS, without_loop_drift
+from lslam.graph.pose_graph import optimise
+from lslam.graph.problem import PoseGraph, Solution
+from lslam.graph.rates import SIZES, hats, rate_roots, set_straight
+from lslam.pipeline.drift import with_drift
+from lslam.types.constraint import Constraint
+from lslam.types.scan_result import ScanResult
+
+Floats = NDArray[np.float64]
+KINDS = [(which, size) for which in range(len(LASTS)) for size in SIZES]
+CONFIG = GraphConfig()
+LAPS, LAP = 3, 60
+REAL = truth(LAPS * LAP + 1, LAPS)
+STEP, LOOP = np.array([2e-3] * 3 + [5e-5] * 3), np.array([0.01] * 3 + [3e-4] * 3)
+# Keyframes of the first lap that are seen again, and how many laps on.
+SEEN = ((3, 1), (20, 2), (34, 1), (51, 1), (80, 1), (110, 1))
+
+
+def away(seed: int, percent: float, degrees: float, memory: float | None = None, real: Floats = REAL) -> PoseGraph:
+    """Odometry with noise, that runs away, and loops that are right."""
+    rng = np.random.default_rng(seed)
+    poses = [real[0]]
+    for step in measured(se3.relative(real[:-1], real[1:]), STEP, rng):
+        poses.append(se3.normalise(poses[-1] @ step))
+    drift = DebugConfig(drift_percent=percent, drift_deg_per_100m=degrees, drift_seed=seed, drift_memory=memory)
+    found = np.stack([r.T_world_lidar for r in with_drift([ScanResult(k, k, T) for k, T in enumerate(poses)], drift)])
+    steps = se3.relative(found[:-1], found[1:])
+    odometry = [Constraint(k, k + 1, step, np.diag(STEP**2), "odometry") for k, step in enumerate(steps)]
+    loops = [
+        Constraint(a, b, measured(se3.relative(real[a], real[b]), LOOP, rng), np.diag(LOOP**2))
+        for a, b in ((a, a + laps * LAP) for a, laps in SEEN)
+        if b < len(real)
+    ]
+    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(np.stack(poses)[:, :3, 3], axis=0), axis=1))])
+    return PoseGraph(found, odometry, loops, distances=way)
+
+
+def nees(solution: Solution) -> float:
+    """Mean squared error over covariance per degree of freedom."""
+    turn = so3.log(solution.poses[:, :3, :3] @ np.swapaxes(REAL[:, :3, :3], -1, -2))
+    d = np.concatenate([solution.poses[:, :3, 3] - REAL[:, :3, 3], turn], axis=1)[5:]
+    return float((d * np.linalg.solve(solution.covariances[5:], d[..., None])[..., 0]).sum(1).mean() / 6)
+
+
+def test_drift_that_lasts_is_taken_out_and_loops_close_better() -> None:
+    before, after, unsure, sure = [], [], [], []
+    for seed in range(6):
+        graph = away(seed, 1.0, 0.2)
+        straight = without_loop_drift(graph, CONFIG)
+        assert straight.claim is not None
+        assert ate(straight.poses, REAL) < 0.05 * ate(graph.poses, REAL)
+        plain, better = optimise(graph, CONFIG), optimise(straight, CONFIG)
+        assert not any(better.loop_reasons)
+        for errors, nee, solution in ((before, unsure, plain), (after, sure, better)):
+            errors.append(ate(solution.poses, REAL))
+            nee.append(nees(solution))
+    assert np.mean(after) < 0.6 * np.mean(before)
+    assert 1.7 * np.mean(unsure) < np.mean(sure)
+    assert 0.15 < np.mean(sure) < 3.0
+
+
+@pytest.mark.parametrize(("percent", "degrees"), [(1.0, 0.0), (0.0, 0.5)])
+def test_what_is_claimed_is_the_drift_and_how_well_it_is_known(percent: float, degrees: float) -> None:
+    squared = []
+    for seed in range(5):
+        claim = without_loop_drift(away(seed, percent, degrees), CONFIG).claim
+        assert claim is not None
+        rng = np.random.default_rng(seed)  # draws as `debug.drift` does
+        direction = rng.normal(size=3)
+        shift, turn = 0.01 * percent * direction / np.linalg.norm(direction), np.radians(degrees) / 100
+        real = np.append(shift, [0.0, 0.0, turn * rng.choice([-1, 1])])
+        np.testing.assert_allclose(claim.rates[:3], real[:3], atol=5e-4)
+        np.testing.assert_allclose(claim.rates[3:], real[3:], atol=5e-6)
+        squared.append(((claim.rates - real) / claim.sigma) ** 2)
+        assert claim.chance == pytest.approx(chi2.ppf(CONFIG.probability, 6))
+    assert 0.1 < np.mean(squared) < 3.0
+
+
+def test_drift_that_wanders_is_known_for_what_it_is() -> None:
+    """Rates of some 100 m, and walks: never much worse for being set straight, and no longer far too unsure or too sure."""
+    ratios, known = [], []
+    for seed in range(8):
+        graph = away(seed, 1.0, 0.5, 60.0)
+        plain, better = optimise(graph, CONFIG), optimise(without_loop_drift(graph, CONFIG), CONFIG)
+        ratios.append(ate(better.poses, REAL) / ate(plain.poses, REAL))
+        known.append(nees(better))
+    assert np.exp(np.mean(np.log(ratios))) < 1.1
+    assert 0.3 < np.mean(known) < 3.0
+
+
+@pytest.mark.parametrize("inflated", [1.0, 30.0])
+def test_noise_is_no_drift(inflated: float) -> None:
+    """Odometry that only walks, also farther than it thinks, stays as it is."""
+    for seed in range(8):
+        graph = away(seed, 0.0, 0.0)
+        rng = np.random.default_rng([seed, 1])
+        steps = [measured(c.T_a_b, (inflated - 1) * STEP, rng) for c in graph.odometry]
+        poses = [graph.poses[0]]
+        for step in steps:
+            poses.append(se3.normalise(poses[-1] @ step))
+        odometry = [replace(c, T_a_b=step) for c, step in zip(graph.odometry, steps, strict=True)]
+        graph = replace(graph, poses=np.stack(poses), odometry=odometry)
+        straight = without_loop_drift(graph, CONFIG)
+        assert straight.claim is None, seed
+        assert straight.walk == 0.0
+        assert straight.spread is None
+        np.testing.assert_array_equal(straight.poses, graph.poses)
+
+
+def test_wrong_loops_among_them_tell_nothing_else() -> None:
+    for seed in range(4):
+        graph = away(seed, 1.0, 0.5)
+        rng = np.random.default_rng(seed)
+        wrong = [
+            replace(c, a=c.a + 4, b=c.b + 7, T_a_b=measured(c.T_a_b, np.array([3.0, 3.0, 0.5, 0.02, 0.02, 0.2]), rng))
+            for c in graph.loops[1::3]
+        ]
+        claims = [without_loop_drift(replace(graph, loops=[*graph.loops, *more]), CONFIG).claim for more in ([], wrong)]
+        assert claims[0] is not None
+        assert claims[1] is not None
+        np.testing.assert_allclose(claims[1].rates, claims[0].rates, atol=2e-4)
+
+
+def test_one_loop_none_or_no_way_tell_nothing() -> None:
+    graph = away(0, 1.0, 0.5)
+    none, one = replace(graph, loops=[]), replace(graph, loops=graph.loops[:1])
+    stays = replace(graph, distances=np.zeros(len(graph)))
+    for given in (none, one, stays):
+        assert without_loop_drift(given, CONFIG).claim is None
+    lost = replace(graph, odometry=graph.odometry[:50])
+    with pytest.raises(GraphError, match="in pieces"):
+        without_loop_drift(lost, CONFIG)
+
+
+def test_ways_are_found_where_nobody_measured_them() -> None:
+    graph = away(0, 1.0, 0.5)
+    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(graph.poses[:, :3, 3], axis=0), axis=1))])
+    measured_by, unmeasured = (without_loop_drift(replace(graph, distances=d), CONFIG) for d in (way, np.zeros(0)))
+    assert unmeasured.claim is not None
+    np.testing.assert_allclose(unmeasured.poses, measured_by.poses)
+
+
+def test_likelihood_and_rates_equal_those_of_all_errors_written_out() -> None:
+    """Against one Gaussian of all loops, whose covariance comes of disturbing each step, rate and loop by itself."""
+    real = truth(31, 2)
+    graph = away(0, 0.02, 0.005, real=real)
+    loops = [
+        Constraint(a, b, measured(se3.relative(real[a], real[b]), LOOP, np.random.default_rng(a)), np.diag(LOOP**2))
+        for a, b in ((1, 16), (4, 18), (9, 30))
+    ]
+    weights = np.array([1.0, 0.5, 0.8])
+    at_knots = hats(graph.distances)
+    count, small = 6 * at_knots.shape[1], 1e-5
+    fit = loop_drift._Fit(graph, loops, np.zeros(count), weights, CONFIG)
+
+    def off(poses: Floats, seen: list[Floats]) -> Floats:
+        moved = poses.copy()
+        moved[:, :3, 3] -= graph.poses[:, :3, 3].mean(0)
+        return np.concatenate([
+            se3.log(moved[c.a] @ T @ se3.inverse(moved[c.b])) for c, T in zip(loops, seen, strict=True)
+        ])  # fmt: skip
+
+    def disturbed(T: Floats, axis: int) -> Floats:
+        d = small * np.eye(6)[axis]
+        return se3.make(so3.exp(d[3:]) @ T[:3, :3], T[:3, 3] + d[:3])
+
+    seen = [c.T_a_b for c in loops]
+    zero = off(graph.poses, seen)
+    by_rates = []
+    for knot in range(count):
+        rates = at_knots @ (small * np.eye(count)[knot]).reshape(-1, 6)
+        by_rates.append((off(set_straight(graph, rates).poses, seen) - zero) / -small)
+    G = np.stack(by_rates, axis=1)
+    known, walk = np.zeros((18, 18)), np.zeros((18, 18))
+    for k, c in enumerate(graph.odometry):
+        columns = []
+        for axis in range(6):
+            after = graph.poses[k] @ disturbed(c.T_a_b, axis) @ se3.inverse(graph.poses[k + 1])
+            poses = np.concatenate([graph.poses[: k + 1], after @ graph.poses[k + 1 :]])
+            columns.append((off(poses, seen) - zero) / small)
+        J = np.stack(columns, axis=1)
+        known += J @ c.covariance @ J.T
+        walk += J @ drift_covariance(float(np.linalg.norm(c.T_a_b[:3, 3])), CONFIG) @ J.T
+    for n, loop in enumerate(loops):
+        changed = [[disturbed(T, axis) if n == m else T for m, T in enumerate(seen)] for axis in range(6)]
+        J = np.stack([(off(graph.poses, some) - zero) / small for some in changed], axis=1)
+        known += J @ loop.covariance @ J.T / weights[n]
+
+    def unlikely(S: Floats) -> float:
+        return float(np.linalg.slogdet(S)[1] + zero @ np.linalg.solve(S, zero))
+
+    roots = rate_roots(float(graph.distances[-1]), CONFIG, list(range(6)), LASTS)
+    for w in (0, 3, 6):
+        alone = known + WALKS[w] * walk
+        assert fit.unlikeliness[w, 0] == pytest.approx(unlikely(alone), rel=1e-3)
+        for kind in (0, 4, 7, 11):
+            which, size = KINDS[kind]
+            prior = size**2 * roots[which] @ roots[which].T
+            S = alone + G @ prior @ G.T
+            assert fit.unlikeliness[w, 1 + kind] == pytest.approx(unlikely(S), rel=1e-3)
+    found, covariance, mean_walk = fit.likeliest()
+    likely = np.exp(-0.5 * (fit.unlikeliness[:, 1:] - fit.unlikeliness[:, 1:].min()))
+    assert mean_walk == pytest.approx((np.array(WALKS)[:, None] * likely).sum() / likely.sum())
+    which, size = KINDS[int(likely.sum(0).argmax())]
+    prior = size**2 * roots[which] @ roots[which].T
+    S = known + mean_walk * walk + G @ prior @ G.T
+    np.testing.assert_allclose(found, prior @ G.T @ np.linalg.solve(S, zero), rtol=1e-3, atol=1e-7)
+    np.testing.assert_allclose(covariance, prior - prior @ G.T @ np.linalg.solve(S, G @ prior), rtol=1e-3, atol=1e-10)
+    last = set_straight(graph, np.zeros((len(graph) - 1, 6))).poses[-1]
+    moves = []
+    for knot in range(count):
+        pose = set_straight(graph, at_knots @ (small * np.eye(count)[knot]).reshape(-1, 6)).poses[-1]
+        moves.append(np.append(pose[:3, 3] - last[:3, 3], so3.log(pose[:3, :3] @ last[:3, :3].T)) / small)
+    E = np.stack(moves, axis=1)
+    np.testing.assert_allclose(fit.spread(covariance)[-1], E @ covariance @ E.T, rtol=1e-3, atol=1e-9)
