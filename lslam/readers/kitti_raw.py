@@ -1,8 +1,8 @@
 """KITTI raw drives: `<date>/<date>_drive_NNNN_{sync,extract}` with `velodyne_points/` and `oxts/`.
 
-Scans of both kinds are distorted, as KITTI's readme of the raw data says: only those of the odometry benchmark had the
-motion taken out. On drives 0005 and 0048 (`sync`) points lie nearest to the map's planes when all of a sweep's motion
-is taken out, neither more nor less: 46 mm for 56 in a bend.
+`sync` scans go with the camera and OXTS sample of their number, at the instant at which the scanner looks ahead, and count
+as compensated to it. They are not quite: on drives 0005 and 0048 points lie nearest to the map's planes when all of a
+sweep's motion is taken out (46 mm for 56 in a bend). `motion_compensated = false` does so; poses are then of scan starts.
 """
 
 from __future__ import annotations
@@ -73,17 +73,19 @@ def open_folder(folder: Path, overrides: SequenceInfo, why: str) -> FolderSequen
     voice = Voice([f"format {KIND}: {why}", *left_out, *compensation_note(info)], [])
     is_extract = folder.name.endswith("_extract")
     oxts = _oxts(folder, voice)
-    files, stamps, rate, looks_ahead = _stamps(folder, info, files, oxts, is_extract, voice)
+    compensated = not is_extract if info.motion_compensated is None else info.motion_compensated
+    files, stamps, rate, looks_ahead = _stamps(folder, info, files, oxts, is_extract, compensated, voice)
     calibration = calibration_over(info, _calibration(folder.parent, voice))
     per_point = per_point_folder(folder, info)
     sweep = None
-    if not info.motion_compensated and per_point is None:
+    if not compensated and per_point is None:
         sweep = _sweeps(folder, files, rate, voice)
         if looks_ahead:
             stamps = stamps - np.round(0.5e9 * sweep).astype(np.int64)
             voice.notes.append("these stamps are of the scanner looking ahead: each scan begins half a sweep earlier")
     if info.motion_compensated is None:
-        voice.notes.append("motion compensated: no (KITTI raw drives are distorted, sync ones too)")
+        drive = "extract drives are distorted" if is_extract else "sync drives count as motion compensated"
+        voice.notes.append(f"motion compensated: {'yes' if compensated else 'no'} (KITTI raw {drive})")
     return FolderSequence(
         name=info.name or folder.name,
         path=folder,
@@ -91,7 +93,7 @@ def open_folder(folder: Path, overrides: SequenceInfo, why: str) -> FolderSequen
         files=files,
         stamps_ns=stamps,
         rate_hz=rate,
-        motion_compensated=bool(info.motion_compensated),
+        motion_compensated=compensated,
         calibration=calibration,
         ground_truth=_ground_truth(folder, info, files, stamps, oxts, calibration, voice),
         imu=load_imu(folder, info, voice.problems) or _imu(oxts),
@@ -129,14 +131,15 @@ def _oxts(folder: Path, voice: Voice) -> Oxts | None:
 
 
 def _stamps(
-    folder: Path, info: SequenceInfo, files: list[Path], oxts: Oxts | None, is_extract: bool, voice: Voice
-) -> tuple[list[Path], NDArray[np.int64], float, bool]:
+    folder: Path, info: SequenceInfo, files: list[Path], oxts: Oxts | None, is_extract: bool, compensated: bool,
+    voice: Voice,
+) -> tuple[list[Path], NDArray[np.int64], float, bool]:  # fmt: skip
     """Stamps of the LiDAR; of OXTS by index where a shared excerpt leaves them out; else nominal.
 
     And whether they are of the instant at which the scanner looks ahead, to which KITTI ties cameras and OXTS.
     """
     names = ("timestamps.txt", "timestamps_start.txt")
-    paths = [folder / "velodyne_points" / name for name in (names if info.motion_compensated else names[::-1])]
+    paths = [folder / "velodyne_points" / name for name in (names if compensated else names[::-1])]
     if info.stamps is not None:
         paths.insert(0, folder / info.stamps)
     path = next((p for p in paths if p.is_file()), None)
@@ -153,7 +156,7 @@ def _stamps(
         )
         return files, nominal_stamps(len(files), rate, start), rate, False
     voice.notes.append("no velodyne_points/timestamps*.txt: scan i goes with OXTS sample i and takes its stamp")
-    even = _evened(oxts.numbers, oxts.stamps_ns, voice)
+    even = oxts.stamps_ns if compensated else _evened(oxts.numbers, oxts.stamps_ns, voice)
     full = np.full(int(oxts.numbers.max()) + 1, -1, np.int64)
     full[oxts.numbers] = even
     source = folder / "oxts" / "timestamps.txt"

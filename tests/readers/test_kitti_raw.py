@@ -26,10 +26,9 @@ def said(sentences: list[str], part: str) -> bool:
 
 def test_an_excerpt_without_velodyne_stamps(tmp_path: Path) -> None:
     s = open_sequence(raw_drive(tmp_path))
-    assert (s.name, s.kind, len(s), s.motion_compensated) == ("2011_09_26_drive_0005_sync", "kitti-raw", 6, False)
-    # OXTS goes with the scanner looking ahead, half a sweep after the scan began.
-    assert s.stamps_ns[0] == 1317042271_950000000
-    assert s.scan(0).times is not None
+    assert (s.name, s.kind, len(s), s.motion_compensated) == ("2011_09_26_drive_0005_sync", "kitti-raw", 6, True)
+    assert s.stamps_ns[0] == 1317042272_000000000
+    assert s.scan(0).times is None
     assert said(s.notes, "scan i goes with OXTS sample i")
     assert s.problems == []
     assert s.calibration.T_lidar_imu is not None
@@ -53,12 +52,23 @@ def test_velodyne_stamps_are_used_when_they_are_there(tmp_path: Path) -> None:
     lines = "".join(f"2011-09-26 13:04:32.{k * 100 + 3:03d}000001\n" for k in range(6))
     (folder / "velodyne_points" / "timestamps.txt").write_text(lines)
     s = open_sequence(folder)
-    assert s.stamps_ns[1] == 1317042272_053000001
-    assert said(s.notes, "each scan begins half a sweep earlier")
+    assert s.stamps_ns[1] == 1317042272_103000001
     assert s.ground_truth is not None
     assert s.ground_truth.stamps_ns.tolist() == s.stamps_ns.tolist()
     np.testing.assert_allclose(s.ground_truth.positions[5], [5.0015, 0, 0], atol=2e-3)
     assert said(s.notes, "interpolated")
+
+
+def test_distorted_scans_begin_half_a_sweep_before_the_scanner_looks_ahead(tmp_path: Path) -> None:
+    folder = raw_drive(tmp_path)
+    # OXTS goes with the scanner looking ahead.
+    s = open_sequence(folder, motion_compensated=False)
+    assert s.stamps_ns[0] == 1317042271_950000000
+    assert s.scan(0).times is not None
+    assert said(s.notes, "each scan begins half a sweep earlier")
+    lines = "".join(f"2011-09-26 13:04:32.{k * 100 + 3:03d}000001\n" for k in range(6))
+    (folder / "velodyne_points" / "timestamps.txt").write_text(lines)
+    assert open_sequence(folder, motion_compensated=False).stamps_ns[1] == 1317042272_053000001
 
 
 def test_the_start_of_the_sweep_is_taken_where_it_is_known(tmp_path: Path) -> None:
@@ -66,7 +76,7 @@ def test_the_start_of_the_sweep_is_taken_where_it_is_known(tmp_path: Path) -> No
     for name, shift in (("timestamps", 3), ("timestamps_start", 0), ("timestamps_end", 96)):
         lines = "".join(f"2011-09-26 13:04:32.{k * 100 + shift:03d}000000\n" for k in range(6))
         (folder / "velodyne_points" / f"{name}.txt").write_text(lines)
-    s = open_sequence(folder)
+    s = open_sequence(folder, motion_compensated=False)
     assert s.stamps_ns[1] == 1317042272_100000000
     assert not said(s.notes, "half a sweep")
     times = s.scan(1).times
@@ -74,9 +84,9 @@ def test_the_start_of_the_sweep_is_taken_where_it_is_known(tmp_path: Path) -> No
     assert 0.09 < times.max() <= np.float32(0.096)
 
 
-def test_scans_stated_as_compensated_keep_the_instant_of_their_stamps(tmp_path: Path) -> None:
+def test_compensated_scans_keep_the_instant_of_their_stamps(tmp_path: Path) -> None:
     folder = raw_drive(tmp_path)
-    s = open_sequence(folder, motion_compensated=True)
+    s = open_sequence(folder)
     assert s.motion_compensated is True
     assert s.stamps_ns[0] == 1317042272_000000000
     assert s.scan(0).times is None
@@ -84,7 +94,7 @@ def test_scans_stated_as_compensated_keep_the_instant_of_their_stamps(tmp_path: 
     for name, shift in (("timestamps", 50), ("timestamps_start", 0)):
         lines = "".join(f"2011-09-26 13:04:32.{k * 100 + shift:03d}000000\n" for k in range(6))
         (folder / "velodyne_points" / f"{name}.txt").write_text(lines)
-    assert open_sequence(folder, motion_compensated=True).stamps_ns[1] == 1317042272_150000000
+    assert open_sequence(folder).stamps_ns[1] == 1317042272_150000000
 
 
 @pytest.mark.parametrize(("late", "evened"), [(0.0, True), (0.02, False)])
@@ -96,7 +106,7 @@ def test_stamps_of_the_nearest_oxts_samples_are_evened_out(tmp_path: Path, late:
     nearest = np.round(true, 2)
     assert 4e-3 < np.abs(nearest - true).max() < 5.1e-3
     (folder / "oxts" / "timestamps.txt").write_text("".join(f"2011-09-26 13:04:{t:012.9f}\n" for t in nearest))
-    s = open_sequence(folder)
+    s = open_sequence(folder, motion_compensated=False)
     assert said(s.notes, "evened out") == evened
     begun = s.stamps_ns - 1317042240_000000000 + 51_650_000
     if evened:
