@@ -46,12 +46,12 @@ def yaw_at_end(estimate: Floats, truth: Floats) -> float:
     return float(np.degrees(so3.euler_rpy(se3.relative(truth[-1], estimate[-1])[:3, :3])[2]))
 
 
-def simulated(lidars: tuple[str, ...], seeds: tuple[int, ...], **given: float) -> Iterator[Case]:
+def simulated(scenario: str, lidars: tuple[str, ...], seeds: tuple[int, ...], **given: float) -> Iterator[Case]:
     for lidar in lidars:
         for seed in seeds:
-            line = simulate("street", seed=seed, lidar=lidar, **given)  # type: ignore[arg-type]
+            line = simulate(scenario, seed=seed, lidar=lidar, motion_compensated=True, **given)  # type: ignore[arg-type]
             scans = [line.scan(i).points for i in range(len(line))]
-            yield f"street {seed} {lidar}", scans, _from_first(line.ground_truth.poses)
+            yield f"{scenario} {seed} {lidar}", scans, _from_first(line.ground_truth.poses)
 
 
 def recordings(folder: Path) -> Iterator[Case]:
@@ -116,8 +116,11 @@ def main() -> None:
     args = parser.parse_args()
     methods = args.peers.split(",")
     real = list(recordings(args.recordings)) if args.recordings else []
-    table([*real, *simulated(("hdl64", "vlp16"), (0, 1, 2), count=120, speed=10.0)], methods)
-    fast = simulated(("hdl64",), (0, 1, 2), count=12, speed=8.3, start_speed=8.3)
+    streets = simulated("street", ("hdl64", "vlp16"), (0, 1, 2), count=120, speed=10.0)
+    # At 30 m/s from the first scan on.
+    motorways = simulated("motorway", ("vlp16", "os1-16"), (0, 1), count=30)
+    table([*real, *streets, *motorways], methods)
+    fast = simulated("street", ("hdl64",), (0, 1, 2), count=12, speed=8.3, start_speed=8.3)
     starts([*((n, s[:12], t[:12]) for n, s, t in real), *fast], methods)
 
 

@@ -88,7 +88,7 @@ def cases(recordings: Path | None, seeds: tuple[int, ...]) -> Iterator[Case]:
             is_whole = name in ("closed", "open", "small-eight")
             yield Case(f"{name}@full", seed, (*(("icp", *PEERS) if is_whole else ("icp", "loam")), *PRESETS))
         for lidar in ("hdl64", "vlp16", "os1-16"):
-            for name in ("residential", "street"):
+            for name in ("residential", "street", "motorway"):
                 yield Case(f"{name}:{lidar}", seed, FEW_BEAMS)
 
 
