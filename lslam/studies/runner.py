@@ -70,11 +70,10 @@ def run_tasks(
     try:
         while waiting or busy:
             while waiting and len(busy) < crew.at_once:
-                worker = idle.pop() if idle else None
                 data = [tasks[index].data for index, _ in waiting]
-                index, tries[index] = waiting.pop(_choice(data, worker, [*busy, *idle]))
+                index, tries[index] = waiting.pop(_choice(data, idle[-1] if idle else None, [*busy, *idle]))
                 on_start(index)
-                worker = worker or _hire(crew)
+                worker = idle.pop() if idle else _hire(crew)
                 worker.index = index
                 worker.has_read.add(tasks[index].data)
                 busy.append(worker)
@@ -95,11 +94,11 @@ def run_tasks(
         _end([worker.process for worker in [*busy, *idle]])
 
 
-def _choice(data: Sequence[str], worker: _Worker | None, others: Sequence[_Worker]) -> int:
+def _choice(data: Sequence[str], worker: _Worker | None, workers: Sequence[_Worker]) -> int:
     """Which of the waiting tasks, by what they read: one whose data the worker has, else nobody, else the first."""
     own = set() if worker is None else worker.has_read
-    of_others = {name for other in others for name in other.has_read}
-    wanted = (name in own for name in data), (name not in of_others for name in data)
+    of_all = {name for other in workers for name in other.has_read}
+    wanted = (name in own for name in data), (name not in of_all for name in data)
     return next((k for marks in wanted for k, is_wanted in enumerate(marks) if is_wanted), 0)
 
 

@@ -152,6 +152,20 @@ def test_a_task_whose_process_died_is_begun_once_more_and_ends_once(tmp_path: Pa
     assert len((tmp_path / "a").read_text().split()) == 2
 
 
+def test_an_interruption_between_two_tasks_ends_the_process_that_waits(tmp_path: Path) -> None:
+    def interrupt_the_second(index: int) -> None:
+        if index == 1:
+            raise KeyboardInterrupt
+
+    pids = tmp_path / "pids"
+    tasks = [Task(f"{i}", partial(note, pids), tmp_path / f"{i}.out") for i in range(2)]
+    with pytest.raises(KeyboardInterrupt):
+        run_tasks(tasks, Crew(1, is_kept=True), interrupt_the_second, lambda index, cause: None)
+    (pid,) = pids.read_text().split()
+    with pytest.raises(ProcessLookupError):
+        os.kill(int(pid), 0)
+
+
 def test_kept_processes_have_one_thread_each(tmp_path: Path) -> None:
     keep(tmp_path, partial(write_environment, tmp_path / "said"))
     assert (tmp_path / "said").read_text().split()[1:] == ["1", "1"]
