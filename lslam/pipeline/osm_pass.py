@@ -198,10 +198,11 @@ def _turn(
 
     A house drawn askew is enough for a first match that turns the run by degrees.
     """
-    numbers = [first.keyframe, *(m.keyframe for m in accepted)]
+    matches = [first, *(match for match in accepted if match is not first)]
+    numbers = [match.keyframe for match in matches]
     turn = se2.compose(first.pose, se2.inverse(poses[first.keyframe]))
     ways = np.array([store.keyframes[k].distance for k in numbers])
-    return se2.compose(track.lay(se2.compose(turn, poses[numbers]), ways, [first, *accepted], sigma), turn)
+    return se2.compose(track.lay(se2.compose(turn, poses[numbers]), ways, matches, sigma), turn)
 
 
 def _lowered(T: Floats, first: Floats, placed: Floats | None) -> Floats:

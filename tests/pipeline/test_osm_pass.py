@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from wall_scenes import box_at, plain, upright
@@ -111,6 +113,22 @@ def test_odometry_that_runs_away_is_followed() -> None:
     located = locate(extract_of(HOUSES), driven(HOUSES, way, told), None, config())
     assert len(located.priors) >= 16
     assert (off(located, way) < [0.1, 0.1, 0.3]).all()
+
+
+def test_a_first_match_that_is_askew_does_not_turn_the_run(monkeypatch: pytest.MonkeyPatch) -> None:
+    way, turn = street(60.0), np.array([0.0, 0.0, np.radians(2.5)])
+
+    def askew(view: KeyframeMatch, osm: OsmMap, given: OsmConfig) -> KeyframeMatch:
+        match = match_keyframe(view, osm, given)
+        return replace(match, pose=match.pose + turn) if match.keyframe == 0 else match
+
+    monkeypatch.setattr(osm_pass, "match_keyframe", askew)
+    store = driven(HOUSES, way)
+    located = locate(extract_of(HOUSES), store, None, config())
+    assert located.accepted[0].keyframe == 0
+    laid = se2.of_se3(located.T_enu_odometry @ np.stack([k.T_world_lidar for k in store.keyframes])) - way
+    assert np.abs(laid[:, :2]).max() < 0.3
+    assert np.abs(np.degrees(laid[:, 2])).max() < 0.4
 
 
 def test_the_first_keyframe_is_at_height_zero_wherever_odometry_has_it() -> None:
