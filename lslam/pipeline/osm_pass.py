@@ -42,7 +42,7 @@ LOST = 4.0
 class Located:
     """Where the keyframes of a run are on the map.
 
-    T_enu_odometry : (4, 4) from the world of odometry into the map frame, right about the first match
+    T_enu_odometry : (4, 4) from the world of odometry into the map frame, as the first match has its place and all its heading
     matches : of all keyframes; priors : the accepted ones, for the pose graph; start_sigma : (3,) of the first pose
     problem : why there are none
     """
@@ -90,7 +90,7 @@ def locate(
     first = next((match for match in accepted if match.rank == 3), accepted[0])
     sigma = np.maximum(start.sigma, track.sigma)
     T = _lowered(
-        se2.to_se3(_turn(store, se2.of_se3(poses), first, accepted, track, sigma)) @ T_level, odometry[0], placed
+        se2.to_se3(_place(store, se2.of_se3(poses), first, accepted, track, sigma)) @ T_level, odometry[0], placed
     )
     parts = shares(accepted, len(osm.walls))
     priors = [
@@ -186,7 +186,7 @@ def _judged(match: KeyframeMatch, doubt: str) -> KeyframeMatch:
     return replace(match, verdict="rejected", reason=doubt) if doubt else match
 
 
-def _turn(
+def _place(
     store: KeyframeStore,
     poses: Floats,
     first: KeyframeMatch,
@@ -194,15 +194,16 @@ def _turn(
     track: OsmTrack,
     sigma: Floats,
 ) -> Floats:
-    """The pose (3,) of the world of `poses` (K, 3) in the map frame, by the `first` match and all that are `accepted`.
+    """The pose (3,) of the world of `poses` (K, 3) in the map frame: where the `first` match has it, turned as all have it.
 
-    A house drawn askew is enough for a first match that turns the run by degrees.
+    A house drawn askew is enough for a match that turns the run by degrees, which would look like drift of odometry.
     """
     matches = [first, *(match for match in accepted if match is not first)]
     numbers = [match.keyframe for match in matches]
-    turn = se2.compose(first.pose, se2.inverse(poses[first.keyframe]))
+    place = se2.compose(first.pose, se2.inverse(poses[first.keyframe]))
     ways = np.array([store.keyframes[k].distance for k in numbers])
-    return se2.compose(track.lay(se2.compose(turn, poses[numbers]), ways, matches, sigma), turn)
+    turn = track.turn(se2.compose(place, poses[numbers]), ways, matches, sigma)
+    return se2.compose(first.pose + np.array([0.0, 0.0, turn]), se2.inverse(poses[first.keyframe]))
 
 
 def _lowered(T: Floats, first: Floats, placed: Floats | None) -> Floats:

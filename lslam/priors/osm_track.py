@@ -19,7 +19,7 @@ Floats = NDArray[np.float64]
 MEMORY = 100.0
 # Directions with less than this share of the largest information are free.
 FREE = 1e-9
-# A whole run laid on its matches: rounds, and degrees of freedom (Student's t), as some lie on the neighbour's walls.
+# The heading of a whole run by its matches: rounds, and degrees of freedom (Student's t), as some lie on the neighbour's walls.
 ROUNDS, FREEDOM = 10, 3.0
 
 
@@ -69,11 +69,11 @@ class OsmTrack:
         kept: Floats = np.eye(3) - gain @ H
         self.covariance = kept @ self.covariance @ kept.T + gain @ R @ gain.T
 
-    def lay(self, poses: Floats, ways: Floats, matches: Sequence[KeyframeMatch], sigma: Floats) -> Floats:
-        """The pose (3,) of the frame of `poses` (M, 3) in the map frame, with which they lie on their `matches`, one each.
+    def turn(self, poses: Floats, ways: Floats, matches: Sequence[KeyframeMatch], sigma: Floats) -> float:
+        """By how much, rad, `poses` (M, 3) have to be turned about the first to lie on their `matches`, one each, best.
 
-        They lie about right already, but for `sigma` (3,) about the first of them, which one match does not tell well; and
-        the more of the `ways` (M,), m travelled, odometry went since, the less a match says of it.
+        They lie about right already, but for `sigma` (3,), which the first match alone does not tell well; and the more of
+        the `ways` (M,), m travelled, odometry went since, the less a match says of it.
         """
         weights = np.stack([
             self._weight(m.information, self._map + self._drift * abs(way - ways[0]) * MEMORY)
@@ -93,7 +93,7 @@ class OsmTrack:
             normal = np.diag(1.0 / sigma**2) + (pulls @ effect).sum(axis=0)
             pull = (pulls @ away[:, :, None]).sum(axis=0)[:, 0] - moved / sigma**2
             moved = moved + np.linalg.solve(normal, pull)
-        return se2.compose(pivot + moved, se2.inverse(pivot))
+        return float(moved[2])
 
     @staticmethod
     def _weight(information: Floats, variance: Floats) -> Floats:
