@@ -53,11 +53,14 @@ def without_loop_drift(graph: PoseGraph, config: GraphConfig) -> PoseGraph:
     loops = [loops[i] for i in np.unique(np.linspace(0, len(loops) - 1, MOST).round().astype(int))]
     at_knots = hats(graph.distances)
     straight, found, weights = graph, np.zeros(6 * at_knots.shape[1]), np.ones(len(loops))
+    turned = np.tile(np.eye(3), (len(graph) - 1, 1, 1))
     for _ in range(ROUNDS):
-        fit = _Fit(straight, loops, found, weights, config)
+        fit = _Fit(straight, loops, found, turned, weights, config)
         found, covariance, walk = fit.likeliest()
         weights = fit.believable()
-        straight = set_straight(graph, at_knots @ found.reshape(-1, 6))
+        rates = at_knots @ found.reshape(-1, 6)
+        turned = _turned(rates[:, 3:], np.diff(graph.distances))
+        straight = set_straight(graph, np.column_stack([np.einsum("kij,kj->ki", turned, rates[:, :3]), rates[:, 3:]]))
     gain = float(fit.unlikeliness[:, 0].min() - fit.unlikeliness.min())
     chance = quantile(config.probability, 6)
     if gain <= chance:
@@ -72,6 +75,7 @@ def without_loop_drift(graph: PoseGraph, config: GraphConfig) -> PoseGraph:
 class _Fit:
     """What loops say of the odometry of `graph`, which was set straight by `found` (6 n,), rates at the knots, already.
 
+    Rates are those along the axes of odometry as it came, which `turned` (K-1, 3, 3) takes into those of the graph.
     Errors are twists of the world about the middle of the way: those of parts of the way add up there.
     weights : (L,) what each loop counts
     unlikeliness : (walks, 1 + LASTS * SIZES) minus twice the logarithm of the likelihood but for a constant; column 0 is that
@@ -79,11 +83,12 @@ class _Fit:
     """
 
     def __init__(
-        self, graph: PoseGraph, loops: Sequence[Constraint], found: Floats, weights: Floats, config: GraphConfig
-    ) -> None:
+        self, graph: PoseGraph, loops: Sequence[Constraint], found: Floats, turned: Floats, weights: Floats,
+        config: GraphConfig,
+    ) -> None:  # fmt: skip
         self._poses = se3.make(np.eye(3), -graph.poses[:, :3, 3].mean(0)) @ graph.poses
         ends, P, self._weights = Ends(loops), self._poses, weights
-        self._effects = _effects(P, graph.distances)
+        self._effects = _effects(P, graph.distances, turned)
         self._rows = (self._effects[ends.b] - self._effects[ends.a]).reshape(-1, len(found))
         self._off = se3.log(P[ends.a] @ ends.T @ se3.inverse(P[ends.b])).ravel() + self._rows @ found
         self._noise = moved(ends.covariances, P[ends.a])
@@ -136,9 +141,18 @@ def _unlikely(S: Floats, off: Floats) -> float:
     return float(np.linalg.slogdet(S)[1] + off @ np.linalg.solve(S, off))
 
 
-def _effects(poses: Floats, distances: Floats) -> Floats:
-    """(K, 6, 6 n) twist about the origin that rates at the knots have brought each pose."""
+def _turned(turns: Floats, ways: Floats) -> Floats:
+    """(K-1, 3, 3) from the axes of odometry to those of odometry that was set right by `turns` (K-1, 3) per m."""
+    turned = [np.eye(3)]
+    for turn in so3.exp(turns * ways[:, None]):
+        turned.append(turn @ turned[-1])
+    return np.stack(turned[1:])
+
+
+def _effects(poses: Floats, distances: Floats, turned: Floats) -> Floats:
+    """(K, 6, 6 n) twist about the origin that rates at the knots have brought each pose; turned : as of `_turned`."""
     step = np.tile(np.eye(6), (len(poses) - 1, 1, 1))
+    step[:, :3, :3] = turned
     step[:, :3, 3:] = so3.hat(poses[1:, :3, 3])
     passed = np.diff(distances)[:, None] * hats(distances)
     effects = np.zeros((len(poses), 6, passed.shape[1], 6))
