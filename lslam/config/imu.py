@@ -22,7 +22,8 @@ class ImuConfig(Section):
     )
     weigh: bool = Field(
         True,
-        description="weigh each registered motion against what the IMU felt by their covariances; false: it predicts only",
+        description="weigh each registered motion against what the IMU felt by their covariances, and bridge a scan whose "
+        "registration the IMU and constant velocity deny; false: it predicts only",
     )
     gyro_bias: Three | None = Field(None, description="rad/s, IMU axes; absent: estimated")
     accel_bias: Three | None = Field(None, description="m/s2, IMU axes; absent: estimated")

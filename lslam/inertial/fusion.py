@@ -40,7 +40,9 @@ class InertialMotion(Stateful):
     JUDGED, WORSE, SLACK_M = 30, 2.0, 0.02
     # One scan in so many is registered from constant velocity too, to tell what the IMU saves.
     COMPARED = 20
-    STATE = ("estimate", "coasting", "refusal", "gap_scans", "_scans", "_has_gap", "_instant_ns", "_pose")
+    STATE = (
+        "estimate", "coasting", "refusal", "gap_scans", "_scans", "_has_gap", "_was_bridged", "_instant_ns", "_pose",
+    )  # fmt: skip
 
     def __init__(self, imu: ImuStream, T_lidar_imu: Floats, estimate: ImuEstimate, config: ImuConfig) -> None:
         self.imu, self.T_lidar_imu, self.config = imu, T_lidar_imu, config
@@ -51,6 +53,8 @@ class InertialMotion(Stateful):
         self.gap_scans = 0
         self._scans = 0
         self._has_gap = False
+        # Whether no registration stands behind the newest pose.
+        self._was_bridged = False
         self._gaps = gaps(imu, config.gap_s)
         self._instant_ns: int | None = None
         self._pose = np.eye(4)
@@ -97,7 +101,8 @@ class InertialMotion(Stateful):
     def weigh(self, result: ScanResult, prior: MotionPrior) -> ScanResult:
         """The registered motion since the last scan weighed against what the IMU felt, each by its covariance.
 
-        Where they contradict each other, it stays registration's. prior : of the registration, says how the sweep moved
+        Where they contradict each other, it stays registration's, or the scan is bridged: `_denied`. prior : of the
+        registration, says how the sweep moved
         """
         C = result.registration_covariance
         if C is None or result.status != "ok" or not self.config.weigh or self.config.velocity == "integrated":
@@ -117,13 +122,32 @@ class InertialMotion(Stateful):
         gyroscope = e.taught(step, begin[:3, :3], end[:3, :3], C[3:, 3:])
         self._taught = instant_ns, gyroscope, C[:3, :3]
         if surprise(rest, P + 2 * C) > 1:
-            return result
+            return self._denied(result, rest, P)
         # A pose that is wrong moves the map by one part in its age only, the scans before hold it: random errors of both
         # then add up to the least drift when those of the IMU count as many times.
         K = np.linalg.solve(C + result.map_age * P, C).T
         d = -K @ rest
         pose = se3.make(so3.exp(d[3:]) @ result.T_world_lidar[:3, :3], result.T_world_lidar[:3, 3] + d[:3])
         return replace(result, T_world_lidar=se3.normalise(pose), registration_covariance=C - K @ C)
+
+    def _denied(self, result: ScanResult, rest: Floats, covariance: Floats) -> ScanResult:
+        """What comes of a registration that contradicts the IMU by `rest` (6,), m and rad: constant velocity decides.
+
+        Where that is nearer to what the IMU expected, the scan is bridged: it stands where the IMU put it, as surely as
+        `covariance` (6, 6) says, and enters the map there, or the next would have nothing to stand on. Never twice in a row:
+        a registration that insists is right, the IMU may have been hit.
+        """
+        if self._was_bridged or not self.coasting.is_known or self._expected is None:
+            return result
+        steady, (stamp_ns, expected) = self.coasting.predict(result.stamp_ns), self._expected
+        if stamp_ns != result.stamp_ns or _distance(steady, expected) >= _distance(steady, result.T_world_lidar):
+            return result
+        metres, degrees = float(np.linalg.norm(rest[:3])), float(np.rad2deg(np.linalg.norm(rest[3:])))
+        reason = f"registration is {metres:.2f} m and {degrees:.1f} deg from what the IMU felt"
+        return replace(
+            result, status="bridged", reason=reason, T_world_lidar=expected, registration_covariance=covariance,
+            converged=False,
+        )  # fmt: skip
 
     def correct(
         self, stamp_ns: int, pose: Floats, prior: MotionPrior | None = None, is_registered: bool = True
@@ -150,6 +174,7 @@ class InertialMotion(Stateful):
                 self.estimate = self._advanced(stamp_ns, instant_ns)
         self.coasting.correct(stamp_ns, pose, prior)
         self._instant_ns, self._pose = instant_ns, middle.copy()
+        self._was_bridged = not is_registered
         self._taught = self._felt = self._expected = None
         self._scans += 1
 
