@@ -49,8 +49,6 @@ OURS = ("icp", "icp-point", "gicp", "vgicp", "ndt", "loam", "loam-odom", "floam"
 PEERS = ("kiss-icp", "small-gicp", "small-vgicp", "genz-icp")
 # Of other packages, called as their authors do; all else runs as a method of lslam.
 BESIDE = ("small-vgicp", "genz-icp")
-# Leave the motion in distorted scans: their poses belong to the middle of a sweep.
-DISTORTING = (*BESIDE, "small-gicp")
 FLIGHTS = ("closed", "open", "climbing", "small-eight", "large-eight")
 PRESETS = ("thesis-icp", "thesis-loam", "thesis-loam-map")
 PLAIN = (*OURS, *PEERS)
@@ -116,7 +114,7 @@ def worker(path: Path, truth_file: str, method: str) -> None:
     logging.getLogger("lslam").setLevel(logging.ERROR)
     sequence = open_sequence(path)
     if truth_file:
-        truth = of_reference(read_trajectory(Path(truth_file)), sequence, is_deskewed=method not in DISTORTING)
+        truth = of_reference(read_trajectory(Path(truth_file)), sequence)
     else:
         given = sequence.ground_truth
         assert given is not None
@@ -141,11 +139,9 @@ def worker(path: Path, truth_file: str, method: str) -> None:
     print(json.dumps(row))
 
 
-def of_reference(reference: Trajectory, sequence: Sequence, is_deskewed: bool) -> NDArray[np.float64]:
-    """Poses of a reference, whose clock begins at midnight, where the scans begin; in mid-sweep for those left distorted."""
-    times = sequence.scan(0).times
-    late = 0 if is_deskewed or times is None else round(0.5e9 * float(times.max()))
-    return poses_at(reference.stamps_ns, reference.poses, (sequence.stamps_ns + late) % DAY_NS)
+def of_reference(reference: Trajectory, sequence: Sequence) -> NDArray[np.float64]:
+    """Poses of a reference, whose clock begins at midnight, at the stamps of the scans."""
+    return poses_at(reference.stamps_ns, reference.poses, sequence.stamps_ns % DAY_NS)
 
 
 def _nearest(stamps_ns: NDArray[np.int64], sequence: Sequence) -> NDArray[np.int64]:
