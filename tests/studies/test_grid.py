@@ -121,6 +121,12 @@ def test_the_input_is_another_when_a_file_a_truth_or_the_number_of_scans_changes
     assert input_digest(open_sequence(drive), None) != first
     (drive / "kept").rename(scan)
     assert scan.read_bytes() == data
+    (drive / "nowhere").symlink_to("gone")
+    assert input_digest(open_sequence(drive), None) == first, "a link that leads nowhere is no file"
+    (drive / "nowhere").unlink()
+    (drive / "more").mkdir()
+    (drive / "more" / "notes").write_text("")
+    assert input_digest(open_sequence(drive), None) != first
 
 
 def test_the_job_is_another_when_any_key_changes() -> None:
