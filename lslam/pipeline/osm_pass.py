@@ -36,13 +36,15 @@ Floats = NDArray[np.float64]
 
 # Beyond so many sigmas of the map itself the run does not know where it is, and a match has to fix all three coordinates.
 LOST = 4.0
+# A match is borne out by the others within this quantile of its own distribution.
+BORNE_OUT = 0.95
 
 
 @dataclass(frozen=True)
 class Located:
     """Where the keyframes of a run are on the map.
 
-    T_enu_odometry : (4, 4) from the world of odometry into the map frame, as the first match has its place and all its heading
+    T_enu_odometry : (4, 4) from the world of odometry into the map frame, placed by one match and turned by all
     matches : of all keyframes; priors : the accepted ones, for the pose graph; start_sigma : (3,) of the first pose
     problem : why there are none
     """
@@ -194,16 +196,25 @@ def _place(
     track: OsmTrack,
     sigma: Floats,
 ) -> Floats:
-    """The pose (3,) of the world of `poses` (K, 3) in the map frame: where the `first` match has it, turned as all have it.
+    """The pose (3,) of the world of `poses` (K, 3) in the map frame.
 
-    A house drawn askew is enough for a match that turns the run by degrees, which would look like drift of odometry.
+    In place as that match has it, next to `first`, that is known as well as the map is and that the others bear out, and
+    turned as all have it: a house drawn askew, or few walls, are enough for one match that turns the run by degrees, which
+    would look like drift of odometry.
     """
     matches = [first, *(match for match in accepted if match is not first)]
     numbers = [match.keyframe for match in matches]
     place = se2.compose(first.pose, se2.inverse(poses[first.keyframe]))
-    ways = np.array([store.keyframes[k].distance for k in numbers])
-    turn = track.turn(se2.compose(place, poses[numbers]), ways, matches, sigma)
-    return se2.compose(first.pose + np.array([0.0, 0.0, turn]), se2.inverse(poses[first.keyframe]))
+    laid, ways = se2.compose(place, poses[numbers]), np.array([store.keyframes[k].distance for k in numbers])
+    turn, squared = track.lay(laid, ways, matches, sigma)
+    right = [
+        match
+        for match, far in zip(matches, squared, strict=True)
+        if match.rank == 3 and track.knows(match.information) and far <= quantile(BORNE_OUT, 3)
+    ]
+    at = min(right, key=lambda m: abs(m.keyframe - first.keyframe), default=first)
+    heading = laid[matches.index(at), 2] + turn
+    return se2.compose(np.append(at.pose[:2], heading), se2.inverse(poses[at.keyframe]))
 
 
 def _lowered(T: Floats, first: Floats, placed: Floats | None) -> Floats:

@@ -19,7 +19,7 @@ Floats = NDArray[np.float64]
 MEMORY = 100.0
 # Directions with less than this share of the largest information are free.
 FREE = 1e-9
-# The heading of a whole run by its matches: rounds, and degrees of freedom (Student's t), as some lie on the neighbour's walls.
+# A whole run laid on its matches: rounds, and degrees of freedom (Student's t), as some lie on the neighbour's walls.
 ROUNDS, FREEDOM = 10, 3.0
 
 
@@ -69,18 +69,20 @@ class OsmTrack:
         kept: Floats = np.eye(3) - gain @ H
         self.covariance = kept @ self.covariance @ kept.T + gain @ R @ gain.T
 
-    def turn(self, poses: Floats, ways: Floats, matches: Sequence[KeyframeMatch], sigma: Floats) -> float:
-        """By how much, rad, `poses` (M, 3) have to be turned about the first to lie on their `matches`, one each, best.
+    def lay(self, poses: Floats, ways: Floats, matches: Sequence[KeyframeMatch], sigma: Floats) -> tuple[float, Floats]:
+        """`poses` (M, 3) moved as a whole onto their `matches`, one each.
 
         They lie about right already, but for `sigma` (3,), which the first match alone does not tell well; and the more of
         the `ways` (M,), m travelled, odometry went since, the less a match says of it.
+
+        Returns by how much, rad, they are turned about the first, and (M,) squared Mahalanobis distances of the matches.
         """
         weights = np.stack([
             self._weight(m.information, self._map + self._drift * abs(way - ways[0]) * MEMORY)
             for m, way in zip(matches, ways, strict=True)
         ])  # fmt: skip
         real, pivot = np.stack([m.pose for m in matches]), np.append(poses[0, :2], 0.0)
-        about, moved = se2.relative(pivot, poses), np.zeros(3)
+        about, moved, squared = se2.relative(pivot, poses), np.zeros(3), np.zeros(len(poses))
         for _ in range(ROUNDS):
             there = se2.compose(pivot + moved, about)
             away = real - there
@@ -93,7 +95,11 @@ class OsmTrack:
             normal = np.diag(1.0 / sigma**2) + (pulls @ effect).sum(axis=0)
             pull = (pulls @ away[:, :, None]).sum(axis=0)[:, 0] - moved / sigma**2
             moved = moved + np.linalg.solve(normal, pull)
-        return float(moved[2])
+        return float(moved[2]), squared
+
+    def knows(self, information: Floats) -> bool:
+        """Whether a match that fixes everything is no less sure than the map itself about any place."""
+        return bool((np.diag(np.linalg.inv(information)) <= self._map).all())
 
     @staticmethod
     def _weight(information: Floats, variance: Floats) -> Floats:

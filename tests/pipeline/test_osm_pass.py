@@ -115,12 +115,18 @@ def test_odometry_that_runs_away_is_followed() -> None:
     assert (off(located, way) < [0.1, 0.1, 0.3]).all()
 
 
-def test_a_first_match_that_is_askew_does_not_turn_the_run(monkeypatch: pytest.MonkeyPatch) -> None:
-    way, turn = street(60.0), np.array([0.0, 0.0, np.radians(2.5)])
+@pytest.mark.parametrize(
+    ("wrong", "known"), [((0.0, 0.0, 2.5), 1.0), ((0.3, 2.0, -3.0), 1.0), ((0.3, 1.5, -2.0), 2e-4)]
+)
+def test_a_first_match_that_is_wrong_or_unsure_neither_turns_the_run_nor_moves_it(
+    wrong: tuple[float, float, float], known: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    way, error = street(60.0), np.array([*wrong[:2], np.radians(wrong[2])])
 
     def askew(view: KeyframeMatch, osm: OsmMap, given: OsmConfig) -> KeyframeMatch:
         match = match_keyframe(view, osm, given)
-        return replace(match, pose=match.pose + turn) if match.keyframe == 0 else match
+        spoilt = replace(match, pose=match.pose + error, information=known * match.information)
+        return spoilt if match.keyframe == 0 else match
 
     monkeypatch.setattr(osm_pass, "match_keyframe", askew)
     store = driven(HOUSES, way)

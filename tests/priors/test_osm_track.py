@@ -66,13 +66,16 @@ SURE, WALL = np.diag([1e4, 1e4, 1e6]), np.diag([0.0, 1e4, 1e6])
 START = np.array([2.0, 2.0, np.radians(5.0)])
 
 
-def turned_to(told: np.ndarray, real: np.ndarray, information: list[np.ndarray], sigma: np.ndarray = START) -> float:
-    """deg, by which keyframes that odometry has at `told` (M, 3) are turned to lie on matches at `real`, 5 m after each other."""
+def laid_on(
+    told: np.ndarray, real: np.ndarray, information: list[np.ndarray], sigma: np.ndarray = START
+) -> tuple[float, np.ndarray]:
+    """Keyframes that odometry has at `told` (M, 3), 5 m after each other, on matches at `real`; the turn in deg."""
     matches = [
         KeyframeMatch(k, np.zeros((0, 2, 2)), np.zeros((1, 2)), pose, np.ones(3), pose, known, rank=3)
         for k, (pose, known) in enumerate(zip(real, information, strict=True))
     ]
-    return float(np.degrees(track().turn(told, 5.0 * np.arange(len(told)), matches, sigma)))
+    turn, squared = track().lay(told, 5.0 * np.arange(len(told)), matches, sigma)
+    return float(np.degrees(turn)), squared
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -83,22 +86,31 @@ def test_a_run_is_turned_as_all_its_matches_have_it_though_the_first_house_is_as
     real[0] = way[0] + np.array([0.1, 0.1, np.radians(2.5)])
     real[7] += np.array([3.0, -2.0, 0.2])  # another's walls
     told = se2.compose(real[0], se2.relative(way[0], way))
-    assert turned_to(told, real, [SURE] * 20) == pytest.approx(-2.5, abs=0.35)
+    turn, squared = laid_on(told, real, [SURE] * 20)
+    assert turn == pytest.approx(-2.5, abs=0.35)
+    assert squared[7] > 12.0
+    assert np.delete(squared, [0, 7]).max() < 1.0
     # Where the start is known that well, matches do not turn it.
-    assert turned_to(told, real, [SURE] * 20, np.full(3, 1e-4)) == pytest.approx(0.0, abs=0.1)
+    assert laid_on(told, real, [SURE] * 20, np.full(3, 1e-4))[0] == pytest.approx(0.0, abs=0.1)
 
 
 def test_what_no_wall_fixes_turns_nothing() -> None:
     """All walls lie along the way, and the matches are 9 m farther along them; or on the other side of the circle."""
     told = np.column_stack([5.0 * np.arange(10), np.zeros((10, 2))])
-    assert turned_to(told, told + np.array([9.0, 0.3, 0.0]), [WALL] * 10) == pytest.approx(0.0, abs=0.1)
+    assert laid_on(told, told + np.array([9.0, 0.3, 0.0]), [WALL] * 10)[0] == pytest.approx(0.0, abs=0.1)
     around = se2.compose(np.array([0.0, 0.0, np.pi - 0.01]), told)
     real = se2.compose(np.array([0.0, 0.0, -np.pi + 0.01]), told)
-    assert turned_to(around, real, [SURE] * 10) == pytest.approx(np.degrees(0.02), abs=0.03)
+    assert laid_on(around, real, [SURE] * 10)[0] == pytest.approx(np.degrees(0.02), abs=0.03)
 
 
 def test_far_matches_count_less_by_what_odometry_may_have_drifted_since() -> None:
     """Odometry that bends away to one side over 400 m: 2.3 deg in the mean, less where it begins."""
     way = np.column_stack([5.0 * np.arange(80), np.zeros((80, 2))])
     told = way + np.column_stack([np.zeros(80), 2e-4 * way[:, 0] ** 2 / 2, 2e-4 * way[:, 0]])
-    assert -2.1 < turned_to(told, way, [SURE] * 80) < -1.0
+    assert -2.1 < laid_on(told, way, [SURE] * 80)[0] < -1.0
+
+
+def test_a_match_is_known_as_well_as_the_map_or_not() -> None:
+    assert track().knows(np.diag([5.0, 5.0, 3e3]))
+    assert not track().knows(np.diag([3.0, 1e4, 1e6]))
+    assert not track().knows(np.diag([1e4, 1e4, 2e3]))
