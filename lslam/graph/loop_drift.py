@@ -18,7 +18,6 @@ from lslam.geometry import noise, se3, so3
 from lslam.graph.chi_square import quantile
 from lslam.graph.consistency import Ends, as_twists, judge_loops, moved
 from lslam.graph.drift import drift_covariance
-from lslam.graph.drift_fit import FREEDOM
 from lslam.graph.pose_graph import check_graph, with_distances
 from lslam.graph.problem import DriftClaim, PoseGraph
 from lslam.graph.rates import LASTING, SIZES, hats, rate_roots, set_straight
@@ -32,7 +31,7 @@ MOST = 30
 WALKS = (0.0, 1e-4, 1e-3, 0.01, 0.1, 1.0, 10.0, 100.0)
 # Shares of the variance of rates that last: all of it, too, since loops are few and tell nothing of places between them.
 LASTS = (*LASTING, 0.9999)
-# How often the loops are asked, each time of what was set straight by the last answer, and doubting what did not fit it.
+# How often the loops are asked, each time of what was set straight by the last answer.
 ROUNDS = 4
 
 
@@ -52,12 +51,11 @@ def without_loop_drift(graph: PoseGraph, config: GraphConfig) -> PoseGraph:
         return graph
     loops = [loops[i] for i in np.unique(np.linspace(0, len(loops) - 1, MOST).round().astype(int))]
     at_knots = hats(graph.distances)
-    straight, found, weights = graph, np.zeros(6 * at_knots.shape[1]), np.ones(len(loops))
+    straight, found = graph, np.zeros(6 * at_knots.shape[1])
     turned = np.tile(np.eye(3), (len(graph) - 1, 1, 1))
     for _ in range(ROUNDS):
-        fit = _Fit(straight, loops, found, turned, weights, config)
+        fit = _Fit(straight, loops, found, turned, config)
         found, covariance, walk = fit.likeliest()
-        weights = fit.believable()
         rates = at_knots @ found.reshape(-1, 6)
         turned = _turned(rates[:, 3:], np.diff(graph.distances))
         straight = set_straight(graph, np.column_stack([np.einsum("kij,kj->ki", turned, rates[:, :3]), rates[:, 3:]]))
@@ -77,21 +75,19 @@ class _Fit:
 
     Rates are those along the axes of odometry as it came, which `turned` (K-1, 3, 3) takes into those of the graph.
     Errors are twists of the world about the middle of the way: those of parts of the way add up there.
-    weights : (L,) what each loop counts
     unlikeliness : (walks, 1 + LASTS * SIZES) minus twice the logarithm of the likelihood but for a constant; column 0 is that
         without rates
     """
 
     def __init__(
-        self, graph: PoseGraph, loops: Sequence[Constraint], found: Floats, turned: Floats, weights: Floats,
+        self, graph: PoseGraph, loops: Sequence[Constraint], found: Floats, turned: Floats,
         config: GraphConfig,
     ) -> None:  # fmt: skip
         self._poses = se3.make(np.eye(3), -graph.poses[:, :3, 3].mean(0)) @ graph.poses
-        ends, P, self._weights = Ends(loops), self._poses, weights
+        ends, P = Ends(loops), self._poses
         self._effects = _effects(P, graph.distances, turned)
         self._rows = (self._effects[ends.b] - self._effects[ends.a]).reshape(-1, len(found))
         self._off = se3.log(P[ends.a] @ ends.T @ se3.inverse(P[ends.b])).ravel() + self._rows @ found
-        self._noise = moved(ends.covariances, P[ends.a])
         lengths = np.linalg.norm([c.T_a_b[:3, 3] for c in graph.odometry], axis=1)
         self._known, self._walk = (
             _shared(_accumulated(P, graph.odometry, np.array(own)), ends)
@@ -99,7 +95,7 @@ class _Fit:
                 [c.covariance for c in graph.odometry], [drift_covariance(length, config) for length in lengths]
             )
         )  # fmt: skip
-        self._known += _on_diagonal(self._noise / weights[:, None, None])
+        self._known += _on_diagonal(moved(ends.covariances, P[ends.a]))
         roots = rate_roots(graph.distances[-1], config, list(range(6)), LASTS)
         self._priors = [np.zeros_like(roots[0])] + [size**2 * root @ root.T for root in roots for size in SIZES]
         drifted = [self._rows @ prior @ self._rows.T for prior in self._priors]
@@ -113,14 +109,6 @@ class _Fit:
         seen = self._rows @ prior
         gain = np.linalg.solve(self._walked(walk) + seen @ self._rows.T, seen).T
         return np.asarray(gain @ self._off), np.asarray(prior - gain @ seen), walk
-
-    def believable(self) -> Floats:
-        """(L,) what each loop should count: less when it lies far from where all the rest has it."""
-        prior, walk = self._choice()
-        told = np.linalg.solve(self._walked(walk) + self._rows @ prior @ self._rows.T, self._off).reshape(-1, 6, 1)
-        away = self._noise / self._weights[:, None, None] @ told
-        pulls = np.linalg.solve(self._noise, away)
-        return np.asarray((FREEDOM + 6.0) / (FREEDOM + (away * pulls).sum((1, 2))))
 
     def spread(self, covariance: Floats) -> Floats:
         """(K, 6, 6) what poses are unsure by when rates are by `covariance` (6 n, 6 n), as the covariances of `Solution`."""
