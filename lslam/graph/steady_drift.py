@@ -28,6 +28,8 @@ SCALES = (0.25, 0.5, 1.0)
 # The more lasts, the farther drift is believed to go on where no wall is seen, so more is believed only of what is likelier by
 # so much that chance seldom explains it.
 SELDOM = 0.95
+# What is fitted with drift and not without: how large it is and how it lasts. The rates themselves are averaged over.
+FITTED = 2
 ROUNDS = 6
 SETTLED = 0.1  # of the squared length that chance would give rates
 
@@ -95,7 +97,7 @@ def find_steady_drift(
     spread[:, np.array(PLANAR)[:, None], PLANAR] = moves @ covariance @ np.swapaxes(moves, -1, -2)
     return SteadyDrift(
         found.reshape(-1, 3), np.asarray(at_knots @ new.reshape(-1, 3)), spread,
-        DriftClaim(-(mean @ found), sigma, gain, quantile(config.probability, len(found))),
+        DriftClaim(-(mean @ found), sigma, gain, quantile(config.probability, FITTED)),
         is_settled=float(new @ np.linalg.solve(covariance, new)) <= SETTLED * len(found),
     )  # fmt: skip
 
