@@ -55,11 +55,13 @@ def without_loop_drift(graph: PoseGraph, config: GraphConfig) -> PoseGraph:
     turned = np.tile(np.eye(3), (len(graph) - 1, 1, 1))
     for _ in range(ROUNDS):
         fit = _Fit(straight, loops, found, turned, config)
+        gain = float(fit.unlikeliness[:, 0].min() - fit.unlikeliness.min())
+        if gain <= 0.0:
+            return graph
         found, covariance, walk = fit.likeliest()
         rates = at_knots @ found.reshape(-1, 6)
         turned = _turned(rates[:, 3:], np.diff(graph.distances))
         straight = set_straight(graph, np.column_stack([np.einsum("kij,kj->ki", turned, rates[:, :3]), rates[:, 3:]]))
-    gain = float(fit.unlikeliness[:, 0].min() - fit.unlikeliness.min())
     chance = quantile(config.probability, 6)
     if gain <= chance:
         return graph
@@ -97,8 +99,9 @@ class _Fit:
         )  # fmt: skip
         self._known += _on_diagonal(moved(ends.covariances, P[ends.a]))
         roots = rate_roots(graph.distances[-1], config, list(range(6)), LASTS)
-        self._priors = [np.zeros_like(roots[0])] + [size**2 * root @ root.T for root in roots for size in SIZES]
-        drifted = [self._rows @ prior @ self._rows.T for prior in self._priors]
+        self._kinds = [(root, size) for root in roots for size in SIZES]
+        seen = [self._rows @ root for root in roots]
+        drifted = [np.zeros_like(self._known)] + [size**2 * part @ part.T for part in seen for size in SIZES]
         self.unlikeliness = np.array(
             [[_unlikely(self._walked(walk) + D, self._off) for D in drifted] for walk in WALKS]
         )
@@ -118,7 +121,8 @@ class _Fit:
     def _choice(self) -> tuple[Floats, float]:
         """The covariance of rates of the likeliest kind before any loop, and the walk."""
         likely = np.exp(-0.5 * (self.unlikeliness[:, 1:] - self.unlikeliness[:, 1:].min()))
-        return self._priors[1 + int(likely.sum(0).argmax())], float(WALKS @ likely.sum(1) / likely.sum())
+        root, size = self._kinds[int(likely.sum(0).argmax())]
+        return size**2 * root @ root.T, float(WALKS @ likely.sum(1) / likely.sum())
 
     def _walked(self, walk: float) -> Floats:
         return np.asarray(self._known + walk * self._walk)
