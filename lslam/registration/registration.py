@@ -25,6 +25,7 @@ from lslam.registration.start_search import (
     START_STEP,
     StandingPoints,
     distinct,
+    is_at_rest,
     is_much_more,
     start_offsets,
 )
@@ -116,7 +117,7 @@ class Registration(Stateful):
         coarse = self._judge(self._coarse_to_fine(points, T_prior), T_prior)
         coarse = replace(coarse, iterations=coarse.iterations + fine.iterations)
         best = coarse if not fine.ok or (coarse.ok and coarse.inliers > fine.inliers) else fine
-        is_far = best.ok and best.prior_error[0] >= c.recover_m
+        is_far = not best.ok or best.prior_error[0] >= c.recover_m
         return self._held(points, T_prior, best) if is_far and c.start_reach > 0 else best
 
     def update(self, points: PreparedPoints, result: RegistrationResult) -> None:
@@ -189,19 +190,23 @@ class Registration(Stateful):
         starts = [T_prior]
         if self._inserted == 1:
             found = self._search(points, T_prior, found, standing, seen)
+        if self._inserted == 1 or not found.ok:
             starts.append(standing.likeliest(seen, T_prior, self.config.start_reach))
 
         def share(result: RegistrationResult) -> float:
             return standing.share(seen, result.T_world_lidar)
 
         stood = max((standing.align(seen, start) for start in starts), key=share)
-        if not is_much_more(share(stood), share(found), len(seen.source)):
-            return found
         place = stood.T_world_lidar
+        is_drawn = found.ok and is_at_rest(place, self._recent[-1][1])
+        if is_drawn or not is_much_more(share(stood), share(found), len(seen.source)):
+            return found
         near = self._refine(
             points, place, 2 * self.config.kernel_min, self.config.start_iterations, self._coarse_map(points, place)
         )
         judged = self._judge(near, place)
+        if not judged.ok and not found.ok:
+            return found
         if not judged.ok or is_much_more(share(stood), share(judged), len(seen.source)):
             place = standing.place_on_ground(place, near.T_world_lidar, points.map_points)
             judged = near.moved(place, stood.covariance)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.config.preprocess import PreprocessConfig
-from lslam.geometry import se3
+from lslam.geometry import se3, so3
 from lslam.preprocessing.ground import CELL, above_ground, levelling
 from lslam.preprocessing.prepare import PreparedPoints
 from lslam.registration.gaussian_map import GaussianMap
@@ -20,6 +20,10 @@ Points = NDArray[np.float32]
 
 # m; starts this far apart leave no gap between their capture ranges, not even between piers of a facade.
 START_STEP = 1.0
+# A hand-held sensor turns at 100 deg/s, by 30 deg at every third scan; so far apart that 20 m away a step is left.
+START_TURNS_DEG = np.delete(np.arange(-30.0, 31.0, 3.0), 10)
+# Less than the rings of most sensors are apart.
+AT_REST_DEG = 3.0
 # Every so many-th source point is enough to tell a good start from a bad one; so many of the best are looked at closely.
 SEARCH_SHARE, LOOKED_AT = 4, 3
 # Along a bare wall the rings repeat best where nothing moved, by up to five percent: a start elsewhere must have more, and
@@ -57,9 +61,12 @@ class StandingPoints:
         return self._solve(seen, T_start, Annealing(START_STEP, NEAR / 2, 0.7, 20))
 
     def likeliest(self, seen: PreparedPoints, T_prior: Floats, reach: float) -> Floats:
-        """(4, 4) pose up to `reach`, m, from the prior at which most of them have a point near by."""
-        starts = [T_prior @ se3.make(np.eye(3), offset) for offset in start_offsets(reach, NEAR)]
-        return max(starts, key=lambda start: self.share(seen, start))
+        """(4, 4) pose up to `reach`, m, from the prior, or turned, at which most of them have a point near by."""
+        moved = [T_prior @ se3.make(np.eye(3), offset) for offset in start_offsets(reach, NEAR)]
+        turned = [
+            T_prior @ se3.make(so3.exp(np.array([0, 0, turn])), np.zeros(3)) for turn in np.deg2rad(START_TURNS_DEG)
+        ]
+        return max([*moved, *turned], key=lambda start: self.share(seen, start))
 
     def place_on_ground(self, stood: Floats, planes: Floats, points: Points) -> Floats:
         """(4, 4) pose with place and heading of `stood`, height and tilt of `planes`, both of the scan of `points`.
@@ -78,6 +85,12 @@ class StandingPoints:
     def _standing(self, points: Points) -> Points:
         p = self._preprocess
         return points[above_ground(points, p.ground_slope, p.ground_tolerance)]
+
+
+def is_at_rest(pose: Floats, last: Floats) -> bool:
+    """Whether the pose (4, 4) is so near to the last scan's that the sensor's own rings, on roofs or walls, explain it."""
+    move, turn = se3.relative(last, pose)[:3, 3], so3.angle(se3.relative(last, pose)[:3, :3])
+    return bool(np.linalg.norm(move) < 2 * NEAR and turn < np.deg2rad(AT_REST_DEG))
 
 
 def is_much_more(share: float, other: float, count: int) -> bool:

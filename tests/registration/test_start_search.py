@@ -36,6 +36,22 @@ def test_nine_metres_a_scan_are_found_among_posts_and_cars_that_keep_pace(seed: 
     assert error < 0.1
 
 
+@pytest.mark.parametrize(("seed", "first"), [(1, 0), (2, 290)])
+def test_a_first_turn_of_more_than_twenty_degrees_is_found(seed: int, first: int) -> None:
+    error, _ = at_every_third("walk", seed, first, np.eye(4))
+    assert error < 0.02
+
+
+def test_turns_of_thirty_degrees_that_nothing_foretells_are_found_along_the_way() -> None:
+    drive = simulate("walk", motion_compensated=True)
+    registration = Registration()
+    for i in range(0, 54, STRIDE):
+        result = registration.register(drive.scan(i).points)
+        truth = se3.relative(drive.ground_truth.poses[0], drive.ground_truth.poses[i])
+        assert result.ok, result.reason
+        assert np.linalg.norm(result.T_world_lidar[:3, 3] - truth[:3, 3]) < 0.02
+
+
 def test_between_bare_walls_the_prior_stays_though_rings_match_best_where_nothing_moved() -> None:
     error, blind = at_every_third("corridor", 0, 145, None)
     assert blind == 1
