@@ -105,8 +105,9 @@ def expand_lines(lines: Sequence[Line], place: Place) -> Expanded:
 
 def _names(tree: dict[str, Any]) -> list[str]:
     """What the content of MARK goes by: its lines, or each recording and scenario of its jobs with each method."""
-    if "lines" in tree:
-        return [str(line) for line in tree["lines"]]
+    lines = tree.get("lines")
+    if isinstance(lines, list) and lines:
+        return [str(line) for line in lines]
     return [
         f"{sequence.path or sequence.scenario} {method}"
         for job in parse_batch(tree, MARK).jobs

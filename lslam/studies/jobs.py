@@ -59,9 +59,12 @@ def run_jobs(
     if crew.at_once > 1:  # a long one begun last would keep one process busy while the others have no more to do
         jobs = sorted(jobs, key=lambda job: used(_MANY, job.config.input), reverse=True)
     tasks = [
-        Task(job.name, partial(work, job, bench), job.folder.with_name(f"{job.folder.name}.out"), str(job.path))
+        Task(
+            job.name, partial(work, job, bench), job.folder.with_name(f"{job.folder.name}.out"),
+            str(job.path) if crew.is_kept else "",
+        )
         for job in jobs
-    ]
+    ]  # fmt: skip
 
     def on_end(index: int, cause: str) -> None:
         settle(jobs[index], cause, bench)

@@ -59,7 +59,8 @@ def run_tasks(
 ) -> None:
     """Run every task; on_start(index) and, once per task, on_end(index, how its process died or "") are called here.
 
-    They begin in order, but for a process that goes on with what it has read as long as there is such a task.
+    They begin in order, but for a process that goes on with what it has read as long as there is such a task, and turns to
+    what no other has read before it reads what another has.
     Processes are spawned, not forked: a fork of a process whose kernels have run is a process that may hang. An exception,
     KeyboardInterrupt included, ends those that run, politely first.
     """

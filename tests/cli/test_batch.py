@@ -103,10 +103,18 @@ def test_another_list_does_not_go_on_in_the_folder_of_this_one(
         command.main([source, *words], standalone_mode=False)
 
 
-def test_a_folder_whose_list_is_damaged_is_named(sample: Path, tmp_path: Path) -> None:
-    (tmp_path / "batch.toml").write_text("[[jobs]]\nsequence = ['street']\n")
+@pytest.mark.parametrize(
+    ("held", "said"),
+    [
+        ("[[jobs]]\nsequence = ['street']\n", r"batch\.toml: jobs: unknown key 'sequence'; did you mean 'sequences'"),
+        ("lines = []\n", r"batch\.toml: unknown key 'lines'"),
+        ("lines = 3\n", r"batch\.toml: unknown key 'lines'"),
+    ],
+)
+def test_a_folder_whose_list_is_damaged_is_named(held: str, said: str, sample: Path, tmp_path: Path) -> None:
+    (tmp_path / "batch.toml").write_text(held)
     batch = BatchConfig.model_validate({"jobs": [{"sequences": [str(sample)]}]})
-    with pytest.raises(ConfigError, match=r"batch\.toml: jobs: unknown key 'sequence'; did you mean 'sequences'"):
+    with pytest.raises(ConfigError, match=said):
         expand_batch(batch, Place(tmp_path, resume=True))
 
 

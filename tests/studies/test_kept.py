@@ -108,10 +108,10 @@ def test_several_at_once_begin_with_what_takes_longest_and_one_keeps_the_order(
         begun[:] = tasks
 
     monkeypatch.setattr("lslam.studies.jobs.run_tasks", fake)
-    for crew, order in ((Crew(2, is_kept=True), "3201"), (Crew(1, is_kept=True), "0123")):
+    for crew, order in ((Crew(2, is_kept=True), "3201"), (Crew(2), "3201"), (Crew(1, is_kept=True), "0123")):
         run_jobs(jobs, crew, Follow())
         assert [task.name for task in begun] == [f"sample {k} seed 0" for k in order]
-    assert {task.data for task in begun} == {str(tmp_path)}
+        assert {task.data for task in begun} == {str(tmp_path) if crew.is_kept else ""}
 
 
 def test_memory_is_bounded_by_what_is_free() -> None:
