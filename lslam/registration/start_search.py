@@ -96,7 +96,8 @@ def is_at_rest(pose: Floats, last: Floats) -> bool:
 def is_much_more(share: float, other: float, count: int) -> bool:
     """Whether of `count` points a much larger share agrees at one pose than at the `other`, and not by chance.
 
-    McNemar's test of paired shares at two sigma, with as many points in dispute as there can be.
+    McNemar's test of paired shares at two sigma. How many points the poses dispute is not known: every one that fails to
+    agree at either pose is taken for one, which none in dispute escapes.
     """
     in_dispute = count * (2 - share - other)
     return share > MUCH * other and count * (share - other) > 2 * np.sqrt(in_dispute)

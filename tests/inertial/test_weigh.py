@@ -242,6 +242,35 @@ def test_a_registration_that_neither_imu_nor_constant_velocity_bears_out_is_brid
     assert 1e-4 < np.sqrt(np.linalg.eigvalsh(out.registration_covariance[:3, :3])[-1]) < 0.05
 
 
+def test_a_bridged_scan_is_as_sure_as_the_imu_whatever_registration_said_of_itself() -> None:
+    bridged = []
+    for C in (SURE, 0.1 * SURE):
+        motion = motion_of()
+        stamp, true = begun(motion)
+        bridged.append(motion.weigh(result_of(3, stamp, true @ FALSE, C), motion.sweep(stamp, 0.0)))
+    assert [out.status for out in bridged] == ["bridged", "bridged"]
+    first, second = (out.registration_covariance for out in bridged)
+    assert first is not None
+    assert second is not None
+    np.testing.assert_array_equal(first, second)
+
+
+@pytest.mark.parametrize("why", ["no speed yet", "the sweep ends in a gap", "another scan was expected"])
+def test_a_contradiction_that_nobody_can_decide_leaves_the_pose_registered(why: str) -> None:
+    imu, stamps = motion_of().imu, drone().stamps_ns
+    config, span = ImuConfig(use=True), 0.1 if why == "the sweep ends in a gap" else 0.0
+    # Samples tell of `gap_s` more: of the middle of the sweep that begins at scan 3, not of its end.
+    keep = imu.stamps_ns < stamps[3] + 75_000_000 - 1e9 * config.gap_s if span else np.ones(len(imu), np.bool_)
+    motion = motion_of(ImuStream(imu.stamps_ns[keep], imu.accel[keep], imu.gyro[keep]))
+    stamp, true = begun(motion, 1 if why == "no speed yet" else 3)
+    prior = motion.sweep(stamp, span)
+    if why == "another scan was expected":
+        motion.sweep(int(stamps[4]), 0.0)
+    out = motion.weigh(result_of(3, stamp, true @ FALSE, SURE), prior)
+    assert out.status == "ok"
+    np.testing.assert_array_equal(out.T_world_lidar, true @ FALSE)
+
+
 @pytest.mark.parametrize("is_restored", [False, True])
 def test_a_registration_that_insists_is_believed(is_restored: bool) -> None:
     motion = motion_of()

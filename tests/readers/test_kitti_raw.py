@@ -71,6 +71,14 @@ def test_distorted_scans_begin_half_a_sweep_before_the_scanner_looks_ahead(tmp_p
     assert open_sequence(folder, motion_compensated=False).stamps_ns[1] == 1317042272_053000001
 
 
+def test_stamps_that_the_user_names_are_those_of_scan_starts_as_they_are(tmp_path: Path) -> None:
+    folder = raw_drive(tmp_path)
+    lines = "".join(f"2011-09-26 13:04:32.{k * 100 + 3:03d}000000\n" for k in range(6))
+    (folder / "timestamps.txt").write_text(lines)
+    write_sequence_toml(folder / "sequence.toml", SequenceInfo(stamps="timestamps.txt"))
+    assert open_sequence(folder, motion_compensated=False).stamps_ns[1] == 1317042272_103000000
+
+
 def test_the_start_of_the_sweep_is_taken_where_it_is_known(tmp_path: Path) -> None:
     folder = raw_drive(tmp_path)
     for name, shift in (("timestamps", 3), ("timestamps_start", 0), ("timestamps_end", 96)):
