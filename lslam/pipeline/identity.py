@@ -6,7 +6,6 @@ import hashlib
 import json
 import os
 from collections.abc import Iterator
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -66,5 +65,6 @@ def _files(path: Path) -> Iterator[tuple[str, os.stat_result]]:
         inner.sort()
         place = os.path.relpath(folder, path)
         for name in sorted(names):
-            with suppress(FileNotFoundError):  # a link that leads nowhere
-                yield os.path.normpath(os.path.join(place, name)), os.stat(os.path.join(folder, name))
+            file = os.path.join(folder, name)
+            if os.path.isfile(file):
+                yield os.path.normpath(os.path.join(place, name)), os.stat(file)

@@ -121,9 +121,10 @@ def test_the_input_is_another_when_a_file_a_truth_or_the_number_of_scans_changes
     assert input_digest(open_sequence(drive), None) != first
     (drive / "kept").rename(scan)
     assert scan.read_bytes() == data
-    (drive / "nowhere").symlink_to("gone")
-    assert input_digest(open_sequence(drive), None) == first, "a link that leads nowhere is no file"
-    (drive / "nowhere").unlink()
+    for target in ("gone", "nowhere", "velodyne/000001.bin/inside"):
+        (drive / "nowhere").symlink_to(target)
+        assert input_digest(open_sequence(drive), None) == first, "a link that leads nowhere is no file"
+        (drive / "nowhere").unlink()
     (drive / "more").mkdir()
     (drive / "more" / "notes").write_text("")
     assert input_digest(open_sequence(drive), None) != first
