@@ -50,7 +50,7 @@ def drift_factor(graph: PoseGraph, loops: Sequence[Constraint], config: GraphCon
     on_map = _as_fixes(graph)
     if not loops and max(len(graph.fixes), len(on_map)) < 2 and not graph.ups:
         return 0.0
-    known, drift = _chains(graph, config)
+    known, drift = chains(graph, config)
     by_loops = _of_loops(graph, loops, known, drift) if loops else 0.0
     by_fixes, by_map = (_of_fixes(graph.poses, *what, known, drift) for what in ((graph.fixes, 3), (on_map, 2)))
     return max(by_loops, by_fixes, by_map, _of_ups(graph, known, drift, config))
@@ -58,10 +58,10 @@ def drift_factor(graph: PoseGraph, loops: Sequence[Constraint], config: GraphCon
 
 def tilt_factor(graph: PoseGraph, config: GraphConfig) -> float:
     """As `drift_factor` by the up directions alone: 0 unless they are sure that odometry tilts."""
-    return _of_ups(graph, *_chains(graph, config), config) if graph.ups else 0.0
+    return _of_ups(graph, *chains(graph, config), config) if graph.ups else 0.0
 
 
-def _chains(graph: PoseGraph, config: GraphConfig) -> tuple[Floats, Floats]:
+def chains(graph: PoseGraph, config: GraphConfig) -> tuple[Floats, Floats]:
     """What odometry says of its own errors, and drift of factor 1, both (K, 6, 6) accumulated."""
     drifting = [replace(c, covariance=drift_covariance(_length(c), config)) for c in graph.odometry]
     return _accumulated(graph.poses, graph.odometry), _accumulated(graph.poses, drifting)
@@ -80,13 +80,12 @@ def _as_fixes(graph: PoseGraph) -> list[PositionFix]:
 
 def _accumulated(poses: Floats, odometry: Sequence[Constraint]) -> Floats:
     """(K, 6, 6) of each pose in the world when only odometry, from each keyframe to the next, is known."""
-    total = np.zeros((len(poses), 6, 6))
-    steps = {c.b: c for c in odometry if c.b == c.a + 1}
-    for k in range(1, len(poses)):
-        moved = noise.transported(total[k - 1], poses[k, :3, 3] - poses[k - 1, :3, 3])
-        added = noise.rotated(steps[k].covariance, poses[k - 1, :3, :3]) if k in steps else 0.0
-        total[k] = moved + added
-    return total
+    steps = [c for c in odometry if c.b == c.a + 1]
+    b, own = np.array([c.b for c in steps], np.intp), np.array([c.covariance for c in steps]).reshape(-1, 6, 6)
+    # About one place the errors of all steps add up.
+    about_origin = np.zeros((len(poses), 6, 6))
+    about_origin[b] = noise.transported(noise.rotated(own, poses[b - 1, :3, :3]), -poses[b, :3, 3])
+    return noise.transported(np.cumsum(about_origin, axis=0), poses[:, :3, 3])
 
 
 def _between(chain: Floats, poses: Floats, a: NDArray[np.intp], b: NDArray[np.intp]) -> Floats:

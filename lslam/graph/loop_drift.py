@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from lslam.config.graph import GraphConfig
 from lslam.geometry import noise, se3, so3
 from lslam.graph.chi_square import quantile
-from lslam.graph.consistency import Ends, as_twists, judge_loops, moved
-from lslam.graph.drift import drift_covariance
+from lslam.graph.consistency import Ends, judge_loops, moved
+from lslam.graph.drift import chains
 from lslam.graph.pose_graph import check_graph, with_distances
 from lslam.graph.problem import DriftClaim, PoseGraph
 from lslam.graph.rates import LASTING, SIZES, hats, rate_roots, set_straight
@@ -90,13 +90,9 @@ class _Fit:
         self._effects = _effects(P, graph.distances, turned)
         self._rows = (self._effects[ends.b] - self._effects[ends.a]).reshape(-1, len(found))
         self._off = se3.log(P[ends.a] @ ends.T @ se3.inverse(P[ends.b])).ravel() + self._rows @ found
-        lengths = np.linalg.norm([c.T_a_b[:3, 3] for c in graph.odometry], axis=1)
         self._known, self._walk = (
-            _shared(_accumulated(P, graph.odometry, np.array(own)), ends)
-            for own in (
-                [c.covariance for c in graph.odometry], [drift_covariance(length, config) for length in lengths]
-            )
-        )  # fmt: skip
+            _shared(noise.transported(chain, -P[:, :3, 3]), ends) for chain in chains(graph, config)
+        )
         self._known += _on_diagonal(moved(ends.covariances, P[ends.a]))
         roots = rate_roots(graph.distances[-1], config, list(range(6)), LASTS)
         self._kinds = [(root, size) for root in roots for size in SIZES]
@@ -152,17 +148,11 @@ def _effects(poses: Floats, distances: Floats, turned: Floats) -> Floats:
     return effects.reshape(len(poses), 6, -1)
 
 
-def _accumulated(poses: Floats, odometry: Sequence[Constraint], covariances: Floats) -> Floats:
-    """(K, 6, 6) of the twist about the origin that errors of odometry have brought each pose."""
-    steps = [i for i, c in enumerate(odometry) if c.b == c.a + 1]
-    a, T = np.array([odometry[i].a for i in steps]), np.stack([odometry[i].T_a_b for i in steps])
-    total = np.zeros((len(poses), 6, 6))
-    total[a + 1] = moved(as_twists(covariances[steps], T), poses[a])
-    return np.cumsum(total, axis=0)
-
-
 def _shared(accumulated: Floats, ends: Ends) -> Floats:
-    """(6 L, 6 L) covariance of what loops are off by: two of them have the errors of the way in common that both go."""
+    """(6 L, 6 L) covariance of what loops, a before b, are off by: two have the errors of the way in common that both go.
+
+    accumulated : (K, 6, 6) of the twist about the origin that errors of odometry have brought each pose
+    """
     first = np.maximum.outer(ends.a, ends.a)
     last = np.maximum(np.minimum.outer(ends.b, ends.b), first)
     return np.asarray((accumulated[last] - accumulated[first]).transpose(0, 2, 1, 3).reshape(6 * len(first), -1))
