@@ -117,11 +117,7 @@ class DriftFit:
         squares, pulls = np.zeros((count, 3, 3)), np.zeros((count, 3))
         np.add.at(squares, self._keyframes, weighted[:, :, None] * self._axes[:, None])
         np.add.at(pulls, self._keyframes, weighted * self._offsets[:, None])
-        values, axes = np.linalg.eigh(squares)
-        rooted = (np.sqrt(np.maximum(values, 0.0))[:, :, None] * np.swapaxes(axes, -1, -2) @ self._effects).reshape(
-            -1, width
-        )
-        self._normal, self._pull = rooted.T @ rooted, flat.T @ pulls.ravel()
+        self._normal, self._pull = flat.T @ (squares @ self._effects).reshape(-1, width), flat.T @ pulls.ravel()
         self._squared = float(weights @ self._offsets**2)
         columns = 3 * self._keyframes[:, None] + np.arange(3)
         by_wall = csr_array(
