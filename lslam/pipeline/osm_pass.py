@@ -208,13 +208,13 @@ def _place(
     laid, ways = se2.compose(place, poses[numbers]), np.array([store.keyframes[k].distance for k in numbers])
     turn, squared = track.lay(laid, ways, matches, sigma)
     right = [
-        match
-        for match, far in zip(matches, squared, strict=True)
+        i
+        for i, (match, far) in enumerate(zip(matches, squared, strict=True))
         if match.rank == 3 and track.knows(match.information) and far <= quantile(BORNE_OUT, 3)
     ]
-    at = min(right, key=lambda m: abs(m.keyframe - first.keyframe), default=first)
-    heading = laid[matches.index(at), 2] + turn
-    return se2.compose(np.append(at.pose[:2], heading), se2.inverse(poses[at.keyframe]))
+    at = min(right, key=lambda i: abs(numbers[i] - first.keyframe), default=0)
+    there = np.append(matches[at].pose[:2], laid[at, 2] + turn)
+    return se2.compose(there, se2.inverse(poses[numbers[at]]))
 
 
 def _lowered(T: Floats, first: Floats, placed: Floats | None) -> Floats:
