@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.optimize import minimize
 
 from lslam.geometry import se2
 from lslam.priors.osm_track import OsmTrack
@@ -92,6 +93,30 @@ def test_a_run_is_turned_as_all_its_matches_have_it_though_the_first_house_is_as
     assert np.delete(squared, [0, 7]).max() < 1.0
     # Where the start is known that well, matches do not turn it.
     assert laid_on(told, real, [SURE] * 20, np.full(3, 1e-4))[0] == pytest.approx(0.0, abs=0.1)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_run_is_laid_where_matches_and_what_is_known_of_its_start_are_likeliest(seed: int) -> None:
+    """Against a general minimiser of Student's t of the matches and a Gaussian of the move about the first pose."""
+    rng = np.random.default_rng(seed)
+    told = se2.compose(np.array([300.0, -200.0, 2.0]), np.column_stack([5.0 * np.arange(12), np.zeros((12, 2))]))
+    real = told + np.array([1.0, -0.7, 0.04]) + rng.normal(0, [0.4, 0.4, 0.01], told.shape)
+    sigma = np.array([0.4, 0.3, 0.01])
+    variances = (
+        MAP**2
+        + 5.0 * np.arange(12)[:, None] * 100.0 * np.array([0.01, 0.01, np.radians(0.005)]) ** 2
+        + 1 / np.diag(SURE)
+    )
+
+    def unlikely(moved: np.ndarray) -> float:
+        turn = se2.compose(np.array([*told[0, :2], 0.0]) + moved, se2.inverse(np.array([*told[0, :2], 0.0])))
+        squared = ((real - se2.compose(turn, told)) ** 2 / variances).sum(axis=1)
+        return float((moved**2 / sigma**2).sum() + 4.0 * np.log(3.0 + squared).sum())
+
+    best = minimize(unlikely, np.zeros(3), method="Nelder-Mead", options={"xatol": 1e-7, "fatol": 1e-10}).x
+    turn, _ = laid_on(told, real, [SURE] * 12, sigma)
+    assert 0.5 < turn < 2.0
+    assert turn == pytest.approx(np.degrees(best[2]), abs=1e-4)
 
 
 def test_what_no_wall_fixes_turns_nothing() -> None:
