@@ -121,7 +121,7 @@ def solve(graph: PoseGraph, given: Given, georeference: Georeference | None = No
 
 def _set_straight(graph: PoseGraph, config: Config) -> PoseGraph:
     """The graph without a steady drift that loops tell; as it is where fixes or walls hold it, which tell more of it."""
-    if not config.graph.steady_drift or graph.fixes or graph.map_priors or graph.is_rigid:
+    if not config.graph.steady_drift or graph.fixes or graph.map_priors:
         return graph
     graph = without_loop_drift(graph, config.graph)
     if graph.claim is not None:

@@ -178,6 +178,9 @@ def test_a_drift_that_stays_the_same_for_long_is_believed_to_go_on(seed: int) ->
     drift = find_steady_drift(graph, some(seen, WAY[seen.keyframes] < 200.0), SEEN, MAP, GraphConfig())
     assert drift is not None
     np.testing.assert_allclose(drift.rates[-5:, :2].mean(axis=0), drift.rates[:20, :2].mean(axis=0), atol=1e-3)
+    # What is claimed is the mean of all that, and of the heading what it is unsure by at the end.
+    np.testing.assert_allclose(drift.claim.rates, -np.diff(WAY) @ drift.rates / WAY[-1], rtol=1e-9)
+    assert drift.claim.sigma[2] == pytest.approx(np.sqrt(drift.spread[-1, 5, 5]) / WAY[-1])
 
 
 @pytest.mark.parametrize("seed", range(4))

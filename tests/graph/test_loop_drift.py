@@ -69,6 +69,8 @@ def test_drift_that_lasts_is_taken_out_and_loops_close_better() -> None:
         assert ate(straight.poses, REAL) < 0.05 * ate(graph.poses, REAL)
         assert straight.spread is not None
         assert straight.spread[-1].trace() > straight.spread[LAP // 2].trace() > 0.0
+        at_end = np.sqrt(np.diag(straight.spread[-1])[3:]) / graph.distances[-1]
+        np.testing.assert_allclose(straight.claim.sigma[3:], at_end, rtol=1e-6)
         plain, better = optimise(graph, CONFIG), optimise(straight, CONFIG)
         assert better.drift >= straight.walk > 0.0
         assert not any(better.loop_reasons)
