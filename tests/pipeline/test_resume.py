@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import zipfile
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
@@ -244,6 +245,9 @@ def test_another_configuration_is_refused_and_what_changes_nothing_is_not(tmp_pa
     free = ("input.threads=1", "keyframes.deflate=0")
     lslam.run(drive(), config_of("map.write=false", *free), out=out, resume=True)
     assert manifest(out)["status"] == "degraded"
+    clouds = sorted((out / "keyframes").glob("0*.npz"))
+    ways = [zipfile.ZipFile(clouds[k]).infolist()[0].compress_type for k in (0, -1)]
+    assert ways == [zipfile.ZIP_DEFLATED, zipfile.ZIP_STORED], "packed as was asked when each was made"
 
 
 @pytest.mark.parametrize(
