@@ -82,6 +82,13 @@ def test_drift_that_lasts_is_taken_out_and_loops_close_better() -> None:
     assert 0.15 < np.mean(sure) < 3.0
 
 
+def test_what_bends_the_way_much_is_sought_again_on_the_way_set_straight() -> None:
+    """Seven degrees a lap: what the first answer leaves is three times as much."""
+    for seed in range(4):
+        graph = away(seed, 1.0, 2.0)
+        assert ate(without_loop_drift(graph, CONFIG).poses, REAL) < 0.006 * ate(graph.poses, REAL)
+
+
 @pytest.mark.parametrize(("percent", "degrees"), [(1.0, 0.0), (0.0, 0.5), (1.0, 0.5)])
 def test_what_is_claimed_is_the_drift_and_how_well_it_is_known(percent: float, degrees: float) -> None:
     squared = []
