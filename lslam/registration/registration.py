@@ -122,12 +122,11 @@ class Registration(Stateful):
 
     def update(self, points: PreparedPoints, result: RegistrationResult) -> None:
         """Enter the scan into the map unless its registration failed, and learn from how wrong the prior was."""
-        c = self.config
         if result.ok:
             first = len(self.map) == 0
             self.target.enter(self.map, points.map_points, result.T_world_lidar)
             self._inserted += 1
-            self._recent = (*self._recent, (points.map_points, result.T_world_lidar))[-c.start_scans :]
+            self._recent = (*self._recent, (points.map_points, result.T_world_lidar))[-self.config.start_scans :]
             if not first:
                 self._starting = max(self._starting - 1, 0)
                 self.agreement.observe(self._agreement(result))

@@ -61,7 +61,7 @@ class StandingPoints:
         return self._solve(seen, T_start, Annealing(START_STEP, NEAR / 2, 0.7, 20))
 
     def likeliest(self, seen: PreparedPoints, T_prior: Floats, reach: float) -> Floats:
-        """(4, 4) pose up to `reach`, m, from the prior, or turned, at which most of them have a point near by."""
+        """(4, 4) pose up to `reach`, m, from the prior, or turned about its z, at which most have a point near by."""
         moved = [T_prior @ se3.make(np.eye(3), offset) for offset in start_offsets(reach, NEAR)]
         turned = [
             T_prior @ se3.make(so3.exp(np.array([0, 0, turn])), np.zeros(3)) for turn in np.deg2rad(START_TURNS_DEG)

@@ -162,22 +162,17 @@ def test_a_drift_is_settled_well_below_what_it_is_unsure_by(seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_where_no_wall_is_seen_half_of_the_drift_is_believed_to_last(seed: int) -> None:
+@pytest.mark.parametrize(("metres", "lasting", "tolerance"), [(100.0, 0.5, 2e-3), (200.0, 1.0, 1e-3)])
+def test_where_no_wall_is_seen_drift_lasts_by_half_and_whole_once_it_stayed_the_same_for_long(
+    metres: float, lasting: float, tolerance: float, seed: int
+) -> None:
     graph = odometry(1.0, 0.0)
     seen = sighted(graph, seed, 0.3)
-    drift = find_steady_drift(graph, some(seen, WAY[seen.keyframes] < 100.0), SEEN, MAP, GraphConfig())
+    drift = find_steady_drift(graph, some(seen, WAY[seen.keyframes] < metres), SEEN, MAP, GraphConfig())
     assert drift is not None
     assert WAY[-1] > 350.0
-    np.testing.assert_allclose(drift.rates[-5:, :2].mean(axis=0), 0.5 * drift.rates[:20, :2].mean(axis=0), atol=2e-3)
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_a_drift_that_stays_the_same_for_long_is_believed_to_go_on(seed: int) -> None:
-    graph = odometry(1.0, 0.0)
-    seen = sighted(graph, seed, 0.3)
-    drift = find_steady_drift(graph, some(seen, WAY[seen.keyframes] < 200.0), SEEN, MAP, GraphConfig())
-    assert drift is not None
-    np.testing.assert_allclose(drift.rates[-5:, :2].mean(axis=0), drift.rates[:20, :2].mean(axis=0), atol=1e-3)
+    first, last = drift.rates[:20, :2].mean(axis=0), drift.rates[-5:, :2].mean(axis=0)
+    np.testing.assert_allclose(last, lasting * first, atol=tolerance)
     # What is claimed is the mean of all that, and of the heading what it is unsure by at the end.
     np.testing.assert_allclose(drift.claim.rates, -np.diff(WAY) @ drift.rates / WAY[-1], rtol=1e-9)
     assert drift.claim.sigma[2] == pytest.approx(np.sqrt(drift.spread[-1, 5, 5]) / WAY[-1])
