@@ -72,6 +72,17 @@ class InterruptedRunError(LslamError):
     exit_code = 130
 
 
+def cause(error: BaseException) -> str:
+    """What went wrong, for a sentence that names the file itself: an OSError's own words bring errno and path again.
+
+    >>> cause(FileNotFoundError(2, "No such file or directory", "poses.txt"))
+    'No such file or directory'
+    >>> cause(ValueError("no number"))
+    'no number'
+    """
+    return getattr(error, "strerror", None) or str(error)
+
+
 def nearest(name: str, known: Iterable[str]) -> str:
     """Sentence fragment suggesting the known names nearest to `name`, or listing the known ones.
 

@@ -10,7 +10,7 @@ from typing import Any, NoReturn
 
 import click
 
-from lslam.errors import LslamError, nearest
+from lslam.errors import LslamError, cause, nearest
 from lslam.version import __version__
 
 # name -> one line for --help; the module lslam.cli.<name> has the click command `command`.
@@ -129,7 +129,7 @@ def main() -> NoReturn:
             from lslam.cli.console import leave_stdout
 
             leave_stdout()  # what is still buffered would fail once more at exit, with a code of Python's own
-        _fail(f"{error.filename or 'standard output'} cannot be used: {error.strerror or error}", 3)
+        _fail(f"{error.filename or 'standard output'} cannot be used: {cause(error)}", 3)
     except MemoryError:
         _fail("out of memory: use fewer points (preprocess.range_max) or larger voxels (map.voxel)", 1)
     except Exception as error:

@@ -7,7 +7,7 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from lslam.errors import ConfigError, InputError, UsageError, nearest
+from lslam.errors import ConfigError, InputError, UsageError, cause, nearest
 
 FOLDER = "presets"
 # A preset may say what it is on one line beside its sections.
@@ -40,7 +40,7 @@ def read_toml(path: Path, what: str) -> dict[str, Any]:
     try:
         return tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except OSError as error:
-        raise InputError(f"{what} {path} cannot be read: {error.strerror or error}") from None
+        raise InputError(f"{what} {path} cannot be read: {cause(error)}") from None
     except UnicodeDecodeError:
         raise InputError(f"{what} {path} cannot be read: it is not UTF-8 text") from None
     except tomllib.TOMLDecodeError as error:

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO
 
-from lslam.errors import OutputError
+from lslam.errors import OutputError, cause
 
 
 @contextmanager
@@ -24,7 +24,7 @@ def atomic_write(path: Path) -> Iterator[BinaryIO]:
         os.replace(part, path)
     except OSError as error:
         _remove(part)
-        raise OutputError(f"{path} cannot be written: {error.strerror or error}") from None
+        raise OutputError(f"{path} cannot be written: {cause(error)}") from None
     except BaseException:
         _remove(part)
         raise

@@ -13,7 +13,7 @@ from zlib import crc32
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.errors import InputError
+from lslam.errors import InputError, cause
 
 _BLOCK = 1 << 18  # compressed bytes read at a time when only the beginning of a chunk is wanted
 IN_FILE = -1  # chunk number of a message that lies in the file itself
@@ -66,7 +66,7 @@ class ChunkFile:
         try:
             self._file = path.open("rb")
         except OSError as error:
-            raise InputError(f"{path} cannot be read: {error.strerror or error}") from None
+            raise InputError(f"{path} cannot be read: {cause(error)}") from None
         self.path = path
         self.size = os.fstat(self._file.fileno()).st_size
         self._kept: tuple[int, bytes] = (-1, b"")

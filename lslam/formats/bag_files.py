@@ -18,7 +18,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, NamedTuple, Protocol
 
-from lslam.errors import InputError, OutputError, UsageError
+from lslam.errors import InputError, OutputError, UsageError, cause
 from lslam.formats.bag_chunks import Topic
 from lslam.formats.bag_listing import SUFFIXES, list_bag_files, suffix_of
 from lslam.formats.bag_sqlite import SqliteBag
@@ -176,7 +176,7 @@ class BagWriter:
             self._part.mkdir(parents=True)
             self._writer = _writer(self._part / path.name, kind, is_zstd)
         except OSError as error:
-            raise OutputError(f"{path} cannot be written: {error.strerror or error}") from None
+            raise OutputError(f"{path} cannot be written: {cause(error)}") from None
 
     def __enter__(self) -> BagWriter:
         return self
@@ -193,7 +193,7 @@ class BagWriter:
             serialise = self.store.serialize_ros1 if self.kind == "bag" else self.store.serialize_cdr
             self._writer.write(self._connections[topic], stamp_ns, serialise(message, kind))
         except (OSError, sqlite3.Error) as error:
-            raise OutputError(f"{self.path} cannot be written: {getattr(error, 'strerror', None) or error}") from None
+            raise OutputError(f"{self.path} cannot be written: {cause(error)}") from None
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
@@ -209,9 +209,7 @@ class BagWriter:
                 made = next(p for p in made.iterdir() if p.suffix == self.path.suffix)
             os.replace(made, self.path)
         except (OSError, sqlite3.Error) as failure:
-            raise OutputError(
-                f"{self.path} cannot be written: {getattr(failure, 'strerror', None) or failure}"
-            ) from None
+            raise OutputError(f"{self.path} cannot be written: {cause(failure)}") from None
         finally:
             shutil.rmtree(self._part, ignore_errors=True)
 

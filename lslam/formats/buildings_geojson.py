@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.errors import InputError
+from lslam.errors import InputError, cause
 from lslam.formats.atomic import atomic_write
 from lslam.formats.osm_files import DECIMALS
 from lslam.geometry import se2
@@ -77,7 +77,7 @@ def read_corrected(path: Path) -> CorrectedMap:
             origin, buildings, tree["mode"], shift, walls, tuple(sorted(left)), tree["attribution"] or None
         )
     except OSError as error:
-        raise InputError(f"{path} cannot be read: {error.strerror or error}") from None
+        raise InputError(f"{path} cannot be read: {cause(error)}") from None
     except (ValueError, KeyError, TypeError, IndexError, AttributeError, RecursionError) as error:
         raise InputError(f"{path} is no buildings.geojson of a run: {error}") from None
 

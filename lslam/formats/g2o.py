@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.errors import InputError
+from lslam.errors import InputError, cause
 from lslam.formats.atomic import atomic_write
 from lslam.geometry import noise, se3, so3
 from lslam.types.constraint import Constraint, ConstraintKind
@@ -51,7 +51,7 @@ def read_g2o(path: Path) -> tuple[Floats, list[Constraint]]:
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"pose graph {path} cannot be read: {error}") from None
+        raise InputError(f"pose graph {path} cannot be read: {cause(error)}") from None
     for number, line in enumerate(lines, 1):
         tag, *fields = line.split() or [""]
         try:

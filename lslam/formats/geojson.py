@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.errors import InputError
+from lslam.errors import InputError, cause
 from lslam.formats.atomic import atomic_write
 
 
@@ -44,7 +44,7 @@ def read_line(path: Path) -> NDArray[np.float64]:
         rows = lines[0] if len(lines) == 1 and np.ndim(lines[0][0]) else lines
         places = np.array([[*row, 0.0][:3] for row in rows], np.float64)[:, [1, 0, 2]]
     except OSError as error:
-        raise InputError(f"{path} cannot be read: {error.strerror or error}") from None
+        raise InputError(f"{path} cannot be read: {cause(error)}") from None
     except (ValueError, TypeError, KeyError, IndexError, RecursionError):
         raise InputError(f"{path} is no GeoJSON of one line in longitude and latitude") from None
     if not (np.isfinite(places).all() and (np.abs(places[:, :2]) <= [90, 180]).all()):

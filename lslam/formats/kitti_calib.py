@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.errors import InputError
+from lslam.errors import InputError, cause
 from lslam.geometry import se3
 
 Floats = NDArray[np.float64]
@@ -85,7 +85,7 @@ def read_entries(path: Path) -> dict[str, str]:
     except UnicodeDecodeError:
         raise InputError(f"calibration {path} is not a text file") from None
     except OSError as error:
-        raise InputError(f"calibration {path} cannot be read: {error.strerror}") from None
+        raise InputError(f"calibration {path} cannot be read: {cause(error)}") from None
     entries = {}
     for line in lines:
         name, colon, values = line.partition(":")

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.errors import InputError, OutputError
+from lslam.errors import InputError, OutputError, cause
 from lslam.foreign import importing
 from lslam.formats.atomic import atomic_write
 from lslam.types.cloud import ArrayCloud, Cloud
@@ -68,7 +68,7 @@ def read_las(path: Path) -> tuple[ArrayCloud, str]:
         points = np.asarray(data.xyz, np.float64)
         intensity = np.asarray(data.intensity, np.float32)
     except OSError as error:
-        raise InputError(f"{path} cannot be read: {error.strerror or error}") from None
+        raise InputError(f"{path} cannot be read: {cause(error)}") from None
     except Exception as error:  # laspy and lazrs raise whatever a damaged byte leads to
         raise InputError(f"{path} cannot be read as LAS: {error}") from None
     texts = [vlr.string for vlr in data.header.vlrs if type(vlr).__name__ == "WktCoordinateSystemVlr"]

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.errors import InputError
+from lslam.errors import InputError, cause
 
 _ROW = re.compile(r"-\s*\[(.*)\]\s*$")
 
@@ -21,7 +21,7 @@ def read_mcd_extrinsics(path: Path, sensor: str = "os_sensor") -> NDArray[np.flo
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path} cannot be read: {error}") from None
+        raise InputError(f"{path} cannot be read: {cause(error)}") from None
     begin = next((k for k, line in enumerate(lines) if line.strip() == f"{sensor}:"), None)
     if begin is None:
         return None

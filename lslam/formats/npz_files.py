@@ -11,7 +11,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.errors import InputError
+from lslam.errors import InputError, cause
 from lslam.formats.atomic import atomic_write
 
 # Of a zip member: numpy's own writer gives this date too.
@@ -41,7 +41,7 @@ def read_npz(source: Path | BinaryIO) -> dict[str, NDArray[Any]]:
         with np.load(source, allow_pickle=False) as archive:
             return {name: archive[name] for name in archive.files}
     except OSError as error:
-        raise InputError(f"{_name(source)} cannot be read: {error.strerror or error}") from None
+        raise InputError(f"{_name(source)} cannot be read: {cause(error)}") from None
     except (ValueError, KeyError, EOFError, TypeError, AttributeError, zipfile.BadZipFile, zlib.error) as error:
         raise InputError(f"{_name(source)} is damaged: {error}") from None
 

@@ -14,7 +14,7 @@ from typing import Any
 from xml.etree.ElementTree import Element, ParseError
 from xml.sax.saxutils import quoteattr
 
-from lslam.errors import InputError
+from lslam.errors import InputError, cause
 from lslam.formats.atomic import atomic_write
 from lslam.formats.osm_geojson import elements_of, is_geojson
 
@@ -22,6 +22,8 @@ ATTRIBUTION = "© OpenStreetMap contributors, ODbL 1.0, openstreetmap.org/copyri
 GENERATOR = "lslam"
 DECIMALS = 7  # of a degree, as in OpenStreetMap's own database: 1.1 cm
 WAY_OUT = "fetch the extract again"
+# First bytes of gzip, bzip2, xz, zip and Zstandard.
+_COMPRESSED = (b"\x1f\x8b", b"BZh", b"\xfd7zXZ", b"PK\x03\x04", b"\x28\xb5\x2f\xfd")
 
 
 @dataclass(frozen=True)
@@ -105,15 +107,17 @@ def read_osm(path: Path) -> OsmData:
     try:
         with path.open("rb") as stream:
             start = stream.read(64)
-        if start[:2] == b"\x1f\x8b" or b"OSMHeader" in start:
-            raise InputError(f"{path} is compressed: turn it into plain XML first (gunzip, or osmium cat -o map.osm)")
+        if start.startswith(_COMPRESSED) or b"OSMHeader" in start:
+            raise InputError(
+                f"{path} is compressed: turn it into plain XML first (gunzip, bunzip2, or osmium cat -o map.osm)"
+            )
         first = start.removeprefix(b"\xef\xbb\xbf").lstrip()[:1]
         if first not in (b"<", b"{", b"["):
             what = "is neither XML nor JSON" if first else "is empty"
             raise InputError(f"{path} {what}, so it is no OpenStreetMap extract: {WAY_OUT}")
         return _read_xml(path) if first == b"<" else _read_json(path)
     except OSError as error:
-        raise InputError(f"{path} cannot be read: {error.strerror or error}") from None
+        raise InputError(f"{path} cannot be read: {cause(error)}") from None
 
 
 def from_overpass(tree: Any) -> OsmData:
@@ -159,7 +163,12 @@ def _add_json(data: OsmData, element: dict[str, Any]) -> None:
     if kind == "node":
         data.add_node(number, element["lat"], element["lon"])
     elif kind == "way":
-        data.add_way(Way(number, tuple(int(n) for n in element.get("nodes", ())), tags))
+        nodes = tuple(int(n) for n in element.get("nodes", ()))
+        # `out geom` says where nodes are beside their numbers, and of those outside its box nothing.
+        for node, place in zip(nodes, element.get("geometry", ()), strict=False):
+            if place is not None:
+                data.add_node(node, place["lat"], place["lon"])
+        data.add_way(Way(number, nodes, tags))
     elif kind == "relation":
         members = element.get("members", ())
         found = tuple(Member(str(m["type"]), int(m["ref"]), str(m.get("role", ""))) for m in members)
@@ -182,8 +191,11 @@ def _read_xml(path: Path) -> OsmData:
                 _add_xml(data, element)
                 root.clear()
     except DTDForbidden as error:
-        what = "is a web page" if str(error.name).lower() == "html" else "declares a document type or entities"
-        raise InputError(f"{path} {what}, which no OpenStreetMap file does: {WAY_OUT}") from None
+        if str(error.name).lower() == "html":
+            raise InputError(f"{path} is a web page and no OpenStreetMap extract: {WAY_OUT}") from None
+        raise InputError(
+            f"{path} declares a document type or entities, which no OpenStreetMap file does: {WAY_OUT}"
+        ) from None
     except DefusedXmlException:
         raise InputError(f"{path} declares entities, which no OpenStreetMap file does: {WAY_OUT}") from None
     except ParseError as error:
@@ -217,7 +229,11 @@ def _add_xml(data: OsmData, element: Element) -> None:
         return
     tags = {tag.attrib["k"]: tag.attrib["v"] for tag in element.iter("tag")}
     if element.tag == "way":
-        data.add_way(Way(number, tuple(int(n.attrib["ref"]) for n in element.iter("nd")), tags))
+        corners = [(int(n.attrib["ref"]), n.attrib) for n in element.iter("nd")]
+        for node, place in corners:
+            if "lat" in place:
+                data.add_node(node, place["lat"], place["lon"])
+        data.add_way(Way(number, tuple(node for node, _ in corners), tags))
         return
     members = (m.attrib for m in element.iter("member"))
     found = tuple(Member(m["type"], int(m["ref"]), m.get("role", "")) for m in members)

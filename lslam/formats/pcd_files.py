@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.errors import InputError, UsageError
+from lslam.errors import InputError, UsageError, cause
 from lslam.formats.atomic import atomic_write
 from lslam.formats.point_cloud import PointCloud, cloud_from_fields
 
@@ -44,7 +44,7 @@ def read_pcd(path: Path) -> PointCloud:
     try:
         data = path.read_bytes()
     except OSError as error:
-        raise InputError(f"{path} cannot be read: {error.strerror or error}") from None
+        raise InputError(f"{path} cannot be read: {cause(error)}") from None
     header = _read_header(path, data)
     body = memoryview(data)[header.size :]
     if header.points == 0:

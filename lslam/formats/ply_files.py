@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.errors import InputError
+from lslam.errors import InputError, cause
 from lslam.formats.atomic import atomic_write
 from lslam.formats.point_cloud import PointCloud, cloud_from_fields
 
@@ -37,7 +37,7 @@ def read_ply(path: Path) -> PointCloud:
     try:
         data = path.read_bytes()
     except OSError as error:
-        raise InputError(f"{path} cannot be read: {error.strerror or error}") from None
+        raise InputError(f"{path} cannot be read: {cause(error)}") from None
     encoding, elements, size = _read_header(path, data)
     order = _ORDERS[encoding]
     body = memoryview(data)[size:]

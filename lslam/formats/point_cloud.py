@@ -67,6 +67,8 @@ def _first(lower: Mapping[str, str], names: tuple[str, ...]) -> str | None:
 
 
 def _as_rings(path: Path, name: str, values: NDArray[Any]) -> NDArray[np.uint16]:
+    if np.can_cast(values.dtype, np.uint16):
+        return values.astype(np.uint16)
     if len(values) and not (np.isfinite(values).all() and values.min() >= 0 and values.max() <= 65535):
         raise InputError(f"{path}: field {name!r} holds no ring numbers (0 to 65535)")
     return values.astype(np.uint16)

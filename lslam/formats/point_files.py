@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.errors import InputError, UsageError
+from lslam.errors import InputError, UsageError, cause
 from lslam.formats.atomic import atomic_write
 from lslam.formats.pcd_files import read_pcd, write_pcd
 from lslam.formats.ply_files import read_ply, write_ply
@@ -49,7 +49,7 @@ def read_bin(path: Path) -> NDArray[np.float32]:
         with path.open("rb") as stream:
             raw = np.fromfile(stream, np.uint8)
     except OSError as error:
-        raise InputError(f"{path} cannot be read: {error.strerror or error}") from None
+        raise InputError(f"{path} cannot be read: {cause(error)}") from None
     if len(raw) % 16:
         others = [f"{size} bytes ({what})" for size, what in _OTHER_RECORDS.items() if len(raw) % size == 0]
         could = f"or its records are of {' or '.join(others)}: convert them" if others else "fetch it again"

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.errors import InputError
+from lslam.errors import InputError, cause
 from lslam.geometry import se3, so3
 
 Floats = NDArray[np.float64]
@@ -33,7 +33,7 @@ def read_rows(path: Path) -> tuple[list[Row], list[str]]:
     except UnicodeDecodeError:
         raise InputError(f"{path} is not a text file: a trajectory or a table of times is expected") from None
     except OSError as error:
-        raise InputError(f"{path} cannot be read: {error.strerror}") from None
+        raise InputError(f"{path} cannot be read: {cause(error)}") from None
     rows, comments = [], []
     for number, line in enumerate(text.splitlines(), start=1):
         stripped = line.strip()

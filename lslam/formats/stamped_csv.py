@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.errors import InputError
+from lslam.errors import InputError, cause
 from lslam.formats.atomic import atomic_write
 from lslam.formats.stamps_files import parse_stamp
 
@@ -29,7 +29,7 @@ def read_stamped_csv(
     try:
         lines = path.read_text(encoding="utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path} cannot be read: {error}") from None
+        raise InputError(f"{path} cannot be read: {cause(error)}") from None
     header = [_plain(name) for name in lines[0].split(",")] if lines else []
     time = _find(header, TIME_COLUMNS)
     if time is None:

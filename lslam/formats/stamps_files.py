@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.errors import InputError
+from lslam.errors import InputError, cause
 
 _DATE = re.compile(r"(\d{4})-(\d\d)-(\d\d)[ T](\d\d):(\d\d):(\d\d)(?:\.(\d{1,9}))?$")
 # Whole numbers from here on are nanoseconds: as seconds they would lie 3 million years ahead.
@@ -27,7 +27,7 @@ def read_stamps(path: Path) -> NDArray[np.int64]:
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path} cannot be read: {error}") from None
+        raise InputError(f"{path} cannot be read: {cause(error)}") from None
     stamps: list[int] = []
     headed = False
     for number, line in enumerate(lines, 1):

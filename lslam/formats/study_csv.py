@@ -15,7 +15,7 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
-from lslam.errors import InputError
+from lslam.errors import InputError, cause
 from lslam.formats.atomic import atomic_write
 from lslam.types.study import StudyRow, Value
 
@@ -64,7 +64,7 @@ def read_study_csv(path: Path) -> list[StudyRow]:
         with path.open(newline="", encoding="utf-8-sig") as stream:
             lines = [line for line in csv.reader(stream) if line]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise InputError(f"study {path} cannot be read: {error}") from None
+        raise InputError(f"study {path} cannot be read: {cause(error)}") from None
     header = lines[0] if lines else []
     if SCHEMA not in header:
         raise InputError(f"{path} is no results.csv of a study: it has no column {SCHEMA}")

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.errors import InputError
+from lslam.errors import InputError, cause
 
 NOT_STAGES = ("index", "stamp_ns", "stamp", "total")
 
@@ -63,7 +63,7 @@ def _table(path: Path) -> tuple[list[str], NDArray[np.float64]]:
                 (n, row) for n, row in enumerate(csv.reader(stream), start=1) if row and not row[0].startswith("#")
             ]
     except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"timing {path} cannot be read: {error}") from None
+        raise InputError(f"timing {path} cannot be read: {cause(error)}") from None
     if len(lines) < 2:
         raise InputError(f"timing {path} holds no scans")
     header = [name.strip() for name in lines[0][1]]

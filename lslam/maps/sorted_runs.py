@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.errors import InputError, OutputError
+from lslam.errors import InputError, OutputError, cause
 from lslam.types.state import State
 
 Rows = NDArray[np.int64]
@@ -46,7 +46,7 @@ class SortedRuns:
                 self._folder = Path(self._owner.name)
         except OSError as error:
             place = folder or beside or tempfile.gettempdir()
-            raise OutputError(f"{place} cannot be written: {error.strerror}") from None
+            raise OutputError(f"{place} cannot be written: {cause(error)}") from None
         self._runs: list[StoredRows] = []
 
     def __len__(self) -> int:
@@ -128,7 +128,7 @@ class StoredRows:
                 stream.write(np.ascontiguousarray(rows).data)
                 keys.write(np.ascontiguousarray(rows[:, 0]).data)
         except OSError as error:
-            raise OutputError(f"{self._path} cannot be written: {error.strerror or error}") from None
+            raise OutputError(f"{self._path} cannot be written: {cause(error)}") from None
         self._count += len(rows)
 
     def read(self, begin: int, end: int) -> Rows:
@@ -138,7 +138,7 @@ class StoredRows:
                 self._path, np.int64, max(end - begin, 0) * self.columns, offset=8 * self.columns * begin
             )
         except OSError as error:
-            raise OutputError(f"{self._path} cannot be read back: {error.strerror or error}") from None
+            raise OutputError(f"{self._path} cannot be read back: {cause(error)}") from None
         return flat.reshape(-1, self.columns)
 
     def first_not_below(self, key: int) -> int:

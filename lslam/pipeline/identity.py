@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from lslam.config import Config
-from lslam.errors import InputError
+from lslam.errors import InputError, cause
 from lslam.types.sequence import Sequence
 from lslam.types.trajectory import Trajectory
 from lslam.version import __version__
@@ -29,7 +29,7 @@ def input_digest(sequence: Sequence, truth: Trajectory | None) -> str:
             line = f"{path}\0{stat.st_size}\0{stat.st_mtime_ns}\n"
             digest.update(line.encode(errors="surrogateescape"))
     except OSError as error:
-        raise InputError(f"{error.filename or sequence.path} cannot be read: {error.strerror or error}") from None
+        raise InputError(f"{error.filename or sequence.path} cannot be read: {cause(error)}") from None
     truth = sequence.ground_truth if truth is None else truth
     if truth is not None:
         digest.update(truth.stamps_ns.tobytes())

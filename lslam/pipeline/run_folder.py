@@ -13,7 +13,7 @@ from collections.abc import Collection
 from pathlib import Path
 from typing import IO, Any
 
-from lslam.errors import OutputError, OutputExistsError
+from lslam.errors import OutputError, OutputExistsError, cause
 from lslam.formats.atomic import atomic_write
 from lslam.locks import lock
 
@@ -56,7 +56,7 @@ class RunFolder:
             self._clear(_NEEDED if goes_on else ())
         except OSError as error:
             self._let_go()
-            raise OutputError(f"output folder {path} cannot be written: {error.strerror or error}") from None
+            raise OutputError(f"output folder {path} cannot be written: {cause(error)}") from None
 
     def write_text(self, name: str, text: str) -> Path:
         r"""Write one text file atomically; bytes of file names that are no UTF-8 become \udcXX, as JSON writes them."""
@@ -79,7 +79,7 @@ class RunFolder:
         try:
             left = shutil.disk_usage(self.path).free
         except OSError as error:
-            raise OutputError(f"output folder {self.path} cannot be written: {error.strerror or error}") from None
+            raise OutputError(f"output folder {self.path} cannot be written: {cause(error)}") from None
         if left < size:
             raise OutputError(
                 f"the disk of {self.path} has {left / 1e6:.1f} MB left, {what} needs about {size / 1e6:.1f} MB; "
@@ -96,7 +96,7 @@ class RunFolder:
             self._log_handler = _LogFile(self.path / LOG)
         except OSError as error:
             self._let_go()
-            raise OutputError(f"{self.path / LOG} cannot be written: {error.strerror or error}") from None
+            raise OutputError(f"{self.path / LOG} cannot be written: {cause(error)}") from None
         self._log_handler.attach()
         return self
 

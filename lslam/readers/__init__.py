@@ -7,7 +7,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from lslam.errors import InputError, UsageError
+from lslam.errors import InputError, UsageError, cause
 from lslam.formats.sequence_toml import SequenceInfo
 from lslam.formats.transform_text import read_transform
 from lslam.readers.lookup import find_folder
@@ -76,7 +76,7 @@ def open_sequence(
     try:
         sequence = _open(folder, overrides)
     except OSError as error:
-        raise InputError(f"{error.filename or folder} cannot be read: {error.strerror or error}") from None
+        raise InputError(f"{error.filename or folder} cannot be read: {cause(error)}") from None
     flags = {"--lidar-topic": lidar_topic, "--imu-topic": imu_topic, "--gnss-topic": gnss_topic}
     given = [flag for flag, topic in flags.items() if topic is not None]
     if given and sequence.kind != "bag":

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.errors import InputError
+from lslam.errors import InputError, cause
 from lslam.formats.point_files import SUFFIXES
 from lslam.formats.stamps_files import parse_stamp
 
@@ -22,7 +22,7 @@ def list_scans(folder: Path, suffixes: tuple[str, ...] = SUFFIXES) -> tuple[list
     try:
         files = [p for p in folder.iterdir() if p.suffix.lower() in suffixes and not p.name.startswith(".")]
     except OSError as error:
-        raise InputError(f"{folder} cannot be read: {error.strerror or error}") from None
+        raise InputError(f"{folder} cannot be read: {cause(error)}") from None
     kinds = Counter(p.suffix.lower() for p in files)
     if not kinds:
         return [], []

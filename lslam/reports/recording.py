@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.errors import OutputError
+from lslam.errors import OutputError, cause
 from lslam.foreign import importing
 from lslam.types.cloud import ArrayCloud
 from lslam.types.trajectory import Trajectory
@@ -56,7 +56,7 @@ def write_recording(path: Path, run: ViewedRun) -> None:
         stream.disconnect()
         os.replace(part, path)
     except OSError as error:
-        raise OutputError(f"{path} cannot be written: {error.strerror or error}") from None
+        raise OutputError(f"{path} cannot be written: {cause(error)}") from None
     finally:
         if path.parent.is_dir():
             part.unlink(missing_ok=True)

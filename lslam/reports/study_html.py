@@ -7,7 +7,7 @@ from collections.abc import Sequence, Set
 from dataclasses import dataclass
 from pathlib import Path
 
-from lslam.errors import OutputError
+from lslam.errors import OutputError, cause
 from lslam.formats.atomic import atomic_write
 from lslam.reports.compare_table import CompareTable, as_text
 from lslam.reports.grid_text import comma_separated
@@ -38,7 +38,7 @@ def write_study_files(folder: Path, results: Sequence[StudyResult], rows: Sequen
     try:
         (folder / "figures").mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise OutputError(f"folder {folder / 'figures'} cannot be made: {error.strerror or error}") from None
+        raise OutputError(f"folder {folder / 'figures'} cannot be made: {cause(error)}") from None
     sections = []
     keys = {result.parameters[0] for result in results}
     for result in results:

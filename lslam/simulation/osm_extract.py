@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.errors import InputError, OutputError
+from lslam.errors import InputError, OutputError, cause
 from lslam.formats.osm_buildings import buildings_of, osm_from_buildings
 from lslam.formats.osm_files import write_osm
 from lslam.simulation.city import City
@@ -67,7 +67,7 @@ def write_extracts(
     try:
         extracts.record.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise OutputError(f"{extracts.record.parent} cannot be made: {error.strerror or error}") from None
+        raise OutputError(f"{extracts.record.parent} cannot be made: {cause(error)}") from None
     write_osm(extracts.exact, data)
     write_osm(extracts.perturbed, osm_from_buildings(perturb(exact, perturbation), origin, attribution))
     write_perturbation(extracts.record, perturbation)

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lslam.errors import OutputError, OutputExistsError
+from lslam.errors import OutputError, OutputExistsError, cause
 from lslam.formats.kitti_layout import PER_POINT, POINTS, in_camera, write_calib, write_times
 from lslam.formats.sequence_toml import FILE_NAME, SequenceInfo, write_sequence_toml
 from lslam.formats.trajectory_files import write_kitti
@@ -84,7 +84,7 @@ def record(
         os.replace(part, sequence)
         done = True
     except OSError as error:
-        raise OutputError(f"{error.filename or out} cannot be written: {error.strerror or error}") from None
+        raise OutputError(f"{error.filename or out} cannot be written: {cause(error)}") from None
     finally:
         if not done:
             _keep_what_is_worth_it(out, part)
@@ -112,7 +112,7 @@ def check_target(out: Path, overwrite: bool, resume: bool = False) -> None:
             "--overwrite to replace the sequence in it"
         )
     except OSError as error:
-        raise OutputError(f"{out} cannot be read: {error.strerror or error}") from None
+        raise OutputError(f"{out} cannot be read: {cause(error)}") from None
 
 
 def _part(out: Path) -> Path:

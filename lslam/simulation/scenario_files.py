@@ -12,7 +12,7 @@ from typing import Any, Literal
 from pydantic import BaseModel, Field, ValidationError, model_validator
 
 from lslam.config.section import Section
-from lslam.errors import ConfigError, InputError, UsageError, nearest
+from lslam.errors import ConfigError, InputError, UsageError, cause, nearest
 from lslam.simulation.city import Layout
 from lslam.simulation.lidar_models import LIDARS
 from lslam.simulation.shapes import SHAPES
@@ -141,7 +141,7 @@ def _read_toml(path: Path) -> dict[str, Any]:
     try:
         return tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
-        raise InputError(f"{path} cannot be read: {error.strerror or error}") from None
+        raise InputError(f"{path} cannot be read: {cause(error)}") from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise InputError(f"{path} is not valid TOML: {error}") from None
 

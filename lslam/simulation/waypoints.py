@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.errors import InputError, nearest
+from lslam.errors import InputError, cause, nearest
 from lslam.formats.trajectory_files import read_trajectory
 from lslam.geometry.geodesy import to_local
 
@@ -64,7 +64,7 @@ def _text(path: Path) -> str:
     try:
         return path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path} cannot be read: {error}") from None
+        raise InputError(f"{path} cannot be read: {cause(error)}") from None
 
 
 def _from_toml(path: Path) -> WayPoints:

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from lslam.errors import InputError, OutputError, RunFailedError, UsageError
+from lslam.errors import InputError, OutputError, RunFailedError, UsageError, cause
 from lslam.studies.engines import simulate_scenes
 from lslam.studies.grid import Job
 from lslam.studies.jobs import make_room, settle
@@ -184,7 +184,7 @@ def unpack(archive: bytes, job: Job) -> None:
         os.replace(part / "run.json", job.state_file)
         shutil.rmtree(part)
     except OSError as error:
-        raise OutputError(f"{error.filename or job.folder} cannot be written: {error.strerror or error}") from None
+        raise OutputError(f"{error.filename or job.folder} cannot be written: {cause(error)}") from None
 
 
 def _inspect(paths: list[str]) -> tuple[str, list[str]]:

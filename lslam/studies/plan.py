@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from lslam.errors import OutputError, OutputExistsError, UsageError
+from lslam.errors import OutputError, OutputExistsError, UsageError, cause
 from lslam.studies.subjects import Subject
 from lslam.studies.variants import Variant
 from lslam.types.trajectory import Trajectory
@@ -87,7 +87,7 @@ def claim(out: Path, mark: str, what: str, overwrite: bool, resume: bool) -> Non
             )
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise OutputError(f"output folder {out} cannot be used: {error.strerror or error}") from None
+        raise OutputError(f"output folder {out} cannot be used: {cause(error)}") from None
 
 
 def release(out: Path, mark: str) -> None:

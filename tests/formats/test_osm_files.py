@@ -93,6 +93,26 @@ def test_deleted_elements_are_not_there_and_skeletons_do_not_erase_tags(tmp_path
     assert data.ways == {3: Way(3, (4,), {"building": "yes"})}
 
 
+def test_places_written_beside_the_numbers_of_nodes_are_taken(tmp_path: Path) -> None:
+    """Overpass' `out geom`, as its web page exports; nodes outside the box asked for have none."""
+    path = tmp_path / "a.json"
+    places = [{"lat": 48.0, "lon": 11.0}, None, {"lat": 48.1, "lon": 11.1}]
+    way = {"type": "way", "id": 1, "nodes": [4, 5, 6, 4], "geometry": [*places, places[0]], "tags": {"building": "yes"}}
+    path.write_text(json.dumps({"elements": [way]}))
+    reply = read_osm(path)
+    assert reply.nodes == {4: (48.0, 11.0), 6: (48.1, 11.1)}
+    assert reply.ways == {1: Way(1, (4, 5, 6, 4), {"building": "yes"})}
+    path.write_text(
+        "<osm><way id='1'><nd ref='4' lat='48.0' lon='11.0'/><nd ref='5'/><nd ref='6' lat='48.1' lon='11.1'/>"
+        "<nd ref='4' lat='48.0' lon='11.0'/><tag k='building' v='yes'/></way></osm>"
+    )
+    xml = read_osm(path)
+    assert (xml.nodes, xml.ways) == (reply.nodes, reply.ways)
+    path.write_text(json.dumps({"elements": [{**way, "geometry": [{"lat": 48.0}]}]}))
+    with pytest.raises(InputError, match="an element without 'lon'"):
+        read_osm(path)
+
+
 def bomb() -> bytes:
     levels = "".join(f'<!ENTITY a{k} "{f"&a{k - 1};" * 10}">' for k in range(1, 10))
     return f'<?xml version="1.0"?><!DOCTYPE osm [<!ENTITY a0 "ha">{levels}]><osm><tag k="&a9;"/></osm>'.encode()
@@ -103,7 +123,7 @@ def bomb() -> bytes:
     [
         (bomb(), "declares a document type or entities"),
         (b'<!DOCTYPE osm [<!ENTITY x SYSTEM "file:///etc/passwd">]><osm>&x;</osm>', "declares a document type"),
-        (b"<!DOCTYPE html><html><body>504</body></html>", "is a web page"),
+        (b"<!DOCTYPE html><html><body>504</body></html>", "is a web page and no OpenStreetMap extract"),
         (b"<html><body>busy</body></html>", "begins with <html>, not with <osm>"),
         (b"", "is empty"),
         (b" \n", "is empty"),
@@ -124,6 +144,10 @@ def bomb() -> bytes:
         (b'{"elements": [], "remark": "runtime error: Query timed out"}', "the server gave up: runtime error"),
         (b"\x1f\x8b\x08\x00rest", "is compressed"),
         (b"\x00\x00\x00\x0d\x0a\x09OSMHeader\x18", "is compressed"),
+        (b"BZh91AY&SY", "is compressed: .*bunzip2"),
+        (b"\xfd7zXZ\x00\x00\x04", "is compressed"),
+        (b"PK\x03\x04\x14\x00", "is compressed"),
+        (b"\x28\xb5\x2f\xfd\x04\x58", "is compressed"),
     ],
 )
 def test_bad_files_get_one_sentence_that_names_them(tmp_path: Path, content: bytes, message: str) -> None:
