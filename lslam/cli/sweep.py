@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from contextlib import ExitStack
+from math import isnan
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -73,6 +74,9 @@ def command(study: str | None, **given: Any) -> None:
         on_rows = stack.enter_context(best_so_far())
         rows = run_sweep(sweep, engine, bars(stack), on_rows)
     _print(rows)
+    unscored = [row for row in rows if row.is_usable and isnan(row.thesis_rmse) and row.reason]
+    if unscored:
+        log.warning("%d of %d runs have no score, the first one: %s", len(unscored), len(rows), unscored[0].reason)
     log.info("every run: %s", sweep.place.out / "results.csv")
     _report(sweep.place.out)
     failed = [row for row in rows if not row.is_usable]

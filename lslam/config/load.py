@@ -132,6 +132,7 @@ def explain(error: ValidationError, where: str = "configuration") -> str:
         said = f"{key}: {wanted}" if isinstance(e["input"], dict) else f"{key} = {e['input']!r}: {wanted}"
         if key not in parts:
             parts[key] = said
-        elif wanted not in parts[key]:
+        # Who wrote a table did not mean a list.
+        elif wanted not in parts[key] and not (e["type"] == "tuple_type" and isinstance(e["input"], dict)):
             parts[key] += f", or {wanted}"
     return f"{where}: " + "; ".join(parts.values())

@@ -71,7 +71,7 @@ class StudySequence(Section):
     scenario: str = Field("", description="or a scenario: a name of `lslam simulate --list` or a .toml file")
     lidar: str | None = Field(None, description="scenario: the sensor, absent: the scenario's")
     columns: int | None = Field(None, ge=16, le=8192, description="scenario: firings per scan, absent: the sensor's")
-    count: int | None = Field(None, ge=1, description="scenario: scans, absent: all of its way, or as many as are used")
+    scans: int | None = Field(None, ge=1, description="scenario: scans, absent: all of its way, or as many as are used")
     speed: float | None = Field(None, gt=0, description="scenario: m/s, absent: the scenario's")
     compensated: bool | None = Field(None, description="scenario: scans without motion in them, absent: the scenario's")
     imu: str = Field("icm20948", description="scenario: the IMU that rides along")

@@ -66,23 +66,30 @@ def _diverges_beyond(finding: Finding, result: CurveResult) -> Judged:
     expected = finding.values[0]
     if found.first_bad is None:
         outcome: Outcome = "refuted" if values[-1] > expected else "undecided"
-        return outcome, f"nothing diverges up to {values[-1]:g}, the largest value{_alone(result)}"
+        lost = _lost(result, values[-1])
+        said = "it holds" if lost else "nothing diverges"
+        return outcome, f"{said} up to {values[-1]:g}, the largest value{lost}"
     if found.last_good is None:
         return "refuted", f"everything diverges, from {found.first_bad:g} on"
     is_near = abs(_place(values, found.last_good) - _place(values, expected)) <= 1
-    return "confirmed" if is_near else "refuted", f"{found.last_good:g} is the last value that works{_alone(result)}"
+    return (
+        "confirmed" if is_near else "refuted",
+        f"{found.last_good:g} is the last value that works{_lost(result, found.last_good)}",
+    )
 
 
 def _holds_up_to(finding: Finding, result: CurveResult) -> Judged:
     values, found = _run_values(result), result.divergence
     expected = finding.values[0]
     if found.first_bad is not None and found.first_bad <= expected:
-        return "refuted", f"it diverges from {found.first_bad:g} on{_alone(result)}"
+        below = -np.inf if found.last_good is None else found.last_good
+        return "refuted", f"it diverges from {found.first_bad:g} on{_lost(result, below)}"
     if values[-1] < expected:
         return "undecided", f"{values[-1]:g} is the largest value that was run"
+    lost = _lost(result, expected)
     if any(value <= expected for value in found.alone):
-        return "undecided", f"nothing diverges for good{_alone(result)}"
-    return "confirmed", f"nothing diverges up to {expected:g}"
+        return "undecided", f"nothing diverges for good{lost}"
+    return "confirmed", f"{'it holds' if lost else 'nothing diverges'} up to {expected:g}{lost}"
 
 
 def _between(finding: Finding, result: CurveResult, *, is_highest: bool) -> Judged:
@@ -199,9 +206,16 @@ def _place(values: Floats, value: float) -> int:
     return int(np.argmin(np.abs(values - value)))
 
 
-def _alone(result: CurveResult) -> str:
-    alone = result.divergence.alone
-    return f", though runs at {_list(alone)} are lost" if alone else ""
+def _lost(result: CurveResult, last: float) -> str:
+    """How many runs are lost at values up to `last`, which for most seeds work."""
+    curve = result.curve
+    at = curve.lost.any(1) & (curve.values <= last)
+    lost, ran = int(curve.lost[at].sum()), int(curve.ran[at].sum())
+    return (
+        f", though {lost} of {ran} runs at {_list(curve.values[at])} {'is' if lost == 1 else 'are'} lost"
+        if lost
+        else ""
+    )
 
 
 def _list(values: Sequence[float] | Floats) -> str:

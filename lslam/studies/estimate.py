@@ -68,6 +68,21 @@ class _Pilot:
     scans: int
 
 
+@dataclass(frozen=True)
+class _Group:
+    """Runs that differ in parameters and seeds alone.
+
+    names : of their contenders; X : (names, K) where they lie; chosen : those with pilots; pilots : a short and a long one each
+    """
+
+    members: list[Job]
+    place: _Place
+    names: list[str]
+    X: Floats
+    chosen: list[int]
+    pilots: list[list[_Pilot]]
+
+
 def estimate(
     jobs: Sequence[Job],
     contenders: dict[str, Contender],
@@ -86,29 +101,41 @@ def estimate(
     pilots: list[Job] = []
     with tempfile.TemporaryDirectory(prefix="lslam-pilots-") as folder:
         places = _places(jobs, Path(folder), follow)
-        for number, members in enumerate(_groups(jobs, contenders)):
-            place = places[members[0].sequence]
-            names = list(dict.fromkeys(job.method for job in members))
-            X = _coordinates([contenders[name] for name in names])
-            first = {job.method: job for job in members}
-            made = [
-                _pilots(first[names[k]], place, Path(folder) / f"{number}-{k}") for k in _chosen(X)
-            ]  # fmt: skip
+        groups = [_group(members, places[members[0].sequence], contenders) for members in _groups(jobs, contenders)]
+        # Kernels are kept on disk once compiled: the study will find those that these runs compile.
+        _run([group.pilots[0][0] for group in groups], Path(folder) / "compile", follow)
+        for number, group in enumerate(groups):
             began = time.monotonic()
-            run, times = _run([made[0][1], *(pilot for pair in made for pilot in pair)], follow)
+            first = [group.pilots[0][1], *(pilot for pair in group.pilots for pilot in pair)]
+            run, times = _run(first, Path(folder) / str(number), follow)
             start_s = max(start_s, time.monotonic() - began - sum(times))
             pilots += run
             warming_s += max(times[0] - times[2], 0.0)
-            base, per_scan = _costs(made, times[1:])
-            for name, cost in zip(names, _at(X, X[_chosen(X)], base, per_scan), strict=True):
-                scans = used(place.whole, first[name].config.input)
-                seconds += sum(job.method == name for job in members) * float(cost[0] + cost[1] * scans)
+            seconds += _seconds(group, *_costs(group.pilots, times[1:]))
         simulation_s = sum(places[job.sequence].simulation_s for job in _to_simulate(jobs))
         report_s = _report_s(Path(folder), pilots, contenders)
     # One simulation already keeps two cores busy.
     simulation_s /= max(1, at_once // 2)
     around_s = own_s + start_s + report_s
     return Guess(around_s + simulation_s + warming_s + seconds / at_once, len(pilots), around_s)
+
+
+def _group(members: list[Job], place: _Place, contenders: dict[str, Contender]) -> _Group:
+    names = list(dict.fromkeys(job.method for job in members))
+    first = {job.method: job for job in members}
+    X = _coordinates([contenders[name] for name in names])
+    chosen = _chosen(X)
+    return _Group(members, place, names, X, chosen, [_pilots(first[names[k]], place) for k in chosen])
+
+
+def _seconds(group: _Group, base: Floats, per_scan: Floats) -> float:
+    """Of all runs of the group, from what its pilots cost."""
+    first = {job.method: job for job in group.members}
+    seconds = 0.0
+    for name, cost in zip(group.names, _at(group.X, group.X[group.chosen], base, per_scan), strict=True):
+        scans = used(group.place.whole, first[name].config.input)
+        seconds += sum(job.method == name for job in group.members) * float(cost[0] + cost[1] * scans)
+    return seconds
 
 
 def _groups(jobs: Sequence[Job], contenders: dict[str, Contender]) -> list[list[Job]]:
@@ -164,7 +191,7 @@ def _chosen(X: Floats) -> list[int]:
     return list(dict.fromkeys(int(np.argmin(np.sum((X - np.array(w)) ** 2, axis=1))) for w in wanted))
 
 
-def _pilots(job: Job, place: _Place, folder: Path) -> list[_Pilot]:
+def _pilots(job: Job, place: _Place) -> list[_Pilot]:
     """The short one and the long one."""
     most = used(place.scans, job.config.input)
     long = min(_LONG, most)
@@ -173,14 +200,13 @@ def _pilots(job: Job, place: _Place, folder: Path) -> list[_Pilot]:
         config = job.config.model_copy(
             update={"input": job.config.input.model_copy(update={"count": scans})}
         )  # fmt: skip
-        pilot = replace(job, path=place.path, config=config, scene=None, folder=folder / str(scans))
-        pilots.append(_Pilot(pilot, scans))
+        pilots.append(_Pilot(replace(job, path=place.path, config=config, scene=None), scans))
     return pilots
 
 
-def _run(pilots: Sequence[_Pilot], follow: Follow) -> tuple[list[Job], list[float]]:
-    """The runs and the seconds of each; the first one pays for what is loaded and compiled."""
-    jobs = [replace(p.job, folder=p.job.folder.with_name(f"{k}-{p.scans}")) for k, p in enumerate(pilots)]
+def _run(pilots: Sequence[_Pilot], folder: Path, follow: Follow) -> tuple[list[Job], list[float]]:
+    """The runs, in one process, and the seconds of each; the first one pays for what is loaded."""
+    jobs = [replace(p.job, folder=folder / f"{k}-{p.scans}") for k, p in enumerate(pilots)]
     Local(title="pilot runs").run(jobs, follow, lambda job: None)
     seconds = []
     for job in jobs:

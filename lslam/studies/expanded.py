@@ -172,6 +172,6 @@ def _recorded(word: str, needs_imu: bool, place: Place) -> Cell:
 
 
 def _simulated(s: StudySequence, needed: int | None, seeds: Sequence[int], place: Place) -> list[Cell]:
-    scans = needed if s.count is None else s.count
+    scans = needed if s.scans is None else s.scans
     scene = Scene(s.scenario, scans, s.lidar, s.columns, s.speed, s.compensated, s.imu, s.settings)
     return [scene_cell(scene, seed, place.scenes or place.out / SIMULATED) for seed in seeds]

@@ -48,7 +48,10 @@ def contenders(study: StudyConfig, settings: Sequence[str] = ()) -> list[Contend
         try:
             variants = find_variants(study.methods, None, [*common, *_setting(point)], study.imu)
         except (ConfigError, UsageError) as error:
-            raise type(error)(f"study {study.name}, {said}: {error}") from None
+            what = str(error)
+            for setting in _setting(point):
+                what = what.removeprefix(f"--set {setting}: ")
+            raise type(error)(f"study {study.name}, {said}: {what}") from None
         for variant in variants:
             values = (f"{key.partition('.')[2]}_{value}" for key, value in point.items())
             name = free_name("-".join([variant.name, *values]), taken)

@@ -19,7 +19,7 @@ from lslam.types.study import StudyRow
 
 STUDY = """
 methods = ["icp"]
-sequences = [{ scenario = "block", lidar = "sample", columns = 256, count = 30 }]
+sequences = [{ scenario = "block", lidar = "sample", columns = 256, scans = 30 }]
 [parameters]
 input.skip_frames = [1, 2, 3, 4]
 [config]
@@ -86,12 +86,20 @@ def test_strict_makes_a_failed_run_exit_4(file: Path, tmp_path: Path) -> None:
     assert "--start 31 is beyond the last scan" in done.stderr
 
 
+def test_a_run_too_short_for_a_score_is_said(file: Path, tmp_path: Path) -> None:
+    (tmp_path / "late.toml").write_text(STUDY.replace("input.skip_frames = [1, 2, 3, 4]", "input.start = [29]"))
+    done = lslam("sweep", tmp_path / "late.toml", "--out", tmp_path / "out", "-q")
+    assert done.returncode == 0
+    assert "1 of 1 runs have no score, the first one: not scored: estimate icp has 1 poses, 3 are needed" in done.stderr
+
+
 @pytest.mark.parametrize(
     ("words", "code", "sentence"),
     [
         ((), 2, "STUDY is missing"),
         (("nonsense",), 2, "no study 'nonsense' and no TOML file"),
-        (("none.toml",), 3, "study none.toml cannot be read"),
+        (("none.toml",), 3, "study none.toml cannot be read: No such file or directory"),
+        (("--report", "none"), 3, "study none/results.csv cannot be read: No such file or directory"),
         (("FILE", "--jobs", "0"), 2, "--jobs 0: at least one run"),
         (("FILE", "--jobs", "1", "--cluster", "local:2"), 2, "give one of them"),
         (("FILE", "--cluster", "two"), 2, "local:N with N workers"),
@@ -110,4 +118,5 @@ def test_wrong_calls_are_answered_in_one_sentence(
         command.main([str(file) if word == "FILE" else word for word in words], standalone_mode=False)
     assert caught.value.exit_code == code
     assert sentence in str(caught.value)
+    assert "Errno" not in str(caught.value)
     assert not list(tmp_path.iterdir())

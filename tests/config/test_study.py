@@ -63,7 +63,7 @@ def test_ranges_hold_both_ends_and_round_numbers(given: dict[str, Any], values: 
 @pytest.mark.parametrize(
     ("old", "new", "sentence"),
     [
-        ("stop = 5", "stop = 0", r"mine\.toml.*from 1 to 0 is empty: stop lies below start"),
+        ("stop = 5", "stop = 0", r"mine\.toml.*from 1 to 0 is empty: stop lies below start$"),
         ("step = 2", "log = true, step = 1", "log needs num"),
         ("step = 2", "step = 2, num = 3", "a step or num, one of them"),
         ("step = 2", "step = 0", "greater than 0"),

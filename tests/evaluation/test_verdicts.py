@@ -44,7 +44,28 @@ def test_holding_up() -> None:
     assert outcome(rows_of(range(1, 10)), "holds_up_to", 20) == "undecided"
     once = verdict(rows_of(SKIPS, diverges=lambda v: v == 5), "holds_up_to", 20)
     assert once.outcome == "undecided"
-    assert "runs at 5 are lost" in once.measured
+    assert once.measured == "nothing diverges for good, though 3 of 3 runs at 5 are lost"
+
+
+def test_runs_lost_where_most_seeds_hold_are_told() -> None:
+    rows = rows_of(SKIPS)
+    one = [replace(r, status="diverged") if r.seed == 1 and r.parameters["input.skip_frames"] > 18 else r for r in rows]
+    at_20 = verdict(one, "holds_up_to", 20)
+    assert (at_20.outcome, at_20.measured) == ("confirmed", "it holds up to 20, though 2 of 6 runs at 19, 20 are lost")
+    assert verdict(one, "holds_up_to", 18).measured == "nothing diverges up to 18"
+    beyond = verdict(one, "diverges_beyond", 7).measured
+    assert beyond == "it holds up to 20, the largest value, though 2 of 6 runs at 19, 20 are lost"
+    rows = rows_of(SKIPS, diverges=lambda v: v > 12)
+    some = [
+        replace(r, status="diverged") if r.seed == 2 and r.parameters["input.skip_frames"] == 9 else r for r in rows
+    ]
+    assert (
+        verdict(some, "diverges_beyond", 7).measured
+        == "12 is the last value that works, though 1 of 3 runs at 9 is lost"
+    )
+    assert verdict(some, "holds_up_to", 20).measured == "it diverges from 13 on, though 1 of 3 runs at 9 is lost"
+    none = rows_of(SKIPS, diverges=lambda v: True)
+    assert verdict(none, "holds_up_to", 20).measured == "it diverges from 1 on"
 
 
 @pytest.mark.parametrize("kind", ["diverges_beyond", "holds_up_to", "good_from"])

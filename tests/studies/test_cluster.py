@@ -29,7 +29,7 @@ from lslam.studies.worker import Bench
 from lslam.types.study import StudyRow
 
 TREE = {
-    "sequences": [{"scenario": "block", "lidar": "sample", "columns": 256, "count": 12}],
+    "sequences": [{"scenario": "block", "lidar": "sample", "columns": 256, "scans": 12}],
     "methods": ["icp"],
     "parameters": {"preprocess.source_voxel": [0.6, 0.7, 0.8, 0.9, 1.0, 1.1]},
     "config": {"loops": {"use": False}, "preprocess": {"downsample": "grid"}},

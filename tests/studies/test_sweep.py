@@ -28,7 +28,7 @@ from lslam.studies.sweep import Sweep, expand_study, run_sweep
 from lslam.types.study import StudyRow
 
 TREE: dict[str, Any] = {
-    "sequences": [{"scenario": "block", "lidar": "sample", "columns": 256, "count": 16}],
+    "sequences": [{"scenario": "block", "lidar": "sample", "columns": 256, "scans": 16}],
     "methods": ["icp"],
     "beside": ["kiss-icp"],
     "seeds": [3],
@@ -174,7 +174,7 @@ def test_results_of_another_version_are_not_mixed(sweep: Sweep, made: list[Study
 @pytest.mark.parametrize(
     ("changes", "error", "sentence"),
     [
-        ({"parameters": {"input.skip_frame": [1]}}, ConfigError, "study tiny, input.skip_frame = 1: .*mean 'skip_frames'"),
+        ({"parameters": {"input.skip_frame": [1]}}, ConfigError, "skip_frame = 1: unknown key.*mean 'skip_frames'"),
         ({"parameters": {"preprocess.random_share": [0.5, 2]}}, ConfigError, "random_share = 2: .*less than or equal to 1"),
         ({"methods": ["ipc"]}, UsageError, "no method or preset 'ipc'; did you mean 'icp'"),
         ({"beside": ["lom"]}, UsageError, "did you mean 'loam'"),
@@ -236,15 +236,19 @@ def test_the_time_is_estimated_from_short_runs_and_their_report(
 def test_an_estimate_adds_up_what_is_told_apart(
     at_once: int, times: int, expected: float, made: list[StudyRow], sweep: Sweep, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Pilots of 0.5 s and 0.1 s a scan, 5 s more for the first; a report of 3 s; runs of 16 and of 8 scans."""
+    """Pilots of 0.5 s and 0.1 s a scan, 5 s more for the first, 60 s to compile; a report of 3 s; runs of 16 and 8 scans."""
+    asked: list[tuple[str, int]] = []
 
-    def fake(pilots: Sequence[Any], follow: Follow) -> tuple[list[Any], list[float]]:
-        return [], [0.5 + 0.1 * pilot.scans + 5 * (k == 0) for k, pilot in enumerate(pilots)]
+    def fake(pilots: Sequence[Any], folder: Path, follow: Follow) -> tuple[list[Any], list[float]]:
+        asked.append((folder.name, len(pilots)))
+        first = 60 if len(asked) == 1 else 5
+        return [], [0.5 + 0.1 * pilot.scans + first * (k == 0) for k, pilot in enumerate(pilots)]
 
     monkeypatch.setattr("lslam.studies.estimate._run", fake)
     monkeypatch.setattr("lslam.studies.estimate._report_s", lambda *given: 3.0)
     jobs = expand_study(replace(sweep, study=study(beside=[], parameters={"input.skip_frames": [1, 2]})))
     assert estimate(jobs.jobs * times, jobs.contenders, at_once).seconds == pytest.approx(expected, abs=0.01)
+    assert asked == [("compile", 1), ("0", 5)]
 
 
 def test_an_estimate_names_the_pilot_that_failed(sweep: Sweep) -> None:
