@@ -14,3 +14,17 @@ def quantile(probability: float, dim: int) -> float:
     from scipy.special import gammaincinv
 
     return float(2.0 * gammaincinv(0.5 * dim, probability))
+
+
+def chance_of_median(median: float, dim: int, count: int) -> float:
+    """How probable it is that the median of `count` chi-square variables of `dim` degrees of freedom stays below `median`.
+
+    >>> round(chance_of_median(quantile(0.95, 3), 3, 1), 3)
+    0.95
+    >>> round(chance_of_median(quantile(0.5, 3), 3, 33), 3)
+    0.5
+    """
+    from scipy.special import betainc, gammainc
+
+    rank = 0.5 * (count + 1)
+    return float(betainc(rank, rank, gammainc(0.5 * dim, 0.5 * median)))

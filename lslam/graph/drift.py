@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from lslam.config.graph import GraphConfig
 from lslam.geometry import noise, se3, so3
-from lslam.graph.chi_square import quantile
+from lslam.graph.chi_square import chance_of_median, quantile
 from lslam.graph.problem import PoseGraph, PositionFix
 from lslam.types.constraint import Constraint
 
@@ -45,14 +45,16 @@ def with_drift(graph: PoseGraph, factor: float, config: GraphConfig) -> list[Con
 def drift_factor(graph: PoseGraph, loops: Sequence[Constraint], config: GraphConfig) -> float:
     """The factor on `drift_covariance`, 0 where none is needed, with which median loop and fix are where they should be.
 
-    At least that of `tilt_factor`.
+    Fixes are so much noisier than odometry that what explains a chance among them is a large drift: only those count that are
+    farther off than chance would have them. At least that of `tilt_factor`.
     """
     on_map = _as_fixes(graph)
     if not loops and max(len(graph.fixes), len(on_map)) < 2 and not graph.ups:
         return 0.0
     known, drift = chains(graph, config)
     by_loops = _of_loops(graph, loops, known, drift) if loops else 0.0
-    by_fixes, by_map = (_of_fixes(graph.poses, *what, known, drift) for what in ((graph.fixes, 3), (on_map, 2)))
+    by_fixes = _of_fixes(graph.poses, graph.fixes, 3, known, drift, config.probability)
+    by_map = _of_fixes(graph.poses, on_map, 2, known, drift)
     return max(by_loops, by_fixes, by_map, _of_ups(graph, known, drift, config))
 
 
@@ -107,8 +109,13 @@ def _of_loops(graph: PoseGraph, loops: Sequence[Constraint], known: Floats, drif
     return _fitting(error, own + np.stack([c.covariance for c in few]), grown)
 
 
-def _of_fixes(poses: Floats, fixes: Sequence[PositionFix], dim: int, known: Floats, drift: Floats) -> float:
-    """By pairs of fixes, half the fixes apart: how the way between them differs from odometry's, along `dim` axes."""
+def _of_fixes(
+    poses: Floats, fixes: Sequence[PositionFix], dim: int, known: Floats, drift: Floats, probability: float = 0.0
+) -> float:
+    """By pairs of fixes, half the fixes apart: how the way between them differs from odometry's, along `dim` axes.
+
+    probability : with which chance stays below what counts
+    """
     half = len(fixes) // 2
     if not half:
         return 0.0
@@ -121,7 +128,11 @@ def _of_fixes(poses: Floats, fixes: Sequence[PositionFix], dim: int, known: Floa
     a, b = k[first], k[first + half]
     noise_of_pair = (own[first] + own[first + half])[:, :, None] * np.eye(dim)
     moved, grown = (_between(chain, poses, a, b)[:, :dim, :dim] for chain in (known, drift))
-    return _fitting(off[first + half] - off[first], moved + noise_of_pair, grown)
+    error, known_of_pair = off[first + half] - off[first], moved + noise_of_pair
+    median = float(np.median(_squared(error, known_of_pair)))
+    if chance_of_median(median, dim, len(first)) < probability:
+        return 0.0
+    return _fitting(error, known_of_pair, grown)
 
 
 def _of_ups(graph: PoseGraph, known: Floats, drift: Floats, config: GraphConfig) -> float:
@@ -167,8 +178,7 @@ def _fitting(error: Floats, own: Floats, grown: Floats) -> float:
     typical = quantile(0.5, error.shape[1])
 
     def is_enough(factor: float) -> bool:
-        solved = np.linalg.solve(factor * grown + own, error[..., None])[..., 0]
-        return bool(np.median(np.einsum("ij,ij->i", error, solved)) <= typical)
+        return bool(np.median(_squared(error, factor * grown + own)) <= typical)
 
     if is_enough(0.0):
         return 0.0
@@ -177,6 +187,11 @@ def _fitting(error: Floats, own: Floats, grown: Floats) -> float:
         middle = 0.5 * (low + high)
         low, high = (low, middle) if is_enough(float(np.exp(middle))) else (middle, high)
     return float(np.exp(high))
+
+
+def _squared(error: Floats, covariance: Floats) -> Floats:
+    """(P,) squared Mahalanobis distances of error (P, n)."""
+    return np.asarray(np.einsum("ij,ij->i", error, np.linalg.solve(covariance, error[..., None])[..., 0]))
 
 
 def _length(constraint: Constraint) -> float:

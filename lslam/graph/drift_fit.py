@@ -1,4 +1,4 @@
-"""Walls of a map that were seen, and how well steady drift explains where: what one Gaussian of everything unknown says.
+"""Walls of a map that were seen, and how well drift explains where: what one Gaussian of everything unknown says.
 
 Sightings are many and each is of one keyframe and one wall, so only sums over these are ever written out.
 """

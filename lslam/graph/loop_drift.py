@@ -7,7 +7,7 @@ that was right. Which of the two it was is told by loops over different ways.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -29,17 +29,25 @@ Floats = NDArray[np.float64]
 MOST = 30
 # Times the drift of the configuration, as variance of a walk, that are believed in.
 WALKS = (0.0, 1e-4, 1e-3, 0.01, 0.1, 1.0, 10.0, 100.0)
-# Shares of the variance of rates that last: all of it, too, since loops are few and tell nothing of places between them.
-LASTS = (*LASTING, 0.9999)
+# Shares of the variance of rates that last: none or all of it, too, since loops are few and tell nothing of places between them.
+# What wanders smoothly would be known there too well.
+LASTS = (0.0, *LASTING, 0.9999)
+# m from knot to knot, by which rates that wander differ from a walk, and into how many parts a long way is cut at the most.
+APART, PARTS = 50.0, 100
 # How often the loops are asked, each time of what was set straight by the last answer.
 ROUNDS = 4
+# Keyframes of which it is written out at a time what each rate does to them.
+PART = 256
+# Share of its variance that each error has for itself at the least: what is less drowns in rounding.
+LEAST = 1e-12
 
 
 def without_loop_drift(graph: PoseGraph, config: GraphConfig) -> PoseGraph:
     """The graph set straight by the drift that its loops tell, which it says as `claim`; as it is where they tell none.
 
-    Rates and a walk have unknown sizes. Rates are of that kind with which the loops are likeliest, and they are drift where
-    this is likelier than any walk alone by more than chance would have it; the walk is the mean of those that are likely then.
+    Rates and a walk have unknown sizes. There is drift where rates of which most lasts are likelier than any walk alone by more
+    than chance would have it; the rates are then of that kind with which the loops are likeliest, and the walk beside them is
+    the mean of those that are likely.
 
     Raises GraphError when the graph is in pieces or not finite.
     """
@@ -50,12 +58,13 @@ def without_loop_drift(graph: PoseGraph, config: GraphConfig) -> PoseGraph:
     if not loops or graph.distances[-1] <= 0:
         return graph
     loops = [loops[i] for i in np.unique(np.linspace(0, len(loops) - 1, MOST).round().astype(int))]
-    at_knots = hats(graph.distances)
+    at_knots = hats(graph.distances, _apart(graph.distances))
+    does_last = np.repeat(LASTS, len(SIZES)) > 0.5
     straight, found = graph, np.zeros(6 * at_knots.shape[1])
     turned = np.tile(np.eye(3), (len(graph) - 1, 1, 1))
     for _ in range(ROUNDS):
         fit = _Fit(straight, loops, found, turned, config)
-        gain = float(fit.unlikeliness[:, 0].min() - fit.unlikeliness.min())
+        gain = float(fit.unlikeliness[:, 0].min() - fit.unlikeliness[:, 1:][:, does_last].min())
         if gain <= 0.0:
             return graph
         found, covariance, walk = fit.likeliest()
@@ -69,7 +78,7 @@ def without_loop_drift(graph: PoseGraph, config: GraphConfig) -> PoseGraph:
     mean = np.kron(share @ at_knots, np.eye(6))
     sigma = np.sqrt(np.diag(mean @ covariance @ mean.T)).astype(np.float64)
     claim = DriftClaim(-np.asarray(mean @ found, np.float64), sigma, gain, chance)
-    return replace(straight, spread=fit.spread(covariance), walk=walk, claim=claim)
+    return replace(straight, spread=fit.spread(covariance, walk), walk=walk, claim=claim)
 
 
 class _Fit:
@@ -86,18 +95,22 @@ class _Fit:
         config: GraphConfig,
     ) -> None:  # fmt: skip
         self._poses = se3.make(np.eye(3), -graph.poses[:, :3, 3].mean(0)) @ graph.poses
-        ends, P = Ends(loops), self._poses
-        self._effects = _effects(P, graph.distances, turned)
-        self._rows = (self._effects[ends.b] - self._effects[ends.a]).reshape(-1, len(found))
+        self._ends, self._way = Ends(loops), (graph.distances, turned)
+        ends, P = self._ends, self._poses
+        at_ends = np.empty((2, len(loops), 6, len(found)))
+        for k, effects in _effects(P, *self._way):
+            for at_end, end in zip(at_ends, (ends.a, ends.b), strict=True):
+                is_here = (k.start <= end) & (end < k.stop)
+                at_end[is_here] = effects[end[is_here] - k.start]
+        self._rows = (at_ends[1] - at_ends[0]).reshape(-1, len(found))
         self._off = se3.log(P[ends.a] @ ends.T @ se3.inverse(P[ends.b])).ravel() + self._rows @ found
-        self._known, self._walk = (
-            _shared(noise.transported(chain, -P[:, :3, 3]), ends) for chain in chains(graph, config)
-        )
+        self._chains = [noise.transported(chain, -P[:, :3, 3]) for chain in chains(graph, config)]
+        self._known, self._walk = (_shared(chain, ends) for chain in self._chains)
         self._known += _on_diagonal(moved(ends.covariances, P[ends.a]))
-        roots = rate_roots(graph.distances[-1], config, list(range(6)), LASTS)
+        roots = rate_roots(graph.distances[-1], config, list(range(6)), LASTS, _apart(graph.distances), is_smooth=False)
         self._kinds = [(root, size) for root in roots for size in SIZES]
-        seen = [self._rows @ root for root in roots]
-        drifted = [np.zeros_like(self._known)] + [size**2 * part @ part.T for part in seen for size in SIZES]
+        seen = [part @ part.T for part in (self._rows @ root for root in roots)]
+        drifted = [np.zeros_like(self._known)] + [size**2 * part for part in seen for size in SIZES]
         self.unlikeliness = np.array(
             [[_unlikely(self._walked(walk) + D, self._off) for D in drifted] for walk in WALKS]
         )
@@ -109,9 +122,19 @@ class _Fit:
         gain = np.linalg.solve(self._walked(walk) + seen @ self._rows.T, seen).T
         return np.asarray(gain @ self._off), np.asarray(prior - gain @ seen), walk
 
-    def spread(self, covariance: Floats) -> Floats:
-        """(K, 6, 6) what poses are unsure by when rates are by `covariance` (6 n, 6 n), as the covariances of `Solution`."""
-        about_middle = self._effects @ covariance @ np.swapaxes(self._effects, -1, -2)
+    def spread(self, covariance: Floats, walk: float) -> Floats:
+        """(K, 6, 6) what poses are unsure by when rates are by `covariance` (6 n, 6 n), as the covariances of `Solution`.
+
+        Beside what they are unsure by when the rates are known: loops that are closed then take back a part of what wrong rates
+        do, as they cannot tell it from a walk.
+        """
+        known, walked = self._chains
+        chain, taken = known + walk * walked, np.linalg.solve(self._walked(walk), self._rows)
+        about_middle = np.empty((len(self._poses), 6, 6))
+        for k, effects in _effects(self._poses, *self._way):
+            left = effects - _walked_along(chain, np.arange(len(chain))[k], self._ends) @ taken
+            spread = (left.reshape(-1, len(covariance)) @ covariance).reshape(left.shape)
+            about_middle[k] = spread @ np.swapaxes(left, -1, -2)
         return noise.transported(about_middle, self._poses[:, :3, 3])
 
     def _choice(self) -> tuple[Floats, float]:
@@ -124,9 +147,18 @@ class _Fit:
         return np.asarray(self._known + walk * self._walk)
 
 
+def _apart(distances: Floats) -> float:
+    """m from knot to knot."""
+    return max(APART, float(distances[-1]) / PARTS)
+
+
 def _unlikely(S: Floats, off: Floats) -> float:
     """Minus twice the logarithm of the likelihood of `off` (N,) with the covariance S, but for a constant."""
-    return float(np.linalg.slogdet(S)[1] + off @ np.linalg.solve(S, off))
+    from scipy.linalg import solve_triangular
+
+    L = np.linalg.cholesky(S + LEAST * np.diag(np.diag(S)))
+    whitened = solve_triangular(L, off, lower=True, check_finite=False)
+    return float(2.0 * np.log(np.diag(L)).sum() + whitened @ whitened)
 
 
 def _turned(turns: Floats, ways: Floats) -> Floats:
@@ -137,15 +169,28 @@ def _turned(turns: Floats, ways: Floats) -> Floats:
     return np.stack(turned[1:])
 
 
-def _effects(poses: Floats, distances: Floats, turned: Floats) -> Floats:
-    """(K, 6, 6 n) twist about the origin that rates at the knots have brought each pose; turned : as of `_turned`."""
-    step = np.tile(np.eye(6), (len(poses) - 1, 1, 1))
-    step[:, :3, :3] = turned
-    step[:, :3, 3:] = so3.hat(poses[1:, :3, 3])
-    passed = np.diff(distances)[:, None] * hats(distances)
-    effects = np.zeros((len(poses), 6, passed.shape[1], 6))
-    np.cumsum(step[:, :, None] * passed[:, None, :, None], axis=0, out=effects[1:])
-    return effects.reshape(len(poses), 6, -1)
+def _effects(poses: Floats, distances: Floats, turned: Floats) -> Iterator[tuple[slice, Floats]]:
+    """Keyframes, part after part, and (k, 6, 6 n) twist about the origin that rates at the knots have brought each of them.
+
+    turned : as of `_turned`
+    """
+    passed = np.diff(distances)[:, None] * hats(distances, _apart(distances))
+    passed, turned = (np.concatenate([0.0 * rows[:1], rows]) for rows in (passed, turned))
+    before = np.zeros((6, passed.shape[1], 6))
+    for begin in range(0, len(poses), PART):
+        k = slice(begin, min(begin + PART, len(poses)))
+        step = np.tile(np.eye(6), (k.stop - k.start, 1, 1))
+        step[:, :3, :3] = turned[k]
+        step[:, :3, 3:] = so3.hat(poses[k, :3, 3])
+        effects = before + np.cumsum(step[:, :, None] * passed[k, None, :, None], axis=0)
+        before = effects[-1]
+        yield k, effects.reshape(len(step), 6, -1)
+
+
+def _walked_along(accumulated: Floats, keyframes: NDArray[np.intp], ends: Ends) -> Floats:
+    """(k, 6, 6 L) covariance of what errors of odometry have brought keyframes (k,) with what loops, a before b, see of it."""
+    last, first = (accumulated[np.minimum.outer(keyframes, end)] for end in (ends.b, ends.a))
+    return np.asarray((last - first).transpose(0, 2, 1, 3).reshape(len(keyframes), 6, -1))
 
 
 def _shared(accumulated: Floats, ends: Ends) -> Floats:

@@ -67,17 +67,24 @@ class PlanarPrior:
 
 @dataclass(frozen=True)
 class DriftClaim:
-    """A steady drift that odometry is said to have.
+    """A drift that odometry is said to have.
 
     rates, sigma : per m, the mean over the way: (3,) m along x and y of the world, rad of heading, to the left; or (6,) m along
         x, y and z, rad about them
     gain : how much lower minus twice the logarithm of the likelihood is with it; chance : what that stays below by chance
+    rms : per m, the root mean square over the way of rates that wander; None of rates that last
     """
 
     rates: Floats
     sigma: Floats
     gain: float
     chance: float
+    rms: Floats | None = None
+
+    @property
+    def does_wander(self) -> bool:
+        """Whether the rates are others from place to place."""
+        return self.rms is not None
 
 
 @dataclass(frozen=True)
@@ -94,7 +101,7 @@ class PoseGraph:
     is_rigid : odometry is trusted: the whole moves, and nothing bends it
     walk : factor on `drift.drift_covariance` that odometry errs by at the least beside its covariances
     spread : (K, 6, 6) what poses are unsure by beside all that, as the covariances of `Solution`; None for nothing
-    claim : the steady drift that odometry was set right by before it came here
+    claim : the drift that odometry was set right by before it came here
     """
 
     poses: Floats

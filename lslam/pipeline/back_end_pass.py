@@ -102,7 +102,8 @@ def write_back_end(folder: Path, record: RunRecord, store: KeyframeStore, done: 
         return
     write_tum(
         folder / "trajectory_odometry.tum", record.odometry,
-        comment=f"lslam {__version__}, {record.method}: T_world_lidar of odometry, before the pose graph\npose_time: scan_start",
+        comment=f"lslam {__version__}, {record.method}: T_world_lidar of odometry, before the pose graph\n"
+        f"pose_time: {record.pose_time}",
     )  # fmt: skip
     if done.osm is not None:
         write_osm_matches(folder / "osm_matches.csv", done.osm, store.keyframes, se2.of_se3(done.keyframes))

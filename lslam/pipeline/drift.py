@@ -4,7 +4,7 @@ A direction fixed in the world, as a tilted start or slipping would give it, and
 scale error would be neither seen nor repaired: a loop that is 1 % too large closes as well.
 
 Steady drift is what loops repair best: where they tell its rate it is set right before they are closed (`graph.loop_drift`),
-and covariances, which expect some random walk beside it, are cautious then (NEES per degree of freedom 0.1 to 0.7). With
+and covariances, which expect some random walk beside it, are cautious then (NEES per degree of freedom 0.1 to 1.1). With
 `debug.drift_memory` it becomes such a walk, of which one loop at the end takes away less than half.
 """
 

@@ -16,6 +16,7 @@ from lslam.geometry import geodesy, se3, so3
 from lslam.geometry.interpolate import poses_at
 from lslam.graph.alignment import Alignment, align
 from lslam.graph.problem import PoseGraph, PositionFix
+from lslam.maps.georeference import Projection
 from lslam.types.georeference import Georeference
 from lslam.types.gnss import GnssStream
 from lslam.types.keyframe import Keyframe
@@ -62,12 +63,26 @@ class Placement:
 
 
 def require_gnss(sequence: Sequence, config: GnssConfig) -> None:
-    """Raise InputError when fixes are wanted of a sequence that has none: before odometry, not after."""
-    if config.mode != "off" and (sequence.gnss is None or not len(sequence.gnss)):
+    """Raise InputError when fixes are wanted of a sequence that has none: before odometry, not after.
+
+    UsageError when the result is wanted in coordinates that no map can be written in.
+    """
+    if config.mode == "off":
+        return
+    if sequence.gnss is None or not len(sequence.gnss):
         flag = "--gnss" if config.mode == "graph" else "--georeference"
         raise InputError(
             f"{sequence.path} has no satellite fixes: name their file with `gnss` in sequence.toml, or run without {flag}"
         )
+    places = sequence.gnss.lat_lon_alt[sequence.gnss.is_place]
+    if len(places):
+        require_crs(np.median(places, axis=0), config)
+
+
+def require_crs(origin: Floats, config: GnssConfig) -> None:
+    """Raise UsageError when results about `origin`, lat, lon (deg), height (m), are wanted in coordinates of no map."""
+    if config.crs is not None:
+        Projection(Georeference(origin, np.eye(4), config.crs)).check()
 
 
 def place(

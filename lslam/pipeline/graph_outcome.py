@@ -198,14 +198,17 @@ def _facts(
         "drift_factor": round(solution.drift, 4),
         "rounds": solution.rounds,
         "largest_correction_m": round(float(np.linalg.norm(moved, axis=1).max()), 4),
-        **({} if graph.claim is None else {"steady_drift": _claimed(graph.claim)}),
+        **({} if graph.claim is None else _claimed(graph.claim)),
     }
 
 
 def _claimed(claim: DriftClaim) -> dict[str, Any]:
     names = _OF_WALLS if len(claim.rates) == len(_OF_WALLS) else _OF_LOOPS
     units = np.array([100.0 if name.endswith("percent") else np.degrees(100.0) for name in names])
-    return {
-        name: {"estimate": round(float(rate), 4), "sigma": round(float(sigma), 4)}
-        for name, rate, sigma in zip(names, units * claim.rates, units * claim.sigma, strict=True)
-    } | {"log_likelihood_gain": round(0.5 * claim.gain, 1), "gain_by_chance": round(0.5 * claim.chance, 1)}
+    columns = {"estimate": claim.rates, "sigma": claim.sigma} | ({} if claim.rms is None else {"rms": claim.rms})
+    told: dict[str, Any] = {
+        name: {column: round(float(unit * rates[i]), 4) for column, rates in columns.items()}
+        for i, (name, unit) in enumerate(zip(names, units, strict=True))
+    }
+    told |= {"log_likelihood_gain": round(0.5 * claim.gain, 1), "gain_by_chance": round(0.5 * claim.chance, 1)}
+    return {"wandering_drift" if claim.does_wander else "steady_drift": told}

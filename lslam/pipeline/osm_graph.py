@@ -13,7 +13,7 @@ from lslam.formats.osm_buildings import BuildingExtract
 from lslam.geometry import se2, se3
 from lslam.graph.drift_fit import WallSightings
 from lslam.graph.problem import PoseGraph
-from lslam.graph.steady_drift import SteadyDrift, find_steady_drift, without_drift
+from lslam.graph.wall_drift import WallDrift, find_wall_drift, without_drift
 from lslam.keyframes.store import KeyframeStore
 from lslam.pipeline.osm_pass import Located, locate
 from lslam.priors.osm_prior import match_buildings
@@ -34,7 +34,7 @@ def find_on_map(
     placed: Floats | None,
     config: Config,
 ) -> tuple[Located, PoseGraph]:
-    """Where the keyframes are on the map, and the graph in its frame, set straight where the map reveals a steady drift.
+    """Where the keyframes are on the map, and the graph in its frame, set straight where the map reveals a drift.
 
     graph : of odometry, or where satellite fixes have it; up, placed : as of `locate`
     """
@@ -42,10 +42,10 @@ def find_on_map(
     held = on_map(graph, located, config)
     if located.problem or config.osm.matcher != "walls" or held.is_rigid:
         return located, held
-    before: SteadyDrift | None = None
+    before: WallDrift | None = None
     for _ in range(ROUNDS):
         seen = sightings(located, held.poses, config)
-        drift = find_steady_drift(held, seen, config.osm.wall_sigma, config.osm.building_sigma, config.graph, before)
+        drift = find_wall_drift(held, seen, config.osm.wall_sigma, config.osm.building_sigma, config.graph, before)
         if drift is None or not drift.is_sure:
             break
         before = drift
@@ -57,9 +57,11 @@ def find_on_map(
         located = again
         held = on_map(replace(held, poses=odometry), located, config)
     if before is not None:
-        rates = before.claim.rates
+        claim = before.claim
+        rates = claim.rates if claim.rms is None else claim.rms
         log.info(
-            "OSM: odometry drifts steadily by %.1f %% and %.1f deg/100 m, and is set straight",
+            "OSM: odometry %s by %.1f %% and %.1f deg/100 m, and is set straight",
+            "wanders" if claim.does_wander else "drifts steadily",
             100 * np.linalg.norm(rates[:2]), 100 * np.degrees(rates[2]),
         )  # fmt: skip
     return located, held

@@ -14,12 +14,13 @@ from numpy.typing import NDArray
 
 from lslam.config import Config
 from lslam.config.osm import OsmConfig
-from lslam.errors import InputError, UsageError
+from lslam.errors import InputError, UsageError, cause
 from lslam.formats.osm_buildings import BuildingExtract, buildings_of, some_buildings_of
 from lslam.formats.osm_files import OsmData, from_overpass, read_osm
 from lslam.geometry import se2
 from lslam.geometry.geodesy import to_local
 from lslam.kernels.jit import cache_folder
+from lslam.pipeline.georeferencing import require_crs
 from lslam.priors.buffer import Fetch, OsmBuffer
 from lslam.priors.osm_map import OsmMap
 from lslam.priors.overpass import fetch_buildings
@@ -181,16 +182,17 @@ def start_of(sequence: Sequence, config: Config) -> Floats:
 def open_osm(sequence: Sequence, config: Config) -> OsmSource | None:
     """What `osm.extract` names; None when it names nothing.
 
-    Raises UsageError when nobody says where the run begins, InputError for a file that cannot be read or of another town.
+    Raises UsageError when nobody says where the run begins or its result is wanted in coordinates that no map can be written
+    in, InputError for a file that cannot be read or of another town.
     """
     if not config.osm.extract:
         return None
+    origin = start_of(sequence, config)
+    require_crs(origin, config.gnss)
     if config.osm.extract == AUTO:
         fetch = partial(fetch_buildings, config=config.osm, folder=cache_folder() / "osm")
-        return OsmServer(
-            start_of(sequence, config), sequence.gnss if config.gnss.mode != "off" else None, config.osm, fetch
-        )
-    return OsmFile(Path(config.osm.extract), start_of(sequence, config))
+        return OsmServer(origin, sequence.gnss if config.gnss.mode != "off" else None, config.osm, fetch)
+    return OsmFile(Path(config.osm.extract), origin)
 
 
 def extract_digest(config: OsmConfig) -> str:
@@ -202,4 +204,4 @@ def extract_digest(config: OsmConfig) -> str:
         files = sorted(path.glob("*.json")) if path.is_dir() else [path]
         return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()
     except OSError as error:
-        raise InputError(f"{config.extract} cannot be read: {error.strerror or error}") from None
+        raise InputError(f"{config.extract} cannot be read: {cause(error)}") from None

@@ -12,10 +12,11 @@ from typing import Any
 import numpy as np
 
 from lslam.config import Config, load_config
-from lslam.errors import InputError, InterruptedRunError, OutputError, OutputExistsError, UsageError
+from lslam.errors import InputError, InterruptedRunError, OutputError, OutputExistsError, UsageError, cause
 from lslam.formats.cloud_files import SUFFIXES
 from lslam.formats.trajectory_files import read_trajectory
 from lslam.maps.crispness import crispness
+from lslam.maps.georeference import Projection
 from lslam.maps.mesh import require_open3d
 from lslam.pipeline.map_files import (
     LOCAL,
@@ -87,7 +88,7 @@ def read_run(folder: Path, settings: Iterable[str] = ()) -> EarlierRun:
     try:
         manifest = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
     except OSError as error:
-        raise InputError(f"{folder} is no folder of a run: {MANIFEST} cannot be read: {error.strerror}") from None
+        raise InputError(f"{folder} is no folder of a run: {MANIFEST} cannot be read: {cause(error)}") from None
     except ValueError as error:
         raise InputError(f"{folder / MANIFEST}: {error}; run the sequence again") from None
     if not isinstance(manifest, dict):
@@ -132,7 +133,7 @@ def rebuild(
     """Build the map with the run's configuration and write it to `out`, by default map.<format> in the run folder.
 
     Raises OutputExistsError when the file is there, OutputError when it cannot be written, UsageError for a `crs` without
-    a georeference, InterruptedRunError when `should_stop` said so.
+    a georeference or that no map can be written in, InterruptedRunError when `should_stop` said so.
     """
     path = run.folder / f"map.{run.config.map.format}" if out is None else out
     check_output(path, overwrite)
@@ -145,6 +146,7 @@ def rebuild(
                 f"--crs: {run.folder} is not georeferenced; run the sequence with --georeference or --gnss"
             )
         georeference = replace(georeference, epsg=crs)
+        Projection(georeference).check()
     built = build_map(sequence, results_of(run), run.config, on_step, should_stop, path.parent)
     if built is None:
         raise InterruptedRunError("interrupted while the map was built: nothing is written")

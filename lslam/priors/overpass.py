@@ -142,20 +142,16 @@ def _ask(bounds: Bounds, config: OsmConfig) -> dict[str, Any]:
             stream=True,
         ) as reply:
             _check_status(reply, server)
-            body = _read(reply, config.timeout)
+            body = _read(reply, server, config.timeout)
     except requests.exceptions.Timeout as error:
-        # Nobody waits for that a second time; a server with too much to do says so itself.
         is_connecting = isinstance(error, requests.exceptions.ConnectTimeout)
-        limit = config.connect_timeout if is_connecting else config.timeout
-        raise InputError(f"{server} did not answer within {limit:g} s: try later, or name another osm.server") from None
+        raise InputError(_too_late(server, config.connect_timeout if is_connecting else config.timeout)) from None
     except requests.exceptions.ConnectionError as error:
         reason = getattr(error.args[0] if error.args else None, "reason", None)
         if type(reason).__name__ in ("NewConnectionError", "NameResolutionError"):
             raise InputError(f"{server} cannot be reached: check the network, or name another osm.server") from None
         raise _TryAgainError("the connection broke") from None
     except requests.exceptions.RequestException as error:
-        if isinstance(error, requests.exceptions.ChunkedEncodingError | requests.exceptions.ContentDecodingError):
-            raise _TryAgainError("the connection broke") from None
         raise InputError(f"{server} cannot be asked: {error}") from None
     return _parsed(body, bounds, server)
 
@@ -172,17 +168,29 @@ def _check_status(reply: Any, server: str) -> None:
         raise InputError(f"{server} refused the request (HTTP {status}): check osm.server")
 
 
-def _read(reply: Any, timeout: float) -> bytes:
-    """The body, but neither for ever nor without end."""
+def _read(reply: Any, server: str, timeout: float) -> bytes:
+    """The body, but neither for ever nor without end: what has come is looked at as it comes, drop by drop."""
+    import urllib3
+
     parts, size, end = [], 0, time.monotonic() + timeout
-    for part in reply.iter_content(4096):
-        parts.append(part)
-        size += len(part)
-        if size > LONGEST_REPLY:
-            raise InputError(f"the reply grows beyond {LONGEST_REPLY >> 20} MB: ask for a smaller place")
-        if time.monotonic() > end:
-            raise _TryAgainError(f"the reply was not complete within {timeout:g} s")
+    try:
+        while part := reply.raw.read1(65536, decode_content=True):
+            parts.append(part)
+            size += len(part)
+            if size > LONGEST_REPLY:
+                raise InputError(f"the reply grows beyond {LONGEST_REPLY >> 20} MB: ask for a smaller place")
+            if time.monotonic() > end:
+                raise InputError(_too_late(server, timeout))
+    except urllib3.exceptions.ReadTimeoutError:
+        raise InputError(_too_late(server, timeout)) from None
+    except urllib3.exceptions.HTTPError:
+        raise _TryAgainError("the connection broke") from None
     return b"".join(parts)
+
+
+def _too_late(server: str, limit: float) -> str:
+    # Nobody waits for that a second time; a server with too much to do says so itself.
+    return f"{server} did not answer within {limit:g} s: try later, or name another osm.server"
 
 
 def _parsed(body: bytes, bounds: Bounds, server: str) -> dict[str, Any]:

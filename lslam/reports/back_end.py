@@ -11,7 +11,7 @@ from lslam.geometry import se3
 from lslam.reports import svg
 from lslam.reports.buildings import drift_tables
 from lslam.reports.loop_view import loop_figures
-from lslam.reports.metrics import counted, metres
+from lslam.reports.metrics import Table, counted, metres
 from lslam.reports.plane import Track, plane_chart
 from lslam.reports.plots import ALIGNED, DISTANCE, Figure, first_available
 from lslam.types.run_record import RunRecord
@@ -50,13 +50,7 @@ def back_end_rows(record: RunRecord, evaluation: Evaluation | None) -> list[tupl
             f"{len(record.osm.accepted)} of {len(record.osm.keyframes)} keyframes held by {len(record.osm.buildings)} buildings, "
             f"which lie {east:+.2f} m east and {north:+.2f} m north of the run (sigma {sigma:.2f} m)",
         ))  # fmt: skip
-    rows += [
-        (
-            "steady drift",
-            "; ".join(f"{word} {estimate} ± {sigma}" for word, estimate, sigma in table.rows) + ", set right",
-        )
-        for table in drift_tables(record)
-    ]
+    rows += [_drift_row(table) for table in drift_tables(record)]
     if record.buildings is not None:
         found = record.buildings
         moves = [float(np.linalg.norm(c.displacement[:2])) for c in found.buildings if c.status == "seen"]
@@ -65,6 +59,15 @@ def back_end_rows(record: RunRecord, evaluation: Evaluation | None) -> list[tupl
         new = f"{counted(len(found.new_walls), 'wall')} without a building"
         rows.append(("buildings", f"{said}; {gone} absent; {new}; {counted(len(found.left), 'overlap')} left"))
     return rows
+
+
+def _drift_row(table: Table) -> tuple[str, str]:
+    """What was set right, as one line."""
+    told = [
+        f"{word} {estimate} ± {sigma}" + "".join(f" (rms {rms})" for rms in rest)
+        for word, estimate, sigma, *rest in table.rows
+    ]
+    return table.title.removesuffix(" of odometry").lower(), "; ".join(told) + ", set right"
 
 
 def back_end_figures(record: RunRecord, evaluation: Evaluation | None) -> list[Figure]:

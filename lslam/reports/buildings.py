@@ -24,6 +24,7 @@ Floats = NDArray[np.float64]
 MOST_WALLS = 2500  # drawn; the page stays small
 MOST_ROWS = 60
 AROUND = 30.0  # m round the way that are drawn
+KINDS = ("steady", "wandering")  # of drift, as the manifest has them
 
 
 @dataclass(frozen=True)
@@ -66,20 +67,24 @@ def building_figures(found: CorrectedMap, matches: OsmMatches, poses: NDArray[np
 
 
 def drift_tables(record: RunRecord) -> list[Table]:
-    """The steady drift that walls or loops told and that was taken out; none where none was claimed."""
-    claim = record.manifest.get("graph", {}).get("steady_drift")
-    if not claim:
+    """The drift that walls or loops told and that was taken out, steady or wandering; none where none was claimed."""
+    known = record.manifest.get("graph", {})
+    kind, claim = next(((kind, known[f"{kind}_drift"]) for kind in KINDS if f"{kind}_drift" in known), ("", None))
+    if claim is None:
         return []
     words = (
         ("east_percent", "to the east, %"), ("north_percent", "to the north, %"), ("x_percent", "along x, %"),
         ("y_percent", "along y, %"), ("z_percent", "along z, %"), ("about_x_deg_per_100m", "turn about x, deg/100 m"),
         ("about_y_deg_per_100m", "turn about y, deg/100 m"), ("left_deg_per_100m", "turn to the left, deg/100 m"),
     )  # fmt: skip
-    rows = tuple(
-        (word, f"{claim[name]['estimate']:+.3f}", f"{claim[name]['sigma']:.3f}")
-        for name, word in words
-        if name in claim
+    told_of = [(word, claim[name]) for name, word in words if name in claim]
+    rows: tuple[tuple[str, ...], ...] = tuple(
+        (word, f"{one['estimate']:+.3f}", f"{one['sigma']:.3f}") for word, one in told_of
     )
+    header: tuple[str, ...] = ("drift", "estimate", "sigma")
+    if kind == "wandering":
+        rows = tuple((*row, f"{one['rms']:.3f}") for row, (_, one) in zip(rows, told_of, strict=True))
+        header = (*header, "rms, from place to place")
     told, then = "walls moved while they were passed", "the map held it"
     if "x_percent" in claim:
         told, then = "loops over different ways tell one rate", "they were closed"
@@ -88,7 +93,7 @@ def drift_tables(record: RunRecord) -> list[Table]:
         f"likelihood is higher with the drift by {claim['log_likelihood_gain']:.1f}; chance stays below "
         f"{claim['gain_by_chance']:.1f}."
     )
-    return [Table("Steady drift of odometry", ("drift", "estimate", "sigma"), rows, recipe)]
+    return [Table(f"{kind.capitalize()} drift of odometry", header, rows, recipe)]
 
 
 def building_tables(found: CorrectedMap, matches: OsmMatches) -> list[Table]:

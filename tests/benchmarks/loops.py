@@ -73,7 +73,7 @@ def drive(name: str, scans: int, seed: int, scale: float, turn: float) -> tuple[
             bend = np.deg2rad(turn) * length / 100
             step[:3, 3] *= 1 + scale / 100
             odometry = odometry @ step @ se3.make(so3.exp(np.array([0.0, 0.0, bend])), np.zeros(3))
-        still = MotionPrior(np.zeros(1), np.eye(4)[None])
+        still = MotionPrior.at_once(np.eye(4))
         cloud = keyframe_cloud(sequence.scan(i), still, PreprocessConfig(), config)
         stamp = int(sequence.stamps_ns[i])
         store.add(Keyframe(len(chosen), i, stamp, odometry, None, float(travelled[i])), cloud)

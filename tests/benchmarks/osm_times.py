@@ -42,7 +42,7 @@ def measured(drive: Path, count: int, size: int) -> dict[str, list[float]]:
     scans = np.unique(np.searchsorted(way, SPACING * np.arange(count)).clip(max=len(poses) - 1))
     sequence, store = open_sequence(drive), KeyframeStore()
     for k, scan in enumerate(scans.tolist()):
-        still = MotionPrior(np.zeros(1), poses[scan][None])
+        still = MotionPrior.at_once(poses[scan])
         cloud = keyframe_cloud(sequence.scan(scan), still, PreprocessConfig(), KeyframesConfig())
         store.add(Keyframe(k, scan, scan, poses[scan], None, float(way[scan])), cloud)
     config, osm = OsmConfig(), OsmMap(read_buildings(drive / "map.osm", origin)[1].buildings)

@@ -41,6 +41,15 @@ def test_fixes_place_the_run_where_the_sample_was_made(closed: Path) -> None:
     assert "east, north, up" in facts["frames"]["world"]
 
 
+def test_a_map_in_degrees_is_refused_before_it_is_built(closed: Path) -> None:
+    before = (closed / "map.laz").read_bytes()
+    done = lslam("map", closed, "--crs", "EPSG:4326", "--overwrite")
+    assert done.returncode == 2
+    assert "EPSG:4326 (WGS 84) does not count in metres on a plane" in done.stderr
+    assert "scans/s" not in done.stderr
+    assert (closed / "map.laz").read_bytes() == before
+
+
 def test_before_and_after_are_told_apart(closed: Path) -> None:
     document = strict_json((closed / "evaluation.json").read_text())
     before, after = document["odometry"]["ate"]["se3"]["rmse"], document["ate"]["se3"]["rmse"]

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy.stats import chi2
-from test_steady_drift import MAP, SEEN, WAY, odometry, sighted
+from test_wall_drift import MAP, SEEN, WAY, odometry, sighted
 
 from lslam.config.graph import GraphConfig
 from lslam.geometry import se2
@@ -18,8 +18,8 @@ from lslam.graph import drift_fit
 from lslam.graph.drift_fit import DriftFit, Sizes, WallSightings
 from lslam.graph.factors import PLANAR
 from lslam.graph.problem import PoseGraph
-from lslam.graph.rates import LASTING, SIZES, hats, rate_roots
-from lslam.graph.steady_drift import SCALES, _effects, find_steady_drift, without_drift
+from lslam.graph.rates import LASTING, MEMORY, SIZES, hats, rate_roots, walk_root
+from lslam.graph.wall_drift import SCALES, _effects, find_wall_drift, without_drift
 
 Floats = NDArray[np.float64]
 CHOICES = [(0.25, 0.0, 0.5), (0.25, 0.5, 0.9), (0.5, 2.0, 0.99), (1.0, 8.0, 0.5)]
@@ -51,7 +51,7 @@ class Dense:
         self.graph, self.seen = graph, seen
         about = seen.places - graph.poses[seen.keyframes, :2, 3]
         turned = seen.normals[:, 1] * about[:, 0] - seen.normals[:, 0] * about[:, 1]
-        self.effects = _effects(graph)
+        self.effects = _effects(graph, hats(graph.distances))
         axes = np.column_stack([seen.normals, turned])
         self.rows = np.stack([axis @ self.effects[k] for axis, k in zip(axes, seen.keyframes, strict=True)])
         self.given = np.append(graph.start_sigma, [graph.shift_sigma] * 2)  # type: ignore[arg-type]
@@ -135,6 +135,17 @@ def test_five_copies_that_count_a_fifth_are_one() -> None:
         )
 
 
+@pytest.mark.parametrize(("length", "apart"), [(366.0, 20.0), (2000.0, 50.0)])
+def test_rates_that_wander_go_as_far_as_a_walk(length: float, apart: float) -> None:
+    """Its variance grows with the way, and over `MEMORY` it is that of rates that last as long."""
+    way = np.arange(0.0, length, 2.0)
+    moves = 2.0 * np.cumsum(hats(way, apart), axis=0)
+    root = walk_root(float(way[-1]), GraphConfig(), PLANAR, apart)[::3, ::3]
+    variance = np.einsum("kn,nm,km->k", moves, root @ root.T, moves)
+    middle = slice(len(way) // 3, 2 * len(way) // 3)
+    np.testing.assert_allclose(variance[middle], 0.01**2 * MEMORY * way[1:][middle], rtol=0.2)
+
+
 @pytest.mark.parametrize("seed", [0, 2])
 def test_a_drift_is_sure_when_it_explains_more_than_chance(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(drift_fit, "FREEDOM", 1e12)
@@ -145,7 +156,7 @@ def test_a_drift_is_sure_when_it_explains_more_than_chance(seed: int, monkeypatc
     for factor, is_sure in ((0.9, True), (1.1, False)):
         level = float(chi2.cdf(factor * gain, 2))
         assert 0.5 < level < 1.0
-        drift = find_steady_drift(graph, seen, SEEN, MAP, GraphConfig(probability=level))
+        drift = find_wall_drift(graph, seen, SEEN, MAP, GraphConfig(probability=level))
         assert drift is not None
         assert drift.is_sure == is_sure
 
@@ -155,9 +166,7 @@ def test_a_drift_is_settled_well_below_what_it_is_unsure_by(seed: int) -> None:
     """The fewer sightings count as new, the less sure are the same rates: 0.5 and 0.02 of the squares that chance gives."""
     graph = odometry(0.1, 0.0)
     seen = sighted(graph, seed, 0.5)
-    verdicts = [
-        find_steady_drift(graph, replace(seen, share=share), SEEN, MAP, GraphConfig()) for share in (0.01, 3e-4)
-    ]
+    verdicts = [find_wall_drift(graph, replace(seen, share=share), SEEN, MAP, GraphConfig()) for share in (0.01, 3e-4)]
     assert [drift is not None and drift.is_settled for drift in verdicts] == [False, True]
 
 
@@ -168,7 +177,7 @@ def test_where_no_wall_is_seen_drift_lasts_by_half_and_whole_once_it_stayed_the_
 ) -> None:
     graph = odometry(1.0, 0.0)
     seen = sighted(graph, seed, 0.3)
-    drift = find_steady_drift(graph, some(seen, WAY[seen.keyframes] < metres), SEEN, MAP, GraphConfig())
+    drift = find_wall_drift(graph, some(seen, WAY[seen.keyframes] < metres), SEEN, MAP, GraphConfig())
     assert drift is not None
     assert WAY[-1] > 350.0
     first, last = drift.rates[:20, :2].mean(axis=0), drift.rates[-5:, :2].mean(axis=0)
@@ -187,11 +196,11 @@ def test_what_is_left_of_a_drift_is_no_smaller_one_where_no_wall_is_seen(seed: i
         seen = sighted(one, seed, 0.3)
         return some(seen, WAY[seen.keyframes] > 80.0)
 
-    first = find_steady_drift(graph, later(graph), SEEN, MAP, GraphConfig())
+    first = find_wall_drift(graph, later(graph), SEEN, MAP, GraphConfig())
     assert first is not None
     straight = without_drift(graph, first.rates)
-    again = find_steady_drift(straight, later(straight), SEEN, MAP, GraphConfig(), first)
-    anew = find_steady_drift(straight, later(straight), SEEN, MAP, GraphConfig())
+    again = find_wall_drift(straight, later(straight), SEEN, MAP, GraphConfig(), first)
+    anew = find_wall_drift(straight, later(straight), SEEN, MAP, GraphConfig())
     assert again is not None
     assert anew is not None
     assert again.is_sure
@@ -230,7 +239,7 @@ def test_no_table_of_all_sightings_and_all_unknowns_is_written_out() -> None:
     seen = WallSightings(keyframes, walls, normals, places + moved, offsets, 0.2)
     tracemalloc.start()
     try:
-        found = find_steady_drift(graph, seen, SEEN, MAP, GraphConfig())
+        found = find_wall_drift(graph, seen, SEEN, MAP, GraphConfig())
         peak = tracemalloc.get_traced_memory()[1]
     finally:
         tracemalloc.stop()

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from graph_builders import ate, measured, truth
+from graph_builders import ate, graph_of, measured, truth
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
@@ -16,8 +17,8 @@ from lslam.errors import GraphError
 from lslam.geometry import se3, so3
 from lslam.graph import loop_drift
 from lslam.graph.drift import drift_covariance
-from lslam.graph.loop_drift import LASTS, WALKS, without_loop_drift
-from lslam.graph.pose_graph import optimise
+from lslam.graph.loop_drift import APART, LASTS, PARTS, WALKS, without_loop_drift
+from lslam.graph.pose_graph import optimise, with_distances
 from lslam.graph.problem import PoseGraph, Solution
 from lslam.graph.rates import SIZES, hats, rate_roots, set_straight
 from lslam.pipeline.drift import with_drift
@@ -68,18 +69,18 @@ def test_drift_that_lasts_is_taken_out_and_loops_close_better() -> None:
         assert straight.claim is not None
         assert ate(straight.poses, REAL) < 0.05 * ate(graph.poses, REAL)
         assert straight.spread is not None
-        assert straight.spread[-1].trace() > straight.spread[LAP // 2].trace() > 0.0
+        # What rates may be wrong by, less what loops take back of it.
         at_end = np.sqrt(np.diag(straight.spread[-1])[3:]) / graph.distances[-1]
-        np.testing.assert_allclose(straight.claim.sigma[3:], at_end, rtol=1e-6)
+        assert (at_end < 0.5 * straight.claim.sigma[3:]).all()
         plain, better = optimise(graph, CONFIG), optimise(straight, CONFIG)
         assert better.drift >= straight.walk > 0.0
         assert not any(better.loop_reasons)
         for errors, nee, solution in ((before, unsure, plain), (after, sure, better)):
             errors.append(ate(solution.poses, REAL))
             nee.append(nees(solution))
-    assert np.mean(after) < 0.6 * np.mean(before)
-    assert 1.7 * np.mean(unsure) < np.mean(sure)
-    assert 0.15 < np.mean(sure) < 3.0
+    assert np.mean(after) < 0.1 * np.mean(before)
+    assert 3.0 * np.mean(unsure) < np.mean(sure)
+    assert 0.3 < np.mean(sure) < 3.0
 
 
 def test_what_bends_the_way_much_is_sought_again_on_the_way_set_straight() -> None:
@@ -164,6 +165,51 @@ def test_a_loop_that_is_a_little_off_changes_little() -> None:
     assert mixed.walk > 5 * right.walk
 
 
+def test_loops_surer_than_can_be_reckoned_with_tell_their_drift_too() -> None:
+    """Each twice, and to a hundredth of a micrometre: large rates and walks leave no such difference in 64 bits."""
+    graph = away(0, 1.0, 0.5)
+    loops = [replace(c, covariance=1e-16 * np.eye(6)) for c in graph.loops for _ in range(2)]
+    sure, plain = (without_loop_drift(given, CONFIG).claim for given in (replace(graph, loops=loops), graph))
+    assert sure is not None
+    assert plain is not None
+    np.testing.assert_allclose(sure.rates[:3], plain.rates[:3], atol=5e-4)
+    np.testing.assert_allclose(sure.rates[3:], plain.rates[3:], atol=5e-6)
+
+
+def test_a_long_way_takes_little_memory() -> None:
+    """15 km: what each rate does to each keyframe, written out at once, takes 200 MB."""
+    real = truth(2000, 6, radius=400.0)
+    graph = with_distances(graph_of(real, 40, 0, np.random.default_rng(0), 6))
+    columns = 6 * (PARTS + 1)
+    tracemalloc.start()
+    fit = loop_drift._Fit(graph, graph.loops, np.zeros(columns), np.tile(np.eye(3), (len(graph) - 1, 1, 1)), CONFIG)
+    _, covariance, walk = fit.likeliest()
+    spread = fit.spread(covariance, walk)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert np.isfinite(spread).all()
+    assert peak < 80e6
+
+
+def test_parts_are_of_one_way(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Written out ten keyframes at a time or all at once: loops begin and end in any of them."""
+    graph = away(0, 1.0, 0.5, real=truth(61, 2))
+    loops = [
+        Constraint(a, b, se3.relative(graph.poses[a], graph.poses[b]), np.diag(LOOP**2))
+        for a, b in ((3, 33), (9, 29), (10, 40), (19, 60))
+    ]
+    found = np.random.default_rng(0).normal(0, 1e-3, 6 * hats(graph.distances, APART).shape[1])
+    turned = so3.exp(np.random.default_rng(1).normal(0, 0.3, (len(graph) - 1, 3)))
+    told = []
+    for part in (256, 10):
+        monkeypatch.setattr(loop_drift, "PART", part)
+        fit = loop_drift._Fit(graph, loops, found, turned, CONFIG)
+        rates, covariance, walk = fit.likeliest()
+        told.append((fit.unlikeliness, rates, fit.spread(covariance, walk)))
+    for whole, in_parts in zip(*told, strict=True):
+        np.testing.assert_allclose(in_parts, whole, rtol=1e-6, atol=1e-6 * np.abs(whole).max())
+
+
 def test_one_loop_none_or_no_way_tell_nothing() -> None:
     graph = away(0, 1.0, 0.5)
     none, one = replace(graph, loops=[]), replace(graph, loops=graph.loops[:1])
@@ -191,7 +237,7 @@ def test_likelihood_and_rates_equal_those_of_all_errors_written_out() -> None:
         Constraint(a, b, measured(se3.relative(real[a], real[b]), LOOP, np.random.default_rng(a)), np.diag(LOOP**2))
         for a, b in ((1, 16), (4, 18), (9, 30))
     ]
-    at_knots = hats(graph.distances)
+    at_knots = hats(graph.distances, APART)
     count, small = 6 * at_knots.shape[1], 1e-5
     turned = so3.exp(np.random.default_rng(1).normal(0, 0.3, (len(graph) - 1, 3)))
     fit = loop_drift._Fit(graph, loops, np.zeros(count), turned, CONFIG)
@@ -208,6 +254,9 @@ def test_likelihood_and_rates_equal_those_of_all_errors_written_out() -> None:
             se3.log(moved[c.a] @ T @ se3.inverse(moved[c.b])) for c, T in zip(loops, seen, strict=True)
         ])  # fmt: skip
 
+    def moved(pose: Floats) -> Floats:
+        return np.append(pose[:3, 3] - last[:3, 3], so3.log(pose[:3, :3] @ last[:3, :3].T)) / small
+
     def disturbed(T: Floats, axis: int) -> Floats:
         d = small * np.eye(6)[axis]
         return se3.make(so3.exp(d[3:]) @ T[:3, :3], T[:3, 3] + d[:3])
@@ -218,16 +267,21 @@ def test_likelihood_and_rates_equal_those_of_all_errors_written_out() -> None:
     for knot in range(count):
         by_rates.append((off(set_by(knot), seen) - zero) / -small)
     G = np.stack(by_rates, axis=1)
+    last = graph.poses[-1]
     known, walk = np.zeros((18, 18)), np.zeros((18, 18))
+    at_last = []
     for k, c in enumerate(graph.odometry):
-        columns = []
+        columns, moves = [], []
         for axis in range(6):
             after = graph.poses[k] @ disturbed(c.T_a_b, axis) @ se3.inverse(graph.poses[k + 1])
             poses = np.concatenate([graph.poses[: k + 1], after @ graph.poses[k + 1 :]])
             columns.append((off(poses, seen) - zero) / small)
-        J = np.stack(columns, axis=1)
+            moves.append(moved(poses[-1]))
+        J, at_end = np.stack(columns, axis=1), np.stack(moves, axis=1)
+        walked = drift_covariance(float(np.linalg.norm(c.T_a_b[:3, 3])), CONFIG)
         known += J @ c.covariance @ J.T
-        walk += J @ drift_covariance(float(np.linalg.norm(c.T_a_b[:3, 3])), CONFIG) @ J.T
+        walk += J @ walked @ J.T
+        at_last.append([-at_end @ C @ J.T for C in (c.covariance, walked)])
     for n, loop in enumerate(loops):
         changed = [[disturbed(T, axis) if n == m else T for m, T in enumerate(seen)] for axis in range(6)]
         J = np.stack([(off(graph.poses, some) - zero) / small for some in changed], axis=1)
@@ -236,7 +290,7 @@ def test_likelihood_and_rates_equal_those_of_all_errors_written_out() -> None:
     def unlikely(S: Floats) -> float:
         return float(np.linalg.slogdet(S)[1] + zero @ np.linalg.solve(S, zero))
 
-    roots = rate_roots(float(graph.distances[-1]), CONFIG, list(range(6)), LASTS)
+    roots = rate_roots(float(graph.distances[-1]), CONFIG, list(range(6)), LASTS, APART, is_smooth=False)
     for w in (0, 3, 6):
         alone = known + WALKS[w] * walk
         assert fit.unlikeliness[w, 0] == pytest.approx(unlikely(alone), rel=1e-3)
@@ -253,10 +307,9 @@ def test_likelihood_and_rates_equal_those_of_all_errors_written_out() -> None:
     S = known + mean_walk * walk + G @ prior @ G.T
     np.testing.assert_allclose(found, prior @ G.T @ np.linalg.solve(S, zero), rtol=1e-3, atol=1e-7)
     np.testing.assert_allclose(covariance, prior - prior @ G.T @ np.linalg.solve(S, G @ prior), rtol=1e-3, atol=1e-10)
-    last = set_straight(graph, np.zeros((len(graph) - 1, 6))).poses[-1]
-    moves = []
-    for knot in range(count):
-        pose = set_by(knot)[-1]
-        moves.append(np.append(pose[:3, 3] - last[:3, 3], so3.log(pose[:3, :3] @ last[:3, :3].T)) / small)
-    E = np.stack(moves, axis=1)
-    np.testing.assert_allclose(fit.spread(covariance)[-1], E @ covariance @ E.T, rtol=1e-3, atol=1e-9)
+    E = np.stack([moved(set_by(knot)[-1]) for knot in range(count)], axis=1)
+    by_known, by_walk = np.sum(at_last, axis=0)
+    left = E - (by_known + mean_walk * by_walk) @ np.linalg.solve(known + mean_walk * walk, G)
+    spread, expected = fit.spread(covariance, mean_walk)[-1], left @ covariance @ left.T
+    sigma = np.sqrt(np.diag(expected))
+    np.testing.assert_allclose(spread / np.outer(sigma, sigma), expected / np.outer(sigma, sigma), atol=5e-3)

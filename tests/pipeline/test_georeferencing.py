@@ -10,7 +10,7 @@ from stub_sequences import Stub
 
 from lslam.config.gnss import GnssConfig
 from lslam.config.graph import GraphConfig
-from lslam.errors import InputError
+from lslam.errors import InputError, UsageError
 from lslam.geometry import geodesy, se3, so3
 from lslam.pipeline.georeferencing import place, require_gnss
 from lslam.types.calibration import Calibration
@@ -138,3 +138,13 @@ def test_a_recording_without_fixes_is_told_before_the_run() -> None:
     with pytest.raises(InputError, match="--georeference"):
         require_gnss(replace(recording(0.1), gnss=None), GnssConfig(mode="fit"))
     require_gnss(replace(recording(0.1), gnss=None), GnssConfig())
+
+
+@pytest.mark.parametrize(
+    ("code", "why"), [(4326, "does not count in metres on a plane"), (29999, "PROJ knows no such")]
+)
+def test_coordinates_of_no_map_are_refused_before_the_run(code: int, why: str) -> None:
+    with pytest.raises(UsageError, match=why):
+        require_gnss(recording(0.1), GnssConfig(mode="graph", crs=code))
+    require_gnss(recording(0.1), GnssConfig(crs=code))
+    require_gnss(recording(0.1), GnssConfig(mode="graph", crs=25832))

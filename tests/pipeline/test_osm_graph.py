@@ -92,6 +92,34 @@ def test_a_drift_is_taken_out_by_a_map_that_errs(seed: int, caplog: pytest.LogCa
     assert told["log_likelihood_gain"] > told["gain_by_chance"] > 5.0
 
 
+def test_drift_that_wanders_is_said_to(caplog: pytest.LogCaptureFixture) -> None:
+    """To the north for a third of the way, to the south as long, and back."""
+    caplog.set_level("INFO", "lslam")
+    way = street(60.0)
+    third = len(way) // 3
+    side = np.concatenate([np.full(third, 1.0), np.full(third, -1.0), np.full(len(way) - 2 * third, 1.0)])
+    north = 0.04 * np.concatenate([[0.0], np.cumsum(side[1:] * np.linalg.norm(np.diff(way[:, :2], axis=0), axis=1))])
+    store = driven(HOUSES, way, way + north[:, None] * [0.0, 1.0, 0.0])
+    _, held = laid(store, drawn_wrong(0, 0.1))
+    # As seen from the first pose: the map may be turned as a whole.
+    shapes = (
+        se2.relative(planar[0], planar) for planar in (se2.of_se3(p) for p in (held.poses, graph_of(store).poses))
+    )
+    after, before = (np.linalg.norm((shape - se2.relative(way[0], way))[:, :2], axis=1).mean() for shape in shapes)
+    assert after < 0.5 * before
+    said = re.search(r"OSM: odometry wanders by (\S+) % and (\S+) deg/100 m, and is set straight", caplog.text)
+    assert said is not None
+    assert 1.0 < float(said[1]) < 5.0
+    done = solve(
+        held, Given([ScanResult(k.scan, k.stamp_ns, k.T_world_lidar) for k in store.keyframes], store, config(), [])
+    )
+    assert done is not None
+    assert "steady_drift" not in done.facts
+    told = done.facts["wandering_drift"]
+    assert told["north_percent"]["rms"] > 2.0 * abs(told["north_percent"]["estimate"])
+    assert told["log_likelihood_gain"] > told["gain_by_chance"] > 5.0
+
+
 @pytest.mark.parametrize("size", [0.0, 0.5])
 def test_a_run_that_does_not_drift_stays_as_it_is(size: float) -> None:
     way = street(60.0)

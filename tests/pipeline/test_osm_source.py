@@ -9,12 +9,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from stub_sequences import Stub
 
+from lslam.config import Config
 from lslam.config.osm import OsmConfig
-from lslam.errors import InputError
+from lslam.errors import InputError, UsageError
 from lslam.geometry import geodesy, se2
 from lslam.pipeline import osm_source
-from lslam.pipeline.osm_source import OsmFile, OsmServer
+from lslam.pipeline.osm_source import OsmFile, OsmServer, open_osm
 from lslam.priors.bounds import Bounds
 from lslam.types.gnss import GnssStream
 
@@ -157,3 +159,18 @@ def test_a_folder_without_replies_and_one_with_a_broken_one(tmp_path: Path) -> N
         (tmp_path / "000000.json").write_text(broken)
         with pytest.raises(InputError, match=r"holds a reply that cannot be read"):
             OsmFile(tmp_path, ORIGIN)
+
+
+@pytest.mark.parametrize("extract", ["auto", "town.osm"])
+def test_coordinates_of_no_map_are_refused_before_any_building_is_read(extract: str) -> None:
+    def opened(crs: int) -> Any:
+        tree = {"osm": {"extract": extract, "origin": ORIGIN.tolist()}, "gnss": {"crs": crs}}
+        return open_osm(Stub([]), Config.model_validate(tree))
+
+    with pytest.raises(UsageError, match="does not count in metres on a plane"):
+        opened(4326)
+    if extract == "auto":
+        assert isinstance(opened(25832), OsmServer)
+    else:
+        with pytest.raises(InputError, match=r"town\.osm"):
+            opened(25832)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import json
 import re
 import threading
@@ -27,7 +28,8 @@ class FakeOverpass:
     """Answers each request with the next of `script`, and in good order when that is used up.
 
     Words of the script: ok, busy, busy:SECONDS, gateway, drop, html, cut, remark, elsewhere, redirect, forbidden, empty,
-    slow:SECONDS. `requests` keeps the queries and headers; `most_at_once` how many were open together.
+    slow:SECONDS, drip:SECONDS (from byte to byte), torn, zipped.
+    `requests` keeps the queries and headers; `most_at_once` how many were open together.
     """
 
     def __init__(self) -> None:
@@ -99,7 +101,14 @@ def _answer(handler: BaseHTTPRequestHandler, fake: FakeOverpass, word: str, quer
         handler.send_header("Retry-After", value)
     if kind == "redirect":
         handler.send_header("Location", "https://portal.example/login")
+    if kind == "zipped":
+        body = gzip.compress(body)
+        handler.send_header("Content-Encoding", "gzip")
     handler.send_header("Content-Type", "application/json")
     handler.send_header("Content-Length", str(len(body)))
     handler.end_headers()
-    handler.wfile.write(body)
+    if kind == "drip":
+        for byte in body:
+            handler.wfile.write(bytes([byte]))
+            time.sleep(float(value))
+    handler.wfile.write(body[: len(body) // 2] if kind == "torn" else body)

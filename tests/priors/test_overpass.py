@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -110,17 +111,25 @@ def test_a_busy_server_is_given_time(
         ("forbidden", r"refused the request \(HTTP 403\)", 1),
         ("elsewhere", "most of it lies elsewhere, about -32.9", 1),
         ("slow:2", "did not answer within 0.3 s", 1),
+        ("drip:0.05", "did not answer within 0.3 s", 1),
+        ("torn", "after 3 attempts: the connection broke", 3),
     ],
 )
 def test_what_no_patience_mends_is_one_sentence_and_is_not_kept(
     server: FakeOverpass, tmp_path: Path, word: str, sentence: str, requests: int
 ) -> None:
-    timeout = 0.3 if word.startswith("slow") else 5.0
+    timeout = 0.3 if word.startswith(("slow", "drip")) else 5.0
+    begun = time.monotonic()
     with pytest.raises(InputError, match=sentence) as caught:
         fetch(server, tmp_path, *[word] * 3, timeout=timeout)
     assert "\n" not in str(caught.value)
+    assert time.monotonic() - begun < 20.0, "a reply that comes drop by drop lasts for half a minute"
     assert len(server.requests) == requests
     assert list(tmp_path.glob("*.json*")) == []
+
+
+def test_a_reply_may_be_compressed(server: FakeOverpass, tmp_path: Path) -> None:
+    assert len(from_overpass(fetch(server, tmp_path, "zipped")).ways) == 2
 
 
 def test_a_place_without_buildings_is_an_answer(server: FakeOverpass, tmp_path: Path) -> None:

@@ -150,6 +150,21 @@ def test_a_drift_that_loops_told_is_told_along_the_axes_of_the_run(make_record: 
     assert dict(back_end_rows(record, None))["steady drift"].startswith("along x, % +0.500 ± 0.010; ")
 
 
+def test_a_drift_that_wanders_is_told_with_its_size(make_record: Callable[..., RunRecord]) -> None:
+    record = make_record(10)
+    told = {"estimate": 0.5, "sigma": 0.01, "rms": 1.25}
+    names = ["east_percent", "north_percent", "left_deg_per_100m"]
+    claim = dict.fromkeys(names, told) | {"log_likelihood_gain": 60.0, "gain_by_chance": 11.2}
+    record.manifest = {"graph": {"wandering_drift": claim}}
+    (table,) = drift_tables(record)
+    assert table.title == "Wandering drift of odometry"
+    assert table.header == ("drift", "estimate", "sigma", "rms, from place to place")
+    assert table.rows[0] == ("to the east, %", "+0.500", "0.010", "1.250")
+    said = dict(back_end_rows(record, None))["wandering drift"]
+    assert said.startswith("to the east, % +0.500 ± 0.010 (rms 1.250); ")
+    assert said.endswith("(rms 1.250), set right")
+
+
 def test_the_summary_counts_buildings(make_record: Callable[..., RunRecord]) -> None:
     found, _, _ = scene()
     rows = dict(back_end_rows(make_record(10, buildings=found), None))

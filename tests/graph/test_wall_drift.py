@@ -11,7 +11,7 @@ from lslam.geometry import se2, se3, so3
 from lslam.graph.drift_fit import WallSightings
 from lslam.graph.pose_graph import optimise
 from lslam.graph.problem import PlanarPrior, PoseGraph
-from lslam.graph.steady_drift import SteadyDrift, find_steady_drift, without_drift
+from lslam.graph.wall_drift import WallDrift, find_wall_drift, without_drift
 from lslam.types.constraint import Constraint
 
 COUNT = 100
@@ -25,11 +25,26 @@ SEEDS = range(5)
 
 def odometry(percent: float, degrees: float) -> PoseGraph:
     """The real way, which runs away by so much to the north-west and turns by so much per 100 m."""
+    return run_away(np.tile([-0.006 * percent, 0.008 * percent, np.radians(degrees) / 100], (COUNT - 1, 1)))
+
+
+def wandering(seed: int, percent: float, degrees: float, memory: float) -> PoseGraph:
+    """The same with rates drawn anew along the way, forgotten over `memory` m; percent to either side, rms."""
+    rng = np.random.default_rng([seed, 7])
+    rates = [rng.standard_normal(3)]
+    for way in np.diff(WAY)[1:]:
+        kept = np.exp(-way / memory)
+        rates.append(kept * rates[-1] + np.sqrt(1.0 - kept**2) * rng.standard_normal(3))
+    return run_away(np.array(rates) * [0.01 * percent, 0.01 * percent, np.radians(degrees) / 100])
+
+
+def run_away(rates: np.ndarray) -> PoseGraph:
+    """The real way with errors at `rates` (K-1, 3) per m: m to the east and north, rad to the left."""
     poses = [REAL[0]]
-    for step, way in zip(se3.relative(REAL[:-1], REAL[1:]), np.diff(WAY), strict=True):
+    for step, way, rate in zip(se3.relative(REAL[:-1], REAL[1:]), np.diff(WAY), rates, strict=True):
         pose = poses[-1] @ step
-        pose[:3, :3] = so3.exp(np.array([0, 0, np.radians(degrees) / 100 * way])) @ pose[:3, :3]
-        pose[:2, 3] += 0.01 * percent * way * np.array([-0.6, 0.8])
+        pose[:3, :3] = so3.exp(np.array([0, 0, rate[2] * way])) @ pose[:3, :3]
+        pose[:2, 3] += rate[:2] * way
         poses.append(se3.normalise(pose))
     found = np.stack(poses)
     steps = se3.relative(found[:-1], found[1:])
@@ -59,8 +74,8 @@ def sighted(graph: PoseGraph, seed: int, size: float, facing: float | None = Non
     return WallSightings(keyframes, walls, normals[walls], seen, off, 1.0)
 
 
-def found(graph: PoseGraph, seen: WallSightings) -> SteadyDrift | None:
-    return find_steady_drift(graph, seen, SEEN, MAP, GraphConfig())
+def found(graph: PoseGraph, seen: WallSightings) -> WallDrift | None:
+    return find_wall_drift(graph, seen, SEEN, MAP, GraphConfig())
 
 
 @pytest.mark.parametrize("size", [0.1, 1.0])
@@ -70,6 +85,7 @@ def test_drift_is_taken_out_though_the_map_errs(seed: int, size: float) -> None:
     drift = found(graph, sighted(graph, seed, size))
     assert drift is not None
     assert drift.is_sure
+    assert not drift.claim.does_wander
     assert not drift.is_settled
     straight = without_drift(graph, drift.rates)
     assert ate(straight.poses, REAL) < 0.1 * ate(graph.poses, REAL)
@@ -131,21 +147,51 @@ def test_without_a_start_on_the_map_a_way_or_walls_nothing_is_told() -> None:
     assert found(graph, none) is None
 
 
+def unsure(drift: WallDrift, straight: PoseGraph) -> float:
+    """Normalised squared error a coordinate, of the poses but for the first ones."""
+    error = se2.of_se3(straight.poses) - se2.of_se3(REAL)
+    error[:, 2] = se2.wrapped(error[:, 2])
+    planar = drift.spread[:, [[0], [1], [5]], [0, 1, 5]]
+    return float(np.einsum("ki,kij,kj->k", error[10:], np.linalg.inv(planar[10:]), error[10:]).mean() / 3)
+
+
 def test_poses_are_as_unsure_as_the_rates_are() -> None:
-    """Normalised squared errors of poses that were set straight, over drifts and maps, are about one a coordinate."""
+    """Over drifts and maps."""
     squared = []
     for seed in range(12):
         rng = np.random.default_rng(100 + seed)
         graph = odometry(*rng.uniform([1.5, -2.0], [4.0, 2.0]))
         drift = found(graph, sighted(graph, seed, 0.7))
         assert drift is not None
-        straight = without_drift(graph, drift.rates)
-        error = se2.of_se3(straight.poses) - se2.of_se3(REAL)
-        error[:, 2] = se2.wrapped(error[:, 2])
-        planar = drift.spread[:, [[0], [1], [5]], [0, 1, 5]]
-        squared.append(np.einsum("ki,kij,kj->k", error[10:], np.linalg.inv(planar[10:]), error[10:]) / 3)
+        squared.append(unsure(drift, without_drift(graph, drift.rates)))
         assert not drift.spread[0].any(), "the start is not unsure for that"
         assert not drift.spread[:, 2:5].any(), "from above nothing is said of height, roll and pitch"
+    assert 0.3 < np.mean(squared) < 3.0
+
+
+@pytest.mark.parametrize("memory", [20.0, 50.0])
+def test_drift_that_wanders_is_taken_for_no_other_and_taken_out(memory: float) -> None:
+    """Rates that last explain it worse, and would be far too sure of it."""
+    ratios, squared = [], []
+    for seed in range(6):
+        graph = wandering(seed, 2.0, 1.0, memory)
+        seen = sighted(graph, seed, 0.7)
+        drift = found(graph, seen)
+        assert drift is not None
+        assert drift.is_sure
+        assert drift.claim.does_wander
+        straight = without_drift(graph, drift.rates)
+        again = find_wall_drift(straight, sighted(straight, seed, 0.7), SEEN, MAP, GraphConfig(), drift)
+        assert again is not None
+        assert again.claim.does_wander
+        assert again.knots.shape == drift.knots.shape
+        straight = without_drift(straight, again.rates)
+        ratios.append(ate(straight.poses, REAL) / ate(graph.poses, REAL))
+        squared.append(unsure(again, straight))
+        assert again.claim.rms is not None
+        assert 0.3 < again.claim.rms[0] / 0.02 < 2.0
+        assert 0.3 < again.claim.rms[2] / (np.radians(1.0) / 100) < 2.0
+    assert max(ratios) < 0.5
     assert 0.3 < np.mean(squared) < 3.0
 
 

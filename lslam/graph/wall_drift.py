@@ -1,6 +1,8 @@
-"""Odometry that runs away steadily, as the buildings of a map reveal it, and that is set straight before the graph is solved.
+"""Odometry that runs away, as the buildings of a map reveal it, and that is set straight before the graph is solved.
 
-What makes every scan wrong alike (a bent calibration, a wheel that slips) turns and shifts a trajectory at a rate that lasts.
+What makes every scan wrong alike (a bent calibration, a wheel that slips) turns and shifts a trajectory at a rate that lasts;
+what else a registration does not know of its own errors makes it wander. Either is told by what was seen with it: rates that
+last explain what wanders badly, and would lead where no wall is seen.
 A map has each wall wrong by far more than odometry errs from keyframe to keyframe, but wrong by the same from wherever it is
 seen: that a wall moves while the run passes it tells a rate, whatever the map is worth, and a rate bends no step.
 """
@@ -18,7 +20,7 @@ from lslam.graph.chi_square import quantile
 from lslam.graph.drift_fit import DriftFit, Sizes, WallSightings
 from lslam.graph.factors import PLANAR
 from lslam.graph.problem import DriftClaim, PoseGraph
-from lslam.graph.rates import SIZES, hats, rate_roots, set_straight
+from lslam.graph.rates import MEMORY, SIZES, hats, rate_roots, set_straight, walk_root
 
 Floats = NDArray[np.float64]
 
@@ -31,12 +33,14 @@ SELDOM = 0.95
 # What is fitted with drift and not without: how large it is and how it lasts. The rates themselves are averaged over.
 FITTED = 2
 ROUNDS = 6
+# m between knots of rates that wander, or so many knots, where rates last no longer than from one to the next.
+APART, MOST = 20.0, 40
 SETTLED = 0.1  # of the squared length that chance would give rates
 
 
 @dataclass(frozen=True)
-class SteadyDrift:
-    """What odometry has to be set right by.
+class WallDrift:
+    """What odometry has to be set right by: rates that last, or those that wander.
 
     knots : (n, 3) rates at knots along the way, with all that was found before
     rates : (K-1, 3) per m of the way from each keyframe to the next: m along x and y of the world, rad of heading; beside
@@ -58,14 +62,15 @@ class SteadyDrift:
         return self.claim.gain > self.claim.chance
 
 
-def find_steady_drift(
+def find_wall_drift(
     graph: PoseGraph, seen: WallSightings, seen_sigma: float, map_sigma: float, config: GraphConfig,
-    before: SteadyDrift | None = None,
-) -> SteadyDrift | None:  # fmt: skip
+    before: WallDrift | None = None,
+) -> WallDrift | None:  # fmt: skip
     """The rates at which odometry has to be set right to see walls stand still; None where nothing tells any.
 
     Rates at knots along the way and the errors of what is seen are random, of sizes that are unknown: each is given that with
-    which what was seen is likeliest (empirical Bayes), and drift is what this is likelier with than chance would have it.
+    which what was seen is likeliest (empirical Bayes), and drift is what this is likelier with than chance would have it;
+    drift that wanders, what is likelier still with that.
 
     graph : in the frame of the map, held by `start_sigma`, with `distances`
     seen_sigma, map_sigma : m, of a wall that is seen, and of one of the map beside the shift of the whole
@@ -73,12 +78,29 @@ def find_steady_drift(
     """
     if not len(seen.walls) or graph.start_sigma is None or graph.distances[-1] <= 0:
         return None
-    effects, at_knots = _effects(graph), hats(graph.distances)
+
+    def told(does_wander: bool) -> WallDrift:
+        return _found(graph, seen, (seen_sigma, map_sigma), config, before, does_wander)
+
+    if before is not None:
+        return told(before.claim.does_wander)
+    lasting, wandering = told(does_wander=False), told(does_wander=True)
+    return wandering if wandering.is_sure and wandering.claim.gain > lasting.claim.gain else lasting
+
+
+def _found(
+    graph: PoseGraph, seen: WallSightings, sigmas: tuple[float, float], config: GraphConfig, before: WallDrift | None,
+    does_wander: bool,
+) -> WallDrift:  # fmt: skip
+    """Drift of one kind, as `find_wall_drift`."""
+    assert graph.start_sigma is not None
+    length = float(graph.distances[-1])
+    apart = min(max(APART, length / MOST), MEMORY) if does_wander else MEMORY
+    at_knots = hats(graph.distances, apart)
+    effects = _effects(graph, at_knots)
     taken = np.zeros(3 * at_knots.shape[1]) if before is None else before.knots.ravel()
-    fit = DriftFit(
-        graph, seen, effects, taken, seen_sigma, map_sigma, np.append(graph.start_sigma, [graph.shift_sigma] * 2)
-    )
-    roots = rate_roots(graph.distances[-1], config, PLANAR)
+    fit = DriftFit(graph, seen, effects, taken, *sigmas, np.append(graph.start_sigma, [graph.shift_sigma] * 2))
+    roots = [walk_root(length, config, PLANAR, apart)] if does_wander else rate_roots(length, config, PLANAR)
     sizes = _likeliest(fit, roots)
     for _ in range(ROUNDS):
         fit.doubt(sizes)
@@ -90,14 +112,16 @@ def find_steady_drift(
     without = min(float(fit.unlikeliness(noise, sizes.root, (0.0,))[0]) for noise in SCALES)
     gain = without - float(fit.unlikeliness(sizes.noise, sizes.root, (1.0,))[0])
     new = found - taken
-    mean = np.kron(np.diff(graph.distances) / np.ptp(graph.distances) @ at_knots, np.eye(3))
+    shares = np.diff(graph.distances) / np.ptp(graph.distances)
+    mean = np.kron(shares @ at_knots, np.eye(3))
     sigma = np.sqrt(np.diag(mean @ covariance @ mean.T))
+    rms = np.sqrt(shares @ (at_knots @ found.reshape(-1, 3)) ** 2) if does_wander else None
     moves = effects[:, :, 5:]
     spread = np.zeros((len(graph), 6, 6))
     spread[:, np.array(PLANAR)[:, None], PLANAR] = moves @ covariance @ np.swapaxes(moves, -1, -2)
-    return SteadyDrift(
+    return WallDrift(
         found.reshape(-1, 3), np.asarray(at_knots @ new.reshape(-1, 3)), spread,
-        DriftClaim(-(mean @ found), sigma, gain, quantile(config.probability, FITTED)),
+        DriftClaim(-(mean @ found), sigma, gain, quantile(config.probability, FITTED), rms),
         is_settled=float(new @ np.linalg.solve(covariance, new)) <= SETTLED * len(found),
     )  # fmt: skip
 
@@ -114,15 +138,18 @@ def _likeliest(fit: DriftFit, roots: Sequence[Floats]) -> Sizes:
 
 
 def without_drift(graph: PoseGraph, rates: NDArray[np.float64]) -> PoseGraph:
-    """The graph with poses and odometry set right by `rates` of `find_steady_drift`."""
+    """The graph with poses and odometry set right by `rates` of `find_wall_drift`."""
     whole = np.zeros((len(rates), 6))
     whole[:, PLANAR] = rates
     return set_straight(graph, whole)
 
 
-def _effects(graph: PoseGraph) -> Floats:
-    """(K, 3, 5 + 3 n) what start, shift of the map, and rates at the knots do to planar poses, as seen from the map."""
-    place, way, at_knots = graph.poses[:, :2, 3], np.diff(graph.distances), hats(graph.distances)
+def _effects(graph: PoseGraph, at_knots: Floats) -> Floats:
+    """(K, 3, 5 + 3 n) what start, shift of the map, and rates at the knots do to planar poses, as seen from the map.
+
+    at_knots : (K-1, n) of `hats`
+    """
+    place, way = graph.poses[:, :2, 3], np.diff(graph.distances)
     passed = way[:, None] * at_knots
     about = _across(0.5 * (place[1:] + place[:-1]))[:, :, None] * passed[:, None]
     behind, turned = (np.concatenate([0 * part[:1], np.cumsum(part, axis=0)]) for part in (passed, about))
