@@ -18,6 +18,8 @@ LEAST_TURNING = np.deg2rad(0.6)
 LEAST_CORRELATION = 0.5
 # Rates in deg/s are 57.3 times too large; a good gyroscope is right to some per cent.
 LIKELY_DEGREES, MOST_SCALE = (30.0, 110.0), 2.0
+# About its own axes an IMU leaves no more than twice what it leaves about the best ones, which are three degrees off.
+MUCH_WORSE, OTHER_AXES = 4.0, np.deg2rad(20.0)
 # s: clocks of one machine differ by less; what differs by more is looked for only to say so.
 NEAR_S, FAR_S, STEP_S = 0.25, 10.0, 0.005
 # A correlation that is larger by less is the same.
@@ -74,6 +76,7 @@ def check_agreement(
             raise ImuRefusedError(_beyond(felt, seen, float(offsets[best]), at_zero, correlation))
         # Long even bends fit at any offset: nothing is told of the clock.
         best = len(offsets) // 2
+    _refuse_axes(felt, seen, offsets, float(offsets[best]))
     bias = _mean_excess(felt.rates(float(offsets[best])), seen, T_lidar_imu)
     if offset_s is not None:
         return Agreement(True, correlation, offset_s, gyro_bias=bias)
@@ -163,6 +166,38 @@ def _refuse_scale(ratio: float) -> None:
         )
 
 
+def _refuse_axes(felt: _Felt, seen: Floats, offsets: Floats, offset_s: float) -> None:
+    """Refuse turns that are those of the scans about other axes: where one axis turns most, they correlate all the same.
+
+    offset_s : of `offsets`, the best about the given axes; about others it may be another
+    """
+
+    def left(axes: Floats, t: float) -> float:
+        a, b = _centred(seen, felt.rates(t))
+        return float(np.sum((a - b @ axes.T) ** 2)) if len(a) else np.inf
+
+    best = min(offsets, key=lambda t: left(_best_axes(*_centred(seen, felt.rates(t)))[1], t))
+    R, M = _best_axes(*_centred(seen, felt.rates(float(best))))
+    given, turned, mirrored = left(np.eye(3), offset_s), left(R, best), left(M, best)
+    if MUCH_WORSE * mirrored < min(given, turned):
+        raise ImuRefusedError(
+            "its turns fit those of the scans when mirrored: one of its axes has the wrong sign, or two of them are swapped, "
+            "which no T_lidar_imu mends: correct its recording"
+        )
+    angle = float(so3.angle(R))
+    if angle > OTHER_AXES and MUCH_WORSE * turned < given:
+        raise ImuRefusedError(
+            f"its turns fit those of the scans far better when turned by {np.rad2deg(angle):.0f} deg: correct T_lidar_imu"
+        )
+
+
+def _best_axes(seen: Floats, felt: Floats) -> tuple[Floats, Floats]:
+    """What (3, 3) makes the `felt` turns (M, 3) fit those `seen` best: a rotation, and what may mirror them too."""
+    u, _, vt = np.linalg.svd(seen.T @ felt)
+    M = u @ vt
+    return np.asarray(u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(M))]) @ vt), np.asarray(M)
+
+
 def _why_not(felt: _Felt, seen: Floats, correlation: float) -> str:
     """What would make the turns agree, as a sentence."""
     said = f"its turns do not fit those of the scans (correlation {correlation:.2f}, {LEAST_CORRELATION} needed): "
@@ -171,8 +206,7 @@ def _why_not(felt: _Felt, seen: Floats, correlation: float) -> str:
         return said + f"with its stamps moved by {far:.2f} s they would, set imu.time_offset_s"
     a, b = _centred(seen, felt.rates(0.0))
     if len(a):
-        u, _, vt = np.linalg.svd(a.T @ b)
-        R = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
+        R = _best_axes(a, b)[0]
         if _compare(a, b @ R.T)[0] > 0.9:
             return said + f"turned by {np.rad2deg(float(so3.angle(R))):.0f} deg they would, correct T_lidar_imu"
     return said + "check its axes, T_lidar_imu and its stamps"

@@ -14,12 +14,13 @@ from lslam.inertial.estimate import ImuEstimate
 from lslam.inertial.gyroscope import Gyroscope
 from lslam.inertial.integrate import Increments
 from lslam.inertial.kalman import surprise
-from lslam.inertial.stream import gaps
-from lslam.preprocessing.deskew import KNOTS
+from lslam.inertial.stream import covers, gaps
+from lslam.preprocessing.deskew import knots_over
 from lslam.registration.motion import ConstantVelocity, middle_of
 from lslam.types.gravity import GravityDirection
 from lslam.types.imu import ImuStream
 from lslam.types.motion_prior import MotionPrior
+from lslam.types.scan import Span
 from lslam.types.scan_result import ScanResult
 from lslam.types.state import State, Stateful
 
@@ -53,6 +54,8 @@ class InertialMotion(Stateful):
         self.gap_scans = 0
         self._scans = 0
         self._has_gap = False
+        # Whether the IMU predicted the newest sweep.
+        self.is_felt = False
         # Whether no registration stands behind the newest pose.
         self._was_bridged = False
         self._gaps = gaps(imu, config.gap_s)
@@ -67,45 +70,47 @@ class InertialMotion(Stateful):
 
     @property
     def is_known(self) -> bool:
-        """Whether there is a velocity: from the start on."""
-        return self.coasting.is_known if self.refusal else True
+        """Whether there is a velocity: from the start on, unless the IMU is silent there."""
+        return self.coasting.is_known or self.is_felt
 
-    def is_compared(self, stamp_ns: int, span_s: float) -> bool:
+    def is_compared(self, stamp_ns: int, span: Span) -> bool:
         """Whether the scan to come is one of the sample that shows what constant velocity would have cost.
 
         Where constant velocity predicts it anyway, over a gap of the IMU, there is nothing to compare.
         """
         is_due = self.coasting.is_known and self._scans % self.COMPARED == self.COMPARED - 1
-        return is_due and self._feels(stamp_ns, span_s)
+        return is_due and self._feels(stamp_ns, span)
 
-    def sweep(self, stamp_ns: int, span_s: float) -> MotionPrior:
-        """Poses from scan start over the `span_s` seconds that the sweep takes; one pose when it takes none."""
-        if not self._feels(stamp_ns, span_s):
-            return self.coasting.sweep(stamp_ns, span_s)
+    def sweep(self, stamp_ns: int, span: Span) -> MotionPrior:
+        """Poses over the `span` of the sweep; the one at the stamp when it takes no time."""
+        self.is_felt = self._feels(stamp_ns, span)
+        if not self.is_felt:
+            return self.coasting.sweep(stamp_ns, span)
         anchor_ns = stamp_ns if self._instant_ns is None else self._instant_ns
-        prior = self._prior(self.estimate, anchor_ns, self._pose, stamp_ns, span_s)
-        self._expected = stamp_ns, prior.start
+        prior = self._prior(self.estimate, anchor_ns, self._pose, stamp_ns, knots_over(span))
+        self._expected = stamp_ns, prior.pose
         return prior
 
-    def refine(self, prior: MotionPrior, stamp_ns: int, start: Floats) -> MotionPrior:
-        """The sweep's motion again, now that registration gave the pose `start` (4, 4) for `prior`."""
-        span = float(prior.times[-1])
-        middle, instant_ns = middle_of(prior, stamp_ns, start)
-        end_ns = stamp_ns + round(1e9 * span)
-        if self.refusal or span <= 0 or self._instant_ns is None or not self._covers(self._instant_ns, end_ns):
-            return self.coasting.refine(prior, stamp_ns, start)
+    def refine(self, prior: MotionPrior, stamp_ns: int, pose: Floats) -> MotionPrior:
+        """The sweep's motion again, now that registration gave the `pose` (4, 4) at the stamp for `prior`."""
+        middle, instant_ns = middle_of(prior, stamp_ns, pose)
+        end_ns = stamp_ns + round(1e9 * float(prior.times[-1]))
+        is_swept = len(prior.times) > 1
+        if self.refusal or not is_swept or self._instant_ns is None or not self._covers(self._instant_ns, end_ns):
+            return self.coasting.refine(prior, stamp_ns, pose)
         if self.config.velocity == "integrated":
             return prior
-        return self._prior(self._corrected(instant_ns, middle), instant_ns, middle, stamp_ns, span)
+        return self._prior(self._corrected(instant_ns, middle), instant_ns, middle, stamp_ns, prior.times)
 
     def weigh(self, result: ScanResult, prior: MotionPrior) -> ScanResult:
         """The registered motion since the last scan weighed against what the IMU felt, each by its covariance.
 
-        Where they contradict each other, it stays registration's, or the scan is bridged: `_denied`. prior : of the
-        registration, says how the sweep moved
+        Where they contradict each other, it stays registration's, or the scan is bridged: `_denied`. Behind a gap nothing is
+        weighed: the scan before was deskewed without the IMU, and is wrong by more than its covariance says. prior : of
+        the registration, says how the sweep moved
         """
-        C = result.registration_covariance
-        if C is None or result.status != "ok" or not self.config.weigh or self.config.velocity == "integrated":
+        C, is_off = result.registration_covariance, not self.config.weigh or self.config.velocity == "integrated"
+        if C is None or result.status != "ok" or is_off or self._has_gap:
             return result
         middle, instant_ns = middle_of(prior, result.stamp_ns, result.T_world_lidar)
         before = self._instant_ns
@@ -160,9 +165,10 @@ class InertialMotion(Stateful):
             return
         middle, instant_ns = (pose, stamp_ns) if prior is None else middle_of(prior, stamp_ns, pose)
         if not self.refusal:
+            is_behind_gap = self._has_gap
             self._has_gap = self._instant_ns is not None and not self._covers(self._instant_ns, instant_ns)
-            if self._has_gap:
-                self.gap_scans += 1
+            self.gap_scans += self._has_gap
+            if self._has_gap or is_behind_gap:
                 self._restart(instant_ns, middle)
             elif self._instant_ns is not None and instant_ns > self._instant_ns:
                 if is_registered:
@@ -188,12 +194,15 @@ class InertialMotion(Stateful):
         direction, sigma = self.estimate.down
         return GravityDirection(pose[:3, :3].T @ direction, sigma)
 
-    def rewind(self, stamp_ns: int, start: Floats, span_s: float) -> MotionPrior:
-        """Forget all scans but the first, taken at `stamp_ns` and `start` (4, 4); its sweep by what is known of the speed.
+    def rewind(self, stamp_ns: int, pose: Floats, span: Span) -> MotionPrior:
+        """Forget all scans but the first, taken at `stamp_ns` and `pose` (4, 4); its sweep by what is known of the speed.
 
-        The IMU knows the speed from the start: only one that was refused is ever asked.
+        An IMU knows the speed from the start: only one that begins later is ever asked.
         """
-        return self.coasting.rewind(stamp_ns, start, span_s)
+        prior = self.coasting.rewind(stamp_ns, pose, span)
+        self._pose, self._instant_ns = middle_of(prior, stamp_ns, pose)
+        self.gap_scans, self._scans = 0, 1
+        return prior
 
     def state(self) -> State:
         """What `restore` needs to go on from here; not the stream."""
@@ -221,9 +230,8 @@ class InertialMotion(Stateful):
         return float(own), float(steady)
 
     def _prior(
-        self, estimate: ImuEstimate, anchor_ns: int, anchor: Floats, stamp_ns: int, span_s: float
+        self, estimate: ImuEstimate, anchor_ns: int, anchor: Floats, stamp_ns: int, times: Floats
     ) -> MotionPrior:
-        times = np.linspace(0.0, span_s, KNOTS) if span_s > 0 else np.zeros(1)
         wanted = stamp_ns + np.round(1e9 * times).astype(np.int64)
         instants = np.unique(np.append(wanted, anchor_ns))
         T_world_imu = anchor @ self.T_lidar_imu
@@ -256,14 +264,14 @@ class InertialMotion(Stateful):
         return self._felt
 
     def _advanced(self, stamp_ns: int, instant_ns: int) -> ImuEstimate:
-        """The estimate of the first scan's start at the middle of its sweep."""
+        """The estimate at the first scan's stamp at the middle of its sweep."""
         if instant_ns <= stamp_ns or not self._covers(stamp_ns, instant_ns):
             return self.estimate
         step = self.estimate.over(self.imu, np.array([stamp_ns, instant_ns]))
         return self.estimate.carried(step, self.T_lidar_imu[:3, :3])
 
     def _restart(self, instant_ns: int, middle: Floats) -> None:
-        """After a gap the velocity is what registration says over the gap, and doubtful."""
+        """After a gap, and a scan later, the velocity is what registration says over it, and doubtful."""
         assert self._instant_ns is not None
         moved = (middle @ self.T_lidar_imu)[:3, 3] - (self._pose @ self.T_lidar_imu)[:3, 3]
         covariance = self.estimate.covariance.copy()
@@ -281,7 +289,7 @@ class InertialMotion(Stateful):
         if self._expected is not None and self._expected[0] == stamp_ns:
             mine = self._expected[1]
         else:
-            mine = self._prior(self.estimate, self._instant_ns, self._pose, stamp_ns, 0.0).start
+            mine = self._prior(self.estimate, self._instant_ns, self._pose, stamp_ns, np.zeros(1)).pose
         self._errors.append((_distance(mine, pose), _distance(self.coasting.predict(stamp_ns), pose)))
         if len(self._errors) < self.JUDGED or self.config.velocity == "integrated":
             return
@@ -293,14 +301,16 @@ class InertialMotion(Stateful):
             )
             log.warning("the IMU is refused from here on: %s", self.refusal)
 
-    def _feels(self, stamp_ns: int, span_s: float) -> bool:
-        """Whether the IMU, if it is believed, has samples from the newest pose to the end of a sweep."""
-        begin_ns = stamp_ns if self._instant_ns is None else self._instant_ns
-        return not self.refusal and self._covers(begin_ns, stamp_ns + round(1e9 * span_s))
+    def _feels(self, stamp_ns: int, span: Span) -> bool:
+        """Whether the IMU, if it is believed, has samples from the newest pose, or the sweep's begin, to the sweep's end."""
+        begin_ns, end_ns = (stamp_ns + round(1e9 * seconds) for seconds in span)
+        if self._instant_ns is not None:
+            begin_ns = min(begin_ns, self._instant_ns)
+        return not self.refusal and self._covers(begin_ns, end_ns)
 
     def _covers(self, begin_ns: int, end_ns: int) -> bool:
         """Whether there are samples without a gap from one instant to the other."""
-        return not bool(((self._gaps[:, 0] < end_ns) & (self._gaps[:, 1] > begin_ns)).any())
+        return covers(self._gaps, begin_ns, end_ns)
 
 
 def _distance(a: Floats, b: Floats) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +12,7 @@ from lslam.config.imu import ImuConfig
 from lslam.inertial.agreement import LEAST_OFFSET_S, check_agreement
 from lslam.inertial.estimate import BIAS, DOWN, GRAVITY, ImuEstimate
 from lslam.inertial.gyroscope import Gyroscope
-from lslam.inertial.stream import clean
+from lslam.inertial.stream import ImuRefusedError, clean, covers, gaps
 from lslam.types.imu import ImuStream
 
 Floats = NDArray[np.float64]
@@ -31,6 +32,8 @@ LEVEL_SIGMA = 0.3
 SPEED_S = 0.8
 # Gravity is read off so many seconds: shorter, and swings of the sensor take its place.
 GRAVITY_S = 3.0
+# Forces of the wrong sign miss the path so many times farther; of the right one, never farther where anything accelerates.
+WRONG_WAY = 2.0
 
 
 @dataclass(frozen=True)
@@ -47,6 +50,15 @@ class FirstPoses:
     instants_ns: NDArray[np.int64]
     middles: Floats
     covariances: Floats | None = None
+
+    def during(self, begin: int, end: int) -> FirstPoses:
+        """The scans from number `begin` to before `end`, and the middles of sweeps between them."""
+        stamps = self.stamps_ns[begin:end]
+        kept = self.instants_ns >= stamps[0]
+        if end < len(self.stamps_ns):
+            kept &= self.instants_ns <= stamps[-1]
+        covariances = None if self.covariances is None else self.covariances[kept]
+        return FirstPoses(stamps, self.poses[begin:end], self.instants_ns[kept], self.middles[kept], covariances)
 
 
 @dataclass(frozen=True)
@@ -81,13 +93,13 @@ def start(
 
     Raises ImuRefusedError with the reason when the stream cannot be of this sensor's motion.
     """
-    stamps_ns, poses = first.stamps_ns, first.poses
     given = config.time_offset_s
     shift = 0 if given is None else round(1e9 * given)
-    cleaned = clean(replace(imu, stamps_ns=imu.stamps_ns + shift), int(stamps_ns[0]), last_ns)
+    cleaned = clean(replace(imu, stamps_ns=imu.stamps_ns + shift), int(first.stamps_ns[0]), last_ns)
     notes = list(cleaned.notes)
+    told = told_poses(first, cleaned.imu, config.gap_s)[0]
     agreement = check_agreement(
-        cleaned.imu, T_lidar_imu, first.instants_ns, first.middles, None if given is None else 0.0, least_offset_s
+        cleaned.imu, T_lidar_imu, told.instants_ns, told.middles, None if given is None else 0.0, least_offset_s
     )
     offset = agreement.offset_s if given is None else given
     if not agreement.is_judged:
@@ -96,14 +108,51 @@ def start(
     config = _without_wrong_bias(config, agreement.gyro_bias, problems)
     moved = round(1e9 * agreement.offset_s)
     usable = replace(cleaned.imu, stamps_ns=cleaned.imu.stamps_ns + moved)
-    guess, is_static = _first_guess(usable, T_lidar_imu, stamps_ns, poses, config, agreement.gyro_bias)
-    estimate = _learnt(usable, T_lidar_imu, guess, first, config)
+    told, opening = told_poses(first, usable, config.gap_s)
+    _refuse_sign(usable, T_lidar_imu, told, agreement.gyro_bias)
+    guess, is_static = _first_guess(usable, T_lidar_imu, told.stamps_ns, told.poses, config, agreement.gyro_bias)
+    estimate = _learnt(usable, T_lidar_imu, guess, told, opening, config)
     if config.gyro_bias is not None:
         bias = np.array(config.gyro_bias)
         known = Gyroscope.of_bias(bias, _doubt(bias, estimate.gyroscope))
-        estimate = _learnt(usable, T_lidar_imu, replace(guess, gyroscope=known), first, config)
+        estimate = _learnt(usable, T_lidar_imu, replace(guess, gyroscope=known), told, opening, config)
     notes.append("IMU aligned " + ("while standing" if is_static else "while moving"))
     return Start(usable, T_lidar_imu, estimate, offset, agreement.is_judged, is_static, notes, problems)
+
+
+def told_poses(first: FirstPoses, imu: ImuStream, gap_s: float) -> tuple[FirstPoses, FirstPoses]:
+    """The longest time among the first scans that the stream tells of, and how far it does from the very first on.
+
+    Raises ImuRefusedError when it is silent between all of them.
+    """
+    silent = gaps(imu, gap_s)
+    ends = [k + 1 for k, (a, b) in enumerate(pairwise(first.stamps_ns)) if not covers(silent, int(a), int(b))]
+    stretches = list(pairwise([0, *ends, len(first.stamps_ns)]))
+    longest = max(stretches, key=lambda stretch: stretch[1] - stretch[0])
+    if longest == (0, 1) and ends:
+        seconds = 1e-9 * float(first.stamps_ns[-1] - first.stamps_ns[0])
+        raise ImuRefusedError(
+            f"it is silent between all {len(first.stamps_ns)} scans of the first {seconds:.1f} s, which registration found "
+            "without it: begin where it speaks, with --start"
+        )
+    return first.during(*longest), first.during(*stretches[0])
+
+
+def _refuse_sign(imu: ImuStream, T_lidar_imu: Floats, told: FirstPoses, gyro_bias: Floats | None) -> None:
+    """Refuse forces that lead along the scans' path when they point the other way: at rest +g is up (REP 145)."""
+    bias, none = np.zeros(3) if gyro_bias is None else gyro_bias, np.zeros(3)
+    guess = ImuEstimate(none, none, none, Gyroscope.of_bias(bias, MEAN_GYRO_BIAS), np.eye(9))
+    as_given, reversed_ = (
+        _path_of_force(
+            replace(imu, accel=sign * imu.accel), told.poses @ T_lidar_imu, told.stamps_ns, guess, GRAVITY_S
+        )[2]
+        for sign in (1.0, -1.0)
+    )
+    if as_given > WRONG_WAY * reversed_:
+        raise ImuRefusedError(
+            "its specific forces fit the path of the scans when they point the other way: at rest they must be +g up, change "
+            "the sign of its accelerometer"
+        )
 
 
 def _without_wrong_bias(config: ImuConfig, seen: Floats | None, problems: list[str]) -> ImuConfig:
@@ -163,22 +212,22 @@ def _is_standing(imu: ImuStream, stamps_ns: NDArray[np.int64], poses: Floats) ->
 
 
 def _learnt(
-    imu: ImuStream, T_lidar_imu: Floats, guess: ImuEstimate, first: FirstPoses, config: ImuConfig
+    imu: ImuStream, T_lidar_imu: Floats, guess: ImuEstimate, told: FirstPoses, opening: FirstPoses, config: ImuConfig
 ) -> ImuEstimate:
-    """The guess after all the sweeps, brought back to the first pose."""
-    T = first.middles @ T_lidar_imu
+    """The guess after all the sweeps, with the velocity at the first pose."""
+    T = told.middles @ T_lidar_imu
     learnt = guess
     for k in range(len(T) - 1):
-        step, R, R_end = learnt.over(imu, first.instants_ns[k : k + 2]), T[k, :3, :3], T[k + 1, :3, :3]
-        noise = None if first.covariances is None else first.covariances[k + 1, 3:, 3:]
+        step, R, R_end = learnt.over(imu, told.instants_ns[k : k + 2]), T[k, :3, :3], T[k + 1, :3, :3]
+        noise = None if told.covariances is None else told.covariances[k + 1, 3:, 3:]
         gyroscope = learnt.taught(step, R, R_end, noise)
         learnt = learnt.corrected(imu, step, R, R_end, T[k + 1, :3, 3] - T[k, :3, 3], gyroscope)
     covariance = learnt.covariance.copy()
     covariance[:3, :] = covariance[:, :3] = 0.0
-    velocity, _, spread = _path_of_force(imu, first.poses @ T_lidar_imu, first.stamps_ns, learnt, SPEED_S)
+    velocity, _, spread = _path_of_force(imu, opening.poses @ T_lidar_imu, opening.stamps_ns, learnt, SPEED_S)
     sigma = max(spread, 0.1)
     if config.initial_velocity is not None:
-        i = min(int(np.searchsorted(imu.stamps_ns, first.stamps_ns[0])), len(imu) - 1)
+        i = min(int(np.searchsorted(imu.stamps_ns, opening.stamps_ns[0])), len(imu) - 1)
         rate = T_lidar_imu[:3, :3] @ learnt.gyroscope.rates(imu.gyro[i])
         velocity, sigma = np.array(config.initial_velocity) + np.cross(rate, T_lidar_imu[:3, 3]), GIVEN_SPEED
     covariance[:3, :3] = sigma**2 * np.eye(3)

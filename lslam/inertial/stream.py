@@ -97,6 +97,11 @@ def gaps(imu: ImuStream, longest_s: float) -> NDArray[np.int64]:
     return np.concatenate([before, inner, after])
 
 
+def covers(silent: NDArray[np.int64], begin_ns: int, end_ns: int) -> bool:
+    """Whether there are samples all the way from one instant to the other; silent : (G, 2) ns, the stream's `gaps`."""
+    return not bool(((silent[:, 0] < end_ns) & (silent[:, 1] > begin_ns)).any())
+
+
 def _ordered(imu: ImuStream, notes: list[str]) -> ImuStream:
     """Finite samples in increasing time."""
     finite = np.isfinite(imu.accel).all(axis=1) & np.isfinite(imu.gyro).all(axis=1)

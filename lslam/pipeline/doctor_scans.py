@@ -15,6 +15,8 @@ from lslam.types.sequence import Sequence
 
 # A sweep lasts one period; drivers that cut it elsewhere stay well within these.
 _SWEEP = (0.2, 1.6)
+# A tenth of a sweep past the stamp is no other sweep.
+_BESIDE = 0.1
 
 
 def examine_stamps(sequence: Sequence, findings: list[Finding]) -> Facts:
@@ -91,13 +93,15 @@ def examine_times(sequence: Sequence, points: Facts, findings: list[Finding]) ->
             )
         return
     sweeps = (limits[1] - limits[0]) * sequence.rate_hz
-    if limits[0] < -1e-6 or not _SWEEP[0] <= sweeps <= _SWEEP[1]:
+    is_about_stamp = limits[0] * sequence.rate_hz < _BESIDE and limits[1] * sequence.rate_hz > -_BESIDE
+    if not is_about_stamp or not _SWEEP[0] <= sweeps <= _SWEEP[1]:
         findings.append(
             Finding(
                 "point-times",
                 f"per-point times run from {limits[0]:.6g} to {limits[1]:.6g} s, {sweeps:.2g} sweeps at "
                 f"{sequence.rate_hz:g} Hz",
-                "they should be s since scan start and fill one sweep; state point_time_unit or rate_hz in sequence.toml",
+                "they should be s from the scan's stamp and fill one sweep that holds it; state point_time_unit or rate_hz in "
+                "sequence.toml",
             )
         )
 

@@ -12,16 +12,19 @@ from numpy.typing import NDArray
 from lslam.config import Config
 from lslam.geometry import so3
 from lslam.inertial.agreement import FAR_S, LEAST_TURNING, NEAR_S, STEP_S, Agreement, check_agreement, turns
+from lslam.inertial.fusion import InertialMotion
+from lslam.inertial.initialise import FirstPoses, start, told_poses
 from lslam.inertial.stream import Cleaned, ImuRefusedError, clean
 from lslam.pipeline.findings import Facts, Finding
 from lslam.pipeline.inertial_start import first_poses
+from lslam.types.imu import ImuStream
 from lslam.types.sequence import Sequence
 
 log = logging.getLogger("lslam")
 
 Floats = NDArray[np.float64]
 
-_SCANS = 60
+_SCANS, _FEWEST = 60, 5
 # s: less moves a point 20 m away by 5 cm at 30 deg/s.
 _LEAST_OFFSET_S = 0.005
 # Correlation about an axis: below the first it does not fit, from the second on it does.
@@ -37,7 +40,7 @@ _HOPELESS = {"imu-accel-unit", "imu-apart", "imu-finite"}
 def examine_turns(sequence: Sequence, findings: list[Finding]) -> Facts | None:
     """Register the first scans with `icp` and compare their turns with the gyroscope's; None without an IMU."""
     imu, stamps_ns = sequence.imu, sequence.stamps_ns
-    if imu is None or not len(imu) or len(sequence) < 5:
+    if imu is None or not len(imu) or len(sequence) < _FEWEST:
         return None
     try:
         cleaned = clean(imu, int(stamps_ns[0]), int(stamps_ns[-1]))
@@ -49,11 +52,34 @@ def examine_turns(sequence: Sequence, findings: list[Finding]) -> Facts | None:
         return None
     log.info("registering the first %d scans to compare their turns with the IMU's", min(_SCANS, len(sequence)))
     seconds = float(np.clip(_SCANS / sequence.rate_hz, 0.5, 60))
-    first = first_poses(sequence, Config.model_validate({"imu": {"start_s": seconds}}), None)
-    if len(first.instants_ns) < 5:
+    config = Config.model_validate({"imu": {"start_s": seconds}})
+    try:
+        first, _ = told_poses(first_poses(sequence, config, None), cleaned.imu, config.imu.gap_s)
+    except ImuRefusedError:
+        return None  # gaps everywhere, which are found by now
+    if len(first.instants_ns) < _FEWEST:
         return None
     known = sequence.calibration.T_lidar_imu
-    return compare(cleaned, np.eye(4) if known is None else known, first.instants_ns, first.middles, findings)
+    T_lidar_imu = np.eye(4) if known is None else known
+    first = _swept_by_imu(sequence, cleaned.imu, T_lidar_imu, first, config)
+    return compare(cleaned, T_lidar_imu, first.instants_ns, first.middles, findings)
+
+
+def _swept_by_imu(
+    sequence: Sequence, imu: ImuStream, T_lidar_imu: Floats, first: FirstPoses, config: Config
+) -> FirstPoses:
+    """The first scans as the IMU deskews them, where its clock seems off: constant velocity bends turns as a clock does."""
+    if first.covariances is not None:
+        return first  # nothing to deskew
+    try:
+        begun = start(imu, T_lidar_imu, first, int(sequence.stamps_ns[-1]), config.imu)
+        if not begun.offset_s:
+            return first
+        motion = InertialMotion(begun.imu, T_lidar_imu, begun.estimate, config.imu)
+        again = told_poses(first_poses(sequence, config, motion), imu, config.imu.gap_s)[0]
+    except ImuRefusedError:
+        return first
+    return again if len(again.instants_ns) >= _FEWEST else first
 
 
 def compare(

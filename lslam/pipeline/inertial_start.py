@@ -122,9 +122,15 @@ def with_imu_settings(config: Config) -> Config:
 
 
 def first_poses(sequence: Sequence, config: Config, motion: InertialMotion | None) -> FirstPoses:
-    """The first seconds, every scan of them, by `icp` in its defaults, up to the first that fails."""
+    """The first seconds, every scan of them, by `icp` in its defaults, up to the first that fails.
+
+    Where the IMU begins later, its first seconds, and all scans before.
+    """
     whole, first = (sequence.whole, int(sequence.indices[0])) if isinstance(sequence, Selection) else (sequence, 0)
-    end_ns = whole.stamps_ns[first] + round(1e9 * config.imu.start_s)
+    begin_ns = _first_heard_ns(sequence.imu, whole.stamps_ns[first:], config)
+    if motion is None and begin_ns > whole.stamps_ns[first]:
+        log.info("the IMU begins %.1f s after the first scan", 1e-9 * (begin_ns - whole.stamps_ns[first]))
+    end_ns = begin_ns + round(1e9 * config.imu.start_s)
     few = select(whole, first, max(int(np.searchsorted(whole.stamps_ns[first:], end_ns)), 1))
     gate = config.preprocess.model_dump(include={"range_min", "range_max", "deskew"})
     odometry = create_odometry(Config.model_validate({"preprocess": gate}))
@@ -155,6 +161,17 @@ def first_poses(sequence: Sequence, config: Config, motion: InertialMotion | Non
         np.array(stamps, np.int64), np.stack(poses), np.array(instants[turns], np.int64),
         np.array(middles[turns]).reshape(-1, 4, 4), np.stack(covariances)[turns] if len(covariances) == len(poses) else None,
     )  # fmt: skip
+
+
+def _first_heard_ns(imu: ImuStream | None, stamps_ns: NDArray[np.int64], config: Config) -> int:
+    """Since when the IMU tells of the scans: from the first on, unless it begins among the later ones."""
+    first_ns = int(stamps_ns[0])
+    if imu is None:
+        return first_ns
+    shifted = imu.stamps_ns + round(1e9 * (config.imu.time_offset_s or 0.0))
+    during = shifted[(shifted >= first_ns) & (shifted <= stamps_ns[-1])]
+    silent_s = 1e-9 * (int(during.min()) - first_ns) if len(during) else 0.0
+    return first_ns if silent_s <= config.imu.gap_s else int(during.min())
 
 
 def close_inertial(part: Inertial, results: list[ScanResult]) -> dict[str, Any]:

@@ -31,6 +31,7 @@ from lslam.types.trajectory import Trajectory
 KIND = "bag"
 _LAYOUTS = ("velodyne", "velodyne_points", "sequences")
 _LOOKED_AT = 5
+_SAID_NS = 1000  # shorter shifts are what absolute seconds are rounded by
 
 
 @dataclass
@@ -178,7 +179,8 @@ def _decide_times(sequence: BagSequence, info: SequenceInfo) -> None:
     sequence.time_rule = rule
     sequence.notes.append(rule.sentence)
     if shift:
+        sequence.stamps_ns = sequence.headers_ns + shift
+    if abs(shift) >= _SAID_NS:
         sequence.notes.append(
             f"stamps of the scans moved by {shift * 1e-9:.6f} s, to where their first points were measured"
         )
-        sequence.stamps_ns = sequence.headers_ns + shift

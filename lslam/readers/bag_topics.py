@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.errors import InputError, UsageError
+from lslam.errors import InputError, LslamError, UsageError
 from lslam.formats.bag_files import Bag, BagTopic, read_header
 from lslam.formats.bag_streams import Stream, read_fixes, read_imu
 from lslam.readers.ground_truth import Voice
@@ -70,6 +70,16 @@ def load_imu(bag: Bag, wanted: str | None, voice: Voice) -> Stream | None:
 def load_fixes(bag: Bag, wanted: str | None, voice: Voice) -> Stream | None:
     """The satellite fixes on topic `wanted`, or on the only one that has some; None, said in `voice`, when there are several."""
     return _load(bag, wanted, voice, "GNSS", "--gnss-topic", "NavSatFix", read_fixes)
+
+
+def why_no_imu(bag: Bag) -> LslamError:
+    """What to tell one who asks for the IMU of a bag that gave none: choose among several, or there is none."""
+    return _why_none(bag, "IMU", "--imu-topic", "Imu", "--imu")
+
+
+def why_no_fixes(bag: Bag) -> LslamError:
+    """As `why_no_imu`, of satellite fixes."""
+    return _why_none(bag, "GNSS", "--gnss-topic", "NavSatFix", "--gnss and --georeference")
 
 
 def index_scans(bag: Bag, topic: BagTopic, voice: Voice) -> tuple[Stamps, Stamps, str]:
@@ -169,6 +179,14 @@ def _load(
     order, stamps = put_in_order(stream.stamps_ns, recorded, f"{what}: samples", voice)
     voice.notes.append(f"{what} from {topic.name} ({len(topic)} messages, frame {stream.frame or 'unnamed'})")
     return Stream(stamps, stream.values[order], stream.frame)
+
+
+def _why_none(bag: Bag, what: str, flag: str, kind: str, wish: str) -> LslamError:
+    topics = bag.of_type(kind)
+    if len(topics) > 1:
+        return UsageError(f"{bag.path} has {what} on {len(topics)} topics, choose one:\n{_flags(topics, flag)}")
+    fact = f"{topics[0].name} holds none that can be used" if topics else f"no topic is sensor_msgs/{kind}"
+    return InputError(f"{bag.path} has no {what}: {fact}; {_listing(bag)}; run without {wish}")
 
 
 def _named(bag: Bag, topics: list[BagTopic], wanted: str, flag: str, what: str) -> BagTopic:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 class GravityDirection:
     """Measured direction of gravity at the start of a scan.
 
-    direction : (3,) float64, unit, downwards, in LiDAR axes at scan start
+    direction : (3,) float64, unit, downwards, in LiDAR axes at the scan's stamp
     sigma : rad, one standard deviation of either of the two tilts that it fixes (it says nothing of yaw)
 
     Errors of scans that follow each other are nearly the same error: the filter behind it forgets over some twenty seconds. A

@@ -42,10 +42,16 @@ def ours(sequence: Sequence, scans: int, method: str, use_imu: bool) -> Outcome:
 
 
 def times_of(scan: Scan, sequence: Sequence) -> Floats:
-    """Seconds since scan start; evenly over the sweep where points have none."""
+    """Seconds from the scan's stamp; evenly over a sweep that begins there where points have none."""
     if scan.times is None:
         return np.linspace(0.0, 1.0 / sequence.rate_hz, len(scan))
     return scan.times.astype(np.float64)
+
+
+def shares_of(scan: Scan, sequence: Sequence) -> Floats:
+    """The same as 0 to 1 of the sweep, which peers want."""
+    times = times_of(scan, sequence) - scan.span.begin_s
+    return np.asarray(times / max(float(times.max()), 1e-9))
 
 
 def genz_icp(sequence: Sequence, scans: int) -> Outcome:
@@ -59,9 +65,9 @@ def genz_icp(sequence: Sequence, scans: int) -> Outcome:
     poses, seconds = [], []
     for i in range(scans):
         scan = sequence.scan(i)
-        times = times_of(scan, sequence)
+        shares = shares_of(scan, sequence)
         began = time.perf_counter()
-        genz.register_frame(scan.points.astype(np.float64), times / float(times.max()))
+        genz.register_frame(scan.points.astype(np.float64), shares)
         seconds.append(time.perf_counter() - began)
         poses.append(np.array(genz.last_pose))
     return np.stack(poses), np.array(seconds)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -16,8 +17,10 @@ from lslam.inertial.initialise import FirstPoses, start
 from lslam.registration.motion import ConstantVelocity, MotionModel
 from lslam.simulation.scenarios import SimulatedDrive
 from lslam.types.imu import ImuStream
+from lslam.types.scan import Span
 
 Floats = NDArray[np.float64]
+SPAN = Span(0.0, 0.1)
 
 
 def motion_of(
@@ -37,7 +40,7 @@ def motion_of(
 
 
 def errors(
-    motion: MotionModel, drive: SimulatedDrive, failed: range = range(0), every: int = 1, span: float = 0.1
+    motion: MotionModel, drive: SimulatedDrive, failed: range = range(0), every: int = 1, span: Span = SPAN
 ) -> tuple[Floats, Floats]:
     """Error of each prediction, m and rad, (N, 2), and of the turn predicted within each sweep, rad (N,)."""
     stamps, poses = (values[::every] for values in truth_of(drive))
@@ -45,15 +48,14 @@ def errors(
     predicted, within = [], []
     for k, (stamp, true) in enumerate(zip(stamps, poses, strict=True)):
         prior = motion.sweep(int(stamp), span)
-        delta = se3.relative(prior.start, true)
+        delta = se3.relative(prior.pose, true)
         predicted.append((np.linalg.norm(delta[:3, 3]), so3.angle(delta[:3, :3])))
         if len(prior.times) > 1:
-            end = start_pose @ drive.vehicle.poses(np.array([stamp * 1e-9 + prior.times[-1]]))[0]
-            within.append(
-                so3.angle(se3.relative(se3.relative(prior.start, prior.poses[-1]), se3.relative(true, end))[:3, :3])
-            )
+            begin, end = start_pose @ drive.vehicle.poses(np.maximum(stamp * 1e-9 + prior.times[[0, -1]], 0.0))
+            moved = se3.relative(prior.poses[0], prior.poses[-1])
+            within.append(so3.angle(se3.relative(moved, se3.relative(begin, end))[:3, :3]))
         ok = k not in failed
-        motion.correct(int(stamp), true if ok else prior.start, prior, ok)
+        motion.correct(int(stamp), true if ok else prior.pose, prior, ok)
     return np.array(predicted), np.array(within)
 
 
@@ -70,6 +72,22 @@ def test_it_predicts_better_than_constant_velocity(make: object) -> None:
     assert own[1, 0] < 0.02, "the speed is known from the first scan on"
 
 
+@pytest.mark.parametrize("make", [walk, drone])
+def test_it_predicts_sweeps_about_their_stamps_as_well(make: Callable[[], SimulatedDrive]) -> None:
+    """Half of each sweep lies before the last pose's next stamp: none of it is felt twice, or not at all."""
+    drive = make()
+    begun, _ = errors(motion_of(drive), drive)
+    motion = motion_of(drive)
+    about, within = errors(motion, drive, span=Span(-0.05, 0.05))
+    steady, steady_within = errors(ConstantVelocity(), drive, span=Span(-0.05, 0.05))
+    rms = [np.sqrt(np.mean(e[10:] ** 2, axis=0)) for e in (begun, about, steady)]
+    assert (rms[1] < 1.3 * rms[0]).all()
+    assert (rms[1] < rms[2] / [1.2, 4]).all()
+    assert np.median(within[10:]) < 0.3 * np.median(steady_within[10:])
+    # The first sweep began before the IMU did; the last ends after it may have.
+    assert motion.gap_scans <= 2
+
+
 def test_a_seeming_standstill_is_no_prediction() -> None:
     """The sentinel: an IMU that is told nothing moves is far off."""
     drive = drone()
@@ -77,7 +95,7 @@ def test_a_seeming_standstill_is_no_prediction() -> None:
     stamps, poses = truth_of(drive)
     off = []
     for stamp, true in zip(stamps, poses, strict=True):
-        off.append(np.linalg.norm(motion.sweep(int(stamp), 0.0).start[:3, 3] - true[:3, 3]))
+        off.append(np.linalg.norm(motion.sweep(int(stamp), Span()).pose[:3, 3] - true[:3, 3]))
         motion.correct(int(stamp), np.eye(4))
     assert np.median(off) > 10.0
 
@@ -138,12 +156,12 @@ def test_wrong_axes_that_slipped_through_are_refused_on_the_way() -> None:
     drive = walk()
     wrong = extrinsics_of(drive) @ se3.make(so3.exp(np.array([np.pi / 2, 0, 0])), np.zeros(3))
     motion = motion_of(drive, T=wrong)
-    own, _ = errors(motion, drive, span=0.0)
-    steady, _ = errors(ConstantVelocity(), drive, span=0.0)
+    own, _ = errors(motion, drive, span=Span())
+    steady, _ = errors(ConstantVelocity(), drive, span=Span())
     assert "T_lidar_imu" in motion.refusal
     np.testing.assert_allclose(own[45:], steady[45:], atol=1e-9)
     right = motion_of(drive)
-    errors(right, drive, span=0.0)
+    errors(right, drive, span=Span())
     assert not right.refusal
 
 
@@ -165,10 +183,12 @@ def test_the_lever_arm_counts() -> None:
     far = simulate_imu(drive.vehicle, IMUS["ideal"], arm, drive.end, np.random.default_rng(0))
     stamps, poses = truth_of(drive, 50)
     begun = start(far.stream, arm, FirstPoses(stamps, poses, stamps, poses), int(drive.stamps_ns[-1]), ImuConfig())
-    own, _ = errors(InertialMotion(far.stream, arm, begun.estimate, ImuConfig()), drive, span=0.0)
+    own, _ = errors(InertialMotion(far.stream, arm, begun.estimate, ImuConfig()), drive, span=Span())
     assert np.median(own[10:, 0]) < 0.002
     mistaken = dataclasses.replace(begun, T_lidar_imu=se3.make(arm[:3, :3], np.zeros(3)))
-    ignored, _ = errors(InertialMotion(far.stream, mistaken.T_lidar_imu, begun.estimate, ImuConfig()), drive, span=0.0)
+    ignored, _ = errors(
+        InertialMotion(far.stream, mistaken.T_lidar_imu, begun.estimate, ImuConfig()), drive, span=Span()
+    )
     assert np.median(ignored[10:, 0]) > 5 * np.median(own[10:, 0])
 
 

@@ -16,6 +16,7 @@ from lslam.inertial.initialise import FirstPoses, start
 from lslam.simulation.scenarios import SimulatedDrive
 from lslam.types.gravity import GravityDirection
 from lslam.types.imu import ImuStream
+from lslam.types.scan import Span
 
 Floats = NDArray[np.float64]
 
@@ -35,7 +36,7 @@ def directions(
     motion = InertialMotion(begun.imu if imu is None else imu, extrinsics_of(drive), begun.estimate, config)
     found = []
     for stamp, pose in zip(stamps, poses, strict=True):
-        motion.correct(int(stamp), pose, motion.sweep(int(stamp), 0.0))
+        motion.correct(int(stamp), pose, motion.sweep(int(stamp), Span()))
         found.append(motion.gravity_at(pose))
     return found
 

@@ -7,10 +7,11 @@ import dataclasses
 import numpy as np
 import pytest
 from imu_drives import ACCEL_BIAS, GYRO_BIAS, drone, extrinsics_of, late, stream_of, truth_of, walk
+from numpy.typing import NDArray
 
 from lslam.config.imu import ImuConfig
 from lslam.geometry import se3
-from lslam.inertial.initialise import FirstPoses, Start, start
+from lslam.inertial.initialise import FirstPoses, Start, start, told_poses
 from lslam.inertial.stream import ImuRefusedError, clean, gaps, gravity_unit
 from lslam.simulation.scenarios import SimulatedDrive
 from lslam.types.imu import ImuStream
@@ -30,6 +31,28 @@ def begun(drive: SimulatedDrive, imu: ImuStream | None = None, *, T_lidar_imu: o
 
 def spoilt(imu: ImuStream, **values: object) -> ImuStream:
     return dataclasses.replace(imu, **values)  # type: ignore[arg-type]
+
+
+def test_only_what_no_silence_parts_tells_of_the_first_scans() -> None:
+    """Sweeps of 0.1 s and no sample from 0.32 to 0.58 s, of which 50 ms at either end are known: scans 3 to 6 stand apart."""
+    stamps = np.arange(12) * 100_000_000
+    numbered = np.arange(12.0)[:, None, None] * np.eye(4)
+    first = FirstPoses(stamps, numbered, stamps + 50_000_000, numbered, numbered)
+    times = np.arange(0, 1_400_000_000, 10_000_000)
+    whole = ImuStream(times, np.ones((140, 3)), np.ones((140, 3)))
+    heard = (times <= 320_000_000) | (times >= 580_000_000)
+    parted = ImuStream(times[heard], whole.accel[heard], whole.gyro[heard])
+    longest, opening = told_poses(first, parted, 0.1)
+    for found, scans, middles in ((longest, range(6, 12), range(6, 12)), (opening, range(4), range(3))):
+        np.testing.assert_array_equal(found.stamps_ns, stamps[list(scans)])
+        np.testing.assert_array_equal(found.poses[:, 3, 3], list(scans))
+        np.testing.assert_array_equal(found.instants_ns, first.instants_ns[list(middles)])
+        assert found.covariances is not None
+        for values in (found.middles, found.covariances):
+            np.testing.assert_array_equal(values[:, 0, 0], list(middles))
+    for found in told_poses(first, whole, 0.1):
+        np.testing.assert_array_equal(found.stamps_ns, stamps)
+        np.testing.assert_array_equal(found.instants_ns, first.instants_ns)
 
 
 @pytest.mark.parametrize("make", [walk, drone])
@@ -102,6 +125,11 @@ def test_a_slow_imu_says_what_it_cannot_do() -> None:
     assert any("10 Hz" in note for note in found.notes)
 
 
+def about_axes(imu: ImuStream, axes: NDArray[np.float64]) -> ImuStream:
+    """As an IMU with other axes (3, 3), in the rows, would feel it."""
+    return spoilt(imu, accel=imu.accel @ axes.T, gyro=imu.gyro @ axes.T)
+
+
 ROLLED = np.roll(np.eye(3), 1, axis=0)
 
 
@@ -113,6 +141,11 @@ ROLLED = np.roll(np.eye(3), 1, axis=0)
         ("no gravity", "neither in m/s2"),
         ("axes", "T_lidar_imu"),
         ("sign", "do not fit"),
+        ("a quarter turn aside", r"turned by (8|9)\d deg"),
+        ("half a turn aside", r"turned by 1[78]\d deg"),
+        ("an axis mirrored", "when mirrored"),
+        ("two axes swapped", "when mirrored"),
+        ("forces down", "point the other way"),
         ("seconds late", "imu.time_offset_s"),
         ("hours late", "imu.time_offset_s"),
         ("noise", "check"),
@@ -133,6 +166,11 @@ def test_garbage_is_refused_with_a_reason(kind: str, says: str) -> None:
         "no gravity": lambda: spoilt(imu, accel=imu.accel - imu.accel.mean(axis=0)),
         "axes": lambda: spoilt(imu, gyro=imu.gyro @ ROLLED.T),
         "sign": lambda: spoilt(imu, gyro=-imu.gyro),
+        "a quarter turn aside": lambda: about_axes(imu, np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])),
+        "half a turn aside": lambda: about_axes(imu, np.diag([-1.0, -1, 1])),
+        "an axis mirrored": lambda: about_axes(imu, np.diag([-1.0, 1, 1])),
+        "two axes swapped": lambda: about_axes(imu, np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, 1]])),
+        "forces down": lambda: spoilt(imu, accel=-imu.accel),
         "seconds late": lambda: late(imu, 1.5),
         "hours late": lambda: late(imu, 3600.0),
         "noise": lambda: spoilt(imu, gyro=rng.normal(0, imu.gyro.std(), imu.gyro.shape)),

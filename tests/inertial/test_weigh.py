@@ -15,6 +15,7 @@ from lslam.inertial.fusion import InertialMotion
 from lslam.inertial.initialise import FirstPoses, start
 from lslam.inertial.integrate import Increments, integrate
 from lslam.types.imu import ImuStream
+from lslam.types.scan import Span
 from lslam.types.scan_result import ScanResult
 
 Floats = NDArray[np.float64]
@@ -28,6 +29,15 @@ def motion_of(imu: ImuStream | None = None, **keys: object) -> InertialMotion:
     first = FirstPoses(stamps, poses, stamps, poses, np.repeat(LEAST[None], 50, axis=0))
     begun = start(stream_of(drive), extrinsics_of(drive), first, int(drive.stamps_ns[-1]), config)
     return InertialMotion(begun.imu if imu is None else imu, begun.T_lidar_imu, begun.estimate, config)
+
+
+def part(imu: ImuStream, keep: slice) -> ImuStream:
+    return ImuStream(imu.stamps_ns[keep], imu.accel[keep], imu.gyro[keep])
+
+
+def behind_third_scan(imu: ImuStream) -> slice:
+    """The samples since 50 ms after it: they do not reach back to the second scan, and do to the third."""
+    return slice(int(np.searchsorted(imu.stamps_ns, drone().stamps_ns[2] + 50_000_000)), None)
 
 
 def result_of(index: int, stamp_ns: int, pose: Floats, covariance: Floats | None, **values: object) -> ScanResult:
@@ -44,7 +54,7 @@ def followed(
     C = np.diag([sigma_m**2] * 3 + [sigma_rad**2] * 3)
     last, rows = poses[0], []
     for k, (stamp, true) in enumerate(zip(stamps, poses, strict=True)):
-        prior = motion.sweep(int(stamp), 0.0)
+        prior = motion.sweep(int(stamp), Span())
         if k:
             step = se3.relative(poses[k - 1], true)
             seen = last @ step
@@ -78,7 +88,7 @@ def begun(motion: InertialMotion, count: int = 3) -> tuple[int, Floats]:
     """Some true poses taken in; stamp and true pose of the next scan."""
     stamps, poses = truth_of(drone())
     for stamp, pose in zip(stamps[:count], poses[:count], strict=True):
-        motion.correct(int(stamp), pose, motion.sweep(int(stamp), 0.0))
+        motion.correct(int(stamp), pose, motion.sweep(int(stamp), Span()))
     return int(stamps[count]), poses[count]
 
 
@@ -90,7 +100,7 @@ def test_a_direction_that_registration_leaves_open_is_the_imus() -> None:
     C = LEAST + np.outer(weak, weak)
     off = 0.3 * weak
     seen = se3.make(so3.exp(off[3:]) @ true[:3, :3], true[:3, 3] + off[:3])
-    out = motion.weigh(result_of(3, stamp, seen, C), motion.sweep(stamp, 0.0))
+    out = motion.weigh(result_of(3, stamp, seen, C), motion.sweep(stamp, Span()))
     assert np.linalg.norm(out.T_world_lidar[:3, 3] - true[:3, 3]) < 0.03
     assert so3.angle(se3.relative(out.T_world_lidar, true)[:3, :3]) < np.deg2rad(0.2)
     assert out.registration_covariance is not None
@@ -103,7 +113,7 @@ def test_a_poor_registration_teaches_the_gyroscope_nothing() -> None:
     stamp, true = begun(motion)
     before = motion.estimate.gyroscope
     seen = true @ se3.make(so3.exp(np.array([0, 0, 0.02])), np.zeros(3))
-    prior = motion.sweep(stamp, 0.0)
+    prior = motion.sweep(stamp, Span())
     out = motion.weigh(result_of(3, stamp, seen, np.diag([1e-6] * 3 + [1.0] * 3)), prior)
     assert so3.angle(se3.relative(out.T_world_lidar, true)[:3, :3]) < 2e-3
     motion.correct(stamp, out.T_world_lidar, prior)
@@ -119,7 +129,7 @@ def test_a_place_that_registration_hardly_sees_along_one_axis_teaches_the_veloci
     stamp, true = begun(motion)
     seen = true.copy()
     seen[0, 3] += 0.5
-    prior = motion.sweep(stamp, 0.0)
+    prior = motion.sweep(stamp, Span())
     out = motion.weigh(result_of(3, stamp, seen, np.diag([1.0, 1e-6, 1e-6] + [1e-10] * 3)), prior)
     before = motion.estimate.covariance.copy()
     motion.correct(stamp, out.T_world_lidar, prior)
@@ -127,7 +137,7 @@ def test_a_place_that_registration_hardly_sees_along_one_axis_teaches_the_veloci
     assert after[0, 0] > before[0, 0]
     assert (np.diag(after)[1:3] < np.diag(before)[1:3]).all()
     np.testing.assert_allclose(
-        motion.sweep(stamp + 100_000_000, 0.0).start[:3, 3], truth_of(drone())[1][4, :3, 3], atol=0.03
+        motion.sweep(stamp + 100_000_000, Span()).pose[:3, 3], truth_of(drone())[1][4, :3, 3], atol=0.03
     )
 
 
@@ -140,7 +150,7 @@ def test_the_velocity_is_as_sure_as_it_says_whatever_registration_is(seed: int) 
     C = np.diag([0.1**2] * 3 + [1e-8] * 3)
     squared = []
     for k in range(1, 60):
-        prior = motion.sweep(int(stamps[k]), 0.0)
+        prior = motion.sweep(int(stamps[k]), Span())
         seen = poses[k].copy()
         seen[:3, 3] += rng.normal(0, 0.1, 3)
         out = motion.weigh(result_of(k, int(stamps[k]), seen, C, map_age=1e3), prior)
@@ -163,7 +173,7 @@ def test_no_interval_is_integrated_twice(monkeypatch: pytest.MonkeyPatch) -> Non
 
     monkeypatch.setattr("lslam.inertial.estimate.integrate", counted)
     seen = true @ se3.make(so3.exp(np.array([0, 0, 4e-4])), np.zeros(3))
-    prior = motion.refine(motion.sweep(stamp, 0.1), stamp, seen)
+    prior = motion.refine(motion.sweep(stamp, Span(0.0, 0.1)), stamp, seen)
     out = motion.weigh(result_of(3, stamp, seen, np.diag([1e-6] * 3 + [1e-8] * 3)), prior)
     assert not np.array_equal(out.T_world_lidar, seen)
     motion.correct(stamp, out.T_world_lidar, prior)
@@ -179,11 +189,11 @@ def test_what_was_integrated_for_another_scan_is_not_taken(why: str) -> None:
     C = np.diag([1e-6] * 3 + [1e-8] * 3)
     if why == "restored":
         before = motion.state()
-        motion.correct(int(stamps[3]), poses[3], motion.sweep(int(stamps[3]), 0.0))
-        motion.weigh(result_of(4, int(stamps[4]), poses[4], C), motion.sweep(int(stamps[4]), 0.0))
+        motion.correct(int(stamps[3]), poses[3], motion.sweep(int(stamps[3]), Span()))
+        motion.weigh(result_of(4, int(stamps[4]), poses[4], C), motion.sweep(int(stamps[4]), Span()))
         motion.restore(before)
     else:
-        motion.weigh(result_of(5, int(stamps[5]), poses[5], C), motion.sweep(int(stamps[5]), 0.0))
+        motion.weigh(result_of(5, int(stamps[5]), poses[5], C), motion.sweep(int(stamps[5]), Span()))
     for one in (motion, other):
         one.correct(int(stamps[4]), poses[4])
     np.testing.assert_array_equal(motion.estimate.velocity, other.estimate.velocity)
@@ -199,7 +209,7 @@ def test_an_old_map_counts_for_more_than_one_scan() -> None:
     moved = [
         so3.angle(
             se3.relative(
-                seen, motion.weigh(result_of(3, stamp, seen, C, map_age=age), motion.sweep(stamp, 0.0)).T_world_lidar
+                seen, motion.weigh(result_of(3, stamp, seen, C, map_age=age), motion.sweep(stamp, Span())).T_world_lidar
             )[:3, :3]
         )
         for age in (1.0, 30.0)
@@ -207,22 +217,56 @@ def test_an_old_map_counts_for_more_than_one_scan() -> None:
     assert 0 < moved[1] < 0.4 * moved[0]
 
 
-@pytest.mark.parametrize("why", ["bridged", "no covariance", "switched off", "integrated", "gap"])
+@pytest.mark.parametrize("why", ["bridged", "no covariance", "switched off", "integrated", "gap", "behind a gap"])
 def test_the_registered_pose_stays_where_nothing_can_be_weighed(why: str) -> None:
     keys = {"switched off": {"weigh": False}, "integrated": {"velocity": "integrated"}}.get(why, {})
     imu = motion_of().imu
-    keep = slice(None, int(np.searchsorted(imu.stamps_ns, drone().stamps_ns[2]))) if why == "gap" else slice(None)
-    motion = motion_of(ImuStream(imu.stamps_ns[keep], imu.accel[keep], imu.gyro[keep]), **keys)
+    at = int(np.searchsorted(imu.stamps_ns, drone().stamps_ns[2]))
+    stream = {"gap": part(imu, slice(None, at)), "behind a gap": part(imu, behind_third_scan(imu))}.get(why, imu)
+    motion = motion_of(stream, **keys)
     stamp, true = begun(motion)
     seen = true @ se3.make(so3.exp(np.array([0, 2e-3, 0])), np.zeros(3))
     C = None if why == "no covariance" else np.diag([1e-4] * 3 + [1e-6] * 3)
     result = result_of(3, stamp, seen, C, status="bridged" if why == "bridged" else "ok")
-    np.testing.assert_array_equal(motion.weigh(result, motion.sweep(stamp, 0.0)).T_world_lidar, seen)
+    np.testing.assert_array_equal(motion.weigh(result, motion.sweep(stamp, Span())).T_world_lidar, seen)
     good = motion_of()
     begun(good)
-    if why == "gap":
-        weighed = good.weigh(result, good.sweep(stamp, 0.0))
+    if "gap" in why:
+        weighed = good.weigh(result, good.sweep(stamp, Span()))
         assert not np.array_equal(weighed.T_world_lidar, seen), "with samples it would have been"
+
+
+def test_the_step_from_a_scan_in_a_gap_teaches_the_gyroscope_nothing() -> None:
+    """That scan was deskewed without the IMU: here it is off by half a degree."""
+    imu = motion_of().imu
+    stamps, poses = truth_of(drone())
+    taught = []
+    for stream in (imu, part(imu, behind_third_scan(imu))):
+        motion = motion_of(stream)
+        begun(motion, 2)
+        tilted = poses[2] @ se3.make(so3.exp(np.array([0, np.deg2rad(0.5), 0])), np.zeros(3))
+        motion.correct(int(stamps[2]), tilted, motion.sweep(int(stamps[2]), Span()))
+        before = motion.estimate.gyroscope.bias
+        motion.correct(int(stamps[3]), poses[3], motion.sweep(int(stamps[3]), Span()))
+        taught.append(float(np.abs(motion.estimate.gyroscope.bias - before).max()))
+        off = motion.sweep(int(stamps[4]), Span()).pose[:3, 3] - poses[4, :3, 3]
+        assert np.linalg.norm(off) < 0.1
+    assert taught[0] > 1e-6, "with samples before it would have"
+    assert taught[1] == 0.0
+
+
+def test_over_a_silence_between_two_sweeps_constant_velocity_predicts() -> None:
+    """Samples tell of the last scan and of the next, which is the fourth after it, and of nothing between."""
+    imu, (stamps, _) = motion_of().imu, truth_of(drone())
+    near_ns = 10_000_000
+    silent = (imu.stamps_ns > stamps[2] + near_ns) & (imu.stamps_ns < stamps[6] - near_ns)
+    told, deaf = motion_of(), motion_of(ImuStream(imu.stamps_ns[~silent], imu.accel[~silent], imu.gyro[~silent]))
+    for motion in (told, deaf):
+        begun(motion)
+    stamp = int(stamps[6])
+    np.testing.assert_array_equal(deaf.sweep(stamp, Span()).pose, deaf.coasting.predict(stamp))
+    assert not deaf.is_felt
+    assert not np.array_equal(told.sweep(stamp, Span()).pose, told.coasting.predict(stamp))
 
 
 FALSE = se3.make(so3.exp(np.array([0, 0.2, 0])), np.array([0, 0, 2.0]))
@@ -232,11 +276,11 @@ SURE = np.diag([1e-4] * 3 + [1e-6] * 3)
 def test_a_registration_that_neither_imu_nor_constant_velocity_bears_out_is_bridged() -> None:
     motion = motion_of()
     stamp, true = begun(motion)
-    prior = motion.sweep(stamp, 0.0)
+    prior = motion.sweep(stamp, Span())
     out = motion.weigh(result_of(3, stamp, true @ FALSE, SURE), prior)
     assert (out.status, out.converged) == ("bridged", False)
     assert out.reason == "registration is 2.00 m and 11.5 deg from what the IMU felt"
-    np.testing.assert_array_equal(out.T_world_lidar, prior.start)
+    np.testing.assert_array_equal(out.T_world_lidar, prior.pose)
     assert np.linalg.norm(out.T_world_lidar[:3, 3] - true[:3, 3]) < 0.03
     assert out.registration_covariance is not None
     assert 1e-4 < np.sqrt(np.linalg.eigvalsh(out.registration_covariance[:3, :3])[-1]) < 0.05
@@ -247,7 +291,7 @@ def test_a_bridged_scan_is_as_sure_as_the_imu_whatever_registration_said_of_itse
     for C in (SURE, 0.1 * SURE):
         motion = motion_of()
         stamp, true = begun(motion)
-        bridged.append(motion.weigh(result_of(3, stamp, true @ FALSE, C), motion.sweep(stamp, 0.0)))
+        bridged.append(motion.weigh(result_of(3, stamp, true @ FALSE, C), motion.sweep(stamp, Span())))
     assert [out.status for out in bridged] == ["bridged", "bridged"]
     first, second = (out.registration_covariance for out in bridged)
     assert first is not None
@@ -258,14 +302,14 @@ def test_a_bridged_scan_is_as_sure_as_the_imu_whatever_registration_said_of_itse
 @pytest.mark.parametrize("why", ["no speed yet", "the sweep ends in a gap", "another scan was expected"])
 def test_a_contradiction_that_nobody_can_decide_leaves_the_pose_registered(why: str) -> None:
     imu, stamps = motion_of().imu, drone().stamps_ns
-    config, span = ImuConfig(use=True), 0.1 if why == "the sweep ends in a gap" else 0.0
+    config, span = ImuConfig(use=True), Span(0.0, 0.1 if why == "the sweep ends in a gap" else 0.0)
     # Samples tell of `gap_s` more: of the middle of the sweep that begins at scan 3, not of its end.
-    keep = imu.stamps_ns < stamps[3] + 75_000_000 - 1e9 * config.gap_s if span else np.ones(len(imu), np.bool_)
-    motion = motion_of(ImuStream(imu.stamps_ns[keep], imu.accel[keep], imu.gyro[keep]))
+    keep = imu.stamps_ns < stamps[3] + 75_000_000 - 1e9 * config.gap_s if span.seconds else np.ones(len(imu), np.bool_)
+    motion = motion_of(part(imu, keep))
     stamp, true = begun(motion, 1 if why == "no speed yet" else 3)
     prior = motion.sweep(stamp, span)
     if why == "another scan was expected":
-        motion.sweep(int(stamps[4]), 0.0)
+        motion.sweep(int(stamps[4]), Span())
     out = motion.weigh(result_of(3, stamp, true @ FALSE, SURE), prior)
     assert out.status == "ok"
     np.testing.assert_array_equal(out.T_world_lidar, true @ FALSE)
@@ -276,14 +320,14 @@ def test_a_registration_that_insists_is_believed(is_restored: bool) -> None:
     motion = motion_of()
     stamps, poses = truth_of(drone())
     stamp, true = begun(motion)
-    prior = motion.sweep(stamp, 0.0)
+    prior = motion.sweep(stamp, Span())
     motion.correct(stamp, motion.weigh(result_of(3, stamp, true @ FALSE, SURE), prior).T_world_lidar, prior, False)
     if is_restored:
         state, motion = motion.state(), motion_of()
         motion.restore(state)
     for k, wanted in ((4, "ok"), (5, "bridged")):
         stamp, seen = int(stamps[k]), poses[k] @ FALSE
-        prior = motion.sweep(stamp, 0.0)
+        prior = motion.sweep(stamp, Span())
         out = motion.weigh(result_of(k, stamp, seen, SURE), prior)
         assert out.status == wanted
         if wanted == "ok":
@@ -298,8 +342,8 @@ def test_an_imu_that_constant_velocity_does_not_bear_out_leaves_the_pose_registe
     gyro[(imu.stamps_ns > stamps[2]) & (imu.stamps_ns <= stamps[3]), 1] += 20.0
     motion = motion_of(ImuStream(imu.stamps_ns, imu.accel, gyro))
     stamp, true = begun(motion)
-    prior = motion.sweep(stamp, 0.0)
-    assert so3.angle(se3.relative(prior.start, true)[:3, :3]) > 1.0
+    prior = motion.sweep(stamp, Span())
+    assert so3.angle(se3.relative(prior.pose, true)[:3, :3]) > 1.0
     out = motion.weigh(result_of(3, stamp, true, SURE), prior)
     assert out.status == "ok"
     np.testing.assert_array_equal(out.T_world_lidar, true)

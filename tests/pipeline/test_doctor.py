@@ -207,10 +207,24 @@ def test_gaps_of_the_scans_and_times_in_the_wrong_unit(healthy: Sequence) -> Non
     examine_stamps(spoilt(healthy, stamps_ns=stamps), findings)
     assert codes(findings) == ["scan-gaps"]
     assert "2 gaps in the scans, the longest 0.300 s after scan 19" in findings[0].what
-    for limits, found in (([0.0, 0.0999], []), ([0.0, 99.9], ["point-times"]), ([-0.1, 0.0], ["point-times"])):
-        findings = []
-        examine_times(healthy, {"per_point_times": limits}, findings)
-        assert codes(findings) == found
+
+
+# The stamp lies at the start, in the middle, at the end, just before the first point; in another sweep, in other units.
+LIMITS = [
+    *(([begin, begin + 0.0999], True) for begin in (0.0, -0.05, -0.0999, 0.005)),
+    *(
+        (limits, False)
+        for limits in ([0.02, 0.12], [-0.12, -0.02], [0.1, 0.2], [-0.3, -0.2], [0.0, 99.9], [-0.001, 0.001])
+    ),
+]
+
+
+@pytest.mark.parametrize(("limits", "is_sound"), LIMITS)
+def test_point_times_fill_a_sweep_that_holds_the_stamp(healthy: Sequence, limits: list[float], is_sound: bool) -> None:
+    findings: list[Finding] = []
+    examine_times(healthy, {"per_point_times": limits}, findings)
+    assert codes(findings) == ([] if is_sound else ["point-times"])
+    assert is_sound or "from the scan's stamp" in findings[0].way_out
 
 
 def test_satellite_fixes(healthy: Sequence) -> None:

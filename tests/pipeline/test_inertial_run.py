@@ -15,8 +15,11 @@ from stub_sequences import Standstill, Stub
 from lslam.config import Config, load_config
 from lslam.errors import GateError, InputError
 from lslam.formats.trajectory_files import read_trajectory
+from lslam.geometry import se3
 from lslam.inertial.fusion import InertialMotion
 from lslam.odometry import create_odometry
+from lslam.pipeline.doctor_turns import examine_turns
+from lslam.pipeline.findings import Finding
 from lslam.pipeline.front_end import estimate
 from lslam.pipeline.inertial_start import begin_inertial, close_inertial
 from lslam.pipeline.run import run
@@ -175,11 +178,15 @@ def test_refused_means_degraded_and_a_failed_gate_when_strict(tmp_path: Path) ->
     np.testing.assert_allclose(poses, runs()[0].trajectory.poses[:40], atol=1e-6)
 
 
-def test_a_gap_is_bridged_said_and_counted() -> None:
+def silent(begin_ns: int, end_ns: int) -> Stub:
+    """The walk without what the IMU said in between."""
     imu = imu_of(walk())
-    keep = (imu.stamps_ns < 3_000_000_000) | (imu.stamps_ns > 3_250_000_000)
-    stub = with_imu(ImuStream(imu.stamps_ns[keep], imu.accel[keep], imu.gyro[keep]))
-    config = config_of()
+    keep = (imu.stamps_ns < begin_ns) | (imu.stamps_ns > end_ns)
+    return with_imu(ImuStream(imu.stamps_ns[keep], imu.accel[keep], imu.gyro[keep]))
+
+
+def test_a_gap_is_bridged_said_and_counted() -> None:
+    stub, config = silent(3_000_000_000, 3_250_000_000), config_of()
     part = begin_inertial(stub, config)
     results = estimate(stub, create_odometry(config), motion=part.motion)
     facts = close_inertial(part, results)
@@ -187,6 +194,44 @@ def test_a_gap_is_bridged_said_and_counted() -> None:
     assert 2 <= facts["scans_in_gaps"] <= 6
     assert any("gaps of the IMU" in problem for problem in part.problems)
     assert rmse(results) < 1.5 * rmse(runs()[1].record.results) + 0.005
+
+
+@pytest.mark.parametrize("start_s", ["1.5", "5.0"])
+def test_an_imu_that_begins_later_is_aligned_where_it_begins(start_s: str, caplog: pytest.LogCaptureFixture) -> None:
+    """Two seconds after the first scan: within the time that is registered without it, and beyond."""
+    stub = silent(-1, 2_000_000_000)
+    config = config_of(f"imu.start_s={start_s}")
+    with caplog.at_level("INFO", "lslam"):
+        part = begin_inertial(stub, config)
+    assert caplog.text.count("the IMU begins 2.0 s after the first scan") == 1
+    results = estimate(stub, create_odometry(config), motion=part.motion)
+    facts = close_inertial(part, results)
+    assert facts["used"]
+    assert facts["is_checked_by_turns"]
+    assert 17 <= facts["scans_in_gaps"] <= 20
+    assert np.abs(np.array(facts["gyro_bias_rad_s"]) - 0.0873).max() < 0.01
+    assert all(r.status == "ok" for r in results)
+    assert float(np.median([r.prior_norm for r in results[24:]])) < 0.04
+    alone = runs()[0].record.results
+    assert rmse(results) < 1.2 * rmse(alone)
+    within = se3.relative(results[0].T_world_lidar, results[2].T_world_lidar)
+    np.testing.assert_allclose(within, se3.relative(alone[0].T_world_lidar, alone[2].T_world_lidar), atol=0.01)
+
+
+def test_a_hole_in_the_first_seconds_is_no_fault_of_the_imu() -> None:
+    """Its turns over the hole are not known, and would fit nothing."""
+    part = begin_inertial(silent(500_000_000, 2_500_000_000), config_of())
+    assert part.motion is not None
+    assert np.abs(part.motion.estimate.gyroscope.bias - 0.0873).max() < 0.01
+
+
+def test_an_imu_that_speaks_only_where_registration_did_not_come_is_refused() -> None:
+    stub = silent(-1, 2_000_000_000)
+    stub.scans[10] = walk_drive().scan(10).select(np.arange(9))
+    part = begin_inertial(stub, config_of("imu.start_s=1"))
+    assert part.motion is None
+    assert "it is silent between all 10 scans" in part.problems[0]
+    assert "--start" in part.problems[0]
 
 
 def test_late_stamps_are_found_and_the_imu_still_helps() -> None:
@@ -198,6 +243,16 @@ def test_late_stamps_are_found_and_the_imu_still_helps() -> None:
     assert close_inertial(part, results)["time_offset_s"] == pytest.approx(-0.02, abs=0.002)
     assert any("stamps moved" in note for note in part.notes)
     assert rmse(results) < 0.8 * rmse(runs()[0].record.results)
+
+
+@pytest.mark.parametrize("late_s", [0.0, 0.02])
+def test_the_doctor_takes_no_sweep_that_is_bent_for_a_clock_that_is_off(late_s: float) -> None:
+    imu = imu_of(walk())
+    findings: list[Finding] = []
+    facts = examine_turns(with_imu(dataclasses.replace(imu, stamps_ns=imu.stamps_ns + round(1e9 * late_s))), findings)
+    assert facts is not None
+    assert facts["time_offset_s"] == pytest.approx(-late_s, abs=0.002)
+    assert [finding.code for finding in findings] == (["imu-time-offset"] if late_s else [])
 
 
 def test_scans_that_cannot_be_read_are_bridged_by_the_imu() -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bag_builders import GRAVITY, KINDS, START_NS, STEP_NS, SUFFIX, bag, clouds, imu, scan, together, transforms
+from bag_builders import GRAVITY, KINDS, START_NS, STEP_NS, SUFFIX, Fill, bag, clouds, imu, scan, together, transforms
 
 from lslam.errors import InputError, UsageError
 from lslam.formats import bag_messages
@@ -15,6 +15,7 @@ from lslam.formats.bag_files import BagWriter
 from lslam.geometry import se3
 from lslam.readers import open_sequence
 from lslam.readers.bag import BagSequence
+from lslam.readers.raw_drive import with_gnss, with_imu
 from lslam.types.scan import Scan
 from lslam.types.sequence import Sequence
 
@@ -132,9 +133,36 @@ def test_two_imus_are_listed_and_none_is_guessed(tmp_path: Path) -> None:
     sequence = open_sequence(path)
     assert sequence.imu is None
     assert any("--imu-topic /b/imu  (7 messages" in problem for problem in sequence.problems)
+    with pytest.raises(
+        UsageError, match=r"IMU on 2 topics, choose one:\n  --imu-topic /a/imu  \(5 messages.*\n  --imu-topic /b"
+    ):
+        with_imu(sequence)
     chosen = open_sequence(path, imu_topic="/b/imu")
     assert chosen.imu is not None
     assert len(chosen.imu) == 7
+    assert with_imu(chosen) is chosen
+
+
+def test_one_who_asks_for_what_a_bag_lacks_hears_what_it_has(tmp_path: Path) -> None:
+    def fixes(*topics: str, status: int = 0) -> Fill:
+        def fill(writer: BagWriter) -> None:
+            for topic in topics:
+                fix = bag_messages.fix(writer.store, START_NS, np.array([49.0, 8.4, 110.0]), 1.0, "gnss")
+                fix.status.status = status
+                writer.write(topic, START_NS, fix)
+
+        return fill
+
+    two = bag(tmp_path / "a.bag", together(clouds(3), fixes("/a/fix", "/b/fix")))
+    with pytest.raises(InputError, match=r"no IMU: no topic is sensor_msgs/Imu; its topics are /a/fix .*without --imu"):
+        with_imu(open_sequence(two))
+    with pytest.raises(UsageError, match=r"GNSS on 2 topics, choose one:\n  --gnss-topic /a/fix .*\n  --gnss-topic /b"):
+        with_gnss(open_sequence(two))
+    chosen = open_sequence(two, gnss_topic="/b/fix")
+    assert with_gnss(chosen) is chosen
+    none = bag(tmp_path / "b.bag", together(clouds(3), fixes("/fix", status=-1)))
+    with pytest.raises(InputError, match=r"no GNSS: /fix holds none that can be used; .* without --gnss and --georef"):
+        with_gnss(open_sequence(none))
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -17,9 +17,9 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from lslam.errors import InputError
 from lslam.formats import bag_messages
 from lslam.formats.bag_files import BagWriter
-from lslam.pipeline.front_end import has_point_times
+from lslam.pipeline.front_end import sweep_of
 from lslam.readers import open_sequence
-from lslam.types.scan import Scan
+from lslam.types.scan import Scan, Span
 from lslam.types.sequence import Sequence
 
 N = 800
@@ -101,7 +101,25 @@ def test_every_drivers_times_become_seconds_since_scan_start(tmp_path: Path, sen
     check(sequence.scan(0), rows, START_NS, tolerance)
     assert any(words in note for note in sequence.notes), sequence.notes
     assert abs(int(sequence.stamps_ns[0]) - START_NS) <= tolerance * 1e9
+    assert any("scans moved by -0.0999" in note for note in sequence.notes) == (late_ns > 0)
+    assert not any("moved by -0.0000" in note for note in sequence.notes)
     assert not sequence.problems
+
+
+@pytest.mark.parametrize(
+    ("clock_s", "field", "unit"),
+    [(4.5, "<f8", 1.0), (3000.0, "<u4", 1e-6), (946684800.0, "<f8", 1.0), (946684800.0, "<f8", 1e-9)],
+)
+def test_a_clock_of_another_epoch_tells_the_time_within_the_scan(
+    tmp_path: Path, clock_s: float, field: str, unit: float
+) -> None:
+    """Since the sensor was switched on, since the hour, since 2000: the stamps of the headers stay."""
+    values = (clock_s + SECONDS) / unit
+    rows = table([*XYZI, ("ring", "<u2"), ("timestamp", field)], ring=RING, timestamp=values)
+    sequence = opened(tmp_path, rows)
+    check(sequence.scan(1), rows, START_NS + STEP_NS, 1e-6)
+    assert any("absolute" in note for note in sequence.notes), sequence.notes
+    assert sequence.stamps_ns[1] == START_NS + STEP_NS
 
 
 def test_without_times_the_notes_say_so(tmp_path: Path) -> None:
@@ -116,6 +134,17 @@ def test_times_that_make_no_sense_are_said_and_not_used(tmp_path: Path) -> None:
     (problem,) = sequence.problems
     for part in ("no deskew", "'time'", "float32", "0 to 999", str(START_NS)):
         assert part in problem
+
+
+def test_times_about_the_stamp_leave_it_in_the_middle(tmp_path: Path) -> None:
+    """As lslam writes scans of KITTI raw: a clock at either end is not meant, and nothing moves."""
+    rows = table([*XYZI, ("time", "<f4")], time=SECONDS - 0.05)
+    sequence = opened(tmp_path, rows)
+    assert any("s, relative to the scan's middle" in note for note in sequence.notes), sequence.notes
+    scan = sequence.scan(1)
+    assert scan.stamp_ns == sequence.stamps_ns[1] == START_NS + STEP_NS
+    np.testing.assert_array_equal(scan.times, rows["time"])
+    assert sweep_of(sequence) == scan.span
 
 
 STATED: list[tuple[NDArray[Any], str, int, str]] = [
@@ -182,7 +211,7 @@ def test_clouds_without_points_are_empty_scans_and_the_rule_waits_for_points(tmp
 
     sequence = open_sequence(bag(tmp_path / "a.bag", fill))
     assert [len(sequence.scan(k)) for k in range(3)] == [0, N, 0]
-    assert has_point_times(sequence)
+    assert sweep_of(sequence) == sequence.scan(1).span == Span(0.0, float(rows["time"][-1]))
     np.testing.assert_array_equal(sequence.scan(1).times, rows["time"])
 
 
