@@ -38,6 +38,13 @@ class PreprocessConfig(Section):
     standing_deg: float = Field(0.1, gt=0, description="deg; likewise for rotation")
     deskew: bool = Field(True, description="take the motion within a scan out of it, where points have times")
     map_leaf: float = Field(0.3, gt=0, description="m; centroids of this grid feed the local map")
+    least_line: float = Field(
+        0.5,
+        ge=0,
+        description="share of the line of pulses that a surface leaves in a cell of `map_leaf` below which its points are "
+        "of the air; where these fill a quarter of the cells (rain, snow, dust), they are left out of the map, and of `target` "
+        "and `grid` source points; 0 keeps all",
+    )
     downsample: Literal["target", "grid", "first", "random", "none"] = Field(
         "target",
         description="source points: centroids of a grid adapted to a target count, of a fixed grid, first point per "

@@ -48,7 +48,9 @@ class RegistrationConfig(Section):
     kernel_min: float = Field(0.15, gt=0, description="m; width at which annealing ends: five sigma")
     kernel_decay: float = Field(0.5, gt=0, lt=1, description="factor of the width from step to step")
     max_iterations: int = Field(
-        10, ge=1, description="Gauss-Newton steps per scan; three times as many for `point`, which converges slowly"
+        10,
+        ge=1,
+        description="Gauss-Newton steps per scan; three times as many for `point` and `ndt`, which converge slowly",
     )
     start_scans: int = Field(5, ge=1, description="first scans, registered coarse to fine because the speed is unknown")
     start_reach: float = Field(

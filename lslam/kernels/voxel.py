@@ -85,8 +85,8 @@ def table_size(n: int) -> int:
 @kernel
 def centroids(
     points: NDArray[np.float32], times: NDArray[np.float32], size: float
-) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-    """One centroid per voxel in order of first appearance: (M, 3) float32, its mean time (M,), its scatter (M, 6).
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32], NDArray[np.int32]]:
+    """One centroid per voxel in order of first appearance: (M, 3) float32, mean time (M,), scatter (M, 6), count (M,).
 
     The scatter is the covariance xx, xy, xz, yy, yz, zz of the voxel's points, m2. Sums run relative to the first point
     of the voxel, so float32 input keeps its digits. `times` (N,) may be empty, then the mean times are. Points of the
@@ -146,8 +146,10 @@ def centroids(
     out = np.empty((count, 3), np.float32)
     mean_times = np.empty(count if is_timed else 0, np.float32)
     scatter = np.empty((count, 6), np.float32)
+    counts = np.empty(count, np.int32)
     for j in range(count):
         s = sums[j]
+        counts[j] = int(s[0])
         f = first[j]
         w = 1.0 / s[0]
         mx, my, mz = s[1] * w, s[2] * w, s[3] * w
@@ -162,7 +164,55 @@ def centroids(
         scatter[j, 5] = s[9] * w - mz * mz
         if is_timed:
             mean_times[j] = time_sums[j] * w
-    return out, mean_times, scatter
+    return out, mean_times, scatter, counts
+
+
+@kernel
+def accompanied(
+    points: NDArray[np.float32], counts: NDArray[np.int32], least: float, size: float, least_around: float
+) -> NDArray[np.int64]:
+    """Indices of the points (N, 3) whose count times range reaches `least`, and that of their voxel `least_around`.
+
+    counts : (N,), what each point stands for; a voxel's is the sum over those of its points that reach `least`
+    """
+    n = len(points)
+    entries = table_size(n)
+    mask = entries - 1
+    table = np.full(entries, -1, np.int32)
+    keys, sums = np.empty(n, np.int64), np.zeros(n, np.int32)
+    slots, chosen = np.empty(n, np.int32), np.empty(n, np.int64)
+    inverse = 1.0 / size
+    least2, around2 = least * least, least_around * least_around
+    last_key, slot = -1, 0
+    count = filled = 0
+    for i in range(n):
+        x, y, z = float(points[i, 0]), float(points[i, 1]), float(points[i, 2])
+        if float(counts[i]) * counts[i] * (x * x + y * y + z * z) < least2:
+            continue
+        key = pack(index_of(x, inverse), index_of(y, inverse), index_of(z, inverse))
+        if count == 0 or key != last_key:
+            last_key = key
+            h = hash_key(key, mask)
+            while table[h] >= 0 and keys[table[h]] != key:
+                h = (h + 1) & mask
+            if table[h] < 0:
+                table[h] = count
+                keys[count] = key
+                count += 1
+            slot = int(table[h])
+        sums[slot] += counts[i]
+        slots[filled] = slot
+        chosen[filled] = i
+        filled += 1
+    kept = 0
+    for j in range(filled):
+        i = chosen[j]
+        around = float(sums[slots[j]])
+        x, y, z = float(points[i, 0]), float(points[i, 1]), float(points[i, 2])
+        if around * around * (x * x + y * y + z * z) >= around2:
+            chosen[kept] = i
+            kept += 1
+    return chosen[:kept]
 
 
 @kernel

@@ -10,6 +10,7 @@ import numpy as np
 from lslam.config.config import Config
 from lslam.config.registration import Residual
 from lslam.errors import UsageError
+from lslam.odometry.outcome import of_registration
 from lslam.preprocessing.deskew import deskew
 from lslam.preprocessing.prepare import PreparedPoints, prepare_points
 from lslam.registration.registration import Registration
@@ -59,36 +60,28 @@ class Icp(Stateful):
 
     def register(self, scan: Scan, prepared: PreparedPoints, prior: MotionPrior) -> ScanResult:
         """Align with the local map."""
+        return self._align(scan, prepared, prior)
+
+    def register_near(self, scan: Scan, prepared: PreparedPoints, prior: MotionPrior) -> ScanResult:
+        """Align with the local map from the prior alone."""
+        return self._align(scan, prepared, prior, is_near=True)
+
+    def _align(self, scan: Scan, prepared: PreparedPoints, prior: MotionPrior, is_near: bool = False) -> ScanResult:
         began = time.perf_counter()
         self._points = deskew(prepared, prior)
         deskewed = time.perf_counter()
-        self._located = result = self.registration.locate(self._points, prior.start)
+        result = self.registration.locate(self._points, prior.pose, is_near)
+        if result.ok or not is_near:
+            self._located = result
         stages = {"register": time.perf_counter() - deskewed}
         if self._points is not prepared:
             stages = {"deskew": deskewed - began, **stages}
-        return ScanResult(
-            index=scan.index,
-            stamp_ns=scan.stamp_ns,
-            T_world_lidar=result.T_world_lidar,
-            status="ok" if result.ok else "bridged",
-            reason=result.reason,
-            registration_covariance=result.covariance,
-            map_age=self._uncertainty.map_age,
-            converged=result.converged,
-            iterations=result.iterations,
-            source_points=result.source_points,
-            inliers=result.inliers,
-            rmse=result.rmse,
-            overlap=result.overlap,
-            degenerate=result.degenerate,
-            prior_error=result.prior_error,
-            stages=stages,
-        )
+        return of_registration(scan, result, self._uncertainty.map_age, stages)
 
     def update(self, scan: Scan, prepared: PreparedPoints, prior: MotionPrior, result: ScanResult) -> ScanResult:
         """Enter the scan into the local map where `register` put it."""
         began = time.perf_counter()
-        located = self._located.moved(result.T_world_lidar, result.registration_covariance)
+        located = self._located.decided(result)
         self.registration.update(self._points, located)
         result = self._uncertainty.stamped(result, located, prior)
         return replace(result, stages={**result.stages, "update": time.perf_counter() - began})

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lslam.config.config import Config
+from lslam.odometry.outcome import of_registration
 from lslam.preprocessing.deskew import deskew_points
 from lslam.preprocessing.features import FeaturePoints, Features, extract_features
 from lslam.registration.feature_registration import FeatureRegistration
@@ -73,42 +74,34 @@ class Loam(Stateful):
         return extract_features(scan, self.config.loam, self.config.preprocess)
 
     def features_of(self, prepared: Features, motion: MotionPrior) -> Features:
-        """The features as seen from scan start, the sensor having moved as `motion` says."""
+        """The features as seen from the pose at the stamp, the sensor having moved as `motion` says."""
         is_swept = self.config.preprocess.deskew and prepared.planes.times is not None and len(motion.times) > 1
         return _deskewed(prepared, motion) if is_swept else prepared
 
     def register(self, scan: Scan, prepared: Features, prior: MotionPrior) -> ScanResult:
         """Align with the scan before, with the feature map, or with one after the other."""
+        return self._align(scan, prepared, prior)
+
+    def register_near(self, scan: Scan, prepared: Features, prior: MotionPrior) -> ScanResult:
+        """As `register`, from the prior alone."""
+        return self._align(scan, prepared, prior, is_near=True)
+
+    def _align(self, scan: Scan, prepared: Features, prior: MotionPrior, is_near: bool = False) -> ScanResult:
         clock = StageClock()
         with clock.stage("deskew"):
             self._features = self.features_of(prepared, prior)
         if self._features is prepared:
             del clock.seconds["deskew"]
-        self._located = result = self.registration.locate(self._features, prior.start, clock)
-        return ScanResult(
-            index=scan.index,
-            stamp_ns=scan.stamp_ns,
-            T_world_lidar=result.T_world_lidar,
-            status="ok" if result.ok else "bridged",
-            reason=result.reason,
-            registration_covariance=result.covariance,
-            map_age=self._uncertainty.map_age,
-            converged=result.converged,
-            iterations=result.iterations,
-            source_points=result.source_points,
-            inliers=result.inliers,
-            rmse=result.rmse,
-            overlap=result.overlap,
-            degenerate=result.degenerate,
-            prior_error=result.prior_error,
-            stages=clock.seconds,
-        )
+        result = self.registration.locate(self._features, prior.pose, clock, is_near)
+        if result.ok or not is_near:
+            self._located = result
+        return of_registration(scan, result, self._uncertainty.map_age, clock.seconds)
 
     def update(self, scan: Scan, prepared: Features, prior: MotionPrior, result: ScanResult) -> ScanResult:
         """Enter the scan where `register` put it: into the feature map, and as what the next one is registered on."""
         clock = StageClock()
         with clock.stage("update"):
-            located = self._located.moved(result.T_world_lidar, result.registration_covariance)
+            located = self._located.decided(result)
             self.registration.update(self._features, located)
             result = self._uncertainty.stamped(result, located, prior)
         return replace(result, stages={**result.stages, **clock.seconds})
@@ -117,14 +110,14 @@ class Loam(Stateful):
         """Register a small room with a throw-away copy, well and badly: every kernel is compiled or loaded."""
         trial = type(self)(self.config, self.variant)
         room = _room()
-        prior = MotionPrior(np.zeros(1), np.eye(4)[None])
+        prior = MotionPrior.at_once(np.eye(4))
         for scan in (room, room, room.select(np.arange(0, len(room), 3))):
             prepared = trial.prepare(scan)
             trial.update(scan, prepared, prior, trial.register(scan, prepared, prior))
 
 
 def _deskewed(features: Features, prior: MotionPrior) -> Features:
-    """The features as seen from scan start."""
+    """The features as seen from the pose at the stamp."""
 
     def moved(part: FeaturePoints) -> FeaturePoints:
         return replace(part, points=deskew_points(part.points, part.times, prior))
@@ -135,6 +128,7 @@ def _deskewed(features: Features, prior: MotionPrior) -> Features:
         less_edges=moved(features.less_edges),
         planes=moved(features.planes),
         less_planes=moved(features.less_planes),
+        neither=moved(features.neither),
     )
 
 

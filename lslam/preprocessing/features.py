@@ -22,6 +22,8 @@ WIDEST_STEP = np.radians(2.0)
 _MANY_TURNS = 0.1
 # Neighbours farther apart than this many steps have missing returns between them: one lost return is bridged.
 _GAP_STEPS = 2.5
+# m; grid of the points that are no feature: they only tell what stands where.
+_NEITHER_GRID = 0.2
 # A plane's curvature is within this many standard deviations of noise.
 _PLANE_NOISE = 2.0
 
@@ -31,7 +33,7 @@ class FeaturePoints:
     """Points of one kind of feature.
 
     points : (M, 3) float64, m, LiDAR frame; rings : (M,) uint16, not decreasing
-    times : (M,) float32, s since scan start, None when the scan has none
+    times : (M,) float32, s from the scan's stamp, None when the scan has none
     """
 
     points: NDArray[np.float64]
@@ -48,6 +50,7 @@ class Features:
 
     edges : the sharpest of each region; less_edges : these and more, what the next scan's edges are matched with
     planes : the flattest of each region; less_planes : all that is flat, down-sampled along each ring
+    neither : all else, down-sampled likewise: silhouettes, single returns from posts, leaves
     labels : (N,) int8, of each point of the scan: EDGE 2, LESS_EDGE 1, NEITHER 0, LESS_PLANE -1, PLANE -2
     """
 
@@ -55,6 +58,7 @@ class Features:
     less_edges: FeaturePoints
     planes: FeaturePoints
     less_planes: FeaturePoints
+    neither: FeaturePoints
     labels: NDArray[np.int8]
 
 
@@ -162,19 +166,20 @@ def _gather(scan: Scan, walk: RingWalk, labels: NDArray[np.int8], grid_step: flo
         edges=those(labels == curvature.EDGE),
         less_edges=those(labels > 0),
         planes=those(labels == curvature.PLANE),
-        less_planes=_less_planes(walk, labels, rings, times, grid_step),
+        less_planes=_thinned(walk, labels < 0, rings, times, grid_step),
+        neither=_thinned(walk, labels == curvature.NEITHER, rings, times, _NEITHER_GRID),
         labels=back,
     )
 
 
-def _less_planes(
+def _thinned(
     walk: RingWalk,
-    labels: NDArray[np.int8],
+    mask: NDArray[np.bool_],
     rings: NDArray[np.uint16],
     times: NDArray[np.float32] | None,
     grid_step: float,
 ) -> FeaturePoints:
-    at = np.flatnonzero(labels < 0)
+    at = np.flatnonzero(mask)
     if grid_step == 0:
         return FeaturePoints(walk.points[at], rings[at], None if times is None else times[at])
     centroids, first, mean_times = curvature.thin(

@@ -11,12 +11,12 @@ from lslam.config.loam import LoamConfig
 from lslam.config.registration import RegistrationConfig
 from lslam.kernels import voxel
 from lslam.preprocessing.features import Features
-from lslam.preprocessing.prepare import NO_TIMES
+from lslam.preprocessing.prepare import NO_TIMES, prepare_points
 from lslam.registration.feature_map import FeatureMap
 from lslam.registration.feature_scan import FeatureScan, feature_scan, surface_size
 from lslam.registration.feature_solver import NONE, FeatureNoise, kept_where_blind, solve_on_map
 from lslam.registration.feature_steps import ScanStep, StageClock
-from lslam.registration.registration import DOUBT, Registration, correction
+from lslam.registration.registration import DOUBT, NEAR_KERNEL, Registration, correction
 from lslam.registration.robust import AdaptiveThreshold, Annealing, UsualAgreement
 from lslam.registration.solver import RegistrationResult
 from lslam.types.state import Stateful
@@ -42,7 +42,7 @@ class FeatureRegistration(Stateful):
     reach : m, how far from the sensor the map is kept
     """
 
-    STATE = ("map", "target", "threshold", "agreement", "_starting", "_first", "_inserted", "_failures")
+    STATE = ("map", "target", "threshold", "agreement", "_starting", "_recent", "_inserted", "_failures")
 
     def __init__(
         self, config: RegistrationConfig, loam: LoamConfig, *, scan_step: ScanStep | None, with_map: bool,
@@ -56,7 +56,8 @@ class FeatureRegistration(Stateful):
         self.threshold = AdaptiveThreshold(config.kernel_min, config.kernel_max)
         self.agreement = UsualAgreement(config.min_agreement)
         self._starting = config.start_scans
-        self._first: tuple[Features, Floats] | None = None
+        # All points and the poses of the scans that were registered last.
+        self._recent: tuple[tuple[NDArray[np.float32], Floats], ...] = ()
         self._inserted = 0
         self._failures = 0
 
@@ -68,25 +69,33 @@ class FeatureRegistration(Stateful):
         """
         return replace(self._usual, least=self.config.sigma**2 / max(self.threshold.mean_square, self.config.sigma**2))
 
-    def locate(self, features: Features, T_prior: Floats, clock: StageClock) -> RegistrationResult:
-        """Align with what is there; the result says whether to believe it, and when less planar points stood in."""
+    def locate(
+        self, features: Features, T_prior: Floats, clock: StageClock, is_near: bool = False
+    ) -> RegistrationResult:
+        """Align with what is there; the result says whether to believe it, and when less planar points stood in.
+
+        is_near : the prior is nearly right: nothing is sought away from it, it decides what features leave open
+        """
         count = len(features.edges) + len(features.planes)
         if len(features.less_planes) + len(features.less_edges) < MIN_FEATURES:
             return _failed(T_prior, count, f"only {len(features.edges)} edges and {len(features.planes)} planar points")
         if self.target is None:
             return RegistrationResult(T_prior, covariance=np.diag([1e-12] * 6), source_points=count)
+        if is_near:
+            result = self._attempt(features, T_prior, T_prior, clock, self._near)
+            return self._kept(result, T_prior, T_prior) if result.ok else result
         if self._starting > 0:
             with clock.stage("start"):
                 start = self._capture(features, T_prior)
-            result = self._attempt(features, start.T_world_lidar, T_prior, clock)
+            result = self._attempt(features, start.T_world_lidar, T_prior, clock, self._quick)
         else:
             start = RegistrationResult(T_prior)
-            result = self._attempt(features, T_prior, T_prior, clock)
+            result = self._attempt(features, T_prior, T_prior, clock, self._quick)
             move, turn = result.prior_error
             if not result.ok or move > self.config.recover_m or turn > np.deg2rad(self.config.recover_deg):
                 with clock.stage("recover"):
                     start = self._capture(features, T_prior)
-                again = self._attempt(features, start.T_world_lidar, T_prior, clock)
+                again = self._attempt(features, start.T_world_lidar, T_prior, clock, self._quick)
                 if again.ok and (not result.ok or again.inliers > result.inliers):
                     result = again
         # One scan's planes hold no more than its features do: only a map can close a direction that these leave open.
@@ -94,22 +103,32 @@ class FeatureRegistration(Stateful):
         if not result.ok or result.inliers < MIN_FEATURES or is_open:
             with clock.stage("stand-in"):
                 result = self._stand_in(features, start, T_prior, result)
-        if result.ok and len(result.degenerate):
+        if result.ok:
             # The first step's prior is no more than a guess, which the search has replaced.
-            expected = T_prior if self._first is None else start.T_world_lidar
-            kept = self._judge(replace(kept_where_blind(result, expected), reason=""), T_prior)
-            # What a good result says is that less planar points stood in.
-            result = replace(kept, reason=kept.reason or result.reason)
+            expected = T_prior if self._inserted > 1 else start.T_world_lidar
+            result = self._kept(result, expected, T_prior)
+        is_far = not result.ok or result.prior_error[0] > self.config.recover_m
+        if self.config.start_reach > 0 and (self._is_begun or is_far):
+            with clock.stage("start" if self._starting else "recover"):
+                result = self._held(features, start.T_world_lidar if self._is_begun else T_prior, T_prior, result)
         return result
 
+    def _kept(self, result: RegistrationResult, expected: Floats, T_prior: Floats) -> RegistrationResult:
+        """The result at `expected` (4, 4) in the directions it leaves open."""
+        if not len(result.degenerate):
+            return result
+        kept = self._judge(replace(kept_where_blind(result, expected), reason=""), T_prior)
+        # What a good result says is that less planar points stood in.
+        return replace(kept, reason=kept.reason or result.reason)
+
     def update(self, features: Features, result: RegistrationResult) -> None:
-        """Enter the scan into map and target unless its registration failed, and learn from how wrong the prior was."""
+        """Enter the scan into map and target unless its registration failed; learn from it unless it was denied."""
         if result.ok:
             self._inserted += 1
-            self._first = (features, result.T_world_lidar) if self._inserted == 1 else None
+            self._recent = (*self._recent, (_all_points(features), result.T_world_lidar))[-self.config.start_scans :]
             if self.map is not None:
                 self.map.insert(features, result.T_world_lidar)
-            if self.target is not None:
+            if self.target is not None and not result.is_denied:
                 self._starting = max(self._starting - 1, 0)
                 self.agreement.observe(result.agreement)
                 move, turn = result.prior_error
@@ -120,16 +139,27 @@ class FeatureRegistration(Stateful):
             self._starting = max(self._starting, 1)
             self.threshold.widen()
             self.agreement.relax()
-        if result.ok or self._failures >= PATIENCE:
+        # Before anything was registered there is nothing to lie far behind: the first good scan is the first.
+        if result.ok or (self._inserted > 0 and self._failures >= PATIENCE):
             self.target = feature_scan(features, result.T_world_lidar, self.loam.grid_step)
 
-    def _attempt(self, features: Features, T_start: Floats, T_prior: Floats, clock: StageClock) -> RegistrationResult:
-        """The method's own stages, judged."""
+    @property
+    def _quick(self) -> Annealing:
+        """As far as priors have lately been wrong."""
+        c, is_starting = self.config, self._starting > 0
+        width, steps = (c.kernel_max, c.start_iterations) if is_starting else (self.threshold.width, c.max_iterations)
+        return Annealing(width, c.kernel_min, c.kernel_decay, steps)
+
+    @property
+    def _near(self) -> Annealing:
+        """Around a prior that is nearly right."""
         c = self.config
-        quick = Annealing(
-            c.kernel_max if self._starting else self.threshold.width, c.kernel_min, c.kernel_decay,
-            c.start_iterations if self._starting else c.max_iterations,
-        )  # fmt: skip
+        return Annealing(NEAR_KERNEL * c.kernel_min, c.kernel_min, c.kernel_decay, c.start_iterations)
+
+    def _attempt(
+        self, features: Features, T_start: Floats, T_prior: Floats, clock: StageClock, quick: Annealing
+    ) -> RegistrationResult:
+        """The method's own stages, judged."""
         result, iterations = RegistrationResult(T_start, ok=False), 0
         assert self.target is not None
         if self._step is not None:
@@ -150,15 +180,16 @@ class FeatureRegistration(Stateful):
         return replace(result, iterations=result.iterations + (iterations if self.map is not None else 0))
 
     @property
-    def _is_searched(self) -> bool:
-        """Whether this is the first step, and where it led is searched for."""
-        return self._first is not None and self.config.start_reach > 0
+    def _is_begun(self) -> bool:
+        """Whether so few scans were registered that all their points are asked for the pose, as `icp` asks them."""
+        return self.config.start_reach > 0 and self._inserted <= self.config.start_scans
 
     def _capture(self, features: Features, T_prior: Floats) -> RegistrationResult:
         """A start that is metres nearer, where the prior may be metres off: less planar points on coarse planes."""
         c = self.config
-        if self._first is not None and self._is_searched:
-            return self._first_step(features, *self._first, T_prior)
+        if self._is_begun:
+            plain = self._plain()
+            return plain.locate(prepare_points(_all_points(features), plain.preprocess), T_prior)
         points, scatter = _thinned(features)
         target = self._planes()
         slow = Annealing(c.coarse_kernel, c.kernel_min, c.coarse_decay, c.start_iterations)
@@ -168,23 +199,35 @@ class FeatureRegistration(Stateful):
         )
         return self._judge(result, T_prior)
 
-    def _first_step(self, features: Features, first: Features, T_first: Floats, T_prior: Floats) -> RegistrationResult:
-        """The search for the first step that `icp` makes, on all features: the speed is unknown."""
+    def _held(
+        self, features: Features, T_start: Floats, T_prior: Floats, found: RegistrationResult
+    ) -> RegistrationResult:
+        """What was found, unless much more of what stands on the ground agrees elsewhere: few rings slide along a road."""
+        plain = self._plain()
+        held = plain.held(prepare_points(_all_points(features), plain.preprocess), T_start, found)
+        if held is found:
+            return found
+        why = found.reason or "features disagree with what stands on the ground"
+        return replace(held, prior_error=correction(T_prior, held.T_world_lidar), reason=f"{why}: all points stood in")
+
+    def _plain(self) -> Registration:
+        """`icp` with all points of the scans that were registered last in its map."""
         size = surface_size(self.config.voxel_size, self.loam.grid_step)
         plain = {"residual": None, "target": "map", "inlier_distance": None, "inlier_ratio": 1.0, "voxel_size": size}
-        search = Registration(self.config.model_copy(update=plain))
-        search.register(_all_points(first), T_first)
-        return search.register(_all_points(features), T_prior)
+        icp = Registration(self.config.model_copy(update=plain))
+        for points, T_world_lidar in self._recent:
+            icp.update(prepare_points(points, icp.preprocess), RegistrationResult(T_world_lidar))
+        return icp
 
     def _stand_in(
         self, features: Features, start: RegistrationResult, T_prior: Floats, starved: RegistrationResult
     ) -> RegistrationResult:
         """Less planar points on planes in place of features that are too few or leave a direction open.
 
-        The search for the first step has asked them all already, and better than the planes of one scan can.
+        While the map is made of a few scans, all points have been asked already, and better than planes of one scan can be.
         """
         T_start = starved.T_world_lidar if starved.ok else start.T_world_lidar
-        result = start if self._is_searched else self._on_planes(features, T_start, T_prior)
+        result = start if self._is_begun else self._on_planes(features, T_start, T_prior)
         are_few = starved.inliers < MIN_FEATURES
         # They must close a direction; where features are too few to be sure of any, open none.
         if not result.ok or (starved.ok and len(result.degenerate) > len(starved.degenerate) - (not are_few)):
@@ -250,7 +293,7 @@ class FeatureRegistration(Stateful):
 
 def _thinned(features: Features) -> tuple[Floats, Floats]:
     """Centroids (S, 3) of the less planar points and the scatter (S, 6) behind each."""
-    points, _, scatter = voxel.centroids(features.less_planes.points.astype(np.float32), NO_TIMES, STAND_IN_GRID)
+    points, _, scatter, _ = voxel.centroids(features.less_planes.points.astype(np.float32), NO_TIMES, STAND_IN_GRID)
     return points.astype(np.float64), scatter.astype(np.float64)
 
 
@@ -261,5 +304,6 @@ def _failed(T_prior: Floats, source_points: int, reason: str) -> RegistrationRes
     )
 
 
-def _all_points(features: Features) -> Floats:
-    return np.concatenate([part.points for part in (features.less_planes, features.planes, features.less_edges)])
+def _all_points(features: Features) -> NDArray[np.float32]:
+    parts = (features.less_planes, features.planes, features.less_edges, features.neither)
+    return np.concatenate([part.points for part in parts], dtype=np.float32)

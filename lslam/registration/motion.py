@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.geometry import se3
-from lslam.preprocessing.deskew import KNOTS
+from lslam.preprocessing.deskew import knots_over
 from lslam.types.motion_prior import MotionPrior
+from lslam.types.scan import Span
 from lslam.types.state import State, Stateful
 
 Floats = NDArray[np.float64]
@@ -23,12 +24,12 @@ class MotionModel(Protocol):
         """Whether there is a velocity yet."""
         ...
 
-    def sweep(self, stamp_ns: int, span_s: float) -> MotionPrior:
-        """Poses from scan start over the `span_s` seconds that the sweep takes; one pose when it takes none."""
+    def sweep(self, stamp_ns: int, span: Span) -> MotionPrior:
+        """Poses over the `span` of the sweep; the one at the stamp when it takes no time."""
         ...
 
-    def refine(self, prior: MotionPrior, stamp_ns: int, start: Floats) -> MotionPrior:
-        """The sweep's motion again, now that registration gave the pose `start` (4, 4) for `prior`."""
+    def refine(self, prior: MotionPrior, stamp_ns: int, pose: Floats) -> MotionPrior:
+        """The sweep's motion again, now that registration gave the `pose` (4, 4) at the stamp for `prior`."""
         ...
 
     def correct(
@@ -37,8 +38,8 @@ class MotionModel(Protocol):
         """Take the pose (4, 4) found at `stamp_ns` as the newest; `prior` says how its sweep moved."""
         ...
 
-    def rewind(self, stamp_ns: int, start: Floats, span_s: float) -> MotionPrior:
-        """Forget all scans but the first, taken at `stamp_ns` and `start` (4, 4); its sweep by what is known of the speed."""
+    def rewind(self, stamp_ns: int, pose: Floats, span: Span) -> MotionPrior:
+        """Forget all scans but the first, taken at `stamp_ns` and `pose` (4, 4); its sweep by what is known of the speed."""
         ...
 
     def state(self) -> State:
@@ -79,28 +80,27 @@ class ConstantVelocity(Stateful):
         """Whether there is a velocity yet."""
         return self._step_s > 0
 
-    def sweep(self, stamp_ns: int, span_s: float) -> MotionPrior:
-        """Poses from scan start over the `span_s` seconds that the sweep takes; one pose when it takes none."""
-        return self.steady(self.predict(stamp_ns), span_s)
+    def sweep(self, stamp_ns: int, span: Span) -> MotionPrior:
+        """Poses over the `span` of the sweep; the one at the stamp when it takes no time."""
+        return self.steady(self.predict(stamp_ns), span)
 
-    def steady(self, start: Floats, span_s: float) -> MotionPrior:
-        """As `sweep`, from the pose `start` (4, 4)."""
-        if span_s <= 0 or not self.is_known:
-            return MotionPrior(np.zeros(1), start[None])
-        return _steady(start, self._twist / self._step_s, span_s)
+    def steady(self, pose: Floats, span: Span) -> MotionPrior:
+        """As `sweep`, through the `pose` (4, 4) at the stamp."""
+        if span.seconds <= 0 or not self.is_known:
+            return MotionPrior.at_once(pose)
+        return _steady(pose, self._twist / self._step_s, knots_over(span))
 
-    def refine(self, prior: MotionPrior, stamp_ns: int, start: Floats) -> MotionPrior:
-        """The sweep's motion again, now that registration gave the pose `start` (4, 4) for `prior`.
+    def refine(self, prior: MotionPrior, stamp_ns: int, pose: Floats) -> MotionPrior:
+        """The sweep's motion again, now that registration gave the `pose` (4, 4) at the stamp for `prior`.
 
         Continuing the change of velocity as well was tried: it amplifies jitter more than it follows bends.
         """
-        span = float(prior.times[-1])
-        middle, instant_ns = middle_of(prior, stamp_ns, start)
+        middle, instant_ns = middle_of(prior, stamp_ns, pose)
         step = 0.0 if self._instant_ns is None else (instant_ns - self._instant_ns) * 1e-9
-        if span <= 0 or step <= 0:
+        if len(prior.times) < 2 or step <= 0:
             return prior
         velocity = se3.log(se3.relative(self._pose, middle)) / step
-        return _steady(middle @ se3.exp(-0.5 * span * velocity), velocity, span)
+        return _steady(middle @ se3.exp(-prior.times[len(prior.times) // 2] * velocity), velocity, prior.times)
 
     def correct(
         self, stamp_ns: int, pose: Floats, prior: MotionPrior | None = None, is_registered: bool = True
@@ -116,21 +116,20 @@ class ConstantVelocity(Stateful):
                 self._twist, self._step_s = se3.log(se3.relative(self._pose, middle)), step
         self._instant_ns, self._pose = instant_ns, middle.copy()
 
-    def rewind(self, stamp_ns: int, start: Floats, span_s: float) -> MotionPrior:
-        """Forget all scans but the first, taken at `stamp_ns` and `start` (4, 4); its sweep by what is known of the speed."""
-        prior = self.steady(start, span_s)
+    def rewind(self, stamp_ns: int, pose: Floats, span: Span) -> MotionPrior:
+        """Forget all scans but the first, taken at `stamp_ns` and `pose` (4, 4); its sweep by what is known of the speed."""
+        prior = self.steady(pose, span)
         self._instant_ns, self._step_s = None, 0.0
-        self.correct(stamp_ns, start, prior)
+        self.correct(stamp_ns, pose, prior)
         return prior
 
 
-def _steady(start: Floats, velocity: Floats, span: float) -> MotionPrior:
-    times = np.linspace(0.0, span, KNOTS)
-    return MotionPrior(times, se3.normalise(start @ se3.exp(times[:, None] * velocity)))
+def _steady(pose: Floats, velocity: Floats, times: Floats) -> MotionPrior:
+    return MotionPrior(times, se3.normalise(pose @ se3.exp(times[:, None] * velocity)))
 
 
-def middle_of(prior: MotionPrior, stamp_ns: int, start: Floats) -> tuple[Floats, int]:
-    """Pose and instant of the middle of a sweep that began at `start` and moved as `prior` says."""
+def middle_of(prior: MotionPrior, stamp_ns: int, pose: Floats) -> tuple[Floats, int]:
+    """Pose and instant of the middle of a sweep that had the `pose` at the stamp and moved as `prior` says."""
     k = len(prior.times) // 2
-    within = se3.relative(prior.start, prior.poses[k])
-    return np.asarray(start @ within), stamp_ns + round(1e9 * float(prior.times[k]))
+    within = se3.relative(prior.pose, prior.poses[k])
+    return np.asarray(pose @ within), stamp_ns + round(1e9 * float(prior.times[k]))

@@ -33,10 +33,14 @@ from lslam.registration.target import make_target
 from lslam.types.state import Stateful
 
 MIN_SOURCE_POINTS = 30
+# The kernel opens so many times its end width around a pose that is nearly right.
+NEAR_KERNEL = 2.0
 
-# Point to point: of the voxel size, because a voxel's mean stands for one point of its surface, its plane for all; and
-# times the steps, because a point is drawn to where its match is, not to where the surfaces meet.
-POINT_VOXEL, POINT_STEPS = 0.625, 3
+# Point to point: of the voxel size, because a voxel's mean stands for one point of its surface, its plane for all.
+POINT_VOXEL = 0.625
+# Times the steps: a point is drawn to where its match is, not to where the surfaces meet, and the score of a normal
+# distribution has no pull on points a few sigma away, so that those near by turn the sensor a little with each step.
+SLOWLY: dict[Residual, int] = {"point": 3, "ndt": 3}
 
 # Half a metre and two degrees: what a pose that no scan supports may be wrong by, one sigma.
 DOUBT = np.diag([0.25] * 3 + [np.deg2rad(2.0) ** 2] * 3)
@@ -92,8 +96,11 @@ class Registration(Stateful):
         self.update(points, result)
         return result
 
-    def locate(self, points: PreparedPoints, T_prior: NDArray[np.float64]) -> RegistrationResult:
-        """Align with the map as it is; the result says whether to believe it."""
+    def locate(self, points: PreparedPoints, T_prior: NDArray[np.float64], is_near: bool = False) -> RegistrationResult:
+        """Align with the map as it is; the result says whether to believe it.
+
+        is_near : the prior is nearly right: nothing is sought away from it
+        """
         if len(points.source) < MIN_SOURCE_POINTS:
             return _failed(
                 T_prior, len(points.source), f"{len(points.source)} usable points, {MIN_SOURCE_POINTS} needed"
@@ -103,31 +110,40 @@ class Registration(Stateful):
         if self.residual in NEEDS_COVARIANCE and points.covariance is None:
             found = source_covariance(points.source, points.map_points, self.config.sigma**2)
             points = replace(points, covariance=found)
-        if self._starting > 0:
+        if self._starting > 0 and not is_near:
             return self._start(points, T_prior)
         c = self.config
         # One scan alone puts single rings into fine voxels; several fill them.
-        coarse_map = self.map.coarsen(c.coarse_factor) if c.target == "scan" else None
-        steps = c.max_iterations * (POINT_STEPS if self.residual == "point" else 1)
-        fine = self._refine(points, T_prior, self.threshold.width, steps, coarse_map)
-        fine = self._judge(fine, T_prior)
+        are_few = c.target == "scan" or self._starting > 0
+        coarse_map = self.map.coarsen(c.coarse_factor) if are_few else None
+        steps = c.max_iterations * SLOWLY.get(self.residual, 1)
+        width = NEAR_KERNEL * c.kernel_min if is_near else self.threshold.width
+        fine = self._judge(self._refine(points, T_prior, width, steps, coarse_map), T_prior)
+        if is_near:
+            return fine
         move, turn = fine.prior_error
-        if fine.ok and move < c.recover_m and turn < np.deg2rad(c.recover_deg):
+        is_small = move < c.recover_m and turn < np.deg2rad(c.recover_deg)
+        # A prior that is wrong by more than the kernel reaches can be held by the sensor's own rings, hardly corrected.
+        if fine.ok and is_small and not self.agreement.is_less(self._agreement(fine)):
             return fine
         coarse = self._judge(self._coarse_to_fine(points, T_prior), T_prior)
         coarse = replace(coarse, iterations=coarse.iterations + fine.iterations)
-        best = coarse if not fine.ok or (coarse.ok and coarse.inliers > fine.inliers) else fine
+        is_better = coarse.ok and coarse.inliers > fine.inliers
+        if fine.ok and is_small:
+            # What hides part of the map, as a crowd does, hides it from both.
+            is_better = is_better and not self.agreement.is_less(self._agreement(coarse))
+        best = coarse if not fine.ok or is_better else fine
         is_far = not best.ok or best.prior_error[0] >= c.recover_m
-        return self._held(points, T_prior, best) if is_far and c.start_reach > 0 else best
+        return self.held(points, T_prior, best) if is_far and c.start_reach > 0 else best
 
     def update(self, points: PreparedPoints, result: RegistrationResult) -> None:
-        """Enter the scan into the map unless its registration failed, and learn from how wrong the prior was."""
+        """Enter the scan into the map unless its registration failed; learn from it unless it was denied."""
         if result.ok:
             first = len(self.map) == 0
             self.target.enter(self.map, points.map_points, result.T_world_lidar)
             self._inserted += 1
             self._recent = (*self._recent, (points.map_points, result.T_world_lidar))[-self.config.start_scans :]
-            if not first:
+            if not first and not result.is_denied:
                 self._starting = max(self._starting - 1, 0)
                 self.agreement.observe(self._agreement(result))
                 move, turn = result.prior_error
@@ -139,6 +155,42 @@ class Registration(Stateful):
         self._motion.correct(self._index, result.T_world_lidar)
         self._index += 1
 
+    def held(
+        self, points: PreparedPoints, T_prior: NDArray[np.float64], found: RegistrationResult, *, is_lost: bool = False
+    ) -> RegistrationResult:
+        """What was found, unless much more of what stands on the ground agrees elsewhere.
+
+        The few rings of a sparse sensor make planes on the road that move with it, and most of its points lie there.
+        is_lost : whether the sensor may be anywhere within `start_reach`, which a failed registration says too
+        """
+        standing = StandingPoints(self._recent, self.preprocess)
+        seen = standing.seen_in(points.map_points)
+        starts = [T_prior]
+        if is_lost:
+            found = self._search(points, T_prior, found, standing, seen)
+        if is_lost or not found.ok:
+            starts.append(standing.likeliest(seen, T_prior, self.config.start_reach))
+
+        def share(result: RegistrationResult) -> float:
+            return standing.share(seen, result.T_world_lidar)
+
+        stood = max((standing.align(seen, start) for start in starts), key=share)
+        place = stood.T_world_lidar
+        is_drawn = found.ok and is_at_rest(place, self._recent[-1][1])
+        if is_drawn or not is_much_more(share(stood), share(found), len(seen.source)):
+            return found
+        width = NEAR_KERNEL * self.config.kernel_min
+        near = self._refine(points, place, width, self.config.start_iterations, self._coarse_map(points, place))
+        judged = self._judge(near, place)
+        if not judged.ok and not found.ok:
+            return found
+        if not judged.ok or is_much_more(share(stood), share(judged), len(seen.source)):
+            place = standing.place_on_ground(place, near.T_world_lidar, points.map_points)
+            judged = near.moved(place, stood.covariance)
+        return replace(
+            judged, iterations=found.iterations + near.iterations, prior_error=correction(T_prior, judged.T_world_lidar)
+        )
+
     @property
     def _is_begun(self) -> bool:
         """Whether so few scans are in the map that what stands on the ground is asked too."""
@@ -147,7 +199,7 @@ class Registration(Stateful):
     def _start(self, points: PreparedPoints, T_prior: NDArray[np.float64]) -> RegistrationResult:
         """Coarse to fine; while the map is made of a few scans, what stands on the ground has the last word."""
         found = self._judge(self._coarse_to_fine(points, T_prior), T_prior)
-        return self._held(points, T_prior, found) if self._is_begun else found
+        return self.held(points, T_prior, found, is_lost=self._inserted == 1) if self._is_begun else found
 
     def _search(
         self, points: PreparedPoints, T_prior: NDArray[np.float64], best: RegistrationResult,
@@ -176,42 +228,6 @@ class Registration(Stateful):
             if found.ok and (share > CLEARLY * known if best.ok else share >= known):
                 best = replace(found, prior_error=correction(T_prior, found.T_world_lidar))
         return best
-
-    def _held(
-        self, points: PreparedPoints, T_prior: NDArray[np.float64], found: RegistrationResult
-    ) -> RegistrationResult:
-        """What was found, unless much more of what stands on the ground agrees elsewhere.
-
-        The few rings of a sparse sensor make planes on the road that move with it, and most of its points lie there.
-        """
-        standing = StandingPoints(self._recent, self.preprocess)
-        seen = standing.seen_in(points.map_points)
-        starts = [T_prior]
-        if self._inserted == 1:
-            found = self._search(points, T_prior, found, standing, seen)
-        if self._inserted == 1 or not found.ok:
-            starts.append(standing.likeliest(seen, T_prior, self.config.start_reach))
-
-        def share(result: RegistrationResult) -> float:
-            return standing.share(seen, result.T_world_lidar)
-
-        stood = max((standing.align(seen, start) for start in starts), key=share)
-        place = stood.T_world_lidar
-        is_drawn = found.ok and is_at_rest(place, self._recent[-1][1])
-        if is_drawn or not is_much_more(share(stood), share(found), len(seen.source)):
-            return found
-        near = self._refine(
-            points, place, 2 * self.config.kernel_min, self.config.start_iterations, self._coarse_map(points, place)
-        )
-        judged = self._judge(near, place)
-        if not judged.ok and not found.ok:
-            return found
-        if not judged.ok or is_much_more(share(stood), share(judged), len(seen.source)):
-            place = standing.place_on_ground(place, near.T_world_lidar, points.map_points)
-            judged = near.moved(place, stood.covariance)
-        return replace(
-            judged, iterations=found.iterations + near.iterations, prior_error=correction(T_prior, judged.T_world_lidar)
-        )
 
     def _coarse_to_fine(self, points: PreparedPoints, T_prior: NDArray[np.float64]) -> RegistrationResult:
         """Coarse planes, annealed slowly, catch what fine voxels lose: metres per scan instead of decimetres.

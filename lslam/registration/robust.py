@@ -60,11 +60,17 @@ class UsualAgreement(Stateful):
 
     FORGETTING = 0.8
     RELAXING = 0.9
+    # Scans in a row differ by an eighth at most, unless something has happened.
+    LESS = 0.8
     STATE = ("usual",)
 
     def __init__(self, drop: float) -> None:
         self.drop = drop
         self.usual = 0.0
+
+    def is_less(self, share: float) -> bool:
+        """Whether `share` is so far below the usual one that the scan may lie in the wrong place."""
+        return share < self.LESS * self.usual
 
     def is_collapse(self, share: float) -> bool:
         """Whether `share` is below `drop` times the usual one."""

@@ -14,6 +14,7 @@ from lslam.registration.gaussian_map import GaussianMap
 from lslam.registration.residuals import NEEDS_COVARIANCE, kernel_of, voxels_of
 from lslam.registration.robust import Annealing
 from lslam.registration.source_covariance import source_covariance
+from lslam.types.scan_result import ScanResult
 
 # A step below these ends the iteration: a tenth of the noise of a point, and what that is at 10 m.
 STEP_M, STEP_RAD = 1e-3, 1e-4
@@ -25,6 +26,7 @@ class RegistrationResult:
 
     T_world_lidar : (4, 4); covariance : (6, 6) of t' = t + d[:3], R' = exp(d[3:]) R in world axes, m2 and rad2
     ok : False when the pose is the motion prior because registration failed, `reason` says why
+    is_denied : the pose is not what registration found: the scan enters there, and what was found teaches nothing
     inliers : source points within the final kernel; fine_inliers : those of them in fine voxels
     matched : points that found a voxel; overlap : matched / source
     rmse : weighted distance to the planes, m; degenerate : (K, 6) unobserved unit directions (rotation scaled by lever arm)
@@ -45,10 +47,16 @@ class RegistrationResult:
     degenerate: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 6)))
     prior_error: tuple[float, float] = (0.0, 0.0)
     lever_arm: float = 1.0
+    is_denied: bool = False
 
     def moved(self, T_world_lidar: NDArray[np.float64], covariance: NDArray[np.float64] | None) -> RegistrationResult:
         """The same registration, where more than the map was asked for the pose."""
         return replace(self, T_world_lidar=T_world_lidar, covariance=covariance)
+
+    def decided(self, result: ScanResult) -> RegistrationResult:
+        """The same registration, at the pose of `result`: whoever had a say in it after the registration."""
+        moved = self.moved(result.T_world_lidar, result.registration_covariance)
+        return replace(moved, is_denied=self.ok and result.status != "ok")
 
     @property
     def overlap(self) -> float:

@@ -1,10 +1,13 @@
-"""How far the pose at scan start may be off because nobody knows how the sensor moved within the sweep.
+"""How far the pose of a scan may be off because nobody knows how the sensor moved within the sweep.
 
 A sweep of T seconds is deskewed by one velocity, that of the way to it, and registration finds its middle. Under a constant
 acceleration `a` the start is then off by a T^2 / 6 (half the sweep at a velocity that is wrong by a T / 2, less what the
 bend of the true motion gives back), and the points by as much (rms). The next scan tells how wrong the velocity was: it lies
 a T^2 / 2 from where the sweep's motion leads. A rattling car changes its velocity from scan to scan, so it is the mean
 square over the last scans that says what the next is worth.
+
+A stamp half the `lead` L before the middle (L is T at the start, 0 in the middle) is off by
+a (L^2 / 6 + (T^2 - L^2) / 24 + L (T - L) / 4), and the next scan by a (T^2 - L T / 2) from where the motion leads.
 """
 
 from __future__ import annotations
@@ -29,7 +32,7 @@ DIRECTIONS = 6
 class SweepDoubt(Stateful):
     """Learns from successive scans how wrong the motion is by which they were deskewed."""
 
-    STATE = ("_mean", "scans", "_stamp_ns", "_pose", "_within", "_span_s")
+    STATE = ("_mean", "scans", "_stamp_ns", "_pose", "_within", "_span_s", "_lead_s")
 
     def __init__(self) -> None:
         self.scans = 0  # that said something, `MEMORY` at most
@@ -37,7 +40,7 @@ class SweepDoubt(Stateful):
         self._stamp_ns: int | None = None
         self._pose = np.eye(4)
         self._within = np.eye(4)
-        self._span_s = 0.0
+        self._span_s = self._lead_s = 0.0
 
     def observe(self, prior: MotionPrior, stamp_ns: int, pose: Floats, is_registered: bool) -> Floats:
         """(6, 6) covariance, world axes, of the pose (4, 4) found at `stamp_ns` for the scan that `prior` deskewed.
@@ -48,13 +51,15 @@ class SweepDoubt(Stateful):
         if is_registered and self._span_s > 0 and step_s > 0:
             self._learn(se3.relative(self._pose, pose), step_s)
         # The first sweep was deskewed by where the second scan was found: that agrees by itself.
-        self._span_s = float(prior.times[-1]) if is_registered and self._stamp_ns is not None else 0.0
+        self._span_s = prior.span_s if is_registered and self._stamp_ns is not None else 0.0
+        self._lead_s = float(prior.times[0] + prior.times[-1])
         self._stamp_ns, self._pose = stamp_ns, pose.copy()
-        self._within = se3.relative(prior.start, prior.poses[-1])
+        self._within = se3.relative(prior.poses[0], prior.poses[-1])
         if len(prior.times) < 2:
             return np.zeros((6, 6))
         if self.scans == 0:
-            return np.diag((USUAL * float(prior.times[-1]) ** 2 / 6.0) ** 2)
+            T, L = prior.span_s, self._lead_s
+            return np.diag((USUAL * L**2 / 6.0 + USUAL * ((T**2 - L**2) / 24.0 + L * (T - L) / 4.0)) ** 2)
         alike = np.repeat([np.trace(self._mean[:3, :3]) / 3, np.trace(self._mean[3:, 3:]) / 3], 3)
         share = self.scans / (self.scans + DIRECTIONS)
         return noise.rotated(share * self._mean + (1.0 - share) * np.diag(alike), pose[:3, :3])
@@ -62,8 +67,9 @@ class SweepDoubt(Stateful):
     def _learn(self, moved: Floats, step_s: float) -> None:
         """From the motion (4, 4) found over `step_s` seconds since the last scan."""
         expected = se3.exp(se3.log(self._within) * step_s / self._span_s)
-        share = min(self._span_s / step_s, 1.0)
-        # Of a dt^2 - a T dt / 2, by which the next scan is missed, the part a (T dt / 4 - T^2 / 12).
-        off = share * (3.0 - share) / (12.0 - 6.0 * share) * se3.log(se3.relative(expected, moved))
+        share, lead = min(self._span_s / step_s, 1.0), min(self._lead_s / step_s, 1.0)
+        # Of a dt^2 - a L dt / 2, by which the next scan is missed, the part a (L dt / 4 - L^2 / 12 + (T^2 - L^2) / 24).
+        part = lead * (3.0 - lead) / (12.0 - 6.0 * lead) + (share**2 - lead**2) / (24.0 - 12.0 * lead)
+        off = part * se3.log(se3.relative(expected, moved))
         self.scans = min(self.scans + 1, MEMORY)
         self._mean = self._mean + (np.outer(off, off) - self._mean) / self.scans

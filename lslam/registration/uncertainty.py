@@ -51,7 +51,7 @@ class PoseUncertainty(Stateful):
 
     def stamped(self, result: ScanResult, located: RegistrationResult, prior: MotionPrior) -> ScanResult:
         """The result of a scan that `prior` deskewed, with the covariances of its pose in the world and on the map."""
-        sweep = self._sweep.observe(prior, result.stamp_ns, located.T_world_lidar, located.ok)
+        sweep = self._sweep.observe(prior, result.stamp_ns, located.T_world_lidar, result.status == "ok")
         own = None if located.covariance is None else located.covariance + sweep
         return replace(result, covariance=self.add(located, sweep), registration_covariance=own)
 

@@ -91,9 +91,10 @@ def test_gate_without_limits_drops_only_what_is_no_point() -> None:
 def test_centroids_and_scatter_are_those_of_numpy(size: float) -> None:
     points = cloud(1, spread=4.0)
     first, voxel_of = groups(points, size)
-    out, _, scatter = voxel.centroids(points, UNTIMED, size)
+    out, _, scatter, found = voxel.centroids(points, UNTIMED, size)
     assert len(out) == len(first)
     counts = np.bincount(voxel_of)
+    np.testing.assert_array_equal(found, counts)
     assert counts.max() > 1
     p = points.astype(np.float64)
     mean = np.stack([np.bincount(voxel_of, p[:, k]) for k in range(3)], axis=1) / counts[:, None]
@@ -106,7 +107,7 @@ def test_centroids_and_scatter_are_those_of_numpy(size: float) -> None:
 
 def test_centroids_far_from_the_origin_keep_their_digits() -> None:
     points = (cloud(2, 2000, 0.5) + np.array([90_000.0, -70_000.0, 300.0])).astype(np.float32)
-    out, _, scatter = voxel.centroids(points, UNTIMED, 1.0)
+    out, _, scatter, _ = voxel.centroids(points, UNTIMED, 1.0)
     _, voxel_of = groups(points, 1.0)
     p = points.astype(np.float64)
     for j in range(len(out)):
@@ -122,7 +123,7 @@ def test_first_points_are_those_of_numpy(size: float) -> None:
 
 def test_one_point_and_none() -> None:
     one = np.array([[1.0, 2.0, 3.0]], np.float32)
-    out, _, scatter = voxel.centroids(one, UNTIMED, 0.5)
+    out, _, scatter, _ = voxel.centroids(one, UNTIMED, 0.5)
     np.testing.assert_array_equal(out, one)
     np.testing.assert_array_equal(scatter, np.zeros((1, 6)))
     none = np.zeros((0, 3), np.float32)
@@ -141,8 +142,8 @@ def test_points_that_have_no_voxel_harm_nobody_else(bad: float) -> None:
     good = cloud(4, 300, 3.0)
     points = np.concatenate([np.array([[0.0, 0.0, bad]], np.float32), good])
     assert set(groups(good, 0.3)[0] + 1) <= set(voxel.first_points(points, 0.3).tolist())
-    out, _, scatter = voxel.centroids(points, UNTIMED, 0.3)
-    expected, _, expected_scatter = voxel.centroids(good, UNTIMED, 0.3)
+    out, _, scatter, _ = voxel.centroids(points, UNTIMED, 0.3)
+    expected, _, expected_scatter, _ = voxel.centroids(good, UNTIMED, 0.3)
     np.testing.assert_array_equal(out[-len(expected) :], expected)
     np.testing.assert_array_equal(scatter[-len(expected) :], expected_scatter)
     assert len(out) == len(expected) + 1
@@ -160,7 +161,7 @@ def test_mean_times_and_the_two_halves_of_a_sweep() -> None:
     points = cloud(6, 6000, 2.0)
     times = np.random.default_rng(6).uniform(0.0, 0.1, len(points)).astype(np.float32)
     times[:2] = [0.0, 0.1]
-    out, mean_times, scatter = voxel.centroids(points, times, 0.7)
+    out, mean_times, scatter, _ = voxel.centroids(points, times, 0.7)
     is_late = times > 0.05
     parts = [voxel.centroids(points[part], UNTIMED, 0.7) for part in (~is_late, is_late)]
     together = np.concatenate([part[0] for part in parts])

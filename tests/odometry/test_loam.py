@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import threading
-from dataclasses import replace
+from copy import deepcopy
+from dataclasses import fields, replace
 from functools import cache
 
 import numpy as np
@@ -14,11 +15,16 @@ from numpy.typing import NDArray
 
 from lslam.config.config import Config
 from lslam.errors import InputError
+from lslam.geometry import se3
 from lslam.odometry import create_odometry
 from lslam.odometry.loam import Loam
 from lslam.pipeline.tracker import Loaded, Tracker
+from lslam.preprocessing.deskew import deskew_points
+from lslam.preprocessing.features import FeaturePoints, Features
 from lslam.registration.feature_registration import PATIENCE
+from lslam.registration.feature_steps import StageClock
 from lslam.simulation.scenarios import simulate
+from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan import Scan
 from lslam.types.scan_result import ScanResult
 
@@ -157,6 +163,20 @@ def test_after_a_row_of_failures_the_target_is_a_scan_at_hand() -> None:
     assert driver.loam.registration.target is not before
 
 
+@pytest.mark.parametrize("method", METHODS)
+def test_a_recording_that_begins_without_features_begins_with_the_first_scan_that_has_some(method: str) -> None:
+    """A lens cap, taken off on the move: what failed is no target, and the step from the first scan is sought far off."""
+    scans, truth = street()
+    driver, first = Driver(method), PATIENCE + 1
+    blind = driver.drive([starved(scan, "empty") for scan in scans[:first]])
+    assert [r.status for r in blind] == ["bridged"] * first
+    found = driver.drive([scans[first], scans[first + 2]])
+    assert [r.status for r in found] == ["ok", "ok"]
+    moved = se3.relative(truth[first], truth[first + 2])
+    assert np.linalg.norm(moved[:3, 3]) > 1.5
+    np.testing.assert_allclose(se3.relative(*poses_of(found))[:3, 3], moved[:3, 3], atol=0.05)
+
+
 @pytest.mark.parametrize("method", ["loam-odom", "loam", "floam"])
 def test_few_features_are_helped_by_less_planar_points(method: str) -> None:
     """One region with one edge and one planar point per ring: too few to decide a pose; the scan says who stood in."""
@@ -202,6 +222,22 @@ def test_one_to_one_matches_points_with_points_and_is_worse() -> None:
     assert ate(poses_of(many), truth[:20]) < 0.5 * ate(poses_of(one), truth[:20]) < 1.0
 
 
+def test_every_kind_of_feature_is_seen_from_the_stamp() -> None:
+    """What is no feature as well: it tells where things stand on the ground."""
+    scan = street(seed=3, count=25, compensated=False, speed=12.0)[0][0]
+    times = np.linspace(-0.05, 0.05, 5)
+    motion = MotionPrior(times, se3.exp(times[:, None] * np.array([12.0, 0, 0, 0, 0, 1.0])))
+    method = Driver("loam").loam
+    prepared = method.prepare(scan)
+    seen = method.features_of(prepared, motion)
+    kinds = [f.name for f in fields(Features) if isinstance(getattr(prepared, f.name), FeaturePoints)]
+    assert len(kinds) == 5
+    for kind in kinds:
+        before, after = getattr(prepared, kind), getattr(seen, kind)
+        np.testing.assert_array_equal(after.points, deskew_points(before.points, before.times, motion))
+        assert np.linalg.norm(after.points - before.points, axis=1).max() > 0.3
+
+
 @pytest.mark.parametrize("method", ["loam", "floam"])
 def test_the_motion_within_a_sweep_is_taken_out(method: str) -> None:
     scans, truth = street(seed=3, count=25, compensated=False, speed=12.0)
@@ -239,3 +275,50 @@ def test_a_first_step_of_six_metres_is_found(method: str) -> None:
     blind.loam.registration.config = blind.loam.registration.config.model_copy(update={"start_reach": 0.0})
     blind.feed(scans[0])
     assert metres(blind.feed(scans[6]), truth[6]) > 1.0
+
+
+@cache
+def of_motorway(seed: int, lidar: str, count: int) -> tuple[list[Scan], Floats]:
+    drive = simulate("motorway", seed=seed, lidar=lidar, count=count, motion_compensated=True)
+    return list(drive), se3.relative(drive.ground_truth.poses[0], drive.ground_truth.poses)
+
+
+@pytest.mark.parametrize(
+    ("method", "seed", "lidar"),
+    [("loam-odom", 1, "os1-16"), ("loam", 1, "vlp16"), ("floam", 0, "os1-16"), ("lego-loam", 0, "os1-16")],
+)
+def test_sixteen_beams_hold_a_start_at_thirty_metres_a_second(method: str, seed: int, lidar: str) -> None:
+    """Planar points of so few rings lie on the road and slide with it, by all of the 3 m a scan."""
+    scans, truth = of_motorway(seed, lidar, 4)
+    for result, true in zip(Driver(method).drive(scans), truth, strict=True):
+        assert result.status == "ok"
+        assert metres(result, true) < 0.8
+
+
+def test_features_that_leave_their_prior_later_on_are_held_to_what_stands() -> None:
+    """Half a metre of the prior is enough for the road's planar points to slide with sixteen beams by two."""
+    scans, truth = of_motorway(0, "os1-16", 9)
+    driver = Driver("floam")
+    expected = driver.drive(scans[:8])[-1].T_world_lidar @ se3.relative(truth[7], truth[8])
+    prior = expected @ se3.make(np.eye(3), np.array([0.5, 0.0, 0.0]))
+    features, registration = driver.loam.prepare(scans[8]), driver.loam.registration
+    held = registration.locate(features, prior, StageClock())
+    registration.config = registration.config.model_copy(update={"start_reach": 0.0})
+    slid = registration.locate(features, prior, StageClock())
+    assert slid.ok
+    assert np.linalg.norm(slid.T_world_lidar[:3, 3] - expected[:3, 3]) > 1.2
+    assert held.ok
+    assert "all points stood in" in held.reason
+    assert np.linalg.norm(held.T_world_lidar[:3, 3] - expected[:3, 3]) < 0.2
+    assert held.prior_error[0] == pytest.approx(0.5, abs=0.2)
+
+
+def test_a_start_that_is_taken_up_again_knows_what_stands() -> None:
+    scans, _ = of_motorway(1, "vlp16", 3)
+    first, again = Driver("floam"), Driver("floam")
+    first.drive(scans[:2])
+    again.loam.registration.restore(deepcopy(first.loam.registration.state()))
+    features, prior = first.loam.prepare(scans[2]), np.eye(4)
+    poses = [one.loam.registration.locate(features, prior, StageClock()).T_world_lidar for one in (first, again)]
+    np.testing.assert_array_equal(poses[0], poses[1])
+    assert metres(first.feed(scans[2]), prior) > 3.0

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from numpy_labels import reference_labels
+from scipy.spatial import cKDTree
 
 from lslam.config import load_config
 from lslam.config.loam import LoamConfig
@@ -176,6 +177,19 @@ def test_less_planar_points_are_thinned_along_each_ring_and_keep_ring_and_time()
         assert near.min(axis=1).max() < 0.5
         late = np.abs(some.times[mine] - every.times[all_of_it][near.argmin(axis=1)])
         assert late.max() < np.radians(0.4) * 40
+
+
+def test_what_is_no_feature_is_kept_near_by_for_each_point_of_it() -> None:
+    scan = bumpy(3)
+    assert scan.times is not None
+    found = extract_features(scan)
+    rest = np.flatnonzero(found.labels == 0)
+    kept = found.neither
+    assert kept.times is not None
+    assert 0.02 * len(rest) < len(kept) < 0.8 * len(rest)
+    away, nearest = cKDTree(kept.points).query(scan.points[rest])
+    assert away.max() < 0.2 * np.sqrt(3)
+    assert np.abs(kept.times[nearest] - scan.times[rest]).max() < np.radians(0.4) * 40
 
 
 def test_the_order_of_points_in_the_file_does_not_matter() -> None:

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 from lslam.geometry import se3
 from lslam.registration.motion import ConstantVelocity
 from lslam.types.motion_prior import MotionPrior
+from lslam.types.scan import Span
 
 TENTH = 100_000_000
+# Stamps at the start of the sweep, in its middle, a quarter over and at its end.
+SPANS = [Span(begin, begin + 0.1) for begin in (0.0, -0.05, -0.025, -0.1)]
 TWIST = np.array([1.2, 0.1, -0.05, 0.01, -0.02, 0.2])
 
 
@@ -72,35 +76,37 @@ def test_predictions_are_rotations_after_thousands_of_steps() -> None:
     np.testing.assert_allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-14)
 
 
-def drive(motion: ConstantVelocity, twist: NDArray[np.float64], scans: int) -> NDArray[np.float64]:
-    """Register `scans` sweeps of 0.1 s that all move by `twist`, perfectly; returns the true starts, one more than scans."""
-    starts = np.stack([se3.exp(k * twist) for k in range(scans + 1)])
+def drive(motion: ConstantVelocity, twist: NDArray[np.float64], scans: int, span: Span) -> NDArray[np.float64]:
+    """Register `scans` sweeps of 0.1 s that all move by `twist`, perfectly; returns the true poses, one more than scans."""
+    poses = np.stack([se3.exp(k * twist) for k in range(scans + 1)])
     for k in range(scans):
-        motion.correct(k * TENTH, starts[k], motion.sweep(k * TENTH, 0.1))
-    return starts
+        motion.correct(k * TENTH, poses[k], motion.sweep(k * TENTH, span))
+    return poses
 
 
-def test_a_sweep_moves_as_the_sensor_did() -> None:
+@pytest.mark.parametrize("span", SPANS)
+def test_a_sweep_moves_as_the_sensor_did(span: Span) -> None:
     motion = ConstantVelocity()
-    assert len(motion.sweep(0, 0.1).times) == 1, "the first speed is unknown"
-    starts = drive(motion, TWIST, 4)
-    sweep = motion.sweep(4 * TENTH, 0.1)
+    assert len(motion.sweep(0, span).times) == 1, "the first speed is unknown"
+    poses = drive(motion, TWIST, 4, span)
+    sweep = motion.sweep(4 * TENTH, span)
     # The first sweep could not be deskewed, later ones measure from middle to middle.
-    np.testing.assert_allclose(sweep.poses[0], starts[4], atol=1e-6)
+    np.testing.assert_allclose(sweep.pose, poses[4], atol=1e-5)
+    np.testing.assert_allclose(sweep.poses[0], poses[4] @ se3.exp(10 * span.begin_s * TWIST), atol=1e-5)
     np.testing.assert_allclose(se3.relative(sweep.poses[0], sweep.poses[-1]), se3.exp(TWIST), atol=1e-6)
-    assert len(motion.sweep(4 * TENTH, 0.0).times) == 1, "compensated scans have one instant"
+    assert len(motion.sweep(4 * TENTH, Span()).times) == 1, "compensated scans have one instant"
 
 
-def test_refining_finds_the_velocity_that_the_middle_tells() -> None:
+@pytest.mark.parametrize("span", SPANS)
+def test_refining_finds_the_velocity_that_the_middle_tells(span: Span) -> None:
     """The prior is 20 % too slow; registration puts the middle of the sweep right, as it does for a skewed cloud."""
     motion = ConstantVelocity()
-    starts = drive(motion, TWIST, 4)
-    right = motion.sweep(4 * TENTH, 0.1)
-    slow = se3.exp(np.linspace(0, 0.8, len(right.times))[:, None] * TWIST)
-    middle = starts[4] @ se3.exp(0.5 * TWIST)
-    start = middle @ se3.inverse(slow[len(slow) // 2])
-    prior = MotionPrior(right.times, start @ slow)
-    better = motion.refine(prior, 4 * TENTH, start)
+    poses = drive(motion, TWIST, 4, span)
+    right = motion.sweep(4 * TENTH, span)
+    middle = poses[4] @ se3.exp((0.5 - span.passed) * TWIST)
+    slow = middle @ se3.exp(np.linspace(-0.4, 0.4, len(right.times))[:, None] * TWIST)
+    prior = MotionPrior(right.times, slow)
+    better = motion.refine(prior, 4 * TENTH, prior.pose)
     np.testing.assert_allclose(better.poses, right.poses, atol=1e-6)
-    single = MotionPrior(np.zeros(1), start[None])
-    assert motion.refine(single, 4 * TENTH, start) is single
+    single = MotionPrior.at_once(poses[4])
+    assert motion.refine(single, 4 * TENTH, poses[4]) is single

@@ -193,6 +193,7 @@ def test_who_stands_in_closes_a_direction_or_opens_none_where_features_are_few(
     monkeypatch: pytest.MonkeyPatch, inliers: int, before: int, after: int, is_taken: bool
 ) -> None:
     registration = engine(None, True)
+    registration._inserted = registration.config.start_scans + 1
     stand_in = RegistrationResult(se3.exp(np.full(6, 0.1)), degenerate=np.eye(6)[:after])
     monkeypatch.setattr(registration, "_on_planes", lambda *_: stand_in)
     starved = RegistrationResult(np.eye(4), degenerate=np.eye(6)[:before], inliers=inliers)

@@ -56,6 +56,15 @@ def test_agreement_collapses_only_against_what_was_usual() -> None:
     assert not agreement.is_collapse(0.21)
 
 
+def test_a_scan_that_agrees_less_than_usual_is_told_from_one_that_varies() -> None:
+    agreement = UsualAgreement(0.5)
+    assert not agreement.is_less(0.01)
+    for share in (0.8, 0.72, 0.8, 0.72):
+        assert not agreement.is_less(share)
+        agreement.observe(share)
+    assert agreement.is_less(0.6)
+
+
 def test_a_changed_place_is_accepted_after_a_few_bad_scans() -> None:
     agreement = UsualAgreement(0.5)
     agreement.observe(0.8)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from copy import deepcopy
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -53,6 +54,53 @@ def test_turns_of_thirty_degrees_that_nothing_foretells_are_found_along_the_way(
         truth = se3.relative(drive.ground_truth.poses[0], drive.ground_truth.poses[i])
         assert result.ok, result.reason
         assert np.linalg.norm(result.T_world_lidar[:3, 3] - truth[:3, 3]) < 0.02
+
+
+@pytest.mark.parametrize(("seed", "first"), [(0, 10), (1, 5)])
+def test_scans_that_went_missing_unnoticed_leave_no_scan_misplaced(seed: int, first: int) -> None:
+    # A metre and more beyond the prior a fine map holds a scan by its own rings, with two thirds of the usual points.
+    drive = simulate("urban", seed=seed, motion_compensated=True)
+    registration = Registration()
+    for i in (*range(first, first + 9), first + 11, first + 14, first + 15):
+        result = registration.register(drive.scan(i).points)
+        truth = se3.relative(drive.ground_truth.poses[first], drive.ground_truth.poses[i])
+        assert result.ok
+        assert np.linalg.norm(result.T_world_lidar[:3, 3] - truth[:3, 3]) < 0.03
+
+
+@pytest.mark.parametrize(("coarse", "is_taken"), [(0.9, True), (0.7, False)])
+def test_coarse_to_fine_is_believed_only_where_it_agrees_as_usual(
+    coarse: float, is_taken: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What hides the map from the fine registration, as passers-by do, hides it from the coarse one, which knows no better."""
+    drive = simulate("block", count=8, motion_compensated=True)
+    registration = Registration()
+    last = [registration.register(drive.scan(i).points) for i in range(8)][-1]
+    points = prepare_points(drive.scan(7).points, registration.preprocess, 7)
+    found = replace(last, fine_inliers=int(0.6 * last.source_points), inliers=int(0.6 * last.source_points))
+    other = replace(
+        last, T_world_lidar=last.T_world_lidar @ se3.make(np.eye(3), np.array([0.05, 0, 0])),
+        fine_inliers=int(coarse * last.source_points), inliers=int(coarse * last.source_points),
+    )  # fmt: skip
+    monkeypatch.setattr(registration, "_refine", lambda *_: found)
+    monkeypatch.setattr(registration, "_coarse_to_fine", lambda *_: other)
+    registration.agreement.usual = 1.0
+    located = registration.locate(points, last.T_world_lidar)
+    assert (located.T_world_lidar is other.T_world_lidar) == is_taken
+
+
+@pytest.mark.parametrize("scenario", ["street", "block", "walk"])
+def test_near_its_prior_a_scan_lies_on_coarse_planes_while_the_map_is_young(scenario: str) -> None:
+    """Single rings of one scan pass for planes in fine voxels: they hold the next by four centimetres in the wrong place."""
+    drive = simulate(scenario, lidar="vlp16", motion_compensated=True)
+    first, second = (drive.ground_truth.poses[i] for i in range(2))
+    registration = Registration()
+    points = [prepare_points(drive.scan(i).points, registration.preprocess) for i in range(2)]
+    registration.align(points[0], first)
+    prior = second @ pose_at((0.1, 0.05, 0.0))
+    result = registration.locate(points[1], prior, is_near=True)
+    assert result.ok
+    assert np.linalg.norm(result.T_world_lidar[:3, 3] - second[:3, 3]) < 0.02
 
 
 def test_between_bare_walls_the_prior_stays_though_rings_match_best_where_nothing_moved() -> None:

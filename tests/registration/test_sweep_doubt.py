@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from copy import deepcopy
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -23,41 +25,57 @@ def at(x: float) -> NDArray[np.float64]:
     return se3.make(np.eye(3), np.array([x, 0.0, 0.0]))
 
 
-def steady(start: float, velocity: float) -> MotionPrior:
-    times = np.linspace(0.0, SPAN, 5)
-    return MotionPrior(times, np.stack([at(start + velocity * t) for t in times]))
+def steady(pose: float, velocity: float, passed: float = 0.0) -> MotionPrior:
+    times = np.linspace(0.0, SPAN, 5) - passed * SPAN
+    return MotionPrior(times, np.stack([at(pose + velocity * t) for t in times]))
 
 
+@pytest.mark.parametrize("passed", [0.0, 0.5, 0.3])
 @pytest.mark.parametrize("every", [1, 4])
-def test_a_steady_acceleration_is_told_to_its_last_millimetre(every: int) -> None:
-    """Points deskewed by the velocity since the last sweep's middle: their mean error is that of the start.
+def test_a_steady_acceleration_is_told_to_its_last_millimetre(every: int, passed: float) -> None:
+    """Points deskewed by the velocity since the last sweep's middle: their mean error is that of the pose at the stamp.
 
-    2 m/s2, points all over the sweep, every scan and every fourth.
+    2 m/s2, points all over the sweep, every scan and every fourth, stamps at its start, in its middle and between.
     """
     a, step = 2.0, every * SPAN
     doubt = SweepDoubt()
     for k in range(20):
         t = k * step
-        used = a * (t + 0.5 * SPAN - 0.5 * step)
-        within = np.linspace(0.0, SPAN, 1001)
+        used = a * (t + (0.5 - passed) * SPAN - 0.5 * step)
+        within = ((np.arange(1000) + 0.5) / 1000 - passed) * SPAN
         off = float(np.mean(0.5 * a * (t + within) ** 2 - used * within)) - 0.5 * a * t**2
-        start = 0.5 * a * t**2 + off
-        S = doubt.observe(steady(start, used), round(1e9 * t), at(start), is_registered=True)
-    assert off > 1e-3
+        pose = 0.5 * a * t**2 + off
+        S = doubt.observe(steady(pose, used, passed), round(1e9 * t), at(pose), is_registered=True)
+    assert off > (1e-3 if passed == 0 else 5e-4)
     # Ten lessons in six directions: a part of it counts for those across, as if none were special.
     np.testing.assert_allclose(np.trace(S[:3, :3]), off**2, rtol=1e-3)
     assert S[0, 0] > 0.7 * off**2
     assert np.abs(S[3:, 3:]).max() < 1e-12
 
 
-def test_before_anything_is_known_a_car_may_brake_and_a_hand_turn() -> None:
-    """3 m/s2 and 1 rad/s2 over a sweep T put its start off by a T^2 / 6; the second scan cannot tell, the third can."""
+@pytest.mark.parametrize(("passed", "part"), [(0.0, 6), (0.5, 24)])
+def test_before_anything_is_known_a_car_may_brake_and_a_hand_turn(passed: float, part: int) -> None:
+    """3 m/s2 and 1 rad/s2 over a sweep T put its start off by a T^2 / 6 and its middle by a T^2 / 24.
+
+    The second scan cannot tell, the third can.
+    """
     doubt = SweepDoubt()
-    usual = (np.repeat([3.0, 1.0], 3) * SPAN**2 / 6) ** 2
+    usual = (np.repeat([3.0, 1.0], 3) * SPAN**2 / part) ** 2
     for k in range(2):
-        S = doubt.observe(steady(k, 10.0), k * 10**8, at(k), is_registered=True)
+        S = doubt.observe(steady(k, 10.0, passed), k * 10**8, at(k), is_registered=True)
         np.testing.assert_allclose(S, np.diag(usual))
-    assert not doubt.observe(steady(2.0, 10.0), 2 * 10**8, at(2.0), is_registered=True).any()
+    assert not doubt.observe(steady(2.0, 10.0, passed), 2 * 10**8, at(2.0), is_registered=True).any()
+
+
+def test_what_is_taken_up_again_learns_as_if_nothing_had_been() -> None:
+    """The next lesson needs where in its sweep the stamp of the scan before lay."""
+    whole, again = SweepDoubt(), SweepDoubt()
+    for k in range(6):
+        whole.observe(steady(k**2 / 10, 10.0, 0.2), k * 10**8, at(k**2 / 10), is_registered=True)
+    again.restore(deepcopy(whole.state()))
+    after = [one.observe(steady(3.6, 10.0, 0.2), 6 * 10**8, at(3.6), is_registered=True) for one in (whole, again)]
+    assert after[0].any()
+    np.testing.assert_array_equal(*after)
 
 
 def test_doubt_lies_along_the_axes_of_the_world() -> None:
@@ -77,7 +95,7 @@ def test_doubt_lies_along_the_axes_of_the_world() -> None:
 def test_scans_of_one_instant_have_no_motion_to_doubt() -> None:
     doubt = SweepDoubt()
     for k in range(5):
-        S = doubt.observe(MotionPrior(np.zeros(1), at(k)[None]), k * 10**8, at(k**2), is_registered=True)
+        S = doubt.observe(MotionPrior.at_once(at(k)), k * 10**8, at(k**2), is_registered=True)
         assert not S.any()
 
 
@@ -100,7 +118,7 @@ def test_the_first_sweep_is_in_all_poses() -> None:
         jerk = so3.exp(np.array([0.0, 2e-3 * (-1) ** k, 0.0]))
         located = RegistrationResult(se3.make(jerk, np.array([10.0 * k, 0, 0])), covariance=C, lever_arm=20.0)
         scan = ScanResult(k, k * 10**8, located.T_world_lidar)
-        one = instant.stamped(scan, located, MotionPrior(np.zeros(1), located.T_world_lidar[None]))
+        one = instant.stamped(scan, located, MotionPrior.at_once(located.T_world_lidar))
         found = swept.stamped(scan, located, steady(10.0 * k, 100.0))
     assert one.covariance is not None
     assert found.covariance is not None
@@ -142,3 +160,16 @@ def test_covariances_of_a_shaken_sensor_are_honest() -> None:
         e = np.concatenate([off, so3.log(result.T_world_lidar[:3, :3] @ T[:3, :3].T)])
         nees.append(float(e @ np.linalg.solve(result.covariance, e)) / 6)
     assert 0.05 < np.mean(nees) < 10.0
+
+
+def test_where_a_denied_scan_was_put_says_nothing_of_the_motion() -> None:
+    """Two decimetres off, as an IMU may be: neither the way to it nor the way from it is an acceleration."""
+    C, uncertainty = 1e-8 * np.eye(6), PoseUncertainty()
+    for k in range(12):
+        is_denied = k == 7
+        put = ScanResult(
+            k, k * 10**8, at(k + 0.2 * is_denied), "bridged" if is_denied else "ok", registration_covariance=C
+        )
+        located = RegistrationResult(at(k + 3.0 * is_denied), covariance=C, lever_arm=10.0).decided(put)
+        found = uncertainty.stamped(put, located, steady(1.0 * k, 10.0))
+    np.testing.assert_allclose(found.registration_covariance, C, atol=1e-12)
