@@ -84,7 +84,7 @@ def _lines(facts: dict[str, Any]) -> Iterator[tuple[str, str]]:
         low, high = points["elevation_deg"]
         yield "elevation", f"{low:.1f} .. {high:.1f} deg (98 % of the points)"
     yield "intensity", _limits(points["intensity"], "")
-    yield "per-point times", _limits(points["per_point_times"], " s since scan start")
+    yield "per-point times", _limits(points["per_point_times"], " s from the scan's stamp")
     reconstructed = points["rings"] is None and facts["rings_rule"]
     yield "rings", f"by {facts['rings_rule']}" if reconstructed else _limits(points["rings"], "")
     yield "compensated", {True: "yes", False: "no", None: "unknown"}[facts["motion_compensated"]]

@@ -30,7 +30,7 @@ def write_scan(
     times: NDArray[np.float32] | None,
     rings: NDArray[np.uint16] | None,
 ) -> None:
-    """Write points, and beside them what is known of times, s since scan start, and rings. That file comes last, always."""
+    """Write points, and beside them what is known of times, s from the scan's stamp, and rings. That file comes last, always."""
     cloud, beside = scan_files(folder, number)
     write_points(cloud, points, intensity)
     known: dict[str, Any] = {name: v for name, v in (("t", times), ("ring", rings)) if v is not None}

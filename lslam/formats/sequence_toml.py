@@ -32,7 +32,7 @@ class SequenceInfo:
     rows, cols : organised clouds, point r * cols + c is row (ring) r; rate_hz : scans per second
     motion_compensated : scans are free of motion distortion; compensated_to : the instant, one of `INSTANTS`
     vertical_correction_deg : rotation of every point about p x z that the scans still need, 0 for none
-    per_point : folder of `<scan>.npz` with `t` (float32 s since scan start) and `ring` (uint16)
+    per_point : folder of `<scan>.npz` with `t` (float32 s from the scan's stamp) and `ring` (uint16)
     point_time_unit, point_time_reference : of the points' own time field, where it does not show, one of `UNITS` and of
         `REFERENCES`: the scan's start or end, which is its stamp then, or absolute
     stamps, imu, gnss, ground_truth : files, relative to the sequence folder

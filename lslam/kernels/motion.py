@@ -23,7 +23,7 @@ def deskew(
     for i in range(len(points)):
         s = (times[i] - start) / step
         if not np.isfinite(s):
-            s = 0.0
+            s = -start / step
         k = min(max(int(np.floor(s)), 0), last)
         b = s - k
         a = 1.0 - b

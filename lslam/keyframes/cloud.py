@@ -21,7 +21,7 @@ GRAIN = 2.0**-9
 def keyframe_cloud(
     scan: Scan, motion: MotionPrior, preprocess: PreprocessConfig, config: KeyframesConfig
 ) -> NDArray[np.float32]:
-    """Centroids (M, 3), m, of the scan's points in voxels of `keyframes.voxel`, LiDAR frame at scan start.
+    """Centroids (M, 3), m, of the scan's points in voxels of `keyframes.voxel`, LiDAR frame at the scan's stamp.
 
     motion : of the sensor within the sweep; points are deskewed by it before they are averaged
 
@@ -32,5 +32,5 @@ def keyframe_cloud(
     raw = as_cloud(scan.points)
     kept = gate_points(raw, plain)
     times = scan.times[kept] if scan.times is not None and preprocess.deskew else None
-    centroids, _, _ = voxel.centroids(deskew_points(raw[kept], times, motion), NO_TIMES, config.voxel)
+    centroids = voxel.centroids(deskew_points(raw[kept], times, motion), NO_TIMES, config.voxel)[0]
     return np.asarray(np.round(centroids / np.float32(GRAIN)) * np.float32(GRAIN), np.float32)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.errors import InputError, OutputError
+from lslam.errors import InputError, OutputError, cause
 from lslam.formats.npz_files import pack_npz, read_npz, write_npz
 from lslam.types.keyframe import Keyframe
 
@@ -54,7 +54,7 @@ class KeyframeStore:
         return len(self.keyframes)
 
     def add(self, keyframe: Keyframe, points: Points) -> None:
-        """Take the next keyframe with its cloud (N, 3), m, in the LiDAR frame at scan start; written at once."""
+        """Take the next keyframe with its cloud (N, 3), m, in the LiDAR frame at its scan's stamp; written at once."""
         if keyframe.number != len(self):
             raise ValueError(f"keyframe {keyframe.number} cannot follow {len(self) - 1}")
         cloud = np.ascontiguousarray(points, np.float32).reshape(-1, 3)
@@ -161,4 +161,4 @@ def _make(folder: Path) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise OutputError(f"{folder} cannot be written: {error.strerror or error}") from None
+        raise OutputError(f"{folder} cannot be written: {cause(error)}") from None

@@ -34,7 +34,7 @@ COLUMNS_DEG, ROWS_DEG, FILLED = (0.4, 0.8, 1.6, 3.2), 0.3 * 1.15 ** np.arange(18
 class PosedScan:
     """A deskewed scan and where it was taken.
 
-    points : (N, 3) float32, m, LiDAR frame at scan start; T_world_lidar : (4, 4); intensity : (N,) float32 or None
+    points : (N, 3) float32, m, LiDAR frame at the scan's stamp; T_world_lidar : (4, 4); intensity : (N,) float32 or None
     """
 
     points: NDArray[np.float32]

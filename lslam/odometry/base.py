@@ -25,7 +25,7 @@ class Odometry(Protocol):
         ...
 
     def register(self, scan: Scan, prepared: Any, prior: MotionPrior) -> ScanResult:
-        """Pose of the scan at its start; a failed registration returns the prior with status `bridged`."""
+        """Pose of the scan at its stamp; a failed registration returns the prior with status `bridged`."""
         ...
 
     def warm_up(self) -> None:
@@ -38,7 +38,7 @@ class FeatureSource(Odometry, Protocol):
     """A method that sees features, of which a map can be made."""
 
     def features_of(self, prepared: Any, motion: MotionPrior) -> Features:
-        """What `prepare` made of a scan, as seen from scan start when the sensor moved as `motion` says."""
+        """What `prepare` made of a scan, as seen from the pose at the stamp when the sensor moved as `motion` says."""
         ...
 
 
@@ -56,6 +56,18 @@ class Deskewing(Odometry, Protocol):
 
     def restart(self) -> None:
         """Forget all scans."""
+        ...
+
+
+@runtime_checkable
+class Searching(Deskewing, Protocol):
+    """A method that looks for scans farther off than a good prior can be, and finds them there where places are alike."""
+
+    def register_near(self, scan: Scan, prepared: Any, prior: MotionPrior) -> ScanResult:
+        """As `register`, which came before; nothing is sought away from a prior that is nearly right.
+
+        Where nothing is found there, `update` is of what `register` found.
+        """
         ...
 
 

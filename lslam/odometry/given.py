@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from lslam.errors import UsageError
 from lslam.formats.trajectory_files import read_trajectory
 from lslam.geometry.interpolate import poses_at
-from lslam.preprocessing.deskew import KNOTS
+from lslam.preprocessing.deskew import knots_over
 from lslam.types.motion_prior import MotionPrior
-from lslam.types.scan import Scan
+from lslam.types.scan import Scan, Span
 from lslam.types.scan_result import ScanResult
 from lslam.types.state import Stateful
 from lslam.types.trajectory import Trajectory
@@ -51,19 +51,19 @@ class GivenMotion(Stateful):
         # A millisecond: stamps of files are rounded.
         return bool(min(abs(int(stamps[0]) - stamp_ns), abs(int(stamps[-1]) - stamp_ns)) <= 1_000_000)
 
-    def sweep(self, stamp_ns: int, span_s: float) -> MotionPrior:
-        """Poses from scan start over the `span_s` seconds that the sweep takes; one pose when it takes none."""
-        times = np.linspace(0.0, span_s, KNOTS) if span_s > 0 else np.zeros(1)
+    def sweep(self, stamp_ns: int, span: Span) -> MotionPrior:
+        """Poses over the `span` of the sweep; the one at the stamp when it takes no time."""
+        times = knots_over(span)
         instants = stamp_ns + np.round(1e9 * times).astype(np.int64)
         return MotionPrior(times, poses_at(self.trajectory.stamps_ns, self.trajectory.poses, instants))
 
-    def refine(self, prior: MotionPrior, stamp_ns: int, start: Floats) -> MotionPrior:
+    def refine(self, prior: MotionPrior, stamp_ns: int, pose: Floats) -> MotionPrior:
         """The same: nothing was registered."""
         return prior
 
-    def rewind(self, stamp_ns: int, start: Floats, span_s: float) -> MotionPrior:
+    def rewind(self, stamp_ns: int, pose: Floats, span: Span) -> MotionPrior:
         """The same: there is nothing to forget."""
-        return self.sweep(stamp_ns, span_s)
+        return self.sweep(stamp_ns, span)
 
     def correct(
         self, stamp_ns: int, pose: Floats, prior: MotionPrior | None = None, is_registered: bool = True
@@ -85,12 +85,12 @@ class GivenPoses(Stateful):
         """Nothing to be made of a scan."""
 
     def register(self, scan: Scan, prepared: None, prior: MotionPrior) -> ScanResult:
-        """The trajectory's pose at scan start; `bridged` where it has a gap."""
+        """The trajectory's pose at the scan's stamp; `bridged` where it has a gap."""
         covered = self.motion.covers(scan.stamp_ns)
         return ScanResult(
             index=scan.index,
             stamp_ns=scan.stamp_ns,
-            T_world_lidar=self.motion.sweep(scan.stamp_ns, 0.0).start,
+            T_world_lidar=self.motion.sweep(scan.stamp_ns, Span()).pose,
             status="ok" if covered else "bridged",
             reason="" if covered else "the given trajectory has no pose at this time",
             source_points=len(scan),

@@ -65,14 +65,14 @@ class IcpSvd(Stateful):
         began = time.perf_counter()
         c = self._config
         if self._last is None or len(prepared.source) < MIN_SOURCE_POINTS:
-            found = Alignment(prior.start, len(prepared.source), len(prepared.source))
+            found = Alignment(prior.pose, len(prepared.source), len(prepared.source))
         else:
             found = align_closed_form(
-                prepared.source, self._last, prior.start, inlier_ratio=c.inlier_ratio,
+                prepared.source, self._last, prior.pose, inlier_ratio=c.inlier_ratio,
                 inlier_distance=c.inlier_distance, max_iterations=c.max_iterations,
             )  # fmt: skip
         aligned = time.perf_counter()
-        result = judged(scan, found, prior.start, c, {})
+        result = judged(scan, found, prior.pose, c, {})
         self._failed = 0 if result.status == "ok" else self._failed + 1
         if len(prepared.source) >= MIN_SOURCE_POINTS and self._failed in (0, 2):
             self._last = as_partners(prepared.map_points, result.T_world_lidar)

@@ -30,7 +30,7 @@ def create(config: Config) -> Kiss:
 class Kiss:
     """kiss-icp as its authors run it: it predicts, deskews and down-samples by itself and ignores the motion prior.
 
-    kiss-icp's pose belongs to the scan's end when it deskews: it is carried back to the scan's start. Compensated scans
+    kiss-icp's pose belongs to the scan's end when it deskews: it is carried back to the scan's stamp. Compensated scans
     have one instant and are left alone.
     """
 
@@ -52,7 +52,8 @@ class Kiss:
         self._with_deskew: bool | None = None
         self._kiss: Any = None
         self._registered = 0
-        self._half_step = np.eye(4)
+        self._step = np.zeros(6)
+        self._T_world_kiss = np.eye(4)
 
     def prepare(self, scan: Scan) -> tuple[Any, Any]:
         """Points as float64 and their times scaled to 0..1 as kiss-icp wants them."""
@@ -70,7 +71,7 @@ class Kiss:
         """One kiss-icp frame."""
         points, times = prepared
         if len(points) == 0:
-            return ScanResult(scan.index, scan.stamp_ns, prior.start, "bridged", "no usable points", converged=False)
+            return ScanResult(scan.index, scan.stamp_ns, prior.pose, "bridged", "no usable points", converged=False)
         if self._kiss is None:
             # The choice is made once: a sequence has per-point times or has not.
             self._with_deskew = len(times) > 0
@@ -80,26 +81,28 @@ class Kiss:
         _, source = self._kiss.register_frame(points, times if len(times) else np.zeros(len(points)))
         pose = np.asarray(self._kiss.last_pose, np.float64).copy()
         if self._with_deskew:
-            pose = self._at_scan_start(pose, np.asarray(self._kiss.last_delta, np.float64))
+            pose = self._at_stamp(pose, np.asarray(self._kiss.last_delta, np.float64), scan.span.passed)
         took = time.perf_counter() - began
         return ScanResult(
             scan.index, scan.stamp_ns, se3.normalise(pose), source_points=len(source), stages={"register": took}
         )
 
-    def _at_scan_start(self, pose: Floats, delta: Floats) -> Floats:
-        """Pose at the scan's start, in the world of the LiDAR at the start of the first scan.
+    def _at_stamp(self, pose: Floats, delta: Floats, passed: float) -> Floats:
+        """Pose at the scan's stamp, when the share `passed` of its sweep is over, in the world of the first scan's stamp.
 
         `pose` is kiss-icp's newest, `delta` its motion since the one before: the start of a scan is the end of the one
-        before. But kiss-icp knows no motion to deskew its first two scans with: their poses belong to the middle, and its
-        world begins half a step late.
+        before. But kiss-icp knows no motion to deskew its first two scans with: their poses belong to the middle, and there
+        its world begins.
         """
         self._registered += 1
         if self._registered == 1:
             return pose
         if self._registered == 2:
-            self._half_step = se3.exp(0.5 * se3.log(delta))
-        start = self._half_step @ pose @ se3.inverse(delta)
-        return np.asarray(start @ self._half_step if self._registered <= 3 else start)
+            self._step = se3.log(delta)
+            self._T_world_kiss = se3.exp((0.5 - passed) * self._step)
+        before = self._T_world_kiss @ pose @ se3.inverse(delta)
+        since = (0.5 + passed) * self._step if self._registered <= 3 else passed * se3.log(delta)
+        return np.asarray(before @ se3.exp(since))
 
     def warm_up(self) -> None:
         """Nothing to compile."""

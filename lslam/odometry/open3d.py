@@ -64,8 +64,8 @@ class Open3dGicp:
     def register(self, scan: Scan, prepared: Any, prior: MotionPrior) -> ScanResult:
         """Align with the last scan that was registered."""
         began = time.perf_counter()
-        found = self._align(prepared, prior.start)
-        result = judged(scan, found, prior.start, self._limits, {})
+        found = self._align(prepared, prior.pose)
+        result = judged(scan, found, prior.pose, self._limits, {})
         if result.status == "ok":
             self._last = Reference(prepared, result.T_world_lidar)
         result.stages["register"] = time.perf_counter() - began

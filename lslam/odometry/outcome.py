@@ -1,4 +1,4 @@
-"""What a method without a judge of its own makes of a registration."""
+"""What became of a scan: as our registration judged it, or a method that has no judge of its own."""
 
 from __future__ import annotations
 
@@ -10,8 +10,34 @@ from numpy.typing import NDArray
 from lslam.config.registration import RegistrationConfig
 from lslam.geometry import se3, so3
 from lslam.registration.registration import MIN_SOURCE_POINTS
+from lslam.registration.solver import RegistrationResult
 from lslam.types.scan import Scan
 from lslam.types.scan_result import ScanResult
+
+
+def of_registration(scan: Scan, found: RegistrationResult, map_age: float, stages: dict[str, float]) -> ScanResult:
+    """The result of a scan whose registration judged itself.
+
+    map_age : as `PoseUncertainty`; stages : seconds of each
+    """
+    return ScanResult(
+        index=scan.index,
+        stamp_ns=scan.stamp_ns,
+        T_world_lidar=found.T_world_lidar,
+        status="ok" if found.ok else "bridged",
+        reason=found.reason,
+        registration_covariance=found.covariance,
+        map_age=map_age,
+        converged=found.converged,
+        iterations=found.iterations,
+        source_points=found.source_points,
+        inliers=found.inliers,
+        rmse=found.rmse,
+        overlap=found.overlap,
+        degenerate=found.degenerate,
+        prior_error=found.prior_error,
+        stages=stages,
+    )
 
 
 @dataclass(frozen=True)

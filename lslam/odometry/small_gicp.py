@@ -55,9 +55,9 @@ class SmallGicp:
     def register(self, scan: Scan, prepared: Any, prior: MotionPrior) -> ScanResult:
         """Align with the local map; enter a keyframe when the sensor has moved on."""
         began = time.perf_counter()
-        found = self._align(prepared, prior.start)
+        found = self._align(prepared, prior.pose)
         aligned = time.perf_counter()
-        result = judged(scan, found, prior.start, self._limits, {})
+        result = judged(scan, found, prior.pose, self._limits, {})
         if result.status == "ok" and self._has_moved_on(result.T_world_lidar):
             self._insert(np.asarray(prepared.points())[:, :3], result.T_world_lidar)
         result.stages.update(register=aligned - began, update=time.perf_counter() - aligned)

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from lslam.errors import InputError, OutputError, OutputExistsError, UsageError
+from lslam.errors import InputError, OutputError, OutputExistsError, UsageError, cause
 from lslam.formats import bag_messages
 from lslam.formats.bag_files import INFO_TOPIC, KINDS, BagWriter
 from lslam.formats.gnss_csv import write_gnss_csv
@@ -23,7 +23,7 @@ from lslam.formats.sequence_toml import FILE_NAME, FRAMES, SequenceInfo, sequenc
 from lslam.formats.trajectory_files import write_kitti, write_tum
 from lslam.geometry import se3
 from lslam.pipeline.convert_trajectory import change_frame
-from lslam.pipeline.front_end import has_point_times
+from lslam.pipeline.front_end import sweep_of
 from lslam.pipeline.map_pass import motion_within
 from lslam.preprocessing.deskew import deskew_points
 from lslam.types.calibration import Calibration
@@ -87,7 +87,7 @@ def convert_sequence(
             out.rename(stage / "old")
         os.replace(made, out)
     except OSError as error:
-        raise OutputError(f"{error.filename or out} cannot be written: {error.strerror or error}") from None
+        raise OutputError(f"{error.filename or out} cannot be written: {cause(error)}") from None
     finally:
         shutil.rmtree(stage, ignore_errors=True)
     return Converted(out, source.written, source.skipped)
@@ -114,6 +114,7 @@ class _Source:
     def __init__(self, sequence: Sequence, trajectory: Trajectory | None, on_scan: Callable[[], None]) -> None:
         self.sequence, self.trajectory, self.on_scan = sequence, trajectory, on_scan
         self.written = self.skipped = 0
+        self.sweep = None if trajectory is None else sweep_of(sequence)
         if trajectory is not None:
             self.trajectory = self._check(trajectory)
 
@@ -133,7 +134,7 @@ class _Source:
 
     def _check(self, trajectory: Trajectory) -> Trajectory:
         """The trajectory as LiDAR poses. Raises InputError when there is nothing to deskew, or nothing to deskew along."""
-        if not has_point_times(self.sequence):
+        if self.sweep is None:
             raise InputError(f"{self.sequence.path} has no per-point times: there is nothing to deskew")
         if len(trajectory) < 2 or not trajectory.has_stamps:
             raise InputError(f"{trajectory.source} has no stamped poses to deskew along")
@@ -164,7 +165,7 @@ class _Source:
             rings=getattr(self.sequence, "rings", None),
             rate_hz=self.sequence.rate_hz,
             motion_compensated=True if is_deskewed else self.sequence.motion_compensated,
-            compensated_to="scan_start" if is_deskewed else None,
+            compensated_to=None if self.sweep is None else self.sweep.instant,
             T_cam0_lidar=self.calibration.T_cam0_lidar,
             T_lidar_imu=self.calibration.T_lidar_imu,
             T_lidar_gnss=self.calibration.T_lidar_gnss,

@@ -21,7 +21,7 @@ from lslam.readers.selection import Selection
 from lslam.registration.motion import MotionModel
 from lslam.registration.registration import DOUBT
 from lslam.registration.standing import Standing
-from lslam.types.scan import Scan
+from lslam.types.scan import Scan, Span
 from lslam.types.scan_result import ScanResult
 from lslam.types.sequence import Sequence
 from lslam.types.trajectory import Trajectory
@@ -80,12 +80,14 @@ def _failures_at_end(results: list[ScanResult]) -> int:
     return next((k for k, result in enumerate(reversed(results)) if result.status == "ok"), len(results))
 
 
-def has_point_times(sequence: Sequence) -> bool:
-    """Whether the scans have per-point times: the first that can be read speaks for all."""
+def sweep_of(sequence: Sequence) -> Span | None:
+    """When sweeps begin and end, None when points have no times: the first scan with points speaks for all."""
     for i in range(min(len(sequence), 10)):
         with suppress(InputError):
-            return sequence.scan(i).times is not None
-    return False
+            scan = sequence.scan(i)
+            if len(scan):
+                return None if scan.times is None else scan.span
+    return None
 
 
 def is_diverged(results: list[ScanResult], max_failures: int) -> bool:

@@ -6,13 +6,10 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
 
-import numpy as np
-
 from lslam.config import Config
 from lslam.keyframes.cloud import keyframe_cloud
 from lslam.keyframes.select import KeyframeSelector
 from lslam.keyframes.store import KeyframeStore
-from lslam.pipeline.tracker import sweep_seconds
 from lslam.types.keyframe import Keyframe
 from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan import Scan
@@ -55,7 +52,7 @@ class Keyframing:
             self._make_unknown(motion)
         if keyframe is None or scan is None:
             return
-        if not is_known and sweep_seconds(scan) > 0 and self._config.preprocess.deskew:
+        if not is_known and scan.span.seconds > 0 and self._config.preprocess.deskew:
             self._unknown.append(_Due(keyframe, scan))
         else:
             self._make(keyframe, scan, motion)
@@ -97,7 +94,7 @@ class Keyframing:
     def _make_unknown(self, motion: MotionPrior | None) -> None:
         due, self._unknown = self._unknown, []
         for one in due:
-            at_once = MotionPrior(np.zeros(1), one.keyframe.T_world_lidar[None])
+            at_once = MotionPrior.at_once(one.keyframe.T_world_lidar)
             self._make(one.keyframe, one.scan, at_once if motion is None else motion)
 
     def _make(self, keyframe: Keyframe, scan: Scan, motion: MotionPrior) -> None:

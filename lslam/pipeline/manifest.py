@@ -15,6 +15,7 @@ from typing import Any
 
 from lslam.config import Config
 from lslam.errors import InterruptedRunError
+from lslam.types.scan import Span
 from lslam.types.scan_result import ScanResult
 from lslam.types.sequence import Sequence
 from lslam.version import __version__
@@ -30,6 +31,7 @@ class Manifest:
         interrupted
     reading : what else than its path the sequence was opened with: topics, extrinsics
     deskew : what becomes of the motion within a scan, `describe_deskew`
+    pose_time : where in a sweep the stamps of scans lie, to which poses belong: scan_start, scan_middle or scan_end
     world : where the coordinates begin and whether z is up
     imu : what became of the IMU, empty without `--imu`; keyframes : how many and how large
     graph, georeference : what the back end did and where on the Earth the world lies, empty where it did nothing
@@ -40,6 +42,7 @@ class Manifest:
     def __init__(self, command: str, sequence: Sequence, config: Config) -> None:
         self.command, self.sequence, self.config = command, sequence, config
         self.deskew = self.world = "not decided yet"
+        self.pose_time = Span().instant
         self.started = datetime.now(UTC)
         self.reading: dict[str, str] = {}
         self.timings: dict[str, float] = {}
@@ -125,7 +128,7 @@ class Manifest:
                 "world": self.world,
                 "trajectory.tum": "T_world_lidar",
                 "trajectory_kitti.txt": "camera 0 (Tr is known)" if has_camera else "LiDAR (no Tr is known)",
-                "pose_time": "scan_start",
+                "pose_time": self.pose_time,
                 "deskew": self.deskew,
                 "covariances.npz": "covariances: of the poses in the world; registration: against the local map (NaN: none); "
                 "both (N, 6, 6) of t' = t + d[:3], R' = exp(d[3:]) R in world axes, m2 and rad2",

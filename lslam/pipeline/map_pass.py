@@ -20,8 +20,7 @@ from lslam.maps.occupancy import OccupancyGrid, OccupancyMapper
 from lslam.maps.top_view import top_view
 from lslam.pipeline.front_end import read_ahead
 from lslam.pipeline.map_checkpoints import MapCheckpoints
-from lslam.pipeline.tracker import sweep_seconds
-from lslam.preprocessing.deskew import KNOTS, deskew_points
+from lslam.preprocessing.deskew import deskew_points, knots_over
 from lslam.types.cloud import Cloud, in_memory
 from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan import Scan
@@ -168,8 +167,7 @@ def without_box(scan: Scan, box: tuple[float, ...]) -> Scan:
 
 def motion_within(scan: Scan, stamps_ns: NDArray[np.int64], poses: NDArray[np.float64]) -> MotionPrior:
     """How the sensor moved during a sweep, from the final poses (N, 4, 4) of all scans; one pose when they cannot say."""
-    span = sweep_seconds(scan)
-    if span <= 0 or len(stamps_ns) < 2:
-        return MotionPrior(np.zeros(1), np.eye(4)[None])
-    times = np.linspace(0.0, span, KNOTS)
+    times = knots_over(scan.span)
+    if len(times) < 2 or len(stamps_ns) < 2:
+        return MotionPrior.at_once(np.eye(4))
     return MotionPrior(times, poses_at(stamps_ns, poses, scan.stamp_ns + np.round(1e9 * times).astype(np.int64)))

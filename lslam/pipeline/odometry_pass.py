@@ -90,6 +90,7 @@ def estimate_poses(
         trajectory=to_trajectory(results, config.odometry.method),
         ground_truth=truth,
         real_time_limit=config.input.skip_frames / sequence.rate_hz,
+        pose_time=manifest.pose_time,
         turns=_turns(inertial, store, config),
     )
 

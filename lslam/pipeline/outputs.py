@@ -48,7 +48,7 @@ def write_trajectories(folder: RunFolder, record: RunRecord, calibration: Calibr
     trajectory = record.trajectory
     write_tum(
         folder.path / "trajectory.tum", trajectory,
-        comment=f"lslam {__version__}, {record.method}: T_world_lidar\nworld: {record.world}\npose_time: scan_start",
+        comment=f"lslam {__version__}, {record.method}: T_world_lidar\nworld: {record.world}\npose_time: {record.pose_time}",
     )  # fmt: skip
     write_kitti(folder.path / "trajectory_kitti.txt", _in_camera(trajectory, calibration))
     if trajectory.covariances is not None:

@@ -22,7 +22,7 @@ from lslam.pipeline.check import check_config
 from lslam.pipeline.checkpoints import OdometryCheckpoints
 from lslam.pipeline.choose import choose_scans
 from lslam.pipeline.feature_pass import build_feature_map
-from lslam.pipeline.front_end import has_point_times
+from lslam.pipeline.front_end import sweep_of
 from lslam.pipeline.georeferencing import require_gnss
 from lslam.pipeline.given_poses import bind
 from lslam.pipeline.graph_outcome import BackEnd
@@ -39,6 +39,7 @@ from lslam.pipeline.watch import RunOutcome, Watch
 from lslam.readers import open_sequence
 from lslam.readers.raw_drive import with_gnss, with_imu
 from lslam.types.run_record import RunRecord
+from lslam.types.scan import Span
 from lslam.types.sequence import Sequence
 from lslam.types.trajectory import Trajectory
 
@@ -177,8 +178,10 @@ def _announce(job: _Job) -> None:
         log.info("%s", note)
     for problem in sequence.problems:
         log.warning("%s", problem)
-    deskew = describe_deskew(sequence, config, has_point_times(sequence), getattr(job.odometry, "deskew", ""))
+    sweep = sweep_of(sequence)
+    deskew = describe_deskew(sequence, config, sweep is not None, getattr(job.odometry, "deskew", ""))
     job.manifest.deskew = deskew
+    job.manifest.pose_time = (sweep or Span()).instant
     if deskew.startswith("no deskew"):
         log.warning("%s", deskew)
     else:

@@ -11,17 +11,19 @@ from numpy.typing import NDArray
 
 from lslam.geometry import se3, so3
 from lslam.inertial.fusion import InertialMotion
-from lslam.odometry.base import Deskewing, Odometry, Resumable
+from lslam.odometry.base import Deskewing, Odometry, Resumable, Searching
 from lslam.registration.feature_steps import StageClock
 from lslam.registration.motion import ConstantVelocity, MotionModel, middle_of
 from lslam.registration.standing import Standing
 from lslam.types.motion_prior import MotionPrior
-from lslam.types.scan import Scan
+from lslam.types.scan import Scan, Span
 from lslam.types.scan_result import ScanResult
 from lslam.types.state import State
 
 # Half the points of a scan are nearer.
 LEVER_M = 10.0
+# Found in the same place from two sides: so many times nearer to each other than where it was sought is to it.
+SAME = 0.3
 
 
 @dataclass(frozen=True)
@@ -50,7 +52,7 @@ class Tracker:
     def __init__(self, odometry: Odometry, standing: Standing | None = None, motion: MotionModel | None = None) -> None:
         self.odometry, self.standing = odometry, standing
         self.motion: MotionModel = ConstantVelocity() if motion is None else motion
-        self.sweep = MotionPrior(np.zeros(1), np.eye(4)[None])
+        self.sweep = MotionPrior.at_once(np.eye(4))
         self.middle = (0, np.eye(4))
         # The first scan, until a second one tells how fast it was taken.
         self._first: tuple[Scan, Any, NDArray[np.float64]] | None = None
@@ -95,7 +97,7 @@ class Tracker:
         stages = {"standing": time.perf_counter() - began}
         if result is not None:
             self.motion.correct(result.stamp_ns, result.T_world_lidar)
-            self.sweep = MotionPrior(np.zeros(1), result.T_world_lidar[None])
+            self.sweep = MotionPrior.at_once(result.T_world_lidar)
             return replace(result, stages=stages)
         result = self._move(loaded)
         began = time.perf_counter()
@@ -105,7 +107,7 @@ class Tracker:
 
     def _move(self, loaded: Loaded) -> ScanResult:
         scan = loaded.scan
-        span = sweep_seconds(scan)
+        span = Span() if scan is None else scan.span
         inertial = self.motion if isinstance(self.motion, InertialMotion) else None
         clock = StageClock()
         with clock.stage("imu"):
@@ -113,7 +115,7 @@ class Tracker:
         steady = None if inertial is None else inertial.coasting.predict(loaded.stamp_ns)
         trial = None
         if scan is None:
-            result = ScanResult(loaded.index, loaded.stamp_ns, prior.start, "skipped", loaded.error, converged=False)
+            result = ScanResult(loaded.index, loaded.stamp_ns, prior.pose, "skipped", loaded.error, converged=False)
         elif isinstance(self.odometry, Deskewing):
             if inertial is not None and inertial.is_compared(loaded.stamp_ns, span):
                 trial = self._without_imu(self.odometry, scan, loaded.prepared, inertial.coasting)
@@ -129,7 +131,7 @@ class Tracker:
         found = result.T_world_lidar
         result = replace(
             result,
-            prior_norm=_matrix_norm(expected.start, found),
+            prior_norm=_matrix_norm(expected.pose, found),
             steady_norm=None if steady is None else _matrix_norm(steady, found),
             gravity=inertial.gravity_at(found) if inertial is not None and result.status == "ok" else None,
             stages=result.stages if inertial is None else {**result.stages, **clock.seconds},
@@ -140,8 +142,10 @@ class Tracker:
         self, odometry: Deskewing, scan: Scan, prepared: Any, prior: MotionPrior, clock: StageClock
     ) -> tuple[ScanResult, MotionPrior]:
         """Register, weigh and enter the scan; the prior that was right."""
+        expected = prior
         result, prior = self._align(odometry, scan, prepared, prior, self.motion, clock)
-        if result.status == "ok" and sweep_seconds(scan) > 0 and not self.motion.is_known:
+        is_first_open = self._first is not None or not self.motion.is_known
+        if result.status == "ok" and scan.span.seconds > 0 and is_first_open:
             if self._first is None:
                 self._first = (scan, prepared, result.T_world_lidar)
             else:
@@ -149,15 +153,37 @@ class Tracker:
                 result = odometry.register(scan, prepared, prior)
         if isinstance(self.motion, InertialMotion):
             with clock.stage("imu"):
-                result = self.motion.weigh(result, prior)
+                weighed = self.motion.weigh(result, prior)
+            if weighed.status != "ok" and self.motion.is_felt and isinstance(odometry, Searching):
+                prior = expected
+                weighed = self._near(odometry, self.motion, scan, prepared, prior, result, weighed, clock)
+            result = weighed
         return odometry.update(scan, prepared, prior, result), prior
+
+    @staticmethod
+    def _near(
+        odometry: Searching, motion: InertialMotion, scan: Scan, prepared: Any, prior: MotionPrior, found: ScanResult,
+        denied: ScanResult, clock: StageClock,
+    ) -> ScanResult:  # fmt: skip
+        """What is found where the IMU expects a scan, in place of what was `found` elsewhere and `denied`, or failed.
+
+        Where places are alike, what is sought metres around is found in the wrong one; what is found there from both sides
+        is right, and the IMU wrong.
+        """
+        near = odometry.register_near(scan, prepared, prior)
+        with clock.stage("imu"):
+            again = motion.weigh(near, prior)
+        if again.status == "ok":
+            return _both(found, again)
+        apart, off = (_apart(pose, found.T_world_lidar) for pose in (near.T_world_lidar, prior.pose))
+        return _both(near, found if near.status == "ok" and apart < SAME * off else denied)
 
     def _align(
         self, odometry: Deskewing, scan: Scan, prepared: Any, prior: MotionPrior, motion: MotionModel, clock: StageClock
     ) -> tuple[ScanResult, MotionPrior]:
         """Register, and again with the motion within the sweep that this found; the prior that was right."""
         result = odometry.register(scan, prepared, prior)
-        if result.status == "ok" and sweep_seconds(scan) > 0 and motion.is_known:
+        if result.status == "ok" and scan.span.seconds > 0 and motion.is_known:
             with clock.stage("imu"):
                 better = motion.refine(prior, scan.stamp_ns, result.T_world_lidar)
             if _distance(prior, better) > self.REFINE_M:
@@ -167,7 +193,7 @@ class Tracker:
 
     def _without_imu(self, odometry: Deskewing, scan: Scan, prepared: Any, coasting: ConstantVelocity) -> ScanResult:
         """What constant velocity makes of the scan on the same map; nothing is learnt from it."""
-        prior = coasting.sweep(scan.stamp_ns, sweep_seconds(scan))
+        prior = coasting.sweep(scan.stamp_ns, scan.span)
         return self._align(odometry, scan, prepared, prior, coasting, StageClock())[0]
 
     def _begin_again(
@@ -178,16 +204,11 @@ class Tracker:
         The prior of the second scan, whose registration told the speed.
         """
         self.motion.correct(scan.stamp_ns, result.T_world_lidar)
-        again = self.motion.sweep(scan.stamp_ns, sweep_seconds(scan))
-        prior = self.motion.rewind(first.stamp_ns, pose, sweep_seconds(first))
+        again = self.motion.sweep(scan.stamp_ns, scan.span)
+        prior = self.motion.rewind(first.stamp_ns, pose, first.span)
         odometry.restart()
         odometry.update(first, prepared, prior, odometry.register(first, prepared, prior))
         return again
-
-
-def sweep_seconds(scan: Scan | None) -> float:
-    """How long the sensor took for the scan, s; 0 when its points belong to one instant."""
-    return 0.0 if scan is None or scan.times is None or len(scan) == 0 else max(float(scan.times.max()), 0.0)
 
 
 def _compared(result: ScanResult, trial: ScanResult) -> ScanResult:
@@ -211,6 +232,11 @@ def _matrix_norm(prior: NDArray[np.float64], pose: NDArray[np.float64]) -> float
 
 
 def _distance(before: MotionPrior, after: MotionPrior) -> float:
-    """How far the motion within a sweep differs at its end, m, at a lever arm of `LEVER_M`."""
-    change = se3.relative(se3.relative(before.start, before.poses[-1]), se3.relative(after.start, after.poses[-1]))
+    """How far the motion from a sweep's begin to its end differs, m, at a lever arm of `LEVER_M`."""
+    return _apart(*(se3.relative(prior.poses[0], prior.poses[-1]) for prior in (before, after)))
+
+
+def _apart(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
+    """How far two poses (4, 4) are apart, m, at a lever arm of `LEVER_M`."""
+    change = se3.relative(a, b)
     return float(np.linalg.norm(change[:3, 3]) + LEVER_M * so3.angle(change[:3, :3]))

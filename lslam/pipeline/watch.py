@@ -19,7 +19,7 @@ class RunOutcome:
 
     @property
     def trajectory(self) -> Trajectory:
-        """T_world_lidar per scan, at scan start."""
+        """T_world_lidar per scan, at its stamp."""
         return self.record.trajectory
 
 

@@ -13,6 +13,7 @@ from lslam.geometry.interpolate import poses_at
 from lslam.kernels import motion
 from lslam.preprocessing.prepare import PreparedPoints
 from lslam.types.motion_prior import MotionPrior
+from lslam.types.scan import Span
 
 Floats = NDArray[np.float64]
 
@@ -20,8 +21,13 @@ Floats = NDArray[np.float64]
 KNOTS = 33
 
 
+def knots_over(span: Span) -> Floats:
+    """(KNOTS,) times over a sweep, s from the scan's stamp; that of the stamp alone where the sweep takes no time."""
+    return np.linspace(*span, KNOTS) if span.seconds > 0 else np.zeros(1)
+
+
 def deskew_points(points: NDArray[Any], times: NDArray[np.float32] | None, prior: MotionPrior) -> NDArray[Any]:
-    """Points (N, 3), m, LiDAR frame at their `times` (N,), s since scan start, as seen from the pose at scan start.
+    """Points (N, 3), m, LiDAR frame at their `times` (N,), s from the scan's stamp, as seen from the pose at the stamp.
 
     Without times, or when the prior knows one instant only, they are returned as they are.
     """
@@ -34,7 +40,7 @@ def deskew_points(points: NDArray[Any], times: NDArray[np.float32] | None, prior
 
 
 def deskew(points: PreparedPoints, prior: MotionPrior) -> PreparedPoints:
-    """Both sets of points as seen from scan start; the very same object when there is nothing to do."""
+    """Both sets of points as seen from the pose at the stamp; the very same object when there is nothing to do."""
     if points.map_times is None or len(prior.times) < 2:
         return points
     return replace(
@@ -45,10 +51,9 @@ def deskew(points: PreparedPoints, prior: MotionPrior) -> PreparedPoints:
 
 
 def _knots(prior: MotionPrior) -> tuple[float, float, Floats]:
-    """Start, step and (KNOTS, 3, 4) poses within the sweep, seen from the pose at scan start."""
-    within = se3.relative(prior.start, prior.poses)
+    """Start, step and (KNOTS, 3, 4) poses within the sweep, seen from the pose at the stamp."""
+    within = se3.relative(prior.pose, prior.poses)
     start, end = float(prior.times[0]), float(prior.times[-1])
     if len(within) != KNOTS:
-        known, wanted = (np.round(1e9 * t).astype(np.int64) for t in (prior.times, np.linspace(start, end, KNOTS)))
-        within = poses_at(known, within, wanted)
+        within = poses_at(prior.times_ns, within, np.round(1e9 * np.linspace(start, end, KNOTS)).astype(np.int64))
     return start, (end - start) / (KNOTS - 1), np.ascontiguousarray(within[:, :3, :])

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from lslam.config.preprocess import PreprocessConfig
 from lslam.errors import InputError
 from lslam.kernels import voxel
+from lslam.preprocessing.air import on_surfaces
 from lslam.preprocessing.ground import above_ground
 
 # A source grid never gets finer than the points it is made of, nor so coarse that walls merge.
@@ -26,7 +27,7 @@ class PreparedPoints:
     map_points : (M, 3) float32, m, one centroid per small voxel
     source : (S, 3) float64, m; scatter : (S, 6) float64, m2, covariance xx xy xz yy yz zz of the points behind each
     used : points that passed the range gate
-    map_times (M,), source_times (S,) : float32, s since scan start, mean over the points behind each; None when the scan
+    map_times (M,), source_times (S,) : float32, s from the scan's stamp, mean over the points behind each; None when the scan
         has no times
     covariance : (S, 6) float64, m2, likewise, of the surface round each source point; None where no method asked for it
     """
@@ -45,8 +46,9 @@ def prepare_points(
 ) -> PreparedPoints:
     """Gate and down-sample points (N, 3), m, in the LiDAR frame. `index` seeds the random share, scan by scan.
 
-    `times` (N,), s since scan start, are averaged along, so that the centroids can be deskewed instead of the points.
+    `times` (N,), s from the scan's stamp, are averaged along, so that the centroids can be deskewed instead of the points.
 
+    Drops in the air are left out of the map points, and of source points made of these (`air.on_surfaces`).
     Centroids, not first points: the average of the points of a cell is nearer to the surface than any one of them.
     Further columns are ignored. Raises InputError for arrays of another shape.
     """
@@ -54,7 +56,10 @@ def prepare_points(
     chosen = gate_points(cloud, config)
     kept = voxel.take(cloud, chosen)
     kept_times = NO_TIMES if times is None else np.ascontiguousarray(times, np.float32)[chosen]
-    map_points, map_times, _ = voxel.centroids(kept, kept_times, config.map_leaf)
+    map_points, map_times, _, counts = voxel.centroids(kept, kept_times, config.map_leaf)
+    if config.least_line > 0:
+        solid = on_surfaces(map_points, counts, config.map_leaf, config.least_line)
+        map_points, map_times = voxel.take(map_points, solid), map_times[solid] if len(map_times) else map_times
     source, source_times, scatter = _source_points(kept, kept_times, map_points, map_times, config, index)
     return PreparedPoints(
         map_points,
@@ -122,7 +127,7 @@ def _source_points(
     if config.downsample == "target":
         return _target_count(map_points, map_times, config)
     if config.downsample == "grid":
-        return voxel.centroids(map_points, map_times, config.source_voxel)
+        return voxel.centroids(map_points, map_times, config.source_voxel)[:3]
     if config.downsample == "first":
         chosen = voxel.first_points(kept, config.source_voxel)
     elif config.downsample == "random":
@@ -142,7 +147,7 @@ def _target_count(map_points: NDArray[np.float32], map_times: NDArray[np.float32
     """
     low, high = config.source_points_min, config.source_points_max
     size = config.source_voxel
-    down = voxel.centroids(map_points, map_times, size)
+    down = voxel.centroids(map_points, map_times, size)[:3]
     for _ in range(3):
         found = len(down[0])
         if found > high:
@@ -154,5 +159,5 @@ def _target_count(map_points: NDArray[np.float32], map_times: NDArray[np.float32
         if wanted == size:
             break
         size = wanted
-        down = voxel.centroids(map_points, map_times, size)
+        down = voxel.centroids(map_points, map_times, size)[:3]
     return down

@@ -11,14 +11,14 @@ from zipfile import BadZipFile
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.errors import InputError
+from lslam.errors import InputError, cause
 from lslam.formats.point_cloud import PointCloud
 from lslam.formats.point_files import read_bin, read_points
 from lslam.readers.point_times import TimeRule, apply_rule, azimuth_times
 from lslam.types.calibration import Calibration
 from lslam.types.gnss import GnssStream
 from lslam.types.imu import ImuStream
-from lslam.types.scan import Scan
+from lslam.types.scan import Scan, Span
 from lslam.types.trajectory import Trajectory
 
 
@@ -29,7 +29,7 @@ class FolderSequence:
     files : one per scan; correction_deg : rotation of every point about p x z, 0 for none
     rows, cols : organised clouds, point r * cols + c has ring r; per_point : folder of `<stem>.npz` with `t` and `ring`
     time_rule : how the files' own per-point times are understood, None when they have none or are not to be used
-    sweep_s : (N,) duration of each sweep, s, when per-point times follow from the azimuth; None otherwise
+    sweep_s : (N, 2) begin and end of each sweep, s from its stamp, when per-point times follow from the azimuth; else None
     rings : number of beams, if known; sensor : its name, if known
     """
 
@@ -89,7 +89,7 @@ class FolderSequence:
             times, shift_ns = apply_rule(self.time_rule, cloud.times, stamp)
             stamp += shift_ns
         elif self.sweep_s is not None:
-            times = azimuth_times(cloud.points, float(self.sweep_s[index]))
+            times = azimuth_times(cloud.points, Span(*self.sweep_s[index].tolist()))
         if rings is None and self.rows is not None and self.cols is not None and len(cloud):
             if self.rows * self.cols != len(cloud):
                 raise InputError(f"{path}: {len(cloud)} points are not {self.rows} rows of {self.cols} columns")
@@ -112,7 +112,7 @@ def _read_per_point(path: Path, count: int) -> tuple[NDArray[np.float32] | None,
             times = np.asarray(file["t"], np.float32) if "t" in file else None
             rings = np.asarray(file["ring"], np.uint16) if "ring" in file else None
     except (OSError, ValueError, EOFError, KeyError, SyntaxError, BadZipFile, zlib.error) as error:
-        raise InputError(f"{path}, named by per_point of sequence.toml, cannot be read: {error}") from None
+        raise InputError(f"{path}, named by per_point of sequence.toml, cannot be read: {cause(error)}") from None
     for name, values in (("t", times), ("ring", rings)):
         if values is not None and values.shape != (count,):
             raise InputError(f"{path}: {name} has shape {values.shape} for a scan of {count} points")

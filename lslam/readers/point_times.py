@@ -1,4 +1,4 @@
-"""Per-point times of any sensor to seconds since scan start: the rule is decided once per sequence and said aloud."""
+"""Per-point times of any sensor to seconds from the scan's stamp: the rule is decided once per sequence and said aloud."""
 
 from __future__ import annotations
 
@@ -9,10 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.errors import InputError
+from lslam.types.scan import Span
 
 _UNITS_NS = {"s": 1e9, "ms": 1e6, "us": 1e3, "ns": 1.0}
-# A stored time this near the scan's stamp is a clock reading and not an offset.
-_NEAR_NS = 10e9
+# A field's unit is that in which the scan lasts so many of its periods; an offset that begins later is a clock's reading.
+_SHORTEST, _LONGEST = 0.05, 3.0
 
 
 @dataclass(frozen=True)
@@ -20,7 +21,7 @@ class TimeRule:
     """How a per-point time field is read.
 
     ns_per_unit : length of its unit, ns; is_absolute : clock readings instead of offsets
-    is_before_stamp : offsets are negative, the stamp belongs to the scan's end
+    is_before_stamp : offsets are negative, the stamp belongs to the scan's end and moves to its start
     sentence : the decision in words, for the log and the manifest
     """
 
@@ -42,14 +43,15 @@ def decide_rule(
 
     unit : s, ms, us or ns; reference : `start` or `end` of the scan, or `absolute`; None finds out
 
-    The unit is the one in which the scan lasts about 1 / `rate_hz`; integers are ns when that fits too. Offsets that are
-    negative refer to the scan's end, values near the stamp or beyond 1e9 s are clock readings (CONVENTIONS).
+    The unit is the one in which the scan lasts about 1 / `rate_hz`; integers are ns when that fits too. Offsets that lie
+    about 0 refer to the scan's middle, others that are negative to its end, those that begin later than a scan can last are
+    readings of a clock, whatever its epoch (a sensor that was never told the time counts from where it was switched on).
     Raises InputError with field, type, range and stamp when no unit fits.
     """
     finite = values[np.isfinite(values)] if values.dtype.kind == "f" else values
     low, high = (float(finite.min()), float(finite.max())) if len(finite) else (0.0, 0.0)
     period_ns = 1e9 / rate_hz
-    fitting = [u for u, ns in _UNITS_NS.items() if 0.05 <= (high - low) * ns / period_ns <= 3]
+    fitting = [u for u, ns in _UNITS_NS.items() if _SHORTEST <= (high - low) * ns / period_ns <= _LONGEST]
     if unit is not None:
         fitting = [unit]
     if not fitting or values.dtype.kind not in "fiu":
@@ -61,11 +63,15 @@ def decide_rule(
     how = ", as stated" if unit or reference else ""
     unit = "ns" if values.dtype.kind in "iu" and "ns" in fitting else fitting[0]
     scale = _UNITS_NS[unit]
-    is_absolute = low * scale > 1e18 or (low * scale > _NEAR_NS and abs(low * scale - stamp_ns) < _NEAR_NS)
-    is_before_stamp = not is_absolute and low < 0
+    is_absolute = low * scale > _LONGEST * period_ns
+    is_about_stamp = reference is None and low < 0 and Span(low, high).instant == "scan_middle"
+    is_before_stamp = not is_absolute and low < 0 and not is_about_stamp
     if reference is not None:
         is_absolute, is_before_stamp = reference == "absolute", reference == "end"
-    words = "absolute" if is_absolute else "relative to the scan's end" if is_before_stamp else "since scan start"
+    words = (
+        "absolute" if is_absolute else "relative to the scan's end" if is_before_stamp else
+        "relative to the scan's middle" if is_about_stamp else "since scan start"
+    )  # fmt: skip
     return TimeRule(
         scale,
         is_absolute,
@@ -75,7 +81,10 @@ def decide_rule(
 
 
 def apply_rule(rule: TimeRule, values: NDArray[Any], stamp_ns: int) -> tuple[NDArray[np.float32], int]:
-    """Times (N,) float32 s since scan start, and what to add to the stamp (ns) so that it is the scan's start."""
+    """Times (N,) float32 s, and what to add to the stamp (ns) so that they count from it.
+
+    It becomes the scan's start, unless the offsets lie about it: then it stays in the middle.
+    """
     if not len(values):
         return np.zeros(0, np.float32), 0
     if not rule.is_absolute and not rule.is_before_stamp:
@@ -94,7 +103,7 @@ def apply_rule(rule: TimeRule, values: NDArray[Any], stamp_ns: int) -> tuple[NDA
     return times, start_ns - stamp_ns if abs(start_ns - stamp_ns) < 1e9 else 0
 
 
-def azimuth_times(points: NDArray[np.float32], sweep_s: float) -> NDArray[np.float32]:
+def azimuth_times(points: NDArray[np.float32], sweep: Span) -> NDArray[np.float32]:
     """Times (N,) float32 s of a sensor that turns clockwise seen from above and starts behind (KITTI's HDL-64E)."""
     azimuth = np.arctan2(points[:, 1], points[:, 0])
-    return (0.5 * (1 - azimuth / np.pi) * sweep_s).astype(np.float32)
+    return (sweep.begin_s + 0.5 * (1 - azimuth / np.pi) * sweep.seconds).astype(np.float32)

@@ -13,6 +13,8 @@ from lslam.errors import InputError
 from lslam.formats.kitti_calib import read_rigid
 from lslam.formats.oxts_files import ACCEL, GYRO, POS_ACC, Oxts, read_oxts
 from lslam.formats.stamps_files import read_stamps
+from lslam.readers.bag import BagSequence
+from lslam.readers.bag_topics import why_no_fixes, why_no_imu
 from lslam.readers.folder_sequence import FolderSequence
 from lslam.readers.kitti_odometry import KIND
 from lslam.types.gnss import GnssStream
@@ -44,10 +46,12 @@ def with_imu(sequence: Sequence, data_root: Path | None = None) -> Sequence:
     The drive is looked for below `data_root`, LSLAM_DATA and the folders the sequence lies in, as
     `raw/<date>/<drive>_extract` (100 Hz) or `_sync` (10 Hz), with `calib_imu_to_velo.txt` beside it.
 
-    Raises InputError naming the paths looked at.
+    Raises InputError naming the paths looked at, UsageError when a bag has several to choose from.
     """
     if sequence.imu is not None:
         return sequence
+    if isinstance(sequence, BagSequence):
+        raise why_no_imu(sequence.bag)
     number = sequence.path.name
     if not isinstance(sequence, FolderSequence):
         raise InputError(f"{sequence.path} ({sequence.kind}) has no IMU: run without --imu")
@@ -62,10 +66,14 @@ def with_imu(sequence: Sequence, data_root: Path | None = None) -> Sequence:
 def with_gnss(sequence: Sequence, data_root: Path | None = None) -> Sequence:
     """The sequence with satellite fixes: its own, else, for a KITTI odometry sequence, those of its raw drive, as `with_imu`.
 
-    Other sequences come back as they are. Raises InputError naming the paths looked at.
+    Other folders come back as they are. Raises as `with_imu`.
     """
+    if sequence.gnss is not None:
+        return sequence
+    if isinstance(sequence, BagSequence):
+        raise why_no_fixes(sequence.bag)
     number = sequence.path.name
-    if sequence.gnss is not None or not isinstance(sequence, FolderSequence):
+    if not isinstance(sequence, FolderSequence):
         return sequence
     if sequence.kind != KIND or number not in DRIVES:
         return sequence

@@ -14,7 +14,7 @@ class Keyframe:
 
     number : 0, 1, 2, ... among the keyframes
     scan : position of its scan among the scans of the run (not the scan's number in the recording)
-    T_world_lidar : (4, 4) odometry pose at scan start
+    T_world_lidar : (4, 4) odometry pose at the scan's stamp
     covariance : (6, 6) of the pose in the world, t' = t + d[:3], R' = exp(d[3:]) R in world axes, m2 and rad2, or None
     distance : m travelled since the start of the run
     """

@@ -7,20 +7,40 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.geometry.interpolate import poses_at
+
 
 @dataclass(frozen=True)
 class MotionPrior:
     """Poses sampled over one scan, so that it can be deskewed as well as predicted.
 
-    times : (K,) float64 s since scan start, increasing; poses : (K, 4, 4) float64 T_world_lidar at those times
-    The pose at scan start is `poses[0]`; K is 1 when only the start is predicted.
+    times : (K,) float64 s from the scan's stamp, increasing, 0 within; poses : (K, 4, 4) float64 T_world_lidar at those times
+    K is 1 when only the pose at the stamp is predicted.
     """
 
     times: NDArray[np.float64]
     poses: NDArray[np.float64]
 
+    @classmethod
+    def at_once(cls, pose: NDArray[np.float64]) -> MotionPrior:
+        """The pose (4, 4) at the stamp, and nothing of the motion about it."""
+        return cls(np.zeros(1), pose[None])
+
     @property
-    def start(self) -> NDArray[np.float64]:
-        """(4, 4) predicted T_world_lidar at scan start."""
-        start: NDArray[np.float64] = self.poses[0]
-        return start
+    def pose(self) -> NDArray[np.float64]:
+        """(4, 4) predicted T_world_lidar at the stamp."""
+        if self.times[0] == 0 or len(self.times) == 1:
+            first: NDArray[np.float64] = self.poses[0]
+            return first
+        at: NDArray[np.float64] = poses_at(self.times_ns, self.poses, np.zeros(1, np.int64))[0]
+        return at
+
+    @property
+    def times_ns(self) -> NDArray[np.int64]:
+        """(K,) `times` in whole ns."""
+        return np.round(1e9 * self.times).astype(np.int64)
+
+    @property
+    def span_s(self) -> float:
+        """Seconds from the first pose to the last."""
+        return float(self.times[-1] - self.times[0])

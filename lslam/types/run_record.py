@@ -27,6 +27,7 @@ class RunRecord:
     map_image : (H, W) float32 density of the merged map seen from above, row 0 at the largest y, or None
     map_extent : (x_min, x_max, y_min, y_max), m; crispness : of the merged map, None without one
     real_time_limit : seconds one scan may take: skip_frames / rate
+    pose_time : where in a sweep the stamps of scans lie, to which poses belong: scan_start, scan_middle or scan_end
     world : where the coordinates of trajectory and map begin and whether z is up, in words
     odometry : the trajectory before the pose graph, in its own world, None when there was no back end
     T_final_odometry : (4, 4) from that world into the trajectory's
@@ -49,6 +50,7 @@ class RunRecord:
     map_extent: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
     crispness: Crispness | None = None
     world: str = "LiDAR at the first scan, not levelled"
+    pose_time: str = "scan_start"
     problems: list[str] = field(default_factory=list)
     odometry: Trajectory | None = None
     T_final_odometry: NDArray[np.float64] = field(default_factory=lambda: np.eye(4))

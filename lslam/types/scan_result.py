@@ -19,7 +19,7 @@ class ScanResult:
 
     status : `ok` registered; `bridged` registration failed and the motion prior stands in; `skipped` the scan could
         not be read or was empty, the motion prior stands in
-    T_world_lidar : (4, 4) pose at scan start
+    T_world_lidar : (4, 4) pose at the scan's stamp
     covariance : (6, 6) of the pose in the world, t' = t + d[:3], R' = exp(d[3:]) R in world axes, m2 and rad2; grows with
         the distance travelled. None when the method has none
     registration_covariance : likewise, but relative to the local map the scan was registered on

@@ -64,7 +64,7 @@ def gicp_keyframes() -> Register:
     def register(points: NDArray[np.float32]) -> NDArray[np.float64]:
         index = next(count)
         scan = Scan(points, index * 100_000_000, index)
-        prior = MotionPrior(np.zeros(1), motion.predict(scan.stamp_ns)[None])
+        prior = MotionPrior.at_once(motion.predict(scan.stamp_ns))
         pose = method.register(scan, method.prepare(scan), prior).T_world_lidar
         motion.correct(scan.stamp_ns, pose)
         return pose

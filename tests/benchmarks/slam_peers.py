@@ -18,7 +18,7 @@ import time
 from pathlib import Path
 
 import numpy as np
-from inertial_peers import score, times_of, truth_of
+from inertial_peers import score, shares_of, truth_of
 from numpy.typing import NDArray
 
 from lslam.config import load_config
@@ -48,9 +48,8 @@ def kiss_slam(sequence: Sequence, scans: int, python: Path) -> tuple[NDArray[np.
         assert worker.stdout is not None
         for i in range(scans):
             scan = sequence.scan(i)
-            times = times_of(scan, sequence)
             packed = io.BytesIO()
-            np.savez(packed, points=scan.points, times=times / max(float(times.max()), 1e-9))
+            np.savez(packed, points=scan.points, times=shares_of(scan, sequence))
             worker.stdin.write(len(packed.getvalue()).to_bytes(8, "little") + packed.getvalue())
         worker.stdin.close()
         answer = worker.stdout.read()

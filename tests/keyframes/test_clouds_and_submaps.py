@@ -16,7 +16,7 @@ from lslam.types.keyframe import Keyframe
 from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan import Scan
 
-AT_ONCE = MotionPrior(np.zeros(1), np.eye(4)[None])
+AT_ONCE = MotionPrior.at_once(np.eye(4))
 CONFIG = KeyframesConfig(voxel=0.3)
 
 

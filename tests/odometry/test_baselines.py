@@ -44,7 +44,7 @@ def results(method: str) -> list[ScanResult]:
 
 
 def at(pose: Floats) -> MotionPrior:
-    return MotionPrior(np.zeros(1), pose[None])
+    return MotionPrior.at_once(pose)
 
 
 @pytest.mark.parametrize("method", BASELINES)

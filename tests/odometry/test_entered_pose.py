@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,9 +11,10 @@ import pytest
 from lslam.config.config import Config
 from lslam.geometry import se3, so3
 from lslam.odometry import create_odometry
-from lslam.odometry.base import Deskewing
+from lslam.odometry.base import Deskewing, Searching
 from lslam.simulation.scenarios import simulate
 from lslam.types.motion_prior import MotionPrior
+from lslam.types.scan_result import ScanResult
 
 
 @pytest.mark.parametrize("method", ["gicp", "loam-odom"])
@@ -22,7 +24,7 @@ def test_a_scan_enters_where_it_was_put(method: str) -> None:
     odometry = create_odometry(config)
     assert isinstance(odometry, Deskewing)
     drive = simulate("block", count=2)
-    prior = MotionPrior(np.zeros(1), np.eye(4)[None])
+    prior = MotionPrior.at_once(np.eye(4))
     moved = se3.make(so3.exp(np.array([0.0, 0.01, 0.02])), np.array([0.3, -0.1, 0.05]))
     covariance = 1e-6 * np.eye(6)
     for scan in drive:
@@ -30,8 +32,65 @@ def test_a_scan_enters_where_it_was_put(method: str) -> None:
         found = odometry.register(scan, prepared, prior)
         put = replace(found, T_world_lidar=moved @ found.T_world_lidar, registration_covariance=covariance)
         done = odometry.update(scan, prepared, prior, put)
-    again = odometry.register(scan, prepared, MotionPrior(np.zeros(1), put.T_world_lidar[None]))
+    again = odometry.register(scan, prepared, MotionPrior.at_once(put.T_world_lidar))
     np.testing.assert_allclose(again.T_world_lidar, put.T_world_lidar, atol=0.02)
     assert np.linalg.norm(again.T_world_lidar[:3, 3] - found.T_world_lidar[:3, 3]) > 0.2
     assert done.covariance is not None
     assert np.trace(done.covariance) < 1e-4, "what it was said to be known to adds up"
+
+
+@pytest.mark.parametrize("method", ["icp", "loam"])
+def test_a_scan_whose_registration_is_denied_enters_where_it_is_put_and_teaches_nothing(method: str) -> None:
+    """The third scan is found a metre from its prior: believed, that opens the kernel; denied, it enters at the prior."""
+    odometry = create_odometry(Config.model_validate({"odometry": {"method": method}}))
+    assert isinstance(odometry, Deskewing)
+    registration: Any = vars(odometry)["registration"]
+    drive = simulate("block", count=3)
+    assert drive.ground_truth is not None
+    for scan, pose in zip(list(drive)[:2], drive.ground_truth.poses, strict=False):
+        prior, prepared = MotionPrior.at_once(pose), odometry.prepare(scan)
+        odometry.update(scan, prepared, prior, odometry.register(scan, prepared, prior))
+    scan = drive.scan(2)
+    prepared = odometry.prepare(scan)
+    found = odometry.register(scan, prepared, prior)
+    assert (found.status, round(found.prior_error[0])) == ("ok", 1)
+    known = registration.threshold.width, registration.agreement.usual
+    entered = registration.state()["_inserted"]
+    put = replace(found, status="bridged", T_world_lidar=prior.pose, registration_covariance=1e-6 * np.eye(6))
+    done = odometry.update(scan, prepared, prior, put)
+    np.testing.assert_array_equal(done.T_world_lidar, prior.pose)
+    assert registration.state()["_inserted"] == entered + 1
+    assert (registration.threshold.width, registration.agreement.usual) == known
+    odometry.update(scan, prepared, prior, found)
+    assert (registration.threshold.width, registration.agreement.usual) != known
+
+
+@pytest.mark.parametrize("method", ["icp", "loam"])
+def test_near_a_prior_nothing_is_sought_elsewhere(method: str) -> None:
+    """The third scan, expected two metres beside it: it is found all the same, but not near there."""
+    odometry = create_odometry(Config.model_validate({"odometry": {"method": method}}))
+    assert isinstance(odometry, Searching)
+    registration: Any = vars(odometry)["registration"]
+    drive = simulate("block", count=3)
+    assert drive.ground_truth is not None
+    *entered, true = drive.ground_truth.poses
+
+    def off_by(y: float, z: float = 0.0) -> MotionPrior:
+        return MotionPrior.at_once(true @ se3.make(np.eye(3), np.array([0, y, z])))
+
+    def error(result: ScanResult) -> float:
+        return float(np.linalg.norm(result.T_world_lidar[:3, 3] - true[:3, 3]))
+
+    for scan, pose in zip(list(drive)[:2], entered, strict=True):
+        prior, prepared = MotionPrior.at_once(pose), odometry.prepare(scan)
+        odometry.update(scan, prepared, prior, odometry.register(scan, prepared, prior))
+    scan = drive.scan(2)
+    prepared = odometry.prepare(scan)
+    assert error(odometry.register(scan, prepared, off_by(2.0))) < 0.05
+    assert odometry.register_near(scan, prepared, off_by(2.0)).status == "bridged"
+    near = odometry.register_near(scan, prepared, off_by(0.05))
+    assert (near.status, error(near) < 0.05) == ("ok", True)
+    found, count = odometry.register(scan, prepared, off_by(2.0)), registration.state()["_inserted"]
+    assert odometry.register_near(scan, prepared, off_by(0.0, 500.0)).status == "bridged"
+    odometry.update(scan, prepared, off_by(0.0), found)
+    assert registration.state()["_inserted"] == count + 1, "what `register` found is what enters"

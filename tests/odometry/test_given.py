@@ -7,7 +7,7 @@ import pytest
 
 from lslam.geometry import se3
 from lslam.odometry.given import GivenMotion, GivenPoses
-from lslam.types.scan import Scan
+from lslam.types.scan import Scan, Span
 from lslam.types.trajectory import Trajectory
 
 STEP = 100_000_000
@@ -28,7 +28,7 @@ def scan(stamp_ns: int) -> Scan:
 def test_a_scan_has_a_pose_where_the_trajectory_has(at: float, status: str) -> None:
     given = GivenPoses(TRAJECTORY)
     stamp = round(at * STEP)
-    result = given.register(scan(stamp), None, given.motion.sweep(stamp, 0.0))
+    result = given.register(scan(stamp), None, given.motion.sweep(stamp, Span()))
     assert result.status == status
     assert bool(result.reason) == (status != "ok")
     if status == "ok":
@@ -38,8 +38,8 @@ def test_a_scan_has_a_pose_where_the_trajectory_has(at: float, status: str) -> N
 
 def test_the_sweep_follows_the_trajectory() -> None:
     motion = GivenMotion(TRAJECTORY)
-    prior = motion.sweep(3 * STEP, 0.1)
+    prior = motion.sweep(3 * STEP, Span(0.0, 0.1))
     np.testing.assert_allclose(prior.poses[0], se3.exp(3 * TWIST), atol=1e-9)
     np.testing.assert_allclose(prior.poses[-1], se3.exp(4 * TWIST), atol=1e-9)
-    assert motion.refine(prior, 3 * STEP, prior.start) is prior
+    assert motion.refine(prior, 3 * STEP, prior.pose) is prior
     assert motion.is_known

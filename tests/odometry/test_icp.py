@@ -50,7 +50,7 @@ class Driver:
         self.motion = ConstantVelocity()
 
     def feed(self, scan: Scan) -> ScanResult:
-        prior = MotionPrior(np.zeros(1), self.motion.predict(scan.stamp_ns)[None])
+        prior = MotionPrior.at_once(self.motion.predict(scan.stamp_ns))
         result = feed(self.icp, scan, prior)
         self.motion.correct(scan.stamp_ns, result.T_world_lidar)
         return result
@@ -165,7 +165,7 @@ def test_warming_up_leaves_no_trace() -> None:
     warm.warm_up()
     assert len(warm.registration.map) == 0
     scans, _ = block()
-    prior = MotionPrior(np.zeros(1), np.eye(4)[None])
+    prior = MotionPrior.at_once(np.eye(4))
     for k in (0, 1):
         a, b = (feed(icp, scans[k], prior) for icp in (warm, cold))
         assert a.T_world_lidar.tobytes() == b.T_world_lidar.tobytes()
@@ -227,7 +227,7 @@ def test_beginning_again_keeps_how_errors_add_up() -> None:
             icp.restart()
         motion = ConstantVelocity()
         for scan in scans[:6]:
-            result = feed(icp, scan, MotionPrior(np.zeros(1), motion.predict(scan.stamp_ns)[None]))
+            result = feed(icp, scan, MotionPrior.at_once(motion.predict(scan.stamp_ns)))
             motion.correct(scan.stamp_ns, result.T_world_lidar)
         assert result.covariance is not None
         traces.append(float(np.trace(result.covariance)))

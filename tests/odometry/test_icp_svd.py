@@ -130,7 +130,7 @@ def test_a_bad_scan_is_bridged_and_no_reference_until_it_persists() -> None:
 
     def feed(points: NDArray[Any], index: int) -> str:
         scan = Scan(points.astype(np.float32), index, index)
-        prior = MotionPrior(np.zeros(1), np.eye(4)[None])
+        prior = MotionPrior.at_once(np.eye(4))
         result = method.register(scan, method.prepare(scan), prior)
         if result.status == "bridged":
             assert result.reason
@@ -152,7 +152,7 @@ def test_the_options_reach_the_method() -> None:
         method = create(Config.model_validate({"registration": options}))
         for index, cloud in enumerate(clouds):
             scan = Scan(cloud, index, index)
-            last = method.register(scan, method.prepare(scan), MotionPrior(np.zeros(1), np.eye(4)[None]))
+            last = method.register(scan, method.prepare(scan), MotionPrior.at_once(np.eye(4)))
         return last
 
     assert result(max_iterations=2).iterations == 2

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,7 @@ from lslam.types.gnss import GnssStream
 from lslam.types.imu import ImuStream
 from lslam.types.scan import Scan
 from lslam.types.scan_result import ScanResult
+from lslam.types.sequence import Sequence
 from lslam.types.trajectory import Trajectory
 
 SAMPLE = Path(__file__).resolve().parents[2] / "sample_data"
@@ -81,6 +83,30 @@ def with_points(stub: Stub, index: int, points: NDArray[np.float32]) -> Stub:
 def noise(seed: int, count: int = 5000) -> NDArray[np.float32]:
     """Points all over the place, (count, 3): no surface anywhere."""
     return np.random.default_rng(seed).uniform(-30, 30, (count, 3)).astype(np.float32)
+
+
+class StampedInTheMiddle:
+    """The same scans stamped half a sweep of 0.1 s later, with times about that."""
+
+    HALF_NS = 50_000_000
+
+    def __init__(self, sequence: Sequence) -> None:
+        self.sequence = sequence
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.sequence, name)
+
+    def __len__(self) -> int:
+        return len(self.sequence)
+
+    @property
+    def stamps_ns(self) -> NDArray[np.int64]:
+        return self.sequence.stamps_ns + self.HALF_NS
+
+    def scan(self, index: int) -> Scan:
+        scan = self.sequence.scan(index)
+        assert scan.times is not None
+        return replace(scan, stamp_ns=scan.stamp_ns + self.HALF_NS, times=scan.times - np.float32(1e-9 * self.HALF_NS))
 
 
 class Standstill:

@@ -25,7 +25,7 @@ from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan import Scan
 from lslam.types.scan_result import ScanResult
 
-AT_ONCE = MotionPrior(np.zeros(1), np.eye(4)[None])
+AT_ONCE = MotionPrior.at_once(np.eye(4))
 
 
 def config_of(*settings: str) -> Config:

@@ -16,10 +16,10 @@ from lslam.inertial.gyroscope import Gyroscope
 from lslam.pipeline.tracker import Loaded, Tracker
 from lslam.types.imu import ImuStream
 from lslam.types.motion_prior import MotionPrior
-from lslam.types.scan import Scan
+from lslam.types.scan import Scan, Span
 from lslam.types.scan_result import ScanResult
 
-SPAN_S = 0.1
+SPAN_S, NO_SPAN = 0.1, Span()
 
 
 class Oracle:
@@ -88,19 +88,49 @@ class Priced(Oracle):
 
     def register(self, scan: Scan, prepared: Scan, prior: MotionPrior) -> ScanResult:
         self.calls.append(scan.index)
-        off = float(np.linalg.norm(prior.start[:3, 3] - self.poses[scan.index][:3, 3]))
+        off = float(np.linalg.norm(prior.pose[:3, 3] - self.poses[scan.index][:3, 3]))
         steps = 1 + int(off / 0.05)
         is_found = off < self.lost_m and (scan.index, self.calls.count(scan.index)) not in self.missed
-        pose, status = (self.poses[scan.index], "ok") if is_found else (prior.start, "bridged")
+        pose, status = (self.poses[scan.index], "ok") if is_found else (prior.pose, "bridged")
         return ScanResult(scan.index, scan.stamp_ns, pose, status, iterations=steps, stages={"register": 0.01 * steps})  # type: ignore[arg-type]
 
     def update(self, scan: Scan, prepared: Scan, prior: MotionPrior, result: ScanResult) -> ScanResult:
         return replace(result, stages={**result.stages, "update": 7.0})
 
 
+class Misled(Priced):
+    """Sure of a place three metres off at one scan, or lost; near the prior it finds the truth, nothing, or a false place."""
+
+    FALSE_AT, FALSE_M = 20, 3.0
+    near = "true"
+    is_lost = False
+    off_m = 0.0
+
+    def register(self, scan: Scan, prepared: Scan, prior: MotionPrior) -> ScanResult:
+        found = super().register(scan, prepared, prior)
+        pose = found.T_world_lidar.copy()
+        pose[0, 3] += self.FALSE_M * (scan.index == self.FALSE_AT)
+        is_lost = self.is_lost and scan.index == self.FALSE_AT
+        return replace(
+            found, T_world_lidar=prior.pose if is_lost else pose, status="bridged" if is_lost else "ok",
+            reason="lost" if is_lost else "", registration_covariance=1e-6 * np.eye(6),
+        )  # fmt: skip
+
+    def register_near(self, scan: Scan, prepared: Scan, prior: MotionPrior) -> ScanResult:
+        again = self.register(scan, prepared, prior)
+        self.off_m = max(self.off_m, float(np.linalg.norm(prior.pose[:3, 3] - self.poses[scan.index, :3, 3])))
+        if self.near == "nothing":
+            return replace(again, status="bridged", T_world_lidar=prior.pose)
+        pose = self.poses[scan.index].copy()
+        if scan.index == self.FALSE_AT:
+            pose[0, 3] += {"true": 0.0, "elsewhere": 1.0, "same": self.FALSE_M}[self.near]
+        return replace(again, status="ok", reason="", T_world_lidar=pose)
+
+
 def braked(
-    lost_m: float = np.inf, gap: tuple[float, float] = (0.0, 0.0), missed: Misses = frozenset()
-) -> tuple[Priced, list[ScanResult]]:
+    lost_m: float = np.inf, gap: tuple[float, float] = (0.0, 0.0), missed: Misses = frozenset(),
+    kind: type[Priced] = Priced, span: Span = NO_SPAN,
+) -> tuple[Priced, list[ScanResult]]:  # fmt: skip
     """From 40 m/s by 8 m/s2 with an IMU that knows all but in a `gap` (s): constant velocity is 8 cm wrong at each scan."""
     count, brake = 45, -8.0
     t = 0.1 * np.arange(count)
@@ -118,11 +148,66 @@ def braked(
         Gyroscope.of_bias(np.zeros(3), 1e-6),
         1e-8 * np.eye(9),
     )
-    oracle = Priced(np.asarray(poses))
+    oracle = kind(np.asarray(poses))
     oracle.lost_m, oracle.missed = lost_m, missed
     tracker = Tracker(oracle, motion=InertialMotion(imu, np.eye(4), known, ImuConfig(use=True)))
-    scans = [Scan(np.ones((3, 3), np.float32), int(1e9 * k * 0.1), k) for k in range(count)]
+    times = np.linspace(*span, 3, dtype=np.float32)
+    scans = [Scan(np.ones((3, 3), np.float32), int(1e9 * k * 0.1), k, times=times) for k in range(count)]
     return oracle, [tracker.track(Loaded(k, scan.stamp_ns, scan, scan)) for k, scan in enumerate(scans)]
+
+
+WHY = "registration is 3.00 m and 0.0 deg from what the IMU felt"
+
+
+@pytest.mark.parametrize(
+    ("near", "is_lost", "off_m", "reason"),
+    [
+        ("true", False, 0.0, ""),
+        ("nothing", False, 0.0, WHY),
+        ("elsewhere", False, 0.0, WHY),
+        ("same", False, Misled.FALSE_M, ""),
+        ("true", True, 0.0, ""),
+        ("nothing", True, 0.0, "lost"),
+        ("elsewhere", True, 0.0, "lost"),
+    ],
+)
+def test_a_scan_that_is_lost_or_denied_is_sought_again_where_the_imu_expects_it(
+    near: str, is_lost: bool, off_m: float, reason: str
+) -> None:
+    """Found there, it is there; found where it was denied from there too, it is right and the IMU wrong."""
+    oracle, results = braked(kind=type("Told", (Misled,), {"near": near, "is_lost": is_lost}))
+    denied = results[Misled.FALSE_AT]
+    assert oracle.calls.count(denied.index) == 2
+    off = denied.T_world_lidar[:3, 3] - oracle.poses[denied.index, :3, 3]
+    np.testing.assert_allclose(off, [off_m, 0, 0], atol=1e-2)
+    assert (denied.status, denied.reason) == ("bridged" if reason else "ok", reason)
+    assert denied.iterations == 2
+
+
+def test_it_is_sought_where_the_imu_expects_it_and_not_where_it_was_denied(monkeypatch: pytest.MonkeyPatch) -> None:
+    """However little the sweep changes: deskewed anew, it begins at the false place."""
+    monkeypatch.setattr(Tracker, "REFINE_M", -1.0)
+    oracle, results = braked(kind=Misled, span=Span(0.0, SPAN_S))
+    denied = results[Misled.FALSE_AT]
+    assert isinstance(oracle, Misled)
+    assert oracle.calls.count(denied.index) == 3
+    assert 0.0 < oracle.off_m < 0.05
+    assert denied.status == "ok"
+    np.testing.assert_allclose(denied.T_world_lidar, oracle.poses[denied.index], atol=0.02)
+
+
+def test_nothing_is_sought_where_a_silent_imu_expects_nothing() -> None:
+    oracle, results = braked(gap=(1.5, 2.6), kind=type("Told", (Misled,), {"is_lost": True}))
+    lost = results[Misled.FALSE_AT]
+    assert (lost.status, lost.reason, oracle.calls.count(lost.index)) == ("bridged", "lost", 1)
+
+
+def test_a_first_sweep_that_began_before_the_imu_is_deskewed_once_the_second_tells_the_speed() -> None:
+    """Stamped in the middle: of the second sweep, and of all since the first stamp, the IMU tells."""
+    for begins_s, asked in ((0.08, 2), (0.0, 1)):
+        oracle, results = braked(gap=(-1.0, begins_s), span=Span(-0.5 * SPAN_S, 0.5 * SPAN_S))
+        assert all(r.status == "ok" for r in results)
+        assert oracle.calls.count(0) == asked
 
 
 def test_some_scans_tell_what_the_imu_saves() -> None:

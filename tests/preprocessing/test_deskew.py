@@ -11,15 +11,16 @@ from lslam.geometry import se3
 from lslam.preprocessing.deskew import KNOTS, deskew, deskew_points
 from lslam.preprocessing.prepare import prepare_points
 from lslam.types.motion_prior import MotionPrior
+from lslam.types.scan import Scan, Span
 
 # 15 m/s and 150 deg/s, as a 0.1 s sweep sees them.
 TWIST = np.array([1.5, 0.05, -0.02, 0.03, -0.02, np.deg2rad(15.0)])
 
 
-def sweep(knots: int, twist: NDArray[np.float64] = TWIST, span: float = 0.1) -> MotionPrior:
-    times = np.linspace(0.0, span, knots)
-    start = se3.exp(np.array([30.0, -20.0, 1.0, 0.1, 0.2, 2.0]))
-    return MotionPrior(times, start @ se3.exp(times[:, None] / span * twist))
+def sweep(knots: int, twist: NDArray[np.float64] = TWIST, begin: float = 0.0) -> MotionPrior:
+    times = begin + np.linspace(0.0, 0.1, knots)
+    pose = se3.exp(np.array([30.0, -20.0, 1.0, 0.1, 0.2, 2.0]))
+    return MotionPrior(times, pose @ se3.exp(times[:, None] / 0.1 * twist))
 
 
 def cloud(n: int = 3000) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -27,15 +28,18 @@ def cloud(n: int = 3000) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     return rng.uniform(-60, 60, (n, 3)).astype(np.float32), rng.uniform(0, 0.1, n).astype(np.float32)
 
 
+@pytest.mark.parametrize("begin", [0.0, -0.05, -0.037, -0.1])
 @pytest.mark.parametrize("knots", [2, 11, KNOTS])
-def test_every_point_is_carried_by_the_pose_at_its_time(knots: int) -> None:
+def test_every_point_is_carried_by_the_pose_at_its_time(knots: int, begin: float) -> None:
+    """To the stamp: where the sweep begins, in its middle, elsewhere, at its end."""
     points, times = cloud()
-    moved = deskew_points(points, times, sweep(knots))
-    T_start_point = se3.exp(times[:, None].astype(float) / 0.1 * TWIST)
-    expected = np.einsum("nij,nj->ni", T_start_point[:, :3, :3], points.astype(float)) + T_start_point[:, :3, 3]
+    times += np.float32(begin)
+    moved = deskew_points(points, times, sweep(knots, begin=begin))
+    T_stamp_point = se3.exp(times[:, None].astype(float) / 0.1 * TWIST)
+    expected = np.einsum("nij,nj->ni", T_stamp_point[:, :3, :3], points.astype(float)) + T_stamp_point[:, :3, 3]
     # Between two knots translation runs straight and not along the screw.
     np.testing.assert_allclose(moved, expected, atol=0.06 if knots == 2 else 2e-3)
-    assert np.linalg.norm(moved - points, axis=1).max() > 5.0
+    assert np.linalg.norm(moved - points, axis=1).max() > 5.0 * max(-begin, 0.1 + begin) / 0.1
 
 
 def test_what_has_no_times_or_no_motion_is_left_alone() -> None:
@@ -46,11 +50,13 @@ def test_what_has_no_times_or_no_motion_is_left_alone() -> None:
     assert deskew(prepared, sweep(5)) is prepared
 
 
-def test_points_without_a_finite_time_keep_their_place_and_harm_nobody() -> None:
+@pytest.mark.parametrize("begin", [0.0, -0.05])
+def test_points_without_a_finite_time_keep_their_place_and_harm_nobody(begin: float) -> None:
     points, times = cloud(100)
-    good = deskew_points(points, times, sweep(KNOTS))
+    good = deskew_points(points, times, sweep(KNOTS, begin=begin))
     times[7] = np.nan
-    moved = deskew_points(points, times, sweep(KNOTS))
+    assert Scan(points, 0, 0, None, times).span == Span(0.0, float(np.nanmax(times)))
+    moved = deskew_points(points, times, sweep(KNOTS, begin=begin))
     np.testing.assert_allclose(moved[7], points[7], atol=1e-5)
     np.testing.assert_array_equal(np.delete(moved, 7, 0), np.delete(good, 7, 0))
 

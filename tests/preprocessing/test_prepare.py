@@ -31,11 +31,11 @@ def same(a: PreparedPoints, b: PreparedPoints) -> bool:
 
 def test_map_points_are_centroids_and_source_points_centroids_of_these() -> None:
     points = street(20_000)
-    config = PreprocessConfig(range_max=50.0, downsample="grid", source_voxel=1.2)
+    config = PreprocessConfig(range_max=50.0, downsample="grid", source_voxel=1.2, least_line=0)
     out = prepare_points(points, config)
     kept = points[gate_points(points, config)]
-    map_points, _, _ = voxel.centroids(kept, UNTIMED, config.map_leaf)
-    source, _, scatter = voxel.centroids(map_points, UNTIMED, 1.2)
+    map_points, _, _, _ = voxel.centroids(kept, UNTIMED, config.map_leaf)
+    source, _, scatter, _ = voxel.centroids(map_points, UNTIMED, 1.2)
     np.testing.assert_array_equal(out.map_points, map_points)
     np.testing.assert_array_equal(out.source, source)
     np.testing.assert_array_equal(out.scatter, scatter)

@@ -30,6 +30,9 @@ def test_an_excerpt_without_velodyne_stamps(tmp_path: Path) -> None:
     assert s.stamps_ns[0] == 1317042272_000000000
     assert s.scan(0).times is None
     assert said(s.notes, "scan i goes with OXTS sample i")
+    assert said(
+        s.notes, "motion compensated: yes (KITTI raw sync drives count as motion compensated; motion_compensated ="
+    )
     assert s.problems == []
     assert s.calibration.T_lidar_imu is not None
     assert s.calibration.T_cam0_lidar is not None
@@ -59,37 +62,57 @@ def test_velodyne_stamps_are_used_when_they_are_there(tmp_path: Path) -> None:
     assert said(s.notes, "interpolated")
 
 
-def test_distorted_scans_begin_half_a_sweep_before_the_scanner_looks_ahead(tmp_path: Path) -> None:
+def test_untwisted_scans_keep_the_stamp_of_the_scanner_looking_ahead(tmp_path: Path) -> None:
+    """OXTS, cameras and whoever pairs pose i with sample i mean that instant: times lie about it."""
     folder = raw_drive(tmp_path)
-    # OXTS goes with the scanner looking ahead.
     s = open_sequence(folder, motion_compensated=False)
-    assert s.stamps_ns[0] == 1317042271_950000000
-    assert s.scan(0).times is not None
-    assert said(s.notes, "each scan begins half a sweep earlier")
+    np.testing.assert_array_equal(s.stamps_ns, open_sequence(folder).stamps_ns)
+    scan = s.scan(0)
+    assert scan.times is not None
+    np.testing.assert_allclose(scan.span, (-0.05, 0.05), atol=1e-3)
+    # Clockwise from behind: zero ahead, the left side before it.
+    azimuth = np.arctan2(scan.points[:, 1], scan.points[:, 0])
+    np.testing.assert_allclose(scan.times, -0.05 * azimuth / np.pi, atol=1e-7)
     lines = "".join(f"2011-09-26 13:04:32.{k * 100 + 3:03d}000001\n" for k in range(6))
     (folder / "velodyne_points" / "timestamps.txt").write_text(lines)
-    assert open_sequence(folder, motion_compensated=False).stamps_ns[1] == 1317042272_053000001
+    assert open_sequence(folder, motion_compensated=False).stamps_ns[1] == 1317042272_103000001
 
 
-def test_stamps_that_the_user_names_are_those_of_scan_starts_as_they_are(tmp_path: Path) -> None:
-    folder = raw_drive(tmp_path)
+@pytest.mark.parametrize(("kind", "begin"), [("sync", -0.05), ("extract", 0.0)])
+def test_stamps_that_the_user_names_are_taken_as_they_are(tmp_path: Path, kind: str, begin: float) -> None:
+    folder = raw_drive(tmp_path, name=f"2011_09_26_drive_0005_{kind}")
     lines = "".join(f"2011-09-26 13:04:32.{k * 100 + 3:03d}000000\n" for k in range(6))
     (folder / "timestamps.txt").write_text(lines)
     write_sequence_toml(folder / "sequence.toml", SequenceInfo(stamps="timestamps.txt"))
-    assert open_sequence(folder, motion_compensated=False).stamps_ns[1] == 1317042272_103000000
-
-
-def test_the_start_of_the_sweep_is_taken_where_it_is_known(tmp_path: Path) -> None:
-    folder = raw_drive(tmp_path)
-    for name, shift in (("timestamps", 3), ("timestamps_start", 0), ("timestamps_end", 96)):
-        lines = "".join(f"2011-09-26 13:04:32.{k * 100 + shift:03d}000000\n" for k in range(6))
-        (folder / "velodyne_points" / f"{name}.txt").write_text(lines)
     s = open_sequence(folder, motion_compensated=False)
-    assert s.stamps_ns[1] == 1317042272_100000000
-    assert not said(s.notes, "half a sweep")
-    times = s.scan(1).times
-    assert times is not None
-    assert 0.09 < times.max() <= np.float32(0.096)
+    assert s.stamps_ns[1] == 1317042272_103000000
+    np.testing.assert_allclose(s.scan(1).span, (begin, begin + 0.1), atol=1e-3)
+
+
+# Kind of drive, files that are there, stamp of the second scan in ms, begin of its sweep in s, what is said.
+SWEEPS = [
+    ("sync", ("", "_start", "_end"), 148, -0.048, ""),
+    ("sync", ("_start", "_end"), 148, -0.048, "the scanner looks ahead half a sweep later"),
+    ("extract", ("", "_start", "_end"), 100, 0.0, ""),
+    ("extract", ("", "_end"), 98, 0.0, "each scan begins half a sweep earlier"),
+]
+
+
+@pytest.mark.parametrize(("kind", "files", "stamp", "begin", "words"), SWEEPS)
+def test_stamps_and_sweeps_by_the_files_that_are_there(
+    tmp_path: Path, kind: str, files: tuple[str, ...], stamp: int, begin: float, words: str
+) -> None:
+    folder = raw_drive(tmp_path, name=f"2011_09_26_drive_0005_{kind}")
+    for name, shift in (("", 48), ("_start", 0), ("_end", 96)):
+        lines = "".join(f"2011-09-26 13:04:32.{k * 100 + shift:03d}000000\n" for k in range(6))
+        if name in files:
+            (folder / "velodyne_points" / f"timestamps{name}.txt").write_text(lines)
+    s = open_sequence(folder, motion_compensated=False)
+    assert s.stamps_ns[1] == 1317042272_000000000 + stamp * 10**6
+    assert said(s.notes, "half a sweep") == bool(words)
+    assert said(s.notes, words)
+    seconds = 0.096 if "_start" in files else 0.1
+    np.testing.assert_allclose(s.scan(1).span, (begin, begin + seconds), atol=1e-3)
 
 
 def test_compensated_scans_keep_the_instant_of_their_stamps(tmp_path: Path) -> None:
@@ -116,10 +139,10 @@ def test_stamps_of_the_nearest_oxts_samples_are_evened_out(tmp_path: Path, late:
     (folder / "oxts" / "timestamps.txt").write_text("".join(f"2011-09-26 13:04:{t:012.9f}\n" for t in nearest))
     s = open_sequence(folder, motion_compensated=False)
     assert said(s.notes, "evened out") == evened
-    begun = s.stamps_ns - 1317042240_000000000 + 51_650_000
+    taken = s.stamps_ns - 1317042240_000000000
     if evened:
         assert s.rate_hz == pytest.approx(1 / 0.1033, rel=2e-3)
-        assert np.abs(begun * 1e-9 - true).max() < 1.5e-3
+        assert np.abs(taken * 1e-9 - true).max() < 1.5e-3
     else:
         np.testing.assert_allclose(np.diff(s.stamps_ns) * 1e-9, np.diff(nearest), atol=1e-8)
 

@@ -1,0 +1,85 @@
+"""Scans stamped in the middle of their sweeps, as KITTI's are: the same drive, poses half a sweep later, the same map."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+from stub_sequences import StampedInTheMiddle, Stub
+
+from lslam.config import load_config
+from lslam.formats.point_files import read_points
+from lslam.formats.trajectory_files import read_trajectory
+from lslam.geometry import se3
+from lslam.pipeline.run import run
+from lslam.simulation.scenarios import SimulatedDrive, simulate
+from lslam.types.sequence import Sequence
+
+Floats = NDArray[np.float64]
+COUNT = 30
+
+
+@cache
+def drive() -> SimulatedDrive:
+    """A walk, looking about at up to 110 deg/s, rays fired on the way."""
+    return simulate("walk", lidar="vlp16", count=COUNT, imu="icm20948", motion_compensated=False)
+
+
+@cache
+def scans() -> Stub:
+    walk = drive()
+    loaded = [walk.scan(i) for i in range(COUNT)]
+    return Stub(loaded, None, walk.calibration, motion_compensated=False, imu=walk.imu)  # type: ignore[arg-type]
+
+
+def walked(in_the_middle: bool) -> Sequence:
+    fresh = dataclasses.replace(scans(), problems=[], reads=[], notes=[])
+    return StampedInTheMiddle(fresh) if in_the_middle else fresh
+
+
+def poses_of(sequence: Sequence, method: str, use_imu: bool) -> Floats:
+    settings = [f"odometry.method={method}", f"imu.use={str(use_imu).lower()}", "loops.use=false"]
+    results = run(sequence, load_config(None, settings, {})).record.results
+    assert all(r.status == "ok" for r in results)
+    return np.stack([r.T_world_lidar for r in results])
+
+
+def rmse(poses: Floats, sequence: Sequence) -> float:
+    """Position error, m, against the truth at the sequence's stamps, both starting at the same pose."""
+    true = drive().vehicle.poses(sequence.stamps_ns * 1e-9)
+    off = poses[:, :3, 3] - se3.relative(true[0], true)[:, :3, 3]
+    return float(np.sqrt(np.mean(np.sum(off**2, axis=1))))
+
+
+@pytest.mark.parametrize(("method", "use_imu"), [("icp", False), ("icp", True), ("loam", False)])
+def test_poses_are_as_good_wherever_the_stamp_lies(method: str, use_imu: bool) -> None:
+    start, middle = walked(False), walked(True)
+    early, late = poses_of(start, method, use_imu), poses_of(middle, method, use_imu)
+    assert rmse(late, middle) < 1.25 * rmse(early, start) + 2e-3
+    # They do not belong to the starts: the sentinel.
+    assert rmse(late, start) > 2 * rmse(late, middle)
+
+
+def test_what_is_written_belongs_to_the_middle(tmp_path: Path) -> None:
+    settings = ["input.count=15", "loops.use=false", "report.html=false"]
+    clouds = []
+    for name, sequence in (("scan_start", walked(False)), ("scan_middle", walked(True))):
+        run(sequence, load_config(None, settings, {}), out=tmp_path / name)
+        manifest = json.loads((tmp_path / name / "manifest.json").read_text())
+        assert manifest["frames"]["pose_time"] == name
+        for path in ("trajectory.tum", "trajectory_odometry.tum"):
+            assert f"# pose_time: {name}\n" in (tmp_path / name / path).read_text()
+        stamps = read_trajectory(tmp_path / name / "trajectory.tum").stamps_ns
+        np.testing.assert_array_equal(stamps, sequence.stamps_ns[:15])
+        clouds.append(read_points(tmp_path / name / "map.ply").points)
+    # Each map counts from the LiDAR at its first stamp.
+    moved = se3.apply(se3.relative(*drive().vehicle.poses(np.array([0.0, 0.05]))), clouds[1])
+    near = cKDTree(clouds[0])
+    apart, as_it_is = (float(np.median(near.query(points)[0])) for points in (moved, clouds[1]))
+    assert apart < 0.15 < 0.3 * as_it_is
