@@ -39,6 +39,7 @@ HOMES = {
     "embreex": ["simulation/lidar.py"],
     "open3d": ["maps/", "odometry/open3d.py"],
     "requests": ["priors/overpass.py"],
+    "urllib3": ["priors/overpass.py"],
     "pyproj": ["geometry/geodesy.py", "maps/georeference.py"],
     "dask": ["studies/cluster.py"],
     "distributed": ["studies/cluster.py"],

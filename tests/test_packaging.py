@@ -10,6 +10,8 @@ import subprocess
 import sys
 import time
 import tomllib
+from collections.abc import Mapping
+from functools import cache
 from importlib.metadata import distribution, entry_points, packages_distributions
 from pathlib import Path
 from typing import Any
@@ -79,8 +81,14 @@ def third_party(folder: Path) -> dict[str, list[str]]:
 ABSENT = {"rerun": "rerun-sdk"}
 
 
+@cache
+def distributions() -> Mapping[str, list[str]]:
+    """Of every installed top module; listing them takes a second."""
+    return packages_distributions()
+
+
 def provider(module: str) -> set[str]:
-    return {canonical(name) for name in packages_distributions().get(module, [ABSENT.get(module, module)])}
+    return {canonical(name) for name in distributions().get(module, [ABSENT.get(module, module)])}
 
 
 # -- what is declared
