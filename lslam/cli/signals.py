@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import logging
 import signal
+import sys
+from _thread import interrupt_main
 from collections.abc import Iterator
 from contextlib import contextmanager
+from threading import Timer
 
 log = logging.getLogger("lslam")
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
+AGAIN_S = 0.05
 
 
 class GentleStop:
@@ -34,8 +38,21 @@ def gentle_stop() -> Iterator[GentleStop]:
     """Install the handlers for the length of the block."""
     stop = GentleStop()
     previous = [(number, signal.signal(number, stop.on_signal)) for number in SIGNALS]
+    report = sys.unraisablehook
+
+    def on_lost(lost: sys.UnraisableHookArgs) -> None:
+        # Python loses what is raised in a finaliser or a callback of LLVM, where compiling spends its time: raise it again.
+        if issubclass(lost.exc_type, KeyboardInterrupt):
+            again = Timer(AGAIN_S, interrupt_main)
+            again.daemon = True
+            again.start()
+        else:
+            report(lost)
+
+    sys.unraisablehook = on_lost
     try:
         yield stop
     finally:
+        sys.unraisablehook = report
         for number, handler in previous:
             signal.signal(number, handler)
