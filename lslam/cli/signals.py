@@ -5,10 +5,9 @@ from __future__ import annotations
 import logging
 import signal
 import sys
-from _thread import interrupt_main
 from collections.abc import Iterator
 from contextlib import contextmanager
-from threading import Timer
+from threading import Timer, main_thread
 
 log = logging.getLogger("lslam")
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
@@ -43,7 +42,7 @@ def gentle_stop() -> Iterator[GentleStop]:
     def on_lost(lost: sys.UnraisableHookArgs) -> None:
         # Python loses what is raised in a finaliser or a callback of LLVM, where compiling spends its time: raise it again.
         if issubclass(lost.exc_type, KeyboardInterrupt):
-            again = Timer(AGAIN_S, interrupt_main)
+            again = Timer(AGAIN_S, signal.pthread_kill, (main_thread().ident, signal.SIGINT))
             again.daemon = True
             again.start()
         else:
