@@ -77,6 +77,8 @@ def fetch(
         raise click.UsageError("--refresh asks the server and --offline never does: give one of them")
     if bbox is not None and radius is not None:
         raise click.UsageError("--radius goes with --around or --along; a --bbox has its size")
+    if origin is not None and along is None:
+        raise click.UsageError("--origin goes with --along, and says where a trajectory in metres lies")
     if out.suffix.lower() not in (".osm", ".xml", ".json"):
         raise click.UsageError(f"--out {out}: end the name with .osm or .json")
     console.setup_logging(verbose, quiet)

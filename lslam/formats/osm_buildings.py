@@ -70,7 +70,7 @@ def buildings_of(data: OsmData, origin: NDArray[Any], source: str = "the extract
     where = _Positions(data, at)
     if data.nodes and not (away := where.distance()) < FARTHEST:
         far = "more than a continent" if not np.isfinite(away) else _far(away)
-        raise InputError(f"{source} lies {far} away from the origin: {_way_out(at)}")
+        raise InputError(f"{source} lies {far} away from the origin: {_way_out(at, _is_swapped(data, at))}")
     skipped: Counter[str] = Counter()
     of_relations: list[Building] = []
     outlines: set[int] = set()
@@ -241,7 +241,17 @@ def _written_tags(building: Building) -> dict[str, str]:
     return tags
 
 
-def _way_out(origin: Floats) -> str:
+def _is_swapped(data: OsmData, origin: Floats) -> bool:
+    """True when data and origin are of one place, but for the order of latitude and longitude."""
+    return abs(float(origin[1])) <= 90 and _Positions(data, origin[[1, 0, 2]]).distance() < FARTHEST
+
+
+def _way_out(origin: Floats, is_swapped: bool = False) -> str:
+    if is_swapped:
+        return (
+            f"latitude and longitude are swapped, in --origin ({origin[0]:.5f},{origin[1]:.5f}; latitude first) or in the file "
+            "(GeoJSON has the longitude first)"
+        )
     return f"check --origin ({origin[0]:.5f},{origin[1]:.5f}) or fetch the extract of that place"
 
 

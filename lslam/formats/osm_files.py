@@ -8,9 +8,9 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 from xml.etree.ElementTree import Element, ParseError
 from xml.sax.saxutils import quoteattr
 
@@ -22,6 +22,9 @@ ATTRIBUTION = "© OpenStreetMap contributors, ODbL 1.0, openstreetmap.org/copyri
 GENERATOR = "lslam"
 DECIMALS = 7  # of a degree, as in OpenStreetMap's own database: 1.1 cm
 WAY_OUT = "fetch the extract again"
+# Marks of byte order, the zeros of wide characters, and blanks, before the first that counts.
+_BEFORE = b"\xef\xbb\xbf\xff\xfe\0 \t\r\n"
+_UTF16 = (b"\xff\xfe", b"\xfe\xff")
 # First bytes of gzip, bzip2, xz, zip and Zstandard.
 _COMPRESSED = (b"\x1f\x8b", b"BZh", b"\xfd7zXZ", b"PK\x03\x04", b"\x28\xb5\x2f\xfd")
 
@@ -73,6 +76,7 @@ class OsmData:
     attribution: str | None = ATTRIBUTION
     versions: dict[tuple[str, int], int] = field(default_factory=dict)
     modified: set[tuple[str, int]] = field(default_factory=set)
+    _drawn: dict[int, list[tuple[float, float] | None]] = field(default_factory=dict, repr=False, compare=False)
 
     def add_version(self, kind: str, number: int, version: Any) -> None:
         """Remember an element's version where it says another than 1."""
@@ -98,6 +102,26 @@ class OsmData:
         if relation.tags or relation.id not in self.relations:
             self.relations[relation.id] = relation
 
+    def draw_way(self, number: int, places: Iterable[tuple[Any, Any] | None]) -> None:
+        """Say where a way runs whose nodes have no numbers (Overpass' `out geom`); None of a node outside the box asked for."""
+        self._drawn.setdefault(number, [None if p is None else (float(p[0]), float(p[1])) for p in places])
+
+    def number_drawn(self) -> None:
+        """When all is read: ways that are only drawn get nodes, with numbers below zero where the place has none yet."""
+        at = {place: number for number, place in self.nodes.items()} if self._drawn else {}
+        fresh = min([0, *self.nodes]) - 1
+        for number, places in self._drawn.items():
+            way = self.ways.get(number, Way(number, ()))
+            if None in places or (way.nodes and all(node in self.nodes for node in way.nodes)):
+                continue
+            for place in places:
+                if place is not None and place not in at:
+                    self.add_node(fresh, *place)
+                    at[place] = fresh
+                    fresh -= 1
+            self.ways[number] = replace(way, nodes=tuple(at[place] for place in places if place is not None))
+        self._drawn.clear()
+
 
 def read_osm(path: Path) -> OsmData:
     """Read an OSM XML file, a stored Overpass reply (JSON) or outlines in GeoJSON; the content decides, not the name.
@@ -111,11 +135,11 @@ def read_osm(path: Path) -> OsmData:
             raise InputError(
                 f"{path} is compressed: turn it into plain XML first (gunzip, bunzip2, or osmium cat -o map.osm)"
             )
-        first = start.removeprefix(b"\xef\xbb\xbf").lstrip()[:1]
+        first = start.lstrip(_BEFORE)[:1]
         if first not in (b"<", b"{", b"["):
             what = "is neither XML nor JSON" if first else "is empty"
             raise InputError(f"{path} {what}, so it is no OpenStreetMap extract: {WAY_OUT}")
-        return _read_xml(path) if first == b"<" else _read_json(path)
+        return _read_xml(path, start.startswith(_UTF16)) if first == b"<" else _read_json(path)
     except OSError as error:
         raise InputError(f"{path} cannot be read: {cause(error)}") from None
 
@@ -133,6 +157,7 @@ def from_overpass(tree: Any) -> OsmData:
             _add_json(data, element)
         except (AttributeError, KeyError, TypeError, OverflowError) as error:
             raise ValueError(f"an element without {error}: {str(element)[:80]}") from None
+    data.number_drawn()
     return data
 
 
@@ -168,28 +193,30 @@ def _add_json(data: OsmData, element: dict[str, Any]) -> None:
         for node, place in zip(nodes, element.get("geometry", ()), strict=False):
             if place is not None:
                 data.add_node(node, place["lat"], place["lon"])
+        if not nodes and "geometry" in element:
+            data.draw_way(number, _places(element["geometry"]))
         data.add_way(Way(number, nodes, tags))
     elif kind == "relation":
         members = element.get("members", ())
         found = tuple(Member(str(m["type"]), int(m["ref"]), str(m.get("role", ""))) for m in members)
+        for member in members:
+            if member["type"] == "way" and "geometry" in member:
+                data.draw_way(int(member["ref"]), _places(member["geometry"]))
         data.add_relation(Relation(number, found, tags))
 
 
-def _read_xml(path: Path) -> OsmData:
-    """Element by element, each forgotten once it is understood: a town's extract is large."""
-    from defusedxml import DefusedXmlException, DTDForbidden
-    from defusedxml.ElementTree import iterparse
+def _places(geometry: list[Any]) -> list[tuple[Any, Any] | None]:
+    """Where nodes without numbers are; None of those outside the box asked for, of which XML says nothing more either."""
+    return [(place["lat"], place["lon"]) if place and "lat" in place else None for place in geometry]
 
-    data, root = OsmData(), None
+
+def _read_xml(path: Path, is_wide: bool) -> OsmData:
+    from defusedxml import DefusedXmlException, DTDForbidden
+
     try:
-        for event, element in iterparse(path, events=("start", "end"), forbid_dtd=True):
-            if root is None:
-                root = element
-                _check_root(path, root)
-                _take_attribution(data, root)
-            elif event == "end" and element.tag in ("node", "way", "relation"):
-                _add_xml(data, element)
-                root.clear()
+        # What a shell turned into UTF-16 still says of itself that it is UTF-8.
+        with path.open(encoding="utf-16") if is_wide else path.open("rb") as stream:
+            return _parsed_xml(path, stream)
     except DTDForbidden as error:
         if str(error.name).lower() == "html":
             raise InputError(f"{path} is a web page and no OpenStreetMap extract: {WAY_OUT}") from None
@@ -198,10 +225,26 @@ def _read_xml(path: Path) -> OsmData:
         ) from None
     except DefusedXmlException:
         raise InputError(f"{path} declares entities, which no OpenStreetMap file does: {WAY_OUT}") from None
-    except ParseError as error:
+    except (ParseError, UnicodeError) as error:
         raise InputError(f"{path} is broken XML or cut short ({error}): {WAY_OUT}") from None
     except (KeyError, ValueError, LookupError) as error:
         raise InputError(f"{path} holds an element that makes no sense ({error}): {WAY_OUT}") from None
+
+
+def _parsed_xml(path: Path, stream: IO[Any]) -> OsmData:
+    """Element by element, each forgotten once it is understood: a town's extract is large."""
+    from defusedxml.ElementTree import iterparse
+
+    data, root = OsmData(), None
+    for event, element in iterparse(stream, events=("start", "end"), forbid_dtd=True):
+        if root is None:
+            root = element
+            _check_root(path, root)
+            _take_attribution(data, root)
+        elif event == "end" and element.tag in ("node", "way", "relation"):
+            _add_xml(data, element)
+            root.clear()
+    data.number_drawn()
     return data
 
 
@@ -229,14 +272,20 @@ def _add_xml(data: OsmData, element: Element) -> None:
         return
     tags = {tag.attrib["k"]: tag.attrib["v"] for tag in element.iter("tag")}
     if element.tag == "way":
-        corners = [(int(n.attrib["ref"]), n.attrib) for n in element.iter("nd")]
-        for node, place in corners:
+        corners = [n.attrib for n in element.iter("nd")]
+        if corners and "ref" not in corners[0]:
+            data.draw_way(number, _places(corners))
+            corners = []
+        for place in corners:
             if "lat" in place:
-                data.add_node(node, place["lat"], place["lon"])
-        data.add_way(Way(number, tuple(node for node, _ in corners), tags))
+                data.add_node(int(place["ref"]), place["lat"], place["lon"])
+        data.add_way(Way(number, tuple(int(place["ref"]) for place in corners), tags))
         return
-    members = (m.attrib for m in element.iter("member"))
-    found = tuple(Member(m["type"], int(m["ref"]), m.get("role", "")) for m in members)
+    members = list(element.iter("member"))
+    for member in members:
+        if member.attrib["type"] == "way" and len(member):
+            data.draw_way(int(member.attrib["ref"]), _places([n.attrib for n in member.iter("nd")]))
+    found = tuple(Member(m.attrib["type"], int(m.attrib["ref"]), m.get("role", "")) for m in members)
     data.add_relation(Relation(number, found, tags))
 
 

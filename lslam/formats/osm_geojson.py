@@ -76,7 +76,9 @@ class _Elements:
         except (TypeError, ValueError, IndexError, KeyError):
             raise ValueError(f"{str(position)[:60]} is no position") from None
         if not (math.isfinite(lon) and abs(lon) <= 180 and math.isfinite(lat) and abs(lat) <= 90):
-            raise ValueError(f"{lon:g}, {lat:g} are no degrees: {_REPROJECT}")
+            is_swapped = abs(lon) <= 90 < abs(lat) <= 180
+            way_out = "GeoJSON has the longitude first, and then the latitude" if is_swapped else _REPROJECT
+            raise ValueError(f"{lon:g}, {lat:g} are no degrees of longitude and latitude: {way_out}")
         at = (lat, lon)
         if at not in self._nodes:
             self._nodes[at] = self._fresh()

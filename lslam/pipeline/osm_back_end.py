@@ -26,7 +26,10 @@ def hold_by_buildings(osm: OsmSource, graph: PoseGraph, placement: Placement, gi
     known = placement.georeference
     origin = known.origin if known is not None else config.osm.origin
     if origin is None:
-        problems.append("OSM: without its fixes the run has no place on the map: it goes on without the buildings")
+        problems.append(
+            "OSM: without its fixes the run has no place on the map: give --origin LAT,LON of the first scan; it goes on without "
+            "the buildings"
+        )
         return None
     try:
         extract = osm.extract(np.asarray(origin, np.float64))

@@ -34,6 +34,10 @@ class Bounds:
             raise UsageError(f"{self} is no box SOUTH,WEST,NORTH,EAST in degrees, for example 49.00,8.40,49.01,8.42")
         if self.west == self.east:
             raise UsageError(f"{self} is a box without width")
+        if self.area_km2 > LARGEST_KM2 and self.west > self.east:
+            raise UsageError(
+                f"{self} goes from west to east almost round the Earth: the order is SOUTH,WEST,NORTH,EAST"
+            )
         if self.area_km2 > LARGEST_KM2:
             raise UsageError(
                 f"{self} covers {self.area_km2:.0f} km2, public servers are asked for at most {LARGEST_KM2:.0f}: take "

@@ -66,7 +66,9 @@ def fetch_buildings(
     if kept is not None:
         return kept
     if config.cache == "only":
-        raise InputError(f"no reply for {bounds} is in {folder}: fetch it with the network, osm.cache = use")
+        raise InputError(
+            f"no reply for {bounds} is in {folder}: ask a server for it once, osm.cache = use, without --offline"
+        )
     try:
         tree = _ask_patiently(bounds, config, folder, sleep)
     except InputError as error:

@@ -117,6 +117,8 @@ def test_extracts_are_shown_and_drawn(tmp_path: Path) -> None:
         ("fetch --around 8.4229", "", 2, "--around 8.4229: expected LAT,LON"),
         ("fetch --around 149,8", "", 2, "--around 149,8 is no place on the Earth"),
         ("fetch --bbox 49,8,48,9", "", 2, "is no box SOUTH,WEST,NORTH,EAST"),
+        ("fetch --bbox 49,8.42,49.01,8.40", "", 2, "almost round the Earth: the order is SOUTH,WEST,NORTH,EAST"),
+        ("fetch --bbox 49,8.4,49.01,8.42 --origin " + PLACE, "", 2, "--origin goes with --along"),
         ("fetch --bbox 45,8,49,12", "", 2, "public servers are asked for at most"),
         ("fetch", "", 2, "one of --bbox, --around and --along"),
         ("fetch --around " + PLACE + " --out town.png", "", 2, "end the name with .osm or .json"),

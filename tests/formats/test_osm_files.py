@@ -11,6 +11,7 @@ import pytest
 from osm_builders import ExtractMaker
 
 from lslam.errors import InputError, OutputError
+from lslam.formats.osm_buildings import buildings_of
 from lslam.formats.osm_files import ATTRIBUTION, Member, OsmData, Relation, Way, from_overpass, read_osm, write_osm
 
 
@@ -40,6 +41,20 @@ def test_a_byte_order_mark_and_leading_blanks_are_no_obstacle(tmp_path: Path) ->
     xml = small().write_xml(tmp_path / "a.osm")
     xml.write_bytes(b"\xef\xbb\xbf" + xml.read_bytes())
     assert len(read_osm(xml).ways) == 2
+
+
+@pytest.mark.parametrize("code", ["utf-16", "UTF-16BE"])
+def test_wide_characters_are_no_obstacle(code: str, tmp_path: Path) -> None:
+    """A shell that redirects into UTF-16 leaves the declaration of UTF-8 as it is; without a mark the declaration is right."""
+    path = small().write_xml(tmp_path / "a.osm")
+    whole, text = read_osm(path), path.read_text("utf-8")
+    path.write_bytes(text.replace("UTF-8", "UTF-8" if code == "utf-16" else code).encode(code))
+    assert read_osm(path) == whole
+    path.write_bytes(json.dumps(small().tree()).encode(code))
+    assert read_osm(path).ways == whole.ways
+    path.write_bytes(text.encode("utf-16")[:-7])
+    with pytest.raises(InputError, match="is broken XML or cut short"):
+        read_osm(path)
 
 
 def test_what_is_written_reads_back_equal(tmp_path: Path) -> None:
@@ -116,6 +131,43 @@ def test_places_written_beside_the_numbers_of_nodes_are_taken(tmp_path: Path) ->
 def bomb() -> bytes:
     levels = "".join(f'<!ENTITY a{k} "{f"&a{k - 1};" * 10}">' for k in range(1, 10))
     return f'<?xml version="1.0"?><!DOCTYPE osm [<!ENTITY a0 "ha">{levels}]><osm><tag k="&a9;"/></osm>'.encode()
+
+
+def test_ways_that_are_only_drawn_are_as_good_as_those_with_nodes(tmp_path: Path) -> None:
+    """Overpass' `out geom` draws the members of relations, and `out tags geom` ways, without numbers of nodes."""
+    maker = ExtractMaker()
+    ((lat, lon), (lat_2, lon_2)) = (
+        (float(e["lat"]), float(e["lon"])) for e in (maker.nodes([[0, 0], [10, 8]]), maker.elements)[1]
+    )
+    a, b, c, d = ({"lat": y, "lon": x} for y, x in ((lat, lon), (lat, lon_2), (lat_2, lon_2), (lat_2, lon)))
+    members = [
+        {"type": "way", "ref": 11, "role": "outer", "geometry": [a, b, c]},
+        {"type": "way", "ref": 12, "role": "outer", "geometry": [c, d, a]},
+        {"type": "node", "ref": 5, "role": "entrance", **a},
+    ]
+    house = {"type": "relation", "id": 9, "members": members, "tags": {"type": "multipolygon", "building": "yes"}}
+    shed = {"type": "way", "id": 7, "geometry": [a, b, d, a], "tags": {"building": "yes"}}
+    cut = {"type": "way", "id": 8, "geometry": [a, None, d, a], "tags": {"building": "yes"}}
+    drawn = from_overpass({"elements": [house, shed, cut]})
+    assert len(drawn.nodes) == 4, "one place is one node"
+    assert max(drawn.nodes) < 0
+    assert [len(drawn.ways[number].nodes) for number in (11, 12, 7, 8)] == [3, 3, 4, 0]
+    extract = buildings_of(drawn, np.array([lat, lon, 0.0]))
+    assert [round(one.area, 2) for one in extract.buildings] == [40.0, 80.0]
+    assert extract.skipped == {"nodes missing": 1}
+
+    def xml(corners: list[dict[str, float]]) -> str:
+        return "".join(f'<nd lat="{place["lat"]!r}" lon="{place["lon"]!r}"/>' for place in corners)
+
+    outline = "".join(
+        f'<member type="way" ref="{m["ref"]}" role="outer">{xml(m["geometry"])}</member>' for m in members[:2]
+    )
+    (tmp_path / "a.osm").write_text(
+        f'<osm><way id="7">{xml([a, b, d, a])}<tag k="building" v="yes"/></way><way id="8"><nd/>{xml([b, d])}</way>'
+        f'<relation id="9">{outline}<tag k="type" v="multipolygon"/><tag k="building" v="yes"/></relation></osm>'
+    )
+    again = buildings_of(read_osm(tmp_path / "a.osm"), np.array([lat, lon, 0.0]))
+    assert [round(one.area, 2) for one in again.buildings] == [40.0, 80.0]
 
 
 @pytest.mark.parametrize(

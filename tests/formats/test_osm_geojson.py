@@ -90,6 +90,19 @@ def test_a_building_on_the_antimeridian_is_in_one_piece(tmp_path: Path) -> None:
     np.testing.assert_allclose(building.area, 21.3 * 22.1, rtol=0.02)
 
 
+def test_swapped_degrees_are_said_to_be_swapped_whichever_side_has_them_so(tmp_path: Path) -> None:
+    corners = ring(0, 0, 10)
+    hint = r"latitude and longitude are swapped, in --origin \(%s; latitude first\) or in the file \(GeoJSON has the longitude"
+    right = written(tmp_path / "right.geojson", feature(polygon(corners), building="yes"))
+    with pytest.raises(InputError, match=hint % "8.42290,49.01120"):
+        read_buildings(right, ORIGIN[[1, 0, 2]])
+    wrong = written(tmp_path / "wrong.geojson", feature(polygon([[lat, lon] for lon, lat in corners]), building="yes"))
+    with pytest.raises(InputError, match=hint % "49.01120,8.42290"):
+        read_buildings(wrong, ORIGIN)
+    with pytest.raises(InputError, match="check --origin"):
+        read_buildings(right, np.array([-ORIGIN[0], 108.4, 0.0]))
+
+
 @pytest.mark.parametrize(
     ("document", "sentence"),
     [
@@ -98,7 +111,9 @@ def test_a_building_on_the_antimeridian_is_in_one_piece(tmp_path: Path) -> None:
             "its coordinates are in .*25832.*ogr2ogr",
         ),
         (polygon([[456000.0, 5428000.0], [456010.0, 5428000.0], [456010.0, 5428010.0], [456000.0, 5428000.0]]),
-         "456000, 5.428e.06 are no degrees: turn it into longitude"),
+         "456000, 5.428e.06 are no degrees of longitude and latitude: turn it into longitude"),
+        (polygon([[35.6, 139.7], [35.7, 139.7], [35.7, 139.8], [35.6, 139.7]]),
+         "35.6, 139.7 are no degrees of longitude and latitude: GeoJSON has the longitude first"),
         (polygon([[8.0, 49.0], [8.1, 49.0], [8.0, 49.0]]), "fewer than four positions"),
         (polygon([[8.0, 49.0], ["east"], [8.1, 49.1], [8.0, 49.0]]), "is no position"),
         ({"type": "Polygon"}, "a Polygon without a list of rings"),
