@@ -5,8 +5,6 @@ from __future__ import annotations
 import contextlib
 import ctypes
 from collections.abc import Iterator
-from importlib.util import find_spec
-from pathlib import Path
 
 from lslam.errors import InputError
 
@@ -29,16 +27,15 @@ def importing(library: str, way_out: str) -> Iterator[None]:
 def importing_open3d() -> Iterator[None]:
     """As `importing`, for Open3D: it needs libusb, libGL and libX11, which a bare machine lacks.
 
-    The libusb of the wheel `libusb-package` is loaded first where that is installed: Open3D then finds it.
+    The libusb of the wheel `libusb-package` is loaded first: Open3D then finds it.
     """
-    spec = find_spec("libusb_package")
-    for folder in spec.submodule_search_locations or () if spec is not None else ():
-        for path in sorted(Path(folder).glob("libusb-1.0*.so*")):
-            with contextlib.suppress(OSError):
-                ctypes.CDLL(str(path), mode=ctypes.RTLD_GLOBAL)
+    with contextlib.suppress(ImportError, OSError):
+        import libusb_package
+
+        ctypes.CDLL(str(libusb_package.get_library_path()), mode=ctypes.RTLD_GLOBAL)
     way_out = (
         "install it with: pip install open3d-cpu (Linux x86-64) or pip install open3d; on a bare Linux also: "
-        "apt install libusb-1.0-0 libgl1 libegl1 libx11-6 libgomp1 (without root: pip install libusb-package)"
+        "pip install libusb-package; apt install libgl1 libegl1 libx11-6 libgomp1"
     )
     with importing("Open3D", way_out):
         yield

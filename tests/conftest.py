@@ -6,9 +6,13 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 from hypothesis import settings
+
+from lslam.errors import InputError
+from lslam.foreign import importing_open3d
 
 # How long an example takes is the machine's affair.
 settings.register_profile("untimed", deadline=None)
@@ -35,3 +39,14 @@ def recordings(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path
         return target
 
     return unpack
+
+
+@pytest.fixture(scope="session")
+def open3d() -> ModuleType:
+    """Open3D; the test skips where a bare machine lacks the libGL, libEGL or libX11 that its wheel wants."""
+    try:
+        with importing_open3d():
+            import open3d
+    except InputError as error:
+        pytest.skip(str(error))
+    return open3d  # type: ignore[no-any-return]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import struct
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import pytest
@@ -61,8 +62,7 @@ def test_without_intensity(suffix: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("encoding", ENCODINGS)
-def test_open3d_reads_our_pcd_and_we_read_its(encoding: str, tmp_path: Path) -> None:
-    open3d = pytest.importorskip("open3d", exc_type=ImportError)
+def test_open3d_reads_our_pcd_and_we_read_its(encoding: str, tmp_path: Path, open3d: ModuleType) -> None:
     points, intensity = cloud()
     write_pcd(tmp_path / "ours.pcd", points, intensity, encoding)
     theirs = np.asarray(open3d.io.read_point_cloud(str(tmp_path / "ours.pcd")).points)
@@ -74,8 +74,7 @@ def test_open3d_reads_our_pcd_and_we_read_its(encoding: str, tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize("ascii_", [True, False])
-def test_open3d_reads_our_ply_and_we_read_its(ascii_: bool, tmp_path: Path) -> None:
-    open3d = pytest.importorskip("open3d", exc_type=ImportError)
+def test_open3d_reads_our_ply_and_we_read_its(ascii_: bool, tmp_path: Path, open3d: ModuleType) -> None:
     points, _ = cloud()
     write_points(tmp_path / "ours.ply", points)
     theirs = np.asarray(open3d.io.read_point_cloud(str(tmp_path / "ours.ply")).points)

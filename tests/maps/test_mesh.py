@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import pytest
@@ -12,11 +13,12 @@ from scipy.spatial import cKDTree
 from lslam.config import load_config
 from lslam.errors import InputError
 from lslam.formats.ply_files import write_ply_mesh
-from lslam.maps.mesh import Mesh, denoise, require_open3d, surface
+from lslam.maps.mesh import Mesh, denoise, surface
 from lslam.pipeline.check import check_config
 from lslam.types.cloud import ArrayCloud
 
 
+@pytest.mark.usefixtures("open3d")
 def test_strays_go_and_the_rest_keeps_its_intensity() -> None:
     rng = np.random.default_rng(0)
     wall = np.column_stack([rng.uniform(0, 10, 4000), rng.normal(0, 0.01, 4000), rng.uniform(0, 3, 4000)])
@@ -43,7 +45,7 @@ def hall() -> tuple[Mesh, np.ndarray]:
     return surface(ArrayCloud.of(points), 0.2, np.zeros((1, 3))), points
 
 
-def test_a_surface_lies_on_its_points_and_looks_at_the_sensor(tmp_path: Path) -> None:
+def test_a_surface_lies_on_its_points_and_looks_at_the_sensor(tmp_path: Path, open3d: ModuleType) -> None:
     mesh, points = hall()
     assert len(mesh.triangles) > 2000
     radius = np.linalg.norm(mesh.vertices, axis=1)
@@ -54,7 +56,7 @@ def test_a_surface_lies_on_its_points_and_looks_at_the_sensor(tmp_path: Path) ->
     inward = np.einsum("ij,ij->i", np.cross(b - a, c - a), -a)
     assert (inward > 0).mean() > 0.99
     write_ply_mesh(tmp_path / "mesh.ply", mesh.vertices, mesh.triangles, "a hall")
-    back = require_open3d().io.read_triangle_mesh(str(tmp_path / "mesh.ply"))
+    back = open3d.io.read_triangle_mesh(str(tmp_path / "mesh.ply"))
     np.testing.assert_allclose(np.asarray(back.vertices), mesh.vertices, atol=1e-6)
     assert np.array_equal(np.asarray(back.triangles), mesh.triangles)
     again, _ = hall()
@@ -62,6 +64,7 @@ def test_a_surface_lies_on_its_points_and_looks_at_the_sensor(tmp_path: Path) ->
     assert again.triangles.tobytes() == mesh.triangles.tobytes()
 
 
+@pytest.mark.usefixtures("open3d")
 def test_a_handful_of_points_has_no_surface() -> None:
     with pytest.raises(InputError, match="a map of 3 points has no surface"):
         surface(ArrayCloud.of(np.eye(3)), 0.2, np.zeros((1, 3)))

@@ -47,6 +47,14 @@ def at(pose: Floats) -> MotionPrior:
     return MotionPrior.at_once(pose)
 
 
+@pytest.fixture(autouse=True)
+def loadable(request: pytest.FixtureRequest) -> None:
+    """Open3D, where it is asked for."""
+    spec = getattr(request.node, "callspec", None)
+    if spec is not None and spec.params.get("method") == "open3d-gicp":
+        request.getfixturevalue("open3d")
+
+
 @pytest.mark.parametrize("method", BASELINES)
 def test_a_drive_is_followed_and_standing_still_would_not_pass(method: str) -> None:
     found, (_, truth) = results(method), block()

@@ -45,9 +45,11 @@ def foreign(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
 
 @pytest.mark.parametrize("name", sorted(METHODS))
-def test_every_method_can_be_made_and_says_what_it_is(name: str) -> None:
+def test_every_method_can_be_made_and_says_what_it_is(name: str, request: pytest.FixtureRequest) -> None:
     if name == "kiss-icp":
         pytest.importorskip("kiss_icp")
+    if name == "open3d-gicp":
+        request.getfixturevalue("open3d")
     method = create_odometry(config(name))
     assert all(callable(getattr(method, verb)) for verb in ("prepare", "register", "warm_up"))
     assert len(known_methods()[name]) > 10

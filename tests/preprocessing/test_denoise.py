@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from types import ModuleType
+
 import numpy as np
-import open3d
 import pytest
 from numpy.typing import NDArray
 
@@ -31,7 +32,9 @@ def brute_force(points: NDArray[np.float32], neighbours: int, deviations: float)
 
 @pytest.mark.parametrize(("neighbours", "deviations"), [(10, 2.0), (4, 1.0), (2, 0.1), (30, 0.5)])
 @pytest.mark.parametrize("seed", [0, 1])
-def test_the_same_points_as_the_definition_and_as_open3d(seed: int, neighbours: int, deviations: float) -> None:
+def test_the_same_points_as_the_definition_and_as_open3d(
+    seed: int, neighbours: int, deviations: float, open3d: ModuleType
+) -> None:
     points = cloud(seed)
     kept = dense_points(points, neighbours, deviations).tolist()
     assert kept == brute_force(points, neighbours, deviations)
