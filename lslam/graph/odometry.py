@@ -74,9 +74,28 @@ def corrected(
     Between two keyframes the correction is interpolated on SE(3) over time, so that no seam shows.
     covariances : (K, 6, 6) of the keyframes in the world; drift : how much odometry drifts beside its own, `Solution.drift`
     """
+    moved = np.stack([r.T_world_lidar for r in results])
+    final, owners = _bent(results, keyframes, moved, poses)
+    out = []
+    for result, T, before, k in zip(results, final, moved, owners.tolist(), strict=True):
+        keyframe = results[keyframes[k].scan]
+        S = _covariance(result, keyframe, T, before, poses[k], covariances[k], drift, config)
+        out.append(replace(result, T_world_lidar=T, covariance=S))
+    return out
+
+
+def bent(results: Sequence[ScanResult], keyframes: Sequence[Keyframe], poses: Floats) -> list[ScanResult]:
+    """All scans where the keyframes `poses` (K, 4, 4) put them, as `corrected` has it, with the covariances they had."""
+    final, _ = _bent(results, keyframes, np.stack([r.T_world_lidar for r in results]), poses)
+    return [replace(result, T_world_lidar=T) for result, T in zip(results, final, strict=True)]
+
+
+def _bent(
+    results: Sequence[ScanResult], keyframes: Sequence[Keyframe], moved: Floats, poses: Floats
+) -> tuple[Floats, NDArray[np.intp]]:
+    """(N, 4, 4) poses of all scans, which odometry has at `moved`, and the keyframe that is the nearest in time, (N,)."""
     scans = np.array([k.scan for k in keyframes])
     stamps = np.array([k.stamp_ns for k in keyframes], np.int64)
-    moved = np.stack([r.T_world_lidar for r in results])
     left = np.clip(np.searchsorted(scans, np.arange(len(results)), side="right") - 1, 0, max(len(scans) - 2, 0))
     right = np.minimum(left + 1, len(scans) - 1)
     from_left = poses[left] @ se3.relative(moved[scans[left]], moved)
@@ -86,12 +105,7 @@ def corrected(
     share = np.clip((own - stamps[left]).astype(np.float64) / span, 0.0, 1.0)
     twist = se3.log(se3.relative(from_left, from_right))
     final = se3.normalise(from_left @ se3.exp(share[:, None] * twist))
-    out = []
-    for i, result in enumerate(results):
-        k = int(left[i] if share[i] < 0.5 else right[i])
-        S = _covariance(result, results[scans[k]], final[i], moved[i], poses[k], covariances[k], drift, config)
-        out.append(replace(result, T_world_lidar=final[i], covariance=S))
-    return out
+    return final, np.where(share < 0.5, left, right)
 
 
 def positive(covariance: Floats) -> Floats:

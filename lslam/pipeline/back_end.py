@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 from lslam.config import Config
 from lslam.graph.drift import tilt_factor
 from lslam.graph.floors import on_one_plane
-from lslam.graph.odometry import fitness_covariance, odometry_constraints
+from lslam.graph.odometry import bent, fitness_covariance, odometry_constraints
 from lslam.graph.problem import PoseGraph
 from lslam.keyframes.store import KeyframeStore
 from lslam.pipeline.georeferencing import Placement, on_earth, place
 from lslam.pipeline.graph_inputs import floor_planes, up_directions, world_up
-from lslam.pipeline.graph_outcome import BackEnd, Given, solve, unsolved
+from lslam.pipeline.graph_outcome import BackEnd, Given, solve, unsolved, without_steady_drift
 from lslam.pipeline.osm_back_end import hold_by_buildings
 from lslam.pipeline.osm_source import OsmSource
 from lslam.types.constraint import LoopCandidate, Turn
@@ -45,32 +45,53 @@ def run_back_end(
             problems.append("GNSS: fewer than two keyframes have no heading on the Earth")
         return BackEnd(results, candidates, problems=problems)
     graph = replace(_graph(given), turns=turns)
-    up = graph.world_up if graph.ups else None
-    out, placement = None, Placement()
-    if config.gnss.mode == "graph" or (config.gnss.mode == "fit" and osm is not None and config.osm.origin is None):
-        placement = place(sequence, results, keyframes, up, config.gnss, config.graph)
-        problems += [placement.problem] if placement.problem else []
+    out = None
     if osm is not None:
-        out = hold_by_buildings(osm, graph, placement, given)
-    if out is None and config.gnss.mode == "graph" and placement.georeference is not None:
-        out = solve(on_earth(graph, placement), given, placement.georeference)
+        by_fixes = config.gnss.mode == "graph" or (config.gnss.mode == "fit" and config.osm.origin is None)
+        out = hold_by_buildings(osm, graph, _placed(sequence, graph, given) if by_fixes else Placement(), given)
+    if out is None:
+        # Loops know a drift that lasts to a part of the noise of fixes, which are judged by odometry that had it.
+        graph = without_steady_drift(graph, given)
+        placement = _placed(sequence, graph, given) if config.gnss.mode == "graph" else Placement()
+        if placement.georeference is not None:
+            out = solve(on_earth(graph, placement), given, placement.georeference)
     if out is None and (graph.loops or graph.floors or tilt_factor(graph, config.graph) > 0):
         out = solve(graph, given)
     if out is None:
         out = unsolved(given)
     if config.gnss.mode == "fit" and out.georeference is None:
-        turned = None if up is None else _up_after(out, graph)
-        placement = place(sequence, out.results, keyframes, turned, config.gnss, config.graph)
-        problems += [placement.problem] if placement.problem and placement.problem not in problems else []
-        out = replace(out, georeference=placement.georeference)
+        moved = replace(graph, poses=out.keyframes)
+        out = replace(out, georeference=_placed(sequence, moved, given, out.results).georeference)
     for problem in problems:
         log.warning("%s", problem)
     return replace(out, problems=problems, facts={"keyframes": len(keyframes)} | out.facts)
 
 
-def _up_after(out: BackEnd, graph: PoseGraph) -> Floats:
-    """(3,) up in the world of the optimised poses, by what the keyframes saw of it."""
-    turned = sum(out.keyframes[u.keyframe, :3, :3] @ u.up * u.share / u.sigma**2 for u in graph.ups)
+def _placed(
+    sequence: Sequence, graph: PoseGraph, given: Given, results: list[ScanResult] | None = None
+) -> Placement:  # fmt: skip
+    """Where the graph's poses lie on the Earth by the fixes of a run.
+
+    results : all scans there; None for those of odometry as the keyframes put them
+    """
+    keyframes, config = given.store.keyframes, given.config
+    up = _up(graph)
+    if results is None and graph.claim is None:
+        # Odometry's tilt grows: the first that was seen of up is the best.
+        results, up = given.results, None if up is None else graph.world_up
+    elif results is None:
+        results = bent(given.results, keyframes, graph.poses)
+    placement = place(sequence, results, keyframes, up, config.gnss, config.graph)
+    if placement.problem and placement.problem not in given.problems:
+        given.problems.append(placement.problem)
+    return placement
+
+
+def _up(graph: PoseGraph) -> Floats | None:
+    """(3,) up in the world of the graph's poses, by what the keyframes saw of it; None when they saw nothing."""
+    if not graph.ups:
+        return None
+    turned = sum(graph.poses[u.keyframe, :3, :3] @ u.up * u.share / u.sigma**2 for u in graph.ups)
     return np.asarray(turned / np.linalg.norm(turned))
 
 

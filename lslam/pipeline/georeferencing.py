@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from lslam.config.gnss import GnssConfig
 from lslam.config.graph import GraphConfig
 from lslam.errors import InputError
-from lslam.geometry import geodesy, se3, so3
+from lslam.geometry import geodesy, noise, se3, so3
 from lslam.geometry.interpolate import poses_at
 from lslam.graph.alignment import Alignment, align
 from lslam.graph.problem import PoseGraph, PositionFix
@@ -119,9 +119,9 @@ def on_earth(graph: PoseGraph, placement: Placement) -> PoseGraph:
     """The graph in east, north, up, held by its fixes instead of its first pose."""
     assert placement.georeference is not None
     T = placement.georeference.T_enu_world
-    return replace(
-        graph, poses=T @ graph.poses, fixes=placement.fixes, world_up=np.array([0.0, 0.0, 1.0]), is_anchored=False
-    )
+    spread = None if graph.spread is None else noise.rotated(graph.spread, T[:3, :3])
+    up = np.array([0.0, 0.0, 1.0])
+    return replace(graph, poses=T @ graph.poses, fixes=placement.fixes, world_up=up, is_anchored=False, spread=spread)
 
 
 def _usable(

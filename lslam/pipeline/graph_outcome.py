@@ -89,7 +89,6 @@ def solve(graph: PoseGraph, given: Given, georeference: Georeference | None = No
     """
     config = given.config
     try:
-        graph = _set_straight(graph, config)
         solution = optimise(graph, config.graph)
     except (GraphError, np.linalg.LinAlgError) as error:
         given.problems.append(f"{error}; the run goes on without it")
@@ -119,11 +118,17 @@ def solve(graph: PoseGraph, given: Given, georeference: Georeference | None = No
     return BackEnd(moved, judged, solution.poses, kept, georeference, T, solution=solution, facts=facts)
 
 
-def _set_straight(graph: PoseGraph, config: Config) -> PoseGraph:
-    """The graph without a steady drift that loops tell; as it is where fixes or walls hold it, which tell more of it."""
-    if not config.graph.steady_drift or graph.fixes or graph.map_priors:
+def without_steady_drift(graph: PoseGraph, given: Given) -> PoseGraph:
+    """The graph without a steady drift that its loops tell; as it is where they tell none."""
+    if not given.config.graph.steady_drift:
         return graph
-    graph = without_loop_drift(graph, config.graph)
+    try:
+        graph = without_loop_drift(graph, given.config.graph)
+    except GraphError:
+        # Who solves it says why it cannot be.
+        return graph
+    except np.linalg.LinAlgError as error:
+        given.problems.append(f"graph.steady_drift: {error}; odometry is not set straight by loops")
     if graph.claim is not None:
         shift, turn = (float(np.linalg.norm(part)) for part in np.split(graph.claim.rates, 2))
         log.info(

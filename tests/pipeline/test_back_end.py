@@ -202,13 +202,29 @@ def test_fixes_of_a_metre_hold_the_trajectory_through_an_outage(loops: list[Loop
     results = drifted("debug.drift_percent=0.5", "debug.drift_deg_per_100m=0.25")
     done = run_back_end(recording(), results, store_of(results), config("gnss.mode=graph"), loops)
     assert done.georeference.method == "graph"
-    assert "steady_drift" not in done.facts, "fixes tell more of it"
+    assert ("steady_drift" in done.facts) == bool(loops), "only loops tell it"
     off = (on_earth(done) - CITY[:, :3, 3])[:, :2]
     assert np.sqrt((off**2).sum(1).mean()) < 0.5
     before = (on_earth(run_back_end(recording(), results, store_of(results), config("gnss.mode=fit"), []))) - CITY[
         :, :3, 3
     ]
     assert np.sqrt((off**2).sum(1).mean()) < 0.7 * np.sqrt((before[:, :2] ** 2).sum(1).mean())
+
+
+def test_drift_that_lasts_is_set_right_before_fixes_hold_it() -> None:
+    """Loops know its rate to a part of what fixes of a metre know: the shape is theirs, the place on the Earth the fixes'."""
+    results = drifted()
+    shapes = []
+    for words in ((), ("gnss.mode=graph",)):
+        done = run_back_end(recording(), results, store_of(results), config(*words), LOOPS)
+        assert "steady_drift" in done.facts
+        p = np.stack([r.T_world_lidar[:3, 3] for r in done.results])
+        off = se3.apply(align(p, CITY[:, :3, 3])[0], p) - CITY[:, :3, 3]
+        shapes.append(float(np.sqrt((off**2).sum(1).mean())))
+    assert shapes[1] < 1.3 * shapes[0]
+    assert done.georeference.used >= done.georeference.fixes - 2
+    away = (on_earth(done) - CITY[:, :3, 3])[:, :2]
+    assert np.sqrt((away**2).sum(1).mean()) < 0.5
 
 
 def test_fixes_of_a_metre_bend_no_scan_matching_of_hdl() -> None:
