@@ -40,6 +40,11 @@ def check_config(config: Config) -> None:
     _check_heeded(config)
     if not config.osm.extract and (config.osm.origin is not None or config.osm.heading_deg is not None):
         raise UsageError("--origin and --heading do nothing without --osm FILE: give it, or drop them")
+    if config.gnss.crs is not None and config.gnss.mode == "off" and not config.osm.extract:
+        raise UsageError(
+            "--crs does nothing without --gnss, --georeference or --osm, which tell where on the Earth the run lies: give one "
+            "of them, or drop it"
+        )
     for delta in config.eval.delta:
         parse_delta(delta)
 

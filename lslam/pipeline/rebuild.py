@@ -132,6 +132,8 @@ def rebuild(
 ) -> RebuiltMap:  # fmt: skip
     """Build the map with the run's configuration and write it to `out`, by default map.<format> in the run folder.
 
+    The map of which the note beside `out` told is replaced, too, whatever its format was.
+
     Raises OutputExistsError when the file is there, OutputError when it cannot be written, UsageError for a `crs` without
     a georeference or that no map can be written in, InterruptedRunError when `should_stop` said so.
     """
@@ -151,7 +153,10 @@ def rebuild(
     if built is None:
         raise InterruptedRunError("interrupted while the map was built: nothing is written")
     note = MapNote(sequence.name, run.config.map.voxel, built.done, f"{LOCAL}: {run.world}")
+    before = _noted(path.with_suffix(".json")) if overwrite else None
     write_map(path, built.merged, note, georeference)
+    if before not in (None, path):
+        before.unlink(missing_ok=True)  # The note tells of the new one now.
     if run.config.map.mesh:
         write_mesh(path.with_name(f"{path.stem}_mesh.ply"), built.merged, note, run.trajectory)
     if built.occupancy is not None:
@@ -183,13 +188,23 @@ def results_of(run: EarlierRun) -> list[ScanResult]:
 
 
 def map_of(target: Path) -> Path:
-    """A map file, or the one in a run folder; raises InputError when there is none."""
+    """A map file, or the one that was written last in a run folder; raises InputError when there is none."""
     if not target.is_dir():
         return target
     found = [target / f"map{suffix}" for suffix in SUFFIXES if (target / f"map{suffix}").is_file()]
     if not found:
         raise InputError(f"{target} has no map file; build one with: lslam map {target}")
-    return found[0]
+    noted = _noted(target / "map.json")
+    return noted if noted in found else found[0]
+
+
+def _noted(note: Path) -> Path | None:
+    """The map that a note tells of, beside it and with its name; None where there is none."""
+    try:
+        path = note.parent / str(json.loads(note.read_text(encoding="utf-8"))["file"])
+    except (OSError, ValueError, LookupError, TypeError):
+        return None
+    return path if path in [note.with_suffix(suffix) for suffix in SUFFIXES] else None
 
 
 def _statuses(path: Path, count: int) -> tuple[Status, ...]:

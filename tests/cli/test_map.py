@@ -65,6 +65,15 @@ def test_other_settings(run: Path, tmp_path: Path) -> None:
     assert (about["voxel"], about["crs"], about["points"]) == (0.5, None, len(part))
 
 
+def test_a_map_in_another_format_replaces_the_one_before_or_stands_beside_it(run: Path) -> None:
+    (run / "map_mesh.ply").write_text("not a map")
+    assert lslam("map", run, "--format", "pcd", "--voxel", 0.5, "-q").returncode == 0
+    assert {p.name for p in run.glob("map*.*")} == {"map.ply", "map.pcd", "map.json", "map_mesh.ply"}
+    assert strict_json(lslam("map", run, "--score", "--json").stdout)["file"] == str(run / "map.pcd")
+    assert lslam("map", run, "--format", "las", "--voxel", 0.5, "--overwrite", "-q").returncode == 0
+    assert {p.name for p in run.glob("map*.*")} == {"map.ply", "map.las", "map.json", "map_mesh.ply"}
+
+
 def test_a_bridged_scan_stays_out(run: Path, tmp_path: Path) -> None:
     table = (run / "scans.csv").read_text().replace(",ok,", ",bridged,", COUNT - 1)
     (run / "scans.csv").write_text(table)

@@ -135,3 +135,10 @@ def test_what_a_preset_says_and_its_method_only_heeds_is_said_to_be_the_presets(
     with pytest.raises(UsageError, match=r"^registration\.target = 'keyframe' does nothing with method loam"):
         check_config(load_config(None, own, {}))
     check_config(load_config(None, [preset, "odometry.method=icp-svd"], {}))
+
+
+def test_coordinates_of_a_run_with_no_place_on_the_earth_are_refused() -> None:
+    with pytest.raises(UsageError, match=r"^--crs does nothing without --gnss, --georeference or --osm"):
+        check_config(load_config(settings=["gnss.crs=25832"], environ={}))
+    for place in ("gnss.mode=fit", "gnss.mode=graph", 'osm.extract="town.osm"'):
+        check_config(load_config(settings=["gnss.crs=25832", place], environ={}))
