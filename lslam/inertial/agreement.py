@@ -16,6 +16,9 @@ Floats = NDArray[np.float64]
 # Turns that vary less than this (rms, rad/s) are registration's own noise: nothing can be told from them.
 LEAST_TURNING = np.deg2rad(0.6)
 LEAST_CORRELATION = 0.5
+# The part of what scans show as turns that may be noise of their registration; turns over more scans have less of it, and of
+# so many stretches there must be left.
+MOST_NOISE, FEWEST_STRETCHES = 0.2, 4
 # Rates in deg/s are 57.3 times too large; a good gyroscope is right to some per cent.
 LIKELY_DEGREES, MOST_SCALE = (30.0, 110.0), 2.0
 # About its own axes an IMU leaves no more than twice what it leaves about the best ones, which are three degrees off.
@@ -62,6 +65,10 @@ def check_agreement(
         return Agreement(False)
     felt, seen = _Felt(imu, T_lidar_imu, stamps_ns), _seen(stamps_ns, poses)
     offsets = np.arange(-NEAR_S, NEAR_S + STEP_S / 2, STEP_S) if offset_s is None else np.array([offset_s])
+    width = _width(felt, seen, stamps_ns, poses, offsets)
+    if width is None:
+        return _hardly_turning(felt.rates(0.0 if offset_s is None else offset_s), seen, T_lidar_imu)
+    felt, seen = _Felt(imu, T_lidar_imu, stamps_ns, width), _seen(stamps_ns, poses, width)
     scores = np.array([_compare(seen, felt.rates(t))[0] for t in offsets])
     best = int(np.argmax(scores))
     correlation, ratio, turning = _compare(seen, felt.rates(float(offsets[best])))
@@ -96,16 +103,17 @@ def turns(
     return _centred(_seen(stamps_ns, poses), _Felt(imu, T_lidar_imu, stamps_ns).rates(offset_s))
 
 
-def _seen(stamps_ns: NDArray[np.int64], poses: Floats) -> Floats:
-    """(N - 1, 3) rad/s in LiDAR axes."""
-    seconds = np.diff(stamps_ns)[:, None] * 1e-9
-    return np.asarray(so3.log(np.swapaxes(poses[:-1, :3, :3], -1, -2) @ poses[1:, :3, :3]) / seconds)
+def _seen(stamps_ns: NDArray[np.int64], poses: Floats, width: int = 1) -> Floats:
+    """(N - width, 3) rad/s in LiDAR axes, each from a scan to the one `width` later."""
+    seconds = (stamps_ns[width:] - stamps_ns[:-width])[:, None] * 1e-9
+    return np.asarray(so3.log(np.swapaxes(poses[:-width, :3, :3], -1, -2) @ poses[width:, :3, :3]) / seconds)
 
 
 class _Felt:
-    """Mean angular rates between the stamps of scans, in LiDAR axes, for any offset of the clocks."""
+    """Mean angular rates from scan to scan, or to the one `width` later, in LiDAR axes, for any offset of the clocks."""
 
-    def __init__(self, imu: ImuStream, T_lidar_imu: Floats, stamps_ns: NDArray[np.int64]) -> None:
+    def __init__(self, imu: ImuStream, T_lidar_imu: Floats, stamps_ns: NDArray[np.int64], width: int = 1) -> None:
+        self.width = width
         self.origin = int(stamps_ns[0])
         self.times = (imu.stamps_ns - self.origin) * 1e-9
         self.query = (stamps_ns - self.origin) * 1e-9
@@ -114,10 +122,32 @@ class _Felt:
         self.turned = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
 
     def rates(self, offset_s: float) -> Floats:
-        """(N - 1, 3) rad/s, NaN where the stream does not reach."""
+        """(N - width, 3) rad/s, NaN where the stream does not reach."""
         query = self.query - offset_s
         at = np.stack([np.interp(query, self.times, self.turned[:, k], np.nan, np.nan) for k in range(3)], axis=-1)
-        return np.asarray(np.diff(at, axis=0) / np.diff(query)[:, None])
+        w = self.width
+        return np.asarray((at[w:] - at[:-w]) / (query[w:] - query[:-w])[:, None])
+
+
+def _width(felt: _Felt, seen: Floats, stamps_ns: NDArray[np.int64], poses: Floats, offsets: Floats) -> int | None:
+    """Over how many scans turns must be compared for registration's noise to be a small part of them; None over any.
+
+    felt, seen : from scan to scan; offsets : of the clocks that are possible, s
+
+    What one pose is wrong by, two turns show with opposite signs: the noise stands in how what the gyroscope leaves changes
+    its sign from scan to scan. A wrong gyroscope leaves turns, which do not.
+    """
+    best = max(offsets, key=lambda t: _compare(seen, felt.rates(t))[0])
+    a, b = _centred(seen, felt.rates(float(best)))
+    if not len(a):
+        return 1
+    left = a - b * (float(np.sum(a * b)) / max(float(np.sum(b * b)), 1e-12))
+    noise = max(-2.0 * float(np.sum(left[1:] * left[:-1])) / len(a), 0.0)
+    for width in range(1, max(len(stamps_ns) // FEWEST_STRETCHES, 1) + 1):
+        power = float(np.sum(np.var(_seen(stamps_ns, poses, width), axis=0)))
+        if noise / width**2 <= MOST_NOISE * power:
+            return width
+    return None
 
 
 def _centred(seen: Floats, felt: Floats) -> tuple[Floats, Floats]:
@@ -242,5 +272,5 @@ def _refined(felt: _Felt, seen: Floats, near: float) -> tuple[float, float]:
     if not np.isfinite(bend) or bend <= 0:
         return 0.0, np.inf
     shift = float(np.clip(0.5 * (costs[0] - costs[2]) / STEP_S / bend, -STEP_S, STEP_S))
-    variance = costs[1] / max(3 * len(seen) - 4, 1)
+    variance = costs[1] / max(3 * len(seen) / felt.width - 4, 1)
     return near + shift, float(np.sqrt(2 * variance / bend))

@@ -1,0 +1,65 @@
+"""What registration's own noise does to the comparison of turns: a car in gentle bends, whose turns are known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from lslam.geometry import se3, so3
+from lslam.inertial.agreement import Agreement, check_agreement
+from lslam.inertial.stream import ImuRefusedError
+from lslam.types.imu import ImuStream
+
+IMU_NS, SCAN_NS = 10_000_000, 100_000_000
+
+
+def compared(
+    noise_deg: float, seed: int, factor: float = 1.0, weave_deg_s: float = 4.0, late_s: float = 0.0
+) -> Agreement:
+    """Five seconds at 10 Hz of bends of so many deg/s about z, seen with white noise, felt `factor` times."""
+    rng = np.random.default_rng(seed)
+    stamps = np.arange(0, 52 * SCAN_NS, IMU_NS)
+    gyro = np.zeros((len(stamps), 3))
+    gyro[:, 2] = np.deg2rad(weave_deg_s) * np.sin(2 * np.pi * 0.4 * 1e-9 * stamps)
+    yaw = np.concatenate([[0.0], np.cumsum(0.5 * (gyro[1:, 2] + gyro[:-1, 2])) * 1e-9 * IMU_NS])[:: SCAN_NS // IMU_NS][
+        :50
+    ]
+    R = so3.exp(yaw[:, None] * [0.0, 0, 1]) @ so3.exp(np.deg2rad(noise_deg) * rng.normal(size=(50, 3)))
+    gyro = factor * gyro + rng.normal(0, 1e-3, gyro.shape) + [0.01, -0.02, 0.005]
+    imu = ImuStream(stamps + round(1e9 * late_s), np.zeros((len(stamps), 3)), gyro)
+    return check_agreement(imu, np.eye(4), SCAN_NS * np.arange(50), se3.make(R, np.zeros((50, 3))), None)
+
+
+@pytest.mark.parametrize("noise_deg", [0.0, 0.05, 0.2, 0.3])
+def test_a_good_gyroscope_fits_what_a_poor_registration_sees(noise_deg: float) -> None:
+    """From scan to scan 0.2 deg are 5 deg/s of noise beside turns of 3: over a few scans the turns stand out."""
+    for seed in range(5):
+        found = compared(noise_deg, seed)
+        assert found.is_judged
+        assert found.correlation > 0.85
+        assert found.offset_s == 0.0
+        assert found.gyro_bias is not None
+        np.testing.assert_allclose(found.gyro_bias, [0.01, -0.02, 0.005], atol=3e-3)
+
+
+@pytest.mark.parametrize(
+    ("factor", "says"),
+    [(57.3, "deg/s"), (3.0, r"vary 2\.[5-9] times"), (0.3, r"vary 0\.2[3-9] times"), (-1.0, "do not fit")],
+)
+def test_a_wrong_gyroscope_is_refused_by_a_poor_registration_too(factor: float, says: str) -> None:
+    for seed in range(5):
+        with pytest.raises(ImuRefusedError, match=says):
+            compared(0.2, seed, factor)
+
+
+def test_a_clock_is_found_by_a_poor_registration() -> None:
+    for seed in range(5):
+        found = compared(0.1, seed, weave_deg_s=20.0, late_s=0.1)
+        assert found.offset_s == pytest.approx(-0.1, abs=4 * found.offset_sigma_s)
+        assert found.offset_sigma_s < 0.02
+
+
+def test_turns_that_drown_in_noise_are_judged_by_nobody() -> None:
+    """They would pass for an IMU whose rates are too small."""
+    for seed in range(5):
+        assert not compared(0.2, seed, weave_deg_s=0.5).is_judged
