@@ -48,7 +48,7 @@ class InertialMotion(Stateful):
     def __init__(self, imu: ImuStream, T_lidar_imu: Floats, estimate: ImuEstimate, config: ImuConfig) -> None:
         self.imu, self.T_lidar_imu, self.config = imu, T_lidar_imu, config
         self.T_imu_lidar = se3.inverse(T_lidar_imu)
-        self.estimate = estimate
+        self.estimate = self._opening = estimate
         self.coasting = ConstantVelocity()
         self.refusal = ""
         self.gap_scans = 0
@@ -201,7 +201,10 @@ class InertialMotion(Stateful):
         """
         prior = self.coasting.rewind(stamp_ns, pose, span)
         self._pose, self._instant_ns = middle_of(prior, stamp_ns, pose)
-        self.gap_scans, self._scans = 0, 1
+        # What the second scan taught, it teaches again when it is registered on the first as that is now.
+        self.estimate = self._opening
+        self.estimate = self._advanced(stamp_ns, self._instant_ns)
+        self.gap_scans, self._scans, self._has_gap = 0, 1, False
         return prior
 
     def state(self) -> State:

@@ -100,6 +100,24 @@ def test_a_seeming_standstill_is_no_prediction() -> None:
     assert np.median(off) > 10.0
 
 
+def test_what_a_second_scan_taught_before_the_start_was_done_again_counts_once() -> None:
+    drive = drone()
+    stamps, poses = truth_of(drive, 2)
+    learnt = []
+    for is_seen in (True, False):
+        motion = motion_of(drive)
+        motion.correct(int(stamps[0]), poses[0])
+        if is_seen:
+            motion.correct(int(stamps[1]), poses[1])
+        motion.rewind(int(stamps[0]), poses[0], Span())
+        motion.correct(int(stamps[1]), poses[1])
+        learnt.append(motion.estimate)
+    twice, once = learnt
+    for values in ("velocity", "gravity", "accel_bias", "covariance"):
+        np.testing.assert_array_equal(getattr(twice, values), getattr(once, values))
+    np.testing.assert_array_equal(twice.gyroscope.bias, once.gyroscope.bias)
+
+
 def test_failed_scans_are_bridged() -> None:
     """Half a second without registration: the walker is lost by constant velocity, not by the IMU."""
     drive = walk()
