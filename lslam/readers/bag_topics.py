@@ -16,6 +16,7 @@ from lslam.readers.ground_truth import Voice
 CLOUDS = ("PointCloud2", "CustomMsg")
 _HEADER = 512  # bytes of a message that hold its header
 _LATE_NS = 10**9  # stamps that go back further are no jitter
+_CROWDED = 1.5  # times as many messages as the rate makes: they tell of a time that others have told of
 _APART_NS = 60 * 10**9  # parts of one recording follow each other sooner
 _SAID = 3  # damaged messages that are named one by one
 
@@ -110,7 +111,8 @@ def put_in_order(stamps: Stamps, recorded: Stamps, what: str, voice: Voice) -> t
     """Which messages stay, in order, and their stamps, which then increase; what was wrong goes to the problems.
 
     Stamps that are all zero give way to the times of recording. What is late by up to a second is sorted in; what goes back
-    further comes from a clock that was set back, and is dropped, as repeated stamps are.
+    further, or tells again of a time that is told of, comes from a clock that was set back, and is dropped, as repeated
+    stamps are.
     """
     if len(stamps) and not stamps.any() and recorded.any():
         voice.problems.append(
@@ -119,7 +121,7 @@ def put_in_order(stamps: Stamps, recorded: Stamps, what: str, voice: Voice) -> t
         stamps = recorded
     index = np.arange(len(stamps), dtype=np.int64)
     late = np.maximum.accumulate(stamps) - stamps if len(stamps) else stamps
-    dropped = late > _LATE_NS
+    dropped = (late > _LATE_NS) | _told_again(stamps, late)
     if dropped.any():
         first = int(np.flatnonzero(dropped)[0])
         voice.problems.append(
@@ -138,6 +140,23 @@ def put_in_order(stamps: Stamps, recorded: Stamps, what: str, voice: Voice) -> t
         voice.problems.append(f"{what} repeat a stamp {int(repeats.sum())} times: the first one of each counts")
     index = index[~repeats]
     return index, stamps[index]
+
+
+def _told_again(stamps: Stamps, late: Stamps) -> NDArray[np.bool_]:
+    """Which messages, late by `late` ns, are behind a clock that was set back: they do not fill a hole, they interleave."""
+    again = np.zeros(len(stamps), bool)
+    steps = np.diff(stamps)
+    if not (late > 0).any() or not (steps > 0).any():
+        return again
+    step = float(np.median(steps[steps > 0]))
+    ahead = stamps[late == 0]
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], (late > 0).astype(np.int8), [0]])))
+    for begin, end in edges.reshape(-1, 2):
+        lo, hi = stamps[begin:end].min(), stamps[begin:end].max()
+        there = int(np.searchsorted(ahead, hi, "right") - np.searchsorted(ahead, lo))
+        own = int(end - begin)
+        again[begin:end] = 2 <= own <= 2 * there and own + there >= _CROWDED * (float(hi - lo) / step + 1)
+    return again
 
 
 def say_broken(broken: Sequence[str], topic: str, voice: Voice) -> None:

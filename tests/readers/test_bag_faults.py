@@ -20,6 +20,8 @@ from lslam.errors import InputError, LslamError
 from lslam.formats import bag_messages
 from lslam.formats.bag_files import BagWriter
 from lslam.readers import open_sequence
+from lslam.readers.bag_topics import put_in_order
+from lslam.readers.ground_truth import Voice
 from lslam.types.sequence import Sequence
 
 CLOUD = "sensor_msgs/msg/PointCloud2"
@@ -266,6 +268,27 @@ def test_jitter_is_sorted_repeats_and_rewinds_are_dropped_aloud(tmp_path: Path) 
     assert "out of order in 1 places, by up to 0.100 s: sorted" in said
     assert "repeat a stamp 1 times" in said
     assert "go back in time by 23.000 s at message 8: 1 of 10 are dropped" in said
+
+
+def test_what_follows_a_clock_that_was_set_back_a_little_is_dropped_and_what_comes_late_is_not() -> None:
+    """Half a second back at 100 Hz: samples of two times would lie between each other, as jitter never does."""
+    regular = 10_000_000 * np.arange(300, dtype=np.int64)
+    set_back, late_batch, two_threads, backwards = (regular.copy() for _ in range(4))
+    set_back[150:] -= 503_000_000
+    late_batch[100:120] = np.roll(late_batch[100:120], 8)
+    two_threads[200:220] = np.concatenate([regular[201:220:2], regular[200:220:2]])
+    backwards[50:60] = backwards[50:60][::-1]
+    for stamps, kept, words in (
+        (set_back, np.r_[0:150, 200:300], "go back in time by 0.493 s at message 150: 50 of 300 are dropped"),
+        (late_batch, np.arange(300), "out of order in 12 places, by up to 0.190 s: sorted"),
+        (two_threads, np.arange(300), "out of order in 10 places, by up to 0.190 s: sorted"),
+        (backwards, np.arange(300), "out of order in 9 places, by up to 0.090 s: sorted"),
+    ):
+        voice = Voice([], [])
+        order, ordered = put_in_order(stamps, stamps, "samples", voice)
+        np.testing.assert_array_equal(np.sort(order), kept)
+        np.testing.assert_array_equal(ordered, np.sort(stamps[kept]))
+        assert [p for p in voice.problems if words in p] == voice.problems, voice.problems
 
 
 # -- what is no bag
