@@ -11,12 +11,16 @@ import pytest
 from test_osm_pass import HOUSES, ORIGIN, Outline, config, driven, extract_of, street
 
 from lslam.config import Config
+from lslam.config.load import load_config
 from lslam.geometry import se2, se3
 from lslam.graph.problem import PoseGraph
 from lslam.keyframes.store import KeyframeStore
+from lslam.pipeline.georeferencing import Placement
 from lslam.pipeline.graph_outcome import Given, solve
+from lslam.pipeline.osm_back_end import hold_by_buildings
 from lslam.pipeline.osm_graph import find_on_map, on_map, sightings
 from lslam.pipeline.osm_pass import Located, locate
+from lslam.pipeline.osm_source import OsmServer
 from lslam.types.constraint import Constraint
 from lslam.types.georeference import Georeference
 from lslam.types.scan_result import ScanResult
@@ -180,3 +184,14 @@ def test_without_a_building_there_is_no_wall_to_see() -> None:
     assert located.problem
     assert held.spread is None
     assert not len(sightings(located, held.poses, config()).walls)
+
+
+def test_a_run_that_its_fixes_cannot_place_says_what_would() -> None:
+    store = driven(HOUSES, street(6.0))
+    given = Given([], store, load_config(), [])
+    nobody_asks = OsmServer(ORIGIN, None, given.config.osm, lambda bounds: {})
+    assert hold_by_buildings(nobody_asks, graph_of(store), Placement(), given) is None
+    (said,) = given.problems
+    assert said.startswith(
+        "OSM: without its fixes the run has no place on the map: give --origin LAT,LON of the first scan;"
+    )
