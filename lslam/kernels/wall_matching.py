@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 
 from lslam.kernels.jit import inline, kernel
 
+STAYS, STAYS_RAD = 0.002, 0.0001  # m and rad; a pose that moves less in one step stays: far below what a map is worth
+
 Floats = NDArray[np.float64]
 Longs = NDArray[np.int64]
 
@@ -213,11 +215,12 @@ def fit(
 
 @kernel
 def refine(
-    source: Floats, target: Floats, pose: Floats, prior: Floats, trust: Floats, gates: Floats, likeness: float,
+    source: Floats, target: Floats, pose: Floats, prior: Floats, trust: Floats, gates: Floats, more: int, likeness: float,
     short: float, by_coverage: bool,
 ) -> tuple[Floats, Floats, Floats, float, Longs]:  # fmt: skip
     """Gauss-Newton of the walls' distances across their partners' lines, from `pose`, pairs anew with each of `gates`, m.
 
+    The last of them is repeated until the pose stays, but at most `more` times: walls that are half doubted pull slowly.
     Every wall is one measurement of an offset and an angle: two points at +- length / sqrt(12) about its middle, weighted
     length / (length + short), downweighted as Geman and McClure do. `trust` (3,), the inverse variances about `prior` in units
     of a wall's, keeps what no wall says. Returns the pose, the normal matrix of the walls alone about their centre, the
@@ -228,8 +231,8 @@ def refine(
     centre = np.zeros(2)
     rms = 0.0
     pair = np.full(len(source), -1, np.int64)
-    for r in range(len(gates)):
-        gate = gates[r]
+    for r in range(len(gates) + more):
+        gate = gates[min(r, len(gates) - 1)]
         _, _, pair = fit(source, target, pose, gate, likeness, by_coverage)
         sw = cx = cy = 0.0
         for i in range(len(source)):
@@ -278,6 +281,8 @@ def refine(
         pose[0] = centre[0] + c * dx - s * dy + step[0]
         pose[1] = centre[1] + s * dx + c * dy + step[1]
         pose[2] = wrapped(pose[2] + step[2])
+        if r >= len(gates) and math.hypot(step[0], step[1]) < STAYS and abs(step[2]) < STAYS_RAD:
+            break
     return pose, normal, centre, rms, pair
 
 

@@ -33,6 +33,7 @@ SHORT = 4.0  # m; a wall of this length is believed half as much as an endless o
 # one house does not.
 GATES = np.array([2.5, 2.2, 1.9, 1.6, 1.4, 1.2, 1.2])
 FINE_GATES = np.array([2.0, 1.5, 1.0, 0.7, 0.5, 0.4, 0.4])
+MORE = 30  # rounds with the last gate, at most, until the pose stays
 WIDE = np.array([6.0, 4.5, 3.0])  # from the prior itself: far walls move with its heading
 FAINT = 1e-3  # of the prior's weight while the walls are fitted: it is for the graph to weigh the two
 START_WALLS = 4  # two walls make a corner, and a town has many
@@ -181,7 +182,7 @@ def _refined(
 ) -> WallMatch | None:  # fmt: skip
     """The pose moved onto the lines; None when it leaves the window or loses all its walls."""
     pose, normal, centre, rms, pair = wall_matching.refine(
-        seen, known, pose, at, trust, gates, LIKENESS, SHORT, by_coverage
+        seen, known, pose, at, trust, gates, MORE, LIKENESS, SHORT, by_coverage
     )
     away = np.array([*(pose[:2] - at[:2]), (pose[2] - at[2] + np.pi) % (2 * np.pi) - np.pi])
     if (np.abs(away) > window + SLACK).any() or not (pair >= 0).any():
