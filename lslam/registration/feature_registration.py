@@ -11,7 +11,7 @@ from lslam.config.loam import LoamConfig
 from lslam.config.registration import RegistrationConfig
 from lslam.kernels import voxel
 from lslam.preprocessing.features import Features
-from lslam.preprocessing.prepare import NO_TIMES, prepare_points
+from lslam.preprocessing.prepare import NO_TIMES, PreparedPoints, prepare_points
 from lslam.registration.feature_map import FeatureMap
 from lslam.registration.feature_scan import FeatureScan, feature_scan, surface_size
 from lslam.registration.feature_solver import NONE, FeatureNoise, kept_where_blind, solve_on_map
@@ -27,6 +27,8 @@ Floats = NDArray[np.float64]
 MIN_FEATURES = 60
 # A scan that failed is no target; after this many in a row the last good one lies too far behind to be.
 PATIENCE = 3
+# Planar points that face one way hold the place along it well enough, as many as LOAM asks for a plane.
+ENOUGH = 5
 # m, grid of the less planar points when they stand in for the features: as `preprocess.source_voxel`.
 STAND_IN_GRID = 1.0
 
@@ -42,7 +44,9 @@ class FeatureRegistration(Stateful):
     reach : m, how far from the sensor the map is kept
     """
 
-    STATE = ("map", "target", "threshold", "agreement", "_starting", "_recent", "_inserted", "_failures")
+    STATE = (
+        "map", "target", "threshold", "agreement", "_starting", "_recent", "_inserted", "_failures", "_all", "_is_starved",
+    )  # fmt: skip
 
     def __init__(
         self, config: RegistrationConfig, loam: LoamConfig, *, scan_step: ScanStep | None, with_map: bool,
@@ -60,6 +64,11 @@ class FeatureRegistration(Stateful):
         self._recent: tuple[tuple[NDArray[np.float32], Floats], ...] = ()
         self._inserted = 0
         self._failures = 0
+        # `icp` with all points, kept up to date from the first scan on whose features hold a direction badly.
+        self._all = self._new_plain()
+        self._is_starved = False
+        # Of the scan that was located last, when all its points were asked.
+        self._asked: tuple[Features, PreparedPoints, RegistrationResult] | None = None
 
     @property
     def noise(self) -> FeatureNoise:
@@ -72,7 +81,7 @@ class FeatureRegistration(Stateful):
     def locate(
         self, features: Features, T_prior: Floats, clock: StageClock, is_near: bool = False
     ) -> RegistrationResult:
-        """Align with what is there; the result says whether to believe it, and when less planar points stood in.
+        """Align with what is there; the result says whether to believe it, and when less planar points, or all, stood in.
 
         is_near : the prior is nearly right: nothing is sought away from it, it decides what features leave open
         """
@@ -111,7 +120,34 @@ class FeatureRegistration(Stateful):
         if self.config.start_reach > 0 and (self._is_begun or is_far):
             with clock.stage("start" if self._starting else "recover"):
                 result = self._held(features, start.T_world_lidar if self._is_begun else T_prior, T_prior, result)
+        if self.map is not None and not self._holds_place(result):
+            with clock.stage("all-points"):
+                result = self._by_all_points(features, start, T_prior, result)
         return result
+
+    def _holds_place(self, result: RegistrationResult) -> bool:
+        """Whether all features together hold the sensor's place as well as `ENOUGH` planar points that face one way do."""
+        if not result.ok or result.covariance is None:
+            return False
+        return float(np.linalg.eigvalsh(result.covariance[:3, :3])[-1]) < self.config.sigma**2 / ENOUGH
+
+    def _by_all_points(
+        self, features: Features, start: RegistrationResult, T_prior: Floats, starved: RegistrationResult
+    ) -> RegistrationResult:
+        """Where `icp` finds all points on a map of all points, unless it fails; what features leave open stays flagged.
+
+        Few rings at speed leave so few features that one false one leads them astray, metres from scan to scan.
+        """
+        if not self._is_starved:
+            self._is_starved, self._all = True, self._plain()
+        points = prepare_points(_all_points(features), self._all.preprocess)
+        found = start if self._is_begun else self._all.locate(points, T_prior)
+        self._asked = (features, points, found)
+        if not found.ok:
+            return starved
+        why = starved.reason or "features hold the place badly"
+        flagged = found.degenerate if len(found.degenerate) else starved.degenerate
+        return replace(found, degenerate=flagged, reason=f"{why}: all points stood in")
 
     def _kept(self, result: RegistrationResult, expected: Floats, T_prior: Floats) -> RegistrationResult:
         """The result at `expected` (4, 4) in the directions it leaves open."""
@@ -128,6 +164,8 @@ class FeatureRegistration(Stateful):
             self._recent = (*self._recent, (_all_points(features), result.T_world_lidar))[-self.config.start_scans :]
             if self.map is not None:
                 self.map.insert(features, result.T_world_lidar)
+            if self._is_starved:
+                self._enter_all(features, result)
             if self.target is not None and not result.is_denied:
                 self._starting = max(self._starting - 1, 0)
                 self.agreement.observe(result.agreement)
@@ -212,12 +250,27 @@ class FeatureRegistration(Stateful):
 
     def _plain(self) -> Registration:
         """`icp` with all points of the scans that were registered last in its map."""
-        size = surface_size(self.config.voxel_size, self.loam.grid_step)
-        plain = {"residual": None, "target": "map", "inlier_distance": None, "inlier_ratio": 1.0, "voxel_size": size}
-        icp = Registration(self.config.model_copy(update=plain))
+        icp = self._new_plain()
         for points, T_world_lidar in self._recent:
             icp.update(prepare_points(points, icp.preprocess), RegistrationResult(T_world_lidar))
         return icp
+
+    def _new_plain(self) -> Registration:
+        """`icp` in its default ways, with an empty map."""
+        size = surface_size(self.config.voxel_size, self.loam.grid_step)
+        plain = {"residual": None, "target": "map", "inlier_distance": None, "inlier_ratio": 1.0, "voxel_size": size}
+        return Registration(self.config.model_copy(update=plain))
+
+    def _enter_all(self, features: Features, result: RegistrationResult) -> None:
+        """All points of a registered scan; what `icp` found of it, if asked, teaches it what to expect."""
+        if self._asked is not None and self._asked[0] is features and self._asked[2].ok:
+            _, points, found = self._asked
+            found = replace(found, T_world_lidar=result.T_world_lidar, is_denied=result.is_denied)
+        else:
+            points = prepare_points(_all_points(features), self._all.preprocess)
+            found = RegistrationResult(result.T_world_lidar, is_denied=True)
+        self._all.update(points, found)
+        self._asked = None
 
     def _stand_in(
         self, features: Features, start: RegistrationResult, T_prior: Floats, starved: RegistrationResult
