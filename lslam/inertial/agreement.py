@@ -175,11 +175,12 @@ def _mean_excess(felt: Floats, seen: Floats, T_lidar_imu: Floats) -> Floats | No
 
 
 def _hardly_turning(felt: Floats, seen: Floats, T_lidar_imu: Floats) -> Agreement:
-    """Nothing turned, so nothing can be compared, unless the gyroscope says something else."""
+    """Nothing turned, or not beyond noise, so nothing can be compared, unless the gyroscope says something else."""
     varied = float(np.nanstd(felt, axis=0).max()) if np.isfinite(felt).any() else 0.0
-    if varied > 20 * LEAST_TURNING:
+    shown = float(np.std(seen, axis=0).max())
+    if varied > max(20 * LEAST_TURNING, MOST_SCALE * shown):
         raise ImuRefusedError(
-            f"its rates vary by {np.rad2deg(varied):.1f} deg/s while the scans show that nothing turns: "
+            f"its rates vary by {np.rad2deg(varied):.1f} deg/s, those of the scans by {np.rad2deg(shown):.1f}: "
             "check its unit (rad/s), its axes and its stamps"
         )
     return Agreement(False, gyro_bias=_mean_excess(felt, seen, T_lidar_imu))

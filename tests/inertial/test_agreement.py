@@ -14,13 +14,18 @@ IMU_NS, SCAN_NS = 10_000_000, 100_000_000
 
 
 def compared(
-    noise_deg: float, seed: int, factor: float = 1.0, weave_deg_s: float = 4.0, late_s: float = 0.0
+    noise_deg: float,
+    seed: int,
+    factor: float = 1.0,
+    weave_deg_s: float = 4.0,
+    late_s: float = 0.0,
+    weave_hz: float = 0.4,
 ) -> Agreement:
     """Five seconds at 10 Hz of bends of so many deg/s about z, seen with white noise, felt `factor` times."""
     rng = np.random.default_rng(seed)
     stamps = np.arange(0, 52 * SCAN_NS, IMU_NS)
     gyro = np.zeros((len(stamps), 3))
-    gyro[:, 2] = np.deg2rad(weave_deg_s) * np.sin(2 * np.pi * 0.4 * 1e-9 * stamps)
+    gyro[:, 2] = np.deg2rad(weave_deg_s) * np.sin(2 * np.pi * weave_hz * 1e-9 * stamps)
     yaw = np.concatenate([[0.0], np.cumsum(0.5 * (gyro[1:, 2] + gyro[:-1, 2])) * 1e-9 * IMU_NS])[:: SCAN_NS // IMU_NS][
         :50
     ]
@@ -60,6 +65,9 @@ def test_a_clock_is_found_by_a_poor_registration() -> None:
 
 
 def test_turns_that_drown_in_noise_are_judged_by_nobody() -> None:
-    """They would pass for an IMU whose rates are too small."""
+    """They would pass for an IMU whose rates are too small; quick ones, for turns that no scan shows. Degrees are too many."""
     for seed in range(5):
         assert not compared(0.2, seed, weave_deg_s=0.5).is_judged
+        assert not compared(1.5, seed, weave_deg_s=25.0, weave_hz=3.3).is_judged
+        with pytest.raises(ImuRefusedError, match=r"check its unit"):
+            compared(0.2, seed, 57.3, weave_deg_s=0.8)
