@@ -11,20 +11,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from calling import Done, lslam
 
 from lslam.formats.trajectory_files import write_euroc, write_kitti, write_tum
 from lslam.geometry import se3
 from lslam.types.trajectory import Trajectory
 
 
-def lslam(*arguments: object) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "lslam", "eval", *map(str, arguments)],
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=False,
-    )
+def evaluated(*words: object) -> Done:
+    return lslam("eval", *words)
 
 
 def wander(noise: float, seed: int = 0) -> Trajectory:
@@ -65,7 +60,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_table(folder: Path) -> None:
-    done = lslam(folder / "good.tum", folder / "gt.tum")
+    done = evaluated(folder / "good.tum", folder / "gt.tum")
     assert done.returncode == 0, done.stderr
     for word in ("ATE se3 rmse", "ATE origin rmse", "RPE 10 m, all pairs", "KITTI drift", "thesis1", "thesis2", "how:"):
         assert word in done.stdout
@@ -73,7 +68,7 @@ def test_table(folder: Path) -> None:
 
 
 def test_json_is_one_object_and_the_numbers_are_right(folder: Path) -> None:
-    done = lslam(
+    done = evaluated(
         folder / "good.tum", folder / "gt.tum", "--json", "--align", "none,origin,se3,sim3,posyaw", "--delta", "2s"
     )
     document = json.loads(done.stdout)
@@ -87,12 +82,12 @@ def test_json_is_one_object_and_the_numbers_are_right(folder: Path) -> None:
 
 
 def test_several_estimates_and_a_run_folder_with_its_timing(folder: Path) -> None:
-    done = lslam(folder / "run", folder / "bad.csv", folder / "gt.tum", "--json")
+    done = evaluated(folder / "run", folder / "bad.csv", folder / "gt.tum", "--json")
     first, second = json.loads(done.stdout)["evaluations"]
     assert first["timing"]["total"]["median"] == pytest.approx(0.03)
     assert second["timing"] is None
     assert second["ate"]["se3"]["rmse"] > 5 * first["ate"]["se3"]["rmse"]
-    table = lslam(folder / "run", folder / "bad.csv", folder / "gt.tum", "--table", "md")
+    table = evaluated(folder / "run", folder / "bad.csv", folder / "gt.tum", "--table", "md")
     assert table.stdout.startswith("| metric | unit | run | bad.csv |")
 
 
@@ -110,7 +105,7 @@ def test_several_estimates_and_a_run_folder_with_its_timing(folder: Path) -> Non
     ],
 )
 def test_gates(gate: tuple[str, str], estimate: str, code: int, folder: Path) -> None:
-    done = lslam(folder / estimate, folder / "gt.tum", *gate)
+    done = evaluated(folder / estimate, folder / "gt.tum", *gate)
     assert done.returncode == code, done.stderr
     assert "RPE" in done.stdout
     if code:
@@ -120,29 +115,29 @@ def test_gates(gate: tuple[str, str], estimate: str, code: int, folder: Path) ->
 
 def test_a_gate_that_cannot_be_measured_does_not_hold(folder: Path, tmp_path: Path) -> None:
     write_tum(tmp_path / "short.tum", wander(0).select(slice(0, 50)))
-    done = lslam(tmp_path / "short.tum", tmp_path / "short.tum", "--fail-drift", "1")
+    done = evaluated(tmp_path / "short.tum", tmp_path / "short.tum", "--fail-drift", "1")
     assert done.returncode == 4
     assert "KITTI drift" in done.stderr
     assert "n/a" in done.stderr
 
 
 def test_clocks(folder: Path) -> None:
-    done = lslam(folder / "late.tum", folder / "gt.tum")
+    done = evaluated(folder / "late.tum", folder / "gt.tum")
     assert done.returncode == 3
     assert "1317043272.350 .. 1317043292.250 s" in done.stderr
     assert "1317042272.350 .. 1317042292.250 s" in done.stderr
     assert "--time-offset auto" in done.stderr
     assert done.stdout == ""
     for offset in ("auto", "-1000"):
-        again = lslam(folder / "late.tum", folder / "gt.tum", "--time-offset", offset, "--json")
+        again = evaluated(folder / "late.tum", folder / "gt.tum", "--time-offset", offset, "--json")
         assert json.loads(again.stdout)["association"]["time_offset_s"] == -1000
 
 
 def test_a_straight_line(folder: Path) -> None:
-    done = lslam(folder / "line.tum", folder / "line.tum")
+    done = evaluated(folder / "line.tum", folder / "line.tum")
     assert done.returncode == 0
     assert "n/a (collinear)" in done.stdout
-    asked = lslam(folder / "line.tum", folder / "line.tum", "--align", "se3")
+    asked = evaluated(folder / "line.tum", folder / "line.tum", "--align", "se3")
     assert asked.returncode == 3
     assert "n/a (collinear)" in asked.stderr
     assert asked.stdout == ""
@@ -172,7 +167,7 @@ def test_a_straight_line(folder: Path) -> None:
 )
 def test_what_is_wrong_is_one_sentence(arguments: tuple[str, ...], code: int, sentence: str, folder: Path) -> None:
     paths = [folder / a if a.endswith((".tum", ".csv")) and i < 2 else a for i, a in enumerate(arguments)]
-    done = lslam(*paths)
+    done = evaluated(*paths)
     assert done.returncode == code, done.stderr
     assert sentence in done.stderr
     assert "Traceback" not in done.stderr
@@ -191,26 +186,26 @@ def test_kitti_layout_finds_times_and_calibration(folder: Path, tmp_path: Path) 
     (tmp_path / "sequences/07/times.txt").write_text("".join(f"{0.1 * k:.6f}\n" for k in range(200)))
     own = wander(0.002).select(slice(10, 150))
     write_tum(tmp_path / "own.tum", replace(own, stamps_ns=np.arange(10, 150, dtype=np.int64) * 10**8))
-    done = lslam(tmp_path / "own.tum", tmp_path / "poses/07.txt", "--json")
+    done = evaluated(tmp_path / "own.tum", tmp_path / "poses/07.txt", "--json")
     assert done.returncode == 0, done.stderr
     document = json.loads(done.stdout)
     assert document["association"]["matched"] == 140
     assert document["ate"]["origin"]["rmse"] < 0.5
     assert any("converted to the LiDAR" in note for note in document["notes"])
     (tmp_path / "sequences/07/calib.txt").unlink()
-    loud = lslam(tmp_path / "own.tum", tmp_path / "poses/07.txt", "--json", "-q")
+    loud = evaluated(tmp_path / "own.tum", tmp_path / "poses/07.txt", "--json", "-q")
     assert "WRONG FRAMES" in loud.stderr
     assert any("WRONG FRAMES" in note for note in json.loads(loud.stdout)["notes"])
 
 
 def test_plot(folder: Path, tmp_path: Path) -> None:
-    done = lslam(folder / "good.tum", folder / "bad.csv", folder / "gt.tum", "--plot", tmp_path / "p.png")
+    done = evaluated(folder / "good.tum", folder / "bad.csv", folder / "gt.tum", "--plot", tmp_path / "p.png")
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "p.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_help_has_an_example_and_is_light() -> None:
-    done = lslam("--help")
+    done = evaluated("--help")
     assert "lslam eval runs/seq07-icp poses/07.txt" in done.stdout
     code = "import sys, lslam.cli.eval; print([m for m in ('numpy', 'matplotlib', 'scipy', 'pydantic') if m in sys.modules])"
     light = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
@@ -220,7 +215,7 @@ def test_help_has_an_example_and_is_light() -> None:
 def test_published_estimates(recordings: Callable[[str], Path]) -> None:
     root = recordings("kitti_poses") / "kitti_poses"
     names = [root / f"estimates/{name}_00.txt" for name in ("simple_offline", "orb_slam")]
-    done = lslam(*names, root / "ground_truth/00.txt", "--json")
+    done = evaluated(*names, root / "ground_truth/00.txt", "--json")
     simple, orb = json.loads(done.stdout)["evaluations"]
     assert simple["kitti_drift"]["translation_percent"] == pytest.approx(0.5114, abs=1e-4)
     assert orb["ate"]["se3"]["rmse"] == pytest.approx(1.3034, abs=1e-4)

@@ -46,7 +46,7 @@ def started(sequence: Path, out: Path, *words: str) -> Iterator[Child]:
         child.communicate()
 
 
-def wait_for(condition: Callable[[], bool], child: Child, seconds: float = 60) -> None:
+def wait_for(condition: Callable[[], bool], child: Child, seconds: float = 180) -> None:
     end = time.monotonic() + seconds
     while not condition():
         assert child.poll() is None, "the run ended before it could be interrupted"
@@ -56,12 +56,12 @@ def wait_for(condition: Callable[[], bool], child: Child, seconds: float = 60) -
 
 def in_odometry(out: Path, child: Child) -> None:
     # Kernels are loaded, scans are being registered.
-    wait_for(lambda: any(out.glob("checkpoint/odometry-*.npz")), child, 120)
+    wait_for(lambda: any(out.glob("checkpoint/odometry-*.npz")), child)
     assert not (out / "trajectory.tum").exists()
 
 
 def in_map(out: Path, child: Child) -> None:
-    wait_for(lambda: (out / "scans.csv").exists(), child, 120)
+    wait_for(lambda: (out / "scans.csv").exists(), child)
 
 
 def assert_whole(out: Path) -> None:

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import json
 import shutil
-import subprocess
-import sys
 import tomllib
 from pathlib import Path
 
@@ -142,38 +139,3 @@ def test_static_start_comes_on_top_of_the_drive() -> None:
     np.testing.assert_allclose(still.poses, np.broadcast_to(np.eye(4), still.poses.shape), atol=1e-6)
     gap = waiting.ground_truth.positions[-1] - plain.ground_truth.positions[-1]
     assert np.linalg.norm(gap) < 3.0, "it ends where the street ends"
-
-
-def test_info_finds_nothing_wrong_and_the_options_do_what_they_say(tmp_path: Path) -> None:
-    def lslam(*words: str) -> subprocess.CompletedProcess[str]:
-        return subprocess.run([sys.executable, "-m", "lslam", *words], capture_output=True, text=True, check=False)
-
-    def simulated(name: str, *words: str) -> Path:
-        done = lslam("simulate", "block", "--out", str(tmp_path / name), "--count", "12", *words)
-        assert done.returncode == 0, done.stderr
-        return tmp_path / name
-
-    out = simulated(
-        "full", "--gnss-rate", "10", "--gnss-outage", "0.25", "0.55", "--static-start", "0.5", "--distorted"
-    )
-    facts = json.loads(lslam("info", str(out), "--json").stdout)
-    assert facts["problems"] == []
-    assert (facts["imu"]["samples"], facts["imu"]["gravity_unit"], facts["imu"]["gaps"]) == (121, "m/s2", 0)
-    assert facts["imu"]["rate_hz"] == pytest.approx(100.0)
-    assert facts["gnss"]["fixes"] == 13 - 3
-    assert all(T is not None for T in facts["extrinsics"].values())
-    bare = simulated("bare", "--no-imu", "--gnss-rate", "0")
-    names = {p.name for p in (bare / "sequences" / "00").iterdir()}
-    assert names.isdisjoint({"imu.csv", "gnss.csv"})
-    facts = json.loads(lslam("info", str(bare), "--json").stdout)
-    assert facts["problems"] == []
-    assert (facts["imu"], facts["gnss"]) == (None, None)
-    for words, sentence in (
-        (["--gnss-rate", "40"], "--gnss-rate 40 is out of range"),
-        (["--static-start", "-1"], "--static-start -1 is out of range"),
-        (["--imu-model", "icm2094"], "did you mean 'icm20948'"),
-    ):
-        refused = lslam("simulate", "block", "--out", str(tmp_path / "none"), *words)
-        assert (refused.returncode, refused.stdout) == (2, "")
-        assert sentence in refused.stderr
-        assert not (tmp_path / "none").exists()
