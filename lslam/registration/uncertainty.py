@@ -29,6 +29,9 @@ class PoseUncertainty(Stateful):
     error. So per scan the map's covariance grows by (step / lever arm) times the registration's, and a rotation error
     moves all later positions. A sensor that stands still does not drift.
 
+    A map that begins is the mean of its scans: of the error of the k-th one part in k stays in all that follow. On a map of
+    hardly anything the first few err most, and later ones, which agree with each other, do not show it.
+
     From scan to scan there is no such map: every registration's error enters in full.
 
     Scans that were deskewed carry the doubt about their motion into the map likewise; that of the first scan, at whose start
@@ -73,8 +76,8 @@ class PoseUncertainty(Stateful):
         self._map = noise.transported(self._map, step)
         if result.ok:
             renewed = 1.0 if self.is_scan_to_scan else float(np.linalg.norm(step)) / max(result.lever_arm, 1.0)
-            self._map += renewed * own
             self._scans += 1
+            self._map += max(renewed, 1 / self._scans**2) * own
             share = min(max(renewed, 1 / self._scans), 1.0)
             self.map_age = 1 + (1 - share) * self.map_age
         begun = np.zeros((6, 6)) if self._start is None else noise.transported(FIRST * sweep, position - self._start)

@@ -19,12 +19,32 @@ def result(x: float, covariance: NDArray[np.float64] | None = C, ok: bool = True
     return RegistrationResult(pose, ok=ok, covariance=covariance, lever_arm=LEVER)
 
 
+def shares(count: int, step: float) -> NDArray[np.float64]:
+    """Of its registration, that enter the map with each of `count` scans, `step` m apart."""
+    n = np.arange(1, count + 1)
+    return np.maximum(np.where(n > 1, step / LEVER, 0.0), 1 / n**2)
+
+
 def test_a_standing_sensor_does_not_drift() -> None:
     uncertainty = PoseUncertainty()
-    for _ in range(500):
+    for n in range(1, 501):
         now = uncertainty.add(result(3.0))
         assert now is not None
-        np.testing.assert_allclose(now, C, atol=1e-18)
+        np.testing.assert_allclose(now, C * (1 + shares(n, 0.0).sum()), rtol=1e-9)
+        # The sum ends: what the first scans were wrong by is in the map, and nothing follows.
+        assert (now < C * (1 + np.pi**2 / 6) + 1e-18).all()
+
+
+def test_what_few_scans_are_registered_on_fewer_with_is_in_all_that_follow() -> None:
+    """They agree with each other, so half of a large error of the second lasts, however good the later ones are."""
+    exact, poor, good = 1e-9 * C, 100 * C, 0.01 * C
+    uncertainty, chained = PoseUncertainty(), PoseUncertainty(is_scan_to_scan=True)
+    for own in (exact, poor, *[good] * 20):
+        now = uncertainty.add(result(0.0, own))
+        chain = chained.add(result(0.0, own))
+    np.testing.assert_allclose(now, 0.5**2 * poor + good * (1 + shares(22, 0.0)[2:].sum()), rtol=1e-6, atol=1e-20)
+    # From scan to scan all of it is.
+    np.testing.assert_allclose(chain, poor + 21 * good, rtol=1e-6, atol=1e-20)
 
 
 def test_distance_adds_a_registration_per_lever_arm() -> None:
@@ -36,11 +56,13 @@ def test_distance_adds_a_registration_per_lever_arm() -> None:
         assert np.linalg.eigvalsh(now).min() > 0
         assert np.trace(now) > np.trace(last)
         last = now
-    # 49.5 m are 4.95 lever arms; along x nothing but these adds up.
-    assert last[0, 0] == pytest.approx(C[0, 0] * (1 + 4.95), rel=1e-9)
-    assert last[5, 5] == pytest.approx(C[5, 5] * (1 + 4.95), rel=1e-9)
+    # 49.5 m are 4.95 lever arms, beside the few scans at the start; along x nothing but these adds up.
+    entered = shares(100, 0.5).sum()
+    assert 4.95 < entered < 4.95 + 1.3
+    assert last[0, 0] == pytest.approx(C[0, 0] * (1 + entered), rel=1e-9)
+    assert last[5, 5] == pytest.approx(C[5, 5] * (1 + entered), rel=1e-9)
     # A yaw error at the start swings the end sideways.
-    assert last[1, 1] > C[1, 1] * 5.95 + 0.5 * 4.95 * C[5, 5] * 24.0**2
+    assert last[1, 1] > C[1, 1] * (1 + entered) + 0.5 * 4.95 * C[5, 5] * 24.0**2
 
 
 def test_driving_equals_accumulating_a_random_walk() -> None:
@@ -52,10 +74,10 @@ def test_driving_equals_accumulating_a_random_walk() -> None:
     for k in range(steps + 1):
         found = uncertainty.add(result(step * k))
     d = np.zeros((runs, 6))
-    for _ in range(steps):
-        swing = np.cross(d[:, 3:], [step, 0.0, 0.0])
+    for k, share in enumerate(shares(steps + 1, step)):
+        swing = np.cross(d[:, 3:], [step if k else 0.0, 0.0, 0.0])
         d[:, :3] += swing
-        d += rng.multivariate_normal(np.zeros(6), C * step / LEVER, runs)
+        d += rng.multivariate_normal(np.zeros(6), C * share, runs)
     d += rng.multivariate_normal(np.zeros(6), C, runs)
     assert found is not None
     np.testing.assert_allclose(np.sqrt(np.diag(found)), d.std(0), rtol=0.06)
@@ -84,7 +106,8 @@ def test_doubt_about_sweeps_adds_up_like_that_of_registrations_and_that_of_the_f
     uncertainty = PoseUncertainty()
     for k in range(41):
         now = uncertainty.add(result(0.5 * k, own), sweep)
-        np.testing.assert_allclose(now, (1 + 0.5 * k / LEVER) * (own + sweep) + 4 * sweep, atol=1e-16)
+        entered = 1 + shares(k + 1, 0.5).sum()
+        np.testing.assert_allclose(now, entered * (own + sweep) + 4 * sweep, atol=1e-16)
 
 
 def test_no_covariance_gives_none() -> None:
