@@ -169,11 +169,13 @@ def centroids(
 
 @kernel
 def accompanied(
-    points: NDArray[np.float32], counts: NDArray[np.int32], least: float, size: float, least_around: float
-) -> NDArray[np.int64]:
+    points: NDArray[np.float32], counts: NDArray[np.int32], least: float, size: float, least_around: float, one_in: int
+) -> tuple[NDArray[np.int64], int]:
     """Indices of the points (N, 3) whose count times range reaches `least`, and that of their voxel `least_around`.
 
     counts : (N,), what each point stands for; a voxel's is the sum over those of its points that reach `least`
+    one_in : a power of two; of so many voxels one is looked at, the hash of its key chooses
+    Returns also how many points lie in the voxels that were looked at.
     """
     n = len(points)
     entries = table_size(n)
@@ -184,12 +186,15 @@ def accompanied(
     inverse = 1.0 / size
     least2, around2 = least * least, least_around * least_around
     last_key, slot = -1, 0
-    count = filled = 0
+    count = filled = seen = 0
     for i in range(n):
         x, y, z = float(points[i, 0]), float(points[i, 1]), float(points[i, 2])
+        key = pack(index_of(x, inverse), index_of(y, inverse), index_of(z, inverse))
+        if hash_key(key, one_in - 1) != 0:
+            continue
+        seen += 1
         if float(counts[i]) * counts[i] * (x * x + y * y + z * z) < least2:
             continue
-        key = pack(index_of(x, inverse), index_of(y, inverse), index_of(z, inverse))
         if count == 0 or key != last_key:
             last_key = key
             h = hash_key(key, mask)
@@ -212,7 +217,7 @@ def accompanied(
         if around * around * (x * x + y * y + z * z) >= around2:
             chosen[kept] = i
             kept += 1
-    return chosen[:kept]
+    return chosen[:kept], seen
 
 
 @kernel

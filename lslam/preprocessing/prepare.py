@@ -59,7 +59,8 @@ def prepare_points(
     map_points, map_times, _, counts = voxel.centroids(kept, kept_times, config.map_leaf)
     if config.least_line > 0:
         solid = on_surfaces(map_points, counts, config.map_leaf, config.least_line)
-        map_points, map_times = voxel.take(map_points, solid), map_times[solid] if len(map_times) else map_times
+        if len(solid) < len(map_points):
+            map_points, map_times = voxel.take(map_points, solid), map_times[solid] if len(map_times) else map_times
     source, source_times, scatter = _source_points(kept, kept_times, map_points, map_times, config, index)
     return PreparedPoints(
         map_points,
