@@ -56,17 +56,24 @@ class ConstantVelocity(Stateful):
 
     A sweep's registration knows the pose at the middle of the sweep best: an error of the velocity that deskewed it pulls
     start and end apart, but not the middle. So velocities are measured from middle to middle.
+
+    A registration that is wrong by decimetres is taken for a velocity wrong by metres a second, which leads the next one
+    astray: velocities change no faster than a sensor can be accelerated.
     """
 
     # A longer pause says nothing about the speed at its end; the last step is not stretched beyond this factor.
     MAX_STRETCH = 5.0
-    STATE = ("_instant_ns", "_pose", "_twist", "_step_s")
+    # m/s2, twice gravity: what changes faster is an error of registration, unless the next step says the same.
+    MAX_ACCELERATION = 20.0
+    STATE = ("_instant_ns", "_pose", "_twist", "_step_s", "_seen")
 
     def __init__(self) -> None:
         self._instant_ns: int | None = None
         self._pose = np.eye(4)
         self._twist = np.zeros(6)
         self._step_s = 0.0
+        # Velocity (6,) between the last two poses, m/s and rad/s.
+        self._seen: Floats | None = None
 
     def predict(self, stamp_ns: int) -> Floats:
         """(4, 4) T_world_lidar expected at `stamp_ns`; the identity before the first scan."""
@@ -113,13 +120,25 @@ class ConstantVelocity(Stateful):
         if self._instant_ns is not None:
             step = (instant_ns - self._instant_ns) * 1e-9
             if step > 0:
-                self._twist, self._step_s = se3.log(se3.relative(self._pose, middle)), step
+                self._learn(se3.log(se3.relative(self._pose, middle)) / step, step)
         self._instant_ns, self._pose = instant_ns, middle.copy()
+
+    def _learn(self, velocity: Floats, step: float) -> None:
+        """Take the velocity (6,) of a step of so many seconds, as far as the sensor can have come to it since."""
+        before, self._seen = self._seen, velocity
+        if before is not None and self._step_s > 0:
+            known = self._twist / self._step_s
+            change, again = velocity[:3] - known[:3], velocity[:3] - before[:3]
+            most = self.MAX_ACCELERATION * (step + self._step_s) / 2
+            size = float(np.linalg.norm(change))
+            if size > most and np.linalg.norm(again) > most:
+                velocity = np.concatenate([known[:3] + change * most / size, velocity[3:]])
+        self._twist, self._step_s = velocity * step, step
 
     def rewind(self, stamp_ns: int, pose: Floats, span: Span) -> MotionPrior:
         """Forget all scans but the first, taken at `stamp_ns` and `pose` (4, 4); its sweep by what is known of the speed."""
         prior = self.steady(pose, span)
-        self._instant_ns, self._step_s = None, 0.0
+        self._instant_ns, self._step_s, self._seen = None, 0.0, None
         self.correct(stamp_ns, pose, prior)
         return prior
 

@@ -36,6 +36,9 @@ MIN_SOURCE_POINTS = 30
 # The kernel opens so many times its end width around a pose that is nearly right.
 NEAR_KERNEL = 2.0
 
+# Between scans that come without stamps, ns: most sensors turn ten times a second.
+SCAN_NS = 100_000_000
+
 # Point to point: of the voxel size, because a voxel's mean stands for one point of its surface, its plane for all.
 POINT_VOXEL = 0.625
 # Times the steps: a point is drawn to where its match is, not to where the surfaces meet, and the score of a normal
@@ -89,7 +92,7 @@ class Registration(Stateful):
 
         Raises InputError for a prior that is no finite (4, 4).
         """
-        T_prior = self._motion.predict(self._index) if prior is None else np.asarray(prior, np.float64)
+        T_prior = self._motion.predict(self._index * SCAN_NS) if prior is None else np.asarray(prior, np.float64)
         if T_prior.shape != (4, 4) or not np.isfinite(T_prior).all():
             raise InputError(f"the motion prior has shape {T_prior.shape}: a finite (4, 4) pose is needed")
         result = self.locate(points, T_prior)
@@ -152,7 +155,7 @@ class Registration(Stateful):
             self._starting = max(self._starting, 1)
             self.threshold.widen()
             self.agreement.relax()
-        self._motion.correct(self._index, result.T_world_lidar)
+        self._motion.correct(self._index * SCAN_NS, result.T_world_lidar)
         self._index += 1
 
     def held(
