@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from multiprocessing import get_context
+from multiprocessing.forkserver import ensure_running
 from pathlib import Path
 from types import ModuleType
 
@@ -50,3 +52,17 @@ def open3d() -> ModuleType:
     except InputError as error:
         pytest.skip(str(error))
     return open3d  # type: ignore[no-any-return]
+
+
+@pytest.fixture(scope="module")
+def forked_runs() -> Iterator[None]:
+    """The processes of studies are forked by a server that has imported what a run needs, and run no kernel.
+
+    To import it anew takes a process longer than a short run. That they are spawned is test_runner's.
+    """
+    context = get_context("forkserver")
+    context.set_forkserver_preload(["lslam.pipeline.run", "lslam.studies.worker"])
+    ensure_running()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("lslam.studies.runner.get_context", lambda _: context)
+        yield

@@ -8,6 +8,7 @@ import shlex
 import subprocess
 import sys
 from pathlib import Path
+from unittest import mock
 
 import pytest
 from calling import COMMAND, Done, assert_one_sentence, environment, lslam, sample_copy
@@ -18,6 +19,8 @@ from lslam.errors import ConfigError, LslamError, OutputExistsError
 from lslam.formats.study_csv import read_study_csv
 from lslam.studies.batch import expand_batch, run_words
 from lslam.studies.expanded import Place
+
+pytestmark = pytest.mark.usefixtures("forked_runs")
 
 JOBS = """
 [config]
@@ -45,6 +48,12 @@ def piped(text: str, *words: object) -> Done:
         [*COMMAND, "batch", "-", *map(str, words)], input=text, capture_output=True, text=True, timeout=180, check=False,
         env=environment(),
     )  # fmt: skip
+
+
+def fed(text: str, *words: object) -> Done:
+    """Likewise, in this process."""
+    with mock.patch.object(sys, "stdin", io.StringIO(text)):
+        return lslam("batch", "-", *words)
 
 
 def refusal(words: list[str], folder: Path, monkeypatch: pytest.MonkeyPatch) -> LslamError:
@@ -124,7 +133,7 @@ def test_lines_are_understood_as_lslam_run_does_and_a_failure_is_exit_1(sample: 
         f"# tonight\nlslam run {sample} --count 5 --set map.write=false\n"
         f"{sample} --method kiss-icp --count 4 --out {own}\nlslam run {sample} --start 8\n"
     )
-    done = piped(text, "--out", tmp_path / "out", "--jobs", "1")
+    done = fed(text, "--out", tmp_path / "out", "--jobs", "1")
     assert done.returncode == 1, done.stderr
     assert "1 of 3 runs failed" in done.stderr
     assert "--start 8 is beyond the last scan" in done.stderr
@@ -206,7 +215,7 @@ def test_strict_counts_a_degraded_run_as_a_failed_gate(sample: Path, tmp_path: P
     """A recording with a torn scan in it."""
     torn = sample_copy(tmp_path, 6)
     (torn / "velodyne" / "000003.bin").write_bytes(b"torn")
-    done = piped(f"lslam run {torn} --set map.write=false", "--out", tmp_path / "out", "--strict", "-q")
+    done = fed(f"lslam run {torn} --set map.write=false", "--out", tmp_path / "out", "--strict", "-q")
     assert done.returncode == 4, done.stderr
     assert_one_sentence(done.stderr)
     assert "1 of 1 runs are degraded" in done.stderr

@@ -20,6 +20,8 @@ from calling import COMMAND, assert_one_sentence, environment, lslam, sample_cop
 from lslam.cli.compare import command
 from lslam.errors import InputError, UsageError
 
+pytestmark = pytest.mark.usefixtures("forked_runs")
+
 
 def test_one_object_on_stdout_progress_on_stderr_and_a_crop_of_ones_own(tmp_path: Path) -> None:
     out = tmp_path / "out"

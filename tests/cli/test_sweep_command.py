@@ -17,6 +17,8 @@ from lslam.errors import LslamError
 from lslam.formats.study_csv import read_study_csv
 from lslam.types.study import StudyRow
 
+pytestmark = pytest.mark.usefixtures("forked_runs")
+
 STUDY = """
 methods = ["icp"]
 sequences = [{ scenario = "block", lidar = "sample", columns = 256, scans = 30 }]

@@ -33,6 +33,7 @@ from lslam.studies.variants import find_variants
 from lslam.studies.worker import Bench
 from lslam.types.comparison import Comparison, RunScore
 
+pytestmark = pytest.mark.usefixtures("forked_runs")
 SCANS = 14
 METHODS = ("icp", "kiss-icp")
 

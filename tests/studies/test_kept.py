@@ -18,6 +18,8 @@ from lslam.studies.runner import Crew, Task
 from lslam.studies.states import read_state
 from lslam.types.scan import Scan
 
+pytestmark = pytest.mark.usefixtures("forked_runs")
+
 
 @pytest.fixture(scope="module")
 def drive() -> SimulatedDrive:

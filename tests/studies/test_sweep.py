@@ -27,6 +27,8 @@ from lslam.studies.subjects import used
 from lslam.studies.sweep import Sweep, expand_study, run_sweep
 from lslam.types.study import StudyRow
 
+pytestmark = pytest.mark.usefixtures("forked_runs")
+
 TREE: dict[str, Any] = {
     "sequences": [{"scenario": "block", "lidar": "sample", "columns": 256, "scans": 16}],
     "methods": ["icp"],
