@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,8 +29,20 @@ MIN_FEATURES = 60
 PATIENCE = 3
 # Planar points that face one way hold the place along it well enough, as many as LOAM asks for a plane.
 ENOUGH = 5
+# After so many scans in a row that features held well, two seconds at 10 Hz, the map of all points is given up.
+FED = 20
 # m, grid of the less planar points when they stand in for the features: as `preprocess.source_voxel`.
 STAND_IN_GRID = 1.0
+
+
+@dataclass(frozen=True)
+class _Asked:
+    """What `icp` found of a scan's points, and before it the features."""
+
+    features: Features
+    points: PreparedPoints
+    found: RegistrationResult
+    by_features: RegistrationResult
 
 
 class FeatureRegistration(Stateful):
@@ -45,7 +57,7 @@ class FeatureRegistration(Stateful):
     """
 
     STATE = (
-        "map", "target", "threshold", "agreement", "_starting", "_recent", "_inserted", "_failures", "_all", "_is_starved",
+        "map", "target", "threshold", "agreement", "_starting", "_recent", "_inserted", "_failures", "_all", "_fed",
     )  # fmt: skip
 
     def __init__(
@@ -64,11 +76,11 @@ class FeatureRegistration(Stateful):
         self._recent: tuple[tuple[NDArray[np.float32], Floats], ...] = ()
         self._inserted = 0
         self._failures = 0
-        # `icp` with all points, kept up to date from the first scan on whose features hold a direction badly.
+        # `icp` with all points, kept up to date from a scan on whose features hold the place badly.
         self._all = self._new_plain()
-        self._is_starved = False
+        self._fed = FED
         # Of the scan that was located last, when all its points were asked.
-        self._asked: tuple[Features, PreparedPoints, RegistrationResult] | None = None
+        self._asked: _Asked | None = None
 
     @property
     def noise(self) -> FeatureNoise:
@@ -138,11 +150,12 @@ class FeatureRegistration(Stateful):
 
         Few rings at speed leave so few features that one false one leads them astray, metres from scan to scan.
         """
-        if not self._is_starved:
-            self._is_starved, self._all = True, self._plain()
+        if self._fed >= FED:
+            self._all = self._plain()
+        self._fed = 0
         points = prepare_points(_all_points(features), self._all.preprocess)
         found = start if self._is_begun else self._all.locate(points, T_prior)
-        self._asked = (features, points, found)
+        self._asked = _Asked(features, points, found, starved)
         if not found.ok:
             return starved
         why = starved.reason or "features hold the place badly"
@@ -164,11 +177,16 @@ class FeatureRegistration(Stateful):
             self._recent = (*self._recent, (_all_points(features), result.T_world_lidar))[-self.config.start_scans :]
             if self.map is not None:
                 self.map.insert(features, result.T_world_lidar)
-            if self._is_starved:
-                self._enter_all(features, result)
+            asked = self._asked if self._asked is not None and self._asked.features is features else None
+            if self._fed < FED:
+                self._enter_all(features, result, asked)
+                self._fed += 1
             if self.target is not None and not result.is_denied:
                 self._starting = max(self._starting - 1, 0)
-                self.agreement.observe(result.agreement)
+                # All points agree less with their map than features do with theirs.
+                own = asked.by_features if asked is not None and asked.found.ok else result
+                if own.ok:
+                    self.agreement.observe(own.agreement)
                 move, turn = result.prior_error
                 self.threshold.observe(move + turn * result.lever_arm)
             self._failures = 0
@@ -261,16 +279,15 @@ class FeatureRegistration(Stateful):
         plain = {"residual": None, "target": "map", "inlier_distance": None, "inlier_ratio": 1.0, "voxel_size": size}
         return Registration(self.config.model_copy(update=plain))
 
-    def _enter_all(self, features: Features, result: RegistrationResult) -> None:
+    def _enter_all(self, features: Features, result: RegistrationResult, asked: _Asked | None) -> None:
         """All points of a registered scan; what `icp` found of it, if asked, teaches it what to expect."""
-        if self._asked is not None and self._asked[0] is features and self._asked[2].ok:
-            _, points, found = self._asked
-            found = replace(found, T_world_lidar=result.T_world_lidar, is_denied=result.is_denied)
+        if asked is not None and asked.found.ok:
+            points = asked.points
+            found = replace(asked.found, T_world_lidar=result.T_world_lidar, is_denied=result.is_denied)
         else:
             points = prepare_points(_all_points(features), self._all.preprocess)
             found = RegistrationResult(result.T_world_lidar, is_denied=True)
         self._all.update(points, found)
-        self._asked = None
 
     def _stand_in(
         self, features: Features, start: RegistrationResult, T_prior: Floats, starved: RegistrationResult
