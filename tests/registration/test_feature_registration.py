@@ -13,7 +13,7 @@ from lslam.config.config import Config
 from lslam.config.loam import LoamConfig
 from lslam.geometry import se3
 from lslam.preprocessing.features import Features, extract_features
-from lslam.registration.feature_registration import FeatureRegistration
+from lslam.registration.feature_registration import FED, FeatureRegistration
 from lslam.registration.feature_scan import feature_scan
 from lslam.registration.feature_solver import NONE, FeatureNoise, kept_where_blind, solve_on_scan
 from lslam.registration.feature_steps import ScanStep, StageClock, joint_step, two_steps, upright_directions
@@ -184,6 +184,22 @@ def test_less_planar_points_may_stand_in_and_leave_a_direction_open(monkeypatch:
     assert len(result.degenerate) == 1
     assert abs(result.T_world_lidar[0, 3] - prior[0, 3]) < 5e-3
     assert np.abs(result.T_world_lidar[1:3, 3] - truth[1:3, 3]).max() < 0.01
+
+
+def test_a_map_of_all_points_is_given_up_when_features_are_fed_again(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    registration, features = engine(None, True), features_at(np.eye(4))
+    registration.update(features, registration.locate(features, np.eye(4), StageClock()))
+    entered = []
+    for is_starved in (False, True, *[False] * (FED + 2)):
+        monkeypatch.setattr(registration, "_holds_place", lambda result, starved=is_starved: not starved)
+        result = registration.locate(features, np.eye(4), StageClock())
+        assert ("all points stood in" in result.reason) == is_starved
+        registration.update(features, result)
+        entered.append(registration._all.state()["_inserted"])
+    assert entered[0] == 0
+    assert np.diff(entered[1:]).tolist() == [1] * (FED - 1) + [0] * 3
 
 
 @pytest.mark.parametrize(
