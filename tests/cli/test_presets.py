@@ -16,7 +16,7 @@ def test_flags_beat_settings_beat_the_preset_and_the_run_records_it(tmp_path: Pa
     (tmp_path / "mine.toml").write_text(PRESET)
     done = lslam_process(
         "run", SAMPLE, "--preset", "mine.toml", "--method", "icp", "--set", "map.voxel=0.4", "--count", "6",
-        "--out", "out", cwd=tmp_path, env=environment(LSLAM_MAP_VOXEL="0.3"),
+        "--out", "out", cwd=tmp_path, env=environment(LSLAM_MAP_VOXEL="0.3", PYTHONPATH=str(SAMPLE.parent)),
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     resolved = tomllib.loads((tmp_path / "out" / "config.toml").read_text())

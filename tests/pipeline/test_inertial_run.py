@@ -26,6 +26,7 @@ from lslam.pipeline.run import run
 from lslam.pipeline.watch import RunOutcome
 from lslam.readers import select
 from lslam.reports.text import summary
+from lslam.simulation.lidar_models import LIDARS
 from lslam.simulation.scenarios import SimulatedDrive, simulate
 from lslam.types.imu import ImuStream
 from lslam.types.scan_result import ScanResult
@@ -36,7 +37,8 @@ COUNT = 60
 @cache
 def walk_drive() -> SimulatedDrive:
     """A hand-held walk, looking about at up to 110 deg/s, rays fired on the way."""
-    return simulate("walk", lidar="vlp16", count=COUNT, imu="icm20948", motion_compensated=False)
+    lidar = dataclasses.replace(LIDARS["vlp16"], columns=600)
+    return simulate("walk", lidar=lidar, count=COUNT, imu="icm20948", motion_compensated=False)
 
 
 @cache
