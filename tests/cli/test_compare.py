@@ -122,7 +122,7 @@ def test_wrong_use_is_said_before_anything_runs(
 
 def test_an_interruption_keeps_what_is_finished_for_resume(tmp_path: Path) -> None:
     out = tmp_path / "out"
-    call = ["compare", "block", "--methods", "icp", "--seeds", "0,1", "--count", "200", "--out", str(out)]
+    call = ["compare", "block", "--methods", "icp", "--seeds", "0,1", "--count", "100", "--out", str(out)]
     child = subprocess.Popen(
         [*COMMAND, *call], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment(),
         start_new_session=True,

@@ -21,8 +21,8 @@ from lslam.types.scan_result import ScanResult
 @pytest.mark.parametrize(
     ("scenario", "sensor", "count"),
     [
-        ("motorway", None, 45),
-        ("walk", None, 50),
+        ("motorway", None, 30),
+        ("walk", None, 30),
         ("motorway", "os1-32", 55),
         ("walk", "vlp16", 50),
         ("urban", "os1-32", 50),

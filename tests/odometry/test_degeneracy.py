@@ -14,6 +14,7 @@ from lslam.config.config import Config
 from lslam.geometry import se3
 from lslam.odometry import create_odometry
 from lslam.pipeline.front_end import estimate
+from lslam.readers import select
 from lslam.registration.solver import RegistrationResult
 from lslam.simulation.scenarios import simulate
 from lslam.studies.kept import KeptSequences, ScanStore
@@ -86,12 +87,14 @@ def by_features(drive: Sequence, method: str) -> list[ScanResult]:
 
 @pytest.mark.parametrize("scenario", ["street", "urban"])
 def test_towns_hold_every_direction(scenario: str) -> None:
-    d = drive(scenario, 0, 50, compensated=True)
+    d = drive(scenario, 0, 25, every=2, compensated=True)
     flagged = [len(r.degenerate) > 0 for r in d.results]
     assert np.mean(flagged) < 0.02
 
 
 @pytest.mark.parametrize(("scenario", "lidar"), [("street", "vlp16"), ("urban", None)])
 def test_towns_hold_every_direction_of_loam_scan_to_scan(scenario: str, lidar: str | None) -> None:
-    results = by_features(simulate(scenario, seed=1, count=30, lidar=lidar, motion_compensated=True), "loam-odom")
+    whole = simulate(scenario, seed=1, count=29, lidar=lidar, motion_compensated=True)
+    results = by_features(select(whole, skip_frames=2), "loam-odom")
+    assert len(results) == 15
     assert not any(len(r.degenerate) for r in results)
