@@ -73,8 +73,8 @@ def test_only_the_first_compiles(cold_starts: tuple[Path, list[tuple[int, str]],
     assert warm.returncode == 0
     assert "compiling" not in warm.stderr
     assert manifest(tmp_path / "out")["timings"]["compile_s"] < 3
-    # To compile takes 12 s of an idle core and more of a busy one, and all of them would have needed it.
-    assert cold_s - STARTS * warm_s < (STARTS - 1) * 12
+    # To compile takes ten times as long as such a run, on any machine, and all of them would have needed it.
+    assert cold_s - STARTS * warm_s < STARTS / 2 * 10 * warm_s
 
 
 def test_a_damaged_cache_costs_time_not_the_run(
