@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from lslam.config.config import Config
 from lslam.geometry import se3, so3
@@ -14,6 +15,7 @@ from lslam.odometry import create_odometry
 from lslam.odometry.base import Deskewing, Searching
 from lslam.simulation.scenarios import simulate
 from lslam.types.motion_prior import MotionPrior
+from lslam.types.scan import Scan
 from lslam.types.scan_result import ScanResult
 
 
@@ -39,19 +41,23 @@ def test_a_scan_enters_where_it_was_put(method: str) -> None:
     assert np.trace(done.covariance) < 1e-4, "what it was said to be known to adds up"
 
 
-@pytest.mark.parametrize("method", ["icp", "loam"])
-def test_a_scan_whose_registration_is_denied_enters_where_it_is_put_and_teaches_nothing(method: str) -> None:
-    """The third scan is found a metre from its prior: believed, that opens the kernel; denied, it enters at the prior."""
+def before_the_third(method: str) -> tuple[Searching, Any, Scan, NDArray[np.float64]]:
+    """A method that knows two scans of a drive, its registration, the third scan, and the true poses (3, 4, 4)."""
     odometry = create_odometry(Config.model_validate({"odometry": {"method": method}}))
-    assert isinstance(odometry, Deskewing)
-    registration: Any = vars(odometry)["registration"]
+    assert isinstance(odometry, Searching)
     drive = simulate("block", count=3)
     assert drive.ground_truth is not None
     for scan, pose in zip(list(drive)[:2], drive.ground_truth.poses, strict=False):
         prior, prepared = MotionPrior.at_once(pose), odometry.prepare(scan)
         odometry.update(scan, prepared, prior, odometry.register(scan, prepared, prior))
-    scan = drive.scan(2)
-    prepared = odometry.prepare(scan)
+    return odometry, vars(odometry)["registration"], drive.scan(2), drive.ground_truth.poses
+
+
+@pytest.mark.parametrize("method", ["icp", "loam"])
+def test_a_scan_whose_registration_is_denied_enters_where_it_is_put_and_teaches_nothing(method: str) -> None:
+    """The third scan is found a metre from its prior: believed, that opens the kernel; denied, it enters at the prior."""
+    odometry, registration, scan, (_, before, _) = before_the_third(method)
+    prepared, prior = odometry.prepare(scan), MotionPrior.at_once(before)
     found = odometry.register(scan, prepared, prior)
     assert (found.status, round(found.prior_error[0])) == ("ok", 1)
     known = registration.threshold.width, registration.agreement.usual
@@ -68,12 +74,8 @@ def test_a_scan_whose_registration_is_denied_enters_where_it_is_put_and_teaches_
 @pytest.mark.parametrize("method", ["icp", "loam"])
 def test_near_a_prior_nothing_is_sought_elsewhere(method: str) -> None:
     """The third scan, expected two metres beside it: it is found all the same, but not near there."""
-    odometry = create_odometry(Config.model_validate({"odometry": {"method": method}}))
-    assert isinstance(odometry, Searching)
-    registration: Any = vars(odometry)["registration"]
-    drive = simulate("block", count=3)
-    assert drive.ground_truth is not None
-    *entered, true = drive.ground_truth.poses
+    odometry, registration, scan, (*_, true) = before_the_third(method)
+    prepared = odometry.prepare(scan)
 
     def off_by(y: float, z: float = 0.0) -> MotionPrior:
         return MotionPrior.at_once(true @ se3.make(np.eye(3), np.array([0, y, z])))
@@ -81,11 +83,6 @@ def test_near_a_prior_nothing_is_sought_elsewhere(method: str) -> None:
     def error(result: ScanResult) -> float:
         return float(np.linalg.norm(result.T_world_lidar[:3, 3] - true[:3, 3]))
 
-    for scan, pose in zip(list(drive)[:2], entered, strict=True):
-        prior, prepared = MotionPrior.at_once(pose), odometry.prepare(scan)
-        odometry.update(scan, prepared, prior, odometry.register(scan, prepared, prior))
-    scan = drive.scan(2)
-    prepared = odometry.prepare(scan)
     assert error(odometry.register(scan, prepared, off_by(2.0))) < 0.05
     assert odometry.register_near(scan, prepared, off_by(2.0)).status == "bridged"
     near = odometry.register_near(scan, prepared, off_by(0.05))
