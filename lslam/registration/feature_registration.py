@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,12 +11,13 @@ from lslam.config.loam import LoamConfig
 from lslam.config.registration import RegistrationConfig
 from lslam.kernels import voxel
 from lslam.preprocessing.features import Features
-from lslam.preprocessing.prepare import NO_TIMES, PreparedPoints, prepare_points
+from lslam.preprocessing.prepare import NO_TIMES
+from lslam.registration.all_points import AllPoints
 from lslam.registration.feature_map import FeatureMap
 from lslam.registration.feature_scan import FeatureScan, feature_scan, surface_size
 from lslam.registration.feature_solver import NONE, FeatureNoise, kept_where_blind, solve_on_map
 from lslam.registration.feature_steps import ScanStep, StageClock
-from lslam.registration.registration import DOUBT, NEAR_KERNEL, Registration, correction
+from lslam.registration.registration import DOUBT, NEAR_KERNEL, correction
 from lslam.registration.robust import AdaptiveThreshold, Annealing, UsualAgreement
 from lslam.registration.solver import RegistrationResult
 from lslam.types.state import Stateful
@@ -29,20 +30,8 @@ MIN_FEATURES = 60
 PATIENCE = 3
 # Planar points that face one way hold the place along it well enough, as many as LOAM asks for a plane.
 ENOUGH = 5
-# After so many scans in a row that features held well, two seconds at 10 Hz, the map of all points is given up.
-FED = 20
 # m, grid of the less planar points when they stand in for the features: as `preprocess.source_voxel`.
 STAND_IN_GRID = 1.0
-
-
-@dataclass(frozen=True)
-class _Asked:
-    """What `icp` found of a scan's points, and before it the features."""
-
-    features: Features
-    points: PreparedPoints
-    found: RegistrationResult
-    by_features: RegistrationResult
 
 
 class FeatureRegistration(Stateful):
@@ -57,7 +46,7 @@ class FeatureRegistration(Stateful):
     """
 
     STATE = (
-        "map", "target", "threshold", "agreement", "_starting", "_recent", "_inserted", "_failures", "_all", "_fed",
+        "map", "target", "threshold", "agreement", "_starting", "_inserted", "_failures", "_all",
     )  # fmt: skip
 
     def __init__(
@@ -72,15 +61,9 @@ class FeatureRegistration(Stateful):
         self.threshold = AdaptiveThreshold(config.kernel_min, config.kernel_max)
         self.agreement = UsualAgreement(config.min_agreement)
         self._starting = config.start_scans
-        # All points and the poses of the scans that were registered last.
-        self._recent: tuple[tuple[NDArray[np.float32], Floats], ...] = ()
         self._inserted = 0
         self._failures = 0
-        # `icp` with all points, kept up to date from a scan on whose features hold the place badly.
-        self._all = self._new_plain()
-        self._fed = FED
-        # Of the scan that was located last, when all its points were asked.
-        self._asked: _Asked | None = None
+        self._all = AllPoints(config, surface_size(config.voxel_size, loam.grid_step))
 
     @property
     def noise(self) -> FeatureNoise:
@@ -131,10 +114,11 @@ class FeatureRegistration(Stateful):
         is_far = not result.ok or result.prior_error[0] > self.config.recover_m
         if self.config.start_reach > 0 and (self._is_begun or is_far):
             with clock.stage("start" if self._starting else "recover"):
-                result = self._held(features, start.T_world_lidar if self._is_begun else T_prior, T_prior, result)
+                T_start = start.T_world_lidar if self._is_begun else T_prior
+                result = self._all.held(features, T_start, T_prior, result)
         if self.map is not None and not self._holds_place(result):
             with clock.stage("all-points"):
-                result = self._by_all_points(features, start, T_prior, result)
+                result = self._all.stand_in(features, T_prior, result, start if self._is_begun else None)
         return result
 
     def _holds_place(self, result: RegistrationResult) -> bool:
@@ -142,25 +126,6 @@ class FeatureRegistration(Stateful):
         if not result.ok or result.covariance is None:
             return False
         return float(np.linalg.eigvalsh(result.covariance[:3, :3])[-1]) < self.config.sigma**2 / ENOUGH
-
-    def _by_all_points(
-        self, features: Features, start: RegistrationResult, T_prior: Floats, starved: RegistrationResult
-    ) -> RegistrationResult:
-        """Where `icp` finds all points on a map of all points, unless it fails; what features leave open stays flagged.
-
-        Few rings at speed leave so few features that one false one leads them astray, metres from scan to scan.
-        """
-        if self._fed >= FED:
-            self._all = self._plain()
-        self._fed = 0
-        points = prepare_points(_all_points(features), self._all.preprocess)
-        found = start if self._is_begun else self._all.locate(points, T_prior)
-        self._asked = _Asked(features, points, found, starved)
-        if not found.ok:
-            return starved
-        why = starved.reason or "features hold the place badly"
-        flagged = found.degenerate if len(found.degenerate) else starved.degenerate
-        return replace(found, degenerate=flagged, reason=f"{why}: all points stood in")
 
     def _kept(self, result: RegistrationResult, expected: Floats, T_prior: Floats) -> RegistrationResult:
         """The result at `expected` (4, 4) in the directions it leaves open."""
@@ -174,17 +139,13 @@ class FeatureRegistration(Stateful):
         """Enter the scan into map and target unless its registration failed; learn from it unless it was denied."""
         if result.ok:
             self._inserted += 1
-            self._recent = (*self._recent, (_all_points(features), result.T_world_lidar))[-self.config.start_scans :]
             if self.map is not None:
                 self.map.insert(features, result.T_world_lidar)
-            asked = self._asked if self._asked is not None and self._asked.features is features else None
-            if self._fed < FED:
-                self._enter_all(features, result, asked)
-                self._fed += 1
+            self._all.update(features, result)
             if self.target is not None and not result.is_denied:
                 self._starting = max(self._starting - 1, 0)
                 # All points agree less with their map than features do with theirs.
-                own = asked.by_features if asked is not None and asked.found.ok else result
+                own = self._all.by_features(features, result)
                 if own.ok:
                     self.agreement.observe(own.agreement)
                 move, turn = result.prior_error
@@ -244,8 +205,7 @@ class FeatureRegistration(Stateful):
         """A start that is metres nearer, where the prior may be metres off: less planar points on coarse planes."""
         c = self.config
         if self._is_begun:
-            plain = self._plain()
-            return plain.locate(prepare_points(_all_points(features), plain.preprocess), T_prior)
+            return self._all.locate(features, T_prior)
         points, scatter = _thinned(features)
         target = self._planes()
         slow = Annealing(c.coarse_kernel, c.kernel_min, c.coarse_decay, c.start_iterations)
@@ -254,40 +214,6 @@ class FeatureRegistration(Stateful):
             target, NONE, points, T_prior, slow, self.noise, scatter=scatter, coarse=coarse, is_coarse_only=True
         )
         return self._judge(result, T_prior)
-
-    def _held(
-        self, features: Features, T_start: Floats, T_prior: Floats, found: RegistrationResult
-    ) -> RegistrationResult:
-        """What was found, unless much more of what stands on the ground agrees elsewhere: few rings slide along a road."""
-        plain = self._plain()
-        held = plain.held(prepare_points(_all_points(features), plain.preprocess), T_start, found)
-        if held is found:
-            return found
-        why = found.reason or "features disagree with what stands on the ground"
-        return replace(held, prior_error=correction(T_prior, held.T_world_lidar), reason=f"{why}: all points stood in")
-
-    def _plain(self) -> Registration:
-        """`icp` with all points of the scans that were registered last in its map."""
-        icp = self._new_plain()
-        for points, T_world_lidar in self._recent:
-            icp.update(prepare_points(points, icp.preprocess), RegistrationResult(T_world_lidar))
-        return icp
-
-    def _new_plain(self) -> Registration:
-        """`icp` in its default ways, with an empty map."""
-        size = surface_size(self.config.voxel_size, self.loam.grid_step)
-        plain = {"residual": None, "target": "map", "inlier_distance": None, "inlier_ratio": 1.0, "voxel_size": size}
-        return Registration(self.config.model_copy(update=plain))
-
-    def _enter_all(self, features: Features, result: RegistrationResult, asked: _Asked | None) -> None:
-        """All points of a registered scan; what `icp` found of it, if asked, teaches it what to expect."""
-        if asked is not None and asked.found.ok:
-            points = asked.points
-            found = replace(asked.found, T_world_lidar=result.T_world_lidar, is_denied=result.is_denied)
-        else:
-            points = prepare_points(_all_points(features), self._all.preprocess)
-            found = RegistrationResult(result.T_world_lidar, is_denied=True)
-        self._all.update(points, found)
 
     def _stand_in(
         self, features: Features, start: RegistrationResult, T_prior: Floats, starved: RegistrationResult
@@ -372,8 +298,3 @@ def _failed(T_prior: Floats, source_points: int, reason: str) -> RegistrationRes
     return RegistrationResult(
         T_prior.copy(), ok=False, reason=reason, covariance=DOUBT.copy(), converged=False, source_points=source_points
     )
-
-
-def _all_points(features: Features) -> NDArray[np.float32]:
-    parts = (features.less_planes, features.planes, features.less_edges, features.neither)
-    return np.concatenate([part.points for part in parts], dtype=np.float32)

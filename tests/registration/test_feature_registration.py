@@ -13,7 +13,8 @@ from lslam.config.config import Config
 from lslam.config.loam import LoamConfig
 from lslam.geometry import se3
 from lslam.preprocessing.features import Features, extract_features
-from lslam.registration.feature_registration import FED, FeatureRegistration
+from lslam.registration.all_points import FED
+from lslam.registration.feature_registration import FeatureRegistration
 from lslam.registration.feature_scan import feature_scan
 from lslam.registration.feature_solver import NONE, FeatureNoise, kept_where_blind, solve_on_scan
 from lslam.registration.feature_steps import ScanStep, StageClock, joint_step, two_steps, upright_directions
@@ -197,7 +198,7 @@ def test_a_map_of_all_points_is_given_up_when_features_are_fed_again(
         result = registration.locate(features, np.eye(4), StageClock())
         assert ("all points stood in" in result.reason) == is_starved
         registration.update(features, result)
-        entered.append(registration._all.state()["_inserted"])
+        entered.append(registration._all.state()["_icp"]["_inserted"])
     assert entered[0] == 0
     assert np.diff(entered[1:]).tolist() == [1] * (FED - 1) + [0] * 3
 

@@ -1,0 +1,127 @@
+"""`icp` beside LOAM's features: all points of a scan, asked where features are few or hold the place badly."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.config.registration import RegistrationConfig
+from lslam.preprocessing.features import Features
+from lslam.preprocessing.prepare import PreparedPoints, prepare_points
+from lslam.registration.registration import Registration, correction
+from lslam.registration.solver import RegistrationResult
+from lslam.types.state import Stateful
+
+Floats = NDArray[np.float64]
+
+# After so many scans in a row that features held well, two seconds at 10 Hz, the map of all points is given up.
+FED = 20
+
+
+@dataclass(frozen=True)
+class _Asked:
+    """What `icp` found of a scan's points, and before it the features."""
+
+    features: Features
+    points: PreparedPoints
+    found: RegistrationResult
+    by_features: RegistrationResult
+
+
+class AllPoints(Stateful):
+    """Keeps the points of the scans registered last, and a map of all points while it is needed.
+
+    Parameters
+    ----------
+    voxel_size : m, of the map of all points
+    """
+
+    STATE = ("_recent", "_icp", "_fed")
+
+    def __init__(self, config: RegistrationConfig, voxel_size: float) -> None:
+        plain = {
+            "residual": None, "target": "map", "inlier_distance": None, "inlier_ratio": 1.0, "voxel_size": voxel_size,
+        }  # fmt: skip
+        self._config = config.model_copy(update=plain)
+        # All points and the poses of the scans that were registered last.
+        self._recent: tuple[tuple[NDArray[np.float32], Floats], ...] = ()
+        # `icp` in its default ways, kept up to date from a scan on whose features hold the place badly.
+        self._icp = Registration(self._config)
+        self._fed = FED
+        # Of the scan that was located last, when all its points were asked.
+        self._asked: _Asked | None = None
+
+    def locate(self, features: Features, T_prior: Floats) -> RegistrationResult:
+        """Where `icp` finds all points on those of the scans that were registered last."""
+        icp = self._of_recent()
+        return icp.locate(prepare_points(_points(features), icp.preprocess), T_prior)
+
+    def held(
+        self, features: Features, T_start: Floats, T_prior: Floats, found: RegistrationResult
+    ) -> RegistrationResult:
+        """What was found, unless much more of what stands on the ground agrees elsewhere: few rings slide along a road."""
+        icp = self._of_recent()
+        held = icp.held(prepare_points(_points(features), icp.preprocess), T_start, found)
+        if held is found:
+            return found
+        why = found.reason or "features disagree with what stands on the ground"
+        return replace(held, prior_error=correction(T_prior, held.T_world_lidar), reason=f"{why}: all points stood in")
+
+    def stand_in(
+        self, features: Features, T_prior: Floats, starved: RegistrationResult, known: RegistrationResult | None
+    ) -> RegistrationResult:
+        """Where `icp` finds all points on a map of all points, unless it fails; what features leave open stays flagged.
+
+        Few rings at speed leave so few features that one false one leads them astray, metres from scan to scan.
+        known : what `locate` found of them, if that was asked already
+        """
+        if self._fed >= FED:
+            self._icp = self._of_recent()
+        self._fed = 0
+        points = prepare_points(_points(features), self._icp.preprocess)
+        found = self._icp.locate(points, T_prior) if known is None else known
+        self._asked = _Asked(features, points, found, starved)
+        if not found.ok:
+            return starved
+        why = starved.reason or "features hold the place badly"
+        flagged = found.degenerate if len(found.degenerate) else starved.degenerate
+        return replace(found, degenerate=flagged, reason=f"{why}: all points stood in")
+
+    def update(self, features: Features, result: RegistrationResult) -> None:
+        """Remember all points of a registered scan; what `icp` found of it, if asked, teaches it what to expect."""
+        self._recent = (*self._recent, (_points(features), result.T_world_lidar))[-self._config.start_scans :]
+        if self._fed >= FED:
+            return
+        self._fed += 1
+        asked = self._asked_of(features)
+        if asked is not None:
+            points = asked.points
+            found = replace(asked.found, T_world_lidar=result.T_world_lidar, is_denied=result.is_denied)
+        else:
+            points = prepare_points(_points(features), self._icp.preprocess)
+            found = RegistrationResult(result.T_world_lidar, is_denied=True)
+        self._icp.update(points, found)
+
+    def by_features(self, features: Features, result: RegistrationResult) -> RegistrationResult:
+        """What the features found of a scan before all points stood in for them: `result` where these did not."""
+        asked = self._asked_of(features)
+        return result if asked is None else asked.by_features
+
+    def _asked_of(self, features: Features) -> _Asked | None:
+        """What all points said of this scan, where they were asked and did not fail."""
+        asked = self._asked
+        return asked if asked is not None and asked.features is features and asked.found.ok else None
+
+    def _of_recent(self) -> Registration:
+        """`icp` with all points of the scans that were registered last in its map."""
+        icp = Registration(self._config)
+        for points, T_world_lidar in self._recent:
+            icp.update(prepare_points(points, icp.preprocess), RegistrationResult(T_world_lidar))
+        return icp
+
+
+def _points(features: Features) -> NDArray[np.float32]:
+    parts = (features.less_planes, features.planes, features.less_edges, features.neither)
+    return np.concatenate([part.points for part in parts], dtype=np.float32)
