@@ -77,8 +77,11 @@ class UsualAgreement(Stateful):
         return share < self.drop * self.usual
 
     def observe(self, share: float) -> None:
-        """Learn from a good scan."""
-        self.usual = share if self.usual == 0.0 else self.FORGETTING * self.usual + (1 - self.FORGETTING) * share
+        """Learn from a good scan: at once what is more than usual, by and by what is less.
+
+        Each scan fills the voxels of a young map, and the next one finds more of them: a mean over the last few lags behind.
+        """
+        self.usual = max(share, self.FORGETTING * self.usual + (1 - self.FORGETTING) * share)
 
     def relax(self) -> None:
         """Expect less after a bad scan, so that a place that has changed for good is accepted after a few."""

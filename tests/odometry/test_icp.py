@@ -132,6 +132,19 @@ def test_a_bad_scan_is_bridged_flagged_kept_out_of_the_map_and_got_over(kind: st
         assert np.sqrt(good.covariance[0, 0]) < 0.05
 
 
+def test_a_sensor_carried_away_while_the_map_is_young_is_told() -> None:
+    """Few points agree with a young map, and of those from elsewhere hardly fewer than of the map's own second scan."""
+    scans, truth = block()
+    driver = Driver()
+    for k in range(9):
+        elsewhere = [i for i in range(k + 20, 95, 17) if np.linalg.norm(truth[i, :3, 3] - truth[k, :3, 3]) > 12]
+        for i in elsewhere[: 2 if k > 2 else 0]:
+            prior = MotionPrior.at_once(driver.motion.predict(scans[k].stamp_ns))
+            carried = driver.icp.register(scans[i], driver.icp.prepare(scans[i]), prior)
+            assert carried.status == "bridged", (k, i)
+        assert driver.feed(scans[k]).status == "ok"
+
+
 def test_five_bad_scans_in_a_row_are_bridged_by_constant_velocity() -> None:
     scans, truth = block()
     driver = warmed()

@@ -65,6 +65,14 @@ def test_a_scan_that_agrees_less_than_usual_is_told_from_one_that_varies() -> No
     assert agreement.is_less(0.6)
 
 
+def test_what_a_filling_map_agrees_with_is_usual_at_once() -> None:
+    agreement = UsualAgreement(0.5)
+    for share in (0.18, 0.34, 0.42, 0.46, 0.52):  # the sample drive, 16 x 400 rays
+        assert not agreement.is_less(share)
+        agreement.observe(share)
+    assert agreement.is_collapse(0.17)  # and its next scan from elsewhere
+
+
 def test_a_changed_place_is_accepted_after_a_few_bad_scans() -> None:
     agreement = UsualAgreement(0.5)
     agreement.observe(0.8)
