@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.kernels.gauss_newton import advance, clear, trimmed, workspace
+from lslam.kernels.gaussians import BLOB
 from lslam.kernels.jit import kernel
 from lslam.kernels.residuals import add_information, octant_slots
 
@@ -16,13 +17,15 @@ Flags = NDArray[np.bool_]
 
 
 @kernel
-def linearise_point(source: Floats, R: Floats, t: Floats, size: float, scale: float, sigma2: float, gate2: float,
+def linearise_point(source: Floats, gaps: Floats, R: Floats, t: Floats, size: float, scale: float, sigma2: float, gate2: float,
                     planes: Floats, keys: Longs, table: Ints, cells: Longs, slots: Ints, is_done: Flags, away2: Floats,
                     H: Floats, g: Floats, facts: Floats) -> None:  # fmt: skip
     """Add to H (6, 6), g (6,) and facts all source points (S, 3), LiDAR frame, that are not done.
 
     Residual e = R s + t - mean of the nearest of eight voxels, planes or not; variance sigma2 plus that of a place in a
     voxel, size2 / 12; Geman-McClure weight of width sqrt(scale2 + size2): where in its voxel a point lies is no outlier.
+    Where the next ring lies farther off than a voxel, gaps (S,), a mean of few points is one ring's, and would hold those
+    that follow to where this one lies: such a match is left to a coarser map.
     `away2` and `facts` as in `residuals.linearise`, distances being those to the mean.
     """
     inverse = 1.0 / size
@@ -47,7 +50,7 @@ def linearise_point(source: Floats, R: Floats, t: Floats, size: float, scale: fl
             d = (x - p[0]) ** 2 + (y - p[1]) ** 2 + (z - p[2]) ** 2
             if d < best_d:
                 best_d, best = d, s
-        if best < 0:
+        if best < 0 or (gaps[i] > size and planes[best, 7] < BLOB):
             continue
         is_done[i] = True
         away2[i] = best_d
@@ -69,15 +72,16 @@ def linearise_point(source: Floats, R: Floats, t: Floats, size: float, scale: fl
 
 @kernel
 def align_point(
-    source: Floats, scatter: Floats, R: Floats, t: Floats, scale_start: float, scale_end: float, decay: float,
+    source: Floats, gaps: Floats, R: Floats, t: Floats, scale_start: float, scale_end: float, decay: float,
     max_iterations: int, step_m: float, step_rad: float, inlier_distance: float, inlier_ratio: float, sigma2: float,
     blob_weight: float, weak_share: float, size: float, planes: Floats, keys: Longs, table: Ints,
     has_coarse: bool, coarse_size: float, coarse_planes: Floats, coarse_keys: Longs,
     coarse_table: Ints,
 ) -> tuple[Floats, Floats, Floats, int, bool, int, Floats]:  # fmt: skip
-    """As `gauss_newton.align`, point to point; scatter and blobs do not matter to it."""
+    """As `gauss_newton.align`, point to point: gaps (S,), m, stand for the scatter, and blobs do not matter to it."""
     cells, slots, is_done, away2 = workspace(len(source))
     coarse_cells, coarse_slots, _, _ = workspace(len(source) if has_coarse else 0)
+    everywhere = np.zeros(len(source))
     H, g, d, facts, weak = np.empty((6, 6)), np.empty(6), np.zeros(6), np.zeros(7), np.zeros((6, 6))
     farthest2 = inlier_distance * inlier_distance
     gate2, scale = farthest2, scale_start
@@ -86,11 +90,11 @@ def align_point(
     iterations = 0
     for _ in range(max_iterations):
         clear(H, g, facts, is_done, away2)
-        linearise_point(source, R, t, size, scale, sigma2, gate2, planes, keys, table, cells, slots, is_done, away2, H, g,
+        linearise_point(source, gaps, R, t, size, scale, sigma2, gate2, planes, keys, table, cells, slots, is_done, away2, H, g,
                         facts)  # fmt: skip
         facts[6] = facts[2]
         if has_coarse:
-            linearise_point(source, R, t, coarse_size, scale, sigma2, gate2, coarse_planes, coarse_keys, coarse_table,
+            linearise_point(source, everywhere, R, t, coarse_size, scale, sigma2, gate2, coarse_planes, coarse_keys, coarse_table,
                             coarse_cells, coarse_slots, is_done, away2, H, g, facts)  # fmt: skip
         iterations += 1
         moved, weak_count, move, turn = advance(H, g, facts, scale, weak_share, R, t, d, weak, weak_count)

@@ -12,6 +12,7 @@ from lslam.config.preprocess import PreprocessConfig
 from lslam.config.registration import RegistrationConfig, Residual
 from lslam.errors import InputError
 from lslam.geometry import se3, so3
+from lslam.preprocessing.beams import ring_gap
 from lslam.preprocessing.prepare import PreparedPoints, prepare_points, thin
 from lslam.registration.gaussian_map import GaussianMap
 from lslam.registration.motion import ConstantVelocity
@@ -41,6 +42,11 @@ SCAN_NS = 100_000_000
 
 # Point to point: of the voxel size, because a voxel's mean stands for one point of its surface, its plane for all.
 POINT_VOXEL = 0.625
+# Times the voxel size: where the rings of a sparse sensor lie farther apart than a voxel, points go to voxels that hold
+# several: 2.5 m are the gaps of sixteen beams two degrees apart at 70 m.
+GAP_FACTOR = 4
+# A few points at the edge of sight are not worth a second map.
+SPARSE_SHARE = 0.1
 # Times the steps: a point is drawn to where its match is, not to where the surfaces meet, and the score of a normal
 # distribution has no pull on points a few sigma away, so that those near by turn the sensor a little with each step.
 SLOWLY: dict[Residual, int] = {"point": 3, "ndt": 3}
@@ -60,7 +66,8 @@ class Registration(Stateful):
     (4, 4)
     """
 
-    STATE = ("map", "target", "threshold", "agreement", "_motion", "_index", "_starting", "_inserted", "_recent")
+    STATE = ("map", "target", "threshold", "agreement", "_motion", "_index", "_starting", "_inserted", "_recent",
+             "_ring_gap")  # fmt: skip
 
     def __init__(self, config: RegistrationConfig | None = None, preprocess: PreprocessConfig | None = None) -> None:
         self.config = config or RegistrationConfig()
@@ -80,6 +87,8 @@ class Registration(Stateful):
         self._index = 0
         self._starting = self.config.start_scans
         self._inserted = 0
+        # Angle between rings, rad, for point to point; 0 where unknown.
+        self._ring_gap = 0.0
         # Points and poses of the scans that entered the map last.
         self._recent: tuple[tuple[NDArray[np.float32], NDArray[np.float64]], ...] = ()
 
@@ -113,6 +122,8 @@ class Registration(Stateful):
         if self.residual in NEEDS_COVARIANCE and points.covariance is None:
             found = source_covariance(points.source, points.map_points, self.config.sigma**2)
             points = replace(points, covariance=found)
+        if self.residual == "point":
+            points = replace(points, gaps=self._gaps(points))
         if self._starting > 0 and not is_near:
             return self._start(points, T_prior)
         c = self.config
@@ -279,11 +290,23 @@ class Registration(Stateful):
             annealing = Annealing(max(width, widest * c.kernel_min), widest * c.kernel_min, c.kernel_decay, steps)
         else:
             annealing = Annealing(c.inlier_distance, c.inlier_distance, c.kernel_decay, steps)
+        if coarse is None and points.gaps is not None:
+            coarse = self.map.coarsen(GAP_FACTOR)
         return solve(
             self.map, points, start, annealing,
             sigma=c.sigma, blob_weight=c.blob_weight, weak_share=c.weak_share, coarse=coarse, residual=self.residual,
             inlier_distance=np.inf if c.inlier_distance is None else c.inlier_distance, inlier_ratio=c.inlier_ratio,
         )  # fmt: skip
+
+    def _gaps(self, points: PreparedPoints) -> NDArray[np.float64] | None:
+        """(S,) m, between the rings at each source point, or None where they are seldom farther apart than a voxel.
+
+        The angle between rings is learnt while the map is young.
+        """
+        if self._inserted <= self.config.start_scans:
+            self._ring_gap = ring_gap(points.map_points)
+        gaps: NDArray[np.float64] = self._ring_gap * np.linalg.norm(points.source, axis=1)
+        return gaps if (gaps > self.map.size).mean() > SPARSE_SHARE else None
 
     def _agreement(self, result: RegistrationResult) -> float:
         """Share of the points on the map's surfaces; those of a single scan are coarse ones where its rings lie apart."""

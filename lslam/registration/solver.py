@@ -86,12 +86,9 @@ def solve(
     """
     second = target if coarse is None else coarse
     R, t = np.ascontiguousarray(T_prior[:3, :3]).copy(), T_prior[:3, 3].copy()
-    spread = points.scatter
-    if residual in NEEDS_COVARIANCE:
-        known = points.covariance
-        spread = source_covariance(points.source, points.map_points, sigma**2) if known is None else known
     H, facts, step, iterations, converged, weak_count, weak = kernel_of(residual)(
-        points.source, spread, R, t, annealing.start, annealing.end, annealing.decay, annealing.steps,
+        points.source, _known_of_source(residual, points, sigma), R, t,
+        annealing.start, annealing.end, annealing.decay, annealing.steps,
         STEP_M, STEP_RAD, inlier_distance, inlier_ratio, sigma**2, blob_weight, weak_share,
         target.size, *voxels_of(residual, target), coarse is not None, second.size, *voxels_of(residual, second),
     )  # fmt: skip
@@ -113,6 +110,16 @@ def solve(
         degenerate=weak[:weak_count].copy(),
         lever_arm=lever,
     )
+
+
+def _known_of_source(residual: Residual, points: PreparedPoints, sigma: float) -> NDArray[np.float64]:
+    """What a residual takes of each source point beside its place: scatter, covariance or the gap between rings."""
+    if residual == "point":
+        return np.zeros(len(points.source)) if points.gaps is None else points.gaps
+    if residual not in NEEDS_COVARIANCE:
+        return points.scatter
+    known = points.covariance
+    return source_covariance(points.source, points.map_points, sigma**2) if known is None else known
 
 
 def _covariance(

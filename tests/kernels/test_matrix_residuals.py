@@ -78,14 +78,15 @@ def scene() -> Scene:
     return Scene(target, reference, source, covariance, R, t)
 
 
-def linearise(s: Scene, residual: str, c: float, gate2: float = np.inf, blob: float = BLOB) -> Sums:
+def linearise(s: Scene, residual: str, c: float, gate2: float = np.inf, blob: float = BLOB, gap: float = 0.0) -> Sums:
     n, m = len(s.source), s.target
     H, g, facts, away2 = np.zeros((6, 6)), np.zeros(6), np.zeros(8), np.full(n, -1.0)
     S = np.zeros((6, 6))
     work = (np.full(n, -1, np.int64), np.full((n, 8), -1, np.int32), np.zeros(n, np.bool_), away2, H, S, g, facts)
     pose = (s.R, s.t, m.size, c)
     if residual == "point":
-        linearise_point(s.source, *pose, SIGMA2, gate2, m.planes, m.keys, m.table, *work[:5], *work[6:])
+        gaps = np.full(n, gap)
+        linearise_point(s.source, gaps, *pose, SIGMA2, gate2, m.planes, m.keys, m.table, *work[:5], *work[6:])
     elif residual == "gicp":
         linearise_gicp(s.source, s.covariance, *pose, SIGMA2, blob, gate2, m.planes, m.keys, m.table, *work)
     elif residual == "vgicp":
@@ -171,6 +172,20 @@ def test_distances_and_counts_are_those_of_the_closest_pair(scene: Scene, residu
     gated = linearise(scene, residual, c, 0.01)
     np.testing.assert_array_equal(gated.away2, found.away2)
     np.testing.assert_array_equal(gated.facts[2:4], found.facts[2:4])
+
+
+def test_a_mean_of_few_points_holds_nothing_where_rings_lie_far_apart(scene: Scene) -> None:
+    sparse, dense = np.array([[40.0, -25.0, 80.0]]), np.array([[40.0, -25.0, 90.0]])
+    some = np.tile(np.eye(3) / 10, (2, 1)).astype(np.float32)
+    target = GaussianMap(SIZE)
+    for points in (some[:3] + sparse + 0.05, some + dense + 0.05):
+        target.insert(points.astype(np.float32), np.eye(4))
+    source = (np.vstack([sparse, dense]) - scene.t) @ scene.R
+    few = Scene(target, scene.reference, source, scene.covariance[:2], scene.R, scene.t)
+    assert linearise(few, "point", 1.0, gap=0.9 * SIZE).facts[3] == 2
+    left = linearise(few, "point", 1.0, gap=1.1 * SIZE)
+    assert left.facts[3] == 1
+    assert left.away2[0] == -1.0 < left.away2[1]
 
 
 @pytest.mark.parametrize("residual", ["gicp", "vgicp"])

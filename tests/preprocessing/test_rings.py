@@ -15,7 +15,7 @@ from scipy.optimize import linear_sum_assignment
 
 from lslam.config import load_config
 from lslam.errors import ConfigError, InputError, UsageError
-from lslam.preprocessing.beams import elevation_borders
+from lslam.preprocessing.beams import elevation_borders, ring_gap
 from lslam.preprocessing.rings import RingRule, decide_rings, elevations, rings_by_order
 from lslam.readers import open_sequence
 from lslam.simulation.scenarios import simulate
@@ -127,6 +127,16 @@ def test_beams_may_be_uneven_and_hold_few_points_or_strays() -> None:
     assert borders is not None
     np.testing.assert_array_equal(np.searchsorted(borders, beams), np.arange(len(beams)))
     assert elevation_borders(rng.uniform(-0.4, 0.3, 50_000)) is None
+
+
+def test_the_angle_between_rings_is_read_from_the_points() -> None:
+    azimuth, beams = np.linspace(0, 2 * np.pi, 300), np.radians(np.linspace(-15, 15, 16))
+    a, e = (x.ravel() for x in np.meshgrid(azimuth, beams))
+    way = np.stack([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)], -1)
+    points = (np.random.default_rng(0).uniform(5, 80, (len(way), 1)) * way).astype(np.float32)
+    assert ring_gap(points) == pytest.approx(np.radians(2.0), rel=0.02)
+    assert ring_gap(np.random.default_rng(0).normal(0, 10, (20_000, 3)).astype(np.float32)) == 0.0
+    assert ring_gap(np.zeros((0, 3), np.float32)) == 0.0
 
 
 @pytest.mark.parametrize("wanted", ["auto", "field", "order", "rows", "rows:64", "elevation"])
