@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from lslam.kernels.gaussians import find
 from lslam.kernels.jit import inline, kernel
-from lslam.kernels.voxel import OFFSET, hash_key, index_of, pack, table_size
+from lslam.kernels.voxel import OFFSET, index_of, pack, place_of, table_size
 
 Floats = NDArray[np.float64]
 Longs = NDArray[np.int64]
@@ -23,8 +23,7 @@ Rings = NDArray[np.uint16]
 def build(points: Floats, rings: Rings, R: Floats, t: Floats, size: float) -> tuple[Floats, Rings, Ints, Longs, Ints]:
     """Grid of points (N, 3), LiDAR frame, at pose R, t; cells of `size`, m. Points too far for a cell are left out."""
     n = len(points)
-    mask = table_size(n) - 1
-    table = np.full(mask + 1, -1, np.int32)
+    table = np.full(table_size(n), -1, np.int32)
     keys = np.empty(n, np.int64)
     counts = np.zeros(n + 1, np.int32)
     cells = np.full(n, -1, np.int32)
@@ -41,9 +40,7 @@ def build(points: Floats, rings: Rings, R: Floats, t: Floats, size: float) -> tu
         if not (abs(x) * inverse < limit and abs(y) * inverse < limit and abs(z) * inverse < limit):
             continue
         key = pack(index_of(x, inverse), index_of(y, inverse), index_of(z, inverse))
-        h = hash_key(key, mask)
-        while table[h] >= 0 and keys[table[h]] != key:
-            h = (h + 1) & mask
+        h = place_of(key, keys, table)
         if table[h] < 0:
             table[h] = used
             keys[used] = key

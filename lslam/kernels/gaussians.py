@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from lslam.kernels.jit import inline, kernel
 from lslam.kernels.linalg import plane_of
-from lslam.kernels.voxel import MASK, OFFSET, hash_key, index_of, pack
+from lslam.kernels.voxel import MASK, OFFSET, hash_key, index_of, pack, place_of
 
 Floats = NDArray[np.float64]
 Longs = NDArray[np.int64]
@@ -32,25 +32,16 @@ USED, FREED, HAND, LIVE = 0, 1, 2, 3
 @inline
 def find(key: int, keys: Longs, table: Ints) -> int:
     """Slot of a key, or -1."""
-    mask = len(table) - 1
-    h = hash_key(key, mask)
-    while table[h] >= 0:
-        if keys[table[h]] == key:
-            return int(table[h])
-        h = (h + 1) & mask
-    return -1
+    return int(table[place_of(key, keys, table)])
 
 
 @inline
 def _claim(key: int, moments: Floats, planes: Floats, keys: Longs, refreshed: Floats, table: Ints, state: Longs,
            free: Ints) -> int:  # fmt: skip
     """Slot of a key, taking a fresh one when it is new; -1 when the pool is full."""
-    mask = len(table) - 1
-    h = hash_key(key, mask)
-    while table[h] >= 0:
-        if keys[table[h]] == key:
-            return int(table[h])
-        h = (h + 1) & mask
+    h = place_of(key, keys, table)
+    if table[h] >= 0:
+        return int(table[h])
     if state[FREED] > 0:
         state[FREED] -= 1
         slot = int(free[state[FREED]])

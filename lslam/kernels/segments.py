@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from lslam.kernels.jit import inline, kernel
 from lslam.kernels.linalg import plane_of
-from lslam.kernels.voxel import hash_key, index_of, pack, table_size
+from lslam.kernels.voxel import index_of, pack, place_of, table_size
 
 Floats = NDArray[np.float64]
 Longs = NDArray[np.int64]
@@ -20,24 +20,15 @@ Ints = NDArray[np.int32]
 
 
 @inline
-def find(key: int, table: Ints, keys: Longs, mask: int) -> int:
-    """Position in the table of `key`, or of the free place where it belongs."""
-    h = hash_key(key, mask)
-    while table[h] >= 0 and keys[table[h]] != key:
-        h = (h + 1) & mask
-    return h
-
-
-@inline
 def upright_plane(
-    ix: int, iy: int, iz: int, table: Ints, keys: Longs, mask: int, sums: Floats, tilt: float, thickness: float
+    ix: int, iy: int, iz: int, table: Ints, keys: Longs, sums: Floats, tilt: float, thickness: float
 ) -> tuple[float, float]:
     """Horizontal unit normal of the points in the eight cells about a corner of the lattice; 0, 0 when they are no wall."""
     n = sx = sy = sz = xx = xy = xz = yy = yz = zz = 0.0
     for a in range(2):
         for b in range(2):
             for c in range(2):
-                h = find(pack(ix - a, iy - b, iz - c), table, keys, mask)
+                h = place_of(pack(ix - a, iy - b, iz - c), keys, table)
                 if table[h] >= 0:
                     s = sums[table[h]]
                     n += s[0]
@@ -76,8 +67,8 @@ def flat_walls(
     largest vertical part of the normal, `thickness` the largest standard deviation across the plane, m.
     """
     n = len(kept)
-    mask = table_size(n) - 1
-    table = np.full(mask + 1, -1, np.int32)
+    entries = table_size(n)
+    table = np.full(entries, -1, np.int32)
     keys = np.empty(n, np.int64)
     sums = np.zeros((n, 10))
     inverse = 1.0 / cell
@@ -86,7 +77,7 @@ def flat_walls(
         p = points[kept[k]]
         x, y, z = float(p[0]), float(p[1]), float(p[2])
         key = pack(index_of(x, inverse), index_of(y, inverse), index_of(z, inverse))
-        h = find(key, table, keys, mask)
+        h = place_of(key, keys, table)
         if table[h] < 0:
             table[h] = count
             keys[count] = key
@@ -102,11 +93,11 @@ def flat_walls(
         s[7] += y * y
         s[8] += y * z
         s[9] += z * z
-    corner_table = np.full(mask + 1, -1, np.int32)
+    corner_table = np.full(entries, -1, np.int32)
     corner_keys = np.empty(n, np.int64)
     normals = np.empty((n, 2))
     corners = 0
-    flat_table = np.full(mask + 1, -1, np.int32)
+    flat_table = np.full(entries, -1, np.int32)
     flat_keys = np.empty(n, np.int64)
     flat = np.zeros((n, 5))
     every = np.zeros((n, 3))
@@ -115,7 +106,7 @@ def flat_walls(
         p = points[kept[k]]
         x, y, z = float(p[0]), float(p[1]), float(p[2])
         key = pack(index_of(x, 1.0 / thin), index_of(y, 1.0 / thin), 0)
-        h = find(key, flat_table, flat_keys, mask)
+        h = place_of(key, flat_keys, flat_table)
         if flat_table[h] < 0:
             flat_table[h] = rows
             flat_keys[rows] = key
@@ -127,11 +118,11 @@ def flat_walls(
         half = 0.5 * cell
         ix, iy, iz = index_of(x + half, inverse), index_of(y + half, inverse), index_of(z + half, inverse)
         key = pack(ix, iy, iz)
-        h = find(key, corner_table, corner_keys, mask)
+        h = place_of(key, corner_keys, corner_table)
         if corner_table[h] < 0:
             corner_table[h] = corners
             corner_keys[corners] = key
-            nx, ny = upright_plane(ix, iy, iz, table, keys, mask, sums, tilt, thickness)
+            nx, ny = upright_plane(ix, iy, iz, table, keys, sums, tilt, thickness)
             normals[corners, 0], normals[corners, 1] = nx, ny
             corners += 1
         nx, ny = normals[corner_table[h], 0], normals[corner_table[h], 1]

@@ -74,6 +74,16 @@ def take(points: NDArray[np.float32], index: NDArray[np.int64]) -> NDArray[np.fl
 
 
 @inline
+def place_of(key: int, keys: NDArray[np.int64], table: NDArray[np.int32]) -> int:
+    """Where in an open-addressed table of slots a key stands, or the free place where it belongs."""
+    mask = len(table) - 1
+    h = hash_key(key, mask)
+    while table[h] >= 0 and keys[table[h]] != key:
+        h = (h + 1) & mask
+    return h
+
+
+@inline
 def table_size(n: int) -> int:
     """Power of two that keeps a table of n keys at most half full."""
     size = 64
@@ -94,9 +104,7 @@ def centroids(
     the sensor has moved in between.
     """
     n = len(points)
-    entries = table_size(n)
-    mask = entries - 1
-    table = np.full(entries, -1, np.int32)
+    table = np.full(table_size(n), -1, np.int32)
     keys = np.empty(n, np.int64)
     first = np.empty(n, np.int32)
     sums = np.empty((n, 10))
@@ -116,9 +124,7 @@ def centroids(
             key = ~key
         # A coordinate beyond all voxels can give any key, the initial one too.
         if count == 0 or key != last_key:
-            h = hash_key(key, mask)
-            while table[h] >= 0 and keys[table[h]] != key:
-                h = (h + 1) & mask
+            h = place_of(key, keys, table)
             if table[h] < 0:
                 table[h] = count
                 keys[count] = key
@@ -178,9 +184,7 @@ def accompanied(
     Returns also how many points lie in the voxels that were looked at.
     """
     n = len(points)
-    entries = table_size(n)
-    mask = entries - 1
-    table = np.full(entries, -1, np.int32)
+    table = np.full(table_size(n), -1, np.int32)
     keys, sums = np.empty(n, np.int64), np.zeros(n, np.int32)
     slots, chosen = np.empty(n, np.int32), np.empty(n, np.int64)
     inverse = 1.0 / size
@@ -197,9 +201,7 @@ def accompanied(
             continue
         if count == 0 or key != last_key:
             last_key = key
-            h = hash_key(key, mask)
-            while table[h] >= 0 and keys[table[h]] != key:
-                h = (h + 1) & mask
+            h = place_of(key, keys, table)
             if table[h] < 0:
                 table[h] = count
                 keys[count] = key
@@ -224,9 +226,7 @@ def accompanied(
 def first_points(points: NDArray[np.float32], size: float) -> NDArray[np.int64]:
     """Index of the first point in each voxel, increasing."""
     n = len(points)
-    entries = table_size(n)
-    mask = entries - 1
-    table = np.full(entries, -1, np.int32)
+    table = np.full(table_size(n), -1, np.int32)
     keys = np.empty(n, np.int64)
     first = np.empty(n, np.int64)
     inverse = 1.0 / size
@@ -237,9 +237,7 @@ def first_points(points: NDArray[np.float32], size: float) -> NDArray[np.int64]:
             index_of(float(points[i, 1]), inverse),
             index_of(float(points[i, 2]), inverse),
         )
-        h = hash_key(key, mask)
-        while table[h] >= 0 and keys[table[h]] != key:
-            h = (h + 1) & mask
+        h = place_of(key, keys, table)
         if table[h] < 0:
             table[h] = count
             keys[count] = key
