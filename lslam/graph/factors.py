@@ -1,4 +1,7 @@
-"""From plain values to factors of gtsam. Of K keyframes k has the key k, the floor the key K, the map the key K + 1."""
+"""From plain values to factors of gtsam.
+
+Of K keyframes k has the key k, the floor the key K, the map the key K + 1; what fixes err by in common has keys beyond `WANDER`.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.geometry import noise, se2, se3
+from lslam.graph.fix_noise import Wander
 from lslam.graph.problem import FloorPlane, PlanarPrior, PoseGraph, PositionFix
 from lslam.types.constraint import Constraint, Turn
 
@@ -19,6 +23,10 @@ HELD, FREE, TILTING = (1e-4, 1e-4), (1e3, 3.0), 0.2
 ANYWHERE = 1e4
 # x, y and yaw among the six of a pose in this house's order.
 PLANAR = [0, 1, 5]
+# Keys of the error of fixes at its instants: beyond all others.
+WANDER = 1 << 40
+# After so many times its memory nothing is left of an error.
+LONG = 20.0
 # No constraint is known better than this, m and rad: the optimiser's arithmetic.
 SMALLEST = np.array([1e-4, 1e-4, 1e-4, 1e-5, 1e-5, 1e-5])
 
@@ -44,8 +52,21 @@ def position(fix: PositionFix, scale: float = 1.0, kernel: Any = None) -> Any:
     """A measured position of the antenna."""
     import gtsam
 
-    model = gtsam.noiseModel.Diagonal.Sigmas(np.sqrt(scale) * fix.sigma)
-    return gtsam.GPSFactorArm(fix.keyframe, fix.position, fix.arm, _robust(model, kernel))
+    model = _robust(gtsam.noiseModel.Diagonal.Sigmas(np.sqrt(scale) * fix.sigma), kernel)
+    if fix.instant is None:
+        return gtsam.GPSFactorArm(fix.keyframe, fix.position, fix.arm, model)
+    key, arm = WANDER + fix.instant, fix.arm
+    across = np.array([[0.0, -arm[2], arm[1]], [arm[2], 0.0, -arm[0]], [-arm[1], arm[0], 0.0]])
+
+    def error(_: Any, values: Any, jacobians: list[Floats] | None) -> Floats:
+        pose = values.atPose3(fix.keyframe)
+        R = pose.rotation().matrix()
+        if jacobians is not None:
+            jacobians[0] = np.hstack([-R @ across, R])
+            jacobians[1] = np.eye(3)
+        return np.asarray(pose.translation() + R @ arm + values.atPoint3(key) - fix.position)
+
+    return gtsam.CustomFactor(model, [fix.keyframe, key], error)
 
 
 def planar(prior: PlanarPrior, pose: Floats, key: int, scale: float = 1.0, kernel: Any = None) -> Any:
@@ -94,6 +115,8 @@ def fixed_part(graph: PoseGraph, may_tilt: bool = False) -> Any:
         factors.add(_turn(turn))
     for floor in graph.floors:
         factors.add(_floor(floor, len(graph)))
+    if graph.wander is not None:
+        _add_wander(factors, graph.wander)
     if graph.map_priors:
         shift = gtsam.noiseModel.Diagonal.Sigmas(
             np.array([HELD[1]] * 3 + [max(graph.shift_sigma, HELD[0])] * 2 + [HELD[0]])
@@ -113,6 +136,9 @@ def start_values(graph: PoseGraph, poses: Floats) -> Any:
         values.insert(len(poses), gtsam.OrientedPlane3(_floor_in_world(graph.floors, poses)))
     if graph.map_priors:
         values.insert(map_key(graph), gtsam.Pose3())
+    if graph.wander is not None:
+        for i in range(len(graph.wander.seconds)):
+            values.insert(WANDER + i, np.zeros(3))
     return values
 
 
@@ -135,6 +161,25 @@ def _floor(floor: FloorPlane, key: int) -> Any:
     # gtsam's planes are n . p + d = 0 with errors of direction (2) first, then of distance.
     model = gtsam.noiseModel.Diagonal.Sigmas(np.array([floor.sigma_rad, floor.sigma_rad, floor.sigma_m]))
     return gtsam.OrientedPlane3Factor(np.append(floor.normal, floor.offset), model, floor.keyframe, key)
+
+
+def _add_wander(factors: Any, wander: Wander) -> None:
+    """A first-order Gauss-Markov process in its steady state.
+
+    (b - p a)^2 = p (b - a)^2 + (1 - p) b^2 - p (1 - p) a^2: two instants a and b hold each other, and each holds itself.
+    """
+    import gtsam
+
+    steps = np.minimum(np.diff(wander.seconds) / wander.memory, LONG)
+    kept, driven = np.exp(-steps), -np.expm1(-2 * steps)
+    own = np.append(1.0, 1 / (1 + kept))
+    own[:-1] -= kept / (1 + kept)
+    for i, weight in enumerate(own.tolist()):
+        model = gtsam.noiseModel.Diagonal.Sigmas(wander.sigma / np.sqrt(weight))
+        factors.add(gtsam.PriorFactorPoint3(WANDER + i, np.zeros(3), model))
+    for i, ratio in enumerate((driven / kept).tolist()):
+        model = gtsam.noiseModel.Diagonal.Sigmas(wander.sigma * np.sqrt(ratio))
+        factors.add(gtsam.BetweenFactorPoint3(WANDER + i, WANDER + i + 1, np.zeros(3), model))
 
 
 def _floor_in_world(floors: Any, poses: Floats) -> Floats:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.graph.fix_noise import Wander
 from lslam.types.constraint import Constraint, Turn
 
 Floats = NDArray[np.float64]
@@ -18,12 +19,14 @@ class PositionFix:
     """A position that was measured: `keyframe`'s point `arm` (3,), m, in its own axes, lies at `position` (3,), m.
 
     sigma : (3,) m; the arm is the antenna at the instant of the fix, as seen from the keyframe by odometry
+    instant : which of the graph's `wander` it errs by as well, None for none
     """
 
     keyframe: int
     position: Floats
     sigma: Floats
     arm: Floats
+    instant: int | None = None
 
 
 @dataclass(frozen=True)
@@ -102,6 +105,7 @@ class PoseGraph:
     walk : factor on `drift.drift_covariance` that odometry errs by at the least beside its covariances
     spread : (K, 6, 6) what poses are unsure by beside all that, as the covariances of `Solution`; None for nothing
     claim : the drift that odometry was set right by before it came here
+    wander : the error that fixes have in common, None where each has one of its own
     """
 
     poses: Floats
@@ -122,6 +126,7 @@ class PoseGraph:
     walk: float = 0.0
     spread: Floats | None = None
     claim: DriftClaim | None = None
+    wander: Wander | None = None
 
     def __len__(self) -> int:
         return len(self.poses)

@@ -15,6 +15,7 @@ from lslam.errors import InputError
 from lslam.geometry import geodesy, noise, se3, so3
 from lslam.geometry.interpolate import poses_at
 from lslam.graph.alignment import Alignment, align
+from lslam.graph.fix_noise import Wander, wander_of
 from lslam.graph.problem import PoseGraph, PositionFix
 from lslam.maps.georeference import Projection
 from lslam.types.georeference import Georeference
@@ -42,6 +43,7 @@ class Fixes:
 
     stamps_ns : (F,); positions : (F, 3) east, north, up from `origin` (3,) lat, lon, height; sigmas : (F, 3)
     antenna : (F, 3) in the world of odometry; slack : (F,) what odometry may have drifted by
+    is_stated : whether the sigmas are those of the recording
     """
 
     stamps_ns: NDArray[np.int64]
@@ -51,14 +53,19 @@ class Fixes:
     slack: Floats
     origin: Floats
     given: int
+    is_stated: bool
 
 
 @dataclass(frozen=True)
 class Placement:
-    """A georeference and, for the graph, the fixes as positions; `problem` says why there is none, or what was left out."""
+    """A georeference and, for the graph, the fixes as positions and what they err by in common.
+
+    problem : why there is none, or what was left out
+    """
 
     georeference: Georeference | None = None
     fixes: tuple[PositionFix, ...] = ()
+    wander: Wander | None = None
     problem: str = ""
 
 
@@ -112,7 +119,9 @@ def place(
         "GNSS: %d of %d fixes believed, %.2f m rms from the antenna horizontally, %.2f m vertically",
         georeference.used, georeference.fixes, georeference.rmse_horizontal, georeference.rmse_vertical,
     )  # fmt: skip
-    return Placement(georeference, _as_factors(fixes, found, shift, results, keyframes, arm), _elsewhere(found))
+    wander = _wander(fixes, found, drift)
+    factors = _as_factors(fixes, found, shift, results, keyframes, arm, wander)
+    return Placement(georeference, factors, wander, _elsewhere(found))
 
 
 def on_earth(graph: PoseGraph, placement: Placement) -> PoseGraph:
@@ -121,7 +130,10 @@ def on_earth(graph: PoseGraph, placement: Placement) -> PoseGraph:
     T = placement.georeference.T_enu_world
     spread = None if graph.spread is None else noise.rotated(graph.spread, T[:3, :3])
     up = np.array([0.0, 0.0, 1.0])
-    return replace(graph, poses=T @ graph.poses, fixes=placement.fixes, world_up=up, is_anchored=False, spread=spread)
+    return replace(
+        graph, poses=T @ graph.poses, fixes=placement.fixes, world_up=up, is_anchored=False, spread=spread,
+        wander=placement.wander,
+    )  # fmt: skip
 
 
 def _usable(
@@ -151,7 +163,8 @@ def _usable(
     slack = 0.01 * drift.drift_percent * np.abs(travelled - 0.5 * way[-1])
     sigmas = stated[good, None] * [1.0, 1.0, config.vertical]
     antenna = np.einsum("fij,j->fi", at[:, :3, :3], arm) + at[:, :3, 3]
-    return Fixes(stream.stamps_ns[good], positions, sigmas, antenna, slack, origin, given)
+    is_stated = config.sigma is None and bool((np.isfinite(stream.sigma) & (stream.sigma > 0))[good].all())
+    return Fixes(stream.stamps_ns[good], positions, sigmas, antenna, slack, origin, given, is_stated)
 
 
 def _at_first(found: Alignment, fixes: Fixes, config: GnssConfig) -> tuple[Georeference, Floats]:
@@ -186,17 +199,37 @@ def _elsewhere(found: Alignment) -> str:
     )
 
 
+def _wander(fixes: Fixes, found: Alignment, config: GraphConfig) -> Wander | None:
+    """What the fixes err by together, from those that are believed; None where nobody stated what they err by at all."""
+    good = found.believed
+    if not fixes.is_stated:
+        return None
+    wander = wander_of(
+        1e-9 * (fixes.stamps_ns[good] - fixes.stamps_ns[0]), found.residuals[good], fixes.sigmas[good],
+        (fixes.positions - found.residuals)[good], config.probability,
+    )  # fmt: skip
+    if wander is not None:
+        log.info(
+            "GNSS: fixes scatter by less than they state; they are taken to err by %.2f m together, for %.0f s",
+            wander.sigma[0], wander.memory,
+        )  # fmt: skip
+    return wander
+
+
 def _as_factors(
-    fixes: Fixes, found: Alignment, shift: Floats, results: Many[ScanResult], keyframes: Many[Keyframe], arm: Floats
-) -> tuple[PositionFix, ...]:
+    fixes: Fixes, found: Alignment, shift: Floats, results: Many[ScanResult], keyframes: Many[Keyframe], arm: Floats,
+    wander: Wander | None,
+) -> tuple[PositionFix, ...]:  # fmt: skip
     """Positions of the antenna as seen from the keyframe before each fix, the absurd ones left out."""
     near = np.linalg.norm(found.residuals / np.hypot(fixes.sigmas, fixes.slack[:, None]), axis=1) < ABSURD
     stamps = np.array([k.stamp_ns for k in keyframes], np.int64)
     owners = np.clip(np.searchsorted(stamps, fixes.stamps_ns, side="right") - 1, 0, None)
     positions = se3.apply(shift, fixes.positions)
+    seconds = 1e-9 * (fixes.stamps_ns - fixes.stamps_ns[0])
     out = []
     for i in np.flatnonzero(near).tolist():
         keyframe = keyframes[int(owners[i])]
         seen = se3.apply(se3.inverse(results[keyframe.scan].T_world_lidar), fixes.antenna[i][None])[0]
-        out.append(PositionFix(keyframe.number, positions[i], fixes.sigmas[i], seen))
+        instant = None if wander is None else int(np.argmin(np.abs(wander.seconds - seconds[i])))
+        out.append(PositionFix(keyframe.number, positions[i], fixes.sigmas[i], seen, instant))
     return tuple(out)

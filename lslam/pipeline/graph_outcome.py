@@ -14,6 +14,7 @@ from lslam.errors import GraphError
 from lslam.geometry import se3
 from lslam.graph.drift import tilt_factor
 from lslam.graph.factors import well_conditioned
+from lslam.graph.fix_noise import Wander
 from lslam.graph.loop_drift import without_loop_drift
 from lslam.graph.odometry import corrected
 from lslam.graph.pose_graph import optimise
@@ -204,7 +205,13 @@ def _facts(
         "rounds": solution.rounds,
         "largest_correction_m": round(float(np.linalg.norm(moved, axis=1).max()), 4),
         **({} if graph.claim is None else _claimed(graph.claim)),
+        **({} if graph.wander is None else _wandering(graph.wander)),
     }
+
+
+def _wandering(wander: Wander) -> dict[str, Any]:
+    east, _, up = (round(float(sigma), 3) for sigma in wander.sigma)
+    return {"wandering_fixes": {"horizontal_m": east, "vertical_m": up, "memory_s": round(wander.memory, 1)}}
 
 
 def _claimed(claim: DriftClaim) -> dict[str, Any]:

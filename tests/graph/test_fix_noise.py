@@ -1,0 +1,91 @@
+"""What fixes err by together: told where it is, not where it is not, and a process in its steady state in the graph."""
+
+from __future__ import annotations
+
+import gtsam
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from lslam.geometry import se3
+from lslam.graph import factors
+from lslam.graph.alignment import align
+from lslam.graph.fix_noise import Wander, wander_of
+from lslam.graph.problem import PositionFix
+
+Floats = NDArray[np.float64]
+VERTICAL = np.array([1.0, 1.0, 1.8])
+
+
+def fixes(count: int, gap: float, white: float, slow: float, memory: float, seed: int) -> Wander | None:
+    """What is found of fixes about a drive at 5 m/s along an arc, stated as they err."""
+    rng = np.random.default_rng(seed)
+    seconds = gap * np.arange(count)
+    error, kept = slow * rng.normal(size=(count, 3)), np.exp(-gap / memory)
+    for i in range(1, count):
+        error[i] = kept * error[i - 1] + np.sqrt(1 - kept**2) * error[i]
+    error = (error + white * rng.normal(size=error.shape)) * VERTICAL
+    path = 60 * np.column_stack([np.cos(seconds / 12), np.sin(seconds / 12), 0 * seconds])
+    sigmas = np.tile(np.hypot(white, slow) * VERTICAL, (count, 1))
+    found = align(path, path + error, sigmas, np.zeros(count), np.array([0.0, 0, 1]), 0.01, 5)
+    assert found is not None
+    return wander_of(seconds, found.residuals, sigmas, path, 0.999)
+
+
+@pytest.mark.parametrize(("count", "gap"), [(30, 1.0), (300, 0.2)])
+def test_fixes_that_scatter_as_they_state_err_alone(count: int, gap: float) -> None:
+    assert [fixes(count, gap, 1.0, 0.0, 100.0, seed) for seed in range(12)] == [None] * 12
+
+
+@pytest.mark.parametrize(
+    ("count", "gap", "white", "slow", "memory"),
+    [(90, 1.0, 0.3, 0.8, 120.0), (500, 1.0, 0.5, 0.8, 20.0), (700, 0.2, 0.3, 2.0, 60.0)],
+)  # fmt: skip
+def test_the_common_part_and_its_memory_are_found(
+    count: int, gap: float, white: float, slow: float, memory: float
+) -> None:
+    found = [fixes(count, gap, white, slow, memory, seed) for seed in range(5)]
+    assert all(f is not None for f in found)
+    np.testing.assert_allclose([f.sigma for f in found if f], [slow * VERTICAL] * 5, rtol=0.12)
+    assert memory / 2 < np.median([f.memory for f in found if f]) < 2 * memory
+
+
+def test_nothing_is_told_of_fixes_out_of_order_or_alone() -> None:
+    flat, one = np.zeros((3, 3)), np.ones((3, 3))
+    assert wander_of(np.array([0.0, 1.0, 1.0]), flat, one, flat, 0.999) is None
+    assert wander_of(np.zeros(1), flat[:1], one[:1], flat[:1], 0.999) is None
+
+
+def test_perfect_fixes_have_a_memory() -> None:
+    seconds = np.arange(60.0)
+    path = np.column_stack([seconds, seconds**2 / 60, 0 * seconds])
+    found = wander_of(seconds, np.zeros((60, 3)), np.ones((60, 3)), path, 0.999)
+    assert found is not None
+    assert found.memory > 60
+
+
+def test_the_graph_has_the_covariance_of_the_process() -> None:
+    wander = Wander(np.array([0.0, 1.0, 1.5, 40.0, 41.0, 4000.0]), np.array([0.5, 1.0, 2.0]), 30.0)
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    factors._add_wander(graph, wander)
+    for i in range(6):
+        values.insert(factors.WANDER + i, np.zeros(3))
+    information, _ = graph.linearize(values).hessian()
+    expected = np.exp(-np.abs(wander.seconds[:, None] - wander.seconds) / wander.memory)
+    np.testing.assert_allclose(np.linalg.inv(information), np.kron(expected, np.diag(wander.sigma**2)), atol=1e-8)
+
+
+def test_a_fix_that_errs_with_others_is_one_without_where_they_err_by_nothing() -> None:
+    pose = se3.exp(np.array([1.0, 2.0, 3.0, 0.3, -0.2, 0.5]))
+    alone, together = (
+        factors.position(PositionFix(0, np.array([1.5, 2.0, 2.0]), np.array([1.0, 2.0, 3.0]), np.array([0.3, 0.2, 0.9]), k))
+        for k in (None, 0)
+    )  # fmt: skip
+    values = gtsam.Values()
+    values.insert(0, gtsam.Pose3(pose))
+    values.insert(factors.WANDER, np.zeros(3))
+    assert together.error(values) == pytest.approx(alone.error(values), rel=1e-9)
+    (A, b), (A_own, b_own) = ((f.linearize(values).jacobian()) for f in (together, alone))
+    np.testing.assert_allclose(A[:, :6], A_own, atol=1e-9)
+    np.testing.assert_allclose(A[:, 6:], np.diag([1.0, 1 / 2, 1 / 3]), atol=1e-12)
+    np.testing.assert_allclose(b, b_own, atol=1e-9)
