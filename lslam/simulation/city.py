@@ -201,10 +201,13 @@ def add_row(
         # Outside a bend there is more frontage than street, inside less.
         bend = float(street.curvature(np.array([min(s, street.length)]))[0])
         along = 1 / np.clip(1 - side * offset * bend, 0.6, 3.0)
+        position, tangent = _front(street, s + along * width / 2, side, offset)
+        yaw = float(np.arctan2(tangent[1], tangent[0]))
         placed = False
-        for share in (1.0, 0.8, 0.65):
-            corners, position, yaw = _lot(street, s + along * width / 2, side, offset, width, share * depth)
-            if lots.is_free(corners):
+        # Most places are taken, and where the shallowest house has no room none has.
+        for share in (1.0, 0.8, 0.65) if lots.is_free(_lot(position, tangent, width, 0.65 * depth)) else ():
+            corners = _lot(position, tangent, width, share * depth)
+            if share == 0.65 or lots.is_free(corners):
                 ground = float(terrain.height(position)) + KERB
                 plan = np.random.default_rng(1) if layout.identical else rng
                 building = house(plan, width, share * depth, layout.storeys)
@@ -218,15 +221,18 @@ def add_row(
         s += along * (width + opening) if placed else 1.0
 
 
-def _lot(street: Curve, s: float, side: int, offset: float, width: float, depth: float) -> tuple[Floats, Floats, float]:
-    """Outline (4, 2), middle of the front (2,) and yaw of a house whose front is `offset` m from the street's middle."""
+def _front(street: Curve, s: float, side: int, offset: float) -> tuple[Floats, Floats]:
+    """Middle of a house's front (2,), `offset` m from the street's middle, and the unit vector (2,) along it."""
     at = np.array([min(s, street.length)])
-    tangent = street.tangent(at)[0] * side
+    tangent = street.tangent(at)[0]
+    return street.position(at)[0] + side * offset * np.array([-tangent[1], tangent[0]]), tangent * side
+
+
+def _lot(front: Floats, tangent: Floats, width: float, depth: float) -> Floats:
+    """Outline (4, 2) of a house behind `front`, as `_front` gives it."""
     inward = np.array([-tangent[1], tangent[0]])
-    front = street.beside(at, side * offset)[0]
     half = width / 2 * tangent
-    outline = np.array([front - half, front + half, front + half + depth * inward, front - half + depth * inward])
-    return outline, front, float(np.arctan2(tangent[1], tangent[0]))
+    return np.array([front - half, front + half, front + half + depth * inward, front - half + depth * inward])
 
 
 def _add_front_garden(
