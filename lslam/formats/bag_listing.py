@@ -8,6 +8,7 @@ from pathlib import Path
 from lslam.errors import InputError
 
 SUFFIXES = (".bag", ".bag.active", ".mcap", ".db3")
+_PART = re.compile(r"(.+)_\d+\.(bag|mcap|db3)(?:\.active)?$")
 
 
 def list_bag_files(path: Path) -> list[Path]:
@@ -31,6 +32,15 @@ def list_bag_files(path: Path) -> list[Path]:
         return []
     kind = max(sorted(set(kinds)), key=kinds.count)
     return sorted((p for p in files if suffix_of(p).removesuffix(".active") == kind), key=_natural)
+
+
+def parts_beside(path: Path) -> list[Path]:
+    """Files beside a bag that recorders name so when they split it: as `path` but for the number at the end of the name."""
+    stem = _PART.match(path.name)
+    if stem is None:
+        return []
+    beside = (p for p in path.parent.iterdir() if p.is_file() and p != path)
+    return sorted((p for p in beside if (m := _PART.match(p.name)) and m.groups() == stem.groups()), key=_natural)
 
 
 def suffix_of(path: Path) -> str:

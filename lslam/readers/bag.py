@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from lslam.errors import InputError
 from lslam.formats import bag_streams
 from lslam.formats.bag_files import INFO_TOPIC, Bag, BagTopic, open_bag, read_header
-from lslam.formats.bag_listing import list_bag_files
+from lslam.formats.bag_listing import list_bag_files, parts_beside
 from lslam.formats.point_cloud import TIME_NAMES, PointCloud
 from lslam.formats.pointcloud2 import decode_livox, decode_pointcloud2
 from lslam.formats.sequence_toml import FILE_NAME, SequenceInfo, parse_sequence_toml, read_sequence_toml
@@ -106,7 +106,13 @@ def locate(path: Path) -> tuple[Path, str] | None:
     if not files:
         return None
     if path.is_file():
-        return path, f"{path.name} is a bag"
+        others = parts_beside(path)
+        more = (
+            f"; by its name {others[0].name} is another part of it: a folder of its parts is read as one"
+            if others
+            else ""
+        )
+        return path, f"{path.name} is a bag{more}"
     return path, f"it holds {len(files)} bag file{'s' if len(files) > 1 else ''}, {files[0].name} first"
 
 

@@ -101,7 +101,8 @@ def index_scans(bag: Bag, topic: BagTopic, voice: Voice) -> tuple[Stamps, Stamps
         frame = frame or header.frame
     say_broken(broken, topic.name, voice)
     if not kept:
-        raise InputError(f"{bag.path}: none of the {len(topic)} messages of {topic.name} can be read")
+        way_out = "; where its index is wrong `rosbag reindex` mends it" if topic.encoding == "ros1" else ""
+        raise InputError(f"{bag.path}: none of the {len(topic)} messages of {topic.name} can be read{way_out}")
     recorded = np.array(bag.recorded_ns(topic), np.int64)[kept]
     order, ordered = put_in_order(np.array(stamps, np.int64), recorded, f"{topic.name}: scans", voice)
     return np.array(kept, np.int64)[order], ordered, frame

@@ -109,6 +109,21 @@ def test_a_chunk_without_its_index_is_indexed_by_hand(tmp_path: Path) -> None:
     assert_prefix(sequence)
 
 
+@pytest.mark.parametrize("shift", [7, 10**8])
+def test_an_index_that_points_elsewhere_is_said(tmp_path: Path, shift: int) -> None:
+    path = bag(tmp_path / "a.bag", clouds(3))
+    data = bytearray(path.read_bytes())
+    field = data.rindex(b"op=\x04")  # of the last index; the length of its header stands 8 bytes before
+    (length,) = struct.unpack_from("<I", data, field - 8)
+    begin = field + length  # of the entries: seconds, nanoseconds, offset
+    for k in range(3):
+        (offset,) = struct.unpack_from("<I", data, begin + 12 * k + 8)
+        struct.pack_into("<I", data, begin + 12 * k + 8, offset + shift)
+    path.write_bytes(data)
+    with pytest.raises(InputError, match="none of the 3 messages of /points can be read; where its index is wrong"):
+        open_sequence(path)
+
+
 @pytest.mark.parametrize("compression", ["bz2", "lz4"])
 def test_compressed_ros1_bags(tmp_path: Path, compression: str) -> None:
     store = get_typestore(Stores.ROS1_NOETIC)
