@@ -39,7 +39,8 @@ def with_drift(graph: PoseGraph, factor: float, config: GraphConfig) -> list[Con
         return [replace(c, covariance=np.zeros((6, 6))) for c in graph.odometry]
     if factor == 0:
         return list(graph.odometry)
-    return [replace(c, covariance=c.covariance + factor * drift_covariance(_length(c), config)) for c in graph.odometry]
+    unit = factor * drift_covariance(1.0, config)
+    return [replace(c, covariance=c.covariance + _length(c) * unit) for c in graph.odometry]
 
 
 def drift_factor(graph: PoseGraph, loops: Sequence[Constraint], config: GraphConfig) -> float:
@@ -65,7 +66,8 @@ def tilt_factor(graph: PoseGraph, config: GraphConfig) -> float:
 
 def chains(graph: PoseGraph, config: GraphConfig) -> tuple[Floats, Floats]:
     """What odometry says of its own errors, and drift of factor 1, both (K, 6, 6) accumulated."""
-    drifting = [replace(c, covariance=drift_covariance(_length(c), config)) for c in graph.odometry]
+    unit = drift_covariance(1.0, config)
+    drifting = [replace(c, covariance=_length(c) * unit) for c in graph.odometry]
     return _accumulated(graph.poses, graph.odometry), _accumulated(graph.poses, drifting)
 
 

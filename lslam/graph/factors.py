@@ -5,6 +5,7 @@ Of K keyframes k has the key k, the floor the key K, the map the key K + 1; what
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -46,6 +47,20 @@ def between(constraint: Constraint, scale: float = 1.0, kernel: Any = None) -> A
     covariance = scale * well_conditioned(constraint.covariance)
     model = gtsam.noiseModel.Gaussian.Covariance(noise.to_body(covariance, constraint.T_a_b))
     return gtsam.BetweenFactorPose3(constraint.a, constraint.b, gtsam.Pose3(constraint.T_a_b), _robust(model, kernel))
+
+
+def between_all(constraints: Sequence[Constraint]) -> list[Any]:
+    """As `between` of each: of thousands, linear algebra takes longer one by one."""
+    import gtsam
+
+    if not constraints:
+        return []
+    poses = np.stack([c.T_a_b for c in constraints])
+    bodies = noise.to_body(well_conditioned(np.stack([c.covariance for c in constraints])), poses)
+    return [
+        gtsam.BetweenFactorPose3(c.a, c.b, gtsam.Pose3(c.T_a_b), gtsam.noiseModel.Gaussian.Covariance(body))
+        for c, body in zip(constraints, bodies, strict=True)
+    ]
 
 
 def position(fix: PositionFix, scale: float = 1.0, kernel: Any = None) -> Any:
@@ -106,8 +121,8 @@ def fixed_part(graph: PoseGraph, may_tilt: bool = False) -> Any:
         held[3:, 3:] += TILTING**2 * (np.eye(3) - np.outer(graph.world_up, graph.world_up))
     start = gtsam.noiseModel.Gaussian.Covariance(noise.to_body(held, graph.poses[0]))
     factors.add(gtsam.PriorFactorPose3(0, gtsam.Pose3(graph.poses[0]), start))
-    for constraint in graph.odometry:
-        factors.add(between(constraint))
+    for factor in between_all(graph.odometry):
+        factors.add(factor)
     for up in graph.ups:
         model = gtsam.noiseModel.Isotropic.Sigma(2, up.sigma / np.sqrt(up.share))
         factors.add(gtsam.AttitudeFactorPose3(up.keyframe, gtsam.Unit3(graph.world_up), model, gtsam.Unit3(up.up)))

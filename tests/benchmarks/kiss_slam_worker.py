@@ -6,11 +6,13 @@ Reads pairs of arrays (points (N, 3), m, and times (N,), 0 to 1 of the sweep) fr
 
 from __future__ import annotations
 
+import ctypes
 import io
 import os
 import sys
 import time
 
+import libusb_package
 import numpy as np
 
 
@@ -18,6 +20,8 @@ def main() -> None:
     # What kiss-slam prints must not get among the arrays.
     stream, sys.stdout = os.fdopen(os.dup(1), "wb"), sys.stderr
     os.dup2(2, 1)
+    # kiss-slam imports Open3D, whose wheel leaves libusb to the system.
+    ctypes.CDLL(str(libusb_package.get_library_path()), mode=ctypes.RTLD_GLOBAL)
     from kiss_slam.config import load_config
     from kiss_slam.slam import KissSLAM
 

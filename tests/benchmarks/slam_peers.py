@@ -34,7 +34,7 @@ def environment(folder: Path) -> Path:
     python = folder / "bin" / "python"
     if not python.exists():
         subprocess.run([sys.executable, "-m", "venv", str(folder)], check=True)
-        subprocess.run([str(python), "-m", "pip", "install", "-q", "kiss-slam"], check=True)
+        subprocess.run([str(python), "-m", "pip", "install", "-q", "kiss-slam", "libusb-package"], check=True)
     return python
 
 
