@@ -16,6 +16,7 @@ from hypothesis import settings
 
 from lslam.errors import InputError
 from lslam.foreign import importing_open3d
+from lslam.locks import one_at_a_time
 
 # How long an example takes is the machine's affair.
 settings.register_profile("untimed", deadline=None)
@@ -29,19 +30,22 @@ SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
 
 @pytest.fixture(scope="session")
 def recordings(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
-    """`recordings(name)` unpacks one recording and gives the folder it lies in; the test skips where there is none."""
-    target = tmp_path_factory.getbasetemp() / "recordings"
-    done: set[str] = set()
+    """`recordings(name)` unpacks one recording and gives the folder it lies in; the test skips where there is none.
+
+    What one worker has unpacked the others read.
+    """
+    base = tmp_path_factory.getbasetemp()
+    target = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "recordings"
 
     def unpack(name: str) -> Path:
         if not (SHARED / "unpack.py").is_file() or not any(SHARED.glob(f"{name}.*")):
             pytest.skip(f"recording {name} is not on this machine")
-        if name not in done:
-            target.mkdir(exist_ok=True)
-            subprocess.run(
-                [sys.executable, str(SHARED / "unpack.py"), str(target), name], check=True, capture_output=True
-            )
-            done.add(name)
+        with one_at_a_time(target / f"{name}.lock"):
+            if not (done := target / f"{name}.done").exists():
+                subprocess.run(
+                    [sys.executable, str(SHARED / "unpack.py"), str(target), name], check=True, capture_output=True
+                )
+                done.touch()
         return target
 
     return unpack
