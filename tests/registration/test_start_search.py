@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from copy import deepcopy
+from copy import copy, deepcopy
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -16,16 +17,29 @@ from lslam.geometry import se3
 from lslam.preprocessing.prepare import prepare_points
 from lslam.registration.registration import Registration
 from lslam.registration.start_search import CLEARLY, MUCH, NEAR, StandingPoints, is_much_more, start_offsets
-from lslam.simulation.scenarios import simulate
+from lslam.simulation.lidar_models import lidar_named
+from lslam.simulation.scenarios import SimulatedDrive, simulate
 
 Floats = NDArray[np.float64]
 
 STRIDE = 3
 
 
+@cache
+def driven(scenario: str, seed: int) -> SimulatedDrive:
+    return simulate(scenario, seed=seed, motion_compensated=True)
+
+
+def seen_by(lidar: str, scenario: str, seed: int = 0) -> SimulatedDrive:
+    """The same drive with another LiDAR: to build the town takes longer than what is asked here."""
+    drive = copy(driven(scenario, seed))
+    drive.lidar = lidar_named(lidar)
+    return drive
+
+
 def at_every_third(scenario: str, seed: int, first: int, prior: Floats | None) -> tuple[float, int]:
     """Error of the first step, m, and how many directions nothing observes, with a prior or without one."""
-    drive = simulate(scenario, seed=seed, motion_compensated=True)
+    drive = driven(scenario, seed)
     truth = se3.relative(drive.ground_truth.poses[first], drive.ground_truth.poses[first + STRIDE])
     registration = Registration()
     registration.register(drive.scan(first).points)
@@ -47,7 +61,7 @@ def test_a_first_turn_of_more_than_twenty_degrees_is_found(seed: int, first: int
 
 
 def test_turns_of_thirty_degrees_that_nothing_foretells_are_found_along_the_way() -> None:
-    drive = simulate("walk", motion_compensated=True)
+    drive = driven("walk", 0)
     registration = Registration()
     for i in range(0, 54, STRIDE):
         result = registration.register(drive.scan(i).points)
@@ -59,7 +73,7 @@ def test_turns_of_thirty_degrees_that_nothing_foretells_are_found_along_the_way(
 @pytest.mark.parametrize(("seed", "first"), [(0, 10), (1, 5)])
 def test_scans_that_went_missing_unnoticed_leave_no_scan_misplaced(seed: int, first: int) -> None:
     # A metre and more beyond the prior a fine map holds a scan by its own rings, with two thirds of the usual points.
-    drive = simulate("urban", seed=seed, motion_compensated=True)
+    drive = driven("urban", seed)
     registration = Registration()
     for i in (*range(first, first + 9), first + 11, first + 14, first + 15):
         result = registration.register(drive.scan(i).points)
@@ -92,7 +106,7 @@ def test_coarse_to_fine_is_believed_only_where_it_agrees_as_usual(
 @pytest.mark.parametrize("scenario", ["street", "block", "walk"])
 def test_near_its_prior_a_scan_lies_on_coarse_planes_while_the_map_is_young(scenario: str) -> None:
     """Single rings of one scan pass for planes in fine voxels: they hold the next by four centimetres in the wrong place."""
-    drive = simulate(scenario, lidar="vlp16", motion_compensated=True)
+    drive = seen_by("vlp16", scenario)
     first, second = (drive.ground_truth.poses[i] for i in range(2))
     registration = Registration()
     points = [prepare_points(drive.scan(i).points, registration.preprocess) for i in range(2)]
@@ -112,7 +126,7 @@ def test_between_bare_walls_the_prior_stays_though_rings_match_best_where_nothin
 @pytest.mark.parametrize(("lidar", "seed"), [("vlp16", 0), ("vlp16", 1), ("os1-16", 0), ("os1-16", 1)])
 def test_sixteen_beams_start_at_thirty_metres_a_second(lidar: str, seed: int) -> None:
     # Planes of so few rings lie on the road, and slide with it: by two metres in the first scan, by more in later ones.
-    drive = simulate("motorway", seed=seed, lidar=lidar, motion_compensated=True)
+    drive = seen_by(lidar, "motorway", seed)
     registration = Registration()
     for i in range(10):
         result = registration.register(drive.scan(i).points)
@@ -128,7 +142,7 @@ def test_sixteen_beams_start_at_thirty_metres_a_second(lidar: str, seed: int) ->
 
 
 def test_a_start_that_is_taken_up_again_knows_what_stands() -> None:
-    drive = simulate("motorway", seed=1, lidar="os1-16", motion_compensated=True)
+    drive = seen_by("os1-16", "motorway", 1)
     first, again = Registration(), Registration()
     for i in range(2):
         first.register(drive.scan(i).points)
@@ -139,7 +153,7 @@ def test_a_start_that_is_taken_up_again_knows_what_stands() -> None:
 
 def test_a_scan_that_leaves_its_prior_later_on_is_held_to_what_stands_too() -> None:
     """Half a metre of the prior is enough for the planes of the road to slide with sixteen beams by two."""
-    drive = simulate("motorway", seed=0, lidar="os1-16", motion_compensated=True)
+    drive = seen_by("os1-16", "motorway", 0)
     registration, truth = Registration(), drive.ground_truth.poses
     for i in range(8):
         last = registration.register(drive.scan(i).points).T_world_lidar
@@ -160,7 +174,7 @@ def test_a_scan_that_leaves_its_prior_later_on_is_held_to_what_stands_too() -> N
 @pytest.mark.parametrize("scenario", ["residential", "urban"])
 def test_a_second_scan_from_elsewhere_is_not_placed_by_the_few_points_that_agree(scenario: str) -> None:
     """Somewhere twelve metres around, a tenth of what stands has a point near by: planes refuse the scan with reason."""
-    begun, other = (simulate(name, seed=0, lidar="vlp16", motion_compensated=True) for name in ("street", scenario))
+    begun, other = (seen_by("vlp16", name) for name in ("street", scenario))
     registration = Registration()
     registration.register(begun.scan(0).points)
     result = registration.register(other.scan(100).points)
