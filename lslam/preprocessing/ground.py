@@ -9,6 +9,8 @@ under the sensor is not asked for its opinion.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -25,23 +27,41 @@ TRIPLES = 200
 UPRIGHT = float(np.cos(np.deg2rad(40.0)))
 
 
+@dataclass(frozen=True)
+class Ground:
+    """The ground under one scan's points: (3, 3) rotation that levels them, cells in half a side of the grid, and heights, m."""
+
+    R: Floats
+    half: int
+    top: Floats
+
+    def above(self, points: NDArray[np.float32], height: float) -> NDArray[np.int64]:
+        """Indices of those of the scan's points (N, 3), m, that lie higher above it than `height`, m, increasing."""
+        return ground.above(points, self.R, CELL, self.half, self.top, height)
+
+
 def above_ground(points: NDArray[np.float32], slope: float, tolerance: float) -> NDArray[np.int64]:
-    """Indices of the points (N, 3), m, LiDAR frame, that do not lie on the ground, increasing.
+    """Indices of the points (N, 3), m, LiDAR frame, that do not lie on the ground (`ground_of`), increasing."""
+    return ground_of(points, slope, tolerance).above(points, tolerance)
+
+
+def ground_of(points: NDArray[np.float32], slope: float, tolerance: float) -> Ground:
+    """The ground under the points (N, 3), m, LiDAR frame, of a scan.
 
     slope : steepest ground, m per m, against the dominant plane; tolerance : height that still counts as ground, m.
     Without a plane to be found nothing is levelled and the slope is that against the sensor's own horizontal.
     """
     if len(points) < 3:
-        return np.arange(len(points))
-    half = int(np.ceil(min(float(np.abs(points).max()) * np.sqrt(3.0), REACH) / CELL)) + 1
+        return Ground(np.eye(3), 1, np.full((2, 2), ground.EMPTY))
+    farthest = float(np.sqrt(np.einsum("ij,ij->i", points, points).max()))
+    half = int(np.ceil(min(farthest, REACH) / CELL)) + 1
     R, floor = levelling(points, tolerance, half)
     index = ground.lowest(points, R, CELL, half)
     low = points[index[index >= 0]].astype(np.float64) @ R.T
     is_under = low[:, 2] < floor - tolerance - slope * np.hypot(low[:, 0], low[:, 1])
     height = np.full(len(index), ground.EMPTY)
     height[index >= 0] = np.where(is_under, ground.EMPTY, low[:, 2])
-    top = ground.envelope(height.reshape(2 * half, 2 * half), slope * CELL, tolerance)
-    return ground.above(points, R, CELL, half, top, tolerance)
+    return Ground(R, half, ground.envelope(height.reshape(2 * half, 2 * half), slope * CELL, tolerance))
 
 
 def levelling(points: NDArray[np.float32], tolerance: float, half: int) -> tuple[Floats, float]:

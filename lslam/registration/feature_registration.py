@@ -28,8 +28,6 @@ Floats = NDArray[np.float64]
 MIN_FEATURES = 60
 # A scan that failed is no target; after this many in a row the last good one lies too far behind to be.
 PATIENCE = 3
-# Planar points that face one way hold the place along it well enough, as many as LOAM asks for a plane.
-ENOUGH = 5
 # m, grid of the less planar points when they stand in for the features: as `preprocess.source_voxel`.
 STAND_IN_GRID = 1.0
 
@@ -123,9 +121,7 @@ class FeatureRegistration(Stateful):
 
     def _holds_place(self, result: RegistrationResult) -> bool:
         """Whether all features together hold the sensor's place as well as `ENOUGH` planar points that face one way do."""
-        if not result.ok or result.covariance is None:
-            return False
-        return float(np.linalg.eigvalsh(result.covariance[:3, :3])[-1]) < self.config.sigma**2 / ENOUGH
+        return result.holds_place(self.config.sigma)
 
     def _kept(self, result: RegistrationResult, expected: Floats, T_prior: Floats) -> RegistrationResult:
         """The result at `expected` (4, 4) in the directions it leaves open."""

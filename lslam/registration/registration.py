@@ -16,6 +16,7 @@ from lslam.preprocessing.beams import ring_gap
 from lslam.preprocessing.prepare import PreparedPoints, prepare_points, thin
 from lslam.registration.gaussian_map import GaussianMap
 from lslam.registration.motion import ConstantVelocity
+from lslam.registration.recent_scans import RecentScans
 from lslam.registration.residuals import NEEDS_COVARIANCE
 from lslam.registration.robust import AdaptiveThreshold, Annealing, UsualAgreement
 from lslam.registration.solver import RegistrationResult, solve
@@ -36,6 +37,8 @@ from lslam.types.state import Stateful
 MIN_SOURCE_POINTS = 30
 # The kernel opens so many times its end width around a pose that is nearly right.
 NEAR_KERNEL = 2.0
+# Sigma; what stands lies elsewhere when it lies farther off than this.
+APART = 3.0
 
 # Between scans that come without stamps, ns: most sensors turn ten times a second.
 SCAN_NS = 100_000_000
@@ -89,8 +92,7 @@ class Registration(Stateful):
         self._inserted = 0
         # Angle between rings, rad, for point to point; 0 where unknown.
         self._ring_gap = 0.0
-        # Points and poses of the scans that entered the map last.
-        self._recent: tuple[tuple[NDArray[np.float32], NDArray[np.float64]], ...] = ()
+        self._recent = RecentScans(self.config.start_scans, self.preprocess)
 
     def register(self, points: NDArray[Any], prior: NDArray[np.float64] | None = None) -> RegistrationResult:
         """Pose of points (N, 3), m, LiDAR frame; without `prior` (4, 4) the velocity is taken as constant."""
@@ -139,7 +141,7 @@ class Registration(Stateful):
         is_small = move < c.recover_m and turn < np.deg2rad(c.recover_deg)
         # A prior that is wrong by more than the kernel reaches can be held by the sensor's own rings, hardly corrected.
         if fine.ok and is_small and not self.agreement.is_less(self._agreement(fine)):
-            return fine
+            return self._steadied(points, T_prior, fine)
         coarse = self._judge(self._coarse_to_fine(points, T_prior), T_prior)
         coarse = replace(coarse, iterations=coarse.iterations + fine.iterations)
         is_better = coarse.ok and coarse.inliers > fine.inliers
@@ -148,7 +150,8 @@ class Registration(Stateful):
             is_better = is_better and not self.agreement.is_less(self._agreement(coarse))
         best = coarse if not fine.ok or is_better else fine
         is_far = not best.ok or best.prior_error[0] >= c.recover_m
-        return self.held(points, T_prior, best) if is_far and c.start_reach > 0 else best
+        best = self.held(points, T_prior, best) if is_far and c.start_reach > 0 else best
+        return self._steadied(points, T_prior, best)
 
     def update(self, points: PreparedPoints, result: RegistrationResult) -> None:
         """Enter the scan into the map unless its registration failed; learn from it unless it was denied."""
@@ -156,7 +159,7 @@ class Registration(Stateful):
             first = len(self.map) == 0
             self.target.enter(self.map, points.map_points, result.T_world_lidar)
             self._inserted += 1
-            self._recent = (*self._recent, (points.map_points, result.T_world_lidar))[-self.config.start_scans :]
+            self._recent.enter(points.map_points, result.T_world_lidar)
             if not first and not result.is_denied:
                 self._starting = max(self._starting - 1, 0)
                 self.agreement.observe(self._agreement(result))
@@ -177,8 +180,7 @@ class Registration(Stateful):
         The few rings of a sparse sensor make planes on the road that move with it, and most of its points lie there.
         is_lost : whether the sensor may be anywhere within `start_reach`, which a failed registration says too
         """
-        standing = StandingPoints(self._recent, self.preprocess)
-        seen = standing.seen_in(points.map_points)
+        standing, seen = self._recent.standing(), self._recent.seen_in(points.map_points)
         starts = [T_prior]
         if is_lost:
             found = self._search(points, T_prior, found, standing, seen)
@@ -190,7 +192,7 @@ class Registration(Stateful):
 
         stood = max((standing.align(seen, start) for start in starts), key=share)
         place = stood.T_world_lidar
-        is_drawn = found.ok and is_at_rest(place, self._recent[-1][1])
+        is_drawn = found.ok and is_at_rest(place, self._recent.scans[-1][1])
         if is_drawn or not is_much_more(share(stood), share(found), len(seen.source)):
             return found
         width = NEAR_KERNEL * self.config.kernel_min
@@ -204,6 +206,42 @@ class Registration(Stateful):
         return replace(
             judged, iterations=found.iterations + near.iterations, prior_error=correction(T_prior, judged.T_world_lidar)
         )
+
+    def _steadied(
+        self, points: PreparedPoints, T_prior: NDArray[np.float64], found: RegistrationResult
+    ) -> RegistrationResult:
+        """What was found, where planes hold the place well; else with a say of what stands on the ground.
+
+        Few rings make planes that slide with the sensor, by decimetres from scan to scan and without a sign of it. What stands
+        is asked about the direction that planes hold worst, by the variances of both; where it lies clearly elsewhere, it is
+        believed.
+        """
+        doubt = found.covariance
+        if self.config.start_reach == 0 or not found.ok or doubt is None or found.holds_place(self.config.sigma):
+            return found
+        # Along bare walls, which nothing observes, the sensor's own rings agree best where nothing moved.
+        if len(found.degenerate):
+            return found
+        standing, seen = self._recent.standing(), self._recent.seen_in(points.map_points)
+
+        def share(result: RegistrationResult) -> float:
+            return standing.share(seen, result.T_world_lidar)
+
+        stood = max((standing.align(seen, start) for start in (found.T_world_lidar, T_prior)), key=share)
+        if stood.covariance is None or share(stood) <= share(found):
+            return found
+        off, theirs = (stood.T_world_lidar - found.T_world_lidar)[:3, 3], stood.covariance[:3, :3]
+        if off[:2] @ np.linalg.solve(theirs[:2, :2], off[:2]) > APART**2:
+            place = standing.place_on_ground(stood.T_world_lidar, found.T_world_lidar, points.map_points)
+            found = found.moved(place, stood.covariance)
+        else:
+            values, axes = np.linalg.eigh(doubt[:3, :3])
+            loosest = axes[:, -1]
+            part = values[-1] / (values[-1] + loosest @ theirs @ loosest)
+            place = found.T_world_lidar.copy()
+            place[:3, 3] += part * (loosest @ off) * loosest
+            found = found.moved(place, doubt)
+        return replace(found, prior_error=correction(T_prior, place))
 
     @property
     def _is_begun(self) -> bool:

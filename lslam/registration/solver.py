@@ -18,6 +18,8 @@ from lslam.types.scan_result import ScanResult
 
 # A step below these ends the iteration: a tenth of the noise of a point, and what that is at 10 m.
 STEP_M, STEP_RAD = 1e-3, 1e-4
+# Planar points that face one way hold the place along it well enough, as many as LOAM asks for a plane.
+ENOUGH = 5
 
 
 @dataclass(frozen=True)
@@ -67,6 +69,12 @@ class RegistrationResult:
     def inlier_share(self) -> float:
         """Share of the matched points within the final kernel."""
         return self.inliers / max(self.matched, 1)
+
+    def holds_place(self, sigma: float) -> bool:
+        """Whether all points together hold the sensor's place as well as `ENOUGH` that face one way, of `sigma`, m, do."""
+        if not self.ok or self.covariance is None:
+            return False
+        return float(np.linalg.eigvalsh(self.covariance[:3, :3])[-1]) < sigma**2 / ENOUGH
 
     @property
     def agreement(self) -> float:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from lslam.config.preprocess import PreprocessConfig
 from lslam.geometry import se3, so3
-from lslam.preprocessing.ground import CELL, above_ground, levelling
+from lslam.preprocessing.ground import CELL, ground_of, levelling
 from lslam.preprocessing.prepare import PreparedPoints
 from lslam.registration.gaussian_map import GaussianMap
 from lslam.registration.robust import Annealing
@@ -32,10 +32,14 @@ CLEARLY, MUCH = 1.05, 1.1
 # m; points this near belong together. Poles and leaves make no planes: their voxels are as large, one point is enough,
 # and none of them passes for a plane.
 NEAR, NO_PLANES = 0.4, 2.0
+# m above the ground: crash barriers are lower, along which a sensor's rings match best where nothing moved; ...
+HIGH = 1.2
+# ... where fewer points than this are higher, the lower ones are asked, too.
+FEW = 60
 
 
 class StandingPoints:
-    """The points of a few scans that do not lie on the ground: (points (M, 3), pose (4, 4)) of each.
+    """What stands on the ground in a few scans: (`standing_points` (M, 3), pose (4, 4)) of each.
 
     Bare ground, guard rails and walls look alike metres further on, and a sensor's own rings match best where nothing
     moved. Posts, trees, signs and the ends of walls repeat nowhere at once, though they make few planes or none.
@@ -45,12 +49,7 @@ class StandingPoints:
         self._preprocess = preprocess
         self._cells = GaussianMap(NEAR, min_points=1, planarity=NO_PLANES, reach=np.inf, capacity=1 << 12)
         for points, T_world_lidar in scans:
-            self._cells.insert(self._standing(points), T_world_lidar)
-
-    def seen_in(self, points: Points) -> PreparedPoints:
-        """What to look for at some pose: the standing points of another scan (N, 3), LiDAR frame."""
-        standing = self._standing(points)
-        return PreparedPoints(standing, standing.astype(np.float64), np.zeros((len(standing), 6)), len(standing))
+            self._cells.insert(points, T_world_lidar)
 
     def share(self, seen: PreparedPoints, T_world_lidar: Floats) -> float:
         """Part of them that have one of these points near by when seen from `T_world_lidar` (4, 4)."""
@@ -82,9 +81,15 @@ class StandingPoints:
     def _solve(self, seen: PreparedPoints, T_start: Floats, annealing: Annealing) -> RegistrationResult:
         return solve(self._cells, seen, T_start, annealing, sigma=NEAR, blob_weight=1.0, weak_share=0.0)
 
-    def _standing(self, points: Points) -> Points:
-        p = self._preprocess
-        return points[above_ground(points, p.ground_slope, p.ground_tolerance)]
+
+def standing_points(points: Points, preprocess: PreprocessConfig) -> tuple[Points, Points]:
+    """Those of the points (N, 3), LiDAR frame, that do not lie on the ground; and what to look for among others' of them.
+
+    Which is those that rise `HIGH`, unless they are too `FEW`.
+    """
+    ground = ground_of(points, preprocess.ground_slope, preprocess.ground_tolerance)
+    standing, high = (points[ground.above(points, height)] for height in (preprocess.ground_tolerance, HIGH))
+    return standing, high if len(high) >= FEW else standing
 
 
 def is_at_rest(pose: Floats, last: Floats) -> bool:

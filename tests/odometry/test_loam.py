@@ -296,7 +296,7 @@ def test_sixteen_beams_hold_a_start_at_thirty_metres_a_second(method: str, seed:
 
 
 def test_features_that_leave_their_prior_later_on_are_held_to_what_stands(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Half a metre of the prior is enough for the road's planar points to slide with sixteen beams by two."""
+    """Half a metre too far is kept by the road's planar points: with sixteen beams these lie there, too."""
     scans, truth = of_motorway(0, "os1-16", 9)
     driver = Driver("floam")
     monkeypatch.setattr(driver.loam.registration, "_holds_place", lambda result: True)
@@ -307,7 +307,7 @@ def test_features_that_leave_their_prior_later_on_are_held_to_what_stands(monkey
     registration.config = registration.config.model_copy(update={"start_reach": 0.0})
     slid = registration.locate(features, prior, StageClock())
     assert slid.ok
-    assert np.linalg.norm(slid.T_world_lidar[:3, 3] - expected[:3, 3]) > 1.2
+    assert np.linalg.norm(slid.T_world_lidar[:3, 3] - expected[:3, 3]) > 0.4
     assert held.ok
     assert "all points stood in" in held.reason
     assert np.linalg.norm(held.T_world_lidar[:3, 3] - expected[:3, 3]) < 0.2
