@@ -274,14 +274,17 @@ class Registration(Stateful):
         tried.sort(key=lambda found: (-standing.share(seen, found.T_world_lidar), -found.inliers))
         for promising in distinct(tried, best.T_world_lidar):
             start = promising.T_world_lidar
-            found = self._judge(self._coarse_to_fine(points, start), start)
+            # Once more as wide as from an unknown start, what was found right could be drawn to the false place again.
+            found = self._judge(self._coarse_to_fine(points, start, 2 * START_STEP), start)
             share, known = (standing.share(seen, result.T_world_lidar) for result in (found, best))
             # A failed one has the prior's pose: where less stands than there, nothing is found.
             if found.ok and (share > CLEARLY * known if best.ok else share >= known):
                 best = replace(found, prior_error=correction(T_prior, found.T_world_lidar))
         return best
 
-    def _coarse_to_fine(self, points: PreparedPoints, T_prior: NDArray[np.float64]) -> RegistrationResult:
+    def _coarse_to_fine(
+        self, points: PreparedPoints, T_prior: NDArray[np.float64], width: float = np.inf
+    ) -> RegistrationResult:
         """Coarse planes, annealed slowly, catch what fine voxels lose: metres per scan instead of decimetres.
 
         Planes whatever the residual: all others also hold a point to where the rings of earlier scans lie, and on flat
@@ -291,7 +294,7 @@ class Registration(Stateful):
         """
         c = self.config
         coarse_map = self._coarse_map(points, T_prior)
-        slow = Annealing(c.coarse_kernel, c.kernel_min, c.coarse_decay, c.start_iterations)
+        slow = Annealing(min(width, c.coarse_kernel), c.kernel_min, c.coarse_decay, c.start_iterations)
         coarse = solve(
             coarse_map, points, T_prior, slow,
             sigma=c.sigma, blob_weight=c.blob_weight, weak_share=c.weak_share,
