@@ -18,6 +18,8 @@ Floats = NDArray[np.float64]
 
 # Fixes whose correlation is looked at; of more, means of as many as it takes.
 MOST = 200
+# Fixes in a row of which the most are right: an alignment forgives what drift and tilt may explain.
+AROUND = 7
 # Instants at which a graph has the error; between them it is that of the nearest.
 INSTANTS = 2000
 # Of the variance: what no fix is better than, so that likelihoods can be had of perfect ones.
@@ -46,6 +48,8 @@ def wander_of(seconds: Floats, residuals: Floats, sigmas: Floats, antenna: Float
     sigmas : (F, 3) m, stated; antenna : (F, 3) m, east, north, up; probability : with which chance scatters more
     """
     scaled = residuals[:, :2] / sigmas[:, :2]
+    good = _near_neighbours(scaled, probability)
+    seconds, scaled, sigmas, antenna = seconds[good], scaled[good], sigmas[good], antenna[good]
     gaps = np.diff(seconds)
     near = gaps <= 1.5 * np.median(gaps) if len(gaps) else np.zeros(0, bool)
     if not near.any() or gaps.min() <= 0:
@@ -58,6 +62,14 @@ def wander_of(seconds: Floats, residuals: Floats, sigmas: Floats, antenna: Float
     white = max(white, LEAST_WHITE)
     memory = _memory(seconds, scaled, antenna[:, :2] / sigmas[:, :2], white, float(np.median(gaps)))
     return Wander(seconds[:: -(-len(seconds) // INSTANTS)], np.sqrt(1.0 - white) * np.median(sigmas, axis=0), memory)
+
+
+def _near_neighbours(scaled: Floats, probability: float) -> NDArray[np.bool_]:
+    """(F,) which of `scaled` (F, 2) residuals are as near to the median of those around as they state to be."""
+    from scipy.ndimage import median_filter
+
+    off = scaled - median_filter(scaled, size=(AROUND, 1), mode="reflect")
+    return np.asarray((off**2).sum(axis=1) <= quantile(probability, 2))
 
 
 def _memory(seconds: Floats, scaled: Floats, antenna: Floats, white: float, gap: float) -> float:

@@ -50,6 +50,17 @@ def test_the_common_part_and_its_memory_are_found(
     assert memory / 2 < np.median([f.memory for f in found if f]) < 2 * memory
 
 
+def test_fixes_that_are_wrong_hide_nothing_from_the_others() -> None:
+    rng = np.random.default_rng(2)
+    seconds = np.arange(200.0)
+    residuals = 0.8 + 0.3 * rng.normal(size=(200, 3))
+    residuals[::7] += [0.0, 33.0, 0.0]
+    found = wander_of(seconds, residuals, np.full((200, 3), 0.85), 5 * rng.normal(size=(200, 3)).cumsum(0), 0.999)
+    assert found is not None
+    assert found.sigma[0] == pytest.approx(0.8, abs=0.05)
+    assert not set(found.seconds.tolist()) & set(seconds[::7].tolist())
+
+
 def test_nothing_is_told_of_fixes_out_of_order_or_alone() -> None:
     flat, one = np.zeros((3, 3)), np.ones((3, 3))
     assert wander_of(np.array([0.0, 1.0, 1.0]), flat, one, flat, 0.999) is None
