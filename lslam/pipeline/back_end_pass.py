@@ -13,12 +13,14 @@ from lslam.config import Config
 from lslam.formats.g2o import write_g2o
 from lslam.formats.loops_csv import write_loops
 from lslam.formats.osm_matches_csv import write_osm_matches
+from lslam.formats.state_files import Records
 from lslam.formats.trajectory_files import write_tum
 from lslam.geometry import se2, se3
 from lslam.keyframes.store import KeyframeStore
 from lslam.loops.detector import find_loops
 from lslam.pipeline import drift
 from lslam.pipeline.back_end import run_back_end
+from lslam.pipeline.checkpoints import Checkpoints
 from lslam.pipeline.front_end import to_trajectory
 from lslam.pipeline.graph_outcome import BackEnd
 from lslam.pipeline.levelling import find_level, level_results
@@ -35,11 +37,11 @@ log = logging.getLogger("lslam")
 
 def optimise_poses(
     sequence: Sequence, record: RunRecord, store: KeyframeStore, config: Config, manifest: Manifest,
-    osm: OsmSource | None = None,
+    osm: OsmSource | None = None, checkpoints: Checkpoints | None = None,
 ) -> BackEnd:  # fmt: skip
     """Put the final poses into `record`, and what the graph did into the manifest.
 
-    A run that was interrupted, or whose odometry is lost, keeps what it has.
+    A run that was interrupted, or whose odometry is lost, keeps what it has. `checkpoints` keep the loops that were found.
     """
     if config.debug.drift:
         manifest.problems.append(drift.describe(config.debug))
@@ -53,7 +55,7 @@ def optimise_poses(
         candidates: list[LoopCandidate] = []
         if config.loops.use:
             with manifest.timed("loops_s"):
-                candidates = find_loops(store, config.loops, config.registration, config.keyframes.submap_size)
+                candidates = _loops(store, config, checkpoints)
         done = run_back_end(sequence, record.results, store, config, candidates, record.turns, osm)
     record.odometry = record.trajectory
     if done.is_optimised:
@@ -65,6 +67,19 @@ def optimise_poses(
     manifest.problems += done.problems
     manifest.graph = dict(done.facts)
     return done
+
+
+def _loops(store: KeyframeStore, config: Config, checkpoints: Checkpoints | None) -> list[LoopCandidate]:
+    """All candidates of the keyframes where they are now, by an earlier run where it found them for the same poses."""
+    poses = np.array([k.T_world_lidar for k in store.keyframes]).reshape(-1, 4, 4)
+    known = None if checkpoints is None else checkpoints.latest()
+    if known is not None and np.array_equal(known["poses"], poses):
+        candidates: list[LoopCandidate] = known["candidates"]
+        return candidates
+    candidates = find_loops(store, config.loops, config.registration, config.keyframes.submap_size)
+    if checkpoints is not None:
+        checkpoints.write(len(poses), lambda: {"poses": poses, "candidates": Records(candidates)})
+    return candidates
 
 
 def level_world(record: RunRecord, sequence: Sequence, config: Config, manifest: Manifest) -> None:

@@ -19,7 +19,7 @@ from lslam.pipeline import outputs
 from lslam.pipeline.back_end_pass import level_world, optimise_poses, write_back_end
 from lslam.pipeline.building_pass import write_buildings
 from lslam.pipeline.check import check_config
-from lslam.pipeline.checkpoints import OdometryCheckpoints
+from lslam.pipeline.checkpoints import Checkpoints, OdometryCheckpoints
 from lslam.pipeline.choose import choose_scans
 from lslam.pipeline.feature_pass import build_feature_map
 from lslam.pipeline.front_end import sweep_of
@@ -142,7 +142,8 @@ def _solve(
     record = estimate_poses(
         job.sequence, job.odometry, job.config, job.manifest, folder, job.truth, job.watch, store, checkpoints, job.osm
     )
-    done = optimise_poses(job.sequence, record, store, job.config, job.manifest, job.osm)
+    loops = None if checkpoints is None else Checkpoints(checkpoints.folder, "loops", job.config.odometry.checkpoint_s)
+    done = optimise_poses(job.sequence, record, store, job.config, job.manifest, job.osm, loops)
     level_world(record, job.sequence, job.config, job.manifest)
     record.loop_view = view_loop(record, done, store)
     return record, done, _score(record, job.sequence, job.config)

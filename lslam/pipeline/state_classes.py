@@ -7,10 +7,12 @@ from lslam.inertial.gyroscope import Gyroscope
 from lslam.inertial.initialise import Start
 from lslam.preprocessing.features import FeaturePoints, Features
 from lslam.registration.feature_scan import FeatureScan
+from lslam.types.constraint import Constraint, LoopCandidate
 from lslam.types.gravity import GravityDirection
 from lslam.types.imu import ImuStream
 from lslam.types.scan_result import ScanResult
 
 STATE_CLASSES = (
-    FeaturePoints, Features, FeatureScan, GravityDirection, Gyroscope, ImuEstimate, ImuStream, ScanResult, Start,
+    Constraint, FeaturePoints, Features, FeatureScan, GravityDirection, Gyroscope, ImuEstimate, ImuStream, LoopCandidate,
+    ScanResult, Start,
 )  # fmt: skip
