@@ -14,12 +14,13 @@ from lslam.errors import InputError
 from lslam.geometry import se3, so3
 from lslam.preprocessing.beams import ring_gap
 from lslam.preprocessing.prepare import PreparedPoints, prepare_points, thin
+from lslam.registration.alignment import MapAlignment
 from lslam.registration.gaussian_map import GaussianMap
 from lslam.registration.motion import ConstantVelocity
 from lslam.registration.recent_scans import RecentScans
 from lslam.registration.residuals import NEEDS_COVARIANCE
-from lslam.registration.robust import AdaptiveThreshold, Annealing, UsualAgreement
-from lslam.registration.solver import RegistrationResult, solve
+from lslam.registration.robust import AdaptiveThreshold, UsualAgreement
+from lslam.registration.solver import RegistrationResult
 from lslam.registration.source_covariance import source_covariance
 from lslam.registration.start_search import (
     CLEARLY,
@@ -45,9 +46,6 @@ SCAN_NS = 100_000_000
 
 # Point to point: of the voxel size, because a voxel's mean stands for one point of its surface, its plane for all.
 POINT_VOXEL = 0.625
-# Times the voxel size: where the rings of a sparse sensor lie farther apart than a voxel, points go to voxels that hold
-# several: 2.5 m are the gaps of sixteen beams two degrees apart at 70 m.
-GAP_FACTOR = 4
 # A few points at the edge of sight are not worth a second map.
 SPARSE_SHARE = 0.1
 # Times the steps: a point is drawn to where its match is, not to where the surfaces meet, and the score of a normal
@@ -84,6 +82,7 @@ class Registration(Stateful):
             count_cap=self.config.count_cap,
             reach=1.2 * self.preprocess.range_max,
         )
+        self._alignment = MapAlignment(self.map, self.config, self.residual)
         self.threshold = AdaptiveThreshold(self.config.kernel_min, self.config.kernel_max)
         self.agreement = UsualAgreement(self.config.min_agreement)
         self._motion = ConstantVelocity()
@@ -134,7 +133,7 @@ class Registration(Stateful):
         coarse_map = self.map.coarsen(c.coarse_factor) if are_few else None
         steps = c.max_iterations * SLOWLY.get(self.residual, 1)
         width = NEAR_KERNEL * c.kernel_min if is_near else self.threshold.width
-        fine = self._judge(self._refine(points, T_prior, width, steps, coarse_map), T_prior)
+        fine = self._judge(self._alignment.refine(points, T_prior, width, steps, coarse_map), T_prior)
         if is_near:
             return fine
         move, turn = fine.prior_error
@@ -142,7 +141,7 @@ class Registration(Stateful):
         # A prior that is wrong by more than the kernel reaches can be held by the sensor's own rings, hardly corrected.
         if fine.ok and is_small and not self.agreement.is_less(self._agreement(fine)):
             return self._steadied(points, T_prior, fine)
-        coarse = self._judge(self._coarse_to_fine(points, T_prior), T_prior)
+        coarse = self._judge(self._alignment.coarse_to_fine(points, T_prior), T_prior)
         coarse = replace(coarse, iterations=coarse.iterations + fine.iterations)
         is_better = coarse.ok and coarse.inliers > fine.inliers
         if fine.ok and is_small:
@@ -196,7 +195,9 @@ class Registration(Stateful):
         if is_drawn or not is_much_more(share(stood), share(found), len(seen.source)):
             return found
         width = NEAR_KERNEL * self.config.kernel_min
-        near = self._refine(points, place, width, self.config.start_iterations, self._coarse_map(points, place))
+        near = self._alignment.refine(
+            points, place, width, self.config.start_iterations, self._alignment.coarse_map(points, place)
+        )
         judged = self._judge(near, place)
         if not judged.ok and not found.ok:
             return found
@@ -250,7 +251,7 @@ class Registration(Stateful):
 
     def _start(self, points: PreparedPoints, T_prior: NDArray[np.float64]) -> RegistrationResult:
         """Coarse to fine; while the map is made of a few scans, what stands on the ground has the last word."""
-        found = self._judge(self._coarse_to_fine(points, T_prior), T_prior)
+        found = self._judge(self._alignment.coarse_to_fine(points, T_prior), T_prior)
         return self.held(points, T_prior, found, is_lost=self._inserted == 1) if self._is_begun else found
 
     def _search(
@@ -262,82 +263,23 @@ class Registration(Stateful):
         Posts and crash barriers repeat every few metres, so the nearest agreement may be a false one; what stands on the
         ground tells. A few points on the coarse map show which starts are worth a whole registration.
         """
-        c = self.config
-        coarse_map, few = self._coarse_map(points, T_prior), thin(points, SEARCH_SHARE)
-        slow = Annealing(2 * START_STEP, c.kernel_min, c.coarse_decay, c.start_iterations)
+        coarse_map, few = self._alignment.coarse_map(points, T_prior), thin(points, SEARCH_SHARE)
+        slow = self._alignment.slowly(2 * START_STEP)
         tried = [
-            solve(coarse_map, few, T_prior @ se3.make(np.eye(3), offset), slow, sigma=c.sigma, blob_weight=c.blob_weight,
-                  weak_share=c.weak_share)
-            for offset in start_offsets(c.start_reach, START_STEP)
-        ]  # fmt: skip
+            self._alignment.on_planes(coarse_map, few, T_prior @ se3.make(np.eye(3), offset), slow)
+            for offset in start_offsets(self.config.start_reach, START_STEP)
+        ]
         # Where nothing stands, as in hills, what matches the ground is all that tells.
         tried.sort(key=lambda found: (-standing.share(seen, found.T_world_lidar), -found.inliers))
         for promising in distinct(tried, best.T_world_lidar):
             start = promising.T_world_lidar
             # Once more as wide as from an unknown start, what was found right could be drawn to the false place again.
-            found = self._judge(self._coarse_to_fine(points, start, 2 * START_STEP), start)
+            found = self._judge(self._alignment.coarse_to_fine(points, start, 2 * START_STEP), start)
             share, known = (standing.share(seen, result.T_world_lidar) for result in (found, best))
             # A failed one has the prior's pose: where less stands than there, nothing is found.
             if found.ok and (share > CLEARLY * known if best.ok else share >= known):
                 best = replace(found, prior_error=correction(T_prior, found.T_world_lidar))
         return best
-
-    def _coarse_to_fine(
-        self, points: PreparedPoints, T_prior: NDArray[np.float64], width: float = np.inf
-    ) -> RegistrationResult:
-        """Coarse planes, annealed slowly, catch what fine voxels lose: metres per scan instead of decimetres.
-
-        Planes whatever the residual: all others also hold a point to where the rings of earlier scans lie, and on flat
-        ground these agree with any speed that the map was once made with.
-        Few scans of a sparse sensor put single rings into fine voxels, which are no planes yet: the points there keep
-        their coarse plane, the others take a fine one.
-        """
-        c = self.config
-        coarse_map = self._coarse_map(points, T_prior)
-        slow = Annealing(min(width, c.coarse_kernel), c.kernel_min, c.coarse_decay, c.start_iterations)
-        coarse = solve(
-            coarse_map, points, T_prior, slow,
-            sigma=c.sigma, blob_weight=c.blob_weight, weak_share=c.weak_share,
-        )  # fmt: skip
-        start = coarse.T_world_lidar if coarse.ok else T_prior
-        fine = self._refine(points, start, c.kernel_max, c.start_iterations, coarse_map)
-        return replace(fine, iterations=coarse.iterations + fine.iterations)
-
-    def _coarse_map(self, points: PreparedPoints, T_prior: NDArray[np.float64]) -> GaussianMap:
-        """The map in coarse voxels: so large that planes lie under enough of the points.
-
-        From thirty metres above the ground the rings of one scan lie metres apart.
-        """
-        c = self.config
-        once = Annealing(c.coarse_kernel, c.coarse_kernel, c.coarse_decay, 1)
-        for factor in (c.coarse_factor, 2 * c.coarse_factor, 4 * c.coarse_factor):
-            coarse_map = self.map.coarsen(factor)
-            found = solve(
-                coarse_map, points, T_prior, once,
-                sigma=c.sigma, blob_weight=c.blob_weight, weak_share=c.weak_share,
-            )  # fmt: skip
-            if found.overlap >= c.start_overlap:
-                break
-        return coarse_map
-
-    def _refine(
-        self, points: PreparedPoints, start: NDArray[np.float64], width: float, steps: int, coarse: GaussianMap | None
-    ) -> RegistrationResult:
-        """Align with the fine map from `start`, the kernel closing from `width`, or as the user wants it."""
-        c = self.config
-        if c.inlier_distance is None:
-            # The larger the planes, the farther their surface may be from them.
-            widest = 1.0 if coarse is None else coarse.size / (c.coarse_factor * self.map.size)
-            annealing = Annealing(max(width, widest * c.kernel_min), widest * c.kernel_min, c.kernel_decay, steps)
-        else:
-            annealing = Annealing(c.inlier_distance, c.inlier_distance, c.kernel_decay, steps)
-        if coarse is None and points.gaps is not None:
-            coarse = self.map.coarsen(GAP_FACTOR)
-        return solve(
-            self.map, points, start, annealing,
-            sigma=c.sigma, blob_weight=c.blob_weight, weak_share=c.weak_share, coarse=coarse, residual=self.residual,
-            inlier_distance=np.inf if c.inlier_distance is None else c.inlier_distance, inlier_ratio=c.inlier_ratio,
-        )  # fmt: skip
 
     def _gaps(self, points: PreparedPoints) -> NDArray[np.float64] | None:
         """(S,) m, between the rings at each source point, or None where they are seldom farther apart than a voxel.

@@ -103,8 +103,8 @@ def test_coarse_to_fine_is_believed_only_where_it_agrees_as_usual(
         last, T_world_lidar=last.T_world_lidar @ se3.make(np.eye(3), np.array([0.05, 0, 0])),
         fine_inliers=int(coarse * last.source_points), inliers=int(coarse * last.source_points),
     )  # fmt: skip
-    monkeypatch.setattr(registration, "_refine", lambda *_: found)
-    monkeypatch.setattr(registration, "_coarse_to_fine", lambda *_: other)
+    monkeypatch.setattr(registration._alignment, "refine", lambda *_: found)
+    monkeypatch.setattr(registration._alignment, "coarse_to_fine", lambda *_: other)
     registration.agreement.usual = 1.0
     located = registration.locate(points, last.T_world_lidar)
     assert (located.T_world_lidar is other.T_world_lidar) == is_taken

@@ -1,0 +1,89 @@
+"""The ways a scan is laid on the local map: from nearly the right place, or from metres off."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.config.registration import RegistrationConfig, Residual
+from lslam.preprocessing.prepare import PreparedPoints
+from lslam.registration.gaussian_map import GaussianMap
+from lslam.registration.robust import Annealing
+from lslam.registration.solver import RegistrationResult, solve
+
+Floats = NDArray[np.float64]
+
+# Times the voxel size: where the rings of a sparse sensor lie farther apart than a voxel, points go to voxels that hold
+# several: 2.5 m are the gaps of sixteen beams two degrees apart at 70 m.
+GAP_FACTOR = 4
+
+
+class MapAlignment:
+    """Aligns scans with one map by one residual; nothing here says whether to believe the result."""
+
+    def __init__(self, target: GaussianMap, config: RegistrationConfig, residual: Residual) -> None:
+        self._map, self._config, self._residual = target, config, residual
+
+    def refine(
+        self, points: PreparedPoints, start: Floats, width: float, steps: int, coarse: GaussianMap | None
+    ) -> RegistrationResult:
+        """Align with the fine map from `start` (4, 4), the kernel closing from `width`, m, or as the user wants it."""
+        c = self._config
+        if c.inlier_distance is None:
+            # The larger the planes, the farther their surface may be from them.
+            widest = 1.0 if coarse is None else coarse.size / (c.coarse_factor * self._map.size)
+            annealing = Annealing(max(width, widest * c.kernel_min), widest * c.kernel_min, c.kernel_decay, steps)
+        else:
+            annealing = Annealing(c.inlier_distance, c.inlier_distance, c.kernel_decay, steps)
+        if coarse is None and points.gaps is not None:
+            coarse = self._map.coarsen(GAP_FACTOR)
+        return solve(
+            self._map, points, start, annealing,
+            sigma=c.sigma, blob_weight=c.blob_weight, weak_share=c.weak_share, coarse=coarse, residual=self._residual,
+            inlier_distance=np.inf if c.inlier_distance is None else c.inlier_distance, inlier_ratio=c.inlier_ratio,
+        )  # fmt: skip
+
+    def coarse_to_fine(self, points: PreparedPoints, T_prior: Floats, width: float = np.inf) -> RegistrationResult:
+        """Coarse planes, annealed slowly, catch what fine voxels lose: metres per scan instead of decimetres.
+
+        Planes whatever the residual: all others also hold a point to where the rings of earlier scans lie, and on flat
+        ground these agree with any speed that the map was once made with.
+        Few scans of a sparse sensor put single rings into fine voxels, which are no planes yet: the points there keep
+        their coarse plane, the others take a fine one.
+        width : m, of the kernel at the start, where the prior is known better than `coarse_kernel`
+        """
+        c = self._config
+        coarse_map = self.coarse_map(points, T_prior)
+        coarse = self.on_planes(coarse_map, points, T_prior, self.slowly(min(width, c.coarse_kernel)))
+        start = coarse.T_world_lidar if coarse.ok else T_prior
+        fine = self.refine(points, start, c.kernel_max, c.start_iterations, coarse_map)
+        return replace(fine, iterations=coarse.iterations + fine.iterations)
+
+    def coarse_map(self, points: PreparedPoints, T_prior: Floats) -> GaussianMap:
+        """The map in coarse voxels: so large that planes lie under enough of the points.
+
+        From thirty metres above the ground the rings of one scan lie metres apart.
+        """
+        c = self._config
+        once = Annealing(c.coarse_kernel, c.coarse_kernel, c.coarse_decay, 1)
+        for factor in (c.coarse_factor, 2 * c.coarse_factor, 4 * c.coarse_factor):
+            coarse_map = self._map.coarsen(factor)
+            if self.on_planes(coarse_map, points, T_prior, once).overlap >= c.start_overlap:
+                break
+        return coarse_map
+
+    def slowly(self, width: float) -> Annealing:
+        """A kernel that closes from `width`, m, so slowly that coarse planes are followed."""
+        c = self._config
+        return Annealing(width, c.kernel_min, c.coarse_decay, c.start_iterations)
+
+    def on_planes(
+        self, coarse_map: GaussianMap, points: PreparedPoints, start: Floats, annealing: Annealing
+    ) -> RegistrationResult:
+        """Align with the planes of a coarse map alone, from `start` (4, 4)."""
+        c = self._config
+        return solve(
+            coarse_map, points, start, annealing, sigma=c.sigma, blob_weight=c.blob_weight, weak_share=c.weak_share
+        )
