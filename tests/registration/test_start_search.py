@@ -274,18 +274,21 @@ def test_much_more_is_more_than_chance_and_more_than_walls_show() -> None:
     assert 0.01 < by_chance < 0.03
 
 
-def test_height_and_tilt_come_from_planes_and_the_rest_from_what_stands() -> None:
+@pytest.mark.parametrize(("height", "kept"), [(0.3, 0.3), (0.5, 0.0)])
+def test_height_and_tilt_come_from_planes_and_the_rest_from_what_stands(height: float, kept: float) -> None:
+    """Half a metre higher nothing that stands would have its like near by: planes that say so do not hold the height."""
     rng = np.random.default_rng(3)
     tilted = se3.exp(np.array([0, 0, 0, 0.05, -0.2, 0.0]))
     level = street(rng, 0.0)
     scan = se3.apply(se3.inverse(tilted), level.astype(np.float64)).astype(np.float32)
-    stands, planes = pose_at((3.0, 0.2, 0.0), 4.0), pose_at((2.8, 0.1, 0.5), 3.5) @ se3.exp([0, 0, 0, 0.02, 0.01, 0])
+    stands, planes = pose_at((3.0, 0.2, 0.0), 4.0), pose_at((2.8, 0.1, height), 3.5) @ se3.exp([0, 0, 0, 0.02, 0.01, 0])
     # Poses of the tilted sensor whose levelled frames are the two.
     placed = recent(scan, np.eye(4)).standing().place_on_ground(stands @ tilted, planes @ tilted, scan) @ se3.inverse(
         tilted
     )
     np.testing.assert_allclose(placed[:2, 3], stands[:2, 3], atol=0.05)
-    np.testing.assert_allclose(placed[2], planes[2], atol=5e-3)
+    np.testing.assert_allclose(placed[2, :3], planes[2, :3], atol=5e-3)
+    assert placed[2, 3] == pytest.approx(kept, abs=0.02)
     yaw = np.rad2deg(np.arctan2(placed[1, 0], placed[0, 0]))
     assert abs(yaw - 4.0) < 0.1
 
