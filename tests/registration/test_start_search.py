@@ -130,7 +130,9 @@ def test_between_bare_walls_the_prior_stays_though_rings_match_best_where_nothin
     assert error < 0.02
 
 
-@pytest.mark.parametrize(("lidar", "seed"), [("vlp16", 0), ("vlp16", 4), ("os1-16", 1), ("os1-16", 4)])
+@pytest.mark.parametrize(
+    ("lidar", "seed"), [("vlp16", 0), ("vlp16", 1), ("vlp16", 4), ("os1-16", 0), ("os1-16", 1), ("os1-16", 4)]
+)
 def test_sixteen_beams_start_at_thirty_metres_a_second(lidar: str, seed: int) -> None:
     # Planes of so few rings lie on the road, and slide with it: by two metres in the first scan, by more in later ones.
     drive = seen_by(lidar, "motorway", seed)
