@@ -45,11 +45,12 @@ def build_place(
     count: int | None = None,
     way_points: WayPoints | None = None,
     extract: MapExtract | None = None,
+    standing: int = 0,
 ) -> Place:
     """Build the place of `scenario`; one generator per part, so that another LiDAR or speed leaves the city as it is.
 
-    `way_points` replace the scenario's own line, `extract` its town. Raises UsageError for bends too tight and more scans
-    than fit, InputError for an extract that is far from the way-points.
+    `way_points` replace the scenario's own line, `extract` its town; `standing` of the `count` scans pass before it moves
+    off. Raises UsageError for bends too tight and more scans than fit, InputError for an extract that is far from the way-points.
     """
     place, build, shake = (np.random.default_rng([seed, 2**32 - k]) for k in (1, 2, 3))
     if extract is not None:
@@ -58,7 +59,7 @@ def build_place(
         route = given_route(scenario, way_points) if way_points is not None else own_route(scenario, place)
     terrain = rolling(place, scenario.world.relief, scenario.world.unevenness, scenario.world.swell)
     _check_radius(scenario, route.line)
-    path, scans = _move(scenario, route, terrain, count, shake)
+    path, scans = _move(scenario, route, terrain, count, standing, shake)
     if extract is not None:
         return Place(city_of_map(scenario, extract, terrain, build, route), path, scans)
     return Place(_city(scenario, route.street, terrain, build), path, scans)
@@ -115,7 +116,7 @@ def _check_radius(scenario: Scenario, line: Curve) -> None:
 
 
 def _move(
-    scenario: Scenario, route: Route, terrain: Terrain, count: int | None, rng: np.random.Generator
+    scenario: Scenario, route: Route, terrain: Terrain, count: int | None, standing: int, rng: np.random.Generator
 ) -> tuple[paths.VehiclePath | FreePath, int]:
     """The path, and how many scans there are: `count`, or one lap, or all that fit on an open line."""
     line, rate = route.line, scenario.rate_hz
@@ -127,9 +128,9 @@ def _move(
     path = _carried(scenario, route, terrain, distance, rng)
     fits = int(np.floor(path.duration * rate + 1e-6))
     if not line.closed:
-        if count is not None and count > fits:
+        if count is not None and count - standing > fits:
             raise UsageError(
-                f"scenario {scenario.name!r} ends after {fits} scans at {scenario.speed:g} m/s: ask for fewer with "
+                f"scenario {scenario.name!r} ends after {fits + standing} scans at {scenario.speed:g} m/s: ask for fewer with "
                 "--count, or drive slower with --speed"
             )
         return path, fits if count is None else count

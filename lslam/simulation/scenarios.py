@@ -180,7 +180,8 @@ def simulate(
         chosen = chosen.model_copy(
             update={"name": osm.stem, "summary": f"As {chosen.name!r}, in the city of {osm.name}."}
         )
-    place = build_place(chosen, seed, count, line, extract)
+    standing = int(static_start * chosen.rate_hz)
+    place = build_place(chosen, seed, count, line, extract, standing)
     scene = RayScene(place.city.mesh)
     if chosen.path.clearance:
         check_path(scene, place.city, place.path.poses, place.path.duration)

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from lslam.errors import UsageError
 from lslam.formats.stamped_csv import read_stamped_csv
 from lslam.formats.trajectory_files import read_trajectory
 from lslam.geometry import geodesy, se3, so3
@@ -139,3 +140,9 @@ def test_static_start_comes_on_top_of_the_drive() -> None:
     np.testing.assert_allclose(still.poses, np.broadcast_to(np.eye(4), still.poses.shape), atol=1e-6)
     gap = waiting.ground_truth.positions[-1] - plain.ground_truth.positions[-1]
     assert np.linalg.norm(gap) < 3.0, "it ends where the street ends"
+
+
+def test_scans_that_are_asked_for_may_pass_standing() -> None:
+    assert len(simulate("street", count=285, static_start=2.0)) == 285
+    with pytest.raises(UsageError, match="ends after 285 scans"):
+        simulate("street", count=290, static_start=2.0)
