@@ -1,4 +1,4 @@
-"""Gently uneven ground: a sum of plane waves, so that height and slope are exact everywhere."""
+"""Gently uneven ground: a fall and a sum of plane waves, so that height and slope are exact everywhere."""
 
 from __future__ import annotations
 
@@ -13,31 +13,46 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Terrain:
-    """Ground height as a sum of K plane waves `amplitude sin(wave . xy + phase)`.
+    """Ground height as a sum of K plane waves `amplitude sin(wave . xy + phase)` on a plane.
 
     waves : (K, 2) wave vectors, rad/m; amplitudes : (K,) m; phases : (K,) rad
+    tilt : gradient of the plane, m/m
     """
 
     waves: Floats
     amplitudes: Floats
     phases: Floats
+    tilt: tuple[float, float] = (0.0, 0.0)
 
     def height(self, xy: NDArray[Any]) -> Floats:
         """Height at (..., 2) positions, m, shape (...)."""
-        return np.asarray(np.sin(xy @ self.waves.T + self.phases) @ self.amplitudes)
+        return np.asarray(np.sin(xy @ self.waves.T + self.phases) @ self.amplitudes + xy @ np.array(self.tilt))
 
     def slope(self, xy: NDArray[Any]) -> Floats:
         """Gradient of the height at (..., 2) positions, m/m, shape (..., 2)."""
-        return np.asarray((np.cos(xy @ self.waves.T + self.phases) * self.amplitudes) @ self.waves)
+        return np.asarray(
+            (np.cos(xy @ self.waves.T + self.phases) * self.amplitudes) @ self.waves + np.array(self.tilt)
+        )
 
 
-def rolling(rng: np.random.Generator, relief: float = 0.35, unevenness: float = 0.012, swell: float = 100.0) -> Terrain:
-    """Uneven ground: about `relief` m up and down over about `swell` m, bumps of about `unevenness` m over 7 to 20 m."""
+def rolling(
+    rng: np.random.Generator,
+    relief: float = 0.35,
+    unevenness: float = 0.012,
+    swell: float = 100.0,
+    slope: tuple[float, float] = (0.0, 0.0),
+) -> Terrain:
+    """Uneven ground: about `relief` m up and down over about `swell` m, bumps of about `unevenness` m over 7 to 20 m.
+
+    slope : the least and the greatest fall of the whole, m/m, towards any side
+    """
     lengths = np.concatenate([rng.uniform(0.6, 1.4, 4) * swell, rng.uniform(7, 20, 5)])
     amplitudes = np.concatenate([rng.uniform(0.4, 1.0, 4) * relief, rng.uniform(0.4, 1.0, 5) * unevenness])
     heading = rng.uniform(0, 2 * np.pi, len(lengths))
     waves = (2 * np.pi / lengths)[:, None] * np.stack([np.cos(heading), np.sin(heading)], axis=1)
-    return Terrain(waves, amplitudes, rng.uniform(0, 2 * np.pi, len(lengths)))
+    phases = rng.uniform(0, 2 * np.pi, len(lengths))
+    fall, towards = rng.uniform(*slope), rng.uniform(0, 2 * np.pi)
+    return Terrain(waves, amplitudes, phases, (float(fall * np.cos(towards)), float(fall * np.sin(towards))))
 
 
 def flat() -> Terrain:
