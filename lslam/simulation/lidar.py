@@ -40,18 +40,23 @@ BODY_STEP = 0.004  # s between the poses of a moving body
 
 @dataclass(frozen=True)
 class Roof:
-    """The roof under a LiDAR, level in its frame, m: behind, ahead, to either side, and how far below."""
+    """The roof under a LiDAR, level in its frame, m: behind, ahead, to either side, and how far below.
+
+    returns : whether it is seen, or what it is in the way of is only missing, as where its returns are cut off
+    """
 
     behind: float
     ahead: float
     aside: float
     below: float
+    returns: bool = False
 
-    def blocks(self, directions: NDArray[np.float32], heights: NDArray[np.float32]) -> NDArray[np.bool_]:
-        """Which rays (N, 3) from `heights` (N,), m, above the LiDAR's origin end on it."""
+    def reach(self, directions: NDArray[np.float32], heights: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Distance (N,), m, at which unit rays (N, 3) from `heights` (N,), m, above the LiDAR's origin end on it, else inf."""
         fall = (self.below + heights) / np.maximum(-directions[:, 2], np.float32(1e-6))
         x, y = fall * directions[:, 0], fall * directions[:, 1]
-        return np.asarray((x > -self.behind) & (x < self.ahead) & (np.abs(y) < self.aside))
+        blocked = (x > -self.behind) & (x < self.ahead) & (np.abs(y) < self.aside)
+        return np.where(blocked, fall, np.float32(np.inf)).astype(np.float32)
 
 
 class RayScene:
@@ -131,7 +136,7 @@ def trace(
     rng : source of noise and losses
     bodies : what moves, each ray meets it where it is when that ray is fired (at `stamp_ns` in a compensated scan)
     glass : share of the rays on a pane that pass it and go on to what is behind
-    roof : of the vehicle that carries the LiDAR; what it is in the way of gives nothing
+    roof : of the vehicle that carries the LiDAR, which is in the way of the ground
 
     Returns
     -------
@@ -148,7 +153,7 @@ def trace(
         _pass_glass(scene, rays, bodies, hits, rng.random(model.rays) < glass, stamp_ns / 1e9)
     heights = model.heights.astype(np.float32)[ring]
     if roof is not None:
-        hits.distance[roof.blocks(true, heights)] = np.inf
+        _meet_roof(roof, true, heights, hits)
     seen, distance, intensity = _detect(model, hits, rng)
     kept = model.sequence[seen[model.sequence]]
     points = directions[kept] * distance[kept, None]
@@ -211,6 +216,15 @@ def _meet_body(body: MovingMesh, which: NDArray[np.intp], rays: _Rays, hits: _Hi
     hits.distance[met] = far[nearer]
     hits.cosine[met] = np.abs(np.einsum("ij,ij->i", body.scene.mesh.normals[face], local[nearer]))
     hits.surface[met] = body.scene.mesh.surfaces[face]
+
+
+def _meet_roof(roof: Roof, directions: NDArray[np.float32], heights: NDArray[np.float32], hits: _Hits) -> None:
+    """Put hits on the own roof into `hits`, or nothing where it does not show; rays in the LiDAR's frame."""
+    reach = roof.reach(directions, heights)
+    met = np.flatnonzero(np.isfinite(reach))
+    hits.distance[met] = reach[met] if roof.returns else np.inf
+    hits.cosine[met] = -directions[met, 2]
+    hits.surface[met] = Surface.CAR
 
 
 def _turned(angle: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -150,6 +150,24 @@ def test_the_own_roof_shadows_what_is_low() -> None:
     assert np.abs(np.abs(azimuth[scan.rings == 2]) - 90).max() < 16
 
 
+def test_the_own_roof_is_seen_where_it_returns() -> None:
+    """From 0.2 m above it, rays at -15 deg end on it 0.77 m away; what it hides is the same as where it does not show."""
+    down = replace(LIDARS["vlp16"], range_noise=0.0, range_step=1e-6, angle_noise_deg=0.0, range_10pct=1e6, dropout=0.0)
+    scene = RayScene(cube(50.0, Surface.WALL))
+    seen, cut = (
+        trace(scene, down, np.eye(4), np.random.default_rng(0), roof=Roof(0.8, 0.5, 0.6, 0.2, returns))
+        for returns in (True, False)
+    )
+    near = np.linalg.norm(seen.points, axis=1) < 1.0
+    body = seen.points[near].astype(float)
+    np.testing.assert_allclose(body[:, 2], -0.2, atol=1e-5)
+    assert seen.rings is not None
+    assert set(seen.rings[near].tolist()) == {14, 15}, "at -11 deg it would be 1.03 m away, beyond its edge"
+    np.testing.assert_allclose(np.hypot(*body[seen.rings[near] == 15, :2].T), 0.2 / np.tan(np.radians(15)), atol=1e-4)
+    assert np.all((body[:, 0] > -0.8) & (body[:, 0] < 0.5) & (np.abs(body[:, 1]) < 0.6))
+    assert seen.points[~near].tobytes() == cut.points.tobytes()
+
+
 def test_what_calibration_misses_stays_with_its_ring() -> None:
     model = replace(PERFECT, ring_bias=0.05, ring_tilt_deg=0.0)
     scan = trace(RayScene(cube(20.0)), model, np.eye(4), np.random.default_rng(0))
