@@ -44,7 +44,7 @@ def build_motorway(street: Curve, terrain: Terrain, layout: Layout, rng: np.rand
         _add_gantry(builder, street, terrain, s + rng.uniform(-40, 40), layout.road + 1.4)
     barrier = rng.uniform(0.3, 0.5) * street.length
     s = np.arange(barrier, min(barrier + 0.15 * street.length, street.length), 4.0)
-    _add_wall(builder, street, terrain, s, -layout.band - 2.5, rng.uniform(2.5, 4.0), Surface.FENCE)
+    add_wall(builder, street, terrain, s, -layout.band - 2.5, rng.uniform(2.5, 4.0), Surface.FENCE)
     footprints, heights = _add_country(builder, street, terrain, layout, rng)
     return City(builder.build(), terrain, street, footprints, heights, [street])
 
@@ -65,7 +65,7 @@ def build_corridor(street: Curve, terrain: Terrain, layout: Layout, rng: np.rand
     for side in (1, -1):
         for start, end in ends.reshape(-1, 2):
             s = np.append(np.arange(start, end - 1.0, 2.0), end)
-            _add_wall(builder, street, terrain, s, side * inside, WALL_HEIGHT, Surface.WALL)
+            add_wall(builder, street, terrain, s, side * inside, WALL_HEIGHT, Surface.WALL)
             near, far = street.beside(s, side * (inside - 0.2)), street.beside(s, side * (inside + 0.2))
             footprints.append(np.concatenate([near, far[::-1]]))
             heights.append(WALL_HEIGHT)
@@ -91,12 +91,12 @@ def _fill_opening(
         xy = street.beside(np.array([tree]), side * (layout.band + rng.uniform(2.5, 4.0)))[0]
         builder.add_mesh(furniture.tree(rng), [*xy, float(terrain.height(xy))])
     width, depth = rng.uniform(*layout.house_width), rng.uniform(*layout.house_depth)
-    return _add_house(
+    return add_house(
         builder, street, terrain, layout, s + rng.uniform(-5, 5), side * (layout.band + 7.0), width, depth, rng
     )
 
 
-def _add_house(
+def add_house(
     builder: MeshBuilder,
     street: Curve,
     terrain: Terrain,
@@ -131,12 +131,12 @@ def _add_strip(
 
 def _add_rail(builder: MeshBuilder, street: Curve, terrain: Terrain, offset: float) -> None:
     """A guard rail: a band along the road and a post every 4 m."""
-    _add_wall(builder, street, terrain, street.sample(4.0), offset, RAIL[1], Surface.FENCE, RAIL[0], 0.1)
+    add_wall(builder, street, terrain, street.sample(4.0), offset, RAIL[1], Surface.FENCE, RAIL[0], 0.1)
     for s in street.sample(4.0):
         _put(builder, street, terrain, s, offset, [-0.05, -0.05, -0.3], [0.05, 0.05, RAIL[1]], Surface.POLE)
 
 
-def _add_wall(
+def add_wall(
     builder: MeshBuilder,
     street: Curve,
     terrain: Terrain,
@@ -202,7 +202,7 @@ def _add_country(
             rng.uniform(*layout.house_width),
             rng.uniform(*layout.house_depth),
         )
-        outline, height = _add_house(builder, street, terrain, layout, s, side * rng.uniform(48, 58), width, depth, rng)
+        outline, height = add_house(builder, street, terrain, layout, s, side * rng.uniform(48, 58), width, depth, rng)
         footprints.append(outline)
         heights.append(height)
     return footprints, heights

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from lslam.errors import UsageError
 from lslam.simulation import path as paths
+from lslam.simulation.carpark import build_carpark
 from lslam.simulation.city import City, build_city
 from lslam.simulation.clearance import check_bends
 from lslam.simulation.countryside import build_corridor, build_motorway
@@ -19,7 +20,7 @@ from lslam.simulation.motion import PosePath
 from lslam.simulation.moving import Mover, add_traffic
 from lslam.simulation.osm_city import OsmCity
 from lslam.simulation.osm_place import MapExtract, city_of_map, keep_out_of_walls, route_in_map
-from lslam.simulation.routes import SPARE, TIGHTEST, Route, given_route, own_route
+from lslam.simulation.routes import SPARE, TIGHTEST, Route, given_route, own_route, speed_profile
 from lslam.simulation.scenario_files import Scenario
 from lslam.simulation.terrain import Terrain, rolling
 from lslam.simulation.town import build_town
@@ -49,15 +50,17 @@ def build_place(
 ) -> Place:
     """Build the place of `scenario`; one generator per part, so that another LiDAR or speed leaves the city as it is.
 
-    `way_points` replace the scenario's own line, `extract` its town; `standing` of the `count` scans pass before it moves
-    off. Raises UsageError for bends too tight and more scans than fit, InputError for an extract that is far from the way-points.
+    Only an out-and-back, and what is round it, is longer when a speed or `count` needs it. `way_points` replace the scenario's
+    own line, `extract` its town; `standing` of the `count` scans pass before it moves off. Raises UsageError for bends too
+    tight and more scans than fit, InputError for an extract that is far from the way-points.
     """
     place, build, shake = (np.random.default_rng([seed, 2**32 - k]) for k in (1, 2, 3))
     if extract is not None:
         route = route_in_map(scenario, extract, way_points)
     else:
-        route = given_route(scenario, way_points) if way_points is not None else own_route(scenario, place)
-    terrain = rolling(place, scenario.world.relief, scenario.world.unevenness, scenario.world.swell)
+        moving = None if count is None else count - standing
+        route = given_route(scenario, way_points) if way_points is not None else own_route(scenario, place, moving)
+    terrain = _terrain(scenario, place)
     _check_radius(scenario, route.line)
     path, scans = _move(scenario, route, terrain, count, standing, shake)
     if extract is not None:
@@ -71,7 +74,7 @@ def whole_map(scenario: Scenario, seed: int, extract: MapExtract) -> tuple[OsmCi
     It is what a plan to pick way-points from shows.
     """
     place, build = (np.random.default_rng([seed, 2**32 - k]) for k in (1, 2))
-    terrain = rolling(place, scenario.world.relief, scenario.world.unevenness, scenario.world.swell)
+    terrain = _terrain(scenario, place)
     try:
         line = route_in_map(scenario, extract, None).line
         xy = line.position(line.sample(1.0))
@@ -91,6 +94,11 @@ def populate(scenario: Scenario, city: City, path: PosePath, seed: int) -> list[
     return keep_out_of_walls(movers, city, path.duration) if isinstance(city, OsmCity) else movers
 
 
+def _terrain(scenario: Scenario, rng: np.random.Generator) -> Terrain:
+    world = scenario.world
+    return rolling(rng, world.relief, world.unevenness, world.swell, world.slope)
+
+
 def _city(scenario: Scenario, street: Curve, terrain: Terrain, rng: np.random.Generator) -> City:
     world = scenario.world
     if world.kind == "street":
@@ -99,6 +107,8 @@ def _city(scenario: Scenario, street: Curve, terrain: Terrain, rng: np.random.Ge
         return build_motorway(stretched(street, SPARE), terrain, scenario.layout, rng)
     if world.kind == "corridor":
         return build_corridor(stretched(street, CORRIDOR_SPARE), terrain, scenario.layout, rng)
+    if world.kind == "carpark":
+        return build_carpark(street, terrain, scenario.layout, world.roughness, rng)
     return build_town([stretched(street, SPARE)], terrain, scenario.layout, rng, world.spacing, world.levels)
 
 
@@ -144,7 +154,7 @@ def _carried(
     scenario: Scenario, route: Route, terrain: Terrain, distance: float, rng: np.random.Generator
 ) -> paths.VehiclePath | FreePath:
     line, section = route.line, scenario.path
-    profile = paths.SpeedProfile(scenario.speed, scenario.start_speed, lateral=scenario.lateral)
+    profile = speed_profile(scenario)
     if scenario.carrier == "car":
         return paths.drive(line, terrain, profile, distance, scenario.lidar_height, paths.suspension(rng))
     nodes: tuple[Any, Any] = route.climb or (np.array([0.0, line.length]), np.array(section.heights))

@@ -9,13 +9,18 @@ from numpy.typing import NDArray
 
 from lslam.errors import UsageError
 from lslam.simulation.curve import Curve, rounded_rectangle, smooth_curve, winding_line
+from lslam.simulation.path import SpeedProfile, drive, suspension
 from lslam.simulation.scenario_files import Scenario
-from lslam.simulation.shapes import SHAPES
+from lslam.simulation.shapes import SHAPES, out_and_back
+from lslam.simulation.terrain import flat
 from lslam.simulation.waypoints import WayPoints
 
 Floats = NDArray[np.float64]
 
 SPARE = 60.0  # m of street before the start and after the end of an open line
+TURN = 6.0  # m, radius of the U-turn of an out-and-back: a car on full lock
+HOLD = 5.0  # s at full speed on each of its straights, at least
+LONGEST = 3000.0  # m that many scans make of it: the fine ground beside it must fit into memory
 TIGHTEST = {"car": 3.0, "drone": 1.0, "walker": 0.3}  # m, radius of a bend
 
 
@@ -28,13 +33,20 @@ class Route:
     climb: tuple[Floats, Floats] | None = None
 
 
-def own_route(scenario: Scenario, rng: np.random.Generator) -> Route:
-    """The scenario's own street and line, scaled to its length."""
+def speed_profile(scenario: Scenario) -> SpeedProfile:
+    """What limits a car in this scenario."""
+    return SpeedProfile(scenario.speed, scenario.start_speed, lateral=scenario.lateral)
+
+
+def own_route(scenario: Scenario, rng: np.random.Generator, scans: int | None = None) -> Route:
+    """The scenario's own street and line, scaled to its length; an out-and-back is made long enough for `scans` in motion."""
     path = scenario.path
     if path.shape == "block":
         return _block(rng)
     if path.shape == "street":
         return _street(rng)
+    if path.shape == "out-and-back":
+        return _out_and_back(scenario, scans)
     shape, closed = SHAPES[path.shape]
     points = shape(rng)
     climb = path.heights[1] - path.heights[0] if scenario.carrier == "drone" else 0.0
@@ -81,3 +93,23 @@ def _street(rng: np.random.Generator) -> Route:
     s = np.arange(SPARE, street.length - SPARE, 1.0)
     sway = -0.4 + 0.5 * np.sin(2 * np.pi * s / rng.uniform(80, 120) + rng.uniform(0, 2 * np.pi))
     return Route(street, smooth_curve(street.beside(s, sway), closed=False))
+
+
+def _out_and_back(scenario: Scenario, scans: int | None) -> Route:
+    """As long as the scenario says, or as it takes to reach the speed, hold it and brake for the turn, or as `scans` last."""
+    profile, path = speed_profile(scenario), scenario.path
+    slow = min(profile.cruise, float(np.sqrt(profile.lateral * TURN)))
+    speeding = (profile.cruise**2 - profile.start**2) / (2 * profile.acceleration)
+    braking = (profile.cruise**2 - slow**2) / (2 * profile.braking)
+    length = max(path.length or 0.0, 2 * (speeding + HOLD * profile.cruise + braking) + np.pi * TURN)
+    longest = max(LONGEST, length)
+    while True:
+        street = smooth_curve(out_and_back(length, TURN), False, path.smoothing)
+        line = beside(street, -path.lane)
+        still = suspension(np.random.default_rng(0), 0.0, 0.0)
+        takes = drive(line, flat(), profile, line.length, scenario.lidar_height, still).duration
+        # Every further metre is driven at full speed.
+        missing = 0.0 if scans is None else (scans + 1) / scenario.rate_hz - takes
+        if missing <= 1e-3 or length == longest:
+            return Route(street, line)
+        length = min(length + missing * profile.cruise, longest)

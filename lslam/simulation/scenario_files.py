@@ -18,14 +18,16 @@ from lslam.simulation.lidar_models import LIDARS
 from lslam.simulation.shapes import SHAPES
 
 FOLDER = "ready"
-# `block` and `street` draw their lines from the seed; the other shapes are way-points.
-LINES = ("block", "street", *SHAPES)
+# `block` and `street` draw their lines from the seed, `out-and-back` is as long as speed and scans need; the other shapes are
+# way-points.
+LINES = ("block", "street", "out-and-back", *SHAPES)
 
 
 class PathSection(Section):
     """The line that is driven or flown.
 
-    shape : a name of `LINES`, scaled to `length` m when that is given; smoothing : of its corners, m
+    shape : a name of `LINES`, scaled to `length` m when that is given (of an out-and-back the least); smoothing : of
+        its corners, m
     lane : m to the right of the middle of the street
     heights : of a drone's LiDAR at the start and the end, or of a walker's above the ground, m
     bank : share of a coordinated turn's tilt; swing : strength of what shakes a carried LiDAR, 0 for nothing
@@ -45,16 +47,26 @@ class PathSection(Section):
 class WorldSection(Section):
     """The place: its kind, side streets (see `build_town`), the share of rays that pass a pane.
 
-    relief, swell : m up and down over m; unevenness : m of bumps
+    relief, swell : m up and down over m; unevenness : m of bumps; slope : least and greatest fall of the whole ground, m/m
+    roughness : standard deviation of the surface itself, m, of a car park
     """
 
-    kind: Literal["street", "town", "motorway", "corridor"] = "town"
+    kind: Literal["street", "town", "motorway", "corridor", "carpark"] = "town"
     spacing: float = Field(80.0, ge=30, le=1000)
     levels: int = Field(1, ge=0, le=3)
     relief: float = Field(0.35, ge=0, le=20)
     swell: float = Field(100.0, ge=20, le=5000)
     unevenness: float = Field(0.012, ge=0, le=0.5)
+    slope: tuple[float, float] = (0.0, 0.0)
+    roughness: float = Field(0.0, ge=0, le=0.1)
     glass: float = Field(0.0, ge=0, le=1)
+
+    @model_validator(mode="after")
+    def _slope_is_ordered(self) -> WorldSection:
+        low, high = self.slope
+        if not 0 <= low <= high <= 0.2:
+            raise ValueError(f"world.slope = [{low:g}, {high:g}], expected two numbers from 0 to 0.2, in order")
+        return self
 
 
 class TrafficSection(Section):
@@ -73,7 +85,8 @@ class Scenario(Section):
 
     carrier : what carries the LiDAR; speed, start_speed : m/s; lateral : greatest acceleration in bends, m/s2, to which a car
     and a walker slow down and which a drone must not exceed; roof : m behind, ahead, aside and below the LiDAR that the car's
-    own roof takes up, or nothing; overlap : distance beyond one lap of a closed line, m
+    own roof takes up, or nothing; roof_returns : whether the roof is seen, or what it is in the way of is only missing
+    overlap : distance beyond one lap of a closed line, m
     """
 
     name: str
@@ -85,6 +98,7 @@ class Scenario(Section):
     start_speed: float = Field(ge=0, le=40)
     lateral: float = Field(2.5, gt=0, le=30)
     roof: tuple[float, float, float, float] | None = None
+    roof_returns: bool = False
     rate_hz: float = Field(10.0, ge=1, le=100)
     overlap: float = Field(0.0, ge=0, le=1000)
     motion_compensated: bool = False

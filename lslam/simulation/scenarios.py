@@ -84,7 +84,7 @@ class SimulatedDrive:
         self.gnss: GnssStream | None = None if gnss is None else gnss.stream
         self.notes: list[str] = []
         self.problems: list[str] = []
-        self._roof = None if scenario.roof is None else Roof(*scenario.roof)
+        self._roof = None if scenario.roof is None else Roof(*scenario.roof, scenario.roof_returns)
         self.scene = RayScene(city.mesh) if scene is None else scene
 
     def __len__(self) -> int:

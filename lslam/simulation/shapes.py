@@ -73,6 +73,14 @@ def spiral(approach: float, radius: float, turns: float) -> Floats:
     return np.concatenate([straight, circle])
 
 
+def out_and_back(length: float, radius: float) -> Floats:
+    """(N, 2): along +x, round a U-turn to the left of `radius` m, and back beside; `length` m in all, 10 m of it straight."""
+    straight = max(0.5 * (length - np.pi * radius), 5.0)
+    angle = np.linspace(-np.pi / 2, np.pi / 2, max(int(np.pi * radius / STEP), 8) + 1)
+    turn = np.array([straight, radius]) + radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    return np.concatenate([[[0.0, 0.0]], turn, [[0.0, 2 * radius]]])
+
+
 _CLOSED = [(0, 0), (190, 0), (235, 25), (235, 150), (120, 150), (120, 95), (0, 95)]
 _OPEN = [(0, 0), (125, 0), (125, 105), (260, 125), (300, 190)]
 _RESIDENTIAL = [

@@ -34,7 +34,7 @@ def test_list_names_scenarios_and_sensors() -> None:
     listed = simulated("--list")
     assert listed.returncode == 0
     assert [line.split()[1] for line in listed.stdout.splitlines()] == [
-        "block", "climbing", "closed", "corridor", "identical", "large-eight", "motorway", "open", "residential",
+        "block", "carpark", "climbing", "closed", "corridor", "identical", "large-eight", "motorway", "open", "residential",
         "small-eight", "street", "urban", "walk", "sample", "vlp16", "hdl64", "hdl64-kitti", "os1-16", "os1-32", "os1-64",
         "livox", "icm20948", "icm20948-calibrated", "ideal",
     ]  # fmt: skip

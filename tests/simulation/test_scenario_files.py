@@ -83,9 +83,8 @@ def test_residential_is_as_long_as_kitti_07() -> None:
 
 def test_every_scenario_says_what_it_is() -> None:
     names = scenario_names()
-    assert {*FLIGHTS, "block", "street", "residential", "urban", "motorway", "corridor", "identical", "walk"} <= set(
-        names
-    )
+    drives = {"block", "street", "residential", "urban", "motorway", "corridor", "identical", "walk", "carpark"}
+    assert {*FLIGHTS, *drives} <= set(names)
     for name in names:
         scenario = scenario_named(name)
         assert scenario.name == name
@@ -121,6 +120,7 @@ def test_settings_change_one_thing() -> None:
         ("layout.gap=[5, 1]", "layout.gap"),
         ("layout.storeys=[0, 2]", "layout.storeys"),
         ("world.glass=nan", "world.glass"),
+        ("world.slope=[0.02, 0.01]", "world.slope"),
     ],
 )
 def test_wrong_settings_are_named(setting: str, sentence: str) -> None:
