@@ -12,9 +12,11 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.kernels.facts import INFORMATION, INLIERS, LEVER, MATCHED, ROBUST, SQUARED
 from lslam.kernels.feature_grid import nearest
 from lslam.kernels.gaussians import find
 from lslam.kernels.jit import inline, kernel
+from lslam.kernels.linearisation import Pose, Sums, Width
 from lslam.kernels.lines import add_line
 from lslam.kernels.residuals import add_row
 from lslam.kernels.surface_information import add_surface
@@ -24,6 +26,11 @@ Floats = NDArray[np.float64]
 Longs = NDArray[np.int64]
 Ints = NDArray[np.int32]
 Rings = NDArray[np.uint16]
+# A grid, see `feature_grid`; one with the normal of the surface around each point; and cells of it, m, how far a
+# counterpart may lie, m, the variance of a point, m2, and whether several counterparts make a line or a plane.
+Grid = tuple[Floats, Rings, Ints, Longs, Ints]
+SurfaceGrid = tuple[Floats, Rings, Ints, Longs, Ints, Floats]
+Reach = tuple[float, float, float, bool]
 
 # Two rings up or down, as in LOAM. (Rings are unsigned: int() of them stays so, and a difference would wrap.)
 NEARBY_RINGS = 2
@@ -45,13 +52,13 @@ def _add_point(H: Floats, g: Floats, facts: Floats, ex: float, ey: float, ez: fl
     add_row(H, g, w, ex, 1.0, 0.0, 0.0, 0.0, rz, -ry)
     add_row(H, g, w, ey, 0.0, 1.0, 0.0, -rz, 0.0, rx)
     add_row(H, g, w, ez, 0.0, 0.0, 1.0, ry, -rx, 0.0)
-    facts[0] += 3.0 * w
-    facts[1] += robust * d2
-    facts[3] += 1.0
-    facts[4] += 3.0 * w * (rx * rx + ry * ry + rz * rz)
-    facts[5] += robust
+    facts[INFORMATION] += 3.0 * w
+    facts[SQUARED] += robust * d2
+    facts[MATCHED] += 1.0
+    facts[LEVER] += 3.0 * w * (rx * rx + ry * ry + rz * rz)
+    facts[ROBUST] += robust
     if d2 < c2:
-        facts[2] += 1.0
+        facts[INLIERS] += 1.0
 
 
 @inline
@@ -62,21 +69,27 @@ def _add_plane(H: Floats, g: Floats, facts: Floats, e: float, nx: float, ny: flo
     robust *= robust
     w = robust / variance
     add_row(H, g, w, e, nx, ny, nz, ry * nz - rz * ny, rz * nx - rx * nz, rx * ny - ry * nx)
-    facts[0] += w
-    facts[1] += robust * e * e
-    facts[3] += 1.0
-    facts[4] += w * (rx * rx + ry * ry + rz * rz)
-    facts[5] += robust
+    facts[INFORMATION] += w
+    facts[SQUARED] += robust * e * e
+    facts[MATCHED] += 1.0
+    facts[LEVER] += w * (rx * rx + ry * ry + rz * rz)
+    facts[ROBUST] += robust
     if abs(e) < math.sqrt(c2):
-        facts[2] += 1.0
+        facts[INLIERS] += 1.0
     return w
 
 
 @kernel
-def linearise_edges(source: Floats, R: Floats, t: Floats, size: float, limit: float, scale: float, variance: float,
-                    with_lines: bool, points: Floats, rings: Rings, starts: Ints, keys: Longs, table: Ints, H: Floats,
-                    g: Floats, facts: Floats) -> None:  # fmt: skip
-    """Add to the upper triangle of H (6, 6), to g (6,) and facts (6,) all edges (S, 3), LiDAR frame; points in `limit`."""
+def linearise_edges(points: tuple[Floats], grid: Grid, settings: Reach, search: tuple[()], pose: Pose, width: Width,
+                    sums: Sums) -> None:  # fmt: skip
+    """Add all edges (S, 3), LiDAR frame, to H, S, g and facts, see `linearisation`: lines are what they are."""
+    (source,) = points
+    edges, rings, starts, keys, table = grid
+    size, limit, variance, with_lines = settings
+    R, t = pose
+    scale, _, _ = width
+    H, S, g, facts = sums
+    E = np.zeros((6, 6))
     c2 = scale * scale
     for i in range(len(source)):
         a, b, c = source[i, 0], source[i, 1], source[i, 2]
@@ -84,18 +97,18 @@ def linearise_edges(source: Floats, R: Floats, t: Floats, size: float, limit: fl
         ry = R[1, 0] * a + R[1, 1] * b + R[1, 2] * c
         rz = R[2, 0] * a + R[2, 1] * b + R[2, 2] * c
         x, y, z = rx + t[0], ry + t[1], rz + t[2]
-        j, _ = nearest(x, y, z, size, limit, 0, -1, -1, points, rings, starts, keys, table)
+        j, _ = nearest(x, y, z, size, limit, 0, -1, -1, edges, rings, starts, keys, table)
         if j < 0:
             continue
-        p = points[j]
+        p = edges[j]
         ex, ey, ez = x - p[0], y - p[1], z - p[2]
         if not with_lines:
-            _add_point(H, g, facts, ex, ey, ez, rx, ry, rz, variance, c2)
+            _add_point(E, g, facts, ex, ey, ez, rx, ry, rz, variance, c2)
             continue
-        k, _ = nearest(x, y, z, size, limit, np.int64(rings[j]), NEARBY_RINGS, -1, points, rings, starts, keys, table)
+        k, _ = nearest(x, y, z, size, limit, np.int64(rings[j]), NEARBY_RINGS, -1, edges, rings, starts, keys, table)
         if k < 0:
             continue
-        ux, uy, uz = points[k, 0] - p[0], points[k, 1] - p[1], points[k, 2] - p[2]
+        ux, uy, uz = edges[k, 0] - p[0], edges[k, 1] - p[1], edges[k, 2] - p[2]
         length = math.sqrt(ux * ux + uy * uy + uz * uz)
         if length < SHORTEST:
             continue
@@ -104,7 +117,11 @@ def linearise_edges(source: Floats, R: Floats, t: Floats, size: float, limit: fl
         # What the two points' noise makes of the line beside, between or beyond them.
         share = (ex * ux + ey * uy + ez * uz) * s
         spread = variance * (1.0 + share * share + (1.0 - share) * (1.0 - share))
-        add_line(H, g, facts, ex, ey, ez, ux, uy, uz, rx, ry, rz, spread, c2)
+        add_line(E, g, facts, ex, ey, ez, ux, uy, uz, rx, ry, rz, spread, c2)
+    for i in range(6):
+        for j in range(i, 6):
+            H[i, j] += E[i, j]
+            S[i, j] += E[i, j]
 
 
 @kernel
@@ -126,17 +143,21 @@ def add_normals(points: Floats, size: float, thick: float, waver: float, rows: F
 
 
 @kernel
-def linearise_planes(source: Floats, R: Floats, t: Floats, size: float, limit: float, scale: float, variance: float,
-                     with_planes: bool, points: Floats, rings: Rings, starts: Ints, keys: Longs, table: Ints, H: Floats,
-                     g: Floats, facts: Floats, normals: Floats,
-                     S: Floats) -> None:  # fmt: skip
-    """As `linearise_edges`, of planar points.
+def linearise_planes(points: tuple[Floats], grid: SurfaceGrid, settings: Reach, search: tuple[()], pose: Pose,
+                     width: Width, sums: Sums) -> None:  # fmt: skip
+    """As `linearise_edges`, of planar points; S takes those planes that are sure of themselves.
 
     normals : (N, 3) of the surface around each point of the grid, zero where it is not known. Three points a few
         decimetres apart make a normal that wavers by ten degrees and more, and a sum of wavering normals seems to observe
         every direction, that along a corridor too. So the distance is that to the plane through the three points, but it
         moves the pose along the surface's normal: an instrumental variable, whose error has nothing to do with theirs.
     """
+    (source,) = points
+    surface, rings, starts, keys, table, normals = grid
+    size, limit, variance, with_planes = settings
+    R, t = pose
+    scale, _, _ = width
+    H, S, g, facts = sums
     c2 = scale * scale
     unused = np.zeros(6)
     for i in range(len(source)):
@@ -145,23 +166,23 @@ def linearise_planes(source: Floats, R: Floats, t: Floats, size: float, limit: f
         ry = R[1, 0] * a + R[1, 1] * b + R[1, 2] * c
         rz = R[2, 0] * a + R[2, 1] * b + R[2, 2] * c
         x, y, z = rx + t[0], ry + t[1], rz + t[2]
-        j, _ = nearest(x, y, z, size, limit, 0, -1, -1, points, rings, starts, keys, table)
+        j, _ = nearest(x, y, z, size, limit, 0, -1, -1, surface, rings, starts, keys, table)
         if j < 0:
             continue
-        p = points[j]
+        p = surface[j]
         ex, ey, ez = x - p[0], y - p[1], z - p[2]
         if not with_planes:
             _add_point(H, g, facts, ex, ey, ez, rx, ry, rz, variance, c2)
             continue
         ring = np.int64(rings[j])
-        k, _ = nearest(x, y, z, size, limit, ring, 0, j, points, rings, starts, keys, table)
+        k, _ = nearest(x, y, z, size, limit, ring, 0, j, surface, rings, starts, keys, table)
         if k < 0:
             continue
-        m, _ = nearest(x, y, z, size, limit, ring, NEARBY_RINGS, -1, points, rings, starts, keys, table)
+        m, _ = nearest(x, y, z, size, limit, ring, NEARBY_RINGS, -1, surface, rings, starts, keys, table)
         if m < 0:
             continue
-        ax, ay, az = points[k, 0] - p[0], points[k, 1] - p[1], points[k, 2] - p[2]
-        bx, by, bz = points[m, 0] - p[0], points[m, 1] - p[1], points[m, 2] - p[2]
+        ax, ay, az = surface[k, 0] - p[0], surface[k, 1] - p[1], surface[k, 2] - p[2]
+        bx, by, bz = surface[m, 0] - p[0], surface[m, 1] - p[1], surface[m, 2] - p[2]
         nx, ny, nz = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
         area = math.sqrt(nx * nx + ny * ny + nz * nz)
         aa, bb = ax * ax + ay * ay + az * az, bx * bx + by * by + bz * bz

@@ -1,4 +1,4 @@
-"""Registration of one scan in one call that holds no GIL: annealed Gauss-Newton with a guard on unobserved directions."""
+"""One Gauss-Newton step from normal equations, with a guard on unobserved directions; and the bound that trims matches."""
 
 from __future__ import annotations
 
@@ -7,15 +7,14 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.kernels.facts import INFORMATION, LEVER, MATCHED, POPULATION
 from lslam.kernels.jit import inline, kernel
 from lslam.kernels.linalg import eigen, rotate_left
-from lslam.kernels.residuals import linearise, step_norms
+from lslam.kernels.linearisation import Pose, Sums
+from lslam.kernels.surface_information import solve_on_surfaces
 
 Floats = NDArray[np.float64]
-Longs = NDArray[np.int64]
-Ints = NDArray[np.int32]
-Flags = NDArray[np.bool_]
-
+Limits = tuple[float, float, float, bool]
 
 # A weak direction is followed, though not believed, until it holds less than this part of what makes it weak: normals that
 # waver by a degree look like 3e-4 of the information.
@@ -31,7 +30,7 @@ def solve_observed(H: Floats, g: Floats, facts: Floats, weak_share: float, least
     it holds less than `weak_share` of the total information or less than `least`, 1/m2, and not followed below `unseen`
     times that.
     """
-    lever = math.sqrt(max(facts[4] / max(facts[0], 1e-300), 1e-6))
+    lever = math.sqrt(max(facts[LEVER] / max(facts[INFORMATION], 1e-300), 1e-6))
     A = np.empty((6, 6))
     for i in range(6):
         for j in range(6):
@@ -39,7 +38,7 @@ def solve_observed(H: Floats, g: Floats, facts: Floats, weak_share: float, least
     values, vectors = eigen(A)
     d[:] = 0.0
     count = 0
-    needed = max(weak_share * facts[0], least)
+    needed = max(weak_share * facts[INFORMATION], least)
     for k in range(6):
         if values[k] <= needed or values[k] <= 0.0:
             for i in range(6):
@@ -64,6 +63,15 @@ def mirror(H: Floats) -> None:
 
 
 @inline
+def step_norms(d: Floats) -> tuple[float, float]:
+    """Translation, m, and rotation, rad, of an update (6,)."""
+    return (
+        math.sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2]),
+        math.sqrt(d[3] * d[3] + d[4] * d[4] + d[5] * d[5]),
+    )
+
+
+@inline
 def move_by(d: Floats, move: float, turn: float, scale: float, R: Floats, t: Floats) -> bool:
     """Move R and t by the step d, whose translation and rotation are given; False when it is not finite."""
     if not (np.isfinite(move) and np.isfinite(turn)):
@@ -81,21 +89,59 @@ def move_by(d: Floats, move: float, turn: float, scale: float, R: Floats, t: Flo
 
 
 @inline
-def advance(H: Floats, g: Floats, facts: Floats, scale: float, weak_share: float, R: Floats, t: Floats, d: Floats,
-            weak: Floats, weak_count: int) -> tuple[bool, int, float, float]:  # fmt: skip
-    """Move R and t by one guarded step: whether there was one, the unobserved directions, its translation and rotation.
-
-    H comes with its upper triangle and leaves whole.
-    """
-    mirror(H)
-    if facts[3] < 6.0:
-        return False, weak_count, 0.0, 0.0
-    weak_count = solve_observed(H, g, facts, weak_share, 0.0, UNSEEN, d, weak)
-    move, turn = step_norms(d)
-    return move_by(d, move, turn, scale, R, t), weak_count, move, turn
+def scale_by_population(H: Floats, S: Floats, g: Floats, facts: Floats) -> None:
+    """What weighs points against each other, divided by its mean: the information stays that of the points."""
+    w = facts[MATCHED] / max(facts[POPULATION], 1e-300)
+    for i in range(6):
+        g[i] *= w
+        for j in range(6):
+            H[i, j] *= w
+            S[i, j] *= w
+    facts[INFORMATION] *= w
+    facts[LEVER] *= w
 
 
 @inline
+def within(allowed: Floats, H: Floats) -> Floats:
+    """H (6, 6) as seen by the directions on which `allowed` (6, 6) projects; where it has no rows, all are."""
+    if len(allowed) == 0:
+        return H
+    A = np.zeros((6, 6))
+    for i in range(6):
+        for k in range(6):
+            for m in range(6):
+                for j in range(6):
+                    A[i, j] += allowed[i, k] * H[k, m] * allowed[m, j]
+    return A
+
+
+@kernel
+def step(pose: Pose, sums: Sums, scale: float, limits: Limits, allowed: Floats, d: Floats,
+         weak: Floats) -> tuple[bool, int, float, float]:  # fmt: skip
+    """Move the pose by one guarded step, left in d (6,): whether it could, how many directions are unobserved, which are
+    rows of `weak` (6, 6), and the translation, m, and rotation, rad, of the step.
+
+    limits : `weak_share`, `least` and `unseen` of `solve_observed`, and whether S tells what is observed
+    allowed : projector on the directions that may be stepped in; no rows: on all
+    H and S come with their upper triangles and leave whole.
+    """
+    R, t = pose
+    H, S, g, facts = sums
+    weak_share, least, unseen, by_surfaces = limits
+    if facts[POPULATION] > 0.0:
+        scale_by_population(H, S, g, facts)
+    mirror(H)
+    # What the projector takes away has no eigenvalue left, so that the step never looks along it in g.
+    if by_surfaces:
+        mirror(S)
+        count = solve_on_surfaces(within(allowed, H), within(allowed, S), g, facts, weak_share, least, d, weak)
+    else:
+        count = solve_observed(within(allowed, H), g, facts, weak_share, least, unseen, d, weak)
+    move, turn = step_norms(d)
+    return move_by(d, move, turn, scale, R, t), count, move, turn
+
+
+@kernel
 def trimmed(away2: Floats, share: float, gate2: float) -> float:
     """Squared distance up to which the nearest `share` of the matched points lie, `gate2` at most.
 
@@ -121,63 +167,3 @@ def trimmed(away2: Floats, share: float, gate2: float) -> float:
         else:
             low = middle
     return high
-
-
-@inline
-def workspace(n: int) -> tuple[Longs, Ints, Flags, Floats]:
-    """Octant cells and slots of n points, who is matched, and squared distances."""
-    return np.full(n, -1, np.int64), np.full((n, 8), -1, np.int32), np.zeros(n, np.bool_), np.empty(n)
-
-
-@inline
-def clear(H: Floats, g: Floats, facts: Floats, is_done: Flags, away2: Floats) -> None:
-    """Before a linearisation: sums are zero, nothing is matched."""
-    H[:] = 0.0
-    g[:] = 0.0
-    facts[:] = 0.0
-    is_done[:] = False
-    away2[:] = -1.0
-
-
-@kernel
-def align(source: Floats, scatter: Floats, R: Floats, t: Floats, scale_start: float, scale_end: float, decay: float,
-          max_iterations: int, step_m: float, step_rad: float, inlier_distance: float, inlier_ratio: float,
-          sigma2: float, blob_weight: float, weak_share: float, size: float, planes: Floats, keys: Longs, table: Ints,
-          has_coarse: bool, coarse_size: float, coarse_planes: Floats, coarse_keys: Longs,
-          coarse_table: Ints) -> tuple[Floats, Floats, Floats, int, bool, int, Floats]:  # fmt: skip
-    """Register source points on a map, point to plane: R (3, 3) and t (3,) are updated in place.
-
-    With a coarse map, points that find no plane in the fine one are matched there; blobs serve the last map only.
-
-    Correspondences beyond `inlier_distance`, m, are rejected, and from the second step on those beyond the distance
-    within which the nearest `inlier_ratio` of the last step's lay. The robust width falls from `scale_start` by `decay`
-    to `scale_end`; iterations stop when, at the end width, the update is under `step_m` and `step_rad`. Returns H (6, 6)
-    and facts (7,) of the last linearisation, the seventh being the inliers in the fine map, the last update (6,),
-    iterations, whether they converged, the number of unobserved directions and these (6, 6).
-    """
-    cells, slots, is_done, away2 = workspace(len(source))
-    coarse_cells, coarse_slots, _, _ = workspace(len(source) if has_coarse else 0)
-    H, g, d, facts, weak = np.empty((6, 6)), np.empty(6), np.zeros(6), np.zeros(7), np.zeros((6, 6))
-    farthest2 = inlier_distance * inlier_distance
-    gate2, scale = farthest2, scale_start
-    converged = False
-    weak_count = 0
-    iterations = 0
-    for _ in range(max_iterations):
-        clear(H, g, facts, is_done, away2)
-        linearise(source, scatter, R, t, size, scale, sigma2, 0.0 if has_coarse else blob_weight, gate2, planes, keys,
-                  table, cells, slots, is_done, away2, H, g, facts)  # fmt: skip
-        facts[6] = facts[2]
-        if has_coarse:
-            linearise(source, scatter, R, t, coarse_size, scale, sigma2, blob_weight, gate2, coarse_planes, coarse_keys,
-                      coarse_table, coarse_cells, coarse_slots, is_done, away2, H, g, facts)  # fmt: skip
-        iterations += 1
-        moved, weak_count, move, turn = advance(H, g, facts, scale, weak_share, R, t, d, weak, weak_count)
-        if not moved:
-            break
-        if scale <= scale_end and move < step_m and turn < step_rad:
-            converged = True
-            break
-        scale = max(scale * decay, scale_end)
-        gate2 = trimmed(away2, inlier_ratio, farthest2)
-    return H, facts, d, iterations, converged, weak_count, weak

@@ -13,14 +13,18 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.kernels.facts import INFORMATION, INLIERS, LEVER, MATCHED, ROBUST, SQUARED
 from lslam.kernels.jit import inline, kernel
 from lslam.kernels.linalg import plane_of
+from lslam.kernels.linearisation import Pose, Sums, Width
 from lslam.kernels.residuals import add_row, octant_slots
 from lslam.kernels.voxel import MASK, OFFSET
 
 Floats = NDArray[np.float64]
 Longs = NDArray[np.int64]
 Ints = NDArray[np.int32]
+# Moments, keys and table of a voxel pool, see `gaussians`; rows of lines, and the keys and sums they were computed at.
+LineVoxels = tuple[Floats, Longs, Ints, Floats, Longs, Floats]
 
 NO_LINE = -1.0
 # LOAM's rule: a line when the largest eigenvalue is three times the second one.
@@ -68,7 +72,7 @@ def add_line(H: Floats, g: Floats, facts: Floats, ex: float, ey: float, ez: floa
     """Point to line, equation 2.24 of the thesis, squared: (I - u u^T) e has two components across the unit direction u.
 
     `e` goes from a point of the line to the transformed point, `r` is that point seen from the sensor, world axes.
-    Geman-McClure weight of squared width `c2`; upper triangle of H, facts as in `residuals.linearise`.
+    Geman-McClure weight of squared width `c2`; upper triangle of H.
     """
     along = ex * ux + ey * uy + ez * uz
     ex, ey, ez = ex - along * ux, ey - along * uy, ez - along * uz
@@ -89,24 +93,31 @@ def add_line(H: Floats, g: Floats, facts: Floats, ex: float, ey: float, ez: floa
     qx, qy, qz = uy * pz - uz * py, uz * px - ux * pz, ux * py - uy * px
     add_row(H, g, w, ex * px + ey * py + ez * pz, px, py, pz, ry * pz - rz * py, rz * px - rx * pz, rx * py - ry * px)
     add_row(H, g, w, ex * qx + ey * qy + ez * qz, qx, qy, qz, ry * qz - rz * qy, rz * qx - rx * qz, rx * qy - ry * qx)
-    facts[0] += 2.0 * w
-    facts[1] += robust * d2
-    facts[3] += 1.0
-    facts[4] += 2.0 * w * (rx * rx + ry * ry + rz * rz)
-    facts[5] += robust
+    facts[INFORMATION] += 2.0 * w
+    facts[SQUARED] += robust * d2
+    facts[MATCHED] += 1.0
+    facts[LEVER] += 2.0 * w * (rx * rx + ry * ry + rz * rz)
+    facts[ROBUST] += robust
     if d2 < c2:
-        facts[2] += 1.0
+        facts[INLIERS] += 1.0
 
 
 @kernel
-def linearise_lines(source: Floats, R: Floats, t: Floats, size: float, scale: float, sigma2: float, min_points: float,
-                    floor: float, moments: Floats, keys: Longs, table: Ints, lines: Floats, line_keys: Longs,
-                    line_sums: Floats, cells: Longs, slots: Ints, H: Floats, g: Floats, facts: Floats) -> None:  # fmt: skip
-    """Add to the upper triangle of H (6, 6), to g (6,) and facts (6,) all edge points (S, 3), LiDAR frame.
+def linearise_lines(points: tuple[Floats], voxels: LineVoxels, settings: tuple[float, float, float, float],
+                    search: tuple[Longs, Ints], pose: Pose, width: Width, sums: Sums) -> None:  # fmt: skip
+    """Add all edge points (S, 3), LiDAR frame, to H, g and facts, see `linearisation`.
 
     Each takes the line voxel, of the eight around it, whose line passes nearest: residual across the line, variance =
     that of the voxel across its line + sigma2 + tilt at that distance along it, Geman-McClure weight of width `scale`.
+    settings : voxel size, m; variance of a point, m2; points and floor of a line's variance, m2, see `line_of`
     """
+    (source,) = points
+    moments, keys, table, lines, line_keys, line_sums = voxels
+    size, sigma2, min_points, floor = settings
+    cells, slots = search
+    R, t = pose
+    scale, _, _ = width
+    H, _, g, facts = sums
     inverse = 1.0 / size
     c2 = scale * scale
     for i in range(len(source)):

@@ -7,17 +7,17 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.kernels.gauss_newton import clear, trimmed, workspace
+from lslam.kernels.facts import INFORMATION, INLIERS, LEVER, MATCHED, ROBUST, SQUARED
 from lslam.kernels.gaussians import FREE
 from lslam.kernels.jit import inline, kernel
 from lslam.kernels.linalg import invert_symmetric, plane_of
-from lslam.kernels.residuals import add_information, octant_slots
-from lslam.kernels.surface_information import add_surface, advance_on_surfaces
+from lslam.kernels.linearisation import Pose, Search, Settings, Sums, Width
+from lslam.kernels.residuals import Voxels, add_information, octant_slots
+from lslam.kernels.surface_information import add_surface
 
 Floats = NDArray[np.float64]
 Longs = NDArray[np.int64]
 Ints = NDArray[np.int32]
-Flags = NDArray[np.bool_]
 
 # Eigenvalues below this share of the largest are raised to it (Magnusson, section 6.2.1).
 SMALLEST_SHARE = 0.01
@@ -72,18 +72,26 @@ def describe(moments: Floats, planes: Floats, keys: Longs, refreshed: Floats, us
 
 
 @kernel
-def linearise_ndt(source: Floats, R: Floats, t: Floats, size: float, scale: float, widening: float, gate2: float,
-                  shapes: Floats, keys: Longs, table: Ints, cells: Longs, slots: Ints, is_done: Flags, away2: Floats,
-                  H: Floats, S: Floats, g: Floats, facts: Floats) -> None:  # fmt: skip
-    """Add to H (6, 6), S (6, 6), g (6,) and facts all source points (S, 3), LiDAR frame, that are not done.
+def linearise_ndt(points: tuple[Floats], voxels: Voxels, settings: Settings, search: Search, pose: Pose, width: Width,
+                  sums: Sums) -> None:  # fmt: skip
+    """Add all source points (S, 3), LiDAR frame, that are not done, to the sums, see `linearisation`.
 
     The cost is the negative score: -d1 u exp(-d2 / (2 u) e^T C^-1 e) over the eight voxels around R s + t, where u =
-    `widening` is 1 but while annealing. g is its gradient. H is the Gauss-Newton Hessian, J^T C^-1 J times the weight d1
-    d2 exp(..) of the gradient: Newton's, which Magnusson steps with, also has the curvature of that weight and of the
-    rotation, is indefinite away from the optimum, and then has to be mended. `away2` and `facts` as in
-    `residuals.linearise`; the distance is e^T C^-1 e times the smallest eigenvalue of C, of the nearest voxel. S is the
-    information along the thinnest axis of each voxel alone.
+    `widening` is 1 but while annealing, when the Gaussians are as much wider as the kernel is. g is its gradient. H is the
+    Gauss-Newton Hessian, J^T C^-1 J times the weight d1 d2 exp(..) of the gradient: Newton's, which Magnusson steps with,
+    also has the curvature of that weight and of the rotation, is indefinite away from the optimum, and then has to be
+    mended. The score brings its own robustness: neither the variance of a point nor blobs matter to it. Distances are e^T
+    C^-1 e times the smallest eigenvalue of C, of the nearest voxel. S is the information along the thinnest axis of each
+    voxel alone.
     """
+    (source,) = points
+    shapes, keys, table = voxels
+    size, _, _, _ = settings
+    cells, slots, is_done, away2 = search
+    R, t = pose
+    scale, scale_end, gate2 = width
+    widening = (scale / scale_end) ** 2
+    H, S, g, facts = sums
     inverse = 1.0 / size
     unused = np.zeros(6)
     c2 = scale * scale
@@ -120,59 +128,13 @@ def linearise_ndt(source: Floats, R: Floats, t: Floats, size: float, scale: floa
             add_information(H, g, w, q[3], q[4], q[5], q[6], q[7], q[8], ex, ey, ez, rx, ry, rz)
             trace = w * (q[3] + q[6] + q[8])
             add_surface(S, unused, w / q[9], q[11], q[12], q[13], rx, ry, rz)
-            facts[0] += trace
-            facts[4] += trace * (rx * rx + ry * ry + rz * rz)
+            facts[INFORMATION] += trace
+            facts[LEVER] += trace * (rx * rx + ry * ry + rz * rz)
         if best < 1e300:
             is_done[i] = True
             away2[i] = best
-            facts[3] += 1.0
-            facts[1] += best_score * best
-            facts[5] += best_score
+            facts[MATCHED] += 1.0
+            facts[SQUARED] += best_score * best
+            facts[ROBUST] += best_score
             if best < c2:
-                facts[2] += 1.0
-
-
-@kernel
-def align_ndt(
-    source: Floats, scatter: Floats, R: Floats, t: Floats, scale_start: float, scale_end: float, decay: float,
-    max_iterations: int, step_m: float, step_rad: float, inlier_distance: float, inlier_ratio: float, sigma2: float,
-    blob_weight: float, weak_share: float, size: float, shapes: Floats, keys: Longs, table: Ints,
-    has_coarse: bool, coarse_size: float, coarse_shapes: Floats, coarse_keys: Longs,
-    coarse_table: Ints,
-) -> tuple[Floats, Floats, Floats, int, bool, int, Floats]:  # fmt: skip
-    """As `gauss_newton.align`, by the NDT score over `shapes` (C, 14), see `describe`.
-
-    While annealing the Gaussians are (scale / scale_end) times as wide; at the end they are themselves. The score brings
-    its own robustness: sigma2, scatter and blobs do not matter to it.
-    """
-    cells, slots, is_done, away2 = workspace(len(source))
-    coarse_cells, coarse_slots, _, _ = workspace(len(source) if has_coarse else 0)
-    H, g, d, facts, weak = np.empty((6, 6)), np.empty(6), np.zeros(6), np.zeros(7), np.zeros((6, 6))
-    S = np.empty((6, 6))
-    farthest2 = inlier_distance * inlier_distance
-    gate2, scale = farthest2, scale_start
-    converged = False
-    weak_count = 0
-    iterations = 0
-    for _ in range(max_iterations):
-        clear(H, g, facts, is_done, away2)
-        S[:] = 0.0
-        widening = (scale / scale_end) ** 2
-        linearise_ndt(source, R, t, size, scale, widening, gate2, shapes, keys, table, cells, slots, is_done, away2, H, S, g,
-                      facts)  # fmt: skip
-        facts[6] = facts[2]
-        if has_coarse:
-            linearise_ndt(source, R, t, coarse_size, scale, widening, gate2, coarse_shapes, coarse_keys, coarse_table,
-                          coarse_cells, coarse_slots, is_done, away2, H, S, g, facts)  # fmt: skip
-        iterations += 1
-        moved, weak_count, move, turn = advance_on_surfaces(
-            H, S, g, facts, scale, weak_share, R, t, d, weak, weak_count
-        )
-        if not moved:
-            break
-        if scale <= scale_end and move < step_m and turn < step_rad:
-            converged = True
-            break
-        scale = max(scale * decay, scale_end)
-        gate2 = trimmed(away2, inlier_ratio, farthest2)
-    return H, facts, d, iterations, converged, weak_count, weak
+                facts[INLIERS] += 1.0

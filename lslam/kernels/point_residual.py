@@ -5,29 +5,33 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.kernels.gauss_newton import advance, clear, trimmed, workspace
+from lslam.kernels.facts import INFORMATION, INLIERS, LEVER, MATCHED, ROBUST, SQUARED
 from lslam.kernels.gaussians import BLOB
 from lslam.kernels.jit import kernel
-from lslam.kernels.residuals import add_information, octant_slots
+from lslam.kernels.linearisation import Pose, Search, Settings, Sums, Width
+from lslam.kernels.residuals import Voxels, add_information, octant_slots
 
 Floats = NDArray[np.float64]
-Longs = NDArray[np.int64]
-Ints = NDArray[np.int32]
-Flags = NDArray[np.bool_]
 
 
 @kernel
-def linearise_point(source: Floats, gaps: Floats, R: Floats, t: Floats, size: float, scale: float, sigma2: float, gate2: float,
-                    planes: Floats, keys: Longs, table: Ints, cells: Longs, slots: Ints, is_done: Flags, away2: Floats,
-                    H: Floats, g: Floats, facts: Floats) -> None:  # fmt: skip
-    """Add to H (6, 6), g (6,) and facts all source points (S, 3), LiDAR frame, that are not done.
+def linearise_point(points: tuple[Floats, Floats], voxels: Voxels, settings: Settings, search: Search, pose: Pose,
+                    width: Width, sums: Sums) -> None:  # fmt: skip
+    """Add all source points (S, 3), LiDAR frame, that are not done, to H, g and facts, see `linearisation`.
 
     Residual e = R s + t - mean of the nearest of eight voxels, planes or not; variance sigma2 plus that of a place in a
     voxel, size2 / 12; Geman-McClure weight of width sqrt(scale2 + size2): where in its voxel a point lies is no outlier.
     Where the next ring lies farther off than a voxel, gaps (S,), a mean of few points is one ring's, and would hold those
-    that follow to where this one lies: such a match is left to a coarser map.
-    `away2` and `facts` as in `residuals.linearise`, distances being those to the mean.
+    that follow to where this one lies: such a match is left to a coarser map, the coarsest of which takes all. Distances
+    are those to the mean.
     """
+    source, gaps = points
+    planes, keys, table = voxels
+    size, sigma2, _, takes_all = settings
+    cells, slots, is_done, away2 = search
+    R, t = pose
+    scale, _, gate2 = width
+    H, _, g, facts = sums
     inverse = 1.0 / size
     c2 = scale * scale + size * size
     information = 1.0 / (sigma2 + size * size / 12.0)
@@ -50,13 +54,13 @@ def linearise_point(source: Floats, gaps: Floats, R: Floats, t: Floats, size: fl
             d = (x - p[0]) ** 2 + (y - p[1]) ** 2 + (z - p[2]) ** 2
             if d < best_d:
                 best_d, best = d, s
-        if best < 0 or (gaps[i] > size and planes[best, 7] < BLOB):
+        if best < 0 or (gaps[i] > size and planes[best, 7] < BLOB and not takes_all):
             continue
         is_done[i] = True
         away2[i] = best_d
-        facts[3] += 1.0
+        facts[MATCHED] += 1.0
         if best_d < c2:
-            facts[2] += 1.0
+            facts[INLIERS] += 1.0
         if best_d > gate2:
             continue
         p = planes[best]
@@ -64,45 +68,7 @@ def linearise_point(source: Floats, gaps: Floats, R: Floats, t: Floats, size: fl
         robust *= robust
         w = robust * information
         add_information(H, g, w, 1.0, 0.0, 0.0, 1.0, 0.0, 1.0, x - p[0], y - p[1], z - p[2], rx, ry, rz)
-        facts[0] += 3.0 * w
-        facts[1] += robust * best_d
-        facts[4] += 3.0 * w * (rx * rx + ry * ry + rz * rz)
-        facts[5] += robust
-
-
-@kernel
-def align_point(
-    source: Floats, gaps: Floats, R: Floats, t: Floats, scale_start: float, scale_end: float, decay: float,
-    max_iterations: int, step_m: float, step_rad: float, inlier_distance: float, inlier_ratio: float, sigma2: float,
-    blob_weight: float, weak_share: float, size: float, planes: Floats, keys: Longs, table: Ints,
-    has_coarse: bool, coarse_size: float, coarse_planes: Floats, coarse_keys: Longs,
-    coarse_table: Ints,
-) -> tuple[Floats, Floats, Floats, int, bool, int, Floats]:  # fmt: skip
-    """As `gauss_newton.align`, point to point: gaps (S,), m, stand for the scatter, and blobs do not matter to it."""
-    cells, slots, is_done, away2 = workspace(len(source))
-    coarse_cells, coarse_slots, _, _ = workspace(len(source) if has_coarse else 0)
-    everywhere = np.zeros(len(source))
-    H, g, d, facts, weak = np.empty((6, 6)), np.empty(6), np.zeros(6), np.zeros(7), np.zeros((6, 6))
-    farthest2 = inlier_distance * inlier_distance
-    gate2, scale = farthest2, scale_start
-    converged = False
-    weak_count = 0
-    iterations = 0
-    for _ in range(max_iterations):
-        clear(H, g, facts, is_done, away2)
-        linearise_point(source, gaps, R, t, size, scale, sigma2, gate2, planes, keys, table, cells, slots, is_done, away2, H, g,
-                        facts)  # fmt: skip
-        facts[6] = facts[2]
-        if has_coarse:
-            linearise_point(source, everywhere, R, t, coarse_size, scale, sigma2, gate2, coarse_planes, coarse_keys, coarse_table,
-                            coarse_cells, coarse_slots, is_done, away2, H, g, facts)  # fmt: skip
-        iterations += 1
-        moved, weak_count, move, turn = advance(H, g, facts, scale, weak_share, R, t, d, weak, weak_count)
-        if not moved:
-            break
-        if scale <= scale_end and move < step_m and turn < step_rad:
-            converged = True
-            break
-        scale = max(scale * decay, scale_end)
-        gate2 = trimmed(away2, inlier_ratio, farthest2)
-    return H, facts, d, iterations, converged, weak_count, weak
+        facts[INFORMATION] += 3.0 * w
+        facts[SQUARED] += robust * best_d
+        facts[LEVER] += 3.0 * w * (rx * rx + ry * ry + rz * rz)
+        facts[ROBUST] += robust

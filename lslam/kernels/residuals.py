@@ -1,20 +1,19 @@
-"""Normal equations of scan points against Gaussian voxels.
-
-Pose update: t <- t + d[:3], R <- exp(d[3:]) R, so a residual n . (R s + t - m) has the Jacobian [n, (R s) x n].
-"""
+"""Normal equations of scan points against Gaussian voxels, point to plane; and what the other residuals share with it."""
 
 from __future__ import annotations
-
-import math
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.kernels.facts import INFORMATION, INLIERS, LEVER, MATCHED, ROBUST, SQUARED
 from lslam.kernels.gaussians import BLOB, find
 from lslam.kernels.jit import inline, kernel
+from lslam.kernels.linearisation import Pose, Search, Settings, Sums, Width
 from lslam.kernels.voxel import index_of, pack
 
 Floats = NDArray[np.float64]
+# Rows of planes, keys and table, see `gaussians`.
+Voxels = tuple[Floats, NDArray[np.int64], NDArray[np.int32]]
 
 # Four sigma-squared of tilt: neighbouring points of one ring err together.
 TILT = 4.0
@@ -75,11 +74,9 @@ def variance_of(p: Floats, off: float, d2: float) -> float:
 
 
 @kernel
-def linearise(source: Floats, scatter: Floats, R: Floats, t: Floats, size: float, scale: float, sigma2: float,
-              blob_weight: float, gate2: float, planes: Floats, keys: NDArray[np.int64], table: NDArray[np.int32],
-              cells: NDArray[np.int64], slots: NDArray[np.int32], is_done: NDArray[np.bool_], away2: Floats, H: Floats,
-              g: Floats, facts: Floats) -> None:  # fmt: skip
-    """Add to H (6, 6), g (6,) and facts all source points (S, 3), LiDAR frame, with scatter (S, 6) around each.
+def linearise(points: tuple[Floats, Floats], voxels: Voxels, settings: Settings, search: Search, pose: Pose,
+              width: Width, sums: Sums) -> None:  # fmt: skip
+    """Add all source points (S, 3), LiDAR frame, with scatter (S, 6) around each, to H, g and facts, see `linearisation`.
 
     Points that are done are left out, those that find a plane here become so: a coarser map can serve the rest.
 
@@ -88,9 +85,14 @@ def linearise(source: Floats, scatter: Floats, R: Floats, t: Floats, size: float
     width `scale`. Without a plane the nearest blob stands in: isotropic, its mean variance, times `blob_weight`.
     `away2` (S,) takes the squared distance of each matched point to its plane, or mean; those beyond `gate2` are
     rejected: counted, without a say.
-    `facts`: sum of information, weighted squared residuals (m2), inliers within `scale`, matched, information times
-    squared lever arm, sum of robust weights.
     """
+    source, scatter = points
+    planes, keys, table = voxels
+    size, sigma2, blob_weight, _ = settings
+    cells, slots, is_done, away2 = search
+    R, t = pose
+    scale, _, gate2 = width
+    H, _, g, facts = sums
     inverse = 1.0 / size
     c2 = scale * scale
     for i in range(len(source)):
@@ -109,9 +111,9 @@ def linearise(source: Floats, scatter: Floats, R: Floats, t: Floats, size: float
             nx, ny, nz = p[3], p[4], p[5]
             r = nx * (x - p[0]) + ny * (y - p[1]) + nz * (z - p[2])
             away2[i] = r * r
-            facts[3] += 1.0
+            facts[MATCHED] += 1.0
             if abs(r) < scale:
-                facts[2] += 1.0
+                facts[INLIERS] += 1.0
             if r * r > gate2:
                 continue
             # The normal seen from the scan, to read the source scatter along it.
@@ -128,16 +130,16 @@ def linearise(source: Floats, scatter: Floats, R: Floats, t: Floats, size: float
             w = robust / (variance_of(p, r, best_d) + max(spread, 0.0) + sigma2)
             j3, j4, j5 = ry * nz - rz * ny, rz * nx - rx * nz, rx * ny - ry * nx
             add_row(H, g, w, r, nx, ny, nz, j3, j4, j5)
-            facts[0] += w
-            facts[1] += robust * r * r
-            facts[4] += w * (rx * rx + ry * ry + rz * rz)
-            facts[5] += robust
+            facts[INFORMATION] += w
+            facts[SQUARED] += robust * r * r
+            facts[LEVER] += w * (rx * rx + ry * ry + rz * rz)
+            facts[ROBUST] += robust
         elif blob >= 0 and blob_weight > 0.0:
             p = planes[blob]
             away2[i] = blob_d
-            facts[3] += 1.0
+            facts[MATCHED] += 1.0
             if blob_d < c2:
-                facts[2] += 1.0
+                facts[INLIERS] += 1.0
             if blob_d > gate2:
                 continue
             robust = c2 / (c2 + blob_d)
@@ -148,8 +150,8 @@ def linearise(source: Floats, scatter: Floats, R: Floats, t: Floats, size: float
             add_row(H, g, w, ex, 1.0, 0.0, 0.0, 0.0, rz, -ry)
             add_row(H, g, w, ey, 0.0, 1.0, 0.0, -rz, 0.0, rx)
             add_row(H, g, w, ez, 0.0, 0.0, 1.0, ry, -rx, 0.0)
-            facts[0] += 3.0 * w
-            facts[4] += 3.0 * w * (rx * rx + ry * ry + rz * rz)
+            facts[INFORMATION] += 3.0 * w
+            facts[LEVER] += 3.0 * w * (rx * rx + ry * ry + rz * rz)
 
 
 @inline
@@ -224,12 +226,3 @@ def add_information(H: Floats, g: Floats, w: float, xx: float, xy: float, xz: fl
     g[3] += ry * pz - rz * py
     g[4] += rz * px - rx * pz
     g[5] += rx * py - ry * px
-
-
-@inline
-def step_norms(d: Floats) -> tuple[float, float]:
-    """Translation, m, and rotation, rad, of an update (6,)."""
-    return (
-        math.sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2]),
-        math.sqrt(d[3] * d[3] + d[4] * d[4] + d[5] * d[5]),
-    )

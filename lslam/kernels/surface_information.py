@@ -12,10 +12,10 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.kernels.gauss_newton import mirror, move_by
+from lslam.kernels.facts import INFORMATION, LEVER
 from lslam.kernels.jit import inline
 from lslam.kernels.linalg import eigen
-from lslam.kernels.residuals import add_information, step_norms
+from lslam.kernels.residuals import add_information
 
 Floats = NDArray[np.float64]
 
@@ -42,7 +42,7 @@ def solve_on_surfaces(H: Floats, S: Floats, g: Floats, facts: Floats, weak_share
 
     `least` is asked of H. Both matrices are whole, not triangles.
     """
-    lever = math.sqrt(max(facts[4] / max(facts[0], 1e-300), 1e-6))
+    lever = math.sqrt(max(facts[LEVER] / max(facts[INFORMATION], 1e-300), 1e-6))
     needed = weak_share * (S[0, 0] + S[1, 1] + S[2, 2])
     D = np.ones(6)
     D[3:] = 1.0 / lever
@@ -87,16 +87,3 @@ def solve_on_surfaces(H: Floats, S: Floats, g: Floats, facts: Floats, weak_share
         for i in range(6):
             d[i] -= vectors[i, k] * dot / values[k] * D[i]
     return count
-
-
-@inline
-def advance_on_surfaces(H: Floats, S: Floats, g: Floats, facts: Floats, scale: float, weak_share: float, R: Floats,
-                        t: Floats, d: Floats, weak: Floats, weak_count: int) -> tuple[bool, int, float, float]:  # fmt: skip
-    """As `gauss_newton.advance`, along the directions that S observes."""
-    mirror(H)
-    mirror(S)
-    if facts[3] < 6.0:
-        return False, weak_count, 0.0, 0.0
-    weak_count = solve_on_surfaces(H, S, g, facts, weak_share, 0.0, d, weak)
-    move, turn = step_norms(d)
-    return move_by(d, move, turn, scale, R, t), weak_count, move, turn

@@ -6,28 +6,33 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.kernels.discs import disc
-from lslam.kernels.gauss_newton import clear, trimmed, workspace
-from lslam.kernels.jit import inline, kernel
+from lslam.kernels.facts import INFORMATION, INLIERS, LEVER, MATCHED, POPULATION, ROBUST, SQUARED
+from lslam.kernels.jit import kernel
 from lslam.kernels.linalg import invert_symmetric, rotate_symmetric
+from lslam.kernels.linearisation import Pose, Search, Settings, Sums, Width
 from lslam.kernels.residuals import add_information, nearest, octant_slots, variance_of
-from lslam.kernels.surface_information import add_surface, advance_on_surfaces, thin_information
+from lslam.kernels.surface_information import add_surface, thin_information
 
 Floats = NDArray[np.float64]
 Longs = NDArray[np.int64]
 Ints = NDArray[np.int32]
-Flags = NDArray[np.bool_]
 
 
 @kernel
-def linearise_vgicp(source: Floats, covariance: Floats, R: Floats, t: Floats, size: float, scale: float, sigma2: float,
-                    blob_weight: float, gate2: float, planes: Floats, counts: Floats, keys: Longs, table: Ints,
-                    cells: Longs, slots: Ints, is_done: Flags, away2: Floats, H: Floats, S: Floats, g: Floats,
-                    facts: Floats) -> None:  # fmt: skip
-    """Add to H, S (6, 6), g (6,) and facts all source points (S, 3) with covariance (S, 6), LiDAR frame, not done yet.
+def linearise_vgicp(points: tuple[Floats, Floats], voxels: tuple[Floats, Floats, Longs, Ints], settings: Settings,
+                    search: Search, pose: Pose, width: Width, sums: Sums) -> None:  # fmt: skip
+    """Add all source points (S, 3) with covariance (S, 6), LiDAR frame, not done yet, to the sums, see `linearisation`.
 
     As `linearise_gicp`, but on all plane voxels of the eight around R s + t, each times the number of points in it,
-    counts (C,). Distances are those to the closest; the eighth of the facts is the sum of the counts.
+    counts (C,). Distances are those to the closest.
     """
+    source, covariance = points
+    planes, counts, keys, table = voxels
+    size, sigma2, blob_weight, _ = settings
+    cells, slots, is_done, away2 = search
+    R, t = pose
+    scale, _, gate2 = width
+    H, S, g, facts = sums
     inverse = 1.0 / size
     unused = np.zeros(6)
     c2 = scale * scale
@@ -70,7 +75,7 @@ def linearise_vgicp(source: Floats, covariance: Floats, R: Floats, t: Floats, si
             robust *= robust
             if away < closest:
                 closest, closest_robust = away, robust
-            facts[7] += n
+            facts[POPULATION] += n
             if away > gate2:
                 continue
             w = n * robust
@@ -81,68 +86,12 @@ def linearise_vgicp(source: Floats, covariance: Floats, R: Floats, t: Floats, si
                 add_surface(S, unused, along, p[3], p[4], p[5], rx, ry, rz)
             else:
                 add_information(S, unused, w, mxx, mxy, mxz, myy, myz, mzz, 0.0, 0.0, 0.0, rx, ry, rz)
-            facts[0] += trace
-            facts[4] += trace * (rx * rx + ry * ry + rz * rz)
+            facts[INFORMATION] += trace
+            facts[LEVER] += trace * (rx * rx + ry * ry + rz * rz)
         away2[i] = closest
-        facts[3] += 1.0
+        facts[MATCHED] += 1.0
         if closest < c2:
-            facts[2] += 1.0
+            facts[INLIERS] += 1.0
         if closest <= gate2:
-            facts[1] += closest_robust * closest
-            facts[5] += closest_robust
-
-
-@inline
-def scale_by_mean_count(H: Floats, S: Floats, g: Floats, facts: Floats) -> None:
-    """Counts weigh points against each other; divided by their mean, the information stays that of the points."""
-    w = facts[3] / max(facts[7], 1e-300)
-    for i in range(6):
-        g[i] *= w
-        for j in range(6):
-            H[i, j] *= w
-            S[i, j] *= w
-    facts[0] *= w
-    facts[4] *= w
-
-
-@kernel
-def align_vgicp(
-    source: Floats, covariance: Floats, R: Floats, t: Floats, scale_start: float, scale_end: float, decay: float,
-    max_iterations: int, step_m: float, step_rad: float, inlier_distance: float, inlier_ratio: float, sigma2: float,
-    blob_weight: float, weak_share: float, size: float, planes: Floats, counts: Floats, keys: Longs, table: Ints,
-    has_coarse: bool, coarse_size: float, coarse_planes: Floats, coarse_counts: Floats, coarse_keys: Longs,
-    coarse_table: Ints,
-) -> tuple[Floats, Floats, Floats, int, bool, int, Floats]:  # fmt: skip
-    """As `gauss_newton.align`, distribution to distribution; `counts` (C,) goes with `planes`."""
-    cells, slots, is_done, away2 = workspace(len(source))
-    coarse_cells, coarse_slots, _, _ = workspace(len(source) if has_coarse else 0)
-    H, g, d, facts, weak = np.empty((6, 6)), np.empty(6), np.zeros(6), np.zeros(8), np.zeros((6, 6))
-    S = np.empty((6, 6))
-    farthest2 = inlier_distance * inlier_distance
-    gate2, scale = farthest2, scale_start
-    converged = False
-    weak_count = 0
-    iterations = 0
-    for _ in range(max_iterations):
-        clear(H, g, facts, is_done, away2)
-        S[:] = 0.0
-        linearise_vgicp(source, covariance, R, t, size, scale, sigma2, 0.0 if has_coarse else blob_weight, gate2, planes,
-                        counts, keys, table, cells, slots, is_done, away2, H, S, g, facts)  # fmt: skip
-        facts[6] = facts[2]
-        if has_coarse:
-            linearise_vgicp(source, covariance, R, t, coarse_size, scale, sigma2, blob_weight, gate2, coarse_planes,
-                            coarse_counts, coarse_keys, coarse_table, coarse_cells, coarse_slots, is_done, away2, H, S, g,
-                            facts)  # fmt: skip
-        scale_by_mean_count(H, S, g, facts)
-        iterations += 1
-        moved, weak_count, move, turn = advance_on_surfaces(
-            H, S, g, facts, scale, weak_share, R, t, d, weak, weak_count
-        )
-        if not moved:
-            break
-        if scale <= scale_end and move < step_m and turn < step_rad:
-            converged = True
-            break
-        scale = max(scale * decay, scale_end)
-        gate2 = trimmed(away2, inlier_ratio, farthest2)
-    return H, facts, d, iterations, converged, weak_count, weak
+            facts[SQUARED] += closest_robust * closest
+            facts[ROBUST] += closest_robust

@@ -16,8 +16,8 @@ from lslam.config.registration import RegistrationConfig
 from lslam.geometry import se3, so3, umeyama
 from lslam.odometry.outcome import Alignment, judged
 from lslam.preprocessing.prepare import PreparedPoints, prepare_points
+from lslam.registration.optimiser import STEP_M, STEP_RAD
 from lslam.registration.registration import MIN_SOURCE_POINTS
-from lslam.registration.solver import STEP_M, STEP_RAD
 from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan import Scan
 from lslam.types.scan_result import ScanResult

@@ -41,7 +41,8 @@ class MapAlignment:
             coarse = self._map.coarsen(GAP_FACTOR)
         return solve(
             self._map, points, start, annealing,
-            sigma=c.sigma, blob_weight=c.blob_weight, weak_share=c.weak_share, coarse=coarse, residual=self._residual,
+            sigma=c.sigma, blob_weight=c.blob_weight, weak_share=c.weak_share,
+            coarser=() if coarse is None else (coarse,), residual=self._residual,
             inlier_distance=np.inf if c.inlier_distance is None else c.inlier_distance, inlier_ratio=c.inlier_ratio,
         )  # fmt: skip
 

@@ -8,15 +8,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.geometry import se3, so3
-from lslam.kernels.feature_alignment import align_to_map, align_to_scan
+from lslam.kernels.feature_residuals import linearise_edges, linearise_planes
+from lslam.kernels.lines import linearise_lines
 from lslam.registration.feature_map import MIN_LINE_POINTS, FeatureMap
 from lslam.registration.feature_scan import FeatureScan
 from lslam.registration.gaussian_map import FLOOR, GaussianMap
+from lslam.registration.optimiser import EVERYWHERE, Limits, Matches, Term, optimise, slots_of
+from lslam.registration.residuals import RESIDUALS
 from lslam.registration.robust import Annealing
-from lslam.registration.solver import STEP_M, STEP_RAD, RegistrationResult, _covariance
+from lslam.registration.solver import RegistrationResult, result_of, voxel_terms
 
 Floats = NDArray[np.float64]
 NONE: Floats = np.zeros((0, 3))
+# From scan to scan no map takes an error back, and it goes on as velocity: twice as much is asked for there. More would doubt
+# sparse sensors, whose scans have few features, in every direction.
+TIMES_ON_SCAN = 2.0
 
 
 @dataclass(frozen=True)
@@ -42,16 +48,22 @@ def solve_on_scan(
 
     `allowed` (6, 6) projects the steps; the result's degenerate directions are those that it allows.
     """
-    R, t, projector = _start(T_prior, allowed)
-    H, edge_facts, plane_facts, step, iterations, converged, count, weak = align_to_scan(
-        edges, planes, R, t, annealing.start, annealing.end, annealing.decay, annealing.steps, STEP_M, STEP_RAD,
-        noise.edge**2, noise.plane**2, noise.weak_share, noise.least, projector, one_to_many, target.size, target.reach,
-        target.edges, target.planes, target.normals,
+
+    def settings(sigma: float) -> tuple[float, float, float, bool]:
+        return float(target.size), float(target.reach), float(sigma) ** 2, bool(one_to_many)
+
+    terms = [
+        Term(linearise_edges, (edges,), target.edges, settings(noise.edge)),
+        Term(linearise_planes, (planes,), (*target.planes, target.normals), settings(noise.plane)),
+    ]
+    limits = Limits(
+        noise.weak_share, TIMES_ON_SCAN * noise.least / noise.plane**2, by_surfaces=True,
+        allowed=EVERYWHERE if allowed is None else np.ascontiguousarray(allowed),
     )  # fmt: skip
-    facts = edge_facts + plane_facts
-    return _result(
-        T_prior, R, t, H, facts, step, iterations, converged, weak[:count], len(edges) + len(planes), allowed
-    )
+    found = optimise(terms, T_prior, annealing, limits, Matches(0))
+    if allowed is not None:
+        found = replace(found, weak=found.weak[np.linalg.norm(found.weak @ allowed, axis=1) > 0.5])
+    return result_of(found, T_prior, len(edges) + len(planes))
 
 
 def solve_on_map(
@@ -63,22 +75,21 @@ def solve_on_map(
     scatter : (P, 6) m2, of the points behind each planar point when that is a centroid
     coarse : serves planar points without a plane in the map; alone when `is_coarse_only`
     """
-    R, t, projector = _start(T_prior, None)
     if scatter is None:
         scatter = np.zeros((len(planes), 6))
-    lines, fine = target.edges, target.planes
-    second = fine if coarse is None else coarse
-    if is_coarse_only:
-        fine = second
-    H, edge_facts, plane_facts, step, iterations, converged, count, weak = align_to_map(
-        edges, planes, scatter, R, t, annealing.start, annealing.end, annealing.decay,
-        annealing.steps, STEP_M, STEP_RAD, noise.edge**2, noise.plane**2, noise.weak_share, noise.least, projector,
-        lines.size, float(MIN_LINE_POINTS), FLOOR, lines.moments, lines.keys, lines.table, *target.lines,
-        fine.size, fine.planes, fine.keys, fine.table,
-        second is not fine, second.size, second.planes, second.keys, second.table,
+    lines, matches = target.edges, Matches(len(planes))
+    coarser = [] if coarse is None else [coarse]
+    levels = coarser if coarser and is_coarse_only else [target.planes, *coarser]
+    on_lines = Term(
+        linearise_lines, (edges,), (lines.moments, lines.keys, lines.table, *target.lines),
+        (float(lines.size), float(noise.edge) ** 2, float(MIN_LINE_POINTS), FLOOR), slots_of(len(edges)),
     )  # fmt: skip
-    facts = edge_facts + plane_facts
-    return _result(T_prior, R, t, H, facts, step, iterations, converged, weak[:count], len(edges) + len(planes), None)
+    on_planes = voxel_terms(RESIDUALS["plane"], (planes, scatter), levels, matches, noise.plane, 0.0)
+    limits = Limits(noise.weak_share, noise.least / noise.plane**2, unseen=1.0)
+    found = optimise([on_lines, *on_planes], T_prior, annealing, limits, matches)
+    result = result_of(found, T_prior, len(edges) + len(planes))
+    # Features are so few that a coarse plane counts like a fine one.
+    return replace(result, fine_inliers=result.inliers)
 
 
 def kept_where_blind(result: RegistrationResult, T_expected: Floats) -> RegistrationResult:
@@ -92,34 +103,3 @@ def kept_where_blind(result: RegistrationResult, T_expected: Floats) -> Registra
     false = result.degenerate.T @ (result.degenerate @ moved)
     pose = se3.make(so3.exp(-false[3:] / arm) @ R, result.T_world_lidar[:3, 3] - false[:3])
     return replace(result, T_world_lidar=se3.normalise(pose))
-
-
-def _start(T_prior: Floats, allowed: Floats | None) -> tuple[Floats, Floats, Floats]:
-    R, t = np.ascontiguousarray(T_prior[:3, :3]).copy(), T_prior[:3, 3].copy()
-    return R, t, np.eye(6) if allowed is None else np.ascontiguousarray(allowed)
-
-
-def _result(
-    T_prior: Floats, R: Floats, t: Floats, H: Floats, facts: Floats, step: Floats, iterations: int, converged: bool,
-    weak: Floats, source_points: int, allowed: Floats | None,
-) -> RegistrationResult:  # fmt: skip
-    pose = se3.make(R, t)
-    finite = bool(np.isfinite(pose).all() and np.isfinite(step).all())
-    lever = float(np.sqrt(max(facts[4] / max(facts[0], 1e-300), 1e-6)))
-    if allowed is not None:
-        weak = weak[np.linalg.norm(weak @ allowed, axis=1) > 0.5]
-    return RegistrationResult(
-        T_world_lidar=pose if finite else T_prior,
-        ok=finite,
-        reason="" if finite else "the solution is not finite",
-        covariance=_covariance(H, facts, weak, lever) if finite and facts[3] >= 6 else None,
-        converged=converged,
-        iterations=iterations,
-        source_points=source_points,
-        matched=int(facts[3]),
-        inliers=int(facts[2]),
-        fine_inliers=int(facts[2]),
-        rmse=float(np.sqrt(facts[1] / max(facts[5], 1e-12))),
-        degenerate=weak.copy(),
-        lever_arm=lever,
-    )

@@ -1,36 +1,90 @@
-"""The residuals by name: the kernel of each, compiled when it is asked for, and what it reads of the map."""
+"""The residuals by name. A new one is a kernel file and a line here; nothing heavy is imported before it is asked for."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from importlib import import_module
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from lslam.config.registration import Residual
-from lslam.registration.gaussian_map import GaussianMap
+from lslam.errors import UsageError, nearest
 
-# The loop of steps stands once in each: with the residual as its argument, one loop would be compiled anew for every
-# residual that is handed to it and kept by no cache. What the loops share is inlined from `gauss_newton`.
-KERNELS = {
-    "plane": ("lslam.kernels.gauss_newton", "align"),
-    "point": ("lslam.kernels.point_residual", "align_point"),
-    "gicp": ("lslam.kernels.gicp_residual", "align_gicp"),
-    "vgicp": ("lslam.kernels.vgicp_residual", "align_vgicp"),
-    "ndt": ("lslam.kernels.ndt_residual", "align_ndt"),
-}
-NEEDS_COVARIANCE = frozenset({"gicp", "vgicp"})
+if TYPE_CHECKING:
+    from lslam.preprocessing.prepare import PreparedPoints
+    from lslam.registration.gaussian_map import GaussianMap
+
+Arrays = tuple[Any, ...]
 
 
-def kernel_of(residual: Residual) -> Callable[..., Any]:
-    """The kernel that aligns by this residual, called as `gauss_newton.align`."""
-    module, name = KERNELS[residual]
-    return getattr(import_module(module), name)  # type: ignore[no-any-return]
+def _alone(points: PreparedPoints, sigma: float) -> Arrays:
+    return (points.source,)
 
 
-def voxels_of(residual: Residual, target: GaussianMap) -> tuple[Any, ...]:
-    """The arrays of a map that its kernel takes after the voxel size."""
-    if residual == "ndt":
-        return target.shapes(), target.keys, target.table
-    if residual == "vgicp":
-        return target.planes, target.refreshed, target.keys, target.table
+def _with_scatter(points: PreparedPoints, sigma: float) -> Arrays:
+    return points.source, points.scatter
+
+
+def _with_gaps(points: PreparedPoints, sigma: float) -> Arrays:
+    from numpy import zeros
+
+    return points.source, zeros(len(points.source)) if points.gaps is None else points.gaps
+
+
+def _with_covariance(points: PreparedPoints, sigma: float) -> Arrays:
+    from lslam.registration.source_covariance import source_covariance
+
+    known = points.covariance
+    return points.source, source_covariance(points.source, points.map_points, sigma**2) if known is None else known
+
+
+def _planes(target: GaussianMap) -> Arrays:
     return target.planes, target.keys, target.table
+
+
+def _counted_planes(target: GaussianMap) -> Arrays:
+    return target.planes, target.refreshed, target.keys, target.table
+
+
+def _shapes(target: GaussianMap) -> Arrays:
+    return target.shapes(), target.keys, target.table
+
+
+@dataclass(frozen=True)
+class ResidualKind:
+    """What one residual is.
+
+    module, function : its compiled `linearise`, see `kernels.linearisation`; imported when it is asked for
+    points : source points, and what it takes of each, by the noise of a point, m
+    voxels : what it takes of a map
+    by_surfaces : whether S of its sums tells which directions are observed: its matrices are full
+    """
+
+    module: str
+    function: str
+    points: Callable[[PreparedPoints, float], Arrays] = _with_scatter
+    voxels: Callable[[GaussianMap], Arrays] = _planes
+    by_surfaces: bool = False
+
+    @property
+    def linearise(self) -> Callable[..., None]:
+        """The kernel."""
+        return getattr(import_module(self.module), self.function)  # type: ignore[no-any-return]
+
+
+RESIDUALS = {
+    "plane": ResidualKind("lslam.kernels.residuals", "linearise"),
+    "point": ResidualKind("lslam.kernels.point_residual", "linearise_point", _with_gaps),
+    "gicp": ResidualKind("lslam.kernels.gicp_residual", "linearise_gicp", _with_covariance, by_surfaces=True),
+    "vgicp": ResidualKind(
+        "lslam.kernels.vgicp_residual", "linearise_vgicp", _with_covariance, _counted_planes, by_surfaces=True
+    ),
+    "ndt": ResidualKind("lslam.kernels.ndt_residual", "linearise_ndt", _alone, _shapes, by_surfaces=True),
+}
+NEEDS_COVARIANCE = frozenset(name for name, residual in RESIDUALS.items() if residual.points is _with_covariance)
+
+
+def residual_named(name: str) -> ResidualKind:
+    """The residual of that name. Raises UsageError with the nearest one when there is none."""
+    if name not in RESIDUALS:
+        raise UsageError(f"no residual {name!r}; {nearest(name, list(RESIDUALS))}")
+    return RESIDUALS[name]

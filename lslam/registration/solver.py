@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.config.registration import Residual
-from lslam.geometry import se3
 from lslam.preprocessing.prepare import PreparedPoints
 from lslam.registration.gaussian_map import GaussianMap
-from lslam.registration.residuals import NEEDS_COVARIANCE, kernel_of, voxels_of
+from lslam.registration.optimiser import LEAST_MATCHED, Limits, Matches, Optimum, Term, optimise
+from lslam.registration.residuals import ResidualKind, residual_named
 from lslam.registration.robust import Annealing
-from lslam.registration.source_covariance import source_covariance
 from lslam.types.scan_result import ScanResult
 
-# A step below these ends the iteration: a tenth of the noise of a point, and what that is at 10 m.
-STEP_M, STEP_RAD = 1e-3, 1e-4
+Floats = NDArray[np.float64]
+
 # Planar points that face one way hold the place along it well enough, as many as LOAM asks for a plane.
 ENOUGH = 5
 
@@ -83,63 +83,74 @@ class RegistrationResult:
 
 
 def solve(
-    target: GaussianMap, points: PreparedPoints, T_prior: NDArray[np.float64], annealing: Annealing, *, sigma: float,
-    blob_weight: float, weak_share: float, coarse: GaussianMap | None = None, residual: Residual = "plane",
+    target: GaussianMap, points: PreparedPoints, T_prior: Floats, annealing: Annealing, *, sigma: float,
+    blob_weight: float, weak_share: float, coarser: Sequence[GaussianMap] = (), residual: str = "plane",
     inlier_distance: float = np.inf, inlier_ratio: float = 1.0,
 ) -> RegistrationResult:  # fmt: skip
     """Align the source points with the map by annealed Gauss-Newton, starting at `T_prior` (4, 4).
 
-    Points without a plane in `target` are matched in `coarse`, when given. Correspondences beyond `inlier_distance`, m,
-    are rejected, and all but the nearest `inlier_ratio`.
+    Points without a plane in `target` are matched in the first of the `coarser` maps that has one. Blobs serve in the last
+    map only. Correspondences beyond `inlier_distance`, m, are rejected, and all but the nearest `inlier_ratio`.
     """
-    second = target if coarse is None else coarse
-    R, t = np.ascontiguousarray(T_prior[:3, :3]).copy(), T_prior[:3, 3].copy()
-    H, facts, step, iterations, converged, weak_count, weak = kernel_of(residual)(
-        points.source, _known_of_source(residual, points, sigma), R, t,
-        annealing.start, annealing.end, annealing.decay, annealing.steps,
-        STEP_M, STEP_RAD, inlier_distance, inlier_ratio, sigma**2, blob_weight, weak_share,
-        target.size, *voxels_of(residual, target), coarse is not None, second.size, *voxels_of(residual, second),
+    kind, matches = residual_named(residual), Matches(len(points.source))
+    terms = voxel_terms(kind, kind.points(points, sigma), (target, *coarser), matches, sigma, blob_weight)
+    found = optimise(
+        terms, T_prior, annealing, Limits(weak_share, by_surfaces=kind.by_surfaces), matches,
+        inlier_distance=inlier_distance, inlier_ratio=inlier_ratio,
     )  # fmt: skip
-    pose = se3.make(R, t)
-    finite = bool(np.isfinite(pose).all() and np.isfinite(step).all())
-    lever = float(np.sqrt(max(facts[4] / max(facts[0], 1e-300), 1e-6)))
+    return result_of(found, T_prior, len(points.source))
+
+
+def voxel_terms(
+    kind: ResidualKind, points: tuple[Any, ...], levels: Sequence[GaussianMap], matches: Matches, sigma: float,
+    blob_weight: float,
+) -> list[Term]:  # fmt: skip
+    """The residual of the points on each of the maps, the finest first, which share their matches.
+
+    points : arrays that the residual takes of them; sigma : m, noise of a point; blob_weight : of the last map's
+    """
+    last, linearise = len(levels) - 1, kind.linearise
+    return [
+        Term(
+            linearise, points, kind.voxels(level),
+            (float(level.size), float(sigma) ** 2, float(blob_weight) if k == last else 0.0, 0 < k == last),
+            matches.search(), is_fine=k == 0,
+        )
+        for k, level in enumerate(levels)
+    ]  # fmt: skip
+
+
+def result_of(found: Optimum, T_prior: Floats, source_points: int) -> RegistrationResult:
+    """The optimum in words, or the prior (4, 4) where it is not finite."""
+    facts = found.facts
+    finite = bool(np.isfinite(found.pose).all() and np.isfinite(found.step).all())
+    is_known = finite and facts.matched >= LEAST_MATCHED
     return RegistrationResult(
-        T_world_lidar=pose if finite else T_prior,
+        T_world_lidar=found.pose if finite else T_prior,
         ok=finite,
         reason="" if finite else "the solution is not finite",
-        covariance=_covariance(H, facts, weak[:weak_count], lever) if finite and facts[3] >= 6 else None,
-        converged=converged,
-        iterations=iterations,
-        source_points=len(points.source),
-        matched=int(facts[3]),
-        inliers=int(facts[2]),
-        fine_inliers=int(facts[6]),
-        rmse=float(np.sqrt(facts[1] / max(facts[5], 1e-12))),
-        degenerate=weak[:weak_count].copy(),
-        lever_arm=lever,
+        covariance=_covariance(found) if is_known else None,
+        converged=found.converged,
+        iterations=found.iterations,
+        source_points=source_points,
+        matched=facts.matched,
+        inliers=facts.inliers,
+        fine_inliers=facts.fine_inliers,
+        rmse=facts.rmse,
+        degenerate=found.weak,
+        lever_arm=facts.lever_arm,
     )
 
 
-def _known_of_source(residual: Residual, points: PreparedPoints, sigma: float) -> NDArray[np.float64]:
-    """What a residual takes of each source point beside its place: scatter, covariance or the gap between rings."""
-    if residual == "point":
-        return np.zeros(len(points.source)) if points.gaps is None else points.gaps
-    if residual not in NEEDS_COVARIANCE:
-        return points.scatter
-    known = points.covariance
-    return source_covariance(points.source, points.map_points, sigma**2) if known is None else known
-
-
-def _covariance(
-    H: NDArray[np.float64], facts: NDArray[np.float64], weak: NDArray[np.float64], lever: float
-) -> NDArray[np.float64]:
+def _covariance(found: Optimum) -> Floats:
     """Inverse of the information, with one metre of doubt along directions the scan does not observe."""
+    lever = found.facts.lever_arm
     scale = np.array([1.0, 1.0, 1.0, 1 / lever, 1 / lever, 1 / lever])
-    A = H * np.outer(scale, scale)
+    A = found.H * np.outer(scale, scale)
     values, vectors = np.linalg.eigh(A)
-    values = np.maximum(values, 1e-9 * max(float(facts[0]), 1e-9))
-    if len(weak):
-        along = ((weak @ vectors) ** 2).sum(0) > 0.5
+    values = np.maximum(values, 1e-9 * max(found.facts.information, 1e-9))
+    if len(found.weak):
+        along = ((found.weak @ vectors) ** 2).sum(0) > 0.5
         values = np.where(along, np.minimum(values, 1.0), values)
     C = (vectors / values) @ vectors.T
     return np.asarray(C * np.outer(scale, scale))

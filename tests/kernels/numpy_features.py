@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.geometry import so3
+from lslam.kernels import facts as at
 
 Floats = NDArray[np.float64]
 
@@ -38,8 +39,8 @@ class Match:
 
 
 def normal_equations(found: list[Match], R: Floats, t: Floats, c: float) -> tuple[Floats, Floats, Floats]:
-    """H (6, 6), g (6,) and facts (6,) as `residuals.linearise` gives them."""
-    H, g, facts = np.zeros((6, 6)), np.zeros(6), np.zeros(6)
+    """H (6, 6), g (6,) and facts as a `linearise` gives them."""
+    H, g, facts = np.zeros((6, 6)), np.zeros(6), np.zeros(at.COUNT)
     for m in found:
         r, rotated = m.residual(R, t), R @ m.s
         J = m.A @ np.hstack([np.eye(3), -so3.hat(rotated)])
@@ -47,10 +48,12 @@ def normal_equations(found: list[Match], R: Floats, t: Floats, c: float) -> tupl
         H += w * J.T @ J
         g += w * J.T @ r
         rank = round(float(np.trace(m.A @ m.A.T)))
-        facts += [
-            rank * w, m.robust(R, t, c) * float(r @ r), float(r @ r) < c * c, 1.0,
-            rank * w * float(rotated @ rotated), m.robust(R, t, c),
-        ]  # fmt: skip
+        facts[at.INFORMATION] += rank * w
+        facts[at.SQUARED] += m.robust(R, t, c) * float(r @ r)
+        facts[at.INLIERS] += float(r @ r) < c * c
+        facts[at.MATCHED] += 1.0
+        facts[at.LEVER] += rank * w * float(rotated @ rotated)
+        facts[at.ROBUST] += m.robust(R, t, c)
     return H, g, facts
 
 

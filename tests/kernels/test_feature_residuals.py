@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from numpy_features import Match, gradient, match_edge, match_plane, match_point, nearest, normal_equations
 
 from lslam.geometry import se3, so3
+from lslam.kernels import facts as at
 from lslam.kernels import feature_grid, feature_residuals
 from lslam.kernels.jit import kernel
 from lslam.kernels.voxel import OFFSET
@@ -42,17 +43,20 @@ class Scene:
     def linearise(self, kind: str, c: float) -> tuple[Floats, Floats, Floats]:
         if kind == "plane":
             return self.linearise_planes(c, np.zeros_like(self.world))[:3]
-        H, g, facts = np.zeros((6, 6)), np.zeros(6), np.zeros(6)
+        H, S, g, facts = np.zeros((6, 6)), np.zeros((6, 6)), np.zeros(6), np.zeros(at.COUNT)
         feature_residuals.linearise_edges(
-            self.source, self.R, self.t, SIZE, REACH, c, VARIANCE, kind != "point", *self.grid, H, g, facts
-        )
+            (self.source,), self.grid, (SIZE, REACH, VARIANCE, kind != "point"), (), (self.R, self.t), (c, c, np.inf),
+            (H, S, g, facts),
+        )  # fmt: skip
+        np.testing.assert_array_equal(S, H)
         return whole(H), g, facts
 
     def linearise_planes(self, c: float, normals: Floats) -> tuple[Floats, Floats, Floats, Floats]:
-        H, S, g, facts = np.zeros((6, 6)), np.zeros((6, 6)), np.zeros(6), np.zeros(6)
+        H, S, g, facts = np.zeros((6, 6)), np.zeros((6, 6)), np.zeros(6), np.zeros(at.COUNT)
         feature_residuals.linearise_planes(
-            self.source, self.R, self.t, SIZE, REACH, c, VARIANCE, True, *self.grid, H, g, facts, normals, S
-        )
+            (self.source,), (*self.grid, normals), (SIZE, REACH, VARIANCE, True), (), (self.R, self.t), (c, c, np.inf),
+            (H, S, g, facts),
+        )  # fmt: skip
         return whole(H), g, facts, whole(S)
 
 
@@ -201,12 +205,12 @@ def test_points_in_line_make_no_plane_and_points_of_one_ring_no_line() -> None:
     for rings in (np.zeros(20, np.uint16), np.arange(20, dtype=np.uint16) // 10):
         grid = feature_grid.build(line, rings, np.eye(3), np.zeros(3), SIZE)
         s = Scene(grid, grid[0], grid[1].astype(np.int64), source, np.eye(3), np.zeros(3))
-        assert s.linearise("plane", 1.0)[2][3] == 0
-        assert s.linearise("edge", 1.0)[2][3] == len(s.matches("edge"))
-        assert s.linearise("point", 1.0)[2][3] == len(source)
+        assert s.linearise("plane", 1.0)[2][at.MATCHED] == 0
+        assert s.linearise("edge", 1.0)[2][at.MATCHED] == len(s.matches("edge"))
+        assert s.linearise("point", 1.0)[2][at.MATCHED] == len(source)
     one_ring = feature_grid.build(line, np.zeros(20, np.uint16), np.eye(3), np.zeros(3), SIZE)
     s = Scene(one_ring, one_ring[0], one_ring[1].astype(np.int64), source, np.eye(3), np.zeros(3))
-    assert s.linearise("edge", 1.0)[2][3] == 0
+    assert s.linearise("edge", 1.0)[2][at.MATCHED] == 0
 
 
 def test_an_empty_scan_and_an_empty_target_match_nothing(scene: Scene) -> None:

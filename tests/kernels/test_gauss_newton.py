@@ -1,4 +1,4 @@
-"""The solver: steps only where the points observe, known transforms found again, and an end in every case."""
+"""The step: only where the points observe, in the directions that are allowed, and never farther than they reach."""
 
 from __future__ import annotations
 
@@ -7,11 +7,10 @@ import pytest
 from numpy.typing import NDArray
 
 from lslam.geometry import so3
+from lslam.kernels import facts as at
 from lslam.kernels import gauss_newton
-from lslam.registration.gaussian_map import GaussianMap
 
 Floats = NDArray[np.float64]
-STEPS = 30
 
 
 def solve(
@@ -19,7 +18,8 @@ def solve(
 ) -> tuple[Floats, Floats]:
     d, weak = np.full(6, np.nan), np.zeros((6, 6))
     information = float(np.trace(H[:3, :3]))
-    facts = np.array([information, 0, 0, 0, information * lever**2, 0])
+    facts = np.zeros(at.COUNT)
+    facts[[at.INFORMATION, at.LEVER]] = information, information * lever**2
     count = gauss_newton.solve_observed(H, g, facts, weak_share, least, gauss_newton.UNSEEN, d, weak)
     return d, weak[:count]
 
@@ -73,93 +73,83 @@ def test_no_information_gives_no_step() -> None:
     assert len(weak) == 6
 
 
-def room(rng: np.random.Generator, n: int, noise: float) -> Floats:
-    """Floor and two walls: all six directions are seen."""
-    u = rng.uniform(-6, 6, (3, n, 2))
-    floor = np.column_stack([u[0], rng.normal(-1.5, noise, n)])
-    wall = np.column_stack([u[1, :, 0], rng.normal(6.0, noise, n), u[1, :, 1] / 2 + 1.5])
-    side = np.column_stack([rng.normal(6.0, noise, n), u[2, :, 0], u[2, :, 1] / 2 + 1.5])
-    return np.concatenate([floor, wall, side])
+def step(
+    H: Floats,
+    g: Floats,
+    scale: float = 1.0,
+    allowed: Floats | None = None,
+    S: Floats | None = None,
+    population: float = 0.0,
+) -> tuple[Floats, Floats, bool, Floats, tuple[Floats, ...]]:
+    """R, t, whether they moved, the unobserved directions, and the sums as the kernel leaves them."""
+    pose, d, weak = (np.eye(3), np.zeros(3)), np.zeros(6), np.zeros((6, 6))
+    facts = np.zeros(at.COUNT)
+    facts[[at.INFORMATION, at.LEVER, at.MATCHED, at.POPULATION]] = (
+        np.trace(H[:3, :3]),
+        np.trace(H[:3, :3]),
+        60.0,
+        population,
+    )
+    sums = np.triu(H), np.triu(H if S is None else S), g.copy(), facts
+    limits = 1e-9, 0.0, gauss_newton.UNSEEN, S is not None
+    none = np.zeros((0, 6))
+    moved, count, move, turn = gauss_newton.step(
+        pose, sums, scale, limits, none if allowed is None else allowed, d, weak
+    )
+    if np.linalg.norm(d[:3]) < 2 * scale:
+        np.testing.assert_allclose([move, turn], [np.linalg.norm(d[:3]), np.linalg.norm(d[3:])])
+    return *pose, moved, weak[:count], sums
 
 
-@pytest.fixture(scope="module")
-def target() -> GaussianMap:
-    m = GaussianMap(0.8)
-    m.insert(room(np.random.default_rng(0), 6000, 0.01).astype(np.float32), np.eye(4))
-    return m
+def test_a_step_moves_the_pose_by_the_newton_step() -> None:
+    for seed in range(20):
+        H, g = random_problem(seed, 6)
+        expected = -np.linalg.solve(H, g)
+        R, t, moved, weak, sums = step(H, g)
+        assert moved
+        assert len(weak) == 0
+        np.testing.assert_allclose(t, expected[:3], atol=1e-9)
+        np.testing.assert_allclose(R, so3.exp(expected[3:]), atol=1e-9)
+        np.testing.assert_array_equal(sums[0], sums[0].T)
 
 
-def align(
-    m: GaussianMap,
-    source: Floats,
-    R: Floats,
-    t: Floats,
-    steps: int = STEPS,
-    weak_share: float = 1e-3,
-    farthest: float = np.inf,
-    ratio: float = 1.0,
-) -> tuple[Floats, Floats, Floats, int, bool, int, Floats]:
-    return gauss_newton.align(
-        source, np.zeros((len(source), 6)), R, t, 1.0, 0.1, 0.5, steps, 1e-3, 1e-4, farthest, ratio, 9e-4, 0.5, weak_share,
-        m.size, m.planes, m.keys, m.table, False, m.size, m.planes, m.keys, m.table,
-    )  # fmt: skip
+def test_a_step_stays_within_the_directions_allowed() -> None:
+    upright = np.diag([0.0, 0.0, 1.0, 1.0, 1.0, 0.0])
+    for seed in range(20):
+        H, g = random_problem(seed, 6)
+        R, t, _, weak, _ = step(H, g, allowed=upright)
+        expected = -np.linalg.solve(H[2:5, 2:5], g[2:5])
+        np.testing.assert_allclose(t, [0, 0, expected[0]], atol=1e-9)
+        np.testing.assert_allclose(so3.log(R), [expected[1], expected[2], 0], atol=1e-8)
+        np.testing.assert_allclose(weak @ upright, 0.0, atol=1e-9)
 
 
-def test_known_transforms_are_found_again(target: GaussianMap) -> None:
-    rng = np.random.default_rng(1)
-    for _ in range(10):
-        R_true, t_true = so3.exp(rng.normal(0, 0.5, 3)), rng.normal(0, 1.0, 3)
-        source = (room(rng, 400, 0.01) - t_true) @ R_true
-        R, t = so3.exp(rng.normal(0, 0.01, 3)) @ R_true, t_true + rng.uniform(-0.15, 0.15, 3)
-        H, facts, step, iterations, converged, weak, _ = align(target, source, R, t)
-        assert converged
-        assert weak == 0
-        assert 3 < iterations < STEPS
-        assert np.linalg.norm(t - t_true) < 0.005
-        assert so3.angle(R @ R_true.T) < 0.001
-        assert np.linalg.norm(step[:3]) < 1e-3
-        assert facts[3] > 0.9 * len(source)
-        assert np.linalg.eigvalsh(H).min() > 0
-        np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-14)
+def test_surfaces_tell_what_is_observed_where_matrices_are_full() -> None:
+    H, g = random_problem(0, 6)
+    _, t, _, weak, _ = step(H, g, S=np.diag([0.0, 1, 1, 1, 1, 1]))
+    np.testing.assert_allclose(np.abs(weak), np.eye(6)[:1])
+    assert t[0] == pytest.approx(0.0, abs=1e-12)
+    assert len(step(H, g)[3]) == 0
 
 
-def test_it_stops_at_the_iterations_it_was_given(target: GaussianMap) -> None:
-    source = room(np.random.default_rng(2), 400, 0.01)
-    R, t = so3.exp(np.array([0.0, 0.0, 0.1])), np.array([0.3, 0.3, 0.0])
-    *_, iterations, converged, _, _ = align(target, source, R, t, steps=2)
-    assert (iterations, converged) == (2, False)
+def test_a_population_scales_the_information_and_not_the_step() -> None:
+    H, g = random_problem(1, 6)
+    R, t, _, _, sums = step(H, g)
+    R_few, t_few, _, _, scaled = step(H, g, S=H, population=600.0)
+    np.testing.assert_allclose(t_few, t, atol=1e-12)
+    np.testing.assert_allclose(R_few, R, atol=1e-12)
+    np.testing.assert_allclose(scaled[0], sums[0] / 10, rtol=1e-12)
+    for place, factor in ((at.INFORMATION, 10), (at.LEVER, 10), (at.MATCHED, 1)):
+        assert scaled[3][place] == pytest.approx(sums[3][place] / factor)
 
 
-def test_fewer_than_six_matches_move_nothing(target: GaussianMap) -> None:
-    source = room(np.random.default_rng(2), 400, 0.01)[:5]
-    R, t = np.eye(3), np.array([0.1, 0.0, 0.05])
-    _, facts, step, iterations, converged, _, _ = align(target, source, R, t)
-    assert facts[3] < 6
-    assert (iterations, converged) == (1, False)
-    np.testing.assert_array_equal(t, [0.1, 0.0, 0.05])
-    np.testing.assert_array_equal(R, np.eye(3))
-    np.testing.assert_array_equal(step, 0.0)
-
-
-@pytest.mark.parametrize("bad", [np.nan, np.inf, 1e200])
-def test_a_pose_that_is_no_pose_ends_at_once(target: GaussianMap, bad: float) -> None:
-    source = room(np.random.default_rng(2), 400, 0.01)
-    *_, iterations, converged, _, _ = align(target, source, np.eye(3), np.array([bad, 0.0, 0.0]))
-    assert (iterations, converged) == (1, False)
-
-
-def test_no_single_step_leaves_the_reach_of_the_correspondences() -> None:
-    # All normals nearly alike: along x the information is tiny and an unguarded step is huge.
-    rng = np.random.default_rng(3)
-    m = GaussianMap(0.8)
-    xy = rng.uniform(-6, 6, (20000, 2))
-    m.insert(np.column_stack([xy, 0.002 * xy[:, 0] ** 2 + rng.normal(0, 0.02, 20000)]).astype(np.float32), np.eye(4))
-    xy = rng.uniform(-5, 5, (300, 2))
-    source = np.column_stack([xy, 0.002 * xy[:, 0] ** 2 + 0.05 * xy[:, 0]])
-    R, t = np.eye(3), np.zeros(3)
-    _, _, step, *_ = align(m, source, R, t, steps=1, weak_share=0.0)
-    assert np.linalg.norm(step[:3]) <= 2.0 + 1e-12
-    assert np.linalg.norm(t) == pytest.approx(np.linalg.norm(step[:3]))
+def test_a_long_step_is_cut_and_one_that_is_no_number_not_made() -> None:
+    H, g = np.eye(6), np.array([-30.0, 0, 0, 0, 0, 0])
+    assert step(H, g, scale=1.0)[1][0] == pytest.approx(2.0)
+    assert step(H, g, scale=0.1)[1][0] == pytest.approx(1.0)
+    _, t, moved, _, _ = step(H, np.array([np.nan, 0, 0, 0, 0, 0]))
+    assert not moved
+    np.testing.assert_array_equal(t, 0.0)
 
 
 @pytest.mark.parametrize("share", [0.1, 0.5, 0.9])
@@ -172,13 +162,3 @@ def test_trimming_keeps_the_share_of_the_nearest(share: float, bound: float) -> 
     assert np.mean(candidates <= limit) == pytest.approx(share, abs=1.5 / len(candidates))
     assert gauss_newton.trimmed(away2[::-1].copy(), share, bound) == limit
     assert gauss_newton.trimmed(away2, 1.0, bound) == bound
-
-
-def test_a_bound_no_match_is_within_moves_nothing(target: GaussianMap) -> None:
-    floor = np.random.default_rng(2).uniform(-4, 4, (400, 3))
-    floor[:, 2] = -1.5 + 0.4
-    R, t = np.eye(3), np.zeros(3)
-    H, facts, *_ = align(target, floor, R, t, steps=1, farthest=0.3)
-    assert facts[3] > 300
-    np.testing.assert_array_equal(H, 0.0)
-    np.testing.assert_array_equal(t, 0.0)

@@ -8,9 +8,11 @@ from numpy.typing import NDArray
 from numpy_features import Match, gradient, normal_equations
 
 from lslam.geometry import so3
+from lslam.kernels import facts as at
 from lslam.kernels import lines
 from lslam.registration.feature_map import MIN_LINE_POINTS
 from lslam.registration.gaussian_map import FLOOR, GaussianMap
+from lslam.registration.optimiser import slots_of
 
 Floats = NDArray[np.float64]
 SIZE, SIGMA2 = 1.0, 1e-3
@@ -40,10 +42,10 @@ class LineScene:
 
     def linearise(self, c: float) -> tuple[Floats, Floats, Floats]:
         m, n = self.target, len(self.source)
-        H, g, facts = np.zeros((6, 6)), np.zeros(6), np.zeros(6)
+        H, S, g, facts = np.zeros((6, 6)), np.zeros((6, 6)), np.zeros(6), np.zeros(at.COUNT)
         lines.linearise_lines(
-            self.source, self.R, self.t, SIZE, c, SIGMA2, float(MIN_LINE_POINTS), FLOOR, m.moments, m.keys, m.table,
-            *self.rows, np.full(n, -1, np.int64), np.full((n, 8), -1, np.int32), H, g, facts,
+            (self.source,), (m.moments, m.keys, m.table, *self.rows), (SIZE, SIGMA2, float(MIN_LINE_POINTS), FLOOR),
+            slots_of(n), (self.R, self.t), (c, c, np.inf), (H, S, g, facts),
         )  # fmt: skip
         return np.triu(H) + np.triu(H, 1).T, g, facts
 
@@ -109,7 +111,7 @@ def test_a_pole_is_blind_along_itself_and_holds_both_directions_across() -> None
     scene.target.insert(pole, np.eye(4))
     scene.R, scene.t = np.eye(3), np.array([0.45, 0.52, 0.0])
     H, g, facts = scene.linearise(1.0)
-    assert facts[3] == 8
+    assert facts[at.MATCHED] == 8
     assert H[2, 2] < 1e-4 * H[0, 0]
     assert g[0] / H[0, 0] == pytest.approx(-0.05, abs=2e-3)
     assert g[1] / H[1, 1] == pytest.approx(0.02, abs=2e-3)

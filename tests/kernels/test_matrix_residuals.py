@@ -12,12 +12,12 @@ from numpy_residuals import GemanMcClure, Magnusson, Pair, disc_pairs, ndt_pairs
 from numpy_voxels import VoxelMap
 
 from lslam.geometry import so3
+from lslam.kernels import facts as at
 from lslam.kernels.discs import EXTENT2, source_discs
-from lslam.kernels.gicp_residual import linearise_gicp
-from lslam.kernels.ndt_residual import linearise_ndt
-from lslam.kernels.point_residual import linearise_point
-from lslam.kernels.vgicp_residual import linearise_vgicp
+from lslam.preprocessing.prepare import PreparedPoints
 from lslam.registration.gaussian_map import GaussianMap
+from lslam.registration.optimiser import Matches
+from lslam.registration.residuals import RESIDUALS as TABLE
 
 Floats = NDArray[np.float64]
 SIZE, SIGMA2, BLOB = 0.8, 9e-4, 0.5
@@ -78,24 +78,25 @@ def scene() -> Scene:
     return Scene(target, reference, source, covariance, R, t)
 
 
-def linearise(s: Scene, residual: str, c: float, gate2: float = np.inf, blob: float = BLOB, gap: float = 0.0) -> Sums:
-    n, m = len(s.source), s.target
-    H, g, facts, away2 = np.zeros((6, 6)), np.zeros(6), np.zeros(8), np.full(n, -1.0)
-    S = np.zeros((6, 6))
-    work = (np.full(n, -1, np.int64), np.full((n, 8), -1, np.int32), np.zeros(n, np.bool_), away2, H, S, g, facts)
-    pose = (s.R, s.t, m.size, c)
-    if residual == "point":
-        gaps = np.full(n, gap)
-        linearise_point(s.source, gaps, *pose, SIGMA2, gate2, m.planes, m.keys, m.table, *work[:5], *work[6:])
-    elif residual == "gicp":
-        linearise_gicp(s.source, s.covariance, *pose, SIGMA2, blob, gate2, m.planes, m.keys, m.table, *work)
-    elif residual == "vgicp":
-        linearise_vgicp(
-            s.source, s.covariance, *pose, SIGMA2, blob, gate2, m.planes, m.refreshed, m.keys, m.table, *work
-        )  # fmt: skip
-    else:
-        linearise_ndt(s.source, *pose, (c / 0.15) ** 2, gate2, m.shapes(), m.keys, m.table, *work)
-    return Sums(np.triu(H) + np.triu(H, 1).T, g, facts, away2, np.triu(S) + np.triu(S, 1).T)
+def linearise(
+    s: Scene,
+    residual: str,
+    c: float,
+    gate2: float = np.inf,
+    blob: float = BLOB,
+    gap: float = 0.0,
+    takes_all: bool = False,
+) -> Sums:
+    n, kind, matches = len(s.source), TABLE[residual], Matches(len(s.source))
+    H, S, g, facts = np.zeros((6, 6)), np.zeros((6, 6)), np.zeros(6), np.zeros(at.COUNT)
+    seen = PreparedPoints(
+        s.source.astype(np.float32), s.source, np.zeros((n, 6)), n, covariance=s.covariance, gaps=np.full(n, gap)
+    )
+    kind.linearise(
+        kind.points(seen, np.sqrt(SIGMA2)), kind.voxels(s.target), (s.target.size, SIGMA2, blob, takes_all), matches.search(),
+        (s.R, s.t), (c, 0.15, gate2), (H, S, g, facts),
+    )  # fmt: skip
+    return Sums(np.triu(H) + np.triu(H, 1).T, g, facts, matches.away2, np.triu(S) + np.triu(S, 1).T)
 
 
 def reference(s: Scene, residual: str, c: float, blob: float = BLOB) -> tuple[list[Pair], GemanMcClure | Magnusson]:
@@ -148,10 +149,10 @@ def test_normal_equations_are_those_of_numpy(scene: Scene, residual: str, c: flo
     np.testing.assert_allclose(found.g, g, rtol=1e-6, atol=1e-6 * np.abs(g).max())
     if residual != "point":
         np.testing.assert_allclose(found.S, S, rtol=1e-6, atol=1e-6 * np.abs(S).max())
-    assert found.facts[0] == pytest.approx(information, rel=1e-6)
-    assert found.facts[4] == pytest.approx(lever, rel=1e-6)
+    assert found.facts[at.INFORMATION] == pytest.approx(information, rel=1e-6)
+    assert found.facts[at.LEVER] == pytest.approx(lever, rel=1e-6)
     if residual == "vgicp":
-        assert found.facts[7] == pytest.approx(sum(p.weight for p in pairs), rel=1e-9)
+        assert found.facts[at.POPULATION] == pytest.approx(sum(p.weight for p in pairs), rel=1e-9)
 
 
 @pytest.mark.parametrize("residual", RESIDUALS)
@@ -166,12 +167,12 @@ def test_distances_and_counts_are_those_of_the_closest_pair(scene: Scene, residu
     assert 0 < is_matched.sum() < len(expected)
     np.testing.assert_allclose(found.away2[is_matched], expected[is_matched], rtol=1e-6, atol=1e-12)
     np.testing.assert_array_equal(found.away2[~is_matched], -1.0)
-    assert found.facts[3] == is_matched.sum()
+    assert found.facts[at.MATCHED] == is_matched.sum()
     width2 = c**2 + SIZE**2 if residual == "point" else c**2
-    assert found.facts[2] == (expected < width2).sum() > 0
+    assert found.facts[at.INLIERS] == (expected < width2).sum() > 0
     gated = linearise(scene, residual, c, 0.01)
     np.testing.assert_array_equal(gated.away2, found.away2)
-    np.testing.assert_array_equal(gated.facts[2:4], found.facts[2:4])
+    np.testing.assert_array_equal(gated.facts[[at.INLIERS, at.MATCHED]], found.facts[[at.INLIERS, at.MATCHED]])
 
 
 def test_a_mean_of_few_points_holds_nothing_where_rings_lie_far_apart(scene: Scene) -> None:
@@ -182,17 +183,18 @@ def test_a_mean_of_few_points_holds_nothing_where_rings_lie_far_apart(scene: Sce
         target.insert(points.astype(np.float32), np.eye(4))
     source = (np.vstack([sparse, dense]) - scene.t) @ scene.R
     few = Scene(target, scene.reference, source, scene.covariance[:2], scene.R, scene.t)
-    assert linearise(few, "point", 1.0, gap=0.9 * SIZE).facts[3] == 2
+    assert linearise(few, "point", 1.0, gap=0.9 * SIZE).facts[at.MATCHED] == 2
     left = linearise(few, "point", 1.0, gap=1.1 * SIZE)
-    assert left.facts[3] == 1
+    assert left.facts[at.MATCHED] == 1
     assert left.away2[0] == -1.0 < left.away2[1]
+    assert linearise(few, "point", 1.0, gap=1.1 * SIZE, takes_all=True).facts[at.MATCHED] == 2
 
 
 @pytest.mark.parametrize("residual", ["gicp", "vgicp"])
 def test_without_a_weight_blobs_stay_out(scene: Scene, residual: str) -> None:
     pairs, _ = reference(scene, residual, 0.5, blob=0.0)
-    counted = linearise(scene, residual, 0.5, blob=0.0).facts[3]
-    assert counted == len({p.index for p in pairs}) < linearise(scene, residual, 0.5).facts[3]
+    counted = linearise(scene, residual, 0.5, blob=0.0).facts[at.MATCHED]
+    assert counted == len({p.index for p in pairs}) < linearise(scene, residual, 0.5).facts[at.MATCHED]
 
 
 @pytest.mark.parametrize("residual", RESIDUALS)
@@ -208,8 +210,8 @@ def test_ndt_knows_no_voxel_that_holds_a_line(scene: Scene) -> None:
     wire = np.column_stack([np.linspace(-5, 5, 50), np.zeros(50), np.full(50, 2.5)])
     source = (wire + np.array([40.0, -25.0, 3.0]) - scene.t) @ scene.R
     on_wire = Scene(scene.target, scene.reference, source, scene.covariance[:50], scene.R, scene.t)
-    assert linearise(on_wire, "ndt", 1.0).facts[3] == 0
-    assert linearise(on_wire, "point", 1.0).facts[3] == 50
+    assert linearise(on_wire, "ndt", 1.0).facts[at.MATCHED] == 0
+    assert linearise(on_wire, "point", 1.0).facts[at.MATCHED] == 50
 
 
 def shapes_after(change: Callable[[GaussianMap], None]) -> Floats:

@@ -10,9 +10,11 @@ from numpy.typing import NDArray
 from numpy_voxels import Match, VoxelMap, matches
 
 from lslam.geometry import so3
+from lslam.kernels import facts as at
 from lslam.kernels import residuals
 from lslam.preprocessing.prepare import PreparedPoints
 from lslam.registration.gaussian_map import GaussianMap
+from lslam.registration.optimiser import Matches, slots_of
 
 Floats = NDArray[np.float64]
 SIZE, SIGMA2, BLOB = 0.8, 9e-4, 0.5
@@ -69,14 +71,14 @@ def linearise(
     s: Scene, R: Floats, t: Floats, c: float, blob: float = BLOB, gate2: float = np.inf,
     cache: tuple[NDArray[np.int64], NDArray[np.int32]] | None = None,
 ) -> tuple[Floats, Floats, Floats]:  # fmt: skip
-    n = len(s.points.source)
-    cells, slots = cache or (np.full(n, -1, np.int64), np.full((n, 8), -1, np.int32))
-    H, g, facts, is_done = np.zeros((6, 6)), np.zeros(6), np.zeros(6), np.zeros(n, np.bool_)
-    m, away2 = s.target, np.empty(n)
+    m, matches = s.target, Matches(len(s.points.source))
+    search = matches.search() if cache is None else (*cache, matches.is_done, matches.away2)
+    H, S, g, facts = np.zeros((6, 6)), np.zeros((6, 6)), np.zeros(6), np.zeros(at.COUNT)
     residuals.linearise(
-        s.points.source, s.points.scatter, R, t, m.size, c, SIGMA2, blob, gate2, m.planes, m.keys, m.table, cells, slots,
-        is_done, away2, H, g, facts,
+        (s.points.source, s.points.scatter), (m.planes, m.keys, m.table), (m.size, SIGMA2, blob, False), search,
+        (R, t), (c, c, gate2), (H, S, g, facts),
     )  # fmt: skip
+    np.testing.assert_array_equal(S, 0.0)
     # The kernel fills the upper triangle.
     return np.triu(H) + np.triu(H, 1).T, g, facts
 
@@ -90,7 +92,7 @@ def moved(R: Floats, t: Floats, d: Floats) -> tuple[Floats, Floats]:
 def test_gradient_is_that_of_the_robust_cost(scene: Scene, c: float, blob: float) -> None:
     found = scene.matches(blob)
     _, g, facts = linearise(scene, scene.R, scene.t, c, blob)
-    assert facts[3] == len(found)
+    assert facts[at.MATCHED] == len(found)
     assert {m.normal is None for m in found} == ({True, False} if blob else {False})
     h = 1e-5
     numeric = np.empty(6)
@@ -119,9 +121,9 @@ def test_normal_equations_are_those_of_numpy(scene: Scene, c: float) -> None:
     np.testing.assert_allclose(H, expected_H, rtol=1e-6, atol=1e-6 * np.abs(expected_H).max())
     np.testing.assert_allclose(g, expected_g, atol=1e-6 * np.abs(expected_g).max())
     np.testing.assert_array_equal(H, H.T)
-    assert facts[0] == pytest.approx(information, rel=1e-6)
-    assert facts[2] == inliers > 0
-    assert facts[4] == pytest.approx(lever, rel=1e-6)
+    assert facts[at.INFORMATION] == pytest.approx(information, rel=1e-6)
+    assert facts[at.INLIERS] == inliers > 0
+    assert facts[at.LEVER] == pytest.approx(lever, rel=1e-6)
 
 
 @pytest.mark.parametrize("gate", [0.02, 0.1])
@@ -133,7 +135,7 @@ def test_matches_beyond_the_gate_count_but_do_not_pull(scene: Scene, gate: float
         _, J = m.rows(scene.R, scene.t)
         expected += m.information(scene.R, scene.t, 0.5) * J.T @ J
     np.testing.assert_allclose(H, expected, rtol=1e-6, atol=1e-6 * np.abs(expected).max())
-    assert facts[3] == len(scene.matches()) > len(kept) > 0
+    assert facts[at.MATCHED] == len(scene.matches()) > len(kept) > 0
 
 
 def test_rmse_facts_are_those_of_the_planes(scene: Scene) -> None:
@@ -141,13 +143,13 @@ def test_rmse_facts_are_those_of_the_planes(scene: Scene) -> None:
     planes = [m for m in scene.matches() if m.normal is not None]
     r2 = np.array([m.distance2(scene.R, scene.t) for m in planes])
     robust = (0.09 / (0.09 + r2)) ** 2
-    assert facts[1] == pytest.approx(float(robust @ r2), rel=1e-6)
-    assert facts[5] == pytest.approx(float(robust.sum()), rel=1e-6)
+    assert facts[at.SQUARED] == pytest.approx(float(robust @ r2), rel=1e-6)
+    assert facts[at.ROBUST] == pytest.approx(float(robust.sum()), rel=1e-6)
 
 
 def test_the_octant_cache_gives_the_same_as_none(scene: Scene) -> None:
     n = len(scene.points.source)
-    cache = np.full(n, -1, np.int64), np.full((n, 8), -1, np.int32)
+    cache = slots_of(n)
     rng = np.random.default_rng(1)
     R, t = scene.R, scene.t
     kept = 0
@@ -186,28 +188,28 @@ def test_a_pose_far_off_matches_nothing(scene: Scene, where: float) -> None:
 
 def test_an_empty_map_and_an_empty_scan_match_nothing(scene: Scene) -> None:
     empty = Scene(GaussianMap(SIZE), VoxelMap(SIZE), scene.points, scene.R, scene.t)
-    assert linearise(empty, scene.R, scene.t, 1.0)[2].tolist() == [0.0] * 6
+    assert linearise(empty, scene.R, scene.t, 1.0)[2].tolist() == [0.0] * at.COUNT
     none = PreparedPoints(np.zeros((0, 3), np.float32), np.zeros((0, 3)), np.zeros((0, 6)), 0)
     H, _, facts = linearise(Scene(scene.target, scene.reference, none, scene.R, scene.t), scene.R, scene.t, 1.0)
-    assert facts.tolist() == [0.0] * 6
+    assert facts.tolist() == [0.0] * at.COUNT
     np.testing.assert_array_equal(H, 0.0)
 
 
 def test_a_coarser_map_serves_the_points_that_found_no_plane(scene: Scene) -> None:
     """Two calls with one list of done points add up to each point matched once, at the finest map that has a plane."""
-    n = len(scene.points.source)
-    is_done = np.zeros(n, np.bool_)
-    H, g, facts = np.zeros((6, 6)), np.zeros(6), np.zeros(6)
+    matches, sums = (
+        Matches(len(scene.points.source)),
+        (np.zeros((6, 6)), np.zeros((6, 6)), np.zeros(6), np.zeros(at.COUNT)),
+    )
     fine, coarse = scene.target, scene.target.coarsen(3)
     counts = []
     for m in (fine, coarse):
-        cells, slots = np.full(n, -1, np.int64), np.full((n, 8), -1, np.int32)
         residuals.linearise(
-            scene.points.source, scene.points.scatter, scene.R, scene.t, m.size, 0.5, SIGMA2, 0.0, np.inf, m.planes, m.keys,
-            m.table, cells, slots, is_done, np.empty(n), H, g, facts,
+            (scene.points.source, scene.points.scatter), (m.planes, m.keys, m.table), (m.size, SIGMA2, 0.0, False),
+            matches.search(), (scene.R, scene.t), (0.5, 0.5, np.inf), sums,
         )  # fmt: skip
-        counts.append(facts[3])
-        assert is_done.sum() == facts[3]
+        counts.append(sums[3][at.MATCHED])
+        assert matches.is_done.sum() == counts[-1]
     _, _, alone = linearise(scene, scene.R, scene.t, 0.5, 0.0)
-    assert counts[0] == alone[3]
+    assert counts[0] == alone[at.MATCHED]
     assert counts[1] > counts[0]

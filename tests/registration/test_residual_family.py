@@ -14,14 +14,14 @@ from lslam.config.registration import RegistrationConfig, Residual
 from lslam.geometry import se3
 from lslam.preprocessing.prepare import prepare_points
 from lslam.registration.registration import Registration
-from lslam.registration.residuals import KERNELS
+from lslam.registration.residuals import RESIDUALS as TABLE
 from lslam.registration.robust import Annealing
 from lslam.registration.solver import solve
 from lslam.registration.uncertainty import PoseUncertainty
 from lslam.simulation.scenarios import simulate
 
 Floats = NDArray[np.float64]
-RESIDUALS: list[Residual] = list(KERNELS)  # type: ignore[arg-type]
+RESIDUALS: list[Residual] = list(TABLE)
 # m, deg: a point finds the mean of a voxel, not the place where it lies, so its residual averages out only.
 ROOM = {"plane": (0.01, 0.05), "point": (0.06, 0.3), "gicp": (0.01, 0.05), "vgicp": (0.01, 0.05), "ndt": (0.01, 0.05)}
 

@@ -1,0 +1,173 @@
+"""The one optimiser: annealed Gauss-Newton over whatever residuals are handed to it.
+
+The kernels hold no GIL; between two of them there is a handful of Python, microseconds of the milliseconds that a scan takes.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.geometry import se3
+from lslam.kernels import facts as at
+from lslam.kernels.gauss_newton import UNSEEN, step, trimmed
+from lslam.registration.robust import Annealing
+
+Floats = NDArray[np.float64]
+
+# A step below these ends the iteration: a tenth of the noise of a point, and what that is at 10 m.
+STEP_M, STEP_RAD = 1e-3, 1e-4
+# Fewer matches than a pose has directions say nothing.
+LEAST_MATCHED = 6
+EVERYWHERE: Floats = np.zeros((0, 6))
+
+
+class Matches:
+    """Which of `count` points are matched in an iteration, and their squared distances: what the maps of a scan share."""
+
+    def __init__(self, count: int) -> None:
+        self.is_done = np.zeros(count, np.bool_)
+        self.away2 = np.full(count, -1.0)
+
+    def clear(self) -> None:
+        """Nothing is matched."""
+        self.is_done.fill(False)
+        self.away2.fill(-1.0)
+
+    def search(self) -> tuple[Any, ...]:
+        """What a residual on voxels remembers, of one map, see `kernels.linearisation`."""
+        return *slots_of(len(self.away2)), self.is_done, self.away2
+
+
+def slots_of(count: int) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
+    """Octant cells and slots of so many points, nothing looked up yet."""
+    return np.full(count, -1, np.int64), np.full((count, 8), -1, np.int32)
+
+
+@dataclass(frozen=True)
+class Term:
+    """A residual of some points on one map: its compiled `linearise` and what this takes, see `kernels.linearisation`.
+
+    is_fine : whether its inliers are counted as `Facts.fine_inliers`
+    """
+
+    linearise: Callable[..., None]
+    points: tuple[Any, ...]
+    target: tuple[Any, ...]
+    settings: tuple[float, ...]
+    search: tuple[Any, ...] = ()
+    is_fine: bool = True
+
+
+@dataclass(frozen=True)
+class Limits:
+    """When a direction counts as observed, and which may be stepped in.
+
+    weak_share : part of the information below which it does not; least : 1/m2, likewise
+    unseen : part of either below which it is not even followed
+    by_surfaces : the residual's matrices are full, and its surfaces alone tell
+    allowed : (6, 6) projector on the directions of the steps; no rows: all
+    """
+
+    weak_share: float
+    least: float = 0.0
+    unseen: float = UNSEEN
+    by_surfaces: bool = False
+    allowed: Floats = field(default_factory=lambda: EVERYWHERE)
+
+
+@dataclass(frozen=True)
+class Facts:
+    """What the last linearisation says beside its normal equations.
+
+    information : its sum, 1/m2; lever_information : times the squared lever arm of each point
+    squared : weighted squared residuals, m2; robust : the sum of their weights
+    matched : points that found a counterpart; inliers : those within the kernel's width; fine_inliers : of the fine terms
+    """
+
+    information: float
+    squared: float
+    inliers: int
+    fine_inliers: int
+    matched: int
+    lever_information: float
+    robust: float
+
+    @property
+    def lever_arm(self) -> float:
+        """Root mean square, m, by information."""
+        return math.sqrt(max(self.lever_information / max(self.information, 1e-300), 1e-6))
+
+    @property
+    def rmse(self) -> float:
+        """Weighted residual, m."""
+        return math.sqrt(self.squared / max(self.robust, 1e-12))
+
+
+@dataclass(frozen=True)
+class Optimum:
+    """Where the iterations ended: pose (4, 4), H (6, 6) and facts of the last one, and its step (6,).
+
+    weak : (K, 6) unobserved directions, unit rows, rotations scaled by the lever arm
+    """
+
+    pose: Floats
+    H: Floats
+    facts: Facts
+    step: Floats
+    iterations: int
+    converged: bool
+    weak: Floats
+
+
+def optimise(
+    terms: Sequence[Term], T_start: Floats, annealing: Annealing, limits: Limits, matches: Matches, *,
+    inlier_distance: float = np.inf, inlier_ratio: float = 1.0,
+) -> Optimum:  # fmt: skip
+    """Step from `T_start` (4, 4) until, at the kernel's end width, a step is below `STEP_M` and `STEP_RAD`.
+
+    Every step linearises all terms anew, in their order: on several maps the finest first. Correspondences beyond
+    `inlier_distance`, m, are rejected, and from the second step on those of `matches` beyond the distance within which the
+    nearest `inlier_ratio` of the last step's lay.
+    """
+    pose = np.ascontiguousarray(T_start[:3, :3], np.float64).copy(), np.array(T_start[:3, 3], np.float64)
+    # One buffer, so that one call clears it.
+    buffer = np.zeros(78 + at.COUNT)
+    H, S, g, facts = buffer[:36].reshape(6, 6), buffer[36:72].reshape(6, 6), buffer[72:78], buffer[78:]
+    sums, d, weak, count = (H, S, g, facts), np.zeros(6), np.zeros((6, 6)), 0
+    bounds = (float(limits.weak_share), float(limits.least), float(limits.unseen), limits.by_surfaces)
+    scale, end = float(annealing.start), float(annealing.end)
+    farthest2 = gate2 = float(inlier_distance) ** 2
+    fine, iterations, converged = 0, 0, False
+    while iterations < annealing.steps and not converged:
+        iterations += 1
+        buffer.fill(0.0)
+        matches.clear()
+        width = (scale, end, gate2)
+        for term in terms:
+            term.linearise(term.points, term.target, term.settings, term.search, pose, width, sums)
+            if term.is_fine:
+                fine = int(facts[at.INLIERS])
+        if facts[at.MATCHED] < LEAST_MATCHED:
+            break
+        is_moved, count, move, turn = step(pose, sums, scale, bounds, limits.allowed, d, weak)
+        if not is_moved:
+            break
+        converged = scale <= end and move < STEP_M and turn < STEP_RAD
+        scale = max(scale * annealing.decay, end)
+        if inlier_ratio < 1.0:
+            gate2 = trimmed(matches.away2, float(inlier_ratio), farthest2)
+    return Optimum(se3.make(*pose), H, _named(facts, fine), d, iterations, converged, weak[:count])
+
+
+def _named(facts: Floats, fine: int) -> Facts:
+    f = facts.tolist()
+    return Facts(
+        information=f[at.INFORMATION], squared=f[at.SQUARED], inliers=int(f[at.INLIERS]), fine_inliers=fine,
+        matched=int(f[at.MATCHED]), lever_information=f[at.LEVER], robust=f[at.ROBUST],
+    )  # fmt: skip

@@ -1,0 +1,174 @@
+"""The one loop: known transforms found again on any number of maps, an end in every case, and a new residual in a line."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from analytic_scenes import is_near, random_pose, seen_from
+from numpy.typing import NDArray
+
+from lslam.geometry import se3, so3
+from lslam.kernels import facts as at
+from lslam.kernels.linearisation import Floats
+from lslam.preprocessing.prepare import PreparedPoints
+from lslam.registration.gaussian_map import GaussianMap
+from lslam.registration.optimiser import Limits, Matches, Optimum, Term, optimise
+from lslam.registration.residuals import RESIDUALS
+from lslam.registration.robust import Annealing
+from lslam.registration.solver import solve, voxel_terms
+
+STEPS = 30
+
+
+def room(rng: np.random.Generator, n: int, noise: float) -> Floats:
+    """Floor and two walls: all six directions are seen."""
+    u = rng.uniform(-6, 6, (3, n, 2))
+    floor = np.column_stack([u[0], rng.normal(-1.5, noise, n)])
+    wall = np.column_stack([u[1, :, 0], rng.normal(6.0, noise, n), u[1, :, 1] / 2 + 1.5])
+    side = np.column_stack([rng.normal(6.0, noise, n), u[2, :, 0], u[2, :, 1] / 2 + 1.5])
+    return np.concatenate([floor, wall, side])
+
+
+@pytest.fixture(scope="module")
+def target() -> GaussianMap:
+    m = GaussianMap(0.8)
+    m.insert(room(np.random.default_rng(0), 6000, 0.01).astype(np.float32), np.eye(4))
+    return m
+
+
+def align(
+    m: GaussianMap, source: Floats, R: Floats, t: Floats, steps: int = STEPS, weak_share: float = 1e-3,
+    farthest: float = np.inf,
+) -> Optimum:  # fmt: skip
+    matches = Matches(len(source))
+    terms = voxel_terms(RESIDUALS["plane"], (source, np.zeros((len(source), 6))), [m], matches, 0.03, 0.5)
+    return optimise(
+        terms, se3.make(R, t), Annealing(1.0, 0.1, 0.5, steps), Limits(weak_share), matches, inlier_distance=farthest
+    )
+
+
+def test_known_transforms_are_found_again(target: GaussianMap) -> None:
+    rng = np.random.default_rng(1)
+    for _ in range(10):
+        R_true, t_true = so3.exp(rng.normal(0, 0.5, 3)), rng.normal(0, 1.0, 3)
+        source = (room(rng, 400, 0.01) - t_true) @ R_true
+        R, t = so3.exp(rng.normal(0, 0.01, 3)) @ R_true, t_true + rng.uniform(-0.15, 0.15, 3)
+        found = align(target, source, R, t)
+        assert found.converged
+        assert len(found.weak) == 0
+        assert 3 < found.iterations < STEPS
+        assert np.linalg.norm(found.pose[:3, 3] - t_true) < 0.005
+        assert so3.angle(found.pose[:3, :3] @ R_true.T) < 0.001
+        assert np.linalg.norm(found.step[:3]) < 1e-3
+        assert found.facts.matched > 0.9 * len(source)
+        assert np.linalg.eigvalsh(found.H).min() > 0
+        np.testing.assert_allclose(found.pose[:3, :3] @ found.pose[:3, :3].T, np.eye(3), atol=1e-14)
+
+
+def test_it_stops_at_the_iterations_it_was_given(target: GaussianMap) -> None:
+    source = room(np.random.default_rng(2), 400, 0.01)
+    found = align(target, source, so3.exp(np.array([0.0, 0.0, 0.1])), np.array([0.3, 0.3, 0.0]), steps=2)
+    assert (found.iterations, found.converged) == (2, False)
+
+
+def test_fewer_than_six_matches_move_nothing(target: GaussianMap) -> None:
+    source = room(np.random.default_rng(2), 400, 0.01)[:5]
+    start = se3.make(np.eye(3), np.array([0.1, 0.0, 0.05]))
+    found = align(target, source, start[:3, :3], start[:3, 3])
+    assert found.facts.matched < 6
+    assert (found.iterations, found.converged) == (1, False)
+    np.testing.assert_array_equal(found.pose, start)
+    np.testing.assert_array_equal(found.step, 0.0)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, 1e200])
+def test_a_pose_that_is_no_pose_ends_at_once(target: GaussianMap, bad: float) -> None:
+    found = align(target, room(np.random.default_rng(2), 400, 0.01), np.eye(3), np.array([bad, 0.0, 0.0]))
+    assert (found.iterations, found.converged) == (1, False)
+
+
+def test_no_single_step_leaves_the_reach_of_the_correspondences() -> None:
+    # All normals nearly alike: along x the information is tiny and an unguarded step is huge.
+    rng = np.random.default_rng(3)
+    m = GaussianMap(0.8)
+    xy = rng.uniform(-6, 6, (20000, 2))
+    m.insert(np.column_stack([xy, 0.002 * xy[:, 0] ** 2 + rng.normal(0, 0.02, 20000)]).astype(np.float32), np.eye(4))
+    xy = rng.uniform(-5, 5, (300, 2))
+    source = np.column_stack([xy, 0.002 * xy[:, 0] ** 2 + 0.05 * xy[:, 0]])
+    found = align(m, source, np.eye(3), np.zeros(3), steps=1, weak_share=0.0)
+    assert np.linalg.norm(found.step[:3]) <= 2.0 + 1e-12
+    assert np.linalg.norm(found.pose[:3, 3]) == pytest.approx(np.linalg.norm(found.step[:3]))
+
+
+def test_a_bound_no_match_is_within_moves_nothing(target: GaussianMap) -> None:
+    floor = np.random.default_rng(2).uniform(-4, 4, (400, 3))
+    floor[:, 2] = -1.5 + 0.4
+    found = align(target, floor, np.eye(3), np.zeros(3), steps=1, farthest=0.3)
+    assert found.facts.matched > 300
+    np.testing.assert_array_equal(found.H, 0.0)
+    np.testing.assert_array_equal(found.pose, np.eye(4))
+
+
+def test_a_start_that_is_no_contiguous_array_is_left_alone(target: GaussianMap) -> None:
+    source = room(np.random.default_rng(2), 400, 0.01)
+    start = se3.make(so3.exp(np.array([0.0, 0.0, 0.01])), np.array([0.05, 0.0, 0.0]))
+    turned = np.asfortranarray(start)
+    np.testing.assert_array_equal(
+        align(target, source, start[:3, :3], start[:3, 3]).pose,
+        align(target, source, turned[:3, :3], turned[:3, 3]).pose,
+    )
+    np.testing.assert_array_equal(turned, start)
+
+
+def test_the_facts_are_named() -> None:
+    """A term that only sums up: every fact arrives under its own name, and the fine inliers without those of the others."""
+    places = [at.INFORMATION, at.SQUARED, at.INLIERS, at.MATCHED, at.LEVER, at.ROBUST]
+
+    def sum_up(points: object, target: object, settings: object, search: object, pose: object, width: object,
+               sums: tuple[Floats, ...]) -> None:  # fmt: skip
+        sums[0][:] += np.eye(6)
+        sums[3][places] += [4.0, 9.0, 20.0, 30.0, 16.0, 1.0]
+
+    fine = Term(sum_up, (), (), ())
+    found = optimise(
+        [fine, replace(fine, is_fine=False)], np.eye(4), Annealing(1.0, 1.0, 0.5, 1), Limits(1e-3), Matches(0)
+    )
+    facts = found.facts
+    assert (facts.information, facts.squared, facts.lever_information, facts.robust) == (8.0, 18.0, 32.0, 2.0)
+    assert (facts.inliers, facts.fine_inliers, facts.matched) == (40, 20, 60)
+    assert facts.lever_arm == 2.0
+    assert facts.rmse == 3.0
+
+
+def as_source(points: NDArray[np.float32]) -> PreparedPoints:
+    return PreparedPoints(points, points.astype(np.float64), np.zeros((len(points), 6)), len(points))
+
+
+@pytest.mark.parametrize("residual", list(RESIDUALS))
+def test_each_map_serves_what_the_finer_ones_left(residual: str) -> None:
+    """Three maps: of floor, of one wall, of the other. Only all three hold the pose."""
+    world = room(np.random.default_rng(0), 20000, 0.01)
+    thirds = np.array_split(world, 3)
+    levels = []
+    for k, part in enumerate(thirds):
+        level = GaussianMap(0.5 * 2**k)
+        level.insert(part.astype(np.float32), np.eye(4))
+        levels.append(level)
+    rng = np.random.default_rng(1)
+    T = random_pose(rng, 0.1, 0.5)
+    scan = as_source(seen_from(room(rng, 400, 0.01), T))
+
+    def found(count: int) -> tuple[int, int, Floats]:
+        result = solve(
+            levels[0], scan, np.eye(4), Annealing(1.0, 0.15, 0.7, 40), sigma=0.03, blob_weight=0.0, weak_share=1e-3,
+            coarser=levels[1:count], residual=residual,
+        )  # fmt: skip
+        return result.matched, result.fine_inliers, result.T_world_lidar
+
+    matched, fine = zip(*(found(k)[:2] for k in (1, 2, 3)), strict=True)
+    assert matched[0] < matched[1] < matched[2]
+    assert 0 < max(fine) <= len(scan.source) / 2
+    # The mean of a voxel of two metres is no place to draw a point to.
+    assert residual == "point" or is_near(T, found(3)[2], 0.02, 0.1)
