@@ -16,6 +16,7 @@ from lslam.cli import options
 from lslam.cli.console import log, progress, setup_logging, show
 from lslam.cli.signals import GentleStop, gentle_stop
 from lslam.errors import RunFinishedError, UsageError
+from lslam.registration.residuals import RESIDUALS
 
 if TYPE_CHECKING:
     from lslam.config import Config
@@ -35,7 +36,7 @@ if TYPE_CHECKING:
 @click.argument("sequence")
 @click.option("--method", metavar="NAME", help="Odometry method, see `lslam methods` [default: icp].")
 @options.preset
-@click.option("--residual", metavar="NAME", help="Of --method icp: point, plane, gicp, vgicp or ndt [default: plane].")
+@click.option("--residual", metavar="NAME", help=f"Of --method icp: {', '.join(RESIDUALS)} [default: plane].")
 @click.option(
     "--gt", type=click.Path(path_type=Path), metavar="FILE", help="Ground truth instead of the sequence's own."
 )

@@ -8,12 +8,12 @@ from dataclasses import replace
 import numpy as np
 
 from lslam.config.config import Config
-from lslam.config.registration import Residual
 from lslam.errors import UsageError
 from lslam.odometry.outcome import of_registration
 from lslam.preprocessing.deskew import deskew
 from lslam.preprocessing.prepare import PreparedPoints, prepare_points
 from lslam.registration.registration import Registration
+from lslam.registration.residuals import RESIDUALS
 from lslam.registration.solver import RegistrationResult
 from lslam.registration.uncertainty import PoseUncertainty
 from lslam.types.motion_prior import MotionPrior
@@ -21,17 +21,16 @@ from lslam.types.scan import Scan
 from lslam.types.scan_result import ScanResult
 from lslam.types.state import Stateful
 
-# Methods named after their residual; `icp` is the plane unless told otherwise.
-RESIDUALS: dict[str, Residual] = {"icp-point": "point", "gicp": "gicp", "vgicp": "vgicp", "ndt": "ndt"}
-
 
 def create(config: Config) -> Icp:
     """The method as the configuration wants it.
 
-    `icp` takes any residual; the others are named after theirs. Raises UsageError when one is asked for another.
+    `icp` takes any residual; the others are named after theirs, with or without `icp-` before it. Raises UsageError when
+    one is asked for another.
     """
     method, chosen = config.odometry.method, config.registration.residual
-    own = RESIDUALS.get(method)
+    name = method.removeprefix("icp-")
+    own = name if name in RESIDUALS else None
     if own is not None and chosen not in (None, own):
         raise UsageError(
             f"method {method!r} measures by the residual {own!r}, registration.residual asks for {chosen!r}: "

@@ -8,6 +8,7 @@ from lslam.errors import UsageError, nearest
 from lslam.evaluation.relative import parse_delta
 from lslam.maps.mesh import require_open3d
 from lslam.odometry import FEATURE_METHODS, METHODS, known_methods
+from lslam.registration.residuals import residual_named
 
 # Methods that match a scan against Gaussian voxels, and what of `registration` only some methods look at.
 ON_GAUSSIANS = tuple(name for name, (module, _) in METHODS.items() if module == METHODS["icp"][0])
@@ -37,6 +38,8 @@ def check_config(config: Config) -> None:
         raise UsageError("--imu does nothing with --poses, whose motion is given: drop one of them")
     if config.map.write and (config.map.denoise or config.map.mesh):
         require_open3d()
+    if config.registration.residual is not None:
+        residual_named(config.registration.residual)
     _check_heeded(config)
     if not config.osm.extract and (config.osm.origin is not None or config.osm.heading_deg is not None):
         raise UsageError("--origin and --heading do nothing without --osm FILE: give it, or drop them")

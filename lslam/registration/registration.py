@@ -18,7 +18,7 @@ from lslam.registration.alignment import MapAlignment
 from lslam.registration.gaussian_map import GaussianMap
 from lslam.registration.motion import ConstantVelocity
 from lslam.registration.recent_scans import RecentScans
-from lslam.registration.residuals import NEEDS_COVARIANCE
+from lslam.registration.residuals import NEEDS_COVARIANCE, residual_named
 from lslam.registration.robust import AdaptiveThreshold, UsualAgreement
 from lslam.registration.solver import RegistrationResult
 from lslam.registration.source_covariance import source_covariance
@@ -74,6 +74,7 @@ class Registration(Stateful):
         self.config = config or RegistrationConfig()
         self.preprocess = preprocess or PreprocessConfig()
         self.residual: Residual = self.config.residual or "plane"
+        residual_named(self.residual)
         self.target = make_target(self.config.target, self.config.keyframes)
         self.map = GaussianMap(
             self.config.voxel_size * (POINT_VOXEL if self.residual == "point" else 1.0),

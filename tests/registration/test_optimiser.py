@@ -2,20 +2,27 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from analytic_scenes import is_near, random_pose, seen_from
+from analytic_scenes import room as lit_room
 from numpy.typing import NDArray
 
+from lslam.config.registration import RegistrationConfig
+from lslam.errors import UsageError
 from lslam.geometry import se3, so3
 from lslam.kernels import facts as at
-from lslam.kernels.linearisation import Floats
+from lslam.kernels.jit import kernel
+from lslam.kernels.linearisation import Floats, Pose, Search, Settings, Sums, Width
+from lslam.kernels.residuals import Voxels, add_row, nearest, octant_slots
 from lslam.preprocessing.prepare import PreparedPoints
 from lslam.registration.gaussian_map import GaussianMap
 from lslam.registration.optimiser import Limits, Matches, Optimum, Term, optimise
-from lslam.registration.residuals import RESIDUALS
+from lslam.registration.registration import Registration
+from lslam.registration.residuals import RESIDUALS, ResidualKind
 from lslam.registration.robust import Annealing
 from lslam.registration.solver import solve, voxel_terms
 
@@ -172,3 +179,52 @@ def test_each_map_serves_what_the_finer_ones_left(residual: str) -> None:
     assert 0 < max(fine) <= len(scan.source) / 2
     # The mean of a voxel of two metres is no place to draw a point to.
     assert residual == "point" or is_near(T, found(3)[2], 0.02, 0.1)
+
+
+@kernel
+def linearise_cauchy(points: tuple[Floats, Floats], voxels: Voxels, settings: Settings, search: Search, pose: Pose,
+                     width: Width, sums: Sums) -> None:  # fmt: skip
+    """Point to plane with the weight of Cauchy, of planes alone."""
+    source, _ = points
+    planes, keys, table = voxels
+    cells, slots, is_done, away2 = search
+    R, t = pose
+    H, _, g, facts = sums
+    for i in range(len(source)):
+        if is_done[i]:
+            continue
+        r = R @ source[i]
+        x, y, z = r[0] + t[0], r[1] + t[1], r[2] + t[2]
+        octant_slots(x, y, z, i, 1.0 / settings[0], cells, slots, keys, table)
+        best, _, _, _ = nearest(x, y, z, i, slots, planes)
+        if best < 0:
+            continue
+        p = planes[best]
+        e = p[3] * (x - p[0]) + p[4] * (y - p[1]) + p[5] * (z - p[2])
+        robust = 1.0 / (1.0 + (e / width[0]) ** 2)
+        w = robust / (p[6] + settings[1])
+        j3, j4, j5 = r[1] * p[5] - r[2] * p[4], r[2] * p[3] - r[0] * p[5], r[0] * p[4] - r[1] * p[3]
+        add_row(H, g, w, e, p[3], p[4], p[5], j3, j4, j5)
+        is_done[i], away2[i] = True, e * e
+        facts[at.INFORMATION] += w
+        facts[at.SQUARED] += robust * e * e
+        facts[at.INLIERS] += math.fabs(e) < width[0]
+        facts[at.MATCHED] += 1.0
+        facts[at.LEVER] += w * (r[0] * r[0] + r[1] * r[1] + r[2] * r[2])
+        facts[at.ROBUST] += robust
+
+
+def test_a_new_residual_is_a_kernel_and_a_line_in_the_table(monkeypatch: pytest.MonkeyPatch) -> None:
+    config = RegistrationConfig(residual="cauchy")
+    with pytest.raises(UsageError, match="no residual 'cauchy'"):
+        Registration(config)
+    monkeypatch.setitem(RESIDUALS, "cauchy", ResidualKind(__name__, "linearise_cauchy"))
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        registration = Registration(config)
+        registration.register(lit_room(rng).astype(np.float32))
+        T = random_pose(rng, 1.0, 3.0)
+        result = registration.register(seen_from(lit_room(rng), T))
+        assert result.ok
+        assert result.converged
+        assert is_near(T, result.T_world_lidar, 0.01, 0.05)
