@@ -17,12 +17,12 @@ if TYPE_CHECKING:
     from lslam.evaluation.evaluate import evaluate
     from lslam.pipeline.run import run
     from lslam.readers import open_sequence
-    from lslam.registration.registration import Registration
+    from lslam.recovery.policies import RecoveringRegistration as Registration
 
 __all__ = ["Registration", "__version__", "evaluate", "open_sequence", "run"]
 
 _HOMES = {
-    "Registration": "lslam.registration.registration",
+    "Registration": "lslam.recovery.policies",
     "evaluate": "lslam.evaluation.evaluate",
     "open_sequence": "lslam.readers",
     "run": "lslam.pipeline.run",

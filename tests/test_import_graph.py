@@ -17,6 +17,7 @@ LAYERS = [
     ["pipeline"],
     ["reports"],
     ["readers", "odometry", "inertial", "loops", "graph", "priors", "maps", "evaluation", "simulation"],
+    ["recovery"],
     ["keyframes", "registration"],
     ["preprocessing"],
     ["formats"],

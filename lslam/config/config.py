@@ -15,6 +15,7 @@ from lslam.config.map import MapConfig
 from lslam.config.odometry import OdometryConfig
 from lslam.config.osm import OsmConfig
 from lslam.config.preprocess import PreprocessConfig
+from lslam.config.recovery import RecoveryConfig
 from lslam.config.registration import RegistrationConfig
 from lslam.config.report import ReportConfig
 from lslam.config.section import Section
@@ -27,6 +28,7 @@ class Config(Section):
     preprocess: PreprocessConfig = PreprocessConfig()
     odometry: OdometryConfig = OdometryConfig()
     registration: RegistrationConfig = RegistrationConfig()
+    recovery: RecoveryConfig = RecoveryConfig()
     loam: LoamConfig = LoamConfig()
     imu: ImuConfig = ImuConfig()
     keyframes: KeyframesConfig = KeyframesConfig()

@@ -1,7 +1,8 @@
 """The local map's voxels, each a running Gaussian.
 
 Layout, one row per slot of the pool:
-    moments (C, 10) float64 : n, sum x y z, sum xx xy xz yy yz zz, relative to the voxel centre
+    moments (C, 13) float64 : n, sum x y z, sum xx xy xz yy yz zz, sum of the sensor's x y z when the points were seen, all
+        relative to the voxel centre
     planes (C, 8) float64 : mean x y z (world), normal x y z, variance along the normal, tilt: the variance of the normal's
         direction, rad2, or BLOB or EMPTY; one cache line, all that a residual needs
     keys (C,) int64 : packed voxel, FREE when the slot is unused
@@ -12,6 +13,8 @@ Layout, one row per slot of the pool:
 """
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +29,9 @@ Ints = NDArray[np.int32]
 
 FREE = -1
 EMPTY, BLOB = -2.0, -1.0
+# Of the largest variance of a blob: how broad it must be across the beams that saw it. A bush is as deep as it is wide, a
+# ring that bends in its voxel is a strip.
+SOLID = 0.1
 USED, FREED, HAND, LIVE = 0, 1, 2, 3
 
 
@@ -84,8 +90,13 @@ def _release(slot: int, keys: Longs, table: Ints, state: Longs, free: Ints, plan
 
 @inline
 def _refresh(slot: int, size: float, moments: Floats, planes: Floats, keys: Longs, min_points: float,
-             planarity: float, floor: float) -> None:  # fmt: skip
-    """Mean, normal and kind of one voxel from its moments."""
+             planarity: float, floor: float, breadth: float) -> None:  # fmt: skip
+    """Mean, normal and kind of one voxel from its moments.
+
+    What one ring of one scan hits lies on the cone of its beams, and so does what it hits next, wherever the sensor went: a
+    voxel of such points is `EMPTY`, because they tell where the sensor is, not where a surface is. It is matched when its
+    points spread across the beams by `breadth` times the variance of the surface; 0 asks for nothing.
+    """
     s = moments[slot]
     n = s[0]
     w = 1.0 / n
@@ -98,12 +109,17 @@ def _refresh(slot: int, size: float, moments: Floats, planes: Floats, keys: Long
     if n < min_points:
         p[7] = EMPTY
         return
-    l0, l1, l2, nx, ny, nz = plane_of(
-        s[4] * w - mx * mx, s[5] * w - mx * my, s[6] * w - mx * mz,
-        s[7] * w - my * my, s[8] * w - my * mz, s[9] * w - mz * mz,
-    )  # fmt: skip
+    xx, xy, xz = s[4] * w - mx * mx, s[5] * w - mx * my, s[6] * w - mx * mz
+    yy, yz, zz = s[7] * w - my * my, s[8] * w - my * mz, s[9] * w - mz * mz
+    l0, l1, l2, nx, ny, nz = plane_of(xx, xy, xz, yy, yz, zz)
     # Planarity as in the field: (l1 - l0) / l2 is 1 on a disc, 0 on a line or a ball.
-    if l1 - l0 >= planarity * max(l2, 1e-12):
+    is_plane = l1 - l0 >= planarity * max(l2, 1e-12)
+    if breadth > 0.0:
+        across = breadth_of(xx, xy, xz, yy, yz, zz, mx - s[10] * w, my - s[11] * w, mz - s[12] * w)
+        if across < (breadth * (max(l0, 0.0) + floor) if is_plane else SOLID * l2):
+            p[7] = EMPTY
+            return
+    if is_plane:
         p[3], p[4], p[5] = nx, ny, nz
         p[6] = max(l0, 0.0) + floor
         # A strip of few points fixes its own height but hardly its slope across.
@@ -113,11 +129,47 @@ def _refresh(slot: int, size: float, moments: Floats, planes: Floats, keys: Long
         p[7] = BLOB
 
 
+@inline
+def _add_rotated(q: Floats, R: Floats, s: Floats) -> None:
+    """Add R Q R^T to the second moments, Q the symmetric matrix xx xy xz yy yz zz."""
+    j = 4
+    for r in range(3):
+        x = R[r, 0] * q[0] + R[r, 1] * q[1] + R[r, 2] * q[2]
+        y = R[r, 0] * q[1] + R[r, 1] * q[3] + R[r, 2] * q[4]
+        z = R[r, 0] * q[2] + R[r, 1] * q[4] + R[r, 2] * q[5]
+        for c in range(r, 3):
+            s[j] += x * R[c, 0] + y * R[c, 1] + z * R[c, 2]
+            j += 1
+
+
+@inline
+def breadth_of(xx: float, xy: float, xz: float, yy: float, yz: float, zz: float, dx: float, dy: float,
+               dz: float) -> float:  # fmt: skip
+    """Smaller variance, m2, of points of covariance xx..zz across the beams that saw them, which come along d.
+
+    The smaller eigenvalue of the covariance seen along d: of all planes through the sensor, the one that fits best leaves it.
+    """
+    d2 = dx * dx + dy * dy + dz * dz
+    if d2 < 1e-12:
+        return 0.0
+    along = (
+        xx * dx * dx + yy * dy * dy + zz * dz * dz + 2.0 * (xy * dx * dy + xz * dx * dz + yz * dy * dz)
+    ) / d2  # fmt: skip
+    total = xx + yy + zz - along
+    product = (
+        (yy * zz - yz * yz) * dx * dx + (xx * zz - xz * xz) * dy * dy + (xx * yy - xy * xy) * dz * dz
+        + 2.0 * ((xz * yz - xy * zz) * dx * dy + (xy * yz - xz * yy) * dx * dz + (xy * xz - xx * yz) * dy * dz)
+    ) / d2  # fmt: skip
+    return 0.5 * (total - math.sqrt(max(total * total - 4.0 * product, 0.0)))
+
+
 @kernel
-def insert(points: NDArray[np.float32], R: Floats, t: Floats, size: float, cap: float, min_points: float,
-           planarity: float, floor: float, reach: float, moments: Floats, planes: Floats, keys: Longs,
+def insert(points: NDArray[np.float32], scatter: Floats, R: Floats, t: Floats, size: float, cap: float, min_points: float,
+           planarity: float, floor: float, breadth: float, reach: float, moments: Floats, planes: Floats, keys: Longs,
            refreshed: Floats, table: Ints, state: Longs, free: Ints) -> int:  # fmt: skip
-    """Add points (N, 3), LiDAR frame, at pose R, t; returns how many found no room.
+    """Add points (N, 3), LiDAR frame, seen from the pose R, t; returns how many found no room.
+
+    scatter : (N, 6) of what each point stands for, or no rows
 
     Counts over `cap` are scaled down, so that new points keep their say. A voxel's plane is recomputed when it has grown
     by a tenth. For every voxel touched the clock hand looks at two more and frees those farther than `reach` from t.
@@ -161,15 +213,20 @@ def insert(points: NDArray[np.float32], R: Floats, t: Floats, size: float, cap: 
         s[7] += dy * dy
         s[8] += dy * dz
         s[9] += dz * dz
+        if len(scatter) > 0:
+            _add_rotated(scatter[i], R, s)
+        s[10] += t[0] - (ix + 0.5) * size
+        s[11] += t[1] - (iy + 0.5) * size
+        s[12] += t[2] - (iz + 0.5) * size
     for j in range(count):
         slot = int(touched[j])
         s = moments[slot]
         if s[0] >= 1.1 * refreshed[slot]:
             if s[0] > cap:
                 w = cap / s[0]
-                for k in range(10):
+                for k in range(13):
                     s[k] *= w
-            _refresh(slot, size, moments, planes, keys, min_points, planarity, floor)
+            _refresh(slot, size, moments, planes, keys, min_points, planarity, floor, breadth)
             refreshed[slot] = s[0]
     _evict(2 * count, t, size, reach, keys, table, state, free, planes)
     return lost
@@ -209,7 +266,7 @@ def rehash(keys: Longs, table: Ints, used: int) -> None:
 
 
 @kernel
-def coarsen(factor: int, size: float, min_points: float, planarity: float, floor: float, fine_moments: Floats,
+def coarsen(factor: int, size: float, min_points: float, planarity: float, floor: float, breadth: float, fine_moments: Floats,
             fine_keys: Longs, used: int, moments: Floats, planes: Floats, keys: Longs, refreshed: Floats,
             table: Ints, state: Longs, free: Ints) -> None:  # fmt: skip
     """Fill an empty map of voxels of `size` = factor * fine size with the exact moments of a finer one."""
@@ -241,6 +298,9 @@ def coarsen(factor: int, size: float, min_points: float, planarity: float, floor
         s[7] += m[7] + 2.0 * oy * m[2] + n * oy * oy
         s[8] += m[8] + oy * m[3] + oz * m[2] + n * oy * oz
         s[9] += m[9] + 2.0 * oz * m[3] + n * oz * oz
+        s[10] += m[10] + n * ox
+        s[11] += m[11] + n * oy
+        s[12] += m[12] + n * oz
     for slot in range(state[USED]):
-        _refresh(slot, size, moments, planes, keys, min_points, planarity, floor)
+        _refresh(slot, size, moments, planes, keys, min_points, planarity, floor, breadth)
         refreshed[slot] = moments[slot, 0]

@@ -12,6 +12,7 @@ from lslam.errors import UsageError
 from lslam.odometry.outcome import of_registration
 from lslam.preprocessing.deskew import deskew
 from lslam.preprocessing.prepare import PreparedPoints, prepare_points
+from lslam.recovery.policies import policies_of
 from lslam.registration.registration import Registration
 from lslam.registration.residuals import RESIDUALS
 from lslam.registration.solver import RegistrationResult
@@ -36,7 +37,8 @@ def create(config: Config) -> Icp:
             f"method {method!r} measures by the residual {own!r}, registration.residual asks for {chosen!r}: "
             f"choose one of them, or --method icp --residual {chosen}"
         )
-    return Icp(Registration(config.registration.model_copy(update={"residual": own or chosen}), config.preprocess))
+    section = config.registration.model_copy(update={"residual": own or chosen})
+    return Icp(Registration(section, config.preprocess, policies_of(config.recovery)))
 
 
 class Icp(Stateful):
@@ -87,7 +89,9 @@ class Icp(Stateful):
 
     def restart(self) -> None:
         """An empty map."""
-        self.registration = Registration(self.registration.config, self.registration.preprocess)
+        self.registration = Registration(
+            self.registration.config, self.registration.preprocess, self.registration.recovery
+        )
         self._uncertainty = self._fresh_uncertainty()
 
     def _fresh_uncertainty(self) -> PoseUncertainty:
@@ -98,6 +102,6 @@ class Icp(Stateful):
         rng = np.random.default_rng(0)
         room = rng.uniform(-8, 8, (3000, 3)).astype(np.float32)
         room[np.arange(3000), rng.integers(0, 3, 3000)] = 8.0
-        trial = Registration(self.registration.config, self.registration.preprocess)
+        trial = Registration(self.registration.config, self.registration.preprocess, self.registration.recovery)
         for _ in range(2):
             trial.register(room)

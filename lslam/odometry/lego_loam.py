@@ -8,10 +8,10 @@ from those. Its mapping takes the less planar points of ground and clusters, as 
 from __future__ import annotations
 
 from lslam.config.config import Config
+from lslam.odometry.feature_steps import two_steps
 from lslam.odometry.loam import Loam, Variant
 from lslam.preprocessing.features import Features
 from lslam.preprocessing.segments import lego_features
-from lslam.registration.feature_steps import two_steps
 from lslam.types.scan import Scan
 
 LEGO = Variant(two_steps, with_map=True, with_less_planes=True)

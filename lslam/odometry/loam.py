@@ -7,11 +7,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lslam.config.config import Config
+from lslam.odometry.feature_registration import FeatureRegistration
+from lslam.odometry.feature_steps import ScanStep, StageClock, joint_step
 from lslam.odometry.outcome import of_registration
 from lslam.preprocessing.deskew import deskew_points
 from lslam.preprocessing.features import FeaturePoints, Features, extract_features
-from lslam.registration.feature_registration import FeatureRegistration
-from lslam.registration.feature_steps import ScanStep, StageClock, joint_step
 from lslam.registration.solver import RegistrationResult
 from lslam.registration.uncertainty import PoseUncertainty
 from lslam.types.motion_prior import MotionPrior

@@ -5,8 +5,8 @@ from __future__ import annotations
 from lslam.inertial.estimate import ImuEstimate
 from lslam.inertial.gyroscope import Gyroscope
 from lslam.inertial.initialise import Start
+from lslam.odometry.feature_scan import FeatureScan
 from lslam.preprocessing.features import FeaturePoints, Features
-from lslam.registration.feature_scan import FeatureScan
 from lslam.types.constraint import Constraint, LoopCandidate
 from lslam.types.gravity import GravityDirection
 from lslam.types.imu import ImuStream

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from lslam.geometry import se3, so3
 from lslam.inertial.fusion import InertialMotion
 from lslam.odometry.base import Deskewing, Odometry, Resumable, Searching
-from lslam.registration.feature_steps import StageClock
+from lslam.odometry.feature_steps import StageClock
 from lslam.registration.motion import ConstantVelocity, MotionModel, middle_of
 from lslam.registration.standing import Standing
 from lslam.types.motion_prior import MotionPrior

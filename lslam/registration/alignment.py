@@ -7,42 +7,37 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.config.registration import RegistrationConfig, Residual
+from lslam.config.registration import RegistrationConfig
 from lslam.preprocessing.prepare import PreparedPoints
 from lslam.registration.gaussian_map import GaussianMap
+from lslam.registration.local_map import LocalMap
 from lslam.registration.robust import Annealing
 from lslam.registration.solver import RegistrationResult, solve
 
 Floats = NDArray[np.float64]
 
-# Times the voxel size: where the rings of a sparse sensor lie farther apart than a voxel, points go to voxels that hold
-# several: 2.5 m are the gaps of sixteen beams two degrees apart at 70 m.
-GAP_FACTOR = 4
-
 
 class MapAlignment:
     """Aligns scans with one map by one residual; nothing here says whether to believe the result."""
 
-    def __init__(self, target: GaussianMap, config: RegistrationConfig, residual: Residual) -> None:
+    def __init__(self, target: LocalMap, config: RegistrationConfig, residual: str) -> None:
         self._map, self._config, self._residual = target, config, residual
 
     def refine(
-        self, points: PreparedPoints, start: Floats, width: float, steps: int, coarse: GaussianMap | None
+        self, points: PreparedPoints, start: Floats, width: float, steps: int, coarse: GaussianMap | None = None
     ) -> RegistrationResult:
         """Align with the fine map from `start` (4, 4), the kernel closing from `width`, m, or as the user wants it."""
         c = self._config
         if c.inlier_distance is None:
             # The larger the planes, the farther their surface may be from them.
-            widest = 1.0 if coarse is None else coarse.size / (c.coarse_factor * self._map.size)
+            widest = 1.0 if coarse is None else coarse.size / self._map.coarse.size
             annealing = Annealing(max(width, widest * c.kernel_min), widest * c.kernel_min, c.kernel_decay, steps)
         else:
             annealing = Annealing(c.inlier_distance, c.inlier_distance, c.kernel_decay, steps)
-        if coarse is None and points.gaps is not None:
-            coarse = self._map.coarsen(GAP_FACTOR)
         return solve(
-            self._map, points, start, annealing,
+            self._map.fine, points, start, annealing,
             sigma=c.sigma, blob_weight=c.blob_weight, weak_share=c.weak_share,
-            coarser=() if coarse is None else (coarse,), residual=self._residual,
+            coarser=(self._map.coarse if coarse is None else coarse,), residual=self._residual,
             inlier_distance=np.inf if c.inlier_distance is None else c.inlier_distance, inlier_ratio=c.inlier_ratio,
         )  # fmt: skip
 
@@ -69,8 +64,8 @@ class MapAlignment:
         """
         c = self._config
         once = Annealing(c.coarse_kernel, c.coarse_kernel, c.coarse_decay, 1)
-        for factor in (c.coarse_factor, 2 * c.coarse_factor, 4 * c.coarse_factor):
-            coarse_map = self._map.coarsen(factor)
+        for factor in (1, 2, 4):
+            coarse_map = self._map.coarse if factor == 1 else self._map.coarse.coarsen(factor)
             if self.on_planes(coarse_map, points, T_prior, once).overlap >= c.start_overlap:
                 break
         return coarse_map

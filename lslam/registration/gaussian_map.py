@@ -11,6 +11,7 @@ from lslam.types.state import State, Stateful
 
 # Variance added to every voxel, (1 cm)2: a standing sensor would otherwise collapse the Gaussians.
 FLOOR = 1e-4
+NO_SCATTER = np.zeros((0, 6))
 
 
 class GaussianMap(Stateful):
@@ -21,15 +22,17 @@ class GaussianMap(Stateful):
     size : m, edge of a voxel
     min_points, planarity, count_cap : when a voxel is matched, when it is a plane, how much it remembers
     reach : m, voxels farther than this from the sensor are given back
+    breadth : how broad points must lie across the beams that saw them, see `kernels.gaussians`; 0: not asked
     """
 
     def __init__(
         self, size: float, *, min_points: int = 6, planarity: float = 0.3, count_cap: float = 200.0,
-        reach: float = 150.0, capacity: int = 1 << 16,
+        reach: float = 150.0, capacity: int = 1 << 16, breadth: float = 0.0,
     ) -> None:  # fmt: skip
         self.size, self.min_points, self.planarity = size, min_points, planarity
         self.count_cap, self.reach = count_cap, reach
-        self.moments = np.zeros((capacity, 10))
+        self.breadth = breadth
+        self.moments = np.zeros((capacity, 13))
         self.planes = np.zeros((capacity, 8))
         self.keys = np.full(capacity, gaussians.FREE, np.int64)
         self.refreshed = np.zeros(capacity)
@@ -42,17 +45,20 @@ class GaussianMap(Stateful):
         """Voxels that hold points."""
         return int(self.pool[gaussians.LIVE])
 
-    def insert(self, points: NDArray[np.float32], T_world_lidar: NDArray[np.float64]) -> int:
+    def insert(
+        self, points: NDArray[np.float32], T_world_lidar: NDArray[np.float64], scatter: NDArray[np.float64] = NO_SCATTER
+    ) -> int:
         """Add points (N, 3), m, LiDAR frame; returns how many lie too far from the origin to have a voxel.
 
+        scatter : (N, 6), m2, xx xy xz yy yz zz of what each point stands for; no rows: nothing
         The pool grows before it can overflow: every point might open a voxel of its own.
         """
         while len(self.keys) - len(self) < len(points):
             self._grow()
         R, t = np.ascontiguousarray(T_world_lidar[:3, :3]), np.ascontiguousarray(T_world_lidar[:3, 3])
         return gaussians.insert(
-            points, R, t, self.size, self.count_cap, float(self.min_points), self.planarity, FLOOR, self.reach,
-            self.moments, self.planes, self.keys, self.refreshed, self.table, self.pool, self.free,
+            points, scatter, R, t, self.size, self.count_cap, float(self.min_points), self.planarity, FLOOR,
+            self.breadth, self.reach, self.moments, self.planes, self.keys, self.refreshed, self.table, self.pool, self.free,
         )  # fmt: skip
 
     def clear(self) -> None:
@@ -82,10 +88,10 @@ class GaussianMap(Stateful):
         capacity = 1 << max(8, int(np.ceil(np.log2(len(self) + 1))))
         coarse = GaussianMap(
             self.size * factor, min_points=self.min_points * factor, planarity=self.planarity, count_cap=self.count_cap,
-            reach=self.reach, capacity=capacity,
+            reach=self.reach, capacity=capacity, breadth=self.breadth,
         )  # fmt: skip
         gaussians.coarsen(
-            factor, coarse.size, float(coarse.min_points), self.planarity, FLOOR, self.moments, self.keys,
+            factor, coarse.size, float(coarse.min_points), self.planarity, FLOOR, self.breadth, self.moments, self.keys,
             int(self.pool[gaussians.USED]), coarse.moments, coarse.planes, coarse.keys, coarse.refreshed,
             coarse.table, coarse.pool, coarse.free,
         )  # fmt: skip

@@ -51,17 +51,13 @@ def slots_of(count: int) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
 
 @dataclass(frozen=True)
 class Term:
-    """A residual of some points on one map: its compiled `linearise` and what this takes, see `kernels.linearisation`.
-
-    is_fine : whether its inliers are counted as `Facts.fine_inliers`
-    """
+    """A residual of some points on one map: its compiled `linearise` and what this takes, see `kernels.linearisation`."""
 
     linearise: Callable[..., None]
     points: tuple[Any, ...]
     target: tuple[Any, ...]
     settings: tuple[float, ...]
     search: tuple[Any, ...] = ()
-    is_fine: bool = True
 
 
 @dataclass(frozen=True)
@@ -87,13 +83,12 @@ class Facts:
 
     information : its sum, 1/m2; lever_information : times the squared lever arm of each point
     squared : weighted squared residuals, m2; robust : the sum of their weights
-    matched : points that found a counterpart; inliers : those within the kernel's width; fine_inliers : of the fine terms
+    matched : points that found a counterpart; inliers : those within the kernel's width
     """
 
     information: float
     squared: float
     inliers: int
-    fine_inliers: int
     matched: int
     lever_information: float
     robust: float
@@ -143,7 +138,7 @@ def optimise(
     bounds = (float(limits.weak_share), float(limits.least), float(limits.unseen), limits.by_surfaces)
     scale, end = float(annealing.start), float(annealing.end)
     farthest2 = gate2 = float(inlier_distance) ** 2
-    fine, iterations, converged = 0, 0, False
+    iterations, converged = 0, False
     while iterations < annealing.steps and not converged:
         iterations += 1
         buffer.fill(0.0)
@@ -151,8 +146,6 @@ def optimise(
         width = (scale, end, gate2)
         for term in terms:
             term.linearise(term.points, term.target, term.settings, term.search, pose, width, sums)
-            if term.is_fine:
-                fine = int(facts[at.INLIERS])
         if facts[at.MATCHED] < LEAST_MATCHED:
             break
         is_moved, count, move, turn = step(pose, sums, scale, bounds, limits.allowed, d, weak)
@@ -162,12 +155,12 @@ def optimise(
         scale = max(scale * annealing.decay, end)
         if inlier_ratio < 1.0:
             gate2 = trimmed(matches.away2, float(inlier_ratio), farthest2)
-    return Optimum(se3.make(*pose), H, _named(facts, fine), d, iterations, converged, weak[:count])
+    return Optimum(se3.make(*pose), H, _named(facts), d, iterations, converged, weak[:count])
 
 
-def _named(facts: Floats, fine: int) -> Facts:
+def _named(facts: Floats) -> Facts:
     f = facts.tolist()
     return Facts(
-        information=f[at.INFORMATION], squared=f[at.SQUARED], inliers=int(f[at.INLIERS]), fine_inliers=fine,
+        information=f[at.INFORMATION], squared=f[at.SQUARED], inliers=int(f[at.INLIERS]),
         matched=int(f[at.MATCHED]), lever_information=f[at.LEVER], robust=f[at.ROBUST],
     )  # fmt: skip

@@ -28,8 +28,9 @@ class RegistrationResult:
 
     T_world_lidar : (4, 4); covariance : (6, 6) of t' = t + d[:3], R' = exp(d[3:]) R in world axes, m2 and rad2
     ok : False when the pose is the motion prior because registration failed, `reason` says why
+    posed_by : the recovery policy that found the pose; empty: the registration itself
     is_denied : the pose is not what registration found: the scan enters there, and what was found teaches nothing
-    inliers : source points within the final kernel; fine_inliers : those of them in fine voxels
+    inliers : source points within the final kernel
     matched : points that found a voxel; overlap : matched / source
     rmse : weighted distance to the planes, m; degenerate : (K, 6) unobserved unit directions (rotation scaled by lever arm)
     prior_error : correction of the motion prior, (m, rad)
@@ -44,12 +45,12 @@ class RegistrationResult:
     source_points: int = 0
     matched: int = 0
     inliers: int = 0
-    fine_inliers: int = 0
     rmse: float = 0.0
     degenerate: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 6)))
     prior_error: tuple[float, float] = (0.0, 0.0)
     lever_arm: float = 1.0
     is_denied: bool = False
+    posed_by: str = ""
 
     def moved(self, T_world_lidar: NDArray[np.float64], covariance: NDArray[np.float64] | None) -> RegistrationResult:
         """The same registration, where more than the map was asked for the pose."""
@@ -78,8 +79,8 @@ class RegistrationResult:
 
     @property
     def agreement(self) -> float:
-        """Share of the source points within the final kernel of the fine map, with or without a coarse one beside it."""
-        return self.fine_inliers / max(self.source_points, 1)
+        """Share of the source points within the final kernel."""
+        return self.inliers / max(self.source_points, 1)
 
 
 def solve(
@@ -89,8 +90,8 @@ def solve(
 ) -> RegistrationResult:  # fmt: skip
     """Align the source points with the map by annealed Gauss-Newton, starting at `T_prior` (4, 4).
 
-    Points without a plane in `target` are matched in the first of the `coarser` maps that has one. Blobs serve in the last
-    map only. Correspondences beyond `inlier_distance`, m, are rejected, and all but the nearest `inlier_ratio`.
+    Points without a plane or a blob in `target` are matched in the first of the `coarser` maps that has one. Correspondences
+    beyond `inlier_distance`, m, are rejected, and all but the nearest `inlier_ratio`.
     """
     kind, matches = residual_named(residual), Matches(len(points.source))
     terms = voxel_terms(kind, kind.points(points, sigma), (target, *coarser), matches, sigma, blob_weight)
@@ -107,14 +108,14 @@ def voxel_terms(
 ) -> list[Term]:  # fmt: skip
     """The residual of the points on each of the maps, the finest first, which share their matches.
 
-    points : arrays that the residual takes of them; sigma : m, noise of a point; blob_weight : of the last map's
+    points : arrays that the residual takes of them; sigma : m, noise of a point; blob_weight : of voxels that are no plane
     """
     last, linearise = len(levels) - 1, kind.linearise
     return [
         Term(
             linearise, points, kind.voxels(level),
-            (float(level.size), float(sigma) ** 2, float(blob_weight) if k == last else 0.0, 0 < k == last),
-            matches.search(), is_fine=k == 0,
+            (float(level.size), float(sigma) ** 2, float(blob_weight), 0 < k == last),
+            matches.search(),
         )
         for k, level in enumerate(levels)
     ]  # fmt: skip
@@ -135,7 +136,6 @@ def result_of(found: Optimum, T_prior: Floats, source_points: int) -> Registrati
         source_points=source_points,
         matched=facts.matched,
         inliers=facts.inliers,
-        fine_inliers=facts.fine_inliers,
         rmse=facts.rmse,
         degenerate=found.weak,
         lever_arm=facts.lever_arm,

@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.geometry import se3, so3
-from lslam.registration.gaussian_map import GaussianMap
+from lslam.preprocessing.prepare import PreparedPoints
+from lslam.registration.local_map import LocalMap
 from lslam.types.state import Stateful
 
 Floats = NDArray[np.float64]
-Points = NDArray[np.float32]
 
 KEYFRAME_M, KEYFRAME_DEG = 2.0, 15.0
 
@@ -20,15 +20,15 @@ KEYFRAME_M, KEYFRAME_DEG = 2.0, 15.0
 class Target(Protocol):
     """Enters registered scans into the local map, and takes out what no longer belongs there."""
 
-    def enter(self, target: GaussianMap, points: Points, T_world_lidar: Floats) -> None:
-        """Points (N, 3), m, LiDAR frame."""
+    def enter(self, target: LocalMap, points: PreparedPoints, T_world_lidar: Floats) -> None:
+        """The prepared points of a scan, LiDAR frame."""
         ...
 
 
 class MapTarget(Stateful):
     """Every scan stays until the sensor has left it behind."""
 
-    def enter(self, target: GaussianMap, points: Points, T_world_lidar: Floats) -> None:
+    def enter(self, target: LocalMap, points: PreparedPoints, T_world_lidar: Floats) -> None:
         """Add to the map."""
         target.insert(points, T_world_lidar)
 
@@ -36,7 +36,7 @@ class MapTarget(Stateful):
 class ScanTarget(Stateful):
     """The last scan alone: scan-to-scan registration."""
 
-    def enter(self, target: GaussianMap, points: Points, T_world_lidar: Floats) -> None:
+    def enter(self, target: LocalMap, points: PreparedPoints, T_world_lidar: Floats) -> None:
         """Replace the map."""
         target.clear()
         target.insert(points, T_world_lidar)
@@ -49,9 +49,9 @@ class KeyframeTarget(Stateful):
 
     def __init__(self, count: int) -> None:
         self.count = count
-        self.keyframes: list[tuple[Points, Floats]] = []
+        self.keyframes: list[tuple[PreparedPoints, Floats]] = []
 
-    def enter(self, target: GaussianMap, points: Points, T_world_lidar: Floats) -> None:
+    def enter(self, target: LocalMap, points: PreparedPoints, T_world_lidar: Floats) -> None:
         """Add a keyframe when it is due; the map is built anew when an old one leaves."""
         if self.keyframes:
             step = se3.relative(self.keyframes[-1][1], T_world_lidar)

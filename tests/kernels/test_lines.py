@@ -10,7 +10,7 @@ from numpy_features import Match, gradient, normal_equations
 from lslam.geometry import so3
 from lslam.kernels import facts as at
 from lslam.kernels import lines
-from lslam.registration.feature_map import MIN_LINE_POINTS
+from lslam.odometry.feature_map import MIN_LINE_POINTS
 from lslam.registration.gaussian_map import FLOOR, GaussianMap
 from lslam.registration.optimiser import slots_of
 

@@ -17,12 +17,12 @@ from lslam.config.config import Config
 from lslam.errors import InputError
 from lslam.geometry import se3
 from lslam.odometry import create_odometry
+from lslam.odometry.feature_registration import PATIENCE
+from lslam.odometry.feature_steps import StageClock
 from lslam.odometry.loam import Loam
 from lslam.pipeline.tracker import Loaded, Tracker
 from lslam.preprocessing.deskew import deskew_points
 from lslam.preprocessing.features import FeaturePoints, Features
-from lslam.registration.feature_registration import PATIENCE
-from lslam.registration.feature_steps import StageClock
 from lslam.simulation.scenarios import simulate
 from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan import Scan

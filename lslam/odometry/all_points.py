@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 from lslam.config.registration import RegistrationConfig
 from lslam.preprocessing.features import Features
 from lslam.preprocessing.prepare import PreparedPoints, prepare_points
+from lslam.recovery.policies import RecoveringRegistration
+from lslam.recovery.start_search import held_by_non_ground
 from lslam.registration.registration import Registration, correction
 from lslam.registration.solver import RegistrationResult
 from lslam.types.state import Stateful
@@ -48,7 +50,7 @@ class AllPoints(Stateful):
         # All points and the poses of the scans that were registered last.
         self._recent: tuple[tuple[NDArray[np.float32], Floats], ...] = ()
         # `icp` in its default ways, kept up to date from a scan on whose features hold the place badly.
-        self._icp = Registration(self._config)
+        self._icp: Registration = RecoveringRegistration(self._config)
         self._fed = FED
         # Of the scan that was located last, when all its points were asked.
         self._asked: _Asked | None = None
@@ -63,7 +65,8 @@ class AllPoints(Stateful):
     ) -> RegistrationResult:
         """What was found, unless much more of what stands on the ground agrees elsewhere: few rings slide along a road."""
         icp = self._of_recent()
-        held = icp.held(prepare_points(_points(features), icp.preprocess), T_start, found)
+        points = prepare_points(_points(features), icp.preprocess)
+        held = held_by_non_ground(icp, points, T_start, found)
         if held is found:
             return found
         why = found.reason or "features disagree with what stands on the ground"
@@ -116,7 +119,7 @@ class AllPoints(Stateful):
 
     def _of_recent(self) -> Registration:
         """`icp` with all points of the scans that were registered last in its map."""
-        icp = Registration(self._config)
+        icp = RecoveringRegistration(self._config)
         for points, T_world_lidar in self._recent:
             icp.update(prepare_points(points, icp.preprocess), RegistrationResult(T_world_lidar))
         return icp

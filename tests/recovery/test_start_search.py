@@ -9,15 +9,15 @@ from functools import cache
 import numpy as np
 import pytest
 from analytic_scenes import pose_at
+from lslam.registration.recent_scans import RecentScans
+from lslam.registration.start_search import CLEARLY, MUCH, NEAR, is_much_more, standing_points, start_offsets
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from lslam.config.preprocess import PreprocessConfig
 from lslam.geometry import se3
 from lslam.preprocessing.prepare import prepare_points
-from lslam.registration.recent_scans import RecentScans
 from lslam.registration.registration import Registration
-from lslam.registration.start_search import CLEARLY, MUCH, NEAR, is_much_more, standing_points, start_offsets
 from lslam.simulation.lidar_models import lidar_named
 from lslam.simulation.scenarios import SimulatedDrive, simulate
 

@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from lslam.config.config import Config
 from lslam.config.loam import LoamConfig
 from lslam.geometry import se3
+from lslam.odometry.all_points import FED
+from lslam.odometry.feature_registration import FeatureRegistration
+from lslam.odometry.feature_scan import feature_scan
+from lslam.odometry.feature_solver import NONE, FeatureNoise, kept_where_blind, solve_on_scan
+from lslam.odometry.feature_steps import ScanStep, StageClock, joint_step, two_steps, upright_directions
 from lslam.preprocessing.features import Features, extract_features
-from lslam.registration.all_points import FED
-from lslam.registration.feature_registration import FeatureRegistration
-from lslam.registration.feature_scan import feature_scan
-from lslam.registration.feature_solver import NONE, FeatureNoise, kept_where_blind, solve_on_scan
-from lslam.registration.feature_steps import ScanStep, StageClock, joint_step, two_steps, upright_directions
 from lslam.registration.robust import Annealing
 from lslam.registration.solver import RegistrationResult
 from lslam.types.scan import Scan

@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 from lslam.config.loam import LoamConfig
 from lslam.config.registration import RegistrationConfig
 from lslam.kernels import voxel
+from lslam.odometry.all_points import AllPoints
+from lslam.odometry.feature_map import FeatureMap
+from lslam.odometry.feature_scan import FeatureScan, feature_scan, surface_size
+from lslam.odometry.feature_solver import NONE, FeatureNoise, kept_where_blind, solve_on_map
+from lslam.odometry.feature_steps import ScanStep, StageClock
 from lslam.preprocessing.features import Features
 from lslam.preprocessing.prepare import NO_TIMES
-from lslam.registration.all_points import AllPoints
-from lslam.registration.feature_map import FeatureMap
-from lslam.registration.feature_scan import FeatureScan, feature_scan, surface_size
-from lslam.registration.feature_solver import NONE, FeatureNoise, kept_where_blind, solve_on_map
-from lslam.registration.feature_steps import ScanStep, StageClock
 from lslam.registration.registration import DOUBT, NEAR_KERNEL, correction
 from lslam.registration.robust import AdaptiveThreshold, Annealing, UsualAgreement
 from lslam.registration.solver import RegistrationResult

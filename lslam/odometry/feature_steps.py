@@ -10,9 +10,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.odometry.feature_scan import FeatureScan
+from lslam.odometry.feature_solver import NONE, FeatureNoise, solve_on_scan
 from lslam.preprocessing.features import Features
-from lslam.registration.feature_scan import FeatureScan
-from lslam.registration.feature_solver import NONE, FeatureNoise, solve_on_scan
 from lslam.registration.robust import Annealing
 from lslam.registration.solver import RegistrationResult
 
@@ -81,7 +81,6 @@ def two_steps(
         source_points=ground.source_points + edges.source_points,
         matched=ground.matched + edges.matched,
         inliers=ground.inliers + edges.inliers,
-        fine_inliers=ground.fine_inliers + edges.fine_inliers,
         degenerate=np.concatenate([ground.degenerate, edges.degenerate]),
     )
 

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from lslam.geometry import se3, so3
 from lslam.kernels.feature_residuals import linearise_edges, linearise_planes
 from lslam.kernels.lines import linearise_lines
-from lslam.registration.feature_map import MIN_LINE_POINTS, FeatureMap
-from lslam.registration.feature_scan import FeatureScan
+from lslam.odometry.feature_map import MIN_LINE_POINTS, FeatureMap
+from lslam.odometry.feature_scan import FeatureScan
 from lslam.registration.gaussian_map import FLOOR, GaussianMap
 from lslam.registration.optimiser import EVERYWHERE, Limits, Matches, Term, optimise, slots_of
 from lslam.registration.residuals import RESIDUALS
@@ -87,9 +87,7 @@ def solve_on_map(
     on_planes = voxel_terms(RESIDUALS["plane"], (planes, scatter), levels, matches, noise.plane, 0.0)
     limits = Limits(noise.weak_share, noise.least / noise.plane**2, unseen=1.0)
     found = optimise([on_lines, *on_planes], T_prior, annealing, limits, matches)
-    result = result_of(found, T_prior, len(edges) + len(planes))
-    # Features are so few that a coarse plane counts like a fine one.
-    return replace(result, fine_inliers=result.inliers)
+    return result_of(found, T_prior, len(edges) + len(planes))
 
 
 def kept_where_blind(result: RegistrationResult, T_expected: Floats) -> RegistrationResult:

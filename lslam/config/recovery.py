@@ -1,0 +1,19 @@
+"""Section `recovery`: what is tried when a registration from the motion prior is not enough."""
+
+from __future__ import annotations
+
+from pydantic import Field
+
+from lslam.config.section import Section
+
+
+class RecoveryConfig(Section):
+    """One switch per policy; `posed_by` in scans.csv names the one that acted."""
+
+    coarse_to_fine: bool = Field(
+        True,
+        description="align with coarse planes from metres off where a scan fails, corrects its prior by much or is new",
+    )
+    start_search: bool = Field(
+        True, description="seek the first steps within `registration.start_reach`, told by the points above the ground"
+    )

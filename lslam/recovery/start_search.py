@@ -1,0 +1,158 @@
+"""The search for the first steps: nothing is known yet of how fast the sensor moves."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.geometry import se3, so3
+from lslam.preprocessing.prepare import PreparedPoints, thin
+from lslam.recovery.non_ground import NEAR, NonGroundPoints, sought
+from lslam.registration.registration import NEAR_KERNEL, Registration, correction
+from lslam.registration.solver import RegistrationResult
+
+Floats = NDArray[np.float64]
+
+# m; starts this far apart leave no gap between their capture ranges, not even between piers of a facade.
+START_STEP = 1.0
+# A hand-held sensor turns at 100 deg/s, by 30 deg at every third scan; so far apart that 20 m away a step is left.
+START_TURNS_DEG = np.delete(np.arange(-30.0, 31.0, 3.0), 10)
+# Less than the rings of most sensors are apart.
+AT_REST_DEG = 3.0
+# Every so many-th source point is enough to tell a good start from a bad one; so many of the best are looked at closely.
+SEARCH_SHARE, LOOKED_AT = 4, 3
+# Along a bare wall the rings repeat best where nothing moved, by up to five percent: a start elsewhere must have more, and
+# twice as much where planes, the prior or both say otherwise.
+CLEARLY, MUCH = 1.05, 1.1
+
+
+class StartSearch:
+    """Tries several starts along the sensor's axis; the non-ground points of the last scans decide between them.
+
+    Posts and crash barriers repeat every few metres, so the nearest agreement of planes may be a false one.
+    """
+
+    name = "start search"
+
+    def recover(
+        self, registration: Registration, points: PreparedPoints, T_prior: Floats, found: RegistrationResult
+    ) -> RegistrationResult:
+        """Acts while the map is made of the first scans; on the second scan, and on failed ones, it seeks farther."""
+        r, c = registration, registration.config
+        if c.start_reach == 0 or r.inserted > c.start_scans:
+            return found
+        result = held_by_non_ground(r, points, T_prior, found, is_lost=r.inserted == 1)
+        if result is found:
+            return found
+        error = correction(T_prior, result.T_world_lidar) if result.ok else result.prior_error
+        return replace(result, prior_error=error, posed_by=self.name if result.ok else result.posed_by)
+
+
+def held_by_non_ground(
+    registration: Registration,
+    points: PreparedPoints,
+    T_prior: Floats,
+    found: RegistrationResult,
+    *,
+    is_lost: bool = False,
+) -> RegistrationResult:
+    """What was found, unless much more of the non-ground points of the last scans agrees elsewhere.
+
+    is_lost : whether the sensor may be anywhere within `start_reach`, which a failed registration says too
+    """
+    r, c = registration, registration.config
+    standing, seen = NonGroundPoints(r.recent, r.preprocess), sought(points.map_points, r.preprocess)
+    if is_lost:
+        found = _best_start(r, points, T_prior, found, standing, seen)
+    starts = [T_prior]
+    if is_lost or not found.ok:
+        starts.append(_likeliest(standing, seen, T_prior, c.start_reach))
+
+    def share(result: RegistrationResult) -> float:
+        return standing.share(seen, result.T_world_lidar)
+
+    stood = max((standing.align(seen, start) for start in starts), key=share)
+    place, count = stood.T_world_lidar, len(seen.source)
+    is_drawn = found.ok and is_at_rest(place, r.recent[-1][1])
+    if is_drawn or not is_much_more(share(stood), share(found), count):
+        return found
+    coarse = r.alignment.coarse_map(points, place)
+    near = r.alignment.refine(points, place, NEAR_KERNEL * c.kernel_min, c.start_iterations, coarse)
+    judged = r.judged(near, place)
+    if not judged.ok and not found.ok:
+        return found
+    if not judged.ok or is_much_more(share(stood), share(judged), count):
+        place = standing.place_on_ground(place, near.T_world_lidar, points.map_points)
+        judged = near.moved(place, stood.covariance)
+    return replace(judged, iterations=found.iterations + near.iterations)
+
+
+def _best_start(
+    registration: Registration, points: PreparedPoints, T_prior: Floats, best: RegistrationResult,
+    standing: NonGroundPoints, seen: PreparedPoints,
+) -> RegistrationResult:  # fmt: skip
+    """The best of several starts: a few points on the coarse map show which are worth a whole registration."""
+    alignment = registration.alignment
+    coarse_map, few = alignment.coarse_map(points, T_prior), thin(points, SEARCH_SHARE)
+    slow = alignment.slowly(2 * START_STEP)
+    tried = [
+        alignment.on_planes(coarse_map, few, T_prior @ se3.make(np.eye(3), offset), slow)
+        for offset in start_offsets(registration.config.start_reach, START_STEP)
+    ]
+    # Where nothing stands, as in hills, what matches the ground is all that tells.
+    tried.sort(key=lambda found: (-standing.share(seen, found.T_world_lidar), -found.inliers))
+    for promising in distinct(tried, best.T_world_lidar):
+        start = promising.T_world_lidar
+        # Once more as wide as from an unknown start, what was found right could be drawn to the false place again.
+        found = registration.judged(alignment.coarse_to_fine(points, start, 2 * START_STEP), start)
+        share, known = (standing.share(seen, result.T_world_lidar) for result in (found, best))
+        # A failed one has the prior's pose: where less stands than there, nothing is found.
+        if found.ok and (share > CLEARLY * known if best.ok else share >= known):
+            best = found
+    return best
+
+
+def _likeliest(standing: NonGroundPoints, seen: PreparedPoints, T_prior: Floats, reach: float) -> Floats:
+    """(4, 4) pose up to `reach`, m, from the prior, or turned about its z, at which most points have one near by."""
+    moved = [T_prior @ se3.make(np.eye(3), offset) for offset in start_offsets(reach, NEAR)]
+    turns = np.deg2rad(START_TURNS_DEG)
+    turned = [T_prior @ se3.make(so3.exp(np.array([0, 0, turn])), np.zeros(3)) for turn in turns]
+    return max([*moved, *turned], key=lambda start: standing.share(seen, start))
+
+
+def is_at_rest(pose: Floats, last: Floats) -> bool:
+    """Whether the pose (4, 4) is so near to the last scan's that the sensor's own rings, on roofs or walls, explain it."""
+    move, turn = se3.relative(last, pose)[:3, 3], so3.angle(se3.relative(last, pose)[:3, :3])
+    return bool(np.linalg.norm(move) < 2 * NEAR and turn < np.deg2rad(AT_REST_DEG))
+
+
+def is_much_more(share: float, other: float, count: int) -> bool:
+    """Whether of `count` points a much larger share agrees at one pose than at the `other`, and not by chance.
+
+    McNemar's test of paired shares at two sigma. How many points the poses dispute is not known: every one that fails to
+    agree at either pose is taken for one, which none in dispute escapes.
+    """
+    in_dispute = count * (2 - share - other)
+    return share > MUCH * other and count * (share - other) > 2 * np.sqrt(in_dispute)
+
+
+def distinct(results: list[RegistrationResult], known: Floats) -> list[RegistrationResult]:
+    """The first `LOOKED_AT` places that lie at least half a step from the known pose (4, 4) and from each other."""
+    places, chosen = [known[:3, 3]], []
+    for result in results:
+        place = result.T_world_lidar[:3, 3]
+        if min(float(np.linalg.norm(place - other)) for other in places) > START_STEP / 2:
+            places.append(place)
+            chosen.append(result)
+    return chosen[:LOOKED_AT]
+
+
+def start_offsets(reach: float, step: float) -> Floats:
+    """(N, 3) m in the LiDAR frame, nearest first: ahead and back up to `reach`, sideways one step at most."""
+    count = int(np.ceil(reach / step - 1e-9))
+    ahead = [sign * min(k * step, reach) for k in range(1, count + 1) for sign in (1, -1)]
+    sideways = [sign * min(step, reach) for sign in (1, -1)] if count else []
+    offsets = np.array([(x, 0.0, 0.0) for x in ahead] + [(0.0, y, 0.0) for y in sideways]).reshape(-1, 3)
+    return offsets[np.argsort(np.linalg.norm(offsets, axis=1), kind="stable")]
