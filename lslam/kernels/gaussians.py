@@ -130,19 +130,6 @@ def _refresh(slot: int, size: float, moments: Floats, planes: Floats, keys: Long
 
 
 @inline
-def _add_rotated(q: Floats, R: Floats, s: Floats) -> None:
-    """Add R Q R^T to the second moments, Q the symmetric matrix xx xy xz yy yz zz."""
-    j = 4
-    for r in range(3):
-        x = R[r, 0] * q[0] + R[r, 1] * q[1] + R[r, 2] * q[2]
-        y = R[r, 0] * q[1] + R[r, 1] * q[3] + R[r, 2] * q[4]
-        z = R[r, 0] * q[2] + R[r, 1] * q[4] + R[r, 2] * q[5]
-        for c in range(r, 3):
-            s[j] += x * R[c, 0] + y * R[c, 1] + z * R[c, 2]
-            j += 1
-
-
-@inline
 def breadth_of(xx: float, xy: float, xz: float, yy: float, yz: float, zz: float, dx: float, dy: float,
                dz: float) -> float:  # fmt: skip
     """Smaller variance, m2, of points of covariance xx..zz across the beams that saw them, which come along d.
@@ -164,12 +151,11 @@ def breadth_of(xx: float, xy: float, xz: float, yy: float, yz: float, zz: float,
 
 
 @kernel
-def insert(points: NDArray[np.float32], scatter: Floats, R: Floats, t: Floats, size: float, cap: float, min_points: float,
+def insert(points: NDArray[np.float32], R: Floats, t: Floats, size: float, cap: float, min_points: float,
            planarity: float, floor: float, breadth: float, reach: float, moments: Floats, planes: Floats, keys: Longs,
            refreshed: Floats, table: Ints, state: Longs, free: Ints) -> int:  # fmt: skip
     """Add points (N, 3), LiDAR frame, seen from the pose R, t; returns how many found no room.
 
-    scatter : (N, 6) of what each point stands for, or no rows
 
     Counts over `cap` are scaled down, so that new points keep their say. A voxel's plane is recomputed when it has grown
     by a tenth. For every voxel touched the clock hand looks at two more and frees those farther than `reach` from t.
@@ -213,11 +199,9 @@ def insert(points: NDArray[np.float32], scatter: Floats, R: Floats, t: Floats, s
         s[7] += dy * dy
         s[8] += dy * dz
         s[9] += dz * dz
-        if len(scatter) > 0:
-            _add_rotated(scatter[i], R, s)
-        s[10] += t[0] - (ix + 0.5) * size
-        s[11] += t[1] - (iy + 0.5) * size
-        s[12] += t[2] - (iz + 0.5) * size
+        s[10] += t[0] - x + dx
+        s[11] += t[1] - y + dy
+        s[12] += t[2] - z + dz
     for j in range(count):
         slot = int(touched[j])
         s = moments[slot]

@@ -51,8 +51,7 @@ def linearise_gicp(points: tuple[Floats, Floats], voxels: Voxels, settings: Sett
             if blob < 0 or blob_weight <= 0.0:
                 continue
             best = blob
-        else:
-            is_done[i] = True
+        is_done[i] = True
         p = planes[best]
         sxx, sxy, sxz, syy, syz, szz = rotate_symmetric(R, covariance[i])
         if p[7] >= 0.0:

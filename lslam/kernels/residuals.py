@@ -135,6 +135,7 @@ def linearise(points: tuple[Floats, Floats], voxels: Voxels, settings: Settings,
             facts[LEVER] += w * (rx * rx + ry * ry + rz * rz)
             facts[ROBUST] += robust
         elif blob >= 0 and blob_weight > 0.0:
+            is_done[i] = True
             p = planes[blob]
             away2[i] = blob_d
             facts[MATCHED] += 1.0

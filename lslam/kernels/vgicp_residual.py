@@ -49,7 +49,7 @@ def linearise_vgicp(points: tuple[Floats, Floats], voxels: tuple[Floats, Floats,
         best, _, blob, _ = nearest(x, y, z, i, slots, planes)
         if best < 0 and (blob < 0 or blob_weight <= 0.0):
             continue
-        is_done[i] = best >= 0
+        is_done[i] = True
         closest, closest_robust = 1e300, 0.0
         for k in range(8):
             v = slots[i, k]

@@ -74,4 +74,4 @@ def _source(target: GaussianMap, slots: NDArray[np.int64]) -> PreparedPoints:
     mean = s[:, 1:4]
     outer = mean[:, (0, 0, 0, 1, 1, 2)] * mean[:, (0, 1, 2, 1, 2, 2)]
     points = np.ascontiguousarray(target.planes[slots, :3])
-    return PreparedPoints(np.zeros((0, 3), np.float32), points, np.ascontiguousarray(s[:, 4:] - outer), len(points))
+    return PreparedPoints(np.zeros((0, 3), np.float32), points, np.ascontiguousarray(s[:, 4:10] - outer), len(points))

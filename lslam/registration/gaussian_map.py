@@ -11,7 +11,6 @@ from lslam.types.state import State, Stateful
 
 # Variance added to every voxel, (1 cm)2: a standing sensor would otherwise collapse the Gaussians.
 FLOOR = 1e-4
-NO_SCATTER = np.zeros((0, 6))
 
 
 class GaussianMap(Stateful):
@@ -45,19 +44,16 @@ class GaussianMap(Stateful):
         """Voxels that hold points."""
         return int(self.pool[gaussians.LIVE])
 
-    def insert(
-        self, points: NDArray[np.float32], T_world_lidar: NDArray[np.float64], scatter: NDArray[np.float64] = NO_SCATTER
-    ) -> int:
+    def insert(self, points: NDArray[np.float32], T_world_lidar: NDArray[np.float64]) -> int:
         """Add points (N, 3), m, LiDAR frame; returns how many lie too far from the origin to have a voxel.
 
-        scatter : (N, 6), m2, xx xy xz yy yz zz of what each point stands for; no rows: nothing
         The pool grows before it can overflow: every point might open a voxel of its own.
         """
         while len(self.keys) - len(self) < len(points):
             self._grow()
         R, t = np.ascontiguousarray(T_world_lidar[:3, :3]), np.ascontiguousarray(T_world_lidar[:3, 3])
         return gaussians.insert(
-            points, scatter, R, t, self.size, self.count_cap, float(self.min_points), self.planarity, FLOOR,
+            points, R, t, self.size, self.count_cap, float(self.min_points), self.planarity, FLOOR,
             self.breadth, self.reach, self.moments, self.planes, self.keys, self.refreshed, self.table, self.pool, self.free,
         )  # fmt: skip
 

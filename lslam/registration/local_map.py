@@ -12,6 +12,8 @@ from lslam.types.state import Stateful
 # A plane must have been seen across its beams by twice the standard deviation that it is thick: below that, a plane
 # through the sensor explains its points as well, which is where the beams of one ring lie whatever they hit.
 BREADTH = 4.0
+# A mean has no normal that could be wrong: more than a ring is enough.
+POINT_BREADTH = 1.0
 
 
 class LocalMap(Stateful):
@@ -20,17 +22,18 @@ class LocalMap(Stateful):
     Parameters
     ----------
     size : m, edge of a fine voxel; coarse_factor : how many times larger a coarse one is
-    min_points, planarity, count_cap, reach : as in `GaussianMap`
+    min_points, planarity, count_cap, reach, breadth : as in `GaussianMap`
     """
 
     STATE = ("fine", "coarse")
 
     def __init__(
-        self, size: float, *, coarse_factor: int, min_points: int, planarity: float, count_cap: float, reach: float
-    ) -> None:
+        self, size: float, *, coarse_factor: int, min_points: int, planarity: float, count_cap: float, reach: float,
+        breadth: float = BREADTH,
+    ) -> None:  # fmt: skip
         self.fine, self.coarse = (
             GaussianMap(
-                edge, min_points=min_points, planarity=planarity, count_cap=count_cap, reach=reach, breadth=BREADTH
+                edge, min_points=min_points, planarity=planarity, count_cap=count_cap, reach=reach, breadth=breadth
             )
             for edge in (size, size * coarse_factor)
         )
@@ -40,9 +43,9 @@ class LocalMap(Stateful):
         return len(self.fine)
 
     def insert(self, points: PreparedPoints, T_world_lidar: NDArray[np.float64]) -> None:
-        """Enter a scan: its small centroids into fine voxels, its source points, with their scatter, into coarse ones."""
+        """Enter a scan: its small centroids into fine voxels, its source points into coarse ones."""
         self.fine.insert(points.map_points, T_world_lidar)
-        self.coarse.insert(points.source.astype(np.float32), T_world_lidar, points.scatter)
+        self.coarse.insert(points.source.astype(np.float32), T_world_lidar)
 
     def clear(self) -> None:
         """Forget everything; the room is kept."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, Protocol
@@ -12,10 +13,9 @@ from numpy.typing import NDArray
 from lslam.config.preprocess import PreprocessConfig
 from lslam.config.registration import RegistrationConfig
 from lslam.errors import InputError
-from lslam.geometry import se3, so3
 from lslam.preprocessing.prepare import PreparedPoints, prepare_points
 from lslam.registration.alignment import MapAlignment
-from lslam.registration.local_map import LocalMap
+from lslam.registration.local_map import BREADTH, POINT_BREADTH, LocalMap
 from lslam.registration.motion import ConstantVelocity
 from lslam.registration.residuals import NEEDS_COVARIANCE, residual_named
 from lslam.registration.robust import AdaptiveThreshold, UsualAgreement
@@ -67,10 +67,12 @@ class Registration(Stateful):
         self.recovery = tuple(recovery)
         self.residual = c.residual or "plane"
         residual_named(self.residual)
+        is_point = self.residual == "point"
         self.target = make_target(c.target, c.keyframes)
         self.map = LocalMap(
-            c.voxel_size * (POINT_VOXEL if self.residual == "point" else 1.0), coarse_factor=c.coarse_factor,
-            min_points=c.min_points, planarity=c.planarity, count_cap=c.count_cap, reach=1.2 * self.preprocess.range_max,
+            c.voxel_size * (POINT_VOXEL if is_point else 1.0), coarse_factor=c.coarse_factor, min_points=c.min_points,
+            planarity=c.planarity, count_cap=c.count_cap, reach=1.2 * self.preprocess.range_max,
+            breadth=POINT_BREADTH if is_point else BREADTH,
         )  # fmt: skip
         self.alignment = MapAlignment(self.map, c, self.residual)
         self.threshold = AdaptiveThreshold(c.kernel_min, c.kernel_max)
@@ -165,8 +167,9 @@ class Registration(Stateful):
 
 def correction(T_prior: Floats, pose: Floats) -> tuple[float, float]:
     """How far (m, rad) the pose is from what was expected."""
-    delta = se3.relative(T_prior, pose)
-    return float(np.linalg.norm(delta[:3, 3])), float(so3.angle(delta[:3, :3]))
+    move, R = pose[:3, 3] - T_prior[:3, 3], (T_prior[:3, :3].T @ pose[:3, :3]).tolist()
+    sine = math.hypot(R[2][1] - R[1][2], R[0][2] - R[2][0], R[1][0] - R[0][1])
+    return math.sqrt(float(move @ move)), math.atan2(sine, R[0][0] + R[1][1] + R[2][2] - 1.0)
 
 
 def _failed(T_prior: Floats, source_points: int, reason: str) -> RegistrationResult:
