@@ -22,10 +22,10 @@ if TYPE_CHECKING:
 __all__ = ["Registration", "__version__", "evaluate", "open_sequence", "run"]
 
 _HOMES = {
-    "Registration": "lslam.recovery.policies",
-    "evaluate": "lslam.evaluation.evaluate",
-    "open_sequence": "lslam.readers",
-    "run": "lslam.pipeline.run",
+    "Registration": ("lslam.recovery.policies", "RecoveringRegistration"),
+    "evaluate": ("lslam.evaluation.evaluate", "evaluate"),
+    "open_sequence": ("lslam.readers", "open_sequence"),
+    "run": ("lslam.pipeline.run", "run"),
 }
 
 
@@ -35,4 +35,5 @@ def __getattr__(name: str) -> Any:
         raise AttributeError(f"module 'lslam' has no attribute {name!r}")
     from importlib import import_module
 
-    return getattr(import_module(_HOMES[name]), name)
+    module, attribute = _HOMES[name]
+    return getattr(import_module(module), attribute)

@@ -15,16 +15,17 @@ Floats = NDArray[np.float64]
 
 
 @kernel
-def linearise_point(points: tuple[Floats], voxels: Voxels, settings: Settings, search: Search, pose: Pose,
+def linearise_point(points: tuple[Floats, Floats], voxels: Voxels, settings: Settings, search: Search, pose: Pose,
                     width: Width, sums: Sums) -> None:  # fmt: skip
     """Add all source points (S, 3), LiDAR frame, that are not done, to H, g and facts, see `linearisation`.
 
-    Residual e = R s + t - mean of the nearest of eight matched voxels, planes or not; variance sigma2 plus that of a place in a
+    Residual e = R s + t - mean of the nearest of eight voxels, planes or not; variance sigma2 plus that of a place in a
     voxel, size2 / 12; Geman-McClure weight of width sqrt(scale2 + size2): where in its voxel a point lies is no outlier.
-    Points that have only voxels of single rings near by are left to a coarser map, the coarsest of which takes all.
-    Distances are those to the mean.
+    Where the next ring lies farther off than a voxel, gaps (S,), a mean of few points is one ring's, and would hold those
+    that follow to where this one lies: such a match is left to a coarser map, the coarsest of which takes all. Distances
+    are those to the mean.
     """
-    (source,) = points
+    source, gaps = points
     planes, keys, table = voxels
     size, sigma2, _, takes_all = settings
     cells, slots, is_done, away2 = search
@@ -50,12 +51,10 @@ def linearise_point(points: tuple[Floats], voxels: Voxels, settings: Settings, s
             if s < 0:
                 continue
             p = planes[s]
-            if p[7] < BLOB and not takes_all:
-                continue
             d = (x - p[0]) ** 2 + (y - p[1]) ** 2 + (z - p[2]) ** 2
             if d < best_d:
                 best_d, best = d, s
-        if best < 0:
+        if best < 0 or (gaps[i] > size and planes[best, 7] < BLOB and not takes_all):
             continue
         is_done[i] = True
         away2[i] = best_d

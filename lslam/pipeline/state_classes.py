@@ -7,6 +7,7 @@ from lslam.inertial.gyroscope import Gyroscope
 from lslam.inertial.initialise import Start
 from lslam.odometry.feature_scan import FeatureScan
 from lslam.preprocessing.features import FeaturePoints, Features
+from lslam.preprocessing.prepare import PreparedPoints
 from lslam.types.constraint import Constraint, LoopCandidate
 from lslam.types.gravity import GravityDirection
 from lslam.types.imu import ImuStream
@@ -14,5 +15,5 @@ from lslam.types.scan_result import ScanResult
 
 STATE_CLASSES = (
     Constraint, FeaturePoints, Features, FeatureScan, GravityDirection, Gyroscope, ImuEstimate, ImuStream, LoopCandidate,
-    ScanResult, Start,
+    PreparedPoints, ScanResult, Start,
 )  # fmt: skip

@@ -32,6 +32,13 @@ def elevation_borders(elevation: Floats, count: int | None = None) -> Floats | N
     return None
 
 
+def ring_gap(points: NDArray[np.float32]) -> float:
+    """The usual angle, rad, between neighbouring rings of points (N, 3), LiDAR frame; 0 where elevations do not cluster."""
+    p = points.astype(np.float64)
+    borders = elevation_borders(np.arctan2(p[:, 2], np.hypot(p[:, 0], p[:, 1])))
+    return 0.0 if borders is None else float(np.median(np.diff(borders)))
+
+
 def _borders(elevation: Floats, width_deg: float) -> Floats:
     edges = np.radians(np.arange(-90.0, 90.0 + _BIN_DEG, _BIN_DEG))
     counts = np.histogram(elevation, edges)[0].astype(np.float64)

@@ -30,6 +30,7 @@ class PreparedPoints:
     map_times (M,), source_times (S,) : float32, s from the scan's stamp, mean over the points behind each; None when the scan
         has no times
     covariance : (S, 6) float64, m2, likewise, of the surface round each source point; None where no method asked for it
+    gaps : (S,) float64, m, how far from each source point the next ring lies on a surface that faces the sensor; None likewise
     """
 
     map_points: NDArray[np.float32]
@@ -39,6 +40,7 @@ class PreparedPoints:
     map_times: NDArray[np.float32] | None = None
     source_times: NDArray[np.float32] | None = None
     covariance: NDArray[np.float64] | None = None
+    gaps: NDArray[np.float64] | None = None
 
 
 def prepare_points(
@@ -74,13 +76,14 @@ def prepare_points(
 
 def thin(points: PreparedPoints, step: int) -> PreparedPoints:
     """Every `step`-th source point."""
-    times, covariance = points.source_times, points.covariance
+    times, covariance, gaps = points.source_times, points.covariance, points.gaps
     return replace(
         points,
         source=np.ascontiguousarray(points.source[::step]),
         scatter=np.ascontiguousarray(points.scatter[::step]),
         source_times=None if times is None else times[::step],
         covariance=None if covariance is None else np.ascontiguousarray(covariance[::step]),
+        gaps=None if gaps is None else np.ascontiguousarray(gaps[::step]),
     )
 
 

@@ -23,13 +23,13 @@ START_TURNS_DEG = np.delete(np.arange(-30.0, 31.0, 3.0), 10)
 AT_REST_DEG = 3.0
 # Every so many-th source point is enough to tell a good start from a bad one; so many of the best are looked at closely.
 SEARCH_SHARE, LOOKED_AT = 4, 3
-# Along a bare wall the rings repeat best where nothing moved, by up to five percent: a start elsewhere must have more, and
-# twice as much where planes, the prior or both say otherwise.
-CLEARLY, MUCH = 1.05, 1.1
+# Along a bare wall the rings repeat best where nothing moved, by five percent: a start elsewhere must have more, and twice
+# as much where planes, the prior or both say otherwise.
+CLEARLY, MUCH = 1.06, 1.1
 
 
 class StartSearch:
-    """Tries several starts along the sensor's axis; the non-ground points of the last scans decide between them.
+    """Tries several places along the sensor's axis; the non-ground points of the last scans decide between them.
 
     Posts and crash barriers repeat every few metres, so the nearest agreement of planes may be a false one.
     """
@@ -39,9 +39,9 @@ class StartSearch:
     def recover(
         self, registration: Registration, points: PreparedPoints, T_prior: Floats, found: RegistrationResult
     ) -> RegistrationResult:
-        """Acts while the map is made of the first scans; on the second scan, and on failed ones, it seeks farther."""
+        """Acts while the map is made of the first scans and on failed ones; the second scan may lie anywhere in reach."""
         r, c = registration, registration.config
-        if c.start_reach == 0 or r.inserted > c.start_scans:
+        if c.start_reach == 0 or (found.ok and r.inserted > c.start_scans):
             return found
         result = held_by_non_ground(r, points, T_prior, found, is_lost=r.inserted == 1)
         if result is found:
@@ -94,7 +94,7 @@ def _best_start(
     standing: NonGroundPoints, seen: PreparedPoints,
 ) -> RegistrationResult:  # fmt: skip
     """The best of several starts: a few points on the coarse map show which are worth a whole registration."""
-    alignment = registration.alignment
+    alignment, count = registration.alignment, len(seen.source)
     coarse_map, few = alignment.coarse_map(points, T_prior), thin(points, SEARCH_SHARE)
     slow = alignment.slowly(2 * START_STEP)
     tried = [
@@ -108,6 +108,8 @@ def _best_start(
         # Once more as wide as from an unknown start, what was found right could be drawn to the false place again.
         found = registration.judged(alignment.coarse_to_fine(points, start, 2 * START_STEP), start)
         share, known = (standing.share(seen, result.T_world_lidar) for result in (found, best))
+        if count == 0:
+            share, known = found.agreement, best.agreement
         # A failed one has the prior's pose: where less stands than there, nothing is found.
         if found.ok and (share > CLEARLY * known if best.ok else share >= known):
             best = found

@@ -12,8 +12,6 @@ from lslam.types.state import Stateful
 # A plane must have been seen across its beams by twice the standard deviation that it is thick: below that, a plane
 # through the sensor explains its points as well, which is where the beams of one ring lie whatever they hit.
 BREADTH = 4.0
-# A mean has no normal that could be wrong: more than a ring is enough.
-POINT_BREADTH = 1.0
 
 
 class LocalMap(Stateful):
@@ -22,18 +20,17 @@ class LocalMap(Stateful):
     Parameters
     ----------
     size : m, edge of a fine voxel; coarse_factor : how many times larger a coarse one is
-    min_points, planarity, count_cap, reach, breadth : as in `GaussianMap`
+    min_points, planarity, count_cap, reach : as in `GaussianMap`
     """
 
     STATE = ("fine", "coarse")
 
     def __init__(
-        self, size: float, *, coarse_factor: int, min_points: int, planarity: float, count_cap: float, reach: float,
-        breadth: float = BREADTH,
-    ) -> None:  # fmt: skip
+        self, size: float, *, coarse_factor: int, min_points: int, planarity: float, count_cap: float, reach: float
+    ) -> None:
         self.fine, self.coarse = (
             GaussianMap(
-                edge, min_points=min_points, planarity=planarity, count_cap=count_cap, reach=reach, breadth=breadth
+                edge, min_points=min_points, planarity=planarity, count_cap=count_cap, reach=reach, breadth=BREADTH
             )
             for edge in (size, size * coarse_factor)
         )

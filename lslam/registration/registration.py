@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 from lslam.config.preprocess import PreprocessConfig
 from lslam.config.registration import RegistrationConfig
 from lslam.errors import InputError
+from lslam.preprocessing.beams import ring_gap
 from lslam.preprocessing.prepare import PreparedPoints, prepare_points
 from lslam.registration.alignment import MapAlignment
-from lslam.registration.local_map import BREADTH, POINT_BREADTH, LocalMap
+from lslam.registration.local_map import LocalMap
 from lslam.registration.motion import ConstantVelocity
 from lslam.registration.residuals import NEEDS_COVARIANCE, residual_named
 from lslam.registration.robust import AdaptiveThreshold, UsualAgreement
@@ -33,6 +34,8 @@ NEAR_KERNEL = 2.0
 SCAN_NS = 100_000_000
 # Point to point: of the voxel size, because a voxel's mean stands for one point of its surface, its plane for all.
 POINT_VOXEL = 0.625
+# A few points at the edge of sight are not worth a look at the coarse map.
+SPARSE_SHARE = 0.1
 # Times the steps: a point is drawn to where its match is, not to where the surfaces meet, and the score of a normal
 # distribution has no pull on points a few sigma away, so that those near by turn the sensor a little with each step.
 SLOWLY: dict[str, int] = {"point": 3, "ndt": 3}
@@ -56,7 +59,8 @@ class Registration(Stateful):
     recovery : asked in this order after each registration
     """
 
-    STATE = ("map", "target", "threshold", "agreement", "starting", "inserted", "recent", "_motion", "_index")
+    STATE = ("map", "target", "threshold", "agreement", "starting", "inserted", "recent", "_motion", "_index",
+             "_ring_gap")  # fmt: skip
 
     def __init__(
         self, config: RegistrationConfig | None = None, preprocess: PreprocessConfig | None = None,
@@ -67,12 +71,10 @@ class Registration(Stateful):
         self.recovery = tuple(recovery)
         self.residual = c.residual or "plane"
         residual_named(self.residual)
-        is_point = self.residual == "point"
         self.target = make_target(c.target, c.keyframes)
         self.map = LocalMap(
-            c.voxel_size * (POINT_VOXEL if is_point else 1.0), coarse_factor=c.coarse_factor, min_points=c.min_points,
-            planarity=c.planarity, count_cap=c.count_cap, reach=1.2 * self.preprocess.range_max,
-            breadth=POINT_BREADTH if is_point else BREADTH,
+            c.voxel_size * (POINT_VOXEL if self.residual == "point" else 1.0), coarse_factor=c.coarse_factor,
+            min_points=c.min_points, planarity=c.planarity, count_cap=c.count_cap, reach=1.2 * self.preprocess.range_max,
         )  # fmt: skip
         self.alignment = MapAlignment(self.map, c, self.residual)
         self.threshold = AdaptiveThreshold(c.kernel_min, c.kernel_max)
@@ -81,6 +83,8 @@ class Registration(Stateful):
         self.starting, self.inserted = c.start_scans, 0
         self.recent: tuple[tuple[NDArray[np.float32], Floats], ...] = ()
         self._motion, self._index = ConstantVelocity(), 0
+        # Angle between rings, rad, for point to point; 0 where unknown.
+        self._ring_gap = 0.0
 
     def register(self, points: NDArray[Any], prior: Floats | None = None) -> RegistrationResult:
         """Pose of points (N, 3), m, LiDAR frame; without `prior` (4, 4) the velocity is taken as constant."""
@@ -111,6 +115,8 @@ class Registration(Stateful):
         if self.residual in NEEDS_COVARIANCE and points.covariance is None:
             found = source_covariance(points.source, points.map_points, c.sigma**2)
             points = replace(points, covariance=found)
+        if self.residual == "point":
+            points = replace(points, gaps=self._gaps(points))
         width, steps = self.threshold.width, c.max_iterations * SLOWLY.get(self.residual, 1)
         if is_near:
             width = NEAR_KERNEL * c.kernel_min
@@ -139,6 +145,13 @@ class Registration(Stateful):
             self.agreement.relax()
         self._motion.correct(self._index * SCAN_NS, result.T_world_lidar)
         self._index += 1
+
+    def _gaps(self, points: PreparedPoints) -> Floats | None:
+        """(S,) m, between the rings at each source point; the angle between rings is learnt while the map is young."""
+        if self.inserted <= self.config.start_scans:
+            self._ring_gap = ring_gap(points.map_points)
+        gaps: Floats = self._ring_gap * np.linalg.norm(points.source, axis=1)
+        return gaps if (gaps > self.map.fine.size).mean() > SPARSE_SHARE else None
 
     def is_small(self, result: RegistrationResult) -> bool:
         """Whether the correction of the motion prior is no larger than priors are wrong by."""

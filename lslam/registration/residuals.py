@@ -24,6 +24,12 @@ def _with_scatter(points: PreparedPoints, sigma: float) -> Arrays:
     return points.source, points.scatter
 
 
+def _with_gaps(points: PreparedPoints, sigma: float) -> Arrays:
+    from numpy import zeros
+
+    return points.source, zeros(len(points.source)) if points.gaps is None else points.gaps
+
+
 def _with_covariance(points: PreparedPoints, sigma: float) -> Arrays:
     from lslam.registration.source_covariance import source_covariance
 
@@ -67,7 +73,7 @@ class ResidualKind:
 
 RESIDUALS = {
     "plane": ResidualKind("lslam.kernels.residuals", "linearise"),
-    "point": ResidualKind("lslam.kernels.point_residual", "linearise_point", _alone),
+    "point": ResidualKind("lslam.kernels.point_residual", "linearise_point", _with_gaps),
     "gicp": ResidualKind("lslam.kernels.gicp_residual", "linearise_gicp", _with_covariance, by_surfaces=True),
     "vgicp": ResidualKind(
         "lslam.kernels.vgicp_residual", "linearise_vgicp", _with_covariance, _counted_planes, by_surfaces=True

@@ -23,7 +23,7 @@ from lslam.config.recovery import RecoveryConfig
 from lslam.config.registration import RegistrationConfig
 from lslam.errors import UsageError
 from lslam.recovery.policies import RecoveringRegistration
-from lslam.registration import registration as core
+from lslam.registration import local_map
 from lslam.simulation.scenarios import simulate
 
 Make = Callable[[], RecoveringRegistration]
@@ -34,7 +34,7 @@ SCANS = 100
 
 
 def _without_breadth() -> RecoveringRegistration:
-    with mock.patch.multiple(core, BREADTH=0.0, POINT_BREADTH=0.0):
+    with mock.patch.object(local_map, "BREADTH", 0.0):
         return RecoveringRegistration()
 
 

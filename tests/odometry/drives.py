@@ -15,7 +15,7 @@ from lslam.evaluation.pairs import by_path
 from lslam.evaluation.relative import error_transforms
 from lslam.geometry import se3, so3
 from lslam.preprocessing.prepare import PreparedPoints, prepare_points
-from lslam.registration.registration import Registration
+from lslam.recovery.policies import RecoveringRegistration
 from lslam.registration.solver import RegistrationResult
 from lslam.registration.uncertainty import PoseUncertainty
 from lslam.simulation.scenarios import simulate
@@ -58,7 +58,7 @@ def prepared(sequence: Sequence, indices: Iterable[int]) -> list[PreparedPoints]
 
 def registered(points: Iterable[PreparedPoints]) -> list[RegistrationResult]:
     """All scans, one after the other, in the default configuration."""
-    registration = Registration()
+    registration = RecoveringRegistration()
     return [registration.align(p) for p in points]
 
 

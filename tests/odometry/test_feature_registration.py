@@ -198,7 +198,7 @@ def test_a_map_of_all_points_is_given_up_when_features_are_fed_again(
         result = registration.locate(features, np.eye(4), StageClock())
         assert ("all points stood in" in result.reason) == is_starved
         registration.update(features, result)
-        entered.append(registration._all.state()["_icp"]["_inserted"])
+        entered.append(registration._all.state()["_icp"]["inserted"])
     assert entered[0] == 0
     assert np.diff(entered[1:]).tolist() == [1] * (FED - 1) + [0] * 3
 

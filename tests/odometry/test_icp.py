@@ -121,7 +121,7 @@ def test_a_bad_scan_is_bridged_flagged_kept_out_of_the_map_and_got_over(kind: st
     assert not result.converged
     np.testing.assert_array_equal(result.T_world_lidar, expected)
     for name in ("moments", "planes", "keys", "table"):
-        np.testing.assert_array_equal(getattr(target, name), getattr(before, name))
+        np.testing.assert_array_equal(getattr(target.fine, name), getattr(before.fine, name))
     assert result.covariance is not None
     assert np.sqrt(result.covariance[0, 0]) > 0.4
     for k in (BAD + 1, BAD + 2, BAD + 3):
@@ -213,8 +213,8 @@ def test_the_configuration_reaches_the_method() -> None:
     )
     icp = create_odometry(config)
     assert isinstance(icp, Icp)
-    assert icp.registration.map.size == 1.1
-    assert icp.registration.map.reach == pytest.approx(60.0)
+    assert icp.registration.map.fine.size == 1.1
+    assert icp.registration.map.fine.reach == pytest.approx(60.0)
     assert icp.registration.preprocess.map_leaf == 0.4
 
 

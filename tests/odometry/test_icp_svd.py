@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import sys
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from analytic_scenes import distance, random_pose, room, seen_from
 from drives import ate, standing
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
@@ -19,9 +18,6 @@ from lslam.pipeline.front_end import estimate
 from lslam.simulation.scenarios import simulate
 from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan import Scan
-
-sys.path.append(str(Path(__file__).resolve().parents[1] / "registration"))
-from analytic_scenes import distance, random_pose, room, seen_from
 
 Floats = NDArray[np.float64]
 

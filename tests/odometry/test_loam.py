@@ -267,14 +267,14 @@ def test_options_act_as_they_are_named() -> None:
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_a_first_step_of_six_metres_is_found(method: str) -> None:
+def test_a_first_step_of_nine_metres_is_found(method: str) -> None:
     scans, truth = street(0, "os1-32", 13, speed=10.0)
     driver = Driver(method)
     driver.feed(scans[0])
-    assert metres(driver.feed(scans[6]), truth[6]) < 0.1
+    assert metres(driver.feed(scans[9]), truth[9]) < 0.1
     blind = Driver(method, start_reach=0.0)
     blind.feed(scans[0])
-    assert metres(blind.feed(scans[6]), truth[6]) > 1.0
+    assert metres(blind.feed(scans[9]), truth[9]) > 1.0
 
 
 @cache

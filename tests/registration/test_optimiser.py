@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
-from analytic_scenes import is_near, random_pose, seen_from
+from analytic_scenes import bushes, is_near, random_pose, seen_from
 from analytic_scenes import room as lit_room
 from numpy.typing import NDArray
 
@@ -24,7 +23,7 @@ from lslam.registration.optimiser import Limits, Matches, Optimum, Term, optimis
 from lslam.registration.registration import Registration
 from lslam.registration.residuals import RESIDUALS, ResidualKind
 from lslam.registration.robust import Annealing
-from lslam.registration.solver import solve, voxel_terms
+from lslam.registration.solver import RegistrationResult, solve, voxel_terms
 
 STEPS = 30
 
@@ -130,7 +129,7 @@ def test_a_start_that_is_no_contiguous_array_is_left_alone(target: GaussianMap) 
 
 
 def test_the_facts_are_named() -> None:
-    """A term that only sums up: every fact arrives under its own name, and the fine inliers without those of the others."""
+    """Two terms that only sum up: every fact of both arrives under its own name."""
     places = [at.INFORMATION, at.SQUARED, at.INLIERS, at.MATCHED, at.LEVER, at.ROBUST]
 
     def sum_up(points: object, target: object, settings: object, search: object, pose: object, width: object,
@@ -138,13 +137,10 @@ def test_the_facts_are_named() -> None:
         sums[0][:] += np.eye(6)
         sums[3][places] += [4.0, 9.0, 20.0, 30.0, 16.0, 1.0]
 
-    fine = Term(sum_up, (), (), ())
-    found = optimise(
-        [fine, replace(fine, is_fine=False)], np.eye(4), Annealing(1.0, 1.0, 0.5, 1), Limits(1e-3), Matches(0)
-    )
-    facts = found.facts
+    term = Term(sum_up, (), (), ())
+    facts = optimise([term, term], np.eye(4), Annealing(1.0, 1.0, 0.5, 1), Limits(1e-3), Matches(0)).facts
     assert (facts.information, facts.squared, facts.lever_information, facts.robust) == (8.0, 18.0, 32.0, 2.0)
-    assert (facts.inliers, facts.fine_inliers, facts.matched) == (40, 20, 60)
+    assert (facts.inliers, facts.matched) == (40, 60)
     assert facts.lever_arm == 2.0
     assert facts.rmse == 3.0
 
@@ -167,18 +163,36 @@ def test_each_map_serves_what_the_finer_ones_left(residual: str) -> None:
     T = random_pose(rng, 0.1, 0.5)
     scan = as_source(seen_from(room(rng, 400, 0.01), T))
 
-    def found(count: int) -> tuple[int, int, Floats]:
-        result = solve(
+    def found(count: int) -> RegistrationResult:
+        return solve(
             levels[0], scan, np.eye(4), Annealing(1.0, 0.15, 0.7, 40), sigma=0.03, blob_weight=0.0, weak_share=1e-3,
             coarser=levels[1:count], residual=residual,
         )  # fmt: skip
-        return result.matched, result.fine_inliers, result.T_world_lidar
 
-    matched, fine = zip(*(found(k)[:2] for k in (1, 2, 3)), strict=True)
-    assert matched[0] < matched[1] < matched[2]
-    assert 0 < max(fine) <= len(scan.source) / 2
+    one, two, three = (found(k) for k in (1, 2, 3))
+    assert 0 < one.matched < two.matched < three.matched
+    assert one.inliers < two.inliers < three.inliers
     # The mean of a voxel of two metres is no place to draw a point to.
-    assert residual == "point" or is_near(T, found(3)[2], 0.02, 0.1)
+    assert residual == "point" or is_near(T, three.T_world_lidar, 0.02, 0.1)
+
+
+@pytest.mark.parametrize("residual", list(RESIDUALS))
+def test_no_point_is_matched_on_two_maps(residual: str) -> None:
+    """Bushes among walls: what a blob of the fine map serves, the coarse one does not serve again."""
+    rng = np.random.default_rng(0)
+
+    def seen() -> NDArray[np.float32]:
+        return np.concatenate([room(rng, 2000, 0.01), bushes(rng)]).astype(np.float32)
+
+    levels = [GaussianMap(0.8), GaussianMap(2.4)]
+    for level in levels:
+        level.insert(seen(), np.eye(4))
+    scan = as_source(seen()[::20])
+    result = solve(
+        levels[0], scan, np.eye(4), Annealing(0.15, 0.15, 0.5, 5), sigma=0.03, blob_weight=0.5, weak_share=1e-3,
+        coarser=levels[1:], residual=residual,
+    )  # fmt: skip
+    assert 0 < result.inliers <= result.matched <= result.source_points
 
 
 @kernel

@@ -13,7 +13,7 @@ from lslam.config.preprocess import PreprocessConfig
 from lslam.config.registration import RegistrationConfig, Residual
 from lslam.geometry import se3
 from lslam.preprocessing.prepare import prepare_points
-from lslam.registration.registration import Registration
+from lslam.recovery.policies import RecoveringRegistration as Registration
 from lslam.registration.residuals import RESIDUALS as TABLE
 from lslam.registration.robust import Annealing
 from lslam.registration.solver import solve
@@ -57,7 +57,7 @@ def test_the_coarse_map_alone_brings_a_start_near(residual: Residual) -> None:
         registration = in_room(residual, seed)
         points = prepare_points(seen_from(room(rng), T), registration.preprocess)
         slow = Annealing(5.0, 0.15, 0.85, 40)
-        coarse = registration.map.coarsen(3)
+        coarse = registration.map.coarse
         found = solve(coarse, points, np.eye(4), slow, sigma=0.03, blob_weight=0.5, weak_share=1e-3, residual=residual)
         assert distance(T, found.T_world_lidar)[0] < 0.1
 
@@ -113,7 +113,7 @@ def test_a_bad_scan_fails_says_why_and_leaves_the_map_alone(residual: Residual, 
     assert np.sqrt(result.covariance[0, 0]) == pytest.approx(0.5)
     assert is_near(result.T_world_lidar, pose_at((0.7, 0.0, 0.0)), 0.05, 0.3)
     for name in ("moments", "planes", "keys", "table"):
-        np.testing.assert_array_equal(getattr(registration.map, name), getattr(before, name))
+        np.testing.assert_array_equal(getattr(registration.map.fine, name), getattr(before.fine, name))
     T = pose_at((0.8, 0.0, 0.0))
     assert is_near(T, registration.register(seen_from(room(rng), T)).T_world_lidar, *ROOM[residual])
 
@@ -175,8 +175,8 @@ def test_the_map_holds_what_its_target_says(target: str) -> None:
     for k in range(21):
         scan = seen_from(corridor(rng, 4000, along=float(k)), pose_at((float(k), 0.0, 0.0)))
         registration.register(scan, pose_at((float(k), 0.0, 0.0)))
-        live = registration.map.keys >= 0
-        behind.append(k - float(registration.map.planes[live, 0].min()))
+        live = registration.map.fine.keys >= 0
+        behind.append(k - float(registration.map.fine.planes[live, 0].min()))
     assert behind[0] == pytest.approx(25.0, abs=0.5)
     # Keyframes are two metres apart, or three where an estimate falls short; the newest is up to as old.
     low, high = (24.5, 25.5) if target == "scan" else (28.5, 33.5)

@@ -1,0 +1,21 @@
+"""Drives that are simulated once, with whichever LiDAR on the roof."""
+
+from __future__ import annotations
+
+from copy import copy
+from functools import cache
+
+from lslam.simulation.lidar_models import lidar_named
+from lslam.simulation.scenarios import SimulatedDrive, simulate
+
+
+@cache
+def driven(scenario: str, seed: int) -> SimulatedDrive:
+    return simulate(scenario, seed=seed, motion_compensated=True)
+
+
+def seen_by(lidar: str, scenario: str, seed: int = 0) -> SimulatedDrive:
+    """The same drive with another LiDAR: to build the town takes longer than what is asked here."""
+    drive = copy(driven(scenario, seed))
+    drive.lidar = lidar_named(lidar)
+    return drive

@@ -1,0 +1,82 @@
+"""Non-ground points: which they are, how many agree at a pose, and which directions are left to the planes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from analytic_scenes import pose_at
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from lslam.config.preprocess import PreprocessConfig
+from lslam.geometry import se3
+from lslam.preprocessing.prepare import PreparedPoints
+from lslam.recovery.non_ground import NEAR, NonGroundPoints, non_ground_points, sought
+from lslam.recovery.start_search import CLEARLY
+
+Floats = NDArray[np.float64]
+Points = NDArray[np.float32]
+
+
+def street(rng: np.random.Generator, x: float) -> NDArray[np.float32]:
+    """Flat ground and irregular poles as seen from (x, 0, 1.7)."""
+    ground = np.column_stack([rng.uniform(-30, 30, (4000, 2)), np.zeros(4000)])
+    poles = np.random.default_rng(9).uniform(-25, 25, (40, 2)).repeat(20, axis=0)
+    standing = np.column_stack([poles, np.tile(np.linspace(1.6, 4.0, 20), 40)])
+    return (np.concatenate([ground, standing]) - [x, 0, 1.7]).astype(np.float32)
+
+
+def standing_in(points: Points, pose: Floats) -> NonGroundPoints:
+    return NonGroundPoints([(points, pose)], PreprocessConfig())
+
+
+def seen_in(points: Points) -> PreparedPoints:
+    return sought(points, PreprocessConfig())
+
+
+def test_the_share_is_that_of_points_with_a_neighbour_and_leaves_the_ground_out() -> None:
+    rng = np.random.default_rng(0)
+    first = standing_in(street(rng, 0.0), pose_at((5.0, 0.0, 0.0), 30.0))
+    seen = seen_in(street(rng, 2.0))
+    assert len(seen.source) == 800
+    tree = cKDTree(se3.apply(pose_at((5.0, 0.0, 0.0), 30.0), street(rng, 0.0)[4000:].astype(float)))
+    true = pose_at((5.0, 0.0, 0.0), 30.0) @ pose_at((2.0, 0.0, 0.0))
+    for off in np.arange(0.0, 6.0, 0.75):
+        pose = true @ pose_at((off, 0.1, 0.0))
+        away, _ = tree.query(se3.apply(pose, seen.source))
+        # Cells stand for their points: their mean lies up to half a cell from any of them.
+        assert (away < NEAR / 2).mean() - 0.02 <= first.share(seen, pose) <= (away < 1.5 * NEAR).mean() + 0.02
+    assert first.share(seen, true) == 1.0
+    assert first.share(seen, true) > CLEARLY * first.share(seen, true @ pose_at((1.0, 0.0, 0.0)))
+
+
+def test_what_is_as_low_as_a_crash_barrier_is_asked_only_where_hardly_anything_is_higher() -> None:
+    """Barriers lie along the road everywhere: the sensor's own rings match on them best where nothing moved."""
+    points = street(np.random.default_rng(1), 0.0)
+    along = np.arange(-20, 20, 0.1)
+    barrier = np.column_stack([along, np.full_like(along, 5.0), np.full_like(along, 0.8 - 1.7)]).astype(np.float32)
+    assert len(non_ground_points(np.concatenate([points, barrier]), PreprocessConfig())[1]) == 800
+    few = np.concatenate([points[:4000], barrier, points[-20:]])
+    assert len(non_ground_points(few, PreprocessConfig())[1]) == len(barrier) + 20
+
+
+def test_bare_ground_says_nothing() -> None:
+    ground = street(np.random.default_rng(1), 0.0)[:4000]
+    assert standing_in(ground, np.eye(4)).share(seen_in(ground), np.eye(4)) == 0.0
+
+
+@pytest.mark.parametrize(("height", "kept"), [(0.3, 0.3), (0.5, 0.0)])
+def test_height_and_tilt_come_from_planes_and_the_rest_from_what_stands(height: float, kept: float) -> None:
+    """Half a metre higher nothing that stands would have its like near by: planes that say so do not hold the height."""
+    rng = np.random.default_rng(3)
+    tilted = se3.exp(np.array([0, 0, 0, 0.05, -0.2, 0.0]))
+    level = street(rng, 0.0)
+    scan = se3.apply(se3.inverse(tilted), level.astype(np.float64)).astype(np.float32)
+    stands, planes = pose_at((3.0, 0.2, 0.0), 4.0), pose_at((2.8, 0.1, height), 3.5) @ se3.exp([0, 0, 0, 0.02, 0.01, 0])
+    # Poses of the tilted sensor whose levelled frames are the two.
+    placed = standing_in(scan, np.eye(4)).place_on_ground(stands @ tilted, planes @ tilted, scan) @ se3.inverse(tilted)
+    np.testing.assert_allclose(placed[:2, 3], stands[:2, 3], atol=0.05)
+    np.testing.assert_allclose(placed[2, :3], planes[2, :3], atol=5e-3)
+    assert placed[2, 3] == pytest.approx(kept, abs=0.02)
+    yaw = np.rad2deg(np.arctan2(placed[1, 0], placed[0, 0]))
+    assert abs(yaw - 4.0) < 0.1

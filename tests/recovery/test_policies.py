@@ -1,0 +1,91 @@
+"""Which policies a configuration switches on, and that `posed_by` names the one that found the pose."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from analytic_scenes import distance, is_near, pose_at, room, seen_from
+from numpy.typing import NDArray
+from recovery_drives import driven
+
+from lslam.config.config import Config
+from lslam.config.recovery import RecoveryConfig
+from lslam.geometry import se3
+from lslam.preprocessing.prepare import prepare_points
+from lslam.recovery.coarse_to_fine import CoarseToFine
+from lslam.recovery.policies import RecoveringRegistration, policies_of
+from lslam.recovery.start_search import StartSearch
+from lslam.registration.registration import Registration
+from lslam.registration.solver import RegistrationResult
+
+Floats = NDArray[np.float64]
+
+
+def test_each_policy_has_its_switch_and_the_nearer_one_is_asked_first() -> None:
+    def kinds(config: RecoveryConfig) -> list[type]:
+        return [type(policy) for policy in policies_of(config)]
+
+    assert kinds(RecoveryConfig()) == kinds(Config().recovery) == [CoarseToFine, StartSearch]
+    assert kinds(RecoveryConfig(coarse_to_fine=False)) == [StartSearch]
+    assert kinds(RecoveryConfig(start_search=False)) == [CoarseToFine]
+    assert kinds(RecoveryConfig(coarse_to_fine=False, start_search=False)) == []
+
+
+def surprised(config: RecoveryConfig) -> tuple[RegistrationResult, Floats]:
+    """What is made of three metres and six degrees that the prior does not know, after ten scans; and the true pose."""
+    registration, rng = RecoveringRegistration(recovery=config), np.random.default_rng(0)
+    for k in range(10):
+        assert registration.register(seen_from(room(rng), pose_at((0.1 * k, 0.0, 0.0)))).posed_by == ""
+    T = pose_at((1.0, 3.0, 0.0), 6.0)
+    return registration.register(seen_from(room(rng), T)), T
+
+
+def test_coarse_to_fine_catches_a_surprise_where_it_is_switched_on() -> None:
+    result, T = surprised(RecoveryConfig())
+    assert is_near(T, result.T_world_lidar, 0.01, 0.05)
+    assert result.posed_by == "coarse-to-fine"
+    lost, T = surprised(RecoveryConfig(coarse_to_fine=False))
+    assert distance(T, lost.T_world_lidar)[0] > 0.5
+    assert lost.posed_by == ""
+
+
+@pytest.mark.parametrize("coarse_to_fine", [True, False])
+def test_the_start_search_finds_a_far_first_step_where_it_is_switched_on(coarse_to_fine: bool) -> None:
+    """Nine metres on a motorway, from one scan to the next."""
+    drive = driven("motorway", 0)
+    truth = se3.relative(drive.ground_truth.poses[0], drive.ground_truth.poses[3])
+
+    def second(start_search: bool) -> RegistrationResult:
+        config = RecoveryConfig(coarse_to_fine=coarse_to_fine, start_search=start_search)
+        registration = RecoveringRegistration(recovery=config)
+        registration.register(drive.scan(0).points)
+        return registration.register(drive.scan(3).points)
+
+    found, lost = second(True), second(False)
+    assert found.ok
+    assert found.posed_by == "start search"
+    assert np.linalg.norm(found.T_world_lidar[:3, 3] - truth[:3, 3]) < 0.1
+    assert found.prior_error[0] == pytest.approx(np.linalg.norm(found.T_world_lidar[:3, 3]))
+    assert lost.posed_by != "start search"
+    assert not lost.ok or np.linalg.norm(lost.T_world_lidar[:3, 3] - truth[:3, 3]) > 1.0
+
+
+def test_without_policies_it_is_the_core() -> None:
+    bare = RecoveryConfig(coarse_to_fine=False, start_search=False)
+    poses = []
+    for registration in (RecoveringRegistration(recovery=bare), Registration()):
+        rng = np.random.default_rng(0)
+        for k in range(8):
+            result = registration.register(seen_from(room(rng, 2000), pose_at((0.1 * k, 0.02 * k, 0.0), 0.5 * k)))
+        poses.append(result.T_world_lidar)
+    np.testing.assert_array_equal(*poses)
+
+
+def test_near_its_prior_nobody_is_asked(monkeypatch: pytest.MonkeyPatch) -> None:
+    for policy in (CoarseToFine, StartSearch):
+        monkeypatch.setattr(policy, "recover", lambda *_: pytest.fail("asked"))
+    registration = RecoveringRegistration()
+    rng = np.random.default_rng(0)
+    first, second = (prepare_points(room(rng).astype(np.float32), registration.preprocess, k) for k in range(2))
+    registration.align(first)
+    assert registration.locate(second, pose_at((0.05, 0.0, 0.0)), is_near=True).ok

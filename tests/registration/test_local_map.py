@@ -1,0 +1,73 @@
+"""The local map in two resolutions: what enters each, that both forget, and what a young one holds."""
+
+from __future__ import annotations
+
+from copy import deepcopy
+
+import numpy as np
+import pytest
+from analytic_scenes import pose_at, room
+
+from lslam.config.preprocess import PreprocessConfig
+from lslam.preprocessing.prepare import PreparedPoints, prepare_points
+from lslam.registration.gaussian_map import GaussianMap
+from lslam.registration.local_map import BREADTH, LocalMap
+from lslam.registration.registration import Registration
+from lslam.simulation.scenarios import simulate
+
+ARRAYS = ("moments", "planes", "keys", "table")
+
+
+def new_map() -> LocalMap:
+    return LocalMap(0.8, coarse_factor=3, min_points=6, planarity=0.3, count_cap=200.0, reach=100.0)
+
+
+def scan(seed: int) -> PreparedPoints:
+    return prepare_points(room(np.random.default_rng(seed)).astype(np.float32), PreprocessConfig(), seed)
+
+
+def assert_same(a: GaussianMap, b: GaussianMap) -> None:
+    for name in ARRAYS:
+        np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
+
+
+def test_map_points_enter_fine_voxels_and_source_points_coarse_ones() -> None:
+    target, points, T = new_map(), scan(0), pose_at((1.0, 2.0, 0.5), 30.0)
+    target.insert(points, T)
+    kept = {"min_points": 6, "planarity": 0.3, "count_cap": 200.0, "reach": 100.0, "breadth": BREADTH}
+    fine, coarse = (GaussianMap(size, **kept) for size in (0.8, 3 * 0.8))
+    fine.insert(points.map_points, T)
+    coarse.insert(points.source.astype(np.float32), T)
+    assert_same(target.fine, fine)
+    assert_same(target.coarse, coarse)
+    assert len(target) == len(fine) > len(coarse) > 0
+
+
+def test_both_levels_are_forgotten_and_taken_up_again() -> None:
+    target = new_map()
+    target.insert(scan(0), np.eye(4))
+    known, again = deepcopy(target.state()), new_map()
+    again.restore(known)
+    for one in (target, again):
+        one.insert(scan(1), pose_at((0.3, 0.0, 0.0)))
+    for level in ("fine", "coarse"):
+        a, b = getattr(target, level), getattr(again, level)
+        live = np.sort(a.keys[a.keys >= 0])
+        np.testing.assert_array_equal(live, np.sort(b.keys[b.keys >= 0]))
+        np.testing.assert_array_equal(a.planes[a.keys >= 0], b.planes[b.keys >= 0])
+    target.clear()
+    assert len(target) == len(target.fine) == len(target.coarse) == 0
+
+
+@pytest.mark.parametrize("scenario", ["street", "block", "walk"])
+def test_near_its_prior_a_scan_is_placed_well_while_the_map_is_young(scenario: str) -> None:
+    """Single rings of one scan must not pass for planes in fine voxels: they held the next four centimetres off."""
+    drive = simulate(scenario, count=2, lidar="vlp16", motion_compensated=True)
+    first, second = (drive.ground_truth.poses[i] for i in range(2))
+    registration = Registration()
+    points = [prepare_points(drive.scan(i).points, registration.preprocess) for i in range(2)]
+    registration.align(points[0], first)
+    prior = second @ pose_at((0.1, 0.05, 0.0))
+    result = registration.locate(points[1], prior, is_near=True)
+    assert result.ok
+    assert np.linalg.norm(result.T_world_lidar[:3, 3] - second[:3, 3]) < 0.02
