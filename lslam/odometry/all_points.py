@@ -18,6 +18,8 @@ from lslam.types.state import Stateful
 
 Floats = NDArray[np.float64]
 
+# In `posed_by`.
+ALL_POINTS = "all-points"
 # After so many scans in a row that features held well, two seconds at 10 Hz, the map of all points is given up.
 FED = 20
 
@@ -70,7 +72,8 @@ class AllPoints(Stateful):
         if held is found:
             return found
         why = found.reason or "features disagree with what stands on the ground"
-        return replace(held, prior_error=correction(T_prior, held.T_world_lidar), reason=f"{why}: all points stood in")
+        error, why = correction(T_prior, held.T_world_lidar), f"{why}: all points stood in"
+        return replace(held, prior_error=error, reason=why, posed_by=ALL_POINTS)
 
     def stand_in(
         self, features: Features, T_prior: Floats, starved: RegistrationResult, known: RegistrationResult | None
@@ -90,7 +93,7 @@ class AllPoints(Stateful):
             return starved
         why = starved.reason or "features hold the place badly"
         flagged = found.degenerate if len(found.degenerate) else starved.degenerate
-        return replace(found, degenerate=flagged, reason=f"{why}: all points stood in")
+        return replace(found, degenerate=flagged, reason=f"{why}: all points stood in", posed_by=ALL_POINTS)
 
     def update(self, features: Features, result: RegistrationResult) -> None:
         """Remember all points of a registered scan; what `icp` found of it, if asked, teaches it what to expect."""

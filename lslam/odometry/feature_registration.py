@@ -30,6 +30,8 @@ MIN_FEATURES = 60
 PATIENCE = 3
 # m, grid of the less planar points when they stand in for the features: as `preprocess.source_voxel`.
 STAND_IN_GRID = 1.0
+# In `posed_by`.
+LESS_PLANAR = "less planar points"
 
 
 class FeatureRegistration(Stateful):
@@ -227,7 +229,7 @@ class FeatureRegistration(Stateful):
         why = starved.reason or (
             f"only {starved.inliers} features agree" if are_few else "features leave a direction open"
         )
-        return replace(result, reason=f"{why}: less planar points stood in")
+        return replace(result, reason=f"{why}: less planar points stood in", posed_by=LESS_PLANAR)
 
     def _on_planes(self, features: Features, T_start: Floats, T_prior: Floats) -> RegistrationResult:
         """Edges, and centroids of the less planar points, on fine and coarse planes."""

@@ -26,6 +26,7 @@ def of_registration(scan: Scan, found: RegistrationResult, map_age: float, stage
         T_world_lidar=found.T_world_lidar,
         status="ok" if found.ok else "bridged",
         reason=found.reason,
+        posed_by=found.posed_by,
         registration_covariance=found.covariance,
         map_age=map_age,
         converged=found.converged,

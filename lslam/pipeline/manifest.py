@@ -5,6 +5,7 @@ from __future__ import annotations
 import platform
 import sys
 import time
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
@@ -15,12 +16,15 @@ from typing import Any
 
 from lslam.config import Config
 from lslam.errors import InterruptedRunError
+from lslam.reports.facts import describe
 from lslam.types.scan import Span
 from lslam.types.scan_result import ScanResult
 from lslam.types.sequence import Sequence
 from lslam.version import __version__
 
 SCHEMA = 1
+# Share of the scans that may leave a direction open before the run counts as degraded.
+MOST_DEGENERATE = 0.1
 LIBRARIES = ("numpy", "numba", "scipy", "kiss-icp")
 
 
@@ -36,6 +40,7 @@ class Manifest:
     imu : what became of the IMU, empty without `--imu`; keyframes : how many and how large
     graph, georeference : what the back end did and where on the Earth the world lies, empty where it did nothing
     identity : digests that a run and its resumption share; resumed_after : scans that were done when it was resumed
+    posed_by : scans by who posed them: the method, what stood in for it, the motion prior
     problems : what went wrong in this run, beside what was wrong with the recording before
     """
 
@@ -48,6 +53,7 @@ class Manifest:
         self.timings: dict[str, float] = {}
         self.problems: list[str] = []
         self.counts: dict[str, int] = {}
+        self.posed_by: dict[str, int] = {}
         self.map_points: int | None = None
         self.imu: dict[str, Any] = {}
         self.keyframes: dict[str, Any] = {}
@@ -77,9 +83,9 @@ class Manifest:
             status: sum(r.status == status for r in results) for status in ("ok", "bridged", "skipped")
         }
         self.counts["standing"] = sum(r.is_standing for r in results)
-        # Registered, but by points that stood in for the method's own.
-        self.counts["stand_in"] = sum(r.status == "ok" and bool(r.reason) and not r.is_standing for r in results)
         self.counts["degenerate"] = sum(len(r.degenerate) > 0 for r in results)
+        self.posed_by = dict(Counter(r.poser(self.config.odometry.method) for r in results))
+        self._judge_degenerate(results)
         bad = [r for r in results if r.status != "ok"]
         if bad:
             self.problems.append(
@@ -90,6 +96,15 @@ class Manifest:
             self._ended = "diverged"
         elif len(results) < expected:
             self.interrupt(f"interrupted after {len(results)} of {expected} scans")
+
+    def _judge_degenerate(self, results: list[ScanResult]) -> None:
+        """A direction that many scans leave open is where the motion prior drifts."""
+        weak = [r for r in results if len(r.degenerate)]
+        if len(weak) > MOST_DEGENERATE * len(results):
+            self.problems.append(
+                f"{len(weak)} of {len(results)} scans left a direction open, which the motion prior decided, "
+                f"the first is scan {weak[0].index}: {describe(weak[0].degenerate)}"
+            )
 
     def interrupt(self, where: str) -> None:
         """The run ends early because somebody asked for it."""
@@ -135,6 +150,7 @@ class Manifest:
             },
             **({"imu": dict(self.imu)} if self.imu else {}),
             "counts": dict(self.counts),
+            **({"posed_by": dict(self.posed_by)} if self.posed_by else {}),
             **({"resumed_after_scans": list(self.resumed_after)} if self.resumed_after else {}),
             **({"keyframes": dict(self.keyframes)} if self.keyframes else {}),
             **({"graph": dict(self.graph)} if self.graph else {}),

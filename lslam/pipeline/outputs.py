@@ -69,12 +69,12 @@ def write_scans(folder: RunFolder, record: RunRecord) -> None:
     names, seconds = stage_matrix(record.results)
     indices, stamps = [r.index for r in record.results], [r.stamp_ns for r in record.results]
     folder.write_text("timing.csv", timing_text(indices, stamps, names, seconds))
-    columns = "index,stamp_ns,status,standing,converged,iterations,source_points,inliers,overlap,rmse_m,degenerate"
-    rows = [columns + ",prior_m,prior_deg,prior_norm,steady_norm,steady_iterations,saved_s"]
+    columns = "index,stamp_ns,status,posed_by,standing,converged,iterations,source_points,inliers,overlap,rmse_m"
+    rows = [columns + ",degenerate,prior_m,prior_deg,prior_norm,steady_norm,steady_iterations,saved_s"]
     for r in record.results:
         values = (
-            r.index, r.stamp_ns, r.status, int(r.is_standing), int(r.converged), r.iterations, r.source_points, r.inliers,
-            f"{r.overlap:.4f}", f"{r.rmse:.5f}", len(r.degenerate), f"{r.prior_error[0]:.5f}",
+            r.index, r.stamp_ns, r.status, r.poser(record.method), int(r.is_standing), int(r.converged), r.iterations,
+            r.source_points, r.inliers, f"{r.overlap:.4f}", f"{r.rmse:.5f}", len(r.degenerate), f"{r.prior_error[0]:.5f}",
             f"{np.rad2deg(r.prior_error[1]):.5f}", f"{r.prior_norm:.5f}",
             "" if r.steady_norm is None else f"{r.steady_norm:.5f}",
             "" if r.steady_iterations is None else r.steady_iterations, "" if r.saved_s is None else f"{r.saved_s:.5f}",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass
 from typing import Any
 
@@ -39,6 +40,7 @@ class RunFacts:
     status : the manifest's word: `done`, `degraded`, `diverged`, `interrupted`, `failed`; reasons : why, one sentence each
     registered, bridged, skipped, standing : scans that were registered, followed the motion prior, could not be read, and
         were not registered because the sensor stood
+    stand_ins : scans by who posed them in place of the method, in the order in which they first did
     path_length : m; duration : s between the first and the last pose
     stages : in the order they ran; total : the sum of stages per scan
     over_limit : scans whose stages took longer than the real-time limit
@@ -54,12 +56,19 @@ class RunFacts:
     standing: int
     failures: tuple[Failure, ...]
     degenerate: tuple[Degeneracy, ...]
+    stand_ins: dict[str, int]
     path_length: float
     duration: float
     stages: dict[str, StageTime]
     total: StageTime | None
     over_limit: int
     real_time_factor: float
+
+    @property
+    def posed_by(self) -> str:
+        """In words, who posed scans in place of the method; empty when it posed them all."""
+        said = ", ".join(f"{who} {count}" for who, count in self.stand_ins.items())
+        return f"{said} of {self.scans} scans" if said else ""
 
     @property
     def is_flawless(self) -> bool:
@@ -87,6 +96,7 @@ def run_facts(record: RunRecord) -> RunFacts:
         standing=sum(r.is_standing for r in results),
         failures=failures,
         degenerate=degenerate,
+        stand_ins=dict(Counter(who for r in results if (who := r.poser(record.method)) != record.method)),
         path_length=_path_length(record),
         duration=float(record.trajectory.stamps_ns[-1] - record.trajectory.stamps_ns[0]) * 1e-9
         if len(record.trajectory)

@@ -49,6 +49,8 @@ def _scan_rows(facts: RunFacts) -> list[tuple[str, str]]:
     if facts.degenerate:
         parts.append(f"{len(facts.degenerate)} degenerate")
     rows = [("scans", ", ".join(parts))]
+    if facts.posed_by:
+        rows.append(("posed by", facts.posed_by))
     shown = facts.failures[:MOST_FAILURES]
     rows += [("", _failure(failure)) for failure in shown]
     if len(facts.failures) > len(shown):

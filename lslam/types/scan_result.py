@@ -12,6 +12,8 @@ from lslam.types.gravity import GravityDirection
 
 Status = Literal["ok", "bridged", "skipped"]
 
+MOTION_PRIOR, STANDING = "motion prior", "standing"
+
 
 @dataclass(frozen=True)
 class ScanResult:
@@ -25,6 +27,8 @@ class ScanResult:
     registration_covariance : likewise, but relative to the local map the scan was registered on
     map_age : how many scans ago that local map was taken, on the mean; 1 from scan to scan
     is_standing : the sensor had not moved, so the scan was not registered and has the pose of the one before
+    posed_by : what within a method found the pose in its place, as a recovery policy or all points in place of features;
+        empty: the method itself
     degenerate : (K, 6) unit twists along which the scan says nothing and the motion prior was kept
     prior_error : (translation m, rotation rad) between motion prior and result
     prior_norm : 2-norm of inv(prior) pose - I, of the prior before the scan was looked at (first thesis, equation 5.1)
@@ -51,6 +55,7 @@ class ScanResult:
     rmse: float = 0.0
     overlap: float = 0.0
     is_standing: bool = False
+    posed_by: str = ""
     degenerate: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 6)))
     prior_error: tuple[float, float] = (0.0, 0.0)
     prior_norm: float = 0.0
@@ -59,3 +64,9 @@ class ScanResult:
     saved_s: float | None = None
     gravity: GravityDirection | None = None
     stages: dict[str, float] = field(default_factory=dict)
+
+    def poser(self, method: str) -> str:
+        """Who posed the scan: the `method`, what stood in for it, the motion prior, or the scan before while standing."""
+        if self.is_standing:
+            return STANDING
+        return (self.posed_by or method) if self.status == "ok" else MOTION_PRIOR

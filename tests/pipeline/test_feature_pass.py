@@ -14,6 +14,7 @@ from lslam.errors import UsageError
 from lslam.formats.ply_files import read_ply, write_ply
 from lslam.pipeline.check import check_config
 from lslam.pipeline.run import run
+from lslam.reports.text import summary
 from lslam.simulation.scenarios import simulate
 
 SETTINGS = ["map.write_features=true", "map.write=false", "report.html=false"]
@@ -40,17 +41,21 @@ def test_a_run_saves_its_feature_map(method: str, tmp_path: Path) -> None:
         assert len(np.unique(np.floor(part[:, :3]), axis=0)) > 0.9 * len(part)  # voxels of 1 m
     # The street's ground, 1.7 m below the sensor, is made of planes.
     assert np.mean(planes[:, 2] < -1.4) > 2 * np.mean(edges[:, 2] < -1.4)
-    counts = json.loads((out / "manifest.json").read_text())["counts"]
-    assert counts["stand_in"] == 0
+    posed_by = json.loads((out / "manifest.json").read_text())["posed_by"]
+    assert set(posed_by) <= {method, "all-points"}
 
 
 def test_stand_ins_are_counted(tmp_path: Path) -> None:
     few = ["loam.regions=1", "loam.max_edge_points=1", "loam.max_planar_points=1"]
     config = load_config(None, ["odometry.method=floam", "map.write=false", "report.html=false", *few], {})
-    run(simulate("street", seed=1, lidar="vlp16", count=8), config, out=tmp_path / "run")
+    outcome = run(simulate("street", seed=1, lidar="vlp16", count=8), config, out=tmp_path / "run")
     assert not (tmp_path / "run" / "feature_map.ply").exists()
-    counts = json.loads((tmp_path / "run" / "manifest.json").read_text())["counts"]
-    assert counts["stand_in"] == 7
+    posed_by = json.loads((tmp_path / "run" / "manifest.json").read_text())["posed_by"]
+    assert posed_by == {"floam": 1, "less planar points": 5, "all-points": 2}
+    assert "posed by     less planar points 5, all-points 2 of 8 scans" in summary(outcome.record, None)
+    header, *rows = (tmp_path / "run" / "scans.csv").read_text().splitlines()
+    column = header.split(",").index("posed_by")
+    assert [row.split(",")[column] for row in rows] == ["floam", "less planar points", *2 * ["all-points"], *4 * ["less planar points"]]
 
 
 def test_a_method_without_features_is_refused_with_those_that_have_them() -> None:

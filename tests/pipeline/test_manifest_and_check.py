@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -45,7 +46,6 @@ def test_problems_name_the_first_bad_scan_by_its_number_in_the_recording() -> No
         "bridged": 1,
         "skipped": 1,
         "standing": 0,
-        "stand_in": 0,
         "degenerate": 0,
     }
     assert "2 of 4 scans" in manifest.problems[0]
@@ -142,3 +142,21 @@ def test_coordinates_of_a_run_with_no_place_on_the_earth_are_refused() -> None:
         check_config(load_config(settings=["gnss.crs=25832"], environ={}))
     for place in ("gnss.mode=fit", "gnss.mode=graph", 'osm.extract="town.osm"'):
         check_config(load_config(settings=["gnss.crs=25832", place], environ={}))
+
+
+def test_who_posed_the_scans_is_counted() -> None:
+    manifest = Manifest("lslam run x", Stub(["gone"] * 4), Config())
+    ok, policy, bridged, standing = results("ok", "ok", "bridged", "ok")
+    policy, standing = replace(policy, posed_by="start search"), replace(standing, is_standing=True)
+    manifest.judge([ok, policy, bridged, standing], 4, False)
+    assert manifest.as_dict("done")["posed_by"] == {"icp": 1, "start search": 1, "motion prior": 1, "standing": 1}
+
+
+@pytest.mark.parametrize(("weak", "outcome"), [(1, "done"), (2, "degraded")])
+def test_more_than_a_tenth_of_the_scans_with_an_open_direction_degrade_the_run(weak: int, outcome: str) -> None:
+    manifest = Manifest("lslam run x", Stub(["gone"] * 10), Config())
+    found = results(*["ok"] * 10)
+    along = np.eye(6)[:1]
+    manifest.judge([replace(r, degenerate=along) if i < weak else r for i, r in enumerate(found)], 10, False)
+    assert manifest.outcome == outcome
+    assert all("scan 10: along x" in problem for problem in manifest.problems)

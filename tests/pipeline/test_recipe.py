@@ -82,7 +82,6 @@ def test_a_good_run_writes_everything_and_ends_done(tmp_path: Path) -> None:
         "bridged": 0,
         "skipped": 0,
         "standing": 0,
-        "stand_in": 0,
         "degenerate": 0,
     }
     assert facts["sequence"]["decisions"] == ["a note of the reader"]
