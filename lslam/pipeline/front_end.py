@@ -21,6 +21,7 @@ from lslam.readers.selection import Selection
 from lslam.registration.motion import MotionModel
 from lslam.registration.registration import DOUBT
 from lslam.registration.standing import Standing
+from lslam.registration.witness import Witness
 from lslam.types.scan import Scan, Span
 from lslam.types.scan_result import ScanResult
 from lslam.types.sequence import Sequence
@@ -39,15 +40,16 @@ def estimate(
     on_scan: Callable[[ScanResult], None] = lambda result: None,
     keyframing: Keyframing | None = None,
     checkpoints: OdometryCheckpoints | None = None,
+    witness: Witness | None = None,
 ) -> list[ScanResult]:
     """Register every scan of the sequence; stops early on `should_stop` or after `max_failures` failures in a row.
 
     A scan that cannot be read, or is empty, is skipped: the motion prior stands in for its pose. With `standing`, scans
     during which the sensor stands are not registered. `motion` predicts the scans, constant velocity when None.
     `keyframing` sees every scan and how the sensor moved within it. `checkpoints`, which need keyframing, say where an
-    earlier run left off and keep what this one does.
+    earlier run left off and keep what this one does. `witness` sees every scan and the pose claimed for it.
     """
-    tracker = Tracker(odometry, standing, motion)
+    tracker = Tracker(odometry, standing, motion, witness)
     results: list[ScanResult] = []
     if checkpoints is not None and keyframing is not None:
         results = checkpoints.begin(tracker, keyframing)
@@ -61,6 +63,10 @@ def estimate(
             began = time.perf_counter()
             keyframing.see(len(results), loaded.scan, result, tracker.sweep)
             stages["keyframe"] = time.perf_counter() - began
+        if witness is not None:
+            began = time.perf_counter()
+            witness.see(len(results), loaded.scan, loaded.prepared, result, tracker.sweep)
+            stages["witness"] = time.perf_counter() - began
         result = replace(result, stages=stages)
         results.append(result)
         on_scan(result)

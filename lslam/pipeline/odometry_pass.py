@@ -23,12 +23,14 @@ from lslam.pipeline.checkpoints import Checkpoints, OdometryCheckpoints
 from lslam.pipeline.front_end import estimate, is_diverged, to_trajectory
 from lslam.pipeline.inertial_start import Inertial, begin_inertial, close_inertial, load_start, save_start
 from lslam.pipeline.keyframing import Keyframing
+from lslam.pipeline.lost import mark_lost
 from lslam.pipeline.manifest import Manifest
 from lslam.pipeline.osm_source import OsmSource
 from lslam.pipeline.run_folder import CHECKPOINT, RunFolder
 from lslam.pipeline.watch import Watch
 from lslam.priors import osm_prior
 from lslam.registration.standing import Standing
+from lslam.registration.witness import Witness
 from lslam.types.constraint import Turn
 from lslam.types.run_record import RunRecord
 from lslam.types.scan_result import ScanResult
@@ -47,8 +49,9 @@ def estimate_poses(
     Raises InputError when no scan can be used.
     """
     standing = Standing(config.preprocess, config.registration) if config.preprocess.skip_standing else None
+    witness = Witness(config.preprocess, config.registration) if config.odometry.witness else None
     is_over = checkpoints is not None and checkpoints.is_over
-    _warm_up(sequence, odometry, standing, config, manifest, is_over)
+    _warm_up(sequence, odometry, standing, witness, config, manifest, is_over)
 
     if osm is not None and checkpoints is not None:
         for result in checkpoints.results:
@@ -69,7 +72,7 @@ def estimate_poses(
         results = estimate(
             sequence, odometry, threads=config.input.threads, max_failures=limit, standing=standing,
             motion=motion, should_stop=watch.should_stop, on_scan=seen, keyframing=keyframing,
-            checkpoints=checkpoints,
+            checkpoints=checkpoints, witness=witness,
         )  # fmt: skip
         keyframing.settle()
     if checkpoints is not None and checkpoints.resumed_after:
@@ -82,6 +85,8 @@ def estimate_poses(
         manifest.imu = close_inertial(inertial, results)
         manifest.problems += inertial.problems
     manifest.judge(results, len(sequence), is_diverged(results, limit))
+    if witness is not None:
+        results = mark_lost(results, witness, manifest)
     return RunRecord(
         name=sequence.name,
         method=config.odometry.method,
@@ -123,14 +128,17 @@ def odometry_checkpoints(
 
 
 def _warm_up(
-    sequence: Sequence, odometry: Odometry, standing: Standing | None, config: Config, manifest: Manifest, is_over: bool
-) -> None:
+    sequence: Sequence, odometry: Odometry, standing: Standing | None, witness: Witness | None, config: Config,
+    manifest: Manifest, is_over: bool,
+) -> None:  # fmt: skip
     """Compile or load what the scans would otherwise wait for, less of it when odometry is over."""
     with manifest.timed("compile_s"), jit.announced(log), one_at_a_time(jit.lock_file()):
         if not is_over:
             odometry.warm_up()
         if standing is not None:
             standing.warm_up()
+        if witness is not None and not is_over:
+            witness.warm_up()
         if config.loops.use:
             detector.warm_up()
         if config.osm.extract:

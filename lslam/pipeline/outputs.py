@@ -70,7 +70,7 @@ def write_scans(folder: RunFolder, record: RunRecord) -> None:
     indices, stamps = [r.index for r in record.results], [r.stamp_ns for r in record.results]
     folder.write_text("timing.csv", timing_text(indices, stamps, names, seconds))
     columns = "index,stamp_ns,status,posed_by,standing,converged,iterations,source_points,inliers,overlap,rmse_m"
-    rows = [columns + ",degenerate,prior_m,prior_deg,prior_norm,steady_norm,steady_iterations,saved_s"]
+    rows = [columns + ",degenerate,prior_m,prior_deg,prior_norm,steady_norm,steady_iterations,saved_s,lost"]
     for r in record.results:
         values = (
             r.index, r.stamp_ns, r.status, r.poser(record.method), int(r.is_standing), int(r.converged), r.iterations,
@@ -78,6 +78,7 @@ def write_scans(folder: RunFolder, record: RunRecord) -> None:
             f"{np.rad2deg(r.prior_error[1]):.5f}", f"{r.prior_norm:.5f}",
             "" if r.steady_norm is None else f"{r.steady_norm:.5f}",
             "" if r.steady_iterations is None else r.steady_iterations, "" if r.saved_s is None else f"{r.saved_s:.5f}",
+            int(r.is_lost),
         )  # fmt: skip
         rows.append(",".join(str(v) for v in values))
     folder.write_text("scans.csv", "\n".join(rows) + "\n")

@@ -82,6 +82,8 @@ def run(
     job.manifest.reading = dict(reading or {})
     if out is None:
         record, _, evaluation = _solve(job, KeyframeStore(deflate=config.keyframes.deflate))
+        job.manifest.problems += record.problems
+        record.manifest = job.manifest.as_dict(job.manifest.outcome)
     else:
         job.manifest.identity = run_identity(job.sequence, job.truth, config, job.given)
         goes_on = resume and may_go_on(Path(out), job.manifest.identity, config)

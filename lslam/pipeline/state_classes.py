@@ -8,12 +8,14 @@ from lslam.inertial.initialise import Start
 from lslam.odometry.feature_scan import FeatureScan
 from lslam.preprocessing.features import FeaturePoints, Features
 from lslam.preprocessing.prepare import PreparedPoints
+from lslam.registration.witness import Seen
 from lslam.types.constraint import Constraint, LoopCandidate
 from lslam.types.gravity import GravityDirection
 from lslam.types.imu import ImuStream
 from lslam.types.scan_result import ScanResult
+from lslam.types.testimony import Testimony
 
 STATE_CLASSES = (
     Constraint, FeaturePoints, Features, FeatureScan, GravityDirection, Gyroscope, ImuEstimate, ImuStream, LoopCandidate,
-    PreparedPoints, ScanResult, Start,
+    PreparedPoints, ScanResult, Seen, Start, Testimony,
 )  # fmt: skip

@@ -15,6 +15,7 @@ from lslam.odometry.base import Deskewing, Odometry, Resumable, Searching
 from lslam.odometry.feature_steps import StageClock
 from lslam.registration.motion import ConstantVelocity, MotionModel, middle_of
 from lslam.registration.standing import Standing
+from lslam.registration.witness import Witness
 from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan import Scan, Span
 from lslam.types.scan_result import ScanResult
@@ -43,14 +44,18 @@ class Tracker:
     """Poses of scans, one after the other.
 
     sweep : how the sensor moved within the last scan, as far as its registration knew
+    witness : what looks on, only to be kept with the rest
     middle : instant, ns, and pose of the middle of the last sweep: what its registration knows best
     """
 
     # A change of the motion within the sweep that moves no point by more is not worth a second registration.
     REFINE_M = 0.01
 
-    def __init__(self, odometry: Odometry, standing: Standing | None = None, motion: MotionModel | None = None) -> None:
-        self.odometry, self.standing = odometry, standing
+    def __init__(
+        self, odometry: Odometry, standing: Standing | None = None, motion: MotionModel | None = None,
+        witness: Witness | None = None,
+    ) -> None:  # fmt: skip
+        self.odometry, self.standing, self.witness = odometry, standing, witness
         self.motion: MotionModel = ConstantVelocity() if motion is None else motion
         self.sweep = MotionPrior.at_once(np.eye(4))
         self.middle = (0, np.eye(4))
@@ -80,6 +85,7 @@ class Tracker:
             "motion": self.motion.state(),
             "standing": None if self.standing is None else self.standing.state(),
             "middle": self.middle,
+            "witness": None if self.witness is None else self.witness.state(),
         }
 
     def restore(self, state: State) -> None:
@@ -90,6 +96,8 @@ class Tracker:
         if self.standing is not None:
             self.standing.restore(state["standing"])
         self.middle = state["middle"]
+        if self.witness is not None:
+            self.witness.restore(state["witness"])
 
     def _stand_or_move(self, scan: Scan, loaded: Loaded, standing: Standing) -> ScanResult:
         began = time.perf_counter()

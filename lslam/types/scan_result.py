@@ -29,6 +29,7 @@ class ScanResult:
     is_standing : the sensor had not moved, so the scan was not registered and has the pose of the one before
     posed_by : what within a method found the pose in its place, as a recovery policy or all points in place of features;
         empty: the method itself
+    is_lost : the scans round it say that it may be elsewhere, which a problem of the run says in words
     degenerate : (K, 6) unit twists along which the scan says nothing and the motion prior was kept
     prior_error : (translation m, rotation rad) between motion prior and result
     prior_norm : 2-norm of inv(prior) pose - I, of the prior before the scan was looked at (first thesis, equation 5.1)
@@ -56,6 +57,7 @@ class ScanResult:
     overlap: float = 0.0
     is_standing: bool = False
     posed_by: str = ""
+    is_lost: bool = False
     degenerate: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 6)))
     prior_error: tuple[float, float] = (0.0, 0.0)
     prior_norm: float = 0.0

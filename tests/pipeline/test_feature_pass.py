@@ -55,7 +55,12 @@ def test_stand_ins_are_counted(tmp_path: Path) -> None:
     assert "posed by     less planar points 5, all-points 2 of 8 scans" in summary(outcome.record, None)
     header, *rows = (tmp_path / "run" / "scans.csv").read_text().splitlines()
     column = header.split(",").index("posed_by")
-    assert [row.split(",")[column] for row in rows] == ["floam", "less planar points", *2 * ["all-points"], *4 * ["less planar points"]]
+    assert [row.split(",")[column] for row in rows] == [
+        "floam",
+        "less planar points",
+        *2 * ["all-points"],
+        *4 * ["less planar points"],
+    ]
 
 
 def test_a_method_without_features_is_refused_with_those_that_have_them() -> None:

@@ -1,0 +1,48 @@
+"""What two scans alone say of the motion between them, beside what was claimed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.geometry import so3
+
+# What explains less than this part of what is usual, or less than a share of the points, is not to be believed, nor what
+# leaves the turn open, rad.
+USUAL, FEWEST, UNTURNED = 0.7, 0.15, float(np.deg2rad(1.0))
+
+
+@dataclass(frozen=True)
+class Testimony:
+    """One comparison of a claimed motion with the scans at its ends; m and rad, axes of the sensor at its begin.
+
+    first, last : positions of the scans in the run; seconds : between them
+    claimed, found : (4, 4) poses of the last scan seen from the first
+    sigma : (6,) standard deviation of what was found, about a metre along directions that the scans do not hold
+    agreement : share of the points that lie on surfaces of the first scan as found; claimed_agreement : as claimed
+    usual : what the agreement lately was; is_after_break : whether scans are missing or failed just before the last
+    """
+
+    first: int
+    last: int
+    seconds: float
+    claimed: NDArray[np.float64]
+    found: NDArray[np.float64]
+    sigma: NDArray[np.float64]
+    agreement: float
+    claimed_agreement: float
+    usual: float
+    is_after_break: bool = False
+
+    @property
+    def is_telling(self) -> bool:
+        """Whether so many of the points lie on surfaces, and hold the turn so well, that it is to be believed."""
+        return self.agreement >= max(USUAL * self.usual, FEWEST) and float(np.max(self.sigma[3:])) < UNTURNED
+
+    @property
+    def apart(self) -> NDArray[np.float64]:
+        """(6,) by how much the scans say the motion was more than claimed."""
+        turn = so3.log(self.found[:3, :3] @ self.claimed[:3, :3].T)
+        return np.concatenate([self.found[:3, 3] - self.claimed[:3, 3], turn])

@@ -1,0 +1,160 @@
+"""Never success while lost: failures that are injected are noticed without truth, and good runs are not accused."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from lost_odometry import Corruption, Lost, freeze, slip, yaw_ramp
+from stub_sequences import SAMPLE, Stub
+
+from lslam.config import Config, load_config
+from lslam.errors import GateError, RunFailedError
+from lslam.pipeline import run as recipe
+from lslam.pipeline.run import run
+from lslam.pipeline.watch import RunOutcome, Watch
+from lslam.readers import open_sequence, select
+from lslam.reports.text import summary
+from lslam.simulation.lidar_models import LIDARS
+from lslam.simulation.scenarios import simulate
+from lslam.types.scan import Scan
+from lslam.types.sequence import Sequence
+
+BEGIN = 30
+
+
+@cache
+def drive(scenario: str, count: int = 80, seed: int = 0, lidar: str = "vlp16") -> Sequence:
+    """Scans of a scenario, thinned, in memory."""
+    simulated = simulate(
+        scenario, seed=seed, count=count, lidar=replace(LIDARS[lidar], columns=900 if lidar == "vlp16" else 600)
+    )
+    return Stub(
+        list(simulated), simulated.ground_truth, simulated.calibration, motion_compensated=simulated.motion_compensated
+    )
+
+
+def config(*settings: str) -> Config:
+    return load_config(None, ["map.write=false", "report.html=false", "loops.use=false", *settings], {})
+
+
+def ended(sequence: Sequence, *settings: str) -> RunOutcome:
+    """The outcome, also of a run that diverges."""
+    outcomes: list[RunOutcome] = []
+    with suppress(RunFailedError):
+        run(sequence, config(*settings), watch=Watch(on_end=outcomes.append))
+    return outcomes[0]
+
+
+def problems(outcome: RunOutcome) -> list[str]:
+    return [p for p in outcome.record.manifest["problems"] if "may be lost" in p]
+
+
+def reordered(sequence: Sequence, order: list[int]) -> Stub:
+    """The scans in another order, at the stamps of the right one."""
+    assert isinstance(sequence, Stub)
+    scans: list[Scan | str] = []
+    for k, i in enumerate(order):
+        scan = sequence.scan(i)
+        scans.append(replace(scan, index=k, stamp_ns=100_000_000 * k))
+    return Stub(scans, None, sequence.calibration)
+
+
+class Holed(Stub):
+    """Scans at their own stamps, however many miss between them."""
+
+    @property
+    def stamps_ns(self) -> np.ndarray:
+        return np.array([scan.stamp_ns for scan in self.scans if isinstance(scan, Scan)], np.int64)
+
+
+@pytest.mark.parametrize("scenario", ["street", "residential"])
+@pytest.mark.parametrize(("corruption", "words"), [(freeze, "m ahead"), (slip, "m ahead"), (yaw_ramp, "deg of yaw")])
+def test_poses_that_contradict_the_scans_are_noticed(
+    scenario: str, corruption: Corruption, words: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(recipe, "create_odometry", lambda _: Lost(corruption, BEGIN))
+    outcome = ended(drive(scenario))
+    assert outcome.record.manifest["status"] == "degraded"
+    assert any(words in problem for problem in problems(outcome))
+    lost = np.flatnonzero([r.is_lost for r in outcome.record.results])
+    assert BEGIN - 5 <= lost[0] <= BEGIN + 10
+    assert lost[-1] >= 70
+    assert "may be lost" in summary(outcome.record, None)
+
+
+def test_what_is_lost_for_two_seconds_is_named_and_fails_a_strict_run(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(recipe, "create_odometry", lambda _: Lost(slip, BEGIN, BEGIN + 20))
+    with pytest.raises(GateError, match="may be lost"):
+        run(drive("street"), config("input.strict=true"), out=tmp_path / "run")
+    header, *rows = (tmp_path / "run" / "scans.csv").read_text().splitlines()
+    column = header.split(",").index("lost")
+    lost = np.flatnonzero([row.split(",")[column] == "1" for row in rows])
+    assert BEGIN - 5 <= lost[0] <= BEGIN + 5
+    assert BEGIN + 15 <= lost[-1] <= BEGIN + 27
+    document = json.loads((tmp_path / "run" / "manifest.json").read_text())
+    assert document["witness"]["doubts"] >= 1
+    assert document["witness"]["telling"] > 10
+
+
+@pytest.mark.parametrize("scenario", ["street", "residential"])
+def test_four_scans_out_of_order_are_recovered_from_or_named(scenario: str) -> None:
+    order = list(range(80))
+    order[40:44] = [43, 42, 41, 40]
+    outcome = ended(reordered(drive(scenario), order))
+    assert outcome.record.manifest["status"] in ("degraded", "diverged")
+    assert any(r.is_lost for r in outcome.record.results[38:46])
+    assert any("out of order" in problem for problem in problems(outcome))
+
+
+def test_scans_that_change_places_by_twos_are_noticed() -> None:
+    order = np.arange(60).reshape(-1, 2)[:, ::-1].ravel().tolist()
+    outcome = ended(reordered(drive("street"), order))
+    assert outcome.record.manifest["status"] in ("degraded", "diverged")
+    assert sum(r.is_lost for r in outcome.record.results) > 50
+
+
+@pytest.mark.parametrize("lidar", ["vlp16", "hdl64"])
+def test_a_hole_of_three_seconds_while_moving_is_noticed(lidar: str) -> None:
+    whole = drive("street", 100, lidar=lidar)
+    scans = [whole.scan(i) for i in (*range(40), *range(70, 100))]
+    outcome = ended(Holed([replace(scan, index=k) for k, scan in enumerate(scans)], None, whole.calibration))
+    assert outcome.record.manifest["status"] in ("degraded", "diverged")
+    if outcome.record.manifest["status"] == "degraded":
+        assert any(r.is_lost for r in outcome.record.results[38:46])
+
+
+@pytest.mark.parametrize(
+    ("scenario", "lidar"),
+    [
+        ("street", "vlp16"), ("residential", "hdl64"), ("carpark", "vlp16"), ("carpark", "hdl64"), ("corridor", "vlp16"),
+        ("motorway", "vlp16"), ("motorway", "hdl64"), ("urban", "vlp16"), ("climbing", "vlp16"), ("walk", "vlp16"),
+    ],
+)  # fmt: skip
+def test_no_good_drive_is_accused(scenario: str, lidar: str) -> None:
+    outcome = ended(drive(scenario, 80, 1, lidar))
+    assert problems(outcome) == []
+    assert outcome.record.manifest["witness"]["comparisons"] >= 14
+
+
+@pytest.mark.parametrize("method", ["icp", "kiss-icp", "loam"])
+def test_the_sample_is_not_accused_by_any_method(method: str) -> None:
+    outcome = ended(open_sequence(SAMPLE), f"odometry.method={method}")
+    assert problems(outcome) == []
+    assert outcome.record.manifest["witness"]["telling"] > 10
+
+
+@pytest.mark.parametrize("name", ["kitti_raw_0005", "kitti_raw_0048", "mcd_kth_day_06"])
+def test_no_recording_is_accused(recordings: Callable[[str], Path], name: str) -> None:
+    folder = recordings(name)
+    drive_folder = folder / "2011_09_26" / f"2011_09_26_drive_{name[-4:]}_sync" if "kitti" in name else folder / name
+    outcome = ended(select(open_sequence(drive_folder), 0, 100))
+    assert problems(outcome) == []
