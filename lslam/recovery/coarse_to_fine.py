@@ -34,8 +34,11 @@ class CoarseToFine:
             return found
         coarse = registration.judged(registration.alignment.coarse_to_fine(points, T_prior), T_prior)
         iterations = found.iterations + coarse.iterations
-        is_better = coarse.ok and (not found.ok or coarse.inliers > found.inliers)
-        if is_sure and registration.starting == 0:
+        is_started = registration.starting == 0
+        # Forty steps that lead nowhere are no consensus; the ten of a usual scan may end a millimetre short of it.
+        is_rival = found.ok and (found.converged or is_started)
+        is_better = coarse.ok and (not is_rival or coarse.inliers > found.inliers)
+        if is_sure and is_started:
             # What hides part of the map, as a crowd does, hides it from both.
             is_better = is_better and not usual.is_less(coarse.agreement)
         return (

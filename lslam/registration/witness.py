@@ -124,7 +124,7 @@ class Witness(Stateful):
         claimed = se3.relative(first.pose, last.pose)
         seconds = (last.stamp_ns - first.stamp_ns) * 1e-9
         self._planes.clear()
-        self._planes.insert(first.source.astype(np.float32), np.eye(4), first.scatter)
+        self._planes.insert(first.source.astype(np.float32), np.eye(4))
         points = thin(last.points, 1 + len(last.source) // LAID_POINTS)
         found = self._lay(points, claimed, self._quick())
         usual = self._usual.usual
