@@ -111,7 +111,8 @@ class Manifest:
     def interrupt(self, where: str) -> None:
         """The run ends early because somebody asked for it."""
         self._ended = "interrupted"
-        self.problems.append(where)
+        # What ended the run is said before what was noticed on the way.
+        self.problems.insert(0, where)
 
     def word_for(self, error: BaseException) -> str:
         """Status of a run that `error` ended."""

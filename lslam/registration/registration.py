@@ -121,7 +121,7 @@ class Registration(Stateful):
         if is_near:
             width = NEAR_KERNEL * c.kernel_min
         elif self.starting > 0:
-            width, steps = c.kernel_max, c.start_iterations
+            steps = c.start_iterations
         result = self.judged(self.alignment.refine(points, T_prior, width, steps), T_prior)
         for policy in () if is_near else self.recovery:
             result = policy.recover(self, points, T_prior, result)
