@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from lslam.odometry.feature_scan import FeatureScan
 from lslam.odometry.feature_solver import NONE, FeatureNoise, solve_on_scan
 from lslam.preprocessing.features import Features
+from lslam.registration.alignment import upright_directions
 from lslam.registration.robust import Annealing
 from lslam.registration.solver import RegistrationResult
 
@@ -83,12 +84,3 @@ def two_steps(
         inliers=ground.inliers + edges.inliers,
         degenerate=np.concatenate([ground.degenerate, edges.degenerate]),
     )
-
-
-def upright_directions(T_prior: Floats) -> Floats:
-    """(6, 6) projector on the sensor's z, roll and pitch at a pose (4, 4), world axes."""
-    R = T_prior[:3, :3]
-    projector = np.zeros((6, 6))
-    projector[:3, :3] = np.outer(R[:, 2], R[:, 2])
-    projector[3:, 3:] = np.eye(3) - np.outer(R[:, 2], R[:, 2])
-    return projector

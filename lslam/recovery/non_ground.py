@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.config.preprocess import PreprocessConfig
-from lslam.geometry import se3
-from lslam.preprocessing.ground import CELL, ground_of, levelling
+from lslam.preprocessing.ground import ground_of
 from lslam.preprocessing.prepare import PreparedPoints
 from lslam.registration.gaussian_map import GaussianMap
 from lslam.registration.robust import Annealing
@@ -49,21 +48,6 @@ class NonGroundPoints:
     def align(self, seen: PreparedPoints, T_start: Floats) -> RegistrationResult:
         """Lay them on these points, point to point, from less than `REACH` away."""
         return self._solve(seen, T_start, Annealing(REACH, NEAR / 2, 0.7, 20))
-
-    def place_on_ground(self, stood: Floats, planes: Floats, points: Points) -> Floats:
-        """(4, 4) pose with place and heading of `stood`, height and tilt of `planes`, both of the scan of `points`.
-
-        Two steps as in LeGO-LOAM (Shan and Englot 2018): few rings on a post say nothing of tilt, the ground does. But where
-        planes would lift the scan so far that nothing of what stands had its like near by, they do not hold its height: from
-        above the roofs few rings make any.
-        """
-        p = self._preprocess
-        R, _ = levelling(points, p.ground_tolerance, int(p.range_max / CELL) + 1)
-        between = se3.log(se3.relative(stood, planes)).reshape(2, 3) @ R.T
-        between[0, :2] = between[1, 2] = 0.0
-        if abs(between[0, 2]) > NEAR:
-            between[0, 2] = 0.0
-        return se3.normalise(stood @ se3.exp((between @ R).ravel()))
 
     def _solve(self, seen: PreparedPoints, T_start: Floats, annealing: Annealing) -> RegistrationResult:
         return solve(self._cells, seen, T_start, annealing, sigma=NEAR, blob_weight=1.0, weak_share=0.0)

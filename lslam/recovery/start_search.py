@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from lslam.geometry import se3, so3
 from lslam.preprocessing.prepare import PreparedPoints, thin
 from lslam.recovery.non_ground import NEAR, NonGroundPoints, sought
+from lslam.registration.alignment import upright_directions
 from lslam.registration.registration import NEAR_KERNEL, Registration, correction
 from lslam.registration.solver import RegistrationResult
 
@@ -23,6 +24,8 @@ START_TURNS_DEG = np.delete(np.arange(-30.0, 31.0, 3.0), 10)
 AT_REST_DEG = 3.0
 # Every so many-th source point is enough to tell a good start from a bad one; so many of the best are looked at closely.
 SEARCH_SHARE, LOOKED_AT = 4, 3
+# Times the coarse voxels, ten metres: of so much ground one scan of sixteen beams sees two rings.
+GROUND_FACTOR = 4
 # Along a bare wall the rings repeat best where nothing moved, by five percent: a start elsewhere must have more, and twice
 # as much where planes, the prior or both say otherwise.
 CLEARLY, MUCH = 1.06, 1.1
@@ -79,13 +82,16 @@ def held_by_non_ground(
     if is_drawn or not is_much_more(share(stood), share(found), count):
         return found
     coarse = r.alignment.coarse_map(points, place)
-    near = r.alignment.refine(points, place, NEAR_KERNEL * c.kernel_min, c.start_iterations, coarse)
+    width = NEAR_KERNEL * c.kernel_min
+    near = r.alignment.refine(points, place, width, c.start_iterations, (coarse,))
     judged = r.judged(near, place)
     if not judged.ok and not found.ok:
         return found
     if not judged.ok or is_much_more(share(stood), share(judged), count):
-        place = standing.place_on_ground(place, near.T_world_lidar, points.map_points)
-        judged = near.moved(place, stood.covariance)
+        # What stands says little of height and tilt, the ground does: two steps as in LeGO-LOAM (Shan and Englot 2018).
+        levels = (coarse, coarse.coarsen(GROUND_FACTOR))
+        ground = r.alignment.refine(points, place, width, c.start_iterations, levels, upright_directions(place))
+        judged = near.moved(ground.T_world_lidar, stood.covariance)
     return replace(judged, iterations=found.iterations + near.iterations)
 
 

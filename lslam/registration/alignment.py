@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -11,6 +12,7 @@ from lslam.config.registration import RegistrationConfig
 from lslam.preprocessing.prepare import PreparedPoints
 from lslam.registration.gaussian_map import GaussianMap
 from lslam.registration.local_map import LocalMap
+from lslam.registration.optimiser import EVERYWHERE
 from lslam.registration.robust import Annealing
 from lslam.registration.solver import RegistrationResult, solve
 
@@ -24,21 +26,27 @@ class MapAlignment:
         self._map, self._config, self._residual = target, config, residual
 
     def refine(
-        self, points: PreparedPoints, start: Floats, width: float, steps: int, coarse: GaussianMap | None = None
-    ) -> RegistrationResult:
-        """Align with the fine map from `start` (4, 4), the kernel closing from `width`, m, or as the user wants it."""
-        c = self._config
+        self, points: PreparedPoints, start: Floats, width: float, steps: int, coarser: Sequence[GaussianMap] = (),
+        allowed: Floats = EVERYWHERE,
+    ) -> RegistrationResult:  # fmt: skip
+        """Align with the fine map from `start` (4, 4), the kernel closing from `width`, m, or as the user wants it.
+
+        coarser : maps for the points that find nothing in the fine one, finest first; none: the coarse one
+        allowed : (6, 6) projector on the directions that are aligned, world axes; no rows: all
+        """
+        c, coarser = self._config, coarser or (self._map.coarse,)
         if c.inlier_distance is None:
             # The larger the planes, the farther their surface may be from them.
-            widest = 1.0 if coarse is None else coarse.size / self._map.coarse.size
+            widest = coarser[0].size / self._map.coarse.size
             annealing = Annealing(max(width, widest * c.kernel_min), widest * c.kernel_min, c.kernel_decay, steps)
         else:
             annealing = Annealing(c.inlier_distance, c.inlier_distance, c.kernel_decay, steps)
         return solve(
             self._map.fine, points, start, annealing,
             sigma=c.sigma, blob_weight=c.blob_weight, weak_share=c.weak_share,
-            coarser=(self._map.coarse if coarse is None else coarse,), residual=self._residual,
+            coarser=coarser, residual=self._residual,
             inlier_distance=np.inf if c.inlier_distance is None else c.inlier_distance, inlier_ratio=c.inlier_ratio,
+            allowed=allowed,
         )  # fmt: skip
 
     def coarse_to_fine(self, points: PreparedPoints, T_prior: Floats, width: float = np.inf) -> RegistrationResult:
@@ -54,7 +62,7 @@ class MapAlignment:
         coarse_map = self.coarse_map(points, T_prior)
         coarse = self.on_planes(coarse_map, points, T_prior, self.slowly(min(width, c.coarse_kernel)))
         start = coarse.T_world_lidar if coarse.ok else T_prior
-        fine = self.refine(points, start, c.kernel_max, c.start_iterations, coarse_map)
+        fine = self.refine(points, start, c.kernel_max, c.start_iterations, (coarse_map,))
         return replace(fine, iterations=coarse.iterations + fine.iterations)
 
     def coarse_map(self, points: PreparedPoints, T_prior: Floats) -> GaussianMap:
@@ -83,3 +91,12 @@ class MapAlignment:
         return solve(
             coarse_map, points, start, annealing, sigma=c.sigma, blob_weight=c.blob_weight, weak_share=c.weak_share
         )
+
+
+def upright_directions(T_prior: Floats) -> Floats:
+    """(6, 6) projector on the sensor's z, roll and pitch at a pose (4, 4), world axes."""
+    R = T_prior[:3, :3]
+    projector = np.zeros((6, 6))
+    projector[:3, :3] = np.outer(R[:, 2], R[:, 2])
+    projector[3:, 3:] = np.eye(3) - np.outer(R[:, 2], R[:, 2])
+    return projector

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from lslam.preprocessing.prepare import PreparedPoints
 from lslam.registration.gaussian_map import GaussianMap
-from lslam.registration.optimiser import LEAST_MATCHED, Limits, Matches, Optimum, Term, optimise
+from lslam.registration.optimiser import EVERYWHERE, LEAST_MATCHED, Limits, Matches, Optimum, Term, optimise
 from lslam.registration.residuals import ResidualKind, residual_named
 from lslam.registration.robust import Annealing
 from lslam.types.scan_result import ScanResult
@@ -86,17 +86,17 @@ class RegistrationResult:
 def solve(
     target: GaussianMap, points: PreparedPoints, T_prior: Floats, annealing: Annealing, *, sigma: float,
     blob_weight: float, weak_share: float, coarser: Sequence[GaussianMap] = (), residual: str = "plane",
-    inlier_distance: float = np.inf, inlier_ratio: float = 1.0,
+    inlier_distance: float = np.inf, inlier_ratio: float = 1.0, allowed: Floats = EVERYWHERE,
 ) -> RegistrationResult:  # fmt: skip
     """Align the source points with the map by annealed Gauss-Newton, starting at `T_prior` (4, 4).
 
     Points without a plane or a blob in `target` are matched in the first of the `coarser` maps that has one. Correspondences
-    beyond `inlier_distance`, m, are rejected, and all but the nearest `inlier_ratio`.
+    beyond `inlier_distance`, m, are rejected, and all but the nearest `inlier_ratio`. `allowed` as in `Limits`.
     """
     kind, matches = residual_named(residual), Matches(len(points.source))
     terms = voxel_terms(kind, kind.points(points, sigma), (target, *coarser), matches, sigma, blob_weight)
     found = optimise(
-        terms, T_prior, annealing, Limits(weak_share, by_surfaces=kind.by_surfaces), matches,
+        terms, T_prior, annealing, Limits(weak_share, by_surfaces=kind.by_surfaces, allowed=allowed), matches,
         inlier_distance=inlier_distance, inlier_ratio=inlier_ratio,
     )  # fmt: skip
     return result_of(found, T_prior, len(points.source))

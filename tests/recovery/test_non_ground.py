@@ -1,9 +1,8 @@
-"""Non-ground points: which they are, how many agree at a pose, and which directions are left to the planes."""
+"""Non-ground points: which they are, and how many agree at a pose."""
 
 from __future__ import annotations
 
 import numpy as np
-import pytest
 from analytic_scenes import pose_at
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
@@ -63,20 +62,3 @@ def test_what_is_as_low_as_a_crash_barrier_is_asked_only_where_hardly_anything_i
 def test_bare_ground_says_nothing() -> None:
     ground = street(np.random.default_rng(1), 0.0)[:4000]
     assert standing_in(ground, np.eye(4)).share(seen_in(ground), np.eye(4)) == 0.0
-
-
-@pytest.mark.parametrize(("height", "kept"), [(0.3, 0.3), (0.5, 0.0)])
-def test_height_and_tilt_come_from_planes_and_the_rest_from_what_stands(height: float, kept: float) -> None:
-    """Half a metre higher nothing that stands would have its like near by: planes that say so do not hold the height."""
-    rng = np.random.default_rng(3)
-    tilted = se3.exp(np.array([0, 0, 0, 0.05, -0.2, 0.0]))
-    level = street(rng, 0.0)
-    scan = se3.apply(se3.inverse(tilted), level.astype(np.float64)).astype(np.float32)
-    stands, planes = pose_at((3.0, 0.2, 0.0), 4.0), pose_at((2.8, 0.1, height), 3.5) @ se3.exp([0, 0, 0, 0.02, 0.01, 0])
-    # Poses of the tilted sensor whose levelled frames are the two.
-    placed = standing_in(scan, np.eye(4)).place_on_ground(stands @ tilted, planes @ tilted, scan) @ se3.inverse(tilted)
-    np.testing.assert_allclose(placed[:2, 3], stands[:2, 3], atol=0.05)
-    np.testing.assert_allclose(placed[2, :3], planes[2, :3], atol=5e-3)
-    assert placed[2, 3] == pytest.approx(kept, abs=0.02)
-    yaw = np.rad2deg(np.arctan2(placed[1, 0], placed[0, 0]))
-    assert abs(yaw - 4.0) < 0.1

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from lslam.geometry import se3, so3
 from lslam.preprocessing.prepare import PreparedPoints
+from lslam.registration.alignment import upright_directions
 from lslam.registration.gaussian_map import GaussianMap
 from lslam.registration.robust import Annealing
 from lslam.registration.solver import RegistrationResult, solve
@@ -50,6 +51,23 @@ def test_the_facts_are_those_of_the_registration(room_map: GaussianMap) -> None:
     assert 0.8 * NOISE < result.rmse < 2 * NOISE
     assert 5.0 < result.lever_arm < 11.0
     assert len(result.degenerate) == 0
+
+
+def test_the_ground_aligns_height_and_tilt_alone(room_map: GaussianMap) -> None:
+    """Of a start that is wrong in all six directions, place and heading stay as they were, on a tilted sensor, too."""
+    rng = np.random.default_rng(4)
+    T = se3.exp(np.array([0.0, 0.0, 0.0, 0.1, -0.15, 0.4]))
+    off = se3.exp(np.array([0.12, -0.1, 0.14, 0.02, -0.015, 0.03]))
+    start = T @ off
+    result = solve(
+        room_map, as_source(seen_from(room(rng, 300), T)), start, FINE, sigma=NOISE, blob_weight=0.5, weak_share=1e-3,
+        allowed=upright_directions(start),
+    )  # fmt: skip
+    moved = se3.log(se3.relative(start, result.T_world_lidar))
+    left = se3.log(se3.relative(T, result.T_world_lidar))
+    np.testing.assert_allclose(moved[[0, 1, 5]], 0.0, atol=5e-3)
+    assert abs(left[2]) < 0.02
+    np.testing.assert_allclose(left[3:5], 0.0, atol=5e-3)
 
 
 def test_covariance_is_symmetric_and_shrinks_as_points_come_in(room_map: GaussianMap) -> None:
