@@ -1,0 +1,70 @@
+"""Open ground seen by sixteen beams, from rest: rings that repeat wherever the sensor is must not hold it where it was."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from lslam.config.config import Config
+from lslam.odometry import create_odometry
+from lslam.pipeline.front_end import estimate
+from lslam.registration import local_map
+from lslam.simulation.scenarios import simulate
+from lslam.types.sequence import Sequence
+
+Floats = NDArray[np.float64]
+
+
+def from_rest(
+    scenario: str, seed: int, count: int, speed: float, settings: tuple[str, ...] = ()
+) -> tuple[Sequence, Floats]:
+    """A VLP-16 that stands a second, then drives off, every column from its own pose; the true positions (N, 3)."""
+    simulated = simulate(
+        scenario, seed=seed, lidar="vlp16", count=count, speed=speed, start_speed=0.0, static_start=1.0,
+        motion_compensated=False, settings=settings,
+    )  # fmt: skip
+    assert simulated.ground_truth is not None
+    return simulated, simulated.ground_truth.poses[:, :3, 3]
+
+
+def run(sequence: Sequence, method: str = "icp") -> Floats:
+    results = estimate(sequence, create_odometry(Config.model_validate({"odometry": {"method": method}})))
+    return np.stack([result.T_world_lidar[:3, 3] for result in results])
+
+
+def worst(found: Floats, truth: Floats) -> float:
+    return float(np.linalg.norm(found - truth, axis=1).max())
+
+
+@pytest.fixture(scope="module")
+def rings() -> tuple[Sequence, Floats]:
+    """A motorway whose verge is rough by two centimetres: hardly anything but rings on the ground."""
+    return from_rest("motorway", 205, 80, 5.0, ("world.unevenness=0.02",))
+
+
+@pytest.fixture(scope="module")
+def car_park() -> tuple[Sequence, Floats]:
+    return from_rest("carpark", 1, 80, 5.0)
+
+
+@pytest.mark.parametrize("method", ["icp", "loam"])
+def test_rings_on_a_rough_motorway_do_not_hold_the_sensor(rings: tuple[Sequence, Floats], method: str) -> None:
+    sequence, truth = rings
+    assert np.linalg.norm(truth[-1] - truth[0]) > 15
+    assert worst(run(sequence, method), truth) < 0.25
+
+
+def test_rings_on_a_car_park_do_not_hold_the_sensor(car_park: tuple[Sequence, Floats]) -> None:
+    sequence, truth = car_park
+    assert np.linalg.norm(truth[-1] - truth[0]) > 10
+    assert worst(run(sequence), truth) < 0.25
+
+
+def test_voxels_of_single_rings_are_what_held_it(
+    car_park: tuple[Sequence, Floats], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Matched with all voxels, it never leaves the start and no scan fails: the breadth of a voxel is what tells."""
+    monkeypatch.setattr(local_map, "BREADTH", 0.0)
+    sequence, truth = car_park
+    assert worst(run(sequence), truth) > 10.0
