@@ -12,39 +12,70 @@ from __future__ import annotations
 import argparse
 from collections import Counter
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from unittest import mock
 
 import numpy as np
 from accuracy import Case, ate, rotation_rpe
+from numpy.typing import NDArray
 from sparse import length, origin, thinned
 
 from lslam.config.recovery import RecoveryConfig
 from lslam.config.registration import RegistrationConfig
 from lslam.errors import UsageError
+from lslam.preprocessing.prepare import PreparedPoints
+from lslam.recovery import non_ground, start_search
+from lslam.recovery.coarse_to_fine import CoarseToFine
 from lslam.recovery.policies import RecoveringRegistration
+from lslam.recovery.start_search import StartSearch
 from lslam.registration import local_map
+from lslam.registration.registration import Registration
+from lslam.registration.solver import RegistrationResult
 from lslam.simulation.scenarios import simulate
 
 Make = Callable[[], RecoveringRegistration]
+Patch = tuple[object, str, object]
 
 SPEEDS = {"motorway": (5.0, 30.0), "carpark": (5.0, 12.0), "street": (5.0, 12.0)}
 SLOW = ("urban", "residential", "corridor", "walk", "block", "closed", "climbing")
 SCANS = 100
 
 
-def _without_breadth() -> RecoveringRegistration:
-    with mock.patch.object(local_map, "BREADTH", 0.0):
-        return RecoveringRegistration()
+class AnyRival(CoarseToFine):
+    """Takes a result for a rival consensus at the start, too, when its steps have not converged."""
+
+    def recover(
+        self, registration: Registration, points: PreparedPoints, T_prior: NDArray[np.float64], found: RegistrationResult
+    ) -> RegistrationResult:  # fmt: skip
+        return super().recover(registration, points, T_prior, replace(found, converged=True))
 
 
-WITHOUT: dict[str, Make] = {
-    "-": RecoveringRegistration,
-    "breadth": _without_breadth,
-    "solid blobs": lambda: RecoveringRegistration(RegistrationConfig(blob_weight=0.0)),
-    "coarse-to-fine": lambda: RecoveringRegistration(recovery=RecoveryConfig(coarse_to_fine=False)),
-    "start search": lambda: RecoveringRegistration(recovery=RecoveryConfig(start_search=False)),
-    "agreement": lambda: RecoveringRegistration(RegistrationConfig(min_agreement=0.0)),
+def _any_rival() -> RecoveringRegistration:
+    registration = RecoveringRegistration()
+    registration.recovery = (AnyRival(), StartSearch())
+    return registration
+
+
+def _with(**recovery: bool) -> Make:
+    return lambda: RecoveringRegistration(recovery=RecoveryConfig(**recovery))
+
+
+WITHOUT: dict[str, tuple[Make, tuple[Patch, ...]]] = {
+    "-": (RecoveringRegistration, ()),
+    "breadth": (RecoveringRegistration, ((local_map, "BREADTH", 0.0),)),
+    "blobs": (lambda: RecoveringRegistration(RegistrationConfig(blob_weight=0.0)), ()),
+    "coarse-to-fine": (_with(coarse_to_fine=False), ()),
+    "converged rival": (_any_rival, ()),
+    "start search": (_with(start_search=False), ()),
+    # Lower points are always asked; never asked.
+    "HIGH": (RecoveringRegistration, ((non_ground, "FEW", np.inf),)),
+    "FEW": (RecoveringRegistration, ((non_ground, "FEW", 0),)),
+    "CLEARLY": (RecoveringRegistration, ((start_search, "CLEARLY", 1.0),)),
+    "MUCH": (RecoveringRegistration, ((start_search, "MUCH", 1.0),)),
+    "ground": (RecoveringRegistration, ((start_search, "GROUND_FACTOR", 1),)),
+    "agreement": (lambda: RecoveringRegistration(RegistrationConfig(min_agreement=0.0)), ()),
 }
 
 
@@ -67,15 +98,20 @@ def drives(lidars: list[str], seeds: list[int]) -> Iterator[Case]:
                         yield name, [line.scan(i).points for i in range(SCANS)], line.ground_truth.poses
 
 
-def row(make: Make, case: Case) -> tuple[float, float, float, int, Counter[str]]:
+def row(name: str, case: Case) -> tuple[float, float, float, int, Counter[str]]:
     """ATE origin and se3, m, rotation over 10 m, deg, failed scans, and who posed."""
     _, scans, truth = case
-    registration, poses, acted, failed = make(), [], Counter[str](), 0
-    for points in scans:
-        result = registration.register(points)
-        poses.append(result.T_world_lidar)
-        failed += not result.ok
-        acted[result.posed_by] += bool(result.posed_by)
+    make, patches = WITHOUT[name]
+    poses, acted, failed = [], Counter[str](), 0
+    with ExitStack() as stack:
+        for patch in patches:
+            stack.enter_context(mock.patch.object(*patch))
+        registration = make()
+        for points in scans:
+            result = registration.register(points)
+            poses.append(result.T_world_lidar)
+            failed += not result.ok
+            acted[result.posed_by] += bool(result.posed_by)
     found = np.stack(poses)
     return origin(found, truth), ate(found, truth), rotation_rpe(found, truth), failed, +acted
 
@@ -97,7 +133,7 @@ def main() -> None:
     for case in cases:
         whole = 0.0
         for name in names:
-            start, shape, turn, failed, acted = row(WITHOUT[name], case)
+            start, shape, turn, failed, acted = row(name, case)
             is_lost = start > 0.05 * length(case[2]) and not args.recordings
             whole = shape if name == "-" else whole
             lost[name] += is_lost
