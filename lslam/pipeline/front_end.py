@@ -14,13 +14,13 @@ from numpy.typing import NDArray
 
 from lslam.errors import InputError
 from lslam.odometry.base import Odometry
+from lslam.odometry.standing import Standing
 from lslam.pipeline.checkpoints import OdometryCheckpoints
 from lslam.pipeline.keyframing import Keyframing
 from lslam.pipeline.tracker import Loaded, Tracker
 from lslam.readers.selection import Selection
 from lslam.registration.motion import MotionModel
 from lslam.registration.registration import DOUBT
-from lslam.registration.standing import Standing
 from lslam.registration.witness import Witness
 from lslam.types.scan import Scan, Span
 from lslam.types.scan_result import ScanResult

@@ -18,6 +18,7 @@ from lslam.loops import detector
 from lslam.maps import crispness, merge
 from lslam.odometry.base import Odometry, Resumable
 from lslam.odometry.given import GivenPoses
+from lslam.odometry.standing import Standing
 from lslam.pipeline import inertial_start
 from lslam.pipeline.checkpoints import Checkpoints, OdometryCheckpoints
 from lslam.pipeline.front_end import estimate, is_diverged, to_trajectory
@@ -29,7 +30,6 @@ from lslam.pipeline.osm_source import OsmSource
 from lslam.pipeline.run_folder import CHECKPOINT, RunFolder
 from lslam.pipeline.watch import Watch
 from lslam.priors import osm_prior
-from lslam.registration.standing import Standing
 from lslam.registration.witness import Witness
 from lslam.types.constraint import Turn
 from lslam.types.run_record import RunRecord

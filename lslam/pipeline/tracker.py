@@ -13,8 +13,8 @@ from lslam.geometry import se3, so3
 from lslam.inertial.fusion import InertialMotion
 from lslam.odometry.base import Deskewing, Odometry, Resumable, Searching
 from lslam.odometry.feature_steps import StageClock
+from lslam.odometry.standing import Standing
 from lslam.registration.motion import ConstantVelocity, MotionModel, middle_of
-from lslam.registration.standing import Standing
 from lslam.registration.witness import Witness
 from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan import Scan, Span

@@ -15,6 +15,7 @@ from lslam.errors import InputError
 from lslam.formats.state_files import Records, read_state, write_state
 from lslam.odometry import METHODS, create_odometry
 from lslam.odometry.base import Resumable
+from lslam.odometry.standing import Standing
 from lslam.pipeline.front_end import read_ahead
 from lslam.pipeline.inertial_start import Inertial, begin_inertial
 from lslam.pipeline.state_classes import STATE_CLASSES
@@ -22,7 +23,6 @@ from lslam.pipeline.tracker import Tracker
 from lslam.readers.ringed import with_rings
 from lslam.registration.gaussian_map import GaussianMap
 from lslam.registration.motion import ConstantVelocity
-from lslam.registration.standing import Standing
 from lslam.simulation.scenarios import simulate
 from lslam.types.scan import Scan
 from lslam.types.scan_result import ScanResult

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from lslam.config.config import Config
 from lslam.geometry import se3, so3
-from lslam.registration.standing import Standing
+from lslam.odometry.standing import Standing
 from lslam.simulation.scenarios import simulate
 from lslam.types.scan import Scan
 from lslam.types.scan_result import ScanResult
