@@ -16,7 +16,7 @@ LAYERS = [
     ["studies"],
     ["pipeline"],
     ["reports"],
-    ["readers", "odometry", "inertial", "loops", "graph", "priors", "maps", "evaluation", "simulation"],
+    ["readers", "odometry", "inertial", "integrity", "loops", "graph", "priors", "maps", "evaluation", "simulation"],
     ["recovery"],
     ["keyframes", "registration"],
     ["preprocessing"],

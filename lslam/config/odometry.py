@@ -16,7 +16,7 @@ class OdometryConfig(Section):
     checkpoint_s: float = Field(
         30.0, ge=0, description="s; a run that is killed goes on (--resume) from a checkpoint at most so old; 0: none"
     )
-    witness: bool = Field(
+    integrity: bool = Field(
         True,
         description="compare pairs of scans beside the method, whatever it is, and say where they contradict its poses",
     )

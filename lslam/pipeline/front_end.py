@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.errors import InputError
+from lslam.integrity.monitor import IntegrityMonitor
 from lslam.odometry.base import Odometry
 from lslam.odometry.standing import Standing
 from lslam.pipeline.checkpoints import OdometryCheckpoints
@@ -21,7 +22,6 @@ from lslam.pipeline.tracker import Loaded, Tracker
 from lslam.readers.selection import Selection
 from lslam.registration.motion import MotionModel
 from lslam.registration.registration import DOUBT
-from lslam.registration.witness import Witness
 from lslam.types.scan import Scan, Span
 from lslam.types.scan_result import ScanResult
 from lslam.types.sequence import Sequence
@@ -40,16 +40,16 @@ def estimate(
     on_scan: Callable[[ScanResult], None] = lambda result: None,
     keyframing: Keyframing | None = None,
     checkpoints: OdometryCheckpoints | None = None,
-    witness: Witness | None = None,
+    monitor: IntegrityMonitor | None = None,
 ) -> list[ScanResult]:
     """Register every scan of the sequence; stops early on `should_stop` or after `max_failures` failures in a row.
 
     A scan that cannot be read, or is empty, is skipped: the motion prior stands in for its pose. With `standing`, scans
     during which the sensor stands are not registered. `motion` predicts the scans, constant velocity when None.
     `keyframing` sees every scan and how the sensor moved within it. `checkpoints`, which need keyframing, say where an
-    earlier run left off and keep what this one does. `witness` sees every scan and the pose claimed for it.
+    earlier run left off and keep what this one does. `monitor` checks the pose claimed for every scan.
     """
-    tracker = Tracker(odometry, standing, motion, witness)
+    tracker = Tracker(odometry, standing, motion, monitor)
     results: list[ScanResult] = []
     if checkpoints is not None and keyframing is not None:
         results = checkpoints.begin(tracker, keyframing)
@@ -63,10 +63,10 @@ def estimate(
             began = time.perf_counter()
             keyframing.see(len(results), loaded.scan, result, tracker.sweep)
             stages["keyframe"] = time.perf_counter() - began
-        if witness is not None:
+        if monitor is not None:
             began = time.perf_counter()
-            witness.see(len(results), loaded.scan, loaded.prepared, result, tracker.sweep)
-            stages["witness"] = time.perf_counter() - began
+            tracker.check(len(results), loaded, result)
+            stages["integrity"] = time.perf_counter() - began
         result = replace(result, stages=stages)
         results.append(result)
         on_scan(result)

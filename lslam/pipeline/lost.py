@@ -1,4 +1,4 @@
-"""Where a run may be lost: what its witness says, in the words of the manifest and beside each scan."""
+"""Where a run may be lost: the alerts of its integrity monitor, in the words of the manifest and beside each scan."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from lslam.integrity.alerts import Alert, alerts
+from lslam.integrity.monitor import IntegrityMonitor
 from lslam.pipeline.manifest import Manifest
-from lslam.registration.verdict import Doubt, doubts
-from lslam.registration.witness import Witness
 from lslam.types.scan_result import ScanResult
 
 log = logging.getLogger("lslam")
@@ -18,11 +18,11 @@ log = logging.getLogger("lslam")
 MOST_SAID = 6
 
 
-def mark_lost(results: list[ScanResult], witness: Witness, manifest: Manifest) -> list[ScanResult]:
-    """The results, those in doubt marked so; the manifest has a problem for each stretch of them."""
+def mark_lost(results: list[ScanResult], monitor: IntegrityMonitor, manifest: Manifest) -> list[ScanResult]:
+    """The results, those that an alert speaks of marked so; the manifest has a problem for each stretch of them."""
     positions = np.stack([r.T_world_lidar[:3, 3] for r in results])
-    found = doubts(witness.testimonies, positions, np.array([r.stamp_ns for r in results]))
-    said = [_sentence(results, doubt) for doubt in found]
+    found = alerts(monitor.checks, positions, np.array([r.stamp_ns for r in results]))
+    said = [_sentence(results, alert) for alert in found]
     if len(said) > MOST_SAID:
         said = [
             *said[:MOST_SAID],
@@ -31,16 +31,16 @@ def mark_lost(results: list[ScanResult], witness: Witness, manifest: Manifest) -
     for sentence in said:
         log.warning("%s", sentence)
     manifest.problems += said
-    manifest.witness = {
-        "comparisons": len(witness.testimonies),
-        "telling": sum(t.is_telling for t in witness.testimonies),
-        "doubts": len(found),
+    manifest.integrity = {
+        "checks": len(monitor.checks),
+        "conclusive": sum(check.is_conclusive for check in monitor.checks),
+        "alerts": len(found),
     }
-    in_doubt = {k for doubt in found for k in range(doubt.first, doubt.last + 1)}
-    return [replace(r, is_lost=True) if k in in_doubt else r for k, r in enumerate(results)]
+    lost = {k for alert in found for k in range(alert.first, alert.last + 1)}
+    return [replace(r, is_lost=True) if k in lost else r for k, r in enumerate(results)]
 
 
-def _sentence(results: list[ScanResult], doubt: Doubt) -> str:
-    first, last = results[doubt.first].index, results[doubt.last].index
+def _sentence(results: list[ScanResult], alert: Alert) -> str:
+    first, last = results[alert.first].index, results[alert.last].index
     scans = f"scan {first}" if first == last else f"scans {first} to {last}"
-    return f"{scans} may be lost: {doubt.why}"
+    return f"{scans} may be lost: {alert.why}"

@@ -41,7 +41,7 @@ class Manifest:
     graph, georeference : what the back end did and where on the Earth the world lies, empty where it did nothing
     identity : digests that a run and its resumption share; resumed_after : scans that were done when it was resumed
     posed_by : scans by who posed them: the method, what stood in for it, the motion prior
-    witness : how many pairs of scans were compared beside the method, and how often they contradict its poses
+    integrity : how many pairs of scans checked the motion beside the method, how many were conclusive, and the alerts raised
     problems : what went wrong in this run, beside what was wrong with the recording before
     """
 
@@ -55,7 +55,7 @@ class Manifest:
         self.problems: list[str] = []
         self.counts: dict[str, int] = {}
         self.posed_by: dict[str, int] = {}
-        self.witness: dict[str, int] = {}
+        self.integrity: dict[str, int] = {}
         self.map_points: int | None = None
         self.imu: dict[str, Any] = {}
         self.keyframes: dict[str, Any] = {}
@@ -154,7 +154,7 @@ class Manifest:
             **({"imu": dict(self.imu)} if self.imu else {}),
             "counts": dict(self.counts),
             **({"posed_by": dict(self.posed_by)} if self.posed_by else {}),
-            **({"witness": dict(self.witness)} if self.witness else {}),
+            **({"integrity": dict(self.integrity)} if self.integrity else {}),
             **({"resumed_after_scans": list(self.resumed_after)} if self.resumed_after else {}),
             **({"keyframes": dict(self.keyframes)} if self.keyframes else {}),
             **({"graph": dict(self.graph)} if self.graph else {}),

@@ -11,6 +11,7 @@ import numpy as np
 
 from lslam.config import Config
 from lslam.errors import InputError
+from lslam.integrity.monitor import IntegrityMonitor
 from lslam.kernels import jit
 from lslam.keyframes.store import KeyframeStore
 from lslam.locks import one_at_a_time
@@ -30,7 +31,6 @@ from lslam.pipeline.osm_source import OsmSource
 from lslam.pipeline.run_folder import CHECKPOINT, RunFolder
 from lslam.pipeline.watch import Watch
 from lslam.priors import osm_prior
-from lslam.registration.witness import Witness
 from lslam.types.constraint import Turn
 from lslam.types.run_record import RunRecord
 from lslam.types.scan_result import ScanResult
@@ -49,9 +49,9 @@ def estimate_poses(
     Raises InputError when no scan can be used.
     """
     standing = Standing(config.preprocess, config.registration) if config.preprocess.skip_standing else None
-    witness = Witness(config.preprocess, config.registration) if config.odometry.witness else None
+    monitor = IntegrityMonitor(config.preprocess, config.registration) if config.odometry.integrity else None
     is_over = checkpoints is not None and checkpoints.is_over
-    _warm_up(sequence, odometry, standing, witness, config, manifest, is_over)
+    _warm_up(sequence, odometry, standing, monitor, config, manifest, is_over)
 
     if osm is not None and checkpoints is not None:
         for result in checkpoints.results:
@@ -72,7 +72,7 @@ def estimate_poses(
         results = estimate(
             sequence, odometry, threads=config.input.threads, max_failures=limit, standing=standing,
             motion=motion, should_stop=watch.should_stop, on_scan=seen, keyframing=keyframing,
-            checkpoints=checkpoints, witness=witness,
+            checkpoints=checkpoints, monitor=monitor,
         )  # fmt: skip
         keyframing.settle()
     if checkpoints is not None and checkpoints.resumed_after:
@@ -85,8 +85,8 @@ def estimate_poses(
         manifest.imu = close_inertial(inertial, results)
         manifest.problems += inertial.problems
     manifest.judge(results, len(sequence), is_diverged(results, limit))
-    if witness is not None:
-        results = mark_lost(results, witness, manifest)
+    if monitor is not None:
+        results = mark_lost(results, monitor, manifest)
     return RunRecord(
         name=sequence.name,
         method=config.odometry.method,
@@ -128,7 +128,7 @@ def odometry_checkpoints(
 
 
 def _warm_up(
-    sequence: Sequence, odometry: Odometry, standing: Standing | None, witness: Witness | None, config: Config,
+    sequence: Sequence, odometry: Odometry, standing: Standing | None, monitor: IntegrityMonitor | None, config: Config,
     manifest: Manifest, is_over: bool,
 ) -> None:  # fmt: skip
     """Compile or load what the scans would otherwise wait for, less of it when odometry is over."""
@@ -137,8 +137,8 @@ def _warm_up(
             odometry.warm_up()
         if standing is not None:
             standing.warm_up()
-        if witness is not None and not is_over:
-            witness.warm_up()
+        if monitor is not None and not is_over:
+            monitor.warm_up()
         if config.loops.use:
             detector.warm_up()
         if config.osm.extract:

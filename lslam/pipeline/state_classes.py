@@ -5,17 +5,17 @@ from __future__ import annotations
 from lslam.inertial.estimate import ImuEstimate
 from lslam.inertial.gyroscope import Gyroscope
 from lslam.inertial.initialise import Start
+from lslam.integrity.monitor import Seen
 from lslam.odometry.feature_scan import FeatureScan
 from lslam.preprocessing.features import FeaturePoints, Features
 from lslam.preprocessing.prepare import PreparedPoints
-from lslam.registration.witness import Seen
 from lslam.types.constraint import Constraint, LoopCandidate
 from lslam.types.gravity import GravityDirection
 from lslam.types.imu import ImuStream
+from lslam.types.motion_check import MotionCheck
 from lslam.types.scan_result import ScanResult
-from lslam.types.testimony import Testimony
 
 STATE_CLASSES = (
     Constraint, FeaturePoints, Features, FeatureScan, GravityDirection, Gyroscope, ImuEstimate, ImuStream, LoopCandidate,
-    PreparedPoints, ScanResult, Seen, Start, Testimony,
+    MotionCheck, PreparedPoints, ScanResult, Seen, Start,
 )  # fmt: skip

@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 
 from lslam.geometry import se3, so3
 from lslam.inertial.fusion import InertialMotion
+from lslam.integrity.monitor import IntegrityMonitor
 from lslam.odometry.base import Deskewing, Odometry, Resumable, Searching
 from lslam.odometry.feature_steps import StageClock
 from lslam.odometry.standing import Standing
 from lslam.registration.motion import ConstantVelocity, MotionModel, middle_of
-from lslam.registration.witness import Witness
 from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan import Scan, Span
 from lslam.types.scan_result import ScanResult
@@ -44,7 +44,7 @@ class Tracker:
     """Poses of scans, one after the other.
 
     sweep : how the sensor moved within the last scan, as far as its registration knew
-    witness : what looks on, only to be kept with the rest
+    monitor : checks the poses that were found, by `check`
     middle : instant, ns, and pose of the middle of the last sweep: what its registration knows best
     """
 
@@ -53,9 +53,9 @@ class Tracker:
 
     def __init__(
         self, odometry: Odometry, standing: Standing | None = None, motion: MotionModel | None = None,
-        witness: Witness | None = None,
+        monitor: IntegrityMonitor | None = None,
     ) -> None:  # fmt: skip
-        self.odometry, self.standing, self.witness = odometry, standing, witness
+        self.odometry, self.standing, self.monitor = odometry, standing, monitor
         self.motion: MotionModel = ConstantVelocity() if motion is None else motion
         self.sweep = MotionPrior.at_once(np.eye(4))
         self.middle = (0, np.eye(4))
@@ -73,6 +73,11 @@ class Tracker:
             self._first = None
         return result
 
+    def check(self, position: int, loaded: Loaded, result: ScanResult) -> None:
+        """Have the monitor, if there is one, check what `track` found for the scan at this position of the run."""
+        if self.monitor is not None:
+            self.monitor.see(position, loaded.scan, loaded.prepared, result, self.sweep)
+
     @property
     def is_settled(self) -> bool:
         """Whether nothing waits for the next scan, so that `state` says all."""
@@ -85,7 +90,7 @@ class Tracker:
             "motion": self.motion.state(),
             "standing": None if self.standing is None else self.standing.state(),
             "middle": self.middle,
-            "witness": None if self.witness is None else self.witness.state(),
+            "monitor": None if self.monitor is None else self.monitor.state(),
         }
 
     def restore(self, state: State) -> None:
@@ -96,8 +101,8 @@ class Tracker:
         if self.standing is not None:
             self.standing.restore(state["standing"])
         self.middle = state["middle"]
-        if self.witness is not None:
-            self.witness.restore(state["witness"])
+        if self.monitor is not None:
+            self.monitor.restore(state["monitor"])
 
     def _stand_or_move(self, scan: Scan, loaded: Loaded, standing: Standing) -> ScanResult:
         began = time.perf_counter()

@@ -16,14 +16,19 @@ from stub_sequences import SAMPLE, Stub
 
 from lslam.config import Config, load_config
 from lslam.errors import GateError, RunFailedError
+from lslam.integrity.monitor import IntegrityMonitor
 from lslam.pipeline import run as recipe
+from lslam.pipeline.lost import MOST_SAID, mark_lost
+from lslam.pipeline.manifest import Manifest
 from lslam.pipeline.run import run
 from lslam.pipeline.watch import RunOutcome, Watch
 from lslam.readers import open_sequence, select
 from lslam.reports.text import summary
 from lslam.simulation.lidar_models import LIDARS
 from lslam.simulation.scenarios import simulate
+from lslam.types.motion_check import MotionCheck
 from lslam.types.scan import Scan
+from lslam.types.scan_result import ScanResult
 from lslam.types.sequence import Sequence
 
 BEGIN = 30
@@ -101,8 +106,8 @@ def test_what_is_lost_for_two_seconds_is_named_and_fails_a_strict_run(
     assert BEGIN - 5 <= lost[0] <= BEGIN + 5
     assert BEGIN + 15 <= lost[-1] <= BEGIN + 27
     document = json.loads((tmp_path / "run" / "manifest.json").read_text())
-    assert document["witness"]["doubts"] >= 1
-    assert document["witness"]["telling"] > 10
+    assert document["integrity"]["alerts"] >= 1
+    assert document["integrity"]["conclusive"] > 10
 
 
 @pytest.mark.parametrize("scenario", ["street", "residential"])
@@ -142,14 +147,38 @@ def test_a_hole_of_three_seconds_while_moving_is_noticed(lidar: str) -> None:
 def test_no_good_drive_is_accused(scenario: str, lidar: str) -> None:
     outcome = ended(drive(scenario, 80, 1, lidar))
     assert problems(outcome) == []
-    assert outcome.record.manifest["witness"]["comparisons"] >= 14
+    assert outcome.record.manifest["integrity"]["checks"] >= 14
+
+
+@pytest.mark.parametrize("more", [0, 1, 3])
+def test_of_many_stretches_the_first_are_told_and_the_others_counted(more: int) -> None:
+    """One check in six finds the sensor a metre ahead: the scans of each are marked, also of those that are not told."""
+    stretches = MOST_SAID + more
+    cfg = config()
+    monitor = IntegrityMonitor(cfg.preprocess, cfg.registration)
+    for k in range(6 * stretches):
+        found, is_ahead = np.eye(4), k % 6 == 5
+        found[0, 3] = is_ahead
+        as_claimed = 0.5 if is_ahead else 0.9
+        check = MotionCheck(5 * k, 5 * k + 5, 0.5, np.eye(4), found, np.full(6, 1e-3), 0.9, as_claimed, 0.9)
+        monitor.checks.append(check)
+    count = 30 * stretches + 1
+    results = [ScanResult(100 + k, 100_000_000 * k, np.eye(4)) for k in range(count)]
+    manifest = Manifest("run", drive("street"), cfg)
+    marked = mark_lost(results, monitor, manifest)
+    assert [k for k in range(count) if marked[k].is_lost] == [k for k in range(1, count) if (k - 1) % 30 >= 25]
+    assert manifest.integrity == {"checks": 6 * stretches, "conclusive": 6 * stretches, "alerts": stretches}
+    told = [problem.split(" may be")[0] for problem in manifest.problems[:MOST_SAID]]
+    assert told == [f"scans {126 + 30 * k} to {130 + 30 * k}" for k in range(MOST_SAID)]
+    said = [f"and {more} more stretches of scans that may be lost: see scans.csv"] if more else []
+    assert manifest.problems[MOST_SAID:] == said
 
 
 @pytest.mark.parametrize("method", ["icp", "kiss-icp", "loam"])
 def test_the_sample_is_not_accused_by_any_method(method: str) -> None:
     outcome = ended(open_sequence(SAMPLE), f"odometry.method={method}")
     assert problems(outcome) == []
-    assert outcome.record.manifest["witness"]["telling"] > 10
+    assert outcome.record.manifest["integrity"]["conclusive"] > 10
 
 
 @pytest.mark.parametrize("name", ["kitti_raw_0005", "kitti_raw_0048", "mcd_kth_day_06"])

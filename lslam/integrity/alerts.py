@@ -1,4 +1,4 @@
-"""What the testimonies of a run come to: where its poses may be lost, and why."""
+"""Alerts from the motion checks of a run: where its poses may be lost, and why."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.types.testimony import USUAL, Testimony
+from lslam.types.motion_check import USUAL, MotionCheck
 
 Floats = NDArray[np.float64]
 
-# Comparisons in a row that say the same, two seconds of them, and by how much at least, m and rad: few rings hold tilt badly.
+# Checks in a row that say the same, two seconds of them, and by how much at least, m and rad: few rings hold tilt badly.
 IN_A_ROW = 4
 LEAST: Floats = np.array([0.06, 0.06, 0.08, *np.deg2rad([0.3, 0.3, 0.12])])
-# One comparison is enough where it says so much more, and clearly explains more of the points.
+# One check is enough where it says so much more, and clearly explains more of the points.
 LARGE: Floats = np.array([0.5, 0.5, 0.5, *np.deg2rad([2.0, 2.0, 2.0])])
 SIGMAS_IN_A_ROW, SIGMAS_ALONE, MORE = 3.0, 6.0, 1.15
-# A comparison that leaves the place open by so much, m, confirms nothing.
+# A check that leaves the place open by so much, m, confirms nothing.
 OPEN_M = 0.5
 # Five times gravity over so many m: nothing that carries a LiDAR is accelerated so, but scans out of order are.
 MOST_ACCELERATION, LEAST_JERK_M = 50.0, 0.3
@@ -26,7 +26,7 @@ AXES = ("ahead", "to the left", "up", "of roll", "of pitch", "of yaw")
 
 
 @dataclass(frozen=True)
-class Doubt:
+class Alert:
     """Scans whose poses may be lost, by their positions in the run, and why."""
 
     first: int
@@ -34,56 +34,56 @@ class Doubt:
     why: str
 
 
-def doubts(testimonies: list[Testimony], positions: Floats, stamps_ns: NDArray[np.int64]) -> list[Doubt]:
+def alerts(checks: list[MotionCheck], positions: Floats, stamps_ns: NDArray[np.int64]) -> list[Alert]:
     """All that speaks against the claimed `positions` (N, 3), m, of scans at `stamps_ns` (N,), in their order."""
-    found = [*_broken(testimonies), *_thrown(positions, stamps_ns), *_contradicted(testimonies)]
-    return sorted(found, key=lambda doubt: (doubt.first, doubt.last))
+    found = [*_unconfirmed(checks), *_jumps(positions, stamps_ns), *_inconsistent(checks)]
+    return sorted(found, key=lambda alert: (alert.first, alert.last))
 
 
-def _contradicted(testimonies: list[Testimony]) -> list[Doubt]:
-    """Where comparisons say that the motion was another; axes that are contradicted together make one doubt.
+def _inconsistent(checks: list[MotionCheck]) -> list[Alert]:
+    """Where checks say that the motion was another; axes that are inconsistent together make one alert.
 
-    Those that tell nothing do not part those that do.
+    Inconclusive checks do not part conclusive ones.
     """
-    testimonies = [t for t in testimonies if t.is_telling]
-    if not testimonies:
+    checks = [check for check in checks if check.is_conclusive]
+    if not checks:
         return []
-    apart, sigma = (np.stack([getattr(t, name) for t in testimonies]) for name in ("apart", "sigma"))
+    apart, sigma = (np.stack([getattr(check, name) for check in checks]) for name in ("apart", "sigma"))
     sigma = np.maximum(sigma, _noise(apart))
-    spans = sorted(span for axis in range(6) for span in _stretches(testimonies, apart[:, axis], sigma[:, axis], axis))
+    spans = sorted(span for axis in range(6) for span in _stretches(checks, apart[:, axis], sigma[:, axis], axis))
     merged: list[tuple[int, int]] = []
     for begin, end in spans:
         if merged and begin < merged[-1][1]:
             merged[-1] = merged[-1][0], max(end, merged[-1][1])
         else:
             merged.append((begin, end))
-    return [_doubt(testimonies[begin:end], np.median(apart[begin:end], axis=0)) for begin, end in merged]
+    return [_alert(checks[begin:end], np.median(apart[begin:end], axis=0)) for begin, end in merged]
 
 
 def _noise(apart: Floats) -> Floats:
-    """(6,) by how much comparisons usually differ from the next: what is constant is none."""
+    """(6,) by how much checks usually differ from the next: what is constant is none."""
     if len(apart) < IN_A_ROW:
         return np.zeros(6)
     return np.asarray(1.4826 / np.sqrt(2) * np.median(np.abs(np.diff(apart, axis=0)), axis=0))
 
 
-def _stretches(testimonies: list[Testimony], apart: Floats, sigma: Floats, axis: int) -> list[tuple[int, int]]:
-    """Begin and end of where they say so again and again, or one of them loudly, along one axis."""
-    is_better = np.array([t.agreement > MORE * t.claimed_agreement for t in testimonies])
-    is_loud = is_better & (np.abs(apart) > LARGE[axis] + SIGMAS_ALONE * sigma)
+def _stretches(checks: list[MotionCheck], apart: Floats, sigma: Floats, axis: int) -> list[tuple[int, int]]:
+    """Begin and end of where they say so again and again, or one of them by much, along one axis."""
+    is_better = np.array([check.agreement > MORE * check.claimed_agreement for check in checks])
+    is_large = is_better & (np.abs(apart) > LARGE[axis] + SIGMAS_ALONE * sigma)
     found = []
     for begin, end in _runs(np.where(np.abs(apart) > LEAST[axis], np.sign(apart), 0)):
         part = slice(begin, end)
         mean, count = float(np.mean(apart[part])), end - begin
         bound = LEAST[axis] + SIGMAS_IN_A_ROW * float(np.median(sigma[part])) / np.sqrt(count)
-        if is_loud[part].any() or (count >= IN_A_ROW and abs(mean) > bound):
+        if is_large[part].any() or (count >= IN_A_ROW and abs(mean) > bound):
             found.append((begin, end))
     return found
 
 
-def _doubt(run: list[Testimony], apart: Floats) -> Doubt:
+def _alert(run: list[MotionCheck], apart: Floats) -> Alert:
     """In words, the two axes along which most is missing."""
-    seconds = float(np.median([t.seconds for t in run]))
+    seconds = float(np.median([check.seconds for check in run]))
     worst = sorted(np.argsort(-np.abs(apart) / LEAST)[:2].tolist())
     said = " and ".join(
         f"{apart[axis]:+.2f} m {AXES[axis]}" if axis < 3 else f"{np.rad2deg(apart[axis]):+.2f} deg {AXES[axis]}"
@@ -92,22 +92,22 @@ def _doubt(run: list[Testimony], apart: Floats) -> Doubt:
     )
     each = "each" if len(run) > 1 else "it"
     why = f"beside the scan {seconds:.1f} s before, {each} moved by {said or 'another way'} more than its pose says"
-    return Doubt(run[0].first + 1, run[-1].last, why)
+    return Alert(run[0].first + 1, run[-1].last, why)
 
 
-def _broken(testimonies: list[Testimony]) -> list[Doubt]:
+def _unconfirmed(checks: list[MotionCheck]) -> list[Alert]:
     """Where scans are missing or failed, and those before and after do not show the motion that is claimed between them."""
     found = []
-    for t in testimonies:
-        is_open = float(np.max(t.sigma[:3])) > OPEN_M or not t.is_telling
-        is_elsewhere = t.claimed_agreement < USUAL * t.usual
-        if t.is_after_break and t.usual > 0 and (is_open or is_elsewhere):
-            why = f"nothing in the scans confirms the motion over the {t.seconds:.1f} s before, in which scans failed or miss"
-            found.append(Doubt(t.first + 1, t.last, why))
+    for check in checks:
+        is_open = float(np.max(check.sigma[:3])) > OPEN_M or not check.is_conclusive
+        is_elsewhere = check.claimed_agreement < USUAL * check.usual
+        if check.is_after_break and check.usual > 0 and (is_open or is_elsewhere):
+            why = f"nothing in the scans confirms the motion over the {check.seconds:.1f} s before, in which scans failed or miss"
+            found.append(Alert(check.first + 1, check.last, why))
     return found
 
 
-def _thrown(positions: Floats, stamps_ns: NDArray[np.int64]) -> list[Doubt]:
+def _jumps(positions: Floats, stamps_ns: NDArray[np.int64]) -> list[Alert]:
     """Where poses jump as nothing that carries a sensor does."""
     steps = np.diff(stamps_ns) * 1e-9
     if len(steps) < 2 or np.any(steps <= 0):
@@ -115,12 +115,12 @@ def _thrown(positions: Floats, stamps_ns: NDArray[np.int64]) -> list[Doubt]:
     velocity = np.diff(positions, axis=0) / steps[:, None]
     between = (steps[1:] + steps[:-1]) / 2
     change = np.linalg.norm(np.diff(velocity, axis=0), axis=1)
-    is_thrown = (change / between > MOST_ACCELERATION) & (change * between > LEAST_JERK_M)
+    is_jump = (change / between > MOST_ACCELERATION) & (change * between > LEAST_JERK_M)
     # The second of three poses that make a jump is scan k + 1; jumps less than three scans apart are one.
-    at = np.flatnonzero(is_thrown) + 1
+    at = np.flatnonzero(is_jump) + 1
     groups = np.split(at, np.flatnonzero(np.diff(at) > 3) + 1) if len(at) else []
     return [
-        Doubt(
+        Alert(
             int(group[0]),
             int(group[-1]) + 1,
             f"the poses jump, by {np.max(change[group - 1] * between[group - 1]):.1f} m from one scan to the next against "

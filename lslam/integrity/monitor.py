@@ -1,4 +1,4 @@
-"""A witness of the poses that a method claims: it sees scans by twos and knows neither the method nor its map."""
+"""Monitors the poses that a method claims by registering pairs of scans, without the method and without its map."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from lslam.registration.gaussian_map import GaussianMap
 from lslam.registration.local_map import BREADTH
 from lslam.registration.robust import Annealing, UsualAgreement
 from lslam.registration.solver import RegistrationResult, solve
+from lslam.types.motion_check import MotionCheck
 from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan import Scan
 from lslam.types.scan_result import ScanResult
 from lslam.types.state import Stateful
-from lslam.types.testimony import Testimony
 
 Floats = NDArray[np.float64]
 
@@ -39,7 +39,7 @@ PAUSE_S = 1.0
 
 @dataclass(frozen=True)
 class Seen:
-    """A scan as the witness keeps it: when and where, and its points (S, 3) with their scatter, deskewed."""
+    """A scan as the monitor keeps it: when and where, and its points (S, 3) with their scatter, deskewed."""
 
     position: int
     stamp_ns: int
@@ -53,15 +53,15 @@ class Seen:
         return PreparedPoints(np.zeros((0, 3), np.float32), self.source, self.scatter, len(self.source))
 
 
-class Witness(Stateful):
-    """Registers every fifth scan on the planes of the scan half a second before, and keeps what that says of the claims.
+class IntegrityMonitor(Stateful):
+    """Registers every fifth scan on the planes of the scan half a second before, and keeps these checks of the claims.
 
-    Planes that one ring could make by itself are left out (`BREADTH`), so that a sensor's own pattern is no witness of
-    standing still. Of a claim of no motion, and where a scan fits less than usual, two more are weighed: the motion that the
-    witness saw last, and what is found from metres away.
+    Planes that one ring could make by itself are left out (`BREADTH`), so that a sensor's own pattern does not confirm
+    standing still. Of a claim of no motion, and where a scan fits less than usual, two more are weighed: the motion of the
+    last conclusive check, and what is found from metres away.
     """
 
-    STATE = ("testimonies", "_reference", "_is_broken", "_last_ns", "_motion", "_usual")
+    STATE = ("checks", "_reference", "_is_broken", "_last_ns", "_motion", "_usual")
 
     def __init__(self, preprocess: PreprocessConfig, registration: RegistrationConfig) -> None:
         self._preprocess, self._config = preprocess, registration
@@ -70,11 +70,11 @@ class Witness(Stateful):
             planarity=registration.planarity, count_cap=registration.count_cap, reach=1.2 * preprocess.range_max,
             capacity=1 << 13, breadth=BREADTH,
         )  # fmt: skip
-        self.testimonies: list[Testimony] = []
+        self.checks: list[MotionCheck] = []
         self._reference: Seen | None = None
         self._is_broken = False
         self._last_ns = 0
-        # What the last telling testimony found, per second.
+        # What the last conclusive check found, per second.
         self._motion: Floats | None = None
         self._usual = UsualAgreement(registration.min_agreement)
 
@@ -99,7 +99,7 @@ class Witness(Stateful):
         """Compile or load the kernels with a small room."""
         room = np.random.default_rng(0).uniform(-8, 8, (3000, 3)).astype(np.float32)
         room[:, 2] = np.where(room[:, 2] > 0, 8.0, -8.0)
-        trial = Witness(self._preprocess, self._config)
+        trial = IntegrityMonitor(self._preprocess, self._config)
         for k in range(2):
             at, scan = k * EVERY + 1, Scan(room, round(1e9 * k), k)
             trial.see(at, scan, None, ScanResult(k, scan.stamp_ns, np.eye(4)), MotionPrior.at_once(np.eye(4)))
@@ -139,13 +139,13 @@ class Witness(Stateful):
             return
         as_claimed = self._lay(points, claimed, self._at_once())
         self._usual.observe(found.agreement)
-        self.testimonies.append(
-            Testimony(
+        self.checks.append(
+            MotionCheck(
                 first.position, last.position, seconds, claimed, found.T_world_lidar,
                 np.sqrt(np.diag(found.covariance)), found.agreement, as_claimed.agreement, usual, self._is_broken,
             )
         )  # fmt: skip
-        if self.testimonies[-1].is_telling and seconds > 0:
+        if self.checks[-1].is_conclusive and seconds > 0:
             self._motion = se3.log(found.T_world_lidar) / seconds
 
     def _lay(self, points: PreparedPoints, start: Floats, annealing: Annealing) -> RegistrationResult:

@@ -1,4 +1,4 @@
-"""What two scans alone say of the motion between them, beside what was claimed."""
+"""The motion between two scans, registered from these two alone, beside what their poses claim."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ USUAL, FEWEST, UNTURNED = 0.7, 0.15, float(np.deg2rad(1.0))
 
 
 @dataclass(frozen=True)
-class Testimony:
+class MotionCheck:
     """One comparison of a claimed motion with the scans at its ends; m and rad, axes of the sensor at its begin.
 
     first, last : positions of the scans in the run; seconds : between them
@@ -37,7 +37,7 @@ class Testimony:
     is_after_break: bool = False
 
     @property
-    def is_telling(self) -> bool:
+    def is_conclusive(self) -> bool:
         """Whether so many of the points lie on surfaces, and hold the turn so well, that it is to be believed."""
         return self.agreement >= max(USUAL * self.usual, FEWEST) and float(np.max(self.sigma[3:])) < UNTURNED
 

@@ -1,0 +1,89 @@
+"""Alerts from checks that are made up: what they say in a row or by much, what they leave open, and poses that jump."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.geometry import se3, so3
+from lslam.integrity.alerts import IN_A_ROW, alerts
+from lslam.types.motion_check import MotionCheck
+
+Floats = NDArray[np.float64]
+
+SURE = np.array([0.005] * 3 + [0.0005] * 3)
+
+
+def checks_of(ahead: list[float], **more: float) -> list[MotionCheck]:
+    """Checks every five scans that find the sensor so many m farther ahead than claimed, a metre in half a second."""
+    one = MotionCheck(0, 5, 0.5, shifted(1.0), shifted(1.0), SURE, agreement=0.8, claimed_agreement=0.8, usual=0.8)
+    return [
+        replace(one, first=5 * k, last=5 * k + 5, found=shifted(1.0 + off), **more)  # type: ignore[arg-type]
+        for k, off in enumerate(ahead)
+    ]
+
+
+def shifted(x: float) -> Floats:
+    return se3.make(np.eye(3), np.array([x, 0.0, 0.0]))
+
+
+def spans(checks: list[MotionCheck]) -> list[tuple[int, int]]:
+    """First and last scan of each alert, of a sensor that stands."""
+    count = checks[-1].last + 1
+    found = alerts(checks, np.zeros((count, 3)), 100_000_000 * np.arange(count, dtype=np.int64))
+    return [(alert.first, alert.last) for alert in found]
+
+
+def test_checks_that_confirm_the_poses_raise_no_alert() -> None:
+    assert spans(checks_of([0.01, -0.02, 0.0, 0.02] * 5)) == []
+
+
+def test_the_same_in_a_row_raises_one_alert_from_the_first_to_the_last_of_them() -> None:
+    around = [0.0] * 8
+    assert spans(checks_of([*around, *[0.2] * (IN_A_ROW - 1), *around])) == []
+    assert spans(checks_of([*around, *[0.2] * IN_A_ROW, *around])) == [(41, 60)]
+
+
+def test_one_check_is_enough_where_it_says_much_and_explains_more_points() -> None:
+    alone = [0.0] * 8 + [1.0] + [0.0] * 8
+    assert spans(checks_of(alone)) == []
+    assert spans(checks_of(alone, claimed_agreement=0.5)) == [(41, 45)]
+
+
+def test_inconclusive_checks_say_nothing_and_part_nothing() -> None:
+    checks = checks_of([0.0] * 8 + [0.2] * IN_A_ROW + [0.0] * 8)
+    assert spans([replace(check, agreement=0.1) for check in checks]) == []
+    vague = [
+        replace(check, agreement=0.1) if k == 9 else check for k, check in enumerate(checks_of([0.0] * 8 + [0.2] * 5))
+    ]
+    assert spans(vague) == [(41, 65)]
+
+
+def test_axes_that_are_inconsistent_together_make_one_alert_that_names_both() -> None:
+    turned = shifted(1.3) @ se3.make(so3.exp(np.array([0, 0, np.deg2rad(1.0)])), np.zeros(3))
+    checks = [replace(check, found=turned) for check in checks_of([0.0] * 6)]
+    (alert,) = alerts(checks, np.zeros((31, 3)), 100_000_000 * np.arange(31, dtype=np.int64))
+    assert (alert.first, alert.last) == (1, 30)
+    assert alert.why == (
+        "beside the scan 0.5 s before, each moved by +0.30 m ahead and +1.00 deg of yaw more than its pose says"
+    )
+
+
+def test_a_break_over_which_nothing_confirms_the_motion_raises_an_alert() -> None:
+    checks = checks_of([0.0] * 4)
+    open_ahead = np.array([1.0, *SURE[1:]])
+    for unsure in ({"sigma": open_ahead}, {"agreement": 0.1}, {"claimed_agreement": 0.3}):
+        assert spans([*checks[:2], replace(checks[2], is_after_break=True, **unsure), checks[3]]) == [(11, 15)]  # type: ignore[arg-type]
+    assert spans([*checks[:2], replace(checks[2], is_after_break=True), checks[3]]) == []
+
+
+def test_poses_that_jump_raise_an_alert_without_any_check() -> None:
+    positions = np.column_stack([np.arange(20.0), np.zeros(20), np.zeros(20)])
+    stamps_ns = 100_000_000 * np.arange(20, dtype=np.int64)
+    assert alerts([], positions, stamps_ns) == []
+    positions[10:, 1] = 3.0
+    (alert,) = alerts([], positions, stamps_ns)
+    assert (alert.first, alert.last) == (9, 11)
+    assert "the poses jump, by 3.0 m" in alert.why
