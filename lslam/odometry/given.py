@@ -12,6 +12,7 @@ from lslam.errors import UsageError
 from lslam.formats.trajectory_files import read_trajectory
 from lslam.geometry.interpolate import poses_at
 from lslam.preprocessing.deskew import knots_over
+from lslam.registration.motion import MotionModel
 from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan import Scan, Span
 from lslam.types.scan_result import ScanResult
@@ -27,8 +28,8 @@ Floats = NDArray[np.float64]
 GAP_STEPS, GAP_S = 2.5, 0.25
 
 
-class GivenMotion(Stateful):
-    """A `MotionModel` that reads the motion off a trajectory."""
+class GivenMotion(Stateful, MotionModel):
+    """Reads the motion off a trajectory."""
 
     def __init__(self, trajectory: Trajectory) -> None:
         self.trajectory = trajectory

@@ -9,15 +9,20 @@ from numpy.typing import NDArray
 
 from lslam.geometry import se3
 from lslam.preprocessing.deskew import knots_over
+from lslam.types.gravity import GravityDirection
 from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan import Span
+from lslam.types.scan_result import ScanResult
 from lslam.types.state import State, Stateful
 
 Floats = NDArray[np.float64]
 
 
 class MotionModel(Protocol):
-    """What predicts a scan and the motion within it, and learns from where registration put it."""
+    """What predicts a scan and the motion within it, and learns from where registration put it.
+
+    What has a body here is what a model without a sensor of its own does: it has no say in where a scan is.
+    """
 
     @property
     def is_known(self) -> bool:
@@ -50,8 +55,30 @@ class MotionModel(Protocol):
         """Go on where `state` was taken."""
         ...
 
+    @property
+    def coasting(self) -> ConstantVelocity | None:
+        """Constant velocity, where the model takes its place and is compared with it."""
+        return None
 
-class ConstantVelocity(Stateful):
+    @property
+    def is_felt(self) -> bool:
+        """Whether a sensor of motion predicted the newest sweep: the scan is sought near there when it is denied or lost."""
+        return False
+
+    def is_compared(self, stamp_ns: int, span: Span) -> bool:
+        """Whether the scan to come is to be registered from `coasting` as well."""
+        return False
+
+    def weigh(self, result: ScanResult, prior: MotionPrior) -> ScanResult:
+        """A registration from `prior` weighed against what was felt."""
+        return result
+
+    def gravity_at(self, pose: Floats) -> GravityDirection | None:
+        """Which way is down for a LiDAR at `pose` (4, 4) in the world, as of the last scan; None where that is not known."""
+        return None
+
+
+class ConstantVelocity(Stateful, MotionModel):
     """Predicts the next pose from the last two, scaled to the time between scans.
 
     A sweep's registration knows the pose at the middle of the sweep best: an error of the velocity that deskewed it pulls
