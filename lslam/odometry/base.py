@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
 from lslam.preprocessing.features import Features
@@ -11,8 +12,21 @@ from lslam.types.scan_result import ScanResult
 from lslam.types.state import State
 
 
-class Odometry(Protocol):
-    """Scan + motion prior -> pose, scan after scan.
+@dataclass(frozen=True)
+class Registered:
+    """A scan as `register` of a method that deskews found it.
+
+    result : what is said about it; detail : what the method's own `update` needs beside
+    """
+
+    result: ScanResult
+    detail: Any = None
+
+
+class Method(Protocol):
+    """What all methods have in common.
+
+    Scan + motion prior -> pose, scan after scan.
 
     A method with an attribute `needs_rings` that is true gets scans whose `rings` are filled in (`input.rings`).
     `prepare` knows nothing of earlier scans, so the front end runs it for the next scan while `register` works on this one.
@@ -24,17 +38,21 @@ class Odometry(Protocol):
         """Whatever can be made of one scan by itself."""
         ...
 
-    def register(self, scan: Scan, prepared: Any, prior: MotionPrior) -> ScanResult:
-        """Pose of the scan at its stamp; a failed registration returns the prior with status `bridged`."""
-        ...
-
     def warm_up(self) -> None:
         """Compile or load what the first scan would otherwise wait for."""
         ...
 
 
+class Registering(Method, Protocol):
+    """A method that registers a scan and learns from it at once."""
+
+    def register(self, scan: Scan, prepared: Any, prior: MotionPrior) -> ScanResult:
+        """Pose of the scan at its stamp; a failed registration returns the prior with status `bridged`."""
+        ...
+
+
 @runtime_checkable
-class FeatureSource(Odometry, Protocol):
+class FeatureSource(Method, Protocol):
     """A method that sees features, of which a map can be made."""
 
     def features_of(self, prepared: Any, motion: MotionPrior) -> Features:
@@ -43,15 +61,19 @@ class FeatureSource(Odometry, Protocol):
 
 
 @runtime_checkable
-class Deskewing(Odometry, Protocol):
+class Deskewing(Method, Protocol):
     """A method that takes the motion within a sweep from the prior.
 
     Its `register` only aligns, so that the front end can call it again with the motion that the first alignment found;
     `update` then takes the scan in.
     """
 
-    def update(self, scan: Scan, prepared: Any, prior: MotionPrior, result: ScanResult) -> ScanResult:
-        """Learn from the scan of the last `register`, at the pose of `result`; the result with the time that took."""
+    def register(self, scan: Scan, prepared: Any, prior: MotionPrior) -> Registered:
+        """Pose of the scan at its stamp; a failed registration returns the prior with status `bridged`. Learns nothing."""
+        ...
+
+    def update(self, prior: MotionPrior, found: Registered) -> ScanResult:
+        """Learn from a scan that was registered from `prior`, at the pose of its result; the result with the time that took."""
         ...
 
     def restart(self) -> None:
@@ -63,16 +85,19 @@ class Deskewing(Odometry, Protocol):
 class Searching(Deskewing, Protocol):
     """A method that looks for scans farther off than a good prior can be, and finds them there where places are alike."""
 
-    def register_near(self, scan: Scan, prepared: Any, prior: MotionPrior) -> ScanResult:
-        """As `register`, which came before; nothing is sought away from a prior that is nearly right.
+    def register_near(self, scan: Scan, prepared: Any, prior: MotionPrior, found: Registered) -> Registered:
+        """As `register`, which `found` something before; nothing is sought away from a prior that is nearly right.
 
         Where nothing is found there, `update` is of what `register` found.
         """
         ...
 
 
+Odometry = Registering | Deskewing
+
+
 @runtime_checkable
-class Resumable(Odometry, Protocol):
+class Resumable(Method, Protocol):
     """A method that can leave off after any scan and go on later as if nothing had been, to the last bit."""
 
     def state(self) -> State:

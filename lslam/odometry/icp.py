@@ -9,13 +9,13 @@ import numpy as np
 
 from lslam.config.config import Config
 from lslam.errors import UsageError
+from lslam.odometry.base import Registered
 from lslam.odometry.outcome import of_registration
 from lslam.preprocessing.deskew import deskew
 from lslam.preprocessing.prepare import PreparedPoints, prepare_points
 from lslam.recovery.policies import policies_of
 from lslam.registration.registration import Registration
 from lslam.registration.residuals import RESIDUALS
-from lslam.registration.solver import RegistrationResult
 from lslam.registration.uncertainty import PoseUncertainty
 from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan import Scan
@@ -42,7 +42,10 @@ def create(config: Config) -> Icp:
 
 
 class Icp(Stateful):
-    """Adapter from scans and motion priors to `Registration`."""
+    """Adapter from scans and motion priors to `Registration`.
+
+    The detail of a scan that was registered: its points, deskewed, and what the registration found.
+    """
 
     deskew = "by the motion prior, and again by the motion that registration finds"
     STATE = ("registration", "_uncertainty")
@@ -50,41 +53,39 @@ class Icp(Stateful):
     def __init__(self, registration: Registration) -> None:
         self.registration = registration
         self._uncertainty = self._fresh_uncertainty()
-        # What `register` saw and found last, for `update`.
-        self._points: PreparedPoints
-        self._located: RegistrationResult
 
     def prepare(self, scan: Scan) -> PreparedPoints:
         """Range gate and down-sampling."""
         config = self.registration.preprocess
         return prepare_points(scan.points, config, scan.index, scan.times if config.deskew else None)
 
-    def register(self, scan: Scan, prepared: PreparedPoints, prior: MotionPrior) -> ScanResult:
+    def register(self, scan: Scan, prepared: PreparedPoints, prior: MotionPrior) -> Registered:
         """Align with the local map."""
         return self._align(scan, prepared, prior)
 
-    def register_near(self, scan: Scan, prepared: PreparedPoints, prior: MotionPrior) -> ScanResult:
+    def register_near(self, scan: Scan, prepared: PreparedPoints, prior: MotionPrior, found: Registered) -> Registered:
         """Align with the local map from the prior alone."""
-        return self._align(scan, prepared, prior, is_near=True)
+        near = self._align(scan, prepared, prior, is_near=True)
+        points, located = near.detail
+        return near if located.ok else replace(near, detail=(points, found.detail[1]))
 
-    def _align(self, scan: Scan, prepared: PreparedPoints, prior: MotionPrior, is_near: bool = False) -> ScanResult:
+    def _align(self, scan: Scan, prepared: PreparedPoints, prior: MotionPrior, is_near: bool = False) -> Registered:
         began = time.perf_counter()
-        self._points = deskew(prepared, prior)
+        points = deskew(prepared, prior)
         deskewed = time.perf_counter()
-        result = self.registration.locate(self._points, prior.pose, is_near)
-        if result.ok or not is_near:
-            self._located = result
+        located = self.registration.locate(points, prior.pose, is_near)
         stages = {"register": time.perf_counter() - deskewed}
-        if self._points is not prepared:
+        if points is not prepared:
             stages = {"deskew": deskewed - began, **stages}
-        return of_registration(scan, result, self._uncertainty.map_age, stages)
+        return Registered(of_registration(scan, located, self._uncertainty.map_age, stages), (points, located))
 
-    def update(self, scan: Scan, prepared: PreparedPoints, prior: MotionPrior, result: ScanResult) -> ScanResult:
-        """Enter the scan into the local map where `register` put it."""
+    def update(self, prior: MotionPrior, found: Registered) -> ScanResult:
+        """Enter the scan into the local map where its result puts it."""
         began = time.perf_counter()
-        located = self._located.decided(result)
-        self.registration.update(self._points, located)
-        result = self._uncertainty.stamped(result, located, prior)
+        points, located = found.detail
+        located = located.decided(found.result)
+        self.registration.update(points, located)
+        result = self._uncertainty.stamped(found.result, located, prior)
         return replace(result, stages={**result.stages, "update": time.perf_counter() - began})
 
     def restart(self) -> None:

@@ -7,12 +7,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lslam.config.config import Config
+from lslam.odometry.base import Registered
 from lslam.odometry.feature_registration import FeatureRegistration
 from lslam.odometry.feature_steps import ScanStep, StageClock, joint_step
 from lslam.odometry.outcome import of_registration
 from lslam.preprocessing.deskew import deskew_points
 from lslam.preprocessing.features import FeaturePoints, Features, extract_features
-from lslam.registration.solver import RegistrationResult
 from lslam.registration.uncertainty import PoseUncertainty
 from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan import Scan
@@ -47,7 +47,10 @@ def create(config: Config) -> Loam:
 
 
 class Loam(Stateful):
-    """Adapter from scans and motion priors to `FeatureRegistration`."""
+    """Adapter from scans and motion priors to `FeatureRegistration`.
+
+    The detail of a scan that was registered: its features, deskewed, and what the registration found.
+    """
 
     needs_rings = True
     deskew = "features by the motion prior, and again by the motion that registration finds"
@@ -65,9 +68,6 @@ class Loam(Stateful):
             reach=1.2 * c.preprocess.range_max,
         )  # fmt: skip
         self._uncertainty = PoseUncertainty(is_scan_to_scan=not v.with_map)
-        # What `register` saw and found last, for `update`.
-        self._features: Features
-        self._located: RegistrationResult
 
     def prepare(self, scan: Scan) -> Features:
         """Edges and planar points. Raises InputError for a scan without usable rings."""
@@ -78,32 +78,33 @@ class Loam(Stateful):
         is_swept = self.config.preprocess.deskew and prepared.planes.times is not None and len(motion.times) > 1
         return _deskewed(prepared, motion) if is_swept else prepared
 
-    def register(self, scan: Scan, prepared: Features, prior: MotionPrior) -> ScanResult:
+    def register(self, scan: Scan, prepared: Features, prior: MotionPrior) -> Registered:
         """Align with the scan before, with the feature map, or with one after the other."""
         return self._align(scan, prepared, prior)
 
-    def register_near(self, scan: Scan, prepared: Features, prior: MotionPrior) -> ScanResult:
+    def register_near(self, scan: Scan, prepared: Features, prior: MotionPrior, found: Registered) -> Registered:
         """As `register`, from the prior alone."""
-        return self._align(scan, prepared, prior, is_near=True)
+        near = self._align(scan, prepared, prior, is_near=True)
+        features, located = near.detail
+        return near if located.ok else replace(near, detail=(features, found.detail[1]))
 
-    def _align(self, scan: Scan, prepared: Features, prior: MotionPrior, is_near: bool = False) -> ScanResult:
+    def _align(self, scan: Scan, prepared: Features, prior: MotionPrior, is_near: bool = False) -> Registered:
         clock = StageClock()
         with clock.stage("deskew"):
-            self._features = self.features_of(prepared, prior)
-        if self._features is prepared:
+            features = self.features_of(prepared, prior)
+        if features is prepared:
             del clock.seconds["deskew"]
-        result = self.registration.locate(self._features, prior.pose, clock, is_near)
-        if result.ok or not is_near:
-            self._located = result
-        return of_registration(scan, result, self._uncertainty.map_age, clock.seconds)
+        located = self.registration.locate(features, prior.pose, clock, is_near)
+        return Registered(of_registration(scan, located, self._uncertainty.map_age, clock.seconds), (features, located))
 
-    def update(self, scan: Scan, prepared: Features, prior: MotionPrior, result: ScanResult) -> ScanResult:
-        """Enter the scan where `register` put it: into the feature map, and as what the next one is registered on."""
+    def update(self, prior: MotionPrior, found: Registered) -> ScanResult:
+        """Enter the scan where its result puts it: into the feature map, and as what the next one is registered on."""
         clock = StageClock()
         with clock.stage("update"):
-            located = self._located.decided(result)
-            self.registration.update(self._features, located)
-            result = self._uncertainty.stamped(result, located, prior)
+            features, located = found.detail
+            located = located.decided(found.result)
+            self.registration.update(features, located)
+            result = self._uncertainty.stamped(found.result, located, prior)
         return replace(result, stages={**result.stages, **clock.seconds})
 
     def warm_up(self) -> None:
@@ -113,7 +114,7 @@ class Loam(Stateful):
         prior = MotionPrior.at_once(np.eye(4))
         for scan in (room, room, room.select(np.arange(0, len(room), 3))):
             prepared = trial.prepare(scan)
-            trial.update(scan, prepared, prior, trial.register(scan, prepared, prior))
+            trial.update(prior, trial.register(scan, prepared, prior))
 
 
 def _deskewed(features: Features, prior: MotionPrior) -> Features:

@@ -10,9 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.geometry import se3, so3
-from lslam.inertial.fusion import InertialMotion
 from lslam.integrity.monitor import IntegrityMonitor
-from lslam.odometry.base import Deskewing, Odometry, Resumable, Searching
+from lslam.odometry.base import Deskewing, Odometry, Registered, Resumable, Searching
 from lslam.odometry.feature_steps import StageClock
 from lslam.odometry.standing import Standing
 from lslam.registration.motion import ConstantVelocity, MotionModel, middle_of
@@ -119,35 +118,37 @@ class Tracker:
         return replace(result, stages=stages | result.stages)
 
     def _move(self, loaded: Loaded) -> ScanResult:
-        scan = loaded.scan
+        scan, odometry, motion = loaded.scan, self.odometry, self.motion
         span = Span() if scan is None else scan.span
-        inertial = self.motion if isinstance(self.motion, InertialMotion) else None
         clock = StageClock()
         with clock.stage("imu"):
-            prior = expected = self.motion.sweep(loaded.stamp_ns, span)
-        steady = None if inertial is None else inertial.coasting.predict(loaded.stamp_ns)
+            prior = expected = motion.sweep(loaded.stamp_ns, span)
+        coasting = motion.coasting
+        steady = None if coasting is None else coasting.predict(loaded.stamp_ns)
         trial = None
         if scan is None:
             result = ScanResult(loaded.index, loaded.stamp_ns, prior.pose, "skipped", loaded.error, converged=False)
-        elif isinstance(self.odometry, Deskewing):
-            if inertial is not None and inertial.is_compared(loaded.stamp_ns, span):
-                trial = self._without_imu(self.odometry, scan, loaded.prepared, inertial.coasting)
-            result, prior = self._register(self.odometry, scan, loaded.prepared, prior, clock)
+        elif isinstance(odometry, Deskewing):
+            if coasting is not None and motion.is_compared(loaded.stamp_ns, span):
+                # Nothing is learnt from it.
+                without = coasting.sweep(scan.stamp_ns, span)
+                trial = self._align(odometry, scan, loaded.prepared, without, coasting)[0].result
+            result, prior = self._register(odometry, scan, loaded.prepared, prior, clock)
         else:
-            result = self.odometry.register(scan, loaded.prepared, prior)
-        is_blind = result.status == "ok" and not isinstance(self.odometry, Deskewing)
-        with clock.stage("imu"):
-            self.sweep = self.motion.refine(prior, result.stamp_ns, result.T_world_lidar) if is_blind else prior
-            self.motion.correct(result.stamp_ns, result.T_world_lidar, prior, result.status == "ok")
-        pose, instant_ns = middle_of(prior, result.stamp_ns, result.T_world_lidar)
-        self.middle = (instant_ns, pose)
+            result = odometry.register(scan, loaded.prepared, prior)
         found = result.T_world_lidar
+        is_blind = result.status == "ok" and not isinstance(odometry, Deskewing)
+        with clock.stage("imu"):
+            self.sweep = motion.refine(prior, result.stamp_ns, found) if is_blind else prior
+            motion.correct(result.stamp_ns, found, prior, result.status == "ok")
+        pose, instant_ns = middle_of(prior, result.stamp_ns, found)
+        self.middle = (instant_ns, pose)
         result = replace(
             result,
             prior_norm=_matrix_norm(expected.pose, found),
             steady_norm=None if steady is None else _matrix_norm(steady, found),
-            gravity=inertial.gravity_at(found) if inertial is not None and result.status == "ok" else None,
-            stages=result.stages if inertial is None else {**result.stages, **clock.seconds},
+            gravity=motion.gravity_at(found) if result.status == "ok" else None,
+            stages=result.stages if coasting is None else {**result.stages, **clock.seconds},
         )
         return result if trial is None or "bridged" in (trial.status, result.status) else _compared(result, trial)
 
@@ -156,71 +157,71 @@ class Tracker:
     ) -> tuple[ScanResult, MotionPrior]:
         """Register, weigh and enter the scan; the prior that was right."""
         expected = prior
-        result, prior = self._align(odometry, scan, prepared, prior, self.motion, clock)
+        found, prior = self._align(odometry, scan, prepared, prior, self.motion, clock)
         is_first_open = self._first is not None or not self.motion.is_known
-        if result.status == "ok" and scan.span.seconds > 0 and is_first_open:
+        if found.result.status == "ok" and scan.span.seconds > 0 and is_first_open:
             if self._first is None:
-                self._first = (scan, prepared, result.T_world_lidar)
+                self._first = (scan, prepared, found.result.T_world_lidar)
             else:
-                prior = self._begin_again(odometry, *self._first, scan, result)
-                result = odometry.register(scan, prepared, prior)
-        if isinstance(self.motion, InertialMotion):
-            with clock.stage("imu"):
-                weighed = self.motion.weigh(result, prior)
-            if weighed.status != "ok" and self.motion.is_felt and isinstance(odometry, Searching):
-                prior = expected
-                weighed = self._near(odometry, self.motion, scan, prepared, prior, result, weighed, clock)
-            result = weighed
-        return odometry.update(scan, prepared, prior, result), prior
+                prior = self._begin_again(odometry, *self._first, found.result, scan.span)
+                found, prior = self._align(odometry, scan, prepared, prior)
+        with clock.stage("imu"):
+            weighed = self.motion.weigh(found.result, prior)
+        if weighed.status != "ok" and self.motion.is_felt and isinstance(odometry, Searching):
+            found, prior = self._near(odometry, scan, prepared, expected, found, weighed, clock), expected
+        else:
+            found = replace(found, result=weighed)
+        return odometry.update(prior, found), prior
 
-    @staticmethod
+    def _align(
+        self, odometry: Deskewing, scan: Scan, prepared: Any, prior: MotionPrior, motion: MotionModel | None = None,
+        clock: StageClock | None = None,
+    ) -> tuple[Registered, MotionPrior]:  # fmt: skip
+        """Register, and again with the motion within the sweep that this found; the prior that was right.
+
+        motion : what makes a better prior of what was found; None: there is no better one
+        clock : what counts the time that takes, if anything does
+        """
+        found = odometry.register(scan, prepared, prior)
+        if motion is None or not motion.is_known or found.result.status != "ok" or scan.span.seconds <= 0:
+            return found, prior
+        with (clock or StageClock()).stage("imu"):
+            better = motion.refine(prior, scan.stamp_ns, found.result.T_world_lidar)
+        if _distance(prior, better) <= self.REFINE_M:
+            return found, prior
+        again = odometry.register(scan, prepared, better)
+        return replace(again, result=_both(found.result, again.result)), better
+
     def _near(
-        odometry: Searching, motion: InertialMotion, scan: Scan, prepared: Any, prior: MotionPrior, found: ScanResult,
-        denied: ScanResult, clock: StageClock,
-    ) -> ScanResult:  # fmt: skip
+        self, odometry: Searching, scan: Scan, prepared: Any, prior: MotionPrior, found: Registered, denied: ScanResult,
+        clock: StageClock,
+    ) -> Registered:  # fmt: skip
         """What is found where the IMU expects a scan, in place of what was `found` elsewhere and `denied`, or failed.
 
         Where places are alike, what is sought metres around is found in the wrong one; what is found there from both sides
         is right, and the IMU wrong.
         """
-        near = odometry.register_near(scan, prepared, prior)
+        near, first = odometry.register_near(scan, prepared, prior, found), found.result
         with clock.stage("imu"):
-            again = motion.weigh(near, prior)
-        if again.status == "ok":
-            return _both(found, again)
-        apart, off = (_apart(pose, found.T_world_lidar) for pose in (near.T_world_lidar, prior.pose))
-        return _both(near, found if near.status == "ok" and apart < SAME * off else denied)
-
-    def _align(
-        self, odometry: Deskewing, scan: Scan, prepared: Any, prior: MotionPrior, motion: MotionModel, clock: StageClock
-    ) -> tuple[ScanResult, MotionPrior]:
-        """Register, and again with the motion within the sweep that this found; the prior that was right."""
-        result = odometry.register(scan, prepared, prior)
-        if result.status == "ok" and scan.span.seconds > 0 and motion.is_known:
-            with clock.stage("imu"):
-                better = motion.refine(prior, scan.stamp_ns, result.T_world_lidar)
-            if _distance(prior, better) > self.REFINE_M:
-                prior = better
-                result = _both(result, odometry.register(scan, prepared, prior))
-        return result, prior
-
-    def _without_imu(self, odometry: Deskewing, scan: Scan, prepared: Any, coasting: ConstantVelocity) -> ScanResult:
-        """What constant velocity makes of the scan on the same map; nothing is learnt from it."""
-        prior = coasting.sweep(scan.stamp_ns, scan.span)
-        return self._align(odometry, scan, prepared, prior, coasting, StageClock())[0]
+            weighed = self.motion.weigh(near.result, prior)
+        if weighed.status == "ok":
+            return replace(near, result=_both(first, weighed))
+        apart, off = (_apart(pose, first.T_world_lidar) for pose in (near.result.T_world_lidar, prior.pose))
+        is_same = near.result.status == "ok" and apart < SAME * off
+        return replace(near, result=_both(near.result, first if is_same else denied))
 
     def _begin_again(
-        self, odometry: Deskewing, first: Scan, prepared: Any, pose: NDArray[np.float64], scan: Scan, result: ScanResult
+        self, odometry: Deskewing, first: Scan, prepared: Any, pose: NDArray[np.float64], second: ScanResult, span: Span
     ) -> MotionPrior:
         """The first scan was taken at an unknown speed: now that it is known, deskew it and build the map anew.
 
-        The prior of the second scan, whose registration told the speed.
+        The prior of the second scan, whose registration told the speed; `span` is that of its sweep.
         """
-        self.motion.correct(scan.stamp_ns, result.T_world_lidar)
-        again = self.motion.sweep(scan.stamp_ns, scan.span)
+        self.motion.correct(second.stamp_ns, second.T_world_lidar)
+        again = self.motion.sweep(second.stamp_ns, span)
         prior = self.motion.rewind(first.stamp_ns, pose, first.span)
         odometry.restart()
-        odometry.update(first, prepared, prior, odometry.register(first, prepared, prior))
+        odometry.update(prior, self._align(odometry, first, prepared, prior)[0])
         return again
 
 

@@ -31,10 +31,11 @@ def test_a_scan_enters_where_it_was_put(method: str) -> None:
     covariance = 1e-6 * np.eye(6)
     for scan in drive:
         prepared = odometry.prepare(scan)
-        found = odometry.register(scan, prepared, prior)
+        registered = odometry.register(scan, prepared, prior)
+        found = registered.result
         put = replace(found, T_world_lidar=moved @ found.T_world_lidar, registration_covariance=covariance)
-        done = odometry.update(scan, prepared, prior, put)
-    again = odometry.register(scan, prepared, MotionPrior.at_once(put.T_world_lidar))
+        done = odometry.update(prior, replace(registered, result=put))
+    again = odometry.register(scan, prepared, MotionPrior.at_once(put.T_world_lidar)).result
     np.testing.assert_allclose(again.T_world_lidar, put.T_world_lidar, atol=0.02)
     assert np.linalg.norm(again.T_world_lidar[:3, 3] - found.T_world_lidar[:3, 3]) > 0.2
     assert done.covariance is not None
@@ -49,7 +50,7 @@ def before_the_third(method: str) -> tuple[Searching, Any, Scan, NDArray[np.floa
     assert drive.ground_truth is not None
     for scan, pose in zip(list(drive)[:2], drive.ground_truth.poses, strict=False):
         prior, prepared = MotionPrior.at_once(pose), odometry.prepare(scan)
-        odometry.update(scan, prepared, prior, odometry.register(scan, prepared, prior))
+        odometry.update(prior, odometry.register(scan, prepared, prior))
     return odometry, vars(odometry)["registration"], drive.scan(2), drive.ground_truth.poses
 
 
@@ -64,16 +65,17 @@ def test_a_scan_whose_registration_is_denied_enters_where_it_is_put_and_teaches_
     """The third scan is found a metre from its prior: believed, that opens the kernel; denied, it enters at the prior."""
     odometry, registration, scan, (_, before, _) = before_the_third(method)
     prepared, prior = odometry.prepare(scan), MotionPrior.at_once(before)
-    found = odometry.register(scan, prepared, prior)
+    registered = odometry.register(scan, prepared, prior)
+    found = registered.result
     assert (found.status, round(found.prior_error[0])) == ("ok", 1)
     known = registration.threshold.width, registration.agreement.usual
     entered = scans_in(registration)
     put = replace(found, status="bridged", T_world_lidar=prior.pose, registration_covariance=1e-6 * np.eye(6))
-    done = odometry.update(scan, prepared, prior, put)
+    done = odometry.update(prior, replace(registered, result=put))
     np.testing.assert_array_equal(done.T_world_lidar, prior.pose)
     assert scans_in(registration) == entered + 1
     assert (registration.threshold.width, registration.agreement.usual) == known
-    odometry.update(scan, prepared, prior, found)
+    odometry.update(prior, registered)
     assert (registration.threshold.width, registration.agreement.usual) != known
 
 
@@ -89,11 +91,12 @@ def test_near_a_prior_nothing_is_sought_elsewhere(method: str) -> None:
     def error(result: ScanResult) -> float:
         return float(np.linalg.norm(result.T_world_lidar[:3, 3] - true[:3, 3]))
 
-    assert error(odometry.register(scan, prepared, off_by(2.0))) < 0.05
-    assert odometry.register_near(scan, prepared, off_by(2.0)).status == "bridged"
-    near = odometry.register_near(scan, prepared, off_by(0.05))
-    assert (near.status, error(near) < 0.05) == ("ok", True)
     found, count = odometry.register(scan, prepared, off_by(2.0)), scans_in(registration)
-    assert odometry.register_near(scan, prepared, off_by(0.0, 500.0)).status == "bridged"
-    odometry.update(scan, prepared, off_by(0.0), found)
+    assert error(found.result) < 0.05
+    assert odometry.register_near(scan, prepared, off_by(2.0), found).result.status == "bridged"
+    near = odometry.register_near(scan, prepared, off_by(0.05), found).result
+    assert (near.status, error(near) < 0.05) == ("ok", True)
+    lost = odometry.register_near(scan, prepared, off_by(0.0, 500.0), found)
+    assert lost.result.status == "bridged"
+    odometry.update(off_by(0.0), replace(lost, result=found.result))
     assert scans_in(registration) == count + 1, "what `register` found is what enters"

@@ -39,7 +39,7 @@ def block(seed: int = 0) -> tuple[tuple[Scan, ...], Floats]:
 
 def feed(icp: Icp, scan: Scan, prior: MotionPrior) -> ScanResult:
     prepared = icp.prepare(scan)
-    return icp.update(scan, prepared, prior, icp.register(scan, prepared, prior))
+    return icp.update(prior, icp.register(scan, prepared, prior))
 
 
 class Driver:
@@ -140,7 +140,7 @@ def test_a_sensor_carried_away_while_the_map_is_young_is_told() -> None:
         elsewhere = [i for i in range(k + 20, 95, 17) if np.linalg.norm(truth[i, :3, 3] - truth[k, :3, 3]) > 12]
         for i in elsewhere[: 2 if k > 2 else 0]:
             prior = MotionPrior.at_once(driver.motion.predict(scans[k].stamp_ns))
-            carried = driver.icp.register(scans[i], driver.icp.prepare(scans[i]), prior)
+            carried = driver.icp.register(scans[i], driver.icp.prepare(scans[i]), prior).result
             assert carried.status == "bridged", (k, i)
         assert driver.feed(scans[k]).status == "ok"
 

@@ -13,6 +13,7 @@ from lslam.geometry import se3
 from lslam.inertial.estimate import GRAVITY, ImuEstimate
 from lslam.inertial.fusion import InertialMotion
 from lslam.inertial.gyroscope import Gyroscope
+from lslam.odometry.base import Registered
 from lslam.pipeline.tracker import Loaded, Tracker
 from lslam.types.imu import ImuStream
 from lslam.types.motion_prior import MotionPrior
@@ -32,14 +33,13 @@ class Oracle:
     def prepare(self, scan: Scan) -> Scan:
         return scan
 
-    def register(self, scan: Scan, prepared: Scan, prior: MotionPrior) -> ScanResult:
+    def register(self, scan: Scan, prepared: Scan, prior: MotionPrior) -> Registered:
         self.calls.append(scan.index)
-        return ScanResult(
-            scan.index, scan.stamp_ns, self.poses[scan.index], iterations=3, stages={"register": 0.01, "deskew": 0.001}
-        )
+        stages = {"register": 0.01, "deskew": 0.001}
+        return Registered(ScanResult(scan.index, scan.stamp_ns, self.poses[scan.index], iterations=3, stages=stages))
 
-    def update(self, scan: Scan, prepared: Scan, prior: MotionPrior, result: ScanResult) -> ScanResult:
-        return result
+    def update(self, prior: MotionPrior, found: Registered) -> ScanResult:
+        return found.result
 
     def restart(self) -> None:
         pass
@@ -86,16 +86,17 @@ class Priced(Oracle):
     lost_m = np.inf
     missed: Misses = frozenset()
 
-    def register(self, scan: Scan, prepared: Scan, prior: MotionPrior) -> ScanResult:
+    def register(self, scan: Scan, prepared: Scan, prior: MotionPrior) -> Registered:
         self.calls.append(scan.index)
         off = float(np.linalg.norm(prior.pose[:3, 3] - self.poses[scan.index][:3, 3]))
         steps = 1 + int(off / 0.05)
         is_found = off < self.lost_m and (scan.index, self.calls.count(scan.index)) not in self.missed
         pose, status = (self.poses[scan.index], "ok") if is_found else (prior.pose, "bridged")
-        return ScanResult(scan.index, scan.stamp_ns, pose, status, iterations=steps, stages={"register": 0.01 * steps})  # type: ignore[arg-type]
+        stages = {"register": 0.01 * steps}
+        return Registered(ScanResult(scan.index, scan.stamp_ns, pose, status, iterations=steps, stages=stages))  # type: ignore[arg-type]
 
-    def update(self, scan: Scan, prepared: Scan, prior: MotionPrior, result: ScanResult) -> ScanResult:
-        return replace(result, stages={**result.stages, "update": 7.0})
+    def update(self, prior: MotionPrior, found: Registered) -> ScanResult:
+        return replace(found.result, stages={**found.result.stages, "update": 7.0})
 
 
 class Misled(Priced):
@@ -106,25 +107,27 @@ class Misled(Priced):
     is_lost = False
     off_m = 0.0
 
-    def register(self, scan: Scan, prepared: Scan, prior: MotionPrior) -> ScanResult:
-        found = super().register(scan, prepared, prior)
+    def register(self, scan: Scan, prepared: Scan, prior: MotionPrior) -> Registered:
+        found = super().register(scan, prepared, prior).result
         pose = found.T_world_lidar.copy()
         pose[0, 3] += self.FALSE_M * (scan.index == self.FALSE_AT)
         is_lost = self.is_lost and scan.index == self.FALSE_AT
-        return replace(
-            found, T_world_lidar=prior.pose if is_lost else pose, status="bridged" if is_lost else "ok",
-            reason="lost" if is_lost else "", registration_covariance=1e-6 * np.eye(6),
+        return Registered(
+            replace(
+                found, T_world_lidar=prior.pose if is_lost else pose, status="bridged" if is_lost else "ok",
+                reason="lost" if is_lost else "", registration_covariance=1e-6 * np.eye(6),
+            )
         )  # fmt: skip
 
-    def register_near(self, scan: Scan, prepared: Scan, prior: MotionPrior) -> ScanResult:
-        again = self.register(scan, prepared, prior)
+    def register_near(self, scan: Scan, prepared: Scan, prior: MotionPrior, found: Registered) -> Registered:
+        again = self.register(scan, prepared, prior).result
         self.off_m = max(self.off_m, float(np.linalg.norm(prior.pose[:3, 3] - self.poses[scan.index, :3, 3])))
         if self.near == "nothing":
-            return replace(again, status="bridged", T_world_lidar=prior.pose)
+            return Registered(replace(again, status="bridged", T_world_lidar=prior.pose))
         pose = self.poses[scan.index].copy()
         if scan.index == self.FALSE_AT:
             pose[0, 3] += {"true": 0.0, "elsewhere": 1.0, "same": self.FALSE_M}[self.near]
-        return replace(again, status="ok", reason="", T_world_lidar=pose)
+        return Registered(replace(again, status="ok", reason="", T_world_lidar=pose))
 
 
 def braked(
