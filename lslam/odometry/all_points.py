@@ -12,7 +12,8 @@ from lslam.preprocessing.features import Features
 from lslam.preprocessing.prepare import PreparedPoints, prepare_points
 from lslam.recovery.policies import RecoveringRegistration
 from lslam.recovery.start_search import held_by_non_ground
-from lslam.registration.registration import Registration, correction
+from lslam.registration.acceptance import correction
+from lslam.registration.registration import Registration
 from lslam.registration.solver import RegistrationResult
 from lslam.types.state import Stateful
 

@@ -17,7 +17,8 @@ from lslam.odometry.feature_solver import NONE, FeatureNoise, kept_where_blind, 
 from lslam.odometry.feature_steps import ScanStep, StageClock
 from lslam.preprocessing.features import Features
 from lslam.preprocessing.prepare import NO_TIMES
-from lslam.registration.registration import DOUBT, NEAR_KERNEL, correction
+from lslam.registration.acceptance import Wording, accepted, failed
+from lslam.registration.registration import NEAR_KERNEL
 from lslam.registration.robust import AdaptiveThreshold, Annealing, UsualAgreement
 from lslam.registration.solver import RegistrationResult
 from lslam.types.state import Stateful
@@ -30,6 +31,7 @@ MIN_FEATURES = 60
 PATIENCE = 3
 # m, grid of the less planar points when they stand in for the features: as `preprocess.source_voxel`.
 STAND_IN_GRID = 1.0
+WORDING = Wording("of the features have a counterpart", "of the features agree")
 # In `posed_by`.
 LESS_PLANAR = "less planar points"
 
@@ -82,7 +84,7 @@ class FeatureRegistration(Stateful):
         """
         count = len(features.edges) + len(features.planes)
         if len(features.less_planes) + len(features.less_edges) < MIN_FEATURES:
-            return _failed(T_prior, count, f"only {len(features.edges)} edges and {len(features.planes)} planar points")
+            return failed(T_prior, count, f"only {len(features.edges)} edges and {len(features.planes)} planar points")
         if self.target is None:
             return RegistrationResult(T_prior, covariance=np.diag([1e-12] * 6), source_points=count)
         if is_near:
@@ -270,29 +272,12 @@ class FeatureRegistration(Stateful):
     def _judge(self, result: RegistrationResult, T_prior: Floats) -> RegistrationResult:
         """The result with its correction of the prior, or a failed one that keeps the prior and says why."""
         c = self.config
-        move, turn = correction(T_prior, result.T_world_lidar)
-        reason = result.reason
-        if not reason and result.overlap < (c.start_overlap if self._starting else c.min_overlap):
-            reason = f"only {result.overlap:.0%} of the features have a counterpart"
-        elif not reason and result.inlier_share < c.min_inliers:
-            reason = f"only {result.inlier_share:.0%} of the matches agree"
-        elif not reason and self.agreement.is_collapse(result.agreement):
-            reason = f"only {result.agreement:.0%} of the features agree, lately {self.agreement.usual:.0%} did"
-        elif not reason and (move > c.max_jump_m or turn > np.deg2rad(c.max_jump_deg)):
-            reason = f"impossible jump of {move:.1f} m and {np.rad2deg(turn):.0f} deg"
-        if reason:
-            return replace(_failed(T_prior, result.source_points, reason), iterations=result.iterations)
-        return replace(result, prior_error=(move, turn))
+        return accepted(
+            result, T_prior, c, self.agreement, c.start_overlap if self._starting else c.min_overlap, WORDING
+        )
 
 
 def _thinned(features: Features) -> tuple[Floats, Floats]:
     """Centroids (S, 3) of the less planar points and the scatter (S, 6) behind each."""
     points, _, scatter, _ = voxel.centroids(features.less_planes.points.astype(np.float32), NO_TIMES, STAND_IN_GRID)
     return points.astype(np.float64), scatter.astype(np.float64)
-
-
-def _failed(T_prior: Floats, source_points: int, reason: str) -> RegistrationResult:
-    """The motion prior, in doubt."""
-    return RegistrationResult(
-        T_prior.copy(), ok=False, reason=reason, covariance=DOUBT.copy(), converged=False, source_points=source_points
-    )

@@ -20,8 +20,8 @@ from lslam.pipeline.checkpoints import OdometryCheckpoints
 from lslam.pipeline.keyframing import Keyframing
 from lslam.pipeline.tracker import Loaded, Tracker
 from lslam.readers.selection import Selection
+from lslam.registration.acceptance import DOUBT
 from lslam.registration.motion import MotionModel
-from lslam.registration.registration import DOUBT
 from lslam.types.scan import Scan, Span
 from lslam.types.scan_result import ScanResult
 from lslam.types.sequence import Sequence

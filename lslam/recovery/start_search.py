@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 from lslam.geometry import se3, so3
 from lslam.preprocessing.prepare import PreparedPoints, thin
 from lslam.recovery.non_ground import NEAR, NonGroundPoints, sought
+from lslam.registration.acceptance import correction
 from lslam.registration.alignment import upright_directions
-from lslam.registration.registration import NEAR_KERNEL, Registration, correction
+from lslam.registration.registration import NEAR_KERNEL, Registration
 from lslam.registration.solver import RegistrationResult
 
 Floats = NDArray[np.float64]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, Protocol
@@ -15,6 +14,7 @@ from lslam.config.registration import RegistrationConfig
 from lslam.errors import InputError
 from lslam.preprocessing.beams import ring_gap
 from lslam.preprocessing.prepare import PreparedPoints, prepare_points
+from lslam.registration.acceptance import Wording, accepted, failed
 from lslam.registration.alignment import MapAlignment
 from lslam.registration.local_map import LocalMap
 from lslam.registration.motion import ConstantVelocity
@@ -39,8 +39,7 @@ SPARSE_SHARE = 0.1
 # Times the steps: a point is drawn to where its match is, not to where the surfaces meet, and the score of a normal
 # distribution has no pull on points a few sigma away, so that those near by turn the sensor a little with each step.
 SLOWLY: dict[str, int] = {"point": 3, "ndt": 3}
-# Half a metre and two degrees: what a pose that no scan supports may be wrong by, one sigma.
-DOUBT = np.diag([0.25] * 3 + [np.deg2rad(2.0) ** 2] * 3)
+WORDING = Wording("of the points overlap the map", "of the points agree with the map")
 
 
 class Recovery(Protocol):
@@ -109,7 +108,7 @@ class Registration(Stateful):
         """
         count, c = len(points.source), self.config
         if count < MIN_SOURCE_POINTS:
-            return _failed(T_prior, count, f"{count} usable points, {MIN_SOURCE_POINTS} needed")
+            return failed(T_prior, count, f"{count} usable points, {MIN_SOURCE_POINTS} needed")
         if len(self.map) == 0:
             return RegistrationResult(T_prior, covariance=np.diag([1e-12] * 6), source_points=count)
         if self.residual in NEEDS_COVARIANCE and points.covariance is None:
@@ -160,33 +159,6 @@ class Registration(Stateful):
 
     def judged(self, result: RegistrationResult, T_prior: Floats) -> RegistrationResult:
         """The result with its correction of the prior, or a failed one that keeps the prior and says why."""
-        c, usual = self.config, self.agreement.usual
-        move, turn = correction(T_prior, result.T_world_lidar)
         # One scan of a sparse sensor makes few planes: what matches them may be right and yet a small share.
-        is_filled = self.inserted > c.start_scans and c.target != "scan"
-        reason = result.reason
-        if not reason and result.overlap < (c.min_overlap if is_filled else c.start_overlap):
-            reason = f"only {result.overlap:.0%} of the points overlap the map"
-        elif not reason and result.inlier_share < c.min_inliers:
-            reason = f"only {result.inlier_share:.0%} of the matches agree"
-        elif not reason and self.agreement.is_collapse(result.agreement):
-            reason = f"only {result.agreement:.0%} of the points agree with the map, lately {usual:.0%} did"
-        elif not reason and (move > c.max_jump_m or turn > np.deg2rad(c.max_jump_deg)):
-            reason = f"impossible jump of {move:.1f} m and {np.rad2deg(turn):.0f} deg"
-        if reason:
-            return replace(_failed(T_prior, result.source_points, reason), iterations=result.iterations)
-        return replace(result, prior_error=(move, turn))
-
-
-def correction(T_prior: Floats, pose: Floats) -> tuple[float, float]:
-    """How far (m, rad) the pose is from what was expected."""
-    move, R = pose[:3, 3] - T_prior[:3, 3], (T_prior[:3, :3].T @ pose[:3, :3]).tolist()
-    sine = math.hypot(R[2][1] - R[1][2], R[0][2] - R[2][0], R[1][0] - R[0][1])
-    return math.sqrt(float(move @ move)), math.atan2(sine, R[0][0] + R[1][1] + R[2][2] - 1.0)
-
-
-def _failed(T_prior: Floats, source_points: int, reason: str) -> RegistrationResult:
-    """The motion prior, in doubt."""
-    return RegistrationResult(
-        T_prior.copy(), ok=False, reason=reason, covariance=DOUBT.copy(), converged=False, source_points=source_points
-    )
+        c, is_filled = self.config, self.inserted > self.config.start_scans and self.config.target != "scan"
+        return accepted(result, T_prior, c, self.agreement, c.min_overlap if is_filled else c.start_overlap, WORDING)

@@ -1,0 +1,66 @@
+"""The gates of a registration, one by one: what is refused keeps the prior and says why in the words of its matches."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from lslam.config.registration import RegistrationConfig
+from lslam.geometry import se3, so3
+from lslam.odometry.feature_registration import WORDING as OF_FEATURES
+from lslam.registration.acceptance import DOUBT, Wording, accepted, correction
+from lslam.registration.registration import WORDING as OF_POINTS
+from lslam.registration.robust import UsualAgreement
+from lslam.registration.solver import RegistrationResult
+
+CONFIG = RegistrationConfig(min_inliers=0.3, min_agreement=0.5, max_jump_m=5.0, max_jump_deg=30.0)
+PRIOR = se3.make(np.eye(3), np.array([1.0, 2.0, 3.0]))
+
+
+def judged(
+    wording: Wording, metres: float = 0.1, degrees: float = 1.0, matched: int = 90, inliers: int = 80, reason: str = ""
+) -> RegistrationResult:
+    """Of 100 points, so far from the prior; lately 80 % agreed, and 60 % have to find a match."""
+    step = se3.make(so3.exp(np.array([0, 0, np.deg2rad(degrees)])), np.array([metres, 0, 0]))
+    result = RegistrationResult(
+        PRIOR @ step, reason=reason, iterations=7, source_points=100, matched=matched, inliers=inliers
+    )
+    usual = UsualAgreement(CONFIG.min_agreement)
+    usual.observe(0.8)
+    return accepted(result, PRIOR, CONFIG, usual, 0.6, wording)
+
+
+def test_what_passes_all_gates_gets_its_correction_of_the_prior() -> None:
+    result = judged(OF_POINTS)
+    assert (result.ok, result.reason, result.inliers) == (True, "", 80)
+    np.testing.assert_allclose(result.prior_error, (0.1, np.deg2rad(1.0)))
+
+
+@pytest.mark.parametrize(
+    ("facts", "of_points", "of_features"),
+    [
+        ({"matched": 50, "inliers": 50}, "only 50% of the points overlap the map", "only 50% of the features have a counterpart"),
+        ({"inliers": 20}, "only 22% of the matches agree", "only 22% of the matches agree"),
+        (
+            {"inliers": 35},
+            "only 35% of the points agree with the map, lately 80% did",
+            "only 35% of the features agree, lately 80% did",
+        ),
+        ({"metres": 5.1}, "impossible jump of 5.1 m and 1 deg", "impossible jump of 5.1 m and 1 deg"),
+        ({"degrees": 31.0}, "impossible jump of 0.1 m and 31 deg", "impossible jump of 0.1 m and 31 deg"),
+        ({"reason": "singular", "inliers": 0}, "singular", "singular"),
+    ],
+)  # fmt: skip
+def test_what_is_refused_keeps_the_prior_and_says_why(
+    facts: dict[str, float], of_points: str, of_features: str
+) -> None:
+    for wording, why in ((OF_POINTS, of_points), (OF_FEATURES, of_features)):
+        result = judged(wording, **facts)  # type: ignore[arg-type]
+        assert (result.ok, result.reason, result.iterations, result.source_points) == (False, why, 7, 100)
+        np.testing.assert_array_equal(result.T_world_lidar, PRIOR)
+        np.testing.assert_array_equal(result.covariance, DOUBT)
+
+
+def test_a_correction_is_measured_from_the_prior() -> None:
+    step = se3.make(so3.exp(np.array([0.0, 0.3, 0.4])), np.array([3.0, 0.0, 4.0]))
+    np.testing.assert_allclose(correction(PRIOR, PRIOR @ step), (5.0, 0.5))
