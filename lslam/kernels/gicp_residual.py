@@ -29,7 +29,7 @@ def linearise_gicp(points: tuple[Floats, Floats], voxels: Voxels, settings: Sett
     """
     source, covariance = points
     planes, keys, table = voxels
-    size, sigma2, blob_weight, _ = settings
+    size, sigma2, plane_weight, blob_weight, _ = settings
     cells, slots, is_done, away2 = search
     R, t = pose
     scale, _, gate2 = width
@@ -58,7 +58,7 @@ def linearise_gicp(points: tuple[Floats, Floats], voxels: Voxels, settings: Sett
             off = p[3] * (x - p[0]) + p[4] * (y - p[1]) + p[5] * (z - p[2])
             across = variance_of(p, off, best_d) + sigma2
             dxx, dxy, dxz, dyy, dyz, dzz = disc(p[3], p[4], p[5], across)
-            share, thin = 1.0, across + sigma2
+            share, thin = plane_weight, across + sigma2
         else:
             dxx, dxy, dxz, dyy, dyz, dzz = p[6], 0.0, 0.0, p[6], 0.0, p[6]
             share, thin = blob_weight, p[6] + sigma2

@@ -82,13 +82,14 @@ def linearise(points: tuple[Floats, Floats], voxels: Voxels, settings: Settings,
 
     Each point takes the nearest plane voxel of the eight around it: residual n . (R s + t - mean), variance = map
     eigenvalue + source scatter along the normal + sigma2 + tilt at that distance from the mean, Geman-McClure weight of
-    width `scale`. Without a plane the nearest blob stands in: isotropic, its mean variance, times `blob_weight`.
+    width `scale`, times `plane_weight`. Without a plane the nearest blob stands in: isotropic, its mean variance, times
+    `blob_weight`.
     `away2` (S,) takes the squared distance of each matched point to its plane, or mean; those beyond `gate2` are
     rejected: counted, without a say.
     """
     source, scatter = points
     planes, keys, table = voxels
-    size, sigma2, blob_weight, _ = settings
+    size, sigma2, plane_weight, blob_weight, _ = settings
     cells, slots, is_done, away2 = search
     R, t = pose
     scale, _, gate2 = width
@@ -127,7 +128,7 @@ def linearise(points: tuple[Floats, Floats], voxels: Voxels, settings: Settings,
             )  # fmt: skip
             robust = c2 / (c2 + r * r)
             robust *= robust
-            w = robust / (variance_of(p, r, best_d) + max(spread, 0.0) + sigma2)
+            w = plane_weight * robust / (variance_of(p, r, best_d) + max(spread, 0.0) + sigma2)
             j3, j4, j5 = ry * nz - rz * ny, rz * nx - rx * nz, rx * ny - ry * nx
             add_row(H, g, w, r, nx, ny, nz, j3, j4, j5)
             facts[INFORMATION] += w

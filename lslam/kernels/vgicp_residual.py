@@ -28,7 +28,7 @@ def linearise_vgicp(points: tuple[Floats, Floats], voxels: tuple[Floats, Floats,
     """
     source, covariance = points
     planes, counts, keys, table = voxels
-    size, sigma2, blob_weight, _ = settings
+    size, sigma2, plane_weight, blob_weight, _ = settings
     cells, slots, is_done, away2 = search
     R, t = pose
     scale, _, gate2 = width
@@ -61,7 +61,7 @@ def linearise_vgicp(points: tuple[Floats, Floats], voxels: tuple[Floats, Floats,
                 off = p[3] * ex + p[4] * ey + p[5] * ez
                 across = variance_of(p, off, ex * ex + ey * ey + ez * ez) + sigma2
                 dxx, dxy, dxz, dyy, dyz, dzz = disc(p[3], p[4], p[5], across)
-                n, thin = counts[v], across + sigma2
+                n, thin = plane_weight * counts[v], across + sigma2
             else:
                 dxx, dxy, dxz, dyy, dyz, dzz = p[6], 0.0, 0.0, p[6], 0.0, p[6]
                 n, thin = blob_weight * counts[v], p[6] + sigma2

@@ -22,10 +22,8 @@ Points = NDArray[np.float32]
 NEAR, NO_PLANES = 0.4, 2.0
 # m, from which they find each other.
 REACH = 1.0
-# m above the ground: crash barriers are lower, along which a sensor's rings match best where nothing moved; ...
+# m above the ground: crash barriers are lower, along which a sensor's rings match best where nothing moved.
 HIGH = 1.2
-# ... where fewer points than this are higher, the lower ones are asked, too.
-FEW = 60
 
 
 class NonGroundPoints:
@@ -60,10 +58,7 @@ def sought(points: Points, preprocess: PreprocessConfig) -> PreparedPoints:
 
 
 def non_ground_points(points: Points, preprocess: PreprocessConfig) -> tuple[Points, Points]:
-    """Those of the points (N, 3), LiDAR frame, that do not lie on the ground; and what to look for among others' of them.
-
-    Which is those that rise `HIGH`, unless they are too `FEW`.
-    """
+    """Those of the points (N, 3), LiDAR frame, that do not lie on the ground; and what to look for among others' of them."""
     ground = ground_of(points, preprocess.ground_slope, preprocess.ground_tolerance)
     standing, high = (points[ground.above(points, height)] for height in (preprocess.ground_tolerance, HIGH))
-    return standing, high if len(high) >= FEW else standing
+    return standing, high

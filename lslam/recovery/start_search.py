@@ -25,8 +25,6 @@ START_TURNS_DEG = np.delete(np.arange(-30.0, 31.0, 3.0), 10)
 AT_REST_DEG = 3.0
 # Every so many-th source point is enough to tell a good start from a bad one; so many of the best are looked at closely.
 SEARCH_SHARE, LOOKED_AT = 4, 3
-# Times the coarse voxels, ten metres: of so much ground one scan of sixteen beams sees two rings.
-GROUND_FACTOR = 4
 # Along a bare wall the rings repeat best where nothing moved, by five percent: a start elsewhere must have more, and twice
 # as much where planes, the prior or both say otherwise.
 CLEARLY, MUCH = 1.06, 1.1
@@ -82,16 +80,14 @@ def held_by_non_ground(
     is_drawn = found.ok and is_at_rest(place, r.recent[-1][1])
     if is_drawn or not is_much_more(share(stood), share(found), count):
         return found
-    coarse = r.alignment.coarse_map(points, place)
-    width = NEAR_KERNEL * c.kernel_min
-    near = r.alignment.refine(points, place, width, c.start_iterations, (coarse,))
+    coarser, width = r.alignment.coarse_maps(points, place), NEAR_KERNEL * c.kernel_min
+    near = r.alignment.refine(points, place, width, c.start_iterations, coarser)
     judged = r.judged(near, place)
     if not judged.ok and not found.ok:
         return found
-    if not judged.ok or is_much_more(share(stood), share(judged), count):
+    if not judged.ok or len(judged.degenerate) or is_much_more(share(stood), share(judged), count):
         # What stands says little of height and tilt, the ground does: two steps as in LeGO-LOAM (Shan and Englot 2018).
-        levels = (coarse, coarse.coarsen(GROUND_FACTOR))
-        ground = r.alignment.refine(points, place, width, c.start_iterations, levels, upright_directions(place))
+        ground = r.alignment.refine(points, place, width, c.start_iterations, coarser, upright_directions(place))
         judged = near.moved(ground.T_world_lidar, stood.covariance)
     return replace(judged, iterations=found.iterations + near.iterations)
 
@@ -102,7 +98,7 @@ def _best_start(
 ) -> RegistrationResult:  # fmt: skip
     """The best of several starts: a few points on the coarse map show which are worth a whole registration."""
     alignment, count = registration.alignment, len(seen.source)
-    coarse_map, few = alignment.coarse_map(points, T_prior), thin(points, SEARCH_SHARE)
+    coarse_map, few = alignment.coarse_maps(points, T_prior)[0], thin(points, SEARCH_SHARE)
     slow = alignment.slowly(2 * START_STEP)
     tried = [
         alignment.on_planes(coarse_map, few, T_prior @ se3.make(np.eye(3), offset), slow)

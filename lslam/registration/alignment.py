@@ -13,6 +13,7 @@ from lslam.preprocessing.prepare import PreparedPoints
 from lslam.registration.gaussian_map import GaussianMap
 from lslam.registration.local_map import LocalMap
 from lslam.registration.optimiser import EVERYWHERE
+from lslam.registration.residuals import residual_named
 from lslam.registration.robust import Annealing
 from lslam.registration.solver import RegistrationResult, solve
 
@@ -31,13 +32,14 @@ class MapAlignment:
     ) -> RegistrationResult:  # fmt: skip
         """Align with the fine map from `start` (4, 4), the kernel closing from `width`, m, or as the user wants it.
 
-        coarser : maps for the points that find nothing in the fine one, finest first; none: the coarse one
+        coarser : maps for the points that find nothing in the fine one, finest first; none: all that there are
         allowed : (6, 6) projector on the directions that are aligned, world axes; no rows: all
         """
-        c, coarser = self._config, coarser or (self._map.coarse,)
+        c, coarser = self._config, coarser or self._map.coarser
+        coarser = coarser if residual_named(self._residual).is_wide else coarser[:1]
         if c.inlier_distance is None:
             # The larger the planes, the farther their surface may be from them.
-            widest = coarser[0].size / self._map.coarse.size
+            widest = coarser[0].size / self._map.coarser[0].size
             annealing = Annealing(max(width, widest * c.kernel_min), widest * c.kernel_min, c.kernel_decay, steps)
         else:
             annealing = Annealing(c.inlier_distance, c.inlier_distance, c.kernel_decay, steps)
@@ -59,24 +61,23 @@ class MapAlignment:
         width : m, of the kernel at the start, where the prior is known better than `coarse_kernel`
         """
         c = self._config
-        coarse_map = self.coarse_map(points, T_prior)
-        coarse = self.on_planes(coarse_map, points, T_prior, self.slowly(min(width, c.coarse_kernel)))
+        coarser = self.coarse_maps(points, T_prior)
+        coarse = self.on_planes(coarser[0], points, T_prior, self.slowly(min(width, c.coarse_kernel)))
         start = coarse.T_world_lidar if coarse.ok else T_prior
-        fine = self.refine(points, start, c.kernel_max, c.start_iterations, (coarse_map,))
+        fine = self.refine(points, start, c.kernel_max, c.start_iterations, coarser)
         return replace(fine, iterations=coarse.iterations + fine.iterations)
 
-    def coarse_map(self, points: PreparedPoints, T_prior: Floats) -> GaussianMap:
-        """The map in coarse voxels: so large that planes lie under enough of the points.
+    def coarse_maps(self, points: PreparedPoints, T_prior: Floats) -> tuple[GaussianMap, ...]:
+        """The coarser levels of the map, from the one on whose voxels are so large that planes lie under enough points.
 
         From thirty metres above the ground the rings of one scan lie metres apart.
         """
-        c = self._config
+        c, coarser = self._config, self._map.coarser
         once = Annealing(c.coarse_kernel, c.coarse_kernel, c.coarse_decay, 1)
-        for factor in (1, 2, 4):
-            coarse_map = self._map.coarse if factor == 1 else self._map.coarse.coarsen(factor)
-            if self.on_planes(coarse_map, points, T_prior, once).overlap >= c.start_overlap:
-                break
-        return coarse_map
+        for k, level in enumerate(coarser):
+            if self.on_planes(level, points, T_prior, once).overlap >= c.start_overlap:
+                return coarser[k:]
+        return coarser[-1:]
 
     def slowly(self, width: float) -> Annealing:
         """A kernel that closes from `width`, m, so slowly that coarse planes are followed."""

@@ -1,4 +1,4 @@
-"""The local map in two resolutions: fine voxels where a scan's beams lie close together, coarse ones where they do not."""
+"""The local map in a pyramid of resolutions: a point takes the finest voxel whose points spread across the beams."""
 
 from __future__ import annotations
 
@@ -7,15 +7,17 @@ from numpy.typing import NDArray
 
 from lslam.preprocessing.prepare import PreparedPoints
 from lslam.registration.gaussian_map import GaussianMap
-from lslam.types.state import Stateful
+from lslam.types.state import State, Stateful
 
 # A plane must have been seen across its beams by twice the standard deviation that it is thick: below that, a plane
 # through the sensor explains its points as well, which is where the beams of one ring lie whatever they hit.
 BREADTH = 4.0
+# Times the coarse voxels. Beams of two degrees lie two metres apart on a wall 60 m away, and on the ground 10 m ahead.
+WIDE = (2, 4)
 
 
 class LocalMap(Stateful):
-    """Gaussian voxels of two sizes around the sensor.
+    """Gaussian voxels of four sizes around the sensor.
 
     Parameters
     ----------
@@ -23,28 +25,47 @@ class LocalMap(Stateful):
     min_points, planarity, count_cap, reach : as in `GaussianMap`
     """
 
-    STATE = ("fine", "coarse")
-
     def __init__(
         self, size: float, *, coarse_factor: int, min_points: int, planarity: float, count_cap: float, reach: float
     ) -> None:
-        self.fine, self.coarse = (
+        self.levels = tuple(
             GaussianMap(
                 edge, min_points=min_points, planarity=planarity, count_cap=count_cap, reach=reach, breadth=BREADTH
             )
-            for edge in (size, size * coarse_factor)
+            for edge in (size, *(size * coarse_factor * wider for wider in (1, *WIDE)))
         )
+
+    @property
+    def fine(self) -> GaussianMap:
+        """The level of the smallest voxels."""
+        return self.levels[0]
+
+    @property
+    def coarser(self) -> tuple[GaussianMap, ...]:
+        """All other levels, the finest of them first."""
+        return self.levels[1:]
 
     def __len__(self) -> int:
         """Fine voxels that hold points."""
         return len(self.fine)
 
     def insert(self, points: PreparedPoints, T_world_lidar: NDArray[np.float64]) -> None:
-        """Enter a scan: its small centroids into fine voxels, its source points into coarse ones."""
+        """Enter a scan: its small centroids into fine voxels, its source points into all others."""
         self.fine.insert(points.map_points, T_world_lidar)
-        self.coarse.insert(points.source.astype(np.float32), T_world_lidar)
+        source = points.source.astype(np.float32)
+        for level in self.coarser:
+            level.insert(source, T_world_lidar)
 
     def clear(self) -> None:
         """Forget everything; the room is kept."""
-        self.fine.clear()
-        self.coarse.clear()
+        for level in self.levels:
+            level.clear()
+
+    def state(self) -> State:
+        """What `restore` needs to go on from here."""
+        return {"levels": [level.state() for level in self.levels]}
+
+    def restore(self, state: State) -> None:
+        """Go on where `state` was taken."""
+        for level, kept in zip(self.levels, state["levels"], strict=True):
+            level.restore(kept)

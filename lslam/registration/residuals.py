@@ -57,6 +57,7 @@ class ResidualKind:
     points : source points, and what it takes of each, by the noise of a point, m
     voxels : what it takes of a map
     by_surfaces : whether S of its sums tells which directions are observed: its matrices are full
+    is_wide : whether voxels of the wide levels tell it something: a mean does not
     """
 
     module: str
@@ -64,6 +65,7 @@ class ResidualKind:
     points: Callable[[PreparedPoints, float], Arrays] = _with_scatter
     voxels: Callable[[GaussianMap], Arrays] = _planes
     by_surfaces: bool = False
+    is_wide: bool = True
 
     @property
     def linearise(self) -> Callable[..., None]:
@@ -73,7 +75,7 @@ class ResidualKind:
 
 RESIDUALS = {
     "plane": ResidualKind("lslam.kernels.residuals", "linearise"),
-    "point": ResidualKind("lslam.kernels.point_residual", "linearise_point", _with_gaps),
+    "point": ResidualKind("lslam.kernels.point_residual", "linearise_point", _with_gaps, is_wide=False),
     "gicp": ResidualKind("lslam.kernels.gicp_residual", "linearise_gicp", _with_covariance, by_surfaces=True),
     "vgicp": ResidualKind(
         "lslam.kernels.vgicp_residual", "linearise_vgicp", _with_covariance, _counted_planes, by_surfaces=True

@@ -109,12 +109,15 @@ def voxel_terms(
     """The residual of the points on each of the maps, the finest first, which share their matches.
 
     points : arrays that the residual takes of them; sigma : m, noise of a point; blob_weight : of voxels that are no plane
+
+    Voxels beyond the second size hold what bends within them, so that points on one plane err together: it weighs less by
+    as much as they are larger. The mean of such a voxel says nothing of where anything is.
     """
-    last, linearise = len(levels) - 1, kind.linearise
+    last, linearise, usual = len(levels) - 1, kind.linearise, levels[:2][-1].size
     return [
         Term(
             linearise, points, kind.voxels(level),
-            (float(level.size), float(sigma) ** 2, float(blob_weight), 0 < k == last),
+            (level.size, float(sigma) ** 2, min(usual / level.size, 1.0), float(blob_weight) if k < 2 else 0.0, 0 < k == last),
             matches.search(),
         )
         for k, level in enumerate(levels)

@@ -69,13 +69,13 @@ def scene() -> Scene:
 
 def linearise(
     s: Scene, R: Floats, t: Floats, c: float, blob: float = BLOB, gate2: float = np.inf,
-    cache: tuple[NDArray[np.int64], NDArray[np.int32]] | None = None,
+    cache: tuple[NDArray[np.int64], NDArray[np.int32]] | None = None, plane: float = 1.0,
 ) -> tuple[Floats, Floats, Floats]:  # fmt: skip
     m, matches = s.target, Matches(len(s.points.source))
     search = matches.search() if cache is None else (*cache, matches.is_done, matches.away2)
     H, S, g, facts = np.zeros((6, 6)), np.zeros((6, 6)), np.zeros(6), np.zeros(at.COUNT)
     residuals.linearise(
-        (s.points.source, s.points.scatter), (m.planes, m.keys, m.table), (m.size, SIGMA2, blob, False), search,
+        (s.points.source, s.points.scatter), (m.planes, m.keys, m.table), (m.size, SIGMA2, plane, blob, False), search,
         (R, t), (c, c, gate2), (H, S, g, facts),
     )  # fmt: skip
     np.testing.assert_array_equal(S, 0.0)
@@ -195,6 +195,13 @@ def test_an_empty_map_and_an_empty_scan_match_nothing(scene: Scene) -> None:
     np.testing.assert_array_equal(H, 0.0)
 
 
+def test_planes_and_blobs_weigh_what_they_are_told(scene: Scene) -> None:
+    """H is a sum over both: a quarter of the planes' part and all of the blobs'."""
+    H, planes = (linearise(scene, scene.R, scene.t, 0.5, blob)[0] for blob in (BLOB, 0.0))
+    quarter = linearise(scene, scene.R, scene.t, 0.5, BLOB, plane=0.25)[0]
+    np.testing.assert_allclose(quarter, H - 0.75 * planes, rtol=1e-9, atol=1e-9 * np.abs(H).max())
+
+
 def test_a_coarser_map_serves_the_points_that_found_no_plane(scene: Scene) -> None:
     """Two calls with one list of done points add up to each point matched once, at the finest map that has a plane."""
     matches, sums = (
@@ -205,7 +212,7 @@ def test_a_coarser_map_serves_the_points_that_found_no_plane(scene: Scene) -> No
     counts = []
     for m in (fine, coarse):
         residuals.linearise(
-            (scene.points.source, scene.points.scatter), (m.planes, m.keys, m.table), (m.size, SIGMA2, 0.0, False),
+            (scene.points.source, scene.points.scatter), (m.planes, m.keys, m.table), (m.size, SIGMA2, 1.0, 0.0, False),
             matches.search(), (scene.R, scene.t), (0.5, 0.5, np.inf), sums,
         )  # fmt: skip
         counts.append(sums[3][at.MATCHED])

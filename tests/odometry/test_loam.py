@@ -316,12 +316,16 @@ def test_features_that_leave_their_prior_later_on_are_held_to_what_stands(monkey
 
 def test_where_features_hold_the_place_badly_all_points_are_asked() -> None:
     """A hundred features of sixteen rings leave decimetres along a motorway open from scan to scan, unseen."""
-    scans, truth = of_motorway(1, "vlp16", 9)
-    results = Driver("loam").drive(scans)
-    assert all("all points stood in" in result.reason for result in results[1:])
-    poses = poses_of(results)
-    steps = se3.relative(poses[1:-1], poses[2:])[:, :3, 3] - se3.relative(truth[1:-1], truth[2:])[:, :3, 3]
-    assert np.linalg.norm(steps, axis=1).max() < 0.1
+    off = []
+    for seed in range(4):
+        scans, truth = of_motorway(seed, "vlp16", 9)
+        results = Driver("loam").drive(scans)
+        assert seed != 1 or all("all points stood in" in result.reason for result in results[1:])
+        poses = poses_of(results)
+        steps = se3.relative(poses[1:-1], poses[2:])[:, :3, 3] - se3.relative(truth[1:-1], truth[2:])[:, :3, 3]
+        off.append(np.linalg.norm(steps, axis=1))
+    assert np.median(off) < 0.03
+    assert np.max(off) < 0.3
 
 
 def test_a_start_that_is_taken_up_again_knows_what_stands() -> None:

@@ -93,7 +93,7 @@ def test_a_result_that_is_sure_is_not_asked_twice(monkeypatch: pytest.MonkeyPatc
 
 
 def test_a_standing_start_on_few_planes_does_not_slide() -> None:
-    """A motorway under sixteen rings: from metres off the few planes of one scan draw the next to a false place."""
+    """A motorway under sixteen rings: from metres off the few planes of one scan drew the next to a false place."""
     drive = simulate("motorway", seed=0, count=3, lidar="os1-16", motion_compensated=True, static_start=0.5)
     np.testing.assert_allclose(drive.ground_truth.poses[1], drive.ground_truth.poses[0], atol=1e-9)
     registration = RecoveringRegistration(recovery=ALONE)
@@ -104,11 +104,7 @@ def test_a_standing_start_on_few_planes_does_not_slide() -> None:
         assert result.ok
         return float(np.linalg.norm(result.T_world_lidar[:3, 3]))
 
-    alone = registration.judged(registration.alignment.coarse_to_fine(points, np.eye(4)), np.eye(4))
-    assert slid(alone) > 0.1
-    held = registration.locate(points, np.eye(4))
-    assert slid(held) < 0.05
-    assert held.posed_by == ""
+    assert slid(registration.judged(registration.alignment.coarse_to_fine(points, np.eye(4)), np.eye(4))) < 0.05
     for i in (1, 2):
         assert slid(registration.register(drive.scan(i).points)) < 0.05
 

@@ -11,7 +11,6 @@ from lslam.config.preprocess import PreprocessConfig
 from lslam.geometry import se3
 from lslam.preprocessing.prepare import PreparedPoints
 from lslam.recovery.non_ground import NEAR, NonGroundPoints, non_ground_points, sought
-from lslam.recovery.start_search import CLEARLY
 
 Floats = NDArray[np.float64]
 Points = NDArray[np.float32]
@@ -46,17 +45,17 @@ def test_the_share_is_that_of_points_with_a_neighbour_and_leaves_the_ground_out(
         # Cells stand for their points: their mean lies up to half a cell from any of them.
         assert (away < NEAR / 2).mean() - 0.02 <= first.share(seen, pose) <= (away < 1.5 * NEAR).mean() + 0.02
     assert first.share(seen, true) == 1.0
-    assert first.share(seen, true) > CLEARLY * first.share(seen, true @ pose_at((1.0, 0.0, 0.0)))
+    assert first.share(seen, true) > 1.06 * first.share(seen, true @ pose_at((1.0, 0.0, 0.0)))
 
 
-def test_what_is_as_low_as_a_crash_barrier_is_asked_only_where_hardly_anything_is_higher() -> None:
+def test_what_is_as_low_as_a_crash_barrier_is_not_asked() -> None:
     """Barriers lie along the road everywhere: the sensor's own rings match on them best where nothing moved."""
     points = street(np.random.default_rng(1), 0.0)
     along = np.arange(-20, 20, 0.1)
     barrier = np.column_stack([along, np.full_like(along, 5.0), np.full_like(along, 0.8 - 1.7)]).astype(np.float32)
-    assert len(non_ground_points(np.concatenate([points, barrier]), PreprocessConfig())[1]) == 800
-    few = np.concatenate([points[:4000], barrier, points[-20:]])
-    assert len(non_ground_points(few, PreprocessConfig())[1]) == len(barrier) + 20
+    standing, asked = non_ground_points(np.concatenate([points, barrier]), PreprocessConfig())
+    assert len(asked) == 800
+    assert len(standing) == 800 + len(barrier)
 
 
 def test_bare_ground_says_nothing() -> None:

@@ -1,4 +1,4 @@
-"""The local map in two resolutions: what enters each, that both forget, and what a young one holds."""
+"""The local map in a pyramid of resolutions: what enters each, that both forget, and what a young one holds."""
 
 from __future__ import annotations
 
@@ -31,32 +31,32 @@ def assert_same(a: GaussianMap, b: GaussianMap) -> None:
         np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
 
 
-def test_map_points_enter_fine_voxels_and_source_points_coarse_ones() -> None:
+def test_map_points_enter_fine_voxels_and_source_points_all_larger_ones() -> None:
     target, points, T = new_map(), scan(0), pose_at((1.0, 2.0, 0.5), 30.0)
     target.insert(points, T)
     kept = {"min_points": 6, "planarity": 0.3, "count_cap": 200.0, "reach": 100.0, "breadth": BREADTH}
-    fine, coarse = (GaussianMap(size, **kept) for size in (0.8, 3 * 0.8))
+    fine, *coarser = (GaussianMap(size, **kept) for size in (0.8, 3 * 0.8, 6 * 0.8, 12 * 0.8))
     fine.insert(points.map_points, T)
-    coarse.insert(points.source.astype(np.float32), T)
     assert_same(target.fine, fine)
-    assert_same(target.coarse, coarse)
-    assert len(target) == len(fine) > len(coarse) > 0
+    for level, expected in zip(target.coarser, coarser, strict=True):
+        expected.insert(points.source.astype(np.float32), T)
+        assert_same(level, expected)
+    assert len(target) == len(fine) > len(target.coarser[0]) > len(target.coarser[2]) > 0
 
 
-def test_both_levels_are_forgotten_and_taken_up_again() -> None:
+def test_all_levels_are_forgotten_and_taken_up_again() -> None:
     target = new_map()
     target.insert(scan(0), np.eye(4))
     known, again = deepcopy(target.state()), new_map()
     again.restore(known)
     for one in (target, again):
         one.insert(scan(1), pose_at((0.3, 0.0, 0.0)))
-    for level in ("fine", "coarse"):
-        a, b = getattr(target, level), getattr(again, level)
+    for a, b in zip(target.levels, again.levels, strict=True):
         live = np.sort(a.keys[a.keys >= 0])
         np.testing.assert_array_equal(live, np.sort(b.keys[b.keys >= 0]))
         np.testing.assert_array_equal(a.planes[a.keys >= 0], b.planes[b.keys >= 0])
     target.clear()
-    assert len(target) == len(target.fine) == len(target.coarse) == 0
+    assert [len(level) for level in target.levels] == [0] * 4
 
 
 @pytest.mark.parametrize("scenario", ["street", "block", "walk"])

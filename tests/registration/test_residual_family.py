@@ -57,7 +57,7 @@ def test_the_coarse_map_alone_brings_a_start_near(residual: Residual) -> None:
         registration = in_room(residual, seed)
         points = prepare_points(seen_from(room(rng), T), registration.preprocess)
         slow = Annealing(5.0, 0.15, 0.85, 40)
-        coarse = registration.map.coarse
+        coarse = registration.map.coarser[0]
         found = solve(coarse, points, np.eye(4), slow, sigma=0.03, blob_weight=0.5, weak_share=1e-3, residual=residual)
         assert distance(T, found.T_world_lidar)[0] < 0.1
 
