@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from lslam.geometry import noise
 from lslam.registration.solver import RegistrationResult
-from lslam.registration.sweep_doubt import MEMORY, SweepDoubt
+from lslam.registration.sweep_doubt import SweepDoubt
 from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan_result import ScanResult
 from lslam.types.state import Stateful
@@ -18,6 +18,8 @@ Floats = NDArray[np.float64]
 
 # The first sweep is deskewed by the velocity at its end, off by a T: twice as far as the later ones (`sweep_doubt`), squared.
 FIRST = 4.0
+# What the two scans after it say of how the motion changes is said of the first one, too: rattling lasts no longer.
+BEGINNING = 2
 
 
 class PoseUncertainty(Stateful):
@@ -34,13 +36,14 @@ class PoseUncertainty(Stateful):
 
     From scan to scan there is no such map: every registration's error enters in full.
 
-    Scans that were deskewed carry the doubt about their motion into the map likewise; that of the first scan, at whose start
-    the world begins, is in all others.
+    The doubt about the motion within a sweep is another in every scan, so that on a map of many it averages out: each scan
+    makes as much of the map as is renewed with it, and so much of its error stays. That of the first scan, at whose start the
+    world begins, is in all others.
 
     map_age : how many scans ago, on the mean, the points of the map were taken on which the next scan is registered
     """
 
-    STATE = ("_map", "_position", "_start", "_sweep", "_scans", "map_age")
+    STATE = ("_map", "_position", "_start", "_begun", "_sweep", "_scans", "map_age")
 
     def __init__(self, *, is_scan_to_scan: bool = False) -> None:
         self.is_scan_to_scan = is_scan_to_scan
@@ -48,6 +51,8 @@ class PoseUncertainty(Stateful):
         self._position: Floats | None = None
         # Where the world begins, until it is known how wrong the first sweep was.
         self._start: Floats | None = None
+        # Times the doubt about a sweep, of the first scan and those entered with it until then.
+        self._begun = FIRST
         self._sweep = SweepDoubt()
         self._scans = 0
         self.map_age = 1.0
@@ -77,10 +82,22 @@ class PoseUncertainty(Stateful):
         if result.ok:
             renewed = 1.0 if self.is_scan_to_scan else float(np.linalg.norm(step)) / max(result.lever_arm, 1.0)
             self._scans += 1
-            self._map += max(renewed, 1 / self._scans**2) * own
+            self._map += max(renewed, 1 / self._scans**2) * result.covariance
+            if self._scans > 1:
+                self._enter(max(min(renewed, 1.0), 1 / self._scans) ** 2, sweep)
             share = min(max(renewed, 1 / self._scans), 1.0)
             self.map_age = 1 + (1 - share) * self.map_age
-        begun = np.zeros((6, 6)) if self._start is None else noise.transported(FIRST * sweep, position - self._start)
-        if self._sweep.scans == MEMORY and self._start is not None:
-            self._map, self._start, begun = self._map + begun, None, np.zeros((6, 6))
+        if self._start is None:
+            return np.asarray(self._map + own)
+        begun = noise.transported(self._begun * sweep, position - self._start)
+        if self._sweep.scans >= BEGINNING:
+            self._map, self._start = self._map + begun, None
+            return np.asarray(self._map + own)
         return np.asarray(self._map + begun + own)
+
+    def _enter(self, share: float, sweep: Floats) -> None:
+        """So much of a scan's doubt about its sweep (6, 6) stays in the map."""
+        if self._start is None:
+            self._map += share * sweep
+        else:
+            self._begun += share

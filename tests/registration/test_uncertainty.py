@@ -100,14 +100,29 @@ def test_a_failed_scan_doubts_its_own_pose_only() -> None:
     np.testing.assert_allclose(np.diag(after), np.diag(expected), rtol=0.2)
 
 
-def test_doubt_about_sweeps_adds_up_like_that_of_registrations_and_that_of_the_first_stays() -> None:
+def test_doubt_about_sweeps_averages_out_on_the_map_and_that_of_the_first_stays() -> None:
     """The first sweep's is twice as far off, so four times the covariance, in all poses."""
     own, sweep = np.diag([1e-4, 2e-4, 3e-4, 0, 0, 0]), np.diag([7e-5, 0, 1e-5, 0, 0, 0])
     uncertainty = PoseUncertainty()
     for k in range(41):
         now = uncertainty.add(result(0.5 * k, own), sweep)
-        entered = 1 + shares(k + 1, 0.5).sum()
-        np.testing.assert_allclose(now, entered * (own + sweep) + 4 * sweep, atol=1e-16)
+        n = np.arange(2, k + 2)
+        of_sweeps = 1 + 4 + (np.maximum(0.5 / LEVER, 1 / n) ** 2).sum()
+        np.testing.assert_allclose(now, (1 + shares(k + 1, 0.5).sum()) * own + of_sweeps * sweep, atol=1e-16)
+
+
+def test_independent_errors_of_sweeps_walk_the_map_by_the_part_that_is_renewed() -> None:
+    """Monte Carlo: a map that is the mean of the last scans, each laid on it with an error of its own."""
+    rng, runs, steps, renewed = np.random.default_rng(0), 4000, 200, 0.1
+    at_map = np.zeros(runs)
+    for _ in range(steps):
+        at_map = at_map + renewed * rng.normal(0, 0.01, runs)
+    walked = PoseUncertainty()
+    sweep = np.diag([1e-4, 0, 0, 0, 0, 0])
+    values = [walked.add(result(renewed * LEVER * k, np.zeros((6, 6))), sweep) for k in range(steps + 60)]
+    assert values[59] is not None
+    assert values[-1] is not None
+    assert values[-1][0, 0] - values[59][0, 0] == pytest.approx(at_map.var(), rel=0.1)
 
 
 def test_no_covariance_gives_none() -> None:
