@@ -76,14 +76,19 @@ def prepare_points(
 
 def thin(points: PreparedPoints, step: int) -> PreparedPoints:
     """Every `step`-th source point."""
+    return subset(points, slice(None, None, step))
+
+
+def subset(points: PreparedPoints, which: slice | NDArray[np.bool_]) -> PreparedPoints:
+    """Some of the source points, with what goes with each; the map points stay."""
     times, covariance, gaps = points.source_times, points.covariance, points.gaps
     return replace(
         points,
-        source=np.ascontiguousarray(points.source[::step]),
-        scatter=np.ascontiguousarray(points.scatter[::step]),
-        source_times=None if times is None else times[::step],
-        covariance=None if covariance is None else np.ascontiguousarray(covariance[::step]),
-        gaps=None if gaps is None else np.ascontiguousarray(gaps[::step]),
+        source=np.ascontiguousarray(points.source[which]),
+        scatter=np.ascontiguousarray(points.scatter[which]),
+        source_times=None if times is None else times[which],
+        covariance=None if covariance is None else np.ascontiguousarray(covariance[which]),
+        gaps=None if gaps is None else np.ascontiguousarray(gaps[which]),
     )
 
 

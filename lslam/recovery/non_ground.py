@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from lslam.config.preprocess import PreprocessConfig
 from lslam.preprocessing.ground import ground_of
-from lslam.preprocessing.prepare import PreparedPoints
+from lslam.preprocessing.prepare import PreparedPoints, subset
 from lslam.registration.gaussian_map import GaussianMap
 from lslam.registration.robust import Annealing
 from lslam.registration.solver import RegistrationResult, solve
@@ -62,3 +62,11 @@ def non_ground_points(points: Points, preprocess: PreprocessConfig) -> tuple[Poi
     ground = ground_of(points, preprocess.ground_slope, preprocess.ground_tolerance)
     standing, high = (points[ground.above(points, height)] for height in (preprocess.ground_tolerance, HIGH))
     return standing, high
+
+
+def on_ground(points: PreparedPoints, preprocess: PreprocessConfig) -> PreparedPoints:
+    """The source points on the ground."""
+    ground = ground_of(points.map_points, preprocess.ground_slope, preprocess.ground_tolerance)
+    is_ground = np.ones(len(points.source), bool)
+    is_ground[ground.above(points.source.astype(np.float32), preprocess.ground_tolerance)] = False
+    return subset(points, is_ground)

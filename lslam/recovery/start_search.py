@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from lslam.geometry import se3, so3
 from lslam.preprocessing.prepare import PreparedPoints, thin
-from lslam.recovery.non_ground import NEAR, NonGroundPoints, sought
+from lslam.recovery.non_ground import NEAR, NonGroundPoints, on_ground, sought
 from lslam.registration.acceptance import correction
 from lslam.registration.alignment import upright_directions
 from lslam.registration.registration import NEAR_KERNEL, Registration
@@ -87,7 +87,8 @@ def held_by_non_ground(
         return found
     if not judged.ok or len(judged.degenerate) or is_much_more(share(stood), share(judged), count):
         # What stands says little of height and tilt, the ground does: two steps as in LeGO-LOAM (Shan and Englot 2018).
-        ground = r.alignment.refine(points, place, width, c.start_iterations, coarser, upright_directions(place))
+        level = on_ground(points, r.preprocess)
+        ground = r.alignment.refine(level, place, width, c.start_iterations, coarser, upright_directions(place))
         judged = near.moved(ground.T_world_lidar, stood.covariance)
     return replace(judged, iterations=found.iterations + near.iterations)
 
