@@ -11,6 +11,7 @@ from lslam.config.preprocess import PreprocessConfig
 from lslam.preprocessing.ground import ground_of
 from lslam.preprocessing.prepare import PreparedPoints, subset
 from lslam.registration.gaussian_map import GaussianMap
+from lslam.registration.residuals import MEANS
 from lslam.registration.robust import Annealing
 from lslam.registration.solver import RegistrationResult, solve
 
@@ -48,7 +49,7 @@ class NonGroundPoints:
         return self._solve(seen, T_start, Annealing(REACH, NEAR / 2, 0.7, 20))
 
     def _solve(self, seen: PreparedPoints, T_start: Floats, annealing: Annealing) -> RegistrationResult:
-        return solve(self._cells, seen, T_start, annealing, sigma=NEAR, blob_weight=1.0, weak_share=0.0)
+        return solve(self._cells, seen, T_start, annealing, sigma=NEAR, blob_weight=1.0, weak_share=0.0, residual=MEANS)
 
 
 def sought(points: Points, preprocess: PreprocessConfig) -> PreparedPoints:

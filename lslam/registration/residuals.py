@@ -82,6 +82,8 @@ RESIDUALS = {
     ),
     "ndt": ResidualKind("lslam.kernels.ndt_residual", "linearise_ndt", _alone, _shapes, by_surfaces=True),
 }
+# Of what stands on the ground, in voxels that pass for no planes; nothing that a user chooses.
+MEANS = ResidualKind("lslam.kernels.mean_residual", "linearise_means", _alone, is_wide=False)
 NEEDS_COVARIANCE = frozenset(name for name, residual in RESIDUALS.items() if residual.points is _with_covariance)
 
 

