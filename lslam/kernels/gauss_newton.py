@@ -19,6 +19,8 @@ Limits = tuple[float, float, float, bool]
 # A weak direction is followed, though not believed, until it holds less than this part of what makes it weak: normals that
 # waver by a degree look like 3e-4 of the information.
 UNSEEN = 0.3
+# Of the largest eigenvalue: less is what rounding leaves of none.
+ROUNDING = 1e-12
 
 
 @inline
@@ -39,12 +41,13 @@ def solve_observed(H: Floats, g: Floats, facts: Floats, weak_share: float, least
     d[:] = 0.0
     count = 0
     needed = max(weak_share * facts[INFORMATION], least)
+    none = ROUNDING * values.max()
     for k in range(6):
-        if values[k] <= needed or values[k] <= 0.0:
+        if values[k] <= needed or values[k] <= none:
             for i in range(6):
                 weak[count, i] = vectors[i, k]
             count += 1
-            if values[k] <= unseen * needed or values[k] <= 0.0:
+            if values[k] <= unseen * needed or values[k] <= none:
                 continue
         dot = 0.0
         for i in range(6):

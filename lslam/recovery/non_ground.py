@@ -10,13 +10,16 @@ from numpy.typing import NDArray
 from lslam.config.preprocess import PreprocessConfig
 from lslam.preprocessing.ground import ground_of
 from lslam.preprocessing.prepare import PreparedPoints, subset
+from lslam.registration.alignment import upright_directions
 from lslam.registration.gaussian_map import GaussianMap
+from lslam.registration.optimiser import Limits, Matches, optimise
 from lslam.registration.residuals import MEANS
 from lslam.registration.robust import Annealing
-from lslam.registration.solver import RegistrationResult, solve
+from lslam.registration.solver import RegistrationResult, solve, voxel_terms
 
 Floats = NDArray[np.float64]
 Points = NDArray[np.float32]
+Flags = NDArray[np.bool_]
 
 # m; points this near belong together. Poles and leaves make no planes: their voxels are as large, one point is enough,
 # and none of them passes for a plane.
@@ -40,16 +43,26 @@ class NonGroundPoints:
         for points, T_world_lidar in scans:
             self._cells.insert(non_ground_points(points, preprocess)[0], T_world_lidar)
 
+    def agreeing(self, seen: PreparedPoints, T_world_lidar: Floats) -> Flags:
+        """(S,) which of them have one of these points near by when seen from `T_world_lidar` (4, 4)."""
+        matches = Matches(len(seen.source))
+        terms = voxel_terms(MEANS, MEANS.points(seen, NEAR), (self._cells,), matches, NEAR, 1.0)
+        optimise(terms, T_world_lidar, Annealing(NEAR, NEAR, 0.5, 1), Limits(0.0), matches)
+        return (matches.away2 >= 0) & (matches.away2 < NEAR**2)
+
     def share(self, seen: PreparedPoints, T_world_lidar: Floats) -> float:
-        """Part of them that have one of these points near by when seen from `T_world_lidar` (4, 4)."""
-        return self._solve(seen, T_world_lidar, Annealing(NEAR, NEAR, 0.5, 1)).inliers / max(len(seen.source), 1)
+        """Which part of them does."""
+        return np.count_nonzero(self.agreeing(seen, T_world_lidar)) / max(len(seen.source), 1)
 
     def align(self, seen: PreparedPoints, T_start: Floats) -> RegistrationResult:
-        """Lay them on these points, point to point, from less than `REACH` away."""
-        return self._solve(seen, T_start, Annealing(REACH, NEAR / 2, 0.7, 20))
+        """Lay them on these points, point to point, from less than `REACH` away, with height and tilt as they are.
 
-    def _solve(self, seen: PreparedPoints, T_start: Floats, annealing: Annealing) -> RegistrationResult:
-        return solve(self._cells, seen, T_start, annealing, sigma=NEAR, blob_weight=1.0, weak_share=0.0, residual=MEANS)
+        At the wrong height, or tilted by a degree, rings agree with those of another scan that hit something else.
+        """
+        return solve(
+            self._cells, seen, T_start, Annealing(REACH, NEAR / 2, 0.7, 20), sigma=NEAR, blob_weight=1.0, weak_share=0.0,
+            residual=MEANS, allowed=np.eye(6) - upright_directions(T_start),
+        )  # fmt: skip
 
 
 def sought(points: Points, preprocess: PreprocessConfig) -> PreparedPoints:

@@ -16,6 +16,7 @@ from lslam.registration.registration import NEAR_KERNEL, Registration
 from lslam.registration.solver import RegistrationResult
 
 Floats = NDArray[np.float64]
+Flags = NDArray[np.bool_]
 
 # m; starts this far apart leave no gap between their capture ranges, not even between piers of a facade.
 START_STEP = 1.0
@@ -68,28 +69,36 @@ def held_by_non_ground(
     standing, seen = NonGroundPoints(r.recent, r.preprocess), sought(points.map_points, r.preprocess)
     if is_lost:
         found = _best_start(r, points, T_prior, found, standing, seen)
+    coarser, ground = r.alignment.coarse_maps(points, T_prior), on_ground(points, r.preprocess)
+    width = NEAR_KERNEL * c.kernel_min
+
+    def placed(start: Floats) -> RegistrationResult:
+        """Height and tilt by the ground, the rest by what stands, in turn as in LeGO-LOAM (Shan and Englot 2018)."""
+        stood = standing.align(seen, upright(start))
+        return stood.moved(upright(stood.T_world_lidar), stood.covariance)
+
+    def upright(pose: Floats) -> Floats:
+        return r.alignment.refine(
+            ground, pose, width, c.start_iterations, coarser, upright_directions(pose)
+        ).T_world_lidar
+
+    def agreeing(result: RegistrationResult) -> Flags:
+        return standing.agreeing(seen, result.T_world_lidar)
+
     starts = [T_prior]
     if is_lost or not found.ok:
         starts.append(_likeliest(standing, seen, T_prior, c.start_reach))
-
-    def share(result: RegistrationResult) -> float:
-        return standing.share(seen, result.T_world_lidar)
-
-    stood = max((standing.align(seen, start) for start in starts), key=share)
-    place, count = stood.T_world_lidar, len(seen.source)
+    stood = max(map(placed, starts), key=lambda result: np.count_nonzero(agreeing(result)))
+    place, most = stood.T_world_lidar, agreeing(stood)
     is_drawn = found.ok and is_at_rest(place, r.recent[-1][1])
-    if is_drawn or not is_much_more(share(stood), share(found), count):
+    if is_drawn or not is_much_more(most, agreeing(found)):
         return found
-    coarser, width = r.alignment.coarse_maps(points, place), NEAR_KERNEL * c.kernel_min
-    near = r.alignment.refine(points, place, width, c.start_iterations, coarser)
+    near = r.alignment.refine(points, place, width, c.start_iterations, r.alignment.coarse_maps(points, place))
     judged = r.judged(near, place)
     if not judged.ok and not found.ok:
         return found
-    if not judged.ok or len(judged.degenerate) or is_much_more(share(stood), share(judged), count):
-        # What stands says little of height and tilt, the ground does: two steps as in LeGO-LOAM (Shan and Englot 2018).
-        level = on_ground(points, r.preprocess)
-        ground = r.alignment.refine(level, place, width, c.start_iterations, coarser, upright_directions(place))
-        judged = near.moved(ground.T_world_lidar, stood.covariance)
+    if not judged.ok or len(judged.degenerate) or is_much_more(most, agreeing(judged)):
+        judged = near.moved(place, stood.covariance)
     return replace(judged, iterations=found.iterations + near.iterations)
 
 
@@ -134,14 +143,13 @@ def is_at_rest(pose: Floats, last: Floats) -> bool:
     return bool(np.linalg.norm(move) < 2 * NEAR and turn < np.deg2rad(AT_REST_DEG))
 
 
-def is_much_more(share: float, other: float, count: int) -> bool:
-    """Whether of `count` points a much larger share agrees at one pose than at the `other`, and not by chance.
+def is_much_more(ours: Flags, others: Flags) -> bool:
+    """Whether much more of the points agrees at one pose than at the other, and not by chance: flags (S,) of the same.
 
-    McNemar's test of paired shares at two sigma. How many points the poses dispute is not known: every one that fails to
-    agree at either pose is taken for one, which none in dispute escapes.
+    McNemar's test of paired shares at two sigma: only points that agree at one of the poses alone have a say.
     """
-    in_dispute = count * (2 - share - other)
-    return share > MUCH * other and count * (share - other) > 2 * np.sqrt(in_dispute)
+    won, lost = np.count_nonzero(ours & ~others), np.count_nonzero(others & ~ours)
+    return bool(np.count_nonzero(ours) > MUCH * np.count_nonzero(others) and won - lost > 2 * np.sqrt(won + lost))
 
 
 def distinct(results: list[RegistrationResult], known: Floats) -> list[RegistrationResult]:

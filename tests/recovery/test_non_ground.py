@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from lslam.config.preprocess import PreprocessConfig
 from lslam.geometry import se3
 from lslam.preprocessing.prepare import PreparedPoints
-from lslam.recovery.non_ground import NEAR, NonGroundPoints, non_ground_points, sought
+from lslam.recovery.non_ground import NEAR, NonGroundPoints, non_ground_points, on_ground, sought
 
 Floats = NDArray[np.float64]
 Points = NDArray[np.float32]
@@ -61,3 +61,11 @@ def test_what_is_as_low_as_a_crash_barrier_is_not_asked() -> None:
 def test_bare_ground_says_nothing() -> None:
     ground = street(np.random.default_rng(1), 0.0)[:4000]
     assert standing_in(ground, np.eye(4)).share(seen_in(ground), np.eye(4)) == 0.0
+
+
+def test_the_points_on_the_ground_are_the_others() -> None:
+    points = street(np.random.default_rng(1), 0.0)
+    seen = PreparedPoints(points, points.astype(np.float64), np.arange(len(points))[:, None] * np.ones(6), len(points))
+    ground = on_ground(seen, PreprocessConfig())
+    np.testing.assert_array_equal(ground.source, points[:4000].astype(np.float64))
+    np.testing.assert_array_equal(ground.scatter, seen.scatter[:4000])

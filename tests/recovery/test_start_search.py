@@ -12,8 +12,10 @@ from recovery_drives import driven, seen_by
 from lslam.geometry import se3
 from lslam.recovery.policies import RecoveringRegistration
 from lslam.recovery.start_search import MUCH, is_much_more, start_offsets
+from lslam.simulation.scenarios import simulate
 
 Floats = NDArray[np.float64]
+Flags = NDArray[np.bool_]
 
 STRIDE = 3
 
@@ -83,6 +85,20 @@ def test_sixteen_beams_start_at_thirty_metres_a_second(lidar: str, seed: int) ->
             assert result.prior_error[0] == pytest.approx(np.linalg.norm(result.T_world_lidar[:3, 3]))
 
 
+@pytest.mark.parametrize("seed", [0, 1, 2, 3])
+def test_a_start_high_above_a_town_keeps_height_and_tilt(seed: int) -> None:
+    """The first step tilts by 1.7 deg: where it does not, twice as many rings on roofs and walls agree with themselves."""
+    flight = simulate("closed", seed=seed, lidar="os1-16", count=40, motion_compensated=True)
+    assert flight.ground_truth is not None
+    truth = se3.relative(flight.ground_truth.poses[0], flight.ground_truth.poses)
+    registration = RecoveringRegistration()
+    off = np.stack([
+        se3.relative(pose, registration.register(flight.scan(i).points).T_world_lidar) for i, pose in enumerate(truth)
+    ])  # fmt: skip
+    assert np.linalg.norm(off[:, :3, 3], axis=1).max() < 0.02
+    assert np.rad2deg(np.linalg.norm(off[:, :2, 2], axis=1)).max() < 0.05
+
+
 def test_a_start_that_is_taken_up_again_knows_what_stands() -> None:
     drive = seen_by("os1-16", "motorway", 1)
     first, again = RecoveringRegistration(), RecoveringRegistration()
@@ -132,11 +148,16 @@ def test_starts_reach_as_far_as_asked_nearest_first() -> None:
 
 
 def test_much_more_is_more_than_chance_and_more_than_walls_show() -> None:
-    assert is_much_more(0.7, 0.6, 1000)
-    assert not is_much_more(0.7, 0.6, 100)
-    assert not is_much_more(0.6, 0.7, 1000)
-    assert not is_much_more(0.7, 1.01 * 0.7 / MUCH, 10**6)
+    def of(agree_here: int, agree_there: int, agree_at_both: int, count: int) -> tuple[Flags, Flags]:
+        k = np.arange(count)
+        return k < agree_here, (agree_here - agree_at_both <= k) & (k < agree_here - agree_at_both + agree_there)
+
+    assert is_much_more(*of(700, 600, 500, 1000))
+    assert not is_much_more(*of(70, 60, 40, 100))
+    assert is_much_more(*of(70, 60, 60, 100)), "ten agree here alone, and none does there alone"
+    assert not is_much_more(*of(600, 700, 500, 1000))
+    assert not is_much_more(*of(7000, int(1.01 * 7000 / MUCH), 6000, 10_000))
     # 60 points agree at both poses, 40 at either one or the other, by chance: more than two sigma once in 52 times.
     ours = np.random.default_rng(0).binomial(40, 0.5, 4000)
-    by_chance = np.mean([is_much_more((60 + k) / 100, (100 - k) / 100, 100) for k in ours.tolist()])
+    by_chance = np.mean([is_much_more(*of(60 + k, 100 - k, 60, 100)) for k in ours.tolist()])
     assert 0.01 < by_chance < 0.03

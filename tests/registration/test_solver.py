@@ -53,15 +53,16 @@ def test_the_facts_are_those_of_the_registration(room_map: GaussianMap) -> None:
     assert len(result.degenerate) == 0
 
 
-def test_the_ground_aligns_height_and_tilt_alone(room_map: GaussianMap) -> None:
+@pytest.mark.parametrize("weak_share", [0.0, 1e-3])
+def test_the_ground_aligns_height_and_tilt_alone(room_map: GaussianMap, weak_share: float) -> None:
     """Of a start that is wrong in all six directions, place and heading stay as they were, on a tilted sensor, too."""
     rng = np.random.default_rng(4)
     T = se3.exp(np.array([0.0, 0.0, 0.0, 0.1, -0.15, 0.4]))
     off = se3.exp(np.array([0.12, -0.1, 0.14, 0.02, -0.015, 0.03]))
     start = T @ off
     result = solve(
-        room_map, as_source(seen_from(room(rng, 300), T)), start, FINE, sigma=NOISE, blob_weight=0.5, weak_share=1e-3,
-        allowed=upright_directions(start),
+        room_map, as_source(seen_from(room(rng, 300), T)), start, FINE, sigma=NOISE, blob_weight=0.5,
+        weak_share=weak_share, allowed=upright_directions(start),
     )  # fmt: skip
     moved = se3.log(se3.relative(start, result.T_world_lidar))
     left = se3.log(se3.relative(T, result.T_world_lidar))
