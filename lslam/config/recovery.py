@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 from pydantic import Field
 
 from lslam.config.section import Section
@@ -16,4 +18,7 @@ class RecoveryConfig(Section):
     )
     start_search: bool = Field(
         True, description="seek the first steps within `registration.start_reach`, told by the points above the ground"
+    )
+    fallback: Literal["none", "all-points"] = Field(
+        "none", description="who poses a scan that LOAM's features hold badly: nobody, or `icp` on all its points"
     )

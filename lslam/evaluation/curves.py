@@ -82,6 +82,7 @@ def _curve(rows: Sequence[StudyRow], limit: float) -> Curve:
             "angular": angular,
             "time_per_scan": per_scan,
             "total_time": total,
+            "fallback": 100 * table(lambda row: row.fallback_share),
             "efficiency": np.where(lost, 0.0, efficiency(translation, angular, per_scan / 1e3)),
             "total_efficiency": np.where(lost, 0.0, efficiency(translation, angular, total)),
         },

@@ -1,16 +1,21 @@
-"""The feature map of the LOAM family: Gaussian voxels of edges, read as lines, and of planar points, read as planes."""
+"""The feature map of the LOAM family: voxels of edges, read as lines, and a pyramid of planar points, read as planes."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.kernels import voxel
 from lslam.preprocessing.features import Features
+from lslam.preprocessing.prepare import NO_TIMES
 from lslam.registration.gaussian_map import GaussianMap
+from lslam.registration.local_map import LocalMap
 from lslam.types.state import State, Stateful
 
 # As LOAM fits its lines: five points at least.
 MIN_LINE_POINTS = 5
+# m, grid of the less planar points for wide voxels, and where they stand in for the planar ones: as `source_voxel`.
+WIDE_GRID = 1.0
 
 
 class FeatureMap(Stateful):
@@ -19,24 +24,20 @@ class FeatureMap(Stateful):
     Parameters
     ----------
     size : m, edge of a voxel of edges
-    plane_size : m, edge of a voxel of planar points; as `size` when absent
-    min_points, planarity, count_cap, reach : of the plane voxels, as in `GaussianMap`
+    plane_size : m, edge of the smallest voxel of planar points; as `size` when absent
+    coarse_factor, min_points, planarity, count_cap, reach : of the planes, as in `LocalMap`
     """
 
     STATE = ("planes", "edges")
 
     def __init__(
-        self, size: float, *, plane_size: float | None = None, min_points: int = 6, planarity: float = 0.3,
-        count_cap: float = 200.0, reach: float = 150.0, capacity: int = 1 << 16,
+        self, size: float, *, plane_size: float | None = None, coarse_factor: int = 3, min_points: int = 6,
+        planarity: float = 0.3, count_cap: float = 200.0, reach: float = 150.0, capacity: int = 1 << 16,
     ) -> None:  # fmt: skip
-        self.planes = GaussianMap(
-            plane_size or size,
-            min_points=min_points,
-            planarity=planarity,
-            count_cap=count_cap,
-            reach=reach,
-            capacity=capacity,
-        )
+        self.planes = LocalMap(
+            plane_size or size, coarse_factor=coarse_factor, min_points=min_points, planarity=planarity,
+            count_cap=count_cap, reach=reach,
+        )  # fmt: skip
         self.edges = GaussianMap(size, count_cap=count_cap, reach=reach, capacity=capacity // 4)
         self._lines = _lines_for(self.edges)
 
@@ -54,12 +55,19 @@ class FeatureMap(Stateful):
     def insert(self, features: Features, T_world_lidar: NDArray[np.float64]) -> None:
         """Add the less sharp edges and the less planar points of a scan."""
         self.edges.insert(features.less_edges.points.astype(np.float32), T_world_lidar)
-        self.planes.insert(features.less_planes.points.astype(np.float32), T_world_lidar)
+        flat = features.less_planes.points.astype(np.float32)
+        self.planes.insert(flat, thinned(features)[0], T_world_lidar)
 
     def restore(self, state: State) -> None:
         """Go on with the voxels of `state`."""
         super().restore(state)
         self._lines = _lines_for(self.edges)
+
+
+def thinned(features: Features) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Centroids (S, 3) of the less planar points and the scatter (S, 6) behind each."""
+    points, _, scatter, _ = voxel.centroids(features.less_planes.points.astype(np.float32), NO_TIMES, WIDE_GRID)
+    return points.astype(np.float64), scatter.astype(np.float64)
 
 
 def _lines_for(edges: GaussianMap) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64]]:

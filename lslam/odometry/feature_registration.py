@@ -9,14 +9,12 @@ from numpy.typing import NDArray
 
 from lslam.config.loam import LoamConfig
 from lslam.config.registration import RegistrationConfig
-from lslam.kernels import voxel
 from lslam.odometry.all_points import AllPoints
-from lslam.odometry.feature_map import FeatureMap
+from lslam.odometry.feature_map import FeatureMap, thinned
 from lslam.odometry.feature_scan import FeatureScan, feature_scan, surface_size
 from lslam.odometry.feature_solver import NONE, FeatureNoise, kept_where_blind, solve_on_map
 from lslam.odometry.feature_steps import ScanStep, StageClock
 from lslam.preprocessing.features import Features
-from lslam.preprocessing.prepare import NO_TIMES
 from lslam.registration.acceptance import Wording, accepted, failed
 from lslam.registration.registration import NEAR_KERNEL
 from lslam.registration.robust import AdaptiveThreshold, Annealing, UsualAgreement
@@ -29,8 +27,6 @@ Floats = NDArray[np.float64]
 MIN_FEATURES = 60
 # A scan that failed is no target; after this many in a row the last good one lies too far behind to be.
 PATIENCE = 3
-# m, grid of the less planar points when they stand in for the features: as `preprocess.source_voxel`.
-STAND_IN_GRID = 1.0
 WORDING = Wording("of the features have a counterpart", "of the features agree")
 # In `posed_by`.
 LESS_PLANAR = "less planar points"
@@ -45,6 +41,7 @@ class FeatureRegistration(Stateful):
     with_map : whether the pose is found, or refined, on the feature map
     with_less_planes : whether the map is matched with centroids of the less planar points in place of the planar points
     reach : m, how far from the sensor the map is kept
+    with_all_points : whether `icp` on all points poses a scan that features hold badly
     """
 
     STATE = (
@@ -53,7 +50,7 @@ class FeatureRegistration(Stateful):
 
     def __init__(
         self, config: RegistrationConfig, loam: LoamConfig, *, scan_step: ScanStep | None, with_map: bool,
-        with_less_planes: bool = False, reach: float = 120.0,
+        with_less_planes: bool = False, reach: float = 120.0, with_all_points: bool = False,
     ) -> None:  # fmt: skip
         self.config, self.loam = config, loam
         self._step, self._with_less_planes, self._reach = scan_step, with_less_planes, reach
@@ -65,7 +62,8 @@ class FeatureRegistration(Stateful):
         self._starting = config.start_scans
         self._inserted = 0
         self._failures = 0
-        self._all = AllPoints(config, surface_size(config.voxel_size, loam.grid_step))
+        size = surface_size(config.voxel_size, loam.grid_step)
+        self._all = AllPoints(config, size) if with_all_points else None
 
     @property
     def noise(self) -> FeatureNoise:
@@ -113,14 +111,21 @@ class FeatureRegistration(Stateful):
             # The first step's prior is no more than a guess, which the search has replaced.
             expected = T_prior if self._inserted > 1 else start.T_world_lidar
             result = self._kept(result, expected, T_prior)
+        return result if self._all is None else self._held(self._all, features, start, T_prior, result, clock)
+
+    def _held(
+        self, points: AllPoints, features: Features, start: RegistrationResult, T_prior: Floats,
+        result: RegistrationResult, clock: StageClock,
+    ) -> RegistrationResult:  # fmt: skip
+        """What features found, unless all points say otherwise or hold the place that they hold badly."""
         is_far = not result.ok or result.prior_error[0] > self.config.recover_m
-        if self.config.start_reach > 0 and (self._is_begun or is_far):
+        if self.config.start_reach > 0 and (self._asks_all or is_far):
             with clock.stage("start" if self._starting else "recover"):
-                T_start = start.T_world_lidar if self._is_begun else T_prior
-                result = self._all.held(features, T_start, T_prior, result)
+                T_start = start.T_world_lidar if self._asks_all else T_prior
+                result = points.held(features, T_start, T_prior, result)
         if self.map is not None and not self._holds_place(result):
             with clock.stage("all-points"):
-                result = self._all.stand_in(features, T_prior, result, start if self._is_begun else None)
+                result = points.stand_in(features, T_prior, result, start if self._asks_all else None)
         return result
 
     def _holds_place(self, result: RegistrationResult) -> bool:
@@ -141,11 +146,12 @@ class FeatureRegistration(Stateful):
             self._inserted += 1
             if self.map is not None:
                 self.map.insert(features, result.T_world_lidar)
-            self._all.update(features, result)
+            if self._all is not None:
+                self._all.update(features, result)
             if self.target is not None and not result.is_denied:
                 self._starting = max(self._starting - 1, 0)
                 # All points agree less with their map than features do with theirs.
-                own = self._all.by_features(features, result)
+                own = result if self._all is None else self._all.by_features(features, result)
                 if own.ok:
                     self.agreement.observe(own.agreement)
                 move, turn = result.prior_error
@@ -188,30 +194,29 @@ class FeatureRegistration(Stateful):
         if self.map is not None:
             start = result.T_world_lidar if result.ok else T_start
             with clock.stage("map"):
-                points, scatter = _thinned(features) if self._with_less_planes else (features.planes.points, None)
+                points, scatter = thinned(features) if self._with_less_planes else (features.planes.points, None)
                 result = solve_on_map(
-                    self.map, features.edges.points, points, start, quick, self.noise, scatter=scatter,
-                    coarse=self.map.planes.coarsen(self._coarse_factor()) if self._starting else None,
-                )  # fmt: skip
+                    self.map, features.edges.points, points, start, quick, self.noise, scatter=scatter
+                )
             result = self._judge(result, T_prior)
         return replace(result, iterations=result.iterations + (iterations if self.map is not None else 0))
 
     @property
-    def _is_begun(self) -> bool:
+    def _asks_all(self) -> bool:
         """Whether so few scans were registered that all their points are asked for the pose, as `icp` asks them."""
-        return self.config.start_reach > 0 and self._inserted <= self.config.start_scans
+        is_begun = self.config.start_reach > 0 and self._inserted <= self.config.start_scans
+        return is_begun and self._all is not None
 
     def _capture(self, features: Features, T_prior: Floats) -> RegistrationResult:
         """A start that is metres nearer, where the prior may be metres off: less planar points on coarse planes."""
         c = self.config
-        if self._is_begun:
+        if self._asks_all and self._all is not None:
             return self._all.locate(features, T_prior)
-        points, scatter = _thinned(features)
+        points, scatter = thinned(features)
         target = self._planes()
         slow = Annealing(c.coarse_kernel, c.kernel_min, c.coarse_decay, c.start_iterations)
-        coarse = target.planes.coarsen(self._coarse_factor())
         result = solve_on_map(
-            target, NONE, points, T_prior, slow, self.noise, scatter=scatter, coarse=coarse, is_coarse_only=True
+            target, NONE, points, T_prior, slow, self.noise, scatter=scatter, levels=target.planes.coarser
         )
         return self._judge(result, T_prior)
 
@@ -223,7 +228,7 @@ class FeatureRegistration(Stateful):
         While the map is made of a few scans, all points have been asked already, and better than planes of one scan can be.
         """
         T_start = starved.T_world_lidar if starved.ok else start.T_world_lidar
-        result = start if self._is_begun else self._on_planes(features, T_start, T_prior)
+        result = start if self._asks_all else self._on_planes(features, T_start, T_prior)
         are_few = starved.inliers < MIN_FEATURES
         # They must close a direction; where features are too few to be sure of any, open none.
         if not result.ok or (starved.ok and len(result.degenerate) > len(starved.degenerate) - (not are_few)):
@@ -236,13 +241,11 @@ class FeatureRegistration(Stateful):
     def _on_planes(self, features: Features, T_start: Floats, T_prior: Floats) -> RegistrationResult:
         """Edges, and centroids of the less planar points, on fine and coarse planes."""
         c = self.config
-        points, scatter = _thinned(features)
-        target = self._planes()
+        points, scatter = thinned(features)
         quick = Annealing(c.kernel_max, c.kernel_min, c.kernel_decay, c.start_iterations)
         result = solve_on_map(
-            target, features.edges.points, points, T_start, quick, self.noise, scatter=scatter,
-            coarse=target.planes.coarsen(self._coarse_factor()),
-        )  # fmt: skip
+            self._planes(), features.edges.points, points, T_start, quick, self.noise, scatter=scatter
+        )
         return self._judge(result, T_prior)
 
     def _planes(self) -> FeatureMap:
@@ -257,17 +260,12 @@ class FeatureRegistration(Stateful):
     def _new_map(self, capacity: int) -> FeatureMap:
         c = self.config
         return FeatureMap(
-            self.loam.feature_map_voxel, plane_size=self._plane_size(), min_points=c.min_points, planarity=c.planarity,
-            count_cap=c.count_cap, reach=self._reach, capacity=capacity,
+            self.loam.feature_map_voxel, plane_size=self._plane_size(), coarse_factor=c.coarse_factor,
+            min_points=c.min_points, planarity=c.planarity, count_cap=c.count_cap, reach=self._reach, capacity=capacity,
         )  # fmt: skip
 
     def _plane_size(self) -> float:
         return surface_size(self.loam.feature_map_voxel, self.loam.grid_step)
-
-    def _coarse_factor(self) -> int:
-        """Coarse voxels are as large as those of `icp`."""
-        c = self.config
-        return max(2, round(c.coarse_factor * c.voxel_size / self._plane_size()))
 
     def _judge(self, result: RegistrationResult, T_prior: Floats) -> RegistrationResult:
         """The result with its correction of the prior, or a failed one that keeps the prior and says why."""
@@ -275,9 +273,3 @@ class FeatureRegistration(Stateful):
         return accepted(
             result, T_prior, c, self.agreement, c.start_overlap if self._starting else c.min_overlap, WORDING
         )
-
-
-def _thinned(features: Features) -> tuple[Floats, Floats]:
-    """Centroids (S, 3) of the less planar points and the scatter (S, 6) behind each."""
-    points, _, scatter, _ = voxel.centroids(features.less_planes.points.astype(np.float32), NO_TIMES, STAND_IN_GRID)
-    return points.astype(np.float64), scatter.astype(np.float64)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -68,23 +69,23 @@ def solve_on_scan(
 
 def solve_on_map(
     target: FeatureMap, edges: Floats, planes: Floats, T_prior: Floats, annealing: Annealing, noise: FeatureNoise, *,
-    scatter: Floats | None = None, coarse: GaussianMap | None = None, is_coarse_only: bool = False,
+    scatter: Floats | None = None, levels: Sequence[GaussianMap] | None = None,
 ) -> RegistrationResult:  # fmt: skip
     """Align edges (E, 3) and planar points (P, 3), LiDAR frame, with the feature map, starting at `T_prior` (4, 4).
 
     scatter : (P, 6) m2, of the points behind each planar point when that is a centroid
-    coarse : serves planar points without a plane in the map; alone when `is_coarse_only`
+    levels : of the map's planes, the finest first, each for the points without a plane in those before; None takes all
     """
     if scatter is None:
         scatter = np.zeros((len(planes), 6))
     lines, matches = target.edges, Matches(len(planes))
-    coarser = [] if coarse is None else [coarse]
-    levels = coarser if coarser and is_coarse_only else [target.planes, *coarser]
     on_lines = Term(
         linearise_lines, (edges,), (lines.moments, lines.keys, lines.table, *target.lines),
         (float(lines.size), float(noise.edge) ** 2, float(MIN_LINE_POINTS), FLOOR), slots_of(len(edges)),
     )  # fmt: skip
-    on_planes = voxel_terms(RESIDUALS["plane"], (planes, scatter), levels, matches, noise.plane, 0.0)
+    on_planes = voxel_terms(
+        RESIDUALS["plane"], (planes, scatter), levels or target.planes.levels, matches, noise.plane, 0.0
+    )
     limits = Limits(noise.weak_share, noise.least / noise.plane**2, unseen=1.0)
     found = optimise([on_lines, *on_planes], T_prior, annealing, limits, matches)
     return result_of(found, T_prior, len(edges) + len(planes))

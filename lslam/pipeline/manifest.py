@@ -86,6 +86,7 @@ class Manifest:
         }
         self.counts["standing"] = sum(r.is_standing for r in results)
         self.counts["degenerate"] = sum(len(r.degenerate) > 0 for r in results)
+        self.counts["fallback"] = sum(r.status == "ok" and bool(r.posed_by) for r in results)
         self.posed_by = dict(Counter(r.poser(self.config.odometry.method) for r in results))
         self._judge_degenerate(results)
         bad = [r for r in results if r.status != "ok"]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.preprocessing.prepare import PreparedPoints
 from lslam.registration.gaussian_map import GaussianMap
 from lslam.types.state import State, Stateful
 
@@ -49,12 +48,14 @@ class LocalMap(Stateful):
         """Fine voxels that hold points."""
         return len(self.fine)
 
-    def insert(self, points: PreparedPoints, T_world_lidar: NDArray[np.float64]) -> None:
-        """Enter a scan: its small centroids into fine voxels, its source points into all others."""
-        self.fine.insert(points.map_points, T_world_lidar)
-        source = points.source.astype(np.float32)
+    def insert(
+        self, map_points: NDArray[np.float32], source: NDArray[np.float64], T_world_lidar: NDArray[np.float64]
+    ) -> None:
+        """Enter a scan: its small centroids (M, 3) into fine voxels, its source points (S, 3) into all others."""
+        self.fine.insert(map_points, T_world_lidar)
+        few = source.astype(np.float32)
         for level in self.coarser:
-            level.insert(source, T_world_lidar)
+            level.insert(few, T_world_lidar)
 
     def clear(self) -> None:
         """Forget everything; the room is kept."""

@@ -30,7 +30,7 @@ class MapTarget(Stateful):
 
     def enter(self, target: LocalMap, points: PreparedPoints, T_world_lidar: Floats) -> None:
         """Add to the map."""
-        target.insert(points, T_world_lidar)
+        target.insert(points.map_points, points.source, T_world_lidar)
 
 
 class ScanTarget(Stateful):
@@ -39,7 +39,7 @@ class ScanTarget(Stateful):
     def enter(self, target: LocalMap, points: PreparedPoints, T_world_lidar: Floats) -> None:
         """Replace the map."""
         target.clear()
-        target.insert(points, T_world_lidar)
+        target.insert(points.map_points, points.source, T_world_lidar)
 
 
 class KeyframeTarget(Stateful):
@@ -60,12 +60,12 @@ class KeyframeTarget(Stateful):
                 return
         self.keyframes.append((points, T_world_lidar.copy()))
         if len(self.keyframes) <= self.count:
-            target.insert(points, T_world_lidar)
+            target.insert(points.map_points, points.source, T_world_lidar)
             return
         del self.keyframes[0]
         target.clear()
         for cloud, pose in self.keyframes:
-            target.insert(cloud, pose)
+            target.insert(cloud.map_points, cloud.source, pose)
 
 
 def make_target(kind: Literal["map", "keyframe", "scan"], keyframes: int) -> Target:

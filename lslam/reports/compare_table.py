@@ -14,7 +14,7 @@ from lslam.types.comparison import Comparison, Metric, Spread, SummaryRow
 
 STYLES = ("md", "csv", "tex")
 TITLES = {"error": "errors", "time": "time", "health": "scans and runs"}
-HEALTH = ("bridged", "skipped", "degenerate")
+HEALTH = ("bridged", "skipped", "degenerate", "fallback")
 
 
 @dataclass(frozen=True)
@@ -116,7 +116,7 @@ def write_files(out: Path, comparison: Comparison) -> None:
 def _methods_table(comparison: Comparison, groups: Sequence[str], title: str) -> CompareTable:
     metrics = [m for m in comparison.metrics if m.is_main and m.group in groups and m.key not in HEALTH]
     header = ["sequence", "method", *(f"{m.label}, {m.unit}" if m.unit != "x" else f"x {m.label}" for m in metrics)]
-    header += ["bridged/skipped/degenerate", "runs"] if "health" in groups else []
+    header += ["/".join(HEALTH), "runs"] if "health" in groups else []
     rows, best = [], set()
     for i, row in enumerate(comparison.rows):
         cells = [_cell(metric, row) for metric in metrics]

@@ -17,7 +17,7 @@ from lslam.types.study import StudyRow
 UNKNOWN = "-"
 # Columns of the table for programs, by quantity.
 _UNITS = {
-    "translation": "m", "angular": "deg", "time_per_scan": "ms", "total_time": "s",
+    "translation": "m", "angular": "deg", "time_per_scan": "ms", "total_time": "s", "fallback": "%",
     "efficiency": "1/(m deg s)", "total_efficiency": "1/(m deg s)",
 }  # fmt: skip
 
@@ -56,6 +56,7 @@ def study_recipes(result: StudyResult) -> list[str]:
         "registration: all stages of a scan but reading, preparing, standing still and keyframes",
         "E: 1 over translation, rotation and registration time per scan (equation 5.2); E tot: with the total time (5.3); both "
         "over the largest of the curve; median over seeds, a lost run counts as 0",
+        "fallback: scans that a recovery policy or another method posed",
         f"lost: a run that says so, or whose error is above {result.lost_above:.3g} m: 10 times the best of the study, and not "
         "less than the thesis takes for a result (2.2 m)",
         "diverges: the first value, lost in more than half of its runs, from which on more than half of the values are",
@@ -109,7 +110,7 @@ def _law_row(name: str, law: Law) -> tuple[str, ...]:
 def _means(result: StudyResult) -> CompareTable:
     head = (
         "method", result.parameters[0].rpartition(".")[2], "translation, m", "rotation, deg", "registration, ms", "total, s",
-        "E", "E tot", "lost/runs",
+        "fallback, %", "E", "E tot", "lost/runs",
     )  # fmt: skip
     rows: list[tuple[str, ...]] = []
     best = set()
@@ -118,7 +119,7 @@ def _means(result: StudyResult) -> CompareTable:
         for v, value in enumerate(curve.values):
             cells = [_mean(r.means[name], v, name) for name in _UNITS if not name.endswith("efficiency")]
             cells += [fixed(e[v], 2) if math.isfinite(e[v]) else UNKNOWN for e in share]
-            best |= {(len(rows), 6 + k) for k, e in enumerate(share) if e[v] == 1}
+            best |= {(len(rows), 7 + k) for k, e in enumerate(share) if e[v] == 1}
             rows.append((curve.label, curve.name_of(value), *cells, f"{curve.lost[v].sum()}/{curve.ran[v].sum()}"))
     return CompareTable("means over seeds", head, tuple(rows), 1, frozenset(best))
 
@@ -152,7 +153,7 @@ def _mean(means: Interval, v: int, name: str) -> str:
     text = (
         metres(mean)
         if name == "translation"
-        else fixed(mean, {"angular": 3, "time_per_scan": 1, "total_time": 2}[name])
+        else fixed(mean, {"angular": 3, "time_per_scan": 1, "total_time": 2, "fallback": 1}[name])
     )
     half = float(means.high[v] - mean)
     return f"{text} ± {fixed(half, len(text.partition('.')[2]))}" if math.isfinite(half) else text

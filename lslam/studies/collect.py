@@ -15,7 +15,10 @@ from lslam.studies.grid import Job
 from lslam.studies.states import FINAL, State, read_state
 from lslam.types.comparison import Metric, RunScore
 
-COUNTS = ("bridged", "skipped", "degenerate")
+COUNTS = {
+    "bridged": "bridged scans of a run", "skipped": "skipped scans of a run", "degenerate": "degenerate scans of a run",
+    "fallback": "scans of a run that a recovery policy or another method posed",
+}  # fmt: skip
 IMU = "imu_used"
 NO_TRUTH = "no ground truth"
 
@@ -126,7 +129,7 @@ def metrics_of(
         Metric("time.p95", "p95", "ms", "time", "all stages of a scan: 95th percentile over scans"),
         Metric("factor", "real time", "x", "time", "recorded time over processing time (mean)", "high"),
     ]
-    metrics += [Metric(key, key, "scans", "health", f"{key} scans of a run", "") for key in COUNTS]
+    metrics += [Metric(key, key, "scans", "health", recipe, "") for key, recipe in COUNTS.items()]
     return metrics + _for_programs(alignments, deltas, stages)
 
 

@@ -73,6 +73,7 @@ class Results:
             total_time_s=sum(stages_ms.values()) * scans / 1e3 if stages_ms else nan,
             run_s=values.get("run_s", nan),
             bridged_share=values["bridged"] / scans if scans else nan,
+            fallback_share=values.get("fallback", nan) / scans if scans else nan,
             is_timing_comparable=is_comparable(state),
             digest=job.digest,
             machine=state.machine,

@@ -22,7 +22,8 @@ class StudyRow:
         the first thesis; nan where there is none
     scans : processed; stages_ms : mean ms per scan by stage, in the order they are passed; total_time_s : of all stages over
         all scans; run_s : of the whole run with its reading and writing
-    bridged_share : of the scans, 0..1; is_timing_comparable : nothing else ran on the machine that the study knows of
+    bridged_share : of the scans, 0..1; fallback_share : likewise, that a recovery policy or another method posed
+    is_timing_comparable : nothing else ran on the machine that the study knows of
     digest : of the resolved configuration, the input and lslam's version; machine : name of the host
     folder : of the run, from the study's
     """
@@ -46,6 +47,7 @@ class StudyRow:
     total_time_s: float = nan
     run_s: float = nan
     bridged_share: float = nan
+    fallback_share: float = nan
     is_timing_comparable: bool = True
     digest: str = ""
     machine: str = ""

@@ -16,8 +16,8 @@ from lslam.types.study import StudyRow, Value
 DONE = StudyRow(
     "open-0/thesis-icp/1", "skip frames", "open", 0, "thesis-icp", True, {"input.skip_frames": 3, "map.voxel": 0.1 + 0.2},
     status="done", thesis_rmse=1 / 3, ate_se3=0.2, ate_origin=0.7, angular_rmse_deg=1.5, scans=9,
-    stages_ms={"read": 1.25, "register": 7.0}, total_time_s=0.5, run_s=2.0, bridged_share=0.0, digest="ab", machine="here",
-    folder="runs/1",
+    stages_ms={"read": 1.25, "register": 7.0}, total_time_s=0.5, run_s=2.0, bridged_share=0.0, fallback_share=0.125, digest="ab",
+    machine="here", folder="runs/1",
 )  # fmt: skip
 FAILED = replace(
     StudyRow("open-0/loam/2", "skip frames", "open", 0, "loam"), status="crashed", parameters={"registration.target": "scan"},
@@ -87,12 +87,12 @@ def test_no_rows_are_a_file_too(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "sentence"),
     [
-        ("\n1,", "\n7,", "another version of lslam.*study version 7.*--overwrite makes its runs anew"),
+        ("\n2,", "\n7,", "another version of lslam.*study version 7.*--overwrite makes its runs anew"),
         ("study_version,", "version,", "no column study_version"),
         ("ate_se3", "ate", "column ate_se3 is missing"),
         (",0.2,", ",much,", "line 2: could not convert string to float: 'much'"),
         (",true,", ",perhaps,", "line 2: 'perhaps' is neither true nor false"),
-        (",here,", ",", "line 2: 27 columns where the header has 28"),
+        (",here,", ",", "line 2: 28 columns where the header has 29"),
     ],
 )
 def test_what_is_no_result_of_this_version_is_said(tmp_path: Path, old: str, new: str, sentence: str) -> None:

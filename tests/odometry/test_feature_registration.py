@@ -190,8 +190,12 @@ def test_less_planar_points_may_stand_in_and_leave_a_direction_open(monkeypatch:
 def test_a_map_of_all_points_is_given_up_when_features_are_fed_again(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    registration, features = engine(None, True), features_at(np.eye(4))
+    registration = FeatureRegistration(
+        Config().registration, LoamConfig(), scan_step=None, with_map=True, with_all_points=True
+    )
+    features = features_at(np.eye(4))
     registration.update(features, registration.locate(features, np.eye(4), StageClock()))
+    assert registration._all is not None
     entered = []
     for is_starved in (False, True, *[False] * (FED + 2)):
         monkeypatch.setattr(registration, "_holds_place", lambda result, starved=is_starved: not starved)

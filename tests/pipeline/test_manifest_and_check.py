@@ -47,6 +47,7 @@ def test_problems_name_the_first_bad_scan_by_its_number_in_the_recording() -> No
         "skipped": 1,
         "standing": 0,
         "degenerate": 0,
+        "fallback": 0,
     }
     assert "2 of 4 scans" in manifest.problems[0]
     assert "scan 11: why 1" in manifest.problems[0]

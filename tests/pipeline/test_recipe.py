@@ -83,6 +83,7 @@ def test_a_good_run_writes_everything_and_ends_done(tmp_path: Path) -> None:
         "skipped": 0,
         "standing": 0,
         "degenerate": 0,
+        "fallback": 0,
     }
     assert facts["sequence"]["decisions"] == ["a note of the reader"]
     assert facts["frames"]["trajectory_kitti.txt"].startswith("camera 0")

@@ -33,7 +33,7 @@ def assert_same(a: GaussianMap, b: GaussianMap) -> None:
 
 def test_map_points_enter_fine_voxels_and_source_points_all_larger_ones() -> None:
     target, points, T = new_map(), scan(0), pose_at((1.0, 2.0, 0.5), 30.0)
-    target.insert(points, T)
+    target.insert(points.map_points, points.source, T)
     kept = {"min_points": 6, "planarity": 0.3, "count_cap": 200.0, "reach": 100.0, "breadth": BREADTH}
     fine, *coarser = (GaussianMap(size, **kept) for size in (0.8, 3 * 0.8, 6 * 0.8, 12 * 0.8))
     fine.insert(points.map_points, T)
@@ -46,11 +46,11 @@ def test_map_points_enter_fine_voxels_and_source_points_all_larger_ones() -> Non
 
 def test_all_levels_are_forgotten_and_taken_up_again() -> None:
     target = new_map()
-    target.insert(scan(0), np.eye(4))
+    target.insert(scan(0).map_points, scan(0).source, np.eye(4))
     known, again = deepcopy(target.state()), new_map()
     again.restore(known)
     for one in (target, again):
-        one.insert(scan(1), pose_at((0.3, 0.0, 0.0)))
+        one.insert(scan(1).map_points, scan(1).source, pose_at((0.3, 0.0, 0.0)))
     for a, b in zip(target.levels, again.levels, strict=True):
         live = np.sort(a.keys[a.keys >= 0])
         np.testing.assert_array_equal(live, np.sort(b.keys[b.keys >= 0]))

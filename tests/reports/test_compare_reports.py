@@ -26,7 +26,7 @@ def test_one_row_per_method_with_spread_failures_and_words_for_what_is_missing(t
     main, pairs, differences, failures = tables(comparison(tmp_path))
     cells = [dict(zip(main.header, line, strict=True)) for line in main.rows]
     assert cells[0]["ATE se3, m"] == "0.100 ± 0.020"
-    assert cells[1]["bridged/skipped/degenerate"] == "1.5/-/-"
+    assert cells[1]["bridged/skipped/degenerate/fallback"] == "1.5/-/-/-"
     assert cells[2]["ATE se3, m"] == "no ground truth"
     assert cells[3]["ATE se3, m"] == "failed"
     assert [c["runs"] for c in cells] == ["2/2", "2/2", "1/1", "0/1"]

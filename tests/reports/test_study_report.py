@@ -28,7 +28,7 @@ def row(value: float, seed: int, method: str, uses_imu: bool = False, **more: ob
     plain = StudyRow(
         f"{method}-{uses_imu}-{value}-{seed}", "skip", "open", seed, method, uses_imu, {SKIP: value}, status="done",
         thesis_rmse=0.5, angular_rmse_deg=2.0, scans=100, stages_ms={"read": 5.0, "scan": 60.0, "map": 40.0},
-        total_time_s=40.0 / value,
+        total_time_s=40.0 / value, fallback_share=0.125,
     )  # fmt: skip
     return replace(plain, **more)  # type: ignore[arg-type]
 
@@ -159,8 +159,11 @@ def test_means_stand_in_all_tables_alike(folder: Path, results: list[StudyResult
     assert float(said["total_efficiency (1/(m deg s))"]) == pytest.approx(0.025)
     assert float(said["time_per_scan (ms)"]) == pytest.approx(100)
     text = (folder / "report.md").read_text()
-    assert "| icp | 1 | 0.500 ± 0.000 | 2.000 ± 0.000 | 100.0 ± 0.0 | 40.00 ± 0.00 | 1.00 | 0.20 | 0/2 |" in text
-    assert "| loam+imu | 9 | - | - | - | - | - | - | 0/0 |" in text
+    assert (
+        "| icp | 1 | 0.500 ± 0.000 | 2.000 ± 0.000 | 100.0 ± 0.0 | 40.00 ± 0.00 | 12.5 ± 0.0 | 1.00 | 0.20 | 0/2 |"
+        in text
+    )
+    assert "| loam+imu | 9 | - | - | - | - | - | - | - | 0/0 |" in text
     latex = (folder / "report.tex").read_text()
     assert latex.count(r"\begin{tabular}") == latex.count(r"\end{tabular}") == 6
     assert r"gone\_by 100\%" in latex

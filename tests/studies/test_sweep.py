@@ -165,7 +165,7 @@ def test_an_interruption_says_how_to_go_on(made: list[StudyRow], sweep: Sweep, t
 def test_results_of_another_version_are_not_mixed(sweep: Sweep, made: list[StudyRow], tmp_path: Path) -> None:
     shutil.copytree(sweep.place.out, tmp_path / "out")
     file = tmp_path / "out" / "results.csv"
-    file.write_text(file.read_text().replace("\n1,", "\n0,"))
+    file.write_text(file.read_text().replace("\n2,", "\n0,"))
     with pytest.raises(InputError, match="written by another version of lslam"):
         run_sweep(elsewhere(sweep, tmp_path / "out", True), Local(1))
     anew = elsewhere(sweep, tmp_path / "out", parameters={"input.skip_frames": [2]}, beside=[])

@@ -1,0 +1,28 @@
+"""Every method poses scans in its own way: no two of them give one trajectory, and nobody else poses a scan for them."""
+
+from __future__ import annotations
+
+from itertools import combinations
+
+import numpy as np
+
+from lslam.config import load_config
+from lslam.odometry import METHODS, create_odometry
+from lslam.pipeline.front_end import estimate
+from lslam.simulation.scenarios import simulate
+
+FOREIGN = {"kiss-icp", "small-gicp", "open3d-gicp", "poses"}
+# Their own ways of looking twice.
+OWN = {"", "less planar points", "coarse-to-fine", "start search"}
+
+
+def test_no_two_methods_give_the_same_trajectory() -> None:
+    drive = simulate("block", seed=1, lidar="vlp16", count=12, motion_compensated=True)
+    trajectories = {}
+    for method in sorted(set(METHODS) - FOREIGN):
+        results = estimate(drive, create_odometry(load_config(None, [f"odometry.method={method}"], {})))
+        assert {r.posed_by for r in results} <= OWN, method
+        trajectories[method] = np.stack([r.T_world_lidar for r in results])
+    assert len(trajectories) >= 10
+    for one, other in combinations(trajectories, 2):
+        assert np.abs(trajectories[one] - trajectories[other]).max() > 1e-6, f"{one} and {other}"
