@@ -20,6 +20,11 @@ class RegistrationConfig(Section):
         description="how a point is measured against the map: point to point, point to plane, plane to plane, "
         "distribution to distribution, NDT score; absent: what the method is named after, of icp the plane",
     )
+    neighbourhood: Literal["voxel", "knn"] = Field(
+        "voxel",
+        description="`gicp` and `vgicp`: a point's surface is that of its scan in the voxel around, where several rings make "
+        "one, or of its twenty nearest neighbours, as in the paper",
+    )
     target: Literal["map", "keyframe", "scan"] = Field(
         "map",
         description="registered against a map of all scans near by, of the last keyframes, or the last scan alone",

@@ -112,7 +112,7 @@ class Registration(Stateful):
         if len(self.map) == 0:
             return RegistrationResult(T_prior, covariance=np.diag([1e-12] * 6), source_points=count)
         if self.residual in NEEDS_COVARIANCE and points.covariance is None:
-            found = source_covariance(points.source, points.map_points, c.sigma**2)
+            found = source_covariance(points.source, points.map_points, c.sigma**2, c.neighbourhood)
             points = replace(points, covariance=found)
         if self.residual == "point":
             points = replace(points, gaps=self._gaps(points))

@@ -2,23 +2,51 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.kernels.discs import source_discs
+from lslam.kernels.discs import EXTENT2, source_discs
 from lslam.registration.gaussian_map import GaussianMap
 
 # m; a sparse sensor's neighbouring rings share a cell of the second size, where the first holds one of them.
 CELL = 1.0
 WIDENING = 2
+# As many neighbours as Segal et al. (2009) take.
+NEIGHBOURS = 20
+
+Neighbourhood = Literal["voxel", "knn"]
 
 
 def source_covariance(
-    source: NDArray[np.float64], map_points: NDArray[np.float32], thin: float
-) -> NDArray[np.float64]:  # fmt: skip
+    source: NDArray[np.float64], map_points: NDArray[np.float32], thin: float, neighbourhood: Neighbourhood = "voxel"
+) -> NDArray[np.float64]:
     """Covariances (S, 6), m2, LiDAR frame, of source points (S, 3): discs of variance `thin` along their normal.
 
-    The normal is that of the scan's own points in the cell around. A ring by itself has none: a disc across it would be
+    neighbourhood : of which of the scan's own points (M, 3): `_of_voxels` or `_of_neighbours`
+    """
+    return (_of_neighbours if neighbourhood == "knn" else _of_voxels)(source, map_points, thin)
+
+
+def _of_neighbours(
+    source: NDArray[np.float64], map_points: NDArray[np.float32], thin: float
+) -> NDArray[np.float64]:  # fmt: skip
+    """As generalized ICP has it: the normal of the nearest points, whether these are of several rings or of one."""
+    from scipy.spatial import cKDTree
+
+    cloud = map_points.astype(np.float64)
+    near = cloud[cKDTree(cloud).query(source, min(NEIGHBOURS, len(cloud)))[1].reshape(len(source), -1)]
+    away = near - near.mean(axis=1, keepdims=True)
+    normal = np.linalg.eigh(np.swapaxes(away, 1, 2) @ away)[1][:, :, 0]
+    discs = EXTENT2 * np.eye(3) - (EXTENT2 - thin) * normal[:, :, None] * normal[:, None, :]
+    return np.ascontiguousarray(discs[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]])
+
+
+def _of_voxels(
+    source: NDArray[np.float64], map_points: NDArray[np.float32], thin: float
+) -> NDArray[np.float64]:  # fmt: skip
+    """The normal is that of the scan's own points in the cell around. A ring by itself has none: a disc across it would be
     a guess that holds the sensor to where the ring was. Such points get no normal but their noise, `thin` in all
     directions, and the map's normal alone decides.
     """

@@ -1,0 +1,63 @@
+"""The surface round a source point: of its voxel, where several rings make one, or of its nearest neighbours."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from analytic_scenes import is_near, random_pose, room, seen_from
+from numpy.typing import NDArray
+
+from lslam.config.registration import RegistrationConfig
+from lslam.recovery.policies import RecoveringRegistration
+from lslam.registration.source_covariance import NEIGHBOURS, Neighbourhood, source_covariance
+
+THIN = 9e-4
+
+
+def full(six: NDArray[np.float64]) -> NDArray[np.float64]:
+    return six[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
+
+
+def test_neighbours_are_the_twenty_nearest_and_make_a_disc() -> None:
+    rng = np.random.default_rng(0)
+    cloud = room(rng).astype(np.float32)[::5]
+    source = cloud[::50].astype(np.float64) + rng.normal(0, 0.02, (len(cloud[::50]), 3))
+    found = full(source_covariance(source, cloud, THIN, "knn"))
+    for point, C in zip(source, found, strict=True):
+        near = cloud[np.argsort(((cloud - point) ** 2).sum(1), kind="stable")[:NEIGHBOURS]].astype(np.float64)
+        _, vectors = np.linalg.eigh(np.cov(near.T))
+        values, axes = np.linalg.eigh(C)
+        np.testing.assert_allclose(values, [THIN, 1.0, 1.0], atol=1e-9)
+        assert abs(axes[:, 0] @ vectors[:, 0]) > 1 - 1e-6
+
+
+def test_one_ring_has_no_surface_in_its_voxel_and_a_false_one_of_its_neighbours() -> None:
+    """Twenty points along a line have some normal; it is that of nothing."""
+    along = np.linspace(0, 2 * np.pi, 2000)
+    ring = np.column_stack([8 * np.cos(along), 8 * np.sin(along), np.full_like(along, -1.7)]).astype(np.float32)
+    source = ring[::40].astype(np.float64)
+    np.testing.assert_allclose(
+        full(source_covariance(source, ring, THIN, "voxel")), THIN * np.tile(np.eye(3), (50, 1, 1))
+    )
+    assert np.all(np.linalg.eigvalsh(full(source_covariance(source, ring, THIN, "knn")))[:, 1] > 0.99)
+
+
+@pytest.mark.parametrize("neighbourhood", ["voxel", "knn"])
+@pytest.mark.parametrize("residual", ["gicp", "vgicp"])
+def test_either_finds_a_known_motion(residual: str, neighbourhood: Neighbourhood) -> None:
+    rng = np.random.default_rng(3)
+    registration = RecoveringRegistration(RegistrationConfig(residual=residual, neighbourhood=neighbourhood))
+    registration.register(room(np.random.default_rng(0)).astype(np.float32))
+    T = random_pose(rng, 0.5, 3.0)
+    assert is_near(T, registration.register(seen_from(room(rng), T)).T_world_lidar, 0.01, 0.05)
+
+
+def test_they_are_not_the_same() -> None:
+    poses = []
+    for neighbourhood in ("voxel", "knn"):
+        rng = np.random.default_rng(3)
+        config = RegistrationConfig.model_validate({"residual": "gicp", "neighbourhood": neighbourhood})
+        registration = RecoveringRegistration(config)
+        registration.register(room(np.random.default_rng(0)).astype(np.float32))
+        poses.append(registration.register(seen_from(room(rng), random_pose(rng, 0.5, 3.0))).T_world_lidar)
+    assert not np.array_equal(poses[0], poses[1])
