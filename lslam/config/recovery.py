@@ -19,6 +19,9 @@ class RecoveryConfig(Section):
     start_search: bool = Field(
         True, description="seek the first steps within `registration.start_reach`, told by the points above the ground"
     )
+    less_planar: bool = Field(
+        True, description="LOAM methods: less planar points in place of features that are few or leave a direction open"
+    )
     fallback: Literal["none", "all-points"] = Field(
         "none", description="who poses a scan that LOAM's features hold badly: nobody, or `icp` on all its points"
     )

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.config.loam import LoamConfig
+from lslam.config.recovery import RecoveryConfig
 from lslam.config.registration import RegistrationConfig
 from lslam.odometry.all_points import AllPoints
 from lslam.odometry.feature_map import FeatureMap, thinned
@@ -41,7 +42,7 @@ class FeatureRegistration(Stateful):
     with_map : whether the pose is found, or refined, on the feature map
     with_less_planes : whether the map is matched with centroids of the less planar points in place of the planar points
     reach : m, how far from the sensor the map is kept
-    with_all_points : whether `icp` on all points poses a scan that features hold badly
+    recovery : what is tried where features are not enough; its `start_search` is that of all points
     """
 
     STATE = (
@@ -50,9 +51,9 @@ class FeatureRegistration(Stateful):
 
     def __init__(
         self, config: RegistrationConfig, loam: LoamConfig, *, scan_step: ScanStep | None, with_map: bool,
-        with_less_planes: bool = False, reach: float = 120.0, with_all_points: bool = False,
+        with_less_planes: bool = False, reach: float = 120.0, recovery: RecoveryConfig | None = None,
     ) -> None:  # fmt: skip
-        self.config, self.loam = config, loam
+        self.config, self.loam, self.recovery = config, loam, recovery or RecoveryConfig()
         self._step, self._with_less_planes, self._reach = scan_step, with_less_planes, reach
         self.map: FeatureMap | None = self._new_map(1 << 16) if with_map else None
         self.target: FeatureScan | None = None
@@ -63,7 +64,7 @@ class FeatureRegistration(Stateful):
         self._inserted = 0
         self._failures = 0
         size = surface_size(config.voxel_size, loam.grid_step)
-        self._all = AllPoints(config, size) if with_all_points else None
+        self._all = AllPoints(config, size) if self.recovery.fallback == "all-points" else None
 
     @property
     def noise(self) -> FeatureNoise:
@@ -88,7 +89,8 @@ class FeatureRegistration(Stateful):
         if is_near:
             result = self._attempt(features, T_prior, T_prior, clock, self._near)
             return self._kept(result, T_prior, T_prior) if result.ok else result
-        if self._starting > 0:
+        captures = self.recovery.coarse_to_fine
+        if self._starting > 0 and captures:
             with clock.stage("start"):
                 start = self._capture(features, T_prior)
             result = self._attempt(features, start.T_world_lidar, T_prior, clock, self._quick)
@@ -96,7 +98,8 @@ class FeatureRegistration(Stateful):
             start = RegistrationResult(T_prior)
             result = self._attempt(features, T_prior, T_prior, clock, self._quick)
             move, turn = result.prior_error
-            if not result.ok or move > self.config.recover_m or turn > np.deg2rad(self.config.recover_deg):
+            is_off = not result.ok or move > self.config.recover_m or turn > np.deg2rad(self.config.recover_deg)
+            if is_off and captures:
                 with clock.stage("recover"):
                     start = self._capture(features, T_prior)
                 again = self._attempt(features, start.T_world_lidar, T_prior, clock, self._quick)
@@ -104,7 +107,7 @@ class FeatureRegistration(Stateful):
                     result = again
         # One scan's planes hold no more than its features do: only a map can close a direction that these leave open.
         is_open = len(result.degenerate) > 0 and self.map is not None
-        if not result.ok or result.inliers < MIN_FEATURES or is_open:
+        if self.recovery.less_planar and (not result.ok or result.inliers < MIN_FEATURES or is_open):
             with clock.stage("stand-in"):
                 result = self._stand_in(features, start, T_prior, result)
         if result.ok:

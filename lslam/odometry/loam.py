@@ -65,7 +65,7 @@ class Loam(Stateful):
         c, v = self.config, self.variant
         self.registration = FeatureRegistration(
             c.registration, c.loam, scan_step=v.scan_step, with_map=v.with_map, with_less_planes=v.with_less_planes,
-            reach=1.2 * c.preprocess.range_max, with_all_points=c.recovery.fallback == "all-points",
+            reach=1.2 * c.preprocess.range_max, recovery=c.recovery,
         )  # fmt: skip
         self._uncertainty = PoseUncertainty(is_scan_to_scan=not v.with_map)
 

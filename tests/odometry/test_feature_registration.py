@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from lslam.config.config import Config
 from lslam.config.loam import LoamConfig
+from lslam.config.recovery import RecoveryConfig
 from lslam.geometry import se3
 from lslam.odometry.all_points import FED
 from lslam.odometry.feature_registration import FeatureRegistration
@@ -191,7 +192,11 @@ def test_a_map_of_all_points_is_given_up_when_features_are_fed_again(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     registration = FeatureRegistration(
-        Config().registration, LoamConfig(), scan_step=None, with_map=True, with_all_points=True
+        Config().registration,
+        LoamConfig(),
+        scan_step=None,
+        with_map=True,
+        recovery=RecoveryConfig(fallback="all-points"),
     )
     features = features_at(np.eye(4))
     registration.update(features, registration.locate(features, np.eye(4), StageClock()))
