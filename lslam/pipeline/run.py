@@ -22,6 +22,7 @@ from lslam.pipeline.check import check_config
 from lslam.pipeline.checkpoints import Checkpoints, OdometryCheckpoints
 from lslam.pipeline.choose import choose_scans
 from lslam.pipeline.feature_pass import build_feature_map
+from lslam.pipeline.feature_view import view_features
 from lslam.pipeline.front_end import sweep_of
 from lslam.pipeline.georeferencing import require_gnss
 from lslam.pipeline.given_poses import bind
@@ -255,6 +256,8 @@ def _report(folder: RunFolder, job: _Job, record: RunRecord, evaluation: Evaluat
     record.manifest = manifest.as_dict(manifest.outcome)
     with manifest.timed("report_s"):
         if job.config.report.html:
+            if isinstance(job.odometry, FeatureSource):
+                record.features = view_features(job.sequence, job.odometry, record.results)
             outputs.write_html(folder, record, evaluation)
     record.manifest = manifest.as_dict(manifest.outcome)
 

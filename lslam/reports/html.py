@@ -12,6 +12,7 @@ from lslam.reports import plots
 from lslam.reports.back_end import back_end_figures
 from lslam.reports.buildings import building_pages
 from lslam.reports.facts import RunFacts, run_facts
+from lslam.reports.feature_view import feature_figures
 from lslam.reports.metrics import counted, metres, metric_tables
 from lslam.reports.png import data_uri, density_png
 from lslam.reports.text import imu_rows
@@ -73,6 +74,7 @@ def render_report(record: RunRecord, evaluation: Evaluation | None) -> str:
         time=plots.time_figure(record, facts) if facts.stages else None,
         share_bar=plots.share_bar(facts) if facts.stages else "",
         registration=plots.registration_figures(record),
+        features=feature_figures(record.features),
         imu=[said for _, said in imu_rows(record)],
         uncertainty=plots.uncertainty_figures(record),
         facts_of_input=flatten(record.manifest),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -29,12 +30,14 @@ def plane_chart(
     *,
     backdrop: tuple[str, tuple[float, float, float, float]] | None = None,
     points: NDArray[Any] | None = None,
+    dots: Sequence[tuple[str, NDArray[Any]]] = (),
     width: int = svg.WIDTH,
     tallest: int = 460,
 ) -> str:
     """Tracks from above, x to the right, y up; `backdrop` is an image's address and its extent (x0, x1, y0, y1).
 
-    `points` (K, 2) are marked as failures. Empty text when nothing is finite.
+    `points` (K, 2) are marked as failures; `dots` are points (K, 2) in a style each, one group over
+    the other. Empty text when nothing is finite.
     """
     xs, ys = [t.xy[:, 0] for t in tracks], [t.xy[:, 1] for t in tracks]
     if backdrop is not None:
@@ -52,6 +55,10 @@ def plane_chart(
             f'<image class="density" x="{left:.1f}" y="{top:.1f}" width="{right - left:.1f}" '
             f'height="{bottom - top:.1f}" preserveAspectRatio="none" href="{backdrop[0]}"/>'
         )
+    for style, group in dots:
+        px, py = frame.px(group[:, 0]), frame.py(group[:, 1])
+        path = "".join(f"M{x:.1f} {y:.1f}h0" for x, y in zip(px.tolist(), py.tolist(), strict=True))
+        frame.add(f'<path class="points {style}" d="{path}"/>')
     for track in tracks:
         xy = np.asarray(track.xy, np.float64)
         xy = xy[:: max(1, -(-len(xy) // MOST_POINTS))]

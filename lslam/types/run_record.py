@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from lslam.types.building_correction import CorrectedMap
 from lslam.types.building_match import OsmMatches
 from lslam.types.constraint import LoopCandidate, Turn
+from lslam.types.feature_view import FeatureView
 from lslam.types.georeference import Georeference
 from lslam.types.loop_view import LoopView
 from lslam.types.map_score import Crispness
@@ -36,6 +37,7 @@ class RunRecord:
         of that map, where they really stand
     loops : candidates with verdicts, between keyframes; keyframe_scans : (K,) position of each one's scan in `results`
     loop_view : the map at the loop that was corrected most, None without one
+    features : what a feature method saw, None of another
     """
 
     name: str
@@ -59,5 +61,6 @@ class RunRecord:
     keyframe_scans: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
     georeference: Georeference | None = None
     loop_view: LoopView | None = None
+    features: FeatureView | None = None
     osm: OsmMatches | None = None
     buildings: CorrectedMap | None = None
