@@ -8,7 +8,7 @@ import numpy as np
 
 from lslam.config.finding import Finding
 from lslam.evaluation.curves import NOT_REGISTRATION
-from lslam.evaluation.landmarks import elbow, optimum
+from lslam.evaluation.landmarks import Rise, elbow, optimum, rise_below
 from lslam.evaluation.laws import FEWEST, fit_law
 from lslam.types.sensitivity import CurveResult, Floats, Law, LawKind, Optimum, Outcome, Verdict
 
@@ -16,6 +16,10 @@ R2 = 0.95
 OWN_SHARE = 0.8  # of the change of all stages, for a parameter that acts on one of them
 LEAST_CHANGE = 0.1  # of registration's time: below it nothing was acted on
 UNITS = {"translation": "m", "angular": "deg", "time_per_scan": "ms", "total_time": "s"}
+BELOW: dict[Rise, str] = {
+    "worse": "it is worse by more than the seeds scatter", "as good": "it is as good",
+    "unknown": "too few runs say whether it rises",
+}  # fmt: skip
 _OF_TIME = ("time_per_scan", "total_time")
 _LAWS: tuple[LawKind, ...] = ("linear", "inverse", "product")
 _OF_WORDS = ("matters_little", "acts_only_on")
@@ -104,6 +108,9 @@ def _between(finding: Finding, result: CurveResult, *, is_highest: bool) -> Judg
         f"within 10 % from {best.low:g} to {best.high:g}" if best.low < best.high else "no value beside it within 10 %"
     )
     said = f"{finding.of.replace('_', ' ')} is {word} at {best.value:g} ({flat})"
+    ran = _run_values(result)
+    if low <= best.value <= high and ((ran[0] > low or ran[-1] < high) or (ran[0] >= low and ran[-1] <= high)):
+        return "undecided", f"{said}, but only values from {ran[0]:g} to {ran[-1]:g} were run"
     if low <= best.value <= high:
         own = _best_by_seed(finding, result, is_highest)
         agree = sum(seed.low <= high and seed.high >= low for seed in own)
@@ -129,19 +136,27 @@ def _elbow_at(finding: Finding, result: CurveResult) -> Judged:
     if found == values[0]:
         outcome: Outcome = "undecided" if expected <= values[0] else "refuted"
         return outcome, f"there is no elbow: {found:g}, the smallest value, is as good as the others"
-    is_near = abs(_place(values, found) - _place(values, expected)) <= 1
-    return "confirmed" if is_near else "refuted", f"the error is on its plateau from {found:g} on"
+    said = f"the error is on its plateau from {found:g} on"
+    if abs(_place(values, found) - _place(values, expected)) > 1:
+        return "refuted", said
+    below = rise_below(result.curve, found)
+    return "confirmed" if below == "worse" else "undecided", f"{said}; below {BELOW[below]}"
 
 
 def _good_from(finding: Finding, result: CurveResult) -> Judged:
+    """Confirmed when the error has come to its plateau there and a value below is worse, refuted when these are as good."""
     found = _elbow(result)
     if found is None:
         return "refuted", "the error comes to no plateau"
     values, expected = _run_values(result), finding.values[0]
     if not values[0] <= expected <= values[-1]:
         return "undecided", f"values from {values[0]:g} to {values[-1]:g} were run"
-    outcome: Outcome = "confirmed" if found <= expected else "refuted"
-    return outcome, f"the error is on its plateau from {found:g} on"
+    said = f"the error is on its plateau from {found:g} on"
+    if found > expected:
+        return "refuted", said
+    below = rise_below(result.curve, expected)
+    outcomes: dict[Rise, Outcome] = {"worse": "confirmed", "as good": "refuted", "unknown": "undecided"}
+    return outcomes[below], f"{said}; below {expected:g} {BELOW[below]}"
 
 
 def _matters_little(finding: Finding, result: CurveResult) -> Judged:

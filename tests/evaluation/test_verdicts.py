@@ -162,6 +162,32 @@ def test_elbow() -> None:
     assert {outcome(unsteady, "elbow_at", 0.2), outcome(unsteady, "good_from", 0.2)} == {"refuted"}
 
 
+def test_a_bound_needs_values_below_it_that_are_worse() -> None:
+    """That errors rise only below a share of 0.2 is not shown by a plateau that begins at the smallest value run."""
+    flat = rows_of(DISTANCES, "imu.inlier_distance", noise=0.02)
+    found = verdict(flat, "good_from", 0.3)
+    assert (found.outcome, "below 0.3 it is as good" in found.measured) == ("refuted", True)
+    assert outcome(flat, "good_from", 0.1) == "undecided", "nothing was run below"
+    rises = rows_of(DISTANCES, "imu.inlier_distance", error=lambda v: 0.5 if v >= 0.3 else 0.7, noise=0.02)
+    assert outcome(rises, "good_from", 0.3) == "confirmed"
+    assert outcome([r for r in rises if r.seed == 0], "good_from", 0.3) == "undecided", "one seed has no scatter"
+    lost = rows_of(DISTANCES, "imu.inlier_distance", diverges=lambda v: v < 0.2)
+    assert outcome(lost, "good_from", 0.2) == "confirmed"
+    # One seed of three is worse below, by so much that the mean is too.
+    unlucky = [
+        replace(r, thesis_rmse=1.0) if r.seed == 0 and r.parameters["imu.inlier_distance"] < 0.3 else r for r in flat
+    ]
+    assert outcome(unlucky, "good_from", 0.3) == "refuted"
+
+
+def test_a_range_needs_values_beside_it() -> None:
+    falling = rows_of((1.0, 1.5, 2.0), "loam.grid_step", error=lambda v: 1 / v)
+    assert outcome(falling, "best_between", 1, 2) == "undecided"
+    assert outcome(falling, "best_between", 1.5, 3) == "undecided", "nothing was run above"
+    assert outcome(falling, "best_between", 1.5, 2) == "confirmed", "the range ends where the values do"
+    assert outcome(falling, "largest_between", 0.5, 1.5, of="translation") == "undecided"
+
+
 def test_little_influence() -> None:
     flat = rows_of(SKIPS, error=lambda v: 0.5 + 0.005 * v)
     assert outcome(flat, "matters_little", 1.5, of="translation") == "confirmed"
