@@ -20,16 +20,15 @@ if TYPE_CHECKING:
 
 @click.command(
     epilog="\b\nExamples: lslam sweep --list\n"
-    "          lslam sweep skip-frames --dry-run\n"
+    "          lslam sweep skip-frames --dry-run --pilot\n"
     "          lslam sweep STUDY.toml --out runs/shares --jobs 2\n"
     "          lslam sweep STUDY.toml --out runs/shares --scheduler tcp://node1:8786 --resume\n"
     "          lslam sweep --report runs/shares"
 )
 @click.argument("study", required=False)
 @click.option("--list", "show_list", is_flag=True, help="List the studies that ship with lslam.")
-@click.option(
-    "--dry-run", is_flag=True, help="List and count the runs, estimate the time by a few short ones, and stop."
-)
+@click.option("--dry-run", is_flag=True, help="List and count the runs, and stop; the time, as finished ones took it.")
+@click.option("--pilot", is_flag=True, help="With --dry-run: estimate the time by a few short runs.")
 @options.studied
 @click.option(
     "--report", type=click.Path(path_type=Path), metavar="DIR",
@@ -59,6 +58,8 @@ def command(study: str | None, **given: Any) -> None:
             raise click.UsageError(f"--report writes the report of a folder and runs nothing: leave out {study}")
         _report(given["report"])
         return
+    if given["pilot"] and not given["dry_run"]:
+        raise click.UsageError("--pilot estimates the time of a --dry-run: give both")
     if study is None:
         raise click.UsageError("STUDY is missing; for example: lslam sweep skip-frames --dry-run")
     from lslam.errors import GateError
@@ -69,7 +70,7 @@ def command(study: str | None, **given: Any) -> None:
         from lslam.cli.study_screen import bars, best_so_far
 
         if given["dry_run"]:
-            _print_plan(sweep, engine.at_once, stack)
+            _print_plan(sweep, engine.at_once, given["pilot"], stack)
             return
         on_rows = stack.enter_context(best_so_far())
         rows = run_sweep(sweep, engine, bars(stack), on_rows)
@@ -120,10 +121,10 @@ def _print_list() -> None:
         show(f"{name:<22}  {find_study(name).summary}\n")
 
 
-def _print_plan(sweep: Sweep, at_once: int, stack: ExitStack) -> None:
+def _print_plan(sweep: Sweep, at_once: int, is_piloted: bool, stack: ExitStack) -> None:
     """Every run, how many there are, and how long those will take that are not finished."""
     from lslam.cli.study_screen import bars
-    from lslam.studies.estimate import estimate
+    from lslam.studies.estimate import estimate, from_finished
     from lslam.studies.expanded import left_to_do
     from lslam.studies.sweep import expand_study
 
@@ -135,5 +136,12 @@ def _print_plan(sweep: Sweep, at_once: int, stack: ExitStack) -> None:
     if not left:
         show(f"{many}\n")
         return
-    guess = estimate(left, expanded.contenders, at_once, bars(stack), time.process_time())
-    show(f"{many}: about {guess.text}, {at_once} at once ({guess.pilots} pilot runs)\n")
+    if is_piloted:
+        guess = estimate(left, expanded.contenders, at_once, bars(stack), time.process_time())
+        show(f"{many}: about {guess.text}, {at_once} at once ({guess.pilots} pilot runs)\n")
+        return
+    earlier = from_finished(expanded.jobs, left, expanded.contenders, at_once)
+    if earlier is None:
+        show(f"{many}; how long they take says --pilot, by a few short ones\n")
+    else:
+        show(f"{many}: about {earlier.text}, {at_once} at once (as the finished ones took)\n")

@@ -1,4 +1,4 @@
-"""How long a study will take, from short pilot runs of its methods at a few points of their parameters."""
+"""How long a study will take: from runs of it that are finished, or from short pilot runs at a few points of its parameters."""
 
 from __future__ import annotations
 
@@ -83,6 +83,25 @@ class _Group:
     pilots: list[list[_Pilot]]
 
 
+def from_finished(
+    jobs: Sequence[Job], left: Sequence[Job], contenders: dict[str, Contender], at_once: int
+) -> Guess | None:
+    """Time that the `left` of a study's `jobs` will take, from what its finished runs took; None without any.
+
+    A run takes as long as those of its sequence and method did in the mean, or as all did where none of these is finished.
+    """
+    open_ones = {job.folder for job in left}
+    taken: dict[object, list[float]] = {}
+    for job in jobs:
+        state = None if job.folder in open_ones else read_state(job.state_file)
+        if state is not None and state.status in FINAL:
+            taken.setdefault(_kind(job, contenders), []).append(state.seconds)
+    every = [seconds for group in taken.values() for seconds in group]
+    if not every:
+        return None
+    return Guess(sum(float(np.mean(taken.get(_kind(job, contenders), every))) for job in left) / at_once, 0)
+
+
 def estimate(
     jobs: Sequence[Job],
     contenders: dict[str, Contender],
@@ -142,9 +161,14 @@ def _groups(jobs: Sequence[Job], contenders: dict[str, Contender]) -> list[list[
     """Runs that differ in parameters and seeds alone."""
     groups: dict[object, list[Job]] = {}
     for job in jobs:
-        c = contenders[job.method]
-        groups.setdefault((job.sequence, c.method, c.uses_imu, c.is_beside), []).append(job)
+        groups.setdefault(_kind(job, contenders), []).append(job)
     return list(groups.values())
+
+
+def _kind(job: Job, contenders: dict[str, Contender]) -> object:
+    """What runs of a study that differ in parameters and seeds alone have in common."""
+    c = contenders[job.method]
+    return job.sequence, c.method, c.uses_imu, c.is_beside
 
 
 def _to_simulate(jobs: Sequence[Job]) -> list[Job]:

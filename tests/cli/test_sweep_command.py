@@ -69,12 +69,17 @@ def test_a_study_killed_on_the_way_goes_on_and_every_run_is_there_once(tmp_path:
 
 
 def test_a_dry_run_lists_and_counts_and_writes_nothing(file: Path, tmp_path: Path) -> None:
-    done = lslam("sweep", file, "--out", tmp_path / "out", "--dry-run", "--seeds", "1,2", "--jobs", "1")
+    words = ("sweep", file, "--out", tmp_path / "out", "--dry-run", "--seeds", "1,2", "--jobs", "1")
+    done = lslam(*words)
     assert done.returncode == 0, done.stderr
     *runs, last = done.stdout.splitlines()
     assert runs[0] == "block icp-skip_frames_1 seed 1"
     assert len(runs) == 8
-    assert last.startswith("8 runs, 8 left to do: about ")
+    assert last == "8 runs, 8 left to do; how long they take says --pilot, by a few short ones"
+    assert done.stderr == "", "nothing is simulated or run"
+    piloted = lslam(*words, "--pilot")
+    assert piloted.stdout.splitlines()[-1].startswith("8 runs, 8 left to do: about ")
+    assert "pilot runs)" in piloted.stdout
     assert not list(tmp_path.iterdir())
 
 
@@ -99,6 +104,7 @@ def test_a_run_too_short_for_a_score_is_said(file: Path, tmp_path: Path) -> None
     ("words", "code", "sentence"),
     [
         ((), 2, "STUDY is missing"),
+        (("FILE", "--pilot"), 2, "--pilot estimates the time of a --dry-run: give both"),
         (("nonsense",), 2, "no study 'nonsense' and no TOML file"),
         (("none.toml",), 3, "study none.toml cannot be read: No such file or directory"),
         (("--report", "none"), 3, "study none/results.csv cannot be read: No such file or directory"),

@@ -10,17 +10,18 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from lslam.config.study import StudyConfig, parse_study
 from lslam.errors import ConfigError, InputError, InterruptedRunError, OutputExistsError, RunFailedError, UsageError
 from lslam.formats.study_csv import read_study_csv
 from lslam.studies.engines import Local
-from lslam.studies.estimate import estimate
+from lslam.studies.estimate import estimate, from_finished
 from lslam.studies.expanded import Expanded, Place
 from lslam.studies.plan import Follow
 from lslam.studies.results import is_comparable
-from lslam.studies.states import State
+from lslam.studies.states import State, read_state
 from lslam.studies.study_files import find_study
 from lslam.studies.study_report import write_study_report
 from lslam.studies.subjects import used
@@ -251,6 +252,20 @@ def test_an_estimate_adds_up_what_is_told_apart(
     jobs = expand_study(replace(sweep, study=study(beside=[], parameters={"input.skip_frames": [1, 2]})))
     assert estimate(jobs.jobs * times, jobs.contenders, at_once).seconds == pytest.approx(expected, abs=0.01)
     assert asked == [("compile", 1), ("0", 5)]
+
+
+def test_the_time_is_that_of_finished_runs_of_the_same_kind(sweep: Sweep, made: list[StudyRow], tmp_path: Path) -> None:
+    shutil.copytree(sweep.place.out, tmp_path / "out")
+    jobs = expand_study(elsewhere(sweep, tmp_path / "out", True)).jobs
+    contenders = expand_study(elsewhere(sweep, tmp_path / "out", True)).contenders
+    seconds = {job.folder: read_state(job.state_file).seconds for job in jobs}  # type: ignore[union-attr]
+    same = [job for job in jobs if contenders[job.method].method == contenders[jobs[0].method].method]
+    same = [job for job in same if contenders[job.method].is_beside == contenders[jobs[0].method].is_beside]
+    guess = from_finished(jobs, jobs[:1], contenders, 1)
+    assert guess is not None
+    assert guess.seconds == pytest.approx(np.mean([seconds[job.folder] for job in same[1:]]))
+    assert from_finished(jobs, [*jobs[:1], *jobs[:1]], contenders, 2).seconds == guess.seconds  # type: ignore[union-attr]
+    assert from_finished(jobs, jobs, contenders, 1) is None
 
 
 def test_an_estimate_names_the_pilot_that_failed(sweep: Sweep) -> None:
