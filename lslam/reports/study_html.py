@@ -71,10 +71,11 @@ def timing_notes(rows: Sequence[StudyRow]) -> list[str]:
     shared = sum(not row.is_timing_comparable for row in usable)
     if not shared:
         return []
+    were_several = any(row.at_once > 1 for row in usable)
     return [
         f"{shared} of {counted(len(usable), 'run')} shared a core or ran on a cluster: times of this study cannot be compared, "
         "and findings about time are left undecided. To have them judged, run it on an idle machine into another folder: "
-        "lslam sweep STUDY --jobs 1 --out DIR"
+        f"lslam sweep STUDY{' --jobs 1' if were_several else ''} --out DIR"
     ]
 
 

@@ -75,6 +75,7 @@ class Results:
             bridged_share=values["bridged"] / scans if scans else nan,
             fallback_share=values.get("fallback", nan) / scans if scans else nan,
             is_timing_comparable=is_comparable(state),
+            at_once=state.jobs,
             digest=job.digest,
             machine=state.machine,
             folder=Path(os.path.relpath(job.folder, self.out)).as_posix(),

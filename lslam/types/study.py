@@ -24,6 +24,7 @@ class StudyRow:
         all scans; run_s : of the whole run with its reading and writing
     bridged_share : of the scans, 0..1; fallback_share : likewise, that a recovery policy or another method posed
     is_timing_comparable : nothing else ran on the machine that the study knows of
+    at_once : runs of the study that shared the machine
     digest : of the resolved configuration, the input and lslam's version; machine : name of the host
     folder : of the run, from the study's
     """
@@ -49,6 +50,7 @@ class StudyRow:
     bridged_share: float = nan
     fallback_share: float = nan
     is_timing_comparable: bool = True
+    at_once: int = 1
     digest: str = ""
     machine: str = ""
     folder: str = ""

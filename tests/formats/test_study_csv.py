@@ -92,7 +92,7 @@ def test_no_rows_are_a_file_too(tmp_path: Path) -> None:
         ("ate_se3", "ate", "column ate_se3 is missing"),
         (",0.2,", ",much,", "line 2: could not convert string to float: 'much'"),
         (",true,", ",perhaps,", "line 2: 'perhaps' is neither true nor false"),
-        (",here,", ",", "line 2: 28 columns where the header has 29"),
+        (",here,", ",", "line 2: 29 columns where the header has 30"),
     ],
 )
 def test_what_is_no_result_of_this_version_is_said(tmp_path: Path, old: str, new: str, sentence: str) -> None:

@@ -128,7 +128,9 @@ def test_page_says_when_times_cannot_be_compared(rows: list[StudyRow], tmp_path:
     shared = [*some, replace(rows[-2], is_timing_comparable=False)]
     (note,) = timing_notes(shared)
     assert note.startswith("3 of 4 runs shared a core or ran on a cluster: times of this study cannot be compared")
-    assert note.endswith("lslam sweep STUDY --jobs 1 --out DIR")
+    assert note.endswith("lslam sweep STUDY --out DIR"), "they were one at a time already"
+    (advice,) = timing_notes([replace(r, at_once=2) for r in shared])
+    assert advice.endswith("lslam sweep STUDY --jobs 1 --out DIR")
     write_study_files(tmp_path, evaluate_study(shared), shared, "study")
     assert note in (tmp_path / "report.html").read_text()
     assert timing_notes(rows) == []
