@@ -5,7 +5,8 @@ scale error would be neither seen nor repaired: a loop that is 1 % too large clo
 
 Steady drift is what loops repair best: where they tell its rate it is set right before they are closed (`graph.loop_drift`),
 and covariances, which expect some random walk beside it, are cautious then (NEES per degree of freedom 0.1 to 1.1). With
-`debug.drift_memory` it becomes such a walk, of which one loop at the end takes away less than half.
+`debug.drift_memory` it wanders, and as a random walk it has no rate at all: of either one loop at the end takes away less than
+half. What real odometry does is neither: its recorded errors can be laid on another run.
 """
 
 from __future__ import annotations
@@ -17,11 +18,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.config.debug import DebugConfig
+from lslam.errors import InputError
+from lslam.evaluation.associate import associate
+from lslam.evaluation.frames import main_axis
+from lslam.formats.trajectory_files import read_trajectory
 from lslam.geometry import noise, se3, so3
 from lslam.types.keyframe import Keyframe
 from lslam.types.scan_result import ScanResult
 
 Floats = NDArray[np.float64]
+
+# x ahead, y to the left, z up, of axes with x to the right, y down, z ahead.
+CAMERA_TO_LIDAR = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
 
 def with_drift(results: Sequence[ScanResult], config: DebugConfig) -> list[ScanResult]:
@@ -29,6 +37,12 @@ def with_drift(results: Sequence[ScanResult], config: DebugConfig) -> list[ScanR
     poses = np.stack([r.T_world_lidar for r in results])
     steps = se3.relative(poses[:-1], poses[1:])
     way = np.linalg.norm(steps[:, :3, 3], axis=1)
+    if config.drift_kind == "recorded":
+        errors = errors_over(way, *recorded_errors(config.drift_estimate, config.drift_truth))
+        astray = [poses[0]]
+        for step, error in zip(steps, errors, strict=True):
+            astray.append(se3.normalise(astray[-1] @ step @ error))
+        return [_moved(result, pose) for result, pose in zip(results, astray, strict=True)]
     directions, sides = _courses(way, config)
     # The horizon sinks towards the direction.
     across = np.stack([-directions[:, 1], directions[:, 0]], axis=1)
@@ -50,6 +64,10 @@ def _courses(way: Floats, config: DebugConfig) -> tuple[Floats, Floats]:
     direction = rng.normal(size=3)
     direction /= np.linalg.norm(direction)
     side = float(rng.choice([-1.0, 1.0]))
+    if config.drift_kind == "random-walk":
+        scale = np.sqrt(100.0 / np.maximum(way, 1e-9)) * (way > 0)
+        walk = scale[:, None] * rng.normal(size=(len(way), 4))
+        return walk[:, :3] * np.sqrt(1 / 3), walk[:, 3]
     if config.drift_memory is None:
         return np.tile(direction, (len(way), 1)), np.full(len(way), side)
     kept = np.exp(-way / config.drift_memory)
@@ -62,6 +80,33 @@ def _courses(way: Floats, config: DebugConfig) -> tuple[Floats, Floats]:
     return courses[:, :3], courses[:, 3]
 
 
+def recorded_errors(estimate: str, truth: str) -> tuple[Floats, Floats]:
+    """Of a real run: m travelled (K,), from 0, and the error added up until there, (K, 6) twists in LiDAR axes.
+
+    Raises InputError when a file cannot be read, the two do not belong together, or nothing moves.
+    """
+    matches = associate(read_trajectory(estimate), read_trajectory(truth))
+    real, found = (se3.relative(poses[:-1], poses[1:]) for poses in (matches.truth, matches.estimate))
+    way = np.linalg.norm(real[:, :3, 3], axis=1)
+    if way.sum() <= 0:
+        raise InputError(f"{truth} does not move: it has no errors over the way")
+    twists = se3.log(se3.relative(real, found))
+    if main_axis(matches.truth) in ("+z", "-z"):  # as cameras advance
+        twists = (twists.reshape(-1, 2, 3) @ CAMERA_TO_LIDAR.T).reshape(-1, 6)
+    zero = np.zeros((1, 6))
+    return np.append(0.0, np.cumsum(way)), np.concatenate([zero, np.cumsum(twists, axis=0)])
+
+
+def errors_over(way: Floats, known: Floats, errors: Floats) -> Floats:
+    """(N, 4, 4) errors of steps of `way` (N,) m: what was added up until `known` (K,) m, begun anew where that ends."""
+    ends = np.append(0.0, np.cumsum(way))
+    rounds, at = np.divmod(ends, known[-1])
+    # Places where the sensor stood have one way and several errors: the last one counts.
+    last = np.append(np.diff(known) > 0, True)
+    summed = np.column_stack([np.interp(at, known[last], column[last]) for column in errors.T])
+    return np.asarray(se3.exp(np.diff(summed + rounds[:, None] * errors[-1], axis=0)))
+
+
 def moved_keyframes(keyframes: Sequence[Keyframe], results: Sequence[ScanResult]) -> list[Keyframe]:
     """The keyframes where their scans are now."""
     return [
@@ -72,7 +117,14 @@ def moved_keyframes(keyframes: Sequence[Keyframe], results: Sequence[ScanResult]
 
 def describe(config: DebugConfig) -> str:
     """For the manifest and the log."""
+    if config.drift_kind == "recorded":
+        return (
+            f"debug.drift: odometry was made to err as {config.drift_estimate} does against {config.drift_truth}; this run is "
+            "an experiment"
+        )
     lasting = "steadily" if config.drift_memory is None else f"anew after some {config.drift_memory:g} m"
+    if config.drift_kind == "random-walk":
+        lasting = "in the root mean square after 100 m of a random walk"
     return (
         f"debug.drift: odometry was made to drift by {config.drift_percent:g} % of the way and "
         f"{config.drift_deg_per_100m:g} deg/100 m, and to tilt by {config.drift_tilt_deg_per_100m:g}, {lasting} "
