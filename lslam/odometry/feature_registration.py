@@ -10,12 +10,14 @@ from numpy.typing import NDArray
 from lslam.config.loam import LoamConfig
 from lslam.config.recovery import RecoveryConfig
 from lslam.config.registration import RegistrationConfig
+from lslam.geometry import se3
 from lslam.odometry.all_points import AllPoints
 from lslam.odometry.feature_map import FeatureMap, thinned
 from lslam.odometry.feature_scan import FeatureScan, feature_scan, surface_size
 from lslam.odometry.feature_solver import NONE, FeatureNoise, kept_where_blind, solve_on_map
 from lslam.odometry.feature_steps import ScanStep, StageClock
 from lslam.preprocessing.features import Features
+from lslam.recovery.start_search import MUCH, START_STEP, start_offsets
 from lslam.registration.acceptance import Wording, accepted, failed
 from lslam.registration.registration import NEAR_KERNEL
 from lslam.registration.robust import AdaptiveThreshold, Annealing, UsualAgreement
@@ -217,11 +219,32 @@ class FeatureRegistration(Stateful):
             return self._all.locate(features, T_prior)
         points, scatter = thinned(features)
         target = self._planes()
-        slow = Annealing(c.coarse_kernel, c.kernel_min, c.coarse_decay, c.start_iterations)
-        result = solve_on_map(
-            target, NONE, points, T_prior, slow, self.noise, scatter=scatter, levels=target.planes.coarser
-        )
-        return self._judge(result, T_prior)
+
+        def on_coarse(start: Floats, width: float) -> RegistrationResult:
+            slow = Annealing(width, c.kernel_min, c.coarse_decay, c.start_iterations)
+            return solve_on_map(
+                target, NONE, points, start, slow, self.noise, scatter=scatter, levels=target.planes.coarser[:1]
+            )
+
+        found = self._judge(on_coarse(T_prior, c.coarse_kernel), T_prior)
+        if self._inserted > 1 or not self.recovery.start_search:
+            return found
+        # Planes slide along a road; edges repeat nowhere at once. Few of them decide nothing: two sigma of what is counted.
+        offsets = [se3.make(np.eye(3), offset) for offset in start_offsets(c.start_reach, START_STEP)]
+        tried = [self._judge(on_coarse(T_prior @ T, 2 * START_STEP), T_prior) for T in offsets]
+        agree = [self._edges_at(target, features, result) for result in tried]
+        most, known = max(agree, default=0), max(self._edges_at(target, features, found), 0)
+        is_more = most > MUCH * known and most - known > 2 * np.sqrt(most + known)
+        return tried[int(np.argmax(agree))] if is_more else found
+
+    def _edges_at(self, target: FeatureMap, features: Features, result: RegistrationResult) -> int:
+        """How many of the less sharp edges lie on edges of the map; -1 where the registration failed."""
+        if not result.ok:
+            return -1
+        width = self.config.kernel_max / 2
+        once = Annealing(width, width, 0.5, 1)
+        pose = result.T_world_lidar
+        return solve_on_map(target, features.less_edges.points, NONE, pose, once, self.noise).inliers
 
     def _stand_in(
         self, features: Features, start: RegistrationResult, T_prior: Floats, starved: RegistrationResult

@@ -358,3 +358,22 @@ def test_features_pose_every_scan_by_themselves(method: str) -> None:
     assert {r.posed_by for r in results} <= {"", LESS_PLANAR}
     assert all(r.status == "ok" for r in results)
     assert ate(poses_of(results), drive.ground_truth.poses) < {"loam-odom": 0.2, "lego-loam": 0.1}.get(method, 0.02)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_edges_find_a_start_at_thirty_metres_a_second(method: str) -> None:
+    """Planar points slide along the road by all of the 3 m a scan; without the search they do."""
+    drive = simulate("motorway", seed=2, lidar="hdl64", count=5, motion_compensated=True, speed=30.0, start_speed=30.0)
+    assert drive.ground_truth is not None
+    truth = se3.relative(drive.ground_truth.poses[0], drive.ground_truth.poses)
+    found, blind = (Driver(method, start_reach=reach).drive(list(drive)) for reach in (12.0, 0.0))
+    assert max(metres(result, true) for result, true in zip(found, truth, strict=True)) < 0.05
+    assert metres(blind[1], truth[1]) > 1.0
+    assert {r.posed_by for r in found} <= {"", LESS_PLANAR}
+
+
+def test_few_edges_start_no_search_astray() -> None:
+    """One scan of sixteen beams makes hardly a line: where two edges agree, not one, is no place."""
+    scans, truth = street(100, "vlp16", 6, speed=12.0)
+    for result, true in zip(Driver("loam").drive(scans), truth, strict=True):
+        assert metres(result, se3.relative(truth[0], true)) < 0.05
