@@ -205,6 +205,7 @@ def test_top_level_holds_nothing_else() -> None:
         "pyproject.toml",
         "lslam",
         "tests",
+        "docs",
         "sample_data",
         "README.md",
         "LICENSE",
