@@ -13,7 +13,7 @@ from lslam.geometry import se3, so3
 from lslam.preprocessing.deskew import deskew_points
 from lslam.preprocessing.prepare import PreparedPoints, prepare_points, thin
 from lslam.registration.gaussian_map import GaussianMap
-from lslam.registration.local_map import BREADTH
+from lslam.registration.local_map import BREADTH, WIDE
 from lslam.registration.robust import Annealing, UsualAgreement
 from lslam.registration.solver import RegistrationResult, solve
 from lslam.types.motion_check import MotionCheck
@@ -65,10 +65,14 @@ class IntegrityMonitor(Stateful):
 
     def __init__(self, preprocess: PreprocessConfig, registration: RegistrationConfig) -> None:
         self._preprocess, self._config = preprocess, registration
-        self._planes = GaussianMap(
-            registration.voxel_size * registration.coarse_factor, min_points=registration.min_points,
-            planarity=registration.planarity, count_cap=registration.count_cap, reach=1.2 * preprocess.range_max,
-            capacity=1 << 13, breadth=BREADTH,
+        # One scan has no fine planes.
+        self._planes = tuple(
+            GaussianMap(
+                registration.voxel_size * registration.coarse_factor * wider, min_points=registration.min_points,
+                planarity=registration.planarity, count_cap=registration.count_cap, reach=1.2 * preprocess.range_max,
+                capacity=1 << 13, breadth=BREADTH,
+            )
+            for wider in (1, *WIDE)
         )  # fmt: skip
         self.checks: list[MotionCheck] = []
         self._reference: Seen | None = None
@@ -123,8 +127,9 @@ class IntegrityMonitor(Stateful):
         """Weigh the motion claimed between two scans."""
         claimed = se3.relative(first.pose, last.pose)
         seconds = (last.stamp_ns - first.stamp_ns) * 1e-9
-        self._planes.clear()
-        self._planes.insert(first.source.astype(np.float32), np.eye(4))
+        for level in self._planes:
+            level.clear()
+            level.insert(first.source.astype(np.float32), np.eye(4))
         points = thin(last.points, 1 + len(last.source) // LAID_POINTS)
         found = self._lay(points, claimed, self._quick())
         usual = self._usual.usual
@@ -150,7 +155,10 @@ class IntegrityMonitor(Stateful):
 
     def _lay(self, points: PreparedPoints, start: Floats, annealing: Annealing) -> RegistrationResult:
         c = self._config
-        return solve(self._planes, points, start, annealing, sigma=c.sigma, blob_weight=0.0, weak_share=c.weak_share)
+        return solve(
+            self._planes[0], points, start, annealing,
+            sigma=c.sigma, blob_weight=0.0, weak_share=c.weak_share, coarser=self._planes[1:],
+        )  # fmt: skip
 
     def _quick(self) -> Annealing:
         c = self._config

@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+import lslam
+from lslam.config import load_config
 from lslam.config.config import Config
 from lslam.odometry import create_odometry
 from lslam.pipeline.front_end import estimate
@@ -69,3 +71,15 @@ def test_voxels_of_single_rings_are_what_held_it(
     monkeypatch.setattr(local_map, "BREADTH", 0.0)
     sequence, truth = car_park
     assert worst(run(sequence), truth) > 10.0
+
+
+@pytest.mark.parametrize("method", ["icp-point", "ndt"])
+def test_who_stays_behind_on_open_ground_is_told(method: str) -> None:
+    """They hold points to where a scan's rings were; pairs of scans tell by what lies metres wide, their rings aside."""
+    drive = simulate("carpark", seed=1, lidar="vlp16", count=80, motion_compensated=True)
+    assert drive.ground_truth is not None
+    config = load_config(None, [f"odometry.method={method}", "map.write=false", "loops.use=false"], {})
+    record = lslam.run(drive, config).record
+    behind = np.linalg.norm(record.trajectory.positions[-1] - drive.ground_truth.positions[-1])
+    assert behind > 10.0
+    assert np.mean([r.is_lost for r in record.results]) > 0.5
