@@ -29,7 +29,7 @@ def linearise_gicp(points: tuple[Floats, Floats], voxels: Voxels, settings: Sett
     """
     source, covariance = points
     planes, keys, table = voxels
-    size, sigma2, plane_weight, blob_weight, _ = settings
+    size, sigma2, plane_weight, blob_weight, _, _ = settings
     cells, slots, is_done, away2 = search
     R, t = pose
     scale, _, gate2 = width

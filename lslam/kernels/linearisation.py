@@ -3,8 +3,8 @@
     linearise(points, target, settings, search, pose, width, sums) -> None
 
 points : source points (S, 3), LiDAR frame, and what goes with each; target : arrays of one map
-settings : numbers that stay as they are; on voxels size, m, variance of a point, m2, weights of planes and of blobs, and
-    whether this is the coarsest of several maps, which takes what the others left
+settings : numbers that stay as they are; on voxels size, m, variance of a point, m2, weights of planes and of blobs, the
+    blobs' part along the sensor's axis, and whether this is the coarsest of several maps, which takes what the others left
 search : what is remembered from one iteration to the next, and of one map for the next coarser one, see `Search`
 pose : R (3, 3) and t (3,); width : of the robust kernel, m, the one it ends with, and the squared distance, m2, beyond
     which correspondences are rejected
@@ -24,7 +24,7 @@ Longs = NDArray[np.int64]
 Ints = NDArray[np.int32]
 Flags = NDArray[np.bool_]
 
-Settings = tuple[float, float, float, float, bool]
+Settings = tuple[float, float, float, float, float, bool]
 # Octant cell (S,) and slots (S, 8) of each point; whether it is matched, and its squared distance, -1 where it is not.
 Search = tuple[Longs, Ints, Flags, Floats]
 Pose = tuple[Floats, Floats]

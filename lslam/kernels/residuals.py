@@ -17,9 +17,6 @@ Voxels = tuple[Floats, NDArray[np.int64], NDArray[np.int32]]
 
 # Four sigma-squared of tilt: neighbouring points of one ring err together.
 TILT = 4.0
-# The mean of a blob lies where rings do, which it stands across: along the sensor's axis it is known to a ring's gap, five
-# or six times worse than the points scatter.
-ALONG = 0.03
 
 
 @inline
@@ -85,14 +82,14 @@ def linearise(points: tuple[Floats, Floats], voxels: Voxels, settings: Settings,
 
     Each point takes the nearest plane voxel of the eight around it: residual n . (R s + t - mean), variance = map
     eigenvalue + source scatter along the normal + sigma2 + tilt at that distance from the mean, Geman-McClure weight of
-    width `scale`, times `plane_weight`. Without a plane the nearest blob stands in, across the sensor's axis: its
-    mean variance, times `blob_weight`.
+    width `scale`, times `plane_weight`. Without a plane the nearest blob stands in, point to point: its mean variance,
+    times `blob_weight`, and once more times `along` in the direction of the sensor's axis.
     `away2` (S,) takes the squared distance of each matched point to its plane, or mean; those beyond `gate2` are
     rejected: counted, without a say.
     """
     source, scatter = points
     planes, keys, table = voxels
-    size, sigma2, plane_weight, blob_weight, _ = settings
+    size, sigma2, plane_weight, blob_weight, along, _ = settings
     cells, slots, is_done, away2 = search
     R, t = pose
     scale, _, gate2 = width
@@ -143,7 +140,7 @@ def linearise(points: tuple[Floats, Floats], voxels: Voxels, settings: Settings,
             p = planes[blob]
             ux, uy, uz = R[0, 2], R[1, 2], R[2, 2]
             ex, ey, ez = x - p[0], y - p[1], z - p[2]
-            drop = 1.0 - ALONG
+            drop = 1.0 - along
             across2 = blob_d - drop * (ux * ex + uy * ey + uz * ez) ** 2
             away2[i] = across2
             facts[MATCHED] += 1.0
@@ -159,8 +156,8 @@ def linearise(points: tuple[Floats, Floats], voxels: Voxels, settings: Settings,
                 H, g, w, 1.0 - drop * ux * ux, -drop * ux * uy, -drop * ux * uz, 1.0 - drop * uy * uy, -drop * uy * uz,
                 1.0 - drop * uz * uz, ex, ey, ez, rx, ry, rz,
             )  # fmt: skip
-            facts[INFORMATION] += (2.0 + ALONG) * w
-            facts[LEVER] += (2.0 + ALONG) * w * (rx * rx + ry * ry + rz * rz)
+            facts[INFORMATION] += (2.0 + along) * w
+            facts[LEVER] += (2.0 + along) * w * (rx * rx + ry * ry + rz * rz)
 
 
 @inline

@@ -28,7 +28,7 @@ def linearise_vgicp(points: tuple[Floats, Floats], voxels: tuple[Floats, Floats,
     """
     source, covariance = points
     planes, counts, keys, table = voxels
-    size, sigma2, plane_weight, blob_weight, _ = settings
+    size, sigma2, plane_weight, blob_weight, _, _ = settings
     cells, slots, is_done, away2 = search
     R, t = pose
     scale, _, gate2 = width

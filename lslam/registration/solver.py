@@ -118,7 +118,8 @@ def voxel_terms(
     return [
         Term(
             linearise, points, kind.voxels(level),
-            (level.size, float(sigma) ** 2, min(usual / level.size, 1.0), float(blob_weight) if k < 2 else 0.0, 0 < k == last),
+            (level.size, float(sigma) ** 2, min(usual / level.size, 1.0), float(blob_weight) if k < 2 else 0.0, kind.along,
+             0 < k == last),
             matches.search(),
         )
         for k, level in enumerate(levels)

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from lslam.geometry import so3
 from lslam.kernels import gaussians
 from lslam.kernels.jit import kernel
-from lslam.kernels.residuals import ALONG
 from lslam.kernels.voxel import MASK, OFFSET
 
 Floats = NDArray[np.float64]
@@ -118,9 +117,9 @@ class Match:
         return self.weight / self.variance * (c * c / (c * c + self.distance2(R, t))) ** 2
 
 
-def along(R: Floats) -> Floats:
-    """(3, 3) what a blob is asked: the sensor's axis counts little, because that is where the next ring lies."""
-    return np.asarray(np.diag([1.0, 1.0, np.sqrt(ALONG)]) @ R.T)
+def sensor_axes(R: Floats, along: float) -> Floats:
+    """(3, 3) what a blob is asked: its weight along the sensor's axis is so many times that across."""
+    return np.asarray(np.diag([1.0, 1.0, np.sqrt(along)]) @ R.T)
 
 
 def kind_of(voxel: Voxel, min_points: int, planarity: float) -> tuple[str, Floats, Floats, float, float]:
@@ -137,7 +136,7 @@ def kind_of(voxel: Voxel, min_points: int, planarity: float) -> tuple[str, Float
 
 def matches(
     target: VoxelMap, source: Floats, scatter: Floats, R: Floats, t: Floats, sigma2: float, blob_weight: float,
-    tilt: float, min_points: int = 6, planarity: float = 0.3,
+    tilt: float, along: float, min_points: int = 6, planarity: float = 0.3,
 ) -> list[Match]:  # fmt: skip
     """The nearest plane of the eight voxels around each point, else the nearest blob."""
     kinds = {cell: kind_of(v, min_points, planarity) for cell, v in target.voxels.items()}
@@ -155,7 +154,7 @@ def matches(
         C = symmetric(six)
         if kind == "blob":
             spread = float(np.trace(C)) / 3
-            out.append(Match(point, mean, None, variance + spread + sigma2, blob_weight, along(R)))
+            out.append(Match(point, mean, None, variance + spread + sigma2, blob_weight, sensor_axes(R, along)))
             continue
         e = world - mean
         beside2 = float(e @ e - (normal @ e) ** 2)

@@ -93,7 +93,7 @@ def linearise(
         s.source.astype(np.float32), s.source, np.zeros((n, 6)), n, covariance=s.covariance, gaps=np.full(n, gap)
     )
     kind.linearise(
-        kind.points(seen, np.sqrt(SIGMA2)), kind.voxels(s.target), (s.target.size, SIGMA2, 1.0, blob, takes_all),
+        kind.points(seen, np.sqrt(SIGMA2)), kind.voxels(s.target), (s.target.size, SIGMA2, 1.0, blob, kind.along, takes_all),
         matches.search(), (s.R, s.t), (c, 0.15, gate2), (H, S, g, facts),
     )  # fmt: skip
     return Sums(np.triu(H) + np.triu(H, 1).T, g, facts, matches.away2, np.triu(S) + np.triu(S, 1).T)

@@ -17,7 +17,7 @@ from lslam.registration.gaussian_map import GaussianMap
 from lslam.registration.optimiser import Matches, slots_of
 
 Floats = NDArray[np.float64]
-SIZE, SIGMA2, BLOB = 0.8, 9e-4, 0.5
+SIZE, SIGMA2, BLOB, ALONG = 0.8, 9e-4, 0.5, 0.03
 
 
 @dataclass
@@ -30,10 +30,10 @@ class Scene:
     R: Floats
     t: Floats
 
-    def matches(self, blob_weight: float = BLOB) -> list[Match]:
+    def matches(self, blob_weight: float = BLOB, along: float = ALONG) -> list[Match]:
         p = self.points
         return matches(
-            self.reference, p.source, p.scatter, self.R, self.t, SIGMA2, blob_weight, residuals.TILT
+            self.reference, p.source, p.scatter, self.R, self.t, SIGMA2, blob_weight, residuals.TILT, along
         )  # fmt: skip
 
 
@@ -70,13 +70,14 @@ def scene() -> Scene:
 def linearise(
     s: Scene, R: Floats, t: Floats, c: float, blob: float = BLOB, gate2: float = np.inf,
     cache: tuple[NDArray[np.int64], NDArray[np.int32]] | None = None, plane: float = 1.0,
+    along: float = ALONG,
 ) -> tuple[Floats, Floats, Floats]:  # fmt: skip
     m, matches = s.target, Matches(len(s.points.source))
     search = matches.search() if cache is None else (*cache, matches.is_done, matches.away2)
     H, S, g, facts = np.zeros((6, 6)), np.zeros((6, 6)), np.zeros(6), np.zeros(at.COUNT)
     residuals.linearise(
-        (s.points.source, s.points.scatter), (m.planes, m.keys, m.table), (m.size, SIGMA2, plane, blob, False), search,
-        (R, t), (c, c, gate2), (H, S, g, facts),
+        (s.points.source, s.points.scatter), (m.planes, m.keys, m.table), (m.size, SIGMA2, plane, blob, along, False),
+        search, (R, t), (c, c, gate2), (H, S, g, facts),
     )  # fmt: skip
     np.testing.assert_array_equal(S, 0.0)
     # The kernel fills the upper triangle.
@@ -105,12 +106,14 @@ def test_gradient_is_that_of_the_robust_cost(scene: Scene, c: float, blob: float
     np.testing.assert_allclose(g, numeric, atol=1e-6 * np.abs(numeric).max())
 
 
+@pytest.mark.parametrize("along", [ALONG, 1.0])
 @pytest.mark.parametrize("c", [0.05, 0.5, 5.0])
-def test_normal_equations_are_those_of_numpy(scene: Scene, c: float) -> None:
-    H, g, facts = linearise(scene, scene.R, scene.t, c)
+def test_normal_equations_are_those_of_numpy(scene: Scene, c: float, along: float) -> None:
+    """Blobs count little along the sensor's axis, or, where they stand for points, as much as across."""
+    H, g, facts = linearise(scene, scene.R, scene.t, c, along=along)
     expected_H, expected_g = np.zeros((6, 6)), np.zeros(6)
     information, inliers, lever = 0.0, 0, 0.0
-    for m in scene.matches():
+    for m in scene.matches(along=along):
         r, J = m.rows(scene.R, scene.t)
         w = m.information(scene.R, scene.t, c)
         expected_H += w * J.T @ J
@@ -214,7 +217,7 @@ def test_a_coarser_map_serves_the_points_that_found_no_plane(scene: Scene) -> No
     counts = []
     for m in (fine, coarse):
         residuals.linearise(
-            (scene.points.source, scene.points.scatter), (m.planes, m.keys, m.table), (m.size, SIGMA2, 1.0, 0.0, False),
+            (scene.points.source, scene.points.scatter), (m.planes, m.keys, m.table), (m.size, SIGMA2, 1.0, 0.0, ALONG, False),
             matches.search(), (scene.R, scene.t), (0.5, 0.5, np.inf), sums,
         )  # fmt: skip
         counts.append(sums[3][at.MATCHED])
