@@ -111,19 +111,23 @@ def voxel_terms(
 
     points : arrays that the residual takes of them; sigma : m, noise of a point; blob_weight : of voxels that are no plane
 
-    Voxels beyond the second size hold what bends within them, so that points on one plane err together: it weighs less by
-    as much as they are larger. The mean of such a voxel says nothing of where anything is.
+    The mean of a voxel beyond the second size says nothing of where anything is.
     """
     last, linearise, usual = len(levels) - 1, kind.linearise, levels[:2][-1].size
     return [
         Term(
             linearise, points, kind.voxels(level),
-            (level.size, float(sigma) ** 2, min(usual / level.size, 1.0), float(blob_weight) if k < 2 else 0.0, kind.along,
+            (level.size, float(sigma) ** 2, part_of_usual(level.size, usual), float(blob_weight) if k < 2 else 0.0, kind.along,
              0 < k == last),
             matches.search(),
         )
         for k, level in enumerate(levels)
     ]  # fmt: skip
+
+
+def part_of_usual(size: float, usual: float) -> float:
+    """Weight of planes in voxels that are larger than usual, m: what bends within them makes their points err together."""
+    return min(usual / size, 1.0)
 
 
 def result_of(found: Optimum, T_prior: Floats, source_points: int) -> RegistrationResult:

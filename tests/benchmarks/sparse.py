@@ -110,6 +110,8 @@ def main() -> None:
     parser.add_argument("--recordings", type=Path)
     args = parser.parse_args()
     methods = args.methods.split(",")
+    if set(methods) - set(PEERS):
+        parser.error(f"--methods takes {', '.join(PEERS)}")
     if args.recordings is not None:
         recordings(args.recordings, methods)
         return
