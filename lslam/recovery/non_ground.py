@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.config.preprocess import PreprocessConfig
-from lslam.preprocessing.ground import ground_of
+from lslam.preprocessing.ground import Ground, above_ground, ground_of
 from lslam.preprocessing.prepare import PreparedPoints, subset
 from lslam.registration.alignment import upright_directions
 from lslam.registration.gaussian_map import GaussianMap
@@ -38,10 +38,10 @@ class NonGroundPoints:
     """
 
     def __init__(self, scans: Iterable[tuple[Points, Floats]], preprocess: PreprocessConfig) -> None:
-        self._preprocess = preprocess
         self._cells = GaussianMap(NEAR, min_points=1, planarity=NO_PLANES, reach=np.inf, capacity=1 << 12)
         for points, T_world_lidar in scans:
-            self._cells.insert(non_ground_points(points, preprocess)[0], T_world_lidar)
+            index = above_ground(points, preprocess.ground_slope, preprocess.ground_tolerance)
+            self._cells.insert(points[index], T_world_lidar)
 
     def agreeing(self, seen: PreparedPoints, T_world_lidar: Floats) -> Flags:
         """(S,) which of them have one of these points near by when seen from `T_world_lidar` (4, 4)."""
@@ -65,22 +65,19 @@ class NonGroundPoints:
         )  # fmt: skip
 
 
-def sought(points: Points, preprocess: PreprocessConfig) -> PreparedPoints:
-    """What to look for among `NonGroundPoints` at some pose: the non-ground points of another scan (N, 3), LiDAR frame."""
-    wanted = non_ground_points(points, preprocess)[1]
+def ground_under(points: PreparedPoints, preprocess: PreprocessConfig) -> Ground:
+    """The ground under a scan."""
+    return ground_of(points.map_points, preprocess.ground_slope, preprocess.ground_tolerance)
+
+
+def sought(points: PreparedPoints, ground: Ground) -> PreparedPoints:
+    """What to look for among `NonGroundPoints` at some pose: the points of another scan that are high above its ground."""
+    wanted = points.map_points[ground.above(points.map_points, HIGH)]
     return PreparedPoints(wanted, wanted.astype(np.float64), np.zeros((len(wanted), 6)), len(wanted))
 
 
-def non_ground_points(points: Points, preprocess: PreprocessConfig) -> tuple[Points, Points]:
-    """Those of the points (N, 3), LiDAR frame, that do not lie on the ground; and what to look for among others' of them."""
-    ground = ground_of(points, preprocess.ground_slope, preprocess.ground_tolerance)
-    standing, high = (points[ground.above(points, height)] for height in (preprocess.ground_tolerance, HIGH))
-    return standing, high
-
-
-def on_ground(points: PreparedPoints, preprocess: PreprocessConfig) -> PreparedPoints:
-    """The source points on the ground."""
-    ground = ground_of(points.map_points, preprocess.ground_slope, preprocess.ground_tolerance)
+def on_ground(points: PreparedPoints, ground: Ground, tolerance: float) -> PreparedPoints:
+    """The source points no higher above the ground than `tolerance`, m."""
     is_ground = np.ones(len(points.source), bool)
-    is_ground[ground.above(points.source.astype(np.float32), preprocess.ground_tolerance)] = False
+    is_ground[ground.above(points.source.astype(np.float32), tolerance)] = False
     return subset(points, is_ground)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from lslam.geometry import se3, so3
 from lslam.preprocessing.prepare import PreparedPoints, thin
-from lslam.recovery.non_ground import NEAR, NonGroundPoints, on_ground, sought
+from lslam.recovery.non_ground import NEAR, NonGroundPoints, ground_under, on_ground, sought
 from lslam.registration.acceptance import correction
 from lslam.registration.alignment import upright_directions
 from lslam.registration.registration import NEAR_KERNEL, Registration
@@ -66,10 +66,11 @@ def held_by_non_ground(
     is_lost : whether the sensor may be anywhere within `start_reach`, which a failed registration says too
     """
     r, c = registration, registration.config
-    standing, seen = NonGroundPoints(r.recent, r.preprocess), sought(points.map_points, r.preprocess)
+    ground = ground_under(points, r.preprocess)
+    standing, seen = NonGroundPoints(r.recent, r.preprocess), sought(points, ground)
     if is_lost:
         found = _best_start(r, points, T_prior, found, standing, seen)
-    coarser, ground = r.alignment.coarse_maps(points, T_prior), on_ground(points, r.preprocess)
+    coarser, flat = r.alignment.coarse_maps(points, T_prior), on_ground(points, ground, r.preprocess.ground_tolerance)
     width = NEAR_KERNEL * c.kernel_min
 
     def placed(start: Floats) -> RegistrationResult:
@@ -79,7 +80,7 @@ def held_by_non_ground(
 
     def upright(pose: Floats) -> Floats:
         return r.alignment.refine(
-            ground, pose, width, c.start_iterations, coarser, upright_directions(pose)
+            flat, pose, width, c.start_iterations, coarser, upright_directions(pose)
         ).T_world_lidar
 
     def agreeing(result: RegistrationResult) -> Flags:

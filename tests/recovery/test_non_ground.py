@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from lslam.config.preprocess import PreprocessConfig
 from lslam.geometry import se3
 from lslam.preprocessing.prepare import PreparedPoints
-from lslam.recovery.non_ground import NEAR, NonGroundPoints, non_ground_points, on_ground, sought
+from lslam.recovery.non_ground import NEAR, NonGroundPoints, ground_under, on_ground, sought
 
 Floats = NDArray[np.float64]
 Points = NDArray[np.float32]
@@ -29,7 +29,8 @@ def standing_in(points: Points, pose: Floats) -> NonGroundPoints:
 
 
 def seen_in(points: Points) -> PreparedPoints:
-    return sought(points, PreprocessConfig())
+    prepared = PreparedPoints(points, points.astype(np.float64), np.zeros((len(points), 6)), len(points))
+    return sought(prepared, ground_under(prepared, PreprocessConfig()))
 
 
 def test_the_share_is_that_of_points_with_a_neighbour_and_leaves_the_ground_out() -> None:
@@ -53,9 +54,12 @@ def test_what_is_as_low_as_a_crash_barrier_is_not_asked() -> None:
     points = street(np.random.default_rng(1), 0.0)
     along = np.arange(-20, 20, 0.1)
     barrier = np.column_stack([along, np.full_like(along, 5.0), np.full_like(along, 0.8 - 1.7)]).astype(np.float32)
-    standing, asked = non_ground_points(np.concatenate([points, barrier]), PreprocessConfig())
-    assert len(asked) == 800
-    assert len(standing) == 800 + len(barrier)
+    points = np.concatenate([points, barrier])
+    asked = seen_in(points)
+    assert len(asked.source) == 800
+    # What was seen of it earlier is kept: posts end at the height of barriers.
+    low = PreparedPoints(barrier, barrier.astype(np.float64), np.zeros((len(barrier), 6)), len(barrier))
+    assert standing_in(points, np.eye(4)).share(low, np.eye(4)) == 1.0
 
 
 def test_bare_ground_says_nothing() -> None:
@@ -66,6 +70,6 @@ def test_bare_ground_says_nothing() -> None:
 def test_the_points_on_the_ground_are_the_others() -> None:
     points = street(np.random.default_rng(1), 0.0)
     seen = PreparedPoints(points, points.astype(np.float64), np.arange(len(points))[:, None] * np.ones(6), len(points))
-    ground = on_ground(seen, PreprocessConfig())
+    ground = on_ground(seen, ground_under(seen, PreprocessConfig()), PreprocessConfig().ground_tolerance)
     np.testing.assert_array_equal(ground.source, points[:4000].astype(np.float64))
     np.testing.assert_array_equal(ground.scatter, seen.scatter[:4000])
