@@ -44,7 +44,7 @@ class FeatureRegistration(Stateful):
     with_map : whether the pose is found, or refined, on the feature map
     with_less_planes : whether the map is matched with centroids of the less planar points in place of the planar points
     reach : m, how far from the sensor the map is kept
-    recovery : what is tried where features are not enough; its `start_search` is that of all points
+    recovery : what is tried where features are not enough; `start_search` is by edges, or by all points when they stand in
     """
 
     STATE = (
@@ -91,8 +91,7 @@ class FeatureRegistration(Stateful):
         if is_near:
             result = self._attempt(features, T_prior, T_prior, clock, self._near)
             return self._kept(result, T_prior, T_prior) if result.ok else result
-        captures = self.recovery.coarse_to_fine
-        if self._starting > 0 and captures:
+        if self._starting > 0 and self.recovery.coarse_to_fine:
             with clock.stage("start"):
                 start = self._capture(features, T_prior)
             result = self._attempt(features, start.T_world_lidar, T_prior, clock, self._quick)
@@ -101,7 +100,7 @@ class FeatureRegistration(Stateful):
             result = self._attempt(features, T_prior, T_prior, clock, self._quick)
             move, turn = result.prior_error
             is_off = not result.ok or move > self.config.recover_m or turn > np.deg2rad(self.config.recover_deg)
-            if is_off and captures:
+            if is_off and self.recovery.coarse_to_fine:
                 with clock.stage("recover"):
                     start = self._capture(features, T_prior)
                 again = self._attempt(features, start.T_world_lidar, T_prior, clock, self._quick)
@@ -124,13 +123,14 @@ class FeatureRegistration(Stateful):
     ) -> RegistrationResult:  # fmt: skip
         """What features found, unless all points say otherwise or hold the place that they hold badly."""
         is_far = not result.ok or result.prior_error[0] > self.config.recover_m
-        if self.config.start_reach > 0 and (self._asks_all or is_far):
+        is_young = self._young is not None
+        if self.config.start_reach > 0 and (is_young or is_far):
             with clock.stage("start" if self._starting else "recover"):
-                T_start = start.T_world_lidar if self._asks_all else T_prior
+                T_start = start.T_world_lidar if is_young else T_prior
                 result = points.held(features, T_start, T_prior, result)
         if self.map is not None and not self._holds_place(result):
             with clock.stage("all-points"):
-                result = points.stand_in(features, T_prior, result, start if self._asks_all else None)
+                result = points.stand_in(features, T_prior, result, start if is_young else None)
         return result
 
     def _holds_place(self, result: RegistrationResult) -> bool:
@@ -207,16 +207,16 @@ class FeatureRegistration(Stateful):
         return replace(result, iterations=result.iterations + (iterations if self.map is not None else 0))
 
     @property
-    def _asks_all(self) -> bool:
-        """Whether so few scans were registered that all their points are asked for the pose, as `icp` asks them."""
-        is_begun = self.config.start_reach > 0 and self._inserted <= self.config.start_scans
-        return is_begun and self._all is not None
+    def _young(self) -> AllPoints | None:
+        """All points of the scans, while these are so few that all points are asked for the pose, as `icp` asks them."""
+        is_young = self.config.start_reach > 0 and self._inserted <= self.config.start_scans
+        return self._all if is_young else None
 
     def _capture(self, features: Features, T_prior: Floats) -> RegistrationResult:
         """A start that is metres nearer, where the prior may be metres off: less planar points on coarse planes."""
         c = self.config
-        if self._asks_all and self._all is not None:
-            return self._all.locate(features, T_prior)
+        if self._young is not None:
+            return self._young.locate(features, T_prior)
         points, scatter = thinned(features)
         target = self._planes()
 
@@ -251,10 +251,10 @@ class FeatureRegistration(Stateful):
     ) -> RegistrationResult:
         """Less planar points on planes in place of features that are too few or leave a direction open.
 
-        While the map is made of a few scans, all points have been asked already, and better than planes of one scan can be.
+        Where all points stand in and the map is made of a few scans, they have been asked already, and are the better ones.
         """
         T_start = starved.T_world_lidar if starved.ok else start.T_world_lidar
-        result = start if self._asks_all else self._on_planes(features, T_start, T_prior)
+        result = start if self._young is not None else self._on_planes(features, T_start, T_prior)
         are_few = starved.inliers < MIN_FEATURES
         # They must close a direction; where features are too few to be sure of any, open none.
         if not result.ok or (starved.ok and len(result.degenerate) > len(starved.degenerate) - (not are_few)):
