@@ -35,20 +35,24 @@ def test_it_is_so_for_loam_scan_to_scan_too() -> None:
     assert share_along(results, truth) >= 0.95
 
 
-@pytest.mark.parametrize(("method", "usual"), [("loam-odom", 0.01), ("loam", 0.02), ("lego-loam", 0.02)])
-def test_bare_walls_do_not_lead_features_astray(method: str, usual: float) -> None:
+@pytest.mark.parametrize(
+    ("method", "usual", "worst"), [("loam-odom", 0.01, 0.016), ("loam", 0.016, 0.03), ("lego-loam", 0.012, 0.04)]
+)
+def test_bare_walls_do_not_lead_features_astray(method: str, usual: float, worst: float) -> None:
     """The last scans that see anything know the speed; a few edges that walls do not have must not unlearn it.
 
     How well they know it is a matter of where the last pier stands: of one of five seeds to four percent.
     """
-    shares = []
-    for seed in range(5):
-        results, truth = between_walls(seed, method)
-        assert sum(len(r.degenerate) > 0 for r in results) > (30 if seed < 2 else 10)
-        way = se3.relative(truth[0], truth[-1])[:3, 3]
-        shares.append(np.linalg.norm(results[-1].T_world_lidar[:3, 3] - way) / np.linalg.norm(way))
+    shares = [strayed(seed, method) for seed in range(5)]
     assert np.median(shares) < usual
-    assert max(shares) < 0.04
+    assert max(shares) < worst
+
+
+@pytest.mark.parametrize("method", ["loam", "lego-loam"])
+def test_between_bare_walls_all_points_know_the_speed_better(method: str) -> None:
+    shares = [strayed(seed, method, "all-points") for seed in range(3)]
+    assert np.median(shares) < 0.001
+    assert max(shares) < 0.025
 
 
 @pytest.mark.parametrize("seed", [0, 1])
@@ -58,8 +62,7 @@ def test_a_sparse_sensor_holds_every_direction_as_it_turns(seed: int) -> None:
     results = by_features(block, "loam-odom")
     assert len(results) > 90
     assert np.mean([len(r.degenerate) > 0 for r in results]) < 0.02
-    # The heading of the first step, a hundred features' own, stays in all that follow.
-    assert ate(np.stack([r.T_world_lidar for r in results]), block.ground_truth.poses) < 0.7
+    assert ate(np.stack([r.T_world_lidar for r in results]), block.ground_truth.poses) < 0.3
 
 
 @lru_cache(maxsize=1)
@@ -70,11 +73,19 @@ def corridor(seed: int) -> Sequence:
 
 
 @cache
-def between_walls(seed: int, method: str) -> tuple[list[ScanResult], Floats]:
+def between_walls(seed: int, method: str, fallback: str = "none") -> tuple[list[ScanResult], Floats]:
     """What a method makes of the corridor, and the true poses."""
     drive = corridor(seed)
     assert drive.ground_truth is not None
-    return by_features(drive, method), drive.ground_truth.poses
+    return by_features(drive, method, fallback), drive.ground_truth.poses
+
+
+def strayed(seed: int, method: str, fallback: str = "none") -> float:
+    """Error of the last pose in parts of the way through the corridor, which leaves thirty scans and more open."""
+    results, truth = between_walls(seed, method, fallback)
+    assert sum(len(r.degenerate) > 0 for r in results) > 30
+    way = se3.relative(truth[0], truth[-1])[:3, 3]
+    return float(np.linalg.norm(results[-1].T_world_lidar[:3, 3] - way) / np.linalg.norm(way))
 
 
 def share_along(results: Many[RegistrationResult | ScanResult], truth: Floats) -> float:
@@ -86,8 +97,9 @@ def share_along(results: Many[RegistrationResult | ScanResult], truth: Floats) -
     return float(np.mean(np.degrees(np.arccos(cosines)) < 10.0))
 
 
-def by_features(drive: Sequence, method: str) -> list[ScanResult]:
-    odometry = create_odometry(Config.model_validate({"odometry": {"method": method}}))
+def by_features(drive: Sequence, method: str, fallback: str = "none") -> list[ScanResult]:
+    given = {"odometry": {"method": method}, "recovery": {"fallback": fallback}}
+    odometry = create_odometry(Config.model_validate(given))
     return estimate(drive, odometry, threads=1)
 
 
