@@ -29,8 +29,8 @@ class OsmConfig(Section):
     start_heading_deg: float = Field(20.0, gt=0, le=180, description="deg; so far off the heading may be")
     mode: Literal["prior", "rigid", "non-rigid", "two-level"] = Field(
         "two-level",
-        description="prior: buildings stay; rigid: they move together per scan; non-rigid: each moves with the trajectory; "
-        "two-level: first the trajectory, then each building",
+        description="prior: the map is true; rigid: it is off as a whole, as far as the start tells; non-rigid: each building is "
+        "off by itself, in one graph with the trajectory; two-level: first the trajectory, then each building",
     )
     matcher: Literal["walls", "baseline"] = Field(
         "walls",

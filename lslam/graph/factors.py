@@ -91,9 +91,7 @@ def planar(prior: PlanarPrior, pose: Floats, key: int, scale: float = 1.0, kerne
     """
     import gtsam
 
-    now = se2.of_se3(pose)
-    turn = se2.to_se3(np.array([0.0, 0.0, prior.pose[2] - now[2]]))[:3, :3]
-    T = se3.make(turn @ pose[:3, :3], np.array([*prior.pose[:2], pose[2, 3]]))
+    T = _seen_from_above(prior.pose, pose)
     information = np.zeros((6, 6))
     information[np.ix_(PLANAR, PLANAR)] = prior.information * (prior.share / scale)
     values, axes = np.linalg.eigh(noise.to_body(information, T))
@@ -101,6 +99,12 @@ def planar(prior: PlanarPrior, pose: Floats, key: int, scale: float = 1.0, kerne
     root = np.sqrt(np.maximum(values, 0.0))[:, None] * axes.T
     model = gtsam.noiseModel.Gaussian.SqrtInformation(root, False)
     return gtsam.BetweenFactorPose3(key, prior.keyframe, gtsam.Pose3(T), _robust(model, kernel))
+
+
+def _seen_from_above(planar: Floats, pose: Floats) -> Floats:
+    """(4, 4) at x, y and yaw of `planar` (3,), with the height and the tilt of `pose` (4, 4)."""
+    turn = se2.to_se3(np.array([0.0, 0.0, planar[2] - se2.of_se3(pose)[2]]))[:3, :3]
+    return se3.make(turn @ pose[:3, :3], np.array([*planar[:2], pose[2, 3]]))
 
 
 def map_key(graph: PoseGraph) -> int:
@@ -119,8 +123,9 @@ def fixed_part(graph: PoseGraph, may_tilt: bool = False) -> Any:
         held[PLANAR, PLANAR] = graph.start_sigma**2
     if may_tilt:
         held[3:, 3:] += TILTING**2 * (np.eye(3) - np.outer(graph.world_up, graph.world_up))
-    start = gtsam.noiseModel.Gaussian.Covariance(noise.to_body(held, graph.poses[0]))
-    factors.add(gtsam.PriorFactorPose3(0, gtsam.Pose3(graph.poses[0]), start))
+    first = graph.poses[0] if graph.start is None else _seen_from_above(graph.start, graph.poses[0])
+    start = gtsam.noiseModel.Gaussian.Covariance(noise.to_body(held, first))
+    factors.add(gtsam.PriorFactorPose3(0, gtsam.Pose3(first), start))
     for factor in between_all(graph.odometry):
         factors.add(factor)
     for up in graph.ups:

@@ -100,7 +100,8 @@ class PoseGraph:
     map_priors : planar priors in the frame of a map that is off as a whole by `shift_sigma` m, and one sigma by `map_sigma` m
         about each place
     is_anchored : whether the first pose is held where it is; else the fixes hold the graph
-    start_sigma : (3,) x, y (m), yaw (rad), how well these are known of a first pose that is held only otherwise
+    start : (3,) x, y (m), yaw (rad) that somebody gave of the first pose; None takes `poses`
+    start_sigma : (3,) m, m, rad, how well these are known of a first pose that is held only otherwise
     is_rigid : odometry is trusted: the whole moves, and nothing bends it
     walk : factor on `drift.drift_covariance` that odometry errs by at the least beside its covariances
     spread : (K, 6, 6) what poses are unsure by beside all that, as the covariances of `Solution`; None for nothing
@@ -121,6 +122,7 @@ class PoseGraph:
     shift_sigma: float = 0.0
     map_sigma: float = 0.0
     is_anchored: bool = True
+    start: Floats | None = None
     start_sigma: Floats | None = None
     is_rigid: bool = False
     walk: float = 0.0

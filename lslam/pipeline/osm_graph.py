@@ -12,7 +12,7 @@ from lslam.config import Config
 from lslam.formats.osm_buildings import BuildingExtract
 from lslam.geometry import se2, se3
 from lslam.graph.drift_fit import WallSightings
-from lslam.graph.problem import PoseGraph
+from lslam.graph.problem import PlanarPrior, PoseGraph
 from lslam.graph.wall_drift import WallDrift, find_wall_drift, without_drift
 from lslam.keyframes.store import KeyframeStore
 from lslam.pipeline.osm_pass import Located, locate
@@ -24,6 +24,8 @@ Floats = NDArray[np.float64]
 # How often drift is looked for: a wall ahead is seen from the last keyframe of a submap and one behind from the first, so
 # that only the greater part of it shows.
 ROUNDS = 5
+# Modes in which the map's buildings stand to each other as they are drawn.
+TRUSTING = ("prior", "rigid")
 
 
 def find_on_map(
@@ -72,13 +74,27 @@ def on_map(graph: PoseGraph, located: Located, config: Config) -> PoseGraph:
     return replace(
         graph,
         poses=graph.poses if graph.fixes else located.T_enu_odometry @ graph.poses,
-        map_priors=located.priors,
-        shift_sigma=config.osm.shift_sigma,
+        map_priors=_priors(located, config),
+        shift_sigma=0.0 if config.osm.mode == "prior" else config.osm.shift_sigma,
         map_sigma=config.osm.map_sigma,
         world_up=np.array([0.0, 0.0, 1.0]),
+        start=None if graph.fixes else located.start,
         start_sigma=None if graph.fixes else located.start_sigma,
         is_rigid=config.osm.trust_poses and config.odometry.method == "poses",
     )
+
+
+def _priors(located: Located, config: Config) -> list[PlanarPrior]:
+    """What the matches say. A map of which no part is off by itself errs only as what is seen does, anew with each submap.
+
+    Walls that are drawn by hand err by `wall_sigma`, the same for all who see them (`shares`).
+    """
+    if config.osm.mode not in TRUSTING:
+        return located.priors
+    # Of points that lie anywhere within the tolerance.
+    sharper = 3.0 * (config.osm.wall_sigma / config.osm.wall_tolerance) ** 2
+    share = 1.0 / config.keyframes.submap_size
+    return [replace(prior, information=sharper * prior.information, share=share) for prior in located.priors]
 
 
 def sightings(located: Located, poses: Floats, config: Config) -> WallSightings:

@@ -40,7 +40,7 @@ def join_buildings(
         _believed(graph, solution),
         poses=solution.poses,
         odometry=with_drift(graph, solution.drift, config.graph),
-        map_priors=[prior for prior, why in zip(graph.map_priors, solution.map_reasons, strict=True) if not why],
+        map_priors=(),
     )
     local = agreed(matches, se2.of_se3(solution.poses))
     found = optimise_jointly(believed, middles_of(matches), local, map_belief(matches, config.osm), config.graph)
@@ -58,7 +58,7 @@ def run_baseline(
     """
     osm = OsmMap(extract.buildings)
     odometry = with_drift(graph, 0.0, config.graph)
-    graph = replace(_believed(graph, solution), odometry=odometry, map_priors=(), start_sigma=None)
+    graph = replace(_believed(graph, solution), odometry=odometry, map_priors=(), start=None, start_sigma=None)
     middles = np.array([b.middle for b in osm.buildings]).reshape(-1, 2)
     poses, local, sights = graph.poses.copy(), list[BuildingMatch](), list[KeyframeMatch]()
     for k in range(len(store)):

@@ -51,9 +51,10 @@ def see_walls(store: KeyframeStore, poses: Floats, number: int, size: int, confi
 
 
 def known_start(config: OsmConfig) -> Start:
-    """The start that the configuration gives, with its heading."""
+    """What the configuration says of the start; of its heading nothing, unless that is given."""
+    is_headed = config.heading_deg is not None
     radius, turn = config.start_radius / WINDOW, np.radians(config.start_heading_deg) / WINDOW
-    return Start(first_pose(config), np.array([radius, radius, turn]))
+    return Start(first_pose(config), np.array([radius, radius, turn if is_headed else np.pi]))
 
 
 def sought_start(store: KeyframeStore, poses: Floats, osm: OsmMap, config: OsmConfig, submap_size: int) -> Start:

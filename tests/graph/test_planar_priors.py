@@ -83,6 +83,17 @@ def test_a_map_that_is_off_as_a_whole_does_not_move_a_start_that_is_known() -> N
     assert off(rigid.poses)[60:, :2].max() > 1.0
 
 
+def test_what_a_given_start_and_the_map_disagree_on_is_shared_by_how_well_both_are_known() -> None:
+    """The start is said to be 1.3 m beside where the map puts it: of one metre's sigma against the map's two."""
+    graph = held(6)
+    begun = se2.of_se3(REAL[0]) + np.array([1.2, -0.5, 0.0])
+    told = replace(graph, start=begun, start_sigma=np.array([1.0, 1.0, 0.5]))
+    shared = optimise(replace(told, shift_sigma=2.0), GraphConfig())
+    np.testing.assert_allclose(shared.shift, 0.8 * np.array([1.2, -0.5]), atol=0.08)
+    trusted = optimise(told, GraphConfig())
+    assert off(trusted.poses)[:, :2].max() < 0.15
+
+
 def test_a_match_with_the_wrong_house_is_given_up() -> None:
     graph = held(7)
     wrong = [5, 20, 41]
