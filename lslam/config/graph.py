@@ -31,7 +31,9 @@ class GraphConfig(Section):
     )
     drift_deg_per_100m: float = Field(0.5, gt=0, description="deg/100 m; likewise of its heading, roll and pitch")
     steady_drift: bool = Field(
-        True, description="set odometry straight where loops tell that it runs away at one rate, before they are closed"
+        True,
+        description="set odometry straight where loops tell that it runs away at one rate, before they are closed, or walls of "
+        "buildings that it drifts",
     )
     max_iterations: int = Field(100, ge=1, description="of the optimiser, per solution")
     gravity: bool = Field(True, description="with an IMU: hold each keyframe's up direction to what it measured")
@@ -39,11 +41,15 @@ class GraphConfig(Section):
     imu_orientation: bool = Field(False, description="with an IMU: hold turns between keyframes to the gyroscope's")
     imu_orientation_deg: float = Field(0.2, gt=0, description="deg; one sigma of such a turn")
     floor: bool = Field(False, description="hold keyframes to one floor plane, for flat ground only (hdl_graph_slam)")
+    floor_is_flat: bool = Field(
+        True, description="only where nearly all of it is one plane; false: whatever it is, as hdl_graph_slam does"
+    )
     floor_m: float = Field(0.1, gt=0, description="m; one sigma of the floor's distance")
     floor_deg: float = Field(1.0, gt=0, description="deg; one sigma of the floor's direction")
     information: Literal["registration", "fitness"] = Field(
         "registration",
-        description="covariances of constraints: of the registrations, or from their rmse (hdl_graph_slam)",
+        description="covariances of constraints: of the registrations, or from how far the points of one keyframe lie from the "
+        "nearest ones of the other (hdl_graph_slam)",
     )
     fitness_sigma_m: tuple[float, float] = Field((0.1, 5.0), description="m; sigma of a perfect fit and of a bad one")
     fitness_sigma_rad: tuple[float, float] = Field((0.05, 0.2), description="rad; likewise of rotation")

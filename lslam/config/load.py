@@ -13,7 +13,7 @@ import tomli_w
 from pydantic import BaseModel, ValidationError
 
 from lslam.config.config import Config
-from lslam.config.preset_files import known_presets, read_preset, read_toml
+from lslam.config.preset_files import BASE, known_presets, read_preset, read_toml
 from lslam.errors import ConfigError, nearest
 
 Tree = dict[str, Any]
@@ -44,12 +44,24 @@ def _over_preset(tree: Tree) -> Tree:
     name = str(tree.get("odometry", {}).get("preset", ""))
     if not name:
         return tree
-    under: Tree = {}
-    _merge(under, read_preset(name), f"preset {name}")
-    if "preset" in under.get("odometry", {}):
-        raise ConfigError(f"preset {name}: a preset cannot stand on another one, remove odometry.preset")
+    under = _whole(name)
     _merge(under, tree, "")
     under["odometry"]["preset"] = name if name in known_presets() else str(Path(name).resolve())
+    return under
+
+
+def _whole(name: str, above: tuple[str, ...] = ()) -> Tree:
+    """A preset with the one that it names as its `base` under it."""
+    if name in above:
+        raise ConfigError(f"presets {', '.join(above)}: one cannot stand on itself")
+    tree = read_preset(name)
+    base = tree.pop(BASE, None)
+    under = {} if base is None else _whole(str(base), (*above, name))
+    _merge(under, tree, f"preset {name}")
+    if "preset" in under.get("odometry", {}):
+        raise ConfigError(
+            f'preset {name}: what it stands on is said by base = "NAME" at its top, not by odometry.preset'
+        )
     return under
 
 

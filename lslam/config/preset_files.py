@@ -10,8 +10,8 @@ from typing import Any
 from lslam.errors import ConfigError, InputError, UsageError, cause, nearest
 
 FOLDER = "presets"
-# A preset may say what it is on one line beside its sections.
-SUMMARY = "summary"
+# A preset may say what it is, and on which other one it stands, on a line each beside its sections.
+SUMMARY, BASE = "summary", "base"
 
 
 def known_presets() -> dict[str, str]:
@@ -20,7 +20,7 @@ def known_presets() -> dict[str, str]:
 
 
 def read_preset(name: str) -> dict[str, Any]:
-    """Sections of a preset: a shipped name, or a TOML file of the user's.
+    """Sections of a preset, and its `base` if it has one: a shipped name, or a TOML file of the user's.
 
     Raises UsageError with the nearest name when there is none, InputError or ConfigError for an unusable file.
     """

@@ -29,7 +29,9 @@ class RegistrationConfig(Section):
         "map",
         description="registered against a map of all scans near by, of the last keyframes, or the last scan alone",
     )
-    keyframes: int = Field(10, ge=1, description="`target = keyframe`: how many; a new one each 2 m or 15 deg")
+    keyframes: int = Field(10, ge=1, description="`target = keyframe`: how many")
+    keyframe_m: float = Field(2.0, gt=0, description="m; so far from the newest of them a new one is made")
+    keyframe_deg: float = Field(15.0, gt=0, description="deg; or turned by so much")
     inlier_distance: float | None = Field(
         None,
         gt=0,

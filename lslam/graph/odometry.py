@@ -23,19 +23,23 @@ LEAST_M, LEAST_RAD = 1e-3, 1e-4
 
 
 def odometry_constraints(
-    keyframes: Sequence[Keyframe], results: Sequence[ScanResult], config: GraphConfig
+    keyframes: Sequence[Keyframe],
+    results: Sequence[ScanResult],
+    config: GraphConfig,
+    fitness: Sequence[float] | None = None,
 ) -> list[Constraint]:
     """From each keyframe to the next, with what odometry's uncertainty grew by on the way.
 
     A scan's covariance is that of the local map and that of its registration on it; only the former accumulates
     (`registration.uncertainty`). Methods without covariances are taken to drift as `config` says of drift.
+    fitness : of each keyframe but the first with the one before, m2, where covariances come of that
     """
     constraints = []
-    for before, after in pairwise(keyframes):
+    for k, (before, after) in enumerate(pairwise(keyframes)):
         a, b = results[before.scan], results[after.scan]
         T = se3.relative(a.T_world_lidar, b.T_world_lidar)
-        if config.information == "fitness":
-            covariance = fitness_covariance(b.rmse, config)
+        if fitness is not None:
+            covariance = fitness_covariance(fitness[k], config)
         else:
             grown = growth(a, b, after.distance - before.distance, config)
             covariance = noise.rotated(grown, a.T_world_lidar[:3, :3].T)
@@ -43,16 +47,28 @@ def odometry_constraints(
     return constraints
 
 
-def fitness_covariance(rmse: float, config: GraphConfig) -> Floats:
-    """(6, 6) covariance of a registration from its rmse, m, as hdl_graph_slam has it.
+def fitness_score(seen: NDArray[np.float32], other: NDArray[np.float32], T: Floats) -> float:
+    """Mean squared distance, m2, of the points (N, 3) of one keyframe to the nearest of another's (M, 3), at T (4, 4) from it.
 
-    Its fitness score is the mean squared distance; sigma rises from the smaller of two values to the larger with it.
+    PCL's `getFitnessScore`, which hdl_graph_slam takes of its keyframes; infinite without points.
     """
-    score = min(rmse**2, config.fitness_limit)
-    share = (1 - np.exp(-config.fitness_gain * score)) / (1 - np.exp(-config.fitness_gain * config.fitness_limit))
-    (near_m, far_m), (near_rad, far_rad) = config.fitness_sigma_m, config.fitness_sigma_rad
-    sigma_m, sigma_rad = near_m + (far_m - near_m) * share, near_rad + (far_rad - near_rad) * share
-    return np.diag(np.repeat([sigma_m**2, sigma_rad**2], 3))
+    from scipy.spatial import cKDTree
+
+    if not len(seen) or not len(other):
+        return float("inf")
+    away, _ = cKDTree(other).query(se3.apply(T, seen.astype(np.float64)))
+    return float(np.mean(np.square(away)))
+
+
+def fitness_covariance(score: float, config: GraphConfig) -> Floats:
+    """(6, 6) covariance of a registration from its fitness score, m2, as hdl_graph_slam has it.
+
+    The variance rises from that of the smaller of two sigmas to that of the larger with it.
+    """
+    gain, limit = config.fitness_gain, config.fitness_limit
+    share = (1 - np.exp(-gain * min(score, limit))) / (1 - np.exp(-gain * limit))
+    (near_m, far_m), (near_rad, far_rad) = (np.square(s) for s in (config.fitness_sigma_m, config.fitness_sigma_rad))
+    return np.diag(np.repeat([near_m + (far_m - near_m) * share, near_rad + (far_rad - near_rad) * share], 3))
 
 
 def growth(a: ScanResult, b: ScanResult, way: float, config: GraphConfig) -> Floats:

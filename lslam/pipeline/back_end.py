@@ -9,14 +9,16 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence as Many
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lslam.config import Config
+from lslam.geometry import se3
 from lslam.graph.drift import tilt_factor
 from lslam.graph.floors import on_one_plane
-from lslam.graph.odometry import bent, fitness_covariance, odometry_constraints
+from lslam.graph.odometry import bent, fitness_covariance, fitness_score, odometry_constraints
 from lslam.graph.problem import PoseGraph
 from lslam.keyframes.store import KeyframeStore
 from lslam.pipeline.georeferencing import Placement, on_earth, place
@@ -95,18 +97,29 @@ def _up(graph: PoseGraph) -> Floats | None:
     return np.asarray(turned / np.linalg.norm(turned))
 
 
+def _fitness(store: KeyframeStore, a: int, b: int, T_a_b: Floats) -> float:
+    """Fitness score, m2, of keyframe `b` on keyframe `a`."""
+    return fitness_score(store.points(b), store.points(a), T_a_b)
+
+
 def _graph(given: Given) -> PoseGraph:
     store, config, results, candidates = given.store, given.config, given.results, given.candidates
     loops = [c.constraint for c in candidates if c.verdict == "accepted" and c.constraint is not None]
+    fitness = None
     if config.graph.information == "fitness":
-        rmse = {(c.a, c.b): c.rmse for c in candidates}
-        loops = [replace(loop, covariance=fitness_covariance(rmse[loop.a, loop.b], config.graph)) for loop in loops]
+        loops = [
+            replace(loop, covariance=fitness_covariance(_fitness(store, loop.a, loop.b, loop.T_a_b), config.graph))
+            for loop in loops
+        ]
+        known = [k.T_world_lidar for k in store.keyframes]
+        steps = [se3.relative(a, b) for a, b in pairwise(known)]
+        fitness = [_fitness(store, k, k + 1, T) for k, T in enumerate(steps)]
     ups = up_directions(store.keyframes, results, config.graph) if config.graph.gravity else []
     up = world_up(ups, store.keyframes)
     poses = np.stack([k.T_world_lidar for k in store.keyframes])
     distances = np.array([k.distance for k in store.keyframes])
     seen = floor_planes(store, config.graph) if config.graph.floor else []
-    floors = on_one_plane(seen, poses, distances, config.graph)
+    floors = on_one_plane(seen, poses, distances, config.graph) if config.graph.floor_is_flat else seen
     if seen and not floors:
         given.problems.append(
             f"floor: the ground seen from {len(seen)} keyframes is not one plane: it holds no pose "
@@ -114,7 +127,7 @@ def _graph(given: Given) -> PoseGraph:
         )
     return PoseGraph(
         poses=poses,
-        odometry=odometry_constraints(store.keyframes, results, config.graph),
+        odometry=odometry_constraints(store.keyframes, results, config.graph, fitness),
         loops=loops,
         floors=floors,
         distances=distances,

@@ -42,7 +42,8 @@ def find_on_map(
     """
     located = locate(extract, store, up, config, placed)
     held = on_map(graph, located, config)
-    if located.problem or config.osm.matcher != "walls" or held.is_rigid:
+    is_straight = held.is_rigid or not config.graph.steady_drift
+    if located.problem or config.osm.matcher != "walls" or is_straight:
         return located, held
     before: WallDrift | None = None
     for _ in range(ROUNDS):

@@ -104,7 +104,7 @@ def _match(
         walls = osm.walls[osm.owners == building] - middle
         fit = lay_building(walls, seen, se2.relative(start, np.append(middle, 0.0)))
         if fit is not None:
-            spread = fitness_covariance(fit.rmse, config.graph)[np.ix_(PLANAR, PLANAR)]
+            spread = fitness_covariance(fit.rmse**2, config.graph)[np.ix_(PLANAR, PLANAR)]
             information, nothing = np.asarray(np.linalg.inv(spread), np.float64), np.zeros((0, 2), np.int64)
             found.append(
                 BuildingMatch(

@@ -70,7 +70,7 @@ class Registration(Stateful):
         self.recovery = tuple(recovery)
         self.residual = c.residual or "plane"
         residual_named(self.residual)
-        self.target = make_target(c.target, c.keyframes)
+        self.target = make_target(c)
         self.map = LocalMap(
             c.voxel_size * (POINT_VOXEL if self.residual == "point" else 1.0), coarse_factor=c.coarse_factor,
             min_points=c.min_points, planarity=c.planarity, count_cap=c.count_cap, reach=1.2 * self.preprocess.range_max,

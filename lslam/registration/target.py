@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from typing import Literal, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.config.registration import RegistrationConfig
 from lslam.geometry import se3, so3
 from lslam.preprocessing.prepare import PreparedPoints
 from lslam.registration.local_map import LocalMap
 from lslam.types.state import Stateful
 
 Floats = NDArray[np.float64]
-
-KEYFRAME_M, KEYFRAME_DEG = 2.0, 15.0
 
 
 class Target(Protocol):
@@ -43,20 +42,19 @@ class ScanTarget(Stateful):
 
 
 class KeyframeTarget(Stateful):
-    """The last `count` keyframes, a new one where the sensor has moved 2 m or turned 15 deg since the newest."""
+    """The last `count` keyframes, a new one where the sensor has moved `move`, m, or turned `turn`, rad, since the newest."""
 
     STATE = ("keyframes",)
 
-    def __init__(self, count: int) -> None:
-        self.count = count
+    def __init__(self, count: int, move: float, turn: float) -> None:
+        self.count, self.move, self.turn = count, move, turn
         self.keyframes: list[tuple[PreparedPoints, Floats]] = []
 
     def enter(self, target: LocalMap, points: PreparedPoints, T_world_lidar: Floats) -> None:
         """Add a keyframe when it is due; the map is built anew when an old one leaves."""
         if self.keyframes:
             step = se3.relative(self.keyframes[-1][1], T_world_lidar)
-            turn = float(so3.angle(step[:3, :3]))
-            if np.linalg.norm(step[:3, 3]) < KEYFRAME_M and turn < np.deg2rad(KEYFRAME_DEG):
+            if np.linalg.norm(step[:3, 3]) < self.move and float(so3.angle(step[:3, :3])) < self.turn:
                 return
         self.keyframes.append((points, T_world_lidar.copy()))
         if len(self.keyframes) <= self.count:
@@ -68,8 +66,8 @@ class KeyframeTarget(Stateful):
             target.insert(cloud.map_points, cloud.source, pose)
 
 
-def make_target(kind: Literal["map", "keyframe", "scan"], keyframes: int) -> Target:
-    """The target `registration.target` names."""
-    if kind == "keyframe":
-        return KeyframeTarget(keyframes)
-    return ScanTarget() if kind == "scan" else MapTarget()
+def make_target(config: RegistrationConfig) -> Target:
+    """The target that `config.target` names."""
+    if config.target == "keyframe":
+        return KeyframeTarget(config.keyframes, config.keyframe_m, float(np.deg2rad(config.keyframe_deg)))
+    return ScanTarget() if config.target == "scan" else MapTarget()

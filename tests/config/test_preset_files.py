@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from lslam.config import Config, load_config, to_toml
-from lslam.config.preset_files import known_presets, read_preset
+from lslam.config.preset_files import BASE, known_presets, read_preset
 from lslam.errors import ConfigError, InputError, UsageError
 
 MINE = """summary = "ours"
@@ -54,6 +54,17 @@ def test_file_environment_and_setting_may_name_it_and_the_highest_wins(mine: Pat
     assert load(f"odometry.preset={mine}", LSLAM_ODOMETRY_PRESET=str(other)).map.voxel == 0.5
 
 
+def test_a_preset_may_stand_on_another_one(tmp_path: Path) -> None:
+    first, second = tmp_path / "first.toml", tmp_path / "second.toml"
+    first.write_text("[map]\nvoxel = 0.9\nwrite = false\n")
+    second.write_text(f'summary = "two"\nbase = "{first}"\n[map]\nvoxel = 0.7\n')
+    config = load(f"odometry.preset={second}")
+    assert (config.map.voxel, config.map.write, config.odometry.preset) == (0.7, False, str(second))
+    first.write_text(f'base = "{second}"\n')
+    with pytest.raises(ConfigError, match="one cannot stand on itself"):
+        load(f"odometry.preset={second}")
+
+
 def test_a_resolved_configuration_repeats_itself_and_names_its_preset(
     mine: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -83,7 +94,7 @@ def test_wrong_files_and_keys_of_a_preset_are_named(tmp_path: Path) -> None:
         ("[map]\nvoxl = 1\n", r"preset .*p\.toml: unknown key map\.voxl; did you mean 'voxel'"),
         ("[map\n", "not valid TOML"),
         ("voxel = 1\n", "unknown section 'voxel'"),
-        ('[odometry]\npreset = "thesis-icp"\n', "cannot stand on another"),
+        ('[odometry]\npreset = "thesis-icp"\n', "what it stands on is said by base"),
         ("[map]\nvoxel = 0\n", r"map\.voxel = 0"),
     ):
         (tmp_path / "p.toml").write_text(text)
@@ -96,7 +107,9 @@ def test_every_shipped_preset_loads_and_says_what_it_is(name: str) -> None:
     assert len(known_presets()[name]) > 20
     config = load(f"odometry.preset={name}")
     assert config.odometry.preset == name
-    for section, values in read_preset(name).items():
+    sections = {section: values for section, values in read_preset(name).items() if section != BASE}
+    assert len(sections) > 1
+    for section, values in sections.items():
         for key, value in values.items():
             assert getattr(getattr(config, section), key) == (tuple(value) if isinstance(value, list) else value)
 

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from graph_builders import STEP_SIGMAS, measured, truth
 
 from lslam.config.graph import GraphConfig
 from lslam.geometry import noise, se3, so3
-from lslam.graph.odometry import corrected, fitness_covariance, growth, odometry_constraints
+from lslam.graph.odometry import corrected, fitness_covariance, fitness_score, growth, odometry_constraints
 from lslam.types.keyframe import Keyframe
 from lslam.types.scan_result import ScanResult
 
@@ -60,15 +61,30 @@ def test_methods_without_covariances_drift_as_configured() -> None:
     np.testing.assert_allclose(np.sqrt(covariance[0, 0]), 0.02 * 5 + 1e-3)
 
 
-def test_fitness_maps_between_two_sigmas() -> None:
+def test_fitness_maps_between_two_variances() -> None:
+    """hdl_graph_slam's weight: var = near + (far - near) (1 - exp(-gain x)) / (1 - exp(-gain limit))."""
     config = GraphConfig(information="fitness")
     np.testing.assert_allclose(np.sqrt(np.diag(fitness_covariance(0.0, config)))[[0, 5]], [0.1, 0.05])
     np.testing.assert_allclose(np.sqrt(np.diag(fitness_covariance(9.0, config)))[[0, 5]], [5.0, 0.2])
-    sigmas = [fitness_covariance(rmse, config)[0, 0] for rmse in (0.0, 0.1, 0.3, 0.7)]
-    assert sigmas == sorted(sigmas)
+    between = 0.01 + (25.0 - 0.01) * (1 - np.exp(-20 * 0.03)) / (1 - np.exp(-20 * 0.5))
+    np.testing.assert_allclose(fitness_covariance(0.03, config)[0, 0], between)
     results = results_of(POSES)
-    first = odometry_constraints(keyframes_of(results), results, config)[0]
-    np.testing.assert_allclose(first.covariance, fitness_covariance(0.1, config))
+    scores = np.linspace(0.0, 0.5, len(keyframes_of(results)) - 1).tolist()
+    found = odometry_constraints(keyframes_of(results), results, config, scores)
+    np.testing.assert_allclose([c.covariance for c in found], [fitness_covariance(s, config) for s in scores])
+
+
+def test_the_fitness_score_is_the_mean_square_of_the_way_to_the_nearest_point() -> None:
+    rng = np.random.default_rng(0)
+    wall = np.column_stack([np.arange(0, 40, 2.0), np.zeros(20), np.zeros(20)]).astype(np.float32)
+    T = se3.make(so3.exp(np.array([0.0, 0.0, 0.3])), np.array([1.0, 2.0, 0.5]))
+    beside = wall + np.array([0.3, 0.0, 0.4], np.float32)
+    seen = se3.apply(se3.inverse(T), beside.astype(np.float64)).astype(np.float32)
+    assert fitness_score(seen, wall, T) == pytest.approx(0.25, abs=1e-5)
+    cloud = rng.uniform(-5, 5, (50, 3)).astype(np.float32)
+    away = np.linalg.norm(seen[:, None].astype(float) - cloud[None].astype(float), axis=2).min(axis=1)
+    assert fitness_score(seen, cloud, np.eye(4)) == pytest.approx(np.mean(away**2), rel=1e-6)
+    assert fitness_score(seen, cloud[:0], np.eye(4)) == np.inf
 
 
 def test_a_correction_that_is_rigid_moves_all_scans_alike() -> None:
