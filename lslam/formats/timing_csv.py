@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import csv
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,8 @@ from numpy.typing import NDArray
 from lslam.errors import InputError, cause
 
 NOT_STAGES = ("index", "stamp_ns", "stamp", "total")
+# Before the names of what is done after odometry.
+AFTER = "back end: "
 
 
 @dataclass(frozen=True)
@@ -20,20 +23,30 @@ class TimingRows:
 
     stamps_ns : (N,) int64, None when the file has none; stages : (N,) seconds by name, in the order of the file
     total : (N,) seconds
+    back_end : (N,) seconds by name, of what was done to a scan after odometry and does not count in `total`
     """
 
     stamps_ns: NDArray[np.int64] | None
     stages: dict[str, NDArray[np.float64]]
     total: NDArray[np.float64]
+    back_end: dict[str, NDArray[np.float64]] = field(default_factory=dict)
 
 
 def timing_text(
-    indices: list[int], stamps_ns: list[int], names: list[str], seconds: NDArray[np.float64]
+    indices: list[int], stamps_ns: list[int], names: list[str], seconds: NDArray[np.float64],
+    back_end: Mapping[int, Mapping[str, float]] | None = None,
 ) -> str:  # fmt: skip
-    """The file of scans by number and stamp, with seconds (N, S) of the stages `names`."""
-    lines = [",".join(["index", "stamp_ns", *names, "total"])]
-    for index, stamp, row in zip(indices, stamps_ns, seconds, strict=True):
-        lines.append(",".join([str(index), str(stamp), *(f"{v:.6f}" for v in (*row, row.sum()))]))
+    """The file of scans by number and stamp, with seconds (N, S) of the stages `names`.
+
+    back_end : seconds by row and name, of stages that do not count in the total of a scan
+    """
+    back_end = back_end or {}
+    later = list(dict.fromkeys(f"{AFTER}{name}" for row in back_end.values() for name in row))
+    lines = [",".join(["index", "stamp_ns", *names, "total", *later])]
+    for k, (index, stamp, row) in enumerate(zip(indices, stamps_ns, seconds, strict=True)):
+        own = back_end.get(k, {})
+        values = (*row, row.sum(), *(own.get(name.removeprefix(AFTER), 0.0) for name in later))
+        lines.append(",".join([str(index), str(stamp), *(f"{v:.6f}" for v in values)]))
     return "\n".join(lines) + "\n"
 
 
@@ -45,7 +58,9 @@ def read_timing_rows(path: Path) -> TimingRows:
     header, values = _table(path)
     # Others number their rows `scan`; beside an index that is LOAM's stage.
     others = NOT_STAGES if "index" in header else (*NOT_STAGES, "scan")
-    stages = {name: values[:, k] for k, name in enumerate(header) if name not in others}
+    columns = {name: values[:, k] for k, name in enumerate(header) if name not in others}
+    stages = {name: column for name, column in columns.items() if not name.startswith(AFTER)}
+    later = {name.removeprefix(AFTER): column for name, column in columns.items() if name not in stages}
     if "total" in header:
         total = values[:, header.index("total")]
     elif stages:
@@ -53,7 +68,7 @@ def read_timing_rows(path: Path) -> TimingRows:
     else:
         raise InputError(f"{path} has neither a column total nor stages: columns are {', '.join(header)}")
     stamps = values[:, header.index("stamp_ns")].astype(np.int64) if "stamp_ns" in header else None
-    return TimingRows(stamps, stages, total)
+    return TimingRows(stamps, stages, total, later)
 
 
 def _table(path: Path) -> tuple[list[str], NDArray[np.float64]]:

@@ -23,6 +23,7 @@ from lslam.loops.scan_context import PlaceIndex, PlaceMatch
 from lslam.loops.verify import Comparison, Verifier
 from lslam.types.constraint import Constraint, LoopCandidate
 from lslam.types.keyframe import Keyframe
+from lslam.types.stage_clock import KeyframeClocks
 
 log = logging.getLogger("lslam")
 
@@ -42,12 +43,17 @@ KEPT, LOOKS = 16, 8
 
 
 def find_loops(
-    store: KeyframeStore, config: LoopsConfig, registration: RegistrationConfig, submap_size: int = 5
+    store: KeyframeStore,
+    config: LoopsConfig,
+    registration: RegistrationConfig,
+    submap_size: int = 5,
+    clocks: KeyframeClocks | None = None,
 ) -> list[LoopCandidate]:
     """Loop candidates of a run in the order of the newer keyframe, with verdicts.
 
     store : the run's keyframes with odometry's poses, their covariances and the distance travelled
     submap_size : keyframes whose clouds make one submap (`keyframes.submap_size`)
+    clocks : take the time of each keyframe, stage `loops`
 
     An accepted candidate carries its constraint, T_a_b between LiDAR frames.
     """
@@ -55,7 +61,7 @@ def find_loops(
     detector = Detector(
         store.keyframes, lambda number: submap(store, poses, number, submap_size), config, registration
     )  # fmt: skip
-    candidates = detector.find()
+    candidates = detector.find(clocks)
     accepted = sum(c.verdict == "accepted" for c in candidates)
     tried = sum(c.stage != "thinned" for c in candidates)
     log.info("loops: %d closed of %d candidates, %d keyframes", accepted, tried, len(store))
@@ -94,8 +100,9 @@ class Detector:
         steps = np.floor(self.doubt.distances / (NEAR / 2))
         self._is_described = np.diff(steps, prepend=-1.0) > 0
 
-    def find(self) -> list[LoopCandidate]:
+    def find(self, clocks: KeyframeClocks | None = None) -> list[LoopCandidate]:
         """All candidates in the order of the newer keyframe, with verdicts."""
+        clocks = KeyframeClocks() if clocks is None else clocks
         candidates: list[LoopCandidate] = []
         pace = Pace(self.config.spacing)
         gated = [self._gated(b) for b in range(len(self.keyframes))]
@@ -108,15 +115,21 @@ class Detector:
             if not pace.is_due(keyframe.distance):
                 candidates.append(self._thinned(older, b, pace.wait))
                 continue
-            alike, fallback = self._choose(b, older)
-            examined = settle([self._examine(match, b) for match in alike], self.keyframes, self._reach_between)
-            if fallback is not None and not any(c.verdict == "accepted" or c.stage == "ambiguity" for c in examined):
-                examined.append(self._examine(fallback, b))
+            with clocks[b].stage("loops"):
+                examined = self._examined(b, older)
             candidates += examined
             pace.observe(
                 keyframe.distance, "accepted" if any(c.verdict == "accepted" for c in examined) else "rejected"
             )
         return candidates
+
+    def _examined(self, b: int, older: NDArray[np.int64]) -> list[LoopCandidate]:
+        """Keyframe `b` against those of the `older` ones that look alike, with verdicts."""
+        alike, fallback = self._choose(b, older)
+        examined = settle([self._examine(match, b) for match in alike], self.keyframes, self._reach_between)
+        if fallback is not None and not any(c.verdict == "accepted" or c.stage == "ambiguity" for c in examined):
+            examined.append(self._examine(fallback, b))
+        return examined
 
     def _level_world(self) -> None:
         """Turn the world so that z is up: places are compared from above. Relative poses stay as they are."""

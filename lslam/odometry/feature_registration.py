@@ -15,13 +15,14 @@ from lslam.odometry.all_points import AllPoints
 from lslam.odometry.feature_map import FeatureMap, thinned
 from lslam.odometry.feature_scan import FeatureScan, feature_scan, surface_size
 from lslam.odometry.feature_solver import NONE, FeatureNoise, kept_where_blind, solve_on_map
-from lslam.odometry.feature_steps import ScanStep, StageClock
+from lslam.odometry.feature_steps import ScanStep
 from lslam.preprocessing.features import Features
 from lslam.recovery.start_search import MUCH, START_STEP, start_offsets
 from lslam.registration.acceptance import Wording, accepted, failed
 from lslam.registration.registration import NEAR_KERNEL
 from lslam.registration.robust import AdaptiveThreshold, Annealing, UsualAgreement
 from lslam.registration.solver import RegistrationResult
+from lslam.types.stage_clock import StageClock
 from lslam.types.state import Stateful
 
 Floats = NDArray[np.float64]

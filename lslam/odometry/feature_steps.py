@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -16,24 +14,9 @@ from lslam.preprocessing.features import Features
 from lslam.registration.alignment import upright_directions
 from lslam.registration.robust import Annealing
 from lslam.registration.solver import RegistrationResult
+from lslam.types.stage_clock import StageClock
 
 Floats = NDArray[np.float64]
-
-
-class StageClock:
-    """Seconds per stage of one scan, by name, in the order they ran; a stage that runs twice adds up."""
-
-    def __init__(self) -> None:
-        self.seconds: dict[str, float] = {}
-
-    @contextmanager
-    def stage(self, name: str) -> Iterator[None]:
-        """Measure the block."""
-        began = time.perf_counter()
-        try:
-            yield
-        finally:
-            self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - began
 
 
 ScanStep = Callable[[FeatureScan, Features, Floats, Annealing, FeatureNoise, bool, StageClock], RegistrationResult]

@@ -9,7 +9,7 @@ import numpy as np
 from lslam.config.config import Config
 from lslam.odometry.base import Registered
 from lslam.odometry.feature_registration import FeatureRegistration
-from lslam.odometry.feature_steps import ScanStep, StageClock, joint_step
+from lslam.odometry.feature_steps import ScanStep, joint_step
 from lslam.odometry.outcome import of_registration
 from lslam.preprocessing.deskew import deskew_points
 from lslam.preprocessing.features import FeaturePoints, Features, extract_features
@@ -17,6 +17,7 @@ from lslam.registration.uncertainty import PoseUncertainty
 from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan import Scan
 from lslam.types.scan_result import ScanResult
+from lslam.types.stage_clock import StageClock
 from lslam.types.state import Stateful
 
 

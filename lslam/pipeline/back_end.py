@@ -29,6 +29,7 @@ from lslam.pipeline.osm_source import OsmSource
 from lslam.types.constraint import LoopCandidate, Turn
 from lslam.types.scan_result import ScanResult
 from lslam.types.sequence import Sequence
+from lslam.types.stage_clock import KeyframeClocks
 
 log = logging.getLogger("lslam")
 Floats = NDArray[np.float64]
@@ -37,10 +38,11 @@ Floats = NDArray[np.float64]
 def run_back_end(
     sequence: Sequence, results: list[ScanResult], store: KeyframeStore, config: Config,
     candidates: list[LoopCandidate], turns: Many[Turn] = (), osm: OsmSource | None = None,
+    clocks: KeyframeClocks | None = None,
 ) -> BackEnd:  # fmt: skip
     """Close loops, take in fixes and buildings, optimise, and place all scans accordingly; odometry's poses where that fails."""
     keyframes = store.keyframes
-    given = Given(results, store, config, candidates)
+    given = Given(results, store, config, candidates, KeyframeClocks() if clocks is None else clocks)
     problems = given.problems
     if len(keyframes) < 2:
         if config.gnss.mode != "off":

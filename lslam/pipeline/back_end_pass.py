@@ -30,6 +30,7 @@ from lslam.types.constraint import LoopCandidate
 from lslam.types.georeference import Georeference
 from lslam.types.run_record import RunRecord
 from lslam.types.sequence import Sequence
+from lslam.types.stage_clock import KeyframeClocks
 from lslam.version import __version__
 
 log = logging.getLogger("lslam")
@@ -51,12 +52,17 @@ def optimise_poses(
         record.trajectory = to_trajectory(record.results, record.method)
     if manifest.outcome in ("interrupted", "diverged"):
         return BackEnd(record.results)
+    clocks = KeyframeClocks()
     with manifest.timed("back_end_s"):
         candidates: list[LoopCandidate] = []
         if config.loops.use:
             with manifest.timed("loops_s"):
-                candidates = _loops(store, config, checkpoints)
-        done = run_back_end(sequence, record.results, store, config, candidates, record.turns, osm)
+                candidates = _loops(store, config, checkpoints, clocks)
+        done = run_back_end(sequence, record.results, store, config, candidates, record.turns, osm, clocks)
+    record.back_end_seconds = {store.keyframes[k].scan: clock.seconds for k, clock in sorted(clocks.items())}
+    manifest.timings |= {
+        f"{name.replace(' ', '_')}_s": seconds for name, seconds in clocks.totals().items() if name != "loops"
+    }
     record.odometry = record.trajectory
     if done.is_optimised:
         record.results = done.results
@@ -69,14 +75,16 @@ def optimise_poses(
     return done
 
 
-def _loops(store: KeyframeStore, config: Config, checkpoints: Checkpoints | None) -> list[LoopCandidate]:
+def _loops(
+    store: KeyframeStore, config: Config, checkpoints: Checkpoints | None, clocks: KeyframeClocks
+) -> list[LoopCandidate]:
     """All candidates of the keyframes where they are now, by an earlier run where it found them for the same poses."""
     poses = np.array([k.T_world_lidar for k in store.keyframes]).reshape(-1, 4, 4)
     known = None if checkpoints is None else checkpoints.latest()
     if known is not None and np.array_equal(known["poses"], poses):
         candidates: list[LoopCandidate] = known["candidates"]
         return candidates
-    candidates = find_loops(store, config.loops, config.registration, config.keyframes.submap_size)
+    candidates = find_loops(store, config.loops, config.registration, config.keyframes.submap_size, clocks)
     if checkpoints is not None:
         checkpoints.write(len(poses), lambda: {"poses": poses, "candidates": Records(candidates)})
     return candidates

@@ -25,6 +25,7 @@ from lslam.types.building_match import OsmMatches
 from lslam.types.constraint import Constraint, LoopCandidate
 from lslam.types.georeference import Georeference
 from lslam.types.scan_result import ScanResult
+from lslam.types.stage_clock import KeyframeClocks
 
 log = logging.getLogger("lslam")
 Floats = NDArray[np.float64]
@@ -41,6 +42,7 @@ class Given:
     """What the back end has of a run.
 
     results : of odometry, all scans; store : of the keyframes; candidates : all loop candidates with odometry's verdicts
+    clocks : take the time of what is done to each keyframe, and with the last one that of the whole graph
     problems : what could not be done so far, one sentence each: whoever finds one adds it
     """
 
@@ -48,6 +50,7 @@ class Given:
     store: KeyframeStore
     config: Config
     candidates: list[LoopCandidate]
+    clocks: KeyframeClocks = field(default_factory=KeyframeClocks)
     problems: list[str] = field(default_factory=list)
 
 
@@ -90,7 +93,8 @@ def solve(graph: PoseGraph, given: Given, georeference: Georeference | None = No
     """
     config = given.config
     try:
-        solution = optimise(graph, config.graph)
+        with given.clocks[len(given.store) - 1].stage("graph"):
+            solution = optimise(graph, config.graph)
     except (GraphError, np.linalg.LinAlgError) as error:
         given.problems.append(f"{error}; the run goes on without it")
         return None

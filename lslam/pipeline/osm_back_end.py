@@ -23,6 +23,7 @@ from lslam.types.georeference import Georeference
 def hold_by_buildings(osm: OsmSource, graph: PoseGraph, placement: Placement, given: Given) -> BackEnd | None:
     """The run held by the buildings of a map, and by fixes where it has some; None, and why, where they hold nothing."""
     config, store, problems = given.config, given.store, given.problems
+    last = given.clocks[len(store) - 1]
     known = placement.georeference
     origin = known.origin if known is not None else config.osm.origin
     if origin is None:
@@ -40,7 +41,9 @@ def hold_by_buildings(osm: OsmSource, graph: PoseGraph, placement: Placement, gi
     is_on_earth = config.gnss.mode == "graph" and known is not None
     if is_on_earth:
         graph = on_earth(graph, placement)
-    located, held = find_on_map(extract, graph, store, up, None if known is None else known.T_enu_world, config)
+    located, held = find_on_map(
+        extract, graph, store, up, None if known is None else known.T_enu_world, config, given.clocks
+    )
     if located.problem:
         problems.append(located.problem)
         return None
@@ -49,16 +52,17 @@ def hold_by_buildings(osm: OsmSource, graph: PoseGraph, placement: Placement, gi
     out = solve(held, given, georeference)
     if out is None or out.solution is None:
         return None
-    matches = finish(located, extract, out.keyframes, out.solution, config.osm)
+    matches = finish(located, extract, out.keyframes, out.solution, config.osm, given.clocks)
     try:
         if config.osm.matcher == "baseline":
-            joint, matches, buildings = run_baseline(held, out.solution, extract, store, config)
+            joint, matches, buildings = run_baseline(held, out.solution, extract, store, config, given.clocks)
         elif config.osm.mode == "non-rigid":
-            joint, buildings = join_buildings(held, out.solution, matches, config)
+            with last.stage("graph"):
+                joint, buildings = join_buildings(held, out.solution, matches, config)
         else:
-            return replace(
-                out, osm=matches, buildings=correct_buildings(matches, se2.of_se3(out.keyframes), config.osm)
-            )
+            with last.stage("graph"):
+                buildings = correct_buildings(matches, se2.of_se3(out.keyframes), config.osm)
+            return replace(out, osm=matches, buildings=buildings)
     except (GraphError, np.linalg.LinAlgError) as error:
         problems.append(f"OSM: {error}; the run goes on with its buildings where the map has them")
         return replace(out, osm=matches)

@@ -17,6 +17,7 @@ from lslam.graph.wall_drift import WallDrift, find_wall_drift, without_drift
 from lslam.keyframes.store import KeyframeStore
 from lslam.pipeline.osm_pass import Located, locate
 from lslam.priors.osm_prior import match_buildings
+from lslam.types.stage_clock import KeyframeClocks
 
 log = logging.getLogger("lslam")
 Floats = NDArray[np.float64]
@@ -35,26 +36,29 @@ def find_on_map(
     up: Floats | None,
     placed: Floats | None,
     config: Config,
+    clocks: KeyframeClocks | None = None,
 ) -> tuple[Located, PoseGraph]:
     """Where the keyframes are on the map, and the graph in its frame, set straight where the map reveals a drift.
 
-    graph : of odometry, or where satellite fixes have it; up, placed : as of `locate`
+    graph : of odometry, or where satellite fixes have it; up, placed, clocks : as of `locate`; stage `drift` of the last keyframe
     """
-    located = locate(extract, store, up, config, placed)
+    clocks = KeyframeClocks() if clocks is None else clocks
+    located = locate(extract, store, up, config, placed, clocks=clocks)
     held = on_map(graph, located, config)
     is_straight = held.is_rigid or not config.graph.steady_drift
     if located.problem or config.osm.matcher != "walls" or is_straight:
         return located, held
     before: WallDrift | None = None
     for _ in range(ROUNDS):
-        seen = sightings(located, held.poses, config)
-        drift = find_wall_drift(held, seen, config.osm.wall_sigma, config.osm.building_sigma, config.graph, before)
+        with clocks[len(store) - 1].stage("drift"):
+            seen = sightings(located, held.poses, config)
+            drift = find_wall_drift(held, seen, config.osm.wall_sigma, config.osm.building_sigma, config.graph, before)
         if drift is None or not drift.is_sure:
             break
         before = drift
         held = replace(without_drift(held, drift.rates), spread=drift.spread, claim=drift.claim)
         odometry = se3.inverse(located.T_enu_odometry) @ held.poses
-        again = None if drift.is_settled else locate(extract, store, up, config, placed, odometry)
+        again = None if drift.is_settled else locate(extract, store, up, config, placed, odometry, clocks)
         if again is None or again.problem:
             break
         located = again

@@ -21,6 +21,7 @@ from lslam.priors.baseline import flatten_scan, lay_building, lay_scan
 from lslam.priors.osm_map import OsmMap
 from lslam.types.building_correction import CorrectedMap
 from lslam.types.building_match import BuildingMatch, KeyframeMatch, OsmMatches
+from lslam.types.stage_clock import KeyframeClocks, StageClock
 
 Floats = NDArray[np.float64]
 
@@ -48,8 +49,9 @@ def join_buildings(
 
 
 def run_baseline(
-    graph: PoseGraph, solution: Solution, extract: BuildingExtract, store: KeyframeStore, config: Config
-) -> tuple[JointSolution, OsmMatches, CorrectedMap]:
+    graph: PoseGraph, solution: Solution, extract: BuildingExtract, store: KeyframeStore, config: Config,
+    clocks: KeyframeClocks,
+) -> tuple[JointSolution, OsmMatches, CorrectedMap]:  # fmt: skip
     """The baseline, keyframe by keyframe: NDT on all buildings near, VGICP of each, edges to each, optimise, go on.
 
     graph : in the frame of the map, at the start that is shared with every other mode; of `solution` its verdicts on loops
@@ -62,14 +64,16 @@ def run_baseline(
     middles = np.array([b.middle for b in osm.buildings]).reshape(-1, 2)
     poses, local, sights = graph.poses.copy(), list[BuildingMatch](), list[KeyframeMatch]()
     for k in range(len(store)):
-        sight, found = _match(k, store, poses[k], osm, config)
+        sight, found = _match(k, store, poses[k], osm, config, clocks[k])
         sights.append(sight)
         local += found
         if found and (k % EVERY == 0 or k == len(store) - 1):
-            joint = optimise_jointly(_first(graph, poses, k + 1), middles, local, None, config.graph)
+            with clocks[k].stage("graph"):
+                joint = optimise_jointly(_first(graph, poses, k + 1), middles, local, None, config.graph)
             poses[k:] = joint.poses[k] @ se3.inverse(poses[k]) @ poses[k:]
             poses[: k + 1] = joint.poses
-    joint = optimise_jointly(replace(graph, poses=poses), middles, local, None, config.graph)
+    with clocks[len(store) - 1].stage("graph"):
+        joint = optimise_jointly(replace(graph, poses=poses), middles, local, None, config.graph)
     matches = OsmMatches(
         extract.origin, osm.buildings, osm.walls, osm.owners, tuple(sights), tuple(local), source=extract.source,
         attribution=extract.attribution,
@@ -86,13 +90,15 @@ def _believed(graph: PoseGraph, solution: Solution) -> PoseGraph:
 
 
 def _match(
-    number: int, store: KeyframeStore, pose: Floats, osm: OsmMap, config: Config
+    number: int, store: KeyframeStore, pose: Floats, osm: OsmMap, config: Config, clock: StageClock
 ) -> tuple[KeyframeMatch, list[BuildingMatch]]:
     """One keyframe's scan, above the horizon and flat, against the buildings near."""
     at = se2.of_se3(pose)
     tilt = se2.to_se3(np.array([0.0, 0.0, -at[2]]))[:3, :3] @ pose[:3, :3]
-    seen = flatten_scan(store.points(number) @ tilt.T.astype(np.float32), config.osm.wall_range)
-    whole = lay_scan(seen, osm.walls[osm.walls_near(at[:2], config.osm.use_radius)], at)
+    with clock.stage("walls"):
+        seen = flatten_scan(store.points(number) @ tilt.T.astype(np.float32), config.osm.wall_range)
+    with clock.stage("map match"):
+        whole = lay_scan(seen, osm.walls[osm.walls_near(at[:2], config.osm.use_radius)], at)
     start = at if whole is None else whole.pose
     sight = KeyframeMatch(
         number, np.zeros((0, 2, 2)), np.zeros((1, 2)), at, np.zeros(3), start, np.zeros((3, 3)),
@@ -102,7 +108,8 @@ def _match(
     for building in osm.near(start[:2], config.osm.use_radius).tolist():
         middle = osm.buildings[building].middle
         walls = osm.walls[osm.owners == building] - middle
-        fit = lay_building(walls, seen, se2.relative(start, np.append(middle, 0.0)))
+        with clock.stage("building match"):
+            fit = lay_building(walls, seen, se2.relative(start, np.append(middle, 0.0)))
         if fit is not None:
             spread = fitness_covariance(fit.rmse**2, config.graph)[np.ix_(PLANAR, PLANAR)]
             information, nothing = np.asarray(np.linalg.inv(spread), np.float64), np.zeros((0, 2), np.int64)

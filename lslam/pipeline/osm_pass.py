@@ -29,7 +29,8 @@ from lslam.priors.osm_map import OsmMap
 from lslam.priors.osm_prior import match_buildings, match_keyframe, shares
 from lslam.priors.osm_track import OsmTrack
 from lslam.priors.wall_match import START_WALLS
-from lslam.types.building_match import KeyframeMatch, OsmMatches
+from lslam.types.building_match import BuildingMatch, KeyframeMatch, OsmMatches
+from lslam.types.stage_clock import KeyframeClocks
 
 log = logging.getLogger("lslam")
 Floats = NDArray[np.float64]
@@ -66,14 +67,16 @@ class Located:
 
 def locate(
     extract: BuildingExtract, store: KeyframeStore, up: Floats | None, config: Config, placed: Floats | None = None,
-    odometry: Floats | None = None,
+    odometry: Floats | None = None, clocks: KeyframeClocks | None = None,
 ) -> Located:  # fmt: skip
     """Match all keyframes with the map.
 
     up : (3,) up in the world of odometry as an IMU has it, None takes that of the ground
     placed : (4, 4) from that world into the map frame, where satellite fixes say it
     odometry : (K, 4, 4) of the keyframes in it, those of the store by default
+    clocks : take the time of each keyframe, stages `walls` and `map match`
     """
+    clocks = KeyframeClocks() if clocks is None else clocks
     osm = OsmMap(extract.buildings)
     odometry = np.stack([k.T_world_lidar for k in store.keyframes]) if odometry is None else odometry
     up = _up_by_ground(store, odometry, config) if up is None else up
@@ -86,7 +89,7 @@ def locate(
         start.pose, start.sigma, config.graph.drift_percent, np.radians(config.graph.drift_deg_per_100m) / 100,
         np.array([config.osm.map_sigma, config.osm.map_sigma, np.radians(config.osm.map_sigma_deg)]),
     )  # fmt: skip
-    matches = _both_ways(store, poses, osm, track, config)
+    matches = _both_ways(store, poses, osm, track, config, clocks)
     accepted = [match for match in matches if match.verdict == "accepted"]
     if not accepted:
         return Located(T_level, osm, matches, problem=_why_none(matches, osm, extract))
@@ -105,17 +108,20 @@ def locate(
 
 
 def finish(
-    located: Located, extract: BuildingExtract, poses: Floats, solution: Solution, config: OsmConfig
-) -> OsmMatches:
-    """All that was matched, with the graph's verdicts, and each building laid on what was seen from the final `poses`."""
+    located: Located, extract: BuildingExtract, poses: Floats, solution: Solution, config: OsmConfig,
+    clocks: KeyframeClocks | None = None,
+) -> OsmMatches:  # fmt: skip
+    """All that was matched, with the graph's verdicts, and each building laid on what was seen from the final `poses`.
+
+    clocks : take the time of each keyframe, stage `building match`
+    """
+    clocks = KeyframeClocks() if clocks is None else clocks
     doubts = iter(solution.map_reasons)
     judged = [_judged(m, next(doubts)) if m.verdict == "accepted" else m for m in located.matches]
-    planar = se2.of_se3(poses)
-    local = [
-        one
-        for match in judged
-        for one in match_buildings(match, planar[match.keyframe], solution.shift, located.osm, config)
-    ]
+    planar, local = se2.of_se3(poses), list[BuildingMatch]()
+    for match in judged:
+        with clocks[match.keyframe].stage("building match"):
+            local += match_buildings(match, planar[match.keyframe], solution.shift, located.osm, config)
     return OsmMatches(
         extract.origin, located.osm.buildings, located.osm.walls, located.osm.owners, tuple(judged), tuple(local),
         solution.shift, solution.shift_sigma, extract.source, extract.attribution,
@@ -138,22 +144,24 @@ def _start(store: KeyframeStore, poses: Floats, osm: OsmMap, config: Config, pla
 
 
 def _both_ways(
-    store: KeyframeStore, poses: Floats, osm: OsmMap, track: OsmTrack, config: Config
+    store: KeyframeStore, poses: Floats, osm: OsmMap, track: OsmTrack, config: Config, clocks: KeyframeClocks
 ) -> list[KeyframeMatch]:
     """Forward from the first keyframe; then back from the first that was accepted and that fixes everything."""
-    found = _along(range(len(store)), store, poses, osm, track, config)
+    found = _along(range(len(store)), store, poses, osm, track, config, clocks)
     numbers = [m.keyframe for m in found if m.verdict == "accepted" and m.rank == 3]
     if numbers and numbers[0] > 0:
         first = found[numbers[0]]
         back = copy.deepcopy(track)
         back.begin(first.pose, first.information)
-        found[: numbers[0]] = _along(range(numbers[0] - 1, -1, -1), store, poses, osm, back, config, numbers[0])[::-1]
+        found[: numbers[0]] = _along(
+            range(numbers[0] - 1, -1, -1), store, poses, osm, back, config, clocks, numbers[0]
+        )[::-1]
     return found
 
 
 def _along(
     numbers: Iterable[int], store: KeyframeStore, poses: Floats, osm: OsmMap, track: OsmTrack, config: Config,
-    before: int | None = None,
+    clocks: KeyframeClocks, before: int | None = None,
 ) -> list[KeyframeMatch]:  # fmt: skip
     """Match the keyframes `numbers` in turn; the track stands at the keyframe `before`, None at the first of them."""
     planar = se2.of_se3(poses)
@@ -163,9 +171,11 @@ def _along(
             step = se2.relative(planar[before], planar[number])
             track.move(step, float(np.linalg.norm(step[:2])))
         before = number
-        seen = see_walls(store, poses, number, config.keyframes.submap_size, config.osm)
+        with clocks[number].stage("walls"):
+            seen = see_walls(store, poses, number, config.keyframes.submap_size, config.osm)
         view = KeyframeMatch(number, seen.walls, seen.views, track.pose, track.sigma, track.pose, np.zeros((3, 3)))
-        match = _gated(match_keyframe(view, osm, config.osm), track, config.osm, config.graph)
+        with clocks[number].stage("map match"):
+            match = _gated(match_keyframe(view, osm, config.osm), track, config.osm, config.graph)
         if match.verdict == "accepted":
             track.take(match.pose, match.information)
         matches.append(match)

@@ -65,10 +65,10 @@ def write_trajectories(folder: RunFolder, record: RunRecord, calibration: Calibr
 
 
 def write_scans(folder: RunFolder, record: RunRecord) -> None:
-    """timing.csv, seconds per stage, and scans.csv, what became of each scan."""
+    """timing.csv, seconds per stage, those of the back end beside their sum, and scans.csv, what became of each scan."""
     names, seconds = stage_matrix(record.results)
     indices, stamps = [r.index for r in record.results], [r.stamp_ns for r in record.results]
-    folder.write_text("timing.csv", timing_text(indices, stamps, names, seconds))
+    folder.write_text("timing.csv", timing_text(indices, stamps, names, seconds, record.back_end_seconds))
     columns = "index,stamp_ns,status,posed_by,standing,converged,iterations,source_points,inliers,overlap,rmse_m"
     rows = [columns + ",degenerate,prior_m,prior_deg,prior_norm,steady_norm,steady_iterations,saved_s,lost"]
     for r in record.results:

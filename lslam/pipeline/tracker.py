@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from lslam.geometry import se3, so3
 from lslam.integrity.monitor import IntegrityMonitor
 from lslam.odometry.base import Deskewing, Odometry, Registered, Resumable, Searching
-from lslam.odometry.feature_steps import StageClock
 from lslam.odometry.standing import Standing
 from lslam.registration.motion import ConstantVelocity, MotionModel, middle_of
 from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan import Scan, Span
 from lslam.types.scan_result import ScanResult
+from lslam.types.stage_clock import StageClock
 from lslam.types.state import State
 
 # Half the points of a scan are nearer.

@@ -36,6 +36,7 @@ class RunRecord:
     osm : what walls seen and buildings of a map had to do with each other, None without a map that could be used; buildings :
         of that map, where they really stand
     loops : candidates with verdicts, between keyframes; keyframe_scans : (K,) position of each one's scan in `results`
+    back_end_seconds : by the number of its scan, what each stage after odometry took a keyframe, s; the whole graph with the last
     loop_view : the map at the loop that was corrected most, None without one
     features : what a feature method saw, None of another
     """
@@ -59,6 +60,7 @@ class RunRecord:
     turns: list[Turn] = field(default_factory=list)
     loops: list[LoopCandidate] = field(default_factory=list)
     keyframe_scans: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+    back_end_seconds: dict[int, dict[str, float]] = field(default_factory=dict)
     georeference: Georeference | None = None
     loop_view: LoopView | None = None
     features: FeatureView | None = None

@@ -17,11 +17,12 @@ from lslam.odometry.all_points import FED
 from lslam.odometry.feature_registration import FeatureRegistration
 from lslam.odometry.feature_scan import feature_scan
 from lslam.odometry.feature_solver import NONE, FeatureNoise, kept_where_blind, solve_on_scan
-from lslam.odometry.feature_steps import ScanStep, StageClock, joint_step, two_steps, upright_directions
+from lslam.odometry.feature_steps import ScanStep, joint_step, two_steps, upright_directions
 from lslam.preprocessing.features import Features, extract_features
 from lslam.registration.robust import Annealing
 from lslam.registration.solver import RegistrationResult
 from lslam.types.scan import Scan
+from lslam.types.stage_clock import StageClock
 
 Floats = NDArray[np.float64]
 

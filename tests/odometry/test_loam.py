@@ -18,7 +18,6 @@ from lslam.errors import InputError
 from lslam.geometry import se3
 from lslam.odometry import create_odometry
 from lslam.odometry.feature_registration import LESS_PLANAR, PATIENCE
-from lslam.odometry.feature_steps import StageClock
 from lslam.odometry.loam import Loam
 from lslam.pipeline.tracker import Loaded, Tracker
 from lslam.preprocessing.deskew import deskew_points
@@ -28,6 +27,7 @@ from lslam.simulation.scenarios import simulate
 from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan import Scan
 from lslam.types.scan_result import ScanResult
+from lslam.types.stage_clock import StageClock
 
 Floats = NDArray[np.float64]
 
