@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.config import Config
+from lslam.config.osm import OsmConfig
 from lslam.formats.osm_buildings import BuildingExtract
 from lslam.geometry import se2, se3
 from lslam.graph.drift_fit import WallSightings
@@ -27,6 +28,8 @@ Floats = NDArray[np.float64]
 ROUNDS = 5
 # Modes in which the map's buildings stand to each other as they are drawn.
 TRUSTING = ("prior", "rigid")
+# m, by which their walls are off: what a survey rounds to.
+TRUE = 0.01
 
 
 def find_on_map(
@@ -52,7 +55,7 @@ def find_on_map(
     for _ in range(ROUNDS):
         with clocks[len(store) - 1].stage("drift"):
             seen = sightings(located, held.poses, config)
-            drift = find_wall_drift(held, seen, config.osm.wall_sigma, config.osm.building_sigma, config.graph, before)
+            drift = find_wall_drift(held, seen, *_wall_sigmas(config.osm), config.graph, before)
         if drift is None or not drift.is_sure:
             break
         before = drift
@@ -81,7 +84,7 @@ def on_map(graph: PoseGraph, located: Located, config: Config) -> PoseGraph:
         poses=graph.poses if graph.fixes else located.T_enu_odometry @ graph.poses,
         map_priors=_priors(located, config),
         shift_sigma=0.0 if config.osm.mode == "prior" else config.osm.shift_sigma,
-        map_sigma=config.osm.map_sigma,
+        map_sigma=0.0 if config.osm.mode in TRUSTING else config.osm.map_sigma,
         world_up=np.array([0.0, 0.0, 1.0]),
         start=None if graph.fixes else located.start,
         start_sigma=None if graph.fixes else located.start_sigma,
@@ -96,10 +99,17 @@ def _priors(located: Located, config: Config) -> list[PlanarPrior]:
     """
     if config.osm.mode not in TRUSTING:
         return located.priors
-    # Of points that lie anywhere within the tolerance.
-    sharper = 3.0 * (config.osm.wall_sigma / config.osm.wall_tolerance) ** 2
+    sharper = (config.osm.wall_sigma / _wall_sigmas(config.osm)[0]) ** 2
     share = 1.0 / config.keyframes.submap_size
     return [replace(prior, information=sharper * prior.information, share=share) for prior in located.priors]
+
+
+def _wall_sigmas(config: OsmConfig) -> tuple[float, float]:
+    """m; by which a wall that is seen is off where the map has it, and its building beside it."""
+    if config.mode in TRUSTING:
+        # Its points lie anywhere within the tolerance.
+        return config.wall_tolerance / np.sqrt(3.0), TRUE
+    return config.wall_sigma, config.building_sigma
 
 
 def sightings(located: Located, poses: Floats, config: Config) -> WallSightings:

@@ -1,14 +1,15 @@
-"""What OpenStreetMap brings, mode by mode, where everything is known: the ablation of issue 7 and of the thesis' table 4.2.
+"""What OpenStreetMap brings, system by system and mode by mode, where everything is known: the second thesis' tables 4.2 and 4.3.
 
     lslam simulate residential --seed 0 --out drives/residential-0
     lslam simulate residential --path poses/07.txt --out drives/seq07
     python tests/benchmarks/osm.py drives/*/sequences/00 [--scans 300] [--map exact,perturbed] [--drift 1.0,0.5]
-        [--modes none,hdl,baseline,prior,rigid,non-rigid,two-level]
+        [--kinds rate,random-walk] [--modes none,hdl,thesis-baseline,thesis-improved,prior,rigid,non-rigid,two-level]
 
-Every run begins at the true start, without loops and with drift injected (% of the way, deg per 100 m); hdl and the baseline,
-which stands on it, with `--preset hdl`, the rest with our odometry. ATE is the thesis' (planar, origin, mean and standard
+Every run begins at the true start, without loops and with drift injected (% of the way, deg per 100 m), which lasts (`rate`) or
+wanders; modes that are presets with their own odometry, the rest with ours. ATE is the thesis' (planar, origin, mean and standard
 deviation), RPE between consecutive keyframes; buildings with the run begun at its true start: median distance of their middles
-from the truth, of those held from two sides as on the map and corrected, across the wall of those held from one.
+from the truth, of those held from two sides as on the map and corrected, across the wall of those held from one. Times are ms
+per keyframe: to find walls, to match them with the whole map, with one building each, and of the graph.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ import argparse
 import logging
 import tempfile
 import tomllib
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -29,6 +31,7 @@ from lslam.evaluation.buildings import BuildingError, building_errors
 from lslam.evaluation.thesis import planar
 from lslam.formats.buildings_geojson import read_corrected
 from lslam.formats.osm_buildings import read_buildings
+from lslam.formats.timing_csv import read_timing_rows
 from lslam.formats.trajectory_files import read_trajectory
 from lslam.geometry import geodesy, se2
 from lslam.pipeline.building_pass import BUILDINGS_GEOJSON
@@ -37,7 +40,9 @@ from lslam.simulation.osm_perturb import map_errors, read_perturbation
 Floats = NDArray[np.float64]
 
 SPACING = 2.0  # m between keyframes
-MODES = ("none", "hdl", "baseline", "prior", "rigid", "non-rigid", "two-level")
+PRESETS = ("hdl", "thesis-baseline", "thesis-improved")
+MODES = ("none", *PRESETS, "prior", "rigid", "non-rigid", "two-level")
+STAGES = ("walls", "map match", "building match", "graph")
 
 
 def true_poses(drive: Path) -> tuple[Floats, Floats]:
@@ -47,22 +52,23 @@ def true_poses(drive: Path) -> tuple[Floats, Floats]:
     return np.array(world["T_enu_world"]) @ poses, np.array(world["origin_lat_lon_alt"])
 
 
-def configured(drive: Path, args: argparse.Namespace, mode: str, which: str, seed: int) -> Config:
+def configured(drive: Path, args: argparse.Namespace, mode: str, which: str, kind: str, seed: int) -> Config:
     """The run of one line of the table."""
     poses, origin = true_poses(drive)
     start = geodesy.from_local(poses[:1, :3, 3], origin)[0]
     percent, deg = (float(v) for v in args.drift.split(","))
     settings = [f"input.count={args.scans}", "loops.use=false", "map.write=false", f"debug.drift_seed={seed}",
-                f"debug.drift={str(percent > 0).lower()}", f"debug.drift_percent={percent}",
+                f"debug.drift={str(percent > 0).lower()}", f"debug.drift_percent={percent}", f"debug.drift_kind={kind}",
                 f"debug.drift_deg_per_100m={deg}"]  # fmt: skip
-    if mode in ("hdl", "baseline"):
-        settings += ["odometry.preset=hdl", "loops.use=false"]
+    if mode in PRESETS:
+        settings += [f"odometry.preset={mode}"]
     if mode not in ("none", "hdl"):
         extract = drive / ("map.osm" if which == "exact" else "map_perturbed.osm")
         heading = 90.0 - np.degrees(se2.of_se3(poses[0])[2])
         settings += [f"osm.extract={extract}", f"osm.origin={start.tolist()}", f"osm.heading_deg={heading}",
-                     "osm.start_radius=2.0", "osm.start_heading_deg=5.0"]  # fmt: skip
-        settings.append("osm.matcher=baseline" if mode == "baseline" else f"osm.mode={mode}")
+                     "osm.start_heading_deg=5.0"]  # fmt: skip
+        if mode not in PRESETS:
+            settings += [f"osm.mode={mode}", "osm.start_radius=2.0"]
     return load_config(settings=settings)
 
 
@@ -91,10 +97,13 @@ def line(name: str, folder: Path, drive: Path, which: str) -> str:
     steps = planar(run.poses[kept], real[kept])
     errors = [e for e in buildings_of(folder, drive, which, run.poses) if e.status == "seen"]
     two, one = [e for e in errors if e.sides == 2], [e for e in errors if e.sides == 1]
+    rows = read_timing_rows(folder / "timing.csv").back_end
+    spent = [1e3 * rows.get(stage, np.zeros(1)).sum() / len(kept) for stage in STAGES]
     return (
-        f"{name:44s} {whole.ate_mean:6.3f} ± {whole.ate_std:5.3f} {steps.rpe_translation_mean:8.4f} "
+        f"{name:50s} {whole.ate_mean:6.3f} ± {whole.ate_std:5.3f} {steps.rpe_translation_mean:8.4f} "
         f"{np.degrees(steps.rpe_rotation_std):8.4f}  {len(two):4d} {_median([e.before for e in two])} "
-        f"{_median([e.after for e in two])} {len(one):4d} {_median([e.across for e in one])}"
+        f"{_median([e.after for e in two])} {len(one):4d} {_median([e.across for e in one])} "
+        + " ".join(f"{ms:7.1f}" for ms in spent)
     )
 
 
@@ -109,19 +118,22 @@ def main() -> None:
     parser.add_argument("--scans", type=int, default=300)
     parser.add_argument("--modes", default=",".join(MODES))
     parser.add_argument("--map", default="exact,perturbed")
+    parser.add_argument("--kinds", default="rate,random-walk", help="of drift")
     parser.add_argument("--drift", default="1.0,0.5", help="PERCENT,DEG_PER_100M; 0,0: none")
     parser.add_argument("--keep", type=Path, help="folder for the runs")
     args = parser.parse_args()
     logging.getLogger("lslam").setLevel(logging.ERROR)
-    print(f"{'drive, map, mode':44s} {'ATE, m':>14s} {'RPE, m':>8s} {'RPE, deg':>8s}  {'two':>4s} {'map, m':>7s} {'run, m':>7s} "
-          f"{'one':>4s} {'run, m':>7s}")  # fmt: skip
+    print(
+        f"{'drive, drift, map, mode':50s} {'ATE, m':>14s} {'RPE, m':>8s} {'RPE, deg':>8s}  {'two':>4s} {'map, m':>7s} "
+        f"{'run, m':>7s} {'one':>4s} {'run, m':>7s} {'walls':>7s} {'map':>7s} {'house':>7s} {'graph':>7s}"
+    )
     with tempfile.TemporaryDirectory() as scratch:
         for seed, drive in enumerate(args.drives):
-            for mode in args.modes.split(","):
+            for kind, mode in product(args.kinds.split(","), args.modes.split(",")):
                 for which in args.map.split(",") if mode not in ("none", "hdl") else ["-"]:
-                    name = f"{drive.parent.parent.name}, {which}, {mode}"
+                    name = f"{drive.parent.parent.name}, {kind}, {which}, {mode}"
                     folder = (args.keep or Path(scratch)) / name.replace(", ", "_")
-                    config = configured(drive, args, mode, which, seed)
+                    config = configured(drive, args, mode, which, kind, seed)
                     lslam.run(str(drive), config, out=folder, overwrite=True)
                     print(line(name, folder, drive, which), flush=True)
 

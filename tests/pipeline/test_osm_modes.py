@@ -25,6 +25,7 @@ from lslam.priors.osm_track import OsmTrack
 from lslam.simulation.osm_perturb import map_errors, read_perturbation
 from lslam.types.building_correction import CorrectedMap
 from lslam.types.building_match import KeyframeMatch
+from lslam.types.stage_clock import KeyframeClocks
 
 Floats = NDArray[np.float64]
 
@@ -126,7 +127,7 @@ def test_the_way_back_begins_where_walls_fix_everything(monkeypatch: pytest.Monk
 
     monkeypatch.setattr(osm_pass, "_along", along)
     track = OsmTrack(np.zeros(3), np.ones(3), 1.0, 1e-4, np.ones(3))
-    found = osm_pass._both_ways([0] * 4, np.zeros((4, 4, 4)), None, track, Config())  # type: ignore[arg-type]
+    found = osm_pass._both_ways([0] * 4, np.zeros((4, 4, 4)), None, track, Config(), KeyframeClocks())  # type: ignore[arg-type]
     assert asked == [[0, 1, 2, 3], [2, 1, 0]]
     assert [m.keyframe for m in found] == [0, 1, 2, 3]
 

@@ -17,6 +17,7 @@ from lslam.pipeline.back_end import run_back_end
 from lslam.pipeline.checkpoints import Checkpoints
 from lslam.simulation.gnss import GnssModel
 from lslam.simulation.gnss import _errors as gnss_errors
+from lslam.types.stage_clock import KeyframeClocks
 
 
 def wandering(seed: int) -> Stub:
