@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from lslam.errors import InputError
 from lslam.evaluation.timing import read_timing
+from lslam.formats.timing_csv import read_timing_rows, timing_text
 
 GOOD = "index,stamp_ns,read,register,total\n" + "".join(
     f"{k},{k * 10**8},0.01,{0.001 * k},{0.01 + 0.001 * k}\n" for k in range(101)
@@ -25,6 +27,18 @@ def test_stages_and_limit(tmp_path: Path) -> None:
     assert timing.stages["read"].share + timing.stages["register"].share == pytest.approx(1)
     assert timing.period == pytest.approx(0.1)
     assert timing.over_limit == 10
+
+
+def test_what_is_done_after_odometry_stands_beside_the_total(tmp_path: Path) -> None:
+    back_end = {0: {"loops": 0.25}, 2: {"loops": 0.5, "graph": 7.0}}
+    text = timing_text([0, 1, 2], [0, 10**8, 2 * 10**8], ["register"], np.full((3, 1), 0.01), back_end)
+    (tmp_path / "timing.csv").write_text(text)
+    rows = read_timing_rows(tmp_path / "timing.csv")
+    np.testing.assert_allclose(rows.total, 0.01)
+    assert list(rows.stages) == ["register"]
+    np.testing.assert_allclose(rows.back_end["loops"], [0.25, 0.0, 0.5])
+    np.testing.assert_allclose(rows.back_end["graph"], [0.0, 0.0, 7.0])
+    assert read_timing(tmp_path / "timing.csv").over_limit == 0
 
 
 def test_scan_is_a_stage_beside_an_index_and_a_number_without(tmp_path: Path) -> None:
