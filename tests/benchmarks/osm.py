@@ -3,13 +3,15 @@
     lslam simulate residential --seed 0 --out drives/residential-0
     lslam simulate residential --path poses/07.txt --out drives/seq07
     python tests/benchmarks/osm.py drives/*/sequences/00 [--scans 300] [--map exact,perturbed] [--drift 1.0,0.5]
-        [--kinds constant,wandering,random-walk] [--modes none,hdl,thesis-baseline,thesis-improved,prior,rigid,non-rigid,two-level]
+        [--kinds constant,wandering,random-walk]
+        [--modes none,hdl,thesis-baseline,thesis-improved,prior,rigid,non-rigid,two-level]
 
 Every run begins at the true start, without loops and with drift injected (% of the way, deg per 100 m), which lasts, wanders (is
-drawn anew after 20 m) or walks at random; modes that are presets with their own odometry, the rest with ours. ATE is the thesis' (planar, origin, mean and standard
-deviation), RPE between consecutive keyframes; buildings with the run begun at its true start: median distance of their middles
-from the truth, of those held from two sides as on the map and corrected, across the wall of those held from one. Times are ms
-per keyframe: to find walls, to match them with the whole map, with one building each, and of the graph.
+drawn anew after 20 m) or walks at random; modes that are presets with their own odometry, the rest with ours. ATE is the thesis'
+(planar, origin, mean and standard deviation), RPE between consecutive keyframes; buildings with the run begun at its true start:
+median distance of their middles from the truth, of those held from two sides as on the map and corrected, across the wall of
+those held from one. Times are ms per keyframe: to find walls, to match them with the whole map, with one building each, and of
+the graph.
 """
 
 from __future__ import annotations
