@@ -28,11 +28,15 @@ class Finding(Section):
 
     Kinds and their `values`, in the unit of the studied parameter unless said otherwise:
     diverges_beyond v : the last value that works is v; holds_up_to v : nothing diverges up to v
-    best_between low, high : the best value of `of` lies there; largest_between low, high : its largest one
-    elbow_at v : below v the error rises; good_from v : from v on it does not
+    best_between low, high : the best value of `of` lies there; largest_between low, high : its largest one; on either side
+        some value is worse
+    elbow_at v : just below v the error rises; good_from v : from v on it does not, and below it does somewhere
     matters_little r : the largest `of` is less than r times the smallest
-    linear, inverse, product [r2] : total time is a x + b, a / x, a y / x with at least this R2 (0.95)
+    linear, inverse, product [r2] : total time is a x + b, a / x, a y / x with at least this R2 (0.95), and no other of them
+        fits as well
     acts_only_on : of all stages of registration the parameter changes the time of `stages` only
+
+    What differs by less than the seeds scatter is undecided.
     """
 
     text: str = Field(min_length=1, description="the finding in one sentence")

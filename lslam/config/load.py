@@ -141,7 +141,12 @@ def explain(error: ValidationError, where: str = "configuration") -> str:
             words = re.findall(r"'([^']*)'", e["ctx"]["expected"])
             wanted += f"; {nearest(str(e['input']), words)}" if len(words) > 1 else ""
         # What concerns several keys of a section names them itself; a choice of types complains once per type.
-        said = f"{key}: {wanted}" if isinstance(e["input"], dict) else f"{key} = {e['input']!r}: {wanted}"
+        tables = e["input"] if isinstance(e["input"], (list, tuple)) else [e["input"]]
+        said = (
+            f"{key}: {wanted}"
+            if any(isinstance(table, dict) for table in tables)
+            else f"{key} = {e['input']!r}: {wanted}"
+        )
         if key not in parts:
             parts[key] = said
         # Who wrote a table did not mean a list.

@@ -8,7 +8,7 @@ from itertools import product
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import BaseModel, Field, ValidationError, field_validator, model_validator
+from pydantic import BaseModel, Field, ValidationError, ValidationInfo, field_validator, model_validator
 
 from lslam.config.finding import Finding
 from lslam.config.load import explain
@@ -135,6 +135,24 @@ class StudyConfig(Section):
     @classmethod
     def _differ(cls, seeds: tuple[int, ...]) -> tuple[int, ...]:
         return distinct_seeds(seeds)
+
+    @field_validator("finding")
+    @classmethod
+    def _speak_of_runs(cls, findings: tuple[Finding, ...], info: ValidationInfo) -> tuple[Finding, ...]:
+        """What names a key or a method that is not there would never be judged."""
+        keys, words = info.data.get("parameters", {}), info.data.get("methods", ())
+        labels = [Path(word).stem if word.endswith(".toml") else word for word in words]
+        for finding in findings:
+            for name, known in (
+                (finding.parameter, keys),
+                (finding.method, labels),
+                *((key, keys) for key in finding.at),
+            ):
+                if name and known and name not in known:
+                    raise ValueError(
+                        f"{finding.text!r} speaks of {name!r}, which is not studied; {nearest(name, known)}"
+                    )
+        return findings
 
     def points(self) -> list[Point]:
         """Values of the studied parameters, a point per run of a method."""

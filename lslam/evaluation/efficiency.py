@@ -49,7 +49,7 @@ def over_seeds(table: Floats, level: float = LEVEL) -> Interval:
     mean = np.divide(total, n, out=np.full(len(n), np.nan), where=n > 0)
     squares = np.where(known, (table - mean[:, None]) ** 2, 0.0).sum(1)
     several = n > 1
-    error = np.full(len(n), np.nan)
-    error[several] = np.sqrt(squares[several] / (n[several] - 1) / n[several])
-    error[several] *= two_sided(level, n[several] - 1)
-    return Interval(mean, mean - error, mean + error, n)
+    std, error = np.full(len(n), np.nan), np.full(len(n), np.nan)
+    std[several] = np.sqrt(squares[several] / (n[several] - 1))
+    error[several] = std[several] / np.sqrt(n[several]) * two_sided(level, n[several] - 1)
+    return Interval(mean, mean - error, mean + error, n, std)

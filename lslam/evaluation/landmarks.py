@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Literal
-
 import numpy as np
 
 from lslam.types.sensitivity import Bools, Curve, Divergence, Floats, Optimum
 
 FLAT = 0.1  # what differs by less than a tenth is as good
-Rise = Literal["worse", "as good", "unknown"]
 ELBOW = 1.5  # an error above so many times the plateau's is not on the plateau
 
 
@@ -19,8 +16,8 @@ def divergence(curve: Curve) -> Divergence:
     A value is lost when more than half of its runs are; the curve is lost from the first lost value above which, itself
     counted, more than half of the values are. What is lost below stands alone: one unlucky value is not a divergence.
     """
-    ran = curve.ran.any(1)
-    values, bad = curve.values[ran], curve.is_lost[ran]
+    scored = curve.scored.any(1)
+    values, bad = curve.values[scored], curve.is_lost[scored]
     for i in np.flatnonzero(bad):
         if 2 * bad[i:].sum() > len(bad) - i:
             before = float(values[i - 1]) if i else None
@@ -62,33 +59,3 @@ def elbow(values: Floats, errors: Floats, is_lost: Bools) -> float | None:
     bad = np.flatnonzero(~good)
     first = int(bad[-1]) + 1 if len(bad) else 0
     return float(values[first]) if first < len(values) else None
-
-
-def rise_below(curve: Curve, value: float) -> Rise:
-    """Whether the error below a value is worse than from there on: by a tenth, and by more than the seeds scatter.
-
-    Seed by seed against its own median from `value` on; a value at which most runs are lost is worse. It takes one that is
-    worse, or all that are as good.
-    """
-    errors = np.where(curve.lost, np.nan, curve.quantities["translation"])
-    from_there = np.isfinite(errors) & (curve.values >= value)[:, None]
-    plateau = np.array(
-        [
-            np.median(column[known]) if known.any() else np.nan
-            for column, known in zip(errors.T, from_there.T, strict=True)
-        ]
-    )
-    below = np.flatnonzero((curve.values < value) & curve.ran.any(1))
-    are_as_good = []
-    for v in below:
-        if curve.is_lost[v]:
-            return "worse"
-        more = errors[v] - plateau
-        more = more[np.isfinite(more)]
-        if len(more) < 2:
-            are_as_good.append(False)
-        elif more.mean() > max(more.std(ddof=1), FLAT * float(np.nanmean(plateau))):
-            return "worse"
-        else:
-            are_as_good.append(True)
-    return "as good" if are_as_good and all(are_as_good) else "unknown"

@@ -10,7 +10,7 @@ import numpy as np
 from lslam.evaluation.curves import curves_of, lost_above
 from lslam.evaluation.efficiency import median_over_seeds, over_seeds
 from lslam.evaluation.landmarks import divergence, optimum
-from lslam.evaluation.laws import FEWEST, fit_law
+from lslam.evaluation.laws import FEWEST, fit_law, law_over
 from lslam.evaluation.verdicts import judge
 from lslam.types.sensitivity import Curve, CurveResult, Floats, Interval, Law, LawKind, StudyResult
 from lslam.types.study import StudyRow
@@ -78,13 +78,13 @@ def _law_of(curve: Curve, times: Interval) -> tuple[Law | None, str]:
     if curve.words:
         return None, f"{curve.parameter} is not a number"
     kind: LawKind = "inverse" if curve.parameter == SKIP else "linear"
-    law = fit_law(kind, (curve.parameter,), curve.values, times.mean, times.n.astype(np.float64))
+    law = law_over(kind, curve, times)
     return law, "" if law else f"no law from {int((times.n > 0).sum())} values, {FEWEST} are needed"
 
 
 def _products(results: Sequence[CurveResult]) -> dict[str, Law]:
     """Laws a y / x by series, of studies of skipped scans (x) and another number (y)."""
-    groups: dict[str, list[tuple[Floats, Floats, Floats]]] = {}
+    groups: dict[str, list[tuple[Floats, ...]]] = {}
     names: tuple[str, ...] = ()
     for result in results:
         curve = result.curve
@@ -97,9 +97,9 @@ def _products(results: Sequence[CurveResult]) -> dict[str, Law]:
         is_skip = curve.parameter == SKIP
         names = (SKIP, key) if is_skip else (SKIP, curve.parameter)
         points = np.stack([curve.values, second] if is_skip else [second, curve.values], 1)
-        groups.setdefault(curve.series, []).append((points, over.mean, over.n.astype(np.float64)))
+        groups.setdefault(curve.series, []).append((points, over.mean, over.n.astype(np.float64), over.std))
     laws = {}
     for series, parts in groups.items():
-        points, times, runs = (np.concatenate(column) for column in zip(*parts, strict=True))
-        laws[series] = fit_law("product", names, points, times, runs)
+        points, times, runs, scatter = (np.concatenate(column) for column in zip(*parts, strict=True))
+        laws[series] = fit_law("product", names, points, times, runs, scatter=scatter)
     return {series: law for series, law in laws.items() if law is not None}

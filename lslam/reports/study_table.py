@@ -64,7 +64,8 @@ def study_recipes(result: StudyResult) -> list[str]:
         "values on; ± and bands at 99 %; R2 of those means in s, unweighted",
         "±: half of the 95 % interval over seeds (Student's t), of runs that were not lost",
         "best values, elbows and verdicts go by medians over seeds",
-        "verdicts: a range holds the best value confirmed, one that does not and is nowhere within 10 % of it refuted",
+        "verdicts: one value is worse than another by more than 10 % and more than the seeds scatter (one standard deviation of "
+        "their log ratios); what the scatter hides is undecided, and so is what one seed says, laws and divergence aside",
     ]
 
 
@@ -80,7 +81,7 @@ def _landmarks(result: StudyResult) -> CompareTable:
         curve, found = r.curve, r.divergence
         name = curve.name_of
         least = np.where(curve.is_lost, np.nan, r.medians["translation"])
-        cells = ["no result" if not curve.ran.any() else "nowhere", UNKNOWN]
+        cells = ["no result" if not curve.scored.any() else "nowhere", UNKNOWN]
         if found.first_bad is not None:
             cells = [name(found.first_bad), UNKNOWN if found.last_good is None else name(found.last_good)]
         cells += [UNKNOWN] * 2 if r.optimum is None else [name(r.optimum.value), _range(r)]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -13,6 +13,8 @@ from lslam.types.study import StudyRow, Value, series_of
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 Outcome = Literal["confirmed", "refuted", "undecided"]
+# And the numbers that say so.
+Judged = tuple[Outcome, str]
 LawKind = Literal["linear", "inverse", "product"]
 
 
@@ -55,9 +57,26 @@ class Curve:
                                          f"{key.rpartition('.')[2]} {value}" for key, value in self.at)])  # fmt: skip
 
     @property
+    def scored(self) -> Bools:
+        """(V, S) runs that say whether their values work: with an error, or lost. One without ground truth does not."""
+        return np.asarray(self.lost | np.isfinite(self.quantities["translation"]))
+
+    @property
     def is_lost(self) -> Bools:
-        """(V,) values at which more than half of the runs were lost."""
-        return np.asarray(2 * self.lost.sum(1) > self.ran.sum(1))
+        """(V,) values at which more than half of the runs that say so were lost."""
+        return np.asarray(2 * self.lost.sum(1) > self.scored.sum(1))
+
+    def of_seed(self, index: int) -> Curve:
+        """The same curve of one of its seeds alone."""
+        one = slice(index, index + 1)
+        return replace(
+            self,
+            seeds=self.seeds[one],
+            quantities={name: table[:, one] for name, table in self.quantities.items()},
+            stages={name: table[:, one] for name, table in self.stages.items()},
+            lost=self.lost[:, one],
+            ran=self.ran[:, one],
+        )
 
     def name_of(self, value: float) -> str:
         """A value of the parameter for people."""
@@ -66,12 +85,16 @@ class Curve:
 
 @dataclass(frozen=True)
 class Interval:
-    """Mean over seeds with its confidence interval, (V,) each; without one (nan) where fewer than two runs count."""
+    """Mean over seeds with its confidence interval, (V,) each; without one (nan) where fewer than two runs count.
+
+    std : of single runs, likewise nan
+    """
 
     mean: Floats
     low: Floats
     high: Floats
     n: NDArray[np.int64]
+    std: Floats
 
 
 @dataclass(frozen=True)
@@ -103,6 +126,7 @@ class Law:
     names : of x and, for a product, y; coefficients : (P,), margins : (P,) half width of their confidence intervals
     covariance : (P, P); freedom : degrees of freedom; level : of margins and bands, 0..1
     points : (N, K) where it was fitted, observed and fitted : (N,) s; r2 : of those
+    scatter : (N,) s, standard deviation of the runs behind each observation, nan where there is one
     """
 
     kind: LawKind
@@ -116,6 +140,7 @@ class Law:
     observed: Floats
     fitted: Floats
     r2: float
+    scatter: Floats
 
     @property
     def residuals(self) -> Floats:

@@ -27,14 +27,15 @@ values = [3]
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """A study of four runs as `lslam sweep` leaves it."""
+    """A study of eight runs as `lslam sweep` leaves it."""
     rows = [
         StudyRow(
-            f"r{v}", "skips", "open", 0, "icp", parameters={"input.skip_frames": v},
+            f"r{v}-{seed}", "skips", "open", seed, "icp", parameters={"input.skip_frames": v},
             status="diverged" if v > 3 else "done", reason="lost" if v > 3 else "", thesis_rmse=0.1,
             angular_rmse_deg=0.5, scans=60, stages_ms={"register": 10.0}, total_time_s=6.0 / v,
         )
         for v in (1, 2, 3, 4)
+        for seed in (0, 1)
     ]  # fmt: skip
     write_study_csv(tmp_path / "results.csv", rows)
     return tmp_path

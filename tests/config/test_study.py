@@ -17,6 +17,7 @@ sequences = [{ scenario = "block", columns = 512 }, { path = "seq07" }]
 input.skip_frames = { start = 1, stop = 5, step = 2 }
 "preprocess.random_share" = [0.3, 1]
 """
+FINDING = '[[finding]]\ntext = "So."\nkind = "good_from"\nvalues = [1]\n{}\n[parameters]'
 
 
 def study(tmp_path: Path, text: str = TEXT) -> StudyConfig:
@@ -77,6 +78,13 @@ def test_ranges_hold_both_ends_and_round_numbers(given: dict[str, Any], values: 
         ("methods =", "seeds = [1, 1]\nmethods =", "different whole numbers from 0"),
         ("methods =", 'name = "a/b"\nmethods =', "name"),
         ("methods =", "parameters = 3\nmethods =", "not valid TOML"),
+        (
+            "[parameters]",
+            FINDING.format('parameter = "input.skip"'),
+            r"finding: 'So\.' speaks of 'input\.skip', which is not studied; did",
+        ),
+        ("[parameters]", FINDING.format('method = "ipc"'), "speaks of 'ipc', which is not studied; did you mean 'icp'"),
+        ("[parameters]", FINDING.format('at = { "input.start" = 1 }'), r"speaks of 'input\.start'"),
     ],
 )
 def test_what_is_no_study_is_said_in_one_sentence(tmp_path: Path, old: str, new: str, sentence: str) -> None:

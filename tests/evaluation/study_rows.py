@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
+from lslam.config.finding import Finding
+from lslam.evaluation.sensitivity import evaluate_study
+from lslam.types.sensitivity import Verdict
 from lslam.types.study import StudyRow
 
 Formula = Callable[[float], float]
@@ -46,3 +50,19 @@ def rows_of(
             }  # fmt: skip
             rows.append(StudyRow(**(row | more)))
     return rows
+
+
+def by_seed(rows: list[StudyRow], change: Callable[[float, int], dict[str, Any]]) -> list[StudyRow]:
+    """Rows with other numbers, by value of the first parameter and seed."""
+    return [replace(row, **change(float(next(iter(row.parameters.values()))), row.seed)) for row in rows]
+
+
+def verdict(rows: list[StudyRow], kind: str, *values: float, **more: Any) -> Verdict:
+    """What a finding of that kind comes to on rows of one curve or more."""
+    finding = Finding.model_validate({"text": "So it is.", "kind": kind, "values": values, **more})
+    return evaluate_study(rows, [finding])[0].verdicts[0]
+
+
+def outcome(rows: list[StudyRow], kind: str, *values: float, **more: Any) -> str:
+    """In a word."""
+    return verdict(rows, kind, *values, **more).outcome

@@ -15,10 +15,11 @@ from lslam.types.study import StudyRow
 def test_report_of_rows_read_back_is_that_of_the_rows(tmp_path: Path) -> None:
     rows = [
         StudyRow(
-            f"r{v}", "skip", "open", 0, "icp", False, {"input.skip_frames": v}, status="diverged" if v > 3 else "done",
+            f"r{v}-{seed}", "skip", "open", seed, "icp", False, {"input.skip_frames": v}, status="diverged" if v > 3 else "done",
             thesis_rmse=0.1 * v, angular_rmse_deg=1.0, stages_ms={"register": 10.0}, total_time_s=10.0 / v,
         )
         for v in range(1, 6)
+        for seed in (0, 1)
     ]  # fmt: skip
     write_study_csv(tmp_path / "results.csv", rows)
     finding = Finding(text="up to 3", kind="diverges_beyond", values=(3,))
