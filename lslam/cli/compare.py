@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 @click.command(
     epilog="\b\nExamples: lslam compare sample_data --methods icp,kiss-icp\n"
-    "          lslam compare street block --methods icp,kiss-icp --seeds 0,1,2 --count 100\n"
+    "          lslam compare street block --methods icp,kiss-icp --seeds 0,1,2 --count 100 --count block=50\n"
     "          lslam compare walk open --methods icp,loam --imu both --seeds 0,1,2\n"
     "          lslam compare seq07 --data-root ~/kitti --methods icp,kiss-icp --count 300 --out runs/two --resume"
 )
@@ -56,7 +56,7 @@ if TYPE_CHECKING:
 @click.option(
     "--jobs", type=int, default=1, show_default=True, metavar="N", help="Runs at once; with several, times mean little."
 )
-@options.scan_range
+@options.scan_ranges
 @click.option("--crop", metavar="X,Y,SIZE", help="Map crop shown on the page, m; chosen by itself otherwise.")
 @click.option("--strict", is_flag=True, help="Exit 4 when any run failed.")
 @click.option(
@@ -94,13 +94,11 @@ def _plan(sequences: tuple[str, ...], given: dict[str, Any]) -> Plan:
     from lslam.studies.subjects import find_subjects
     from lslam.studies.variants import find_variants
 
-    flags = {f"input.{key}": given[key] for key in ("start", "count", "skip_frames") if given[key] is not None}
+    common, ranges = options.ranges_of(given, sequences)
     settings = options.with_preset(given["settings"], given["preset"])
     methods = [name.strip() for name in given["methods"].split(",") if name.strip()]
-    variants = find_variants(
-        methods, given["config_file"], [*settings, *(f"{k}={v}" for k, v in flags.items())], given["imu"]
-    )
-    subjects = find_subjects(sequences, given["data_root"])
+    variants = find_variants(methods, given["config_file"], [*settings, *common], given["imu"])
+    subjects = find_subjects(sequences, given["data_root"], ranges)
     return Plan(
         subjects=tuple(subjects),
         variants=tuple(variants),

@@ -14,9 +14,10 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
-from lslam.errors import UsageError
+from lslam.errors import ConfigError, UsageError, nearest
 
 if TYPE_CHECKING:
+    from lslam.config.input import ScanRange
     from lslam.studies.engines import Engine
     from lslam.studies.expanded import Place
 
@@ -46,6 +47,50 @@ def scan_range(function: F) -> F:
     ):
         function = click.option(name, type=int, metavar="N", help=text)(function)
     return function
+
+
+def scan_ranges(function: F) -> F:
+    """--start, --count and --skip-frames, of all sequences or of one."""
+    for name, text in (
+        ("--skip-frames", "Use every N-th scan"),
+        ("--count", "Number of scans used"),
+        ("--start", "First scan used"),
+    ):
+        function = click.option(
+            name, multiple=True, metavar="[SEQUENCE=]N", help=f"{text}, of one SEQUENCE or of all; repeatable."
+        )(function)
+    return function
+
+
+def ranges_of(given: dict[str, Any], words: Iterable[str]) -> tuple[list[str], dict[str, ScanRange]]:
+    """What the options of `scan_ranges` set for all sequences, as --set takes it, and for single `words`.
+
+    Raises UsageError for what is no number, or names no such sequence, ConfigError for a number out of range.
+    """
+    from pydantic import ValidationError
+
+    from lslam.config.input import AS_CONFIGURED, ScanRange
+    from lslam.config.load import explain
+
+    words = list(words)
+    common: dict[str, int] = {}
+    own: dict[str, ScanRange] = {}
+    for key in ScanRange.model_fields:
+        for text in given[key]:
+            flag = f"--{key.replace('_', '-')} {text}"
+            word, equals, number = text.rpartition("=")
+            if not number.removeprefix("-").isdecimal():
+                raise UsageError(f"{flag}: a whole number, or SEQUENCE=N for one of the sequences")
+            if equals and word not in words:
+                raise UsageError(f"{flag}: no sequence {word!r} is named; {nearest(word, words)}")
+            if not equals:
+                common[key] = int(number)
+                continue
+            try:
+                own[word] = ScanRange(**(own.get(word, AS_CONFIGURED).own | {key: int(number)}))
+            except ValidationError as error:
+                raise ConfigError(explain(error, flag)) from None
+    return [f"input.{key}={number}" for key, number in common.items()], own
 
 
 def reading(function: F) -> F:

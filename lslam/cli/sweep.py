@@ -46,8 +46,9 @@ def command(study: str | None, **given: Any) -> None:
     """Vary parameters over sequences, methods and seeds; every run is a row of results.csv and results.parquet, and
     report.html shows what was found.
 
-    STUDY is a file, or a name of --list. What fails or diverges is a row with its reason. Findings about time are judged when
-    every run had a core to itself: on an idle machine, with --jobs 1 where in doubt.
+    STUDY is a file, or a name of --list. Its sequences may each have a start, count and skip_frames of their own. What fails or
+    diverges is a row with its reason. Findings about time are judged when every run had a core to itself: on an idle machine,
+    with --jobs 1 where in doubt.
     """
     if given["show_list"]:
         _print_list()

@@ -10,7 +10,7 @@ from pydantic import Field, ValidationError, field_validator
 from lslam.config.load import explain
 from lslam.config.preset_files import read_toml
 from lslam.config.section import Section
-from lslam.config.study import StudySequence, check_keys, distinct_seeds
+from lslam.config.study import StudySequence, check_keys, distinct_seeds, tables
 from lslam.errors import ConfigError
 
 
@@ -53,10 +53,10 @@ def read_batch(path: Path) -> BatchConfig:
 def parse_batch(tree: dict[str, Any], where: str) -> BatchConfig:
     """The batch of a TOML tree found in `where`; raises ConfigError as `read_batch`."""
     check_keys(tree, BatchConfig, where)
-    jobs = tree.get("jobs")
-    for job in jobs if isinstance(jobs, list) else []:
-        if isinstance(job, dict):
-            check_keys(job, BatchJob, f"{where}: jobs")
+    for job in tables(tree.get("jobs")):
+        check_keys(job, BatchJob, f"{where}: jobs")
+        for sequence in tables(job.get("sequences")):
+            check_keys(sequence, StudySequence, f"{where}: jobs: sequences")
     try:
         return BatchConfig.model_validate(tree)
     except ValidationError as error:

@@ -12,6 +12,32 @@ from lslam.config.section import Section
 RINGS = re.compile(r"(auto|field|order)|(rows|elevation)(?::([1-9]\d{0,2}))?")
 
 
+class ScanRange(Section):
+    """Which scans of one sequence are used; what is absent stays as the configuration says."""
+
+    start: int | None = Field(None, ge=0, description="first scan used of this sequence, absent: input.start")
+    count: int | None = Field(None, ge=1, description="number of scans used of it, absent: input.count")
+    skip_frames: int | None = Field(None, ge=1, description="use every n-th scan of it, absent: input.skip_frames")
+
+    @property
+    def own(self) -> dict[str, int]:
+        """What is given, by key of the section `input`.
+
+        >>> ScanRange(count=5).own
+        {'count': 5}
+        """
+        values = {key: getattr(self, key) for key in ScanRange.model_fields}
+        return {key: value for key, value in values.items() if value is not None}
+
+    @property
+    def last(self) -> int:
+        """Index of the last scan that it asks for."""
+        return (self.start or 0) + ((self.count or 1) - 1) * (self.skip_frames or 1)
+
+
+AS_CONFIGURED = ScanRange()
+
+
 class InputConfig(Section):
     """Which scans of the sequence are used, and how strict the run is about them."""
 

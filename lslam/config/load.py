@@ -134,8 +134,16 @@ def _merge(tree: Tree, more: Tree, where: str) -> None:
 def explain(error: ValidationError, where: str = "configuration") -> str:
     """One part per key: what was given and what is wanted, with the nearest of the words that are allowed."""
     parts: dict[str, str] = {}
-    for e in error.errors():
-        key = ".".join([str(p) for p in e["loc"] if not isinstance(p, int)][:2])
+    found = error.errors()
+    for e in found:
+        # Items that are wrong themselves are missing from a list, which is no fault of its own.
+        if e["type"] == "too_short" and any(
+            other is not e and other["loc"][: len(e["loc"])] == e["loc"] for other in found
+        ):
+            continue
+        # What follows two names is a choice of types, except in a table of a table's list.
+        names = 3 if [isinstance(p, int) for p in e["loc"][:5]] == [False, True, False, True, False] else 2
+        key = ".".join([str(p) for p in e["loc"] if not isinstance(p, int)][:names])
         wanted = e["msg"].removeprefix("Value error, ")
         if e["type"] == "literal_error":
             words = re.findall(r"'([^']*)'", e["ctx"]["expected"])

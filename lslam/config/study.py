@@ -11,6 +11,7 @@ from typing import Any, Literal
 from pydantic import BaseModel, Field, ValidationError, ValidationInfo, field_validator, model_validator
 
 from lslam.config.finding import Finding
+from lslam.config.input import ScanRange
 from lslam.config.load import explain
 from lslam.config.preset_files import read_toml
 from lslam.config.section import Section
@@ -64,8 +65,8 @@ class Range(Section):
         return tuple(int(value) if is_whole and value == int(value) else value for value in values)
 
 
-class StudySequence(Section):
-    """A recording (`path`) or a scenario that is simulated once per seed."""
+class StudySequence(ScanRange):
+    """A recording (`path`) or a scenario that is simulated once per seed, and which scans of it are used."""
 
     path: str = Field("", description="a recording: what `lslam run` takes")
     scenario: str = Field("", description="or a scenario: a name of `lslam simulate --list` or a .toml file")
@@ -81,10 +82,15 @@ class StudySequence(Section):
     def _check(self) -> StudySequence:
         if bool(self.path) == bool(self.scenario):
             raise ValueError("a sequence is a path or a scenario: give one of them")
-        if self.path and self.model_fields_set - {"path"}:
-            more = ", ".join(sorted(self.model_fields_set - {"path", "scenario"}))
+        more = ", ".join(sorted(self.model_fields_set - {"path", "scenario", *ScanRange.model_fields}))
+        if self.path and more:
             raise ValueError(f"{more} belong to a scenario: the recording {self.path} is as it is")
         return self
+
+    @property
+    def name(self) -> str:
+        """What the user called it."""
+        return self.path or self.scenario
 
 
 class StudyConfig(Section):
@@ -122,7 +128,13 @@ class StudyConfig(Section):
 
     @field_validator("parameters")
     @classmethod
-    def _has_values(cls, parameters: dict[str, Range | tuple[Value, ...]]) -> dict[str, Range | tuple[Value, ...]]:
+    def _has_values(
+        cls, parameters: dict[str, Range | tuple[Value, ...]], info: ValidationInfo
+    ) -> dict[str, Range | tuple[Value, ...]]:
+        for sequence in info.data.get("sequences", ()):
+            for key in sequence.own:
+                if f"input.{key}" in parameters:
+                    raise ValueError(f"input.{key} is studied, and sequence {sequence.name} has a {key} of its own")
         for key, values in parameters.items():
             listed = values.values() if isinstance(values, Range) else values
             if not listed:
@@ -177,7 +189,7 @@ def read_study(path: Path) -> StudyConfig:
 def parse_study(tree: dict[str, Any], where: str, name: str) -> StudyConfig:
     """The study of a TOML tree found in `where`; `name` is what it is called when it does not say."""
     check_keys(tree, StudyConfig, where)
-    for sequence in _tables(tree.get("sequences")):
+    for sequence in tables(tree.get("sequences")):
         check_keys(sequence, StudySequence, f"{where}: sequences")
     try:
         return StudyConfig.model_validate({"name": name, **tree})
@@ -185,7 +197,8 @@ def parse_study(tree: dict[str, Any], where: str, name: str) -> StudyConfig:
         raise ConfigError(explain(error, where)) from None
 
 
-def _tables(value: Any) -> Sequence[dict[str, Any]]:
+def tables(value: Any) -> Sequence[dict[str, Any]]:
+    """Those in a list; what is none is said when it is validated."""
     return [item for item in value if isinstance(item, dict)] if isinstance(value, list) else []
 
 

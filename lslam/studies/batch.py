@@ -61,7 +61,7 @@ def expand_batch(batch: BatchConfig, place: Place, settings: Sequence[str] = ())
             name = free_name(variant.name, taken)
             variants.append(replace(variant, name=name, without=""))
             found[name] = Contender(variants[-1], method, {})
-        cells = cells_of(entry.sequences, entry.seeds, [found[v.name] for v in variants], place)
+        cells = cells_of(entry.sequences, entry.seeds, [found[v.name] for v in variants], place, settings)
         jobs += expand(cells, variants, entry.seeds, place.out, place.command)
     return Expanded("batch", "batch", MARK, text, jobs, found)
 

@@ -9,7 +9,7 @@ from dataclasses import replace
 from lslam.errors import InterruptedRunError, LslamError
 from lslam.evaluation.relative import parse_delta
 from lslam.reports import compare_html, compare_json, compare_table
-from lslam.studies.cells import recorded_cell
+from lslam.studies.cells import fitted_scene, recorded_cell
 from lslam.studies.collect import IMU, collect_run, metrics_of
 from lslam.studies.drawings import draw
 from lslam.studies.grid import Cell, Job, expand
@@ -17,7 +17,7 @@ from lslam.studies.jobs import crew_of, finished, run_jobs
 from lslam.studies.paired import TIE_M, compare_pairs, summarise
 from lslam.studies.plan import RESULT, SIMULATED, Follow, Plan, check_plan, claim, release
 from lslam.studies.scenes import Scene, simulate_once
-from lslam.studies.subjects import scans_needed
+from lslam.studies.subjects import Subject, scans_needed, with_range
 from lslam.types.comparison import Comparison, Drawing, RunScore
 
 # More than this many busy cores before the first run, and its times are somebody else's too.
@@ -65,22 +65,32 @@ def _cells(plan: Plan, follow: Follow) -> list[Cell]:
     needs_imu = any(variant.config.imu.use for variant in plan.variants)
     # What cannot be opened, or has no IMU though one is asked for, is said before anything is simulated.
     recorded = {
-        s.label: recorded_cell(s.label, s.path, needs_imu=needs_imu, truth=plan.truth, data_root=plan.data_root)
+        s.label: recorded_cell(
+            s.label, s.path, needs_imu=needs_imu, truth=plan.truth, data_root=plan.data_root, own=s.range
+        )
         for s in plan.subjects
         if s.path is not None
     }
+    scenes = {s.label: _scene(plan, s) for s in plan.subjects if s.scenario is not None}
     cells = []
     for subject in plan.subjects:
-        if subject.scenario is None:
+        if subject.label in recorded:
             cells.append(recorded[subject.label])
             continue
         for seed in plan.seeds:
             path = simulate_once(
-                Scene(subject.scenario, scans_needed([v.config.input for v in plan.variants])), seed, plan.out / SIMULATED,
+                scenes[subject.label], seed, plan.out / SIMULATED,
                 lambda stage, total: follow.on_start(stage, total, "scans"), lambda: follow.on_step(""),
             )  # fmt: skip
-            cells.append(recorded_cell(subject.label, path, seed, needs_imu=needs_imu))
+            cells.append(recorded_cell(subject.label, path, seed, needs_imu=needs_imu, own=subject.range))
     return cells
+
+
+def _scene(plan: Plan, subject: Subject) -> Scene:
+    """What is simulated of a scenario; raises UsageError when it ends before the scans that are used."""
+    assert subject.scenario is not None
+    needed = scans_needed([with_range(v.config, subject.range).input for v in plan.variants])
+    return fitted_scene(Scene(subject.scenario), needed, subject.range, plan.seeds)
 
 
 def _notes(scores: Sequence[RunScore]) -> list[str]:

@@ -27,7 +27,7 @@ from lslam.studies.subjects import used
 Floats = NDArray[np.float64]
 # Scans of the shorter and the longer pilot: what they differ by is what scans cost, the rest what a run costs by itself.
 _SHORT, _LONG = 12, 36
-# Scans of a recording that are simulated for pilots, at most.
+# Scans of a recording that are simulated for pilots from the first one used, at most.
 _SIMULATED = 160
 
 
@@ -186,7 +186,8 @@ def _places(jobs: Sequence[Job], folder: Path, follow: Follow) -> dict[str, _Pla
             places[job.sequence] = _Place(job.path, scans, scans, 0.0)
             continue
         whole = len(drive_of(job.scene, job.seed))
-        part = replace(job.scene, scans=min(whole, _SIMULATED))
+        start = max(other.config.input.start for other in jobs if other.sequence == job.sequence)
+        part = replace(job.scene, scans=min(whole, start + _SIMULATED))
         began = time.monotonic()
         path = simulate_once(
             part, job.seed, folder, lambda stage, total: follow.on_start(stage, total, "scans"),

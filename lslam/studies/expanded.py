@@ -8,13 +8,14 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from lslam.config.input import ScanRange
 from lslam.config.preset_files import read_toml
 from lslam.config.study import StudySequence
 from lslam.errors import InterruptedRunError, LslamError, OutputExistsError
 from lslam.formats.atomic import atomic_write
 from lslam.readers import open_sequence
 from lslam.readers.lookup import find_folder
-from lslam.studies.cells import recorded_cell, scene_cell
+from lslam.studies.cells import fitted_scene, recorded_cell, scene_cell
 from lslam.studies.engines import Engine
 from lslam.studies.grid import Cell, Job
 from lslam.studies.jobs import finished
@@ -22,7 +23,7 @@ from lslam.studies.plan import SIMULATED, Follow, claim, release
 from lslam.studies.points import Contender, free_name
 from lslam.studies.results import Results
 from lslam.studies.scenes import Scene
-from lslam.studies.subjects import file_safe, scans_needed
+from lslam.studies.subjects import file_safe, scans_needed, with_range
 from lslam.types.study import StudyRow
 
 
@@ -141,23 +142,31 @@ def _check_folders(jobs: Sequence[Job], place: Place) -> None:
 
 
 def cells_of(
-    sequences: Sequence[StudySequence], seeds: Sequence[int], found: Sequence[Contender], place: Place
+    sequences: Sequence[StudySequence],
+    seeds: Sequence[int],
+    found: Sequence[Contender],
+    place: Place,
+    settings: Sequence[str] = (),
 ) -> list[Cell]:
     """Recordings as they are, scenarios once per seed, every one with a label of its own.
 
+    settings : "a.b=v" that beat the sequences' own `start`, `count` and `skip_frames`
+
     Raises InputError for a recording that cannot be opened or lacks the IMU; UsageError or ConfigError for a scenario that is
-    none.
+    none, UsageError for a sequence that ends before the scans that are its own.
     """
     configs = [c.variant.config for c in found]
-    needed = scans_needed([config.input for config in configs])
     needs_imu = any(config.imu.use for config in configs)
+    beaten = {setting.partition("=")[0].strip() for setting in settings}
     cells: list[Cell] = []
     taken: set[str] = set()
     for sequence in sequences:
+        own = ScanRange(**{key: value for key, value in sequence.own.items() if f"input.{key}" not in beaten})
+        needed = scans_needed([with_range(config, own).input for config in configs])
         made = (
-            [_recorded(sequence.path, needs_imu, place)]
+            [_recorded(sequence.path, own, needs_imu, place)]
             if sequence.path
-            else _simulated(sequence, needed, seeds, place)
+            else _simulated(sequence, own, needed, seeds, place)
         )
         # The same place with other settings is another sequence, with a folder of its own.
         label = free_name(made[0].sequence, taken)
@@ -165,13 +174,13 @@ def cells_of(
     return cells
 
 
-def _recorded(word: str, needs_imu: bool, place: Place) -> Cell:
+def _recorded(word: str, own: ScanRange, needs_imu: bool, place: Place) -> Cell:
     path = find_folder(word, place.data_root).absolute()
     label = file_safe(open_sequence(path).name)
-    return recorded_cell(label, path, needs_imu=needs_imu, data_root=place.data_root)
+    return recorded_cell(label, path, needs_imu=needs_imu, data_root=place.data_root, own=own)
 
 
-def _simulated(s: StudySequence, needed: int | None, seeds: Sequence[int], place: Place) -> list[Cell]:
-    scans = needed if s.scans is None else s.scans
-    scene = Scene(s.scenario, scans, s.lidar, s.columns, s.speed, s.compensated, s.imu, s.settings)
-    return [scene_cell(scene, seed, place.scenes or place.out / SIMULATED) for seed in seeds]
+def _simulated(s: StudySequence, own: ScanRange, needed: int | None, seeds: Sequence[int], place: Place) -> list[Cell]:
+    scene = Scene(s.scenario, s.scans, s.lidar, s.columns, s.speed, s.compensated, s.imu, s.settings)
+    scene = fitted_scene(scene, needed, own, seeds)
+    return [scene_cell(scene, seed, place.scenes or place.out / SIMULATED, own) for seed in seeds]

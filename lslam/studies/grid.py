@@ -8,8 +8,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lslam.config import Config
+from lslam.config.input import AS_CONFIGURED, ScanRange
 from lslam.pipeline.identity import job_digest
 from lslam.studies.scenes import Scene
+from lslam.studies.subjects import with_range
 from lslam.studies.variants import Variant
 
 if TYPE_CHECKING:
@@ -23,7 +25,7 @@ class Cell:
     seed : of the simulation, None for a recording; truth : what replaces the recording's own ground truth
     digest : of the input; imu : likewise of its IMU, empty when no run asks for it
     data_root : where the IMU of a KITTI odometry sequence is looked for
-    scene : what is simulated with `seed` when nothing lies in `path` yet
+    scene : what is simulated with `seed` when nothing lies in `path` yet; range : which scans are used, over the configuration
     """
 
     sequence: str
@@ -34,6 +36,7 @@ class Cell:
     imu: str = ""
     data_root: Path | None = None
     scene: Scene | None = None
+    range: ScanRange = AS_CONFIGURED
 
 
 @dataclass(frozen=True)
@@ -91,6 +94,7 @@ def expand(
                     config = variant.with_seed(seed)
                 elif cell.seed is None and seed != seeds[0]:
                     continue
+                config = with_range(config, cell.range)
                 folder = run_folder(out, cell.sequence, variant.name, seed)
                 digest = job_digest(config, cell.digest, cell.imu)
                 jobs.append(

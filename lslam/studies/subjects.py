@@ -5,11 +5,12 @@ from __future__ import annotations
 import logging
 import os
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from lslam.config.input import InputConfig
+from lslam.config import Config
+from lslam.config.input import AS_CONFIGURED, InputConfig, ScanRange
 from lslam.errors import InputError, UsageError, nearest
 from lslam.readers import open_sequence
 from lslam.readers.lookup import find_folder
@@ -20,21 +21,28 @@ log = logging.getLogger("lslam")
 
 @dataclass(frozen=True)
 class Subject:
-    """A recording (`path`) or a scenario (`scenario`); `label` names it in tables and folders and is unique in a study."""
+    """A recording (`path`) or a scenario (`scenario`); `label` names it in tables and folders and is unique in a study.
+
+    range : which of its scans are used, over the configuration
+    """
 
     label: str
     path: Path | None = None
     scenario: str | None = None
+    range: ScanRange = AS_CONFIGURED
 
 
-def find_subjects(words: Iterable[str], data_root: Path | None = None) -> list[Subject]:
+def find_subjects(
+    words: Iterable[str], data_root: Path | None = None, ranges: Mapping[str, ScanRange] | None = None
+) -> list[Subject]:
     """What the user named, in that order: paths and names of recordings, else names of scenarios.
 
+    ranges : which scans are used, by word, over the configuration
     Raises UsageError for what is named twice, InputError for what is neither, or cannot be opened.
     """
     subjects: list[Subject] = []
     for word in words:
-        subject = _find(word, data_root)
+        subject = replace(_find(word, data_root), range=(ranges or {}).get(word, AS_CONFIGURED))
         if any((s.path, s.scenario) == (subject.path, subject.scenario) for s in subjects):
             raise UsageError(f"sequence {word!r} is named twice: a comparison needs it once")
         subjects.append(subject)
@@ -92,6 +100,18 @@ def used(scans: int, config: InputConfig) -> int:
     """
     left = len(range(config.start, scans, config.skip_frames))
     return left if config.count is None else min(left, config.count)
+
+
+def with_range(config: Config, own: ScanRange) -> Config:
+    """The configuration with the scans of one sequence."""
+    return config.model_copy(update={"input": config.input.model_copy(update=own.own)}) if own.own else config
+
+
+def check_range(name: str, own: ScanRange, scans: int) -> None:
+    """Raise UsageError when a sequence of so many scans ends before what was asked of it."""
+    if own.own and own.last >= scans:
+        said = ", ".join(f"{key} = {value}" for key, value in own.own.items())
+        raise UsageError(f"sequence {name} has {scans} scans: {said} goes beyond its end")
 
 
 def scans_needed(configs: Iterable[InputConfig]) -> int | None:

@@ -39,7 +39,7 @@ def expand_study(sweep: Sweep) -> Expanded:
     text = tomli_w.dumps(study.model_dump(mode="json", exclude_none=True, exclude_defaults=True))
     check_same(place, MARK, "study", text, lambda tree: [str(tree.get("name"))])
     found = contenders(study, sweep.settings)
-    cells = cells_of(study.sequences, study.seeds, found, place)
+    cells = cells_of(study.sequences, study.seeds, found, place, sweep.settings)
     jobs = expand(cells, [c.variant for c in found], study.seeds, place.out, place.command)
     return Expanded(study.name, "study", MARK, text, jobs, {c.variant.name: c for c in found})
 

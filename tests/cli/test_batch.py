@@ -14,7 +14,7 @@ import pytest
 from calling import COMMAND, Done, assert_one_sentence, environment, lslam, sample_copy
 
 from lslam.cli.batch import _line, command
-from lslam.config.batch import BatchConfig
+from lslam.config.batch import BatchConfig, read_batch
 from lslam.errors import ConfigError, LslamError, OutputExistsError
 from lslam.formats.study_csv import read_study_csv
 from lslam.studies.batch import expand_batch, run_words
@@ -82,6 +82,18 @@ def test_every_job_of_a_file_is_a_run_and_a_row_and_is_kept(sample: Path, tmp_pa
     assert again.returncode == 0, again.stderr
     assert again.stdout == done.stdout
     assert [repr(row) for row in read_study_csv(out / "results.csv")] == [repr(row) for row in rows]
+
+
+def test_scans_of_single_sequences_are_used_as_they_say(sample: Path, tmp_path: Path) -> None:
+    file = tmp_path / "jobs.toml"
+    two = '["SAMPLE", { path = "SAMPLE", start = 5, count = 2 }]'
+    file.write_text(JOBS.replace('["SAMPLE"]', two, 1).replace("SAMPLE", str(sample)))
+    jobs = expand_batch(read_batch(file), Place(tmp_path / "out"), ["input.count=3"]).jobs
+    named = [(job.sequence, job.method, job.config.input.start, job.config.input.count) for job in jobs[:4]]
+    assert named == [
+        ("block-0", "icp", 0, 3), ("block-0", "kiss-icp", 0, 3), ("block-0-2", "icp", 5, 3), ("block-0-2", "kiss-icp", 5, 3),
+    ]  # fmt: skip
+    assert expand_batch(read_batch(file), Place(tmp_path / "out")).jobs[2].config.input.count == 2
 
 
 @pytest.mark.parametrize(
@@ -198,6 +210,24 @@ def test_a_wrong_line_is_named_before_anything_runs(
         ("map.write", "map.wrote", 2, "unknown key map.wrote"),
         ('["SAMPLE"]', "[]", 2, "jobs"),
         ('["SAMPLE"]', '"SAMPLE"', 2, "jobs"),
+        (
+            '["SAMPLE"]',
+            '[{ path = "SAMPLE", cuont = 3 }]',
+            2,
+            "jobs: sequences: unknown key 'cuont'; did you mean 'count'",
+        ),
+        (
+            '["SAMPLE"]',
+            '[{ path = "SAMPLE", count = -3 }]',
+            2,
+            "jobs.sequences.count = -3: Input should be greater than",
+        ),
+        (
+            '["SAMPLE"]',
+            '[{ path = "SAMPLE", start = 8 }]',
+            2,
+            "sequence block-0 has 8 scans: start = 8 goes beyond its end",
+        ),
         ("methods =", "seeds = [0, 0]\nmethods =", 2, "different whole numbers"),
     ],
 )

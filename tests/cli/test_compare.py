@@ -10,12 +10,13 @@ import re
 import signal
 import subprocess
 import time
+import tomllib
 from pathlib import Path
 from typing import Any
 
 import click
 import pytest
-from calling import COMMAND, assert_one_sentence, environment, lslam, sample_copy, strict_json
+from calling import COMMAND, SAMPLE, assert_one_sentence, environment, lslam, sample_copy, strict_json
 
 from lslam.cli.compare import command
 from lslam.errors import InputError, UsageError
@@ -39,6 +40,17 @@ def test_one_object_on_stdout_progress_on_stderr_and_a_crop_of_ones_own(tmp_path
     page = (out / "compare.html").read_text()
     assert "map of icp on block at 10, 0" in page
     assert "comparing 1/1" in done.stderr
+
+
+def test_flags_of_one_sequence_beat_those_of_all(tmp_path: Path) -> None:
+    flags = ["--count", "9", "--count", "block=6", "--skip-frames", "block=2", "--start", f"{SAMPLE}=80"]
+    done = lslam("compare", SAMPLE, "block", "--methods", "kiss-icp", *flags, "--json", "--out", tmp_path / "out", "-q")
+    assert done.returncode == 0, done.stderr
+    runs = strict_json(done.stdout)["runs"]
+    assert [(run["sequence"], run["values"]["scans"]) for run in runs] == [("block-0", 9), ("block", 6)]
+    inputs = [tomllib.loads((Path(run["folder"]) / "config.toml").read_text())["input"] for run in runs]
+    assert [(i["start"], i["count"], i["skip_frames"]) for i in inputs] == [(80, 9, 1), (0, 6, 2)]
+    assert (tmp_path / "out" / "simulated" / "block-0-11").is_dir(), "every other scan of 11"
 
 
 def on_a_terminal(words: list[str], columns: int) -> list[str]:
@@ -108,6 +120,27 @@ def test_one_failed_run_is_exit_code_0_and_4_with_strict(torn: Path, tmp_path: P
         (["block", "--methods", "icp", "--jobs", "0"], UsageError, "--jobs 0"),
         (["block", "--methods", "icp", "--set", "map.voxl=1"], UsageError, "did you mean .voxel"),
         (["street", "--methods", "icp", "--count", "5000"], UsageError, "--speed"),
+        (["block", "--methods", "icp", "--count", "x"], UsageError, "--count x: a whole number, or SEQUENCE=N"),
+        (
+            ["block", "--methods", "icp", "--count", "blok=3"],
+            UsageError,
+            "no sequence 'blok' is named; did you mean 'block'",
+        ),
+        (
+            ["block", "--methods", "icp", "--start", "block=-1"],
+            UsageError,
+            "--start block=-1: start = -1: .*or equal to 0",
+        ),
+        (
+            ["street", "--methods", "icp", "--count", "street=5000"],
+            UsageError,
+            "street has 265 scans: count = 5000 goes",
+        ),
+        (
+            [str(SAMPLE), "--methods", "icp", "--start", f"{SAMPLE}=95"],
+            UsageError,
+            "block-0 has 95 scans: start = 95 goes",
+        ),
     ],
 )
 def test_wrong_use_is_said_before_anything_runs(

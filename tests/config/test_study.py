@@ -68,6 +68,14 @@ def test_ranges_hold_both_ends_and_round_numbers(given: dict[str, Any], values: 
         ("step = 2", "log = true, step = 1", "log needs num"),
         ("step = 2", "step = 2, num = 3", "a step or num, one of them"),
         ("step = 2", "step = 0", "greater than 0"),
+        (
+            'path = "seq07"',
+            'path = "seq07", count = 0',
+            r"mine\.toml: sequences\.count = 0: .*greater than or equal to 1$",
+        ),
+        ('path = "seq07"', 'path = "seq07", start = -1', r"sequences\.start = -1: .*greater than or equal to 0$"),
+        ('path = "seq07"', 'path = "seq07", coumt = 9', "sequences: unknown key 'coumt'; did you mean 'count'"),
+        ('path = "seq07"', 'path = "seq07", skip_frames = 2', r"input\.skip_frames is studied, and sequence seq07 has"),
         ("[0.3, 1]", "[]", r"preprocess\.random_share has no values"),
         ("[0.3, 1]", "[0.3, 0.3]", "has a value twice"),
         ('["icp"]', "[]", "methods"),
@@ -104,3 +112,8 @@ def test_parameters_are_a_table_with_something_in_it() -> None:
 def test_a_file_that_is_not_there_is_said(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"study .*none\.toml cannot be read"):
         read_study(tmp_path / "none.toml")
+
+
+def test_a_sequence_may_say_which_of_its_scans_are_used(tmp_path: Path) -> None:
+    first, second = study(tmp_path, TEXT.replace('"seq07"', '"seq07", start = 20, count = 30')).sequences
+    assert (first.own, second.own) == ({}, {"start": 20, "count": 30})

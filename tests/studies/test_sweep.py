@@ -207,6 +207,55 @@ def test_the_same_scenario_seen_otherwise_is_another_sequence(tmp_path: Path) ->
     assert {(c.method, c.uses_imu) for c in expanded.contenders.values()} == {("icp", False), ("icp", True)}
 
 
+def test_scans_of_single_sequences_are_used_as_they_say(sweep: Sweep, tmp_path: Path) -> None:
+    """Both from one simulation: 16 scans, of which one run uses 5 from the 8th on, the other the first 7."""
+    block = TREE["sequences"][0]
+    two = elsewhere(
+        sweep, tmp_path / "out", sequences=[block | {"start": 8, "count": 5}, block], beside=[],
+        parameters={"preprocess.source_voxel": [0.8]}, config={"loops": {"use": False}, "input": {"count": 7}},
+    )  # fmt: skip
+    rows = run_sweep(two, Local(1))
+    assert [(row.sequence, row.scans) for row in rows] == [("block", 5), ("block-2", 7)]
+    inputs = [tomllib.loads((two.place.out / row.folder / "config.toml").read_text())["input"] for row in rows]
+    assert [(i["start"], i["count"]) for i in inputs] == [(8, 5), (0, 7)]
+    assert find_study(str(two.place.out / "study.toml")) == two.study
+    assert len({row.digest for row in rows}) == 2
+    beaten = expand_study(replace(two, settings=("input.count=3",)))
+    assert [(j.config.input.start, j.config.input.count) for j in beaten.jobs] == [(8, 3), (0, 3)], (
+        "--set beats the file"
+    )
+
+
+def test_a_scenario_has_the_scans_that_its_own_range_needs(tmp_path: Path) -> None:
+    def scans(**own: int) -> int | None:
+        one = study(sequences=[{"scenario": "street", "columns": 256} | own], beside=[])
+        job = expand_study(Sweep(one, Place(tmp_path / "out"))).jobs[0]
+        assert job.scene is not None
+        return job.scene.scans
+
+    # skip_frames is studied, up to 2; the street has 266 scans.
+    assert scans(start=10, count=50) == 10 + 49 * 2 + 1
+    assert scans(count=200) is None, "all there are"
+    assert scans(start=10) is None
+    assert scans() is None
+
+
+def test_scans_beyond_the_end_of_a_sequence_are_refused(sweep: Sweep, made: list[StudyRow], tmp_path: Path) -> None:
+    recorded = str(next((sweep.place.scenes or tmp_path).rglob("sequences/00")))
+    street, drive = {"scenario": "street", "columns": 256}, {"path": recorded}
+    for sequence, name in (
+        (TREE["sequences"][0] | {"start": 16}, "block has 16 scans: start = 16 goes"),
+        (TREE["sequences"][0] | {"start": 12, "count": 5}, "block has 16 scans: start = 12, count = 5 goes"),
+        (drive | {"count": 17}, r"block-3 has 16 scans: count = 17 goes"),
+        (street | {"count": 267}, "street has 266 scans: count = 267 goes"),
+        (street | {"start": 266}, "street has 266 scans: start = 266 goes"),
+    ):  # fmt: skip
+        with pytest.raises(UsageError, match=f"sequence {name} beyond its end"):
+            expand_study(elsewhere(sweep, tmp_path / "out", sequences=[sequence]))
+    fits = elsewhere(sweep, tmp_path / "out", sequences=[drive | {"start": 12, "count": 4}])
+    assert {job.config.input.start for job in expand_study(fits).jobs} == {12}
+
+
 def test_keys_of_one_name_in_two_sections_are_runs_of_their_own(tmp_path: Path) -> None:
     keys = ("registration.inlier_distance", "imu.inlier_distance")
     two = study(grid="one-way", parameters={key: [0.5, 1.0] for key in keys}, imu="on", beside=[])
@@ -266,6 +315,15 @@ def test_the_time_is_that_of_finished_runs_of_the_same_kind(sweep: Sweep, made: 
     assert guess.seconds == pytest.approx(np.mean([seconds[job.folder] for job in same[1:]]))
     assert from_finished(jobs, [*jobs[:1], *jobs[:1]], contenders, 2).seconds == guess.seconds  # type: ignore[union-attr]
     assert from_finished(jobs, jobs, contenders, 1) is None
+
+
+def test_pilots_of_scans_far_along_the_way_have_them(
+    sweep: Sweep, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("lslam.studies.estimate._SIMULATED", 6)
+    late = TREE["sequences"][0] | {"start": 9, "count": 4}
+    jobs = expand_study(Sweep(study(sequences=[late], beside=[]), Place(tmp_path / "out")))
+    assert estimate(jobs.jobs, jobs.contenders, 1).pilots > 1
 
 
 def test_an_estimate_names_the_pilot_that_failed(sweep: Sweep) -> None:
