@@ -195,7 +195,7 @@ def judge_good_from(finding: Finding, result: CurveResult) -> Judged:
         return _plateau_is_later(result, expected, found)
     below = rise_below(curve, expected)
     outcomes: dict[Rise, Outcome] = {"worse": "confirmed", "as good": "refuted", "unknown": "undecided"}
-    return outcomes[below], f"the error is on its plateau from {found:g} on; below {expected:g} {BELOW[below]}"
+    return outcomes[below], f"the error is on its plateau from {expected:g} on; below {expected:g} {BELOW[below]}"
 
 
 def _plateau_is_later(result: CurveResult, expected: float, found: float | None) -> Judged:
