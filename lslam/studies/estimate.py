@@ -86,15 +86,14 @@ class _Group:
 def from_finished(
     jobs: Sequence[Job], left: Sequence[Job], contenders: dict[str, Contender], at_once: int
 ) -> Guess | None:
-    """Time that the `left` of a study's `jobs` will take, from what its finished runs took; None without any.
+    """Time that the `left` of a study's `jobs` will take, from what its finished runs took, even if made anew; None without any.
 
     A run takes as long as those of its sequence and method did in the mean, or as all did where none of these is finished.
     """
-    open_ones = {job.folder for job in left}
     taken: dict[object, list[float]] = {}
     for job in jobs:
-        state = None if job.folder in open_ones else read_state(job.state_file)
-        if state is not None and state.status in FINAL:
+        state = read_state(job.state_file)
+        if state is not None and state.status in FINAL and state.digest == job.digest:
             taken.setdefault(_kind(job, contenders), []).append(state.seconds)
     every = [seconds for group in taken.values() for seconds in group]
     if not every:

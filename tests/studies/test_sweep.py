@@ -310,11 +310,16 @@ def test_the_time_is_that_of_finished_runs_of_the_same_kind(sweep: Sweep, made: 
     seconds = {job.folder: read_state(job.state_file).seconds for job in jobs}  # type: ignore[union-attr]
     same = [job for job in jobs if contenders[job.method].method == contenders[jobs[0].method].method]
     same = [job for job in same if contenders[job.method].is_beside == contenders[jobs[0].method].is_beside]
+    every = from_finished(jobs, jobs, contenders, 1)
+    assert every is not None
+    assert every.seconds == pytest.approx(sum(seconds.values())), "all anew"
+    jobs[0].state_file.unlink()
     guess = from_finished(jobs, jobs[:1], contenders, 1)
     assert guess is not None
     assert guess.seconds == pytest.approx(np.mean([seconds[job.folder] for job in same[1:]]))
     assert from_finished(jobs, [*jobs[:1], *jobs[:1]], contenders, 2).seconds == guess.seconds  # type: ignore[union-attr]
-    assert from_finished(jobs, jobs, contenders, 1) is None
+    other = expand_study(elsewhere(sweep, tmp_path / "out", True, config={"input": {"count": 9}}))
+    assert from_finished(other.jobs, other.jobs, other.contenders, 1) is None, "runs of another configuration"
 
 
 def test_pilots_of_scans_far_along_the_way_have_them(
