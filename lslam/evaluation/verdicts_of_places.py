@@ -91,7 +91,7 @@ def judge_largest_between(finding: Finding, result: CurveResult) -> Judged:
 def _between(finding: Finding, result: CurveResult, *, is_highest: bool) -> Judged:
     """Confirmed when the extreme lies between, on each side some value is worse, and most seeds agree.
 
-    Refuted when a value outside is better than the best one between, or all of them are as good.
+    Refuted when the extreme lies outside and beats the best one between, or all values outside are as good as that.
     """
     low, high = finding.values
     curve = result.curve
@@ -112,20 +112,19 @@ def _between(finding: Finding, result: CurveResult, *, is_highest: bool) -> Judg
     if inside is None:
         return "refuted", f"{said}, and it diverges from {low:g} to {high:g}"
     base = int(np.flatnonzero(curve.values == inside.value)[0])
-    sides = [
-        {_standing(finding, curve, int(k), base, is_highest) for k in np.flatnonzero(known & side)}
-        for side in (curve.values < low, curve.values > high)
-    ]
-    outside = sides[0] | sides[1]
-    if "better" in outside:
+    standing = {int(k): _standing(finding, curve, int(k), base, is_highest) for k in np.flatnonzero(known & ~is_inside)}
+    # Of many values some are better by luck, the best of all is so least.
+    if any(how == "better" and (curve.is_lost[k] or curve.values[k] == best.value) for k, how in standing.items()):
         return "refuted", said
+    sides = [{how for k, how in standing.items() if side[k]} for side in (curve.values < low, curve.values > high)]
+    outside = sides[0] | sides[1]
     if outside == {"as good"}:
         return "refuted", f"{said}, and all values outside are as good as {inside.value:g}"
     ran = curve.values[known]
     if (ran[0] > low or ran[-1] < high) or not outside:
         return "undecided", f"{said}, but only values from {ran[0]:g} to {ran[-1]:g} were run"
-    if not low <= best.value <= high:
-        return "undecided", said
+    if not low <= best.value <= high or "better" in outside:
+        return "undecided", f"{said}, by less than the seeds scatter"
     own = _best_by_seed(finding, result, is_highest)
     agree = sum(seed.low <= high and seed.high >= low for seed in own)
     if 2 * agree <= len(own):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from math import nan
 from typing import Any
@@ -209,3 +210,14 @@ def test_a_plateau_that_one_seed_leaves_decides_nothing() -> None:
     rows = rows_of(DISTANCES, "imu.inlier_distance", error=lambda v: 0.5 if v >= 0.2 else 1.9, noise=0.02)
     steep = by_seed(rows, lambda v, s: {"thesis_rmse": (0.3, 0.9, 0.9)[s]} if v == 1.5 else {})
     assert {outcome(steep, kind, 0.2) for kind in ("good_from", "elbow_at")} == {"undecided"}
+
+
+def test_a_value_outside_that_seeds_call_better_but_their_median_does_not_leaves_it_undecided() -> None:
+    at_08 = [math.exp(log) for log in (-0.25, -0.25, 0.01, -0.09, -0.09)]
+    rows = by_seed(
+        rows_of(GRID, "loam.grid_step", seeds=range(5)),
+        lambda v, s: {"thesis_rmse": (1 + s) * (at_08[s] if v == 0.8 else 1.0 if 1 <= v <= 1.5 else 2.0)},
+    )
+    found = verdict(rows, "best_between", 1, 2, of="translation")
+    assert found.outcome == "undecided"
+    assert found.measured.startswith("translation is best at 1 ")
