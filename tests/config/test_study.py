@@ -73,6 +73,7 @@ def test_ranges_hold_both_ends_and_round_numbers(given: dict[str, Any], values: 
             'path = "seq07", count = 0',
             r"mine\.toml: sequences\.count = 0: .*greater than or equal to 1$",
         ),
+        ('{ scenario = "block", columns = 512 }, { path = "seq07" }', '{ path = "x", count = 0 }', r"or equal to 1$"),
         ('path = "seq07"', 'path = "seq07", start = -1', r"sequences\.start = -1: .*greater than or equal to 0$"),
         ('path = "seq07"', 'path = "seq07", coumt = 9', "sequences: unknown key 'coumt'; did you mean 'count'"),
         ('path = "seq07"', 'path = "seq07", skip_frames = 2', r"input\.skip_frames is studied, and sequence seq07 has"),
