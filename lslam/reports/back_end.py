@@ -97,7 +97,8 @@ def back_end_figures(record: RunRecord, evaluation: Evaluation | None) -> list[F
     )
     if ellipses:
         enlarged = f", drawn {factor:g} times as large" if factor > 1 else ""
-        legend.append(("s4", f"{SIGMAS:g} sigma{enlarged}"))
+        beside = " beside the map's own shift" if _common(record).any() else ""
+        legend.append(("s4", f"{SIGMAS:g} sigma{beside}{enlarged}"))
     chart = plane_chart(tracks, "before and after the pose graph", width=720, tallest=760)
     whole = Figure("Before and after the pose graph", chart, tuple(legend), caption, wide=True)
     return [whole, *_error_figures(evaluation), *loop_figures(record.loop_view)]
@@ -140,15 +141,25 @@ def _error_figures(evaluation: Evaluation | None) -> list[Figure]:
     return [Figure(title, chart, tuple((line.style, line.label) for line in lines), caption)] if chart else []
 
 
+def _common(record: RunRecord) -> Floats:
+    """(2, 2) m2, of the shift of the map that holds the run, which is in the covariance of every pose."""
+    if record.osm is None or not np.isfinite(record.osm.shift_sigma).all():
+        return np.zeros((2, 2))
+    return np.diag(record.osm.shift_sigma**2)
+
+
 def _ellipses(record: RunRecord) -> tuple[list[Floats], float]:
-    """Outlines (33, 2) of horizontal uncertainty at some poses, and the power of ten that makes them visible."""
+    """Outlines (33, 2) of horizontal uncertainty at some poses, and the power of ten that makes them visible.
+
+    What all poses are unsure by together moves the run and bends nothing: it is not drawn.
+    """
     covariances, positions = record.trajectory.covariances, record.trajectory.positions
     if covariances is None or len(positions) < 2:
         return [], 1.0
     some = np.unique(np.linspace(0, len(positions) - 1, ELLIPSES).round().astype(int))
     circle = np.linspace(0, 2 * np.pi, 33)
     ring = np.column_stack([np.cos(circle), np.sin(circle)])
-    values, vectors = np.linalg.eigh(covariances[some, :2, :2])
+    values, vectors = np.linalg.eigh(covariances[some, :2, :2] - _common(record))
     axes = SIGMAS * np.sqrt(np.maximum(values, 0.0))
     size, largest = float(np.ptp(positions[:, :2], axis=0).max()), float(axes.max(initial=0.0))
     if not (np.isfinite(largest) and largest > 0 and size > 0):

@@ -12,6 +12,7 @@ from lslam.config.eval import EvalConfig
 from lslam.evaluation.evaluate import evaluate
 from lslam.geometry import se3
 from lslam.reports.back_end import back_end_figures, back_end_rows
+from lslam.types.building_match import OsmMatches
 from lslam.types.constraint import LoopCandidate
 from lslam.types.georeference import Georeference
 from lslam.types.run_record import RunRecord
@@ -55,6 +56,24 @@ def test_ellipses_are_enlarged_until_they_are_seen(
     record.odometry = replace(record.trajectory, poses=record.trajectory.poses + 0.1)
     record.trajectory = replace(record.trajectory, covariances=np.tile(variance * np.eye(6), (40, 1, 1)))
     assert said in [label for _, label in back_end_figures(record, None)[0].legend]
+
+
+def test_the_shift_of_the_map_is_not_drawn_about_each_pose(make_record: Callable[..., RunRecord]) -> None:
+    """A trajectory known to a centimetre on a map known to two metres: the ellipses are those of the trajectory."""
+    record = make_record(40)
+    record.odometry = replace(record.trajectory, poses=record.trajectory.poses + 0.1)
+    own = np.tile(1e-4 * np.eye(6), (40, 1, 1))
+    record.trajectory = replace(record.trajectory, covariances=own)
+    alone = back_end_figures(record, None)[0]
+    sigma = np.array([2.0, 1.5])
+    none = (np.zeros((0, 2, 2)), np.zeros(0, np.int64), (), ())
+    record.osm = OsmMatches(np.zeros(3), (), *none, shift_sigma=sigma)
+    shifted = own.copy()
+    shifted[:, :2, :2] += np.diag(sigma**2)
+    record.trajectory = replace(record.trajectory, covariances=shifted)
+    figure = back_end_figures(record, None)[0]
+    assert figure.svg == alone.svg
+    assert "3 sigma beside the map's own shift, drawn 100 times as large" in [label for _, label in figure.legend]
 
 
 def test_the_error_is_drawn_before_and_after(make_record: Callable[..., RunRecord]) -> None:
