@@ -92,7 +92,7 @@ def _add_trees(
         offset = wall + np.sign(wall) * rng.uniform(*TREES_BEHIND)
         if rng.random() < layout.trees:
             xy = axis.beside(np.array([s]), offset)[0]
-            builder.add_mesh(furniture.tree(rng), [*xy, float(terrain.height(xy))])
+            builder.add_mesh(furniture.tree(rng, layout.volumes), [*xy, float(terrain.height(xy))])
         s += rng.uniform(*TREES_APART)
 
 

@@ -30,6 +30,8 @@ class Layout(Section):
     parked, trees : share of the places beside the road that hold a car or a tree; openings : share of houses followed by a
     wide gap; gardens : share of front gardens with a hedge or a wall; garden_trees : attempts per 5 m of street
     poles, bins : whether there are any; identical : every house and pole is the same, at even distances
+    volumes : crowns and hedges are volumes of leaves and some trees are bushes; what leaves do to beams is said in `returns`
+    camber : fall of the road from its middle to the kerbs, m/m
     """
 
     road: float = Field(4.5, ge=2, le=30)
@@ -48,6 +50,8 @@ class Layout(Section):
     poles: bool = True
     bins: bool = True
     identical: bool = False
+    volumes: bool = False
+    camber: float = Field(0.0, ge=0, le=0.1)
 
     @model_validator(mode="after")
     def _ranges_are_ordered(self) -> Layout:
@@ -147,9 +151,16 @@ def _add_road(builder: MeshBuilder, street: Curve, terrain: Terrain, layout: Lay
     if street.closed:
         rough[:, -1] = rough[:, 0]
     z = terrain.height(xy) + lift[:, None] + rough
+    if layout.camber:
+        z += crown_of_road(offsets, layout)[:, None]
     faces = grid_faces(len(offsets), len(s))
     kinds = np.where((lift[:-1] > 0) | (lift[1:] > 0), Surface.PAVEMENT, Surface.ROAD).astype(np.uint8)
     builder.add(np.concatenate([xy, z[..., None]], -1).reshape(-1, 3), faces, np.repeat(kinds, 2 * (len(s) - 1)))
+
+
+def crown_of_road(offsets: Floats, layout: Layout) -> Floats:
+    """(N,) m by which a road is higher than its edges at `offsets` (N,), m from its middle."""
+    return np.asarray(layout.camber * np.maximum(layout.road - np.abs(offsets), 0.0))
 
 
 def add_ground(
@@ -252,7 +263,7 @@ def _add_front_garden(
     shift = rng.uniform(-0.5, 0.5) * (width - length)
     c, s = np.cos(yaw), np.sin(yaw)
     place = np.asarray(position) + np.array([c * shift - s * across, s * shift + c * across, 0])
-    part = furniture.hedge(rng, length) if kind < 0.4 else furniture.garden_wall(rng, length)
+    part = furniture.hedge(rng, length, layout.volumes) if kind < 0.4 else furniture.garden_wall(rng, length)
     builder.add_mesh(part, place, yaw)
 
 
@@ -282,7 +293,7 @@ def add_street_furniture(
             put(furniture.parked_car(rng), s, layout.road - 1.05 + rng.uniform(-0.12, 0.12), 0.0, turn)
     for s in _stations(rng, street.length, 8.0, 15.0):
         if rng.random() < layout.trees:
-            put(furniture.tree(rng), s, layout.road + 0.7, KERB)
+            put(furniture.tree(rng, layout.volumes), s, layout.road + 0.7, KERB)
     for s in _stations(rng, street.length, 14.0, 30.0) if layout.poles and not layout.identical else ():
         put(furniture.pole(rng), s, layout.road + 0.4, KERB, np.pi)
     for s in np.arange(7.0, street.length, 28.0) if layout.poles and layout.identical else ():
@@ -302,7 +313,7 @@ def add_garden_trees(
     for place in middle.repeat(count, axis=0) + rng.uniform(-35, 35, (count * len(middle), 2)):
         corners = place + 1.2 * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
         if lots.is_free(corners):
-            builder.add_mesh(furniture.tree(rng), [*place, float(terrain.height(place)) + KERB])
+            builder.add_mesh(furniture.tree(rng, layout.volumes), [*place, float(terrain.height(place)) + KERB])
 
 
 def _stations(rng: np.random.Generator, length: float, shortest: float, longest: float) -> Floats:

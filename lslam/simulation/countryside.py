@@ -24,7 +24,7 @@ OPENING = 28.0  # m of an opening
 def build_motorway(street: Curve, terrain: Terrain, layout: Layout, rng: np.random.Generator) -> City:
     """Two carriageways with guard rails, delineators, gantries and a noise barrier; beyond, trees, bushes and a few farms."""
     builder = MeshBuilder()
-    _add_strip(builder, street, terrain, [0.0, 3.0, 6.0, 9.0, layout.road, layout.band], rng)
+    add_strip(builder, street, terrain, [0.0, 3.0, 6.0, 9.0, layout.road, layout.band], rng)
     add_ground(builder, [street], terrain, layout, rng, 1.2, VERGE)
     for offset in (-layout.road - 0.6, 0.0, layout.road + 0.6):
         _add_rail(builder, street, terrain, offset)
@@ -55,7 +55,7 @@ def build_corridor(street: Curve, terrain: Terrain, layout: Layout, rng: np.rand
     Only at the openings between them, with houses, trees and lamps, is there anything that tells how far along one is.
     """
     builder = MeshBuilder()
-    _add_strip(builder, street, terrain, [0.0, 2.0, layout.road, layout.band], rng)
+    add_strip(builder, street, terrain, [0.0, 2.0, layout.road, layout.band], rng)
     add_ground(builder, [street], terrain, layout, rng, 1.2, VERGE)
     inside = layout.band - 0.3
     middles = rng.uniform(-10, 0) + np.cumsum(rng.uniform(*OPENINGS, int(street.length / OPENINGS[0]) + 1))
@@ -89,7 +89,7 @@ def _fill_opening(
     _put(builder, street, terrain, s + rng.uniform(-4, 4), side * (layout.band + 0.5), low, high, Surface.FENCE)
     for tree in (s + rng.uniform(-11, -3), s + rng.uniform(3, 11)):
         xy = street.beside(np.array([tree]), side * (layout.band + rng.uniform(2.5, 4.0)))[0]
-        builder.add_mesh(furniture.tree(rng), [*xy, float(terrain.height(xy))])
+        builder.add_mesh(furniture.tree(rng, layout.volumes), [*xy, float(terrain.height(xy))])
     width, depth = rng.uniform(*layout.house_width), rng.uniform(*layout.house_depth)
     return add_house(
         builder, street, terrain, layout, s + rng.uniform(-5, 5), side * (layout.band + 7.0), width, depth, rng
@@ -117,7 +117,7 @@ def add_house(
     return outline, float(building.vertices[:, 2].max())
 
 
-def _add_strip(
+def add_strip(
     builder: MeshBuilder, street: Curve, terrain: Terrain, half: list[float], rng: np.random.Generator
 ) -> None:
     """A road without kerbs, up to the last of `half` m on both sides."""
@@ -194,7 +194,11 @@ def _add_country(
                 xy = street.beside(
                     np.array([s + rng.uniform(-6, 6)]), side * rng.uniform(layout.band + 6, layout.band + 38)
                 )[0]
-                part = furniture.tree(rng) if rng.random() < 0.7 else furniture.hedge(rng, rng.uniform(3, 12))
+                part = (
+                    furniture.tree(rng, layout.volumes)
+                    if rng.random() < 0.7
+                    else furniture.hedge(rng, rng.uniform(3, 12), layout.volumes)
+                )
                 builder.add_mesh(part, [*xy, float(terrain.height(xy))], rng.uniform(0, np.pi))
     for s in np.arange(60.0, street.length, 150.0):
         side, width, depth = (

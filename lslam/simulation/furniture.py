@@ -10,9 +10,13 @@ from numpy.typing import NDArray
 
 from lslam.simulation.mesh import Mesh, MeshBuilder, Surface, grid_faces, tube
 
+BUSHES = 0.35  # share of the trees that are bushes, where leaves fill volumes
 
-def tree(rng: np.random.Generator) -> Mesh:
-    """A trunk and a crown of loose leaf clusters, through which some rays pass."""
+
+def tree(rng: np.random.Generator, volume: bool = False) -> Mesh:
+    """A trunk and a crown of loose leaf clusters, through which some rays pass; or one whose leaves fill a volume, or a bush."""
+    if volume:
+        return _leafy(rng)
     builder = MeshBuilder()
     trunk, radius = rng.uniform(2.0, 3.0), rng.uniform(0.1, 0.25)
     builder.add(*tube(radius, 0.7 * radius, -0.5, trunk + 1.0, 8), Surface.TRUNK)
@@ -25,6 +29,34 @@ def tree(rng: np.random.Generator) -> Mesh:
     corners = centres[:, None] + rng.normal(0, 0.16, (count, 3, 3))
     builder.add(corners.reshape(-1, 3), np.arange(3 * count).reshape(-1, 3), Surface.FOLIAGE)
     return builder.build()
+
+
+def _leafy(rng: np.random.Generator) -> Mesh:
+    builder = MeshBuilder()
+    if rng.random() < BUSHES:
+        size = np.array([1.0, rng.uniform(0.7, 1.4), rng.uniform(0.6, 1.0)]) * rng.uniform(0.6, 1.4)
+        _add_crown(builder, rng, size, 0.7 * size[2])
+        return builder.build()
+    trunk, radius = rng.uniform(1.6, 3.0), rng.uniform(0.1, 0.25)
+    size = np.array([1.0, 1.0, rng.uniform(1.0, 1.5)]) * rng.uniform(1.4, 2.8)
+    builder.add(*tube(radius, 0.5 * radius, -0.5, trunk + size[2], 8), Surface.TRUNK)
+    _add_crown(builder, rng, size, trunk + size[2])
+    return builder.build()
+
+
+def _add_crown(builder: MeshBuilder, rng: np.random.Generator, size: NDArray[np.float64], height: float) -> None:
+    """The bumpy envelope of leaves, an ellipsoid with half axes `size` (3,), m, wound outwards."""
+    rows, columns = 8, 12
+    polar, round_ = np.linspace(0, np.pi, rows), np.linspace(0, 2 * np.pi, columns + 1)
+    bumps = 1 + rng.normal(0, 0.12, (rows, columns + 1))
+    # Its poles and its seam are one place each.
+    bumps[0], bumps[-1], bumps[:, -1] = bumps[0, 0], bumps[-1, 0], bumps[:, 0]
+    flat = np.sin(polar)[:, None] * np.ones(columns + 1)
+    at = np.stack(
+        [flat * np.cos(round_), flat * np.sin(round_), np.cos(polar)[:, None] * np.ones(columns + 1)], axis=-1
+    )
+    vertices = at * bumps[..., None] * size + [0, 0, height]
+    builder.add(vertices.reshape(-1, 3), grid_faces(rows, columns + 1), Surface.CROWN)
 
 
 def pole(rng: np.random.Generator) -> Mesh:
@@ -42,8 +74,8 @@ def pole(rng: np.random.Generator) -> Mesh:
     return builder.build()
 
 
-def hedge(rng: np.random.Generator, length: float) -> Mesh:
-    """A hedge of `length` m with a bumpy surface."""
+def hedge(rng: np.random.Generator, length: float, volume: bool = False) -> Mesh:
+    """A hedge of `length` m with a bumpy surface, which is shut, or behind which leaves fill a volume."""
     height, width = rng.uniform(0.8, 1.7), rng.uniform(0.5, 0.9)
     rows, columns = 7, max(int(length / 0.3), 2)
     outline = np.array([[-0.5, -0.3], [-0.5, 0.5], [-0.5, 0.95], [0, 1.0], [0.5, 0.95], [0.5, 0.5], [0.5, -0.3]]) * [
@@ -56,9 +88,11 @@ def hedge(rng: np.random.Generator, length: float) -> Mesh:
     vertices[..., 1:] = outline[:, None]
     vertices += rng.normal(0, 0.05, vertices.shape)
     builder = MeshBuilder()
-    builder.add(vertices.reshape(-1, 3), grid_faces(rows, columns), Surface.FOLIAGE)
-    for end in (vertices[:, 0], vertices[:, -1]):
-        builder.add(end, np.array([[0, i, i + 1] for i in range(1, rows - 1)]), Surface.FOLIAGE)
+    leaves = Surface.HEDGE if volume else Surface.FOLIAGE
+    # Wound outwards where it counts: the side as a volume needs it, the first end as it is.
+    builder.add(vertices.reshape(-1, 3), grid_faces(rows, columns)[:, :: -1 if volume else 1], leaves)
+    for end, turn in ((vertices[:, 0], 1), (vertices[:, -1], -1 if volume else 1)):
+        builder.add(end, np.array([[0, i, i + 1] for i in range(1, rows - 1)])[:, ::turn], leaves)
     return builder.build()
 
 

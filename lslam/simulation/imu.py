@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
+from lslam.config.section import Section
 from lslam.errors import UsageError, nearest
 from lslam.geometry import se3, so3
 from lslam.simulation.motion import Kinematics, Motion
@@ -41,12 +43,37 @@ class Triad:
 
 @dataclass(frozen=True)
 class ImuModel:
-    """A kind of IMU; the default has no errors."""
+    """A kind of IMU; the default has no errors.
+
+    jitter : standard deviation of what stamps say over when a reading was taken, s; within 0.45 of a period
+    """
 
     name: str
     accel: Triad = field(default_factory=Triad)
     gyro: Triad = field(default_factory=Triad)
     rate_hz: float = 100.0
+    jitter: float = 0.0
+
+
+class ImuFaults(Section):
+    """What ails any IMU that rides along.
+
+    jitter_ms : standard deviation of its stamps; accel_limit, gyro_limit_deg : beyond which it saturates, m/s2 and deg/s;
+        what it measures itself when absent
+    """
+
+    jitter_ms: float = Field(0.0, ge=0, le=100)
+    accel_limit: float | None = Field(None, gt=0)
+    gyro_limit_deg: float | None = Field(None, gt=0)
+
+    def of(self, model: ImuModel) -> ImuModel:
+        """`model` with these faults; limits are never wider than its own."""
+        accel, gyro = model.accel, model.gyro
+        if self.accel_limit is not None:
+            accel = replace(accel, limit=min(accel.limit, self.accel_limit))
+        if self.gyro_limit_deg is not None:
+            gyro = replace(gyro, limit=min(gyro.limit, float(np.radians(self.gyro_limit_deg))))
+        return replace(model, accel=accel, gyro=gyro, jitter=max(model.jitter, self.jitter_ms * 1e-3))
 
 
 @dataclass(frozen=True)
@@ -103,6 +130,10 @@ def simulate_imu(
     noise = rng.standard_normal((count, 4, 3))
     accel, accel_bias = measure(model.accel, specific_force(truth), noise[:, :2], model.rate_hz)
     gyro, gyro_bias = measure(model.gyro, truth.rate, noise[:, 2:], model.rate_hz)
+    if model.jitter > 0:
+        # Drawn last, so that readings are those of an IMU without it; the first stamp stays, where the recording begins.
+        late = np.clip(rng.standard_normal(count) * model.jitter, -0.45 / model.rate_hz, 0.45 / model.rate_hz)
+        stamps = stamps + np.round(1e9 * np.append(0.0, late[1:])).astype(np.int64)
     return SimulatedImu(ImuStream(stamps, accel, gyro), accel_bias, gyro_bias, truth, np.asarray(T_lidar_imu))
 
 

@@ -9,8 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.simulation.foliage import penetrate
 from lslam.simulation.lidar_models import LidarModel
 from lslam.simulation.mesh import Mesh, Surface
+from lslam.simulation.rays import Hits, Rays
+from lslam.simulation.returns import Errors, Returns, errors, mirrored, range_walk, reflect
 from lslam.types.scan import Scan
 
 # Share of the light of a 905 nm laser that comes back from each surface met squarely.
@@ -28,6 +31,8 @@ for _surface, _share in {
     Surface.CAR: 0.35,
     Surface.FENCE: 0.35,
     Surface.PERSON: 0.35,
+    Surface.CROWN: 0.45,
+    Surface.HEDGE: 0.45,
 }.items():
     REFLECTIVITY[_surface] = _share
 # Light that a rough surface, its facets tilted by 0.6 rad, sends back where it came from: A cos + B sin^2 of the incidence
@@ -94,27 +99,6 @@ class MovingMesh:
     centre: NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class _Rays:
-    """Rays in the city: origins and unit directions (N, 3), and when each is fired (N,), s."""
-
-    origins: NDArray[np.float32]
-    directions: NDArray[np.float32]
-    fired: NDArray[np.float64]
-
-    def __getitem__(self, which: NDArray[np.intp]) -> _Rays:
-        return _Rays(self.origins[which], self.directions[which], self.fired[which])
-
-
-@dataclass(frozen=True)
-class _Hits:
-    """What rays meet first: distance (N,), m, inf for nothing; cosine of incidence (N,); surface (N,)."""
-
-    distance: NDArray[np.float32]
-    cosine: NDArray[np.float32]
-    surface: NDArray[np.uint8]
-
-
 def trace(
     scene: RayScene,
     model: LidarModel,
@@ -126,6 +110,8 @@ def trace(
     bodies: Sequence[MovingMesh] = (),
     glass: float = 0.0,
     roof: Roof | None = None,
+    returns: Returns | None = None,
+    compensated: bool | None = None,
 ) -> Scan:
     """One scan of `model`.
 
@@ -137,24 +123,33 @@ def trace(
     bodies : what moves, each ray meets it where it is when that ray is fired (at `stamp_ns` in a compensated scan)
     glass : share of the rays on a pane that pass it and go on to what is behind
     roof : of the vehicle that carries the LiDAR, which is in the way of the ground
+    returns : what real surfaces and beams add; None for clean, sharp ones
+    compensated : whether all rays are fired at `stamp_ns`, whatever the poses; None: when there is one pose
 
     Returns
     -------
     The points that came back, with intensity 0..1 in steps of 0.01, rings and, for distorted scans, times.
     """
+    # A stream of its own: without these effects every scan stays as it is.
+    extra = rng.spawn(1)[0] if returns is not None else rng
     directions, true = _directions(model, rng, index, period)
     poses = np.asarray(T_city_lidar, np.float64)
-    moving = poses.ndim == 3
+    moving = poses.ndim == 3 if compensated is None else not compensated
     column, ring = np.divmod(np.arange(model.rays), model.rings)
     since = column * (period / model.columns) + model.firing[ring] if moving else np.zeros(model.rays)
     rays = _into_city(model, true, poses, period, stamp_ns / 1e9 + since)
-    hits = _meet(scene, rays, bodies, model.rings, stamp_ns / 1e9)
-    if glass > 0:
-        _pass_glass(scene, rays, bodies, hits, rng.random(model.rays) < glass, stamp_ns / 1e9)
+    meeting = _Meeting(scene, bodies, stamp_ns / 1e9, None if returns is None else returns.extinction, extra)
+    hits = meeting.meet(rays, model.rings)
+    lucky = rng.random(model.rays) < glass if glass > 0 else None
+    if returns is not None and returns.mirror > 0:
+        _mirror(meeting, rays, hits, returns, lucky)
+    if lucky is not None:
+        _pass_glass(meeting, rays, hits, lucky)
     heights = model.heights.astype(np.float32)[ring]
     if roof is not None:
         _meet_roof(roof, true, heights, hits)
-    seen, distance, intensity = _detect(model, hits, rng)
+    wrong = None if returns is None else errors(returns, model, rays, hits, extra)
+    seen, distance, intensity = _detect(model, hits, rng, returns, wrong)
     kept = model.sequence[seen[model.sequence]]
     points = directions[kept] * distance[kept, None]
     points[:, 2] += heights[kept]
@@ -162,17 +157,30 @@ def trace(
     return Scan(points, stamp_ns, index, intensity[kept], times, ring[kept].astype(np.uint16))
 
 
-def _meet(scene: RayScene, rays: _Rays, bodies: Sequence[MovingMesh], rings: int, stamp: float) -> _Hits:
-    """First hits on what stands and what moves; the rays come in columns of `rings`."""
-    distance, face = scene.cast(rays.origins, rays.directions)
-    cosine = np.abs(np.einsum("ij,ij->i", scene.mesh.normals[face], rays.directions))
-    hits = _Hits(distance, cosine, scene.mesh.surfaces[face])
-    if bodies and len(distance):
-        _meet_bodies(bodies, rays, rings, hits, stamp)
-    return hits
+@dataclass(frozen=True)
+class _Meeting:
+    """Whom the rays of a scan may meet: what stands, what moves about `stamp`, s, and leaves, of some `extinction`."""
+
+    scene: RayScene
+    bodies: Sequence[MovingMesh]
+    stamp: float
+    extinction: NDArray[np.float32] | None
+    rng: np.random.Generator
+
+    def meet(self, rays: Rays, rings: int = 1) -> Hits:
+        """First hits on what stands and what moves; the rays come in columns of `rings`."""
+        mesh = self.scene.mesh
+        distance, face = self.scene.cast(rays.origins, rays.directions)
+        cosine = np.abs(np.einsum("ij,ij->i", mesh.normals[face], rays.directions))
+        hits = Hits(distance, cosine, mesh.surfaces[face], face)
+        if self.extinction is not None:
+            penetrate(self.scene.cast, mesh, rays, hits, self.extinction, self.rng)
+        if self.bodies and len(distance):
+            _meet_bodies(self.bodies, rays, rings, hits, self.stamp)
+        return hits
 
 
-def _meet_bodies(bodies: Sequence[MovingMesh], rays: _Rays, rings: int, hits: _Hits, stamp: float) -> None:
+def _meet_bodies(bodies: Sequence[MovingMesh], rays: Rays, rings: int, hits: Hits, stamp: float) -> None:
     """Put hits on what moves into `hits` where they are nearer; `stamp`, s, is that of the bodies' centres."""
     # Bearings of whole columns first: a body is met by few of them.
     bearing = np.arctan2(rays.directions[:, 1], rays.directions[:, 0]).reshape(-1, rings)
@@ -199,7 +207,7 @@ def _meet_bodies(bodies: Sequence[MovingMesh], rays: _Rays, rings: int, hits: _H
             _meet_body(body, near, rays[near], hits, stamp)
 
 
-def _meet_body(body: MovingMesh, which: NDArray[np.intp], rays: _Rays, hits: _Hits, stamp: float) -> None:
+def _meet_body(body: MovingMesh, which: NDArray[np.intp], rays: Rays, hits: Hits, stamp: float) -> None:
     """The rays `which` against the body where it is when each of them is fired."""
     # Between instants of a few milliseconds it moves on evenly, to micrometres; they do not hang on which rays are tried.
     share = (rays.fired - stamp) / BODY_STEP
@@ -216,15 +224,17 @@ def _meet_body(body: MovingMesh, which: NDArray[np.intp], rays: _Rays, hits: _Hi
     hits.distance[met] = far[nearer]
     hits.cosine[met] = np.abs(np.einsum("ij,ij->i", body.scene.mesh.normals[face], local[nearer]))
     hits.surface[met] = body.scene.mesh.surfaces[face]
+    hits.face[met] = -1
 
 
-def _meet_roof(roof: Roof, directions: NDArray[np.float32], heights: NDArray[np.float32], hits: _Hits) -> None:
+def _meet_roof(roof: Roof, directions: NDArray[np.float32], heights: NDArray[np.float32], hits: Hits) -> None:
     """Put hits on the own roof into `hits`, or nothing where it does not show; rays in the LiDAR's frame."""
     reach = roof.reach(directions, heights)
     met = np.flatnonzero(np.isfinite(reach))
     hits.distance[met] = reach[met] if roof.returns else np.inf
     hits.cosine[met] = -directions[met, 2]
     hits.surface[met] = Surface.CAR
+    hits.face[met] = -1
 
 
 def _turned(angle: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -232,18 +242,31 @@ def _turned(angle: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.asarray(angle - np.float32(2 * np.pi) * np.round(angle / np.float32(2 * np.pi)), np.float32)
 
 
-def _pass_glass(
-    scene: RayScene, rays: _Rays, bodies: Sequence[MovingMesh], hits: _Hits, lucky: NDArray[np.bool_], stamp: float
-) -> None:
+def _pass_glass(meeting: _Meeting, rays: Rays, hits: Hits, lucky: NDArray[np.bool_]) -> None:
     """The `lucky` rays on glass go on to what stands or moves behind it; a second pane stops them."""
     through = np.flatnonzero(lucky & (hits.surface == Surface.GLASS) & np.isfinite(hits.distance))
     start = hits.distance[through] + np.float32(0.01)
-    beyond = rays[through]
-    beyond = _Rays(beyond.origins + start[:, None] * beyond.directions, beyond.directions, beyond.fired)
-    onward = _meet(scene, beyond, bodies, 1, stamp)
-    hits.distance[through] = start + onward.distance
-    hits.cosine[through] = onward.cosine
-    hits.surface[through] = onward.surface
+    _go_on(hits, through, start, meeting.meet(rays[through].after(start)))
+
+
+def _mirror(meeting: _Meeting, rays: Rays, hits: Hits, returns: Returns, lucky: NDArray[np.bool_] | None) -> None:
+    """Some rays on panes go on as in a mirror, and what they meet seems to lie behind the pane; none of those passes it too."""
+    normals = meeting.scene.mesh.normals
+    off = mirrored(returns, hits, normals, meeting.rng)
+    # A centimetre before the pane, so that it is not met again.
+    start = hits.distance[off] - np.float32(0.01)
+    met = meeting.meet(reflect(rays[off], start, normals[hits.face[off]]))
+    if lucky is not None:
+        lucky[off] = False
+    _go_on(hits, off, start, met)
+
+
+def _go_on(hits: Hits, which: NDArray[np.intp], start: NDArray[np.float32], onward: Hits) -> None:
+    """Rays `which` that went on at `start`, m, meet `onward`."""
+    hits.distance[which] = start + onward.distance
+    hits.cosine[which] = onward.cosine
+    hits.surface[which] = onward.surface
+    hits.face[which] = onward.face
 
 
 def _directions(
@@ -272,7 +295,7 @@ def _into_city(
     poses: NDArray[np.float64],
     period: float,
     fired: NDArray[np.float64],
-) -> _Rays:
+) -> Rays:
     """Rays of the LiDAR's frame (N, 3), fired from one pose (4, 4) or from a pose (columns, 4, 4) for every column."""
     by_column = directions.reshape(model.columns, model.rings, 3)
     lift = np.outer(model.heights, [0, 0, 1]).astype(np.float32)
@@ -286,7 +309,7 @@ def _into_city(
         origins = origins + share * step_t[:, None]
         towards = towards + share * (by_column @ np.swapaxes(step_R, -1, -2))
     spread = np.broadcast_to(origins, by_column.shape)
-    return _Rays(spread.reshape(-1, 3), towards.reshape(-1, 3), fired)
+    return Rays(spread.reshape(-1, 3), towards.reshape(-1, 3), fired)
 
 
 def _on(steps: NDArray[np.float64]) -> NDArray[np.float32]:
@@ -295,7 +318,7 @@ def _on(steps: NDArray[np.float64]) -> NDArray[np.float32]:
 
 
 def _detect(
-    model: LidarModel, hits: _Hits, rng: np.random.Generator
+    model: LidarModel, hits: Hits, rng: np.random.Generator, returns: Returns | None, wrong: Errors | None
 ) -> tuple[NDArray[np.bool_], NDArray[np.float32], NDArray[np.float32]]:
     """Which rays return, their measured ranges and intensities.
 
@@ -309,6 +332,9 @@ def _detect(
     seen = (distance >= model.range_min) & (distance <= model.range_max)
     r = np.where(seen, distance, np.float32(1))
     colour = REFLECTIVITY[hits.surface] * hits.cosine
+    if returns is not None and wrong is not None:
+        colour = colour * wrong.gain
+        off = off + wrong.late + (range_walk(returns, colour) if returns.walk else 0)
     echo = colour / np.float32(0.1) * (np.float32(model.range_10pct) / r) ** 2
     # Half of the echoes of a quarter of the reference strength are lost.
     seen &= chance < (1 - model.dropout) * echo**2 / (echo**2 + np.float32(0.0625))

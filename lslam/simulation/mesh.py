@@ -28,6 +28,8 @@ class Surface(IntEnum):
     CAR = 9
     FENCE = 10
     PERSON = 11
+    CROWN = 12  # of leaves that fill a volume; so is a hedge
+    HEDGE = 13
 
 
 @dataclass(frozen=True)

@@ -25,6 +25,7 @@ from lslam.simulation.scenario_files import Scenario
 from lslam.simulation.terrain import Terrain, rolling
 from lslam.simulation.town import build_town
 from lslam.simulation.waypoints import WayPoints
+from lslam.simulation.woods import build_woods
 
 Floats = NDArray[np.float64]
 
@@ -107,6 +108,8 @@ def _city(scenario: Scenario, street: Curve, terrain: Terrain, rng: np.random.Ge
         return build_motorway(stretched(street, SPARE), terrain, scenario.layout, rng)
     if world.kind == "corridor":
         return build_corridor(stretched(street, CORRIDOR_SPARE), terrain, scenario.layout, rng)
+    if world.kind == "woods":
+        return build_woods(stretched(street, SPARE), terrain, scenario.layout, rng)
     if world.kind == "carpark":
         return build_carpark(street, terrain, scenario.layout, world.roughness, rng)
     return build_town([stretched(street, SPARE)], terrain, scenario.layout, rng, world.spacing, world.levels)

@@ -36,6 +36,8 @@ for _surface, _colour in {
     Surface.CAR: (50, 76, 150),
     Surface.FENCE: (90, 80, 70),
     Surface.PERSON: (200, 0, 160),
+    Surface.CROWN: (88, 136, 70),
+    Surface.HEDGE: (88, 136, 70),
 }.items():
     COLOURS[_surface] = _colour
 

@@ -14,8 +14,11 @@ from pydantic import BaseModel, Field, ValidationError, model_validator
 from lslam.config.section import Section
 from lslam.errors import ConfigError, InputError, UsageError, cause, nearest
 from lslam.simulation.city import Layout
+from lslam.simulation.imu import ImuFaults
 from lslam.simulation.lidar_models import LIDARS
+from lslam.simulation.returns import Returns
 from lslam.simulation.shapes import SHAPES
+from lslam.simulation.vibration import Vibration
 
 FOLDER = "ready"
 # `block` and `street` draw their lines from the seed, `out-and-back` is as long as speed and scans need; the other shapes are
@@ -51,7 +54,7 @@ class WorldSection(Section):
     roughness : standard deviation of the surface itself, m, of a car park
     """
 
-    kind: Literal["street", "town", "motorway", "corridor", "carpark"] = "town"
+    kind: Literal["street", "town", "motorway", "corridor", "carpark", "woods"] = "town"
     spacing: float = Field(80.0, ge=30, le=1000)
     levels: int = Field(1, ge=0, le=3)
     relief: float = Field(0.35, ge=0, le=20)
@@ -106,6 +109,14 @@ class Scenario(Section):
     world: WorldSection = WorldSection()
     layout: Layout = Layout()
     traffic: TrafficSection = TrafficSection()
+    returns: Returns = Returns()
+    vibration: Vibration = Vibration()
+    imu: ImuFaults = ImuFaults()
+
+    @property
+    def real_returns(self) -> Returns | None:
+        """What surfaces and beams do to returns; None for clean, sharp ones."""
+        return self.returns if self.returns.is_on or self.layout.volumes else None
 
     @model_validator(mode="after")
     def _names_are_known(self) -> Scenario:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +23,7 @@ from lslam.simulation.osm_place import read_extract
 from lslam.simulation.places import build_place, populate
 from lslam.simulation.scenario_files import Scenario, scenario_named
 from lslam.simulation.sensors import Sensors, read_sensors
+from lslam.simulation.vibration import shaking
 from lslam.simulation.waypoints import WayPoints, read_way_points
 from lslam.types.calibration import Calibration
 from lslam.types.gnss import GnssStream
@@ -32,6 +34,7 @@ from lslam.types.trajectory import Trajectory
 FASTEST = 40.0  # m/s
 LONGEST_STAND = 600.0  # s
 SPARE_REACH = 10.0  # m that anything may get nearer while a scan is taken
+_SHAKING_SEED = 2**32 - 13  # of the generator of the LiDAR's vibration
 
 
 class SimulatedDrive:
@@ -84,6 +87,7 @@ class SimulatedDrive:
         self.gnss: GnssStream | None = None if gnss is None else gnss.stream
         self.notes: list[str] = []
         self.problems: list[str] = []
+        self._shaking = shaking(scenario.vibration, np.random.default_rng([seed, _SHAKING_SEED]))
         self._roof = None if scenario.roof is None else Roof(*scenario.roof, scenario.roof_returns)
         self.scene = RayScene(city.mesh) if scene is None else scene
 
@@ -104,14 +108,17 @@ class SimulatedDrive:
             raise IndexError(f"scan {index} of {len(self)}")
         start, period = self.stamps_ns[index] / 1e9, 1 / self.rate_hz
         poses = self.vehicle.poses(np.array([start]))[0]
+        fired = start + np.arange(self.lidar.columns) * (period / self.lidar.columns)
         if not self.motion_compensated:
-            poses = self.vehicle.poses(start + np.arange(self.lidar.columns) * (period / self.lidar.columns))
+            poses = self.vehicle.poses(fired)
+        if self._shaking is not None:
+            poses = self._shaking.shaken(poses, fired)
         rng = np.random.default_rng([self.seed, index])
         here = poses if poses.ndim == 2 else poses[len(poses) // 2]
         bodies = moving_meshes(self.movers, here[:3, 3], start, self.lidar.range_max + SPARE_REACH)
         return trace(
             self.scene, self.lidar, poses, rng, index, int(self.stamps_ns[index]), period,
-            bodies, self.scenario.world.glass, self._roof,
+            bodies, self.scenario.world.glass, self._roof, self.scenario.real_returns, self.motion_compensated,
         )  # fmt: skip
 
 
@@ -168,7 +175,13 @@ def simulate(
     _check(seed, count, cruise, begin)
     if not 0 <= static_start <= LONGEST_STAND:
         raise UsageError(f"--static-start {static_start:g} is out of range: 0 to {LONGEST_STAND:g} s")
-    sensors = Sensors(imu_named(imu) if isinstance(imu, str) else imu, gnss)
+    model = replace(
+        model,
+        ring_bias=chosen.returns.calibration * model.ring_bias,
+        ring_tilt_deg=chosen.returns.calibration * model.ring_tilt_deg,
+    )
+    measuring = imu_named(imu) if isinstance(imu, str) else imu
+    sensors = Sensors(None if measuring is None else chosen.imu.of(measuring), gnss)
     chosen = chosen.model_copy(update={"speed": cruise, "start_speed": begin})
     given = None if origin is None else checked_origin(origin)
     extract = None if osm is None else read_extract(osm, given)

@@ -16,6 +16,7 @@ from lslam.simulation.city import (
     add_ground,
     add_row,
     add_street_furniture,
+    crown_of_road,
 )
 from lslam.simulation.curve import Curve, smooth_curve
 from lslam.simulation.mesh import MeshBuilder, Surface, grid_faces
@@ -175,6 +176,8 @@ def add_road(
     if street.closed:
         rough[:, -1] = rough[:, 0]
     z = terrain.height(xy) + KERB * raised + rough
+    if layout.camber:
+        z += crown_of_road(offsets, layout)[:, None]
     faces = grid_faces(len(offsets), len(s))
     kinds = np.where(raised.ravel()[faces].any(axis=1), Surface.PAVEMENT, Surface.ROAD).astype(np.uint8)
     builder.add(np.concatenate([xy, z[..., None]], -1).reshape(-1, 3), faces, kinds)

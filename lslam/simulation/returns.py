@@ -1,0 +1,177 @@
+"""What real surfaces and real optics do to a return: grass, texture, a beam with a width, mixed pixels, biases, losses.
+
+Everything here acts on arrays of one scan, after the rays are cast. A beam of divergence g (full angle at 1/e2 of the middle's
+light) lights a spot whose standard deviation at r is r g / 4.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from lslam.config.section import Section
+from lslam.simulation.lidar_models import LidarModel
+from lslam.simulation.mesh import Surface
+from lslam.simulation.rays import Hits, Rays
+
+Array = NDArray[np.float32]
+
+CELL = 0.15  # m of one bump of a surface's texture
+FLATTEST = 0.1  # cosine of incidence: what is met still flatter errs no more than there
+REFERENCE = 0.4  # share of light that comes back at which a LiDAR's ranges are calibrated
+SLANT = 2.0  # times the step of a slanted surface between two rays: more is an edge
+_TABLE = 1 << 16
+_TEXTURED = {
+    "ground": (Surface.ROAD, Surface.PAVEMENT, Surface.LAWN),
+    "walls": (Surface.WALL, Surface.ROOF, Surface.FENCE, Surface.TRUNK),
+}
+
+
+class Returns(Section):
+    """How returns differ from those of clean, sharp surfaces; everything is off by default.
+
+    crown_extinction, hedge_extinction : of beams in leaves, 1/m, where `layout.volumes` makes crowns and hedges volumes: half
+        the leaf area in a cubic metre (Beer and Lambert's law with leaves facing every way, Ross 1981)
+    grass : standard deviation of the half-normal heights at which a lawn returns beams, m
+    ground_texture, wall_texture : standard deviation of the surface itself, the same on every visit, m
+    divergence_mrad : width of the beam, which errs on slanted surfaces and straddles edges; HDL-64E about 2, VLP-16 about 3
+    pulse : m along the beam within which two echoes merge into one between them, half the length of the pulse (Adams and
+        Probert 1996, Tuley et al. 2005): mixed pixels; HDL-64E 0.75
+    incidence_bias : m by which a beam at 60 deg to the normal is measured too long, growing as 1/cos - 1 (Laconte et al. 2019)
+    walk : m by which half as bright a surface is measured too long, the range walk of a fixed threshold (Amann et al. 2001)
+    mirror : share of the light that a pane mirrors when met squarely, more when met flat (Schlick 1994)
+    paint : exponent of the cosine by which car bodies and panes, which shine, return less than diffuse surfaces do
+    attenuation : of light in the air, 1/m, there and back: 3.9 over the visibility (Koschmieder 1924)
+    calibration : times the errors that each laser's calibration left, `ring_bias` and `ring_tilt_deg` of the LiDAR
+    """
+
+    crown_extinction: float = Field(1.2, gt=0, le=50)
+    hedge_extinction: float = Field(5.0, gt=0, le=50)
+    grass: float = Field(0.0, ge=0, le=1)
+    ground_texture: float = Field(0.0, ge=0, le=0.2)
+    wall_texture: float = Field(0.0, ge=0, le=0.2)
+    divergence_mrad: float = Field(0.0, ge=0, le=20)
+    pulse: float = Field(0.0, ge=0, le=5)
+    incidence_bias: float = Field(0.0, ge=-0.5, le=0.5)
+    walk: float = Field(0.0, ge=-0.2, le=0.2)
+    mirror: float = Field(0.0, ge=0, le=1)
+    paint: float = Field(0.0, ge=0, le=50)
+    attenuation: float = Field(0.0, ge=0, le=0.1)
+    calibration: float = Field(1.0, ge=0, le=20)
+
+    @property
+    def is_on(self) -> bool:
+        """Whether anything differs from clean surfaces and sharp beams."""
+        return self != Returns()
+
+    @property
+    def extinction(self) -> Array:
+        """(surfaces,) of beams behind each surface, 1/m; 0 where nothing goes on."""
+        table = np.zeros(len(Surface), np.float32)
+        table[Surface.CROWN], table[Surface.HEDGE] = self.crown_extinction, self.hedge_extinction
+        return table
+
+
+@dataclass(frozen=True)
+class Errors:
+    """What happens to the echoes of N rays: m by which each is measured too long, and the share of its light left."""
+
+    late: Array
+    gain: Array
+
+
+def errors(returns: Returns, model: LidarModel, rays: Rays, hits: Hits, rng: np.random.Generator) -> Errors:
+    """Errors of what `rays` of one scan, column after column, meet."""
+    cosine: Array = np.clip(hits.cosine, np.float32(FLATTEST), np.float32(1)).astype(np.float32)
+    distance: Array = np.where(np.isfinite(hits.distance), hits.distance, 0).astype(np.float32)
+    slant: Array = (np.sqrt(1 - cosine**2) / cosine).astype(np.float32)
+    late = np.zeros_like(distance)
+    if returns.divergence_mrad > 0:
+        spot = np.float32(returns.divergence_mrad * 1e-3 / 4) * distance
+        late += rng.standard_normal(len(late), np.float32) * spot * slant
+    if returns.incidence_bias:
+        late += (returns.incidence_bias * (1 / cosine - 1)).astype(np.float32)
+    if returns.grass > 0:
+        lawn = np.flatnonzero(hits.surface == Surface.LAWN)
+        blades = np.abs(rng.standard_normal(len(lawn), np.float32)) * np.float32(returns.grass)
+        late[lawn] -= np.minimum(blades / cosine[lawn], distance[lawn] / 2)
+    for deviation, surfaces in zip((returns.ground_texture, returns.wall_texture), _TEXTURED.values(), strict=True):
+        if deviation > 0:
+            has_texture = np.zeros(len(Surface), np.bool_)
+            has_texture[list(surfaces)] = True
+            met = np.flatnonzero(has_texture[hits.surface] & (distance > 0))
+            place = (rays.origins[met] + distance[met, None] * rays.directions[met]).astype(np.float32)
+            late[met] += np.float32(deviation) * texture(place) / cosine[met]
+    if returns.divergence_mrad > 0 and returns.pulse > 0:
+        late += mixed(returns, model, hits.distance, slant, rng)
+    return Errors(late, _gain(returns, hits, distance))
+
+
+def range_walk(returns: Returns, brightness: Array) -> Array:
+    """(N,) m by which surfaces of some `brightness` (N,), the share of light they return, are measured too long."""
+    dimmer = np.log2(np.float32(REFERENCE) / np.clip(brightness, np.float32(0.02), np.float32(1)))
+    return np.asarray(np.float32(returns.walk) * dimmer, np.float32)
+
+
+def texture(places: Array) -> Array:
+    """(N,) standard normal bumps at (N, 3) places, m: one of every cell of `CELL` m, the same whenever it is seen."""
+    cell = np.floor(places / np.float32(CELL)).astype(np.int32)
+    # Teschner et al. 2003, a hash of cells in space; int32 wraps.
+    mix = cell[:, 0] * np.int32(73856093) ^ cell[:, 1] * np.int32(19349663) ^ cell[:, 2] * np.int32(83492791)
+    return np.asarray(_bumps()[(mix ^ (mix >> 15)) & (_TABLE - 1)])
+
+
+@cache
+def _bumps() -> Array:
+    return np.random.default_rng(_TABLE).standard_normal(_TABLE, np.float32)
+
+
+def mixed(returns: Returns, model: LidarModel, distance: Array, slant: Array, rng: np.random.Generator) -> Array:
+    """(N,) m by which beams that straddle an edge are measured too long.
+
+    An edge somewhere between two columns is within the spot of one of the two rays beside it with the probability of the
+    spot's width over the columns' spacing. Most of that ray's light, half at least, is on its own side, and the one echo of
+    both surfaces lies between them by the shares of light.
+    """
+    spacing = 2 * np.pi / model.columns
+    chance = np.float32(min(returns.divergence_mrad * 1e-3 / spacing, 1.0) / 2)
+    by_column = distance.reshape(model.columns, model.rings)
+    draw = rng.random(by_column.shape, np.float32)
+    share = rng.random(by_column.shape, np.float32) / 2
+    out = np.zeros_like(by_column)
+    edge = np.float32(0.05) + np.float32(SLANT * spacing) * (by_column * slant.reshape(by_column.shape))
+    for shift, low in ((1, 0.0), (-1, 0.5)):
+        # Each side has its half of the draws.
+        with np.errstate(invalid="ignore"):
+            gap = np.roll(by_column, shift, axis=0) - by_column
+        met = (draw >= low) & (draw < low + chance) & (np.abs(gap) > edge) & (np.abs(gap) < np.float32(returns.pulse))
+        out[met] = share[met] * gap[met]
+    return out.ravel()
+
+
+def mirrored(returns: Returns, hits: Hits, normals: Array, rng: np.random.Generator) -> NDArray[np.intp]:
+    """Which rays a pane of the static scene mirrors; `normals` (F, 3) of its faces."""
+    panes = np.flatnonzero((hits.surface == Surface.GLASS) & np.isfinite(hits.distance) & (hits.face >= 0))
+    share = returns.mirror + (1 - returns.mirror) * (1 - hits.cosine[panes]) ** 5
+    lucky = rng.random(len(panes), np.float32) < share
+    met = np.linalg.norm(normals[hits.face[panes]], axis=1) > 0
+    return np.asarray(panes[lucky & met])
+
+
+def reflect(rays: Rays, distance: Array, normals: Array) -> Rays:
+    """Rays (N,) that go on from `distance` (N,), m, mirrored by faces with `normals` (N, 3)."""
+    along = np.einsum("ij,ij->i", rays.directions, normals)
+    directions = rays.directions - 2 * along[:, None] * normals
+    return Rays(rays.origins + distance[:, None] * rays.directions, directions, rays.fired)
+
+
+def _gain(returns: Returns, hits: Hits, distance: Array) -> Array:
+    gain = np.exp(np.float32(-2 * returns.attenuation) * distance)
+    if returns.paint > 0:
+        shiny = np.flatnonzero((hits.surface == Surface.CAR) | (hits.surface == Surface.GLASS))
+        gain[shiny] *= hits.cosine[shiny] ** np.float32(returns.paint)
+    return np.asarray(gain, np.float32)

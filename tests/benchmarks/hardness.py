@@ -1,0 +1,144 @@
+"""Is a simulated drive as hard as a recorded one? Map entropy, plane thickness, inliers of `icp`, rotation of three methods.
+
+    python tests/benchmarks/hardness.py [--scenarios urban,urban-hard] [--seeds 100,101,102] [--scans 154] [--set key=value]
+    python tests/benchmarks/hardness.py --recordings FOLDER      KITTI's drive 0005 as well, and ratios to it
+
+The map is that of `icp`'s own poses, points 2 to 80 m away averaged over voxels of `--voxel` m; entropy and plane thickness
+(the root of the mean plane variance) are those of Razlaw et al. 2015 over neighbourhoods of 0.5 m. The inliers are the mean
+share of a scan's source points within the final kernel. Rotation RPE: every scan with the first one at least 10 m further
+on, rmse. Scans/s is two threads tracing, as `lslam simulate` does. Scans are motion-compensated, as KITTI's synchronised
+drives are; drive 0005's reference is itself a registration that lags in bends, a simulation's truth is exact.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Iterable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from accuracy import rotation_rpe
+from numpy.typing import NDArray
+from peers import drive
+
+from lslam import Registration
+from lslam.config import Config
+from lslam.formats.trajectory_files import read_trajectory
+from lslam.geometry import se3
+from lslam.maps.crispness import crispness
+from lslam.maps.merge import MapMerger
+from lslam.odometry import create_odometry
+from lslam.readers import open_sequence
+from lslam.simulation.scenarios import simulate
+
+Floats = NDArray[np.float64]
+Scans = list[NDArray[np.float32]]
+
+METHODS = ("icp", "kiss-icp", "small-gicp")
+
+
+@dataclass(frozen=True)
+class Hardness:
+    """The figures of one clip: entropy, nats; thickness, m; inliers, a share; rotation of each method, deg; scans/s."""
+
+    entropy: float
+    thickness: float
+    inliers: float
+    rotation: tuple[float, ...]
+    traced: float = float("nan")
+
+    @property
+    def values(self) -> Floats:
+        return np.array([self.entropy, self.thickness, self.inliers, *self.rotation])
+
+    @property
+    def order(self) -> str:
+        return " < ".join(METHODS[i] for i in np.argsort(self.rotation))
+
+
+def measure(scans: Scans, truth: Floats, voxel: float, traced: float = float("nan")) -> Hardness:
+    create_odometry(Config()).warm_up()
+    registration = Registration()
+    results = [registration.register(points) for points in scans]
+    poses = np.stack([result.T_world_lidar for result in results])
+    merger = MapMerger(voxel)
+    for points, pose in zip(scans, poses, strict=True):
+        merger.add(points, pose)
+    score = crispness(merger.result())
+    assert score.entropy is not None
+    assert score.plane_variance is not None
+    inliers = float(np.mean([result.agreement for result in results[1:]]))
+    rotation = [rotation_rpe(poses, truth)]
+    rotation += [rotation_rpe(drive(method, scans)[0], truth) for method in METHODS[1:]]
+    return Hardness(score.entropy, float(np.sqrt(score.plane_variance)), inliers, tuple(rotation), traced)
+
+
+def recorded(folder: Path, count: int) -> tuple[Scans, Floats]:
+    path = folder / "2011_09_26" / "2011_09_26_drive_0005_sync"
+    sequence = open_sequence(path)
+    count = min(count, len(sequence))
+    truth = read_trajectory(path / "reference_lidar.tum").poses[:count]
+    return [sequence.scan(i).points for i in range(count)], se3.relative(truth[0], truth)
+
+
+def simulated(scenario: str, seed: int, count: int, settings: Iterable[str]) -> tuple[Scans, Floats, float]:
+    line = simulate(scenario, seed=seed, count=count, motion_compensated=True, settings=settings)
+    line.scan(0)
+    began = time.perf_counter()
+    with ThreadPoolExecutor(2) as pool:
+        scans = [scan.points for scan in pool.map(line.scan, range(count))]
+    assert line.ground_truth is not None
+    return scans, line.ground_truth.poses, count / (time.perf_counter() - began)
+
+
+def row(name: str, found: Hardness, real: Hardness | None) -> None:
+    e, t, i, *r = found.values
+    rotation = " ".join(f"{v:10.3f}" for v in r)
+    print(f"{name:24} {e:8.3f} {1e3 * t:9.1f} {i:8.3f} {rotation} {found.traced:8.1f}   {found.order}", flush=True)
+    if real is not None:
+        ratio = found.values / real.values
+        # Entropy is a logarithm: what compares is a ratio of volumes, its cube root one of lengths.
+        ratio[0] = np.exp((found.entropy - real.entropy) / 3)
+        e, t, i, *r = ratio
+        print(
+            f"{'  over the recording':24} {e:8.2f} {t:9.2f} {i:8.2f} " + " ".join(f"{v:10.2f}" for v in r), flush=True
+        )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--recordings", type=Path)
+    parser.add_argument("--scenarios", default="urban,urban-hard")
+    parser.add_argument("--seeds", default="100,101,102")
+    parser.add_argument("--scans", type=int, default=154)
+    parser.add_argument("--voxel", type=float, default=0.2)
+    parser.add_argument("--set", action="append", default=[], dest="settings")
+    args = parser.parse_args()
+    print(
+        f"{'clip':24} {'entropy':>8} {'plane mm':>9} {'inliers':>8} "
+        + " ".join(f"{m:>10}" for m in METHODS) + f" {'scans/s':>8}   rotation over 10 m, deg"
+    )  # fmt: skip
+    real = None
+    if args.recordings is not None:
+        scans, truth = recorded(args.recordings, args.scans)
+        real = measure(scans, truth, args.voxel)
+        row("KITTI 0005", real, None)
+    for scenario in filter(None, args.scenarios.split(",")):
+        found = []
+        for seed in (int(v) for v in args.seeds.split(",")):
+            scans, truth, traced = simulated(scenario, seed, args.scans, args.settings)
+            found.append(measure(scans, truth, args.voxel, traced))
+            row(f"{scenario} {seed}", found[-1], None)
+        means = np.mean([f.values for f in found], axis=0)
+        row(
+            f"{scenario} mean",
+            Hardness(*means[:3], tuple(means[3:]), float(np.mean([f.traced for f in found]))),
+            real,
+        )
+
+
+if __name__ == "__main__":
+    main()
