@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -140,11 +140,9 @@ def trace(
     rays = _into_city(model, true, poses, period, stamp_ns / 1e9 + since)
     meeting = _Meeting(scene, bodies, stamp_ns / 1e9, None if returns is None else returns.extinction, extra)
     hits = meeting.meet(rays, model.rings)
-    lucky = rng.random(model.rays) < glass if glass > 0 else None
-    if returns is not None and returns.mirror > 0:
-        _mirror(meeting, rays, hits, returns, lucky)
-    if lucky is not None:
-        _pass_glass(meeting, rays, hits, lucky)
+    lucky = rng.random(model.rays) < glass if glass > 0 else np.zeros(0, np.bool_)
+    if len(lucky) or (returns is not None and returns.mirror > 0):
+        _leave_panes(meeting, rays, hits, lucky, returns)
     heights = model.heights.astype(np.float32)[ring]
     if roof is not None:
         _meet_roof(roof, true, heights, hits)
@@ -182,29 +180,67 @@ class _Meeting:
 
 def _meet_bodies(bodies: Sequence[MovingMesh], rays: Rays, rings: int, hits: Hits, stamp: float) -> None:
     """Put hits on what moves into `hits` where they are nearer; `stamp`, s, is that of the bodies' centres."""
-    # Bearings of whole columns first: a body is met by few of them.
-    bearing = np.arctan2(rays.directions[:, 1], rays.directions[:, 0]).reshape(-1, rings)
-    middle = bearing[:, rings // 2]
-    spread = np.abs(_turned(bearing - middle[:, None])).max(axis=1)
-    half = len(rays.fired) // 2
-    apart, lasting = sum(float(np.ptp(axis)) for axis in rays.origins.T), float(rays.fired.max()) - stamp
-    for body in bodies:
-        centre = body.centre
-        # Body and LiDAR both move while the sweep lasts.
-        reach = body.radius + body.speed * lasting + apart
-        dx, dy, _ = (centre - rays.origins[half]).tolist()
-        share = reach / max(float(np.hypot(dx, dy)), reach)
-        towards = np.abs(_turned(middle - np.float32(np.arctan2(dy, dx)))) <= np.arcsin(share) + spread
-        columns = np.flatnonzero(towards | (share == 1.0))
-        near = (columns[:, None] * rings + np.arange(rings)).ravel()
-        to = (centre - rays.origins[near]).astype(np.float32)
+    centres = np.stack([body.centre for body in bodies])
+    lasting = float(rays.fired.max()) - stamp
+    # Body and LiDAR both move while the sweep lasts; a millimetre for the rounding.
+    swept = np.array([body.radius + 1e-3 + body.speed * lasting for body in bodies])
+    candidates = _by_column(centres, swept, rays, rings) if rings > 1 else _by_ray(centres, swept, rays, hits)
+    for body, near in zip(bodies, candidates, strict=True):
+        if not len(near):
+            continue
+        to = (body.centre - rays.origins[near]).astype(np.float32)
         along = np.einsum("ij,ij->i", to, rays.directions[near])
         aside = np.einsum("ij,ij->i", to, to) - along**2
-        # Each ray knows where it starts and when; a millimetre for the rounding.
+        # Each ray knows where it starts and when.
         reached = (body.radius + 1e-3 + body.speed * (rays.fired[near] - stamp)).astype(np.float32)
         near = near[(along > -reached) & (aside < reached**2) & (along < hits.distance[near] + reached)]
         if len(near):
             _meet_body(body, near, rays[near], hits, stamp)
+
+
+def _by_column(
+    centres: NDArray[np.float64], swept: NDArray[np.float64], rays: Rays, rings: int
+) -> Iterator[NDArray[np.intp]]:
+    """For each body, within `swept` (B,), m, of its centre (B, 3), the rays of a scan that may meet it."""
+    # Bearings of whole columns first: a body is met by few of them, and then by few of their rings.
+    bearing = np.arctan2(rays.directions[:, 1], rays.directions[:, 0]).reshape(-1, rings)
+    middle = bearing[:, rings // 2]
+    spread = np.abs(_turned(bearing - middle[:, None])).max(axis=1)
+    climb = rays.directions[:, 2].reshape(-1, rings)
+    apart = sum(float(np.ptp(axis)) for axis in rays.origins.T)
+    to = centres - rays.origins[len(rays.fired) // 2]
+    reach, level, away = swept + apart, np.hypot(to[:, 0], to[:, 1]), np.linalg.norm(to, axis=1)
+    aside = np.arcsin(reach / np.maximum(level, reach))
+    rise, tilt = np.arcsin(to[:, 2] / away), np.arcsin(reach / np.maximum(away, reach)) + 1e-3
+    lowest, highest = (np.sin(np.clip(rise + k * tilt, -np.pi / 2, np.pi / 2)) for k in (-1, 1))
+    for i, towards in enumerate(np.arctan2(to[:, 1], to[:, 0]).astype(np.float32)):
+        if level[i] <= reach[i]:
+            yield np.arange(len(rays.fired))
+            continue
+        columns = np.flatnonzero(np.abs(_turned(middle - towards)) <= aside[i] + spread)
+        upright = climb[columns]
+        at, ring = np.nonzero((upright >= lowest[i]) & (upright <= highest[i]))
+        yield columns[at] * rings + ring
+
+
+def _by_ray(
+    centres: NDArray[np.float64], swept: NDArray[np.float64], rays: Rays, hits: Hits
+) -> Iterator[NDArray[np.intp]]:
+    """As `_by_column`, for rays that start anywhere."""
+    # Relative to their middle single precision is good for centimetres, which `reach` allows.
+    middle = rays.origins.mean(axis=0, dtype=np.float64)
+    start, at = (rays.origins - middle).astype(np.float32), (centres - middle).astype(np.float32)
+    reach = swept.astype(np.float32)[:, None] + np.float32(0.05)
+    # No matrix product: BLAS would wake its threads for three columns.
+    along = np.einsum("bi,ni->bn", at, rays.directions)
+    along -= np.einsum("ij,ij->i", start, rays.directions)
+    apart2 = np.einsum("bi,ni->bn", at, -2 * start)
+    apart2 += np.einsum("ij,ij->i", start, start)
+    apart2 += np.sum(at**2, axis=1)[:, None]
+    may = np.abs(apart2) < (np.minimum(np.float32(1e4), hits.distance) + reach) ** 2 + reach
+    apart2 -= along**2
+    may &= (apart2 < reach**2) & (along > -reach)
+    return iter([np.flatnonzero(row) for row in may])
 
 
 def _meet_body(body: MovingMesh, which: NDArray[np.intp], rays: Rays, hits: Hits, stamp: float) -> None:
@@ -242,31 +278,33 @@ def _turned(angle: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.asarray(angle - np.float32(2 * np.pi) * np.round(angle / np.float32(2 * np.pi)), np.float32)
 
 
-def _pass_glass(meeting: _Meeting, rays: Rays, hits: Hits, lucky: NDArray[np.bool_]) -> None:
-    """The `lucky` rays on glass go on to what stands or moves behind it; a second pane stops them."""
-    through = np.flatnonzero(lucky & (hits.surface == Surface.GLASS) & np.isfinite(hits.distance))
-    start = hits.distance[through] + np.float32(0.01)
-    _go_on(hits, through, start, meeting.meet(rays[through].after(start)))
+def _leave_panes(meeting: _Meeting, rays: Rays, hits: Hits, lucky: NDArray[np.bool_], returns: Returns | None) -> None:
+    """Some rays on panes are mirrored, and what they meet seems to lie behind the pane; of the others the `lucky` pass it.
 
-
-def _mirror(meeting: _Meeting, rays: Rays, hits: Hits, returns: Returns, lucky: NDArray[np.bool_] | None) -> None:
-    """Some rays on panes go on as in a mirror, and what they meet seems to lie behind the pane; none of those passes it too."""
-    normals = meeting.scene.mesh.normals
-    off = mirrored(returns, hits, normals, meeting.rng)
-    # A centimetre before the pane, so that it is not met again.
-    start = hits.distance[off] - np.float32(0.01)
-    met = meeting.meet(reflect(rays[off], start, normals[hits.face[off]]))
-    if lucky is not None:
+    They go on to what stands or moves there; a second pane stops them.
+    """
+    off = np.zeros(0, np.intp)
+    if returns is not None and returns.mirror > 0:
+        off = mirrored(returns, hits, meeting.scene.mesh.normals, meeting.rng)
+    if len(lucky):
         lucky[off] = False
-    _go_on(hits, off, start, met)
-
-
-def _go_on(hits: Hits, which: NDArray[np.intp], start: NDArray[np.float32], onward: Hits) -> None:
-    """Rays `which` that went on at `start`, m, meet `onward`."""
-    hits.distance[which] = start + onward.distance
-    hits.cosine[which] = onward.cosine
-    hits.surface[which] = onward.surface
-    hits.face[which] = onward.face
+    through = (
+        np.flatnonzero(lucky & (hits.surface == Surface.GLASS) & np.isfinite(hits.distance)) if len(lucky) else off[:0]
+    )
+    # A centimetre behind the pane or before it, so that it is not met again.
+    start = np.concatenate([hits.distance[through] + np.float32(0.01), hits.distance[off] - np.float32(0.01)])
+    onward = rays[through].after(start[: len(through)])
+    if len(off):
+        turned = reflect(rays[off], start[len(through) :], meeting.scene.mesh.normals[hits.face[off]])
+        onward = onward.with_more(turned)
+    which = np.append(through, off)
+    if not len(which):
+        return
+    met = meeting.meet(onward)
+    hits.distance[which] = start + met.distance
+    hits.cosine[which] = met.cosine
+    hits.surface[which] = met.surface
+    hits.face[which] = met.face
 
 
 def _directions(

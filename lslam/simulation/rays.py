@@ -19,6 +19,14 @@ class Rays:
     def __getitem__(self, which: NDArray[np.intp]) -> Rays:
         return Rays(self.origins[which], self.directions[which], self.fired[which])
 
+    def with_more(self, others: Rays) -> Rays:
+        """These rays, then `others`."""
+        return Rays(
+            np.concatenate([self.origins, others.origins]),
+            np.concatenate([self.directions, others.directions]),
+            np.concatenate([self.fired, others.fired]),
+        )
+
     def after(self, distance: NDArray[np.float32]) -> Rays:
         """The same rays from `distance` (N,), m, on."""
         return Rays(self.origins + distance[:, None] * self.directions, self.directions, self.fired)
