@@ -211,7 +211,7 @@ def _by_column(
     to = centres - rays.origins[len(rays.fired) // 2]
     reach, level, away = swept + apart, np.hypot(to[:, 0], to[:, 1]), np.linalg.norm(to, axis=1)
     aside = np.arcsin(reach / np.maximum(level, reach))
-    rise, tilt = np.arcsin(to[:, 2] / away), np.arcsin(reach / np.maximum(away, reach)) + 1e-3
+    rise, tilt = np.arctan2(to[:, 2], level), np.arcsin(reach / np.maximum(away, reach)) + 1e-3
     lowest, highest = (np.sin(np.clip(rise + k * tilt, -np.pi / 2, np.pi / 2)) for k in (-1, 1))
     for i, towards in enumerate(np.arctan2(to[:, 1], to[:, 0]).astype(np.float32)):
         if level[i] <= reach[i]:

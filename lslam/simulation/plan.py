@@ -36,8 +36,8 @@ for _surface, _colour in {
     Surface.CAR: (50, 76, 150),
     Surface.FENCE: (90, 80, 70),
     Surface.PERSON: (200, 0, 160),
-    Surface.CROWN: (88, 136, 70),
-    Surface.HEDGE: (88, 136, 70),
+    Surface.CROWN: (80, 130, 64),
+    Surface.HEDGE: (68, 118, 54),
 }.items():
     COLOURS[_surface] = _colour
 

@@ -143,13 +143,15 @@ def mixed(returns: Returns, model: LidarModel, distance: Array, slant: Array, rn
     draw = rng.random(by_column.shape, np.float32)
     share = rng.random(by_column.shape, np.float32) / 2
     out = np.zeros_like(by_column)
-    edge = np.float32(0.05) + np.float32(SLANT * spacing) * (by_column * slant.reshape(by_column.shape))
-    for shift, low in ((1, 0.0), (-1, 0.5)):
-        # Each side has its half of the draws.
-        with np.errstate(invalid="ignore"):
+    slope = np.float32(SLANT * spacing) * slant.reshape(by_column.shape)
+    with np.errstate(invalid="ignore"):  # the sky is infinitely far
+        edge = np.float32(0.05) + by_column * slope
+        for shift, low in ((1, 0.0), (-1, 0.5)):
+            # Each side has its half of the draws.
             gap = np.roll(by_column, shift, axis=0) - by_column
-        met = (draw >= low) & (draw < low + chance) & (np.abs(gap) > edge) & (np.abs(gap) < np.float32(returns.pulse))
-        out[met] = share[met] * gap[met]
+            wide = np.abs(gap)
+            met = (draw >= low) & (draw < low + chance) & (wide > edge) & (wide < np.float32(returns.pulse))
+            out[met] = share[met] * gap[met]
     return out.ravel()
 
 
