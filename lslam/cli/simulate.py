@@ -212,8 +212,8 @@ def _print_list() -> None:
     from lslam.simulation.scenario_files import scenario_named, scenario_names
 
     for name in scenario_names():
-        click.echo(f"scenario  {name:<11}  {scenario_named(name).summary}")
+        click.echo(f"scenario  {name:<16}  {scenario_named(name).summary}")
     for name, model in LIDARS.items():
-        click.echo(f"lidar     {name:<11}  {model.rings} x {model.columns} rays, {model.range_max:g} m")
+        click.echo(f"lidar     {name:<16}  {model.rings} x {model.columns} rays, {model.range_max:g} m")
     for name, imu in IMUS.items():
-        click.echo(f"imu       {name:<11}  {imu.rate_hz:g} Hz, {'without errors' if name == 'ideal' else 'MEMS'}")
+        click.echo(f"imu       {name:<16}  {imu.rate_hz:g} Hz, {'without errors' if name == 'ideal' else 'MEMS'}")

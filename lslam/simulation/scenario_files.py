@@ -176,13 +176,8 @@ def parse_scenario(name: str, tree: dict[str, Any], settings: Iterable[str] = ()
 
     Raises ConfigError naming `where` it was found, the key and the nearest known one.
     """
-    merged: dict[str, Any] = {}
     where = where or f"scenario {name!r}"
-    tree = dict(tree)
-    base = tree.pop("base", None)
-    if base is not None:
-        _merge(merged, _ready(str(base)), Scenario, f"scenario {base!r}", "")
-    _merge(merged, tree, Scenario, where, "")
+    merged = _on_its_base(tree, where)
     for setting in settings:
         key, equals, value = setting.partition("=")
         if not equals:
@@ -199,6 +194,15 @@ def parse_scenario(name: str, tree: dict[str, Any], settings: Iterable[str] = ()
             for e in error.errors()
         ]
         raise ConfigError(f"{where}: " + "; ".join(text.removeprefix(": ") for text in said)) from None
+
+
+def _on_its_base(tree: dict[str, Any], where: str) -> dict[str, Any]:
+    """What a tree says, over what its base says; a base may have one of its own."""
+    own = dict(tree)
+    base = own.pop("base", None)
+    merged: dict[str, Any] = {} if base is None else _on_its_base(_ready(str(base)), f"scenario {base!r}")
+    _merge(merged, own, Scenario, where, "")
+    return merged
 
 
 def _merge(tree: dict[str, Any], more: dict[str, Any], model: type[BaseModel], where: str, prefix: str) -> None:

@@ -34,9 +34,10 @@ def test_list_names_scenarios_and_sensors() -> None:
     listed = simulated("--list")
     assert listed.returncode == 0
     assert [line.split()[1] for line in listed.stdout.splitlines()] == [
-        "block", "carpark", "climbing", "closed", "corridor", "identical", "large-eight", "motorway", "open", "residential",
-        "small-eight", "street", "urban", "walk", "sample", "vlp16", "hdl64", "hdl64-kitti", "os1-16", "os1-32", "os1-64",
-        "livox", "icm20948", "icm20948-calibrated", "ideal",
+        "block", "carpark", "climbing", "climbing-hard", "closed", "closed-hard", "corridor", "forest-road", "identical",
+        "large-eight", "large-eight-hard", "motorway", "open", "open-hard", "park", "residential", "residential-hard",
+        "small-eight", "small-eight-hard", "street", "urban", "urban-hard", "walk", "sample", "vlp16", "hdl64", "hdl64-kitti",
+        "os1-16", "os1-32", "os1-64", "livox", "icm20948", "icm20948-calibrated", "ideal",
     ]  # fmt: skip
 
 

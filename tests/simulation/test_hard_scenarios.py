@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from lslam.simulation.imu import IMUS, ImuFaults
 from lslam.simulation.mesh import Surface
 from lslam.simulation.places import build_place
-from lslam.simulation.scenario_files import scenario_named, scenario_names
+from lslam.simulation.scenario_files import parse_scenario, scenario_named, scenario_names
 from lslam.simulation.scenarios import simulate
 
 FLIGHTS = ("closed", "open", "climbing", "small-eight", "large-eight")
@@ -29,6 +29,13 @@ def test_a_hard_scenario_goes_the_way_of_its_clean_one(name: str) -> None:
     assert hard.vibration.angle_deg > 0
     assert hard.imu.jitter_ms > 0
     assert hard.traffic.cars + hard.traffic.people > plain.traffic.cars + plain.traffic.people
+
+
+def test_own_files_may_stand_on_a_hard_scenario() -> None:
+    own = parse_scenario("own", {"base": "urban-hard", "returns": {"grass": 0.2}})
+    hard = scenario_named("urban-hard")
+    assert own.returns == hard.returns.model_copy(update={"grass": 0.2})
+    assert own.model_copy(update={"name": hard.name, "returns": hard.returns}) == hard
 
 
 def test_only_hard_worlds_and_woods_have_real_returns() -> None:
