@@ -22,6 +22,8 @@ Flags = NDArray[np.bool_]
 START_STEP = 1.0
 # A hand-held sensor turns at 100 deg/s, by 30 deg at every third scan; so far apart that 20 m away a step is left.
 START_TURNS_DEG = np.delete(np.arange(-30.0, 31.0, 3.0), 10)
+# Less than the rings of most sensors are apart.
+AT_REST_DEG = 3.0
 # Every so many-th source point is enough to tell a good start from a bad one; so many of the best are looked at closely.
 SEARCH_SHARE, LOOKED_AT = 4, 3
 # Along a bare wall the rings repeat best where nothing moved, by five percent: a start elsewhere must have more, and twice
@@ -89,7 +91,8 @@ def held_by_non_ground(
         starts.append(_likeliest(standing, seen, T_prior, c.start_reach))
     stood = max(map(placed, starts), key=lambda result: np.count_nonzero(agreeing(result)))
     place, most = stood.T_world_lidar, agreeing(stood)
-    if not is_much_more(most, agreeing(found)):
+    is_drawn = found.ok and is_at_rest(place, r.recent[-1][1])
+    if is_drawn or not is_much_more(most, agreeing(found)):
         return found
     near = r.alignment.refine(points, place, width, c.start_iterations, r.alignment.coarse_maps(points, place))
     judged = r.judged(near, place)
@@ -133,6 +136,12 @@ def _likeliest(standing: NonGroundPoints, seen: PreparedPoints, T_prior: Floats,
     turns = np.deg2rad(START_TURNS_DEG)
     turned = [T_prior @ se3.make(so3.exp(np.array([0, 0, turn])), np.zeros(3)) for turn in turns]
     return max([*moved, *turned], key=lambda start: standing.share(seen, start))
+
+
+def is_at_rest(pose: Floats, last: Floats) -> bool:
+    """Whether the pose (4, 4) is so near to the last scan's that the sensor's own rings, on roofs or walls, explain it."""
+    move, turn = se3.relative(last, pose)[:3, 3], so3.angle(se3.relative(last, pose)[:3, :3])
+    return bool(np.linalg.norm(move) < 2 * NEAR and turn < np.deg2rad(AT_REST_DEG))
 
 
 def is_much_more(ours: Flags, others: Flags) -> bool:

@@ -60,6 +60,7 @@ WITHOUT: dict[str, dict[str, Variant]] = {
         "along": ((), ((residuals, "RESIDUALS", BLOBS_AS_BEFORE),)),
         "coarse-to-fine": (("recovery.coarse_to_fine=false",), ()),
         "start search": (("recovery.start_search=false",), ()),
+        "at rest": ((), ((start_search, "is_at_rest", lambda pose, last: False),)),
         "HIGH": ((), ((non_ground, "HIGH", 0.3),)),
         "CLEARLY": ((), ((start_search, "CLEARLY", 1.0),)),
         "MUCH": ((), ((start_search, "MUCH", 1.0),)),
