@@ -27,6 +27,11 @@ class OsmConfig(Section):
     )
     start_radius: float = Field(10.0, gt=0, le=100, description="m; so far off the origin may be")
     start_heading_deg: float = Field(20.0, gt=0, le=180, description="deg; so far off the heading may be")
+    hold_start: bool = Field(
+        False,
+        description="hold the first pose where origin and heading have it, as well as both radii say, against a map that is off "
+        "as a whole; else they only say where to look. rigid always does",
+    )
     mode: Literal["prior", "rigid", "non-rigid", "two-level"] = Field(
         "two-level",
         description="prior: the map is true; rigid: it is off as a whole, as far as the start tells; non-rigid: each building is "

@@ -47,7 +47,7 @@ class Located:
 
     T_enu_odometry : (4, 4) from the world of odometry into the map frame, placed by one match and turned by all
     matches : of all keyframes; priors : the accepted ones, for the pose graph
-    start, start_sigma : (3,) x, y (m), yaw (rad) of the first pose as it was given, and how well
+    start, start_sigma : (3,) x, y (m), yaw (rad) that hold the first pose, None where matches have it, and how well
     problem : why there are none
     """
 
@@ -55,7 +55,7 @@ class Located:
     osm: OsmMap
     matches: list[KeyframeMatch] = field(default_factory=list)
     priors: list[PlanarPrior] = field(default_factory=list)
-    start: Floats = field(default_factory=lambda: np.zeros(3))
+    start: Floats | None = None
     start_sigma: Floats = field(default_factory=lambda: np.zeros(3))
     problem: str = ""
 
@@ -103,6 +103,8 @@ def locate(
     priors = [
         PlanarPrior(m.keyframe, m.pose, m.information, m.rank, part) for m, part in zip(accepted, parts, strict=True)
     ]
+    if not (config.osm.hold_start or config.osm.mode == "rigid"):
+        return Located(T, osm, matches, priors, None, sigma)
     given = start if placed is not None else known_start(config.osm)
     return Located(T, osm, matches, priors, given.pose, given.sigma)
 

@@ -75,7 +75,7 @@ def configured(drive: Path, args: argparse.Namespace, mode: str, which: str, kin
         settings += [f"osm.extract={extract}", f"osm.origin={start.tolist()}", f"osm.heading_deg={heading}",
                      "osm.start_heading_deg=5.0"]  # fmt: skip
         if mode not in PRESETS:
-            settings += [f"osm.mode={mode}", "osm.start_radius=2.0"]
+            settings += [f"osm.mode={mode}", "osm.start_radius=2.0", "osm.hold_start=true"]
     return load_config(settings=settings)
 
 

@@ -28,8 +28,8 @@ class MovingTruth:
             mask = self._met.setdefault(id(hits), np.zeros(len(hits.distance), np.bool_))
             mask[which[hits.distance[which] != before]] = True
 
-        def detect_and_note(model: Any, hits: Any, rng: Any) -> Any:
-            found = detect(model, hits, rng)
+        def detect_and_note(model: Any, hits: Any, *given: Any) -> Any:
+            found = detect(model, hits, *given)
             mask = self._met.get(id(hits), np.zeros(len(hits.distance), np.bool_))
             self._kept = mask[model.sequence[found[0][model.sequence]]]
             return found

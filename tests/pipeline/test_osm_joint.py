@@ -13,6 +13,7 @@ from lslam.graph.problem import PoseGraph, PositionFix
 from lslam.pipeline.osm_joint import run_baseline
 from lslam.types.building import Building, Footprint
 from lslam.types.constraint import Constraint
+from lslam.types.stage_clock import KeyframeClocks
 
 
 class NothingSeen:
@@ -40,7 +41,7 @@ def test_a_fix_that_the_graph_gave_up_does_not_bend_the_baseline() -> None:
     assert np.flatnonzero(~solution.fix_believed).tolist() == [10]
     house = Building("way/1", (Footprint(np.array([[200.0, 0], [210, 0], [210, 10], [200, 10]])),))
     extract = BuildingExtract([house], {}, np.array([49.0, 8.4, 0.0]), None, "a map")
-    joint, matches, placed = run_baseline(graph, solution, extract, NothingSeen(), Config())  # type: ignore[arg-type]
+    joint, matches, placed = run_baseline(graph, solution, extract, NothingSeen(), Config(), KeyframeClocks())  # type: ignore[arg-type]
     np.testing.assert_allclose(joint.poses[:, :3, 3], poses[:, :3, 3], atol=0.1)
     assert [match.reason for match in matches.keyframes] == ["no convergence"] * 20
     assert [c.status for c in placed.buildings] == ["unseen"]

@@ -64,6 +64,7 @@ def on(
         "loops.use=false", "map.write=false", "debug.drift=true", "debug.drift_kind=random-walk",
         f"osm.extract={folder / 'map.osm'}", f"osm.origin={geodesy.from_local(start[None], origin)[0].tolist()}",
         f"osm.heading_deg={90 - np.degrees(se2.of_se3(real[0])[2])}", f"osm.start_radius={radius}",
+        "osm.hold_start=true",
     ]  # fmt: skip
 
     def run(mode: str, drift: int) -> Found:

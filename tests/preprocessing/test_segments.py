@@ -27,8 +27,8 @@ def classed(monkeypatch: pytest.MonkeyPatch, scenario: str, model: str, index: i
     heard: list[Any] = []
     detect = lidar._detect
 
-    def listen(model: Any, hits: Any, rng: Any) -> Any:
-        out = detect(model, hits, rng)
+    def listen(model: Any, hits: Any, *given: Any) -> Any:
+        out = detect(model, hits, *given)
         heard.append((hits.surface.copy(), out[0]))
         return out
 
