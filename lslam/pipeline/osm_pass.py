@@ -105,8 +105,10 @@ def locate(
     ]
     if not (config.osm.hold_start or config.osm.mode == "rigid"):
         return Located(T, osm, matches, priors, None, sigma)
-    given = start if placed is not None else known_start(config.osm)
-    return Located(T, osm, matches, priors, given.pose, given.sigma)
+    # Of a heading that was sought only walls know.
+    given = known_start(config.osm)
+    place = start.pose if placed is not None else np.append(given.pose[:2], start.pose[2])
+    return Located(T, osm, matches, priors, place, np.append(given.sigma[:2], start.sigma[2]))
 
 
 def finish(

@@ -51,10 +51,9 @@ def see_walls(store: KeyframeStore, poses: Floats, number: int, size: int, confi
 
 
 def known_start(config: OsmConfig) -> Start:
-    """What the configuration says of the start; of its heading nothing, unless that is given."""
-    is_headed = config.heading_deg is not None
+    """The start that the configuration gives, with its heading."""
     radius, turn = config.start_radius / WINDOW, np.radians(config.start_heading_deg) / WINDOW
-    return Start(first_pose(config), np.array([radius, radius, turn if is_headed else np.pi]))
+    return Start(first_pose(config), np.array([radius, radius, turn]))
 
 
 def sought_start(store: KeyframeStore, poses: Floats, osm: OsmMap, config: OsmConfig, submap_size: int) -> Start:

@@ -105,6 +105,21 @@ def test_the_heading_is_found_among_all(turn: float) -> None:
     assert (off(located, way) < [0.1, 0.1, 0.3]).all()
 
 
+@pytest.mark.parametrize("heading", [90.0, None])
+def test_a_start_that_is_held_is_where_it_was_said_to_be(heading: float | None) -> None:
+    """Houses half a metre north of where the map has them: the place is what was given, a heading that was sought the walls'."""
+    houses = [[(x, y - 0.5) for x, y in ring] for ring in HOUSES]
+    keyframes = driven(HOUSES, street(24.0))
+    held = locate(extract_of(houses), keyframes, None, config(heading, "osm.hold_start=true", "osm.start_radius=1.5"))
+    assert held.start is not None
+    np.testing.assert_array_equal(held.start[:2], 0.0)
+    np.testing.assert_allclose(held.start_sigma[:2], 0.5)
+    assert abs(held.start[2]) < 2 * held.start_sigma[2] < np.radians(15)
+    free = locate(extract_of(houses), keyframes, None, config(heading))
+    assert free.start is None
+    np.testing.assert_allclose((free.T_enu_odometry[:2, 3]), [0.0, -0.5], atol=0.1)
+
+
 def test_odometry_that_runs_away_is_followed() -> None:
     """3 % too long and 4 deg per 100 m to the left: where it ends it would be 3 m off."""
     way = street()
