@@ -49,7 +49,7 @@ def optimise_jointly(
 
     Parameters
     ----------
-    graph : in the frame of the map; its loops, fixes and planar priors are taken at their word, so give the believed ones
+    graph : in the frame of the map; its loops and fixes are taken at their word, so give the believed ones; it has no planar priors
     belief : what the map is trusted with; None is the baseline: the first building matched is held, no match is doubted
 
     Raises GraphError when the graph is in pieces, singular or not finite.
@@ -58,8 +58,6 @@ def optimise_jointly(
     seen = list(dict.fromkeys(m.building for m in matches))
     keys = {building: factors.map_key(graph) + 1 + n for n, building in enumerate(seen)}
     certain = [factors.between(loop) for loop in graph.loops] + [factors.position(fix) for fix in graph.fixes]
-    key = factors.map_key(graph)
-    certain += [factors.planar(p, graph.poses[p.keyframe], key) for p in graph.map_priors]
     values = factors.start_values(graph, graph.poses)
     for building, key in keys.items():
         shift = np.zeros(2) if belief is None else belief.shift
