@@ -9,6 +9,7 @@ from lslam.reports.back_end import back_end_rows
 from lslam.reports.facts import Failure, RunFacts, run_facts
 from lslam.reports.metrics import counted, fixed, metres
 from lslam.types.run_record import RunRecord
+from lslam.types.stage_clock import summed
 
 if TYPE_CHECKING:
     from lslam.evaluation.results import AbsoluteError, Evaluation, RelativeError
@@ -161,10 +162,7 @@ def _time_rows(record: RunRecord, facts: RunFacts) -> list[tuple[str, str]]:
                 f"limit of {1e3 * record.real_time_limit:.0f} ms",
             )
         )
-    later: dict[str, float] = {}
-    for seconds in record.back_end_seconds.values():
-        later = {name: later.get(name, 0.0) + seconds.get(name, 0.0) for name in {**later, **seconds}}
-    if later:
+    if later := summed(record.back_end_seconds.values()):
         each = ", ".join(f"{name} {s:.2f}" for name, s in later.items())
         rows.append(("back end", f"{sum(later.values()):.1f} s on {len(record.keyframe_scans)} keyframes: {each}"))
     return rows

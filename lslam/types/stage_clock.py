@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 
 
@@ -24,6 +24,15 @@ class StageClock:
             self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - began
 
 
+def summed(rows: Iterable[Mapping[str, float]]) -> dict[str, float]:
+    """Seconds per stage of several scans, in the order in which the stages come first."""
+    found: dict[str, float] = {}
+    for row in rows:
+        for name, seconds in row.items():
+            found[name] = found.get(name, 0.0) + seconds
+    return found
+
+
 class KeyframeClocks(defaultdict[int, StageClock]):
     """A clock for each keyframe, by number: of what is done after odometry."""
 
@@ -32,8 +41,4 @@ class KeyframeClocks(defaultdict[int, StageClock]):
 
     def totals(self) -> dict[str, float]:
         """Seconds per stage of all keyframes."""
-        found: dict[str, float] = {}
-        for number in sorted(self):
-            for name, seconds in self[number].seconds.items():
-                found[name] = found.get(name, 0.0) + seconds
-        return found
+        return summed(self[number].seconds for number in sorted(self))
