@@ -74,10 +74,15 @@ def test_flags_the_readme_mentions_exist() -> None:
 
 def test_configuration_keys_of_the_readme_exist() -> None:
     from lslam.config import load_config
+    from lslam.simulation.scenario_files import scenario_named
 
     # Of `simulate` they are a scenario's.
     lines = [line for line in shell_lines() if not line.startswith("lslam simulate")]
     settings = re.findall(r"--set (\S+)", "\n".join(lines))
+    simulated = [line for line in shell_lines() if line.startswith("lslam simulate") and "--set" in line]
+    assert simulated
+    for line in simulated:
+        scenario_named(line.split()[2], re.findall(r"--set (\S+)", line))
     variables = set(re.findall(r"LSLAM_[A-Z_]+", README)) - {"LSLAM_DATA"}
     assert settings
     assert variables
