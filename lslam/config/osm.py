@@ -29,8 +29,8 @@ class OsmConfig(Section):
     start_heading_deg: float = Field(20.0, gt=0, le=180, description="deg; so far off the heading may be")
     hold_start: bool = Field(
         False,
-        description="hold the first pose where origin and heading have it, as well as both radii say, against a map that is off "
-        "as a whole; else they only say where to look. rigid always does",
+        description="hold the first pose where the origin has it, as well as start_radius says, against a map that is off as a "
+        "whole; else it only says where to look. rigid always does",
     )
     mode: Literal["prior", "rigid", "non-rigid", "two-level"] = Field(
         "two-level",

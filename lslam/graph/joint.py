@@ -49,7 +49,8 @@ def optimise_jointly(
 
     Parameters
     ----------
-    graph : in the frame of the map; its loops and fixes are taken at their word, so give the believed ones; it has no planar priors
+    graph : in the frame of the map; its loops and fixes are taken at their word, so give the believed ones;
+        it has no planar priors
     belief : what the map is trusted with; None is the baseline: the first building matched is held, no match is doubted
 
     Raises GraphError when the graph is in pieces, singular or not finite.

@@ -105,10 +105,10 @@ def locate(
     ]
     if not (config.osm.hold_start or config.osm.mode == "rigid"):
         return Located(T, osm, matches, priors, None, sigma)
-    # Of a heading that was sought only walls know.
-    given = known_start(config.osm)
-    place = start.pose if placed is not None else np.append(given.pose[:2], start.pose[2])
-    return Located(T, osm, matches, priors, place, np.append(given.sigma[:2], start.sigma[2]))
+    # All walls together know the heading best.
+    given, laid = known_start(config.osm), se2.of_se3(T @ odometry[0])
+    place = given.pose[:2] if placed is None else start.pose[:2]
+    return Located(T, osm, matches, priors, np.append(place, laid[2]), np.append(given.sigma[:2], sigma[2]))
 
 
 def finish(
