@@ -58,19 +58,34 @@ def recordings(folder: Path) -> Iterator[Case]:
     for drive_number in ("0005", "0048"):
         path = folder / "2011_09_26" / f"2011_09_26_drive_{drive_number}_sync"
         if path.is_dir():
-            sequence = open_sequence(path)
             truth = read_trajectory(path / "reference_lidar.tum").poses
-            yield (
-                f"kitti_raw_{drive_number}",
-                [sequence.scan(i).points for i in range(len(sequence))],
-                _from_first(truth),
-            )
+            scans = [scan.points for scan in untwisted(open_sequence(path))]
+            yield f"kitti_raw_{drive_number}", scans, _from_first(truth)
     path = folder / "mcd_kth_day_06"
     if path.is_dir():
         sequence = open_sequence(path)
         assert sequence.ground_truth is not None
-        truth = sequence.ground_truth.poses
-        yield "mcd_kth_day_06", [sequence.scan(i).points for i in range(len(sequence))], _from_first(truth)
+        scans = [scan.points for scan in untwisted(sequence)]
+        yield "mcd_kth_day_06", scans, _from_first(sequence.ground_truth.poses)
+
+
+def untwisted(sequence: Sequence) -> list[Scan]:
+    """All scans, each with the motion of its sweep taken out along the trajectory of `icp`, so that all peers get the same."""
+    scans = [sequence.scan(i) for i in range(len(sequence))]
+    if not any(len(scan.points) and scan.times is not None for scan in scans):
+        return scans
+    found = estimate(sequence, create_odometry(Config()), threads=1)
+    stamps, poses = sequence.stamps_ns, np.stack([result.T_world_lidar for result in found])
+    clean = []
+    for scan in scans:
+        if scan.times is None:
+            clean.append(scan)
+            continue
+        knots = knots_over(scan.span)
+        within = poses_at(stamps, poses, scan.stamp_ns + np.round(1e9 * knots).astype(np.int64))
+        points = deskew_points(scan.points, scan.times, MotionPrior(knots, within))
+        clean.append(replace(scan, points=points, times=None))
+    return clean
 
 
 def _from_first(poses: Floats) -> Floats:

@@ -26,13 +26,11 @@ def said(sentences: list[str], part: str) -> bool:
 
 def test_an_excerpt_without_velodyne_stamps(tmp_path: Path) -> None:
     s = open_sequence(raw_drive(tmp_path))
-    assert (s.name, s.kind, len(s), s.motion_compensated) == ("2011_09_26_drive_0005_sync", "kitti-raw", 6, True)
+    assert (s.name, s.kind, len(s), s.motion_compensated) == ("2011_09_26_drive_0005_sync", "kitti-raw", 6, False)
     assert s.stamps_ns[0] == 1317042272_000000000
-    assert s.scan(0).times is None
+    assert s.scan(0).times is not None
     assert said(s.notes, "scan i goes with OXTS sample i")
-    assert said(
-        s.notes, "motion compensated: yes (KITTI raw sync drives count as motion compensated; motion_compensated ="
-    )
+    assert said(s.notes, "motion compensated: no (KITTI's raw drives are distorted; motion_compensated = true")
     assert s.problems == []
     assert s.calibration.T_lidar_imu is not None
     assert s.calibration.T_cam0_lidar is not None
@@ -65,8 +63,8 @@ def test_velodyne_stamps_are_used_when_they_are_there(tmp_path: Path) -> None:
 def test_untwisted_scans_keep_the_stamp_of_the_scanner_looking_ahead(tmp_path: Path) -> None:
     """OXTS, cameras and whoever pairs pose i with sample i mean that instant: times lie about it."""
     folder = raw_drive(tmp_path)
-    s = open_sequence(folder, motion_compensated=False)
-    np.testing.assert_array_equal(s.stamps_ns, open_sequence(folder).stamps_ns)
+    s = open_sequence(folder)
+    np.testing.assert_array_equal(s.stamps_ns, open_sequence(folder, motion_compensated=True).stamps_ns)
     scan = s.scan(0)
     assert scan.times is not None
     np.testing.assert_allclose(scan.span, (-0.05, 0.05), atol=1e-3)
@@ -75,7 +73,7 @@ def test_untwisted_scans_keep_the_stamp_of_the_scanner_looking_ahead(tmp_path: P
     np.testing.assert_allclose(scan.times, -0.05 * azimuth / np.pi, atol=1e-7)
     lines = "".join(f"2011-09-26 13:04:32.{k * 100 + 3:03d}000001\n" for k in range(6))
     (folder / "velodyne_points" / "timestamps.txt").write_text(lines)
-    assert open_sequence(folder, motion_compensated=False).stamps_ns[1] == 1317042272_103000001
+    assert open_sequence(folder).stamps_ns[1] == 1317042272_103000001
 
 
 @pytest.mark.parametrize(("kind", "begin"), [("sync", -0.05), ("extract", 0.0)])
@@ -84,7 +82,7 @@ def test_stamps_that_the_user_names_are_taken_as_they_are(tmp_path: Path, kind: 
     lines = "".join(f"2011-09-26 13:04:32.{k * 100 + 3:03d}000000\n" for k in range(6))
     (folder / "timestamps.txt").write_text(lines)
     write_sequence_toml(folder / "sequence.toml", SequenceInfo(stamps="timestamps.txt"))
-    s = open_sequence(folder, motion_compensated=False)
+    s = open_sequence(folder)
     assert s.stamps_ns[1] == 1317042272_103000000
     np.testing.assert_allclose(s.scan(1).span, (begin, begin + 0.1), atol=1e-3)
 
@@ -107,7 +105,7 @@ def test_stamps_and_sweeps_by_the_files_that_are_there(
         lines = "".join(f"2011-09-26 13:04:32.{k * 100 + shift:03d}000000\n" for k in range(6))
         if name in files:
             (folder / "velodyne_points" / f"timestamps{name}.txt").write_text(lines)
-    s = open_sequence(folder, motion_compensated=False)
+    s = open_sequence(folder)
     assert s.stamps_ns[1] == 1317042272_000000000 + stamp * 10**6
     assert said(s.notes, "half a sweep") == bool(words)
     assert said(s.notes, words)
@@ -117,7 +115,7 @@ def test_stamps_and_sweeps_by_the_files_that_are_there(
 
 def test_compensated_scans_keep_the_instant_of_their_stamps(tmp_path: Path) -> None:
     folder = raw_drive(tmp_path)
-    s = open_sequence(folder)
+    s = open_sequence(folder, motion_compensated=True)
     assert s.motion_compensated is True
     assert s.stamps_ns[0] == 1317042272_000000000
     assert s.scan(0).times is None
@@ -125,7 +123,7 @@ def test_compensated_scans_keep_the_instant_of_their_stamps(tmp_path: Path) -> N
     for name, shift in (("timestamps", 50), ("timestamps_start", 0)):
         lines = "".join(f"2011-09-26 13:04:32.{k * 100 + shift:03d}000000\n" for k in range(6))
         (folder / "velodyne_points" / f"{name}.txt").write_text(lines)
-    assert open_sequence(folder).stamps_ns[1] == 1317042272_150000000
+    assert open_sequence(folder, motion_compensated=True).stamps_ns[1] == 1317042272_150000000
 
 
 @pytest.mark.parametrize(("late", "evened"), [(0.0, True), (0.02, False)])
@@ -137,7 +135,7 @@ def test_stamps_of_the_nearest_oxts_samples_are_evened_out(tmp_path: Path, late:
     nearest = np.round(true, 2)
     assert 4e-3 < np.abs(nearest - true).max() < 5.1e-3
     (folder / "oxts" / "timestamps.txt").write_text("".join(f"2011-09-26 13:04:{t:012.9f}\n" for t in nearest))
-    s = open_sequence(folder, motion_compensated=False)
+    s = open_sequence(folder)
     assert said(s.notes, "evened out") == evened
     taken = s.stamps_ns - 1317042240_000000000
     if evened:
