@@ -5,7 +5,7 @@
 
 A VLP-16 stands 2.5 s, then drives off. ATE over positions, first pose on the first true pose, no other alignment: what
 slips at the start counts. A run is lost when that exceeds a twentieth of the path. Recordings are looked up by the names of
-../shared/data; rings are every second or fourth of the sensor's.
+../shared/data and untwisted; rings are then every second or fourth of the sensor's.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from accuracy import Case, ate, rotation_rpe
+from accuracy import Case, ate, rotation_rpe, untwisted
 from numpy.typing import NDArray
 from peers import PEERS, drive
 
@@ -49,11 +49,12 @@ def thinned(folder: Path) -> Iterator[Case]:
         if not path.is_dir():
             continue
         sequence = open_sequence(path)
-        scans = [sequence.scan(i) for i in range(len(sequence))]
-        rule, known = decide_rings(scans[:3]), sequence.ground_truth
+        rule, known = decide_rings([sequence.scan(i) for i in range(3)]), sequence.ground_truth
+        rings = [rule.rings_of(sequence.scan(i)) for i in range(len(sequence))]
+        scans = untwisted(sequence)
         poses = read_trajectory(path / "reference_lidar.tum").poses if known is None or name == "0005" else known.poses
         for step in (1, 2, 4):
-            yield f"{name} {64 // step} rings", [_thin(s, rule.rings_of(s), step) for s in scans], poses
+            yield f"{name} {64 // step} rings", [_thin(s, r, step) for s, r in zip(scans, rings, strict=True)], poses
 
 
 def _thin(scan: Scan, rings: NDArray[np.uint16], step: int) -> NDArray[np.float32]:
