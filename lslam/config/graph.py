@@ -46,6 +46,9 @@ class GraphConfig(Section):
     )
     floor_m: float = Field(0.1, gt=0, description="m; one sigma of the floor's distance")
     floor_deg: float = Field(1.0, gt=0, description="deg; one sigma of the floor's direction")
+    planar: bool = Field(
+        False, description="a graph of two dimensions: odometry's height, roll and pitch stay as they are"
+    )
     information: Literal["registration", "fitness"] = Field(
         "registration",
         description="covariances of constraints: of the registrations, or from how far the points of one keyframe lie from the "

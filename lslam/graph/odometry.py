@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from lslam.config.graph import GraphConfig
 from lslam.geometry import noise, se3, so3
 from lslam.graph.drift import drift_covariance
+from lslam.graph.factors import PLANAR
 from lslam.types.constraint import Constraint
 from lslam.types.keyframe import Keyframe
 from lslam.types.scan_result import ScanResult
@@ -43,8 +44,16 @@ def odometry_constraints(
         else:
             grown = growth(a, b, after.distance - before.distance, config)
             covariance = noise.rotated(grown, a.T_world_lidar[:3, :3].T)
+        covariance = in_plane(covariance) if config.planar else covariance
         constraints.append(Constraint(before.number, after.number, T, covariance, "odometry"))
     return constraints
+
+
+def in_plane(covariance: Floats) -> Floats:
+    """The covariance (6, 6) of a step of a graph of two dimensions: height, roll and pitch are as measured."""
+    flat = np.diag(np.repeat([LEAST_M**2, LEAST_RAD**2], 3))
+    flat[np.ix_(PLANAR, PLANAR)] = covariance[np.ix_(PLANAR, PLANAR)]
+    return flat
 
 
 def fitness_score(seen: NDArray[np.float32], other: NDArray[np.float32], T: Floats) -> float:

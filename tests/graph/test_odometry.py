@@ -125,3 +125,15 @@ def test_covariances_of_scans_grow_from_their_keyframe() -> None:
     np.testing.assert_allclose(final[0].covariance, known[0] + OWN, atol=1e-12)
     for result in final:
         assert np.linalg.eigvalsh(result.covariance).min() > 0
+
+
+def test_a_graph_of_two_dimensions_keeps_height_roll_and_pitch_as_they_are() -> None:
+    results = results_of(POSES)
+    keyframes = keyframes_of(results)
+    free = odometry_constraints(keyframes, results, GraphConfig())
+    flat = odometry_constraints(keyframes, results, GraphConfig(planar=True))
+    plane, other = [0, 1, 5], [2, 3, 4]
+    for a, b in zip(free, flat, strict=True):
+        np.testing.assert_allclose(b.covariance[np.ix_(plane, plane)], a.covariance[np.ix_(plane, plane)])
+        assert (np.sqrt(np.diag(b.covariance)[other]) <= [1e-3, 1e-4, 1e-4]).all()
+        assert not b.covariance[np.ix_(plane, other)].any()

@@ -193,8 +193,8 @@ def test_the_baseline_runs_whole(tmp_path: Path) -> None:
     poses, _ = true_poses()
     found = read_trajectory(folder / "trajectory.tum").poses
     length = np.linalg.norm(found[-1, :2, 3] - found[0, :2, 3])
-    # Its odometry claims metres per step, as much as each building does: these drag it, by 2.8 m of 26.
-    assert length == pytest.approx(np.linalg.norm(poses[29, :2, 3] - poses[0, :2, 3]), abs=4.0)
+    # Its odometry claims metres per step, as much as each building does: these drag it.
+    assert length == pytest.approx(np.linalg.norm(poses[29, :2, 3] - poses[0, :2, 3]), abs=1.0)
 
 
 def test_the_improved_system_lays_walls_of_single_scans_and_holds_the_start(tmp_path: Path) -> None:
