@@ -85,7 +85,7 @@ def _placed(
         results, up = given.results, None if up is None else graph.world_up
     elif results is None:
         results = bent(given.results, keyframes, graph.poses)
-    placement = place(sequence, results, keyframes, up, config.gnss, config.graph)
+    placement = place(sequence, results, keyframes, up, graph, config)
     if placement.problem and placement.problem not in given.problems:
         given.problems.append(placement.problem)
     return placement

@@ -9,13 +9,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.config.config import Config
 from lslam.config.gnss import GnssConfig
 from lslam.config.graph import GraphConfig
 from lslam.errors import InputError
 from lslam.geometry import geodesy, noise, se3, so3
 from lslam.geometry.interpolate import poses_at
 from lslam.graph.alignment import Alignment, align
-from lslam.graph.fix_noise import Wander, wander_of
+from lslam.graph.drift import chains, drift_covariance
+from lslam.graph.fix_noise import DriftOfFixes, Wander, wander_of
 from lslam.graph.problem import PoseGraph, PositionFix
 from lslam.maps.georeference import Projection
 from lslam.types.georeference import Georeference
@@ -60,12 +62,14 @@ class Fixes:
 class Placement:
     """A georeference and, for the graph, the fixes as positions and what they err by in common.
 
+    walk : factor on the drift of odometry, as fixes tell it
     problem : why there is none, or what was left out
     """
 
     georeference: Georeference | None = None
     fixes: tuple[PositionFix, ...] = ()
     wander: Wander | None = None
+    walk: float = 0.0
     problem: str = ""
 
 
@@ -93,35 +97,35 @@ def require_crs(origin: Floats, config: GnssConfig) -> None:
 
 
 def place(
-    sequence: Sequence, results: Many[ScanResult], keyframes: Many[Keyframe], up: Floats | None, config: GnssConfig,
-    drift: GraphConfig,
+    sequence: Sequence, results: Many[ScanResult], keyframes: Many[Keyframe], up: Floats | None, graph: PoseGraph,
+    config: Config,
 ) -> Placement:  # fmt: skip
     """Fit the run's trajectory to its fixes.
 
-    up : (3,) up in the world of the trajectory as an IMU has it, or None; drift : what odometry may be wrong by
+    up : (3,) up in the world of the trajectory as an IMU has it, or None; graph : of the keyframes, without the fixes
     """
     stream = sequence.gnss
     assert stream is not None
     T_lidar_gnss = sequence.calibration.T_lidar_gnss
     arm = np.zeros(3) if T_lidar_gnss is None else T_lidar_gnss[:3, 3]
-    fixes = _usable(stream, results, arm, config, drift)
+    fixes = _usable(stream, results, arm, config.gnss, config.graph)
     if isinstance(fixes, str):
         return Placement(problem=fixes)
     direction, sigma = (np.array([0.0, 0, 1.0]), UNLEVELLED) if up is None else (up, LEVELLED)
-    found = align(fixes.antenna, fixes.positions, fixes.sigmas, fixes.slack, direction, sigma, config.min_fixes)
+    found = align(fixes.antenna, fixes.positions, fixes.sigmas, fixes.slack, direction, sigma, config.gnss.min_fixes)
     if found is None:
         return Placement(
-            problem=f"GNSS: no place and heading on the Earth fits half of {fixes.given} fixes, and {config.min_fixes} at the "
-            "least (gnss.min_fixes): all rejected"
+            problem=f"GNSS: no place and heading on the Earth fits half of {fixes.given} fixes, and "
+            f"{config.gnss.min_fixes} at the least (gnss.min_fixes): all rejected"
         )
-    georeference, shift = _at_first(found, fixes, config)
+    georeference, shift = _at_first(found, fixes, config.gnss)
     log.info(
         "GNSS: %d of %d fixes believed, %.2f m rms from the antenna horizontally, %.2f m vertically",
         georeference.used, georeference.fixes, georeference.rmse_horizontal, georeference.rmse_vertical,
     )  # fmt: skip
-    wander = _wander(fixes, found, drift)
+    wander, walk = _wander(fixes, found, keyframes, graph, config.graph)
     factors = _as_factors(fixes, found, shift, results, keyframes, arm, wander)
-    return Placement(georeference, factors, wander, _elsewhere(found))
+    return Placement(georeference, factors, wander, walk, _elsewhere(found))
 
 
 def on_earth(graph: PoseGraph, placement: Placement) -> PoseGraph:
@@ -132,7 +136,7 @@ def on_earth(graph: PoseGraph, placement: Placement) -> PoseGraph:
     up = np.array([0.0, 0.0, 1.0])
     return replace(
         graph, poses=T @ graph.poses, fixes=placement.fixes, world_up=up, is_anchored=False, spread=spread,
-        wander=placement.wander,
+        wander=placement.wander, walk=max(graph.walk, placement.walk),
     )  # fmt: skip
 
 
@@ -199,21 +203,40 @@ def _elsewhere(found: Alignment) -> str:
     )
 
 
-def _wander(fixes: Fixes, found: Alignment, config: GraphConfig) -> Wander | None:
-    """What the fixes err by together, from those that are believed; None where nobody stated what they err by at all."""
+def _wander(
+    fixes: Fixes, found: Alignment, keyframes: Many[Keyframe], graph: PoseGraph, config: GraphConfig
+) -> tuple[Wander | None, float]:
+    """What the fixes err by together, and the factor on odometry's drift, from those that are believed.
+
+    Nothing where nobody stated what they err by at all.
+    """
     good = found.believed
     if not fixes.is_stated:
-        return None
-    wander = wander_of(
+        return None, 0.0
+    known, unit = (noise.rotated(chain, found.T_enu_world[:3, :3]) for chain in chains(graph, config))
+    metre = drift_covariance(1.0, config)
+    drift = DriftOfFixes(known + graph.walk * unit, unit, metre, _owners(fixes, keyframes)[good])
+    wander, walk = wander_of(
         1e-9 * (fixes.stamps_ns[good] - fixes.stamps_ns[0]), found.residuals[good], fixes.sigmas[good],
-        (fixes.positions - found.residuals)[good], config.probability,
+        (fixes.positions - found.residuals)[good], config.probability, drift,
     )  # fmt: skip
     if wander is not None:
         log.info(
             "GNSS: fixes scatter by less than they state; they are taken to err by %.2f m together, for %.0f s",
             wander.sigma[0], wander.memory,
         )  # fmt: skip
-    return wander
+    if walk > 0:
+        log.info(
+            "GNSS: odometry drifts by more than it says, by about %.2f m after 100 m",
+            np.sqrt(walk * drift_covariance(100.0, config)[0, 0]),
+        )  # fmt: skip
+    return wander, walk
+
+
+def _owners(fixes: Fixes, keyframes: Many[Keyframe]) -> NDArray[np.intp]:
+    """(F,) the keyframe before each fix."""
+    stamps = np.array([k.stamp_ns for k in keyframes], np.int64)
+    return np.clip(np.searchsorted(stamps, fixes.stamps_ns, side="right") - 1, 0, None)
 
 
 def _as_factors(
@@ -222,8 +245,7 @@ def _as_factors(
 ) -> tuple[PositionFix, ...]:  # fmt: skip
     """Positions of the antenna as seen from the keyframe before each fix, the absurd ones left out."""
     near = np.linalg.norm(found.residuals / np.hypot(fixes.sigmas, fixes.slack[:, None]), axis=1) < ABSURD
-    stamps = np.array([k.stamp_ns for k in keyframes], np.int64)
-    owners = np.clip(np.searchsorted(stamps, fixes.stamps_ns, side="right") - 1, 0, None)
+    owners = _owners(fixes, keyframes)
     positions = se3.apply(shift, fixes.positions)
     seconds = 1e-9 * (fixes.stamps_ns - fixes.stamps_ns[0])
     out = []

@@ -8,17 +8,33 @@ import pytest
 from numpy.typing import NDArray
 
 from lslam.geometry import se3
-from lslam.graph import factors
+from lslam.graph import factors, fix_noise
 from lslam.graph.alignment import align
-from lslam.graph.fix_noise import Wander, wander_of
+from lslam.graph.fix_noise import DriftOfFixes, Wander, wander_of
 from lslam.graph.problem import PositionFix
 
 Floats = NDArray[np.float64]
 VERTICAL = np.array([1.0, 1.0, 1.8])
 
 
-def fixes(count: int, gap: float, white: float, slow: float, memory: float, seed: int) -> Wander | None:
-    """What is found of fixes about a drive at 5 m/s along an arc, stated as they err."""
+METRE = np.diag([1e-4] * 3 + [np.radians(0.5) ** 2 / 1e4] * 3)
+
+
+def drift_of(path: Floats) -> DriftOfFixes:
+    """Odometry that claims a millimetre a metre, and a walk of factor 1 along `path` (F, 3), from fix to fix."""
+    steps = np.diff(path, axis=0)
+    unit = np.zeros((len(path), 6, 6))
+    for i, step in enumerate(steps):
+        J = np.eye(6)
+        J[:3, 3:] = [[0, step[2], -step[1]], [-step[2], 0, step[0]], [step[1], -step[0], 0]]
+        unit[i + 1] = J @ unit[i] @ J.T + np.linalg.norm(step) * METRE
+    return DriftOfFixes(1e-2 * unit, unit, METRE, np.arange(len(path)))
+
+
+def fixes(
+    count: int, gap: float, white: float, slow: float, memory: float, seed: int, percent: float = 0.0
+) -> tuple[Wander | None, float]:
+    """What is found of fixes about a drive at 5 m/s along an arc, stated as they err; odometry runs off by `percent`, east."""
     rng = np.random.default_rng(seed)
     seconds = gap * np.arange(count)
     error, kept = slow * rng.normal(size=(count, 3)), np.exp(-gap / memory)
@@ -27,14 +43,15 @@ def fixes(count: int, gap: float, white: float, slow: float, memory: float, seed
     error = (error + white * rng.normal(size=error.shape)) * VERTICAL
     path = 60 * np.column_stack([np.cos(seconds / 12), np.sin(seconds / 12), 0 * seconds])
     sigmas = np.tile(np.hypot(white, slow) * VERTICAL, (count, 1))
-    found = align(path, path + error, sigmas, np.zeros(count), np.array([0.0, 0, 1]), 0.01, 5)
+    run_off = path + np.column_stack([0.01 * percent * 5 * seconds, np.zeros((count, 2))])
+    found = align(run_off, path + error, sigmas, 0.01 * percent * 5 * seconds, np.array([0.0, 0, 1]), 0.01, 5)
     assert found is not None
-    return wander_of(seconds, found.residuals, sigmas, path, 0.999)
+    return wander_of(seconds, found.residuals, sigmas, path, 0.999, drift_of(run_off))
 
 
 @pytest.mark.parametrize(("count", "gap"), [(30, 1.0), (300, 0.2)])
 def test_fixes_that_scatter_as_they_state_err_alone(count: int, gap: float) -> None:
-    assert [fixes(count, gap, 1.0, 0.0, 100.0, seed) for seed in range(12)] == [None] * 12
+    assert [fixes(count, gap, 1.0, 0.0, 100.0, seed) for seed in range(12)] == [(None, 0.0)] * 12
 
 
 @pytest.mark.parametrize(
@@ -44,7 +61,7 @@ def test_fixes_that_scatter_as_they_state_err_alone(count: int, gap: float) -> N
 def test_the_common_part_and_its_memory_are_found(
     count: int, gap: float, white: float, slow: float, memory: float
 ) -> None:
-    found = [fixes(count, gap, white, slow, memory, seed) for seed in range(5)]
+    found = [fixes(count, gap, white, slow, memory, seed)[0] for seed in range(5)]
     assert all(f is not None for f in found)
     np.testing.assert_allclose([f.sigma for f in found if f], [slow * VERTICAL] * 5, rtol=0.12)
     assert memory / 2 < np.median([f.memory for f in found if f]) < 2 * memory
@@ -55,7 +72,8 @@ def test_fixes_that_are_wrong_hide_nothing_from_the_others() -> None:
     seconds = np.arange(200.0)
     residuals = 0.8 + 0.3 * rng.normal(size=(200, 3))
     residuals[::7] += [0.0, 33.0, 0.0]
-    found = wander_of(seconds, residuals, np.full((200, 3), 0.85), 5 * rng.normal(size=(200, 3)).cumsum(0), 0.999)
+    path = 5 * rng.normal(size=(200, 3)).cumsum(0)
+    found, _ = wander_of(seconds, residuals, np.full((200, 3), 0.85), path, 0.999, drift_of(path))
     assert found is not None
     assert found.sigma[0] == pytest.approx(0.8, abs=0.05)
     assert not set(found.seconds.tolist()) & set(seconds[::7].tolist())
@@ -63,16 +81,48 @@ def test_fixes_that_are_wrong_hide_nothing_from_the_others() -> None:
 
 def test_nothing_is_told_of_fixes_out_of_order_or_alone() -> None:
     flat, one = np.zeros((3, 3)), np.ones((3, 3))
-    assert wander_of(np.array([0.0, 1.0, 1.0]), flat, one, flat, 0.999) is None
-    assert wander_of(np.zeros(1), flat[:1], one[:1], flat[:1], 0.999) is None
+    assert wander_of(np.array([0.0, 1.0, 1.0]), flat, one, flat, 0.999, drift_of(flat)) == (None, 0.0)
+    assert wander_of(np.zeros(1), flat[:1], one[:1], flat[:1], 0.999, drift_of(flat[:1])) == (None, 0.0)
 
 
 def test_perfect_fixes_have_a_memory() -> None:
     seconds = np.arange(60.0)
     path = np.column_stack([seconds, seconds**2 / 60, 0 * seconds])
-    found = wander_of(seconds, np.zeros((60, 3)), np.ones((60, 3)), path, 0.999)
+    found, walk = wander_of(seconds, np.zeros((60, 3)), np.ones((60, 3)), path, 0.999, drift_of(path))
     assert found is not None
     assert found.memory > 60
+    assert walk == 0
+
+
+@pytest.mark.parametrize(("percent", "drifts"), [(0.0, (0, 0)), (0.3, (0, 12)), (3.0, (11, 12))])
+def test_odometry_drifts_where_fixes_cannot_err_so_much(percent: float, drifts: tuple[int, int]) -> None:
+    """Fixes wander by 0.8 m for two minutes; within a drive of 450 m odometry runs off by nothing, as much, or 13 m."""
+    walks = [fixes(90, 1.0, 0.3, 0.8, 120.0, seed, percent)[1] for seed in range(12)]
+    assert drifts[0] <= sum(walk > 0 for walk in walks) <= drifts[1]
+    if percent == 3.0:
+        # After the way of 445 m a walk of that factor comes to as much.
+        at_end = np.sqrt(np.median(walks) * METRE[0, 0] * 445)
+        assert 13.0 / 4 < at_end < 13.0 * 4
+
+
+def test_what_an_early_place_errs_by_a_later_one_errs_by_too() -> None:
+    """Against drives drawn step by step; rates that last come to the walk's size at the end of the way."""
+    angle = np.linspace(0, 2, 6)
+    path = np.column_stack([40 * np.cos(angle), 40 * np.sin(angle), 3 * angle])
+    rng = np.random.default_rng(0)
+    root = np.linalg.cholesky(1e4 * METRE)
+    drawn = np.zeros((20_000, 6, 3))
+    turn = np.zeros((20_000, 3))
+    for i, step in enumerate(np.diff(path, axis=0)):
+        d = np.sqrt(np.linalg.norm(step)) * rng.normal(size=(20_000, 6)) @ root.T
+        drawn[:, i + 1] = drawn[:, i] + np.cross(turn, step) + d[:, :3]
+        turn += d[:, 3:]
+    flat = drawn.reshape(20_000, -1)
+    expected = 1e4 * fix_noise._shared(drift_of(path).unit, np.arange(6), path)
+    np.testing.assert_allclose(flat.T @ flat / 20_000, expected, atol=0.04 * expected.max())
+    way = np.linalg.norm(np.diff(path, axis=0), axis=1).sum()
+    lasting = fix_noise._lasting(np.diag([1e-4] * 3 + [0.0] * 3), path)
+    np.testing.assert_allclose(np.diag(lasting)[-3:], 1e-4 * way)
 
 
 def test_the_graph_has_the_covariance_of_the_process() -> None:

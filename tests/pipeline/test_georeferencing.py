@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 from stub_sequences import Stub
 
+from lslam.config import Config
 from lslam.config.gnss import GnssConfig
-from lslam.config.graph import GraphConfig
 from lslam.errors import InputError, UsageError
 from lslam.geometry import geodesy, se3, so3
+from lslam.graph.odometry import odometry_constraints
+from lslam.graph.problem import PoseGraph
 from lslam.pipeline.georeferencing import place, require_gnss
 from lslam.types.calibration import Calibration
 from lslam.types.gnss import GnssStream
@@ -52,8 +54,10 @@ def error_on_earth(found, points: np.ndarray, truth: np.ndarray) -> np.ndarray:
 
 
 def fit(sequence: Stub, up: np.ndarray | None = None, **settings: object):
-    config = GnssConfig.model_validate({"mode": "fit", **settings})
-    return place(sequence, RESULTS, KEYFRAMES, up, config, GraphConfig())
+    config = Config.model_validate({"gnss": {"mode": "fit", **settings}})
+    poses = np.stack([k.T_world_lidar for k in KEYFRAMES])
+    graph = PoseGraph(poses, odometry_constraints(KEYFRAMES, RESULTS, config.graph))
+    return place(sequence, RESULTS, KEYFRAMES, up, graph, config)
 
 
 def test_perfect_fixes_give_the_place_to_millimetres() -> None:
