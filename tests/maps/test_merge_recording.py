@@ -1,8 +1,7 @@
-"""The merged map of a real recording, against NumPy and the clock."""
+"""The merged map of a real recording, against NumPy; `tests/benchmarks/waits.py` has what it takes."""
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -21,20 +20,18 @@ def pack(cells: NDArray[np.float64]) -> NDArray[np.int64]:
     return np.asarray((x << 40) | (y << 20) | z)
 
 
-def test_a_recording_merges_as_in_numpy_and_quickly(recordings: Callable[[str], Path]) -> None:
+def test_a_recording_merges_as_in_numpy(recordings: Callable[[str], Path]) -> None:
     drive = recordings("kitti_raw_0048") / "2011_09_26" / "2011_09_26_drive_0048_sync"
     poses = read_trajectory(drive / "reference_lidar.tum").poses
     files = sorted((drive / "velodyne_points" / "data").glob("*.bin"))
     scans = [np.fromfile(file, np.float32).reshape(-1, 4) for file in files]
     assert len(scans) == len(poses) == 22
 
-    merger, seconds = MapMerger(0.2, 2.0, 80.0), []
+    merger = MapMerger(0.2, 2.0, 80.0)
     world = []
     for scan, T in zip(scans, poses, strict=True):
         points, intensity = np.ascontiguousarray(scan[:, :3]), np.ascontiguousarray(scan[:, 3])
-        began = time.perf_counter()
         merger.add(points, T, intensity)
-        seconds.append(time.perf_counter() - began)
         distance = np.linalg.norm(points.astype(np.float64), axis=1)
         world.append(se3.apply(T, points[(distance >= 2.0) & (distance <= 80.0)]))
     merged = merger.result()
@@ -50,7 +47,6 @@ def test_a_recording_merges_as_in_numpy_and_quickly(recordings: Callable[[str], 
     np.testing.assert_allclose(merged.points[ours][same], means[theirs][same], atol=1e-6)
     assert merged.intensity is not None
     assert 0.0 <= merged.intensity.min() <= merged.intensity.max() <= 1.0
-    assert np.median(seconds) < 0.05, "120,000 points take 4 to 7 ms on two slow cores"
 
     image, (x0, x1, y0, y1) = top_view(merged.points)
     assert x0 < poses[0, 0, 3] < x1

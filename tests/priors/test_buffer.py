@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+import queue
 import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -96,15 +98,25 @@ def test_a_new_circle_is_asked_for_only_outside_the_sixty_metres() -> None:
     np.testing.assert_allclose(widths, 240, rtol=0.01)
 
 
-def test_a_server_that_sleeps_costs_the_caller_nothing() -> None:
+def test_a_server_that_sleeps_costs_the_caller_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its one open request is never answered, and nobody but the buffer's own thread ever waits for a message."""
+    caller, waits = threading.get_ident(), list[float | None]()
+
+    class Watched(queue.SimpleQueue[Any]):
+        def get(self, block: bool = True, timeout: float | None = None) -> Any:
+            if block and self.empty() and threading.get_ident() == caller:
+                waits.append(timeout)
+            return super().get(block, timeout)
+
+    monkeypatch.setattr("lslam.priors.buffer.queue", SimpleNamespace(SimpleQueue=Watched, Empty=queue.Empty))
     server = Server()
-    began = time.perf_counter()
     with OsmBuffer(server, ORIGIN, OsmConfig()) as buffer:
         for position in DRIVE:
             assert near(buffer, position) == []
-        spent = time.perf_counter() - began
+        assert waits == []
         assert not buffer.wait(0.1)
-    assert spent < 0.5
+        assert sum(seconds or 0.0 for seconds in waits) == pytest.approx(0.1)
+    assert len(server.asked) == 1
     server.gate.release(100)
 
 
