@@ -9,13 +9,15 @@ import pytest
 from numpy.typing import NDArray
 
 from lslam.geometry import so3
-from lslam.inertial.gyroscope import BIAS_WALK, RATE_NOISE, Gyroscope
+from lslam.inertial.gyroscope import Gyroscope
 from lslam.inertial.integrate import Increments, integrate
 from lslam.inertial.kalman import update
 from lslam.types.imu import ImuStream
 
 Floats = NDArray[np.float64]
 
+# rad/s per sqrt(Hz) of the best device that is thought of, and rad/s per sqrt(s) that Kalibr has of an ADIS16448's bias.
+RATE_NOISE, BIAS_WALK = np.deg2rad(0.01), np.deg2rad(0.001)
 BIAS = np.array([0.08, -0.05, 0.03])
 SKEW = np.eye(3) + np.array([[0.01, -0.02, 0.015], [0.02, -0.01, 0.02], [-0.015, 0.02, 0.005]])
 STEP_NS, SAMPLE_NS = 200_000_000, 5_000_000

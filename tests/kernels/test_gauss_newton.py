@@ -11,6 +11,8 @@ from lslam.kernels import facts as at
 from lslam.kernels import gauss_newton
 
 Floats = NDArray[np.float64]
+# Of what makes a direction weak: with less of it, it is not followed either.
+UNSEEN = 0.3
 
 
 def solve(
@@ -20,7 +22,7 @@ def solve(
     information = float(np.trace(H[:3, :3]))
     facts = np.zeros(at.COUNT)
     facts[[at.INFORMATION, at.LEVER]] = information, information * lever**2
-    count = gauss_newton.solve_observed(H, g, facts, weak_share, least, gauss_newton.UNSEEN, d, weak)
+    count = gauss_newton.solve_observed(H, g, facts, weak_share, least, UNSEEN, d, weak)
     return d, weak[:count]
 
 
@@ -61,7 +63,7 @@ def test_the_share_of_information_draws_the_line() -> None:
 
 def test_so_does_the_least_that_is_asked_for() -> None:
     H = np.diag([1.0, 1.0, 1e-2, 1.0, 1.0, 1.0])
-    for least, expected, is_followed in [(5e-3, 0, True), (2e-2, 1, True), (5e-2, 1, False)]:
+    for least, expected, is_followed in [(0.9e-2, 0, True), (1.1e-2, 1, True), (3.2e-2, 1, True), (3.5e-2, 1, False)]:
         d, weak = solve(H, np.ones(6), least=least)
         assert len(weak) == expected
         assert d[2] == pytest.approx(-1e2 if is_followed else 0.0)
@@ -91,7 +93,7 @@ def step(
         population,
     )
     sums = np.triu(H), np.triu(H if S is None else S), g.copy(), facts
-    limits = 1e-9, 0.0, gauss_newton.UNSEEN, S is not None
+    limits = 1e-9, 0.0, UNSEEN, S is not None
     none = np.zeros((0, 6))
     moved, count, move, turn = gauss_newton.step(
         pose, sums, scale, limits, none if allowed is None else allowed, d, weak
@@ -147,6 +149,10 @@ def test_a_long_step_is_cut_and_one_that_is_no_number_not_made() -> None:
     H, g = np.eye(6), np.array([-30.0, 0, 0, 0, 0, 0])
     assert step(H, g, scale=1.0)[1][0] == pytest.approx(2.0)
     assert step(H, g, scale=0.1)[1][0] == pytest.approx(1.0)
+    for scale, reach in ((3.0, 6.0), (0.6, 1.2), (0.4, 1.0)):
+        for share, moved in ((0.95, 0.95), (1.05, 1.0), (50.0, 1.0)):
+            g[0] = -share * reach
+            assert step(H, g, scale=scale)[1][0] == pytest.approx(moved * reach)
     _, t, moved, _, _ = step(H, np.array([np.nan, 0, 0, 0, 0, 0]))
     assert not moved
     np.testing.assert_array_equal(t, 0.0)

@@ -16,6 +16,8 @@ from lslam.registration.optimiser import slots_of
 
 Floats = NDArray[np.float64]
 SIZE, SIGMA2 = 1.0, 1e-3
+# A direction that is off by two sigma.
+TILT = 2.0**2
 
 
 class LineScene:
@@ -75,7 +77,7 @@ class LineScene:
             if not choices:
                 continue
             mean, u, across, tilt = min(choices, key=lambda line: float(np.linalg.norm(x - line[0])))
-            variance = across + SIGMA2 + lines.TILT * tilt * float((x - mean) @ u) ** 2
+            variance = across + SIGMA2 + TILT * tilt * float((x - mean) @ u) ** 2
             found.append(Match(s, mean, np.eye(3) - np.outer(u, u), variance))
         return found
 

@@ -8,12 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from numpy_residuals import GemanMcClure, Magnusson, Pair, disc_pairs, ndt_pairs, point_pairs
+from numpy_residuals import EXTENT2, GemanMcClure, Magnusson, Pair, disc_pairs, ndt_pairs, point_pairs
 from numpy_voxels import VoxelMap
 
 from lslam.geometry import so3
 from lslam.kernels import facts as at
-from lslam.kernels.discs import EXTENT2, source_discs
+from lslam.kernels.discs import source_discs
 from lslam.preprocessing.prepare import PreparedPoints
 from lslam.registration.gaussian_map import GaussianMap
 from lslam.registration.optimiser import Matches

@@ -18,6 +18,8 @@ from lslam.registration.optimiser import Matches, slots_of
 
 Floats = NDArray[np.float64]
 SIZE, SIGMA2, BLOB, ALONG = 0.8, 9e-4, 0.5, 0.03
+# A normal that is off by two sigma.
+TILT = 2.0**2
 
 
 @dataclass
@@ -33,7 +35,7 @@ class Scene:
     def matches(self, blob_weight: float = BLOB, along: float = ALONG) -> list[Match]:
         p = self.points
         return matches(
-            self.reference, p.source, p.scatter, self.R, self.t, SIGMA2, blob_weight, residuals.TILT, along
+            self.reference, p.source, p.scatter, self.R, self.t, SIGMA2, blob_weight, TILT, along
         )  # fmt: skip
 
 

@@ -12,10 +12,12 @@ from numpy.typing import NDArray
 from lslam.errors import ConfigError
 from lslam.geometry import se3, so3
 from lslam.maps.floor_plan import FREE, OCCUPIED, UNKNOWN, floor_plan
-from lslam.maps.occupancy import MODEL, OccupancyGrid, OccupancyMapper
+from lslam.maps.occupancy import OccupancyGrid, OccupancyMapper
 from lslam.pipeline.map_files import write_occupancy
 
-HIT, MISS, LOW, HIGH = MODEL.tolist()
+# OctoMap's (Hornung et al. 2013): a hit is 0.7, a miss 0.4, clamped to 0.12 and 0.97; hundredths of log-odds, the clamps rounded.
+HIT, MISS = (round(100 * np.log(p / (1 - p))) for p in (0.7, 0.4))
+LOW, HIGH = -200, 350
 Cell = tuple[int, ...]
 
 
