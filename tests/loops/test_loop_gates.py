@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from known_town import keyframes_of, pose
+from numpy.typing import NDArray
 
 from lslam.config import load_config
 from lslam.config.loops import LoopsConfig
@@ -79,6 +80,37 @@ def test_a_constraint_is_in_the_axes_of_the_keyframes() -> None:
 
 
 FORWARD = RegistrationResult(pose(3, 1, 20), covariance=np.diag([1e-4] * 3 + [1e-6] * 3))
+
+
+def alike(distances: list[float], apart: float = 20.0, **settings: float) -> list[int]:
+    """Which of older keyframes, `apart` m from each other, are compared with a newer one that looks so much like them."""
+    count = len(distances)
+    poses = np.array([pose(apart * k, 0) for k in range(count)] + [pose(500, 0), pose(0, 0)])
+    keyframes = keyframes_of(poses)
+    chooser = Detector(keyframes, lambda _: np.zeros((0, 3), np.float32), LoopsConfig(**settings), RegistrationConfig())  # type: ignore[arg-type]
+
+    class Looks:
+        def __contains__(self, number: int) -> bool:
+            return True
+
+        def nearest(self, number: int, others: NDArray[np.int64], turn: float) -> list[PlaceMatch]:
+            return [
+                PlaceMatch(int(k), distances[int(k)], 0.0)
+                for k in np.array(others)[np.argsort(np.array(distances)[others])]
+            ]
+
+    chooser.index = Looks()  # type: ignore[assignment]
+    return [match.number for match in chooser._choose(count + 1, np.arange(count))[0]]
+
+
+def test_places_half_as_much_again_unlike_the_best_are_no_rivals() -> None:
+    """Odometry is lost after a kilometre, so that looks decide: what looks nearly as much alike must be asked too."""
+    assert alike([0.20, 0.10, 0.145, 0.155]) == [1, 2]
+    assert alike([0.11, 0.10, 0.12, 0.13]) == [1, 0, 2]
+    # Not beyond what may be the same place at all, and not twice what is one place.
+    assert alike([0.20, 0.10, 0.145, 0.155], max_descriptor_distance=0.14) == [1]
+    assert alike([0.20, 0.10, 0.145, 0.155], apart=7.9) == [1]
+    assert alike([0.20, 0.10, 0.145, 0.155], apart=8.1) == [1, 2]
 
 
 def agree(gap: tuple[float, ...], **settings: float) -> Comparison:

@@ -98,6 +98,18 @@ def test_a_pit_does_not_lift_the_ground(cloud: NDArray[np.float32]) -> None:
     assert ((after > 0) & (before == 0)).sum() == 3
 
 
+@pytest.mark.parametrize(("cells", "is_ground"), [(4, False), (7, True)])
+def test_the_ground_is_what_the_lowest_twentieth_stands_on(cells: int, is_ground: bool) -> None:
+    """A floor seen in 100 cells, of which 4 are pits of 5 m, or 7: the floor is 2 m high then, the lift, or 7 m."""
+    angles = (np.arange(10) + 0.5) * 2 * np.pi / 10
+    reach = np.repeat(np.arange(10) + 0.5, 10)
+    z = np.where(np.arange(100) < cells, -6.7, -1.7)
+    points = np.column_stack([reach * np.tile(np.cos(angles), 10), reach * np.tile(np.sin(angles), 10), z])
+    image = describe(points.astype(np.float32), 10, 10, 10.0)
+    np.testing.assert_allclose(image.ravel()[cells:], 7.0 if is_ground else 2.0, atol=1e-5)
+    np.testing.assert_allclose(image.ravel()[:cells], 2.0, atol=1e-5)
+
+
 def test_the_place_is_found_among_more_than_are_compared(cloud: NDArray[np.float32]) -> None:
     """Ring keys choose who is compared: places of other heights per ring are not."""
     rng = np.random.default_rng(2)

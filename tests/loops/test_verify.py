@@ -10,9 +10,13 @@ from numpy.typing import NDArray
 from lslam.config.loops import LoopsConfig
 from lslam.config.registration import RegistrationConfig
 from lslam.geometry import se3
+from lslam.loops import verify
 from lslam.loops.place import Place, make_place
 from lslam.loops.search import find_starts
 from lslam.loops.verify import Comparison, Verifier
+from lslam.preprocessing.prepare import PreparedPoints
+from lslam.registration.gaussian_map import GaussianMap
+from lslam.registration.solver import RegistrationResult, solve
 
 Floats = NDArray[np.float64]
 YAWS = np.deg2rad(np.arange(-10, 11, 2.0))
@@ -90,6 +94,27 @@ def test_survives_places_without_surfaces(points: int) -> None:
     whole = place(world, pose(0, -45), 1)
     for a, b in ((few, whole), (whole, few), (few, few)):
         assert compare(a, b, np.zeros(3), 5.0).reason
+
+
+def test_starts_are_tried_with_a_quarter_of_the_points_and_the_best_refined_with_all(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Counted, since it is work that is saved: a registration of few points tells which start leads anywhere."""
+    a, b = (place(town(), pose(x, -45), x) for x in (5, 7))
+    used: list[int] = []
+
+    def counting(target: GaussianMap, points: PreparedPoints, *given: object, **named: object) -> RegistrationResult:
+        used.append(len(points.source))
+        return solve(target, points, *given, **named)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(verify, "solve", counting)
+    assert compare(a, b, np.zeros(3), 5.0).reason == ""
+    whole = {len(p.source.source) for p in (a, b)} | {len(b.upright.source)}
+    few = [n for n in used if n not in whole]
+    assert len(few) >= 2
+    assert len(few) % 2 == 0
+    assert np.array(few) / len(b.source.source) == pytest.approx(0.25, abs=0.01)
+    assert used.count(len(b.source.source)) >= 2
 
 
 def test_max_rmse_and_overlap_are_heeded() -> None:

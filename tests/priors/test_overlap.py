@@ -149,3 +149,16 @@ def test_what_no_small_move_takes_apart_is_said(caplog: pytest.LogCaptureFixture
     assert found.left == ((0, 1),)
     assert np.array_equal(found.displacements, np.zeros((2, 3)))
     assert "1 pairs of buildings overlap" in caplog.text
+
+
+@pytest.mark.parametrize(("inside", "is_meant"), [(0.45, False), (0.55, True)])
+def test_a_building_that_the_map_puts_mostly_into_another_is_meant_so(inside: float, is_meant: bool) -> None:
+    """A shed of 1 m x 8 m, less or more than half of it in a house: the one is drawn askew, the other is a part."""
+    pair = [house(0, 0, 10, 10, 1), house(10 - inside, 1, 1, 8, 2)]
+    found = remove_overlaps(pair, np.zeros((2, 3)), information([True, False]))
+    assert found.left == ()
+    if is_meant:
+        assert np.array_equal(found.displacements, np.zeros((2, 3)))
+    else:
+        check_apart(pair, found)
+        np.testing.assert_allclose(found.displacements[1], [inside, 0, 0], atol=0.01)

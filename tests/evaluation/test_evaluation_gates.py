@@ -1,0 +1,109 @@
+"""Where the comparison of trajectories draws its lines: just inside and just outside of each."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from evaluation_drives import STEP_NS, drive
+from numpy.typing import NDArray
+
+from lslam.errors import InputError
+from lslam.evaluation.associate import associate
+from lslam.evaluation.frames import main_axis
+from lslam.evaluation.thesis import planar
+from lslam.evaluation.time_offset import estimate_offset
+from lslam.types.trajectory import Trajectory
+
+Floats = NDArray[np.float64]
+
+
+def straight(xy: Floats, yaw: Floats) -> Floats:
+    """Poses (N, 4, 4) at places (N, 2) with headings (N,)."""
+    poses = np.tile(np.eye(4), (len(xy), 1, 1))
+    poses[:, :2, 3] = xy
+    poses[:, 0, 0], poses[:, 0, 1] = np.cos(yaw), -np.sin(yaw)
+    poses[:, 1, 0], poses[:, 1, 1] = np.sin(yaw), np.cos(yaw)
+    return poses
+
+
+def test_the_deviations_of_the_second_thesis_are_those_of_all_poses() -> None:
+    """Errors of 0, 1 and 3 m lie 1.2472 m about their mean when divided by their number; by one less it were 1.5275 m."""
+    truth = straight(np.array([[0.0, 0], [2, 0], [4, 0]]), np.zeros(3))
+    aside = planar(straight(np.array([[0.0, 0], [2, 1], [4, 3]]), np.zeros(3)), truth)
+    assert (aside.ate_mean, aside.ate_std) == pytest.approx((4 / 3, np.sqrt(14) / 3))
+    assert (aside.rpe_translation_mean, aside.rpe_translation_std) == pytest.approx((1.5, 0.5))
+    assert aside.spacing == pytest.approx(2.0)
+    turned = planar(straight(truth[:, :2, 3], np.array([0.0, 0.1, 0.4])), truth)
+    assert (turned.rpe_rotation_mean, turned.rpe_rotation_std) == pytest.approx((0.2, 0.1))
+
+
+@pytest.mark.parametrize(("truth_ms", "is_interpolated"), [(59, True), (61, False)])
+def test_truth_is_interpolated_where_it_is_clearly_denser(truth_ms: int, is_interpolated: bool) -> None:
+    """Estimates lie 100 ms apart: at three fifths of that begins what pays."""
+    truth = drive(400, step_ns=truth_ms * 1_000_000)
+    estimate = drive(150, start_ns=3_000_000)
+    assert ("interpolated" in associate(estimate, truth, max_diff=0.05).recipe) == is_interpolated
+
+
+@pytest.mark.parametrize(("hole_ms", "is_bridged"), [(49, True), (51, False)])
+def test_a_hole_of_five_intervals_is_the_longest_that_is_bridged(hole_ms: int, is_bridged: bool) -> None:
+    """Truth every 10 ms; the pose at 1 s lies in a hole farther from its edges than stamps may differ."""
+    times = np.arange(300) * 10
+    inside = (times > 1000 - hole_ms / 2) & (times < 1000 + hole_ms / 2)
+    kept = np.sort(
+        np.concatenate([times[~inside] * 1_000_000, [(2000 - hole_ms) * 500_000, (2000 + hole_ms) * 500_000]])
+    )
+    truth = replace(drive(len(kept)), stamps_ns=kept.astype(np.int64))
+    assert np.diff(kept).max() == hole_ms * 1_000_000
+    stamps = np.array([500_500_000, 1_000_000_000, 1_500_500_000, 2_000_500_000], np.int64)
+    found = associate(replace(drive(4), stamps_ns=stamps), truth, max_diff=0.01)
+    assert "interpolated" in found.recipe
+    assert (1_000_000_000 in found.stamps_ns) == is_bridged
+
+
+@pytest.mark.parametrize(
+    ("degrees", "axis"),
+    [(0, "+x"), (36, "+x"), (38, None), (52, None), (54, "+y"), (126, "+y"), (144, "-x"), (180, "-x")],
+)
+def test_a_body_that_goes_askew_advances_along_no_axis(degrees: float, axis: str | None) -> None:
+    """Four fifths of the way along an axis are 36.9 deg off it."""
+    direction = np.array([np.cos(np.deg2rad(degrees)), np.sin(np.deg2rad(degrees))])
+    assert main_axis(straight(np.outer(np.arange(20.0), direction), np.zeros(20))) == axis
+
+
+@pytest.mark.parametrize(("forward", "axis"), [(92, "+x"), (88, None)])
+def test_a_body_that_goes_to_and_fro_advances_along_no_axis(forward: int, axis: str | None) -> None:
+    """Of 100 steps as many less one go ahead as are said, and the others back: 0.84 or 0.76 of the way is left."""
+    steps = np.where(np.arange(100) < forward, 1.0, -1.0)
+    x = np.concatenate([[0.0], np.cumsum(steps)])
+    assert main_axis(straight(np.column_stack([x, 0 * x]), 0 * x)) == axis
+
+
+def paced(speeds: Floats) -> Trajectory:
+    """A straight drive at so many m/s, a pose every 0.1 s."""
+    x = np.concatenate([[0.0], np.cumsum(0.1 * speeds)])
+    poses = straight(np.column_stack([x, 0 * x]), 0 * x)
+    return Trajectory(np.arange(len(x), dtype=np.int64) * STEP_NS, poses)
+
+
+@pytest.mark.parametrize(("other_noise", "is_refused"), [(0.085, True), (0.105, False)])
+def test_a_clock_that_fits_another_shift_nearly_as_well_is_not_told(other_noise: float, is_refused: bool) -> None:
+    """Two laps at one rhythm: the estimate is off the first by noise of 0.08 m/s and off the second by its own.
+
+    Their mean squares differ by 1.13 or 1.72; a fifth more is what it takes to tell.
+    """
+    rng = np.random.default_rng(5)
+    k = np.arange(300)
+    rhythm = 5 + 2 * np.sin(2 * np.pi * k / 97) + np.sin(2 * np.pi * k / 41)
+    slow = np.convolve(rng.normal(size=400), np.ones(20), "valid")[:300]
+    slow /= slow.std()
+    first, second = rhythm + 0.08 * slow, rhythm - other_noise * slow
+    truth = paced(np.concatenate([first, second]))
+    estimate = paced(rhythm)
+    if is_refused:
+        with pytest.raises(InputError, match=r"fit alike; give the offset in seconds"):
+            estimate_offset(estimate, truth)
+    else:
+        assert estimate_offset(estimate, truth)[0] == pytest.approx(0, abs=STEP_NS // 2)

@@ -1,0 +1,120 @@
+"""Which loops are believed: just inside and just outside of each line that is drawn."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import gtsam
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from lslam.config.graph import GraphConfig
+from lslam.geometry import se3
+from lslam.graph.consistency import judge_loops
+from lslam.graph.problem import PoseGraph
+from lslam.graph.robust import Doubted, Settled, settle
+from lslam.types.constraint import Constraint
+
+Floats = NDArray[np.float64]
+SURE = 1e-10 * np.eye(6)
+# Six degrees of freedom at the configured probability; m and rad that a closure may be wrong by beyond its covariance.
+LIMIT = float(np.sqrt(chi2.ppf(0.999, 6)))
+WAY = 1000.0
+SLACK_M, SLACK_RAD = 0.03, np.deg2rad(0.1)
+
+
+def there_and_back(offsets: list[Floats], apart: list[float] | None = None, **settings: float) -> list[str]:
+    """What is said of loops between two passes, a kilometre of odometry apart, each wrong by a twist (6,).
+
+    apart : m along either pass at which the loops lie, all at one place if not given
+    """
+    at = np.zeros(len(offsets)) if apart is None else np.array(apart)
+    count = len(at)
+    away = np.linspace(0, 1, 40)[1:-1]
+    x = np.concatenate([at, at[-1] + 500 * np.sin(np.pi * away), at])
+    travelled = np.concatenate([at, at[-1] + WAY * np.linspace(0, 1, 40)[1:-1], at[-1] + WAY + at])
+    poses = np.tile(np.eye(4), (len(x), 1, 1))
+    poses[:, 0, 3] = x
+    odometry = [Constraint(k, k + 1, se3.relative(a, b), SURE) for k, (a, b) in enumerate(pairwise(poses))]
+    second = len(x) - count
+    loops = [
+        Constraint(k, second + k, se3.exp(np.asarray(offset, np.float64)), SURE) for k, offset in enumerate(offsets)
+    ]
+    return judge_loops(PoseGraph(poses, odometry, loops, distances=travelled), GraphConfig(**settings))  # type: ignore[arg-type]
+
+
+def shift(x: float, z: float = 0.0) -> Floats:
+    return np.array([x, 0, z, 0, 0, 0], np.float64)
+
+
+@pytest.mark.parametrize(("share", "is_out"), [(0.9, False), (1.1, True)])
+def test_loops_may_differ_by_their_slack_and_no_more(share: float, is_out: bool) -> None:
+    """Their own covariances are nothing: what is left is 3 cm, and a tenth of a degree."""
+    for offset in (shift(share * LIMIT * SLACK_M), np.array([0, 0, 0, 0, 0, share * LIMIT * SLACK_RAD])):
+        said = there_and_back([np.zeros(6)] * 4 + [offset])
+        assert said[:4] == [""] * 4
+        assert said[4] == ("only 0% of the loops around it agree with it" if is_out else "")
+
+
+def test_a_loop_stays_when_half_of_the_others_agree_with_it() -> None:
+    """Four here, four 0.2 m on, and loops between that both agree with: 4 of 8 others agree with each, or 3 of 7."""
+    here, between, there = shift(0.0), shift(0.1), shift(0.2)
+    assert there_and_back([here] * 4 + [between] + [there] * 4) == [""] * 9
+    assert there_and_back([here] * 4 + [there] * 4) == ["only 43% of the loops around it agree with it"] * 8
+    # The most contradicted go first, and then nobody contradicts the others.
+    assert there_and_back([here] * 5 + [there] * 4) == [""] * 5 + ["only 38% of the loops around it agree with it"] * 4
+
+
+def test_loops_far_away_have_no_say() -> None:
+    """Odometry may have drifted by some decimetres on 100 m: what a loop there agrees with is no witness."""
+    wrong, right = shift(0.2), np.zeros(6)
+    said = there_and_back([right] * 3 + [wrong] + [right] * 9, [0.0, 0.001, 0.002, 0.003, *(100.0 + np.arange(9.0))])
+    assert [bool(reason) for reason in said] == [False] * 3 + [True] + [False] * 9
+    assert said[3].startswith("only 0%")
+
+
+def test_odometry_is_asked_first() -> None:
+    """A per cent of a way of 1,000 m, and half a degree per 100 m of it over the mean distance of that way."""
+    said = there_and_back([shift(0.0, 1000.0)])
+    assert "1000.0 m from where odometry is" in said[0]
+    lever = 500 * 2 / np.pi
+    allowed = LIMIT * (0.01 * 1000 + np.deg2rad(0.5) / 100 * 1000 * lever)
+    for share, is_out in ((0.85, False), (1.1, True)):
+        assert bool(there_and_back([shift(share * allowed)])[0]) == is_out
+
+
+def pulled(distances: list[float]) -> Settled:
+    """A point that is known to lie at 0, and one wrong or right sighting of it at each distance, m, of one sigma of a metre."""
+    fixed, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    fixed.add(gtsam.PriorFactorPoint3(0, np.zeros(3), gtsam.noiseModel.Isotropic.Sigma(3, 1e-6)))
+    values.insert(0, np.zeros(3))
+
+    def sighting(x: float) -> Doubted:
+        def make(scale: float, kernel: None) -> gtsam.PriorFactorPoint3:
+            return gtsam.PriorFactorPoint3(0, np.array([x, 0, 0]), gtsam.noiseModel.Isotropic.Sigma(3, np.sqrt(scale)))
+
+        return Doubted(make, 3)
+
+    return settle(fixed, [sighting(x) for x in distances], values, GraphConfig())
+
+
+def test_the_last_word_is_that_of_the_chi_square_distribution() -> None:
+    """Whatever is weighed on the way: in below the quantile of its own degrees of freedom, out above."""
+    limit = float(np.sqrt(chi2.ppf(0.999, 3)))
+    found = pulled([0.5, 0.95 * limit, 1.05 * limit, 2 * limit, 5 * limit, 30 * limit])
+    assert found.weights.tolist() == [1, 1, 0, 0, 0, 0]
+    np.testing.assert_allclose(found.limits, limit**2, rtol=1e-4)
+    np.testing.assert_allclose(np.sqrt(found.squared) / limit, [0.5 / limit, 0.95, 1.05, 2, 5, 30], rtol=1e-4)
+
+
+def test_the_weights_of_all_are_settled_by_doubling_and_not_at_a_stroke() -> None:
+    """The control parameter begins at 1 / (2 R - 1) for a worst ratio R of 100 and is 4 when one of 0.8 counts in full.
+
+    That are ten doublings, a solution each, one before and one after: Yang et al. 2020, section III, with a growth of 2.
+    """
+    limit = float(np.sqrt(chi2.ppf(0.999, 3)))
+    doublings = np.ceil(np.log2(4 * (2 * 100 - 1)))
+    assert pulled([np.sqrt(0.8) * limit, 10 * limit]).rounds == pytest.approx(1 + (doublings + 1) + 1, abs=1)
+    assert pulled([0.5 * limit, 0.99 * limit]).rounds == 1
