@@ -72,6 +72,20 @@ def test_holes_of_dense_truth_are_not_bridged() -> None:
     assert len(matches.stamps_ns) == pytest.approx(240, abs=2)
 
 
+def test_poses_before_and_after_dense_truth_have_no_partner() -> None:
+    dense = drive(300, step_ns=10_000_000)
+    around = replace(drive(60), stamps_ns=np.arange(-20, 40, dtype=np.int64) * 100_000_000 + 4_000_000)
+    matches = associate(around, dense)
+    assert "interpolated" in matches.recipe
+    assert matches.stamps_ns.tolist() == (np.arange(30) * 100_000_000 + 4_000_000).tolist()
+    np.testing.assert_allclose(matches.seconds, 0.1 * np.arange(30))
+
+
+def test_seconds_count_from_the_first_match(truth: Trajectory) -> None:
+    matches = associate(truth.select(slice(7, 20)), truth)
+    np.testing.assert_allclose(matches.seconds, 0.1 * np.arange(13))
+
+
 def test_files_without_stamps_go_by_index(truth: Trajectory) -> None:
     bare = replace(truth, has_stamps=False)
     both = associate(bare, bare)

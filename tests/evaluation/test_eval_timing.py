@@ -29,6 +29,14 @@ def test_stages_and_limit(tmp_path: Path) -> None:
     assert timing.over_limit == 10
 
 
+def test_two_scans_have_a_period_and_one_has_none(tmp_path: Path) -> None:
+    (tmp_path / "timing.csv").write_text("index,stamp_ns,total\n0,0,0.3\n1,200000000,0.1\n")
+    timing = read_timing(tmp_path / "timing.csv")
+    assert (timing.period, timing.over_limit) == (0.2, 1)
+    (tmp_path / "timing.csv").write_text("index,stamp_ns,total\n0,0,0.3\n")
+    assert read_timing(tmp_path / "timing.csv").period is None
+
+
 def test_what_is_done_after_odometry_stands_beside_the_total(tmp_path: Path) -> None:
     back_end = {0: {"loops": 0.25}, 2: {"loops": 0.5, "graph": 7.0}}
     text = timing_text([0, 1, 2], [0, 10**8, 2 * 10**8], ["register"], np.full((3, 1), 0.01), back_end)

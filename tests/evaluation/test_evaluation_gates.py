@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from lslam.errors import InputError
 from lslam.evaluation.associate import associate
-from lslam.evaluation.frames import main_axis
+from lslam.evaluation.frames import body_rotation, main_axis
 from lslam.evaluation.thesis import planar
 from lslam.evaluation.time_offset import estimate_offset
 from lslam.types.trajectory import Trajectory
@@ -79,6 +79,15 @@ def test_a_body_that_goes_to_and_fro_advances_along_no_axis(forward: int, axis: 
     steps = np.where(np.arange(100) < forward, 1.0, -1.0)
     x = np.concatenate([[0.0], np.cumsum(steps)])
     assert main_axis(straight(np.column_stack([x, 0 * x]), 0 * x)) == axis
+
+
+def test_bodies_that_never_move_together_have_no_rotation_between_them() -> None:
+    """One drives off when the other has come to rest: no motion is shared, and nothing is divided by that."""
+    k = np.arange(60)
+    early = straight(np.column_stack([np.minimum(k, 30), 0 * k]), np.minimum(k, 30) / 20)
+    late = straight(np.column_stack([np.maximum(k, 30), 0 * k]), np.maximum(k, 30) / 20)
+    assert body_rotation(early, late) is None
+    np.testing.assert_allclose(body_rotation(early, early), np.eye(3), atol=1e-12)
 
 
 def paced(speeds: Floats) -> Trajectory:

@@ -105,6 +105,25 @@ def test_drift_of_a_wrong_scale_is_that_scale() -> None:
     assert drift.segments == sum(n for _, _, n in drift.by_length.values())
 
 
+def test_drift_is_told_by_length_as_well() -> None:
+    """Straight ahead, a metre a scan, while the estimate is 2 % long and turns by a millirad a metre.
+
+    A segment of so many metres ends a scan beyond them: of 100 m it has 101, which turn by 101 mrad.
+    """
+    truth = np.tile(np.eye(4), (350, 1, 1))
+    truth[:, 0, 3] = np.arange(350)
+    step = se3.exp(np.array([1.02, 0, 0, 0, 0, 1e-3]))
+    estimate = [np.eye(4)]
+    for _ in range(349):
+        estimate.append(estimate[-1] @ step)
+    drift = kitti_drift(np.array(estimate), truth)
+    assert {length: n for length, (_, _, n) in drift.by_length.items()} == {100: 25, 200: 15, 300: 5}
+    for length, (translation, rotation, _) in drift.by_length.items():
+        assert rotation == pytest.approx(np.rad2deg(1e-3) * 100 * (length + 1) / length)
+        end = (np.exp(1j * 1e-3 * (length + 1)) - 1) / 1j * 1.02e3
+        assert translation == pytest.approx(100 * abs(end - (length + 1)) / length, rel=1e-3)
+
+
 def test_drift_under_100_m_is_not_zero_but_not_available() -> None:
     short = drive(60).poses
     drift = kitti_drift(short, short)

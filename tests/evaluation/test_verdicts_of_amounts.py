@@ -65,6 +65,8 @@ def test_little_influence_is_not_stated_of_values_without_result_or_of_a_key_wit
     assert (same.outcome, "the parameter was not in use" in same.measured) == ("undecided", True)
     seeds = by_seed(rows_of(SKIPS), lambda v, s: {"thesis_rmse": 0.5 + s})
     assert outcome(seeds, "matters_little", 1.5, of="translation") == "undecided", "seeds differ, values do not"
+    first = by_seed(rows_of(SKIPS), lambda v, s: {"thesis_rmse": 0.5 + 0.001 * v * (s > 0)})
+    assert outcome(first, "matters_little", 1.5, of="translation") == "confirmed", "one seed alone shows nothing"
     one = [replace(r, status="diverged") if r.parameters["input.skip_frames"] == 5 else r for r in rows if not r.seed]
     assert outcome(one, "matters_little", 1.5, of="translation") == "undecided", "one lost run may be bad luck"
 

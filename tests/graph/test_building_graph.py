@@ -151,6 +151,35 @@ def test_matches_with_the_wrong_wall_are_given_up() -> None:
     np.testing.assert_allclose(found.displacements, expected.displacements, atol=1e-9)
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_two_wrong_matches_of_five_are_given_up_though_they_agree(seed: int) -> None:
+    """They pull the first solution so far that right ones do not fit it: nothing may be decided there."""
+    rng = np.random.default_rng(seed)
+    middles, poses, truth = town(seed)
+    wrong = rng.normal(0, 1, 2)
+    matches, is_wrong = [], []
+    for b, middle in enumerate(middles):
+        for n, k in enumerate(near(poses, middle, 40.0)[:5]):
+            is_wrong.append(n < 2)
+            off = np.array([*2.5 * wrong / np.linalg.norm(wrong), 0.1]) * (n < 2)
+            matches.append(match(k, b, seen_from(poses[k], middle, truth[b] + off)))
+    found = solve_buildings(middles, matches, poses, BELIEF)
+    assert found.believed.tolist() == [not w for w in is_wrong]
+    right = solve_buildings(middles, [m for m, w in zip(matches, is_wrong, strict=True) if not w], poses, BELIEF)
+    np.testing.assert_allclose(found.displacements, right.displacements, atol=1e-9)
+
+
+@pytest.mark.parametrize(("share", "knows"), [(0.04, False), (0.06, True)])
+def test_a_match_that_knows_a_twentieth_as_well_may_confirm(share: float, knows: bool) -> None:
+    middles, poses, truth = town(4)
+    keyframes = near(poses, middles[5], 40.0)[:3]
+    said = [seen_from(poses[k], middles[5], truth[5]) for k in keyframes]
+    three = [
+        match(k, 5, pose, FULL * (share if n else 1.0)) for n, (k, pose) in enumerate(zip(keyframes, said, strict=True))
+    ]
+    assert agreeing(middles, three, poses)[0] == knows
+
+
 def test_what_no_other_keyframe_says_is_not_believed() -> None:
     middles, poses, truth = town(4)
     keyframes = near(poses, middles[5], 40.0)

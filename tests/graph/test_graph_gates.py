@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 from itertools import pairwise
+from typing import Any
 
 import gtsam
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.optimize import minimize_scalar
 from scipy.stats import chi2
 
 from lslam.config.graph import GraphConfig
 from lslam.geometry import se3
 from lslam.graph.consistency import judge_loops
-from lslam.graph.problem import PoseGraph
+from lslam.graph.drift import drift_factor
+from lslam.graph.problem import PoseGraph, UpDirection
 from lslam.graph.robust import Doubted, Settled, settle
 from lslam.types.constraint import Constraint
 
@@ -85,19 +88,25 @@ def test_odometry_is_asked_first() -> None:
         assert bool(there_and_back([shift(share * allowed)])[0]) == is_out
 
 
-def pulled(distances: list[float]) -> Settled:
-    """A point that is known to lie at 0, and one wrong or right sighting of it at each distance, m, of one sigma of a metre."""
-    fixed, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    fixed.add(gtsam.PriorFactorPoint3(0, np.zeros(3), gtsam.noiseModel.Isotropic.Sigma(3, 1e-6)))
+def pulled(
+    distances: list[float], sigma: float = 1e-6, robust: str = "gnc", scales: list[float] | None = None
+) -> Settled:
+    """A point that is known to lie at 0 to `sigma` m, and one wrong or right sighting of it at each distance, m, to a metre."""
+    fixed, values, scales = gtsam.NonlinearFactorGraph(), gtsam.Values(), [] if scales is None else scales
+    fixed.add(gtsam.PriorFactorPoint3(0, np.zeros(3), gtsam.noiseModel.Isotropic.Sigma(3, sigma)))
     values.insert(0, np.zeros(3))
 
     def sighting(x: float) -> Doubted:
-        def make(scale: float, kernel: None) -> gtsam.PriorFactorPoint3:
-            return gtsam.PriorFactorPoint3(0, np.array([x, 0, 0]), gtsam.noiseModel.Isotropic.Sigma(3, np.sqrt(scale)))
+        def make(scale: float, kernel: Any) -> gtsam.PriorFactorPoint3:
+            scales.append(scale)
+            noise = gtsam.noiseModel.Isotropic.Sigma(3, np.sqrt(scale))
+            if kernel is not None:
+                noise = gtsam.noiseModel.Robust.Create(kernel, noise)
+            return gtsam.PriorFactorPoint3(0, np.array([x, 0, 0]), noise)
 
         return Doubted(make, 3)
 
-    return settle(fixed, [sighting(x) for x in distances], values, GraphConfig())
+    return settle(fixed, [sighting(x) for x in distances], values, GraphConfig.model_validate({"robust": robust}))
 
 
 def test_the_last_word_is_that_of_the_chi_square_distribution() -> None:
@@ -118,3 +127,48 @@ def test_the_weights_of_all_are_settled_by_doubling_and_not_at_a_stroke() -> Non
     doublings = np.ceil(np.log2(4 * (2 * 100 - 1)))
     assert pulled([np.sqrt(0.8) * limit, 10 * limit]).rounds == pytest.approx(1 + (doublings + 1) + 1, abs=1)
     assert pulled([0.5 * limit, 0.99 * limit]).rounds == 1
+
+
+def test_what_is_weighed_less_is_taken_for_less_certain() -> None:
+    """One over the weight of Yang et al. 2020, equation 14, multiplies the covariance; ratios are 0.8 and 25 all along."""
+    limit, scales = float(np.sqrt(chi2.ppf(0.999, 3))), list[float]()
+    pulled([np.sqrt(0.8) * limit, 5 * limit], scales=scales)
+    expected = []
+    mu = 1 / (2 * 25 - 1)
+    while mu < 4:
+        for ratio in (0.8, 25.0):
+            weight = np.sqrt(mu * (mu + 1) / ratio) - mu
+            if mu / (mu + 1) < ratio < (mu + 1) / mu and 1e-3 <= weight <= 0.999:
+                expected.append(1 / weight)
+        mu *= 2
+    assert len(expected) >= 6
+    np.testing.assert_allclose([s for s in scales if s != 1.0], expected, rtol=1e-3)
+
+
+@pytest.mark.parametrize("robust", ["huber", "cauchy"])
+def test_an_estimator_bends_where_one_right_residual_in_twenty_lies(robust: str) -> None:
+    """Against scipy's minimum of the same cost, written out."""
+    bend, sigma, seen = float(np.sqrt(chi2.ppf(0.95, 3))), 2.0, np.array([0.3, -0.4, 3.5, 9.0])
+
+    def cost(x: float) -> float:
+        r = np.abs(x - seen)
+        huber = np.where(r <= bend, r**2 / 2, bend * (r - bend / 2))
+        rho = huber if robust == "huber" else bend**2 / 2 * np.log1p((r / bend) ** 2)
+        return float(rho.sum() + (x / sigma) ** 2 / 2)
+
+    best = minimize_scalar(cost, bounds=(-1, 5), method="bounded", options={"xatol": 1e-10}).x
+    found = pulled(seen.tolist(), sigma, robust)
+    assert found.values.atPoint3(0)[0] == pytest.approx(best, abs=1e-2)
+    assert found.weights.tolist() == [1, 1, 1, 0]
+    assert found.rounds == 1
+
+
+@pytest.mark.parametrize(("share", "drifts"), [(0.95, False), (1.05, True)])
+def test_a_tilt_that_may_be_chance_is_no_drift(share: float, drifts: bool) -> None:
+    """Up is seen twice, each time to 5 mrad, and by odometry without an error: the tilt between has two directions."""
+    poses = np.tile(np.eye(4), (3, 1, 1))
+    poses[:, 0, 3] = 10.0 * np.arange(3)
+    tilt = share * np.sqrt(chi2.ppf(0.999, 2)) * np.sqrt(2) * 5e-3
+    ups = [UpDirection(0, np.array([0.0, 0, 1]), 5e-3), UpDirection(2, np.array([np.sin(tilt), 0, np.cos(tilt)]), 5e-3)]
+    steps = [Constraint(k, k + 1, se3.relative(a, b), 1e-20 * np.eye(6)) for k, (a, b) in enumerate(pairwise(poses))]
+    assert (drift_factor(PoseGraph(poses, steps, ups=ups), [], GraphConfig()) > 0) == drifts

@@ -127,6 +127,17 @@ def test_covariances_of_scans_grow_from_their_keyframe() -> None:
         assert np.linalg.eigvalsh(result.covariance).min() > 0
 
 
+def test_a_scan_is_as_unsure_as_the_way_to_its_keyframe_makes_it() -> None:
+    """Keyframes that are known without an error: what is left is the steps between and the scan's own registration."""
+    results = results_of(POSES)
+    keyframes = keyframes_of(results, 10)
+    final = corrected(
+        results, keyframes, np.stack([k.T_world_lidar for k in keyframes]), np.zeros((6, 6, 6)), 0.0, GraphConfig()
+    )
+    np.testing.assert_allclose(final[24].covariance, results_of(POSES[20:25])[-1].covariance, atol=1e-10)
+    np.testing.assert_allclose(final[27].covariance, results_of(POSES[27:31])[-1].covariance, atol=1e-10)
+
+
 def test_a_graph_of_two_dimensions_keeps_height_roll_and_pitch_as_they_are() -> None:
     results = results_of(POSES)
     keyframes = keyframes_of(results)

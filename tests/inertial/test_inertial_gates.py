@@ -100,3 +100,13 @@ def test_a_sensor_stands_that_hardly_shakes_and_hardly_moves(
     found, bias = _is_standing(imu, SCAN_NS * np.arange(20), poses)
     assert found == stands
     np.testing.assert_allclose(bias, [0.05, 0, -0.02], atol=1e-12)
+
+
+@pytest.mark.parametrize(("samples", "first_scan", "stands"), [(5, 0, True), (4, 0, False), (5, 1, False)])
+def test_a_second_of_too_few_samples_or_scans_tells_of_no_standing(samples: int, first_scan: int, stands: bool) -> None:
+    """Five samples and three scans are needed within a second of the first scan."""
+    begin = 600_000_000 * first_scan
+    stamps = begin + np.round(np.linspace(0, 1e9, samples, endpoint=False)).astype(np.int64)
+    imu = ImuStream(stamps, np.tile([0.0, 0, 9.8], (samples, 1)), np.zeros((samples, 3)))
+    scans = np.array([0, 600_000_000, 900_000_000, 1_650_000_000])[first_scan:]
+    assert _is_standing(imu, scans, np.tile(np.eye(4), (len(scans), 1, 1)))[0] == stands

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import replace
 from itertools import pairwise
 from typing import Any
@@ -163,14 +164,19 @@ def test_covariances_of_odometry_widen_the_search() -> None:
     assert (errors(closures, true) < (0.05, 0.1)).all()
 
 
-def test_joins_the_clouds_of_a_store() -> None:
+def test_joins_the_clouds_of_a_store(caplog: pytest.LogCaptureFixture) -> None:
     true = np.array([round_the_square(d) for d in np.arange(0, 400, 5.0)])
     world, store = town(), KeyframeStore()
     for keyframe in keyframes_of(drifted(true)):
         cloud = seen(world, true[keyframe.number], np.random.default_rng(keyframe.number))
         store.add(keyframe, cloud[keyframe.number % 5 :: 5])
-    closures = accepted(find_loops(store, LoopsConfig(), RegistrationConfig()))
+    with caplog.at_level(logging.INFO, "lslam"):
+        candidates = find_loops(store, LoopsConfig(), RegistrationConfig())
+    closures = accepted(candidates)
     assert len(closures) >= 3
+    tried = [c for c in candidates if c.stage != "thinned"]
+    assert len(tried) < len(candidates)
+    assert caplog.messages == [f"loops: {len(closures)} closed of {len(tried)} candidates, {len(store)} keyframes"]
     assert (errors(closures, true) < (0.1, 0.1)).all()
 
 

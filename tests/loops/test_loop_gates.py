@@ -20,6 +20,7 @@ from lslam.loops.scan_context import PlaceMatch
 from lslam.loops.verify import Comparison, Verifier, _is_elsewhere
 from lslam.registration.solver import RegistrationResult
 
+Floats = NDArray[np.float64]
 # Sigmas of odometry: 2 m along x, 0.5 m across, and three degrees.
 DOUBT = Doubt(np.diag([4.0, 0.25, 0.25])[None], np.deg2rad([3.0]))
 EXPECTED = np.array([10.0, 0.0, 0.0])
@@ -82,11 +83,13 @@ def test_a_constraint_is_in_the_axes_of_the_keyframes() -> None:
 FORWARD = RegistrationResult(pose(3, 1, 20), covariance=np.diag([1e-4] * 3 + [1e-6] * 3))
 
 
-def alike(distances: list[float], apart: float = 20.0, **settings: float) -> list[int]:
-    """Which of older keyframes, `apart` m from each other, are compared with a newer one that looks so much like them."""
+def chosen(distances: list[float], where: list[float], **settings: float) -> tuple[list[int], int | None]:
+    """Which of older keyframes at x = `where` m are compared with a newer one at the second of them that is so unlike them.
+
+    And which one is fallen back on when none of these fits. It has been half a kilometre away meanwhile.
+    """
     count = len(distances)
-    poses = np.array([pose(apart * k, 0) for k in range(count)] + [pose(500, 0), pose(0, 0)])
-    keyframes = keyframes_of(poses)
+    keyframes = keyframes_of(np.array([pose(x, 0) for x in [*where, 500.0, where[1]]]))
     chooser = Detector(keyframes, lambda _: np.zeros((0, 3), np.float32), LoopsConfig(**settings), RegistrationConfig())  # type: ignore[arg-type]
 
     class Looks:
@@ -100,7 +103,12 @@ def alike(distances: list[float], apart: float = 20.0, **settings: float) -> lis
             ]
 
     chooser.index = Looks()  # type: ignore[assignment]
-    return [match.number for match in chooser._choose(count + 1, np.arange(count))[0]]
+    matches, fallback = chooser._choose(count + 1, np.arange(count))
+    return [match.number for match in matches], None if fallback is None else fallback.number
+
+
+def alike(distances: list[float], apart: float = 20.0, **settings: float) -> list[int]:
+    return chosen(distances, [apart * k for k in range(len(distances))], **settings)[0]
 
 
 def test_places_half_as_much_again_unlike_the_best_are_no_rivals() -> None:
@@ -111,6 +119,35 @@ def test_places_half_as_much_again_unlike_the_best_are_no_rivals() -> None:
     assert alike([0.20, 0.10, 0.145, 0.155], max_descriptor_distance=0.14) == [1]
     assert alike([0.20, 0.10, 0.145, 0.155], apart=7.9) == [1]
     assert alike([0.20, 0.10, 0.145, 0.155], apart=8.1) == [1, 2]
+
+
+@pytest.mark.parametrize(("x", "fallback"), [(6.9, None), (7.1, 1)])
+def test_odometrys_nearest_is_fallen_back_on_unless_it_is_asked_already(x: float, fallback: int | None) -> None:
+    """Within half of what two passes of a street lie apart it is the same place: here within 4 m of x = 3 m."""
+    assert chosen([0.3, 0.3, 0.1], [0.0, 3.0, x]) == ([2], fallback)
+
+
+def test_one_keyframe_stands_for_four_metres_of_the_way() -> None:
+    """Of those at 5 and 6 m the second is not compared, however much it looks alike, and that at 3 m only as the nearest."""
+    assert chosen([0.3, 0.3, 0.2, 0.01], [0.0, 3.0, 5.0, 6.0]) == ([2], None)
+    assert chosen([0.3, 0.1, 0.2, 0.01], [0.0, 3.0, 5.0, 6.0]) == ([1], None)
+
+
+@pytest.mark.parametrize(("shift", "stage"), [(0.5, "agreement"), (60.0, "gate")])
+def test_what_fits_and_is_too_far_from_odometry_is_refused_by_the_gate(shift: float, stage: str) -> None:
+    gate = detector()
+    gate.doubt.between = lambda b, older: DOUBT  # type: ignore[method-assign]
+    gate._place = lambda number: None  # type: ignore[assignment, method-assign, return-value]
+
+    class Finds:
+        def compare(self, a: object, b: object, expected: Floats, reach: float, yaws: Floats) -> Comparison:
+            return replace(found((0, 0)), T_a_b=se3.make(np.eye(3), expected + np.array([shift, 0, 0])))
+
+    gate.verifier = Finds()  # type: ignore[assignment]
+    candidate = gate._examine(PlaceMatch(0, 0.1, 0.0), 1)
+    assert candidate.stage == stage
+    assert candidate.verdict == ("accepted" if stage == "agreement" else "rejected")
+    assert bool(candidate.reason) == (stage == "gate")
 
 
 def agree(gap: tuple[float, ...], **settings: float) -> Comparison:

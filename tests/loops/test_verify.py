@@ -12,7 +12,7 @@ from lslam.config.registration import RegistrationConfig
 from lslam.geometry import se3
 from lslam.loops import verify
 from lslam.loops.place import Place, make_place
-from lslam.loops.search import find_starts
+from lslam.loops.search import _peaks, find_starts
 from lslam.loops.verify import Comparison, Verifier
 from lslam.preprocessing.prepare import PreparedPoints
 from lslam.registration.gaussian_map import GaussianMap
@@ -117,6 +117,16 @@ def test_starts_are_tried_with_a_quarter_of_the_points_and_the_best_refined_with
     assert used.count(len(b.source.source)) >= 2
 
 
+def test_overlap_is_that_of_the_place_that_is_covered_less() -> None:
+    """All of what is seen within 22 m lies in what is seen within 50 m; the other way round less than half does."""
+    near, far = (place(town(), pose(5, -45), seed, reach) for seed, reach in ((1, 22.0), (2, 50.0)))
+    for a, b in ((near, far), (far, near)):
+        found = compare(a, b, np.zeros(3), 3.0, min_overlap=0.01)
+        assert found.reason == ""
+        assert 0.1 < found.overlap < 0.6
+        assert compare(a, b, np.zeros(3), 3.0, min_overlap=0.7).stage == "overlap"
+
+
 def test_max_rmse_and_overlap_are_heeded() -> None:
     world = town()
     a, b = place(world, pose(5, -45), 1), place(world, pose(7, -45), 2)
@@ -136,6 +146,21 @@ def test_the_search_from_above_tells_shift_turn_and_climb() -> None:
     assert np.rad2deg(np.arctan2(start[1, 0], start[0, 0])) == pytest.approx(8, abs=2.1)
     near = find_starts(a, b, np.zeros(3), 3.0, YAWS)
     assert all(np.linalg.norm(found.T_a_b[:2, 3]) <= 3.0 for found in near)
+
+
+def test_starts_lie_four_metres_apart_fit_seven_tenths_as_well_and_are_five() -> None:
+    shifts = np.arange(-20.0, 20.0, 0.5)
+
+    def starts(*tops: tuple[float, float]) -> list[float]:
+        score = np.zeros((len(shifts), len(shifts)), np.float32)
+        for x, height in tops:
+            score[np.searchsorted(shifts, x), len(shifts) // 2] = height
+        return [float(shift[0]) for shift, _, _ in _peaks(shifts, score, np.zeros_like(score), np.zeros(3), 18.0)]
+
+    assert starts((0.0, 1.0), (3.5, 0.9), (-4.0, 0.8)) == [0.0, -4.0]
+    assert starts((0.0, 1.0), (5.0, 0.72), (-5.0, 0.68)) == [0.0, 5.0]
+    assert starts(*[(6.0 * k, 1.0 - 0.01 * k) for k in range(-3, 4)]) == [-18.0, -12.0, -6.0, 0.0, 6.0]
+    assert starts((0.0, 0.5), (18.0, 0.5), (18.5, 1.0)) == [0.0, 18.0]
 
 
 def test_a_place_knows_what_stands_up() -> None:

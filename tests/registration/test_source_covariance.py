@@ -42,6 +42,16 @@ def test_one_ring_has_no_surface_in_its_voxel_and_a_false_one_of_its_neighbours(
     assert np.all(np.linalg.eigvalsh(full(source_covariance(source, ring, THIN, "knn")))[:, 1] > 0.99)
 
 
+@pytest.mark.parametrize(("apart", "has_normal"), [(0.8, True), (1.6, True), (2.8, False)])
+def test_rings_within_two_metres_make_a_surface(apart: float, has_normal: bool) -> None:
+    """Two rings along x on level ground, the second in the same cell of 1 m, of 2 m, and in another: only these see no ground."""
+    x = np.arange(0.05, 1.95, 0.05)
+    cloud = np.concatenate([np.column_stack([x, np.full_like(x, y), np.full_like(x, 0.5)]) for y in (0.1, 0.1 + apart)])
+    found = full(source_covariance(cloud[:10].astype(np.float64), cloud.astype(np.float32), THIN))
+    expected = np.diag([1.0, 1.0, THIN]) if has_normal else THIN * np.eye(3)
+    np.testing.assert_allclose(found, np.tile(expected, (10, 1, 1)), atol=1e-6)
+
+
 @pytest.mark.parametrize("neighbourhood", ["voxel", "knn"])
 @pytest.mark.parametrize("residual", ["gicp", "vgicp"])
 def test_either_finds_a_known_motion(residual: str, neighbourhood: Neighbourhood) -> None:
