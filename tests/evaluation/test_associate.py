@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lslam.errors import InputError
-from lslam.evaluation.associate import associate, nearest_one_to_one
+from lslam.evaluation.associate import associate, nearest_one_to_one, time_range
 from lslam.evaluation.time_offset import estimate_offset
 from lslam.types.trajectory import Trajectory
 
@@ -109,6 +109,12 @@ def test_stamps_between_scans_name_the_distance(truth: Trajectory) -> None:
     with pytest.raises(InputError, match=r"0\.050 s apart \(median\): raise --max-diff"):
         associate(between, truth)
     assert len(associate(between, truth, max_diff=0.06).stamps_ns) >= 299
+
+
+def test_a_range_of_time_in_words(truth: Trajectory) -> None:
+    assert time_range(truth, 2_000_000_000) == "2.000 .. 31.900 s"
+    assert time_range(replace(truth, has_stamps=False)) == "300 poses without stamps"
+    assert time_range(truth.select(slice(0, 0))) == "no poses"
 
 
 @pytest.mark.parametrize("count", [0, 1, 2])

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lslam.evaluation.laws import band, fit_law
+from lslam.evaluation.laws import band, fit_law, rival
 from lslam.types.sensitivity import Floats, LawKind
 
 SKIPS = np.arange(1.0, 21.0)
@@ -144,3 +144,24 @@ def test_r2_says_when_the_law_is_wrong() -> None:
     assert right is not None
     assert wrong.r2 < 0.5 < right.r2
     assert right.text == "T = 2 x + 5"
+
+
+@pytest.mark.parametrize(
+    ("kind", "x", "y", "said"),
+    [
+        ("product", np.linspace(9.9, 10.1, 8), np.array([1.0, 4, 2, 8, 3, 7, 5, 6]), "a y"),
+        ("product", np.array([1.0, 4, 2, 8, 3, 7, 5, 6]), np.linspace(0.99, 1.01, 8), "a / x"),
+        ("linear", np.linspace(20, 22, 8), None, "a / x"),
+        ("inverse", np.linspace(20, 22, 8), None, "a x + b"),
+    ],
+)
+def test_the_rival_is_what_the_parameter_that_varied_says_alone(
+    kind: LawKind, x: np.ndarray, y: np.ndarray | None, said: str
+) -> None:
+    points = x if y is None else np.column_stack([x, y])
+    times = {"product": 3 / x * (1 if y is None else y), "linear": 42 - x, "inverse": 3 / x}[kind]
+    law = fit_law(kind, ("x", "y")[: 1 if y is None else 2], points, times)
+    assert law is not None
+    name, r2 = rival(law)
+    assert name == said
+    assert 0.97 < r2 < 1.0

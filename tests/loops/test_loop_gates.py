@@ -55,6 +55,21 @@ def test_a_pose_beyond_three_sigmas_of_odometry_is_none(shift: tuple[float, floa
     assert detector()._beyond(found(shift, turn_deg), EXPECTED, DOUBT) == said
 
 
+@pytest.mark.parametrize(
+    ("shift", "turn_deg", "is_out"),
+    [(0.95, 0.0, False), (1.05, 0.0, True), (0.0, 1.9, False), (0.0, 2.1, True)],
+)
+def test_odometry_that_is_sure_of_itself_may_be_wrong_by_a_metre_and_two_degrees(
+    shift: float, turn_deg: float, is_out: bool
+) -> None:
+    """Two registrations of one place differ by as much."""
+    sure = Doubt(1e-8 * np.eye(3)[None], np.array([1e-8]))
+    gate = detector()
+    assert bool(gate._beyond(found((0.0, shift), turn_deg), EXPECTED, sure)) == is_out
+    assert gate._reach(sure) == 1.0
+    assert gate._turn(sure) == pytest.approx(np.deg2rad(2.0))
+
+
 def test_a_radius_is_the_limit_in_every_direction() -> None:
     gate = detector(radius=3.0)
     assert gate._reach(DOUBT) == 3.0
