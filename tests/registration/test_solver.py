@@ -4,7 +4,18 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from analytic_scenes import NOISE, corridor, distance, floor_only, is_near, pose_at, random_pose, room, seen_from
+from analytic_scenes import (
+    NOISE,
+    corridor,
+    distance,
+    floor_only,
+    is_near,
+    pose_at,
+    random_pose,
+    rectangle,
+    room,
+    seen_from,
+)
 from numpy.typing import NDArray
 
 from lslam.geometry import se3, so3
@@ -96,6 +107,35 @@ def test_covariance_is_the_spread_of_the_results(room_map: GaussianMap) -> None:
         claimed.append(np.sqrt(np.diag(result.covariance)))
     ratio = np.std(found, axis=0) / np.mean(claimed, axis=0)
     assert ((ratio > 0.4) & (ratio < 1.6)).all()
+
+
+@pytest.mark.parametrize(
+    ("held", "is_weak", "is_followed"), [(1.2, False, True), (0.9, True, True), (0.36, True, True), (0.25, True, False)]
+)
+def test_a_weak_direction_is_followed_while_it_holds_three_tenths_of_what_it_needs(
+    held: float, is_weak: bool, is_followed: bool
+) -> None:
+    """Along a corridor whose end is seen in 20 points: how much they hold is read from the covariance of a first solution."""
+    rng = np.random.default_rng(5)
+    ends = [rectangle(rng, n, 0, 20.0, [(-3, 3), (-1.7, 3)]) for n in (4000, 20)]
+    target = map_of(np.concatenate([corridor(rng), ends[0]]))
+    seen = as_source(np.concatenate([corridor(rng, 1000), ends[1]]).astype(np.float32))
+    start = pose_at((0.05, 0.0, 0.0))
+
+    def solved(weak_share: float) -> RegistrationResult:
+        annealing = Annealing(0.3, 0.3, 0.5, 20)
+        return solve(target, seen, start, annealing, sigma=NOISE, blob_weight=0.0, weak_share=weak_share)
+
+    first = solved(1e-12)
+    assert first.covariance is not None
+    H = np.linalg.inv(first.covariance)
+    scale = np.repeat([1.0, 1 / first.lever_arm], 3)
+    values, vectors = np.linalg.eigh(H * np.outer(scale, scale))
+    assert np.abs(vectors[0]).argmax() == 0
+    share = float(values[0] / np.trace(H[:3, :3]))
+    found = solved(share / held)
+    assert bool((np.abs(found.degenerate[:, 0]) > 0.9).any()) == is_weak
+    assert found.T_world_lidar[0, 3] == pytest.approx(0.0 if is_followed else 0.05, abs=0.01)
 
 
 def test_covariance_turns_with_the_world() -> None:
