@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from lslam.errors import InputError, cause
 
+LARGEST = 1 << 29  # bytes of a compressed chunk or message when it is unpacked; recorders make a thousandth of it
 _BLOCK = 1 << 18  # compressed bytes read at a time when only the beginning of a chunk is wanted
 IN_FILE = -1  # chunk number of a message that lies in the file itself
 
@@ -113,13 +114,15 @@ class ChunkFile:
         return records
 
     def _unpack(self, chunk: Chunk) -> bytes:
-        records: bytes = _codec(chunk.compression).decompress(self.read(chunk.position, chunk.size))
+        if chunk.length > LARGEST:
+            raise ValueError(f"it is said to hold {chunk.length} bytes")
+        records = unpack(chunk.compression, self.read(chunk.position, chunk.size), chunk.length)
         if len(records) != chunk.length or (chunk.crc and crc32(records) != chunk.crc):
             raise ValueError("its length or its checksum is not what the file says")
         return records
 
     def _unpack_beginning(self, chunk: Chunk, least: int) -> bytes:
-        engine = _codec(chunk.compression).start()
+        engine = _codec(chunk.compression)()
         records, used = bytearray(), 0
         while len(records) < least and not engine.eof:
             data = b""
@@ -132,28 +135,38 @@ class ChunkFile:
         return bytes(records)
 
 
-@dataclass(frozen=True)
-class _Codec:
-    decompress: Callable[[bytes], Any]
-    start: Callable[[], Any]
-
-
 def check_compression(path: Path, name: str) -> None:
     """Raise InputError for a compression lslam does not know."""
     if name not in ("", "bz2", "lz4", "zstd"):
         raise InputError(f"{path}: compression {name!r} of its chunks is not known: bz2, lz4 and zstd are")
 
 
-def _codec(name: str) -> _Codec:
+def unpack(compression: str, packed: bytes, most: int = LARGEST) -> bytes:
+    """All of `packed`, one frame or several: a few bytes may unpack to any number, so no more than `most` come out.
+
+    Raises ValueError when there are more or the last frame is cut off, and what the decompressors raise.
+    """
+    records = b""
+    while packed:
+        engine = _codec(compression)()
+        records += engine.decompress(packed, max_length=most + 1 - len(records))
+        if not engine.eof or len(records) > most:
+            raise ValueError(f"it is cut off or unpacks to more than {most} bytes")
+        packed = engine.unused_data or b""
+    return records
+
+
+def _codec(name: str) -> Callable[[], Any]:
+    """What makes a decompressor that takes a `max_length`."""
     if name == "bz2":
-        return _Codec(bz2.decompress, bz2.BZ2Decompressor)
+        return bz2.BZ2Decompressor
     if name == "lz4":
         import lz4.frame
 
-        return _Codec(lz4.frame.decompress, lz4.frame.LZ4FrameDecompressor)
+        return lz4.frame.LZ4FrameDecompressor  # type: ignore[no-any-return]
     from backports import zstd
 
-    return _Codec(zstd.decompress, zstd.ZstdDecompressor)
+    return zstd.ZstdDecompressor
 
 
 def _damage() -> tuple[type[Exception], ...]:

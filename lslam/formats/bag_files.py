@@ -19,7 +19,7 @@ from types import TracebackType
 from typing import Any, NamedTuple, Protocol
 
 from lslam.errors import InputError, OutputError, UsageError, cause
-from lslam.formats.bag_chunks import Topic
+from lslam.formats.bag_chunks import Topic, unpack
 from lslam.formats.bag_listing import SUFFIXES, list_bag_files, suffix_of
 from lslam.formats.bag_sqlite import SqliteBag
 from lslam.formats.mcap_records import McapFile
@@ -262,7 +262,7 @@ def _unpacked(recording: Recording, topic: Topic, k: int, limit: int | None) -> 
 
     try:
         if limit is None:
-            return zstd.decompress(recording.read(topic, k))
+            return unpack("zstd", recording.read(topic, k))
         return zstd.ZstdDecompressor().decompress(recording.read(topic, k, _ZSTD_BLOCK), max_length=limit)
-    except zstd.ZstdError as error:
+    except (zstd.ZstdError, ValueError) as error:
         raise InputError(f"{recording.path}: message {k} of {topic.name} is damaged: {error}") from None

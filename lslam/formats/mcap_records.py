@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -163,15 +163,17 @@ class McapFile:
 
     def _index_by_hand(self, number: int | None) -> int:
         """Note the messages of a chunk that no index follows; the end of the last record."""
-        end = 0
         if number is None:
-            return end
+            return 0
+        chunk = self._chunks[number]
         found: dict[int, tuple[list[int], list[int]]] = {}
-        for op, offset, length in self._records_of(self._chunks[number]):
-            end = offset + _PREFIX + length
+
+        def note(op: int, offset: int, length: int) -> None:
             if op == _MESSAGE and length >= _STAMPS:
-                channel, _, stamp = struct.unpack("<HIQ", self._file.part(self._chunks[number], offset + _PREFIX, 14))
+                channel, _, stamp = struct.unpack("<HIQ", self._file.part(chunk, offset + _PREFIX, 14))
                 self._note(found, channel, stamp, offset)
+
+        end = self._each_record(chunk, note)
         for channel, (stamps, offsets) in found.items():
             self._add(channel, number, np.array(stamps, np.int64), np.array(offsets, np.int64))
         return end
@@ -190,24 +192,28 @@ class McapFile:
             number = int(where[0][0, 0])
             for k in range(number + 1) if number != IN_FILE else ():
                 chunk = self._chunks[k]
-                for op, offset, length in self._records_of(chunk):
+
+                def add(op: int, offset: int, length: int, chunk: Chunk = chunk) -> None:
                     if op in (_SCHEMA, _CHANNEL):
                         self._add_names(op, self._file.part(chunk, offset + _PREFIX, length))
 
-    def _records_of(self, chunk: Chunk) -> Iterator[tuple[int, int, int]]:
-        """Op, offset and length of the records of a chunk."""
+                self._each_record(chunk, add)
+
+    def _each_record(self, chunk: Chunk, use: Callable[[int, int, int], None]) -> int:
+        """Hand op, offset and length of the records of a chunk to `use` until one is damaged; the end of the last."""
         offset = 0
         try:
             while offset < chunk.length:
                 op, length = struct.unpack("<BQ", self._file.part(chunk, offset, _PREFIX))
                 if offset + _PREFIX + length > chunk.length:
                     raise CutOffError
-                yield op, offset, length
+                use(op, offset, length)
                 offset += _PREFIX + length
-        except (InputError, CutOffError, struct.error):
+        except (InputError, CutOffError, struct.error, ValueError, OverflowError):
             self.loss = (
                 self.loss or f"{self.path}: the chunk at byte {chunk.position} is damaged and its messages are lost"
             )
+        return offset
 
 
 def _text(data: bytes, at: int) -> tuple[str, int]:

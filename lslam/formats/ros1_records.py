@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -152,17 +152,18 @@ class Ros1Bag:
 
     def _index_by_hand(self, number: int | None) -> int:
         """Note the messages of a chunk that has no index, because the recorder was stopped before; the end of the last."""
-        end = 0
         if number is None:
-            return end
+            return 0
         found: dict[int, tuple[list[int], list[int]]] = {}
-        for record, offset in self._records_of(self._chunks[number]):
-            end = record.end
+
+        def note(record: _Record, offset: int) -> None:
             if record.op == _MESSAGE:
                 seconds, nanoseconds = struct.unpack("<II", record.fields[b"time"])
                 stamps, offsets = found.setdefault(_u32(record.fields[b"conn"]), ([], []))
                 stamps.append(seconds * 10**9 + nanoseconds)
                 offsets.append(offset)
+
+        end = self._each_record(self._chunks[number], note)
         for connection, (stamps, offsets) in found.items():
             self._add(connection, np.array(stamps, np.int64), np.array(offsets, np.int64))
         return end
@@ -173,23 +174,28 @@ class Ros1Bag:
             if number in self._connections or not where:
                 continue
             chunk = self._chunks[int(where[0][0, 0])]
-            for record, _ in self._records_of(chunk):
+
+            def add(record: _Record, offset: int, chunk: Chunk = chunk) -> None:
                 if record.op == _CONNECTION:
                     self._add_connection(chunk, record)
 
-    def _records_of(self, chunk: Chunk) -> Iterator[tuple[_Record, int]]:
+            self._each_record(chunk, add)
+
+    def _each_record(self, chunk: Chunk, use: Callable[[_Record, int], None]) -> int:
+        """Hand the records of a chunk and their offsets to `use` until one is damaged; the end of the last that was not."""
         offset = 0
         try:
             while offset < chunk.length:
                 record = self._record(chunk, offset)
                 if record.end > chunk.length:
                     raise CutOffError
-                yield record, offset
+                use(record, offset)
                 offset = record.end
         except (InputError, *_BROKEN):
             self.loss = (
                 self.loss or f"{self.path}: the chunk at byte {chunk.position} is damaged and its messages are lost"
             )
+        return offset
 
 
 def _fields(block: bytes) -> dict[bytes, bytes]:

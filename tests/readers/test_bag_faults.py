@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import sqlite3
 import struct
+import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -355,3 +356,36 @@ def test_flipped_bytes_are_errors_of_ours_or_nothing_at_all(tmp_path: Path, kind
             with contextlib.suppress(InputError):
                 sequence.scan(index)
     assert opened > 20
+
+
+@pytest.mark.parametrize("field", [b"time=", b"conn="])
+def test_a_record_without_its_fields_costs_the_rest_of_its_chunk(tmp_path: Path, field: bytes) -> None:
+    """The chunk has no index, so its records are walked over; the one with the message says nothing of when or what."""
+    path = bag(tmp_path / "a.bag", clouds(3, n=60))
+    data = path.read_bytes()
+    data = data[: data.index(b"op=\x04") - 8]
+    at = data.rindex(b"op=\x02")
+    at = data.index(field, at) if field in data[at : at + 60] else data.rindex(field, 0, at)
+    path.write_bytes(data[:at] + b"x" + data[at + 1 :])
+    sequence = open_sequence(path)
+    assert len(sequence) == 2
+    assert "is damaged and its messages are lost" in "".join(sequence.problems)
+
+
+def test_a_name_that_is_cut_off_in_a_chunk_costs_the_chunk(tmp_path: Path, store: Any) -> None:
+    short = record(4, struct.pack("<HH", 7, 3)) + b"".join(messages(store, 1))
+    with pytest.raises(InputError, match=r"a\.mcap"):
+        open_sequence(mcap(tmp_path / "a.mcap", chunk(short)))
+
+
+def test_what_unpacks_to_more_than_it_says_takes_no_memory(tmp_path: Path, store: Any) -> None:
+    honest = names() + b"".join(messages(store, 1))
+    packed = lz4.frame.compress(honest + bytes(300_000_000))
+    head = struct.pack("<QQQI", START_NS, START_NS, len(honest), 0)
+    path = mcap(tmp_path / "a.mcap", record(6, head + text("lz4") + struct.pack("<Q", len(packed)) + packed))
+    tracemalloc.start()
+    with pytest.raises(InputError):
+        open_sequence(path)
+    most = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert most < 100_000_000
