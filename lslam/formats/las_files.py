@@ -12,12 +12,14 @@ from numpy.typing import NDArray
 from lslam.errors import InputError, OutputError, cause
 from lslam.foreign import importing
 from lslam.formats.atomic import atomic_write
+from lslam.formats.las_check import check_las
 from lslam.types.cloud import ArrayCloud, Cloud
 from lslam.version import __version__
 
 SCALE = 0.001  # m
 _WAY_OUT = "install it with: pip install laspy lazrs"
 _REACH = 2**31 - 1
+_BLOCK = 1 << 26  # bytes of points decompressed at a time
 
 
 def write_las(path: Path, cloud: Cloud, wkt: str = "") -> None:
@@ -63,15 +65,30 @@ def read_las(path: Path) -> tuple[ArrayCloud, str]:
     """
     with importing("laspy", _WAY_OUT):
         import laspy
+        import lazrs  # noqa: F401
     try:
-        data = laspy.read(path)
-        points = np.asarray(data.xyz, np.float64)
-        intensity = np.asarray(data.intensity, np.float32)
+        with path.open("rb") as stream:
+            sizes = check_las(stream)
+            stream.seek(0)
+            # On all cores whole chunks are decompressed at once, however large they are.
+            is_small = sizes.chunk <= _BLOCK
+            backend = laspy.LazBackend.LazrsParallel if is_small else laspy.LazBackend.Lazrs
+            with laspy.open(stream, closefd=False, laz_backend=backend) as reader:
+                step = max(_BLOCK // sizes.record, 1)
+                blocks = [
+                    (np.column_stack([block.x, block.y, block.z]), np.asarray(block.intensity, np.float32))
+                    for block in reader.chunk_iterator(step)
+                ]
+                header = reader.header
     except OSError as error:
         raise InputError(f"{path} cannot be read: {cause(error)}") from None
-    except Exception as error:  # laspy and lazrs raise whatever a damaged byte leads to
+    except BaseException as error:  # laspy and lazrs raise whatever a damaged byte leads to, Rust its panics
+        if not isinstance(error, Exception) and type(error).__name__ != "PanicException":
+            raise
         raise InputError(f"{path} cannot be read as LAS: {error}") from None
-    texts = [vlr.string for vlr in data.header.vlrs if type(vlr).__name__ == "WktCoordinateSystemVlr"]
+    points = np.concatenate([np.zeros((0, 3)), *(points for points, _ in blocks)])
+    intensity = np.concatenate([np.zeros(0, np.float32), *(values for _, values in blocks)])
+    texts = [vlr.string for vlr in header.vlrs if type(vlr).__name__ == "WktCoordinateSystemVlr"]
     return ArrayCloud(points, intensity), texts[0].rstrip("\0") if texts else ""
 
 
