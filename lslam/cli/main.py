@@ -60,6 +60,16 @@ class LazyGroup(click.Group):
         assert isinstance(command, click.Command)
         return command
 
+    def make_context(self, *args: Any, **more: Any) -> click.Context:
+        """As click does, with the same care for what --help and --version write: click would exit with 1."""
+        try:
+            return super().make_context(*args, **more)
+        except BrokenPipeError:
+            from lslam.cli.console import leave_stdout
+
+            leave_stdout()
+            raise click.exceptions.Exit(0) from None
+
     def invoke(self, ctx: click.Context) -> Any:
         """As click does, but a reader of stdout that has left (`lslam ... | head`) is no error."""
         try:
