@@ -104,6 +104,15 @@ def from_quaternion(q: NDArray[Any]) -> Floats:
     return m
 
 
+def is_rotation(R: NDArray[Any], tolerance: float) -> NDArray[np.bool_]:
+    """(...,) whether each (..., 3, 3) matrix is a rotation up to `tolerance` in R^T R; False where numbers are not finite."""
+    R = np.asarray(R, np.float64)
+    is_small = np.abs(R).max(axis=(-2, -1)) < 2  # NaN is not, and nothing below overflows
+    R = np.where(is_small[..., None, None], R, 0.0)
+    off = np.abs(np.swapaxes(R, -1, -2) @ R - np.eye(3)).max(axis=(-2, -1))
+    return np.asarray(is_small & (off <= tolerance) & (np.linalg.det(R) > 0))
+
+
 def normalise(R: NDArray[Any]) -> Floats:
     """Nearest rotation (SVD) to (..., 3, 3) matrices that rounding moved off SO(3)."""
     u, _, vt = np.linalg.svd(np.asarray(R, np.float64))

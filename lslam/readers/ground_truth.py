@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,10 +14,11 @@ from lslam.errors import InputError
 from lslam.formats.pose_rows import numbers, read_rows
 from lslam.formats.sequence_toml import FILE_NAME, SequenceInfo
 from lslam.formats.trajectory_files import read_trajectory
-from lslam.geometry import se3
+from lslam.geometry import se3, so3
 from lslam.readers.listing import file_numbers, rows_of
 from lslam.types.calibration import Calibration
 from lslam.types.trajectory import Trajectory
+from lslam.untrusted import whole_number
 
 USUAL_NAMES = (
     "gt.tum", "groundtruth.tum", "ground_truth.tum", "gt_poses.tum", "poses.tum", "gt.csv", "groundtruth.csv",
@@ -56,21 +58,47 @@ def load_poses(path: Path, stamps_ns: NDArray[np.int64], files: list[Path], voic
         return None
 
 
-def pair_by_number(truth: Trajectory, files: list[Path]) -> Trajectory | None:
+class Numbered(NamedTuple):
+    """Scans and poses of the same numbers: the truth of scans that `have` (N,) a pose, stamps_ns (N,) of all scans."""
+
+    truth: Trajectory
+    have: NDArray[np.bool_]
+    stamps_ns: NDArray[np.int64]
+
+
+def pair_by_number(truth: Trajectory, files: list[Path]) -> Numbered | None:
     """The poses of a named CSV that belong to the scans by its first column, `num` (MCD), and the scans' file names.
 
-    Exactly one pose per scan, in order; None when the file has no such column or lacks a scan.
+    Scans without a pose get their stamps from their numbers. None when the file has no such column or fewer than two of the
+    scans, and when it has as many poses as there are scans, but of other numbers: one of them is numbered from elsewhere.
     """
     numbers_of_files = file_numbers(files)
     rows, _ = read_rows(Path(truth.source))
     if numbers_of_files is None or rows[0].text.split(",")[0].strip().lower() not in _NUMBER_COLUMNS:
         return None
     cells = [row.text.split(",")[0].strip() for row in rows[1:]]
-    if len(cells) != len(truth) or not all(c.isdigit() for c in cells):
+    row_of = {whole_number(c): k for k, c in enumerate(cells)}
+    if len(cells) != len(truth) or None in row_of:
         return None
-    row_of = {int(c): k for k, c in enumerate(cells)}
-    found = [row_of.get(int(n), -1) for n in numbers_of_files]
-    return None if min(found) < 0 else truth.select(np.array(found))
+    found = np.array([row_of.get(int(n), -1) for n in numbers_of_files])
+    have = found >= 0
+    known = found[have]
+    if len(known) < 2 or np.any(np.diff(known) <= 0) or (not have.all() and len(truth) == len(files)):
+        return None
+    return Numbered(truth.select(known), have, _stamps_by_number(numbers_of_files, have, truth.stamps_ns[known]))
+
+
+def _stamps_by_number(
+    numbers_of_files: NDArray[np.int64], have: NDArray[np.bool_], known: NDArray[np.int64]
+) -> NDArray[np.int64]:
+    """(N,) ns: `known` where there are any, between them evenly, before and after them at their median step."""
+    at, since = numbers_of_files[have], known - known[0]
+    step = float(np.median(np.diff(since) / np.diff(at)))
+    reckoned = np.interp(numbers_of_files, at, since)
+    reckoned += step * (np.minimum(numbers_of_files - at[0], 0) + np.maximum(numbers_of_files - at[-1], 0))
+    stamps: NDArray[np.int64] = known[0] + np.rint(reckoned).astype(np.int64)
+    stamps[have] = known
+    return stamps
 
 
 def to_lidar(
@@ -121,7 +149,7 @@ def _kitti_poses(path: Path) -> NDArray[np.float64]:
     rows, _ = read_rows(path)
     upper = numbers(rows, 12, path, "KITTI poses").reshape(-1, 3, 4)
     R = upper[:, :, :3]
-    wrong = np.flatnonzero(np.abs(np.swapaxes(R, 1, 2) @ R - np.eye(3)).max(axis=(1, 2)) > 1e-2)
+    wrong = np.flatnonzero(~so3.is_rotation(R, 1e-2))
     if len(wrong):
         raise InputError(f"{path}, line {rows[wrong[0]].number}: the 3x3 part is no rotation matrix")
     return se3.make(R, upper[:, :, 3])

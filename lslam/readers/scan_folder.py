@@ -14,7 +14,7 @@ from lslam.formats.mcd_calib import read_mcd_extrinsics
 from lslam.formats.point_files import SUFFIXES, read_points
 from lslam.formats.sequence_toml import SequenceInfo
 from lslam.readers.folder_sequence import FolderSequence
-from lslam.readers.ground_truth import Voice, find_ground_truth, load_poses, pair_by_number, to_lidar
+from lslam.readers.ground_truth import Numbered, Voice, find_ground_truth, load_poses, pair_by_number, to_lidar
 from lslam.readers.listing import list_scans, rows_of, stamps_in_names
 from lslam.readers.point_times import TimeRule, decide_rule
 from lslam.readers.sidecars import calibration_over, compensation_note, load_gnss, load_imu, per_point_folder, read_info
@@ -117,10 +117,17 @@ def _stamps_and_truth(
         numbered = pair_by_number(truth, files)
         if numbered is not None or len(truth) == len(files):
             rule = "by its number column" if numbered is not None else "by index"
-            truth = truth if numbered is None else numbered
             voice.notes.append(f"no stamps of the scans: each takes the stamp of its row of {truth_file.name}, {rule}")
-            stamps, rate = check_stamps(truth.stamps_ns, info.rate_hz, truth_file, voice.problems)
-            return files, stamps, rate, replace(truth, stamps_ns=stamps)
+            if numbered is None:
+                numbered = Numbered(truth, np.ones(len(files), np.bool_), truth.stamps_ns)
+            without = np.flatnonzero(~numbered.have)
+            if len(without):
+                voice.problems.append(
+                    f"{truth_file} has no pose for {len(without)} of {len(files)} scans, {files[without[0]].name} the first: "
+                    "their stamps follow from their numbers, ground truth is of the others"
+                )
+            stamps, rate = check_stamps(numbered.stamps_ns, info.rate_hz, truth_file, voice.problems)
+            return files, stamps, rate, replace(numbered.truth, stamps_ns=stamps[numbered.have])
         voice.problems.append(
             f"{truth_file} has {len(truth)} stamped poses for {len(files)} scans without stamps: ground truth is not used; "
             "add times.txt"

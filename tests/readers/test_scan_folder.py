@@ -192,3 +192,20 @@ def test_real_ouster_folder(recordings: Callable[[str], Path]) -> None:
     elevation = np.arctan2(scan.points[:, 2], np.hypot(scan.points[:, 0], scan.points[:, 1]))
     means = [elevation[good & (scan.rings == r)].mean() for r in range(64)]
     assert (np.diff(means) < 0).all()
+
+
+@pytest.mark.parametrize("missing", [(0, 1), (5,), (0, 3, 7), (6, 7)])
+def test_scans_without_a_pose_keep_the_others_truth_and_stamps(tmp_path: Path, missing: tuple[int, ...]) -> None:
+    folder = scans(tmp_path / "kth", 8, ".pcd")
+    poses = lidar_poses(8)[:, :3, 3]
+    rows = [
+        f"{k},{1670403902.2 + k / 10:.1f},{x},{y},{z},0,0,0,1" for k, (x, y, z) in enumerate(poses) if k not in missing
+    ]
+    (folder / "pose_inW.csv").write_text("\n".join(["num,t,x,y,z,qx,qy,qz,qw", *rows]) + "\n")
+    s = open_sequence(folder)
+    np.testing.assert_array_equal(s.stamps_ns, 1670403902200000000 + np.arange(8) * 100_000_000)
+    assert s.ground_truth is not None
+    kept = np.setdiff1d(np.arange(8), missing)
+    np.testing.assert_array_equal(s.ground_truth.stamps_ns, s.stamps_ns[kept])
+    np.testing.assert_allclose(s.ground_truth.positions, poses[kept])
+    assert said(s.problems, f"has no pose for {len(missing)} of 8 scans, {missing[0]:06d}.pcd the first")
