@@ -7,13 +7,22 @@ unwritable, 4 done but a gate the user set failed, 130 interrupted.
 from __future__ import annotations
 
 import difflib
+import re
 from collections.abc import Iterable
+
+# Nobody reads a word of so many characters; paths may have some hundreds.
+_FLOOD = re.compile(r"\S{1000,}")
 
 
 class LslamError(Exception):
     """Base of all errors lslam raises on purpose: one clear sentence that names the file, the place and the way out."""
 
     exit_code = 1
+
+    def __str__(self) -> str:
+        """What no terminal shows escaped, and without the middle of a flood: sentences quote what files hold."""
+        said = "".join(c if c.isprintable() or c == "\n" else repr(c)[1:-1] for c in super().__str__())
+        return _FLOOD.sub(lambda word: f"{word[0][:200]}...{word[0][-100:]}", said)
 
 
 class RunFailedError(LslamError):

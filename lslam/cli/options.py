@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 
 from lslam.errors import ConfigError, UsageError, nearest
+from lslam.untrusted import whole_number
 
 if TYPE_CHECKING:
     from lslam.config.input import ScanRange
@@ -140,10 +141,10 @@ def with_preset(settings: Iterable[str], preset: str | None) -> list[str]:
 
 def epsg(text: str) -> int:
     """The number of `EPSG:25832` or `25832`; raises UsageError for anything else."""
-    number = text.upper().removeprefix("EPSG:")
-    if not number.isdigit():
+    number = whole_number(text.upper().removeprefix("EPSG:"))
+    if number is None:
         raise UsageError(f"--crs {text} is no EPSG code: EPSG:25832 is one")
-    return int(number)
+    return number
 
 
 def studied(function: F) -> F:

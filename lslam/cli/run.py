@@ -17,6 +17,7 @@ from lslam.cli.console import log, progress, setup_logging, show
 from lslam.cli.signals import GentleStop, gentle_stop
 from lslam.errors import RunFinishedError, UsageError
 from lslam.registration.residuals import RESIDUALS
+from lslam.untrusted import parse_json
 
 if TYPE_CHECKING:
     from lslam.config import Config
@@ -225,10 +226,10 @@ def _print_finished(out: Path, as_json: bool) -> None:
     import json
 
     evaluation = out / "evaluation.json"
-    score = json.loads(evaluation.read_text(encoding="utf-8")) if evaluation.exists() else None
+    score = parse_json(evaluation.read_text(encoding="utf-8")) if evaluation.exists() else None
     document = {
         "folder": str(out),
-        "manifest": json.loads((out / "manifest.json").read_text("utf-8")),
+        "manifest": parse_json((out / "manifest.json").read_text("utf-8")),
         "evaluation": score,
     }
     show(json.dumps(document, allow_nan=False) + "\n")

@@ -15,6 +15,7 @@ from pydantic import BaseModel, ValidationError
 from lslam.config.config import Config
 from lslam.config.preset_files import BASE, known_presets, read_preset, read_toml
 from lslam.errors import ConfigError, nearest
+from lslam.untrusted import parse_toml
 
 Tree = dict[str, Any]
 
@@ -111,7 +112,7 @@ def _parse_setting(setting: str) -> Tree:
 def _value(text: str) -> Any:
     """A TOML value, or the text itself when it is none: `--set odometry.method=icp` needs no quotes."""
     try:
-        return tomllib.loads(f"v = {text}")["v"]
+        return parse_toml(f"v = {text}")["v"]
     except tomllib.TOMLDecodeError:
         return text
 

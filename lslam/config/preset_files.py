@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from lslam.errors import ConfigError, InputError, UsageError, cause, nearest
+from lslam.untrusted import is_file, parse_toml
 
 FOLDER = "presets"
 # A preset may say what it is, and on which other one it stands, on a line each beside its sections.
@@ -16,7 +17,7 @@ SUMMARY, BASE = "summary", "base"
 
 def known_presets() -> dict[str, str]:
     """Names and one-line summaries of the presets that ship with lslam."""
-    return {name: str(tomllib.loads(text).get(SUMMARY, "")) for name, text in _shipped().items()}
+    return {name: str(parse_toml(text).get(SUMMARY, "")) for name, text in _shipped().items()}
 
 
 def read_preset(name: str) -> dict[str, Any]:
@@ -26,8 +27,8 @@ def read_preset(name: str) -> dict[str, Any]:
     """
     shipped = _shipped()
     if name in shipped:
-        tree = tomllib.loads(shipped[name])
-    elif name.endswith(".toml") or Path(name).is_file():
+        tree = parse_toml(shipped[name])
+    elif name.endswith(".toml") or is_file(name):
         tree = read_toml(Path(name), "preset")
     else:
         raise UsageError(f"no preset {name!r} and no TOML file; {nearest(name, shipped)}")
@@ -38,7 +39,7 @@ def read_preset(name: str) -> dict[str, Any]:
 def read_toml(path: Path, what: str) -> dict[str, Any]:
     """A TOML file as a dictionary. Raises InputError when it cannot be read, ConfigError when it is no TOML."""
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8-sig"))
+        return parse_toml(path.read_text(encoding="utf-8-sig"))
     except OSError as error:
         raise InputError(f"{what} {path} cannot be read: {cause(error)}") from None
     except UnicodeDecodeError:

@@ -21,6 +21,8 @@ Value = bool | int | float | str
 Point = dict[str, Value]
 # Decimals of a range's values: 0.1 + 0.2 shall be 0.3.
 _DIGITS = 12
+# Of one range; a run takes seconds at the least.
+MOST_VALUES = 10_000
 
 
 class Range(Section):
@@ -40,6 +42,10 @@ class Range(Section):
             raise ValueError(f"the range from {self.start} to {self.stop} needs a step or num, one of them")
         if self.log and (self.num is None or self.start <= 0):
             raise ValueError(f"the range from {self.start} to {self.stop}: log needs num and a start above 0")
+        # Before they are built: a step of 1e-10 takes all memory.
+        count = self.num if self.step is None else (self.stop - self.start) / self.step
+        if not (count is not None and count < MOST_VALUES):
+            raise ValueError(f"the range from {self.start} to {self.stop} has more than {MOST_VALUES} values")
         return self
 
     def values(self) -> tuple[int | float, ...]:

@@ -50,4 +50,4 @@ def suffix_of(path: Path) -> str:
 
 def _natural(path: Path) -> list[tuple[int, str]]:
     """Sort key with numbers compared as numbers: part_2 before part_10."""
-    return [(int(p), "") if p.isdigit() else (-1, p) for p in re.split(r"(\d+)", path.name)]
+    return [(int(p), "") if p.isdecimal() else (-1, p) for p in re.split(r"(\d+)", path.name)]

@@ -16,6 +16,7 @@ from lslam.geometry import se2
 from lslam.geometry.geodesy import from_local, to_local
 from lslam.types.building import Building, Footprint
 from lslam.types.building_correction import BuildingCorrection, CorrectedMap
+from lslam.untrusted import MISFIT, parse_json
 
 Floats = NDArray[np.float64]
 
@@ -57,7 +58,7 @@ def write_corrected(path: Path, found: CorrectedMap) -> None:
 def read_corrected(path: Path) -> CorrectedMap:
     """Read what `write_corrected` wrote, outlines rounded to 7 decimals of a degree. Raises InputError naming the file."""
     try:
-        tree = json.loads(path.read_bytes())
+        tree = parse_json(path.read_bytes())
         if tree["schema"] != SCHEMA:
             raise ValueError(f"schema {tree['schema']!r}, expected {SCHEMA!r}")
         origin = np.array(tree["origin"], np.float64)
@@ -78,7 +79,7 @@ def read_corrected(path: Path) -> CorrectedMap:
         )
     except OSError as error:
         raise InputError(f"{path} cannot be read: {cause(error)}") from None
-    except (ValueError, KeyError, TypeError, IndexError, AttributeError, RecursionError) as error:
+    except MISFIT as error:
         raise InputError(f"{path} is no buildings.geojson of a run: {error}") from None
 
 

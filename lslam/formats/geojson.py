@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from lslam.errors import InputError, cause
 from lslam.formats.atomic import atomic_write
+from lslam.untrusted import MISFIT, parse_json
 
 
 def write_line(path: Path, lat_lon_alt: NDArray[Any], properties: Mapping[str, Any]) -> None:
@@ -39,13 +40,13 @@ def read_line(path: Path) -> NDArray[np.float64]:
     Raises InputError naming the file: unreadable, no GeoJSON, without exactly one line, with positions off the Earth.
     """
     try:
-        tree = json.loads(path.read_bytes())
+        tree = parse_json(path.read_bytes())
         lines = [shape["coordinates"] for shape in _shapes(tree) if shape.get("type") in ("LineString", "Point")]
         rows = lines[0] if len(lines) == 1 and np.ndim(lines[0][0]) else lines
         places = np.array([[*row, 0.0][:3] for row in rows], np.float64)[:, [1, 0, 2]]
     except OSError as error:
         raise InputError(f"{path} cannot be read: {cause(error)}") from None
-    except (ValueError, TypeError, KeyError, IndexError, RecursionError):
+    except MISFIT:
         raise InputError(f"{path} is no GeoJSON of one line in longitude and latitude") from None
     if not (np.isfinite(places).all() and (np.abs(places[:, :2]) <= [90, 180]).all()):
         raise InputError(

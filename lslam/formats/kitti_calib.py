@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.errors import InputError, cause
-from lslam.geometry import se3
+from lslam.geometry import se3, so3
 
 Floats = NDArray[np.float64]
 LIDAR_TO_CAMERA = ("Tr", "Tr_velo_to_cam", "Tr_velo_cam")
@@ -114,6 +114,6 @@ def _numbers(path: Path, entries: dict[str, str], name: str, count: int) -> list
 def _rigid(upper: Floats, path: Path, name: str) -> Floats:
     """(4, 4) with the rotation put back on SO(3): seven printed digits are not enough for `R^T` to be the inverse."""
     R = upper[:, :3]
-    if np.abs(R @ R.T - np.eye(3)).max() > 1e-2 or np.linalg.det(R) < 0:
+    if not so3.is_rotation(R, 1e-2):
         raise InputError(f"calibration {path}: {name} holds no rotation")
     return se3.normalise(se3.make(R, upper[:, 3]))

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.errors import InputError, cause
+from lslam.geometry import so3
 
 _ROW = re.compile(r"-\s*\[(.*)\]\s*$")
 
@@ -36,6 +37,6 @@ def read_mcd_extrinsics(path: Path, sensor: str = "os_sensor") -> NDArray[np.flo
     if len(rows) != 4 or any(len(row) != 4 for row in rows):
         raise InputError(f"{path}, line {begin + 1}: {sensor} is not followed by 'T:' and four rows of four numbers")
     T = np.array(rows)
-    if np.abs(T[:3, :3] @ T[:3, :3].T - np.eye(3)).max() > 1e-3 or np.linalg.det(T[:3, :3]) < 0:
+    if not so3.is_rotation(T[:3, :3], 1e-3) or not np.isfinite(T).all():
         raise InputError(f"{path}, line {begin + 1}: T of {sensor} is no rigid transform")
     return T

@@ -17,6 +17,7 @@ from xml.sax.saxutils import quoteattr
 from lslam.errors import InputError, cause
 from lslam.formats.atomic import atomic_write
 from lslam.formats.osm_geojson import elements_of, is_geojson
+from lslam.untrusted import parse_json
 
 ATTRIBUTION = "© OpenStreetMap contributors, ODbL 1.0, openstreetmap.org/copyright"
 GENERATOR = "lslam"
@@ -155,7 +156,7 @@ def from_overpass(tree: Any) -> OsmData:
     for element in tree["elements"]:
         try:
             _add_json(data, element)
-        except (AttributeError, KeyError, TypeError, OverflowError) as error:
+        except (AttributeError, LookupError, TypeError, ArithmeticError) as error:
             raise ValueError(f"an element without {error}: {str(element)[:80]}") from None
     data.number_drawn()
     return data
@@ -169,7 +170,7 @@ def write_osm(path: Path, data: OsmData) -> None:
 
 def _read_json(path: Path) -> OsmData:
     try:
-        tree = json.loads(path.read_bytes())
+        tree = parse_json(path.read_bytes())
         if not is_geojson(tree):
             return from_overpass(tree)
         data = from_overpass({"elements": elements_of(tree)})

@@ -10,12 +10,14 @@ from numpy.typing import NDArray
 
 from lslam.errors import InputError
 from lslam.formats.stamps_files import read_stamps
+from lslam.untrusted import whole_number
 
 # Columns, in the order of the devkit's dataformat.txt.
 LAT, LON, ALT, ROLL, PITCH, YAW = range(6)
 ACCEL, GYRO = slice(11, 14), slice(17, 20)  # ax..az and wx..wz: vehicle axes, x forward, y left, z up
 POS_ACC = 23
 _WIDTH = 30
+_HIGHEST = 1e5  # m
 
 
 @dataclass(frozen=True)
@@ -39,7 +41,7 @@ def read_oxts(folder: Path) -> Oxts | None:
     Samples without a stamp are dropped and named in `problems`. Raises InputError naming the file that is not 30 numbers.
     """
     files = sorted((folder / "data").glob("*.txt"))
-    files = [f for f in files if f.stem.isdigit()]
+    files = [f for f in files if whole_number(f.stem) is not None]
     if not files:
         return None
     values = np.empty((len(files), _WIDTH))
@@ -67,4 +69,6 @@ def _read_sample(path: Path) -> NDArray[np.float64]:
         raise InputError(f"{path} is no OXTS sample: {error}") from None
     if len(values) != _WIDTH or not np.isfinite(values).all():
         raise InputError(f"{path} is no OXTS sample: {len(values)} numbers where {_WIDTH} finite ones belong")
+    if not (np.abs(values[:2]) <= [90, 180]).all() or abs(values[2]) > _HIGHEST:
+        raise InputError(f"{path} is no OXTS sample: it begins with no latitude, longitude and height")
     return values

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from lslam.errors import InputError, UsageError, cause
 from lslam.formats.atomic import atomic_write
 from lslam.formats.point_cloud import PointCloud, cloud_from_fields
+from lslam.untrusted import whole_number
 
 ENCODINGS = ("binary", "ascii", "binary_compressed")
 _KINDS = {"F": (4, 8), "I": (1, 2, 4, 8), "U": (1, 2, 4, 8)}
@@ -120,7 +121,7 @@ def _check_header(path: Path, entries: dict[str, list[str]], size: int) -> _Head
         )
     dtypes = []
     for name, length, kind in zip(names, sizes, kinds, strict=True):
-        if kind not in _KINDS or not length.isdigit() or int(length) not in _KINDS[kind]:
+        if kind not in _KINDS or whole_number(length) not in _KINDS[kind]:
             raise InputError(f"{path}: PCD field {name!r} has TYPE {kind} with SIZE {length}, which does not exist")
         dtypes.append(np.dtype(f"<{kind.lower()}{length}"))
     counts = [_number(path, "COUNT", c) for c in repeats]
@@ -136,9 +137,10 @@ def _check_header(path: Path, entries: dict[str, list[str]], size: int) -> _Head
 
 
 def _number(path: Path, key: str, *words: str) -> int:
-    if len(words) != 1 or not words[0].isdigit():
+    value = whole_number(words[0]) if len(words) == 1 else None
+    if value is None:
         raise InputError(f"{path}: PCD {key} {' '.join(words)!r} is no whole number")
-    return int(words[0])
+    return value
 
 
 def _ascii_columns(path: Path, header: _Header, body: memoryview) -> dict[str, NDArray[Any]]:

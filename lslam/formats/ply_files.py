@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from lslam.errors import InputError, cause
 from lslam.formats.atomic import atomic_write
 from lslam.formats.point_cloud import PointCloud, cloud_from_fields
+from lslam.untrusted import whole_number
 
 _TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",
@@ -109,8 +110,8 @@ def _read_header(path: Path, data: bytes) -> tuple[str, list[_Element], int]:
             continue
         if words[0] == "format" and len(words) == 3 and words[1] in _ORDERS:
             encoding = words[1]
-        elif words[0] == "element" and len(words) == 3 and words[2].isdigit():
-            elements.append(_Element(words[1], int(words[2]), []))
+        elif words[0] == "element" and len(words) == 3 and (count := whole_number(words[2])) is not None:
+            elements.append(_Element(words[1], count, []))
         elif words[0] == "property" and elements and len(words) == 3 and words[1] in _TYPES:
             elements[-1].properties.append((words[2], _TYPES[words[1]]))
         elif words[0] == "property" and elements and len(words) == 5 and words[1] == "list":

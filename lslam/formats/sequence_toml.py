@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 
 from lslam.errors import InputError, nearest
 from lslam.formats.atomic import atomic_write
+from lslam.geometry import so3
+from lslam.untrusted import parse_toml
 
 FILE_NAME = "sequence.toml"
 INSTANTS = ("scan_start", "scan_middle", "scan_end")
@@ -86,7 +88,7 @@ def read_sequence_toml(path: Path) -> SequenceInfo:
 def parse_sequence_toml(text: str, path: Path | str) -> SequenceInfo:
     """The same from text that was found at `path`."""
     try:
-        tree = tomllib.loads(text)
+        tree = parse_toml(text)
     except tomllib.TOMLDecodeError as error:
         raise InputError(f"{path} cannot be read as TOML: {error}") from None
     extrinsics = tree.pop("extrinsics", {})
@@ -125,6 +127,11 @@ def sequence_toml_text(info: SequenceInfo) -> str:
     return tomli_w.dumps(tree)
 
 
+def is_rate(rate_hz: float) -> bool:
+    """Whether it can be a sensor's: stamps are made of it."""
+    return 1e-3 < rate_hz < 1e6
+
+
 def _is_text(value: Any) -> bool:
     return isinstance(value, str) and bool(value.strip())
 
@@ -143,7 +150,7 @@ _CHECKS: dict[str, tuple[Callable[[Any], bool], str]] = {
     "rings": (_is_count, "a whole number above 0"),
     "rows": (_is_count, "a whole number above 0"),
     "cols": (_is_count, "a whole number above 0"),
-    "rate_hz": (lambda v: _is_number(v) and v > 0, "a number above 0, scans per second"),
+    "rate_hz": (lambda v: _is_number(v) and is_rate(v), "a number above 0.001 and below a million, scans per second"),
     "motion_compensated": (lambda v: isinstance(v, bool), "true or false"),
     "compensated_to": (lambda v: v in INSTANTS, "one of " + ", ".join(INSTANTS)),
     "vertical_correction_deg": (_is_number, "a number, degrees"),
@@ -178,7 +185,6 @@ def _transform(path: Path | str, key: str, value: Any) -> Matrix:
         raise InputError(f"{path}: extrinsics.{key} needs 3x4 or 4x4 numbers, row by row")
     T = np.eye(4)
     T[:3] = numbers[:12].reshape(3, 4)
-    R = T[:3, :3]
-    if not np.isfinite(numbers).all() or np.abs(R @ R.T - np.eye(3)).max() > 1e-3 or np.linalg.det(R) < 0:
+    if not np.isfinite(numbers).all() or not so3.is_rotation(T[:3, :3], 1e-3):
         raise InputError(f"{path}: extrinsics.{key} is no rigid transform: its left 3x3 block is not a rotation")
     return T

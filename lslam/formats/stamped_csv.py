@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from decimal import Decimal, InvalidOperation
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +12,7 @@ from numpy.typing import NDArray
 from lslam.errors import InputError, cause
 from lslam.formats.atomic import atomic_write
 from lslam.formats.stamps_files import parse_stamp
+from lslam.untrusted import decimal_number
 
 TIME_COLUMNS = ("stamp_ns", "timestamp", "stamp", "time", "t", "time_s", "stamp_s")
 
@@ -68,11 +68,8 @@ def write_stamped_csv(
 
 
 def _nanoseconds(text: str) -> int:
-    try:
-        stamp = Decimal(text)
-    except InvalidOperation:
-        raise ValueError(f"no time: {text!r}") from None
-    if not stamp.is_finite() or abs(stamp) >= 2**63 or stamp != stamp.to_integral_value():
+    stamp = decimal_number(text)
+    if stamp != stamp.to_integral_value():
         raise ValueError(f"no whole number of nanoseconds: {text!r}")
     return int(stamp)
 

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from lslam.errors import InputError
 from lslam.formats.npz_files import read_npz, write_npz
+from lslam.untrusted import MISFIT, parse_json
 
 Arrays = dict[str, NDArray[Any]]
 Classes = Mapping[str, type]
@@ -40,8 +41,8 @@ def read_state(path: Path, classes: Sequence[type]) -> Any:
     """The value that was written; only dataclasses among `classes` are made. Raises InputError naming a file that is damaged."""
     arrays = read_npz(path)
     try:
-        return _decode(json.loads(arrays["tree"].tobytes()), arrays, {c.__name__: c for c in classes})
-    except (KeyError, ValueError, TypeError, IndexError, AttributeError, RecursionError) as error:
+        return _decode(parse_json(arrays["tree"].tobytes()), arrays, {c.__name__: c for c in classes})
+    except MISFIT as error:
         raise InputError(f"{path} is damaged: {type(error).__name__} {error}") from None
 
 

@@ -77,7 +77,7 @@ def _table(path: Path) -> tuple[list[str], NDArray[np.float64]]:
             lines = [
                 (n, row) for n, row in enumerate(csv.reader(stream), start=1) if row and not row[0].startswith("#")
             ]
-    except (OSError, UnicodeDecodeError) as error:
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise InputError(f"timing {path} cannot be read: {cause(error)}") from None
     if len(lines) < 2:
         raise InputError(f"timing {path} holds no scans")

@@ -151,9 +151,7 @@ def _read_kitti(path: Path, rows: list[Row], times: Path | None) -> Trajectory:
     values = numbers(rows, 12, path, "KITTI poses")
     poses = np.tile(np.eye(4), (len(rows), 1, 1))
     poses[:, :3, :] = values.reshape(-1, 3, 4)
-    R = poses[:, :3, :3]
-    off = np.abs(np.swapaxes(R, -1, -2) @ R - np.eye(3)).max(axis=(-1, -2))
-    wrong = np.flatnonzero((off > 1e-2) | (np.linalg.det(R) < 0))
+    wrong = np.flatnonzero(~so3.is_rotation(poses[:, :3, :3], 1e-2))
     if len(wrong):
         raise InputError(f"{path}, line {rows[wrong[0]].number}: the 3x3 part is no rotation matrix")
     stamps = _stamps_of_kitti(path, len(rows), times)

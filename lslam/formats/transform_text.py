@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from lslam.errors import InputError, UsageError
 from lslam.formats import kitti_calib
 from lslam.geometry import se3, so3
+from lslam.untrusted import is_file
 
 Floats = NDArray[np.float64]
 
@@ -28,7 +29,7 @@ def read_transform(text: str) -> Floats:
         except ValueError as error:
             raise UsageError(f"transform {text!r}: {error}") from None
     path = Path(text)
-    if not path.is_file():
+    if not is_file(path):
         raise UsageError(f"transform {text!r} is neither numbers nor a file that exists")
     return _read_file(path)
 
@@ -77,6 +78,6 @@ def _transform(values: list[float]) -> Floats:
     T = np.vstack([np.reshape(values[:12], (3, 4)), [0, 0, 0, 1]])
     if len(values) == 16 and not np.allclose(values[12:], [0, 0, 0, 1]):
         raise ValueError("the last row of the 4x4 matrix is not 0 0 0 1")
-    if np.abs(T[:3, :3] @ T[:3, :3].T - np.eye(3)).max() > 1e-2 or np.linalg.det(T[:3, :3]) < 0:
+    if not so3.is_rotation(T[:3, :3], 1e-2):
         raise ValueError("the 3x3 part is no rotation")
     return se3.normalise(T)

@@ -15,6 +15,7 @@ from lslam.geometry import se3
 from lslam.geometry.geodesy import from_local, local_crs
 from lslam.types.cloud import Cloud, CloudBlock
 from lslam.types.georeference import Georeference
+from lslam.untrusted import whole_number
 
 Floats = NDArray[np.float64]
 
@@ -118,10 +119,11 @@ def to_lat_lon(points: NDArray[Any], georeference: Georeference) -> Floats:
 
 def parse_crs(text: str) -> int:
     """The code of `EPSG:25832`; raises UsageError on anything else."""
-    name, _, number = text.strip().partition(":")
-    if name.upper() != "EPSG" or not number.isdigit():
+    name, _, digits = text.strip().partition(":")
+    number = whole_number(digits)
+    if name.upper() != "EPSG" or number is None:
         raise UsageError(f"--crs {text}: expected EPSG and a number, for example EPSG:25832")
-    return int(number)
+    return number
 
 
 def _without_epsg(georeference: Georeference) -> Georeference:

@@ -22,6 +22,7 @@ from lslam.reports.png import grey_png
 from lslam.types.cloud import Cloud, in_memory
 from lslam.types.georeference import Georeference
 from lslam.types.trajectory import Trajectory
+from lslam.untrusted import MISFIT
 from lslam.version import __version__
 
 LOCAL = "world of trajectory.tum"
@@ -134,11 +135,15 @@ def georeference_note(georeference: Georeference) -> dict[str, Any]:
 def georeference_of(note: Any) -> Georeference | None:
     """What `georeference_note`, or a manifest, says; None when that is nothing."""
     try:
+        origin = np.array(note["origin_lat_lon_height"], np.float64).reshape(3)
+        T_enu_world = np.array(note["T_enu_world"], np.float64).reshape(4, 4)
+        if not (np.isfinite(T_enu_world).all() and (np.abs(origin) <= [90, 180, 1e5]).all()):
+            return None
         return Georeference(
-            np.array(note["origin_lat_lon_height"], np.float64).reshape(3),
-            np.array(note["T_enu_world"], np.float64).reshape(4, 4),
+            origin,
+            T_enu_world,
             None if note.get("epsg") is None else int(note["epsg"]),
             note["method"],
         )
-    except (AttributeError, KeyError, TypeError, ValueError):
+    except MISFIT:
         return None

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import logging
 from functools import partial
 from pathlib import Path
@@ -26,6 +25,7 @@ from lslam.priors.osm_map import OsmMap
 from lslam.priors.overpass import fetch_buildings
 from lslam.types.gnss import GnssStream
 from lslam.types.sequence import Sequence
+from lslam.untrusted import MISFIT, parse_json
 
 log = logging.getLogger("lslam")
 Floats = NDArray[np.float64]
@@ -158,8 +158,8 @@ def _kept_replies(folder: Path) -> OsmData:
             f"{folder} holds no replies of an Overpass server (000000.json, ...): name a file, or that folder"
         )
     try:
-        return _merged([json.loads(file.read_bytes()) for file in files])
-    except (OSError, ValueError, AttributeError, TypeError, RecursionError) as error:
+        return _merged([parse_json(file.read_bytes()) for file in files])
+    except (OSError, *MISFIT) as error:
         raise InputError(f"{folder} holds a reply that cannot be read ({error})") from None
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import json
+import csv
 import logging
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
@@ -36,6 +36,7 @@ from lslam.types.map_score import Crispness
 from lslam.types.scan_result import ScanResult, Status
 from lslam.types.sequence import Sequence
 from lslam.types.trajectory import Trajectory
+from lslam.untrusted import MISFIT, parse_json
 
 log = logging.getLogger("lslam")
 
@@ -86,7 +87,7 @@ def read_run(folder: Path, settings: Iterable[str] = ()) -> EarlierRun:
     if not folder.is_dir():
         raise InputError(f"{folder} is no folder of a run: name what `lslam run` wrote")
     try:
-        manifest = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
+        manifest = parse_json((folder / MANIFEST).read_text(encoding="utf-8"))
     except OSError as error:
         raise InputError(f"{folder} is no folder of a run: {MANIFEST} cannot be read: {cause(error)}") from None
     except ValueError as error:
@@ -201,8 +202,8 @@ def map_of(target: Path) -> Path:
 def _noted(note: Path) -> Path | None:
     """The map that a note tells of, beside it and with its name; None where there is none."""
     try:
-        path = note.parent / str(json.loads(note.read_text(encoding="utf-8"))["file"])
-    except (OSError, ValueError, LookupError, TypeError):
+        path = note.parent / str(parse_json(note.read_text(encoding="utf-8"))["file"])
+    except (OSError, *MISFIT):
         return None
     return path if path in [note.with_suffix(suffix) for suffix in SUFFIXES] else None
 
@@ -211,12 +212,15 @@ def _statuses(path: Path, count: int) -> tuple[Status, ...]:
     """What became of each scan; scans of a run that left no table count as registered."""
     known: dict[str, Status] = {"ok": "ok", "bridged": "bridged", "skipped": "skipped"}
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
+        with path.open(newline="", encoding="utf-8", errors="replace") as stream:
+            header, *rows = [row for row in csv.reader(stream) if row] or [[""]]
     except OSError:
         log.warning("%s cannot be read: every scan counts as registered", path)
         return tuple(known["ok"] for _ in range(count))
-    column = lines[0].split(",").index("status") if lines and "status" in lines[0].split(",") else -1
-    words = [line.split(",")[column] for line in lines[1:]]
-    if column < 0 or len(words) != count or not set(words) <= set(known):
+    except csv.Error as error:
+        raise InputError(f"{path} is no table of scans: {error}; run the sequence again") from None
+    column = header.index("status") if "status" in header else len(header)
+    words = ["".join(row[column : column + 1]) for row in rows]
+    if len(words) != count or not set(words) <= set(known):
         raise InputError(f"{path} does not list the {count} scans of trajectory.tum; run the sequence again")
     return tuple(known[word] for word in words)

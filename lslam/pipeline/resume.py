@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
-import tomllib
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -18,6 +16,7 @@ from lslam.pipeline.osm_source import extract_digest
 from lslam.pipeline.run_folder import MANIFEST
 from lslam.types.sequence import Sequence
 from lslam.types.trajectory import Trajectory
+from lslam.untrusted import MISFIT, parse_json, parse_toml
 from lslam.version import __version__
 
 # Keys that change no byte of the result.
@@ -69,10 +68,10 @@ def may_go_on(folder: Path, identity: dict[str, str], config: Config) -> bool:
     if not (folder / MANIFEST).is_file():
         return False
     try:
-        manifest = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
-        begun = tomllib.loads((folder / "config.toml").read_text(encoding="utf-8"))
+        manifest = parse_json((folder / MANIFEST).read_text(encoding="utf-8"))
+        begun = parse_toml((folder / "config.toml").read_text(encoding="utf-8"))
         status, version, known = str(manifest["status"]), str(manifest["lslam"]), dict(manifest["identity"])
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, *MISFIT) as error:
         raise OutputExistsError(
             f"the run in {folder} does not say what it was ({type(error).__name__}: {error}): --overwrite replaces it"
         ) from None

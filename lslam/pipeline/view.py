@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import json
 import logging
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 from lslam.errors import InputError
 from lslam.formats.cloud_files import read_cloud
@@ -15,6 +15,7 @@ from lslam.pipeline.map_files import georeference_of
 from lslam.pipeline.rebuild import map_of, read_run
 from lslam.reports.recording import ViewedRun
 from lslam.types.cloud import ArrayCloud
+from lslam.untrusted import MISFIT, parse_json
 
 log = logging.getLogger("lslam")
 
@@ -40,9 +41,9 @@ def _cloud(folder: Path) -> ArrayCloud | None:
         log.warning("%s", error)
         return None
     cloud = read_cloud(path)
-    about = {}
-    with suppress(OSError, ValueError):
-        about = json.loads(path.with_suffix(".json").read_text(encoding="utf-8"))
+    about: dict[str, Any] = {}
+    with suppress(OSError, *MISFIT):
+        about = dict(parse_json(path.with_suffix(".json").read_text(encoding="utf-8")))
     georeference = georeference_of(about.get("georeference"))
     if about.get("crs") is None or about.get("file") != path.name or georeference is None:
         return cloud

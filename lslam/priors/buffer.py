@@ -26,6 +26,7 @@ from lslam.formats.osm_buildings import buildings_of
 from lslam.formats.osm_files import from_overpass
 from lslam.geometry.geodesy import from_local
 from lslam.priors.bounds import Bounds, around
+from lslam.untrusted import MISFIT, parse_json
 
 log = logging.getLogger("lslam")
 
@@ -163,11 +164,11 @@ class OsmBuffer:
         """Take what an earlier run kept."""
         for path in [] if self._folder is None else sorted(self._folder.glob("*.json")):
             try:
-                tree = json.loads(path.read_bytes())
+                tree = parse_json(path.read_bytes())
                 wish = _Wish(np.array(tree["lslam_centre"], np.float64), float(tree["lslam_radius"]))
                 self._check(tree)
                 self._use(_Circle(wish, tree))
-            except (OSError, ValueError, KeyError, TypeError) as error:
+            except (OSError, *MISFIT) as error:
                 raise InputError(f"{path} is no reply kept by an earlier run ({error}): remove it") from None
 
     def _collect(self) -> None:

@@ -23,6 +23,7 @@ from lslam.formats.atomic import atomic_write
 from lslam.formats.osm_files import from_overpass
 from lslam.locks import one_at_a_time
 from lslam.priors.bounds import Bounds
+from lslam.untrusted import parse_json, whole_number
 from lslam.version import __version__
 
 log = logging.getLogger("lslam")
@@ -91,7 +92,7 @@ def kept_reply(bounds: Bounds, folder: Path) -> dict[str, Any] | None:
     larger = [(box.area_km2, path) for path in folder.glob("*.json") if (box := _bounds_of(path)) and box.holds(bounds)]
     for path in [exact, *(path for _, path in sorted(larger))]:
         try:
-            return _checked(json.loads(path.read_bytes()), bounds, is_own=path == exact)
+            return _checked(parse_json(path.read_bytes()), bounds, is_own=path == exact)
         except (OSError, ValueError):
             continue
     return None
@@ -162,7 +163,9 @@ def _check_status(reply: Any, server: str) -> None:
     status = reply.status_code
     if status in _BUSY:
         said = reply.headers.get("Retry-After", "")
-        raise _TryAgainError(f"it is busy (HTTP {status})", float(said) if said.isdigit() else None)
+        raise _TryAgainError(
+            f"it is busy (HTTP {status})", None if (wait := whole_number(said)) is None else float(wait)
+        )
     if 300 <= status < 400:
         to = reply.headers.get("Location", "nowhere")
         raise InputError(f"{server} redirects to {to[:120]}: set osm.server to an Overpass server's own address")
@@ -197,8 +200,8 @@ def _too_late(server: str, limit: float) -> str:
 
 def _parsed(body: bytes, bounds: Bounds, server: str) -> dict[str, Any]:
     try:
-        tree = json.loads(body)
-    except (json.JSONDecodeError, UnicodeDecodeError, RecursionError):
+        tree = parse_json(body)
+    except ValueError:
         if body.lstrip()[:1] == b"<":
             raise InputError(f"{server} answered with a web page, not with data: check osm.server") from None
         raise _TryAgainError("the reply was cut short") from None

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from lslam.errors import InputError, UsageError, cause
-from lslam.formats.sequence_toml import SequenceInfo
+from lslam.formats.sequence_toml import SequenceInfo, is_rate
 from lslam.formats.transform_text import read_transform
 from lslam.readers.lookup import find_folder
 from lslam.readers.selection import select
@@ -58,7 +58,7 @@ def open_sequence(
     """
     if (rows is None) != (cols is None) or min(rows or 1, cols or 1) < 1:
         raise UsageError(f"rows {rows} and cols {cols} of organised clouds go together and are above 0")
-    if rate_hz is not None and not 0 < rate_hz < 1e6:
+    if rate_hz is not None and not is_rate(rate_hz):
         raise UsageError(f"a scan rate of {rate_hz} Hz makes no sense")
     overrides = SequenceInfo(
         rows=rows,
@@ -72,11 +72,11 @@ def open_sequence(
         gnss_topic=gnss_topic,
     )
     # Absolute, but links kept: `sequences/07` may be one, and its poses lie beside the link.
-    folder = Path(os.path.abspath(find_folder(name_or_path, data_root)))
     try:
+        folder = Path(os.path.abspath(find_folder(name_or_path, data_root)))
         sequence = _open(folder, overrides)
     except OSError as error:
-        raise InputError(f"{error.filename or folder} cannot be read: {cause(error)}") from None
+        raise InputError(f"{error.filename or name_or_path} cannot be read: {cause(error)}") from None
     flags = {"--lidar-topic": lidar_topic, "--imu-topic": imu_topic, "--gnss-topic": gnss_topic}
     given = [flag for flag, topic in flags.items() if topic is not None]
     if given and sequence.kind != "bag":

@@ -34,7 +34,7 @@ def list_scans(folder: Path, suffixes: tuple[str, ...] = SUFFIXES) -> tuple[list
 def natural_key(path: Path) -> list[tuple[int, int, str]]:
     """Sort key of a file name with numbers compared as numbers."""
     parts = re.split(r"(\d+)", path.stem)
-    return [(0, int(p), "") if p.isdigit() else (1, 0, p) for p in parts]
+    return [(0, int(p), "") if p.isdecimal() else (1, 0, p) for p in parts]
 
 
 def file_numbers(files: list[Path]) -> NDArray[np.int64] | None:

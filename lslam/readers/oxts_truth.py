@@ -32,6 +32,9 @@ def oxts_truth(
         return None
     keep = np.concatenate([[True], oxts.stamps_ns[1:] > np.maximum.accumulate(oxts.stamps_ns)[:-1]])
     stamps, values = oxts.stamps_ns[keep], oxts.values[keep]
+    if len(stamps) < 2:
+        voice.problems.append("OXTS is no ground truth here: its stamps do not increase")
+        return None
     if len(scan_stamps_ns) and (
         scan_stamps_ns[-1] < stamps[0] - _BEYOND_NS or scan_stamps_ns[0] > stamps[-1] + _BEYOND_NS
     ):

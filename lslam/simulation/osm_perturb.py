@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from lslam.errors import InputError
 from lslam.formats.atomic import atomic_write
 from lslam.types.building import Building, Footprint, footprint_polygon, footprints_of
+from lslam.untrusted import MISFIT, parse_json
 
 Floats = NDArray[np.float64]
 
@@ -137,7 +138,7 @@ def write_perturbation(path: Path, perturbation: Perturbation) -> None:
 def read_perturbation(path: Path) -> Perturbation:
     """Read what `write_perturbation` wrote. Raises InputError naming the file."""
     try:
-        tree = json.loads(path.read_bytes())
+        tree = parse_json(path.read_bytes())
         if tree["schema"] != SCHEMA:
             raise ValueError(f"schema {tree['schema']!r}, expected {SCHEMA!r}")
         changes = tuple(
@@ -149,7 +150,7 @@ def read_perturbation(path: Path) -> Perturbation:
             for b in tree["not_yet_built"]
         )
         return Perturbation(_pair(tree["shift_m"]), changes, new, tree["attribution"])
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, *MISFIT) as error:
         raise InputError(f"{path} is no record of a perturbed map: {error}") from None
 
 

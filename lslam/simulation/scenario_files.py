@@ -19,6 +19,7 @@ from lslam.simulation.lidar_models import LIDARS
 from lslam.simulation.returns import Returns
 from lslam.simulation.shapes import SHAPES
 from lslam.simulation.vibration import Vibration
+from lslam.untrusted import parse_toml
 
 FOLDER = "ready"
 # `block` and `street` draw their lines from the seed, `out-and-back` is as long as speed and scans need; the other shapes are
@@ -159,12 +160,12 @@ def scenario_text(scenario: Scenario) -> str:
 def _ready(name: str) -> dict[str, Any]:
     if name not in scenario_names():
         raise UsageError(f"no scenario {name!r} and no file NAME.toml; {nearest(name, scenario_names())}")
-    return tomllib.loads(resources.files(__package__).joinpath(FOLDER, f"{name}.toml").read_text(encoding="utf-8"))
+    return parse_toml(resources.files(__package__).joinpath(FOLDER, f"{name}.toml").read_text(encoding="utf-8"))
 
 
 def _read_toml(path: Path) -> dict[str, Any]:
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
+        return parse_toml(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise InputError(f"{path} cannot be read: {cause(error)}") from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
@@ -224,6 +225,6 @@ def _merge(tree: dict[str, Any], more: dict[str, Any], model: type[BaseModel], w
 def _value(text: str) -> Any:
     """A TOML value, or the text itself when it is none: `--set lidar=vlp16` needs no quotes."""
     try:
-        return tomllib.loads(f"v = {text}")["v"]
+        return parse_toml(f"v = {text}")["v"]
     except tomllib.TOMLDecodeError:
         return text

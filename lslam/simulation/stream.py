@@ -16,6 +16,7 @@ from lslam.formats.atomic import atomic_write
 from lslam.formats.kitti_layout import scan_files, write_scan
 from lslam.simulation.scenarios import SimulatedDrive
 from lslam.types.scan import Scan
+from lslam.untrusted import parse_json
 from lslam.version import __version__
 
 MARK = "simulation.json"
@@ -42,7 +43,7 @@ def fingerprint(drive: SimulatedDrive) -> str:
 def read_mark(folder: Path) -> str | None:
     """The fingerprint of the recording that was begun in `folder`; None when there is none that could go on."""
     try:
-        tree = json.loads((folder / MARK).read_text(encoding="utf-8"))
+        tree = parse_json((folder / MARK).read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return None
     mark = tree.get("fingerprint") if isinstance(tree, dict) else None

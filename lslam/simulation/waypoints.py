@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import json
 import tomllib
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +14,7 @@ from numpy.typing import NDArray
 from lslam.errors import InputError, cause, nearest
 from lslam.formats.trajectory_files import read_trajectory
 from lslam.geometry.geodesy import to_local
+from lslam.untrusted import MISFIT, parse_json, parse_toml
 
 Floats = NDArray[np.float64]
 
@@ -69,7 +69,7 @@ def _text(path: Path) -> str:
 
 def _from_toml(path: Path) -> WayPoints:
     try:
-        tree = tomllib.loads(_text(path))
+        tree = parse_toml(_text(path))
     except tomllib.TOMLDecodeError as error:
         raise InputError(f"{path} is not valid TOML: {error}") from None
     known = ("points", "closed")
@@ -84,7 +84,10 @@ def _from_toml(path: Path) -> WayPoints:
 
 def _rows(path: Path) -> list[list[str]]:
     lines = (line for line in _text(path).splitlines() if line.strip() and not line.lstrip().startswith("#"))
-    return [[cell.strip() for cell in row] for row in csv.reader(lines)]
+    try:
+        return [[cell.strip() for cell in row] for row in csv.reader(lines)]
+    except csv.Error as error:
+        raise InputError(f"{path} cannot be read: {error}") from None
 
 
 def _is_table(path: Path) -> bool:
@@ -112,16 +115,17 @@ def _is_number(text: str) -> bool:
 
 def _from_geojson(path: Path, origin: NDArray[Any] | None) -> WayPoints:
     try:
-        tree = json.loads(_text(path))
-    except json.JSONDecodeError as error:
+        tree = parse_json(_text(path))
+    except ValueError as error:
         raise InputError(f"{path} is not valid JSON: {error}") from None
-    shapes = list(_geometries(tree))
-    lines = [g for g in shapes if g.get("type") in ("LineString", "Polygon")]
+    try:
+        lines = [g for g in _geometries(tree) if g["type"] in ("LineString", "Polygon")]
+        shown = [line["coordinates"][0] if line["type"] == "Polygon" else line["coordinates"] for line in lines]
+    except MISFIT:
+        raise InputError(f"{path} is no GeoJSON of one line or one polygon") from None
     if len(lines) != 1:
         raise InputError(f"{path} holds {len(lines)} lines: way-points are one LineString or one Polygon")
-    is_ring = lines[0]["type"] == "Polygon"
-    coordinates = lines[0].get("coordinates")
-    degrees = _array(path, coordinates[0] if is_ring and coordinates else coordinates)
+    degrees = _array(path, shown[0])
     if not ((np.abs(degrees[:, 0]) <= 180) & (np.abs(degrees[:, 1]) <= 90)).all():
         raise InputError(f"{path}: coordinates of GeoJSON are longitude and latitude in degrees")
     fixes = np.column_stack([degrees[:, 1], degrees[:, 0], np.zeros(len(degrees))])
@@ -163,7 +167,7 @@ def _from_trajectory(path: Path) -> WayPoints:
 def _array(path: Path, values: Any) -> Floats:
     try:
         points = np.array(values, np.float64)
-    except (TypeError, ValueError):
+    except MISFIT:
         points = np.zeros(0)
     if points.ndim != 2 or points.shape[1] not in (2, 3) or not np.isfinite(points).all():
         raise InputError(f"{path}: way-points are rows of two or three numbers, x, y and perhaps z")

@@ -21,6 +21,7 @@ from lslam.studies.grid import Job
 from lslam.studies.jobs import make_room, settle
 from lslam.studies.plan import Follow
 from lslam.studies.worker import Bench, execute
+from lslam.untrusted import whole_number
 from lslam.version import __version__
 
 log = logging.getLogger("lslam")
@@ -194,6 +195,6 @@ def _inspect(paths: list[str]) -> tuple[str, list[str]]:
 
 def _count(local: str) -> int:
     number = local.removeprefix(_LOCAL)
-    if not local.startswith(_LOCAL) or not number.isdigit() or int(number) < 1:
+    if not local.startswith(_LOCAL) or not whole_number(number):
         raise UsageError(f"--cluster {local}: local:N with N workers, for example local:2")
     return int(number)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -14,6 +13,7 @@ from lslam.evaluation.timing import Timing, read_timing
 from lslam.studies.grid import Job
 from lslam.studies.states import FINAL, State, read_state
 from lslam.types.comparison import Metric, RunScore
+from lslam.untrusted import parse_json
 
 COUNTS = {
     "bridged": "bridged scans of a run", "skipped": "skipped scans of a run", "degenerate": "degenerate scans of a run",
@@ -59,7 +59,7 @@ def _filled(score: RunScore, state: State) -> RunScore:
 
 def _read_json(path: Path) -> dict[str, Any]:
     try:
-        tree = json.loads(path.read_text(encoding="utf-8"))
+        tree = parse_json(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         raise InputError(f"{path}: {error}") from None
     if not isinstance(tree, dict):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -25,6 +24,7 @@ from lslam.studies.results import Results
 from lslam.studies.scenes import Scene
 from lslam.studies.subjects import file_safe, scans_needed, with_range
 from lslam.types.study import StudyRow
+from lslam.untrusted import parse_toml
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ def check_same(
     """
     if not place.resume or not (place.out / mark).is_file():
         return
-    theirs, ours = names_of(read_toml(place.out / mark, what)), names_of(tomllib.loads(text))
+    theirs, ours = names_of(read_toml(place.out / mark, what)), names_of(parse_toml(text))
     if not set(theirs) & set(ours):
         raise OutputExistsError(
             f"output folder {place.out} holds {what} {theirs[0]!r} and --resume would go on in it with {what} {ours[0]!r}: "

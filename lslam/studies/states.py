@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from lslam.formats.atomic import atomic_write
+from lslam.untrusted import MISFIT, parse_json
 
 # What a repetition would end with again; everything else is tried anew.
 FINAL = ("done", "degraded", "diverged")
@@ -42,12 +43,12 @@ def write_state(path: Path, state: State) -> None:
 def read_state(path: Path) -> State | None:
     """The state; None when there is none that can be read."""
     try:
-        tree = json.loads(path.read_text(encoding="utf-8"))
+        tree = parse_json(path.read_text(encoding="utf-8"))
         return State(
             str(tree["digest"]), str(tree["status"]), str(tree["reason"]), int(tree["jobs"]), float(tree["load"]),
             float(tree["seconds"]), bool(tree["is_alone"]), float(tree["waited"]), str(tree["machine"]),
         )  # fmt: skip
-    except (OSError, ValueError, KeyError, TypeError):
+    except (OSError, *MISFIT):
         return None
 
 

@@ -173,3 +173,16 @@ def test_mcd_extrinsics(tmp_path: Path) -> None:
     path.write_text(block.replace("[1.0, 0.0, 0.0, 0.1]", "[2.0, 0.0, 0.0, 0.1]"))
     with pytest.raises(InputError, match="no rigid"):
         read_mcd_extrinsics(path)
+
+
+@pytest.mark.parametrize("stamp", ["1e999999999", "-1e999999999", "9" * 5000, "²", "1e-999999999"])
+def test_stamps_no_clock_shows_are_said_or_are_nought(tmp_path: Path, stamp: str) -> None:
+    (tmp_path / "times.txt").write_text(f"0.0\n{stamp}\n")
+    (tmp_path / "imu.csv").write_text(f"stamp_ns,ax,ay,az,wx,wy,wz\n0,0,0,9.8,0,0,0\n{stamp},0,0,9.8,0,0,0\n")
+    for read, name in ((read_stamps, "times.txt"), (read_imu_csv, "imu.csv")):
+        try:
+            assert stamp == "1e-999999999"
+            read(tmp_path / name)
+        except (AssertionError, InputError):
+            with pytest.raises(InputError, match=f"{name}, line "):
+                read(tmp_path / name)

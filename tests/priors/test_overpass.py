@@ -85,6 +85,7 @@ def test_without_network_only_what_is_kept(server: FakeOverpass, tmp_path: Path)
     [
         (["busy", "gateway", "ok"], [5.0, 10.0]),
         (["busy:7", "ok"], [7.0]),
+        (["busy:²", "ok"], [5.0]),
         (["drop", "ok"], [5.0]),
         (["cut", "remark", "ok"], [5.0, 10.0]),
     ],
