@@ -24,7 +24,7 @@ LAYERS = [
     ["types"],
     ["geometry"],
     ["kernels", "config"],
-    ["foreign", "locks", "untrusted"],
+    ["foreign", "locks", "stopping", "untrusted"],
     ["errors", "version"],
 ]
 LEVEL = {name: level for level, names in enumerate(LAYERS) for name in names}

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import signal
 import sys
 from importlib import import_module
 from typing import Any, NoReturn
@@ -11,6 +10,7 @@ from typing import Any, NoReturn
 import click
 
 from lslam.errors import LslamError, cause, nearest
+from lslam.stopping import heeded, is_interrupt, is_too_late
 from lslam.version import __version__
 
 # name -> one line for --help; the module lslam.cli.<name> has the click command `command`.
@@ -121,13 +121,20 @@ def cli() -> None:
 
 def main() -> NoReturn:
     """Entry point: results on stdout, one sentence per error on stderr, documented exit codes."""
-    # SIGTERM ends lslam as Ctrl-C does, with 130 and nothing half-written.
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")  # an ASCII terminal shows ? for ±, instead of an error after hours
+    # SIGTERM ends lslam as Ctrl-C does, with 130 and nothing half-written.
+    with heeded():
+        code = _call()
+    sys.exit(code)
+
+
+def _call() -> int:
     try:
         code = cli(standalone_mode=False)
+        is_too_late()
+        return code if isinstance(code, int) else 0
     except LslamError as error:
         _fail(str(error), error.exit_code)
     except click.ClickException as error:
@@ -143,11 +150,13 @@ def main() -> NoReturn:
     except MemoryError:
         _fail("out of memory: use fewer points (preprocess.range_max) or larger voxels (map.voxel)", 1)
     except Exception as error:
+        if is_interrupt(error):
+            _fail("interrupted", 130)
         _fail_unexpected(error)
-    sys.exit(code if isinstance(code, int) else 0)
 
 
 def _fail(sentence: str, code: int) -> NoReturn:
+    is_too_late()
     click.echo(sentence if code == 130 else f"error: {sentence}", err=True)
     sys.exit(code)
 

@@ -11,7 +11,7 @@ import click
 
 from lslam.cli import options
 from lslam.cli.console import progress, setup_logging, show
-from lslam.cli.signals import gentle_stop
+from lslam.stopping import heeded
 
 if TYPE_CHECKING:
     from lslam.types.map_score import Crispness
@@ -102,7 +102,7 @@ def _rebuild(target: Path, given: dict[str, Any]) -> None:
     run = read_run(target, _settings(given))
     check_output(out or target / f"map.{run.config.map.format}", given["overwrite"])
     sequence = open_scans(run, given["sequence"], **options.reading_of(given))
-    with gentle_stop() as stop, progress("map", len(run.trajectory)) as advance:
+    with heeded() as stop, progress("map", len(run.trajectory)) as advance:
         stop.is_gentle = True
         built = rebuild(run, sequence, out, overwrite=given["overwrite"], crs=crs, on_step=advance, should_stop=stop)
     rows = [("map", f"{built.path}: {built.points} points of {built.scans} scans"), *crispness_rows(built.crispness)]

@@ -14,9 +14,9 @@ import click
 
 from lslam.cli import options
 from lslam.cli.console import log, progress, setup_logging, show
-from lslam.cli.signals import GentleStop, gentle_stop
 from lslam.errors import RunFinishedError, UsageError
 from lslam.registration.residuals import RESIDUALS
+from lslam.stopping import Stop, heeded
 from lslam.untrusted import parse_json
 
 if TYPE_CHECKING:
@@ -91,7 +91,7 @@ def command(sequence: str, **given: Any) -> None:
 
         return _print_plan(choose_scans(opened, create_odometry(config), config), config, out, given["as_json"])
     try:
-        with gentle_stop() as stop, ExitStack() as stack:
+        with heeded() as stop, ExitStack() as stack:
             run(
                 opened, config, out=out, ground_truth=truth, overwrite=given["overwrite"], resume=given["resume"],
                 command=shlex.join(["lslam", *sys.argv[1:]]),
@@ -187,7 +187,7 @@ def read_truth(path: Path | None, sequence: Sequence) -> Trajectory | None:
     return truth
 
 
-def _watch(stack: ExitStack, stop: GentleStop, finish: Callable[[RunOutcome], None]) -> Watch:
+def _watch(stack: ExitStack, stop: Stop, finish: Callable[[RunOutcome], None]) -> Watch:
     """Progress bars, and signals as a wish to stop after the scan at hand."""
     from lslam.pipeline.watch import Watch
 

@@ -187,12 +187,17 @@ def _say_plan(plan: Path, width: float, depth: float) -> None:
 
 
 def _record(drive: SimulatedDrive, out: Path, overwrite: bool, resume: bool) -> None:
-    from lslam.cli.signals import gentle_stop
     from lslam.simulation.record import record
+    from lslam.stopping import heeded
 
-    # SIGTERM ends it as Ctrl-C does: what is whole stays for --resume.
-    with gentle_stop(), console.progress("simulating", len(drive)) as advance:
-        done = record(drive, out, overwrite, lambda _: advance(), resume, shlex.join(["lslam", *sys.argv[1:]]))
+    with heeded() as stop, console.progress("simulating", len(drive)) as advance:
+
+        def on_scan(index: int) -> None:
+            advance()
+            stop.is_gentle = index + 1 < len(drive)  # a scan that is begun is written; what is whole stays for --resume
+            stop.check()
+
+        done = record(drive, out, overwrite, on_scan, resume, shlex.join(["lslam", *sys.argv[1:]]))
     assert drive.ground_truth is not None
     click.echo(
         f"{done.sequence}: {len(drive)} scans, {drive.ground_truth.path_lengths[-1]:.1f} m, "

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from lslam.config.loops import LoopsConfig
 from lslam.config.registration import RegistrationConfig
+from lslam.errors import InterruptedRunError
 from lslam.geometry import se3, so3
 from lslam.keyframes.store import KeyframeStore
 from lslam.keyframes.submaps import submap
@@ -48,6 +49,7 @@ def find_loops(
     registration: RegistrationConfig,
     submap_size: int = 5,
     clocks: KeyframeClocks | None = None,
+    should_stop: Callable[[], bool] = lambda: False,
 ) -> list[LoopCandidate]:
     """Loop candidates of a run in the order of the newer keyframe, with verdicts.
 
@@ -55,13 +57,14 @@ def find_loops(
     submap_size : keyframes whose clouds make one submap (`keyframes.submap_size`)
     clocks : take the time of each keyframe, stage `loops`
 
-    An accepted candidate carries its constraint, T_a_b between LiDAR frames.
+    An accepted candidate carries its constraint, T_a_b between LiDAR frames. Raises InterruptedRunError when `should_stop`
+    said so between two keyframes.
     """
     poses = np.array([keyframe.T_world_lidar for keyframe in store.keyframes]).reshape(-1, 4, 4)
     detector = Detector(
         store.keyframes, lambda number: submap(store, poses, number, submap_size), config, registration
     )  # fmt: skip
-    candidates = detector.find(clocks)
+    candidates = detector.find(clocks, should_stop)
     accepted = sum(c.verdict == "accepted" for c in candidates)
     tried = sum(c.stage != "thinned" for c in candidates)
     log.info("loops: %d closed of %d candidates, %d keyframes", accepted, tried, len(store))
@@ -100,8 +103,10 @@ class Detector:
         steps = np.floor(self.doubt.distances / (NEAR / 2))
         self._is_described = np.diff(steps, prepend=-1.0) > 0
 
-    def find(self, clocks: KeyframeClocks | None = None) -> list[LoopCandidate]:
-        """All candidates in the order of the newer keyframe, with verdicts."""
+    def find(
+        self, clocks: KeyframeClocks | None = None, should_stop: Callable[[], bool] = lambda: False
+    ) -> list[LoopCandidate]:
+        """All candidates in the order of the newer keyframe, with verdicts; raises as `find_loops`."""
         clocks = KeyframeClocks() if clocks is None else clocks
         candidates: list[LoopCandidate] = []
         pace = Pace(self.config.spacing)
@@ -109,6 +114,8 @@ class Detector:
         if any(len(older) for older in gated):
             self._level_world()
         for b, (keyframe, older) in enumerate(zip(self.keyframes, gated, strict=True)):
+            if should_stop():
+                raise InterruptedRunError(f"interrupted while loops were sought, at keyframe {b} of {len(gated)}")
             if len(older) == 0:
                 pace.reset()
                 continue

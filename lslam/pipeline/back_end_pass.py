@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from lslam.config import Config
+from lslam.errors import InterruptedRunError
 from lslam.formats.g2o import write_g2o
 from lslam.formats.loops_csv import write_loops
 from lslam.formats.osm_matches_csv import write_osm_matches
@@ -39,10 +41,12 @@ log = logging.getLogger("lslam")
 def optimise_poses(
     sequence: Sequence, record: RunRecord, store: KeyframeStore, config: Config, manifest: Manifest,
     osm: OsmSource | None = None, checkpoints: Checkpoints | None = None,
+    should_stop: Callable[[], bool] = lambda: False,
 ) -> BackEnd:  # fmt: skip
     """Put the final poses into `record`, and what the graph did into the manifest.
 
-    A run that was interrupted, or whose odometry is lost, keeps what it has. `checkpoints` keep the loops that were found.
+    A run that was interrupted, or whose odometry is lost, keeps what it has; `should_stop` is asked between keyframes and
+    before the graph. `checkpoints` keep the loops that were found.
     """
     if config.debug.drift:
         manifest.problems.append(drift.describe(config.debug))
@@ -55,9 +59,15 @@ def optimise_poses(
     clocks = KeyframeClocks()
     with manifest.timed("back_end_s"):
         candidates: list[LoopCandidate] = []
-        if config.loops.use:
-            with manifest.timed("loops_s"):
-                candidates = _loops(store, config, checkpoints, clocks)
+        try:
+            if config.loops.use:
+                with manifest.timed("loops_s"):
+                    candidates = _loops(store, config, checkpoints, clocks, should_stop)
+            if should_stop():
+                raise InterruptedRunError("interrupted before the pose graph")
+        except InterruptedRunError as error:
+            manifest.interrupt(str(error))
+            return BackEnd(record.results)
         done = run_back_end(sequence, record.results, store, config, candidates, record.turns, osm, clocks)
     record.back_end_seconds = {store.keyframes[k].scan: clock.seconds for k, clock in sorted(clocks.items())}
     manifest.timings |= {
@@ -76,15 +86,17 @@ def optimise_poses(
 
 
 def _loops(
-    store: KeyframeStore, config: Config, checkpoints: Checkpoints | None, clocks: KeyframeClocks
-) -> list[LoopCandidate]:
+    store: KeyframeStore, config: Config, checkpoints: Checkpoints | None, clocks: KeyframeClocks,
+    should_stop: Callable[[], bool],
+) -> list[LoopCandidate]:  # fmt: skip
     """All candidates of the keyframes where they are now, by an earlier run where it found them for the same poses."""
     poses = np.array([k.T_world_lidar for k in store.keyframes]).reshape(-1, 4, 4)
     known = None if checkpoints is None else checkpoints.latest()
     if known is not None and np.array_equal(known["poses"], poses):
         candidates: list[LoopCandidate] = known["candidates"]
         return candidates
-    candidates = find_loops(store, config.loops, config.registration, config.keyframes.submap_size, clocks)
+    submap_size = config.keyframes.submap_size
+    candidates = find_loops(store, config.loops, config.registration, submap_size, clocks, should_stop)
     if checkpoints is not None:
         checkpoints.write(len(poses), lambda: {"poses": poses, "candidates": Records(candidates)})
     return candidates

@@ -17,6 +17,7 @@ from typing import Any
 from lslam.config import Config
 from lslam.errors import InterruptedRunError
 from lslam.reports.facts import describe
+from lslam.stopping import is_interrupt
 from lslam.types.scan import Span
 from lslam.types.scan_result import ScanResult
 from lslam.types.sequence import Sequence
@@ -117,7 +118,7 @@ class Manifest:
 
     def word_for(self, error: BaseException) -> str:
         """Status of a run that `error` ended."""
-        return "interrupted" if isinstance(error, (KeyboardInterrupt, InterruptedRunError)) else "failed"
+        return "interrupted" if isinstance(error, InterruptedRunError) or is_interrupt(error) else "failed"
 
     def as_dict(self, status: str, why: str = "") -> dict[str, Any]:
         """The manifest as plain values."""

@@ -151,7 +151,7 @@ def rebuild(
         georeference = replace(georeference, epsg=crs)
         Projection(georeference).check()
     built = build_map(sequence, results_of(run), run.config, on_step, should_stop, path.parent)
-    if built is None:
+    if built is None or should_stop():
         raise InterruptedRunError("interrupted while the map was built: nothing is written")
     note = MapNote(sequence.name, run.config.map.voxel, built.done, f"{LOCAL}: {run.world}")
     before = _noted(path.with_suffix(".json")) if overwrite else None

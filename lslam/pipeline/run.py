@@ -146,7 +146,7 @@ def _solve(
         job.sequence, job.odometry, job.config, job.manifest, folder, job.truth, job.watch, store, checkpoints, job.osm
     )
     loops = None if checkpoints is None else Checkpoints(checkpoints.folder, "loops", job.config.odometry.checkpoint_s)
-    done = optimise_poses(job.sequence, record, store, job.config, job.manifest, job.osm, loops)
+    done = optimise_poses(job.sequence, record, store, job.config, job.manifest, job.osm, loops, job.watch.should_stop)
     level_world(record, job.sequence, job.config, job.manifest)
     record.loop_view = view_loop(record, done, store)
     return record, done, _score(record, job.sequence, job.config)
@@ -259,6 +259,8 @@ def _report(folder: RunFolder, job: _Job, record: RunRecord, evaluation: Evaluat
             if isinstance(job.odometry, FeatureSource):
                 record.features = view_features(job.sequence, job.odometry, record.results)
             outputs.write_html(folder, record, evaluation)
+    if job.watch.should_stop() and manifest.outcome not in ("interrupted", "diverged"):
+        manifest.interrupt("interrupted before the report was whole")
     record.manifest = manifest.as_dict(manifest.outcome)
 
 

@@ -15,6 +15,8 @@ from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 
+from lslam.stopping import heeded, is_too_late
+
 log = logging.getLogger("lslam")
 _PATIENCE_S = 20.0
 
@@ -150,14 +152,17 @@ def _thread_limits(crew: Crew) -> Iterator[None]:
 def _child(pipe: Connection) -> None:
     """In the new process: Ctrl-C is the parent's, which then asks with SIGTERM; results on stdout are the parent's too."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
     threading.Thread(target=_follow_parent, daemon=True).start()
-    try:
-        while (task := pipe.recv()) is not None:
-            _do(task)
-            pipe.send(True)
-    except (KeyboardInterrupt, EOFError):
-        sys.exit(130)
+    # A group that is ended asks twice, the system and the parent; who has no patience left kills.
+    with heeded([signal.SIGTERM], may_force=False) as stop:
+        try:
+            while (task := pipe.recv()) is not None:
+                _do(task)
+                pipe.send(True)
+                stop.check()
+        except (KeyboardInterrupt, EOFError):
+            is_too_late()
+            sys.exit(130)
 
 
 def _do(task: Task) -> None:

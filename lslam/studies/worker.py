@@ -23,12 +23,15 @@ from lslam.errors import (
     RunFinishedError,
 )
 from lslam.pipeline.run_folder import KEYFRAMES, LOG, MANIFEST
+from lslam.stopping import current, is_interrupt
 from lslam.studies.grid import Job
 from lslam.studies.states import State, write_state
 
 if TYPE_CHECKING:
     from lslam.studies.kept import KeptSequences
     from lslam.types.sequence import Sequence
+
+INTERRUPTED = ("interrupted", "interrupted before its end")
 
 
 @dataclass(frozen=True)
@@ -62,7 +65,7 @@ def execute(job: Job, bench: Bench) -> None:
     try:
         status, reason = _run(job, bench.is_kept)
     except (KeyboardInterrupt, InterruptedRunError):
-        status, reason = "interrupted", "interrupted before its end"
+        status, reason = INTERRUPTED
         raise KeyboardInterrupt from None
     except RunFailedError as error:
         status, reason = "diverged", str(error).removeprefix("the run diverged: ")
@@ -71,9 +74,13 @@ def execute(job: Job, bench: Bench) -> None:
     except MemoryError:
         reason = "out of memory: use fewer points (preprocess.range_max) or larger voxels (map.voxel)"
     except Exception as error:
+        if is_interrupt(error):
+            status, reason = INTERRUPTED
+            raise KeyboardInterrupt from None
         what = ": ".join([type(error).__name__, *str(error).strip().splitlines()[:1]])
         reason = f"lslam made a mistake ({what}){_keep_traceback(job.folder, error)}"
     finally:
+        current().is_gentle = False
         seconds = time.monotonic() - began
         if bench.is_kept and status != "interrupted":  # one of hundreds: nothing asks for its clouds again
             shutil.rmtree(job.folder / KEYFRAMES, ignore_errors=True)
@@ -123,7 +130,12 @@ def _run(job: Job, is_kept: bool) -> tuple[str, str]:
         tuple(sorted(job.reading.items())),
     )  # fmt: skip
     sequence = _kept_sequences().get(key, _opening(job)) if is_kept else _opening(job)()
-    watch = Watch(on_end=ended.append)
+    stop = current()
+
+    def be_gentle(stage: str, scans: int) -> None:
+        stop.is_gentle = True
+
+    watch = Watch(be_gentle, on_end=ended.append, should_stop=stop)
 
     def make(goes_on: bool) -> None:
         # A gate of the run's own (input.strict): it is done all the same.

@@ -17,6 +17,7 @@ from typing import Any
 from unittest import mock
 
 from lslam.cli.main import main
+from lslam.stopping import SIGNALS
 
 SAMPLE = Path(__file__).resolve().parents[2] / "sample_data"
 COMMAND = (sys.executable, "-m", "lslam")
@@ -56,15 +57,16 @@ def lslam_process(*words: object, env: dict[str, str] | None = None, cwd: Path |
 
 @contextlib.contextmanager
 def _nothing_left_behind() -> Iterator[None]:
-    """The variables of `environment`; what `main` sets for its process is put back: the log and the answer to SIGTERM."""
+    """The variables of `environment`; what `main` sets for its process is put back: the log and the answer to signals."""
     hidden = {name: os.environ.pop(name) for name in os.environ.keys() - environment()}
-    log, on_term = logging.getLogger("lslam"), signal.getsignal(signal.SIGTERM)
+    log, heard = logging.getLogger("lslam"), {number: signal.getsignal(number) for number in SIGNALS}
     before, raises = (list(log.handlers), log.level, log.propagate), logging.raiseExceptions
     try:
         yield
     finally:
         (log.handlers[:], log.level, log.propagate), logging.raiseExceptions = before, raises
-        signal.signal(signal.SIGTERM, on_term)
+        for number, handler in heard.items():
+            signal.signal(number, handler)
         os.environ.update(hidden)
 
 

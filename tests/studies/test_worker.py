@@ -2,8 +2,15 @@
 
 from __future__ import annotations
 
+import json
 import logging
+import os
+import signal
+import threading
+import time
 from collections.abc import Iterator
+from functools import partial
+from multiprocessing import active_children
 from pathlib import Path
 
 import pytest
@@ -15,6 +22,7 @@ from lslam.studies import worker
 from lslam.studies.grid import Job
 from lslam.studies.points import Contender
 from lslam.studies.results import Results
+from lslam.studies.runner import Crew, Task, run_tasks
 from lslam.studies.states import read_state
 from lslam.studies.variants import Variant
 from lslam.studies.worker import Bench, execute
@@ -100,3 +108,49 @@ def test_a_mistake_without_a_word_is_named_all_the_same(tmp_path: Path, monkeypa
     state = read_state(job.state_file)
     assert state is not None
     assert state.reason == "lslam made a mistake (AssertionError): its log.txt says where"
+
+
+@pytest.mark.parametrize("again", [0, 2])
+def test_a_run_that_is_ended_in_a_process_of_its_own_is_interrupted_after_the_scan_at_hand(
+    again: int, laps: Path, tmp_path: Path
+) -> None:
+    """However often it is told: the system tells the whole group, and the parent its children."""
+    config = load_config(settings=["map.write=false", "report.html=false"], environ={})
+    job = Job("laps", "icp", 0, laps, config, tmp_path / "runs" / "laps" / "icp-s0", "digest", "lslam sweep")
+
+    def end_it() -> None:
+        end = time.monotonic() + 120
+        while not any(job.folder.glob("checkpoint/odometry-*.npz")) and time.monotonic() < end:
+            time.sleep(0.01)
+        (child,) = [process for process in active_children() if process.name == "lslam worker"]
+        assert child.pid is not None
+        for _ in range(1 + again):
+            os.kill(child.pid, signal.SIGTERM)
+            time.sleep(0.003)
+
+    ended: list[str] = []
+    killer = threading.Thread(target=end_it)
+    task = Task("laps", partial(execute, job, Bench()), tmp_path / "laps.out")
+    run_tasks([task], Crew(1), lambda index: killer.start(), lambda index, cause: ended.append(cause))
+    killer.join()
+    assert ended == ["the process ended with exit code 130"]
+    state = read_state(job.state_file)
+    assert state is not None
+    assert state.status == "interrupted"
+    manifest = json.loads((job.folder / "manifest.json").read_text())
+    assert manifest["status"] == "interrupted"
+    scans = manifest["counts"]["scans"]
+    assert 0 < scans < len(list((laps / "velodyne").iterdir()))
+    newest = max((job.folder / "checkpoint").glob("odometry-*.npz"))
+    assert int(newest.stem.split("-")[-1]) == scans, "the last scan is in a checkpoint"
+
+
+@pytest.fixture(scope="module")
+def laps(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The sample's round driven many times, by links."""
+    source = Path(__file__).resolve().parents[2] / "sample_data" / "sequences" / "00" / "velodyne"
+    target = tmp_path_factory.mktemp("laps") / "velodyne"
+    target.mkdir()
+    for k in range(94 * 20):
+        (target / f"{k:06d}.bin").symlink_to(source / f"{k % 94:06d}.bin")
+    return target.parent

@@ -5,10 +5,13 @@ from __future__ import annotations
 import os
 import signal
 import time
+from collections.abc import Iterator
 
+import numpy as np
 import pytest
 
-from lslam.cli.signals import gentle_stop
+from lslam.kernels.jit import kernel
+from lslam.stopping import Interrupt, heeded
 
 
 class Hit:
@@ -34,7 +37,7 @@ def test_an_interrupt_that_python_would_ignore_comes_again(
         lost.append(time.monotonic())
         time.sleep(20)
 
-    with gentle_stop(), pytest.raises(KeyboardInterrupt):
+    with heeded(), pytest.raises(KeyboardInterrupt):
         be_hit()
     assert lost, "the interrupt was raised in the finaliser: this test proves nothing"
     assert time.monotonic() - lost[0] < 5
@@ -49,6 +52,42 @@ def test_other_errors_of_finalisers_are_reported_as_ever() -> None:
     seen = []
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("sys.unraisablehook", lambda lost: seen.append(lost.exc_type))
-        with gentle_stop():
+        with heeded():
             Broken()
     assert seen == [ValueError]
+
+
+@kernel
+def give_back(values: np.ndarray, rounds: int) -> tuple[np.ndarray, np.ndarray]:
+    out = np.zeros(4)
+    for k in range(rounds):
+        out[k % 4] += values[k % len(values)]
+    return out, 2 * out
+
+
+def test_what_is_raised_while_a_kernel_runs_is_an_interrupt_and_nothing_else() -> None:
+    """A signal that comes in a kernel is handled where numba makes its result an array, and loses what is raised."""
+    values = np.ones(100)
+    give_back(values, 1)
+
+    def work() -> None:
+        while True:
+            give_back(values, 20_000)
+
+    ends = set()
+    for k in range(60):
+        signal.setitimer(signal.ITIMER_REAL, 0.002 + k * 1e-5)
+        try:
+            with heeded():
+                work()
+        except BaseException as error:
+            ends.add(type(error))
+    assert ends == {Interrupt}
+
+
+@pytest.fixture(autouse=True)
+def _alarm() -> Iterator[None]:
+    """An alarm is answered as SIGINT is."""
+    before = signal.signal(signal.SIGALRM, lambda number, frame: signal.getsignal(signal.SIGINT)(number, frame))  # type: ignore
+    yield
+    signal.signal(signal.SIGALRM, before)

@@ -1,0 +1,139 @@
+"""SIGINT and SIGTERM as a wish: a run looks for it between scans and stages; what has no such places ends where it is."""
+
+from __future__ import annotations
+
+import signal
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from itertools import dropwhile, islice
+from threading import Timer, current_thread, main_thread
+from types import FrameType
+from typing import NoReturn
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
+AGAIN_S = 0.01
+# A kernel that gives back an array calls this module of numba, and ends as a SystemError when something is raised there.
+_OF_KERNELS, _DEEP = "numba.core.serialize", 10
+
+
+class Interrupt(KeyboardInterrupt):
+    """What a signal raises; not KeyboardInterrupt itself, for which Python that was in `exec` ends with -2 for any exit code."""
+
+
+class Stop:
+    """Whether somebody asked to stop.
+
+    While `is_gentle`, the first signal only says so; otherwise, and for the second one, it raises Interrupt where Python is,
+    but never in a kernel. may_force : whether a second one means more than the first
+    """
+
+    def __init__(self, may_force: bool = True) -> None:
+        self.is_gentle = False
+        self._may_force = may_force
+        self._is_asked = self._is_forced = self._comes_again = False
+        self._number: int = signal.SIGINT
+
+    def __call__(self) -> bool:
+        """True from the first signal on."""
+        return self._is_asked
+
+    def check(self) -> None:
+        """Raise Interrupt when somebody asked: for loops whose callers clean up and know nothing of signals."""
+        if self._is_asked:
+            raise Interrupt
+
+    def on_signal(self, number: int, frame: FrameType | None) -> None:
+        """The handler."""
+        if self._comes_again:
+            self._comes_again = False
+        else:
+            self._is_forced = self._is_asked and self._may_force
+            self._is_asked, self._number = True, number
+        if self.is_gentle and not self._is_forced:
+            return
+        inner = [(str(f.f_globals.get("__name__")), f) for f in islice(_outwards(frame), _DEEP)]
+        if any(name == __name__ for name, _ in inner):  # in `on_lost`, where it would be lost once more
+            self._come_again()
+            return
+        left = dropwhile(lambda named: named[0] != _OF_KERNELS, inner)
+        caller = next((f for name, f in left if not name.startswith("numba.")), None)
+        if caller is None:
+            raise Interrupt
+        _raise_after(caller)
+
+    def on_lost(self, lost: sys.UnraisableHookArgs, report: Callable[[sys.UnraisableHookArgs], object]) -> None:
+        """Python loses what is raised in a finaliser or a callback of LLVM, where compiling spends its time: raise it again."""
+        if issubclass(lost.exc_type, KeyboardInterrupt):
+            self._come_again()
+        else:
+            report(lost)
+
+    def _come_again(self) -> None:
+        self._comes_again = True
+        again = Timer(AGAIN_S, signal.pthread_kill, (main_thread().ident, self._number))
+        again.daemon = True
+        again.start()
+
+
+_current: Stop | None = None
+
+
+def current() -> Stop:
+    """The one whose signals are heeded now; where nobody does, one that is never asked."""
+    return _current or Stop()
+
+
+@contextmanager
+def heeded(numbers: Sequence[int] = SIGNALS, may_force: bool = True) -> Iterator[Stop]:
+    """Heed signals for the length of the block; in a block within one, and in other threads than the first, nothing changes."""
+    global _current
+    if _current is not None or current_thread() is not main_thread():
+        stop = current()
+        try:
+            yield stop
+        finally:
+            stop.is_gentle = False
+        return
+    _current = stop = Stop(may_force)
+    previous = [(number, signal.signal(number, stop.on_signal)) for number in numbers]
+    report = sys.unraisablehook
+    sys.unraisablehook = lambda lost: stop.on_lost(lost, report)
+    try:
+        yield stop
+    finally:
+        _current = None
+        sys.unraisablehook = report
+        for number, handler in previous:
+            if signal.getsignal(number) == stop.on_signal:  # not what was decided in the block
+                signal.signal(number, handler)
+
+
+def is_too_late() -> None:
+    """The process ends, and how is decided: signals change nothing any more."""
+    for number in SIGNALS:
+        signal.signal(number, signal.SIG_IGN)
+
+
+def is_interrupt(error: BaseException) -> bool:
+    """Whether `error` is a signal's, or what foreign code made of it."""
+    cause: BaseException | None = error
+    while cause is not None and not isinstance(cause, KeyboardInterrupt):
+        cause = cause.__cause__
+    return cause is not None
+
+
+def _outwards(frame: FrameType | None) -> Iterator[FrameType]:
+    while frame is not None:
+        yield frame
+        frame = frame.f_back
+
+
+def _raise_after(caller: FrameType) -> None:
+    """Raise Interrupt in the frame that called the kernel, at its next line or its end."""
+
+    def interrupt(*_: object) -> NoReturn:
+        raise Interrupt
+
+    caller.f_trace = interrupt
+    sys.settrace(lambda *_: None)  # frames are looked at from now on; Python forgets it when one raises
