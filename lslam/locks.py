@@ -25,8 +25,11 @@ def lock(stream: IO[str], wait: bool = False) -> bool:
 
 
 @contextlib.contextmanager
-def one_at_a_time(path: Path) -> Iterator[None]:
-    """Hold `path`, made when it is missing, during the block: others wait. Where it cannot be made, nobody does."""
+def one_at_a_time(path: Path | None) -> Iterator[None]:
+    """Hold `path`, made when it is missing, during the block: others wait. Where it cannot be made, or is None, nobody does."""
+    if path is None:
+        yield
+        return
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         stream = path.open("a")

@@ -95,10 +95,9 @@ def fetch(
     more += ['osm.cache="refresh"'] if refresh else ['osm.cache="only"'] if offline else []
     config = load_config(config_file, [*settings, *more]).osm
     bounds = _bounds(bbox, around, along, config.fetch_radius if radius is None else radius, data_root, origin)
-    from lslam.kernels.jit import cache_folder
-    from lslam.priors.overpass import fetch_buildings
+    from lslam.priors.overpass import fetch_buildings, reply_folder
 
-    reply = fetch_buildings(bounds, config, cache_folder() / "osm")
+    reply = fetch_buildings(bounds, config, reply_folder())
     _write(out, reply)
 
 

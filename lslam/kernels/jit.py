@@ -10,30 +10,15 @@ import contextlib
 import hashlib
 import logging
 import os
-import tempfile
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
+from lslam.kernels.cache import cache_folder, own_folder
+
 F = TypeVar("F", bound=Callable[..., Any])
 _log = logging.getLogger("lslam")
-
-
-def cache_folder() -> Path:
-    """The user's XDG cache, or a folder of the temporary directory when the home cannot be written."""
-    base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    for folder in (
-        base / "lslam",
-        Path(tempfile.gettempdir()) / f"lslam-cache-{os.getuid() if hasattr(os, 'getuid') else 0}",
-    ):
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-            with tempfile.TemporaryFile(dir=folder):
-                return folder
-        except OSError:
-            continue
-    return Path(tempfile.mkdtemp(prefix="lslam-cache-"))
 
 
 def source_digest() -> str:
@@ -44,18 +29,38 @@ def source_digest() -> str:
     return digest.hexdigest()[:12]
 
 
-# Numba reads the variable when it is imported; a folder set by the user is kept, below it each version has its own. The
-# processes of a study find the variable as this one leaves it, and the kernels compiled.
-_base, _own = Path(os.environ.get("NUMBA_CACHE_DIR") or cache_folder() / "numba"), source_digest()
-os.environ["NUMBA_CACHE_DIR"] = str(_base if _base.name == _own else _base / _own)
+def kernel_folder() -> Path | None:
+    """Where machine code is kept; None when there is no folder that is safe, and why is said."""
+    base, own = os.environ.get("NUMBA_CACHE_DIR"), source_digest()
+    if base is None:
+        folder = cache_folder("numba")
+        return None if folder is None else folder / own
+    # A folder set by the user is kept, below it each version has its own. The processes of a study find the variable as this
+    # one leaves it, and the kernels compiled.
+    folder = Path(base) if Path(base).name == own else Path(base) / own
+    try:
+        return own_folder(folder)
+    except OSError as error:
+        _log.warning("%s", error)
+        return None
+
+
+_folder = kernel_folder()
+if _folder is None:
+    _log.warning("kernels are compiled anew each time: name a folder of your own in XDG_CACHE_HOME to keep them")
+    os.environ.pop("NUMBA_CACHE_DIR", None)
+else:
+    os.environ["NUMBA_CACHE_DIR"] = str(_folder)  # numba reads it when it is imported
 
 import numba  # noqa: E402
 
 
 def kernel(function: F) -> F:
     """Compile `function` on first use and keep the machine code in the cache."""
-    compiled: Any = numba.njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)(function)
-    _forgive(compiled._cache)
+    is_kept = _folder is not None
+    compiled: Any = numba.njit(cache=is_kept, nogil=True, error_model="numpy", boundscheck=False)(function)
+    if is_kept:
+        _forgive(compiled._cache)
     return cast(F, compiled)
 
 
@@ -87,17 +92,16 @@ def inline(function: F) -> F:
     return cast(F, compiled)
 
 
-def lock_file() -> Path:
+def lock_file() -> Path | None:
     """Who compiles holds it (`lslam.locks`): others wait instead of compiling the same kernels into the same files."""
-    return Path(os.environ["NUMBA_CACHE_DIR"]) / "compile.lock"
+    return None if _folder is None else _folder / "compile.lock"
 
 
 @contextlib.contextmanager
 def announced(log: logging.Logger, after_s: float = 2.0) -> Iterator[None]:
     """Say that kernels are being compiled when the block takes longer than loading them would."""
-    timer = threading.Timer(
-        after_s, log.info, ["compiling kernels, once; they are kept in %s", os.environ["NUMBA_CACHE_DIR"]]
-    )
+    kept = "for this run only" if _folder is None else f"once; they are kept in {_folder}"
+    timer = threading.Timer(after_s, log.info, ["compiling kernels, %s", kept])
     timer.daemon = True
     timer.start()
     try:

@@ -18,11 +18,10 @@ from lslam.formats.osm_buildings import BuildingExtract, buildings_of, some_buil
 from lslam.formats.osm_files import OsmData, from_overpass, read_osm
 from lslam.geometry import se2
 from lslam.geometry.geodesy import to_local
-from lslam.kernels.jit import cache_folder
 from lslam.pipeline.georeferencing import require_crs
 from lslam.priors.buffer import Fetch, OsmBuffer
 from lslam.priors.osm_map import OsmMap
-from lslam.priors.overpass import fetch_buildings
+from lslam.priors.overpass import fetch_buildings, reply_folder
 from lslam.types.gnss import GnssStream
 from lslam.types.sequence import Sequence
 from lslam.untrusted import MISFIT, parse_json
@@ -190,7 +189,7 @@ def open_osm(sequence: Sequence, config: Config) -> OsmSource | None:
     origin = start_of(sequence, config)
     require_crs(origin, config.gnss)
     if config.osm.extract == AUTO:
-        fetch = partial(fetch_buildings, config=config.osm, folder=cache_folder() / "osm")
+        fetch = partial(fetch_buildings, config=config.osm, folder=reply_folder())
         return OsmServer(origin, sequence.gnss if config.gnss.mode != "off" else None, config.osm, fetch)
     return OsmFile(Path(config.osm.extract), origin)
 

@@ -9,6 +9,7 @@ import contextlib
 import hashlib
 import json
 import logging
+import tempfile
 import threading
 import time
 from collections.abc import Callable
@@ -21,6 +22,7 @@ from lslam.config.osm import OsmConfig
 from lslam.errors import InputError, OutputError, UsageError
 from lslam.formats.atomic import atomic_write
 from lslam.formats.osm_files import from_overpass
+from lslam.kernels.cache import cache_folder
 from lslam.locks import one_at_a_time
 from lslam.priors.bounds import Bounds
 from lslam.untrusted import parse_json, whole_number
@@ -51,6 +53,11 @@ def query(bounds: Bounds, timeout: float) -> str:
         f'[out:json][timeout:{round(timeout)}];(way["building"]({box});'
         f'relation["building"]["type"="multipolygon"]({box}););out body;>;out skel qt;'
     )
+
+
+def reply_folder() -> Path:
+    """Where replies are kept: in the user's cache, or in a new folder when there is none."""
+    return cache_folder("osm") or Path(tempfile.mkdtemp(prefix="lslam-osm-"))
 
 
 def fetch_buildings(

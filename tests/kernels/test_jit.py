@@ -62,6 +62,55 @@ def test_a_home_that_cannot_be_written_falls_back_to_the_temporary_folder(tmp_pa
     assert folder.parent.parent.name.startswith("lslam-cache-")
 
 
+def planted(shared: Path, way: str) -> Path:
+    """What another user may have left where the cache falls back to."""
+    shared.mkdir()
+    shared.parent.chmod(0o1777)
+    if way in ("group", "open"):
+        shared.chmod(0o770 if way == "group" else 0o777)
+    elif way == "link":
+        shared.rmdir()
+        shared.with_name("theirs").mkdir(mode=0o700)
+        shared.symlink_to("theirs")
+    elif os.getuid() == 0:
+        os.chown(shared, 12345, 12345)
+    else:
+        pytest.skip("only root can give a folder away")
+    return shared
+
+
+def test_a_cache_in_the_home_that_a_group_could_write_is_shut(tmp_path: Path) -> None:
+    (tmp_path / "lslam").mkdir()
+    (tmp_path / "lslam").chmod(0o775)
+    folder = folder_in_new_process(XDG_CACHE_HOME=str(tmp_path))
+    assert folder == tmp_path / "lslam" / "numba" / jit.source_digest()
+    assert (tmp_path / "lslam").stat().st_mode & 0o777 == 0o755
+
+
+@pytest.mark.parametrize("way", ["group", "open", "link", "theirs"])
+def test_a_fallback_that_others_can_write_is_refused_and_kernels_are_compiled_without_a_cache(
+    way: str, tmp_path: Path
+) -> None:
+    (tmp_path / "file").write_text("a file where the cache should be")
+    shared = planted(tmp_path / f"lslam-cache-{os.getuid()}", way)
+    code = (
+        "import logging; logging.basicConfig(format='%(message)s')\n"
+        "import numpy as np, lslam.kernels.voxel as v; v.first_points(np.zeros((3, 3), np.float32), 1.0)"
+    )
+    env = {k: v for k, v in os.environ.items() if k != "NUMBA_CACHE_DIR"}
+    env |= {"XDG_CACHE_HOME": str(tmp_path / "file"), "TMPDIR": str(tmp_path)}
+    done = subprocess.run([sys.executable, "-c", code], env=env, capture_output=True, text=True, check=True)
+    assert "is not used as a cache" in done.stderr
+    assert "kernels are compiled anew each time" in done.stderr
+    assert list(shared.iterdir()) == []
+
+
+def test_the_fallback_is_for_the_user_alone(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("a file where the cache should be")
+    folder = folder_in_new_process(XDG_CACHE_HOME=str(tmp_path / "file"), TMPDIR=str(tmp_path))
+    assert (folder.parent.parent.stat().st_mode & 0o777) == 0o700
+
+
 def test_importing_the_package_writes_nothing_and_loads_no_numba(tmp_path: Path) -> None:
     code = "import lslam, sys; assert 'numba' not in sys.modules"
     env = os.environ | {"XDG_CACHE_HOME": str(tmp_path)}
