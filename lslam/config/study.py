@@ -21,8 +21,8 @@ Value = bool | int | float | str
 Point = dict[str, Value]
 # Decimals of a range's values: 0.1 + 0.2 shall be 0.3.
 _DIGITS = 12
-# Of one range; a run takes seconds at the least.
-MOST_VALUES = 10_000
+# Values of a range, and points of a grid: each is a run at least, and a study of more would never end.
+MOST_VALUES, MOST_POINTS = 10_000, 100_000
 
 
 class Range(Section):
@@ -42,11 +42,19 @@ class Range(Section):
             raise ValueError(f"the range from {self.start} to {self.stop} needs a step or num, one of them")
         if self.log and (self.num is None or self.start <= 0):
             raise ValueError(f"the range from {self.start} to {self.stop}: log needs num and a start above 0")
-        # Before they are built: a step of 1e-10 takes all memory.
-        count = self.num if self.step is None else (self.stop - self.start) / self.step
-        if not (count is not None and count < MOST_VALUES):
+        if not self._is_short():
             raise ValueError(f"the range from {self.start} to {self.stop} has more than {MOST_VALUES} values")
         return self
+
+    def _is_short(self) -> bool:
+        """Counted before anything is built; numbers beyond those of the machine are too many as well."""
+        if self.num is not None:
+            return self.num <= MOST_VALUES
+        assert self.step is not None
+        try:
+            return (self.stop - self.start) / self.step < MOST_VALUES
+        except OverflowError:
+            return False
 
     def values(self) -> tuple[int | float, ...]:
         """All of them; whole numbers when both ends are.
@@ -171,6 +179,14 @@ class StudyConfig(Section):
                         f"{finding.text!r} speaks of {name!r}, which is not studied; {nearest(name, known)}"
                     )
         return findings
+
+    @model_validator(mode="after")
+    def _ends(self) -> StudyConfig:
+        counts = [len(v.values() if isinstance(v, Range) else v) for v in self.parameters.values()]
+        count = sum(counts) if self.grid == "one-way" else math.prod(counts)
+        if count > MOST_POINTS:
+            raise ValueError(f"the parameters have {count:,} combinations, more than {MOST_POINTS:,}: vary fewer")
+        return self
 
     def points(self) -> list[Point]:
         """Values of the studied parameters, a point per run of a method."""

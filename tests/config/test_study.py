@@ -68,6 +68,16 @@ def test_ranges_hold_both_ends_and_round_numbers(given: dict[str, Any], values: 
         ("step = 2", "log = true, step = 1", "log needs num"),
         ("step = 2", "step = 2, num = 3", "a step or num, one of them"),
         ("step = 2", "step = 0", "greater than 0"),
+        ("step = 2", "step = 1e-10", r"from 1 to 5 has more than 10000 values$"),
+        ("step = 2", "num = 1000000000000", "has more than 10000 values$"),
+        ("stop = 5", "stop = inf", "finite number|has more than 10000 values"),
+        ("stop = 5", f"stop = 1{'0' * 400}", "has more than 10000 values$"),
+        ("stop = 5, step = 2", "stop = 1e308, step = 5e-324", "has more than 10000 values$"),
+        (
+            "[0.3, 1]",
+            '{ start = 0.1, stop = 1, num = 9999 }\n"map.voxel" = { start = 0.1, stop = 1, num = 9999 }',
+            "combinations, more than 100,000: vary fewer",
+        ),
         (
             'path = "seq07"',
             'path = "seq07", count = 0',
