@@ -149,6 +149,9 @@ def test_elbow() -> None:
     assert outcome(at_02, "elbow_at", 0.3) == "undecided", "a step beside it"
     assert outcome(at_02, "elbow_at", 0.5) == "refuted"
     at_15 = rows_of(DISTANCES, "imu.inlier_distance", error=lambda v: 0.5 if v >= 1 else 1.9, noise=0.02)
+    assert outcome(at_15, "elbow_at", 0.7) == "undecided", "a step beside it, on the other side"
+    later = verdict(at_15, "elbow_at", 0.5)
+    assert (later.outcome, "below" in later.measured) == ("refuted", False)
     assert outcome(at_15, "elbow_at", 100) == "undecided", "no value is taken for the nearest that was run"
     flat = rows_of(DISTANCES, "imu.inlier_distance")
     assert outcome(flat, "elbow_at", 0.2) == "refuted"

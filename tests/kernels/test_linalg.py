@@ -29,6 +29,26 @@ def rotated(values: Floats, rng: np.random.Generator) -> Floats:
     return np.asarray(R @ np.diag(values) @ R.T)
 
 
+@kernel
+def inverted(c: Floats) -> tuple[float, float, float, float, float, float]:
+    return linalg.invert_symmetric(c[0], c[1], c[2], c[3], c[4], c[5])
+
+
+@kernel
+def turned(R: Floats, c: Floats) -> tuple[float, float, float, float, float, float]:
+    return linalg.rotate_symmetric(R, c)
+
+
+def test_symmetric_matrices_are_inverted_and_rotated_as_by_numpy() -> None:
+    rng = np.random.default_rng(0)
+    upper = np.triu_indices(3)
+    for _ in range(20):
+        root, R = rng.normal(size=(3, 3)), so3.exp(rng.normal(size=3))
+        C = root @ root.T + 0.1 * np.eye(3)
+        np.testing.assert_allclose(inverted(C[upper]), np.linalg.inv(C)[upper], rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(turned(R, C[upper]), (R @ C @ R.T)[upper], atol=1e-12)
+
+
 def test_planes_equal_lapack_on_random_covariances() -> None:
     rng = np.random.default_rng(0)
     for _ in range(500):
