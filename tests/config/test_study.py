@@ -71,7 +71,7 @@ def test_ranges_hold_both_ends_and_round_numbers(given: dict[str, Any], values: 
         ("step = 2", "step = 1e-10", r"from 1 to 5 has more than 10000 values$"),
         ("step = 2", "num = 1000000000000", "has more than 10000 values$"),
         ("stop = 5", "stop = inf", "finite number|has more than 10000 values"),
-        ("stop = 5", f"stop = 1{'0' * 400}", "has more than 10000 values$"),
+        ("stop = 5", f"stop = 1{'0' * 400}", "has more than 64 bits"),
         ("stop = 5, step = 2", "stop = 1e308, step = 5e-324", "has more than 10000 values$"),
         (
             "[0.3, 1]",

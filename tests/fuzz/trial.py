@@ -45,6 +45,14 @@ class Verdict:
         return self.kind in ALLOWED
 
 
+_CHANGES = ("os.mkdir", "os.rename", "os.remove", "os.rmdir", "os.link", "os.symlink", "os.truncate")
+
+
+def _is_own(path: str) -> bool:
+    """Whether Python or nobody keeps it."""
+    return "__pycache__" in path or path.startswith("/dev/null")
+
+
 class _TooLongError(BaseException):
     """Raised by the clock; no parser catches it."""
 
@@ -63,21 +71,17 @@ class Watch:
             return
         if event == "open":
             path, _, flags = (*args, None, None)[:3]
-            writes = isinstance(flags, int) and flags & (os.O_WRONLY | os.O_RDWR | os.O_CREAT)
-            is_file = isinstance(path, (str, bytes, os.PathLike))
-            if not (writes and is_file) or os.fsdecode(path).startswith((self.allowed, "/dev/null")):
+            if not (isinstance(flags, int) and flags & (os.O_WRONLY | os.O_RDWR | os.O_CREAT)):
                 return
-        elif event not in (
-            "os.mkdir",
-            "os.rename",
-            "os.remove",
-            "os.rmdir",
-            "os.link",
-            "os.symlink",
-            "os.truncate",
-        ) or any(isinstance(a, str) and a.startswith(self.allowed) for a in args):
+            paths = [path] if isinstance(path, (str, bytes, os.PathLike)) else []
+        elif event in _CHANGES:
+            paths = [a for a in args[:2] if isinstance(a, (str, bytes, os.PathLike))]
+        else:
             return
-        self.found.append(f"{event} {args[:2]}")
+        # What is imported for the first time is compiled and kept.
+        if not any(_is_own(os.fsdecode(path)) or os.fsdecode(path).startswith(self.allowed) for path in paths):
+            if paths or event != "open":
+                self.found.append(f"{event} {args[:2]}")
 
 
 _watch: Watch | None = None
