@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from lslam.errors import InputError, cause
 
-NOT_STAGES = ("index", "stamp_ns", "stamp", "total")
+SAVED = "saved_s"
+NOT_STAGES = ("index", "stamp_ns", "stamp", "total", SAVED)
 # Before the names of what is done after odometry.
 AFTER = "back end: "
 
@@ -34,19 +35,23 @@ class TimingRows:
 
 def timing_text(
     indices: list[int], stamps_ns: list[int], names: list[str], seconds: NDArray[np.float64],
-    back_end: Mapping[int, Mapping[str, float]] | None = None,
+    back_end: Mapping[int, Mapping[str, float]] | None = None, saved: Mapping[int, float] | None = None,
 ) -> str:  # fmt: skip
     """The file of scans by number and stamp, with seconds (N, S) of the stages `names`.
 
     back_end : seconds by row and name, of stages that do not count in the total of a scan
+    saved : seconds by row that were not needed, a column when there are any; empty where nobody knows
     """
     back_end = back_end or {}
     later = list(dict.fromkeys(f"{AFTER}{name}" for row in back_end.values() for name in row))
-    lines = [",".join(["index", "stamp_ns", *names, "total", *later])]
+    lines = [",".join(["index", "stamp_ns", *names, "total", *later, *([SAVED] if saved else [])])]
     for k, (index, stamp, row) in enumerate(zip(indices, stamps_ns, seconds, strict=True)):
         own = back_end.get(k, {})
         values = (*row, row.sum(), *(own.get(name.removeprefix(AFTER), 0.0) for name in later))
-        lines.append(",".join([str(index), str(stamp), *(f"{v:.6f}" for v in values)]))
+        said = [str(index), str(stamp), *(f"{v:.6f}" for v in values)]
+        if saved:
+            said.append(f"{saved[k]:.6f}" if k in saved else "")
+        lines.append(",".join(said))
     return "\n".join(lines) + "\n"
 
 

@@ -65,20 +65,24 @@ def write_trajectories(folder: RunFolder, record: RunRecord, calibration: Calibr
 
 
 def write_scans(folder: RunFolder, record: RunRecord) -> None:
-    """timing.csv, seconds per stage, those of the back end beside their sum, and scans.csv, what became of each scan."""
+    """timing.csv, seconds per stage, those of the back end beside their sum, and scans.csv, what became of each scan.
+
+    `saved_s` of timing.csv is what the IMU saved where a scan was registered from constant velocity too, empty elsewhere.
+    """
     names, seconds = stage_matrix(record.results)
     indices, stamps = [r.index for r in record.results], [r.stamp_ns for r in record.results]
-    folder.write_text("timing.csv", timing_text(indices, stamps, names, seconds, record.back_end_seconds))
+    saved = {k: r.saved_s for k, r in enumerate(record.results) if r.saved_s is not None}
+    folder.write_text("timing.csv", timing_text(indices, stamps, names, seconds, record.back_end_seconds, saved))
+    # Every number of scans.csv is the same in every run.
     columns = "index,stamp_ns,status,posed_by,standing,converged,iterations,source_points,inliers,overlap,rmse_m"
-    rows = [columns + ",degenerate,prior_m,prior_deg,prior_norm,steady_norm,steady_iterations,saved_s,lost"]
+    rows = [columns + ",degenerate,prior_m,prior_deg,prior_norm,steady_norm,steady_iterations,lost"]
     for r in record.results:
         values = (
             r.index, r.stamp_ns, r.status, r.poser(record.method), int(r.is_standing), int(r.converged), r.iterations,
             r.source_points, r.inliers, f"{r.overlap:.4f}", f"{r.rmse:.5f}", len(r.degenerate), f"{r.prior_error[0]:.5f}",
             f"{np.rad2deg(r.prior_error[1]):.5f}", f"{r.prior_norm:.5f}",
             "" if r.steady_norm is None else f"{r.steady_norm:.5f}",
-            "" if r.steady_iterations is None else r.steady_iterations, "" if r.saved_s is None else f"{r.saved_s:.5f}",
-            int(r.is_lost),
+            "" if r.steady_iterations is None else r.steady_iterations, int(r.is_lost),
         )  # fmt: skip
         rows.append(",".join(str(v) for v in values))
     folder.write_text("scans.csv", "\n".join(rows) + "\n")

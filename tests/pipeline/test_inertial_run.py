@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import dataclasses
 import json
 from functools import cache
@@ -14,6 +15,7 @@ from stub_sequences import Standstill, Stub
 
 from lslam.config import Config, load_config
 from lslam.errors import GateError, InputError
+from lslam.formats.timing_csv import read_timing_rows
 from lslam.formats.trajectory_files import read_trajectory
 from lslam.geometry import se3
 from lslam.inertial.fusion import InertialMotion
@@ -111,6 +113,23 @@ def test_the_same_twice_and_without_comparing(monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr(InertialMotion, "COMPARED", 10**6)
     again = run(with_imu(imu_of(walk())), config_of("input.threads=1"))
     np.testing.assert_array_equal(again.trajectory.poses, runs()[1].trajectory.poses)
+
+
+def test_scans_csv_is_the_same_twice_and_times_are_in_timing_csv(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(InertialMotion, "COMPARED", 5)
+    config = config_of("input.count=40")
+    for name in ("first", "second"):
+        run(with_imu(imu_of(walk())), config, out=tmp_path / name)
+    first, second = ((tmp_path / name / "scans.csv").read_bytes() for name in ("first", "second"))
+    assert first == second
+    with (tmp_path / "first" / "timing.csv").open(newline="") as stream:
+        saved = [row["saved_s"] for row in csv.DictReader(stream)]
+    assert 0 < sum(value != "" for value in saved) < len(saved) == 40
+    rows = read_timing_rows(tmp_path / "first" / "timing.csv")
+    assert "saved_s" not in rows.stages
+    np.testing.assert_allclose(sum(rows.stages.values()), rows.total, atol=1e-5)
 
 
 def test_the_manifest_says_what_was_found(tmp_path: Path) -> None:
