@@ -48,11 +48,6 @@ class Verdict:
 _CHANGES = ("os.mkdir", "os.rename", "os.remove", "os.rmdir", "os.link", "os.symlink", "os.truncate")
 
 
-def _is_own(path: str) -> bool:
-    """Whether Python or nobody keeps it."""
-    return "__pycache__" in path or path.startswith("/dev/null")
-
-
 class _TooLongError(BaseException):
     """Raised by the clock; no parser catches it."""
 
@@ -78,10 +73,10 @@ class Watch:
             paths = [a for a in args[:2] if isinstance(a, (str, bytes, os.PathLike))]
         else:
             return
+        elsewhere = [p for p in map(os.fsdecode, paths) if not p.startswith((self.allowed, "/dev/null"))]
         # What is imported for the first time is compiled and kept.
-        if not any(_is_own(os.fsdecode(path)) or os.fsdecode(path).startswith(self.allowed) for path in paths):
-            if paths or event != "open":
-                self.found.append(f"{event} {args[:2]}")
+        if any("__pycache__" not in p for p in elsewhere):
+            self.found.append(f"{event} {args[:2]}")
 
 
 _watch: Watch | None = None
