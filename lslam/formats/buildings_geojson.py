@@ -62,6 +62,8 @@ def read_corrected(path: Path) -> CorrectedMap:
         if tree["schema"] != SCHEMA:
             raise ValueError(f"schema {tree['schema']!r}, expected {SCHEMA!r}")
         origin = np.array(tree["origin"], np.float64)
+        if origin.shape != (3,) or not (np.abs(origin[:2]) <= [90, 180]).all():
+            raise ValueError(f"its origin {tree['origin']} is no latitude, longitude and height")
         held = [f for f in tree["features"] if f["properties"]["status"] != "new"]
         new = [f["geometry"]["coordinates"] for f in tree["features"] if f["properties"]["status"] == "new"]
         buildings = tuple(_correction(feature, origin) for feature in held)

@@ -43,7 +43,7 @@ class McapFile:
         self._check_magic()
         self._walk()
         for channel, (stamps, offsets) in self._loose.items():
-            self._add(channel, IN_FILE, np.array(stamps, np.int64), np.array(offsets, np.int64))
+            self._add(channel, IN_FILE, np.array(stamps, np.uint64).astype(np.int64), np.array(offsets, np.int64))
         self._find_missing_channels()
         self.topics = [self._topic(number) for number in sorted(self._channels)]
 
@@ -175,7 +175,7 @@ class McapFile:
 
         end = self._each_record(chunk, note)
         for channel, (stamps, offsets) in found.items():
-            self._add(channel, number, np.array(stamps, np.int64), np.array(offsets, np.int64))
+            self._add(channel, number, np.array(stamps, np.uint64).astype(np.int64), np.array(offsets, np.int64))
         return end
 
     @staticmethod

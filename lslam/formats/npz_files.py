@@ -19,7 +19,7 @@ from lslam.untrusted import MISFIT
 # Of a zip member: numpy's own writer gives this date too.
 _DATE = (1980, 1, 1, 0, 0, 0)
 # What zipfile and NumPy raise; no memory, for arrays that are said to be larger than any machine; a flag of encryption.
-_DAMAGE = (*MISFIT, EOFError, SyntaxError, MemoryError, RuntimeError, zipfile.BadZipFile, zlib.error, struct.error)
+DAMAGE = (*MISFIT, EOFError, SyntaxError, MemoryError, RuntimeError, zipfile.BadZipFile, zlib.error, struct.error)
 
 
 def write_npz(path: Path, arrays: Mapping[str, NDArray[Any]], level: int = 1) -> None:
@@ -46,7 +46,7 @@ def read_npz(source: Path | BinaryIO) -> dict[str, NDArray[Any]]:
             return {name: archive[name] for name in archive.files}
     except OSError as error:
         raise InputError(f"{_name(source)} cannot be read: {cause(error)}") from None
-    except _DAMAGE as error:
+    except DAMAGE as error:
         raise InputError(f"{_name(source)} is damaged: {error}") from None
 
 

@@ -14,6 +14,7 @@ from lslam.formats.atomic import atomic_write
 from lslam.formats.pcd_files import read_pcd, write_pcd
 from lslam.formats.ply_files import read_ply, write_ply
 from lslam.formats.point_cloud import PointCloud
+from lslam.untrusted import MISFIT
 
 SUFFIXES = (".bin", ".pcd", ".ply", ".npy")
 # Record sizes other data sets use, to tell a truncated file from one of another kind.
@@ -92,7 +93,7 @@ def _read_npy(path: Path) -> PointCloud:
 
     try:
         table = np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError, SyntaxError, MemoryError, TokenError) as error:
+    except (OSError, *MISFIT, EOFError, SyntaxError, MemoryError, TokenError) as error:
         raise InputError(f"{path} cannot be read as a NumPy array: {error}") from None
     if table.dtype.names:
         flat = table.ravel()

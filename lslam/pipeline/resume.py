@@ -106,7 +106,8 @@ def _difference(
 
 def _refuse_finished(folder: Path, status: str, manifest: dict[str, Any], config: Config) -> None:
     """Raise what a finished run ended with."""
-    why = "; ".join(str(problem) for problem in manifest.get("problems", []))
+    said = manifest.get("problems")
+    why = "; ".join(str(problem) for problem in said) if isinstance(said, list) else ""
     said = f"the run in {folder} is finished"
     if status == "diverged":
         raise RunFailedError(f"{said}, it diverged: {why}; --overwrite runs it anew")

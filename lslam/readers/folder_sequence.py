@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import math
-import zlib
 from dataclasses import dataclass, field
 from pathlib import Path
-from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lslam.errors import InputError, cause
+from lslam.formats.npz_files import DAMAGE
 from lslam.formats.point_cloud import PointCloud
 from lslam.formats.point_files import read_bin, read_points
 from lslam.readers.point_times import TimeRule, apply_rule, azimuth_times
@@ -111,7 +110,7 @@ def _read_per_point(path: Path, count: int) -> tuple[NDArray[np.float32] | None,
         with np.load(path, allow_pickle=False) as file:
             times = np.asarray(file["t"], np.float32) if "t" in file else None
             rings = np.asarray(file["ring"], np.uint16) if "ring" in file else None
-    except (OSError, ValueError, EOFError, KeyError, SyntaxError, BadZipFile, zlib.error) as error:
+    except (OSError, *DAMAGE) as error:
         raise InputError(f"{path}, named by per_point of sequence.toml, cannot be read: {cause(error)}") from None
     for name, values in (("t", times), ("ring", rings)):
         if values is not None and values.shape != (count,):

@@ -120,7 +120,7 @@ def _from_geojson(path: Path, origin: NDArray[Any] | None) -> WayPoints:
         raise InputError(f"{path} is not valid JSON: {error}") from None
     try:
         lines = [g for g in _geometries(tree) if g["type"] in ("LineString", "Polygon")]
-        shown = [line["coordinates"][0] if line["type"] == "Polygon" else line["coordinates"] for line in lines]
+        shown = [line["coordinates"][0] if line["type"] == "Polygon" else line.get("coordinates") for line in lines]
     except MISFIT:
         raise InputError(f"{path} is no GeoJSON of one line or one polygon") from None
     if len(lines) != 1:

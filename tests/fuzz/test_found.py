@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 from fuzz.cases import lay_out
 from fuzz.parsers import PARSERS
+from fuzz.texts import CORRECTED
 
 from lslam.config.study import Range
 from lslam.errors import InputError, LslamError
@@ -15,6 +16,8 @@ from lslam.readers import open_sequence
 
 DIGITS = b"9" * 5000
 DEEP = b"[" * 5000
+_NPY = b"\x93NUMPY\x01\x00\x76\x00%-118b"
+_NOWHERE = CORRECTED.replace("[49.0, 8.4, 0.0]", "[49.0, NaN, 0.0]").encode()
 BY_NAME = {parser.name: parser for parser in PARSERS}
 
 
@@ -37,6 +40,9 @@ BY_NAME = {parser.name: parser for parser in PARSERS}
         ("PCD", "a.pcd", b"FIELDS x\nSIZE \xc2\xb2\nTYPE F\nCOUNT 1\nDATA ascii\n", "does not exist"),
         ("PCD", "a.pcd", b"FIELDS x\nSIZE 4\nTYPE F\nWIDTH " + DIGITS + b"\nDATA ascii\n", "no whole number"),
         ("PLY", "a.ply", b"ply\nformat ascii 1.0\nelement vertex " + DIGITS + b"\n", "bad PLY header"),
+        ("NumPy", "a.npy", _NPY % b"{'descr': '<f4', 'shape': (9999999999999999999, 4), 'fortran_order': 0}", "NumPy array"),
+        ("NumPy", "a.npy", _NPY % b"{'descr': '<f4', 3.5: (1, 4), 'fortran_order': False}", "NumPy array"),
+        ("buildings.geojson", "buildings.geojson", _NOWHERE, "its origin"),
         ("KITTI calibration", "calib.txt", b"Tr: 1e308 1e308 0 0 1e308 1e308 0 0 0 0 1e308 0", "no rotation"),
         ("study", "s.toml", b'methods=["icp"]\n[parameters]\n"map.voxel"={start=1,stop=2,step=1e-10}', "more than 10000 values"),
         ("study", "s.toml", b'methods=["icp"]\n[parameters]\n"map.voxel"={start=0,stop=1e308,step=1}', "more than 10000 values"),
@@ -101,3 +107,12 @@ def test_names_that_no_disk_takes() -> None:
         open_sequence(Path(__file__).parents[2] / "sample_data", extrinsics="a" * 300)
     with pytest.raises(ValueError, match="more than"):
         Range(start=0, stop=1, num=10**9)
+
+
+@pytest.mark.parametrize("problems", [b"null", b"3"])
+def test_a_manifest_whose_problems_are_none(tmp_path: Path, problems: bytes) -> None:
+    good = BY_NAME["run folder"].corpus(tmp_path / "corpus")[0]
+    manifest = good["manifest.json"].replace(b'["one"]', problems).replace(b'"interrupted"', b'"done"')
+    lay_out(tmp_path, good | {"manifest.json": manifest})
+    with pytest.raises(LslamError, match="finished"):
+        BY_NAME["run folder"].read(tmp_path)

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from fuzz import campaign, trial
-from fuzz.campaign import run_batch, try_all
+from fuzz.campaign import run_batch, try_all, warm_up
 from fuzz.cases import Parser
 from fuzz.parsers import PARSERS
 from fuzz.trial import attempt, little_memory
@@ -28,7 +28,7 @@ def test_every_input_is_read_or_refused_with_a_sentence(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, parser: Parser
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    # What is imported and compiled for the first file is no part of an input's memory.
+    warm_up(parser, tmp_path)
     assert attempt(parser, parser.corpus(tmp_path / "corpus")[0], tmp_path / "in").kind == trial.READ
     with little_memory():
         verdicts = [(k, verdict) for k, _, verdict in try_all(parser, tmp_path, COUNT)]

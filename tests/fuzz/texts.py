@@ -109,7 +109,7 @@ _OUTLINES = json.dumps({
         {"type": "Feature", "properties": {"osm_id": 5}, "geometry": {"type": "GeometryCollection", "geometries": [{
          "type": "MultiPolygon", "coordinates": [[[[8.41, 49.0], [8.4101, 49.0], [8.4101, 49.0001], [8.41, 49.0]]]]}]}}],
 })  # fmt: skip
-_CORRECTED = json.dumps({
+CORRECTED = json.dumps({
     "type": "FeatureCollection", "schema": "lslam-buildings-1", "attribution": "x", "origin": [49.0, 8.4, 0.0], "mode": "one",
     "map_shift_m": [0.1, 0.2, 0.0], "features": [
         {"type": "Feature", "properties": {
@@ -244,7 +244,7 @@ PARSERS = [
     Parser("Overpass JSON", lambda f: read_buildings(f / "map.json"), _extract("json")),
     _text_parser("GeoJSON outlines", "map.geojson", read_buildings, _OUTLINES),
     _text_parser("GeoJSON line", "line.geojson", read_line, _LINE),
-    _text_parser("buildings.geojson", "buildings.geojson", read_corrected, _CORRECTED),
+    _text_parser("buildings.geojson", "buildings.geojson", read_corrected, CORRECTED),
     _text_parser("perturbed map", "p.json", read_perturbation, _PERTURBED),
     Parser("kept reply", lambda f: kept_reply(_BOUNDS, f), _kept),
     _text_parser("job state", "state.json", states.read_state,

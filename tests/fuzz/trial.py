@@ -45,15 +45,15 @@ class Verdict:
         return self.kind in ALLOWED
 
 
-_CHANGES = ("os.mkdir", "os.rename", "os.remove", "os.rmdir", "os.link", "os.symlink", "os.truncate")
-
-
 class _TooLongError(BaseException):
     """Raised by the clock; no parser catches it."""
 
 
+_CHANGES = ("open", "os.mkdir", "os.rename", "os.remove", "os.rmdir", "os.link", "os.symlink", "os.truncate")
+
+
 class Watch:
-    """Opens and changes of files, as Python's audit events tell them; only one at a time is `on`."""
+    """Changes of files while it `is_on`, as Python's audit events tell them; caches of kernels and of Python are none."""
 
     def __init__(self) -> None:
         self.is_on = False
@@ -62,21 +62,13 @@ class Watch:
         sys.addaudithook(self._hear)
 
     def _hear(self, event: str, args: tuple[Any, ...]) -> None:
-        if not self.is_on:
+        if not self.is_on or event not in _CHANGES:
             return
-        if event == "open":
-            path, _, flags = (*args, None, None)[:3]
-            if not (isinstance(flags, int) and flags & (os.O_WRONLY | os.O_RDWR | os.O_CREAT)):
-                return
-            paths = [path] if isinstance(path, (str, bytes, os.PathLike)) else []
-        elif event in _CHANGES:
-            paths = [a for a in args[:2] if isinstance(a, (str, bytes, os.PathLike))]
-        else:
+        if event == "open" and not (isinstance(args[2], int) and args[2] & (os.O_WRONLY | os.O_RDWR | os.O_CREAT)):
             return
-        elsewhere = [p for p in map(os.fsdecode, paths) if not p.startswith((self.allowed, "/dev/null"))]
-        # What is imported for the first time is compiled and kept.
-        if any("__pycache__" not in p for p in elsewhere):
-            self.found.append(f"{event} {args[:2]}")
+        paths = [os.fsdecode(a) for a in args if isinstance(a, (str, bytes, os.PathLike))]
+        if paths and not paths[0].startswith((self.allowed, os.devnull)) and "__pycache__" not in paths[0]:
+            self.found.append(f"{event} {paths[0]}")
 
 
 _watch: Watch | None = None
@@ -94,7 +86,7 @@ def little_memory(more: int = BYTES) -> Iterator[None]:
         resource.setrlimit(resource.RLIMIT_AS, before)
 
 
-def attempt(parser: Parser, files: Files, folder: Path) -> Verdict:
+def attempt(parser: Parser, files: Files, folder: Path, seconds: float | None = None) -> Verdict:
     """Lay `files` out in `folder`, which is emptied first, and let the parser read them."""
     global _watch
     _watch = _watch or Watch()
@@ -105,7 +97,7 @@ def attempt(parser: Parser, files: Files, folder: Path) -> Verdict:
     began = time.perf_counter()
     _watch.found.clear()
     try:
-        signal.setitimer(signal.ITIMER_REAL, SECONDS)
+        signal.setitimer(signal.ITIMER_REAL, seconds or SECONDS)
         _watch.is_on = True
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
