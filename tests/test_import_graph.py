@@ -24,7 +24,7 @@ LAYERS = [
     ["types"],
     ["geometry"],
     ["kernels", "config"],
-    ["foreign", "locks", "stopping", "untrusted"],
+    ["foreign", "locks", "printable", "stopping", "untrusted"],
     ["errors", "version"],
 ]
 LEVEL = {name: level for level, names in enumerate(LAYERS) for name in names}

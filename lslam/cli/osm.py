@@ -121,14 +121,13 @@ def _bounds(
 def _write(out: Path, reply: dict[str, Any]) -> None:
     import json
 
-    from lslam.formats.atomic import atomic_write
+    from lslam.formats.atomic import write_text
     from lslam.formats.osm_buildings import buildings_of, middle_of
     from lslam.formats.osm_files import from_overpass, write_osm
 
     data = from_overpass(reply)
     if out.suffix.lower() == ".json":
-        with atomic_write(out) as stream:
-            stream.write(json.dumps(reply, ensure_ascii=False).encode() + b"\n")
+        write_text(out, json.dumps(reply, ensure_ascii=False) + "\n")
     else:
         write_osm(out, data)
     found = len(buildings_of(data, middle_of(data), str(out)).buildings)

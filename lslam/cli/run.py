@@ -158,7 +158,7 @@ def _resolve(given: dict[str, Any]) -> Config:
         "input.strict": "true" if given["strict"] else None,
         "loops.use": None if given["loops"] is None else str(given["loops"]).lower(),
         "gnss.mode": given["gnss"],
-        "osm.extract": None if given["osm"] is None else json.dumps(given["osm"]),
+        "osm.extract": None if given["osm"] is None else json.dumps(given["osm"], ensure_ascii=False),
         "osm.origin": None
         if given["origin"] is None
         else json.dumps([*options.place("--origin", given["origin"]), 0.0][:3]),
@@ -168,7 +168,7 @@ def _resolve(given: dict[str, Any]) -> Config:
     if given["poses"] is not None:
         if given["method"] not in (None, "poses"):
             raise UsageError(f"--poses replaces odometry: drop --method {given['method']}")
-        flags |= {"odometry.method": "poses", "odometry.poses": json.dumps(str(given["poses"]))}
+        flags |= {"odometry.method": "poses", "odometry.poses": json.dumps(str(given["poses"]), ensure_ascii=False)}
     settings = options.with_preset(given["settings"], given["preset"])
     return load_config(given["config_file"], [*settings, *(f"{k}={v}" for k, v in flags.items() if v is not None)])
 

@@ -9,12 +9,12 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-import tomli_w
 from pydantic import BaseModel, ValidationError
 
 from lslam.config.config import Config
 from lslam.config.preset_files import BASE, known_presets, read_preset, read_toml
 from lslam.errors import ConfigError, nearest
+from lslam.printable import toml_text
 from lslam.untrusted import parse_toml
 
 Tree = dict[str, Any]
@@ -68,7 +68,7 @@ def _whole(name: str, above: tuple[str, ...] = ()) -> Tree:
 
 def to_toml(config: Config) -> str:
     """The resolved configuration as TOML; absent optional values are left out."""
-    return tomli_w.dumps(config.model_dump(mode="json", exclude_none=True))
+    return toml_text(config.model_dump(mode="json", exclude_none=True))
 
 
 def to_described_toml(config: Config) -> str:
@@ -86,7 +86,7 @@ def to_described_toml(config: Config) -> str:
 def _inline(value: Any) -> str:
     if isinstance(value, list):
         return f"[{', '.join(_inline(v) for v in value)}]"
-    return tomli_w.dumps({"v": value}).removeprefix("v = ").strip()
+    return toml_text({"v": value}).removeprefix("v = ").strip()
 
 
 def _from_environment(environ: Mapping[str, str]) -> Tree:

@@ -30,6 +30,12 @@ def atomic_write(path: Path) -> Iterator[BinaryIO]:
         raise
 
 
+def write_text(path: Path, text: str) -> None:
+    """Text as UTF-8, atomically; of a path that is not, what UTF-8 cannot hold is written as JSON does, `\\udcef`."""
+    with atomic_write(path) as stream:
+        stream.write(text.encode("utf-8", "backslashreplace"))
+
+
 def _remove(part: Path) -> None:
     try:
         part.unlink(missing_ok=True)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.errors import InputError, cause
-from lslam.formats.atomic import atomic_write
+from lslam.formats.atomic import write_text
 from lslam.formats.osm_files import DECIMALS
 from lslam.geometry import se2
 from lslam.geometry.geodesy import from_local, to_local
@@ -51,8 +51,7 @@ def write_corrected(path: Path, found: CorrectedMap) -> None:
         "map_shift_m": [round(float(v), 4) for v in found.shift],
         "features": features,
     }
-    with atomic_write(path) as stream:
-        stream.write((json.dumps(tree, allow_nan=False, ensure_ascii=False) + "\n").encode())
+    write_text(path, json.dumps(tree, allow_nan=False, ensure_ascii=False) + "\n")
 
 
 def read_corrected(path: Path) -> CorrectedMap:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.errors import InputError, cause
-from lslam.formats.atomic import atomic_write
+from lslam.formats.atomic import write_text
 from lslam.geometry import noise, se3, so3
 from lslam.types.constraint import Constraint, ConstraintKind
 
@@ -37,8 +37,7 @@ def write_g2o(path: Path, poses: Floats, constraints: Sequence[Constraint]) -> N
         information = np.linalg.inv(body)
         values = " ".join(f"{v:.9g}" for v in (0.5 * (information + information.T))[_UPPER])
         lines.append(f"EDGE_SE3:QUAT {c.a} {c.b} {_pose_text(c.T_a_b)} {values}")
-    with atomic_write(path) as stream:
-        stream.write(("\n".join(lines) + "\n").encode())
+    write_text(path, "\n".join(lines) + "\n")
 
 
 def read_g2o(path: Path) -> tuple[Floats, list[Constraint]]:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.errors import InputError, cause
-from lslam.formats.atomic import atomic_write
+from lslam.formats.atomic import write_text
 from lslam.untrusted import MISFIT, parse_json
 
 
@@ -30,8 +30,7 @@ def write_line(path: Path, lat_lon_alt: NDArray[Any], properties: Mapping[str, A
         geometry = {"type": "Point", "coordinates": places[0]} if places else None
     feature = {"type": "Feature", "properties": dict(properties), "geometry": geometry}
     text = json.dumps({"type": "FeatureCollection", "features": [feature]}, allow_nan=False, ensure_ascii=False)
-    with atomic_write(path) as stream:
-        stream.write(text.encode() + b"\n")
+    write_text(path, text + "\n")
 
 
 def read_line(path: Path) -> NDArray[np.float64]:

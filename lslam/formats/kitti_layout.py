@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.formats.atomic import atomic_write
+from lslam.formats.atomic import atomic_write, write_text
 from lslam.formats.point_files import write_points
 from lslam.formats.pose_rows import seconds_text
 from lslam.geometry import se3
@@ -40,14 +40,12 @@ def write_scan(
 
 def write_times(folder: Path, stamps_ns: NDArray[np.int64]) -> None:
     """Write `times.txt`, seconds with all nine decimals."""
-    with atomic_write(folder / "times.txt") as stream:
-        stream.write("".join(f"{seconds_text(int(stamp))}\n" for stamp in stamps_ns).encode())
+    write_text(folder / "times.txt", "".join(f"{seconds_text(int(stamp))}\n" for stamp in stamps_ns))
 
 
 def write_calib(folder: Path, T_cam0_lidar: NDArray[np.float64]) -> None:
     """Write `calib.txt` with the line `Tr`."""
-    with atomic_write(folder / "calib.txt") as stream:
-        stream.write(("Tr: " + " ".join(f"{v:.12e}" for v in T_cam0_lidar[:3].ravel()) + "\n").encode())
+    write_text(folder / "calib.txt", "Tr: " + " ".join(f"{v:.12e}" for v in T_cam0_lidar[:3].ravel()) + "\n")
 
 
 def in_camera(truth: Trajectory, T_cam0_lidar: NDArray[np.float64]) -> Trajectory:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lslam.formats.atomic import atomic_write
+from lslam.formats.atomic import write_text
 from lslam.types.constraint import LoopCandidate
 from lslam.types.keyframe import Keyframe
 
@@ -34,8 +34,7 @@ def write_loops(path: Path, candidates: Sequence[LoopCandidate], keyframes: Sequ
             c.verdict, c.stage, _number(c.rmse), _number(c.overlap), _number(sigma_m), _number(sigma_deg), c.reason,
         )  # fmt: skip
         table.writerow(row)
-    with atomic_write(path) as stream:
-        stream.write(text.getvalue().encode())
+    write_text(path, text.getvalue())
 
 
 def _sigmas(candidate: LoopCandidate) -> tuple[float, float]:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.formats.atomic import atomic_write
+from lslam.formats.atomic import write_text
 from lslam.types.building_match import BuildingMatch, KeyframeMatch, OsmMatches
 from lslam.types.keyframe import Keyframe
 
@@ -38,8 +38,7 @@ def write_osm_matches(
         building = matches.buildings[one.building]
         moved = one.displacement(poses[one.keyframe], building.middle)
         table.writerow(_row(one, keyframes, building.osm_id, moved))
-    with atomic_write(path) as stream:
-        stream.write(text.getvalue().encode())
+    write_text(path, text.getvalue())
 
 
 def _row(

@@ -90,7 +90,9 @@ def ply_header(count: int, names: Sequence[str], comment: str = "") -> bytes:
     """Header of `count` binary little-endian vertices of float32 properties."""
     comments = "".join(f"comment {line}\n" for line in comment.splitlines())
     properties = "".join(f"property float {name}\n" for name in names)
-    return f"ply\nformat binary_little_endian 1.0\n{comments}element vertex {count}\n{properties}end_header\n".encode()
+    return f"ply\nformat binary_little_endian 1.0\n{comments}element vertex {count}\n{properties}end_header\n".encode(
+        "utf-8", "backslashreplace"
+    )
 
 
 def _read_header(path: Path, data: bytes) -> tuple[str, list[_Element], int]:

@@ -12,8 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.errors import InputError, nearest
-from lslam.formats.atomic import atomic_write
+from lslam.formats.atomic import write_text
 from lslam.geometry import so3
+from lslam.printable import toml_text
 from lslam.untrusted import parse_toml
 
 FILE_NAME = "sequence.toml"
@@ -110,13 +111,11 @@ def parse_sequence_toml(text: str, path: Path | str) -> SequenceInfo:
 
 def write_sequence_toml(path: Path, info: SequenceInfo) -> None:
     """Write `info` to `path` atomically, leaving out what is None; it reads back equal."""
-    with atomic_write(path) as stream:
-        stream.write(sequence_toml_text(info).encode())
+    write_text(path, sequence_toml_text(info))
 
 
 def sequence_toml_text(info: SequenceInfo) -> str:
     """`info` as TOML, without what is None."""
-    import tomli_w
 
     tree = {f.name: getattr(info, f.name) for f in fields(info) if f.name not in EXTRINSICS}
     tree = {key: value for key, value in tree.items() if value is not None}
@@ -124,7 +123,7 @@ def sequence_toml_text(info: SequenceInfo) -> str:
     matrices = {key: np.asarray(T, np.float64).tolist() for key, T in known.items() if T is not None}
     if matrices:
         tree["extrinsics"] = matrices
-    return tomli_w.dumps(tree)
+    return toml_text(tree)
 
 
 def is_rate(rate_hz: float) -> bool:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.errors import InputError, cause
-from lslam.formats.atomic import atomic_write
+from lslam.formats.atomic import write_text
 from lslam.formats.stamps_files import parse_stamp
 from lslam.untrusted import decimal_number
 
@@ -63,8 +63,7 @@ def write_stamped_csv(
     rows = [",".join(["stamp_ns", *names])]
     for stamp, row in zip(stamps_ns.tolist(), values.tolist(), strict=True):
         rows.append(",".join([str(stamp), *map(repr, row)]))
-    with atomic_write(path) as stream:
-        stream.write(("\n".join(rows) + "\n").encode())
+    write_text(path, "\n".join(rows) + "\n")
 
 
 def _nanoseconds(text: str) -> int:

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from lslam.errors import InputError, cause
-from lslam.formats.atomic import atomic_write
+from lslam.formats.atomic import write_text
 from lslam.types.study import StudyRow, Value
 
 VERSION = 2
@@ -54,8 +54,7 @@ def write_study_csv(path: Path, rows: Sequence[StudyRow]) -> None:
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(table)
     writer.writerows(zip(*([_text(value) for value in column] for column in table.values()), strict=True))
-    with atomic_write(path) as stream:
-        stream.write(text.getvalue().encode("utf-8", "backslashreplace"))
+    write_text(path, text.getvalue())
 
 
 def read_study_csv(path: Path) -> list[StudyRow]:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from lslam.formats.atomic import atomic_write
 from lslam.formats.study_csv import study_columns
+from lslam.printable import printable_tree
 from lslam.types.study import StudyRow, Value
 
 
@@ -15,7 +16,9 @@ def write_study_parquet(path: Path, rows: Sequence[StudyRow]) -> None:
     import pyarrow as pa
     from pyarrow import parquet
 
-    table = pa.table({name: pa.array(_of_one_type(column)) for name, column in study_columns(rows).items()})
+    table = pa.table(
+        {name: pa.array(printable_tree(_of_one_type(column))) for name, column in study_columns(rows).items()}
+    )
     with atomic_write(path) as stream:
         parquet.write_table(table, stream)
 

@@ -197,4 +197,4 @@ def _read_tum(path: Path, rows: list[Row], comments: list[str]) -> Trajectory:
 
 def _write_lines(path: str | Path, lines: list[str]) -> None:
     with atomic_write(Path(path)) as stream:
-        stream.writelines(f"{line}\n".encode() for line in lines)
+        stream.writelines(f"{line}\n".encode("utf-8", "backslashreplace") for line in lines)

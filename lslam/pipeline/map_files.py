@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from lslam.formats.atomic import atomic_write
+from lslam.formats.atomic import atomic_write, write_text
 from lslam.formats.cloud_files import write_cloud
 from lslam.formats.geojson import write_line
 from lslam.formats.ply_files import write_ply, write_ply_mesh
@@ -117,8 +117,7 @@ def write_mesh(path: Path, cloud: Cloud, note: MapNote, trajectory: Trajectory) 
 
 def write_json(path: Path, document: dict[str, Any]) -> None:
     """Strict JSON, indented, atomically."""
-    with atomic_write(path) as stream:
-        stream.write((json.dumps(document, indent=2, allow_nan=False, ensure_ascii=False) + "\n").encode())
+    write_text(path, json.dumps(document, indent=2, allow_nan=False, ensure_ascii=False) + "\n")
 
 
 def georeference_note(georeference: Georeference) -> dict[str, Any]:

@@ -14,6 +14,7 @@ from lslam.errors import GateError, OutputExistsError, RunFailedError, RunFinish
 from lslam.pipeline.identity import imu_digest, input_digest
 from lslam.pipeline.osm_source import extract_digest
 from lslam.pipeline.run_folder import MANIFEST
+from lslam.printable import printable_tree
 from lslam.types.sequence import Sequence
 from lslam.types.trajectory import Trajectory
 from lslam.untrusted import MISFIT, parse_json, parse_toml
@@ -88,7 +89,7 @@ def _difference(
     """What differs between the run that was begun and this one, in words; empty when nothing does."""
     if version != __version__:
         return f"it was begun by lslam {version}, this is {__version__}"
-    before, now = (_flat(tree) for tree in (begun, config.model_dump(mode="json")))
+    before, now = (_flat(tree) for tree in (begun, printable_tree(config.model_dump(mode="json"))))
     changed = [key for key in sorted(before | now) if before.get(key) != now.get(key) and key not in FREE]
     if changed:
         said = [f"{key} was {before.get(key)!r} and is {now.get(key)!r}" for key in changed[:3]]

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from lslam.config.osm import OsmConfig
 from lslam.errors import InputError, LslamError
-from lslam.formats.atomic import atomic_write
+from lslam.formats.atomic import write_text
 from lslam.formats.osm_buildings import buildings_of
 from lslam.formats.osm_files import from_overpass
 from lslam.geometry.geodesy import from_local
@@ -157,8 +157,7 @@ class OsmBuffer:
         """What is used is kept, and nothing else: not what a server sends when nobody waits any more."""
         folder.mkdir(parents=True, exist_ok=True)
         asked = {"lslam_centre": circle.wish.centre.tolist(), "lslam_radius": circle.wish.radius}
-        with atomic_write(folder / f"{len(self.replies):06d}.json") as stream:
-            stream.write(json.dumps({**asked, **circle.reply}, ensure_ascii=False).encode())
+        write_text(folder / f"{len(self.replies):06d}.json", json.dumps({**asked, **circle.reply}, ensure_ascii=False))
 
     def _load(self) -> None:
         """Take what an earlier run kept."""

@@ -20,7 +20,7 @@ import numpy as np
 
 from lslam.config.osm import OsmConfig
 from lslam.errors import InputError, OutputError, UsageError
-from lslam.formats.atomic import atomic_write
+from lslam.formats.atomic import write_text
 from lslam.formats.osm_files import from_overpass
 from lslam.kernels.cache import cache_folder
 from lslam.locks import one_at_a_time
@@ -88,8 +88,7 @@ def fetch_buildings(
         return kept
     with contextlib.suppress(OutputError, OSError):
         folder.mkdir(parents=True, exist_ok=True)
-        with atomic_write(folder / _file_name(bounds)) as stream:
-            stream.write(json.dumps(tree, ensure_ascii=False, separators=(",", ":")).encode())
+        write_text(folder / _file_name(bounds), json.dumps(tree, ensure_ascii=False, separators=(",", ":")))
     return tree
 
 

@@ -16,6 +16,7 @@ from lslam.formats.bag_listing import list_bag_files, parts_beside
 from lslam.formats.point_cloud import TIME_NAMES, PointCloud
 from lslam.formats.pointcloud2 import decode_livox, decode_pointcloud2
 from lslam.formats.sequence_toml import FILE_NAME, SequenceInfo, parse_sequence_toml, read_sequence_toml
+from lslam.printable import printable
 from lslam.readers.bag_extrinsics import find_extrinsics, find_truth
 from lslam.readers.bag_topics import check_parts, choose_clouds, index_scans, load_fixes, load_imu
 from lslam.readers.ground_truth import Voice
@@ -130,7 +131,8 @@ def open_folder(path: Path, overrides: SequenceInfo, why: str) -> BagSequence:
     messages, stamps, frame = index_scans(bag, topic, voice)
     rate = info.rate_hz or measured_rate(stamps)
     sequence = BagSequence(
-        info.name or re.sub(r"\.(bag|mcap|db3|bag\.active)$", "", path.name), path, bag, topic, messages, stamps, stamps, rate,
+        info.name or re.sub(r"\.(bag|mcap|db3|bag\.active)$", "", printable(path.name)),
+        path, bag, topic, messages, stamps, stamps, rate,
         motion_compensated=info.motion_compensated, rings=info.rings, sensor=info.sensor,
         notes=voice.notes, problems=voice.problems,
     )  # fmt: skip

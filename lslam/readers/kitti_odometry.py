@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from lslam.errors import InputError
 from lslam.formats.kitti_calib import read_odometry_calib
 from lslam.formats.sequence_toml import SequenceInfo
+from lslam.printable import printable
 from lslam.readers.folder_sequence import FolderSequence
 from lslam.readers.ground_truth import Voice, find_ground_truth, load_poses, to_lidar
 from lslam.readers.listing import list_scans, rows_of
@@ -55,7 +56,7 @@ def open_folder(folder: Path, overrides: SequenceInfo, why: str) -> FolderSequen
     if not files:
         raise InputError(f"{folder / 'velodyne'} holds no scans (*.bin): fetch the velodyne data of this sequence")
     voice = Voice([f"format {KIND}: {why}", *left_out, *compensation_note(info)], [])
-    name = info.name or (f"seq{folder.name}" if folder.name.isdigit() else folder.name)
+    name = info.name or (f"seq{folder.name}" if folder.name.isdigit() else printable(folder.name))
     files, stamps, rate = _stamps(folder, info, files, voice)
     calibration = calibration_over(info, Calibration(T_cam0_lidar=_tr(folder, voice)))
     compensated = True if info.motion_compensated is None and info.per_point is None else info.motion_compensated

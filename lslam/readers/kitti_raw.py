@@ -23,6 +23,7 @@ from lslam.formats.kitti_calib import read_raw_cam0_lidar, read_rigid
 from lslam.formats.oxts_files import ACCEL, GYRO, POS_ACC, Oxts, read_oxts
 from lslam.formats.point_files import SUFFIXES
 from lslam.formats.sequence_toml import SequenceInfo
+from lslam.printable import printable
 from lslam.readers.folder_sequence import FolderSequence
 from lslam.readers.ground_truth import Voice, find_ground_truth, load_poses, to_lidar
 from lslam.readers.listing import list_scans, rows_of
@@ -101,7 +102,7 @@ def open_folder(folder: Path, overrides: SequenceInfo, why: str) -> FolderSequen
             "leaves scans as they are)"
         )
     return FolderSequence(
-        name=info.name or folder.name,
+        name=info.name or printable(folder.name),
         path=folder,
         kind=KIND,
         files=files,

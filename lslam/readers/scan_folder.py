@@ -13,6 +13,7 @@ from lslam.formats.kitti_calib import read_odometry_calib
 from lslam.formats.mcd_calib import read_mcd_extrinsics
 from lslam.formats.point_files import SUFFIXES, read_points
 from lslam.formats.sequence_toml import SequenceInfo
+from lslam.printable import printable
 from lslam.readers.folder_sequence import FolderSequence
 from lslam.readers.ground_truth import Numbered, Voice, find_ground_truth, load_poses, pair_by_number, to_lidar
 from lslam.readers.listing import list_scans, rows_of, stamps_in_names
@@ -59,7 +60,7 @@ def open_folder(folder: Path, overrides: SequenceInfo, why: str) -> FolderSequen
     if info.rows and info.cols:
         voice.notes.append(f"organised clouds of {info.rows} rows x {info.cols} columns: the row is the ring")
     return FolderSequence(
-        name=info.name or folder.name,
+        name=info.name or printable(folder.name),
         path=folder,
         kind=KIND,
         files=files,

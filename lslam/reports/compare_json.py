@@ -19,7 +19,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from lslam.formats.atomic import atomic_write
+from lslam.formats.atomic import write_text
 from lslam.reports.compare_table import recipes
 from lslam.reports.evaluation_json import strict
 from lslam.types.comparison import Comparison, RunScore
@@ -75,5 +75,4 @@ def _run(run: RunScore) -> dict[str, Any]:
 
 def _write(path: Path, document: dict[str, Any]) -> None:
     text = json.dumps(document, indent=1, allow_nan=False, ensure_ascii=False)
-    with atomic_write(path) as stream:
-        stream.write((text + "\n").encode("utf-8", "backslashreplace"))
+    write_text(path, text + "\n")

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from lslam.formats.atomic import atomic_write
+from lslam.formats.atomic import write_text
 from lslam.reports.grid_text import Grid, aligned, comma_separated, latex, markdown
 from lslam.reports.metrics import counted, fixed, metres
 from lslam.types.comparison import Comparison, Metric, Spread, SummaryRow
@@ -109,8 +109,7 @@ def as_text(shown: Sequence[CompareTable], style: str) -> list[str]:
 def write_files(out: Path, comparison: Comparison) -> None:
     """compare.csv and compare.tex, atomically; raises OutputError."""
     for style in ("csv", "tex"):
-        with atomic_write(out / f"compare.{style}") as stream:
-            stream.write((render(comparison, style) + "\n").encode("utf-8", "backslashreplace"))
+        write_text(out / f"compare.{style}", render(comparison, style) + "\n")
 
 
 def _methods_table(comparison: Comparison, groups: Sequence[str], title: str) -> CompareTable:

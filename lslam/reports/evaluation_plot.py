@@ -11,6 +11,7 @@ import numpy as np
 from lslam.errors import UsageError, nearest
 from lslam.evaluation.results import AbsoluteError, Evaluation
 from lslam.formats.atomic import atomic_write
+from lslam.printable import printable
 from lslam.reports.evaluation_table import short_names
 from lslam.reports.picture import COLOURS, FORMATS, house_style, label, picture
 
@@ -30,7 +31,8 @@ def write_plot(path: str | Path, evaluations: Sequence[Evaluation], names: Seque
     path = Path(path)
     check_plot_path(path)
     with house_style():
-        figure = _draw(evaluations, names or short_names([e.estimate for e in evaluations]))
+        labels = names or short_names([e.estimate for e in evaluations])
+        figure = _draw(evaluations, [printable(label) for label in labels])
         with atomic_write(path) as stream:
             stream.write(picture(figure, path.suffix.lstrip(".").lower()))
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from lslam.formats.atomic import atomic_write
+from lslam.formats.atomic import write_text
 from lslam.simulation.osm_city import OsmCity
 from lslam.simulation.scenarios import SimulatedDrive
 from lslam.version import __version__
@@ -28,8 +28,7 @@ def write_manifest(folder: Path, drive: SimulatedDrive, command: str, points: in
     """
     tree = {**describe_drive(drive), "command": command, "points": points, "bytes": size}
     path = folder / MANIFEST
-    with atomic_write(path) as stream:
-        stream.write((json.dumps(_plain(tree), indent=1, ensure_ascii=False, allow_nan=False) + "\n").encode())
+    write_text(path, json.dumps(_plain(tree), indent=1, ensure_ascii=False, allow_nan=False) + "\n")
     return path
 
 

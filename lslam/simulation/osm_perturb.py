@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.errors import InputError
-from lslam.formats.atomic import atomic_write
+from lslam.formats.atomic import write_text
 from lslam.types.building import Building, Footprint, footprint_polygon, footprints_of
 from lslam.untrusted import MISFIT, parse_json
 
@@ -131,8 +131,7 @@ def write_perturbation(path: Path, perturbation: Perturbation) -> None:
         "buildings": [asdict(change) for change in perturbation.changes],
         "not_yet_built": new,
     }
-    with atomic_write(path) as stream:
-        stream.write((json.dumps(tree, indent=1, allow_nan=False) + "\n").encode())
+    write_text(path, json.dumps(tree, indent=1, allow_nan=False) + "\n")
 
 
 def read_perturbation(path: Path) -> Perturbation:

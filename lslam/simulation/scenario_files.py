@@ -13,6 +13,7 @@ from pydantic import BaseModel, Field, ValidationError, model_validator
 
 from lslam.config.section import Section
 from lslam.errors import ConfigError, InputError, UsageError, cause, nearest
+from lslam.printable import toml_text
 from lslam.simulation.city import Layout
 from lslam.simulation.imu import ImuFaults
 from lslam.simulation.lidar_models import LIDARS
@@ -152,9 +153,8 @@ def scenario_named(name: str, settings: Iterable[str] = ()) -> Scenario:
 
 def scenario_text(scenario: Scenario) -> str:
     """The scenario as TOML with every key, as a file that `scenario_named` reads back."""
-    import tomli_w
 
-    return tomli_w.dumps(scenario.model_dump(mode="json", exclude={"name"}, exclude_none=True))
+    return toml_text(scenario.model_dump(mode="json", exclude={"name"}, exclude_none=True))
 
 
 def _ready(name: str) -> dict[str, Any]:

@@ -8,12 +8,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.formats.atomic import atomic_write
+from lslam.formats.atomic import write_text
 from lslam.formats.gnss_csv import write_gnss_csv
 from lslam.formats.imu_csv import write_imu_csv
 from lslam.formats.stamped_csv import write_stamped_csv
 from lslam.formats.trajectory_files import write_tum
 from lslam.geometry import se3
+from lslam.printable import toml_text
 from lslam.simulation.gnss import (
     ORIGIN,
     T_CAR_ANTENNA,
@@ -125,7 +126,6 @@ def write_truth(
 
 
 def _write_world(path: Path, T_enu_world: Floats, origin: Floats) -> None:
-    import tomli_w
 
     down = np.array([0.0, 0.0, -GRAVITY])
     tree = {
@@ -133,5 +133,4 @@ def _write_world(path: Path, T_enu_world: Floats, origin: Floats) -> None:
         "T_enu_world": T_enu_world.tolist(),
         "gravity_world": (down @ T_enu_world[:3, :3]).tolist(),
     }
-    with atomic_write(path) as stream:
-        stream.write(tomli_w.dumps(tree).encode())
+    write_text(path, toml_text(tree))

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lslam.formats.atomic import atomic_write
+from lslam.formats.atomic import write_text
 from lslam.formats.kitti_layout import scan_files, write_scan
 from lslam.simulation.scenarios import SimulatedDrive
 from lslam.types.scan import Scan
@@ -52,8 +52,7 @@ def read_mark(folder: Path) -> str | None:
 
 def write_mark(folder: Path, drive: SimulatedDrive) -> None:
     """Note in `folder` which recording is begun there."""
-    with atomic_write(folder / MARK) as stream:
-        stream.write(json.dumps({"fingerprint": fingerprint(drive)}).encode())
+    write_text(folder / MARK, json.dumps({"fingerprint": fingerprint(drive)}))
 
 
 def write_scans(drive: SimulatedDrive, folder: Path, on_scan: Callable[[int], None] | None = None) -> int:

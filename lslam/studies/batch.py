@@ -9,12 +9,11 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-import tomli_w
-
 from lslam.config import Config
 from lslam.config.batch import BatchConfig, parse_batch
 from lslam.errors import UsageError
 from lslam.pipeline.identity import imu_digest, input_digest, job_digest
+from lslam.printable import toml_text
 from lslam.studies.expanded import Expanded, Place, cells_of, check_same
 from lslam.studies.grid import Job, expand, run_folder
 from lslam.studies.points import Contender, free_name, settings_of
@@ -47,7 +46,7 @@ def expand_batch(batch: BatchConfig, place: Place, settings: Sequence[str] = ())
     Raises ConfigError, UsageError or InputError for methods, recordings and scenarios that make no sense; OutputExistsError
     when it is to go on in the folder of another list.
     """
-    text = tomli_w.dumps(batch.model_dump(mode="json", exclude_none=True, exclude_defaults=True))
+    text = toml_text(batch.model_dump(mode="json", exclude_none=True, exclude_defaults=True))
     check_same(place, MARK, "batch", text, _names)
     jobs: list[Job] = []
     found: dict[str, Contender] = {}
@@ -72,7 +71,7 @@ def expand_lines(lines: Sequence[Line], place: Place) -> Expanded:
     Raises InputError for a recording that cannot be listed, UsageError for two lines that name one folder, OutputExistsError
     when they are to go on in the folder of a list that has none of them.
     """
-    text = tomli_w.dumps({"lines": [line.words for line in lines]})
+    text = toml_text({"lines": [line.words for line in lines]})
     check_same(place, MARK, "batch", text, _names)
     jobs: list[Job] = []
     found: dict[str, Contender] = {}

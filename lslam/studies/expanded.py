@@ -11,7 +11,7 @@ from lslam.config.input import ScanRange
 from lslam.config.preset_files import read_toml
 from lslam.config.study import StudySequence
 from lslam.errors import InterruptedRunError, LslamError, OutputExistsError
-from lslam.formats.atomic import atomic_write
+from lslam.formats.atomic import write_text
 from lslam.readers import open_sequence
 from lslam.readers.lookup import find_folder
 from lslam.studies.cells import fitted_scene, recorded_cell, scene_cell
@@ -106,8 +106,7 @@ def make_runs(
     try:
         if not place.overwrite:
             results.check()
-        with atomic_write(place.out / expanded.mark) as stream:
-            stream.write(expanded.text.encode())
+        write_text(place.out / expanded.mark, expanded.text)
         left = left_to_do(place, jobs)
         begun = {job.folder for job in left}
         _check_folders(left, place)

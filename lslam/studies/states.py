@@ -6,7 +6,7 @@ import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from lslam.formats.atomic import atomic_write
+from lslam.formats.atomic import write_text
 from lslam.untrusted import MISFIT, parse_json
 
 # What a repetition would end with again; everything else is tried anew.
@@ -36,8 +36,7 @@ class State:
 def write_state(path: Path, state: State) -> None:
     """Write the file atomically; raises OutputError."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    with atomic_write(path) as stream:
-        stream.write((json.dumps(asdict(state), indent=1) + "\n").encode(errors="backslashreplace"))
+    write_text(path, json.dumps(asdict(state), indent=1) + "\n")
 
 
 def read_state(path: Path) -> State | None:

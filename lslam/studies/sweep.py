@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-import tomli_w
-
 from lslam.config.study import StudyConfig
 from lslam.errors import RunFailedError
+from lslam.printable import toml_text
 from lslam.studies.engines import Engine
 from lslam.studies.expanded import Expanded, Place, cells_of, check_same, make_runs
 from lslam.studies.grid import expand
@@ -36,7 +35,7 @@ def expand_study(sweep: Sweep) -> Expanded:
     OutputExistsError when it is to go on in the folder of another study.
     """
     study, place = sweep.study, sweep.place
-    text = tomli_w.dumps(study.model_dump(mode="json", exclude_none=True, exclude_defaults=True))
+    text = toml_text(study.model_dump(mode="json", exclude_none=True, exclude_defaults=True))
     check_same(place, MARK, "study", text, lambda tree: [str(tree.get("name"))])
     found = contenders(study, sweep.settings)
     cells = cells_of(study.sequences, study.seeds, found, place, sweep.settings)
