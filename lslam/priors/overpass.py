@@ -13,6 +13,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable
+from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +32,7 @@ from lslam.version import __version__
 log = logging.getLogger("lslam")
 
 USER_AGENT = f"lslam/{__version__} (batch LiDAR SLAM; buildings around a recorded trajectory)"
-LONGEST_REPLY = 512 * 1024 * 1024  # bytes
+LONGEST_REPLY = 48 * 1024 * 1024  # bytes; as a tree in memory it takes ten times as much
 LONGEST_WAIT = 120.0  # s; whoever says "retry later than that" is not waited for
 FAR_OUT = 1000.0  # m; a long building reaches that far out of a box
 _BUSY = (429, 502, 503, 504)
@@ -137,7 +138,32 @@ def _ask_patiently(bounds: Bounds, config: OsmConfig, folder: Path, sleep: Calla
 
 
 def _ask(bounds: Bounds, config: OsmConfig) -> dict[str, Any]:
-    """One request; InputError when asking again is no use, _TryAgainError when it may be."""
+    """One request; InputError when asking again is no use, _TryAgainError when it may be.
+
+    It has a thread of its own, because a name that is looked up and headers that drip know no end: all of it together has
+    `config.timeout`.
+    """
+    reply: Future[bytes] = Future()
+    is_late = threading.Event()
+
+    def exchange() -> None:
+        try:
+            reply.set_result(_exchange(bounds, config, is_late))
+        except BaseException as error:
+            reply.set_exception(error)
+
+    threading.Thread(target=exchange, name="overpass", daemon=True).start()
+    try:
+        body = reply.result(config.timeout)
+    except TimeoutError:
+        raise InputError(_too_late(config.server, config.timeout)) from None
+    finally:
+        is_late.set()
+    return _parsed(body, bounds, config.server)
+
+
+def _exchange(bounds: Bounds, config: OsmConfig, is_late: threading.Event) -> bytes:
+    """The body of a reply, unless nobody waits for it any more."""
     import requests
 
     server = config.server
@@ -151,7 +177,7 @@ def _ask(bounds: Bounds, config: OsmConfig) -> dict[str, Any]:
             stream=True,
         ) as reply:
             _check_status(reply, server)
-            body = _read(reply, server, config.timeout)
+            return _read(reply, server, config.timeout, is_late)
     except requests.exceptions.Timeout as error:
         is_connecting = isinstance(error, requests.exceptions.ConnectTimeout)
         raise InputError(_too_late(server, config.connect_timeout if is_connecting else config.timeout)) from None
@@ -162,7 +188,6 @@ def _ask(bounds: Bounds, config: OsmConfig) -> dict[str, Any]:
         raise _TryAgainError("the connection broke") from None
     except requests.exceptions.RequestException as error:
         raise InputError(f"{server} cannot be asked: {error}") from None
-    return _parsed(body, bounds, server)
 
 
 def _check_status(reply: Any, server: str) -> None:
@@ -179,24 +204,23 @@ def _check_status(reply: Any, server: str) -> None:
         raise InputError(f"{server} refused the request (HTTP {status}): check osm.server")
 
 
-def _read(reply: Any, server: str, timeout: float) -> bytes:
+def _read(reply: Any, server: str, timeout: float, is_late: threading.Event) -> bytes:
     """The body, but neither for ever nor without end: what has come is looked at as it comes, drop by drop."""
     import urllib3
 
-    parts, size, end = [], 0, time.monotonic() + timeout
+    body = bytearray()
     try:
         while part := reply.raw.read1(65536, decode_content=True):
-            parts.append(part)
-            size += len(part)
-            if size > LONGEST_REPLY:
+            body += part
+            if len(body) > LONGEST_REPLY:
                 raise InputError(f"the reply grows beyond {LONGEST_REPLY >> 20} MB: ask for a smaller place")
-            if time.monotonic() > end:
+            if is_late.is_set():
                 raise InputError(_too_late(server, timeout))
     except urllib3.exceptions.ReadTimeoutError:
         raise InputError(_too_late(server, timeout)) from None
     except urllib3.exceptions.HTTPError:
         raise _TryAgainError("the connection broke") from None
-    return b"".join(parts)
+    return bytes(body)
 
 
 def _too_late(server: str, limit: float) -> str:

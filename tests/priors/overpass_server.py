@@ -28,7 +28,7 @@ class FakeOverpass:
     """Answers each request with the next of `script`, and in good order when that is used up.
 
     Words of the script: ok, busy, busy:SECONDS, gateway, drop, html, cut, remark, elsewhere, redirect, forbidden, empty,
-    slow:SECONDS, drip:SECONDS (from byte to byte), torn, zipped.
+    slow:SECONDS, drip:SECONDS (from byte to byte), header:SECONDS (likewise, before the body), torn, zipped.
     `requests` keeps the queries and headers; `most_at_once` how many were open together.
     """
 
@@ -87,6 +87,10 @@ def _answer(handler: BaseHTTPRequestHandler, fake: FakeOverpass, word: str, quer
     if kind == "drop":
         handler.close_connection = True
         return
+    if kind == "header":
+        for byte in b"HTTP/1.1 200 OK\r\nX-Patience: " + b"a" * 2000:
+            handler.wfile.write(bytes([byte]))
+            time.sleep(float(value))
     status = {"busy": 429, "gateway": 504, "redirect": 301, "forbidden": 403}.get(kind, 200)
     body = {
         "html": PAGE,

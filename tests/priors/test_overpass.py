@@ -113,13 +113,15 @@ def test_a_busy_server_is_given_time(
         ("elsewhere", "most of it lies elsewhere, about -32.9", 1),
         ("slow:2", "did not answer within 0.3 s", 1),
         ("drip:0.05", "did not answer within 0.3 s", 1),
+        ("header:0.05", "did not answer within 0.3 s", 1),
+        ("busy:\u00b2", r"after 3 attempts: it is busy", 3),
         ("torn", "after 3 attempts: the connection broke", 3),
     ],
 )
 def test_what_no_patience_mends_is_one_sentence_and_is_not_kept(
     server: FakeOverpass, tmp_path: Path, word: str, sentence: str, requests: int
 ) -> None:
-    timeout = 0.3 if word.startswith(("slow", "drip")) else 5.0
+    timeout = 0.3 if word.startswith(("slow", "drip", "header")) else 5.0
     begun = time.monotonic()
     with pytest.raises(InputError, match=sentence) as caught:
         fetch(server, tmp_path, *[word] * 3, timeout=timeout)
