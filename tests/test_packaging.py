@@ -64,8 +64,9 @@ def files() -> list[Path]:
 
 def third_party(folder: Path) -> dict[str, list[str]]:
     """Top names imported anywhere below `folder`, lazily too, that are neither Python's nor ours; with the files."""
-    # Test modules import each other by their bare names; a method's file may bear the name of what it wraps.
-    ours = {"lslam"} | {path.stem for path in folder.rglob("*.py") if folder.name == "tests"}
+    # Test modules and their folders import each other by their bare names; a method's file may bear the name of what it wraps.
+    here = [path for path in folder.rglob("*.py") if folder.name == "tests"]
+    ours = {"lslam"} | {path.stem for path in here} | {path.parent.name for path in here}
     found: dict[str, list[str]] = {}
     for path in folder.rglob("*.py"):
         for node in ast.walk(ast.parse(path.read_text())):

@@ -45,12 +45,13 @@ class DriftOfFixes:
     """What odometry may err by at F fixes.
 
     known, unit : (K, 6, 6) of K keyframes, axes east, north, up, as of `drift.chains`: as odometry says, and drift of factor 1
-    metre : (6, 6) of the latter over one metre, `drift.drift_covariance`
+    places : (K, 3) m, of the keyframes; metre : (6, 6) of the drift over one metre, `drift.drift_covariance`
     keyframes : (F,) from which each fix is seen, ascending
     """
 
     known: Floats
     unit: Floats
+    places: Floats
     metre: Floats
     keyframes: NDArray[np.intp]
 
@@ -109,10 +110,14 @@ def _likeliest(
     t, r, a, s = (np.stack([values[g].mean(axis=0) for g in groups]) for values in (seconds, scaled, antenna, sigmas))
     own = np.repeat([white / len(group) for group in groups], 3)
     keyframes = drift.keyframes[[group[len(group) // 2] for group in groups]]
-    weights = (1.0 / s).ravel()
+    places, weights = drift.places[keyframes], (1.0 / s).ravel()
     known, walk, rate = (
         part * np.outer(weights, weights)
-        for part in (_shared(drift.known, keyframes, a), _shared(drift.unit, keyframes, a), _lasting(drift.metre, a))
+        for part in (
+            _shared(drift.known[keyframes], places),
+            _shared(drift.unit[keyframes], places),
+            _lasting(drift.metre, a),
+        )
     )
     # What was fitted moves them: place and heading, and tilt.
     about = a - a.mean(axis=0)
@@ -168,16 +173,15 @@ def _likelihoods(base: Floats, unit: Floats, sides: Floats) -> Floats:
     return np.asarray(out - np.log(np.diag(root)).sum())
 
 
-def _shared(chain: Floats, keyframes: NDArray[np.intp], places: Floats) -> Floats:
-    """(3 F, 3 F) m2 of F places, each seen from one of `keyframes`, ascending.
+def _shared(chain: Floats, places: Floats) -> Floats:
+    """(3 F, 3 F) m2 of F poses at `places` (F, 3), m, world axes, one after the other.
 
-    chain : (K, 6, 6) of the keyframes, world axes, as of `drift.chains`; places : (F, 3) m, world axes
+    chain : (F, 6, 6) of each pose, world axes, as of `drift.chains`
     What the earlier of two errs by, the later errs by as well, turned about it.
     """
-    number = np.arange(len(keyframes))
+    number = np.arange(len(places))
     early, late = np.minimum.outer(number, number), np.maximum.outer(number, number)
     moved = np.cross(np.eye(3), (places[late] - places[early])[:, :, None, :])
-    before = chain[keyframes[early]]
-    shared = before[..., :3, :3] + before[..., :3, 3:] @ moved
+    shared = chain[early][..., :3, :3] + chain[early][..., :3, 3:] @ moved
     shared = np.where((number[:, None] <= number)[..., None, None], shared, np.swapaxes(shared, -1, -2))
     return np.asarray(shared.transpose(0, 2, 1, 3).reshape(3 * len(number), 3 * len(number)))

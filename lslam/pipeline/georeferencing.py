@@ -215,7 +215,8 @@ def _wander(
         return None, 0.0
     known, unit = (noise.rotated(chain, found.T_enu_world[:3, :3]) for chain in chains(graph, config))
     metre = drift_covariance(1.0, config)
-    drift = DriftOfFixes(known + graph.walk * unit, unit, metre, _owners(fixes, keyframes)[good])
+    places = se3.apply(found.T_enu_world, graph.poses[:, :3, 3])
+    drift = DriftOfFixes(known + graph.walk * unit, unit, places, metre, _owners(fixes, keyframes)[good])
     wander, walk = wander_of(
         1e-9 * (fixes.stamps_ns[good] - fixes.stamps_ns[0]), found.residuals[good], fixes.sigmas[good],
         (fixes.positions - found.residuals)[good], config.probability, drift,

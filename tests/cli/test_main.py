@@ -27,7 +27,7 @@ def test_help_is_instant_and_imports_nothing_heavy() -> None:
     roots = {name.split(".")[0] for name in imported} - set(sys.stdlib_module_names)
     assert {root for root in roots if not root.startswith("_")} == {"lslam", "click"}
     ours = {name for name in imported if name.split(".")[0] == "lslam"}
-    assert ours == {"lslam", "lslam.cli", "lslam.cli.main", "lslam.errors", "lslam.version"}
+    assert ours == {"lslam", "lslam.cli", "lslam.cli.main", "lslam.errors", "lslam.stopping", "lslam.version"}
     # A bare interpreter has some 30 modules, click and what it needs of the standard library some 80.
     assert len(imported) < 200
 

@@ -28,7 +28,7 @@ def drift_of(path: Floats) -> DriftOfFixes:
         J = np.eye(6)
         J[:3, 3:] = [[0, step[2], -step[1]], [-step[2], 0, step[0]], [step[1], -step[0], 0]]
         unit[i + 1] = J @ unit[i] @ J.T + np.linalg.norm(step) * METRE
-    return DriftOfFixes(1e-2 * unit, unit, METRE, np.arange(len(path)))
+    return DriftOfFixes(1e-2 * unit, unit, path, METRE, np.arange(len(path)))
 
 
 def fixes(
@@ -118,7 +118,7 @@ def test_what_an_early_place_errs_by_a_later_one_errs_by_too() -> None:
         drawn[:, i + 1] = drawn[:, i] + np.cross(turn, step) + d[:, :3]
         turn += d[:, 3:]
     flat = drawn.reshape(20_000, -1)
-    expected = 1e4 * fix_noise._shared(drift_of(path).unit, np.arange(6), path)
+    expected = 1e4 * fix_noise._shared(drift_of(path).unit, path)
     np.testing.assert_allclose(flat.T @ flat / 20_000, expected, atol=0.04 * expected.max())
     way = np.linalg.norm(np.diff(path, axis=0), axis=1).sum()
     lasting = fix_noise._lasting(np.diag([1e-4] * 3 + [0.0] * 3), path)

@@ -74,14 +74,16 @@ def test_loops_that_an_earlier_run_found_are_not_sought_again(tmp_path: Path, mo
     store, kept = store_of(results), Checkpoints(tmp_path / "checkpoint", "loops", 30.0)
     refused = replace(candidate(3, 190), verdict="rejected", constraint=None)
     monkeypatch.setattr(back_end_pass, "find_loops", lambda *_: [*LOOPS, refused])
-    first = back_end_pass._loops(store, config(), kept, KeyframeClocks())
+    first = back_end_pass._loops(store, config(), kept, KeyframeClocks(), lambda: False)
     monkeypatch.setattr(back_end_pass, "find_loops", lambda *_: [])
-    again = back_end_pass._loops(store, config(), Checkpoints(tmp_path / "checkpoint", "loops", 30.0), KeyframeClocks())
+    again = back_end_pass._loops(
+        store, config(), Checkpoints(tmp_path / "checkpoint", "loops", 30.0), KeyframeClocks(), lambda: False
+    )
     assert [repr(c) for c in again] == [repr(c) for c in first]
     np.testing.assert_array_equal(
         [c.constraint.covariance for c in again[:-1]], [c.constraint.covariance for c in LOOPS]
     )
-    assert back_end_pass._loops(store_of(results[:-EVERY]), config(), kept, KeyframeClocks()) == [], (
+    assert back_end_pass._loops(store_of(results[:-EVERY]), config(), kept, KeyframeClocks(), lambda: False) == [], (
         "the keyframes are others"
     )
-    assert back_end_pass._loops(store, config(), None, KeyframeClocks()) == []
+    assert back_end_pass._loops(store, config(), None, KeyframeClocks(), lambda: False) == []
