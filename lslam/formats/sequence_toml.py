@@ -116,7 +116,6 @@ def write_sequence_toml(path: Path, info: SequenceInfo) -> None:
 
 def sequence_toml_text(info: SequenceInfo) -> str:
     """`info` as TOML, without what is None."""
-
     tree = {f.name: getattr(info, f.name) for f in fields(info) if f.name not in EXTRINSICS}
     tree = {key: value for key, value in tree.items() if value is not None}
     known = {key: getattr(info, key) for key in EXTRINSICS}

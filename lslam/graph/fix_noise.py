@@ -85,9 +85,8 @@ def wander_of(
     white = max(white, LEAST_WHITE)
     drift = replace(drift, keyframes=drift.keyframes[good])
     memory, factor = _likeliest(seconds, scaled, sigmas, antenna, white, drift)
-    return Wander(
-        seconds[:: -(-len(seconds) // INSTANTS)], np.sqrt(1.0 - white) * np.median(sigmas, axis=0), memory
-    ), factor
+    sigma = np.sqrt(1.0 - white) * np.median(sigmas, axis=0)
+    return Wander(seconds[:: -(-len(seconds) // INSTANTS)], sigma, memory), factor
 
 
 def _near_neighbours(scaled: Floats, probability: float) -> NDArray[np.bool_]:

@@ -66,9 +66,11 @@ class Watch:
             return
         if event == "open" and not (isinstance(args[2], int) and args[2] & (os.O_WRONLY | os.O_RDWR | os.O_CREAT)):
             return
-        paths = [os.fsdecode(a) for a in args if isinstance(a, (str, bytes, os.PathLike))]
-        if paths and not paths[0].startswith((self.allowed, os.devnull)) and "__pycache__" not in paths[0]:
-            self.found.append(f"{event} {paths[0]}")
+        # Of `open` the second is the mode.
+        named = args[:1] if event == "open" else args[:2]
+        paths = [os.fsdecode(a) for a in named if isinstance(a, (str, bytes, os.PathLike))]
+        if any(not p.startswith((self.allowed, os.devnull)) and "__pycache__" not in p for p in paths):
+            self.found.append(f"{event} {paths}")
 
 
 _watch: Watch | None = None

@@ -94,9 +94,9 @@ def test_perfect_fixes_have_a_memory() -> None:
     assert walk == 0
 
 
-@pytest.mark.parametrize(("percent", "drifts"), [(0.0, (0, 3)), (0.3, (0, 12)), (3.0, (11, 12))])
+@pytest.mark.parametrize(("percent", "drifts"), [(0.0, (0, 3)), (3.0, (11, 12))])
 def test_odometry_drifts_where_fixes_cannot_err_so_much(percent: float, drifts: tuple[int, int]) -> None:
-    """Fixes wander by 0.8 m for two minutes; within a drive of 450 m odometry runs off by nothing, as much, or 13 m."""
+    """Fixes wander by 0.8 m for two minutes; within a drive of 450 m odometry runs off by nothing or 13 m."""
     walks = [fixes(90, 1.0, 0.3, 0.8, 120.0, seed, percent)[1] for seed in range(12)]
     assert drifts[0] <= sum(walk > 0 for walk in walks) <= drifts[1]
     if percent == 3.0:
