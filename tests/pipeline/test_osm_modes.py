@@ -195,6 +195,11 @@ def test_the_baseline_runs_whole(tmp_path: Path) -> None:
     length = np.linalg.norm(found[-1, :2, 3] - found[0, :2, 3])
     # Its odometry claims metres per step, as much as each building does: these drag it.
     assert length == pytest.approx(np.linalg.norm(poses[29, :2, 3] - poses[0, :2, 3]), abs=1.0)
+    # A graph of two dimensions: heights and tilts from one scan to the next are those of odometry.
+    before = read_trajectory(folder / "trajectory_odometry.tum").poses
+    steps, own = se3.relative(found[:-1], found[1:]), se3.relative(before[:-1], before[1:])
+    np.testing.assert_allclose(steps[:, 2, 3], own[:, 2, 3], atol=5e-3)
+    np.testing.assert_allclose(steps[:, 2, :2], own[:, 2, :2], atol=3e-4)
 
 
 def test_the_improved_system_lays_walls_of_single_scans_and_holds_the_start(tmp_path: Path) -> None:
