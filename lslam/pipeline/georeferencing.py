@@ -123,7 +123,9 @@ def place(
         "GNSS: %d of %d fixes believed, %.2f m rms from the antenna horizontally, %.2f m vertically",
         georeference.used, georeference.fixes, georeference.rmse_horizontal, georeference.rmse_vertical,
     )  # fmt: skip
-    wander, walk = _wander(fixes, found, keyframes, graph, config.graph)
+    wander, walk = None, 0.0
+    if config.gnss.mode == "graph":
+        wander, walk = _wander(fixes, found, keyframes, graph, config.graph)
     factors = _as_factors(fixes, found, shift, results, keyframes, arm, wander)
     return Placement(georeference, factors, wander, walk, _elsewhere(found))
 
