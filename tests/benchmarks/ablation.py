@@ -1,6 +1,7 @@
 """Every recovery policy, and what the map asks of its voxels, switched off one at a time: which rows need it.
 
     python tests/benchmarks/ablation.py [--method loam] [--seeds 100,101] [--rows hdl64,vlp16,os1-16] [--without breadth]
+        [--write docs/results.md]
     python tests/benchmarks/ablation.py --starts
     python tests/benchmarks/ablation.py --recordings FOLDER
 
@@ -22,9 +23,11 @@ from pathlib import Path
 from unittest import mock
 
 import numpy as np
-from accuracy import ate, rotation_rpe
+import tables
 from numpy.typing import NDArray
-from sparse import length, origin, thinned
+from recorded import thinned
+from scores import ate, origin, rotation_rpe
+from sparse import length
 
 from lslam.config import load_config
 from lslam.errors import UsageError
@@ -139,6 +142,7 @@ def main() -> None:
     parser.add_argument("--rows", default="hdl64,vlp16,os1-32")
     parser.add_argument("--method", default="icp", choices=list(WITHOUT))
     parser.add_argument("--without", help="names of this table, comma-separated; default: all")
+    tables.offer(parser)
     args = parser.parse_args()
     known = WITHOUT[args.method]
     asked = args.without.split(",") if args.without else list(known)
@@ -149,12 +153,12 @@ def main() -> None:
     elif args.starts:
         cases = starts()
     else:
-        cases = drives(args.rows.split(","), [int(v) for v in args.seeds.split(",")])
+        cases = drives(args.rows.split(","), tables.numbers(args.seeds))
     variants: dict[str, Variant] = {"-": ((), ()), **{name: known[name] for name in asked}}
-    lost, worse = Counter[str](), Counter[str]()
+    lost, worse, count = Counter[str](), Counter[str](), 0
     print(f"{'case':38} {'without':15} {'origin m':>9} {'se3 m':>8} {'deg/10 m':>9} {'failed':>7}  acted")
     for case in cases:
-        whole = 0.0
+        whole, count = 0.0, count + 1
         for name, variant in variants.items():
             start, shape, turn, failed, acted = row(args.method, variant, case)
             limit = 0.5 if args.starts else 0.05 * length(case[2])
@@ -165,8 +169,13 @@ def main() -> None:
             if name == "-" or is_lost or shape > max(1.1 * whole, whole + 0.002):
                 who = ", ".join(f"{k} {v}" for k, v in acted.items())
                 print(f"{case[0]:38} {name:15} {start:9.3f} {shape:8.4f} {turn:9.3f} {failed:7d}  {who}", flush=True)
-    print("lost without: " + ", ".join(f"{name} {lost[name]}" for name in variants))
-    print("shape worse by half and a centimetre: " + ", ".join(f"{name} {worse[name]}" for name in asked))
+    kind = "recordings" if args.recordings else "starts" if args.starts else args.method
+    limit = "half a metre off" if args.starts else "a twentieth of its path off"
+    caption = (
+        f"{args.method}, {count} runs: lost is one {limit}, worse one whose ATE se3 grows by half and a centimetre."
+    )
+    rows = [["nothing" if name == "-" else name, str(lost[name]), str(worse[name])] for name in variants]
+    tables.table(f"ablation-{kind}", caption, ["without", "lost", "worse"], rows, args.write)
 
 
 if __name__ == "__main__":

@@ -24,10 +24,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from accuracy import ate, rotation_rpe
 from grid_targets import report
 from numpy.typing import NDArray
 from peers import drive
+from scores import ate, rotation_rpe
 
 from lslam import Registration
 from lslam.config import load_config

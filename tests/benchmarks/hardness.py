@@ -1,6 +1,7 @@
 """Is a simulated drive as hard as a recorded one? Map entropy, plane thickness, inliers of `icp`, rotation of three methods.
 
-    python tests/benchmarks/hardness.py [--scenarios urban,urban-hard] [--seeds 100,101,102] [--scans 154] [--set key=value]
+    python tests/benchmarks/hardness.py [--scenarios urban,urban-hard] [--seeds 100-104] [--scans 154]
+        [--set key=value] [--write docs/results.md]
     python tests/benchmarks/hardness.py --recordings FOLDER      KITTI's drive 0005 as well, and ratios to it
 
 The map is that of `icp`'s own poses, points 2 to 80 m away averaged over voxels of `--voxel` m; entropy and plane thickness
@@ -21,9 +22,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from accuracy import rotation_rpe, untwisted
+import tables
 from numpy.typing import NDArray
 from peers import drive
+from recorded import untwisted
+from scores import rotation_rpe
 
 from lslam import Registration
 from lslam.config import Config
@@ -103,55 +106,81 @@ def simulated(scenario: str, seed: int, count: int, settings: list[str]) -> tupl
     return scans, se3.relative(truth[0], truth), count / seconds, cpu / count
 
 
-def row(name: str, found: Hardness, real: Hardness | None) -> None:
+def row(name: str, found: Hardness) -> None:
     e, t, i, *r = found.values
     rotation = " ".join(f"{v:10.3f}" for v in r)
     print(
         f"{name:24} {e:8.3f} {1e3 * t:9.1f} {i:8.3f} {rotation} {found.traced:8.1f} {1e3 * found.cpu:7.0f}   {found.order}",
         flush=True,
     )
-    if real is not None:
-        ratio = found.values / real.values
-        # Entropy is a logarithm: what compares is a ratio of volumes, its cube root one of lengths.
-        ratio[0] = np.exp((found.entropy - real.entropy) / 3)
-        e, t, i, *r = ratio
-        print(
-            f"{'  over the recording':24} {e:8.2f} {t:9.2f} {i:8.2f} " + " ".join(f"{v:10.2f}" for v in r), flush=True
-        )
 
 
-def mean(found: list[Hardness]) -> Hardness:
-    e, t, i, *r = np.mean([f.values for f in found], axis=0).tolist()
-    speed, cpu = np.mean([[f.traced, f.cpu] for f in found], axis=0).tolist()
-    return Hardness(e, t, i, tuple(r[: len(METHODS)]), tuple(r[len(METHODS) :]), speed, cpu)
+def ratios(found: Hardness, real: Hardness) -> None:
+    ratio = found.values / real.values
+    # Entropy is a logarithm: what compares is a ratio of volumes, its cube root one of lengths.
+    ratio[0] = np.exp((found.entropy - real.entropy) / 3)
+    e, t, i, *r = ratio
+    print(f"{'  over the recording':24} {e:8.2f} {t:9.2f} {i:8.2f} " + " ".join(f"{v:10.2f}" for v in r), flush=True)
+
+
+def shown(name: str, found: list[Hardness]) -> list[str]:
+    """A row of the document: medians and ranges over the seeds, or what the one recording has."""
+    values = np.stack([f.values for f in found])
+    values[:, 1] *= 1e3
+    middle, least, most = np.median(values, axis=0), values.min(axis=0), values.max(axis=0)
+    digits = [2, 1, *(3,) * (len(middle) - 2)]
+    if len(found) == 1:
+        return [name, *(f"{v:.{d}f}" for v, d in zip(middle, digits, strict=True))]
+    return [
+        name,
+        *(f"{v:.{d}f} ({a:.{d}f} to {b:.{d}f})" for v, a, b, d in zip(middle, least, most, digits, strict=True)),
+    ]
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--recordings", type=Path)
     parser.add_argument("--scenarios", default="urban,urban-hard")
-    parser.add_argument("--seeds", default="100,101,102")
+    parser.add_argument("--seeds", default=tables.SEEDS)
     parser.add_argument("--scans", type=int, default=154)
     parser.add_argument("--voxel", type=float, default=0.2)
     parser.add_argument("--set", action="append", default=[], dest="settings")
+    tables.offer(parser)
     args = parser.parse_args()
     names = [*METHODS, *(f"{METHODS[a][:5]}/{METHODS[b][:5]}" for a, b in PAIRS)]
     print(
         f"{'clip':24} {'entropy':>8} {'plane mm':>9} {'inliers':>8} " + " ".join(f"{m:>10}" for m in names)
         + f" {'scans/s':>8} {'CPU ms':>7}   rotation over 10 m, deg"
     )  # fmt: skip
-    real = None
+    real, rows, seeds = None, [], tables.numbers(args.seeds)
     if args.recordings is not None:
         scans, truth = recorded(args.recordings, args.scans)
         real = measure(scans, truth, args.voxel)
-        row("KITTI 0005", real, None)
+        row("KITTI 0005", real)
+        rows.append(shown("drive 0005, against OXTS", [real]))
     for scenario in filter(None, args.scenarios.split(",")):
         found = []
-        for seed in (int(v) for v in args.seeds.split(",")):
+        for seed in seeds:
             scans, truth, *speed = simulated(scenario, seed, args.scans, args.settings)
             found.append(measure(scans, truth, args.voxel, *speed))
-            row(f"{scenario} {seed}", found[-1], None)
-        row(f"{scenario} mean", mean(found), real)
+            row(f"{scenario} {seed}", found[-1])
+            if real is not None:
+                ratios(found[-1], real)
+        rows.append(shown(scenario, found))
+    caption = (
+        f"{args.scans} scans, untwisted; median (range) of {tables.seeds_named(seeds)}. Map of `icp`'s own poses: entropy, "
+        "nats, planes, mm; inliers of `icp`; rotation, deg, each scan with the first one at least 10 m on: of methods against "
+        "the truth, and between two of them, which asks no reference."
+    )
+    header = [
+        "clip",
+        "entropy",
+        "planes, mm",
+        "inliers",
+        *METHODS,
+        *(f"{METHODS[a]} to {METHODS[b]}" for a, b in PAIRS),
+    ]
+    tables.table("hardness", caption, header, rows, args.write)
 
 
 if __name__ == "__main__":

@@ -1,21 +1,24 @@
 """Deskew and IMU on distorted scans beside the peers': ATE and time per scan of each on the same sequence.
 
-python tests/benchmarks/inertial_peers.py SEQUENCE [SEQUENCE ...] [--scans 300] [--compensated FOLDER]
+    python tests/benchmarks/inertial_peers.py [--scenarios walk,urban] [--seeds 100-104] [--write docs/results.md]
+    python tests/benchmarks/inertial_peers.py SEQUENCE... [--scans 300]      sequences of one's own
 
 Ours are `icp` with and without the IMU; kiss-icp and genz-icp deskew by constant velocity; rko-lio (pip install rko-lio)
 takes the IMU. All in their defaults. The instant that a peer's pose is valid for is the scan's start, middle or end,
-whichever scores best. `--compensated` names a folder with the same sequences free of distortion: icp is run there too.
+whichever scores best.
 """
 
 from __future__ import annotations
 
 import argparse
 import logging
+import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import tables
 from numpy.typing import NDArray
 
 from lslam.config import load_config
@@ -24,6 +27,7 @@ from lslam.evaluation.evaluate import evaluate
 from lslam.formats.trajectory_files import read_trajectory
 from lslam.pipeline.run import run
 from lslam.readers import open_sequence
+from lslam.studies.scenes import Scene, simulate_once
 from lslam.types.scan import Scan
 from lslam.types.sequence import Sequence
 from lslam.types.trajectory import Trajectory
@@ -127,36 +131,48 @@ def truth_of(sequence: Sequence) -> Trajectory:
     return truth
 
 
-def rows(path: str, scans: int, names: list[str], label: str = "") -> None:
-    """One printed row per method."""
+def scored(path: Path, scans: int, name: str) -> tuple[float, float]:
+    """ATE se3, m, and ms per scan of one method; inf where it failed."""
+    is_at_start, method = METHODS[name]
     sequence = open_sequence(path)
     count = min(scans, len(sequence))
-    truth = truth_of(sequence)
-    for name in names:
-        is_at_start, method = METHODS[name]
-        head = f"{sequence.name:16} {name + label:22} {count:4d}"
-        try:
-            poses, seconds = method(open_sequence(path), count)
-        except (LslamError, ImportError, ValueError, RuntimeError) as error:
-            print(f"{head} failed: {error}"[:120], flush=True)
-            continue
-        se3, origin = score(sequence, truth, poses, is_at_start)
-        print(f"{head} {se3:9.4f} {origin:9.4f} {1e3 * np.median(seconds):8.1f}", flush=True)
+    head = f"{sequence.name:20} {name:10} {count:4d}"
+    try:
+        poses, seconds = method(sequence, count)
+    except (LslamError, ImportError, ValueError, RuntimeError) as error:
+        print(f"{head} failed: {error}"[:120], flush=True)
+        return float("inf"), float("nan")
+    se3, origin = score(sequence, truth_of(sequence), poses, is_at_start)
+    print(f"{head} {se3:9.4f} {origin:9.4f} {1e3 * np.median(seconds):8.1f}", flush=True)
+    return se3, 1e3 * float(np.median(seconds))
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("sequences", nargs="+")
-    parser.add_argument("--scans", type=int, default=300)
+    parser.add_argument("sequences", nargs="*", type=Path, help="in place of --scenarios")
+    parser.add_argument("--scenarios", default="walk,urban,residential,open")
+    parser.add_argument("--seeds", default=tables.SEEDS)
+    parser.add_argument("--scans", type=int, default=100)
     parser.add_argument("--methods", default=",".join(METHODS))
-    parser.add_argument("--compensated", type=Path)
+    tables.offer(parser)
     given = parser.parse_args()
     logging.getLogger("lslam").setLevel(logging.ERROR)
-    print(f"{'sequence':16} {'method':22} {'n':>4} {'ATE se3':>9} {'origin':>9} {'ms':>8}")
-    for path in given.sequences:
-        rows(path, given.scans, given.methods.split(","))
-        if given.compensated is not None and (given.compensated / Path(path).name).is_dir():
-            rows(str(given.compensated / Path(path).name), given.scans, ["icp"], ", compensated")
+    methods, seeds = given.methods.split(","), tables.numbers(given.seeds)
+    print(f"{'sequence':20} {'method':10} {'n':>4} {'ATE se3':>9} {'origin':>9} {'ms':>8}")
+    rows = []
+    with tempfile.TemporaryDirectory() as scratch:
+        groups: dict[str, list[Path]] = {path.stem: [path] for path in given.sequences}
+        for scenario in [] if groups else given.scenarios.split(","):
+            scene = Scene(scenario, given.scans, compensated=False)
+            groups[scenario] = [simulate_once(scene, seed, Path(scratch)) for seed in seeds]
+        for name, paths in groups.items():
+            found = {method: [scored(path, given.scans, method)[0] for path in paths] for method in methods}
+            rows.append([name, *(tables.spread(found[method], 4) for method in methods)])
+    caption = (
+        f"Scans that hold their motion, {given.scans} of each drive, {tables.seeds_named(seeds)}: ATE se3, m, median / worst. "
+        "Peers in their defaults, by the instant of the sweep that suits them best; only rko-lio among them takes the IMU."
+    )
+    tables.table("inertial", caption, ["scenario", *methods], rows, given.write)
 
 
 if __name__ == "__main__":

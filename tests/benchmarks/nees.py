@@ -1,6 +1,7 @@
 """How honest the covariances of poses are: the normalised estimation error squared (NEES) per degree of freedom.
 
     python tests/benchmarks/nees.py [--first 100] [--scans 300] [--modes odometry,loops,imu,gnss,osm]
+        [--write docs/results.md]
 
 One row a drive, each with a seed of its own: e^T inv(C) e / 6, the mean over all poses but the first. One is honest, below it
 the covariances are pessimistic, above it optimistic. Odometry, loops and IMU are compared from the first pose on, GNSS and OSM
@@ -15,6 +16,7 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
+import tables
 from numpy.typing import NDArray
 
 from lslam.config.config import Config
@@ -102,6 +104,7 @@ def main() -> None:
     parser.add_argument("--scans", type=int, default=250)
     parser.add_argument("--modes", default=",".join(MODES))
     parser.add_argument("--drives", default=",".join(str(k) for k in range(len(DRIVES))))
+    tables.offer(parser)
     args = parser.parse_args()
     print(f"{'drive':28} {'mode':9} {'NEES':>8} {'place':>8} {'turn':>8} {'end, m':>8} {'sigma, m':>9}")
     per: dict[str, list[float]] = {}
@@ -127,9 +130,18 @@ def main() -> None:
             per.setdefault(mode, []).append(whole)
             end, sigma = np.linalg.norm(e[-1, :3]), np.sqrt(np.trace(C[-1, :3, :3]))
             print(f"{name:28} {mode:9} {whole:8.2f} {place:8.2f} {turn:8.2f} {end:8.3f} {sigma:9.3f}", flush=True)
-    for mode, values in per.items():
-        spread = f"least {min(values):.2f}, greatest {max(values):.2f}, mean {np.mean(values):.2f}"
-        print(f"{mode}: median {np.median(values):.2f}, {spread}")
+    chosen = [int(v) for v in args.drives.split(",")]
+    drives, seeds = ", ".join(" ".join(DRIVES[k]) for k in chosen), [args.first + k for k in chosen]
+    caption = (
+        f"NEES of the poses per degree of freedom, 1 is honest, more is optimistic: {len(chosen)} drives of {args.scans} "
+        f"distorted scans, {tables.seeds_named(seeds)} ({drives}); odometry, loops and IMU from the first pose on, fixes and "
+        "buildings on the Earth, maps 1 to 3 m off."
+    )
+    rows = [
+        [mode, f"{np.median(values):.2f}", f"{min(values):.2f}", f"{max(values):.2f}", str(len(values))]
+        for mode, values in per.items()
+    ]
+    tables.table("nees", caption, ["with", "median", "least", "greatest", "drives"], rows, args.write)
 
 
 if __name__ == "__main__":

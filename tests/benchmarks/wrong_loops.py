@@ -16,7 +16,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
-from accuracy import ate
+from scores import ate
 
 from lslam.config import Config, load_config
 from lslam.evaluation.associate import associate

@@ -1,0 +1,71 @@
+"""Recordings named as in ../shared/data, untwisted for all alike where they are distorted, with all rings and thinned ones."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.config import Config
+from lslam.formats.trajectory_files import read_trajectory
+from lslam.geometry.interpolate import poses_at
+from lslam.odometry import create_odometry
+from lslam.pipeline.front_end import estimate
+from lslam.preprocessing.deskew import deskew_points, knots_over
+from lslam.preprocessing.rings import decide_rings
+from lslam.readers import open_sequence
+from lslam.types.motion_prior import MotionPrior
+from lslam.types.scan import Scan
+from lslam.types.sequence import Sequence
+
+Floats = NDArray[np.float64]
+# Name, clouds, true poses (N, 4, 4).
+Case = tuple[str, list[NDArray[np.float32]], Floats]
+
+PLACES = {
+    "KITTI raw 0005": Path("2011_09_26", "2011_09_26_drive_0005_sync"),
+    "KITTI raw 0048": Path("2011_09_26", "2011_09_26_drive_0048_sync"),
+    "MCD KTH day 06": Path("mcd_kth_day_06"),
+}
+
+
+def untwisted(sequence: Sequence) -> list[Scan]:
+    """All scans, each with the motion of its sweep taken out along the trajectory of `icp`, so that all peers get the same."""
+    scans = [sequence.scan(i) for i in range(len(sequence))]
+    if all(scan.times is None for scan in scans):
+        return scans
+    found = estimate(sequence, create_odometry(Config()), threads=1)
+    stamps, poses = sequence.stamps_ns, np.stack([result.T_world_lidar for result in found])
+    clean = []
+    for scan in scans:
+        knots = knots_over(scan.span)
+        prior = MotionPrior(knots, poses_at(stamps, poses, scan.stamp_ns + np.round(1e9 * knots).astype(np.int64)))
+        clean.append(replace(scan, points=deskew_points(scan.points, scan.times, prior), times=None))
+    return clean
+
+
+def thinned(folder: Path) -> Iterator[Case]:
+    """Drives 0005 and 0048 and KTH with all of their rings, every second and every fourth."""
+    for name, place in PLACES.items():
+        path = folder / place
+        if not path.is_dir():
+            continue
+        sequence = open_sequence(path)
+        rule, known = decide_rings([sequence.scan(i) for i in range(3)]), sequence.ground_truth
+        rings = [rule.rings_of(sequence.scan(i)) for i in range(len(sequence))]
+        scans, reference = untwisted(sequence), path / "reference_lidar.tum"
+        truth = read_trajectory(reference) if reference.is_file() else known
+        assert truth is not None
+        for step in (1, 2, 4):
+            yield (
+                f"{name}, {64 // step} rings",
+                [_thin(s, r, step) for s, r in zip(scans, rings, strict=True)],
+                truth.poses,
+            )
+
+
+def _thin(scan: Scan, rings: NDArray[np.uint16], step: int) -> NDArray[np.float32]:
+    return replace(scan, intensity=None, times=None, rings=None).points[rings % step == step // 2]
