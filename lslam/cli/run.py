@@ -78,6 +78,13 @@ def command(sequence: str, **given: Any) -> None:
     SEQUENCE is a path (a folder or a bag), or a name under --data-root: seq07, 07, kitti/07, 2011_09_26_drive_0005_sync.
     """
     setup_logging(given["verbose"], given["quiet"])
+    from lslam.pipeline.warned import hearing
+
+    with hearing():
+        _run(sequence, given)
+
+
+def _run(sequence: str, given: dict[str, Any]) -> None:
     from lslam.pipeline.run import run
     from lslam.pipeline.run_folder import default_folder
 
@@ -89,7 +96,8 @@ def command(sequence: str, **given: Any) -> None:
         from lslam.odometry import create_odometry
         from lslam.pipeline.choose import choose_scans
 
-        return _print_plan(choose_scans(opened, create_odometry(config), config), config, out, given["as_json"])
+        _print_plan(choose_scans(opened, create_odometry(config), config), config, out, given["as_json"])
+        return
     try:
         with heeded() as stop, ExitStack() as stack:
             run(
@@ -101,7 +109,6 @@ def command(sequence: str, **given: Any) -> None:
     except RunFinishedError as finished:
         log.info("%s", finished)
         _print_finished(out, given["as_json"])
-    return None
 
 
 def opened_with(given: dict[str, Any]) -> tuple[Sequence, Config]:

@@ -15,6 +15,7 @@ from lslam.odometry.base import Resumable
 from lslam.pipeline.keyframing import Keyframing
 from lslam.pipeline.state_classes import STATE_CLASSES
 from lslam.pipeline.tracker import Tracker
+from lslam.pipeline.warned import warnings_so_far
 from lslam.types.scan_result import ScanResult
 from lslam.types.state import State
 
@@ -61,20 +62,26 @@ class Checkpoints:
         self.pace = Pace(every_s)
 
     def write(self, scans: int, content: Callable[[], State]) -> None:
-        """Write what is known after `scans` scans; to gather it counts as time for the pace. Raises OutputError."""
+        """Write what is known after `scans` scans, and what the run was warned of until there; raises OutputError.
+
+        To gather it counts as time for the pace.
+        """
         began = time.perf_counter()
         self.folder.mkdir(exist_ok=True)
-        write_state(self.folder / f"{self._stage}-{scans:07d}.npz", content())
+        known = {**content(), "warned": warnings_so_far().state()}
+        write_state(self.folder / f"{self._stage}-{scans:07d}.npz", known)
         for old in self._files()[:-KEPT]:
             with contextlib.suppress(OSError):
                 old.unlink()
         self.pace.wrote(time.perf_counter() - began)
 
     def latest(self) -> Any:
-        """What the newest checkpoint that can be read holds; None when there is none."""
+        """What the newest checkpoint that can be read holds, its warnings being those of this run now; None without one."""
         for path in reversed(self._files()):
             try:
-                return read_state(path, STATE_CLASSES)
+                known = read_state(path, STATE_CLASSES)
+                warnings_so_far().take_over(known.pop("warned", {"texts": [], "places": []}))
+                return known
             except InputError as error:
                 log.warning("a checkpoint is left out: %s", error)
                 with contextlib.suppress(OSError):

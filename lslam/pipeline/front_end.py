@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
+from contextvars import copy_context
 from dataclasses import replace
 from typing import Any
 
@@ -130,7 +131,7 @@ def read_ahead(
     with ThreadPoolExecutor(1, "lslam-read") as pool:
         try:
             for i in range(first, len(sequence)):
-                pending.append(pool.submit(_load, sequence, i, prepare))
+                pending.append(pool.submit(copy_context().run, _load, sequence, i, prepare))
                 if len(pending) > depth:
                     yield pending.pop(0).result()
             while pending:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
+from contextvars import copy_context
 from dataclasses import dataclass
 
 from lslam.config import Config
@@ -102,7 +103,7 @@ class Keyframing:
             self._write(keyframe, scan, motion)
             return
         self._wait(WAITING - 1)
-        self._pending.append(self._pool.submit(self._write, keyframe, scan, motion))
+        self._pending.append(self._pool.submit(copy_context().run, self._write, keyframe, scan, motion))
 
     def _write(self, keyframe: Keyframe, scan: Scan, motion: MotionPrior) -> None:
         self.store.add(keyframe, keyframe_cloud(scan, motion, self._config.preprocess, self._config.keyframes))

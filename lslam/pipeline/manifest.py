@@ -16,6 +16,7 @@ from typing import Any
 
 from lslam.config import Config
 from lslam.errors import InterruptedRunError
+from lslam.pipeline.warned import Warnings
 from lslam.reports.facts import describe
 from lslam.stopping import is_interrupt
 from lslam.types.scan import Span
@@ -43,7 +44,8 @@ class Manifest:
     identity : digests that a run and its resumption share; resumed_after : scans that were done when it was resumed
     posed_by : scans by who posed them: the method, what stood in for it, the motion prior
     integrity : how many pairs of scans checked the motion beside the method, how many were conclusive, and the alerts raised
-    problems : what went wrong in this run, beside what was wrong with the recording before
+    problems : what went wrong in this run, beside what was wrong with the recording before; warnings : what its log warns of,
+        which stands behind them in the file and does not decide how the run ended
     """
 
     def __init__(self, command: str, sequence: Sequence, config: Config) -> None:
@@ -54,6 +56,7 @@ class Manifest:
         self.reading: dict[str, str] = {}
         self.timings: dict[str, float] = {}
         self.problems: list[str] = []
+        self.warnings = Warnings()
         self.counts: dict[str, int] = {}
         self.posed_by: dict[str, int] = {}
         self.integrity: dict[str, int] = {}
@@ -123,12 +126,13 @@ class Manifest:
     def as_dict(self, status: str, why: str = "") -> dict[str, Any]:
         """The manifest as plain values."""
         s = self.sequence
+        problems = [*s.problems, *self.problems]
         has_camera = s.calibration.T_cam0_lidar is not None
         return {
             "schema": SCHEMA,
             "status": status,
             **({"why": why} if why else {}),
-            "problems": [*s.problems, *self.problems],
+            "problems": [*problems, *self.warnings.beyond([*problems, why])],
             "command": self.command,
             "lslam": __version__,
             **({"identity": dict(self.identity)} if self.identity else {}),

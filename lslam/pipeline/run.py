@@ -36,6 +36,7 @@ from lslam.pipeline.odometry_pass import estimate_poses, odometry_checkpoints
 from lslam.pipeline.osm_source import OsmSource, open_osm
 from lslam.pipeline.resume import may_go_on, run_identity
 from lslam.pipeline.run_folder import KEYFRAMES, REPLIES, RunFolder
+from lslam.pipeline.warned import hearing
 from lslam.pipeline.watch import RunOutcome, Watch
 from lslam.readers import open_sequence
 from lslam.readers.raw_drive import with_gnss, with_imu
@@ -75,33 +76,13 @@ def run(
         `watch.should_stop` said so. GateError : `input.strict` and the run is degraded. In these three, everything up to
         there is written. InputError, OutputError, UsageError : as named.
     """
-    config, watch = config or Config(), watch or Watch()
-    check_config(config)
-    if isinstance(sequence, (str, Path)):
-        sequence = open_sequence(sequence)
-    job = _prepare(sequence, config, ground_truth, command, watch)
-    job.manifest.reading = dict(reading or {})
-    if out is None:
-        record, _, evaluation = _solve(job, KeyframeStore(deflate=config.keyframes.deflate))
-        job.manifest.problems += record.problems
-        record.manifest = job.manifest.as_dict(job.manifest.outcome)
-    else:
-        job.manifest.identity = run_identity(job.sequence, job.truth, config, job.given)
-        goes_on = resume and may_go_on(Path(out), job.manifest.identity, config)
-        with RunFolder(Path(out), overwrite or resume, goes_on) as folder:
-            try:
-                record, evaluation = _fill(folder, job, goes_on)
-            except BaseException as error:
-                status = job.manifest.word_for(error)
-                _write_last(folder, job.manifest.as_dict(status, str(error) or type(error).__name__))
-                raise
-            folder.write_manifest(record.manifest)
-            if job.manifest.outcome != "interrupted":
-                folder.drop_checkpoint()
-            log.info("%s; results in %s", job.manifest.outcome, folder.path)
-    outcome = RunOutcome(record, evaluation)
+    watch = watch or Watch()
+    with hearing() as heard:
+        job = _prepare(sequence, config or Config(), ground_truth, command, watch)
+        job.manifest.reading, job.manifest.warnings = dict(reading or {}), heard
+        outcome = _perform(job, None if out is None else Path(out), overwrite, resume)
     watch.on_end(outcome)
-    _raise_outcome(job.manifest, config, "" if out is None else ", and --resume goes on")
+    _raise_outcome(job.manifest, job.config, "" if out is None else ", and --resume goes on")
     return outcome
 
 
@@ -119,8 +100,13 @@ class _Job:
     osm: OsmSource | None = None
 
 
-def _prepare(sequence: Sequence, config: Config, truth: Trajectory | None, command: str, watch: Watch) -> _Job:
+def _prepare(
+    sequence: Sequence | str | Path, config: Config, truth: Trajectory | None, command: str, watch: Watch
+) -> _Job:
     """Find what the configuration asks for beside the scans: fixes, an IMU, poses, a map; and choose the scans."""
+    check_config(config)
+    if isinstance(sequence, (str, Path)):
+        sequence = open_sequence(sequence)
     if config.gnss.mode != "off":
         sequence = with_gnss(sequence)
     require_gnss(sequence, config.gnss)
@@ -133,6 +119,30 @@ def _prepare(sequence: Sequence, config: Config, truth: Trajectory | None, comma
     chosen = choose_scans(with_imu(sequence) if config.imu.use else sequence, odometry, config)
     osm = open_osm(sequence, config)
     return _Job(chosen, odometry, config, truth, given, Manifest(command, chosen, config), watch, osm)
+
+
+def _perform(job: _Job, out: Path | None, overwrite: bool, resume: bool) -> RunOutcome:
+    """The run, into its folder when there is one."""
+    manifest = job.manifest
+    if out is None:
+        record, _, evaluation = _solve(job, KeyframeStore(deflate=job.config.keyframes.deflate))
+        manifest.problems += record.problems
+        record.manifest = manifest.as_dict(manifest.outcome)
+        return RunOutcome(record, evaluation)
+    manifest.identity = run_identity(job.sequence, job.truth, job.config, job.given)
+    goes_on = resume and may_go_on(out, manifest.identity, job.config)
+    with RunFolder(out, overwrite or resume, goes_on) as folder:
+        try:
+            record, evaluation = _fill(folder, job, goes_on)
+        except BaseException as error:
+            status = manifest.word_for(error)
+            _write_last(folder, manifest.as_dict(status, str(error) or type(error).__name__))
+            raise
+        folder.write_manifest(record.manifest)
+        if manifest.outcome != "interrupted":
+            folder.drop_checkpoint()
+        log.info("%s; results in %s", manifest.outcome, folder.path)
+    return RunOutcome(record, evaluation)
 
 
 def _solve(

@@ -12,6 +12,7 @@ import logging
 import queue
 import threading
 from collections.abc import Callable
+from contextvars import copy_context
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -97,7 +98,9 @@ class OsmBuffer:
         self._open.append(wish)
         if self._thread is None:
             # A thread that waits for a dead server must not keep the program from ending.
-            self._thread = threading.Thread(target=self._work, name="osm-buffer", daemon=True)
+            self._thread = threading.Thread(
+                target=copy_context().run, args=(self._work,), name="osm-buffer", daemon=True
+            )
             self._thread.start()
         self._wishes.put(wish)
 

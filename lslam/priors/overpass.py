@@ -14,6 +14,7 @@ import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import Future
+from contextvars import copy_context
 from pathlib import Path
 from typing import Any
 
@@ -152,7 +153,7 @@ def _ask(bounds: Bounds, config: OsmConfig) -> dict[str, Any]:
         except BaseException as error:
             reply.set_exception(error)
 
-    threading.Thread(target=exchange, name="overpass", daemon=True).start()
+    threading.Thread(target=copy_context().run, args=(exchange,), name="overpass", daemon=True).start()
     try:
         body = reply.result(config.timeout)
     except TimeoutError:

@@ -29,7 +29,8 @@ FILES = (
 def summary(record: RunRecord, evaluation: Evaluation | None) -> str:
     """Lines of a name and a value, aligned, ending with a newline; every score with its recipe."""
     facts = run_facts(record)
-    rows = [("status", facts.status), *(("", reason) for reason in facts.reasons)]
+    below = {_failure(failure) for failure in facts.failures[:MOST_FAILURES]}
+    rows = [("status", facts.status), *(("", reason) for reason in facts.reasons if reason not in below)]
     rows += _scan_rows(facts)
     rows.append(("path", f"{facts.path_length:.1f} m in {facts.duration:.1f} s"))
     rows += imu_rows(record)

@@ -152,7 +152,8 @@ def _run(job: Job, is_kept: bool) -> tuple[str, str]:
     if not ended:
         make(False)
     manifest = ended[-1].record.manifest
-    return str(manifest["status"]), "; ".join(manifest["problems"])
+    status = str(manifest["status"])
+    return status, "" if status == "done" else "; ".join(manifest["problems"])  # a run that is done may have warned
 
 
 def _opening(job: Job) -> Callable[[], Sequence]:

@@ -18,6 +18,7 @@ import pytest
 from lslam.config import load_config
 from lslam.formats.study_csv import read_study_csv
 from lslam.odometry.icp import Icp
+from lslam.pipeline import run as recipe
 from lslam.studies import worker
 from lslam.studies.grid import Job
 from lslam.studies.points import Contender
@@ -154,3 +155,13 @@ def laps(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for k in range(94 * 20):
         (target / f"{k:06d}.bin").symlink_to(source / f"{k % 94:06d}.bin")
     return target.parent
+
+
+def test_a_run_that_is_done_has_no_reason_though_it_warned(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(recipe, "describe_deskew", lambda *given: "no deskew: the points have no times")
+    job = job_in(tmp_path)
+    execute(job, Bench())
+    assert "no deskew" in (job.folder / "manifest.json").read_text()
+    state = read_state(job.state_file)
+    assert state is not None
+    assert (state.status, state.reason) == ("done", "")
