@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import io
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from lslam.formats.atomic import atomic_write, write_text
+from lslam.formats.atomic import atomic_write
 from lslam.formats.cloud_files import write_cloud
 from lslam.formats.geojson import write_line
 from lslam.formats.ply_files import write_ply, write_ply_mesh
@@ -18,6 +17,8 @@ from lslam.maps.floor_plan import floor_plan
 from lslam.maps.georeference import ProjectedCloud, Projection, to_lat_lon
 from lslam.maps.mesh import surface
 from lslam.maps.occupancy import OccupancyGrid
+from lslam.pipeline.json_files import write_json
+from lslam.pipeline.map_notes import SCHEMA, note_with
 from lslam.reports.png import grey_png
 from lslam.types.cloud import Cloud, in_memory
 from lslam.types.georeference import Georeference
@@ -42,7 +43,7 @@ class MapNote:
 
 
 def write_map(path: Path, cloud: Cloud, note: MapNote, georeference: Georeference | None = None) -> None:
-    """Write the cloud, world frame, m, in the format of the suffix, and `<stem>.json` beside it.
+    """Write the cloud, world frame, m, in the format of the suffix, and what it is into `<stem>.json` beside it.
 
     LAS and LAZ of a georeferenced run are in its coordinate reference system; PLY and PCD hold float32, which is too coarse
     for that: they stay in the run's world, and the note says how to go on. Raises as `write_cloud`, and UsageError when the
@@ -58,7 +59,7 @@ def write_map(path: Path, cloud: Cloud, note: MapNote, georeference: Georeferenc
     else:
         write_cloud(path, cloud, comment=comment)
     about = {
-        "schema": "lslam-map",
+        "schema": SCHEMA,
         "version": 1,
         "file": path.name,
         "points": len(cloud),
@@ -74,7 +75,7 @@ def write_map(path: Path, cloud: Cloud, note: MapNote, georeference: Georeferenc
         "sequence": note.sequence,
         "lslam": __version__,
     }
-    write_json(path.with_suffix(".json"), about)
+    write_json(path.with_suffix(".json"), note_with(path, about))
 
 
 def write_geojson(path: Path, trajectory: Trajectory, georeference: Georeference, sequence: str) -> None:
@@ -113,11 +114,6 @@ def write_mesh(path: Path, cloud: Cloud, note: MapNote, trajectory: Trajectory) 
     """A surface through the map as PLY, world frame, m."""
     made = surface(in_memory(cloud), note.voxel, trajectory.positions)
     write_ply_mesh(path, made.vertices, made.triangles, f"lslam {__version__} map surface; {note.world}")
-
-
-def write_json(path: Path, document: dict[str, Any]) -> None:
-    """Strict JSON, indented, atomically."""
-    write_text(path, json.dumps(document, indent=2, allow_nan=False, ensure_ascii=False) + "\n")
 
 
 def georeference_note(georeference: Georeference) -> dict[str, Any]:

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import csv
 import logging
-from collections.abc import Callable, Iterable
+import os
+import tempfile
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -18,6 +21,7 @@ from lslam.formats.trajectory_files import read_trajectory
 from lslam.maps.crispness import crispness
 from lslam.maps.georeference import Projection
 from lslam.maps.mesh import require_open3d
+from lslam.pipeline.json_files import write_json
 from lslam.pipeline.map_files import (
     LOCAL,
     MapNote,
@@ -27,16 +31,19 @@ from lslam.pipeline.map_files import (
     write_mesh,
     write_occupancy,
 )
-from lslam.pipeline.map_pass import build_map
-from lslam.pipeline.run_folder import MANIFEST
+from lslam.pipeline.map_notes import drop_note, is_note, note_of, note_with, noted_last
+from lslam.pipeline.map_pass import BuiltMap, build_map
+from lslam.pipeline.refresh import write_renewed
+from lslam.pipeline.run_folder import MANIFEST, SPOOL, held
 from lslam.readers import open_sequence
 from lslam.readers.selection import select
 from lslam.types.georeference import Georeference
 from lslam.types.map_score import Crispness
+from lslam.types.run_record import RunRecord
 from lslam.types.scan_result import ScanResult, Status
 from lslam.types.sequence import Sequence
 from lslam.types.trajectory import Trajectory
-from lslam.untrusted import MISFIT, parse_json
+from lslam.untrusted import parse_json
 
 log = logging.getLogger("lslam")
 
@@ -133,39 +140,32 @@ def rebuild(
 ) -> RebuiltMap:  # fmt: skip
     """Build the map with the run's configuration and write it to `out`, by default map.<format> in the run folder.
 
-    The map of which the note beside `out` told is replaced, too, whatever its format was.
+    Maps of other names and formats stay. Where it is a map of the run folder, what the run says of its map is renewed: the
+    figures in evaluation.json, report.html and manifest.json. All is written elsewhere first and then renamed, so that
+    nothing changes before everything is whole.
 
-    Raises OutputExistsError when the file is there, OutputError when it cannot be written, UsageError for a `crs` without
-    a georeference or that no map can be written in, InterruptedRunError when `should_stop` said so.
+    Raises OutputExistsError when the file is there, or a run is at work in the folder, OutputError when it cannot be written,
+    UsageError for a `crs` without a georeference or that no map can be written in, InterruptedRunError when `should_stop`
+    said so.
     """
     path = run.folder / f"map.{run.config.map.format}" if out is None else out
     check_output(path, overwrite)
     if run.config.map.denoise or run.config.map.mesh:
         require_open3d()
-    georeference = run.georeference
-    if crs is not None:
-        if georeference is None:
-            raise UsageError(
-                f"--crs: {run.folder} is not georeferenced; run the sequence with --georeference or --gnss"
-            )
-        georeference = replace(georeference, epsg=crs)
-        Projection(georeference).check()
-    built = build_map(sequence, results_of(run), run.config, on_step, should_stop, path.parent)
-    if built is None or should_stop():
-        raise InterruptedRunError("interrupted while the map was built: nothing is written")
-    note = MapNote(sequence.name, run.config.map.voxel, built.done, f"{LOCAL}: {run.world}")
-    before = _noted(path.with_suffix(".json")) if overwrite else None
-    write_map(path, built.merged, note, georeference)
-    if before not in (None, path):
-        before.unlink(missing_ok=True)  # The note tells of the new one now.
-    if run.config.map.mesh:
-        write_mesh(path.with_name(f"{path.stem}_mesh.ply"), built.merged, note, run.trajectory)
-    if built.occupancy is not None:
-        write_occupancy(path.parent, built.occupancy, note.world)
-    if georeference is not None:
-        write_geojson(path.parent / "trajectory.geojson", run.trajectory, georeference, sequence.name)
+    georeference = _place(run, crs)
+    is_own = path.stem == "map" and path.resolve().parent == run.folder.resolve()
+    with held(run.folder) if is_own else nullcontext():
+        built = build_map(sequence, results_of(run), run.config, on_step, should_stop, path.parent)
+        if built is None or should_stop():
+            raise InterruptedRunError("interrupted while the map was built: nothing is written")
+        score = crispness(built.merged)
+        with _staged(path.parent) as stage:
+            _write(stage / path.name, run, built, sequence.name, georeference)
+            if is_own:
+                write_renewed(stage, run.folder, _record(run, built, path.name, score))
+            _publish(stage, path)
     log.info("%d points in %s", len(built.merged), path)
-    return RebuiltMap(path, len(built.merged), sum(s == "ok" for s in run.statuses), crispness(built.merged))
+    return RebuiltMap(path, len(built.merged), sum(s == "ok" for s in run.statuses), score)
 
 
 def check_output(path: Path, overwrite: bool) -> None:
@@ -176,6 +176,69 @@ def check_output(path: Path, overwrite: bool) -> None:
         raise OutputError(f"{path} cannot be written: the folder {path.parent} does not exist")
     if path.exists() and not overwrite:
         raise OutputExistsError(f"{path} exists; name another file with --out or replace it with --overwrite")
+    beside = path.with_suffix(".json")
+    if not is_note(beside):
+        raise OutputExistsError(f"{beside}, where the note of {path.name} goes, is something else: name another --out")
+
+
+def _place(run: EarlierRun, crs: int | None) -> Georeference | None:
+    """Where the run lies, in the coordinates asked for."""
+    georeference = run.georeference
+    if crs is None:
+        return georeference
+    if georeference is None:
+        raise UsageError(f"--crs: {run.folder} is not georeferenced; run the sequence with --georeference or --gnss")
+    georeference = replace(georeference, epsg=crs)
+    Projection(georeference).check()
+    return georeference
+
+
+def _write(path: Path, run: EarlierRun, built: BuiltMap, name: str, georeference: Georeference | None) -> None:
+    """The map and all that is asked for beside it."""
+    note = MapNote(name, run.config.map.voxel, built.done, f"{LOCAL}: {run.world}")
+    write_map(path, built.merged, note, georeference)
+    if run.config.map.mesh:
+        write_mesh(path.with_name(f"{path.stem}_mesh.ply"), built.merged, note, run.trajectory)
+    if built.occupancy is not None:
+        write_occupancy(path.parent, built.occupancy, note.world)
+    if georeference is not None:
+        write_geojson(path.parent / "trajectory.geojson", run.trajectory, georeference, name)
+
+
+def _record(run: EarlierRun, built: BuiltMap, name: str, score: Crispness) -> RunRecord:
+    """What the run's report shows of its map, and its manifest with this one in it."""
+    points, section = len(built.merged), run.config.map
+    about = {"file": name, "points": points, "voxel": section.voxel, "done": list(built.done)}
+    manifest = {**run.manifest, "map_points": points, "map": about}
+    return RunRecord(
+        name="", method=run.config.odometry.method, folder=run.folder, results=[], trajectory=run.trajectory,
+        ground_truth=None, real_time_limit=0.0, manifest=manifest, map_file=name, map_image=built.image,
+        map_extent=built.extent, crispness=score,
+    )  # fmt: skip
+
+
+@contextmanager
+def _staged(folder: Path) -> Iterator[Path]:
+    """A folder within `folder` to write into, which is gone in the end."""
+    try:
+        stage = tempfile.TemporaryDirectory(prefix=SPOOL, dir=folder, ignore_cleanup_errors=True)
+    except OSError as error:
+        raise OutputError(f"{folder} cannot be written: {cause(error)}") from None
+    with stage as path:
+        yield Path(path)
+
+
+def _publish(stage: Path, path: Path) -> None:
+    """Give everything in `stage` its name beside `path`; at no instant does a note tell of another map than there is."""
+    note = stage / path.with_suffix(".json").name
+    write_json(note, note_with(path, note_of(stage / path.name)))
+    drop_note(path)
+    first = [stage / path.name, note]
+    for file in [*first, *sorted(file for file in stage.iterdir() if file not in first)]:
+        try:
+            os.replace(file, path.with_name(file.name))
+        except OSError as error:
+            raise OutputError(f"{path.with_name(file.name)} cannot be written: {cause(error)}") from None
 
 
 def results_of(run: EarlierRun) -> list[ScanResult]:
@@ -195,17 +258,7 @@ def map_of(target: Path) -> Path:
     found = [target / f"map{suffix}" for suffix in SUFFIXES if (target / f"map{suffix}").is_file()]
     if not found:
         raise InputError(f"{target} has no map file; build one with: lslam map {target}")
-    noted = _noted(target / "map.json")
-    return noted if noted in found else found[0]
-
-
-def _noted(note: Path) -> Path | None:
-    """The map that a note tells of, beside it and with its name; None where there is none."""
-    try:
-        path = note.parent / str(parse_json(note.read_text(encoding="utf-8"))["file"])
-    except (OSError, *MISFIT):
-        return None
-    return path if path in [note.with_suffix(suffix) for suffix in SUFFIXES] else None
+    return noted_last(found[0]) or found[0]
 
 
 def _statuses(path: Path, count: int) -> tuple[Status, ...]:

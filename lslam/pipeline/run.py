@@ -236,7 +236,7 @@ def _map(folder: RunFolder, job: _Job, record: RunRecord) -> None:
             manifest.interrupt("interrupted while the map was built: there is no map")
             return
         record.map_image, record.map_extent = built.image, built.extent
-        record.crispness = crispness(built.merged)
+        record.map_file, record.crispness = f"map.{config.map.format}", crispness(built.merged)
         outputs.write_map(folder, built, config.map, record)
     manifest.map_points = len(built.merged)
 

@@ -9,7 +9,7 @@ import os
 import re
 import shutil
 import time
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import IO, Any
 
@@ -25,6 +25,7 @@ LOCK = ".lock"
 KEYFRAMES = "keyframes"
 CHECKPOINT = "checkpoint"
 REPLIES = "osm_replies"
+SPOOL = ".lslam-map-"  # what a map in the making is called, as its merger does
 # What a run that goes on needs of what the one before left.
 _NEEDED = (MANIFEST, "config.toml", LOG)
 OURS = (
@@ -126,8 +127,7 @@ class RunFolder:
                 continue
             (self.path / name).unlink(missing_ok=True)
             (self.path / f"{name}.part").unlink(missing_ok=True)
-        for folder in self.path.glob(".lslam-map-*"):  # of a run that was killed
-            shutil.rmtree(folder, ignore_errors=True)
+        _clear_spools(self.path)  # of a run that was killed
         if not needed:
             _clear_own(self.path / KEYFRAMES, "*.npz")
             _clear_own(self.path / REPLIES, "*.json")
@@ -209,6 +209,30 @@ def _hold(path: Path) -> IO[str]:
             if os.path.samestat(os.fstat(stream.fileno()), os.stat(path / LOCK)):
                 return stream
         stream.close()
+
+
+@contextlib.contextmanager
+def held(path: Path) -> Iterator[None]:
+    """Hold a run folder for what is done to a run that is over; raises OutputExistsError while another run is at work in it.
+
+    What one that was killed left of a map is cleared away. Raises OutputError where nothing can be written.
+    """
+    try:
+        stream = _hold(path)
+    except OSError as error:
+        raise OutputError(f"{path} cannot be written: {cause(error)}") from None
+    try:
+        _clear_spools(path)
+        yield
+    finally:
+        with contextlib.suppress(OSError):
+            (path / LOCK).unlink(missing_ok=True)
+        stream.close()
+
+
+def _clear_spools(path: Path) -> None:
+    for folder in path.glob(f"{SPOOL}*"):
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 def default_folder(sequence: str, method: str, now: float | None = None) -> Path:

@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 import logging
-from contextlib import suppress
 from pathlib import Path
-from typing import Any
 
 from lslam.errors import InputError
 from lslam.formats.cloud_files import read_cloud
 from lslam.formats.trajectory_files import read_trajectory
 from lslam.maps.georeference import Projection
 from lslam.pipeline.map_files import georeference_of
+from lslam.pipeline.map_notes import note_of
 from lslam.pipeline.rebuild import map_of, read_run
 from lslam.reports.recording import ViewedRun
 from lslam.types.cloud import ArrayCloud
-from lslam.untrusted import MISFIT, parse_json
 
 log = logging.getLogger("lslam")
 
@@ -41,10 +39,8 @@ def _cloud(folder: Path) -> ArrayCloud | None:
         log.warning("%s", error)
         return None
     cloud = read_cloud(path)
-    about: dict[str, Any] = {}
-    with suppress(OSError, *MISFIT):
-        about = dict(parse_json(path.with_suffix(".json").read_text(encoding="utf-8")))
+    about = note_of(path)
     georeference = georeference_of(about.get("georeference"))
-    if about.get("crs") is None or about.get("file") != path.name or georeference is None:
+    if about.get("crs") is None or georeference is None:
         return cloud
     return ArrayCloud(Projection(georeference).invert(cloud.points), cloud.intensity)

@@ -11,8 +11,8 @@ Version 1, one estimate:
     kitti_drift   {recipe, available, note, translation_percent, rotation_deg_per_100m, segments, by_length.<m>{..}}
     thesis1, thesis2, timing
     odometry      {recipe, and association to thesis2 as above}, of a run whose poses a pose graph moved: the poses before
-    map           {recipe, entropy (nats), plane_variance (m2), plane_thickness_m, ..}, of runs with a map; without ground truth
-                  it stands alone behind schema, version, lslam and estimate
+    map           {file, recipe, entropy (nats), plane_variance (m2), plane_thickness_m, ..}, of runs with a map; without ground
+                  truth it stands alone behind schema, version, lslam and estimate
 
 Several estimates: {schema, version, evaluations: [the above, ...]}.
 """
@@ -80,7 +80,7 @@ def run_document(record: RunRecord, evaluation: Evaluation | None) -> Document |
     if evaluation is not None:
         document = to_document(evaluation)
     if record.crispness is not None:
-        document["map"] = crispness_document(record.crispness)
+        document["map"] = {"file": record.map_file, **crispness_document(record.crispness)}
     return document
 
 

@@ -26,6 +26,8 @@ if TYPE_CHECKING:
     from lslam.evaluation.results import Evaluation
 
 MOST_ROWS = 100
+# Parts of the page, between marks of these names, that another map changes.
+MAP_PARTS = {"cards": "map_cards.html.j2", "map": "map_section.html.j2", "manifest": "manifest_table.html.j2"}
 
 
 @dataclass(frozen=True)
@@ -61,7 +63,7 @@ def render_report(record: RunRecord, evaluation: Evaluation | None) -> str:
         record=record,
         facts=facts,
         version=__version__,
-        cards=_cards(facts, evaluation, record.crispness),
+        cards=_cards(facts, evaluation),
         failures=facts.failures[:MOST_ROWS],
         degenerate=facts.degenerate[:MOST_ROWS],
         evaluation=evaluation,
@@ -69,7 +71,6 @@ def render_report(record: RunRecord, evaluation: Evaluation | None) -> str:
         trajectory=plots.trajectory_figures(record, evaluation) + back_end_figures(record, evaluation),
         errors=plots.error_figures(evaluation) if evaluation is not None else [],
         tables=metric_tables(evaluation) if evaluation is not None else [],
-        map_figure=_map_figure(record),
         buildings=building_pages(record),
         time=plots.time_figure(record, facts) if facts.stages else None,
         share_bar=plots.share_bar(facts) if facts.stages else "",
@@ -77,9 +78,19 @@ def render_report(record: RunRecord, evaluation: Evaluation | None) -> str:
         features=feature_figures(record.features),
         imu=[said for _, said in imu_rows(record)],
         uncertainty=plots.uncertainty_figures(record),
-        facts_of_input=flatten(record.manifest),
         config_text=_config_text(record.folder),
+        **map_context(record),
     )
+
+
+def map_context(record: RunRecord) -> dict[str, Any]:
+    """What the templates of `MAP_PARTS` show."""
+    return {
+        "map_cards": _map_cards(record.crispness),
+        "map_figure": _map_figure(record),
+        "map_note": _map_note(record.manifest.get("map")),
+        "facts_of_input": flatten(record.manifest),
+    }
 
 
 def template(name: str) -> Template:
@@ -131,7 +142,25 @@ def _plain(value: Any) -> str:
     return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
-def _cards(facts: RunFacts, evaluation: Evaluation | None, crispness: Crispness | None = None) -> list[Card]:
+def _map_note(built: Any) -> str:
+    """What is special about a map that the run did not make itself; empty for the run's own."""
+    if not isinstance(built, Mapping):
+        return ""
+    done = built.get("done")
+    said = "".join(f"; {text}" for text in done) if isinstance(done, list) else ""
+    return f"{built.get('file')}, built anew after the run with voxels of {_plain(built.get('voxel'))} m{said}"
+
+
+def _map_cards(crispness: Crispness | None) -> list[Card]:
+    cards = []
+    if crispness is not None and crispness.entropy is not None:
+        cards.append(Card(f"{crispness.entropy:.2f}", "", "map entropy: lower is crisper"))
+    if crispness is not None and crispness.plane_variance is not None:
+        cards.append(Card(f"{100 * crispness.plane_variance**0.5:.1f}", "cm", "thickness of planes in the map"))
+    return cards
+
+
+def _cards(facts: RunFacts, evaluation: Evaluation | None) -> list[Card]:
     cards = [
         Card(f"{facts.registered}/{facts.scans}", "", "scans registered"),
         Card(f"{facts.path_length:.1f}", "m", f"path in {facts.duration:.1f} s"),
@@ -145,10 +174,6 @@ def _cards(facts: RunFacts, evaluation: Evaluation | None, crispness: Crispness 
             cards.append(
                 Card(f"{drift.translation_percent:.2f}", "%", f"KITTI drift, {counted(drift.segments, 'segment')}")
             )
-    if crispness is not None and crispness.entropy is not None:
-        cards.append(Card(f"{crispness.entropy:.2f}", "", "map entropy: lower is crisper"))
-    if crispness is not None and crispness.plane_variance is not None:
-        cards.append(Card(f"{100 * crispness.plane_variance**0.5:.1f}", "cm", "thickness of planes in the map"))
     if facts.total is not None:
         cards.append(Card(f"{1e3 * facts.total.median:.1f}", "ms", "median time per scan"))
         if facts.real_time_factor:

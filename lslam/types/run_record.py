@@ -25,6 +25,7 @@ class RunRecord:
     """One run, for reports. `manifest` is the dictionary written as manifest.json.
 
     folder : where its results are, None when nothing is written
+    map_file : name of the merged map in that folder, empty without one
     map_image : (H, W) float32 density of the merged map seen from above, row 0 at the largest y, or None
     map_extent : (x_min, x_max, y_min, y_max), m; crispness : of the merged map, None without one
     real_time_limit : seconds one scan may take: skip_frames / rate
@@ -49,6 +50,7 @@ class RunRecord:
     ground_truth: Trajectory | None
     real_time_limit: float
     manifest: dict[str, Any] = field(default_factory=dict)
+    map_file: str = ""
     map_image: NDArray[np.float32] | None = None
     map_extent: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
     crispness: Crispness | None = None

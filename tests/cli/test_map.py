@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
 import json
+import os
+import re
 import shutil
 from pathlib import Path
 
@@ -12,12 +15,14 @@ import pytest
 from calling import SAMPLE, assert_one_sentence, lslam, sample_copy, strict_json
 
 from lslam.cli.main import cli
-from lslam.errors import InputError, LslamError
+from lslam.errors import InputError, LslamError, OutputError
 from lslam.formats import bag_messages
 from lslam.formats.bag_files import BagWriter
 from lslam.formats.cloud_files import read_cloud
 from lslam.geometry.geodesy import from_local
+from lslam.pipeline import refresh
 from lslam.pipeline.map_files import georeference_note
+from lslam.pipeline.run_folder import held
 from lslam.readers import open_sequence
 from lslam.types.georeference import Georeference
 
@@ -65,13 +70,150 @@ def test_other_settings(run: Path, tmp_path: Path) -> None:
     assert (about["voxel"], about["crs"], about["points"]) == (0.5, None, len(part))
 
 
-def test_a_map_in_another_format_replaces_the_one_before_or_stands_beside_it(run: Path) -> None:
+def test_a_map_in_another_format_stands_beside_the_one_before(run: Path) -> None:
     (run / "map_mesh.ply").write_text("not a map")
     assert lslam("map", run, "--format", "pcd", "--voxel", 0.5, "-q").returncode == 0
     assert {p.name for p in run.glob("map*.*")} == {"map.ply", "map.pcd", "map.json", "map_mesh.ply"}
     assert strict_json(lslam("map", run, "--score", "--json").stdout)["file"] == str(run / "map.pcd")
-    assert lslam("map", run, "--format", "las", "--voxel", 0.5, "--overwrite", "-q").returncode == 0
-    assert {p.name for p in run.glob("map*.*")} == {"map.ply", "map.las", "map.json", "map_mesh.ply"}
+    before = {name: (run / name).read_bytes() for name in ("map.ply", "map.pcd", "map_mesh.ply", "trajectory.tum")}
+    assert lslam("map", run, "--format", "las", "--voxel", 1.0, "--overwrite", "-q").returncode == 0
+    assert {p.name for p in run.glob("map*.*")} == {"map.ply", "map.pcd", "map.las", "map.json", "map_mesh.ply"}
+    assert {name: (run / name).read_bytes() for name in before} == before
+    note = strict_json((run / "map.json").read_text())
+    told = {note["file"]: note, **note["others"]}
+    assert list(told) == ["map.las", "map.pcd", "map.ply"]
+    assert {name: about["voxel"] for name, about in told.items()} == {"map.las": 1.0, "map.pcd": 0.5, "map.ply": 0.2}
+    for name, about in told.items():
+        assert about["file"] == name
+        assert about["points"] == len(read_cloud(run / name))
+    assert not list(run.glob(".l*"))
+
+
+def test_a_map_built_anew_renews_what_the_run_says_of_its_map(run: Path) -> None:
+    """Of its map, and of nothing else."""
+    page, facts = (run / "report.html").read_text(), json.loads((run / "manifest.json").read_text())
+    score = strict_json((run / "evaluation.json").read_text())
+    untouched = {p.name: p.read_bytes() for p in run.iterdir() if p.suffix in (".tum", ".csv", ".npz", ".toml", ".txt")}
+    assert lslam("map", run, "--format", "laz", "-q").returncode == 0
+    done = lslam("map", run, "--clean", "--voxel", 0.3, "--overwrite", "--json")
+    assert done.returncode == 0, done.stderr
+    built = strict_json(done.stdout)
+    assert (run / "map.laz").is_file()
+
+    new = strict_json((run / "evaluation.json").read_text())
+    assert new["map"] == {"file": "map.ply", **built["crispness"]}
+    assert new["map"]["entropy"] != score["map"]["entropy"]
+    assert {k: v for k, v in new.items() if k != "map"} == {k: v for k, v in score.items() if k != "map"}
+
+    told = json.loads((run / "manifest.json").read_text())
+    assert (told["map_points"], told["map"]["file"], told["map"]["voxel"]) == (built["points"], "map.ply", 0.3)
+    assert told["map"]["done"][0].startswith("cleaned: ")
+    assert {k: v for k, v in told.items() if k not in ("map", "map_points")} == {
+        k: v for k, v in facts.items() if k != "map_points"
+    }
+
+    after = (run / "report.html").read_text()
+    assert f"<b>{score['map']['entropy']:.2f}</b>" in page
+    assert f"<b>{new['map']['entropy']:.2f}</b>" in after
+    assert f"<b>{score['map']['entropy']:.2f}</b>" not in after
+    assert "map.ply, built anew after the run with voxels of 0.3 m; cleaned: " in after
+    picture = re.compile(r"data:image/png;base64,[^\"]*")
+    assert picture.findall(page) != picture.findall(after)
+    assert len(picture.findall(page)) == len(picture.findall(after))
+    part = re.compile(r"<!-- begin (\w+) -->.*?<!-- end \1 -->", re.DOTALL)
+    assert part.sub("", page) == part.sub("", after)
+    assert len(part.findall(page)) == 3
+    assert {p.name: p.read_bytes() for p in run.iterdir() if p.name in untouched} == untouched
+
+
+def test_a_map_elsewhere_or_of_another_name_is_not_the_map_of_the_run(run: Path, tmp_path: Path) -> None:
+    kept = {name: (run / name).read_bytes() for name in ("evaluation.json", "report.html", "manifest.json", "map.json")}
+    for out in (tmp_path / "map.ply", run / "square.ply"):
+        assert lslam("map", run, "--crop", "-8,8,-5,5", "--out", out, "-q").returncode == 0
+    assert {name: (run / name).read_bytes() for name in kept} == kept
+    for name in ("manifest.ply", "evaluation.laz"):
+        done = lslam("map", run, "--out", run / name, "--overwrite")
+        assert done.returncode == 2
+        assert_one_sentence(done.stderr)
+        assert "is something else" in done.stderr
+    assert {name: (run / name).read_bytes() for name in kept} == kept
+
+
+def test_what_cannot_be_renewed_is_left_alone_and_said(run: Path) -> None:
+    (run / "report.html").write_text("<html>of another time</html>")
+    (run / "evaluation.json").write_text("{")
+    (run / "map.json").write_text("null")
+    done = lslam("map", run, "--voxel", 1.0, "--overwrite")
+    assert done.returncode == 0, done.stderr
+    assert "report.html keeps the figures of the map before" in done.stderr
+    assert "evaluation.json keeps the figures of the map before" in done.stderr
+    assert (run / "report.html").read_text() == "<html>of another time</html>"
+    assert (run / "evaluation.json").read_text() == "{"
+    (run / "report.html").unlink()
+    (run / "evaluation.json").unlink()
+    assert lslam("map", run, "--voxel", 1.0, "--overwrite", "-q").returncode == 0
+    assert not (run / "report.html").exists()
+    assert set(strict_json((run / "evaluation.json").read_text())) == {"schema", "version", "lslam", "estimate", "map"}
+
+
+def test_ended_at_any_file_a_map_and_its_note_agree(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The process ends at the first, second, ... file that gets its name: what is there is whole and belongs together."""
+
+    class Killed(BaseException):
+        """Nothing comes after it."""
+
+    replace, voxels = os.replace, itertools.cycle([1.0, 0.5])
+    for count in itertools.count():
+        left = [count]
+
+        def replaced(source: Path, target: Path, left: list[int] = left) -> None:
+            if not left[0]:
+                raise Killed
+            left[0] -= 1
+            replace(source, target)
+
+        before = {p.name: p.read_bytes() for p in run.iterdir() if p.is_file()}
+        monkeypatch.setattr(os, "replace", replaced)
+        try:
+            cli(["map", str(run), "--voxel", str(next(voxels)), "--overwrite", "-q"], standalone_mode=False)
+            break
+        except Killed:
+            pass
+        finally:
+            monkeypatch.setattr(os, "replace", replace)
+        after = {p.name: p.read_bytes() for p in run.iterdir() if p.is_file()}
+        assert set(before) - set(after) <= {"map.json"}
+        assert "map.ply.part" not in after
+        cloud = read_cloud(run / "map.ply")
+        note = json.loads(after.get("map.json", b"{}"))
+        assert note.get("points", len(cloud)) == len(cloud)
+        for name in ("evaluation.json", "manifest.json"):
+            strict_json(after[name].decode())
+        assert after["report.html"].rstrip().endswith(b"</html>")
+    assert count > 5
+    assert strict_json((run / "map.json").read_text())["points"] == len(read_cloud(run / "map.ply"))
+    assert not list(run.glob(".l*"))
+
+
+def test_a_disk_that_is_full_leaves_everything_as_it_was(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    before = {p.name: p.read_bytes() for p in run.iterdir() if p.is_file()}
+
+    def full(path: Path, document: object) -> None:
+        raise OutputError(f"{path} cannot be written: no space left on device")
+
+    monkeypatch.setattr(refresh, "write_json", full)
+    with pytest.raises(OutputError):
+        cli(["map", str(run), "--voxel", "1", "--overwrite", "-q"], standalone_mode=False)
+    assert {p.name: p.read_bytes() for p in run.iterdir() if p.is_file()} == before
+
+
+def test_a_run_at_work_keeps_its_folder(run: Path) -> None:
+    with held(run):
+        done = lslam("map", run, "--overwrite", "--voxel", 1.0)
+    assert done.returncode == 2
+    assert "in use by another run" in done.stderr
+    assert_one_sentence(done.stderr)
+    assert lslam("map", run, "--overwrite", "--voxel", 1.0, "-q").returncode == 0
 
 
 def test_a_bridged_scan_stays_out(run: Path, tmp_path: Path) -> None:
