@@ -6,11 +6,14 @@ only where the value is used. Everything of lslam that takes JSON or TOML takes 
 
 from __future__ import annotations
 
+import codecs
 import json
+import re
 import tomllib
+from collections.abc import Iterator
 from decimal import Decimal
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 # More than any file of this field has; far below what Python's stack holds.
 DEEPEST = 100
@@ -18,6 +21,9 @@ DEEPEST = 100
 MISFIT = (ValueError, LookupError, TypeError, AttributeError, ArithmeticError)
 _LARGEST = 2**63  # whole numbers of TOML and of OpenStreetMap have 64 bits
 _DIGITS = 20
+_BLOCK = 1 << 16  # bytes that are read at a time
+_BLANK = re.compile(r"[ \t\n\r]*")
+_BEHIND = frozenset(" \t\n\r,]}:")  # what may stand behind a value
 _TOO_DEEP = f"lists and tables stand in each other more than {DEEPEST} deep"
 
 
@@ -94,3 +100,139 @@ def _check(tree: Any) -> None:
                 raise ValueError(f"the whole number {str(node)[:_DIGITS]}... has more than 64 bits")
         else:
             open_ones.pop()
+
+
+class JsonItems:
+    """The items of one list of a JSON object, one at a time: neither the text nor the tree of the whole is ever in memory.
+
+    stream : of the text; key : of the list, at the top of the object. Iterate once; then `rest` holds all else of the object,
+    and `has_list` says whether there was such a list. Of what is no object, `rest` is empty.
+
+    Raises ValueError as `parse_json`; json.JSONDecodeError or UnicodeDecodeError, which are such, when it is no JSON.
+    """
+
+    def __init__(self, stream: IO[bytes], key: str) -> None:
+        self._stream, self._key = stream, key
+        self.rest: dict[str, Any] = {}
+        self.has_list = False
+
+    def __iter__(self) -> Iterator[Any]:
+        text = _Window(self._stream)
+        if text.peek() == "{":
+            yield from self._members(text)
+        else:
+            text.value()
+        if text.peek():
+            raise text.error("Extra data")
+
+    def _members(self, text: _Window) -> Iterator[Any]:
+        text.take("{")
+        if text.peek() == "}":
+            text.take("}")
+            return
+        while True:
+            if text.peek() != '"':
+                raise text.error("Expecting property name enclosed in double quotes")
+            name = text.value()
+            text.take(":")
+            if text.peek() != "[":
+                self.rest[name] = text.value()
+            elif name != self._key:
+                self.rest[name] = list(text.items())
+            elif self.has_list:
+                raise ValueError(f"it holds {self._key!r} twice")
+            else:
+                self.has_list = True
+                yield from text.items()
+            if text.take(",}") == "}":
+                return
+
+
+class _Window:
+    """The part of a JSON text that is looked at."""
+
+    def __init__(self, stream: IO[bytes]) -> None:
+        self._stream = stream
+        first = stream.read(max(_BLOCK, 4))  # which tell UTF-8 from others
+        self._decoder = codecs.getincrementaldecoder(json.detect_encoding(first))("surrogatepass")
+        self._text, self._at, self._is_over = self._decoder.decode(first), 0, not first
+        self._passed = self._lines = 0
+        self._column = 0
+
+    def peek(self) -> str:
+        """The next character that is no blank; empty at the end."""
+        while True:
+            found = _BLANK.match(self._text, self._at)
+            assert found is not None
+            self._at = found.end()
+            if self._at < len(self._text):
+                return self._text[self._at]
+            if not self._more():
+                return ""
+
+    def take(self, wanted: str) -> str:
+        """The next character, which has to be one of those `wanted`."""
+        found = self.peek()
+        if not found or found not in wanted:
+            raise self.error(f"Expecting {' or '.join(repr(one) for one in wanted)}")
+        self._at += 1
+        return found
+
+    def value(self) -> Any:
+        """The next value, whole."""
+        self.peek()
+        while True:
+            try:
+                value, end = _DECODER.raw_decode(self._text, self._at)
+                # A number may go on behind the window.
+                if self._text[end : end + 1] in _BEHIND or self._is_over:
+                    break
+            except RecursionError:
+                raise ValueError(_TOO_DEEP) from None
+            except json.JSONDecodeError as error:
+                if self._is_over:
+                    self._at = error.pos
+                    raise self.error(error.msg) from None
+            self._more()
+        self._at = end
+        _check(value)
+        return value
+
+    def items(self) -> Iterator[Any]:
+        """Those of the list that comes next."""
+        self.take("[")
+        if self.peek() == "]":
+            self.take("]")
+            return
+        while True:
+            yield self.value()
+            if self.take(",]") == "]":
+                return
+
+    def error(self, why: str) -> json.JSONDecodeError:
+        """What is wrong here, with its place in the whole text."""
+        line, column = self._place()
+        error = json.JSONDecodeError(why, "", 0)
+        error.args = (f"{why}: line {line + 1} column {column + 1} (char {self._passed + self._at})",)
+        return error
+
+    def _place(self) -> tuple[int, int]:
+        """Lines before this place, and characters before it on its line."""
+        ends = self._text.count("\n", 0, self._at)
+        column = self._at - self._text.rindex("\n", 0, self._at) - 1 if ends else self._column + self._at
+        return self._lines + ends, column
+
+    def _more(self) -> bool:
+        """Read on, at least as much as there is, so that a long value is begun anew a few times only; False at the end."""
+        if self._is_over:
+            return False
+        self._lines, self._column = self._place()
+        self._passed += self._at
+        left = self._text[self._at :]
+        block = self._stream.read(max(_BLOCK, len(left)))
+        self._is_over = not block
+        self._text, self._at = left + self._decoder.decode(block, not block), 0
+        return True
+
+
+_DECODER = json.JSONDecoder(parse_int=_whole)

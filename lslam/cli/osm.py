@@ -11,6 +11,7 @@ from lslam.cli import console, options
 
 if TYPE_CHECKING:
     from lslam.formats.osm_buildings import BuildingExtract
+    from lslam.formats.overpass_reply import OverpassReply
     from lslam.priors.bounds import Bounds
 
 
@@ -118,16 +119,15 @@ def _bounds(
     return bounds.around(positions_along(along, data_root, at), radius)
 
 
-def _write(out: Path, reply: dict[str, Any]) -> None:
-    import json
-
-    from lslam.formats.atomic import write_text
+def _write(out: Path, reply: OverpassReply) -> None:
+    from lslam.formats.atomic import atomic_write
     from lslam.formats.osm_buildings import buildings_of, middle_of
     from lslam.formats.osm_files import from_overpass, write_osm
 
     data = from_overpass(reply)
     if out.suffix.lower() == ".json":
-        write_text(out, json.dumps(reply, ensure_ascii=False) + "\n")
+        with atomic_write(out) as stream:
+            stream.write(reply.text)
     else:
         write_osm(out, data)
     found = len(buildings_of(data, middle_of(data), str(out)).buildings)

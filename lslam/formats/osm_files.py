@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import math
+import sys
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -17,7 +18,8 @@ from xml.sax.saxutils import quoteattr
 from lslam.errors import InputError, cause
 from lslam.formats.atomic import atomic_write
 from lslam.formats.osm_geojson import elements_of, is_geojson
-from lslam.untrusted import parse_json
+from lslam.formats.overpass_reply import ELEMENTS, OverpassReply
+from lslam.untrusted import JsonItems
 
 ATTRIBUTION = "© OpenStreetMap contributors, ODbL 1.0, openstreetmap.org/copyright"
 GENERATOR = "lslam"
@@ -145,21 +147,50 @@ def read_osm(path: Path) -> OsmData:
         raise InputError(f"{path} cannot be read: {cause(error)}") from None
 
 
-def from_overpass(tree: Any) -> OsmData:
-    """An Overpass reply (`[out:json]`), already parsed. Raises ValueError saying what is wrong with it."""
-    if not isinstance(tree, dict) or not isinstance(tree.get("elements"), list):
-        raise ValueError("no list of elements, so this is no Overpass reply")
-    if tree.get("remark"):
-        # Overpass says so when it ran out of time or memory: the reply is valid JSON but incomplete.
-        raise ValueError(f"the server gave up: {str(tree['remark'])[:200]}")
+class GaveUpError(ValueError):
+    """What Overpass says, `remark`, when it ran out of time or memory: the reply is valid JSON but incomplete."""
+
+    def __init__(self, remark: Any) -> None:
+        super().__init__(f"the server gave up: {str(remark)[:200]}")
+        self.remark = str(remark)
+
+
+def from_overpass(reply: Any) -> OsmData:
+    """An Overpass reply (`[out:json]`), an `OverpassReply` or parsed already. Raises as `merged`."""
+    return merged([reply])
+
+
+def merged(replies: Iterable[Any]) -> OsmData:
+    """One extract of many replies; what several hold is in it once.
+
+    Raises ValueError saying what is wrong with one; GaveUpError, which is such, when a server did.
+    """
     data = OsmData()
-    for element in tree["elements"]:
+    for reply in replies:
+        if isinstance(reply, OverpassReply):
+            items = reply.items_of()
+            _add_all(data, items)
+            _check_reply(items.has_list, items.rest)
+        else:
+            _check_reply(isinstance(reply, dict) and isinstance(reply.get(ELEMENTS), list), reply)
+            _add_all(data, reply[ELEMENTS])
+    data.number_drawn()
+    return data
+
+
+def _check_reply(has_elements: bool, facts: Any) -> None:
+    if not has_elements:
+        raise ValueError("no list of elements, so this is no Overpass reply")
+    if facts.get("remark"):
+        raise GaveUpError(facts["remark"])
+
+
+def _add_all(data: OsmData, elements: Iterable[Any]) -> None:
+    for element in elements:
         try:
             _add_json(data, element)
         except (AttributeError, LookupError, TypeError, ArithmeticError) as error:
             raise ValueError(f"an element without {error}: {str(element)[:80]}") from None
-    data.number_drawn()
-    return data
 
 
 def write_osm(path: Path, data: OsmData) -> None:
@@ -170,11 +201,16 @@ def write_osm(path: Path, data: OsmData) -> None:
 
 def _read_json(path: Path) -> OsmData:
     try:
-        tree = parse_json(path.read_bytes())
-        if not is_geojson(tree):
-            return from_overpass(tree)
-        data = from_overpass({"elements": elements_of(tree)})
-        data.attribution = tree.get("attribution", ATTRIBUTION) or None
+        data = OsmData()
+        with path.open("rb") as stream:
+            items = JsonItems(stream, ELEMENTS)
+            _add_all(data, items)
+        if not items.has_list and is_geojson(items.rest):
+            data = from_overpass({ELEMENTS: elements_of(items.rest)})
+            data.attribution = items.rest.get("attribution", ATTRIBUTION) or None
+            return data
+        _check_reply(items.has_list, items.rest)
+        data.number_drawn()
         return data
     except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise InputError(f"{path} is broken JSON, perhaps cut short ({error}): {WAY_OUT}") from None
@@ -185,7 +221,7 @@ def _read_json(path: Path) -> OsmData:
 def _add_json(data: OsmData, element: dict[str, Any]) -> None:
     kind, number = element["type"], int(element.get("id", 0))
     data.add_version(kind, number, element.get("version"))
-    tags = {str(key): str(value) for key, value in element.get("tags", {}).items()}
+    tags = {sys.intern(str(key)): str(value) for key, value in element.get("tags", {}).items()}
     if kind == "node":
         data.add_node(number, element["lat"], element["lon"])
     elif kind == "way":
@@ -271,7 +307,7 @@ def _add_xml(data: OsmData, element: Element) -> None:
     if element.tag == "node":
         data.add_node(number, element.attrib["lat"], element.attrib["lon"])
         return
-    tags = {tag.attrib["k"]: tag.attrib["v"] for tag in element.iter("tag")}
+    tags = {sys.intern(tag.attrib["k"]): tag.attrib["v"] for tag in element.iter("tag")}
     if element.tag == "way":
         corners = [n.attrib for n in element.iter("nd")]
         if corners and "ref" not in corners[0]:

@@ -6,7 +6,7 @@ import hashlib
 import logging
 from functools import partial
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +15,8 @@ from lslam.config import Config
 from lslam.config.osm import OsmConfig
 from lslam.errors import InputError, UsageError, cause
 from lslam.formats.osm_buildings import BuildingExtract, buildings_of, some_buildings_of
-from lslam.formats.osm_files import OsmData, from_overpass, read_osm
+from lslam.formats.osm_files import OsmData, merged, read_osm
+from lslam.formats.overpass_reply import OverpassReply
 from lslam.geometry import se2
 from lslam.geometry.geodesy import to_local
 from lslam.pipeline.georeferencing import require_crs
@@ -24,7 +25,7 @@ from lslam.priors.osm_map import OsmMap
 from lslam.priors.overpass import fetch_buildings, reply_folder
 from lslam.types.gnss import GnssStream
 from lslam.types.sequence import Sequence
-from lslam.untrusted import MISFIT, parse_json
+from lslam.untrusted import MISFIT
 
 log = logging.getLogger("lslam")
 Floats = NDArray[np.float64]
@@ -129,7 +130,7 @@ class OsmServer:
     @property
     def data(self) -> OsmData:
         """All that has come so far."""
-        return _merged([] if self._buffer is None else self._buffer.replies)
+        return merged([] if self._buffer is None else self._buffer.replies)
 
 
 def first_pose(config: OsmConfig) -> Floats:
@@ -144,11 +145,6 @@ def _places(gnss: GnssStream, origin: Floats) -> tuple[NDArray[np.int64], Floats
     return gnss.stamps_ns[gnss.is_place], to_local(gnss.lat_lon_alt[gnss.is_place], origin)[:, :2]
 
 
-def _merged(replies: list[dict[str, Any]]) -> OsmData:
-    """One extract of many replies; what several hold is in it once."""
-    return from_overpass({"elements": [element for reply in replies for element in reply.get("elements", [])]})
-
-
 def _kept_replies(folder: Path) -> OsmData:
     """Those a run has kept. Raises InputError when there are none, or for one that is damaged."""
     files = sorted(folder.glob("*.json"))
@@ -157,7 +153,7 @@ def _kept_replies(folder: Path) -> OsmData:
             f"{folder} holds no replies of an Overpass server (000000.json, ...): name a file, or that folder"
         )
     try:
-        return _merged([parse_json(file.read_bytes()) for file in files])
+        return merged(OverpassReply(file.read_bytes()) for file in files)
     except (OSError, *MISFIT) as error:
         raise InputError(f"{folder} holds a reply that cannot be read ({error})") from None
 

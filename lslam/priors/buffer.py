@@ -7,11 +7,10 @@ dead one nothing but buildings.
 
 from __future__ import annotations
 
-import json
 import logging
 import queue
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextvars import copy_context
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,16 +21,18 @@ from numpy.typing import NDArray
 
 from lslam.config.osm import OsmConfig
 from lslam.errors import InputError, LslamError
-from lslam.formats.atomic import write_text
+from lslam.formats.atomic import atomic_write
 from lslam.formats.osm_buildings import buildings_of
 from lslam.formats.osm_files import from_overpass
+from lslam.formats.overpass_reply import OverpassReply
 from lslam.geometry.geodesy import from_local
 from lslam.priors.bounds import Bounds, around
-from lslam.untrusted import MISFIT, parse_json
+from lslam.untrusted import MISFIT
 
 log = logging.getLogger("lslam")
+NOTHING = OverpassReply(b"{}")
 
-Fetch = Callable[[Bounds], dict[str, Any]]
+Fetch = Callable[[Bounds], Mapping[str, Any]]
 
 
 @dataclass(frozen=True)
@@ -50,7 +51,7 @@ class _Circle:
     """A finished request: the reply, of which buildings can be read; why it is none, else None."""
 
     wish: _Wish
-    reply: dict[str, Any]
+    reply: OverpassReply
     problem: str | None = None
 
 
@@ -77,7 +78,7 @@ class OsmBuffer:
         self._done: queue.SimpleQueue[_Circle] = queue.SimpleQueue()
         self._open: list[_Wish] = []
         self._answered: list[_Wish] = []
-        self.replies: list[dict[str, Any]] = []
+        self.replies: list[OverpassReply] = []
         self.problems: list[str] = []
         self._thread: threading.Thread | None = None
         self._load()
@@ -142,17 +143,17 @@ class OsmBuffer:
     def _circle(self, wish: _Wish) -> _Circle:
         try:
             fix = from_local(np.array([[*wish.centre, 0.0]]), self._origin)[:, :2]
-            reply = self._fetch(around(fix, wish.radius))
+            reply = OverpassReply.of(self._fetch(around(fix, wish.radius)))
             self._check(reply)
             return _Circle(wish, reply)
         except LslamError as error:
-            return _Circle(wish, {}, str(error))
+            return _Circle(wish, NOTHING, str(error))
         except Exception as error:
             # Whatever a server sends, the run goes on without it.
             log.debug("traceback", exc_info=error)
-            return _Circle(wish, {}, f"the reply cannot be used ({type(error).__name__}: {error})")
+            return _Circle(wish, NOTHING, f"the reply cannot be used ({type(error).__name__}: {error})")
 
-    def _check(self, reply: dict[str, Any]) -> None:
+    def _check(self, reply: OverpassReply) -> None:
         """Raise what is wrong with a reply."""
         buildings_of(from_overpass(reply), self._origin, "the reply")
 
@@ -160,16 +161,18 @@ class OsmBuffer:
         """What is used is kept, and nothing else: not what a server sends when nobody waits any more."""
         folder.mkdir(parents=True, exist_ok=True)
         asked = {"lslam_centre": circle.wish.centre.tolist(), "lslam_radius": circle.wish.radius}
-        write_text(folder / f"{len(self.replies):06d}.json", json.dumps({**asked, **circle.reply}, ensure_ascii=False))
+        with atomic_write(folder / f"{len(self.replies):06d}.json") as stream:
+            circle.reply.write(stream, asked)
 
     def _load(self) -> None:
         """Take what an earlier run kept."""
         for path in [] if self._folder is None else sorted(self._folder.glob("*.json")):
             try:
-                tree = parse_json(path.read_bytes())
-                wish = _Wish(np.array(tree["lslam_centre"], np.float64), float(tree["lslam_radius"]))
-                self._check(tree)
-                self._use(_Circle(wish, tree))
+                reply = OverpassReply(path.read_bytes())
+                facts = reply.facts()
+                wish = _Wish(np.array(facts["lslam_centre"], np.float64), float(facts["lslam_radius"]))
+                self._check(reply)
+                self._use(_Circle(wish, reply))
             except (OSError, *MISFIT) as error:
                 raise InputError(f"{path} is no reply kept by an earlier run ({error}): remove it") from None
 

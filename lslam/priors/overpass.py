@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import io
 import json
 import logging
 import tempfile
@@ -22,18 +23,19 @@ import numpy as np
 
 from lslam.config.osm import OsmConfig
 from lslam.errors import InputError, OutputError, UsageError
-from lslam.formats.atomic import write_text
-from lslam.formats.osm_files import from_overpass
+from lslam.formats.atomic import atomic_write
+from lslam.formats.osm_files import GaveUpError, from_overpass
+from lslam.formats.overpass_reply import OverpassReply
 from lslam.kernels.cache import cache_folder
 from lslam.locks import one_at_a_time
 from lslam.priors.bounds import Bounds
-from lslam.untrusted import parse_json, whole_number
+from lslam.untrusted import whole_number
 from lslam.version import __version__
 
 log = logging.getLogger("lslam")
 
 USER_AGENT = f"lslam/{__version__} (batch LiDAR SLAM; buildings around a recorded trajectory)"
-LONGEST_REPLY = 48 * 1024 * 1024  # bytes; as a tree in memory it takes ten times as much
+LONGEST_REPLY = 48 * 1024 * 1024  # bytes; its text is kept, and read element by element
 LONGEST_WAIT = 120.0  # s; whoever says "retry later than that" is not waited for
 FAR_OUT = 1000.0  # m; a long building reaches that far out of a box
 _BUSY = (429, 502, 503, 504)
@@ -64,10 +66,10 @@ def reply_folder() -> Path:
 
 def fetch_buildings(
     bounds: Bounds, config: OsmConfig, folder: Path, sleep: Callable[[float], None] = time.sleep
-) -> dict[str, Any]:
+) -> OverpassReply:
     """The Overpass reply for `bounds`, from `folder` when it or a larger one is kept there, else from `config.server`.
 
-    The tree is checked (`osm_files.from_overpass` takes it) and kept when it is whole. `sleep` waits between attempts.
+    It is checked (`osm_files.from_overpass` takes it) and kept when it is whole. `sleep` waits between attempts.
 
     Raises InputError with one sentence: server unreachable or busy to the end, a web page, a reply that is cut short, gave
     up, is of another place or endless; nothing in the cache where `config.cache` is `only`.
@@ -80,7 +82,7 @@ def fetch_buildings(
             f"no reply for {bounds} is in {folder}: ask a server for it once, osm.cache = use, without --offline"
         )
     try:
-        tree = _ask_patiently(bounds, config, folder, sleep)
+        reply = _ask_patiently(bounds, config, folder, sleep)
     except InputError as error:
         # An old reply is better than none, and the world of buildings changes slowly.
         kept = kept_reply(bounds, folder)
@@ -90,17 +92,18 @@ def fetch_buildings(
         return kept
     with contextlib.suppress(OutputError, OSError):
         folder.mkdir(parents=True, exist_ok=True)
-        write_text(folder / _file_name(bounds), json.dumps(tree, ensure_ascii=False, separators=(",", ":")))
-    return tree
+        with atomic_write(folder / _file_name(bounds)) as stream:
+            stream.write(reply.text)
+    return reply
 
 
-def kept_reply(bounds: Bounds, folder: Path) -> dict[str, Any] | None:
+def kept_reply(bounds: Bounds, folder: Path) -> OverpassReply | None:
     """The kept reply for `bounds`, or for the smallest kept box round it; None without one that can be read."""
     exact = folder / _file_name(bounds)
     larger = [(box.area_km2, path) for path in folder.glob("*.json") if (box := _bounds_of(path)) and box.holds(bounds)]
     for path in [exact, *(path for _, path in sorted(larger))]:
         try:
-            return _checked(parse_json(path.read_bytes()), bounds, is_own=path == exact)
+            return _checked(OverpassReply(path.read_bytes()), bounds, is_own=path == exact)
         except (OSError, ValueError):
             continue
     return None
@@ -118,7 +121,7 @@ def _bounds_of(path: Path) -> Bounds | None:
     return None
 
 
-def _ask_patiently(bounds: Bounds, config: OsmConfig, folder: Path, sleep: Callable[[float], None]) -> dict[str, Any]:
+def _ask_patiently(bounds: Bounds, config: OsmConfig, folder: Path, sleep: Callable[[float], None]) -> OverpassReply:
     wait = config.backoff
     # Many runs at once, threads or processes, are still one polite client.
     with _one_thread_at_a_time, one_at_a_time(folder / "request.lock"):
@@ -138,7 +141,7 @@ def _ask_patiently(bounds: Bounds, config: OsmConfig, folder: Path, sleep: Calla
     raise AssertionError("the last attempt returns or raises")
 
 
-def _ask(bounds: Bounds, config: OsmConfig) -> dict[str, Any]:
+def _ask(bounds: Bounds, config: OsmConfig) -> OverpassReply:
     """One request; InputError when asking again is no use, _TryAgainError when it may be.
 
     It has a thread of its own, because a name that is looked up and headers that drip know no end: all of it together has
@@ -209,11 +212,11 @@ def _read(reply: Any, server: str, timeout: float, is_late: threading.Event) -> 
     """The body, but neither for ever nor without end: what has come is looked at as it comes, drop by drop."""
     import urllib3
 
-    body = bytearray()
+    body = io.BytesIO()  # which gives its bytes away without a copy
     try:
         while part := reply.raw.read1(65536, decode_content=True):
-            body += part
-            if len(body) > LONGEST_REPLY:
+            body.write(part)
+            if body.tell() > LONGEST_REPLY:
                 raise InputError(f"the reply grows beyond {LONGEST_REPLY >> 20} MB: ask for a smaller place")
             if is_late.is_set():
                 raise InputError(_too_late(server, timeout))
@@ -221,7 +224,7 @@ def _read(reply: Any, server: str, timeout: float, is_late: threading.Event) -> 
         raise InputError(_too_late(server, timeout)) from None
     except urllib3.exceptions.HTTPError:
         raise _TryAgainError("the connection broke") from None
-    return bytes(body)
+    return body.getvalue()
 
 
 def _too_late(server: str, limit: float) -> str:
@@ -229,26 +232,24 @@ def _too_late(server: str, limit: float) -> str:
     return f"{server} did not answer within {limit:g} s: try later, or name another osm.server"
 
 
-def _parsed(body: bytes, bounds: Bounds, server: str) -> dict[str, Any]:
+def _parsed(body: bytes, bounds: Bounds, server: str) -> OverpassReply:
+    if body[:64].lstrip()[:1] == b"<":
+        raise InputError(f"{server} answered with a web page, not with data: check osm.server")
     try:
-        tree = parse_json(body)
-    except ValueError:
-        if body.lstrip()[:1] == b"<":
-            raise InputError(f"{server} answered with a web page, not with data: check osm.server") from None
+        return _checked(OverpassReply(body), bounds)
+    except (json.JSONDecodeError, UnicodeDecodeError):
         raise _TryAgainError("the reply was cut short") from None
-    if isinstance(tree, dict) and tree.get("remark"):
-        raise _TryAgainError(f"it gave up ({str(tree['remark'])[:120]})")
-    try:
-        return _checked(tree, bounds)
+    except GaveUpError as error:
+        raise _TryAgainError(f"it gave up ({error.remark[:120]})") from None
     except ValueError as error:
         raise InputError(f"the reply of {server} cannot be used, {error}: check osm.server") from None
 
 
-def _checked(tree: Any, bounds: Bounds, is_own: bool = True) -> dict[str, Any]:
-    """The tree; raises ValueError when it is no reply, or, of its own request, one from elsewhere."""
-    data = from_overpass(tree)
+def _checked(reply: OverpassReply, bounds: Bounds, is_own: bool = True) -> OverpassReply:
+    """The reply; raises ValueError when it is none, or, of its own request, one from elsewhere."""
+    data = from_overpass(reply)
     places = np.array([*data.nodes.values()]).reshape(-1, 2)
     if is_own and bounds.share_inside(places, FAR_OUT) < 0.5:
         lat, lon = np.median(places, axis=0)
         raise ValueError(f"most of it lies elsewhere, about {lat:.4f},{lon:.4f}")
-    return dict(tree)
+    return reply

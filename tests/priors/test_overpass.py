@@ -16,6 +16,7 @@ from overpass_server import FakeOverpass, running
 from lslam.config.osm import OsmConfig
 from lslam.errors import InputError
 from lslam.formats.osm_files import from_overpass
+from lslam.formats.overpass_reply import OverpassReply
 from lslam.priors.bounds import Bounds
 from lslam.priors.overpass import fetch_buildings, kept_reply, query
 
@@ -28,7 +29,7 @@ def server() -> Iterator[FakeOverpass]:
         yield fake
 
 
-def fetch(fake: FakeOverpass, folder: Path, *script: str, bounds: Bounds = BOX, **changes: Any) -> dict[str, Any]:
+def fetch(fake: FakeOverpass, folder: Path, *script: str, bounds: Bounds = BOX, **changes: Any) -> OverpassReply:
     """One call against the next words of the script, without waiting between attempts."""
     fake.script = list(script)
     fake.requests.clear()
