@@ -122,7 +122,9 @@ def _likeliest(
     about = a - a.mean(axis=0)
     about /= max(float(np.abs(about).max()), 1e-9)
     fitted = np.concatenate([np.tile(np.eye(3), (len(t), 1, 1)), np.cross(np.eye(3), about[:, None, :])], axis=2)
-    sides = np.column_stack([r.ravel(), weights[:, None] * fitted.reshape(-1, 6)])
+    axes, moves, _ = np.linalg.svd(weights[:, None] * fitted.reshape(-1, 6), full_matrices=False)
+    # About a straight way no turn moves anything.
+    sides = np.column_stack([r.ravel(), axes[:, moves > 1e-9 * moves[0]]])
     gap = float(np.median(np.diff(seconds)))
     tried = np.geomspace(gap, LONGEST * max(t[-1] - t[0], gap), TRIED)
     apart = np.abs(t[:, None] - t)

@@ -79,6 +79,31 @@ def test_fixes_that_are_wrong_hide_nothing_from_the_others() -> None:
     assert not set(found.seconds.tolist()) & set(seconds[::7].tolist())
 
 
+@pytest.mark.parametrize(("share", "wanders"), [(0.9, True), (1.1, False)])
+def test_fixes_err_together_that_scatter_less_than_one_of_a_thousand_drives(share: float, wanders: bool) -> None:
+    """Against draws of fixes that err alone: what the mean square of two neighbours' difference is below by chance."""
+    rng, count = np.random.default_rng(0), 41
+    alone = 0.5 * (np.diff(rng.normal(size=(100_000, count, 2)), axis=1) ** 2).mean(axis=(1, 2))
+    white = share * np.quantile(alone, 0.001)
+    # Neighbours lie to either side, so that each differs from the next by as much.
+    side = np.sqrt(white / 2) * np.where(np.arange(count) % 2, 1.0, -1.0)
+    path = np.outer(np.arange(count), [3.0, 4.0, 0.5])
+    residuals = np.repeat(side[:, None], 3, axis=1)
+    found, _ = wander_of(np.arange(1.0 * count), residuals, np.ones((count, 3)), path, 0.999, drift_of(path))
+    assert (found is not None) == wanders
+
+
+@pytest.mark.parametrize("ahead", [(5.0, 0.0, 0.0), (3.0, 4.0, 0.5)])
+def test_the_common_part_is_found_on_a_way_without_a_bend(ahead: tuple[float, float, float]) -> None:
+    """A roll about it moves no antenna, so that it cannot have been fitted."""
+    rng, seconds = np.random.default_rng(1), np.arange(200.0)
+    residuals = 0.8 * np.sin(seconds / 30)[:, None] + 0.2 * rng.normal(size=(200, 3))
+    path = np.outer(seconds, ahead)
+    found, _ = wander_of(seconds, residuals, np.full((200, 3), 0.7), path, 0.999, drift_of(path))
+    assert found is not None
+    assert found.sigma[0] == pytest.approx(np.hypot(0.8 / np.sqrt(2), 0.2), abs=0.15)
+
+
 def test_nothing_is_told_of_fixes_out_of_order_or_alone() -> None:
     flat, one = np.zeros((3, 3)), np.ones((3, 3))
     assert wander_of(np.array([0.0, 1.0, 1.0]), flat, one, flat, 0.999, drift_of(flat)) == (None, 0.0)
