@@ -17,7 +17,7 @@ Floats = NDArray[np.float64]
 
 # Camera axes (x right, y down, z forward) to body axes (x forward, y left, z up): signed ones, so turning is exact.
 R_BODY_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
-STEADY = 0.8  # |mean direction| above which a body counts as moving along one of its axes
+STEADY = 0.8  # of the mean direction, from which a body counts as moving along one of its axes
 SAME_DEG = 30.0
 
 
@@ -105,8 +105,7 @@ def _mean_direction(poses: Floats) -> Floats | None:
     travelled = float(np.linalg.norm(steps, axis=1).sum())
     if travelled < 1.0:
         return None
-    mean = np.asarray(steps.sum(axis=0) / travelled)
-    return mean if np.linalg.norm(mean) > STEADY else None
+    return np.asarray(steps.sum(axis=0) / travelled)
 
 
 def _steps(poses: Floats, stride: int = 1) -> Floats:
