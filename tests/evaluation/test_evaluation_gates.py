@@ -13,7 +13,7 @@ from lslam.errors import InputError
 from lslam.evaluation.associate import associate
 from lslam.evaluation.frames import body_rotation, main_axis
 from lslam.evaluation.thesis import planar
-from lslam.evaluation.time_offset import estimate_offset
+from lslam.evaluation.time_offset import _peaks, estimate_offset
 from lslam.types.trajectory import Trajectory
 
 Floats = NDArray[np.float64]
@@ -116,3 +116,24 @@ def test_a_clock_that_fits_another_shift_nearly_as_well_is_not_told(other_noise:
             estimate_offset(estimate, truth)
     else:
         assert estimate_offset(estimate, truth)[0] == pytest.approx(0, abs=STEP_NS // 2)
+
+
+def test_a_clock_is_told_through_the_noise_of_poses_and_by_motion_of_a_second() -> None:
+    """Places with noise of 5 cm every 0.1 s are speeds with noise of 0.7 m/s; a walker's speed changes within half a second."""
+    rng, k = np.random.default_rng(1), np.arange(400)
+    for wobble, amplitude, noise in ((59, 0.5, 0.05), (9, 0.8, 0.0)):
+        speeds = 2 + amplitude * np.sin(2 * np.pi * (k + 3 * np.sin(k / 40)) / wobble)
+        truth = paced(speeds)
+        poses = truth.poses.copy()
+        poses[:, :3, 3] += noise * rng.normal(size=(len(poses), 3))
+        estimate = replace(truth, poses=poses, stamps_ns=truth.stamps_ns - 7 * STEP_NS)
+        assert estimate_offset(estimate, truth)[0] == pytest.approx(7 * STEP_NS, abs=STEP_NS)
+
+
+@pytest.mark.parametrize(("good", "poor", "chosen"), [(3, 5, 3), (19, 5, 19), (30, 0, 20)])
+def test_shifts_that_are_refined_fit_well_and_are_twenty_at_most(good: int, poor: int, chosen: int) -> None:
+    """Scores are 0.8 at least, and no two within a second of each other."""
+    scores = np.concatenate([np.linspace(0.95, 0.8, good), np.linspace(0.799, 0.5, poor)])
+    lags = 11 * np.arange(good + poor)
+    assert _peaks(scores, lags) == list(range(chosen))
+    assert _peaks(np.array([0.9, 0.95, 0.85]), np.array([0, 10, 21])) == [1, 2]

@@ -76,3 +76,14 @@ def test_fixes_that_agree_on_nothing_fit_nothing(fixes: str) -> None:
 def test_a_sensor_that_stood_has_no_heading() -> None:
     still = np.zeros((50, 3))
     assert fit(still, noisy(still, 6)) is None
+
+
+@pytest.mark.parametrize(("metres", "is_told"), [(0.45, False), (0.55, True)])
+def test_half_a_metre_is_the_shortest_way_that_has_a_heading(metres: float, is_told: bool) -> None:
+    """However well a fix is known: what moves by less may as well be the antenna's mast."""
+    to_and_fro = np.column_stack([0.5 * metres * np.where(np.arange(40) % 2, 1.0, -1.0), np.zeros((40, 2))])
+    fixes = se3.apply(T_ENU_WORLD, to_and_fro)
+    found = align(to_and_fro, fixes, np.full((40, 3), 1e-3), np.zeros(40), UP, 0.01, 5)
+    assert (found is not None) == is_told
+    if found is not None:
+        np.testing.assert_allclose(se3.apply(found.T_enu_world, to_and_fro), fixes, atol=1e-3)

@@ -12,7 +12,7 @@ from lslam.config.graph import GraphConfig
 from lslam.errors import GraphError
 from lslam.geometry import se3, so3
 from lslam.graph.pose_graph import optimise
-from lslam.graph.problem import FloorPlane, PoseGraph, PositionFix, UpDirection
+from lslam.graph.problem import FloorPlane, PlanarPrior, PoseGraph, PositionFix, UpDirection
 from lslam.types.constraint import Constraint, Turn
 
 LAPS = 6
@@ -119,6 +119,28 @@ def test_up_directions_level_the_graph() -> None:
     before, after = errors(graph.poses, REAL), errors(solution.poses, REAL)
     assert np.abs(after[:, 3:5]).max() < 0.3 * np.abs(before[:, 3:5]).max()
     assert np.abs(after[:, 2]).max() < 0.7 * np.abs(before[:, 2]).max()
+
+
+@pytest.mark.parametrize(("is_doubted", "x"), [(True, 0.4), (False, 0.0)])
+def test_a_start_that_is_doubted_moves_though_up_is_seen(is_doubted: bool, x: float) -> None:
+    """A map puts all poses 0.4 m ahead; where nothing doubts the first one it stays, whatever gravity does to the tilt."""
+    poses = np.tile(np.eye(4), (3, 1, 1))
+    poses[:, 0, 3] = 10.0 * np.arange(3)
+    steps = [Constraint(k, k + 1, se3.relative(poses[k], poses[k + 1]), 1e-6 * np.eye(6)) for k in range(2)]
+    priors = [PlanarPrior(k, np.array([10.0 * k + 0.4, 0.0, 0.0]), 1e4 * np.eye(3), 3) for k in range(3)]
+    graph = PoseGraph(
+        poses,
+        steps,
+        ups=[UpDirection(k, np.array([0.0, 0.0, 1.0]), 0.01) for k in range(3)],
+        distances=poses[:, 0, 3],
+        map_priors=priors,
+        start_sigma=np.array([5.0, 5.0, 0.1]) if is_doubted else None,
+        shift_sigma=1e-4 if is_doubted else 5.0,
+        map_sigma=1e-3,
+    )
+    solution = optimise(graph, GraphConfig())
+    np.testing.assert_allclose(solution.poses[:, 0, 3], x + 10.0 * np.arange(3), atol=0.01)
+    np.testing.assert_allclose(solution.poses[:, 1:3, 3], 0.0, atol=1e-3)
 
 
 def test_turns_hold_the_heading() -> None:

@@ -60,3 +60,23 @@ def test_two_places_teach_the_velocity_as_well_as_both_are_known(sigmas: tuple[f
     gain = shared / (1e4 * t**2 + FORCE_NOISE**2 * t**3 / 3 + places)
     np.testing.assert_allclose(np.diag(after.covariance)[:3], 1e4 + FORCE_NOISE**2 * t - gain * shared, rtol=1e-6)
     np.testing.assert_allclose(after.velocity, gain * moved, rtol=1e-6)
+
+
+def test_instants_within_a_step_say_nothing_more() -> None:
+    """Where the turn ends is its last instant, however many lie between."""
+    stamps = np.arange(0, 300_000_001, 10_000_000)
+    rng = np.random.default_rng(2)
+    imu = ImuStream(stamps, rng.normal(0, 4, (31, 3)), rng.normal(1.0, 0.3, (31, 3)))
+    before = ImuEstimate(
+        np.array([3.0, -1, 0.2]), np.array([0, 0, -GRAVITY]), np.zeros(3), Gyroscope(np.zeros(3)), np.eye(9)
+    )
+    R = so3.exp(np.array([0.3, -0.5, 1.1]))
+    found = []
+    for instants in (stamps[[0, -1]], stamps[[0, 10, 15, -1]]):
+        step = before.over(imu, instants)
+        R_end = R @ step.rotations[-1] @ so3.exp(np.array([0.02, -0.01, 0.03]))
+        found.append(before.corrected(imu, step, R, R_end, np.array([1.0, 0.2, -0.1]), before.gyroscope))
+    whole, parted = found
+    for name in ("velocity", "gravity", "accel_bias", "covariance"):
+        np.testing.assert_allclose(getattr(parted, name), getattr(whole, name), atol=1e-9)
+    assert np.linalg.norm(whole.velocity - before.velocity) > 0.1

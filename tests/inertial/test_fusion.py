@@ -183,6 +183,35 @@ def test_wrong_axes_that_slipped_through_are_refused_on_the_way() -> None:
     assert not right.refusal
 
 
+@pytest.mark.parametrize("velocity", ["registration", "integrated"])
+def test_it_is_judged_by_thirty_scans(velocity: str) -> None:
+    """Not by fewer; constant velocity has something to say from the third on. An integrated speed is the user's wish."""
+    drive = walk()
+    wrong = extrinsics_of(drive) @ se3.make(so3.exp(np.array([np.pi / 2, 0, 0])), np.zeros(3))
+    motion, refused = motion_of(drive, T=wrong, velocity=velocity), []
+    for stamp, pose in zip(*truth_of(drive), strict=True):
+        motion.correct(int(stamp), pose, motion.sweep(int(stamp), Span()))
+        refused.append(bool(motion.refusal))
+    assert (refused.index(True) if any(refused) else None) == (31 if velocity == "registration" else None)
+
+
+@pytest.mark.parametrize("scans", [1, 40])
+def test_it_goes_on_where_it_was_left(scans: int) -> None:
+    drive = walk()
+    stamps, poses = truth_of(drive)
+    whole = motion_of(drive)
+    for stamp, pose in zip(stamps[:scans], poses[:scans], strict=True):
+        whole.correct(int(stamp), pose, whole.sweep(int(stamp), SPAN))
+    again = motion_of(drive)
+    again.restore(whole.state())
+    for stamp, pose in zip(stamps[scans:60], poses[scans:60], strict=True):
+        priors = [motion.sweep(int(stamp), SPAN) for motion in (whole, again)]
+        np.testing.assert_array_equal(priors[0].poses, priors[1].poses)
+        for motion, prior in zip((whole, again), priors, strict=True):
+            motion.correct(int(stamp), pose, prior)
+    assert whole.prior_errors() == again.prior_errors()
+
+
 def test_velocity_from_registration_beats_integrated_velocity() -> None:
     """The thesis' two rules: 0.092 against 0.927 there."""
     drive = drone()

@@ -10,7 +10,7 @@ from lslam.geometry import se3, so3
 from lslam.inertial.agreement import check_agreement
 from lslam.inertial.estimate import ImuEstimate
 from lslam.inertial.gyroscope import Gyroscope
-from lslam.inertial.initialise import _is_standing
+from lslam.inertial.initialise import _is_standing, _path_of_force
 from lslam.inertial.kalman import update
 from lslam.inertial.stream import ImuRefusedError
 from lslam.types.imu import ImuStream
@@ -110,3 +110,34 @@ def test_a_second_of_too_few_samples_or_scans_tells_of_no_standing(samples: int,
     imu = ImuStream(stamps, np.tile([0.0, 0, 9.8], (samples, 1)), np.zeros((samples, 3)))
     scans = np.array([0, 600_000_000, 900_000_000, 1_650_000_000])[first_scan:]
     assert _is_standing(imu, scans, np.tile(np.eye(4), (len(scans), 1, 1)))[0] == stands
+
+
+def test_the_first_speed_is_as_sure_as_the_scans_show_a_path_without_noise() -> None:
+    """A sensor at rest whose places are seen with white noise of 0.2 m: the speed that they fit errs by as much as is said."""
+    stamps = np.arange(0, 3_100_000_000, IMU_NS)
+    imu = ImuStream(stamps, np.tile([0.0, 0.0, 9.8], (len(stamps), 1)), np.zeros((len(stamps), 3)))
+    known = ImuEstimate(np.zeros(3), np.array([0, 0, -9.8]), np.zeros(3), Gyroscope(np.zeros(3)), np.zeros((9, 9)))
+    rng, found = np.random.default_rng(0), []
+    for _ in range(200):
+        noise = 0.2 * rng.normal(size=(31, 3))
+        poses = se3.make(np.tile(np.eye(3), (31, 1, 1)), noise - noise[0])
+        velocity, _, sigma = _path_of_force(imu, poses, SCAN_NS * np.arange(31), known, 3.0)
+        # Where the first place lies is taken as known: what it is wrong by is no noise of the path.
+        t = 0.1 * np.arange(30)
+        found.append((np.linalg.norm(velocity + (t.sum() / (t @ t)) * noise[0]), sigma))
+    errors, sigmas = np.sqrt(np.mean(np.square(found), axis=0))
+    assert errors == pytest.approx(np.sqrt(3) * 0.2 / np.sqrt(t @ t), rel=0.1)
+    assert errors < sigmas < 1.6 * errors
+
+
+def test_turns_that_hardly_fit_better_at_the_edge_tell_nothing_of_the_clock() -> None:
+    """A turn that grows evenly, all but, felt 0.3 s too late: the best of a quarter of a second is none."""
+    stamps = np.arange(0, 13_000_000_000, IMU_NS)
+    t, scans = 1e-9 * stamps, SCAN_NS * np.arange(5, 125)
+    growth, bias = np.array([0.0, 0.05, 0.2]), np.array([0.01, -0.02, 0.005])
+    imu = ImuStream(stamps + 300_000_000, np.zeros((len(t), 3)), np.outer(t + 0.02 * t**2, growth) + bias)
+    angles = np.outer(0.5 * (1e-9 * scans) ** 2 + 0.02 / 3 * (1e-9 * scans) ** 3, growth)
+    found = check_agreement(imu, np.eye(4), scans, se3.make(so3.exp(angles), np.zeros((120, 3))), None)
+    assert found.is_judged
+    assert found.correlation > 0.999
+    assert found.offset_s == 0.0

@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 
 from lslam.config.loops import LoopsConfig
 from lslam.config.registration import RegistrationConfig
-from lslam.geometry import se3
+from lslam.geometry import se3, so3
 from lslam.loops import verify
 from lslam.loops.place import Place, make_place
-from lslam.loops.search import _peaks, find_starts
+from lslam.loops.search import LARGE, _peaks, find_starts
 from lslam.loops.verify import Comparison, Verifier
 from lslam.preprocessing.prepare import PreparedPoints
 from lslam.registration.gaussian_map import GaussianMap
@@ -175,3 +175,27 @@ def test_a_place_knows_what_stands_up() -> None:
     # Across a wall the scatter of a voxel is the noise of a point.
     thinnest = np.sqrt(made.upright.scatter[:, [0, 3]].min(axis=1))
     assert np.median(thinnest) == pytest.approx(NOISE, rel=0.5)
+
+
+@pytest.mark.parametrize(("degrees", "stands"), [(23.0, False), (27.0, True)])
+def test_a_slope_of_twenty_five_degrees_is_the_steepest_ground(degrees: float, stands: bool) -> None:
+    """Seen across and along it: roofs and ramps below that fit wherever one is."""
+    flat = np.mgrid[-15:15:0.1, -15:15:0.1].reshape(2, -1).T
+    for axis in ([1.0, 0.0, 0.0], [0.6, -0.8, 0.0]):
+        plane = np.column_stack([flat, np.zeros(len(flat))]) @ so3.exp(np.deg2rad(degrees) * np.array(axis)).T
+        made = make_place(plane.astype(np.float32), RegistrationConfig())
+        # Voxels that the plane hardly touches have no surface, and stand.
+        share = len(made.standing) / (len(made.standing) + len(made.floor))
+        assert share == 1.0 if stands else share < 0.4
+
+
+@pytest.mark.parametrize(("metres", "support"), [(0.28, 1.0), (0.32, 0.0)])
+def test_what_stands_supports_a_start_within_two_kernels(metres: float, support: float) -> None:
+    """A kernel ends 0.15 m wide: a wall that registration left 30 cm beside the other is not the same."""
+    along, up = np.mgrid[-12:12:0.1, 0:6:0.1].reshape(2, -1)
+    wall = np.column_stack([along, np.full_like(along, 8.05), up]).astype(np.float32)
+    a, b = (make_place(wall, RegistrationConfig()) for _ in range(2))
+    seen = LARGE.cover(a.standing, a.floor).ravel() > 0
+    T = se3.make(np.eye(3), np.array([0.0, metres, 0.0]))
+    found = Verifier(LoopsConfig(), RegistrationConfig())._support(a, b.upright, seen, T)
+    assert found == pytest.approx(support, abs=0.05)

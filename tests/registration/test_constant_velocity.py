@@ -112,6 +112,14 @@ def test_refining_finds_the_velocity_that_the_middle_tells(span: Span) -> None:
     assert motion.refine(single, 4 * TENTH, poses[4]) is single
 
 
+@pytest.mark.parametrize("span", SPANS)
+def test_the_first_sweep_has_no_motion_to_refine(span: Span) -> None:
+    """Nothing was registered before it: what it was given stays, wherever it is found."""
+    twists = np.linspace(-0.4, 0.4, 5)[:, None] * TWIST
+    prior = MotionPrior(np.linspace(span.begin_s, span.begin_s + 0.1, 5), poses(3)[2] @ se3.exp(twists))
+    assert ConstantVelocity().refine(prior, TENTH, poses(4)[3]) is prior
+
+
 def test_a_misplaced_scan_is_not_taken_for_a_velocity_and_a_lasting_change_is() -> None:
     """At 30 m/s, one scan half a metre too far: 50 m/s2 no sensor has. What the next step says again is believed."""
     most = ConstantVelocity.MAX_ACCELERATION * 0.1**2

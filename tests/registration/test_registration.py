@@ -20,6 +20,7 @@ from lslam.config.registration import RegistrationConfig
 from lslam.errors import InputError
 from lslam.recovery.policies import RecoveringRegistration as Registration
 from lslam.registration.registration import MIN_SOURCE_POINTS
+from lslam.registration.solver import RegistrationResult
 
 Floats = NDArray[np.float64]
 
@@ -233,3 +234,22 @@ def test_the_first_step_is_found_beside_posts_that_repeat(metres: float) -> None
     result = registration.register(view(metres))
     assert result.ok
     np.testing.assert_allclose(result.T_world_lidar[:3, 3], [metres, 0, 0], atol=0.03)
+
+
+@pytest.mark.parametrize(
+    ("target", "scans", "is_believed"),
+    [("map", 5, True), ("map", 6, False), ("keyframe", 6, False), ("scan", 60, True)],
+)
+def test_a_map_that_fills_asks_for_less_overlap_than_one_that_is_filled(
+    target: str, scans: int, is_believed: bool
+) -> None:
+    """A share between the two limits; a target of one scan never fills."""
+    config = RegistrationConfig.model_validate(
+        {"target": target, "start_scans": 5, "start_overlap": 0.2, "min_overlap": 0.6, "min_inliers": 0.1}
+    )
+    registration = Registration(config)
+    registration.inserted = scans
+    result = RegistrationResult(np.eye(4), source_points=100, matched=40, inliers=40)
+    judged = registration.judged(result, np.eye(4))
+    assert judged.ok == is_believed
+    assert ("only 40% of the points overlap the map" in judged.reason) == (not is_believed)

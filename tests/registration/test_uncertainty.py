@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -142,3 +144,15 @@ def test_a_map_is_as_old_as_the_way_over_which_it_is_seen() -> None:
     before = driving.map_age
     driving.add(result(200.0, ok=False))
     assert driving.map_age == before, "a scan that failed is not in the map"
+
+
+def test_covariances_do_not_ask_where_the_world_begins() -> None:
+    """The first sweep's tilt swings what lies ahead about the first place, not about the origin."""
+    rng = np.random.default_rng(4)
+    sweep = 1e-6 * np.cov(rng.normal(size=(6, 50)))
+    here, far = PoseUncertainty(), PoseUncertainty()
+    for k in range(6):
+        x = 3.0 * k
+        moved = dataclasses.replace(result(x), T_world_lidar=result(x).T_world_lidar.copy())
+        moved.T_world_lidar[:3, 3] += [500.0, -300.0, 20.0]
+        np.testing.assert_allclose(far.add(moved, sweep), here.add(result(x), sweep), rtol=1e-9)
