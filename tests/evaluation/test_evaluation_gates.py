@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 
 from lslam.errors import InputError
 from lslam.evaluation.associate import associate
-from lslam.evaluation.frames import body_rotation, main_axis
+from lslam.evaluation.frames import R_BODY_CAMERA, body_rotation, main_axis, reconcile
 from lslam.evaluation.thesis import planar
 from lslam.evaluation.time_offset import _peaks, estimate_offset
+from lslam.geometry import se3, so3
 from lslam.types.trajectory import Trajectory
 
 Floats = NDArray[np.float64]
@@ -88,6 +89,37 @@ def test_bodies_that_never_move_together_have_no_rotation_between_them() -> None
     late = straight(np.column_stack([np.maximum(k, 30), 0 * k]), np.maximum(k, 30) / 20)
     assert body_rotation(early, late) is None
     np.testing.assert_allclose(body_rotation(early, early), np.eye(3), atol=1e-12)
+
+
+@pytest.mark.parametrize(("degrees", "is_determined"), [(22.0, False), (26.0, True)])
+def test_bodies_that_move_to_either_side_have_a_rotation_between_them(degrees: float, is_determined: bool) -> None:
+    """Without a turn, a fifth of what goes ahead must go aside: steps 24.1 deg to the left and right of it."""
+    aside = np.deg2rad(degrees) * np.where(np.arange(60) % 2, 1.0, -1.0)
+    places = np.cumsum(np.column_stack([np.cos(aside), np.sin(aside)]), axis=0)
+    truth = straight(places, np.zeros(60))
+    mounted = so3.from_euler_rpy(np.array([0.4, -0.3, 1.2]))
+    estimate = truth.copy()
+    estimate[:, :3, :3] = mounted.T
+    found = body_rotation(estimate, truth)
+    assert (found is not None) == is_determined
+    if found is not None:
+        np.testing.assert_allclose(found, mounted, atol=1e-9)
+
+
+@pytest.mark.parametrize("is_camera", [(True, False), (False, True)])
+def test_who_is_in_the_camera_frame_is_named(is_camera: tuple[bool, bool]) -> None:
+    """And converted to the other, when the calibration is known."""
+    k = np.arange(60)
+    lidar = straight(np.column_stack([k, 5 * np.cos(k / 15)]), np.arctan2(-np.sin(k / 15) / 3, np.ones(60)))
+    T_cam0_lidar = se3.make(R_BODY_CAMERA.T, np.array([0.1, -0.2, -0.3]))
+    camera = T_cam0_lidar @ lidar @ se3.inverse(T_cam0_lidar)
+    given = [camera if is_one else lidar for is_one in is_camera]
+    who, other = ("estimate", "ground truth") if is_camera[0] else ("ground truth", "estimate")
+    fact = f"{who} is in the camera frame (advances along +z), {other} in the LiDAR frame (advances along +x)"
+    unknown, known = (reconcile(*given, ("unknown", "unknown"), T) for T in (None, T_cam0_lidar))
+    assert unknown.notes[0].startswith(f"WRONG FRAMES: {fact}")
+    assert known.notes == [f"{fact}: {who} converted to the LiDAR with T_cam0_lidar"]
+    np.testing.assert_allclose([known.estimate, known.truth], [lidar, lidar], atol=1e-9)
 
 
 def paced(speeds: Floats) -> Trajectory:

@@ -165,3 +165,12 @@ def test_the_rival_is_what_the_parameter_that_varied_says_alone(
     name, r2 = rival(law)
     assert name == said
     assert 0.97 < r2 < 1.0
+
+
+@pytest.mark.parametrize("bad", [(np.nan, 0.3), (2.0, np.inf), (np.nan, np.nan)])
+def test_points_without_a_value_are_no_observations(bad: tuple[float, float]) -> None:
+    points, times = np.vstack([grid(), bad]), np.append(152.2 * grid()[:, 1] / grid()[:, 0], 77.0)
+    law = fit_law("product", ("x", "y"), points, times)
+    assert law is not None
+    assert law.coefficients == pytest.approx([152.2])
+    assert len(law.points) == len(grid())

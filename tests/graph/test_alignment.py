@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from graph_builders import truth
+from scipy.stats import chi2
 
 from lslam.geometry import se3, so3
 from lslam.graph.alignment import align
@@ -87,3 +88,16 @@ def test_half_a_metre_is_the_shortest_way_that_has_a_heading(metres: float, is_t
     assert (found is not None) == is_told
     if found is not None:
         np.testing.assert_allclose(se3.apply(found.T_enu_world, to_and_fro), fixes, atol=1e-3)
+
+
+@pytest.mark.parametrize(("sigma", "slack"), [(0.1, 0.0), (5.0, 0.0), (0.3, 2.0)])
+def test_a_fix_is_believed_within_its_own_sigma_and_what_odometry_drifts(sigma: float, slack: float) -> None:
+    """Three axes at 99.9 %: one fix of two hundred that is so far off by itself."""
+    limit = np.sqrt(chi2.ppf(0.999, 3)) * np.hypot(sigma, slack)
+    for share, is_believed in ((0.95, True), (1.05, False)):
+        fixes = se3.apply(T_ENU_WORLD, PATH)
+        fixes[60] += [0.0, share * limit, 0.0]
+        found = align(PATH, fixes, np.full((200, 3), sigma), np.full(200, slack), UP, 1e-6, 5)
+        assert found is not None
+        assert found.believed[60] == is_believed
+        assert found.believed.sum() == 199 + is_believed

@@ -20,15 +20,15 @@ VERTICAL = np.array([1.0, 1.0, 1.8])
 METRE = np.diag([1e-4] * 3 + [np.radians(0.5) ** 2 / 1e4] * 3)
 
 
-def drift_of(path: Floats) -> DriftOfFixes:
+def drift_of(path: Floats, metre: Floats = METRE) -> DriftOfFixes:
     """Odometry that claims a millimetre a metre, and a walk of factor 1 along `path` (F, 3), from fix to fix."""
     steps = np.diff(path, axis=0)
     unit = np.zeros((len(path), 6, 6))
     for i, step in enumerate(steps):
         J = np.eye(6)
         J[:3, 3:] = [[0, step[2], -step[1]], [-step[2], 0, step[0]], [step[1], -step[0], 0]]
-        unit[i + 1] = J @ unit[i] @ J.T + np.linalg.norm(step) * METRE
-    return DriftOfFixes(1e-2 * unit, unit, path, METRE, np.arange(len(path)))
+        unit[i + 1] = J @ unit[i] @ J.T + np.linalg.norm(step) * metre
+    return DriftOfFixes(1e-2 * unit, unit, path, metre, np.arange(len(path)))
 
 
 def fixes(
@@ -134,8 +134,9 @@ def test_what_an_early_place_errs_by_a_later_one_errs_by_too() -> None:
     """Against drives drawn step by step; rates that last come to the walk's size at the end of the way."""
     angle = np.linspace(0, 2, 6)
     path = np.column_stack([40 * np.cos(angle), 40 * np.sin(angle), 3 * angle])
-    rng = np.random.default_rng(0)
-    root = np.linalg.cholesky(1e4 * METRE)
+    # Turns move what lies ahead by more than the way itself errs.
+    rng, metre = np.random.default_rng(0), np.diag([1e-4] * 3 + [4e-6] * 3)
+    root = np.linalg.cholesky(1e4 * metre)
     drawn = np.zeros((20_000, 6, 3))
     turn = np.zeros((20_000, 3))
     for i, step in enumerate(np.diff(path, axis=0)):
@@ -143,7 +144,7 @@ def test_what_an_early_place_errs_by_a_later_one_errs_by_too() -> None:
         drawn[:, i + 1] = drawn[:, i] + np.cross(turn, step) + d[:, :3]
         turn += d[:, 3:]
     flat = drawn.reshape(20_000, -1)
-    expected = 1e4 * fix_noise._shared(drift_of(path).unit, path)
+    expected = 1e4 * fix_noise._shared(drift_of(path, metre).unit, path)
     np.testing.assert_allclose(flat.T @ flat / 20_000, expected, atol=0.04 * expected.max())
     way = np.linalg.norm(np.diff(path, axis=0), axis=1).sum()
     lasting = fix_noise._lasting(np.diag([1e-4] * 3 + [0.0] * 3), path)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lslam.geometry import se3, so3
-from lslam.inertial.agreement import Agreement, check_agreement
+from lslam.inertial.agreement import Agreement, _hardly_turning, check_agreement
 from lslam.inertial.stream import ImuRefusedError
 from lslam.types.imu import ImuStream
 
@@ -71,3 +71,21 @@ def test_turns_that_drown_in_noise_are_judged_by_nobody() -> None:
         assert not compared(1.5, seed, weave_deg_s=25.0, weave_hz=3.3).is_judged
         with pytest.raises(ImuRefusedError, match=r"check its unit"):
             compared(0.2, seed, 57.3, weave_deg_s=0.8)
+
+
+@pytest.mark.parametrize(
+    ("felt", "shown", "is_refused"), [(11.5, 0.5, False), (12.5, 0.5, True), (19.0, 10.0, False), (21.0, 10.0, True)]
+)
+def test_a_gyroscope_that_turns_twice_as_much_as_anything_shows_is_refused(
+    felt: float, shown: float, is_refused: bool
+) -> None:
+    """Deg/s about one axis; of less than twelve nothing is told. Scans need not have turned about the others."""
+    side = np.where(np.arange(40) % 2, 1.0, -1.0)[:, None] * [0.0, 0.0, 1.0]
+    rates = np.deg2rad(felt) * side + [0.01, 0.0, 0.0], np.deg2rad(shown) * side
+    if is_refused:
+        with pytest.raises(ImuRefusedError, match=f"vary by {felt:.1f} deg/s, those of the scans by {shown:.1f}"):
+            _hardly_turning(*rates, np.eye(4))
+    else:
+        found = _hardly_turning(*rates, np.eye(4))
+        assert not found.is_judged
+        np.testing.assert_allclose(found.gyro_bias, [0.01, 0.0, 0.0], atol=1e-12)

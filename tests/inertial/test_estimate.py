@@ -71,12 +71,15 @@ def test_instants_within_a_step_say_nothing_more() -> None:
         np.array([3.0, -1, 0.2]), np.array([0, 0, -GRAVITY]), np.zeros(3), Gyroscope(np.zeros(3)), np.eye(9)
     )
     R = so3.exp(np.array([0.3, -0.5, 1.1]))
-    found = []
+    found, taught = [], []
     for instants in (stamps[[0, -1]], stamps[[0, 10, 15, -1]]):
         step = before.over(imu, instants)
         R_end = R @ step.rotations[-1] @ so3.exp(np.array([0.02, -0.01, 0.03]))
+        taught.append(before.taught(step, R, R_end))
         found.append(before.corrected(imu, step, R, R_end, np.array([1.0, 0.2, -0.1]), before.gyroscope))
     whole, parted = found
     for name in ("velocity", "gravity", "accel_bias", "covariance"):
         np.testing.assert_allclose(getattr(parted, name), getattr(whole, name), atol=1e-9)
     assert np.linalg.norm(whole.velocity - before.velocity) > 0.1
+    for name in ("bias", "axes", "covariance", "rate_variance"):
+        np.testing.assert_allclose(getattr(taught[1], name), getattr(taught[0], name), atol=1e-12)

@@ -39,6 +39,11 @@ def motion_of(
     return InertialMotion(begun.imu if imu is None else imu, T, begun.estimate, config)
 
 
+def imu_until(imu: ImuStream, end_ns: int) -> ImuStream:
+    keep = imu.stamps_ns <= end_ns
+    return ImuStream(imu.stamps_ns[keep], imu.accel[keep], imu.gyro[keep])
+
+
 def errors(
     motion: MotionModel, drive: SimulatedDrive, failed: range = range(0), every: int = 1, span: Span = SPAN
 ) -> tuple[Floats, Floats]:
@@ -193,6 +198,35 @@ def test_it_is_judged_by_thirty_scans(velocity: str) -> None:
         motion.correct(int(stamp), pose, motion.sweep(int(stamp), Span()))
         refused.append(bool(motion.refusal))
     assert (refused.index(True) if any(refused) else None) == (31 if velocity == "registration" else None)
+
+
+def test_one_scan_in_twenty_is_compared_unless_the_imu_is_silent() -> None:
+    """Then constant velocity predicts it anyway, and before the second scan there is none."""
+    drive = walk()
+    stamps, poses = truth_of(drive)
+    for motion, expected in (
+        (motion_of(drive), [19, 39, 59, 79, 99]),
+        (motion_over_a_gap(drive, 3_800_000_000, 4_200_000_000), [19, 59, 79, 99]),
+    ):
+        compared = []
+        for k, (stamp, pose) in enumerate(zip(stamps, poses, strict=True)):
+            compared += [k] if motion.is_compared(int(stamp), SPAN) else []
+            motion.correct(int(stamp), pose, motion.sweep(int(stamp), SPAN))
+        assert compared == expected
+
+
+def test_a_sweep_is_refined_by_an_imu_that_ends_with_it() -> None:
+    """What comes after a sweep is not asked for."""
+    drive = walk()
+    stamps, poses = truth_of(drive)
+    imu, end_ns = stream_of(drive), int(stamps[30]) + 101_000_000
+    whole, ending = motion_of(drive), motion_of(drive, imu_until(imu, end_ns))
+    refined = []
+    for motion in (whole, ending):
+        for stamp, pose in zip(stamps[:30], poses[:30], strict=True):
+            motion.correct(int(stamp), pose, motion.sweep(int(stamp), SPAN))
+        refined.append(motion.refine(motion.sweep(int(stamps[30]), SPAN), int(stamps[30]), poses[30]))
+    np.testing.assert_array_equal(refined[0].poses, refined[1].poses)
 
 
 @pytest.mark.parametrize("scans", [1, 40])

@@ -88,6 +88,8 @@ def test_stamps_that_are_late_are_moved_back() -> None:
     for wrong in (0.02, -0.035):
         found = begun(drive, late(stream_of(drive), wrong))
         assert found.offset_s == pytest.approx(-wrong, abs=2e-3)
+        right = begun(drive).imu.stamps_ns
+        assert np.abs(found.imu.stamps_ns - right[: len(found.imu)]).max() < 2_500_000
     assert begun(drive).offset_s == pytest.approx(0.0, abs=2e-3)
 
 
