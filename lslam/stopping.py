@@ -1,15 +1,20 @@
-"""SIGINT and SIGTERM as a wish: a run looks for it between scans and stages; what has no such places ends where it is."""
+"""SIGINT and SIGTERM as a wish: a run looks for it wherever its loops turn; what has no such places ends where it is."""
 
 from __future__ import annotations
 
 import signal
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from contextvars import ContextVar
 from itertools import dropwhile, islice
 from threading import Timer, current_thread, main_thread
 from types import FrameType
-from typing import NoReturn
+from typing import NoReturn, TypeVar
+
+from lslam.errors import InterruptedRunError
+
+T = TypeVar("T")
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 AGAIN_S = 0.01
@@ -107,6 +112,36 @@ def heeded(numbers: Sequence[int] = SIGNALS, may_force: bool = True) -> Iterator
         for number, handler in previous:
             if signal.getsignal(number) == stop.on_signal:  # not what was decided in the block
                 signal.signal(number, handler)
+
+
+_asked: ContextVar[tuple[Callable[[], bool], str]] = ContextVar("asked", default=(lambda: False, ""))
+
+
+@contextmanager
+def asking(should_stop: Callable[[], bool], said: str) -> Iterator[None]:
+    """In the block, in this thread, `check_stop` asks `should_stop`: so loops far below need not be handed it.
+
+    said : the sentence when it says so
+    """
+    token = _asked.set((should_stop, said))
+    try:
+        yield
+    finally:
+        _asked.reset(token)
+
+
+def check_stop() -> None:
+    """Raise InterruptedRunError when the run at hand was asked to stop: for loops that take long, once a turn."""
+    should_stop, said = _asked.get()
+    if should_stop():
+        raise InterruptedRunError(said)
+
+
+def checking(items: Iterable[T]) -> Iterator[T]:
+    """The items, with a `check_stop` before each."""
+    for item in items:
+        check_stop()
+        yield item
 
 
 def is_too_late() -> None:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from lslam.geometry import se2
 from lslam.graph.chi_square import quantile
 from lslam.graph.robust import truncated_weights
+from lslam.stopping import checking
 from lslam.types.building_match import BuildingMatch
 
 Floats = NDArray[np.float64]
@@ -74,7 +75,7 @@ def solve_buildings(
     solution = _linear(len(middles), owners, measured, weights, belief)
     ratio = _squared(solution, owners, measured, weights) / limits
     mu = 1.0 / (2.0 * float(ratio.max(initial=1.0)) - 1.0)
-    for _ in range(ROUNDS if (ratio > 1).any() else 0):
+    for _ in checking(range(ROUNDS if (ratio > 1).any() else 0)):
         trust = truncated_weights(ratio, mu)
         solution = _linear(len(middles), owners, measured, trust[:, None, None] * weights, belief)
         ratio = _squared(solution, owners, measured, weights) / limits
@@ -102,7 +103,7 @@ def agreeing(
     weights = np.array([_in_map(m.information, poses[m.keyframe][2]) for m in matches]).reshape(-1, 3, 3)
     owners = np.array([m.building for m in matches], np.intp)
     found = np.zeros(len(matches), bool)
-    for k, match in enumerate(matches):
+    for k, match in enumerate(checking(matches)):
         values, axes = np.linalg.eigh(weights[k])
         own = axes[:, values > FREE * values[-1]]
         others = np.flatnonzero((owners == match.building) & (np.arange(len(matches)) != k))

@@ -17,6 +17,7 @@ from lslam.config.graph import GraphConfig
 from lslam.geometry import noise, se3, so3
 from lslam.graph.chi_square import quantile
 from lslam.graph.problem import PoseGraph
+from lslam.stopping import check_stop
 from lslam.types.constraint import Constraint
 
 Floats = NDArray[np.float64]
@@ -127,6 +128,7 @@ def _voted_out(graph: PoseGraph, ends: Ends, drift: Drift, limit: float) -> list
     alive = np.ones(len(where), bool)
     gone: list[tuple[int, float]] = []
     while True:
+        check_stop()
         asked = np.where(alive[others], votes, 0.0)
         total = asked.sum(1)
         share = np.where(total > 0, (agrees * asked).sum(1) / np.where(total > 0, total, 1.0), 1.0)

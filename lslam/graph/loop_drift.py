@@ -21,6 +21,7 @@ from lslam.graph.drift import chains
 from lslam.graph.pose_graph import check_graph, with_distances
 from lslam.graph.problem import DriftClaim, PoseGraph
 from lslam.graph.rates import LASTING, SIZES, hats, rate_roots, set_straight
+from lslam.stopping import checking
 from lslam.types.constraint import Constraint
 
 Floats = NDArray[np.float64]
@@ -112,7 +113,7 @@ class _Fit:
         seen = [part @ part.T for part in (self._rows @ root for root in roots)]
         drifted = [np.zeros_like(self._known)] + [size**2 * part for part in seen for size in SIZES]
         self.unlikeliness = np.array(
-            [[_unlikely(self._walked(walk) + D, self._off) for D in drifted] for walk in WALKS]
+            [[_unlikely(self._walked(walk) + D, self._off) for D in drifted] for walk in checking(WALKS)]
         )
 
     def likeliest(self) -> tuple[Floats, Floats, float]:
@@ -177,7 +178,7 @@ def _effects(poses: Floats, distances: Floats, turned: Floats) -> Iterator[tuple
     passed = np.diff(distances)[:, None] * hats(distances, _apart(distances))
     passed, turned = (np.concatenate([0.0 * rows[:1], rows]) for rows in (passed, turned))
     before = np.zeros((6, passed.shape[1], 6))
-    for begin in range(0, len(poses), PART):
+    for begin in checking(range(0, len(poses), PART)):
         k = slice(begin, min(begin + PART, len(poses)))
         step = np.tile(np.eye(6), (k.stop - k.start, 1, 1))
         step[:, :3, :3] = turned[k]

@@ -12,6 +12,7 @@ from lslam.config.graph import GraphConfig
 from lslam.errors import GraphError
 from lslam.geometry import noise
 from lslam.graph.factors import WANDER
+from lslam.stopping import check_stop, checking
 
 Floats = NDArray[np.float64]
 
@@ -22,14 +23,16 @@ BATCH = 10
 def solve(factors: Any, values: Any, config: GraphConfig) -> Any:
     """The values at which `factors` fit best, from `values` on.
 
-    Raises GraphError when the graph is singular or the solution is not finite.
+    Raises GraphError when the graph is singular or the solution is not finite, InterruptedRunError as `check_stop`.
     """
     import gtsam
 
+    check_stop()
     try:
         is_dogleg = config.optimizer == "dogleg"
         params: Any = gtsam.DoglegParams() if is_dogleg else gtsam.LevenbergMarquardtParams()
         params.setMaxIterations(config.max_iterations)
+        params.iterationHook = lambda iteration, before, after: check_stop()
         optimizer: Any = gtsam.DoglegOptimizer if is_dogleg else gtsam.LevenbergMarquardtOptimizer
         found = optimizer(factors, values, params).optimize()
         error = float(factors.error(found))
@@ -61,6 +64,7 @@ def solve_incrementally(factors: Any, values: Any, count: int) -> Any:
     solver = gtsam.ISAM2(params)
     try:
         for begin in range(0, count, BATCH):
+            check_stop()
             part, start = gtsam.NonlinearFactorGraph(), gtsam.Values()
             for k in range(begin, min(begin + BATCH, count)):
                 start.insert(k, values.atPose3(k))
@@ -103,7 +107,7 @@ def marginal_blocks(factors: Any, values: Any, keys: Iterable[int]) -> Floats:
     wanted = list(keys)
     try:
         known = gtsam.Marginals(factors, values)
-        return np.stack([known.marginalCovariance(key) for key in wanted])
+        return np.stack([known.marginalCovariance(key) for key in checking(wanted)])
     except RuntimeError:
         # It gives up where neighbouring unknowns are known very differently well, as the roll of a straight path is.
         return scaled_blocks(factors, values, wanted)
@@ -127,7 +131,7 @@ def scaled_blocks(factors: Any, values: Any, keys: list[int]) -> Floats:
     except RuntimeError as failure:
         raise GraphError(f"the pose graph has no covariances: {_first_line(failure)}") from None
     blocks = []
-    for key in keys:
+    for key in checking(keys):
         begin = begins[key]
         units = np.zeros((columns, 6))
         units[begin : begin + 6] = np.diag(scale[begin : begin + 6])

@@ -21,6 +21,7 @@ from lslam.graph.drift_fit import DriftFit, Sizes, WallSightings
 from lslam.graph.factors import PLANAR
 from lslam.graph.problem import DriftClaim, PoseGraph
 from lslam.graph.rates import MEMORY, SIZES, hats, rate_roots, set_straight, walk_root
+from lslam.stopping import checking
 
 Floats = NDArray[np.float64]
 
@@ -129,7 +130,7 @@ def _found(
 def _likeliest(fit: DriftFit, roots: Sequence[Floats]) -> Sizes:
     """The sizes with which what was seen is likeliest."""
     best, least = Sizes(SCALES[0], roots[0]), np.inf
-    for root in roots:
+    for root in checking(roots):
         found = np.array([fit.unlikeliness(noise, root, SIZES) for noise in SCALES])
         noise, size = divmod(int(found.argmin()), len(SIZES))
         if found.min() < least - quantile(SELDOM, 1):

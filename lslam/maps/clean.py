@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from lslam.geometry import se3
 from lslam.maps.things import Floor, floor_of, standing, things_of, whole
+from lslam.stopping import checking
 from lslam.types.state import State
 
 # Scans before and after that are asked: at 10 Hz a pedestrian has left its place after 0.3 s, a lorry after 2.5 s. Every
@@ -103,7 +104,7 @@ class Cleaner:
 
     def finish(self) -> list[PosedScan]:
         """The scans that are left."""
-        return [scan for _ in range(self._count - self._decided) for scan in self._decide()]
+        return [scan for _ in checking(range(self._count - self._decided)) for scan in self._decide()]
 
     def state(self) -> State:
         """What `restore` needs to go on from here; the scans themselves are to be added again."""

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from lslam.errors import ConfigError, InputError
 from lslam.maps.sorted_runs import SortedRuns, StoredRows
+from lslam.stopping import checking
 from lslam.types.cloud import BLOCK, CloudBlock, in_memory
 from lslam.types.state import State
 
@@ -74,7 +75,7 @@ class MergedMap:
             yield CloudBlock(unpack(rows, self._origin, self.voxel), intensity)
 
     def _pieces(self) -> Iterator[NDArray[np.int64]]:
-        for start in range(0, len(self), BLOCK):
+        for start in checking(range(0, len(self), BLOCK)):
             stop = min(start + BLOCK, len(self))
             yield self._rows.read(start, stop) if isinstance(self._rows, StoredRows) else self._rows[start:stop]
 

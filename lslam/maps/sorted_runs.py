@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.errors import InputError, OutputError, cause
+from lslam.stopping import checking
 from lslam.types.state import State
 
 Rows = NDArray[np.int64]
@@ -84,7 +85,7 @@ class SortedRuns:
         whole.remove()
         cuts = self._cuts()
         begins = [0] * len(self._runs)
-        for cut in [*cuts, None]:
+        for cut in checking([*cuts, None]):
             parts = []
             for k, run in enumerate(self._runs):
                 end = len(run) if cut is None else run.first_not_below(cut)

@@ -26,6 +26,7 @@ from lslam.pipeline.graph_inputs import floor_planes, up_directions, world_up
 from lslam.pipeline.graph_outcome import BackEnd, Given, solve, unsolved, without_steady_drift
 from lslam.pipeline.osm_back_end import hold_by_buildings
 from lslam.pipeline.osm_source import OsmSource
+from lslam.stopping import checking
 from lslam.types.constraint import LoopCandidate, Turn
 from lslam.types.scan_result import ScanResult
 from lslam.types.sequence import Sequence
@@ -111,11 +112,11 @@ def _graph(given: Given) -> PoseGraph:
     if config.graph.information == "fitness":
         loops = [
             replace(loop, covariance=fitness_covariance(_fitness(store, loop.a, loop.b, loop.T_a_b), config.graph))
-            for loop in loops
+            for loop in checking(loops)
         ]
         known = [k.T_world_lidar for k in store.keyframes]
         steps = [se3.relative(a, b) for a, b in pairwise(known)]
-        fitness = [_fitness(store, k, k + 1, T) for k, T in enumerate(steps)]
+        fitness = [_fitness(store, k, k + 1, T) for k, T in enumerate(checking(steps))]
     ups = up_directions(store.keyframes, results, config.graph) if config.graph.gravity else []
     up = world_up(ups, store.keyframes)
     poses = np.stack([k.T_world_lidar for k in store.keyframes])

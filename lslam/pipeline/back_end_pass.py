@@ -28,6 +28,7 @@ from lslam.pipeline.graph_outcome import BackEnd
 from lslam.pipeline.levelling import find_level, level_results
 from lslam.pipeline.manifest import Manifest
 from lslam.pipeline.osm_source import OsmSource
+from lslam.stopping import asking
 from lslam.types.constraint import LoopCandidate
 from lslam.types.georeference import Georeference
 from lslam.types.run_record import RunRecord
@@ -45,8 +46,8 @@ def optimise_poses(
 ) -> BackEnd:  # fmt: skip
     """Put the final poses into `record`, and what the graph did into the manifest.
 
-    A run that was interrupted, or whose odometry is lost, keeps what it has; `should_stop` is asked between keyframes and
-    before the graph. `checkpoints` keep the loops that were found.
+    A run that was interrupted, or whose odometry is lost, keeps what it has; `should_stop` is asked between keyframes, before
+    the graph and wherever its loops turn. `checkpoints` keep the loops that were found.
     """
     if config.debug.drift:
         manifest.problems.append(drift.describe(config.debug))
@@ -65,10 +66,11 @@ def optimise_poses(
                     candidates = _loops(store, config, checkpoints, clocks, should_stop)
             if should_stop():
                 raise InterruptedRunError("interrupted before the pose graph")
+            with asking(should_stop, "interrupted before the pose graph was solved"):
+                done = run_back_end(sequence, record.results, store, config, candidates, record.turns, osm, clocks)
         except InterruptedRunError as error:
             manifest.interrupt(str(error))
             return BackEnd(record.results)
-        done = run_back_end(sequence, record.results, store, config, candidates, record.turns, osm, clocks)
     record.back_end_seconds = {store.keyframes[k].scan: clock.seconds for k, clock in sorted(clocks.items())}
     manifest.timings |= {
         f"{name.replace(' ', '_')}_s": seconds for name, seconds in clocks.totals().items() if name != "loops"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,12 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.config import Config
+from lslam.errors import InterruptedRunError
 from lslam.maps.merge import MapMerger
 from lslam.odometry.base import FeatureSource
 from lslam.pipeline.front_end import read_ahead
 from lslam.pipeline.map_checkpoints import MapCheckpoints
 from lslam.pipeline.map_pass import motion_within
 from lslam.preprocessing.features import Features
+from lslam.stopping import asking
 from lslam.types.scan_result import ScanResult
 from lslam.types.sequence import Sequence
 from lslam.types.state import State
@@ -73,7 +76,7 @@ def build_feature_map(
 ) -> FeatureCloud | None:  # fmt: skip
     """Less sharp edges and less planar points of every scan that was registered, in voxels of `loam.feature_map_voxel`.
 
-    None when `should_stop` said so before the last scan; `checkpoints` know then where to go on.
+    None when `should_stop` said so; `checkpoints` know then where to go on.
     """
     stamps = np.array([r.stamp_ns for r in results], np.int64)
     poses = np.stack([r.T_world_lidar for r in results])
@@ -96,4 +99,6 @@ def build_feature_map(
             motion = motion_within(loaded.scan, stamps, poses)
             maker.add(odometry.features_of(loaded.prepared, motion), result.T_world_lidar)
         on_step()
-    return maker.finish()
+    with suppress(InterruptedRunError), asking(should_stop, "interrupted"):
+        return maker.finish()
+    return None

@@ -11,6 +11,7 @@ from lslam.config.graph import GraphConfig
 from lslam.graph.problem import FloorPlane, UpDirection
 from lslam.keyframes.store import KeyframeStore
 from lslam.preprocessing.ground import levelling
+from lslam.stopping import checking
 from lslam.types.keyframe import Keyframe
 from lslam.types.scan_result import ScanResult
 
@@ -55,7 +56,7 @@ def world_up(ups: Sequence[UpDirection], keyframes: Sequence[Keyframe]) -> Float
 def floor_planes(store: KeyframeStore, config: GraphConfig) -> list[FloorPlane]:
     """The floor under each keyframe, where one is seen that lies level, as far below as usual."""
     planes = []
-    for keyframe in store.keyframes:
+    for keyframe in checking(store.keyframes):
         R, height = levelling(store.points(keyframe.number), ROUGHNESS, CELLS)
         normal = R[2]
         if not np.isfinite(height) or (keyframe.T_world_lidar[:3, :3] @ normal)[2] < np.cos(STEEPEST):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 
 from lslam.config import Config
 from lslam.config.map import MapConfig
+from lslam.errors import InterruptedRunError
 from lslam.geometry.interpolate import poses_at
 from lslam.maps.clean import Cleaner, PosedScan
 from lslam.maps.merge import MapMerger
@@ -21,6 +23,7 @@ from lslam.maps.top_view import top_view
 from lslam.pipeline.front_end import read_ahead
 from lslam.pipeline.map_checkpoints import MapCheckpoints
 from lslam.preprocessing.deskew import deskew_points, knots_over
+from lslam.stopping import asking
 from lslam.types.cloud import Cloud, in_memory
 from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan import Scan
@@ -48,8 +51,8 @@ def build_map(
 ) -> BuiltMap | None:  # fmt: skip
     """Merge every scan that was registered; bridged scans would draw their error into the map and stay out.
 
-    A map too large for memory is kept in a temporary folder in `spool` meanwhile. None when `should_stop` said so before
-    the last scan; `checkpoints` know then where to go on.
+    A map too large for memory is kept in a temporary folder in `spool` meanwhile. None when `should_stop` said so;
+    `checkpoints` know then where to go on.
     """
     section = config.map
     ego_box = section.ego_box or config.preprocess.ego_box
@@ -77,7 +80,9 @@ def build_map(
             maker.add(k, PosedScan(points, result.T_world_lidar, scan.intensity))
         if k >= done:
             on_step()
-    return maker.finish()
+    with suppress(InterruptedRunError), asking(should_stop, "interrupted"):
+        return maker.finish()
+    return None
 
 
 class MapMaker:

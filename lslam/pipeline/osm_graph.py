@@ -18,6 +18,7 @@ from lslam.graph.wall_drift import WallDrift, find_wall_drift, without_drift
 from lslam.keyframes.store import KeyframeStore
 from lslam.pipeline.osm_pass import Located, locate
 from lslam.priors.osm_prior import match_buildings
+from lslam.stopping import checking
 from lslam.types.stage_clock import KeyframeClocks
 
 log = logging.getLogger("lslam")
@@ -116,7 +117,7 @@ def sightings(located: Located, poses: Floats, config: Config) -> WallSightings:
     """Which walls of each building were seen from which keyframe, and where, with the keyframes at `poses` (K, 4, 4)."""
     osm, planar = located.osm, se2.of_se3(poses)
     rows: list[tuple[Floats, Floats]] = [(np.zeros((0, 2, 2)), np.zeros((0, 2), np.int64))]
-    for match in located.matches:
+    for match in checking(located.matches):
         at = match.pose if match.verdict == "accepted" else match.prior
         for one in match_buildings(match, at, np.zeros(2), osm, config.osm):
             if one.verdict == "accepted":

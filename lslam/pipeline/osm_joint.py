@@ -19,6 +19,7 @@ from lslam.keyframes.store import KeyframeStore
 from lslam.pipeline.building_pass import agreed, map_belief, middles_of, place_buildings
 from lslam.priors.baseline import flatten_scan, lay_building, lay_scan
 from lslam.priors.osm_map import OsmMap
+from lslam.stopping import checking
 from lslam.types.building_correction import CorrectedMap
 from lslam.types.building_match import BuildingMatch, KeyframeMatch, OsmMatches
 from lslam.types.stage_clock import KeyframeClocks, StageClock
@@ -63,7 +64,7 @@ def run_baseline(
     graph = replace(_believed(graph, solution), odometry=odometry, map_priors=(), start=None, start_sigma=None)
     middles = np.array([b.middle for b in osm.buildings]).reshape(-1, 2)
     poses, local, sights = graph.poses.copy(), list[BuildingMatch](), list[KeyframeMatch]()
-    for k in range(len(store)):
+    for k in checking(range(len(store))):
         sight, found = _match(k, store, poses[k], osm, config, clocks[k])
         sights.append(sight)
         local += found

@@ -29,6 +29,7 @@ from lslam.priors.osm_map import OsmMap
 from lslam.priors.osm_prior import match_buildings, match_keyframe, shares
 from lslam.priors.osm_track import OsmTrack
 from lslam.priors.wall_match import START_WALLS
+from lslam.stopping import checking
 from lslam.types.building_match import BuildingMatch, KeyframeMatch, OsmMatches
 from lslam.types.stage_clock import KeyframeClocks
 
@@ -123,7 +124,7 @@ def finish(
     doubts = iter(solution.map_reasons)
     judged = [_judged(m, next(doubts)) if m.verdict == "accepted" else m for m in located.matches]
     planar, local = se2.of_se3(poses), list[BuildingMatch]()
-    for match in judged:
+    for match in checking(judged):
         with clocks[match.keyframe].stage("building match"):
             local += match_buildings(match, planar[match.keyframe], solution.shift, located.osm, config)
     return OsmMatches(
@@ -170,7 +171,7 @@ def _along(
     """Match the keyframes `numbers` in turn; the track stands at the keyframe `before`, None at the first of them."""
     planar = se2.of_se3(poses)
     matches: list[KeyframeMatch] = []
-    for number in numbers:
+    for number in checking(numbers):
         if before is not None:
             step = se2.relative(planar[before], planar[number])
             track.move(step, float(np.linalg.norm(step[:2])))

@@ -15,6 +15,7 @@ from lslam.pipeline.osm_source import first_pose
 from lslam.priors.osm_map import OsmMap
 from lslam.priors.wall_match import WINDOW, find_heading
 from lslam.priors.walls import find_walls
+from lslam.stopping import checking
 
 Floats = NDArray[np.float64]
 
@@ -62,7 +63,7 @@ def sought_start(store: KeyframeStore, poses: Floats, osm: OsmMap, config: OsmCo
     poses : (K, 4, 4) of all keyframes in a level world; the first keyframe is the start
     """
     first, size, why = se2.of_se3(poses[0]), submap_size, ""
-    for _ in range(TRIES):
+    for _ in checking(range(TRIES)):
         number = min(size // 2, len(store) - 1)
         seen = see_walls(store, poses, number, size, config)
         walls = se2.apply(se2.relative(first, se2.of_se3(poses[number])), seen.walls)

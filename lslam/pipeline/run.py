@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -40,6 +41,7 @@ from lslam.pipeline.warned import hearing
 from lslam.pipeline.watch import RunOutcome, Watch
 from lslam.readers import open_sequence
 from lslam.readers.raw_drive import with_gnss, with_imu
+from lslam.stopping import asking
 from lslam.types.run_record import RunRecord
 from lslam.types.scan import Span
 from lslam.types.sequence import Sequence
@@ -227,18 +229,18 @@ def _map(folder: RunFolder, job: _Job, record: RunRecord) -> None:
     if not config.map.write or manifest.outcome == "interrupted":
         return
     watch.on_start("map", len(record.results))
-    with manifest.timed("map_s"):
+    with manifest.timed("map_s"), _stoppable(job, "interrupted while the map was written"):
         built = build_map(
             job.sequence, record.results, config, watch.on_step, watch.should_stop, folder.path,
             map_checkpoints(folder, config),
         )  # fmt: skip
         if built is None:
-            manifest.interrupt("interrupted while the map was built: there is no map")
-            return
-        record.map_image, record.map_extent = built.image, built.extent
-        record.map_file, record.crispness = f"map.{config.map.format}", crispness(built.merged)
+            raise InterruptedRunError("interrupted while the map was built: there is no map")
+        score = crispness(built.merged)
         outputs.write_map(folder, built, config.map, record)
-    manifest.map_points = len(built.merged)
+        record.map_file, record.map_image, record.map_extent = f"map.{config.map.format}", built.image, built.extent
+        record.crispness = score
+        manifest.map_points = len(built.merged)
 
 
 def _feature_map(folder: RunFolder, job: _Job, record: RunRecord) -> None:
@@ -247,16 +249,25 @@ def _feature_map(folder: RunFolder, job: _Job, record: RunRecord) -> None:
     if not config.map.write_features or manifest.outcome == "interrupted" or not isinstance(odometry, FeatureSource):
         return
     watch.on_start("feature map", len(record.results))
-    with manifest.timed("feature_map_s"):
+    with manifest.timed("feature_map_s"), _stoppable(job, "interrupted while the feature map was written"):
         built = build_feature_map(
             job.sequence, odometry, record.results, config, watch.on_step, watch.should_stop,
             map_checkpoints(folder, config, "feature map"),
         )  # fmt: skip
         if built is None:
-            manifest.interrupt("interrupted while the feature map was built: there is none")
-            return
+            raise InterruptedRunError("interrupted while the feature map was built: there is none")
         outputs.write_feature_map(folder, built)
-    log.info("feature map: %d points in %s", len(built), folder.path / "feature_map.ply")
+        log.info("feature map: %d points in %s", len(built), folder.path / "feature_map.ply")
+
+
+@contextmanager
+def _stoppable(job: _Job, said: str) -> Iterator[None]:
+    """What is asked to stop in the block ends it, and the run is interrupted with the sentence `said`."""
+    try:
+        with asking(job.watch.should_stop, said):
+            yield
+    except InterruptedRunError as error:
+        job.manifest.interrupt(str(error))
 
 
 def _report(folder: RunFolder, job: _Job, record: RunRecord, evaluation: Evaluation | None) -> None:

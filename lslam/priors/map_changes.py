@@ -17,6 +17,7 @@ from lslam.geometry import se2
 from lslam.kernels import wall_matching
 from lslam.priors.wall_match import LIKENESS
 from lslam.priors.walls import walls_of
+from lslam.stopping import checking
 from lslam.types.building import Building, footprint_polygon, is_canopy
 from lslam.types.building_match import KeyframeMatch
 
@@ -63,7 +64,7 @@ def absent_buildings(
     cores = [shapes[k].buffer(-DEPTH / 2) for k in doubted]
     counts = np.zeros(len(doubted), np.int64)
     tree = STRtree(cores)
-    for look, samples in zip(looks, everything, strict=True):
+    for look, samples in zip(checking(looks), everything, strict=True):
         rays = np.stack(np.broadcast_arrays(look.views[:, None], samples[None]), axis=2)
         ray, core = tree.query(linestrings(rays.reshape(-1, 2, 2)), predicate="intersects")
         hits = np.zeros((len(samples), len(doubted)), np.int64)
@@ -85,7 +86,7 @@ def new_walls(buildings: Sequence[Building], sights: Sequence[KeyframeMatch], po
     ground = union_all([_ground(building).buffer(ONE_LINE) for building in buildings])
     prepare(ground)
     lines: list[_Line] = []
-    for look in _placed(sights, poses):
+    for look in checking(_placed(sights, poses)):
         rows = np.ascontiguousarray(look.walls.reshape(-1, 4))
         # Which side of it is outside a wall seen askew does not always tell.
         pairs = [

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.priors.contacts import TOUCHING, Contact, Solid, party_contacts, separate
+from lslam.stopping import checking
 from lslam.types.building import Building, about, is_canopy
 
 Floats = NDArray[np.float64]
@@ -62,7 +63,7 @@ def remove_overlaps(
     contacts = {(i, j): party_contacts(solids[i], solids[j]) for i, j in _neighbours(solid_ground)}
     hopeless: set[tuple[int, int]] = set()
     moved = _settled(solids, wanted, information, contacts)
-    for _ in range(ROUNDS):
+    for _ in checking(range(ROUNDS)):
         pairs = [pair for pair in _overlapping(solid_ground, moved) if pair not in meant and pair not in hopeless]
         if not pairs:
             break
