@@ -6,7 +6,6 @@ import contextlib
 import json
 import logging
 import os
-import re
 import shutil
 import time
 from collections.abc import Collection, Iterator
@@ -16,6 +15,7 @@ from typing import IO, Any
 from lslam.errors import OutputError, OutputExistsError, cause
 from lslam.formats.atomic import atomic_write
 from lslam.locks import lock
+from lslam.printable import file_safe
 
 log = logging.getLogger("lslam")
 
@@ -238,8 +238,7 @@ def _clear_spools(path: Path) -> None:
 def default_folder(sequence: str, method: str, now: float | None = None) -> Path:
     """runs/<sequence>-<method>-<time>, with a number behind it when two runs start in the same second."""
     stamp = time.strftime("%Y%m%d-%H%M%S", time.localtime(now))
-    # The name may come from sequence.toml: it shall not lead out of runs/.
-    name = re.sub(r"[^\w.+-]+", "_", sequence).lstrip(".") or "sequence"
+    name = file_safe(sequence)
     folder = Path("runs") / f"{name}-{method}-{stamp}"
     number = 2
     while folder.exists():

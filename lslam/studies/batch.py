@@ -13,11 +13,10 @@ from lslam.config import Config
 from lslam.config.batch import BatchConfig, parse_batch
 from lslam.errors import UsageError
 from lslam.pipeline.identity import imu_digest, input_digest, job_digest
-from lslam.printable import toml_text
+from lslam.printable import file_safe, toml_text
 from lslam.studies.expanded import Expanded, Place, cells_of, check_same
 from lslam.studies.grid import Job, expand, run_folder
 from lslam.studies.points import Contender, free_name, settings_of
-from lslam.studies.subjects import file_safe
 from lslam.studies.variants import WITH_IMU, Variant, find_variants
 from lslam.types.sequence import Sequence as Recording
 from lslam.types.trajectory import Trajectory

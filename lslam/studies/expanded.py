@@ -12,6 +12,7 @@ from lslam.config.preset_files import read_toml
 from lslam.config.study import StudySequence
 from lslam.errors import InterruptedRunError, LslamError, OutputExistsError
 from lslam.formats.atomic import write_text
+from lslam.printable import file_safe
 from lslam.readers import open_sequence
 from lslam.readers.lookup import find_folder
 from lslam.studies.cells import fitted_scene, recorded_cell, scene_cell
@@ -22,7 +23,7 @@ from lslam.studies.plan import SIMULATED, Follow, claim, release
 from lslam.studies.points import Contender, free_name
 from lslam.studies.results import Results
 from lslam.studies.scenes import Scene
-from lslam.studies.subjects import file_safe, scans_needed, with_range
+from lslam.studies.subjects import scans_needed, with_range
 from lslam.types.study import StudyRow
 from lslam.untrusted import parse_toml
 

@@ -10,7 +10,7 @@ from typing import Any
 
 from lslam.config.study import Point, StudyConfig
 from lslam.errors import ConfigError, UsageError
-from lslam.studies.subjects import file_safe
+from lslam.printable import file_safe
 from lslam.studies.variants import WITH_IMU, Variant, find_variants
 
 # One thread: a run then keeps one core busy, as many go at once as there are cores, and times mean the same. Keyframes go

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import os
-import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,6 +11,7 @@ from pathlib import Path
 from lslam.config import Config
 from lslam.config.input import AS_CONFIGURED, InputConfig, ScanRange
 from lslam.errors import InputError, UsageError, nearest
+from lslam.printable import file_safe
 from lslam.readers import open_sequence
 from lslam.readers.lookup import find_folder
 from lslam.simulation.scenario_files import scenario_names
@@ -64,15 +64,6 @@ def _find(word: str, data_root: Path | None) -> Subject:
             word, path,
         )  # fmt: skip
     return Subject(file_safe(open_sequence(path).name), path=path)
-
-
-def file_safe(name: str) -> str:
-    """A name that can be a folder's: it may come from `sequence.toml` and shall not lead elsewhere.
-
-    >>> file_safe("../street 0")
-    '_street_0'
-    """
-    return re.sub(r"[^\w.+-]+", "_", name).lstrip(".") or "sequence"
 
 
 def _with_unique_labels(subjects: list[Subject]) -> list[Subject]:

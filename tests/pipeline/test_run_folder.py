@@ -165,8 +165,9 @@ def test_default_names_stay_below_runs_and_do_not_collide(tmp_path: Path, monkey
     assert first.name.startswith("seq07-icp-19")
     first.mkdir(parents=True)
     assert default_folder("seq07", "icp", 0.0) == first.with_name(first.name + "-2")
-    for name in ("../../etc", "a/b", "..", "", "ä b:c"):
+    for name in ("../../etc", "a/b", "..", "", "ä b:c", "x" * 400, "ä" * 400):
         folder = default_folder(name, "icp", 0.0)
+        assert len(os.fsencode(folder.name)) <= 200
         assert folder.parent == Path("runs")
         assert ".." not in folder.parts
         assert not folder.name.startswith(("-", "."))
