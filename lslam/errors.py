@@ -14,15 +14,24 @@ from collections.abc import Iterable
 _FLOOD = re.compile(r"\S{1000,}")
 
 
+def sentence(text: str) -> str:
+    """A text for a terminal: what it would obey escaped, and without the middle of a flood, for it quotes what it was given.
+
+    >>> sentence("9" * 5000).count("9"), sentence("a\x1bb")
+    (300, 'a\\x1bb')
+    """
+    said = "".join(c if c.isprintable() or c == "\n" else repr(c)[1:-1] for c in text)
+    return _FLOOD.sub(lambda word: f"{word[0][:200]}...{word[0][-100:]}", said)
+
+
 class LslamError(Exception):
     """Base of all errors lslam raises on purpose: one clear sentence that names the file, the place and the way out."""
 
     exit_code = 1
 
     def __str__(self) -> str:
-        """What no terminal shows escaped, and without the middle of a flood: sentences quote what files hold."""
-        said = "".join(c if c.isprintable() or c == "\n" else repr(c)[1:-1] for c in super().__str__())
-        return _FLOOD.sub(lambda word: f"{word[0][:200]}...{word[0][-100:]}", said)
+        """As `sentence`: it quotes what files hold."""
+        return sentence(super().__str__())
 
 
 class RunFailedError(LslamError):

@@ -9,7 +9,7 @@ from typing import Any, NoReturn
 
 import click
 
-from lslam.errors import LslamError, cause, nearest
+from lslam.errors import LslamError, cause, nearest, sentence
 from lslam.stopping import heeded, is_interrupt, is_too_late
 from lslam.version import __version__
 
@@ -155,9 +155,10 @@ def _call() -> int:
         _fail_unexpected(error)
 
 
-def _fail(sentence: str, code: int) -> NoReturn:
+def _fail(said: str, code: int) -> NoReturn:
     is_too_late()
-    click.echo(sentence if code == 130 else f"error: {sentence}", err=True)
+    said = sentence(said)
+    click.echo(said if code == 130 else f"error: {said}", err=True)
     sys.exit(code)
 
 

@@ -85,7 +85,7 @@ def command(sequence: str, **given: Any) -> None:
 
 
 def _run(sequence: str, given: dict[str, Any]) -> None:
-    from lslam.pipeline.run import run
+    from lslam.pipeline.run import plan, run
     from lslam.pipeline.run_folder import default_folder
 
     _check_folder(given)
@@ -93,10 +93,7 @@ def _run(sequence: str, given: dict[str, Any]) -> None:
     truth = read_truth(given["gt"], opened)
     out = given["out"] or default_folder(opened.name, _variant(config))
     if given["dry_run"]:
-        from lslam.odometry import create_odometry
-        from lslam.pipeline.choose import choose_scans
-
-        _print_plan(choose_scans(opened, create_odometry(config), config), config, out, given["as_json"])
+        _print_plan(plan(opened, config, truth), config, out, given["as_json"])
         return
     try:
         with heeded() as stop, ExitStack() as stack:

@@ -88,6 +88,15 @@ def run(
     return outcome
 
 
+def plan(sequence: Sequence, config: Config, ground_truth: Trajectory | None = None) -> Sequence:
+    """The scans that `run` would take, after a look at everything else that it would read; nothing is written or fetched.
+
+    Raises InputError and UsageError as `run` does before it begins.
+    """
+    check_config(config)
+    return _prepare(sequence, config, ground_truth, "", Watch()).sequence
+
+
 @dataclass(frozen=True)
 class _Job:
     """What is to be done, resolved: the chosen scans, the method, the truth and the map; `given` are the poses of --poses."""
