@@ -1,0 +1,12 @@
+"""`python -m tests.kills --count 100`: see campaign."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from kills.campaign import main
+
+sys.exit(main())
