@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from lslam.config.registration import RegistrationConfig
 from lslam.errors import InputError
+from lslam.preprocessing.prepare import PreparedPoints
 from lslam.recovery.policies import RecoveringRegistration as Registration
 from lslam.registration.registration import MIN_SOURCE_POINTS
 from lslam.registration.solver import RegistrationResult
@@ -253,3 +254,20 @@ def test_a_map_that_fills_asks_for_less_overlap_than_one_that_is_filled(
     judged = registration.judged(result, np.eye(4))
     assert judged.ok == is_believed
     assert ("only 40% of the points overlap the map" in judged.reason) == (not is_believed)
+
+
+@pytest.mark.parametrize(("share", "is_sparse"), [(0.09, False), (0.11, True)])
+def test_a_tenth_of_the_points_beyond_a_voxel_between_rings_makes_a_sparse_sensor(
+    share: float, is_sparse: bool
+) -> None:
+    """Rings two degrees apart lie a voxel apart at a distance of 28.6 voxels."""
+    registration = Registration(RegistrationConfig(residual="point"))
+    registration.inserted = registration.config.start_scans + 1
+    registration._ring_gap = np.deg2rad(2.0)
+    limit = registration.map.fine.size / np.deg2rad(2.0)
+    distances = np.where(np.arange(1000) < 1000 * share, 1.01, 0.99) * limit
+    source = distances[:, None] * [0.6, -0.64, 0.48]
+    found = registration._gaps(PreparedPoints(np.zeros((0, 3), np.float32), source, np.zeros((1000, 6)), 1000))
+    assert (found is not None) == is_sparse
+    if found is not None:
+        np.testing.assert_allclose(found, np.deg2rad(2.0) * distances)
