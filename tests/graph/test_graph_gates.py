@@ -28,10 +28,12 @@ WAY = 1000.0
 SLACK_M, SLACK_RAD = 0.03, np.deg2rad(0.1)
 
 
-def there_and_back(offsets: list[Floats], apart: list[float] | None = None, **settings: float) -> list[str]:
+def there_and_back(
+    offsets: list[Floats], apart: list[float] | None = None, origin: tuple[float, float] = (0.0, 0.0), **settings: float
+) -> list[str]:
     """What is said of loops between two passes, a kilometre of odometry apart, each wrong by a twist (6,).
 
-    apart : m along either pass at which the loops lie, all at one place if not given
+    apart : m along either pass at which the loops lie, all at one place if not given; origin : m, where the way begins
     """
     at = np.zeros(len(offsets)) if apart is None else np.array(apart)
     count = len(at)
@@ -40,6 +42,7 @@ def there_and_back(offsets: list[Floats], apart: list[float] | None = None, **se
     travelled = np.concatenate([at, at[-1] + WAY * np.linspace(0, 1, 40)[1:-1], at[-1] + WAY + at])
     poses = np.tile(np.eye(4), (len(x), 1, 1))
     poses[:, 0, 3] = x
+    poses[:, :2, 3] += origin
     odometry = [Constraint(k, k + 1, se3.relative(a, b), SURE) for k, (a, b) in enumerate(pairwise(poses))]
     second = len(x) - count
     loops = [
@@ -78,14 +81,15 @@ def test_loops_far_away_have_no_say() -> None:
     assert said[3].startswith("only 0%")
 
 
-def test_odometry_is_asked_first() -> None:
+@pytest.mark.parametrize("origin", [(0.0, 0.0), (-700.0, 2000.0)])
+def test_odometry_is_asked_first(origin: tuple[float, float]) -> None:
     """A per cent of a way of 1,000 m, and half a degree per 100 m of it over the mean distance of that way."""
-    said = there_and_back([shift(0.0, 1000.0)])
+    said = there_and_back([shift(0.0, 1000.0)], origin=origin)
     assert "1000.0 m from where odometry is" in said[0]
     lever = 500 * 2 / np.pi
     allowed = LIMIT * (0.01 * 1000 + np.deg2rad(0.5) / 100 * 1000 * lever)
     for share, is_out in ((0.85, False), (1.1, True)):
-        assert bool(there_and_back([shift(share * allowed)])[0]) == is_out
+        assert bool(there_and_back([shift(share * allowed)], origin=origin)[0]) == is_out
 
 
 def pulled(

@@ -215,18 +215,22 @@ def test_one_scan_in_twenty_is_compared_unless_the_imu_is_silent() -> None:
         assert compared == expected
 
 
-def test_a_sweep_is_refined_by_an_imu_that_ends_with_it() -> None:
-    """What comes after a sweep is not asked for."""
+@pytest.mark.parametrize("seconds", [0.101, 0.03])
+def test_a_sweep_is_refined_by_an_imu_that_does_not_end_before_it(seconds: float) -> None:
+    """What comes after a sweep is not asked for. Of half a sweep constant velocity is as good a judge."""
     drive = walk()
     stamps, poses = truth_of(drive)
-    imu, end_ns = stream_of(drive), int(stamps[30]) + 101_000_000
-    whole, ending = motion_of(drive), motion_of(drive, imu_until(imu, end_ns))
+    imu, end_ns = stream_of(drive), int(stamps[30]) + round(1e9 * seconds)
+    whole, ending = motion_of(drive, gap_s=0.05), motion_of(drive, imu_until(imu, end_ns), gap_s=0.05)
     refined = []
     for motion in (whole, ending):
         for stamp, pose in zip(stamps[:30], poses[:30], strict=True):
             motion.correct(int(stamp), pose, motion.sweep(int(stamp), SPAN))
-        refined.append(motion.refine(motion.sweep(int(stamps[30]), SPAN), int(stamps[30]), poses[30]))
-    np.testing.assert_array_equal(refined[0].poses, refined[1].poses)
+        prior = whole.sweep(int(stamps[30]), SPAN)
+        refined.append(motion.refine(prior, int(stamps[30]), poses[30]))
+    expected = refined[0] if seconds > 0.1 else whole.coasting.refine(prior, int(stamps[30]), poses[30])
+    np.testing.assert_array_equal(refined[1].poses, expected.poses)
+    assert (refined[1].poses != refined[0].poses).any() == (seconds < 0.1)
 
 
 @pytest.mark.parametrize("scans", [1, 40])
