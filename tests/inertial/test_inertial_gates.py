@@ -141,3 +141,16 @@ def test_turns_that_hardly_fit_better_at_the_edge_tell_nothing_of_the_clock() ->
     assert found.is_judged
     assert found.correlation > 0.999
     assert found.offset_s == 0.0
+
+
+def test_gravity_is_as_strong_as_anywhere_on_the_earth() -> None:
+    """From 9.764 m/s2 on Huascaran to 9.834 at sea in the Arctic: beyond one sigma, within two. Its direction stays free."""
+    stamps = np.arange(0, 100_000_001, IMU_NS)
+    imu = ImuStream(stamps, np.tile([0.0, 0.0, 9.8], (len(stamps), 1)), np.zeros((len(stamps), 3)))
+    unknown = np.diag(np.repeat([0.0, 1.0, 0.0], 3))
+    before = ImuEstimate(np.zeros(3), np.array([0, 0, -9.8]), np.zeros(3), Gyroscope(np.zeros(3)), unknown)
+    step = before.over(imu, stamps[[0, -1]])
+    after = before.corrected(imu, step, np.eye(3), np.eye(3), np.zeros(3), before.gyroscope, 1e9 * np.eye(3))
+    sigmas = np.sqrt(np.diag(after.covariance)[3:6])
+    np.testing.assert_allclose(sigmas[:2], 1.0, rtol=1e-3)
+    assert sigmas[2] < 9.80665 - 9.764 < 2 * sigmas[2]

@@ -224,6 +224,7 @@ def test_few_bad_samples_are_left_out_and_counted() -> None:
 def test_gaps_are_longer_than_the_limit_and_than_a_slow_rate() -> None:
     fast = ImuStream(np.array([0, 10, 20, 170, 180]) * 1_000_000, np.zeros((5, 3)), np.zeros((5, 3)))
     assert gaps(fast, 0.1)[1:-1].tolist() == [[70_000_000, 120_000_000]]
+    assert gaps(fast, 0.1)[[0, -1], [1, 0]].tolist() == [-100_000_000, 280_000_000]
     assert len(gaps(fast, 0.15)) == 2
     slow = ImuStream(np.arange(9) * 101_000_000, np.zeros((9, 3)), np.zeros((9, 3)))
     assert len(gaps(slow, 0.1)) == 2

@@ -41,6 +41,22 @@ def live_slots(m: GaussianMap) -> NDArray[np.int64]:
     return np.flatnonzero(m.keys != gaussians.FREE)
 
 
+def test_the_place_of_the_sensor_is_kept_about_the_middle_of_each_voxel() -> None:
+    """The mean over its points, of two scans from two places: what tells a surface from what one ring of it shows."""
+    m, places = GaussianMap(1.0), (np.array([1.0, -2.0, 3.0]), np.array([-4.0, 0.5, 0.25]))
+    for k, t in enumerate(places):
+        m.insert((surfaces(1) - t).astype(np.float32)[k::2], pose(np.eye(3), t))
+    slots = live_slots(m)
+    n = m.moments[slots, :1]
+    centres = np.array([cell_of(int(key)) for key in m.keys[slots]]) + 0.5
+    seen_from = m.moments[slots, 10:13] / n + centres
+    share = (seen_from - places[1]) @ (places[0] - places[1]) / np.sum((places[0] - places[1]) ** 2)
+    np.testing.assert_allclose(seen_from, places[1] + share[:, None] * (places[0] - places[1]), atol=1e-5)
+    assert share.min() >= -1e-6
+    assert share.max() <= 1 + 1e-6
+    assert np.average(share, weights=n[:, 0]) == pytest.approx(0.5, abs=1e-3)
+
+
 def assert_same_voxels(m: GaussianMap, reference: VoxelMap) -> None:
     slots = live_slots(m)
     assert {cell_of(int(m.keys[s])) for s in slots} == set(reference.voxels)

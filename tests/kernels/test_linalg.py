@@ -148,3 +148,10 @@ def test_a_full_turn_in_small_steps_comes_back() -> None:
     R = np.eye(3)
     rotate_many(R, np.tile(axis * 2 * np.pi / 100_000, (100_000, 1)))
     np.testing.assert_allclose(R, np.eye(3), atol=1e-10)
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-40, 2.0])
+def test_a_ball_has_a_normal_though_any_would_do(size: float) -> None:
+    values, normal = plane(size * np.eye(3))
+    np.testing.assert_allclose(values, size)
+    assert np.linalg.norm(normal) == pytest.approx(1.0)

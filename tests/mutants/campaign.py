@@ -75,6 +75,7 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--kernels", type=float, default=0.05, help="share of mutants in compiled code")
     parser.add_argument("--jobs", type=int, default=2, help="mutants tried at the same time")
+    parser.add_argument("--also", nargs="*", default=[], help="folders of tests asked beside those of the packages")
     parser.add_argument("--again", action="store_true", help="try again what survived")
     parser.add_argument("--out", type=Path, default=Path("runs/mutants.jsonl"))
     asked = parser.parse_args()
@@ -84,7 +85,7 @@ def main() -> int:
     lock = threading.Lock()
     with tempfile.TemporaryDirectory() as folder:
         copies = [Copy(Path(folder) / str(i)) for i in range(asked.jobs)]
-        covered = copies[0].trace() if left else {}
+        covered = copies[0].trace(asked.also) if left else {}
 
         def judge(mutant: Mutant) -> None:
             with lock:

@@ -11,6 +11,7 @@ import subprocess
 import sys
 import tempfile
 import zlib
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -52,10 +53,10 @@ class Copy:
             return None, ""
         return process.returncode, said
 
-    def trace(self) -> dict[str, Any]:
+    def trace(self, also: Sequence[str]) -> dict[str, Any]:
         """Per test file its seconds and, per file of lslam, the lines it runs. Without a mutant all tests must pass."""
         told = self.root / "lines.json"
-        folders = [f"tests/{name}" for name in TESTS]
+        folders = [f"tests/{name}" for name in (*TESTS, *also)]
         code, said = self.pytest(["-p", "mutants.lines", *folders], MUTANTS_LINES=str(told))
         if code != 0:
             sys.exit(f"the tests fail without a mutant:\n{said}")

@@ -203,7 +203,7 @@ def test_the_same_scans_give_the_same_bytes_twice_in_threads_and_in_another_proc
     assert other.stdout.strip() == expected
 
 
-@pytest.mark.parametrize("prior", [np.eye(3), np.full((4, 4), np.nan), np.zeros(6)])
+@pytest.mark.parametrize("prior", [np.eye(3), np.full((4, 4), np.nan), np.diag([1, 1, np.inf, 1]), np.zeros(6)])
 def test_a_prior_that_is_no_pose_is_refused(prior: Floats) -> None:
     registration = in_room()
     with pytest.raises(InputError, match="motion prior"):
