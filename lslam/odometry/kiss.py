@@ -13,6 +13,7 @@ from lslam.config.preprocess import PreprocessConfig
 from lslam.foreign import importing
 from lslam.geometry import se3
 from lslam.preprocessing.prepare import gate_points
+from lslam.registration.registration import MIN_SOURCE_POINTS
 from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan import Scan
 from lslam.types.scan_result import ScanResult
@@ -70,8 +71,11 @@ class Kiss:
     def register(self, scan: Scan, prepared: tuple[Any, Any], prior: MotionPrior) -> ScanResult:
         """One kiss-icp frame."""
         points, times = prepared
-        if len(points) == 0:
-            return ScanResult(scan.index, scan.stamp_ns, prior.pose, "bridged", "no usable points", converged=False)
+        # Of a scan without points in its range the package says its own prediction, and nothing else.
+        usable = int((np.einsum("ij,ij->i", points, points) < self._config.data.max_range**2).sum())
+        if usable < MIN_SOURCE_POINTS:
+            reason = f"{usable} usable points, {MIN_SOURCE_POINTS} needed"
+            return ScanResult(scan.index, scan.stamp_ns, prior.pose, "bridged", reason, converged=False)
         if self._kiss is None:
             # The choice is made once: a sequence has per-point times or has not.
             self._with_deskew = len(times) > 0
@@ -83,9 +87,8 @@ class Kiss:
         if self._with_deskew:
             pose = self._at_stamp(pose, np.asarray(self._kiss.last_delta, np.float64), scan.span.passed)
         took = time.perf_counter() - began
-        return ScanResult(
-            scan.index, scan.stamp_ns, se3.normalise(pose), source_points=len(source), stages={"register": took}
-        )
+        pose = se3.normalise(pose) if np.isfinite(pose).all() else pose
+        return ScanResult(scan.index, scan.stamp_ns, pose, source_points=len(source), stages={"register": took})
 
     def _at_stamp(self, pose: Floats, delta: Floats, passed: float) -> Floats:
         """Pose at the scan's stamp, when the share `passed` of its sweep is over, in the world of the first scan's stamp.

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.errors import InputError
+from lslam.odometry.sanity import FARTHEST_M
 from lslam.pipeline.findings import Facts, Finding, plural
 from lslam.readers.ringed import Ringed, with_rings
 from lslam.types.scan import Scan
@@ -62,6 +63,13 @@ def examine_points(sequence: Sequence, indices: NDArray[Any], findings: list[Fin
         what = f"{empty} of the {len(indices)} scans looked at hold no points"
         findings.append(Finding("scan-empty", what, "a run skips them and bridges the motion"))
     full = [s for s in scans if s["count"]]
+    far = [s for s in full if s["far"]]
+    if far:
+        what = (
+            f"{sum(s['far'] for s in far)} points of {len(far)} of the {len(indices)} scans looked at lie beyond "
+            f"{FARTHEST_M / 1e3:g} km, where no LiDAR sees"
+        )
+        findings.append(Finding("points-far", what, "a run leaves them out; check the type and unit of x, y, z"))
     total = sum(s["count"] for s in full)
     measured = [s for s in full if s["valid"]]
     return {
@@ -119,10 +127,12 @@ def _scan_facts(scan: Scan) -> Facts:
     points = scan.points
     finite = np.isfinite(points).all(axis=1)
     zero = (points == 0).all(axis=1)
+    far = finite & (np.abs(points) >= FARTHEST_M).any(axis=1)
     good = points[finite & ~zero].astype(np.float64)
     ranges = np.linalg.norm(good, axis=1)
     elevation = np.degrees(np.arctan2(good[:, 2], np.hypot(good[:, 0], good[:, 1])))
     facts: Facts = {"count": len(scan), "valid": len(good), "nan": int((~finite).sum()), "zero": int(zero.sum())}
+    facts["far"] = int(far.sum())
     if len(good):
         facts["ranges"] = [float(v) for v in np.percentile(ranges, [0, 5, 50, 95, 100])]
         # One per cent on either side: single points close by have wild elevations.

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from lslam.errors import InputError
 from lslam.integrity.monitor import IntegrityMonitor
 from lslam.odometry.base import Odometry
+from lslam.odometry.sanity import FARTHEST_M, measurable
 from lslam.odometry.standing import Standing
 from lslam.pipeline.checkpoints import OdometryCheckpoints
 from lslam.pipeline.keyframing import Keyframing
@@ -153,5 +154,9 @@ def _load(sequence: Sequence, i: int, prepare: Callable[[Scan], Any] | None) -> 
     read = time.perf_counter()
     if len(scan) == 0:
         return Loaded(scan.index, stamp_ns, error="the scan has no points", read_s=read - began)
+    given, scan = len(scan), measurable(scan)
+    if len(scan) == 0:
+        why = f"0 usable points: none of {given} is finite and within {FARTHEST_M / 1e3:g} km"
+        return Loaded(scan.index, stamp_ns, error=why, read_s=read - began, status="bridged")
     prepared = prepare(scan) if prepare is not None else None
     return Loaded(scan.index, stamp_ns, scan, prepared, "", read - began, time.perf_counter() - read)

@@ -12,11 +12,12 @@ from numpy.typing import NDArray
 from lslam.geometry import se3, so3
 from lslam.integrity.monitor import IntegrityMonitor
 from lslam.odometry.base import Deskewing, Odometry, Registered, Resumable, Searching
+from lslam.odometry.sanity import plausible
 from lslam.odometry.standing import Standing
 from lslam.registration.motion import ConstantVelocity, MotionModel, middle_of
 from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan import Scan, Span
-from lslam.types.scan_result import ScanResult
+from lslam.types.scan_result import ScanResult, Status
 from lslam.types.stage_clock import StageClock
 from lslam.types.state import State
 
@@ -28,7 +29,7 @@ SAME = 0.3
 
 @dataclass(frozen=True)
 class Loaded:
-    """One scan as the background thread leaves it; `error` says why there is none."""
+    """One scan as the background thread leaves it; `error` says why there is none, which makes it one of that `status`."""
 
     index: int
     stamp_ns: int
@@ -37,6 +38,7 @@ class Loaded:
     error: str = ""
     read_s: float = 0.0
     prepare_s: float = 0.0
+    status: Status = "skipped"
 
 
 class Tracker:
@@ -58,6 +60,8 @@ class Tracker:
         self.motion: MotionModel = ConstantVelocity() if motion is None else motion
         self.sweep = MotionPrior.at_once(np.eye(4))
         self.middle = (0, np.eye(4))
+        # The newest result that was believed.
+        self._last: ScanResult | None = None
         # The first scan, until a second one tells how fast it was taken.
         self._first: tuple[Scan, Any, NDArray[np.float64]] | None = None
 
@@ -70,6 +74,8 @@ class Tracker:
             result = self._move(loaded)
         if self.motion.is_known:
             self._first = None
+        if result.status == "ok":
+            self._last = result
         return result
 
     def check(self, position: int, loaded: Loaded, result: ScanResult) -> None:
@@ -89,6 +95,7 @@ class Tracker:
             "motion": self.motion.state(),
             "standing": None if self.standing is None else self.standing.state(),
             "middle": self.middle,
+            "last": self._last,
             "monitor": None if self.monitor is None else self.monitor.state(),
         }
 
@@ -99,7 +106,7 @@ class Tracker:
         self.motion.restore(state["motion"])
         if self.standing is not None:
             self.standing.restore(state["standing"])
-        self.middle = state["middle"]
+        self.middle, self._last = state["middle"], state["last"]
         if self.monitor is not None:
             self.monitor.restore(state["monitor"])
 
@@ -127,7 +134,7 @@ class Tracker:
         steady = None if coasting is None else coasting.predict(loaded.stamp_ns)
         trial = None
         if scan is None:
-            result = ScanResult(loaded.index, loaded.stamp_ns, prior.pose, "skipped", loaded.error, converged=False)
+            result = ScanResult(loaded.index, loaded.stamp_ns, prior.pose, loaded.status, loaded.error, converged=False)
         elif isinstance(odometry, Deskewing):
             if coasting is not None and motion.is_compared(loaded.stamp_ns, span):
                 # Nothing is learnt from it.
@@ -135,7 +142,7 @@ class Tracker:
                 trial = self._align(odometry, scan, loaded.prepared, without, coasting)[0].result
             result, prior = self._register(odometry, scan, loaded.prepared, prior, clock)
         else:
-            result = odometry.register(scan, loaded.prepared, prior)
+            result = plausible(odometry.register(scan, loaded.prepared, prior), prior.pose, self._last)
         found = result.T_world_lidar
         is_blind = result.status == "ok" and not isinstance(odometry, Deskewing)
         with clock.stage("imu"):
@@ -167,6 +174,7 @@ class Tracker:
                 found, prior = self._align(odometry, scan, prepared, prior)
         with clock.stage("imu"):
             weighed = self.motion.weigh(found.result, prior)
+        weighed = plausible(weighed, prior.pose, self._last)
         if weighed.status != "ok" and self.motion.is_felt and isinstance(odometry, Searching):
             found, prior = self._near(odometry, scan, prepared, expected, found, weighed, clock), expected
         else:

@@ -111,7 +111,7 @@ def parse_rings(wanted: str) -> tuple[str, int | None]:
 def elevations(points: NDArray[Any]) -> NDArray[np.float32]:
     """(N,) angle above the sensor's horizon, rad; NaN for points at the origin and those that are not finite."""
     p = np.asarray(points, np.float32)
-    with np.errstate(invalid="ignore"):
+    with np.errstate(invalid="ignore", over="ignore"):
         flat = np.sqrt(p[:, 0] ** 2 + p[:, 1] ** 2)
         elevation = np.arctan2(p[:, 2], flat)
     elevation[~np.isfinite(flat) | ((flat == 0) & (p[:, 2] == 0))] = np.nan

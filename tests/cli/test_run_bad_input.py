@@ -124,6 +124,24 @@ def test_scans_of_unrelated_places_are_exit_1_with_a_summary(sequence: Path, tmp
     assert {"trajectory.tum", "report.html", "log.txt"} <= {p.name for p in out.iterdir()}
 
 
+@pytest.mark.parametrize("method", ["icp", "ndt", "icp-svd", "kiss-icp", "small-gicp"])
+def test_points_farther_than_any_lidar_sees_are_no_result_of_any_method(
+    method: str, sequence: Path, tmp_path: Path
+) -> None:
+    if method in ("kiss-icp", "small-gicp"):
+        pytest.importorskip(method.replace("-", "_"))
+    for path in (sequence / "velodyne").glob("*.bin"):
+        scan = np.fromfile(path, np.float32).reshape(-1, 4)
+        scan[:, :3] *= 1e30
+        scan.tofile(path)
+    done, out = run(sequence, tmp_path, "--method", method)
+    assert done.returncode == 1, done.stderr
+    assert "the run diverged: 12 of 12 scans were not registered" in done.stderr
+    assert "points: none of" in done.stderr
+    assert "is finite and within 10 km" in done.stderr
+    assert manifest(out)["status"] == "diverged"
+
+
 def shorten(name: str) -> Callable[[Path], None]:
     def spoil(folder: Path) -> None:
         file = (folder / name).resolve()

@@ -119,7 +119,7 @@ def test_an_empty_scan_is_bridged_and_the_next_one_registered() -> None:
     prior = MotionPrior.at_once(np.diag([1.0, 1.0, 1.0, 1.0]))
     result = method.register(empty, method.prepare(empty), prior)
     assert result.status == "bridged"
-    assert result.reason == "no usable points"
+    assert result.reason == "0 usable points, 30 needed"
     np.testing.assert_array_equal(result.T_world_lidar, prior.pose)
     assert method.register(scans[5], method.prepare(scans[5]), PRIOR).status == "ok"
 
@@ -159,3 +159,14 @@ def test_what_the_user_takes_out_is_taken_out_of_kiss_too() -> None:
         kept, _ = create(config).prepare(scans[0])
         np.testing.assert_array_equal(kept, scans[0].points[gate_points(scans[0].points, config.preprocess)])
         assert 0 < len(kept) < len(everything)
+
+
+def test_points_beyond_its_range_are_no_registration() -> None:
+    """The package answers with its own prediction, which looks like a pose."""
+    scans, _ = block(True)
+    method = create(Config())
+    adapter_poses(scans[:5], method)
+    far = replace(scans[5], points=scans[5].points * np.float32(1e3))
+    result = method.register(far, method.prepare(far), PRIOR)
+    assert (result.status, result.converged) == ("bridged", False)
+    assert "usable points, 30 needed" in result.reason

@@ -26,6 +26,7 @@ from lslam.readers import open_sequence
 from lslam.types.calibration import Calibration
 from lslam.types.gnss import GnssStream
 from lslam.types.imu import ImuStream
+from lslam.types.scan import Scan
 from lslam.types.sequence import Sequence
 
 SAMPLE = Path(__file__).parents[2] / "sample_data"
@@ -225,6 +226,16 @@ def test_point_times_fill_a_sweep_that_holds_the_stamp(healthy: Sequence, limits
     examine_times(healthy, {"per_point_times": limits}, findings)
     assert codes(findings) == ([] if is_sound else ["point-times"])
     assert is_sound or "from the scan's stamp" in findings[0].way_out
+
+
+def test_points_that_no_lidar_sees(healthy: Sequence) -> None:
+    def scan(index: int) -> Scan:
+        found = healthy.scan(index)
+        return replace(found, points=found.points * np.float32(1e30 if index % 2 else 1.0))
+
+    facts = inspect(spoilt(healthy, scan=scan), samples=4, is_quick=True)
+    assert [f["code"] for f in facts["findings"]] == ["points-far"]
+    assert "points of 2 of the 4 scans looked at lie beyond 10 km" in facts["problems"][0]
 
 
 def test_satellite_fixes(healthy: Sequence) -> None:

@@ -1,0 +1,63 @@
+"""What every method is held to, whoever wrote it: points that a LiDAR can measure go in, poses of a vehicle come out."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.geometry import se3, so3
+from lslam.types.scan import Scan
+from lslam.types.scan_result import ScanResult
+
+Floats = NDArray[np.float64]
+
+# m along each axis: no LiDAR that is carried along the ground or a little above sees as far.
+FARTHEST_M = 10_000.0
+# m/s and rad/s: trains and small aircraft are slower, and racing drones turn less. Over a shorter time than so many seconds a
+# registration may err by as much.
+FASTEST_M_S, FASTEST_RAD_S, LEAST_S = 150.0, 20.0, 0.1
+# Of R^T R: what float32 and rounding leave of a rotation is nearer.
+RIGID = 1e-3
+
+
+def measurable(scan: Scan) -> Scan:
+    """The scan with the points that are finite and within `FARTHEST_M`; itself where all of them are."""
+    # NaN is not smaller.
+    good = np.asarray((np.abs(scan.points) < FARTHEST_M).all(axis=1))
+    return scan if good.all() else scan.select(good)
+
+
+def plausible(result: ScanResult, T_prior: Floats, last: ScanResult | None) -> ScanResult:
+    """The result, or one `bridged` by the motion prior (4, 4) where its pose is none or no vehicle gets there.
+
+    last : the newest result that was believed; a pose is judged by the time since then, so that a method which jumped once is
+        believed again as soon as it may have got there
+    """
+    reason = "" if result.status != "ok" else _fault(result, last)
+    if not reason:
+        return result
+    return replace(
+        result, T_world_lidar=T_prior.copy(), status="bridged", reason=reason, converged=False, inliers=0, rmse=0.0,
+        overlap=0.0, covariance=None, registration_covariance=None,
+    )  # fmt: skip
+
+
+def _fault(result: ScanResult, last: ScanResult | None) -> str:
+    pose = np.asarray(result.T_world_lidar)
+    if pose.shape != (4, 4) or not np.isfinite(pose).all():
+        return "the pose is not finite"
+    if not so3.is_rotation(pose[:3, :3], RIGID) or not np.array_equal(pose[3], (0.0, 0.0, 0.0, 1.0)):
+        return "the pose is no rigid transform"
+    if last is None:
+        return ""
+    step = se3.relative(last.T_world_lidar, pose)
+    move, turn = float(np.linalg.norm(step[:3, 3])), float(so3.angle(step[:3, :3]))
+    seconds = max((result.stamp_ns - last.stamp_ns) * 1e-9, LEAST_S)
+    if move <= FASTEST_M_S * seconds and turn <= FASTEST_RAD_S * seconds:
+        return ""
+    return (
+        f"impossible jump of {move:.4g} m and {np.rad2deg(turn):.0f} deg since scan {last.index}, "
+        f"{(result.stamp_ns - last.stamp_ns) * 1e-9:.3g} s before"
+    )
