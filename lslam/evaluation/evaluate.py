@@ -26,6 +26,11 @@ __all__ = ["Evaluation", "evaluate"]
 log = logging.getLogger("lslam")
 Floats = NDArray[np.float64]
 STRAIGHT = 0.01
+# Spread of the truth's positions per metre of the estimate's, and the unit that they then seem to have. What is left of a path in
+# km may be the motion of a lever arm.
+UNITS = ((1 / 0.33, 1 / 0.28, "feet"), (67.0, 150.0, "cm"), (670.0, 1500.0, "mm"), (0.0, 0.03, "km"))
+# m; a spread below is noise.
+SPREAD = 5.0
 
 
 def evaluate(
@@ -74,6 +79,9 @@ def evaluate(
         is_given=T_est_gt is not None,
     )
     notes += same.notes
+    units = _other_unit(same.estimate, same.truth)
+    # Whose body it is shows in motions, which are wrong then.
+    notes = [*units, *(note for note in notes if not (units and "WRONG FRAMES" in note))]
     notes += _nearly_straight(same.truth, config)
     for note in notes:
         log.log(logging.WARNING if "WRONG" in note else logging.INFO, "%s: %s", estimate.source or "estimate", note)
@@ -109,6 +117,19 @@ def _measure(
         association=matches.recipe,
         notes=notes,
     )
+
+
+def _other_unit(estimate: Floats, truth: Floats) -> list[str]:
+    """A note when positions of the truth spread so many times wider than the estimate's as metres do in another unit."""
+    own, real = (float(np.linalg.norm(poses[:, :3, 3].std(axis=0))) for poses in (estimate, truth))
+    if max(own, real) < SPREAD or own <= 0:
+        return []
+    return [
+        f"WRONG UNIT: the ground truth's positions spread over {real:.4g} m and the estimate's over {own:.4g} m (standard "
+        f"deviations), {real / own:.4g} times as far: they seem to be in {unit}, convert them to m"
+        for low, high, unit in UNITS
+        if low < real / own < high
+    ]
 
 
 def _nearly_straight(truth: Floats, config: EvalConfig) -> list[str]:

@@ -11,11 +11,20 @@ from lslam.pipeline.doctor_gnss import examine_gnss
 from lslam.pipeline.doctor_imu import examine_imu
 from lslam.pipeline.doctor_scans import examine_points, examine_stamps, examine_times, rings_rule
 from lslam.pipeline.doctor_turns import examine_turns
+from lslam.pipeline.doctor_units import examine_units
 from lslam.pipeline.findings import Facts, Finding
+from lslam.types.scan import Span
 from lslam.types.sequence import Sequence
 from lslam.types.trajectory import Trajectory
 
 SCHEMA = 2
+# What a stamp in the wrong unit brings about is no finding of its own.
+_FOLLOWS = {
+    "scan-unit": {"imu-apart", "gnss-apart", "point-times", "no-point-times"},
+    "imu-unit": {"imu-rate", "imu-gaps", "imu-apart", "imu-accel-unit"},
+    "gnss-unit": {"gnss-apart", "gnss-jumps"},
+    "point-unit": {"point-times"},
+}
 
 
 def inspect(sequence: Sequence, samples: int | None = 50, is_quick: bool = False) -> Facts:
@@ -35,10 +44,17 @@ def inspect(sequence: Sequence, samples: int | None = 50, is_quick: bool = False
     rule, sentence = rings_rule(sequence)
     if sentence:
         notes.append(sentence)
+    limits = points["per_point_times"]
+    units = examine_units(sequence, sequence.ground_truth, sweep=None if limits is None else Span(*limits))
+    findings += units
     imu = examine_imu(sequence, findings)
-    turns = None if imu is None or is_quick else examine_turns(sequence, findings)
+    is_clock_wrong = any(f.code in ("scan-unit", "imu-unit") for f in units)
+    turns = None if imu is None or is_quick or is_clock_wrong else examine_turns(sequence, findings)
     if turns is not None and not turns["is_judged"]:
         notes.append("IMU: the sensor hardly turns in the first scans, so its clock and axes could not be checked")
+    gnss = examine_gnss(sequence, findings)
+    follows = set().union(*(_FOLLOWS.get(f.code, set()) for f in units))
+    findings = [f for f in findings if f.code not in follows]
     return {
         "schema": SCHEMA,
         "name": sequence.name,
@@ -55,7 +71,7 @@ def inspect(sequence: Sequence, samples: int | None = 50, is_quick: bool = False
             key: None if T is None else np.asarray(T).tolist() for key, T in vars(sequence.calibration).items()
         },
         "imu": None if imu is None else {**imu, "turns": turns},
-        "gnss": examine_gnss(sequence, findings),
+        "gnss": gnss,
         "ground_truth": _ground_truth(sequence.ground_truth, sequence.stamps_ns),
         "notes": notes,
         "findings": [asdict(finding) for finding in findings],

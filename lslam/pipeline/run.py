@@ -22,6 +22,7 @@ from lslam.pipeline.building_pass import write_buildings
 from lslam.pipeline.check import check_config
 from lslam.pipeline.checkpoints import Checkpoints, OdometryCheckpoints
 from lslam.pipeline.choose import choose_scans
+from lslam.pipeline.doctor_units import examine_units
 from lslam.pipeline.feature_pass import build_feature_map
 from lslam.pipeline.feature_view import view_features
 from lslam.pipeline.front_end import sweep_of
@@ -201,9 +202,14 @@ def _announce(job: _Job) -> None:
     log.info("%s: %d scans of %s, method %s", sequence.name, len(sequence), sequence.path, config.odometry.method)
     for note in sequence.notes:
         log.info("%s", note)
-    for problem in sequence.problems:
-        log.warning("%s", problem)
     sweep = sweep_of(sequence)
+    units = examine_units(
+        getattr(sequence, "whole", sequence), job.truth, config.imu.use, config.gnss.mode != "off",
+        None if sequence.motion_compensated else sweep,
+    )  # fmt: skip
+    job.manifest.problems += map(str, units)
+    for problem in [*sequence.problems, *job.manifest.problems]:
+        log.warning("%s", problem)
     deskew = describe_deskew(sequence, config, sweep is not None, getattr(job.odometry, "deskew", ""))
     job.manifest.deskew = deskew
     job.manifest.pose_time = (sweep or Span()).instant

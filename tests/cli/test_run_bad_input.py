@@ -205,6 +205,37 @@ def test_truth_in_the_wrong_frame_is_detected(sequence: Path, tmp_path: Path) ->
     assert "WRONG FRAMES" in manifest(out)["problems"][0]
 
 
+@pytest.mark.parametrize(
+    ("slower", "said"), [(1e3, "1,000 times too slow, as ms taken for s are"), (1e-6, "as ms taken for ns are")]
+)
+def test_stamps_in_the_wrong_unit_are_said_by_the_run_and_the_doctor(
+    slower: float, said: str, sequence: Path, tmp_path: Path
+) -> None:
+    times = np.loadtxt(sequence / "times.txt")
+    np.savetxt(sequence / "times.txt", times * slower, fmt="%.9f")
+    done, out = run(sequence, tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert said in done.stderr
+    [problem] = manifest(out)["problems"]
+    assert said in problem
+    assert manifest(out)["status"] == "degraded"
+    assert said in (out / "report.html").read_text()
+    assert said in lslam("info", sequence, "--quick").stdout
+
+
+@pytest.mark.parametrize(("times", "unit"), [(1e3, "mm"), (1e-3, "km"), (1 / 0.3048, "feet")])
+def test_truth_in_another_unit_than_metres_is_said(times: float, unit: str, tmp_path: Path) -> None:
+    sequence = sample_copy(tmp_path / "data", 60)
+    rows = np.loadtxt(sequence / "../../poses/00.txt").reshape(-1, 3, 4)
+    rows[:, :, 3] *= times
+    np.savetxt(sequence / "../../poses/00.txt", rows.reshape(-1, 12))
+    done, out = run(sequence, tmp_path, "--set", "map.write=false")
+    assert done.returncode == 0, done.stderr
+    [problem] = manifest(out)["problems"]
+    assert problem.startswith("WRONG UNIT")
+    assert f"they seem to be in {unit}" in problem
+
+
 def test_truth_of_another_time_leaves_the_run_without_a_score(sequence: Path, tmp_path: Path) -> None:
     stamps = 10**15 + np.arange(12, dtype=np.int64) * 100_000_000
     write_tum(tmp_path / "late.tum", Trajectory(stamps, np.tile(np.eye(4), (12, 1, 1))), comment="poses")
