@@ -46,8 +46,7 @@ def align(
         return None
     level = so3.least_rotation(up, np.array([0.0, 0.0, 1.0]))
     a = antenna @ level.T
-    tilt = np.linalg.norm(a - np.median(a, axis=0), axis=1) * up_sigma
-    judged = np.sqrt(sigmas**2 + (slack**2 + tilt**2)[:, None])
+    judged = np.sqrt(sigmas**2 + slack[:, None] ** 2 + _tilted(a - np.median(a, axis=0), up_sigma) ** 2)
     T = _consensus(a, fixes, judged)
     if T is None:
         return None
@@ -59,6 +58,16 @@ def align(
         T = _refined(T, a[believed], fixes[believed], judged[believed], up_sigma)
     T_enu_world = T @ se3.make(level, np.zeros(3))
     return Alignment(T_enu_world, believed, fixes - se3.apply(T_enu_world, antenna))
+
+
+def _tilted(a: Floats, up_sigma: float) -> Floats:
+    """(F, 3) m by which a tilt of one sigma moves points `a` (F, 3): up or down by the way to the side, to the side by little.
+
+    A single sigma for all axes would let an eleventh of the way pass for tilt, and with it a fix far to the side.
+    """
+    way, height = np.linalg.norm(a[:, :2], axis=1), np.abs(a[:, 2])
+    side = up_sigma * height + 0.5 * up_sigma**2 * way
+    return np.column_stack([side, side, up_sigma * way])
 
 
 def _consensus(a: Floats, fixes: Floats, sigmas: Floats) -> Floats | None:

@@ -16,6 +16,7 @@ from lslam.errors import InputError
 from lslam.geometry import geodesy, noise, se3, so3
 from lslam.geometry.interpolate import poses_at
 from lslam.graph.alignment import Alignment, align
+from lslam.graph.chi_square import quantile
 from lslam.graph.drift import chains, drift_covariance
 from lslam.graph.fix_noise import DriftOfFixes, Wander, wander_of
 from lslam.graph.problem import PoseGraph, PositionFix
@@ -37,6 +38,11 @@ UNLEVELLED, LEVELLED = np.deg2rad(10.0), np.deg2rad(1.0)
 ABSURD = 20.0
 # m; noise and multipath put no fix so far away, a lost sign does.
 ELSEWHERE = 1e5
+# How probable it may be that chance alone has as many fixes disbelieved, or one of them as far away; and the probability with
+# which `align` disbelieves a sound one.
+CHANCE, DISBELIEVED = 1e-5, 1e-3
+# Of the fixes: what nearly as many say together as all the others.
+RIVAL = 0.4
 
 
 @dataclass(frozen=True)
@@ -127,7 +133,7 @@ def place(
     if config.gnss.mode == "graph":
         wander, walk = _wander(fixes, found, keyframes, graph, config.graph)
     factors = _as_factors(fixes, found, shift, results, keyframes, arm, wander)
-    return Placement(georeference, factors, wander, walk, _elsewhere(found))
+    return Placement(georeference, factors, wander, walk, _elsewhere(found) or contradicted(found, fixes))
 
 
 def on_earth(graph: PoseGraph, placement: Placement) -> PoseGraph:
@@ -203,6 +209,39 @@ def _elsewhere(found: Alignment) -> str:
         f"GNSS: {away} of {len(found.residuals)} fixes lie more than {ELSEWHERE / 1e3:g} km from the others and are left "
         "out: has their latitude or longitude lost its sign?"
     )
+
+
+def contradicted(found: Alignment, fixes: Fixes) -> str:
+    """Of fixes that odometry contradicts, and whether they agree with each other, or nothing where it may be chance."""
+    from scipy.special import bdtrc, chdtrc
+
+    wrong = np.flatnonzero(~found.believed)
+    n, k = len(found.residuals), len(wrong)
+    if not k:
+        return ""
+    sigmas = np.hypot(fixes.sigmas, fixes.slack[:, None])
+    farthest = float(((found.residuals / sigmas)[wrong] ** 2).sum(1).max())
+    if bdtrc(k - 1, n, DISBELIEVED) > CHANCE and n * chdtrc(3, farthest) > CHANCE:
+        return ""
+    off = found.residuals[wrong]
+    middle = np.median(off, axis=0)
+    worst = wrong[int(np.argmax(np.linalg.norm(off, axis=1)))]
+    said = (
+        f"GNSS: odometry contradicts {k} of {n} fixes, the farthest by {np.linalg.norm(found.residuals[worst]):.1f} m, "
+        f"{(fixes.stamps_ns[worst] - fixes.stamps_ns[0]) * 1e-9:.1f} s after the first"
+    )
+    is_together = (((off - middle) / sigmas[wrong]) ** 2).sum(1) <= quantile(1.0 - DISBELIEVED, 3)
+    first, last = int(wrong[0]), int(wrong[-1])
+    if k < 3 or is_together.mean() < 0.8 or last - first + 1 != k or (first > 0 and last < n - 1):
+        return f"{said}: they are left out, look at their receiver or state their true sigmas"
+    where = "before" if first == 0 else "from then on"
+    at = first if first > 0 else last + 1
+    said = (
+        f"GNSS: all fixes jump by {np.linalg.norm(middle):.1f} m together "
+        f"{(fixes.stamps_ns[at] - fixes.stamps_ns[0]) * 1e-9:.1f} s after the first, where odometry does not: the {k} of {n} "
+        f"{where} are left out"
+    )
+    return said + (", but they may as well be the right ones" if k >= RIVAL * n else "")
 
 
 def _wander(

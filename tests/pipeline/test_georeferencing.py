@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -152,3 +153,41 @@ def test_coordinates_of_no_map_are_refused_before_the_run(code: int, why: str) -
         require_gnss(recording(0.1), GnssConfig(mode="graph", crs=code))
     require_gnss(recording(0.1), GnssConfig(crs=code))
     require_gnss(recording(0.1), GnssConfig(mode="graph", crs=25832))
+
+
+def moved(which: np.ndarray, metres: float, noise: float = 0.85) -> Stub:
+    """A fix a second with some of them so far north, and noise of the stated sigma."""
+    stub = recording(noise)
+    assert stub.gnss is not None
+    every = slice(None, None, 5)
+    fixes = stub.gnss.lat_lon_alt[every].copy()
+    fixes[which, 0] += metres / 111_200
+    stub.gnss = GnssStream(stub.gnss.stamps_ns[every], fixes, stub.gnss.sigma[every])
+    return stub
+
+
+@pytest.mark.parametrize("which", [[3], [2, 5, 8], [20, 21, 22], [0, 39], [0, 1, 39]])
+def test_fixes_that_odometry_contradicts_are_counted_and_said(which: list[int]) -> None:
+    placed = fit(moved(np.array(which), 100.0))
+    assert placed.georeference is not None
+    assert placed.georeference.used == 40 - len(which)
+    match = re.search(rf"odometry contradicts {len(which)} of 40 fixes, the farthest by ([0-9.]+) m", placed.problem)
+    assert match is not None, placed.problem
+    assert float(match.group(1)) == pytest.approx(100.0, abs=4.0)
+
+
+@pytest.mark.parametrize(("first", "may_be_right"), [(20, True), (26, False)])
+def test_a_jump_of_all_fixes_is_said_with_its_size_and_time(first: int, may_be_right: bool) -> None:
+    problem = fit(moved(np.arange(first, 40), 100.0)).problem
+    match = re.search(rf"all fixes jump by ([0-9.]+) m together {first}.0 s after the first", problem)
+    assert match is not None, problem
+    assert float(match.group(1)) == pytest.approx(100.0, abs=2.0)
+    assert ("may as well be the right ones" in problem) == may_be_right
+    before = fit(moved(np.arange(10), 30.0)).problem
+    assert "together 10.0 s after the first" in before
+    assert "the 10 of 40 before are left out" in before
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_fixes_that_scatter_as_they_state_are_no_problem(seed: int) -> None:
+    assert fit(recording(0.85, seed)).problem == ""
