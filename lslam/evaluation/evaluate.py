@@ -12,12 +12,13 @@ from lslam.errors import InputError
 from lslam.evaluation.absolute import absolute_error
 from lslam.evaluation.associate import Matches, associate
 from lslam.evaluation.frames import reconcile
+from lslam.evaluation.hand_eye import body_turn
 from lslam.evaluation.kitti_drift import kitti_drift
 from lslam.evaluation.relative import relative_error
 from lslam.evaluation.results import Evaluation
 from lslam.evaluation.thesis import axis_errors, planar
 from lslam.evaluation.time_offset import estimate_offset
-from lslam.geometry import se3
+from lslam.geometry import se3, so3
 from lslam.types.calibration import Calibration
 from lslam.types.trajectory import Trajectory
 
@@ -31,6 +32,8 @@ STRAIGHT = 0.01
 UNITS = ((1 / 0.33, 1 / 0.28, "feet"), (67.0, 150.0, "cm"), (670.0, 1500.0, "mm"), (0.0, 0.03, "km"))
 # m; a spread below is noise.
 SPREAD = 5.0
+# Chi-square of three degrees of freedom that chance exceeds once in a million times.
+UNLIKELY = 30.7
 
 
 def evaluate(
@@ -82,6 +85,8 @@ def evaluate(
     units = _other_unit(same.estimate, same.truth)
     # Whose body it is shows in motions, which are wrong then.
     notes = [*units, *(note for note in notes if not (units and "WRONG FRAMES" in note))]
+    if not any("WRONG" in note for note in notes):
+        notes += _turned(same.estimate, same.truth)
     notes += _nearly_straight(same.truth, config)
     for note in notes:
         log.log(logging.WARNING if "WRONG" in note else logging.INFO, "%s: %s", estimate.source or "estimate", note)
@@ -129,6 +134,19 @@ def _other_unit(estimate: Floats, truth: Floats) -> list[str]:
         f"deviations), {real / own:.4g} times as far: they seem to be in {unit}, convert them to m"
         for low, high, unit in UNITS
         if low < real / own < high
+    ]
+
+
+def _turned(estimate: Floats, truth: Floats) -> list[str]:
+    """A note when the motions of both say that their bodies are turned against each other, beyond what drift explains."""
+    turn = body_turn(estimate, truth)
+    if turn is None or turn.squared < UNLIKELY:
+        return []
+    rpy = ", ".join(f"{v:.1f}" for v in np.rad2deg(so3.euler_rpy(so3.exp(turn.rotation))))
+    return [
+        f"WRONG FRAMES: by the motions of both the ground truth's body is turned by {np.rad2deg(turn.angle):.1f} deg (sigma "
+        f"{np.rad2deg(turn.sigma):.1f}) against the estimate's, roll, pitch, yaw = {rpy} deg: correct the rotation of the "
+        "extrinsics that carry one to the other, or give the transform between the bodies with --T-est-gt"
     ]
 
 
