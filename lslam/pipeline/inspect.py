@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from lslam.pipeline.doctor_gnss import examine_gnss
 from lslam.pipeline.doctor_imu import examine_imu
 from lslam.pipeline.doctor_scans import examine_points, examine_stamps, examine_times, rings_rule
+from lslam.pipeline.doctor_truth import examine_gaps, examine_jumps
 from lslam.pipeline.doctor_turns import examine_turns
 from lslam.pipeline.doctor_units import examine_units
 from lslam.pipeline.findings import Facts, Finding
@@ -20,10 +21,11 @@ from lslam.types.trajectory import Trajectory
 SCHEMA = 2
 # What a stamp in the wrong unit brings about is no finding of its own.
 _FOLLOWS = {
-    "scan-unit": {"imu-apart", "gnss-apart", "point-times", "no-point-times"},
+    "scan-unit": {"imu-apart", "gnss-apart", "point-times", "no-point-times", "truth-gaps"},
     "imu-unit": {"imu-rate", "imu-gaps", "imu-apart", "imu-accel-unit"},
     "gnss-unit": {"gnss-apart", "gnss-jumps"},
     "point-unit": {"point-times"},
+    "truth-unit": {"truth-gaps"},
 }
 
 
@@ -53,6 +55,7 @@ def inspect(sequence: Sequence, samples: int | None = 50, is_quick: bool = False
     if turns is not None and not turns["is_judged"]:
         notes.append("IMU: the sensor hardly turns in the first scans, so its clock and axes could not be checked")
     gnss = examine_gnss(sequence, findings)
+    findings += [*examine_gaps(sequence), *examine_jumps(sequence.ground_truth)]
     follows = set().union(*(_FOLLOWS.get(f.code, set()) for f in units))
     findings = [f for f in findings if f.code not in follows]
     return {

@@ -22,6 +22,7 @@ from lslam.pipeline.building_pass import write_buildings
 from lslam.pipeline.check import check_config
 from lslam.pipeline.checkpoints import Checkpoints, OdometryCheckpoints
 from lslam.pipeline.choose import choose_scans
+from lslam.pipeline.doctor_truth import examine_jumps
 from lslam.pipeline.doctor_units import examine_units
 from lslam.pipeline.feature_pass import build_feature_map
 from lslam.pipeline.feature_view import view_features
@@ -207,7 +208,7 @@ def _announce(job: _Job) -> None:
         getattr(sequence, "whole", sequence), job.truth, config.imu.use, config.gnss.mode != "off",
         None if sequence.motion_compensated else sweep,
     )  # fmt: skip
-    job.manifest.problems += map(str, units)
+    job.manifest.problems += map(str, [*units, *examine_jumps(job.truth)])
     for problem in [*sequence.problems, *job.manifest.problems]:
         log.warning("%s", problem)
     deskew = describe_deskew(sequence, config, sweep is not None, getattr(job.odometry, "deskew", ""))

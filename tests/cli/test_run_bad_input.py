@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import html
 import json
 import os
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -14,6 +16,8 @@ from calling import SAMPLE, Done, assert_one_sentence, lslam, manifest, sample_c
 
 from lslam.formats.point_files import write_points
 from lslam.formats.trajectory_files import write_tum
+from lslam.geometry import se3, so3
+from lslam.readers import open_sequence
 from lslam.types.trajectory import Trajectory
 
 
@@ -234,6 +238,59 @@ def test_truth_in_another_unit_than_metres_is_said(times: float, unit: str, tmp_
     [problem] = manifest(out)["problems"]
     assert problem.startswith("WRONG UNIT")
     assert f"they seem to be in {unit}" in problem
+
+
+def turn_calibration(folder: Path) -> None:
+    toml = folder / "sequence.toml"
+    known = open_sequence(folder).calibration.T_cam0_lidar
+    assert known is not None
+    wrong = known @ se3.make(so3.exp(np.array([0.0, np.deg2rad(5.0), 0.0])), np.zeros(3))
+    key = re.search(r"T_cam0_lidar = \[.*?\n\]", toml.read_text(), re.DOTALL)
+    assert key is not None
+    toml.write_text(toml.read_text().replace(key.group(0), f"T_cam0_lidar = {wrong.tolist()}"))
+
+
+def drop_poses(folder: Path) -> None:
+    poses = folder / "../../poses/00.txt"
+    lines = poses.read_text().splitlines(keepends=True)
+    poses.write_text("".join([*lines[:40], *lines[60:]]))
+
+
+def move_fixes(numbers: range | tuple[int, ...]) -> Callable[[Path], None]:
+    def spoil(folder: Path) -> None:
+        header, *rows = (folder / "gnss.csv").read_text().splitlines()
+        cells = [row.split(",") for row in rows]
+        for k in numbers:
+            cells[k][1] = repr(float(cells[k][1]) + 9e-4)
+        (folder / "gnss.csv").write_text("\n".join([header, *(",".join(c) for c in cells)]) + "\n")
+
+    return spoil
+
+
+@pytest.mark.parametrize(
+    ("spoil", "said"),
+    [
+        (turn_calibration, "turned by 5.0 deg (sigma 0.6) against the estimate's"),
+        (drop_poses, "ground truth: 1 jump, the largest by 25.6 m from pose 39 to the next"),
+        (move_fixes((2, 5, 8)), "GNSS: odometry contradicts 3 of 10 fixes, the farthest by 100."),
+        (
+            move_fixes(range(5, 10)),
+            "m together 5.0 s after the first, where odometry does not: the 5 of 10 from then on",
+        ),
+    ],
+)
+def test_what_odometry_contradicts_is_a_problem_of_the_run(
+    spoil: Callable[[Path], None], said: str, tmp_path: Path
+) -> None:
+    sequence = sample_copy(tmp_path / "data", 95)
+    spoil(sequence)
+    done, out = run(sequence, tmp_path, "--gnss", "--imu", "--set", "map.write=false")
+    assert done.returncode == 0, done.stderr
+    assert "WARNING" in done.stderr
+    assert said in done.stderr
+    assert sum(said in problem for problem in manifest(out)["problems"]) == 1
+    assert manifest(out)["status"] == "degraded"
+    assert said in html.unescape((out / "report.html").read_text())
 
 
 def test_truth_of_another_time_leaves_the_run_without_a_score(sequence: Path, tmp_path: Path) -> None:
