@@ -47,11 +47,12 @@ class Whole:
 class Tally:
     """What was done and found.
 
-    hits : kills by stage and signal, and by drive and signal; ended : runs that came to their end, by drive
+    hits : kills by stage and signal; by_drive : by drive and signal; ended : runs that came to their end, by drive
     faults : sentences; slowest : s to answer a signal, by stage
     """
 
     hits: Counter[tuple[str, str]] = field(default_factory=Counter)
+    by_drive: Counter[tuple[str, str]] = field(default_factory=Counter)
     ended: Counter[str] = field(default_factory=Counter)
     faults: list[str] = field(default_factory=list)
     slowest: dict[str, float] = field(default_factory=dict)
@@ -67,7 +68,7 @@ class Tally:
         with self.lock:
             self.kills += 1
             self.hits[done.stage, kill.number.name] += 1
-            self.hits[drive, kill.number.name] += 1
+            self.by_drive[drive, kill.number.name] += 1
             if kill.number != signal.SIGKILL:
                 self.slowest[done.stage] = max(self.slowest.get(done.stage, 0.0), done.answer)
 
@@ -164,14 +165,14 @@ def _report(tally: Tally, seconds: float) -> None:
     for stage in STAGES:
         slowest = f"{tally.slowest[stage]:.1f}" if stage in tally.slowest else ""
         print(
-            f"| {stage:10} | {_cells(tally, stage, names)} | {tally.by_stage(stage)} | {slowest} |",
+            f"| {stage:10} | {_cells(tally.hits, stage, names)} | {tally.by_stage(stage)} | {slowest} |",
         )
     print(f"\n| {'drive':10} | runs | " + " | ".join(names) + " |\n|---|" + "---:|" * (len(names) + 1))
     for drive, runs in tally.ended.items():
-        print(f"| {drive:10} | {runs} | {_cells(tally, drive, names)} |")
+        print(f"| {drive:10} | {runs} | {_cells(tally.by_drive, drive, names)} |")
     print(f"\n{tally.kills} kills of {sum(tally.ended.values())} runs in {seconds:.0f} s, {len(tally.faults)} faults")
     print("\n".join(tally.faults))
 
 
-def _cells(tally: Tally, row: str, names: list[str]) -> str:
-    return " | ".join(str(tally.hits[row, name]) for name in names)
+def _cells(counts: Counter[tuple[str, str]], row: str, names: list[str]) -> str:
+    return " | ".join(str(counts[row, name]) for name in names)

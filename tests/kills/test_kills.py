@@ -56,8 +56,9 @@ def test_each_stage_is_drawn(whole: Whole) -> None:
     for _ in range(100):
         kill = drawn(rng, whole, tally)
         assert 0 <= kill.seconds <= (whole.life if kill.stage == START else whole.lengths[kill.stage])
-        tally.note("all", Run(stage=kill.stage), kill)
+        tally.note("loops", Run(stage=kill.stage), kill)  # the name of a stage, too
     assert all(tally.by_stage(stage) >= 3 for stage in STAGES)
+    assert sum(map(tally.by_stage, STAGES)) == tally.kills == 100
 
 
 def test_half_a_file_is_noticed_whichever_it_is(copy: Path) -> None:
