@@ -68,7 +68,11 @@ def test_instants_within_a_step_say_nothing_more() -> None:
     rng = np.random.default_rng(2)
     imu = ImuStream(stamps, rng.normal(0, 4, (31, 3)), rng.normal(1.0, 0.3, (31, 3)))
     before = ImuEstimate(
-        np.array([3.0, -1, 0.2]), np.array([0, 0, -GRAVITY]), np.zeros(3), Gyroscope(np.zeros(3)), np.eye(9)
+        np.array([3.0, -1, 0.2]),
+        np.array([0, 0, -GRAVITY]),
+        np.zeros(3),
+        Gyroscope.of_bias(np.zeros(3), 0.1),
+        np.eye(9),
     )
     R = so3.exp(np.array([0.3, -0.5, 1.1]))
     found, taught = [], []

@@ -150,8 +150,8 @@ def test_a_full_turn_in_small_steps_comes_back() -> None:
     np.testing.assert_allclose(R, np.eye(3), atol=1e-10)
 
 
-@pytest.mark.parametrize("size", [0.0, 1e-40, 2.0])
-def test_a_ball_has_a_normal_though_any_would_do(size: float) -> None:
-    values, normal = plane(size * np.eye(3))
-    np.testing.assert_allclose(values, size)
+@pytest.mark.parametrize("values", [(0.0, 0.0, 0.0), (1e-40, 1e-40, 1e-40), (2.0, 2.0, 2.0), (0.0, 0.0, 4e-15)])
+def test_a_ball_and_a_line_have_a_normal_though_many_would_do(values: tuple[float, float, float]) -> None:
+    found, normal = plane(np.diag(values[::-1]))
+    np.testing.assert_allclose(found, values, atol=1e-7 * values[2])
     assert np.linalg.norm(normal) == pytest.approx(1.0)

@@ -3,7 +3,7 @@
 Mutants are drawn from graph/, loops/, inertial/, evaluation/ and registration/, and `--kernels` of them from the compiled
 kernels that registration calls. Each is run in a copy of the project, alone, against the test files that run its line.
 Results are lines of JSON in `--out`: what is there already is not tried again, or with `--again` only what survived. The
-tests of the command line and of whole runs are not asked: the share is a lower bound.
+tests of the command line and of whole runs are not asked, unless `--also`: the share is a lower bound.
 """
 
 from __future__ import annotations
