@@ -15,7 +15,7 @@ _FLOOD = re.compile(r"\S{1000,}")
 
 
 def sentence(text: str) -> str:
-    """A text for a terminal: what it would obey escaped, and without the middle of a flood, for it quotes what it was given.
+    r"""A text for a terminal: what it would obey escaped, and without the middle of a flood, for it quotes what it was given.
 
     >>> sentence("9" * 5000).count("9"), sentence("a\x1bb")
     (300, 'a\\x1bb')

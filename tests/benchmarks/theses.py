@@ -2,8 +2,8 @@
 
     python tests/benchmarks/theses.py [--flights closed,open] [--seeds 100-104] [--write docs/results.md]
 
-`thesis_rmse` of the odometry, m: root mean square over all 3 N coordinates, first pose on the first true pose. The climb is
-scored a second time up to where it is 70 m high: above that hardly a beam of its 50 m comes back.
+`thesis_rmse` of the odometry, m: root mean square over all 3 N coordinates, first pose on the first true pose. `failed` is a run
+that said `diverged`. The climb is flown a second time with returns of 70 m: hardly a beam ends within the 50 m of the presets.
 """
 
 from __future__ import annotations
@@ -12,7 +12,6 @@ import argparse
 import logging
 from itertools import product
 
-import numpy as np
 import tables
 from traced import Traced, run_on, traced
 
@@ -20,7 +19,15 @@ from lslam.errors import LslamError
 from lslam.evaluation.associate import associate
 from lslam.evaluation.thesis import axis_errors
 
-FLIGHTS = ("closed", "open", "climbing", "small-eight", "large-eight")
+# Name, scenario, and keys beside the preset's: for the climb the thesis widened its range, by how much it does not say.
+FLIGHTS: dict[str, tuple[str, tuple[str, ...]]] = {
+    "closed": ("closed", ()),
+    "open": ("open", ()),
+    "climbing": ("climbing", ()),
+    "climbing-70m": ("climbing", ("preprocess.range_max=70",)),
+    "small-eight": ("small-eight", ()),
+    "large-eight": ("large-eight", ()),
+}
 PRESETS = ("thesis-icp", "thesis-loam", "thesis-loam-map")
 # What the thesis prints, before its optimisation, m, without and with the IMU.
 PRINTED = {
@@ -30,20 +37,23 @@ PRINTED = {
     "small-eight": ("0.68", "0.34", "0.70", "", "0.41", "0.38"),
     "large-eight": ("0.72", "", "2.16", "", "0.64", ""),
 }
-LOW = 70.0
 
 
-def judged(drive: Traced, preset: str, uses_imu: bool) -> tuple[float, float]:
-    """`thesis_rmse`, m, of all scans and of those up to LOW m of height; inf where the run failed."""
-    settings = [f"odometry.preset={preset}", f"imu.use={str(uses_imu).lower()}", "loops.use=false", "map.write=false"]
+def judged(drive: Traced, preset: str, uses_imu: bool, more: tuple[str, ...]) -> float:
+    """`thesis_rmse`, m; inf where the run failed."""
+    settings = [
+        f"odometry.preset={preset}",
+        f"imu.use={str(uses_imu).lower()}",
+        "loops.use=false",
+        "map.write=false",
+        *more,
+    ]
     try:
         outcome = run_on(drive, *settings)
     except LslamError:
-        return float("inf"), float("inf")
+        return float("inf")
     matches = associate(outcome.trajectory, drive.ground_truth, 0.01, 0)
-    high = np.flatnonzero(matches.truth[:, 2, 3] - matches.truth[0, 2, 3] > LOW)
-    low = high[0] if len(high) else len(matches.truth)
-    return tuple(axis_errors(matches.estimate[:n], matches.truth[:n]).thesis_rmse for n in (len(matches.truth), low))
+    return axis_errors(matches.estimate, matches.truth).thesis_rmse
 
 
 def main() -> None:
@@ -57,16 +67,12 @@ def main() -> None:
     systems = list(product(PRESETS, (False, True)))
     found: dict[str, list[list[float]]] = {}
     for flight, seed in product(flights, seeds):
-        drive = traced(flight, seed, imu="icm20948")
+        scenario, more = FLIGHTS[flight]
+        drive = traced(scenario, seed, imu="icm20948")
         for system in systems:
-            whole, low = judged(drive, *system)
-            print(
-                f"{flight:12} {seed:4d} {system[0]:16} {'imu' if system[1] else '-':4} {whole:9.3f} {low:9.3f}",
-                flush=True,
-            )
-            found.setdefault(flight, [[] for _ in systems])[systems.index(system)].append(whole)
-            if flight == "climbing":
-                found.setdefault(f"climbing, {LOW:.0f} m", [[] for _ in systems])[systems.index(system)].append(low)
+            error = judged(drive, *system, more)
+            print(f"{flight:12} {seed:4d} {system[0]:16} {'imu' if system[1] else '-':4} {error:9.3f}", flush=True)
+            found.setdefault(flight, [[] for _ in systems])[systems.index(system)].append(error)
     caption = (
         f"`thesis_rmse` of the odometry, m, first pose on the first true pose, whole flights, median / worst of "
         f"{tables.seeds_named(seeds)}; in brackets what the thesis prints before its optimisation."
