@@ -44,7 +44,7 @@ def main() -> None:
     logging.getLogger("lslam").setLevel(logging.CRITICAL)
     path, methods = args.recordings / PLACES["KITTI raw 0005"], args.methods.split(",")
     truth = read_trajectory(path / "reference_lidar.tum")
-    late = replace(truth, poses=poses_at(truth.stamps_ns, truth.poses, truth.stamps_ns + round(1e9 * args.late)))
+    late = replace(truth, poses=poses_at(truth.stamps_ns, truth.poses, truth.stamps_ns - round(1e9 * args.late)))
     rows = []
     for name, is_left_in in (("left in", True), ("taken out", False)):
         found = {method: poses_of(path, method, is_left_in) for method in methods}
