@@ -42,7 +42,8 @@ def read_line(path: Path) -> NDArray[np.float64]:
         tree = parse_json(path.read_bytes())
         lines = [shape["coordinates"] for shape in _shapes(tree) if shape.get("type") in ("LineString", "Point")]
         rows = lines[0] if len(lines) == 1 and np.ndim(lines[0][0]) else lines
-        places = np.array([[*row, 0.0][:3] for row in rows], np.float64)[:, [1, 0, 2]]
+        # Of two lines the rows are lines.
+        places = np.array([[*row, 0.0][:3] for row in rows], np.float64).reshape(len(rows), 3)[:, [1, 0, 2]]
     except OSError as error:
         raise InputError(f"{path} cannot be read: {cause(error)}") from None
     except MISFIT:

@@ -18,6 +18,9 @@ ACCEL, GYRO = slice(11, 14), slice(17, 20)  # ax..az and wx..wz: vehicle axes, x
 POS_ACC = 23
 _WIDTH = 30
 _HIGHEST = 1e5  # m
+_LARGEST = (
+    1e9  # of any of them, in its unit: what is larger overflows when it is squared twice, and is nothing a sensor says
+)
 
 
 @dataclass(frozen=True)
@@ -67,8 +70,10 @@ def _read_sample(path: Path) -> NDArray[np.float64]:
         values = np.array([float(w) for w in words], np.float64)
     except (OSError, UnicodeDecodeError, ValueError) as error:
         raise InputError(f"{path} is no OXTS sample: {error}") from None
-    if len(values) != _WIDTH or not np.isfinite(values).all():
-        raise InputError(f"{path} is no OXTS sample: {len(values)} numbers where {_WIDTH} finite ones belong")
+    if len(values) != _WIDTH or not (np.abs(values) < _LARGEST).all():
+        raise InputError(
+            f"{path} is no OXTS sample: {len(values)} numbers where {_WIDTH} finite ones of its size belong"
+        )
     if not (np.abs(values[:2]) <= [90, 180]).all() or abs(values[2]) > _HIGHEST:
         raise InputError(f"{path} is no OXTS sample: it begins with no latitude, longitude and height")
     return values

@@ -18,6 +18,8 @@ DIGITS = b"9" * 5000
 DEEP = b"[" * 5000
 _NPY = b"\x93NUMPY\x01\x00\x76\x00%-118b"
 _NOWHERE = CORRECTED.replace("[49.0, 8.4, 0.0]", "[49.0, NaN, 0.0]").encode()
+_LINE = b'{"type": "Feature", "geometry": {"type": "LineString", "coordinates": [[8.4, 49, 9], [8.5, 49, 9], [8.6, 49, 9]]}}'
+_TWO_LINES = b'{"type": "FeatureCollection", "features": [' + _LINE + b", " + _LINE + b"]}"
 BY_NAME = {parser.name: parser for parser in PARSERS}
 
 
@@ -35,6 +37,7 @@ BY_NAME = {parser.name: parser for parser in PARSERS}
         ("way-points, csv", "w.csv", b"x,y\n" + b"e" * 140_000, "field larger"),
         ("perturbed map", "p.json", DEEP, "deep"),
         ("GeoJSON line", "line.geojson", b"[1]", "no GeoJSON"),
+        ("GeoJSON line", "line.geojson", _TWO_LINES, "no GeoJSON of one line"),
         ("timing.csv", "timing.csv", b"total\n" + b"1" * 140_000, "field larger"),
         ("stamps", "stamps.txt", b"0\n9999-01-01 00:00:00\n", "line 2"),
         ("PCD", "a.pcd", b"FIELDS x\nSIZE \xc2\xb2\nTYPE F\nCOUNT 1\nDATA ascii\n", "does not exist"),
@@ -94,7 +97,11 @@ def test_oxts_off_the_earth_or_without_time(tmp_path: Path) -> None:
     drive = "2011_09_26/2011_09_26_drive_0005_sync"
     sample = f"{drive}/oxts/data/0000000001.txt"
     for k, (file, data) in enumerate(
-        [(sample, good[sample].replace(b"49.0", b"490", 1)), (f"{drive}/oxts/timestamps.txt", b"0\n0\n0\n")]
+        [
+            (sample, good[sample].replace(b"49.0", b"490", 1)),
+            (sample, good[sample].replace(b" 0.0", b" -1e308", 1)),
+            (f"{drive}/oxts/timestamps.txt", b"0\n0\n0\n"),
+        ]
     ):
         lay_out(tmp_path / str(k), good | {file: data})
         assert open_sequence(tmp_path / str(k) / drive).ground_truth is None
