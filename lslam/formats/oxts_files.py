@@ -18,9 +18,8 @@ ACCEL, GYRO = slice(11, 14), slice(17, 20)  # ax..az and wx..wz: vehicle axes, x
 POS_ACC = 23
 _WIDTH = 30
 _HIGHEST = 1e5  # m
-_LARGEST = (
-    1e9  # of any of them, in its unit: what is larger overflows when it is squared twice, and is nothing a sensor says
-)
+# Of any of them, in its unit: no sensor says more, and squared twice it overflows.
+_LARGEST = 1e9
 
 
 @dataclass(frozen=True)
