@@ -95,7 +95,6 @@ def plan(sequence: Sequence, config: Config, ground_truth: Trajectory | None = N
 
     Raises InputError and UsageError as `run` does before it begins.
     """
-    check_config(config)
     return _prepare(sequence, config, ground_truth, "", Watch()).sequence
 
 
