@@ -16,7 +16,10 @@ from lslam.formats.trajectory_files import read_trajectory
 from lslam.printable import printable
 from lslam.readers import open_sequence
 
-pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="names are bytes on Linux only")
+pytestmark = pytest.mark.skipif(
+    sys.platform != "linux",
+    reason="file systems of macOS and Windows refuse such names, which are bytes on Linux alone",
+)
 SOURCE = SAMPLE / "sequences" / "00"
 
 
