@@ -73,6 +73,8 @@ def test_a_seed_draws_the_same_mutants_again() -> None:
 def test_a_mutant_is_killed_by_a_test_that_runs_its_line(tmp_path: Path, new: str, is_killed: bool) -> None:
     (tmp_path / "lslam").mkdir()
     (tmp_path / "tests").mkdir()
+    # Without it a regular package of that name, if one is installed, goes first.
+    (tmp_path / "lslam" / "__init__.py").touch()
     (tmp_path / "lslam" / "one.py").write_text("def one():\n    return 1\n")
     (tmp_path / "tests" / "test_one.py").write_text(
         "from lslam.one import one\n\ndef test_one():\n    assert one() == 1\n"
