@@ -28,6 +28,7 @@ from grid_targets import report
 from numpy.typing import NDArray
 from peers import drive
 from scores import ate, rotation_rpe
+from traced import Traced
 
 from lslam import Registration
 from lslam.config import load_config
@@ -41,7 +42,6 @@ from lslam.readers import open_sequence
 from lslam.simulation.record import NUMBER, record
 from lslam.simulation.scenario_files import scenario_names
 from lslam.simulation.scenarios import simulate
-from lslam.types.scan import Scan
 from lslam.types.sequence import Sequence
 from lslam.types.trajectory import Trajectory
 
@@ -92,23 +92,6 @@ def cases(recordings: Path | None, seeds: tuple[int, ...]) -> Iterator[Case]:
                 yield Case(f"{name}:{lidar}", seed, FEW_BEAMS)
 
 
-class Kept:
-    """A sequence whose scans are read once, before anything is timed."""
-
-    def __init__(self, sequence: Sequence) -> None:
-        self._sequence = sequence
-        self._scans = [sequence.scan(i) for i in range(len(sequence))]
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._sequence, name)
-
-    def __len__(self) -> int:
-        return len(self._scans)
-
-    def scan(self, index: int) -> Scan:
-        return self._scans[index]
-
-
 def worker(path: Path, truth_file: str, method: str) -> None:
     """One run of one method: its row as JSON on stdout."""
     logging.getLogger("lslam").setLevel(logging.ERROR)
@@ -122,7 +105,7 @@ def worker(path: Path, truth_file: str, method: str) -> None:
     truth = se3.relative(truth[0], truth)
     row: dict[str, Any] = {"method": method, "n": len(sequence)}
     if method in BESIDE:
-        scans = Kept(sequence)
+        scans = Traced(sequence)
         poses, seconds = drive(method, (scans.scan(i).points for i in range(len(scans))))
         row |= {"status": "done", "bridged": 0, "degenerate": 0}
     else:
@@ -161,7 +144,7 @@ def configured(method: str, *more: str) -> Any:
 def of_ours(sequence: Sequence, method: str) -> tuple[NDArray[np.float64], NDArray[np.float64], dict[str, Any]]:
     """Poses, seconds per scan without reading, and what became of the scans."""
     ended: list[RunOutcome] = []
-    kept: Any = Kept(sequence)
+    kept: Any = Traced(sequence)
     status = "done"
     try:
         more = ON_THE_CLIMB.get(method, ()) if sequence.name.startswith("climbing") else ()

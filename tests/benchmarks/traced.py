@@ -1,4 +1,4 @@
-"""Simulated drives whose scans are traced once, for several runs on the same scans."""
+"""Sequences whose scans are read or traced once, for several runs on the same scans."""
 
 from __future__ import annotations
 
@@ -9,12 +9,13 @@ from lslam.pipeline.run import run
 from lslam.pipeline.watch import RunOutcome
 from lslam.simulation.scenarios import SimulatedDrive, simulate
 from lslam.types.scan import Scan
+from lslam.types.sequence import Sequence
 
 
 class Traced:
-    """A simulated drive whose scans are kept."""
+    """A simulated drive, or a recording, whose scans are kept."""
 
-    def __init__(self, drive: SimulatedDrive) -> None:
+    def __init__(self, drive: SimulatedDrive | Sequence) -> None:
         self._drive = drive
         self._scans = [drive.scan(i) for i in range(len(drive))]
 
