@@ -32,6 +32,7 @@ from sparse import length
 from lslam.config import load_config
 from lslam.errors import UsageError
 from lslam.odometry import create_odometry
+from lslam.pipeline import tracker
 from lslam.pipeline.tracker import Loaded, Tracker
 from lslam.recovery import non_ground, start_search
 from lslam.registration import local_map, residuals, solver
@@ -68,6 +69,7 @@ WITHOUT: dict[str, dict[str, Variant]] = {
         "CLEARLY": ((), ((start_search, "CLEARLY", 1.0),)),
         "MUCH": ((), ((start_search, "MUCH", 1.0),)),
         "agreement": (("registration.min_agreement=0",), ()),
+        "possible jumps": ((), ((tracker, "plausible", lambda result, prior, last: result),)),
     },
     "loam": {
         **MAP,
@@ -138,11 +140,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--recordings", type=Path)
     parser.add_argument("--starts", action="store_true")
-    parser.add_argument("--seeds", default="100,101")
     parser.add_argument("--rows", default="hdl64,vlp16,os1-32")
     parser.add_argument("--method", default="icp", choices=list(WITHOUT))
     parser.add_argument("--without", help="names of this table, comma-separated; default: all")
-    tables.offer(parser)
+    tables.offer(parser, "100,101")
     args = parser.parse_args()
     known = WITHOUT[args.method]
     asked = args.without.split(",") if args.without else list(known)

@@ -72,7 +72,6 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("recordings", nargs="?", type=Path)
     parser.add_argument("--peers", default=",".join(PEERS_SHOWN), help=f"of {', '.join(PEERS)}")
-    parser.add_argument("--seeds", default=tables.SEEDS)
     tables.offer(parser)
     args = parser.parse_args()
     methods, seeds = args.peers.split(","), tables.numbers(args.seeds)

@@ -42,7 +42,6 @@ def main() -> None:
     parser.add_argument("--scenario", default="urban")
     parser.add_argument("--share", type=float, default=0.1)
     parser.add_argument("--methods", default=METHODS)
-    parser.add_argument("--seeds", default=tables.SEEDS)
     parser.add_argument("--scans", type=int, default=60)
     tables.offer(parser)
     args = parser.parse_args()

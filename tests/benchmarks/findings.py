@@ -44,7 +44,6 @@ def swept(study: str, seeds: list[int], folder: Path) -> list[StudyResult]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--studies", default=",".join(study_names()))
-    parser.add_argument("--seeds", default=tables.SEEDS)
     parser.add_argument("--runs", type=Path, metavar="FOLDER")
     tables.offer(parser)
     args = parser.parse_args()

@@ -64,7 +64,6 @@ def smoothed(drive: Traced) -> float:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scenario", default="small-eight")
-    parser.add_argument("--seeds", default=tables.SEEDS)
     parser.add_argument("--drift", default="1.0,0.5", help="PERCENT,DEG_PER_100M")
     parser.add_argument("--kinds", default=",".join(KINDS))
     tables.offer(parser)

@@ -141,7 +141,6 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--recordings", type=Path)
     parser.add_argument("--scenarios", default="urban,urban-hard")
-    parser.add_argument("--seeds", default=tables.SEEDS)
     parser.add_argument("--scans", type=int, default=154)
     parser.add_argument("--voxel", type=float, default=0.2)
     parser.add_argument("--set", action="append", default=[], dest="settings")

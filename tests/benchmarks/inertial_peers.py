@@ -151,7 +151,6 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("sequences", nargs="*", type=Path, help="in place of --scenarios")
     parser.add_argument("--scenarios", default="walk,urban,residential,open")
-    parser.add_argument("--seeds", default=tables.SEEDS)
     parser.add_argument("--scans", type=int, default=100)
     parser.add_argument("--methods", default=",".join(METHODS))
     tables.offer(parser)

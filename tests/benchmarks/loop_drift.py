@@ -33,7 +33,6 @@ def judged(drive: Traced, settings: list[str]) -> tuple[float, float, int]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scenario", default="closed")
-    parser.add_argument("--seeds", default=tables.SEEDS)
     parser.add_argument("--drift", default="1.0,0.5", help="PERCENT,DEG_PER_100M")
     tables.offer(parser)
     args = parser.parse_args()

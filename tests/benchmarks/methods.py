@@ -48,7 +48,6 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scenarios", default="urban,street,carpark,motorway")
     parser.add_argument("--methods", default=METHODS)
-    parser.add_argument("--seeds", default=tables.SEEDS)
     parser.add_argument("--scans", type=int, default=60)
     tables.offer(parser)
     args = parser.parse_args()

@@ -104,7 +104,7 @@ def main() -> None:
     parser.add_argument("--scans", type=int, default=250)
     parser.add_argument("--modes", default=",".join(MODES))
     parser.add_argument("--drives", default=",".join(str(k) for k in range(len(DRIVES))))
-    tables.offer(parser)
+    tables.offer(parser, None)
     args = parser.parse_args()
     print(f"{'drive':28} {'mode':9} {'NEES':>8} {'place':>8} {'turn':>8} {'end, m':>8} {'sigma, m':>9}")
     per: dict[str, list[float]] = {}

@@ -173,7 +173,6 @@ def main() -> None:
     """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("drives", nargs="*", type=Path, help="folders of simulated sequences, in place of --seeds")
-    parser.add_argument("--seeds", default=tables.SEEDS, help="of `residential`")
     parser.add_argument("--scans", type=int, default=150)
     parser.add_argument("--modes", default=",".join(MODES))
     parser.add_argument("--map", default="exact,perturbed")

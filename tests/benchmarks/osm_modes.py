@@ -24,7 +24,7 @@ from wrong_maps import DRAWN, MODES, OFF, SHIFT, on
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--drifts", default=tables.SEEDS)
-    tables.offer(parser)
+    tables.offer(parser, None)
     args = parser.parse_args()
     logging.getLogger("lslam").setLevel(logging.CRITICAL)
     drifts = tables.numbers(args.drifts)

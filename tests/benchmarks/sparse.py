@@ -65,7 +65,6 @@ def main() -> None:
     parser.add_argument("--methods", default="icp,kiss-icp,small-gicp,genz-icp")
     parser.add_argument("--scenarios", default="carpark,motorway,street")
     parser.add_argument("--speeds", default="2,5,12,30")
-    parser.add_argument("--seeds", default=tables.SEEDS)
     tables.offer(parser)
     args = parser.parse_args()
     methods = args.methods.split(",")

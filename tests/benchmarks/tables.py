@@ -21,8 +21,10 @@ SEEDS = "100,101,102,103,104"
 WIDTH = 132
 
 
-def offer(parser: argparse.ArgumentParser) -> None:
-    """The option `--write`."""
+def offer(parser: argparse.ArgumentParser, seeds: str | None = SEEDS) -> None:
+    """The options `--write` and, unless they are None, `--seeds`."""
+    if seeds is not None:
+        parser.add_argument("--seeds", default=seeds, help="as 100,101 or 100-104")
     parser.add_argument("--write", type=Path, metavar="FILE", help="document in which the table is written anew")
 
 

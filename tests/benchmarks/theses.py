@@ -59,7 +59,6 @@ def judged(drive: Traced, preset: str, uses_imu: bool, more: tuple[str, ...]) ->
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--flights", default=",".join(FLIGHTS))
-    parser.add_argument("--seeds", default=tables.SEEDS)
     tables.offer(parser)
     args = parser.parse_args()
     logging.getLogger("lslam").setLevel(logging.CRITICAL)

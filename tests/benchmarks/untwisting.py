@@ -39,7 +39,7 @@ def main() -> None:
     parser.add_argument("recordings", type=Path)
     parser.add_argument("--methods", default=METHODS)
     parser.add_argument("--late", type=float, default=0.014, help="s by which OXTS is late")
-    tables.offer(parser)
+    tables.offer(parser, None)
     args = parser.parse_args()
     logging.getLogger("lslam").setLevel(logging.CRITICAL)
     path, methods = args.recordings / PLACES["KITTI raw 0005"], args.methods.split(",")
