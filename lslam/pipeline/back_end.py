@@ -7,6 +7,7 @@ odometry's poses stay as they are, byte for byte.
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from collections.abc import Sequence as Many
 from dataclasses import replace
 from itertools import pairwise
@@ -24,8 +25,6 @@ from lslam.keyframes.store import KeyframeStore
 from lslam.pipeline.georeferencing import Placement, on_earth, place
 from lslam.pipeline.graph_inputs import floor_planes, up_directions, world_up
 from lslam.pipeline.graph_outcome import BackEnd, Given, solve, unsolved, without_steady_drift
-from lslam.pipeline.osm_back_end import hold_by_buildings
-from lslam.pipeline.osm_source import OsmSource
 from lslam.stopping import checking
 from lslam.types.constraint import LoopCandidate, Turn
 from lslam.types.scan_result import ScanResult
@@ -34,11 +33,13 @@ from lslam.types.stage_clock import KeyframeClocks
 
 log = logging.getLogger("lslam")
 Floats = NDArray[np.float64]
+# The graph held by what a map knows, given where its poses lie on the Earth; None where the map holds nothing.
+Hold = Callable[[PoseGraph, Placement, Given], BackEnd | None]
 
 
 def run_back_end(
     sequence: Sequence, results: list[ScanResult], store: KeyframeStore, config: Config,
-    candidates: list[LoopCandidate], turns: Many[Turn] = (), osm: OsmSource | None = None,
+    candidates: list[LoopCandidate], turns: Many[Turn] = (), hold: Hold | None = None,
     clocks: KeyframeClocks | None = None,
 ) -> BackEnd:  # fmt: skip
     """Close loops, take in fixes and buildings, optimise, and place all scans accordingly; odometry's poses where that fails."""
@@ -51,9 +52,9 @@ def run_back_end(
         return BackEnd(results, candidates, problems=problems)
     graph = replace(_graph(given), turns=turns)
     out = None
-    if osm is not None:
+    if hold is not None:
         by_fixes = config.gnss.mode == "graph" or (config.gnss.mode == "fit" and config.osm.origin is None)
-        out = hold_by_buildings(osm, graph, _placed(sequence, graph, given) if by_fixes else Placement(), given)
+        out = hold(graph, _placed(sequence, graph, given) if by_fixes else Placement(), given)
     if out is None:
         # Loops know a drift that lasts to a part of the noise of fixes, which are judged by odometry that had it.
         graph = without_steady_drift(graph, given)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +28,7 @@ from lslam.pipeline.front_end import to_trajectory
 from lslam.pipeline.graph_outcome import BackEnd
 from lslam.pipeline.levelling import find_level, level_results
 from lslam.pipeline.manifest import Manifest
+from lslam.pipeline.osm_back_end import hold_by_buildings
 from lslam.pipeline.osm_source import OsmSource
 from lslam.stopping import asking
 from lslam.types.constraint import LoopCandidate
@@ -58,6 +60,7 @@ def optimise_poses(
     if manifest.outcome in ("interrupted", "diverged"):
         return BackEnd(record.results)
     clocks = KeyframeClocks()
+    hold = None if osm is None else partial(hold_by_buildings, osm)
     with manifest.timed("back_end_s"):
         candidates: list[LoopCandidate] = []
         try:
@@ -67,7 +70,7 @@ def optimise_poses(
             if should_stop():
                 raise InterruptedRunError("interrupted before the pose graph")
             with asking(should_stop, "interrupted before the pose graph was solved"):
-                done = run_back_end(sequence, record.results, store, config, candidates, record.turns, osm, clocks)
+                done = run_back_end(sequence, record.results, store, config, candidates, record.turns, hold, clocks)
         except InterruptedRunError as error:
             manifest.interrupt(str(error))
             return BackEnd(record.results)
