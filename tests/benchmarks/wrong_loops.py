@@ -35,7 +35,7 @@ from lslam.readers import open_sequence
 from lslam.types.scan_result import ScanResult
 from lslam.types.trajectory import Trajectory
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "graph"))
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from false_loops import with_false_loops
 
