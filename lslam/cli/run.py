@@ -78,7 +78,7 @@ def command(sequence: str, **given: Any) -> None:
     SEQUENCE is a path (a folder or a bag), or a name under --data-root: seq07, 07, kitti/07, 2011_09_26_drive_0005_sync.
     """
     setup_logging(given["verbose"], given["quiet"])
-    from lslam.pipeline.warned import hearing
+    from lslam.warned import hearing
 
     with hearing():
         _run(sequence, given)

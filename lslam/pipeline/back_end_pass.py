@@ -18,13 +18,13 @@ from lslam.formats.loops_csv import write_loops
 from lslam.formats.osm_matches_csv import write_osm_matches
 from lslam.formats.state_files import Records
 from lslam.formats.trajectory_files import write_tum
+from lslam.frontend.checkpoints import Checkpoints
+from lslam.frontend.register_scans import to_trajectory
 from lslam.geometry import se2, se3
 from lslam.keyframes.store import KeyframeStore
 from lslam.loops.detector import find_loops
 from lslam.pipeline import drift
 from lslam.pipeline.back_end import run_back_end
-from lslam.pipeline.checkpoints import Checkpoints
-from lslam.pipeline.front_end import to_trajectory
 from lslam.pipeline.graph_outcome import BackEnd
 from lslam.pipeline.levelling import find_level, level_results
 from lslam.pipeline.manifest import Manifest

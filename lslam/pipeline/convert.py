@@ -21,9 +21,9 @@ from lslam.formats.imu_csv import write_imu_csv
 from lslam.formats.kitti_layout import PER_POINT, POINTS, in_camera, write_calib, write_scan, write_times
 from lslam.formats.sequence_toml import FILE_NAME, FRAMES, SequenceInfo, sequence_toml_text, write_sequence_toml
 from lslam.formats.trajectory_files import write_kitti, write_tum
+from lslam.frontend.register_scans import sweep_of
 from lslam.geometry import se3
 from lslam.pipeline.convert_trajectory import change_frame
-from lslam.pipeline.front_end import sweep_of
 from lslam.pipeline.map_pass import motion_within
 from lslam.preprocessing.deskew import deskew_points
 from lslam.types.calibration import Calibration

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from lslam.config import Config
 from lslam.errors import InterruptedRunError
+from lslam.frontend.register_scans import read_ahead
 from lslam.maps.merge import MapMerger
 from lslam.odometry.base import FeatureSource
-from lslam.pipeline.front_end import read_ahead
 from lslam.pipeline.map_checkpoints import MapCheckpoints
 from lslam.pipeline.map_pass import motion_within
 from lslam.preprocessing.features import Features

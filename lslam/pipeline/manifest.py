@@ -16,13 +16,13 @@ from typing import Any
 
 from lslam.config import Config
 from lslam.errors import InterruptedRunError
-from lslam.pipeline.warned import Warnings
 from lslam.reports.facts import describe
 from lslam.stopping import is_interrupt
 from lslam.types.scan import Span
 from lslam.types.scan_result import ScanResult
 from lslam.types.sequence import Sequence
 from lslam.version import __version__
+from lslam.warned import Warnings
 
 SCHEMA = 1
 # Share of the scans that may leave a direction open before the run counts as degraded.

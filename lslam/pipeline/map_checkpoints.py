@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from lslam.config import Config
 from lslam.errors import InputError
-from lslam.pipeline.checkpoints import Checkpoints
+from lslam.frontend.checkpoints import Checkpoints
 from lslam.pipeline.run_folder import CHECKPOINT, RunFolder
 from lslam.types.state import State
 

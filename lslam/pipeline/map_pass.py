@@ -14,13 +14,13 @@ from numpy.typing import NDArray
 from lslam.config import Config
 from lslam.config.map import MapConfig
 from lslam.errors import InterruptedRunError
+from lslam.frontend.register_scans import read_ahead
 from lslam.geometry.interpolate import poses_at
 from lslam.maps.clean import Cleaner, PosedScan
 from lslam.maps.merge import MapMerger
 from lslam.maps.mesh import denoise
 from lslam.maps.occupancy import OccupancyGrid, OccupancyMapper
 from lslam.maps.top_view import top_view
-from lslam.pipeline.front_end import read_ahead
 from lslam.pipeline.map_checkpoints import MapCheckpoints
 from lslam.preprocessing.deskew import deskew_points, knots_over
 from lslam.stopping import asking

@@ -11,6 +11,11 @@ import numpy as np
 
 from lslam.config import Config
 from lslam.errors import InputError
+from lslam.frontend import inertial_start
+from lslam.frontend.checkpoints import Checkpoints, OdometryCheckpoints
+from lslam.frontend.inertial_start import Inertial, begin_inertial, close_inertial, load_start, save_start
+from lslam.frontend.keyframing import Keyframing
+from lslam.frontend.register_scans import estimate, is_diverged, to_trajectory
 from lslam.integrity.monitor import IntegrityMonitor
 from lslam.kernels import jit
 from lslam.keyframes.store import KeyframeStore
@@ -20,11 +25,6 @@ from lslam.maps import crispness, merge
 from lslam.odometry.base import Odometry, Resumable
 from lslam.odometry.given import GivenPoses
 from lslam.odometry.standing import Standing
-from lslam.pipeline import inertial_start
-from lslam.pipeline.checkpoints import Checkpoints, OdometryCheckpoints
-from lslam.pipeline.front_end import estimate, is_diverged, to_trajectory
-from lslam.pipeline.inertial_start import Inertial, begin_inertial, close_inertial, load_start, save_start
-from lslam.pipeline.keyframing import Keyframing
 from lslam.pipeline.lost import mark_lost
 from lslam.pipeline.manifest import Manifest
 from lslam.pipeline.osm_source import OsmSource

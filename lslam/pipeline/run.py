@@ -11,6 +11,9 @@ from pathlib import Path
 from lslam.config import Config
 from lslam.errors import GateError, InterruptedRunError, LslamError, OutputError, RunFailedError
 from lslam.evaluation.evaluate import Evaluation, evaluate
+from lslam.frontend.checkpoints import Checkpoints, OdometryCheckpoints
+from lslam.frontend.inertial_start import with_imu_settings
+from lslam.frontend.register_scans import sweep_of
 from lslam.keyframes.store import KeyframeStore
 from lslam.maps.crispness import crispness
 from lslam.odometry import create_odometry
@@ -20,17 +23,14 @@ from lslam.pipeline import outputs
 from lslam.pipeline.back_end_pass import level_world, optimise_poses, write_back_end
 from lslam.pipeline.building_pass import write_buildings
 from lslam.pipeline.check import check_config
-from lslam.pipeline.checkpoints import Checkpoints, OdometryCheckpoints
 from lslam.pipeline.choose import choose_scans
 from lslam.pipeline.doctor_truth import examine_jumps
 from lslam.pipeline.doctor_units import examine_units
 from lslam.pipeline.feature_pass import build_feature_map
 from lslam.pipeline.feature_view import view_features
-from lslam.pipeline.front_end import sweep_of
 from lslam.pipeline.georeferencing import require_gnss
 from lslam.pipeline.given_poses import bind
 from lslam.pipeline.graph_outcome import BackEnd
-from lslam.pipeline.inertial_start import with_imu_settings
 from lslam.pipeline.loop_view import view_loop
 from lslam.pipeline.manifest import Manifest, describe_deskew
 from lslam.pipeline.map_checkpoints import map_checkpoints
@@ -39,7 +39,6 @@ from lslam.pipeline.odometry_pass import estimate_poses, odometry_checkpoints
 from lslam.pipeline.osm_source import OsmSource, open_osm
 from lslam.pipeline.resume import may_go_on, run_identity
 from lslam.pipeline.run_folder import KEYFRAMES, REPLIES, RunFolder
-from lslam.pipeline.warned import hearing
 from lslam.pipeline.watch import RunOutcome, Watch
 from lslam.readers import open_sequence
 from lslam.readers.raw_drive import with_gnss, with_imu
@@ -48,6 +47,7 @@ from lslam.types.run_record import RunRecord
 from lslam.types.scan import Span
 from lslam.types.sequence import Sequence
 from lslam.types.trajectory import Trajectory
+from lslam.warned import hearing
 
 log = logging.getLogger("lslam")
 

@@ -31,9 +31,9 @@ from sparse import length
 
 from lslam.config import load_config
 from lslam.errors import UsageError
+from lslam.frontend import tracker
+from lslam.frontend.tracker import Loaded, Tracker
 from lslam.odometry import create_odometry
-from lslam.pipeline import tracker
-from lslam.pipeline.tracker import Loaded, Tracker
 from lslam.recovery import non_ground, start_search
 from lslam.registration import local_map, residuals, solver
 from lslam.simulation.scenarios import simulate

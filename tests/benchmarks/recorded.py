@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from lslam.config import Config
 from lslam.formats.trajectory_files import read_trajectory
+from lslam.frontend.register_scans import estimate
 from lslam.geometry.interpolate import poses_at
 from lslam.odometry import create_odometry
-from lslam.pipeline.front_end import estimate
 from lslam.preprocessing.deskew import deskew_points, knots_over
 from lslam.preprocessing.rings import decide_rings
 from lslam.readers import open_sequence

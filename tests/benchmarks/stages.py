@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.config import load_config
+from lslam.frontend.register_scans import estimate
 from lslam.kernels import voxel
 from lslam.odometry import create_odometry
 from lslam.odometry.base import Odometry
-from lslam.pipeline.front_end import estimate
 from lslam.preprocessing.prepare import NO_TIMES
 from lslam.readers import open_sequence
 from lslam.types.scan_result import ScanResult

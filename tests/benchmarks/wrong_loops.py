@@ -20,13 +20,13 @@ from scores import ate
 
 from lslam.config import Config, load_config
 from lslam.evaluation.associate import associate
+from lslam.frontend.register_scans import to_trajectory
 from lslam.keyframes.store import KeyframeStore
 from lslam.loops.detector import find_loops
 from lslam.odometry import create_odometry
 from lslam.pipeline import drift
 from lslam.pipeline.back_end import run_back_end
 from lslam.pipeline.choose import choose_scans
-from lslam.pipeline.front_end import to_trajectory
 from lslam.pipeline.graph_outcome import BackEnd
 from lslam.pipeline.manifest import Manifest
 from lslam.pipeline.odometry_pass import estimate_poses

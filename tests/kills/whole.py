@@ -19,7 +19,7 @@ from lslam.formats.g2o import read_g2o
 from lslam.formats.osm_files import read_osm
 from lslam.formats.state_files import read_state
 from lslam.formats.trajectory_files import read_trajectory
-from lslam.pipeline.state_classes import STATE_CLASSES
+from lslam.frontend.state_classes import STATE_CLASSES
 
 # What is appended to: a log, the lock, and rows of which a checkpoint says how many count.
 GROWING = ("log.txt", ".lock", *(f"checkpoint/{part}/" for part in ("map", "occupancy", "edges", "planes")))

@@ -13,8 +13,8 @@ from drives import ate, standing
 from numpy.typing import NDArray
 
 from lslam.config.config import Config
+from lslam.frontend.register_scans import estimate
 from lslam.odometry import create_odometry
-from lslam.pipeline.front_end import estimate
 from lslam.preprocessing.prepare import clean_points
 from lslam.simulation.scenarios import simulate
 from lslam.types.motion_prior import MotionPrior

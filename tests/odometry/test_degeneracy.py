@@ -11,9 +11,9 @@ from drives import ate, drive
 from numpy.typing import NDArray
 
 from lslam.config.config import Config
+from lslam.frontend.register_scans import estimate
 from lslam.geometry import se3
 from lslam.odometry import create_odometry
-from lslam.pipeline.front_end import estimate
 from lslam.readers import select
 from lslam.registration.solver import RegistrationResult
 from lslam.simulation.scenarios import simulate

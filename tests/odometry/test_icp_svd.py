@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from lslam.config.config import Config
+from lslam.frontend.register_scans import estimate
 from lslam.geometry import se3
 from lslam.odometry.icp_svd import align_closed_form, as_partners, create, keep_pairs
-from lslam.pipeline.front_end import estimate
 from lslam.simulation.scenarios import simulate
 from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan import Scan

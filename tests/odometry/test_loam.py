@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 
 from lslam.config.config import Config
 from lslam.errors import InputError
+from lslam.frontend.tracker import Loaded, Tracker
 from lslam.geometry import se3
 from lslam.odometry import create_odometry
 from lslam.odometry.feature_registration import LESS_PLANAR, PATIENCE
 from lslam.odometry.loam import Loam
-from lslam.pipeline.tracker import Loaded, Tracker
 from lslam.preprocessing.deskew import deskew_points
 from lslam.preprocessing.features import FeaturePoints, Features
 from lslam.registration.solver import RegistrationResult

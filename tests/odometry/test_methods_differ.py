@@ -7,8 +7,8 @@ from itertools import combinations
 import numpy as np
 
 from lslam.config import load_config
+from lslam.frontend.register_scans import estimate
 from lslam.odometry import METHODS, create_odometry
-from lslam.pipeline.front_end import estimate
 from lslam.simulation.scenarios import simulate
 
 FOREIGN = {"kiss-icp", "small-gicp", "open3d-gicp", "poses"}

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from lslam.config import Config
 from lslam.formats.trajectory_files import read_trajectory
+from lslam.frontend.register_scans import estimate
 from lslam.geometry import se3
 from lslam.odometry import create_odometry
-from lslam.pipeline.front_end import estimate
 from lslam.readers import open_sequence
 from lslam.readers.selection import select
 from lslam.registration.solver import RegistrationResult

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from lslam.frontend.tracker import Loaded, Tracker
 from lslam.geometry import se3, so3
 from lslam.odometry.sanity import FARTHEST_M, measurable, plausible
-from lslam.pipeline.tracker import Loaded, Tracker
 from lslam.types.scan import Scan
 from lslam.types.scan_result import ScanResult
 

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from lslam.config import load_config
 from lslam.evaluation.absolute import absolute_error
+from lslam.frontend.register_scans import estimate
 from lslam.geometry import se3, so3
 from lslam.odometry import create_odometry
-from lslam.pipeline.front_end import estimate
 from lslam.readers import select
 from lslam.simulation.scenarios import SimulatedDrive, simulate
 

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.config import Config
+from lslam.frontend.tracker import Loaded, Tracker
 from lslam.geometry import se3, so3
 from lslam.odometry import create_odometry
-from lslam.pipeline.tracker import Loaded, Tracker
 from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan import Scan
 from lslam.types.scan_result import ScanResult

@@ -17,13 +17,13 @@ from lslam.config import Config, load_config
 from lslam.errors import GateError, InputError
 from lslam.formats.timing_csv import read_timing_rows
 from lslam.formats.trajectory_files import read_trajectory
+from lslam.frontend.inertial_start import begin_inertial, close_inertial
+from lslam.frontend.register_scans import estimate
 from lslam.geometry import se3
 from lslam.inertial.fusion import InertialMotion
 from lslam.odometry import create_odometry
 from lslam.pipeline.doctor_turns import examine_turns
 from lslam.pipeline.findings import Finding
-from lslam.pipeline.front_end import estimate
-from lslam.pipeline.inertial_start import begin_inertial, close_inertial
 from lslam.pipeline.run import run
 from lslam.pipeline.watch import RunOutcome
 from lslam.readers import select

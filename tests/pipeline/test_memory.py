@@ -9,11 +9,11 @@ import pytest
 from resident import resident_mb
 
 from lslam.config import load_config
+from lslam.frontend.checkpoints import Checkpoints, OdometryCheckpoints
+from lslam.frontend.keyframing import Keyframing
+from lslam.frontend.register_scans import estimate
 from lslam.keyframes.store import KeyframeStore
 from lslam.odometry import create_odometry
-from lslam.pipeline.checkpoints import Checkpoints, OdometryCheckpoints
-from lslam.pipeline.front_end import estimate
-from lslam.pipeline.keyframing import Keyframing
 from lslam.simulation.scenarios import simulate
 from lslam.types.scan_result import ScanResult
 

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 import lslam
 from lslam.config import load_config
 from lslam.config.config import Config
+from lslam.frontend.register_scans import estimate
 from lslam.odometry import create_odometry
-from lslam.pipeline.front_end import estimate
 from lslam.registration import local_map
 from lslam.simulation.scenarios import simulate
 from lslam.types.sequence import Sequence

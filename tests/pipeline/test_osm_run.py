@@ -15,9 +15,9 @@ from lslam.config import Config, load_config
 from lslam.errors import InputError, InterruptedRunError, OutputExistsError
 from lslam.formats.osm_files import read_osm
 from lslam.formats.trajectory_files import read_trajectory
+from lslam.frontend.checkpoints import Pace
 from lslam.geometry import geodesy
 from lslam.pipeline import osm_source
-from lslam.pipeline.checkpoints import Pace
 from lslam.pipeline.watch import Watch
 from lslam.priors.bounds import Bounds
 

@@ -18,9 +18,9 @@ import lslam
 from lslam.config import Config, load_config
 from lslam.errors import GateError, InterruptedRunError, OutputExistsError, RunFailedError, RunFinishedError, UsageError
 from lslam.formats.trajectory_files import read_trajectory
+from lslam.frontend import checkpoints
+from lslam.frontend.checkpoints import Pace
 from lslam.maps import clean
-from lslam.pipeline import checkpoints
-from lslam.pipeline.checkpoints import Pace
 from lslam.pipeline.watch import Watch
 from lslam.simulation.scenarios import simulate
 from lslam.types.scan import Scan

@@ -17,10 +17,10 @@ from stub_sequences import sample
 import lslam
 from lslam.config import Config, load_config
 from lslam.errors import InterruptedRunError
+from lslam.frontend.checkpoints import Pace
 from lslam.pipeline import run as recipe
-from lslam.pipeline.checkpoints import Pace
-from lslam.pipeline.warned import MOST_ALIKE, hearing, warnings_so_far
 from lslam.pipeline.watch import Watch
+from lslam.warned import MOST_ALIKE, hearing, warnings_so_far
 
 PACKAGE = Path(lslam.__file__).parent
 LOG = logging.getLogger("lslam")

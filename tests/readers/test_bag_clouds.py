@@ -17,7 +17,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from lslam.errors import InputError
 from lslam.formats import bag_messages
 from lslam.formats.bag_files import BagWriter
-from lslam.pipeline.front_end import sweep_of
+from lslam.frontend.register_scans import sweep_of
 from lslam.readers import open_sequence
 from lslam.types.scan import Scan, Span
 from lslam.types.sequence import Sequence

@@ -14,13 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.errors import InputError
+from lslam.frontend.checkpoints import OdometryCheckpoints
+from lslam.frontend.keyframing import Keyframing
+from lslam.frontend.tracker import Loaded, Tracker
 from lslam.integrity.monitor import IntegrityMonitor
 from lslam.odometry.base import Odometry
 from lslam.odometry.sanity import FARTHEST_M, measurable
 from lslam.odometry.standing import Standing
-from lslam.pipeline.checkpoints import OdometryCheckpoints
-from lslam.pipeline.keyframing import Keyframing
-from lslam.pipeline.tracker import Loaded, Tracker
 from lslam.readers.selection import Selection
 from lslam.registration.acceptance import DOUBT
 from lslam.registration.motion import MotionModel

@@ -13,13 +13,13 @@ from stub_sequences import Stub, sample, with_points
 from lslam.config import Config, load_config
 from lslam.errors import InputError
 from lslam.formats.state_files import Records, read_state, write_state
+from lslam.frontend.inertial_start import Inertial, begin_inertial
+from lslam.frontend.register_scans import read_ahead
+from lslam.frontend.state_classes import STATE_CLASSES
+from lslam.frontend.tracker import Tracker
 from lslam.odometry import METHODS, create_odometry
 from lslam.odometry.base import Resumable
 from lslam.odometry.standing import Standing
-from lslam.pipeline.front_end import read_ahead
-from lslam.pipeline.inertial_start import Inertial, begin_inertial
-from lslam.pipeline.state_classes import STATE_CLASSES
-from lslam.pipeline.tracker import Tracker
 from lslam.readers.ringed import with_rings
 from lslam.registration.gaussian_map import GaussianMap
 from lslam.registration.motion import ConstantVelocity

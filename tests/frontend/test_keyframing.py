@@ -13,12 +13,12 @@ from stub_sequences import sample
 import lslam
 from lslam.config import Config, load_config
 from lslam.errors import OutputError
+from lslam.frontend.keyframing import Keyframing
+from lslam.frontend.register_scans import estimate
 from lslam.geometry import se3
 from lslam.keyframes.cloud import keyframe_cloud
 from lslam.keyframes.store import KeyframeStore
 from lslam.odometry import create_odometry
-from lslam.pipeline.front_end import estimate
-from lslam.pipeline.keyframing import Keyframing
 from lslam.readers.ringed import with_rings
 from lslam.simulation.scenarios import simulate
 from lslam.types.motion_prior import MotionPrior

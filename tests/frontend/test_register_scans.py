@@ -10,8 +10,8 @@ import pytest
 from stub_sequences import Standstill, Stub, noise, sample, with_points
 
 from lslam.config import Config, load_config
+from lslam.frontend.register_scans import DOUBT, estimate, is_diverged, read_ahead, to_trajectory
 from lslam.odometry import create_odometry
-from lslam.pipeline.front_end import DOUBT, estimate, is_diverged, read_ahead, to_trajectory
 from lslam.readers import select
 from lslam.simulation.scenarios import simulate
 from lslam.types.scan import Scan

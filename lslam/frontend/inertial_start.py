@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 from lslam.config import Config
 from lslam.errors import InputError
 from lslam.formats.state_files import read_state, write_state
+from lslam.frontend.register_scans import read_ahead
+from lslam.frontend.state_classes import STATE_CLASSES
+from lslam.frontend.tracker import Tracker
 from lslam.inertial.fusion import InertialMotion
 from lslam.inertial.initialise import FirstPoses, Start, start
 from lslam.inertial.stream import ImuRefusedError
 from lslam.odometry import create_odometry
-from lslam.pipeline.front_end import read_ahead
-from lslam.pipeline.state_classes import STATE_CLASSES
-from lslam.pipeline.tracker import Tracker
 from lslam.readers import select
 from lslam.readers.selection import Selection
 from lslam.types.imu import ImuStream

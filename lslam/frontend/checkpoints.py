@@ -11,13 +11,13 @@ from typing import Any
 
 from lslam.errors import InputError
 from lslam.formats.state_files import Records, read_state, write_state
+from lslam.frontend.keyframing import Keyframing
+from lslam.frontend.state_classes import STATE_CLASSES
+from lslam.frontend.tracker import Tracker
 from lslam.odometry.base import Resumable
-from lslam.pipeline.keyframing import Keyframing
-from lslam.pipeline.state_classes import STATE_CLASSES
-from lslam.pipeline.tracker import Tracker
-from lslam.pipeline.warned import warnings_so_far
 from lslam.types.scan_result import ScanResult
 from lslam.types.state import State
+from lslam.warned import warnings_so_far
 
 log = logging.getLogger("lslam")
 
