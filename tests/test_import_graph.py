@@ -15,7 +15,7 @@ LAYERS = [
     ["cli"],
     ["studies"],
     ["pipeline"],
-    ["frontend"],
+    ["frontend", "backend"],
     ["reports"],
     ["readers", "odometry", "inertial", "integrity", "loops", "graph", "priors", "maps", "evaluation", "simulation"],
     ["recovery"],

@@ -11,6 +11,10 @@ from typing import Any
 
 import numpy as np
 
+from lslam.backend import added_drift
+from lslam.backend.levelling import find_level, level_results
+from lslam.backend.optimise import run_back_end
+from lslam.backend.outcome import BackEnd
 from lslam.config import Config
 from lslam.errors import InterruptedRunError
 from lslam.formats.g2o import write_g2o
@@ -23,10 +27,6 @@ from lslam.frontend.register_scans import to_trajectory
 from lslam.geometry import se2, se3
 from lslam.keyframes.store import KeyframeStore
 from lslam.loops.detector import find_loops
-from lslam.pipeline import drift
-from lslam.pipeline.back_end import run_back_end
-from lslam.pipeline.graph_outcome import BackEnd
-from lslam.pipeline.levelling import find_level, level_results
 from lslam.pipeline.manifest import Manifest
 from lslam.pipeline.osm_back_end import hold_by_buildings
 from lslam.pipeline.osm_source import OsmSource
@@ -52,10 +52,10 @@ def optimise_poses(
     the graph and wherever its loops turn. `checkpoints` keep the loops that were found.
     """
     if config.debug.drift:
-        manifest.problems.append(drift.describe(config.debug))
+        manifest.problems.append(added_drift.describe(config.debug))
         log.warning("%s", manifest.problems[-1])
-        record.results = drift.with_drift(record.results, config.debug)
-        store.keyframes = drift.moved_keyframes(store.keyframes, record.results)
+        record.results = added_drift.with_drift(record.results, config.debug)
+        store.keyframes = added_drift.moved_keyframes(store.keyframes, record.results)
         record.trajectory = to_trajectory(record.results, record.method)
     if manifest.outcome in ("interrupted", "diverged"):
         return BackEnd(record.results)

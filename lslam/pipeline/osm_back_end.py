@@ -6,13 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 
+from lslam.backend.georeferencing import Placement, on_earth
+from lslam.backend.outcome import BackEnd, Given, solve
 from lslam.errors import GraphError, InputError
 from lslam.geometry import se2
 from lslam.graph.odometry import corrected
 from lslam.graph.problem import PoseGraph
 from lslam.pipeline.building_pass import correct_buildings
-from lslam.pipeline.georeferencing import Placement, on_earth
-from lslam.pipeline.graph_outcome import BackEnd, Given, solve
 from lslam.pipeline.osm_graph import find_on_map
 from lslam.pipeline.osm_joint import join_buildings, run_baseline
 from lslam.pipeline.osm_pass import finish

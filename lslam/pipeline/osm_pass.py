@@ -14,6 +14,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.backend.inputs import floor_planes
+from lslam.backend.levelling import UP
 from lslam.config import Config
 from lslam.config.graph import GraphConfig
 from lslam.config.osm import OsmConfig
@@ -22,8 +24,6 @@ from lslam.geometry import se2, se3, so3
 from lslam.graph.chi_square import quantile
 from lslam.graph.problem import PlanarPrior, Solution
 from lslam.keyframes.store import KeyframeStore
-from lslam.pipeline.graph_inputs import floor_planes
-from lslam.pipeline.levelling import UP
 from lslam.pipeline.osm_start import Start, known_start, see_walls, sought_start
 from lslam.priors.osm_map import OsmMap
 from lslam.priors.osm_prior import match_buildings, match_keyframe, shares

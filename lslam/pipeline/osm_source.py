@@ -11,6 +11,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.backend.georeferencing import require_crs
 from lslam.config import Config
 from lslam.config.osm import OsmConfig
 from lslam.errors import InputError, UsageError, cause
@@ -19,7 +20,6 @@ from lslam.formats.osm_files import OsmData, merged, read_osm
 from lslam.formats.overpass_reply import OverpassReply
 from lslam.geometry import se2
 from lslam.geometry.geodesy import to_local
-from lslam.pipeline.georeferencing import require_crs
 from lslam.priors.buffer import Fetch, OsmBuffer
 from lslam.priors.osm_map import OsmMap
 from lslam.priors.overpass import fetch_buildings, reply_folder

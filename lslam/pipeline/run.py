@@ -8,6 +8,9 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from lslam.backend.georeferencing import require_gnss
+from lslam.backend.loop_view import view_loop
+from lslam.backend.outcome import BackEnd
 from lslam.config import Config
 from lslam.errors import GateError, InterruptedRunError, LslamError, OutputError, RunFailedError
 from lslam.evaluation.evaluate import Evaluation, evaluate
@@ -28,10 +31,7 @@ from lslam.pipeline.doctor_truth import examine_jumps
 from lslam.pipeline.doctor_units import examine_units
 from lslam.pipeline.feature_pass import build_feature_map
 from lslam.pipeline.feature_view import view_features
-from lslam.pipeline.georeferencing import require_gnss
 from lslam.pipeline.given_poses import bind
-from lslam.pipeline.graph_outcome import BackEnd
-from lslam.pipeline.loop_view import view_loop
 from lslam.pipeline.manifest import Manifest, describe_deskew
 from lslam.pipeline.map_checkpoints import map_checkpoints
 from lslam.pipeline.map_pass import build_map

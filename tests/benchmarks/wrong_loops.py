@@ -18,16 +18,16 @@ from pathlib import Path
 import numpy as np
 from scores import ate
 
+from lslam.backend import added_drift
+from lslam.backend.optimise import run_back_end
+from lslam.backend.outcome import BackEnd
 from lslam.config import Config, load_config
 from lslam.evaluation.associate import associate
 from lslam.frontend.register_scans import to_trajectory
 from lslam.keyframes.store import KeyframeStore
 from lslam.loops.detector import find_loops
 from lslam.odometry import create_odometry
-from lslam.pipeline import drift
-from lslam.pipeline.back_end import run_back_end
 from lslam.pipeline.choose import choose_scans
-from lslam.pipeline.graph_outcome import BackEnd
 from lslam.pipeline.manifest import Manifest
 from lslam.pipeline.odometry_pass import estimate_poses
 from lslam.pipeline.watch import Watch
@@ -59,8 +59,8 @@ def measure(path: str, config: Config, share: float, seeds: int) -> None:
     record = estimate_poses(sequence, create_odometry(config), config, manifest, Path(), truth, Watch(), store)
     print(f"{path}: {len(record.results)} scans, {len(store)} keyframes")
     for seed in range(seeds):
-        results = drift.with_drift(record.results, config.debug.model_copy(update={"drift_seed": seed}))
-        store.keyframes = drift.moved_keyframes(store.keyframes, results)
+        results = added_drift.with_drift(record.results, config.debug.model_copy(update={"drift_seed": seed}))
+        store.keyframes = added_drift.moved_keyframes(store.keyframes, results)
         candidates = find_loops(store, config.loops, config.registration, config.keyframes.submap_size)
         right = run_back_end(sequence, results, store, config, candidates)
         mixed, wrong = with_false_loops(candidates, share, np.random.default_rng(seed))

@@ -11,6 +11,7 @@ from graph_builders import ate, graph_of, measured, truth
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from lslam.backend.added_drift import with_drift
 from lslam.config.debug import DebugConfig
 from lslam.config.graph import GraphConfig
 from lslam.errors import GraphError
@@ -21,7 +22,6 @@ from lslam.graph.loop_drift import APART, LASTS, PARTS, WALKS, without_loop_drif
 from lslam.graph.pose_graph import optimise, with_distances
 from lslam.graph.problem import PoseGraph, Solution
 from lslam.graph.rates import SIZES, hats, rate_roots, set_straight
-from lslam.pipeline.drift import with_drift
 from lslam.types.constraint import Constraint
 from lslam.types.scan_result import ScanResult
 

@@ -23,8 +23,7 @@ MARKS = {
         "run": FOLDER, "write_back_end": FILES, "_map": MAP, "_report": REPORT, "RunFolder.drop_checkpoint": END,
     },
     "lslam.pipeline.odometry_pass": {"_warm_up": KERNELS, "estimate": ODOMETRY},
-    "lslam.pipeline.back_end_pass": {"find_loops": LOOPS, "run_back_end": GRAPH},
-    "lslam.pipeline.back_end": {"hold_by_buildings": OSM},
+    "lslam.pipeline.back_end_pass": {"find_loops": LOOPS, "run_back_end": GRAPH, "hold_by_buildings": OSM},
     "lslam.pipeline.map_pass": {"MapMaker.finish": MAP_END},
 }  # fmt: skip
 

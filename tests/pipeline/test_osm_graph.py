@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from test_osm_pass import HOUSES, ORIGIN, Outline, config, driven, extract_of, street
 
+from lslam.backend.georeferencing import Placement
+from lslam.backend.outcome import Given, solve
 from lslam.config import Config
 from lslam.config.load import load_config
 from lslam.geometry import se2, se3
 from lslam.graph.problem import PoseGraph
 from lslam.keyframes.store import KeyframeStore
-from lslam.pipeline.georeferencing import Placement
-from lslam.pipeline.graph_outcome import Given, solve
 from lslam.pipeline.osm_back_end import hold_by_buildings
 from lslam.pipeline.osm_graph import find_on_map, on_map, sightings
 from lslam.pipeline.osm_pass import Located, locate

@@ -10,11 +10,11 @@ import pytest
 from numpy.typing import NDArray
 from stub_sequences import Stub
 
+from lslam.backend.levelling import find_level, level_results
 from lslam.config import Config, load_config
 from lslam.evaluation.evaluate import evaluate
 from lslam.frontend.register_scans import to_trajectory
 from lslam.geometry import se3, so3
-from lslam.pipeline.levelling import find_level, level_results
 from lslam.types.gravity import GravityDirection
 from lslam.types.scan import Scan
 from lslam.types.scan_result import ScanResult

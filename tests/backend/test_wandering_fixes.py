@@ -10,11 +10,11 @@ import pytest
 from stub_sequences import Stub
 from test_back_end import CITY, COUNT, EVERY, LOOPS, ORIGIN, candidate, config, drifted, on_earth, recording, store_of
 
+from lslam.backend.optimise import run_back_end
 from lslam.frontend.checkpoints import Checkpoints
 from lslam.geometry import geodesy, se3
 from lslam.geometry.umeyama import align
 from lslam.pipeline import back_end_pass
-from lslam.pipeline.back_end import run_back_end
 from lslam.simulation.gnss import GnssModel
 from lslam.simulation.gnss import _errors as gnss_errors
 from lslam.types.stage_clock import KeyframeClocks

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from stub_sequences import Stub
 
+from lslam.backend.georeferencing import place, require_gnss
 from lslam.config import Config
 from lslam.config.gnss import GnssConfig
 from lslam.errors import InputError, UsageError
 from lslam.geometry import geodesy, se3, so3
 from lslam.graph.odometry import odometry_constraints
 from lslam.graph.problem import PoseGraph
-from lslam.pipeline.georeferencing import place, require_gnss
 from lslam.types.calibration import Calibration
 from lslam.types.gnss import GnssStream
 from lslam.types.keyframe import Keyframe

@@ -15,6 +15,9 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.backend.georeferencing import Placement, on_earth, place
+from lslam.backend.inputs import floor_planes, up_directions, world_up
+from lslam.backend.outcome import BackEnd, Given, solve, unsolved, without_steady_drift
 from lslam.config import Config
 from lslam.geometry import se3
 from lslam.graph.drift import tilt_factor
@@ -22,9 +25,6 @@ from lslam.graph.floors import on_one_plane
 from lslam.graph.odometry import bent, fitness_covariance, fitness_score, odometry_constraints
 from lslam.graph.problem import PoseGraph
 from lslam.keyframes.store import KeyframeStore
-from lslam.pipeline.georeferencing import Placement, on_earth, place
-from lslam.pipeline.graph_inputs import floor_planes, up_directions, world_up
-from lslam.pipeline.graph_outcome import BackEnd, Given, solve, unsolved, without_steady_drift
 from lslam.stopping import checking
 from lslam.types.constraint import LoopCandidate, Turn
 from lslam.types.scan_result import ScanResult

@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from lslam.backend.added_drift import CAMERA_TO_LIDAR, describe, moved_keyframes, with_drift
 from lslam.config.debug import DebugConfig
 from lslam.errors import InputError
 from lslam.formats.trajectory_files import write_tum
 from lslam.geometry import se3, so3
-from lslam.pipeline.drift import CAMERA_TO_LIDAR, describe, moved_keyframes, with_drift
 from lslam.types.keyframe import Keyframe
 from lslam.types.scan_result import ScanResult
 from lslam.types.trajectory import Trajectory

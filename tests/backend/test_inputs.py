@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from lslam.backend.inputs import floor_planes, up_directions, world_up
 from lslam.config.graph import GraphConfig
 from lslam.geometry import se3, so3
 from lslam.keyframes.store import KeyframeStore
-from lslam.pipeline.graph_inputs import floor_planes, up_directions, world_up
 from lslam.types.gravity import GravityDirection
 from lslam.types.keyframe import Keyframe
 from lslam.types.scan_result import ScanResult

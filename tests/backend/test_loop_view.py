@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from lslam.backend.loop_view import AROUND, view_loop
+from lslam.backend.outcome import BackEnd
 from lslam.geometry import se3
 from lslam.keyframes.store import KeyframeStore
-from lslam.pipeline.graph_outcome import BackEnd
-from lslam.pipeline.loop_view import AROUND, view_loop
 from lslam.reports.loop_view import loop_figures
 from lslam.types.constraint import Constraint, LoopCandidate, Verdict
 from lslam.types.keyframe import Keyframe

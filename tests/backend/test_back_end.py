@@ -11,15 +11,15 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 from stub_sequences import Stub
 
+from lslam.backend import optimise
+from lslam.backend.added_drift import with_drift
+from lslam.backend.optimise import run_back_end
+from lslam.backend.outcome import BackEnd
 from lslam.config import Config, load_config
 from lslam.formats.g2o import write_g2o
 from lslam.geometry import geodesy, se3, so3
 from lslam.geometry.umeyama import align
 from lslam.keyframes.store import KeyframeStore
-from lslam.pipeline import back_end
-from lslam.pipeline.back_end import run_back_end
-from lslam.pipeline.drift import with_drift
-from lslam.pipeline.graph_outcome import BackEnd
 from lslam.types.calibration import Calibration
 from lslam.types.constraint import Constraint, LoopCandidate
 from lslam.types.gnss import GnssStream
@@ -156,8 +156,8 @@ def test_without_a_loop_that_is_believed_nothing_moves(loops: str) -> None:
 
 def test_a_graph_that_cannot_be_solved_leaves_odometry(monkeypatch: pytest.MonkeyPatch) -> None:
     results = drifted()
-    lost = back_end.odometry_constraints
-    monkeypatch.setattr(back_end, "odometry_constraints", lambda *given: lost(*given)[:50])
+    lost = optimise.odometry_constraints
+    monkeypatch.setattr(optimise, "odometry_constraints", lambda *given: lost(*given)[:50])
     done = run_back_end(Stub([]), results, store_of(results), config(), LOOPS)
     assert done.results is results
     assert "in pieces" in done.problems[0]

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.backend.outcome import BackEnd
 from lslam.geometry import se3
 from lslam.keyframes.store import KeyframeStore
-from lslam.pipeline.graph_outcome import BackEnd
 from lslam.types.constraint import LoopCandidate
 from lslam.types.loop_view import LoopView, Place
 from lslam.types.run_record import RunRecord
