@@ -12,7 +12,7 @@ from lslam.cli import console, options
 if TYPE_CHECKING:
     from lslam.formats.osm_buildings import BuildingExtract
     from lslam.formats.overpass_reply import OverpassReply
-    from lslam.priors.bounds import Bounds
+    from lslam.osm.bounds import Bounds
 
 
 @click.group()
@@ -96,7 +96,7 @@ def fetch(
     more += ['osm.cache="refresh"'] if refresh else ['osm.cache="only"'] if offline else []
     config = load_config(config_file, [*settings, *more]).osm
     bounds = _bounds(bbox, around, along, config.fetch_radius if radius is None else radius, data_root, origin)
-    from lslam.priors.overpass import fetch_buildings, reply_folder
+    from lslam.osm.overpass import fetch_buildings, reply_folder
 
     reply = fetch_buildings(bounds, config, reply_folder())
     _write(out, reply)
@@ -107,8 +107,8 @@ def _bounds(
 ) -> Bounds:
     import numpy as np
 
-    from lslam.pipeline.osm_places import positions_along
-    from lslam.priors import bounds
+    from lslam.osm import bounds
+    from lslam.osm.places import positions_along
 
     if bbox is not None:
         return bounds.Bounds(*options.numbers("--bbox", bbox, (4,), "S,W,N,E, for example 49.00,8.40,49.01,8.42"))

@@ -27,9 +27,9 @@ from lslam.frontend.register_scans import to_trajectory
 from lslam.geometry import se2, se3
 from lslam.keyframes.store import KeyframeStore
 from lslam.loops.detector import find_loops
+from lslam.osm.hold import hold_by_buildings
+from lslam.osm.source import OsmSource
 from lslam.pipeline.manifest import Manifest
-from lslam.pipeline.osm_back_end import hold_by_buildings
-from lslam.pipeline.osm_source import OsmSource
 from lslam.stopping import asking
 from lslam.types.constraint import LoopCandidate
 from lslam.types.georeference import Georeference

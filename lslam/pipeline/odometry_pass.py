@@ -25,12 +25,12 @@ from lslam.maps import crispness, merge
 from lslam.odometry.base import Odometry, Resumable
 from lslam.odometry.given import GivenPoses
 from lslam.odometry.standing import Standing
+from lslam.osm import prior
+from lslam.osm.source import OsmSource
 from lslam.pipeline.lost import mark_lost
 from lslam.pipeline.manifest import Manifest
-from lslam.pipeline.osm_source import OsmSource
 from lslam.pipeline.run_folder import CHECKPOINT, RunFolder
 from lslam.pipeline.watch import Watch
-from lslam.priors import osm_prior
 from lslam.types.constraint import Turn
 from lslam.types.run_record import RunRecord
 from lslam.types.scan_result import ScanResult
@@ -142,7 +142,7 @@ def _warm_up(
         if config.loops.use:
             detector.warm_up()
         if config.osm.extract:
-            osm_prior.warm_up()
+            prior.warm_up()
         if config.map.write:
             merge.warm_up()
             crispness.warm_up()

@@ -11,8 +11,8 @@ import numpy as np
 
 from lslam.config import Config
 from lslam.errors import GateError, OutputExistsError, RunFailedError, RunFinishedError
+from lslam.osm.source import extract_digest
 from lslam.pipeline.identity import imu_digest, input_digest
-from lslam.pipeline.osm_source import extract_digest
 from lslam.pipeline.run_folder import MANIFEST
 from lslam.printable import printable_tree
 from lslam.types.sequence import Sequence

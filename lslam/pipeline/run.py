@@ -22,9 +22,10 @@ from lslam.maps.crispness import crispness
 from lslam.odometry import create_odometry
 from lslam.odometry.base import FeatureSource, Odometry
 from lslam.odometry.given import GivenPoses
+from lslam.osm.corrections import write_buildings
+from lslam.osm.source import OsmSource, open_osm
 from lslam.pipeline import outputs
 from lslam.pipeline.back_end_pass import level_world, optimise_poses, write_back_end
-from lslam.pipeline.building_pass import write_buildings
 from lslam.pipeline.check import check_config
 from lslam.pipeline.choose import choose_scans
 from lslam.pipeline.doctor_truth import examine_jumps
@@ -36,7 +37,6 @@ from lslam.pipeline.manifest import Manifest, describe_deskew
 from lslam.pipeline.map_checkpoints import map_checkpoints
 from lslam.pipeline.map_pass import build_map
 from lslam.pipeline.odometry_pass import estimate_poses, odometry_checkpoints
-from lslam.pipeline.osm_source import OsmSource, open_osm
 from lslam.pipeline.resume import may_go_on, run_identity
 from lslam.pipeline.run_folder import KEYFRAMES, REPLIES, RunFolder
 from lslam.pipeline.watch import RunOutcome, Watch

@@ -30,7 +30,7 @@ class KeyframeMatch:
     pose : (3,) where the walls put it, the prior where there is no match
     information : (3, 3) of `pose` in the axes of the map, 1/m2 and 1/rad2, singular along what the walls leave free
     rank : directions it fixes, 0 to 3; kind : `edges` walls of two directions, `lines` parallel ones, `none` no match
-    fitness, coverage, rms : as of `priors.wall_match.WallMatch`, NaN without a match
+    fitness, coverage, rms : as of `osm.wall_match.WallMatch`, NaN without a match
     pairs : (K, 2) which wall seen lies on which wall of the map, numbers of `map_walls` of the run's `OsmMatches`
     verdict, reason : whether it constrains the trajectory, and why not, one clause
     """
@@ -60,7 +60,7 @@ class BuildingMatch:
     pose : (3,) of the building in the level frame of the keyframe: its axes are the map's and its origin is
         `Building.middle`, as OpenStreetMap has it, so that it does not matter where the keyframe is thought to be
     information : (3, 3) of `pose` in the axes of that level frame, singular along what the walls leave free
-    pairs : (K, 2) which of the building's walls (rows of `priors.walls.walls_of([building])`) lies on which wall seen
+    pairs : (K, 2) which of the building's walls (rows of `osm.walls.walls_of([building])`) lies on which wall seen
     """
 
     keyframe: int

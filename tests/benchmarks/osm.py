@@ -38,7 +38,7 @@ from lslam.formats.osm_buildings import read_buildings
 from lslam.formats.timing_csv import read_timing_rows
 from lslam.formats.trajectory_files import read_trajectory
 from lslam.geometry import geodesy, se2
-from lslam.pipeline.building_pass import BUILDINGS_GEOJSON
+from lslam.osm.corrections import BUILDINGS_GEOJSON
 from lslam.simulation.osm_perturb import map_errors, read_perturbation
 from lslam.studies.scenes import Scene, simulate_once
 

@@ -2,7 +2,7 @@
 
     python tests/benchmarks/osm_modes.py [--drifts 100-104] [--write docs/results.md]
 
-The runs of tests/pipeline/wrong_maps.py: sample_data under a random walk, without loops.
+The runs of tests/osm/wrong_maps.py: sample_data under a random walk, without loops.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import tables
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "pipeline"))
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "osm"))
 
 from wrong_maps import DRAWN, MODES, OFF, SHIFT, on
 

@@ -21,8 +21,8 @@ import numpy as np
 
 from lslam.config.osm import OsmConfig
 from lslam.maps.merge import MapMerger
-from lslam.priors.bounds import Bounds
-from lslam.priors.buffer import OsmBuffer
+from lslam.osm.bounds import Bounds
+from lslam.osm.buffer import OsmBuffer
 from lslam.readers import open_sequence
 
 

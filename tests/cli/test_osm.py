@@ -18,7 +18,7 @@ from click.testing import CliRunner
 from lslam.cli.main import cli
 from lslam.errors import LslamError
 
-FAKE = Path(__file__).resolve().parents[1] / "priors" / "overpass_server.py"
+FAKE = Path(__file__).resolve().parents[1] / "osm" / "overpass_server.py"
 VILLAGE = Path(__file__).resolve().parents[1] / "simulation" / "osm_village.py"
 Call = Callable[..., tuple[int, str]]
 PLACE = "49.0112,8.4229"

@@ -12,8 +12,8 @@ import pytest
 
 from lslam.formats.osm_files import OsmData, from_overpass, merged, read_osm, write_osm
 from lslam.formats.overpass_reply import OverpassReply
-from lslam.priors.bounds import Bounds
-from lslam.priors.overpass import _file_name, kept_reply
+from lslam.osm.bounds import Bounds
+from lslam.osm.overpass import _file_name, kept_reply
 
 HOUSES = 12_000
 BOX = Bounds(48.95, 8.35, 49.05, 8.45)

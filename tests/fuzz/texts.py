@@ -31,11 +31,11 @@ from lslam.formats.state_files import read_state, write_state
 from lslam.formats.study_csv import read_study_csv, write_study_csv
 from lslam.formats.trajectory_files import read_times, read_trajectory
 from lslam.formats.transform_text import read_transform
+from lslam.osm.bounds import Bounds
+from lslam.osm.overpass import kept_reply
 from lslam.pipeline.rebuild import map_of, read_run
 from lslam.pipeline.resume import may_go_on
 from lslam.pipeline.view import viewed_run
-from lslam.priors.bounds import Bounds
-from lslam.priors.overpass import kept_reply
 from lslam.simulation.osm_perturb import read_perturbation
 from lslam.simulation.scenario_files import scenario_named
 from lslam.simulation.stream import read_mark
@@ -209,7 +209,7 @@ def _read_run(folder: Path) -> None:
 
 
 def _kept(folder: Path) -> list[Files]:
-    from lslam.priors.overpass import _file_name
+    from lslam.osm.overpass import _file_name
 
     maker = ExtractMaker()
     maker.square(1, 0, 0, 10, building="yes")

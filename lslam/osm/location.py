@@ -1,0 +1,259 @@
+"""Along the keyframes of a run, the walls seen about each are laid on the buildings of the map.
+
+Each match is sought where the ones before it and odometry say that the keyframe is, within what odometry may have drifted
+since; one that is not unique, or not where it may be, does not count.
+"""
+
+from __future__ import annotations
+
+import copy
+import logging
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.backend.inputs import floor_planes
+from lslam.backend.levelling import UP
+from lslam.config import Config
+from lslam.config.graph import GraphConfig
+from lslam.config.osm import OsmConfig
+from lslam.formats.osm_buildings import BuildingExtract
+from lslam.geometry import se2, se3, so3
+from lslam.graph.chi_square import quantile
+from lslam.graph.problem import PlanarPrior, Solution
+from lslam.keyframes.store import KeyframeStore
+from lslam.osm.first_match import Start, known_start, see_walls, sought_start
+from lslam.osm.prior import match_buildings, match_keyframe, shares
+from lslam.osm.track import OsmTrack
+from lslam.osm.wall_map import OsmMap
+from lslam.osm.wall_match import START_WALLS
+from lslam.stopping import checking
+from lslam.types.building_match import BuildingMatch, KeyframeMatch, OsmMatches
+from lslam.types.stage_clock import KeyframeClocks
+
+log = logging.getLogger("lslam")
+Floats = NDArray[np.float64]
+
+# Beyond so many sigmas of the map itself the run does not know where it is, and a match has to fix all three coordinates.
+LOST = 4.0
+# A match is borne out by the others within this quantile of its own distribution.
+BORNE_OUT = 0.95
+
+
+@dataclass(frozen=True)
+class Located:
+    """Where the keyframes of a run are on the map.
+
+    T_enu_odometry : (4, 4) from the world of odometry into the map frame, placed by one match and turned by all
+    matches : of all keyframes; priors : the accepted ones, for the pose graph
+    start, start_sigma : (3,) x, y (m), yaw (rad) that hold the first pose, None where matches have it, and how well
+    problem : why there are none
+    """
+
+    T_enu_odometry: Floats
+    osm: OsmMap
+    matches: list[KeyframeMatch] = field(default_factory=list)
+    priors: list[PlanarPrior] = field(default_factory=list)
+    start: Floats | None = None
+    start_sigma: Floats = field(default_factory=lambda: np.zeros(3))
+    problem: str = ""
+
+    @property
+    def accepted(self) -> list[KeyframeMatch]:
+        """Those of `priors`."""
+        return [match for match in self.matches if match.verdict == "accepted"]
+
+
+def locate(
+    extract: BuildingExtract, store: KeyframeStore, up: Floats | None, config: Config, placed: Floats | None = None,
+    odometry: Floats | None = None, clocks: KeyframeClocks | None = None,
+) -> Located:  # fmt: skip
+    """Match all keyframes with the map.
+
+    up : (3,) up in the world of odometry as an IMU has it, None takes that of the ground
+    placed : (4, 4) from that world into the map frame, where satellite fixes say it
+    odometry : (K, 4, 4) of the keyframes in it, those of the store by default
+    clocks : take the time of each keyframe, stages `walls` and `map match`
+    """
+    clocks = KeyframeClocks() if clocks is None else clocks
+    osm = OsmMap(extract.buildings)
+    odometry = np.stack([k.T_world_lidar for k in store.keyframes]) if odometry is None else odometry
+    up = _up_by_ground(store, odometry, config) if up is None else up
+    T_level = se3.make(so3.least_rotation(up, UP), np.zeros(3)) if placed is None else placed
+    poses = T_level @ odometry
+    start = _start(store, poses, osm, config, placed)
+    if start.problem:
+        return Located(T_level, osm, problem=start.problem)
+    track = OsmTrack(
+        start.pose, start.sigma, config.graph.drift_percent, np.radians(config.graph.drift_deg_per_100m) / 100,
+        np.array([config.osm.map_sigma, config.osm.map_sigma, np.radians(config.osm.map_sigma_deg)]),
+    )  # fmt: skip
+    matches = _both_ways(store, poses, osm, track, config, clocks)
+    accepted = [match for match in matches if match.verdict == "accepted"]
+    if not accepted:
+        return Located(T_level, osm, matches, problem=_why_none(matches, osm, extract))
+    log.info("OSM: %d of %d keyframes lie on the map", len(accepted), len(matches))
+    first = next((match for match in accepted if match.rank == 3), accepted[0])
+    sigma = np.maximum(start.sigma, track.sigma)
+    T = _lowered(
+        se2.to_se3(_place(store, se2.of_se3(poses), first, accepted, track, sigma)) @ T_level, odometry[0], placed
+    )
+    parts = shares(accepted, len(osm.walls))
+    priors = [
+        PlanarPrior(m.keyframe, m.pose, m.information, m.rank, part) for m, part in zip(accepted, parts, strict=True)
+    ]
+    if not (config.osm.hold_start or config.osm.mode == "rigid"):
+        return Located(T, osm, matches, priors, None, sigma)
+    # All walls together know the heading best.
+    given, laid = known_start(config.osm), se2.of_se3(T @ odometry[0])
+    place = given.pose[:2] if placed is None else start.pose[:2]
+    return Located(T, osm, matches, priors, np.append(place, laid[2]), np.append(given.sigma[:2], sigma[2]))
+
+
+def finish(
+    located: Located, extract: BuildingExtract, poses: Floats, solution: Solution, config: OsmConfig,
+    clocks: KeyframeClocks | None = None,
+) -> OsmMatches:  # fmt: skip
+    """All that was matched, with the graph's verdicts, and each building laid on what was seen from the final `poses`.
+
+    clocks : take the time of each keyframe, stage `building match`
+    """
+    clocks = KeyframeClocks() if clocks is None else clocks
+    doubts = iter(solution.map_reasons)
+    judged = [_judged(m, next(doubts)) if m.verdict == "accepted" else m for m in located.matches]
+    planar, local = se2.of_se3(poses), list[BuildingMatch]()
+    for match in checking(judged):
+        with clocks[match.keyframe].stage("building match"):
+            local += match_buildings(match, planar[match.keyframe], solution.shift, located.osm, config)
+    return OsmMatches(
+        extract.origin, located.osm.buildings, located.osm.walls, located.osm.owners, tuple(judged), tuple(local),
+        solution.shift, solution.shift_sigma, extract.source, extract.attribution,
+    )  # fmt: skip
+
+
+def _up_by_ground(store: KeyframeStore, odometry: Floats, config: Config) -> Floats:
+    """(3,) up in the world of odometry, by the ground under all keyframes: roads rise and fall; its z axis without any."""
+    normals = [odometry[f.keyframe, :3, :3] @ f.normal for f in floor_planes(store, config.graph)]
+    up = np.median(normals, axis=0) if normals else UP
+    return np.asarray(up / np.linalg.norm(up))
+
+
+def _start(store: KeyframeStore, poses: Floats, osm: OsmMap, config: Config, placed: Floats | None) -> Start:
+    if placed is not None:
+        return replace(known_start(config.osm), pose=se2.of_se3(poses[0]))
+    if config.osm.heading_deg is not None:
+        return known_start(config.osm)
+    return sought_start(store, poses, osm, config.osm, config.keyframes.submap_size)
+
+
+def _both_ways(
+    store: KeyframeStore, poses: Floats, osm: OsmMap, track: OsmTrack, config: Config, clocks: KeyframeClocks
+) -> list[KeyframeMatch]:
+    """Forward from the first keyframe; then back from the first that was accepted and that fixes everything."""
+    found = _along(range(len(store)), store, poses, osm, track, config, clocks)
+    numbers = [m.keyframe for m in found if m.verdict == "accepted" and m.rank == 3]
+    if numbers and numbers[0] > 0:
+        first = found[numbers[0]]
+        back = copy.deepcopy(track)
+        back.begin(first.pose, first.information)
+        found[: numbers[0]] = _along(
+            range(numbers[0] - 1, -1, -1), store, poses, osm, back, config, clocks, numbers[0]
+        )[::-1]
+    return found
+
+
+def _along(
+    numbers: Iterable[int], store: KeyframeStore, poses: Floats, osm: OsmMap, track: OsmTrack, config: Config,
+    clocks: KeyframeClocks, before: int | None = None,
+) -> list[KeyframeMatch]:  # fmt: skip
+    """Match the keyframes `numbers` in turn; the track stands at the keyframe `before`, None at the first of them."""
+    planar = se2.of_se3(poses)
+    matches: list[KeyframeMatch] = []
+    for number in checking(numbers):
+        if before is not None:
+            step = se2.relative(planar[before], planar[number])
+            track.move(step, float(np.linalg.norm(step[:2])))
+        before = number
+        with clocks[number].stage("walls"):
+            seen = see_walls(store, poses, number, config.keyframes.submap_size, config.osm)
+        view = KeyframeMatch(number, seen.walls, seen.views, track.pose, track.sigma, track.pose, np.zeros((3, 3)))
+        with clocks[number].stage("map match"):
+            match = _gated(match_keyframe(view, osm, config.osm), track, config.osm, config.graph)
+        if match.verdict == "accepted":
+            track.take(match.pose, match.information)
+        matches.append(match)
+    return matches
+
+
+def _gated(match: KeyframeMatch, track: OsmTrack, config: OsmConfig, graph: GraphConfig) -> KeyframeMatch:
+    """The match with its verdict."""
+    if match.reason:
+        return match
+    if track.sigma[0] > LOST * config.map_sigma and (match.rank < 3 or len(match.pairs) < START_WALLS):
+        return replace(match, reason="too few walls to find the place anew")
+    squared, rank = track.squared(match.pose, match.information)
+    limit = quantile(graph.probability, rank)
+    if squared > limit:
+        return replace(
+            match, reason=f"{np.sqrt(squared / limit):.1f} times as far from odometry as it may have drifted"
+        )
+    return replace(match, verdict="accepted")
+
+
+def _judged(match: KeyframeMatch, doubt: str) -> KeyframeMatch:
+    return replace(match, verdict="rejected", reason=doubt) if doubt else match
+
+
+def _place(
+    store: KeyframeStore,
+    poses: Floats,
+    first: KeyframeMatch,
+    accepted: list[KeyframeMatch],
+    track: OsmTrack,
+    sigma: Floats,
+) -> Floats:
+    """The pose (3,) of the world of `poses` (K, 3) in the map frame.
+
+    In place as that match has it, next to `first`, that is known as well as the map is and that the others bear out, and
+    turned as all have it: a house drawn askew, or few walls, are enough for one match that turns the run by degrees, which
+    would look like drift of odometry.
+    """
+    matches = [first, *(match for match in accepted if match is not first)]
+    numbers = [match.keyframe for match in matches]
+    place = se2.compose(first.pose, se2.inverse(poses[first.keyframe]))
+    laid, ways = se2.compose(place, poses[numbers]), np.array([store.keyframes[k].distance for k in numbers])
+    turn, squared = track.lay(laid, ways, matches, sigma)
+    right = [
+        i
+        for i, (match, far) in enumerate(zip(matches, squared, strict=True))
+        if match.rank == 3 and track.knows(match.information) and far <= quantile(BORNE_OUT, 3)
+    ]
+    at = min(right, key=lambda i: abs(numbers[i] - first.keyframe), default=0)
+    there = np.append(matches[at].pose[:2], laid[at, 2] + turn)
+    return se2.compose(there, se2.inverse(poses[numbers[at]]))
+
+
+def _lowered(T: Floats, first: Floats, placed: Floats | None) -> Floats:
+    """With the first keyframe at height 0, where satellite fixes do not say its height."""
+    if placed is not None:
+        return T
+    down = np.eye(4)
+    down[2, 3] = -(T @ first)[2, 3]
+    return np.asarray(down @ T)
+
+
+def _why_none(matches: list[KeyframeMatch], osm: OsmMap, extract: BuildingExtract) -> str:
+    away = min(osm.distance(m.prior[:2]) for m in matches)
+    if all(m.reason == "no building near" for m in matches):
+        return (
+            f"OSM: no building of {extract.source} comes near the run, the nearest is {away:.0f} m away: check --origin; the "
+            "run goes on without the buildings"
+        )
+    reasons = [m.reason for m in matches]
+    usual = max(sorted(set(reasons)), key=reasons.count)
+    return (
+        f"OSM: none of {len(matches)} keyframes could be laid on {extract.source} (most often: {usual}): check --origin and "
+        "--heading; the run goes on without the buildings"
+    )

@@ -1,0 +1,255 @@
+"""Buildings from an Overpass server, politely: one request at a time, never twice for one place, patient when it is busy.
+
+Replies are kept in the user's cache as the server sent them; a box that lies inside a kept one needs no network.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import io
+import json
+import logging
+import tempfile
+import threading
+import time
+from collections.abc import Callable
+from concurrent.futures import Future
+from contextvars import copy_context
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lslam.config.osm import OsmConfig
+from lslam.errors import InputError, OutputError, UsageError
+from lslam.formats.atomic import atomic_write
+from lslam.formats.osm_files import GaveUpError, from_overpass
+from lslam.formats.overpass_reply import OverpassReply
+from lslam.kernels.cache import cache_folder
+from lslam.locks import one_at_a_time
+from lslam.osm.bounds import Bounds
+from lslam.untrusted import whole_number
+from lslam.version import __version__
+
+log = logging.getLogger("lslam")
+
+USER_AGENT = f"lslam/{__version__} (batch LiDAR SLAM; buildings around a recorded trajectory)"
+LONGEST_REPLY = 48 * 1024 * 1024  # bytes; its text is kept, and read element by element
+LONGEST_WAIT = 120.0  # s; whoever says "retry later than that" is not waited for
+FAR_OUT = 1000.0  # m; a long building reaches that far out of a box
+_BUSY = (429, 502, 503, 504)
+_one_thread_at_a_time = threading.Lock()
+
+
+class _TryAgainError(Exception):
+    """The server is busy, or the line broke: `wait` s as it asked for, None when it did not say."""
+
+    def __init__(self, why: str, wait: float | None = None) -> None:
+        super().__init__(why)
+        self.wait = wait
+
+
+def query(bounds: Bounds, timeout: float) -> str:
+    """Overpass QL for all building outlines that touch `bounds`."""
+    box = str(bounds)
+    return (
+        f'[out:json][timeout:{round(timeout)}];(way["building"]({box});'
+        f'relation["building"]["type"="multipolygon"]({box}););out body;>;out skel qt;'
+    )
+
+
+def reply_folder() -> Path:
+    """Where replies are kept: in the user's cache, or in a new folder when there is none."""
+    return cache_folder("osm") or Path(tempfile.mkdtemp(prefix="lslam-osm-"))
+
+
+def fetch_buildings(
+    bounds: Bounds, config: OsmConfig, folder: Path, sleep: Callable[[float], None] = time.sleep
+) -> OverpassReply:
+    """The Overpass reply for `bounds`, from `folder` when it or a larger one is kept there, else from `config.server`.
+
+    It is checked (`osm_files.from_overpass` takes it) and kept when it is whole. `sleep` waits between attempts.
+
+    Raises InputError with one sentence: server unreachable or busy to the end, a web page, a reply that is cut short, gave
+    up, is of another place or endless; nothing in the cache where `config.cache` is `only`.
+    """
+    kept = kept_reply(bounds, folder) if config.cache != "refresh" else None
+    if kept is not None:
+        return kept
+    if config.cache == "only":
+        raise InputError(
+            f"no reply for {bounds} is in {folder}: ask a server for it once, osm.cache = use, without --offline"
+        )
+    try:
+        reply = _ask_patiently(bounds, config, folder, sleep)
+    except InputError as error:
+        # An old reply is better than none, and the world of buildings changes slowly.
+        kept = kept_reply(bounds, folder)
+        if kept is None:
+            raise
+        log.warning("%s; using what was fetched before", error)
+        return kept
+    with contextlib.suppress(OutputError, OSError):
+        folder.mkdir(parents=True, exist_ok=True)
+        with atomic_write(folder / _file_name(bounds)) as stream:
+            stream.write(reply.text)
+    return reply
+
+
+def kept_reply(bounds: Bounds, folder: Path) -> OverpassReply | None:
+    """The kept reply for `bounds`, or for the smallest kept box round it; None without one that can be read."""
+    exact = folder / _file_name(bounds)
+    larger = [(box.area_km2, path) for path in folder.glob("*.json") if (box := _bounds_of(path)) and box.holds(bounds)]
+    for path in [exact, *(path for _, path in sorted(larger))]:
+        try:
+            return _checked(OverpassReply(path.read_bytes()), bounds, is_own=path == exact)
+        except (OSError, ValueError):
+            continue
+    return None
+
+
+def _file_name(bounds: Bounds) -> str:
+    """The box for people and for `holds`, a digest of the query for a change of the query."""
+    return f"{bounds}-{hashlib.sha256(query(bounds, 180).encode()).hexdigest()[:16]}.json"
+
+
+def _bounds_of(path: Path) -> Bounds | None:
+    with contextlib.suppress(ValueError, TypeError, UsageError):
+        bounds = Bounds(*(float(v) for v in path.name.rsplit("-", 1)[0].split(",")))
+        return bounds if _file_name(bounds) == path.name else None
+    return None
+
+
+def _ask_patiently(bounds: Bounds, config: OsmConfig, folder: Path, sleep: Callable[[float], None]) -> OverpassReply:
+    wait = config.backoff
+    # Many runs at once, threads or processes, are still one polite client.
+    with _one_thread_at_a_time, one_at_a_time(folder / "request.lock"):
+        for attempt in range(1, config.attempts + 1):
+            try:
+                return _ask(bounds, config)
+            except _TryAgainError as error:
+                wanted = wait if error.wait is None else error.wait
+                if attempt == config.attempts or wanted > LONGEST_WAIT:
+                    times = f"after {attempt} attempts" if attempt > 1 else "and asks for a long break"
+                    raise InputError(
+                        f"{config.server} gave no buildings {times}: {error}; try later, or another server (osm.server)"
+                    ) from None
+                log.info("%s: %s, again in %.3g s", config.server, error, wanted)
+                sleep(wanted)
+                wait *= 2
+    raise AssertionError("the last attempt returns or raises")
+
+
+def _ask(bounds: Bounds, config: OsmConfig) -> OverpassReply:
+    """One request; InputError when asking again is no use, _TryAgainError when it may be.
+
+    It has a thread of its own, because a name that is looked up and headers that drip know no end: all of it together has
+    `config.timeout`.
+    """
+    reply: Future[bytes] = Future()
+    is_late = threading.Event()
+
+    def exchange() -> None:
+        try:
+            reply.set_result(_exchange(bounds, config, is_late))
+        except BaseException as error:
+            reply.set_exception(error)
+
+    threading.Thread(target=copy_context().run, args=(exchange,), name="overpass", daemon=True).start()
+    try:
+        body = reply.result(config.timeout)
+    except TimeoutError:
+        raise InputError(_too_late(config.server, config.timeout)) from None
+    finally:
+        is_late.set()
+    return _parsed(body, bounds, config.server)
+
+
+def _exchange(bounds: Bounds, config: OsmConfig, is_late: threading.Event) -> bytes:
+    """The body of a reply, unless nobody waits for it any more."""
+    import requests
+
+    server = config.server
+    try:
+        with requests.post(
+            server,
+            data={"data": query(bounds, config.timeout)},
+            headers={"User-Agent": USER_AGENT, "Accept": "application/json"},
+            timeout=(config.connect_timeout, config.timeout),
+            allow_redirects=False,
+            stream=True,
+        ) as reply:
+            _check_status(reply, server)
+            return _read(reply, server, config.timeout, is_late)
+    except requests.exceptions.Timeout as error:
+        is_connecting = isinstance(error, requests.exceptions.ConnectTimeout)
+        raise InputError(_too_late(server, config.connect_timeout if is_connecting else config.timeout)) from None
+    except requests.exceptions.ConnectionError as error:
+        reason = getattr(error.args[0] if error.args else None, "reason", None)
+        if type(reason).__name__ in ("NewConnectionError", "NameResolutionError"):
+            raise InputError(f"{server} cannot be reached: check the network, or name another osm.server") from None
+        raise _TryAgainError("the connection broke") from None
+    except requests.exceptions.RequestException as error:
+        raise InputError(f"{server} cannot be asked: {error}") from None
+
+
+def _check_status(reply: Any, server: str) -> None:
+    status = reply.status_code
+    if status in _BUSY:
+        said = reply.headers.get("Retry-After", "")
+        raise _TryAgainError(
+            f"it is busy (HTTP {status})", None if (wait := whole_number(said)) is None else float(wait)
+        )
+    if 300 <= status < 400:
+        to = reply.headers.get("Location", "nowhere")
+        raise InputError(f"{server} redirects to {to[:120]}: set osm.server to an Overpass server's own address")
+    if status != 200:
+        raise InputError(f"{server} refused the request (HTTP {status}): check osm.server")
+
+
+def _read(reply: Any, server: str, timeout: float, is_late: threading.Event) -> bytes:
+    """The body, but neither for ever nor without end: what has come is looked at as it comes, drop by drop."""
+    import urllib3
+
+    body = io.BytesIO()  # which gives its bytes away without a copy
+    try:
+        while part := reply.raw.read1(65536, decode_content=True):
+            body.write(part)
+            if body.tell() > LONGEST_REPLY:
+                raise InputError(f"the reply grows beyond {LONGEST_REPLY >> 20} MB: ask for a smaller place")
+            if is_late.is_set():
+                raise InputError(_too_late(server, timeout))
+    except urllib3.exceptions.ReadTimeoutError:
+        raise InputError(_too_late(server, timeout)) from None
+    except urllib3.exceptions.HTTPError:
+        raise _TryAgainError("the connection broke") from None
+    return body.getvalue()
+
+
+def _too_late(server: str, limit: float) -> str:
+    # Nobody waits for that a second time; a server with too much to do says so itself.
+    return f"{server} did not answer within {limit:g} s: try later, or name another osm.server"
+
+
+def _parsed(body: bytes, bounds: Bounds, server: str) -> OverpassReply:
+    if body[:64].lstrip()[:1] == b"<":
+        raise InputError(f"{server} answered with a web page, not with data: check osm.server")
+    try:
+        return _checked(OverpassReply(body), bounds)
+    except (json.JSONDecodeError, UnicodeDecodeError):
+        raise _TryAgainError("the reply was cut short") from None
+    except GaveUpError as error:
+        raise _TryAgainError(f"it gave up ({error.remark[:120]})") from None
+    except ValueError as error:
+        raise InputError(f"the reply of {server} cannot be used, {error}: check osm.server") from None
+
+
+def _checked(reply: OverpassReply, bounds: Bounds, is_own: bool = True) -> OverpassReply:
+    """The reply; raises ValueError when it is none, or, of its own request, one from elsewhere."""
+    data = from_overpass(reply)
+    places = np.array([*data.nodes.values()]).reshape(-1, 2)
+    if is_own and bounds.share_inside(places, FAR_OUT) < 0.5:
+        lat, lon = np.median(places, axis=0)
+        raise ValueError(f"most of it lies elsewhere, about {lat:.4f},{lon:.4f}")
+    return reply

@@ -1,0 +1,98 @@
+"""Walls seen about a keyframe against the walls of the map: where it stands, and where each building really is.
+
+Second thesis, sections 3.3 and 3.4: the global match lays what is seen on all buildings near and becomes a prior of the
+keyframe, the local one lays each building on what is seen and moves only the building.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.config.osm import OsmConfig
+from lslam.geometry import se2
+from lslam.osm.wall_map import OsmMap
+from lslam.osm.wall_match import WINDOW, WallMatch, match_walls
+from lslam.osm.walls import find_walls
+from lslam.types.building_match import BuildingMatch, KeyframeMatch
+
+Floats = NDArray[np.float64]
+
+
+def warm_up() -> None:
+    """Compile or load every kernel that a map needs, by laying two walls on themselves."""
+    s, z = (part.ravel() for part in np.meshgrid(np.arange(0.0, 8.0, 0.2), np.arange(2.0, 5.0, 0.2)))
+    corner = np.concatenate([np.column_stack([s, 0 * s + 8, z]), np.column_stack([0 * s + 8, s, z])])
+    floor = np.column_stack([s, s, 0 * z])
+    walls = find_walls(np.concatenate([corner, floor])).segments
+    for by_coverage in (False, True):
+        match_walls(walls, walls, np.zeros(3), np.ones(3), by_coverage=by_coverage)
+
+
+def match_keyframe(view: KeyframeMatch, osm: OsmMap, config: OsmConfig) -> KeyframeMatch:
+    """`view`, walls with a prior and its sigma, laid on the buildings near; not accepted yet, but for a reason if not."""
+    if not len(view.walls):
+        return replace(view, reason="no walls seen")
+    reach = config.use_radius + WINDOW * float(np.hypot(view.sigma[0], view.sigma[1]))
+    numbers = osm.walls_near(view.prior[:2], reach)
+    if not len(numbers):
+        return replace(view, reason="no building near")
+    found = match_walls(view.walls, osm.walls[numbers], view.prior, view.sigma, config)
+    if found is None:
+        return replace(view, reason="too few of the walls seen lie on the map")
+    return matched(view, found, numbers)
+
+
+def matched(view: KeyframeMatch, found: WallMatch, numbers: NDArray[np.int64]) -> KeyframeMatch:
+    """`view` with what was found for it; `numbers` (T,) of the walls it was laid on."""
+    pairs = np.column_stack([found.pairs[:, 0], numbers[found.pairs[:, 1]]])
+    return replace(
+        view, pose=found.pose, information=found.information, rank=found.rank, kind=found.kind, fitness=found.fitness,
+        coverage=found.coverage, rms=found.rms, pairs=pairs,
+        reason="another place fits nearly as well" if found.is_ambiguous else "",
+    )  # fmt: skip
+
+
+def match_buildings(
+    match: KeyframeMatch, pose: Floats, shift: Floats, osm: OsmMap, config: OsmConfig
+) -> list[BuildingMatch]:
+    """Each building near laid on the walls seen from a keyframe that stands at `pose` (3,).
+
+    shift : (2,) m by which the map is off as a whole: buildings are sought so far away from where it has them
+    """
+    found: list[BuildingMatch] = []
+    if not len(match.walls):
+        return found
+    sigma = np.array([config.building_sigma, config.building_sigma, np.radians(config.building_sigma_deg)])
+    for number in osm.near(pose[:2] - shift, config.use_radius).tolist():
+        middle = osm.buildings[number].middle
+        walls = osm.walls[osm.owners == number] - middle
+        if not len(walls):
+            continue
+        prior = se2.relative(pose, np.append(middle + shift, 0.0))
+        # The walls of a big building reach farther than those seen, and most buildings are seen in part.
+        one = match_walls(walls, match.walls, prior, sigma, config, by_coverage=True)
+        if one is None:
+            continue
+        reason = "another place fits nearly as well" if one.is_ambiguous else ""
+        found.append(
+            BuildingMatch(
+                match.keyframe, number, one.pose, one.information, one.rank, one.kind, one.fitness, one.coverage,
+                one.rms, one.pairs, "rejected" if reason else "accepted", reason,
+            )
+        )  # fmt: skip
+    return found
+
+
+def shares(matches: Sequence[KeyframeMatch], walls: int) -> list[float]:
+    """What each match counts beside the others: one over how many of them lie on the same of the map's `walls`, in the mean.
+
+    Who drew a wall half a metre off has done so for every keyframe that sees it: a hundred of them know no more than one.
+    """
+    seen = np.zeros(walls, np.int64)
+    for match in matches:
+        seen[np.unique(match.pairs[:, 1])] += 1
+    return [float(np.mean(1.0 / seen[match.pairs[:, 1]])) for match in matches]

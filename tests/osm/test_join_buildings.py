@@ -1,0 +1,47 @@
+"""What the baseline takes from the graph that was solved before it."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.config import Config
+from lslam.formats.osm_buildings import BuildingExtract
+from lslam.geometry import se3
+from lslam.graph.pose_graph import optimise
+from lslam.graph.problem import PoseGraph, PositionFix
+from lslam.osm.join_buildings import run_baseline
+from lslam.types.building import Building, Footprint
+from lslam.types.constraint import Constraint
+from lslam.types.stage_clock import KeyframeClocks
+
+
+class NothingSeen:
+    """A store of keyframes whose clouds are empty."""
+
+    def __len__(self) -> int:
+        return 20
+
+    def points(self, number: int) -> NDArray[np.float32]:
+        return np.zeros((0, 3), np.float32)
+
+
+def test_a_fix_that_the_graph_gave_up_does_not_bend_the_baseline() -> None:
+    poses = np.tile(np.eye(4), (20, 1, 1))
+    poses[:, 0, 3] = 2.0 * np.arange(20)
+    steps = [
+        Constraint(k, k + 1, se3.relative(poses[k], poses[k + 1]), np.diag(np.repeat([1e-4, 1e-6], 3)), "odometry")
+        for k in range(19)
+    ]
+    off = np.zeros((20, 3))
+    off[10, 1] = 40.0
+    fixes = [PositionFix(k, poses[k, :3, 3] + off[k], np.full(3, 0.1), np.zeros(3)) for k in range(20)]
+    graph = PoseGraph(poses, steps, fixes=fixes, is_anchored=False)
+    solution = optimise(graph, Config().graph)
+    assert np.flatnonzero(~solution.fix_believed).tolist() == [10]
+    house = Building("way/1", (Footprint(np.array([[200.0, 0], [210, 0], [210, 10], [200, 10]])),))
+    extract = BuildingExtract([house], {}, np.array([49.0, 8.4, 0.0]), None, "a map")
+    joint, matches, placed = run_baseline(graph, solution, extract, NothingSeen(), Config(), KeyframeClocks())  # type: ignore[arg-type]
+    np.testing.assert_allclose(joint.poses[:, :3, 3], poses[:, :3, 3], atol=0.1)
+    assert [match.reason for match in matches.keyframes] == ["no convergence"] * 20
+    assert [c.status for c in placed.buildings] == ["unseen"]
