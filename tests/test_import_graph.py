@@ -15,7 +15,7 @@ LAYERS = [
     ["cli"],
     ["studies"],
     ["pipeline"],
-    ["osm"],
+    ["doctor", "osm"],
     ["frontend", "backend"],
     ["reports"],
     ["readers", "odometry", "inertial", "integrity", "loops", "graph", "maps", "evaluation", "simulation"],

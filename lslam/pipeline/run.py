@@ -12,6 +12,8 @@ from lslam.backend.georeferencing import require_gnss
 from lslam.backend.loop_view import view_loop
 from lslam.backend.outcome import BackEnd
 from lslam.config import Config
+from lslam.doctor.examine_truth import examine_jumps
+from lslam.doctor.examine_units import examine_units
 from lslam.errors import GateError, InterruptedRunError, LslamError, OutputError, RunFailedError
 from lslam.evaluation.evaluate import Evaluation, evaluate
 from lslam.frontend.checkpoints import Checkpoints, OdometryCheckpoints
@@ -28,8 +30,6 @@ from lslam.pipeline import outputs
 from lslam.pipeline.back_end_pass import level_world, optimise_poses, write_back_end
 from lslam.pipeline.check import check_config
 from lslam.pipeline.choose import choose_scans
-from lslam.pipeline.doctor_truth import examine_jumps
-from lslam.pipeline.doctor_units import examine_units
 from lslam.pipeline.feature_pass import build_feature_map
 from lslam.pipeline.feature_view import view_features
 from lslam.pipeline.given_poses import bind

@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 from stub_sequences import Standstill, Stub
 
 from lslam.config import Config, load_config
+from lslam.doctor.examine_turns import examine_turns
+from lslam.doctor.findings import Finding
 from lslam.errors import GateError, InputError
 from lslam.formats.timing_csv import read_timing_rows
 from lslam.formats.trajectory_files import read_trajectory
@@ -22,8 +24,6 @@ from lslam.frontend.register_scans import estimate
 from lslam.geometry import se3
 from lslam.inertial.fusion import InertialMotion
 from lslam.odometry import create_odometry
-from lslam.pipeline.doctor_turns import examine_turns
-from lslam.pipeline.findings import Finding
 from lslam.pipeline.run import run
 from lslam.pipeline.watch import RunOutcome
 from lslam.readers import select

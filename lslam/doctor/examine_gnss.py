@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.doctor.findings import Facts, Finding, plural
 from lslam.geometry.geodesy import to_local
-from lslam.pipeline.findings import Facts, Finding, plural
 from lslam.types.sequence import Sequence
 
 # No carrier of a LiDAR accelerates more, m/s2; a fix that does not state its sigma is taken to be so good, m.

@@ -10,13 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.config import Config
+from lslam.doctor.findings import Facts, Finding
 from lslam.frontend.inertial_start import first_poses
 from lslam.geometry import so3
 from lslam.inertial.agreement import FAR_S, LEAST_TURNING, NEAR_S, STEP_S, Agreement, check_agreement, turns
 from lslam.inertial.fusion import InertialMotion
 from lslam.inertial.initialise import FirstPoses, start, told_poses
 from lslam.inertial.stream import Cleaned, ImuRefusedError, clean
-from lslam.pipeline.findings import Facts, Finding
 from lslam.types.imu import ImuStream
 from lslam.types.sequence import Sequence
 

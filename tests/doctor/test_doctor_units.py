@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lslam.pipeline.doctor_units import examine_units
-from lslam.pipeline.findings import Finding
-from lslam.pipeline.inspect import inspect
+from lslam.doctor.examine_units import examine_units
+from lslam.doctor.findings import Finding
+from lslam.doctor.inspect import inspect
 from lslam.readers import open_sequence
 from lslam.types.scan import Span
 from lslam.types.sequence import Sequence

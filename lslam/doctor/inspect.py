@@ -7,13 +7,13 @@ from dataclasses import asdict
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.pipeline.doctor_gnss import examine_gnss
-from lslam.pipeline.doctor_imu import examine_imu
-from lslam.pipeline.doctor_scans import examine_points, examine_stamps, examine_times, rings_rule
-from lslam.pipeline.doctor_truth import examine_gaps, examine_jumps
-from lslam.pipeline.doctor_turns import examine_turns
-from lslam.pipeline.doctor_units import examine_units
-from lslam.pipeline.findings import Facts, Finding
+from lslam.doctor.examine_gnss import examine_gnss
+from lslam.doctor.examine_imu import examine_imu
+from lslam.doctor.examine_scans import examine_points, examine_stamps, examine_times, rings_rule
+from lslam.doctor.examine_truth import examine_gaps, examine_jumps
+from lslam.doctor.examine_turns import examine_turns
+from lslam.doctor.examine_units import examine_units
+from lslam.doctor.findings import Facts, Finding
 from lslam.types.scan import Span
 from lslam.types.sequence import Sequence
 from lslam.types.trajectory import Trajectory

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.doctor.findings import Facts, Finding, plural
 from lslam.inertial.stream import GRAVITY, LEAST_RATE_HZ, gravity_unit, mean_forces
-from lslam.pipeline.findings import Facts, Finding, plural
 from lslam.types.imu import ImuStream
 from lslam.types.sequence import Sequence
 

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.doctor.findings import Facts, Finding, plural
 from lslam.errors import InputError
 from lslam.odometry.sanity import FARTHEST_M
-from lslam.pipeline.findings import Facts, Finding, plural
 from lslam.readers.ringed import Ringed, with_rings
 from lslam.types.scan import Scan
 from lslam.types.sequence import Sequence

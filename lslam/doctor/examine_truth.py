@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from lslam.pipeline.findings import Finding, plural
+from lslam.doctor.findings import Finding, plural
 from lslam.types.sequence import Sequence
 from lslam.types.trajectory import Trajectory
 

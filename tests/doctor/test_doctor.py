@@ -14,14 +14,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from lslam.doctor.examine_gnss import examine_gnss
+from lslam.doctor.examine_imu import examine_imu
+from lslam.doctor.examine_scans import examine_stamps, examine_times
+from lslam.doctor.examine_turns import compare, examine_turns
+from lslam.doctor.findings import Facts, Finding
+from lslam.doctor.inspect import inspect
 from lslam.geometry import so3
 from lslam.inertial.stream import clean
-from lslam.pipeline.doctor_gnss import examine_gnss
-from lslam.pipeline.doctor_imu import examine_imu
-from lslam.pipeline.doctor_scans import examine_stamps, examine_times
-from lslam.pipeline.doctor_turns import compare, examine_turns
-from lslam.pipeline.findings import Facts, Finding
-from lslam.pipeline.inspect import inspect
 from lslam.readers import open_sequence
 from lslam.types.calibration import Calibration
 from lslam.types.gnss import GnssStream
