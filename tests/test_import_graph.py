@@ -13,7 +13,7 @@ PACKAGE = ROOT / "lslam"
 # Top may import below; packages on one line are siblings and never import each other.
 LAYERS = [
     ["cli"],
-    ["studies"],
+    ["studies", "convert"],
     ["pipeline"],
     ["doctor", "osm"],
     ["frontend", "backend"],

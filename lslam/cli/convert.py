@@ -83,8 +83,8 @@ def _convert_sequence(source: str, kind: str, out: Path, given: dict[str, Any]) 
     import logging
 
     from lslam.cli.console import progress, show
+    from lslam.convert.convert_sequence import check_output, convert_sequence
     from lslam.formats.trajectory_files import read_trajectory
-    from lslam.pipeline.convert import check_output, convert_sequence
 
     check_output(kind, out, given["is_zstd"], given["overwrite"])
     sequence = _open(source, given)
@@ -105,7 +105,7 @@ def _convert_sequence(source: str, kind: str, out: Path, given: dict[str, Any]) 
 
 def _convert_trajectory(source: str, kind: str, out: Path, given: dict[str, Any]) -> None:
     from lslam.cli.console import show
-    from lslam.pipeline.convert_trajectory import convert_trajectory
+    from lslam.convert.convert_trajectory import convert_trajectory
 
     for flag, name in (("--zstd", "is_zstd"), ("--deskewed", "deskewed")):
         if given[name]:

@@ -11,12 +11,12 @@ import pytest
 from rosbags.highlevel import AnyReader
 from stub_sequences import StampedInTheMiddle, sample
 
+from lslam.convert.convert_sequence import convert_sequence
 from lslam.errors import InputError, OutputExistsError, UsageError
 from lslam.formats import bag_messages
 from lslam.formats.bag_files import BagWriter
 from lslam.formats.sequence_toml import FILE_NAME, read_sequence_toml
 from lslam.geometry import se3
-from lslam.pipeline.convert import convert_sequence
 from lslam.readers import open_sequence
 from lslam.simulation.gnss import GnssModel
 from lslam.simulation.scenarios import SimulatedDrive, simulate

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from lslam.convert.convert_trajectory import change_frame
 from lslam.errors import InputError, OutputError, OutputExistsError, UsageError, cause
 from lslam.formats import bag_messages
 from lslam.formats.bag_files import INFO_TOPIC, KINDS, BagWriter
@@ -23,7 +24,6 @@ from lslam.formats.sequence_toml import FILE_NAME, FRAMES, SequenceInfo, sequenc
 from lslam.formats.trajectory_files import write_kitti, write_tum
 from lslam.frontend.register_scans import sweep_of
 from lslam.geometry import se3
-from lslam.pipeline.convert_trajectory import change_frame
 from lslam.pipeline.map_pass import motion_within
 from lslam.preprocessing.deskew import deskew_points
 from lslam.types.calibration import Calibration

@@ -1,0 +1,1 @@
+"""Recordings and trajectories into other formats and frames."""
