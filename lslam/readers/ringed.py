@@ -2,46 +2,24 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from pathlib import Path
-
-import numpy as np
-from numpy.typing import NDArray
+from dataclasses import replace
 
 from lslam.errors import InputError
 from lslam.preprocessing.rings import RingRule, decide_rings
-from lslam.types.calibration import Calibration
-from lslam.types.gnss import GnssStream
-from lslam.types.imu import ImuStream
+from lslam.readers.sequence_view import SequenceView
 from lslam.types.scan import Scan
 from lslam.types.sequence import Sequence
-from lslam.types.trajectory import Trajectory
 
 # Scans the rule is decided on: the first that can be read.
 _LOOKED_AT = 3
 
 
-@dataclass
-class Ringed:
+class Ringed(SequenceView):
     """A sequence with the rings of its scans filled in; all else is the sequence's own."""
 
-    whole: Sequence
-    rule: RingRule
-    name: str
-    path: Path
-    kind: str
-    stamps_ns: NDArray[np.int64]
-    rate_hz: float
-    motion_compensated: bool | None
-    calibration: Calibration
-    ground_truth: Trajectory | None
-    imu: ImuStream | None
-    gnss: GnssStream | None
-    notes: list[str]
-    problems: list[str]
-
-    def __len__(self) -> int:
-        return len(self.whole)
+    def __init__(self, whole: Sequence, rule: RingRule) -> None:
+        super().__init__(whole, notes=[*whole.notes, str(rule)])
+        self.rule = rule
 
     def scan(self, index: int) -> Scan:
         """Read scan `index` and find its rings. Raises InputError when either fails."""
@@ -66,11 +44,7 @@ def with_rings(sequence: Sequence, wanted: str = "auto") -> Sequence:
             rule = decide_rings(scans, wanted, rows or getattr(sequence, "rings", None))
     except InputError as error:
         raise InputError(f"{sequence.path}: {error}") from None
-    return Ringed(
-        sequence, rule, sequence.name, sequence.path, sequence.kind, sequence.stamps_ns, sequence.rate_hz,
-        sequence.motion_compensated, sequence.calibration, sequence.ground_truth, sequence.imu, sequence.gnss,
-        [*sequence.notes, str(rule)], sequence.problems,
-    )  # fmt: skip
+    return Ringed(sequence, rule)
 
 
 def _first_scans(sequence: Sequence) -> list[Scan]:

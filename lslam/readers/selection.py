@@ -2,39 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from pathlib import Path
-
 import numpy as np
 from numpy.typing import NDArray
 
 from lslam.errors import UsageError
-from lslam.types.calibration import Calibration
-from lslam.types.gnss import GnssStream
-from lslam.types.imu import ImuStream
+from lslam.readers.sequence_view import SequenceView
 from lslam.types.scan import Scan
 from lslam.types.sequence import Sequence
-from lslam.types.trajectory import Trajectory
 
 
-@dataclass
-class Selection:
+class Selection(SequenceView):
     """Every `step`-th scan of a sequence; scans keep their index of the recording, all else is the sequence's own."""
 
-    whole: Sequence
-    indices: NDArray[np.int64]
-    name: str
-    path: Path
-    kind: str
-    stamps_ns: NDArray[np.int64]
-    rate_hz: float
-    motion_compensated: bool | None
-    calibration: Calibration
-    ground_truth: Trajectory | None
-    imu: ImuStream | None
-    gnss: GnssStream | None
-    notes: list[str]
-    problems: list[str]
+    def __init__(self, whole: Sequence, indices: NDArray[np.int64]) -> None:
+        super().__init__(whole, stamps_ns=whole.stamps_ns[indices])
+        self.indices = indices
 
     def __len__(self) -> int:
         return len(self.indices)
@@ -60,8 +42,4 @@ def select(sequence: Sequence, start: int = 0, count: int | None = None, skip_fr
     indices = np.arange(start, len(sequence), skip_frames, dtype=np.int64)[:count]
     if len(indices) == len(sequence):
         return sequence
-    return Selection(
-        sequence, indices, sequence.name, sequence.path, sequence.kind, sequence.stamps_ns[indices], sequence.rate_hz,
-        sequence.motion_compensated, sequence.calibration, sequence.ground_truth, sequence.imu, sequence.gnss,
-        sequence.notes, sequence.problems,
-    )  # fmt: skip
+    return Selection(sequence, indices)

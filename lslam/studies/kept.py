@@ -6,11 +6,11 @@ import os
 import threading
 from collections import OrderedDict
 from collections.abc import Callable
-from dataclasses import dataclass, field, fields
+from dataclasses import fields
 
 import numpy as np
 
-from lslam.readers.selection import Selection
+from lslam.readers.sequence_view import SequenceView
 from lslam.types.scan import Scan
 from lslam.types.sequence import Sequence
 
@@ -48,16 +48,16 @@ def size_of(scan: Scan) -> int:
     return sum(value.nbytes for value in values if isinstance(value, np.ndarray))
 
 
-@dataclass
-class Kept(Selection):
+class Kept(SequenceView):
     """A whole sequence whose scans come from a store; `number` tells it from the others there."""
 
-    store: ScanStore = field(default_factory=lambda: ScanStore(0))
-    number: int = 0
+    def __init__(self, whole: Sequence, store: ScanStore, number: int) -> None:
+        super().__init__(whole, notes=list(whole.notes), problems=list(whole.problems))
+        self._store, self._number = store, number
 
     def scan(self, index: int) -> Scan:
         """Scan `index`, read at most once while it is kept. Raises InputError as the sequence's own."""
-        return self.store.get((self.number, index), lambda: self.whole.scan(index))
+        return self._store.get((self._number, index), lambda: self.whole.scan(index))
 
 
 class KeptSequences:
@@ -73,11 +73,7 @@ class KeptSequences:
             self._opened[key] = opening()
         whole = self._opened[key]
         number = list(self._opened).index(key)
-        return Kept(
-            whole, np.arange(len(whole)), whole.name, whole.path, whole.kind, whole.stamps_ns, whole.rate_hz,
-            whole.motion_compensated, whole.calibration, whole.ground_truth, whole.imu, whole.gnss, list(whole.notes),
-            list(whole.problems), self.store, number,
-        )  # fmt: skip
+        return Kept(whole, self.store, number)
 
 
 def memory_bound() -> int:
