@@ -117,16 +117,9 @@ def opened_with(given: dict[str, Any]) -> tuple[Sequence, Config]:
     check_config(config)
     opened = open_sequence(
         given["sequence"], data_root=given["data_root"],
-        vertical_correction_deg=config.input.vertical_correction_deg, **options.reading_of(given),
+        vertical_correction_deg=config.input.vertical_correction_deg,
+        imu=config.imu.use, gnss=config.gnss.mode != "off", **options.reading_of(given),
     )  # fmt: skip
-    if config.imu.use:
-        from lslam.readers.raw_drive import with_imu
-
-        opened = with_imu(opened, given["data_root"])
-    if config.gnss.mode != "off":
-        from lslam.readers.raw_drive import with_gnss
-
-        opened = with_gnss(opened, given["data_root"])
     return opened, config
 
 

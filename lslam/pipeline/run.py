@@ -41,7 +41,7 @@ from lslam.pipeline.resume import may_go_on, run_identity
 from lslam.pipeline.run_folder import KEYFRAMES, REPLIES, RunFolder
 from lslam.pipeline.watch import RunOutcome, Watch
 from lslam.readers import open_sequence
-from lslam.readers.raw_drive import with_gnss, with_imu
+from lslam.readers.raw_drive import with_streams
 from lslam.stopping import asking
 from lslam.types.run_record import RunRecord
 from lslam.types.scan import Span
@@ -119,8 +119,7 @@ def _prepare(
     check_config(config)
     if isinstance(sequence, (str, Path)):
         sequence = open_sequence(sequence)
-    if config.gnss.mode != "off":
-        sequence = with_gnss(sequence)
+    sequence = with_streams(sequence, config.imu.use, config.gnss.mode != "off")
     require_gnss(sequence, config.gnss)
     truth = sequence.ground_truth if truth is None else truth
     odometry = create_odometry(with_imu_settings(config))
@@ -128,7 +127,7 @@ def _prepare(
     if isinstance(odometry, GivenPoses):
         sequence.notes.extend(bind(odometry, sequence))
         given = odometry.trajectory
-    chosen = choose_scans(with_imu(sequence) if config.imu.use else sequence, odometry, config)
+    chosen = choose_scans(sequence, odometry, config)
     osm = open_osm(sequence, config)
     return _Job(chosen, odometry, config, truth, given, Manifest(command, chosen, config), watch, osm)
 

@@ -38,6 +38,8 @@ def open_sequence(
     imu_topic: str | None = None,
     gnss_topic: str | None = None,
     extrinsics: str | None = None,
+    imu: bool = False,
+    gnss: bool = False,
 ) -> Sequence:
     """Open a recorded sequence without reading its scans.
 
@@ -51,6 +53,7 @@ def open_sequence(
     lidar_topic, imu_topic, gnss_topic : which topics of a bag are read, where it has several
     extrinsics : T_lidar_imu, as numbers or a file (see `transform_text`)
         What is given wins over `sequence.toml`, which wins over what the layout implies.
+    imu, gnss : the stream is asked for: where the recording has none it is sought, as in the raw drive of a KITTI sequence
 
     Raises
     ------
@@ -77,11 +80,13 @@ def open_sequence(
         sequence = _open(folder, overrides)
     except OSError as error:
         raise InputError(f"{error.filename or name_or_path} cannot be read: {cause(error)}") from None
+    from lslam.readers.raw_drive import with_streams
+
     flags = {"--lidar-topic": lidar_topic, "--imu-topic": imu_topic, "--gnss-topic": gnss_topic}
     given = [flag for flag, topic in flags.items() if topic is not None]
     if given and sequence.kind != "bag":
         raise UsageError(f"{', '.join(given)} is for bags: {folder} is {sequence.kind}")
-    return sequence
+    return with_streams(sequence, imu, gnss, data_root)
 
 
 def _open(folder: Path, overrides: SequenceInfo) -> Sequence:

@@ -40,6 +40,13 @@ CALIBRATION = "calib_imu_to_velo.txt"
 _UPWARDS = 4
 
 
+def with_streams(sequence: Sequence, imu: bool, gnss: bool, data_root: Path | None = None) -> Sequence:
+    """The sequence with the streams that are asked for, by `with_imu` and `with_gnss`; those it has stay."""
+    if imu:
+        sequence = with_imu(sequence, data_root)
+    return with_gnss(sequence, data_root) if gnss else sequence
+
+
 def with_imu(sequence: Sequence, data_root: Path | None = None) -> Sequence:
     """The sequence with an IMU: its own, else, for a KITTI odometry sequence, that of its raw drive.
 

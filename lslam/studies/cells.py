@@ -10,7 +10,6 @@ from lslam.config.input import AS_CONFIGURED, ScanRange
 from lslam.errors import UsageError
 from lslam.pipeline.identity import imu_digest, input_digest
 from lslam.readers import open_sequence
-from lslam.readers.raw_drive import with_imu
 from lslam.studies.grid import Cell
 from lslam.studies.scenes import Scene, drive_of, scene_digest, scene_folder
 from lslam.studies.subjects import check_range
@@ -31,9 +30,9 @@ def recorded_cell(
 
     Raises InputError when it cannot be opened, or has no IMU and some run asks for one; UsageError when it ends before `own`.
     """
-    sequence = open_sequence(path)
+    sequence = open_sequence(path, data_root=data_root, imu=needs_imu)
     check_range(label, own, len(sequence))
-    imu = imu_digest(with_imu(sequence, data_root)) if needs_imu else ""
+    imu = imu_digest(sequence) if needs_imu else ""
     return Cell(label, path, seed, input_digest(sequence, truth), truth, imu, data_root, range=own)
 
 

@@ -158,17 +158,16 @@ def _run(job: Job, is_kept: bool) -> tuple[str, str]:
 
 def _opening(job: Job) -> Callable[[], Sequence]:
     from lslam.readers import open_sequence
-    from lslam.readers.raw_drive import with_gnss, with_imu
     from lslam.studies.scenes import simulate_once
 
     def opening() -> Sequence:
         if job.scene is not None:
             simulate_once(job.scene, job.seed, job.path.parents[2])
-        correction_deg = job.config.input.vertical_correction_deg
-        sequence = open_sequence(job.path, vertical_correction_deg=correction_deg, **job.reading)
-        if job.config.imu.use:
-            sequence = with_imu(sequence, job.data_root)
-        return sequence if job.config.gnss.mode == "off" else with_gnss(sequence, job.data_root)
+        config = job.config
+        return open_sequence(
+            job.path, data_root=job.data_root, vertical_correction_deg=config.input.vertical_correction_deg,
+            imu=config.imu.use, gnss=config.gnss.mode != "off", **job.reading,
+        )  # fmt: skip
 
     return opening
 
