@@ -27,7 +27,7 @@ from lslam.frontend.register_scans import to_trajectory
 from lslam.keyframes.store import KeyframeStore
 from lslam.loops.detector import find_loops
 from lslam.odometry import create_odometry
-from lslam.pipeline.choose import choose_scans
+from lslam.pipeline.job import choose_scans
 from lslam.pipeline.manifest import Manifest
 from lslam.pipeline.odometry_pass import estimate_poses
 from lslam.pipeline.watch import Watch

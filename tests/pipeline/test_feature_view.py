@@ -14,7 +14,7 @@ from lslam.frontend.register_scans import estimate
 from lslam.geometry import se3
 from lslam.odometry import create_odometry
 from lslam.odometry.base import FeatureSource
-from lslam.pipeline.feature_view import MOST_SCANS, view_features
+from lslam.pipeline.feature_pass import MOST_SCANS, view_features
 from lslam.pipeline.run import run
 from lslam.reports.feature_view import feature_figures
 from lslam.types.scan_result import ScanResult

@@ -21,7 +21,7 @@ OF_ALL = (*RESULTS, "osm_matches.csv", "buildings.geojson", "occupancy.ply", "tr
 # Who asks in a run that does everything: what takes long where a recording is long.
 ASKERS = (
     "estimate", "find", "floor_planes", "_voted_out", "solve", "marginal_blocks", "_along", "sightings",
-    "finish", "agreeing", "absent_buildings", "new_walls", "remove_overlaps", "build_map", "combined", "_pieces", "_report",
+    "finish", "agreeing", "absent_buildings", "new_walls", "remove_overlaps", "build_map", "combined", "_pieces", "make_report",
 )  # fmt: skip
 
 
@@ -84,8 +84,8 @@ def test_every_stage_looks(whole: tuple[Path, list[str]]) -> None:
     out, looks = whole
     keyframes = json.loads((out / "manifest.json").read_text())["keyframes"]["count"]
     counts = Counter(looks)
-    assert {who: counts[who] for who in ("estimate", "find", "optimise_poses", "build_map", "_report")} == {
-        "estimate": 95, "find": keyframes, "optimise_poses": 1, "build_map": 95, "_report": 1,
+    assert {who: counts[who] for who in ("estimate", "find", "optimise_poses", "build_map", "make_report")} == {
+        "estimate": 95, "find": keyframes, "optimise_poses": 1, "build_map": 95, "make_report": 1,
     }  # fmt: skip
     assert counts["marginal_blocks"] == keyframes
     assert counts["solve"] >= 2, "before the first iteration and after it"

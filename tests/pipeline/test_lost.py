@@ -17,7 +17,7 @@ from stub_sequences import SAMPLE, Stub
 from lslam.config import Config, load_config
 from lslam.errors import GateError, RunFailedError
 from lslam.integrity.monitor import IntegrityMonitor
-from lslam.pipeline import run as recipe
+from lslam.pipeline import job
 from lslam.pipeline.lost import MOST_SAID, mark_lost
 from lslam.pipeline.manifest import Manifest
 from lslam.pipeline.run import run
@@ -84,7 +84,7 @@ class Holed(Stub):
 def test_poses_that_contradict_the_scans_are_noticed(
     scenario: str, corruption: Corruption, words: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(recipe, "create_odometry", lambda _: Lost(corruption, BEGIN))
+    monkeypatch.setattr(job, "create_odometry", lambda _: Lost(corruption, BEGIN))
     outcome = ended(drive(scenario))
     assert outcome.record.manifest["status"] == "degraded"
     assert any(words in problem for problem in problems(outcome))
@@ -97,7 +97,7 @@ def test_poses_that_contradict_the_scans_are_noticed(
 def test_what_is_lost_for_two_seconds_is_named_and_fails_a_strict_run(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr(recipe, "create_odometry", lambda _: Lost(slip, BEGIN, BEGIN + 20))
+    monkeypatch.setattr(job, "create_odometry", lambda _: Lost(slip, BEGIN, BEGIN + 20))
     with pytest.raises(GateError, match="may be lost"):
         run(drive("street"), config("input.strict=true"), out=tmp_path / "run")
     header, *rows = (tmp_path / "run" / "scans.csv").read_text().splitlines()

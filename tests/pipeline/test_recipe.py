@@ -18,7 +18,7 @@ import lslam
 from lslam.config import Config, load_config
 from lslam.errors import GateError, InputError, InterruptedRunError, OutputError, RunFailedError, UsageError
 from lslam.evaluation.evaluate import Evaluation
-from lslam.pipeline import run as recipe
+from lslam.pipeline import job
 from lslam.pipeline.watch import RunOutcome, Watch
 from lslam.types.scan import Scan
 
@@ -104,7 +104,7 @@ def test_python_without_a_folder_writes_nothing(tmp_path: Path, monkeypatch: pyt
 
 def test_the_identity_sentinel_fails_the_gate_that_icp_passes(monkeypatch: pytest.MonkeyPatch) -> None:
     good = lslam.run(sample(40))
-    monkeypatch.setattr(recipe, "create_odometry", lambda config: Standstill())
+    monkeypatch.setattr(job, "create_odometry", lambda config: Standstill())
     still = lslam.run(sample(40))
     for alignment in ("se3", "origin"):
         assert passes_gate(good.evaluation, alignment)
@@ -214,7 +214,7 @@ def test_a_mistake_of_a_method_is_in_the_manifest(tmp_path: Path, monkeypatch: p
         def register(self, scan: Scan, prepared: None, prior: object) -> Any:
             raise ZeroDivisionError
 
-    monkeypatch.setattr(recipe, "create_odometry", lambda config: Broken())
+    monkeypatch.setattr(job, "create_odometry", lambda config: Broken())
     with pytest.raises(ZeroDivisionError):
         lslam.run(sample(5), out=tmp_path / "out")
     facts = manifest(tmp_path / "out")

@@ -18,7 +18,7 @@ import pytest
 from lslam.config import load_config
 from lslam.formats.study_csv import read_study_csv
 from lslam.odometry.icp import Icp
-from lslam.pipeline import run as recipe
+from lslam.pipeline import job as prepared
 from lslam.studies import worker
 from lslam.studies.grid import Job
 from lslam.studies.points import Contender
@@ -158,7 +158,7 @@ def laps(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_run_that_is_done_has_no_reason_though_it_warned(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(recipe, "describe_deskew", lambda *given: "no deskew: the points have no times")
+    monkeypatch.setattr(prepared, "describe_deskew", lambda *given: "no deskew: the points have no times")
     job = job_in(tmp_path)
     execute(job, Bench())
     assert "no deskew" in (job.folder / "manifest.json").read_text()

@@ -1,0 +1,117 @@
+"""The stages of a run, one after the other: poses, score, map, feature map, report."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import replace
+from pathlib import Path
+
+from lslam.backend.loop_view import view_loop
+from lslam.backend.outcome import BackEnd
+from lslam.config import Config
+from lslam.errors import InterruptedRunError, LslamError
+from lslam.evaluation.evaluate import Evaluation, evaluate
+from lslam.frontend.checkpoints import Checkpoints, OdometryCheckpoints
+from lslam.keyframes.store import KeyframeStore
+from lslam.maps.crispness import crispness
+from lslam.odometry.base import FeatureSource
+from lslam.pipeline import outputs
+from lslam.pipeline.back_end_pass import level_world, optimise_poses
+from lslam.pipeline.feature_pass import build_feature_map, view_features
+from lslam.pipeline.job import Job, announce, stoppable
+from lslam.pipeline.map_checkpoints import map_checkpoints
+from lslam.pipeline.map_pass import build_map
+from lslam.pipeline.odometry_pass import estimate_poses
+from lslam.pipeline.run_folder import REPLIES, RunFolder
+from lslam.types.run_record import RunRecord
+from lslam.types.sequence import Sequence
+
+log = logging.getLogger("lslam")
+
+
+def solve(
+    job: Job, store: KeyframeStore, folder: Path | None = None, checkpoints: OdometryCheckpoints | None = None
+) -> tuple[RunRecord, BackEnd, Evaluation | None]:
+    """The poses of all scans, made consistent and level, and their score."""
+    announce(job)
+    if job.osm is not None:
+        job.osm.begin(None if folder is None else folder / REPLIES)
+    record = estimate_poses(
+        job.sequence, job.odometry, job.config, job.manifest, folder, job.truth, job.watch, store, checkpoints, job.osm
+    )
+    loops = None if checkpoints is None else Checkpoints(checkpoints.folder, "loops", job.config.odometry.checkpoint_s)
+    done = optimise_poses(job.sequence, record, store, job.config, job.manifest, job.osm, loops, job.watch.should_stop)
+    level_world(record, job.sequence, job.config, job.manifest)
+    record.loop_view = view_loop(record, done, store)
+    return record, done, score(record, job.sequence, job.config)
+
+
+def score(record: RunRecord, sequence: Sequence, config: Config) -> Evaluation | None:
+    """The evaluation, or None with the reason among the record's problems."""
+    if record.ground_truth is None:
+        return None
+    try:
+        score = evaluate(record.trajectory, record.ground_truth, config.eval, calibration=sequence.calibration)
+        if record.odometry is not None and record.odometry is not record.trajectory:
+            before = evaluate(record.odometry, record.ground_truth, config.eval, calibration=sequence.calibration)
+            score = replace(score, odometry=before)
+    except LslamError as error:
+        record.problems.append(f"not scored: {error}")
+        log.warning("not scored: %s", error)
+        if record.folder is not None:
+            log.info("score it with other recipes: lslam eval %s GT", record.folder / "trajectory.tum")
+        return None
+    record.problems += [note for note in score.notes if "WRONG" in note]
+    return score
+
+
+def make_map(folder: RunFolder, job: Job, record: RunRecord) -> None:
+    """The merged map, from the raw scans and the final poses."""
+    config, watch, manifest = job.config, job.watch, job.manifest
+    if not config.map.write or manifest.outcome == "interrupted":
+        return
+    watch.on_start("map", len(record.results))
+    with manifest.timed("map_s"), stoppable(job, "interrupted while the map was written"):
+        built = build_map(
+            job.sequence, record.results, config, watch.on_step, watch.should_stop, folder.path,
+            map_checkpoints(folder, config),
+        )  # fmt: skip
+        if built is None:
+            raise InterruptedRunError("interrupted while the map was built: there is no map")
+        score = crispness(built.merged)
+        outputs.write_map(folder, built, config.map, record)
+        record.map_file, record.map_image, record.map_extent = f"map.{config.map.format}", built.image, built.extent
+        record.crispness = score
+        manifest.map_points = len(built.merged)
+
+
+def make_feature_map(folder: RunFolder, job: Job, record: RunRecord) -> None:
+    """The feature map, likewise, when it was asked for."""
+    config, watch, manifest, odometry = job.config, job.watch, job.manifest, job.odometry
+    if not config.map.write_features or manifest.outcome == "interrupted" or not isinstance(odometry, FeatureSource):
+        return
+    watch.on_start("feature map", len(record.results))
+    with manifest.timed("feature_map_s"), stoppable(job, "interrupted while the feature map was written"):
+        built = build_feature_map(
+            job.sequence, odometry, record.results, config, watch.on_step, watch.should_stop,
+            map_checkpoints(folder, config, "feature map"),
+        )  # fmt: skip
+        if built is None:
+            raise InterruptedRunError("interrupted while the feature map was built: there is none")
+        outputs.write_feature_map(folder, built)
+        log.info("feature map: %d points in %s", len(built), folder.path / "feature_map.ply")
+
+
+def make_report(folder: RunFolder, job: Job, record: RunRecord, evaluation: Evaluation | None) -> None:
+    """report.html; the record's manifest is the run's last word, with the report's own time."""
+    manifest = job.manifest
+    manifest.problems += record.problems
+    record.manifest = manifest.as_dict(manifest.outcome)
+    with manifest.timed("report_s"):
+        if job.config.report.html:
+            if isinstance(job.odometry, FeatureSource):
+                record.features = view_features(job.sequence, job.odometry, record.results)
+            outputs.write_html(folder, record, evaluation)
+    if job.watch.should_stop() and manifest.outcome not in ("interrupted", "diverged"):
+        manifest.interrupt("interrupted before the report was whole")
+    record.manifest = manifest.as_dict(manifest.outcome)
