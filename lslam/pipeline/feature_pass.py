@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -26,6 +25,7 @@ from lslam.types.sequence import Sequence
 from lslam.types.state import State
 
 EDGE, PLANE = 1, 0
+INTERRUPTED = "interrupted while the feature map was built: nothing of it is written"
 # Scans looked at, evenly spaced over the run: enough for a course in time, a second of work.
 MOST_SCANS = 30
 
@@ -77,10 +77,10 @@ class FeatureMaker:
 def build_feature_map(
     sequence: Sequence, odometry: FeatureSource, results: list[ScanResult], config: Config, on_step: Callable[[], None],
     should_stop: Callable[[], bool], checkpoints: MapCheckpoints | None = None,
-) -> FeatureCloud | None:  # fmt: skip
+) -> FeatureCloud:  # fmt: skip
     """Less sharp edges and less planar points of every scan that was registered, in voxels of `loam.feature_map_voxel`.
 
-    None when `should_stop` said so; `checkpoints` know then where to go on.
+    Raises InterruptedRunError when `should_stop` says so; `checkpoints` know then where to go on.
     """
     stamps = np.array([r.stamp_ns for r in results], np.int64)
     poses = np.stack([r.T_world_lidar for r in results])
@@ -98,14 +98,13 @@ def build_feature_map(
         if checkpoints is not None:
             checkpoints.offer(k, maker, is_last)
         if is_last:
-            return None
+            raise InterruptedRunError(INTERRUPTED)
         if loaded.scan is not None and result.status == "ok":
             motion = motion_within(loaded.scan, stamps, poses)
             maker.add(odometry.features_of(loaded.prepared, motion), result.T_world_lidar)
         on_step()
-    with suppress(InterruptedRunError), asking(should_stop, "interrupted"):
+    with asking(should_stop, INTERRUPTED):
         return maker.finish()
-    return None
 
 
 def view_features(sequence: Sequence, odometry: FeatureSource, results: list[ScanResult]) -> FeatureView | None:

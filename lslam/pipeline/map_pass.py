@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterable
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -33,6 +32,8 @@ from lslam.types.state import State
 
 log = logging.getLogger("lslam")
 
+INTERRUPTED = "interrupted while the map was built: nothing of it is written"
+
 
 @dataclass(frozen=True)
 class BuiltMap:
@@ -48,11 +49,11 @@ class BuiltMap:
 def build_map(
     sequence: Sequence, results: list[ScanResult], config: Config, on_step: Callable[[], None],
     should_stop: Callable[[], bool], spool: Path | None = None, checkpoints: MapCheckpoints | None = None,
-) -> BuiltMap | None:  # fmt: skip
+) -> BuiltMap:  # fmt: skip
     """Merge every scan that was registered; bridged scans would draw their error into the map and stay out.
 
-    A map too large for memory is kept in a temporary folder in `spool` meanwhile. None when `should_stop` said so;
-    `checkpoints` know then where to go on.
+    A map too large for memory is kept in a temporary folder in `spool` meanwhile. Raises InterruptedRunError when
+    `should_stop` says so; `checkpoints` know then where to go on.
     """
     section = config.map
     ego_box = section.ego_box or config.preprocess.ego_box
@@ -72,7 +73,7 @@ def build_map(
         if checkpoints is not None and k >= done:
             checkpoints.offer(k, maker, is_last)
         if is_last:
-            return None
+            raise InterruptedRunError(INTERRUPTED)
         if loaded.scan is not None and result.status == "ok":
             scan = loaded.scan if ego_box is None else without_box(loaded.scan, ego_box)
             motion = motion_within(scan, stamps, poses)
@@ -80,9 +81,8 @@ def build_map(
             maker.add(k, PosedScan(points, result.T_world_lidar, scan.intensity))
         if k >= done:
             on_step()
-    with suppress(InterruptedRunError), asking(should_stop, "interrupted"):
+    with asking(should_stop, INTERRUPTED):
         return maker.finish()
-    return None
 
 
 class MapMaker:

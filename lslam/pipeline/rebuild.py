@@ -32,7 +32,7 @@ from lslam.pipeline.map_files import (
     write_occupancy,
 )
 from lslam.pipeline.map_notes import drop_note, is_note, note_of, note_with, noted_last
-from lslam.pipeline.map_pass import BuiltMap, build_map
+from lslam.pipeline.map_pass import INTERRUPTED, BuiltMap, build_map
 from lslam.pipeline.refresh import write_renewed
 from lslam.pipeline.run_folder import MANIFEST, SPOOL, held
 from lslam.readers import open_sequence
@@ -156,8 +156,8 @@ def rebuild(
     is_own = path.stem == "map" and path.resolve().parent == run.folder.resolve()
     with held(run.folder) if is_own else nullcontext():
         built = build_map(sequence, results_of(run), run.config, on_step, should_stop, path.parent)
-        if built is None or should_stop():
-            raise InterruptedRunError("interrupted while the map was built: nothing is written")
+        if should_stop():
+            raise InterruptedRunError(INTERRUPTED)
         score = crispness(built.merged)
         with _staged(path.parent) as stage:
             _write(stage / path.name, run, built, sequence.name, georeference)

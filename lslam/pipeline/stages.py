@@ -9,7 +9,7 @@ from pathlib import Path
 from lslam.backend.loop_view import view_loop
 from lslam.backend.outcome import BackEnd
 from lslam.config import Config
-from lslam.errors import InterruptedRunError, LslamError
+from lslam.errors import LslamError
 from lslam.evaluation.evaluate import Evaluation, evaluate
 from lslam.frontend.checkpoints import Checkpoints, OdometryCheckpoints
 from lslam.keyframes.store import KeyframeStore
@@ -76,8 +76,6 @@ def make_map(folder: RunFolder, job: Job, record: RunRecord) -> None:
             job.sequence, record.results, config, watch.on_step, watch.should_stop, folder.path,
             map_checkpoints(folder, config),
         )  # fmt: skip
-        if built is None:
-            raise InterruptedRunError("interrupted while the map was built: there is no map")
         score = crispness(built.merged)
         outputs.write_map(folder, built, config.map, record)
         record.map_file, record.map_image, record.map_extent = f"map.{config.map.format}", built.image, built.extent
@@ -96,8 +94,6 @@ def make_feature_map(folder: RunFolder, job: Job, record: RunRecord) -> None:
             job.sequence, odometry, record.results, config, watch.on_step, watch.should_stop,
             map_checkpoints(folder, config, "feature map"),
         )  # fmt: skip
-        if built is None:
-            raise InterruptedRunError("interrupted while the feature map was built: there is none")
         outputs.write_feature_map(folder, built)
         log.info("feature map: %d points in %s", len(built), folder.path / "feature_map.ply")
 
