@@ -16,8 +16,8 @@ import tables  # noqa: E402
 
 DOCUMENTS = {name: (ROOT / name).read_text(encoding="utf-8") for name in ("README.md", "docs/results.md")}
 BLOCK = re.compile(r"<!-- table (.+?) -->\n(.*?)<!-- end -->", re.DOTALL)
-# Verdicts of the studies and the hardness of worlds have three seeds, for what they take.
-SHORT = ("findings", "hardness")
+# Verdicts of the studies have three seeds, for what they take.
+SHORT = ("findings",)
 BLOCKS = [(name, *match) for name, text in DOCUMENTS.items() for match in BLOCK.findall(text)]
 
 
