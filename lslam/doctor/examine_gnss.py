@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from lslam.doctor.findings import Facts, Finding, plural
 from lslam.geometry.geodesy import to_local
-from lslam.types.sequence import Sequence
+from lslam.types.sequence import Sequence, no_shared_time
 
 # No carrier of a LiDAR accelerates more, m/s2; a fix that does not state its sigma is taken to be so good, m.
 _ACCELERATION, _SIGMA = 15.0, 5.0
@@ -31,10 +31,11 @@ def examine_gnss(sequence: Sequence, findings: list[Finding]) -> Facts | None:
         findings.append(
             Finding("gnss-rewinds", f"GNSS: time repeats or goes back {plural(back, 'time')}", "correct its stamps")
         )
-    if not any(f.what.startswith("GNSS: it shares") for f in findings) and (
+    apart = no_shared_time("GNSS")
+    if apart not in sequence.problems and (
         stamps_ns[0] > sequence.stamps_ns[-1] or stamps_ns[-1] < sequence.stamps_ns[0]
     ):
-        findings.append(Finding("gnss-apart", "GNSS: it shares no time with the scans", "correct its stamps"))
+        findings.append(Finding("gnss-apart", apart, "correct its stamps"))
     finite = sigma[np.isfinite(sigma)]
     median = float(np.median(steps)) if len(steps) else 0.0
     return {

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from lslam.doctor.findings import Facts, Finding, plural
 from lslam.inertial.stream import GRAVITY, LEAST_RATE_HZ, gravity_unit, mean_forces
 from lslam.types.imu import ImuStream
-from lslam.types.sequence import Sequence
+from lslam.types.sequence import Sequence, no_shared_time
 
 Floats = NDArray[np.float64]
 
@@ -60,9 +60,9 @@ def _examine_time(
     if gaps:
         what = f"IMU: {plural(gaps, 'gap')}, the longest {steps.max():.3f} s"
         findings.append(Finding("imu-gaps", what, "scans within them are predicted by constant velocity (imu.gap_s)"))
-    apart = "IMU: it shares no time with the scans"
+    apart = no_shared_time("IMU")
     first, last = sequence.stamps_ns[0], sequence.stamps_ns[-1]
-    if not any(f.what == apart for f in findings) and (imu.stamps_ns[0] > last or imu.stamps_ns[-1] < first):
+    if apart not in sequence.problems and (imu.stamps_ns[0] > last or imu.stamps_ns[-1] < first):
         ahead = (imu.stamps_ns[0] - first) * 1e-9
         findings.append(
             Finding(

@@ -16,7 +16,7 @@ from lslam.geometry import so3
 from lslam.inertial.agreement import FAR_S, LEAST_TURNING, NEAR_S, STEP_S, Agreement, check_agreement, turns
 from lslam.inertial.fusion import InertialMotion
 from lslam.inertial.initialise import FirstPoses, start, told_poses
-from lslam.inertial.stream import Cleaned, ImuRefusedError, clean
+from lslam.inertial.stream import Cleaned, ImuFault, ImuRefusedError, clean
 from lslam.types.imu import ImuStream
 from lslam.types.sequence import Sequence
 
@@ -46,9 +46,8 @@ def examine_turns(sequence: Sequence, findings: list[Finding]) -> Facts | None:
         cleaned = clean(imu, int(stamps_ns[0]), int(stamps_ns[-1]))
     except ImuRefusedError as error:
         if not _HOPELESS & {f.code for f in findings}:
-            found = Finding.of_sentence("imu-refused", "IMU", str(error))
-            way_out = found.way_out or "it holds no measurements; look at its driver, and run without --imu"
-            findings.append(replace(found, way_out=way_out))
+            way_out = error.way_out or "it holds no measurements; look at its driver, and run without --imu"
+            findings.append(Finding("imu-refused", f"IMU: {error.what}", way_out))
         return None
     log.info("registering the first %d scans to compare their turns with the IMU's", min(_SCANS, len(sequence)))
     seconds = float(np.clip(_SCANS / sequence.rate_hz, 0.5, 60))
@@ -86,15 +85,16 @@ def compare(
     cleaned: Cleaned, T_lidar_imu: Floats, stamps_ns: NDArray[np.int64], poses: Floats, findings: list[Finding]
 ) -> Facts:
     """Compare the gyroscope with the poses (N, 4, 4) of the LiDAR at `stamps_ns` (N,)."""
-    agreement, refusal = Agreement(False), ""
+    agreement = Agreement(False)
+    refusal: ImuRefusedError | None = None
     try:
         agreement = check_agreement(cleaned.imu, T_lidar_imu, stamps_ns, poses, None)
     except ImuRefusedError as error:
-        refusal = str(error)
+        refusal = error
     if refusal or (agreement.is_judged and agreement.correlation < _SURE):
         far = _far_off(cleaned, T_lidar_imu, stamps_ns, poses, agreement)
         if far is not None:
-            agreement, refusal = far, ""
+            agreement, refusal = far, None
     seen, felt = turns(cleaned.imu, T_lidar_imu, stamps_ns, poses, agreement.offset_s)
     # In the axes of the IMU, which its user can name.
     R = T_lidar_imu[:3, :3]
@@ -103,8 +103,8 @@ def compare(
         findings.append(found[0])
         agreement = _with_axes(cleaned, found[1], stamps_ns, poses)
     elif refusal and not any(f.code == "imu-gyro-unit" for f in findings):
-        code = "imu-gyro-unit" if "deg/s, convert" in refusal else "imu-turns"
-        findings.append(Finding.of_sentence(code, "IMU", refusal))
+        code = "imu-gyro-unit" if refusal.fault is ImuFault.GYRO_IN_DEGREES else "imu-turns"
+        findings.append(Finding(code, f"IMU: {refusal.what}", refusal.way_out))
     offset, sigma = _examine_clock(agreement, cleaned.rate_hz, findings), float(agreement.offset_sigma_s)
     return {
         "scans": len(stamps_ns),

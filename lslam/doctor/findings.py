@@ -22,12 +22,6 @@ class Finding:
     def __str__(self) -> str:
         return f"{self.what}: {self.way_out}" if self.way_out else self.what
 
-    @classmethod
-    def of_sentence(cls, code: str, subject: str, sentence: str) -> Finding:
-        """From a sentence of another part of the house, whose last colon stands before the way out."""
-        what, _, way_out = sentence.rpartition(": ")
-        return cls(code, f"{subject}: {what or way_out}", way_out if what else "")
-
 
 def plural(count: int, noun: str, several: str = "") -> str:
     """`1 gap`, `2 gaps`."""

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.geometry import so3
-from lslam.inertial.stream import ImuRefusedError
+from lslam.inertial.stream import ImuFault, ImuRefusedError
 from lslam.types.imu import ImuStream
 
 Floats = NDArray[np.float64]
@@ -76,11 +76,11 @@ def check_agreement(
         return _hardly_turning(felt.rates(0.0 if offset_s is None else offset_s), seen, T_lidar_imu)
     _refuse_scale(ratio)
     if correlation < LEAST_CORRELATION:
-        raise ImuRefusedError(_why_not(felt, seen, correlation))
+        raise _no_fit(felt, seen, correlation)
     if offset_s is None and best in (0, len(offsets) - 1):
         at_zero = float(scores[len(offsets) // 2])
         if correlation > at_zero + CLEARLY:
-            raise ImuRefusedError(_beyond(felt, seen, float(offsets[best]), at_zero, correlation))
+            raise _beyond(felt, seen, float(offsets[best]), at_zero, correlation)
         # Long even bends fit at any offset: nothing is told of the clock.
         best = len(offsets) // 2
     _refuse_axes(felt, seen, offsets, float(offsets[best]))
@@ -180,8 +180,8 @@ def _hardly_turning(felt: Floats, seen: Floats, T_lidar_imu: Floats) -> Agreemen
     shown = float(np.std(seen, axis=0).max())
     if varied > max(20 * LEAST_TURNING, MOST_SCALE * shown):
         raise ImuRefusedError(
-            f"its rates vary by {np.rad2deg(varied):.1f} deg/s, those of the scans by {np.rad2deg(shown):.1f}: "
-            "check its unit (rad/s), its axes and its stamps"
+            f"its rates vary by {np.rad2deg(varied):.1f} deg/s, those of the scans by {np.rad2deg(shown):.1f}",
+            "check its unit (rad/s), its axes and its stamps",
         )
     return Agreement(False, gyro_bias=_mean_excess(felt, seen, T_lidar_imu))
 
@@ -189,11 +189,14 @@ def _hardly_turning(felt: Floats, seen: Floats, T_lidar_imu: Floats) -> Agreemen
 def _refuse_scale(ratio: float) -> None:
     if LIKELY_DEGREES[0] < ratio < LIKELY_DEGREES[1]:
         raise ImuRefusedError(
-            f"its rates are {ratio:.0f} times those of the scans: they seem to be in deg/s, convert them to rad/s"
+            f"its rates are {ratio:.0f} times those of the scans",
+            "they seem to be in deg/s, convert them to rad/s",
+            ImuFault.GYRO_IN_DEGREES,
         )
     if not 1 / MOST_SCALE < ratio < MOST_SCALE:
         raise ImuRefusedError(
-            f"its rates vary {ratio:.2g} times as much as those of the scans: check its unit (rad/s), axes and stamps"
+            f"its rates vary {ratio:.2g} times as much as those of the scans",
+            "check its unit (rad/s), axes and stamps",
         )
 
 
@@ -213,12 +216,14 @@ def _refuse_axes(felt: _Felt, seen: Floats, offsets: Floats, offset_s: float) ->
     if MUCH_WORSE * mirrored < min(given, turned):
         raise ImuRefusedError(
             "its turns fit those of the scans when mirrored: one of its axes has the wrong sign, or two of them are swapped, "
-            "which no T_lidar_imu mends: correct its recording"
+            "which no T_lidar_imu mends",
+            "correct its recording",
         )
     angle = float(so3.angle(R))
     if angle > OTHER_AXES and MUCH_WORSE * turned < given:
         raise ImuRefusedError(
-            f"its turns fit those of the scans far better when turned by {np.rad2deg(angle):.0f} deg: correct T_lidar_imu"
+            f"its turns fit those of the scans far better when turned by {np.rad2deg(angle):.0f} deg",
+            "correct T_lidar_imu",
         )
 
 
@@ -229,30 +234,31 @@ def _best_axes(seen: Floats, felt: Floats) -> tuple[Floats, Floats]:
     return np.asarray(u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(M))]) @ vt), np.asarray(M)
 
 
-def _why_not(felt: _Felt, seen: Floats, correlation: float) -> str:
-    """What would make the turns agree, as a sentence."""
-    said = f"its turns do not fit those of the scans (correlation {correlation:.2f}, {LEAST_CORRELATION} needed): "
+def _no_fit(felt: _Felt, seen: Floats, correlation: float) -> ImuRefusedError:
+    """The refusal of turns that do not agree, and what would make them."""
+    what = f"its turns do not fit those of the scans (correlation {correlation:.2f}, {LEAST_CORRELATION} needed)"
     far, score = _best_far(felt, seen)
     if score > 0.9:
-        return said + f"with its stamps moved by {far:.2f} s they would, set imu.time_offset_s"
+        return ImuRefusedError(what, f"with its stamps moved by {far:.2f} s they would, set imu.time_offset_s")
     a, b = _centred(seen, felt.rates(0.0))
     if len(a):
         R = _best_axes(a, b)[0]
         if _compare(a, b @ R.T)[0] > 0.9:
-            return said + f"turned by {np.rad2deg(float(so3.angle(R))):.0f} deg they would, correct T_lidar_imu"
-    return said + "check its axes, T_lidar_imu and its stamps"
+            turn = np.rad2deg(float(so3.angle(R)))
+            return ImuRefusedError(what, f"turned by {turn:.0f} deg they would, correct T_lidar_imu")
+    return ImuRefusedError(what, "check its axes, T_lidar_imu and its stamps")
 
 
-def _beyond(felt: _Felt, seen: Floats, edge_s: float, at_zero: float, at_edge: float) -> str:
-    """What to do about turns that fit the better the farther the stamps are moved, as a sentence."""
-    said = (
+def _beyond(felt: _Felt, seen: Floats, edge_s: float, at_zero: float, at_edge: float) -> ImuRefusedError:
+    """The refusal of turns that fit the better the farther the stamps are moved."""
+    what = (
         f"its turns fit those of the scans the better the farther its stamps are moved (correlation {at_zero:.2f}, moved by "
-        f"{edge_s:+.2f} s {at_edge:.2f}): "
+        f"{edge_s:+.2f} s {at_edge:.2f})"
     )
     far, score = _best_far(felt, seen)
     if score > max(at_edge, 0.9):
-        return said + f"best by {far:+.2f} s; set imu.time_offset_s"
-    return said + "check its stamps, and set imu.time_offset_s when the clocks are known to differ"
+        return ImuRefusedError(what, f"best by {far:+.2f} s; set imu.time_offset_s")
+    return ImuRefusedError(what, "check its stamps, and set imu.time_offset_s when the clocks are known to differ")
 
 
 def _best_far(felt: _Felt, seen: Floats) -> tuple[float, float]:

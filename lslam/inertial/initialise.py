@@ -133,7 +133,8 @@ def told_poses(first: FirstPoses, imu: ImuStream, gap_s: float) -> tuple[FirstPo
         seconds = 1e-9 * float(first.stamps_ns[-1] - first.stamps_ns[0])
         raise ImuRefusedError(
             f"it is silent between all {len(first.stamps_ns)} scans of the first {seconds:.1f} s, which registration found "
-            "without it: begin where it speaks, with --start"
+            "without it",
+            "begin where it speaks, with --start",
         )
     return first.during(*longest), first.during(*stretches[0])
 
@@ -150,8 +151,8 @@ def _refuse_sign(imu: ImuStream, T_lidar_imu: Floats, told: FirstPoses, gyro_bia
     )
     if as_given > WRONG_WAY * reversed_:
         raise ImuRefusedError(
-            "its specific forces fit the path of the scans when they point the other way: at rest they must be +g up, change "
-            "the sign of its accelerometer"
+            "its specific forces fit the path of the scans when they point the other way",
+            "at rest they must be +g up, change the sign of its accelerometer",
         )
 
 

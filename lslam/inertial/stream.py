@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import StrEnum
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,8 +20,19 @@ LEAST_RATE_HZ = 50.0
 MOST_BAD = 0.1
 
 
+class ImuFault(StrEnum):
+    """What is wrong with an IMU that is refused, where a program can tell."""
+
+    UNKNOWN = "unknown"
+    GYRO_IN_DEGREES = "gyro-in-degrees"
+
+
 class ImuRefusedError(Exception):
-    """The IMU cannot be used: why, and what would help, in a sentence."""
+    """The IMU cannot be used: `what` is wrong, the `way_out`, empty where none is known, and the `fault`."""
+
+    def __init__(self, what: str, way_out: str = "", fault: ImuFault = ImuFault.UNKNOWN) -> None:
+        super().__init__(f"{what}: {way_out}" if way_out else what)
+        self.what, self.way_out, self.fault = what, way_out, fault
 
 
 @dataclass(frozen=True)
@@ -49,7 +61,8 @@ def clean(imu: ImuStream, first_ns: int, last_ns: int) -> Cleaned:
         lo, hi = imu.stamps_ns[0] - first_ns, imu.stamps_ns[-1] - first_ns
         raise ImuRefusedError(
             f"its {len(imu)} samples run from {lo * 1e-9:.3f} to {hi * 1e-9:.3f} s after the first scan, the scans to "
-            f"{(last_ns - first_ns) * 1e-9:.3f} s: correct its stamps or set imu.time_offset_s"
+            f"{(last_ns - first_ns) * 1e-9:.3f} s",
+            "correct its stamps or set imu.time_offset_s",
         )
     for what, values in (("gyroscope", imu.gyro[shared]), ("accelerometer", imu.accel[shared])):
         if not np.ptp(values, axis=0).any():
@@ -123,8 +136,8 @@ def _in_si(imu: ImuStream, notes: list[str]) -> NDArray[np.float64]:
     norm, unit = gravity_unit(imu)
     if unit is None:
         raise ImuRefusedError(
-            f"its mean specific force is {norm:.3g}, which is gravity neither in m/s2 (9.81) nor in g (1): check its unit, "
-            "and that gravity was not taken off"
+            f"its mean specific force is {norm:.3g}, which is gravity neither in m/s2 (9.81) nor in g (1)",
+            "check its unit, and that gravity was not taken off",
         )
     if unit == "g":
         notes.append(f"IMU: a mean specific force of {norm:.3f} is in g, converted to m/s2")

@@ -27,6 +27,7 @@ from lslam.types.calibration import Calibration
 from lslam.types.gnss import GnssStream
 from lslam.types.imu import ImuStream
 from lslam.types.scan import Scan
+from lslam.types.sequence import no_shared_time
 from lslam.types.trajectory import Trajectory
 
 KIND = "bag"
@@ -141,7 +142,7 @@ def open_folder(path: Path, overrides: SequenceInfo, why: str) -> BagSequence:
     imu, gnss = load_imu(bag, info.imu_topic, voice), load_fixes(bag, info.gnss_topic, voice)
     for what, stream in (("IMU", imu), ("GNSS", gnss)):
         if stream is not None and (stream.stamps_ns[0] > stamps[-1] or stream.stamps_ns[-1] < stamps[0]):
-            voice.problems.append(f"{what}: it shares no time with the scans")
+            voice.problems.append(no_shared_time(what))
     transforms = bag_streams.read_static_transforms(bag, voice.problems)
     sequence.calibration, sequence.has_assumed_extrinsics = find_extrinsics(transforms, frame, imu, gnss, info, voice)
     sequence.ground_truth = find_truth(bag, transforms, frame, voice)

@@ -15,6 +15,11 @@ from lslam.types.scan import Scan
 from lslam.types.trajectory import Trajectory
 
 
+def no_shared_time(stream: str) -> str:
+    """The problem of a recording whose `stream`, IMU or GNSS, lies wholly before or after its scans."""
+    return f"{stream}: it shares no time with the scans"
+
+
 class Sequence(Protocol):
     """A recorded sequence, opened but not loaded: scans are read one at a time, from any thread.
 

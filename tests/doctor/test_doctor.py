@@ -21,13 +21,13 @@ from lslam.doctor.examine_turns import compare, examine_turns
 from lslam.doctor.findings import Facts, Finding
 from lslam.doctor.inspect import inspect
 from lslam.geometry import so3
-from lslam.inertial.stream import clean
+from lslam.inertial.stream import ImuFault, ImuRefusedError, clean
 from lslam.readers import open_sequence
 from lslam.types.calibration import Calibration
 from lslam.types.gnss import GnssStream
 from lslam.types.imu import ImuStream
 from lslam.types.scan import Scan
-from lslam.types.sequence import Sequence
+from lslam.types.sequence import Sequence, no_shared_time
 
 SAMPLE = Path(__file__).parents[2] / "sample_data"
 Spoil = Callable[[ImuStream], ImuStream]
@@ -261,3 +261,21 @@ def test_satellite_fixes(healthy: Sequence) -> None:
     assert (codes(findings), facts["fixes"]) == (["gnss-invalid"], len(gnss) - 1)
     findings, _ = examined(replace(gnss, stamps_ns=gnss.stamps_ns + 10**12))
     assert codes(findings) == ["gnss-apart"]
+
+
+def test_no_finding_hangs_on_the_words_of_a_refusal(healthy: Sequence, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*given: object) -> None:
+        raise ImuRefusedError("turns: too quick: by far", "divide", ImuFault.GYRO_IN_DEGREES)
+
+    monkeypatch.setattr("lslam.doctor.examine_turns.check_agreement", refuse)
+    findings, _ = against_truth(healthy, imu_of(healthy))
+    assert findings == [Finding("imu-gyro-unit", "IMU: turns: too quick: by far", "divide")]
+
+
+def test_what_the_reader_said_of_a_stream_is_not_said_twice(healthy: Sequence) -> None:
+    imu, gnss = imu_of(healthy), healthy.gnss
+    assert gnss is not None
+    away = spoilt(healthy, imu=replace(imu, stamps_ns=imu.stamps_ns + 10**12))
+    away.gnss = replace(gnss, stamps_ns=gnss.stamps_ns + 10**12)
+    away.problems = [no_shared_time("IMU"), no_shared_time("GNSS")]
+    assert [f["code"] for f in inspect(away, samples=2, is_quick=True)["findings"]] == ["recording", "recording"]
