@@ -20,11 +20,12 @@ DEEPEST = 100
 # What taking a tree apart ends in that has another shape than it should.
 MISFIT = (ValueError, LookupError, TypeError, AttributeError, ArithmeticError)
 _LARGEST = 2**63  # whole numbers of TOML and of OpenStreetMap have 64 bits
-_DIGITS = 20
+_DIGITS, _MANY_BITS = 20, 10_000
 _BLOCK = 1 << 16  # bytes that are read at a time
 _BLANK = re.compile(r"[ \t\n\r]*")
 _BEHIND = frozenset(" \t\n\r,]}:")  # what may stand behind a value
 _TOO_DEEP = f"lists and tables stand in each other more than {DEEPEST} deep"
+_TOO_LONG = "a whole number has thousands of digits"
 
 
 def parse_json(text: str | bytes) -> Any:
@@ -41,14 +42,16 @@ def parse_toml(text: str) -> dict[str, Any]:
     """The tree of a TOML text. Raises tomllib.TOMLDecodeError saying what is wrong with it."""
     try:
         tree = tomllib.loads(text)
-        _check(tree)
     except RecursionError:
         raise tomllib.TOMLDecodeError(_TOO_DEEP) from None
     except tomllib.TOMLDecodeError:
         raise
+    except ValueError:  # of `int`, which refuses so many: all else is TOML's own error
+        raise tomllib.TOMLDecodeError(_TOO_LONG) from None
+    try:
+        _check(tree)
     except ValueError as error:
-        said = "a whole number has thousands of digits" if "digits" in str(error) else str(error)
-        raise tomllib.TOMLDecodeError(said) from None
+        raise tomllib.TOMLDecodeError(str(error)) from None
     return tree
 
 
@@ -97,6 +100,8 @@ def _check(tree: Any) -> None:
                 open_ones.append(iter(node.values() if isinstance(node, dict) else node))
                 break
             if isinstance(node, int) and not -_LARGEST <= node < _LARGEST:
+                if node.bit_length() > _MANY_BITS:  # Python does not write so many digits
+                    raise ValueError(_TOO_LONG)
                 raise ValueError(f"the whole number {str(node)[:_DIGITS]}... has more than 64 bits")
         else:
             open_ones.pop()

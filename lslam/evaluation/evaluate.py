@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -81,16 +82,15 @@ def evaluate(
         calibration.T_cam0_lidar if calibration else None,
         is_given=T_est_gt is not None,
     )
-    notes += same.notes
     units = _other_unit(same.estimate, same.truth)
     # Whose body it is shows in motions, which are wrong then.
-    notes = [*units, *(note for note in notes if not (units and "WRONG FRAMES" in note))]
-    if not any("WRONG" in note for note in notes):
-        notes += _turned(same.estimate, same.truth)
-    notes += _nearly_straight(same.truth, config)
+    frames = [] if units else same.faults or _turned(same.estimate, same.truth)
+    notes = [*units, *notes, *same.notes, *frames, *_nearly_straight(same.truth, config)]
+    faults = (*units, *frames)
     for note in notes:
-        log.log(logging.WARNING if "WRONG" in note else logging.INFO, "%s: %s", estimate.source or "estimate", note)
-    return _measure(same.estimate, same.truth, matches, config, (estimate, ground_truth), offset_ns / 1e9, notes)
+        log.log(logging.WARNING if note in faults else logging.INFO, "%s: %s", estimate.source or "estimate", note)
+    found = _measure(same.estimate, same.truth, matches, config, (estimate, ground_truth), offset_ns / 1e9, notes)
+    return replace(found, faults=faults)
 
 
 def _measure(

@@ -23,11 +23,15 @@ SAME_DEG = 30.0
 
 @dataclass
 class Reconciled:
-    """Both trajectories in one body frame, poses (N, 4, 4), and what was found out."""
+    """Both trajectories in one body frame, poses (N, 4, 4), and what was found out.
+
+    notes : decisions; faults : why the frames of the two do not fit, notes too
+    """
 
     estimate: Floats
     truth: Floats
     notes: list[str] = field(default_factory=list)
+    faults: list[str] = field(default_factory=list)
 
 
 def reconcile(
@@ -44,11 +48,8 @@ def reconcile(
     camera = [_is_camera(poses, frame) for poses, frame in zip((estimate, truth), frames, strict=True)]
     out = Reconciled(estimate, truth)
     if is_given:
-        _say_difference(out, "check")
-        if out.notes:
-            out.notes[-1] += (
-                " (it is the pose of the truth's body in the estimate's body; the one given may be the inverse)"
-            )
+        explained = " (it is the pose of the truth's body in the estimate's body; the one given may be the inverse)"
+        _say_difference(out, "check", explained)
         return out
     for who, frame, poses in (("estimate", frames[0], estimate), ("ground truth", frames[1], truth)):
         if frame == "cam0" and main_axis(poses) == "+x":
@@ -57,14 +58,14 @@ def reconcile(
             )
     if camera[0] is None or camera[1] is None or camera[0] == camera[1]:
         _say_difference(out)
-        if camera[0] and camera[1] and "cam0" in frames and not out.notes:
+        if camera[0] and camera[1] and "cam0" in frames and not (out.notes or out.faults):
             # One rigid relabelling of both: no norm changes, and up is z again.
             out.estimate, out.truth = _turn(estimate), _turn(truth)
         return out
     which, other = ("estimate", "ground truth") if camera[0] else ("ground truth", "estimate")
     fact = f"{which} is in the camera frame (advances along +z), {other} in the LiDAR frame (advances along +x)"
     if T_cam0_lidar is None:
-        out.notes.append(
+        out.faults.append(
             f"WRONG FRAMES: {fact}; without calibration (--calib) they are compared as they are: "
             "origin-aligned, rotational, KITTI drift and per-axis numbers mean nothing"
         )
@@ -145,15 +146,15 @@ def _turns(poses: Floats, stride: int) -> Floats:
     return so3.log(np.swapaxes(R[:-1], -1, -2) @ R[1:])
 
 
-def _say_difference(out: Reconciled, way_out: str = "give") -> None:
-    """Note a body frame that is turned against the other one, seen from the motion alone."""
+def _say_difference(out: Reconciled, way_out: str = "give", explained: str = "") -> None:
+    """Find fault with a body frame that is turned against the other one, seen from the motion alone."""
     R = body_rotation(out.estimate, out.truth)
     if R is None or np.rad2deg(so3.angle(R)) < SAME_DEG:
         return
     rpy = ", ".join(f"{v:.0f}" for v in np.rad2deg(so3.euler_rpy(R)))
-    out.notes.append(
+    out.faults.append(
         f"WRONG FRAMES: the ground truth's body is turned against the estimate's by about roll, pitch, yaw = {rpy} deg: "
-        f"{way_out} the transform between the bodies with --T-est-gt"
+        f"{way_out} the transform between the bodies with --T-est-gt{explained}"
     )
 
 

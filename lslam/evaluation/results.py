@@ -149,6 +149,7 @@ class Evaluation:
     matched, possible : pairs found, pairs at most; stamps_ns : (N,) of the matched poses, on the ground truth's clock
     distance : (N,) m travelled along the ground truth; gt_positions : (N, 3) m; path_length : m
     time_offset : s added to the estimate's stamps; association : recipe sentence; notes : what was decided or is doubtful
+    faults : those of the notes that say what makes the numbers wrong
     odometry : of a run whose poses a graph moved, the same of the poses before
     """
 
@@ -168,4 +169,5 @@ class Evaluation:
     time_offset: float
     association: str
     notes: list[str]
+    faults: tuple[str, ...] = ()
     odometry: Evaluation | None = None

@@ -29,7 +29,7 @@ def perform(job: Job, out: Path | None, overwrite: bool, resume: bool) -> RunOut
     manifest = job.manifest
     if out is None:
         record, _, evaluation = solve(job, KeyframeStore(deflate=job.config.keyframes.deflate))
-        manifest.problems += record.problems
+        manifest.take_over(record)
         record.manifest = manifest.as_dict(manifest.outcome)
         return RunOutcome(record, evaluation)
     manifest.identity = run_identity(job.sequence, job.truth, job.config, job.given)

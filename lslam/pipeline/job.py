@@ -92,10 +92,10 @@ def announce(job: Job) -> None:
     job.manifest.problems += map(str, [*units, *examine_jumps(job.truth)])
     for problem in [*sequence.problems, *job.manifest.problems]:
         log.warning("%s", problem)
-    deskew = describe_deskew(sequence, config, sweep is not None, getattr(job.odometry, "deskew", ""))
+    deskew, is_distorted = describe_deskew(sequence, config, sweep is not None, getattr(job.odometry, "deskew", ""))
     job.manifest.deskew = deskew
     job.manifest.pose_time = (sweep or Span()).instant
-    if deskew.startswith("no deskew"):
+    if is_distorted:
         log.warning("%s", deskew)
     else:
         log.info("deskew: %s", deskew)

@@ -18,6 +18,7 @@ from lslam.config import Config
 from lslam.errors import InterruptedRunError
 from lslam.reports.facts import describe
 from lslam.stopping import is_interrupt
+from lslam.types.run_record import RunRecord
 from lslam.types.scan import Span
 from lslam.types.scan_result import ScanResult
 from lslam.types.sequence import Sequence
@@ -36,6 +37,7 @@ class Manifest:
     outcome : done, degraded (a scan was bridged or skipped, or input was dropped, replaced or refused), diverged or
         interrupted
     reading : what else than its path the sequence was opened with: topics, extrinsics
+    unscored : why a known ground truth gave no score, empty where it did
     deskew : what becomes of the motion within a scan, `describe_deskew`
     pose_time : where in a sweep the stamps of scans lie, to which poses belong: scan_start, scan_middle or scan_end
     world : where the coordinates begin and whether z is up
@@ -56,6 +58,7 @@ class Manifest:
         self.reading: dict[str, str] = {}
         self.timings: dict[str, float] = {}
         self.problems: list[str] = []
+        self.unscored = ""
         self.warnings = Warnings()
         self.counts: dict[str, int] = {}
         self.posed_by: dict[str, int] = {}
@@ -113,6 +116,11 @@ class Manifest:
                 f"the first is scan {weak[0].index}: {describe(weak[0].degenerate)}"
             )
 
+    def take_over(self, record: RunRecord) -> None:
+        """Add what is wrong with the result."""
+        self.problems += record.problems
+        self.unscored = record.unscored
+
     def interrupt(self, where: str) -> None:
         """The run ends early because somebody asked for it."""
         self._ended = "interrupted"
@@ -133,6 +141,7 @@ class Manifest:
             "status": status,
             **({"why": why} if why else {}),
             "problems": [*problems, *self.warnings.beyond([*problems, why])],
+            **({"unscored": self.unscored} if self.unscored else {}),
             "command": self.command,
             "lslam": __version__,
             **({"identity": dict(self.identity)} if self.identity else {}),
@@ -178,19 +187,19 @@ class Manifest:
         }
 
 
-def describe_deskew(sequence: Sequence, config: Config, has_times: bool, how: str) -> str:
-    """What becomes of the motion within a scan; starts with `no deskew` when it stays in.
+def describe_deskew(sequence: Sequence, config: Config, has_times: bool, how: str) -> tuple[str, bool]:
+    """What becomes of the motion within a scan, and whether it stays in.
 
     has_times : whether the scans have per-point times; how : in words, how the method deskews, empty when it does not
     """
     if sequence.motion_compensated:
-        return "none needed: the scans are motion compensated"
+        return "none needed: the scans are motion compensated", False
     why = "is not known to be" if sequence.motion_compensated is None else "is not"
     if not has_times:
-        return f"no deskew: the recording {why} motion compensated, and its points have no times"
+        return f"no deskew: the recording {why} motion compensated, and its points have no times", True
     if not config.preprocess.deskew:
-        return "no deskew: preprocess.deskew is off"
-    return how or f"no deskew: {config.odometry.method} takes each scan as one instant"
+        return "no deskew: preprocess.deskew is off", True
+    return (how, False) if how else (f"no deskew: {config.odometry.method} takes each scan as one instant", True)
 
 
 def peak_memory_mb() -> float | None:

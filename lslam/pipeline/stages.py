@@ -56,12 +56,13 @@ def score(record: RunRecord, sequence: Sequence, config: Config) -> Evaluation |
             before = evaluate(record.odometry, record.ground_truth, config.eval, calibration=sequence.calibration)
             score = replace(score, odometry=before)
     except LslamError as error:
+        record.unscored = str(error)
         record.problems.append(f"not scored: {error}")
         log.warning("not scored: %s", error)
         if record.folder is not None:
             log.info("score it with other recipes: lslam eval %s GT", record.folder / "trajectory.tum")
         return None
-    record.problems += [note for note in score.notes if "WRONG" in note]
+    record.problems += score.faults
     return score
 
 
@@ -101,7 +102,7 @@ def make_feature_map(folder: RunFolder, job: Job, record: RunRecord) -> None:
 def make_report(folder: RunFolder, job: Job, record: RunRecord, evaluation: Evaluation | None) -> None:
     """report.html; the record's manifest is the run's last word, with the report's own time."""
     manifest = job.manifest
-    manifest.problems += record.problems
+    manifest.take_over(record)
     record.manifest = manifest.as_dict(manifest.outcome)
     with manifest.timed("report_s"):
         if job.config.report.html:

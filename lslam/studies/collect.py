@@ -86,8 +86,7 @@ def _add_errors(path: Path, manifest: dict[str, Any], values: dict[str, float]) 
         if score.get("map", {}).get(key) is not None:
             values[f"map.{key}"] = float(score["map"][key])
     if "ate" not in score:
-        said = [str(p) for p in manifest.get("problems", []) if str(p).startswith("not scored")]
-        return said[0] if said else NO_TRUTH
+        return f"not scored: {manifest['unscored']}" if "unscored" in manifest else NO_TRUTH
     for name, error in score["ate"].items():
         if error["available"]:
             values[f"ate.{name}"] = error["rmse"]

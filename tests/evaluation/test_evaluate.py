@@ -102,8 +102,10 @@ def test_a_body_turned_against_the_other_is_found(estimate: Trajectory, truth: T
     turned = replace(truth, poses=truth.poses @ T, frame="unknown")
     result = evaluate(estimate, turned)
     assert any("WRONG FRAMES" in note and "--T-est-gt" in note for note in result.notes)
+    assert result.faults == tuple(result.notes[-1:])
     right = evaluate(estimate, turned, T_est_gt=T)
     assert not any("WRONG" in note for note in right.notes)
+    assert (right.faults, len(right.notes)) == ((), 1)
     assert rmse(right, "origin") == pytest.approx(rmse(evaluate(estimate, truth), "origin"), abs=1e-9)
 
 

@@ -117,7 +117,8 @@ def test_who_is_in_the_camera_frame_is_named(is_camera: tuple[bool, bool]) -> No
     who, other = ("estimate", "ground truth") if is_camera[0] else ("ground truth", "estimate")
     fact = f"{who} is in the camera frame (advances along +z), {other} in the LiDAR frame (advances along +x)"
     unknown, known = (reconcile(*given, ("unknown", "unknown"), T) for T in (None, T_cam0_lidar))
-    assert unknown.notes[0].startswith(f"WRONG FRAMES: {fact}")
+    assert unknown.faults[0].startswith(f"WRONG FRAMES: {fact}")
+    assert known.faults == unknown.notes == []
     assert known.notes == [f"{fact}: {who} converted to the LiDAR with T_cam0_lidar"]
     np.testing.assert_allclose([known.estimate, known.truth], [lidar, lidar], atol=1e-9)
 

@@ -73,21 +73,23 @@ def test_what_ended_a_run() -> None:
 
 
 @pytest.mark.parametrize(
-    ("compensated", "has_times", "how", "words"),
-    [(True, True, "twice", "none needed"), (None, False, "twice", "no deskew: .*not known.* no times"),
-     (False, False, "twice", "no deskew: .*is not motion"), (False, True, "twice", "twice$"), (None, True, "twice", "twice$"),
-     (False, True, "", "no deskew: icp takes each scan as one instant")],
+    ("compensated", "has_times", "how", "words", "is_distorted"),
+    [(True, True, "twice", "none needed", False), (None, False, "twice", "no deskew: .*not known.* no times", True),
+     (False, False, "twice", "no deskew: .*is not motion", True), (False, True, "twice", "twice$", False),
+     (None, True, "no deskew, none at all", "no deskew", False),
+     (False, True, "", "no deskew: icp takes each scan as one instant", True)],
 )  # fmt: skip
-def test_deskew_is_stated(compensated: bool | None, has_times: bool, how: str, words: str) -> None:
+def test_deskew_is_stated(compensated: bool | None, has_times: bool, how: str, words: str, is_distorted: bool) -> None:
     stub = Stub([], motion_compensated=compensated)
-    assert re.match(words, describe_deskew(stub, Config(), has_times, how))
+    said, is_so = describe_deskew(stub, Config(), has_times, how)
+    assert re.match(words, said)
+    assert is_so == is_distorted
 
 
 def test_deskew_switched_off_is_stated() -> None:
     off = load_config(None, ["preprocess.deskew=false"], {})
-    assert (
-        describe_deskew(Stub([], motion_compensated=False), off, True, "twice") == "no deskew: preprocess.deskew is off"
-    )
+    said = describe_deskew(Stub([], motion_compensated=False), off, True, "twice")
+    assert said == ("no deskew: preprocess.deskew is off", True)
 
 
 def test_peak_memory_is_in_megabytes() -> None:

@@ -229,6 +229,7 @@ def test_fewer_poses_than_a_score_needs(tmp_path: Path, count: int) -> None:
     assert facts["status"] == "degraded"
     assert "not scored" in facts["problems"][0]
     assert f"{count} poses" in facts["problems"][0]
+    assert facts["problems"][0].endswith(facts["unscored"])
     assert names(tmp_path / "out") == ALL
     assert set(json.loads((tmp_path / "out" / "evaluation.json").read_text())) == ONLY_MAP
     assert "not scored" in (tmp_path / "out" / "report.html").read_text()

@@ -158,7 +158,7 @@ def laps(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_run_that_is_done_has_no_reason_though_it_warned(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(prepared, "describe_deskew", lambda *given: "no deskew: the points have no times")
+    monkeypatch.setattr(prepared, "describe_deskew", lambda *given: ("no deskew: the points have no times", True))
     job = job_in(tmp_path)
     execute(job, Bench())
     assert "no deskew" in (job.folder / "manifest.json").read_text()
