@@ -20,7 +20,7 @@ AROUND = 10
 
 def view_loop(record: RunRecord, done: BackEnd, store: KeyframeStore) -> LoopView | None:
     """The view; None where no loop was closed, or the pose graph moved nothing."""
-    closed = [c for c in record.loops if c.verdict == "accepted"]
+    closed = [c for c in record.loops if c.is_accepted]
     if record.odometry is None or not done.is_optimised or not closed:
         return None
     scans = record.keyframe_scans

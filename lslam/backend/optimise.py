@@ -108,7 +108,7 @@ def _fitness(store: KeyframeStore, a: int, b: int, T_a_b: Floats) -> float:
 
 def _graph(given: Given) -> PoseGraph:
     store, config, results, candidates = given.store, given.config, given.results, given.candidates
-    loops = [c.constraint for c in candidates if c.verdict == "accepted" and c.constraint is not None]
+    loops = [c.constraint for c in candidates if c.is_accepted and c.constraint is not None]
     fitness = None
     if config.graph.information == "fitness":
         loops = [

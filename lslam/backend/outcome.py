@@ -22,7 +22,7 @@ from lslam.graph.problem import DriftClaim, PoseGraph, Solution
 from lslam.keyframes.store import KeyframeStore
 from lslam.types.building_correction import CorrectedMap
 from lslam.types.building_match import OsmMatches
-from lslam.types.constraint import Constraint, LoopCandidate
+from lslam.types.constraint import Constraint, LoopCandidate, LoopStage, Verdict
 from lslam.types.georeference import Georeference
 from lslam.types.scan_result import ScanResult
 from lslam.types.stage_clock import KeyframeClocks
@@ -146,8 +146,8 @@ def without_steady_drift(graph: PoseGraph, given: Given) -> PoseGraph:
 def unsolved(given: Given) -> BackEnd:
     """The run as odometry has it; loops were accepted for a graph that cannot be had, and are rejected with it."""
     candidates = [
-        replace(c, verdict="rejected", stage="graph", reason="the pose graph could not be solved")
-        if c.verdict == "accepted"
+        replace(c, verdict=Verdict.REJECTED, stage=LoopStage.GRAPH, reason="the pose graph could not be solved")
+        if c.is_accepted
         else c
         for c in given.candidates
     ]
@@ -166,10 +166,10 @@ def _verdicts(
     judged = iter(zip(graph.loops, solution.loop_reasons, solution.loop_stages, strict=True))
     out, believed = [], []
     for candidate in candidates:
-        if candidate.verdict == "accepted" and candidate.constraint is not None:
+        if candidate.is_accepted and candidate.constraint is not None:
             loop, reason, stage = next(judged)
             if reason:
-                candidate = replace(candidate, verdict="rejected", stage=stage, reason=reason)
+                candidate = replace(candidate, verdict=Verdict.REJECTED, stage=stage, reason=reason)
             else:
                 believed.append(loop)
         out.append(candidate)

@@ -17,6 +17,7 @@ from lslam.graph.drift import drift_factor, with_drift
 from lslam.graph.problem import PoseGraph, Solution
 from lslam.graph.robust import Doubted, Settled, joined, settle
 from lslam.graph.solve import marginal_blocks, marginals, solve_incrementally
+from lslam.types.constraint import LoopStage
 
 Floats = NDArray[np.float64]
 
@@ -32,7 +33,7 @@ def optimise(graph: PoseGraph, config: GraphConfig) -> Solution:
     check_graph(graph)
     graph = with_distances(graph)
     reasons = judge_loops(graph, config) if config.is_pairwise else [""] * len(graph.loops)
-    stages = ["consistency" if reason else "graph" for reason in reasons]
+    stages = [LoopStage.CONSISTENCY if reason else LoopStage.GRAPH for reason in reasons]
     kept = [i for i, reason in enumerate(reasons) if not reason]
     loops = [graph.loops[i] for i in kept]
     drift = 0.0 if graph.is_rigid else max(drift_factor(graph, loops, config), graph.walk)

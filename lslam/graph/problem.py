@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.graph.fix_noise import Wander
-from lslam.types.constraint import Constraint, Turn
+from lslam.types.constraint import Constraint, LoopStage, Turn
 
 Floats = NDArray[np.float64]
 
@@ -140,7 +140,7 @@ class Solution:
 
     poses : (K, 4, 4); covariances : (K, 6, 6) marginal, of t' = t + d[:3], R' = exp(d[3:]) R in world axes, m2 and rad2
     loop_reasons : per loop of the graph, empty when it was believed, else why not
-    loop_stages : per loop, what decided: `consistency` or `graph`
+    loop_stages : per loop, what decided
     fix_believed : (F,) bool per fix
     map_reasons : per planar prior, empty when it was believed, else why not
     shift, shift_sigma : (2,) m by which the map is off as a whole (true minus map), and how well that is known
@@ -151,7 +151,7 @@ class Solution:
     poses: Floats
     covariances: Floats
     loop_reasons: list[str]
-    loop_stages: list[str]
+    loop_stages: list[LoopStage]
     fix_believed: NDArray[np.bool_]
     map_reasons: list[str]
     shift: Floats

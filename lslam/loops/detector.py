@@ -22,7 +22,7 @@ from lslam.loops.place import Place, make_place
 from lslam.loops.rivals import settle
 from lslam.loops.scan_context import PlaceIndex, PlaceMatch
 from lslam.loops.verify import Comparison, Verifier
-from lslam.types.constraint import Constraint, LoopCandidate
+from lslam.types.constraint import Constraint, LoopCandidate, LoopStage, Verdict
 from lslam.types.keyframe import Keyframe
 from lslam.types.stage_clock import KeyframeClocks
 
@@ -65,8 +65,8 @@ def find_loops(
         store.keyframes, lambda number: submap(store, poses, number, submap_size), config, registration
     )  # fmt: skip
     candidates = detector.find(clocks, should_stop)
-    accepted = sum(c.verdict == "accepted" for c in candidates)
-    tried = sum(c.stage != "thinned" for c in candidates)
+    accepted = sum(c.is_accepted for c in candidates)
+    tried = sum(c.stage != LoopStage.THINNED for c in candidates)
     log.info("loops: %d closed of %d candidates, %d keyframes", accepted, tried, len(store))
     return candidates
 
@@ -126,7 +126,7 @@ class Detector:
                 examined = self._examined(b, older)
             candidates += examined
             pace.observe(
-                keyframe.distance, "accepted" if any(c.verdict == "accepted" for c in examined) else "rejected"
+                keyframe.distance, Verdict.ACCEPTED if any(c.is_accepted for c in examined) else Verdict.REJECTED
             )
         return candidates
 
@@ -134,7 +134,7 @@ class Detector:
         """Keyframe `b` against those of the `older` ones that look alike, with verdicts."""
         alike, fallback = self._choose(b, older)
         examined = settle([self._examine(match, b) for match in alike], self.keyframes, self._reach_between)
-        if fallback is not None and not any(c.verdict == "accepted" or c.stage == "ambiguity" for c in examined):
+        if fallback is not None and not any(c.is_accepted or c.stage == LoopStage.AMBIGUITY for c in examined):
             examined.append(self._examine(fallback, b))
         return examined
 
@@ -162,7 +162,7 @@ class Detector:
     def _thinned(self, older: NDArray[np.int64], b: int, wait: float) -> LoopCandidate:
         a = self._nearest(older, b)
         said = f"the last one tried was less than {wait:g} m ago"
-        return LoopCandidate(a, b, self._away(a, b), float("nan"), "rejected", "thinned", said)
+        return LoopCandidate(a, b, self._away(a, b), float("nan"), Verdict.REJECTED, LoopStage.THINNED, said)
 
     def _nearest(self, older: NDArray[np.int64], b: int) -> int:
         away = np.linalg.norm(self.doubt.positions[older] - self.doubt.positions[b], axis=1)
@@ -214,9 +214,9 @@ class Detector:
         stage, reason = found.stage, found.reason
         if not reason:
             reason = self._beyond(found, expected, doubt)
-            stage = "gate" if reason else stage
+            stage = LoopStage.GATE if reason else stage
         return LoopCandidate(
-            a, b, self._away(a, b), match.distance, "rejected" if reason else "accepted", stage, reason, found.rmse,
+            a, b, self._away(a, b), match.distance, Verdict.REJECTED if reason else Verdict.ACCEPTED, stage, reason, found.rmse,
             found.overlap, self._constraint(a, b, found),
         )  # fmt: skip
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from lslam.types.constraint import Verdict
+
 
 class Pace:
     """How far to travel from one try to the next: `spacing` where things change, up to three times it while they do not.
@@ -19,7 +21,8 @@ class Pace:
 
     def reset(self) -> None:
         """Try at once: there were no candidates."""
-        self._tried_at, self._row, self._last = -np.inf, 0, ""
+        self._tried_at, self._row = -np.inf, 0
+        self._last: Verdict | None = None
 
     @property
     def wait(self) -> float:
@@ -30,7 +33,7 @@ class Pace:
         """Whether to try after so many metres since the start."""
         return distance - self._tried_at >= self.wait
 
-    def observe(self, distance: float, verdict: str) -> None:
+    def observe(self, distance: float, verdict: Verdict) -> None:
         """A try, and what came of it."""
         self._row = self._row + 1 if verdict == self._last else 1
         self._tried_at, self._last = distance, verdict

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.types.constraint import LoopCandidate
+from lslam.types.constraint import LoopCandidate, LoopStage, Verdict
 from lslam.types.keyframe import Keyframe
 
 
@@ -22,8 +22,8 @@ def settle(
     None is left when two put the keyframe at different places, or when one of them was ambiguous by itself: where places
     repeat, the one that fits is no better than the one that fits twice.
     """
-    accepted = [c for c in examined if c.verdict == "accepted"]
-    doubtful = next((c for c in examined if c.stage == "ambiguity"), None)
+    accepted = [c for c in examined if c.is_accepted]
+    doubtful = next((c for c in examined if c.stage == LoopStage.AMBIGUITY), None)
     if accepted and doubtful is not None:
         return [_ambiguous(c, f"keyframe {doubtful.a} looks as much alike, and is ambiguous") for c in examined]
     if len(accepted) < 2:
@@ -36,7 +36,10 @@ def settle(
             return [_ambiguous(c, said) for c in examined]
     said = f"closed with keyframe {first.a} already"
     extra = {c.a for c in accepted[1:]}
-    return [replace(c, verdict="rejected", stage="thinned", reason=said) if c.a in extra else c for c in examined]
+    return [
+        replace(c, verdict=Verdict.REJECTED, stage=LoopStage.THINNED, reason=said) if c.a in extra else c
+        for c in examined
+    ]
 
 
 def _put(candidate: LoopCandidate, keyframes: Sequence[Keyframe]) -> NDArray[np.float64]:
@@ -47,6 +50,6 @@ def _put(candidate: LoopCandidate, keyframes: Sequence[Keyframe]) -> NDArray[np.
 
 def _ambiguous(candidate: LoopCandidate, reason: str) -> LoopCandidate:
     """Refused, unless it was already."""
-    if candidate.verdict == "rejected":
+    if not candidate.is_accepted:
         return candidate
-    return replace(candidate, verdict="rejected", stage="ambiguity", reason=reason)
+    return replace(candidate, verdict=Verdict.REJECTED, stage=LoopStage.AMBIGUITY, reason=reason)

@@ -16,6 +16,7 @@ from lslam.loops.search import LARGE, SHARED, find_starts
 from lslam.preprocessing.prepare import PreparedPoints, thin
 from lslam.registration.robust import Annealing
 from lslam.registration.solver import RegistrationResult, solve
+from lslam.types.constraint import LoopStage
 
 Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -34,14 +35,14 @@ class Comparison:
     T_a_b : (4, 4) in level axes; covariance : (6, 6), level axes of a; None when nothing was registered
     """
 
-    stage: str
+    stage: LoopStage
     reason: str = ""
     T_a_b: Floats | None = None
     covariance: Floats | None = None
     rmse: float = float("nan")
     overlap: float = float("nan")
 
-    def rejected(self, stage: str, reason: str) -> Comparison:
+    def rejected(self, stage: LoopStage, reason: str) -> Comparison:
         """The same, refused."""
         return replace(self, stage=stage, reason=reason)
 
@@ -56,7 +57,7 @@ class Verifier:
         """Register b in a: T_a_b in level axes, within `reach` m of `expected` (3,), at one of `yaws` (rad) or near it."""
         starts = find_starts(a, b, expected, reach, yaws)
         if not starts:
-            return Comparison("overlap", "nothing stands up there")
+            return Comparison(LoopStage.OVERLAP, "nothing stands up there")
         seen = LARGE.cover(a.standing, a.floor).ravel() > 0
         tried = sorted((self._try(a, b, seen, start.T_a_b) for start in starts), key=lambda found: -found[0])
         support, rough = tried[0]
@@ -67,7 +68,9 @@ class Verifier:
             return facts
         if rivals and rivals[0][0] > self.config.max_ambiguity * support:
             away = float(np.linalg.norm(rivals[0][1][:3, 3] - rough[:3, 3]))
-            return facts.rejected("ambiguity", f"{away:.1f} m away it fits {rivals[0][0] / support:.0%} as well")
+            return facts.rejected(
+                LoopStage.AMBIGUITY, f"{away:.1f} m away it fits {rivals[0][0] / support:.0%} as well"
+            )
         backward = self._refine(b, a, se3.inverse(rough))
         return self._agree(facts, forward, backward)
 
@@ -106,38 +109,38 @@ class Verifier:
         """Of a registration by itself: rmse, what it observes, overlap both ways."""
         c = self.config
         if not found.ok or found.covariance is None:
-            return Comparison("registration", found.reason or "nothing matches")
+            return Comparison(LoopStage.REGISTRATION, found.reason or "nothing matches")
         T = found.T_world_lidar
         there = self._solve(a, b.source, T, Annealing(JUDGED, JUDGED, 0.5, 1))
         back = self._solve(b, a.source, se3.inverse(T), Annealing(JUDGED, JUDGED, 0.5, 1))
         overlap = min(there.overlap, back.overlap)
         rmse = max(there.rmse, back.rmse)
-        facts = Comparison("registration", "", T, found.covariance, rmse, overlap)
+        facts = Comparison(LoopStage.REGISTRATION, "", T, found.covariance, rmse, overlap)
         if len(found.degenerate):
-            return facts.rejected("registration", "the surfaces do not hold it in every direction")
+            return facts.rejected(LoopStage.REGISTRATION, "the surfaces do not hold it in every direction")
         if rmse > c.max_rmse:
-            return facts.rejected("registration", f"rmse {rmse:.2f} m, {c.max_rmse:g} m allowed")
+            return facts.rejected(LoopStage.REGISTRATION, f"rmse {rmse:.2f} m, {c.max_rmse:g} m allowed")
         if overlap < c.min_overlap:
-            return facts.rejected("overlap", f"overlap {overlap:.0%}, {c.min_overlap:.0%} needed")
+            return facts.rejected(LoopStage.OVERLAP, f"overlap {overlap:.0%}, {c.min_overlap:.0%} needed")
         return facts
 
     def _agree(self, facts: Comparison, forward: RegistrationResult, backward: RegistrationResult) -> Comparison:
         """Forward and backward must meet; the closure is no more certain than they differ."""
         c = self.config
         if not backward.ok:
-            return facts.rejected("agreement", f"new to old: {backward.reason or 'nothing matches'}")
+            return facts.rejected(LoopStage.AGREEMENT, f"new to old: {backward.reason or 'nothing matches'}")
         gap = se3.log(forward.T_world_lidar @ backward.T_world_lidar)
         move, turn = float(np.linalg.norm(gap[:3])), float(np.linalg.norm(gap[3:]))
         if move > c.max_disagreement_m or np.rad2deg(turn) > c.max_disagreement_deg:
             said = f"old to new and new to old differ by {move:.2f} m and {np.rad2deg(turn):.2f} deg"
-            return facts.rejected("agreement", said)
+            return facts.rejected(LoopStage.AGREEMENT, said)
         floor = np.diag([c.sigma_m**2] * 3 + [np.deg2rad(c.sigma_deg) ** 2] * 3)
         assert forward.covariance is not None
         doubt = np.diag([move**2 / 3] * 3 + [turn**2 / 3] * 3)
         covariance = forward.covariance + floor + doubt
         # Half way between what the two say.
         T = se3.exp(-0.5 * gap) @ forward.T_world_lidar
-        return Comparison("agreement", "", se3.normalise(T), covariance, facts.rmse, facts.overlap)
+        return Comparison(LoopStage.AGREEMENT, "", se3.normalise(T), covariance, facts.rmse, facts.overlap)
 
 
 def _is_elsewhere(T: Floats, other: Floats) -> bool:

@@ -88,7 +88,7 @@ def middles_of(matches: OsmMatches) -> Floats:
 
 def agreed(matches: OsmMatches, poses: Floats) -> list[BuildingMatch]:
     """The local matches that are accepted and that others bear out, with the keyframes at `poses` (K, 3)."""
-    local = [m for m in matches.local if m.verdict == "accepted" and m.keyframe < len(poses)]
+    local = [m for m in matches.local if m.is_accepted and m.keyframe < len(poses)]
     borne_out = agreeing(middles_of(matches), local, dict(enumerate(poses)))
     return [m for m, is_so in zip(local, borne_out, strict=True) if is_so]
 

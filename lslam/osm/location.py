@@ -31,6 +31,7 @@ from lslam.osm.wall_map import OsmMap
 from lslam.osm.wall_match import START_WALLS
 from lslam.stopping import checking
 from lslam.types.building_match import BuildingMatch, KeyframeMatch, OsmMatches
+from lslam.types.constraint import Verdict
 from lslam.types.stage_clock import KeyframeClocks
 
 log = logging.getLogger("lslam")
@@ -63,7 +64,7 @@ class Located:
     @property
     def accepted(self) -> list[KeyframeMatch]:
         """Those of `priors`."""
-        return [match for match in self.matches if match.verdict == "accepted"]
+        return [match for match in self.matches if match.is_accepted]
 
 
 def locate(
@@ -91,7 +92,7 @@ def locate(
         np.array([config.osm.map_sigma, config.osm.map_sigma, np.radians(config.osm.map_sigma_deg)]),
     )  # fmt: skip
     matches = _both_ways(store, poses, osm, track, config, clocks)
-    accepted = [match for match in matches if match.verdict == "accepted"]
+    accepted = [match for match in matches if match.is_accepted]
     if not accepted:
         return Located(T_level, osm, matches, problem=_why_none(matches, osm, extract))
     log.info("OSM: %d of %d keyframes lie on the map", len(accepted), len(matches))
@@ -122,7 +123,7 @@ def finish(
     """
     clocks = KeyframeClocks() if clocks is None else clocks
     doubts = iter(solution.map_reasons)
-    judged = [_judged(m, next(doubts)) if m.verdict == "accepted" else m for m in located.matches]
+    judged = [_judged(m, next(doubts)) if m.is_accepted else m for m in located.matches]
     planar, local = se2.of_se3(poses), list[BuildingMatch]()
     for match in checking(judged):
         with clocks[match.keyframe].stage("building match"):
@@ -153,7 +154,7 @@ def _both_ways(
 ) -> list[KeyframeMatch]:
     """Forward from the first keyframe; then back from the first that was accepted and that fixes everything."""
     found = _along(range(len(store)), store, poses, osm, track, config, clocks)
-    numbers = [m.keyframe for m in found if m.verdict == "accepted" and m.rank == 3]
+    numbers = [m.keyframe for m in found if m.is_accepted and m.rank == 3]
     if numbers and numbers[0] > 0:
         first = found[numbers[0]]
         back = copy.deepcopy(track)
@@ -181,7 +182,7 @@ def _along(
         view = KeyframeMatch(number, seen.walls, seen.views, track.pose, track.sigma, track.pose, np.zeros((3, 3)))
         with clocks[number].stage("map match"):
             match = _gated(match_keyframe(view, osm, config.osm), track, config.osm, config.graph)
-        if match.verdict == "accepted":
+        if match.is_accepted:
             track.take(match.pose, match.information)
         matches.append(match)
     return matches
@@ -199,11 +200,11 @@ def _gated(match: KeyframeMatch, track: OsmTrack, config: OsmConfig, graph: Grap
         return replace(
             match, reason=f"{np.sqrt(squared / limit):.1f} times as far from odometry as it may have drifted"
         )
-    return replace(match, verdict="accepted")
+    return replace(match, verdict=Verdict.ACCEPTED)
 
 
 def _judged(match: KeyframeMatch, doubt: str) -> KeyframeMatch:
-    return replace(match, verdict="rejected", reason=doubt) if doubt else match
+    return replace(match, verdict=Verdict.REJECTED, reason=doubt) if doubt else match
 
 
 def _place(

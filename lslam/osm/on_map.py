@@ -118,9 +118,9 @@ def sightings(located: Located, poses: Floats, config: Config) -> WallSightings:
     osm, planar = located.osm, se2.of_se3(poses)
     rows: list[tuple[Floats, Floats]] = [(np.zeros((0, 2, 2)), np.zeros((0, 2), np.int64))]
     for match in checking(located.matches):
-        at = match.pose if match.verdict == "accepted" else match.prior
+        at = match.pose if match.is_accepted else match.prior
         for one in match_buildings(match, at, np.zeros(2), osm, config.osm):
-            if one.verdict == "accepted":
+            if one.is_accepted:
                 walls = np.flatnonzero(osm.owners == one.building)[one.pairs[:, 0]]
                 seen = se2.apply(planar[match.keyframe], match.walls[one.pairs[:, 1]])
                 rows.append((seen, np.column_stack([np.full(len(walls), match.keyframe), walls])))

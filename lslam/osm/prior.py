@@ -18,6 +18,7 @@ from lslam.osm.wall_map import OsmMap
 from lslam.osm.wall_match import WINDOW, WallMatch, match_walls
 from lslam.osm.walls import find_walls
 from lslam.types.building_match import BuildingMatch, KeyframeMatch
+from lslam.types.constraint import Verdict
 
 Floats = NDArray[np.float64]
 
@@ -81,7 +82,7 @@ def match_buildings(
         found.append(
             BuildingMatch(
                 match.keyframe, number, one.pose, one.information, one.rank, one.kind, one.fitness, one.coverage,
-                one.rms, one.pairs, "rejected" if reason else "accepted", reason,
+                one.rms, one.pairs, Verdict.REJECTED if reason else Verdict.ACCEPTED, reason,
             )
         )  # fmt: skip
     return found

@@ -29,7 +29,7 @@ def back_end_rows(record: RunRecord, evaluation: Evaluation | None) -> list[tupl
     """Names and values for the summary; nothing of a run without a back end."""
     rows = []
     if record.loops or record.manifest.get("graph", {}).get("loops"):
-        closed = sum(c.verdict == "accepted" for c in record.loops)
+        closed = sum(c.is_accepted for c in record.loops)
         tried = sum(c.stage != "thinned" for c in record.loops)
         text = f"{closed} closed of {tried} tried"
         if evaluation is not None and evaluation.odometry is not None:
@@ -85,7 +85,7 @@ def back_end_figures(record: RunRecord, evaluation: Evaluation | None) -> list[F
         legend.append(("gt", "ground truth"))
     tracks += [Track("before", before, "s2"), Track("after", after, "s1", ends=True)]
     legend += [("s2", "odometry"), ("s1", "after the pose graph")]
-    closed = [c for c in record.loops if c.verdict == "accepted"]
+    closed = [c for c in record.loops if c.is_accepted]
     for loop in closed:
         ends = record.keyframe_scans[[loop.a, loop.b]]
         tracks.append(Track("loop", after[ends], "s3"))

@@ -111,7 +111,7 @@ def building_tables(found: CorrectedMap, matches: OsmMatches) -> list[Table]:
     tables = [Table("Displacement of buildings", header, rows, recipe)]
     reasons: Counter[tuple[str, str]] = Counter()
     for kind, held in (("keyframe on the map", matches.keyframes), ("building on the walls seen", matches.local)):
-        reasons.update((kind, "used" if match.verdict == "accepted" else _plain(match.reason)) for match in held)
+        reasons.update((kind, "used" if match.is_accepted else _plain(match.reason)) for match in held)
     rows = tuple((kind, reason, str(number)) for (kind, reason), number in reasons.most_common())
     recipe = "A keyframe's match holds the trajectory, a building's only moves that building."
     return [*tables, Table("Matches of walls", ("match", "what became of it", "how many"), rows, recipe)]
@@ -134,12 +134,12 @@ def _plain(reason: str) -> str:
 def _holds(matches: OsmMatches, poses: Floats) -> Figure:
     """Where along the way the map held the trajectory."""
     at = {match.keyframe: match for match in matches.keyframes}
-    used = np.array([k for k, match in at.items() if match.verdict == "accepted"], np.intp)
+    used = np.array([k for k, match in at.items() if match.is_accepted], np.intp)
     kinds = [
         ("s1", "held by walls of two directions", [k for k in used if at[int(k)].rank == 3]),
         ("s3", "held across parallel walls only", [k for k in used if at[int(k)].rank < 3]),
     ]
-    refused = [k for k, match in at.items() if match.verdict != "accepted" and match.kind != "none"]
+    refused = [k for k, match in at.items() if not match.is_accepted and match.kind != "none"]
     tracks = [Track("way", poses[:, :2], "gt", ends=True)]
     tracks += [Track(label, _dots(poses[keys, :2]), style) for style, label, keys in kinds if len(keys)]
     legend = [("gt", "way"), *((style, label) for style, label, keys in kinds if len(keys))]

@@ -48,8 +48,13 @@ class KeyframeMatch:
     coverage: float = float("nan")
     rms: float = float("nan")
     pairs: NDArray[np.int64] = field(default_factory=lambda: np.zeros((0, 2), np.int64))
-    verdict: Verdict = "rejected"
+    verdict: Verdict = Verdict.REJECTED
     reason: str = ""
+
+    @property
+    def is_accepted(self) -> bool:
+        """Whether it constrains the trajectory."""
+        return self.verdict == Verdict.ACCEPTED
 
 
 @dataclass(frozen=True)
@@ -73,8 +78,13 @@ class BuildingMatch:
     coverage: float
     rms: float
     pairs: NDArray[np.int64]
-    verdict: Verdict = "accepted"
+    verdict: Verdict = Verdict.ACCEPTED
     reason: str = ""
+
+    @property
+    def is_accepted(self) -> bool:
+        """Whether it constrains its building."""
+        return self.verdict == Verdict.ACCEPTED
 
     def displacement(self, keyframe: Floats, middle: Floats) -> Floats:
         """(3,) by which the building moves, turned about its `middle` (2,), when the keyframe is at `keyframe` (3,)."""
@@ -107,4 +117,4 @@ class OsmMatches:
     @property
     def accepted(self) -> list[KeyframeMatch]:
         """The matches that constrain the trajectory."""
-        return [match for match in self.keyframes if match.verdict == "accepted"]
+        return [match for match in self.keyframes if match.is_accepted]

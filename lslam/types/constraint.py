@@ -3,13 +3,33 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import StrEnum
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 ConstraintKind = Literal["odometry", "loop"]
-Verdict = Literal["accepted", "rejected"]
+
+
+class Verdict(StrEnum):
+    """Whether a measurement constrains the poses."""
+
+    ACCEPTED = "accepted"
+    REJECTED = "rejected"
+
+
+class LoopStage(StrEnum):
+    """What decided on a loop candidate, in the order in which it is asked."""
+
+    THINNED = "thinned"
+    REGISTRATION = "registration"
+    OVERLAP = "overlap"
+    AMBIGUITY = "ambiguity"
+    AGREEMENT = "agreement"
+    GATE = "gate"
+    CONSISTENCY = "consistency"
+    GRAPH = "graph"
 
 
 @dataclass(frozen=True)
@@ -42,7 +62,7 @@ class LoopCandidate:
 
     a : the older keyframe; b : the newer one
     distance : m between their odometry positions; descriptor_distance : 0 (alike) to 1, of Scan Context; NaN without
-    stage : what decided: `thinned`, `registration`, `overlap`, `ambiguity`, `agreement`, `gate`, `consistency`, `graph`
+    stage : what decided
     reason : why it was rejected, one clause; empty when accepted
     constraint : the measured loop closure, also of one that was rejected after registration
     """
@@ -52,8 +72,13 @@ class LoopCandidate:
     distance: float
     descriptor_distance: float
     verdict: Verdict
-    stage: str
+    stage: LoopStage
     reason: str = ""
     rmse: float = float("nan")
     overlap: float = float("nan")
     constraint: Constraint | None = None
+
+    @property
+    def is_accepted(self) -> bool:
+        """Whether its constraint holds the poses."""
+        return self.verdict == Verdict.ACCEPTED
