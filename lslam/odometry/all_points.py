@@ -72,9 +72,7 @@ class AllPoints(Stateful):
         held = held_by_non_ground(icp, points, T_start, found)
         if held is found:
             return found
-        why = found.reason or "features disagree with what stands on the ground"
-        error, why = correction(T_prior, held.T_world_lidar), f"{why}: all points stood in"
-        return replace(held, prior_error=error, reason=why, posed_by=ALL_POINTS)
+        return replace(held, prior_error=correction(T_prior, held.T_world_lidar), posed_by=ALL_POINTS)
 
     def stand_in(
         self, features: Features, T_prior: Floats, starved: RegistrationResult, known: RegistrationResult | None
@@ -92,9 +90,8 @@ class AllPoints(Stateful):
         self._asked = _Asked(features, points, found, starved)
         if not found.ok:
             return starved
-        why = starved.reason or "features hold the place badly"
         flagged = found.degenerate if len(found.degenerate) else starved.degenerate
-        return replace(found, degenerate=flagged, reason=f"{why}: all points stood in", posed_by=ALL_POINTS)
+        return replace(found, degenerate=flagged, posed_by=ALL_POINTS)
 
     def update(self, features: Features, result: RegistrationResult) -> None:
         """Remember all points of a registered scan; what `icp` found of it, if asked, teaches it what to expect."""

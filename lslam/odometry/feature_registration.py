@@ -142,9 +142,7 @@ class FeatureRegistration(Stateful):
         """The result at `expected` (4, 4) in the directions it leaves open."""
         if not len(result.degenerate):
             return result
-        kept = self._judge(replace(kept_where_blind(result, expected), reason=""), T_prior)
-        # What a good result says is that less planar points stood in.
-        return replace(kept, reason=kept.reason or result.reason)
+        return self._judge(kept_where_blind(result, expected), T_prior)
 
     def update(self, features: Features, result: RegistrationResult) -> None:
         """Enter the scan into map and target unless its registration failed; learn from it unless it was denied."""
@@ -260,10 +258,7 @@ class FeatureRegistration(Stateful):
         # They must close a direction; where features are too few to be sure of any, open none.
         if not result.ok or (starved.ok and len(result.degenerate) > len(starved.degenerate) - (not are_few)):
             return starved
-        why = starved.reason or (
-            f"only {starved.inliers} features agree" if are_few else "features leave a direction open"
-        )
-        return replace(result, reason=f"{why}: less planar points stood in", posed_by=LESS_PLANAR)
+        return replace(result, posed_by=LESS_PLANAR)
 
     def _on_planes(self, features: Features, T_start: Floats, T_prior: Floats) -> RegistrationResult:
         """Edges, and centroids of the less planar points, on fine and coarse planes."""

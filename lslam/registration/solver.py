@@ -27,8 +27,8 @@ class RegistrationResult:
     """What came of registering one scan.
 
     T_world_lidar : (4, 4); covariance : (6, 6) of t' = t + d[:3], R' = exp(d[3:]) R in world axes, m2 and rad2
-    ok : False when the pose is the motion prior because registration failed, `reason` says why
-    posed_by : the recovery policy that found the pose; empty: the registration itself
+    ok : False when the pose is the motion prior because registration failed, `reason` says why and is empty otherwise
+    posed_by : the recovery policy or the fallback that found the pose; empty: the registration itself
     is_denied : the pose is not what registration found: the scan enters there, and what was found teaches nothing
     inliers : source points within the final kernel
     matched : points that found a voxel; overlap : matched / source

@@ -13,8 +13,8 @@ from lslam.config.config import Config
 from lslam.config.loam import LoamConfig
 from lslam.config.recovery import RecoveryConfig
 from lslam.geometry import se3
-from lslam.odometry.all_points import FED
-from lslam.odometry.feature_registration import FeatureRegistration
+from lslam.odometry.all_points import ALL_POINTS, FED
+from lslam.odometry.feature_registration import LESS_PLANAR, FeatureRegistration
 from lslam.odometry.feature_scan import feature_scan
 from lslam.odometry.feature_solver import NONE, FeatureNoise, kept_where_blind, solve_on_scan
 from lslam.odometry.feature_steps import ScanStep, joint_step, two_steps, upright_directions
@@ -183,7 +183,7 @@ def test_less_planar_points_may_stand_in_and_leave_a_direction_open(monkeypatch:
         result = registration.locate(features, prior, StageClock())
         registration.update(features, result)
     assert result.ok, result.reason
-    assert "less planar points stood in" in result.reason
+    assert (result.posed_by, result.reason) == (LESS_PLANAR, "")
     assert len(result.degenerate) == 1
     assert abs(result.T_world_lidar[0, 3] - prior[0, 3]) < 5e-3
     assert np.abs(result.T_world_lidar[1:3, 3] - truth[1:3, 3]).max() < 0.01
@@ -206,7 +206,7 @@ def test_a_map_of_all_points_is_given_up_when_features_are_fed_again(
     for is_starved in (False, True, *[False] * (FED + 2)):
         monkeypatch.setattr(registration, "_holds_place", lambda result, starved=is_starved: not starved)
         result = registration.locate(features, np.eye(4), StageClock())
-        assert ("all points stood in" in result.reason) == is_starved
+        assert (result.posed_by == ALL_POINTS) == is_starved
         registration.update(features, result)
         entered.append(registration._all.state()["_icp"]["inserted"])
     assert entered[0] == 0
@@ -227,7 +227,7 @@ def test_who_stands_in_closes_a_direction_or_opens_none_where_features_are_few(
     starved = RegistrationResult(np.eye(4), degenerate=np.eye(6)[:before], inliers=inliers)
     result = registration._stand_in(features_at(np.eye(4)), RegistrationResult(np.eye(4)), np.eye(4), starved)
     assert (result.T_world_lidar is stand_in.T_world_lidar) == is_taken
-    assert ("less planar points stood in" in result.reason) == is_taken
+    assert (result.posed_by == LESS_PLANAR) == is_taken
 
 
 def test_what_led_astray_where_nothing_is_observed_is_taken_back_and_nothing_else() -> None:
