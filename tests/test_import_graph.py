@@ -26,7 +26,7 @@ LAYERS = [
     ["types"],
     ["geometry"],
     ["kernels", "config"],
-    ["foreign", "locks", "printable", "stopping", "untrusted"],
+    ["foreign", "locks", "plugins", "printable", "stopping", "untrusted"],
     ["errors", "version"],
 ]
 LEVEL = {name: level for level, names in enumerate(LAYERS) for name in names}

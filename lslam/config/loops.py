@@ -8,7 +8,7 @@ from lslam.config.section import Section
 
 
 class LoopsConfig(Section):
-    """Candidates by Scan Context and odometry, verified by registration of submap to submap."""
+    """Candidates by a place descriptor and odometry, verified by registration of submap to submap."""
 
     use: bool = Field(True, description="look for places seen before and close loops there")
     radius: float | None = Field(
@@ -34,11 +34,14 @@ class LoopsConfig(Section):
         description="m travelled between one candidate that is registered and the next; up to three times as far after "
         "several that came out alike",
     )
+    descriptor: str = Field(
+        "scan-context", description="by which places are told alike: scan-context, or a plug-in's name"
+    )
     rings: int = Field(20, ge=4, le=400, description="Scan Context: rings of the polar image (Kim and Kim 2018)")
     sectors: int = Field(60, ge=8, le=360, description="Scan Context: sectors of the polar image")
     reach: float = Field(80.0, gt=0, description="m; Scan Context: radius of the polar image")
     max_descriptor_distance: float = Field(
-        0.4, gt=0, le=1, description="Scan Context distance, 0 alike to 1, above which two places are different"
+        0.4, gt=0, le=1, description="distance of the descriptors, 0 alike to 1, above which two places are different"
     )
     max_iterations: int = Field(30, ge=1, description="Gauss-Newton steps of a verification")
     max_rmse: float = Field(0.3, gt=0, description="m; distance of the points to the other submap's surfaces, at most")

@@ -15,12 +15,13 @@ from lslam.errors import InterruptedRunError
 from lslam.geometry import se3, so3
 from lslam.keyframes.store import KeyframeStore
 from lslam.keyframes.submaps import submap
+from lslam.loops import create_descriptor
+from lslam.loops.descriptor import PlaceMatch
 from lslam.loops.doubt import Doubt, OdometryDoubt
 from lslam.loops.level import find_up, levelled
 from lslam.loops.pace import Pace
 from lslam.loops.place import Place, make_place
 from lslam.loops.rivals import settle
-from lslam.loops.scan_context import PlaceIndex, PlaceMatch
 from lslam.loops.verify import Comparison, Verifier
 from lslam.types.constraint import Constraint, LoopCandidate, LoopStage, Verdict
 from lslam.types.keyframe import Keyframe
@@ -75,7 +76,7 @@ def warm_up() -> None:
     """Compile or load every kernel that loops need, by comparing a small room with itself."""
     room = np.random.default_rng(0).uniform(-8, 8, (3000, 3)).astype(np.float32)
     room[np.arange(3000), np.arange(3000) % 3] = 8.0
-    PlaceIndex().add(0, room)
+    create_descriptor(LoopsConfig()).add(0, room)
     place = make_place(room, RegistrationConfig())
     Verifier(LoopsConfig(), RegistrationConfig()).compare(place, place, np.zeros(3), LEAST_REACH, [0.0])
 
@@ -96,7 +97,7 @@ class Detector:
     ) -> None:
         self.keyframes, self.cloud, self.config, self.registration = keyframes, cloud, config, registration
         self.doubt = OdometryDoubt(keyframes, config.drift_percent, config.drift_deg)
-        self.index = PlaceIndex(config.rings, config.sectors, config.reach)
+        self.index = create_descriptor(config)
         self.verifier = Verifier(config, registration)
         self._places: OrderedDict[int, Place] = OrderedDict()
         # Submaps overlap: the first keyframe of every few metres stands for those after it.
@@ -236,7 +237,7 @@ class Detector:
 
     def _yaws(self, match: PlaceMatch, turn: float) -> Floats:
         """rad, turns of the newer place in the older worth a try."""
-        centre, spread = (0.0, turn) if turn <= WIDEST_TURN else (match.yaw, np.pi / self.config.sectors + TURN_STEP)
+        centre, spread = (0.0, turn) if turn <= WIDEST_TURN else (match.yaw, self.index.yaw_error + TURN_STEP)
         count = int(np.ceil(spread / TURN_STEP))
         return np.asarray(centre + TURN_STEP * np.arange(-count, count + 1))
 

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.config.loops import LoopsConfig
 from lslam.kernels.polar_image import polar_image
+from lslam.loops.descriptor import PlaceMatch
 
 Images = NDArray[np.float32]
 
@@ -17,19 +17,6 @@ LIFT = 2.0
 GROUND_SHARE = 0.05
 # So many keyframes, nearest by their ring keys, are compared in full.
 COMPARED = 25
-
-
-@dataclass(frozen=True)
-class PlaceMatch:
-    """A keyframe that looks alike.
-
-    distance : 0 alike to 1 (equation 2.37 of the first thesis)
-    yaw : rad; turning the query's cloud by it about z turns it as the match's
-    """
-
-    number: int
-    distance: float
-    yaw: float
 
 
 def describe(points: NDArray[np.float32], rings: int, sectors: int, reach: float) -> Images:
@@ -69,11 +56,17 @@ def _unit_columns(images: Images) -> tuple[Images, NDArray[np.bool_]]:
     return images / np.maximum(norms, 1e-12)[:, None, :], norms > 0
 
 
+def create(config: LoopsConfig) -> PlaceIndex:
+    """The descriptor, empty."""
+    return PlaceIndex(config.rings, config.sectors, config.reach)
+
+
 class PlaceIndex:
     """The places seen so far, by keyframe number."""
 
     def __init__(self, rings: int = 20, sectors: int = 60, reach: float = 80.0) -> None:
         self.rings, self.sectors, self.reach = rings, sectors, reach
+        self.yaw_error = np.pi / sectors
         self._rows: dict[int, int] = {}
         self._images = np.zeros((64, rings, sectors), np.float32)
         self._keys = np.zeros((64, rings), np.float32)

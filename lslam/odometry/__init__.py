@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from importlib import import_module
-from importlib.metadata import entry_points
 from typing import TYPE_CHECKING, cast
 
-from lslam.errors import UsageError, nearest
 from lslam.odometry.base import Odometry
+from lslam.plugins import factory, known, require
 
 if TYPE_CHECKING:
     from lslam.config.config import Config
 
+GROUP = "lslam.methods"
 # name -> (module with `create(config) -> Odometry`, one line for people)
 METHODS = {
     "icp": (
@@ -40,17 +39,14 @@ FEATURE_METHODS = ("loam-odom", "loam", "floam", "lego-loam")
 
 def known_methods() -> dict[str, str]:
     """Names and one-line summaries, those of other packages included."""
-    own = {name: summary for name, (_, summary) in METHODS.items()}
-    foreign = {e.name: f"from {e.value}" for e in entry_points(group="lslam.methods") if e.name not in own}
-    return own | foreign
+    return known(GROUP, METHODS)
+
+
+def require_method(name: str) -> None:
+    """Raise UsageError with the nearest name when there is no such method."""
+    require(GROUP, METHODS, name, "method")
 
 
 def create_odometry(config: Config) -> Odometry:
     """The method `odometry.method` names. Raises UsageError with the nearest name when there is none."""
-    name = config.odometry.method
-    if name in METHODS:
-        return cast(Odometry, import_module(METHODS[name][0]).create(config))
-    for entry in entry_points(group="lslam.methods"):
-        if entry.name == name:
-            return cast(Odometry, entry.load()(config))
-    raise UsageError(f"no method {name!r}; {nearest(name, known_methods())}")
+    return cast(Odometry, factory(GROUP, METHODS, config.odometry.method, "method")(config))

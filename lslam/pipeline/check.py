@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from lslam.config import Config
 from lslam.config.preset_files import read_preset
-from lslam.errors import UsageError, nearest
+from lslam.errors import UsageError
 from lslam.evaluation.relative import parse_delta
+from lslam.loops import require_descriptor
 from lslam.maps.mesh import require_open3d
-from lslam.odometry import FEATURE_METHODS, METHODS, known_methods
+from lslam.odometry import FEATURE_METHODS, METHODS, require_method
 from lslam.registration.residuals import residual_named
 
 # Methods that match a scan against Gaussian voxels, and what of `registration` only some methods look at.
@@ -26,8 +27,9 @@ def check_config(config: Config) -> None:
     Raises InputError when the map asks for Open3D and it is missing.
     """
     method = config.odometry.method
-    if method not in (known := known_methods()):
-        raise UsageError(f"no method {method!r}; {nearest(method, known)}")
+    require_method(method)
+    if config.loops.use:
+        require_descriptor(config.loops.descriptor)
     if config.map.write_features and method not in FEATURE_METHODS:
         raise UsageError(f"method {method} has no feature map to save; these have: {', '.join(FEATURE_METHODS)}")
     if (method == "poses") != bool(config.odometry.poses):

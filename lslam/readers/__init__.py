@@ -1,8 +1,12 @@
-"""A data set on disk becomes a Sequence. A new reader is one file with `locate` and `open_folder` and one line here."""
+"""A data set on disk becomes a Sequence. A new reader is one file with `locate` and `open_folder` and one line here.
+
+Others register such a module as entry point `lslam.readers`; it is asked about folders that no reader of ours takes.
+"""
 
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -10,12 +14,14 @@ from typing import Any
 from lslam.errors import InputError, UsageError, cause
 from lslam.formats.sequence_toml import SequenceInfo, is_rate
 from lslam.formats.transform_text import read_transform
+from lslam.plugins import load, registered
 from lslam.readers.lookup import find_folder
 from lslam.readers.selection import select
 from lslam.types.sequence import Sequence
 
 __all__ = ["READERS", "open_sequence", "select"]
 
+GROUP = "lslam.readers"
 # Tried in this order: a KITTI layout is also a folder with scans somewhere in it.
 READERS = {
     "bag": "lslam.readers.bag",
@@ -90,13 +96,19 @@ def open_sequence(
 
 
 def _open(folder: Path, overrides: SequenceInfo) -> Sequence:
-    for dotted in READERS.values():
-        reader: Any = import_module(dotted)
+    for reader in _readers():
         located = reader.locate(folder)
         if located is not None:
             sequence: Sequence = reader.open_folder(located[0], overrides, located[1])
             return sequence
     raise InputError(_nothing_in(folder))
+
+
+def _readers() -> Iterator[Any]:
+    """Ours, then those of other packages."""
+    yield from map(import_module, READERS.values())
+    for entry in registered(GROUP, READERS).values():
+        yield load(entry, "reader")
 
 
 def _nothing_in(folder: Path) -> str:

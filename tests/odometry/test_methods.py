@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-import lslam.odometry
+from lslam import plugins
 from lslam.config.config import Config
 from lslam.errors import UsageError
 from lslam.odometry import METHODS, create_odometry, known_methods
@@ -40,7 +40,7 @@ def foreign(monkeypatch: pytest.MonkeyPatch) -> list[str]:
         asked.append(group)
         return [EntryPoint(name, f"{__name__}:Foreign", group) for name in ("their-icp", "icp")]
 
-    monkeypatch.setattr(lslam.odometry, "entry_points", entry_points)
+    monkeypatch.setattr(plugins, "entry_points", entry_points)
     return asked
 
 

@@ -1,0 +1,114 @@
+"""Methods, readers and place descriptors of another package, installed as one is."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from lslam.config.config import Config
+from lslam.config.loops import LoopsConfig
+from lslam.errors import InputError, UsageError
+from lslam.loops import DESCRIPTORS, create_descriptor
+from lslam.odometry import create_odometry, known_methods
+from lslam.pipeline.check import check_config
+from lslam.readers import open_sequence
+
+MODULE = """
+from lslam.readers import scan_folder
+
+
+def method(config):
+    return "a method"
+
+
+def descriptor(config):
+    return "a descriptor"
+
+
+def locate(path):
+    return (path, "") if (path / "clouds.txt").is_file() else None
+
+
+def open_folder(path, overrides, rest):
+    return scan_folder.open_folder(path / "deep", overrides, rest)
+"""
+ENTRIES = """
+[lslam.methods]
+theirs = theirs:method
+broken = theirs:nothing
+
+[lslam.descriptors]
+theirs = theirs:descriptor
+scan-context = theirs:descriptor
+
+[lslam.readers]
+theirs = theirs
+"""
+
+
+@pytest.fixture
+def theirs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Where the package `theirs` is installed."""
+    info = tmp_path / "site" / "theirs-1.0.dist-info"
+    info.mkdir(parents=True)
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: theirs\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text(ENTRIES)
+    (info.parent / "theirs.py").write_text(MODULE)
+    monkeypatch.syspath_prepend(info.parent)
+    monkeypatch.delitem(sys.modules, "theirs", raising=False)
+    return info
+
+
+def config(**sections: dict[str, object]) -> Config:
+    return Config.model_validate(sections)
+
+
+def test_their_methods_and_descriptors_are_found(theirs: Path) -> None:
+    wanted = config(odometry={"method": "theirs"}, loops={"descriptor": "theirs"})
+    check_config(wanted)
+    assert known_methods()["theirs"] == "from theirs:method"
+    assert "theirs" not in sys.modules
+    assert [create_odometry(wanted), create_descriptor(wanted.loops)] == ["a method", "a descriptor"]
+
+
+def test_they_do_not_take_the_place_of_ours(theirs: Path) -> None:
+    assert type(create_descriptor(LoopsConfig())).__name__ == "PlaceIndex"
+    assert "theirs" not in sys.modules
+
+
+def test_their_reader_is_asked_about_what_ours_do_not_take(theirs: Path, tmp_path: Path) -> None:
+    drive = tmp_path / "drive"
+    scans = sorted((Path(__file__).parents[1] / "sample_data/sequences/00/velodyne").glob("*.bin"))[:3]
+    (drive / "deep").mkdir(parents=True)
+    (drive / "clouds.txt").touch()
+    for scan in scans:
+        (drive / "deep" / scan.name).symlink_to(scan)
+    assert len(open_sequence(drive)) == 3
+    (drive / "clouds.txt").unlink()
+    with pytest.raises(InputError, match="holds no scans"):
+        open_sequence(drive)
+
+
+@pytest.mark.parametrize("code", ["", "import nowhere\n"])
+def test_a_broken_one_is_one_sentence_that_names_the_package(theirs: Path, code: str) -> None:
+    if code:
+        (theirs.parent / "theirs.py").write_text(code)
+    with pytest.raises(
+        InputError, match=r"^method 'broken' of the package theirs cannot be loaded from theirs:nothing: \w+: "
+    ):
+        create_odometry(config(odometry={"method": "broken"}))
+
+
+def test_what_nobody_has_is_refused_before_a_run() -> None:
+    assert list(DESCRIPTORS) == ["scan-context"]
+    with pytest.raises(UsageError, match="no place descriptor 'scan-contxt'; did you mean 'scan-context'"):
+        check_config(config(loops={"descriptor": "scan-contxt"}))
+
+
+def test_help_looks_for_no_other_package() -> None:
+    code = "import sys; from lslam.cli.main import main\nsys.argv = ['lslam', '--help']\ntry: main()\nexcept SystemExit: pass\n"
+    code += "assert 'lslam.plugins' not in sys.modules and 'importlib.metadata' not in sys.modules"
+    subprocess.run([sys.executable, "-c", code], check=True, stdout=subprocess.DEVNULL)
