@@ -1,4 +1,4 @@
-"""Places seen before: candidates, verification, loop closures.
+"""Loop closure detection: candidates by gating and descriptors, verification by registration.
 
 A new place descriptor is one file with `create` and one line here; others register an entry point `lslam.descriptors`.
 """

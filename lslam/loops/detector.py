@@ -1,4 +1,4 @@
-"""Loop closures of a run: which keyframes may show the same place, and which do."""
+"""Loop closure detection: candidates by odometry's gate and Scan Context, verified by registration."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from lslam.geometry import se3, so3
 from lslam.keyframes.store import KeyframeStore
 from lslam.keyframes.submaps import submap
 from lslam.loops import create_descriptor
+from lslam.loops.ambiguity import resolve_ambiguity
 from lslam.loops.descriptor import PlaceMatch
-from lslam.loops.doubt import Doubt, OdometryDoubt
+from lslam.loops.gating import OdometryUncertainty, RelativeUncertainty
 from lslam.loops.level import find_up, levelled
-from lslam.loops.pace import Pace
-from lslam.loops.place import Place, make_place
-from lslam.loops.rivals import settle
-from lslam.loops.verify import Comparison, Verifier
+from lslam.loops.level_submap import LevelSubmap, make_level_submap
+from lslam.loops.throttling import LoopThrottle
+from lslam.loops.verify import Verification, Verifier
 from lslam.types.constraint import Constraint, LoopCandidate, LoopStage, Verdict
 from lslam.types.keyframe import Keyframe
 from lslam.types.stage_clock import KeyframeClocks
@@ -34,13 +34,14 @@ Points = NDArray[np.float32]
 
 # m; two passes of a street lie so far apart at most.
 NEAR = 8.0
-# m and rad that odometry may be wrong by at the least: what two registrations of the same place differ by.
+# m and rad, least gate of odometry: what two registrations of the same place differ by.
 LEAST_REACH, LEAST_TURN = 1.0, np.deg2rad(2.0)
-# rad between the turns that are searched; beyond the widest, those round the descriptor's own are.
+# rad between the headings that are searched; beyond the widest gate they lie about the descriptor's own.
 TURN_STEP, WIDEST_TURN = np.deg2rad(2.0), np.deg2rad(20.0)
-# Places this much less alike than the best are its rivals, so many at most; different ones of a town differ twice as much.
+# Factor on the best descriptor distance within which others are candidates too, and how many; different places of a town
+# differ by twice as much.
 RIVAL, RIVALS = 1.5, 3
-# Places kept ready, and how many are looked at to find out which way is up.
+# Level submaps cached, and how many serve to estimate the vertical.
 KEPT, LOOKS = 16, 8
 
 
@@ -73,16 +74,18 @@ def find_loops(
 
 
 def warm_up() -> None:
-    """Compile or load every kernel that loops need, by comparing a small room with itself."""
+    """Compile or load every kernel that loop closure detection needs, with a small room."""
     room = np.random.default_rng(0).uniform(-8, 8, (3000, 3)).astype(np.float32)
     room[np.arange(3000), np.arange(3000) % 3] = 8.0
     create_descriptor(LoopsConfig()).add(0, room)
-    place = make_place(room, RegistrationConfig())
-    Verifier(LoopsConfig(), RegistrationConfig()).compare(place, place, np.zeros(3), LEAST_REACH, [0.0])
+    submap_of_room = make_level_submap(room, RegistrationConfig())
+    Verifier(LoopsConfig(), RegistrationConfig()).verify(
+        submap_of_room, submap_of_room, np.zeros(3), LEAST_REACH, [0.0]
+    )
 
 
 class Detector:
-    """Looks for loop closures among keyframes.
+    """Detects loop closures among keyframes.
 
     keyframes : all of the run, in order
     cloud : gives the submap about a keyframe, (M, 3) m, in its LiDAR frame
@@ -96,12 +99,12 @@ class Detector:
         registration: RegistrationConfig,
     ) -> None:
         self.keyframes, self.cloud, self.config, self.registration = keyframes, cloud, config, registration
-        self.doubt = OdometryDoubt(keyframes, config.drift_percent, config.drift_deg)
+        self.uncertainty = OdometryUncertainty(keyframes, config.drift_percent, config.drift_deg)
         self.index = create_descriptor(config)
         self.verifier = Verifier(config, registration)
-        self._places: OrderedDict[int, Place] = OrderedDict()
-        # Submaps overlap: the first keyframe of every few metres stands for those after it.
-        steps = np.floor(self.doubt.distances / (NEAR / 2))
+        self._submaps: OrderedDict[int, LevelSubmap] = OrderedDict()
+        # Submaps overlap: the first keyframe of every few metres represents those after it.
+        steps = np.floor(self.uncertainty.distances / (NEAR / 2))
         self._is_described = np.diff(steps, prepend=-1.0) > 0
 
     def find(
@@ -110,54 +113,54 @@ class Detector:
         """All candidates in the order of the newer keyframe, with verdicts; raises as `find_loops`."""
         clocks = KeyframeClocks() if clocks is None else clocks
         candidates: list[LoopCandidate] = []
-        pace = Pace(self.config.spacing)
+        throttle = LoopThrottle(self.config.spacing)
         gated = [self._gated(b) for b in range(len(self.keyframes))]
         if any(len(older) for older in gated):
             self._level_world()
         for b, (keyframe, older) in enumerate(zip(self.keyframes, gated, strict=True)):
             if should_stop():
-                raise InterruptedRunError(f"interrupted while loops were sought, at keyframe {b} of {len(gated)}")
+                raise InterruptedRunError(f"interrupted during loop closure detection, at keyframe {b} of {len(gated)}")
             if len(older) == 0:
-                pace.reset()
+                throttle.reset()
                 continue
-            if not pace.is_due(keyframe.distance):
-                candidates.append(self._thinned(older, b, pace.wait))
+            if not throttle.is_due(keyframe.distance):
+                candidates.append(self._thinned(older, b, throttle.wait))
                 continue
             with clocks[b].stage("loops"):
                 examined = self._examined(b, older)
             candidates += examined
-            pace.observe(
+            throttle.observe(
                 keyframe.distance, Verdict.ACCEPTED if any(c.is_accepted for c in examined) else Verdict.REJECTED
             )
         return candidates
 
     def _examined(self, b: int, older: NDArray[np.int64]) -> list[LoopCandidate]:
-        """Keyframe `b` against those of the `older` ones that look alike, with verdicts."""
+        """Keyframe `b` verified against the similar ones of the `older`, with verdicts."""
         alike, fallback = self._choose(b, older)
-        examined = settle([self._examine(match, b) for match in alike], self.keyframes, self._reach_between)
+        examined = resolve_ambiguity([self._examine(match, b) for match in alike], self.keyframes, self._reach_between)
         if fallback is not None and not any(c.is_accepted or c.stage == LoopStage.AMBIGUITY for c in examined):
             examined.append(self._examine(fallback, b))
         return examined
 
     def _level_world(self) -> None:
-        """Turn the world so that z is up: places are compared from above. Relative poses stay as they are."""
+        """Rotate the world so that z is up, as BEV correlation needs. Relative poses stay."""
         shown = np.unique(np.linspace(0, len(self.keyframes) - 1, LOOKS).round().astype(int))
-        up = find_up([make_place(self._level(int(number)), self.registration).fine for number in shown])
+        up = find_up([make_level_submap(self._level(int(number)), self.registration).fine for number in shown])
         self.keyframes = levelled(self.keyframes, up)
-        self.doubt = OdometryDoubt(self.keyframes, self.config.drift_percent, self.config.drift_deg)
+        self.uncertainty = OdometryUncertainty(self.keyframes, self.config.drift_percent, self.config.drift_deg)
 
     def _gated(self, b: int) -> NDArray[np.int64]:
-        """Older keyframes that odometry allows to be the same place as `b`: near it, but not on the way just travelled."""
-        travelled = self.doubt.distances[b] - self.doubt.distances[:b]
+        """Older keyframes within the gate of odometry about `b`, but not on the way just travelled."""
+        travelled = self.uncertainty.distances[b] - self.uncertainty.distances[:b]
         older: NDArray[np.int64] = np.flatnonzero(travelled >= self.config.min_travel)
         if len(older) == 0:
             return older
-        away = np.linalg.norm(self.doubt.positions[older] - self.doubt.positions[b], axis=1)
+        away = np.linalg.norm(self.uncertainty.positions[older] - self.uncertainty.positions[b], axis=1)
         if self.config.radius is not None:
             return np.asarray(older[away <= self.config.radius])
-        limit = NEAR + self.config.sigmas * self.doubt.between(b, older[:1]).reach[0]
+        limit = NEAR + self.config.sigmas * self.uncertainty.between(b, older[:1]).reach[0]
         older, away = older[away <= limit], away[away <= limit]
-        reach = self.doubt.between(b, older).reach
+        reach = self.uncertainty.between(b, older).reach
         return np.asarray(older[away <= NEAR + self.config.sigmas * reach])
 
     def _thinned(self, older: NDArray[np.int64], b: int, wait: float) -> LoopCandidate:
@@ -166,29 +169,29 @@ class Detector:
         return LoopCandidate(a, b, self._away(a, b), float("nan"), Verdict.REJECTED, LoopStage.THINNED, said)
 
     def _nearest(self, older: NDArray[np.int64], b: int) -> int:
-        away = np.linalg.norm(self.doubt.positions[older] - self.doubt.positions[b], axis=1)
+        away = np.linalg.norm(self.uncertainty.positions[older] - self.uncertainty.positions[b], axis=1)
         return int(older[away.argmin()])
 
     def _away(self, a: int, b: int) -> float:
-        return float(np.linalg.norm(self.doubt.positions[b] - self.doubt.positions[a]))
+        return float(np.linalg.norm(self.uncertainty.positions[b] - self.uncertainty.positions[a]))
 
     def _choose(self, b: int, older: NDArray[np.int64]) -> tuple[list[PlaceMatch], PlaceMatch | None]:
-        """The candidates worth a registration, and one more to fall back on.
+        """The candidates to verify, and a fallback.
 
-        Where odometry is nearly certain, its nearest is the one, and what looks alike the other. Elsewhere it is the other
-        way round, and all that look nearly as much alike must be asked, lest they fit as well.
+        Where odometry is nearly certain, its nearest is the candidate and the most similar the fallback. Elsewhere it is the
+        other way round, and all that are nearly as similar are verified, since an ambiguous one must be rejected.
         """
         near = self._nearest(older, b)
         reach = self._reach_between(near, b)
         is_certain = reach < NEAR
         if is_certain:
-            away = np.linalg.norm(self.doubt.positions[older] - self.doubt.positions[b], axis=1)
+            away = np.linalg.norm(self.uncertainty.positions[older] - self.uncertainty.positions[b], axis=1)
             older = older[away <= away.min() + reach]
         older = older[self._is_described[older] | (older == near)]
         for number in (b, *older):
             if int(number) not in self.index:
                 self.index.add(int(number), self._level(int(number)))
-        turn = self._turn(self.doubt.between(b, older[:1]))
+        turn = self._turn(self.uncertainty.between(b, older[:1]))
         matches = self.index.nearest(b, older, turn)
         by_odometry = next((m for m in matches if m.number == near), PlaceMatch(near, float("nan"), 0.0))
         limit = min(self.config.max_descriptor_distance, RIVAL * matches[0].distance)
@@ -198,7 +201,7 @@ class Detector:
         return chosen, far[0] if far else None
 
     def _apart(self, matches: list[PlaceMatch]) -> list[PlaceMatch]:
-        """The first few of which none lies near another."""
+        """The first few matches, none near another."""
         kept: list[PlaceMatch] = []
         for match in matches:
             if len(kept) < RIVALS and all(self._away(match.number, k.number) > NEAR for k in kept):
@@ -206,15 +209,15 @@ class Detector:
         return kept
 
     def _examine(self, match: PlaceMatch, b: int) -> LoopCandidate:
-        """Register keyframe `b` on the match and judge what comes of it."""
+        """Verify the loop of keyframe `b` with the match."""
         a = match.number
-        doubt = self.doubt.between(b, np.array([a]))
-        expected = self.doubt.positions[b] - self.doubt.positions[a]
-        yaws = self._yaws(match, self._turn(doubt))
-        found = self.verifier.compare(self._place(a), self._place(b), expected, self._reach(doubt), yaws)
+        uncertainty = self.uncertainty.between(b, np.array([a]))
+        expected = self.uncertainty.positions[b] - self.uncertainty.positions[a]
+        yaws = self._yaws(match, self._turn(uncertainty))
+        found = self.verifier.verify(self._submap(a), self._submap(b), expected, self._reach(uncertainty), yaws)
         stage, reason = found.stage, found.reason
         if not reason:
-            reason = self._beyond(found, expected, doubt)
+            reason = self._beyond(found, expected, uncertainty)
             stage = LoopStage.GATE if reason else stage
         return LoopCandidate(
             a, b, self._away(a, b), match.distance, Verdict.REJECTED if reason else Verdict.ACCEPTED, stage, reason, found.rmse,
@@ -222,43 +225,43 @@ class Detector:
         )  # fmt: skip
 
     def _reach_between(self, older: int, newer: int) -> float:
-        """m that odometry may be wrong by between two keyframes."""
-        return self._reach(self.doubt.between(newer, np.array([older])))
+        """m, gate of odometry between two keyframes."""
+        return self._reach(self.uncertainty.between(newer, np.array([older])))
 
-    def _reach(self, doubt: Doubt) -> float:
-        """m that the place may lie from where odometry has it."""
+    def _reach(self, uncertainty: RelativeUncertainty) -> float:
+        """m, gate on the position."""
         if self.config.radius is not None:
             return self.config.radius
-        return max(self.config.sigmas * float(doubt.reach[0]), LEAST_REACH)
+        return max(self.config.sigmas * float(uncertainty.reach[0]), LEAST_REACH)
 
-    def _turn(self, doubt: Doubt) -> float:
-        """rad that odometry's heading may be wrong by."""
-        return max(self.config.sigmas * float(doubt.turn[0]), float(LEAST_TURN))
+    def _turn(self, uncertainty: RelativeUncertainty) -> float:
+        """rad, gate on the heading."""
+        return max(self.config.sigmas * float(uncertainty.turn[0]), float(LEAST_TURN))
 
     def _yaws(self, match: PlaceMatch, turn: float) -> Floats:
-        """rad, turns of the newer place in the older worth a try."""
+        """rad, headings of the newer submap in the older to search."""
         centre, spread = (0.0, turn) if turn <= WIDEST_TURN else (match.yaw, self.index.yaw_error + TURN_STEP)
         count = int(np.ceil(spread / TURN_STEP))
         return np.asarray(centre + TURN_STEP * np.arange(-count, count + 1))
 
-    def _beyond(self, found: Comparison, expected: Floats, doubt: Doubt) -> str:
-        """Why odometry does not allow the pose that registration found, or nothing."""
+    def _beyond(self, found: Verification, expected: Floats, uncertainty: RelativeUncertainty) -> str:
+        """Why the pose found lies outside the gate of odometry; empty inside."""
         assert found.T_a_b is not None
         shift = found.T_a_b[:3, 3] - expected
         turn = float(so3.angle(found.T_a_b[:3, :3]))
-        if turn > self._turn(doubt):
+        if turn > self._turn(uncertainty):
             return f"odometry would be wrong by {np.rad2deg(turn):.1f} deg"
         if self.config.radius is not None:
             sigmas = self.config.sigmas * float(np.linalg.norm(shift)) / self.config.radius
         else:
             least = (LEAST_REACH / self.config.sigmas) ** 2 * np.eye(3)
-            sigmas = float(np.sqrt(shift @ np.linalg.solve(doubt.position[0] + least, shift)))
+            sigmas = float(np.sqrt(shift @ np.linalg.solve(uncertainty.position[0] + least, shift)))
         if sigmas > self.config.sigmas:
             return f"odometry would be wrong by {np.linalg.norm(shift):.1f} m"
         return ""
 
-    def _constraint(self, a: int, b: int, found: Comparison) -> Constraint | None:
-        """The pose that was found and covariance, from level axes to those of the keyframes."""
+    def _constraint(self, a: int, b: int, found: Verification) -> Constraint | None:
+        """Pose and covariance of the loop closure, from level axes to those of the keyframes."""
         if found.T_a_b is None or found.covariance is None:
             return None
         R_a, R_b = (self.keyframes[k].T_world_lidar[:3, :3] for k in (a, b))
@@ -266,14 +269,14 @@ class Detector:
         turn = np.kron(np.eye(2), R_a.T)
         return Constraint(a, b, T, turn @ found.covariance @ turn.T)
 
-    def _place(self, number: int) -> Place:
-        """The submap about a keyframe, ready to be compared; the last few are kept."""
-        if number not in self._places:
-            self._places[number] = make_place(self._level(number), self.registration)
-            if len(self._places) > KEPT:
-                self._places.popitem(last=False)
-        self._places.move_to_end(number)
-        return self._places[number]
+    def _submap(self, number: int) -> LevelSubmap:
+        """The level submap about a keyframe, from a cache of the last few."""
+        if number not in self._submaps:
+            self._submaps[number] = make_level_submap(self._level(number), self.registration)
+            if len(self._submaps) > KEPT:
+                self._submaps.popitem(last=False)
+        self._submaps.move_to_end(number)
+        return self._submaps[number]
 
     def _level(self, number: int) -> Points:
         """The submap about a keyframe in the axes of the world."""

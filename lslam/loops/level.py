@@ -1,4 +1,4 @@
-"""Which way is up, where the world of odometry is as tilted as the sensor was at the first scan."""
+"""The vertical in the world of odometry, which is as tilted as the sensor was at the first scan."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from lslam.types.keyframe import Keyframe
 
 Floats = NDArray[np.float64]
 
-# Cosines: surfaces tilted by less against what is known of up so far are taken for ground, floors and flat roofs.
+# Cosines: surfaces tilted by less against the estimate so far are taken for ground, floors and flat roofs.
 ROUNDS = tuple(float(np.cos(np.deg2rad(limit))) for limit in (45.0, 30.0, 20.0, 15.0, 15.0))
 
 
 def find_up(maps: Iterable[GaussianMap]) -> Floats:
-    """(3,) unit vector: the mean normal of what lies nearly level, closer from round to round; z when nothing does."""
+    """(3,) unit vector: the mean normal of nearly horizontal planes, with a tighter limit each round; z without any."""
     planes = [m.planes[m.planes[:, 7] >= 0, 3:6] for m in maps]
     normals = np.concatenate([*planes, np.zeros((0, 3))])
     up = np.array([0.0, 0.0, 1.0])

@@ -1,4 +1,4 @@
-"""Where one place may lie in another: all shifts and turns that odometry allows, seen from above."""
+"""Initial guesses of a loop's registration: BEV correlation over all shifts and headings within odometry's gate."""
 
 from __future__ import annotations
 
@@ -9,54 +9,56 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.geometry import se3, so3
-from lslam.loops.place import Place
-from lslam.loops.raster import CELL, Image, Raster, blurred, correlate, spectrum
+from lslam.loops.bev_correlation import CELL, BevGrid, Image, blurred, correlate, spectrum
+from lslam.loops.level_submap import LevelSubmap
 
 Floats = NDArray[np.float64]
 
 # Cells; the smaller image serves where the search is short.
-SMALL, LARGE = Raster(128), Raster(256)
-# m round a place that is compared, at most and at least; the rest of the image is room for the shift.
+SMALL, LARGE = BevGrid(128), BevGrid(256)
+# m, radius of the compared window, at most and at least; the rest of the image is room for the shift.
 WIDEST, NARROWEST = 60.0, 40.0
-# Of what stands in the window, this share must lie where the other place was seen.
+# Least share of the window's non-ground cells that lie where the other submap was observed.
 SHARED = 0.25
-# m between two starts, how well the next must fit of the best, and how many there are at most.
+# m between two guesses, the least score relative to the best, and how many there are at most.
 APART, NEARLY, STARTS = 4.0, 0.7, 5
 
 
 @dataclass(frozen=True)
-class Start:
-    """A guess: T_a_b (4, 4), level axes, and how well it fits, 0 to 1."""
+class InitialGuess:
+    """Initial guess T_a_b (4, 4), level axes, and its normalised correlation, 0 to 1."""
 
     T_a_b: Floats
     score: float
 
 
-def find_starts(a: Place, b: Place, expected: Floats, reach: float, yaws: Iterable[float]) -> list[Start]:
-    """The best fits of b in a within `reach` m of `expected` (3,), for yaws (rad) of b in a, best first; perhaps none.
+def find_initial_guesses(
+    a: LevelSubmap, b: LevelSubmap, expected: Floats, reach: float, yaws: Iterable[float]
+) -> list[InitialGuess]:
+    """Maxima of the correlation of b in a within `reach` m of `expected` (3,), for yaws (rad) of b in a, best first.
 
-    Both are seen from above: do things stand in the same cells? What the other did not see counts neither for nor
-    against, or else the shift that covers most would win. Each correlation of all shifts is a Fourier transform.
+    The correlation is normalised over the cells that both observed, or else the shift with most overlap would win. All
+    shifts of one heading are correlated by FFT. Empty without non-ground points.
     """
     far = float(np.linalg.norm(expected[:2])) + reach
-    raster = SMALL if far + NARROWEST <= SMALL.size * CELL / 2 else LARGE
-    window = min(raster.size * CELL / 2 - far, WIDEST)
-    image = blurred(raster.heights(a.standing))
-    A, A2, A_seen = spectrum(image), spectrum(image**2), spectrum(raster.cover(a.standing, a.floor))
-    near, floor = (p[(p[:, :2] ** 2).sum(axis=1) < max(window, NARROWEST) ** 2] for p in (b.standing, b.floor))
+    grid = SMALL if far + NARROWEST <= SMALL.size * CELL / 2 else LARGE
+    window = min(grid.size * CELL / 2 - far, WIDEST)
+    image = blurred(grid.heights(a.non_ground))
+    A, A2, A_seen = spectrum(image), spectrum(image**2), spectrum(grid.cover(a.non_ground, a.ground))
+    near, floor = (p[(p[:, :2] ** 2).sum(axis=1) < max(window, NARROWEST) ** 2] for p in (b.non_ground, b.ground))
     best, turn = np.zeros_like(image), np.zeros_like(image)
     for yaw in yaws:
         R = so3.exp(np.array([0.0, 0.0, yaw]))
-        turned = raster.heights(near @ R.T)
-        own = correlate(A_seen, spectrum(turned**2), raster.size)
-        other = correlate(A2, spectrum(raster.cover(near @ R.T, floor @ R.T)), raster.size)
-        score = correlate(A, spectrum(turned), raster.size) / np.sqrt(np.maximum(own * other, 1.0))
+        turned = grid.heights(near @ R.T)
+        own = correlate(A_seen, spectrum(turned**2), grid.size)
+        other = correlate(A2, spectrum(grid.cover(near @ R.T, floor @ R.T)), grid.size)
+        score = correlate(A, spectrum(turned), grid.size) / np.sqrt(np.maximum(own * other, 1.0))
         score[own < SHARED * max(float((turned**2).sum()), 1.0)] = 0.0
         better = score > best
         best, turn = np.where(better, score, best), np.where(better, np.float32(yaw), turn)
     return [
-        Start(_pose(raster, a, b, shift, yaw, float(expected[2])), score)
-        for shift, yaw, score in _peaks(raster.shifts(), best, turn, expected, reach)
+        InitialGuess(_pose(grid, a, b, shift, yaw, float(expected[2])), score)
+        for shift, yaw, score in _peaks(grid.shifts(), best, turn, expected, reach)
     ]
 
 
@@ -65,7 +67,7 @@ def _peaks(
 ) -> list[tuple[Floats, float, float]]:
     """Shift (2,) m, yaw and score of the best cells within reach, none near another.
 
-    Not only of the local maxima: along a ridge, as a street makes it, other places may fit as well as the top.
+    Not only local maxima: along a ridge, as of a street, other cells score as well as the maximum.
     """
     away2 = (shifts[:, None] - expected[0]) ** 2 + (shifts[None, :] - expected[1]) ** 2
     left = np.where(away2 <= max(reach, CELL) ** 2, score, np.float32(0))
@@ -78,10 +80,10 @@ def _peaks(
     return found
 
 
-def _pose(raster: Raster, a: Place, b: Place, shift: Floats, yaw: float, expected_z: float) -> Floats:
-    """(4, 4) with the climb that the floors in common tell, their median difference; `expected_z` without any."""
+def _pose(grid: BevGrid, a: LevelSubmap, b: LevelSubmap, shift: Floats, yaw: float, expected_z: float) -> Floats:
+    """(4, 4) with the median height difference of the ground in common; `expected_z` without any."""
     R = so3.exp(np.array([0.0, 0.0, yaw]))
-    low_a, low_b = raster.lowest(a.floor), raster.lowest(b.floor @ R.T + np.array([*shift, 0.0]))
+    low_a, low_b = grid.lowest(a.ground), grid.lowest(b.ground @ R.T + np.array([*shift, 0.0]))
     both = np.isfinite(low_a) & np.isfinite(low_b)
     climb = float(np.median(low_a[both] - low_b[both])) if both.any() else expected_z
     return se3.make(R, np.array([*shift, climb]))

@@ -1,4 +1,4 @@
-"""Whether two submaps show the same place: registration both ways, from every start that fits."""
+"""Verification of loop candidates: registration both ways, from every initial guess, with tests of the result."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from lslam.config.loops import LoopsConfig
 from lslam.config.registration import RegistrationConfig
 from lslam.geometry import se3, so3
-from lslam.loops.place import Place
-from lslam.loops.search import LARGE, SHARED, find_starts
+from lslam.loops.level_submap import LevelSubmap
+from lslam.loops.search import LARGE, SHARED, find_initial_guesses
 from lslam.preprocessing.prepare import PreparedPoints, thin
 from lslam.registration.robust import Annealing
 from lslam.registration.solver import RegistrationResult, solve
@@ -21,15 +21,15 @@ from lslam.types.constraint import LoopStage
 Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
-# Every so many-th point tells the good starts from the bad ones.
+# Every so many-th source point serves to rank the initial guesses.
 FEW = 4
-# m; widths of the kernel: where starts are caught, and within which residuals are judged.
+# m; kernel widths: at an initial guess, and for rmse and overlap.
 CATCH, JUDGED = 2.5, 1.0
 
 
 @dataclass(frozen=True)
-class Comparison:
-    """What came of comparing two places.
+class Verification:
+    """The result of verifying one loop candidate.
 
     stage : that decided; reason : why it was rejected, empty when accepted
     T_a_b : (4, 4) in level axes; covariance : (6, 6), level axes of a; None when nothing was registered
@@ -42,40 +42,42 @@ class Comparison:
     rmse: float = float("nan")
     overlap: float = float("nan")
 
-    def rejected(self, stage: LoopStage, reason: str) -> Comparison:
-        """The same, refused."""
+    def rejected(self, stage: LoopStage, reason: str) -> Verification:
+        """The same, rejected."""
         return replace(self, stage=stage, reason=reason)
 
 
 class Verifier:
-    """Compares places as `loops` and `registration` of the configuration say."""
+    """Verifies loop candidates by the sections `loops` and `registration` of the configuration."""
 
     def __init__(self, config: LoopsConfig, registration: RegistrationConfig) -> None:
         self.config, self.registration = config, registration
 
-    def compare(self, a: Place, b: Place, expected: Floats, reach: float, yaws: Iterable[float]) -> Comparison:
+    def verify(
+        self, a: LevelSubmap, b: LevelSubmap, expected: Floats, reach: float, yaws: Iterable[float]
+    ) -> Verification:
         """Register b in a: T_a_b in level axes, within `reach` m of `expected` (3,), at one of `yaws` (rad) or near it."""
-        starts = find_starts(a, b, expected, reach, yaws)
+        starts = find_initial_guesses(a, b, expected, reach, yaws)
         if not starts:
-            return Comparison(LoopStage.OVERLAP, "nothing stands up there")
-        seen = LARGE.cover(a.standing, a.floor).ravel() > 0
+            return Verification(LoopStage.OVERLAP, "nothing stands up there")
+        seen = LARGE.cover(a.non_ground, a.ground).ravel() > 0
         tried = sorted((self._try(a, b, seen, start.T_a_b) for start in starts), key=lambda found: -found[0])
         support, rough = tried[0]
-        rivals = [(s, T) for s, T in tried[1:] if _is_elsewhere(rough, T)]
+        others = [(s, T) for s, T in tried[1:] if _is_elsewhere(rough, T)]
         forward = self._refine(a, b, rough)
         facts = self._judge(a, b, forward)
         if facts.reason:
             return facts
-        if rivals and rivals[0][0] > self.config.max_ambiguity * support:
-            away = float(np.linalg.norm(rivals[0][1][:3, 3] - rough[:3, 3]))
+        if others and others[0][0] > self.config.max_ambiguity * support:
+            away = float(np.linalg.norm(others[0][1][:3, 3] - rough[:3, 3]))
             return facts.rejected(
-                LoopStage.AMBIGUITY, f"{away:.1f} m away it fits {rivals[0][0] / support:.0%} as well"
+                LoopStage.AMBIGUITY, f"{away:.1f} m away it fits {others[0][0] / support:.0%} as well"
             )
         backward = self._refine(b, a, se3.inverse(rough))
         return self._agree(facts, forward, backward)
 
-    def _try(self, a: Place, b: Place, seen: Flags, start: Floats) -> tuple[float, Floats]:
-        """Where registration leads from a start, and how much of what stands up lies on surfaces then, 0 to 1."""
+    def _try(self, a: LevelSubmap, b: LevelSubmap, seen: Flags, start: Floats) -> tuple[float, Floats]:
+        """Inlier share of the upright points after registration from `start`, 0 to 1, and the pose found."""
         r = self.registration
         few = thin(b.source, FEW)
         slow = Annealing(CATCH, r.kernel_max / 2, r.coarse_decay, self.config.max_iterations)
@@ -83,13 +85,13 @@ class Verifier:
         fine = self._solve(a, few, coarse.T_world_lidar, Annealing(r.kernel_max, r.kernel_min, 0.7, 15))
         return self._support(a, b.upright, seen, fine.T_world_lidar), fine.T_world_lidar
 
-    def _refine(self, a: Place, b: Place, start: Floats) -> RegistrationResult:
+    def _refine(self, a: LevelSubmap, b: LevelSubmap, start: Floats) -> RegistrationResult:
         r = self.registration
         annealing = Annealing(r.kernel_max, r.kernel_min, r.kernel_decay, self.config.max_iterations)
         return self._solve(a, b.source, start, annealing)
 
     def _solve(
-        self, a: Place, points: PreparedPoints, start: Floats, annealing: Annealing, *, coarse_only: bool = False
+        self, a: LevelSubmap, points: PreparedPoints, start: Floats, annealing: Annealing, *, coarse_only: bool = False
     ) -> RegistrationResult:
         r = self.registration
         return solve(
@@ -97,25 +99,25 @@ class Verifier:
             sigma=r.sigma, blob_weight=r.blob_weight, weak_share=r.weak_share,
         )  # fmt: skip
 
-    def _support(self, a: Place, upright: PreparedPoints, seen: Flags, T_a_b: Floats) -> float:
-        """Of the points in cells of a that were seen: their number depends on the shift, their share does not."""
+    def _support(self, a: LevelSubmap, upright: PreparedPoints, seen: Flags, T_a_b: Floats) -> float:
+        """Inlier share among the points in cells that a observed: unlike their number, it does not depend on the shift."""
         cells, inside = LARGE.cells_of(se3.apply(T_a_b, upright.source))
         comparable = int((inside & seen[cells]).sum())
         width = 2 * self.registration.kernel_min
         inliers = self._solve(a, upright, T_a_b, Annealing(width, width, 0.5, 1)).inliers
         return 0.0 if comparable < SHARED * len(upright.source) else inliers / comparable
 
-    def _judge(self, a: Place, b: Place, found: RegistrationResult) -> Comparison:
-        """Of a registration by itself: rmse, what it observes, overlap both ways."""
+    def _judge(self, a: LevelSubmap, b: LevelSubmap, found: RegistrationResult) -> Verification:
+        """Tests of a registration by itself: degeneracy, rmse, overlap both ways."""
         c = self.config
         if not found.ok or found.covariance is None:
-            return Comparison(LoopStage.REGISTRATION, found.reason or "nothing matches")
+            return Verification(LoopStage.REGISTRATION, found.reason or "nothing matches")
         T = found.T_world_lidar
         there = self._solve(a, b.source, T, Annealing(JUDGED, JUDGED, 0.5, 1))
         back = self._solve(b, a.source, se3.inverse(T), Annealing(JUDGED, JUDGED, 0.5, 1))
         overlap = min(there.overlap, back.overlap)
         rmse = max(there.rmse, back.rmse)
-        facts = Comparison(LoopStage.REGISTRATION, "", T, found.covariance, rmse, overlap)
+        facts = Verification(LoopStage.REGISTRATION, "", T, found.covariance, rmse, overlap)
         if len(found.degenerate):
             return facts.rejected(LoopStage.REGISTRATION, "the surfaces do not hold it in every direction")
         if rmse > c.max_rmse:
@@ -124,8 +126,8 @@ class Verifier:
             return facts.rejected(LoopStage.OVERLAP, f"overlap {overlap:.0%}, {c.min_overlap:.0%} needed")
         return facts
 
-    def _agree(self, facts: Comparison, forward: RegistrationResult, backward: RegistrationResult) -> Comparison:
-        """Forward and backward must meet; the closure is no more certain than they differ."""
+    def _agree(self, facts: Verification, forward: RegistrationResult, backward: RegistrationResult) -> Verification:
+        """Forward and backward must agree; their difference is added to the covariance of the loop closure."""
         c = self.config
         if not backward.ok:
             return facts.rejected(LoopStage.AGREEMENT, f"new to old: {backward.reason or 'nothing matches'}")
@@ -136,11 +138,11 @@ class Verifier:
             return facts.rejected(LoopStage.AGREEMENT, said)
         floor = np.diag([c.sigma_m**2] * 3 + [np.deg2rad(c.sigma_deg) ** 2] * 3)
         assert forward.covariance is not None
-        doubt = np.diag([move**2 / 3] * 3 + [turn**2 / 3] * 3)
-        covariance = forward.covariance + floor + doubt
-        # Half way between what the two say.
+        disagreement = np.diag([move**2 / 3] * 3 + [turn**2 / 3] * 3)
+        covariance = forward.covariance + floor + disagreement
+        # The mean of both.
         T = se3.exp(-0.5 * gap) @ forward.T_world_lidar
-        return Comparison(LoopStage.AGREEMENT, "", se3.normalise(T), covariance, facts.rmse, facts.overlap)
+        return Verification(LoopStage.AGREEMENT, "", se3.normalise(T), covariance, facts.rmse, facts.overlap)
 
 
 def _is_elsewhere(T: Floats, other: Floats) -> bool:

@@ -121,7 +121,7 @@ def test_nothing_comes_of_a_sensor_carried_to_another_town() -> None:
     assert accepted(detect(world, true, odometry)) == []
 
 
-def test_odometry_that_excludes_the_truth_is_believed() -> None:
+def test_a_gate_that_excludes_the_truth_rejects() -> None:
     true = np.array([round_the_square(d) for d in np.arange(0, 390, 5.0)])
     odometry = drifted(true)
     odometry[60:, 0, 3] += 30.0

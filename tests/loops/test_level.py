@@ -11,7 +11,7 @@ from known_town import keyframes_of, pose, round_the_square, seen, town
 from lslam.config.registration import RegistrationConfig
 from lslam.geometry import se3, so3
 from lslam.loops.level import find_up, levelled
-from lslam.loops.place import make_place
+from lslam.loops.level_submap import make_level_submap
 
 
 @pytest.mark.parametrize("tilt", [(0, 0), (25, 0), (-15, 30)])
@@ -19,13 +19,13 @@ def test_finds_up_in_a_tilted_world(tilt: tuple[float, float]) -> None:
     R = pose(0, 0, roll_deg=tilt[0], pitch_deg=tilt[1])[:3, :3]
     world, rng = town(), np.random.default_rng(0)
     clouds = [seen(world, pose(x, -45), rng) for x in (-20.0, 15.0)]
-    maps = [make_place((cloud @ R.T).astype(np.float32), RegistrationConfig()).fine for cloud in clouds]
+    maps = [make_level_submap((cloud @ R.T).astype(np.float32), RegistrationConfig()).fine for cloud in clouds]
     assert np.rad2deg(np.arccos(find_up(maps) @ R[:, 2])) < 1.0
 
 
 def test_up_stays_z_where_nothing_is_level() -> None:
     assert (find_up([]) == (0, 0, 1)).all()
-    empty = make_place(np.zeros((0, 3), np.float32), RegistrationConfig()).fine
+    empty = make_level_submap(np.zeros((0, 3), np.float32), RegistrationConfig()).fine
     assert (find_up([empty]) == (0, 0, 1)).all()
 
 

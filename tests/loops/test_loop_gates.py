@@ -15,14 +15,14 @@ from lslam.config.registration import RegistrationConfig
 from lslam.errors import ConfigError
 from lslam.geometry import se3, so3
 from lslam.loops.detector import LEAST_REACH, TURN_STEP, WIDEST_TURN, Detector
-from lslam.loops.doubt import Doubt
+from lslam.loops.gating import RelativeUncertainty
 from lslam.loops.scan_context import PlaceMatch
-from lslam.loops.verify import Comparison, Verifier, _is_elsewhere
+from lslam.loops.verify import Verification, Verifier, _is_elsewhere
 from lslam.registration.solver import RegistrationResult
 
 Floats = NDArray[np.float64]
 # Sigmas of odometry: 2 m along x, 0.5 m across, and three degrees.
-DOUBT = Doubt(np.diag([4.0, 0.25, 0.25])[None], np.deg2rad([3.0]))
+UNCERTAINTY = RelativeUncertainty(np.diag([4.0, 0.25, 0.25])[None], np.deg2rad([3.0]))
 EXPECTED = np.array([10.0, 0.0, 0.0])
 
 
@@ -33,9 +33,9 @@ def detector(**settings: float) -> Detector:
     )  # type: ignore[arg-type]
 
 
-def found(shift: tuple[float, float], turn_deg: float = 0.0) -> Comparison:
+def found(shift: tuple[float, float], turn_deg: float = 0.0) -> Verification:
     R = so3.exp(np.array([0, 0, np.deg2rad(turn_deg)]))
-    return Comparison("agreement", "", se3.make(R, EXPECTED + np.array([*shift, 0.0])), np.diag([1.0, 2, 3, 4, 5, 6]))
+    return Verification("agreement", "", se3.make(R, EXPECTED + np.array([*shift, 0.0])), np.diag([1.0, 2, 3, 4, 5, 6]))
 
 
 @pytest.mark.parametrize(
@@ -52,7 +52,7 @@ def found(shift: tuple[float, float], turn_deg: float = 0.0) -> Comparison:
 def test_a_pose_beyond_three_sigmas_of_odometry_is_none(shift: tuple[float, float], turn_deg: float, said: str) -> None:
     """`LEAST_REACH` is 1 m at three sigmas: it adds 1/9 m2 to the variances."""
     assert LEAST_REACH == 1.0
-    assert detector()._beyond(found(shift, turn_deg), EXPECTED, DOUBT) == said
+    assert detector()._beyond(found(shift, turn_deg), EXPECTED, UNCERTAINTY) == said
 
 
 @pytest.mark.parametrize(
@@ -63,7 +63,7 @@ def test_odometry_that_is_sure_of_itself_may_be_wrong_by_a_metre_and_two_degrees
     shift: float, turn_deg: float, is_out: bool
 ) -> None:
     """Two registrations of one place differ by as much."""
-    sure = Doubt(1e-8 * np.eye(3)[None], np.array([1e-8]))
+    sure = RelativeUncertainty(1e-8 * np.eye(3)[None], np.array([1e-8]))
     gate = detector()
     assert bool(gate._beyond(found((0.0, shift), turn_deg), EXPECTED, sure)) == is_out
     assert gate._reach(sure) == 1.0
@@ -72,9 +72,9 @@ def test_odometry_that_is_sure_of_itself_may_be_wrong_by_a_metre_and_two_degrees
 
 def test_a_radius_is_the_limit_in_every_direction() -> None:
     gate = detector(radius=3.0)
-    assert gate._reach(DOUBT) == 3.0
+    assert gate._reach(UNCERTAINTY) == 3.0
     for shift, said in (((0.0, 2.9), ""), ((2.9, 0.0), ""), ((3.1, 0.0), "odometry would be wrong by 3.1 m")):
-        assert gate._beyond(found(shift), EXPECTED, DOUBT) == said
+        assert gate._beyond(found(shift), EXPECTED, UNCERTAINTY) == said
 
 
 def test_turns_that_are_tried_are_odometrys_or_else_the_descriptors() -> None:
@@ -92,7 +92,7 @@ def test_a_constraint_is_in_the_axes_of_the_keyframes() -> None:
     assert constraint is not None
     np.testing.assert_allclose(constraint.T_a_b, se3.make(np.eye(3), np.array([0.0, -10.0, 0.0])), atol=1e-12)
     np.testing.assert_allclose(constraint.covariance, np.diag([2.0, 1, 3, 5, 4, 6]), atol=1e-12)
-    assert detector()._constraint(0, 1, Comparison("overlap", "nothing stands up there")) is None
+    assert detector()._constraint(0, 1, Verification("overlap", "nothing stands up there")) is None
 
 
 FORWARD = RegistrationResult(pose(3, 1, 20), covariance=np.diag([1e-4] * 3 + [1e-6] * 3))
@@ -126,7 +126,7 @@ def alike(distances: list[float], apart: float = 20.0, **settings: float) -> lis
     return chosen(distances, [apart * k for k in range(len(distances))], **settings)[0]
 
 
-def test_places_half_as_much_again_unlike_the_best_are_no_rivals() -> None:
+def test_descriptors_half_as_far_again_as_the_best_are_no_candidates() -> None:
     """Odometry is lost after a kilometre, so that looks decide: what looks nearly as much alike must be asked too."""
     assert alike([0.20, 0.10, 0.145, 0.155]) == [1, 2]
     assert alike([0.11, 0.10, 0.12, 0.13]) == [1, 0, 2]
@@ -151,11 +151,11 @@ def test_one_keyframe_stands_for_four_metres_of_the_way() -> None:
 @pytest.mark.parametrize(("shift", "stage"), [(0.5, "agreement"), (60.0, "gate")])
 def test_what_fits_and_is_too_far_from_odometry_is_refused_by_the_gate(shift: float, stage: str) -> None:
     gate = detector()
-    gate.doubt.between = lambda b, older: DOUBT  # type: ignore[method-assign]
-    gate._place = lambda number: None  # type: ignore[assignment, method-assign, return-value]
+    gate.uncertainty.between = lambda b, older: UNCERTAINTY  # type: ignore[method-assign]
+    gate._submap = lambda number: None  # type: ignore[assignment, method-assign, return-value]
 
     class Finds:
-        def compare(self, a: object, b: object, expected: Floats, reach: float, yaws: Floats) -> Comparison:
+        def verify(self, a: object, b: object, expected: Floats, reach: float, yaws: Floats) -> Verification:
             return replace(found((0, 0)), T_a_b=se3.make(np.eye(3), expected + np.array([shift, 0, 0])))
 
     gate.verifier = Finds()  # type: ignore[assignment]
@@ -165,10 +165,10 @@ def test_what_fits_and_is_too_far_from_odometry_is_refused_by_the_gate(shift: fl
     assert bool(candidate.reason) == (stage == "gate")
 
 
-def agree(gap: tuple[float, ...], **settings: float) -> Comparison:
+def agree(gap: tuple[float, ...], **settings: float) -> Verification:
     """Two registrations that differ by the twist `gap`."""
     backward = RegistrationResult(se3.inverse(se3.exp(-np.array(gap)) @ FORWARD.T_world_lidar))
-    return Verifier(LoopsConfig(**settings), RegistrationConfig())._agree(Comparison("overlap"), FORWARD, backward)  # type: ignore[arg-type]
+    return Verifier(LoopsConfig(**settings), RegistrationConfig())._agree(Verification("overlap"), FORWARD, backward)  # type: ignore[arg-type]
 
 
 def test_a_closure_lies_half_way_and_is_no_surer_than_the_two_differ() -> None:
@@ -200,9 +200,9 @@ def test_registrations_that_differ_close_nothing(gap: tuple[float, ...], is_said
 def test_a_way_back_that_is_not_found_is_said() -> None:
     verifier = Verifier(LoopsConfig(), RegistrationConfig())
     lost = RegistrationResult(se3.inverse(FORWARD.T_world_lidar), ok=False, reason="only 3 points match")
-    assert verifier._agree(Comparison("overlap"), FORWARD, lost).reason == "new to old: only 3 points match"
+    assert verifier._agree(Verification("overlap"), FORWARD, lost).reason == "new to old: only 3 points match"
     mute = replace(lost, reason="")
-    assert verifier._agree(Comparison("overlap"), FORWARD, mute).reason == "new to old: nothing matches"
+    assert verifier._agree(Verification("overlap"), FORWARD, mute).reason == "new to old: nothing matches"
 
 
 @pytest.mark.parametrize(

@@ -11,9 +11,9 @@ from lslam.config.loops import LoopsConfig
 from lslam.config.registration import RegistrationConfig
 from lslam.geometry import se3, so3
 from lslam.loops import verify
-from lslam.loops.place import Place, make_place
-from lslam.loops.search import LARGE, _peaks, find_starts
-from lslam.loops.verify import Comparison, Verifier
+from lslam.loops.level_submap import LevelSubmap, make_level_submap
+from lslam.loops.search import LARGE, _peaks, find_initial_guesses
+from lslam.loops.verify import Verification, Verifier
 from lslam.preprocessing.prepare import PreparedPoints
 from lslam.registration.gaussian_map import GaussianMap
 from lslam.registration.solver import RegistrationResult, solve
@@ -22,14 +22,14 @@ Floats = NDArray[np.float64]
 YAWS = np.deg2rad(np.arange(-10, 11, 2.0))
 
 
-def place(world: Floats, at: Floats, seed: int, reach: float = 40.0) -> Place:
+def place(world: Floats, at: Floats, seed: int, reach: float = 40.0) -> LevelSubmap:
     """What is seen from a pose, in level axes with the heading kept: the yaw is what registration has to find."""
-    return make_place(seen(world, at, np.random.default_rng(seed), reach), RegistrationConfig())
+    return make_level_submap(seen(world, at, np.random.default_rng(seed), reach), RegistrationConfig())
 
 
-def compare(a: Place, b: Place, expected: Floats, reach: float, **settings: float) -> Comparison:
+def compare(a: LevelSubmap, b: LevelSubmap, expected: Floats, reach: float, **settings: float) -> Verification:
     config = LoopsConfig.model_validate(settings)
-    return Verifier(config, RegistrationConfig()).compare(a, b, expected, reach, YAWS)
+    return Verifier(config, RegistrationConfig()).verify(a, b, expected, reach, YAWS)
 
 
 @pytest.mark.parametrize(("dx", "dy", "yaw_deg", "climb"), [(0, 0, 0, 0), (5, -3, 7, 0.5), (-8, 2, -9, -1.5)])
@@ -90,7 +90,9 @@ def test_refuses_a_corridor_along_which_nothing_tells() -> None:
 @pytest.mark.parametrize("points", [0, 3, 200])
 def test_survives_places_without_surfaces(points: int) -> None:
     world = town()
-    few = make_place(np.random.default_rng(0).normal(0, 10, (points, 3)).astype(np.float32), RegistrationConfig())
+    few = make_level_submap(
+        np.random.default_rng(0).normal(0, 10, (points, 3)).astype(np.float32), RegistrationConfig()
+    )
     whole = place(world, pose(0, -45), 1)
     for a, b in ((few, whole), (whole, few), (few, few)):
         assert compare(a, b, np.zeros(3), 5.0).reason
@@ -140,11 +142,11 @@ def test_the_search_from_above_tells_shift_turn_and_climb() -> None:
     T_a, T_b = pose(5, -45), pose(11, -48, 8)
     T_b[2, 3] += 4.0
     a, b = place(world, T_a, 1), place(world, T_b, 2)
-    start = find_starts(a, b, np.zeros(3), 12.0, YAWS)[0].T_a_b
+    start = find_initial_guesses(a, b, np.zeros(3), 12.0, YAWS)[0].T_a_b
     assert np.linalg.norm(start[:2, 3] - [6, -3]) < 1.5
     assert abs(start[2, 3] - 4.0) < 0.3
     assert np.rad2deg(np.arctan2(start[1, 0], start[0, 0])) == pytest.approx(8, abs=2.1)
-    near = find_starts(a, b, np.zeros(3), 3.0, YAWS)
+    near = find_initial_guesses(a, b, np.zeros(3), 3.0, YAWS)
     assert all(np.linalg.norm(found.T_a_b[:2, 3]) <= 3.0 for found in near)
 
 
@@ -168,7 +170,7 @@ def test_a_place_knows_what_stands_up() -> None:
     world = np.concatenate([box(5, 5, 8, 8, 6), np.column_stack([flat, np.zeros(len(flat))])])
     at = pose(0, 0)
     made = place(world, at, 1)
-    assert np.abs(made.floor[:, 2] + at[2, 3]).max() < 0.1
+    assert np.abs(made.ground[:, 2] + at[2, 3]).max() < 0.1
     upright = se3.apply(at, made.upright.source)
     assert (np.abs(upright[:, :2] - 9).max(axis=1) < 5).mean() > 0.8
     assert (upright[:, 2] > 5).any()
@@ -183,9 +185,9 @@ def test_a_slope_of_twenty_five_degrees_is_the_steepest_ground(degrees: float, s
     flat = np.mgrid[-15:15:0.1, -15:15:0.1].reshape(2, -1).T
     for axis in ([1.0, 0.0, 0.0], [0.6, -0.8, 0.0]):
         plane = np.column_stack([flat, np.zeros(len(flat))]) @ so3.exp(np.deg2rad(degrees) * np.array(axis)).T
-        made = make_place(plane.astype(np.float32), RegistrationConfig())
+        made = make_level_submap(plane.astype(np.float32), RegistrationConfig())
         # Voxels that the plane hardly touches have no surface, and stand.
-        share = len(made.standing) / (len(made.standing) + len(made.floor))
+        share = len(made.non_ground) / (len(made.non_ground) + len(made.ground))
         assert share == 1.0 if stands else share < 0.4
 
 
@@ -194,8 +196,8 @@ def test_what_stands_supports_a_start_within_two_kernels(metres: float, support:
     """A kernel ends 0.15 m wide: a wall that registration left 30 cm beside the other is not the same."""
     along, up = np.mgrid[-12:12:0.1, 0:6:0.1].reshape(2, -1)
     wall = np.column_stack([along, np.full_like(along, 8.05), up]).astype(np.float32)
-    a, b = (make_place(wall, RegistrationConfig()) for _ in range(2))
-    seen = LARGE.cover(a.standing, a.floor).ravel() > 0
+    a, b = (make_level_submap(wall, RegistrationConfig()) for _ in range(2))
+    seen = LARGE.cover(a.non_ground, a.ground).ravel() > 0
     T = se3.make(np.eye(3), np.array([0.0, metres, 0.0]))
     found = Verifier(LoopsConfig(), RegistrationConfig())._support(a, b.upright, seen, T)
     assert found == pytest.approx(support, abs=0.05)

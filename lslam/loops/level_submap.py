@@ -1,4 +1,4 @@
-"""A submap made ready to be found again: its surfaces, and what of them stands up."""
+"""A submap prepared for loop verification: Gaussian maps, source points, and points split into ground and non-ground."""
 
 from __future__ import annotations
 
@@ -15,37 +15,37 @@ from lslam.registration.gaussian_map import GaussianMap
 Floats = NDArray[np.float64]
 Points = NDArray[np.float32]
 
-# m; larger voxels are for single scans, which are sparse; a submap is not.
+# m; larger voxels serve sparse single scans; a submap is dense.
 LARGEST = 0.8
-# Voxels of a submap that are registered on another, at most.
+# Source points of a submap, at most.
 SOURCE_POINTS = 4000
-# Voxels there is room for at first; a map must have room for as many more as points are added at once.
+# Voxels allocated at first; a map needs room for as many more as points are inserted at once.
 CAPACITY = 1 << 15
-# Planes within 25 degrees of level are ground and ceilings: they fit wherever one is.
+# Cosine; planes within 25 degrees of horizontal are ground and ceilings, which constrain no horizontal shift.
 LEVEL = float(np.cos(np.deg2rad(25)))
 
 
 @dataclass(frozen=True)
-class Place:
-    """What is kept of a submap while it is compared, level axes with z up, origin at its keyframe.
+class LevelSubmap:
+    """A submap in level axes with z up, origin at its keyframe.
 
-    fine, coarse : its surfaces
-    source : means of its voxels, to be registered on another's surfaces; upright : those that are on no level plane
-    standing : (N, 3) m, means of all voxels that are on no level plane; floor : (M, 3) m, of those that are
+    fine, coarse : its Gaussian maps
+    source : means of its voxels, the source points of a registration; upright : those of them on no horizontal plane
+    non_ground : (N, 3) m, means of all voxels on no horizontal plane; ground : (M, 3) m, of those on one
     """
 
     fine: GaussianMap
     coarse: GaussianMap
     source: PreparedPoints
     upright: PreparedPoints
-    standing: Floats
-    floor: Floats
+    non_ground: Floats
+    ground: Floats
 
 
-def make_place(points: Points, config: RegistrationConfig) -> Place:
+def make_level_submap(points: Points, config: RegistrationConfig) -> LevelSubmap:
     """Prepare the points (N, 3), m, of a submap in level axes, z up.
 
-    Voxels with too few points to be matched are no source either: what is seen so thinly will be seen elsewhere next time.
+    Voxels with too few points for a Gaussian give no source points either.
     """
     fine = GaussianMap(
         min(config.voxel_size, LARGEST), min_points=config.min_points, planarity=config.planarity, count_cap=config.count_cap,
@@ -58,7 +58,7 @@ def make_place(points: Points, config: RegistrationConfig) -> Place:
     is_level = (kind[solid] >= 0) & (np.abs(fine.planes[solid, 5]) > LEVEL)
     step = max(int(np.ceil(len(solid) / SOURCE_POINTS)), 1)
     chosen, is_upright = solid[::step], ~is_level[::step]
-    return Place(
+    return LevelSubmap(
         fine,
         fine.coarsen(config.coarse_factor),
         _source(fine, chosen),

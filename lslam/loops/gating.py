@@ -1,4 +1,4 @@
-"""How far odometry may have drifted between two keyframes: what gates loop candidates."""
+"""Gating of loop candidates: the relative uncertainty of two keyframes by odometry."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Doubt:
-    """Uncertainty of one keyframe's pose as seen from others.
+class RelativeUncertainty:
+    """Uncertainty of one keyframe's pose relative to others.
 
     position : (C, 3, 3) m2, world axes; turn : (C,) rad, standard deviation of the rotation
     """
@@ -30,13 +30,13 @@ class Doubt:
         return np.asarray(np.sqrt(np.linalg.eigvalsh(self.position)[:, 2]))
 
 
-class OdometryDoubt:
-    """Relative uncertainty of keyframe poses: odometry's own covariances, and systematic drift that these do not know.
+class OdometryUncertainty:
+    """Relative uncertainty of keyframe poses: odometry's covariances, and systematic drift that they do not model.
 
-    Odometry's covariances grow along the way by independent errors, carried on by the lever of what came before: with
-    A = [[I, -hat(p_b - p_a)], [0, I]], those between a and b are S_b - A S_a A^T. Scale and bending are added as
-    `drift_percent` of the distance travelled and `drift_deg` per 100 m of it, which moves b by the rms distance to where
-    it came from.
+    Odometry's covariances accumulate independent errors, transported by the lever arm: with A = [[I, -hat(p_b - p_a)],
+    [0, I]], the relative covariance of a and b is S_b - A S_a A^T. Errors of scale and bending are added as
+    `drift_percent` of the distance travelled and `drift_deg` per 100 m of it, the latter by the rms distance from b to
+    the keyframes since a.
     """
 
     def __init__(self, keyframes: Sequence[Keyframe], drift_percent: float, drift_deg: float) -> None:
@@ -50,8 +50,8 @@ class OdometryDoubt:
         self._sum = np.concatenate([zero, np.cumsum(self.positions, axis=0)])
         self._squares = np.concatenate([[0.0], np.cumsum((self.positions**2).sum(axis=1))])
 
-    def between(self, b: int, older: NDArray[np.int64]) -> Doubt:
-        """Doubt in keyframe `b` as seen from each of the keyframes `older`."""
+    def between(self, b: int, older: NDArray[np.int64]) -> RelativeUncertainty:
+        """Uncertainty of keyframe `b` relative to each of the keyframes `older`."""
         travelled = self.distances[b] - self.distances[older]
         turn = self._turn_per_m * travelled
         spread = (self._per_m * travelled) ** 2 + (turn * self._lever(b, older)) ** 2
@@ -63,7 +63,7 @@ class OdometryDoubt:
             own = self.covariances[b] - A @ self.covariances[older] @ A.transpose(0, 2, 1)
             position = position + _positive(own[:, :3, :3])
             square = square + np.maximum(np.linalg.eigvalsh(own[:, 3:, 3:])[:, 2], 0.0)
-        return Doubt(position, np.sqrt(square))
+        return RelativeUncertainty(position, np.sqrt(square))
 
     def _lever(self, b: int, older: NDArray[np.int64]) -> Floats:
         """(C,) m, rms distance of keyframe `b` from the keyframes since each of `older`."""

@@ -1,4 +1,4 @@
-"""Older keyframes that look equally alike to a new one: it can be at one place only."""
+"""Perceptual aliasing: several older keyframes that match a new one, which can be at one place only."""
 
 from __future__ import annotations
 
@@ -12,20 +12,19 @@ from lslam.types.constraint import LoopCandidate, LoopStage, Verdict
 from lslam.types.keyframe import Keyframe
 
 
-def settle(
+def resolve_ambiguity(
     examined: list[LoopCandidate], keyframes: Sequence[Keyframe], reach: Callable[[int, int], float]
 ) -> list[LoopCandidate]:
-    """Candidates of one newer keyframe, the most alike first, with at most one closure left among them.
+    """Candidates of one newer keyframe, the most similar first, with at most one loop closure accepted.
 
-    reach : m that odometry may be wrong by between an older and a newer keyframe
+    reach : m, gate of odometry between an older and a newer keyframe
 
-    None is left when two put the keyframe at different places, or when one of them was ambiguous by itself: where places
-    repeat, the one that fits is no better than the one that fits twice.
+    All are rejected when two imply different poses of the keyframe, or when one of them was ambiguous by itself.
     """
     accepted = [c for c in examined if c.is_accepted]
-    doubtful = next((c for c in examined if c.stage == LoopStage.AMBIGUITY), None)
-    if accepted and doubtful is not None:
-        return [_ambiguous(c, f"keyframe {doubtful.a} looks as much alike, and is ambiguous") for c in examined]
+    ambiguous = next((c for c in examined if c.stage == LoopStage.AMBIGUITY), None)
+    if accepted and ambiguous is not None:
+        return [_ambiguous(c, f"keyframe {ambiguous.a} looks as much alike, and is ambiguous") for c in examined]
     if len(accepted) < 2:
         return examined
     first = accepted[0]
@@ -43,13 +42,13 @@ def settle(
 
 
 def _put(candidate: LoopCandidate, keyframes: Sequence[Keyframe]) -> NDArray[np.float64]:
-    """(3,) m in the world, where a closure puts the newer keyframe if the older one is where odometry has it."""
+    """(3,) m in the world, position of the newer keyframe by the loop closure and odometry's pose of the older one."""
     assert candidate.constraint is not None
     return np.asarray((keyframes[candidate.a].T_world_lidar @ candidate.constraint.T_a_b)[:3, 3])
 
 
 def _ambiguous(candidate: LoopCandidate, reason: str) -> LoopCandidate:
-    """Refused, unless it was already."""
+    """The candidate, rejected as ambiguous unless it was rejected before."""
     if not candidate.is_accepted:
         return candidate
     return replace(candidate, verdict=Verdict.REJECTED, stage=LoopStage.AMBIGUITY, reason=reason)

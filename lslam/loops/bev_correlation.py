@@ -1,4 +1,4 @@
-"""Places from above: what stands in each cell, what was seen, and the correlation of two such images."""
+"""Correlation of bird's-eye views (BEV): height and visibility images of submaps, correlated by FFT."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ Floats = NDArray[np.float64]
 Image = NDArray[np.float32]
 Spectrum = NDArray[np.complex64]
 
-# m; a wall stays in its cell or the next when the heading is off by the half of a step of the search.
+# m; a heading error of half a search step moves a wall by one cell at most.
 CELL = 1.0
-# Voxels in a column of a cell that count; what is taller is no more telling.
+# Voxels per cell that count, at most: taller structure is no more distinctive.
 TALLEST = 6.0
 
 
 @dataclass(frozen=True)
-class Raster:
-    """A square of `size` x `size` cells round the origin, x along rows."""
+class BevGrid:
+    """A BEV grid of `size` x `size` cells centred on the origin, x along rows."""
 
     size: int
 
@@ -31,13 +31,13 @@ class Raster:
         return np.where(inside, cells[:, 0] * self.size + cells[:, 1], 0), inside
 
     def heights(self, points: Floats) -> Image:
-        """(size, size) how tall things stand in a cell: points in it, which are means of voxels, up to `TALLEST`."""
+        """(size, size) occupied voxels per cell, up to `TALLEST`; points are means of voxels."""
         cells, inside = self.cells_of(points)
         counts = np.bincount(cells[inside], minlength=self.size**2)
         return np.minimum(counts, TALLEST).astype(np.float32).reshape(self.size, self.size)
 
     def cover(self, *clouds: Floats) -> Image:
-        """(size, size) 1 in the cells that hold a point, and in those next to them, else 0."""
+        """(size, size) visibility: 1 in cells that hold a point and in their neighbours, else 0."""
         seen = np.zeros(self.size**2, np.float32)
         for points in clouds:
             cells, inside = self.cells_of(points)

@@ -11,7 +11,7 @@ from known_town import keyframes_of, round_the_square
 from numpy.typing import NDArray
 
 from lslam.geometry import se3, so3
-from lslam.loops.doubt import OdometryDoubt
+from lslam.loops.gating import OdometryUncertainty
 
 
 def chain(poses: NDArray[np.float64], step: NDArray[np.float64]) -> list[NDArray[np.float64]]:
@@ -24,15 +24,15 @@ def chain(poses: NDArray[np.float64], step: NDArray[np.float64]) -> list[NDArray
     return covariances
 
 
-def test_doubt_between_is_that_of_the_way_between() -> None:
+def test_uncertainty_between_is_that_of_the_way_between() -> None:
     poses = np.array([round_the_square(d) for d in np.arange(0, 200, 5.0)])
     step = np.diag([1e-3, 2e-3, 1e-3, 1e-6, 1e-6, 4e-6])
     whole = chain(poses, step)
     keyframes = [replace(k, covariance=C) for k, C in zip(keyframes_of(poses), whole, strict=True)]
-    doubt = OdometryDoubt(keyframes, 0.0, 0.0).between(39, np.array([0, 17]))
+    uncertainty = OdometryUncertainty(keyframes, 0.0, 0.0).between(39, np.array([0, 17]))
     part = chain(poses[17:], step)[-1]
-    assert np.allclose(doubt.position, [whole[39][:3, :3], part[:3, :3]], rtol=1e-9)
-    assert doubt.turn == pytest.approx(np.sqrt([whole[39][5, 5], part[5, 5]]))
+    assert np.allclose(uncertainty.position, [whole[39][:3, :3], part[:3, :3]], rtol=1e-9)
+    assert uncertainty.turn == pytest.approx(np.sqrt([whole[39][5, 5], part[5, 5]]))
 
 
 def test_never_negative_when_estimates_contradict() -> None:
@@ -40,9 +40,9 @@ def test_never_negative_when_estimates_contradict() -> None:
     keyframes = [
         replace(k, covariance=C * np.eye(6)) for k, C in zip(keyframes_of(poses), (0.5, 0.3, 0.1), strict=True)
     ]
-    doubt = OdometryDoubt(keyframes, 0.0, 0.0).between(2, np.array([0, 1]))
-    assert np.isfinite(doubt.reach).all()
-    assert (doubt.turn >= 0).all()
+    uncertainty = OdometryUncertainty(keyframes, 0.0, 0.0).between(2, np.array([0, 1]))
+    assert np.isfinite(uncertainty.reach).all()
+    assert (uncertainty.turn >= 0).all()
 
 
 @pytest.mark.parametrize(("scale", "turn"), [(0.5, 0.0), (0.0, 0.25), (-0.5, -0.25)])
@@ -55,14 +55,14 @@ def test_three_sigmas_hold_the_drift_they_are_named_after(scale: float, turn: fl
         step[:3, 3] *= 1 + scale / 100
         bend = se3.make(so3.exp(np.array([0, 0, np.deg2rad(turn) * length / 100])), np.zeros(3))
         drifted.append(drifted[-1] @ step @ bend)
-    doubt = OdometryDoubt(keyframes_of(np.array(drifted)), 0.5, 0.25)
+    uncertainty = OdometryUncertainty(keyframes_of(np.array(drifted)), 0.5, 0.25)
     b, older = 179, np.arange(0, 170, 10)
     errors = [
         se3.relative(drifted[a], drifted[b])[:3, 3] - se3.relative(true[a], true[b])[:3, 3] for a in older
     ]  # fmt: skip
-    sigmas = np.linalg.norm(errors, axis=1) / doubt.between(b, older).reach
+    sigmas = np.linalg.norm(errors, axis=1) / uncertainty.between(b, older).reach
     assert (sigmas < 3).all()
-    assert doubt.between(b, np.array([0])).reach[0] < 0.03 * 720
+    assert uncertainty.between(b, np.array([0])).reach[0] < 0.03 * 720
 
 
 def test_drift_of_a_straight_way_is_its_scale_and_its_bend_at_the_lever() -> None:
@@ -70,8 +70,8 @@ def test_drift_of_a_straight_way_is_its_scale_and_its_bend_at_the_lever() -> Non
     h, n = 2.0, 150
     line = keyframes_of(np.array([se3.make(np.eye(3), np.array([k * h, 0.0, 0.0])) for k in range(n + 21)]))
     older = np.array([20, 120])
-    doubt = OdometryDoubt(line, 0.5, 0.25).between(n + 20, older)
-    for reach, turn, steps in zip(doubt.reach, doubt.turn, (n, n - 100), strict=True):
+    uncertainty = OdometryUncertainty(line, 0.5, 0.25).between(n + 20, older)
+    for reach, turn, steps in zip(uncertainty.reach, uncertainty.turn, (n, n - 100), strict=True):
         bend = np.deg2rad(0.25) * steps * h / 100
         lever = h * np.sqrt((np.arange(steps + 1) ** 2).mean())
         assert turn == pytest.approx(bend)

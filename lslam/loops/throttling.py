@@ -1,4 +1,4 @@
-"""How often loop candidates are registered."""
+"""Throttling of loop detection: how often loop candidates are registered."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ import numpy as np
 from lslam.types.constraint import Verdict
 
 
-class Pace:
-    """How far to travel from one try to the next: `spacing` where things change, up to three times it while they do not.
+class LoopThrottle:
+    """Distance between two attempts: `spacing` after a change of verdict, up to three times it while verdicts repeat.
 
-    A closure after a row of closures adds little, and so does a refusal after a row of refusals.
+    One more loop closure in a row of accepted ones adds little information, and so does one more rejection.
     """
 
     LONGEST = 3
@@ -20,20 +20,20 @@ class Pace:
         self.reset()
 
     def reset(self) -> None:
-        """Try at once: there were no candidates."""
+        """Attempt at the next candidate: there were none."""
         self._tried_at, self._row = -np.inf, 0
         self._last: Verdict | None = None
 
     @property
     def wait(self) -> float:
-        """m between the last try and the next."""
+        """m between the last attempt and the next."""
         return self.spacing * min(self._row, self.LONGEST)
 
     def is_due(self, distance: float) -> bool:
-        """Whether to try after so many metres since the start."""
+        """Whether an attempt is due at `distance` m since the start."""
         return distance - self._tried_at >= self.wait
 
     def observe(self, distance: float, verdict: Verdict) -> None:
-        """A try, and what came of it."""
+        """Take the verdict of an attempt at `distance` m."""
         self._row = self._row + 1 if verdict == self._last else 1
         self._tried_at, self._last = distance, verdict

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lslam.loops.raster import CELL, TALLEST, Raster, correlate, spectrum
+from lslam.loops.bev_correlation import CELL, TALLEST, BevGrid, correlate, spectrum
 
-RASTER = Raster(16)
+RASTER = BevGrid(16)
 
 
 def clouds() -> list[np.ndarray]:
