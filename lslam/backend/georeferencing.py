@@ -15,10 +15,10 @@ from lslam.config.graph import GraphConfig
 from lslam.errors import InputError
 from lslam.geometry import geodesy, noise, se3, so3
 from lslam.geometry.interpolate import poses_at
-from lslam.graph.alignment import Alignment, align
 from lslam.graph.chi_square import quantile
 from lslam.graph.drift import chains, drift_covariance
 from lslam.graph.fix_noise import DriftOfFixes, Wander, wander_of
+from lslam.graph.gnss_alignment import GnssAlignment, align
 from lslam.graph.problem import PoseGraph, PositionFix
 from lslam.maps.georeference import Projection
 from lslam.types.georeference import Georeference
@@ -179,7 +179,7 @@ def _usable(
     return Fixes(stream.stamps_ns[good], positions, sigmas, antenna, slack, origin, given, is_stated)
 
 
-def _at_first(found: Alignment, fixes: Fixes, config: GnssConfig) -> tuple[Georeference, Floats]:
+def _at_first(found: GnssAlignment, fixes: Fixes, config: GnssConfig) -> tuple[Georeference, Floats]:
     """The georeference with its origin at the first fix that is believed, and the shift that this is, (4, 4)."""
     first = fixes.positions[int(np.argmax(found.believed))]
     origin = geodesy.from_local(first[None], fixes.origin)[0]
@@ -200,7 +200,7 @@ def _at_first(found: Alignment, fixes: Fixes, config: GnssConfig) -> tuple[Geore
     ), shift
 
 
-def _elsewhere(found: Alignment) -> str:
+def _elsewhere(found: GnssAlignment) -> str:
     """Of fixes in another part of the world, or nothing."""
     away = int((np.linalg.norm(found.residuals, axis=1) > ELSEWHERE).sum())
     if not away:
@@ -211,7 +211,7 @@ def _elsewhere(found: Alignment) -> str:
     )
 
 
-def contradicted(found: Alignment, fixes: Fixes) -> str:
+def contradicted(found: GnssAlignment, fixes: Fixes) -> str:
     """Of fixes that odometry contradicts, and whether they agree with each other, or nothing where it may be chance."""
     from scipy.special import bdtrc, chdtrc
 
@@ -245,7 +245,7 @@ def contradicted(found: Alignment, fixes: Fixes) -> str:
 
 
 def _wander(
-    fixes: Fixes, found: Alignment, keyframes: Many[Keyframe], graph: PoseGraph, config: GraphConfig
+    fixes: Fixes, found: GnssAlignment, keyframes: Many[Keyframe], graph: PoseGraph, config: GraphConfig
 ) -> tuple[Wander | None, float]:
     """What the fixes err by together, and the factor on odometry's drift, from those that are believed.
 
@@ -282,7 +282,7 @@ def _owners(fixes: Fixes, keyframes: Many[Keyframe]) -> NDArray[np.intp]:
 
 
 def _as_factors(
-    fixes: Fixes, found: Alignment, shift: Floats, results: Many[ScanResult], keyframes: Many[Keyframe], arm: Floats,
+    fixes: Fixes, found: GnssAlignment, shift: Floats, results: Many[ScanResult], keyframes: Many[Keyframe], arm: Floats,
     wander: Wander | None,
 ) -> tuple[PositionFix, ...]:  # fmt: skip
     """Positions of the antenna as seen from the keyframe before each fix, the absurd ones left out."""

@@ -9,7 +9,7 @@ from lslam.backend.outcome import BackEnd
 from lslam.geometry import se3
 from lslam.keyframes.store import KeyframeStore
 from lslam.types.constraint import LoopCandidate
-from lslam.types.loop_view import LoopView, Place
+from lslam.types.loop_view import LoopSurroundings, LoopView
 from lslam.types.run_record import RunRecord
 
 Floats = NDArray[np.float64]
@@ -40,7 +40,7 @@ def view_loop(record: RunRecord, done: BackEnd, store: KeyframeStore) -> LoopVie
     )
 
 
-def _place(poses: Floats, loop: LoopCandidate, store: KeyframeStore) -> Place:
+def _place(poses: Floats, loop: LoopCandidate, store: KeyframeStore) -> LoopSurroundings:
     older, newer = (range(max(end - AROUND, 0), min(end + AROUND + 1, len(store))) for end in (loop.a, loop.b))
     points = np.concatenate([se3.apply(poses[k], store.points(k)) for k in sorted({*older, *newer})])
-    return Place(points, poses[list(older), :2, 3], poses[list(newer), :2, 3], poses[loop.a, :2, 3])
+    return LoopSurroundings(points, poses[list(older), :2, 3], poses[list(newer), :2, 3], poses[loop.a, :2, 3])

@@ -22,7 +22,7 @@ from lslam.config import Config
 from lslam.geometry import se3
 from lslam.graph.drift import tilt_factor
 from lslam.graph.floors import on_one_plane
-from lslam.graph.odometry import bent, fitness_covariance, fitness_score, odometry_constraints
+from lslam.graph.odometry_constraints import bent, fitness_covariance, fitness_score, odometry_constraints
 from lslam.graph.problem import PoseGraph
 from lslam.keyframes.store import KeyframeStore
 from lslam.stopping import checking

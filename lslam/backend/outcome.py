@@ -16,7 +16,7 @@ from lslam.graph.drift import tilt_factor
 from lslam.graph.factors import well_conditioned
 from lslam.graph.fix_noise import Wander
 from lslam.graph.loop_drift import without_loop_drift
-from lslam.graph.odometry import corrected
+from lslam.graph.odometry_constraints import corrected
 from lslam.graph.pose_graph import optimise
 from lslam.graph.problem import DriftClaim, PoseGraph, Solution
 from lslam.keyframes.store import KeyframeStore

@@ -170,9 +170,9 @@ def _draw_map(
     scenario: str, seed: int, settings: tuple[str, ...], osm: Path, origin: list[float] | None, plan: Path
 ) -> None:
     """The whole extract, with the street that would be driven when there is one."""
+    from lslam.simulation.built_scenario import whole_map
     from lslam.simulation.lidar import RayScene
     from lslam.simulation.osm_place import read_extract
-    from lslam.simulation.places import whole_map
     from lslam.simulation.plan import write_plan
     from lslam.simulation.scenario_files import scenario_named
     from lslam.simulation.scenarios import checked_origin

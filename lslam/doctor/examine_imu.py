@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.doctor.findings import Facts, Finding, plural
-from lslam.inertial.stream import GRAVITY, LEAST_RATE_HZ, gravity_unit, mean_forces
+from lslam.inertial.imu_cleaning import GRAVITY, LEAST_RATE_HZ, gravity_unit, mean_forces
 from lslam.types.imu import ImuStream
 from lslam.types.sequence import Sequence, no_shared_time
 

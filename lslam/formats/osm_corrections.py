@@ -29,7 +29,7 @@ def corrected_osm(data: OsmData, found: CorrectedMap) -> OsmData:
     """
     owners = {_element(c.building): c for c in found.buildings}
     result = OsmData(attribution=found.attribution)
-    wishes: dict[int, list[_Wish]] = {}
+    wishes: dict[int, list[_NodeTarget]] = {}
     for name, correction in owners.items():
         ways = sorted(_ways_of(data, name))
         for number in ways:
@@ -41,7 +41,7 @@ def corrected_osm(data: OsmData, found: CorrectedMap) -> OsmData:
             result.add_relation(data.relations[name[1]])
     for node in _held(data, owners) & set(wishes):
         was = wishes[node][0].was
-        wishes[node].append(_Wish(node, (), was, was, np.inf))
+        wishes[node].append(_NodeTarget(node, (), was, was, np.inf))
     _place(result, wishes, found.origin)
     kept = {(kind, number) for kind, numbers in _numbers(result) for number in numbers}
     result.versions = {key: version for key, version in data.versions.items() if key in kept}
@@ -49,7 +49,7 @@ def corrected_osm(data: OsmData, found: CorrectedMap) -> OsmData:
 
 
 @dataclass(frozen=True)
-class _Wish:
+class _NodeTarget:
     """Where, m, one building wants one of its nodes, where that is on the map, its ways through it, how well it knows."""
 
     node: int
@@ -59,18 +59,18 @@ class _Wish:
     confidence: float
 
 
-def _wishes(data: OsmData, ways: list[int], correction: BuildingCorrection, origin: Floats) -> list[_Wish]:
+def _wishes(data: OsmData, ways: list[int], correction: BuildingCorrection, origin: Floats) -> list[_NodeTarget]:
     """One for each node of a building."""
     nodes = list(dict.fromkeys(node for number in ways for node in data.ways[number].nodes))
     rotation, shift = about(correction.building.middle, correction.displacement)
     was = to_local(np.array([(*data.nodes[node], 0.0) for node in nodes]).reshape(-1, 3), origin)[:, :2]
     return [
-        _Wish(node, tuple(n for n in ways if node in data.ways[n].nodes), place, old, correction.confidence)
+        _NodeTarget(node, tuple(n for n in ways if node in data.ways[n].nodes), place, old, correction.confidence)
         for node, place, old in zip(nodes, was @ rotation.T + shift, was, strict=True)
     ]
 
 
-def _place(result: OsmData, wishes: dict[int, list[_Wish]], origin: Floats) -> None:
+def _place(result: OsmData, wishes: dict[int, list[_NodeTarget]], origin: Floats) -> None:
     """Move nodes to where they are wanted; part those that are wanted in several places."""
     fresh = iter(range(min([0, *result.nodes, *result.ways]) - 1, -(2**62), -1))
     for node, wanted in wishes.items():
@@ -89,9 +89,9 @@ def _place(result: OsmData, wishes: dict[int, list[_Wish]], origin: Floats) -> N
                 result.modified.add(("way", way))
 
 
-def _agreeing(wanted: list[_Wish]) -> list[list[_Wish]]:
+def _agreeing(wanted: list[_NodeTarget]) -> list[list[_NodeTarget]]:
     """Wishes in groups that want one place, the best known first."""
-    groups: list[list[_Wish]] = []
+    groups: list[list[_NodeTarget]] = []
     for wish in wanted:
         near = [g for g in groups if np.linalg.norm(wish.place - g[0].place) <= ONE_NODE]
         if near:

@@ -25,7 +25,7 @@ log = logging.getLogger("lslam")
 KEPT = 2
 
 
-class Pace:
+class CheckpointSchedule:
     """When a checkpoint is due: after each twentieth of the time so far, but never later than `every_s` after the last.
 
     So a run that is killed loses a twentieth of what it had done, whatever its length, and a long one `every_s`. What
@@ -59,7 +59,7 @@ class Checkpoints:
 
     def __init__(self, folder: Path, stage: str, every_s: float) -> None:
         self.folder, self._stage = folder, stage
-        self.pace = Pace(every_s)
+        self.schedule = CheckpointSchedule(every_s)
 
     def write(self, scans: int, content: Callable[[], State]) -> None:
         """Write what is known after `scans` scans, and what the run was warned of until there; raises OutputError.
@@ -73,7 +73,7 @@ class Checkpoints:
         for old in self._files()[:-KEPT]:
             with contextlib.suppress(OSError):
                 old.unlink()
-        self.pace.wrote(time.perf_counter() - began)
+        self.schedule.wrote(time.perf_counter() - began)
 
     def latest(self) -> Any:
         """What the newest checkpoint that can be read holds, its warnings being those of this run now; None without one."""
@@ -163,7 +163,7 @@ class OdometryCheckpoints:
 
     def offer(self, results: list[ScanResult], tracker: Tracker, keyframing: Keyframing) -> None:
         """Write a checkpoint when one is due."""
-        if self._checkpoints.pace.is_due and isinstance(tracker.odometry, Resumable):
+        if self._checkpoints.schedule.is_due and isinstance(tracker.odometry, Resumable):
             self._write(results, tracker, keyframing, is_over=False)
 
     def close(self, results: list[ScanResult], tracker: Tracker, keyframing: Keyframing, is_over: bool) -> None:

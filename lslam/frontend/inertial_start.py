@@ -17,8 +17,8 @@ from lslam.frontend.register_scans import read_ahead
 from lslam.frontend.state_classes import STATE_CLASSES
 from lslam.frontend.tracker import Tracker
 from lslam.inertial.fusion import InertialMotion
-from lslam.inertial.initialise import FirstPoses, Start, start
-from lslam.inertial.stream import ImuRefusedError
+from lslam.inertial.imu_cleaning import ImuRefusedError
+from lslam.inertial.initialise import FirstPoses, InertialStart, start
 from lslam.odometry import create_odometry
 from lslam.readers import select
 from lslam.readers.selection import Selection
@@ -37,7 +37,7 @@ class Inertial:
     """
 
     motion: InertialMotion | None
-    start: Start | None = None
+    start: InertialStart | None = None
     notes: list[str] = field(default_factory=list)
     problems: list[str] = field(default_factory=list)
 
@@ -93,7 +93,7 @@ def load_start(path: Path, config: Config) -> Inertial | None:
     return part
 
 
-def _begin(sequence: Sequence, imu: ImuStream, T_lidar_imu: NDArray[np.float64], config: Config) -> Start:
+def _begin(sequence: Sequence, imu: ImuStream, T_lidar_imu: NDArray[np.float64], config: Config) -> InertialStart:
     """The start by scans registered without the IMU; again by scans that it then deskewed, where that matters."""
     last_ns = int(sequence.stamps_ns[-1])
     first = first_poses(sequence, config, None)

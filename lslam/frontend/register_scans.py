@@ -23,7 +23,7 @@ from lslam.odometry.sanity import FARTHEST_M, measurable
 from lslam.odometry.standing import Standing
 from lslam.readers.selection import Selection
 from lslam.registration.acceptance import DOUBT
-from lslam.registration.motion import MotionModel
+from lslam.registration.constant_velocity import MotionModel
 from lslam.types.scan import Scan, Span
 from lslam.types.scan_result import ScanResult
 from lslam.types.sequence import Sequence

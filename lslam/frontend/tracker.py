@@ -14,7 +14,7 @@ from lslam.integrity.monitor import IntegrityMonitor
 from lslam.odometry.base import Deskewing, Odometry, Registered, Resumable, Searching
 from lslam.odometry.sanity import plausible
 from lslam.odometry.standing import Standing
-from lslam.registration.motion import ConstantVelocity, MotionModel, middle_of
+from lslam.registration.constant_velocity import ConstantVelocity, MotionModel, middle_of
 from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan import Scan, Span
 from lslam.types.scan_result import ScanResult, Status

@@ -15,13 +15,13 @@ from numpy.typing import NDArray
 
 from lslam.geometry import se2
 from lslam.graph.chi_square import quantile
-from lslam.graph.robust import truncated_weights
+from lslam.graph.gnc import truncated_weights
 from lslam.stopping import checking
 from lslam.types.building_match import BuildingMatch
 
 Floats = NDArray[np.float64]
 
-GROWTH, ROUNDS = 2.0, 30  # of graduated non-convexity, as in `graph.robust`
+GROWTH, ROUNDS = 2.0, 30  # of graduated non-convexity, as in `graph.gnc`
 PROBABILITY = 0.999  # a match within this quantile of its own distribution is right
 SUPPORT = 2  # other matches that have to say the same
 # Shares of information below which a direction is free, and from which two matches know it alike.
@@ -63,7 +63,7 @@ def solve_buildings(
 ) -> BuildingSolution:
     """Displacements of the buildings with `middles` (B, 2), m, from `matches`, with each keyframe at `poses` (3,) of the map.
 
-    Matches that contradict the others are given up: graduated non-convexity with truncated least squares (`graph.robust`).
+    Matches that contradict the others are given up: graduated non-convexity with truncated least squares (`graph.gnc`).
     Of the map's own belief nothing is ever given up. Who drew a house wrong did so for every keyframe that sees it, so the
     covariances are those of one match as good as the mean, while the displacements take all of them at their word.
     """

@@ -18,9 +18,9 @@ from lslam.config.graph import GraphConfig
 from lslam.geometry import noise, se2, se3
 from lslam.graph import factors
 from lslam.graph.building_graph import BuildingSolution, MapBelief
+from lslam.graph.gnc import Doubted, joined, settle
 from lslam.graph.pose_graph import check_graph
 from lslam.graph.problem import PlanarPrior, PoseGraph
-from lslam.graph.robust import Doubted, joined, settle
 from lslam.graph.solve import marginal_blocks, marginals
 from lslam.types.building_match import BuildingMatch
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.geometry import so3
-from lslam.inertial.stream import ImuFault, ImuRefusedError
+from lslam.inertial.imu_cleaning import ImuFault, ImuRefusedError
 from lslam.types.imu import ImuStream
 
 Floats = NDArray[np.float64]

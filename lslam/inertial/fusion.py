@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 
 from lslam.config.imu import ImuConfig
 from lslam.geometry import se3, so3
-from lslam.inertial.estimate import ImuEstimate
 from lslam.inertial.gyroscope import Gyroscope
+from lslam.inertial.imu_cleaning import covers, gaps
+from lslam.inertial.imu_estimate import ImuEstimate
 from lslam.inertial.integrate import Increments
 from lslam.inertial.kalman import surprise
-from lslam.inertial.stream import covers, gaps
 from lslam.preprocessing.deskew import knots_over
-from lslam.registration.motion import ConstantVelocity, middle_of
+from lslam.registration.constant_velocity import ConstantVelocity, middle_of
 from lslam.types.gravity import GravityDirection
 from lslam.types.imu import ImuStream
 from lslam.types.motion_prior import MotionPrior

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from lslam.config.imu import ImuConfig
 from lslam.inertial.agreement import LEAST_OFFSET_S, check_agreement
-from lslam.inertial.estimate import BIAS, DOWN, GRAVITY, ImuEstimate
 from lslam.inertial.gyroscope import Gyroscope
-from lslam.inertial.stream import ImuRefusedError, clean, covers, gaps
+from lslam.inertial.imu_cleaning import ImuRefusedError, clean, covers, gaps
+from lslam.inertial.imu_estimate import BIAS, DOWN, GRAVITY, ImuEstimate
 from lslam.types.imu import ImuStream
 
 Floats = NDArray[np.float64]
@@ -62,7 +62,7 @@ class FirstPoses:
 
 
 @dataclass(frozen=True)
-class Start:
+class InertialStart:
     """A usable IMU: its stream on the clock of the scans, the estimate at the first of them, and what was decided.
 
     problems : what was given and could not be used
@@ -86,7 +86,7 @@ def start(
     last_ns: int,
     config: ImuConfig,
     least_offset_s: float = LEAST_OFFSET_S,
-) -> Start:
+) -> InertialStart:
     """Check the stream against the first poses that registration found, and align it with them.
 
     last_ns : stamp of the recording's last scan; least_offset_s : differences of the clocks below it are none
@@ -117,7 +117,7 @@ def start(
         known = Gyroscope.of_bias(bias, _doubt(bias, estimate.gyroscope))
         estimate = _learnt(usable, T_lidar_imu, replace(guess, gyroscope=known), told, opening, config)
     notes.append("IMU aligned " + ("while standing" if is_static else "while moving"))
-    return Start(usable, T_lidar_imu, estimate, offset, agreement.is_judged, is_static, notes, problems)
+    return InertialStart(usable, T_lidar_imu, estimate, offset, agreement.is_judged, is_static, notes, problems)
 
 
 def told_poses(first: FirstPoses, imu: ImuStream, gap_s: float) -> tuple[FirstPoses, FirstPoses]:

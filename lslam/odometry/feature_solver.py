@@ -14,7 +14,7 @@ from lslam.kernels.lines import linearise_lines
 from lslam.odometry.feature_map import MIN_LINE_POINTS, FeatureMap
 from lslam.odometry.feature_scan import FeatureScan
 from lslam.registration.gaussian_map import FLOOR, GaussianMap
-from lslam.registration.optimiser import EVERYWHERE, Limits, Matches, Term, optimise, slots_of
+from lslam.registration.optimiser import EVERYWHERE, Correspondences, Limits, Term, optimise, slots_of
 from lslam.registration.residuals import RESIDUALS
 from lslam.registration.robust import Annealing
 from lslam.registration.solver import RegistrationResult, result_of, voxel_terms
@@ -61,7 +61,7 @@ def solve_on_scan(
         noise.weak_share, TIMES_ON_SCAN * noise.least / noise.plane**2, by_surfaces=True,
         allowed=EVERYWHERE if allowed is None else np.ascontiguousarray(allowed),
     )  # fmt: skip
-    found = optimise(terms, T_prior, annealing, limits, Matches(0))
+    found = optimise(terms, T_prior, annealing, limits, Correspondences(0))
     if allowed is not None:
         found = replace(found, weak=found.weak[np.linalg.norm(found.weak @ allowed, axis=1) > 0.5])
     return result_of(found, T_prior, len(edges) + len(planes))
@@ -78,7 +78,7 @@ def solve_on_map(
     """
     if scatter is None:
         scatter = np.zeros((len(planes), 6))
-    lines, matches = target.edges, Matches(len(planes))
+    lines, matches = target.edges, Correspondences(len(planes))
     on_lines = Term(
         linearise_lines, (edges,), (lines.moments, lines.keys, lines.table, *target.lines),
         (float(lines.size), float(noise.edge) ** 2, float(MIN_LINE_POINTS), FLOOR), slots_of(len(edges)),

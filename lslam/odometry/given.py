@@ -12,7 +12,7 @@ from lslam.errors import UsageError
 from lslam.formats.trajectory_files import read_trajectory
 from lslam.geometry.interpolate import poses_at
 from lslam.preprocessing.deskew import knots_over
-from lslam.registration.motion import MotionModel
+from lslam.registration.constant_velocity import MotionModel
 from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan import Scan, Span
 from lslam.types.scan_result import ScanResult

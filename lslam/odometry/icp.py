@@ -10,7 +10,7 @@ import numpy as np
 from lslam.config.config import Config
 from lslam.errors import UsageError
 from lslam.odometry.base import Registered
-from lslam.odometry.outcome import of_registration
+from lslam.odometry.scan_outcome import of_registration
 from lslam.preprocessing.deskew import deskew
 from lslam.preprocessing.prepare import PreparedPoints, prepare_points
 from lslam.recovery.policies import policies_of

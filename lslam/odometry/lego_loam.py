@@ -9,12 +9,12 @@ from __future__ import annotations
 
 from lslam.config.config import Config
 from lslam.odometry.feature_steps import two_steps
-from lslam.odometry.loam import Loam, Variant
+from lslam.odometry.loam import Loam, LoamVariant
 from lslam.preprocessing.features import Features
 from lslam.preprocessing.segments import lego_features
 from lslam.types.scan import Scan
 
-LEGO = Variant(two_steps, with_map=True, with_less_planes=True)
+LEGO = LoamVariant(two_steps, with_map=True, with_less_planes=True)
 
 
 def create(config: Config) -> LegoLoam:

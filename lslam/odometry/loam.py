@@ -10,7 +10,7 @@ from lslam.config.config import Config
 from lslam.odometry.base import Registered
 from lslam.odometry.feature_registration import FeatureRegistration
 from lslam.odometry.feature_steps import ScanStep, joint_step
-from lslam.odometry.outcome import of_registration
+from lslam.odometry.scan_outcome import of_registration
 from lslam.preprocessing.deskew import deskew_points
 from lslam.preprocessing.features import FeaturePoints, Features, extract_features
 from lslam.registration.uncertainty import PoseUncertainty
@@ -22,7 +22,7 @@ from lslam.types.state import Stateful
 
 
 @dataclass(frozen=True)
-class Variant:
+class LoamVariant:
     """What makes a method of the family.
 
     scan_step : how a scan is registered on the one before; None leaves that out
@@ -36,9 +36,9 @@ class Variant:
 
 
 VARIANTS = {
-    "loam-odom": Variant(joint_step, with_map=False),
-    "loam": Variant(joint_step, with_map=True),
-    "floam": Variant(None, with_map=True),
+    "loam-odom": LoamVariant(joint_step, with_map=False),
+    "loam": LoamVariant(joint_step, with_map=True),
+    "floam": LoamVariant(None, with_map=True),
 }
 
 
@@ -57,7 +57,7 @@ class Loam(Stateful):
     deskew = "features by the motion prior, and again by the motion that registration finds"
     STATE = ("registration", "_uncertainty")
 
-    def __init__(self, config: Config, variant: Variant) -> None:
+    def __init__(self, config: Config, variant: LoamVariant) -> None:
         self.config, self.variant = config, variant
         self.restart()
 

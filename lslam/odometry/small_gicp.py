@@ -13,7 +13,7 @@ from lslam.config.preprocess import PreprocessConfig
 from lslam.config.registration import RegistrationConfig
 from lslam.foreign import importing
 from lslam.geometry import se3, so3
-from lslam.odometry.outcome import Alignment, judged
+from lslam.odometry.scan_outcome import AlignerResult, judged
 from lslam.preprocessing.prepare import clean_points
 from lslam.registration.registration import MIN_SOURCE_POINTS
 from lslam.types.motion_prior import MotionPrior
@@ -66,16 +66,16 @@ class SmallGicp:
     def warm_up(self) -> None:
         """Nothing to compile."""
 
-    def _align(self, source: Any, T_prior: Floats) -> Alignment:
+    def _align(self, source: Any, T_prior: Floats) -> AlignerResult:
         count = 0 if source is None else source.size()
         if self._target is None or count < MIN_SOURCE_POINTS:
-            return Alignment(T_prior, count, count)
+            return AlignerResult(T_prior, count, count)
         target, tree = self._target
         found = self._package.align(
             target, source, tree, T_prior, max_correspondence_distance=REACH, num_threads=self._threads
         )
         pose = np.asarray(found.T_target_source, np.float64)
-        return Alignment(pose, count, int(found.num_inliers), bool(found.converged), int(found.iterations))
+        return AlignerResult(pose, count, int(found.num_inliers), bool(found.converged), int(found.iterations))
 
     def _has_moved_on(self, pose: Floats) -> bool:
         moved = se3.relative(self._T_world_keyframe, pose)

@@ -27,7 +27,7 @@ MATCHED, AGREEING = 0.3, 0.7
 
 
 @dataclass(frozen=True)
-class Reference:
+class ReferenceScan:
     """The scan that others are compared with: its planes, and where one step puts its own points on them."""
 
     planes: GaussianMap
@@ -47,7 +47,7 @@ class Standing(Stateful):
     def __init__(self, preprocess: PreprocessConfig, registration: RegistrationConfig) -> None:
         self._preprocess, self._config = preprocess, registration
         self._limit_m, self._limit_rad = preprocess.standing_m, float(np.deg2rad(preprocess.standing_deg))
-        self._reference: Reference | None = None
+        self._reference: ReferenceScan | None = None
         self._last: ScanResult | None = None
 
     def result_of(self, scan: Scan) -> ScanResult | None:
@@ -82,7 +82,7 @@ class Standing(Stateful):
         of_it, self._last = state["reference"], state["last"]
         self._reference = None
         if of_it is not None:
-            self._reference = Reference(self._new_planes(), of_it["T_own"])
+            self._reference = ReferenceScan(self._new_planes(), of_it["T_own"])
             self._reference.planes.restore(of_it["planes"])
 
     def warm_up(self) -> None:
@@ -92,12 +92,12 @@ class Standing(Stateful):
         scan = Scan(room, 0, 0)
         self._stands(scan, self._reference_of(scan))
 
-    def _reference_of(self, scan: Scan) -> Reference:
+    def _reference_of(self, scan: Scan) -> ReferenceScan:
         """Planes of one scan alone. Its voxels are coarse, as those of a map's first scans: a ring is no plane."""
         planes = self._new_planes()
         points = prepare_points(scan.points, self._preprocess, scan.index)
         planes.insert(points.map_points, np.eye(4))
-        return Reference(planes, self._step(points, planes).T_world_lidar)
+        return ReferenceScan(planes, self._step(points, planes).T_world_lidar)
 
     def _new_planes(self) -> GaussianMap:
         c = self._config
@@ -111,7 +111,7 @@ class Standing(Stateful):
         once = Annealing(c.kernel_max, c.kernel_max, c.kernel_decay, 1)
         return solve(planes, points, np.eye(4), once, sigma=c.sigma, blob_weight=0.0, weak_share=c.weak_share)
 
-    def _stands(self, scan: Scan, reference: Reference) -> bool:
+    def _stands(self, scan: Scan, reference: ReferenceScan) -> bool:
         found = self._step(prepare_points(scan.points, self._preprocess, scan.index), reference.planes)
         C = found.covariance
         if C is None or found.overlap < MATCHED or found.inlier_share < AGREEING or len(found.degenerate):

@@ -36,7 +36,7 @@ Fetch = Callable[[Bounds], Mapping[str, Any]]
 
 
 @dataclass(frozen=True)
-class _Wish:
+class _RequestedCircle:
     """A circle to be asked for: its place (2,) and radius, m."""
 
     centre: NDArray[np.float64]
@@ -50,7 +50,7 @@ class _Wish:
 class _Circle:
     """A finished request: the reply, of which buildings can be read; why it is none, else None."""
 
-    wish: _Wish
+    wish: _RequestedCircle
     reply: OverpassReply
     problem: str | None = None
 
@@ -74,10 +74,10 @@ class OsmBuffer:
         self._origin = np.asarray(origin, np.float64)
         self._config = config
         self._folder = folder
-        self._wishes: queue.SimpleQueue[_Wish | None] = queue.SimpleQueue()
+        self._wishes: queue.SimpleQueue[_RequestedCircle | None] = queue.SimpleQueue()
         self._done: queue.SimpleQueue[_Circle] = queue.SimpleQueue()
-        self._open: list[_Wish] = []
-        self._answered: list[_Wish] = []
+        self._open: list[_RequestedCircle] = []
+        self._answered: list[_RequestedCircle] = []
         self.replies: list[OverpassReply] = []
         self.problems: list[str] = []
         self._thread: threading.Thread | None = None
@@ -91,7 +91,7 @@ class OsmBuffer:
         at = np.asarray(position, np.float64)[:2]
         self._collect()
         asked = [*self._answered, *self._open]
-        wish = _Wish(at, self._config.fetch_radius if radius is None else radius)
+        wish = _RequestedCircle(at, self._config.fetch_radius if radius is None else radius)
         if any(
             w.radius >= wish.radius and w.is_at(at, self._config.renew_radius + w.radius - wish.radius) for w in asked
         ):
@@ -140,7 +140,7 @@ class OsmBuffer:
         while (wish := self._wishes.get()) is not None:
             self._done.put(self._circle(wish))
 
-    def _circle(self, wish: _Wish) -> _Circle:
+    def _circle(self, wish: _RequestedCircle) -> _Circle:
         try:
             fix = from_local(np.array([[*wish.centre, 0.0]]), self._origin)[:, :2]
             reply = OverpassReply.of(self._fetch(around(fix, wish.radius)))
@@ -170,7 +170,7 @@ class OsmBuffer:
             try:
                 reply = OverpassReply(path.read_bytes())
                 facts = reply.facts()
-                wish = _Wish(np.array(facts["lslam_centre"], np.float64), float(facts["lslam_radius"]))
+                wish = _RequestedCircle(np.array(facts["lslam_centre"], np.float64), float(facts["lslam_radius"]))
                 self._check(reply)
                 self._use(_Circle(wish, reply))
             except (OSError, *MISFIT) as error:

@@ -24,7 +24,7 @@ GROWTH, TRIES = 2, 4
 
 
 @dataclass(frozen=True)
-class Start:
+class FirstPose:
     """Planar pose (3,) of the first scan in the map frame with its sigma (3,), m, m, rad; or why there is none."""
 
     pose: Floats
@@ -51,13 +51,13 @@ def see_walls(store: KeyframeStore, poses: Floats, number: int, size: int, confi
     return WallView(find_walls(cloud, config, views).segments, views)
 
 
-def known_start(config: OsmConfig) -> Start:
+def known_start(config: OsmConfig) -> FirstPose:
     """The start that the configuration gives, with its heading."""
     radius, turn = config.start_radius / WINDOW, np.radians(config.start_heading_deg) / WINDOW
-    return Start(first_pose(config), np.array([radius, radius, turn]))
+    return FirstPose(first_pose(config), np.array([radius, radius, turn]))
 
 
-def sought_start(store: KeyframeStore, poses: Floats, osm: OsmMap, config: OsmConfig, submap_size: int) -> Start:
+def sought_start(store: KeyframeStore, poses: Floats, osm: OsmMap, config: OsmConfig, submap_size: int) -> FirstPose:
     """The start by the first match over all headings, of a submap that grows until it fits one place only.
 
     poses : (K, 4, 4) of all keyframes in a level world; the first keyframe is the start
@@ -70,7 +70,7 @@ def sought_start(store: KeyframeStore, poses: Floats, osm: OsmMap, config: OsmCo
         found = find_heading(walls, osm.walls, np.zeros(2), config.start_radius, config) if len(walls) else None
         if found is not None and not found.is_ambiguous:
             sigma = np.sqrt(np.diag(np.linalg.inv(found.information)))
-            return Start(found.pose, sigma)
+            return FirstPose(found.pose, sigma)
         why = "several places and headings fit alike" if found is not None else "nothing fits"
         if size >= len(store):
             break
@@ -79,4 +79,4 @@ def sought_start(store: KeyframeStore, poses: Floats, osm: OsmMap, config: OsmCo
         f"OSM: the walls about the start do not say where it is on the map ({why} within {config.start_radius:g} m of the "
         "origin): give --heading DEG, or a better --origin; the run goes on without the buildings"
     )
-    return Start(np.zeros(3), np.zeros(3), problem)
+    return FirstPose(np.zeros(3), np.zeros(3), problem)

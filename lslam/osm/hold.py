@@ -10,7 +10,7 @@ from lslam.backend.georeferencing import Placement, on_earth
 from lslam.backend.outcome import BackEnd, Given, solve
 from lslam.errors import GraphError, InputError
 from lslam.geometry import se2
-from lslam.graph.odometry import corrected
+from lslam.graph.odometry_constraints import corrected
 from lslam.graph.problem import PoseGraph
 from lslam.osm.corrections import correct_buildings
 from lslam.osm.join_buildings import join_buildings, run_baseline

@@ -13,7 +13,7 @@ from lslam.geometry import se2, se3
 from lslam.graph.drift import with_drift
 from lslam.graph.factors import PLANAR
 from lslam.graph.joint import JointSolution, optimise_jointly
-from lslam.graph.odometry import fitness_covariance
+from lslam.graph.odometry_constraints import fitness_covariance
 from lslam.graph.problem import PoseGraph, Solution
 from lslam.keyframes.store import KeyframeStore
 from lslam.osm.baseline import flatten_scan, lay_building, lay_scan

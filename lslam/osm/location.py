@@ -24,7 +24,7 @@ from lslam.geometry import se2, se3, so3
 from lslam.graph.chi_square import quantile
 from lslam.graph.problem import PlanarPrior, Solution
 from lslam.keyframes.store import KeyframeStore
-from lslam.osm.first_match import Start, known_start, see_walls, sought_start
+from lslam.osm.first_match import FirstPose, known_start, see_walls, sought_start
 from lslam.osm.prior import match_buildings, match_keyframe, shares
 from lslam.osm.track import OsmTrack
 from lslam.osm.wall_map import OsmMap
@@ -141,7 +141,7 @@ def _up_by_ground(store: KeyframeStore, odometry: Floats, config: Config) -> Flo
     return np.asarray(up / np.linalg.norm(up))
 
 
-def _start(store: KeyframeStore, poses: Floats, osm: OsmMap, config: Config, placed: Floats | None) -> Start:
+def _start(store: KeyframeStore, poses: Floats, osm: OsmMap, config: Config, placed: Floats | None) -> FirstPose:
     if placed is not None:
         return replace(known_start(config.osm), pose=se2.of_se3(poses[0]))
     if config.osm.heading_deg is not None:

@@ -63,7 +63,7 @@ class MapCheckpoints:
 
     def offer(self, scans: int, maker: Maker, is_last: bool = False) -> None:
         """Write a checkpoint after `scans` scans when one is due, or when it is the last."""
-        if scans and (is_last or self._checkpoints.pace.is_due):
+        if scans and (is_last or self._checkpoints.schedule.is_due):
             self._checkpoints.write(scans, lambda: {"poses": self._poses, "scans": scans, "maker": maker.state()})
 
 

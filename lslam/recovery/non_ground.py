@@ -12,7 +12,7 @@ from lslam.preprocessing.ground import Ground, above_ground, ground_of
 from lslam.preprocessing.prepare import PreparedPoints, subset
 from lslam.registration.alignment import upright_directions
 from lslam.registration.gaussian_map import GaussianMap
-from lslam.registration.optimiser import Limits, Matches, optimise
+from lslam.registration.optimiser import Correspondences, Limits, optimise
 from lslam.registration.residuals import MEANS
 from lslam.registration.robust import Annealing
 from lslam.registration.solver import RegistrationResult, solve, voxel_terms
@@ -45,7 +45,7 @@ class NonGroundPoints:
 
     def agreeing(self, seen: PreparedPoints, T_world_lidar: Floats) -> Flags:
         """(S,) which of them have one of these points near by when seen from `T_world_lidar` (4, 4)."""
-        matches = Matches(len(seen.source))
+        matches = Correspondences(len(seen.source))
         terms = voxel_terms(MEANS, MEANS.points(seen, NEAR), (self._cells,), matches, NEAR, 1.0)
         optimise(terms, T_world_lidar, Annealing(NEAR, NEAR, 0.5, 1), Limits(0.0), matches)
         return (matches.away2 >= 0) & (matches.away2 < NEAR**2)

@@ -27,7 +27,7 @@ LEAST_MATCHED = 6
 EVERYWHERE: Floats = np.zeros((0, 6))
 
 
-class Matches:
+class Correspondences:
     """Which of `count` points are matched in an iteration, and their squared distances: what the maps of a scan share."""
 
     def __init__(self, count: int) -> None:
@@ -105,7 +105,7 @@ class Facts:
 
 
 @dataclass(frozen=True)
-class Optimum:
+class OptimiserResult:
     """Where the iterations ended: pose (4, 4), H (6, 6) and facts of the last one, and its step (6,).
 
     weak : (K, 6) unobserved directions, unit rows, rotations scaled by the lever arm
@@ -121,9 +121,9 @@ class Optimum:
 
 
 def optimise(
-    terms: Sequence[Term], T_start: Floats, annealing: Annealing, limits: Limits, matches: Matches, *,
+    terms: Sequence[Term], T_start: Floats, annealing: Annealing, limits: Limits, matches: Correspondences, *,
     inlier_distance: float = np.inf, inlier_ratio: float = 1.0,
-) -> Optimum:  # fmt: skip
+) -> OptimiserResult:  # fmt: skip
     """Step from `T_start` (4, 4) until, at the kernel's end width, a step is below `STEP_M` and `STEP_RAD`.
 
     Every step linearises all terms anew, in their order: on several maps the finest first. Correspondences beyond
@@ -155,7 +155,7 @@ def optimise(
         scale = max(scale * annealing.decay, end)
         if inlier_ratio < 1.0:
             gate2 = trimmed(matches.away2, float(inlier_ratio), farthest2)
-    return Optimum(se3.make(*pose), H, _named(facts), d, iterations, converged, weak[:count])
+    return OptimiserResult(se3.make(*pose), H, _named(facts), d, iterations, converged, weak[:count])
 
 
 def _named(facts: Floats) -> Facts:

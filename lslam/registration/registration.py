@@ -16,8 +16,8 @@ from lslam.preprocessing.beams import ring_gap
 from lslam.preprocessing.prepare import PreparedPoints, prepare_points
 from lslam.registration.acceptance import Wording, accepted, failed
 from lslam.registration.alignment import MapAlignment
+from lslam.registration.constant_velocity import ConstantVelocity
 from lslam.registration.local_map import LocalMap
-from lslam.registration.motion import ConstantVelocity
 from lslam.registration.residuals import NEEDS_COVARIANCE, residual_named
 from lslam.registration.robust import AdaptiveThreshold, UsualAgreement
 from lslam.registration.solver import RegistrationResult

@@ -11,7 +11,15 @@ from numpy.typing import NDArray
 
 from lslam.preprocessing.prepare import PreparedPoints
 from lslam.registration.gaussian_map import GaussianMap
-from lslam.registration.optimiser import EVERYWHERE, LEAST_MATCHED, Limits, Matches, Optimum, Term, optimise
+from lslam.registration.optimiser import (
+    EVERYWHERE,
+    LEAST_MATCHED,
+    Correspondences,
+    Limits,
+    OptimiserResult,
+    Term,
+    optimise,
+)
 from lslam.registration.residuals import ResidualKind, residual_named
 from lslam.registration.robust import Annealing
 from lslam.types.scan_result import ScanResult
@@ -94,7 +102,7 @@ def solve(
     beyond `inlier_distance`, m, are rejected, and all but the nearest `inlier_ratio`. `allowed` as in `Limits`.
     """
     kind = residual if isinstance(residual, ResidualKind) else residual_named(residual)
-    matches = Matches(len(points.source))
+    matches = Correspondences(len(points.source))
     terms = voxel_terms(kind, kind.points(points, sigma), (target, *coarser), matches, sigma, blob_weight)
     found = optimise(
         terms, T_prior, annealing, Limits(weak_share, by_surfaces=kind.by_surfaces, allowed=allowed), matches,
@@ -104,7 +112,7 @@ def solve(
 
 
 def voxel_terms(
-    kind: ResidualKind, points: tuple[Any, ...], levels: Sequence[GaussianMap], matches: Matches, sigma: float,
+    kind: ResidualKind, points: tuple[Any, ...], levels: Sequence[GaussianMap], matches: Correspondences, sigma: float,
     blob_weight: float,
 ) -> list[Term]:  # fmt: skip
     """The residual of the points on each of the maps, the finest first, which share their matches.
@@ -130,7 +138,7 @@ def part_of_usual(size: float, usual: float) -> float:
     return min(usual / size, 1.0)
 
 
-def result_of(found: Optimum, T_prior: Floats, source_points: int) -> RegistrationResult:
+def result_of(found: OptimiserResult, T_prior: Floats, source_points: int) -> RegistrationResult:
     """The optimum in words, or the prior (4, 4) where it is not finite."""
     facts = found.facts
     finite = bool(np.isfinite(found.pose).all() and np.isfinite(found.step).all())
@@ -151,7 +159,7 @@ def result_of(found: Optimum, T_prior: Floats, source_points: int) -> Registrati
     )
 
 
-def _covariance(found: Optimum) -> Floats:
+def _covariance(found: OptimiserResult) -> Floats:
     """Inverse of the information, with one metre of doubt along directions the scan does not observe."""
     lever = found.facts.lever_arm
     scale = np.array([1.0, 1.0, 1.0, 1 / lever, 1 / lever, 1 / lever])

@@ -9,8 +9,8 @@ from lslam.errors import UsageError
 from lslam.simulation import furniture
 from lslam.simulation.city import City, Layout
 from lslam.simulation.countryside import add_house, add_wall
-from lslam.simulation.curve import Curve, smooth_curve
-from lslam.simulation.mesh import MeshBuilder, Surface, grid_faces
+from lslam.simulation.curve import RouteCurve, smooth_curve
+from lslam.simulation.scene_mesh import MeshBuilder, Surface, grid_faces
 from lslam.simulation.terrain import Terrain
 
 Floats = NDArray[np.float64]
@@ -34,7 +34,9 @@ BLOCK, ROW = 60.0, (12.0, 25.0)  # m in which a row has one stretch of bays in u
 IN_USE = 0.7  # share of blocks with such a stretch
 
 
-def build_carpark(line: Curve, terrain: Terrain, layout: Layout, roughness: float, rng: np.random.Generator) -> City:
+def build_carpark(
+    line: RouteCurve, terrain: Terrain, layout: Layout, roughness: float, rng: np.random.Generator
+) -> City:
     """A car park round the path `line`; `roughness` is the standard deviation of its ground's surface, m.
 
     Everything is placed along x in order, each kind by a generator of its own: a longer path has the same beginning.
@@ -84,7 +86,7 @@ def _grid_lines(low: float, high: float) -> Floats:
 
 
 def _add_trees(
-    builder: MeshBuilder, axis: Curve, terrain: Terrain, layout: Layout, wall: float, rng: np.random.Generator
+    builder: MeshBuilder, axis: RouteCurve, terrain: Terrain, layout: Layout, wall: float, rng: np.random.Generator
 ) -> None:
     """A row of trees behind the wall, which is `wall` m to the left of the axis."""
     s = rng.uniform(*TREES_APART)
@@ -97,7 +99,7 @@ def _add_trees(
 
 
 def _add_cars(
-    builder: MeshBuilder, axis: Curve, terrain: Terrain, layout: Layout, offset: float, rng: np.random.Generator
+    builder: MeshBuilder, axis: RouteCurve, terrain: Terrain, layout: Layout, offset: float, rng: np.random.Generator
 ) -> None:
     """A row of bays across the axis, their middles `offset` m to its left, in use here and there."""
     for block in np.arange(0.0, axis.length, BLOCK):
@@ -112,7 +114,7 @@ def _add_cars(
 
 def _add_houses(
     builder: MeshBuilder,
-    axis: Curve,
+    axis: RouteCurve,
     terrain: Terrain,
     layout: Layout,
     side: int,

@@ -12,9 +12,9 @@ from pydantic import Field, model_validator
 
 from lslam.config.section import Section
 from lslam.simulation import furniture
-from lslam.simulation.curve import Curve
+from lslam.simulation.curve import RouteCurve
 from lslam.simulation.houses import house
-from lslam.simulation.mesh import Mesh, MeshBuilder, Surface, grid_faces
+from lslam.simulation.scene_mesh import MeshBuilder, SceneMesh, Surface, grid_faces
 from lslam.simulation.terrain import Terrain
 
 Floats = NDArray[np.float64]
@@ -75,15 +75,15 @@ class City:
     footprints : outlines of the buildings, each (K, 2); heights : of their tops above the ground at the door, m
     """
 
-    mesh: Mesh
+    mesh: SceneMesh
     terrain: Terrain
-    street: Curve | None = None
+    street: RouteCurve | None = None
     footprints: list[Floats] = field(default_factory=list)
     heights: list[float] = field(default_factory=list)
-    streets: list[Curve] = field(default_factory=list)
+    streets: list[RouteCurve] = field(default_factory=list)
 
 
-def build_city(street: Curve, terrain: Terrain, layout: Layout, rng: np.random.Generator) -> City:
+def build_city(street: RouteCurve, terrain: Terrain, layout: Layout, rng: np.random.Generator) -> City:
     """Build a town along `street`. The same generator state gives the same town."""
     builder = MeshBuilder()
     _add_road(builder, street, terrain, layout, rng)
@@ -101,7 +101,7 @@ def build_city(street: Curve, terrain: Terrain, layout: Layout, rng: np.random.G
 class Lots:
     """Which ground is taken: the streets and the houses so far."""
 
-    def __init__(self, streets: list[Curve], layout: Layout) -> None:
+    def __init__(self, streets: list[RouteCurve], layout: Layout) -> None:
         from shapely import LinearRing, LineString, Polygon, prepare, union_all
 
         self.streets = streets
@@ -138,7 +138,9 @@ def _circle(corners: Floats) -> tuple[float, float, float]:
     return float(middle[0]), float(middle[1]), float(np.linalg.norm(corners - middle, axis=1).max())
 
 
-def _add_road(builder: MeshBuilder, street: Curve, terrain: Terrain, layout: Layout, rng: np.random.Generator) -> None:
+def _add_road(
+    builder: MeshBuilder, street: RouteCurve, terrain: Terrain, layout: Layout, rng: np.random.Generator
+) -> None:
     """Road, kerbs and pavements as one strip along the street."""
     s = street.sample(0.75)
     if street.closed:
@@ -165,7 +167,7 @@ def crown_of_road(offsets: Floats, layout: Layout) -> Floats:
 
 def add_ground(
     builder: MeshBuilder,
-    streets: list[Curve],
+    streets: list[RouteCurve],
     terrain: Terrain,
     layout: Layout,
     rng: np.random.Generator,
@@ -193,7 +195,7 @@ def add_ground(
 def add_row(
     builder: MeshBuilder,
     lots: Lots,
-    street: Curve,
+    street: RouteCurve,
     terrain: Terrain,
     layout: Layout,
     rng: np.random.Generator,
@@ -232,7 +234,7 @@ def add_row(
         s += along * (width + opening) if placed else 1.0
 
 
-def _front(street: Curve, s: float, side: int, offset: float) -> tuple[Floats, Floats]:
+def _front(street: RouteCurve, s: float, side: int, offset: float) -> tuple[Floats, Floats]:
     """Middle of a house's front (2,), `offset` m from the street's middle, and the unit vector (2,) along it."""
     at = np.array([min(s, street.length)])
     tangent = street.tangent(at)[0]
@@ -269,7 +271,7 @@ def _add_front_garden(
 
 def add_street_furniture(
     builder: MeshBuilder,
-    street: Curve,
+    street: RouteCurve,
     terrain: Terrain,
     layout: Layout,
     rng: np.random.Generator,
@@ -278,7 +280,7 @@ def add_street_furniture(
 ) -> None:
     """Parked cars, trees, poles and bins along one side; `allowed` says whether a place (2,), offset and yaw are free."""
 
-    def put(part: Mesh, s: float, offset: float, lift: float, turn: float = 0.0) -> None:
+    def put(part: SceneMesh, s: float, offset: float, lift: float, turn: float = 0.0) -> None:
         at = np.array([s])
         xy, tangent = street.beside(at, side * offset)[0], street.tangent(at)[0] * side
         yaw = float(np.arctan2(tangent[1], tangent[0])) + turn

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from lslam.errors import UsageError
 from lslam.simulation.city import City
 from lslam.simulation.lidar import RayScene
-from lslam.simulation.mesh import Surface
+from lslam.simulation.scene_mesh import Surface
 
 Floats = NDArray[np.float64]
 

@@ -7,9 +7,9 @@ from numpy.typing import NDArray
 
 from lslam.simulation import furniture
 from lslam.simulation.city import City, Layout, add_ground
-from lslam.simulation.curve import Curve
+from lslam.simulation.curve import RouteCurve
 from lslam.simulation.houses import house
-from lslam.simulation.mesh import MeshBuilder, Surface, grid_faces
+from lslam.simulation.scene_mesh import MeshBuilder, Surface, grid_faces
 from lslam.simulation.terrain import Terrain
 
 Floats = NDArray[np.float64]
@@ -21,7 +21,7 @@ OPENINGS = (135.0, 155.0)  # m from the middle of one opening of a corridor to t
 OPENING = 28.0  # m of an opening
 
 
-def build_motorway(street: Curve, terrain: Terrain, layout: Layout, rng: np.random.Generator) -> City:
+def build_motorway(street: RouteCurve, terrain: Terrain, layout: Layout, rng: np.random.Generator) -> City:
     """Two carriageways with guard rails, delineators, gantries and a noise barrier; beyond, trees, bushes and a few farms."""
     builder = MeshBuilder()
     add_strip(builder, street, terrain, [0.0, 3.0, 6.0, 9.0, layout.road, layout.band], rng)
@@ -49,7 +49,7 @@ def build_motorway(street: Curve, terrain: Terrain, layout: Layout, rng: np.rand
     return City(builder.build(), terrain, street, footprints, heights, [street])
 
 
-def build_corridor(street: Curve, terrain: Terrain, layout: Layout, rng: np.random.Generator) -> City:
+def build_corridor(street: RouteCurve, terrain: Terrain, layout: Layout, rng: np.random.Generator) -> City:
     """A street between two smooth noise barriers, bare for more than 100 m at a time.
 
     Only at the openings between them, with houses, trees and lamps, is there anything that tells how far along one is.
@@ -80,7 +80,13 @@ def build_corridor(street: Curve, terrain: Terrain, layout: Layout, rng: np.rand
 
 
 def _fill_opening(
-    builder: MeshBuilder, street: Curve, terrain: Terrain, layout: Layout, s: float, side: int, rng: np.random.Generator
+    builder: MeshBuilder,
+    street: RouteCurve,
+    terrain: Terrain,
+    layout: Layout,
+    s: float,
+    side: int,
+    rng: np.random.Generator,
 ) -> tuple[Floats, float]:
     """A house behind an opening of the barrier, before it lamps, a cabinet and two trees; the house's outline and height."""
     for lamp in (s + rng.uniform(-12, -6), s + rng.uniform(6, 12)):
@@ -98,7 +104,7 @@ def _fill_opening(
 
 def add_house(
     builder: MeshBuilder,
-    street: Curve,
+    street: RouteCurve,
     terrain: Terrain,
     layout: Layout,
     s: float,
@@ -118,7 +124,7 @@ def add_house(
 
 
 def add_strip(
-    builder: MeshBuilder, street: Curve, terrain: Terrain, half: list[float], rng: np.random.Generator
+    builder: MeshBuilder, street: RouteCurve, terrain: Terrain, half: list[float], rng: np.random.Generator
 ) -> None:
     """A road without kerbs, up to the last of `half` m on both sides."""
     s = street.sample(1.0)
@@ -129,7 +135,7 @@ def add_strip(
     builder.add(vertices, grid_faces(len(offsets), len(s)), Surface.ROAD)
 
 
-def _add_rail(builder: MeshBuilder, street: Curve, terrain: Terrain, offset: float) -> None:
+def _add_rail(builder: MeshBuilder, street: RouteCurve, terrain: Terrain, offset: float) -> None:
     """A guard rail: a band along the road and a post every 4 m."""
     add_wall(builder, street, terrain, street.sample(4.0), offset, RAIL[1], Surface.FENCE, RAIL[0], 0.1)
     for s in street.sample(4.0):
@@ -138,7 +144,7 @@ def _add_rail(builder: MeshBuilder, street: Curve, terrain: Terrain, offset: flo
 
 def add_wall(
     builder: MeshBuilder,
-    street: Curve,
+    street: RouteCurve,
     terrain: Terrain,
     s: Floats,
     offset: float,
@@ -157,7 +163,7 @@ def add_wall(
 
 def _put(
     builder: MeshBuilder,
-    street: Curve,
+    street: RouteCurve,
     terrain: Terrain,
     s: float,
     offset: float,
@@ -174,7 +180,7 @@ def _put(
     builder.add_mesh(part.build(), [*xy, float(terrain.height(xy))], yaw)
 
 
-def _add_gantry(builder: MeshBuilder, street: Curve, terrain: Terrain, s: float, reach: float) -> None:
+def _add_gantry(builder: MeshBuilder, street: RouteCurve, terrain: Terrain, s: float, reach: float) -> None:
     """A bridge of signs over the right carriageway."""
     for offset in (-reach, 0.0):
         _put(builder, street, terrain, s, offset, [-0.2, -0.2, -0.5], [0.2, 0.2, 7.2], Surface.POLE)
@@ -183,7 +189,7 @@ def _add_gantry(builder: MeshBuilder, street: Curve, terrain: Terrain, s: float,
 
 
 def _add_country(
-    builder: MeshBuilder, street: Curve, terrain: Terrain, layout: Layout, rng: np.random.Generator
+    builder: MeshBuilder, street: RouteCurve, terrain: Terrain, layout: Layout, rng: np.random.Generator
 ) -> tuple[list[Floats], list[float]]:
     """Clumps of trees, bushes, and a farm now and then. Returns outlines and heights of the farms."""
     footprints, heights = [], []

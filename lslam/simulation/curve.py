@@ -14,7 +14,7 @@ SPACING = 0.5  # m between the spline's knots
 
 
 @dataclass(frozen=True)
-class Curve:
+class RouteCurve:
     """A planar curve, twice continuously differentiable and more (quintic spline), over its length in m.
 
     Made by `smooth_curve`. On a closed curve any distance is valid and wraps; on an open one 0..length.
@@ -55,8 +55,8 @@ class Curve:
         return np.asarray(np.mod(s, self.length) if self.closed else s)
 
 
-def smooth_curve(points: NDArray[Any], closed: bool, smoothing: float = 1.5) -> Curve:
-    """Curve through way-points (N, 2), corners rounded by a Gaussian of `smoothing` m along the line.
+def smooth_curve(points: NDArray[Any], closed: bool, smoothing: float = 1.5) -> RouteCurve:
+    """RouteCurve through way-points (N, 2), corners rounded by a Gaussian of `smoothing` m along the line.
 
     A closed curve must not repeat its first point at the end.
     """
@@ -77,10 +77,10 @@ def smooth_curve(points: NDArray[Any], closed: bool, smoothing: float = 1.5) -> 
         even = gaussian_filter1d(np.concatenate([ahead, even, behind]), smoothing / step, axis=0)[reach:-reach]
     knots = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(even, axis=0), axis=1))])
     spline = make_interp_spline(knots, even, k=5, bc_type="periodic" if closed else None)
-    return Curve(spline, float(knots[-1]), closed)
+    return RouteCurve(spline, float(knots[-1]), closed)
 
 
-def stretched(curve: Curve, by: float) -> Curve:
+def stretched(curve: RouteCurve, by: float) -> RouteCurve:
     """An open curve made longer by `by` m, straight on, at both ends; a closed one as it is."""
     if curve.closed or by <= 0:
         return curve

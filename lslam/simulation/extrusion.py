@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.simulation.mesh import MeshBuilder, Surface
+from lslam.simulation.scene_mesh import MeshBuilder, Surface
 from lslam.types.building import Building, Footprint, footprint_polygon, is_canopy
 
 Floats = NDArray[np.float64]
@@ -26,7 +26,7 @@ FLAT = ("flat", "skillion", "round", "dome")
 
 
 @dataclass(frozen=True)
-class _Style:
+class _FacadeStyle:
     """What the facades of one building share, m."""
 
     window: float
@@ -52,7 +52,7 @@ def extrude(builder: MeshBuilder, building: Building, low: float, high: float, r
     """
     if building.height is None:
         raise ValueError(f"{building.osm_id} has no height: choose one first")
-    style = _Style(
+    style = _FacadeStyle(
         window=rng.uniform(0.9, 1.5),
         spacing=rng.uniform(2.2, 3.4),
         sill=rng.uniform(0.7, 1.0),
@@ -81,7 +81,7 @@ def extrude(builder: MeshBuilder, building: Building, low: float, high: float, r
 
 
 def _facade(
-    builder: MeshBuilder, style: _Style, start: Floats, end: Floats, levels: tuple[float, float, float]
+    builder: MeshBuilder, style: _FacadeStyle, start: Floats, end: Floats, levels: tuple[float, float, float]
 ) -> None:
     """One wall from `start` to `end` (2,), outside to its right, from bottom over the ground floor to the top (`levels`)."""
     bottom, floor, top = levels
@@ -132,7 +132,7 @@ class _Gable:
     rise: float
 
 
-def _gable(building: Building, footprint: Footprint, style: _Style) -> _Gable | None:
+def _gable(building: Building, footprint: Footprint, style: _FacadeStyle) -> _Gable | None:
     """The gabled roof of a building that can carry one, None for a flat roof."""
     shape = building.tags.get("roof:shape", "")
     if footprint.holes or shape in FLAT or not (shape in GABLED or style.likes_gables):

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.geometry import se3, so3
-from lslam.simulation.curve import Curve
+from lslam.simulation.curve import RouteCurve
 from lslam.simulation.path import SpeedProfile, drive, suspension
 from lslam.simulation.terrain import Terrain, flat
 
@@ -75,7 +75,7 @@ class FreePath:
     bank : share of the tilt that balances the turn, 1 for a coordinated one; swing : what shakes it
     """
 
-    curve: Curve
+    curve: RouteCurve
     travelled: Any
     duration: float
     climb: Any
@@ -106,7 +106,7 @@ class FreePath:
         return np.asarray(T @ se3.make(so3.exp(shake[:, 3:]), shake[:, :3]))
 
 
-def climb_spline(curve: Curve, s: NDArray[Any], heights: NDArray[Any], smoothing: float) -> Any:
+def climb_spline(curve: RouteCurve, s: NDArray[Any], heights: NDArray[Any], smoothing: float) -> Any:
     """Height over distance along `curve` through `heights` (N,), m, at distances `s` (N,), smoothed by `smoothing` m."""
     from scipy.interpolate import make_interp_spline
     from scipy.ndimage import gaussian_filter1d
@@ -125,7 +125,7 @@ def climb_spline(curve: Curve, s: NDArray[Any], heights: NDArray[Any], smoothing
 
 
 def fly(
-    curve: Curve,
+    curve: RouteCurve,
     speed: SpeedProfile,
     distance: float,
     climb: Any,

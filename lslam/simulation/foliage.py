@@ -7,8 +7,8 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.simulation.mesh import Mesh, Surface
 from lslam.simulation.rays import Hits, Rays
+from lslam.simulation.scene_mesh import SceneMesh, Surface
 
 Cast = Callable[[NDArray[np.float32], NDArray[np.float32]], tuple[NDArray[np.float32], NDArray[np.int32]]]
 
@@ -18,7 +18,7 @@ VOLUMES = (Surface.CROWN, Surface.HEDGE)
 
 
 def penetrate(
-    cast: Cast, mesh: Mesh, rays: Rays, hits: Hits, extinction: NDArray[np.float32], rng: np.random.Generator
+    cast: Cast, mesh: SceneMesh, rays: Rays, hits: Hits, extinction: NDArray[np.float32], rng: np.random.Generator
 ) -> None:
     """Let the rays whose `hits` are surfaces of volumes end at a leaf in them, or at what is in or behind them.
 
@@ -58,7 +58,7 @@ def penetrate(
     _leaf(hits, which, at, facing)
 
 
-def _enters(mesh: Mesh, face: NDArray[np.int32], directions: NDArray[np.float32]) -> NDArray[np.bool_]:
+def _enters(mesh: SceneMesh, face: NDArray[np.int32], directions: NDArray[np.float32]) -> NDArray[np.bool_]:
     """Whether rays go into a volume, not out of it, at its faces (N,)."""
     return np.asarray(np.einsum("ij,ij->i", mesh.normals[face], directions) < 0)
 
@@ -72,7 +72,7 @@ def _leaf(hits: Hits, which: NDArray[np.intp], at: NDArray[np.float32], facing: 
 
 
 def _solid(
-    mesh: Mesh, rays: Rays, hits: Hits, which: NDArray[np.intp], at: NDArray[np.float32], face: NDArray[np.int32]
+    mesh: SceneMesh, rays: Rays, hits: Hits, which: NDArray[np.intp], at: NDArray[np.float32], face: NDArray[np.int32]
 ) -> None:
     hits.distance[which] = at
     hits.cosine[which] = np.abs(np.einsum("ij,ij->i", mesh.normals[face], rays.directions[which]))

@@ -8,12 +8,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.simulation.mesh import Mesh, MeshBuilder, Surface, grid_faces, tube
+from lslam.simulation.scene_mesh import MeshBuilder, SceneMesh, Surface, grid_faces, tube
 
 BUSHES = 0.35  # share of the trees that are bushes, where leaves fill volumes
 
 
-def tree(rng: np.random.Generator, volume: bool = False) -> Mesh:
+def tree(rng: np.random.Generator, volume: bool = False) -> SceneMesh:
     """A trunk and a crown of loose leaf clusters, through which some rays pass; or one whose leaves fill a volume, or a bush."""
     if volume:
         return _leafy(rng)
@@ -31,7 +31,7 @@ def tree(rng: np.random.Generator, volume: bool = False) -> Mesh:
     return builder.build()
 
 
-def _leafy(rng: np.random.Generator) -> Mesh:
+def _leafy(rng: np.random.Generator) -> SceneMesh:
     builder = MeshBuilder()
     if rng.random() < BUSHES:
         size = np.array([1.0, rng.uniform(0.7, 1.4), rng.uniform(0.6, 1.0)]) * rng.uniform(0.6, 1.4)
@@ -59,7 +59,7 @@ def _add_crown(builder: MeshBuilder, rng: np.random.Generator, size: NDArray[np.
     builder.add(vertices.reshape(-1, 3), grid_faces(rows, columns + 1), Surface.CROWN)
 
 
-def pole(rng: np.random.Generator) -> Mesh:
+def pole(rng: np.random.Generator) -> SceneMesh:
     """A street lamp with an arm towards +y, or a traffic sign."""
     builder = MeshBuilder()
     if rng.random() < 0.6:
@@ -74,7 +74,7 @@ def pole(rng: np.random.Generator) -> Mesh:
     return builder.build()
 
 
-def hedge(rng: np.random.Generator, length: float, volume: bool = False) -> Mesh:
+def hedge(rng: np.random.Generator, length: float, volume: bool = False) -> SceneMesh:
     """A hedge of `length` m with a bumpy surface, which is shut, or behind which leaves fill a volume."""
     height, width = rng.uniform(0.8, 1.7), rng.uniform(0.5, 0.9)
     rows, columns = 7, max(int(length / 0.3), 2)
@@ -96,7 +96,7 @@ def hedge(rng: np.random.Generator, length: float, volume: bool = False) -> Mesh
     return builder.build()
 
 
-def garden_wall(rng: np.random.Generator, length: float) -> Mesh:
+def garden_wall(rng: np.random.Generator, length: float) -> SceneMesh:
     """A low wall of `length` m with posts."""
     builder = MeshBuilder()
     height = rng.uniform(0.6, 1.3)
@@ -106,7 +106,7 @@ def garden_wall(rng: np.random.Generator, length: float) -> Mesh:
     return builder.build()
 
 
-def bins(rng: np.random.Generator) -> Mesh:
+def bins(rng: np.random.Generator) -> SceneMesh:
     """One to three rubbish bins in a row."""
     builder = MeshBuilder()
     for k in range(int(rng.integers(1, 4))):
@@ -122,7 +122,7 @@ _ESTATE = np.array([[0.01, 0.6], [0.05, 0.97], [0.55, 1.0], [0.73, 0.62]])
 _VAN = np.array([[0.0, 0.6], [0.01, 1.0], [0.78, 1.0], [0.93, 0.62]])
 
 
-def parked_car(rng: np.random.Generator) -> Mesh:
+def parked_car(rng: np.random.Generator) -> SceneMesh:
     """A saloon, estate or van along x, front towards +x."""
     kind = rng.random()
     cabin = _SALOON if kind < 0.45 else _ESTATE if kind < 0.85 else _VAN

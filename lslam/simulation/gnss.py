@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from lslam.errors import UsageError
 from lslam.geometry import geodesy, se3
-from lslam.simulation.motion import Motion
+from lslam.simulation.kinematics import Motion
 from lslam.types.gnss import GnssStream
 
 Floats = NDArray[np.float64]

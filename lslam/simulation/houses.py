@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.simulation.mesh import Mesh, MeshBuilder, Surface
+from lslam.simulation.scene_mesh import MeshBuilder, SceneMesh, Surface
 
 Floats = NDArray[np.float64]
 Quad = list[list[float]]
@@ -20,7 +20,7 @@ HIGHEST_ROOF = 5.0  # m from the eaves to the ridge
 
 
 @dataclass(frozen=True)
-class _Style:
+class _HouseStyle:
     """What the facades of one house share, m."""
 
     storeys: int
@@ -36,9 +36,9 @@ class _Style:
         return self.storeys * self.storey + 0.3
 
 
-def house(rng: np.random.Generator, width: float, depth: float, storeys: tuple[int, int] = (2, 4)) -> Mesh:
+def house(rng: np.random.Generator, width: float, depth: float, storeys: tuple[int, int] = (2, 4)) -> SceneMesh:
     """A house on a (width x depth) m footprint, with as many `storeys` as the range allows."""
-    style = _Style(
+    style = _HouseStyle(
         storeys=int(rng.integers(storeys[0], storeys[1] + 1)),
         storey=rng.uniform(2.7, 3.3),
         window=rng.uniform(0.9, 1.5),
@@ -64,7 +64,7 @@ def house(rng: np.random.Generator, width: float, depth: float, storeys: tuple[i
 
 
 def _facade(
-    builder: MeshBuilder, rng: np.random.Generator, style: _Style, start: Floats, end: Floats, street: bool
+    builder: MeshBuilder, rng: np.random.Generator, style: _HouseStyle, start: Floats, end: Floats, street: bool
 ) -> None:
     """One wall from `start` to `end` (2,), outside to its right, windows in a grid."""
     length = float(np.linalg.norm(end - start))

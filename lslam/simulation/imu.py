@@ -11,7 +11,7 @@ from pydantic import Field
 from lslam.config.section import Section
 from lslam.errors import UsageError, nearest
 from lslam.geometry import se3, so3
-from lslam.simulation.motion import Kinematics, Motion
+from lslam.simulation.kinematics import Kinematics, Motion
 from lslam.types.imu import ImuStream
 
 Floats = NDArray[np.float64]

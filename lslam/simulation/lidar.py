@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from lslam.simulation.foliage import penetrate
 from lslam.simulation.lidar_models import LidarModel
-from lslam.simulation.mesh import Mesh, Surface
 from lslam.simulation.rays import Hits, Rays
 from lslam.simulation.returns import Errors, Returns, errors, mirrored, range_walk, reflect
+from lslam.simulation.scene_mesh import SceneMesh, Surface
 from lslam.types.scan import Scan
 
 # Share of the light of a 905 nm laser that comes back from each surface met squarely.
@@ -67,7 +67,7 @@ class Roof:
 class RayScene:
     """A mesh prepared for ray casting."""
 
-    def __init__(self, mesh: Mesh) -> None:
+    def __init__(self, mesh: SceneMesh) -> None:
         from embreex.mesh_construction import TriangleMesh
         from embreex.rtcore_scene import EmbreeScene
 

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from lslam.geometry import se3
 from lslam.simulation import furniture
 from lslam.simulation.city import KERB
-from lslam.simulation.curve import Curve
+from lslam.simulation.curve import RouteCurve
 from lslam.simulation.lidar import MovingMesh, RayScene
-from lslam.simulation.mesh import Mesh, MeshBuilder, Surface, tube
+from lslam.simulation.scene_mesh import MeshBuilder, SceneMesh, Surface, tube
 from lslam.simulation.terrain import Terrain
 
 Floats = NDArray[np.float64]
@@ -32,7 +32,7 @@ class Mover:
 
     scene: RayScene
     radius: float
-    street: Curve
+    street: RouteCurve
     terrain: Terrain
     begin: float
     speed: float
@@ -53,7 +53,7 @@ class Mover:
 
 
 def add_traffic(
-    streets: list[Curve],
+    streets: list[RouteCurve],
     terrain: Terrain,
     line: Callable[[NDArray[Any]], Floats],
     duration: float,
@@ -87,7 +87,7 @@ def add_traffic(
     return movers
 
 
-def pedestrian(rng: np.random.Generator) -> Mesh:
+def pedestrian(rng: np.random.Generator) -> SceneMesh:
     """Somebody in the middle of a step along +x."""
     builder = MeshBuilder()
     height, stride = rng.uniform(1.55, 1.9), rng.uniform(0.15, 0.3)
@@ -126,7 +126,7 @@ def _centres(movers: list[Mover], time: float) -> Floats:
 
 
 def _on_street(
-    street: Curve, terrain: Terrain, s: Floats, offset: float | Floats, lift: float | Floats
+    street: RouteCurve, terrain: Terrain, s: Floats, offset: float | Floats, lift: float | Floats
 ) -> tuple[Floats, Floats, Floats]:
     """Positions (M, 3) of bodies `s` m along the street, its tangents (M, 2) and the ground's slopes (M, 2) there."""
     present = np.ones(len(s), np.bool_) if street.closed else (s >= 0) & (s <= street.length)
@@ -146,7 +146,7 @@ def _cross(a: Floats, b: Floats) -> Floats:
 def _body(
     kind: list[RayScene],
     is_car: bool,
-    street: Curve,
+    street: RouteCurve,
     terrain: Terrain,
     rng: np.random.Generator,
     lanes: tuple[float, ...],

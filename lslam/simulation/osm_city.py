@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from lslam.errors import InputError
 from lslam.simulation.city import KERB, MARGIN, City, Layout, Lots, add_garden_trees, add_street_furniture
-from lslam.simulation.curve import Curve
+from lslam.simulation.curve import RouteCurve
 from lslam.simulation.extrusion import extrude, likely_height
-from lslam.simulation.mesh import MeshBuilder, Surface, grid_faces
+from lslam.simulation.scene_mesh import MeshBuilder, Surface, grid_faces
 from lslam.simulation.terrain import Terrain
 from lslam.simulation.town import CAR_LENGTH, Network, Places, add_road
 from lslam.types.building import Building
@@ -43,7 +43,7 @@ def build_osm_city(
     buildings: Sequence[Building],
     terrain: Terrain,
     rng: np.random.Generator,
-    streets: Sequence[Curve] = (),
+    streets: Sequence[RouteCurve] = (),
     layout: Layout | None = None,
     attribution: str | None = None,
     source: str = "a map",

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from lslam.formats.osm_files import OsmData
 from lslam.formats.osm_tags import is_underground
 from lslam.geometry.geodesy import to_local
-from lslam.simulation.curve import Curve, smooth_curve
+from lslam.simulation.curve import RouteCurve, smooth_curve
 from lslam.types.building import Building, footprint_polygon, is_canopy
 
 Floats = NDArray[np.float64]
@@ -85,8 +85,8 @@ def find_route(
 
 
 def side_roads(
-    ways: Sequence[tuple[tuple[int, ...], Floats]], solid: Any, along: Curve | None, apart: float, reach: float
-) -> list[Curve]:
+    ways: Sequence[tuple[tuple[int, ...], Floats]], solid: Any, along: RouteCurve | None, apart: float, reach: float
+) -> list[RouteCurve]:
     """The other roads: `ways` outside of `solid` ground, within `reach` m of the line `along`, more than `apart` m off it."""
     from shapely import LineString, line_merge, union_all
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.geometry import se3, so3
-from lslam.simulation.curve import Curve
+from lslam.simulation.curve import RouteCurve
 from lslam.simulation.terrain import Terrain
 
 Floats = NDArray[np.float64]
@@ -65,7 +65,7 @@ class VehiclePath:
     travelled : distance along the curve over time, a smooth function of s; duration : s it is defined for
     """
 
-    curve: Curve
+    curve: RouteCurve
     terrain: Terrain
     travelled: Any
     duration: float
@@ -90,7 +90,7 @@ class VehiclePath:
 
 
 def drive(
-    curve: Curve, terrain: Terrain, speed: SpeedProfile, distance: float, height: float, shaking: Suspension
+    curve: RouteCurve, terrain: Terrain, speed: SpeedProfile, distance: float, height: float, shaking: Suspension
 ) -> VehiclePath:
     """Drive `distance` m along `curve`, lap after lap on a closed one."""
     from scipy.interpolate import make_interp_spline
@@ -103,7 +103,7 @@ def drive(
     return VehiclePath(curve, terrain, make_interp_spline(times, travelled, k=5), duration, height, shaking)
 
 
-def _speeds(curve: Curve, s: Floats, speed: SpeedProfile) -> Floats:
+def _speeds(curve: RouteCurve, s: Floats, speed: SpeedProfile) -> Floats:
     """Speed at each distance: the cruise, less in bends, reached with bounded acceleration and braking."""
     bend = np.maximum(np.abs(curve.curvature(s)), 1e-9)
     v = np.minimum(speed.cruise, np.sqrt(speed.lateral / bend))

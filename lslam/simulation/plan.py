@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from lslam.formats.atomic import atomic_write
 from lslam.simulation.city import City
 from lslam.simulation.lidar import RayScene
-from lslam.simulation.mesh import Surface
+from lslam.simulation.scene_mesh import Surface
 
 Image = NDArray[np.uint8]
 

@@ -15,8 +15,8 @@ from pydantic import Field
 
 from lslam.config.section import Section
 from lslam.simulation.lidar_models import LidarModel
-from lslam.simulation.mesh import Surface
 from lslam.simulation.rays import Hits, Rays
+from lslam.simulation.scene_mesh import Surface
 
 Array = NDArray[np.float32]
 

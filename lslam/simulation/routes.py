@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.errors import UsageError
-from lslam.simulation.curve import Curve, rounded_rectangle, smooth_curve, winding_line
+from lslam.simulation.curve import RouteCurve, rounded_rectangle, smooth_curve, winding_line
 from lslam.simulation.path import SpeedProfile, drive, suspension
 from lslam.simulation.scenario_files import Scenario
 from lslam.simulation.shapes import SHAPES, out_and_back
@@ -28,8 +28,8 @@ TIGHTEST = {"car": 3.0, "drone": 1.0, "walker": 0.3}  # m, radius of a bend
 class Route:
     """The middle of a street, the line along it, and heights of way-points over the distance along the line, if they have any."""
 
-    street: Curve
-    line: Curve
+    street: RouteCurve
+    line: RouteCurve
     climb: tuple[Floats, Floats] | None = None
 
 
@@ -75,7 +75,7 @@ def given_route(scenario: Scenario, way_points: WayPoints) -> Route:
     return Route(street, line, (s * line.length / s[-1], z))
 
 
-def beside(curve: Curve, offset: float) -> Curve:
+def beside(curve: RouteCurve, offset: float) -> RouteCurve:
     """The curve `offset` m to the left of `curve`."""
     return smooth_curve(curve.beside(curve.sample(0.5), offset), curve.closed) if offset else curve
 

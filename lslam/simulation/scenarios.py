@@ -11,16 +11,16 @@ from numpy.typing import NDArray
 
 from lslam.errors import UsageError
 from lslam.geometry import se3, so3
+from lslam.simulation.built_scenario import build_scenario, populate
 from lslam.simulation.city import City
 from lslam.simulation.clearance import check_path
 from lslam.simulation.gnss import ORIGIN, GnssModel
 from lslam.simulation.imu import ImuModel, imu_named
+from lslam.simulation.kinematics import PosePath, smooth_motion, standing_start
 from lslam.simulation.lidar import RayScene, Roof, trace
 from lslam.simulation.lidar_models import LidarModel, lidar_named
-from lslam.simulation.motion import PosePath, smooth_motion, standing_start
 from lslam.simulation.moving import Mover, moving_meshes
 from lslam.simulation.osm_place import read_extract
-from lslam.simulation.places import build_place, populate
 from lslam.simulation.scenario_files import Scenario, scenario_named
 from lslam.simulation.sensors import Sensors, read_sensors
 from lslam.simulation.vibration import shaking
@@ -194,7 +194,7 @@ def simulate(
             update={"name": osm.stem, "summary": f"As {chosen.name!r}, in the city of {osm.name}."}
         )
     standing = int(static_start * chosen.rate_hz)
-    place = build_place(chosen, seed, count, line, extract, standing)
+    place = build_scenario(chosen, seed, count, line, extract, standing)
     scene = RayScene(place.city.mesh)
     if chosen.path.clearance:
         check_path(scene, place.city, place.path.poses, place.path.duration)

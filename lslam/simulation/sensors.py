@@ -26,7 +26,7 @@ from lslam.simulation.gnss import (
     simulate_gnss,
 )
 from lslam.simulation.imu import GRAVITY, T_CAR_IMU, T_OUSTER_IMU, ImuModel, SimulatedImu, simulate_imu
-from lslam.simulation.motion import Motion
+from lslam.simulation.kinematics import Motion
 from lslam.types.trajectory import Trajectory
 
 Floats = NDArray[np.float64]
@@ -104,7 +104,7 @@ def write_truth(
     """Write the exact truth into `folder`: nothing that reads the sequence needs it.
 
     The world is the LiDAR at the first scan. `trajectory.tum` holds the LiDAR's poses at the scans' starts,
-    `trajectory_100hz.tum` at 100 Hz from 0 to `end` s; `motion.csv` its velocity in the world (m/s) and its rate in its own
+    `trajectory_100hz.tum` at 100 Hz from 0 to `end` s; `kinematics.csv` its velocity in the world (m/s) and its rate in its own
     frame (rad/s) at 100 Hz; `imu_bias.csv` the biases behind `imu.csv`; `world.toml` the world on the Earth.
     """
     folder.mkdir(parents=True, exist_ok=True)

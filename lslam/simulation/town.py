@@ -18,8 +18,8 @@ from lslam.simulation.city import (
     add_street_furniture,
     crown_of_road,
 )
-from lslam.simulation.curve import Curve, smooth_curve
-from lslam.simulation.mesh import MeshBuilder, Surface, grid_faces
+from lslam.simulation.curve import RouteCurve, smooth_curve
+from lslam.simulation.scene_mesh import MeshBuilder, Surface, grid_faces
 from lslam.simulation.terrain import Terrain
 
 Floats = NDArray[np.float64]
@@ -33,7 +33,7 @@ CAR_LENGTH = 5.2  # m kept between the middles of parked cars
 class Network:
     """The middles of all roads, to ask how far a place is from the nearest."""
 
-    def __init__(self, streets: list[Curve]) -> None:
+    def __init__(self, streets: list[RouteCurve]) -> None:
         from scipy.spatial import cKDTree
 
         self.streets = streets
@@ -45,7 +45,7 @@ class Network:
 
 
 def build_town(
-    main: list[Curve],
+    main: list[RouteCurve],
     terrain: Terrain,
     layout: Layout,
     rng: np.random.Generator,
@@ -107,7 +107,7 @@ class Places:
         return True
 
 
-def _shortened(street: Curve, by: float) -> Curve:
+def _shortened(street: RouteCurve, by: float) -> RouteCurve:
     """An open street without its first and last metres; too short a one as it is."""
     if street.closed or street.length < 2 * by + SHORTEST / 2:
         return street
@@ -116,13 +116,13 @@ def _shortened(street: Curve, by: float) -> Curve:
 
 
 def _side_streets(
-    main: list[Curve], streets: list[Curve], layout: Layout, spacing: float, rng: np.random.Generator
-) -> list[Curve]:
+    main: list[RouteCurve], streets: list[RouteCurve], layout: Layout, spacing: float, rng: np.random.Generator
+) -> list[RouteCurve]:
     """Streets off `main` on both sides, each until it meets one of `streets` and those before it, or its own end."""
     from scipy.spatial import cKDTree
 
     taken = np.concatenate([street.position(street.sample(0.5)) for street in streets])
-    out: list[Curve] = []
+    out: list[RouteCurve] = []
     for street in main:
         for side in (1, -1):
             s = rng.uniform(0.3, 0.8) * spacing
@@ -142,7 +142,7 @@ def _side_streets(
     return out
 
 
-def _until_met(start: Floats, ray: Floats, length: float, taken: Any, layout: Layout) -> Curve | None:
+def _until_met(start: Floats, ray: Floats, length: float, taken: Any, layout: Layout) -> RouteCurve | None:
     """A straight street from `start` along `ray` (2,) until it meets another; None when it would run too near to one."""
     steps = np.arange(0.0, length, 0.5)
     points = start + steps[:, None] * ray
@@ -161,7 +161,12 @@ def _until_met(start: Floats, ray: Floats, length: float, taken: Any, layout: La
 
 
 def add_road(
-    builder: MeshBuilder, street: Curve, network: Network, terrain: Terrain, layout: Layout, rng: np.random.Generator
+    builder: MeshBuilder,
+    street: RouteCurve,
+    network: Network,
+    terrain: Terrain,
+    layout: Layout,
+    rng: np.random.Generator,
 ) -> None:
     """Road, kerbs and pavements as one strip along the street; no kerb where another road passes."""
     s = street.sample(0.75)

@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 from lslam.simulation import furniture
 from lslam.simulation.city import City, Layout, add_ground
 from lslam.simulation.countryside import VERGE, add_house, add_strip
-from lslam.simulation.curve import Curve
-from lslam.simulation.mesh import MeshBuilder
+from lslam.simulation.curve import RouteCurve
+from lslam.simulation.scene_mesh import MeshBuilder
 from lslam.simulation.terrain import Terrain
 
 Floats = NDArray[np.float64]
@@ -21,7 +21,7 @@ HEDGE = 12.0  # m of way for every hedge that may stand beside it
 LODGES = 90.0  # m of way from one house to the next
 
 
-def build_woods(street: Curve, terrain: Terrain, layout: Layout, rng: np.random.Generator) -> City:
+def build_woods(street: RouteCurve, terrain: Terrain, layout: Layout, rng: np.random.Generator) -> City:
     """A way through woods or a park along `street`; the same generator state gives the same woods.
 
     Of `layout` it takes the road's half width and verge (`pavement`), `garden_trees` per 5 m of way and side, of which the
@@ -40,7 +40,7 @@ def build_woods(street: Curve, terrain: Terrain, layout: Layout, rng: np.random.
 
 
 def _add_trees(
-    builder: MeshBuilder, street: Curve, terrain: Terrain, layout: Layout, rng: np.random.Generator, way: Floats,
+    builder: MeshBuilder, street: RouteCurve, terrain: Terrain, layout: Layout, rng: np.random.Generator, way: Floats,
     footprints: list[Floats],
 ) -> None:  # fmt: skip
     """Trees and bushes at random, more of them near the way, where they get light; none on it or in a house."""
@@ -65,7 +65,7 @@ def _add_trees(
 
 
 def _add_hedges(
-    builder: MeshBuilder, street: Curve, terrain: Terrain, layout: Layout, rng: np.random.Generator
+    builder: MeshBuilder, street: RouteCurve, terrain: Terrain, layout: Layout, rng: np.random.Generator
 ) -> None:
     """Hedges along both edges of the way."""
     for side in (1, -1):
@@ -80,7 +80,7 @@ def _add_hedges(
 
 
 def _add_things(
-    builder: MeshBuilder, street: Curve, terrain: Terrain, layout: Layout, rng: np.random.Generator
+    builder: MeshBuilder, street: RouteCurve, terrain: Terrain, layout: Layout, rng: np.random.Generator
 ) -> None:
     """Lamps and bins beside the way."""
     for is_there, part, apart in ((layout.poles, furniture.pole, 35.0), (layout.bins, furniture.bins, 60.0)):
@@ -92,7 +92,7 @@ def _add_things(
 
 
 def _add_lodges(
-    builder: MeshBuilder, street: Curve, terrain: Terrain, layout: Layout, rng: np.random.Generator, way: Floats
+    builder: MeshBuilder, street: RouteCurve, terrain: Terrain, layout: Layout, rng: np.random.Generator, way: Floats
 ) -> tuple[list[Floats], list[float]]:
     """A house now and then, where it keeps off every bend of the way; outlines and heights."""
     footprints: list[Floats] = []

@@ -6,7 +6,7 @@ import logging
 from collections.abc import Sequence
 from pathlib import Path
 
-from lslam.config.finding import Finding
+from lslam.config.finding import FindingConfig
 from lslam.config.study import read_study
 from lslam.errors import InputError
 from lslam.evaluation.sensitivity import evaluate_study
@@ -21,7 +21,7 @@ log = logging.getLogger("lslam")
 
 
 def write_study_report(
-    folder: Path, rows: Sequence[StudyRow], findings: Sequence[Finding] = (), title: str = ""
+    folder: Path, rows: Sequence[StudyRow], findings: Sequence[FindingConfig] = (), title: str = ""
 ) -> list[StudyResult]:
     """Evaluate all rows and write report.html, .md, .tex, .csv and figures/ into `folder`.
 

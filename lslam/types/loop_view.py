@@ -11,7 +11,7 @@ Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Place:
+class LoopSurroundings:
     """The surroundings of a loop as one trajectory has them.
 
     points : (N, 3) of the keyframes on both ways past it, m; older, newer : (A, 2), (B, 2) those ways; centre : (2,) of the
@@ -31,5 +31,5 @@ class LoopView:
     older_scan: int
     newer_scan: int
     correction: float
-    before: Place
-    after: Place
+    before: LoopSurroundings
+    after: LoopSurroundings

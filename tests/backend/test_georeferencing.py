@@ -14,7 +14,7 @@ from lslam.config import Config
 from lslam.config.gnss import GnssConfig
 from lslam.errors import InputError, UsageError
 from lslam.geometry import geodesy, se3, so3
-from lslam.graph.odometry import odometry_constraints
+from lslam.graph.odometry_constraints import odometry_constraints
 from lslam.graph.problem import PoseGraph
 from lslam.types.calibration import Calibration
 from lslam.types.gnss import GnssStream

@@ -55,7 +55,7 @@ def gicp_keyframes() -> Register:
     """The method `small-gicp` itself, its preprocessing timed with it."""
     from lslam.config import Config
     from lslam.odometry.small_gicp import create
-    from lslam.registration.motion import ConstantVelocity
+    from lslam.registration.constant_velocity import ConstantVelocity
     from lslam.types.motion_prior import MotionPrior
     from lslam.types.scan import Scan
 

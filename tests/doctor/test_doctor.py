@@ -21,7 +21,7 @@ from lslam.doctor.examine_turns import compare, examine_turns
 from lslam.doctor.findings import Facts, Finding
 from lslam.doctor.inspect import inspect
 from lslam.geometry import so3
-from lslam.inertial.stream import ImuFault, ImuRefusedError, clean
+from lslam.inertial.imu_cleaning import ImuFault, ImuRefusedError, clean
 from lslam.readers import open_sequence
 from lslam.types.calibration import Calibration
 from lslam.types.gnss import GnssStream

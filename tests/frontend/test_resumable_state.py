@@ -21,8 +21,8 @@ from lslam.odometry import METHODS, create_odometry
 from lslam.odometry.base import Resumable
 from lslam.odometry.standing import Standing
 from lslam.readers.ringed import with_rings
+from lslam.registration.constant_velocity import ConstantVelocity
 from lslam.registration.gaussian_map import GaussianMap
-from lslam.registration.motion import ConstantVelocity
 from lslam.simulation.scenarios import simulate
 from lslam.types.scan import Scan
 from lslam.types.scan_result import ScanResult

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from lslam.config.imu import ImuConfig
 from lslam.frontend.tracker import Loaded, Tracker
 from lslam.geometry import se3
-from lslam.inertial.estimate import GRAVITY, ImuEstimate
 from lslam.inertial.fusion import InertialMotion
 from lslam.inertial.gyroscope import Gyroscope
+from lslam.inertial.imu_estimate import GRAVITY, ImuEstimate
 from lslam.odometry.base import Registered
 from lslam.types.imu import ImuStream
 from lslam.types.motion_prior import MotionPrior

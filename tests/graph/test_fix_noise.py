@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from lslam.geometry import se3
 from lslam.graph import factors, fix_noise
-from lslam.graph.alignment import align
 from lslam.graph.fix_noise import DriftOfFixes, Wander, wander_of
+from lslam.graph.gnss_alignment import align
 from lslam.graph.problem import PositionFix
 
 Floats = NDArray[np.float64]

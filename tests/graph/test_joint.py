@@ -17,7 +17,7 @@ from lslam.graph import joint, solve
 from lslam.graph.building_graph import MapBelief
 from lslam.graph.drift import with_drift
 from lslam.graph.joint import optimise_jointly
-from lslam.graph.odometry import in_plane
+from lslam.graph.odometry_constraints import in_plane
 from lslam.graph.problem import FloorPlane, PoseGraph
 from lslam.types.building_match import BuildingMatch
 from lslam.types.constraint import Constraint

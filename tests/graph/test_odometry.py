@@ -8,7 +8,7 @@ from graph_builders import STEP_SIGMAS, measured, truth
 
 from lslam.config.graph import GraphConfig
 from lslam.geometry import noise, se3, so3
-from lslam.graph.odometry import corrected, fitness_covariance, fitness_score, growth, odometry_constraints
+from lslam.graph.odometry_constraints import corrected, fitness_covariance, fitness_score, growth, odometry_constraints
 from lslam.types.keyframe import Keyframe
 from lslam.types.scan_result import ScanResult
 

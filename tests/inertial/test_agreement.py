@@ -7,7 +7,7 @@ import pytest
 
 from lslam.geometry import se3, so3
 from lslam.inertial.agreement import Agreement, _hardly_turning, check_agreement
-from lslam.inertial.stream import ImuRefusedError
+from lslam.inertial.imu_cleaning import ImuRefusedError
 from lslam.types.imu import ImuStream
 
 IMU_NS, SCAN_NS = 10_000_000, 100_000_000

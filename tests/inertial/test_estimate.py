@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from lslam.geometry import so3
-from lslam.inertial.estimate import ImuEstimate, _propagate
 from lslam.inertial.gyroscope import Gyroscope
+from lslam.inertial.imu_estimate import ImuEstimate, _propagate
 from lslam.types.imu import ImuStream
 
 GRAVITY = 9.80665

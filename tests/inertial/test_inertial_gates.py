@@ -8,11 +8,11 @@ from numpy.typing import NDArray
 
 from lslam.geometry import se3, so3
 from lslam.inertial.agreement import check_agreement
-from lslam.inertial.estimate import ImuEstimate
 from lslam.inertial.gyroscope import Gyroscope
+from lslam.inertial.imu_cleaning import ImuRefusedError
+from lslam.inertial.imu_estimate import ImuEstimate
 from lslam.inertial.initialise import _is_standing, _path_of_force
 from lslam.inertial.kalman import update
-from lslam.inertial.stream import ImuRefusedError
 from lslam.types.imu import ImuStream
 
 Floats = NDArray[np.float64]

@@ -11,13 +11,15 @@ from numpy.typing import NDArray
 
 from lslam.config.imu import ImuConfig
 from lslam.geometry import se3
-from lslam.inertial.initialise import FirstPoses, Start, start, told_poses
-from lslam.inertial.stream import ImuRefusedError, clean, gaps, gravity_unit
+from lslam.inertial.imu_cleaning import ImuRefusedError, clean, gaps, gravity_unit
+from lslam.inertial.initialise import FirstPoses, InertialStart, start, told_poses
 from lslam.simulation.scenarios import SimulatedDrive
 from lslam.types.imu import ImuStream
 
 
-def begun(drive: SimulatedDrive, imu: ImuStream | None = None, *, T_lidar_imu: object = None, **keys: object) -> Start:
+def begun(
+    drive: SimulatedDrive, imu: ImuStream | None = None, *, T_lidar_imu: object = None, **keys: object
+) -> InertialStart:
     """The start after five seconds of true poses with the noise of a registration."""
     stamps, poses = truth_of(drive, 50)
     rng = np.random.default_rng(3)

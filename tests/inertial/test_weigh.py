@@ -171,7 +171,7 @@ def test_no_interval_is_integrated_twice(monkeypatch: pytest.MonkeyPatch) -> Non
         calls.append((tuple(instants_ns), tuple(bias)))
         return integrate(imu, instants_ns, bias, *rest)
 
-    monkeypatch.setattr("lslam.inertial.estimate.integrate", counted)
+    monkeypatch.setattr("lslam.inertial.imu_estimate.integrate", counted)
     seen = true @ se3.make(so3.exp(np.array([0, 0, 4e-4])), np.zeros(3))
     prior = motion.refine(motion.sweep(stamp, Span(0.0, 0.1)), stamp, seen)
     out = motion.weigh(result_of(3, stamp, seen, np.diag([1e-6] * 3 + [1e-8] * 3)), prior)

@@ -16,7 +16,7 @@ from lslam.kernels import facts as at
 from lslam.kernels.discs import source_discs
 from lslam.preprocessing.prepare import PreparedPoints
 from lslam.registration.gaussian_map import GaussianMap
-from lslam.registration.optimiser import Matches
+from lslam.registration.optimiser import Correspondences
 from lslam.registration.residuals import RESIDUALS as TABLE
 
 Floats = NDArray[np.float64]
@@ -87,7 +87,7 @@ def linearise(
     gap: float = 0.0,
     takes_all: bool = False,
 ) -> Sums:
-    n, kind, matches = len(s.source), TABLE[residual], Matches(len(s.source))
+    n, kind, matches = len(s.source), TABLE[residual], Correspondences(len(s.source))
     H, S, g, facts = np.zeros((6, 6)), np.zeros((6, 6)), np.zeros(6), np.zeros(at.COUNT)
     seen = PreparedPoints(
         s.source.astype(np.float32), s.source, np.zeros((n, 6)), n, covariance=s.covariance, gaps=np.full(n, gap)

@@ -14,7 +14,7 @@ from lslam.kernels import facts as at
 from lslam.kernels import residuals
 from lslam.preprocessing.prepare import PreparedPoints
 from lslam.registration.gaussian_map import GaussianMap
-from lslam.registration.optimiser import Matches, slots_of
+from lslam.registration.optimiser import Correspondences, slots_of
 
 Floats = NDArray[np.float64]
 SIZE, SIGMA2, BLOB, ALONG = 0.8, 9e-4, 0.5, 0.03
@@ -74,7 +74,7 @@ def linearise(
     cache: tuple[NDArray[np.int64], NDArray[np.int32]] | None = None, plane: float = 1.0,
     along: float = ALONG,
 ) -> tuple[Floats, Floats, Floats]:  # fmt: skip
-    m, matches = s.target, Matches(len(s.points.source))
+    m, matches = s.target, Correspondences(len(s.points.source))
     search = matches.search() if cache is None else (*cache, matches.is_done, matches.away2)
     H, S, g, facts = np.zeros((6, 6)), np.zeros((6, 6)), np.zeros(6), np.zeros(at.COUNT)
     residuals.linearise(
@@ -212,7 +212,7 @@ def test_planes_and_blobs_weigh_what_they_are_told(scene: Scene) -> None:
 def test_a_coarser_map_serves_the_points_that_found_no_plane(scene: Scene) -> None:
     """Two calls with one list of done points add up to each point matched once, at the finest map that has a plane."""
     matches, sums = (
-        Matches(len(scene.points.source)),
+        Correspondences(len(scene.points.source)),
         (np.zeros((6, 6)), np.zeros((6, 6)), np.zeros(6), np.zeros(at.COUNT)),
     )
     fine, coarse = scene.target, scene.target.coarsen(3)

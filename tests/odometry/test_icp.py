@@ -19,7 +19,7 @@ from lslam.config.config import Config
 from lslam.geometry import se3
 from lslam.odometry import create_odometry
 from lslam.odometry.icp import Icp, create
-from lslam.registration.motion import ConstantVelocity
+from lslam.registration.constant_velocity import ConstantVelocity
 from lslam.simulation.scenarios import simulate
 from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan import Scan

@@ -15,7 +15,7 @@ from lslam.config import Config, load_config
 from lslam.errors import InputError, InterruptedRunError, OutputExistsError
 from lslam.formats.osm_files import read_osm
 from lslam.formats.trajectory_files import read_trajectory
-from lslam.frontend.checkpoints import Pace
+from lslam.frontend.checkpoints import CheckpointSchedule
 from lslam.geometry import geodesy
 from lslam.osm import source
 from lslam.osm.bounds import Bounds
@@ -104,7 +104,7 @@ def test_a_dead_server_leaves_odometry_as_it_is(by_file: Path, tmp_path: Path, m
 def test_interrupted_it_goes_on_with_the_same_bytes(
     extract: str, by_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(Pace, "is_due", True)
+    monkeypatch.setattr(CheckpointSchedule, "is_due", True)
     serve(monkeypatch)
     left = [9]
 

@@ -19,7 +19,7 @@ from lslam.config import Config, load_config
 from lslam.errors import GateError, InterruptedRunError, OutputExistsError, RunFailedError, RunFinishedError, UsageError
 from lslam.formats.trajectory_files import read_trajectory
 from lslam.frontend import checkpoints
-from lslam.frontend.checkpoints import Pace
+from lslam.frontend.checkpoints import CheckpointSchedule
 from lslam.maps import clean
 from lslam.pipeline.watch import Watch
 from lslam.simulation.scenarios import simulate
@@ -82,7 +82,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Whole:
 
 @pytest.fixture
 def at_every_scan(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Pace, "is_due", True)
+    monkeypatch.setattr(CheckpointSchedule, "is_due", True)
 
 
 def interrupted(stage: str, after: int) -> Watch:
@@ -324,21 +324,21 @@ def test_resume_of_a_folder_that_is_no_run_is_refused(tmp_path: Path) -> None:
 def test_the_pace_of_checkpoints_is_cheap_and_loses_little() -> None:
     """Over an hour: none costs more than a fiftieth, and what a kill loses is a twentieth or half a minute."""
     now = [0.0]
-    pace, written, took = Pace(30.0, clock=lambda: now[0]), [0.0], 0.01
+    schedule, written, took = CheckpointSchedule(30.0, clock=lambda: now[0]), [0.0], 0.01
     while now[0] < 3600:
         now[0] += 0.1
-        if pace.is_due:
+        if schedule.is_due:
             now[0] += took
-            pace.wrote(took)
+            schedule.wrote(took)
             written.append(now[0])
             lost = written[-1] - written[-2]
             assert lost <= max(1.2, 0.06 * now[0])
             assert lost <= 30.3
     assert took * len(written) < 0.02 * 3600
     assert len(written) < 250
-    never = Pace(0.0, clock=lambda: 1e9)
+    never = CheckpointSchedule(0.0, clock=lambda: 1e9)
     assert not never.is_due
-    slow = Pace(1.0, clock=lambda: now[0])
+    slow = CheckpointSchedule(1.0, clock=lambda: now[0])
     slow.wrote(5.0)
     now[0] += 200
     assert not slow.is_due

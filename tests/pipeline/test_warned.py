@@ -17,7 +17,7 @@ from stub_sequences import sample
 import lslam
 from lslam.config import Config, load_config
 from lslam.errors import InterruptedRunError
-from lslam.frontend.checkpoints import Pace
+from lslam.frontend.checkpoints import CheckpointSchedule
 from lslam.pipeline import deliver
 from lslam.pipeline.watch import Watch
 from lslam.warned import MOST_ALIKE, hearing, warnings_so_far
@@ -134,7 +134,7 @@ def test_one_run_after_the_other_and_both_at_once_do_not_mix(tmp_path: Path) -> 
 def test_a_run_that_goes_on_keeps_what_it_was_warned_of(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, threads: int
 ) -> None:
-    monkeypatch.setattr(Pace, "is_due", True)
+    monkeypatch.setattr(CheckpointSchedule, "is_due", True)
     settings = config_of("report.html=false", f"input.threads={threads}")
     stub = replace(sample(COUNT), motion_compensated=None)
     lslam.run(replace(stub, on_read=saying(3, "scan 3 looks odd")), settings, out=tmp_path / "whole")
@@ -150,7 +150,7 @@ def test_a_run_that_goes_on_keeps_what_it_was_warned_of(
 
 
 def test_a_map_that_goes_on_keeps_what_it_was_warned_of(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Pace, "is_due", True)
+    monkeypatch.setattr(CheckpointSchedule, "is_due", True)
     stub, out, begun = sample(COUNT), tmp_path / "out", [False]
 
     class Killed(BaseException):

@@ -15,8 +15,8 @@ from lslam.kernels import range_image
 from lslam.preprocessing.features import extract_features
 from lslam.preprocessing.segments import lego_features, segment_scan
 from lslam.simulation import lidar
-from lslam.simulation.mesh import Surface
 from lslam.simulation.scenarios import simulate
+from lslam.simulation.scene_mesh import Surface
 from lslam.types.scan import Scan
 
 GROUND = [Surface.ROAD, Surface.PAVEMENT, Surface.LAWN]

@@ -19,7 +19,7 @@ from lslam.kernels.linearisation import Floats, Pose, Search, Settings, Sums, Wi
 from lslam.kernels.residuals import Voxels, add_row, nearest, octant_slots
 from lslam.preprocessing.prepare import PreparedPoints
 from lslam.registration.gaussian_map import GaussianMap
-from lslam.registration.optimiser import Limits, Matches, Optimum, Term, optimise
+from lslam.registration.optimiser import Correspondences, Limits, OptimiserResult, Term, optimise
 from lslam.registration.registration import Registration
 from lslam.registration.residuals import RESIDUALS, ResidualKind
 from lslam.registration.robust import Annealing
@@ -47,8 +47,8 @@ def target() -> GaussianMap:
 def align(
     m: GaussianMap, source: Floats, R: Floats, t: Floats, steps: int = STEPS, weak_share: float = 1e-3,
     farthest: float = np.inf,
-) -> Optimum:  # fmt: skip
-    matches = Matches(len(source))
+) -> OptimiserResult:  # fmt: skip
+    matches = Correspondences(len(source))
     terms = voxel_terms(RESIDUALS["plane"], (source, np.zeros((len(source), 6))), [m], matches, 0.03, 0.5)
     return optimise(
         terms, se3.make(R, t), Annealing(1.0, 0.1, 0.5, steps), Limits(weak_share), matches, inlier_distance=farthest
@@ -138,7 +138,7 @@ def test_the_facts_are_named() -> None:
         sums[3][places] += [4.0, 9.0, 20.0, 30.0, 16.0, 1.0]
 
     term = Term(sum_up, (), (), ())
-    facts = optimise([term, term], np.eye(4), Annealing(1.0, 1.0, 0.5, 1), Limits(1e-3), Matches(0)).facts
+    facts = optimise([term, term], np.eye(4), Annealing(1.0, 1.0, 0.5, 1), Limits(1e-3), Correspondences(0)).facts
     assert (facts.information, facts.squared, facts.lever_information, facts.robust) == (8.0, 18.0, 32.0, 2.0)
     assert (facts.inliers, facts.matched) == (40, 60)
     assert facts.lever_arm == 2.0

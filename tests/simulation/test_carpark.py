@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from lslam.errors import UsageError
 from lslam.geometry import se3
 from lslam.simulation.lidar_models import LIDARS
-from lslam.simulation.mesh import Surface
 from lslam.simulation.scenarios import SimulatedDrive, simulate
+from lslam.simulation.scene_mesh import Surface
 from lslam.simulation.terrain import rolling
 
 Floats = NDArray[np.float64]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lslam.geometry import se3, so3
-from lslam.simulation.curve import Curve, smooth_curve, stretched
+from lslam.simulation.curve import RouteCurve, smooth_curve, stretched
 from lslam.simulation.flight import GRAVITY, FreePath, buffeting, climb_spline, fly, gait
 from lslam.simulation.path import SpeedProfile
 from lslam.simulation.terrain import rolling
@@ -15,12 +15,12 @@ STEADY = SpeedProfile(8.0, 8.0, lateral=1e6)
 CALM = buffeting(np.random.default_rng(0), 0.0)
 
 
-def circle(radius: float) -> Curve:
+def circle(radius: float) -> RouteCurve:
     angle = np.linspace(0, 2 * np.pi, 400, endpoint=False)
     return smooth_curve(radius * np.stack([np.cos(angle), np.sin(angle)], 1), closed=True)
 
 
-def flight(curve: Curve, heights: tuple[float, float] = (10.0, 10.0), bank: float = 1.0) -> FreePath:
+def flight(curve: RouteCurve, heights: tuple[float, float] = (10.0, 10.0), bank: float = 1.0) -> FreePath:
     climb = climb_spline(curve, np.array([0.0, curve.length]), np.array(heights), 4.0)
     return fly(curve, STEADY, curve.length, climb, bank, CALM)
 

@@ -12,15 +12,15 @@ from scipy import stats
 from lslam.simulation import furniture
 from lslam.simulation.lidar import RayScene, trace
 from lslam.simulation.lidar_models import LidarModel
-from lslam.simulation.mesh import Mesh, MeshBuilder, Surface, box
 from lslam.simulation.returns import Returns
+from lslam.simulation.scene_mesh import MeshBuilder, SceneMesh, Surface, box
 from lslam.types.scan import Scan
 
 BEAMS = LidarModel("beams", (0.0,), 36000, 0.1, 500.0, 0.0, 1e-6, 0.0, 1e6, 0.0)
 AHEAD = 5.0  # deg to either side
 
 
-def slab(near: float, far: float, surface: int = Surface.CROWN) -> Mesh:
+def slab(near: float, far: float, surface: int = Surface.CROWN) -> SceneMesh:
     """A volume across the way from x = near to far, wound outwards; walls when it is one."""
     builder = MeshBuilder()
     low, high = np.array([near, -50.0, -20.0]), np.array([far, 50.0, 20.0])
@@ -32,7 +32,7 @@ def slab(near: float, far: float, surface: int = Surface.CROWN) -> Mesh:
     return builder.build()
 
 
-def joined(*meshes: Mesh) -> RayScene:
+def joined(*meshes: SceneMesh) -> RayScene:
     builder = MeshBuilder()
     for mesh in meshes:
         builder.add_mesh(mesh)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from lslam.errors import UsageError
 from lslam.geometry import geodesy, se3, so3
 from lslam.simulation.gnss import ORIGIN, T_CAR_ANTENNA, GnssModel, SimulatedGnss, simulate_gnss
-from lslam.simulation.motion import Motion, smooth_motion
+from lslam.simulation.kinematics import Motion, smooth_motion
 from lslam.simulation.scenarios import SimulatedDrive, simulate
 
 Floats = NDArray[np.float64]

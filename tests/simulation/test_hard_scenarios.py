@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
+from lslam.simulation.built_scenario import build_scenario
 from lslam.simulation.imu import IMUS, ImuFaults
-from lslam.simulation.mesh import Surface
-from lslam.simulation.places import build_place
 from lslam.simulation.scenario_files import parse_scenario, scenario_named, scenario_names
 from lslam.simulation.scenarios import simulate
+from lslam.simulation.scene_mesh import Surface
 
 FLIGHTS = ("closed", "open", "climbing", "small-eight", "large-eight")
 PAIRS = {name: f"{name}-hard" for name in ("urban", "residential", *FLIGHTS)}
@@ -46,7 +46,7 @@ def test_only_hard_worlds_and_woods_have_real_returns() -> None:
 @pytest.mark.parametrize("name", ["park", "forest-road"])
 def test_in_woods_leaves_are_everywhere_but_on_the_way(name: str) -> None:
     scenario = scenario_named(name)
-    place = build_place(scenario, 1, count=50)
+    place = build_scenario(scenario, 1, count=50)
     mesh, street = place.city.mesh, place.city.street
     assert street is not None
     leaves = np.isin(mesh.surfaces, (Surface.CROWN, Surface.HEDGE))

@@ -21,7 +21,7 @@ from lslam.simulation.imu import (
     measure,
     simulate_imu,
 )
-from lslam.simulation.motion import Motion, smooth_motion, standing_start
+from lslam.simulation.kinematics import Motion, smooth_motion, standing_start
 from lslam.simulation.scenarios import SimulatedDrive, simulate
 from lslam.types.imu import ImuStream
 

@@ -12,23 +12,23 @@ from lslam.errors import UsageError
 from lslam.geometry import se3, so3
 from lslam.simulation.lidar import RayScene, trace
 from lslam.simulation.lidar_models import LIDARS, LidarModel, lidar_named
-from lslam.simulation.mesh import Mesh, MeshBuilder, Surface
+from lslam.simulation.scene_mesh import MeshBuilder, SceneMesh, Surface
 
 # A LiDAR without faults, so that answers are exact.
 PERFECT = LidarModel("perfect", (10.0, 2.0, -5.0, -15.0, -30.0), 360, 0.1, 500.0, 0.0, 1e-6, 0.0, 1e6, 0.0)
 
 
-def quad(*corners: tuple[float, float, float], surface: int = Surface.WALL) -> Mesh:
+def quad(*corners: tuple[float, float, float], surface: int = Surface.WALL) -> SceneMesh:
     builder = MeshBuilder()
     builder.add_quads([corners], surface)
     return builder.build()
 
 
-def floor(z: float) -> Mesh:
+def floor(z: float) -> SceneMesh:
     return quad((-900, -900, z), (900, -900, z), (900, 900, z), (-900, 900, z))
 
 
-def room(half: float) -> Mesh:
+def room(half: float) -> SceneMesh:
     builder = MeshBuilder()
     builder.add_box([-half] * 3, [half] * 3, Surface.WALL)
     return builder.build()
@@ -130,11 +130,11 @@ def test_angle_noise_moves_points_across_the_ray() -> None:
     assert np.std(elevation(scan.points)) == pytest.approx(0.1, rel=0.05)
 
 
-def wall_at(x: float, surface: int = Surface.WALL) -> Mesh:
+def wall_at(x: float, surface: int = Surface.WALL) -> SceneMesh:
     return quad((x, -500, -500), (x, 500, -500), (x, 500, 500), (x, -500, 500), surface=surface)
 
 
-def returned(mesh: Mesh, azimuth_deg: float = 0.0) -> float:
+def returned(mesh: SceneMesh, azimuth_deg: float = 0.0) -> float:
     """Share of rays near one azimuth that come back."""
     model = replace(LIDARS["hdl64"], elevations_deg=(0.0,), columns=36000, firing_us=())
     scan = trace(RayScene(mesh), model, np.eye(4), rng())

@@ -14,22 +14,26 @@ from numpy.typing import NDArray
 from lslam.simulation.curve import smooth_curve
 from lslam.simulation.lidar import MovingMesh, RayScene, Roof, trace
 from lslam.simulation.lidar_models import LIDARS, LidarModel
-from lslam.simulation.mesh import Mesh, MeshBuilder, Surface
 from lslam.simulation.moving import NEAREST, Mover, add_traffic, moving_meshes, pedestrian
 from lslam.simulation.scenarios import simulate
+from lslam.simulation.scene_mesh import MeshBuilder, SceneMesh, Surface
 from lslam.simulation.terrain import flat, rolling
 
 PERFECT = LidarModel("perfect", (2.0, 0.0, -2.0), 3600, 0.1, 500.0, 0.0, 1e-6, 0.0, 1e6, 0.0)
 
 
-def cube(half: float, surface: int = Surface.CAR) -> Mesh:
+def cube(half: float, surface: int = Surface.CAR) -> SceneMesh:
     builder = MeshBuilder()
     builder.add_box([-half] * 3, [half] * 3, surface)
     return builder.build()
 
 
 def body_of(
-    mesh: Mesh, poses: Callable[[NDArray[Any]], NDArray[np.float64]], radius: float, speed: float = 0.0, at: float = 0.0
+    mesh: SceneMesh,
+    poses: Callable[[NDArray[Any]], NDArray[np.float64]],
+    radius: float,
+    speed: float = 0.0,
+    at: float = 0.0,
 ) -> MovingMesh:
     """The body as a scan stamped `at` s is told of it."""
     return MovingMesh(RayScene(mesh), poses, radius, speed, poses(np.array([at]))[0, :3, 3])

@@ -17,9 +17,9 @@ from lslam.errors import InputError
 from lslam.simulation.curve import smooth_curve
 from lslam.simulation.extrusion import extrude
 from lslam.simulation.lidar import RayScene
-from lslam.simulation.mesh import MeshBuilder, Surface
 from lslam.simulation.osm_city import OsmCity, build_osm_city
 from lslam.simulation.osm_place import read_extract
+from lslam.simulation.scene_mesh import MeshBuilder, Surface
 from lslam.simulation.terrain import flat, rolling
 from lslam.types.building import Building, Footprint, footprint_polygon
 

@@ -17,13 +17,13 @@ from lslam.errors import InputError, OutputError
 from lslam.formats.osm_buildings import buildings_of, osm_from_buildings
 from lslam.formats.osm_files import ATTRIBUTION, read_osm, write_osm
 from lslam.simulation.city import City
-from lslam.simulation.mesh import Surface
 from lslam.simulation.osm_city import build_osm_city
 from lslam.simulation.osm_extract import Extracts, city_buildings, write_extracts
 from lslam.simulation.osm_faults import MapFaults, draw_perturbation
 from lslam.simulation.osm_perturb import Change, map_errors, perturb, read_perturbation, write_perturbation
 from lslam.simulation.osm_place import read_extract
 from lslam.simulation.scenarios import simulate
+from lslam.simulation.scene_mesh import Surface
 from lslam.simulation.terrain import flat, rolling
 from lslam.types.building import Building, Footprint, footprint_polygon
 

@@ -14,14 +14,14 @@ from shapely import LineString, MultiPolygon, Point, contains_xy, distance, poin
 from lslam.errors import InputError, UsageError
 from lslam.formats.osm_files import ATTRIBUTION, read_osm, write_osm
 from lslam.geometry.geodesy import from_local, to_local
-from lslam.simulation.mesh import Surface
+from lslam.simulation.built_scenario import whole_map
 from lslam.simulation.osm_city import OsmCity
 from lslam.simulation.osm_place import read_extract
 from lslam.simulation.osm_streets import DRIVABLE, WALKABLE, find_route, highways
-from lslam.simulation.places import whole_map
 from lslam.simulation.record import record
 from lslam.simulation.scenario_files import scenario_named
 from lslam.simulation.scenarios import SimulatedDrive, simulate
+from lslam.simulation.scene_mesh import Surface
 from lslam.simulation.waypoints import WayPoints
 from lslam.types.building import footprint_polygon
 

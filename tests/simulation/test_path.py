@@ -6,18 +6,18 @@ import numpy as np
 import pytest
 
 from lslam.geometry import se3, so3
-from lslam.simulation.curve import Curve, rounded_rectangle, smooth_curve, winding_line
+from lslam.simulation.curve import RouteCurve, rounded_rectangle, smooth_curve, winding_line
 from lslam.simulation.path import SpeedProfile, Suspension, VehiclePath, drive, suspension
 from lslam.simulation.terrain import flat, rolling
 
 STILL = Suspension(np.zeros((1, 3)), np.zeros((1, 3)), np.ones(1))
 
 
-def straight(length: float = 200.0) -> Curve:
+def straight(length: float = 200.0) -> RouteCurve:
     return smooth_curve(np.array([[0.0, 0.0], [length, 0.0]]), closed=False)
 
 
-def circle(radius: float) -> Curve:
+def circle(radius: float) -> RouteCurve:
     angle = np.linspace(0, 2 * np.pi, 400, endpoint=False)
     return smooth_curve(radius * np.stack([np.cos(angle), np.sin(angle)], 1), closed=True)
 

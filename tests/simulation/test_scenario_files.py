@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lslam.errors import ConfigError, UsageError
-from lslam.simulation.places import Place, build_place
+from lslam.simulation.built_scenario import BuiltScenario, build_scenario
 from lslam.simulation.scenario_files import Scenario, parse_scenario, scenario_named, scenario_names
 from lslam.simulation.scenarios import simulate
 
@@ -20,11 +20,11 @@ FLIGHTS = {
 }
 
 
-def built(name: str, *settings: str) -> tuple[Scenario, Place]:
+def built(name: str, *settings: str) -> tuple[Scenario, BuiltScenario]:
     """A place without its houses, which take time and are not asked about here."""
     bare = ("world.levels=0", "layout.garden_trees=0", "layout.parked=0", "layout.trees=0", *settings)
     scenario = scenario_named(name, bare)
-    return scenario, build_place(scenario, 0)
+    return scenario, build_scenario(scenario, 0)
 
 
 @pytest.mark.parametrize("name", FLIGHTS)

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from lslam.errors import UsageError
 from lslam.geometry import se3
-from lslam.simulation.mesh import Surface
 from lslam.simulation.scenarios import SimulatedDrive, simulate
+from lslam.simulation.scene_mesh import Surface
 from lslam.types.scan import Scan
 from lslam.types.sequence import Sequence
 

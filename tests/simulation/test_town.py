@@ -12,9 +12,9 @@ from lslam.errors import UsageError
 from lslam.simulation.city import KERB, City
 from lslam.simulation.clearance import check_bends, check_path
 from lslam.simulation.lidar import RayScene
-from lslam.simulation.mesh import MeshBuilder, Surface
 from lslam.simulation.scenario_files import scenario_names
 from lslam.simulation.scenarios import SimulatedDrive, simulate
+from lslam.simulation.scene_mesh import MeshBuilder, Surface
 from lslam.simulation.terrain import Terrain
 from lslam.simulation.town import Network
 from lslam.types.scan import Scan

@@ -14,9 +14,9 @@ from lslam.simulation.carpark import build_carpark
 from lslam.simulation.city import City, build_city
 from lslam.simulation.clearance import check_bends
 from lslam.simulation.countryside import build_corridor, build_motorway
-from lslam.simulation.curve import Curve, stretched
+from lslam.simulation.curve import RouteCurve, stretched
 from lslam.simulation.flight import FreePath, buffeting, climb_spline, fly, gait
-from lslam.simulation.motion import PosePath
+from lslam.simulation.kinematics import PosePath
 from lslam.simulation.moving import Mover, add_traffic
 from lslam.simulation.osm_city import OsmCity
 from lslam.simulation.osm_place import MapExtract, city_of_map, keep_out_of_walls, route_in_map
@@ -33,7 +33,7 @@ CORRIDOR_SPARE = 130.0  # m, so that no LiDAR here sees an end of the corridor
 
 
 @dataclass(frozen=True)
-class Place:
+class BuiltScenario:
     """A built scenario: the city, the path of the LiDAR through it, and how many scans it gives."""
 
     city: City
@@ -41,14 +41,14 @@ class Place:
     scans: int
 
 
-def build_place(
+def build_scenario(
     scenario: Scenario,
     seed: int,
     count: int | None = None,
     way_points: WayPoints | None = None,
     extract: MapExtract | None = None,
     standing: int = 0,
-) -> Place:
+) -> BuiltScenario:
     """Build the place of `scenario`; one generator per part, so that another LiDAR or speed leaves the city as it is.
 
     Only an out-and-back, and what is round it, is longer when a speed or `count` needs it. `way_points` replace the scenario's
@@ -65,8 +65,8 @@ def build_place(
     _check_radius(scenario, route.line)
     path, scans = _move(scenario, route, terrain, count, standing, shake)
     if extract is not None:
-        return Place(city_of_map(scenario, extract, terrain, build, route), path, scans)
-    return Place(_city(scenario, route.street, terrain, build), path, scans)
+        return BuiltScenario(city_of_map(scenario, extract, terrain, build, route), path, scans)
+    return BuiltScenario(_city(scenario, route.street, terrain, build), path, scans)
 
 
 def whole_map(scenario: Scenario, seed: int, extract: MapExtract) -> tuple[OsmCity, Floats]:
@@ -100,7 +100,7 @@ def _terrain(scenario: Scenario, rng: np.random.Generator) -> Terrain:
     return rolling(rng, world.relief, world.unevenness, world.swell, world.slope)
 
 
-def _city(scenario: Scenario, street: Curve, terrain: Terrain, rng: np.random.Generator) -> City:
+def _city(scenario: Scenario, street: RouteCurve, terrain: Terrain, rng: np.random.Generator) -> City:
     world = scenario.world
     if world.kind == "street":
         return build_city(street, terrain, scenario.layout, rng)
@@ -115,7 +115,7 @@ def _city(scenario: Scenario, street: Curve, terrain: Terrain, rng: np.random.Ge
     return build_town([stretched(street, SPARE)], terrain, scenario.layout, rng, world.spacing, world.levels)
 
 
-def _check_radius(scenario: Scenario, line: Curve) -> None:
+def _check_radius(scenario: Scenario, line: RouteCurve) -> None:
     s = line.sample(0.25)
     curvature = line.curvature(s)
     least, worst = TIGHTEST[scenario.carrier], int(np.argmax(np.abs(curvature)))

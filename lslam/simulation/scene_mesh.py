@@ -33,7 +33,7 @@ class Surface(IntEnum):
 
 
 @dataclass(frozen=True)
-class Mesh:
+class SceneMesh:
     """Triangles in one frame.
 
     vertices : (V, 3) float32, m; faces : (F, 3) int32 indices of vertices; surfaces : (F,) uint8 values of `Surface`
@@ -79,17 +79,17 @@ class MeshBuilder:
         """Add an axis-aligned box between two corners (3,)."""
         self.add(*box(low, high), surface)
 
-    def add_mesh(self, mesh: Mesh, position: Any = (0, 0, 0), yaw: float = 0.0) -> None:
+    def add_mesh(self, mesh: SceneMesh, position: Any = (0, 0, 0), yaw: float = 0.0) -> None:
         """Add a mesh turned by `yaw` (rad, about z) and moved to `position` (3,)."""
         c, s = np.cos(yaw), np.sin(yaw)
         turned = mesh.vertices @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
         self.add(turned + np.asarray(position, np.float64), mesh.faces, mesh.surfaces)
 
-    def build(self) -> Mesh:
+    def build(self) -> SceneMesh:
         """All parts as one mesh."""
         if not self._faces:
-            return Mesh(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32), np.zeros(0, np.uint8))
-        return Mesh(
+            return SceneMesh(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32), np.zeros(0, np.uint8))
+        return SceneMesh(
             np.concatenate(self._vertices).astype(np.float32),
             np.concatenate(self._faces).astype(np.int32),
             np.concatenate(self._surfaces),

@@ -42,7 +42,7 @@ def of_registration(scan: Scan, found: RegistrationResult, map_age: float, stage
 
 
 @dataclass(frozen=True)
-class Alignment:
+class AlignerResult:
     """What an aligner says of one scan.
 
     T_world_lidar : (4, 4); source_points : points that were offered; inliers : those with a partner within reach
@@ -58,7 +58,7 @@ class Alignment:
 
 
 def judged(
-    scan: Scan, found: Alignment, T_prior: NDArray[np.float64], limits: RegistrationConfig, stages: dict[str, float]
+    scan: Scan, found: AlignerResult, T_prior: NDArray[np.float64], limits: RegistrationConfig, stages: dict[str, float]
 ) -> ScanResult:
     """The result of a scan: `ok`, or `bridged` by the motion prior when the alignment cannot be believed."""
     share = found.inliers / max(found.source_points, 1)

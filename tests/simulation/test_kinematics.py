@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from lslam.geometry import se3, so3
-from lslam.simulation.motion import Kinematics, Motion, smooth_motion, standing_start
+from lslam.simulation.kinematics import Kinematics, Motion, smooth_motion, standing_start
 from lslam.simulation.scenarios import simulate
 
 Floats = NDArray[np.float64]

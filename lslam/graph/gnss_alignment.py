@@ -23,7 +23,7 @@ MAJORITY = 0.5
 
 
 @dataclass(frozen=True)
-class Alignment:
+class GnssAlignment:
     """T_enu_world (4, 4); believed : (F,) bool; residuals : (F, 3) m, east, north, up, of fixes minus trajectory."""
 
     T_enu_world: Floats
@@ -33,7 +33,7 @@ class Alignment:
 
 def align(
     antenna: Floats, fixes: Floats, sigmas: Floats, slack: Floats, up: Floats, up_sigma: float, min_fixes: int
-) -> Alignment | None:
+) -> GnssAlignment | None:
     """Fit the antenna's positions in the world to its fixes; None when fewer than `min_fixes` or half of them agree.
 
     Parameters
@@ -57,7 +57,7 @@ def align(
             return None
         T = _refined(T, a[believed], fixes[believed], judged[believed], up_sigma)
     T_enu_world = T @ se3.make(level, np.zeros(3))
-    return Alignment(T_enu_world, believed, fixes - se3.apply(T_enu_world, antenna))
+    return GnssAlignment(T_enu_world, believed, fixes - se3.apply(T_enu_world, antenna))
 
 
 def _tilted(a: Floats, up_sigma: float) -> Floats:

@@ -8,7 +8,7 @@ from graph_builders import truth
 from scipy.stats import chi2
 
 from lslam.geometry import se3, so3
-from lslam.graph.alignment import align
+from lslam.graph.gnss_alignment import align
 
 PATH = truth(200, 2, radius=80.0)[:, :3, 3]
 T_ENU_WORLD = se3.make(so3.from_euler_rpy(np.array([0.04, -0.05, 2.1])), np.array([300.0, -40.0, 7.0]))
