@@ -15,8 +15,9 @@ from lslam.cli.console import log, setup_logging, show
 from lslam.errors import GateError, LslamError, RunFailedError, UsageError
 
 if TYPE_CHECKING:
-    from lslam.studies.batch import Line
-    from lslam.studies.expanded import Expanded, Place
+    from lslam.studies.batch import RunLine
+    from lslam.studies.expanded_study import ExpandedStudy
+    from lslam.studies.output import OutputOptions
     from lslam.types.study import StudyRow
 
 # What a line may not say, because the batch does.
@@ -45,37 +46,37 @@ def command(jobs_file: Path, **given: Any) -> None:
     """
     setup_logging(given["verbose"], given["quiet"])
     from lslam.cli.study_screen import bars
-    from lslam.studies.expanded import make_runs
+    from lslam.studies.expanded_study import make_runs
 
-    place = options.place_of(given, "batch")
-    expanded = _expanded(jobs_file, place, given)
+    output = options.output_of(given, "batch")
+    expanded = _expanded(jobs_file, output, given)
     if given["dry_run"]:
         show("".join(f"{job.name}  {job.folder}\n" for job in expanded.jobs))
         return
-    with options.engine_of(given, "runs", is_kept=False) as engine, ExitStack() as stack:
-        rows = make_runs(expanded, place, engine, bars(stack))
+    with options.engine_of(given, "runs", is_persistent=False) as engine, ExitStack() as stack:
+        rows = make_runs(expanded, output, engine, bars(stack))
     _print(rows)
-    log.info("every run: %s", place.out / "results.csv")
+    log.info("every run: %s", output.out / "results.csv")
     _judge(rows, given["strict"])
 
 
-def _expanded(path: Path, place: Place, given: dict[str, Any]) -> Expanded:
+def _expanded(path: Path, output: OutputOptions, given: dict[str, Any]) -> ExpandedStudy:
     from lslam.config.batch import read_batch
     from lslam.studies.batch import expand_batch, expand_lines, run_words
 
     if path != Path("-"):
-        return expand_batch(read_batch(path), place, given["settings"])
+        return expand_batch(read_batch(path), output, given["settings"])
     lines = [_line(number, words, given) for number, words in run_words(sys.stdin.read())]
     if not lines:
         raise UsageError("there is no line on stdin: write `lslam run SEQUENCE ...` on each")
-    return expand_lines(lines, place)
+    return expand_lines(lines, output)
 
 
-def _line(number: int, words: list[str], given: dict[str, Any]) -> Line:
+def _line(number: int, words: list[str], given: dict[str, Any]) -> RunLine:
     """One `lslam run`, understood as that command does; raises what it raises, naming the line."""
     from lslam.cli.run import command as run_command
     from lslam.cli.run import opened_with, read_truth
-    from lslam.studies.batch import Line
+    from lslam.studies.batch import RunLine
 
     try:
         said = run_command.make_context("run", list(words)).params
@@ -86,7 +87,7 @@ def _line(number: int, words: list[str], given: dict[str, Any]) -> Line:
         said["settings"] = (*said["settings"], *given["settings"])
         said["data_root"] = said["data_root"] or given["data_root"]
         sequence, config = opened_with(said)
-        return Line(
+        return RunLine(
             shlex.join(words), sequence, config, read_truth(said["gt"], sequence), said["out"], options.reading_of(said)
         )  # fmt: skip
     except LslamError as error:

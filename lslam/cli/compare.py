@@ -16,7 +16,7 @@ from lslam.cli import options
 from lslam.cli.console import log, setup_logging, show
 
 if TYPE_CHECKING:
-    from lslam.studies.plan import Plan
+    from lslam.studies.compare import Plan
     from lslam.studies.subjects import Subject
     from lslam.types.comparison import Comparison
     from lslam.types.trajectory import Trajectory
@@ -90,7 +90,7 @@ def command(sequences: tuple[str, ...], **given: Any) -> None:
 
 
 def _plan(sequences: tuple[str, ...], given: dict[str, Any]) -> Plan:
-    from lslam.studies.plan import Plan
+    from lslam.studies.compare import Plan
     from lslam.studies.subjects import find_subjects
     from lslam.studies.variants import find_variants
 
@@ -125,7 +125,7 @@ def _truth(path: Path | None, subjects: list[Subject]) -> Trajectory | None:
     from lslam.cli.run import read_truth
     from lslam.errors import UsageError
     from lslam.readers import open_sequence
-    from lslam.studies.plan import ONE_TRUTH
+    from lslam.studies.compare import ONE_TRUTH
 
     if path is None:
         return None

@@ -20,7 +20,7 @@ from lslam.untrusted import whole_number
 if TYPE_CHECKING:
     from lslam.config.input import ScanRange
     from lslam.studies.engines import Engine
-    from lslam.studies.expanded import Place
+    from lslam.studies.output import OutputOptions
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -162,13 +162,13 @@ def studied(function: F) -> F:
     return function
 
 
-def place_of(given: dict[str, Any], name: str) -> Place:
+def output_of(given: dict[str, Any], name: str) -> OutputOptions:
     """Where runs go, as the options of `studied` say."""
-    from lslam.studies.expanded import Place
+    from lslam.studies.output import OutputOptions
 
     out = given["out"] or Path("runs") / time.strftime(f"{name}-%Y%m%d-%H%M%S")
     command = shlex.join(["lslam", *sys.argv[1:]])
-    return Place(out, given["overwrite"], given["resume"], given["scenes"], given["data_root"], command)
+    return OutputOptions(out, given["overwrite"], given["resume"], given["scenes"], given["data_root"], command)
 
 
 def engine(function: F) -> F:
@@ -188,10 +188,10 @@ def engine(function: F) -> F:
 
 
 @contextmanager
-def engine_of(given: dict[str, Any], title: str, is_kept: bool = True) -> Iterator[Engine]:
+def engine_of(given: dict[str, Any], title: str, is_persistent: bool = True) -> Iterator[Engine]:
     """What makes the runs, as the options of `engine` say; raises UsageError for what does not go together.
 
-    is_kept : whether data stay read from one run to the next, and keyframes do not stay
+    is_persistent : whether data stay read from one run to the next, and keyframes do not stay
     """
     from lslam.studies.engines import Local
 
@@ -201,11 +201,11 @@ def engine_of(given: dict[str, Any], title: str, is_kept: bool = True) -> Iterat
     if jobs is not None and jobs < 1:
         raise UsageError(f"--jobs {jobs}: at least one run at a time")
     if scheduler is None and cluster is None:
-        yield Local(jobs or os.cpu_count() or 1, is_kept, title)
+        yield Local(jobs or os.cpu_count() or 1, is_persistent, title)
         return
     from lslam.studies.cluster import connected
 
-    with connected(scheduler, cluster, title, is_kept=is_kept) as engine:
+    with connected(scheduler, cluster, title, is_persistent=is_persistent) as engine:
         yield engine
 
 

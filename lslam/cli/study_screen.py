@@ -12,13 +12,13 @@ from lslam.cli.console import log, progress, terminal
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from lslam.studies.plan import Follow
+    from lslam.studies.runner import StudyProgress
     from lslam.types.study import StudyRow
 
 
-def bars(stack: ExitStack) -> Follow:
+def bars(stack: ExitStack) -> StudyProgress:
     """One progress bar after the other."""
-    from lslam.studies.plan import Follow
+    from lslam.studies.runner import StudyProgress
 
     bar = stack.enter_context(ExitStack())
     advance: list[Any] = []
@@ -27,7 +27,7 @@ def bars(stack: ExitStack) -> Follow:
         bar.close()
         advance[:] = [bar.enter_context(progress(stage, total, unit))]
 
-    return Follow(on_start, lambda note: advance[0](note))
+    return StudyProgress(on_start, lambda note: advance[0](note))
 
 
 class BestTable:

@@ -79,8 +79,8 @@ def command(study: str | None, **given: Any) -> None:
     unscored = [row for row in rows if row.is_usable and isnan(row.thesis_rmse) and row.reason]
     if unscored:
         log.warning("%d of %d runs have no score, the first one: %s", len(unscored), len(rows), unscored[0].reason)
-    log.info("every run: %s", sweep.place.out / "results.csv")
-    _report(sweep.place.out)
+    log.info("every run: %s", sweep.output.out / "results.csv")
+    _report(sweep.output.out)
     failed = [row for row in rows if not row.is_usable]
     if failed and given["strict"]:
         raise GateError(f"--strict: {len(failed)} of {len(rows)} runs failed, the first one: {failed[0].reason}")
@@ -88,14 +88,13 @@ def command(study: str | None, **given: Any) -> None:
 
 def _sweep(word: str, given: dict[str, Any]) -> Sweep:
     from lslam.config.study import parse_study
-    from lslam.studies.study_files import find_study
-    from lslam.studies.sweep import Sweep
+    from lslam.studies.sweep import Sweep, find_study
 
     study = find_study(word)
     if given["seeds"] is not None:
         seeds = options.seeds_of(given["seeds"])
         study = parse_study(study.model_dump(exclude_unset=True) | {"seeds": seeds}, "--seeds", study.name)
-    return Sweep(study, options.place_of(given, study.name), given["settings"])
+    return Sweep(study, options.output_of(given, study.name), given["settings"])
 
 
 def _print(rows: list[StudyRow]) -> None:
@@ -107,7 +106,7 @@ def _print(rows: list[StudyRow]) -> None:
 
 def _report(folder: Path) -> None:
     """Write the report and print its verdicts."""
-    from lslam.studies.study_report import report_folder
+    from lslam.studies.sweep import report_folder
 
     for result in report_folder(folder):
         for verdict in result.verdicts:
@@ -116,7 +115,7 @@ def _report(folder: Path) -> None:
 
 
 def _print_list() -> None:
-    from lslam.studies.study_files import find_study, study_names
+    from lslam.studies.sweep import find_study, study_names
 
     for name in study_names():
         show(f"{name:<22}  {find_study(name).summary}\n")
@@ -126,22 +125,22 @@ def _print_plan(sweep: Sweep, at_once: int, is_piloted: bool, stack: ExitStack) 
     """Every run, how many there are, and how long those will take that are not finished."""
     from lslam.cli.study_screen import bars
     from lslam.studies.estimate import estimate, from_finished
-    from lslam.studies.expanded import left_to_do
+    from lslam.studies.expanded_study import left_to_do
     from lslam.studies.sweep import expand_study
 
     expanded = expand_study(sweep)
     for job in expanded.jobs:
         show(f"{job.name}\n")
-    left = left_to_do(sweep.place, expanded.jobs)
+    left = left_to_do(sweep.output, expanded.jobs)
     many = f"{len(expanded.jobs)} runs, {len(left)} left to do"
     if not left:
         show(f"{many}\n")
         return
     if is_piloted:
-        guess = estimate(left, expanded.contenders, at_once, bars(stack), time.process_time())
+        guess = estimate(left, expanded.variants, at_once, bars(stack), time.process_time())
         show(f"{many}: about {guess.text}, {at_once} at once ({guess.pilots} pilot runs)\n")
         return
-    earlier = from_finished(expanded.jobs, left, expanded.contenders, at_once)
+    earlier = from_finished(expanded.jobs, left, expanded.variants, at_once)
     if earlier is None:
         show(f"{many}; how long they take says --pilot, by a few short ones\n")
     else:

@@ -23,7 +23,7 @@ _COUNTS: dict[str, tuple[int, int]] = {
 _LAWS = ("linear", "inverse", "product")
 
 
-class FindingConfig(Section):
+class ExpectedFinding(Section):
     """One `[[finding]]` of a study file.
 
     Kinds and their `values`, in the unit of the studied parameter unless said otherwise:

@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, Field, ValidationError, ValidationInfo, field_validator, model_validator
 
-from lslam.config.finding import FindingConfig
+from lslam.config.finding import ExpectedFinding
 from lslam.config.input import ScanRange
 from lslam.config.load import explain
 from lslam.config.preset_files import read_toml
@@ -124,7 +124,7 @@ class StudyConfig(Section):
         min_length=1, description="by configuration key: a list of values or a range {start, stop, step | num, log}"
     )
     config: dict[str, dict[str, Any]] = Field({}, description="sections that hold for all runs, over the presets")
-    finding: tuple[FindingConfig, ...] = Field((), description="what is expected")
+    finding: tuple[ExpectedFinding, ...] = Field((), description="what is expected")
 
     @field_validator("parameters", mode="before")
     @classmethod
@@ -164,7 +164,7 @@ class StudyConfig(Section):
 
     @field_validator("finding")
     @classmethod
-    def _speak_of_runs(cls, findings: tuple[FindingConfig, ...], info: ValidationInfo) -> tuple[FindingConfig, ...]:
+    def _speak_of_runs(cls, findings: tuple[ExpectedFinding, ...], info: ValidationInfo) -> tuple[ExpectedFinding, ...]:
         """What names a key or a method that is not there would never be judged."""
         keys, words = info.data.get("parameters", {}), info.data.get("methods", ())
         labels = [Path(word).stem if word.endswith(".toml") else word for word in words]

@@ -16,13 +16,13 @@ from lslam.types.sensitivity import Curve, CurveResult, Floats, Interval, Law, L
 from lslam.types.study import StudyRow
 
 if TYPE_CHECKING:
-    from lslam.config.finding import FindingConfig
+    from lslam.config.finding import ExpectedFinding
 
 SKIP = "input.skip_frames"
 EFFICIENCIES = ("efficiency", "total_efficiency")
 
 
-def evaluate_study(rows: Sequence[StudyRow], findings: Sequence[FindingConfig] = ()) -> list[StudyResult]:
+def evaluate_study(rows: Sequence[StudyRow], findings: Sequence[ExpectedFinding] = ()) -> list[StudyResult]:
     """One result per study, sequence and studied parameter, in the order they appear in `rows`; runs beside belong to all."""
     groups: dict[tuple[str, str, str], list[StudyRow]] = {}
     for row in rows:
@@ -36,7 +36,7 @@ def evaluate_study(rows: Sequence[StudyRow], findings: Sequence[FindingConfig] =
     return out
 
 
-def _evaluate(rows: Sequence[StudyRow], beside: Sequence[StudyRow], findings: Sequence[FindingConfig]) -> StudyResult:
+def _evaluate(rows: Sequence[StudyRow], beside: Sequence[StudyRow], findings: Sequence[ExpectedFinding]) -> StudyResult:
     limit = lost_above(rows)
     results = tuple(_result(curve) for curve in curves_of(rows, limit))
     products = _products(results)

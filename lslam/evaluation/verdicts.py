@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
-from lslam.config.finding import FindingConfig
+from lslam.config.finding import ExpectedFinding
 from lslam.evaluation.verdicts_of_amounts import judge_acts_only_on, judge_law, judge_matters_little, judge_product
 from lslam.evaluation.verdicts_of_places import (
     judge_best_between,
@@ -28,7 +28,7 @@ _OF_ERROR = ("diverges_beyond", "holds_up_to", "elbow_at", "good_from")
 _OF_WORDS = ("matters_little", "acts_only_on")
 
 
-def judge(finding: FindingConfig, results: Sequence[CurveResult], products: Mapping[str, Law]) -> Verdict:
+def judge(finding: ExpectedFinding, results: Sequence[CurveResult], products: Mapping[str, Law]) -> Verdict:
     """The verdict over all curves that the finding speaks of: where they disagree it is undecided."""
     mine = [result for result in results if _speaks_of(finding, result)]
     if not mine:
@@ -50,7 +50,7 @@ def judge(finding: FindingConfig, results: Sequence[CurveResult], products: Mapp
     return Verdict(finding.text, outcome, "; ".join(told), finding.source)
 
 
-def _judge_one(finding: FindingConfig, result: CurveResult) -> Judged:
+def _judge_one(finding: ExpectedFinding, result: CurveResult) -> Judged:
     curve = result.curve
     if curve.words and finding.kind not in _OF_WORDS:
         return "undecided", f"{curve.parameter} is not a number"
@@ -71,11 +71,11 @@ def _has_errors(curve: Curve) -> bool:
     return bool(are_scored or curve.lost[curve.ran].all())
 
 
-def _is_of_time(finding: FindingConfig) -> bool:
+def _is_of_time(finding: ExpectedFinding) -> bool:
     return finding.kind in (*_LAWS, "acts_only_on") or (finding.kind not in _OF_ERROR and finding.of in _OF_TIME)
 
 
-def _speaks_of(finding: FindingConfig, result: CurveResult) -> bool:
+def _speaks_of(finding: ExpectedFinding, result: CurveResult) -> bool:
     curve = result.curve
     return (
         finding.method in ("", curve.method)
@@ -84,7 +84,7 @@ def _speaks_of(finding: FindingConfig, result: CurveResult) -> bool:
     )
 
 
-_JUDGES: dict[str, Callable[[FindingConfig, CurveResult], Judged]] = {
+_JUDGES: dict[str, Callable[[ExpectedFinding, CurveResult], Judged]] = {
     "diverges_beyond": judge_diverges_beyond,
     "holds_up_to": judge_holds_up_to,
     "best_between": judge_best_between,

@@ -6,7 +6,7 @@ from itertools import permutations
 
 import numpy as np
 
-from lslam.config.finding import FindingConfig
+from lslam.config.finding import ExpectedFinding
 from lslam.evaluation.contrast import contrast
 from lslam.evaluation.curves import NOT_REGISTRATION
 from lslam.evaluation.efficiency import over_seeds
@@ -21,7 +21,7 @@ UNITS = {"translation": "m", "angular": "deg", "time_per_scan": "ms", "total_tim
 _EQUAL = 1e-9  # R2 of laws that fit alike
 
 
-def judge_matters_little(finding: FindingConfig, result: CurveResult) -> Judged:
+def judge_matters_little(finding: ExpectedFinding, result: CurveResult) -> Judged:
     """Confirmed where the largest is less than so many times the smallest, refuted where it is more, scatter included.
 
     Refuted as well where most runs of some value are lost; a value without result, or numbers that do not vary at all,
@@ -53,7 +53,7 @@ def judge_matters_little(finding: FindingConfig, result: CurveResult) -> Judged:
     return "confirmed", said
 
 
-def judge_law(finding: FindingConfig, result: CurveResult) -> Judged:
+def judge_law(finding: ExpectedFinding, result: CurveResult) -> Judged:
     """As `_law`, of the total time over the studied parameter."""
     law = result.law
     if law is None or law.kind != finding.kind:
@@ -62,14 +62,14 @@ def judge_law(finding: FindingConfig, result: CurveResult) -> Judged:
     return _law(finding, law)
 
 
-def judge_product(finding: FindingConfig, law: Law | None, result: CurveResult) -> Judged:
+def judge_product(finding: ExpectedFinding, law: Law | None, result: CurveResult) -> Judged:
     """As `_law`, of the total time over both studied parameters."""
     if result.curve.words:
         return "undecided", f"{result.curve.parameter} is not a number"
     return _law(finding, law)
 
 
-def _law(finding: FindingConfig, law: Law | None) -> Judged:
+def _law(finding: ExpectedFinding, law: Law | None) -> Judged:
     """Confirmed where it explains enough and nothing else does better; refuted where something else explains enough, or it is
     off by more than the seeds scatter.
     """
@@ -100,7 +100,7 @@ def _rms(values: Floats) -> float:
     return float(np.sqrt(np.mean(known**2))) if len(known) else float("inf")
 
 
-def judge_acts_only_on(finding: FindingConfig, result: CurveResult) -> Judged:
+def judge_acts_only_on(finding: ExpectedFinding, result: CurveResult) -> Judged:
     """Confirmed when the named stages make up at least 80 % of the change, stage by stage, of registration, refuted when less;
     in most seeds by themselves too.
     """
@@ -148,7 +148,7 @@ def _changes(curve: Curve) -> tuple[dict[str, float], float | None]:
     )
 
 
-def _own_share(finding: FindingConfig, change: dict[str, float]) -> float:
+def _own_share(finding: ExpectedFinding, change: dict[str, float]) -> float:
     return sum(change.get(name, 0.0) for name in finding.stages) / sum(change.values())
 
 

@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 
-from lslam.config.finding import FindingConfig
+from lslam.config.finding import ExpectedFinding
 from lslam.evaluation.contrast import Rise, contrast, plateau, rise_at, rise_below
 from lslam.evaluation.landmarks import divergence, elbow, optimum
 from lslam.types.sensitivity import Curve, CurveResult, Floats, Judged, Optimum, Outcome
@@ -19,12 +19,12 @@ BELOW: dict[Rise, str] = {
 Standing = Literal["worse", "as good", "better", "unknown"]
 
 
-def judge_diverges_beyond(finding: FindingConfig, result: CurveResult) -> Judged:
+def judge_diverges_beyond(finding: ExpectedFinding, result: CurveResult) -> Judged:
     """Confirmed where the last value that works is the expected one, undecided one value beside it, refuted elsewhere."""
     return _as_most_seeds(lambda curve: _diverges_beyond(curve, finding.values[0]), result.curve)
 
 
-def judge_holds_up_to(finding: FindingConfig, result: CurveResult) -> Judged:
+def judge_holds_up_to(finding: ExpectedFinding, result: CurveResult) -> Judged:
     """Confirmed where the expected value, or a larger one, works and none below is lost; refuted where it diverges before."""
     return _as_most_seeds(lambda curve: _holds_up_to(curve, finding.values[0]), result.curve)
 
@@ -78,17 +78,17 @@ def _holds_up_to(curve: Curve, expected: float) -> Judged:
     return "confirmed", f"{'it holds' if lost else 'nothing diverges'} up to {expected:g}{lost}"
 
 
-def judge_best_between(finding: FindingConfig, result: CurveResult) -> Judged:
+def judge_best_between(finding: ExpectedFinding, result: CurveResult) -> Judged:
     """As `_between`, of the highest efficiency, the smallest error or the shortest time."""
     return _between(finding, result, is_highest=finding.of.endswith("efficiency"))
 
 
-def judge_largest_between(finding: FindingConfig, result: CurveResult) -> Judged:
+def judge_largest_between(finding: ExpectedFinding, result: CurveResult) -> Judged:
     """As `_between`, of the largest number whatever it is."""
     return _between(finding, result, is_highest=True)
 
 
-def _between(finding: FindingConfig, result: CurveResult, *, is_highest: bool) -> Judged:
+def _between(finding: ExpectedFinding, result: CurveResult, *, is_highest: bool) -> Judged:
     """Confirmed when the extreme lies between, on each side some value is worse, and most seeds agree.
 
     Refuted when the extreme lies outside and beats the best one between, or all values outside are as good as that.
@@ -134,7 +134,7 @@ def _between(finding: FindingConfig, result: CurveResult, *, is_highest: bool) -
     return "confirmed", said
 
 
-def _standing(finding: FindingConfig, curve: Curve, other: int, base: int, is_highest: bool) -> Standing:
+def _standing(finding: ExpectedFinding, curve: Curve, other: int, base: int, is_highest: bool) -> Standing:
     """How the value at index `other` stands against that at `base`."""
     if curve.is_lost[other]:
         if finding.kind == "best_between" or finding.of.endswith("efficiency"):
@@ -151,14 +151,14 @@ def _standing(finding: FindingConfig, curve: Curve, other: int, base: int, is_hi
     return "as good" if lead.is_no_more and lag.is_no_more else "unknown"
 
 
-def _best_by_seed(finding: FindingConfig, result: CurveResult, is_highest: bool) -> list[Optimum]:
+def _best_by_seed(finding: ExpectedFinding, result: CurveResult, is_highest: bool) -> list[Optimum]:
     """Where each seed alone is best, of seeds that have any result."""
     table = np.where(result.curve.lost, np.nan, result.curve.quantities[finding.of])
     found = [optimum(result.curve.values, column, is_highest_best=is_highest) for column in table.T]
     return [best for best in found if best is not None]
 
 
-def judge_elbow_at(finding: FindingConfig, result: CurveResult) -> Judged:
+def judge_elbow_at(finding: ExpectedFinding, result: CurveResult) -> Judged:
     """Confirmed where the error comes to its plateau at the expected value and is worse just below it.
 
     Undecided one value beside it; refuted where it comes there later, or is as good just below.
@@ -183,7 +183,7 @@ def judge_elbow_at(finding: FindingConfig, result: CurveResult) -> Judged:
     return _only_if_as_good(_rise_before(curve, values, place)), said
 
 
-def judge_good_from(finding: FindingConfig, result: CurveResult) -> Judged:
+def judge_good_from(finding: ExpectedFinding, result: CurveResult) -> Judged:
     """Confirmed when the error has come to its plateau there and a value below is worse, refuted when these are as good."""
     curve, expected = result.curve, finding.values[0]
     values = _scored_values(curve)

@@ -21,7 +21,7 @@ WIDEST = 125  # characters of a table that the page shows without scrolling
 
 
 @dataclass(frozen=True)
-class Section:
+class SequenceSection:
     """One sequence on the page: its figures, its map crops by place, links to the pages of its runs."""
 
     sequence: str
@@ -61,7 +61,7 @@ def render_page(
 
 def _section(
     folder: Path, comparison: Comparison, sequence: str, drawings: Sequence[Drawing], crop: Crop | None
-) -> Section:
+) -> SequenceSection:
     figures: list[Figure | None] = []
     crops: list[list[Figure]] = []
     for drawing in drawings:
@@ -74,7 +74,7 @@ def _section(
         for run in comparison.runs
         if run.sequence == sequence and (page := run.folder / "report.html").is_file()
     ]
-    return Section(sequence, [f for f in figures if f is not None], crops, links)
+    return SequenceSection(sequence, [f for f in figures if f is not None], crops, links)
 
 
 def _machine(comparison: Comparison) -> list[tuple[str, list[str]]]:

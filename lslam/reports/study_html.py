@@ -21,7 +21,7 @@ from lslam.version import __version__
 
 
 @dataclass(frozen=True)
-class Section:
+class StudySection:
     """One studied parameter on one sequence: its figures with their data, its tables."""
 
     result: StudyResult
@@ -49,7 +49,7 @@ def write_study_files(folder: Path, results: Sequence[StudyResult], rows: Sequen
             _write(folder / "figures" / f"{stem}.svg", figure.svg)
         data = [f"data:image/svg+xml;base64,{base64.b64encode(figure.svg).decode('ascii')}" for figure in figures]
         shown = list(zip(figures, data, strict=True))
-        sections.append(Section(result, shown, study_tables(result), study_recipes(result)))
+        sections.append(StudySection(result, shown, study_tables(result), study_recipes(result)))
     page = template("study.html.j2").render(
         title=title,
         version=__version__,
@@ -79,7 +79,7 @@ def timing_notes(rows: Sequence[StudyRow]) -> list[str]:
     ]
 
 
-def _as_text(section: Section, style: str, heading: str, item: str) -> list[str]:
+def _as_text(section: StudySection, style: str, heading: str, item: str) -> list[str]:
     result = section.result
     title = heading.format(f"{result.study}: {' and '.join(result.parameters)} on {result.sequence}")
     recipes = "\n".join(item.format(line) for line in section.recipes)

@@ -14,10 +14,11 @@ from lslam.config.batch import BatchConfig, parse_batch
 from lslam.errors import UsageError
 from lslam.pipeline.identity import imu_digest, input_digest, job_digest
 from lslam.printable import file_safe, toml_text
-from lslam.studies.expanded import Expanded, Place, cells_of, check_same
+from lslam.studies.cells import cells_of
+from lslam.studies.expanded_study import ExpandedStudy, check_same
 from lslam.studies.grid import Job, expand, run_folder
-from lslam.studies.points import Contender, free_name, settings_of
-from lslam.studies.variants import WITH_IMU, Variant, find_variants
+from lslam.studies.output import OutputOptions
+from lslam.studies.variants import WITH_IMU, Variant, find_variants, free_name, settings_of
 from lslam.types.sequence import Sequence as Recording
 from lslam.types.trajectory import Trajectory
 
@@ -25,7 +26,7 @@ MARK = "batch.toml"
 
 
 @dataclass(frozen=True)
-class Line:
+class RunLine:
     """One `lslam run`, resolved: what it reads, how, and where it is written.
 
     words : of its command line; sequence : opened; reading : what else it was opened with; folder : None to choose
@@ -39,46 +40,44 @@ class Line:
     reading: dict[str, Any] = field(default_factory=dict)
 
 
-def expand_batch(batch: BatchConfig, place: Place, settings: Sequence[str] = ()) -> Expanded:
+def expand_batch(batch: BatchConfig, output: OutputOptions, settings: Sequence[str] = ()) -> ExpandedStudy:
     """All runs of a batch file; `settings` ("a.b=v") beat what it says.
 
     Raises ConfigError, UsageError or InputError for methods, recordings and scenarios that make no sense; OutputExistsError
     when it is to go on in the folder of another list.
     """
     text = toml_text(batch.model_dump(mode="json", exclude_none=True, exclude_defaults=True))
-    check_same(place, MARK, "batch", text, _names)
+    check_same(output, MARK, "batch", text, _names)
     jobs: list[Job] = []
-    found: dict[str, Contender] = {}
+    found: dict[str, Variant] = {}
     taken: set[str] = set()
     for entry in batch.jobs:
         common = [*settings_of(batch.config), *settings_of(entry.config), *settings]
         variants = []
         for variant in find_variants(entry.methods, None, common, entry.imu):
-            method = variant.name.removesuffix(WITH_IMU)
             # One method with two configurations is two folders.
-            name = free_name(variant.name, taken)
-            variants.append(replace(variant, name=name, without=""))
-            found[name] = Contender(variants[-1], method, {})
-        cells = cells_of(entry.sequences, entry.seeds, [found[v.name] for v in variants], place, settings)
-        jobs += expand(cells, variants, entry.seeds, place.out, place.command)
-    return Expanded("batch", "batch", MARK, text, jobs, found)
+            variants.append(replace(variant, name=free_name(variant.name, taken), without=""))
+        cells = cells_of(entry.sequences, entry.seeds, variants, output, settings)
+        jobs += expand(cells, variants, entry.seeds, output.out, output.command)
+        found |= {variant.name: variant for variant in variants}
+    return ExpandedStudy("batch", "batch", MARK, text, jobs, found)
 
 
-def expand_lines(lines: Sequence[Line], place: Place) -> Expanded:
-    """All runs of a list of lines; those without a folder of their own are numbered in `place.out`.
+def expand_lines(lines: Sequence[RunLine], output: OutputOptions) -> ExpandedStudy:
+    """All runs of a list of lines; those without a folder of their own are numbered in `output.out`.
 
     Raises InputError for a recording that cannot be listed, UsageError for two lines that name one folder, OutputExistsError
     when they are to go on in the folder of a list that has none of them.
     """
     text = toml_text({"lines": [line.words for line in lines]})
-    check_same(place, MARK, "batch", text, _names)
+    check_same(output, MARK, "batch", text, _names)
     jobs: list[Job] = []
-    found: dict[str, Contender] = {}
+    found: dict[str, Variant] = {}
     owners: dict[Path, int] = {}
     for number, line in enumerate(lines, 1):
         method = line.config.odometry.preset or line.config.odometry.method
         name = f"{number:03d}-{file_safe(method)}{WITH_IMU if line.config.imu.use else ''}"
-        found[name] = Contender(Variant(name, line.config), method, {})
+        found[name] = Variant(name, line.config, method)
         label = file_safe(line.sequence.name)
         seed = line.config.preprocess.seed
         how = hashlib.sha256(repr(sorted(line.reading.items())).encode()).hexdigest()
@@ -86,7 +85,7 @@ def expand_lines(lines: Sequence[Line], place: Place) -> Expanded:
             line.config, input_digest(line.sequence, line.truth) + how,
             imu_digest(line.sequence) if line.config.imu.use else "",
         )  # fmt: skip
-        folder = run_folder(place.out, label, name, seed) if line.folder is None else line.folder
+        folder = run_folder(output.out, label, name, seed) if line.folder is None else line.folder
         if owners.setdefault(folder.resolve(), number) != number:
             raise UsageError(
                 f"run {owners[folder.resolve()]} and run {number} of the batch are both to be written to {folder}: give each "
@@ -95,10 +94,10 @@ def expand_lines(lines: Sequence[Line], place: Place) -> Expanded:
         jobs.append(
             Job(
                 label, name, seed, line.sequence.path.absolute(), line.config, folder, digest, line.words, line.truth,
-                place.data_root, reading=line.reading,
+                output.data_root, reading=line.reading,
             )
         )  # fmt: skip
-    return Expanded("batch", "batch", MARK, text, jobs, found)
+    return ExpandedStudy("batch", "batch", MARK, text, jobs, found)
 
 
 def _names(tree: dict[str, Any]) -> list[str]:

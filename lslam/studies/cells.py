@@ -7,12 +7,17 @@ from dataclasses import replace
 from pathlib import Path
 
 from lslam.config.input import AS_CONFIGURED, ScanRange
+from lslam.config.study import StudySequence
 from lslam.errors import UsageError
 from lslam.pipeline.identity import imu_digest, input_digest
+from lslam.printable import file_safe
 from lslam.readers import open_sequence
+from lslam.readers.lookup import find_folder
 from lslam.studies.grid import Cell
+from lslam.studies.output import SIMULATED, OutputOptions
 from lslam.studies.scenes import Scene, drive_of, scene_digest, scene_folder
-from lslam.studies.subjects import check_range
+from lslam.studies.subjects import check_range, scans_needed, with_range
+from lslam.studies.variants import Variant, free_name
 from lslam.types.trajectory import Trajectory
 
 
@@ -62,3 +67,50 @@ def fitted_scene(scene: Scene, needed: int | None, own: ScanRange, seeds: Sequen
             ways = [drive_of(scene, seed) for seed in seeds]
         check_range(scene.name, own, min(map(len, ways)))
     return fitted
+
+
+def cells_of(
+    sequences: Sequence[StudySequence],
+    seeds: Sequence[int],
+    variants: Sequence[Variant],
+    output: OutputOptions,
+    settings: Sequence[str] = (),
+) -> list[Cell]:
+    """Recordings as they are, scenarios once per seed, every one with a label of its own.
+
+    settings : "a.b=v" that beat the sequences' own `start`, `count` and `skip_frames`
+
+    Raises InputError for a recording that cannot be opened or lacks the IMU; UsageError or ConfigError for a scenario that is
+    none, UsageError for a sequence that ends before the scans that are its own.
+    """
+    configs = [variant.config for variant in variants]
+    needs_imu = any(config.imu.use for config in configs)
+    beaten = {setting.partition("=")[0].strip() for setting in settings}
+    cells: list[Cell] = []
+    taken: set[str] = set()
+    for sequence in sequences:
+        own = ScanRange(**{key: value for key, value in sequence.own.items() if f"input.{key}" not in beaten})
+        needed = scans_needed([with_range(config, own).input for config in configs])
+        made = (
+            [_recorded(sequence.path, own, needs_imu, output)]
+            if sequence.path
+            else _simulated(sequence, own, needed, seeds, output)
+        )
+        # The same recording with other settings is another sequence, with a folder of its own.
+        label = free_name(made[0].sequence, taken)
+        cells += [replace(cell, sequence=label) for cell in made]
+    return cells
+
+
+def _recorded(word: str, own: ScanRange, needs_imu: bool, output: OutputOptions) -> Cell:
+    path = find_folder(word, output.data_root).absolute()
+    label = file_safe(open_sequence(path).name)
+    return recorded_cell(label, path, needs_imu=needs_imu, data_root=output.data_root, own=own)
+
+
+def _simulated(
+    s: StudySequence, own: ScanRange, needed: int | None, seeds: Sequence[int], output: OutputOptions
+) -> list[Cell]:
+    scene = Scene(s.scenario, s.scans, s.lidar, s.columns, s.speed, s.compensated, s.imu, s.settings)
+    scene = fitted_scene(scene, needed, own, seeds)
+    return [scene_cell(scene, seed, output.scenes or output.out / SIMULATED, own) for seed in seeds]

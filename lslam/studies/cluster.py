@@ -18,9 +18,9 @@ from typing import Any
 from lslam.errors import InputError, OutputError, RunFailedError, UsageError, cause
 from lslam.studies.engines import simulate_scenes
 from lslam.studies.grid import Job
-from lslam.studies.jobs import make_room, settle
-from lslam.studies.plan import Follow
-from lslam.studies.worker import Bench, execute
+from lslam.studies.jobs import clear_attempt, ensure_state
+from lslam.studies.runner import StudyProgress
+from lslam.studies.worker import WorkerContext, execute
 from lslam.untrusted import whole_number
 from lslam.version import __version__
 
@@ -32,8 +32,8 @@ _ALONE = threading.Lock()
 
 
 @contextmanager
-def connected(scheduler: str | None, local: str | None, title: str, *, is_kept: bool = True) -> Iterator[Cluster]:
-    """The cluster of a scheduler "tcp://host:port", or one of this machine, "local:N"; `is_kept` as of the cluster.
+def connected(scheduler: str | None, local: str | None, title: str, *, is_persistent: bool = True) -> Iterator[Cluster]:
+    """The cluster of a scheduler "tcp://host:port", or one of this machine, "local:N"; `is_persistent` as of the cluster.
 
     Raises UsageError when Dask is missing or `local` is no number of workers; InputError when the scheduler does not answer.
     """
@@ -53,7 +53,7 @@ def connected(scheduler: str | None, local: str | None, title: str, *, is_kept: 
             ) as made,
             Client(made) as client,
         ):
-            yield Cluster(client, made.scheduler_address, title, is_here=True, is_kept=is_kept)
+            yield Cluster(client, made.scheduler_address, title, is_here=True, is_persistent=is_persistent)
         return
     assert scheduler is not None
     try:
@@ -65,28 +65,28 @@ def connected(scheduler: str | None, local: str | None, title: str, *, is_kept: 
             "running there, and its port open?"
         ) from None
     with client:
-        yield Cluster(client, scheduler, title, is_kept=is_kept)
+        yield Cluster(client, scheduler, title, is_persistent=is_persistent)
 
 
 @dataclass(frozen=True)
 class Cluster:
     """The workers of a scheduler.
 
-    is_here : they share this machine's disk; is_kept : they keep data read from run to run, and no keyframes
+    is_here : they share this machine's disk; is_persistent : they keep data read from run to run, and no keyframes
     """
 
     client: Any
     address: str
     title: str
     is_here: bool = False
-    is_kept: bool = True
+    is_persistent: bool = True
 
     @property
     def at_once(self) -> int:
         """One run per worker."""
         return max(1, len(self._workers()))
 
-    def prepare(self, jobs: Sequence[Job], follow: Follow) -> None:
+    def prepare(self, jobs: Sequence[Job], progress: StudyProgress) -> None:
         """See whether the workers can do it, and simulate here what they all can read here.
 
         Raises InputError naming the worker that lacks lslam, this version of it, or a recording; RunFailedError without any.
@@ -109,9 +109,9 @@ class Cluster:
                     f"worker {worker} does not have {missing[0]}: the recordings must lie there as they do here"
                 )
         if self.is_here:
-            simulate_scenes(jobs, self.at_once, follow)
+            simulate_scenes(jobs, self.at_once, progress)
 
-    def run(self, jobs: Sequence[Job], follow: Follow, on_done: Callable[[Job], None]) -> None:
+    def run(self, jobs: Sequence[Job], progress: StudyProgress, on_done: Callable[[Job], None]) -> None:
         """Make every run on some worker; the scheduler begins anew what a worker that died had in hand.
 
         Raises RunFailedError when the scheduler goes away.
@@ -121,11 +121,11 @@ class Cluster:
         if not jobs:
             return
         for job in jobs:
-            make_room(job)
-        bench = Bench(self.at_once, is_alone=False, is_kept=self.is_kept)
-        follow.on_start(self.title, len(jobs), "runs")
+            clear_attempt(job)
+        context = WorkerContext(self.at_once, is_alone=False, is_persistent=self.is_persistent)
+        progress.on_start(self.title, len(jobs), "runs")
         futures = {
-            self.client.submit(perform, job, bench, key=f"lslam-{k}-{job.digest}", pure=False): job
+            self.client.submit(perform, job, context, key=f"lslam-{k}-{job.digest}", pure=False): job
             for k, job in enumerate(jobs)
         }
         try:
@@ -138,9 +138,9 @@ class Cluster:
                     )
                 if error is None:
                     unpack(future.result(), job)
-                settle(job, "" if error is None else f"its worker failed: {error}", bench)
+                ensure_state(job, "" if error is None else f"its worker failed: {error}", context)
                 on_done(job)
-                follow.on_step(job.name)
+                progress.on_step(job.name)
                 future.release()
         finally:
             self.client.cancel(list(futures), force=True)
@@ -149,7 +149,7 @@ class Cluster:
         return dict(self.client.scheduler_info(n_workers=-1)["workers"])
 
 
-def perform(job: Job, bench: Bench) -> bytes:
+def perform(job: Job, context: WorkerContext) -> bytes:
     """On a worker: make the run in a folder of the worker's, which comes home as an archive with its state."""
     from distributed import get_worker
 
@@ -158,7 +158,7 @@ def perform(job: Job, bench: Bench) -> bytes:
     if job.scene is not None and not path.is_dir():
         path = own / "scenes" / path.relative_to(path.parents[2])
     with _ALONE, tempfile.TemporaryDirectory(dir=own) as scratch:
-        execute(replace(job, path=path, folder=Path(scratch) / "run"), bench)
+        execute(replace(job, path=path, folder=Path(scratch) / "run"), context)
         return pack(Path(scratch))
 
 

@@ -16,13 +16,13 @@ from lslam.errors import RunFailedError
 from lslam.readers import open_sequence
 from lslam.studies.engines import Local
 from lslam.studies.grid import Job
-from lslam.studies.plan import Follow
-from lslam.studies.points import Contender
 from lslam.studies.results import Results
+from lslam.studies.runner import StudyProgress
 from lslam.studies.scenes import drive_of, simulate_once
 from lslam.studies.states import FINAL, read_state
-from lslam.studies.study_report import write_study_report
 from lslam.studies.subjects import used
+from lslam.studies.sweep import write_study_report
+from lslam.studies.variants import Variant
 
 Floats = NDArray[np.float64]
 # Scans of the shorter and the longer pilot: what they differ by is what scans cost, the rest what a run costs by itself.
@@ -51,7 +51,7 @@ class Guess:
 
 
 @dataclass(frozen=True)
-class _Place:
+class _PilotRecording:
     """A recording for pilots; `whole` : scans of the one the study uses; simulation_s : of all its scans."""
 
     path: Path
@@ -72,20 +72,18 @@ class _Pilot:
 class _Group:
     """Runs that differ in parameters and seeds alone.
 
-    names : of their contenders; X : (names, K) where they lie; chosen : those with pilots; pilots : a short and a long one each
+    names : of their variants; X : (names, K) where they lie; chosen : those with pilots; pilots : a short and a long one each
     """
 
     members: list[Job]
-    place: _Place
+    recording: _PilotRecording
     names: list[str]
     X: Floats
     chosen: list[int]
     pilots: list[list[_Pilot]]
 
 
-def from_finished(
-    jobs: Sequence[Job], left: Sequence[Job], contenders: dict[str, Contender], at_once: int
-) -> Guess | None:
+def from_finished(jobs: Sequence[Job], left: Sequence[Job], variants: dict[str, Variant], at_once: int) -> Guess | None:
     """Time that the `left` of a study's `jobs` will take, from what its finished runs took, even if made anew; None without any.
 
     A run takes as long as those of its sequence and method did in the mean, or as all did where none of these is finished.
@@ -94,18 +92,18 @@ def from_finished(
     for job in jobs:
         state = read_state(job.state_file)
         if state is not None and state.status in FINAL and state.digest == job.digest:
-            taken.setdefault(_kind(job, contenders), []).append(state.seconds)
+            taken.setdefault(_kind(job, variants), []).append(state.seconds)
     every = [seconds for group in taken.values() for seconds in group]
     if not every:
         return None
-    return Guess(sum(float(np.mean(taken.get(_kind(job, contenders), every))) for job in left) / at_once, 0)
+    return Guess(sum(float(np.mean(taken.get(_kind(job, variants), every))) for job in left) / at_once, 0)
 
 
 def estimate(
     jobs: Sequence[Job],
-    contenders: dict[str, Contender],
+    variants: dict[str, Variant],
     at_once: int,
-    follow: Follow | None = None,
+    progress: StudyProgress | None = None,
     own_s: float = 0.0,
 ) -> Guess:
     """Time that `jobs` will take with `at_once` together; pilots and their report go to a temporary folder.
@@ -114,36 +112,36 @@ def estimate(
 
     Raises RunFailedError naming a pilot that does not come to its end, and what simulating raises.
     """
-    follow = follow or Follow()
+    progress = progress or StudyProgress()
     seconds, warming_s, start_s = 0.0, 0.0, 0.0
     pilots: list[Job] = []
     with tempfile.TemporaryDirectory(prefix="lslam-pilots-") as folder:
-        places = _places(jobs, Path(folder), follow)
-        groups = [_group(members, places[members[0].sequence], contenders) for members in _groups(jobs, contenders)]
+        places = _places(jobs, Path(folder), progress)
+        groups = [_group(members, places[members[0].sequence], variants) for members in _groups(jobs, variants)]
         # Kernels are kept on disk once compiled: the study will find those that these runs compile.
-        _run([group.pilots[0][0] for group in groups], Path(folder) / "compile", follow)
+        _run([group.pilots[0][0] for group in groups], Path(folder) / "compile", progress)
         for number, group in enumerate(groups):
             began = time.monotonic()
             first = [group.pilots[0][1], *(pilot for pair in group.pilots for pilot in pair)]
-            run, times = _run(first, Path(folder) / str(number), follow)
+            run, times = _run(first, Path(folder) / str(number), progress)
             start_s = max(start_s, time.monotonic() - began - sum(times))
             pilots += run
             warming_s += max(times[0] - times[2], 0.0)
             seconds += _seconds(group, *_costs(group.pilots, times[1:]))
         simulation_s = sum(places[job.sequence].simulation_s for job in _to_simulate(jobs))
-        report_s = _report_s(Path(folder), pilots, contenders)
+        report_s = _report_s(Path(folder), pilots, variants)
     # One simulation already keeps two cores busy.
     simulation_s /= max(1, at_once // 2)
     around_s = own_s + start_s + report_s
     return Guess(around_s + simulation_s + warming_s + seconds / at_once, len(pilots), around_s)
 
 
-def _group(members: list[Job], place: _Place, contenders: dict[str, Contender]) -> _Group:
+def _group(members: list[Job], recording: _PilotRecording, variants: dict[str, Variant]) -> _Group:
     names = list(dict.fromkeys(job.method for job in members))
     first = {job.method: job for job in members}
-    X = _coordinates([contenders[name] for name in names])
+    X = _coordinates([variants[name] for name in names])
     chosen = _chosen(X)
-    return _Group(members, place, names, X, chosen, [_pilots(first[names[k]], place) for k in chosen])
+    return _Group(members, recording, names, X, chosen, [_pilots(first[names[k]], recording) for k in chosen])
 
 
 def _seconds(group: _Group, base: Floats, per_scan: Floats) -> float:
@@ -151,22 +149,22 @@ def _seconds(group: _Group, base: Floats, per_scan: Floats) -> float:
     first = {job.method: job for job in group.members}
     seconds = 0.0
     for name, cost in zip(group.names, _at(group.X, group.X[group.chosen], base, per_scan), strict=True):
-        scans = used(group.place.whole, first[name].config.input)
+        scans = used(group.recording.whole, first[name].config.input)
         seconds += sum(job.method == name for job in group.members) * float(cost[0] + cost[1] * scans)
     return seconds
 
 
-def _groups(jobs: Sequence[Job], contenders: dict[str, Contender]) -> list[list[Job]]:
+def _groups(jobs: Sequence[Job], variants: dict[str, Variant]) -> list[list[Job]]:
     """Runs that differ in parameters and seeds alone."""
     groups: dict[object, list[Job]] = {}
     for job in jobs:
-        groups.setdefault(_kind(job, contenders), []).append(job)
+        groups.setdefault(_kind(job, variants), []).append(job)
     return list(groups.values())
 
 
-def _kind(job: Job, contenders: dict[str, Contender]) -> object:
+def _kind(job: Job, variants: dict[str, Variant]) -> object:
     """What runs of a study that differ in parameters and seeds alone have in common."""
-    c = contenders[job.method]
+    c = variants[job.method]
     return job.sequence, c.method, c.uses_imu, c.is_beside
 
 
@@ -175,29 +173,29 @@ def _to_simulate(jobs: Sequence[Job]) -> list[Job]:
     return list({job.path: job for job in jobs if job.scene is not None and not job.path.is_dir()}.values())
 
 
-def _places(jobs: Sequence[Job], folder: Path, follow: Follow) -> dict[str, _Place]:
-    places: dict[str, _Place] = {}
+def _places(jobs: Sequence[Job], folder: Path, progress: StudyProgress) -> dict[str, _PilotRecording]:
+    places: dict[str, _PilotRecording] = {}
     for job in jobs:
         if job.sequence in places:
             continue
         if job.scene is None or job.path.is_dir():
             scans = len(open_sequence(job.path))
-            places[job.sequence] = _Place(job.path, scans, scans, 0.0)
+            places[job.sequence] = _PilotRecording(job.path, scans, scans, 0.0)
             continue
         whole = len(drive_of(job.scene, job.seed))
         start = max(other.config.input.start for other in jobs if other.sequence == job.sequence)
         part = replace(job.scene, scans=min(whole, start + _SIMULATED))
         began = time.monotonic()
         path = simulate_once(
-            part, job.seed, folder, lambda stage, total: follow.on_start(stage, total, "scans"),
-            lambda: follow.on_step(""),
+            part, job.seed, folder, lambda stage, total: progress.on_start(stage, total, "scans"),
+            lambda: progress.on_step(""),
         )  # fmt: skip
         assert part.scans is not None
-        places[job.sequence] = _Place(path, part.scans, whole, (time.monotonic() - began) * whole / part.scans)
+        places[job.sequence] = _PilotRecording(path, part.scans, whole, (time.monotonic() - began) * whole / part.scans)
     return places
 
 
-def _coordinates(points: Sequence[Contender]) -> Floats:
+def _coordinates(points: Sequence[Variant]) -> Floats:
     """(P, K) studied values from 0 to 1; of what is no number, its place in the list."""
     columns = []
     for key in points[0].parameters:
@@ -215,23 +213,23 @@ def _chosen(X: Floats) -> list[int]:
     return list(dict.fromkeys(int(np.argmin(np.sum((X - np.array(w)) ** 2, axis=1))) for w in wanted))
 
 
-def _pilots(job: Job, place: _Place) -> list[_Pilot]:
+def _pilots(job: Job, recording: _PilotRecording) -> list[_Pilot]:
     """The short one and the long one."""
-    most = used(place.scans, job.config.input)
+    most = used(recording.scans, job.config.input)
     long = min(_LONG, most)
     pilots = []
     for scans in (max(1, min(_SHORT, long // 2)), long):
         config = job.config.model_copy(
             update={"input": job.config.input.model_copy(update={"count": scans})}
         )  # fmt: skip
-        pilots.append(_Pilot(replace(job, path=place.path, config=config, scene=None), scans))
+        pilots.append(_Pilot(replace(job, path=recording.path, config=config, scene=None), scans))
     return pilots
 
 
-def _run(pilots: Sequence[_Pilot], folder: Path, follow: Follow) -> tuple[list[Job], list[float]]:
+def _run(pilots: Sequence[_Pilot], folder: Path, progress: StudyProgress) -> tuple[list[Job], list[float]]:
     """The runs, in one process, and the seconds of each; the first one pays for what is loaded."""
     jobs = [replace(p.job, folder=folder / f"{k}-{p.scans}") for k, p in enumerate(pilots)]
-    Local(title="pilot runs").run(jobs, follow, lambda job: None)
+    Local(title="pilot runs").run(jobs, progress, lambda job: None)
     seconds = []
     for job in jobs:
         state = read_state(job.state_file)
@@ -242,9 +240,9 @@ def _run(pilots: Sequence[_Pilot], folder: Path, follow: Follow) -> tuple[list[J
     return jobs, seconds
 
 
-def _report_s(folder: Path, pilots: Sequence[Job], contenders: dict[str, Contender]) -> float:
+def _report_s(folder: Path, pilots: Sequence[Job], variants: dict[str, Variant]) -> float:
     """Seconds of a report, tried on the pilots, which are of every sequence and every parameter."""
-    results = Results("pilots", folder, pilots, contenders)
+    results = Results("pilots", folder, pilots, variants)
     results.add(pilots)
     began = time.monotonic()
     write_study_report(folder, results.rows)

@@ -10,11 +10,10 @@ from functools import partial
 from pathlib import Path
 
 from lslam.studies.grid import Job
-from lslam.studies.plan import Follow
-from lslam.studies.runner import Crew, Task, run_tasks
+from lslam.studies.runner import StudyProgress, Task, WorkerPool, run_tasks
 from lslam.studies.states import State, is_reusable, read_state, write_state
 from lslam.studies.subjects import used
-from lslam.studies.worker import Bench, execute
+from lslam.studies.worker import WorkerContext, execute
 
 log = logging.getLogger("lslam")
 # Scans of a recording, when only the order of its runs by length matters.
@@ -26,7 +25,7 @@ def finished(jobs: Sequence[Job]) -> set[Path]:
     return {job.folder for job in jobs if is_reusable(job.state_file, job.folder, job.digest)}
 
 
-def crew_of(most_at_once: int, count: int, *, is_kept: bool = False, tries: int = 1) -> Crew:
+def pool_of(most_at_once: int, count: int, *, is_persistent: bool = False, tries: int = 1) -> WorkerPool:
     """Who makes `count` runs when the user asks for `most_at_once`: no more than there are cores."""
     cores = os.cpu_count() or 1
     at_once = max(1, min(most_at_once, cores, count))
@@ -34,16 +33,16 @@ def crew_of(most_at_once: int, count: int, *, is_kept: bool = False, tries: int 
         log.info(
             "%d jobs are asked for: this machine has %d cores, so %d runs go at once", most_at_once, cores, at_once
         )
-    return Crew(at_once, is_kept, tries)
+    return WorkerPool(at_once, is_persistent, tries)
 
 
 def run_jobs(
     jobs: Sequence[Job],
-    crew: Crew,
-    follow: Follow,
+    pool: WorkerPool,
+    progress: StudyProgress,
     title: str = "comparing",
     on_done: Callable[[Job], None] = lambda job: None,
-    work: Callable[[Job, Bench], None] = execute,
+    work: Callable[[Job, WorkerContext], None] = execute,
 ) -> None:
     """Run jobs in processes beside this one; on_done(job) is called here once per job, when its state is there.
 
@@ -53,40 +52,40 @@ def run_jobs(
     if not jobs:
         return
     load = round(os.getloadavg()[0], 2) if hasattr(os, "getloadavg") else 0.0
-    bench = Bench(crew.at_once, load, crew.at_once == 1 or crew.is_kept, crew.is_kept)
+    context = WorkerContext(pool.at_once, load, pool.at_once == 1 or pool.is_persistent, pool.is_persistent)
     for job in jobs:
-        make_room(job)
-    if crew.at_once > 1:  # a long one begun last would keep one process busy while the others have no more to do
+        clear_attempt(job)
+    if pool.at_once > 1:  # a long one begun last would keep one process busy while the others have no more to do
         jobs = sorted(jobs, key=lambda job: used(_MANY, job.config.input), reverse=True)
     tasks = [
         Task(
-            job.name, partial(work, job, bench), job.folder.with_name(f"{job.folder.name}.out"),
-            str(job.path) if crew.is_kept else "",
+            job.name, partial(work, job, context), job.folder.with_name(f"{job.folder.name}.out"),
+            str(job.path) if pool.is_persistent else "",
         )
         for job in jobs
     ]  # fmt: skip
 
     def on_end(index: int, cause: str) -> None:
-        settle(jobs[index], cause, bench)
+        ensure_state(jobs[index], cause, context)
         on_done(jobs[index])
-        follow.on_step(jobs[index].name)
+        progress.on_step(jobs[index].name)
 
-    follow.on_start(title, len(jobs), "runs")
-    run_tasks(tasks, crew, lambda index: log.debug("%s begins", jobs[index].name), on_end)
+    progress.on_start(title, len(jobs), "runs")
+    run_tasks(tasks, pool, lambda index: log.debug("%s begins", jobs[index].name), on_end)
 
 
-def settle(job: Job, cause: str, bench: Bench) -> None:
+def ensure_state(job: Job, cause: str, context: WorkerContext) -> None:
     """See to it that a job that was run has a state, and say so when it went wrong."""
     state = read_state(job.state_file)
     if state is None:
         reason = cause or "the process left no result"
-        state = State(job.digest, "crashed", reason, bench.at_once, bench.load, is_alone=bench.is_alone)
+        state = State(job.digest, "crashed", reason, context.at_once, context.load, is_alone=context.is_alone)
         write_state(job.state_file, state)
     if state.status not in ("done", "degraded"):
         log.warning("%s %s: %s", job.name, state.status, state.reason)
 
 
-def make_room(job: Job) -> None:
+def clear_attempt(job: Job) -> None:
     """What an earlier attempt left may be no run at all: a folder without a manifest must not stand in the way."""
     if job.folder.is_dir() and not (job.folder / "manifest.json").is_file():
         shutil.rmtree(job.folder, ignore_errors=True)

@@ -11,8 +11,8 @@ from lslam.formats.study_csv import read_study_csv, write_study_csv
 from lslam.formats.study_parquet import write_study_parquet
 from lslam.studies.collect import collect_run
 from lslam.studies.grid import Job
-from lslam.studies.points import Contender
 from lslam.studies.states import State, read_state
+from lslam.studies.variants import Variant
 from lslam.types.study import StudyRow
 
 RESULTS = "results.csv"
@@ -26,8 +26,8 @@ _MOST_WAITED = 0.05
 class Results:
     """Rows of finished runs in the order of the study; the files are whole at any moment."""
 
-    def __init__(self, study: str, out: Path, jobs: Sequence[Job], contenders: dict[str, Contender]) -> None:
-        self.study, self.out, self.contenders = study, out, contenders
+    def __init__(self, study: str, out: Path, jobs: Sequence[Job], variants: dict[str, Variant]) -> None:
+        self.study, self.out, self.variants = study, out, variants
         self._order = {job.folder: k for k, job in enumerate(jobs)}
         self._rows: dict[int, StudyRow] = {}
 
@@ -49,7 +49,7 @@ class Results:
         write_study_parquet(self.out / PARQUET, self.rows)
 
     def _row(self, job: Job) -> StudyRow:
-        score, contender = collect_run(job), self.contenders[job.method]
+        score, variant = collect_run(job), self.variants[job.method]
         state = read_state(job.state_file) or State(job.digest, score.status)
         values, scans = score.values, int(score.values.get("scans", 0))
         stages_ms = {name: 1e3 * seconds for name, seconds in score.stages.items() if name not in _NOT_TIMED}
@@ -58,10 +58,10 @@ class Results:
             study=self.study,
             sequence=job.sequence,
             seed=job.seed,
-            method=contender.method,
-            uses_imu=contender.uses_imu,
-            parameters=contender.parameters,
-            is_beside=contender.is_beside,
+            method=variant.method,
+            uses_imu=variant.uses_imu,
+            parameters=variant.parameters,
+            is_beside=variant.is_beside,
             status=score.status,
             reason=score.reason or score.note,
             thesis_rmse=values.get("thesis_rmse", nan),

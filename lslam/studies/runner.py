@@ -22,6 +22,14 @@ _PATIENCE_S = 20.0
 
 
 @dataclass(frozen=True)
+class StudyProgress:
+    """How a caller follows a study: on_start(stage, number of steps, unit), then on_step(note) per step."""
+
+    on_start: Callable[[str, int, str], None] = lambda stage, total, unit: None
+    on_step: Callable[[str], None] = lambda note: None
+
+
+@dataclass(frozen=True)
 class Task:
     """work : called without arguments in the process, so it must be picklable; said : file for what the process prints.
 
@@ -35,16 +43,16 @@ class Task:
 
 
 @dataclass(frozen=True)
-class Crew:
+class WorkerPool:
     """Which processes do the work.
 
-    at_once : tasks together; is_kept : a process goes on with the next task, so that its kernels stay compiled and its data
+    at_once : tasks together; is_persistent : a process goes on with the next task, so that its kernels stay compiled and its data
         read, and has one thread, so that it needs one core; otherwise each task has a new process
     tries : how often a task is begun whose process died
     """
 
     at_once: int
-    is_kept: bool = False
+    is_persistent: bool = False
     tries: int = 1
 
 
@@ -57,7 +65,7 @@ class _Worker:
 
 
 def run_tasks(
-    tasks: Sequence[Task], crew: Crew, on_start: Callable[[int], None], on_end: Callable[[int, str], None]
+    tasks: Sequence[Task], pool: WorkerPool, on_start: Callable[[int], None], on_end: Callable[[int, str], None]
 ) -> None:
     """Run every task; on_start(index) and, once per task, on_end(index, how its process died or "") are called here.
 
@@ -72,11 +80,11 @@ def run_tasks(
     busy: list[_Worker] = []
     try:
         while waiting or busy:
-            while waiting and len(busy) < crew.at_once:
+            while waiting and len(busy) < pool.at_once:
                 data = [tasks[index].data for index, _ in waiting]
                 index, tries[index] = waiting.pop(_choice(data, idle[-1] if idle else None, [*busy, *idle]))
                 on_start(index)
-                worker = idle.pop() if idle else _hire(crew)
+                worker = idle.pop() if idle else _hire(pool)
                 worker.index = index
                 worker.has_read.add(tasks[index].data)
                 busy.append(worker)
@@ -85,10 +93,10 @@ def run_tasks(
             for pipe in connection.wait([worker.pipe for worker in busy]):
                 worker = next(worker for worker in busy if worker.pipe is pipe)
                 busy.remove(worker)
-                cause = _ending(worker, tasks[worker.index].said, crew.is_kept)
+                cause = _ending(worker, tasks[worker.index].said, pool.is_persistent)
                 if cause is None:
                     idle.append(worker)
-                if cause and tries[worker.index] < crew.tries:
+                if cause and tries[worker.index] < pool.tries:
                     log.warning("%s is begun anew: %s", tasks[worker.index].name, cause)
                     waiting.append((worker.index, tries[worker.index] + 1))
                 else:
@@ -105,21 +113,21 @@ def _choice(data: Sequence[str], worker: _Worker | None, workers: Sequence[_Work
     return next((k for marks in wanted for k, is_wanted in enumerate(marks) if is_wanted), 0)
 
 
-def _hire(crew: Crew) -> _Worker:
+def _hire(pool: WorkerPool) -> _Worker:
     context = get_context("spawn")
     ours, theirs = context.Pipe()
     process = context.Process(target=_child, args=(theirs,), name="lslam worker", daemon=False)
-    with _thread_limits(crew):
+    with _thread_limits(pool):
         process.start()
     theirs.close()
     return _Worker(process, ours)
 
 
-def _ending(worker: _Worker, said: Path, is_kept: bool) -> str | None:
+def _ending(worker: _Worker, said: Path, is_persistent: bool) -> str | None:
     """None when the process is ready for more; otherwise it is gone, and how: empty when it came to its end."""
     try:
         worker.pipe.recv()
-        if is_kept:
+        if is_persistent:
             return None
         worker.pipe.send(None)
     except (EOFError, OSError):
@@ -132,11 +140,11 @@ def _ending(worker: _Worker, said: Path, is_kept: bool) -> str | None:
 
 
 @contextlib.contextmanager
-def _thread_limits(crew: Crew) -> Iterator[None]:
+def _thread_limits(pool: WorkerPool) -> Iterator[None]:
     """What a process that starts now shall know before it imports anything: its share of the cores."""
-    share = "1" if crew.is_kept else str(max(1, (os.cpu_count() or 1) // crew.at_once))
+    share = "1" if pool.is_persistent else str(max(1, (os.cpu_count() or 1) // pool.at_once))
     limits = {"NUMBA_NUM_THREADS": "1"}
-    if crew.at_once > 1 or crew.is_kept:
+    if pool.at_once > 1 or pool.is_persistent:
         limits |= dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), share)
     before = {name: os.environ.get(name) for name in limits}
     os.environ.update(limits)

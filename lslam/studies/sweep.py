@@ -2,21 +2,37 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
 
-from lslam.config.study import StudyConfig
-from lslam.errors import RunFailedError
+from lslam.config.finding import ExpectedFinding
+from lslam.config.study import StudyConfig, parse_study, read_study
+from lslam.errors import InputError, RunFailedError, UsageError, nearest
+from lslam.evaluation.sensitivity import evaluate_study
+from lslam.formats.study_csv import read_study_csv
 from lslam.printable import toml_text
+from lslam.reports.study_html import timing_notes, write_study_files
+from lslam.studies.cells import cells_of
 from lslam.studies.engines import Engine
-from lslam.studies.expanded import Expanded, Place, cells_of, check_same, make_runs
+from lslam.studies.expanded_study import ExpandedStudy, check_same, make_runs
 from lslam.studies.grid import expand
-from lslam.studies.plan import Follow
-from lslam.studies.points import contenders
+from lslam.studies.output import OutputOptions
+from lslam.studies.results import RESULTS
+from lslam.studies.runner import StudyProgress
+from lslam.studies.variants import study_variants
+from lslam.types.sensitivity import StudyResult
 from lslam.types.study import StudyRow
+from lslam.untrusted import parse_toml
 
 # The study as it was resolved; it makes the folder one of a study.
 MARK = "study.toml"
+# Studies that ship with lslam.
+FOLDER = "ready"
+
+log = logging.getLogger("lslam")
 
 
 @dataclass(frozen=True)
@@ -24,36 +40,86 @@ class Sweep:
     """What is to be studied where; settings : "a.b=v" over what the study says."""
 
     study: StudyConfig
-    place: Place
+    output: OutputOptions
     settings: tuple[str, ...] = ()
 
 
-def expand_study(sweep: Sweep) -> Expanded:
+def expand_study(sweep: Sweep) -> ExpandedStudy:
     """All runs, checked before any begins; nothing is simulated or written.
 
     Raises ConfigError, UsageError or InputError for parameters, methods, recordings and scenarios that make no sense;
     OutputExistsError when it is to go on in the folder of another study.
     """
-    study, place = sweep.study, sweep.place
+    study, output = sweep.study, sweep.output
     text = toml_text(study.model_dump(mode="json", exclude_none=True, exclude_defaults=True))
-    check_same(place, MARK, "study", text, lambda tree: [str(tree.get("name"))])
-    found = contenders(study, sweep.settings)
-    cells = cells_of(study.sequences, study.seeds, found, place, sweep.settings)
-    jobs = expand(cells, [c.variant for c in found], study.seeds, place.out, place.command)
-    return Expanded(study.name, "study", MARK, text, jobs, {c.variant.name: c for c in found})
+    check_same(output, MARK, "study", text, lambda tree: [str(tree.get("name"))])
+    found = study_variants(study, sweep.settings)
+    cells = cells_of(study.sequences, study.seeds, found, output, sweep.settings)
+    jobs = expand(cells, found, study.seeds, output.out, output.command)
+    return ExpandedStudy(study.name, "study", MARK, text, jobs, {variant.name: variant for variant in found})
 
 
 def run_sweep(
     sweep: Sweep,
     engine: Engine,
-    follow: Follow | None = None,
+    progress: StudyProgress | None = None,
     on_rows: Callable[[Sequence[StudyRow]], None] = lambda rows: None,
 ) -> list[StudyRow]:
     """Make every run of the study, as `make_runs`.
 
     Raises what `expand_study` and `make_runs` raise, and RunFailedError when all runs failed.
     """
-    rows = make_runs(expand_study(sweep), sweep.place, engine, follow, on_rows)
+    rows = make_runs(expand_study(sweep), sweep.output, engine, progress, on_rows)
     if rows and not any(row.is_usable for row in rows):
         raise RunFailedError(f"all {len(rows)} runs failed, the first one: {rows[0].reason}")
     return rows
+
+
+def study_names() -> tuple[str, ...]:
+    """Names of the studies that ship with lslam: those of the first thesis' chapter 5.3."""
+    files = resources.files(__package__).joinpath(FOLDER).iterdir()
+    return tuple(sorted(file.name.removesuffix(".toml") for file in files if file.name.endswith(".toml")))
+
+
+def find_study(word: str) -> StudyConfig:
+    """The study of a TOML file, else the ready one of that name.
+
+    Raises UsageError with the nearest name for what is neither, and what `read_study` raises.
+    """
+    if word.endswith(".toml") or Path(word).is_file():
+        return read_study(Path(word))
+    if word not in study_names():
+        raise UsageError(f"no study {word!r} and no TOML file; {nearest(word, study_names())}")
+    text = resources.files(__package__).joinpath(FOLDER, f"{word}.toml").read_text(encoding="utf-8")
+    return parse_study(parse_toml(text), f"study {word!r}", word)
+
+
+def write_study_report(
+    folder: Path, rows: Sequence[StudyRow], findings: Sequence[ExpectedFinding] = (), title: str = ""
+) -> list[StudyResult]:
+    """Evaluate all rows and write report.html, .md, .tex, .csv and figures/ into `folder`.
+
+    findings : what the study is expected to find, for the verdicts; title : of the page, the names of the studies by default
+    Raises OutputError.
+    """
+    results = evaluate_study(rows, findings)
+    write_study_files(folder, results, rows, title or ", ".join(dict.fromkeys(row.study for row in rows)))
+    return results
+
+
+def report_folder(folder: Path) -> list[StudyResult]:
+    """The report of a study from its results.csv, with the findings of its study.toml when that is there.
+
+    Says so in the log when its times cannot be compared.
+
+    Raises InputError for a folder without runs and what cannot be read, ConfigError for findings that make no sense, OutputError.
+    """
+    rows = read_study_csv(folder / RESULTS)
+    if not rows:
+        raise InputError(f"study {folder} has no finished run yet: lslam sweep with --out {folder} --resume makes them")
+    for note in timing_notes(rows):
+        log.warning("%s", note)
+    if not (folder / MARK).is_file():
+        return write_study_report(folder, rows)
+    study = read_study(folder / MARK)
+    return write_study_report(folder, rows, study.finding, study.summary or study.name)

@@ -1,19 +1,22 @@
-"""The contenders of a study: methods by name, and whole configurations by the name or file of their preset."""
+"""The variants of a study: methods by name, configurations by their preset, at every point of the studied parameters."""
 
 from __future__ import annotations
 
 import json
 import logging
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+from itertools import count
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 from lslam.config import Config, load_config
 from lslam.config.preset_files import known_presets
-from lslam.errors import UsageError, nearest
+from lslam.config.study import Point, StudyConfig
+from lslam.errors import ConfigError, UsageError, nearest
 from lslam.odometry import known_methods
 from lslam.pipeline.check import check_config
+from lslam.printable import file_safe
 
 log = logging.getLogger("lslam")
 
@@ -24,17 +27,33 @@ PREDICT_THEMSELVES = ("kiss-icp",)
 # Methods that bring their own preprocessing and so never draw by `preprocess.seed`.
 DRAW_NOTHING = ("kiss-icp", "small-gicp", "open3d-gicp", "loam-odom", "loam", "floam", "lego-loam")
 
+# One thread: a run then keeps one core busy, as many go at once as there are cores, and times mean the same. Keyframes go
+# with the run that made them, so they are not packed.
+_ALWAYS = (
+    "input.threads=1", "keyframes.deflate=0", "map.write=false", "map.write_features=false", "report.html=false",
+)  # fmt: skip
+
 
 @dataclass(frozen=True)
 class Variant:
-    """name : of the method or preset, for tables and folders; config : resolved, all of it.
+    """One resolved configuration of a comparison, study or batch.
 
-    without : name of the same contender without the IMU, where `both` were asked for
+    name : for tables and folders, unique; method : of the method or preset, without its IMU
+    without : name of the same variant without the IMU, where `both` were asked for
+    parameters : what a study varies, by configuration key; empty beside a study (`is_beside`)
     """
 
     name: str
     config: Config
+    method: str
     without: str = ""
+    parameters: Point = field(default_factory=dict)
+    is_beside: bool = False
+
+    @property
+    def uses_imu(self) -> bool:
+        """Whether it is to use the IMU."""
+        return self.config.imu.use
 
     @property
     def draws(self) -> bool:
@@ -77,7 +96,7 @@ def find_variants(
                 log.info("%s predicts by itself: it runs without the IMU only", label)
                 continue
             called = label + WITH_IMU if uses else label
-            variants.append(Variant(called, config, label if uses and imu == "both" else ""))
+            variants.append(Variant(called, config, label, label if uses and imu == "both" else ""))
     return variants
 
 
@@ -89,3 +108,55 @@ def _meaning(name: str) -> tuple[str, str]:
     if name in presets or name.endswith(".toml"):
         return name if name in presets else Path(name).stem, f"odometry.preset={json.dumps(name)}"
     raise UsageError(f"no method or preset {name!r}; {nearest(name, [*known_methods(), *presets])}")
+
+
+def study_variants(study: StudyConfig, settings: Sequence[str] = ()) -> list[Variant]:
+    """All of a study; `settings` ("a.b=v") beat what the study says, but not its parameters.
+
+    Raises ConfigError or UsageError naming the parameter, the value and the nearest known key; UsageError for unknown methods.
+    """
+    common = [*_ALWAYS, *settings_of(study.config), *settings]
+    found: list[Variant] = []
+    taken: set[str] = set()
+    for point in study.points():
+        said = ", ".join(f"{key} = {value}" for key, value in point.items())
+        try:
+            variants = find_variants(study.methods, None, [*common, *_setting(point)], study.imu)
+        except (ConfigError, UsageError) as error:
+            what = str(error)
+            for setting in _setting(point):
+                what = what.removeprefix(f"--set {setting}: ")
+            raise type(error)(f"study {study.name}, {said}: {what}") from None
+        for variant in variants:
+            values = (f"{key.partition('.')[2]}_{value}" for key, value in point.items())
+            name = free_name("-".join([variant.name, *values]), taken)
+            found.append(replace(variant, name=name, without="", parameters=point))
+    for variant in find_variants(study.beside, None, common, study.imu) if study.beside else []:
+        name = free_name(f"beside-{variant.name}", taken)
+        found.append(replace(variant, name=name, without="", is_beside=True))
+    return found
+
+
+def free_name(name: str, taken: set[str]) -> str:
+    """The name as a folder's, with a number when one in `taken` has it; it is taken then.
+
+    >>> taken = {"icp"}
+    >>> free_name("icp", taken), free_name("icp", taken)
+    ('icp-2', 'icp-3')
+    """
+    plain = file_safe(name)
+    free = next(made for k in count(1) if (made := plain if k == 1 else f"{plain}-{k}") not in taken)
+    taken.add(free)
+    return free
+
+
+def settings_of(sections: dict[str, dict[str, Any]]) -> list[str]:
+    """Sections of a study file as settings "a.b=v"."""
+    return [
+        s for section, values in sections.items() for s in _setting({f"{section}.{k}": v for k, v in values.items()})
+    ]
+
+
+def _setting(values: dict[str, Any]) -> list[str]:
+    """As `--set` takes them: JSON's values are TOML's."""
+    return [f"{key}={json.dumps(value)}" for key, value in values.items()]

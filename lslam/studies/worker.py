@@ -28,27 +28,27 @@ from lslam.studies.grid import Job
 from lslam.studies.states import State, write_state
 
 if TYPE_CHECKING:
-    from lslam.studies.kept import KeptSequences
+    from lslam.studies.cached_sequence import SequenceCache
     from lslam.types.sequence import Sequence
 
 INTERRUPTED = ("interrupted", "interrupted before its end")
 
 
 @dataclass(frozen=True)
-class Bench:
+class WorkerContext:
     """What the reader of the times must know.
 
     at_once : runs that share the machine; load : of the machine before them; is_alone : whether no other run shares its core
-    is_kept : whether the process goes on with other runs of the same data, which it then keeps; keyframes are not
+    is_persistent : whether the process goes on with other runs of the same data, which it then keeps; keyframes are not
     """
 
     at_once: int = 1
     load: float = 0.0
     is_alone: bool = True
-    is_kept: bool = False
+    is_persistent: bool = False
 
 
-def execute(job: Job, bench: Bench) -> None:
+def execute(job: Job, context: WorkerContext) -> None:
     """Run the job into its folder, replacing what is there unless it goes on with that, and leave its state behind.
 
     Raises nothing of the run's; KeyboardInterrupt after the state is written, so that the process ends.
@@ -63,7 +63,7 @@ def execute(job: Job, bench: Bench) -> None:
     began, waited = time.monotonic(), _waited_s()
     status, reason = "failed", ""
     try:
-        status, reason = _run(job, bench.is_kept)
+        status, reason = _run(job, context.is_persistent)
     except (KeyboardInterrupt, InterruptedRunError):
         status, reason = INTERRUPTED
         raise KeyboardInterrupt from None
@@ -82,10 +82,10 @@ def execute(job: Job, bench: Bench) -> None:
     finally:
         current().is_gentle = False
         seconds = time.monotonic() - began
-        if bench.is_kept and status != "interrupted":  # one of hundreds: nothing asks for its clouds again
+        if context.is_persistent and status != "interrupted":  # one of hundreds: nothing asks for its clouds again
             shutil.rmtree(job.folder / KEYFRAMES, ignore_errors=True)
         state = State(
-            job.digest, status, reason, bench.at_once, bench.load, round(seconds, 3), bench.is_alone,
+            job.digest, status, reason, context.at_once, context.load, round(seconds, 3), context.is_alone,
             round((_waited_s() - waited) / max(seconds, 1e-9), 4), platform.node(),
         )  # fmt: skip
         write_state(job.state_file, state)
@@ -118,7 +118,7 @@ def _waited_s() -> float:
     return waited / 1e9
 
 
-def _run(job: Job, is_kept: bool) -> tuple[str, str]:
+def _run(job: Job, is_persistent: bool) -> tuple[str, str]:
     """Status and reason of a run that came to its end."""
     from lslam.pipeline.run import run
     from lslam.pipeline.watch import RunOutcome, Watch
@@ -129,7 +129,7 @@ def _run(job: Job, is_kept: bool) -> tuple[str, str]:
         job.path, job.data_root, config.input.vertical_correction_deg, config.imu.use, config.gnss.mode != "off",
         tuple(sorted(job.reading.items())),
     )  # fmt: skip
-    sequence = _kept_sequences().get(key, _opening(job)) if is_kept else _opening(job)()
+    sequence = _sequences().get(key, _opening(job)) if is_persistent else _opening(job)()
     stop = current()
 
     def be_gentle(stage: str, scans: int) -> None:
@@ -173,7 +173,7 @@ def _opening(job: Job) -> Callable[[], Sequence]:
 
 
 @cache
-def _kept_sequences() -> KeptSequences:
-    from lslam.studies.kept import KeptSequences, ScanStore, memory_bound
+def _sequences() -> SequenceCache:
+    from lslam.studies.cached_sequence import ScanStore, SequenceCache, memory_bound
 
-    return KeptSequences(ScanStore(memory_bound()))
+    return SequenceCache(ScanStore(memory_bound()))

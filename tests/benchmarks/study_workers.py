@@ -23,12 +23,10 @@ from pathlib import Path
 from resource import RUSAGE_CHILDREN, RUSAGE_SELF, getrusage
 
 from lslam.studies.engines import Local
-from lslam.studies.expanded import Place
-from lslam.studies.plan import Follow
+from lslam.studies.output import OutputOptions
+from lslam.studies.runner import StudyProgress
 from lslam.studies.states import read_state
-from lslam.studies.study_files import find_study
-from lslam.studies.study_report import report_folder
-from lslam.studies.sweep import Sweep, expand_study, run_sweep
+from lslam.studies.sweep import Sweep, expand_study, find_study, report_folder, run_sweep
 
 GAIN = 1.8
 
@@ -44,7 +42,7 @@ def study_once(sweep: Sweep, workers: int) -> dict[str, float]:
     began, imported_s = time.perf_counter(), seconds_of(RUSAGE_SELF)
     run_sweep(sweep, Local(workers))
     ran, own_s = time.perf_counter(), seconds_of(RUSAGE_SELF)
-    report_folder(sweep.place.out)
+    report_folder(sweep.output.out)
     return {
         "wall: runs": ran - began,
         "wall: report": time.perf_counter() - ran,
@@ -78,9 +76,9 @@ def run_parts(out: Path) -> dict[str, float]:
 def warm_up(sweep: Sweep) -> None:
     """Simulate all scenes, and compile the kernels of every method in a run of it."""
     expanded, engine = expand_study(sweep), Local(os.cpu_count() or 1)
-    engine.prepare(expanded.jobs, Follow())
-    one_each = {expanded.contenders[job.method].method: job for job in expanded.jobs}
-    engine.run(list(one_each.values()), Follow(), lambda job: None)
+    engine.prepare(expanded.jobs, StudyProgress())
+    one_each = {expanded.variants[job.method].method: job for job in expanded.jobs}
+    engine.run(list(one_each.values()), StudyProgress(), lambda job: None)
 
 
 def in_own_process(args: argparse.Namespace, workers: int, out: Path) -> dict[str, float]:
@@ -130,7 +128,7 @@ def main() -> None:
     logging.getLogger("lslam").setLevel(logging.ERROR)
 
     def sweep(out: Path) -> Sweep:
-        return Sweep(find_study(args.study), Place(out, scenes=args.scenes), tuple(args.settings))
+        return Sweep(find_study(args.study), OutputOptions(out, scenes=args.scenes), tuple(args.settings))
 
     if args.one is not None:
         print(json.dumps(study_once(sweep(args.one), args.workers[0])))

@@ -18,7 +18,7 @@ from lslam.config.batch import BatchConfig, read_batch
 from lslam.errors import ConfigError, LslamError, OutputExistsError
 from lslam.formats.study_csv import read_study_csv
 from lslam.studies.batch import expand_batch, run_words
-from lslam.studies.expanded import Place
+from lslam.studies.output import OutputOptions
 
 pytestmark = pytest.mark.usefixtures("forked_runs")
 
@@ -88,12 +88,12 @@ def test_scans_of_single_sequences_are_used_as_they_say(sample: Path, tmp_path: 
     file = tmp_path / "jobs.toml"
     two = '["SAMPLE", { path = "SAMPLE", start = 5, count = 2 }]'
     file.write_text(JOBS.replace('["SAMPLE"]', two, 1).replace("SAMPLE", str(sample)))
-    jobs = expand_batch(read_batch(file), Place(tmp_path / "out"), ["input.count=3"]).jobs
+    jobs = expand_batch(read_batch(file), OutputOptions(tmp_path / "out"), ["input.count=3"]).jobs
     named = [(job.sequence, job.method, job.config.input.start, job.config.input.count) for job in jobs[:4]]
     assert named == [
         ("block-0", "icp", 0, 3), ("block-0", "kiss-icp", 0, 3), ("block-0-2", "icp", 5, 3), ("block-0-2", "kiss-icp", 5, 3),
     ]  # fmt: skip
-    assert expand_batch(read_batch(file), Place(tmp_path / "out")).jobs[2].config.input.count == 2
+    assert expand_batch(read_batch(file), OutputOptions(tmp_path / "out")).jobs[2].config.input.count == 2
 
 
 @pytest.mark.parametrize(
@@ -136,7 +136,7 @@ def test_a_folder_whose_list_is_damaged_is_named(held: str, said: str, sample: P
     (tmp_path / "batch.toml").write_text(held)
     batch = BatchConfig.model_validate({"jobs": [{"sequences": [str(sample)]}]})
     with pytest.raises(ConfigError, match=said):
-        expand_batch(batch, Place(tmp_path, resume=True))
+        expand_batch(batch, OutputOptions(tmp_path, resume=True))
 
 
 def test_lines_are_understood_as_lslam_run_does_and_a_failure_is_exit_1(sample: Path, tmp_path: Path) -> None:
@@ -174,7 +174,7 @@ def test_presets_whose_names_differ_in_a_space_are_runs_of_their_own(sample: Pat
     for file in files:
         file.write_text("")
     batch = BatchConfig.model_validate({"jobs": [{"sequences": [str(sample)], "methods": [str(f)]} for f in files]})
-    jobs = expand_batch(batch, Place(tmp_path / "out")).jobs
+    jobs = expand_batch(batch, OutputOptions(tmp_path / "out")).jobs
     assert [job.method for job in jobs] == ["my_voxel", "my_voxel-2"]
     assert jobs[0].folder != jobs[1].folder
 

@@ -7,11 +7,11 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
-from lslam.config.finding import FindingConfig
+from lslam.config.finding import ExpectedFinding
 
 
 def test_finding_reads_what_a_study_file_says() -> None:
-    finding = FindingConfig.model_validate(
+    finding = ExpectedFinding.model_validate(
         {"text": "best 1..2 m", "kind": "best_between", "values": [1, 2], "imu": False, "at": {"input.skip_frames": 4}}
     )
     assert finding.values == (1.0, 2.0)
@@ -33,4 +33,4 @@ def test_finding_reads_what_a_study_file_says() -> None:
 )
 def test_numbers_that_do_not_fit_the_kind_are_refused(wrong: dict[str, Any], said: str) -> None:
     with pytest.raises(ValidationError, match=said):
-        FindingConfig.model_validate({"text": "so it is", **wrong})
+        ExpectedFinding.model_validate({"text": "so it is", **wrong})

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from lslam.config.finding import FindingConfig
+from lslam.config.finding import ExpectedFinding
 from lslam.evaluation.sensitivity import evaluate_study
 from lslam.types.sensitivity import Verdict
 from lslam.types.study import StudyRow
@@ -59,7 +59,7 @@ def by_seed(rows: list[StudyRow], change: Callable[[float, int], dict[str, Any]]
 
 def verdict(rows: list[StudyRow], kind: str, *values: float, **more: Any) -> Verdict:
     """What a finding of that kind comes to on rows of one curve or more."""
-    finding = FindingConfig.model_validate({"text": "So it is.", "kind": kind, "values": values, **more})
+    finding = ExpectedFinding.model_validate({"text": "So it is.", "kind": kind, "values": values, **more})
     return evaluate_study(rows, [finding])[0].verdicts[0]
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from study_rows import rows_of
 
-from lslam.config.finding import FindingConfig
+from lslam.config.finding import ExpectedFinding
 from lslam.evaluation.curves import curves_of, lost_above, registration_ms
 from lslam.evaluation.landmarks import divergence, elbow, optimum
 from lslam.evaluation.sensitivity import evaluate_study
@@ -183,7 +183,7 @@ def test_studies_and_sequences_are_apart_and_runs_beside_are_kept() -> None:
 
 def test_parameters_studied_one_at_a_time_are_apart_with_their_findings() -> None:
     rows = rows_of(SKIPS, error=lambda v: 0.5) + rows_of([0.1, 0.2, 0.5], "preprocess.random_share")
-    skip = FindingConfig(text="it holds", kind="holds_up_to", values=(20,), parameter="input.skip_frames")
+    skip = ExpectedFinding(text="it holds", kind="holds_up_to", values=(20,), parameter="input.skip_frames")
     results = evaluate_study(rows, [skip, skip.model_copy(update={"parameter": "preprocess.random_share"})])
     assert [r.parameters for r in results] == [("input.skip_frames",), ("preprocess.random_share",)]
     assert [[v.outcome for v in r.verdicts] for r in results] == [["confirmed"], ["undecided"]]

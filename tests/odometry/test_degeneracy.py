@@ -17,7 +17,7 @@ from lslam.odometry import create_odometry
 from lslam.readers import select
 from lslam.registration.solver import RegistrationResult
 from lslam.simulation.scenarios import simulate
-from lslam.studies.kept import KeptSequences, ScanStore
+from lslam.studies.cached_sequence import ScanStore, SequenceCache
 from lslam.types.scan_result import ScanResult
 from lslam.types.sequence import Sequence
 
@@ -69,7 +69,7 @@ def test_a_sparse_sensor_holds_every_direction_as_it_turns(seed: int) -> None:
 def corridor(seed: int) -> Sequence:
     """Scans kept from method to method, of one seed at a time."""
     drive = simulate("corridor", seed=seed, count=90, speed=9.0, start_speed=9.0, motion_compensated=True)
-    return KeptSequences(ScanStore(10**9)).get(seed, lambda: drive)
+    return SequenceCache(ScanStore(10**9)).get(seed, lambda: drive)
 
 
 @cache

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lslam.config.finding import FindingConfig
+from lslam.config.finding import ExpectedFinding
 from lslam.evaluation.sensitivity import evaluate_study
 from lslam.reports.study_figures import StudyFigure, study_figures
 from lslam.reports.study_html import timing_notes, write_study_files
@@ -47,7 +47,7 @@ def rows() -> list[StudyRow]:
 
 @pytest.fixture(scope="module")
 def results(rows: list[StudyRow]) -> list[StudyResult]:
-    finding = FindingConfig(text="holds <up> to 5", kind="holds_up_to", values=(5,), source="figure 5.16")
+    finding = ExpectedFinding(text="holds <up> to 5", kind="holds_up_to", values=(5,), source="figure 5.16")
     return evaluate_study(rows, [finding, finding.model_copy(update={"values": (8.0,), "method": "icp"})])
 
 

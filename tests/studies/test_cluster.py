@@ -20,12 +20,12 @@ from lslam.errors import InputError, RunFailedError, UsageError
 from lslam.formats.study_csv import read_study_csv
 from lslam.studies import cluster
 from lslam.studies.cluster import Cluster, connected, pack, unpack
-from lslam.studies.expanded import Place
 from lslam.studies.grid import Job
-from lslam.studies.plan import Follow
+from lslam.studies.output import OutputOptions
+from lslam.studies.runner import StudyProgress
 from lslam.studies.states import State, read_state, write_state
 from lslam.studies.sweep import Sweep, expand_study, run_sweep
-from lslam.studies.worker import Bench
+from lslam.studies.worker import WorkerContext
 from lslam.types.study import StudyRow
 
 TREE = {
@@ -44,14 +44,14 @@ def workers() -> Iterator[LocalCluster]:
 
 def job(tmp_path: Path) -> Job:
     """Of a recording that lies nowhere."""
-    sweep = Sweep(parse_study(TREE, "tiny", "tiny"), Place(tmp_path / "out"))
+    sweep = Sweep(parse_study(TREE, "tiny", "tiny"), OutputOptions(tmp_path / "out"))
     return replace(expand_study(sweep).jobs[0], scene=None, path=Path("/nowhere/00"))
 
 
 def test_a_worker_killed_in_the_middle_loses_nothing_and_counts_nothing_twice(
     workers: LocalCluster, tmp_path: Path
 ) -> None:
-    sweep = Sweep(parse_study(TREE, "tiny", "tiny"), Place(tmp_path / "out"))
+    sweep = Sweep(parse_study(TREE, "tiny", "tiny"), OutputOptions(tmp_path / "out"))
     victim = next(iter(workers.workers.values())).pid
     steps: list[str] = []
 
@@ -61,15 +61,15 @@ def test_a_worker_killed_in_the_middle_loses_nothing_and_counts_nothing_twice(
 
     with connected(workers.scheduler_address, None, "studying") as engine:
         assert engine.at_once == 2
-        rows = run_sweep(sweep, engine, Follow(on_step=steps.append), kill_one)  # type: ignore[arg-type]
+        rows = run_sweep(sweep, engine, StudyProgress(on_step=steps.append), kill_one)  # type: ignore[arg-type]
     assert len(steps) == len(set(steps)) == 6
     assert [row.parameters["preprocess.source_voxel"] for row in rows] == [0.6, 0.7, 0.8, 0.9, 1.0, 1.1]
     assert {row.status for row in rows} == {"done"}
     assert not any(row.is_timing_comparable for row in rows), "others may share the worker's machine"
-    assert not (sweep.place.out / "simulated").exists(), "workers simulate by themselves"
+    assert not (sweep.output.out / "simulated").exists(), "workers simulate by themselves"
     for row in rows:
-        assert (sweep.place.out / row.folder / "trajectory.tum").is_file(), "run folders come home"
-    assert [repr(row) for row in read_study_csv(sweep.place.out / "results.csv")] == [repr(row) for row in rows]
+        assert (sweep.output.out / row.folder / "trajectory.tum").is_file(), "run folders come home"
+    assert [repr(row) for row in read_study_csv(sweep.output.out / "results.csv")] == [repr(row) for row in rows]
 
 
 def test_workers_without_the_recording_are_named(workers: LocalCluster, tmp_path: Path) -> None:
@@ -77,7 +77,7 @@ def test_workers_without_the_recording_are_named(workers: LocalCluster, tmp_path
         connected(workers.scheduler_address, None, "studying") as engine,
         pytest.raises(InputError, match=r"worker tcp://.* does not have /nowhere/00: the recordings must lie there"),
     ):
-        engine.prepare([job(tmp_path)], Follow())
+        engine.prepare([job(tmp_path)], StudyProgress())
 
 
 def test_workers_of_another_version_are_named(
@@ -88,7 +88,7 @@ def test_workers_of_another_version_are_named(
         connected(workers.scheduler_address, None, "studying") as engine,
         pytest.raises(InputError, match=r"worker tcp://.* has lslam .*, this is 9\.9: install the same"),
     ):
-        engine.prepare([job(tmp_path)], Follow())
+        engine.prepare([job(tmp_path)], StudyProgress())
 
 
 def test_workers_without_lslam_are_named(
@@ -102,7 +102,7 @@ def test_workers_without_lslam_are_named(
         connected(workers.scheduler_address, None, "studying") as engine,
         pytest.raises(InputError, match=r"worker tcp://.* cannot run lslam: No module named 'lslam'; install it there"),
     ):
-        engine.prepare([job(tmp_path)], Follow())
+        engine.prepare([job(tmp_path)], StudyProgress())
 
 
 def test_a_scheduler_without_workers_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -112,7 +112,7 @@ def test_a_scheduler_without_workers_is_said(tmp_path: Path, monkeypatch: pytest
         connected(empty.scheduler_address, None, "studying") as engine,
         pytest.raises(RunFailedError, match=r"has no workers: start some, `dask worker tcp://"),
     ):
-        engine.prepare([job(tmp_path)], Follow())
+        engine.prepare([job(tmp_path)], StudyProgress())
 
 
 def test_a_scheduler_that_does_not_answer_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -162,36 +162,36 @@ def test_a_scheduler_that_goes_away_is_said(tmp_path: Path, monkeypatch: pytest.
     monkeypatch.setattr("distributed.as_completed", iter)
     engine = Cluster(Gone("connecting", None), "tcp://there:1", "studying")
     with pytest.raises(RunFailedError, match=r"tcp://there:1 went away after 0 of 1 runs: start it, and .*--resume"):
-        engine.run([job(tmp_path)], Follow(), lambda job: None)
+        engine.run([job(tmp_path)], StudyProgress(), lambda job: None)
 
 
 def test_a_run_whose_workers_all_died_is_a_row_with_its_reason(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("distributed.as_completed", iter)
     engine = Cluster(Gone("running", MemoryError("three workers died")), "tcp://there:1", "studying")
     run, done = job(tmp_path), []
-    engine.run([run], Follow(), done.append)
+    engine.run([run], StudyProgress(), done.append)
     state = read_state(run.state_file)
     assert state is not None
     assert (state.status, state.reason, done) == ("crashed", "its worker failed: three workers died", [run])
 
 
-@pytest.mark.parametrize("is_kept", [True, False])
+@pytest.mark.parametrize("is_persistent", [True, False])
 def test_workers_keep_data_between_runs_when_the_study_asks_for_it(
-    is_kept: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    is_persistent: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A batch does not: each of its runs keeps its keyframes, here as on one machine."""
     monkeypatch.setattr("distributed.as_completed", iter)
     client = Gone("running", MemoryError("three workers died"))
 
     @contextmanager
-    def there(*words: object, is_kept: bool) -> Iterator[Cluster]:
-        yield Cluster(client, "tcp://there:1", "", is_kept=is_kept)
+    def there(*words: object, is_persistent: bool) -> Iterator[Cluster]:
+        yield Cluster(client, "tcp://there:1", "", is_persistent=is_persistent)
 
     monkeypatch.setattr(cluster, "connected", there)
     run = job(tmp_path)
-    with engine_of({"jobs": None, "scheduler": "tcp://there:1", "cluster": None}, "", is_kept) as engine:
-        engine.run([run], Follow(), lambda job: None)
-    assert client.given == [(run, Bench(1, is_alone=False, is_kept=is_kept))]
+    with engine_of({"jobs": None, "scheduler": "tcp://there:1", "cluster": None}, "", is_persistent) as engine:
+        engine.run([run], StudyProgress(), lambda job: None)
+    assert client.given == [(run, WorkerContext(1, is_alone=False, is_persistent=is_persistent))]
 
 
 def test_a_run_that_comes_home_replaces_what_was_there(tmp_path: Path) -> None:
@@ -209,11 +209,11 @@ def test_a_run_that_comes_home_replaces_what_was_there(tmp_path: Path) -> None:
 
 
 def test_workers_of_this_machine_read_what_is_simulated_here(tmp_path: Path) -> None:
-    sweep = Sweep(parse_study(TREE, "tiny", "tiny"), Place(tmp_path / "out"))
+    sweep = Sweep(parse_study(TREE, "tiny", "tiny"), OutputOptions(tmp_path / "out"))
     scenes: list[str] = []
     with connected(None, "local:1", "studying") as engine:
         assert engine.at_once == 1
         jobs = expand_study(sweep).jobs
-        engine.prepare(jobs, Follow(on_step=scenes.append))
+        engine.prepare(jobs, StudyProgress(on_step=scenes.append))
     assert scenes == ["block 0"]
     assert jobs[0].path.is_dir()

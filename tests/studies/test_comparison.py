@@ -22,15 +22,14 @@ from lslam.pipeline.watch import Watch
 from lslam.readers import open_sequence
 from lslam.simulation.record import record
 from lslam.simulation.scenarios import simulate
-from lslam.studies.compare import compare
+from lslam.studies.compare import Plan, check_plan, compare
 from lslam.studies.grid import Job
 from lslam.studies.jobs import finished, run_jobs
-from lslam.studies.plan import Follow, Plan, check_plan
-from lslam.studies.runner import Crew
+from lslam.studies.runner import StudyProgress, WorkerPool
 from lslam.studies.states import read_state
 from lslam.studies.subjects import Subject
 from lslam.studies.variants import find_variants
-from lslam.studies.worker import Bench
+from lslam.studies.worker import WorkerContext
 from lslam.types.comparison import Comparison, RunScore
 
 pytestmark = pytest.mark.usefixtures("forked_runs")
@@ -133,7 +132,7 @@ def test_resume_runs_only_what_is_missing_or_changed(made: Comparison, plan: Pla
     two = replace(plan, out=out, subjects=plan.subjects[:2], resume=True)
     (out / "runs" / "good" / "icp-s0.json").unlink()
     seen: list[str] = []
-    again = compare(two, Follow(on_step=seen.append))
+    again = compare(two, StudyProgress(on_step=seen.append))
     assert seen == ["good icp seed 0"]
     assert [r.is_reused for r in again.runs] == [False, True, True, True]
     assert one(again, "good", "icp").values["ate.se3"] == one(made, "good", "icp").values["ate.se3"]
@@ -214,7 +213,7 @@ def test_what_cannot_be_compared_is_said_before_anything_runs(
         check_plan(replace(plan, **change))
 
 
-def die(job: Job, bench: Bench) -> None:
+def die(job: Job, context: WorkerContext) -> None:
     os.kill(os.getpid(), signal.SIGSEGV)
 
 
@@ -222,7 +221,7 @@ def test_a_process_that_dies_is_a_crashed_job_that_is_tried_again(plan: Plan, tm
     path = plan.subjects[0].path
     assert path is not None
     job = Job("good", "icp", 0, path, plan.variants[0].config, tmp_path / "runs" / "icp-s0", "digest", "")
-    run_jobs([job], Crew(1), Follow(), work=die)
+    run_jobs([job], WorkerPool(1), StudyProgress(), work=die)
     state = read_state(job.state_file)
     assert state is not None
     assert state.status == "crashed"

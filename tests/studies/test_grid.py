@@ -28,8 +28,8 @@ def variants(*names: str, settings: tuple[str, ...] = ()) -> list[Variant]:
     return find_variants(names or ("icp", "kiss-icp"), None, settings)
 
 
-def jobs(contenders: list[Variant], cells: list[Cell], seeds: tuple[int, ...] = (0, 1)) -> list[Job]:
-    return expand(cells, contenders, seeds, Path("out"), "")
+def jobs(variants: list[Variant], cells: list[Cell], seeds: tuple[int, ...] = (0, 1)) -> list[Job]:
+    return expand(cells, variants, seeds, Path("out"), "")
 
 
 def recording(name: str = "drive") -> Cell:
@@ -41,8 +41,8 @@ def test_a_recording_is_run_once_by_methods_that_do_not_draw() -> None:
 
 
 def test_a_method_that_draws_runs_every_seed_of_a_recording() -> None:
-    contenders = variants(settings=("preprocess.downsample=random",))
-    made = jobs(contenders, [recording()], (4, 7))
+    drawing = variants(settings=("preprocess.downsample=random",))
+    made = jobs(drawing, [recording()], (4, 7))
     assert [(j.method, j.seed) for j in made] == [("icp", 4), ("kiss-icp", 4), ("icp", 7)]
     assert [j.config.preprocess.seed for j in made if j.method == "icp"] == [4, 7]
     assert len({j.digest for j in made}) == 3
@@ -64,7 +64,7 @@ def test_methods_are_checked_before_anything_runs(methods: tuple[str, ...], sent
         find_variants(methods)
 
 
-def test_a_preset_or_a_file_is_a_contender_with_all_it_says(tmp_path: Path) -> None:
+def test_a_preset_or_a_file_is_a_variant_with_all_it_says(tmp_path: Path) -> None:
     (tmp_path / "coarse.toml").write_text("[map]\nvoxel = 0.9\n")
     plain, coarse = variants("icp", str(tmp_path / "coarse.toml"), settings=("input.count=5",))
     assert (plain.name, coarse.name) == ("icp", "coarse")

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from lslam.studies.runner import Crew, Task, run_tasks
+from lslam.studies.runner import Task, WorkerPool, run_tasks
 
 
 def write_environment(path: Path) -> None:
@@ -53,7 +53,7 @@ def wait_to_be_ended(own: Path) -> None:
 def go(folder: Path, *works: object, at_once: int = 1) -> dict[int, str]:
     tasks = [Task(f"task {i}", work, folder / f"{i}.out") for i, work in enumerate(works)]  # type: ignore[arg-type]
     ended: dict[int, str] = {}
-    run_tasks(tasks, Crew(at_once), lambda index: None, lambda index, cause: ended.update({index: cause}))
+    run_tasks(tasks, WorkerPool(at_once), lambda index: None, lambda index, cause: ended.update({index: cause}))
     return ended
 
 
@@ -89,12 +89,12 @@ def test_a_process_goes_on_with_what_it_has_read_and_a_new_one_takes_what_nobody
         for i, (work, data) in enumerate(zip(works, "xxyx", strict=True))
     ]
     begun: list[int] = []
-    run_tasks(tasks, Crew(2, is_kept=True), begun.append, lambda index, cause: None)
+    run_tasks(tasks, WorkerPool(2, is_persistent=True), begun.append, lambda index, cause: None)
     assert begun[:2] == [0, 2]
     assert sorted(begun) == [0, 1, 2, 3]
     one_after_the_other: list[int] = []
     again = [Task("", partial(note, c), tmp_path / "out", data) for data in "xyxzy"]
-    run_tasks(again, Crew(1, is_kept=True), one_after_the_other.append, lambda index, cause: None)
+    run_tasks(again, WorkerPool(1, is_persistent=True), one_after_the_other.append, lambda index, cause: None)
     assert one_after_the_other == [0, 2, 1, 4, 3]
 
 
@@ -111,7 +111,7 @@ def test_an_interruption_ends_what_runs(tmp_path: Path) -> None:
     tasks = [Task(f"{i}", partial(wait_to_be_ended, mark), tmp_path / f"{i}.out") for i in range(2)]
     began = time.monotonic()
     with pytest.raises(KeyboardInterrupt):
-        run_tasks(tasks, Crew(2), interrupt_when_started, lambda index, cause: None)
+        run_tasks(tasks, WorkerPool(2), interrupt_when_started, lambda index, cause: None)
     assert mark.read_text() == "ended"
     assert time.monotonic() - began < 60
 
@@ -130,8 +130,8 @@ def die_the_first_time(path: Path) -> None:
 def keep(folder: Path, *works: object, tries: int = 2) -> list[tuple[int, str]]:
     tasks = [Task(f"task {i}", work, folder / f"{i}.out") for i, work in enumerate(works)]  # type: ignore[arg-type]
     ended: list[tuple[int, str]] = []
-    crew = Crew(1, is_kept=True, tries=tries)
-    run_tasks(tasks, crew, lambda index: None, lambda index, cause: ended.append((index, cause)))
+    pool = WorkerPool(1, is_persistent=True, tries=tries)
+    run_tasks(tasks, pool, lambda index: None, lambda index, cause: ended.append((index, cause)))
     return ended
 
 
@@ -160,7 +160,7 @@ def test_an_interruption_between_two_tasks_ends_the_process_that_waits(tmp_path:
     pids = tmp_path / "pids"
     tasks = [Task(f"{i}", partial(note, pids), tmp_path / f"{i}.out") for i in range(2)]
     with pytest.raises(KeyboardInterrupt):
-        run_tasks(tasks, Crew(1, is_kept=True), interrupt_the_second, lambda index, cause: None)
+        run_tasks(tasks, WorkerPool(1, is_persistent=True), interrupt_the_second, lambda index, cause: None)
     (pid,) = pids.read_text().split()
     with pytest.raises(ProcessLookupError):
         os.kill(int(pid), 0)

@@ -9,9 +9,9 @@ import pytest
 
 from lslam.config.finding import Kind
 from lslam.errors import UsageError
-from lslam.studies.expanded import Expanded, Place
-from lslam.studies.study_files import find_study, study_names
-from lslam.studies.sweep import Sweep, expand_study
+from lslam.studies.expanded_study import ExpandedStudy
+from lslam.studies.output import OutputOptions
+from lslam.studies.sweep import Sweep, expand_study, find_study, study_names
 
 ROOT = Path(__file__).resolve().parents[2]
 # Points of each study x (without and with the IMU), beside ones aside.
@@ -21,22 +21,21 @@ RUNS = {
 }  # fmt: skip
 
 
-def expanded(name: str) -> Expanded:
-    return expand_study(Sweep(find_study(name), Place(Path("out"))))
+def expanded(name: str) -> ExpandedStudy:
+    return expand_study(Sweep(find_study(name), OutputOptions(Path("out"))))
 
 
 @pytest.mark.parametrize("name", RUNS)
 def test_each_study_has_its_runs_on_the_open_flight_and_the_defaults_beside(name: str) -> None:
     found = expanded(name)
-    stand = {c.variant.name: c for c in found.contenders.values()}
-    studied = [job for job in found.jobs if not stand[job.method].is_beside]
+    studied = [job for job in found.jobs if not found.variants[job.method].is_beside]
     assert len(studied) == 3 * RUNS[name]
     assert len(found.jobs) > len(studied)
     assert len({job.digest for job in found.jobs}) == len(found.jobs)
     for job in found.jobs:
         assert job.scene is not None
         assert (job.scene.scenario, job.scene.columns, job.config.map.write) == ("open", 512, False)
-        assert bool(job.config.odometry.preset) is not stand[job.method].is_beside
+        assert bool(job.config.odometry.preset) is not found.variants[job.method].is_beside
 
 
 def test_every_study_states_what_the_thesis_found() -> None:

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from lslam.config.finding import FindingConfig
+from lslam.config.finding import ExpectedFinding
 from lslam.formats.study_csv import read_study_csv, write_study_csv
-from lslam.studies.study_report import report_folder, write_study_report
+from lslam.studies.sweep import report_folder, write_study_report
 from lslam.types.study import StudyRow
 
 
@@ -22,7 +22,7 @@ def test_report_of_rows_read_back_is_that_of_the_rows(tmp_path: Path) -> None:
         for seed in (0, 1)
     ]  # fmt: skip
     write_study_csv(tmp_path / "results.csv", rows)
-    finding = FindingConfig(text="up to 3", kind="diverges_beyond", values=(3,))
+    finding = ExpectedFinding(text="up to 3", kind="diverges_beyond", values=(3,))
     first = write_study_report(tmp_path / "a", rows, [finding], "skipped scans")
     write_study_report(tmp_path / "b", read_study_csv(tmp_path / "results.csv"), [finding], "skipped scans")
     assert first[0].verdicts[0].outcome == "confirmed"

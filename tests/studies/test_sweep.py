@@ -18,14 +18,13 @@ from lslam.errors import ConfigError, InputError, InterruptedRunError, OutputExi
 from lslam.formats.study_csv import read_study_csv
 from lslam.studies.engines import Local
 from lslam.studies.estimate import estimate, from_finished
-from lslam.studies.expanded import Expanded, Place
-from lslam.studies.plan import Follow
+from lslam.studies.expanded_study import ExpandedStudy
+from lslam.studies.output import OutputOptions
 from lslam.studies.results import is_comparable
+from lslam.studies.runner import StudyProgress
 from lslam.studies.states import State, read_state
-from lslam.studies.study_files import find_study
-from lslam.studies.study_report import write_study_report
 from lslam.studies.subjects import used
-from lslam.studies.sweep import Sweep, expand_study, run_sweep
+from lslam.studies.sweep import Sweep, expand_study, find_study, run_sweep, write_study_report
 from lslam.types.study import StudyRow
 
 pytestmark = pytest.mark.usefixtures("forked_runs")
@@ -50,7 +49,7 @@ def study(**changes: Any) -> StudyConfig:
 
 def elsewhere(sweep: Sweep, out: Path, resume: bool = False, **changes: Any) -> Sweep:
     """The same simulations in another folder, of a study with changes."""
-    return replace(sweep, study=study(**changes), place=replace(sweep.place, out=out, resume=resume))
+    return replace(sweep, study=study(**changes), output=replace(sweep.output, out=out, resume=resume))
 
 
 @pytest.fixture(scope="module")
@@ -60,7 +59,7 @@ def scenes(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def sweep(tmp_path_factory: pytest.TempPathFactory, scenes: Path) -> Sweep:
-    return Sweep(study(), Place(tmp_path_factory.mktemp("study") / "out", scenes=scenes))
+    return Sweep(study(), OutputOptions(tmp_path_factory.mktemp("study") / "out", scenes=scenes))
 
 
 @pytest.fixture(scope="module")
@@ -83,18 +82,18 @@ def test_every_point_is_a_row_with_its_values_and_numbers(made: list[StudyRow], 
         assert "read" not in row.stages_ms
         assert row.total_time_s == pytest.approx(row.time_per_scan_ms * row.scans / 1e3)
         assert row.total_time_s < row.run_s
-        assert (sweep.place.out / row.folder / "manifest.json").is_file()
-        assert not [*(sweep.place.out / row.folder).glob("map.*"), *(sweep.place.out / row.folder).glob("keyframes")]
-        config = tomllib.loads((sweep.place.out / row.folder / "config.toml").read_text())
+        assert (sweep.output.out / row.folder / "manifest.json").is_file()
+        assert not [*(sweep.output.out / row.folder).glob("map.*"), *(sweep.output.out / row.folder).glob("keyframes")]
+        config = tomllib.loads((sweep.output.out / row.folder / "config.toml").read_text())
         assert (config["input"]["threads"], config["keyframes"]["deflate"]) == (1, 0), (
             "one core, and no work for nothing"
         )
 
 
 def test_files_hold_the_same_rows(made: list[StudyRow], sweep: Sweep) -> None:
-    assert [repr(row) for row in read_study_csv(sweep.place.out / "results.csv")] == [repr(row) for row in made]
-    assert (sweep.place.out / "results.parquet").stat().st_size > 0
-    again = find_study(str(sweep.place.out / "study.toml"))
+    assert [repr(row) for row in read_study_csv(sweep.output.out / "results.csv")] == [repr(row) for row in made]
+    assert (sweep.output.out / "results.parquet").stat().st_size > 0
+    again = find_study(str(sweep.output.out / "study.toml"))
     assert again == sweep.study
 
 
@@ -102,20 +101,22 @@ def test_kept_data_and_processes_change_nothing(made: list[StudyRow], sweep: Swe
     """The last of the runs, made anew in a process of its own."""
     one = elsewhere(sweep, tmp_path, parameters={"input.skip_frames": [2]}, beside=[])
     one = replace(one, settings=("preprocess.source_voxel=1.2",))
-    (row,) = run_sweep(one, Local(1, is_kept=False))
+    (row,) = run_sweep(one, Local(1, is_persistent=False))
     assert row.digest == made[3].digest
-    first, second = (out / r.folder / "trajectory.tum" for out, r in ((one.place.out, row), (sweep.place.out, made[3])))
+    first, second = (
+        out / r.folder / "trajectory.tum" for out, r in ((one.output.out, row), (sweep.output.out, made[3]))
+    )
     assert first.read_bytes() == second.read_bytes()
 
 
 def test_a_study_that_grew_runs_only_what_is_new(made: list[StudyRow], sweep: Sweep, tmp_path: Path) -> None:
     out = tmp_path / "copy"
-    shutil.copytree(sweep.place.out, out)
+    shutil.copytree(sweep.output.out, out)
     with pytest.raises(OutputExistsError, match="--resume keeps"):
         run_sweep(elsewhere(sweep, out), Local(1))
     grown = elsewhere(sweep, out, True, parameters={"input.skip_frames": [1, 2, 4], "preprocess.source_voxel": [0.8]})
     steps: list[str] = []
-    rows = run_sweep(grown, Local(1), Follow(on_step=steps.append))
+    rows = run_sweep(grown, Local(1), StudyProgress(on_step=steps.append))
     assert steps == ["block icp-skip_frames_4-source_voxel_0.8 seed 3"]
     assert [row.parameters.get("input.skip_frames") for row in rows] == [1, 2, 4, None]
     assert repr(rows[0]) == repr(made[0])
@@ -125,7 +126,7 @@ def test_another_study_does_not_go_on_in_the_folder_of_this_one(
     made: list[StudyRow], sweep: Sweep, tmp_path: Path
 ) -> None:
     out = tmp_path / "copy"
-    shutil.copytree(sweep.place.out, out)
+    shutil.copytree(sweep.output.out, out)
     before = (out / "results.csv").read_bytes(), (out / "study.toml").read_bytes()
     other = elsewhere(sweep, out, True, name="shares")
     for go_on in (expand_study, lambda sweep: run_sweep(sweep, Local(1))):
@@ -137,7 +138,7 @@ def test_another_study_does_not_go_on_in_the_folder_of_this_one(
 def test_another_study_may_replace_the_one_in_a_folder(sweep: Sweep, tmp_path: Path) -> None:
     (tmp_path / "study.toml").write_text('name = "tiny"\n')
     other = elsewhere(sweep, tmp_path, name="shares")
-    assert expand_study(replace(other, place=replace(other.place, overwrite=True))).name == "shares"
+    assert expand_study(replace(other, output=replace(other.output, overwrite=True))).name == "shares"
 
 
 def test_what_fails_is_a_row_with_its_reason(sweep: Sweep, tmp_path: Path) -> None:
@@ -154,23 +155,23 @@ def test_what_fails_is_a_row_with_its_reason(sweep: Sweep, tmp_path: Path) -> No
 
 def test_an_interruption_says_how_to_go_on(made: list[StudyRow], sweep: Sweep, tmp_path: Path) -> None:
     class Interrupted(Local):
-        def run(self, jobs: object, follow: object, on_done: object) -> None:
+        def run(self, jobs: object, progress: object, on_done: object) -> None:
             raise KeyboardInterrupt
 
-    shutil.copytree(sweep.place.out, tmp_path / "out")
+    shutil.copytree(sweep.output.out, tmp_path / "out")
     grown = elsewhere(sweep, tmp_path / "out", True, seeds=[3, 4])
     with pytest.raises(InterruptedRunError, match=r"interrupted; 5 of 10 runs are finished in .*--resume goes on"):
         run_sweep(grown, Interrupted(1))
 
 
 def test_results_of_another_version_are_not_mixed(sweep: Sweep, made: list[StudyRow], tmp_path: Path) -> None:
-    shutil.copytree(sweep.place.out, tmp_path / "out")
+    shutil.copytree(sweep.output.out, tmp_path / "out")
     file = tmp_path / "out" / "results.csv"
     file.write_text(file.read_text().replace("\n2,", "\n0,"))
     with pytest.raises(InputError, match="written by another version of lslam"):
         run_sweep(elsewhere(sweep, tmp_path / "out", True), Local(1))
     anew = elsewhere(sweep, tmp_path / "out", parameters={"input.skip_frames": [2]}, beside=[])
-    rows = run_sweep(replace(anew, place=replace(anew.place, overwrite=True)), Local(1))
+    rows = run_sweep(replace(anew, output=replace(anew.output, overwrite=True)), Local(1))
     assert [repr(row) for row in read_study_csv(file)] == [repr(row) for row in rows]
 
 
@@ -190,13 +191,13 @@ def test_what_cannot_be_studied_is_said_before_anything_runs(
     changes: dict[str, Any], error: type[Exception], sentence: str, tmp_path: Path
 ) -> None:
     with pytest.raises(error, match=sentence):
-        run_sweep(Sweep(study(**changes), Place(tmp_path / "out")), Local(1))
+        run_sweep(Sweep(study(**changes), OutputOptions(tmp_path / "out")), Local(1))
     assert not (tmp_path / "out").exists()
 
 
 def test_the_same_scenario_seen_otherwise_is_another_sequence(tmp_path: Path) -> None:
     two = study(sequences=[{"scenario": "block", "columns": n} for n in (256, 512)], imu="both", beside=[])
-    expanded: Expanded = expand_study(Sweep(two, Place(tmp_path / "out")))
+    expanded: ExpandedStudy = expand_study(Sweep(two, OutputOptions(tmp_path / "out")))
     assert {job.sequence for job in expanded.jobs} == {"block", "block-2"}
     assert (
         len({job.folder for job in expanded.jobs})
@@ -204,7 +205,7 @@ def test_the_same_scenario_seen_otherwise_is_another_sequence(tmp_path: Path) ->
         == len(expanded.jobs)
         == 16
     )
-    assert {(c.method, c.uses_imu) for c in expanded.contenders.values()} == {("icp", False), ("icp", True)}
+    assert {(c.method, c.uses_imu) for c in expanded.variants.values()} == {("icp", False), ("icp", True)}
 
 
 def test_scans_of_single_sequences_are_used_as_they_say(sweep: Sweep, tmp_path: Path) -> None:
@@ -216,9 +217,9 @@ def test_scans_of_single_sequences_are_used_as_they_say(sweep: Sweep, tmp_path: 
     )  # fmt: skip
     rows = run_sweep(two, Local(1))
     assert [(row.sequence, row.scans) for row in rows] == [("block", 5), ("block-2", 7)]
-    inputs = [tomllib.loads((two.place.out / row.folder / "config.toml").read_text())["input"] for row in rows]
+    inputs = [tomllib.loads((two.output.out / row.folder / "config.toml").read_text())["input"] for row in rows]
     assert [(i["start"], i["count"]) for i in inputs] == [(8, 5), (0, 7)]
-    assert find_study(str(two.place.out / "study.toml")) == two.study
+    assert find_study(str(two.output.out / "study.toml")) == two.study
     assert len({row.digest for row in rows}) == 2
     beaten = expand_study(replace(two, settings=("input.count=3",)))
     assert [(j.config.input.start, j.config.input.count) for j in beaten.jobs] == [(8, 3), (0, 3)], (
@@ -229,7 +230,7 @@ def test_scans_of_single_sequences_are_used_as_they_say(sweep: Sweep, tmp_path: 
 def test_a_scenario_has_the_scans_that_its_own_range_needs(tmp_path: Path) -> None:
     def scans(**own: int) -> int | None:
         one = study(sequences=[{"scenario": "street", "columns": 256} | own], beside=[])
-        job = expand_study(Sweep(one, Place(tmp_path / "out"))).jobs[0]
+        job = expand_study(Sweep(one, OutputOptions(tmp_path / "out"))).jobs[0]
         assert job.scene is not None
         return job.scene.scans
 
@@ -241,7 +242,7 @@ def test_a_scenario_has_the_scans_that_its_own_range_needs(tmp_path: Path) -> No
 
 
 def test_scans_beyond_the_end_of_a_sequence_are_refused(sweep: Sweep, made: list[StudyRow], tmp_path: Path) -> None:
-    recorded = str(next((sweep.place.scenes or tmp_path).rglob("sequences/00")))
+    recorded = str(next((sweep.output.scenes or tmp_path).rglob("sequences/00")))
     street, drive = {"scenario": "street", "columns": 256}, {"path": recorded}
     for sequence, name in (
         (TREE["sequences"][0] | {"start": 16}, "block has 16 scans: start = 16 goes"),
@@ -259,8 +260,8 @@ def test_scans_beyond_the_end_of_a_sequence_are_refused(sweep: Sweep, made: list
 def test_keys_of_one_name_in_two_sections_are_runs_of_their_own(tmp_path: Path) -> None:
     keys = ("registration.inlier_distance", "imu.inlier_distance")
     two = study(grid="one-way", parameters={key: [0.5, 1.0] for key in keys}, imu="on", beside=[])
-    expanded = expand_study(Sweep(two, Place(tmp_path / "out")))
-    said = [expanded.contenders[job.method].parameters for job in expanded.jobs]
+    expanded = expand_study(Sweep(two, OutputOptions(tmp_path / "out")))
+    said = [expanded.variants[job.method].parameters for job in expanded.jobs]
     assert said == [{key: value} for key in keys for value in (0.5, 1.0)]
     assert len({job.folder for job in expanded.jobs}) == 4
 
@@ -277,7 +278,7 @@ def test_the_time_is_estimated_from_short_runs_and_their_report(
 
     monkeypatch.setattr("lslam.studies.estimate.write_study_report", report)
     jobs = expand_study(replace(sweep, study=study(beside=[], parameters={"input.skip_frames": [1, 2]})))
-    guess = estimate(jobs.jobs, jobs.contenders, 1, own_s=300.0)
+    guess = estimate(jobs.jobs, jobs.variants, 1, own_s=300.0)
     assert guess.pilots == 5
     assert 302 < guess.around_s + 0.1 < guess.seconds < 420
     assert [row.parameters["input.skip_frames"] for row in reported[0]] == [1, 1, 1, 2, 2]
@@ -291,7 +292,7 @@ def test_an_estimate_adds_up_what_is_told_apart(
     """Pilots of 0.5 s and 0.1 s a scan, 5 s more for the first, 60 s to compile; a report of 3 s; runs of 16 and 8 scans."""
     asked: list[tuple[str, int]] = []
 
-    def fake(pilots: Sequence[Any], folder: Path, follow: Follow) -> tuple[list[Any], list[float]]:
+    def fake(pilots: Sequence[Any], folder: Path, progress: StudyProgress) -> tuple[list[Any], list[float]]:
         asked.append((folder.name, len(pilots)))
         first = 60 if len(asked) == 1 else 5
         return [], [0.5 + 0.1 * pilot.scans + first * (k == 0) for k, pilot in enumerate(pilots)]
@@ -299,27 +300,27 @@ def test_an_estimate_adds_up_what_is_told_apart(
     monkeypatch.setattr("lslam.studies.estimate._run", fake)
     monkeypatch.setattr("lslam.studies.estimate._report_s", lambda *given: 3.0)
     jobs = expand_study(replace(sweep, study=study(beside=[], parameters={"input.skip_frames": [1, 2]})))
-    assert estimate(jobs.jobs * times, jobs.contenders, at_once).seconds == pytest.approx(expected, abs=0.01)
+    assert estimate(jobs.jobs * times, jobs.variants, at_once).seconds == pytest.approx(expected, abs=0.01)
     assert asked == [("compile", 1), ("0", 5)]
 
 
 def test_the_time_is_that_of_finished_runs_of_the_same_kind(sweep: Sweep, made: list[StudyRow], tmp_path: Path) -> None:
-    shutil.copytree(sweep.place.out, tmp_path / "out")
+    shutil.copytree(sweep.output.out, tmp_path / "out")
     jobs = expand_study(elsewhere(sweep, tmp_path / "out", True)).jobs
-    contenders = expand_study(elsewhere(sweep, tmp_path / "out", True)).contenders
+    variants = expand_study(elsewhere(sweep, tmp_path / "out", True)).variants
     seconds = {job.folder: read_state(job.state_file).seconds for job in jobs}  # type: ignore[union-attr]
-    same = [job for job in jobs if contenders[job.method].method == contenders[jobs[0].method].method]
-    same = [job for job in same if contenders[job.method].is_beside == contenders[jobs[0].method].is_beside]
-    every = from_finished(jobs, jobs, contenders, 1)
+    same = [job for job in jobs if variants[job.method].method == variants[jobs[0].method].method]
+    same = [job for job in same if variants[job.method].is_beside == variants[jobs[0].method].is_beside]
+    every = from_finished(jobs, jobs, variants, 1)
     assert every is not None
     assert every.seconds == pytest.approx(sum(seconds.values())), "all anew"
     jobs[0].state_file.unlink()
-    guess = from_finished(jobs, jobs[:1], contenders, 1)
+    guess = from_finished(jobs, jobs[:1], variants, 1)
     assert guess is not None
     assert guess.seconds == pytest.approx(np.mean([seconds[job.folder] for job in same[1:]]))
-    assert from_finished(jobs, [*jobs[:1], *jobs[:1]], contenders, 2).seconds == guess.seconds  # type: ignore[union-attr]
+    assert from_finished(jobs, [*jobs[:1], *jobs[:1]], variants, 2).seconds == guess.seconds  # type: ignore[union-attr]
     other = expand_study(elsewhere(sweep, tmp_path / "out", True, config={"input": {"count": 9}}))
-    assert from_finished(other.jobs, other.jobs, other.contenders, 1) is None, "runs of another configuration"
+    assert from_finished(other.jobs, other.jobs, other.variants, 1) is None, "runs of another configuration"
 
 
 def test_pilots_of_scans_far_along_the_way_have_them(
@@ -327,14 +328,14 @@ def test_pilots_of_scans_far_along_the_way_have_them(
 ) -> None:
     monkeypatch.setattr("lslam.studies.estimate._SIMULATED", 6)
     late = TREE["sequences"][0] | {"start": 9, "count": 4}
-    jobs = expand_study(Sweep(study(sequences=[late], beside=[]), Place(tmp_path / "out")))
-    assert estimate(jobs.jobs, jobs.contenders, 1).pilots > 1
+    jobs = expand_study(Sweep(study(sequences=[late], beside=[]), OutputOptions(tmp_path / "out")))
+    assert estimate(jobs.jobs, jobs.variants, 1).pilots > 1
 
 
 def test_an_estimate_names_the_pilot_that_failed(sweep: Sweep) -> None:
     jobs = expand_study(replace(sweep, study=study(beside=[], parameters={"input.start": [0, 99]})))
     with pytest.raises(RunFailedError, match=r"a pilot run of block icp-start_99 seed 3 failed, .*: .*beyond the last"):
-        estimate(jobs.jobs, jobs.contenders, 1)
+        estimate(jobs.jobs, jobs.variants, 1)
 
 
 @pytest.mark.parametrize(

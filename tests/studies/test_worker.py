@@ -21,12 +21,11 @@ from lslam.odometry.icp import Icp
 from lslam.pipeline import job as prepared
 from lslam.studies import worker
 from lslam.studies.grid import Job
-from lslam.studies.points import Contender
 from lslam.studies.results import Results
-from lslam.studies.runner import Crew, Task, run_tasks
+from lslam.studies.runner import Task, WorkerPool, run_tasks
 from lslam.studies.states import read_state
 from lslam.studies.variants import Variant
-from lslam.studies.worker import Bench, execute
+from lslam.studies.worker import WorkerContext, execute
 
 MOTHS = "moths\nin the relay"
 
@@ -53,11 +52,11 @@ def in_the_relay(*given: object) -> None:
 def test_a_mistake_within_a_run_ends_its_log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Icp, "register", in_the_relay)
     job = job_in(tmp_path)
-    execute(job, Bench())
+    execute(job, WorkerContext())
     said = (job.folder / "log.txt").read_text()
     assert said.index("3 scans of") < said.index("Traceback (most recent call last)") < said.index("in in_the_relay")
     assert said.endswith(f"RuntimeError: {MOTHS}\n")
-    results = Results("moths", tmp_path, [job], {"icp": Contender(Variant("icp", job.config), "icp", {})})
+    results = Results("moths", tmp_path, [job], {"icp": Variant("icp", job.config, "icp")})
     results.add([job])
     (row,) = read_study_csv(tmp_path / "results.csv")
     assert row.status == "failed"
@@ -67,7 +66,7 @@ def test_a_mistake_within_a_run_ends_its_log(tmp_path: Path, monkeypatch: pytest
 def test_a_mistake_before_a_run_has_a_log_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(worker, "_run", in_the_relay)
     job = job_in(tmp_path)
-    execute(job, Bench())
+    execute(job, WorkerContext())
     assert "in in_the_relay" in (job.folder / "log.txt").read_text()
     state = read_state(job.state_file)
     assert state is not None
@@ -80,8 +79,8 @@ def test_what_a_mistake_before_a_run_left_is_no_obstacle_to_the_run(
     job = job_in(tmp_path)
     with monkeypatch.context() as broken:
         broken.setattr(worker, "_run", in_the_relay)
-        execute(job, Bench())
-    execute(job, Bench())
+        execute(job, WorkerContext())
+    execute(job, WorkerContext())
     state = read_state(job.state_file)
     assert state is not None
     assert (state.status, state.reason) == ("done", "")
@@ -93,7 +92,7 @@ def test_a_log_that_cannot_be_written_is_not_promised(tmp_path: Path, monkeypatc
     job = job_in(tmp_path)
     job.folder.parent.mkdir(parents=True)
     job.folder.write_text("in the way")
-    execute(job, Bench())
+    execute(job, WorkerContext())
     state = read_state(job.state_file)
     assert state is not None
     assert state.reason == "lslam made a mistake (RuntimeError: moths)"
@@ -105,7 +104,7 @@ def test_a_mistake_without_a_word_is_named_all_the_same(tmp_path: Path, monkeypa
 
     monkeypatch.setattr(worker, "_run", silent)
     job = job_in(tmp_path)
-    execute(job, Bench())
+    execute(job, WorkerContext())
     state = read_state(job.state_file)
     assert state is not None
     assert state.reason == "lslam made a mistake (AssertionError): its log.txt says where"
@@ -131,8 +130,8 @@ def test_a_run_that_is_ended_in_a_process_of_its_own_is_interrupted_after_the_sc
 
     ended: list[str] = []
     killer = threading.Thread(target=end_it)
-    task = Task("laps", partial(execute, job, Bench()), tmp_path / "laps.out")
-    run_tasks([task], Crew(1), lambda index: killer.start(), lambda index, cause: ended.append(cause))
+    task = Task("laps", partial(execute, job, WorkerContext()), tmp_path / "laps.out")
+    run_tasks([task], WorkerPool(1), lambda index: killer.start(), lambda index, cause: ended.append(cause))
     killer.join()
     assert ended == ["the process ended with exit code 130"]
     state = read_state(job.state_file)
@@ -160,7 +159,7 @@ def laps(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_run_that_is_done_has_no_reason_though_it_warned(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(prepared, "describe_deskew", lambda *given: ("no deskew: the points have no times", True))
     job = job_in(tmp_path)
-    execute(job, Bench())
+    execute(job, WorkerContext())
     assert "no deskew" in (job.folder / "manifest.json").read_text()
     state = read_state(job.state_file)
     assert state is not None

@@ -10,11 +10,10 @@ import pytest
 
 from lslam.config.load import load_config
 from lslam.simulation.scenarios import SimulatedDrive, simulate
+from lslam.studies.cached_sequence import ScanStore, SequenceCache, memory_bound, size_of
 from lslam.studies.grid import Job
 from lslam.studies.jobs import run_jobs
-from lslam.studies.kept import KeptSequences, ScanStore, memory_bound, size_of
-from lslam.studies.plan import Follow
-from lslam.studies.runner import Crew, Task
+from lslam.studies.runner import StudyProgress, Task, WorkerPool
 from lslam.studies.states import read_state
 from lslam.types.scan import Scan
 
@@ -36,7 +35,7 @@ def test_a_scan_is_read_once_until_it_must_make_room(drive: SimulatedDrive, monk
 
     monkeypatch.setattr(drive, "scan", scan)
     store = ScanStore(sum(size_of(s) for s in scans[:3]) + 10)
-    sequence = KeptSequences(store).get("drive", lambda: drive)
+    sequence = SequenceCache(store).get("drive", lambda: drive)
     assert [sequence.scan(i) is scans[i] for i in (0, 1, 0, 2, 0)] == [True] * 5
     assert read == [0, 1, 2]
     sequence.scan(3)  # 1 was used least lately
@@ -47,7 +46,7 @@ def test_a_scan_is_read_once_until_it_must_make_room(drive: SimulatedDrive, monk
 
 
 def test_a_sequence_is_opened_once_and_each_run_has_notes_of_its_own(drive: SimulatedDrive) -> None:
-    kept = KeptSequences(ScanStore(10**9))
+    kept = SequenceCache(ScanStore(10**9))
     opened: list[int] = []
 
     def opening() -> SimulatedDrive:
@@ -89,7 +88,7 @@ def test_what_a_recording_is_opened_with_tells_it_from_others(tmp_path: Path) ->
         Job("sample", "icp", k, path, config, tmp_path / str(k), str(k), "", reading=reading)
         for k, reading in enumerate([{}, {"lidar_topic": "/points"}])
     ]
-    run_jobs(jobs, Crew(1, is_kept=True), Follow())
+    run_jobs(jobs, WorkerPool(1, is_persistent=True), StudyProgress())
     states = [read_state(job.state_file) for job in jobs]
     assert states[0] is not None
     assert states[1] is not None
@@ -110,10 +109,14 @@ def test_several_at_once_begin_with_what_takes_longest_and_one_keeps_the_order(
         begun[:] = tasks
 
     monkeypatch.setattr("lslam.studies.jobs.run_tasks", fake)
-    for crew, order in ((Crew(2, is_kept=True), "3201"), (Crew(2), "3201"), (Crew(1, is_kept=True), "0123")):
-        run_jobs(jobs, crew, Follow())
+    for pool, order in (
+        (WorkerPool(2, is_persistent=True), "3201"),
+        (WorkerPool(2), "3201"),
+        (WorkerPool(1, is_persistent=True), "0123"),
+    ):
+        run_jobs(jobs, pool, StudyProgress())
         assert [task.name for task in begun] == [f"sample {k} seed 0" for k in order]
-        assert {task.data for task in begun} == {str(tmp_path) if crew.is_kept else ""}
+        assert {task.data for task in begun} == {str(tmp_path) if pool.is_persistent else ""}
 
 
 def test_memory_is_bounded_by_what_is_free() -> None:

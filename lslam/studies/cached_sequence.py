@@ -48,7 +48,7 @@ def size_of(scan: Scan) -> int:
     return sum(value.nbytes for value in values if isinstance(value, np.ndarray))
 
 
-class Kept(SequenceView):
+class CachedSequence(SequenceView):
     """A whole sequence whose scans come from a store; `number` tells it from the others there."""
 
     def __init__(self, whole: Sequence, store: ScanStore, number: int) -> None:
@@ -60,7 +60,7 @@ class Kept(SequenceView):
         return self._store.get((self._number, index), lambda: self.whole.scan(index))
 
 
-class KeptSequences:
+class SequenceCache:
     """Opened sequences of a process by what they were opened with."""
 
     def __init__(self, store: ScanStore) -> None:
@@ -73,7 +73,7 @@ class KeptSequences:
             self._opened[key] = opening()
         whole = self._opened[key]
         number = list(self._opened).index(key)
-        return Kept(whole, self.store, number)
+        return CachedSequence(whole, self.store, number)
 
 
 def memory_bound() -> int:

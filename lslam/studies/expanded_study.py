@@ -1,0 +1,116 @@
+"""Every run of a sweep or a batch, made in order: keep what is finished, simulate, run, and write each row as it comes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from lslam.config.preset_files import read_toml
+from lslam.errors import InterruptedRunError, LslamError, OutputExistsError
+from lslam.formats.atomic import write_text
+from lslam.studies.engines import Engine
+from lslam.studies.grid import Job
+from lslam.studies.jobs import finished
+from lslam.studies.output import OutputOptions, lock_output, release_output
+from lslam.studies.results import Results
+from lslam.studies.runner import StudyProgress
+from lslam.studies.variants import Variant
+from lslam.types.study import StudyRow
+from lslam.untrusted import parse_toml
+
+
+@dataclass(frozen=True)
+class ExpandedStudy:
+    """Every run, and what its variants stand for, by name.
+
+    name : of the study or batch, which `text` in the file `mark` describes; what : the word for it
+    """
+
+    name: str
+    what: str
+    mark: str
+    text: str
+    jobs: list[Job] = field(default_factory=list)
+    variants: dict[str, Variant] = field(default_factory=dict)
+
+
+def check_same(
+    output: OutputOptions, mark: str, what: str, text: str, names_of: Callable[[dict[str, Any]], Sequence[str]]
+) -> None:
+    """What changed since reuses its runs by digest; rows of two studies or batches in one table are of no use to either.
+
+    text : for the file `mark`; names_of : what its content goes by, the same if what is there and `text` share a name
+    Raises OutputExistsError when it is to go on in the folder of another one; ConfigError for a damaged `mark`.
+    """
+    if not output.resume or not (output.out / mark).is_file():
+        return
+    theirs, ours = names_of(read_toml(output.out / mark, what)), names_of(parse_toml(text))
+    if not set(theirs) & set(ours):
+        raise OutputExistsError(
+            f"output folder {output.out} holds {what} {theirs[0]!r} and --resume would go on in it with {what} {ours[0]!r}: "
+            "name another folder with --out"
+        )
+
+
+def left_to_do(output: OutputOptions, jobs: Sequence[Job]) -> list[Job]:
+    """Those that are not finished, or all unless `output.resume`."""
+    kept = finished(jobs) if output.resume else set()
+    return [replace(job, goes_on=output.resume) for job in jobs if job.folder not in kept]
+
+
+def make_runs(
+    expanded: ExpandedStudy,
+    output: OutputOptions,
+    engine: Engine,
+    progress: StudyProgress | None = None,
+    on_rows: Callable[[Sequence[StudyRow]], None] = lambda rows: None,
+) -> list[StudyRow]:
+    """Make every run that is not finished yet; results.csv and results.parquet in `output.out` grow as they end.
+
+    on_rows : called with all rows so far
+
+    Raises
+    ------
+    LslamError : as `lock_output` and the engine; OutputExistsError : a run's own folder holds something else
+    InterruptedRunError : Ctrl-C or SIGTERM; finished runs are kept, and `resume` goes on
+    """
+    progress = progress or StudyProgress()
+    jobs = expanded.jobs
+    results = Results(expanded.name, output.out, jobs, expanded.variants)
+    lock_output(output.out, expanded.mark, expanded.what, output.overwrite, output.resume)
+    try:
+        if not output.overwrite:
+            results.check()
+        write_text(output.out / expanded.mark, expanded.text)
+        left = left_to_do(output, jobs)
+        begun = {job.folder for job in left}
+        _check_folders(left, output)
+        results.add([job for job in jobs if job.folder not in begun])
+        engine.prepare(left, progress)
+
+        def on_done(job: Job) -> None:
+            results.add([job])
+            on_rows(results.rows)
+
+        on_rows(results.rows)
+        engine.run(left, progress, on_done)
+    except KeyboardInterrupt:
+        raise InterruptedRunError(
+            f"interrupted; {len(finished(jobs))} of {len(jobs)} runs are finished in {output.out}: the same command with "
+            "--resume goes on"
+        ) from None
+    except LslamError:
+        release_output(output.out, expanded.mark)
+        raise
+    return results.rows
+
+
+def _check_folders(jobs: Sequence[Job], output: OutputOptions) -> None:
+    """Raise OutputExistsError for a run that was given a folder of its own, which no run of this output wrote."""
+    for job in jobs:
+        may_replace = output.overwrite or (output.resume and job.state_file.is_file())
+        if output.out not in job.folder.parents and job.folder.exists() and not may_replace:
+            raise OutputExistsError(
+                f"the folder {job.folder} of {job.name} exists: name another, or --overwrite replaces it"
+            )

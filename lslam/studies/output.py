@@ -1,0 +1,61 @@
+"""The output folder of a comparison, study or batch: where runs go, and how the folder is taken and left."""
+
+from __future__ import annotations
+
+import contextlib
+from dataclasses import dataclass
+from pathlib import Path
+
+from lslam.errors import OutputError, OutputExistsError, UsageError, cause
+
+SIMULATED = "simulated"
+
+
+@dataclass(frozen=True)
+class OutputOptions:
+    """Where runs go.
+
+    overwrite : run everything anew; resume : keep finished runs, go on with the others
+    scenes : where simulations lie, None for a folder in `out`; studies of the same scenarios can share them
+    data_root : where recordings by name and the IMU of a KITTI odometry sequence are looked for
+    """
+
+    out: Path
+    overwrite: bool = False
+    resume: bool = False
+    scenes: Path | None = None
+    data_root: Path | None = None
+    command: str = ""
+
+
+def lock_output(out: Path, mark: str, what: str, overwrite: bool, resume: bool) -> None:
+    """Take the output folder, or say why not; the file `mark` tells `what` it is, and is the caller's to write.
+
+    Raises OutputExistsError for a file, a folder of something else, or one that holds runs and neither `overwrite` nor `resume`
+    is set; OutputError when it cannot be used.
+    """
+    if overwrite and resume:
+        raise UsageError("--overwrite runs everything anew and --resume keeps what is finished: give one of them")
+    if out.exists() and not out.is_dir():
+        raise OutputExistsError(f"output {out} is a file; name a folder with --out")
+    try:
+        has_something = out.is_dir() and any(out.iterdir())
+        if has_something and not (out / mark).is_file():
+            raise OutputExistsError(f"output folder {out} is not a {what} of lslam; name another with --out")
+        if has_something and not (overwrite or resume):
+            raise OutputExistsError(
+                f"output folder {out} exists; --resume keeps its finished runs, --overwrite runs all anew, or name "
+                "another with --out"
+            )
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"output folder {out} cannot be used: {cause(error)}") from None
+
+
+def release_output(out: Path, mark: str) -> None:
+    """Leave nothing behind when nothing was begun, so that the command can be given again."""
+    with contextlib.suppress(OSError):
+        inside = [path.name for path in out.iterdir()]
+        if inside == [mark]:
+            (out / mark).unlink()
+            out.rmdir()
