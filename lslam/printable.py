@@ -1,8 +1,9 @@
-"""Text that any file can hold, and names that any folder can have: what strangers or the system give may be neither."""
+"""Text that any file can hold, names that any folder can have, and numbers as text."""
 
 from __future__ import annotations
 
 import hashlib
+import math
 import re
 from typing import Any
 
@@ -48,3 +49,35 @@ def printable_tree(value: Any) -> Any:
     if isinstance(value, dict):
         return {printable(key): printable_tree(item) for key, item in value.items()}
     return [printable_tree(item) for item in value] if isinstance(value, (list, tuple)) else value
+
+
+def metres(value: float) -> str:
+    """A length with a millimetre's resolution, finer when it is small.
+
+    >>> metres(1.23456), metres(0.00123456), metres(float("nan"))
+    ('1.235', '0.0012', 'n/a')
+    """
+    if not math.isfinite(value):
+        return "n/a"
+    return f"{value:.3f}" if abs(value) >= 0.01 or value == 0 else f"{value:.4f}"
+
+
+def fixed(value: float, decimals: int) -> str:
+    """A number with fixed decimals, `n/a` when it is not finite."""
+    return f"{value:.{decimals}f}" if math.isfinite(value) else "n/a"
+
+
+def significant(value: float | None) -> str:
+    """Four significant digits; an exponent only below 0.0001; `n/a` for None and NaN.
+
+    >>> significant(0.123456), significant(12345.67), significant(None)
+    ('0.1235', '12345.7', 'n/a')
+    """
+    if value is None or value != value:
+        return "n/a"
+    return f"{value:.4g}" if abs(value) < 1000 else f"{value:.1f}"
+
+
+def counted(number: int, noun: str) -> str:
+    """A number with its noun, in the plural unless it is one."""
+    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"

@@ -21,6 +21,7 @@ EPILOG = """\b
 Examples:
   lslam eval runs/seq07-icp poses/07.txt
   lslam eval ours.tum theirs.tum gt.csv --align se3 --delta 1scan --delta 100m/all
+  lslam eval runs/seq07-icp poses/07.txt --metrics thesis
   lslam eval runs/seq07-icp poses/07.txt --fail-ate 1.0 --fail-drift 0.6
 """
 
@@ -55,6 +56,7 @@ Examples:
 @click.option(
     "--timing", "timing_file", type=click.Path(path_type=Path), metavar="CSV", help="timing.csv of the one estimate."
 )
+@options.metrics
 @options.as_json
 @click.option("--table", type=click.Choice(["text", "md", "csv", "tex"]), default="text", help="Style of the table.")
 @click.option("--plot", type=click.Path(path_type=Path), metavar="FILE", help="Draw a .png, .svg or .pdf.")
@@ -95,6 +97,7 @@ def _config(given: dict[str, Any]) -> EvalConfig:
     from lslam.config import load_config
     from lslam.config.eval import EvalConfig
     from lslam.errors import UsageError, nearest
+    from lslam.evaluation.metrics import check_words
     from lslam.evaluation.relative import parse_delta
     from lslam.evaluation.results import ALIGNMENTS
 
@@ -110,10 +113,12 @@ def _config(given: dict[str, Any]) -> EvalConfig:
             offset = float(offset)
         except ValueError:
             raise UsageError(f"--time-offset {offset}: seconds, or auto") from None
-    flags = {"align": align, "delta": deltas, "max_diff": given["max_diff"], "time_offset": offset}
+    words = [word for text in given["metrics"] for word in text.split(",") if word]
+    flags = {"metrics": words, "align": align, "delta": deltas, "max_diff": given["max_diff"], "time_offset": offset}
     values.update({key: value for key, value in flags.items() if value not in (None, [])})
     for delta in values["delta"]:
         parse_delta(delta)
+    check_words(values["metrics"])
     try:
         return EvalConfig.model_validate(values)
     except ValidationError as error:
@@ -173,25 +178,17 @@ def _timing(estimate: Path, given: Path | None, count: int) -> Timing | None:
 def _hold_gates(evaluations: list[Evaluation], given: dict[str, Any]) -> None:
     """GateError naming every number that is over its gate; a number that is not available holds no gate."""
     from lslam.errors import GateError
+    from lslam.evaluation.metrics import METRICS
 
     broken = []
     for e in evaluations:
-        ate = next((error for error in e.ate.values() if error.translation), None)
-        rpe = e.rpe[0]
-        values = {
-            "fail_ate": (
-                f"ATE {ate.alignment} rmse" if ate else "ATE",
-                ate and ate.translation and ate.translation.rmse,
-                "m",
-            ),
-            "fail_rpe": (f"RPE {rpe.name} rmse", rpe.translation and rpe.translation.rmse, "m"),
-            "fail_drift": ("KITTI drift", e.kitti_drift.translation_percent if e.kitti_drift.available else None, "%"),
-        }
-        for key, (what, value, unit) in values.items():
-            gate = given[key]
-            if gate is None or (value is not None and value <= gate):
+        for metric in METRICS:
+            gate = given.get(f"fail_{metric.gate_option}")
+            if gate is None:
                 continue
-            number = "n/a" if value is None else f"{value:.4g} {unit}"
-            broken.append(f"{what} of {e.estimate} is {number}, --{key.replace('_', '-')} allows {gate:g} {unit}")
+            name, value, unit = metric.gated(e)
+            if value is None or not value <= gate:
+                number = "n/a" if value is None else f"{value:.4g} {unit}"
+                broken.append(f"{name} of {e.estimate} is {number}, --fail-{metric.gate_option} allows {gate:g} {unit}")
     if broken:
         raise GateError("; ".join(broken))

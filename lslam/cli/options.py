@@ -222,6 +222,13 @@ def as_json(function: F) -> F:
     return click.option("--json", "as_json", is_flag=True, help="Print one JSON object on stdout.")(function)
 
 
+def metrics(function: F) -> F:
+    """--metrics."""
+    return click.option(
+        "--metrics", multiple=True, metavar="WORD", help="Show more metrics: thesis for those of the theses."
+    )(function)
+
+
 def numbers(flag: str, text: str, counts: tuple[int, ...], example: str) -> list[float]:
     """The comma-separated numbers of a flag; raises UsageError when they are not so many."""
     try:

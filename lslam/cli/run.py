@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     "          lslam run sample_data --gnss --crs EPSG:25832 --set map.format=laz\n"
     "          lslam run my_scans --poses theirs.tum --out runs/theirs\n"
     "          lslam run my_scans --osm town.osm --origin 49.0112,8.4229\n"
+    "          lslam run sample_data --method loam --metrics thesis\n"
     "          lslam run 2011_09_26_drive_0005_sync --set map.voxel=0.1 --json"
 )
 @click.argument("sequence")
@@ -67,6 +68,7 @@ if TYPE_CHECKING:
 )
 @click.option("--strict", is_flag=True, help="Exit 4 when anything was degraded: a scan skipped or bridged.")
 @click.option("--dry-run", is_flag=True, help="Resolve everything, write nothing.")
+@options.metrics
 @options.reading
 @options.data_root
 @options.configuration
@@ -142,6 +144,9 @@ def _resolve(given: dict[str, Any]) -> Config:
 
     flags = {
         "odometry.method": given["method"],
+        "eval.metrics": json.dumps([word for text in given["metrics"] for word in text.split(",")])
+        if given["metrics"]
+        else None,
         "registration.residual": given["residual"],
         "input.start": given["start"],
         "input.count": given["count"],

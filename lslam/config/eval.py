@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal
 
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from lslam.config.section import Section
 
@@ -21,3 +21,12 @@ class EvalConfig(Section):
     )
     max_diff: float = Field(0.01, gt=0, description="s; largest stamp difference of a matched pair")
     time_offset: float | Literal["auto"] = Field(0.0, description="s added to the estimate's stamps, or auto")
+    metrics: tuple[str, ...] = Field(
+        (), description="shown beside ATE, RPE and KITTI drift: thesis for those of the theses"
+    )
+
+    @field_validator("metrics", mode="before")
+    @classmethod
+    def _listed(cls, words: Any) -> Any:
+        """One word is a list of one."""
+        return (words,) if isinstance(words, str) else words

@@ -2,13 +2,28 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.config.eval import EvalConfig
 from lslam.errors import UsageError, nearest
-from lslam.evaluation.results import ALIGNMENTS, AbsoluteError
+from lslam.evaluation.metric import (
+    Document,
+    MatchedPoses,
+    MetricRow,
+    TrajectoryMetric,
+    cells_of,
+    statistics_document,
+    two,
+)
+from lslam.evaluation.results import ALIGNMENTS, AbsoluteError, Evaluation
 from lslam.evaluation.statistics import describe, percent_of_length
 from lslam.geometry import se3, so3, umeyama
+from lslam.printable import fixed, metres, significant
+from lslam.types.comparison import Metric
+from lslam.types.table import Table
 
 Floats = NDArray[np.float64]
 
@@ -74,3 +89,131 @@ def _position_and_yaw(p: Floats, q: Floats) -> tuple[Floats, float, str]:
         return np.eye(4), 1.0, "n/a (no horizontal motion)"
     R = so3.exp(np.array([0.0, 0.0, np.arctan2(sine, cosine)]))
     return se3.make(R, q.mean(0) - R @ p.mean(0)), 1.0, ""
+
+
+class AbsoluteTrajectoryError(TrajectoryMetric[dict[str, AbsoluteError]]):
+    """ATE under each alignment of `eval.align`."""
+
+    key, name, gate_option = "ate", "ATE", "ate"
+
+    def measure(self, poses: MatchedPoses, config: EvalConfig) -> dict[str, AbsoluteError]:
+        return {name: absolute_error(poses.estimate, poses.truth, name) for name in config.align}
+
+    def document(self, score: dict[str, AbsoluteError]) -> Document:
+        return {name: _document(error) for name, error in score.items()}
+
+    def summary(self, e: Evaluation) -> list[tuple[str, str]]:
+        return [(f"ATE {name}", _sentence(error, e)) for name, error in self.of(e).items()]
+
+    def rows(self, es: Sequence[Evaluation]) -> list[MetricRow]:
+        return [row for name in self.of(es[0]) for row in _rows(name, [self.of(e)[name] for e in es])]
+
+    def recipes(self, e: Evaluation) -> list[str]:
+        errors = self.of(e).items()
+        return [f"ATE {error.recipe if error.available else f'{name}: {error.note}'}" for name, error in errors]
+
+    def tables(self, e: Evaluation) -> list[Table]:
+        rows = []
+        for name, error in self.of(e).items():
+            if not error.available or error.translation is None:
+                rows.append((name, error.note or "n/a", *[""] * 8))
+                continue
+            t = error.translation
+            rows.append(
+                (
+                    name,
+                    *(metres(v) for v in (t.rmse, t.mean, t.median, t.std, t.max)),
+                    metres(error.horizontal.rmse) if error.horizontal else "",
+                    metres(error.vertical.rmse) if error.vertical else "",
+                    f"{error.rotation_deg.rmse:.3f}" if error.rotation_deg else "",
+                    fixed(error.percent_of_length, 2),
+                )
+            )
+        header = (
+            "alignment", "rmse, m", "mean, m", "median, m", "std, m", "max, m", "horizontal rmse, m", "vertical rmse, m",
+            "rotation rmse, deg", "rmse, % of length",
+        )  # fmt: skip
+        alignments = "; ".join(f"{name}: {ALIGNMENTS.get(name, name)}" for name in self.of(e))
+        recipe = f"{e.matched} of {e.possible} poses matched, path {e.path_length:.1f} m. {alignments}."
+        return [Table("Absolute trajectory error (ATE)", header, tuple(rows), recipe)]
+
+    def cards(self, e: Evaluation) -> list[tuple[str, str, str]]:
+        return [
+            (metres(error.translation.rmse), "m", f"ATE rmse, {name}")
+            for name, error in self.of(e).items()
+            if error.available and error.translation is not None
+        ]
+
+    def gated(self, e: Evaluation) -> tuple[str, float | None, str]:
+        for error in self.of(e).values():
+            if error.translation:
+                return f"ATE {error.alignment} rmse", error.translation.rmse, "m"
+        return "ATE", None, "m"
+
+    def compared(self, configs: Sequence[EvalConfig]) -> list[Metric]:
+        names = list(dict.fromkeys(name for config in configs for name in config.align))
+        main = [
+            Metric(f"ate.{name}", f"ATE {name}", "m", "error", f"alignment {name}: {ALIGNMENTS[name]}; rmse over poses")
+            for name in names
+        ]
+        more = [(f"ate.{name}.{what}", unit) for name in names for what, unit in (("max", "m"), ("rotation", "deg"))]
+        return main + [Metric(key, key, unit, "error", is_main=False) for key, unit in more]
+
+    def values(self, document: Document) -> dict[str, float]:
+        values = {}
+        for name, error in document.items():
+            if error["available"]:
+                values[f"ate.{name}"] = error["rmse"]
+                values[f"ate.{name}.max"] = error["max"]
+                values[f"ate.{name}.rotation"] = error["rotation_deg"]["rmse"]
+        return values
+
+
+def _document(error: AbsoluteError) -> Document:
+    return {
+        "recipe": error.recipe,
+        "available": error.available,
+        "note": error.note,
+        "unit": "m",
+        **statistics_document(error.translation),
+        "rotation_deg": statistics_document(error.rotation_deg),
+        "horizontal": statistics_document(error.horizontal),
+        "vertical": statistics_document(error.vertical),
+        "percent_of_length": error.percent_of_length,
+        "T_gt_est": error.T_gt_est.tolist(),
+        "scale": error.scale,
+    }
+
+
+def _sentence(error: AbsoluteError, e: Evaluation) -> str:
+    if not error.available or error.translation is None:
+        return error.note or "n/a"
+    rotation = f", {error.rotation_deg.rmse:.3f} deg" if error.rotation_deg else ""
+    return (
+        f"{metres(error.translation.rmse)} m rmse{rotation}, max {metres(error.translation.max)} m, "
+        f"{fixed(error.percent_of_length, 2)} % of length ({ALIGNMENTS.get(error.alignment, error.alignment)}; "
+        f"{e.matched} of {e.possible} poses)"
+    )
+
+
+def _rows(name: str, errors: list[AbsoluteError]) -> list[MetricRow]:
+    under = f"ATE {name}"
+
+    def row(label: str, unit: str, pick: Callable[[AbsoluteError], str], under: str = under) -> MetricRow:
+        return MetricRow(label, unit, cells_of(errors, lambda e: e.available, pick), under)
+
+    def rmse(error: AbsoluteError, what: str) -> str:
+        values = getattr(error, what)
+        return "n/a" if values is None else significant(values.rmse)
+
+    rows = [
+        row(f"{under} rmse", "m", lambda e: rmse(e, "translation"), ""),
+        row("mean / median", "m", lambda e: two(e.translation, "mean", "median")),
+        row("std / max", "m", lambda e: two(e.translation, "std", "max")),
+        row("horizontal / vertical rmse", "m", lambda e: f"{rmse(e, 'horizontal')} / {rmse(e, 'vertical')}"),
+        row("rotation rmse / max", "deg", lambda e: two(e.rotation_deg, "rmse", "max")),
+        row("rmse of path length", "%", lambda e: significant(e.percent_of_length)),
+    ]
+    if name == "sim3":
+        rows.append(row("scale", "", lambda e: f"{e.scale:.6f}"))
+    return rows if any(e.available for e in errors) else rows[:1]

@@ -10,14 +10,12 @@ from numpy.typing import NDArray
 
 from lslam.config.eval import EvalConfig
 from lslam.errors import InputError
-from lslam.evaluation.absolute import absolute_error
 from lslam.evaluation.associate import Matches, associate
 from lslam.evaluation.frames import reconcile
 from lslam.evaluation.hand_eye import body_turn
-from lslam.evaluation.kitti_drift import kitti_drift
-from lslam.evaluation.relative import relative_error
+from lslam.evaluation.metric import MatchedPoses
+from lslam.evaluation.metrics import METRICS
 from lslam.evaluation.results import Evaluation
-from lslam.evaluation.thesis import axis_errors, planar
 from lslam.evaluation.time_offset import estimate_offset
 from lslam.geometry import se3, so3
 from lslam.types.calibration import Calibration
@@ -104,6 +102,7 @@ def _measure(
 ) -> Evaluation:
     """All metrics of matched poses in one body frame: P estimate, Q ground truth, (N, 4, 4)."""
     distance = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(Q[:, :3, 3], axis=0), axis=1))])
+    poses = MatchedPoses(P, Q, matches.seconds)
     return Evaluation(
         estimate=trajectories[0].source or "estimate",
         ground_truth=trajectories[1].source or "ground truth",
@@ -113,14 +112,11 @@ def _measure(
         distance=distance,
         gt_positions=Q[:, :3, 3],
         path_length=float(distance[-1]),
-        ate={name: absolute_error(P, Q, name) for name in config.align},
-        rpe=[relative_error(P, Q, matches.seconds, delta) for delta in config.delta],
-        kitti_drift=kitti_drift(P, Q),
-        thesis1=axis_errors(P, Q),
-        thesis2=planar(P, Q),
+        scores={metric.key: metric.measure(poses, config) for metric in METRICS},
         time_offset=time_offset,
         association=matches.recipe,
         notes=notes,
+        shown=config.metrics,
     )
 
 

@@ -2,14 +2,38 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.evaluation.results import KittiDrift
+from lslam.config.eval import EvalConfig
+from lslam.evaluation.metric import Document, MatchedPoses, MetricRow, TrajectoryMetric
+from lslam.evaluation.results import Evaluation
+from lslam.printable import counted, significant
+from lslam.types.comparison import Metric
+from lslam.types.table import Table
 
 Floats = NDArray[np.float64]
 LENGTHS = (100, 200, 300, 400, 500, 600, 700, 800)
 START_EVERY = 10
+
+
+@dataclass(frozen=True)
+class KittiDrift:
+    """KITTI's odometry metric: mean drift over all segments of 100..800 m.
+
+    by_length : length in m -> (translation %, rotation deg/100 m, segments)
+    """
+
+    available: bool
+    note: str
+    translation_percent: float
+    rotation_deg_per_100m: float
+    segments: int
+    by_length: dict[int, tuple[float, float, int]]
+    recipe: str = "KITTI devkit: 100..800 m of ground truth, a start every 10 scans, mean over segments, no alignment"
 
 
 def kitti_drift(estimate: Floats, truth: Floats) -> KittiDrift:
@@ -51,3 +75,62 @@ def _segment_errors(estimate: Floats, truth: Floats, first: NDArray[np.intp], la
     E = np.linalg.inv(motion) @ true_motion
     cosine = 0.5 * (np.trace(E[:, :3, :3], axis1=1, axis2=2) - 1.0)
     return np.stack([np.linalg.norm(E[:, :3, 3], axis=1), np.arccos(np.clip(cosine, -1.0, 1.0))], axis=1)
+
+
+class KittiOdometry(TrajectoryMetric[KittiDrift]):
+    """Drift over segments of 100 to 800 m."""
+
+    key, name, gate_option = "kitti_drift", "KITTI drift", "drift"
+    columns = {  # noqa: RUF012
+        "translation_percent": Metric(
+            "drift", "drift", "%", "error", "KITTI: 100 to 800 m of ground truth, mean over segments"
+        ),
+        "rotation_deg_per_100m": Metric("drift.rotation", "drift.rotation", "deg/100m", "error", is_main=False),
+    }
+
+    def measure(self, poses: MatchedPoses, config: EvalConfig) -> KittiDrift:
+        return kitti_drift(poses.estimate, poses.truth)
+
+    def document(self, score: KittiDrift) -> Document:
+        names = ("translation_percent", "rotation_deg_per_100m", "segments")
+        lengths = {str(length): dict(zip(names, values, strict=True)) for length, values in score.by_length.items()}
+        whole = asdict(score)
+        return {"recipe": whole.pop("recipe"), **whole, "by_length": lengths}
+
+    def summary(self, e: Evaluation) -> list[tuple[str, str]]:
+        drift = self.of(e)
+        text = (
+            f"{drift.translation_percent:.3f} %, {drift.rotation_deg_per_100m:.4f} deg/100 m "
+            f"({counted(drift.segments, 'segment')} of 100 to 800 m)"
+        )
+        return [(self.name, text if drift.available else drift.note or "n/a")]
+
+    def rows(self, es: Sequence[Evaluation]) -> list[MetricRow]:
+        drifts = [self.of(e) for e in es]
+        return [
+            MetricRow(self.name, "%", [significant(d.translation_percent) for d in drifts]),
+            MetricRow("rotation", "deg/100m", [significant(d.rotation_deg_per_100m) for d in drifts], self.name),
+        ]
+
+    def recipes(self, e: Evaluation) -> list[str]:
+        drift = self.of(e)
+        return [f"drift: {drift.recipe}; {counted(drift.segments, 'segment') if drift.available else drift.note}"]
+
+    def tables(self, e: Evaluation) -> list[Table]:
+        drift = self.of(e)
+        header = ("segment length", "translation, %", "rotation, deg/100 m", "segments")
+        rows = [("all", f"{drift.translation_percent:.3f}", f"{drift.rotation_deg_per_100m:.4f}", str(drift.segments))]
+        for length, (translation, rotation, count) in sorted(drift.by_length.items()):
+            rows.append((f"{length} m", f"{translation:.3f}", f"{rotation:.4f}", str(count)))
+        if not drift.available:
+            rows = [("all", drift.note or "n/a", "", "0")]
+        return [Table(self.name, header, tuple(rows), f"{drift.recipe}.")]
+
+    def cards(self, e: Evaluation) -> list[tuple[str, str, str]]:
+        drift = self.of(e)
+        name = f"{self.name}, {counted(drift.segments, 'segment')}"
+        return [(f"{drift.translation_percent:.2f}", "%", name)] if drift.available else []
+
+    def gated(self, e: Evaluation) -> tuple[str, float | None, str]:
+        drift = self.of(e)
+        return self.name, drift.translation_percent if drift.available else None, "%"

@@ -3,15 +3,30 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.config.eval import EvalConfig
 from lslam.errors import UsageError
 from lslam.evaluation import pairs as pair_rules
-from lslam.evaluation.results import RelativeError
+from lslam.evaluation.metric import (
+    Document,
+    MatchedPoses,
+    MetricRow,
+    TrajectoryMetric,
+    cells_of,
+    statistics_document,
+    two,
+)
+from lslam.evaluation.results import Evaluation, RelativeError
 from lslam.evaluation.statistics import describe
 from lslam.geometry import se3, so3
+from lslam.printable import metres
+from lslam.types.comparison import Metric
+from lslam.types.table import Table
 
 Floats = NDArray[np.float64]
 UNIT_NAMES = {"scan": "scan", "scans": "scan", "m": "m", "s": "s", "": "scan"}
@@ -71,3 +86,104 @@ def _pairs(poses: Floats, seconds: Floats | None, delta: float, unit: str, all_p
         return pair_rules.by_path(poses[:, :3, 3], delta, all_pairs)
     assert seconds is not None
     return pair_rules.by_time(seconds, delta, all_pairs)
+
+
+class RelativePoseError(TrajectoryMetric[list[RelativeError]]):
+    """RPE at each distance of `eval.delta`."""
+
+    key, name, gate_option = "rpe", "RPE", "rpe"
+
+    def measure(self, poses: MatchedPoses, config: EvalConfig) -> list[RelativeError]:
+        return [relative_error(poses.estimate, poses.truth, poses.seconds, delta) for delta in config.delta]
+
+    def document(self, score: list[RelativeError]) -> list[Document]:
+        return [_document(error) for error in score]
+
+    def summary(self, e: Evaluation) -> list[tuple[str, str]]:
+        return [(self.name, _sentence(error)) for error in self.of(e)]
+
+    def rows(self, es: Sequence[Evaluation]) -> list[MetricRow]:
+        return [row for k in range(len(self.of(es[0]))) for row in _rows([self.of(e)[k] for e in es])]
+
+    def recipes(self, e: Evaluation) -> list[str]:
+        return [f"RPE {error.name}: {error.rule}, no alignment" for error in self.of(e)]
+
+    def tables(self, e: Evaluation) -> list[Table]:
+        rows = []
+        for error in self.of(e):
+            if error.translation is None or error.rotation_deg is None:
+                rows.append((error.name, str(error.n_pairs), error.note or "n/a", "", "", "", "", ""))
+                continue
+            t, r = error.translation, error.rotation_deg
+            values = (metres(t.rmse), metres(t.mean), metres(t.max), f"{r.rmse:.4f}", f"{r.mean:.4f}", f"{r.max:.4f}")
+            rows.append((error.name, str(error.n_pairs), *values))
+        header = (
+            "pair rule", "pairs", "translation rmse, m", "mean, m", "max, m", "rotation rmse, deg", "mean, deg", "max, deg",
+        )  # fmt: skip
+        recipe = (
+            "E = inv(inv(Q_i) Q_j) (inv(P_i) P_j) over the pairs of the rule; P estimate, Q ground truth; no alignment."
+        )
+        return [Table("Relative pose error (RPE)", header, tuple(rows), recipe)]
+
+    def gated(self, e: Evaluation) -> tuple[str, float | None, str]:
+        first = self.of(e)[0]
+        return f"RPE {first.name} rmse", first.translation.rmse if first.translation else None, "m"
+
+    def compared(self, configs: Sequence[EvalConfig]) -> list[Metric]:
+        deltas = list(dict.fromkeys(parse_delta(text) for config in configs for text in config.delta))
+        metrics = []
+        for delta, unit, pairs in deltas:
+            recipe = f"{delta:g} {unit}, {pairs} pairs, no alignment; rmse of the translation"
+            metrics.append(Metric(rpe_key(delta, unit, pairs), f"RPE {delta:g} {unit}", "m", "error", recipe))
+        rotations = [f"{rpe_key(*delta)}.rotation" for delta in deltas]
+        return metrics + [Metric(key, key, "deg", "error", is_main=False) for key in rotations]
+
+    def values(self, document: Any) -> dict[str, float]:
+        values = {}
+        for error in document:
+            if error["n_pairs"]:
+                key = rpe_key(error["delta"], error["unit"], error["pairs"])
+                values[key], values[f"{key}.rotation"] = error["translation"]["rmse"], error["rotation_deg"]["rmse"]
+        return values
+
+
+def rpe_key(delta: float, unit: str, pairs: str) -> str:
+    """Key of an RPE among the values of a run.
+
+    >>> rpe_key(10.0, "m", "all")
+    'rpe.10m.all'
+    """
+    return f"rpe.{delta:g}{unit}.{pairs}"
+
+
+def _document(error: RelativeError) -> Document:
+    return {
+        "recipe": error.recipe,
+        "delta": error.delta,
+        "unit": error.unit,
+        "pairs": error.pairs,
+        "n_pairs": error.n_pairs,
+        "note": error.note,
+        "translation": statistics_document(error.translation),
+        "rotation_deg": statistics_document(error.rotation_deg),
+    }
+
+
+def _sentence(error: RelativeError) -> str:
+    if error.translation is None or error.rotation_deg is None:
+        return f"{error.name}: {error.note or 'n/a'}"
+    return f"{metres(error.translation.rmse)} m, {error.rotation_deg.rmse:.4f} deg rmse ({error.name}, n = {error.n_pairs})"
+
+
+def _rows(errors: list[RelativeError]) -> list[MetricRow]:
+    under = f"RPE {errors[0].name}"
+
+    def cells(pick: Callable[[RelativeError], str]) -> list[str]:
+        return cells_of(errors, lambda e: e.n_pairs > 0, pick)
+
+    rows = [
+        MetricRow(f"{under}: rmse / mean", "m", cells(lambda e: two(e.translation, "rmse", "mean"))),
+        MetricRow("rotation rmse / mean", "deg", cells(lambda e: two(e.rotation_deg, "rmse", "mean")), under),
+        MetricRow("pairs", "", [str(e.n_pairs) for e in errors], under),
+    ]
+    return rows if any(e.n_pairs for e in errors) else rows[:1]

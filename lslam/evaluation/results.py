@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -85,69 +86,12 @@ class RelativeError:
 
 
 @dataclass(frozen=True)
-class KittiDrift:
-    """KITTI's odometry metric: mean drift over all segments of 100..800 m.
-
-    by_length : length in m -> (translation %, rotation deg/100 m, segments)
-    """
-
-    available: bool
-    note: str
-    translation_percent: float
-    rotation_deg_per_100m: float
-    segments: int
-    by_length: dict[int, tuple[float, float, int]]
-    recipe: str = "KITTI devkit: 100..800 m of ground truth, a start every 10 scans, mean over segments, no alignment"
-
-
-@dataclass(frozen=True)
-class AxisErrors:
-    """The first thesis' numbers, origin alignment: estimate minus ground truth per axis of the ground truth's world.
-
-    thesis_rmse : sqrt(sum |e|^2 / 3N), m, its equation 2.14 divided by sqrt(3); xyz : (N, 3) m; rpy_deg : (N, 3)
-    angular : (N,) deg, equation 2.15; the _rmse values are per axis
-    """
-
-    alignment: str
-    thesis_rmse: float
-    rmse: float
-    max_error: float
-    percent_of_length: float
-    xyz_rmse: tuple[float, float, float]
-    rpy_rmse_deg: tuple[float, float, float]
-    angular_rmse_deg: float
-    angular_max_deg: float
-    xyz: Floats
-    rpy_deg: Floats
-    angular: Floats
-    recipe: str = "origin alignment; thesis_rmse = sqrt(sum|e|^2 / 3N): compare with the first thesis' tables only"
-
-
-@dataclass(frozen=True)
-class Planar:
-    """The second thesis' numbers on SE(2) poses: mean and std of ATE (m), translational (m) and signed rotational RPE (rad).
-
-    spacing : mean ground-truth distance between consecutive poses, m; the thesis' is about 2 m
-    """
-
-    ate_mean: float
-    ate_std: float
-    rpe_translation_mean: float
-    rpe_translation_std: float
-    rpe_rotation_mean: float
-    rpe_rotation_std: float
-    spacing: float
-    recipe: str = (
-        "SE(2) poses (x, y, yaw), shared start and heading; RPE between consecutive matched poses, rotation signed"
-    )
-
-
-@dataclass(frozen=True)
 class Evaluation:
     """One estimate against one ground truth.
 
     matched, possible : pairs found, pairs at most; stamps_ns : (N,) of the matched poses, on the ground truth's clock
     distance : (N,) m travelled along the ground truth; gt_positions : (N, 3) m; path_length : m
+    scores : by key of the metric (`evaluation.metrics`), each with its recipe; shown : words of `eval.metrics`
     time_offset : s added to the estimate's stamps; association : recipe sentence; notes : what was decided or is doubtful
     faults : those of the notes that say what makes the numbers wrong
     odometry : of a run whose poses a graph moved, the same of the poses before
@@ -161,13 +105,22 @@ class Evaluation:
     distance: Floats
     gt_positions: Floats
     path_length: float
-    ate: dict[str, AbsoluteError]
-    rpe: list[RelativeError]
-    kitti_drift: KittiDrift
-    thesis1: AxisErrors
-    thesis2: Planar
+    scores: dict[str, Any]
     time_offset: float
     association: str
     notes: list[str]
     faults: tuple[str, ...] = ()
+    shown: tuple[str, ...] = ()
     odometry: Evaluation | None = None
+
+    @property
+    def ate(self) -> dict[str, AbsoluteError]:
+        """Absolute errors by alignment."""
+        errors: dict[str, AbsoluteError] = self.scores["ate"]
+        return errors
+
+    @property
+    def rpe(self) -> list[RelativeError]:
+        """Relative errors by distance."""
+        errors: list[RelativeError] = self.scores["rpe"]
+        return errors

@@ -1,20 +1,74 @@
-"""The numbers of the two theses behind lslam, by their own definitions."""
+"""The metrics of two theses, by their own definitions.
+
+Girolimetto: "Confronto di metodi SLAM basati su LiDAR mediante ambiente virtuale", University of Padua 2024.
+Del Tufo: "Improved Graph SLAM with OpenStreetMap Priors", Politecnico di Milano 2022.
+"""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.config.eval import EvalConfig
 from lslam.evaluation.absolute import align
-from lslam.evaluation.results import AxisErrors, Planar
+from lslam.evaluation.metric import MatchedPoses, MetricRow, TrajectoryMetric, two
+from lslam.evaluation.results import Evaluation
 from lslam.evaluation.statistics import percent_of_length
 from lslam.geometry import so3
+from lslam.printable import fixed, metres, significant
+from lslam.types.comparison import Metric
+from lslam.types.table import Table
 
 Floats = NDArray[np.float64]
 
 
+@dataclass(frozen=True)
+class AxisErrors:
+    """Girolimetto's errors, origin alignment: estimate minus ground truth per axis of the ground truth's world.
+
+    thesis_rmse : sqrt(sum |e|^2 / 3N), m, his equation 2.14 divided by sqrt(3); xyz : (N, 3) m; rpy_deg : (N, 3)
+    angular : (N,) deg, equation 2.15; the _rmse values are per axis
+    """
+
+    alignment: str
+    thesis_rmse: float
+    rmse: float
+    max_error: float
+    percent_of_length: float
+    xyz_rmse: tuple[float, float, float]
+    rpy_rmse_deg: tuple[float, float, float]
+    angular_rmse_deg: float
+    angular_max_deg: float
+    xyz: Floats
+    rpy_deg: Floats
+    angular: Floats
+    recipe: str = "origin alignment; thesis_rmse = sqrt(sum|e|^2 / 3N): compare with the first thesis' tables only"
+
+
+@dataclass(frozen=True)
+class Planar:
+    """Del Tufo's errors of SE(2) poses: mean and std of ATE (m), translational (m) and signed rotational RPE (rad).
+
+    spacing : mean ground-truth distance between consecutive poses, m; theirs is about 2 m
+    """
+
+    ate_mean: float
+    ate_std: float
+    rpe_translation_mean: float
+    rpe_translation_std: float
+    rpe_rotation_mean: float
+    rpe_rotation_std: float
+    spacing: float
+    recipe: str = (
+        "SE(2) poses (x, y, yaw), shared start and heading; RPE between consecutive matched poses, rotation signed"
+    )
+
+
 def axis_errors(estimate: Floats, truth: Floats) -> AxisErrors:
-    """First thesis, equations 2.14 and 2.15: errors per axis of poses (N, 4, 4) brought to the true start."""
+    """Girolimetto, equations 2.14 and 2.15: errors per axis of poses (N, 4, 4) brought to the true start."""
     T, _, _ = align(estimate, truth, "origin")
     moved = T @ estimate
     e = moved[:, :3, 3] - truth[:, :3, 3]
@@ -40,7 +94,7 @@ def axis_errors(estimate: Floats, truth: Floats) -> AxisErrors:
 
 
 def planar(estimate: Floats, truth: Floats) -> Planar:
-    """Second thesis, equations 4.2 to 4.7: SE(2) errors of poses (N, 4, 4), N >= 2, after a shared start and heading."""
+    """Del Tufo, equations 4.2 to 4.7: SE(2) errors of poses (N, 4, 4), N >= 2, after a shared start and heading."""
     T, _, _ = align(estimate, truth, "origin")
     p, q = _flatten(T @ estimate), _flatten(truth)
     # The start is shared in the plane too: flattening a tilted start leaves a rest of yaw.
@@ -80,3 +134,87 @@ def _compose(a: Floats, b: Floats) -> Floats:
 
 def _rms(values: Floats) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
+
+
+def _more(key: str, unit: str) -> Metric:
+    return Metric(key, key, unit, "error", is_main=False)
+
+
+class Girolimetto(TrajectoryMetric[AxisErrors]):
+    """Errors per axis."""
+
+    key, name, word = "thesis1", "thesis1", "thesis"
+    columns = {  # noqa: RUF012
+        "thesis_rmse": _more("thesis_rmse", "m"), "angular_rmse_deg": _more("thesis_angular", "deg")
+    }  # fmt: skip
+
+    def measure(self, poses: MatchedPoses, config: EvalConfig) -> AxisErrors:
+        return axis_errors(poses.estimate, poses.truth)
+
+    def summary(self, e: Evaluation) -> list[tuple[str, str]]:
+        return [(self.name, f"{metres(self.of(e).thesis_rmse)} m (thesis_rmse, sqrt(sum|e|²/3N), origin alignment)")]
+
+    def rows(self, es: Sequence[Evaluation]) -> list[MetricRow]:
+        scores, below = [self.of(e) for e in es], self.name
+        return [
+            MetricRow("thesis1 thesis_rmse", "m", [significant(s.thesis_rmse) for s in scores]),
+            MetricRow("x / y / z rmse", "m", [_joined(s.xyz_rmse) for s in scores], below),
+            MetricRow("roll / pitch / yaw rmse", "deg", [_joined(s.rpy_rmse_deg) for s in scores], below),
+            MetricRow(
+                "angular rmse / max", "deg", [two(s, "angular_rmse_deg", "angular_max_deg") for s in scores], below
+            ),
+        ]
+
+    def tables(self, e: Evaluation) -> list[Table]:
+        s = self.of(e)
+        header = (
+            "", "thesis_rmse, m", "x, m", "y, m", "z, m", "roll, deg", "pitch, deg", "yaw, deg", "angular, deg",
+        )  # fmt: skip
+        angles = (fixed(v, 3) for v in (*s.rpy_rmse_deg, s.angular_rmse_deg))
+        row = ("rmse", metres(s.thesis_rmse), *(metres(v) for v in s.xyz_rmse), *angles)
+        return [Table("Girolimetto (thesis1): errors per axis", header, (row,), f"{s.recipe}.")]
+
+
+class DelTufo(TrajectoryMetric[Planar]):
+    """Planar errors."""
+
+    key, name, word = "thesis2", "thesis2", "thesis"
+
+    def measure(self, poses: MatchedPoses, config: EvalConfig) -> Planar:
+        return planar(poses.estimate, poses.truth)
+
+    def summary(self, e: Evaluation) -> list[tuple[str, str]]:
+        s = self.of(e)
+        return [(self.name, f"ATE {metres(s.ate_mean)} ± {metres(s.ate_std)} m (planar, mean ± std)")]
+
+    def rows(self, es: Sequence[Evaluation]) -> list[MetricRow]:
+        scores = [self.of(e) for e in es]
+
+        def row(label: str, unit: str, key: str, below: str = self.name) -> MetricRow:
+            cells = [
+                f"{significant(getattr(s, f'{key}_mean'))} ± {significant(getattr(s, f'{key}_std'))}" for s in scores
+            ]
+            return MetricRow(label, unit, cells, below)
+
+        return [
+            row("thesis2 planar ATE", "m", "ate", ""),
+            row("RPE translation", "m", "rpe_translation"),
+            row("RPE rotation, signed", "rad", "rpe_rotation"),
+        ]
+
+    def recipes(self, e: Evaluation) -> list[str]:
+        return [f"{self.name}: {self.of(e).recipe}; mean spacing {self.of(e).spacing:.2f} m"]
+
+    def tables(self, e: Evaluation) -> list[Table]:
+        s = self.of(e)
+        rows = (
+            ("ATE, m", metres(s.ate_mean), metres(s.ate_std)),
+            ("RPE translation, m", fixed(s.rpe_translation_mean, 5), fixed(s.rpe_translation_std, 5)),
+            ("RPE rotation, rad", f"{s.rpe_rotation_mean:.3e}", f"{s.rpe_rotation_std:.3e}"),
+        )
+        recipe = f"{s.recipe}; matched poses are {s.spacing:.2f} m apart."
+        return [Table("Del Tufo (thesis2): planar errors", ("", "mean", "std"), rows, recipe)]
+
+
+def _joined(values: Sequence[float]) -> str:
+    return " / ".join(significant(value) for value in values)

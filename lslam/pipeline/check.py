@@ -5,6 +5,7 @@ from __future__ import annotations
 from lslam.config import Config
 from lslam.config.preset_files import read_preset
 from lslam.errors import UsageError
+from lslam.evaluation.metrics import check_words
 from lslam.evaluation.relative import parse_delta
 from lslam.loops import require_descriptor
 from lslam.maps.mesh import require_open3d
@@ -52,6 +53,7 @@ def check_config(config: Config) -> None:
         )
     for delta in config.eval.delta:
         parse_delta(delta)
+    check_words(config.eval.metrics)
 
 
 def _check_heeded(config: Config) -> None:

@@ -8,13 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.geometry import se3
+from lslam.printable import counted, metres
 from lslam.reports import svg
 from lslam.reports.buildings import drift_tables
 from lslam.reports.loop_view import loop_figures
-from lslam.reports.metrics import Table, counted, metres
 from lslam.reports.plane import Track, plane_chart
 from lslam.reports.plots import ALIGNED, DISTANCE, Figure, first_available
 from lslam.types.run_record import RunRecord
+from lslam.types.table import Table
 
 if TYPE_CHECKING:
     from lslam.evaluation.results import Evaluation

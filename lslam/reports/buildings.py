@@ -11,13 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.geometry import se2
-from lslam.reports.metrics import Table, counted
+from lslam.printable import counted
 from lslam.reports.plane import MOST_POINTS, Track, plane_chart
 from lslam.reports.plots import Figure
 from lslam.types.building import Building
 from lslam.types.building_correction import BuildingCorrection, CorrectedMap
 from lslam.types.building_match import KeyframeMatch, OsmMatches
 from lslam.types.run_record import RunRecord
+from lslam.types.table import Table
 
 Floats = NDArray[np.float64]
 

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lslam.formats.atomic import write_text
+from lslam.printable import counted, fixed, metres
 from lslam.reports.grid_text import Grid, aligned, comma_separated, latex, markdown
-from lslam.reports.metrics import counted, fixed, metres
 from lslam.types.comparison import Comparison, Metric, Spread, SummaryRow
 
 STYLES = ("md", "csv", "tex")

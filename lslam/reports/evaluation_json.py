@@ -5,12 +5,13 @@ Version 1, one estimate:
     schema, version, lslam, estimate, ground_truth
     association   {recipe, matched, possible, time_offset_s}
     path_length_m, notes[]
-    ate.<alignment>   {recipe, available, note, rmse, mean, median, std, min, max, sse, n (m), rotation_deg{..}, horizontal{..},
-                       vertical{..}, percent_of_length, T_gt_est, scale}
-    rpe[]         {recipe, delta, unit, pairs, n_pairs, note, translation{..} (m), rotation_deg{..}}
-    kitti_drift   {recipe, available, note, translation_percent, rotation_deg_per_100m, segments, by_length.<m>{..}}
-    thesis1, thesis2, timing
-    odometry      {recipe, and association to thesis2 as above}, of a run whose poses a pose graph moved: the poses before
+    ate, rpe, kitti_drift, ..   of each metric of `evaluation.metrics`, as its `document` makes it, in m unless the key says else:
+        ate.<alignment>   {recipe, available, note, rmse, mean, median, std, min, max, sse, n, rotation_deg{..}, horizontal{..},
+                           vertical{..}, percent_of_length, T_gt_est, scale}
+        rpe[]             {recipe, delta, unit, pairs, n_pairs, note, translation{..}, rotation_deg{..}}
+        others            {recipe, ..}
+    timing        {recipe, ..} or null
+    odometry      {recipe, and association to the last metric as above}, of a run whose poses a pose graph moved: the poses before
     map           {file, recipe, entropy (nats), plane_variance (m2), plane_thickness_m, ..}, of runs with a map; without ground
                   truth it stands alone behind schema, version, lslam and estimate
 
@@ -25,8 +26,8 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
 
-from lslam.evaluation.results import AbsoluteError, Evaluation, KittiDrift, RelativeError
-from lslam.evaluation.statistics import Statistics
+from lslam.evaluation.metrics import METRICS
+from lslam.evaluation.results import Evaluation
 from lslam.evaluation.timing import Timing
 from lslam.types.map_score import Crispness
 from lslam.types.run_record import RunRecord
@@ -39,9 +40,6 @@ Document = dict[str, Any]
 def to_document(evaluation: Evaluation, timing: Timing | None = None) -> Document:
     """The evaluation as plain values, ready for `json.dumps`; numbers that are NaN or infinite become None."""
     e = evaluation
-    t1, t2 = asdict(e.thesis1), asdict(e.thesis2)
-    for arrays in ("xyz", "rpy_deg", "angular"):
-        t1.pop(arrays)
     document = {
         "schema": SCHEMA,
         "version": VERSION,
@@ -56,16 +54,12 @@ def to_document(evaluation: Evaluation, timing: Timing | None = None) -> Documen
         },
         "path_length_m": e.path_length,
         "notes": list(e.notes),
-        "ate": {name: _absolute(error) for name, error in e.ate.items()},
-        "rpe": [_relative(error) for error in e.rpe],
-        "kitti_drift": _drift(e.kitti_drift),
-        "thesis1": t1,
-        "thesis2": t2,
+        **{metric.key: metric.document(e.scores[metric.key]) for metric in METRICS},
         "timing": None if timing is None else {"recipe": "s per scan, from timing.csv", **asdict(timing)},
     }
     if e.odometry is not None:
         whole = to_document(e.odometry)
-        kept = ("association", "path_length_m", "ate", "rpe", "kitti_drift", "thesis1", "thesis2")
+        kept = ("association", "path_length_m", *(metric.key for metric in METRICS))
         document["odometry"] = {"recipe": "of the poses before the pose graph"} | {name: whole[name] for name in kept}
     plain = strict(document)
     assert isinstance(plain, dict)
@@ -98,48 +92,6 @@ def to_json(evaluations: Sequence[Evaluation], timings: Sequence[Timing | None] 
     documents = [to_document(e, t) for e, t in zip(evaluations, padded, strict=True)]
     whole = documents[0] if len(documents) == 1 else {"schema": SCHEMA, "version": VERSION, "evaluations": documents}
     return json.dumps(whole, indent=2, allow_nan=False)
-
-
-def _absolute(error: AbsoluteError) -> Document:
-    return {
-        "recipe": error.recipe,
-        "available": error.available,
-        "note": error.note,
-        "unit": "m",
-        **_statistics(error.translation),
-        "rotation_deg": _statistics(error.rotation_deg),
-        "horizontal": _statistics(error.horizontal),
-        "vertical": _statistics(error.vertical),
-        "percent_of_length": error.percent_of_length,
-        "T_gt_est": error.T_gt_est.tolist(),
-        "scale": error.scale,
-    }
-
-
-def _relative(error: RelativeError) -> Document:
-    return {
-        "recipe": error.recipe,
-        "delta": error.delta,
-        "unit": error.unit,
-        "pairs": error.pairs,
-        "n_pairs": error.n_pairs,
-        "note": error.note,
-        "translation": _statistics(error.translation),
-        "rotation_deg": _statistics(error.rotation_deg),
-    }
-
-
-def _drift(drift: KittiDrift) -> Document:
-    names = ("translation_percent", "rotation_deg_per_100m", "segments")
-    whole = asdict(drift)
-    lengths = {str(length): dict(zip(names, values, strict=True)) for length, values in drift.by_length.items()}
-    return {"recipe": whole.pop("recipe"), **whole, "by_length": lengths}
-
-
-def _statistics(values: Statistics | None) -> Document:
-    if values is None:
-        return {**dict.fromkeys(("rmse", "mean", "median", "std", "min", "max", "sse")), "n": 0}
-    return asdict(values)
 
 
 def strict(value: Any) -> Any:

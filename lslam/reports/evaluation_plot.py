@@ -50,9 +50,8 @@ def _draw(evaluations: Sequence[Evaluation], names: Sequence[str]) -> Any:
     for e, name, error, colour in zip(evaluations, names, shown, _colours(len(names)), strict=True):
         position.plot(e.distance, np.linalg.norm(error.errors, axis=1), color=colour, lw=1.1, label=name)
         rotation.plot(e.distance, error.rotation_errors_deg, color=colour, lw=1.1)
-        if e.kitti_drift.available:
-            lengths = sorted(e.kitti_drift.by_length)
-            drift.plot(lengths, [e.kitti_drift.by_length[n][0] for n in lengths], "o-", ms=3, color=colour)
+        by_length = e.scores["kitti_drift"].by_length
+        drift.plot(sorted(by_length), [by_length[n][0] for n in sorted(by_length)], "o-", ms=3, color=colour)
     rmse = ", ".join(f"{error.translation.rmse:.3f} m" for error in shown if error.translation)
     position.set_title(f"position error, alignment {shown[0].alignment}: rmse {rmse}", fontsize=9)
     rotation.set_title("rotation error, same alignment", fontsize=9)
@@ -83,20 +82,21 @@ def _trajectories(
 
 def _axis_errors(plot: Any, evaluation: Evaluation, name: str) -> None:
     for k, axis in enumerate("xyz"):
-        plot.plot(evaluation.distance, evaluation.thesis1.xyz[:, k], lw=1.0, color=COLOURS[k], label=axis)
+        plot.plot(evaluation.distance, evaluation.scores["thesis1"].xyz[:, k], lw=1.0, color=COLOURS[k], label=axis)
     plot.legend(loc="best", ncol=3, frameon=False)
     plot.set_title(f"error per axis, alignment origin: {name}", fontsize=9)
     label(plot, "distance along ground truth, m", "m")
 
 
 def _drift_axes(plot: Any, evaluations: Sequence[Evaluation]) -> None:
-    if any(e.kitti_drift.available for e in evaluations):
+    drifts = [e.scores["kitti_drift"] for e in evaluations]
+    if any(drift.available for drift in drifts):
         plot.set_title("KITTI drift over segment length", fontsize=9)
         plot.set_ylim(bottom=0)
         label(plot, "segment, m", "%")
         return
     plot.set_axis_off()
-    plot.text(0.5, 0.5, f"KITTI drift: {evaluations[0].kitti_drift.note}", ha="center", va="center")
+    plot.text(0.5, 0.5, f"KITTI drift: {drifts[0].note}", ha="center", va="center")
 
 
 def _best_alignment(evaluation: Evaluation) -> AbsoluteError:

@@ -7,17 +7,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from lslam.evaluation.metrics import shown_metrics
 from lslam.formats.atomic import atomic_write
 from lslam.reports import plots
 from lslam.reports.back_end import back_end_figures
 from lslam.reports.buildings import building_pages
 from lslam.reports.facts import RunFacts, run_facts
 from lslam.reports.feature_view import feature_figures
-from lslam.reports.metrics import counted, metres, metric_tables
 from lslam.reports.png import data_uri, density_png
 from lslam.reports.text import imu_rows
 from lslam.types.map_score import Crispness
 from lslam.types.run_record import RunRecord
+from lslam.types.table import Table
 from lslam.version import __version__
 
 if TYPE_CHECKING:
@@ -70,7 +71,7 @@ def render_report(record: RunRecord, evaluation: Evaluation | None) -> str:
         has_truth=record.ground_truth is not None,
         trajectory=plots.trajectory_figures(record, evaluation) + back_end_figures(record, evaluation),
         errors=plots.error_figures(evaluation) if evaluation is not None else [],
-        tables=metric_tables(evaluation) if evaluation is not None else [],
+        tables=[] if evaluation is None else _metric_tables(evaluation),
         buildings=building_pages(record),
         time=plots.time_figure(record, facts) if facts.stages else None,
         share_bar=plots.share_bar(facts) if facts.stages else "",
@@ -160,20 +161,18 @@ def _map_cards(crispness: Crispness | None) -> list[Card]:
     return cards
 
 
+def _metric_tables(evaluation: Evaluation) -> list[Table]:
+    tables = [table for metric in shown_metrics(evaluation) for table in metric.tables(evaluation)]
+    return [table for table in tables if table.rows]
+
+
 def _cards(facts: RunFacts, evaluation: Evaluation | None) -> list[Card]:
     cards = [
         Card(f"{facts.registered}/{facts.scans}", "", "scans registered"),
         Card(f"{facts.path_length:.1f}", "m", f"path in {facts.duration:.1f} s"),
     ]
     if evaluation is not None:
-        for name, error in evaluation.ate.items():
-            if error.available and error.translation is not None:
-                cards.append(Card(metres(error.translation.rmse), "m", f"ATE rmse, {name}"))
-        drift = evaluation.kitti_drift
-        if drift.available:
-            cards.append(
-                Card(f"{drift.translation_percent:.2f}", "%", f"KITTI drift, {counted(drift.segments, 'segment')}")
-            )
+        cards += [Card(*card) for metric in shown_metrics(evaluation) for card in metric.cards(evaluation)]
     if facts.total is not None:
         cards.append(Card(f"{1e3 * facts.total.median:.1f}", "ms", "median time per scan"))
         if facts.real_time_factor:

@@ -68,14 +68,14 @@ def trajectory_figures(record: RunRecord, evaluation: Evaluation | None) -> list
 
 
 def error_figures(evaluation: Evaluation) -> list[Figure]:
-    """Errors over distance for each alignment, and per axis (thesis1: origin alignment)."""
+    """Errors over distance for each alignment, and per axis (origin alignment)."""
     available = [a for a in evaluation.ate.values() if a.available]
     distance = evaluation.distance
     position = [
         svg.Line(a.alignment, distance, np.linalg.norm(a.errors, axis=1), f"s{i + 1}") for i, a in enumerate(available)
     ]
     rotation = [svg.Line(a.alignment, distance, a.rotation_errors_deg, f"s{i + 1}") for i, a in enumerate(available)]
-    axes = evaluation.thesis1
+    axes = evaluation.scores["thesis1"]
     figures = [
         _lines(
             "Position error", position, DISTANCE, "position error, m", "Distance between matched poses, per alignment."

@@ -9,10 +9,10 @@ from pathlib import Path
 
 from lslam.errors import OutputError, cause
 from lslam.formats.atomic import atomic_write
+from lslam.printable import counted
 from lslam.reports.compare_table import CompareTable, as_text
 from lslam.reports.grid_text import comma_separated
 from lslam.reports.html import template
-from lslam.reports.metrics import counted
 from lslam.reports.study_figures import StudyFigure, study_figures
 from lslam.reports.study_table import means_grid, study_recipes, study_tables
 from lslam.types.sensitivity import StudyResult

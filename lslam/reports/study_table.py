@@ -8,9 +8,9 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 from lslam.evaluation.efficiency import normalise
+from lslam.printable import counted, fixed, metres
 from lslam.reports.compare_table import CompareTable
 from lslam.reports.grid_text import Grid
-from lslam.reports.metrics import counted, fixed, metres
 from lslam.types.sensitivity import CurveResult, Interval, Law, StudyResult
 from lslam.types.study import StudyRow
 

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from lslam.evaluation.results import ALIGNMENTS
+from lslam.evaluation.metrics import shown_metrics
+from lslam.printable import counted, metres
 from lslam.reports.back_end import back_end_rows
 from lslam.reports.facts import Failure, RunFacts, run_facts
-from lslam.reports.metrics import counted, fixed, metres
 from lslam.types.run_record import RunRecord
 from lslam.types.stage_clock import summed
 
 if TYPE_CHECKING:
-    from lslam.evaluation.results import AbsoluteError, Evaluation, RelativeError
+    from lslam.evaluation.results import Evaluation
 
 MOST_FAILURES = 5
 FILES = (
@@ -101,21 +101,7 @@ def _score_rows(record: RunRecord, evaluation: Evaluation | None) -> list[tuple[
     if evaluation is None:
         why = "ground truth could not be compared" if record.ground_truth is not None else "no ground truth is known"
         return [("errors", f"not stated: {why}")]
-    rows = [(f"ATE {name}", _absolute(error, evaluation)) for name, error in evaluation.ate.items()]
-    rows += [("RPE", _relative(error)) for error in evaluation.rpe]
-    drift = evaluation.kitti_drift
-    if drift.available:
-        value = (
-            f"{drift.translation_percent:.3f} %, {drift.rotation_deg_per_100m:.4f} deg/100 m "
-            f"({counted(drift.segments, 'segment')} of 100 to 800 m)"
-        )
-    else:
-        value = drift.note or "n/a"
-    rows.append(("KITTI drift", value))
-    first, second = evaluation.thesis1, evaluation.thesis2
-    rows.append(("thesis1", f"{metres(first.thesis_rmse)} m (thesis_rmse, sqrt(sum|e|²/3N), origin alignment)"))
-    rows.append(("thesis2", f"ATE {metres(second.ate_mean)} ± {metres(second.ate_std)} m (planar, mean ± std)"))
-    return rows
+    return [row for metric in shown_metrics(evaluation) for row in metric.summary(evaluation)]
 
 
 def _map_rows(record: RunRecord) -> list[tuple[str, str]]:
@@ -125,23 +111,6 @@ def _map_rows(record: RunRecord) -> list[tuple[str, str]]:
         return []
     thickness = f"planes {metres(score.plane_variance**0.5)} m thick (root of the mean plane variance)"
     return [("crispness", f"map entropy {score.entropy:.3f}, {thickness}; {score.radius:g} m, lower is crisper")]
-
-
-def _absolute(error: AbsoluteError, evaluation: Evaluation) -> str:
-    if not error.available or error.translation is None:
-        return error.note or "n/a"
-    rotation = f", {error.rotation_deg.rmse:.3f} deg" if error.rotation_deg else ""
-    return (
-        f"{metres(error.translation.rmse)} m rmse{rotation}, max {metres(error.translation.max)} m, "
-        f"{fixed(error.percent_of_length, 2)} % of length ({ALIGNMENTS.get(error.alignment, error.alignment)}; "
-        f"{evaluation.matched} of {evaluation.possible} poses)"
-    )
-
-
-def _relative(error: RelativeError) -> str:
-    if error.translation is None or error.rotation_deg is None:
-        return f"{error.name}: {error.note or 'n/a'}"
-    return f"{metres(error.translation.rmse)} m, {error.rotation_deg.rmse:.4f} deg rmse ({error.name}, n = {error.n_pairs})"
 
 
 def _time_rows(record: RunRecord, facts: RunFacts) -> list[tuple[str, str]]:

@@ -7,12 +7,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from lslam.config.eval import EvalConfig
 from lslam.errors import InputError
-from lslam.evaluation.results import ALIGNMENTS
+from lslam.evaluation.metrics import METRICS
 from lslam.evaluation.timing import Timing, read_timing
 from lslam.studies.grid import Job
 from lslam.studies.states import FINAL, State, read_state
-from lslam.types.comparison import Metric, RunScore
+from lslam.types.comparison import Group, Metric, RunScore
 from lslam.untrusted import parse_json
 
 COUNTS = {
@@ -87,76 +88,37 @@ def _add_errors(path: Path, manifest: dict[str, Any], values: dict[str, float]) 
             values[f"map.{key}"] = float(score["map"][key])
     if "ate" not in score:
         return f"not scored: {manifest['unscored']}" if "unscored" in manifest else NO_TRUTH
-    for name, error in score["ate"].items():
-        if error["available"]:
-            values[f"ate.{name}"] = error["rmse"]
-            values[f"ate.{name}.max"] = error["max"]
-            values[f"ate.{name}.rotation"] = error["rotation_deg"]["rmse"]
-    for error in score["rpe"]:
-        if error["n_pairs"]:
-            key = rpe_key(error["delta"], error["unit"], error["pairs"])
-            values[key], values[f"{key}.rotation"] = error["translation"]["rmse"], error["rotation_deg"]["rmse"]
-    drift = score["kitti_drift"]
-    if drift["available"]:
-        values["drift"], values["drift.rotation"] = drift["translation_percent"], drift["rotation_deg_per_100m"]
-    values["thesis_rmse"] = score["thesis1"]["thesis_rmse"]
-    values["thesis_angular"] = score["thesis1"]["angular_rmse_deg"]
+    for metric in METRICS:
+        values |= metric.values(score[metric.key])
     values["path"] = score["path_length_m"]
     for key in [key for key, value in values.items() if value is None]:
         del values[key]
     return ""
 
 
-def metrics_of(
-    alignments: Sequence[str], deltas: Sequence[tuple[float, str, str]], runs: Sequence[RunScore]
-) -> list[Metric]:
-    """Every number the runs may have, in the order of the table; deltas as (distance, unit, pair rule)."""
-    metrics = []
-    for name in alignments:
-        recipe = f"alignment {name}: {ALIGNMENTS[name]}; rmse over poses"
-        metrics.append(Metric(f"ate.{name}", f"ATE {name}", "m", "error", recipe))
-    metrics.append(Metric("drift", "drift", "%", "error", "KITTI: 100 to 800 m of ground truth, mean over segments"))
-    for delta, unit, pairs in deltas:
-        recipe = f"{delta:g} {unit}, {pairs} pairs, no alignment; rmse of the translation"
-        metrics.append(Metric(rpe_key(delta, unit, pairs), f"RPE {delta:g} {unit}", "m", "error", recipe))
+def metrics_of(configs: Sequence[EvalConfig], runs: Sequence[RunScore]) -> list[Metric]:
+    """Every number the runs may have, in the order of the table; those for programs alone come last."""
+    errors = [metric for entry in METRICS for metric in entry.compared(configs)]
     stages = list(dict.fromkeys(name for run in runs for name in run.stages))
-    metrics += [
-        Metric(f"time.{name}.median", name, "ms", "time", f"stage {name}: median over scans", "") for name in stages
-    ]
-    metrics += [
+    return [
+        *(metric for metric in errors if metric.is_main),
+        *(Metric(f"time.{name}.median", name, "ms", "time", f"stage {name}: median over scans", "") for name in stages),
         Metric("time.total", "total", "ms", "time", "all stages of a scan: median over scans"),
         Metric("time.p95", "p95", "ms", "time", "all stages of a scan: 95th percentile over scans"),
         Metric("factor", "real time", "x", "time", "recorded time over processing time (mean)", "high"),
+        *(Metric(key, key, "scans", "health", recipe, "") for key, recipe in COUNTS.items()),
+        *(metric for metric in errors if not metric.is_main),
+        _more("path", "m", "error"),
+        _more("map.entropy", "nats", "error"),
+        _more("map.plane_variance", "m2", "error"),
+        *(_more(f"time.{name}.p95", "ms", "time") for name in stages),
+        *(_more(key, unit, "time") for key, unit in (("time.mean", "ms"), ("time.max", "ms"), ("run_s", "s"))),
+        *(_more(key, unit, "health") for key, unit in (("scans", "scans"), ("ok", "scans"), ("over_limit", "scans"))),
+        _more("memory", "MB", "health"),
+        _more(IMU, "0 or 1", "health"),
     ]
-    metrics += [Metric(key, key, "scans", "health", recipe, "") for key, recipe in COUNTS.items()]
-    return metrics + _for_programs(alignments, deltas, stages)
 
 
-def rpe_key(delta: float, unit: str, pairs: str) -> str:
-    """Key of an RPE among a run's values.
-
-    >>> rpe_key(10.0, "m", "all")
-    'rpe.10m.all'
-    """
-    return f"rpe.{delta:g}{unit}.{pairs}"
-
-
-def _for_programs(
-    alignments: Sequence[str], deltas: Sequence[tuple[float, str, str]], stages: Sequence[str]
-) -> list[Metric]:
+def _more(key: str, unit: str, group: Group) -> Metric:
     """What stands in CSV and JSON only."""
-
-    def more(key: str, unit: str, group: Any = "error") -> Metric:
-        return Metric(key, key, unit, group, is_main=False)
-
-    metrics = [
-        more(f"ate.{name}.{what}", unit) for name in alignments for what, unit in (("max", "m"), ("rotation", "deg"))
-    ]
-    metrics += [more(f"{rpe_key(*delta)}.rotation", "deg") for delta in deltas]
-    metrics += [more("drift.rotation", "deg/100m"), more("thesis_rmse", "m"), more("thesis_angular", "deg")]
-    metrics += [more("path", "m")]
-    metrics += [more("map.entropy", "nats"), more("map.plane_variance", "m2")]
-    metrics += [more(f"time.{name}.p95", "ms", "time") for name in stages]
-    metrics += [more(key, unit, "time") for key, unit in (("time.mean", "ms"), ("time.max", "ms"), ("run_s", "s"))]
-    counts = (("scans", "scans"), ("ok", "scans"), ("over_limit", "scans"), ("memory", "MB"), (IMU, "0 or 1"))
-    return metrics + [more(key, unit, "health") for key, unit in counts]
+    return Metric(key, key, unit, group, is_main=False)

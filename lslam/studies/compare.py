@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from lslam.errors import InterruptedRunError, LslamError, UsageError
-from lslam.evaluation.relative import parse_delta
 from lslam.reports import compare_html, compare_json, compare_table
 from lslam.studies.cells import fitted_scene, recorded_cell
 from lslam.studies.collect import IMU, collect_run, metrics_of
@@ -160,14 +159,11 @@ def _notes(scores: Sequence[RunScore]) -> list[str]:
 def _weigh(plan: Plan, jobs: Sequence[Job], scores: Sequence[RunScore]) -> tuple[Comparison, list[Drawing]]:
     drawings, differences = draw(jobs, scores)
     methods = tuple(variant.name for variant in plan.variants)
-    recipes = [variant.config.eval for variant in plan.variants]
-    alignments = list(dict.fromkeys(name for recipe in recipes for name in recipe.align))
-    deltas = list(dict.fromkeys(parse_delta(delta) for recipe in recipes for delta in recipe.delta))
     return Comparison(
         command=plan.command,
         methods=methods,
         sequences=tuple(subject.label for subject in plan.subjects),
-        metrics=tuple(metrics_of(alignments, deltas, scores)),
+        metrics=tuple(metrics_of([variant.config.eval for variant in plan.variants], scores)),
         runs=tuple(scores),
         rows=tuple(summarise(scores)),
         paired=tuple(compare_pairs(scores, methods, ((v.name, v.without) for v in plan.variants if v.without))),

@@ -107,7 +107,7 @@ def test_only_the_world_turns() -> None:
         assert a is not None
         assert b is not None
         assert b.rmse == pytest.approx(a.rmse, rel=1e-6)
-    assert before.thesis1.thesis_rmse == pytest.approx(after.thesis1.thesis_rmse, rel=1e-6)
+    assert before.scores["thesis1"].thesis_rmse == pytest.approx(after.scores["thesis1"].thesis_rmse, rel=1e-6)
     assert turned[5].gravity is results[5].gravity, "in LiDAR axes, so the same"
     # A twist of the pose has the same likelihood in either world.
     T, d = level.R, np.arange(6) / 10

@@ -62,9 +62,19 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_table(folder: Path) -> None:
     done = evaluated(folder / "good.tum", folder / "gt.tum")
     assert done.returncode == 0, done.stderr
-    for word in ("ATE se3 rmse", "ATE origin rmse", "RPE 10 m, all pairs", "KITTI drift", "thesis1", "thesis2", "how:"):
+    for word in ("ATE se3 rmse", "ATE origin rmse", "RPE 10 m, all pairs", "KITTI drift", "how:"):
         assert word in done.stdout
+    assert "thesis" not in done.stdout
     assert done.stderr == ""
+
+
+def test_metrics_of_the_theses_are_asked_for(folder: Path) -> None:
+    done = evaluated(folder / "good.tum", folder / "gt.tum", "--metrics", "thesis")
+    assert "thesis1 thesis_rmse" in done.stdout
+    assert "thesis2 planar ATE" in done.stdout
+    wrong = evaluated(folder / "good.tum", folder / "gt.tum", "--metrics", "theses")
+    assert wrong.returncode == 2
+    assert "no metrics 'theses'; did you mean 'thesis'" in wrong.stderr
 
 
 def test_json_is_one_object_and_the_numbers_are_right(folder: Path) -> None:
