@@ -37,10 +37,10 @@ class OsmConfig(Section):
         description="prior: the map is true; rigid: it is off as a whole, as far as the start tells; non-rigid: each building is "
         "off by itself, in one graph with the trajectory; two-level: first the trajectory, then each building",
     )
-    matcher: Literal["walls", "baseline"] = Field(
+    matcher: str = Field(
         "walls",
-        description="walls laid on walls; baseline: NDT and VGICP of flattened scans, buildings and trajectory in one graph, as "
-        "in the second thesis, section 2.5 (the mode is not asked)",
+        description="walls: walls laid on walls; baseline: NDT and VGICP of flattened scans, buildings and trajectory in one "
+        "graph, as in the second thesis, section 2.5 (the mode is not asked)",
     )
     trust_poses: bool = Field(
         True, description="with --poses: they are laid on the map as a whole and not bent; false: held like odometry"

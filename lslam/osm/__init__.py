@@ -1,1 +1,39 @@
-"""OpenStreetMap as prior knowledge: fetched buildings, walls seen in clouds, and how the two are matched."""
+"""OpenStreetMap as prior knowledge: fetched buildings, walls seen in clouds, and how the two are matched.
+
+A new matcher is one file with `lay` and one line here.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from importlib import import_module
+from typing import cast
+
+from lslam.errors import UsageError, nearest
+from lslam.osm.matcher import Lay
+
+
+@dataclass(frozen=True)
+class Matcher:
+    """One way to lay buildings: the module with `lay`, and whether walls may show before how odometry drifts."""
+
+    module: str
+    reveals_drift: bool = True
+
+    @property
+    def lay(self) -> Lay:
+        """Imported when it is asked for."""
+        return cast(Lay, import_module(self.module).lay)
+
+
+MATCHERS = {
+    "walls": Matcher("lslam.osm.join_buildings"),
+    "baseline": Matcher("lslam.osm.baseline_matcher", reveals_drift=False),
+}
+
+
+def matcher_named(name: str) -> Matcher:
+    """The matcher `osm.matcher` names. Raises UsageError with the nearest name when there is none."""
+    if name not in MATCHERS:
+        raise UsageError(f"no matcher {name!r} (osm.matcher); {nearest(name, MATCHERS)}")
+    return MATCHERS[name]

@@ -44,15 +44,18 @@ def correct_buildings(matches: OsmMatches, poses: NDArray[np.float64], config: O
         belief = replace(belief, sigma=TOGETHER)
     local = agreed(matches, poses)
     solution = solve_buildings(middles_of(matches), local, dict(enumerate(poses)), belief)
-    return place_buildings(matches, poses, local, solution, config)
+    return place_buildings(matches, poses, local, solution, config, config.mode)
 
 
 def place_buildings(
-    matches: OsmMatches, poses: Floats, local: Sequence[BuildingMatch], solution: BuildingSolution, config: OsmConfig
-) -> CorrectedMap:
-    """The map that a solution of `local` matches means: overlaps parted, what is absent and what is new."""
+    matches: OsmMatches, poses: Floats, local: Sequence[BuildingMatch], solution: BuildingSolution, config: OsmConfig,
+    mode: str,
+) -> CorrectedMap:  # fmt: skip
+    """The map that a solution of `local` matches means: overlaps parted, what is absent and what is new.
+
+    mode : by which it was made, of `OsmConfig.mode`, or a matcher's name
+    """
     place = dict(enumerate(poses))
-    mode = "baseline" if config.matcher == "baseline" else config.mode
     untangled, own = Untangled(solution.displacements, (), ()), solution.covariances
     if mode == "prior":
         # What would move a building moves none, so the map is as good as before anything was seen.

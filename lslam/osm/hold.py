@@ -9,11 +9,9 @@ import numpy as np
 from lslam.backend.georeferencing import Placement, on_earth
 from lslam.backend.outcome import BackEnd, Given, solve
 from lslam.errors import GraphError, InputError
-from lslam.geometry import se2
 from lslam.graph.odometry_constraints import corrected
 from lslam.graph.problem import PoseGraph
-from lslam.osm.corrections import correct_buildings
-from lslam.osm.join_buildings import join_buildings, run_baseline
+from lslam.osm import matcher_named
 from lslam.osm.location import finish
 from lslam.osm.on_map import find_on_map
 from lslam.osm.source import OsmSource
@@ -23,7 +21,6 @@ from lslam.types.georeference import Georeference
 def hold_by_buildings(osm: OsmSource, graph: PoseGraph, placement: Placement, given: Given) -> BackEnd | None:
     """The run held by the buildings of a map, and by fixes where it has some; None, and why, where they hold nothing."""
     config, store, problems = given.config, given.store, given.problems
-    last = given.clocks[len(store) - 1]
     known = placement.georeference
     origin = known.origin if known is not None else config.osm.origin
     if origin is None:
@@ -54,17 +51,13 @@ def hold_by_buildings(osm: OsmSource, graph: PoseGraph, placement: Placement, gi
         return None
     matches = finish(located, extract, out.keyframes, out.solution, config.osm, given.clocks)
     try:
-        if config.osm.matcher == "baseline":
-            joint, matches, buildings = run_baseline(held, out.solution, extract, store, config, given.clocks)
-        elif config.osm.mode == "non-rigid":
-            with last.stage("graph"):
-                joint, buildings = join_buildings(held, out.solution, matches, config)
-        else:
-            with last.stage("graph"):
-                buildings = correct_buildings(matches, se2.of_se3(out.keyframes), config.osm)
-            return replace(out, osm=matches, buildings=buildings)
+        laid = matcher_named(config.osm.matcher).lay(held, out.solution, matches, extract, given)
     except (GraphError, np.linalg.LinAlgError) as error:
         problems.append(f"OSM: {error}; the run goes on with its buildings where the map has them")
         return replace(out, osm=matches)
-    moved = corrected(given.results, store.keyframes, joint.poses, joint.covariances, out.solution.drift, config.graph)
-    return replace(out, results=moved, keyframes=joint.poses, osm=matches, buildings=buildings)
+    laid_out = replace(out, osm=laid.matches, buildings=laid.buildings)
+    if laid.joint is None:
+        return laid_out
+    poses, covariances = laid.joint.poses, laid.joint.covariances
+    moved = corrected(given.results, store.keyframes, poses, covariances, out.solution.drift, config.graph)
+    return replace(laid_out, results=moved, keyframes=poses)

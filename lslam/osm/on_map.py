@@ -14,6 +14,7 @@ from lslam.formats.osm_buildings import BuildingExtract
 from lslam.geometry import se2, se3
 from lslam.graph.problem import PlanarPrior, PoseGraph
 from lslam.keyframes.store import KeyframeStore
+from lslam.osm import matcher_named
 from lslam.osm.drift_fit import WallSightings
 from lslam.osm.location import Located, locate
 from lslam.osm.prior import match_buildings
@@ -50,7 +51,7 @@ def find_on_map(
     located = locate(extract, store, up, config, placed, clocks=clocks)
     held = on_map(graph, located, config)
     is_straight = held.is_rigid or not config.graph.steady_drift
-    if located.problem or config.osm.matcher != "walls" or is_straight:
+    if located.problem or not matcher_named(config.osm.matcher).reveals_drift or is_straight:
         return located, held
     before: WallDrift | None = None
     for _ in range(ROUNDS):

@@ -10,6 +10,7 @@ from lslam.evaluation.relative import parse_delta
 from lslam.loops import require_descriptor
 from lslam.maps.mesh import require_open3d
 from lslam.odometry import FEATURE_METHODS, METHODS, require_method
+from lslam.osm import matcher_named
 from lslam.registration.residuals import residual_named
 
 # Methods that match a scan against Gaussian voxels, and what of `registration` only some methods look at.
@@ -44,6 +45,7 @@ def check_config(config: Config) -> None:
     if config.registration.residual is not None:
         residual_named(config.registration.residual)
     _check_heeded(config)
+    matcher_named(config.osm.matcher)
     if not config.osm.extract and (config.osm.origin is not None or config.osm.heading_deg is not None):
         raise UsageError("--origin and --heading do nothing without --osm FILE: give it, or drop them")
     if config.gnss.crs is not None and config.gnss.mode == "off" and not config.osm.extract:

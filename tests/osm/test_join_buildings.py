@@ -10,7 +10,7 @@ from lslam.formats.osm_buildings import BuildingExtract
 from lslam.geometry import se3
 from lslam.graph.pose_graph import optimise
 from lslam.graph.problem import PoseGraph, PositionFix
-from lslam.osm.join_buildings import run_baseline
+from lslam.osm.baseline_matcher import run_baseline
 from lslam.types.building import Building, Footprint
 from lslam.types.constraint import Constraint
 from lslam.types.stage_clock import KeyframeClocks

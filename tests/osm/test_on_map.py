@@ -14,13 +14,16 @@ from lslam.backend.georeferencing import Placement
 from lslam.backend.outcome import Given, solve
 from lslam.config import Config
 from lslam.config.load import load_config
+from lslam.errors import UsageError
 from lslam.geometry import se2, se3
 from lslam.graph.problem import PoseGraph
 from lslam.keyframes.store import KeyframeStore
+from lslam.osm import MATCHERS
 from lslam.osm.hold import hold_by_buildings
 from lslam.osm.location import Located, locate
 from lslam.osm.on_map import find_on_map, on_map, sightings
 from lslam.osm.source import OsmServer
+from lslam.pipeline.check import check_config
 from lslam.types.constraint import Constraint
 from lslam.types.georeference import Georeference
 from lslam.types.scan_result import ScanResult
@@ -195,3 +198,10 @@ def test_a_run_that_its_fixes_cannot_place_says_what_would() -> None:
     assert said.startswith(
         "OSM: without its fixes the run has no place on the map: give --origin LAT,LON of the first scan;"
     )
+
+
+def test_an_unknown_matcher_is_refused_before_a_run() -> None:
+    assert set(MATCHERS) == {"walls", "baseline"}
+    assert all(callable(matcher.lay) for matcher in MATCHERS.values())
+    with pytest.raises(UsageError, match=r"no matcher 'wals' \(osm.matcher\); did you mean 'walls'"):
+        check_config(load_config(None, ["osm.matcher=wals"], {}))
