@@ -9,13 +9,14 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from lslam.cli import options
+from lslam.formats.trajectory_formats import WRITTEN
 
 if TYPE_CHECKING:
     from lslam.types.calibration import Calibration
     from lslam.types.sequence import Sequence
     from lslam.types.trajectory import Trajectory
 
-SEQUENCES, TRAJECTORIES = ("bag", "mcap", "sqlite", "kitti"), ("kitti", "tum", "euroc")
+SEQUENCES = ("bag", "mcap", "sqlite", "kitti")
 EPILOG = """\b
 Examples:
   lslam convert seq07 --data-root ~/kitti --to mcap --zstd --out seq07.mcap
@@ -28,7 +29,7 @@ Examples:
 @click.command(epilog=EPILOG)
 @click.argument("source")
 @click.option(
-    "--to", "kind", required=True, type=click.Choice(list(dict.fromkeys(SEQUENCES + TRAJECTORIES))),
+    "--to", "kind", required=True, type=click.Choice(list(dict.fromkeys(SEQUENCES + WRITTEN))),
     help="bag is ROS 1, mcap and sqlite are ROS 2; tum and euroc are for trajectories, kitti for both.",
 )  # fmt: skip
 @click.option("--out", required=True, type=click.Path(path_type=Path), metavar="PATH", help="What is written.")
@@ -58,7 +59,7 @@ def command(source: str, kind: str, out: Path, **given: Any) -> None:
     from lslam.cli.console import setup_logging
 
     setup_logging(given["verbose"], given["quiet"])
-    if kind in ("tum", "euroc") or _is_trajectory(source):
+    if kind not in SEQUENCES or _is_trajectory(source):
         _convert_trajectory(source, kind, out, given)
     else:
         _convert_sequence(source, kind, out, given)

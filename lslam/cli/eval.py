@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from lslam.cli import options
+from lslam.formats.trajectory_formats import FORMATS
 
 if TYPE_CHECKING:
     from lslam.config.eval import EvalConfig
@@ -16,7 +17,6 @@ if TYPE_CHECKING:
     from lslam.types.calibration import Calibration
     from lslam.types.trajectory import Trajectory
 
-FORMATS = ["kitti", "tum", "euroc", "csv"]
 EPILOG = """\b
 Examples:
   lslam eval runs/seq07-icp poses/07.txt
@@ -50,9 +50,9 @@ Examples:
 )
 @click.option("--times", type=click.Path(path_type=Path), metavar="FILE", help="Stamps of KITTI files, one per line.")
 @click.option(
-    "--format", "file_format", type=click.Choice(FORMATS), help="Format of the estimates; detected by default."
+    "--format", "file_format", type=click.Choice(list(FORMATS)), help="Format of the estimates; detected by default."
 )
-@click.option("--gt-format", type=click.Choice(FORMATS), help="Format of the ground truth; detected by default.")
+@click.option("--gt-format", type=click.Choice(list(FORMATS)), help="Format of the ground truth; detected by default.")
 @click.option(
     "--timing", "timing_file", type=click.Path(path_type=Path), metavar="CSV", help="timing.csv of the one estimate."
 )

@@ -3,22 +3,17 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 from lslam.errors import InputError, OutputExistsError, UsageError
 from lslam.formats.sequence_toml import FRAMES
-from lslam.formats.trajectory_files import write_euroc, write_kitti, write_tum
+from lslam.formats.trajectory_formats import FORMATS, WRITTEN
 from lslam.geometry import se3
 from lslam.types.calibration import Calibration
 from lslam.types.trajectory import Trajectory
 
 log = logging.getLogger("lslam")
-
-WRITERS: dict[str, Callable[[Path, Trajectory], None]] = {"kitti": write_kitti, "tum": write_tum, "euroc": write_euroc}
-# The body whose poses a format holds by convention; TUM files say theirs.
-USUAL = {"kitti": "cam0", "euroc": "imu"}
 
 
 def convert_trajectory(
@@ -37,19 +32,20 @@ def convert_trajectory(
     InputError : the change of body needs an extrinsic that `calibration` does not have. UsageError : unknown `kind` or `frame`.
     OutputExistsError : `out` is there and `overwrite` is not set.
     """
-    if kind not in WRITERS:
-        raise UsageError(f"no trajectory format {kind!r} to write: {', '.join(WRITERS)} are")
+    if kind not in WRITTEN:
+        raise UsageError(f"no trajectory format {kind!r} to write: {', '.join(WRITTEN)} are")
+    wanted = FORMATS[kind]
     if out.exists() and not overwrite:
         raise OutputExistsError(f"{out} exists already: choose another --out, or --overwrite it")
-    moved = change_frame(trajectory, frame or USUAL.get(kind, trajectory.frame), calibration)
-    if kind == "kitti":
-        log.info("KITTI files have no stamps: line i is pose i")
+    moved = change_frame(trajectory, frame or wanted.frame or trajectory.frame, calibration)
+    if not wanted.has_stamps:
+        log.info("%s files have no stamps: line i is pose i", kind.upper())
     elif not trajectory.has_stamps:
         raise InputError(
             f"{trajectory.source} has no stamps and --to {kind} needs them: --times names them, one a line"
         )
     out.parent.mkdir(parents=True, exist_ok=True)
-    WRITERS[kind](out, moved)
+    wanted.write(out, moved)
     return moved
 
 

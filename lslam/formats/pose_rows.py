@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.errors import InputError, cause
+from lslam.formats.atomic import atomic_write
 from lslam.geometry import se3, so3
 
 Floats = NDArray[np.float64]
@@ -124,3 +125,9 @@ def frame_in(comments: list[str]) -> str | None:
         if found:
             return found.group(1)
     return None
+
+
+def write_lines(path: str | Path, lines: list[str]) -> None:
+    """Write a text file, atomically; names that are no text are escaped."""
+    with atomic_write(Path(path)) as stream:
+        stream.writelines(f"{line}\n".encode("utf-8", "backslashreplace") for line in lines)

@@ -15,7 +15,9 @@ from lslam.formats.pose_rows import (
     frame_in,
     poses_from_quaternions,
     seconds_to_ns,
+    write_lines,
 )
+from lslam.geometry import so3
 from lslam.types.trajectory import Trajectory
 
 # Names after lower case and without units, prefixes and punctuation.
@@ -34,10 +36,41 @@ def looks_like_header(line: str) -> bool:
     return bool(re.match(r"[A-Za-z_]", field)) and field.lower() not in ("nan", "inf", "infinity")
 
 
-def detect(first: str) -> str:
-    """`euroc` for a bare table that starts with integer nanoseconds, else `csv`."""
-    field = re.split(r"[,;]", first)[0].strip()
-    return "euroc" if re.fullmatch(r"\d{15,}", field) else "csv"
+def is_table(first: str) -> bool:
+    """Whether the first line is of a table and not of numbers between blanks."""
+    return any(separator in first for separator in ",;") or looks_like_header(first)
+
+
+def fits_euroc(first: str) -> bool:
+    """A bare table that starts with integer nanoseconds."""
+    return is_table(first) and re.fullmatch(r"\d{15,}", re.split(r"[,;]", first)[0].strip()) is not None
+
+
+def fits_csv(first: str) -> bool:
+    """Any other table."""
+    return is_table(first)
+
+
+def read_euroc(path: Path, rows: list[Row], comments: list[str], times: Path | None) -> Trajectory:
+    """Poses of the IMU, if no comment names another body."""
+    return parse(path, rows, comments, is_euroc=True)
+
+
+def read_csv(path: Path, rows: list[Row], comments: list[str], times: Path | None) -> Trajectory:
+    """Poses of the body that a comment names."""
+    return parse(path, rows, comments, is_euroc=False)
+
+
+def write_euroc(path: str | Path, trajectory: Trajectory) -> None:
+    """Write a EuRoC csv, atomically: integer ns, position, quaternion wxyz."""
+    lines = [
+        "#timestamp [ns],p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],q_RS_w [],q_RS_x [],q_RS_y [],q_RS_z []",
+        f"# frame: {trajectory.frame}",
+    ]
+    q = np.roll(so3.to_quaternion(trajectory.poses[:, :3, :3]), 1, axis=-1)
+    for stamp, p, r in zip(trajectory.stamps_ns.tolist(), trajectory.positions.tolist(), q.tolist(), strict=True):
+        lines.append(",".join([str(stamp), *(f"{v:.9f}" for v in p), *(f"{v:.12f}" for v in r)]))
+    write_lines(path, lines)
 
 
 def parse(path: Path, rows: list[Row], comments: list[str], is_euroc: bool) -> Trajectory:

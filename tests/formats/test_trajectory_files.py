@@ -22,6 +22,7 @@ from lslam.formats.trajectory_files import (
     write_kitti,
     write_tum,
 )
+from lslam.formats.trajectory_formats import FORMATS, WRITTEN
 from lslam.geometry import se3
 from lslam.types.trajectory import Trajectory
 
@@ -234,3 +235,17 @@ def test_real_files(recordings: Callable[[str], Path]) -> None:
     assert len(read_trajectory(drive / "reference_lidar.tum")) == 154
     poses = read_trajectory(recordings("kitti_poses") / "kitti_poses/ground_truth/00.txt")
     assert (len(poses), poses.has_stamps, int(poses.stamps_ns[1])) == (4541, True, 103_735_900)
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_every_format_of_the_table_reads_what_it_writes(name: str, tmp_path: Path) -> None:
+    one = FORMATS[name]
+    assert (name in WRITTEN) == one.is_written
+    if not one.is_written:
+        return
+    one.write(tmp_path / "a", sample())
+    again = read_trajectory(tmp_path / "a")
+    np.testing.assert_allclose(again.poses, sample().poses, atol=1e-9, rtol=0)
+    assert again.has_stamps == one.has_stamps
+    first = next(line for line in (tmp_path / "a").read_text().splitlines() if not line.startswith("#"))
+    assert next(other for other in FORMATS if FORMATS[other].fits(first)) == name

@@ -1,0 +1,70 @@
+"""The trajectory formats by name. A new one is a file with `fits_NAME`, `read_NAME` and `write_NAME` and a line here."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from lslam.errors import UsageError, nearest
+
+if TYPE_CHECKING:
+    from lslam.formats.pose_rows import Row
+    from lslam.types.trajectory import Trajectory
+
+
+@dataclass(frozen=True)
+class TrajectoryFormat:
+    """One format; its functions are imported when they are asked for.
+
+    module : with `fits_NAME(first line)`, `read_NAME(path, rows, comments, times)` and `write_NAME(path, trajectory)`
+    frame : the body whose poses it holds by convention, empty where the file says
+    has_stamps : whether a file holds them; is_written : whether there is `write_NAME`
+    """
+
+    name: str
+    module: str
+    frame: str = ""
+    has_stamps: bool = True
+    is_written: bool = True
+
+    @property
+    def fits(self) -> Callable[[str], bool]:
+        """Whether a file whose first line of data is this one may be of the format."""
+        return self._function("fits")
+
+    @property
+    def read(self) -> Callable[[Path, list[Row], list[str], Path | None], Trajectory]:
+        """The trajectory of lines and comments; the last argument names a file of stamps."""
+        return self._function("read")
+
+    @property
+    def write(self) -> Callable[[Path, Trajectory], None]:
+        """Write a file, atomically."""
+        return self._function("write")
+
+    def _function(self, verb: str) -> Callable[..., Any]:
+        found: Callable[..., Any] = getattr(import_module(self.module), f"{verb}_{self.name}")
+        return found
+
+
+# Asked in this order whether they fit.
+FORMATS = {
+    one.name: one
+    for one in (
+        TrajectoryFormat("kitti", "lslam.formats.trajectory_lines", frame="cam0", has_stamps=False),
+        TrajectoryFormat("tum", "lslam.formats.trajectory_lines"),
+        TrajectoryFormat("euroc", "lslam.formats.trajectory_csv", frame="imu"),
+        TrajectoryFormat("csv", "lslam.formats.trajectory_csv", is_written=False),
+    )
+}
+WRITTEN = tuple(name for name, one in FORMATS.items() if one.is_written)
+
+
+def format_named(name: str) -> TrajectoryFormat:
+    """The format of this name. Raises UsageError with the nearest name when there is none."""
+    if name not in FORMATS:
+        raise UsageError(f"no trajectory format {name!r}; {nearest(name, FORMATS)}")
+    return FORMATS[name]
