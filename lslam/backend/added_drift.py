@@ -1,12 +1,12 @@
-"""`debug.drift`: odometry that runs away on purpose.
+"""`debug.drift`: drift added to odometry on purpose.
 
-A direction fixed in the world, as a tilted start or slipping would give it, and a heading or a horizon that turns steadily. A
-scale error would be neither seen nor repaired: a loop that is 1 % too large closes as well.
+Positions drift along a direction fixed in the world, heading and horizon turn steadily. A scale error is not modelled: a loop
+closure does not observe it.
 
-Steady drift is what loops repair best: where they tell its rate it is set right before they are closed (`graph.loop_drift`),
-and covariances, which expect some random walk beside it, are cautious then (NEES per degree of freedom 0.1 to 1.1). With
-`debug.drift_memory` it wanders, and as a random walk it has no rate at all: of either one loop at the end takes away less than
-half. What real odometry does is neither: its recorded errors can be laid on another run.
+The pose graph estimates and corrects a steady rate of drift from loop closures (`graph.loop_drift`); its covariances, which
+allow for a random walk beside it, are conservative then (NEES per degree of freedom 0.1 to 1.1). With `debug.drift_memory` the
+rate is a Gauss-Markov process, and a random walk has no rate: one loop closure at the end removes less than half of either.
+Errors recorded from real odometry can be added, too.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ CAMERA_TO_LIDAR = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]
 
 
 def with_drift(results: Sequence[ScanResult], config: DebugConfig) -> list[ScanResult]:
-    """The results with poses that run away over the way travelled; covariances are turned along, and not enlarged."""
+    """The results with drift over the distance travelled; covariances are rotated with the poses, and not enlarged."""
     poses = np.stack([r.T_world_lidar for r in results])
     steps = se3.relative(poses[:-1], poses[1:])
     way = np.linalg.norm(steps[:, :3, 3], axis=1)

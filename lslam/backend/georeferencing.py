@@ -1,4 +1,4 @@
-"""Satellite fixes of a run: where its world lies on the Earth, and positions for the pose graph."""
+"""GNSS fixes of a run: its georeference, and position factors for the pose graph."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from lslam.geometry import geodesy, noise, se3, so3
 from lslam.geometry.interpolate import poses_at
 from lslam.graph.chi_square import quantile
 from lslam.graph.drift import chains, drift_covariance
-from lslam.graph.fix_noise import DriftOfFixes, Wander, wander_of
+from lslam.graph.fix_noise import DriftOfFixes, GaussMarkovNoise, fit_gauss_markov
 from lslam.graph.gnss_alignment import GnssAlignment, align
 from lslam.graph.problem import PoseGraph, PositionFix
 from lslam.maps.georeference import Projection
@@ -32,25 +32,25 @@ Floats = NDArray[np.float64]
 
 # m; of a fix that does not state its sigma.
 UNSTATED = 5.0
-# rad; how far the z axis of a world that nothing levelled may be from up, and of one that an IMU did.
+# rad; one sigma of the z axis against up, of a world that nothing levelled and of one levelled by an IMU.
 UNLEVELLED, LEVELLED = np.deg2rad(10.0), np.deg2rad(1.0)
-# A fix so many times farther away than its noise and odometry's drift allow is no measurement that a graph could weigh.
+# Sigmas (noise and drift) beyond which a fix is no outlier candidate of the graph but left out.
 ABSURD = 20.0
-# m; noise and multipath put no fix so far away, a lost sign does.
+# m; beyond noise and multipath: a lost sign.
 ELSEWHERE = 1e5
-# How probable it may be that chance alone has as many fixes disbelieved, or one of them as far away; and the probability with
-# which `align` disbelieves a sound one.
-CHANCE, DISBELIEVED = 1e-5, 1e-3
-# Of the fixes: what nearly as many say together as all the others.
-RIVAL = 0.4
+# Significance of too many rejected fixes, or of one too far away, under the null hypothesis that all are sound; and the
+# probability with which `align` rejects a sound one.
+CHANCE, FALSE_REJECTION = 1e-5, 1e-3
+# Share of the fixes from which a group of outliers is as plausible as the inliers.
+AMBIGUOUS = 0.4
 
 
 @dataclass(frozen=True)
 class Fixes:
-    """The usable fixes of a run, m, and where its odometry has the antenna.
+    """The usable fixes of a run, m, and odometry's positions of the antenna.
 
     stamps_ns : (F,); positions : (F, 3) east, north, up from `origin` (3,) lat, lon, height; sigmas : (F, 3)
-    antenna : (F, 3) in the world of odometry; slack : (F,) what odometry may have drifted by
+    antenna : (F, 3) in the world of odometry; slack : (F,) one sigma of odometry's drift
     is_stated : whether the sigmas are those of the recording
     """
 
@@ -66,15 +66,15 @@ class Fixes:
 
 @dataclass(frozen=True)
 class Placement:
-    """A georeference and, for the graph, the fixes as positions and what they err by in common.
+    """A georeference and, for the graph, position factors of the fixes with their correlated noise.
 
-    walk : factor on the drift of odometry, as fixes tell it
+    walk : factor on odometry's random-walk drift, estimated from the fixes
     problem : why there is none, or what was left out
     """
 
     georeference: Georeference | None = None
     fixes: tuple[PositionFix, ...] = ()
-    wander: Wander | None = None
+    fix_noise: GaussMarkovNoise | None = None
     walk: float = 0.0
     problem: str = ""
 
@@ -126,14 +126,14 @@ def place(
         )
     georeference, shift = _at_first(found, fixes, config.gnss)
     log.info(
-        "GNSS: %d of %d fixes believed, %.2f m rms from the antenna horizontally, %.2f m vertically",
+        "GNSS: %d of %d fixes are inliers, %.2f m rms from the antenna horizontally, %.2f m vertically",
         georeference.used, georeference.fixes, georeference.rmse_horizontal, georeference.rmse_vertical,
     )  # fmt: skip
-    wander, walk = None, 0.0
+    fix_noise, walk = None, 0.0
     if config.gnss.mode == "graph":
-        wander, walk = _wander(fixes, found, keyframes, graph, config.graph)
-    factors = _as_factors(fixes, found, shift, results, keyframes, arm, wander)
-    return Placement(georeference, factors, wander, walk, _elsewhere(found) or contradicted(found, fixes))
+        fix_noise, walk = _fix_noise(fixes, found, keyframes, graph, config.graph)
+    factors = _as_factors(fixes, found, shift, results, keyframes, arm, fix_noise)
+    return Placement(georeference, factors, fix_noise, walk, _elsewhere(found) or contradicted(found, fixes))
 
 
 def on_earth(graph: PoseGraph, placement: Placement) -> PoseGraph:
@@ -144,14 +144,14 @@ def on_earth(graph: PoseGraph, placement: Placement) -> PoseGraph:
     up = np.array([0.0, 0.0, 1.0])
     return replace(
         graph, poses=T @ graph.poses, fixes=placement.fixes, world_up=up, is_anchored=False, spread=spread,
-        wander=placement.wander, walk=max(graph.walk, placement.walk),
+        fix_noise=placement.fix_noise, walk=max(graph.walk, placement.walk),
     )  # fmt: skip
 
 
 def _usable(
     stream: GnssStream, results: Many[ScanResult], arm: Floats, config: GnssConfig, drift: GraphConfig
 ) -> Fixes | str:
-    """The fixes taken during the run that are places and claim to be good; why there are too few."""
+    """The fixes taken during the run that have a position and a small enough sigma; or why there are too few."""
     stamps = np.array([r.stamp_ns for r in results], np.int64)
     stated = np.full(len(stream), config.sigma) if config.sigma is not None else stream.sigma
     stated = np.maximum(np.where(np.isfinite(stated) & (stated > 0), stated, UNSTATED), config.min_sigma)
@@ -180,28 +180,28 @@ def _usable(
 
 
 def _at_first(found: GnssAlignment, fixes: Fixes, config: GnssConfig) -> tuple[Georeference, Floats]:
-    """The georeference with its origin at the first fix that is believed, and the shift that this is, (4, 4)."""
-    first = fixes.positions[int(np.argmax(found.believed))]
+    """The georeference with its origin at the first inlier fix, and that shift of origin, (4, 4)."""
+    first = fixes.positions[int(np.argmax(found.inliers))]
     origin = geodesy.from_local(first[None], fixes.origin)[0]
     # Meridians converge: the two frames' norths differ by a little turn about up.
     ahead = geodesy.to_local(geodesy.from_local(first[None] + [[0.0, 1000.0, 0.0]], fixes.origin), origin)[0]
     R = so3.exp(np.array([0.0, 0.0, np.arctan2(-ahead[0], ahead[1])]))
     shift = se3.make(R, -R @ first)
-    residuals = found.residuals[found.believed]
+    residuals = found.residuals[found.inliers]
     return Georeference(
         origin=origin,
         T_enu_world=shift @ found.T_enu_world,
         epsg=config.crs,
         method="graph" if config.mode == "graph" else "fit",
         fixes=fixes.given,
-        used=int(found.believed.sum()),
+        used=int(found.inliers.sum()),
         rmse_horizontal=float(np.sqrt((residuals[:, :2] ** 2).sum(1).mean())),
         rmse_vertical=float(np.sqrt((residuals[:, 2] ** 2).mean())),
     ), shift
 
 
 def _elsewhere(found: GnssAlignment) -> str:
-    """Of fixes in another part of the world, or nothing."""
+    """A sentence about fixes in another part of the world, or nothing."""
     away = int((np.linalg.norm(found.residuals, axis=1) > ELSEWHERE).sum())
     if not away:
         return ""
@@ -212,16 +212,16 @@ def _elsewhere(found: GnssAlignment) -> str:
 
 
 def contradicted(found: GnssAlignment, fixes: Fixes) -> str:
-    """Of fixes that odometry contradicts, and whether they agree with each other, or nothing where it may be chance."""
+    """A sentence about fixes that odometry rejects, and whether they agree with each other; empty where insignificant."""
     from scipy.special import bdtrc, chdtrc
 
-    wrong = np.flatnonzero(~found.believed)
+    wrong = np.flatnonzero(~found.inliers)
     n, k = len(found.residuals), len(wrong)
     if not k:
         return ""
     sigmas = np.hypot(fixes.sigmas, fixes.slack[:, None])
     farthest = float(((found.residuals / sigmas)[wrong] ** 2).sum(1).max())
-    if bdtrc(k - 1, n, DISBELIEVED) > CHANCE and n * chdtrc(3, farthest) > CHANCE:
+    if bdtrc(k - 1, n, FALSE_REJECTION) > CHANCE and n * chdtrc(3, farthest) > CHANCE:
         return ""
     off = found.residuals[wrong]
     middle = np.median(off, axis=0)
@@ -230,7 +230,7 @@ def contradicted(found: GnssAlignment, fixes: Fixes) -> str:
         f"GNSS: odometry contradicts {k} of {n} fixes, the farthest by {np.linalg.norm(found.residuals[worst]):.1f} m, "
         f"{(fixes.stamps_ns[worst] - fixes.stamps_ns[0]) * 1e-9:.1f} s after the first"
     )
-    is_together = (((off - middle) / sigmas[wrong]) ** 2).sum(1) <= quantile(1.0 - DISBELIEVED, 3)
+    is_together = (((off - middle) / sigmas[wrong]) ** 2).sum(1) <= quantile(1.0 - FALSE_REJECTION, 3)
     first, last = int(wrong[0]), int(wrong[-1])
     if k < 3 or is_together.mean() < 0.8 or last - first + 1 != k or (first > 0 and last < n - 1):
         return f"{said}: they are left out, look at their receiver or state their true sigmas"
@@ -241,38 +241,38 @@ def contradicted(found: GnssAlignment, fixes: Fixes) -> str:
         f"{(fixes.stamps_ns[at] - fixes.stamps_ns[0]) * 1e-9:.1f} s after the first, where odometry does not: the {k} of {n} "
         f"{where} are left out"
     )
-    return said + (", but they may as well be the right ones" if k >= RIVAL * n else "")
+    return said + (", but they may as well be the right ones" if k >= AMBIGUOUS * n else "")
 
 
-def _wander(
+def _fix_noise(
     fixes: Fixes, found: GnssAlignment, keyframes: Many[Keyframe], graph: PoseGraph, config: GraphConfig
-) -> tuple[Wander | None, float]:
-    """What the fixes err by together, and the factor on odometry's drift, from those that are believed.
+) -> tuple[GaussMarkovNoise | None, float]:
+    """Correlated noise of the fixes and the factor on odometry's drift, from the inliers.
 
-    Nothing where nobody stated what they err by at all.
+    Neither where the recording states no sigmas.
     """
-    good = found.believed
+    good = found.inliers
     if not fixes.is_stated:
         return None, 0.0
     known, unit = (noise.rotated(chain, found.T_enu_world[:3, :3]) for chain in chains(graph, config))
     metre = drift_covariance(1.0, config)
     places = se3.apply(found.T_enu_world, graph.poses[:, :3, 3])
     drift = DriftOfFixes(known + graph.walk * unit, unit, places, metre, _owners(fixes, keyframes)[good])
-    wander, walk = wander_of(
+    fix_noise, walk = fit_gauss_markov(
         1e-9 * (fixes.stamps_ns[good] - fixes.stamps_ns[0]), found.residuals[good], fixes.sigmas[good],
         (fixes.positions - found.residuals)[good], config.probability, drift,
     )  # fmt: skip
-    if wander is not None:
+    if fix_noise is not None:
         log.info(
-            "GNSS: fixes scatter by less than they state; they are taken to err by %.2f m together, for %.0f s",
-            wander.sigma[0], wander.memory,
+            "GNSS: fixes scatter by less than their sigmas; correlated noise of %.2f m over %.0f s is estimated",
+            fix_noise.sigma[0], fix_noise.memory,
         )  # fmt: skip
     if walk > 0:
         log.info(
-            "GNSS: odometry drifts by more than it says, by about %.2f m after 100 m",
+            "GNSS: odometry drifts by more than its covariances, by about %.2f m after 100 m",
             np.sqrt(walk * drift_covariance(100.0, config)[0, 0]),
         )  # fmt: skip
-    return wander, walk
+    return fix_noise, walk
 
 
 def _owners(fixes: Fixes, keyframes: Many[Keyframe]) -> NDArray[np.intp]:
@@ -283,9 +283,9 @@ def _owners(fixes: Fixes, keyframes: Many[Keyframe]) -> NDArray[np.intp]:
 
 def _as_factors(
     fixes: Fixes, found: GnssAlignment, shift: Floats, results: Many[ScanResult], keyframes: Many[Keyframe], arm: Floats,
-    wander: Wander | None,
+    fix_noise: GaussMarkovNoise | None,
 ) -> tuple[PositionFix, ...]:  # fmt: skip
-    """Positions of the antenna as seen from the keyframe before each fix, the absurd ones left out."""
+    """Position factors, each from the keyframe before the fix; gross outliers are left out."""
     near = np.linalg.norm(found.residuals / np.hypot(fixes.sigmas, fixes.slack[:, None]), axis=1) < ABSURD
     owners = _owners(fixes, keyframes)
     positions = se3.apply(shift, fixes.positions)
@@ -294,6 +294,6 @@ def _as_factors(
     for i in np.flatnonzero(near).tolist():
         keyframe = keyframes[int(owners[i])]
         seen = se3.apply(se3.inverse(results[keyframe.scan].T_world_lidar), fixes.antenna[i][None])[0]
-        instant = None if wander is None else int(np.argmin(np.abs(wander.seconds - seconds[i])))
+        instant = None if fix_noise is None else int(np.argmin(np.abs(fix_noise.seconds - seconds[i])))
         out.append(PositionFix(keyframe.number, positions[i], fixes.sigmas[i], seen, instant))
     return tuple(out)

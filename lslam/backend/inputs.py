@@ -1,4 +1,4 @@
-"""What the pose graph is told beside odometry, loops and fixes: which way is up, and where the floor is."""
+"""Inputs of the pose graph beside odometry, loop closures and fixes: up directions and floor planes."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ from lslam.types.scan_result import ScanResult
 
 Floats = NDArray[np.float64]
 
-# s over which errors of the IMU's up direction are nearly the same error.
+# s, correlation time of the errors of the IMU's up direction.
 MEMORY_S = 20.0
-# Floors are looked for within so many cells of half a metre, with so much roughness, m.
+# Extent of the floor, in cells of half a metre, and its roughness, m.
 CELLS, ROUGHNESS = 80, 0.15
 # rad; a floor this much steeper than the world's horizon is a ramp or a roof (hdl_graph_slam takes 10 deg).
 STEEPEST = np.deg2rad(10.0)
-# m; what lies higher or lower under the sensor than its floor usually does is a roof or a hole (height_clip_range there).
+# m; a floor farther from the usual height below the sensor is a roof or a hole (height_clip_range there).
 CLIP_M = 1.0
 
 
 def up_directions(
     keyframes: Sequence[Keyframe], results: Sequence[ScanResult], config: GraphConfig
 ) -> list[UpDirection]:
-    """One per keyframe at which an IMU knows which way is down; those of one stretch count as one measurement."""
+    """One per keyframe with a direction of gravity; those within the correlation time count as one measurement."""
     known = [(k, g) for k in keyframes if (g := results[k.scan].gravity) is not None]
     stamps = np.array([k.stamp_ns for k, _ in known], np.int64)
     half = round(0.5e9 * MEMORY_S)
@@ -43,7 +43,7 @@ def up_directions(
 
 
 def world_up(ups: Sequence[UpDirection], keyframes: Sequence[Keyframe]) -> Floats | None:
-    """(3,) up in the world of odometry, by the first stretch in which the IMU knows it; None when it never does."""
+    """(3,) up in the world of odometry, by the first stretch with directions of gravity; None without any."""
     if not ups:
         return None
     begin = keyframes[ups[0].keyframe].stamp_ns
@@ -54,7 +54,7 @@ def world_up(ups: Sequence[UpDirection], keyframes: Sequence[Keyframe]) -> Float
 
 
 def floor_planes(store: KeyframeStore, config: GraphConfig) -> list[FloorPlane]:
-    """The floor under each keyframe, where one is seen that lies level, as far below as usual."""
+    """The floor plane under each keyframe that is level and as far below as usual."""
     planes = []
     for keyframe in checking(store.keyframes):
         R, height = levelling(store.points(keyframe.number), ROUGHNESS, CELLS)

@@ -1,7 +1,6 @@
-"""The world of a run made level: up becomes z, the origin and the heading stay the first scan's.
+"""Levelling of a run's world: up becomes z, origin and heading stay the first scan's.
 
-Nothing else changes: every pose is turned by one rotation, so that relative motions, aligned errors and the map's shape are
-those of a run that is not levelled.
+All poses are turned by one rotation, so relative motions, aligned errors and the map's shape do not change.
 """
 
 from __future__ import annotations
@@ -29,15 +28,15 @@ ORIGIN = "LiDAR at the first scan"
 UP = np.array([0.0, 0.0, 1.0])
 # The ground under the sensor: so many cells of half a metre to each side.
 CELLS = 80
-# A tilt of fewer sigmas may be none: most sensors are mounted level, and a bias looks like a tilt before the first bends.
+# Sigmas below which a tilt is insignificant: most sensors are mounted level, and a bias looks like a tilt before the first bends.
 SIGNIFICANT = 2.0
 
 
 @dataclass(frozen=True)
 class Level:
-    """The rotation that makes a world level, and where it comes from.
+    """The rotation that levels a world, and its source.
 
-    R : (3, 3) from the world as it was; world : in words, for files; problem : what was asked for and could not be had
+    R : (3, 3) from the world before; world : description for files; problem : what was asked for and failed
     """
 
     R: Floats
@@ -46,12 +45,12 @@ class Level:
 
     @property
     def is_turned(self) -> bool:
-        """Whether there is anything to turn."""
+        """Whether the rotation is not the identity."""
         return not np.array_equal(self.R, np.eye(3))
 
 
 def find_level(sequence: Sequence, results: list[ScanResult], config: Config) -> Level:
-    """What `input.level` asks for: gravity when an IMU measured it, the ground under the first scan, or nothing."""
+    """The level that `input.level` asks for: by gravity from an IMU, by the ground under the first scan, or none."""
     wanted = config.input.level
     if wanted == "auto":
         wanted = "gravity" if config.imu.use else "none"
@@ -78,7 +77,7 @@ def find_level(sequence: Sequence, results: list[ScanResult], config: Config) ->
 
 
 def level_results(results: list[ScanResult], level: Level) -> list[ScanResult]:
-    """The results in the level world: poses, covariances and weak directions; all else is as it was."""
+    """The results in the level world: poses, covariances and degenerate directions are rotated."""
     if not level.is_turned:
         return results
     T = se3.make(level.R, np.zeros(3))
@@ -100,9 +99,9 @@ def level_results(results: list[ScanResult], level: Level) -> list[ScanResult]:
 
 
 def _up_by_gravity(results: list[ScanResult]) -> tuple[Floats | None, float]:
-    """Mean over the run, by their sigmas: what tells a bias from a tilt comes with the bends of the way.
+    """Mean over the run weighted by sigmas: bias and tilt become observable only in bends.
 
-    Its sigma, rad, is that of the best: errors of the others are not independent of its own.
+    Its sigma, rad, is that of the best measurement, since their errors are correlated.
     """
     up = np.zeros(3)
     for r in results:

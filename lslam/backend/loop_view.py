@@ -1,4 +1,4 @@
-"""The map at the loop that was corrected most, by odometry's poses and by the final ones: what closing it was good for."""
+"""The map about the loop closure with the largest correction, by odometry's poses and by the final ones."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ AROUND = 10
 
 
 def view_loop(record: RunRecord, done: BackEnd, store: KeyframeStore) -> LoopView | None:
-    """The view; None where no loop was closed, or the pose graph moved nothing."""
+    """The view; None without an accepted loop closure or an optimised graph."""
     closed = [c for c in record.loops if c.is_accepted]
     if record.odometry is None or not done.is_optimised or not closed:
         return None
@@ -35,12 +35,12 @@ def view_loop(record: RunRecord, done: BackEnd, store: KeyframeStore) -> LoopVie
         int(scans[loop.a]),
         int(scans[loop.b]),
         correction(loop),
-        _place(before, loop, store),
-        _place(after, loop, store),
+        _surroundings(before, loop, store),
+        _surroundings(after, loop, store),
     )
 
 
-def _place(poses: Floats, loop: LoopCandidate, store: KeyframeStore) -> LoopSurroundings:
+def _surroundings(poses: Floats, loop: LoopCandidate, store: KeyframeStore) -> LoopSurroundings:
     older, newer = (range(max(end - AROUND, 0), min(end + AROUND + 1, len(store))) for end in (loop.a, loop.b))
     points = np.concatenate([se3.apply(poses[k], store.points(k)) for k in sorted({*older, *newer})])
     return LoopSurroundings(points, poses[list(older), :2, 3], poses[list(newer), :2, 3], poses[loop.a, :2, 3])

@@ -1,7 +1,7 @@
-"""From odometry to a consistent trajectory: loops, satellite fixes, gravity and floor, made one in a pose graph.
+"""From odometry to a consistent trajectory: loop closures, GNSS fixes, gravity and floor in one pose graph.
 
-Where nothing but odometry is known, or an IMU finds no tilt in it beyond its own doubt, or the graph cannot be solved,
-odometry's poses stay as they are, byte for byte.
+Odometry's poses stay as they are, byte for byte, where the graph has no other constraint (gravity counts where it is
+significant) or cannot be solved.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from lslam.types.stage_clock import KeyframeClocks
 
 log = logging.getLogger("lslam")
 Floats = NDArray[np.float64]
-# The graph held by what a map knows, given where its poses lie on the Earth; None where the map holds nothing.
+# Solves the graph with the priors of a map, given its georeference; None where the map gives none.
 Hold = Callable[[PoseGraph, Placement, Given], BackEnd | None]
 
 
@@ -42,7 +42,7 @@ def run_back_end(
     candidates: list[LoopCandidate], turns: Many[Turn] = (), hold: Hold | None = None,
     clocks: KeyframeClocks | None = None,
 ) -> BackEnd:  # fmt: skip
-    """Close loops, take in fixes and buildings, optimise, and place all scans accordingly; odometry's poses where that fails."""
+    """Optimise the pose graph with loop closures, fixes and map priors, and correct all scans; odometry's poses on failure."""
     keyframes = store.keyframes
     given = Given(results, store, config, candidates, KeyframeClocks() if clocks is None else clocks)
     problems = given.problems
@@ -56,7 +56,7 @@ def run_back_end(
         by_fixes = config.gnss.mode == "graph" or (config.gnss.mode == "fit" and config.osm.origin is None)
         out = hold(graph, _placed(sequence, graph, given) if by_fixes else Placement(), given)
     if out is None:
-        # Loops know a drift that lasts to a part of the noise of fixes, which are judged by odometry that had it.
+        # Loop closures observe a steady drift far better than fixes, whose gates assume odometry without it.
         graph = without_steady_drift(graph, given)
         placement = _placed(sequence, graph, given) if config.gnss.mode == "graph" else Placement()
         if placement.georeference is not None:
@@ -76,14 +76,14 @@ def run_back_end(
 def _placed(
     sequence: Sequence, graph: PoseGraph, given: Given, results: list[ScanResult] | None = None
 ) -> Placement:  # fmt: skip
-    """Where the graph's poses lie on the Earth by the fixes of a run.
+    """Placement of the graph's poses by the fixes of a run.
 
-    results : all scans there; None for those of odometry as the keyframes put them
+    results : all scans at those poses; None for odometry's scans moved with the keyframes
     """
     keyframes, config = given.store.keyframes, given.config
     up = _up(graph)
-    if results is None and graph.claim is None:
-        # Odometry's tilt grows: the first that was seen of up is the best.
+    if results is None and graph.estimated_drift is None:
+        # Odometry's tilt drifts: the first measurements of up are the best.
         results, up = given.results, None if up is None else graph.world_up
     elif results is None:
         results = bent(given.results, keyframes, graph.poses)
@@ -94,7 +94,7 @@ def _placed(
 
 
 def _up(graph: PoseGraph) -> Floats | None:
-    """(3,) up in the world of the graph's poses, by what the keyframes saw of it; None when they saw nothing."""
+    """(3,) up in the world of the graph's poses, by the up directions of the keyframes; None without any."""
     if not graph.ups:
         return None
     turned = sum(graph.poses[u.keyframe, :3, :3] @ u.up * u.share / u.sigma**2 for u in graph.ups)

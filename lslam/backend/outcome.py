@@ -1,4 +1,4 @@
-"""What becomes of a run in its pose graph: poses, verdicts on loops, and the numbers for the manifest."""
+"""The outcome of the pose graph for a run: poses, verdicts on loop closures, and facts for the manifest."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from lslam.errors import GraphError
 from lslam.geometry import se3
 from lslam.graph.drift import tilt_factor
 from lslam.graph.factors import well_conditioned
-from lslam.graph.fix_noise import Wander
+from lslam.graph.fix_noise import GaussMarkovNoise
 from lslam.graph.loop_drift import without_loop_drift
 from lslam.graph.odometry_constraints import corrected
 from lslam.graph.pose_graph import optimise
-from lslam.graph.problem import DriftClaim, PoseGraph, Solution
+from lslam.graph.problem import EstimatedDrift, PoseGraph, Solution
 from lslam.keyframes.store import KeyframeStore
 from lslam.types.building_correction import CorrectedMap
 from lslam.types.building_match import OsmMatches
@@ -30,7 +30,7 @@ from lslam.types.stage_clock import KeyframeClocks
 log = logging.getLogger("lslam")
 Floats = NDArray[np.float64]
 
-# What the rates of a claimed drift are called, by who told it.
+# Names of the rates of an estimated drift, from walls and from loop closures.
 _OF_WALLS = ("east_percent", "north_percent", "left_deg_per_100m")
 _OF_LOOPS = (
     "x_percent", "y_percent", "z_percent", "about_x_deg_per_100m", "about_y_deg_per_100m", "left_deg_per_100m"
@@ -39,11 +39,11 @@ _OF_LOOPS = (
 
 @dataclass(frozen=True)
 class Given:
-    """What the back end has of a run.
+    """The input of the back end.
 
-    results : of odometry, all scans; store : of the keyframes; candidates : all loop candidates with odometry's verdicts
-    clocks : take the time of what is done to each keyframe, and with the last one that of the whole graph
-    problems : what could not be done so far, one sentence each: whoever finds one adds it
+    results : of odometry, all scans; store : of the keyframes; candidates : all loop candidates with the verdicts of verification
+    clocks : time the work on each keyframe; the last one takes that of the whole graph
+    problems : what failed so far, one sentence each; appended to
     """
 
     results: list[ScanResult]
@@ -56,16 +56,15 @@ class Given:
 
 @dataclass(frozen=True)
 class BackEnd:
-    """What became of a run's odometry.
+    """The result of the back end.
 
-    results : all scans, where they belong; candidates : all loop candidates with verdicts
-    keyframes : (K, 4, 4) final poses; constraints : odometry's and the loops that were believed, empty without a graph
-    georeference : where the world of `results` lies on the Earth, None when that is not known
+    results : all scans at their final poses; candidates : all loop candidates with final verdicts
+    keyframes : (K, 4, 4) final poses; constraints : odometry and accepted loop closures, empty without a graph
+    georeference : of the world of `results`, None when unknown
     T_final_odometry : (4, 4) from the world of odometry into that of `results`
-    solution : the graph's, None where the poses are not its own
-    osm : what walls and buildings had to do with each other, None without a map that could be used; buildings : of that map,
-        where they really stand
-    facts : for the manifest; problems : what could not be done, one sentence each
+    solution : of the graph, None where the poses are odometry's
+    osm : matches of walls with buildings, None without a usable map; buildings : of that map, at their estimated places
+    facts : for the manifest; problems : what failed, one sentence each
     """
 
     results: list[ScanResult]
@@ -87,7 +86,7 @@ class BackEnd:
 
 
 def solve(graph: PoseGraph, given: Given, georeference: Georeference | None = None) -> BackEnd | None:
-    """The run as the optimised graph has it; None, and one more of the problems, when it cannot be had.
+    """The run at the optimum of the graph; None, and one more of the problems, when that fails.
 
     georeference : of the graph's frame, None where that is odometry's
     """
@@ -98,53 +97,53 @@ def solve(graph: PoseGraph, given: Given, georeference: Georeference | None = No
     except (GraphError, np.linalg.LinAlgError) as error:
         given.problems.append(f"{error}; the run goes on without it")
         return None
-    if graph.fixes and solution.fix_believed.sum() < config.gnss.min_fixes:
+    if graph.fixes and solution.fix_inliers.sum() < config.gnss.min_fixes:
         given.problems.append(
-            f"GNSS: the pose graph believes {solution.fix_believed.sum()} of {len(graph.fixes)} fixes: all rejected"
+            f"GNSS: the pose graph accepts {solution.fix_inliers.sum()} of {len(graph.fixes)} fixes: all rejected"
         )
         return None
-    judged, believed = _verdicts(given.candidates, graph, solution)
+    judged, accepted = _verdicts(given.candidates, graph, solution)
     log.info(
-        "pose graph: %d keyframes, %d of %d loops believed, drift beside odometry's covariances %.3g, %d rounds",
-        len(graph), len(believed), len(graph.loops), solution.drift, solution.rounds,
+        "pose graph: %d keyframes, %d of %d loop closures accepted, drift factor %.3g, %d rounds",
+        len(graph), len(accepted), len(graph.loops), solution.drift, solution.rounds,
     )  # fmt: skip
     T = np.eye(4) if georeference is None else georeference.T_enu_world
-    facts = _facts(solution, graph, T @ _odometry(given), given.candidates, believed)
-    tilts = not believed and tilt_factor(graph, config.graph) > 0
-    if not (believed or graph.fixes or graph.floors or graph.map_priors or tilts):
+    facts = _facts(solution, graph, T @ _odometry(given), given.candidates, accepted)
+    tilts = not accepted and tilt_factor(graph, config.graph) > 0
+    if not (accepted or graph.fixes or graph.floors or graph.map_priors or tilts):
         return BackEnd(given.results, judged, graph.poses, facts=facts)
     if georeference is not None:
         georeference = replace(_scored(georeference, graph, solution), T_enu_world=np.eye(4))
     moved = corrected(
         given.results, given.store.keyframes, solution.poses, solution.covariances, solution.drift, config.graph
     )
-    # As they were solved: the covariance of odometry may be singular, and no information can be written of that.
-    kept = [replace(c, covariance=well_conditioned(c.covariance)) for c in (*graph.odometry, *believed)]
+    # As they were solved: odometry's covariance may be singular and has no information matrix then.
+    kept = [replace(c, covariance=well_conditioned(c.covariance)) for c in (*graph.odometry, *accepted)]
     return BackEnd(moved, judged, solution.poses, kept, georeference, T, solution=solution, facts=facts)
 
 
 def without_steady_drift(graph: PoseGraph, given: Given) -> PoseGraph:
-    """The graph without a steady drift that its loops tell; as it is where they tell none."""
+    """The graph corrected by the steady drift that its loop closures reveal; unchanged where they reveal none."""
     if not given.config.graph.steady_drift:
         return graph
     try:
         graph = without_loop_drift(graph, given.config.graph)
     except GraphError:
-        # Who solves it says why it cannot be.
+        # Reported where it is solved.
         return graph
     except np.linalg.LinAlgError as error:
-        given.problems.append(f"graph.steady_drift: {error}; odometry is not set straight by loops")
-    if graph.claim is not None:
-        shift, turn = (float(np.linalg.norm(part)) for part in np.split(graph.claim.rates, 2))
+        given.problems.append(f"graph.steady_drift: {error}; steady drift is not corrected")
+    if graph.estimated_drift is not None:
+        shift, turn = (float(np.linalg.norm(part)) for part in np.split(graph.estimated_drift.rates, 2))
         log.info(
-            "loops: odometry drifts steadily by %.1f %% and %.1f deg/100 m, and is set straight",
+            "loop closures: steady drift of odometry, %.1f %% and %.1f deg/100 m, is corrected",
             100 * shift, 100 * np.degrees(turn),
         )  # fmt: skip
     return graph
 
 
 def unsolved(given: Given) -> BackEnd:
-    """The run as odometry has it; loops were accepted for a graph that cannot be had, and are rejected with it."""
+    """The run as odometry has it; accepted loop closures are rejected with the graph."""
     candidates = [
         replace(c, verdict=Verdict.REJECTED, stage=LoopStage.GRAPH, reason="the pose graph could not be solved")
         if c.is_accepted
@@ -162,45 +161,45 @@ def _odometry(given: Given) -> Floats:
 def _verdicts(
     candidates: list[LoopCandidate], graph: PoseGraph, solution: Solution
 ) -> tuple[list[LoopCandidate], list[Constraint]]:
-    """Candidates with the graph's verdicts on the accepted ones, and the constraints it believed."""
+    """Candidates with the graph's verdicts on those accepted before, and the constraints it accepts."""
     judged = iter(zip(graph.loops, solution.loop_reasons, solution.loop_stages, strict=True))
-    out, believed = [], []
+    out, accepted = [], []
     for candidate in candidates:
         if candidate.is_accepted and candidate.constraint is not None:
             loop, reason, stage = next(judged)
             if reason:
                 candidate = replace(candidate, verdict=Verdict.REJECTED, stage=stage, reason=reason)
             else:
-                believed.append(loop)
+                accepted.append(loop)
         out.append(candidate)
-    return out, believed
+    return out, accepted
 
 
 def _scored(georeference: Georeference, graph: PoseGraph, solution: Solution) -> Georeference:
-    """The georeference with the residuals of the fixes that the graph believed; as it is without fixes."""
+    """The georeference with the residuals of the graph's inlier fixes; unchanged without fixes."""
     if not graph.fixes:
         return georeference
     k = np.array([f.keyframe for f in graph.fixes])
     arms, positions = np.stack([f.arm for f in graph.fixes]), np.stack([f.position for f in graph.fixes])
     antenna = np.einsum("fij,fj->fi", solution.poses[k, :3, :3], arms) + solution.poses[k, :3, 3]
-    off = (positions - antenna)[solution.fix_believed]
+    off = (positions - antenna)[solution.fix_inliers]
     return replace(
         georeference,
         rmse_horizontal=float(np.sqrt((off[:, :2] ** 2).sum(1).mean())),
         rmse_vertical=float(np.sqrt((off[:, 2] ** 2).mean())),
-        used=int(solution.fix_believed.sum()),
+        used=int(solution.fix_inliers.sum()),
     )
 
 
 def _facts(
-    solution: Solution, graph: PoseGraph, before: Floats, candidates: list[LoopCandidate], believed: list[Constraint]
+    solution: Solution, graph: PoseGraph, before: Floats, candidates: list[LoopCandidate], accepted: list[Constraint]
 ) -> dict[str, Any]:
-    """For the manifest; before : (K, 4, 4) poses of the keyframes as odometry has them, in the frame of the graph."""
+    """For the manifest; before : (K, 4, 4) odometry's poses of the keyframes, in the frame of the graph."""
     moved = se3.relative(before, solution.poses)[:, :3, 3]
     return {
         "loop_candidates": len(candidates),
-        "loops": len(believed),
-        "fixes": int(solution.fix_believed.sum()),
+        "loops": len(accepted),
+        "fixes": int(solution.fix_inliers.sum()),
         "gravity_factors": len(graph.ups),
         "imu_orientation_factors": len(graph.turns),
         "floor_factors": len(graph.floors),
@@ -208,23 +207,23 @@ def _facts(
         "drift_factor": round(solution.drift, 4),
         "rounds": solution.rounds,
         "largest_correction_m": round(float(np.linalg.norm(moved, axis=1).max()), 4),
-        **({} if graph.claim is None else _claimed(graph.claim)),
-        **({} if graph.wander is None else _wandering(graph.wander)),
+        **({} if graph.estimated_drift is None else _drift_facts(graph.estimated_drift)),
+        **({} if graph.fix_noise is None else _noise_facts(graph.fix_noise)),
     }
 
 
-def _wandering(wander: Wander) -> dict[str, Any]:
-    east, _, up = (round(float(sigma), 3) for sigma in wander.sigma)
-    return {"wandering_fixes": {"horizontal_m": east, "vertical_m": up, "memory_s": round(wander.memory, 1)}}
+def _noise_facts(fix_noise: GaussMarkovNoise) -> dict[str, Any]:
+    east, _, up = (round(float(sigma), 3) for sigma in fix_noise.sigma)
+    return {"wandering_fixes": {"horizontal_m": east, "vertical_m": up, "memory_s": round(fix_noise.memory, 1)}}
 
 
-def _claimed(claim: DriftClaim) -> dict[str, Any]:
-    names = _OF_WALLS if len(claim.rates) == len(_OF_WALLS) else _OF_LOOPS
+def _drift_facts(drift: EstimatedDrift) -> dict[str, Any]:
+    names = _OF_WALLS if len(drift.rates) == len(_OF_WALLS) else _OF_LOOPS
     units = np.array([100.0 if name.endswith("percent") else np.degrees(100.0) for name in names])
-    columns = {"estimate": claim.rates, "sigma": claim.sigma} | ({} if claim.rms is None else {"rms": claim.rms})
+    columns = {"estimate": drift.rates, "sigma": drift.sigma} | ({} if drift.rms is None else {"rms": drift.rms})
     told: dict[str, Any] = {
         name: {column: round(float(unit * rates[i]), 4) for column, rates in columns.items()}
         for i, (name, unit) in enumerate(zip(names, units, strict=True))
     }
-    told |= {"log_likelihood_gain": round(0.5 * claim.gain, 1), "gain_by_chance": round(0.5 * claim.chance, 1)}
-    return {"wandering_drift" if claim.does_wander else "steady_drift": told}
+    told |= {"log_likelihood_gain": round(0.5 * drift.gain, 1), "gain_by_chance": round(0.5 * drift.chance, 1)}
+    return {"wandering_drift" if drift.is_varying else "steady_drift": told}

@@ -18,7 +18,7 @@ class ImuConfig(Section):
     velocity: Literal["registration", "integrated"] = Field(
         "registration",
         description="where a prediction's velocity comes from: what registration found, or integration alone since the "
-        "start (first thesis, methods 2 and 1)",
+        "start (Girolimetto, methods 2 and 1)",
     )
     weigh: bool = Field(
         True,

@@ -10,7 +10,7 @@ from lslam.config.section import Section
 
 
 class OsmConfig(Section):
-    """Fetching buildings from an Overpass server, the circles of the buffer, and walls (second thesis, 3.1 and 3.2)."""
+    """Fetching buildings from an Overpass server, the circles of the buffer, and walls (Del Tufo, 3.1 and 3.2)."""
 
     extract: str = Field(
         "",
@@ -40,7 +40,7 @@ class OsmConfig(Section):
     matcher: str = Field(
         "walls",
         description="walls: walls laid on walls; baseline: NDT and VGICP of flattened scans, buildings and trajectory in one "
-        "graph, as in the second thesis, section 2.5 (the mode is not asked)",
+        "graph, as in Del Tufo, section 2.5 (the mode is not asked)",
     )
     trust_poses: bool = Field(
         True, description="with --poses: they are laid on the map as a whole and not bent; false: held like odometry"

@@ -10,11 +10,11 @@ from lslam.evaluation.efficiency import efficiency
 from lslam.types.sensitivity import Bools, Curve, Floats
 from lslam.types.study import StudyRow, Value
 
-# Everything else is registration: what the thesis' times per iteration hold (equation 5.2).
+# Everything else is registration: what Girolimetto's times per iteration hold (equation 5.2).
 NOT_REGISTRATION = ("read", "prepare", "standing", "keyframe", "integrity")
 # A run is lost when its error is that many times the best of the study ...
 LOST_FACTOR = 10.0
-# ... and more than the thesis takes for a result: its largest rmse that is one (LOAM, large eight) is 2.156 m.
+# ... and more than Girolimetto takes for a result: its largest rmse that is one (LOAM, large eight) is 2.156 m.
 LOST_FLOOR_M = 2.2
 
 

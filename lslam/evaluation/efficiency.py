@@ -1,4 +1,4 @@
-"""How good a run is for the time it takes (first thesis, equations 5.2 and 5.3), and means over seeds."""
+"""How good a run is for the time it takes (Girolimetto, equations 5.2 and 5.3), and means over seeds."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ LEVEL = 0.95
 def efficiency(translation: ArrayLike, angular: ArrayLike, seconds: ArrayLike) -> Floats:
     """1 / (translation rmse in m, angular rmse in deg, time in s); nan where one of them is not above 0 or unknown.
 
-    Time is that of registration per scan for equation 5.2 and the total for equation 5.3 of the first thesis.
+    Time is that of registration per scan for equation 5.2 and the total for equation 5.3 of Girolimetto.
 
     >>> float(efficiency(0.5, 2.0, 0.1))
     10.0
@@ -24,7 +24,7 @@ def efficiency(translation: ArrayLike, angular: ArrayLike, seconds: ArrayLike) -
 
 
 def normalise(values: Floats) -> Floats:
-    """Values over the largest of them, as the thesis shows efficiency; all nan where there is none above 0."""
+    """Values over the largest of them, as Girolimetto shows efficiency; all nan where there is none above 0."""
     known = values[np.isfinite(values)]
     top = float(known.max()) if len(known) else 0.0
     return values / top if top > 0 else np.full_like(values, np.nan)

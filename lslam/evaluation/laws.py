@@ -1,4 +1,4 @@
-"""Laws of computing time over a parameter, by weighted least squares, with their confidence (first thesis, section 5.3)."""
+"""Laws of computing time over a parameter, by weighted least squares, with their confidence (Girolimetto, section 5.3)."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from lslam.evaluation.student import two_sided
 from lslam.types.sensitivity import Curve, Floats, Interval, Law, LawKind
 
 FEWEST = 6
-LEVEL = 0.99  # as the bands of the thesis' figure 5.19
+LEVEL = 0.99  # as the bands of Girolimetto's figure 5.19
 _ROUNDS = 5
 
 

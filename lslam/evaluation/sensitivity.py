@@ -1,4 +1,4 @@
-"""A sensitivity study evaluated: means over seeds, divergence, optimum, laws and verdicts (first thesis, section 5.3)."""
+"""A sensitivity study evaluated: means over seeds, divergence, optimum, laws and verdicts (Girolimetto, section 5.3)."""
 
 from __future__ import annotations
 

@@ -248,7 +248,7 @@ def _both(first: ScanResult, second: ScanResult) -> ScanResult:
 def _matrix_norm(prior: NDArray[np.float64], pose: NDArray[np.float64]) -> float:
     """Error of the motion prior, (4, 4), against registration: the largest singular value of inv(prior) pose - I.
 
-    First thesis, equation 5.1.
+    Girolimetto, equation 5.1.
     """
     return float(np.linalg.norm(se3.relative(prior, pose) - np.eye(4), 2))
 

@@ -1,8 +1,8 @@
-"""Buildings held to the walls seen along a trajectory that is not moved any more: the second of two levels.
+"""Displacements of buildings estimated from walls along a fixed trajectory: the second of two levels.
 
-Second thesis, section 3.4: mapping never harms localisation. A building's displacement is x, y, yaw about its middle; every
-match measures some directions of it, and the map itself says, weakly, that it stands where all others stand: displaced by the
-map's common shift. So the problem is linear, and a direction that no wall fixes follows the shift and nothing else.
+Del Tufo, section 3.4: mapping never harms localisation. A building's displacement is x, y, yaw about its middle; every match
+observes some directions of it, and a weak prior of the map has it displaced by the common shift of all buildings. So the
+problem is linear, and an unobserved direction follows the shift.
 """
 
 from __future__ import annotations
@@ -22,18 +22,18 @@ from lslam.types.building_match import BuildingMatch
 Floats = NDArray[np.float64]
 
 GROWTH, ROUNDS = 2.0, 30  # of graduated non-convexity, as in `graph.gnc`
-PROBABILITY = 0.999  # a match within this quantile of its own distribution is right
-SUPPORT = 2  # other matches that have to say the same
-# Shares of information below which a direction is free, and from which two matches know it alike.
+PROBABILITY = 0.999  # chi-square quantile of an inlier match
+SUPPORT = 2  # other matches that must agree
+# Shares of information below which a direction is unobserved, and from which another match observes it as well.
 FREE, ALIKE = 1e-9, 0.05
 
 
 @dataclass(frozen=True)
-class MapBelief:
-    """What a map is trusted with before anything is seen.
+class MapPrior:
+    """The prior of a map's errors.
 
-    shift : (2,) m, real minus map, that the map is thought to be off by as a whole, and shift_sigma (2,), m, how well
-    sigma : (3,) m, m, rad; by which a building is off beside that
+    shift : (2,) m, real minus map, its common shift, and its shift_sigma (2,), m
+    sigma : (3,) m, m, rad; of a building's displacement beside that
     """
 
     shift: Floats
@@ -43,61 +43,61 @@ class MapBelief:
 
 @dataclass(frozen=True)
 class BuildingSolution:
-    """Where buildings stand.
+    """Estimated displacements of buildings.
 
     displacements : (B, 3) x, y (m), yaw (rad) about each middle, real minus map; covariances : (B, 3, 3)
-    shift : (2,) m, of the map as a whole; believed : (M,) which matches were
+    shift : (2,) m, common to all; inliers : (M,) bool per match
     """
 
     displacements: Floats
     covariances: Floats
     shift: Floats
-    believed: NDArray[np.bool_]
+    inliers: NDArray[np.bool_]
 
 
 def solve_buildings(
     middles: NDArray[np.float64],
     matches: Sequence[BuildingMatch],
     poses: Mapping[int, Floats],
-    belief: MapBelief,
+    map_prior: MapPrior,
 ) -> BuildingSolution:
     """Displacements of the buildings with `middles` (B, 2), m, from `matches`, with each keyframe at `poses` (3,) of the map.
 
-    Matches that contradict the others are given up: graduated non-convexity with truncated least squares (`graph.gnc`).
-    Of the map's own belief nothing is ever given up. Who drew a house wrong did so for every keyframe that sees it, so the
-    covariances are those of one match as good as the mean, while the displacements take all of them at their word.
+    Outlier matches are rejected by graduated non-convexity with truncated least squares (`graph.gnc`); the map's prior is no
+    outlier candidate. Matches of one building share the map's error, so the covariances are those of one match of mean
+    information, while the displacements use all of them.
     """
     owners = np.array([m.building for m in matches], np.intp)
     measured = np.array([m.displacement(poses[m.keyframe], middles[m.building]) for m in matches]).reshape(-1, 3)
     weights = np.array([_in_map(m.information, poses[m.keyframe][2]) for m in matches]).reshape(-1, 3, 3)
     limits = np.array([quantile(PROBABILITY, max(m.rank, 1)) for m in matches])
     trust = np.ones(len(matches))
-    solution = _linear(len(middles), owners, measured, weights, belief)
+    solution = _linear(len(middles), owners, measured, weights, map_prior)
     ratio = _squared(solution, owners, measured, weights) / limits
     mu = 1.0 / (2.0 * float(ratio.max(initial=1.0)) - 1.0)
     for _ in checking(range(ROUNDS if (ratio > 1).any() else 0)):
         trust = truncated_weights(ratio, mu)
-        solution = _linear(len(middles), owners, measured, trust[:, None, None] * weights, belief)
+        solution = _linear(len(middles), owners, measured, trust[:, None, None] * weights, map_prior)
         ratio = _squared(solution, owners, measured, weights) / limits
         if bool(np.all((trust < 1e-3) | (trust > 0.999))):
             break
         mu *= GROWTH
-    believed = ratio <= 1
-    if not believed.all():
-        solution = _linear(len(middles), owners, measured, believed[:, None, None] * weights, belief)
-    counts = np.bincount(owners[believed], minlength=len(middles))
-    shared = np.where(believed, 1.0 / np.maximum(counts[owners], 1), 0.0)
-    _, covariances, _ = _linear(len(middles), owners, measured, shared[:, None, None] * weights, belief)
-    return BuildingSolution(solution[0], covariances, solution[2], believed)
+    inliers = ratio <= 1
+    if not inliers.all():
+        solution = _linear(len(middles), owners, measured, inliers[:, None, None] * weights, map_prior)
+    counts = np.bincount(owners[inliers], minlength=len(middles))
+    shared = np.where(inliers, 1.0 / np.maximum(counts[owners], 1), 0.0)
+    _, covariances, _ = _linear(len(middles), owners, measured, shared[:, None, None] * weights, map_prior)
+    return BuildingSolution(solution[0], covariances, solution[2], inliers)
 
 
 def agreeing(
     middles: NDArray[np.float64], matches: Sequence[BuildingMatch], poses: Mapping[int, Floats]
 ) -> NDArray[np.bool_]:
-    """(M,) true where `SUPPORT` other matches of the same building, which know the same directions, say the same.
+    """(M,) true where `SUPPORT` other matches of the same building, which observe the same directions, agree.
 
-    One keyframe may take a hedge or the neighbour's wall for a building's; along a direction that nothing else speaks of,
-    nothing would contradict it.
+    One keyframe may match a hedge or the neighbour's wall; along a direction that no other match observes, it could not be
+    rejected as an outlier.
     """
     measured = np.array([m.displacement(poses[m.keyframe], middles[m.building]) for m in matches]).reshape(-1, 3)
     weights = np.array([_in_map(m.information, poses[m.keyframe][2]) for m in matches]).reshape(-1, 3, 3)
@@ -124,21 +124,21 @@ def _in_map(information: Floats, yaw: float) -> Floats:
 
 
 def _linear(
-    count: int, owners: NDArray[np.intp], measured: Floats, weights: Floats, belief: MapBelief
+    count: int, owners: NDArray[np.intp], measured: Floats, weights: Floats, map_prior: MapPrior
 ) -> tuple[Floats, Floats, Floats]:
     """Displacements, covariances and shift by least squares; each building is eliminated, the shift is what is left."""
-    own = np.diag(1.0 / belief.sigma**2)
+    own = np.diag(1.0 / map_prior.sigma**2)
     normal, pull = np.tile(own, (count, 1, 1)), np.zeros((count, 3))
     np.add.at(normal, owners, weights)
     np.add.at(pull, owners, (weights @ measured[:, :, None])[:, :, 0])
     covariances = np.linalg.inv(normal)
-    # d_i = C_i (pull_i + own (shift, 0)), so the shift sees each building through what it is known by beside the map.
+    # d_i = C_i (pull_i + own (shift, 0)), so each building informs the shift by its matches alone.
     through = own[:2, :2]
-    common = np.diag(1.0 / belief.shift_sigma**2)
+    common = np.diag(1.0 / map_prior.shift_sigma**2)
     seen = through @ (np.linalg.inv(through) - covariances[:, :2, :2]) @ through
     told = (through @ (covariances @ pull[:, :, None])[:, :2])[:, :, 0]
     spread = np.linalg.inv(common + seen.sum(axis=0))
-    shift = spread @ (common @ belief.shift + told.sum(axis=0))
+    shift = spread @ (common @ map_prior.shift + told.sum(axis=0))
     found = (covariances @ (pull + own[:, :2] @ shift)[:, :, None])[:, :, 0]
     by_shift = covariances @ own[:, :2]
     return found, covariances + by_shift @ spread @ np.swapaxes(by_shift, -1, -2), shift

@@ -1,4 +1,4 @@
-"""How large sums of squared, normalised errors are."""
+"""Quantiles of the chi-square distribution."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def quantile(probability: float, dim: int) -> float:
 
 
 def chance_of_median(median: float, dim: int, count: int) -> float:
-    """How probable it is that the median of `count` chi-square variables of `dim` degrees of freedom stays below `median`.
+    """The probability that the median of `count` chi-square variables of `dim` degrees of freedom stays below `median`.
 
     >>> round(chance_of_median(quantile(0.95, 3), 3, 1), 3)
     0.95

@@ -1,8 +1,8 @@
-"""Which loops agree with each other and with odometry, before anything is optimised.
+"""Consistency of loop closures with each other and with odometry, before optimisation.
 
-Two right loops close a cycle with the odometry between their ends (Mangelson et al. 2018, pairwise consistent
-measurements). Each loop is asked about its nearest loops, where odometry has not had room to drift; whoever is
-contradicted by most of them goes, the most contradicted first, so that the others are asked without it.
+Two true loop closures make a cycle with the odometry between their ends (Mangelson et al. 2018, pairwise consistent
+measurements). Each is tested against its nearest neighbours, between which odometry drifts least; one that most of them
+contradict is rejected, the most contradicted first, and the others are tested without it.
 """
 
 from __future__ import annotations
@@ -22,17 +22,17 @@ from lslam.types.constraint import Constraint
 
 Floats = NDArray[np.float64]
 
-# Loops that each loop is compared with, and the share of them that must agree.
+# Neighbours that each loop closure is tested against, and the share that must agree.
 NEIGHBOURS, SHARE = 16, 0.5
-# What a loop may be wrong by beyond its covariance, m and rad: its scans are deskewed and thinned.
+# m and rad, error of a loop closure beyond its covariance: its scans are deskewed and downsampled.
 SLACK_M, SLACK_RAD = 0.03, np.deg2rad(0.1)
-# Positions that stand for the way between two keyframes.
+# Positions sampled on the way between two keyframes.
 SAMPLES = 16
 
 
 @dataclass(frozen=True)
 class Drift:
-    """What odometry may have drifted over any part of a trajectory, pessimistically: proportional to the way.
+    """Conservative model of odometry's drift over any part of a trajectory: proportional to the way.
 
     positions : (K, 3); distances : (K,) m travelled; percent : one sigma of translation; rad_per_m : of rotation
     """
@@ -61,7 +61,7 @@ def drift_of(graph: PoseGraph, config: GraphConfig) -> Drift:
 
 
 def judge_loops(graph: PoseGraph, config: GraphConfig) -> list[str]:
-    """Per loop why it is not believed, empty where it is."""
+    """Per loop closure why it is rejected, empty where it is accepted."""
     reasons = [""] * len(graph.loops)
     if not graph.loops:
         return reasons
@@ -82,7 +82,7 @@ def judge_loops(graph: PoseGraph, config: GraphConfig) -> list[str]:
 
 
 class Ends:
-    """Loops as arrays: ends `a` and `b` (L,), poses `T` (L, 4, 4), covariances (L, 6, 6) of twists on the left."""
+    """Loop closures as arrays: ends `a` and `b` (L,), poses `T` (L, 4, 4), covariances (L, 6, 6) of twists on the left."""
 
     def __init__(self, loops: Any) -> None:
         items: list[Constraint] = list(loops)
@@ -104,7 +104,7 @@ def as_twists(covariance: Floats, T: Floats) -> Floats:
 
 
 def _against_odometry(graph: PoseGraph, ends: Ends, drift: Drift) -> tuple[Floats, Floats]:
-    """(L, 6) where loops put b against odometry, in the axes of a, and the covariances of that by drift and loop."""
+    """(L, 6) residuals of the loop closures against odometry, in the axes of a, and their covariances."""
     odometry = se3.relative(graph.poses[ends.a], graph.poses[ends.b])
     turn = ends.T[:, :3, :3] @ np.swapaxes(odometry[:, :3, :3], -1, -2)
     twists = np.concatenate([ends.T[:, :3, 3] - odometry[:, :3, 3], so3.log(turn)], axis=1)
@@ -113,7 +113,7 @@ def _against_odometry(graph: PoseGraph, ends: Ends, drift: Drift) -> tuple[Float
 
 
 def _voted_out(graph: PoseGraph, ends: Ends, drift: Drift, limit: float) -> list[tuple[int, float]]:
-    """Loops that most of their neighbours contradict, with the share that agreed."""
+    """Loop closures that most of their neighbours contradict, with the share that agrees."""
     from scipy.spatial import cKDTree
 
     where = np.column_stack([drift.distances[ends.a], drift.distances[ends.b]])
@@ -123,7 +123,7 @@ def _voted_out(graph: PoseGraph, ends: Ends, drift: Drift, limit: float) -> list
     first = np.repeat(np.arange(len(where)), k)
     errors, sharpness = _cycle_errors(graph, ends, drift, first, others.ravel())
     agrees = (errors <= limit).reshape(others.shape)
-    # Far neighbours agree with anything: odometry may have drifted as far between.
+    # Far neighbours agree with anything, as odometry drifts far between: votes are weighted.
     votes = sharpness.reshape(others.shape)
     alive = np.ones(len(where), bool)
     gone: list[tuple[int, float]] = []
@@ -146,7 +146,7 @@ def _cycle_errors(
 ) -> tuple[Floats, Floats]:
     """(P,) squared Mahalanobis distances from the identity of a_i -> b_i -> b_j -> a_j -> a_i.
 
-    Beside them how sharp each question is: one over the variance, m2, that drift has on the way.
+    Beside them the sharpness of each test: the inverse variance, 1/m2, of drift on the way.
     """
     ahead = se3.relative(graph.poses[ends.b[i]], graph.poses[ends.b[j]])
     home = se3.relative(graph.poses[ends.a[j]], graph.poses[ends.a[i]])

@@ -1,7 +1,7 @@
-"""How much odometry drifts beyond what its covariances say, as loops and fixes reveal it.
+"""Scale of odometry's drift beyond its covariances, estimated from loop closures and fixes.
 
-A registration knows its noise, not what makes every scan wrong alike (a range bias, a bent calibration), and the latter adds
-up. Loops see the sum: the drift is that with which the typical loop is as far from odometry as it should be.
+The covariance of a registration models noise, not systematic errors (range bias, calibration), which accumulate. Loop closures
+observe the sum: the drift factor is that with which the median residual has its expected size.
 """
 
 from __future__ import annotations
@@ -20,21 +20,21 @@ from lslam.types.constraint import Constraint
 
 Floats = NDArray[np.float64]
 
-# Loops that are looked at, evenly spread, and the factors between which the drift's variance is looked for.
+# Loop closures used at most, evenly spread, and bounds of the factor on the drift's variance.
 MOST, SMALLEST, LARGEST = 300, 1e-8, 1e8
 
 
 def drift_covariance(way: float, config: GraphConfig) -> Floats:
-    """(6, 6) of random drift over `way` m, in proportion `drift_percent` per m to `drift_deg_per_100m`, at factor 1.
+    """(6, 6) of a random walk over `way` m, in proportion `drift_percent` per m to `drift_deg_per_100m`, at factor 1.
 
-    A walk: its variance grows with the way, so that a path in many steps and in few drifts alike.
+    Its variance grows with the way, whatever the number of steps.
     """
     turn = np.deg2rad(config.drift_deg_per_100m) / 100
     return np.diag(np.repeat([(0.01 * config.drift_percent) ** 2 * way, turn**2 * way], 3))
 
 
 def with_drift(graph: PoseGraph, factor: float, config: GraphConfig) -> list[Constraint]:
-    """The graph's odometry with `factor` times the drift over its length; without any error where the graph is rigid."""
+    """The graph's odometry with `factor` times the drift added to its covariances; zero covariances where it is rigid."""
     if graph.is_rigid:
         return [replace(c, covariance=np.zeros((6, 6))) for c in graph.odometry]
     if factor == 0:
@@ -44,10 +44,10 @@ def with_drift(graph: PoseGraph, factor: float, config: GraphConfig) -> list[Con
 
 
 def drift_factor(graph: PoseGraph, loops: Sequence[Constraint], config: GraphConfig) -> float:
-    """The factor on `drift_covariance`, 0 where none is needed, with which median loop and fix are where they should be.
+    """The factor on `drift_covariance`, 0 where none is needed, with which the median residual has its expected size.
 
-    Fixes are so much noisier than odometry that what explains a chance among them is a large drift: only those count that are
-    farther off than chance would have them. At least that of `tilt_factor`.
+    Fixes are so much noisier than odometry that chance among them would give a large drift: they count where the median is
+    significant. At least `tilt_factor`.
     """
     on_map = _as_fixes(graph)
     if not loops and max(len(graph.fixes), len(on_map)) < 2 and not graph.ups:
@@ -60,19 +60,19 @@ def drift_factor(graph: PoseGraph, loops: Sequence[Constraint], config: GraphCon
 
 
 def tilt_factor(graph: PoseGraph, config: GraphConfig) -> float:
-    """As `drift_factor` by the up directions alone: 0 unless they are sure that odometry tilts."""
+    """As `drift_factor` by the up directions alone: 0 unless a tilt of odometry is significant."""
     return _of_ups(graph, *chains(graph, config), config) if graph.ups else 0.0
 
 
 def chains(graph: PoseGraph, config: GraphConfig) -> tuple[Floats, Floats]:
-    """What odometry says of its own errors, and drift of factor 1, both (K, 6, 6) accumulated."""
+    """Odometry's covariances and drift of factor 1, both accumulated, (K, 6, 6)."""
     unit = drift_covariance(1.0, config)
     drifting = [replace(c, covariance=_length(c) * unit) for c in graph.odometry]
     return _accumulated(graph.poses, graph.odometry), _accumulated(graph.poses, drifting)
 
 
 def _as_fixes(graph: PoseGraph) -> list[PositionFix]:
-    """Planar priors that fix both coordinates, as positions; their height is not known and means nothing."""
+    """Planar priors that observe both coordinates, as positions; their height is meaningless."""
     found = []
     for prior in graph.map_priors:
         if prior.rank == 3:
@@ -83,17 +83,17 @@ def _as_fixes(graph: PoseGraph) -> list[PositionFix]:
 
 
 def _accumulated(poses: Floats, odometry: Sequence[Constraint]) -> Floats:
-    """(K, 6, 6) of each pose in the world when only odometry, from each keyframe to the next, is known."""
+    """(K, 6, 6) of each pose in the world by odometry alone, from each keyframe to the next."""
     steps = [c for c in odometry if c.b == c.a + 1]
     b, own = np.array([c.b for c in steps], np.intp), np.array([c.covariance for c in steps]).reshape(-1, 6, 6)
-    # About one place the errors of all steps add up.
+    # About one point the covariances of all steps add up.
     about_origin = np.zeros((len(poses), 6, 6))
     about_origin[b] = noise.transported(noise.rotated(own, poses[b - 1, :3, :3]), -poses[b, :3, 3])
     return noise.transported(np.cumsum(about_origin, axis=0), poses[:, :3, 3])
 
 
 def _between(chain: Floats, poses: Floats, a: NDArray[np.intp], b: NDArray[np.intp]) -> Floats:
-    """(P, 6, 6) of keyframes `b` seen from `a`, world axes."""
+    """(P, 6, 6) of keyframes `b` relative to `a`, world axes."""
     return np.asarray(chain[b] - noise.transported(chain[a], poses[b, :3, 3] - poses[a, :3, 3]))
 
 
@@ -114,9 +114,9 @@ def _of_loops(graph: PoseGraph, loops: Sequence[Constraint], known: Floats, drif
 def _of_fixes(
     poses: Floats, fixes: Sequence[PositionFix], dim: int, known: Floats, drift: Floats, probability: float = 0.0
 ) -> float:
-    """By pairs of fixes, half the fixes apart: how the way between them differs from odometry's, along `dim` axes.
+    """By pairs of fixes, half the fixes apart: difference between their displacement and odometry's, along `dim` axes.
 
-    probability : with which chance stays below what counts
+    probability : of the median under the null hypothesis, below which there is no drift
     """
     half = len(fixes) // 2
     if not half:
@@ -138,9 +138,9 @@ def _of_fixes(
 
 
 def _of_ups(graph: PoseGraph, known: Floats, drift: Floats, config: GraphConfig) -> float:
-    """By all that was measured of up: how it tilts in the world of odometry on the way from the first time.
+    """By all measurements of up: their tilt in the world of odometry relative to the first.
 
-    Gravity is known to a part of a degree and mostly worse than odometry: only what can be no chance counts.
+    Gravity is mostly less accurate than odometry: only a significant tilt counts.
     """
     keyframes, ups, variances = _measurements(graph)
     count = len(ups) - 1
@@ -151,7 +151,7 @@ def _of_ups(graph: PoseGraph, known: Floats, drift: Floats, config: GraphConfig)
     shared = np.minimum.outer(np.arange(count), np.arange(count))
 
     def together(chain: Floats) -> Floats:
-        """Of all tilts, (1, 2 M, 2 M): two of them have the way to the earlier one in common."""
+        """Of all tilts, (1, 2 M, 2 M): two of them share the way to the earlier one."""
         single = level @ (chain[keyframes[1:], 3:, 3:] - chain[keyframes[0], 3:, 3:]) @ level.T
         return np.asarray(single[shared].swapaxes(1, 2).reshape(1, 2 * count, 2 * count))
 
@@ -176,7 +176,7 @@ def _measurements(graph: PoseGraph) -> tuple[NDArray[np.intp], Floats, Floats]:
 
 
 def _fitting(error: Floats, own: Floats, grown: Floats) -> float:
-    """The factor on `grown` (P, n, n), beside `own`, with which the median error (P, n) is as large as it should be."""
+    """The factor on `grown` (P, n, n), beside `own`, with which the median error (P, n) has its expected size."""
     typical = quantile(0.5, error.shape[1])
 
     def is_enough(factor: float) -> bool:

@@ -1,6 +1,6 @@
 """From plain values to factors of gtsam.
 
-Of K keyframes k has the key k, the floor the key K, the map the key K + 1; what fixes err by in common has keys beyond `WANDER`.
+Of K keyframes k has the key k, the floor the key K, the map the key K + 1; correlated noise of fixes has keys from `FIX_NOISE`.
 """
 
 from __future__ import annotations
@@ -12,28 +12,28 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.geometry import noise, se2, se3
-from lslam.graph.fix_noise import Wander
+from lslam.graph.fix_noise import GaussMarkovNoise
 from lslam.graph.problem import FloorPlane, PlanarPrior, PoseGraph, PositionFix
 from lslam.types.constraint import Constraint, Turn
 
 Floats = NDArray[np.float64]
 
-# The first pose, m and rad, when it is held, and when the fixes hold it; its tilt while up in its world is not known well.
+# Sigmas of the prior on the first pose, m and rad, when anchored and when the fixes anchor it; of its tilt before up is known.
 HELD, FREE, TILTING = (1e-4, 1e-4), (1e3, 3.0), 0.2
-# A gyroscope says nothing of positions, m.
+# m, sigma of the positions that a gyroscope does not observe.
 ANYWHERE = 1e4
-# x, y and yaw among the six of a pose in this house's order.
+# x, y and yaw among the six of a pose, translation first.
 PLANAR = [0, 1, 5]
-# Keys of the error of fixes at its instants: beyond all others.
-WANDER = 1 << 40
-# After so many times its memory nothing is left of an error.
+# First key of the correlated noise of fixes, beyond all others.
+FIX_NOISE = 1 << 40
+# Correlation times after which an error is independent.
 LONG = 20.0
-# No constraint is known better than this, m and rad: the optimiser's arithmetic.
+# Least sigmas of a constraint, m and rad, for the optimiser's arithmetic.
 SMALLEST = np.array([1e-4, 1e-4, 1e-4, 1e-5, 1e-5, 1e-5])
 
 
 def well_conditioned(covariance: Floats) -> Floats:
-    """Symmetric, positive definite (..., 6, 6): no direction is known better than `SMALLEST`."""
+    """Symmetric, positive definite (..., 6, 6): no sigma is below `SMALLEST`."""
     scaled = covariance / np.outer(SMALLEST, SMALLEST)
     values, vectors = np.linalg.eigh(0.5 * (scaled + np.swapaxes(scaled, -1, -2)))
     kept = (vectors * np.maximum(values, 1.0)[..., None, :]) @ np.swapaxes(vectors, -1, -2)
@@ -70,7 +70,7 @@ def position(fix: PositionFix, scale: float = 1.0, kernel: Any = None) -> Any:
     model = _robust(gtsam.noiseModel.Diagonal.Sigmas(np.sqrt(scale) * fix.sigma), kernel)
     if fix.instant is None:
         return gtsam.GPSFactorArm(fix.keyframe, fix.position, fix.arm, model)
-    key, arm = WANDER + fix.instant, fix.arm
+    key, arm = FIX_NOISE + fix.instant, fix.arm
     across = np.array([[0.0, -arm[2], arm[1]], [arm[2], 0.0, -arm[0]], [-arm[1], arm[0], 0.0]])
 
     def error(_: Any, values: Any, jacobians: list[Floats] | None) -> Floats:
@@ -85,9 +85,9 @@ def position(fix: PositionFix, scale: float = 1.0, kernel: Any = None) -> Any:
 
 
 def planar(prior: PlanarPrior, pose: Floats, key: int, scale: float = 1.0, kernel: Any = None) -> Any:
-    """Where the map `key` puts a keyframe, seen from above: height, roll and pitch stay free, and what the walls leave free.
+    """A planar prior on a keyframe in the map `key`: height, roll, pitch and directions that walls do not observe stay free.
 
-    pose : (4, 4) of the keyframe now, whose height and tilt are those at which the error is looked at
+    pose : (4, 4) of the keyframe now, at whose height and tilt the error is linearised
     """
     import gtsam
 
@@ -95,7 +95,7 @@ def planar(prior: PlanarPrior, pose: Floats, key: int, scale: float = 1.0, kerne
     information = np.zeros((6, 6))
     information[np.ix_(PLANAR, PLANAR)] = prior.information * (prior.share / scale)
     values, axes = np.linalg.eigh(noise.to_body(information, T))
-    # Rows of the root, one per direction that is not free: what is free says nothing, not little.
+    # Rows of the square root, one per observed direction: an unobserved one has no information at all.
     root = np.sqrt(np.maximum(values, 0.0))[:, None] * axes.T
     model = gtsam.noiseModel.Gaussian.SqrtInformation(root, False)
     return gtsam.BetweenFactorPose3(key, prior.keyframe, gtsam.Pose3(T), _robust(model, kernel))
@@ -113,7 +113,7 @@ def map_key(graph: PoseGraph) -> int:
 
 
 def fixed_part(graph: PoseGraph, may_tilt: bool = False) -> Any:
-    """The factor graph of all that is never doubted; with `may_tilt` the first pose holds but its heading and place."""
+    """The factors that are no outlier candidates; with `may_tilt` the prior on the first pose leaves roll and pitch free."""
     import gtsam
 
     factors = gtsam.NonlinearFactorGraph()
@@ -135,8 +135,8 @@ def fixed_part(graph: PoseGraph, may_tilt: bool = False) -> Any:
         factors.add(_turn(turn))
     for floor in graph.floors:
         factors.add(_floor(floor, len(graph)))
-    if graph.wander is not None:
-        _add_wander(factors, graph.wander)
+    if graph.fix_noise is not None:
+        _add_fix_noise(factors, graph.fix_noise)
     if graph.map_priors:
         shift = gtsam.noiseModel.Diagonal.Sigmas(
             np.array([HELD[1]] * 3 + [max(graph.shift_sigma, HELD[0])] * 2 + [HELD[0]])
@@ -146,7 +146,7 @@ def fixed_part(graph: PoseGraph, may_tilt: bool = False) -> Any:
 
 
 def start_values(graph: PoseGraph, poses: Floats) -> Any:
-    """Poses as the optimiser takes them, and where the floor is there."""
+    """Initial values of all variables, poses (K, 4, 4) of the keyframes."""
     import gtsam
 
     values = gtsam.Values()
@@ -156,9 +156,9 @@ def start_values(graph: PoseGraph, poses: Floats) -> Any:
         values.insert(len(poses), gtsam.OrientedPlane3(_floor_in_world(graph.floors, poses)))
     if graph.map_priors:
         values.insert(map_key(graph), gtsam.Pose3())
-    if graph.wander is not None:
-        for i in range(len(graph.wander.seconds)):
-            values.insert(WANDER + i, np.zeros(3))
+    if graph.fix_noise is not None:
+        for i in range(len(graph.fix_noise.seconds)):
+            values.insert(FIX_NOISE + i, np.zeros(3))
     return values
 
 
@@ -183,27 +183,27 @@ def _floor(floor: FloorPlane, key: int) -> Any:
     return gtsam.OrientedPlane3Factor(np.append(floor.normal, floor.offset), model, floor.keyframe, key)
 
 
-def _add_wander(factors: Any, wander: Wander) -> None:
+def _add_fix_noise(factors: Any, fix_noise: GaussMarkovNoise) -> None:
     """A first-order Gauss-Markov process in its steady state.
 
-    (b - p a)^2 = p (b - a)^2 + (1 - p) b^2 - p (1 - p) a^2: two instants a and b hold each other, and each holds itself.
+    (b - p a)^2 = p (b - a)^2 + (1 - p) b^2 - p (1 - p) a^2: between factors of instants a and b, and a prior on each.
     """
     import gtsam
 
-    steps = np.minimum(np.diff(wander.seconds) / wander.memory, LONG)
+    steps = np.minimum(np.diff(fix_noise.seconds) / fix_noise.memory, LONG)
     kept, driven = np.exp(-steps), -np.expm1(-2 * steps)
     own = np.append(1.0, 1 / (1 + kept))
     own[:-1] -= kept / (1 + kept)
     for i, weight in enumerate(own.tolist()):
-        model = gtsam.noiseModel.Diagonal.Sigmas(wander.sigma / np.sqrt(weight))
-        factors.add(gtsam.PriorFactorPoint3(WANDER + i, np.zeros(3), model))
+        model = gtsam.noiseModel.Diagonal.Sigmas(fix_noise.sigma / np.sqrt(weight))
+        factors.add(gtsam.PriorFactorPoint3(FIX_NOISE + i, np.zeros(3), model))
     for i, ratio in enumerate((driven / kept).tolist()):
-        model = gtsam.noiseModel.Diagonal.Sigmas(wander.sigma * np.sqrt(ratio))
-        factors.add(gtsam.BetweenFactorPoint3(WANDER + i, WANDER + i + 1, np.zeros(3), model))
+        model = gtsam.noiseModel.Diagonal.Sigmas(fix_noise.sigma * np.sqrt(ratio))
+        factors.add(gtsam.BetweenFactorPoint3(FIX_NOISE + i, FIX_NOISE + i + 1, np.zeros(3), model))
 
 
 def _floor_in_world(floors: Any, poses: Floats) -> Floats:
-    """(4,) the median plane of all that were seen."""
+    """(4,) the median of the floor planes."""
     normals = np.stack([poses[f.keyframe][:3, :3] @ f.normal for f in floors])
     normal = np.median(normals, axis=0)
     normal /= np.linalg.norm(normal)

@@ -1,9 +1,9 @@
-"""What satellite fixes err by together: they state the whole of their error, and scatter by less.
+"""Correlated noise of GNSS fixes: their stated sigma is that of the total error, of which only a part is white.
 
-Orbits, ionosphere and multipath change over minutes: most of a fix's error is the next one's as well, a first-order
-Gauss-Markov process beside white noise (Rankin 1994, GPS and differential GPS: an error model for sensor simulation). A
-thousand such fixes know a place hardly better than one of them does. What odometry drifts by looks much like that; it is the
-fixes' up to what they state, and odometry's beyond.
+Orbits, ionosphere and multipath change over minutes: the error is a first-order Gauss-Markov process beside white noise
+(Rankin 1994, GPS and differential GPS: an error model for sensor simulation), so that a thousand fixes are hardly more accurate
+than one. Odometry's drift looks similar; correlated residuals belong to the fixes up to their stated sigma, and to odometry
+beyond.
 """
 
 from __future__ import annotations
@@ -17,23 +17,23 @@ from lslam.graph.chi_square import quantile
 
 Floats = NDArray[np.float64]
 
-# Fixes whose correlation is looked at; of more, means of as many as it takes.
+# Size of the covariance: more fixes are averaged in groups.
 MOST = 100
-# Factors tried on the drift of odometry.
+# Factors on odometry's drift that are tried.
 FACTORS = np.concatenate([[0.0], np.geomspace(1e-3, 1e5, 17)])
-# Fixes in a row of which the most are right: an alignment forgives what drift and tilt may explain.
+# Window of the median filter against outliers that the alignment accepts.
 AROUND = 7
-# Instants at which a graph has the error; between them it is that of the nearest.
+# Instants of the error in the graph, at most; a fix has that of the nearest.
 INSTANTS = 2000
-# Of the variance: what no fix is better than, so that likelihoods can be had of perfect ones.
+# Least white share of the variance, against singular covariances of perfect fixes.
 LEAST_WHITE = 1e-4
-# Memories tried, of the time between two fixes up to so many times all of it: beyond, an error is a constant.
+# Correlation times tried, up to so many times the duration: beyond, an error is a constant.
 TRIED, LONGEST = 24, 10.0
 
 
 @dataclass(frozen=True)
-class Wander:
-    """An error that wanders, at the instants `seconds` (W,), ascending: `sigma` (3,), m, of each axis, and `memory`, s."""
+class GaussMarkovNoise:
+    """A Gauss-Markov process at the instants `seconds` (W,), ascending: `sigma` (3,), m, per axis; time constant `memory`, s."""
 
     seconds: Floats
     sigma: Floats
@@ -42,9 +42,9 @@ class Wander:
 
 @dataclass(frozen=True)
 class DriftOfFixes:
-    """What odometry may err by at F fixes.
+    """Covariance of odometry at F fixes.
 
-    known, unit : (K, 6, 6) of K keyframes, axes east, north, up, as of `drift.chains`: as odometry says, and drift of factor 1
+    known, unit : (K, 6, 6) of K keyframes, axes east, north, up, as of `drift.chains`: odometry's own, and drift of factor 1
     places : (K, 3) m, of the keyframes; metre : (6, 6) of the drift over one metre, `drift.drift_covariance`
     keyframes : (F,) from which each fix is seen, ascending
     """
@@ -56,19 +56,19 @@ class DriftOfFixes:
     keyframes: NDArray[np.intp]
 
 
-def wander_of(
+def fit_gauss_markov(
     seconds: Floats, residuals: Floats, sigmas: Floats, antenna: Floats, probability: float, drift: DriftOfFixes
-) -> tuple[Wander | None, float]:
-    """What fixes err by together, and the factor on the drift of odometry beside it.
+) -> tuple[GaussMarkovNoise | None, float]:
+    """Correlated noise of the fixes, and the factor on odometry's drift beside it.
 
-    No wander where fixes scatter as they state, so that each may have an error of its own.
+    None where fixes scatter by their stated sigmas, so that their errors may be independent.
 
-    The way from one fix to the next is free of what they have in common, and of odometry's drift as well: that tells the
-    white part of the variance that is stated. The rest is the fixes' up to that variance, for as long as their memory, and
-    odometry's beyond: memory and drift are the likeliest (restricted likelihood, since a place and a heading were fitted).
+    Differences of successive fixes contain neither correlated noise nor drift: they give the white share of the stated variance.
+    The time constant of the rest and the drift factor maximise the restricted likelihood, since position and heading were
+    fitted.
 
     seconds : (F,) ascending; residuals : (F, 3) m, east, north, up, of fixes minus trajectory, aligned to them
-    sigmas : (F, 3) m, stated; antenna : (F, 3) m, east, north, up; probability : with which chance scatters more
+    sigmas : (F, 3) m, stated; antenna : (F, 3) m, east, north, up; probability : of the chi-square test for white noise
     """
     scaled = residuals / sigmas
     good = _near_neighbours(scaled[:, :2], probability)
@@ -78,7 +78,7 @@ def wander_of(
     if not near.any() or gaps.min() <= 0:
         return None, 0.0
     white = float(0.5 * (np.diff(scaled[:, :2], axis=0)[near] ** 2).mean())
-    # Differences of neighbours share an error: of three of them, two are free. Two axes.
+    # Adjacent differences share an error, which leaves two of three degrees of freedom. Two axes.
     free = max(round(2 * near.sum() / 1.5), 1)
     if white > quantile(1 - probability, free) / free:
         return None, 0.0
@@ -86,11 +86,11 @@ def wander_of(
     drift = replace(drift, keyframes=drift.keyframes[good])
     memory, factor = _likeliest(seconds, scaled, sigmas, antenna, white, drift)
     sigma = np.sqrt(1.0 - white) * np.median(sigmas, axis=0)
-    return Wander(seconds[:: -(-len(seconds) // INSTANTS)], sigma, memory), factor
+    return GaussMarkovNoise(seconds[:: -(-len(seconds) // INSTANTS)], sigma, memory), factor
 
 
 def _near_neighbours(scaled: Floats, probability: float) -> NDArray[np.bool_]:
-    """(F,) which of `scaled` (F, 2) residuals are as near to the median of those around as they state to be."""
+    """(F,) inliers of `scaled` (F, 2) residuals about their running median."""
     from scipy.ndimage import median_filter
 
     off = scaled - median_filter(scaled, size=(AROUND, 1), mode="reflect")
@@ -100,10 +100,10 @@ def _near_neighbours(scaled: Floats, probability: float) -> NDArray[np.bool_]:
 def _likeliest(
     seconds: Floats, scaled: Floats, sigmas: Floats, antenna: Floats, white: float, drift: DriftOfFixes
 ) -> tuple[float, float]:
-    """Time constant, s, of what residuals `scaled` (F, 3) of unit variance have beside their `white` part, and drift factor.
+    """Time constant, s, of residuals `scaled` (F, 3) of unit variance beside their `white` part, and drift factor.
 
-    Drift is a walk or lasts, either as likely; by the end of the way both come to the same. There is some where it is likelier
-    than none by more than the one number that it is (Akaike 1974), on the mean of all memories, which nobody asks for.
+    Drift is a random walk or a constant rate with equal prior probability and equal variance at the end of the way. It is
+    accepted where the likelihood, marginal over time constants, gains more than its one parameter (Akaike 1974).
     """
     groups = np.array_split(np.arange(len(seconds)), min(len(seconds), MOST))
     t, r, a, s = (np.stack([values[g].mean(axis=0) for g in groups]) for values in (seconds, scaled, antenna, sigmas))
@@ -118,12 +118,12 @@ def _likeliest(
             _lasting(drift.metre, a),
         )
     )
-    # What was fitted moves them: place and heading, and tilt.
+    # Nuisance parameters of the alignment: position, heading and tilt.
     about = a - a.mean(axis=0)
     about /= max(float(np.abs(about).max()), 1e-9)
     fitted = np.concatenate([np.tile(np.eye(3), (len(t), 1, 1)), np.cross(np.eye(3), about[:, None, :])], axis=2)
     axes, moves, _ = np.linalg.svd(weights[:, None] * fitted.reshape(-1, 6), full_matrices=False)
-    # About a straight way no turn moves anything.
+    # Rotations about a straight way are unobservable.
     sides = np.column_stack([r.ravel(), axes[:, moves > 1e-9 * moves[0]]])
     gap = float(np.median(np.diff(seconds)))
     tried = np.geomspace(gap, LONGEST * max(t[-1] - t[0], gap), TRIED)
@@ -139,9 +139,9 @@ def _likeliest(
 
 
 def _lasting(metre: Floats, places: Floats) -> Floats:
-    """(3 F, 3 F) m2 of `places` (F, 3), m, under rates of drift that last all the way.
+    """(3 F, 3 F) m2 of `places` (F, 3), m, under constant rates of drift.
 
-    metre : (6, 6) of a walk over one metre, which comes to the same at the end of the way
+    metre : (6, 6) of a random walk over one metre, with equal variance at the end of the way
     """
     steps = np.diff(places, axis=0)
     way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(steps, axis=1))])
@@ -156,11 +156,11 @@ def _lasting(metre: Floats, places: Floats) -> Floats:
 def _likelihoods(base: Floats, unit: Floats, sides: Floats) -> Floats:
     """(len(FACTORS),) logarithms of the restricted likelihood of `base` + factor x `unit` (N, N), both covariances.
 
-    sides : (N, 1 + P) residuals, and what moves them that was fitted
+    sides : (N, 1 + P) residuals, and Jacobians of the nuisance parameters
     """
     root = np.linalg.cholesky(base)
     half = np.linalg.solve(root, unit)
-    # Along these axes both are diagonal: each factor costs a row.
+    # Along these axes both are diagonal.
     values, axes = np.linalg.eigh(np.linalg.solve(root, half.T))
     turned = axes.T @ np.linalg.solve(root, sides)
     out = np.empty(len(FACTORS))
@@ -178,7 +178,7 @@ def _shared(chain: Floats, places: Floats) -> Floats:
     """(3 F, 3 F) m2 of F poses at `places` (F, 3), m, world axes, one after the other.
 
     chain : (F, 6, 6) of each pose, world axes, as of `drift.chains`
-    What the earlier of two errs by, the later errs by as well, turned about it.
+    The error of the earlier of two is transported to the later.
     """
     number = np.arange(len(places))
     early, late = np.minimum.outer(number, number), np.maximum.outer(number, number)

@@ -1,4 +1,4 @@
-"""Whether the floors that keyframes saw are one plane, before any pose is bent to lie on it."""
+"""Consensus of the floor planes of keyframes on one plane, before they enter the graph."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from lslam.graph.problem import FloorPlane
 
 Floats = NDArray[np.float64]
 
-# What two sights of one flat floor differ by at the most, m and rad.
+# Largest difference of two measurements of one flat floor, m and rad.
 NOISE_M, NOISE_RAD = 0.05, np.deg2rad(0.5)
-# Floors that have to be on the plane: on hills a half or fewer are, on flat streets nearly all.
+# Least share of inliers: on hills a half or fewer, on flat streets nearly all.
 MOST = 0.8
 
 
 def on_one_plane(
     floors: Sequence[FloorPlane], poses: Floats, distances: Floats, config: GraphConfig
 ) -> list[FloorPlane]:
-    """The floors that agree with the one that most agree with; none where so few do that the ground is not flat.
+    """The floors consistent with the one that has the most support; none where so few are that the ground is not flat.
 
-    poses : (K, 4, 4) of the keyframes by odometry, which may have drifted as `config` says; distances : (K,) m travelled
+    poses : (K, 4, 4) of the keyframes by odometry, with the drift of `config`; distances : (K,) m travelled
     """
     if not floors:
         return []
@@ -37,7 +37,7 @@ def on_one_plane(
     bend = np.arccos(np.clip(normals @ normals.T, -1.0, 1.0))
     slack = NOISE_M + 0.01 * config.drift_percent * way + turn * np.linalg.norm(between, axis=-1)
     agrees = (bend <= NOISE_RAD + turn) & (np.maximum(rise, rise.T) <= slack)
-    believed = agrees[agrees.sum(1).argmax()]
-    if believed.sum() < MOST * len(floors):
+    inliers = agrees[agrees.sum(1).argmax()]
+    if inliers.sum() < MOST * len(floors):
         return []
-    return [floor for floor, is_right in zip(floors, believed, strict=True) if is_right]
+    return [floor for floor, is_right in zip(floors, inliers, strict=True) if is_right]

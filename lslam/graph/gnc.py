@@ -1,8 +1,7 @@
-"""Solving a graph of which some loops and fixes may be wrong.
+"""Robust solution of a factor graph by graduated non-convexity with truncated least squares (Yang et al. 2020).
 
-Graduated non-convexity with truncated least squares (Yang et al. 2020): the first solution believes everything, the
-following ones give those that do not fit less and less weight, until each is in or out. Only loops and fixes are
-re-weighted, and a graph in which all fit is solved once. The M-estimators are gtsam's, for comparison.
+The first solution gives all outlier candidates full weight, the following ones re-weight them until each is an inlier or an
+outlier. A graph without outliers is solved once. The M-estimators are gtsam's, for comparison.
 """
 
 from __future__ import annotations
@@ -22,24 +21,25 @@ Floats = NDArray[np.float64]
 
 # The control parameter's growth per round, and rounds at most (Yang et al. take 1.4 and 100, from far worse starts).
 GROWTH, ROUNDS = 2.0, 30
-# Weights this near to 0 and 1 are decided; a factor under the first is left out.
+# Weights beyond these are decided; a factor below the first is left out.
 OUT, IN = 1e-3, 0.999
 
 
 @dataclass(frozen=True)
-class Doubted:
-    """A factor that may be wrong: `make(scale, kernel)` gives it with its covariance times `scale`; dim of its residual."""
+class OutlierCandidate:
+    """A factor that may be an outlier: `make(scale, kernel)` gives it with its covariance times `scale`; dim of its residual."""
 
     make: Callable[[float, Any], Any]
     dim: int
 
 
 @dataclass(frozen=True)
-class Settled:
-    """What the graph is in the end.
+class GncResult:
+    """The solution of a graph.
 
-    factors : gtsam's graph of all that is believed; values : the solution; weights : (D,) 0..1 per doubted factor
-    squared : (D,) whitened squared residuals at the solution; limits : (D,) up to which they are believed
+    factors : gtsam's graph of all inliers; values : the solution; weights : (D,) 0..1 per candidate
+    squared : (D,) whitened squared residuals at the solution; limits : (D,) their chi-square quantiles, inliers are below
+    rounds : solutions it took
     """
 
     factors: Any
@@ -50,22 +50,27 @@ class Settled:
     rounds: int
 
 
-def settle(fixed: Any, doubted: Sequence[Doubted], values: Any, config: GraphConfig) -> Settled:
-    """Solve, deciding what to believe as `config.robust` says."""
-    limits = np.array([quantile(config.probability, d.dim) for d in doubted])
-    plain = [d.make(1.0, None) for d in doubted]
+def gnc_solve(fixed: Any, candidates: Sequence[OutlierCandidate], values: Any, config: GraphConfig) -> GncResult:
+    """Solve, classifying the outlier candidates by the method `config.robust`."""
+    limits = np.array([quantile(config.probability, d.dim) for d in candidates])
+    plain = [d.make(1.0, None) for d in candidates]
     if config.robust == "gnc":
-        return _graduated(fixed, doubted, plain, limits, values, config)
-    factors = joined(fixed, [d.make(1.0, _kernel(config.robust, d.dim)) for d in doubted])
+        return _graduated(fixed, candidates, plain, limits, values, config)
+    factors = joined(fixed, [d.make(1.0, _kernel(config.robust, d.dim)) for d in candidates])
     values = solve(factors, values, config)
     squared = _squared(plain, values)
-    believed = (squared <= limits) | (config.robust == "none")
-    return Settled(factors, values, believed.astype(float), squared, limits, 1)
+    is_inlier = (squared <= limits) | (config.robust == "none")
+    return GncResult(factors, values, is_inlier.astype(float), squared, limits, 1)
 
 
 def _graduated(
-    fixed: Any, doubted: Sequence[Doubted], plain: list[Any], limits: Floats, values: Any, config: GraphConfig
-) -> Settled:
+    fixed: Any,
+    candidates: Sequence[OutlierCandidate],
+    plain: list[Any],
+    limits: Floats,
+    values: Any,
+    config: GraphConfig,
+) -> GncResult:
     weights = np.ones(len(plain))
     factors = joined(fixed, plain)
     values = solve(factors, values, config)
@@ -73,23 +78,23 @@ def _graduated(
     rounds = 1
     ratio = float((squared / limits).max()) if len(plain) else 0.0
     if ratio <= 1:
-        return Settled(factors, values, weights, squared, limits, rounds)
+        return GncResult(factors, values, weights, squared, limits, rounds)
     mu = 1.0 / (2.0 * ratio - 1.0)
     while rounds < ROUNDS:
         weights = truncated_weights(squared / limits, mu)
-        factors = joined(fixed, _weighted(doubted, plain, weights))
+        factors = joined(fixed, _weighted(candidates, plain, weights))
         values = solve(factors, values, config)
         squared = _squared(plain, values)
         rounds += 1
         if bool(np.all((weights < OUT) | (weights > IN))):
             break
         mu *= GROWTH
-    # The last word: what fits is in, with its own covariance, what does not is out.
-    believed = squared <= limits
-    weights = believed.astype(float)
-    factors = joined(fixed, [f for f, b in zip(plain, believed, strict=True) if b])
+    # Finally inliers have their own covariance, outliers are left out.
+    is_inlier = squared <= limits
+    weights = is_inlier.astype(float)
+    factors = joined(fixed, [f for f, b in zip(plain, is_inlier, strict=True) if b])
     values = solve(factors, values, config)
-    return Settled(factors, values, weights, _squared(plain, values), limits, rounds + 1)
+    return GncResult(factors, values, weights, _squared(plain, values), limits, rounds + 1)
 
 
 def truncated_weights(ratio: Floats, mu: float) -> Floats:
@@ -99,9 +104,9 @@ def truncated_weights(ratio: Floats, mu: float) -> Floats:
     return np.where(ratio <= low, 1.0, np.where(ratio >= high, 0.0, np.clip(middle, 0.0, 1.0)))
 
 
-def _weighted(doubted: Sequence[Doubted], plain: list[Any], weights: Floats) -> list[Any]:
+def _weighted(candidates: Sequence[OutlierCandidate], plain: list[Any], weights: Floats) -> list[Any]:
     chosen = []
-    for item, factor, weight in zip(doubted, plain, weights, strict=True):
+    for item, factor, weight in zip(candidates, plain, weights, strict=True):
         if weight >= OUT:
             chosen.append(factor if weight > IN else item.make(1.0 / weight, None))
     return chosen
@@ -123,7 +128,7 @@ def _squared(factors: list[Any], values: Any) -> Floats:
 
 
 def _kernel(name: str, dim: int) -> Any:
-    """M-estimators whose bend lies where 95 % of right residuals are below."""
+    """An M-estimator with its parameter at the 95 % quantile of inlier residuals."""
     import gtsam
 
     bend = float(np.sqrt(quantile(0.95, dim)))

@@ -1,7 +1,7 @@
-"""Where a trajectory lies on the Earth: one rigid transform to satellite fixes, most of which are right.
+"""Robust rigid alignment of a trajectory with GNSS fixes.
 
-A path on flat ground does not tell its roll about a straight street, and a short one not its tilt: the world's up
-direction is a measurement beside the fixes, which those outweigh as soon as the geometry allows it.
+Roll about a straight street and the tilt of a short path are not observable from fixes: the world's up direction is a
+measurement beside them, which they outweigh as soon as the geometry allows it.
 """
 
 from __future__ import annotations
@@ -16,30 +16,30 @@ from lslam.graph.chi_square import quantile
 
 Floats = NDArray[np.float64]
 
-# Pairs of fixes that are tried, and how far apart they have to be at least, as a share of the farthest.
+# RANSAC samples, and the least distance of a pair as a share of the largest.
 TRIALS, APART_SHARE = 500, 0.5
-# Fixes that agree, at least: one direction for half of them may be chance.
+# Least share of inliers.
 MAJORITY = 0.5
 
 
 @dataclass(frozen=True)
 class GnssAlignment:
-    """T_enu_world (4, 4); believed : (F,) bool; residuals : (F, 3) m, east, north, up, of fixes minus trajectory."""
+    """T_enu_world (4, 4); inliers : (F,) bool; residuals : (F, 3) m, east, north, up, of fixes minus trajectory."""
 
     T_enu_world: Floats
-    believed: NDArray[np.bool_]
+    inliers: NDArray[np.bool_]
     residuals: Floats
 
 
 def align(
     antenna: Floats, fixes: Floats, sigmas: Floats, slack: Floats, up: Floats, up_sigma: float, min_fixes: int
 ) -> GnssAlignment | None:
-    """Fit the antenna's positions in the world to its fixes; None when fewer than `min_fixes` or half of them agree.
+    """Fit the antenna's positions in the world to its fixes; None with fewer than `min_fixes` or half of them as inliers.
 
     Parameters
     ----------
     antenna : (F, 3) m, in the world of the trajectory; fixes : (F, 3) m, east, north, up; sigmas : (F, 3) m
-    slack : (F,) m that odometry may have drifted by at each, when it is judged
+    slack : (F,) m, one sigma of odometry's drift at each, in the inlier test
     up : (3,) unit, up in the world of the trajectory; up_sigma : rad
     """
     if len(antenna) < max(min_fixes, 2):
@@ -50,20 +50,20 @@ def align(
     T = _consensus(a, fixes, judged)
     if T is None:
         return None
-    # Again: what the first fit, tilted as it may be, leaves out may belong to it after all.
+    # Repeated, since outliers of the first fit may be inliers of the refined one.
     for _ in range(3):
-        believed = _fits(T, a, fixes, judged)
-        if believed.sum() < max(min_fixes, MAJORITY * len(a)):
+        inliers = _fits(T, a, fixes, judged)
+        if inliers.sum() < max(min_fixes, MAJORITY * len(a)):
             return None
-        T = _refined(T, a[believed], fixes[believed], judged[believed], up_sigma)
+        T = _refined(T, a[inliers], fixes[inliers], judged[inliers], up_sigma)
     T_enu_world = T @ se3.make(level, np.zeros(3))
-    return GnssAlignment(T_enu_world, believed, fixes - se3.apply(T_enu_world, antenna))
+    return GnssAlignment(T_enu_world, inliers, fixes - se3.apply(T_enu_world, antenna))
 
 
 def _tilted(a: Floats, up_sigma: float) -> Floats:
-    """(F, 3) m by which a tilt of one sigma moves points `a` (F, 3): up or down by the way to the side, to the side by little.
+    """(F, 3) m by which a tilt of one sigma moves points `a` (F, 3): mostly vertically.
 
-    A single sigma for all axes would let an eleventh of the way pass for tilt, and with it a fix far to the side.
+    A single sigma for all axes would accept a fix off to the side by an eleventh of the way.
     """
     way, height = np.linalg.norm(a[:, :2], axis=1), np.abs(a[:, 2])
     side = up_sigma * height + 0.5 * up_sigma**2 * way
@@ -71,7 +71,7 @@ def _tilted(a: Floats, up_sigma: float) -> Floats:
 
 
 def _consensus(a: Floats, fixes: Floats, sigmas: Floats) -> Floats | None:
-    """The heading and place, from two fixes, that most fixes agree with (RANSAC, 4 degrees of freedom)."""
+    """Heading and position by RANSAC over pairs of fixes (4 degrees of freedom)."""
     rng = np.random.default_rng(0)
     reach = float(np.linalg.norm(a[:, :2] - np.median(a[:, :2], axis=0), axis=1).max())
     best: Floats | None = None
@@ -83,9 +83,9 @@ def _consensus(a: Floats, fixes: Floats, sigmas: Floats) -> Floats | None:
             continue
         R = so3.exp(np.array([0.0, 0.0, np.arctan2(seen[1], seen[0]) - np.arctan2(own[1], own[0])]))
         T = se3.make(R, 0.5 * (fixes[i] + fixes[j]) - R @ (0.5 * (a[i] + a[j])))
-        # Place and heading come of two noisy fixes about as far apart as the others are from them.
+        # The hypothesis has the noise of two fixes.
         count = int(_fits(T, a, fixes, np.sqrt(3) * sigmas).sum())
-        # Of equals the farther pair: its heading is the better one.
+        # Of equals the farther pair, whose heading is more accurate.
         if (count, away) > most:
             best, most = T, (count, away)
     return best
@@ -98,7 +98,7 @@ def _fits(T: Floats, a: Floats, fixes: Floats, sigmas: Floats) -> NDArray[np.boo
 
 
 def _refined(T: Floats, a: Floats, fixes: Floats, sigmas: Floats, up_sigma: float) -> Floats:
-    """Least squares over all six degrees of freedom, tilt held by what is known of up."""
+    """Least squares over all six degrees of freedom, with the up direction as prior on the tilt."""
     from scipy.optimize import least_squares
 
     centre = a.mean(0)

@@ -1,7 +1,7 @@
-"""Buildings and trajectory in one graph: the thesis' first level, where each wall moves both.
+"""Buildings and trajectory in one graph.
 
-`non-rigid` lets the map believe in itself and doubts matches; the baseline (second thesis, section 2.5) holds the first
-building where the map has it, all others by nothing but matches, and doubts none.
+Mode `non-rigid` has the map's prior on all buildings and matches as outlier candidates; the baseline (Del Tufo, section 2.5)
+anchors the first building, leaves all others to their matches, and rejects none.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from lslam.config.graph import GraphConfig
 from lslam.geometry import noise, se2, se3
 from lslam.graph import factors
-from lslam.graph.building_graph import BuildingSolution, MapBelief
-from lslam.graph.gnc import Doubted, joined, settle
+from lslam.graph.building_graph import BuildingSolution, MapPrior
+from lslam.graph.gnc import OutlierCandidate, gnc_solve, joined
 from lslam.graph.pose_graph import check_graph
 from lslam.graph.problem import PlanarPrior, PoseGraph
 from lslam.graph.solve import marginal_blocks, marginals
@@ -26,7 +26,7 @@ from lslam.types.building_match import BuildingMatch
 
 Floats = NDArray[np.float64]
 
-FIRM, LOOSE = 1e-4, 1e4  # m and rad; what is held, and what nothing says
+FIRM, LOOSE = 1e-4, 1e4  # m and rad; sigmas of what is anchored, and of what has no prior
 
 
 @dataclass(frozen=True)
@@ -42,18 +42,17 @@ def optimise_jointly(
     graph: PoseGraph,
     middles: NDArray[np.float64],
     matches: Sequence[BuildingMatch],
-    belief: MapBelief | None,
+    map_prior: MapPrior | None,
     config: GraphConfig,
 ) -> JointSolution:
     """Poses of keyframes and displacements of the buildings with `middles` (B, 2), m, from everything at once.
 
     Parameters
     ----------
-    graph : in the frame of the map; its loops and fixes are taken at their word, so give the believed ones;
-        it has no planar priors
-    belief : what the map is trusted with; None is the baseline: the first building matched is held, no match is doubted
+    graph : in the frame of the map; its loop closures and fixes are inliers; it has no planar priors
+    map_prior : None is the baseline: the first building matched is anchored, no match is an outlier candidate
 
-    Raises GraphError when the graph is in pieces, singular or not finite.
+    Raises GraphError when the graph is disconnected, singular or not finite.
     """
     check_graph(graph)
     seen = list(dict.fromkeys(m.building for m in matches))
@@ -61,21 +60,21 @@ def optimise_jointly(
     certain = [factors.between(loop) for loop in graph.loops] + [factors.position(fix) for fix in graph.fixes]
     values = factors.start_values(graph, graph.poses)
     for building, key in keys.items():
-        shift = np.zeros(2) if belief is None else belief.shift
+        shift = np.zeros(2) if map_prior is None else map_prior.shift
         pose = se2.to_se3(np.append(middles[building] + shift, 0.0))
-        certain.append(_own(key, pose, _sigma(belief, building == seen[0])))
+        certain.append(_own(key, pose, _sigma(map_prior, building == seen[0])))
         _insert(values, key, pose)
     edges = [partial(factors.planar, _seen_from(m), graph.poses[m.keyframe], keys[m.building]) for m in matches]
     fixed = joined(factors.fixed_part(graph), certain)
-    doubted = [Doubted(edge, max(m.rank, 1)) for edge, m in zip(edges, matches, strict=True)]
-    settled = settle(fixed, doubted, values, config if belief else config.model_copy(update={"robust": "none"}))
-    poses = se3.normalise(factors.poses_of(settled.values, len(graph)))
-    places = np.array([settled.values.atPose3(key).matrix() for key in keys.values()]).reshape(-1, 4, 4)
+    candidates = [OutlierCandidate(edge, max(m.rank, 1)) for edge, m in zip(edges, matches, strict=True)]
+    solved = gnc_solve(fixed, candidates, values, config if map_prior else config.model_copy(update={"robust": "none"}))
+    poses = se3.normalise(factors.poses_of(solved.values, len(graph)))
+    places = np.array([solved.values.atPose3(key).matrix() for key in keys.values()]).reshape(-1, 4, 4)
     spread = np.zeros((0, 6, 6))
     if seen:
-        spread = noise.from_body(marginal_blocks(settled.factors, settled.values, keys.values()), places)
-    buildings = _solution(middles, seen, places, spread, settled.weights >= 0.5, belief)
-    covariances = marginals(settled.factors, settled.values, poses)
+        spread = noise.from_body(marginal_blocks(solved.factors, solved.values, keys.values()), places)
+    buildings = _solution(middles, seen, places, spread, solved.weights >= 0.5, map_prior)
+    covariances = marginals(solved.factors, solved.values, poses)
     covariances = covariances if graph.spread is None else covariances + graph.spread
     return JointSolution(poses, covariances, buildings)
 
@@ -91,11 +90,11 @@ def _seen_from(match: BuildingMatch) -> PlanarPrior:
     return PlanarPrior(match.keyframe, pose, undone.T @ match.information @ undone, match.rank)
 
 
-def _sigma(belief: MapBelief | None, is_first: bool) -> Floats:
-    """(3,) x, y (m), yaw (rad) by which a building may be off its place on the map."""
-    if belief is None:
+def _sigma(map_prior: MapPrior | None, is_first: bool) -> Floats:
+    """(3,) prior sigmas of a building's displacement: x, y (m), yaw (rad)."""
+    if map_prior is None:
         return np.full(3, FIRM if is_first else LOOSE)
-    return np.asarray(np.sqrt(belief.sigma**2 + np.append(belief.shift_sigma, 0.0) ** 2))
+    return np.asarray(np.sqrt(map_prior.sigma**2 + np.append(map_prior.shift_sigma, 0.0) ** 2))
 
 
 def _own(key: int, pose: Floats, sigma: Floats) -> Any:
@@ -117,15 +116,18 @@ def _solution(
     seen: list[int],
     places: Floats,
     spread: Floats,
-    believed: NDArray[np.bool_],
-    belief: MapBelief | None,
+    inliers: NDArray[np.bool_],
+    map_prior: MapPrior | None,
 ) -> BuildingSolution:
-    """Displacements of all; those that nothing was matched with follow the others."""
-    found, covariances = np.zeros((len(middles), 3)), np.tile(np.diag(_sigma(belief, False) ** 2), (len(middles), 1, 1))
+    """Displacements of all buildings; those without a match follow the shift of the others."""
+    found, covariances = (
+        np.zeros((len(middles), 3)),
+        np.tile(np.diag(_sigma(map_prior, False) ** 2), (len(middles), 1, 1)),
+    )
     if seen:
         found[seen] = se2.of_se3(places) - np.column_stack([middles[seen], np.zeros(len(seen))])
         covariances[seen] = spread[:, factors.PLANAR][:, :, factors.PLANAR]
-    shift = found[seen, :2].mean(axis=0) if seen else (np.zeros(2) if belief is None else belief.shift)
+    shift = found[seen, :2].mean(axis=0) if seen else (np.zeros(2) if map_prior is None else map_prior.shift)
     unseen = np.setdiff1d(np.arange(len(middles)), seen)
-    found[unseen, :2] = 0.0 if belief is None else shift
-    return BuildingSolution(found, covariances, shift, believed)
+    found[unseen, :2] = 0.0 if map_prior is None else shift
+    return BuildingSolution(found, covariances, shift, inliers)

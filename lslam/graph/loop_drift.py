@@ -1,8 +1,8 @@
-"""Odometry that runs away steadily, as loops reveal it, and that is set straight before the graph is solved.
+"""Steady drift of odometry, estimated from loop closures and corrected before the graph is solved.
 
-What odometry drifted by between the ends of a loop is a walk, of which each loop tells its own sum, or a rate, which one loop
-tells all the others. A graph knows walks only: it spreads what a loop is off by as well as it can, and is far too unsure where
-that was right. Which of the two it was is told by loops over different ways.
+The drift between the ends of a loop is a random walk, of which each loop closure observes one sum, or comes of a rate that all
+of them observe. A pose graph models random walks only: it distributes the error of a loop, with too large covariances where
+the drift was steady. Loop closures over different distances tell the two apart (empirical Bayes).
 """
 
 from __future__ import annotations
@@ -19,38 +19,37 @@ from lslam.graph.chi_square import quantile
 from lslam.graph.consistency import Ends, judge_loops, moved
 from lslam.graph.drift import chains
 from lslam.graph.pose_graph import check_graph, with_distances
-from lslam.graph.problem import DriftClaim, PoseGraph
-from lslam.graph.rates import LASTING, SIZES, hats, rate_roots, set_straight
+from lslam.graph.problem import EstimatedDrift, PoseGraph
+from lslam.graph.rates import LASTING, SIZES, correct_drift, linear_basis, rate_roots
 from lslam.stopping import checking
 from lslam.types.constraint import Constraint
 
 Floats = NDArray[np.float64]
 
-# Loops that are looked at, evenly spread.
+# Loop closures used at most, evenly spread.
 MOST = 30
-# Times the drift of the configuration, as variance of a walk, that are believed in.
+# Variances of the random walk tried, in multiples of the configured drift.
 WALKS = (0.0, 1e-4, 1e-3, 0.01, 0.1, 1.0, 10.0, 100.0)
-# Shares of the variance of rates that last: none or all of it, too, since loops are few and tell nothing of places between them.
-# What wanders smoothly would be known there too well.
+# Constant shares of the variance of rates: none and all of it, too, since loop closures are few and observe nothing between
+# them. A smooth prior would be overconfident there.
 LASTS = (0.0, *LASTING, 0.9999)
-# m from knot to knot, by which rates that wander differ from a walk, and into how many parts a long way is cut at the most.
+# m from knot to knot, above which varying rates differ from a random walk, and intervals at the most.
 APART, PARTS = 50.0, 100
-# How often the loops are asked, each time of what was set straight by the last answer.
+# Iterations, each linearised about the last estimate.
 ROUNDS = 4
-# Keyframes of which it is written out at a time what each rate does to them.
+# Keyframes whose Jacobians are held in memory at a time.
 PART = 256
-# Share of its variance that each error has for itself at the least: what is less drowns in rounding.
+# Least independent share of each variance, against rounding.
 LEAST = 1e-12
 
 
 def without_loop_drift(graph: PoseGraph, config: GraphConfig) -> PoseGraph:
-    """The graph set straight by the drift that its loops tell, which it says as `claim`; as it is where they tell none.
+    """The graph corrected by the steady drift that its loop closures reveal, `estimated_drift`; unchanged where there is none.
 
-    Rates and a walk have unknown sizes. There is drift where rates of which most lasts are likelier than any walk alone by more
-    than chance would have it; the rates are then of that kind with which the loops are likeliest, and the walk beside them is
-    the mean of those that are likely.
+    A likelihood ratio test against the null hypothesis of a random walk alone decides whether there is a mostly constant rate.
+    The hyperparameters of the rates maximise the marginal likelihood; the random walk beside them is the posterior mean.
 
-    Raises GraphError when the graph is in pieces or not finite.
+    Raises GraphError when the graph is disconnected or not finite.
     """
     check_graph(graph)
     graph = with_distances(graph)
@@ -59,36 +58,35 @@ def without_loop_drift(graph: PoseGraph, config: GraphConfig) -> PoseGraph:
     if not loops or graph.distances[-1] <= 0:
         return graph
     loops = [loops[i] for i in np.unique(np.linspace(0, len(loops) - 1, MOST).round().astype(int))]
-    at_knots = hats(graph.distances, _apart(graph.distances))
+    at_knots = linear_basis(graph.distances, _apart(graph.distances))
     does_last = np.repeat(LASTS, len(SIZES)) > 0.5
     straight, found = graph, np.zeros(6 * at_knots.shape[1])
     turned = np.tile(np.eye(3), (len(graph) - 1, 1, 1))
     for _ in range(ROUNDS):
         fit = _Fit(straight, loops, found, turned, config)
-        gain = float(fit.unlikeliness[:, 0].min() - fit.unlikeliness[:, 1:][:, does_last].min())
+        gain = float(fit.negative_log_likelihood[:, 0].min() - fit.negative_log_likelihood[:, 1:][:, does_last].min())
         if gain <= 0.0:
             return graph
         found, covariance, walk = fit.likeliest()
         rates = at_knots @ found.reshape(-1, 6)
         turned = _turned(rates[:, 3:], np.diff(graph.distances))
-        straight = set_straight(graph, np.column_stack([np.einsum("kij,kj->ki", turned, rates[:, :3]), rates[:, 3:]]))
+        straight = correct_drift(graph, np.column_stack([np.einsum("kij,kj->ki", turned, rates[:, :3]), rates[:, 3:]]))
     chance = quantile(config.probability, 6)
     if gain <= chance:
         return graph
     share = np.diff(graph.distances) / np.ptp(graph.distances)
     mean = np.kron(share @ at_knots, np.eye(6))
     sigma = np.sqrt(np.diag(mean @ covariance @ mean.T)).astype(np.float64)
-    claim = DriftClaim(-np.asarray(mean @ found, np.float64), sigma, gain, chance)
-    return replace(straight, spread=fit.spread(covariance, walk), walk=walk, claim=claim)
+    estimated_drift = EstimatedDrift(-np.asarray(mean @ found, np.float64), sigma, gain, chance)
+    return replace(straight, spread=fit.spread(covariance, walk), walk=walk, estimated_drift=estimated_drift)
 
 
 class _Fit:
-    """What loops say of the odometry of `graph`, which was set straight by `found` (6 n,), rates at the knots, already.
+    """Likelihood of rates given loop closures, for the odometry of `graph` corrected by `found` (6 n,), rates at the knots.
 
-    Rates are those along the axes of odometry as it came, which `turned` (K-1, 3, 3) takes into those of the graph.
-    Errors are twists of the world about the middle of the way: those of parts of the way add up there.
-    unlikeliness : (walks, 1 + LASTS * SIZES) minus twice the logarithm of the likelihood but for a constant; column 0 is that
-        without rates
+    Rates are along the axes of the odometry given, which `turned` (K-1, 3, 3) takes into those of the graph.
+    Errors are twists of the world about the middle of the way, where those of parts of the way add up.
+    negative_log_likelihood : (walks, 1 + LASTS * SIZES) twice, up to a constant; column 0 is the null hypothesis without rates
     """
 
     def __init__(
@@ -112,22 +110,22 @@ class _Fit:
         self._kinds = [(root, size) for root in roots for size in SIZES]
         seen = [part @ part.T for part in (self._rows @ root for root in roots)]
         drifted = [np.zeros_like(self._known)] + [size**2 * part for part in seen for size in SIZES]
-        self.unlikeliness = np.array(
-            [[_unlikely(self._walked(walk) + D, self._off) for D in drifted] for walk in checking(WALKS)]
+        self.negative_log_likelihood = np.array(
+            [[_negative_log_likelihood(self._walked(walk) + D, self._off) for D in drifted] for walk in checking(WALKS)]
         )
 
     def likeliest(self) -> tuple[Floats, Floats, float]:
-        """(6 n,) rates at the knots, their covariance (6 n, 6 n), and the walk beside them."""
+        """(6 n,) rates at the knots, their covariance (6 n, 6 n), and the random walk beside them."""
         prior, walk = self._choice()
         seen = self._rows @ prior
         gain = np.linalg.solve(self._walked(walk) + seen @ self._rows.T, seen).T
         return np.asarray(gain @ self._off), np.asarray(prior - gain @ seen), walk
 
     def spread(self, covariance: Floats, walk: float) -> Floats:
-        """(K, 6, 6) what poses are unsure by when rates are by `covariance` (6 n, 6 n), as the covariances of `Solution`.
+        """(K, 6, 6) covariances of poses due to the `covariance` (6 n, 6 n) of the rates, as those of `Solution`.
 
-        Beside what they are unsure by when the rates are known: loops that are closed then take back a part of what wrong rates
-        do, as they cannot tell it from a walk.
+        They add to the covariances given the rates: loop closures then take back a part of the error of wrong rates, since they
+        cannot tell it from a random walk.
         """
         known, walked = self._chains
         chain, taken = known + walk * walked, np.linalg.solve(self._walked(walk), self._rows)
@@ -139,8 +137,8 @@ class _Fit:
         return noise.transported(about_middle, self._poses[:, :3, 3])
 
     def _choice(self) -> tuple[Floats, float]:
-        """The covariance of rates of the likeliest kind before any loop, and the walk."""
-        likely = np.exp(-0.5 * (self.unlikeliness[:, 1:] - self.unlikeliness[:, 1:].min()))
+        """The prior covariance of the rates with maximum likelihood, and the variance of the random walk."""
+        likely = np.exp(-0.5 * (self.negative_log_likelihood[:, 1:] - self.negative_log_likelihood[:, 1:].min()))
         root, size = self._kinds[int(likely.sum(0).argmax())]
         return size**2 * root @ root.T, float(WALKS @ likely.sum(1) / likely.sum())
 
@@ -153,8 +151,8 @@ def _apart(distances: Floats) -> float:
     return max(APART, float(distances[-1]) / PARTS)
 
 
-def _unlikely(S: Floats, off: Floats) -> float:
-    """Minus twice the logarithm of the likelihood of `off` (N,) with the covariance S, but for a constant."""
+def _negative_log_likelihood(S: Floats, off: Floats) -> float:
+    """Twice the negative log-likelihood of `off` (N,) with the covariance S, up to a constant."""
     from scipy.linalg import solve_triangular
 
     L = np.linalg.cholesky(S + LEAST * np.diag(np.diag(S)))
@@ -163,7 +161,7 @@ def _unlikely(S: Floats, off: Floats) -> float:
 
 
 def _turned(turns: Floats, ways: Floats) -> Floats:
-    """(K-1, 3, 3) from the axes of odometry to those of odometry that was set right by `turns` (K-1, 3) per m."""
+    """(K-1, 3, 3) from the axes of odometry to those of odometry corrected by `turns` (K-1, 3) per m."""
     turned = [np.eye(3)]
     for turn in so3.exp(turns * ways[:, None]):
         turned.append(turn @ turned[-1])
@@ -171,11 +169,11 @@ def _turned(turns: Floats, ways: Floats) -> Floats:
 
 
 def _effects(poses: Floats, distances: Floats, turned: Floats) -> Iterator[tuple[slice, Floats]]:
-    """Keyframes, part after part, and (k, 6, 6 n) twist about the origin that rates at the knots have brought each of them.
+    """Keyframes, part after part, and their Jacobians (k, 6, 6 n): twist about the origin by rates at the knots.
 
     turned : as of `_turned`
     """
-    passed = np.diff(distances)[:, None] * hats(distances, _apart(distances))
+    passed = np.diff(distances)[:, None] * linear_basis(distances, _apart(distances))
     passed, turned = (np.concatenate([0.0 * rows[:1], rows]) for rows in (passed, turned))
     before = np.zeros((6, passed.shape[1], 6))
     for begin in checking(range(0, len(poses), PART)):
@@ -189,15 +187,15 @@ def _effects(poses: Floats, distances: Floats, turned: Floats) -> Iterator[tuple
 
 
 def _walked_along(accumulated: Floats, keyframes: NDArray[np.intp], ends: Ends) -> Floats:
-    """(k, 6, 6 L) covariance of what errors of odometry have brought keyframes (k,) with what loops, a before b, see of it."""
+    """(k, 6, 6 L) covariance of odometry's errors at keyframes (k,) with those that loop closures, a before b, observe."""
     last, first = (accumulated[np.minimum.outer(keyframes, end)] for end in (ends.b, ends.a))
     return np.asarray((last - first).transpose(0, 2, 1, 3).reshape(len(keyframes), 6, -1))
 
 
 def _shared(accumulated: Floats, ends: Ends) -> Floats:
-    """(6 L, 6 L) covariance of what loops, a before b, are off by: two have the errors of the way in common that both go.
+    """(6 L, 6 L) covariance of the residuals of loop closures, a before b: two share the errors of the way in common.
 
-    accumulated : (K, 6, 6) of the twist about the origin that errors of odometry have brought each pose
+    accumulated : (K, 6, 6) of each pose's twist about the origin by errors of odometry
     """
     first = np.maximum.outer(ends.a, ends.a)
     last = np.maximum(np.minimum.outer(ends.b, ends.b), first)

@@ -19,7 +19,7 @@ from lslam.types.scan_result import ScanResult
 
 Floats = NDArray[np.float64]
 
-# m and rad; what a step is wrong by at the least when a method states no covariance.
+# m and rad; least sigmas of a step when a method states no covariance.
 LEAST_M, LEAST_RAD = 1e-3, 1e-4
 
 
@@ -29,10 +29,10 @@ def odometry_constraints(
     config: GraphConfig,
     fitness: Sequence[float] | None = None,
 ) -> list[Constraint]:
-    """From each keyframe to the next, with what odometry's uncertainty grew by on the way.
+    """From each keyframe to the next, with the growth of odometry's covariance on the way.
 
     A scan's covariance is that of the local map and that of its registration on it; only the former accumulates
-    (`registration.uncertainty`). Methods without covariances are taken to drift as `config` says of drift.
+    (`registration.uncertainty`). Methods without covariances get the drift of `config`.
     fitness : of each keyframe but the first with the one before, m2, where covariances come of that
     """
     constraints = []
@@ -81,7 +81,7 @@ def fitness_covariance(score: float, config: GraphConfig) -> Floats:
 
 
 def growth(a: ScanResult, b: ScanResult, way: float, config: GraphConfig) -> Floats:
-    """(6, 6) covariance, world axes, of what odometry's error grew by from scan `a` to scan `b`, `way` m on."""
+    """(6, 6) growth of odometry's covariance, world axes, from scan `a` to scan `b`, `way` m on."""
     of_a, of_b = _of_map(a), _of_map(b)
     if of_a is None or of_b is None:
         turn = np.deg2rad(config.drift_deg_per_100m) / 100 * way + LEAST_RAD
@@ -94,10 +94,10 @@ def corrected(
     results: Sequence[ScanResult], keyframes: Sequence[Keyframe], poses: Floats, covariances: Floats, drift: float,
     config: GraphConfig,
 ) -> list[ScanResult]:  # fmt: skip
-    """All scans where the optimised keyframes `poses` (K, 4, 4) put them, with covariances.
+    """All scans corrected by the optimised keyframes `poses` (K, 4, 4), with covariances.
 
-    Between two keyframes the correction is interpolated on SE(3) over time, so that no seam shows.
-    covariances : (K, 6, 6) of the keyframes in the world; drift : how much odometry drifts beside its own, `Solution.drift`
+    Between two keyframes the correction is interpolated on SE(3) over time.
+    covariances : (K, 6, 6) of the keyframes in the world; drift : `Solution.drift`
     """
     moved = np.stack([r.T_world_lidar for r in results])
     final, owners = _bent(results, keyframes, moved, poses)
@@ -110,7 +110,7 @@ def corrected(
 
 
 def bent(results: Sequence[ScanResult], keyframes: Sequence[Keyframe], poses: Floats) -> list[ScanResult]:
-    """All scans where the keyframes `poses` (K, 4, 4) put them, as `corrected` has it, with the covariances they had."""
+    """All scans corrected by the keyframes `poses` (K, 4, 4) as in `corrected`, with their own covariances."""
     final, _ = _bent(results, keyframes, np.stack([r.T_world_lidar for r in results]), poses)
     return [replace(result, T_world_lidar=T) for result, T in zip(results, final, strict=True)]
 
@@ -118,7 +118,7 @@ def bent(results: Sequence[ScanResult], keyframes: Sequence[Keyframe], poses: Fl
 def _bent(
     results: Sequence[ScanResult], keyframes: Sequence[Keyframe], moved: Floats, poses: Floats
 ) -> tuple[Floats, NDArray[np.intp]]:
-    """(N, 4, 4) poses of all scans, which odometry has at `moved`, and the keyframe that is the nearest in time, (N,)."""
+    """(N, 4, 4) corrected poses of all scans, `moved` by odometry, and the keyframe nearest in time, (N,)."""
     scans = np.array([k.scan for k in keyframes])
     stamps = np.array([k.stamp_ns for k in keyframes], np.int64)
     left = np.clip(np.searchsorted(scans, np.arange(len(results)), side="right") - 1, 0, max(len(scans) - 2, 0))
@@ -134,7 +134,7 @@ def _bent(
 
 
 def positive(covariance: Floats) -> Floats:
-    """The nearest covariance (6, 6) without negative eigenvalues: a difference of two estimates may have some."""
+    """The nearest positive semidefinite matrix (6, 6): a difference of two covariances may have negative eigenvalues."""
     scaled = np.array([1.0, 1, 1, 10, 10, 10])
     values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T) * np.outer(scaled, scaled))
     return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T / np.outer(scaled, scaled))
@@ -144,7 +144,7 @@ def _covariance(
     result: ScanResult, keyframe: ScanResult, final: Floats, moved: Floats, pose: Floats, covariance: Floats,
     drift: float, config: GraphConfig,
 ) -> Floats:  # fmt: skip
-    """(6, 6) of a scan's pose: its keyframe's, what odometry adds between them, and its own registration."""
+    """(6, 6) of a scan's pose: its keyframe's, odometry's growth between them, and its own registration."""
     step = final[:3, 3] - pose[:3, 3]
     first, last = (keyframe, result) if keyframe.stamp_ns <= result.stamp_ns else (result, keyframe)
     way = float(np.linalg.norm(step))

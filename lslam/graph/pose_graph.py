@@ -1,4 +1,4 @@
-"""Optimise the poses of keyframes: the whole recipe."""
+"""Pose graph optimisation: consistency checks, drift estimation, robust solution, marginals."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from lslam.geometry import noise, se3
 from lslam.graph import factors
 from lslam.graph.consistency import judge_loops
 from lslam.graph.drift import drift_factor, with_drift
-from lslam.graph.gnc import Doubted, Settled, joined, settle
+from lslam.graph.gnc import GncResult, OutlierCandidate, gnc_solve, joined
 from lslam.graph.problem import PoseGraph, Solution
 from lslam.graph.solve import marginal_blocks, marginals, solve_incrementally
 from lslam.types.constraint import LoopStage
@@ -23,12 +23,12 @@ Floats = NDArray[np.float64]
 
 
 def optimise(graph: PoseGraph, config: GraphConfig) -> Solution:
-    """Poses and covariances of all keyframes, and which loops, fixes and planar priors were believed.
+    """Poses and covariances of all keyframes, and which loop closures, fixes and planar priors are inliers.
 
-    Loops that contradict each other or odometry go first; odometry's covariances grow by the drift that the loops left show;
-    then everything is solved together, loops, fixes and planar priors that still do not fit being given up on the way.
+    Loop closures inconsistent with each other or with odometry are rejected first; odometry's covariances grow by the drift
+    that the others reveal; then all is solved together, with loop closures, fixes and planar priors as outlier candidates.
 
-    Raises GraphError when the graph is in pieces, singular or not finite.
+    Raises GraphError when the graph is disconnected, singular or not finite.
     """
     check_graph(graph)
     graph = with_distances(graph)
@@ -41,77 +41,77 @@ def optimise(graph: PoseGraph, config: GraphConfig) -> Solution:
     may_tilt = graph.is_anchored and len(graph.ups) > 0
     is_placed = graph.start_sigma is not None or not graph.is_anchored
     fixed = factors.fixed_part(graph, may_tilt)
-    doubted = [Doubted(partial(factors.between, loop), 6) for loop in loops]
-    doubted += [Doubted(partial(factors.position, fix), 3) for fix in graph.fixes]
+    candidates = [OutlierCandidate(partial(factors.between, loop), 6) for loop in loops]
+    candidates += [OutlierCandidate(partial(factors.position, fix), 3) for fix in graph.fixes]
     key = factors.map_key(graph)
-    doubted += [
-        Doubted(partial(factors.planar, prior, graph.poses[prior.keyframe], key), prior.rank)
+    candidates += [
+        OutlierCandidate(partial(factors.planar, prior, graph.poses[prior.keyframe], key), prior.rank)
         for prior in graph.map_priors
     ]
     values = factors.start_values(graph, graph.poses)
     if config.incremental:
-        everything = joined(fixed, [item.make(1.0, None) for item in doubted])
+        everything = joined(fixed, [item.make(1.0, None) for item in candidates])
         values = solve_incrementally(everything, values, len(graph))
-    settled = settle(fixed, doubted, values, config)
-    poses = se3.normalise(factors.poses_of(settled.values, len(graph)))
+    solved = gnc_solve(fixed, candidates, values, config)
+    poses = se3.normalise(factors.poses_of(solved.values, len(graph)))
     if not np.isfinite(poses).all():
         raise GraphError("the pose graph cannot be optimised: its poses are not finite")
     if may_tilt and not is_placed:
         poses, covariances = _upright(
-            graph, poses, [d for d, w in zip(doubted, settled.weights, strict=True) if w >= 0.5]
+            graph, poses, [d for d, w in zip(candidates, solved.weights, strict=True) if w >= 0.5]
         )
     else:
-        covariances = marginals(settled.factors, settled.values, poses)
+        covariances = marginals(solved.factors, solved.values, poses)
     covariances = covariances if graph.spread is None else covariances + graph.spread
-    doubts = [
+    rejections = [
         ""
         if weight >= 0.5
         else f"{np.sqrt(squared / limit):.1f} times as far as it may be from where all others put it"
-        for weight, squared, limit in zip(settled.weights, settled.squared, settled.limits, strict=True)
+        for weight, squared, limit in zip(solved.weights, solved.squared, solved.limits, strict=True)
     ]
-    for i, doubt in zip(kept, doubts, strict=False):
-        reasons[i] = reasons[i] or doubt
+    for i, rejection in zip(kept, rejections, strict=False):
+        reasons[i] = reasons[i] or rejection
     rest = len(loops) + len(graph.fixes)
-    shift, shift_sigma = _map_shift(graph, settled)
+    shift, shift_sigma = _map_shift(graph, solved)
     return Solution(
         poses=poses,
         covariances=covariances,
         loop_reasons=reasons,
         loop_stages=stages,
-        fix_believed=settled.weights[len(loops) : rest] >= 0.5,
-        map_reasons=doubts[rest:],
+        fix_inliers=solved.weights[len(loops) : rest] >= 0.5,
+        map_reasons=rejections[rest:],
         shift=shift,
         shift_sigma=shift_sigma,
         drift=drift,
-        rounds=settled.rounds,
-        error=float(settled.factors.error(settled.values)),
+        rounds=solved.rounds,
+        error=float(solved.factors.error(solved.values)),
     )
 
 
-def _map_shift(graph: PoseGraph, settled: Settled) -> tuple[Floats, Floats]:
-    """(2,) m by which the map is off as a whole, and its sigma; zero and infinity without a map."""
+def _map_shift(graph: PoseGraph, solved: GncResult) -> tuple[Floats, Floats]:
+    """(2,) m, common shift of the map, and its sigma; zero and infinity without a map."""
     if not graph.map_priors:
         return np.zeros(2), np.full(2, np.inf)
     key = factors.map_key(graph)
-    frame = settled.values.atPose3(key).matrix()
-    covariance = noise.from_body(marginal_blocks(settled.factors, settled.values, [key]), frame[None])[0]
+    frame = solved.values.atPose3(key).matrix()
+    covariance = noise.from_body(marginal_blocks(solved.factors, solved.values, [key]), frame[None])[0]
     return frame[:2, 3], np.sqrt(np.diag(covariance)[:2])
 
 
-def _upright(graph: PoseGraph, poses: Floats, believed: list[Doubted]) -> tuple[Floats, Floats]:
-    """The solution with its first pose where it was, and its covariances as seen from there.
+def _upright(graph: PoseGraph, poses: Floats, inliers: list[OutlierCandidate]) -> tuple[Floats, Floats]:
+    """The solution with its first pose as before, and its covariances relative to that pose.
 
-    Which way is up in the world came out of the solution: gravity bends no trajectory to a first guess of it.
+    Up in the world is estimated by the solution, so that a wrong initial guess of it bends no trajectory.
     """
     back = graph.poses[0] @ se3.inverse(poses[0])
     poses = se3.normalise(back @ poses)
     turned = replace(graph, world_up=back[:3, :3] @ graph.world_up)
-    whole = joined(factors.fixed_part(turned), [item.make(1.0, None) for item in believed])
+    whole = joined(factors.fixed_part(turned), [item.make(1.0, None) for item in inliers])
     return poses, marginals(whole, factors.start_values(turned, poses), poses)
 
 
 def check_graph(graph: PoseGraph) -> None:
-    """Raise GraphError for a graph that has no solution: numbers that are not finite, keyframes that hang on nothing."""
+    """Raise GraphError for a graph without a solution: numbers that are not finite, disconnected keyframes."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
@@ -133,7 +133,7 @@ def check_graph(graph: PoseGraph) -> None:
 
 
 def with_distances(graph: PoseGraph) -> PoseGraph:
-    """The graph with the distances travelled along its poses, where nobody filled them in."""
+    """The graph with the distances travelled along its poses, where they are missing."""
     if len(graph.distances) == len(graph):
         return graph
     steps = np.linalg.norm(np.diff(graph.poses[:, :3, 3], axis=0), axis=1)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.graph.fix_noise import Wander
+from lslam.graph.fix_noise import GaussMarkovNoise
 from lslam.types.constraint import Constraint, LoopStage, Turn
 
 Floats = NDArray[np.float64]
@@ -16,10 +16,10 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class PositionFix:
-    """A position that was measured: `keyframe`'s point `arm` (3,), m, in its own axes, lies at `position` (3,), m.
+    """A measured position: `keyframe`'s point `arm` (3,), m, in its own axes, lies at `position` (3,), m.
 
-    sigma : (3,) m; the arm is the antenna at the instant of the fix, as seen from the keyframe by odometry
-    instant : which of the graph's `wander` it errs by as well, None for none
+    sigma : (3,) m; the arm is the antenna at the instant of the fix, relative to the keyframe by odometry
+    instant : index of the correlated error in the graph's `fix_noise`, None for none
     """
 
     keyframe: int
@@ -33,7 +33,7 @@ class PositionFix:
 class UpDirection:
     """Which way is up (3,), unit, in the axes of `keyframe`.
 
-    sigma : rad; share : part of one measurement that it is, as errors of keyframes that follow each other are the same error
+    sigma : rad; share : weight as a part of one measurement, as errors of successive keyframes are correlated
     """
 
     keyframe: int
@@ -55,10 +55,10 @@ class FloorPlane:
 
 @dataclass(frozen=True)
 class PlanarPrior:
-    """Where the map puts `keyframe`, seen from above: `pose` (3,) x, y (m), yaw (rad) in the frame of the map.
+    """Planar prior on `keyframe`: `pose` (3,) x, y (m), yaw (rad) in the frame of the map.
 
-    information : (3, 3) in its axes, 1/m2 and 1/rad2, singular along what is free; rank : directions that are not
-    share : what of it counts beside all others, since those that look at the same walls make the same error
+    information : (3, 3) in its axes, 1/m2 and 1/rad2, singular along unobserved directions; rank : observed ones
+    share : weight beside the other priors, since those from the same walls have correlated errors
     """
 
     keyframe: int
@@ -69,13 +69,13 @@ class PlanarPrior:
 
 
 @dataclass(frozen=True)
-class DriftClaim:
-    """A drift that odometry is said to have.
+class EstimatedDrift:
+    """An estimated drift of odometry.
 
     rates, sigma : per m, the mean over the way: (3,) m along x and y of the world, rad of heading, to the left; or (6,) m along
         x, y and z, rad about them
-    gain : how much lower minus twice the logarithm of the likelihood is with it; chance : what that stays below by chance
-    rms : per m, the root mean square over the way of rates that wander; None of rates that last
+    gain : likelihood ratio statistic against no drift; chance : its critical value under the null hypothesis
+    rms : per m, the root mean square over the way of varying rates; None for constant ones
     """
 
     rates: Floats
@@ -85,28 +85,28 @@ class DriftClaim:
     rms: Floats | None = None
 
     @property
-    def does_wander(self) -> bool:
-        """Whether the rates are others from place to place."""
+    def is_varying(self) -> bool:
+        """Whether the rates vary along the way."""
         return self.rms is not None
 
 
 @dataclass(frozen=True)
 class PoseGraph:
-    """Everything known of K keyframes.
+    """The measurements of K keyframes.
 
-    poses : (K, 4, 4) where they are now
-    distances : (K,) m travelled up to each, for what odometry may have drifted
+    poses : (K, 4, 4) initial values
+    distances : (K,) m travelled up to each, for the model of odometry's drift
     world_up : (3,) unit, up in the world of `poses`, needed where there are `ups`
-    map_priors : planar priors in the frame of a map that is off as a whole by `shift_sigma` m, and one sigma by `map_sigma` m
+    map_priors : planar priors in the frame of a map with a common shift of `shift_sigma` m, and errors of `map_sigma` m
         about each place
-    is_anchored : whether the first pose is held where it is; else the fixes hold the graph
-    start : (3,) x, y (m), yaw (rad) that somebody gave of the first pose; None takes `poses`
-    start_sigma : (3,) m, m, rad, how well these are known of a first pose that is held only otherwise
-    is_rigid : odometry is trusted: the whole moves, and nothing bends it
-    walk : factor on `drift.drift_covariance` that odometry errs by at the least beside its covariances
-    spread : (K, 6, 6) what poses are unsure by beside all that, as the covariances of `Solution`; None for nothing
-    claim : the drift that odometry was set right by before it came here
-    wander : the error that fixes have in common, None where each has one of its own
+    is_anchored : whether the first pose has a tight prior; else the fixes anchor the graph
+    start : (3,) x, y (m), yaw (rad), prior of the first pose; None takes `poses`
+    start_sigma : (3,) m, m, rad, its sigmas; height, roll and pitch keep the tight prior
+    is_rigid : odometry has no error: the trajectory moves as a whole
+    walk : least factor on `drift.drift_covariance` that is added to odometry's covariances
+    spread : (K, 6, 6) covariances of poses to be added to those of `Solution`; None for nothing
+    estimated_drift : the drift that odometry was corrected by
+    fix_noise : correlated noise of the fixes, None where they are independent
     """
 
     poses: Floats
@@ -127,8 +127,8 @@ class PoseGraph:
     is_rigid: bool = False
     walk: float = 0.0
     spread: Floats | None = None
-    claim: DriftClaim | None = None
-    wander: Wander | None = None
+    estimated_drift: EstimatedDrift | None = None
+    fix_noise: GaussMarkovNoise | None = None
 
     def __len__(self) -> int:
         return len(self.poses)
@@ -139,12 +139,12 @@ class Solution:
     """Optimised keyframes.
 
     poses : (K, 4, 4); covariances : (K, 6, 6) marginal, of t' = t + d[:3], R' = exp(d[3:]) R in world axes, m2 and rad2
-    loop_reasons : per loop of the graph, empty when it was believed, else why not
-    loop_stages : per loop, what decided
-    fix_believed : (F,) bool per fix
-    map_reasons : per planar prior, empty when it was believed, else why not
-    shift, shift_sigma : (2,) m by which the map is off as a whole (true minus map), and how well that is known
-    drift : factor on `graph.drift.drift_covariance` that odometry's covariances were short of, 0 when loops bear them out
+    loop_reasons : per loop closure of the graph why it is rejected, empty when accepted
+    loop_stages : per loop closure, what decided: `consistency` or `graph`
+    fix_inliers : (F,) bool per fix
+    map_reasons : per planar prior why it is rejected, empty when accepted
+    shift, shift_sigma : (2,) m, common shift of the map (true minus map), and its sigma
+    drift : factor on `graph.drift.drift_covariance` added to odometry's covariances, 0 when they are consistent
     rounds : solutions it took; error : half the sum of squared whitened residuals at the end
     """
 
@@ -152,7 +152,7 @@ class Solution:
     covariances: Floats
     loop_reasons: list[str]
     loop_stages: list[LoopStage]
-    fix_believed: NDArray[np.bool_]
+    fix_inliers: NDArray[np.bool_]
     map_reasons: list[str]
     shift: Floats
     shift_sigma: Floats

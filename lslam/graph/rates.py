@@ -1,7 +1,7 @@
-"""Rates at which odometry runs away along the way, what is believed of them, and odometry set right by them.
+"""Rates of odometry's drift along the way: their linear basis, their priors, and odometry corrected by them.
 
-Rates are given at knots and straight between: a calibration has one for the whole run, what bends or slips another for a
-while; and those that wander are others wherever one looks.
+Rates are given at knots and interpolated linearly. A calibration error has one rate for the whole run, bending and slip change
+over some distance; varying rates are a Markov process or a random walk.
 """
 
 from __future__ import annotations
@@ -17,15 +17,14 @@ from lslam.graph.problem import PoseGraph
 
 Floats = NDArray[np.float64]
 
-# m over which a rate is about one and the same.
+# m, correlation length of a rate.
 MEMORY = 100.0
-# Shares of the variance of rates that last for the whole run, as a calibration does, and times the drift that the configuration
-# believes in: the likeliest are taken.
+# Hyperparameters tried: share of the variance of rates that is constant over the run, and scale of the configured drift.
 LASTING, SIZES = (0.5, 0.9, 0.99), (0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
 
 
-def hats(distances: NDArray[np.float64], apart: float = MEMORY) -> Floats:
-    """(K-1, n) how much each knot counts halfway between two keyframes that were reached after `distances` (K,), m.
+def linear_basis(distances: NDArray[np.float64], apart: float = MEMORY) -> Floats:
+    """(K-1, n) linear (hat) basis functions of the knots, halfway between keyframes reached after `distances` (K,), m.
 
     apart : m from knot to knot at the most
     """
@@ -37,28 +36,28 @@ def rate_roots(
     length: float, config: GraphConfig, axes: list[int], lasting: tuple[float, ...] = LASTING, apart: float = MEMORY,
     is_smooth: bool = True,
 ) -> list[Floats]:  # fmt: skip
-    """(n d, n d) each, roots of covariances of the rates at the knots of so many m, one for each share that lasts.
+    """(n d, n d) each, square roots of the prior covariance of the rates at the knots over `length` m, per constant share.
 
-    axes : the d that are asked about, of x, y, z and the turns about them
+    axes : the d among x, y, z and the rotations about them
     apart : m from knot to knot at the most
-    is_smooth : whether what does not last comes and goes gently; else it wanders as a Markov process does
+    is_smooth : whether the varying part has a squared exponential kernel; else it is a Markov process
     """
     knots = _knots(length, apart)
     gap = np.abs(knots[:, None] - knots) / MEMORY
     alike = np.exp(-0.5 * gap**2 if is_smooth else -gap)
-    size = _believed(config, axes)
+    size = _prior_sigmas(config, axes)
     return [np.asarray(np.kron(np.linalg.cholesky(share + (1.0 - share) * alike), size)) for share in lasting]
 
 
 def walk_root(length: float, config: GraphConfig, axes: list[int], apart: float) -> Floats:
-    """(n d, n d) as `rate_roots`, of rates no two of which are alike: a walk, as far over `MEMORY` as rates that last."""
+    """(n d, n d) as `rate_roots`, of independent rates: a random walk, over `MEMORY` as far as constant rates."""
     knots = _knots(length, apart)
     times = np.sqrt(MEMORY / (knots[1] - knots[0]))
-    return np.asarray(np.kron(times * np.eye(len(knots)), _believed(config, axes)))
+    return np.asarray(np.kron(times * np.eye(len(knots)), _prior_sigmas(config, axes)))
 
 
-def set_straight(graph: PoseGraph, rates: NDArray[np.float64]) -> PoseGraph:
-    """The graph with poses and odometry set right by `rates` (K-1, 6) per m: m along the axes of the world, rad about them."""
+def correct_drift(graph: PoseGraph, rates: NDArray[np.float64]) -> PoseGraph:
+    """The graph with poses and odometry corrected by `rates` (K-1, 6) per m: m along the axes of the world, rad about them."""
     steps = se3.relative(graph.poses[:-1], graph.poses[1:])
     by = rates * np.diff(graph.distances)[:, None]
     poses = [graph.poses[0]]
@@ -77,7 +76,7 @@ def set_straight(graph: PoseGraph, rates: NDArray[np.float64]) -> PoseGraph:
     return replace(graph, poses=moved, odometry=odometry)
 
 
-def _believed(config: GraphConfig, axes: list[int]) -> Floats:
+def _prior_sigmas(config: GraphConfig, axes: list[int]) -> Floats:
     """(d, d) diagonal: one sigma of each rate."""
     percent, turn = 0.01 * config.drift_percent, np.radians(config.drift_deg_per_100m) / 100
     return np.diag(np.repeat([percent, turn], 3)[axes])

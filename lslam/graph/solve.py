@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from lslam.config.graph import GraphConfig
 from lslam.errors import GraphError
 from lslam.geometry import noise
-from lslam.graph.factors import WANDER
+from lslam.graph.factors import FIX_NOISE
 from lslam.stopping import check_stop, checking
 
 Floats = NDArray[np.float64]
@@ -57,9 +57,9 @@ def solve_incrementally(factors: Any, values: Any, count: int) -> Any:
         due[max((key for key in names if key < count), default=0)].append(factor)
     params = gtsam.ISAM2Params()
     params.relinearizeSkip = 1
-    together = [key for key in map(int, values.keys()) if key >= WANDER]
+    together = [key for key in map(int, values.keys()) if key >= FIX_NOISE]
     if together:
-        # Beside odometry of a centimetre a metre that fixes err by together is little: normal equations lose it.
+        # Beside odometry of a centimetre the information of correlated noise of a metre is lost in the normal equations.
         params.setFactorization("QR")
     solver = gtsam.ISAM2(params)
     try:

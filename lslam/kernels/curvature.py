@@ -1,4 +1,4 @@
-"""LOAM's features: points in ring order, the curvature along each ring (first thesis, equation 2.21), edges and planes.
+"""LOAM's features: points in ring order, the curvature along each ring (Girolimetto, equation 2.21), edges and planes.
 
 A ring is walked in the order its beams were fired. `order` (K,) holds indices of points, ring after ring; ring k owns
 `order[starts[k]:starts[k + 1]]`.

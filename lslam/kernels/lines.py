@@ -69,7 +69,7 @@ def line_of(slot: int, size: float, min_points: float, floor: float, moments: Fl
 @inline
 def add_line(H: Floats, g: Floats, facts: Floats, ex: float, ey: float, ez: float, ux: float, uy: float, uz: float,
              rx: float, ry: float, rz: float, variance: float, c2: float) -> None:  # fmt: skip
-    """Point to line, equation 2.24 of the thesis, squared: (I - u u^T) e has two components across the unit direction u.
+    """Point to line, equation 2.24 of Girolimetto, squared: (I - u u^T) e has two components across the unit direction u.
 
     `e` goes from a point of the line to the transformed point, `r` is that point seen from the sensor, world axes.
     Geman-McClure weight of squared width `c2`; upper triangle of H.

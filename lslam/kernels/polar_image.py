@@ -16,7 +16,7 @@ EMPTY = -np.inf
 def polar_image(points: NDArray[np.float32], rings: int, sectors: int, reach: float) -> NDArray[np.float32]:
     """Greatest z of the points (N, 3), m, in each of `rings` x `sectors` cells within `reach` m; -inf where none lies.
 
-    Sector 0 begins at +x and sectors count counter-clockwise (equations 2.34 and 2.35 of the first thesis).
+    Sector 0 begins at +x and sectors count counter-clockwise (equations 2.34 and 2.35 of Girolimetto).
     """
     image = np.full((rings, sectors), np.float32(EMPTY))
     per_metre = rings / reach

@@ -268,7 +268,7 @@ def find_segments(
 ) -> Floats:
     """Segments (S, 6) through `flat`, most points first found: x y of both ends, number of points, their rms, m.
 
-    Second thesis, algorithm 3.1: the best of a few lines, the largest cluster of its inliers, a segment between its extreme
+    Del Tufo, algorithm 3.1: the best of a few lines, the largest cluster of its inliers, a segment between its extreme
     projections; the cluster is taken away and the next line sought, until fewer than `min_cluster` points are left or no
     row of random numbers `tries` (R, K) is. A line is tried through one point along its own plane, not through two.
     """

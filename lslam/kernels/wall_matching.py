@@ -29,7 +29,7 @@ def wrapped(angle: float) -> float:
 def corners(segments: Floats, reach: float, sharpest: float) -> Floats:
     """Corners of all pairs of segments (N, 4) that meet at `sharpest` rad or more, at most `reach` m beyond their ends.
 
-    Angular edges have a common end, virtual edges have none (second thesis, section 3.3.1): the weight is the shorter of
+    Angular edges have a common end, virtual edges have none (Del Tufo, section 3.3.1): the weight is the shorter of
     both lengths, less the farther the walls have to be produced.
     """
     n = len(segments)
@@ -164,7 +164,7 @@ def line_distance(
 ) -> tuple[float, float]:
     """Distance of the segment a b to a target one, m, and how much of it is covered, m; `farthest`, 0 when they are no pair.
 
-    Second thesis, section 3.3.4 and figure 3.8. Without coverage: mean distance of both ends from the target, beyond its
+    Del Tufo, section 3.3.4 and figure 3.8. Without coverage: mean distance of both ends from the target, beyond its
     ends from the end. With coverage: mean distance from its line where the two lie side by side. `likeness` is the least
     cosine between the directions: a wall seen from outside is no wall seen from inside.
     """
@@ -220,7 +220,7 @@ def refine(
 ) -> tuple[Floats, Floats, Floats, float, Longs]:  # fmt: skip
     """Gauss-Newton of the walls' distances across their partners' lines, from `pose`, pairs anew with each of `gates`, m.
 
-    The last of them is repeated until the pose stays, but at most `more` times: walls that are half doubted pull slowly.
+    The last of them is repeated until the pose stays, but at most `more` times: walls with half weight converge slowly.
     Every wall is one measurement of an offset and an angle: two points at +- length / sqrt(12) about its middle, weighted
     length / (length + short), downweighted as Geman and McClure do. `trust` (3,), the inverse variances about `prior` in units
     of a wall's, keeps what no wall says. Returns the pose, the normal matrix of the walls alone about their centre, the

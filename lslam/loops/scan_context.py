@@ -36,7 +36,7 @@ def describe(points: NDArray[np.float32], rings: int, sectors: int, reach: float
 def distances(query: Images, images: Images) -> NDArray[np.float64]:
     """(C, S) distance of a query (R, S) to images (C, R, S) at each of S column shifts: mean of 1 - cos over the columns.
 
-    Shift n compares column j of the query with column j + n (equations 2.36 and 2.37 of the first thesis). Columns that
+    Shift n compares column j of the query with column j + n (equations 2.36 and 2.37 of Girolimetto). Columns that
     are empty in both say nothing; those empty in one only count as different.
     """
     count = query.shape[1]

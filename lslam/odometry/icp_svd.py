@@ -105,7 +105,7 @@ def align_closed_form(
     source: Floats, last: Partners, T_prior: Floats, *,
     inlier_ratio: float = 1.0, inlier_distance: float | None = None, max_iterations: int = 50,
 ) -> AlignerResult:  # fmt: skip
-    """Pose of the source points (S, 3), m, LiDAR frame, by equations 2.17 to 2.20 of the first thesis.
+    """Pose of the source points (S, 3), m, LiDAR frame, by equations 2.17 to 2.20 of Girolimetto.
 
     Each round pairs every point with its nearest in the last scan, keeps the pairs within `inlier_distance`, m (None: those
     the X84 rule does not call outliers), of these the nearest `inlier_ratio`, and takes the transform of least squares:

@@ -1,4 +1,4 @@
-"""The second thesis' baseline of matching, section 2.5: flattened scans on flattened outlines, by NDT and VGICP.
+"""Del Tufo's baseline of matching, section 2.5: flattened scans on flattened outlines, by NDT and VGICP.
 
 What lies below the sensor's horizon is cut off, the rest flattened; the scan is laid on all buildings near by NDT, and from
 there each building on the scan by VGICP. Our kernels are made for space, so both clouds stand up again as low walls.

@@ -19,7 +19,7 @@ from lslam.graph.problem import PoseGraph, Solution
 from lslam.keyframes.store import KeyframeStore
 from lslam.osm.baseline import flatten_scan, lay_building, lay_scan
 from lslam.osm.corrections import place_buildings
-from lslam.osm.join_buildings import believed_part
+from lslam.osm.join_buildings import accepted_part
 from lslam.osm.matcher import Laid
 from lslam.osm.wall_map import OsmMap
 from lslam.stopping import checking
@@ -52,7 +52,7 @@ def run_baseline(
     """
     osm = OsmMap(extract.buildings)
     odometry = with_drift(graph, 0.0, config.graph)
-    graph = replace(believed_part(graph, solution), odometry=odometry, map_priors=(), start=None, start_sigma=None)
+    graph = replace(accepted_part(graph, solution), odometry=odometry, map_priors=(), start=None, start_sigma=None)
     middles = np.array([b.middle for b in osm.buildings]).reshape(-1, 2)
     poses, local, sights = graph.poses.copy(), list[BuildingMatch](), list[KeyframeMatch]()
     for k in checking(range(len(store))):

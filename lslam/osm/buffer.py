@@ -1,6 +1,6 @@
 """Buildings along a way nobody knows beforehand: the next circle is asked for in the background, before it is needed.
 
-Second thesis, section 3.1: a circle of `fetch_radius` about the estimate is asked for at once; when the estimate leaves the
+Del Tufo, section 3.1: a circle of `fetch_radius` about the estimate is asked for at once; when the estimate leaves the
 circle of `renew_radius` about that place, the next one is. The caller never waits, so a slow server costs nothing, and a
 dead one nothing but buildings.
 """

@@ -1,6 +1,6 @@
 """Where two buildings touch, or should: party walls on the map, and the smallest move that takes an overlap apart.
 
-Second thesis, section 3.5. Among the moves that lay a corner on a corner or a wall on a wall and leave no overlap the smallest
+Del Tufo, section 3.5. Among the moves that lay a corner on a corner or a wall on a wall and leave no overlap the smallest
 is taken. A move counts as what it does to the corner that goes farthest, so that turning a house has its price.
 """
 
@@ -20,8 +20,8 @@ Floats = NDArray[np.float64]
 TOUCHING = 0.05  # m; walls of neighbours that lie so near one another on the map are one wall
 SHARED = 0.5  # m of it at least
 SLACK = 0.005  # m each of two buildings may stand in the other: half the tolerance
-STEEPEST = np.radians(60.0)  # by which a building is turned at most (the thesis')
-LARGEST = 5.0  # m; no building of a map is farther off
+STEEPEST = np.radians(60.0)  # by which a building is turned at most (Del Tufo)
+LARGEST = 5.0  # m; largest displacement of a building
 FLUSH_WORTH = 1.0  # m more than a bare touch that walls flush with each other may cost
 PARALLEL = np.cos(np.radians(10.0))
 SHORTEST = 0.3  # m; walls under this length are ornaments

@@ -1,4 +1,4 @@
-"""The second level: with the trajectory done, every building of the map is put where the walls seen say it stands."""
+"""The second level: with the trajectory fixed, every building's displacement is estimated from the walls seen."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from lslam.config.osm import OsmConfig
 from lslam.formats.buildings_geojson import write_corrected
 from lslam.formats.osm_corrections import corrected_osm
 from lslam.formats.osm_files import OsmData, write_osm
-from lslam.graph.building_graph import BuildingSolution, MapBelief, agreeing, solve_buildings
+from lslam.graph.building_graph import BuildingSolution, MapPrior, agreeing, solve_buildings
 from lslam.osm.map_changes import absent_buildings, new_walls
 from lslam.osm.overlap import Untangled, remove_overlaps
 from lslam.types.building_correction import BuildingCorrection, BuildingStatus, CorrectedMap
@@ -25,7 +25,7 @@ Floats = NDArray[np.float64]
 
 BUILDINGS_GEOJSON, BUILDINGS_OSM = "buildings.geojson", "buildings.osm"
 
-# m and rad; by which a building moves that may only move with all others.
+# m and rad; prior sigmas of a building that may only move with all others.
 TOGETHER = np.array([1e-3, 1e-3, 1e-5])
 
 
@@ -39,11 +39,11 @@ def correct_buildings(matches: OsmMatches, poses: NDArray[np.float64], config: O
 
     Absent buildings follow the others, as those nobody saw do. Covariances are those against the trajectory, which is given.
     """
-    belief = map_belief(matches, config)
+    prior = map_prior(matches, config)
     if config.mode == "rigid":
-        belief = replace(belief, sigma=TOGETHER)
+        prior = replace(prior, sigma=TOGETHER)
     local = agreed(matches, poses)
-    solution = solve_buildings(middles_of(matches), local, dict(enumerate(poses)), belief)
+    solution = solve_buildings(middles_of(matches), local, dict(enumerate(poses)), prior)
     return place_buildings(matches, poses, local, solution, config, config.mode)
 
 
@@ -58,7 +58,7 @@ def place_buildings(
     place = dict(enumerate(poses))
     untangled, own = Untangled(solution.displacements, (), ()), solution.covariances
     if mode == "prior":
-        # What would move a building moves none, so the map is as good as before anything was seen.
+        # No building moves: covariances are those of the prior.
         own = solve_buildings(middles_of(matches), (), {}, _unseen(config)).covariances
         untangled = Untangled(np.zeros_like(solution.displacements), (), ())
     elif mode in ("non-rigid", "two-level"):
@@ -90,23 +90,23 @@ def middles_of(matches: OsmMatches) -> Floats:
 
 
 def agreed(matches: OsmMatches, poses: Floats) -> list[BuildingMatch]:
-    """The local matches that are accepted and that others bear out, with the keyframes at `poses` (K, 3)."""
+    """The accepted local matches that others support, with the keyframes at `poses` (K, 3)."""
     local = [m for m in matches.local if m.is_accepted and m.keyframe < len(poses)]
     borne_out = agreeing(middles_of(matches), local, dict(enumerate(poses)))
     return [m for m, is_so in zip(local, borne_out, strict=True) if is_so]
 
 
-def map_belief(matches: OsmMatches, config: OsmConfig) -> MapBelief:
-    """What the map is trusted with: its shift as the trajectory has it, its buildings as the configuration says."""
+def map_prior(matches: OsmMatches, config: OsmConfig) -> MapPrior:
+    """The map's prior: common shift by the trajectory's estimate, buildings by the configuration."""
     unseen = _unseen(config)
     common = np.minimum(matches.shift_sigma, unseen.shift_sigma)
     return replace(unseen, shift=matches.shift, shift_sigma=np.maximum(common, TOGETHER[:2]))
 
 
-def _unseen(config: OsmConfig) -> MapBelief:
-    """The same before a scan is looked at."""
+def _unseen(config: OsmConfig) -> MapPrior:
+    """The prior before any scan."""
     sigma = np.array([config.building_sigma, config.building_sigma, np.radians(config.building_sigma_deg)])
-    return MapBelief(np.zeros(2), np.maximum(np.full(2, config.shift_sigma), TOGETHER[:2]), sigma)
+    return MapPrior(np.zeros(2), np.maximum(np.full(2, config.shift_sigma), TOGETHER[:2]), sigma)
 
 
 def write_buildings(folder: Path, found: CorrectedMap, data: OsmData) -> None:
@@ -127,9 +127,9 @@ def _status(used: int, is_gone: bool) -> BuildingStatus:
 def _counts(
     matches: OsmMatches, local: Sequence[BuildingMatch], solution: BuildingSolution
 ) -> tuple[list[int], list[int]]:
-    """Per building, how many matches hold it and how many were given up."""
+    """Per building, how many matches are inliers and how many were rejected."""
     owners = np.array([m.building for m in local], np.intp)
     size = len(matches.buildings)
-    used = np.bincount(owners[solution.believed], minlength=size)
+    used = np.bincount(owners[solution.inliers], minlength=size)
     tried = np.bincount(np.array([m.building for m in matches.local], np.intp), minlength=size)
     return used.tolist(), (tried - used).tolist()

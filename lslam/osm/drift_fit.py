@@ -1,6 +1,6 @@
-"""Walls of a map that were seen, and how well drift explains where: what one Gaussian of everything unknown says.
+"""Likelihood of odometry's drift given sightings of a map's walls: one linear Gaussian model of all unknowns.
 
-Sightings are many and each is of one keyframe and one wall, so only sums over these are ever written out.
+Each of the many sightings involves one keyframe and one wall, so only sums over these are formed.
 """
 
 from __future__ import annotations
@@ -14,17 +14,17 @@ from lslam.graph.problem import PoseGraph
 
 Floats = NDArray[np.float64]
 
-# Degrees of freedom of what is seen (Student's t): among many walls some are taken for others.
+# Degrees of freedom of the residuals (Student's t), against walls matched wrongly.
 FREEDOM = 3.0
 
 
 @dataclass(frozen=True)
 class WallSightings:
-    """Walls of a map that were seen, one row per wall and keyframe.
+    """Sightings of a map's walls, one row per wall and keyframe.
 
     keyframes, walls : (N,) numbers; normals : (N, 2) of the walls on the map
     places : (N, 2) m, the middle of what was seen, as the graph has it; offsets : (N,) m, along the normal, from the wall
-    share : 0..1, what each counts: those from neighbouring keyframes are of the same scans and make the same error
+    share : 0..1, weight of each, since those from neighbouring keyframes have correlated errors
     """
 
     keyframes: NDArray[np.int64]
@@ -37,9 +37,9 @@ class WallSightings:
 
 @dataclass(frozen=True)
 class Sizes:
-    """How large what is unknown is.
+    """Hyperparameters.
 
-    noise : of what is seen, times what the configuration says; root : (P, P) of the covariance of the rates
+    noise : scale of the configured sigma of a sighting; root : (P, P) square root of the prior covariance of the rates
     """
 
     noise: float
@@ -47,10 +47,10 @@ class Sizes:
 
 
 class DriftFit:
-    """Start and shift of the map, and rates at knots, on what was seen; what each wall is off by on the map is eliminated.
+    """Start, shift of the map and rates at knots, given sightings; the error of each wall on the map is eliminated.
 
-    effects : (K, 3, 5 + P) what they do to planar poses; taken : (P,) rates that the poses are without already
-    seen_sigma, map_sigma : m, of a wall that is seen, and of one of the map; given : (5,) m, rad, of start and shift
+    effects : (K, 3, 5 + P) Jacobians of planar poses; taken : (P,) rates that the poses are corrected by already
+    seen_sigma, map_sigma : m, of a sighting and of a wall of the map; given : (5,) m, rad, prior sigmas of start and shift
     """
 
     def __init__(
@@ -64,10 +64,10 @@ class DriftFit:
         self._effects, self._seen, self._map, self._given = effects, seen_sigma**2, map_sigma**2, given
         self._offsets = seen.offsets - self._along(np.append(np.zeros(len(given)), taken))
         self._rows = float(len(seen.walls))
-        self._believe(np.ones(len(seen.walls)))
+        self._set_weights(np.ones(len(seen.walls)))
 
-    def unlikeliness(self, noise: float, root: Floats, sizes: tuple[float, ...]) -> Floats:
-        """(len(sizes),) minus twice the logarithm of the likelihood, but for a constant, with `root` so many times as large."""
+    def negative_log_likelihood(self, noise: float, root: Floats, sizes: tuple[float, ...]) -> Floats:
+        """(len(sizes),) twice the negative log-likelihood, up to a constant, with `root` times each of `sizes`."""
         from scipy.linalg import cho_factor, cho_solve
 
         variance, n = noise**2 * self._seen, len(self._given)
@@ -89,24 +89,24 @@ class DriftFit:
         n = len(self._given)
         return found[n:], covariance[n:, n:]
 
-    def doubt(self, sizes: Sizes) -> None:
-        """Believe what lies far from where all the rest has it less."""
+    def reweight(self, sizes: Sizes) -> None:
+        """Reweight the sightings by Student's t of their residuals (IRLS)."""
         variance = sizes.noise**2 * self._seen
         away = self._offsets + self._along(self._solved(sizes)[0])
         pulls = np.bincount(self._wall, self._weights * away)
         away -= (pulls / (self._weight + variance / self._map))[self._wall]
-        self._believe((FREEDOM + 1.0) / (FREEDOM + away**2 / variance))
+        self._set_weights((FREEDOM + 1.0) / (FREEDOM + away**2 / variance))
 
     def count_less(self, share: float) -> None:
-        """Take only so much of what was seen as new."""
+        """Scale the information of all sightings by `share`."""
         self._rows *= share
-        self._believe(share * self._weights)
+        self._set_weights(share * self._weights)
 
     def _along(self, unknown: Floats) -> Floats:
-        """(N,) m by which `unknown` moves what was seen along the normals."""
+        """(N,) m by which `unknown` moves the sightings along the normals."""
         return np.asarray(np.einsum("ni,ni->n", self._axes, (self._effects @ unknown)[self._keyframes]))
 
-    def _believe(self, weights: Floats) -> None:
+    def _set_weights(self, weights: Floats) -> None:
         """Sums over the sightings of each keyframe and of each wall."""
         from scipy.sparse import csr_array
 
@@ -146,7 +146,7 @@ class DriftFit:
         return whole
 
     def _solved(self, sizes: Sizes) -> tuple[Floats, Floats]:
-        """What all that is unknown is found to be, and its covariance; not by the inverse of the prior, which may be none."""
+        """Posterior mean and covariance of the unknowns, without the inverse of the prior, which may be singular."""
         normal, pull, _ = self._reduced(sizes.noise**2 * self._seen)
         root = self._root(sizes.root)
         covariance = root @ np.linalg.solve(np.eye(len(root)) + root.T @ normal @ root, root.T)

@@ -11,7 +11,7 @@ from lslam.geometry import se2
 from lslam.graph.drift import with_drift
 from lslam.graph.joint import JointSolution, optimise_jointly
 from lslam.graph.problem import PoseGraph, Solution
-from lslam.osm.corrections import agreed, correct_buildings, map_belief, middles_of, place_buildings
+from lslam.osm.corrections import agreed, correct_buildings, map_prior, middles_of, place_buildings
 from lslam.osm.matcher import Laid
 from lslam.types.building_correction import CorrectedMap
 from lslam.types.building_match import OsmMatches
@@ -29,23 +29,23 @@ def lay(graph: PoseGraph, solution: Solution, matches: OsmMatches, extract: Buil
 def join_buildings(
     graph: PoseGraph, solution: Solution, matches: OsmMatches, config: Config
 ) -> tuple[JointSolution, CorrectedMap]:
-    """Mode `non-rigid`: what `solution` believed of `graph`, and every building, in one graph.
+    """Mode `non-rigid`: the inliers of `solution` in `graph`, and every building, in one graph.
 
     Raises GraphError when it cannot be solved.
     """
-    believed = replace(
-        believed_part(graph, solution),
+    accepted = replace(
+        accepted_part(graph, solution),
         poses=solution.poses,
         odometry=with_drift(graph, solution.drift, config.graph),
         map_priors=(),
     )
     local = agreed(matches, se2.of_se3(solution.poses))
-    found = optimise_jointly(believed, middles_of(matches), local, map_belief(matches, config.osm), config.graph)
+    found = optimise_jointly(accepted, middles_of(matches), local, map_prior(matches, config.osm), config.graph)
     return found, place_buildings(matches, se2.of_se3(found.poses), local, found.buildings, config.osm, config.osm.mode)
 
 
-def believed_part(graph: PoseGraph, solution: Solution) -> PoseGraph:
-    """The graph without the loops and fixes that `solution` gave up."""
+def accepted_part(graph: PoseGraph, solution: Solution) -> PoseGraph:
+    """The graph without the loops and fixes that `solution` rejected."""
     loops = [loop for loop, why in zip(graph.loops, solution.loop_reasons, strict=True) if not why]
-    fixes = [fix for fix, is_kept in zip(graph.fixes, solution.fix_believed, strict=True) if is_kept]
+    fixes = [fix for fix, is_kept in zip(graph.fixes, solution.fix_inliers, strict=True) if is_kept]
     return replace(graph, loops=loops, fixes=fixes)

@@ -1,7 +1,7 @@
-"""Along the keyframes of a run, the walls seen about each are laid on the buildings of the map.
+"""Localisation of a run's keyframes on a map: the walls seen about each are matched with its buildings.
 
-Each match is sought where the ones before it and odometry say that the keyframe is, within what odometry may have drifted
-since; one that is not unique, or not where it may be, does not count.
+Each match is searched about the track of odometry and earlier matches, within its covariance; ambiguous matches and those
+outside the gate are rejected.
 """
 
 from __future__ import annotations
@@ -37,19 +37,19 @@ from lslam.types.stage_clock import KeyframeClocks
 log = logging.getLogger("lslam")
 Floats = NDArray[np.float64]
 
-# Beyond so many sigmas of the map itself the run does not know where it is, and a match has to fix all three coordinates.
+# Sigmas of the map beyond which the run is lost, and a match has to observe all three coordinates.
 LOST = 4.0
-# A match is borne out by the others within this quantile of its own distribution.
+# Chi-square quantile within which a match is supported by the others.
 BORNE_OUT = 0.95
 
 
 @dataclass(frozen=True)
 class Located:
-    """Where the keyframes of a run are on the map.
+    """The keyframes of a run located on the map.
 
     T_enu_odometry : (4, 4) from the world of odometry into the map frame, placed by one match and turned by all
     matches : of all keyframes; priors : the accepted ones, for the pose graph
-    start, start_sigma : (3,) x, y (m), yaw (rad) that hold the first pose, None where matches have it, and how well
+    start, start_sigma : (3,) x, y (m), yaw (rad), prior of the first pose and its sigmas; None where matches give it
     problem : why there are none
     """
 
@@ -73,8 +73,8 @@ def locate(
 ) -> Located:  # fmt: skip
     """Match all keyframes with the map.
 
-    up : (3,) up in the world of odometry as an IMU has it, None takes that of the ground
-    placed : (4, 4) from that world into the map frame, where satellite fixes say it
+    up : (3,) up in the world of odometry by an IMU, None takes that of the ground
+    placed : (4, 4) from that world into the map frame by GNSS fixes
     odometry : (K, 4, 4) of the keyframes in it, those of the store by default
     clocks : take the time of each keyframe, stages `walls` and `map match`
     """
@@ -107,7 +107,7 @@ def locate(
     ]
     if not (config.osm.hold_start or config.osm.mode == "rigid"):
         return Located(T, osm, matches, priors, None, sigma)
-    # All walls together know the heading best.
+    # The heading is best estimated by all walls.
     given, laid = known_start(config.osm), se2.of_se3(T @ odometry[0])
     place = given.pose[:2] if placed is None else start.pose[:2]
     return Located(T, osm, matches, priors, np.append(place, laid[2]), np.append(given.sigma[:2], sigma[2]))
@@ -117,13 +117,13 @@ def finish(
     located: Located, extract: BuildingExtract, poses: Floats, solution: Solution, config: OsmConfig,
     clocks: KeyframeClocks | None = None,
 ) -> OsmMatches:  # fmt: skip
-    """All that was matched, with the graph's verdicts, and each building laid on what was seen from the final `poses`.
+    """All keyframe matches with the graph's verdicts, and the building matches from the final `poses`.
 
     clocks : take the time of each keyframe, stage `building match`
     """
     clocks = KeyframeClocks() if clocks is None else clocks
-    doubts = iter(solution.map_reasons)
-    judged = [_judged(m, next(doubts)) if m.is_accepted else m for m in located.matches]
+    rejections = iter(solution.map_reasons)
+    judged = [_judged(m, next(rejections)) if m.is_accepted else m for m in located.matches]
     planar, local = se2.of_se3(poses), list[BuildingMatch]()
     for match in checking(judged):
         with clocks[match.keyframe].stage("building match"):
@@ -152,7 +152,7 @@ def _start(store: KeyframeStore, poses: Floats, osm: OsmMap, config: Config, pla
 def _both_ways(
     store: KeyframeStore, poses: Floats, osm: OsmMap, track: OsmTrack, config: Config, clocks: KeyframeClocks
 ) -> list[KeyframeMatch]:
-    """Forward from the first keyframe; then back from the first that was accepted and that fixes everything."""
+    """Forward from the first keyframe; then back from the first accepted match of full rank."""
     found = _along(range(len(store)), store, poses, osm, track, config, clocks)
     numbers = [m.keyframe for m in found if m.is_accepted and m.rank == 3]
     if numbers and numbers[0] > 0:
@@ -203,8 +203,8 @@ def _gated(match: KeyframeMatch, track: OsmTrack, config: OsmConfig, graph: Grap
     return replace(match, verdict=Verdict.ACCEPTED)
 
 
-def _judged(match: KeyframeMatch, doubt: str) -> KeyframeMatch:
-    return replace(match, verdict=Verdict.REJECTED, reason=doubt) if doubt else match
+def _judged(match: KeyframeMatch, reason: str) -> KeyframeMatch:
+    return replace(match, verdict=Verdict.REJECTED, reason=reason) if reason else match
 
 
 def _place(

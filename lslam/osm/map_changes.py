@@ -60,18 +60,18 @@ def absent_buildings(
         return found
     near, _ = STRtree(points(seen)).query([s.buffer(NEAR) for s in shapes], predicate="intersects")
     is_near = np.isin(np.arange(len(shapes)), near)
-    doubted = [k for k in range(len(shapes)) if not is_near[k] and not is_canopy(buildings[k])]
-    cores = [shapes[k].buffer(-DEPTH / 2) for k in doubted]
-    counts = np.zeros(len(doubted), np.int64)
+    candidates = [k for k in range(len(shapes)) if not is_near[k] and not is_canopy(buildings[k])]
+    cores = [shapes[k].buffer(-DEPTH / 2) for k in candidates]
+    counts = np.zeros(len(candidates), np.int64)
     tree = STRtree(cores)
     for look, samples in zip(checking(looks), everything, strict=True):
         rays = np.stack(np.broadcast_arrays(look.views[:, None], samples[None]), axis=2)
         ray, core = tree.query(linestrings(rays.reshape(-1, 2, 2)), predicate="intersects")
-        hits = np.zeros((len(samples), len(doubted)), np.int64)
+        hits = np.zeros((len(samples), len(candidates)), np.int64)
         np.add.at(hits, (ray % max(len(samples), 1), core), 1)
         # Whichever of its places the sensor saw the wall from, the way led through the building.
         counts += (hits == len(look.views)).sum(axis=0) * STEP >= WIDE
-    found[doubted] = counts >= VIEWS
+    found[candidates] = counts >= VIEWS
     return found
 
 

@@ -1,4 +1,4 @@
-"""The pose graph in the frame of a map: held by its walls, and without the drift that they reveal."""
+"""The pose graph in the frame of a map: with planar priors by its walls, corrected by the drift that they reveal."""
 
 from __future__ import annotations
 
@@ -25,12 +25,11 @@ from lslam.types.stage_clock import KeyframeClocks
 log = logging.getLogger("lslam")
 Floats = NDArray[np.float64]
 
-# How often drift is looked for: a wall ahead is seen from the last keyframe of a submap and one behind from the first, so
-# that only the greater part of it shows.
+# Iterations of the drift estimate: walls seen from the ends of a submap hide a part of it.
 ROUNDS = 5
 # Modes in which the map's buildings stand to each other as they are drawn.
 TRUSTING = ("prior", "rigid")
-# m, by which their walls are off: what a survey rounds to.
+# m, sigma of their walls: the rounding of a survey.
 TRUE = 0.01
 
 
@@ -43,9 +42,9 @@ def find_on_map(
     config: Config,
     clocks: KeyframeClocks | None = None,
 ) -> tuple[Located, PoseGraph]:
-    """Where the keyframes are on the map, and the graph in its frame, set straight where the map reveals a drift.
+    """The keyframes located on the map, and the graph in its frame, corrected where the map reveals a drift.
 
-    graph : of odometry, or where satellite fixes have it; up, placed, clocks : as of `locate`; stage `drift` of the last keyframe
+    graph : of odometry, or aligned by GNSS fixes; up, placed, clocks : as of `locate`; stage `drift` of the last keyframe
     """
     clocks = KeyframeClocks() if clocks is None else clocks
     located = locate(extract, store, up, config, placed, clocks=clocks)
@@ -61,7 +60,7 @@ def find_on_map(
         if drift is None or not drift.is_sure:
             break
         before = drift
-        held = replace(without_drift(held, drift.rates), spread=drift.spread, claim=drift.claim)
+        held = replace(without_drift(held, drift.rates), spread=drift.spread, estimated_drift=drift.estimated_drift)
         odometry = se3.inverse(located.T_enu_odometry) @ held.poses
         again = None if drift.is_settled else locate(extract, store, up, config, placed, odometry, clocks)
         if again is None or again.problem:
@@ -69,18 +68,18 @@ def find_on_map(
         located = again
         held = on_map(replace(held, poses=odometry), located, config)
     if before is not None:
-        claim = before.claim
-        rates = claim.rates if claim.rms is None else claim.rms
+        estimated = before.estimated_drift
+        rates = estimated.rates if estimated.rms is None else estimated.rms
         log.info(
-            "OSM: odometry %s by %.1f %% and %.1f deg/100 m, and is set straight",
-            "wanders" if claim.does_wander else "drifts steadily",
+            "OSM: %s drift of odometry, %.1f %% and %.1f deg/100 m, is corrected",
+            "varying" if estimated.is_varying else "steady",
             100 * np.linalg.norm(rates[:2]), 100 * np.degrees(rates[2]),
         )  # fmt: skip
     return located, held
 
 
 def on_map(graph: PoseGraph, located: Located, config: Config) -> PoseGraph:
-    """The graph in the frame of the map, held by its walls, and by its fixes where it has some."""
+    """The graph in the frame of the map, with planar priors by its walls, and its fixes where it has some."""
     return replace(
         graph,
         poses=graph.poses if graph.fixes else located.T_enu_odometry @ graph.poses,
@@ -95,9 +94,9 @@ def on_map(graph: PoseGraph, located: Located, config: Config) -> PoseGraph:
 
 
 def _priors(located: Located, config: Config) -> list[PlanarPrior]:
-    """What the matches say. A map of which no part is off by itself errs only as what is seen does, anew with each submap.
+    """The planar priors by the matches. With an exact map only sightings have errors, independent per submap.
 
-    Walls that are drawn by hand err by `wall_sigma`, the same for all who see them (`shares`).
+    Walls drawn by hand have an error of `wall_sigma`, common to all keyframes that see them (`shares`).
     """
     if config.osm.mode not in TRUSTING:
         return located.priors
@@ -107,7 +106,7 @@ def _priors(located: Located, config: Config) -> list[PlanarPrior]:
 
 
 def _wall_sigmas(config: OsmConfig) -> tuple[float, float]:
-    """m; by which a wall that is seen is off where the map has it, and its building beside it."""
+    """m, sigmas of a sighting against the map's wall, and of the wall's building."""
     if config.mode in TRUSTING:
         # Its points lie anywhere within the tolerance.
         return config.wall_tolerance / np.sqrt(3.0), TRUE
@@ -115,7 +114,7 @@ def _wall_sigmas(config: OsmConfig) -> tuple[float, float]:
 
 
 def sightings(located: Located, poses: Floats, config: Config) -> WallSightings:
-    """Which walls of each building were seen from which keyframe, and where, with the keyframes at `poses` (K, 4, 4)."""
+    """The sightings of all buildings' walls, with the keyframes at `poses` (K, 4, 4)."""
     osm, planar = located.osm, se2.of_se3(poses)
     rows: list[tuple[Floats, Floats]] = [(np.zeros((0, 2, 2)), np.zeros((0, 2), np.int64))]
     for match in checking(located.matches):

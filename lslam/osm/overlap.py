@@ -1,6 +1,6 @@
 """Overlap removal: displaced buildings taken apart, party walls flush, and everything else as it was measured.
 
-Second thesis, section 3.5. Contacts are hard constraints between buildings; what each building is known by, from the scans or
+Del Tufo, section 3.5. Contacts are hard constraints between buildings; what each building is known by, from the scans or
 only from the map, decides who gives way. A building that nobody saw is held near its place by the weak knowledge of the map.
 """
 

@@ -1,7 +1,7 @@
-"""Walls seen about a keyframe against the walls of the map: where it stands, and where each building really is.
+"""Matches of the walls seen about a keyframe with the walls of the map: planar priors, and observations of buildings.
 
-Second thesis, sections 3.3 and 3.4: the global match lays what is seen on all buildings near and becomes a prior of the
-keyframe, the local one lays each building on what is seen and moves only the building.
+Del Tufo, sections 3.3 and 3.4: the global match aligns the walls seen with all buildings near and becomes a prior of the
+keyframe, the local one aligns each building with the walls seen and moves only the building.
 """
 
 from __future__ import annotations
@@ -89,9 +89,9 @@ def match_buildings(
 
 
 def shares(matches: Sequence[KeyframeMatch], walls: int) -> list[float]:
-    """What each match counts beside the others: one over how many of them lie on the same of the map's `walls`, in the mean.
+    """Weight of each match: the mean over its walls of one over the number of matches with the same of the map's `walls`.
 
-    Who drew a wall half a metre off has done so for every keyframe that sees it: a hundred of them know no more than one.
+    The map's error of a wall is common to all keyframes that see it, so their matches are not independent.
     """
     seen = np.zeros(walls, np.int64)
     for match in matches:

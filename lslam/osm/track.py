@@ -1,6 +1,6 @@
-"""Where the run is on the map, as the walls seen so far say: an estimate that follows odometry and is held by matches.
+"""The track of a run on the map: a planar Kalman filter, predicted by odometry and updated by matches.
 
-Its uncertainty opens the window in which the next match is sought, and judges what is found there.
+Its covariance opens the window in which the next match is searched, and gates the result.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ from lslam.types.building_match import KeyframeMatch
 
 Floats = NDArray[np.float64]
 
-# m over which the drift of odometry is one and the same: over so far it adds up in proportion to the way.
+# m, correlation length of odometry's drift.
 MEMORY = 100.0
-# Directions with less than this share of the largest information are free.
+# Directions with less than this share of the largest information are unobserved.
 FREE = 1e-9
-# A whole run laid on its matches: rounds, and degrees of freedom (Student's t), as some lie on the neighbour's walls.
+# Alignment of a run with its matches: iterations, and degrees of freedom (Student's t) against wrong ones.
 ROUNDS, FREEDOM = 10, 3.0
 
 
@@ -27,7 +27,7 @@ class OsmTrack:
     """Planar pose (3,) in the map frame and its covariance (3, 3).
 
     percent, rad_per_m : one sigma of odometry's drift, % of the way and rad per m of it
-    map_sigma : (3,) m, m, rad by which what stands about one place is off in the map, however well it is seen
+    map_sigma : (3,) m, m, rad, local error of the map
     """
 
     def __init__(self, pose: Floats, sigma: Floats, percent: float, rad_per_m: float, map_sigma: Floats) -> None:
@@ -38,7 +38,7 @@ class OsmTrack:
 
     @property
     def sigma(self) -> Floats:
-        """(3,) m, m, rad, of the pose against what stands about it in the map."""
+        """(3,) m, m, rad, of the pose relative to the map around it."""
         return np.asarray(np.sqrt(np.diag(self.covariance) + self._map))
 
     def move(self, step: Floats, way: float) -> None:
@@ -50,18 +50,18 @@ class OsmTrack:
         self.pose = moved
 
     def begin(self, pose: Floats, information: Floats) -> None:
-        """Be where a match that fixes everything says, and nowhere else."""
+        """Reset to a match of full rank."""
         self.pose = np.asarray(pose, np.float64)
         self.covariance = np.asarray(np.linalg.inv(information) + np.diag(self._map))
 
     def squared(self, pose: Floats, information: Floats) -> tuple[float, int]:
-        """Squared Mahalanobis distance of a match from the track, of the directions it fixes, and how many these are."""
+        """Squared Mahalanobis distance of a match from the track, along the directions it observes, and their number."""
         error, H, R = self._innovation(pose, information)
         S = H @ self.covariance @ H.T + R
         return float(error @ np.linalg.solve(S, error)), len(error)
 
     def take(self, pose: Floats, information: Floats) -> None:
-        """Believe a match."""
+        """Update with a match."""
         error, H, R = self._innovation(pose, information)
         gain = np.linalg.solve(H @ self.covariance @ H.T + R, H @ self.covariance).T
         moved = self.pose + gain @ error
@@ -72,8 +72,8 @@ class OsmTrack:
     def lay(self, poses: Floats, ways: Floats, matches: Sequence[KeyframeMatch], sigma: Floats) -> tuple[float, Floats]:
         """`poses` (M, 3) moved as a whole onto their `matches`, one each.
 
-        They lie about right already, but for `sigma` (3,), which the first match alone does not tell well; and the more of
-        the `ways` (M,), m travelled, odometry went since, the less a match says of it.
+        The displacement has the prior `sigma` (3,); the weight of a match decreases with the `ways` (M,), m travelled since the
+        first.
 
         Returns by how much, rad, they are turned about the first, and (M,) squared Mahalanobis distances of the matches.
         """
@@ -88,27 +88,27 @@ class OsmTrack:
             away = real - there
             away[:, 2] = se2.wrapped(away[:, 2])
             squared = np.einsum("mi,mij,mj->m", away, weights, away)
-            believed = (FREEDOM + 1.0) / (FREEDOM + squared)
+            robust = (FREEDOM + 1.0) / (FREEDOM + squared)
             effect = np.tile(np.eye(3), (len(there), 1, 1))
             effect[:, 0, 2], effect[:, 1, 2] = pivot[1] + moved[1] - there[:, 1], there[:, 0] - pivot[0] - moved[0]
-            pulls = np.swapaxes(effect, -1, -2) @ (believed[:, None, None] * weights)
+            pulls = np.swapaxes(effect, -1, -2) @ (robust[:, None, None] * weights)
             normal = np.diag(1.0 / sigma**2) + (pulls @ effect).sum(axis=0)
             pull = (pulls @ away[:, :, None]).sum(axis=0)[:, 0] - moved / sigma**2
             moved = moved + np.linalg.solve(normal, pull)
         return float(moved[2]), squared
 
     def knows(self, information: Floats) -> bool:
-        """Whether a match that fixes everything is no less sure than the map itself about any place."""
+        """Whether the sigmas of a match of full rank are at most those of the map."""
         return bool((np.diag(np.linalg.inv(information)) <= self._map).all())
 
     @staticmethod
     def _weight(information: Floats, variance: Floats) -> Floats:
-        """(3, 3) information of a match that is off by `variance` (3,) as well; what it leaves free stays free."""
+        """(3, 3) information of a match with an additional `variance` (3,); unobserved directions stay so."""
         H, own = _seen(information)
         return np.asarray(H.T @ np.linalg.solve(own + H @ np.diag(variance) @ H.T, H))
 
     def _innovation(self, pose: Floats, information: Floats) -> tuple[Floats, Floats, Floats]:
-        """Error, directions and covariance of what the match fixes."""
+        """Error, directions and covariance of what the match observes."""
         H, own = _seen(information)
         away = np.asarray(pose, np.float64) - self.pose
         away[2] = se2.wrapped(away[2])
@@ -116,7 +116,7 @@ class OsmTrack:
 
 
 def _seen(information: Floats) -> tuple[Floats, Floats]:
-    """Directions (R, 3) that a match does not leave free, and the covariance (R, R) along them."""
+    """Directions (R, 3) that a match observes, and the covariance (R, R) along them."""
     values, axes = np.linalg.eigh(information)
     is_seen = values > FREE * values[-1]
     return axes[:, is_seen].T, np.diag(1.0 / values[is_seen])

@@ -1,8 +1,8 @@
-"""Walls that are seen laid on walls that are known: the planar pose that fits best, and which directions it really fixes.
+"""Matching of seen walls with known walls: the best planar pose, and which directions it observes.
 
-Second thesis, section 3.3. Pairs of corners, angular and virtual, propose poses inside the window that the odometry's
-uncertainty opens; lines refine them; the fitness of equations 3.1 to 3.4 chooses. What the thesis leaves open is answered so:
-along lone parallel walls nothing is claimed, and of two places that look alike none is taken.
+Del Tufo, section 3.3. Pairs of corners, angular and virtual, propose poses inside the window that the odometry's
+uncertainty opens; lines refine them; the fitness of equations 3.1 to 3.4 chooses. Beyond Del Tufo, parallel walls give no
+information along them, and an ambiguous match is rejected.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ CORNERS = 40
 PROPOSALS = 150  # that get the most votes; of these the best few are laid on the lines
 REFINED = 12
 ROUGH = 2.5  # m; a pose of votes is right to about a cell
-SHORT = 4.0  # m; a wall of this length is believed half as much as an endless one
+SHORT = 4.0  # m; a wall of this length has half the weight of an endless one
 # m, round by round. Where the map is right walls lie on walls; its houses err by a metre or so, one by one. What is seen of
 # one house does not.
 GATES = np.array([2.5, 2.2, 1.9, 1.6, 1.4, 1.2, 1.2])
@@ -38,7 +38,7 @@ WIDE = np.array([6.0, 4.5, 3.0])  # from the prior itself: far walls move with i
 FAINT = 1e-3  # of the prior's weight while the walls are fitted: it is for the graph to weigh the two
 START_WALLS = 4  # two walls make a corner, and a town has many
 SLACK = np.array([0.5, 0.5, 0.03])  # that refinement may leave the window by
-NEAR_RIVAL, LIKE_RIVAL = 1.5, np.radians(6.0)  # m and rad; what differs less is the same answer
+NEAR_SAME, LIKE_SAME = 1.5, np.radians(6.0)  # m and rad; what differs less is the same answer
 BESIDE = 2.0  # m between places that are tried across parallel walls: the first gate of either kind is as wide
 ALIGNED = np.sin(np.radians(12.0)) ** 2  # a direction seen by less than this share of the best one is not seen
 LONGEST = 60.0  # m from the walls seen; the map beyond is not asked
@@ -54,7 +54,7 @@ class WallMatch:
         target; distance : m, mean distance of equation 3.1; rms : m, across the walls that found a partner
     pairs : (K, 2) int64 which source wall lies on which target wall
     kind : `edges` when two walls that are not parallel found partners, else `lines`
-    is_ambiguous : another pose fits nearly as well: then this one is a guess
+    is_ambiguous : another pose fits nearly as well
     """
 
     pose: Floats
@@ -79,7 +79,7 @@ def match_walls(
 ) -> WallMatch | None:
     """Lay `source` (S, 2, 2) on `target` (T, 2, 2), directed segments in m, near the pose `prior` (3,) x, y, yaw.
 
-    The window is `WINDOW` times `sigma` (3,), m, m, rad. The thesis' global match lays the walls of a submap on those of all
+    The window is `WINDOW` times `sigma` (3,), m, m, rad. Del Tufo's global match lays the walls of a submap on those of all
     buildings near; its local match one building's on those of the submap, `by_coverage`, because most of it is not seen.
 
     Returns None when too little of the source finds a partner. A match that `is_ambiguous` is returned as such.
@@ -134,7 +134,7 @@ def _best(
     if best.coverage < (config.min_building_coverage if by_coverage else config.min_coverage):
         return None
     pairs = np.column_stack([best.pairs[:, 0], numbers[best.pairs[:, 1]]])
-    return replace(best, pairs=pairs, is_ambiguous=_has_rival(best, inside, config))
+    return replace(best, pairs=pairs, is_ambiguous=_has_alternative(best, inside, config))
 
 
 def _rows(segments: NDArray[Any]) -> Floats:
@@ -229,7 +229,7 @@ def _at_pose(planar: Floats, centre: Floats, pose: Floats) -> Floats:
     return np.asarray(moves.T @ planar @ moves)
 
 
-def _has_rival(best: WallMatch, found: list[WallMatch], config: OsmConfig) -> bool:
+def _has_alternative(best: WallMatch, found: list[WallMatch], config: OsmConfig) -> bool:
     """True when a pose that differs in what the walls fix fits nearly as well."""
     for other in found:
         if other.fitness < best.fitness - config.rival_margin:
@@ -240,6 +240,6 @@ def _has_rival(best: WallMatch, found: list[WallMatch], config: OsmConfig) -> bo
             values, axes = np.linalg.eigh(best.information[:2, :2])
             free = axes[:, values < 1e-9 * max(values[1], 1e-12)]
             away[:2] -= free @ (free.T @ away[:2])
-        if np.hypot(away[0], away[1]) > NEAR_RIVAL or abs(away[2]) > LIKE_RIVAL:
+        if np.hypot(away[0], away[1]) > NEAR_SAME or abs(away[2]) > LIKE_SAME:
             return True
     return False

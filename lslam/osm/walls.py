@@ -1,6 +1,6 @@
 """Walls as directed segments on level ground: those a cloud shows, and those a map says.
 
-Second thesis, section 3.2: what is low is cut off, what is no upright plane left out, the rest flattened, and lines found by
+Del Tufo, section 3.2: what is low is cut off, what is no upright plane left out, the rest flattened, and lines found by
 RANSAC. Height is counted from the ground below each point and not from the sensor, which may fly. All segments are directed
 so that the outside, where a wall is seen from, lies to the right; so a wall's back is never taken for its front.
 """

@@ -1,4 +1,4 @@
-"""A scan with rings -> edges and planes (Zhang and Singh 2014; first thesis, section 2.4.2)."""
+"""A scan with rings -> edges and planes (Zhang and Singh 2014; Girolimetto, section 2.4.2)."""
 
 from __future__ import annotations
 

@@ -91,7 +91,7 @@ class SimulatedImu:
     T_lidar_imu: Floats
 
 
-# First thesis, table 2.3 (from the data sheet). Neither states a bias random walk: it is that of Kalibr's example of a MEMS IMU.
+# Girolimetto, table 2.3 (from the data sheet). Neither states a bias random walk: it is that of Kalibr's example of a MEMS IMU.
 _ICM_ACCEL = Triad(19.62, 0.000598754, 0.4905, 2.0, 0.0022563, 2e-4)
 _ICM_GYRO = Triad(4.36332313, 0.000133231, 0.087266462, 2.0, 0.000261799, 4e-6)
 

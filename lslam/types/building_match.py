@@ -23,7 +23,7 @@ MatchKind = Literal["edges", "lines", "none"]
 
 @dataclass(frozen=True)
 class KeyframeMatch:
-    """The walls seen about one keyframe, laid on all buildings near: the thesis' global match.
+    """The walls seen about one keyframe, laid on all buildings near: Del Tufo's global match.
 
     walls : (S, 2, 2) segments seen, m, level frame, the outside to the right; views : (V, 2) the sensor's places there
     prior : (3,) where the run expected the keyframe in the map frame; sigma : (3,) how well, m, m, rad
@@ -59,7 +59,7 @@ class KeyframeMatch:
 
 @dataclass(frozen=True)
 class BuildingMatch:
-    """One building's walls laid on the walls seen about one keyframe: the thesis' local match, of use to the buildings only.
+    """One building's walls laid on the walls seen about one keyframe: Del Tufo's local match, of use to the buildings only.
 
     building : number among the buildings of the run's `OsmMatches`
     pose : (3,) of the building in the level frame of the keyframe: its axes are the map's and its origin is

@@ -32,7 +32,7 @@ class ScanResult:
     is_lost : the scans round it say that it may be elsewhere, which a problem of the run says in words
     degenerate : (K, 6) unit twists along which the scan says nothing and the motion prior was kept
     prior_error : (translation m, rotation rad) between motion prior and result
-    prior_norm : 2-norm of inv(prior) pose - I, of the prior before the scan was looked at (first thesis, equation 5.1)
+    prior_norm : 2-norm of inv(prior) pose - I, of the prior before the scan was looked at (Girolimetto, equation 5.1)
     steady_norm : likewise of constant velocity, which an IMU took the place of; None without an IMU
     steady_iterations : what registration from constant velocity took on the same map; None but for a sample of the scans
         that an IMU predicted

@@ -25,7 +25,7 @@ class Curve:
     values : (V,) of `parameter`, ascending; 0, 1, 2 .. when they are words, and then `words` names them
     at : the other studied parameter and its value; empty in a one-way study
     quantities : translation (m), angular (deg), time_per_scan (ms, of registration), total_time (s), fallback (% of the scans
-        that the method did not pose), efficiency (equation 5.2 of the first thesis), total_efficiency (5.3); nan where a run
+        that the method did not pose), efficiency (equation 5.2 of Girolimetto), total_efficiency (5.3); nan where a run
         has no such number or is not usable
     stages : ms per scan by name; lost : runs that diverged, by their status or by their error; ran : runs there are
     is_timed_alone : no run shared the machine with another

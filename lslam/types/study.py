@@ -19,7 +19,7 @@ class StudyRow:
     parameters : what is studied, by configuration key; empty for a run beside the study, at its own values (`is_beside`)
     status : `done`, `degraded`, `diverged`, `failed` or `crashed`; reason : why it is not done
     thesis_rmse : m, origin alignment, sqrt(sum |e|^2 / 3N); ate_se3, ate_origin : m, rmse; angular_rmse_deg : equation 2.15 of
-        the first thesis; nan where there is none
+        Girolimetto; nan where there is none
     scans : processed; stages_ms : mean ms per scan by stage, in the order they are passed; total_time_s : of all stages over
         all scans; run_s : of the whole run with its reading and writing
     bridged_share : of the scans, 0..1; fallback_share : likewise, that a recovery policy or another method posed

@@ -141,7 +141,7 @@ def test_wrong_loops_are_refused_and_say_so() -> None:
 
 
 @pytest.mark.parametrize("loops", ["none", "rejected", "refused"])
-def test_without_a_loop_that_is_believed_nothing_moves(loops: str) -> None:
+def test_without_an_accepted_loop_closure_nothing_moves(loops: str) -> None:
     results = drifted()
     given = {
         "none": [],

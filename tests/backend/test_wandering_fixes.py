@@ -31,7 +31,7 @@ def wandering(seed: int) -> Stub:
 
 
 def test_poses_know_that_fixes_err_together() -> None:
-    """As if each erred alone, covariances claim to know the place twenty times better (NEES per degree of freedom 70)."""
+    """As if each erred alone, covariances would be four hundred times too small (NEES per degree of freedom 70)."""
     results = drifted("debug.drift_percent=0", "debug.drift_deg_per_100m=0")
     store, nees = store_of(results), []
     for seed in range(3):

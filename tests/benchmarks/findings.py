@@ -1,4 +1,4 @@
-"""What the first thesis found of parameters, judged by its eight studies on fresh seeds.
+"""What Girolimetto found of parameters, judged by its eight studies on fresh seeds.
 
     python tests/benchmarks/findings.py [--runs FOLDER] [--studies share,skip-frames] [--seeds 100-104] [--write docs/results.md]
 
@@ -53,7 +53,7 @@ def main() -> None:
                 rows += [[study, v.text, v.outcome, v.measured] for v in result.verdicts]
     scenes = {place.scenario for study in studies for place in find_study(study).sequences}
     caption = (
-        f"The first thesis' presets on the simulated flight `{', '.join(sorted(scenes))}`, {tables.seeds_named(seeds)}. A "
+        f"Girolimetto's presets on the simulated flight `{', '.join(sorted(scenes))}`, {tables.seeds_named(seeds)}. A "
         "verdict asks for evidence on both sides of what is stated, beyond what the seeds scatter."
     )
     tables.table("findings", caption, ["study", "the thesis", "verdict", "here"], rows, args.write)

@@ -164,7 +164,7 @@ def of_ours(sequence: Sequence, method: str) -> tuple[NDArray[np.float64], NDArr
 
 
 def scores(poses: NDArray[np.float64], truth: NDArray[np.float64]) -> dict[str, float]:
-    """Errors in m and deg; `thesis_rmse` after equation 2.14 of the first thesis."""
+    """Errors in m and deg; `thesis_rmse` after equation 2.14 of Girolimetto."""
     e = poses[:, :3, 3] - truth[:, :3, 3]
     spread = np.linalg.svd(truth[:, :3, 3] - truth[:, :3, 3].mean(0), compute_uv=False)
     origin = float(np.sqrt(np.mean(np.sum(e**2, axis=1))))

@@ -16,7 +16,7 @@ RIVALS = ("kiss-icp", "small-gicp", "small-vgicp", "genz-icp")
 # Nothing there has the edges and planes that LOAM lives on.
 UNSTRUCTURED = ("corridor", "motorway")
 ON_FOOT_OR_WING = ("walk", "closed", "open", "climbing", "small-eight", "large-eight")
-# First thesis: rmse before optimisation, m (its ICP, LOAM and LOAM map).
+# Girolimetto: rmse before optimisation, m (its ICP, LOAM and LOAM map).
 THESIS = {
     "closed": (2.046, 1.574, 0.856), "open": (0.843, 0.844, 0.584), "climbing": (0.346, 1.948, 1.037),
     "small-eight": (0.681, 0.701, 0.407), "large-eight": (0.719, 2.156, 0.635),

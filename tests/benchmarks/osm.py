@@ -1,4 +1,4 @@
-"""What OpenStreetMap brings, system by system and mode by mode, where everything is known: the second thesis' tables 4.2 and 4.3.
+"""What OpenStreetMap brings, system by system and mode by mode, where everything is known: Del Tufo's tables 4.2 and 4.3.
 
     python tests/benchmarks/osm.py [--seeds 100-104] [--scans 150] [--map exact,perturbed] [--drift 3.0,2.0]
         [--kinds constant,wandering,random-walk] [--write docs/results.md]
@@ -191,7 +191,7 @@ def main() -> None:
         else f"`residential`, {tables.seeds_named(tables.numbers(args.seeds))}"
     )
     caption = (
-        f"{drives}, {args.scans} scans, median / worst: ATE as the second thesis defines it (planar, origin: first pose and "
+        f"{drives}, {args.scans} scans, median / worst: ATE as Del Tufo defines it (planar, origin: first pose and "
         f"heading on the true ones), mean over the scans, m; RPE from keyframe to keyframe, m; {percent} % and {deg} deg/100 m "
         "of drift put into odometry; no loops; the start is known (`osm.hold_start`)."
     )

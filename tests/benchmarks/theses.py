@@ -1,4 +1,4 @@
-"""The first thesis' presets, without and with the IMU, on its five flights, as its section 4.2 scores them.
+"""Girolimetto's presets, without and with the IMU, on its five flights, as its section 4.2 scores them.
 
     python tests/benchmarks/theses.py [--flights closed,open] [--seeds 100-104] [--write docs/results.md]
 

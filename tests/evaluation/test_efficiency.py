@@ -1,4 +1,4 @@
-"""Efficiency of equations 5.2 and 5.3 on numbers that the first thesis prints, and intervals over seeds."""
+"""Efficiency of equations 5.2 and 5.3 on numbers that Girolimetto prints, and intervals over seeds."""
 
 from __future__ import annotations
 

@@ -7,12 +7,12 @@ import pytest
 from numpy.typing import NDArray
 
 from lslam.geometry import se2
-from lslam.graph.building_graph import SUPPORT, BuildingSolution, MapBelief, agreeing, solve_buildings
+from lslam.graph.building_graph import SUPPORT, BuildingSolution, MapPrior, agreeing, solve_buildings
 from lslam.types.building_match import BuildingMatch
 
 Floats = NDArray[np.float64]
 
-BELIEF = MapBelief(np.zeros(2), np.full(2, 3.0), np.array([1.0, 1.0, np.radians(2.0)]))
+MAP_PRIOR = MapPrior(np.zeros(2), np.full(2, 3.0), np.array([1.0, 1.0, np.radians(2.0)]))
 FULL = np.diag([1 / 0.3**2, 1 / 0.3**2, 1 / 0.03**2])
 
 
@@ -54,14 +54,14 @@ def near(poses: dict[int, Floats], middle: Floats, reach: float = 20.0) -> list[
 def test_the_solution_is_that_of_all_rows_in_one_least_squares_problem(seed: int) -> None:
     rng = np.random.default_rng(50 + seed)
     middles, poses, _ = town(seed, 5)
-    belief = MapBelief(np.array([0.4, -0.7]), np.array([2.0, 1.0]), BELIEF.sigma)
+    map_prior = MapPrior(np.array([0.4, -0.7]), np.array([2.0, 1.0]), MAP_PRIOR.sigma)
     matches = []
     for b, middle in enumerate(middles[:4]):
         for k in near(poses, middle):
             root = rng.normal(0, 2, (int(rng.integers(1, 4)), 3))
             matches.append(match(k, b, seen_from(poses[k], middle, rng.normal(0, 0.1, 3)), root.T @ root))
-    found = solve_buildings(middles, matches, poses, belief)
-    assert found.believed.all()
+    found = solve_buildings(middles, matches, poses, map_prior)
+    assert found.inliers.all()
     rows, values = [], []
     for m in matches:
         turn = np.eye(3)
@@ -74,14 +74,14 @@ def test_the_solution_is_that_of_all_rows_in_one_least_squares_problem(seed: int
         values.append(root @ m.displacement(poses[m.keyframe], middles[m.building]))
     for b in range(5):
         row = np.zeros((3, 17))
-        row[:, 3 * b : 3 * b + 3] = np.diag(1 / belief.sigma)
-        row[:2, 15:] = -np.diag(1 / belief.sigma[:2])
+        row[:, 3 * b : 3 * b + 3] = np.diag(1 / map_prior.sigma)
+        row[:2, 15:] = -np.diag(1 / map_prior.sigma[:2])
         rows.append(row)
         values.append(np.zeros(3))
     row = np.zeros((2, 17))
-    row[:, 15:] = np.diag(1 / belief.shift_sigma)
+    row[:, 15:] = np.diag(1 / map_prior.shift_sigma)
     rows.append(row)
-    values.append(belief.shift / belief.shift_sigma)
+    values.append(map_prior.shift / map_prior.shift_sigma)
     A = np.concatenate(rows)
     answer = np.linalg.lstsq(A, np.concatenate(values), rcond=None)[0]
     counts = np.bincount([m.building for m in matches])
@@ -101,7 +101,7 @@ def test_buildings_seen_from_two_sides_end_where_they_are(seed: int) -> None:
     for b, middle in enumerate(middles):
         for k in near(poses, middle):
             matches.append(match(k, b, seen_from(poses[k], middle, truth[b] + rng.normal(0, [0.1, 0.1, 0.01]))))
-    found = solve_buildings(middles, matches, poses, BELIEF)
+    found = solve_buildings(middles, matches, poses, MAP_PRIOR)
     away = found.displacements - truth
     assert np.linalg.norm(away[:, :2], axis=1).max() < 0.25
     assert np.abs(away[:, 2]).max() < np.radians(1.2)
@@ -116,7 +116,7 @@ def test_a_lone_wall_moves_its_building_across_and_not_along() -> None:
     matches = [
         match(k, 5, seen_from(poses[k], middles[5], truth[5]), across(n, poses[k])) for k in near(poses, middles[5])
     ]
-    sure = MapBelief(np.array([1.0, -2.0]), np.full(2, 1e-4), BELIEF.sigma)
+    sure = MapPrior(np.array([1.0, -2.0]), np.full(2, 1e-4), MAP_PRIOR.sigma)
     found = solve_buildings(middles, matches, poses, sure)
     along = np.array([n[1], -n[0]])
     assert found.displacements[5, :2] @ n == pytest.approx(truth[5, :2] @ n, abs=0.12)
@@ -131,10 +131,10 @@ def test_who_was_not_seen_follows_the_shift_of_the_whole() -> None:
     middles, poses, _ = town(2)
     shift = np.array([2.0, -1.0, 0.0])
     matches = [match(k, b, seen_from(poses[k], middles[b], shift)) for b in range(11) for k in near(poses, middles[b])]
-    found = solve_buildings(middles, matches, poses, BELIEF)
+    found = solve_buildings(middles, matches, poses, MAP_PRIOR)
     np.testing.assert_allclose(found.displacements[11], shift, atol=0.05)
     assert found.covariances[11, 0, 0] > 1.0
-    empty = solve_buildings(middles, [], poses, BELIEF)
+    empty = solve_buildings(middles, [], poses, MAP_PRIOR)
     np.testing.assert_array_equal(empty.displacements, np.zeros((12, 3)))
     assert empty.covariances[0, 0, 0] == pytest.approx(10.0)
 
@@ -144,10 +144,10 @@ def test_matches_with_the_wrong_wall_are_given_up() -> None:
     good = [match(k, b, seen_from(poses[k], middles[b], truth[b])) for b in range(12) for k in near(poses, middles[b])]
     wrong = [match(k, b, seen_from(poses[k], middles[b], truth[b] + [3.0, -2.0, 0.2])) for b in range(12)
              for k in near(poses, middles[b])[:1]]  # fmt: skip
-    found = solve_buildings(middles, good + wrong, poses, BELIEF)
-    assert found.believed[: len(good)].all()
-    assert not found.believed[len(good) :].any()
-    expected: BuildingSolution = solve_buildings(middles, good, poses, BELIEF)
+    found = solve_buildings(middles, good + wrong, poses, MAP_PRIOR)
+    assert found.inliers[: len(good)].all()
+    assert not found.inliers[len(good) :].any()
+    expected: BuildingSolution = solve_buildings(middles, good, poses, MAP_PRIOR)
     np.testing.assert_allclose(found.displacements, expected.displacements, atol=1e-9)
 
 
@@ -167,9 +167,9 @@ def test_two_wrong_matches_of_five_are_given_up_though_they_agree(seed: int, met
             is_wrong.append(n < 2)
             off = np.array([*metres * wrong / np.linalg.norm(wrong), 0.1]) * (n < 2)
             matches.append(match(k, b, seen_from(poses[k], middle, truth[b] + off)))
-    found = solve_buildings(middles, matches, poses, BELIEF)
-    assert found.believed.tolist() == [not w for w in is_wrong]
-    right = solve_buildings(middles, [m for m, w in zip(matches, is_wrong, strict=True) if not w], poses, BELIEF)
+    found = solve_buildings(middles, matches, poses, MAP_PRIOR)
+    assert found.inliers.tolist() == [not w for w in is_wrong]
+    right = solve_buildings(middles, [m for m, w in zip(matches, is_wrong, strict=True) if not w], poses, MAP_PRIOR)
     np.testing.assert_allclose(found.displacements, right.displacements, atol=1e-9)
 
 
@@ -184,7 +184,7 @@ def test_a_match_that_knows_a_twentieth_as_well_may_confirm(share: float, knows:
     assert agreeing(middles, three, poses)[0] == knows
 
 
-def test_what_no_other_keyframe_says_is_not_believed() -> None:
+def test_a_match_that_no_other_supports_is_rejected() -> None:
     middles, poses, truth = town(4)
     keyframes = near(poses, middles[5], 40.0)
     n = np.array([0.0, 1.0])

@@ -10,7 +10,7 @@ from lslam.geometry import se3
 from lslam.graph.drift import drift_factor
 from lslam.graph.pose_graph import optimise, with_distances
 from lslam.graph.problem import PoseGraph, PositionFix
-from lslam.graph.rates import set_straight
+from lslam.graph.rates import correct_drift
 from lslam.types.constraint import Constraint
 
 CONFIG = GraphConfig()
@@ -29,7 +29,7 @@ def fixed(seed: int, noise: float, drift: float = 0.0) -> PoseGraph:
     places = REAL[:, :3, 3] + noise * rng.normal(size=(len(REAL), 3))
     fixes = [PositionFix(k, places[k], np.full(3, noise), np.zeros(3)) for k in range(0, len(REAL), 4)]
     graph = with_distances(PoseGraph(np.stack(poses), odometry, fixes=fixes, is_anchored=False))
-    return set_straight(graph, np.tile([0.0, drift, 0.0, 0.0, 0.0, 0.0], (len(steps), 1)))
+    return correct_drift(graph, np.tile([0.0, drift, 0.0, 0.0, 0.0, 0.0], (len(steps), 1)))
 
 
 def test_noise_of_fixes_is_no_drift() -> None:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from lslam.geometry import se3
 from lslam.graph import factors, fix_noise
-from lslam.graph.fix_noise import DriftOfFixes, Wander, wander_of
+from lslam.graph.fix_noise import DriftOfFixes, GaussMarkovNoise, fit_gauss_markov
 from lslam.graph.gnss_alignment import align
 from lslam.graph.problem import PositionFix
 
@@ -33,7 +33,7 @@ def drift_of(path: Floats, metre: Floats = METRE) -> DriftOfFixes:
 
 def fixes(
     count: int, gap: float, white: float, slow: float, memory: float, seed: int, percent: float = 0.0
-) -> tuple[Wander | None, float]:
+) -> tuple[GaussMarkovNoise | None, float]:
     """What is found of fixes about a drive at 5 m/s along an arc, stated as they err; odometry runs off by `percent`, east."""
     rng = np.random.default_rng(seed)
     seconds = gap * np.arange(count)
@@ -46,7 +46,7 @@ def fixes(
     run_off = path + np.column_stack([0.01 * percent * 5 * seconds, np.zeros((count, 2))])
     found = align(run_off, path + error, sigmas, 0.01 * percent * 5 * seconds, np.array([0.0, 0, 1]), 0.01, 5)
     assert found is not None
-    return wander_of(seconds, found.residuals, sigmas, path, 0.999, drift_of(run_off))
+    return fit_gauss_markov(seconds, found.residuals, sigmas, path, 0.999, drift_of(run_off))
 
 
 @pytest.mark.parametrize(("count", "gap"), [(30, 1.0), (300, 0.2)])
@@ -73,7 +73,7 @@ def test_fixes_that_are_wrong_hide_nothing_from_the_others() -> None:
     residuals = 0.8 + 0.3 * rng.normal(size=(200, 3))
     residuals[::7] += [0.0, 33.0, 0.0]
     path = 5 * rng.normal(size=(200, 3)).cumsum(0)
-    found, _ = wander_of(seconds, residuals, np.full((200, 3), 0.85), path, 0.999, drift_of(path))
+    found, _ = fit_gauss_markov(seconds, residuals, np.full((200, 3), 0.85), path, 0.999, drift_of(path))
     assert found is not None
     assert found.sigma[0] == pytest.approx(0.8, abs=0.05)
     assert not set(found.seconds.tolist()) & set(seconds[::7].tolist())
@@ -89,7 +89,7 @@ def test_fixes_err_together_that_scatter_less_than_one_of_a_thousand_drives(shar
     side = np.sqrt(white / 2) * np.where(np.arange(count) % 2, 1.0, -1.0)
     path = np.outer(np.arange(count), [3.0, 4.0, 0.5])
     residuals = np.repeat(side[:, None], 3, axis=1)
-    found, _ = wander_of(np.arange(1.0 * count), residuals, np.ones((count, 3)), path, 0.999, drift_of(path))
+    found, _ = fit_gauss_markov(np.arange(1.0 * count), residuals, np.ones((count, 3)), path, 0.999, drift_of(path))
     assert (found is not None) == wanders
 
 
@@ -99,21 +99,21 @@ def test_the_common_part_is_found_on_a_way_without_a_bend(ahead: tuple[float, fl
     rng, seconds = np.random.default_rng(1), np.arange(200.0)
     residuals = 0.8 * np.sin(seconds / 30)[:, None] + 0.2 * rng.normal(size=(200, 3))
     path = np.outer(seconds, ahead)
-    found, _ = wander_of(seconds, residuals, np.full((200, 3), 0.7), path, 0.999, drift_of(path))
+    found, _ = fit_gauss_markov(seconds, residuals, np.full((200, 3), 0.7), path, 0.999, drift_of(path))
     assert found is not None
     assert found.sigma[0] == pytest.approx(np.hypot(0.8 / np.sqrt(2), 0.2), abs=0.15)
 
 
 def test_nothing_is_told_of_fixes_out_of_order_or_alone() -> None:
     flat, one = np.zeros((3, 3)), np.ones((3, 3))
-    assert wander_of(np.array([0.0, 1.0, 1.0]), flat, one, flat, 0.999, drift_of(flat)) == (None, 0.0)
-    assert wander_of(np.zeros(1), flat[:1], one[:1], flat[:1], 0.999, drift_of(flat[:1])) == (None, 0.0)
+    assert fit_gauss_markov(np.array([0.0, 1.0, 1.0]), flat, one, flat, 0.999, drift_of(flat)) == (None, 0.0)
+    assert fit_gauss_markov(np.zeros(1), flat[:1], one[:1], flat[:1], 0.999, drift_of(flat[:1])) == (None, 0.0)
 
 
 def test_perfect_fixes_have_a_memory() -> None:
     seconds = np.arange(60.0)
     path = np.column_stack([seconds, seconds**2 / 60, 0 * seconds])
-    found, walk = wander_of(seconds, np.zeros((60, 3)), np.ones((60, 3)), path, 0.999, drift_of(path))
+    found, walk = fit_gauss_markov(seconds, np.zeros((60, 3)), np.ones((60, 3)), path, 0.999, drift_of(path))
     assert found is not None
     assert found.memory > 60
     assert walk == 0
@@ -152,14 +152,14 @@ def test_what_an_early_place_errs_by_a_later_one_errs_by_too() -> None:
 
 
 def test_the_graph_has_the_covariance_of_the_process() -> None:
-    wander = Wander(np.array([0.0, 1.0, 1.5, 40.0, 41.0, 4000.0]), np.array([0.5, 1.0, 2.0]), 30.0)
+    fix_noise = GaussMarkovNoise(np.array([0.0, 1.0, 1.5, 40.0, 41.0, 4000.0]), np.array([0.5, 1.0, 2.0]), 30.0)
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    factors._add_wander(graph, wander)
+    factors._add_fix_noise(graph, fix_noise)
     for i in range(6):
-        values.insert(factors.WANDER + i, np.zeros(3))
+        values.insert(factors.FIX_NOISE + i, np.zeros(3))
     information, _ = graph.linearize(values).hessian()
-    expected = np.exp(-np.abs(wander.seconds[:, None] - wander.seconds) / wander.memory)
-    np.testing.assert_allclose(np.linalg.inv(information), np.kron(expected, np.diag(wander.sigma**2)), atol=1e-8)
+    expected = np.exp(-np.abs(fix_noise.seconds[:, None] - fix_noise.seconds) / fix_noise.memory)
+    np.testing.assert_allclose(np.linalg.inv(information), np.kron(expected, np.diag(fix_noise.sigma**2)), atol=1e-8)
 
 
 def test_a_fix_that_errs_with_others_is_one_without_where_they_err_by_nothing() -> None:
@@ -170,7 +170,7 @@ def test_a_fix_that_errs_with_others_is_one_without_where_they_err_by_nothing() 
     )  # fmt: skip
     values = gtsam.Values()
     values.insert(0, gtsam.Pose3(pose))
-    values.insert(factors.WANDER + 3, np.zeros(3))
+    values.insert(factors.FIX_NOISE + 3, np.zeros(3))
     assert together.error(values) == pytest.approx(alone.error(values), rel=1e-9)
     (A, b), (A_own, b_own) = ((f.linearize(values).jacobian()) for f in (together, alone))
     np.testing.assert_allclose(A[:, :6], A_own, atol=1e-9)

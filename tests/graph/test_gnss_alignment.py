@@ -30,7 +30,7 @@ def test_noise_averages_out() -> None:
     off = se3.apply(found.T_enu_world, PATH) - se3.apply(T_ENU_WORLD, PATH)
     assert np.linalg.norm(off[:, :2], axis=1).max() < 0.5
     assert np.abs(off[:, 2]).max() < 0.8
-    assert found.believed.mean() > 0.98
+    assert found.inliers.mean() > 0.98
 
 
 @pytest.mark.parametrize("share", [0.2, 0.45])
@@ -39,8 +39,8 @@ def test_jumps_are_left_out(share: float) -> None:
     bad = np.arange(200) < 200 * share
     fixes[bad] += [40.0, -25.0, 3.0]
     found = fit(PATH, fixes)
-    np.testing.assert_array_equal(found.believed[bad], False)
-    assert found.believed[~bad].mean() > 0.97
+    np.testing.assert_array_equal(found.inliers[bad], False)
+    assert found.inliers[~bad].mean() > 0.97
     off = se3.apply(found.T_enu_world, PATH) - se3.apply(T_ENU_WORLD, PATH)
     assert np.linalg.norm(off[:, :2], axis=1).max() < 1.0
 
@@ -91,13 +91,13 @@ def test_half_a_metre_is_the_shortest_way_that_has_a_heading(metres: float, is_t
 
 
 @pytest.mark.parametrize(("sigma", "slack"), [(0.1, 0.0), (5.0, 0.0), (0.3, 2.0)])
-def test_a_fix_is_believed_within_its_own_sigma_and_what_odometry_drifts(sigma: float, slack: float) -> None:
+def test_a_fix_is_an_inlier_within_its_own_sigma_and_what_odometry_drifts(sigma: float, slack: float) -> None:
     """Three axes at 99.9 %: one fix of two hundred that is so far off by itself."""
     limit = np.sqrt(chi2.ppf(0.999, 3)) * np.hypot(sigma, slack)
-    for share, is_believed in ((0.95, True), (1.05, False)):
+    for share, is_inlier in ((0.95, True), (1.05, False)):
         fixes = se3.apply(T_ENU_WORLD, PATH)
         fixes[60] += [0.0, share * limit, 0.0]
         found = align(PATH, fixes, np.full((200, 3), sigma), np.full(200, slack), UP, 1e-6, 5)
         assert found is not None
-        assert found.believed[60] == is_believed
-        assert found.believed.sum() == 199 + is_believed
+        assert found.inliers[60] == is_inlier
+        assert found.inliers.sum() == 199 + is_inlier

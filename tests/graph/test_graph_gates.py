@@ -1,4 +1,4 @@
-"""Which loops are believed: just inside and just outside of each line that is drawn."""
+"""Which loop closures are accepted: just inside and just outside of each gate."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from lslam.config.graph import GraphConfig
 from lslam.geometry import se3
 from lslam.graph.consistency import judge_loops
 from lslam.graph.drift import drift_factor
-from lslam.graph.gnc import Doubted, Settled, settle
+from lslam.graph.gnc import GncResult, OutlierCandidate, gnc_solve
 from lslam.graph.problem import PoseGraph, UpDirection
 from lslam.types.constraint import Constraint
 
@@ -94,13 +94,13 @@ def test_odometry_is_asked_first(origin: tuple[float, float]) -> None:
 
 def pulled(
     distances: list[float], sigma: float = 1e-6, robust: str = "gnc", scales: list[float] | None = None
-) -> Settled:
+) -> GncResult:
     """A point that is known to lie at 0 to `sigma` m, and one wrong or right sighting of it at each distance, m, to a metre."""
     fixed, values, scales = gtsam.NonlinearFactorGraph(), gtsam.Values(), [] if scales is None else scales
     fixed.add(gtsam.PriorFactorPoint3(0, np.zeros(3), gtsam.noiseModel.Isotropic.Sigma(3, sigma)))
     values.insert(0, np.zeros(3))
 
-    def sighting(x: float) -> Doubted:
+    def sighting(x: float) -> OutlierCandidate:
         def make(scale: float, kernel: Any) -> gtsam.PriorFactorPoint3:
             scales.append(scale)
             noise = gtsam.noiseModel.Isotropic.Sigma(3, np.sqrt(scale))
@@ -108,9 +108,9 @@ def pulled(
                 noise = gtsam.noiseModel.Robust.Create(kernel, noise)
             return gtsam.PriorFactorPoint3(0, np.array([x, 0, 0]), noise)
 
-        return Doubted(make, 3)
+        return OutlierCandidate(make, 3)
 
-    return settle(fixed, [sighting(x) for x in distances], values, GraphConfig.model_validate({"robust": robust}))
+    return gnc_solve(fixed, [sighting(x) for x in distances], values, GraphConfig.model_validate({"robust": robust}))
 
 
 def test_the_last_word_is_that_of_the_chi_square_distribution() -> None:

@@ -1,4 +1,4 @@
-"""Buildings and trajectory in one graph: walls mend a drifting way and a wrong map together; the baseline believes them all."""
+"""Buildings and trajectory in one graph: walls mend a drifting way and a wrong map together; the baseline rejects none."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from lslam.config.graph import GraphConfig
 from lslam.errors import GraphError
 from lslam.geometry import se2, se3, so3
 from lslam.graph import joint, solve
-from lslam.graph.building_graph import MapBelief
+from lslam.graph.building_graph import MapPrior
 from lslam.graph.drift import with_drift
 from lslam.graph.joint import optimise_jointly
 from lslam.graph.odometry_constraints import in_plane
@@ -25,7 +25,7 @@ from lslam.types.constraint import Constraint
 Floats = NDArray[np.float64]
 
 FULL = np.diag([1 / 0.1**2, 1 / 0.1**2, 1 / 0.01**2])
-BELIEF = MapBelief(np.zeros(2), np.full(2, 1e-3), np.array([0.3, 0.3, np.radians(1.0)]))
+MAP_PRIOR = MapPrior(np.zeros(2), np.full(2, 1e-3), np.array([0.3, 0.3, np.radians(1.0)]))
 
 
 def drive(seed: int) -> tuple[PoseGraph, Floats, Floats, Floats, list[BuildingMatch]]:
@@ -65,8 +65,8 @@ def off_the_way(poses: Floats, real: Floats) -> float:
 def test_poses_are_unsure_by_what_is_given_beside_the_graph() -> None:
     graph, _, middles, _, matches = drive(0)
     spread = np.tile(np.diag([0.04, 0.09, 0.0, 0.0, 0.0, 1e-4]), (len(graph), 1, 1))
-    known = optimise_jointly(graph, middles, matches, BELIEF, GraphConfig())
-    unsure = optimise_jointly(replace(graph, spread=spread), middles, matches, BELIEF, GraphConfig())
+    known = optimise_jointly(graph, middles, matches, MAP_PRIOR, GraphConfig())
+    unsure = optimise_jointly(replace(graph, spread=spread), middles, matches, MAP_PRIOR, GraphConfig())
     np.testing.assert_allclose(unsure.covariances - known.covariances, spread, atol=1e-12)
     np.testing.assert_array_equal(unsure.poses, known.poses)
 
@@ -74,9 +74,9 @@ def test_poses_are_unsure_by_what_is_given_beside_the_graph() -> None:
 @pytest.mark.parametrize("seed", range(3))
 def test_walls_mend_the_way_and_the_map_together(seed: int) -> None:
     graph, real, middles, off, matches = drive(seed)
-    found = optimise_jointly(graph, middles, matches, BELIEF, GraphConfig())
+    found = optimise_jointly(graph, middles, matches, MAP_PRIOR, GraphConfig())
     assert off_the_way(found.poses, real) < max(0.5 * off_the_way(graph.poses, real), 0.2)
-    assert found.buildings.believed.mean() > 0.98
+    assert found.buildings.inliers.mean() > 0.98
     away = np.linalg.norm(found.buildings.displacements[:, :2] - off[:, :2], axis=1)
     assert np.median(away) < 0.3
     assert (np.linalg.eigvalsh(found.covariances) > 0).all()
@@ -87,8 +87,8 @@ def test_walls_mend_the_way_and_the_map_together(seed: int) -> None:
 
 def test_only_what_is_seen_from_above_is_touched() -> None:
     graph, _, middles, _, matches = drive(1)
-    alone = optimise_jointly(graph, middles, [], BELIEF, GraphConfig())
-    found = optimise_jointly(graph, middles, matches, BELIEF, GraphConfig())
+    alone = optimise_jointly(graph, middles, [], MAP_PRIOR, GraphConfig())
+    found = optimise_jointly(graph, middles, matches, MAP_PRIOR, GraphConfig())
     np.testing.assert_allclose(found.poses[:, 2, 3], alone.poses[:, 2, 3], atol=0.15)
     np.testing.assert_allclose(found.poses[:, 2, :2], alone.poses[:, 2, :2], atol=0.03)
 
@@ -96,11 +96,11 @@ def test_only_what_is_seen_from_above_is_touched() -> None:
 def test_matches_with_the_wrong_wall_are_given_up_but_not_by_the_baseline() -> None:
     graph, real, middles, _, matches = drive(2)
     wrong = [replace(m, pose=np.add(m.pose, [4.0, -3.0, 0.1])) for m in matches[::12]]
-    found = optimise_jointly(graph, middles, [*matches, *wrong], BELIEF, GraphConfig())
-    assert not found.buildings.believed[len(matches) :].any()
-    assert found.buildings.believed[: len(matches)].mean() > 0.95
+    found = optimise_jointly(graph, middles, [*matches, *wrong], MAP_PRIOR, GraphConfig())
+    assert not found.buildings.inliers[len(matches) :].any()
+    assert found.buildings.inliers[: len(matches)].mean() > 0.95
     baseline = optimise_jointly(graph, middles, [*matches, *wrong], None, GraphConfig())
-    assert baseline.buildings.believed.all()
+    assert baseline.buildings.inliers.all()
     assert off_the_way(baseline.poses, real) > 2 * off_the_way(found.poses, real)
 
 
@@ -119,7 +119,7 @@ def test_a_lone_wall_leaves_its_building_free_along_it() -> None:
     walls = [replace(m, information=across(n, planar[m.keyframe]), rank=2) for m in matches if m.building == 3]
     rest = [m for m in matches if m.building != 3]
     sure = replace(graph, odometry=[replace(c, covariance=1e-6 * np.eye(6)) for c in graph.odometry])
-    found = optimise_jointly(sure, middles, [*rest, *walls], BELIEF, GraphConfig(robust="none"))
+    found = optimise_jointly(sure, middles, [*rest, *walls], MAP_PRIOR, GraphConfig(robust="none"))
     spread = np.sqrt(np.diag(found.buildings.covariances[3]))
     assert spread[1] == pytest.approx(0.3, rel=0.1)
     assert spread[0] < 0.15
@@ -131,10 +131,10 @@ def test_covariances_of_buildings_do_not_depend_on_how_they_are_had(monkeypatch:
     floors = [FloorPlane(k, np.array([0.0, 0.0, 1.0]), 1.7, 0.1, 1.0) for k in (0, 30)]
     for known in (graph, replace(graph, floors=floors)):
         config = GraphConfig(robust="none")
-        by_gtsam = optimise_jointly(known, middles, matches, BELIEF, config)
+        by_gtsam = optimise_jointly(known, middles, matches, MAP_PRIOR, config)
         with monkeypatch.context() as without:
             without.setattr(joint, "marginal_blocks", lambda f, v, keys: solve.scaled_blocks(f, v, list(keys)))
-            by_scaling = optimise_jointly(known, middles, matches, BELIEF, config)
+            by_scaling = optimise_jointly(known, middles, matches, MAP_PRIOR, config)
         np.testing.assert_allclose(
             by_scaling.buildings.covariances, by_gtsam.buildings.covariances, rtol=1e-4, atol=1e-9
         )
@@ -143,7 +143,7 @@ def test_covariances_of_buildings_do_not_depend_on_how_they_are_had(monkeypatch:
 def test_what_nothing_was_matched_with_follows_the_others() -> None:
     graph, _, middles, _, matches = drive(1)
     more = np.vstack([middles, [[300.0, 0.0]]])
-    found = optimise_jointly(graph, more, matches, BELIEF, GraphConfig()).buildings
+    found = optimise_jointly(graph, more, matches, MAP_PRIOR, GraphConfig()).buildings
     np.testing.assert_allclose(found.displacements[-1], [*found.displacements[:-1, :2].mean(axis=0), 0.0], atol=1e-9)
     assert np.linalg.norm(found.shift) > 0.01
     baseline = optimise_jointly(graph, more, matches, None, GraphConfig()).buildings
@@ -165,15 +165,15 @@ def test_a_wall_that_fixes_less_is_judged_by_less() -> None:
     ]  # fmt: skip
     at, place = walls[0].keyframe, np.append(middles[3], 0.0) + off[3]
     odd = replace(walls[0], pose=se2.relative(planar[at], np.add(place, [4.2 * 0.3, 0.0, 0.0])))
-    found = optimise_jointly(sure, middles, [*walls * 4, odd], BELIEF, GraphConfig())
-    assert found.buildings.believed.tolist() == [True] * (4 * len(walls)) + [False]
+    found = optimise_jointly(sure, middles, [*walls * 4, odd], MAP_PRIOR, GraphConfig())
+    assert found.buildings.inliers.tolist() == [True] * (4 * len(walls)) + [False]
 
 
 def test_trusted_odometry_is_not_bent_by_walls() -> None:
     graph, _, middles, _, matches = drive(1)
     rigid = replace(graph, is_rigid=True, start_sigma=np.array([3.0, 3.0, 0.1]))
     rigid = replace(rigid, odometry=with_drift(rigid, 4.0, GraphConfig()))
-    found = optimise_jointly(rigid, middles, matches, BELIEF, GraphConfig())
+    found = optimise_jointly(rigid, middles, matches, MAP_PRIOR, GraphConfig())
     np.testing.assert_allclose(
         se3.relative(found.poses[:1], found.poses), se3.relative(graph.poses[:1], graph.poses), atol=0.01
     )
@@ -182,12 +182,12 @@ def test_trusted_odometry_is_not_bent_by_walls() -> None:
 def test_a_graph_in_pieces_is_refused() -> None:
     graph, _, middles, _, matches = drive(0)
     with pytest.raises(GraphError, match="in pieces"):
-        optimise_jointly(replace(graph, odometry=graph.odometry[:-3]), middles, matches, BELIEF, GraphConfig())
+        optimise_jointly(replace(graph, odometry=graph.odometry[:-3]), middles, matches, MAP_PRIOR, GraphConfig())
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_a_planar_graph_does_not_tip_over_when_all_sigmas_are_of_metres(seed: int) -> None:
-    """The thesis' baseline: odometry and buildings weigh alike, a tenth of the matches is wrong. In space it tilts by 114 deg."""
+    """Del Tufo's baseline: odometry and buildings weigh alike, a tenth of the matches is wrong. In space it tilts by 114 deg."""
     graph, real, middles, _, matches = drive(seed)
     rng = np.random.default_rng(seed)
     information = np.diag([1 / 5.0, 1 / 5.0, 1 / 0.2])

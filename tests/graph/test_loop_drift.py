@@ -21,7 +21,7 @@ from lslam.graph.drift import drift_covariance
 from lslam.graph.loop_drift import APART, LASTS, PARTS, WALKS, without_loop_drift
 from lslam.graph.pose_graph import optimise, with_distances
 from lslam.graph.problem import PoseGraph, Solution
-from lslam.graph.rates import SIZES, hats, rate_roots, set_straight
+from lslam.graph.rates import SIZES, correct_drift, linear_basis, rate_roots
 from lslam.types.constraint import Constraint
 from lslam.types.scan_result import ScanResult
 
@@ -66,12 +66,12 @@ def test_drift_that_lasts_is_taken_out_and_loops_close_better() -> None:
     for seed in range(6):
         graph = away(seed, 1.0, 0.2)
         straight = without_loop_drift(graph, CONFIG)
-        assert straight.claim is not None
+        assert straight.estimated_drift is not None
         assert ate(straight.poses, REAL) < 0.05 * ate(graph.poses, REAL)
         assert straight.spread is not None
         # What rates may be wrong by, less what loops take back of it.
         at_end = np.sqrt(np.diag(straight.spread[-1])[3:]) / graph.distances[-1]
-        assert (at_end < 0.5 * straight.claim.sigma[3:]).all()
+        assert (at_end < 0.5 * straight.estimated_drift.sigma[3:]).all()
         plain, better = optimise(graph, CONFIG), optimise(straight, CONFIG)
         assert better.drift >= straight.walk > 0.0
         assert not any(better.loop_reasons)
@@ -94,21 +94,21 @@ def test_what_bends_the_way_much_is_sought_again_on_the_way_set_straight() -> No
 def test_what_is_claimed_is_the_drift_and_how_well_it_is_known(percent: float, degrees: float) -> None:
     squared = []
     for seed in range(5):
-        claim = without_loop_drift(away(seed, percent, degrees), CONFIG).claim
-        assert claim is not None
+        estimated_drift = without_loop_drift(away(seed, percent, degrees), CONFIG).estimated_drift
+        assert estimated_drift is not None
         rng = np.random.default_rng(seed)  # draws as `debug.drift` does
         direction = rng.normal(size=3)
         shift, turn = 0.01 * percent * direction / np.linalg.norm(direction), np.radians(degrees) / 100
         real = np.append(shift, [0.0, 0.0, turn * rng.choice([-1, 1])])
-        np.testing.assert_allclose(claim.rates[:3], real[:3], atol=5e-4)
-        np.testing.assert_allclose(claim.rates[3:], real[3:], atol=5e-6)
-        squared.append(((claim.rates - real) / claim.sigma) ** 2)
-        assert claim.chance == pytest.approx(chi2.ppf(CONFIG.probability, 6))
+        np.testing.assert_allclose(estimated_drift.rates[:3], real[:3], atol=5e-4)
+        np.testing.assert_allclose(estimated_drift.rates[3:], real[3:], atol=5e-6)
+        squared.append(((estimated_drift.rates - real) / estimated_drift.sigma) ** 2)
+        assert estimated_drift.chance == pytest.approx(chi2.ppf(CONFIG.probability, 6))
     assert 0.1 < np.mean(squared) < 3.0
 
 
 def test_drift_that_wanders_is_known_for_what_it_is() -> None:
-    """Rates of some 100 m, and walks: never much worse for being set straight, and no longer far too unsure or too sure."""
+    """Rates of some 100 m, and walks: never much worse once corrected, and covariances neither far too large nor too small."""
     ratios, known = [], []
     for seed in range(8):
         graph = away(seed, 1.0, 0.5, 60.0)
@@ -132,7 +132,7 @@ def test_noise_is_no_drift(inflated: float) -> None:
         odometry = [replace(c, T_a_b=step) for c, step in zip(graph.odometry, steps, strict=True)]
         graph = replace(graph, poses=np.stack(poses), odometry=odometry)
         straight = without_loop_drift(graph, CONFIG)
-        assert straight.claim is None, seed
+        assert straight.estimated_drift is None, seed
         assert straight.walk == 0.0
         assert straight.spread is None
         np.testing.assert_array_equal(straight.poses, graph.poses)
@@ -146,10 +146,13 @@ def test_wrong_loops_among_them_tell_nothing_else() -> None:
             replace(c, a=c.a + 4, b=c.b + 7, T_a_b=measured(c.T_a_b, np.array([3.0, 3.0, 0.5, 0.02, 0.02, 0.2]), rng))
             for c in graph.loops[1::3]
         ]
-        claims = [without_loop_drift(replace(graph, loops=[*graph.loops, *more]), CONFIG).claim for more in ([], wrong)]
-        assert claims[0] is not None
-        assert claims[1] is not None
-        np.testing.assert_allclose(claims[1].rates, claims[0].rates, atol=2e-4)
+        estimates = [
+            without_loop_drift(replace(graph, loops=[*graph.loops, *more]), CONFIG).estimated_drift
+            for more in ([], wrong)
+        ]
+        assert estimates[0] is not None
+        assert estimates[1] is not None
+        np.testing.assert_allclose(estimates[1].rates, estimates[0].rates, atol=2e-4)
 
 
 def test_a_loop_that_is_a_little_off_changes_little() -> None:
@@ -159,9 +162,9 @@ def test_a_loop_that_is_a_little_off_changes_little() -> None:
     T[2, 3] += 0.2
     off = [replace(c, T_a_b=T) if n == 2 else c for n, c in enumerate(graph.loops)]
     right, mixed = (without_loop_drift(replace(graph, loops=loops), CONFIG) for loops in (graph.loops, off))
-    assert right.claim is not None
-    assert mixed.claim is not None
-    np.testing.assert_allclose(mixed.claim.rates[:3], right.claim.rates[:3], atol=1e-4)
+    assert right.estimated_drift is not None
+    assert mixed.estimated_drift is not None
+    np.testing.assert_allclose(mixed.estimated_drift.rates[:3], right.estimated_drift.rates[:3], atol=1e-4)
     assert mixed.walk > 5 * right.walk
 
 
@@ -169,7 +172,7 @@ def test_loops_surer_than_can_be_reckoned_with_tell_their_drift_too() -> None:
     """Each twice, and to a hundredth of a micrometre: large rates and walks leave no such difference in 64 bits."""
     graph = away(0, 1.0, 0.5)
     loops = [replace(c, covariance=1e-16 * np.eye(6)) for c in graph.loops for _ in range(2)]
-    sure, plain = (without_loop_drift(given, CONFIG).claim for given in (replace(graph, loops=loops), graph))
+    sure, plain = (without_loop_drift(given, CONFIG).estimated_drift for given in (replace(graph, loops=loops), graph))
     assert sure is not None
     assert plain is not None
     np.testing.assert_allclose(sure.rates[:3], plain.rates[:3], atol=5e-4)
@@ -198,14 +201,14 @@ def test_parts_are_of_one_way(monkeypatch: pytest.MonkeyPatch) -> None:
         Constraint(a, b, se3.relative(graph.poses[a], graph.poses[b]), np.diag(LOOP**2))
         for a, b in ((3, 33), (9, 29), (10, 40), (19, 60))
     ]
-    found = np.random.default_rng(0).normal(0, 1e-3, 6 * hats(graph.distances, APART).shape[1])
+    found = np.random.default_rng(0).normal(0, 1e-3, 6 * linear_basis(graph.distances, APART).shape[1])
     turned = so3.exp(np.random.default_rng(1).normal(0, 0.3, (len(graph) - 1, 3)))
     told = []
     for part in (256, 10):
         monkeypatch.setattr(loop_drift, "PART", part)
         fit = loop_drift._Fit(graph, loops, found, turned, CONFIG)
         rates, covariance, walk = fit.likeliest()
-        told.append((fit.unlikeliness, rates, fit.spread(covariance, walk)))
+        told.append((fit.negative_log_likelihood, rates, fit.spread(covariance, walk)))
     for whole, in_parts in zip(*told, strict=True):
         np.testing.assert_allclose(in_parts, whole, rtol=1e-6, atol=1e-6 * np.abs(whole).max())
 
@@ -215,7 +218,7 @@ def test_one_loop_none_or_no_way_tell_nothing() -> None:
     none, one = replace(graph, loops=[]), replace(graph, loops=graph.loops[:1])
     stays = replace(graph, distances=np.zeros(len(graph)))
     for given in (none, one, stays):
-        assert without_loop_drift(given, CONFIG).claim is None
+        assert without_loop_drift(given, CONFIG).estimated_drift is None
     lost = replace(graph, odometry=graph.odometry[:50])
     with pytest.raises(GraphError, match="in pieces"):
         without_loop_drift(lost, CONFIG)
@@ -225,7 +228,7 @@ def test_ways_are_found_where_nobody_measured_them() -> None:
     graph = away(0, 1.0, 0.5)
     way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(graph.poses[:, :3, 3], axis=0), axis=1))])
     measured_by, unmeasured = (without_loop_drift(replace(graph, distances=d), CONFIG) for d in (way, np.zeros(0)))
-    assert unmeasured.claim is not None
+    assert unmeasured.estimated_drift is not None
     np.testing.assert_allclose(unmeasured.poses, measured_by.poses)
 
 
@@ -237,7 +240,7 @@ def test_likelihood_and_rates_equal_those_of_all_errors_written_out() -> None:
         Constraint(a, b, measured(se3.relative(real[a], real[b]), LOOP, np.random.default_rng(a)), np.diag(LOOP**2))
         for a, b in ((1, 16), (4, 18), (9, 30))
     ]
-    at_knots = hats(graph.distances, APART)
+    at_knots = linear_basis(graph.distances, APART)
     count, small = 6 * at_knots.shape[1], 1e-5
     turned = so3.exp(np.random.default_rng(1).normal(0, 0.3, (len(graph) - 1, 3)))
     fit = loop_drift._Fit(graph, loops, np.zeros(count), turned, CONFIG)
@@ -245,7 +248,7 @@ def test_likelihood_and_rates_equal_those_of_all_errors_written_out() -> None:
     def set_by(knot: int) -> Floats:
         rates = at_knots @ (small * np.eye(count)[knot]).reshape(-1, 6)
         along = np.einsum("kij,kj->ki", turned, rates[:, :3])
-        return set_straight(graph, np.column_stack([along, rates[:, 3:]])).poses
+        return correct_drift(graph, np.column_stack([along, rates[:, 3:]])).poses
 
     def off(poses: Floats, seen: list[Floats]) -> Floats:
         moved = poses.copy()
@@ -287,20 +290,20 @@ def test_likelihood_and_rates_equal_those_of_all_errors_written_out() -> None:
         J = np.stack([(off(graph.poses, some) - zero) / small for some in changed], axis=1)
         known += J @ loop.covariance @ J.T
 
-    def unlikely(S: Floats) -> float:
+    def negative_log_likelihood(S: Floats) -> float:
         return float(np.linalg.slogdet(S)[1] + zero @ np.linalg.solve(S, zero))
 
     roots = rate_roots(float(graph.distances[-1]), CONFIG, list(range(6)), LASTS, APART, is_smooth=False)
     for w in (0, 3, 6):
         alone = known + WALKS[w] * walk
-        assert fit.unlikeliness[w, 0] == pytest.approx(unlikely(alone), rel=1e-3)
+        assert fit.negative_log_likelihood[w, 0] == pytest.approx(negative_log_likelihood(alone), rel=1e-3)
         for kind in (0, 4, 7, 11):
             which, size = KINDS[kind]
             prior = size**2 * roots[which] @ roots[which].T
             S = alone + G @ prior @ G.T
-            assert fit.unlikeliness[w, 1 + kind] == pytest.approx(unlikely(S), rel=1e-3)
+            assert fit.negative_log_likelihood[w, 1 + kind] == pytest.approx(negative_log_likelihood(S), rel=1e-3)
     found, covariance, mean_walk = fit.likeliest()
-    likely = np.exp(-0.5 * (fit.unlikeliness[:, 1:] - fit.unlikeliness[:, 1:].min()))
+    likely = np.exp(-0.5 * (fit.negative_log_likelihood[:, 1:] - fit.negative_log_likelihood[:, 1:].min()))
     assert mean_walk == pytest.approx((np.array(WALKS)[:, None] * likely).sum() / likely.sum())
     which, size = KINDS[int(likely.sum(0).argmax())]
     prior = size**2 * roots[which] @ roots[which].T

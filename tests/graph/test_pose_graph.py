@@ -83,7 +83,7 @@ def test_odometry_that_thinks_too_well_of_itself_is_found_out() -> None:
     assert ate(solution.poses, REAL) < 0.35 * ate(graph.poses, REAL)
 
 
-def test_a_loop_between_far_places_is_not_believed_alone() -> None:
+def test_a_loop_closure_between_far_places_is_not_accepted_alone() -> None:
     """One loop has no other to contradict it, but odometry cannot have drifted so far."""
     graph = graph_of(REAL, 0, 0, np.random.default_rng(6), LAPS)
     wrong = Constraint(0, 20, se3.exp(np.array([0.5, 0.0, 0, 0, 0, 0])), np.diag(LOOP_SIGMAS**2))
@@ -103,7 +103,7 @@ def test_fixes_place_the_graph_and_wrong_ones_are_left_out() -> None:
         fixes.append(PositionFix(k, position + (30.0 if k % 10 == 0 else 0.0), np.full(3, 1.0), arm))
     rough = se3.exp(np.array([1.0, -1.0, 0.5, 0.0, 0.0, 0.03])) @ graph.poses
     solution = optimise(replace(graph, poses=rough, fixes=fixes, is_anchored=False), GraphConfig())
-    np.testing.assert_array_equal(solution.fix_believed, [k % 10 != 0 for k in range(0, 240, 2)])
+    np.testing.assert_array_equal(solution.fix_inliers, [k % 10 != 0 for k in range(0, 240, 2)])
     assert ate(solution.poses, REAL) < 0.7 < ate(rough, REAL)
 
 
@@ -143,7 +143,7 @@ def test_a_start_that_is_doubted_moves_though_up_is_seen(is_doubted: bool, x: fl
     np.testing.assert_allclose(solution.poses[:, 1:3, 3], 0.0, atol=1e-3)
 
 
-def test_what_is_believed_makes_poses_surer_where_up_is_seen_too() -> None:
+def test_inliers_make_poses_surer_where_up_is_measured_too() -> None:
     """Two steps of 0.1 m and a loop of 0.05 m: along the way 1 / (1 / 0.02 + 1 / 0.0025) m2, and 0.02 beside a wrong loop."""
     poses = np.tile(np.eye(4), (3, 1, 1))
     poses[:, 0, 3] = 10.0 * np.arange(3)

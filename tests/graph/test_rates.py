@@ -1,10 +1,10 @@
-"""What is believed of rates before anything is seen: how alike two of them are, and how far they lead."""
+"""The prior of rates: how correlated two of them are, and how far they lead."""
 
 import numpy as np
 import pytest
 
 from lslam.config.graph import GraphConfig
-from lslam.graph.rates import MEMORY, hats, rate_roots, walk_root
+from lslam.graph.rates import MEMORY, linear_basis, rate_roots, walk_root
 
 CONFIG = GraphConfig(drift_percent=2.0, drift_deg_per_100m=0.25)
 SIGMA = np.array([0.02] * 3 + [np.radians(0.25) / 100] * 3)
@@ -15,7 +15,7 @@ WAY = np.linspace(0.0, LENGTH, 501)
 @pytest.mark.parametrize(("apart", "knots"), [(MEMORY, 11), (30.0, 35), (2 * LENGTH, 2)])
 def test_knots_share_every_step(apart: float, knots: int) -> None:
     """No rate between two knots but what these have, and a straight line stays one."""
-    shares = hats(WAY, apart)
+    shares = linear_basis(WAY, apart)
     assert shares.shape == (len(WAY) - 1, knots)
     np.testing.assert_allclose(shares.sum(axis=1), 1.0)
     np.testing.assert_allclose(shares @ np.linspace(0, LENGTH, knots), 0.5 * (WAY[1:] + WAY[:-1]), atol=1e-9)
@@ -40,7 +40,7 @@ def test_a_walk_leads_as_far_over_the_memory_as_a_rate_that_lasts(apart: float) 
     root = walk_root(LENGTH, CONFIG, axes, apart)
     for times in (1, 4):
         is_gone = (WAY[1:] > 300.0) & (WAY[1:] < 301.0 + times * MEMORY)
-        gone = np.kron((np.diff(WAY) * is_gone) @ hats(WAY, apart), np.eye(3))
+        gone = np.kron((np.diff(WAY) * is_gone) @ linear_basis(WAY, apart), np.eye(3))
         sigma = np.sqrt(np.diag(gone @ root @ root.T @ gone.T))
         expected = np.sqrt((times * MEMORY - 0.5 * apart) * MEMORY) * SIGMA[axes]
         np.testing.assert_allclose(sigma, expected, rtol=0.01)

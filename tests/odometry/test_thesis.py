@@ -1,4 +1,4 @@
-"""The first thesis' presets on the beginning of two of its flights."""
+"""Girolimetto's presets on the beginning of two of its flights."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The thesis' baseline: what its NDT and VGICP find where they can, and that they say nothing without anything to match."""
+"""Del Tufo's baseline: what its NDT and VGICP find where they can, and that they say nothing without anything to match."""
 
 from __future__ import annotations
 

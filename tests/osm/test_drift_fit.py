@@ -1,4 +1,4 @@
-"""How likely a steady drift is, and what it is then, against all covariances written out; and what is believed beforehand."""
+"""Likelihood and estimate of a steady drift against all covariances written out, and the prior."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from lslam.config.graph import GraphConfig
 from lslam.geometry import se2
 from lslam.graph.factors import PLANAR
 from lslam.graph.problem import PoseGraph
-from lslam.graph.rates import LASTING, MEMORY, SIZES, hats, rate_roots, walk_root
+from lslam.graph.rates import LASTING, MEMORY, SIZES, linear_basis, rate_roots, walk_root
 from lslam.osm import drift_fit
 from lslam.osm.drift_fit import DriftFit, Sizes, WallSightings
 from lslam.osm.wall_drift import SCALES, _effects, find_wall_drift, without_drift
@@ -37,7 +37,7 @@ def scene(seed: int, percent: float = 0.5, count: int = 150) -> tuple[PoseGraph,
     return graph, some(seen, np.random.default_rng(seed).permutation(len(seen.walls))[:count])
 
 
-def believed(size: float, lasting: float) -> Floats:
+def prior_covariance(size: float, lasting: float) -> Floats:
     """Covariance of three rates at each knot, 100 m apart at most."""
     knots = np.linspace(0.0, WAY[-1], int(np.ceil(WAY[-1] / 100.0)) + 1)
     alike = lasting + (1 - lasting) * np.exp(-0.5 * ((knots[:, None] - knots) / 100.0) ** 2)
@@ -51,7 +51,7 @@ class Dense:
         self.graph, self.seen = graph, seen
         about = seen.places - graph.poses[seen.keyframes, :2, 3]
         turned = seen.normals[:, 1] * about[:, 0] - seen.normals[:, 0] * about[:, 1]
-        self.effects = _effects(graph, hats(graph.distances))
+        self.effects = _effects(graph, linear_basis(graph.distances))
         axes = np.column_stack([seen.normals, turned])
         self.rows = np.stack([axis @ self.effects[k] for axis, k in zip(axes, seen.keyframes, strict=True)])
         self.given = np.append(graph.start_sigma, [graph.shift_sigma] * 2)  # type: ignore[arg-type]
@@ -64,14 +64,14 @@ class Dense:
 
     def parts(self, scale: float, size: float, lasting: float) -> tuple[Floats, Floats, Floats]:
         """Covariances of what is seen, of all unknowns, and of the offsets."""
-        of_rates = believed(size, lasting)
+        of_rates = prior_covariance(size, lasting)
         prior = np.zeros((5 + len(of_rates),) * 2)
         prior[:5, :5], prior[5:, 5:] = np.diag(self.given**2), of_rates
         noise = np.diag((scale * SEEN) ** 2 / self.weights)
         drawn = MAP**2 * (self.seen.walls[:, None] == self.seen.walls)
         return noise, prior, noise + drawn + self.rows @ prior @ self.rows.T
 
-    def unlikeliness(self, scale: float, size: float, lasting: float) -> float:
+    def negative_log_likelihood(self, scale: float, size: float, lasting: float) -> float:
         _, _, C = self.parts(scale, size, lasting)
         return float(np.linalg.slogdet(C)[1] + self.offsets @ np.linalg.solve(C, self.offsets))
 
@@ -87,8 +87,8 @@ class Dense:
         self.weights = 4.0 / (3.0 + (missed / (scale * SEEN)) ** 2)
 
 
-def unlikeliness(fit: DriftFit, scale: float, size: float, lasting: float) -> float:
-    return float(fit.unlikeliness(scale, ROOTS[lasting], (0.1, size))[1])
+def negative_log_likelihood(fit: DriftFit, scale: float, size: float, lasting: float) -> float:
+    return float(fit.negative_log_likelihood(scale, ROOTS[lasting], (0.1, size))[1])
 
 
 def sizes(scale: float, size: float, lasting: float) -> Sizes:
@@ -96,9 +96,11 @@ def sizes(scale: float, size: float, lasting: float) -> Sizes:
 
 
 def agree(fit: DriftFit, dense: Dense) -> None:
-    base = unlikeliness(fit, 1.0, 1.0, 0.9) - dense.unlikeliness(1.0, 1.0, 0.9)
+    base = negative_log_likelihood(fit, 1.0, 1.0, 0.9) - dense.negative_log_likelihood(1.0, 1.0, 0.9)
     for choice in CHOICES:
-        assert unlikeliness(fit, *choice) - dense.unlikeliness(*choice) == pytest.approx(base, abs=1e-4)
+        assert negative_log_likelihood(fit, *choice) - dense.negative_log_likelihood(*choice) == pytest.approx(
+            base, abs=1e-4
+        )
         for found, expected in zip(fit.rates(sizes(*choice)), dense.rates(*choice), strict=True):
             np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-5 * np.abs(expected).max() + 1e-15)
 
@@ -108,17 +110,17 @@ def test_likelihood_and_rates_are_those_of_all_covariances_written_out(seed: int
     dense = Dense(*scene(seed))
     agree(dense.fit(), dense)
     for lasting, root in ROOTS.items():
-        np.testing.assert_allclose(root @ root.T, believed(1.0, lasting), rtol=1e-9)
+        np.testing.assert_allclose(root @ root.T, prior_covariance(1.0, lasting), rtol=1e-9)
     # And where poses are without some rates already, what is found are all of them.
     taken = 0.3 * ROOTS[0.5] @ np.random.default_rng(seed).standard_normal(len(dense.taken))
     agree(Dense(*scene(seed), taken).fit(), Dense(*scene(seed), taken))
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_what_lies_far_off_is_believed_less(seed: int) -> None:
+def test_outliers_get_less_weight(seed: int) -> None:
     dense = Dense(*scene(seed))
     fit = dense.fit()
-    fit.doubt(sizes(0.5, 1.0, 0.9))
+    fit.reweight(sizes(0.5, 1.0, 0.9))
     dense.doubt(0.5, 1.0, 0.9)
     assert dense.weights.min() < 0.3 < 1.0 < dense.weights.max()
     agree(fit, dense)
@@ -129,7 +131,9 @@ def test_five_copies_that_count_a_fifth_are_one() -> None:
     once, fifths = Dense(graph, seen).fit(), Dense(graph, some(seen, np.repeat(np.arange(len(seen.walls)), 5))).fit()
     fifths.count_less(0.2)
     for choice in CHOICES:
-        assert unlikeliness(fifths, *choice) == pytest.approx(unlikeliness(once, *choice), abs=1e-6)
+        assert negative_log_likelihood(fifths, *choice) == pytest.approx(
+            negative_log_likelihood(once, *choice), abs=1e-6
+        )
         np.testing.assert_allclose(
             fifths.rates(sizes(*choice))[1], once.rates(sizes(*choice))[1], rtol=1e-8, atol=1e-18
         )
@@ -139,7 +143,7 @@ def test_five_copies_that_count_a_fifth_are_one() -> None:
 def test_rates_that_wander_go_as_far_as_a_walk(length: float, apart: float) -> None:
     """Its variance grows with the way, and over `MEMORY` it is that of rates that last as long."""
     way = np.arange(0.0, length, 2.0)
-    moves = 2.0 * np.cumsum(hats(way, apart), axis=0)
+    moves = 2.0 * np.cumsum(linear_basis(way, apart), axis=0)
     root = walk_root(float(way[-1]), GraphConfig(), PLANAR, apart)[::3, ::3]
     variance = np.einsum("kn,nm,km->k", moves, root @ root.T, moves)
     middle = slice(len(way) // 3, 2 * len(way) // 3)
@@ -151,8 +155,8 @@ def test_a_drift_is_sure_when_it_explains_more_than_chance(seed: int, monkeypatc
     monkeypatch.setattr(drift_fit, "FREEDOM", 1e12)
     graph, seen = scene(seed, 1.0, 60)
     dense = Dense(graph, seen)
-    best = min(dense.unlikeliness(*choice) for choice in product(SCALES, SIZES, LASTING))
-    gain = min(dense.unlikeliness(scale, 0.0, 0.5) for scale in SCALES) - best
+    best = min(dense.negative_log_likelihood(*choice) for choice in product(SCALES, SIZES, LASTING))
+    gain = min(dense.negative_log_likelihood(scale, 0.0, 0.5) for scale in SCALES) - best
     for factor, is_sure in ((0.9, True), (1.1, False)):
         level = float(chi2.cdf(factor * gain, 2))
         assert 0.5 < level < 1.0
@@ -183,8 +187,8 @@ def test_where_no_wall_is_seen_drift_lasts_by_half_and_whole_once_it_stayed_the_
     first, last = drift.rates[:20, :2].mean(axis=0), drift.rates[-5:, :2].mean(axis=0)
     np.testing.assert_allclose(last, lasting * first, atol=tolerance)
     # What is claimed is the mean of all that, and of the heading what it is unsure by at the end.
-    np.testing.assert_allclose(drift.claim.rates, -np.diff(WAY) @ drift.rates / WAY[-1], rtol=1e-9)
-    assert drift.claim.sigma[2] == pytest.approx(np.sqrt(drift.spread[-1, 5, 5]) / WAY[-1])
+    np.testing.assert_allclose(drift.estimated_drift.rates, -np.diff(WAY) @ drift.rates / WAY[-1], rtol=1e-9)
+    assert drift.estimated_drift.sigma[2] == pytest.approx(np.sqrt(drift.spread[-1, 5, 5]) / WAY[-1])
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -205,9 +209,9 @@ def test_what_is_left_of_a_drift_is_no_smaller_one_where_no_wall_is_seen(seed: i
     assert anew is not None
     assert again.is_sure
     assert not anew.is_sure
-    np.testing.assert_allclose(again.claim.rates[:2], [-0.015, 0.02], rtol=0.1)
-    assert again.claim.rates[2] == pytest.approx(np.radians(1.0) / 100, rel=0.1)
-    np.testing.assert_allclose(first.rates + again.rates, hats(WAY) @ again.knots, atol=1e-12)
+    np.testing.assert_allclose(again.estimated_drift.rates[:2], [-0.015, 0.02], rtol=0.1)
+    assert again.estimated_drift.rates[2] == pytest.approx(np.radians(1.0) / 100, rel=0.1)
+    np.testing.assert_allclose(first.rates + again.rates, linear_basis(WAY) @ again.knots, atol=1e-12)
     at = int(np.searchsorted(WAY, 80.0))
     sigma = [np.sqrt(np.diag(drift.spread[at])[[0, 1, 5]]) for drift in (first, again, anew)]
     assert (sigma[1] > 0.5 * sigma[0]).all()
@@ -245,5 +249,5 @@ def test_no_table_of_all_sightings_and_all_unknowns_is_written_out() -> None:
         tracemalloc.stop()
     assert found is not None
     assert found.is_sure
-    assert np.linalg.norm(found.claim.rates[:2]) > 1e-3
+    assert np.linalg.norm(found.estimated_drift.rates[:2]) > 1e-3
     assert peak < 8 * len(walls) * (5 + found.knots.size)

@@ -38,7 +38,7 @@ def test_a_fix_that_the_graph_gave_up_does_not_bend_the_baseline() -> None:
     fixes = [PositionFix(k, poses[k, :3, 3] + off[k], np.full(3, 0.1), np.zeros(3)) for k in range(20)]
     graph = PoseGraph(poses, steps, fixes=fixes, is_anchored=False)
     solution = optimise(graph, Config().graph)
-    assert np.flatnonzero(~solution.fix_believed).tolist() == [10]
+    assert np.flatnonzero(~solution.fix_inliers).tolist() == [10]
     house = Building("way/1", (Footprint(np.array([[200.0, 0], [210, 0], [210, 10], [200, 10]])),))
     extract = BuildingExtract([house], {}, np.array([49.0, 8.4, 0.0]), None, "a map")
     joint, matches, placed = run_baseline(graph, solution, extract, NothingSeen(), Config(), KeyframeClocks())  # type: ignore[arg-type]

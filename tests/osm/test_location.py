@@ -220,7 +220,7 @@ def test_one_long_wall_does_not_say_where_a_run_begins() -> None:
         assert "OSM: " in located.problem
 
 
-def test_along_one_long_wall_odometry_is_believed() -> None:
+def test_along_one_long_wall_the_pose_is_odometrys() -> None:
     """After the houses a hall of 200 m: across it the run is held, along it nothing is claimed."""
     town = [*HOUSES[:4], *HOUSES[5:8], box_at(90, 8, 260, 30)]
     way = np.column_stack([np.arange(20.0, 190.0, 4.0), np.zeros(43), np.zeros(43)])
@@ -261,7 +261,7 @@ def test_a_start_among_houses_that_are_all_alike_is_refused() -> None:
 
 
 def test_in_the_end_each_building_is_laid_on_what_was_seen() -> None:
-    """One house of the map stands 0.8 m off: it and no other is to be moved, whatever the graph doubted."""
+    """One house of the map stands 0.8 m off: it and no other is to be moved, whatever the graph rejected."""
     moved = [ring if n != 2 else [(x + 0.8, y) for x, y in ring] for n, ring in enumerate(HOUSES)]
     way = street()
     extract = extract_of(moved)

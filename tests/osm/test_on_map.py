@@ -80,10 +80,10 @@ def test_a_drift_is_taken_out_by_a_map_that_errs(seed: int, caplog: pytest.LogCa
     steps = se3.relative(held.poses[:-1], held.poses[1:])
     np.testing.assert_allclose([c.T_a_b for c in held.odometry], steps, atol=1e-9)
     # All of it: submaps are smeared by the drift and show the greater part only, so it is looked for again.
-    said = re.search(r"drifts steadily by (\S+) % and (\S+) deg/100 m, and is set straight", caplog.text)
+    said = re.search(r"steady drift of odometry, (\S+) % and (\S+) deg/100 m, is corrected", caplog.text)
     assert said is not None
     assert [float(number) for number in said.groups()] == pytest.approx([4.0, 3.0], abs=0.15)
-    # What the manifest calls the largest correction is that of odometry, with what was set straight before the graph.
+    # What the manifest calls the largest correction is that of odometry, with the drift corrected before the graph.
     results = [ScanResult(k.scan, k.stamp_ns, k.T_world_lidar) for k in store.keyframes]
     on_walls = Georeference(ORIGIN, located.T_enu_odometry, None, "osm")
     done = solve(held, Given(results, store, config(), []), on_walls)
@@ -114,7 +114,7 @@ def test_drift_that_wanders_is_said_to(caplog: pytest.LogCaptureFixture) -> None
     )
     after, before = (np.linalg.norm((shape - se2.relative(way[0], way))[:, :2], axis=1).mean() for shape in shapes)
     assert after < 0.5 * before
-    said = re.search(r"OSM: odometry wanders by (\S+) % and (\S+) deg/100 m, and is set straight", caplog.text)
+    said = re.search(r"OSM: varying drift of odometry, (\S+) % and (\S+) deg/100 m, is corrected", caplog.text)
     assert said is not None
     assert 1.0 < float(said[1]) < 5.0
     done = solve(
@@ -134,7 +134,7 @@ def test_a_run_that_does_not_drift_stays_as_it_is(size: float) -> None:
     located, held = laid(store, drawn_wrong(3, size))
     assert not located.problem
     assert held.spread is None
-    assert held.claim is None
+    assert held.estimated_drift is None
     given = graph_of(store)
     np.testing.assert_array_equal([c.T_a_b for c in held.odometry], [c.T_a_b for c in given.odometry])
     np.testing.assert_allclose(held.poses, located.T_enu_odometry @ given.poses, atol=1e-12)

@@ -108,12 +108,14 @@ def test_a_run_is_laid_where_matches_and_what_is_known_of_its_start_are_likelies
         + 1 / np.diag(SURE)
     )
 
-    def unlikely(moved: np.ndarray) -> float:
+    def negative_log_likelihood(moved: np.ndarray) -> float:
         turn = se2.compose(np.array([*told[0, :2], 0.0]) + moved, se2.inverse(np.array([*told[0, :2], 0.0])))
         squared = ((real - se2.compose(turn, told)) ** 2 / variances).sum(axis=1)
         return float((moved**2 / sigma**2).sum() + 4.0 * np.log(3.0 + squared).sum())
 
-    best = minimize(unlikely, np.zeros(3), method="Nelder-Mead", options={"xatol": 1e-7, "fatol": 1e-10}).x
+    best = minimize(
+        negative_log_likelihood, np.zeros(3), method="Nelder-Mead", options={"xatol": 1e-7, "fatol": 1e-10}
+    ).x
     turn, _ = laid_on(told, real, [SURE] * 12, sigma)
     assert 0.5 < turn < 2.0
     assert turn == pytest.approx(np.degrees(best[2]), abs=1e-4)

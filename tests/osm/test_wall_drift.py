@@ -85,7 +85,7 @@ def test_drift_is_taken_out_though_the_map_errs(seed: int, size: float) -> None:
     drift = found(graph, sighted(graph, seed, size))
     assert drift is not None
     assert drift.is_sure
-    assert not drift.claim.does_wander
+    assert not drift.estimated_drift.is_varying
     assert not drift.is_settled
     straight = without_drift(graph, drift.rates)
     assert ate(straight.poses, REAL) < 0.1 * ate(graph.poses, REAL)
@@ -128,7 +128,7 @@ def test_errors_of_the_map_are_no_drift(size: float) -> None:
         drift = found(graph, sighted(graph, seed, size))
         assert drift is not None
         assert not drift.is_sure, seed
-        assert drift.claim.gain < 0.0, "not even likelier"
+        assert drift.estimated_drift.gain < 0.0, "not even likelier"
 
 
 def test_walls_that_look_one_way_tell_no_drift_along_them() -> None:
@@ -179,18 +179,18 @@ def test_drift_that_wanders_is_taken_for_no_other_and_taken_out(memory: float) -
         drift = found(graph, seen)
         assert drift is not None
         assert drift.is_sure
-        assert drift.claim.does_wander
+        assert drift.estimated_drift.is_varying
         straight = without_drift(graph, drift.rates)
         again = find_wall_drift(straight, sighted(straight, seed, 0.7), SEEN, MAP, GraphConfig(), drift)
         assert again is not None
-        assert again.claim.does_wander
+        assert again.estimated_drift.is_varying
         assert again.knots.shape == drift.knots.shape
         straight = without_drift(straight, again.rates)
         ratios.append(ate(straight.poses, REAL) / ate(graph.poses, REAL))
         squared.append(unsure(again, straight))
-        assert again.claim.rms is not None
-        assert 0.3 < again.claim.rms[0] / 0.02 < 2.0
-        assert 0.3 < again.claim.rms[2] / (np.radians(1.0) / 100) < 2.0
+        assert again.estimated_drift.rms is not None
+        assert 0.3 < again.estimated_drift.rms[0] / 0.02 < 2.0
+        assert 0.3 < again.estimated_drift.rms[2] / (np.radians(1.0) / 100) < 2.0
     assert max(ratios) < 0.5
     assert 0.3 < np.mean(squared) < 3.0
 

@@ -85,7 +85,7 @@ def test_a_known_offset_is_recovered_through_clutter_and_gaps(seed: int) -> None
 
 
 def test_where_houses_are_drawn_a_metre_off_the_answer_seldom_hangs_on_the_prior() -> None:
-    """It did in most villages while the last walls that are half doubted still pulled; some have two answers that fit alike."""
+    """It did in most villages while the last walls with half weight still pulled; some have two answers that fit alike."""
     spread = []
     for seed in range(10):
         rng = np.random.default_rng(seed)
@@ -211,7 +211,7 @@ def gables(*places: float) -> Floats:
 
 @pytest.mark.parametrize("turn", [0.0, 0.8, 2.5])
 @pytest.mark.parametrize("beside", [2.0, 4.0, 5.5, -2.0, -4.0, -5.5, 10.0, -10.0])
-def test_one_gable_beside_is_a_rival_as_far_as_the_window_goes(beside: float, turn: float) -> None:
+def test_one_gable_beside_is_an_alternative_as_far_as_the_window_goes(beside: float, turn: float) -> None:
     """The window is 6 m along each axis; what lies beyond it is no answer, on whichever side it is."""
     known = turned(gables(0.0, beside), (0.0, 0.0, turn))
     match = match_walls(gables(0.0), known, np.array([0.2, 0.1, turn]), np.array([2.0, 2.0, 0.03]))
@@ -325,7 +325,7 @@ def test_one_building_is_laid_on_the_walls_seen_of_it(shift: tuple[float, float,
 
 
 def reference(source: Floats, target: Floats, farthest: float, by_coverage: bool) -> tuple[float, float]:
-    """Mean distance and coverage by the words of the thesis, wall by wall."""
+    """Mean distance and coverage by the words of Del Tufo, wall by wall."""
     distance = covered = total = 0.0
     for a, b in source:
         length = np.linalg.norm(b - a)
