@@ -81,12 +81,16 @@ class KittiOdometry(TrajectoryMetric[KittiDrift]):
     """Drift over segments of 100 to 800 m."""
 
     key, name, gate_option = "kitti_drift", "KITTI drift", "drift"
-    columns = {  # noqa: RUF012
-        "translation_percent": Metric(
-            "drift", "drift", "%", "error", "KITTI: 100 to 800 m of ground truth, mean over segments"
+    columns = (
+        (
+            "translation_percent",
+            Metric("drift", "drift", "%", "error", "KITTI: 100 to 800 m of ground truth, mean over segments"),
         ),
-        "rotation_deg_per_100m": Metric("drift.rotation", "drift.rotation", "deg/100m", "error", is_main=False),
-    }
+        (
+            "rotation_deg_per_100m",
+            Metric("drift.rotation", "drift.rotation", "deg/100m", "error", is_main=False),
+        ),
+    )
 
     def measure(self, poses: MatchedPoses, config: EvalConfig) -> KittiDrift:
         return kitti_drift(poses.estimate, poses.truth)

@@ -50,14 +50,14 @@ class TrajectoryMetric(ABC, Generic[Score]):
 
     key : of the score in `Evaluation.scores` and evaluation.json; name : for people
     word : in `eval.metrics`, which shows it; empty: it is always shown
-    columns : by field of the score, how the value is called and in which unit
+    columns : fields of the score that are numbers, and how each is called and in which unit
     gate_option : option of `lslam eval` that limits `gated`, without its dashes
     """
 
     key: str
     name: str
     word = ""
-    columns: dict[str, Metric] = {}  # noqa: RUF012
+    columns: tuple[tuple[str, Metric], ...] = ()
     gate_option = ""
 
     @abstractmethod
@@ -81,7 +81,7 @@ class TrajectoryMetric(ABC, Generic[Score]):
     def rows(self, es: Sequence[Evaluation]) -> list[MetricRow]:
         """Rows for the table of `lslam eval`."""
         rows = []
-        for k, metric in enumerate(self.columns.values()):
+        for k, metric in enumerate(metric for _, metric in self.columns):
             cells = [self._texts(e)[k][1] for e in es]
             rows.append(MetricRow(metric.label, metric.unit, cells, self.name) if k else
                         MetricRow(self.name, metric.unit, cells))  # fmt: skip
@@ -107,16 +107,16 @@ class TrajectoryMetric(ABC, Generic[Score]):
 
     def compared(self, configs: Sequence[EvalConfig]) -> list[Metric]:
         """The numbers that comparisons and studies read."""
-        return list(self.columns.values())
+        return [metric for _, metric in self.columns]
 
     def values(self, document: Any) -> dict[str, float]:
         """Those numbers by key, from the metric's part of evaluation.json; what is null is left out."""
-        found = {metric.key: document[field] for field, metric in self.columns.items()}
+        found = {metric.key: document[field] for field, metric in self.columns}
         return {key: value for key, value in found.items() if value is not None}
 
     def _texts(self, e: Evaluation) -> list[tuple[Metric, str]]:
         score = self.of(e)
-        return [(metric, significant(getattr(score, field))) for field, metric in self.columns.items()]
+        return [(metric, significant(getattr(score, field))) for field, metric in self.columns]
 
 
 def statistics_document(values: Statistics | None) -> Document:

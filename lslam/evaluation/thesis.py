@@ -144,9 +144,10 @@ class Girolimetto(TrajectoryMetric[AxisErrors]):
     """Errors per axis."""
 
     key, name, word = "thesis1", "thesis1", "thesis"
-    columns = {  # noqa: RUF012
-        "thesis_rmse": _more("thesis_rmse", "m"), "angular_rmse_deg": _more("thesis_angular", "deg")
-    }  # fmt: skip
+    columns = (
+        ("thesis_rmse", _more("thesis_rmse", "m")),
+        ("angular_rmse_deg", _more("thesis_angular", "deg")),
+    )
 
     def measure(self, poses: MatchedPoses, config: EvalConfig) -> AxisErrors:
         return axis_errors(poses.estimate, poses.truth)
