@@ -76,7 +76,7 @@ def command(study: str | None, **given: Any) -> None:
         on_rows = stack.enter_context(best_so_far())
         rows = run_sweep(sweep, engine, bars(stack), on_rows)
     _print(rows)
-    unscored = [row for row in rows if row.is_usable and isnan(row.thesis_rmse) and row.reason]
+    unscored = [row for row in rows if row.is_usable and isnan(row.error) and row.reason]
     if unscored:
         log.warning("%d of %d runs have no score, the first one: %s", len(unscored), len(rows), unscored[0].reason)
     log.info("every run: %s", sweep.output.out / "results.csv")

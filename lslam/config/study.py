@@ -117,6 +117,7 @@ class StudyConfig(Section):
     beside: tuple[str, ...] = Field((), description="likewise, run once at their own values")
     imu: Literal["off", "on", "both"] = Field("off", description="without the IMU, with it, or each method both ways")
     seeds: tuple[int, ...] = Field((0,), min_length=1, description="of simulations, and of methods that draw")
+    metric: Literal["ate_se3", "ate_origin", "thesis_rmse"] = Field("ate_se3", description="the error it judges by, m")
     grid: Literal["full", "one-way"] = Field(
         "full", description="all combinations of the parameters' values, or one parameter at a time"
     )

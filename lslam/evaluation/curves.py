@@ -20,7 +20,7 @@ LOST_FLOOR_M = 2.2
 
 def lost_above(rows: Sequence[StudyRow]) -> float:
     """The error in m above which a run counts as lost: 10 times the best of all rows, and not below 2.2 m."""
-    errors = [row.thesis_rmse for row in rows if row.is_usable and np.isfinite(row.thesis_rmse)]
+    errors = [row.error for row in rows if row.is_usable and np.isfinite(row.error)]
     return max(LOST_FLOOR_M, LOST_FACTOR * min(errors, default=0.0))
 
 
@@ -66,7 +66,7 @@ def _curve(rows: Sequence[StudyRow], limit: float) -> Curve:
             out[cell] = holds(row)
         return out
 
-    translation, angular = table(lambda row: row.thesis_rmse), table(lambda row: row.angular_rmse_deg)
+    translation, angular = table(lambda row: row.error), table(lambda row: row.angular_rmse_deg)
     per_scan, total = table(registration_ms), table(lambda row: row.total_time_s)
     lost = mask(lambda row: row.is_diverged) | (translation > limit)
     stages = list(dict.fromkeys(name for row in rows for name in row.stages_ms))

@@ -50,6 +50,7 @@ def _evaluate(rows: Sequence[StudyRow], beside: Sequence[StudyRow], findings: Se
         beside=tuple(row for row in beside if row.is_usable),
         failed=tuple(row for row in (*rows, *beside) if not row.is_usable),
         lost_above=limit,
+        metric=rows[0].metric,
     )
 
 

@@ -19,7 +19,7 @@ from lslam.errors import InputError, cause
 from lslam.formats.atomic import write_text
 from lslam.types.study import StudyRow, Value
 
-VERSION = 2
+VERSION = 3
 SCHEMA = "study_version"
 STAGE = "stage_ms."
 # Worked out from the others, for those who read the table elsewhere.

@@ -128,7 +128,7 @@ def map_figure(record: RunRecord, png_uri: str) -> Figure:
 
 
 def registration_figures(record: RunRecord) -> list[Figure]:
-    """Inliers, overlap, rmse, iterations and the prior's error (first thesis, equation 5.1): those that the method reports."""
+    """Inliers, overlap, rmse, iterations and the prior's error (Girolimetto, equation 5.1): those that the method reports."""
     results = record.results
     index = np.array([r.index for r in results], np.float64)
     failed = np.array([r.index for r in results if r.status != "ok"], np.float64)

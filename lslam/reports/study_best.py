@@ -9,12 +9,12 @@ from math import inf
 from lslam.reports.grid_text import Grid
 from lslam.types.study import StudyRow
 
-HEADER = ["sequence", "method", "runs", "failed", "best at", "thesis_rmse, m", "angular, deg", "total, s"]
+LABELS = {"ate_se3": "ATE se3", "ate_origin": "ATE origin", "thesis_rmse": "thesis_rmse"}
 
 
 @dataclass(frozen=True)
 class Best:
-    """One method on one sequence: how many runs have ended and failed, and the point with the least mean thesis_rmse.
+    """One method on one sequence: how many runs have ended and failed, and the point with the least mean error.
 
     point : rows of that point, one per seed; empty when no point is without a failed run
     """
@@ -52,7 +52,9 @@ def label(row: StudyRow) -> str:
 
 def best_table(rows: Sequence[StudyRow]) -> Grid:
     """Header and a line per method."""
-    return [HEADER, *(_line(best) for best in best_points(rows))]
+    metric = LABELS[rows[0].metric] if rows else "error"
+    header = ["sequence", "method", "runs", "failed", "best at", f"{metric}, m", "angular, deg", "total, s"]
+    return [header, *(_line(best) for best in best_points(rows))]
 
 
 def batch_table(rows: Sequence[StudyRow]) -> Grid:
@@ -74,7 +76,7 @@ def _best(rows: Sequence[StudyRow]) -> tuple[StudyRow, ...]:
     best: tuple[StudyRow, ...] = ()
     least = inf
     for point in points.values():
-        error = sum(row.thesis_rmse if row.is_usable else inf for row in point) / len(point)
+        error = sum(row.error if row.is_usable else inf for row in point) / len(point)
         if error < least:  # never with nan, without ground truth
             best, least = tuple(point), error
     return best
@@ -85,5 +87,5 @@ def _line(best: Best) -> list[str]:
     if not best.point:
         return [*head, "-", "-", "-", "-"]
     at = ", ".join(f"{key.partition('.')[2]} {value}" for key, value in best.point[0].parameters.items())
-    errors = [f"{best.mean('thesis_rmse'):.3f}", f"{best.mean('angular_rmse_deg'):.2f}"]
+    errors = [f"{best.mean('error'):.3f}", f"{best.mean('angular_rmse_deg'):.2f}"]
     return [*head, at or "its own values", *errors, f"{best.mean('total_time_s'):.2f}"]

@@ -1,4 +1,4 @@
-"""The figures of a sensitivity study, those of the first thesis' section 5.3: errors, times, stages, laws, efficiency."""
+"""The figures of a sensitivity study, those of Girolimetto's section 5.3: errors, times, stages, laws, efficiency."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ _LOG_RATIO = 30.0  # of the largest to the smallest error, above which the axis 
 
 @dataclass(frozen=True)
 class StudyFigure:
-    """One figure as files: `name` is that of the files; `caption` says how it is made and which of the thesis it repeats."""
+    """One figure as files: `name` is that of the files; `caption` says how it is made and which of Girolimetto's it repeats."""
 
     name: str
     title: str
@@ -67,13 +67,13 @@ def study_figures(result: StudyResult) -> Iterator[StudyFigure]:
             if not known or not draw(figure, result, known):
                 continue
             of_thesis = THESIS.get(result.parameters[0], {}).get(name, "")
-            more = f" Of the first thesis: figure {of_thesis}." if of_thesis else ""
+            more = f" Girolimetto, figure {of_thesis}." if of_thesis else ""
             yield StudyFigure(name, title, caption + more, *pictures(figure, ("png", "svg")))
 
 
 def _errors(figure: Any, result: StudyResult, shown: Sequence[CurveResult]) -> bool:
     left, right = figure.subplots(1, 2)
-    _quantity(left, result, shown, "translation", "rmse of translation, m", lambda row: row.thesis_rmse)
+    _quantity(left, result, shown, "translation", "rmse of translation, m", lambda row: row.error)
     _quantity(right, result, shown, "angular", "rmse of rotation, deg", lambda row: row.angular_rmse_deg)
     _legend(figure, left)
     return any(r.means["translation"].n.any() for r in shown)

@@ -1,4 +1,4 @@
-"""Laws of total time as a figure: points, law, confidence band and residuals (first thesis, figures 5.19, 5.27a, 5.28)."""
+"""Laws of total time as a figure: points, law, confidence band and residuals (Girolimetto, figures 5.19, 5.27a, 5.28)."""
 
 from __future__ import annotations
 

@@ -8,6 +8,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 from lslam.evaluation.efficiency import normalise
+from lslam.evaluation.results import ALIGNMENTS
 from lslam.printable import counted, fixed, metres
 from lslam.reports.compare_table import CompareTable
 from lslam.reports.grid_text import Grid
@@ -15,6 +16,12 @@ from lslam.types.sensitivity import CurveResult, Interval, Law, StudyResult
 from lslam.types.study import StudyRow
 
 UNKNOWN = "-"
+TRANSLATION = {
+    "ate_se3": f"ATE rmse over poses, {ALIGNMENTS['se3']}",
+    "ate_origin": f"ATE rmse over poses, {ALIGNMENTS['origin']}",
+    "thesis_rmse": "rmse over the 3N coordinates with the first poses put on each other (Girolimetto, equation 2.14 over the "
+    "root of 3)",
+}
 # Columns of the table for programs, by quantity.
 _UNITS = {
     "translation": "m", "angular": "deg", "time_per_scan": "ms", "total_time": "s", "fallback": "%",
@@ -51,14 +58,13 @@ def means_grid(results: Sequence[StudyResult]) -> Grid:
 def study_recipes(result: StudyResult) -> list[str]:
     """How the numbers are made, one sentence each."""
     return [
-        "translation: rmse over the 3N coordinates with the first poses put on each other, as the first thesis counts it "
-        "(equation 2.14 over the root of 3); rotation: its equation 2.15",
+        f"translation: {TRANSLATION[result.metric]}; rotation: equation 2.15 of Girolimetto",
         "registration: all stages of a scan but reading, preparing, standing still and keyframes",
         "E: 1 over translation, rotation and registration time per scan (equation 5.2); E tot: with the total time (5.3); both "
         "over the largest of the curve; median over seeds, a lost run counts as 0",
         "fallback: scans that a recovery policy or another method posed",
         f"lost: a run that says so, or whose error is above {result.lost_above:.3g} m: 10 times the best of the study, and not "
-        "less than the thesis takes for a result (2.2 m)",
+        "less than Girolimetto takes for a result (2.2 m)",
         "diverges: the first value, lost in more than half of its runs, from which on more than half of the values are",
         "laws: weighted least squares over means of the runs that were not lost, scatter in proportion to the time, from 6 "
         "values on; ± and bands at 99 %; R2 of those means in s, unweighted",
@@ -142,7 +148,7 @@ def _failures(result: StudyResult) -> CompareTable:
 
 
 def _numbers(row: StudyRow) -> Iterable[str]:
-    yield metres(row.thesis_rmse) if math.isfinite(row.thesis_rmse) else UNKNOWN
+    yield metres(row.error) if math.isfinite(row.error) else UNKNOWN
     for value, decimals in ((row.angular_rmse_deg, 3), (row.time_per_scan_ms, 1), (row.total_time_s, 2)):
         yield fixed(value, decimals) if math.isfinite(value) else UNKNOWN
 

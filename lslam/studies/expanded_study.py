@@ -25,6 +25,7 @@ class ExpandedStudy:
     """Every run, and what its variants stand for, by name.
 
     name : of the study or batch, which `text` in the file `mark` describes; what : the word for it
+    metric : the error it judges by
     """
 
     name: str
@@ -33,6 +34,7 @@ class ExpandedStudy:
     text: str
     jobs: list[Job] = field(default_factory=list)
     variants: dict[str, Variant] = field(default_factory=dict)
+    metric: str = "ate_se3"
 
 
 def check_same(
@@ -77,7 +79,7 @@ def make_runs(
     """
     progress = progress or StudyProgress()
     jobs = expanded.jobs
-    results = Results(expanded.name, output.out, jobs, expanded.variants)
+    results = Results(expanded.name, output.out, jobs, expanded.variants, expanded.metric)
     lock_output(output.out, expanded.mark, expanded.what, output.overwrite, output.resume)
     try:
         if not output.overwrite:

@@ -26,8 +26,10 @@ _MOST_WAITED = 0.05
 class Results:
     """Rows of finished runs in the order of the study; the files are whole at any moment."""
 
-    def __init__(self, study: str, out: Path, jobs: Sequence[Job], variants: dict[str, Variant]) -> None:
-        self.study, self.out, self.variants = study, out, variants
+    def __init__(
+        self, study: str, out: Path, jobs: Sequence[Job], variants: dict[str, Variant], metric: str = "ate_se3"
+    ) -> None:
+        self.study, self.out, self.variants, self.metric = study, out, variants, metric
         self._order = {job.folder: k for k, job in enumerate(jobs)}
         self._rows: dict[int, StudyRow] = {}
 
@@ -79,6 +81,7 @@ class Results:
             digest=job.digest,
             machine=state.machine,
             folder=Path(os.path.relpath(job.folder, self.out)).as_posix(),
+            metric=self.metric,
         )
 
 

@@ -56,7 +56,9 @@ def expand_study(sweep: Sweep) -> ExpandedStudy:
     found = study_variants(study, sweep.settings)
     cells = cells_of(study.sequences, study.seeds, found, output, sweep.settings)
     jobs = expand(cells, found, study.seeds, output.out, output.command)
-    return ExpandedStudy(study.name, "study", MARK, text, jobs, {variant.name: variant for variant in found})
+    return ExpandedStudy(
+        study.name, "study", MARK, text, jobs, {variant.name: variant for variant in found}, study.metric
+    )
 
 
 def run_sweep(
@@ -76,7 +78,7 @@ def run_sweep(
 
 
 def study_names() -> tuple[str, ...]:
-    """Names of the studies that ship with lslam: those of the first thesis' chapter 5.3."""
+    """Names of the studies that ship with lslam: those of Girolimetto's chapter 5.3."""
     files = resources.files(__package__).joinpath(FOLDER).iterdir()
     return tuple(sorted(file.name.removesuffix(".toml") for file in files if file.name.endswith(".toml")))
 

@@ -200,7 +200,7 @@ class StudyResult:
     parameters : one or two studied keys, the first is the abscissa
     products : laws of both parameters by series, of a two-way study
     beside : runs at their own values, our defaults; failed : rows without a usable result
-    lost_above : m, the error above which a run counts as lost
+    metric : the error that is judged; lost_above : m, the error above which a run counts as lost
     """
 
     study: str
@@ -212,3 +212,4 @@ class StudyResult:
     beside: tuple[StudyRow, ...]
     failed: tuple[StudyRow, ...]
     lost_above: float
+    metric: str = "ate_se3"

@@ -20,6 +20,7 @@ class StudyRow:
     status : `done`, `degraded`, `diverged`, `failed` or `crashed`; reason : why it is not done
     thesis_rmse : m, origin alignment, sqrt(sum |e|^2 / 3N); ate_se3, ate_origin : m, rmse; angular_rmse_deg : equation 2.15 of
         Girolimetto; nan where there is none
+    metric : which of them the study judges by
     scans : processed; stages_ms : mean ms per scan by stage, in the order they are passed; total_time_s : of all stages over
         all scans; run_s : of the whole run with its reading and writing
     bridged_share : of the scans, 0..1; fallback_share : likewise, that a recovery policy or another method posed
@@ -54,11 +55,17 @@ class StudyRow:
     digest: str = ""
     machine: str = ""
     folder: str = ""
+    metric: str = "ate_se3"
 
     @property
     def series(self) -> str:
         """The method as people read it, with its IMU."""
         return series_of(self.method, self.uses_imu)
+
+    @property
+    def error(self) -> float:
+        """m, by the metric of the study; nan where there is none."""
+        return float(getattr(self, self.metric))
 
     @property
     def is_usable(self) -> bool:

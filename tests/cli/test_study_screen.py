@@ -12,7 +12,19 @@ from lslam.cli import study_screen
 from lslam.cli.study_screen import BestTable, best_so_far
 from lslam.types.study import StudyRow
 
-ROWS = [StudyRow("r", "s", "open", 0, "icp", parameters={"map.voxel": 0.5}, status="done", thesis_rmse=0.125)]
+ROWS = [
+    StudyRow(
+        "r",
+        "s",
+        "open",
+        0,
+        "icp",
+        parameters={"map.voxel": 0.5},
+        status="done",
+        thesis_rmse=0.125,
+        metric="thesis_rmse",
+    )
+]
 
 
 class Terminal(io.StringIO):

@@ -31,7 +31,7 @@ def folder(tmp_path: Path) -> Path:
     rows = [
         StudyRow(
             f"r{v}-{seed}", "skips", "open", seed, "icp", parameters={"input.skip_frames": v},
-            status="diverged" if v > 3 else "done", reason="lost" if v > 3 else "", thesis_rmse=0.1,
+            status="diverged" if v > 3 else "done", reason="lost" if v > 3 else "", thesis_rmse=0.1, metric="thesis_rmse",
             angular_rmse_deg=0.5, scans=60, stages_ms={"register": 10.0}, total_time_s=6.0 / v,
         )
         for v in (1, 2, 3, 4)

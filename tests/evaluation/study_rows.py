@@ -46,7 +46,7 @@ def rows_of(
                 "angular_rmse_deg": float(angular(value) * factor[1]),
                 "total_time_s": float(total(value) * factor[2]),
                 "stages_ms": {"read": 3.0, **stages(value)},
-                "scans": 100,
+                "scans": 100, "metric": "thesis_rmse",
             }  # fmt: skip
             rows.append(StudyRow(**(row | more)))
     return rows

@@ -87,12 +87,12 @@ def test_no_rows_are_a_file_too(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "sentence"),
     [
-        ("\n2,", "\n7,", "another version of lslam.*study version 7.*--overwrite makes its runs anew"),
+        ("\n3,", "\n7,", "another version of lslam.*study version 7.*--overwrite makes its runs anew"),
         ("study_version,", "version,", "no column study_version"),
         ("ate_se3", "ate", "column ate_se3 is missing"),
         (",0.2,", ",much,", "line 2: could not convert string to float: 'much'"),
         (",true,", ",perhaps,", "line 2: 'perhaps' is neither true nor false"),
-        (",here,", ",", "line 2: 29 columns where the header has 30"),
+        (",here,", ",", "line 2: 30 columns where the header has 31"),
     ],
 )
 def test_what_is_no_result_of_this_version_is_said(tmp_path: Path, old: str, new: str, sentence: str) -> None:

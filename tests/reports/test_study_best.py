@@ -14,7 +14,7 @@ from lslam.types.study import StudyRow
 def row(skip: int, error: float, seed: int = 0, **more: object) -> StudyRow:
     made = StudyRow(
         f"{skip}-{seed}", "study", "open", seed, "icp", parameters={"input.skip_frames": skip}, status="done",
-        thesis_rmse=error, angular_rmse_deg=1.0, total_time_s=2.0,
+        thesis_rmse=error, metric="thesis_rmse", angular_rmse_deg=1.0, total_time_s=2.0,
     )  # fmt: skip
     return replace(made, **more)  # type: ignore[arg-type]
 

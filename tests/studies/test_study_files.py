@@ -1,4 +1,4 @@
-"""The studies that ship: the first thesis' chapter 5.3, each as package data and as a copy to start from."""
+"""The studies that ship: Girolimetto's chapter 5.3, each as package data and as a copy to start from."""
 
 from __future__ import annotations
 
@@ -42,9 +42,9 @@ def test_every_study_states_what_the_thesis_found() -> None:
     assert study_names() == tuple(sorted(RUNS))
     for name in study_names():
         study = find_study(name)
-        assert study.summary.startswith("first thesis, 5.3.")
+        assert study.summary.startswith("Girolimetto, 5.3.")
         assert study.finding
-        assert all(finding.source.startswith("first thesis") for finding in study.finding)
+        assert all(finding.source.startswith("Girolimetto") for finding in study.finding)
 
 
 def test_the_studies_have_an_example_of_every_kind_of_finding() -> None:

@@ -16,7 +16,7 @@ def test_report_of_rows_read_back_is_that_of_the_rows(tmp_path: Path) -> None:
     rows = [
         StudyRow(
             f"r{v}-{seed}", "skip", "open", seed, "icp", False, {"input.skip_frames": v}, status="diverged" if v > 3 else "done",
-            thesis_rmse=0.1 * v, angular_rmse_deg=1.0, stages_ms={"register": 10.0}, total_time_s=10.0 / v,
+            thesis_rmse=0.1 * v, metric="thesis_rmse", angular_rmse_deg=1.0, stages_ms={"register": 10.0}, total_time_s=10.0 / v,
         )
         for v in range(1, 6)
         for seed in (0, 1)
@@ -36,7 +36,7 @@ def test_the_log_says_when_times_cannot_be_compared(tmp_path: Path, caplog: pyte
     for is_comparable, expected in ((True, 0), (False, 1)):
         caplog.clear()
         row = StudyRow(
-            "r", "skip", "open", 0, "icp", parameters={"input.skip_frames": 1}, status="done", thesis_rmse=0.1,
+            "r", "skip", "open", 0, "icp", parameters={"input.skip_frames": 1}, status="done", ate_se3=0.1,
             angular_rmse_deg=1.0, scans=9, stages_ms={"register": 10.0}, total_time_s=1.0, is_timing_comparable=is_comparable,
         )  # fmt: skip
         write_study_csv(tmp_path / "results.csv", [row])
