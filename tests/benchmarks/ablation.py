@@ -5,7 +5,7 @@
     python tests/benchmarks/ablation.py --starts
     python tests/benchmarks/ablation.py --recordings FOLDER
 
-Recordings are those of ../shared/data with all rings, every second and every fourth. Drives are simulated with compensated
+Recordings are those of the folder given, with all rings, every second and every fourth. Drives are simulated with compensated
 scans: standing 2.5 s before they drive off, and moving from the first scan. A run is lost when its error, the first pose on
 the first true pose, exceeds a twentieth of the path. Starts are ten scans from the first step at 30 m/s, or forty metres above a
 town, by sixteen beams, on seeds from 200 on; one is lost half a metre off. `acted` counts scans that a policy posed.

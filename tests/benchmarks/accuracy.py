@@ -1,9 +1,9 @@
 """`icp` with its default configuration beside its peers: recordings, simulated streets and motorways, starts at unknown speed.
 
     python tests/benchmarks/accuracy.py [FOLDER_WITH_UNPACKED_RECORDINGS] [--peers icp,kiss-icp] [--seeds 100-104]
-        [--write README.md]
+        [--write docs/results.md]
 
-Recordings are looked up by the names of ../shared/data, and untwisted for all alike where they are distorted. Rotation
+Recordings are looked up by their names in the folder given, and untwisted for all alike where they are distorted. Rotation
 RPE: every scan with the first one at least 10 m further along the reference. A start is lost when the
 first registered scan is off by 0.1 m or more.
 """

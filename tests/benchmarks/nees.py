@@ -42,7 +42,7 @@ MODES: dict[str, dict[str, object]] = {
     "gnss": {"loops.use": False, "gnss.mode": "graph"},
     "osm": {"loops.use": False},
 }
-# m, by which a map is often off as a whole (ALGORITHMS, "OpenStreetMap prior").
+# m, by which a map is often off as a whole.
 OFFSET = (1.0, 3.0)
 # Of position and rotation, what is judged: all where nothing is said.
 HELD = {"osm": [0, 1, 5]}

@@ -1,4 +1,4 @@
-"""Recordings named as in ../shared/data, untwisted for all alike where they are distorted, with all rings and thinned ones."""
+"""Recordings by the names of their folders, untwisted for all alike where they are distorted, with all rings and thinned ones."""
 
 from __future__ import annotations
 
