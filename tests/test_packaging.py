@@ -30,9 +30,10 @@ TEST_EXTRA = [Requirement(text) for text in PROJECT["optional-dependencies"]["te
 CHOICES = [
     Requirement(t)
     for name, texts in PROJECT["optional-dependencies"].items()
-    if name not in ("test", "peers")
+    if name not in ("test", "peers", "docs")
     for t in texts
 ]
+DOCS = [Requirement(t) for t in PROJECT["optional-dependencies"]["docs"]]
 PEERS = [Requirement(t) for t in PROJECT["optional-dependencies"]["peers"]]
 # One module by two names: a machine has one of them.
 EITHER = {"open3d", "open3d-cpu"}
@@ -119,7 +120,7 @@ def test_every_import_of_the_tests_is_declared() -> None:
     assert extra - {name for module in imported for name in provider(module)} <= TOOLS
 
 
-@pytest.mark.parametrize("requirement", DEPENDENCIES + CHOICES + PEERS + TEST_EXTRA, ids=str)
+@pytest.mark.parametrize("requirement", DEPENDENCIES + CHOICES + PEERS + DOCS + TEST_EXTRA, ids=str)
 def test_lower_bounds_are_stated(requirement: Requirement) -> None:
     operators = [s.operator for s in requirement.specifier]
     assert ">=" in operators
@@ -209,6 +210,9 @@ def test_top_level_holds_nothing_else() -> None:
         "docs",
         "sample_data",
         "README.md",
+        "CHANGELOG.md",
+        "CONTRIBUTING.md",
+        "mkdocs.yml",
         "LICENSE",
         "CITATION.cff",
         ".ci",
