@@ -57,7 +57,7 @@ def evaluate(
 
     Notes
     -----
-    Definitions: CONVENTIONS, "Metrics". Every part of the result carries its recipe.
+    Definitions: docs/conventions.md, "Metrics". Every part of the result carries its recipe.
     """
     config = config or EvalConfig()
     for which, trajectory in (("estimate", estimate), ("ground truth", ground_truth)):

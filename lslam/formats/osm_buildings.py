@@ -61,7 +61,7 @@ def some_buildings_of(data: OsmData, origin: NDArray[Any], path: Path) -> Buildi
 
 
 def buildings_of(data: OsmData, origin: NDArray[Any], source: str = "the extract") -> BuildingExtract:
-    """Footprints of every building in `data`, by the rules of CONVENTIONS ("OSM and geodesy").
+    """Footprints of every building in `data`, by the rules of docs/conventions.md ("Geodesy and OpenStreetMap").
 
     Closed ways and multipolygons count; `building=no`, what lies underground and what misses nodes does not.
     Raises InputError when all nodes lie more than 100 km from the origin, where a local frame means nothing.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 
-STOREY = 3.0  # m, CONVENTIONS
+STOREY = 3.0  # m, docs/conventions.md
 FOOT = 0.3048  # m
 TALLEST = 1000.0  # m; what is higher is a slip of the pen
 

@@ -14,7 +14,7 @@ from lslam.errors import InputError
 
 INTENSITY_NAMES = ("intensity", "intensities", "i", "reflectivity", "reflectance", "scalar_intensity", "remission")
 RING_NAMES = ("ring", "rings", "channel", "line", "laser_id", "scalar_ring")
-# CONVENTIONS, "Per-point time".
+# docs/conventions.md, "Per-point times".
 TIME_NAMES = (
     "t", "time", "times", "timestamp", "timestamps", "time_stamp", "offset_time", "time_offset", "timeoffset", "stamp",
 )  # fmt: skip

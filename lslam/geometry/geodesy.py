@@ -22,7 +22,7 @@ def local_crs(lat_lon: NDArray[Any]) -> str:
 def to_local(lat_lon_alt: NDArray[Any], origin: NDArray[Any]) -> Floats:
     """(N, 3) lat, lon (deg), height (m), WGS84, to (N, 3) east, north, up in m from `origin` (3,).
 
-    x and y are the transverse Mercator projection at the origin (k = 1), z is the difference of heights (CONVENTIONS).
+    x and y are the transverse Mercator projection at the origin (k = 1), z is the difference of heights (docs/conventions.md).
     """
     fixes = np.asarray(lat_lon_alt, np.float64).reshape(-1, 3)
     x, y = _projection(origin)(fixes[:, 1], fixes[:, 0])

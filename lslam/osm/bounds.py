@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from lslam.errors import UsageError
 
 METRES_PER_DEGREE = 111_320.0
-DECIMALS = 6  # CONVENTIONS: what a cached reply is known by
+DECIMALS = 6  # docs/conventions.md: what a cached reply is known by
 LARGEST_KM2 = 600.0
 
 

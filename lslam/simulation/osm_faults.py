@@ -20,7 +20,7 @@ class MapFaults:
     new : not yet built buildings, as a share of the others; shift, turn, tolerance : greatest sizes, m, rad, m
     swing : m, no corner moves farther than this by turning; gap : m, only neighbours this near are merged
 
-    OpenStreetMap is often off by 1 to 3 m as a whole (ALGORITHMS, "OpenStreetMap prior").
+    OpenStreetMap is often off by 1 to 3 m as a whole.
     """
 
     offset: float = 1.5

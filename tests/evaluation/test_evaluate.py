@@ -187,7 +187,7 @@ def test_kitti_07_in_both_frames(recordings: Callable[[str], Path]) -> None:
     camera = evaluate(estimate, truth)
     lidar = replace(estimate, poses=se3.inverse(Tr) @ estimate.poses @ Tr, frame="lidar")
     converted = evaluate(lidar, truth, calibration=Calibration(T_cam0_lidar=Tr))
-    # SEEDS: aligned rmse of good odometry on 07 is 0.38 to 0.50 m.
+    # Aligned rmse of good odometry on 07 is 0.38 to 0.50 m.
     assert rmse(camera, "se3") == pytest.approx(0.3841, abs=1e-3)
     assert rmse(converted, "se3") == pytest.approx(rmse(camera, "se3"), abs=0.01)
     assert drift(converted) == pytest.approx(drift(camera), abs=0.01)
