@@ -306,7 +306,7 @@ def test_no_constant_is_missing_in_the_register() -> None:
 def test_every_paper_that_code_cites_is_in_the_bibliography() -> None:
     papers = METHODS.text.split("## Bibliography")[1]
     cited = re.compile(r"\b([A-Z][a-z]{2,})(?: et al\.?| and [A-Z][a-z]+)?,? \(?(?:[A-Z]{4} )?((?:19|20)\d\d)\b")
-    no_authors = {"ECMR", "September", "April"}
+    no_authors = {"ECMR", "Padua", "Milano"}
     missing = set()
     for path in PACKAGE.rglob("*.py"):
         text = re.sub(r"\s+(#\s*)?", " ", path.read_text(encoding="utf-8"))
