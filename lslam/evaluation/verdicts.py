@@ -20,7 +20,7 @@ from lslam.evaluation.verdicts_of_places import (
     judge_holds_up_to,
     judge_largest_between,
 )
-from lslam.types.sensitivity import Curve, CurveResult, Judged, Law, Outcome, Verdict
+from lslam.types.sensitivity import Curve, CurveResult, FindingVerdict, Judged, Law, Outcome
 
 _OF_TIME = ("time_per_scan", "total_time")
 _LAWS = ("linear", "inverse", "product")
@@ -28,13 +28,13 @@ _OF_ERROR = ("diverges_beyond", "holds_up_to", "elbow_at", "good_from")
 _OF_WORDS = ("matters_little", "acts_only_on")
 
 
-def judge(finding: ExpectedFinding, results: Sequence[CurveResult], products: Mapping[str, Law]) -> Verdict:
+def judge(finding: ExpectedFinding, results: Sequence[CurveResult], products: Mapping[str, Law]) -> FindingVerdict:
     """The verdict over all curves that the finding speaks of: where they disagree it is undecided."""
     mine = [result for result in results if _speaks_of(finding, result)]
     if not mine:
-        return Verdict(finding.text, "undecided", "no run of that kind was made", finding.source)
+        return FindingVerdict(finding.text, "undecided", "no run of that kind was made", finding.source)
     if not any(result.curve.ran.any() for result in mine):
-        return Verdict(finding.text, "undecided", "no run of that kind came to an end", finding.source)
+        return FindingVerdict(finding.text, "undecided", "no run of that kind came to an end", finding.source)
     if finding.kind == "product":
         judged = {
             result.curve.series: judge_product(finding, products.get(result.curve.series), result) for result in mine
@@ -47,7 +47,7 @@ def judge(finding: ExpectedFinding, results: Sequence[CurveResult], products: Ma
     if _is_of_time(finding) and not all(result.curve.is_timed_alone for result in mine):
         outcome = "undecided"
         told.append("runs shared the machine, so times cannot be compared")
-    return Verdict(finding.text, outcome, "; ".join(told), finding.source)
+    return FindingVerdict(finding.text, outcome, "; ".join(told), finding.source)
 
 
 def _judge_one(finding: ExpectedFinding, result: CurveResult) -> Judged:

@@ -12,7 +12,7 @@ from lslam.keyframes.store import KeyframeStore
 from lslam.osm.corrections import write_buildings
 from lslam.pipeline import outputs
 from lslam.pipeline.back_end_pass import write_back_end
-from lslam.pipeline.job import Job
+from lslam.pipeline.job import PreparedRun
 from lslam.pipeline.manifest import Manifest
 from lslam.pipeline.odometry_pass import odometry_checkpoints
 from lslam.pipeline.resume import may_go_on, run_identity
@@ -24,7 +24,7 @@ from lslam.types.run_record import RunRecord
 log = logging.getLogger("lslam")
 
 
-def perform(job: Job, out: Path | None, overwrite: bool, resume: bool) -> RunOutcome:
+def perform(job: PreparedRun, out: Path | None, overwrite: bool, resume: bool) -> RunOutcome:
     """The run, into its folder when there is one."""
     manifest = job.manifest
     if out is None:
@@ -48,7 +48,7 @@ def perform(job: Job, out: Path | None, overwrite: bool, resume: bool) -> RunOut
     return RunOutcome(record, evaluation)
 
 
-def _fill(folder: RunFolder, job: Job, goes_on: bool) -> tuple[RunRecord, Evaluation | None]:
+def _fill(folder: RunFolder, job: PreparedRun, goes_on: bool) -> tuple[RunRecord, Evaluation | None]:
     """The whole result in a run folder, the last word of its manifest aside."""
     folder.require_space(outputs.least_bytes(len(job.sequence)), "the result without its map")
     folder.write_text("config.toml", outputs.config_text(job.config))

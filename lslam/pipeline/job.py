@@ -35,7 +35,7 @@ log = logging.getLogger("lslam")
 
 
 @dataclass(frozen=True)
-class Job:
+class PreparedRun:
     """What is to be done, resolved: the chosen scans, the method, the truth and the map; `given` are the poses of --poses."""
 
     sequence: Sequence
@@ -50,7 +50,7 @@ class Job:
 
 def prepare(
     sequence: Sequence | str | Path, config: Config, truth: Trajectory | None, command: str, watch: Watch
-) -> Job:
+) -> PreparedRun:
     """Find what the configuration asks for beside the scans: fixes, an IMU, poses, a map; and choose the scans."""
     check_config(config)
     if isinstance(sequence, (str, Path)):
@@ -65,7 +65,7 @@ def prepare(
         given = odometry.trajectory
     chosen = choose_scans(sequence, odometry, config)
     osm = open_osm(sequence, config)
-    return Job(chosen, odometry, config, truth, given, Manifest(command, chosen, config), watch, osm)
+    return PreparedRun(chosen, odometry, config, truth, given, Manifest(command, chosen, config), watch, osm)
 
 
 def choose_scans(sequence: Sequence, odometry: Odometry, config: Config) -> Sequence:
@@ -78,7 +78,7 @@ def choose_scans(sequence: Sequence, odometry: Odometry, config: Config) -> Sequ
     return select(sequence, config.input.start, config.input.count, config.input.skip_frames)
 
 
-def announce(job: Job) -> None:
+def announce(job: PreparedRun) -> None:
     """Say what is about to be run and what the reader decided, once: the log keeps it beside the results."""
     sequence, config = job.sequence, job.config
     log.info("%s: %d scans of %s, method %s", sequence.name, len(sequence), sequence.path, config.odometry.method)
@@ -102,7 +102,7 @@ def announce(job: Job) -> None:
 
 
 @contextmanager
-def stoppable(job: Job, said: str) -> Iterator[None]:
+def stoppable(job: PreparedRun, said: str) -> Iterator[None]:
     """What is asked to stop in the block ends it, and the run is interrupted with the sentence `said`."""
     try:
         with asking(job.watch.should_stop, said):

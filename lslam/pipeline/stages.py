@@ -18,7 +18,7 @@ from lslam.odometry.base import FeatureSource
 from lslam.pipeline import outputs
 from lslam.pipeline.back_end_pass import level_world, optimise_poses
 from lslam.pipeline.feature_pass import build_feature_map, view_features
-from lslam.pipeline.job import Job, announce, stoppable
+from lslam.pipeline.job import PreparedRun, announce, stoppable
 from lslam.pipeline.map_checkpoints import map_checkpoints
 from lslam.pipeline.map_pass import build_map
 from lslam.pipeline.odometry_pass import estimate_poses
@@ -30,7 +30,7 @@ log = logging.getLogger("lslam")
 
 
 def solve(
-    job: Job, store: KeyframeStore, folder: Path | None = None, checkpoints: OdometryCheckpoints | None = None
+    job: PreparedRun, store: KeyframeStore, folder: Path | None = None, checkpoints: OdometryCheckpoints | None = None
 ) -> tuple[RunRecord, BackEnd, Evaluation | None]:
     """The poses of all scans, made consistent and level, and their score."""
     announce(job)
@@ -66,7 +66,7 @@ def score(record: RunRecord, sequence: Sequence, config: Config) -> Evaluation |
     return score
 
 
-def make_map(folder: RunFolder, job: Job, record: RunRecord) -> None:
+def make_map(folder: RunFolder, job: PreparedRun, record: RunRecord) -> None:
     """The merged map, from the raw scans and the final poses."""
     config, watch, manifest = job.config, job.watch, job.manifest
     if not config.map.write or manifest.outcome == "interrupted":
@@ -84,7 +84,7 @@ def make_map(folder: RunFolder, job: Job, record: RunRecord) -> None:
         manifest.map_points = len(built.merged)
 
 
-def make_feature_map(folder: RunFolder, job: Job, record: RunRecord) -> None:
+def make_feature_map(folder: RunFolder, job: PreparedRun, record: RunRecord) -> None:
     """The feature map, likewise, when it was asked for."""
     config, watch, manifest, odometry = job.config, job.watch, job.manifest, job.odometry
     if not config.map.write_features or manifest.outcome == "interrupted" or not isinstance(odometry, FeatureSource):
@@ -99,7 +99,7 @@ def make_feature_map(folder: RunFolder, job: Job, record: RunRecord) -> None:
         log.info("feature map: %d points in %s", len(built), folder.path / "feature_map.ply")
 
 
-def make_report(folder: RunFolder, job: Job, record: RunRecord, evaluation: Evaluation | None) -> None:
+def make_report(folder: RunFolder, job: PreparedRun, record: RunRecord, evaluation: Evaluation | None) -> None:
     """report.html; the record's manifest is the run's last word, with the report's own time."""
     manifest = job.manifest
     manifest.take_over(record)

@@ -179,7 +179,7 @@ class CurveResult:
 
 
 @dataclass(frozen=True)
-class Verdict:
+class FindingVerdict:
     """Whether a finding holds here, in one sentence with its numbers."""
 
     text: str
@@ -208,7 +208,7 @@ class StudyResult:
     parameters: tuple[str, ...]
     results: tuple[CurveResult, ...]
     products: dict[str, Law]
-    verdicts: tuple[Verdict, ...]
+    verdicts: tuple[FindingVerdict, ...]
     beside: tuple[StudyRow, ...]
     failed: tuple[StudyRow, ...]
     lost_above: float

@@ -10,7 +10,7 @@ import numpy as np
 
 from lslam.config.finding import ExpectedFinding
 from lslam.evaluation.sensitivity import evaluate_study
-from lslam.types.sensitivity import Verdict
+from lslam.types.sensitivity import FindingVerdict
 from lslam.types.study import StudyRow
 
 Formula = Callable[[float], float]
@@ -57,7 +57,7 @@ def by_seed(rows: list[StudyRow], change: Callable[[float, int], dict[str, Any]]
     return [replace(row, **change(float(next(iter(row.parameters.values()))), row.seed)) for row in rows]
 
 
-def verdict(rows: list[StudyRow], kind: str, *values: float, **more: Any) -> Verdict:
+def verdict(rows: list[StudyRow], kind: str, *values: float, **more: Any) -> FindingVerdict:
     """What a finding of that kind comes to on rows of one curve or more."""
     finding = ExpectedFinding.model_validate({"text": "So it is.", "kind": kind, "values": values, **more})
     return evaluate_study(rows, [finding])[0].verdicts[0]

@@ -12,7 +12,7 @@ import pytest
 from study_rows import by_seed, outcome, rows_of, verdict
 
 from lslam.config.finding import Kind
-from lslam.types.sensitivity import Verdict
+from lslam.types.sensitivity import FindingVerdict
 from lslam.types.study import StudyRow
 
 SKIPS = range(1, 21)
@@ -31,7 +31,7 @@ class Case:
     hidden: list[StudyRow]
     more: dict[str, Any] = field(default_factory=dict)
 
-    def judged(self, kind: str, rows: list[StudyRow]) -> Verdict:
+    def judged(self, kind: str, rows: list[StudyRow]) -> FindingVerdict:
         return verdict(rows, kind, *self.values, **self.more)
 
 
