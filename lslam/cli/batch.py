@@ -100,7 +100,7 @@ def _line(number: int, words: list[str], given: dict[str, Any]) -> RunLine:
 
 def _print(rows: list[StudyRow]) -> None:
     from lslam.reports.grid_text import aligned
-    from lslam.reports.study_best import batch_table
+    from lslam.reports.study_table import batch_table
 
     show(aligned(batch_table(rows), 3) + "\n")
 

@@ -41,7 +41,7 @@ class BestTable:
         from rich import box
         from rich.table import Table
 
-        from lslam.reports.study_best import best_table
+        from lslam.reports.study_table import best_table
 
         header, *lines = best_table(rows)
         self.table = Table(*header, box=box.SIMPLE_HEAD, pad_edge=False)

@@ -9,7 +9,7 @@ from lslam.formats.atomic import write_text
 from lslam.pipeline.json_files import read_json, write_json
 from lslam.pipeline.run_folder import MANIFEST
 from lslam.reports.evaluation_json import run_document
-from lslam.reports.renewed import with_new_map
+from lslam.reports.html import with_new_map
 from lslam.types.run_record import RunRecord
 
 log = logging.getLogger("lslam")

@@ -11,9 +11,11 @@ from lslam.geometry import se3
 from lslam.printable import counted, metres
 from lslam.reports import svg
 from lslam.reports.buildings import drift_tables
-from lslam.reports.loop_view import loop_figures
+from lslam.reports.crops import Crop, crop_images
 from lslam.reports.plane import Track, plane_chart
 from lslam.reports.plots import ALIGNED, DISTANCE, Figure, first_available
+from lslam.reports.png import data_uri, density_png
+from lslam.types.loop_view import LoopView
 from lslam.types.run_record import RunRecord
 from lslam.types.table import Table
 
@@ -24,6 +26,8 @@ Floats = NDArray[np.float64]
 
 # Ellipses on the plan, their sigmas, and how large the largest is drawn at least, as a share of the plan.
 ELLIPSES, SIGMAS, SEEN = 16, 3.0, 0.02
+# m; the edge of the square leaves so much beside the correction, and is no smaller and no larger than that.
+BESIDE, SMALLEST, LARGEST = 40.0, 50.0, 150.0
 
 
 def back_end_rows(record: RunRecord, evaluation: Evaluation | None) -> list[tuple[str, str]]:
@@ -168,3 +172,25 @@ def _ellipses(record: RunRecord) -> tuple[list[Floats], float]:
     factor = 10.0 ** max(int(np.ceil(np.log10(SEEN * size / largest))), 0)
     outlines = [positions[i, :2] + factor * (ring * a) @ v.T for i, a, v in zip(some, axes, vectors, strict=True)]
     return outlines, factor
+
+
+def loop_figures(view: LoopView | None) -> list[Figure]:
+    """Both figures; nothing without a loop."""
+    if view is None:
+        return []
+    size = float(np.clip(2 * view.correction + BESIDE, SMALLEST, LARGEST))
+    places = (("before", view.before), ("after", view.after))
+    crops = [Crop(float(place.centre[0]), float(place.centre[1]), size) for _, place in places]
+    # The same grey in both: what is drawn twice is fainter, not hidden.
+    images = [crop_images([place.points], crop) for (_, place), crop in zip(places, crops, strict=True)]
+    top = max(top for _, top in images)
+    legend = (("s2", f"scan {view.older_scan} and around"), ("s1", f"scan {view.newer_scan} and around"))
+    caption = f"Keyframes on both ways past the loop that was corrected most, by {view.correction:.2f} m."
+    figures = []
+    for (word, place), crop, ((image,), _) in zip(places, crops, images, strict=True):
+        assert image is not None
+        tracks = [Track("older", crop.inside(place.older), "s2"), Track("newer", crop.inside(place.newer), "s1")]
+        backdrop = (data_uri(density_png(image, top)), crop.extent)
+        chart = plane_chart(tracks, f"map at a loop, {word} the pose graph", backdrop=backdrop)
+        figures.append(Figure(f"Map at a loop, {word} the pose graph", chart, legend, caption))
+    return figures

@@ -10,7 +10,7 @@ import numpy as np
 from lslam.errors import LslamError
 from lslam.formats.point_files import read_points
 from lslam.reports import svg
-from lslam.reports.compare_crops import Crop, Floats, choose_crops, crop_images
+from lslam.reports.crops import Crop, Floats, choose_crops, crop_images
 from lslam.reports.plane import Track, plane_chart
 from lslam.reports.plots import DISTANCE, Figure
 from lslam.reports.png import data_uri, density_png

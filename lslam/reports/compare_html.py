@@ -9,9 +9,9 @@ from typing import Any
 from urllib.parse import quote
 
 from lslam.formats.atomic import atomic_write
-from lslam.reports.compare_crops import Crop
 from lslam.reports.compare_figures import crop_figures, error_figure, style_of, time_figure, trajectory_figure
 from lslam.reports.compare_table import recipes, tables
+from lslam.reports.crops import Crop
 from lslam.reports.html import flatten, template
 from lslam.reports.plots import Figure
 from lslam.types.comparison import Comparison, Drawing

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.reports import svg
-from lslam.reports.compare_crops import Crop, crop_images
+from lslam.reports.crops import Crop, crop_images
 from lslam.reports.plane import MOST_POINTS, plane_chart
 from lslam.reports.plots import Figure
 from lslam.reports.png import data_uri, density_png
@@ -26,7 +26,7 @@ def feature_figures(view: FeatureView | None) -> list[Figure]:
     crop = Crop(0.0, 0.0, 2 * REACH)
     scan = plane_chart(
         [], f"features of scan {view.scan}", backdrop=_backdrop(view.around, crop),
-        dots=[("s2", _inside(view.planes, crop)), ("s1", _inside(view.edges, crop))],
+        dots=[("s2", crop.inside(view.planes)), ("s1", crop.inside(view.edges))],
     )  # fmt: skip
     low, high = view.map_planes[:, :2].min(axis=0, initial=np.inf), view.map_planes[:, :2].max(axis=0, initial=-np.inf)
     if not np.isfinite([low, high]).all():
@@ -35,7 +35,7 @@ def feature_figures(view: FeatureView | None) -> list[Figure]:
     around = Crop(float(centre[0]), float(centre[1]), float((high - low).max()) + 1.0)
     edges = view.map_edges[:: max(1, -(-len(view.map_edges) // MOST_POINTS)), :2]
     whole = plane_chart(
-        [], "feature map", backdrop=_backdrop(view.map_planes, around), dots=[("s1", _inside(edges, around))]
+        [], "feature map", backdrop=_backdrop(view.map_planes, around), dots=[("s1", around.inside(edges))]
     )
     lines = [
         svg.Line("edges", view.scans.astype(np.float64), view.edge_counts.astype(np.float64), "s1"),
@@ -59,9 +59,3 @@ def _backdrop(points: Floats, crop: Crop) -> tuple[str, tuple[float, float, floa
     (image,), top = crop_images([points], crop)
     assert image is not None
     return data_uri(density_png(image, top)), crop.extent
-
-
-def _inside(points: Floats, crop: Crop) -> Floats:
-    """Those of the points (K, 2) that lie in the crop."""
-    x0, x1, y0, y1 = crop.extent
-    return points[((points[:, :2] >= (x0, y0)) & (points[:, :2] <= (x1, y1))).all(axis=1)]

@@ -12,9 +12,9 @@ import numpy as np
 from lslam.evaluation.curves import NOT_REGISTRATION, registration_ms
 from lslam.evaluation.efficiency import normalise
 from lslam.evaluation.landmarks import FLAT
+from lslam.evaluation.laws import band
 from lslam.reports.picture import COLOURS, house_style, label, pictures
-from lslam.reports.study_law_figure import draw_laws
-from lslam.types.sensitivity import CurveResult, Floats, StudyResult
+from lslam.types.sensitivity import CurveResult, Floats, Law, StudyResult
 from lslam.types.study import StudyRow
 
 # Of section 5.3, by studied parameter and figure.
@@ -29,6 +29,7 @@ THESIS = {
     "loam.max_planar_points": {"errors": "5.35", "times": "5.34b", "stages": "5.34a", "efficiency": "5.35"},
 }  # fmt: skip
 _STAGE_PANELS = 6
+SAMPLES = 200  # of a drawn law
 _SEEDS = (
     "Mean over the seeds whose run was not lost, bars: 95 % interval (Student's t). Crosses above: more than half of the "
     "runs were lost there."
@@ -221,6 +222,60 @@ def _legend(figure: Any, *plots: Any) -> None:
     found = {name: handle for plot in plots for handle, name in zip(*plot.get_legend_handles_labels(), strict=True)}
     columns = max(1, _LEGEND_WIDTH // (max((len(name) for name in found), default=0) + 6))
     figure.legend(found.values(), found.keys(), loc="outside lower center", ncols=columns, frameon=False)
+
+
+def draw_laws(figure: Any, result: StudyResult, shown: Sequence[CurveResult]) -> bool:
+    """The law of each curve, or of each series over both parameters; False where there is none."""
+    colours = {r.curve.label: colour for r, colour in zip(result.results, COLOURS, strict=False)}
+    singles = [(r.curve.label, r.law) for r in shown if r.law is not None and r.curve.label in colours]
+    laws = list(result.products.items()) or singles
+    if not laws:
+        return False
+    columns = len(laws) if result.products else 1
+    grid = figure.add_gridspec(2, columns, height_ratios=[3, 1])
+    for k, (name, law) in enumerate(laws):
+        if k < columns:
+            upper = figure.add_subplot(grid[0, k])
+            lower = figure.add_subplot(grid[1, k], sharex=upper)
+        if law.kind == "product":
+            _product(upper, lower, law, name)
+        else:
+            _single(upper, lower, law, f"{name}: {law.text} s, R2 {law.r2:.3f}", colours[name])
+        lower.axhline(0, color="0.5", lw=0.8)
+        label(upper, "", "total time, s")
+        label(lower, law.names[0], "residual, %")
+        upper.legend(frameon=False, fontsize=8)
+        upper.tick_params(labelbottom=False)
+    for upper in figure.axes[::2]:
+        upper.set_ylim(bottom=0)
+    return True
+
+
+def _single(upper: Any, lower: Any, law: Law, name: str, colour: str) -> None:
+    x = law.points[:, 0]
+    line = np.linspace(x.min(), x.max(), SAMPLES)
+    fitted, half = band(law, line)
+    upper.plot(x, law.observed, "o", ms=3.5, color=colour)
+    upper.plot(line, fitted, color=colour, lw=1.2, label=name)
+    upper.fill_between(line, fitted - half, fitted + half, color=colour, alpha=0.2, lw=0)
+    lower.plot(x, 100 * law.residuals, "o", ms=3, color=colour)
+
+
+def _product(upper: Any, lower: Any, law: Law, name: str) -> None:
+    """A line per value of the second parameter: one law over all of them."""
+    from matplotlib import colormaps
+
+    seconds = np.unique(law.points[:, 1])
+    for second, colour in zip(seconds, colormaps["viridis"](np.linspace(0.0, 0.88, len(seconds))), strict=True):
+        own = law.points[:, 1] == second
+        x = law.points[own, 0]
+        line = np.linspace(x.min(), x.max(), SAMPLES)
+        fitted, half = band(law, np.stack([line, np.full(SAMPLES, second)], 1))
+        upper.plot(x, law.observed[own], "o", ms=3, color=colour)
+        upper.plot(line, fitted, lw=1.1, color=colour, label=f"{law.names[1].rpartition('.')[2]} {second:g}")
+        upper.fill_between(line, fitted - half, fitted + half, color=colour, alpha=0.2, lw=0)
+        lower.plot(x, 100 * law.residuals[own], "o", ms=2.5, color=colour)
+    upper.set_title(f"{name}: {law.text} s, R2 {law.r2:.3f}", fontsize=9)
 
 
 _FIGURES: tuple[tuple[str, str, str, Callable[[Any, StudyResult, Sequence[CurveResult]], bool]], ...] = (

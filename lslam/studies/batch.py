@@ -14,9 +14,8 @@ from lslam.config.batch import BatchConfig, parse_batch
 from lslam.errors import UsageError
 from lslam.pipeline.identity import imu_digest, input_digest, job_digest
 from lslam.printable import file_safe, toml_text
-from lslam.studies.cells import cells_of
 from lslam.studies.expanded_study import ExpandedStudy, check_same
-from lslam.studies.grid import Job, expand, run_folder
+from lslam.studies.grid import Job, cells_of, expand, run_folder
 from lslam.studies.output import OutputOptions
 from lslam.studies.variants import WITH_IMU, Variant, find_variants, free_name, settings_of
 from lslam.types.sequence import Sequence as Recording

@@ -9,10 +9,9 @@ from pathlib import Path
 
 from lslam.errors import InterruptedRunError, LslamError, UsageError
 from lslam.reports import compare_html, compare_json, compare_table
-from lslam.studies.cells import fitted_scene, recorded_cell
 from lslam.studies.collect import IMU, collect_run, metrics_of
 from lslam.studies.drawings import draw
-from lslam.studies.grid import Cell, Job, expand
+from lslam.studies.grid import Cell, Job, expand, fitted_scene, recorded_cell
 from lslam.studies.jobs import finished, pool_of, run_jobs
 from lslam.studies.output import SIMULATED, lock_output, release_output
 from lslam.studies.paired import TIE_M, compare_pairs, summarise

@@ -1,18 +1,25 @@
-"""The grid of a study: sequences x methods x seeds, expanded to jobs."""
+"""The grid of a study: recordings and simulations as cells with digests of their input, x methods x seeds, as jobs."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lslam.config import Config
 from lslam.config.input import AS_CONFIGURED, ScanRange
-from lslam.pipeline.identity import job_digest
-from lslam.studies.scenes import Scene
-from lslam.studies.subjects import with_range
-from lslam.studies.variants import Variant
+from lslam.config.study import StudySequence
+from lslam.errors import UsageError
+from lslam.pipeline.identity import imu_digest, input_digest, job_digest
+from lslam.printable import file_safe
+from lslam.readers import open_sequence
+from lslam.readers.lookup import find_folder
+from lslam.studies.output import SIMULATED, OutputOptions
+from lslam.studies.scenes import Scene, drive_of, scene_digest, scene_folder
+from lslam.studies.subjects import check_range, scans_needed, with_range
+from lslam.studies.variants import Variant, free_name
+from lslam.types.trajectory import Trajectory
 
 if TYPE_CHECKING:
     from lslam.types.trajectory import Trajectory
@@ -104,3 +111,98 @@ def expand(
                     )
                 )  # fmt: skip
     return jobs
+
+
+def recorded_cell(
+    label: str,
+    path: Path,
+    seed: int | None = None,
+    *,
+    needs_imu: bool,
+    truth: Trajectory | None = None,
+    data_root: Path | None = None,
+    own: ScanRange = AS_CONFIGURED,
+) -> Cell:
+    """A recording that is there; `own` : which of its scans are used.
+
+    Raises InputError when it cannot be opened, or has no IMU and some run asks for one; UsageError when it ends before `own`.
+    """
+    sequence = open_sequence(path, data_root=data_root, imu=needs_imu)
+    check_range(label, own, len(sequence))
+    imu = imu_digest(sequence) if needs_imu else ""
+    return Cell(label, path, seed, input_digest(sequence, truth), truth, imu, data_root, range=own)
+
+
+def scene_cell(scene: Scene, seed: int, parent: Path, own: ScanRange = AS_CONFIGURED) -> Cell:
+    """A simulation that may still have to be made, below `parent`; its digest says what it will hold, IMU included.
+
+    Raises UsageError, ConfigError or InputError for a scenario that is none.
+    """
+    return Cell(scene.name, scene_folder(scene, seed, parent), seed, scene_digest(scene, seed), scene=scene, range=own)
+
+
+def fitted_scene(scene: Scene, needed: int | None, own: ScanRange, seeds: Sequence[int]) -> Scene:
+    """The scene with the scans that are needed, unless it says how many; all of its way where skipping leads beyond it.
+
+    own : which scans are used, over the configurations; seeds : of the simulations, whose ways differ a little
+    Raises UsageError when the scenario ends before them.
+    """
+    if scene.scans is not None:
+        check_range(scene.name, own, scene.scans)
+        return scene
+    fitted = replace(scene, scans=needed)
+    if own.own:
+        try:
+            ways = [drive_of(fitted, seed) for seed in seeds]
+        except UsageError:
+            fitted = scene
+            ways = [drive_of(scene, seed) for seed in seeds]
+        check_range(scene.name, own, min(map(len, ways)))
+    return fitted
+
+
+def cells_of(
+    sequences: Sequence[StudySequence],
+    seeds: Sequence[int],
+    variants: Sequence[Variant],
+    output: OutputOptions,
+    settings: Sequence[str] = (),
+) -> list[Cell]:
+    """Recordings as they are, scenarios once per seed, every one with a label of its own.
+
+    settings : "a.b=v" that beat the sequences' own `start`, `count` and `skip_frames`
+
+    Raises InputError for a recording that cannot be opened or lacks the IMU; UsageError or ConfigError for a scenario that is
+    none, UsageError for a sequence that ends before the scans that are its own.
+    """
+    configs = [variant.config for variant in variants]
+    needs_imu = any(config.imu.use for config in configs)
+    beaten = {setting.partition("=")[0].strip() for setting in settings}
+    cells: list[Cell] = []
+    taken: set[str] = set()
+    for sequence in sequences:
+        own = ScanRange(**{key: value for key, value in sequence.own.items() if f"input.{key}" not in beaten})
+        needed = scans_needed([with_range(config, own).input for config in configs])
+        made = (
+            [_recorded(sequence.path, own, needs_imu, output)]
+            if sequence.path
+            else _simulated(sequence, own, needed, seeds, output)
+        )
+        # The same recording with other settings is another sequence, with a folder of its own.
+        label = free_name(made[0].sequence, taken)
+        cells += [replace(cell, sequence=label) for cell in made]
+    return cells
+
+
+def _recorded(word: str, own: ScanRange, needs_imu: bool, output: OutputOptions) -> Cell:
+    path = find_folder(word, output.data_root).absolute()
+    label = file_safe(open_sequence(path).name)
+    return recorded_cell(label, path, needs_imu=needs_imu, data_root=output.data_root, own=own)
+
+
+def _simulated(
+    s: StudySequence, own: ScanRange, needed: int | None, seeds: Sequence[int], output: OutputOptions
+) -> list[Cell]:
+    scene = Scene(s.scenario, s.scans, s.lidar, s.columns, s.speed, s.compensated, s.imu, s.settings)
+    scene = fitted_scene(scene, needed, own, seeds)
+    return [scene_cell(scene, seed, output.scenes or output.out / SIMULATED, own) for seed in seeds]

@@ -12,7 +12,7 @@ from lslam.backend.loop_view import AROUND, view_loop
 from lslam.backend.outcome import BackEnd
 from lslam.geometry import se3
 from lslam.keyframes.store import KeyframeStore
-from lslam.reports.loop_view import loop_figures
+from lslam.reports.back_end import loop_figures
 from lslam.types.constraint import Constraint, LoopCandidate, Verdict
 from lslam.types.keyframe import Keyframe
 from lslam.types.run_record import RunRecord

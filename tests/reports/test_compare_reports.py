@@ -15,10 +15,10 @@ import pytest
 from comparisons import comparison, drawing, row, walls
 from test_html import parse
 
-from lslam.reports.compare_crops import Crop, choose_crops, crop_images
 from lslam.reports.compare_html import render_page
 from lslam.reports.compare_json import to_document
 from lslam.reports.compare_table import recipes, render, tables
+from lslam.reports.crops import Crop, choose_crops, crop_images
 from lslam.types.comparison import Spread
 
 

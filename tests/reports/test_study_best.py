@@ -7,7 +7,7 @@ from math import nan
 
 import pytest
 
-from lslam.reports.study_best import batch_table, best_points, best_table
+from lslam.reports.study_table import batch_table, best_points, best_table
 from lslam.types.study import StudyRow
 
 

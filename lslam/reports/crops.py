@@ -1,4 +1,4 @@
-"""The same places in the maps of several methods: chosen where there is most to see, drawn with one scale of grey."""
+"""Squares of maps seen from above: chosen where there is most structure, drawn with one scale of grey."""
 
 from __future__ import annotations
 
@@ -33,6 +33,11 @@ class Crop:
         """x_min, x_max, y_min, y_max."""
         half = self.size / 2
         return (self.x - half, self.x + half, self.y - half, self.y + half)
+
+    def inside(self, points: Floats) -> Floats:
+        """Those of the points (K, 2) or (K, 3) that lie in it."""
+        x0, x1, y0, y1 = self.extent
+        return points[((points[:, :2] >= (x0, y0)) & (points[:, :2] <= (x1, y1))).all(axis=1)]
 
 
 def choose_crops(points: NDArray[Any], size: float = SIZE_M, most: int = MOST_CROPS) -> list[Crop]:
