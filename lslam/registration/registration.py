@@ -18,7 +18,7 @@ from lslam.registration.acceptance import Wording, accepted, failed
 from lslam.registration.alignment import MapAlignment
 from lslam.registration.constant_velocity import ConstantVelocity
 from lslam.registration.local_map import LocalMap
-from lslam.registration.residuals import NEEDS_COVARIANCE, residual_named
+from lslam.registration.residuals import residual_named
 from lslam.registration.robust import AdaptiveThreshold, UsualAgreement
 from lslam.registration.solver import RegistrationResult
 from lslam.registration.source_covariance import source_covariance
@@ -32,13 +32,8 @@ MIN_SOURCE_POINTS = 30
 NEAR_KERNEL = 2.0
 # Between scans that come without stamps, ns: most sensors turn ten times a second.
 SCAN_NS = 100_000_000
-# Point to point: of the voxel size, because a voxel's mean stands for one point of its surface, its plane for all.
-POINT_VOXEL = 0.625
 # A few points at the edge of sight are not worth a look at the coarse map.
 SPARSE_SHARE = 0.1
-# Times the steps: a point is drawn to where its match is, not to where the surfaces meet, and the score of a normal
-# distribution has no pull on points a few sigma away, so that those near by turn the sensor a little with each step.
-SLOWLY: dict[str, int] = {"point": 3, "ndt": 3}
 WORDING = Wording("of the points overlap the map", "of the points agree with the map")
 
 
@@ -69,10 +64,10 @@ class Registration(Stateful):
         self.preprocess = preprocess or PreprocessConfig()
         self.recovery = tuple(recovery)
         self.residual = c.residual or "plane"
-        residual_named(self.residual)
+        self.kind = residual_named(self.residual)
         self.target = make_target(c)
         self.map = LocalMap(
-            c.voxel_size * (POINT_VOXEL if self.residual == "point" else 1.0), coarse_factor=c.coarse_factor,
+            c.voxel_size * self.kind.voxel_share, coarse_factor=c.coarse_factor,
             min_points=c.min_points, planarity=c.planarity, count_cap=c.count_cap, reach=1.2 * self.preprocess.range_max,
         )  # fmt: skip
         self.alignment = MapAlignment(self.map, c, self.residual)
@@ -111,12 +106,12 @@ class Registration(Stateful):
             return failed(T_prior, count, f"{count} usable points, {MIN_SOURCE_POINTS} needed")
         if len(self.map) == 0:
             return RegistrationResult(T_prior, covariance=np.diag([1e-12] * 6), source_points=count)
-        if self.residual in NEEDS_COVARIANCE and points.covariance is None:
+        if self.kind.needs_covariance and points.covariance is None:
             found = source_covariance(points.source, points.map_points, c.sigma**2, c.neighbourhood)
             points = replace(points, covariance=found)
-        if self.residual == "point":
+        if self.kind.needs_gaps:
             points = replace(points, gaps=self._gaps(points))
-        width, steps = self.threshold.width, c.max_iterations * SLOWLY.get(self.residual, 1)
+        width, steps = self.threshold.width, c.max_iterations * self.kind.times_steps
         if is_near:
             width = NEAR_KERNEL * c.kernel_min
         elif self.starting > 0:

@@ -64,6 +64,9 @@ class ResidualKind:
     by_surfaces : whether S of its sums tells which directions are observed: its matrices are full
     is_wide : whether voxels of the wide levels tell it something: a mean does not
     along : of a blob's weight, along the sensor's axis
+    voxel_share : of the voxel size: a voxel's mean stands for one point of its surface, its plane for all
+    times_steps : of the steps: a point is drawn to where its match is, not to where the surfaces meet, and the score of a
+        normal distribution has no pull on points a few sigma away, so that those near by turn the sensor a little with each
     """
 
     module: str
@@ -73,6 +76,18 @@ class ResidualKind:
     by_surfaces: bool = False
     is_wide: bool = True
     along: float = ALONG
+    voxel_share: float = 1.0
+    times_steps: int = 1
+
+    @property
+    def needs_covariance(self) -> bool:
+        """Whether it takes the covariance about each source point."""
+        return self.points is _with_covariance
+
+    @property
+    def needs_gaps(self) -> bool:
+        """Whether it takes the gap between the rings at each source point."""
+        return self.points is _with_gaps
 
     @property
     def linearise(self) -> Callable[..., None]:
@@ -82,16 +97,19 @@ class ResidualKind:
 
 RESIDUALS = {
     "plane": ResidualKind("lslam.kernels.residuals", "linearise"),
-    "point": ResidualKind("lslam.kernels.point_residual", "linearise_point", _with_gaps, is_wide=False),
+    "point": ResidualKind(
+        "lslam.kernels.point_residual", "linearise_point", _with_gaps, is_wide=False, voxel_share=0.625, times_steps=3
+    ),
     "gicp": ResidualKind("lslam.kernels.gicp_residual", "linearise_gicp", _with_covariance, by_surfaces=True),
     "vgicp": ResidualKind(
         "lslam.kernels.vgicp_residual", "linearise_vgicp", _with_covariance, _counted_planes, by_surfaces=True
     ),
-    "ndt": ResidualKind("lslam.kernels.ndt_residual", "linearise_ndt", _alone, _shapes, by_surfaces=True),
+    "ndt": ResidualKind(
+        "lslam.kernels.ndt_residual", "linearise_ndt", _alone, _shapes, by_surfaces=True, times_steps=3
+    ),
 }
 # Point to point in small voxels that pass for no planes, where all axes count alike; nothing that a user chooses.
 MEANS = replace(RESIDUALS["plane"], is_wide=False, along=1.0)
-NEEDS_COVARIANCE = frozenset(name for name, residual in RESIDUALS.items() if residual.points is _with_covariance)
 
 
 def residual_named(name: str) -> ResidualKind:
