@@ -220,7 +220,7 @@ MARKS = {
     "EVERYWHERE",
     "NO_TIMES",
     "PLANAR",
-    "WANDER",
+    "FIX_NOISE",
     "STATE",
     "FREE",
     "EMPTY",
