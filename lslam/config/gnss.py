@@ -19,7 +19,7 @@ class GnssConfig(Section):
         None, ge=1024, le=32767, description="EPSG code of georeferenced outputs; default: UTM zone"
     )
     sigma: float | None = Field(None, gt=0, description="m; one sigma of a fix; default: what the recording states")
-    min_sigma: float = Field(0.02, gt=0, description="m; no fix is believed more than this")
+    min_sigma: float = Field(0.02, gt=0, description="m; least sigma of a fix")
     vertical: float = Field(1.8, ge=1, description="heights are worse than positions by this factor")
     max_sigma: float = Field(20.0, gt=0, description="m; fixes that state more are left out")
     min_fixes: int = Field(5, ge=3, description="with fewer fixes that agree there is no georeference")

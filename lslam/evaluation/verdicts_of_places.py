@@ -16,7 +16,7 @@ BELOW: dict[Rise, str] = {
     "worse": "it is worse by more than the seeds scatter", "as good": "it is as good",
     "unknown": "too few runs, or too scattered ones, say whether it rises",
 }  # fmt: skip
-Standing = Literal["worse", "as good", "better", "unknown"]
+Ranking = Literal["worse", "as good", "better", "unknown"]
 
 
 def judge_diverges_beyond(finding: ExpectedFinding, result: CurveResult) -> Judged:
@@ -134,7 +134,7 @@ def _between(finding: ExpectedFinding, result: CurveResult, *, is_highest: bool)
     return "confirmed", said
 
 
-def _standing(finding: ExpectedFinding, curve: Curve, other: int, base: int, is_highest: bool) -> Standing:
+def _standing(finding: ExpectedFinding, curve: Curve, other: int, base: int, is_highest: bool) -> Ranking:
     """How the value at index `other` stands against that at `base`."""
     if curve.is_lost[other]:
         if finding.kind == "best_between" or finding.of.endswith("efficiency"):

@@ -1,4 +1,4 @@
-"""osm_matches.csv: what walls seen said about keyframes and buildings, what was believed of it and why the rest was not."""
+"""osm_matches.csv: matches of walls with keyframes and buildings, accepted ones and why the rest is rejected."""
 
 from __future__ import annotations
 

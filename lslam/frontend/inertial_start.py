@@ -189,7 +189,7 @@ def close_inertial(part: Inertial, results: list[ScanResult]) -> dict[str, Any]:
     errors = motion.prior_errors()
     norms = [r.prior_norm for r in results[1:] if r.status == "ok"]
     steady = [r.steady_norm for r in results[1:] if r.status == "ok" and r.steady_norm is not None]
-    iterations = [r.iterations for r in results[1:] if r.status == "ok" and not r.is_standing]
+    iterations = [r.iterations for r in results[1:] if r.status == "ok" and not r.is_stationary]
     return {
         "used": not motion.refusal,
         "decisions": part.notes,

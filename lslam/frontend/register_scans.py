@@ -20,9 +20,9 @@ from lslam.frontend.tracker import Loaded, Tracker
 from lslam.integrity.monitor import IntegrityMonitor
 from lslam.odometry.base import Odometry
 from lslam.odometry.sanity import FARTHEST_M, measurable
-from lslam.odometry.standing import Standing
+from lslam.odometry.stationary import StationaryDetector
 from lslam.readers.selection import Selection
-from lslam.registration.acceptance import DOUBT
+from lslam.registration.acceptance import PRIOR_COVARIANCE
 from lslam.registration.constant_velocity import MotionModel
 from lslam.types.scan import Scan, Span
 from lslam.types.scan_result import ScanResult
@@ -36,7 +36,7 @@ def estimate(
     *,
     threads: int = 2,
     max_failures: int = 20,
-    standing: Standing | None = None,
+    stationary: StationaryDetector | None = None,
     motion: MotionModel | None = None,
     should_stop: Callable[[], bool] = lambda: False,
     on_scan: Callable[[ScanResult], None] = lambda result: None,
@@ -46,12 +46,12 @@ def estimate(
 ) -> list[ScanResult]:
     """Register every scan of the sequence; stops early on `should_stop` or after `max_failures` failures in a row.
 
-    A scan that cannot be read, or is empty, is skipped: the motion prior stands in for its pose. With `standing`, scans
-    during which the sensor stands are not registered. `motion` predicts the scans, constant velocity when None.
+    A scan that cannot be read, or is empty, is skipped: its pose is the motion prior. With `stationary`, scans of
+    a stationary sensor are not registered. `motion` predicts the scans, constant velocity when None.
     `keyframing` sees every scan and how the sensor moved within it. `checkpoints`, which need keyframing, say where an
-    earlier run left off and keep what this one does. `monitor` checks the pose claimed for every scan.
+    earlier run left off and keep what this one does. `monitor` checks the pose of every scan.
     """
-    tracker = Tracker(odometry, standing, motion, monitor)
+    tracker = Tracker(odometry, stationary, motion, monitor)
     results: list[ScanResult] = []
     if checkpoints is not None and keyframing is not None:
         results = checkpoints.begin(tracker, keyframing)
@@ -106,12 +106,12 @@ def is_diverged(results: list[ScanResult], max_failures: int) -> bool:
 
 
 def to_trajectory(results: list[ScanResult], method: str) -> Trajectory:
-    """The poses of all scans; covariances when the method has them, where a scan was skipped the last one and `DOUBT`."""
+    """The poses of all scans, with covariances when the method has them; a skipped scan adds `PRIOR_COVARIANCE` to the last one."""
     known = any(r.covariance is not None for r in results)
     covariances: list[NDArray[np.float64]] = []
     for result in results if known else ():
         before = covariances[-1] if covariances else np.zeros((6, 6))
-        covariances.append(before + DOUBT if result.covariance is None else result.covariance)
+        covariances.append(before + PRIOR_COVARIANCE if result.covariance is None else result.covariance)
     return Trajectory(
         stamps_ns=np.array([r.stamp_ns for r in results], np.int64),
         poses=np.stack([r.T_world_lidar for r in results]),

@@ -13,7 +13,7 @@ from lslam.geometry import se3, so3
 from lslam.integrity.monitor import IntegrityMonitor
 from lslam.odometry.base import Deskewing, Odometry, Registered, Resumable, Searching
 from lslam.odometry.sanity import plausible
-from lslam.odometry.standing import Standing
+from lslam.odometry.stationary import StationaryDetector
 from lslam.registration.constant_velocity import ConstantVelocity, MotionModel, middle_of
 from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan import Scan, Span
@@ -44,23 +44,23 @@ class Loaded:
 class Tracker:
     """Poses of scans, one after the other.
 
-    sweep : how the sensor moved within the last scan, as far as its registration knew
+    sweep : motion of the sensor within the last scan, as used by its registration
     monitor : checks the poses that were found, by `check`
-    middle : instant, ns, and pose of the middle of the last sweep: what its registration knows best
+    middle : instant, ns, and pose of the middle of the last sweep, where registration is most accurate
     """
 
     # A change of the motion within the sweep that moves no point by more is not worth a second registration.
     REFINE_M = 0.01
 
     def __init__(
-        self, odometry: Odometry, standing: Standing | None = None, motion: MotionModel | None = None,
+        self, odometry: Odometry, stationary: StationaryDetector | None = None, motion: MotionModel | None = None,
         monitor: IntegrityMonitor | None = None,
     ) -> None:  # fmt: skip
-        self.odometry, self.standing, self.monitor = odometry, standing, monitor
+        self.odometry, self.stationary, self.monitor = odometry, stationary, monitor
         self.motion: MotionModel = ConstantVelocity() if motion is None else motion
         self.sweep = MotionPrior.at_once(np.eye(4))
         self.middle = (0, np.eye(4))
-        # The newest result that was believed.
+        # The newest accepted result.
         self._last: ScanResult | None = None
         # The first scan, until a second one tells how fast it was taken.
         self._first: tuple[Scan, Any, NDArray[np.float64]] | None = None
@@ -68,8 +68,8 @@ class Tracker:
     def track(self, loaded: Loaded) -> ScanResult:
         """Pose of the next scan."""
         scan = loaded.scan
-        if scan is not None and self.standing is not None:
-            result = self._stand_or_move(scan, loaded, self.standing)
+        if scan is not None and self.stationary is not None:
+            result = self._stand_or_move(scan, loaded, self.stationary)
         else:
             result = self._move(loaded)
         if self.motion.is_known:
@@ -85,7 +85,7 @@ class Tracker:
 
     @property
     def is_settled(self) -> bool:
-        """Whether nothing waits for the next scan, so that `state` says all."""
+        """Whether nothing waits for the next scan, so that `state` is complete."""
         return self._first is None
 
     def state(self) -> State:
@@ -93,7 +93,7 @@ class Tracker:
         return {
             "odometry": self.odometry.state() if isinstance(self.odometry, Resumable) else None,
             "motion": self.motion.state(),
-            "standing": None if self.standing is None else self.standing.state(),
+            "stationary": None if self.stationary is None else self.stationary.state(),
             "middle": self.middle,
             "last": self._last,
             "monitor": None if self.monitor is None else self.monitor.state(),
@@ -104,15 +104,15 @@ class Tracker:
         if isinstance(self.odometry, Resumable) and state["odometry"] is not None:
             self.odometry.restore(state["odometry"])
         self.motion.restore(state["motion"])
-        if self.standing is not None:
-            self.standing.restore(state["standing"])
+        if self.stationary is not None:
+            self.stationary.restore(state["stationary"])
         self.middle, self._last = state["middle"], state["last"]
         if self.monitor is not None:
             self.monitor.restore(state["monitor"])
 
-    def _stand_or_move(self, scan: Scan, loaded: Loaded, standing: Standing) -> ScanResult:
+    def _stand_or_move(self, scan: Scan, loaded: Loaded, stationary: StationaryDetector) -> ScanResult:
         began = time.perf_counter()
-        result = standing.result_of(scan)
+        result = stationary.result_of(scan)
         stages = {"standing": time.perf_counter() - began}
         if result is not None:
             self.motion.correct(result.stamp_ns, result.T_world_lidar)
@@ -120,7 +120,7 @@ class Tracker:
             return replace(result, stages=stages)
         result = self._move(loaded)
         began = time.perf_counter()
-        standing.observe(scan, result)
+        stationary.observe(scan, result)
         stages["standing"] += time.perf_counter() - began
         return replace(result, stages=stages | result.stages)
 
@@ -204,10 +204,10 @@ class Tracker:
         self, odometry: Searching, scan: Scan, prepared: Any, prior: MotionPrior, found: Registered, denied: ScanResult,
         clock: StageClock,
     ) -> Registered:  # fmt: skip
-        """What is found where the IMU expects a scan, in place of what was `found` elsewhere and `denied`, or failed.
+        """The registration near the IMU's prediction, in place of the one `found` elsewhere and `denied`, or failed.
 
-        Where places are alike, what is sought metres around is found in the wrong one; what is found there from both sides
-        is right, and the IMU wrong.
+        With perceptual aliasing a wide search converges at the wrong place; a pose found from both sides is accepted against
+        the IMU.
         """
         near, first = odometry.register_near(scan, prepared, prior, found), found.result
         with clock.stage("imu"):

@@ -27,7 +27,7 @@ MUCH_WORSE, OTHER_AXES = 4.0, np.deg2rad(20.0)
 NEAR_S, FAR_S, STEP_S = 0.25, 10.0, 0.005
 # A correlation that is larger by less is the same.
 CLEARLY = 0.02
-# A clock that is off by less is not worth a doubt, and what may be chance is no offset.
+# A smaller clock offset is negligible, and an insignificant one is none.
 LEAST_OFFSET_S, SIGNIFICANT = 0.005, 3.0
 
 

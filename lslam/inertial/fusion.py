@@ -274,7 +274,7 @@ class InertialMotion(Stateful):
         return self.estimate.carried(step, self.T_lidar_imu[:3, :3])
 
     def _restart(self, instant_ns: int, middle: Floats) -> None:
-        """After a gap, and a scan later, the velocity is what registration says over it, and doubtful."""
+        """After a gap, and a scan later, the velocity is that of registration over it, with a large covariance."""
         assert self._instant_ns is not None
         moved = (middle @ self.T_lidar_imu)[:3, 3] - (self._pose @ self.T_lidar_imu)[:3, 3]
         covariance = self.estimate.covariance.copy()
@@ -305,7 +305,7 @@ class InertialMotion(Stateful):
             log.warning("the IMU is refused from here on: %s", self.refusal)
 
     def _feels(self, stamp_ns: int, span: Span) -> bool:
-        """Whether the IMU, if it is believed, has samples from the newest pose, or the sweep's begin, to the sweep's end."""
+        """Whether the IMU, unless rejected, has samples from the newest pose, or the sweep's begin, to the sweep's end."""
         begin_ns, end_ns = (stamp_ns + round(1e9 * seconds) for seconds in span)
         if self._instant_ns is not None:
             begin_ns = min(begin_ns, self._instant_ns)

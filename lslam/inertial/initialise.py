@@ -114,7 +114,7 @@ def start(
     estimate = _learnt(usable, T_lidar_imu, guess, told, opening, config)
     if config.gyro_bias is not None:
         bias = np.array(config.gyro_bias)
-        known = Gyroscope.of_bias(bias, _doubt(bias, estimate.gyroscope))
+        known = Gyroscope.of_bias(bias, _bias_sigma(bias, estimate.gyroscope))
         estimate = _learnt(usable, T_lidar_imu, replace(guess, gyroscope=known), told, opening, config)
     notes.append("IMU aligned " + ("while standing" if is_static else "while moving"))
     return InertialStart(usable, T_lidar_imu, estimate, offset, agreement.is_judged, is_static, notes, problems)
@@ -170,7 +170,7 @@ def _without_wrong_bias(config: ImuConfig, seen: Floats | None, problems: list[s
     return config.model_copy(update={"gyro_bias": None, "accel_bias": None})
 
 
-def _doubt(given: Floats, seen: Gyroscope) -> float:
+def _bias_sigma(given: Floats, seen: Gyroscope) -> float:
     """One sigma of a given bias (3,), rad/s: as far as what was `seen` from a guess that hardly holds it contradicts it."""
     beyond = np.abs(given - seen.bias) - 3 * np.sqrt(np.diag(seen.covariance)[:3])
     return max(float(beyond.max()), GIVEN_GYRO_BIAS)
@@ -181,7 +181,7 @@ def _first_guess(
     mean_bias: Floats | None,
 ) -> tuple[ImuEstimate, bool]:  # fmt: skip
     """Biases as given, or of a standing sensor, or by the mean turn; gravity as the scans' path and the forces need it."""
-    stands, rates = _is_standing(imu, stamps_ns, poses)
+    stands, rates = _is_stationary(imu, stamps_ns, poses)
     gyro_bias, gyro_sigma = (np.zeros(3), ANY_GYRO_BIAS) if mean_bias is None else (mean_bias, MEAN_GYRO_BIAS)
     if stands:
         gyro_bias, gyro_sigma = rates, STANDING_GYRO_BIAS
@@ -200,7 +200,7 @@ def _first_guess(
     return replace(guess, gravity=GRAVITY * gravity / max(float(np.linalg.norm(gravity)), 1e-9)), stands
 
 
-def _is_standing(imu: ImuStream, stamps_ns: NDArray[np.int64], poses: Floats) -> tuple[bool, Floats]:
+def _is_stationary(imu: ImuStream, stamps_ns: NDArray[np.int64], poses: Floats) -> tuple[bool, Floats]:
     """Whether the first second is one of standing still, and the mean rates (3,) in it."""
     end_ns = stamps_ns[0] + 1_000_000_000
     i, j = (int(k) for k in np.searchsorted(imu.stamps_ns, [stamps_ns[0], end_ns]))

@@ -16,8 +16,8 @@ from lslam.kernels.surface_information import solve_on_surfaces
 Floats = NDArray[np.float64]
 Limits = tuple[float, float, float, bool]
 
-# A weak direction is followed, though not believed, until it holds less than this part of what makes it weak: normals that
-# waver by a degree look like 3e-4 of the information.
+# A direction flagged as degenerate is still stepped in until its information is below this part of the threshold: normals with
+# errors of a degree look like 3e-4 of the information.
 UNSEEN = 0.3
 # Of the largest eigenvalue: less is what rounding leaves of none.
 ROUNDING = 1e-12

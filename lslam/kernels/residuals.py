@@ -66,7 +66,7 @@ def nearest(x: float, y: float, z: float, i: int, slots: NDArray[np.int32],
 def variance_of(p: Floats, off: float, d2: float) -> float:
     """Variance, m2, of a plane voxel's surface, a row of `planes`, beneath a point.
 
-    Its thickness, and what the doubt in its normal makes of the way to the mean: the point is `off` from the plane and
+    Its thickness, and what the uncertainty of its normal makes of the way to the mean: the point is `off` from the plane and
     the root of `d2` from the mean.
     """
     variance: float = p[6] + TILT * p[7] * (d2 - off * off)

@@ -1,4 +1,4 @@
-"""`icp` beside LOAM's features: all points of a scan, asked where features are few or hold the place badly."""
+"""`icp` as fallback of LOAM's features: all points of a scan, where features are few or poorly constrained."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ Floats = NDArray[np.float64]
 
 # In `posed_by`.
 ALL_POINTS = "all-points"
-# After so many scans in a row that features held well, two seconds at 10 Hz, the map of all points is given up.
+# Well constrained scans in a row, two seconds at 10 Hz, after which the map of all points is dropped.
 FED = 20
 
 
 @dataclass(frozen=True)
 class _Asked:
-    """What `icp` found of a scan's points, and before it the features."""
+    """The result of `icp` on a scan's points, and that of the features before."""
 
     features: Features
     points: PreparedPoints
@@ -52,10 +52,10 @@ class AllPoints(Stateful):
         self._config = config.model_copy(update=plain)
         # All points and the poses of the scans that were registered last.
         self._recent: tuple[tuple[NDArray[np.float32], Floats], ...] = ()
-        # `icp` in its default ways, kept up to date from a scan on whose features hold the place badly.
+        # `icp` by default settings, updated from the first poorly constrained scan on.
         self._icp: Registration = RecoveringRegistration(self._config)
         self._fed = FED
-        # Of the scan that was located last, when all its points were asked.
+        # Of the scan located last, when all its points were registered.
         self._asked: _Asked | None = None
 
     def locate(self, features: Features, T_prior: Floats) -> RegistrationResult:
@@ -66,7 +66,7 @@ class AllPoints(Stateful):
     def held(
         self, features: Features, T_start: Floats, T_prior: Floats, found: RegistrationResult
     ) -> RegistrationResult:
-        """What was found, unless much more of what stands on the ground agrees elsewhere: few rings slide along a road."""
+        """The result, unless many more non-ground points are inliers elsewhere: few rings slide along a road."""
         icp = self._of_recent()
         points = prepare_points(_points(features), icp.preprocess)
         held = held_by_non_ground(icp, points, T_start, found)
@@ -74,13 +74,13 @@ class AllPoints(Stateful):
             return found
         return replace(held, prior_error=correction(T_prior, held.T_world_lidar), posed_by=ALL_POINTS)
 
-    def stand_in(
+    def fallback(
         self, features: Features, T_prior: Floats, starved: RegistrationResult, known: RegistrationResult | None
     ) -> RegistrationResult:
-        """Where `icp` finds all points on a map of all points, unless it fails; what features leave open stays flagged.
+        """The pose by `icp` on a map of all points, unless it fails; directions degenerate by features stay flagged.
 
-        Few rings at speed leave so few features that one false one leads them astray, metres from scan to scan.
-        known : what `locate` found of them, if that was asked already
+        Few rings at speed leave so few features that one outlier misleads them by metres.
+        known : the result of `locate`, if there is one already
         """
         if self._fed >= FED:
             self._icp = self._of_recent()
@@ -94,7 +94,7 @@ class AllPoints(Stateful):
         return replace(found, degenerate=flagged, posed_by=ALL_POINTS)
 
     def update(self, features: Features, result: RegistrationResult) -> None:
-        """Remember all points of a registered scan; what `icp` found of it, if asked, teaches it what to expect."""
+        """Keep all points of a registered scan; adapt `icp` by its own result of the scan, if there is one."""
         self._recent = (*self._recent, (_points(features), result.T_world_lidar))[-self._config.start_scans :]
         if self._fed >= FED:
             return
@@ -109,12 +109,12 @@ class AllPoints(Stateful):
         self._icp.update(points, found)
 
     def by_features(self, features: Features, result: RegistrationResult) -> RegistrationResult:
-        """What the features found of a scan before all points stood in for them: `result` where these did not."""
+        """The features' own result of a scan: `result` where there was no fallback."""
         asked = self._asked_of(features)
         return result if asked is None else asked.by_features
 
     def _asked_of(self, features: Features) -> _Asked | None:
-        """What all points said of this scan, where they were asked and did not fail."""
+        """The result of all points on this scan, where there is one and it did not fail."""
         asked = self._asked
         return asked if asked is not None and asked.features is features and asked.found.ok else None
 

@@ -14,7 +14,7 @@ from lslam.geometry import se3
 from lslam.odometry.all_points import AllPoints
 from lslam.odometry.feature_map import FeatureMap, thinned
 from lslam.odometry.feature_scan import FeatureScan, feature_scan, surface_size
-from lslam.odometry.feature_solver import NONE, FeatureNoise, kept_where_blind, solve_on_map
+from lslam.odometry.feature_solver import NONE, FeatureNoise, remap_solution, solve_on_map
 from lslam.odometry.feature_steps import ScanStep
 from lslam.preprocessing.features import Features
 from lslam.recovery.start_search import MUCH, START_STEP, start_offsets
@@ -27,9 +27,9 @@ from lslam.types.state import Stateful
 
 Floats = NDArray[np.float64]
 
-# Fewer features than this many per direction of a pose decide nothing: chance has its say.
+# Fewer inliers, ten per degree of freedom, are insignificant.
 MIN_FEATURES = 60
-# A scan that failed is no target; after this many in a row the last good one lies too far behind to be.
+# A failed scan is no target; after this many in a row the last good one is too far behind.
 PATIENCE = 3
 WORDING = Wording("of the features have a counterpart", "of the features agree")
 # In `posed_by`.
@@ -45,7 +45,7 @@ class FeatureRegistration(Stateful):
     with_map : whether the pose is found, or refined, on the feature map
     with_less_planes : whether the map is matched with centroids of the less planar points in place of the planar points
     reach : m, how far from the sensor the map is kept
-    recovery : what is tried where features are not enough; `start_search` is by edges, or by all points when they stand in
+    recovery : what is tried where features are not enough; `start_search` is by edges, or by all points with that fallback
     """
 
     STATE = (
@@ -71,18 +71,18 @@ class FeatureRegistration(Stateful):
 
     @property
     def noise(self) -> FeatureNoise:
-        """Features that hold a direction worse than the motion prior does have no say there: it is as good as it lately was.
+        """With the recent variance of the motion prior as threshold of degeneracy.
 
-        No better than one planar point, though: a sensor on a straight way is not expected to stay on it.
+        The prior counts at most as one planar point: a sensor on a straight way need not stay on it.
         """
         return replace(self._usual, least=self.config.sigma**2 / max(self.threshold.mean_square, self.config.sigma**2))
 
     def locate(
         self, features: Features, T_prior: Floats, clock: StageClock, is_near: bool = False
     ) -> RegistrationResult:
-        """Align with what is there; the result says whether to believe it, and when less planar points, or all, stood in.
+        """Align with the target; the result says whether it is accepted, and whether a fallback posed it.
 
-        is_near : the prior is nearly right: nothing is sought away from it, it decides what features leave open
+        is_near : the prior is nearly right: no search, and solution remapping onto it
         """
         count = len(features.edges) + len(features.planes)
         if len(features.less_planes) + len(features.less_edges) < MIN_FEATURES:
@@ -91,7 +91,7 @@ class FeatureRegistration(Stateful):
             return RegistrationResult(T_prior, covariance=np.diag([1e-12] * 6), source_points=count)
         if is_near:
             result = self._attempt(features, T_prior, T_prior, clock, self._near)
-            return self._kept(result, T_prior, T_prior) if result.ok else result
+            return self._remapped(result, T_prior, T_prior) if result.ok else result
         if self._starting > 0 and self.recovery.coarse_to_fine:
             with clock.stage("start"):
                 start = self._capture(features, T_prior)
@@ -107,45 +107,45 @@ class FeatureRegistration(Stateful):
                 again = self._attempt(features, start.T_world_lidar, T_prior, clock, self._quick)
                 if again.ok and (not result.ok or again.inliers > result.inliers):
                     result = again
-        # One scan's planes hold no more than its features do: only a map can close a direction that these leave open.
+        # Only a map constrains more than a scan's features: there less planar points may observe a degenerate direction.
         is_open = len(result.degenerate) > 0 and self.map is not None
         if self.recovery.less_planar and (not result.ok or result.inliers < MIN_FEATURES or is_open):
             with clock.stage("stand-in"):
-                result = self._stand_in(features, start, T_prior, result)
+                result = self._fallback(features, start, T_prior, result)
         if result.ok:
-            # The first step's prior is no more than a guess, which the search has replaced.
+            # The first step's prior is a guess, which the search has replaced.
             expected = T_prior if self._inserted > 1 else start.T_world_lidar
-            result = self._kept(result, expected, T_prior)
+            result = self._remapped(result, expected, T_prior)
         return result if self._all is None else self._held(self._all, features, start, T_prior, result, clock)
 
     def _held(
         self, points: AllPoints, features: Features, start: RegistrationResult, T_prior: Floats,
         result: RegistrationResult, clock: StageClock,
     ) -> RegistrationResult:  # fmt: skip
-        """What features found, unless all points say otherwise or hold the place that they hold badly."""
+        """The features' result, unless all points contradict it or constrain a poorly constrained pose."""
         is_far = not result.ok or result.prior_error[0] > self.config.recover_m
         is_young = self._young is not None
         if self.config.start_reach > 0 and (is_young or is_far):
             with clock.stage("start" if self._starting else "recover"):
                 T_start = start.T_world_lidar if is_young else T_prior
                 result = points.held(features, T_start, T_prior, result)
-        if self.map is not None and not self._holds_place(result):
+        if self.map is not None and not self._is_well_constrained(result):
             with clock.stage("all-points"):
-                result = points.stand_in(features, T_prior, result, start if is_young else None)
+                result = points.fallback(features, T_prior, result, start if is_young else None)
         return result
 
-    def _holds_place(self, result: RegistrationResult) -> bool:
-        """Whether all features together hold the sensor's place as well as `ENOUGH` planar points that face one way do."""
-        return result.holds_place(self.config.sigma)
+    def _is_well_constrained(self, result: RegistrationResult) -> bool:
+        """Whether the features constrain the position as well as `ENOUGH` planar points of one normal."""
+        return result.is_well_constrained(self.config.sigma)
 
-    def _kept(self, result: RegistrationResult, expected: Floats, T_prior: Floats) -> RegistrationResult:
-        """The result at `expected` (4, 4) in the directions it leaves open."""
+    def _remapped(self, result: RegistrationResult, expected: Floats, T_prior: Floats) -> RegistrationResult:
+        """The result remapped onto `expected` (4, 4) along its degenerate directions."""
         if not len(result.degenerate):
             return result
-        return self._judge(kept_where_blind(result, expected), T_prior)
+        return self._judge(remap_solution(result, expected), T_prior)
 
     def update(self, features: Features, result: RegistrationResult) -> None:
-        """Enter the scan into map and target unless its registration failed; learn from it unless it was denied."""
+        """Insert the scan into map and target unless its registration failed; adapt thresholds unless it was denied."""
         if result.ok:
             self._inserted += 1
             if self.map is not None:
@@ -172,7 +172,7 @@ class FeatureRegistration(Stateful):
 
     @property
     def _quick(self) -> Annealing:
-        """As far as priors have lately been wrong."""
+        """From the recent error of the motion prior."""
         c, is_starting = self.config, self._starting > 0
         width, steps = (c.kernel_max, c.start_iterations) if is_starting else (self.threshold.width, c.max_iterations)
         return Annealing(width, c.kernel_min, c.kernel_decay, steps)
@@ -245,17 +245,17 @@ class FeatureRegistration(Stateful):
         pose = result.T_world_lidar
         return solve_on_map(target, features.less_edges.points, NONE, pose, once, self.noise).inliers
 
-    def _stand_in(
+    def _fallback(
         self, features: Features, start: RegistrationResult, T_prior: Floats, starved: RegistrationResult
     ) -> RegistrationResult:
-        """Less planar points on planes in place of features that are too few or leave a direction open.
+        """Fallback to less planar points where features are too few or degenerate.
 
-        Where all points stand in and the map is made of a few scans, they have been asked already, and are the better ones.
+        With the fallback of all points and a young map these are registered already, and preferred.
         """
         T_start = starved.T_world_lidar if starved.ok else start.T_world_lidar
         result = start if self._young is not None else self._on_planes(features, T_start, T_prior)
         are_few = starved.inliers < MIN_FEATURES
-        # They must close a direction; where features are too few to be sure of any, open none.
+        # The fallback must observe a degenerate direction; with too few features it may not add one.
         if not result.ok or (starved.ok and len(result.degenerate) > len(starved.degenerate) - (not are_few)):
             return starved
         return replace(result, posed_by=LESS_PLANAR)

@@ -21,8 +21,8 @@ from lslam.registration.solver import RegistrationResult, result_of, voxel_terms
 
 Floats = NDArray[np.float64]
 NONE: Floats = np.zeros((0, 3))
-# From scan to scan no map takes an error back, and it goes on as velocity: twice as much is asked for there. More would doubt
-# sparse sensors, whose scans have few features, in every direction.
+# Scan-to-scan errors persist as velocity, without a map to correct them: the threshold of degeneracy is twice as high there.
+# Higher ones would call sparse scans degenerate in every direction.
 TIMES_ON_SCAN = 2.0
 
 
@@ -31,8 +31,8 @@ class FeatureNoise:
     """Standard deviations of a feature's point, m: of an edge across it, of a planar point along the normal.
 
     weak_share : part of the information below which a direction counts as unobserved
-    least : planar points that hold a direction no better than all features do when it counts as unobserved: one at most,
-        for a few false edges hold as much, and fewer where the motion prior is worse
+    least : information, in planar points, below which a direction is degenerate: one at most, since a few outlier edges have as
+        much, and fewer where the motion prior is worse
     """
 
     edge: float
@@ -91,11 +91,10 @@ def solve_on_map(
     return result_of(found, T_prior, len(edges) + len(planes))
 
 
-def kept_where_blind(result: RegistrationResult, T_expected: Floats) -> RegistrationResult:
-    """The result with the pose expected, (4, 4), along the directions that it does not observe, whatever led it there.
+def remap_solution(result: RegistrationResult, T_expected: Floats) -> RegistrationResult:
+    """Solution remapping (Zhang, Kaess and Singh 2016): the result at the expected pose (4, 4) along degenerate directions.
 
-    Zhang, Kaess and Singh (2016), solution remapping. To leave such a direction out of the last step alone does not do:
-    the ones before it, with a wider kernel, observed more, and falsely so. The error would go on as velocity.
+    Remapping the last step alone does not suffice: earlier ones with a wider kernel moved along such directions by outliers.
     """
     R, arm = result.T_world_lidar[:3, :3], result.lever_arm
     moved = np.concatenate([result.T_world_lidar[:3, 3] - T_expected[:3, 3], arm * so3.log(R @ T_expected[:3, :3].T)])

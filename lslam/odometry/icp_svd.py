@@ -47,7 +47,7 @@ class IcpSvd(Stateful):
     """Nearest neighbours, trimmed, then the transform that fits them best, until it no longer changes.
 
     Of `registration` it takes `inlier_ratio`, `inlier_distance`, `max_iterations` and the limits beyond which a result is
-    not believed; it gives no covariance. It follows the sensor's start only when that is slow, and on sparse rings it lags:
+    not accepted; it gives no covariance. It follows the sensor's start only when that is slow, and on sparse rings it lags:
     a ring's nearest neighbour is the ring of the scan before. Trimming makes that worse.
     """
 

@@ -32,8 +32,8 @@ def measurable(scan: Scan) -> Scan:
 def plausible(result: ScanResult, T_prior: Floats, last: ScanResult | None) -> ScanResult:
     """The result, or one `bridged` by the motion prior (4, 4) where its pose is none or no vehicle gets there.
 
-    last : the newest result that was believed; a pose is judged by the time since then, so that a method which jumped once is
-        believed again as soon as it may have got there
+    last : the newest accepted result; a pose is tested by the time since then, so that a method which jumped once is
+        accepted again as soon as it may have got there
     """
     reason = "" if result.status != "ok" else _fault(result, last)
     if not reason:

@@ -1,4 +1,4 @@
-"""What became of a scan: as our registration judged it, or a method that has no judge of its own."""
+"""Scan results from registrations, which have acceptance tests, and from external aligners, which get one here."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from lslam.types.scan_result import ScanResult
 
 
 def of_registration(scan: Scan, found: RegistrationResult, map_age: float, stages: dict[str, float]) -> ScanResult:
-    """The result of a scan whose registration judged itself.
+    """The result of a scan from its registration.
 
     map_age : as `PoseUncertainty`; stages : seconds of each
     """
@@ -43,7 +43,7 @@ def of_registration(scan: Scan, found: RegistrationResult, map_age: float, stage
 
 @dataclass(frozen=True)
 class AlignerResult:
-    """What an aligner says of one scan.
+    """The result of an external aligner.
 
     T_world_lidar : (4, 4); source_points : points that were offered; inliers : those with a partner within reach
     rmse : distance of the inliers to their partners, m
@@ -60,7 +60,7 @@ class AlignerResult:
 def judged(
     scan: Scan, found: AlignerResult, T_prior: NDArray[np.float64], limits: RegistrationConfig, stages: dict[str, float]
 ) -> ScanResult:
-    """The result of a scan: `ok`, or `bridged` by the motion prior when the alignment cannot be believed."""
+    """The result of a scan: `ok`, or `bridged` by the motion prior when the alignment is rejected."""
     share = found.inliers / max(found.source_points, 1)
     move = turn = 0.0
     reason = ""

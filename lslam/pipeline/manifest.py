@@ -91,7 +91,7 @@ class Manifest:
         self.counts = {"scans": len(results)} | {
             status: sum(r.status == status for r in results) for status in ("ok", "bridged", "skipped")
         }
-        self.counts["standing"] = sum(r.is_standing for r in results)
+        self.counts["standing"] = sum(r.is_stationary for r in results)
         self.counts["degenerate"] = sum(len(r.degenerate) > 0 for r in results)
         self.counts["fallback"] = sum(r.status == "ok" and bool(r.posed_by) for r in results)
         self.posed_by = dict(Counter(r.poser(self.config.odometry.method) for r in results))

@@ -24,7 +24,7 @@ from lslam.loops import detector
 from lslam.maps import crispness, merge
 from lslam.odometry.base import Odometry, Resumable
 from lslam.odometry.given import GivenPoses
-from lslam.odometry.standing import Standing
+from lslam.odometry.stationary import StationaryDetector
 from lslam.osm import prior
 from lslam.osm.source import OsmSource
 from lslam.pipeline.lost import mark_lost
@@ -48,10 +48,10 @@ def estimate_poses(
 
     Raises InputError when no scan can be used.
     """
-    standing = Standing(config.preprocess, config.registration) if config.preprocess.skip_standing else None
+    stationary = StationaryDetector(config.preprocess, config.registration) if config.preprocess.skip_standing else None
     monitor = IntegrityMonitor(config.preprocess, config.registration) if config.odometry.integrity else None
     is_over = checkpoints is not None and checkpoints.is_over
-    _warm_up(sequence, odometry, standing, monitor, config, manifest, is_over)
+    _warm_up(sequence, odometry, stationary, monitor, config, manifest, is_over)
 
     if osm is not None and checkpoints is not None:
         for result in checkpoints.results:
@@ -70,7 +70,7 @@ def estimate_poses(
     motion = odometry.motion if isinstance(odometry, GivenPoses) else inertial.motion
     with manifest.timed("odometry_s"), Keyframing(store, config) as keyframing:
         results = estimate(
-            sequence, odometry, threads=config.input.threads, max_failures=limit, standing=standing,
+            sequence, odometry, threads=config.input.threads, max_failures=limit, stationary=stationary,
             motion=motion, should_stop=watch.should_stop, on_scan=seen, keyframing=keyframing,
             checkpoints=checkpoints, monitor=monitor,
         )  # fmt: skip
@@ -128,15 +128,15 @@ def odometry_checkpoints(
 
 
 def _warm_up(
-    sequence: Sequence, odometry: Odometry, standing: Standing | None, monitor: IntegrityMonitor | None, config: Config,
-    manifest: Manifest, is_over: bool,
+    sequence: Sequence, odometry: Odometry, stationary: StationaryDetector | None, monitor: IntegrityMonitor | None,
+    config: Config, manifest: Manifest, is_over: bool,
 ) -> None:  # fmt: skip
     """Compile or load what the scans would otherwise wait for, less of it when odometry is over."""
     with manifest.timed("compile_s"), jit.announced(log), one_at_a_time(jit.lock_file()):
         if not is_over:
             odometry.warm_up()
-        if standing is not None:
-            standing.warm_up()
+        if stationary is not None:
+            stationary.warm_up()
         if monitor is not None and not is_over:
             monitor.warm_up()
         if config.loops.use:

@@ -78,7 +78,7 @@ def write_scans(folder: RunFolder, record: RunRecord) -> None:
     rows = [columns + ",degenerate,prior_m,prior_deg,prior_norm,steady_norm,steady_iterations,lost"]
     for r in record.results:
         values = (
-            r.index, r.stamp_ns, r.status, r.poser(record.method), int(r.is_standing), int(r.converged), r.iterations,
+            r.index, r.stamp_ns, r.status, r.poser(record.method), int(r.is_stationary), int(r.converged), r.iterations,
             r.source_points, r.inliers, f"{r.overlap:.4f}", f"{r.rmse:.5f}", len(r.degenerate), f"{r.prior_error[0]:.5f}",
             f"{np.rad2deg(r.prior_error[1]):.5f}", f"{r.prior_norm:.5f}",
             "" if r.steady_norm is None else f"{r.steady_norm:.5f}",

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from lslam.config.preprocess import PreprocessConfig
 from lslam.errors import InputError
 from lslam.kernels import voxel
-from lslam.preprocessing.air import on_surfaces
 from lslam.preprocessing.ground import above_ground
+from lslam.preprocessing.weather_filter import on_surfaces
 
 # A source grid never gets finer than the points it is made of, nor so coarse that walls merge.
 COARSEST_SOURCE = 3.0
@@ -50,7 +50,7 @@ def prepare_points(
 
     `times` (N,), s from the scan's stamp, are averaged along, so that the centroids can be deskewed instead of the points.
 
-    Drops in the air are left out of the map points, and of source points made of these (`air.on_surfaces`).
+    The weather filter removes drops from the map points, and from source points made of these (`weather_filter.on_surfaces`).
     Centroids, not first points: the average of the points of a cell is nearer to the surface than any one of them.
     Further columns are ignored. Raises InputError for arrays of another shape.
     """

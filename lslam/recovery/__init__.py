@@ -1,1 +1,1 @@
-"""What happens when a registration from the motion prior is not enough: one policy a class."""
+"""Recovery policies of registrations that fail from the motion prior: one policy a class."""

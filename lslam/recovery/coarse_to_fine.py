@@ -36,8 +36,8 @@ class CoarseToFine:
         iterations = found.iterations + coarse.iterations
         is_started = registration.starting == 0
         # Forty steps that lead nowhere are no consensus; the ten of a usual scan may end a millimetre short of it.
-        is_rival = found.ok and (found.converged or is_started)
-        is_better = coarse.ok and (not is_rival or coarse.inliers > found.inliers)
+        is_consensus = found.ok and (found.converged or is_started)
+        is_better = coarse.ok and (not is_consensus or coarse.inliers > found.inliers)
         if is_sure and is_started:
             # What hides part of the map, as a crowd does, hides it from both.
             is_better = is_better and not usual.is_less(coarse.agreement)

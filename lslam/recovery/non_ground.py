@@ -1,4 +1,4 @@
-"""Non-ground points: posts, trees and the ends of walls repeat nowhere at once, though they make few planes or none."""
+"""Non-ground points: posts, trees and the ends of walls disambiguate places, though they make few planes or none."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ HIGH = 1.2
 
 
 class NonGroundPoints:
-    """What stands on the ground in a few scans: points (N, 3), LiDAR frame, and pose (4, 4) of each.
+    """Non-ground points of a few scans: points (N, 3), LiDAR frame, and pose (4, 4) of each.
 
-    Bare ground, guard rails and walls look alike metres further on, and a sensor's own rings match best where nothing
-    moved. Posts, trees, signs and the ends of walls repeat nowhere at once, though they make few planes or none.
+    Ground, guard rails and walls are self-similar, and a sensor's own rings match best at zero motion. The pattern of posts,
+    trees, signs and ends of walls is unique.
     """
 
     def __init__(self, scans: Iterable[tuple[Points, Floats]], preprocess: PreprocessConfig) -> None:

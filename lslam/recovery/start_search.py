@@ -61,22 +61,22 @@ def held_by_non_ground(
     *,
     is_lost: bool = False,
 ) -> RegistrationResult:
-    """What was found, unless much more of the non-ground points of the last scans agrees elsewhere.
+    """The result, unless significantly more non-ground points of the last scans are inliers elsewhere.
 
-    is_lost : whether the sensor may be anywhere within `start_reach`, which a failed registration says too
+    is_lost : whether the sensor may be anywhere within `start_reach`, as after a failed registration
     """
     r, c = registration, registration.config
     ground = ground_under(points, r.preprocess)
-    standing, seen = NonGroundPoints(r.recent, r.preprocess), sought(points, ground)
+    non_ground, seen = NonGroundPoints(r.recent, r.preprocess), sought(points, ground)
     if is_lost:
-        found = _best_start(r, points, T_prior, found, standing, seen)
+        found = _best_start(r, points, T_prior, found, non_ground, seen)
     coarser, flat = r.alignment.coarse_maps(points, T_prior), on_ground(points, ground, r.preprocess.ground_tolerance)
     width = NEAR_KERNEL * c.kernel_min
 
     def placed(start: Floats) -> RegistrationResult:
-        """Height and tilt by the ground, the rest by what stands, in turn as in LeGO-LOAM (Shan and Englot 2018)."""
-        stood = standing.align(seen, upright(start))
-        return stood.moved(upright(stood.T_world_lidar), stood.covariance)
+        """Height and tilt by the ground, the rest by non-ground points, in turn as in LeGO-LOAM (Shan and Englot 2018)."""
+        aligned = non_ground.align(seen, upright(start))
+        return aligned.moved(upright(aligned.T_world_lidar), aligned.covariance)
 
     def upright(pose: Floats) -> Floats:
         return r.alignment.refine(
@@ -84,13 +84,13 @@ def held_by_non_ground(
         ).T_world_lidar
 
     def agreeing(result: RegistrationResult) -> Flags:
-        return standing.agreeing(seen, result.T_world_lidar)
+        return non_ground.agreeing(seen, result.T_world_lidar)
 
     starts = [T_prior]
     if is_lost or not found.ok:
-        starts.append(_likeliest(standing, seen, T_prior, c.start_reach))
-    stood = max(map(placed, starts), key=lambda result: np.count_nonzero(agreeing(result)))
-    place, most = stood.T_world_lidar, agreeing(stood)
+        starts.append(_likeliest(non_ground, seen, T_prior, c.start_reach))
+    aligned = max(map(placed, starts), key=lambda result: np.count_nonzero(agreeing(result)))
+    place, most = aligned.T_world_lidar, agreeing(aligned)
     is_drawn = found.ok and is_at_rest(place, r.recent[-1][1])
     if is_drawn or not is_much_more(most, agreeing(found)):
         return found
@@ -99,13 +99,13 @@ def held_by_non_ground(
     if not judged.ok and not found.ok:
         return found
     if not judged.ok or len(judged.degenerate) or is_much_more(most, agreeing(judged)):
-        judged = near.moved(place, stood.covariance)
+        judged = near.moved(place, aligned.covariance)
     return replace(judged, iterations=found.iterations + near.iterations)
 
 
 def _best_start(
     registration: Registration, points: PreparedPoints, T_prior: Floats, best: RegistrationResult,
-    standing: NonGroundPoints, seen: PreparedPoints,
+    non_ground: NonGroundPoints, seen: PreparedPoints,
 ) -> RegistrationResult:  # fmt: skip
     """The best of several starts: a few points on the coarse map show which are worth a whole registration."""
     alignment, count = registration.alignment, len(seen.source)
@@ -115,27 +115,27 @@ def _best_start(
         alignment.on_planes(coarse_map, few, T_prior @ se3.make(np.eye(3), offset), slow)
         for offset in start_offsets(registration.config.start_reach, START_STEP)
     ]
-    # Where nothing stands, as in hills, what matches the ground is all that tells.
-    tried.sort(key=lambda found: (-standing.share(seen, found.T_world_lidar), -found.inliers))
+    # Without non-ground points, as in hills, the ground decides.
+    tried.sort(key=lambda found: (-non_ground.share(seen, found.T_world_lidar), -found.inliers))
     for promising in distinct(tried, best.T_world_lidar):
         start = promising.T_world_lidar
         # Once more as wide as from an unknown start, what was found right could be drawn to the false place again.
         found = registration.judged(alignment.coarse_to_fine(points, start, 2 * START_STEP), start)
-        share, known = (standing.share(seen, result.T_world_lidar) for result in (found, best))
+        share, known = (non_ground.share(seen, result.T_world_lidar) for result in (found, best))
         if count == 0:
             share, known = found.agreement, best.agreement
-        # A failed one has the prior's pose: where less stands than there, nothing is found.
+        # A failed one has the prior's pose: fewer inliers than there are no improvement.
         if found.ok and (share > CLEARLY * known if best.ok else share >= known):
             best = found
     return best
 
 
-def _likeliest(standing: NonGroundPoints, seen: PreparedPoints, T_prior: Floats, reach: float) -> Floats:
+def _likeliest(non_ground: NonGroundPoints, seen: PreparedPoints, T_prior: Floats, reach: float) -> Floats:
     """(4, 4) pose up to `reach`, m, from the prior, or turned about its z, at which most points have one near by."""
     moved = [T_prior @ se3.make(np.eye(3), offset) for offset in start_offsets(reach, NEAR)]
     turns = np.deg2rad(START_TURNS_DEG)
     turned = [T_prior @ se3.make(so3.exp(np.array([0, 0, turn])), np.zeros(3)) for turn in turns]
-    return max([*moved, *turned], key=lambda start: standing.share(seen, start))
+    return max([*moved, *turned], key=lambda start: non_ground.share(seen, start))
 
 
 def is_at_rest(pose: Floats, last: Floats) -> bool:
@@ -147,7 +147,7 @@ def is_at_rest(pose: Floats, last: Floats) -> bool:
 def is_much_more(ours: Flags, others: Flags) -> bool:
     """Whether much more of the points agrees at one pose than at the other, and not by chance: flags (S,) of the same.
 
-    McNemar's test of paired shares at two sigma: only points that agree at one of the poses alone have a say.
+    McNemar's test of paired shares at two sigma, on the points that agree at one of the poses only.
     """
     won, lost = np.count_nonzero(ours & ~others), np.count_nonzero(others & ~ours)
     return bool(np.count_nonzero(ours) > MUCH * np.count_nonzero(others) and won - lost > 2 * np.sqrt(won + lost))

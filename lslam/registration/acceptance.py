@@ -1,4 +1,4 @@
-"""Whether to believe a registration: the gates that those of points and of features go through alike."""
+"""Acceptance of a registration: the gates that points and features share."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from lslam.registration.solver import RegistrationResult
 
 Floats = NDArray[np.float64]
 
-# Half a metre and two degrees: what a pose that no scan supports may be wrong by, one sigma.
-DOUBT = np.diag([0.25] * 3 + [np.deg2rad(2.0) ** 2] * 3)
+# Of a pose from the motion prior alone: sigmas of half a metre and two degrees.
+PRIOR_COVARIANCE = np.diag([0.25] * 3 + [np.deg2rad(2.0) ** 2] * 3)
 
 
 @dataclass(frozen=True)
 class Wording:
-    """How a refusal goes on after "only 12 %": what has too little overlap with its target, and what agrees too little."""
+    """How a rejection goes on after "only 12 %": of too little overlap with the target, and of too few inliers."""
 
     overlap: str
     agreement: str
@@ -30,9 +30,9 @@ def accepted(
     result: RegistrationResult, T_prior: Floats, config: RegistrationConfig, usual: UsualAgreement, min_overlap: float,
     wording: Wording,
 ) -> RegistrationResult:  # fmt: skip
-    """The result with its correction of the prior, or a failed one that keeps the prior and says why.
+    """The result with its correction of the prior, or a failed one at the prior with the reason.
 
-    usual : what scans have agreed lately; min_overlap : the least share of the source points that must find a match
+    usual : recent inlier shares; min_overlap : least share of matched source points
     """
     move, turn = correction(T_prior, result.T_world_lidar)
     reason = result.reason
@@ -50,9 +50,14 @@ def accepted(
 
 
 def failed(T_prior: Floats, source_points: int, reason: str) -> RegistrationResult:
-    """The motion prior, in doubt."""
+    """The motion prior with its covariance."""
     return RegistrationResult(
-        T_prior.copy(), ok=False, reason=reason, covariance=DOUBT.copy(), converged=False, source_points=source_points
+        T_prior.copy(),
+        ok=False,
+        reason=reason,
+        covariance=PRIOR_COVARIANCE.copy(),
+        converged=False,
+        source_points=source_points,
     )
 
 

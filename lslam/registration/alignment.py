@@ -21,7 +21,7 @@ Floats = NDArray[np.float64]
 
 
 class MapAlignment:
-    """Aligns scans with one map by one residual; nothing here says whether to believe the result."""
+    """Aligns scans with one map by one residual; acceptance of the result is elsewhere (`acceptance`)."""
 
     def __init__(self, target: LocalMap, config: RegistrationConfig, residual: str) -> None:
         self._map, self._config, self._residual = target, config, residual

@@ -19,9 +19,9 @@ Floats = NDArray[np.float64]
 
 
 class MotionModel(Protocol):
-    """What predicts a scan and the motion within it, and learns from where registration put it.
+    """Predicts the pose of a scan and the motion within it, and is corrected by registration.
 
-    What has a body here is what a model without a sensor of its own does: it has no say in where a scan is.
+    Methods with a body here are defaults for a model without a sensor.
     """
 
     @property
@@ -34,13 +34,13 @@ class MotionModel(Protocol):
         ...
 
     def refine(self, prior: MotionPrior, stamp_ns: int, pose: Floats) -> MotionPrior:
-        """The sweep's motion again, now that registration gave the `pose` (4, 4) at the stamp for `prior`."""
+        """The sweep's motion, refined by the registered `pose` (4, 4) at the stamp for `prior`."""
         ...
 
     def correct(
         self, stamp_ns: int, pose: Floats, prior: MotionPrior | None = None, is_registered: bool = True
     ) -> None:
-        """Take the pose (4, 4) found at `stamp_ns` as the newest; `prior` says how its sweep moved."""
+        """Update with the pose (4, 4) found at `stamp_ns`; `prior` is the motion of its sweep."""
         ...
 
     def rewind(self, stamp_ns: int, pose: Floats, span: Span) -> MotionPrior:
@@ -62,7 +62,7 @@ class MotionModel(Protocol):
 
     @property
     def is_felt(self) -> bool:
-        """Whether a sensor of motion predicted the newest sweep: the scan is sought near there when it is denied or lost."""
+        """Whether an inertial sensor predicted the newest sweep: a denied or lost scan is searched near there."""
         return False
 
     def is_compared(self, stamp_ns: int, span: Span) -> bool:
@@ -70,27 +70,27 @@ class MotionModel(Protocol):
         return False
 
     def weigh(self, result: ScanResult, prior: MotionPrior) -> ScanResult:
-        """A registration from `prior` weighed against what was felt."""
+        """A registration from `prior` fused with the sensor's prediction."""
         return result
 
     def gravity_at(self, pose: Floats) -> GravityDirection | None:
-        """Which way is down for a LiDAR at `pose` (4, 4) in the world, as of the last scan; None where that is not known."""
+        """Direction of gravity for a LiDAR at `pose` (4, 4) in the world, as of the last scan; None where unknown."""
         return None
 
 
 class ConstantVelocity(Stateful, MotionModel):
     """Predicts the next pose from the last two, scaled to the time between scans.
 
-    A sweep's registration knows the pose at the middle of the sweep best: an error of the velocity that deskewed it pulls
-    start and end apart, but not the middle. So velocities are measured from middle to middle.
+    Registration is most accurate at the middle of a sweep: an error of the deskewing velocity has opposite signs at start and
+    end. So velocities are measured from middle to middle.
 
-    A registration that is wrong by decimetres is taken for a velocity wrong by metres a second, which leads the next one
-    astray: velocities change no faster than a sensor can be accelerated.
+    A registration error of decimetres is a velocity error of metres per second: the change of velocity is bounded by the
+    largest plausible acceleration.
     """
 
-    # A longer pause says nothing about the speed at its end; the last step is not stretched beyond this factor.
+    # Bound of extrapolation, in last steps: the speed after a longer pause is unknown.
     MAX_STRETCH = 5.0
-    # m/s2, twice gravity: what changes faster is an error of registration, unless the next step says the same.
+    # m/s2, twice gravity: a faster change is a registration error, unless the next step confirms it.
     MAX_ACCELERATION = 20.0
     STATE = ("_instant_ns", "_pose", "_twist", "_step_s", "_seen")
 
@@ -141,7 +141,7 @@ class ConstantVelocity(Stateful, MotionModel):
     ) -> None:
         """Take the pose (4, 4) found at `stamp_ns` as the newest; `prior` says how its sweep moved.
 
-        A pose that no registration stands behind (`is_registered`) continues the motion just as well.
+        A pose without a registration (`is_registered`) is used alike.
         """
         middle, instant_ns = (pose, stamp_ns) if prior is None else middle_of(prior, stamp_ns, pose)
         if self._instant_ns is not None:
@@ -151,7 +151,7 @@ class ConstantVelocity(Stateful, MotionModel):
         self._instant_ns, self._pose = instant_ns, middle.copy()
 
     def _learn(self, velocity: Floats, step: float) -> None:
-        """Take the velocity (6,) of a step of so many seconds, as far as the sensor can have come to it since."""
+        """Update with the velocity (6,) of a step of so many seconds, with bounded acceleration."""
         before, self._seen = self._seen, velocity
         if before is not None and self._step_s > 0:
             known = self._twist / self._step_s

@@ -22,13 +22,13 @@ Floats = NDArray[np.float64]
 
 # A step below these ends the iteration: a tenth of the noise of a point, and what that is at 10 m.
 STEP_M, STEP_RAD = 1e-3, 1e-4
-# Fewer matches than a pose has directions say nothing.
+# A pose has six degrees of freedom.
 LEAST_MATCHED = 6
 EVERYWHERE: Floats = np.zeros((0, 6))
 
 
 class Correspondences:
-    """Which of `count` points are matched in an iteration, and their squared distances: what the maps of a scan share."""
+    """Correspondences of `count` points in an iteration: which have one, and squared distances; shared by the maps of a scan."""
 
     def __init__(self, count: int) -> None:
         self.is_done = np.zeros(count, np.bool_)
@@ -40,7 +40,7 @@ class Correspondences:
         self.away2.fill(-1.0)
 
     def search(self) -> tuple[Any, ...]:
-        """What a residual on voxels remembers, of one map, see `kernels.linearisation`."""
+        """The state of a residual's search in one map, see `kernels.linearisation`."""
         return *slots_of(len(self.away2)), self.is_done, self.away2
 
 
@@ -79,7 +79,7 @@ class Limits:
 
 @dataclass(frozen=True)
 class Facts:
-    """What the last linearisation says beside its normal equations.
+    """Facts of the last linearisation beside its normal equations.
 
     information : its sum, 1/m2; lever_information : times the squared lever arm of each point
     squared : weighted squared residuals, m2; robust : the sum of their weights

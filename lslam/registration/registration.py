@@ -97,7 +97,7 @@ class Registration(Stateful):
         return result
 
     def locate(self, points: PreparedPoints, T_prior: Floats, is_near: bool = False) -> RegistrationResult:
-        """Align with the map as it is; the result says whether to believe it.
+        """Align with the map as it is; the result says whether it is accepted.
 
         is_near : the prior is nearly right: nothing is sought away from it
         """
@@ -122,7 +122,7 @@ class Registration(Stateful):
         return result
 
     def update(self, points: PreparedPoints, result: RegistrationResult) -> None:
-        """Enter the scan into the map unless its registration failed; learn from it unless it was denied."""
+        """Insert the scan into the map unless its registration failed; adapt thresholds unless it was denied."""
         if result.ok:
             first = len(self.map) == 0
             self.target.enter(self.map, points, result.T_world_lidar)
@@ -153,7 +153,7 @@ class Registration(Stateful):
         return move < self.config.recover_m and turn < np.deg2rad(self.config.recover_deg)
 
     def judged(self, result: RegistrationResult, T_prior: Floats) -> RegistrationResult:
-        """The result with its correction of the prior, or a failed one that keeps the prior and says why."""
+        """The result with its correction of the prior, or a failed one at the prior with the reason."""
         # One scan of a sparse sensor makes few planes: what matches them may be right and yet a small share.
         c, is_filled = self.config, self.inserted > self.config.start_scans and self.config.target != "scan"
         return accepted(result, T_prior, c, self.agreement, c.min_overlap if is_filled else c.start_overlap, WORDING)

@@ -1,4 +1,4 @@
-"""How wide the robust kernel opens, and when a scan agrees with the map far less than scans have lately."""
+"""Width of the robust kernel, and detection of a drop in a scan's inlier share."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class Annealing:
 
 
 class AdaptiveThreshold(Stateful):
-    """Opens the kernel as wide as the motion prior has lately been wrong, between `low` and `high`, m.
+    """Kernel width by the recent errors of the motion prior, between `low` and `high`, m.
 
     The prediction error of a scan is its correction in metres at the rms lever arm (KISS-ICP, section III-C, measures
     the same at the far end of the scan). Three times the rms of recent errors covers nearly all of the next ones.
@@ -47,15 +47,15 @@ class AdaptiveThreshold(Stateful):
         self._mean_square = self.FORGETTING * self._mean_square + (1 - self.FORGETTING) * error**2
 
     def widen(self) -> None:
-        """Forget the confidence after a bad scan."""
+        """Reset to the widest after a failed scan."""
         self._mean_square = (self.high / 3) ** 2
 
 
 class UsualAgreement(Stateful):
-    """Remembers which share of its points each good scan had on the map's surfaces.
+    """Recent inlier share of accepted scans.
 
-    A sensor carried elsewhere still matches ground and walls: half the points agree with some plane, and no fixed bound
-    parts that from a sparse sensor's honest scan. The drop from one scan to the next does.
+    A sensor carried elsewhere still matches ground and walls: half the points are inliers of some plane, and no fixed threshold
+    separates that from a sparse sensor's good scan. The drop from one scan to the next does.
     """
 
     FORGETTING = 0.8

@@ -26,18 +26,18 @@ from lslam.types.scan_result import ScanResult
 
 Floats = NDArray[np.float64]
 
-# Planar points that face one way hold the place along it well enough, as many as LOAM asks for a plane.
+# Planar points of one normal that constrain a direction well enough, as many as LOAM asks for a plane.
 ENOUGH = 5
 
 
 @dataclass(frozen=True)
 class RegistrationResult:
-    """What came of registering one scan.
+    """The result of registering one scan.
 
     T_world_lidar : (4, 4); covariance : (6, 6) of t' = t + d[:3], R' = exp(d[3:]) R in world axes, m2 and rad2
     ok : False when the pose is the motion prior because registration failed, `reason` says why and is empty otherwise
     posed_by : the recovery policy or the fallback that found the pose; empty: the registration itself
-    is_denied : the pose is not what registration found: the scan enters there, and what was found teaches nothing
+    is_denied : the pose is not the registration's: the scan enters the map there, and adaptive thresholds do not learn from it
     inliers : source points within the final kernel
     matched : points that found a voxel; overlap : matched / source
     rmse : weighted distance to the planes, m; degenerate : (K, 6) unobserved unit directions (rotation scaled by lever arm)
@@ -61,11 +61,11 @@ class RegistrationResult:
     posed_by: str = ""
 
     def moved(self, T_world_lidar: NDArray[np.float64], covariance: NDArray[np.float64] | None) -> RegistrationResult:
-        """The same registration, where more than the map was asked for the pose."""
+        """The same registration at another pose."""
         return replace(self, T_world_lidar=T_world_lidar, covariance=covariance)
 
     def decided(self, result: ScanResult) -> RegistrationResult:
-        """The same registration, at the pose of `result`: whoever had a say in it after the registration."""
+        """The same registration at the pose and with the status of `result`."""
         moved = self.moved(result.T_world_lidar, result.registration_covariance)
         return replace(moved, is_denied=self.ok and result.status != "ok")
 
@@ -79,8 +79,8 @@ class RegistrationResult:
         """Share of the matched points within the final kernel."""
         return self.inliers / max(self.matched, 1)
 
-    def holds_place(self, sigma: float) -> bool:
-        """Whether all points together hold the sensor's place as well as `ENOUGH` that face one way, of `sigma`, m, do."""
+    def is_well_constrained(self, sigma: float) -> bool:
+        """Whether the position's largest variance is below that of `ENOUGH` points of one normal, of `sigma`, m."""
         if not self.ok or self.covariance is None:
             return False
         return float(np.linalg.eigvalsh(self.covariance[:3, :3])[-1]) < sigma**2 / ENOUGH
@@ -119,7 +119,7 @@ def voxel_terms(
 
     points : arrays that the residual takes of them; sigma : m, noise of a point; blob_weight : of voxels that are no plane
 
-    The mean of a voxel beyond the second size says nothing of where anything is.
+    The mean of a voxel beyond the second size constrains nothing.
     """
     last, linearise, usual = len(levels) - 1, kind.linearise, levels[:2][-1].size
     return [
@@ -139,7 +139,7 @@ def part_of_usual(size: float, usual: float) -> float:
 
 
 def result_of(found: OptimiserResult, T_prior: Floats, source_points: int) -> RegistrationResult:
-    """The optimum in words, or the prior (4, 4) where it is not finite."""
+    """The optimiser's result as a registration's, or the prior (4, 4) where it is not finite."""
     facts = found.facts
     finite = bool(np.isfinite(found.pose).all() and np.isfinite(found.step).all())
     is_known = finite and facts.matched >= LEAST_MATCHED
@@ -160,7 +160,7 @@ def result_of(found: OptimiserResult, T_prior: Floats, source_points: int) -> Re
 
 
 def _covariance(found: OptimiserResult) -> Floats:
-    """Inverse of the information, with one metre of doubt along directions the scan does not observe."""
+    """Inverse of the information, with a sigma of one metre along degenerate directions."""
     lever = found.facts.lever_arm
     scale = np.array([1.0, 1.0, 1.0, 1 / lever, 1 / lever, 1 / lever])
     A = found.H * np.outer(scale, scale)

@@ -1,4 +1,4 @@
-"""From the uncertainty of one registration to that of a pose in the world."""
+"""Propagation of covariances: from that of one registration to that of a pose in the world."""
 
 from __future__ import annotations
 
@@ -8,39 +8,38 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.geometry import noise
+from lslam.registration.deskew_uncertainty import DeskewUncertainty
 from lslam.registration.solver import RegistrationResult
-from lslam.registration.sweep_doubt import SweepDoubt
 from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan_result import ScanResult
 from lslam.types.state import Stateful
 
 Floats = NDArray[np.float64]
 
-# The first sweep is deskewed by the velocity at its end, off by a T: twice as far as the later ones (`sweep_doubt`), squared.
+# Factor on the first sweep's variance: its velocity is that at its end, off by a T, twice the error of later ones.
 FIRST = 4.0
-# What the two scans after it say of how the motion changes is said of the first one, too: rattling lasts no longer.
+# Scans after it from which the first sweep's covariance is estimated.
 BEGINNING = 2
 
 
 class PoseUncertainty(Stateful):
-    """Accumulates the drift of scan-to-map odometry.
+    """Accumulates the covariance of scan-to-map odometry.
 
     A registration's covariance is relative to the local map, whose own error grows only as the map is renewed: after
-    the sensor has moved by its lever arm (the rms distance of the matched points) the map stands on new scans, and one
+    the sensor has moved by its lever arm (the rms distance of the matched points) the map consists of new scans, and one
     more independent registration error has entered it. In between, registrations against the same map share its
     error. So per scan the map's covariance grows by (step / lever arm) times the registration's, and a rotation error
-    moves all later positions. A sensor that stands still does not drift.
+    moves all later positions. A stationary sensor does not drift.
 
-    A map that begins is the mean of its scans: of the error of the k-th one part in k stays in all that follow. On a map of
-    hardly anything the first few err most, and later ones, which agree with each other, do not show it.
+    A young map is the mean of its scans: one part in k of the error of the k-th stays in all that follow. The registrations
+    of the first few are the least accurate, which the later covariances do not model.
 
-    From scan to scan there is no such map: every registration's error enters in full.
+    Scan-to-scan odometry has no such map: every registration's error enters in full.
 
-    The doubt about the motion within a sweep is another in every scan, so that on a map of many it averages out: each scan
-    makes as much of the map as is renewed with it, and so much of its error stays. That of the first scan, at whose start the
-    world begins, is in all others.
+    Deskewing errors are independent between scans and average out on the map: a scan contributes the share of the map that is
+    renewed with it. That of the first scan, whose start is the world's origin, is common to all others.
 
-    map_age : how many scans ago, on the mean, the points of the map were taken on which the next scan is registered
+    map_age : mean age, in scans, of the points of the map on which the next scan is registered
     """
 
     STATE = ("_map", "_position", "_start", "_begun", "_sweep", "_scans", "map_age")
@@ -49,11 +48,11 @@ class PoseUncertainty(Stateful):
         self.is_scan_to_scan = is_scan_to_scan
         self._map = np.zeros((6, 6))
         self._position: Floats | None = None
-        # Where the world begins, until it is known how wrong the first sweep was.
+        # The world's origin, until the first sweep's covariance is estimated.
         self._start: Floats | None = None
-        # Times the doubt about a sweep, of the first scan and those entered with it until then.
+        # Factor on the deskewing covariance, of the first scan and those entered with it until then.
         self._begun = FIRST
-        self._sweep = SweepDoubt()
+        self._sweep = DeskewUncertainty()
         self._scans = 0
         self.map_age = 1.0
 
@@ -67,7 +66,7 @@ class PoseUncertainty(Stateful):
         """(6, 6) covariance of the pose, t' = t + d[:3], R' = exp(d[3:]) R in world axes, m2 and rad2.
 
         sweep : (6, 6) of it that comes from the motion within the sweep, none when absent
-        A failed registration adds its own doubt to its own pose only: the next good one is tied to the map again.
+        A failed registration affects the covariance of its own pose only: the next good one is relative to the map again.
         """
         if result.covariance is None:
             return None
@@ -96,7 +95,7 @@ class PoseUncertainty(Stateful):
         return np.asarray(self._map + begun + own)
 
     def _enter(self, share: float, sweep: Floats) -> None:
-        """So much of a scan's doubt about its sweep (6, 6) stays in the map."""
+        """Add a share of a scan's deskewing covariance (6, 6) to the map's."""
         if self._start is None:
             self._map += share * sweep
         else:

@@ -181,7 +181,7 @@ def uncertainty_figures(record: RunRecord) -> list[Figure]:
     if len(record.results) == len(sigma):
         failed = np.array([r.status != "ok" for r in record.results], bool)
     if failed.any():
-        # A bridged pose has the doubt of a guess: drawn, it would press the registered ones flat.
+        # A bridged pose has the covariance of a guess: drawn, it would press the registered ones flat.
         sigma[failed] = np.nan
         recipe += " Bridged and skipped scans are marked and left out of the lines."
     figures = []

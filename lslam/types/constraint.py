@@ -1,4 +1,4 @@
-"""What the back end knows beside odometry: relations between keyframes."""
+"""Constraints between keyframes, and loop candidates."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class LoopStage(StrEnum):
 
 @dataclass(frozen=True)
 class Constraint:
-    """Pose of keyframe `b` seen from keyframe `a`, as something measured it.
+    """A measured pose of keyframe `b` relative to keyframe `a`.
 
     T_a_b : (4, 4); covariance : (6, 6) of t' = t + d[:3], R' = exp(d[3:]) R in the axes of keyframe a, m2 and rad2
     """
@@ -58,7 +58,7 @@ class Turn:
 
 @dataclass(frozen=True)
 class LoopCandidate:
-    """Two keyframes that may show the same place, and what became of them: a row of loops.csv.
+    """A candidate loop closure with its verdict: a row of loops.csv.
 
     a : the older keyframe; b : the newer one
     distance : m between their odometry positions; descriptor_distance : 0 (alike) to 1, of Scan Context; NaN without

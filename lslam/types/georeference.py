@@ -19,8 +19,8 @@ class Georeference:
     epsg : the code outputs are to be written in; None leaves it to the writer, which takes the UTM zone of the origin
     method : `fit` one rigid transform of the finished trajectory to all fixes; `graph` fixes were factors; `osm` the
         buildings of OpenStreetMap were
-    fixes, used : fixes that were given, and those that were believed
-    rmse_horizontal, rmse_vertical : m, of the believed fixes against the trajectory's antenna
+    fixes, used : fixes that were given, and the inliers
+    rmse_horizontal, rmse_vertical : m, of the inliers against the trajectory's antenna
     """
 
     origin: NDArray[np.float64]

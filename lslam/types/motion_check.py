@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from lslam.geometry import so3
 
-# What explains less than this part of what is usual, or less than a share of the points, is not to be believed, nor what
+# What explains less than this part of what is usual, or less than a share of the points, is rejected, as is what
 # leaves the turn open, rad.
 USUAL, FEWEST, UNTURNED = 0.7, 0.15, float(np.deg2rad(1.0))
 
@@ -38,7 +38,7 @@ class MotionCheck:
 
     @property
     def is_conclusive(self) -> bool:
-        """Whether so many of the points lie on surfaces, and hold the turn so well, that it is to be believed."""
+        """Whether enough points are inliers, and the rotation is constrained well enough, to accept it."""
         return self.agreement >= max(USUAL * self.usual, FEWEST) and float(np.max(self.sigma[3:])) < UNTURNED
 
     @property

@@ -1,4 +1,4 @@
-"""What is believed about the motion of a scan before it is registered."""
+"""The prior of a scan's motion before it is registered."""
 
 from __future__ import annotations
 

@@ -12,7 +12,7 @@ from lslam.types.gravity import GravityDirection
 
 Status = Literal["ok", "bridged", "skipped"]
 
-MOTION_PRIOR, STANDING = "motion prior", "standing"
+MOTION_PRIOR, STATIONARY = "motion prior", "standing"
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,7 @@ class ScanResult:
         the distance travelled. None when the method has none
     registration_covariance : likewise, but relative to the local map the scan was registered on
     map_age : how many scans ago that local map was taken, on the mean; 1 from scan to scan
-    is_standing : the sensor had not moved, so the scan was not registered and has the pose of the one before
+    is_stationary : the sensor had not moved, so the scan was not registered and has the pose of the one before
     posed_by : what within a method found the pose in its place, as a recovery policy or all points in place of features;
         empty: the method itself
     is_lost : the scans round it say that it may be elsewhere, which a problem of the run says in words
@@ -55,7 +55,7 @@ class ScanResult:
     inliers: int = 0
     rmse: float = 0.0
     overlap: float = 0.0
-    is_standing: bool = False
+    is_stationary: bool = False
     posed_by: str = ""
     is_lost: bool = False
     degenerate: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 6)))
@@ -68,7 +68,7 @@ class ScanResult:
     stages: dict[str, float] = field(default_factory=dict)
 
     def poser(self, method: str) -> str:
-        """Who posed the scan: the `method`, what stood in for it, the motion prior, or the scan before while standing."""
-        if self.is_standing:
-            return STANDING
+        """What posed the scan: the `method`, its fallback, the motion prior, or the scan before while stationary."""
+        if self.is_stationary:
+            return STATIONARY
         return (self.posed_by or method) if self.status == "ok" else MOTION_PRIOR

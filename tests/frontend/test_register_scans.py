@@ -10,7 +10,7 @@ import pytest
 from stub_sequences import Standstill, Stub, noise, sample, with_points
 
 from lslam.config import Config, load_config
-from lslam.frontend.register_scans import DOUBT, estimate, is_diverged, read_ahead, to_trajectory
+from lslam.frontend.register_scans import PRIOR_COVARIANCE, estimate, is_diverged, read_ahead, to_trajectory
 from lslam.odometry import create_odometry
 from lslam.readers import select
 from lslam.simulation.scenarios import simulate
@@ -128,7 +128,9 @@ def test_a_skipped_scan_is_more_doubtful_than_the_one_before() -> None:
     trajectory = to_trajectory([known, skipped, skipped, known], "icp")
     assert trajectory.covariances is not None
     one = np.eye(6) * 1e-4
-    np.testing.assert_allclose(trajectory.covariances, np.stack([one, one + DOUBT, one + 2 * DOUBT, one]))
+    np.testing.assert_allclose(
+        trajectory.covariances, np.stack([one, one + PRIOR_COVARIANCE, one + 2 * PRIOR_COVARIANCE, one])
+    )
     assert to_trajectory([skipped], "kiss-icp").covariances is None
     assert (trajectory.source, trajectory.stamps_ns.tolist()) == ("icp", [0, 100, 100, 0])
 

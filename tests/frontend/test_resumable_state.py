@@ -19,7 +19,7 @@ from lslam.frontend.state_classes import STATE_CLASSES
 from lslam.frontend.tracker import Tracker
 from lslam.odometry import METHODS, create_odometry
 from lslam.odometry.base import Resumable
-from lslam.odometry.standing import Standing
+from lslam.odometry.stationary import StationaryDetector
 from lslam.readers.ringed import with_rings
 from lslam.registration.constant_velocity import ConstantVelocity
 from lslam.registration.gaussian_map import GaussianMap
@@ -45,8 +45,8 @@ def config_of(method: str, *settings: str) -> Config:
 
 
 def tracker_of(config: Config, part: Inertial | None = None) -> Tracker:
-    standing = Standing(config.preprocess, config.registration) if config.preprocess.skip_standing else None
-    return Tracker(create_odometry(config), standing, None if part is None else part.motion)
+    stationary = StationaryDetector(config.preprocess, config.registration) if config.preprocess.skip_standing else None
+    return Tracker(create_odometry(config), stationary, None if part is None else part.motion)
 
 
 def tracked(tracker: Tracker, sequence: Sequence, begin: int, end: int) -> Iterator[ScanResult]:

@@ -11,7 +11,7 @@ from lslam.inertial.agreement import check_agreement
 from lslam.inertial.gyroscope import Gyroscope
 from lslam.inertial.imu_cleaning import ImuRefusedError
 from lslam.inertial.imu_estimate import ImuEstimate
-from lslam.inertial.initialise import _is_standing, _path_of_force
+from lslam.inertial.initialise import _is_stationary, _path_of_force
 from lslam.inertial.kalman import update
 from lslam.types.imu import ImuStream
 
@@ -97,7 +97,7 @@ def test_a_sensor_stands_that_hardly_shakes_and_hardly_moves(
     imu = ImuStream(stamps, [0, 0, 9.8] + force * side * [1, 0, 0], [0.05, 0, -0.02] + rate * side * [0, 1, 0])
     poses = np.tile(np.eye(4), (20, 1, 1))
     poses[1::2, 1, 3] = moved
-    found, bias = _is_standing(imu, SCAN_NS * np.arange(20), poses)
+    found, bias = _is_stationary(imu, SCAN_NS * np.arange(20), poses)
     assert found == stands
     np.testing.assert_allclose(bias, [0.05, 0, -0.02], atol=1e-12)
 
@@ -109,7 +109,7 @@ def test_a_second_of_too_few_samples_or_scans_tells_of_no_standing(samples: int,
     stamps = begin + np.round(np.linspace(0, 1e9, samples, endpoint=False)).astype(np.int64)
     imu = ImuStream(stamps, np.tile([0.0, 0, 9.8], (samples, 1)), np.zeros((samples, 3)))
     scans = np.array([0, 600_000_000, 900_000_000, 1_650_000_000])[first_scan:]
-    assert _is_standing(imu, scans, np.tile(np.eye(4), (len(scans), 1, 1)))[0] == stands
+    assert _is_stationary(imu, scans, np.tile(np.eye(4), (len(scans), 1, 1)))[0] == stands
 
 
 def test_the_first_speed_is_as_sure_as_the_scans_show_a_path_without_noise() -> None:

@@ -45,7 +45,7 @@ def test_no_start_is_lost_at_up_to_two_and_a_half_metres_per_scan(every: int, li
     errors = np.linalg.norm((poses_of(results) - d.truth)[:, :3, 3], axis=1)
     assert errors[1] < 0.1
     assert errors.max() < 0.1
-    # Standing still would be a lost start.
+    # StationaryDetector still would be a lost start.
     assert step > 0.1
 
 

@@ -16,7 +16,7 @@ from lslam.geometry import se3
 from lslam.odometry.all_points import ALL_POINTS, FED
 from lslam.odometry.feature_registration import LESS_PLANAR, FeatureRegistration
 from lslam.odometry.feature_scan import feature_scan
-from lslam.odometry.feature_solver import NONE, FeatureNoise, kept_where_blind, solve_on_scan
+from lslam.odometry.feature_solver import NONE, FeatureNoise, remap_solution, solve_on_scan
 from lslam.odometry.feature_steps import ScanStep, joint_step, two_steps, upright_directions
 from lslam.preprocessing.features import Features, extract_features
 from lslam.registration.robust import Annealing
@@ -173,7 +173,7 @@ def test_less_planar_points_may_stand_in_and_leave_a_direction_open(monkeypatch:
         )  # fmt: skip
 
     registration = engine(None, True)
-    monkeypatch.setattr(registration, "_holds_place", lambda result: True)
+    monkeypatch.setattr(registration, "_is_well_constrained", lambda result: True)
     first = between_walls(np.eye(4), 0)
     registration.update(first, registration.locate(first, np.eye(4), StageClock()))
     for k in range(1, 8):
@@ -204,7 +204,7 @@ def test_a_map_of_all_points_is_given_up_when_features_are_fed_again(
     assert registration._all is not None
     entered = []
     for is_starved in (False, True, *[False] * (FED + 2)):
-        monkeypatch.setattr(registration, "_holds_place", lambda result, starved=is_starved: not starved)
+        monkeypatch.setattr(registration, "_is_well_constrained", lambda result, starved=is_starved: not starved)
         result = registration.locate(features, np.eye(4), StageClock())
         assert (result.posed_by == ALL_POINTS) == is_starved
         registration.update(features, result)
@@ -222,11 +222,11 @@ def test_who_stands_in_closes_a_direction_or_opens_none_where_features_are_few(
 ) -> None:
     registration = engine(None, True)
     registration._inserted = registration.config.start_scans + 1
-    stand_in = RegistrationResult(se3.exp(np.full(6, 0.1)), degenerate=np.eye(6)[:after])
-    monkeypatch.setattr(registration, "_on_planes", lambda *_: stand_in)
+    fallback = RegistrationResult(se3.exp(np.full(6, 0.1)), degenerate=np.eye(6)[:after])
+    monkeypatch.setattr(registration, "_on_planes", lambda *_: fallback)
     starved = RegistrationResult(np.eye(4), degenerate=np.eye(6)[:before], inliers=inliers)
-    result = registration._stand_in(features_at(np.eye(4)), RegistrationResult(np.eye(4)), np.eye(4), starved)
-    assert (result.T_world_lidar is stand_in.T_world_lidar) == is_taken
+    result = registration._fallback(features_at(np.eye(4)), RegistrationResult(np.eye(4)), np.eye(4), starved)
+    assert (result.T_world_lidar is fallback.T_world_lidar) == is_taken
     assert (result.posed_by == LESS_PLANAR) == is_taken
 
 
@@ -243,7 +243,7 @@ def test_what_led_astray_where_nothing_is_observed_is_taken_back_and_nothing_els
             return se3.make(turned, start[:3, 3] + step[:3])
 
         astray = RegistrationResult(after(moved), degenerate=weak, lever_arm=arm)
-        kept = kept_where_blind(astray, expected)
+        kept = remap_solution(astray, expected)
         right = after(moved - weak.T @ (weak @ moved))
         # Small rotations add up but for the product of two of them.
         np.testing.assert_allclose(kept.T_world_lidar, right, atol=2e-4)
@@ -259,7 +259,7 @@ def test_features_are_asked_to_be_as_good_as_the_prior_and_no_better_than_one_pl
 
 
 @pytest.mark.parametrize(("step", "with_map"), VARIANTS)
-def test_no_features_at_all_keep_the_prior_in_doubt(step: ScanStep | None, with_map: bool) -> None:
+def test_no_features_at_all_keep_the_prior_and_its_covariance(step: ScanStep | None, with_map: bool) -> None:
     registration = engine(step, with_map)
     first = features_at(np.eye(4))
     registration.update(first, registration.locate(first, np.eye(4), StageClock()))

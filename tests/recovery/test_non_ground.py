@@ -24,7 +24,7 @@ def street(rng: np.random.Generator, x: float) -> NDArray[np.float32]:
     return (np.concatenate([ground, standing]) - [x, 0, 1.7]).astype(np.float32)
 
 
-def standing_in(points: Points, pose: Floats) -> NonGroundPoints:
+def non_ground_of(points: Points, pose: Floats) -> NonGroundPoints:
     return NonGroundPoints([(points, pose)], PreprocessConfig())
 
 
@@ -35,7 +35,7 @@ def seen_in(points: Points) -> PreparedPoints:
 
 def test_the_share_is_that_of_points_with_a_neighbour_and_leaves_the_ground_out() -> None:
     rng = np.random.default_rng(0)
-    first = standing_in(street(rng, 0.0), pose_at((5.0, 0.0, 0.0), 30.0))
+    first = non_ground_of(street(rng, 0.0), pose_at((5.0, 0.0, 0.0), 30.0))
     seen = seen_in(street(rng, 2.0))
     assert len(seen.source) == 800
     tree = cKDTree(se3.apply(pose_at((5.0, 0.0, 0.0), 30.0), street(rng, 0.0)[4000:].astype(float)))
@@ -59,12 +59,12 @@ def test_what_is_as_low_as_a_crash_barrier_is_not_asked() -> None:
     assert len(asked.source) == 800
     # What was seen of it earlier is kept: posts end at the height of barriers.
     low = PreparedPoints(barrier, barrier.astype(np.float64), np.zeros((len(barrier), 6)), len(barrier))
-    assert standing_in(points, np.eye(4)).share(low, np.eye(4)) == 1.0
+    assert non_ground_of(points, np.eye(4)).share(low, np.eye(4)) == 1.0
 
 
 def test_bare_ground_says_nothing() -> None:
     ground = street(np.random.default_rng(1), 0.0)[:4000]
-    assert standing_in(ground, np.eye(4)).share(seen_in(ground), np.eye(4)) == 0.0
+    assert non_ground_of(ground, np.eye(4)).share(seen_in(ground), np.eye(4)) == 0.0
 
 
 def test_the_points_on_the_ground_are_the_others() -> None:

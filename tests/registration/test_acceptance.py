@@ -8,7 +8,7 @@ import pytest
 from lslam.config.registration import RegistrationConfig
 from lslam.geometry import se3, so3
 from lslam.odometry.feature_registration import WORDING as OF_FEATURES
-from lslam.registration.acceptance import DOUBT, Wording, accepted, correction
+from lslam.registration.acceptance import PRIOR_COVARIANCE, Wording, accepted, correction
 from lslam.registration.registration import WORDING as OF_POINTS
 from lslam.registration.robust import UsualAgreement
 from lslam.registration.solver import RegistrationResult
@@ -58,7 +58,7 @@ def test_what_is_refused_keeps_the_prior_and_says_why(
         result = judged(wording, **facts)  # type: ignore[arg-type]
         assert (result.ok, result.reason, result.iterations, result.source_points) == (False, why, 7, 100)
         np.testing.assert_array_equal(result.T_world_lidar, PRIOR)
-        np.testing.assert_array_equal(result.covariance, DOUBT)
+        np.testing.assert_array_equal(result.covariance, PRIOR_COVARIANCE)
 
 
 def test_a_correction_is_measured_from_the_prior() -> None:

@@ -87,7 +87,7 @@ def test_driving_equals_accumulating_a_random_walk() -> None:
     assert correlation == pytest.approx(np.corrcoef(d[:, 1], d[:, 5])[0, 1], abs=0.05)
 
 
-def test_a_failed_scan_doubts_its_own_pose_only() -> None:
+def test_a_failed_scan_enlarges_the_covariance_of_its_own_pose_only() -> None:
     uncertainty, without = PoseUncertainty(), PoseUncertainty()
     doubt = np.diag([0.25] * 3 + [1e-3] * 3)
     for k in range(5):
@@ -102,7 +102,7 @@ def test_a_failed_scan_doubts_its_own_pose_only() -> None:
     np.testing.assert_allclose(np.diag(after), np.diag(expected), rtol=0.2)
 
 
-def test_doubt_about_sweeps_averages_out_on_the_map_and_that_of_the_first_stays() -> None:
+def test_deskew_uncertainty_averages_out_on_the_map_and_that_of_the_first_stays() -> None:
     """The first sweep's is twice as far off, so four times the covariance, in all poses."""
     own, sweep = np.diag([1e-4, 2e-4, 3e-4, 0, 0, 0]), np.diag([7e-5, 0, 1e-5, 0, 0, 0])
     uncertainty = PoseUncertainty()

@@ -1,4 +1,4 @@
-"""Whether the sensor still stands where it stood, told from the scan and before any registration."""
+"""Stationary detection from scans, before any registration."""
 
 from __future__ import annotations
 
@@ -20,28 +20,27 @@ from lslam.types.state import State, Stateful
 
 Floats = NDArray[np.float64]
 
-# Nothing is asked after a step beyond these, m and deg: what moves so fast between two scans does not stand in the next.
+# Steps beyond these, m and deg, need no test of the next scan: it is not stationary.
 SLOW_M, SLOW_DEG = 0.1, 1.0
-# Shares of the points that must find a surface, and lie on it, for the scan to have a say.
+# Least overlap and inlier share for a test.
 MATCHED, AGREEING = 0.3, 0.7
 
 
 @dataclass(frozen=True)
 class ReferenceScan:
-    """The scan that others are compared with: its planes, and where one step puts its own points on them."""
+    """The reference scan: its planes, and the pose of its own points on them after one step."""
 
     planes: GaussianMap
     T_own: Floats
 
 
-class Standing(Stateful):
-    """Compares scans with the last one that was registered, its reference.
+class StationaryDetector(Stateful):
+    """Tests scans against the last registered one, the reference.
 
-    Rao's score test in the words of registration: one Gauss-Newton step of point to plane against the reference, from
-    "nothing moved", is taken for the scan and was taken for the reference itself; while the sensor stands both have the
-    same pattern and end in the same place. The reference stays while the sensor stands, so slow creeping adds up until it
-    is seen, and a pose is wrong by the limits at most. A scan that cannot tell, because its step is uncertain or few of
-    its points lie on surfaces, does not stand.
+    Rao's score test of the null hypothesis "no motion": one Gauss-Newton step of point to plane against the reference, for the
+    scan and for the reference itself, whose common bias cancels. The reference stays while the sensor is stationary, so slow
+    motion adds up until it is detected, and the pose error is bounded by the limits. A scan with an uncertain step or few
+    inliers is not stationary.
     """
 
     def __init__(self, preprocess: PreprocessConfig, registration: RegistrationConfig) -> None:
@@ -51,17 +50,17 @@ class Standing(Stateful):
         self._last: ScanResult | None = None
 
     def result_of(self, scan: Scan) -> ScanResult | None:
-        """The result of a scan whose sensor stands: pose and covariance of the reference; None when it has moved."""
-        if self._reference is None or self._last is None or not self._stands(scan, self._reference):
+        """The result of a stationary scan: pose and covariance of the reference; None when the sensor has moved."""
+        if self._reference is None or self._last is None or not self._is_stationary(scan, self._reference):
             return None
         return ScanResult(
             scan.index, scan.stamp_ns, self._last.T_world_lidar.copy(),
-            reason=f"standing since scan {self._last.index}", is_standing=True,
+            reason=f"standing since scan {self._last.index}", is_stationary=True,
             covariance=self._last.covariance, registration_covariance=self._last.registration_covariance,
         )  # fmt: skip
 
     def observe(self, scan: Scan, result: ScanResult) -> None:
-        """Take a scan that went through registration as the reference, if the sensor was slow enough to stand soon."""
+        """Take a registered scan as the reference if the sensor was slow."""
         if result.status != "ok":
             self._reference = None
             return
@@ -90,7 +89,7 @@ class Standing(Stateful):
         room = np.random.default_rng(0).uniform(-8, 8, (3000, 3)).astype(np.float32)
         room[:, 2] = np.where(room[:, 2] > 0, 8.0, -8.0)
         scan = Scan(room, 0, 0)
-        self._stands(scan, self._reference_of(scan))
+        self._is_stationary(scan, self._reference_of(scan))
 
     def _reference_of(self, scan: Scan) -> ReferenceScan:
         """Planes of one scan alone. Its voxels are coarse, as those of a map's first scans: a ring is no plane."""
@@ -111,7 +110,7 @@ class Standing(Stateful):
         once = Annealing(c.kernel_max, c.kernel_max, c.kernel_decay, 1)
         return solve(planes, points, np.eye(4), once, sigma=c.sigma, blob_weight=0.0, weak_share=c.weak_share)
 
-    def _stands(self, scan: Scan, reference: ReferenceScan) -> bool:
+    def _is_stationary(self, scan: Scan, reference: ReferenceScan) -> bool:
         found = self._step(prepare_points(scan.points, self._preprocess, scan.index), reference.planes)
         C = found.covariance
         if C is None or found.overlap < MATCHED or found.inlier_share < AGREEING or len(found.degenerate):

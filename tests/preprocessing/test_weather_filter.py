@@ -10,8 +10,8 @@ from lslam import Registration
 from lslam.config.preprocess import PreprocessConfig
 from lslam.geometry import se3
 from lslam.kernels import voxel
-from lslam.preprocessing.air import CLEAR, FIELD_OF_VIEW_SR, MOSTLY, WIDE_CELL, on_surfaces
 from lslam.preprocessing.prepare import NO_TIMES, prepare_points
+from lslam.preprocessing.weather_filter import CLEAR, FIELD_OF_VIEW_SR, MOSTLY, WIDE_CELL, on_surfaces
 from lslam.simulation.scenarios import simulate
 
 Points = NDArray[np.float32]

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from lslam.config import load_config
 from lslam.geometry import se3, so3
 from lslam.pipeline.run import run
+from lslam.registration.deskew_uncertainty import DeskewUncertainty
 from lslam.registration.solver import RegistrationResult
-from lslam.registration.sweep_doubt import SweepDoubt
 from lslam.registration.uncertainty import PoseUncertainty
 from lslam.simulation.scenarios import simulate
 from lslam.types.motion_prior import MotionPrior
@@ -38,7 +38,7 @@ def test_a_steady_acceleration_is_told_to_its_last_millimetre(every: int, passed
     2 m/s2, points all over the sweep, every scan and every fourth, stamps at its start, in its middle and between.
     """
     a, step = 2.0, every * SPAN
-    doubt = SweepDoubt()
+    doubt = DeskewUncertainty()
     for k in range(20):
         t = k * step
         used = a * (t + (0.5 - passed) * SPAN - 0.5 * step)
@@ -59,7 +59,7 @@ def test_before_anything_is_known_a_car_may_brake_and_a_hand_turn(passed: float,
 
     The second scan cannot tell, the third can.
     """
-    doubt = SweepDoubt()
+    doubt = DeskewUncertainty()
     usual = (np.repeat([3.0, 1.0], 3) * SPAN**2 / part) ** 2
     for k in range(2):
         S = doubt.observe(steady(k, 10.0, passed), k * 10**8, at(k), is_registered=True)
@@ -69,7 +69,7 @@ def test_before_anything_is_known_a_car_may_brake_and_a_hand_turn(passed: float,
 
 def test_what_is_taken_up_again_learns_as_if_nothing_had_been() -> None:
     """The next lesson needs where in its sweep the stamp of the scan before lay."""
-    whole, again = SweepDoubt(), SweepDoubt()
+    whole, again = DeskewUncertainty(), DeskewUncertainty()
     for k in range(6):
         whole.observe(steady(k**2 / 10, 10.0, 0.2), k * 10**8, at(k**2 / 10), is_registered=True)
     again.restore(deepcopy(whole.state()))
@@ -78,11 +78,11 @@ def test_what_is_taken_up_again_learns_as_if_nothing_had_been() -> None:
     np.testing.assert_array_equal(*after)
 
 
-def test_doubt_lies_along_the_axes_of_the_world() -> None:
+def test_uncertainty_lies_along_the_axes_of_the_world() -> None:
     """The same motion in a world that is turned: the same doubt, turned."""
     rng = np.random.default_rng(2)
     turn = se3.make(so3.exp(np.array([0.4, -0.3, 1.5])), np.zeros(3))
-    straight, turned = SweepDoubt(), SweepDoubt()
+    straight, turned = DeskewUncertainty(), DeskewUncertainty()
     for k in range(12):
         prior, pose = steady(k, 10.0), at(k + 0.01 * rng.normal())
         S = straight.observe(prior, k * 10**8, pose, is_registered=True)
@@ -92,8 +92,8 @@ def test_doubt_lies_along_the_axes_of_the_world() -> None:
     assert S[0, 0] > 2 * S[1, 1]
 
 
-def test_scans_of_one_instant_have_no_motion_to_doubt() -> None:
-    doubt = SweepDoubt()
+def test_scans_of_one_instant_have_no_deskew_uncertainty() -> None:
+    doubt = DeskewUncertainty()
     for k in range(5):
         S = doubt.observe(MotionPrior.at_once(at(k)), k * 10**8, at(k**2), is_registered=True)
         assert not S.any()
@@ -101,7 +101,7 @@ def test_scans_of_one_instant_have_no_motion_to_doubt() -> None:
 
 def test_a_failed_scan_teaches_nothing() -> None:
     rng = np.random.default_rng(0)
-    doubt = SweepDoubt()
+    doubt = DeskewUncertainty()
     for k in range(12):
         S = doubt.observe(steady(k, 10.0), k * 10**8, at(k + 0.01 * rng.normal()), is_registered=True)
     lost = doubt.observe(steady(12.0, 10.0), 12 * 10**8, at(40.0), is_registered=False)

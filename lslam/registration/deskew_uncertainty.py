@@ -1,13 +1,12 @@
-"""How far the pose of a scan may be off because nobody knows how the sensor moved within the sweep.
+"""Uncertainty of a scan's pose due to the unknown motion within its sweep.
 
-A sweep of T seconds is deskewed by one velocity, that of the way to it, and registration finds its middle. Under a constant
-acceleration `a` the start is then off by a T^2 / 6 (half the sweep at a velocity that is wrong by a T / 2, less what the
-bend of the true motion gives back), and the points by as much (rms). The next scan tells how wrong the velocity was: it lies
-a T^2 / 2 from where the sweep's motion leads. A rattling car changes its velocity from scan to scan, so it is the mean
-square over the last scans that says what the next is worth.
+A sweep of T seconds is deskewed by one velocity, that between the scans before, and registration finds its middle. Under a
+constant acceleration `a` the error at the start is a T^2 / 6 (half the sweep at a velocity error of a T / 2, less the curvature
+of the true motion), and the same for the points (rms). The next scan observes the velocity error: it lies a T^2 / 2 from the
+prediction. Vibration changes the velocity from scan to scan, so the covariance is the mean square over the last scans.
 
-A stamp half the `lead` L before the middle (L is T at the start, 0 in the middle) is off by
-a (L^2 / 6 + (T^2 - L^2) / 24 + L (T - L) / 4), and the next scan by a (T^2 - L T / 2) from where the motion leads.
+At a stamp half the `lead` L before the middle (L is T at the start, 0 in the middle) the error is
+a (L^2 / 6 + (T^2 - L^2) / 24 + L (T - L) / 4), and that of the prediction of the next scan a (T^2 - L T / 2).
 """
 
 from __future__ import annotations
@@ -23,19 +22,19 @@ Floats = NDArray[np.float64]
 
 # Scans over which the change of the motion is averaged: a second.
 MEMORY = 10
-# m/s2 and rad/s2, what a sensor is taken to do before anything is known: a car brakes, a hand turns.
+# m/s2 and rad/s2, prior sigmas of the acceleration: a car brakes, a hand turns.
 USUAL = np.repeat([3.0, 1.0], 3)
-# Lessons that outweigh the assumption that no direction is special: there are six of them.
+# Weight, in scans, of the prior that the covariance is isotropic: its six directions.
 DIRECTIONS = 6
 
 
-class SweepDoubt(Stateful):
-    """Learns from successive scans how wrong the motion is by which they were deskewed."""
+class DeskewUncertainty(Stateful):
+    """Estimates the covariance of the deskewing motion's error from successive scans."""
 
     STATE = ("_mean", "scans", "_stamp_ns", "_pose", "_within", "_span_s", "_lead_s")
 
     def __init__(self) -> None:
-        self.scans = 0  # that said something, `MEMORY` at most
+        self.scans = 0  # observed, `MEMORY` at most
         self._mean = np.zeros((6, 6))
         self._stamp_ns: int | None = None
         self._pose = np.eye(4)
@@ -45,12 +44,12 @@ class SweepDoubt(Stateful):
     def observe(self, prior: MotionPrior, stamp_ns: int, pose: Floats, is_registered: bool) -> Floats:
         """(6, 6) covariance, world axes, of the pose (4, 4) found at `stamp_ns` for the scan that `prior` deskewed.
 
-        Zero for scans of one instant. A pose that no registration stands behind teaches nothing, nor does the one after it.
+        Zero for scans of one instant. A pose without a registration is not learnt from, nor is the one after it.
         """
         step_s = 0.0 if self._stamp_ns is None else 1e-9 * (stamp_ns - self._stamp_ns)
         if is_registered and self._span_s > 0 and step_s > 0:
             self._learn(se3.relative(self._pose, pose), step_s)
-        # The first sweep was deskewed by where the second scan was found: that agrees by itself.
+        # The first sweep was deskewed by the second scan's registration: their residual is zero by construction.
         self._span_s = prior.span_s if is_registered and self._stamp_ns is not None else 0.0
         self._lead_s = float(prior.times[0] + prior.times[-1])
         self._stamp_ns, self._pose = stamp_ns, pose.copy()
@@ -68,7 +67,7 @@ class SweepDoubt(Stateful):
         """From the motion (4, 4) found over `step_s` seconds since the last scan."""
         expected = se3.exp(se3.log(self._within) * step_s / self._span_s)
         share, lead = min(self._span_s / step_s, 1.0), min(self._lead_s / step_s, 1.0)
-        # Of a dt^2 - a L dt / 2, by which the next scan is missed, the part a (L dt / 4 - L^2 / 12 + (T^2 - L^2) / 24).
+        # The ratio to the prediction error a dt^2 - a L dt / 2 of the error a (L dt / 4 - L^2 / 12 + (T^2 - L^2) / 24).
         part = lead * (3.0 - lead) / (12.0 - 6.0 * lead) + (share**2 - lead**2) / (24.0 - 12.0 * lead)
         off = part * se3.log(se3.relative(expected, moved))
         self.scans = min(self.scans + 1, MEMORY)
