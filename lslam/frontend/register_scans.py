@@ -106,7 +106,7 @@ def is_diverged(results: list[ScanResult], max_failures: int) -> bool:
 
 
 def to_trajectory(results: list[ScanResult], method: str) -> Trajectory:
-    """The poses of all scans, with covariances when the method has them; a skipped scan adds `PRIOR_COVARIANCE` to the last one."""
+    """The poses of all scans, with covariances when the method has them; a skipped scan adds `PRIOR_COVARIANCE` to the last."""
     known = any(r.covariance is not None for r in results)
     covariances: list[NDArray[np.float64]] = []
     for result in results if known else ():

@@ -133,7 +133,7 @@ def align_closed_form(
 
 
 def keep_pairs(distance: Floats, inlier_ratio: float, inlier_distance: float | None) -> NDArray[np.int64]:
-    """Indices of the pairs to believe by their distance (S,), m, infinite where there is none; increasing."""
+    """Indices of the inlier pairs by their distance (S,), m, infinite where there is none; increasing."""
     near = np.flatnonzero(np.isfinite(distance))
     if inlier_distance is None and len(near):
         middle = float(np.median(distance[near]))
