@@ -137,7 +137,7 @@ def place(
 
 
 def on_earth(graph: PoseGraph, placement: Placement) -> PoseGraph:
-    """The graph in east, north, up, held by its fixes instead of its first pose."""
+    """The graph in east, north, up, anchored by its fixes instead of its first pose."""
     assert placement.georeference is not None
     T = placement.georeference.T_enu_world
     spread = None if graph.spread is None else noise.rotated(graph.spread, T[:3, :3])

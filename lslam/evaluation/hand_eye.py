@@ -68,7 +68,7 @@ def body_turn(estimate: Floats, truth: Floats) -> BodyTurn | None:
         weights = np.minimum(SCALE * np.sqrt(3) * scales / np.maximum(sizes, 1e-12), 1.0) / scales**2
         w = np.repeat(weights, 3, axis=1)
         information = np.einsum("nij,ni,nik->jk", J, w, J)
-        # A weak hold at no turn and no lever arm: what the motion does not tell stays there.
+        # A weak prior at no rotation and no lever arm, for unobservable directions.
         hold = np.diag(np.repeat([1.0, 1e-2], 3))
         step = -np.linalg.solve(information + hold, np.einsum("nij,ni,ni->j", J, w, r) + hold @ _state(R, x))
         R, x = so3.exp(step[:3]) @ R, x + np.concatenate([np.zeros(3), step[3:]])

@@ -1,4 +1,4 @@
-"""What an evaluation says: plain frozen values, each with the recipe it was made by."""
+"""The results of an evaluation: plain frozen values, each with its recipe."""
 
 from __future__ import annotations
 

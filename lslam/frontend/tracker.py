@@ -175,7 +175,7 @@ class Tracker:
         with clock.stage("imu"):
             weighed = self.motion.weigh(found.result, prior)
         weighed = plausible(weighed, prior.pose, self._last)
-        if weighed.status != "ok" and self.motion.is_felt and isinstance(odometry, Searching):
+        if weighed.status != "ok" and self.motion.is_inertial and isinstance(odometry, Searching):
             found, prior = self._near(odometry, scan, prepared, expected, found, weighed, clock), expected
         else:
             found = replace(found, result=weighed)

@@ -1,4 +1,4 @@
-"""Do gyroscope and registration tell of the same turns? Units, axes and clocks are wrong where they do not."""
+"""Consistency of gyroscope and registration: rotations that disagree reveal wrong units, axes or clocks."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from lslam.types.imu import ImuStream
 
 Floats = NDArray[np.float64]
 
-# Turns that vary less than this (rms, rad/s) are registration's own noise: nothing can be told from them.
+# rad/s, rms of rotation rates below which registration's noise dominates and nothing is observable.
 LEAST_TURNING = np.deg2rad(0.6)
 LEAST_CORRELATION = 0.5
 # The part of what scans show as turns that may be noise of their registration; turns over more scans have less of it, and of
@@ -81,7 +81,7 @@ def check_agreement(
         at_zero = float(scores[len(offsets) // 2])
         if correlation > at_zero + CLEARLY:
             raise _beyond(felt, seen, float(offsets[best]), at_zero, correlation)
-        # Long even bends fit at any offset: nothing is told of the clock.
+        # In long even bends the clock offset is unobservable.
         best = len(offsets) // 2
     _refuse_axes(felt, seen, offsets, float(offsets[best]))
     bias = _mean_excess(felt.rates(float(offsets[best])), seen, T_lidar_imu)
@@ -95,7 +95,7 @@ def check_agreement(
 def turns(
     imu: ImuStream, T_lidar_imu: Floats, stamps_ns: NDArray[np.int64], poses: Floats, offset_s: float
 ) -> tuple[Floats, Floats]:
-    """What registration saw and the gyroscope felt, (M, 3) rad/s in LiDAR axes, each about its mean.
+    """Rates by registration and by the gyroscope, (M, 3) rad/s in LiDAR axes, each about its mean.
 
     stamps_ns : (N,) of the poses (N, 4, 4) of the LiDAR; offset_s : s added to the IMU's stamps. M is 0 where the stream
     tells of less than half of the poses.

@@ -1,4 +1,4 @@
-"""The IMU as a motion model: it predicts scans and the motion within them, and learns from where registration put them."""
+"""The IMU as a motion model: an error-state Kalman filter that predicts scans and sweeps, and is updated by registration."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from lslam.types.state import State, Stateful
 Floats = NDArray[np.float64]
 log = logging.getLogger("lslam")
 
-# Half the points of a scan are nearer: what a wrong turn moves them by.
+# m, lever arm of rotation errors: half the points of a scan are nearer.
 LEVER_M = 10.0
 
 
@@ -37,7 +37,7 @@ class InertialMotion(Stateful):
     imu : cleaned, on the clock of the scans; T_lidar_imu : (4, 4); estimate : at the first scan, in the LiDAR frame there
     """
 
-    # Of so many scans the IMU must predict the typical one not clearly worse than constant velocity does.
+    # Scans over which the IMU's median prediction error is tested against constant velocity, and the limits of the test.
     JUDGED, WORSE, SLACK_M = 30, 2.0, 0.02
     # One scan in so many is registered from constant velocity too, to tell what the IMU saves.
     COMPARED = 20
@@ -55,8 +55,8 @@ class InertialMotion(Stateful):
         self._scans = 0
         self._has_gap = False
         # Whether the IMU predicted the newest sweep.
-        self.is_felt = False
-        # Whether no registration stands behind the newest pose.
+        self.is_inertial = False
+        # Whether the newest pose has no registration.
         self._was_bridged = False
         self._gaps = gaps(imu, config.gap_s)
         self._instant_ns: int | None = None
@@ -71,7 +71,7 @@ class InertialMotion(Stateful):
     @property
     def is_known(self) -> bool:
         """Whether there is a velocity: from the start on, unless the IMU is silent there."""
-        return self.coasting.is_known or self.is_felt
+        return self.coasting.is_known or self.is_inertial
 
     def is_compared(self, stamp_ns: int, span: Span) -> bool:
         """Whether the scan to come is one of the sample that shows what constant velocity would have cost.
@@ -83,8 +83,8 @@ class InertialMotion(Stateful):
 
     def sweep(self, stamp_ns: int, span: Span) -> MotionPrior:
         """Poses over the `span` of the sweep; the one at the stamp when it takes no time."""
-        self.is_felt = self._feels(stamp_ns, span)
-        if not self.is_felt:
+        self.is_inertial = self._feels(stamp_ns, span)
+        if not self.is_inertial:
             return self.coasting.sweep(stamp_ns, span)
         anchor_ns = stamp_ns if self._instant_ns is None else self._instant_ns
         prior = self._prior(self.estimate, anchor_ns, self._pose, stamp_ns, knots_over(span))

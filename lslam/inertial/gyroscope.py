@@ -1,4 +1,4 @@
-"""A gyroscope's constant errors, learnt from the turns that registration finds, and how far its own turns can be trusted.
+"""Calibration of a gyroscope's constant errors by registered rotations, and the covariance of its own rotations.
 
 The axes of a consumer device are some per cent askew, and its mounting is known to a degree or two: while the sensor turns,
 that is worth more than its bias wanders, and no noise at all but the same error at every turn.
@@ -19,7 +19,7 @@ Floats = NDArray[np.float64]
 
 # One sigma of scale, misalignment and mounting together: a data sheet's 2 % across the axes, a degree of mounting.
 AXES_SIGMA = 0.025
-# rad/s per sqrt(Hz) that no constant error explains, at the least; rad/s per sqrt(s) by which the bias wanders: that of Kalibr's
+# rad/s per sqrt(Hz), least noise density; rad/s per sqrt(s), random walk of the bias: that of Kalibr's
 # ADIS16448. Ten times more, and turns over more than some seconds were registration's again, with all its noise.
 RATE_NOISE, BIAS_WALK = np.deg2rad(0.01), np.deg2rad(0.001)
 # The noise is learnt over so many scans.
@@ -42,7 +42,7 @@ class Gyroscope:
 
     @classmethod
     def of_bias(cls, bias: Floats, sigma: float) -> Gyroscope:
-        """What is known of a device before it was seen to turn: its bias (3,), to `sigma` rad/s."""
+        """The prior of a device: its bias (3,), with `sigma` rad/s."""
         return cls(bias, covariance=np.diag(np.repeat([sigma**2, AXES_SIGMA**2], [3, 9])))
 
     def rates(self, readings: Floats) -> Floats:

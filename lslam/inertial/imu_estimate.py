@@ -25,7 +25,7 @@ PLACE_SIGMA, TURN_SIGMA = 0.007, np.deg2rad(0.05)
 # Force that no bias explains (shaking, misaligned axes, readings cut at the rate), m/s2 per sqrt(Hz). With the ICM-20948 over
 # 0.1 s of simulated drives, walks and flights it is 0.004 (motorway) to 0.05 (streets, flights).
 FORCE_NOISE = 0.05
-# Bias and the direction of gravity wander: per sqrt(s).
+# Random walks of bias and direction of gravity, per sqrt(s).
 GRAVITY_WALK, ACCEL_WALK = 5e-3, 2e-3
 GRAVITY_SIGMA = 0.03  # m/s2, over the Earth
 

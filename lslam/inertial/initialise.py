@@ -1,4 +1,4 @@
-"""Velocity, gravity and biases at the first scan, from what registration says about the first seconds."""
+"""Initialisation of the IMU: velocity, gravity and biases at the first scan, from the registration of the first seconds."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from lslam.types.imu import ImuStream
 
 Floats = NDArray[np.float64]
 
-# One sigma before anything is known: any vehicle's speed; consumer devices' biases; a bias by the mean turn.
+# Prior sigmas: any vehicle's speed; consumer devices' biases; a bias by the mean turn.
 ANY_SPEED, ANY_ACCEL_BIAS, ANY_GYRO_BIAS, MEAN_GYRO_BIAS = 50.0, 0.5, 0.1, 0.02
 # Given biases: axes up to 2 % askew (a consumer device's data sheet) show as much of gravity as one more: two sigma.
 # A bias that is given was measured over minutes; one second that looks like standing may be a slow turn.
@@ -38,7 +38,7 @@ WRONG_WAY = 2.0
 
 @dataclass(frozen=True)
 class FirstPoses:
-    """What registration found about the first seconds by itself.
+    """The registration of the first seconds without an IMU.
 
     stamps_ns (N,), poses (N, 4, 4) : at the starts of the scans, the first scan's first
     instants_ns (M,), middles (M, 4, 4) : in the middle of sweeps, where turns are known best
@@ -171,7 +171,7 @@ def _without_wrong_bias(config: ImuConfig, seen: Floats | None, problems: list[s
 
 
 def _bias_sigma(given: Floats, seen: Gyroscope) -> float:
-    """One sigma of a given bias (3,), rad/s: as far as what was `seen` from a guess that hardly holds it contradicts it."""
+    """Sigma of a given bias (3,), rad/s: its difference from the one `seen` with a weak prior."""
     beyond = np.abs(given - seen.bias) - 3 * np.sqrt(np.diag(seen.covariance)[:3])
     return max(float(beyond.max()), GIVEN_GYRO_BIAS)
 
@@ -190,7 +190,7 @@ def _first_guess(
         gyro_bias, gyro_sigma = np.array(config.gyro_bias), MOST_BIAS_ERROR
     if config.accel_bias is not None:
         accel_bias, accel_sigma = np.array(config.accel_bias), GIVEN_ACCEL_BIAS
-    # Force and gravity only say their difference at first: a bias tilts what is taken for vertical.
+    # At first only the difference of force and gravity is observable: a bias tilts the vertical.
     R, shared = T_lidar_imu[:3, :3], accel_sigma**2
     covariance = np.zeros((9, 9))
     np.fill_diagonal(covariance, np.repeat([ANY_SPEED**2, LEVEL_SIGMA**2 + shared, shared], 3))

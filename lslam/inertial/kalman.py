@@ -27,5 +27,5 @@ def update(x: Floats, P: Floats, H: Floats, rest: Floats, noise: Floats) -> tupl
 
 
 def surprise(rest: Floats, expected: Floats) -> float:
-    """Squared innovation (M,) by its covariance (M, M), over what an outlier has at the least."""
+    """Squared Mahalanobis length of the innovation (M,), over the outlier threshold."""
     return float(rest @ np.linalg.solve(expected, rest)) / (len(rest) * OUTLIER**2)

@@ -1,1 +1,1 @@
-"""Integrity of the trajectory: the motion between scans checked beside the method, and alerts where its poses may be lost."""
+"""Integrity of the trajectory: independent checks of the motion between scans, and alerts where poses may be lost."""

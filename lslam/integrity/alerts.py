@@ -12,13 +12,13 @@ from lslam.types.motion_check import USUAL, MotionCheck
 
 Floats = NDArray[np.float64]
 
-# Checks in a row that say the same, two seconds of them, and by how much at least, m and rad: few rings hold tilt badly.
+# Consistent checks in a row, two seconds of them, and least deviations, m and rad: few rings constrain tilt poorly.
 IN_A_ROW = 4
 LEAST: Floats = np.array([0.06, 0.06, 0.08, *np.deg2rad([0.3, 0.3, 0.12])])
 # One check is enough where it says so much more, and clearly explains more of the points.
 LARGE: Floats = np.array([0.5, 0.5, 0.5, *np.deg2rad([2.0, 2.0, 2.0])])
 SIGMAS_IN_A_ROW, SIGMAS_ALONE, MORE = 3.0, 6.0, 1.15
-# A check that leaves the place open by so much, m, confirms nothing.
+# m; a check with a larger sigma of the position confirms nothing.
 OPEN_M = 0.5
 # Five times gravity over so many m: nothing that carries a LiDAR is accelerated so, but scans out of order are.
 MOST_ACCELERATION, LEAST_JERK_M = 50.0, 0.3
@@ -35,13 +35,13 @@ class Alert:
 
 
 def alerts(checks: list[MotionCheck], positions: Floats, stamps_ns: NDArray[np.int64]) -> list[Alert]:
-    """All that speaks against the claimed `positions` (N, 3), m, of scans at `stamps_ns` (N,), in their order."""
+    """All alerts on the `positions` (N, 3), m, of scans at `stamps_ns` (N,), in their order."""
     found = [*_unconfirmed(checks), *_jumps(positions, stamps_ns), *_inconsistent(checks)]
     return sorted(found, key=lambda alert: (alert.first, alert.last))
 
 
 def _inconsistent(checks: list[MotionCheck]) -> list[Alert]:
-    """Where checks say that the motion was another; axes that are inconsistent together make one alert.
+    """Where checks reject the motion of the poses; axes rejected together make one alert.
 
     Inconclusive checks do not part conclusive ones.
     """
@@ -61,7 +61,7 @@ def _inconsistent(checks: list[MotionCheck]) -> list[Alert]:
 
 
 def _noise(apart: Floats) -> Floats:
-    """(6,) by how much checks usually differ from the next: what is constant is none."""
+    """(6,) usual difference of successive checks: a constant one is no alert."""
     if len(apart) < IN_A_ROW:
         return np.zeros(6)
     return np.asarray(1.4826 / np.sqrt(2) * np.median(np.abs(np.diff(apart, axis=0)), axis=0))
@@ -96,7 +96,7 @@ def _alert(run: list[MotionCheck], apart: Floats) -> Alert:
 
 
 def _unconfirmed(checks: list[MotionCheck]) -> list[Alert]:
-    """Where scans are missing or failed, and those before and after do not show the motion that is claimed between them."""
+    """Where scans are missing or failed, and a check rejects the motion of the poses before and after."""
     found = []
     for check in checks:
         is_open = float(np.max(check.sigma[:3])) > OPEN_M or not check.is_conclusive

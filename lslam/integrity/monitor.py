@@ -1,4 +1,4 @@
-"""Monitors the poses that a method claims by registering pairs of scans, without the method and without its map."""
+"""Monitors the poses of a method by registering pairs of scans, independently of the method and its map."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ EVERY, LAG_S = 5, 0.45
 FEWEST, LONGEST_S = 2, 0.9
 # Points that make the planes of the first scan, and of the last scan those that are laid on them.
 PLANE_POINTS, LAID_POINTS = 5000, 1200
-# A claim of less, m and rad, is none of motion: what moves all the same is looked for metres away.
+# m and rad; poses that move by less state no motion, which is tested against a motion of metres.
 STILL_M, STILL_RAD = 0.05, float(np.deg2rad(0.3))
 # Another motion than the one found first must explain so many times more points.
 MORE = 1.1
@@ -83,7 +83,7 @@ class IntegrityMonitor(Stateful):
         self._usual = UsualAgreement(registration.min_agreement)
 
     def see(self, position: int, scan: Scan | None, prepared: object, result: ScanResult, sweep: MotionPrior) -> None:
-        """The next scan of the run, None when it could not be read, and what is claimed for it.
+        """The next scan of the run, None when it could not be read, and its result.
 
         prepared : what its method made of it, taken where it fits; sweep : the motion within the scan
         """
@@ -124,7 +124,7 @@ class IntegrityMonitor(Stateful):
         return Seen(position, result.stamp_ns, result.T_world_lidar, source, points.scatter)
 
     def _compare(self, first: Seen, last: Seen) -> None:
-        """Weigh the motion claimed between two scans."""
+        """Test the motion of the poses between two scans."""
         claimed = se3.relative(first.pose, last.pose)
         seconds = (last.stamp_ns - first.stamp_ns) * 1e-9
         for level in self._planes:

@@ -1,4 +1,4 @@
-"""What a linearisation says beside its normal equations: the places in `facts`, an array of `COUNT` sums.
+"""Facts of a linearisation beside its normal equations: the indices in `facts`, an array of `COUNT` sums.
 
 INFORMATION, 1/m2; SQUARED, weighted squared residuals, m2; INLIERS, points within the kernel's width; MATCHED, points that
 found a counterpart; LEVER, information times squared lever arm; ROBUST, robust weights; POPULATION, what points weigh against

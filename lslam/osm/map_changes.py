@@ -1,4 +1,4 @@
-"""What the ground says that the map does not: buildings that scans look through, and walls where no building is.
+"""Changes against the map: absent buildings, through which scans see, and new walls, where no building is.
 
 Both are said only when several keyframes agree, and a building is called absent only when nothing at all stands near its
 outline and walls behind it were seen through it from wherever they were seen.

@@ -1,7 +1,7 @@
 """Overlap removal: displaced buildings taken apart, party walls flush, and everything else as it was measured.
 
-Del Tufo, section 3.5. Contacts are hard constraints between buildings; what each building is known by, from the scans or
-only from the map, decides who gives way. A building that nobody saw is held near its place by the weak knowledge of the map.
+Del Tufo, section 3.5. Contacts are hard constraints between buildings; the information of each building, from scans or
+only from the map's prior, weights its displacement. An unseen building is held near its place by that prior.
 """
 
 from __future__ import annotations

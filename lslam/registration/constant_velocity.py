@@ -61,7 +61,7 @@ class MotionModel(Protocol):
         return None
 
     @property
-    def is_felt(self) -> bool:
+    def is_inertial(self) -> bool:
         """Whether an inertial sensor predicted the newest sweep: a denied or lost scan is searched near there."""
         return False
 

@@ -1,4 +1,4 @@
-"""What walls say about a run: per keyframe where it stands on the map, per building where its walls are really seen.
+"""Matches of seen walls with a map: per keyframe its pose on the map, per building its real place.
 
 Map frame: east, north, m, from the origin of the run's georeference, the buildings as OpenStreetMap has them. Level frame of
 a keyframe: at its LiDAR, z up, x the LiDAR's heading. Planar poses are (3,) x, y (m), yaw (rad) (`geometry.se2`).

@@ -1,4 +1,4 @@
-"""What a comparison of methods holds: plain values that tables, files and the page are written from."""
+"""A comparison of methods: plain values that tables, files and the page are written from."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The motion between two scans, registered from these two alone, beside what their poses claim."""
+"""The motion between two scans, registered from these two alone, beside that of their poses."""
 
 from __future__ import annotations
 

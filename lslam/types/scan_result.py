@@ -17,7 +17,7 @@ MOTION_PRIOR, STATIONARY = "motion prior", "standing"
 
 @dataclass(frozen=True)
 class ScanResult:
-    """What odometry says about one scan.
+    """The result of odometry for one scan.
 
     status : `ok` registered; `bridged` registration failed and the motion prior stands in; `skipped` the scan could
         not be read or was empty, the motion prior stands in

@@ -1,4 +1,4 @@
-"""What a sensitivity study holds: one plain row per run, failures included."""
+"""The rows of a sensitivity study: one per run, failures included."""
 
 from __future__ import annotations
 

@@ -265,7 +265,7 @@ def test_over_a_silence_between_two_sweeps_constant_velocity_predicts() -> None:
         begun(motion)
     stamp = int(stamps[6])
     np.testing.assert_array_equal(deaf.sweep(stamp, Span()).pose, deaf.coasting.predict(stamp))
-    assert not deaf.is_felt
+    assert not deaf.is_inertial
     assert not np.array_equal(told.sweep(stamp, Span()).pose, told.coasting.predict(stamp))
 
 
