@@ -112,11 +112,11 @@ def _between(finding: ExpectedFinding, result: CurveResult, *, is_highest: bool)
     if inside is None:
         return "refuted", f"{said}, and it diverges from {low:g} to {high:g}"
     base = int(np.flatnonzero(curve.values == inside.value)[0])
-    standing = {int(k): _standing(finding, curve, int(k), base, is_highest) for k in np.flatnonzero(known & ~is_inside)}
+    rankings = {int(k): _ranking(finding, curve, int(k), base, is_highest) for k in np.flatnonzero(known & ~is_inside)}
     # Of many values some are better by luck, the best of all is so least.
-    if any(how == "better" and (curve.is_lost[k] or curve.values[k] == best.value) for k, how in standing.items()):
+    if any(how == "better" and (curve.is_lost[k] or curve.values[k] == best.value) for k, how in rankings.items()):
         return "refuted", said
-    sides = [{how for k, how in standing.items() if side[k]} for side in (curve.values < low, curve.values > high)]
+    sides = [{how for k, how in rankings.items() if side[k]} for side in (curve.values < low, curve.values > high)]
     outside = sides[0] | sides[1]
     if outside == {"as good"}:
         return "refuted", f"{said}, and all values outside are as good as {inside.value:g}"
@@ -134,7 +134,7 @@ def _between(finding: ExpectedFinding, result: CurveResult, *, is_highest: bool)
     return "confirmed", said
 
 
-def _standing(finding: ExpectedFinding, curve: Curve, other: int, base: int, is_highest: bool) -> Ranking:
+def _ranking(finding: ExpectedFinding, curve: Curve, other: int, base: int, is_highest: bool) -> Ranking:
     """How the value at index `other` stands against that at `base`."""
     if curve.is_lost[other]:
         if finding.kind == "best_between" or finding.of.endswith("efficiency"):

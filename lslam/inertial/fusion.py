@@ -61,7 +61,7 @@ class InertialMotion(Stateful):
         self._gaps = gaps(imu, config.gap_s)
         self._instant_ns: int | None = None
         self._pose = np.eye(4)
-        # What `weigh` learnt at an instant, ns, for `correct`: the gyroscope, and how well registration knows the place, m2.
+        # From `weigh` at an instant, ns, for `correct`: the gyroscope, and the variance of the registered position, m2.
         self._taught: tuple[int, Gyroscope, Floats] | None = None
         # Until the next `correct`: what the IMU felt since the last scan, and where it expects the LiDAR at a stamp, ns.
         self._felt: Increments | None = None

@@ -72,7 +72,7 @@ class ImuEstimate:
         """The gyroscope, now that registration turned the IMU from R to R_end (3, 3) in the course of `step`.
 
         step : as this estimate finds it `over` the two instants
-        noise : (3, 3) rad2, world axes, of either rotation; None where a registration says nothing of its quality
+        noise : (3, 3) rad2, world axes, of either rotation; None for a registration without covariance
         """
         R_felt = R @ step.rotations[-1]
         if noise is None:
@@ -83,12 +83,12 @@ class ImuEstimate:
         self, imu: ImuStream, step: Increments, R: Floats, R_end: Floats, moved: Floats,
         gyroscope: Gyroscope, noise: Floats | None = None,
     ) -> ImuEstimate:  # fmt: skip
-        """The estimate at the last instant of `step`, now that registration says how the IMU got there.
+        """The estimate at the last instant of `step`, updated by the registered motion over it.
 
         step : as this estimate finds it `over` the two instants
         R, R_end : (3, 3) of the IMU in the world at the first and the last instant; moved : (3,) m in between
         gyroscope : as the turn has `taught`
-        noise : (3, 3) m2, world axes, of either place; None where a registration says nothing of its quality
+        noise : (3, 3) m2, world axes, of either place; None for a registration without covariance
         """
         rest = so3.log((R @ step.rotations[-1]).T @ R_end)
         # The shape of the turn is the gyroscope's, its sum is registration's.

@@ -15,7 +15,7 @@ from lslam.types.state import Stateful
 class KeyframeSelector(Stateful):
     """Takes a registered scan when the sensor has travelled `distance`, or turned by `angle_deg`, since the last taken.
 
-    The first registered scan is one. Scans that were bridged or skipped never are: nobody knows where they belong.
+    The first registered scan is one. Scans that were bridged or skipped never are: their poses are unknown.
     """
 
     STATE = ("_count", "_travelled", "_here", "_last")

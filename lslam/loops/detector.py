@@ -69,7 +69,7 @@ def find_loops(
     candidates = detector.find(clocks, should_stop)
     accepted = sum(c.is_accepted for c in candidates)
     tried = sum(c.stage != LoopStage.THINNED for c in candidates)
-    log.info("loops: %d closed of %d candidates, %d keyframes", accepted, tried, len(store))
+    log.info("loop closures: %d of %d candidates accepted, %d keyframes", accepted, tried, len(store))
     return candidates
 
 

@@ -1,4 +1,4 @@
-"""Buildings along a way nobody knows beforehand: the next circle is asked for in the background, before it is needed.
+"""Buildings along an unknown way: the next circle is requested in the background, before it is needed.
 
 Del Tufo, section 3.1: a circle of `fetch_radius` about the estimate is asked for at once; when the estimate leaves the
 circle of `renew_radius` about that place, the next one is. The caller never waits, so a slow server costs nothing, and a

@@ -1,4 +1,4 @@
-"""Where on the map a run begins: what is given, and the first match over all headings where nobody knows the heading."""
+"""The first pose of a run on the map: as given, or by a first match over all headings where the heading is unknown."""
 
 from __future__ import annotations
 

@@ -134,7 +134,7 @@ class OsmServer:
 
 
 def first_pose(config: OsmConfig) -> Floats:
-    """(3,) of the first scan in the map frame, by origin and heading, which is 0 where nobody knows it."""
+    """(3,) of the first scan in the map frame, by origin and heading, which is 0 where unknown."""
     return np.array(
         [0.0, 0.0, 0.0 if config.heading_deg is None else se2.wrapped(np.radians(90.0 - config.heading_deg))]
     )

@@ -176,7 +176,9 @@ def test_joins_the_clouds_of_a_store(caplog: pytest.LogCaptureFixture) -> None:
     assert len(closures) >= 3
     tried = [c for c in candidates if c.stage != "thinned"]
     assert len(tried) < len(candidates)
-    assert caplog.messages == [f"loops: {len(closures)} closed of {len(tried)} candidates, {len(store)} keyframes"]
+    assert caplog.messages == [
+        f"loop closures: {len(closures)} of {len(tried)} candidates accepted, {len(store)} keyframes"
+    ]
     assert (errors(closures, true) < (0.1, 0.1)).all()
 
 
