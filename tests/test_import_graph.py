@@ -51,9 +51,6 @@ HOMES = {
     "matplotlib": ["reports/"],
 }
 
-# Class names that may still stand twice.
-RECURRING: set[str] = {"Line", "Section"}
-
 
 def modules() -> dict[str, Path]:
     names = {}
@@ -162,7 +159,7 @@ def test_a_class_name_stands_once() -> None:
         for node in ast.walk(ast.parse(path.read_text())):
             if isinstance(node, ast.ClassDef):
                 homes.setdefault(node.name, []).append(name)
-    wrong = {name: places for name, places in homes.items() if len(places) > 1 and name not in RECURRING}
+    wrong = {name: places for name, places in homes.items() if len(places) > 1}
     assert not wrong, wrong
 
 
