@@ -58,9 +58,8 @@ def body_turn(estimate: Floats, truth: Floats) -> BodyTurn | None:
         return None
     A, B = (se3.relative(poses[pairs[:, 0]], poses[pairs[:, 1]]) for poses in (estimate, truth))
     R, x = np.eye(3), np.zeros(6)
-    weights = np.ones((len(pairs), 2))
-    scales = np.ones(2)
-    information = np.zeros((6, 6))
+    # A weak prior at no rotation and no lever arm, for unobservable directions.
+    hold = np.diag(np.repeat([1.0, 1e-2], 3))
     for _ in range(ROUNDS):
         r, J = _linearised(A, B, R, x[3:])
         sizes = np.linalg.norm(r.reshape(len(r), 2, 3), axis=2)
@@ -68,8 +67,6 @@ def body_turn(estimate: Floats, truth: Floats) -> BodyTurn | None:
         weights = np.minimum(SCALE * np.sqrt(3) * scales / np.maximum(sizes, 1e-12), 1.0) / scales**2
         w = np.repeat(weights, 3, axis=1)
         information = np.einsum("nij,ni,nik->jk", J, w, J)
-        # A weak prior at no rotation and no lever arm, for unobservable directions.
-        hold = np.diag(np.repeat([1.0, 1e-2], 3))
         step = -np.linalg.solve(information + hold, np.einsum("nij,ni,ni->j", J, w, r) + hold @ _state(R, x))
         R, x = so3.exp(step[:3]) @ R, x + np.concatenate([np.zeros(3), step[3:]])
         if np.linalg.norm(step) < 1e-9:

@@ -96,8 +96,7 @@ class MapAlignment:
 
 def upright_directions(T_prior: Floats) -> Floats:
     """(6, 6) projector on the sensor's z, roll and pitch at a pose (4, 4), world axes."""
-    R = T_prior[:3, :3]
+    along_z = np.outer(T_prior[:3, 2], T_prior[:3, 2])
     projector = np.zeros((6, 6))
-    projector[:3, :3] = np.outer(R[:, 2], R[:, 2])
-    projector[3:, 3:] = np.eye(3) - np.outer(R[:, 2], R[:, 2])
+    projector[:3, :3], projector[3:, 3:] = along_z, np.eye(3) - along_z
     return projector
