@@ -1,13 +1,16 @@
-"""Fixes tell that odometry drifts, and chance among noisy ones does not."""
+"""Fixes and loops tell how much odometry drifts, and chance among noisy ones does not."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
-from graph_builders import STEP_SIGMAS, ate, measured, truth
+import pytest
+from graph_builders import STEP_SIGMAS, ate, graph_of, measured, truth
 
 from lslam.config.graph import GraphConfig
-from lslam.geometry import se3
-from lslam.graph.drift import drift_factor
+from lslam.geometry import se3, so3
+from lslam.graph.drift import drift_factor, with_drift
 from lslam.graph.pose_graph import optimise, with_distances
 from lslam.graph.problem import PoseGraph, PositionFix
 from lslam.graph.rates import correct_drift
@@ -46,3 +49,27 @@ def test_fixes_still_tell_drift() -> None:
     for seed in range(6):
         assert drift_factor(fixed(seed, 0.5, 0.01), [], CONFIG) > 1.0
         assert drift_factor(fixed(seed, 5.0, 0.1), [], CONFIG) > 1.0
+
+
+@pytest.mark.parametrize("factor", [0.0, 0.25, 1.0, 4.0])
+def test_drift_is_a_walk_beside_what_odometry_says(factor: float) -> None:
+    """A hundred steps of a metre: 2 % per root metre are 20 cm, half a degree per hundred metres 0.05 deg, at factor 1."""
+    own = np.diag([1e-4] * 3 + [1e-6] * 3)
+    steps = [Constraint(k, k + 1, se3.make(np.eye(3), np.array([0.6, 0.0, -0.8])), own) for k in range(100)]
+    config = GraphConfig(drift_percent=2.0, drift_deg_per_100m=0.5)
+    grown = with_drift(PoseGraph(np.tile(np.eye(4), (101, 1, 1)), steps), factor, config)
+    sums = [np.sum([c.covariance for c in each], axis=0) for each in (steps, grown)]
+    drift = np.diag(np.repeat([0.2**2, np.deg2rad(0.05) ** 2], 3))
+    np.testing.assert_allclose(sums[1], sums[0] + factor * drift, rtol=1e-12, atol=1e-18)
+
+
+def test_drift_that_loops_tell_does_not_ask_where_the_world_begins() -> None:
+    """Odometry that thinks ten times too well of itself, and loops that know where they are along their way, not across."""
+    graph = graph_of(REAL, 30, 0, np.random.default_rng(6), 2, 0.01)
+    loops = [replace(c, covariance=np.diag([1e-4, 1.0, 1.0, 1e-6, 1e-2, 1e-2])) for c in graph.loops]
+    found = []
+    for turn in ([0.0, 0.0, 0.0], [0.3, -0.4, 2.0], [0.0, 2.5, 0.5]):
+        T = se3.make(so3.exp(np.array(turn)), np.array([50.0, -20.0, 5.0]))
+        found.append(drift_factor(replace(graph, poses=T @ graph.poses), loops, CONFIG))
+    assert found[0] > 0
+    np.testing.assert_allclose(found, found[0], rtol=0.02)
