@@ -143,6 +143,17 @@ def test_a_start_that_is_doubted_moves_though_up_is_seen(is_doubted: bool, x: fl
     np.testing.assert_allclose(solution.poses[:, 1:3, 3], 0.0, atol=1e-3)
 
 
+def test_gravity_bends_no_trajectory_to_a_first_guess_of_it() -> None:
+    """Straight on for 200 m in a world that is two degrees askew, as all the keyframes feel: it was the guess that was wrong."""
+    poses = np.tile(np.eye(4), (21, 1, 1))
+    poses[:, 0, 3] = 10.0 * np.arange(21)
+    loose = np.diag([1e-4] * 3 + [1e-4] * 3)
+    steps = [Constraint(k, k + 1, se3.relative(poses[k], poses[k + 1]), loose) for k in range(20)]
+    up = so3.exp(np.deg2rad([1.2, 1.6, 0.0]))[:, 2]
+    graph = PoseGraph(poses, steps, ups=[UpDirection(k, up, 0.002) for k in range(21)])
+    np.testing.assert_allclose(optimise(graph, GraphConfig()).poses, poses, atol=1e-3)
+
+
 def test_inliers_make_poses_surer_where_up_is_measured_too() -> None:
     """Two steps of 0.1 m and a loop of 0.05 m: along the way 1 / (1 / 0.02 + 1 / 0.0025) m2, and 0.02 beside a wrong loop."""
     poses = np.tile(np.eye(4), (3, 1, 1))
