@@ -101,3 +101,18 @@ def test_a_fix_is_an_inlier_within_its_own_sigma_and_what_odometry_drifts(sigma:
         assert found is not None
         assert found.inliers[60] == is_inlier
         assert found.inliers.sum() == 199 + is_inlier
+
+
+@pytest.mark.parametrize(("metres", "is_inlier"), [(0.7, True), (1.3, False)])
+def test_a_tilt_lifts_what_lies_aside_and_not_what_is_above(metres: float, is_inlier: bool) -> None:
+    """A shaft of 100 m, 10 m wide, and a height that is wrong: 0.05 rad of tilt lift by 0.25 m there, however high it is."""
+    limit = np.sqrt(chi2.ppf(0.999, 3)) * np.hypot(0.05, 0.05 * 5.0)
+    phase = np.linspace(0, 2 * np.pi * 9, 200)
+    shaft = np.column_stack([5 * np.cos(phase), 5 * np.sin(phase), np.linspace(-50, 50, 200)])
+    fixes = shaft.copy()
+    fixes[[3, 190], 2] += metres
+    assert 0.7 < limit < 1.3
+    found = align(shaft, fixes, np.full((200, 3), 0.05), np.zeros(200), np.array([0.0, 0.0, 1.0]), 0.05, 5)
+    assert found is not None
+    assert found.inliers.sum() == 198 + 2 * is_inlier
+    assert found.inliers[[3, 190]].tolist() == [is_inlier] * 2
