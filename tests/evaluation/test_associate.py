@@ -89,9 +89,11 @@ def test_seconds_count_from_the_first_match(truth: Trajectory) -> None:
 def test_files_without_stamps_go_by_index(truth: Trajectory) -> None:
     bare = replace(truth, has_stamps=False)
     both = associate(bare, bare)
-    assert "by index" in both.recipe
+    assert both.recipe.endswith("because estimate and ground truth have no stamps")
     assert both.seconds is None
-    one = associate(bare, truth)
+    one, other = associate(bare, truth), associate(truth, bare)
+    assert one.recipe.endswith("because estimate has no stamps")
+    assert other.recipe.endswith("because ground truth has no stamps")
     assert one.seconds is not None
     assert one.stamps_ns.tolist() == truth.stamps_ns.tolist()
     with pytest.raises(InputError, match=r"counts differ: 299 poses .* 300 .*--times"):
@@ -109,6 +111,15 @@ def test_stamps_between_scans_name_the_distance(truth: Trajectory) -> None:
     with pytest.raises(InputError, match=r"0\.050 s apart \(median\): raise --max-diff"):
         associate(between, truth)
     assert len(associate(between, truth, max_diff=0.06).stamps_ns) >= 299
+
+
+@pytest.mark.parametrize("which", ["last", "first"])
+def test_recordings_that_share_an_instant_share_time(which: str, truth: Trajectory) -> None:
+    """One begins where the other ends: no clock need be shifted by as much as one of them lasts."""
+    whole = int(truth.stamps_ns[-1] - truth.stamps_ns[0])
+    moved = replace(truth, stamps_ns=truth.stamps_ns + (whole if which == "last" else -whole))
+    with pytest.raises(InputError, match=r"only 1 poses match .* apart \(median\): raise --max-diff"):
+        associate(moved, truth)
 
 
 def test_a_range_of_time_in_words(truth: Trajectory) -> None:

@@ -76,7 +76,7 @@ def test_noise_alone_is_no_turn(seed: int) -> None:
 
 
 def test_what_the_motion_does_not_tell_is_not_judged() -> None:
-    """Straight on nothing tells a roll, whatever the noise; yaw shows."""
+    """Straight on nothing tells a roll, whatever the noise; yaw shows. Without noise: to a radian, and to what drift leaves."""
     truth = drive(300, bend=0.0, relief=0.0)
     odometry = noisy(truth, 0.02, 0.02, 0)
     roll, yaw = (body_turn(odometry, turned(truth, v)) for v in (np.array([20.0, 0, 0]), np.array([0, 0, 5.0])))
@@ -86,6 +86,10 @@ def test_what_the_motion_does_not_tell_is_not_judged() -> None:
     assert np.rad2deg(np.sqrt(roll.covariance[0, 0])) > 2.0
     assert yaw.squared > 30.7
     assert body_turn(truth[:20], truth[:20]) is None, "20 m are no way"
+    assert body_turn(truth[[0] * 300], truth[[0] * 300]) is None, "nor is standing for long"
+    still = body_turn(truth, truth)
+    assert still is not None
+    np.testing.assert_allclose(np.sqrt(np.diag(still.covariance)), [1.0, 0.01, 0.01], rtol=1e-3)
 
 
 def test_poses_that_are_missing_in_the_middle_are_no_turn() -> None:
