@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -21,6 +22,19 @@ def test_finds_up_in_a_tilted_world(tilt: tuple[float, float]) -> None:
     clouds = [seen(world, pose(x, -45), rng) for x in (-20.0, 15.0)]
     maps = [make_level_submap((cloud @ R.T).astype(np.float32), RegistrationConfig()).fine for cloud in clouds]
     assert np.rad2deg(np.arccos(find_up(maps) @ R[:, 2])) < 1.0
+
+
+@pytest.mark.parametrize(("slope_deg", "up_deg"), [(12.0, 4.0), (21.0, 7.0), (24.0, 0.0)])
+def test_up_is_the_mean_of_what_is_level_to_fifteen_degrees(slope_deg: float, up_deg: float) -> None:
+    """Two thirds of the ground are flat: the mean normal of all leans over by a third of what the other third slopes."""
+    tilts = np.deg2rad([0.0, 0.0, slope_deg])
+    planes = np.zeros((3, 8))
+    planes[:, 3], planes[:, 5] = np.sin(tilts), np.cos(tilts)
+    planes[1, 3:6] *= -1  # which side of a plane was seen says nothing
+    walls = np.zeros((2, 8))
+    walls[:, 3] = 1.0
+    up = find_up([SimpleNamespace(planes=np.concatenate([planes, walls]))])  # type: ignore[list-item]
+    assert np.rad2deg(np.arctan2(up[0], up[2])) == pytest.approx(up_deg, abs=0.1)
 
 
 def test_up_stays_z_where_nothing_is_level() -> None:

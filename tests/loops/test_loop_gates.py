@@ -19,6 +19,7 @@ from lslam.loops.gating import RelativeUncertainty
 from lslam.loops.scan_context import PlaceMatch
 from lslam.loops.verify import Verification, Verifier, _is_elsewhere
 from lslam.registration.solver import RegistrationResult
+from lslam.types.constraint import LoopCandidate, LoopStage, Verdict
 
 Floats = NDArray[np.float64]
 # Sigmas of odometry: 2 m along x, 0.5 m across, and three degrees.
@@ -163,6 +164,25 @@ def test_what_fits_and_is_too_far_from_odometry_is_refused_by_the_gate(shift: fl
     assert candidate.stage == stage
     assert candidate.verdict == ("accepted" if stage == "agreement" else "rejected")
     assert bool(candidate.reason) == (stage == "gate")
+
+
+@pytest.mark.parametrize(
+    ("verdict", "stage", "is_asked"),
+    [
+        (Verdict.ACCEPTED, LoopStage.AGREEMENT, False),
+        (Verdict.REJECTED, LoopStage.AMBIGUITY, False),
+        (Verdict.REJECTED, LoopStage.OVERLAP, True),
+    ],
+)
+def test_odometrys_nearest_is_asked_when_nothing_fits_and_nothing_fits_twice(
+    verdict: Verdict, stage: LoopStage, is_asked: bool
+) -> None:
+    """Where a place fits twice, no other can be told from it either."""
+    gate = detector()
+    gate._choose = lambda b, older: ([PlaceMatch(0, 0.1, 0.0)], PlaceMatch(1, 0.2, 0.0))  # type: ignore[method-assign]
+    gate._examine = lambda match, b: LoopCandidate(match.number, b, 0.0, match.distance, verdict, stage)  # type: ignore[method-assign]
+    examined = gate._examined(2, np.arange(2))
+    assert [(c.a, c.verdict, c.stage) for c in examined] == [(a, verdict, stage) for a in range(1 + is_asked)]
 
 
 def agree(gap: tuple[float, ...], **settings: float) -> Verification:

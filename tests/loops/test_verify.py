@@ -201,3 +201,14 @@ def test_what_stands_supports_a_start_within_two_kernels(metres: float, support:
     T = se3.make(np.eye(3), np.array([0.0, metres, 0.0]))
     found = Verifier(LoopsConfig(), RegistrationConfig())._support(a, b.upright, seen, T)
     assert found == pytest.approx(support, abs=0.05)
+
+
+@pytest.mark.parametrize(("metres", "support"), [(7.0, 1.0), (3.0, 0.0)])
+def test_a_start_has_support_where_a_quarter_of_what_stands_was_seen(metres: float, support: float) -> None:
+    """Of a wall of 24 m the other place saw so many, and as far as the next cell: all that can be compared fits."""
+    along, up = np.mgrid[-12:12:0.1, 0:6:0.1].reshape(2, -1)
+    wall = np.column_stack([along, np.full_like(along, 8.05), up]).astype(np.float32)
+    a, b = (make_place(part, RegistrationConfig()) for part in (wall[along < metres - 12], wall))
+    seen = LARGE.cover(a.standing, a.floor).ravel() > 0
+    found = Verifier(LoopsConfig(), RegistrationConfig())._support(a, b.upright, seen, np.eye(4))
+    assert found == pytest.approx(support, abs=0.2)
