@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lslam.geometry import se3, so3
-from lslam.inertial.agreement import Agreement, _hardly_turning, check_agreement
+from lslam.inertial.agreement import Agreement, _hardly_turning, check_agreement, turns
 from lslam.inertial.imu_cleaning import ImuRefusedError
 from lslam.types.imu import ImuStream
 
@@ -89,3 +89,18 @@ def test_a_gyroscope_that_turns_twice_as_much_as_anything_shows_is_refused(
         found = _hardly_turning(*rates, np.eye(4))
         assert not found.is_judged
         np.testing.assert_allclose(found.gyro_bias, [0.01, 0.0, 0.0], atol=1e-12)
+
+
+@pytest.mark.parametrize(("scans", "heard", "is_told"), [(41, 19, False), (41, 20, True), (7, 5, True), (7, 4, False)])
+def test_turns_are_compared_where_half_of_them_were_felt_and_five_at_the_least(
+    scans: int, heard: int, is_told: bool
+) -> None:
+    """Turns from scan to scan at 10 Hz, of which the stream reaches over so many."""
+    stamps, yaw = SCAN_NS * np.arange(scans), 0.02 * np.arange(scans) ** 2
+    samples = np.arange(0, heard * SCAN_NS + 1, IMU_NS)
+    gyro = np.zeros((len(samples), 3))
+    gyro[:, 2] = 4e-9 * samples
+    poses = se3.make(so3.exp(yaw[:, None] * [0.0, 0, 1]), np.zeros((scans, 3)))
+    seen, felt = turns(ImuStream(samples, np.zeros_like(gyro), gyro), np.eye(4), stamps, poses, 0.0)
+    assert len(seen) == len(felt) == (heard if is_told else 0)
+    np.testing.assert_allclose(felt, seen, atol=1e-9)

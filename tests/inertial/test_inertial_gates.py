@@ -130,6 +130,22 @@ def test_the_first_speed_is_as_sure_as_the_scans_show_a_path_without_noise() -> 
     assert errors < sigmas < 1.6 * errors
 
 
+@pytest.mark.parametrize(("scan_ns", "used"), [(SCAN_NS, 8), (3 * SCAN_NS, 4)])
+def test_the_first_speed_is_that_of_the_first_scans_alone(scan_ns: int, used: int) -> None:
+    """Of 0.8 s, or of four scans where they are slow; 3 m/s, and whatever becomes of the path from then on."""
+    stamps = np.arange(0, 3_100_000_000, IMU_NS)
+    imu = ImuStream(stamps, np.tile([0.0, 0.0, 9.8], (len(stamps), 1)), np.zeros((len(stamps), 3)))
+    known = ImuEstimate(np.zeros(3), np.array([0, 0, -9.8]), np.zeros(3), Gyroscope(np.zeros(3)), np.zeros((9, 9)))
+    scans = scan_ns * np.arange(10)
+    poses = np.tile(np.eye(4), (10, 1, 1))
+    poses[:, 0, 3] = 3e-9 * scans
+    for spoilt, is_right in ((used, True), (used - 1, False)):
+        poses[spoilt:, 1, 3] = 0.5
+        velocity, _, sigma = _path_of_force(imu, poses, scans, known, 0.8)
+        assert (np.abs(velocity - [3.0, 0.0, 0.0]).max() < 1e-6) == is_right
+        assert (sigma < 1e-6) == is_right
+
+
 def test_turns_that_hardly_fit_better_at_the_edge_tell_nothing_of_the_clock() -> None:
     """A turn that grows evenly, all but, felt 0.3 s too late: the best of a quarter of a second is none."""
     stamps = np.arange(0, 13_000_000_000, IMU_NS)
