@@ -208,7 +208,7 @@ def test_a_start_has_support_where_a_quarter_of_what_stands_was_seen(metres: flo
     """Of a wall of 24 m the other place saw so many, and as far as the next cell: all that can be compared fits."""
     along, up = np.mgrid[-12:12:0.1, 0:6:0.1].reshape(2, -1)
     wall = np.column_stack([along, np.full_like(along, 8.05), up]).astype(np.float32)
-    a, b = (make_place(part, RegistrationConfig()) for part in (wall[along < metres - 12], wall))
-    seen = LARGE.cover(a.standing, a.floor).ravel() > 0
+    a, b = (make_level_submap(part, RegistrationConfig()) for part in (wall[along < metres - 12], wall))
+    seen = LARGE.cover(a.non_ground, a.ground).ravel() > 0
     found = Verifier(LoopsConfig(), RegistrationConfig())._support(a, b.upright, seen, np.eye(4))
     assert found == pytest.approx(support, abs=0.2)

@@ -78,6 +78,22 @@ def test_what_is_taken_up_again_learns_as_if_nothing_had_been() -> None:
     np.testing.assert_array_equal(*after)
 
 
+@pytest.mark.parametrize("passed", [0.0, 0.5])
+def test_a_sweep_that_outlasts_the_way_to_the_next_teaches_no_more_than_one_that_fills_it(passed: float) -> None:
+    """Stamps that come in bursts make it look so. The velocity is what was wrong, and it is the same."""
+    full, longer, step = DeskewUncertainty(), DeskewUncertainty(), round(1e9 * SPAN)
+    for k in range(6):
+        priors = [MotionPrior(n * t, np.stack([at(k + 10.0 * n * s) for s in t])) for n in (1, 2)
+                  for t in [(np.linspace(0.0, 1.0, 5) - passed) * SPAN]]  # fmt: skip
+        pose = at(k + 0.01 * (-1) ** k)
+        S = [
+            one.observe(prior, k * step, pose, is_registered=True)
+            for one, prior in zip((full, longer), priors, strict=True)
+        ]
+    assert S[0][0, 0] > 1e-7
+    np.testing.assert_allclose(S[1], S[0], rtol=1e-9, atol=1e-15)
+
+
 def test_uncertainty_lies_along_the_axes_of_the_world() -> None:
     """The same motion in a world that is turned: the same doubt, turned."""
     rng = np.random.default_rng(2)
