@@ -116,3 +116,11 @@ def test_a_tilt_lifts_what_lies_aside_and_not_what_is_above(metres: float, is_in
     assert found is not None
     assert found.inliers.sum() == 198 + 2 * is_inlier
     assert found.inliers[[3, 190]].tolist() == [is_inlier] * 2
+
+
+def test_two_fixes_have_a_heading_where_no_more_are_asked_for() -> None:
+    ends = PATH[[0, 50]]
+    fixes = se3.apply(T_ENU_WORLD, ends)
+    found = align(ends, fixes, np.full((2, 3), 0.1), np.zeros(2), UP, 1e-6, 2)
+    assert found is not None
+    np.testing.assert_allclose(found.T_enu_world, T_ENU_WORLD, atol=1e-3)

@@ -81,6 +81,12 @@ def test_loops_far_away_have_no_say() -> None:
     assert said[3].startswith("only 0%")
 
 
+def test_a_loop_that_was_voted_out_has_no_say_any_more() -> None:
+    """Fifty metres from either neighbour, and a hundred off: it goes, and the two that are left agree."""
+    said = there_and_back([shift(0.0), shift(100.0), shift(0.0)], [0.0, 50.0, 100.0])
+    assert said == ["", "only 0% of the loops around it agree with it", ""]
+
+
 @pytest.mark.parametrize("origin", [(0.0, 0.0), (-700.0, 2000.0)])
 def test_odometry_is_asked_first(origin: tuple[float, float]) -> None:
     """A per cent of a way of 1,000 m, and half a degree per 100 m of it over the mean distance of that way."""
@@ -118,6 +124,7 @@ def test_the_last_word_is_that_of_the_chi_square_distribution() -> None:
     limit = float(np.sqrt(chi2.ppf(0.999, 3)))
     found = pulled([0.5, 0.95 * limit, 1.05 * limit, 2 * limit, 5 * limit, 30 * limit])
     assert found.weights.tolist() == [1, 1, 0, 0, 0, 0]
+    assert pulled([0.5, 1.05 * limit]).weights.tolist() == [1, 0]
     np.testing.assert_allclose(found.limits, limit**2, rtol=1e-4)
     np.testing.assert_allclose(np.sqrt(found.squared) / limit, [0.5 / limit, 0.95, 1.05, 2, 5, 30], rtol=1e-4)
 
