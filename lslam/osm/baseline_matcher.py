@@ -1,4 +1,4 @@
-"""The second thesis' baseline whole: buildings and trajectory move each other, keyframe by keyframe."""
+"""Del Tufo's baseline: buildings and trajectory move each other, keyframe by keyframe."""
 
 from __future__ import annotations
 
