@@ -192,11 +192,20 @@ def test_files_and_functions_of_the_architecture_exist() -> None:
     assert len(answers) > 12
     for row in answers:
         paths = [ROOT / name for name in re.findall(r"`(\S+)`", row[1])]
-        bodies = [node for path in paths for node in ast.parse(path.read_text(encoding="utf-8")).body]
-        defined = {node.name for node in bodies if isinstance(node, (ast.FunctionDef, ast.ClassDef))}
-        names = set(re.findall(r"`(\w+)`", row[2]))
+        nodes = [node for path in paths for node in ast.parse(path.read_text(encoding="utf-8")).body]
+        names = set(re.findall(r"`([\w.]+)`", row[2]))
         assert names
+        defined = set().union(*map(_defined, nodes))
         assert names <= defined, row
+
+
+def _defined(node: ast.stmt) -> set[str]:
+    """What a statement of a module defines: a function, a table, a class and its methods."""
+    if isinstance(node, ast.ClassDef):
+        return {node.name} | {f"{node.name}.{f.name}" for f in node.body if isinstance(f, ast.FunctionDef)}
+    if isinstance(node, ast.Assign):
+        return {target.id for target in node.targets if isinstance(target, ast.Name)}
+    return {node.name} if isinstance(node, ast.FunctionDef) else set()
 
 
 def test_layers_of_the_architecture_are_those_that_are_tested() -> None:
