@@ -64,6 +64,13 @@ def test_a_clock_is_found_by_a_poor_registration() -> None:
         assert found.offset_sigma_s < 0.02
 
 
+@pytest.mark.parametrize("late_s", [0.0165, 0.0175, -0.021])
+def test_a_clock_is_found_between_the_offsets_that_are_tried(late_s: float) -> None:
+    """Those are 5 ms apart."""
+    found = compared(0.0, 0, weave_deg_s=20.0, late_s=late_s)
+    assert found.offset_s == pytest.approx(-late_s, abs=4e-4)
+
+
 def test_turns_that_drown_in_noise_are_judged_by_nobody() -> None:
     """They would pass for an IMU whose rates are too small; quick ones, for turns that no scan shows. Degrees are too many."""
     for seed in range(5):
