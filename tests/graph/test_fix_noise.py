@@ -104,6 +104,19 @@ def test_the_common_part_is_found_on_a_way_without_a_bend(ahead: tuple[float, fl
     assert found.sigma[0] == pytest.approx(np.hypot(0.8 / np.sqrt(2), 0.2), abs=0.15)
 
 
+def test_where_a_trajectory_was_laid_says_nothing_of_the_fixes() -> None:
+    """Place and heading were fitted: another place, and a little turn, are as likely (restricted likelihood)."""
+    rng, seconds = np.random.default_rng(5), 3.0 * np.arange(40.0)
+    path = 60 * np.column_stack([np.cos(seconds / 12), np.sin(seconds / 12), 0 * seconds])
+    residuals = 0.6 * np.sin(seconds / 9)[:, None] * [1.0, -1.0, 0.5] + 0.2 * rng.normal(size=(40, 3))
+    moved = residuals + [30.0, -20.0, 10.0] + np.cross([0.0, 0.0, 1e-3], path)
+    one, other = (wander_of(seconds, r, np.ones((40, 3)), path, 0.999, drift_of(path)) for r in (residuals, moved))
+    assert one[0] is not None
+    assert other[0] is not None
+    assert (other[1], other[0].memory) == (one[1], one[0].memory)
+    np.testing.assert_allclose(other[0].sigma, one[0].sigma, rtol=1e-3)
+
+
 def test_nothing_is_told_of_fixes_out_of_order_or_alone() -> None:
     flat, one = np.zeros((3, 3)), np.ones((3, 3))
     assert fit_gauss_markov(np.array([0.0, 1.0, 1.0]), flat, one, flat, 0.999, drift_of(flat)) == (None, 0.0)
