@@ -68,6 +68,7 @@ def test_holes_of_dense_truth_are_not_bridged() -> None:
     every = replace(dense.select(slice(5, 2900, 10)), stamps_ns=dense.stamps_ns[5:2900:10] + 4_000_000)
     matches = associate(every, holed)
     inside = (matches.stamps_ns > dense.stamps_ns[1000]) & (matches.stamps_ns < dense.stamps_ns[1499])
+    assert "interpolated" in matches.recipe, "it is as dense as it was elsewhere"
     assert not inside.any()
     assert len(matches.stamps_ns) == pytest.approx(240, abs=2)
 
