@@ -14,8 +14,14 @@ Table = Mapping[str, tuple[str, str]]
 
 
 def registered(group: str, own: Mapping[str, object]) -> dict[str, EntryPoint]:
-    """What other packages register under `group`, by name; they cannot take the name of anything of our `own`."""
-    return {entry.name: entry for entry in entry_points(group=group) if entry.name not in own}
+    """What other packages register under `group`, by name; they cannot take the name of anything of our `own`.
+
+    Of two packages with one name the first in the alphabet has it, whatever was installed last.
+    """
+    entries = sorted(
+        entry_points(group=group), key=lambda entry: "" if entry.dist is None else entry.dist.name, reverse=True
+    )
+    return {entry.name: entry for entry in entries if entry.name not in own}
 
 
 def known(group: str, own: Table) -> dict[str, str]:

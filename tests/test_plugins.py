@@ -102,6 +102,25 @@ def test_a_broken_one_is_one_sentence_that_names_the_package(theirs: Path, code:
         create_odometry(config(odometry={"method": "broken"}))
 
 
+@pytest.mark.parametrize("code", ["import nowhere\n", "def locate(path):\n    return path.nothing\n"])
+def test_a_broken_reader_does_not_hide_what_ours_say(theirs: Path, tmp_path: Path, code: str) -> None:
+    (theirs.parent / "theirs.py").write_text(code)
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "empty" / "notes.txt").touch()
+    with pytest.raises(
+        InputError, match=r"holds no scans: .*; reader 'theirs' .*(ModuleNotFoundError|AttributeError): "
+    ):
+        open_sequence(tmp_path / "empty")
+
+
+def test_of_two_packages_with_one_name_the_order_of_installation_decides_nothing(theirs: Path) -> None:
+    info = theirs.parent / "also-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: also\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text("[lslam.methods]\ntheirs = also:method\n")
+    assert known_methods()["theirs"] == "from also:method"
+
+
 def test_what_nobody_has_is_refused_before_a_run() -> None:
     with pytest.raises(UsageError, match="no place descriptor 'scan-contxt'; did you mean 'scan-context'"):
         check_config(config(loops={"descriptor": "scan-contxt"}))

@@ -113,7 +113,7 @@ def _config(given: dict[str, Any]) -> EvalConfig:
             offset = float(offset)
         except ValueError:
             raise UsageError(f"--time-offset {offset}: seconds, or auto") from None
-    words = [word for text in given["metrics"] for word in text.split(",") if word]
+    words = options.metrics_of(given["metrics"])
     flags = {"metrics": words, "align": align, "delta": deltas, "max_diff": given["max_diff"], "time_offset": offset}
     values.update({key: value for key, value in flags.items() if value not in (None, [])})
     for delta in values["delta"]:

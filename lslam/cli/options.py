@@ -229,6 +229,11 @@ def metrics(function: F) -> F:
     )(function)
 
 
+def metrics_of(texts: Iterable[str]) -> list[str]:
+    """The words of --metrics, with commas or in several."""
+    return [word for text in texts for word in text.split(",") if word]
+
+
 def numbers(flag: str, text: str, counts: tuple[int, ...], example: str) -> list[float]:
     """The comma-separated numbers of a flag; raises UsageError when they are not so many."""
     try:

@@ -144,9 +144,7 @@ def _resolve(given: dict[str, Any]) -> Config:
 
     flags = {
         "odometry.method": given["method"],
-        "eval.metrics": json.dumps([word for text in given["metrics"] for word in text.split(",")])
-        if given["metrics"]
-        else None,
+        "eval.metrics": json.dumps(options.metrics_of(given["metrics"])) if given["metrics"] else None,
         "registration.residual": given["residual"],
         "input.start": given["start"],
         "input.count": given["count"],

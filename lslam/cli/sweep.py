@@ -76,9 +76,14 @@ def command(study: str | None, **given: Any) -> None:
         on_rows = stack.enter_context(best_so_far())
         rows = run_sweep(sweep, engine, bars(stack), on_rows)
     _print(rows)
-    unscored = [row for row in rows if row.is_usable and isnan(row.error) and row.reason]
+    unscored = [row for row in rows if row.is_usable and isnan(row.error)]
     if unscored:
-        log.warning("%d of %d runs have no score, the first one: %s", len(unscored), len(rows), unscored[0].reason)
+        log.warning(
+            "%d of %d runs have no score, the first one: %s",
+            len(unscored),
+            len(rows),
+            unscored[0].reason or "its metric is not available",
+        )
     log.info("every run: %s", sweep.output.out / "results.csv")
     _report(sweep.output.out)
     failed = [row for row in rows if not row.is_usable]

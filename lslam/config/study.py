@@ -107,6 +107,10 @@ class StudySequence(ScanRange):
         return self.path or self.scenario
 
 
+# The errors that a study may be judged by.
+StudyMetric = Literal["ate_se3", "ate_origin", "thesis_rmse"]
+
+
 class StudyConfig(Section):
     """What is run: sequences x seeds x methods x points of the parameters, and methods beside at their own values."""
 
@@ -117,7 +121,7 @@ class StudyConfig(Section):
     beside: tuple[str, ...] = Field((), description="likewise, run once at their own values")
     imu: Literal["off", "on", "both"] = Field("off", description="without the IMU, with it, or each method both ways")
     seeds: tuple[int, ...] = Field((0,), min_length=1, description="of simulations, and of methods that draw")
-    metric: Literal["ate_se3", "ate_origin", "thesis_rmse"] = Field("ate_se3", description="the error it judges by, m")
+    metric: StudyMetric = Field("ate_se3", description="the error it judges by, m")
     grid: Literal["full", "one-way"] = Field(
         "full", description="all combinations of the parameters' values, or one parameter at a time"
     )

@@ -13,8 +13,9 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import fields
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
+from lslam.config.study import StudyMetric
 from lslam.errors import InputError, cause
 from lslam.formats.atomic import write_text
 from lslam.types.study import StudyRow, Value
@@ -87,6 +88,8 @@ def read_study_csv(path: Path) -> list[StudyRow]:
 
 def _row(cells: dict[str, str]) -> StudyRow:
     values: dict[str, Any] = {name: _READ[kind](cells[name]) for name, kind in _PLAIN.items()}
+    if values["metric"] not in get_args(StudyMetric):
+        raise ValueError(f"metric {values['metric']!r} is none of {', '.join(get_args(StudyMetric))}")
     stages = {name.removeprefix(STAGE): float(text) for name, text in cells.items() if name.startswith(STAGE) and text}
     parameters = {
         name: _value(text) for name, text in cells.items() if "." in name and not name.startswith(STAGE) and text

@@ -73,11 +73,11 @@ def find_loops(
     return candidates
 
 
-def warm_up() -> None:
+def warm_up(config: LoopsConfig) -> None:
     """Compile or load every kernel that loop closure detection needs, with a small room."""
     room = np.random.default_rng(0).uniform(-8, 8, (3000, 3)).astype(np.float32)
     room[np.arange(3000), np.arange(3000) % 3] = 8.0
-    create_descriptor(LoopsConfig()).add(0, room)
+    create_descriptor(config).add(0, room)
     submap_of_room = make_level_submap(room, RegistrationConfig())
     Verifier(LoopsConfig(), RegistrationConfig()).verify(
         submap_of_room, submap_of_room, np.zeros(3), LEAST_REACH, [0.0]

@@ -29,7 +29,7 @@ from lslam.types.stage_clock import KeyframeClocks, StageClock
 
 Floats = NDArray[np.float64]
 
-# Keyframes after which the baseline's graph is optimised again; the thesis' timer does so every 3 s.
+# Keyframes after which the baseline's graph is optimised again; Del Tufo's timer does so every 3 s.
 EVERY = 5
 ONLY_START = "the baseline lays buildings from there and holds no keyframe by it"
 

@@ -48,8 +48,12 @@ def imu_digest(sequence: Sequence) -> str:
 
 
 def job_digest(config: Config, of_input: str, of_imu: str = "") -> str:
-    """Digest of a run: its resolved configuration, its input, the IMU if it uses one, and lslam's version."""
-    said: dict[str, Any] = {"config": config.model_dump(mode="json"), "input": of_input, "lslam": __version__}
+    """Digest of a run: its resolved configuration, its input, the IMU if it uses one, and lslam's version.
+
+    Which metrics are shown makes no other run.
+    """
+    known = config.model_dump(mode="json", exclude={"eval": {"metrics"}})
+    said: dict[str, Any] = {"config": known, "input": of_input, "lslam": __version__}
     if config.imu.use:
         said["imu"] = of_imu
     return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()

@@ -140,7 +140,7 @@ def _warm_up(
         if monitor is not None and not is_over:
             monitor.warm_up()
         if config.loops.use:
-            detector.warm_up()
+            detector.warm_up(config.loops)
         if config.osm.extract:
             prior.warm_up()
         if config.map.write:

@@ -20,8 +20,8 @@ from lslam.types.trajectory import Trajectory
 from lslam.untrusted import MISFIT, parse_json, parse_toml
 from lslam.version import __version__
 
-# Keys that change no byte of the result.
-FREE = ("input.threads", "odometry.checkpoint_s", "keyframes.deflate")
+# Keys that change no byte of the result, or only which of its metrics are shown.
+FREE = ("input.threads", "odometry.checkpoint_s", "keyframes.deflate", "eval.metrics")
 
 
 def run_identity(
@@ -91,6 +91,9 @@ def _difference(
         return f"it was begun by lslam {version}, this is {__version__}"
     before, now = (_flat(tree) for tree in (begun, printable_tree(config.model_dump(mode="json"))))
     changed = [key for key in sorted(before | now) if before.get(key) != now.get(key) and key not in FREE]
+    unknown = set(_flat(printable_tree(Config().model_dump(mode="json")))) - set(before)
+    if changed and set(changed) <= unknown:
+        return f"it was begun by an earlier lslam, which had no {', '.join(changed)}"
     if changed:
         said = [f"{key} was {before.get(key)!r} and is {now.get(key)!r}" for key in changed[:3]]
         return f"the configuration differs: {', '.join(said)}{', ...' if len(changed) > 3 else ''}"

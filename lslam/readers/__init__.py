@@ -6,12 +6,11 @@ Others register such a module as entry point `lslam.readers`; it is asked about 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from lslam.errors import InputError, UsageError, cause
+from lslam.errors import InputError, LslamError, UsageError, cause
 from lslam.formats.sequence_toml import SequenceInfo, is_rate
 from lslam.formats.transform_text import read_transform
 from lslam.plugins import load, registered
@@ -96,19 +95,27 @@ def open_sequence(
 
 
 def _open(folder: Path, overrides: SequenceInfo) -> Sequence:
-    for reader in _readers():
-        located = reader.locate(folder)
-        if located is not None:
-            sequence: Sequence = reader.open_folder(located[0], overrides, located[1])
+    for dotted in READERS.values():
+        sequence = _opened_by(import_module(dotted), folder, overrides)
+        if sequence is not None:
             return sequence
-    raise InputError(_nothing_in(folder))
-
-
-def _readers() -> Iterator[Any]:
-    """Ours, then those of other packages."""
-    yield from map(import_module, READERS.values())
+    nothing = _nothing_in(folder)
     for entry in registered(GROUP, READERS).values():
-        yield load(entry, "reader")
+        try:
+            sequence = _opened_by(load(entry, "reader"), folder, overrides)
+        except LslamError as error:
+            nothing += f"; {error}"
+        except Exception as error:
+            nothing += f"; reader {entry.name!r} failed on it: {type(error).__name__}: {error}"
+        else:
+            if sequence is not None:
+                return sequence
+    raise InputError(nothing)
+
+
+def _opened_by(reader: Any, folder: Path, overrides: SequenceInfo) -> Sequence | None:
+    located = reader.locate(folder)
+    return None if located is None else reader.open_folder(located[0], overrides, located[1])
 
 
 def _nothing_in(folder: Path) -> str:

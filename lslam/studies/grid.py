@@ -15,11 +15,11 @@ from lslam.pipeline.identity import imu_digest, input_digest, job_digest
 from lslam.printable import file_safe
 from lslam.readers import open_sequence
 from lslam.readers.lookup import find_folder
+from lslam.readers.raw_drive import with_imu
 from lslam.studies.output import SIMULATED, OutputOptions
 from lslam.studies.scenes import Scene, drive_of, scene_digest, scene_folder
 from lslam.studies.subjects import check_range, scans_needed, with_range
 from lslam.studies.variants import Variant, free_name
-from lslam.types.trajectory import Trajectory
 
 if TYPE_CHECKING:
     from lslam.types.trajectory import Trajectory
@@ -127,9 +127,9 @@ def recorded_cell(
 
     Raises InputError when it cannot be opened, or has no IMU and some run asks for one; UsageError when it ends before `own`.
     """
-    sequence = open_sequence(path, data_root=data_root, imu=needs_imu)
+    sequence = open_sequence(path)
     check_range(label, own, len(sequence))
-    imu = imu_digest(sequence) if needs_imu else ""
+    imu = imu_digest(with_imu(sequence, data_root)) if needs_imu else ""
     return Cell(label, path, seed, input_digest(sequence, truth), truth, imu, data_root, range=own)
 
 

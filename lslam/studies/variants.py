@@ -134,7 +134,18 @@ def study_variants(study: StudyConfig, settings: Sequence[str] = ()) -> list[Var
     for variant in find_variants(study.beside, None, common, study.imu) if study.beside else []:
         name = free_name(f"beside-{variant.name}", taken)
         found.append(replace(variant, name=name, without="", is_beside=True))
+    for variant in found:
+        _check_metric(study, variant.config.eval.align)
     return found
+
+
+def _check_metric(study: StudyConfig, align: Sequence[str]) -> None:
+    alignment = study.metric.removeprefix("ate_")
+    if alignment != study.metric and alignment not in align:
+        raise UsageError(
+            f"study {study.name} judges by {study.metric}, and eval.align has {', '.join(align)} only: add {alignment}, or give "
+            "another `metric`"
+        )
 
 
 def free_name(name: str, taken: set[str]) -> str:

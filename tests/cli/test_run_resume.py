@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import signal
 import subprocess
 import time
@@ -90,6 +91,21 @@ def test_what_cannot_go_on_is_refused(whole: Path, words: tuple[object, ...], sa
     assert_one_sentence(refused.stderr)
     assert said in refused.stderr
     assert files_of(whole) == before
+
+
+def test_a_run_of_an_lslam_that_lacked_a_key_is_said_to_be_one(whole: Path, tmp_path: Path) -> None:
+    shutil.copytree(whole, tmp_path / "out")
+    file = tmp_path / "out" / "config.toml"
+    lines = file.read_text().splitlines(keepends=True)
+    file.write_text("".join(line for line in lines if not line.startswith(("descriptor =", "metrics ="))))
+    refused = lslam("run", SAMPLE, "--out", tmp_path / "out", *WORDS, "--resume")
+    assert refused.returncode == 2
+    assert "it was begun by an earlier lslam, which had no loops.descriptor" in refused.stderr
+
+
+def test_other_metrics_may_be_shown_of_a_run_that_is_there(whole: Path) -> None:
+    again = lslam("run", SAMPLE, "--out", whole, *WORDS, "--resume", "--metrics", "thesis")
+    assert again.returncode == 0, again.stderr
 
 
 def test_which_run_shall_go_on_must_be_said() -> None:

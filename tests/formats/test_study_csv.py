@@ -108,3 +108,9 @@ def test_what_is_no_result_of_this_version_is_said(tmp_path: Path, old: str, new
 def test_a_file_that_is_not_there_is_said(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="cannot be read"):
         read_study_csv(tmp_path / "results.csv")
+
+
+def test_a_metric_that_is_none_is_said(tmp_path: Path) -> None:
+    write_study_csv(tmp_path / "results.csv", [replace(DONE, metric="folder")])
+    with pytest.raises(InputError, match="line 2: metric 'folder' is none of ate_se3, ate_origin, thesis_rmse"):
+        read_study_csv(tmp_path / "results.csv")

@@ -110,7 +110,9 @@ def test_where_a_trajectory_was_laid_says_nothing_of_the_fixes() -> None:
     path = 60 * np.column_stack([np.cos(seconds / 12), np.sin(seconds / 12), 0 * seconds])
     residuals = 0.6 * np.sin(seconds / 9)[:, None] * [1.0, -1.0, 0.5] + 0.2 * rng.normal(size=(40, 3))
     moved = residuals + np.cross([0.0, 0.0, 1e-3], path) + np.array([30.0, -20.0, 10.0])
-    one, other = (wander_of(seconds, r, np.ones((40, 3)), path, 0.999, drift_of(path)) for r in (residuals, moved))
+    one, other = (
+        fit_gauss_markov(seconds, r, np.ones((40, 3)), path, 0.999, drift_of(path)) for r in (residuals, moved)
+    )
     assert one[0] is not None
     assert other[0] is not None
     assert (other[1], other[0].memory) == (one[1], one[0].memory)

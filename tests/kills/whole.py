@@ -14,6 +14,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
+from lslam.config import Config
 from lslam.formats.cloud_files import read_cloud
 from lslam.formats.g2o import read_g2o
 from lslam.formats.osm_files import read_osm
@@ -84,6 +85,11 @@ def _png(path: Path) -> None:
     assert kind == b"IEND"
 
 
+def _configuration(path: Path) -> None:
+    missing = set(Config.model_fields) - set(tomllib.loads(_text(path)))
+    assert not missing, f"no section {', '.join(sorted(missing))}"
+
+
 def _settings(path: Path) -> None:
     assert all(": " in line for line in _text(path).splitlines())
 
@@ -102,7 +108,7 @@ _READERS: dict[str, Callable[[Path], object]] = {
     ".ply": read_cloud,
     ".json": lambda path: json.loads(_text(path)),
     ".geojson": lambda path: json.loads(path.read_text()),
-    ".toml": lambda path: tomllib.loads(_text(path)),
+    ".toml": _configuration,
     ".yaml": _settings,
     ".html": _page,
     ".png": _png,

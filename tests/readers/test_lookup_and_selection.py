@@ -83,6 +83,13 @@ def test_selection_keeps_indices_stamps_and_truth(tmp_path: Path) -> None:
         part.scan(-1)
 
 
+def test_what_a_recording_knows_of_its_sensor_a_part_of_it_knows_too() -> None:
+    whole = open_sequence(Path(__file__).resolve().parents[2] / "sample_data")
+    part = select(whole, count=10)
+    assert (part.sensor, part.rings) == (whole.sensor, whole.rings)  # type: ignore[attr-defined]
+    assert part.rings is not None  # type: ignore[attr-defined]
+
+
 def test_selection_of_everything_is_the_sequence(tmp_path: Path) -> None:
     s = open_sequence(kitti_root(tmp_path, 3))
     assert select(s) is s

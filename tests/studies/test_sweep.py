@@ -15,7 +15,7 @@ import pytest
 
 from lslam.config.study import StudyConfig, parse_study
 from lslam.errors import ConfigError, InputError, InterruptedRunError, OutputExistsError, RunFailedError, UsageError
-from lslam.formats.study_csv import read_study_csv
+from lslam.formats.study_csv import VERSION, read_study_csv
 from lslam.studies.engines import Local
 from lslam.studies.estimate import estimate, from_finished
 from lslam.studies.expanded_study import ExpandedStudy
@@ -167,7 +167,7 @@ def test_an_interruption_says_how_to_go_on(made: list[StudyRow], sweep: Sweep, t
 def test_results_of_another_version_are_not_mixed(sweep: Sweep, made: list[StudyRow], tmp_path: Path) -> None:
     shutil.copytree(sweep.output.out, tmp_path / "out")
     file = tmp_path / "out" / "results.csv"
-    file.write_text(file.read_text().replace("\n2,", "\n0,"))
+    file.write_text(file.read_text().replace(f"\n{VERSION},", "\n0,"))
     with pytest.raises(InputError, match="written by another version of lslam"):
         run_sweep(elsewhere(sweep, tmp_path / "out", True), Local(1))
     anew = elsewhere(sweep, tmp_path / "out", parameters={"input.skip_frames": [2]}, beside=[])
@@ -180,6 +180,7 @@ def test_results_of_another_version_are_not_mixed(sweep: Sweep, made: list[Study
     [
         ({"parameters": {"input.skip_frame": [1]}}, ConfigError, "skip_frame = 1: unknown key.*mean 'skip_frames'"),
         ({"parameters": {"preprocess.random_share": [0.5, 2]}}, ConfigError, "random_share = 2: .*less than or equal to 1"),
+        ({"config": {"eval": {"align": ["origin"]}}}, UsageError, "judges by ate_se3, and eval.align has origin only: add se3"),
         ({"methods": ["ipc"]}, UsageError, "no method or preset 'ipc'; did you mean 'icp'"),
         ({"beside": ["lom"]}, UsageError, "did you mean 'loam'"),
         ({"methods": ["loam"], "parameters": {"registration.inlier_ratio": [0.5]}}, UsageError, "does nothing with method loam"),
