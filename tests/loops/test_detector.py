@@ -183,7 +183,7 @@ def test_joins_the_clouds_of_a_store(caplog: pytest.LogCaptureFixture) -> None:
 
 
 def test_after_a_warm_start_nothing_is_left_to_compile() -> None:
-    warm_up()
+    warm_up(LoopsConfig())
     kernels: list[Any] = [polar_image.polar_image, gaussians.insert, gaussians.coarsen, residuals.linearise,
                           gauss_newton.step]  # fmt: skip
     before = [len(kernel.signatures) for kernel in kernels]
