@@ -2,7 +2,7 @@
 
     python tests/benchmarks/findings.py [--runs FOLDER] [--studies share,skip-frames] [--seeds 100-104] [--write docs/results.md]
 
-Runs `lslam sweep STUDY --seeds ...` for each, two at once; an idle machine with two cores takes half an hour. Runs in FOLDER
+Runs `lslam sweep STUDY --seeds ...` for each, two at once; an idle machine with two cores takes fifty minutes. Runs in FOLDER
 are kept and gone on with.
 """
 
