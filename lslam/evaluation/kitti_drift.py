@@ -134,7 +134,3 @@ class KittiOdometry(TrajectoryMetric[KittiDrift]):
         drift = self.of(e)
         name = f"{self.name}, {counted(drift.segments, 'segment')}"
         return [(f"{drift.translation_percent:.2f}", "%", name)] if drift.available else []
-
-    def gated(self, e: Evaluation) -> tuple[str, float | None, str]:
-        drift = self.of(e)
-        return self.name, drift.translation_percent if drift.available else None, "%"

@@ -102,8 +102,10 @@ class TrajectoryMetric(ABC, Generic[Score]):
         return []
 
     def gated(self, e: Evaluation) -> tuple[str, float | None, str]:
-        """Name, value and unit of what `gate_option` limits; None when it is not available."""
-        raise NotImplementedError
+        """Name, value and unit of what `gate_option` limits: the first column unless said; None when it is not available."""
+        field, metric = self.columns[0]
+        value = float(getattr(self.of(e), field))
+        return self.name, None if np.isnan(value) else value, metric.unit
 
     def compared(self, configs: Sequence[EvalConfig]) -> list[Metric]:
         """The numbers that comparisons and studies read."""

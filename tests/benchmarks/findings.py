@@ -2,8 +2,8 @@
 
     python tests/benchmarks/findings.py [--runs FOLDER] [--studies share,skip-frames] [--seeds 100-104] [--write docs/results.md]
 
-Runs `lslam sweep STUDY --seeds ...` for each, two at once; an idle machine with two cores takes fifty minutes. Runs in FOLDER
-are kept and gone on with.
+Runs `lslam sweep STUDY --seeds ...` for each, two at once; an idle machine with two cores takes three quarters of an
+hour. Runs in FOLDER are kept and gone on with.
 """
 
 from __future__ import annotations
