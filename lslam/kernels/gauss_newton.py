@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.kernels.facts import INFORMATION, LEVER, MATCHED, POPULATION
-from lslam.kernels.jit import inline, kernel
+from lslam.kernels.jit import inline, inline_with_arrays, kernel
 from lslam.kernels.linalg import eigen, rotate_left
 from lslam.kernels.linearisation import Pose, Sums
 from lslam.kernels.surface_information import solve_on_surfaces
@@ -23,7 +23,7 @@ UNSEEN = 0.3
 ROUNDING = 1e-12
 
 
-@inline
+@inline_with_arrays
 def solve_observed(H: Floats, g: Floats, facts: Floats, weak_share: float, least: float, unseen: float, d: Floats,
                    weak: Floats) -> int:  # fmt: skip
     """Step d = -inv(H) g in the directions the points observe; returns how many they do not, as unit rows of `weak`.
@@ -104,7 +104,7 @@ def scale_by_population(H: Floats, S: Floats, g: Floats, facts: Floats) -> None:
     facts[LEVER] *= w
 
 
-@inline
+@inline_with_arrays
 def within(allowed: Floats, H: Floats) -> Floats:
     """H (6, 6) as seen by the directions on which `allowed` (6, 6) projects; where it has no rows, all are."""
     if len(allowed) == 0:

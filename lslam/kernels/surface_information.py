@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.kernels.facts import INFORMATION, LEVER
-from lslam.kernels.jit import inline
+from lslam.kernels.jit import inline, inline_with_arrays
 from lslam.kernels.linalg import eigen
 from lslam.kernels.residuals import add_information
 
@@ -35,7 +35,7 @@ def thin_information(p: Floats, xx: float, xy: float, xz: float, yy: float, yz: 
     return along
 
 
-@inline
+@inline_with_arrays
 def solve_on_surfaces(H: Floats, S: Floats, g: Floats, facts: Floats, weak_share: float, least: float, d: Floats,
                       weak: Floats) -> int:  # fmt: skip
     """As `gauss_newton.solve_observed`, with S deciding by its share which directions are observed: d solves H there.

@@ -11,7 +11,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.kernels.jit import inline, kernel
+from lslam.kernels.jit import inline, inline_with_arrays, kernel
 
 STAYS, STAYS_RAD = 0.002, 0.0001  # m and rad; a pose that moves less in one step stays: far below what a map is worth
 
@@ -286,7 +286,7 @@ def refine(
     return pose, normal, centre, rms, pair
 
 
-@inline
+@inline_with_arrays
 def damped_step(normal: Floats, gradient: Floats, trust: Floats, pose: Floats, prior: Floats, centre: Floats) -> Floats:
     """Solve the normal equations with the prior added; x, y of the walls' centre and yaw."""
     arm_x, arm_y = pose[0] - centre[0], pose[1] - centre[1]
