@@ -32,5 +32,5 @@ def keyframe_cloud(
     raw = as_cloud(scan.points)
     kept = gate_points(raw, plain)
     times = scan.times[kept] if scan.times is not None and preprocess.deskew else None
-    centroids = voxel.centroids(deskew_points(raw[kept], times, motion), NO_TIMES, config.voxel)[0]
+    centroids = voxel.means(deskew_points(voxel.take(raw, kept), times, motion), NO_TIMES, config.voxel)[0]
     return np.asarray(np.round(centroids / np.float32(GRAIN)) * np.float32(GRAIN), np.float32)

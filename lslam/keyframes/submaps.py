@@ -35,4 +35,4 @@ def submap(
         for k in neighbours(len(store), number, size)
     ]
     points = np.concatenate(clouds)
-    return points if voxel is None else voxels.centroids(points, NO_TIMES, voxel)[0]
+    return points if voxel is None else voxels.means(points, NO_TIMES, voxel)[0]

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.geometry import se3, so3
+from lslam.kernels import voxel
 from lslam.types.scan import Scan
 from lslam.types.scan_result import ScanResult
 
@@ -24,9 +25,10 @@ RIGID = 1e-3
 
 def measurable(scan: Scan) -> Scan:
     """The scan with the points that are finite and within `FARTHEST_M`; itself where all of them are."""
+    if voxel.count_within(np.ascontiguousarray(scan.points, np.float32), FARTHEST_M) == len(scan):
+        return scan
     # NaN is not smaller.
-    good = np.asarray((np.abs(scan.points) < FARTHEST_M).all(axis=1))
-    return scan if good.all() else scan.select(good)
+    return scan.select((np.abs(scan.points) < FARTHEST_M).all(axis=1))
 
 
 def plausible(result: ScanResult, T_prior: Floats, last: ScanResult | None) -> ScanResult:

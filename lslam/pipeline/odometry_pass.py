@@ -24,6 +24,7 @@ from lslam.loops import detector
 from lslam.maps import crispness, merge
 from lslam.odometry.base import Odometry, Resumable
 from lslam.odometry.given import GivenPoses
+from lslam.odometry.sanity import measurable
 from lslam.odometry.stationary import StationaryDetector
 from lslam.osm import prior
 from lslam.osm.source import OsmSource
@@ -149,7 +150,7 @@ def _warm_up(
         if config.imu.use and not is_over:
             inertial_start.warm_up()
         with suppress(InputError):
-            sequence.scan(0)  # the reader's kernels; what is wrong with the scan is said in its turn
+            measurable(sequence.scan(0))  # the reader's kernels; what is wrong with the scan is said in its turn
 
 
 def _begin_imu(

@@ -58,7 +58,7 @@ def prepare_points(
     chosen = gate_points(cloud, config)
     kept = voxel.take(cloud, chosen)
     kept_times = NO_TIMES if times is None else np.ascontiguousarray(times, np.float32)[chosen]
-    map_points, map_times, _, counts = voxel.centroids(kept, kept_times, config.map_leaf)
+    map_points, map_times, counts = voxel.means(kept, kept_times, config.map_leaf)
     if config.least_line > 0:
         solid = on_surfaces(map_points, counts, config.map_leaf, config.least_line)
         if len(solid) < len(map_points):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -53,7 +54,7 @@ class Scan:
     def __len__(self) -> int:
         return len(self.points)
 
-    @property
+    @cached_property
     def span(self) -> Span:
         """When the sweep begins and ends; the stamp itself is always within."""
         if self.times is None:

@@ -105,6 +105,23 @@ def test_centroids_and_scatter_are_those_of_numpy(size: float) -> None:
         np.testing.assert_allclose(scatter[:, column], expected, atol=1e-6)
 
 
+@pytest.mark.parametrize("is_timed", [False, True])
+def test_means_are_the_centroids_to_the_last_bit(is_timed: bool) -> None:
+    points = cloud(4, 3000, 5.0)
+    times = np.linspace(-0.05, 0.05, 3000).astype(np.float32) if is_timed else UNTIMED
+    whole, times_of, _, counts = voxel.centroids(points, times, 0.7)
+    for a, b in zip((whole, times_of, counts), voxel.means(points, times, 0.7), strict=True):
+        np.testing.assert_array_equal(a, b)
+    assert counts.max() > 1
+    assert len(times_of) == (len(whole) if is_timed else 0)
+
+
+def test_what_no_lidar_measures_is_counted_out() -> None:
+    points = np.array([[1, 2, 3], [np.nan, 0, 0], [0, np.inf, 0], [0, 0, -9999.5], [0, 0, 10000]], np.float32)
+    assert voxel.count_within(points, 1e4) == 2
+    assert voxel.count_within(points[:0], 1e4) == 0
+
+
 def test_centroids_far_from_the_origin_keep_their_digits() -> None:
     points = (cloud(2, 2000, 0.5) + np.array([90_000.0, -70_000.0, 300.0])).astype(np.float32)
     out, _, scatter, _ = voxel.centroids(points, UNTIMED, 1.0)
