@@ -30,7 +30,7 @@ def linearise_gicp(points: tuple[Floats, Floats], voxels: Voxels, settings: Sett
     source, covariance = points
     planes, keys, table = voxels
     size, sigma2, plane_weight, blob_weight, _, _ = settings
-    cells, slots, is_done, away2 = search
+    cells, slots, chosen, asked, is_done, away2 = search
     R, t = pose
     scale, _, gate2 = width
     H, S, g, facts = sums
@@ -45,8 +45,9 @@ def linearise_gicp(points: tuple[Floats, Floats], voxels: Voxels, settings: Sett
         ry = R[1, 0] * a + R[1, 1] * b + R[1, 2] * c
         rz = R[2, 0] * a + R[2, 1] * b + R[2, 2] * c
         x, y, z = rx + t[0], ry + t[1], rz + t[2]
-        octant_slots(x, y, z, i, inverse, cells, slots, keys, table)
-        best, best_d, blob, _ = nearest(x, y, z, i, slots, planes)
+        if octant_slots(x, y, z, i, inverse, cells, slots, keys, table):
+            asked[i, 3] = -1.0
+        best, best_d, blob, _ = nearest(x, y, z, i, slots, chosen, asked, planes)
         if best < 0:
             if blob < 0 or blob_weight <= 0.0:
                 continue

@@ -25,8 +25,9 @@ Ints = NDArray[np.int32]
 Flags = NDArray[np.bool_]
 
 Settings = tuple[float, float, float, float, float, bool]
-# Octant cell (S,) and slots (S, 8) of each point; whether it is matched, and its squared distance, -1 where it is not.
-Search = tuple[Longs, Ints, Flags, Floats]
+# Octant cell (S,) and slots (S, 8) of each point, its nearest plane and blob (S, 2) and where and how long that holds (S, 4),
+# see `residuals.nearest`; whether it is matched, and its squared distance, -1 where it is not.
+Search = tuple[Longs, Ints, Ints, Floats, Flags, Floats]
 Pose = tuple[Floats, Floats]
 Width = tuple[float, float, float]
 Sums = tuple[Floats, Floats, Floats, Floats]

@@ -87,7 +87,7 @@ def linearise_ndt(points: tuple[Floats], voxels: Voxels, settings: Settings, sea
     (source,) = points
     shapes, keys, table = voxels
     size, _, _, _, _, _ = settings
-    cells, slots, is_done, away2 = search
+    cells, slots, _, _, is_done, away2 = search
     R, t = pose
     scale, scale_end, gate2 = width
     widening = (scale / scale_end) ** 2

@@ -28,7 +28,7 @@ def linearise_point(points: tuple[Floats, Floats], voxels: Voxels, settings: Set
     source, gaps = points
     planes, keys, table = voxels
     size, sigma2, _, _, _, takes_all = settings
-    cells, slots, is_done, away2 = search
+    cells, slots, _, _, is_done, away2 = search
     R, t = pose
     scale, _, gate2 = width
     H, _, g, facts = sums

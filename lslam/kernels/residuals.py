@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -21,8 +23,8 @@ TILT = 4.0
 
 @inline
 def octant_slots(x: float, y: float, z: float, i: int, inverse: float, cells: NDArray[np.int64],
-                 slots: NDArray[np.int32], keys: NDArray[np.int64], table: NDArray[np.int32]) -> None:  # fmt: skip
-    """Slots of the eight voxels around a world point, looked up again only when the point left its octant cell."""
+                 slots: NDArray[np.int32], keys: NDArray[np.int64], table: NDArray[np.int32]) -> bool:  # fmt: skip
+    """Slots of the eight voxels around a world point, looked up again, True, only when the point left its octant cell."""
     ix, iy, iz = (
         index_of(x - 0.5 / inverse, inverse),
         index_of(y - 0.5 / inverse, inverse),
@@ -30,7 +32,7 @@ def octant_slots(x: float, y: float, z: float, i: int, inverse: float, cells: ND
     )
     cell = pack(ix, iy, iz)
     if cells[i] == cell:
-        return
+        return False
     cells[i] = cell
     k = 0
     for dx in range(2):
@@ -38,27 +40,49 @@ def octant_slots(x: float, y: float, z: float, i: int, inverse: float, cells: ND
             for dz in range(2):
                 slots[i, k] = find(pack(ix + dx, iy + dy, iz + dz), keys, table)
                 k += 1
+    return True
 
 
 @inline
-def nearest(x: float, y: float, z: float, i: int, slots: NDArray[np.int32],
+def nearest(x: float, y: float, z: float, i: int, slots: NDArray[np.int32], chosen: NDArray[np.int32], asked: Floats,
             planes: Floats) -> tuple[int, float, int, float]:  # fmt: skip
-    """Nearest plane and nearest blob among the slots of point i: slot or -1, and squared distance of its mean, m2."""
-    best, blob = -1, -1
+    """Nearest plane and, without one, nearest blob among the slots of point i: slot or -1, and squared distance of its mean, m2.
+
+    A point that has moved by less than half of what the second nearest is farther away still has the same nearest one:
+    `chosen` (S, 2) plane and blob, `asked` (S, 4) where, and within which distance that holds.
+    """
+    best, blob = int(chosen[i, 0]), int(chosen[i, 1])
     best_d, blob_d = 1e300, 1e300
+    moved2 = (x - asked[i, 0]) ** 2 + (y - asked[i, 1]) ** 2 + (z - asked[i, 2]) ** 2
+    if moved2 < asked[i, 3]:
+        if best >= 0:
+            best_d = (x - planes[best, 0]) ** 2 + (y - planes[best, 1]) ** 2 + (z - planes[best, 2]) ** 2
+        elif blob >= 0:
+            blob_d = (x - planes[blob, 0]) ** 2 + (y - planes[blob, 1]) ** 2 + (z - planes[blob, 2]) ** 2
+        return best, best_d, blob, blob_d
+    best, blob = -1, -1
+    next_d, next_blob_d = 1e300, 1e300
     for k in range(8):
         s = slots[i, k]
         if s < 0:
             continue
-        p = planes[s]
-        if p[7] < BLOB:
+        kind = planes[s, 7]
+        if kind < BLOB:
             continue
-        d = (x - p[0]) ** 2 + (y - p[1]) ** 2 + (z - p[2]) ** 2
-        if p[7] >= 0.0:
+        d = (x - planes[s, 0]) ** 2 + (y - planes[s, 1]) ** 2 + (z - planes[s, 2]) ** 2
+        if kind >= 0.0:
             if d < best_d:
-                best_d, best = d, s
+                next_d, best_d, best = best_d, d, s
+            elif d < next_d:
+                next_d = d
         elif d < blob_d:
-            blob_d, blob = d, s
+            next_blob_d, blob_d, blob = blob_d, d, s
+        elif d < next_blob_d:
+            next_blob_d = d
+    chosen[i, 0], chosen[i, 1] = best, blob
+    asked[i, 0], asked[i, 1], asked[i, 2] = x, y, z
+    margin = math.sqrt(next_d) - math.sqrt(best_d) if best >= 0 else math.sqrt(next_blob_d) - math.sqrt(blob_d)
+    asked[i, 3] = 0.25 * margin * margin if best >= 0 or blob >= 0 else 1e300
     return best, best_d, blob, blob_d
 
 
@@ -90,7 +114,7 @@ def linearise(points: tuple[Floats, Floats], voxels: Voxels, settings: Settings,
     source, scatter = points
     planes, keys, table = voxels
     size, sigma2, plane_weight, blob_weight, along, _ = settings
-    cells, slots, is_done, away2 = search
+    cells, slots, chosen, asked, is_done, away2 = search
     R, t = pose
     scale, _, gate2 = width
     H, _, g, facts = sums
@@ -104,8 +128,9 @@ def linearise(points: tuple[Floats, Floats], voxels: Voxels, settings: Settings,
         ry = R[1, 0] * a + R[1, 1] * b + R[1, 2] * c
         rz = R[2, 0] * a + R[2, 1] * b + R[2, 2] * c
         x, y, z = rx + t[0], ry + t[1], rz + t[2]
-        octant_slots(x, y, z, i, inverse, cells, slots, keys, table)
-        best, best_d, blob, blob_d = nearest(x, y, z, i, slots, planes)
+        if octant_slots(x, y, z, i, inverse, cells, slots, keys, table):
+            asked[i, 3] = -1.0
+        best, best_d, blob, blob_d = nearest(x, y, z, i, slots, chosen, asked, planes)
         if best >= 0:
             is_done[i] = True
             p = planes[best]

@@ -29,7 +29,7 @@ def linearise_vgicp(points: tuple[Floats, Floats], voxels: tuple[Floats, Floats,
     source, covariance = points
     planes, counts, keys, table = voxels
     size, sigma2, plane_weight, blob_weight, _, _ = settings
-    cells, slots, is_done, away2 = search
+    cells, slots, chosen, asked, is_done, away2 = search
     R, t = pose
     scale, _, gate2 = width
     H, S, g, facts = sums
@@ -44,9 +44,10 @@ def linearise_vgicp(points: tuple[Floats, Floats], voxels: tuple[Floats, Floats,
         ry = R[1, 0] * a + R[1, 1] * b + R[1, 2] * c
         rz = R[2, 0] * a + R[2, 1] * b + R[2, 2] * c
         x, y, z = rx + t[0], ry + t[1], rz + t[2]
-        octant_slots(x, y, z, i, inverse, cells, slots, keys, table)
+        if octant_slots(x, y, z, i, inverse, cells, slots, keys, table):
+            asked[i, 3] = -1.0
         sxx, sxy, sxz, syy, syz, szz = rotate_symmetric(R, covariance[i])
-        best, _, blob, _ = nearest(x, y, z, i, slots, planes)
+        best, _, blob, _ = nearest(x, y, z, i, slots, chosen, asked, planes)
         if best < 0 and (blob < 0 or blob_weight <= 0.0):
             continue
         is_done[i] = True

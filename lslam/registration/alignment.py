@@ -12,7 +12,7 @@ from lslam.config.registration import RegistrationConfig
 from lslam.preprocessing.prepare import PreparedPoints
 from lslam.registration.gaussian_map import GaussianMap
 from lslam.registration.local_map import LocalMap
-from lslam.registration.optimiser import EVERYWHERE
+from lslam.registration.optimiser import EVERYWHERE, Correspondences
 from lslam.registration.residuals import residual_named
 from lslam.registration.robust import Annealing
 from lslam.registration.solver import RegistrationResult, solve
@@ -25,6 +25,8 @@ class MapAlignment:
 
     def __init__(self, target: LocalMap, config: RegistrationConfig, residual: str) -> None:
         self._map, self._config, self._residual = target, config, residual
+        # Of the last refinement, and when in the life of the map it was.
+        self._matches, self._changes = Correspondences(0), 0
 
     def refine(
         self, points: PreparedPoints, start: Floats, width: float, steps: int, coarser: Sequence[GaussianMap] = (),
@@ -48,8 +50,14 @@ class MapAlignment:
             sigma=c.sigma, blob_weight=c.blob_weight, weak_share=c.weak_share,
             coarser=coarser, residual=self._residual,
             inlier_distance=np.inf if c.inlier_distance is None else c.inlier_distance, inlier_ratio=c.inlier_ratio,
-            allowed=allowed,
+            allowed=allowed, matches=self._remembered(len(points.source)),
         )  # fmt: skip
+
+    def _remembered(self, count: int) -> Correspondences:
+        """What was looked up for as many points in the map as it is: a scan is deskewed twice, and moves little between."""
+        if self._changes != self._map.changes or len(self._matches) != count:
+            self._matches, self._changes = Correspondences(count), self._map.changes
+        return self._matches
 
     def coarse_to_fine(self, points: PreparedPoints, T_prior: Floats, width: float = np.inf) -> RegistrationResult:
         """Coarse planes, annealed slowly, catch what fine voxels lose: metres per scan instead of decimetres.

@@ -33,6 +33,8 @@ class LocalMap(Stateful):
             )
             for edge in (size, *(size * coarse_factor * wider for wider in (1, *WIDE)))
         )
+        # How often the map has changed: what was looked up in it before is void then.
+        self.changes = 0
 
     @property
     def fine(self) -> GaussianMap:
@@ -52,6 +54,7 @@ class LocalMap(Stateful):
         self, map_points: NDArray[np.float32], source: NDArray[np.float64], T_world_lidar: NDArray[np.float64]
     ) -> None:
         """Enter a scan: its small centroids (M, 3) into fine voxels, its source points (S, 3) into all others."""
+        self.changes += 1
         self.fine.insert(map_points, T_world_lidar)
         few = source.astype(np.float32)
         for level in self.coarser:
@@ -59,6 +62,7 @@ class LocalMap(Stateful):
 
     def clear(self) -> None:
         """Forget everything; the room is kept."""
+        self.changes += 1
         for level in self.levels:
             level.clear()
 
@@ -68,5 +72,6 @@ class LocalMap(Stateful):
 
     def restore(self, state: State) -> None:
         """Go on where `state` was taken."""
+        self.changes += 1
         for level, kept in zip(self.levels, state["levels"], strict=True):
             level.restore(kept)

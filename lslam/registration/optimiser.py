@@ -28,20 +28,30 @@ EVERYWHERE: Floats = np.zeros((0, 6))
 
 
 class Correspondences:
-    """Correspondences of `count` points in an iteration: which have one, and squared distances; shared by the maps of a scan."""
+    """Correspondences of `count` points in an iteration: which have one, and squared distances; shared by the maps of a scan.
+
+    What was looked up in a map is remembered, for as long as that map stays as it is.
+    """
 
     def __init__(self, count: int) -> None:
         self.is_done = np.zeros(count, np.bool_)
         self.away2 = np.full(count, -1.0)
+        self._looked_up: dict[object, tuple[Any, ...]] = {}
+
+    def __len__(self) -> int:
+        return len(self.away2)
 
     def clear(self) -> None:
         """Nothing is matched."""
         self.is_done.fill(False)
         self.away2.fill(-1.0)
 
-    def search(self) -> tuple[Any, ...]:
+    def search(self, target: object = None) -> tuple[Any, ...]:
         """The state of a residual's search in one map, see `kernels.linearisation`."""
-        return *slots_of(len(self.away2)), self.is_done, self.away2
+        if target not in self._looked_up:
+            count = len(self)
+            self._looked_up[target] = (*slots_of(count), np.full((count, 2), -1, np.int32), np.full((count, 4), -1.0))
+        return *self._looked_up[target], self.is_done, self.away2
 
 
 def slots_of(count: int) -> tuple[NDArray[np.int64], NDArray[np.int32]]:

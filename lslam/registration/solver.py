@@ -95,14 +95,16 @@ def solve(
     target: GaussianMap, points: PreparedPoints, T_prior: Floats, annealing: Annealing, *, sigma: float,
     blob_weight: float, weak_share: float, coarser: Sequence[GaussianMap] = (), residual: str | ResidualKind = "plane",
     inlier_distance: float = np.inf, inlier_ratio: float = 1.0, allowed: Floats = EVERYWHERE,
+    matches: Correspondences | None = None,
 ) -> RegistrationResult:  # fmt: skip
     """Align the source points with the map by annealed Gauss-Newton, starting at `T_prior` (4, 4).
 
     Points without a plane or a blob in `target` are matched in the first of the `coarser` maps that has one. Correspondences
-    beyond `inlier_distance`, m, are rejected, and all but the nearest `inlier_ratio`. `allowed` as in `Limits`.
+    beyond `inlier_distance`, m, are rejected, and all but the nearest `inlier_ratio`. `allowed` as in `Limits`; `matches` of as
+    many points in these maps, if there are any, spare what was looked up.
     """
     kind = residual if isinstance(residual, ResidualKind) else residual_named(residual)
-    matches = Correspondences(len(points.source))
+    matches = Correspondences(len(points.source)) if matches is None else matches
     terms = voxel_terms(kind, kind.points(points, sigma), (target, *coarser), matches, sigma, blob_weight)
     found = optimise(
         terms, T_prior, annealing, Limits(weak_share, by_surfaces=kind.by_surfaces, allowed=allowed), matches,
@@ -127,7 +129,7 @@ def voxel_terms(
             linearise, points, kind.voxels(level),
             (level.size, float(sigma) ** 2, part_of_usual(level.size, usual), float(blob_weight) if k < 2 else 0.0, kind.along,
              0 < k == last),
-            matches.search(),
+            matches.search(level),
         )
         for k, level in enumerate(levels)
     ]  # fmt: skip

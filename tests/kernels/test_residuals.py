@@ -14,7 +14,7 @@ from lslam.kernels import facts as at
 from lslam.kernels import residuals
 from lslam.preprocessing.prepare import PreparedPoints
 from lslam.registration.gaussian_map import GaussianMap
-from lslam.registration.optimiser import Correspondences, slots_of
+from lslam.registration.optimiser import Correspondences
 
 Floats = NDArray[np.float64]
 SIZE, SIGMA2, BLOB, ALONG = 0.8, 9e-4, 0.5, 0.03
@@ -71,15 +71,15 @@ def scene() -> Scene:
 
 def linearise(
     s: Scene, R: Floats, t: Floats, c: float, blob: float = BLOB, gate2: float = np.inf,
-    cache: tuple[NDArray[np.int64], NDArray[np.int32]] | None = None, plane: float = 1.0,
+    matches: Correspondences | None = None, plane: float = 1.0,
     along: float = ALONG,
 ) -> tuple[Floats, Floats, Floats]:  # fmt: skip
-    m, matches = s.target, Correspondences(len(s.points.source))
-    search = matches.search() if cache is None else (*cache, matches.is_done, matches.away2)
+    m, matches = s.target, Correspondences(len(s.points.source)) if matches is None else matches
+    matches.clear()
     H, S, g, facts = np.zeros((6, 6)), np.zeros((6, 6)), np.zeros(6), np.zeros(at.COUNT)
     residuals.linearise(
         (s.points.source, s.points.scatter), (m.planes, m.keys, m.table), (m.size, SIGMA2, plane, blob, along, False),
-        search, (R, t), (c, c, gate2), (H, S, g, facts),
+        matches.search(m), (R, t), (c, c, gate2), (H, S, g, facts),
     )  # fmt: skip
     np.testing.assert_array_equal(S, 0.0)
     # The kernel fills the upper triangle.
@@ -154,20 +154,23 @@ def test_rmse_facts_are_those_of_the_planes(scene: Scene) -> None:
     assert facts[at.ROBUST] == pytest.approx(float(robust.sum()), rel=1e-6)
 
 
-def test_the_octant_cache_gives_the_same_as_none(scene: Scene) -> None:
+@pytest.mark.parametrize("step", [1e-3, 0.02, 0.05])
+def test_what_is_remembered_of_the_search_changes_nothing(scene: Scene, step: float) -> None:
     n = len(scene.points.source)
-    cache = slots_of(n)
+    matches = Correspondences(n)
+    cells, _, chosen, asked, _, _ = matches.search(scene.target)
     rng = np.random.default_rng(1)
     R, t = scene.R, scene.t
-    kept = 0
+    same_octant = same_nearest = 0
     for _ in range(12):
-        before = cache[0].copy()
-        cached = linearise(scene, R, t, 0.5, cache=cache)
-        kept += int((before == cache[0]).sum())
-        for a, b in zip(cached, linearise(scene, R, t, 0.5), strict=True):
+        before, place = cells.copy(), asked[:, :3].copy()
+        remembered = linearise(scene, R, t, 0.5, matches=matches)
+        same_octant += int((before == cells).sum())
+        same_nearest += int(((place == asked[:, :3]).all(axis=1) & (chosen[:, 0] >= 0)).sum())
+        for a, b in zip(remembered, linearise(scene, R, t, 0.5), strict=True):
             np.testing.assert_array_equal(a, b)
-        R, t = moved(R, t, rng.normal(0, 0.05, 6))
-    assert 0 < kept < 12 * n
+        R, t = moved(R, t, rng.normal(0, step, 6))
+    assert 0 < same_nearest < same_octant < 12 * n
 
 
 def test_points_are_blind_in_the_plane() -> None:

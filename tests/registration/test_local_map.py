@@ -9,7 +9,9 @@ import pytest
 from analytic_scenes import pose_at, room
 
 from lslam.config.preprocess import PreprocessConfig
+from lslam.config.registration import RegistrationConfig
 from lslam.preprocessing.prepare import PreparedPoints, prepare_points
+from lslam.registration.alignment import MapAlignment
 from lslam.registration.gaussian_map import GaussianMap
 from lslam.registration.local_map import BREADTH, LocalMap
 from lslam.registration.registration import Registration
@@ -71,3 +73,19 @@ def test_near_its_prior_a_scan_is_placed_well_while_the_map_is_young(scenario: s
     result = registration.locate(points[1], prior, is_near=True)
     assert result.ok
     assert np.linalg.norm(result.T_world_lidar[:3, 3] - second[:3, 3]) < 0.02
+
+
+def test_what_an_alignment_remembers_is_void_once_the_map_has_changed() -> None:
+    target, config = new_map(), RegistrationConfig()
+    target.insert(scan(0).map_points, scan(0).source, np.eye(4))
+    alignment, points = MapAlignment(target, config, "plane"), scan(1)
+
+    def align(by: MapAlignment, x: float) -> list[float]:
+        found = by.refine(points, pose_at((x, 0.0, 0.0)), 0.5, 10)
+        return [*found.T_world_lidar.ravel(), found.rmse, found.matched]
+
+    for x in (0.1, 0.05):
+        assert align(alignment, x) == align(MapAlignment(target, config, "plane"), x)
+    before = align(alignment, 0.1)
+    target.insert(scan(2).map_points, scan(2).source, pose_at((0.02, 0.0, 0.0), 0.2))
+    assert before != align(alignment, 0.1) == align(MapAlignment(target, config, "plane"), 0.1)

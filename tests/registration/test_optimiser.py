@@ -201,7 +201,7 @@ def linearise_cauchy(points: tuple[Floats, Floats], voxels: Voxels, settings: Se
     """Point to plane with the weight of Cauchy, of planes alone."""
     source, _ = points
     planes, keys, table = voxels
-    cells, slots, is_done, away2 = search
+    cells, slots, chosen, asked, is_done, away2 = search
     R, t = pose
     H, _, g, facts = sums
     for i in range(len(source)):
@@ -209,8 +209,9 @@ def linearise_cauchy(points: tuple[Floats, Floats], voxels: Voxels, settings: Se
             continue
         r = R @ source[i]
         x, y, z = r[0] + t[0], r[1] + t[1], r[2] + t[2]
-        octant_slots(x, y, z, i, 1.0 / settings[0], cells, slots, keys, table)
-        best, _, _, _ = nearest(x, y, z, i, slots, planes)
+        if octant_slots(x, y, z, i, 1.0 / settings[0], cells, slots, keys, table):
+            asked[i, 3] = -1.0
+        best, _, _, _ = nearest(x, y, z, i, slots, chosen, asked, planes)
         if best < 0:
             continue
         p = planes[best]
