@@ -33,6 +33,8 @@ EMPTY, BLOB = -2.0, -1.0
 # ring that bends in its voxel is a strip.
 SOLID = 0.1
 USED, FREED, HAND, LIVE = 0, 1, 2, 3
+# Points that are looked up together.
+AHEAD = 64
 
 
 @inline
@@ -168,40 +170,62 @@ def insert(points: NDArray[np.float32], R: Floats, t: Floats, size: float, cap: 
     last_key = -2
     slot = -1
     limit = float(OFFSET - 2)
-    for i in range(n):
-        a, b, c = float(points[i, 0]), float(points[i, 1]), float(points[i, 2])
-        x = R[0, 0] * a + R[0, 1] * b + R[0, 2] * c + t[0]
-        y = R[1, 0] * a + R[1, 1] * b + R[1, 2] * c + t[1]
-        z = R[2, 0] * a + R[2, 1] * b + R[2, 2] * c + t[2]
-        if not (abs(x) * inverse < limit and abs(y) * inverse < limit and abs(z) * inverse < limit):
-            lost += 1
-            continue
-        ix, iy, iz = index_of(x, inverse), index_of(y, inverse), index_of(z, inverse)
-        key = pack(ix, iy, iz)
-        if key != last_key:
-            slot = _claim(key, moments, planes, keys, refreshed, table, state, free)
-            last_key = key
-            if slot >= 0:
-                touched[count] = slot
-                count += 1
-        if slot < 0:
-            lost += 1
-            continue
-        dx, dy, dz = x - (ix + 0.5) * size, y - (iy + 0.5) * size, z - (iz + 0.5) * size
-        s = moments[slot]
-        s[0] += 1.0
-        s[1] += dx
-        s[2] += dy
-        s[3] += dz
-        s[4] += dx * dx
-        s[5] += dx * dy
-        s[6] += dx * dz
-        s[7] += dy * dy
-        s[8] += dy * dz
-        s[9] += dz * dz
-        s[10] += t[0] - x + dx
-        s[11] += t[1] - y + dy
-        s[12] += t[2] - z + dz
+    mask = len(table) - 1
+    ahead, likely, offsets = np.empty(AHEAD, np.int64), np.empty(AHEAD, np.int64), np.empty((AHEAD, 3))
+    views = np.empty((AHEAD, 3))
+    for begin in range(0, n, AHEAD):
+        some = 0
+        for i in range(begin, min(begin + AHEAD, n)):
+            a, b, c = float(points[i, 0]), float(points[i, 1]), float(points[i, 2])
+            x = R[0, 0] * a + R[0, 1] * b + R[0, 2] * c + t[0]
+            y = R[1, 0] * a + R[1, 1] * b + R[1, 2] * c + t[1]
+            z = R[2, 0] * a + R[2, 1] * b + R[2, 2] * c + t[2]
+            if not (abs(x) * inverse < limit and abs(y) * inverse < limit and abs(z) * inverse < limit):
+                lost += 1
+                continue
+            ix, iy, iz = index_of(x, inverse), index_of(y, inverse), index_of(z, inverse)
+            ahead[some] = pack(ix, iy, iz)
+            offsets[some, 0], offsets[some, 1], offsets[some, 2] = (
+                x - (ix + 0.5) * size,
+                y - (iy + 0.5) * size,
+                z - (iz + 0.5) * size,
+            )
+            views[some, 0], views[some, 1], views[some, 2] = x, y, z
+            some += 1
+        # The map is larger than the nearest caches: no branch waits for one voxel while others could be fetched.
+        for k in range(some):
+            likely[k] = table[hash_key(ahead[k], mask)]
+        for k in range(some):
+            if keys[max(likely[k], 0)] != ahead[k]:
+                likely[k] = -1
+        for k in range(some):
+            key = ahead[k]
+            if key != last_key:
+                slot = int(likely[k])
+                if slot < 0:
+                    slot = _claim(key, moments, planes, keys, refreshed, table, state, free)
+                last_key = key
+                if slot >= 0:
+                    touched[count] = slot
+                    count += 1
+            if slot < 0:
+                lost += 1
+                continue
+            dx, dy, dz = offsets[k, 0], offsets[k, 1], offsets[k, 2]
+            s = moments[slot]
+            s[0] += 1.0
+            s[1] += dx
+            s[2] += dy
+            s[3] += dz
+            s[4] += dx * dx
+            s[5] += dx * dy
+            s[6] += dx * dz
+            s[7] += dy * dy
+            s[8] += dy * dz
+            s[9] += dz * dz
+            s[10] += t[0] - views[k, 0] + dx
+            s[11] += t[1] - views[k, 1] + dy
+            s[12] += t[2] - views[k, 2] + dz
     for j in range(count):
         slot = int(touched[j])
         s = moments[slot]

@@ -26,7 +26,8 @@ def pack(ix: int, iy: int, iz: int) -> int:
 
 
 @inline
-def _slot(key: int, mask: int) -> int:
+def slot_of(key: int, mask: int) -> int:
+    """Home of a key in a table of mask + 1 slots."""
     mixed = key * _MIX
     return (mixed ^ (mixed >> 29) ^ (mixed >> 43)) & mask
 
@@ -38,7 +39,7 @@ def row_of(key: int, slots: NDArray[np.int32], rows: NDArray[np.int64], used: in
     slots : (S,) row of each hash slot or -1, S a power of two above `used`; rows : (R, k), R > `used`
     """
     mask = slots.shape[0] - 1
-    slot = _slot(key, mask)
+    slot = slot_of(key, mask)
     row = slots[slot]
     while row >= 0 and rows[row, 0] != key:
         slot = (slot + 1) & mask
@@ -55,7 +56,7 @@ def enter(slots: NDArray[np.int32], rows: NDArray[np.int64], used: int) -> None:
     """Enter the first `used` rows into `slots`, which are all -1 and a power of two above `used`."""
     mask = slots.shape[0] - 1
     for row in range(used):
-        slot = _slot(rows[row, 0], mask)
+        slot = slot_of(rows[row, 0], mask)
         while slots[slot] >= 0:
             slot = (slot + 1) & mask
         slots[slot] = row

@@ -14,11 +14,13 @@ from numpy.typing import NDArray
 
 from lslam.kernels import row_table
 from lslam.kernels.jit import kernel
-from lslam.kernels.row_table import pack, row_of
+from lslam.kernels.row_table import pack, row_of, slot_of
 
 UNITS = float(2**24)  # 2**39 points fit into one voxel's sum
 INTENSITY_UNITS = float(2**20)
 _BRIGHTEST = float(2**24)  # of such points a voxel's sum holds 2**19
+# Points that are looked up together.
+AHEAD = 64
 
 
 @kernel
@@ -49,43 +51,61 @@ def accumulate(
     inverse = 1.0 / voxel
     near, far = range_min * range_min, range_max * range_max
     with_intensity = intensity.shape[0] > 0
+    mask = slots.shape[0] - 1
     gated = 0
     outside = 0
     last_key = -1
     row = 0
-    for i in range(points.shape[0]):
-        px, py, pz = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
-        r2 = px * px + py * py + pz * pz
-        if not (r2 >= near and r2 <= far and r2 > 0.0):
-            gated += 1
-            continue
-        x = T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz + T[0, 3]
-        y = T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3]
-        z = T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz + T[2, 3]
-        if x < crop[0] or x > crop[1] or y < crop[2] or y > crop[3] or z < crop[4] or z > crop[5]:
-            gated += 1
-            continue
-        x, y, z = x * inverse, y * inverse, z * inverse
-        fx, fy, fz = np.floor(x), np.floor(y), np.floor(z)
-        key = pack(np.int64(fx) - origin[0], np.int64(fy) - origin[1], np.int64(fz) - origin[2])
-        if key < 0:
-            outside += 1
-            continue
-        # Neighbouring points of a ring mostly fall into one voxel: the table is not asked again.
-        if key != last_key:
-            row = row_of(key, slots, rows, used)
-            if row == used:
-                used += 1
-                rows[row, 1:] = 0
-            last_key = key
-        rows[row, 1] += np.int64(np.rint((x - fx - 0.5) * UNITS))
-        rows[row, 2] += np.int64(np.rint((y - fy - 0.5) * UNITS))
-        rows[row, 3] += np.int64(np.rint((z - fz - 0.5) * UNITS))
-        rows[row, 4] += 1
-        if with_intensity and np.isfinite(intensity[i]):
-            rows[row, 5] += np.int64(
-                np.rint(min(max(np.float64(intensity[i]), -_BRIGHTEST), _BRIGHTEST) * INTENSITY_UNITS)
-            )
+    keys, offsets = np.empty(AHEAD, np.int64), np.empty((AHEAD, 3), np.int64)
+    numbers, likely = np.empty(AHEAD, np.int64), np.empty(AHEAD, np.int64)
+    for begin in range(0, points.shape[0], AHEAD):
+        count = 0
+        for i in range(begin, min(begin + AHEAD, points.shape[0])):
+            px, py, pz = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
+            r2 = px * px + py * py + pz * pz
+            if not (r2 >= near and r2 <= far and r2 > 0.0):
+                gated += 1
+                continue
+            x = T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz + T[0, 3]
+            y = T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3]
+            z = T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz + T[2, 3]
+            if x < crop[0] or x > crop[1] or y < crop[2] or y > crop[3] or z < crop[4] or z > crop[5]:
+                gated += 1
+                continue
+            x, y, z = x * inverse, y * inverse, z * inverse
+            fx, fy, fz = np.floor(x), np.floor(y), np.floor(z)
+            key = pack(np.int64(fx) - origin[0], np.int64(fy) - origin[1], np.int64(fz) - origin[2])
+            if key < 0:
+                outside += 1
+                continue
+            keys[count], numbers[count] = key, i
+            offsets[count, 0] = np.int64(np.rint((x - fx - 0.5) * UNITS))
+            offsets[count, 1] = np.int64(np.rint((y - fy - 0.5) * UNITS))
+            offsets[count, 2] = np.int64(np.rint((z - fz - 0.5) * UNITS))
+            count += 1
+        # The table and the rows are far larger than any cache: no branch waits for one of them while others could be fetched.
+        for k in range(count):
+            likely[k] = slots[slot_of(keys[k], mask)]
+        for k in range(count):
+            if rows[max(likely[k], 0), 0] != keys[k]:
+                likely[k] = -1
+        for k in range(count):
+            # Neighbouring points of a ring mostly fall into one voxel: the table is not asked again.
+            if keys[k] != last_key:
+                row = likely[k]
+                if row < 0:
+                    row = row_of(keys[k], slots, rows, used)
+                    if row == used:
+                        used += 1
+                        rows[row, 1:] = 0
+                last_key = keys[k]
+            rows[row, 1] += offsets[k, 0]
+            rows[row, 2] += offsets[k, 1]
+            rows[row, 3] += offsets[k, 2]
+            rows[row, 4] += 1
+            if with_intensity and np.isfinite(intensity[numbers[k]]):
+                brightness = min(max(np.float64(intensity[numbers[k]]), -_BRIGHTEST), _BRIGHTEST)
+                rows[row, 5] += np.int64(np.rint(brightness * INTENSITY_UNITS))
     return used, gated, outside
 
 
