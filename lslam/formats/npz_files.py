@@ -16,8 +16,6 @@ from lslam.errors import InputError, cause
 from lslam.formats.atomic import atomic_write
 from lslam.untrusted import MISFIT
 
-# Of a zip member: numpy's own writer gives this date too.
-_DATE = (1980, 1, 1, 0, 0, 0)
 # What zipfile and NumPy raise; no memory, for arrays that are said to be larger than any machine; a flag of encryption.
 DAMAGE = (*MISFIT, EOFError, SyntaxError, MemoryError, RuntimeError, zipfile.BadZipFile, zlib.error, struct.error)
 
@@ -33,9 +31,8 @@ def pack_npz(stream: BinaryIO, arrays: Mapping[str, NDArray[Any]], level: int = 
     method = zipfile.ZIP_DEFLATED if level else zipfile.ZIP_STORED
     with zipfile.ZipFile(stream, "w", method, compresslevel=level or None) as archive:
         for name, array in arrays.items():
-            info = zipfile.ZipInfo(f"{name}.npy", _DATE)
-            info.compress_type = method
-            with archive.open(info, "w", force_zip64=True) as member:
+            # By its name alone a member gets the archive's level, and the date of 1980 that numpy's own writer gives.
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
                 np.lib.format.write_array(member, np.asanyarray(array), allow_pickle=False)
 
 

@@ -1,0 +1,34 @@
+"""Arrays in zip files: packed as much as asked for, the same bytes each time."""
+
+from __future__ import annotations
+
+import io
+import zipfile
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from lslam.formats.npz_files import pack_npz, read_npz
+
+
+def packed(values: NDArray[np.float32], level: int) -> bytes:
+    stream = io.BytesIO()
+    pack_npz(stream, {"a": values}, level)
+    return stream.getvalue()
+
+
+@pytest.mark.parametrize("level", [0, 1, 6, 9])
+def test_arrays_come_back_and_the_same_bytes_are_written_again(level: int) -> None:
+    values = np.sin(np.arange(20_000, dtype=np.float32).round(-1))
+    data = packed(values, level)
+    assert data == packed(values, level)
+    np.testing.assert_array_equal(read_npz(io.BytesIO(data))["a"], values)
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        assert [info.date_time for info in archive.infolist()] == [(1980, 1, 1, 0, 0, 0)]
+
+
+def test_a_higher_level_makes_smaller_files() -> None:
+    values = np.repeat(np.random.default_rng(0).integers(0, 99, 20_000), 3).astype(np.float32)
+    sizes = [len(packed(values, level)) for level in (0, 1, 9)]
+    assert sizes[0] > values.nbytes > sizes[1] > sizes[2]
