@@ -92,7 +92,8 @@ def inline(function: F) -> F:
     Without numba's runtime, the arrays that it takes are not counted at each call: two atomic operations for every one of
     them, which cost ten times a lookup in a hash table.
     """
-    compiled = numba.njit(nogil=True, error_model="numpy", forceinline=True, _nrt=False)(function)
+    options: dict[str, Any] = {"nogil": True, "error_model": "numpy", "forceinline": True, "_nrt": False}
+    compiled = numba.njit(**options)(function)
     return cast(F, compiled)
 
 

@@ -28,7 +28,7 @@ def measurable(scan: Scan) -> Scan:
     if voxel.count_within(np.ascontiguousarray(scan.points, np.float32), FARTHEST_M) == len(scan):
         return scan
     # NaN is not smaller.
-    return scan.select((np.abs(scan.points) < FARTHEST_M).all(axis=1))
+    return scan.select(np.asarray((np.abs(scan.points) < FARTHEST_M).all(axis=1)))
 
 
 def plausible(result: ScanResult, T_prior: Floats, last: ScanResult | None) -> ScanResult:
