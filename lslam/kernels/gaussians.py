@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from lslam.kernels.jit import inline, kernel
 from lslam.kernels.linalg import plane_of
-from lslam.kernels.voxel import MASK, OFFSET, hash_key, index_of, pack, place_of
+from lslam.kernels.voxel import AHEAD, MASK, OFFSET, hash_key, index_of, pack, place_of
 
 Floats = NDArray[np.float64]
 Longs = NDArray[np.int64]
@@ -33,8 +33,6 @@ EMPTY, BLOB = -2.0, -1.0
 # ring that bends in its voxel is a strip.
 SOLID = 0.1
 USED, FREED, HAND, LIVE = 0, 1, 2, 3
-# Points that are looked up together.
-AHEAD = 64
 
 
 @inline

@@ -98,7 +98,7 @@ def inline(function: F) -> F:
 
 
 def inline_with_arrays(function: F) -> F:
-    """As `inline`, for one that makes arrays of its own: seldom called, or it would cost more than it does."""
+    """As `inline`, for one that makes arrays of its own. Its calls count references: for what is called once per step."""
     compiled = numba.njit(nogil=True, error_model="numpy", forceinline=True)(function)
     return cast(F, compiled)
 

@@ -13,6 +13,8 @@ from lslam.kernels.jit import inline, kernel
 
 OFFSET = 1 << 20
 MASK = (1 << 21) - 1
+# Points that are looked up together in a table larger than the nearest caches.
+AHEAD = 64
 
 
 @inline

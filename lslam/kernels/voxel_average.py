@@ -15,12 +15,11 @@ from numpy.typing import NDArray
 from lslam.kernels import row_table
 from lslam.kernels.jit import kernel
 from lslam.kernels.row_table import pack, row_of, slot_of
+from lslam.kernels.voxel import AHEAD
 
 UNITS = float(2**24)  # 2**39 points fit into one voxel's sum
 INTENSITY_UNITS = float(2**20)
 _BRIGHTEST = float(2**24)  # of such points a voxel's sum holds 2**19
-# Points that are looked up together.
-AHEAD = 64
 
 
 @kernel
