@@ -69,9 +69,9 @@ def genz_icp(sequence: Sequence, scans: int) -> Outcome:
     poses, seconds = [], []
     for i in range(scans):
         scan = sequence.scan(i)
-        shares = shares_of(scan, sequence)
+        points, shares = scan.points.astype(np.float64), shares_of(scan, sequence)
         began = time.perf_counter()
-        genz.register_frame(scan.points.astype(np.float64), shares)
+        genz.register_frame(points, shares)
         seconds.append(time.perf_counter() - began)
         poses.append(np.array(genz.last_pose))
     return np.stack(poses), np.array(seconds)
@@ -90,11 +90,12 @@ def rko_lio(sequence: Sequence, scans: int) -> Outcome:
     for i in range(scans):
         scan = sequence.scan(i)
         stamps = scan.stamp_ns + np.round(1e9 * times_of(scan, sequence)).astype(np.int64)
+        points = scan.points.astype(np.float64)
         began = time.perf_counter()
         while told < len(imu) and imu.stamps_ns[told] <= stamps.max():
             lio.add_imu_measurement(imu.accel[told], imu.gyro[told], int(imu.stamps_ns[told]), T_lidar_imu)
             told += 1
-        lio.register_scan(scan.points.astype(np.float64), stamps, np.eye(4))
+        lio.register_scan(points, stamps, np.eye(4))
         seconds.append(time.perf_counter() - began)
         poses.append(lio.pose().copy())
     return np.stack(poses), np.array(seconds)
