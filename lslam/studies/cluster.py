@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import logging
 import os
 import shutil
 import tempfile
 import threading
+import time
 import zipfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -26,6 +28,8 @@ from lslam.version import __version__
 
 log = logging.getLogger("lslam")
 _ANSWER_S, _WORKERS_S = 10, 30
+# A scheduler that went away is waited for so long: whatever restarts it has to begin a new process, and workers too.
+_PATIENCE_S, _PAUSE_S = 300.0, 1.0
 _LOCAL = "local:"
 # A worker may have several threads, but a run is to have its process alone.
 _ALONE = threading.Lock()
@@ -38,7 +42,6 @@ def connected(scheduler: str | None, local: str | None, title: str, *, is_persis
     Raises UsageError when Dask is missing or `local` is no number of workers; InputError when the scheduler does not answer.
     """
     try:
-        import dask
         from distributed import Client, LocalCluster
     except ImportError:
         raise UsageError("--scheduler and --cluster need Dask: pip install 'lslam[cluster]'") from None
@@ -56,19 +59,29 @@ def connected(scheduler: str | None, local: str | None, title: str, *, is_persis
             yield Cluster(client, made.scheduler_address, title, is_here=True, is_persistent=is_persistent)
         return
     assert scheduler is not None
+    cluster = Cluster(_client(scheduler), scheduler, title, is_persistent=is_persistent)
+    try:
+        yield cluster
+    finally:
+        cluster.client.close()
+
+
+def _client(scheduler: str) -> Any:
+    """Raises InputError when the scheduler does not answer."""
+    import dask
+    from distributed import Client
+
     try:
         with dask.config.set({"distributed.comm.timeouts.connect": f"{_ANSWER_S}s"}):
-            client = Client(scheduler, timeout=_ANSWER_S)
+            return Client(scheduler, timeout=_ANSWER_S)
     except (OSError, ValueError) as error:
         raise InputError(
             f"the scheduler {scheduler} does not answer within {_ANSWER_S} s ({type(error).__name__}): is `dask scheduler` "
             "running there, and its port open?"
         ) from None
-    with client:
-        yield Cluster(client, scheduler, title, is_persistent=is_persistent)
 
 
-@dataclass(frozen=True)
+@dataclass
 class Cluster:
     """The workers of a scheduler.
 
@@ -114,28 +127,36 @@ class Cluster:
     def run(self, jobs: Sequence[Job], progress: StudyProgress, on_done: Callable[[Job], None]) -> None:
         """Make every run on some worker; the scheduler begins anew what a worker that died had in hand.
 
-        Raises RunFailedError when the scheduler goes away.
+        What a scheduler that went away had in hand is begun anew when it is back. Raises RunFailedError when it stays away.
         """
-        from distributed import as_completed
-
         if not jobs:
             return
+        progress.on_start(self.title, len(jobs), "runs")
+        left = list(jobs)
+        while left := self._attempt(left, progress, on_done):
+            log.warning(
+                "the scheduler %s went away after %d of %d runs: it is waited for", self.address, len(jobs) - len(left),
+                len(jobs),
+            )  # fmt: skip
+            self._reconnect(len(jobs) - len(left), len(jobs))
+
+    def _attempt(self, jobs: Sequence[Job], progress: StudyProgress, on_done: Callable[[Job], None]) -> list[Job]:
+        """Make the runs; those that are left when the scheduler goes away."""
+        from distributed import as_completed
+
         for job in jobs:
             clear_attempt(job)
         context = WorkerContext(self.at_once, is_alone=False, is_persistent=self.is_persistent)
-        progress.on_start(self.title, len(jobs), "runs")
-        futures = {
+        left = {
             self.client.submit(perform, job, context, key=f"lslam-{k}-{job.digest}", pure=False): job
             for k, job in enumerate(jobs)
         }
         try:
-            for number, future in enumerate(as_completed(futures)):
-                job, error = futures[future], future.exception()
+            for future in as_completed(list(left)):
+                error = future.exception()
                 if future.cancelled() or self.client.status != "running":
-                    raise RunFailedError(
-                        f"the scheduler {self.address} went away after {number} of {len(jobs)} runs: start it, and the same "
-                        "command with --resume goes on"
-                    )
+                    break
+                job = left.pop(future)
                 if error is None:
                     unpack(future.result(), job)
                 ensure_state(job, "" if error is None else f"its worker failed: {error}", context)
@@ -143,7 +164,26 @@ class Cluster:
                 progress.on_step(job.name)
                 future.release()
         finally:
-            self.client.cancel(list(futures), force=True)
+            if self.client.status == "running":
+                self.client.cancel(list(left), force=True)
+        return list(left.values())
+
+    def _reconnect(self, done: int, of: int) -> None:
+        """A new client, once the scheduler answers and has a worker; raises RunFailedError when it does not."""
+        with contextlib.suppress(Exception):  # of a connection that is lost
+            self.client.close(timeout=1)
+        until = time.monotonic() + _PATIENCE_S
+        while True:
+            with contextlib.suppress(InputError, TimeoutError, OSError):
+                self.client = _client(self.address)
+                self.client.wait_for_workers(1, timeout=max(until - time.monotonic(), 1.0))
+                return
+            if time.monotonic() > until:
+                raise RunFailedError(
+                    f"the scheduler {self.address} went away after {done} of {of} runs: start it, and the same command with "
+                    "--resume goes on"
+                )
+            time.sleep(_PAUSE_S)
 
     def _workers(self) -> dict[str, Any]:
         return dict(self.client.scheduler_info(n_workers=-1)["workers"])

@@ -96,7 +96,10 @@ def make_runs(
             on_rows(results.rows)
 
         on_rows(results.rows)
-        engine.run(left, progress, on_done)
+        try:
+            engine.run(left, progress, on_done)
+        finally:
+            results.flush()
     except KeyboardInterrupt:
         raise InterruptedRunError(
             f"interrupted; {len(finished(jobs))} of {len(jobs)} runs are finished in {output.out}: the same command with "

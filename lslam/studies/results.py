@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import time
 from collections.abc import Sequence
 from math import nan
 from pathlib import Path
@@ -21,10 +22,15 @@ PARQUET = "results.parquet"
 _NOT_TIMED = ("read",)
 # A run that waited longer for its core was held up by somebody.
 _MOST_WAITED = 0.05
+# Tables that take longer to write, thousands of rows, take no more than one part in so many of the time.
+_QUICK_S, _PARTS = 0.05, 10
 
 
 class Results:
-    """Rows of finished runs in the order of the study; the files are whole at any moment."""
+    """Rows of finished runs in the order of the study; the files are whole at any moment.
+
+    Those of thousands of runs may be some seconds behind, until `flush`.
+    """
 
     def __init__(
         self, study: str, out: Path, jobs: Sequence[Job], variants: dict[str, Variant], metric: str = "ate_se3"
@@ -32,6 +38,7 @@ class Results:
         self.study, self.out, self.variants, self.metric = study, out, variants, metric
         self._order = {job.folder: k for k, job in enumerate(jobs)}
         self._rows: dict[int, StudyRow] = {}
+        self._next_s, self._is_behind = 0.0, False
 
     @property
     def rows(self) -> list[StudyRow]:
@@ -47,8 +54,19 @@ class Results:
         """Take up the runs of jobs that have ended and write the files; raises OutputError."""
         for job in jobs:
             self._rows[self._order[job.folder]] = self._row(job)
+        self._is_behind = True
+        if time.monotonic() >= self._next_s:
+            self.flush()
+
+    def flush(self) -> None:
+        """Write what the files are behind; raises OutputError."""
+        if not self._is_behind:
+            return
+        began = time.monotonic()
         write_study_csv(self.out / RESULTS, self.rows)
         write_study_parquet(self.out / PARQUET, self.rows)
+        self._is_behind, ended = False, time.monotonic()
+        self._next_s = ended + (_PARTS * (ended - began) if ended - began > _QUICK_S else 0.0)
 
     def _row(self, job: Job) -> StudyRow:
         score, variant = collect_run(job), self.variants[job.method]

@@ -157,12 +157,56 @@ class Gone:
     def cancel(self, futures: list[Gone], force: bool) -> None:
         """Likewise."""
 
+    def close(self, timeout: float) -> None:
+        """Likewise."""
 
-def test_a_scheduler_that_goes_away_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+
+def test_a_scheduler_that_goes_away_for_good_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("distributed.as_completed", iter)
-    engine = Cluster(Gone("connecting", None), "tcp://there:1", "studying")
-    with pytest.raises(RunFailedError, match=r"tcp://there:1 went away after 0 of 1 runs: start it, and .*--resume"):
+    monkeypatch.setattr(cluster, "_PATIENCE_S", 0)
+    monkeypatch.setattr(cluster, "_ANSWER_S", 1)
+    engine = Cluster(Gone("connecting", None), "tcp://127.0.0.1:9", "studying")
+    with pytest.raises(
+        RunFailedError, match=r"tcp://127.0.0.1:9 went away after 0 of 1 runs: start it, and .*--resume"
+    ):
         engine.run([job(tmp_path)], StudyProgress(), lambda job: None)
+
+
+def test_a_scheduler_that_is_restarted_gets_the_runs_that_are_left(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(cluster, "_PAUSE_S", 0.05)
+    monkeypatch.setattr(cluster, "_PATIENCE_S", 20)
+    jobs = [replace(job(tmp_path), folder=tmp_path / "out" / str(k), digest=str(k)) for k in range(6)]
+    done: list[str] = []
+    nets: list[LocalCluster] = []
+
+    def start(port: int) -> str:
+        nets.append(
+            LocalCluster(
+                n_workers=1, threads_per_worker=1, processes=False, protocol="tcp", dashboard_address=None,
+                scheduler_port=port, silence_logs=50,
+            )
+        )  # fmt: skip
+        return str(nets[-1].scheduler_address)
+
+    def on_done(one: Job) -> None:
+        done.append(one.digest)
+        if len(done) == 2:
+            nets[0].close()
+            start(port)
+
+    address = start(0)
+    port = int(address.rpartition(":")[2])
+    try:
+        with connected(address, None, "studying") as engine:
+            engine.run(jobs, StudyProgress(), on_done)
+    finally:
+        nets[-1].close()
+    assert sorted(done) == [one.digest for one in jobs], "each once"
+    states = [read_state(one.state_file) for one in jobs]
+    assert [(state.digest, state.status) for state in states if state] == [(one.digest, "failed") for one in jobs]
+    assert not list(tmp_path.rglob("*.part"))
 
 
 def test_a_run_whose_workers_all_died_is_a_row_with_its_reason(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
