@@ -22,8 +22,8 @@ PARQUET = "results.parquet"
 _NOT_TIMED = ("read",)
 # A run that waited longer for its core was held up by somebody.
 _MOST_WAITED = 0.05
-# Tables that take longer to write, thousands of rows, take no more than one part in so many of the time.
-_QUICK_S, _PARTS = 0.05, 10
+# A table of so many rows takes its time to write, and no more than one part in so many of all time.
+_MANY, _PARTS = 1000, 10
 
 
 class Results:
@@ -66,7 +66,7 @@ class Results:
         write_study_csv(self.out / RESULTS, self.rows)
         write_study_parquet(self.out / PARQUET, self.rows)
         self._is_behind, ended = False, time.monotonic()
-        self._next_s = ended + (_PARTS * (ended - began) if ended - began > _QUICK_S else 0.0)
+        self._next_s = ended + (_PARTS * (ended - began) if len(self._rows) >= _MANY else 0.0)
 
     def _row(self, job: Job) -> StudyRow:
         score, variant = collect_run(job), self.variants[job.method]
