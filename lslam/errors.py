@@ -72,6 +72,12 @@ class OutputError(LslamError):
     exit_code = 3
 
 
+class StorageError(LslamError):
+    """Object storage that does not answer or refuses: nothing is known of what lies there, and later it may be read."""
+
+    exit_code = 3
+
+
 class GateError(LslamError):
     """Everything was done, but a gate the user set failed."""
 

@@ -26,7 +26,7 @@ LAYERS = [
     ["types"],
     ["geometry"],
     ["kernels", "config"],
-    ["foreign", "locks", "plugins", "printable", "stopping", "untrusted"],
+    ["foreign", "locks", "plugins", "printable", "remote", "stopping", "untrusted"],
     ["errors", "version"],
 ]
 LEVEL = {name: level for level, names in enumerate(LAYERS) for name in names}
@@ -44,6 +44,7 @@ HOMES = {
     "requests": ["osm/overpass.py"],
     "urllib3": ["osm/overpass.py"],
     "pyproj": ["geometry/geodesy.py", "maps/georeference.py"],
+    "fsspec": ["remote.py"],
     "dask": ["studies/cluster.py"],
     "distributed": ["studies/cluster.py"],
     "pyarrow": ["formats/study_parquet.py"],

@@ -13,6 +13,7 @@ import click
 from lslam.cli import options
 from lslam.cli.console import log, setup_logging, show
 from lslam.errors import GateError, LslamError, RunFailedError, UsageError
+from lslam.remote import RemotePath, as_path
 
 if TYPE_CHECKING:
     from lslam.studies.batch import RunLine
@@ -75,8 +76,9 @@ def _expanded(path: Path, output: OutputOptions, given: dict[str, Any]) -> Expan
 def _line(number: int, words: list[str], given: dict[str, Any]) -> RunLine:
     """One `lslam run`, understood as that command does; raises what it raises, naming the line."""
     from lslam.cli.run import command as run_command
-    from lslam.cli.run import opened_with, read_truth
-    from lslam.studies.batch import RunLine
+    from lslam.cli.run import opened_with, read_truth, resolved
+    from lslam.readers.lookup import find_folder
+    from lslam.studies.batch import listed_line, opened_line
 
     try:
         said = run_command.make_context("run", list(words)).params
@@ -86,10 +88,11 @@ def _line(number: int, words: list[str], given: dict[str, Any]) -> RunLine:
             )
         said["settings"] = (*said["settings"], *given["settings"])
         said["data_root"] = said["data_root"] or given["data_root"]
+        text, folder, reading = shlex.join(words), said["out"], options.reading_of(said)
+        if said["gt"] is None and isinstance(place := as_path(said["sequence"]), RemotePath):
+            return listed_line(text, find_folder(place), resolved(said), folder, reading)
         sequence, config = opened_with(said)
-        return RunLine(
-            shlex.join(words), sequence, config, read_truth(said["gt"], sequence), said["out"], options.reading_of(said)
-        )  # fmt: skip
+        return opened_line(text, sequence, config, read_truth(said["gt"], sequence), folder, reading)
     except LslamError as error:
         raise type(error)(f"line {number}: {error}") from None
     except click.UsageError as error:

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 
 from lslam.errors import ConfigError, UsageError, nearest
+from lslam.remote import RemotePath, as_path
 from lslam.untrusted import whole_number
 
 if TYPE_CHECKING:
@@ -23,6 +24,16 @@ if TYPE_CHECKING:
     from lslam.studies.output import OutputOptions
 
 F = TypeVar("F", bound=Callable[..., Any])
+
+
+class Place(click.Path):
+    """A path, or a URL of storage."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """As `as_path`."""
+        if isinstance(value, str) and "://" in value:
+            return as_path(value)
+        return super().convert(value, param, ctx)
 
 
 def verbosity(function: F) -> F:
@@ -153,7 +164,7 @@ def studied(function: F) -> F:
         ("--scenes", "DIR", "Keep simulations here, for others of the same scenarios [default: simulated/ in --out]."),
         ("--out", "DIR", "Folder of all runs and results [default: runs/NAME-TIME]."),
     ):
-        function = click.option(name, type=click.Path(path_type=Path), metavar=metavar, help=text)(function)
+        function = click.option(name, type=Place(path_type=Path), metavar=metavar, help=text)(function)
     for name, text in (
         ("--overwrite", "Run everything anew in an existing folder."),
         ("--resume", "Keep finished runs of the same input and configuration, go on with the others."),
@@ -167,6 +178,10 @@ def output_of(given: dict[str, Any], name: str) -> OutputOptions:
     from lslam.studies.output import OutputOptions
 
     out = given["out"] or Path("runs") / time.strftime(f"{name}-%Y%m%d-%H%M%S")
+    if name != "batch" and isinstance(out, RemotePath):
+        raise UsageError(
+            f"--out {out}: the results of this command are files of this machine; run and batch write to storage"
+        )
     command = shlex.join(["lslam", *sys.argv[1:]])
     return OutputOptions(out, given["overwrite"], given["resume"], given["scenes"], given["data_root"], command)
 

@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     "--gt", type=click.Path(path_type=Path), metavar="FILE", help="Ground truth instead of the sequence's own."
 )
 @click.option(
-    "--out", type=click.Path(path_type=Path), metavar="DIR", help="Run folder [default: runs/NAME-METHOD-TIME]."
+    "--out", type=options.Place(path_type=Path), metavar="DIR|URL", help="Run folder [default: runs/NAME-METHOD-TIME]."
 )
 @click.option("--resume", is_flag=True, help="Go on with a run that was killed or interrupted; needs its --out.")
 @click.option("--overwrite", is_flag=True, help="Replace an earlier run in the folder.")
@@ -77,7 +77,8 @@ if TYPE_CHECKING:
 def command(sequence: str, **given: Any) -> None:
     """Estimate a trajectory and build a map.
 
-    SEQUENCE is a path (a folder or a bag), or a name under --data-root: seq07, 07, kitti/07, 2011_09_26_drive_0005_sync.
+    SEQUENCE is a path (a folder or a bag), a name under --data-root: seq07, 07, kitti/07, 2011_09_26_drive_0005_sync, or
+    a URL of storage: s3://bucket/drive7.bag.
     """
     setup_logging(given["verbose"], given["quiet"])
     from lslam.warned import hearing
@@ -112,17 +113,24 @@ def _run(sequence: str, given: dict[str, Any]) -> None:
 
 def opened_with(given: dict[str, Any]) -> tuple[Sequence, Config]:
     """The sequence and the configuration that the words of a command line mean; raises what is wrong with them."""
-    from lslam.pipeline.check import check_config
     from lslam.readers import open_sequence
 
-    config = _resolve(given)
-    check_config(config)
+    config = resolved(given)
     opened = open_sequence(
         given["sequence"], data_root=given["data_root"],
         vertical_correction_deg=config.input.vertical_correction_deg,
         imu=config.imu.use, gnss=config.gnss.mode != "off", **options.reading_of(given),
     )  # fmt: skip
     return opened, config
+
+
+def resolved(given: dict[str, Any]) -> Config:
+    """The configuration alone; raises what is wrong with it."""
+    from lslam.pipeline.check import check_config
+
+    config = _resolve(given)
+    check_config(config)
+    return config
 
 
 def _variant(config: Config) -> str:

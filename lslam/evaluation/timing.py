@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.formats.timing_csv import read_timing_rows
+from lslam.remote import as_path
 
 
 @dataclass(frozen=True)
@@ -43,7 +44,7 @@ def read_timing(path: str | Path) -> Timing:
 
     Raises InputError naming file and line when it is missing, empty or holds no numbers.
     """
-    rows = read_timing_rows(Path(path))
+    rows = read_timing_rows(as_path(path))
     period = None
     if rows.stamps_ns is not None and len(rows.total) > 1:
         period = float(np.median(np.diff(rows.stamps_ns))) / 1e9

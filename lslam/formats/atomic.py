@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -9,14 +10,21 @@ from pathlib import Path
 from typing import BinaryIO
 
 from lslam.errors import OutputError, cause
+from lslam.remote import RemotePath
 
 
 @contextmanager
 def atomic_write(path: Path) -> Iterator[BinaryIO]:
     """A binary stream on `<name>.part`, renamed to `path` when the block ends well and removed when it does not.
 
-    Raises OutputError naming the file when it cannot be written (permissions, a full disk).
+    In storage the object is put there when the block ends well.
+    Raises OutputError naming the file when it cannot be written (permissions, a full disk), StorageError likewise.
     """
+    if isinstance(path, RemotePath):
+        held = io.BytesIO()
+        yield held
+        path.write_bytes(held.getbuffer())
+        return
     part = path.with_name(path.name + ".part")
     try:
         with part.open("wb") as stream:

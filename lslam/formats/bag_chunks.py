@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import bz2
+import contextlib
 import os
-from collections.abc import Callable
+import struct
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -14,9 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.errors import InputError, cause
+from lslam.formats.ranged import RangedFile
+from lslam.remote import RemotePath
 
 LARGEST = 1 << 29  # bytes of a compressed chunk or message when it is unpacked; recorders make a thousandth of it
 _BLOCK = 1 << 18  # compressed bytes read at a time when only the beginning of a chunk is wanted
+_HEAD = 1 << 12  # bytes that hold the headers of a record and of its message
 IN_FILE = -1  # chunk number of a message that lies in the file itself
 
 Pairs = NDArray[np.int64]
@@ -64,18 +69,25 @@ class ChunkFile:
     """Random access to a file and to its chunks, from any thread; one decompressed chunk is kept."""
 
     def __init__(self, path: Path) -> None:
+        self.path = path
         try:
-            self._file = path.open("rb")
+            self._ranged = RangedFile(path) if isinstance(path, RemotePath) else None
+            self._file = None if self._ranged else path.open("rb")
         except OSError as error:
             raise InputError(f"{path} cannot be read: {cause(error)}") from None
-        self.path = path
-        self.size = os.fstat(self._file.fileno()).st_size
+        self.size = os.fstat(self._file.fileno()).st_size if self._file else self._ranged.size if self._ranged else 0
         self._kept: tuple[int, bytes] = (-1, b"")
 
     def read(self, position: int, size: int) -> bytes:
         """`size` bytes from `position`. Raises CutOffError when the file ends before."""
         if size < 0 or position + size > self.size:
             raise CutOffError
+        if self._ranged:
+            data = self._ranged.read(position, size)
+            if len(data) < size:
+                raise CutOffError
+            return data
+        assert self._file is not None
         data = os.pread(self._file.fileno(), size, position)
         while len(data) < size:  # a signal, or more than the 2 GB one call reads
             more = os.pread(self._file.fileno(), size - len(data), position + len(data))
@@ -83,6 +95,19 @@ class ChunkFile:
                 raise CutOffError
             data += more
         return data
+
+    def expect(self, ranges: Callable[[], Iterable[tuple[int, int]]]) -> None:
+        """Of a file in storage: say which (position, size) of it will be read next, as `RangedFile.expect`.
+
+        It is no more than a hint, and so are places that the file itself gives: what is wrong with them goes unsaid.
+        """
+        if self._ranged:
+            with contextlib.suppress(CutOffError, struct.error, LookupError, ValueError, InputError):
+                self._ranged.expect(ranges())
+
+    def expect_messages(self, chunks: Sequence[Chunk], where: Pairs) -> None:
+        """Likewise, the beginnings of the messages that lie there."""
+        self.expect(lambda: (_beginning(None if n == IN_FILE else chunks[n], k) for n, k in where.tolist()))
 
     def part(self, chunk: Chunk | None, offset: int, size: int, is_head: bool = False) -> bytes:
         """At most `size` bytes of the records of `chunk` from `offset`; None is the file itself.
@@ -133,6 +158,13 @@ class ChunkFile:
                 used += len(data)
             records += engine.decompress(data, max_length=least - len(records))
         return bytes(records)
+
+
+def _beginning(chunk: Chunk | None, offset: int) -> tuple[int, int]:
+    """Position and size of what is read of a message's beginning."""
+    if chunk is None:
+        return offset, _HEAD
+    return (chunk.position, min(_BLOCK, chunk.size)) if chunk.compression else (chunk.position + offset, _HEAD)
 
 
 def check_compression(path: Path, name: str) -> None:

@@ -47,6 +47,10 @@ class Recording(Protocol):
         """Message `k` of `topic`, its first `limit` bytes at the least when only these are wanted."""
         ...
 
+    def expect(self, topic: Topic) -> None:
+        """Know that the beginnings of all messages of `topic` will be read next; only storage makes use of it."""
+        ...
+
 
 READERS: dict[str, Callable[[Path], Recording]] = {
     ".bag": Ros1Bag,
@@ -101,6 +105,11 @@ class Bag:
         """When each message of `topic` was recorded, ns."""
         return [int(stamp) for _, part in topic.parts for stamp in part.stamps_ns]
 
+    def expect(self, topic: BagTopic) -> None:
+        """Say that the beginnings of all messages of `topic` will be read next."""
+        for recording, part in topic.parts:
+            recording.expect(part)
+
     def message(self, topic: BagTopic, k: int, limit: int | None = None) -> bytes:
         """Message `k` of `topic` as it was serialised, or its first `limit` bytes at the least.
 
@@ -115,6 +124,7 @@ class Bag:
 
     def messages(self, topic: BagTopic, broken: list[str]) -> Iterator[bytes]:
         """All messages of `topic`; of those that are damaged the reason goes to `broken`."""
+        self.expect(topic)
         for k in range(len(topic)):
             try:
                 yield self.message(topic, k)

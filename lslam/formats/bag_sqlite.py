@@ -9,8 +9,9 @@ from urllib.parse import quote
 
 import numpy as np
 
-from lslam.errors import InputError
+from lslam.errors import InputError, UsageError
 from lslam.formats.bag_chunks import Topic
+from lslam.remote import RemotePath
 
 _TABLES = {"topics", "messages"}
 
@@ -19,6 +20,11 @@ class SqliteBag:
     """One `.db3` file: `topics`, and `loss`, a sentence when it was cut off."""
 
     def __init__(self, path: Path) -> None:
+        if isinstance(path, RemotePath):
+            raise UsageError(
+                f"{path}: SQLite cannot be read in place from storage; *.mcap and *.bag are: `lslam convert` makes an MCAP file "
+                "of a copy, or run the copy"
+            )
         self.path = path
         self.loss = ""
         self._lock = threading.Lock()
@@ -42,6 +48,9 @@ class SqliteBag:
         self.topics = list(self._topics.values())
         if path.with_name(path.name + "-wal").is_file():
             self.loss = self.loss or f"{path}-wal holds messages that were never merged: `ros2 bag reindex` does that"
+
+    def expect(self, topic: Topic) -> None:
+        """Nothing: the file is on a disk."""
 
     def read(self, topic: Topic, k: int, limit: int | None = None) -> bytes:
         """Message `k` of `topic`, its first `limit` bytes at the least when only these are wanted."""

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from lslam.errors import InputError, cause
 from lslam.geometry import se3, so3
+from lslam.remote import as_path
 
 Floats = NDArray[np.float64]
 LIDAR_TO_CAMERA = ("Tr", "Tr_velo_to_cam", "Tr_velo_cam")
@@ -19,7 +20,7 @@ def read_odometry_calib(path: str | Path) -> Floats | None:
 
     Raises InputError when the file is missing, is no calibration, or states numbers that are no rigid transform.
     """
-    path = Path(path)
+    path = as_path(path)
     entries = read_entries(path)
     name = next((name for name in LIDAR_TO_CAMERA if name in entries), None)
     if name is None:
@@ -32,7 +33,7 @@ def read_rigid(path: str | Path) -> Floats:
 
     `T_cam0_lidar` of a raw day ends in the unrectified camera 0; see `read_raw_cam0_lidar` for the rectified one.
     """
-    path = Path(path)
+    path = as_path(path)
     entries = read_entries(path)
     R, t = _numbers(path, entries, "R", 9), _numbers(path, entries, "T", 3)
     return _rigid(np.column_stack([np.reshape(R, (3, 3)), t]), path, "R")
@@ -40,7 +41,7 @@ def read_rigid(path: str | Path) -> Floats:
 
 def read_rectification(path: str | Path) -> Floats | None:
     """(4, 4) rotation into the rectified camera 0: `R_rect_00` of `calib_cam_to_cam.txt`, None when it has none."""
-    path = Path(path)
+    path = as_path(path)
     entries = read_entries(path)
     if "R_rect_00" not in entries:
         return None
@@ -50,7 +51,7 @@ def read_rectification(path: str | Path) -> Floats | None:
 
 def read_raw_cam0_lidar(folder: str | Path) -> Floats:
     """`T_cam0_lidar` (4, 4) of a raw day, in the rectified camera 0 when `calib_cam_to_cam.txt` is there."""
-    folder = Path(folder)
+    folder = as_path(folder)
     T = read_rigid(folder / "calib_velo_to_cam.txt")
     cameras = folder / "calib_cam_to_cam.txt"
     rectification = read_rectification(cameras) if cameras.is_file() else None
@@ -62,7 +63,7 @@ def read_cam0_lidar(path: str | Path) -> Floats:
 
     Raises InputError when it holds none.
     """
-    path = Path(path)
+    path = as_path(path)
     if path.is_dir():
         return read_raw_cam0_lidar(path)
     entries = read_entries(path)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +23,9 @@ from lslam.formats.bag_chunks import (
 )
 
 MAGIC = b"\x89MCAP0\r\n"
-_FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _INDEX = 2, 3, 4, 5, 6, 7
+_FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _INDEX, _CHUNK_INDEX = 2, 3, 4, 5, 6, 7, 8
+_FOOTER_SIZE = 29  # bytes of the record, its prefix included
+_INDICES = 8192  # of the indices of a chunk, about
 _PREFIX = 9  # bytes before the content of a record: op and length
 _STAMPS = 22  # bytes before the data of a message: channel, sequence, log time, publish time
 
@@ -41,6 +43,7 @@ class McapFile:
         self._loose: dict[int, tuple[list[int], list[int]]] = {}  # messages outside chunks
         self.loss = ""
         self._check_magic()
+        self._file.expect(self._indexed)
         self._walk()
         for channel, (stamps, offsets) in self._loose.items():
             self._add(channel, IN_FILE, np.array(stamps, np.uint64).astype(np.int64), np.array(offsets, np.int64))
@@ -71,6 +74,24 @@ class McapFile:
             raise InputError(f"{self.path} is no MCAP file: it has {self._file.size} bytes") from None
         if magic != MAGIC:
             raise InputError(f"{self.path} is no MCAP file: it begins with {magic!r}")
+
+    def expect(self, topic: Topic) -> None:
+        """The beginnings of all messages of `topic` will be read next."""
+        self._file.expect_messages(self._chunks, topic.where)
+
+    def _indexed(self) -> Iterator[tuple[int, int]]:
+        """Where the summary at the end of the file says that records lie beside the messages: what the walk will read."""
+        footer = self._file.size - len(MAGIC) - _FOOTER_SIZE
+        (position,) = struct.unpack_from("<Q", self._file.read(footer, _FOOTER_SIZE), _PREFIX)
+        end = footer
+        self._file.expect(lambda: [(position, end - position)])
+        while 0 < position < end:
+            op, length = struct.unpack("<BQ", self._file.read(position, _PREFIX))
+            if op == _CHUNK_INDEX:
+                start, size, *_ = struct.unpack_from("<2Q", self._file.read(position + _PREFIX, length), 16)
+                yield start, 64
+                yield start + size, _INDICES
+            position += _PREFIX + length
 
     def _walk(self) -> None:
         """Note schemas, channels, chunks and indices; stop where a record is not whole."""

@@ -14,6 +14,7 @@ from lslam.formats.atomic import atomic_write
 from lslam.formats.pcd_files import read_pcd, write_pcd
 from lslam.formats.ply_files import read_ply, write_ply
 from lslam.formats.point_cloud import PointCloud
+from lslam.remote import RemotePath
 from lslam.untrusted import MISFIT
 
 SUFFIXES = (".bin", ".pcd", ".ply", ".npy")
@@ -47,8 +48,11 @@ def read_bin(path: Path) -> NDArray[np.float32]:
     Raises InputError naming the file and its size when that is no multiple of 16 bytes.
     """
     try:
-        with path.open("rb") as stream:
-            raw = np.fromfile(stream, np.uint8)
+        if isinstance(path, RemotePath):
+            raw = np.frombuffer(bytearray(path.read_bytes()), np.uint8)
+        else:
+            with path.open("rb") as stream:
+                raw = np.fromfile(stream, np.uint8)
     except OSError as error:
         raise InputError(f"{path} cannot be read: {cause(error)}") from None
     if len(raw) % 16:
@@ -92,7 +96,8 @@ def _read_npy(path: Path) -> PointCloud:
     from lslam.formats.point_cloud import cloud_from_fields
 
     try:
-        table = np.load(path, allow_pickle=False)
+        with path.open("rb") as stream:
+            table = np.load(stream, allow_pickle=False)
     except (OSError, *MISFIT, EOFError, SyntaxError, MemoryError, TokenError) as error:
         raise InputError(f"{path} cannot be read as a NumPy array: {error}") from None
     if table.dtype.names:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -23,8 +23,9 @@ from lslam.formats.bag_chunks import (
 )
 
 MAGIC = b"#ROSBAG V2.0\n"
-_MESSAGE, _INDEX, _CHUNK, _CONNECTION = 2, 4, 5, 7
+_MESSAGE, _INDEX, _CHUNK, _CHUNK_INFO, _CONNECTION = 2, 4, 5, 6, 7
 _BROKEN = (CutOffError, struct.error, LookupError, ValueError)  # what reading a damaged record ends in
+_INDICES = 8192  # of the indices of a chunk, about
 _HEADER = 4096  # more than any record header but one with a message definition
 
 
@@ -50,6 +51,7 @@ class Ros1Bag:
         self._pieces: dict[int, tuple[list[NDArray[np.int64]], list[Pairs]]] = {}
         self.loss = ""
         self._check_magic()
+        self._file.expect(self._indexed)
         self._walk()
         self._find_missing_connections()
         for number, (stamps, where) in self._pieces.items():
@@ -82,6 +84,23 @@ class Ros1Bag:
         if magic != MAGIC:
             old = "an old version, `rosbag fix` brings it to 2.0" if magic.startswith(b"#ROSBAG") else "no ROS 1 bag"
             raise InputError(f"{self.path} is {old}: it begins with {magic[:12]!r}")
+
+    def expect(self, topic: Topic) -> None:
+        """The beginnings of all messages of `topic` will be read next."""
+        self._file.expect_messages(self._chunks, topic.where)
+
+    def _indexed(self) -> Iterator[tuple[int, int]]:
+        """Where the index at the end of the file says that chunks begin, before which the indices of others lie."""
+        (position,) = struct.unpack("<Q", self._record(None, len(MAGIC)).fields[b"index_pos"])
+        size = self._file.size
+        if position:
+            self._file.expect(lambda: [(position, size - position)])
+        while 0 < position < size:
+            record = self._record(None, position)
+            if record.op == _CHUNK_INFO:
+                (start,) = struct.unpack("<Q", record.fields[b"chunk_pos"])
+                yield start - _INDICES, _INDICES + _HEADER
+            position = record.end
 
     def _walk(self) -> None:
         """Note chunks, connections and indices; stop where a record is not whole."""

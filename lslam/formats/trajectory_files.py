@@ -20,6 +20,7 @@ from lslam.formats.pose_rows import Row, read_rows
 from lslam.formats.trajectory_csv import write_euroc
 from lslam.formats.trajectory_formats import FORMATS, format_named
 from lslam.formats.trajectory_lines import find_times, read_times, write_kitti, write_tum
+from lslam.remote import as_path
 from lslam.types.trajectory import Trajectory
 
 __all__ = ["detect_format", "find_times", "read_times", "read_trajectory", "write_euroc", "write_kitti", "write_tum"]
@@ -40,7 +41,7 @@ def read_trajectory(path: str | Path, format: str | None = None, times: str | Pa
     InputError naming file and line: missing, empty, short lines, NaN, no rotation, stamps that do not increase.
     UsageError for an unknown `format`.
     """
-    path = Path(path)
+    path = as_path(path)
     if path.is_dir():
         path = _in_run_folder(path)
     rows, comments = read_rows(path)

@@ -22,6 +22,7 @@ from lslam.formats.pose_rows import (
     write_lines,
 )
 from lslam.geometry import so3
+from lslam.remote import as_path
 from lslam.types.trajectory import Trajectory
 
 log = logging.getLogger("lslam")
@@ -89,7 +90,7 @@ def write_tum(path: str | Path, trajectory: Trajectory, comment: str = "") -> No
 
 def read_times(path: str | Path) -> NDArray[np.int64]:
     """Stamps (N,) int64 ns of a file with one time in seconds per line, as KITTI's `times.txt`."""
-    path = Path(path)
+    path = as_path(path)
     rows, _ = read_rows(path)
     if not rows:
         raise InputError(f"{path} holds no times")
@@ -100,7 +101,7 @@ def read_times(path: str | Path) -> NDArray[np.int64]:
 
 def find_times(path: str | Path) -> Path | None:
     """The times that belong to a KITTI pose file: `times.txt` beside it, `times/NN.txt` or `sequences/NN/times.txt`."""
-    path = Path(path)
+    path = as_path(path)
     above = path.resolve().parent
     candidates = (
         above / "times.txt",

@@ -6,7 +6,7 @@ import logging
 from pathlib import Path
 
 from lslam.config import Config
-from lslam.errors import GateError, InterruptedRunError, OutputError, RunFailedError
+from lslam.errors import GateError, InterruptedRunError, OutputError, RunFailedError, RunFinishedError
 from lslam.evaluation.evaluate import Evaluation
 from lslam.keyframes.store import KeyframeStore
 from lslam.osm.corrections import write_buildings
@@ -18,7 +18,9 @@ from lslam.pipeline.odometry_pass import odometry_checkpoints
 from lslam.pipeline.resume import may_go_on, run_identity
 from lslam.pipeline.run_folder import KEYFRAMES, RunFolder
 from lslam.pipeline.stages import make_feature_map, make_map, make_report, solve
+from lslam.pipeline.storage import check_place, spool_of, upload
 from lslam.pipeline.watch import RunOutcome
+from lslam.remote import RemotePath
 from lslam.types.run_record import RunRecord
 
 log = logging.getLogger("lslam")
@@ -27,6 +29,8 @@ log = logging.getLogger("lslam")
 def perform(job: PreparedRun, out: Path | None, overwrite: bool, resume: bool) -> RunOutcome:
     """The run, into its folder when there is one."""
     manifest = job.manifest
+    if isinstance(out, RemotePath):
+        return _perform_afar(job, out, overwrite, resume)
     if out is None:
         record, _, evaluation = solve(job, KeyframeStore(deflate=job.config.keyframes.deflate))
         manifest.take_over(record)
@@ -46,6 +50,22 @@ def perform(job: PreparedRun, out: Path | None, overwrite: bool, resume: bool) -
             folder.drop_checkpoint()
         log.info("%s; results in %s", manifest.outcome, folder.path)
     return RunOutcome(record, evaluation)
+
+
+def _perform_afar(job: PreparedRun, place: RemotePath, overwrite: bool, resume: bool) -> RunOutcome:
+    """The run, into a folder of this machine that is uploaded when it has ended; what is to go on stays where it is."""
+    check_place(place, overwrite or resume)
+    if resume:
+        may_go_on(place, run_identity(job.sequence, job.truth, job.config, job.given), job.config)
+    spool = spool_of(place)
+    try:
+        outcome = perform(job, spool, not resume, resume)
+    except RunFinishedError:  # and was not uploaded
+        upload(spool, place)
+        raise
+    if job.manifest.outcome != "interrupted":
+        upload(spool, place)
+    return outcome
 
 
 def _fill(folder: RunFolder, job: PreparedRun, goes_on: bool) -> tuple[RunRecord, Evaluation | None]:

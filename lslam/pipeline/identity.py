@@ -13,6 +13,7 @@ import numpy as np
 
 from lslam.config import Config
 from lslam.errors import InputError, cause
+from lslam.remote import RemotePath
 from lslam.types.sequence import Sequence
 from lslam.types.trajectory import Trajectory
 from lslam.version import __version__
@@ -23,18 +24,31 @@ def input_digest(sequence: Sequence, truth: Trajectory | None) -> str:
 
     Raises InputError when the folder cannot be listed.
     """
-    digest = hashlib.sha256(f"{sequence.path}\0{len(sequence)}\0".encode(errors="surrogateescape"))
-    try:
-        for path, stat in _files(sequence.path):
-            line = f"{path}\0{stat.st_size}\0{stat.st_mtime_ns}\n"
-            digest.update(line.encode(errors="surrogateescape"))
-    except OSError as error:
-        raise InputError(f"{error.filename or sequence.path} cannot be read: {cause(error)}") from None
+    digest = _listing(sequence.path, len(sequence))
     truth = sequence.ground_truth if truth is None else truth
     if truth is not None:
         digest.update(truth.stamps_ns.tobytes())
         digest.update(truth.poses.tobytes())
     return digest.hexdigest()
+
+
+def listing_digest(path: Path) -> str:
+    """Likewise of a recording that is not opened: what is in it follows from its files.
+
+    Raises InputError when it cannot be listed.
+    """
+    return _listing(path, 0).hexdigest()
+
+
+def _listing(path: Path, scans: int) -> hashlib._Hash:
+    digest = hashlib.sha256(f"{path}\0{scans}\0".encode(errors="surrogateescape"))
+    try:
+        for name, stat in _files(path):
+            line = f"{name}\0{stat.st_size}\0{stat.st_mtime_ns}\n"
+            digest.update(line.encode(errors="surrogateescape"))
+    except OSError as error:
+        raise InputError(f"{error.filename or path} cannot be read: {cause(error)}") from None
+    return digest
 
 
 def imu_digest(sequence: Sequence) -> str:
@@ -63,6 +77,9 @@ def _files(path: Path) -> Iterator[tuple[str, os.stat_result]]:
     """Every file of a recording in a fixed order, links followed: KITTI's velodyne folders often are links."""
     if path.is_file():
         yield path.name, path.stat()
+        return
+    if isinstance(path, RemotePath):
+        yield from path.files()
         return
     # Plain words instead of paths: of thousands of files they take a third of the time, in every run of a study.
     for folder, inner, names in os.walk(path, followlinks=True):

@@ -37,6 +37,7 @@ from lslam.pipeline.refresh import write_renewed
 from lslam.pipeline.run_folder import MANIFEST, SPOOL, held
 from lslam.readers import open_sequence
 from lslam.readers.selection import select
+from lslam.remote import as_path
 from lslam.types.georeference import Georeference
 from lslam.types.map_score import Crispness
 from lslam.types.run_record import RunRecord
@@ -116,7 +117,7 @@ def open_scans(run: EarlierRun, sequence: Path | None = None, **reading: Any) ->
 
     Raises InputError naming the path when the raw scans are gone, or are others than those of the run.
     """
-    path = Path(run.sequence_path) if sequence is None else sequence
+    path = as_path(run.sequence_path) if sequence is None else sequence
     if sequence is None and not path.exists():
         raise InputError(
             f"the raw scans of {run.folder} are gone: {path} does not exist; say where they are with --sequence"

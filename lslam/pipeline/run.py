@@ -9,6 +9,7 @@ from lslam.config import Config
 from lslam.pipeline.deliver import perform, raise_outcome
 from lslam.pipeline.job import prepare
 from lslam.pipeline.watch import RunOutcome, Watch
+from lslam.remote import as_path
 from lslam.types.sequence import Sequence
 from lslam.types.trajectory import Trajectory
 from lslam.warned import hearing
@@ -31,7 +32,7 @@ def run(
     Parameters
     ----------
     sequence : an open sequence, or what `open_sequence` takes
-    out : the run folder; None writes nothing and builds no map
+    out : the run folder, a URL for one in storage; None writes nothing and builds no map
     ground_truth : replaces the sequence's own
     reading : what `open_sequence` was told beside the path (topics, extrinsics), for the manifest: `lslam map` needs it
     overwrite : replace an earlier run in `out`; resume : go on where it was killed or interrupted, if there is one
@@ -46,7 +47,7 @@ def run(
     with hearing() as heard:
         job = prepare(sequence, config or Config(), ground_truth, command, watch)
         job.manifest.reading, job.manifest.warnings = dict(reading or {}), heard
-        outcome = perform(job, None if out is None else Path(out), overwrite, resume)
+        outcome = perform(job, None if out is None else as_path(out), overwrite, resume)
     watch.on_end(outcome)
     raise_outcome(job.manifest, job.config, "" if out is None else ", and --resume goes on")
     return outcome

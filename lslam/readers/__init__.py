@@ -16,6 +16,7 @@ from lslam.formats.transform_text import read_transform
 from lslam.plugins import load, registered
 from lslam.readers.lookup import find_folder
 from lslam.readers.selection import select
+from lslam.remote import RemotePath
 from lslam.types.sequence import Sequence
 
 __all__ = ["READERS", "open_sequence", "select"]
@@ -81,7 +82,9 @@ def open_sequence(
     )
     # Absolute, but links kept: `sequences/07` may be one, and its poses lie beside the link.
     try:
-        folder = Path(os.path.abspath(find_folder(name_or_path, data_root)))
+        folder = find_folder(name_or_path, data_root)
+        if not isinstance(folder, RemotePath):
+            folder = Path(os.path.abspath(folder))
         sequence = _open(folder, overrides)
     except OSError as error:
         raise InputError(f"{error.filename or name_or_path} cannot be read: {cause(error)}") from None

@@ -107,7 +107,7 @@ def _split(raw: NDArray[np.float32]) -> PointCloud:
 
 def _read_per_point(path: Path, count: int) -> tuple[NDArray[np.float32] | None, NDArray[np.uint16] | None]:
     try:
-        with np.load(path, allow_pickle=False) as file:
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
             times = np.asarray(file["t"], np.float32) if "t" in file else None
             rings = np.asarray(file["ring"], np.uint16) if "ring" in file else None
     except (OSError, *DAMAGE) as error:

@@ -16,6 +16,7 @@ from lslam.formats.sequence_toml import FILE_NAME, SequenceInfo
 from lslam.formats.trajectory_files import read_trajectory
 from lslam.geometry import se3, so3
 from lslam.readers.listing import file_numbers, rows_of
+from lslam.remote import RemotePath, as_path
 from lslam.types.calibration import Calibration
 from lslam.types.trajectory import Trajectory
 from lslam.untrusted import whole_number
@@ -39,7 +40,8 @@ class Voice:
 def find_ground_truth(folder: Path, info: SequenceInfo, voice: Voice) -> Path | None:
     """The file `sequence.toml` names, else the first of the usual names in `folder`."""
     if info.ground_truth is not None:
-        path = Path(os.path.normpath(folder / info.ground_truth))
+        path = folder / info.ground_truth
+        path = path.resolve() if isinstance(path, RemotePath) else Path(os.path.normpath(path))
         if path.is_file():
             return path
         voice.problems.append(f"ground truth {path}, named by {FILE_NAME}, does not exist")
@@ -73,7 +75,7 @@ def pair_by_number(truth: Trajectory, files: list[Path]) -> Numbered | None:
     scans, and when it has as many poses as there are scans, but of other numbers: one of them is numbered from elsewhere.
     """
     numbers_of_files = file_numbers(files)
-    rows, _ = read_rows(Path(truth.source))
+    rows, _ = read_rows(as_path(truth.source))
     if numbers_of_files is None or rows[0].text.split(",")[0].strip().lower() not in _NUMBER_COLUMNS:
         return None
     cells = [row.text.split(",")[0].strip() for row in rows[1:]]

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from lslam.errors import InputError
 from lslam.formats.bag_listing import SUFFIXES, list_bag_files
+from lslam.remote import RemotePath, as_path
 
 _SEQUENCE = re.compile(r"(?:.*/)?(?:seq)?(\d{1,2})$")
 _DRIVE_NAME = re.compile(r"(?:(?P<date>\d{4}_\d\d_\d\d)_)?(?:drive_)?(?P<number>\d{4})(?P<kind>_sync|_extract)?$")
@@ -23,7 +24,7 @@ def find_folder(name_or_path: str | Path, data_root: Path | None = None) -> Path
     `drive_0005` or `0005` when only one has it. Raises InputError naming where it looked and names that are near.
     """
     text = str(name_or_path)
-    path = Path(name_or_path).expanduser()
+    path = as_path(name_or_path).expanduser()
     if path.is_dir() or list_bag_files(path):
         return path
     if path.exists():
@@ -31,6 +32,8 @@ def find_folder(name_or_path: str | Path, data_root: Path | None = None) -> Path
             f"{path} is a file: give a bag ({', '.join('*' + s for s in SUFFIXES)}) or the folder of the sequence (a KITTI "
             "sequence, a raw drive, or its scans)"
         )
+    if isinstance(path, RemotePath):
+        raise InputError(f"no sequence {text!r}: no such bucket, object or folder")
     if data_root is None and os.environ.get("LSLAM_DATA"):
         data_root = Path(os.environ["LSLAM_DATA"])
     if data_root is None:

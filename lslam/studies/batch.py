@@ -12,10 +12,10 @@ from typing import Any
 from lslam.config import Config
 from lslam.config.batch import BatchConfig, parse_batch
 from lslam.errors import UsageError
-from lslam.pipeline.identity import imu_digest, input_digest, job_digest
+from lslam.pipeline.identity import imu_digest, input_digest, job_digest, listing_digest
 from lslam.printable import file_safe, toml_text
 from lslam.studies.expanded_study import ExpandedStudy, check_same
-from lslam.studies.grid import Job, cells_of, expand, run_folder
+from lslam.studies.grid import Job, cells_of, expand, label_of, run_folder
 from lslam.studies.output import OutputOptions
 from lslam.studies.variants import WITH_IMU, Variant, find_variants, free_name, settings_of
 from lslam.types.sequence import Sequence as Recording
@@ -28,15 +28,40 @@ MARK = "batch.toml"
 class RunLine:
     """One `lslam run`, resolved: what it reads, how, and where it is written.
 
-    words : of its command line; sequence : opened; reading : what else it was opened with; folder : None to choose
+    words : of its command line; label, path, digest : of the recording; imu : digest of its IMU, empty when it is not used
+    reading : what else it is opened with; folder : None to choose
     """
 
     words: str
-    sequence: Recording
+    label: str
+    path: Path
+    digest: str
+    imu: str
     config: Config
     truth: Trajectory | None = None
     folder: Path | None = None
     reading: dict[str, Any] = field(default_factory=dict)
+
+
+def opened_line(
+    words: str,
+    sequence: Recording,
+    config: Config,
+    truth: Trajectory | None,
+    folder: Path | None,
+    reading: dict[str, Any],
+) -> RunLine:
+    """Of a recording that is open. Raises InputError when it cannot be listed."""
+    imu = imu_digest(sequence) if config.imu.use else ""
+    return RunLine(
+        words, file_safe(sequence.name), sequence.path.absolute(), input_digest(sequence, truth), imu, config, truth, folder,
+        reading,
+    )  # fmt: skip
+
+
+def listed_line(words: str, path: Path, config: Config, folder: Path | None, reading: dict[str, Any]) -> RunLine:
+    """Of a recording in storage, which its run alone opens. Raises InputError when it cannot be listed."""
+    return RunLine(words, label_of(path), path, listing_digest(path), "", config, None, folder, reading)
 
 
 def expand_batch(batch: BatchConfig, output: OutputOptions, settings: Sequence[str] = ()) -> ExpandedStudy:
@@ -65,7 +90,7 @@ def expand_batch(batch: BatchConfig, output: OutputOptions, settings: Sequence[s
 def expand_lines(lines: Sequence[RunLine], output: OutputOptions) -> ExpandedStudy:
     """All runs of a list of lines; those without a folder of their own are numbered in `output.out`.
 
-    Raises InputError for a recording that cannot be listed, UsageError for two lines that name one folder, OutputExistsError
+    Raises UsageError for two lines that name one folder, OutputExistsError
     when they are to go on in the folder of a list that has none of them.
     """
     text = toml_text({"lines": [line.words for line in lines]})
@@ -77,14 +102,10 @@ def expand_lines(lines: Sequence[RunLine], output: OutputOptions) -> ExpandedStu
         method = line.config.odometry.preset or line.config.odometry.method
         name = f"{number:03d}-{file_safe(method)}{WITH_IMU if line.config.imu.use else ''}"
         found[name] = Variant(name, line.config, method)
-        label = file_safe(line.sequence.name)
         seed = line.config.preprocess.seed
         how = hashlib.sha256(repr(sorted(line.reading.items())).encode()).hexdigest()
-        digest = job_digest(
-            line.config, input_digest(line.sequence, line.truth) + how,
-            imu_digest(line.sequence) if line.config.imu.use else "",
-        )  # fmt: skip
-        folder = run_folder(output.out, label, name, seed) if line.folder is None else line.folder
+        digest = job_digest(line.config, line.digest + how, line.imu)
+        folder = run_folder(output.out, line.label, name, seed) if line.folder is None else line.folder
         if owners.setdefault(folder.resolve(), number) != number:
             raise UsageError(
                 f"run {owners[folder.resolve()]} and run {number} of the batch are both to be written to {folder}: give each "
@@ -92,7 +113,7 @@ def expand_lines(lines: Sequence[RunLine], output: OutputOptions) -> ExpandedStu
             )
         jobs.append(
             Job(
-                label, name, seed, line.sequence.path.absolute(), line.config, folder, digest, line.words, line.truth,
+                line.label, name, seed, line.path, line.config, folder, digest, line.words, line.truth,
                 output.data_root, reading=line.reading,
             )
         )  # fmt: skip

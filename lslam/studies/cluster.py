@@ -11,13 +11,14 @@ import tempfile
 import threading
 import time
 import zipfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from lslam.errors import InputError, OutputError, RunFailedError, UsageError, cause
+from lslam.remote import RemotePath, as_path
 from lslam.studies.engines import simulate_scenes
 from lslam.studies.grid import Job
 from lslam.studies.jobs import clear_attempt, ensure_state
@@ -110,7 +111,7 @@ class Cluster:
             raise RunFailedError(
                 f"the scheduler {self.address} has no workers: start some, `dask worker {self.address} --nthreads 1`"
             ) from None
-        paths = sorted({str(job.path) for job in jobs if job.scene is None})
+        paths = _seen(job.path for job in jobs if job.scene is None)
         for worker, answer in self.client.run(_inspect, paths, on_error="return").items():
             if isinstance(answer, BaseException):
                 raise InputError(f"worker {worker} cannot run lslam: {answer}; install it there")
@@ -157,7 +158,7 @@ class Cluster:
                 if future.cancelled() or self.client.status != "running":
                     break
                 job = left.pop(future)
-                if error is None:
+                if error is None and not isinstance(job.folder, RemotePath):
                     unpack(future.result(), job)
                 ensure_state(job, "" if error is None else f"its worker failed: {error}", context)
                 on_done(job)
@@ -190,13 +191,20 @@ class Cluster:
 
 
 def perform(job: Job, context: WorkerContext) -> bytes:
-    """On a worker: make the run in a folder of the worker's, which comes home as an archive with its state."""
+    """On a worker: make the run in a folder of the worker's, which comes home as an archive with its state.
+
+    A run folder in storage is uploaded by the worker, state and all, and nothing comes home.
+    """
     from distributed import get_worker
 
     own = Path(get_worker().local_directory)
     path = job.path
     if job.scene is not None and not path.is_dir():
         path = own / "scenes" / path.relative_to(path.parents[2])
+    if isinstance(job.folder, RemotePath):
+        with _ALONE:
+            execute(replace(job, path=path), context)
+        return b""
     with _ALONE, tempfile.TemporaryDirectory(dir=own) as scratch:
         execute(replace(job, path=path, folder=Path(scratch) / "run"), context)
         return pack(Path(scratch))
@@ -231,7 +239,13 @@ def unpack(archive: bytes, job: Job) -> None:
 
 def _inspect(paths: list[str]) -> tuple[str, list[str]]:
     """On a worker: its version of lslam, and which paths it does not have."""
-    return __version__, [path for path in paths if not Path(path).exists()]
+    return __version__, [path for path in paths if not as_path(path).exists()]
+
+
+def _seen(paths: Iterable[Path]) -> list[str]:
+    """Those that each worker shall look for: all on disks, and one of each folder in storage, where all or none can be had."""
+    found = {path.parent if isinstance(path, RemotePath) else path: str(path) for path in paths}
+    return sorted(found.values())
 
 
 def _count(local: str) -> int:

@@ -11,11 +11,13 @@ from lslam.config import Config
 from lslam.config.input import AS_CONFIGURED, ScanRange
 from lslam.config.study import StudySequence
 from lslam.errors import UsageError
-from lslam.pipeline.identity import imu_digest, input_digest, job_digest
+from lslam.formats.bag_listing import suffix_of
+from lslam.pipeline.identity import imu_digest, input_digest, job_digest, listing_digest
 from lslam.printable import file_safe
 from lslam.readers import open_sequence
 from lslam.readers.lookup import find_folder
 from lslam.readers.raw_drive import with_imu
+from lslam.remote import RemotePath
 from lslam.studies.output import SIMULATED, OutputOptions
 from lslam.studies.scenes import Scene, drive_of, scene_digest, scene_folder
 from lslam.studies.subjects import check_range, scans_needed, with_range
@@ -133,6 +135,11 @@ def recorded_cell(
     return Cell(label, path, seed, input_digest(sequence, truth), truth, imu, data_root, range=own)
 
 
+def label_of(path: Path) -> str:
+    """What a recording goes by that is not opened: the name of its file or folder."""
+    return file_safe(path.name.removesuffix(suffix_of(path)))
+
+
 def scene_cell(scene: Scene, seed: int, parent: Path, own: ScanRange = AS_CONFIGURED) -> Cell:
     """A simulation that may still have to be made, below `parent`; its digest says what it will hold, IMU included.
 
@@ -196,6 +203,9 @@ def cells_of(
 
 def _recorded(word: str, own: ScanRange, needs_imu: bool, output: OutputOptions) -> Cell:
     path = find_folder(word, output.data_root).absolute()
+    if isinstance(path, RemotePath):
+        # Thousands of recordings are not opened here over a network: each run says what is wrong with its own.
+        return Cell(label_of(path), path, None, listing_digest(path), data_root=output.data_root, range=own)
     label = file_safe(open_sequence(path).name)
     return recorded_cell(label, path, needs_imu=needs_imu, data_root=output.data_root, own=own)
 

@@ -6,9 +6,12 @@ import logging
 import os
 import shutil
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 
+from lslam.pipeline.storage import spool_of
+from lslam.remote import RemotePath
 from lslam.studies.grid import Job
 from lslam.studies.runner import StudyProgress, Task, WorkerPool, run_tasks
 from lslam.studies.states import State, is_reusable, read_state, write_state
@@ -18,11 +21,15 @@ from lslam.studies.worker import WorkerContext, execute
 log = logging.getLogger("lslam")
 # Scans of a recording, when only the order of its runs by length matters.
 _MANY = 10**6
+_ASKED = 32
 
 
 def finished(jobs: Sequence[Job]) -> set[Path]:
     """Folders of the jobs that were run before by the same configuration, input and version."""
-    return {job.folder for job in jobs if is_reusable(job.state_file, job.folder, job.digest)}
+    # Of storage, where each answer takes its time, many are asked for together.
+    with ThreadPoolExecutor(_ASKED if any(isinstance(job.folder, RemotePath) for job in jobs) else 1) as pool:
+        known = pool.map(lambda job: is_reusable(job.state_file, job.folder, job.digest), jobs)
+        return {job.folder for job, is_known in zip(jobs, known, strict=True) if is_known}
 
 
 def pool_of(most_at_once: int, count: int, *, is_persistent: bool = False, tries: int = 1) -> WorkerPool:
@@ -59,7 +66,7 @@ def run_jobs(
         jobs = sorted(jobs, key=lambda job: used(_MANY, job.config.input), reverse=True)
     tasks = [
         Task(
-            job.name, partial(work, job, context), job.folder.with_name(f"{job.folder.name}.out"),
+            job.name, partial(work, job, context), said_file(job.folder),
             str(job.path) if pool.is_persistent else "",
         )
         for job in jobs
@@ -72,6 +79,12 @@ def run_jobs(
 
     progress.on_start(title, len(jobs), "runs")
     run_tasks(tasks, pool, lambda index: log.debug("%s begins", jobs[index].name), on_end)
+
+
+def said_file(folder: Path) -> Path:
+    """Where what a process prints is kept that makes the run in `folder`: beside it, on this machine."""
+    place = spool_of(folder) if isinstance(folder, RemotePath) else folder
+    return place.with_name(f"{place.name}.out")
 
 
 def ensure_state(job: Job, cause: str, context: WorkerContext) -> None:
@@ -87,6 +100,6 @@ def ensure_state(job: Job, cause: str, context: WorkerContext) -> None:
 
 def clear_attempt(job: Job) -> None:
     """What an earlier attempt left may be no run at all: a folder without a manifest must not stand in the way."""
-    if job.folder.is_dir() and not (job.folder / "manifest.json").is_file():
+    if not isinstance(job.folder, RemotePath) and job.folder.is_dir() and not (job.folder / "manifest.json").is_file():
         shutil.rmtree(job.folder, ignore_errors=True)
     job.state_file.unlink(missing_ok=True)

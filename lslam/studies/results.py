@@ -10,6 +10,7 @@ from pathlib import Path
 
 from lslam.formats.study_csv import read_study_csv, write_study_csv
 from lslam.formats.study_parquet import write_study_parquet
+from lslam.remote import RemotePath
 from lslam.studies.collect import collect_run
 from lslam.studies.grid import Job
 from lslam.studies.states import State, read_state
@@ -98,9 +99,16 @@ class Results:
             at_once=state.jobs,
             digest=job.digest,
             machine=state.machine,
-            folder=Path(os.path.relpath(job.folder, self.out)).as_posix(),
+            folder=_seen_from(self.out, job.folder),
             metric=self.metric,
         )
+
+
+def _seen_from(out: Path, folder: Path) -> str:
+    """The folder of a run as a reader of the table finds it: relative where both are of one storage or this machine's."""
+    if isinstance(folder, RemotePath) or isinstance(out, RemotePath):
+        return folder.relative_to(out).as_posix() if folder.is_relative_to(out) else str(folder.absolute())
+    return Path(os.path.relpath(folder, out)).as_posix()
 
 
 def is_comparable(state: State) -> bool:

@@ -23,6 +23,8 @@ from lslam.errors import (
     RunFinishedError,
 )
 from lslam.pipeline.run_folder import KEYFRAMES, LOG, MANIFEST
+from lslam.pipeline.storage import spool_of
+from lslam.remote import RemotePath
 from lslam.stopping import current, is_interrupt
 from lslam.studies.grid import Job
 from lslam.studies.states import State, write_state
@@ -93,6 +95,8 @@ def execute(job: Job, context: WorkerContext) -> None:
 
 def _keep_traceback(folder: Path, error: Exception) -> str:
     """Put it behind what the run said, in its log.txt; the end of a sentence that says so, empty when it cannot be."""
+    if isinstance(folder, RemotePath):
+        folder = spool_of(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with (folder / LOG).open("a", encoding="utf-8", errors="backslashreplace") as stream:
@@ -104,6 +108,8 @@ def _keep_traceback(folder: Path, error: Exception) -> str:
 
 def _drop_lone_log(folder: Path) -> None:
     """A mistake before there was a run left its traceback in a folder that is none, and so would not be replaced."""
+    if isinstance(folder, RemotePath):
+        folder = spool_of(folder)
     with contextlib.suppress(OSError):  # what is in the way is said when the run is made
         if not (folder / MANIFEST).exists():
             (folder / LOG).unlink(missing_ok=True)
