@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import fnmatch
 import io
+import logging
 import os
 import posixpath
 import re
@@ -15,6 +16,7 @@ import stat
 from collections.abc import Generator, Iterator, Sequence
 from contextlib import contextmanager
 from datetime import datetime
+from functools import cache
 from pathlib import Path, PosixPath
 from typing import Any
 
@@ -215,6 +217,7 @@ def _asking(path: RemotePath, what: str) -> Iterator[tuple[Any, str]]:
         from fsspec.core import url_to_fs
     except ImportError:
         raise UsageError(f"{path}: to read {scheme}:// in place takes fsspec: {_INSTALL}") from None
+    _silence()
     try:
         system, place = url_to_fs(str(path), use_listings_cache=False)
         yield system, place
@@ -228,6 +231,13 @@ def _asking(path: RemotePath, what: str) -> Iterator[tuple[Any, str]]:
         if isinstance(error, OSError) and error.errno == 28:
             raise OutputError(f"{path} cannot be {what}: {error.strerror}") from None
         raise StorageError(f"{path} cannot be {what}: {_reason(error)}") from None
+
+
+@cache
+def _silence() -> None:
+    """What goes wrong is said in one sentence, and not in tracebacks of every attempt."""
+    for name in ("gcsfs", "s3fs", "fsspec"):
+        logging.getLogger(name).setLevel(logging.CRITICAL)
 
 
 def _reason(error: Exception) -> str:

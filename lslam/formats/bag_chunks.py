@@ -105,9 +105,9 @@ class ChunkFile:
             with contextlib.suppress(CutOffError, struct.error, LookupError, ValueError, InputError):
                 self._ranged.expect(ranges())
 
-    def expect_messages(self, chunks: Sequence[Chunk], where: Pairs) -> None:
-        """Likewise, the beginnings of the messages that lie there."""
-        self.expect(lambda: (_beginning(None if n == IN_FILE else chunks[n], k) for n, k in where.tolist()))
+    def expect_messages(self, chunks: Sequence[Chunk], where: Pairs, is_head: bool) -> None:
+        """Likewise, the messages that lie there, or with `is_head` no more than their beginnings."""
+        self.expect(lambda: (_needed(None if n == IN_FILE else chunks[n], k, is_head) for n, k in where.tolist()))
 
     def part(self, chunk: Chunk | None, offset: int, size: int, is_head: bool = False) -> bytes:
         """At most `size` bytes of the records of `chunk` from `offset`; None is the file itself.
@@ -160,11 +160,13 @@ class ChunkFile:
         return bytes(records)
 
 
-def _beginning(chunk: Chunk | None, offset: int) -> tuple[int, int]:
-    """Position and size of what is read of a message's beginning."""
+def _needed(chunk: Chunk | None, offset: int, is_head: bool) -> tuple[int, int]:
+    """Position and size of what is read first of a message."""
     if chunk is None:
         return offset, _HEAD
-    return (chunk.position, min(_BLOCK, chunk.size)) if chunk.compression else (chunk.position + offset, _HEAD)
+    if chunk.compression:
+        return chunk.position, min(_BLOCK, chunk.size) if is_head else chunk.size
+    return chunk.position + offset, _HEAD
 
 
 def check_compression(path: Path, name: str) -> None:

@@ -47,8 +47,8 @@ class Recording(Protocol):
         """Message `k` of `topic`, its first `limit` bytes at the least when only these are wanted."""
         ...
 
-    def expect(self, topic: Topic) -> None:
-        """Know that the beginnings of all messages of `topic` will be read next; only storage makes use of it."""
+    def expect(self, topic: Topic, is_head: bool) -> None:
+        """Know that all messages of `topic` will be read next, or their beginnings; only storage makes use of it."""
         ...
 
 
@@ -105,10 +105,10 @@ class Bag:
         """When each message of `topic` was recorded, ns."""
         return [int(stamp) for _, part in topic.parts for stamp in part.stamps_ns]
 
-    def expect(self, topic: BagTopic) -> None:
-        """Say that the beginnings of all messages of `topic` will be read next."""
+    def expect(self, topic: BagTopic, is_head: bool = False) -> None:
+        """Say that all messages of `topic` will be read next, or no more than their beginnings."""
         for recording, part in topic.parts:
-            recording.expect(part)
+            recording.expect(part, is_head)
 
     def message(self, topic: BagTopic, k: int, limit: int | None = None) -> bytes:
         """Message `k` of `topic` as it was serialised, or its first `limit` bytes at the least.

@@ -49,7 +49,7 @@ class SqliteBag:
         if path.with_name(path.name + "-wal").is_file():
             self.loss = self.loss or f"{path}-wal holds messages that were never merged: `ros2 bag reindex` does that"
 
-    def expect(self, topic: Topic) -> None:
+    def expect(self, topic: Topic, is_head: bool) -> None:
         """Nothing: the file is on a disk."""
 
     def read(self, topic: Topic, k: int, limit: int | None = None) -> bytes:

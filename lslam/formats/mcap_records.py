@@ -75,9 +75,9 @@ class McapFile:
         if magic != MAGIC:
             raise InputError(f"{self.path} is no MCAP file: it begins with {magic!r}")
 
-    def expect(self, topic: Topic) -> None:
-        """The beginnings of all messages of `topic` will be read next."""
-        self._file.expect_messages(self._chunks, topic.where)
+    def expect(self, topic: Topic, is_head: bool) -> None:
+        """All messages of `topic` will be read next, or no more than their beginnings."""
+        self._file.expect_messages(self._chunks, topic.where, is_head)
 
     def _indexed(self) -> Iterator[tuple[int, int]]:
         """Where the summary at the end of the file says that records lie beside the messages: what the walk will read."""

@@ -27,7 +27,10 @@ class RangedFile:
         self._lock = threading.Lock()
 
     def expect(self, ranges: Iterable[tuple[int, int]]) -> None:
-        """Say which (position, size) will be read next, in any order; what was expected before is forgotten."""
+        """Say which (position, size) will be read next, in any order; what was expected before is forgotten.
+
+        Nothing is expected twice: what is read again later is asked for by itself.
+        """
         last = max(self.size - 1, 0) // BLOCK
         numbers = {
             k
@@ -60,6 +63,7 @@ class RangedFile:
             at = bisect_left(self._expected, number)
             next_ones = self._expected[at : at + _AHEAD] if self._is_expected(number) else []
             wanted = [k for k in sorted({*range(number, last + 1), *next_ones}) if k not in self._blocks]
+            del self._expected[at : at + len(next_ones)]
             runs = _runs(wanted)
             while len(self._blocks) > max(_KEPT - len(wanted), 0):
                 self._blocks.popitem(last=False)

@@ -85,9 +85,9 @@ class Ros1Bag:
             old = "an old version, `rosbag fix` brings it to 2.0" if magic.startswith(b"#ROSBAG") else "no ROS 1 bag"
             raise InputError(f"{self.path} is {old}: it begins with {magic[:12]!r}")
 
-    def expect(self, topic: Topic) -> None:
-        """The beginnings of all messages of `topic` will be read next."""
-        self._file.expect_messages(self._chunks, topic.where)
+    def expect(self, topic: Topic, is_head: bool) -> None:
+        """All messages of `topic` will be read next, or no more than their beginnings."""
+        self._file.expect_messages(self._chunks, topic.where, is_head)
 
     def _indexed(self) -> Iterator[tuple[int, int]]:
         """Where the index at the end of the file says that chunks begin, before which the indices of others lie."""

@@ -90,7 +90,7 @@ def index_scans(bag: Bag, topic: BagTopic, voice: Voice) -> tuple[Stamps, Stamps
     """
     kept, stamps, broken = [], [], []
     frame = ""
-    bag.expect(topic)
+    bag.expect(topic, is_head=True)
     for k in range(len(topic)):
         try:
             header = read_header(topic, bag.message(topic, k, _HEADER))

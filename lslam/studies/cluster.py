@@ -197,7 +197,9 @@ def perform(job: Job, context: WorkerContext) -> bytes:
     """
     from distributed import get_worker
 
-    own = Path(get_worker().local_directory)
+    worker = get_worker()
+    _forget_samples(worker)
+    own = Path(worker.local_directory)
     path = job.path
     if job.scene is not None and not path.is_dir():
         path = own / "scenes" / path.relative_to(path.parents[2])
@@ -208,6 +210,13 @@ def perform(job: Job, context: WorkerContext) -> bytes:
     with _ALONE, tempfile.TemporaryDirectory(dir=own) as scratch:
         execute(replace(job, path=path, folder=Path(scratch) / "run"), context)
         return pack(Path(scratch))
+
+
+def _forget_samples(worker: Any) -> None:
+    """Dask samples the stack of every worker and keeps an hour of it, 0.3 MB for each second of short runs."""
+    for name in ("profile_history", "profile_keys_history"):
+        with contextlib.suppress(AttributeError):
+            getattr(worker, name).clear()
 
 
 def pack(folder: Path) -> bytes:
