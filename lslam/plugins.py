@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from importlib import import_module
-from importlib.metadata import EntryPoint, entry_points
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from lslam.errors import InputError, UsageError, nearest
+
+if TYPE_CHECKING:
+    from importlib.metadata import EntryPoint
 
 # name -> (module with `create`, one line for people)
 Table = Mapping[str, tuple[str, str]]
@@ -18,6 +20,8 @@ def registered(group: str, own: Mapping[str, object]) -> dict[str, EntryPoint]:
 
     Of two packages with one name the first in the alphabet has it, whatever was installed last.
     """
+    from importlib.metadata import entry_points  # imported late: as much work as the whole command line
+
     entries = sorted(
         entry_points(group=group), key=lambda entry: "" if entry.dist is None else entry.dist.name, reverse=True
     )

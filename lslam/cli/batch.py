@@ -14,6 +14,7 @@ from lslam.cli import options
 from lslam.cli.console import log, setup_logging, show
 from lslam.errors import GateError, LslamError, RunFailedError, UsageError
 from lslam.remote import RemotePath, as_path
+from lslam.studies.output import BATCH, require_free
 
 if TYPE_CHECKING:
     from lslam.studies.batch import RunLine
@@ -46,14 +47,17 @@ def command(jobs_file: Path, **given: Any) -> None:
     failed or diverged.
     """
     setup_logging(given["verbose"], given["quiet"])
-    from lslam.cli.study_screen import bars
-    from lslam.studies.expanded_study import make_runs
-
+    options.check_engine(given)
     output = options.output_of(given, "batch")
+    if not given["dry_run"]:
+        require_free(output.out, BATCH, "batch", output.overwrite, output.resume)
     expanded = _expanded(jobs_file, output, given)
     if given["dry_run"]:
         show("".join(f"{job.name}  {job.folder}\n" for job in expanded.jobs))
         return
+    from lslam.cli.study_screen import bars
+    from lslam.studies.expanded_study import make_runs
+
     with options.engine_of(given, "runs", is_persistent=False) as engine, ExitStack() as stack:
         rows = make_runs(expanded, output, engine, bars(stack))
     _print(rows)
@@ -62,11 +66,17 @@ def command(jobs_file: Path, **given: Any) -> None:
 
 
 def _expanded(path: Path, output: OutputOptions, given: dict[str, Any]) -> ExpandedStudy:
-    from lslam.config.batch import read_batch
-    from lslam.studies.batch import expand_batch, expand_lines, run_words
-
     if path != Path("-"):
-        return expand_batch(read_batch(path), output, given["settings"])
+        from lslam.config.batch import read_batch
+        from lslam.config.load import check_settings
+
+        check_settings(given["settings"])
+        batch = read_batch(path)
+        from lslam.studies.batch import expand_batch
+
+        return expand_batch(batch, output, given["settings"])
+    from lslam.studies.batch import expand_lines, run_words
+
     lines = [_line(number, words, given) for number, words in run_words(sys.stdin.read())]
     if not lines:
         raise UsageError("there is no line on stdin: write `lslam run SEQUENCE ...` on each")

@@ -16,7 +16,7 @@ from lslam.cli import options
 from lslam.cli.console import log, setup_logging, show
 
 if TYPE_CHECKING:
-    from lslam.studies.compare import Plan
+    from lslam.studies.plan import Plan
     from lslam.studies.subjects import Subject
     from lslam.types.comparison import Comparison
     from lslam.types.trajectory import Trajectory
@@ -72,11 +72,11 @@ def command(sequences: tuple[str, ...], **given: Any) -> None:
     SEQUENCE is what `lslam run` takes, or a scenario of `lslam simulate --list`, which is simulated once per seed.
     """
     setup_logging(given["verbose"], given["quiet"])
+    plan = _plan(sequences, given)
     from lslam.cli.study_screen import bars
     from lslam.errors import GateError, RunFailedError
     from lslam.studies.compare import compare
 
-    plan = _plan(sequences, given)
     with ExitStack() as stack:
         comparison = compare(plan, bars(stack))
     _print(comparison, given["table"], given["as_json"])
@@ -90,23 +90,31 @@ def command(sequences: tuple[str, ...], **given: Any) -> None:
 
 
 def _plan(sequences: tuple[str, ...], given: dict[str, Any]) -> Plan:
-    from lslam.studies.compare import Plan
-    from lslam.studies.subjects import find_subjects
+    """What is compared; what is cheap to see is seen before anything heavy is imported."""
+    from lslam.studies.output import COMPARISON, require_free
+    from lslam.studies.plan import Plan, check_numbers
+
+    seeds, crop = options.seeds_of(given["seeds"]), _crop(given["crop"])
+    check_numbers(seeds, given["jobs"], crop)
+    out = given["out"] or Path("runs") / time.strftime("compare-%Y%m%d-%H%M%S")
+    require_free(out, COMPARISON, "comparison", given["overwrite"], given["resume"])
     from lslam.studies.variants import find_variants
 
     common, ranges = options.ranges_of(given, sequences)
     settings = options.with_preset(given["settings"], given["preset"])
     methods = [name.strip() for name in given["methods"].split(",") if name.strip()]
     variants = find_variants(methods, given["config_file"], [*settings, *common], given["imu"])
+    from lslam.studies.subjects import find_subjects
+
     subjects = find_subjects(sequences, given["data_root"], ranges)
     return Plan(
         subjects=tuple(subjects),
         variants=tuple(variants),
-        seeds=options.seeds_of(given["seeds"]),
-        out=given["out"] or Path("runs") / time.strftime("compare-%Y%m%d-%H%M%S"),
+        seeds=seeds,
+        out=out,
         jobs=given["jobs"],
         truth=_truth(given["gt"], subjects),
-        crop=_crop(given["crop"]),
+        crop=crop,
         overwrite=given["overwrite"],
         resume=given["resume"],
         data_root=given["data_root"],
@@ -125,7 +133,7 @@ def _truth(path: Path | None, subjects: list[Subject]) -> Trajectory | None:
     from lslam.cli.run import read_truth
     from lslam.errors import UsageError
     from lslam.readers import open_sequence
-    from lslam.studies.compare import ONE_TRUTH
+    from lslam.studies.plan import ONE_TRUTH
 
     if path is None:
         return None

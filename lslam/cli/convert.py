@@ -74,9 +74,11 @@ def _is_trajectory(source: str) -> bool:
 
 
 def _open(source: str, given: dict[str, Any]) -> Sequence:
-    from lslam.readers import open_sequence, select
+    from lslam.readers import open_sequence
 
     sequence = open_sequence(source, data_root=given["data_root"], **options.reading_of(given))
+    from lslam.readers.selection import select
+
     return select(sequence, given["start"] or 0, given["count"], given["skip_frames"] or 1)
 
 
@@ -84,11 +86,14 @@ def _convert_sequence(source: str, kind: str, out: Path, given: dict[str, Any]) 
     import logging
 
     from lslam.cli.console import progress, show
-    from lslam.convert.convert_sequence import check_output, convert_sequence
-    from lslam.formats.trajectory_files import read_trajectory
+    from lslam.convert.output import check_output
 
     check_output(kind, out, given["is_zstd"], given["overwrite"])
+    options.require_there(given["deskewed"])
     sequence = _open(source, given)
+    from lslam.convert.convert_sequence import convert_sequence
+    from lslam.formats.trajectory_files import read_trajectory
+
     log = logging.getLogger("lslam")
     for note in sequence.notes:
         log.info("%s", note)
@@ -106,11 +111,12 @@ def _convert_sequence(source: str, kind: str, out: Path, given: dict[str, Any]) 
 
 def _convert_trajectory(source: str, kind: str, out: Path, given: dict[str, Any]) -> None:
     from lslam.cli.console import show
-    from lslam.convert.convert_trajectory import convert_trajectory
 
     for flag, name in (("--zstd", "is_zstd"), ("--deskewed", "deskewed")):
         if given[name]:
             raise click.UsageError(f"{flag} is for sequences, and {source} to {kind} is a trajectory")
+    from lslam.convert.convert_trajectory import convert_trajectory
+
     trajectory, calibration = _read_trajectory(source, kind, given)
     moved = convert_trajectory(
         trajectory, kind, out, calibration, frame=given["frame"], overwrite=given["overwrite"]

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from lslam.cli import options
+from lslam.errors import UsageError, nearest
+from lslam.evaluation.recipes import ALIGNMENTS, check_words, parse_delta
 from lslam.formats.trajectory_formats import FORMATS
 
 if TYPE_CHECKING:
@@ -73,14 +75,21 @@ def command(
     Formats are detected: KITTI, TUM, EuRoC, CSV with named columns. Every number is printed with its recipe.
     """
     from lslam.cli.console import setup_logging
-    from lslam.reports import evaluation_json, evaluation_plot, evaluation_table
 
     setup_logging(given["verbose"], given["quiet"])
     if plot is not None:
-        evaluation_plot.check_plot_path(plot)
-    config = _config(given)
+        from lslam.reports.picture import check_plot_path
+
+        check_plot_path(plot)
+    flags = _flags(given)
+    if given["timing_file"] is not None and len(estimates) > 1:
+        raise UsageError("--timing belongs to one estimate; with several, put timing.csv beside each")
+    options.require_there(*estimates, truth, given["calib"], given["times"], given["timing_file"])
+    config = _config(given, flags)
+    from lslam.reports import evaluation_json, evaluation_plot, evaluation_table
+
     evaluations = _evaluate_all(estimates, truth, config, given)
-    timings = [_timing(path, given["timing_file"], len(estimates)) for path in estimates]
+    timings = [_timing(path, given["timing_file"]) for path in estimates]
     if as_json:
         click.echo(evaluation_json.to_json(evaluations, timings))
     else:
@@ -90,18 +99,8 @@ def command(
     _hold_gates(evaluations, given)
 
 
-def _config(given: dict[str, Any]) -> EvalConfig:
-    """Section `eval` with the flags over it."""
-    from pydantic import ValidationError
-
-    from lslam.config import load_config
-    from lslam.config.eval import EvalConfig
-    from lslam.errors import UsageError, nearest
-    from lslam.evaluation.metrics import check_words
-    from lslam.evaluation.relative import parse_delta
-    from lslam.evaluation.results import ALIGNMENTS
-
-    values = load_config(given["config_file"], given["settings"]).eval.model_dump()
+def _flags(given: dict[str, Any]) -> dict[str, Any]:
+    """What the flags set in section `eval`, by key; raises UsageError for words that mean nothing."""
     align = [name for text in given["align"] for name in text.split(",") if name]
     for name in align:
         if name not in ALIGNMENTS:
@@ -114,8 +113,21 @@ def _config(given: dict[str, Any]) -> EvalConfig:
         except ValueError:
             raise UsageError(f"--time-offset {offset}: seconds, or auto") from None
     words = options.metrics_of(given["metrics"])
+    for delta in deltas:
+        parse_delta(delta)
+    check_words(words)
     flags = {"metrics": words, "align": align, "delta": deltas, "max_diff": given["max_diff"], "time_offset": offset}
-    values.update({key: value for key, value in flags.items() if value not in (None, [])})
+    return {key: value for key, value in flags.items() if value not in (None, [])}
+
+
+def _config(given: dict[str, Any], flags: dict[str, Any]) -> EvalConfig:
+    """Section `eval` with the flags over it."""
+    from pydantic import ValidationError
+
+    from lslam.config import load_config
+    from lslam.config.eval import EvalConfig
+
+    values = load_config(given["config_file"], given["settings"]).eval.model_dump() | flags
     for delta in values["delta"]:
         parse_delta(delta)
     check_words(values["metrics"])
@@ -162,14 +174,11 @@ def _calibration(truth: Path, calib: Path | None) -> Calibration | None:
     return None
 
 
-def _timing(estimate: Path, given: Path | None, count: int) -> Timing | None:
+def _timing(estimate: Path, given: Path | None) -> Timing | None:
     """--timing, or the timing.csv beside the estimate."""
-    from lslam.errors import UsageError
     from lslam.evaluation.timing import read_timing
 
     if given is not None:
-        if count > 1:
-            raise UsageError("--timing belongs to one estimate; with several, put timing.csv beside each")
         return read_timing(given)
     beside = (estimate if estimate.is_dir() else estimate.parent) / "timing.csv"
     return read_timing(beside) if beside.is_file() else None

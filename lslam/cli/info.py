@@ -37,10 +37,11 @@ def command(
 
     Each finding says what to do. The first scans are registered to compare their turns with the IMU's.
     """
-    from lslam.doctor.inspect import inspect
     from lslam.readers import open_sequence
 
     opened = open_sequence(sequence, data_root=data_root, rows=rows, cols=cols, **options.reading_of(given))
+    from lslam.doctor.inspect import inspect
+
     facts = inspect(opened, None if all_scans else scans, quick)
     if as_json:
         import json

@@ -60,6 +60,7 @@ def command(target: Path, **given: Any) -> None:
 
 
 def _measure(target: Path, given: dict[str, Any]) -> None:
+    options.require_there(target, given["against"])
     from lslam.formats.cloud_files import read_cloud
     from lslam.maps.compare import THRESHOLD, compare
     from lslam.maps.crispness import RADIUS, crispness
@@ -90,16 +91,20 @@ def _measure(target: Path, given: dict[str, Any]) -> None:
 
 def _rebuild(target: Path, given: dict[str, Any]) -> None:
     from lslam.errors import UsageError
-    from lslam.maps.georeference import parse_crs
-    from lslam.pipeline.rebuild import check_output, open_scans, read_run, rebuild
-    from lslam.reports.evaluation_json import crispness_document
+    from lslam.pipeline.run_folder import require_run
 
     for flag in ("threshold", "radius"):
         if given[flag] is not None:
             raise UsageError(f"--{flag} belongs to {'--against' if flag == 'threshold' else '--score'}")
+    settings = _settings(given)
+    require_run(target)
+    from lslam.maps.georeference import parse_crs
+    from lslam.pipeline.rebuild import check_output, open_scans, read_run, rebuild
+    from lslam.reports.evaluation_json import crispness_document
+
     out: Path | None = given["out"]
     crs = None if given["crs"] is None else parse_crs(given["crs"])
-    run = read_run(target, _settings(given))
+    run = read_run(target, settings)
     check_output(out or target / f"map.{run.config.map.format}", given["overwrite"])
     sequence = open_scans(run, given["sequence"], **options.reading_of(given))
     with heeded() as stop, progress("map", len(run.trajectory)) as advance:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
-from lslam.errors import ConfigError, UsageError, nearest
+from lslam.errors import ConfigError, InputError, UsageError, nearest
 from lslam.remote import RemotePath, as_path
 from lslam.untrusted import whole_number
 
@@ -202,19 +202,23 @@ def engine(function: F) -> F:
     return function
 
 
+def check_engine(given: dict[str, Any]) -> None:
+    """Raise UsageError for what of the options of `engine` does not go together."""
+    if sum(given[name] is not None for name in ("jobs", "scheduler", "cluster")) > 1:
+        raise UsageError("--jobs, --scheduler and --cluster are three ways to make the runs: give one of them")
+    if given["jobs"] is not None and given["jobs"] < 1:
+        raise UsageError(f"--jobs {given['jobs']}: at least one run at a time")
+
+
 @contextmanager
 def engine_of(given: dict[str, Any], title: str, is_persistent: bool = True) -> Iterator[Engine]:
-    """What makes the runs, as the options of `engine` say; raises UsageError for what does not go together.
+    """What makes the runs, as the options of `engine` say, which `check_engine` has looked at.
 
     is_persistent : whether data stay read from one run to the next, and keyframes do not stay
     """
     from lslam.studies.engines import Local
 
     jobs, scheduler, cluster = given["jobs"], given["scheduler"], given["cluster"]
-    if sum(value is not None for value in (jobs, scheduler, cluster)) > 1:
-        raise UsageError("--jobs, --scheduler and --cluster are three ways to make the runs: give one of them")
-    if jobs is not None and jobs < 1:
-        raise UsageError(f"--jobs {jobs}: at least one run at a time")
     if scheduler is None and cluster is None:
         yield Local(jobs or os.cpu_count() or 1, is_persistent, title)
         return
@@ -235,6 +239,13 @@ def seeds_of(text: str) -> tuple[int, ...]:
 def as_json(function: F) -> F:
     """--json."""
     return click.option("--json", "as_json", is_flag=True, help="Print one JSON object on stdout.")(function)
+
+
+def require_there(*paths: Path | None) -> None:
+    """Raise InputError for one that is given and not there: what reads it costs more to import than a look."""
+    for path in paths:
+        if path is not None and not os.path.lexists(path):
+            raise InputError(f"{path} does not exist")
 
 
 def metrics(function: F) -> F:

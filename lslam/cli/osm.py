@@ -82,6 +82,10 @@ def fetch(
         raise click.UsageError("--origin goes with --along, and says where a trajectory in metres lies")
     if out.suffix.lower() not in (".osm", ".xml", ".json"):
         raise click.UsageError(f"--out {out}: end the name with .osm or .json")
+    if bbox is not None:
+        _box(bbox)
+    if around is not None:
+        options.place("--around", around)
     console.setup_logging(verbose, quiet)
     import json
 
@@ -102,6 +106,10 @@ def fetch(
     _write(out, reply)
 
 
+def _box(text: str) -> list[float]:
+    return options.numbers("--bbox", text, (4,), "S,W,N,E, for example 49.00,8.40,49.01,8.42")
+
+
 def _bounds(
     bbox: str | None, around: str | None, along: str | None, radius: float, data_root: Path | None, origin: str | None
 ) -> Bounds:
@@ -111,7 +119,7 @@ def _bounds(
     from lslam.osm.places import positions_along
 
     if bbox is not None:
-        return bounds.Bounds(*options.numbers("--bbox", bbox, (4,), "S,W,N,E, for example 49.00,8.40,49.01,8.42"))
+        return bounds.Bounds(*_box(bbox))
     if around is not None:
         return bounds.around(np.array(options.place("--around", around)[:2]), radius)
     assert along is not None

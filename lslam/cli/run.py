@@ -15,7 +15,7 @@ import click
 from lslam.cli import options
 from lslam.cli.console import log, progress, setup_logging, show
 from lslam.errors import RunFinishedError, UsageError
-from lslam.registration.residuals import RESIDUALS
+from lslam.registration.residuals import RESIDUALS, residual_named
 from lslam.stopping import Stop, heeded
 from lslam.untrusted import parse_json
 
@@ -88,12 +88,12 @@ def command(sequence: str, **given: Any) -> None:
 
 
 def _run(sequence: str, given: dict[str, Any]) -> None:
-    from lslam.pipeline.run import plan, run
-    from lslam.pipeline.run_folder import default_folder
-
     _check_folder(given)
     opened, config = opened_with({**given, "sequence": sequence})
     truth = read_truth(given["gt"], opened)
+    from lslam.pipeline.run import plan, run
+    from lslam.pipeline.run_folder import default_folder
+
     out = given["out"] or default_folder(opened.name, _variant(config))
     if given["dry_run"]:
         _print_plan(plan(opened, config, truth), config, out, given["as_json"])
@@ -112,10 +112,19 @@ def _run(sequence: str, given: dict[str, Any]) -> None:
 
 
 def opened_with(given: dict[str, Any]) -> tuple[Sequence, Config]:
-    """The sequence and the configuration that the words of a command line mean; raises what is wrong with them."""
+    """The sequence and the configuration that the words of a command line mean; raises what is wrong with them.
+
+    What costs least is looked at first: words, then the configuration, then what is to be read.
+    """
+    from lslam.readers.lookup import find_folder
+
+    flags = _flags(given)
+    extract = None if given["osm"] in (None, "auto") else Path(given["osm"])
+    options.require_there(given["gt"], given["poses"], extract)
+    find_folder(given["sequence"], given["data_root"])
+    config = _resolve(given, flags)
     from lslam.readers import open_sequence
 
-    config = resolved(given)
     opened = open_sequence(
         given["sequence"], data_root=given["data_root"],
         vertical_correction_deg=config.input.vertical_correction_deg,
@@ -126,11 +135,7 @@ def opened_with(given: dict[str, Any]) -> tuple[Sequence, Config]:
 
 def resolved(given: dict[str, Any]) -> Config:
     """The configuration alone; raises what is wrong with it."""
-    from lslam.pipeline.check import check_config
-
-    config = _resolve(given)
-    check_config(config)
-    return config
+    return _resolve(given, _flags(given))
 
 
 def _variant(config: Config) -> str:
@@ -144,12 +149,22 @@ def _check_folder(given: dict[str, Any]) -> None:
         raise UsageError("--overwrite runs everything anew and --resume keeps what is done: give one of them")
     if given["resume"] and given["out"] is None:
         raise UsageError("--resume needs --out: the folder of the run that shall go on")
+    if given["out"] is not None and not given["resume"] and not given["dry_run"]:
+        from lslam.pipeline.run_folder import check_target
+
+        check_target(given["out"], given["overwrite"])
 
 
-def _resolve(given: dict[str, Any]) -> Config:
-    """Flags over --set over environment over --config over --preset over defaults."""
-    from lslam.config import load_config
+def _flags(given: dict[str, Any]) -> dict[str, Any]:
+    """The configuration that flags set, by key, None where they do not. Raises UsageError for words that mean nothing."""
+    from lslam.evaluation.recipes import check_words
+    from lslam.odometry import require_method
 
+    check_words(options.metrics_of(given["metrics"]))
+    if given["method"] is not None:
+        require_method(given["method"])
+    if given["residual"] is not None:
+        residual_named(given["residual"])
     flags = {
         "odometry.method": given["method"],
         "eval.metrics": json.dumps(options.metrics_of(given["metrics"])) if given["metrics"] else None,
@@ -177,8 +192,18 @@ def _resolve(given: dict[str, Any]) -> Config:
         if given["method"] not in (None, "poses"):
             raise UsageError(f"--poses replaces odometry: drop --method {given['method']}")
         flags |= {"odometry.method": "poses", "odometry.poses": json.dumps(str(given["poses"]), ensure_ascii=False)}
+    return flags
+
+
+def _resolve(given: dict[str, Any], flags: dict[str, Any]) -> Config:
+    """Flags over --set over environment over --config over --preset over defaults; checked."""
+    from lslam.config import load_config
+    from lslam.pipeline.check import check_config
+
     settings = options.with_preset(given["settings"], given["preset"])
-    return load_config(given["config_file"], [*settings, *(f"{k}={v}" for k, v in flags.items() if v is not None)])
+    config = load_config(given["config_file"], [*settings, *(f"{k}={v}" for k, v in flags.items() if v is not None)])
+    check_config(config)
+    return config
 
 
 def read_truth(path: Path | None, sequence: Sequence) -> Trajectory | None:

@@ -120,13 +120,14 @@ def command(
     if plan is not None and plan.suffix.lower() != ".png":
         raise click.UsageError(f"--plan {plan}: the scene is drawn as PNG, name a file FILE.png")
     console.setup_logging(verbose, quiet)
-    from lslam.simulation.gnss import GnssModel
-    from lslam.simulation.record import check_target
-    from lslam.simulation.scenarios import simulate
+    from lslam.simulation.target import check_target
 
     if out is not None:
         check_target(out, overwrite, resume)
     at = None if origin is None else _numbers(origin)
+    from lslam.simulation.gnss import GnssModel
+    from lslam.simulation.scenarios import simulate
+
     if plan is not None and out is None and osm is not None and path_file is None:
         _draw_map(scenario, seed, settings, osm, at, plan)
         return

@@ -63,10 +63,11 @@ def command(study: str | None, **given: Any) -> None:
         raise click.UsageError("--pilot estimates the time of a --dry-run: give both")
     if study is None:
         raise click.UsageError("STUDY is missing; for example: lslam sweep skip-frames --dry-run")
+    options.check_engine(given)
+    sweep = _sweep(study, given)
     from lslam.errors import GateError
     from lslam.studies.sweep import run_sweep
 
-    sweep = _sweep(study, given)
     with options.engine_of(given, "studying") as engine, ExitStack() as stack:
         from lslam.cli.study_screen import bars, best_so_far
 
@@ -92,14 +93,23 @@ def command(study: str | None, **given: Any) -> None:
 
 
 def _sweep(word: str, given: dict[str, Any]) -> Sweep:
+    """What is studied; what is cheap to see is seen before anything heavy is imported."""
+    seeds = None if given["seeds"] is None else options.seeds_of(given["seeds"])
+    from lslam.config.load import check_settings
     from lslam.config.study import parse_study
-    from lslam.studies.sweep import Sweep, find_study
+    from lslam.studies.output import STUDY, require_free
+    from lslam.studies.study_files import find_study
 
+    check_settings(given["settings"])
     study = find_study(word)
-    if given["seeds"] is not None:
-        seeds = options.seeds_of(given["seeds"])
+    if seeds is not None:
         study = parse_study(study.model_dump(exclude_unset=True) | {"seeds": seeds}, "--seeds", study.name)
-    return Sweep(study, options.output_of(given, study.name), given["settings"])
+    output = options.output_of(given, study.name)
+    if not given["dry_run"]:
+        require_free(output.out, STUDY, "study", output.overwrite, output.resume)
+    from lslam.studies.sweep import Sweep
+
+    return Sweep(study, output, given["settings"])
 
 
 def _print(rows: list[StudyRow]) -> None:
@@ -111,6 +121,7 @@ def _print(rows: list[StudyRow]) -> None:
 
 def _report(folder: Path) -> None:
     """Write the report and print its verdicts."""
+    options.require_there(folder / "results.csv")
     from lslam.studies.sweep import report_folder
 
     for result in report_folder(folder):
@@ -120,7 +131,7 @@ def _report(folder: Path) -> None:
 
 
 def _print_list() -> None:
-    from lslam.studies.sweep import find_study, study_names
+    from lslam.studies.study_files import find_study, study_names
 
     for name in study_names():
         show(f"{name:<22}  {find_study(name).summary}\n")

@@ -28,13 +28,16 @@ def command(run: Path, out: Path | None, overwrite: bool, verbose: bool, quiet: 
     """
     setup_logging(verbose, quiet)
     from lslam.errors import OutputError, OutputExistsError
-    from lslam.pipeline.view import viewed_run
+    from lslam.pipeline.run_folder import require_run
     from lslam.reports.recording import require_rerun, write_recording
 
     require_rerun()
     path = run / "run.rrd" if out is None else out
     if path.exists() and not overwrite:
         raise OutputExistsError(f"{path} exists; name another file with --out or replace it with --overwrite")
+    require_run(run)
+    from lslam.pipeline.view import viewed_run
+
     viewed = viewed_run(run)
     if not path.parent.is_dir():
         raise OutputError(f"{path} cannot be written: the folder {path.parent} does not exist")

@@ -40,6 +40,12 @@ def load_config(
         raise ConfigError(explain(error)) from None
 
 
+def check_settings(settings: Iterable[str]) -> None:
+    """Raise ConfigError for one ("a.b=v") that names no key; whether its value will do, `load_config` says."""
+    for setting in settings:
+        _merge({}, _parse_setting(setting), f"--set {setting}")
+
+
 def _over_preset(tree: Tree) -> Tree:
     """The tree laid over the preset it names; a preset's file is kept as a full path, so that a resolved copy finds it."""
     name = str(tree.get("odometry", {}).get("preset", ""))

@@ -14,9 +14,10 @@ from typing import Any
 import numpy as np
 
 from lslam.convert.convert_trajectory import change_frame
-from lslam.errors import InputError, OutputError, OutputExistsError, UsageError, cause
+from lslam.convert.output import check_output
+from lslam.errors import InputError, OutputError, UsageError, cause
 from lslam.formats import bag_messages
-from lslam.formats.bag_files import INFO_TOPIC, KINDS, BagWriter
+from lslam.formats.bag_files import INFO_TOPIC, BagWriter
 from lslam.formats.gnss_csv import write_gnss_csv
 from lslam.formats.imu_csv import write_imu_csv
 from lslam.formats.kitti_layout import PER_POINT, POINTS, in_camera, write_calib, write_scan, write_times
@@ -33,7 +34,6 @@ from lslam.types.trajectory import Trajectory
 
 log = logging.getLogger("lslam")
 
-SUFFIXES = {"bag": ".bag", "mcap": ".mcap", "sqlite": ".db3"}
 NUMBER = "00"  # of the one sequence in KITTI's layout
 TRUTH_FILE, IMU_FILE, GNSS_FILE = "ground_truth.tum", "imu.csv", "gnss.csv"
 
@@ -91,21 +91,6 @@ def convert_sequence(
     finally:
         shutil.rmtree(stage, ignore_errors=True)
     return Converted(out, source.written, source.skipped)
-
-
-def check_output(kind: str, out: Path, is_zstd: bool, overwrite: bool) -> None:
-    """Raise UsageError when `out` does not suit `kind`, OutputExistsError when it is there already."""
-    if kind not in (*KINDS, "kitti"):
-        raise UsageError(f"no layout {kind!r} for sequences: {', '.join(KINDS)} and kitti are")
-    if is_zstd and kind in ("bag", "kitti"):
-        raise UsageError(f"--zstd is for mcap and sqlite, not for {kind}")
-    fitting = SUFFIXES.get(kind, "")
-    if out.suffix in SUFFIXES.values() and out.suffix != fitting:
-        raise UsageError(f"--out {out}: a name in {out.suffix} is not for --to {kind}")
-    if kind == "bag" and out.suffix != ".bag":
-        raise UsageError(f"--out {out}: a ROS 1 bag is one file, its name ends in .bag")
-    if out.exists() and not overwrite:
-        raise OutputExistsError(f"{out} exists already: choose another --out, or --overwrite it")
 
 
 class _Source:

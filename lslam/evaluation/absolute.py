@@ -18,7 +18,8 @@ from lslam.evaluation.metric import (
     statistics_document,
     two,
 )
-from lslam.evaluation.results import ALIGNMENTS, AbsoluteError, Evaluation
+from lslam.evaluation.recipes import ALIGNMENTS
+from lslam.evaluation.results import AbsoluteError, Evaluation
 from lslam.evaluation.statistics import describe, percent_of_length
 from lslam.geometry import se3, so3, umeyama
 from lslam.printable import fixed, metres, significant

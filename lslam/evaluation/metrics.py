@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
-from lslam.errors import UsageError, nearest
 from lslam.evaluation.absolute import AbsoluteTrajectoryError
 from lslam.evaluation.kitti_drift import KittiOdometry
 from lslam.evaluation.metric import TrajectoryMetric
@@ -20,14 +18,6 @@ METRICS: tuple[TrajectoryMetric[Any], ...] = (
     Girolimetto(),
     DelTufo(),
 )
-
-
-def check_words(words: Sequence[str]) -> None:
-    """Raise UsageError for a word of `eval.metrics` that shows no metric."""
-    known = dict.fromkeys(metric.word for metric in METRICS if metric.word)
-    for word in words:
-        if word not in known:
-            raise UsageError(f"no metrics {word!r}; {nearest(word, known)}")
 
 
 def shown_metrics(evaluation: Evaluation) -> list[TrajectoryMetric[Any]]:

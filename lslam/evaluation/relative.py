@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -10,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.config.eval import EvalConfig
-from lslam.errors import UsageError
 from lslam.evaluation import pairs as pair_rules
 from lslam.evaluation.metric import (
     Document,
@@ -21,6 +19,7 @@ from lslam.evaluation.metric import (
     statistics_document,
     two,
 )
+from lslam.evaluation.recipes import parse_delta
 from lslam.evaluation.results import Evaluation, RelativeError
 from lslam.evaluation.statistics import describe
 from lslam.geometry import se3, so3
@@ -29,27 +28,6 @@ from lslam.types.comparison import Metric
 from lslam.types.table import Table
 
 Floats = NDArray[np.float64]
-UNIT_NAMES = {"scan": "scan", "scans": "scan", "m": "m", "s": "s", "": "scan"}
-
-
-def parse_delta(text: str) -> tuple[float, str, str]:
-    """Distance, unit (scan, m, s) and pair rule of a recipe like `10m/all` or `1scan`.
-
-    Without a rule, scans are compared consecutively, metres and seconds over all pairs. Raises UsageError.
-    """
-    found = re.fullmatch(r"\s*([0-9.]+(?:[eE][-+]?\d+)?)\s*([a-z]*)\s*(?:/\s*(consecutive|all))?\s*", text)
-    unit = UNIT_NAMES.get(found.group(2)) if found else None
-    try:
-        value = float(found.group(1)) if found else 0.0
-    except ValueError:
-        value = 0.0
-    if found is None or unit is None or not value > 0 or not np.isfinite(value):
-        raise UsageError(
-            f"RPE distance {text!r}: expected a number, scan|m|s and /consecutive or /all, for example 10m/all"
-        )
-    if unit == "scan" and value != int(value):
-        raise UsageError(f"RPE distance {text!r}: scans are counted in whole numbers")
-    return value, unit, found.group(3) or ("consecutive" if unit == "scan" else "all")
 
 
 def relative_error(estimate: Floats, truth: Floats, seconds: Floats | None, recipe: str) -> RelativeError:

@@ -8,17 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.evaluation.recipes import ALIGNMENTS
 from lslam.evaluation.statistics import Statistics
 
 Floats = NDArray[np.float64]
 
-ALIGNMENTS = {
-    "none": "estimate as it is",
-    "origin": "first pose on the first true pose",
-    "se3": "least squares over positions (Umeyama), rotation and translation",
-    "sim3": "least squares over positions (Umeyama), rotation, translation and scale",
-    "posyaw": "least squares over positions, translation and rotation about the vertical",
-}
 UNITS = {"scan": "scans", "m": "m", "s": "s"}
 
 

@@ -20,8 +20,7 @@ from lslam.inertial.fusion import InertialMotion
 from lslam.inertial.imu_cleaning import ImuRefusedError
 from lslam.inertial.initialise import FirstPoses, InertialStart, start
 from lslam.odometry import create_odometry
-from lslam.readers import select
-from lslam.readers.selection import Selection
+from lslam.readers.selection import Selection, select
 from lslam.types.imu import ImuStream
 from lslam.types.scan_result import ScanResult
 from lslam.types.sequence import Sequence

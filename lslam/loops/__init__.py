@@ -7,11 +7,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, cast
 
-from lslam.loops.descriptor import PlaceDescriptor
 from lslam.plugins import factory, require
 
 if TYPE_CHECKING:
     from lslam.config.loops import LoopsConfig
+    from lslam.loops.descriptor import PlaceDescriptor
 
 GROUP = "lslam.descriptors"
 # name -> (module with `create(config) -> PlaceDescriptor`, one line for people)
@@ -27,4 +27,4 @@ def require_descriptor(name: str) -> None:
 
 def create_descriptor(config: LoopsConfig) -> PlaceDescriptor:
     """The descriptor `loops.descriptor` names. Raises UsageError with the nearest name when there is none."""
-    return cast(PlaceDescriptor, factory(GROUP, DESCRIPTORS, config.descriptor, "place descriptor")(config))
+    return cast("PlaceDescriptor", factory(GROUP, DESCRIPTORS, config.descriptor, "place descriptor")(config))

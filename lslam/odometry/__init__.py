@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, cast
 
-from lslam.odometry.base import Odometry
 from lslam.plugins import factory, known, require
 
 if TYPE_CHECKING:
     from lslam.config.config import Config
+    from lslam.odometry.base import Odometry
 
 GROUP = "lslam.methods"
 # name -> (module with `create(config) -> Odometry`, one line for people)
@@ -49,4 +49,4 @@ def require_method(name: str) -> None:
 
 def create_odometry(config: Config) -> Odometry:
     """The method `odometry.method` names. Raises UsageError with the nearest name when there is none."""
-    return cast(Odometry, factory(GROUP, METHODS, config.odometry.method, "method")(config))
+    return cast("Odometry", factory(GROUP, METHODS, config.odometry.method, "method")(config))

@@ -1,14 +1,12 @@
-"""What a configuration can get wrong that its sections cannot see by themselves."""
+"""What a configuration can get wrong that its sections cannot see by themselves; nothing heavy is imported for it."""
 
 from __future__ import annotations
 
 from lslam.config import Config
 from lslam.config.preset_files import read_preset
 from lslam.errors import UsageError
-from lslam.evaluation.metrics import check_words
-from lslam.evaluation.relative import parse_delta
+from lslam.evaluation.recipes import check_words, parse_delta
 from lslam.loops import require_descriptor
-from lslam.maps.mesh import require_open3d
 from lslam.odometry import FEATURE_METHODS, METHODS, require_method
 from lslam.osm import matcher_named
 from lslam.registration.residuals import residual_named
@@ -41,6 +39,8 @@ def check_config(config: Config) -> None:
     if method == "poses" and config.imu.use:
         raise UsageError("--imu does nothing with --poses, whose motion is given: drop one of them")
     if config.map.write and (config.map.denoise or config.map.mesh):
+        from lslam.maps.mesh import require_open3d
+
         require_open3d()
     if config.registration.residual is not None:
         residual_named(config.registration.residual)

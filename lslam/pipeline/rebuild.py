@@ -34,7 +34,7 @@ from lslam.pipeline.map_files import (
 from lslam.pipeline.map_notes import drop_note, is_note, note_of, note_with, noted_last
 from lslam.pipeline.map_pass import INTERRUPTED, BuiltMap, build_map
 from lslam.pipeline.refresh import write_renewed
-from lslam.pipeline.run_folder import MANIFEST, SPOOL, held
+from lslam.pipeline.run_folder import MANIFEST, SPOOL, held, require_run
 from lslam.readers import open_sequence
 from lslam.readers.selection import select
 from lslam.remote import as_path
@@ -92,8 +92,7 @@ def read_run(folder: Path, settings: Iterable[str] = ()) -> EarlierRun:
 
     Raises InputError naming the file that is missing or broken, ConfigError for settings that make no sense.
     """
-    if not folder.is_dir():
-        raise InputError(f"{folder} is no folder of a run: name what `lslam run` wrote")
+    require_run(folder)
     try:
         manifest = parse_json((folder / MANIFEST).read_text(encoding="utf-8"))
     except OSError as error:

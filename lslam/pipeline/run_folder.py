@@ -12,7 +12,7 @@ from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import IO, Any
 
-from lslam.errors import OutputError, OutputExistsError, cause
+from lslam.errors import InputError, OutputError, OutputExistsError, cause
 from lslam.formats.atomic import atomic_write
 from lslam.locks import lock
 from lslam.printable import file_safe
@@ -51,7 +51,7 @@ class RunFolder:
         self._lock: IO[str] | None = None
         self._log_handler: _LogFile | None = None
         try:
-            _check_target(path, overwrite or goes_on)
+            _require_free(path, overwrite or goes_on)
             path.mkdir(parents=True, exist_ok=True)
             self._lock = _hold(path)
             self._clear(_NEEDED if goes_on else ())
@@ -168,7 +168,25 @@ class _LogFile(logging.FileHandler):
         """A full disk must not print a traceback per line: the results' own error follows."""
 
 
-def _check_target(path: Path, overwrite: bool) -> None:
+def check_target(path: Path, overwrite: bool) -> None:
+    """Raise what `RunFolder` would for a folder that is there, before any work; nothing is held or written."""
+    try:
+        _require_free(path, overwrite)
+    except OSError as error:
+        raise OutputError(f"output folder {path} cannot be written: {cause(error)}") from None
+
+
+def require_run(path: Path) -> None:
+    """Raise InputError unless `path` is the folder of a run."""
+    if not path.is_dir():
+        raise InputError(f"{path} is no folder of a run: name what `lslam run` wrote")
+    try:
+        (path / MANIFEST).stat()
+    except OSError as error:
+        raise InputError(f"{path} is no folder of a run: {MANIFEST} cannot be read: {cause(error)}") from None
+
+
+def _require_free(path: Path, overwrite: bool) -> None:
     if not path.exists():
         return
     if not path.is_dir():

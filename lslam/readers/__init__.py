@@ -1,6 +1,7 @@
 """A data set on disk becomes a Sequence. A new reader is one file with `locate` and `open_folder` and one line here.
 
 Others register such a module as entry point `lslam.readers`; it is asked about folders that no reader of ours takes.
+Nothing heavy is imported before the folder is found.
 """
 
 from __future__ import annotations
@@ -8,18 +9,16 @@ from __future__ import annotations
 import os
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from lslam.errors import InputError, LslamError, UsageError, cause
-from lslam.formats.sequence_toml import SequenceInfo, is_rate
-from lslam.formats.transform_text import read_transform
 from lslam.plugins import load, registered
 from lslam.readers.lookup import find_folder
-from lslam.readers.selection import select
 from lslam.remote import RemotePath
-from lslam.types.sequence import Sequence
 
-__all__ = ["READERS", "open_sequence", "select"]
+if TYPE_CHECKING:
+    from lslam.formats.sequence_toml import SequenceInfo
+    from lslam.types.sequence import Sequence
 
 GROUP = "lslam.readers"
 # Tried in this order: a KITTI layout is also a folder with scans somewhere in it.
@@ -67,6 +66,16 @@ def open_sequence(
     """
     if (rows is None) != (cols is None) or min(rows or 1, cols or 1) < 1:
         raise UsageError(f"rows {rows} and cols {cols} of organised clouds go together and are above 0")
+    # Absolute, but links kept: `sequences/07` may be one, and its poses lie beside the link.
+    try:
+        folder = find_folder(name_or_path, data_root)
+        if not isinstance(folder, RemotePath):
+            folder = Path(os.path.abspath(folder))
+    except OSError as error:
+        raise _unreadable(name_or_path, error) from None
+    from lslam.formats.sequence_toml import SequenceInfo, is_rate
+    from lslam.formats.transform_text import read_transform
+
     if rate_hz is not None and not is_rate(rate_hz):
         raise UsageError(f"a scan rate of {rate_hz} Hz makes no sense")
     overrides = SequenceInfo(
@@ -80,14 +89,10 @@ def open_sequence(
         imu_topic=imu_topic,
         gnss_topic=gnss_topic,
     )
-    # Absolute, but links kept: `sequences/07` may be one, and its poses lie beside the link.
     try:
-        folder = find_folder(name_or_path, data_root)
-        if not isinstance(folder, RemotePath):
-            folder = Path(os.path.abspath(folder))
         sequence = _open(folder, overrides)
     except OSError as error:
-        raise InputError(f"{error.filename or name_or_path} cannot be read: {cause(error)}") from None
+        raise _unreadable(name_or_path, error) from None
     from lslam.readers.raw_drive import with_streams
 
     flags = {"--lidar-topic": lidar_topic, "--imu-topic": imu_topic, "--gnss-topic": gnss_topic}
@@ -95,6 +100,10 @@ def open_sequence(
     if given and sequence.kind != "bag":
         raise UsageError(f"{', '.join(given)} is for bags: {folder} is {sequence.kind}")
     return with_streams(sequence, imu, gnss, data_root)
+
+
+def _unreadable(name_or_path: str | Path, error: OSError) -> InputError:
+    return InputError(f"{error.filename or name_or_path} cannot be read: {cause(error)}")
 
 
 def _open(folder: Path, overrides: SequenceInfo) -> Sequence:

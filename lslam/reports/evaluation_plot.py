@@ -8,19 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from lslam.errors import UsageError, nearest
+from lslam.errors import UsageError
 from lslam.evaluation.results import AbsoluteError, Evaluation
 from lslam.formats.atomic import atomic_write
 from lslam.printable import printable
 from lslam.reports.evaluation_table import short_names
-from lslam.reports.picture import COLOURS, FORMATS, house_style, label, picture
-
-
-def check_plot_path(path: Path) -> None:
-    """UsageError when the suffix of `path` names no picture format we write: asked before the work, not after."""
-    kind = path.suffix.lstrip(".").lower()
-    if kind not in FORMATS:
-        raise UsageError(f"--plot {path}: {nearest(kind, FORMATS) if kind else 'end the name with .png, .svg or .pdf'}")
+from lslam.reports.picture import COLOURS, check_plot_path, house_style, label, picture
 
 
 def write_plot(path: str | Path, evaluations: Sequence[Evaluation], names: Sequence[str] | None = None) -> None:

@@ -5,10 +5,20 @@ from __future__ import annotations
 import io
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
+
+from lslam.errors import UsageError, nearest
 
 FORMATS = ("png", "svg", "pdf")
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")  # Okabe and Ito: safe for colour blindness
+
+
+def check_plot_path(path: Path) -> None:
+    """UsageError when the suffix of `path` names no picture format we write: asked before the work, not after."""
+    kind = path.suffix.lstrip(".").lower()
+    if kind not in FORMATS:
+        raise UsageError(f"--plot {path}: {nearest(kind, FORMATS) if kind else 'end the name with .png, .svg or .pdf'}")
 
 
 @contextmanager

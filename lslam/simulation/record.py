@@ -21,10 +21,10 @@ from lslam.simulation.osm_extract import write_extracts
 from lslam.simulation.scenarios import SimulatedDrive
 from lslam.simulation.sensors import GNSS_FILE, IMU_FILE, TRUTH, write_readings, write_truth
 from lslam.simulation.stream import MARK, fingerprint, read_mark, write_mark, write_scans
+from lslam.simulation.target import NUMBER, check_target, part_of
 
 log = logging.getLogger("lslam")
 
-NUMBER = "00"  # of the one sequence in the folder
 _MAP_SEED = 2**32 - 9  # of the faults in the perturbed map
 _SIDES, _HOUSE = 80e3, 4e3  # bytes beside the scans: per second of readings and truth, and per building of the maps
 
@@ -60,7 +60,7 @@ def record(
     """
     sequence, poses = out / "sequences" / NUMBER, out / "poses" / f"{NUMBER}.txt"
     check_target(out, overwrite, resume)
-    part = _part(out)
+    part = part_of(out)
     done = False
     try:
         if not resume or not part.is_dir():
@@ -91,32 +91,6 @@ def record(
     size = poses.stat().st_size + sum(file.stat().st_size for file in sequence.rglob("*") if file.is_file())
     write_manifest(sequence, drive, command, points, size)
     return Recorded(sequence, poses, points, size)
-
-
-def check_target(out: Path, overwrite: bool, resume: bool = False) -> None:
-    """Raise OutputExistsError when `out` is a file, or holds something and neither `overwrite` nor `resume` allows that."""
-    try:
-        if out.exists() and not out.is_dir():
-            raise OutputExistsError(f"{out} is a file: give --out a folder that does not exist yet")
-        if overwrite or not out.is_dir() or not any(out.iterdir()):
-            return
-        begun = _part(out).is_dir()
-        if resume and begun:
-            return
-        if begun:
-            raise OutputExistsError(
-                f"{out} holds a simulation that was interrupted: --resume goes on, --overwrite begins anew"
-            )
-        raise OutputExistsError(
-            f"{out} exists already{' and nothing in it was interrupted' if resume else ''}: choose another --out, or "
-            "--overwrite to replace the sequence in it"
-        )
-    except OSError as error:
-        raise OutputError(f"{out} cannot be read: {cause(error)}") from None
-
-
-def _part(out: Path) -> Path:
-    return out / "sequences" / f"{NUMBER}.part"
 
 
 def _check_space(out: Path, part: Path, drive: SimulatedDrive) -> None:

@@ -16,12 +16,10 @@ from lslam.pipeline.identity import imu_digest, input_digest, job_digest, listin
 from lslam.printable import file_safe, toml_text
 from lslam.studies.expanded_study import ExpandedStudy, check_same
 from lslam.studies.grid import Job, cells_of, expand, label_of, run_folder
-from lslam.studies.output import OutputOptions
+from lslam.studies.output import BATCH, OutputOptions
 from lslam.studies.variants import WITH_IMU, Variant, find_variants, free_name, settings_of
 from lslam.types.sequence import Sequence as Recording
 from lslam.types.trajectory import Trajectory
-
-MARK = "batch.toml"
 
 
 @dataclass(frozen=True)
@@ -71,7 +69,7 @@ def expand_batch(batch: BatchConfig, output: OutputOptions, settings: Sequence[s
     when it is to go on in the folder of another list.
     """
     text = toml_text(batch.model_dump(mode="json", exclude_none=True, exclude_defaults=True))
-    check_same(output, MARK, "batch", text, _names)
+    check_same(output, BATCH, "batch", text, _names)
     jobs: list[Job] = []
     found: dict[str, Variant] = {}
     taken: set[str] = set()
@@ -84,7 +82,7 @@ def expand_batch(batch: BatchConfig, output: OutputOptions, settings: Sequence[s
         cells = cells_of(entry.sequences, entry.seeds, variants, output, settings)
         jobs += expand(cells, variants, entry.seeds, output.out, output.command)
         found |= {variant.name: variant for variant in variants}
-    return ExpandedStudy("batch", "batch", MARK, text, jobs, found)
+    return ExpandedStudy("batch", "batch", BATCH, text, jobs, found)
 
 
 def expand_lines(lines: Sequence[RunLine], output: OutputOptions) -> ExpandedStudy:
@@ -94,7 +92,7 @@ def expand_lines(lines: Sequence[RunLine], output: OutputOptions) -> ExpandedStu
     when they are to go on in the folder of a list that has none of them.
     """
     text = toml_text({"lines": [line.words for line in lines]})
-    check_same(output, MARK, "batch", text, _names)
+    check_same(output, BATCH, "batch", text, _names)
     jobs: list[Job] = []
     found: dict[str, Variant] = {}
     owners: dict[Path, int] = {}
@@ -117,17 +115,17 @@ def expand_lines(lines: Sequence[RunLine], output: OutputOptions) -> ExpandedStu
                 output.data_root, reading=line.reading,
             )
         )  # fmt: skip
-    return ExpandedStudy("batch", "batch", MARK, text, jobs, found)
+    return ExpandedStudy("batch", "batch", BATCH, text, jobs, found)
 
 
 def _names(tree: dict[str, Any]) -> list[str]:
-    """What the content of MARK goes by: its lines, or each recording and scenario of its jobs with each method."""
+    """What the content of BATCH goes by: its lines, or each recording and scenario of its jobs with each method."""
     lines = tree.get("lines")
     if isinstance(lines, list) and lines:
         return [str(line) for line in lines]
     return [
         f"{sequence.path or sequence.scenario} {method}"
-        for job in parse_batch(tree, MARK).jobs
+        for job in parse_batch(tree, BATCH).jobs
         for sequence in job.sequences
         for method in job.methods
     ]

@@ -4,69 +4,24 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import replace
 
-from lslam.errors import InterruptedRunError, LslamError, UsageError
+from lslam.errors import InterruptedRunError, LslamError
 from lslam.reports import compare_html, compare_json, compare_table
 from lslam.studies.collect import IMU, collect_run, metrics_of
 from lslam.studies.drawings import draw
 from lslam.studies.grid import Cell, Job, expand, fitted_scene, recorded_cell
 from lslam.studies.jobs import finished, pool_of, run_jobs
-from lslam.studies.output import SIMULATED, lock_output, release_output
+from lslam.studies.output import COMPARISON, SIMULATED, lock_output, release_output
 from lslam.studies.paired import TIE_M, compare_pairs, summarise
+from lslam.studies.plan import Plan, check_plan
 from lslam.studies.runner import StudyProgress
 from lslam.studies.scenes import Scene, simulate_once
 from lslam.studies.subjects import Subject, scans_needed, with_range
-from lslam.studies.variants import Variant
 from lslam.types.comparison import Comparison, Drawing, RunScore
-from lslam.types.trajectory import Trajectory
 
 # More than this many busy cores before the first run, and its times are somebody else's too.
 BUSY = 0.5
-RESULT = "compare.json"
-ONE_TRUTH = "--gt belongs to one recorded sequence: a scenario has its own, and several need one each"
-
-
-@dataclass(frozen=True)
-class Plan:
-    """What is to be compared.
-
-    truth : replaces the ground truth of the only sequence; jobs : runs at once, with more than one times cannot be compared
-    crop : (x, y, size) of the map crop, m, None to choose; overwrite : run everything anew; resume : keep finished runs, go
-        on with the others
-    data_root : where the IMU of a KITTI odometry sequence is looked for
-    """
-
-    subjects: tuple[Subject, ...]
-    variants: tuple[Variant, ...]
-    seeds: tuple[int, ...]
-    out: Path
-    jobs: int = 1
-    truth: Trajectory | None = None
-    crop: tuple[float, float, float] | None = None
-    overwrite: bool = False
-    resume: bool = False
-    data_root: Path | None = None
-    command: str = ""
-
-
-def check_plan(plan: Plan) -> None:
-    """Raise UsageError for what cannot be compared."""
-    if not plan.variants:
-        raise UsageError("no method is named")
-    if not plan.subjects:
-        raise UsageError("no sequence is named")
-    if len(set(plan.seeds)) < len(plan.seeds) or not plan.seeds or min(plan.seeds) < 0:
-        raise UsageError(f"--seeds {','.join(map(str, plan.seeds))}: different whole numbers from 0, for example 0,1,2")
-    if plan.jobs < 1:
-        raise UsageError(f"--jobs {plan.jobs}: at least one run at a time")
-    if plan.truth is not None and (len(plan.subjects) > 1 or plan.subjects[0].scenario):
-        raise UsageError(ONE_TRUTH)
-    if plan.crop is not None and not plan.crop[2] > 0:
-        raise UsageError(f"--crop: the size of {plan.crop[2]:g} m must be above 0")
-    if plan.crop is not None and not all(v.config.map.write for v in plan.variants):
-        raise UsageError("--crop needs maps, and map.write is off")
 
 
 def compare(plan: Plan, progress: StudyProgress | None = None) -> Comparison:
@@ -80,9 +35,9 @@ def compare(plan: Plan, progress: StudyProgress | None = None) -> Comparison:
     """
     progress = progress or StudyProgress()
     check_plan(plan)
-    lock_output(plan.out, RESULT, "comparison", plan.overwrite, plan.resume)
-    if not (plan.out / RESULT).is_file():
-        compare_json.write_running(plan.out / RESULT, plan.command)
+    lock_output(plan.out, COMPARISON, "comparison", plan.overwrite, plan.resume)
+    if not (plan.out / COMPARISON).is_file():
+        compare_json.write_running(plan.out / COMPARISON, plan.command)
     jobs: list[Job] = []
     try:
         jobs = expand(_cells(plan, progress), plan.variants, plan.seeds, plan.out, plan.command)
@@ -95,13 +50,13 @@ def compare(plan: Plan, progress: StudyProgress | None = None) -> Comparison:
             "--resume goes on"
         ) from None
     except LslamError:
-        release_output(plan.out, RESULT)
+        release_output(plan.out, COMPARISON)
         raise
     scores = [collect_run(job, job.folder in kept) for job in jobs]
     comparison, drawings = _weigh(plan, jobs, scores)
     compare_table.write_files(plan.out, comparison)
     compare_html.write_page(plan.out / "compare.html", comparison, drawings, plan.crop)
-    compare_json.write_result(plan.out / RESULT, comparison)
+    compare_json.write_result(plan.out / COMPARISON, comparison)
     return comparison
 
 

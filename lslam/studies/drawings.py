@@ -13,7 +13,8 @@ import numpy as np
 from lslam.config.eval import EvalConfig
 from lslam.errors import LslamError
 from lslam.evaluation.evaluate import evaluate
-from lslam.evaluation.results import ALIGNMENTS, AbsoluteError
+from lslam.evaluation.recipes import ALIGNMENTS
+from lslam.evaluation.results import AbsoluteError
 from lslam.formats.trajectory_files import read_trajectory
 from lslam.readers import open_sequence
 from lslam.studies.grid import Job

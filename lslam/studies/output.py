@@ -9,6 +9,8 @@ from pathlib import Path
 from lslam.errors import OutputError, OutputExistsError, UsageError, cause
 
 SIMULATED = "simulated"
+# The file that makes a folder one of ours.
+COMPARISON, STUDY, BATCH = "compare.json", "study.toml", "batch.toml"
 
 
 @dataclass(frozen=True)
@@ -29,10 +31,18 @@ class OutputOptions:
 
 
 def lock_output(out: Path, mark: str, what: str, overwrite: bool, resume: bool) -> None:
-    """Take the output folder, or say why not; the file `mark` tells `what` it is, and is the caller's to write.
+    """Take the output folder, or raise as `require_free`; the file `mark` tells `what` it is, and is the caller's to write."""
+    require_free(out, mark, what, overwrite, resume)
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"output folder {out} cannot be used: {cause(error)}") from None
 
-    Raises OutputExistsError for a file, a folder of something else, or one that holds runs and neither `overwrite` nor `resume`
-    is set; OutputError when it cannot be used.
+
+def require_free(out: Path, mark: str, what: str, overwrite: bool, resume: bool) -> None:
+    """Raise OutputExistsError for a file, a folder of something else, or one that holds runs and may not be gone on with.
+
+    UsageError for `overwrite` and `resume` at once; OutputError when it cannot be read.
     """
     if overwrite and resume:
         raise UsageError("--overwrite runs everything anew and --resume keeps what is finished: give one of them")
@@ -47,7 +57,6 @@ def lock_output(out: Path, mark: str, what: str, overwrite: bool, resume: bool) 
                 f"output folder {out} exists; --resume keeps its finished runs, --overwrite runs all anew, or name "
                 "another with --out"
             )
-        out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise OutputError(f"output folder {out} cannot be used: {cause(error)}") from None
 

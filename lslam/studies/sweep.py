@@ -5,12 +5,11 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from importlib import resources
 from pathlib import Path
 
 from lslam.config.finding import ExpectedFinding
-from lslam.config.study import StudyConfig, parse_study, read_study
-from lslam.errors import InputError, RunFailedError, UsageError, nearest
+from lslam.config.study import StudyConfig, read_study
+from lslam.errors import InputError, RunFailedError
 from lslam.evaluation.sensitivity import evaluate_study
 from lslam.formats.study_csv import read_study_csv
 from lslam.printable import toml_text
@@ -18,18 +17,12 @@ from lslam.reports.study_html import timing_notes, write_study_files
 from lslam.studies.engines import Engine
 from lslam.studies.expanded_study import ExpandedStudy, check_same, make_runs
 from lslam.studies.grid import cells_of, expand
-from lslam.studies.output import OutputOptions
+from lslam.studies.output import STUDY, OutputOptions
 from lslam.studies.results import RESULTS
 from lslam.studies.runner import StudyProgress
 from lslam.studies.variants import study_variants
 from lslam.types.sensitivity import StudyResult
 from lslam.types.study import StudyRow
-from lslam.untrusted import parse_toml
-
-# The study as it was resolved; it makes the folder one of a study.
-MARK = "study.toml"
-# Studies that ship with lslam.
-FOLDER = "ready"
 
 log = logging.getLogger("lslam")
 
@@ -51,12 +44,12 @@ def expand_study(sweep: Sweep) -> ExpandedStudy:
     """
     study, output = sweep.study, sweep.output
     text = toml_text(study.model_dump(mode="json", exclude_none=True, exclude_defaults=True))
-    check_same(output, MARK, "study", text, lambda tree: [str(tree.get("name"))])
+    check_same(output, STUDY, "study", text, lambda tree: [str(tree.get("name"))])
     found = study_variants(study, sweep.settings)
     cells = cells_of(study.sequences, study.seeds, found, output, sweep.settings)
     jobs = expand(cells, found, study.seeds, output.out, output.command)
     return ExpandedStudy(
-        study.name, "study", MARK, text, jobs, {variant.name: variant for variant in found}, study.metric
+        study.name, "study", STUDY, text, jobs, {variant.name: variant for variant in found}, study.metric
     )
 
 
@@ -74,25 +67,6 @@ def run_sweep(
     if rows and not any(row.is_usable for row in rows):
         raise RunFailedError(f"all {len(rows)} runs failed, the first one: {rows[0].reason}")
     return rows
-
-
-def study_names() -> tuple[str, ...]:
-    """Names of the studies that ship with lslam: those of Girolimetto's chapter 5.3."""
-    files = resources.files(__package__).joinpath(FOLDER).iterdir()
-    return tuple(sorted(file.name.removesuffix(".toml") for file in files if file.name.endswith(".toml")))
-
-
-def find_study(word: str) -> StudyConfig:
-    """The study of a TOML file, else the ready one of that name.
-
-    Raises UsageError with the nearest name for what is neither, and what `read_study` raises.
-    """
-    if word.endswith(".toml") or Path(word).is_file():
-        return read_study(Path(word))
-    if word not in study_names():
-        raise UsageError(f"no study {word!r} and no TOML file; {nearest(word, study_names())}")
-    text = resources.files(__package__).joinpath(FOLDER, f"{word}.toml").read_text(encoding="utf-8")
-    return parse_study(parse_toml(text), f"study {word!r}", word)
 
 
 def write_study_report(
@@ -120,7 +94,7 @@ def report_folder(folder: Path) -> list[StudyResult]:
         raise InputError(f"study {folder} has no finished run yet: lslam sweep with --out {folder} --resume makes them")
     for note in timing_notes(rows):
         log.warning("%s", note)
-    if not (folder / MARK).is_file():
+    if not (folder / STUDY).is_file():
         return write_study_report(folder, rows)
-    study = read_study(folder / MARK)
+    study = read_study(folder / STUDY)
     return write_study_report(folder, rows, study.finding, study.summary or study.name)

@@ -39,9 +39,10 @@ from lslam.geometry import se3
 from lslam.geometry.interpolate import poses_at
 from lslam.pipeline.run import RunOutcome, Watch, run
 from lslam.readers import open_sequence
-from lslam.simulation.record import NUMBER, record
+from lslam.simulation.record import record
 from lslam.simulation.scenario_files import scenario_names
 from lslam.simulation.scenarios import simulate
+from lslam.simulation.target import NUMBER
 from lslam.types.sequence import Sequence
 from lslam.types.trajectory import Trajectory
 

@@ -291,7 +291,7 @@ def test_scores_and_comparisons(run: Path, tmp_path: Path) -> None:
         (["--out", "a.laz", "--crs", "25832"], 2, "expected EPSG and a number"),
         (["--out", "a.ply", "--set", "odometry.method=icp"], 2, "only keys of the map"),
         (["--out", "a.ply", "--threshold", "1"], 2, "belongs to --against"),
-        (["--against", "none.ply"], 3, "none.ply cannot be read"),
+        (["--against", "none.ply"], 3, "none.ply does not exist"),
     ],
 )  # fmt: skip
 def test_what_will_not_do_is_one_sentence(

@@ -107,7 +107,7 @@ def test_a_run_too_short_for_a_score_is_said(file: Path, tmp_path: Path) -> None
         (("FILE", "--pilot"), 2, "--pilot estimates the time of a --dry-run: give both"),
         (("nonsense",), 2, "no study 'nonsense' and no TOML file"),
         (("none.toml",), 3, "study none.toml cannot be read: No such file or directory"),
-        (("--report", "none"), 3, "study none/results.csv cannot be read: No such file or directory"),
+        (("--report", "none"), 3, "none/results.csv does not exist"),
         (("FILE", "--jobs", "0"), 2, "--jobs 0: at least one run"),
         (("FILE", "--jobs", "1", "--cluster", "local:2"), 2, "give one of them"),
         (("FILE", "--cluster", "two"), 2, "local:N with N workers"),

@@ -59,7 +59,7 @@ def test_results_alone_make_a_report_without_verdicts(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("words", "code", "sentence"),
     [
-        (("--report", "none"), 3, "study none/results.csv cannot be read"),
+        (("--report", "none"), 3, "none/results.csv does not exist"),
         (("--report", "empty"), 3, "study empty has no finished run yet"),
         (("--report", "taken"), 3, "folder taken/figures cannot be made"),
         (("skip-frames", "--report", "."), 2, "leave out skip-frames"),

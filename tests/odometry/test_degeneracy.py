@@ -14,7 +14,7 @@ from lslam.config.config import Config
 from lslam.frontend.register_scans import estimate
 from lslam.geometry import se3
 from lslam.odometry import create_odometry
-from lslam.readers import select
+from lslam.readers.selection import select
 from lslam.registration.solver import RegistrationResult
 from lslam.simulation.scenarios import simulate
 from lslam.studies.cached_sequence import ScanStore, SequenceCache

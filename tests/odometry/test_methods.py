@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import importlib.metadata
 from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from lslam import plugins
 from lslam.config.config import Config
 from lslam.errors import UsageError
 from lslam.odometry import METHODS, create_odometry, known_methods
@@ -40,7 +40,7 @@ def foreign(monkeypatch: pytest.MonkeyPatch) -> list[str]:
         asked.append(group)
         return [EntryPoint(name, f"{__name__}:Foreign", group) for name in ("their-icp", "icp")]
 
-    monkeypatch.setattr(plugins, "entry_points", entry_points)
+    monkeypatch.setattr(importlib.metadata, "entry_points", entry_points)
     return asked
 
 

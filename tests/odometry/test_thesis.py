@@ -14,7 +14,7 @@ from lslam.evaluation.absolute import absolute_error
 from lslam.frontend.register_scans import estimate
 from lslam.geometry import se3, so3
 from lslam.odometry import create_odometry
-from lslam.readers import select
+from lslam.readers.selection import select
 from lslam.simulation.scenarios import SimulatedDrive, simulate
 
 Floats = NDArray[np.float64]

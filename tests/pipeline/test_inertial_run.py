@@ -26,7 +26,7 @@ from lslam.inertial.fusion import InertialMotion
 from lslam.odometry import create_odometry
 from lslam.pipeline.run import run
 from lslam.pipeline.watch import RunOutcome
-from lslam.readers import select
+from lslam.readers.selection import select
 from lslam.reports.text import summary
 from lslam.simulation.lidar_models import LIDARS
 from lslam.simulation.scenarios import SimulatedDrive, simulate

@@ -22,7 +22,8 @@ from lslam.pipeline.lost import MOST_SAID, mark_lost
 from lslam.pipeline.manifest import Manifest
 from lslam.pipeline.run import run
 from lslam.pipeline.watch import RunOutcome, Watch
-from lslam.readers import open_sequence, select
+from lslam.readers import open_sequence
+from lslam.readers.selection import select
 from lslam.reports.text import summary
 from lslam.simulation.lidar_models import LIDARS
 from lslam.simulation.scenarios import simulate

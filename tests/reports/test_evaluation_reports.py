@@ -17,7 +17,7 @@ from lslam.evaluation.evaluate import evaluate
 from lslam.evaluation.results import Evaluation
 from lslam.evaluation.timing import StageTime, Timing
 from lslam.geometry import se3
-from lslam.reports import evaluation_json, evaluation_plot, evaluation_table
+from lslam.reports import evaluation_json, evaluation_plot, evaluation_table, picture
 from lslam.types.trajectory import Trajectory
 
 STAGE = StageTime(0.01, 0.02, 0.03, 0.011, 1.0)
@@ -150,6 +150,6 @@ def test_pictures_that_cannot_be(result: Evaluation, tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="png, svg, pdf"):
         evaluation_plot.write_plot(tmp_path / "plot.bmp", [result])
     with pytest.raises(UsageError, match="did you mean 'png'"):
-        evaluation_plot.check_plot_path(tmp_path / "plot.pn")
+        picture.check_plot_path(tmp_path / "plot.pn")
     with pytest.raises(OutputError, match="cannot be written"):
         evaluation_plot.write_plot(tmp_path / "none" / "plot.png", [result])

@@ -22,9 +22,10 @@ from lslam.pipeline.watch import Watch
 from lslam.readers import open_sequence
 from lslam.simulation.record import record
 from lslam.simulation.scenarios import simulate
-from lslam.studies.compare import Plan, check_plan, compare
+from lslam.studies.compare import compare
 from lslam.studies.grid import Job
 from lslam.studies.jobs import finished, run_jobs
+from lslam.studies.plan import Plan, check_plan
 from lslam.studies.runner import StudyProgress, WorkerPool
 from lslam.studies.states import read_state
 from lslam.studies.subjects import Subject
