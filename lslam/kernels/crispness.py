@@ -7,6 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.kernels.extent import extent
 from lslam.kernels.jit import inline, kernel
 from lslam.kernels.linalg import eigen
 from lslam.kernels.voxel import pack
@@ -55,7 +56,8 @@ def shapes(
     points : (N, 3) sorted by `keys`, their cells of edge `radius` from `cell_keys`
     The plane variance is the residual sum of squares over n - 3, the unbiased estimate.
     """
-    out = np.full((len(queries), 2), np.nan)
+    out = np.empty((len(queries), 2))
+    out[:] = np.nan
     r2 = radius * radius
     matrix = np.empty((3, 3))
     for q in range(len(queries)):
@@ -97,5 +99,5 @@ def shapes(
         for k in range(3):
             logs += math.log(max(values[k] / (n - 1), _THIN))
         out[q, 0] = 0.5 * (3.0 * math.log(2.0 * math.pi * math.e) + logs)
-        out[q, 1] = max(values.min(), 0.0) / (n - 3)
+        out[q, 1] = max(extent(values)[0], 0.0) / (n - 3)
     return out

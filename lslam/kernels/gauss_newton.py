@@ -7,6 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.kernels.extent import extent
 from lslam.kernels.facts import INFORMATION, LEVER, MATCHED, POPULATION
 from lslam.kernels.jit import inline, inline_with_arrays, kernel
 from lslam.kernels.linalg import eigen, rotate_left
@@ -14,7 +15,7 @@ from lslam.kernels.linearisation import Pose, Sums
 from lslam.kernels.surface_information import solve_on_surfaces
 
 Floats = NDArray[np.float64]
-Limits = tuple[float, float, float, bool]
+Limits = tuple[float, float, float]
 
 # A direction flagged as degenerate is still stepped in until its information is below this part of the threshold: normals with
 # errors of a degree look like 3e-4 of the information.
@@ -41,7 +42,7 @@ def solve_observed(H: Floats, g: Floats, facts: Floats, weak_share: float, least
     d[:] = 0.0
     count = 0
     needed = max(weak_share * facts[INFORMATION], least)
-    none = ROUNDING * values.max()
+    none = ROUNDING * extent(values)[1]
     for k in range(6):
         if values[k] <= needed or values[k] <= none:
             for i in range(6):
@@ -118,28 +119,43 @@ def within(allowed: Floats, H: Floats) -> Floats:
     return A
 
 
+@inline
+def make_whole(sums: Sums) -> None:
+    """The sums of a linearisation, scaled by what it weighed, and H from its upper triangle."""
+    H, S, g, facts = sums
+    if facts[POPULATION] > 0.0:
+        scale_by_population(H, S, g, facts)
+    mirror(H)
+
+
 @kernel
 def step(pose: Pose, sums: Sums, scale: float, limits: Limits, allowed: Floats, d: Floats,
          weak: Floats) -> tuple[bool, int, float, float]:  # fmt: skip
     """Move the pose by one guarded step, left in d (6,): whether it could, how many directions are unobserved, which are
     rows of `weak` (6, 6), and the translation, m, and rotation, rad, of the step.
 
-    limits : `weak_share`, `least` and `unseen` of `solve_observed`, and whether S tells what is observed
+    limits : `weak_share`, `least` and `unseen` of `solve_observed`
     allowed : projector on the directions that may be stepped in; no rows: on all
-    H and S come with their upper triangles and leave whole.
+    H comes with its upper triangle and leaves whole.
     """
     R, t = pose
-    H, S, g, facts = sums
-    weak_share, least, unseen, by_surfaces = limits
-    if facts[POPULATION] > 0.0:
-        scale_by_population(H, S, g, facts)
-    mirror(H)
+    H, _, g, facts = sums
+    make_whole(sums)
     # What the projector takes away has no eigenvalue left, so that the step never looks along it in g.
-    if by_surfaces:
-        mirror(S)
-        count = solve_on_surfaces(within(allowed, H), within(allowed, S), g, facts, weak_share, least, d, weak)
-    else:
-        count = solve_observed(within(allowed, H), g, facts, weak_share, least, unseen, d, weak)
+    count = solve_observed(within(allowed, H), g, facts, limits[0], limits[1], limits[2], d, weak)
+    move, turn = step_norms(d)
+    return move_by(d, move, turn, scale, R, t), count, move, turn
+
+
+@kernel
+def step_on_surfaces(pose: Pose, sums: Sums, scale: float, limits: Limits, allowed: Floats, d: Floats,
+                     weak: Floats) -> tuple[bool, int, float, float]:  # fmt: skip
+    """As `step`, where S tells what is observed; a kernel of its own, which runs of other residuals need not compile."""
+    R, t = pose
+    H, S, g, facts = sums
+    make_whole(sums)
+    mirror(S)
+    count = solve_on_surfaces(within(allowed, H), within(allowed, S), g, facts, limits[0], limits[1], d, weak)
     move, turn = step_norms(d)
     return move_by(d, move, turn, scale, R, t), count, move, turn
 

@@ -23,8 +23,9 @@ def cell_of(x: float, y: float, inverse: float, half: int) -> int:
 @kernel
 def lowest(points: NDArray[np.float32], R: NDArray[np.float64], cell: float, half: int) -> NDArray[np.int64]:
     """Index of the lowest point of each cell, -1 where there is none: (4 half^2,)."""
-    found = np.full(4 * half * half, -1, np.int64)
-    height = np.full(4 * half * half, EMPTY)
+    found, height = np.empty(4 * half * half, np.int64), np.empty(4 * half * half)
+    found[:] = -1
+    height[:] = EMPTY
     inverse = 1.0 / cell
     for k in range(len(points)):
         px, py, pz = float(points[k, 0]), float(points[k, 1]), float(points[k, 2])
@@ -84,7 +85,8 @@ def envelope(height: NDArray[np.float64], rise: float, tolerance: float) -> NDAr
     longer than the straight line.
     """
     n = len(height)
-    top = np.full((n, n), EMPTY)
+    top = np.empty((n, n))
+    top[:] = EMPTY
     for i in range(n):
         for j in range(n):
             h = height[i, j]

@@ -55,7 +55,9 @@ def eigen(matrix: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.
     """
     n = len(matrix)
     a = matrix.copy()
-    v = np.eye(n)
+    v = np.zeros((n, n))
+    for i in range(n):
+        v[i, i] = 1.0
     for _ in range(30):
         off = 0.0
         total = 0.0

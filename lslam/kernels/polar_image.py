@@ -18,7 +18,8 @@ def polar_image(points: NDArray[np.float32], rings: int, sectors: int, reach: fl
 
     Sector 0 begins at +x and sectors count counter-clockwise (equations 2.34 and 2.35 of Girolimetto).
     """
-    image = np.full((rings, sectors), np.float32(EMPTY))
+    image = np.empty((rings, sectors), np.float32)
+    image[:] = EMPTY
     per_metre = rings / reach
     per_radian = sectors / (2.0 * math.pi)
     for i in range(len(points)):

@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.kernels.extent import extent
 from lslam.kernels.jit import inline, kernel
 
 OFFSET = 1 << 20
@@ -117,14 +118,16 @@ def centroids(
     the sensor has moved in between.
     """
     n = len(points)
-    table = np.full(table_size(n), -1, np.int32)
+    table = np.empty(table_size(n), np.int32)
+    table[:] = -1
     keys = np.empty(n, np.int64)
     first = np.empty(n, np.int32)
     sums = np.empty((n, 10))
     is_timed = len(times) == n
     half = np.float32(0.0)
     if is_timed and n > 0:
-        half = np.float32(0.5) * (times.min() + times.max())
+        early, late = extent(times)
+        half = np.float32(0.5) * (early + late)
     time_sums = np.zeros(n if is_timed else 0)
     inverse = 1.0 / size
     count = 0
@@ -192,14 +195,16 @@ def means(
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.int32]]:
     """As `centroids`, without the scatter: (M, 3) float32, mean time (M,), count (M,), to the same last bit."""
     n = len(points)
-    table = np.full(table_size(n), -1, np.int32)
+    table = np.empty(table_size(n), np.int32)
+    table[:] = -1
     keys = np.empty(n, np.int64)
     # The first point of each voxel, sums relative to it, and count.
     first, sums = np.empty((n, 3), np.float32), np.empty((n, 4))
     is_timed = len(times) == n
     half = np.float32(0.0)
     if is_timed and n > 0:
-        half = np.float32(0.5) * (times.min() + times.max())
+        early, late = extent(times)
+        half = np.float32(0.5) * (early + late)
     time_sums = np.zeros(n if is_timed else 0)
     inverse = 1.0 / size
     count = 0
@@ -253,7 +258,8 @@ def accompanied(
     Returns also how many points lie in the voxels that were looked at.
     """
     n = len(points)
-    table = np.full(table_size(n), -1, np.int32)
+    table = np.empty(table_size(n), np.int32)
+    table[:] = -1
     keys, sums = np.empty(n, np.int64), np.zeros(n, np.int32)
     slots, chosen = np.empty(n, np.int32), np.empty(n, np.int64)
     inverse = 1.0 / size
@@ -295,7 +301,8 @@ def accompanied(
 def first_points(points: NDArray[np.float32], size: float) -> NDArray[np.int64]:
     """Index of the first point in each voxel, increasing."""
     n = len(points)
-    table = np.full(table_size(n), -1, np.int32)
+    table = np.empty(table_size(n), np.int32)
+    table[:] = -1
     keys = np.empty(n, np.int64)
     first = np.empty(n, np.int64)
     inverse = 1.0 / size

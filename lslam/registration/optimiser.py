@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from lslam.geometry import se3
 from lslam.kernels import facts as at
-from lslam.kernels.gauss_newton import UNSEEN, step, trimmed
+from lslam.kernels.gauss_newton import UNSEEN, step, step_on_surfaces, trimmed
 from lslam.registration.robust import Annealing
 
 Floats = NDArray[np.float64]
@@ -145,7 +145,8 @@ def optimise(
     buffer = np.zeros(78 + at.COUNT)
     H, S, g, facts = buffer[:36].reshape(6, 6), buffer[36:72].reshape(6, 6), buffer[72:78], buffer[78:]
     sums, d, weak, count = (H, S, g, facts), np.zeros(6), np.zeros((6, 6)), 0
-    bounds = (float(limits.weak_share), float(limits.least), float(limits.unseen), limits.by_surfaces)
+    bounds = (float(limits.weak_share), float(limits.least), float(limits.unseen))
+    advance = step_on_surfaces if limits.by_surfaces else step
     scale, end = float(annealing.start), float(annealing.end)
     farthest2 = gate2 = float(inlier_distance) ** 2
     iterations, converged = 0, False
@@ -158,7 +159,7 @@ def optimise(
             term.linearise(term.points, term.target, term.settings, term.search, pose, width, sums)
         if facts[at.MATCHED] < LEAST_MATCHED:
             break
-        is_moved, count, move, turn = step(pose, sums, scale, bounds, limits.allowed, d, weak)
+        is_moved, count, move, turn = advance(pose, sums, scale, bounds, limits.allowed, d, weak)
         if not is_moved:
             break
         converged = scale <= end and move < STEP_M and turn < STEP_RAD

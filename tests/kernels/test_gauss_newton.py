@@ -93,11 +93,10 @@ def step(
         population,
     )
     sums = np.triu(H), np.triu(H if S is None else S), g.copy(), facts
-    limits = 1e-9, 0.0, UNSEEN, S is not None
+    limits = 1e-9, 0.0, UNSEEN
     none = np.zeros((0, 6))
-    moved, count, move, turn = gauss_newton.step(
-        pose, sums, scale, limits, none if allowed is None else allowed, d, weak
-    )
+    kernel = gauss_newton.step if S is None else gauss_newton.step_on_surfaces
+    moved, count, move, turn = kernel(pose, sums, scale, limits, none if allowed is None else allowed, d, weak)
     if np.linalg.norm(d[:3]) < 2 * scale:
         np.testing.assert_allclose([move, turn], [np.linalg.norm(d[:3]), np.linalg.norm(d[3:])])
     return *pose, moved, weak[:count], sums
