@@ -225,7 +225,7 @@ def insert(points: NDArray[np.float32], R: Floats, t: Floats, size: float, cap: 
             s[11] += t[1] - views[k, 1] + dy
             s[12] += t[2] - views[k, 2] + dz
     for j in range(count):
-        slot = np.int64(touched[j])  # of one type wherever `_refresh` is called: it is compiled once
+        slot = int(np.int64(touched[j]))  # of one type wherever `_refresh` is called: it is compiled once
         s = moments[slot]
         if s[0] >= 1.1 * refreshed[slot]:
             if s[0] > cap:
