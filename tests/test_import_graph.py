@@ -26,7 +26,7 @@ LAYERS = [
     ["types"],
     ["geometry"],
     ["kernels", "config"],
-    ["foreign", "locks", "plugins", "printable", "remote", "stopping", "untrusted"],
+    ["foreign", "locks", "machine", "plugins", "printable", "remote", "stopping", "untrusted"],
     ["errors", "version"],
 ]
 LEVEL = {name: level for level, names in enumerate(LAYERS) for name in names}

@@ -48,7 +48,7 @@ if TYPE_CHECKING:
 @click.option("--resume", is_flag=True, help="Go on with a run that was killed or interrupted; needs its --out.")
 @click.option("--overwrite", is_flag=True, help="Replace an earlier run in the folder.")
 @options.scan_range
-@click.option("--threads", type=int, metavar="N", help="1: one thread; 2 and more: the next scan is read meanwhile.")
+@click.option("--threads", type=int, metavar="N", help="0: as many as there are cores; 1: one. Results stay the same.")
 @click.option("--rings", metavar="RULE", help="How rings are found: auto, field, order, rows[:N], elevation[:N].")
 @click.option("--save-feature-map", is_flag=True, help="Write feature_map.ply; for the LOAM family.")
 @click.option("--clean", is_flag=True, help="Take what moves out of the map.")

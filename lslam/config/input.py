@@ -8,6 +8,7 @@ from typing import Literal
 from pydantic import Field, field_validator
 
 from lslam.config.section import Section
+from lslam.machine import available_cores
 
 RINGS = re.compile(r"(auto|field|order)|(rows|elevation)(?::([1-9]\d{0,2}))?")
 
@@ -36,6 +37,8 @@ class ScanRange(Section):
 
 
 AS_CONFIGURED = ScanRange()
+# More have nothing to do: scans are read one after the other.
+MOST_WORKERS = 8
 
 
 class InputConfig(Section):
@@ -44,7 +47,9 @@ class InputConfig(Section):
     start: int = Field(0, ge=0, description="first scan used")
     count: int | None = Field(None, ge=1, description="number of scans used; all when absent")
     skip_frames: int = Field(1, ge=1, description="use every n-th scan")
-    threads: int = Field(2, ge=1, description="1: everything in turn; 2 and more: the next scan is read meanwhile")
+    threads: int = Field(
+        0, ge=0, description="0: as many as there are cores; 1: everything in turn; results do not depend on it"
+    )
     strict: bool = Field(False, description="every degradation is a failed gate: exit 4")
     vertical_correction_deg: float | None = Field(
         None, description="rotation of KITTI HDL-64E points about p x z; absent: the reader knows"
@@ -57,6 +62,11 @@ class InputConfig(Section):
     rings: str = Field(
         "auto", description="how rings are found: auto, field, order (of the file), rows[:N] or elevation[:N]"
     )
+
+    @property
+    def workers(self) -> int:
+        """Threads of `threads`, 1 or more."""
+        return self.threads or min(available_cores(), MOST_WORKERS)
 
     @field_validator("rings")
     @classmethod

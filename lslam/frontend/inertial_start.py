@@ -139,7 +139,7 @@ def first_poses(sequence: Sequence, config: Config, motion: InertialMotion | Non
     instants: list[int] = []
     middles: list[NDArray[np.float64]] = []
     covariances: list[NDArray[np.float64]] = []
-    for loaded in read_ahead(few, odometry.prepare, config.input.threads):
+    for loaded in read_ahead(few, odometry.prepare, config.input.workers):
         result = tracker.track(loaded)
         if result.status == "skipped":
             continue

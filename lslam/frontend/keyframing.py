@@ -38,7 +38,7 @@ class Keyframing:
         self.store = store
         self._config = config
         self._selector = KeyframeSelector(config.keyframes)
-        self._pool = ThreadPoolExecutor(1, "lslam-keyframe") if config.input.threads > 1 else None
+        self._pool = ThreadPoolExecutor(1, "lslam-keyframe") if config.input.workers > 1 else None
         self._pending: list[Future[None]] = []
         self._unknown: list[_Due] = []
 

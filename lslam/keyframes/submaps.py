@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from lslam.geometry import se3
 from lslam.kernels import voxel as voxels
+from lslam.kernels.transform import transform
 from lslam.keyframes.store import KeyframeStore
 from lslam.preprocessing.prepare import NO_TIMES
 
@@ -30,9 +31,10 @@ def submap(
     voxel : m, one averaged point per voxel is left; None leaves all
     """
     frame = poses[number] if T_world_frame is None else T_world_frame
-    clouds = [
-        se3.apply(se3.relative(frame, poses[k]), store.points(k).astype(np.float64)).astype(np.float32)
-        for k in neighbours(len(store), number, size)
-    ]
-    points = np.concatenate(clouds)
+    clouds = {k: store.points(k) for k in neighbours(len(store), number, size)}
+    points = np.empty((sum(map(len, clouds.values())), 3), np.float32)
+    first = 0
+    for k, cloud in clouds.items():
+        transform(cloud, se3.relative(frame, poses[k]), points[first : first + len(cloud)])
+        first += len(cloud)
     return points if voxel is None else voxels.means(points, NO_TIMES, voxel)[0]

@@ -8,6 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft, ndimage
 
+from lslam.kernels import bev
+
 Floats = NDArray[np.float64]
 Image = NDArray[np.float32]
 Spectrum = NDArray[np.complex64]
@@ -16,6 +18,7 @@ Spectrum = NDArray[np.complex64]
 CELL = 1.0
 # Voxels per cell that count, at most: taller structure is no more distinctive.
 TALLEST = 6.0
+UNTURNED: Floats = np.eye(2)
 
 
 @dataclass(frozen=True)
@@ -30,19 +33,18 @@ class BevGrid:
         inside = np.asarray(((cells >= 0) & (cells < self.size)).all(axis=1))
         return np.where(inside, cells[:, 0] * self.size + cells[:, 1], 0), inside
 
-    def heights(self, points: Floats) -> Image:
-        """(size, size) occupied voxels per cell, up to `TALLEST`; points are means of voxels."""
-        cells, inside = self.cells_of(points)
-        counts = np.bincount(cells[inside], minlength=self.size**2)
-        return np.minimum(counts, TALLEST).astype(np.float32).reshape(self.size, self.size)
+    def heights(self, points: Floats, R: Floats = UNTURNED) -> Image:
+        """(size, size) occupied voxels per cell, up to `TALLEST`; points are means of voxels, turned by R (2, 2) first."""
+        counts = np.zeros((self.size, self.size), np.float32)
+        bev.count(points, R, CELL, TALLEST, counts)
+        return counts
 
-    def cover(self, *clouds: Floats) -> Image:
-        """(size, size) visibility: 1 in cells that hold a point and in their neighbours, else 0."""
-        seen = np.zeros(self.size**2, np.float32)
+    def cover(self, *clouds: Floats, R: Floats = UNTURNED) -> Image:
+        """(size, size) visibility: 1 in cells that hold a point, turned by R (2, 2), and in their neighbours, else 0."""
+        seen = np.zeros((self.size, self.size), np.float32)
         for points in clouds:
-            cells, inside = self.cells_of(points)
-            seen[cells[inside]] = 1
-        return (blurred(seen.reshape(self.size, self.size)) > 1e-3).astype(np.float32)
+            bev.mark(points, R, CELL, seen)
+        return seen
 
     def lowest(self, points: Floats) -> Floats:
         """(size * size,) least z per cell, m, inf where there is none."""

@@ -30,11 +30,8 @@ class PlaceDescriptor(Protocol):
 
     yaw_error: float
 
-    def __contains__(self, number: int) -> bool:
-        """Whether the keyframe was added."""
-
     def add(self, number: int, points: NDArray[np.float32]) -> None:
-        """Describe the cloud (N, 3), m, round keyframe `number`, level with z up."""
+        """Describe the cloud (N, 3), m, round keyframe `number`, level with z up; keyframes come once, in any order."""
 
     def nearest(self, number: int, others: NDArray[np.int64], turn: float = np.pi) -> list[PlaceMatch]:
         """Those of the keyframes `others` that look most like keyframe `number`, the best first; all must be known.

@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import logging
-from collections import OrderedDict
-from collections.abc import Callable, Sequence
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextvars import copy_context
+from copy import copy
+from itertools import islice
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +17,7 @@ from lslam.config.loops import LoopsConfig
 from lslam.config.registration import RegistrationConfig
 from lslam.errors import InterruptedRunError
 from lslam.geometry import se3, so3
+from lslam.kernels.transform import transform
 from lslam.keyframes.store import KeyframeStore
 from lslam.keyframes.submaps import submap
 from lslam.loops import create_descriptor
@@ -21,11 +26,12 @@ from lslam.loops.descriptor import PlaceMatch
 from lslam.loops.gating import OdometryUncertainty, RelativeUncertainty
 from lslam.loops.level import find_up, levelled
 from lslam.loops.level_submap import LevelSubmap, make_level_submap
+from lslam.loops.shared_results import SharedResults
 from lslam.loops.throttling import LoopThrottle
 from lslam.loops.verify import Verification, Verifier
 from lslam.types.constraint import Constraint, LoopCandidate, LoopStage, Verdict
 from lslam.types.keyframe import Keyframe
-from lslam.types.stage_clock import KeyframeClocks
+from lslam.types.stage_clock import KeyframeClocks, StageClock
 
 log = logging.getLogger("lslam")
 
@@ -41,8 +47,8 @@ TURN_STEP, WIDEST_TURN = np.deg2rad(2.0), np.deg2rad(20.0)
 # Factor on the best descriptor distance within which others are candidates too, and how many; different places of a town
 # differ by twice as much.
 RIVAL, RIVALS = 1.5, 3
-# Level submaps cached, and how many serve to estimate the vertical.
-KEPT, LOOKS = 16, 8
+# Level submaps and clouds cached, and how many serve to estimate the vertical.
+KEPT, CLOUDS, LOOKS = 4, 4, 8
 
 
 def find_loops(
@@ -52,12 +58,14 @@ def find_loops(
     submap_size: int = 5,
     clocks: KeyframeClocks | None = None,
     should_stop: Callable[[], bool] = lambda: False,
+    threads: int = 1,
 ) -> list[LoopCandidate]:
     """Loop candidates of a run in the order of the newer keyframe, with verdicts.
 
     store : the run's keyframes with odometry's poses, their covariances and the distance travelled
     submap_size : keyframes whose clouds make one submap (`keyframes.submap_size`)
     clocks : take the time of each keyframe, stage `loops`
+    threads : so many keyframes are verified at once; the candidates do not depend on it
 
     An accepted candidate carries its constraint, T_a_b between LiDAR frames. Raises InterruptedRunError when `should_stop`
     said so between two keyframes.
@@ -66,7 +74,7 @@ def find_loops(
     detector = Detector(
         store.keyframes, lambda number: submap(store, poses, number, submap_size), config, registration
     )  # fmt: skip
-    candidates = detector.find(clocks, should_stop)
+    candidates = detector.find(clocks, should_stop, threads)
     accepted = sum(c.is_accepted for c in candidates)
     tried = sum(c.stage != LoopStage.THINNED for c in candidates)
     log.info("loop closures: %d of %d candidates accepted, %d keyframes", accepted, tried, len(store))
@@ -77,6 +85,7 @@ def warm_up(config: LoopsConfig) -> None:
     """Compile or load every kernel that loop closure detection needs, with a small room."""
     room = np.random.default_rng(0).uniform(-8, 8, (3000, 3)).astype(np.float32)
     room[np.arange(3000), np.arange(3000) % 3] = 8.0
+    transform(room, np.eye(4), np.empty_like(room))
     create_descriptor(config).add(0, room)
     submap_of_room = make_level_submap(room, RegistrationConfig())
     Verifier(LoopsConfig(), RegistrationConfig()).verify(
@@ -102,50 +111,77 @@ class Detector:
         self.uncertainty = OdometryUncertainty(keyframes, config.drift_percent, config.drift_deg)
         self.index = create_descriptor(config)
         self.verifier = Verifier(config, registration)
-        self._submaps: OrderedDict[int, LevelSubmap] = OrderedDict()
+        self._index_lock = threading.Lock()
+        self._described = SharedResults(self._describe)
+        self._clouds = SharedResults(self._make_level, CLOUDS)
+        self._submaps = SharedResults(self._make_submap, KEPT)
         # Submaps overlap: the first keyframe of every few metres represents those after it.
         steps = np.floor(self.uncertainty.distances / (NEAR / 2))
         self._is_described = np.diff(steps, prepend=-1.0) > 0
 
     def find(
-        self, clocks: KeyframeClocks | None = None, should_stop: Callable[[], bool] = lambda: False
+        self, clocks: KeyframeClocks | None = None, should_stop: Callable[[], bool] = lambda: False, threads: int = 1
     ) -> list[LoopCandidate]:
-        """All candidates in the order of the newer keyframe, with verdicts; raises as `find_loops`."""
+        """All candidates in the order of the newer keyframe, with verdicts; arguments and errors of `find_loops`."""
         clocks = KeyframeClocks() if clocks is None else clocks
         candidates: list[LoopCandidate] = []
         throttle = LoopThrottle(self.config.spacing)
         gated = [self._gated(b) for b in range(len(self.keyframes))]
         if any(len(older) for older in gated):
             self._level_world()
-        for b, (keyframe, older) in enumerate(zip(self.keyframes, gated, strict=True)):
-            if should_stop():
-                raise InterruptedRunError(f"interrupted during loop closure detection, at keyframe {b} of {len(gated)}")
-            if len(older) == 0:
-                throttle.reset()
-                continue
-            if not throttle.is_due(keyframe.distance):
-                candidates.append(self._thinned(older, b, throttle.wait))
-                continue
-            with clocks[b].stage("loops"):
-                examined = self._examined(b, older)
-            candidates += examined
-            throttle.observe(
-                keyframe.distance, Verdict.ACCEPTED if any(c.is_accepted for c in examined) else Verdict.REJECTED
-            )
+        ahead: dict[int, Future[list[LoopCandidate]]] = {}
+        with ThreadPoolExecutor(threads, "lslam-loops") as pool:
+            try:
+                for b, (keyframe, older) in enumerate(zip(self.keyframes, gated, strict=True)):
+                    if should_stop():
+                        raise InterruptedRunError(
+                            f"interrupted during loop closure detection, at keyframe {b} of {len(gated)}"
+                        )
+                    if len(older) == 0:
+                        throttle.reset()
+                        continue
+                    if not throttle.is_due(keyframe.distance):
+                        candidates.append(self._thinned(older, b, throttle.wait))
+                        continue
+                    for n in (b, *islice(self._due_after(b, gated, throttle), threads - 1)):
+                        if n not in ahead:
+                            clock = clocks[n]
+                            ahead[n] = pool.submit(copy_context().run, self._examined, n, gated[n], clock)
+                    examined = ahead.pop(b).result()
+                    candidates += examined
+                    throttle.observe(
+                        keyframe.distance,
+                        Verdict.ACCEPTED if any(c.is_accepted for c in examined) else Verdict.REJECTED,
+                    )
+            finally:
+                pool.shutdown(cancel_futures=True)
         return candidates
 
-    def _examined(self, b: int, older: NDArray[np.int64]) -> list[LoopCandidate]:
+    def _due_after(self, b: int, gated: list[NDArray[np.int64]], throttle: LoopThrottle) -> Iterator[int]:
+        """The keyframes after `b` that are due next if all verdicts are as the last one."""
+        throttle = copy(throttle)
+        throttle.observe(self.keyframes[b].distance, throttle.last or Verdict.ACCEPTED)
+        for n in range(b + 1, len(gated)):
+            if len(gated[n]) == 0:
+                throttle.reset()
+            elif throttle.is_due(self.keyframes[n].distance):
+                yield n
+                throttle.observe(self.keyframes[n].distance, throttle.last or Verdict.ACCEPTED)
+
+    def _examined(self, b: int, older: NDArray[np.int64], clock: StageClock) -> list[LoopCandidate]:
         """Keyframe `b` verified against the similar ones of the `older`, with verdicts."""
-        alike, fallback = self._choose(b, older)
-        examined = resolve_ambiguity([self._examine(match, b) for match in alike], self.keyframes, self._reach_between)
-        if fallback is not None and not any(c.is_accepted or c.stage == LoopStage.AMBIGUITY for c in examined):
-            examined.append(self._examine(fallback, b))
-        return examined
+        with clock.stage("loops"):
+            alike, fallback = self._choose(b, older)
+            verified = [self._examine(match, b) for match in alike]
+            examined = resolve_ambiguity(verified, self.keyframes, self._reach_between)
+            if not any(c.is_accepted or c.stage == LoopStage.AMBIGUITY for c in examined):
+                examined += [self._examine(match, b) for match in fallback()]
+            return examined
 
     def _level_world(self) -> None:
         """Rotate the world so that z is up, as BEV correlation needs. Relative poses stay."""
         shown = np.unique(np.linspace(0, len(self.keyframes) - 1, LOOKS).round().astype(int))
-        up = find_up([make_level_submap(self._level(int(number)), self.registration).fine for number in shown])
+        up = find_up([make_level_submap(self._make_level(int(number)), self.registration).fine for number in shown])
         self.keyframes = levelled(self.keyframes, up)
         self.uncertainty = OdometryUncertainty(self.keyframes, self.config.drift_percent, self.config.drift_deg)
 
@@ -159,9 +195,12 @@ class Detector:
         if self.config.radius is not None:
             return np.asarray(older[away <= self.config.radius])
         limit = NEAR + self.config.sigmas * self.uncertainty.between(b, older[:1]).reach[0]
-        older, away = older[away <= limit], away[away <= limit]
-        reach = self.uncertainty.between(b, older).reach
-        return np.asarray(older[away <= NEAR + self.config.sigmas * reach])
+        is_inside = away <= NEAR
+        # The reach is never negative: those nearby are inside whatever it is.
+        asked = np.flatnonzero(~is_inside & (away <= limit))
+        reach = self.uncertainty.between(b, older[asked]).reach
+        is_inside[asked] = away[asked] <= NEAR + self.config.sigmas * reach
+        return np.asarray(older[is_inside])
 
     def _thinned(self, older: NDArray[np.int64], b: int, wait: float) -> LoopCandidate:
         a = self._nearest(older, b)
@@ -175,30 +214,42 @@ class Detector:
     def _away(self, a: int, b: int) -> float:
         return float(np.linalg.norm(self.uncertainty.positions[b] - self.uncertainty.positions[a]))
 
-    def _choose(self, b: int, older: NDArray[np.int64]) -> tuple[list[PlaceMatch], PlaceMatch | None]:
-        """The candidates to verify, and a fallback.
+    def _choose(self, b: int, older: NDArray[np.int64]) -> tuple[list[PlaceMatch], Callable[[], list[PlaceMatch]]]:
+        """The candidates to verify, and what gives a fallback, if there is one.
 
         Where odometry is nearly certain, its nearest is the candidate and the most similar the fallback. Elsewhere it is the
         other way round, and all that are nearly as similar are verified, since an ambiguous one must be rejected.
         """
         near = self._nearest(older, b)
         reach = self._reach_between(near, b)
-        is_certain = reach < NEAR
-        if is_certain:
+        nearest = np.array([near])
+        if reach < NEAR:
             away = np.linalg.norm(self.uncertainty.positions[older] - self.uncertainty.positions[b], axis=1)
-            older = older[away <= away.min() + reach]
-        older = older[self._is_described[older] | (older == near)]
-        for number in (b, *older):
-            if int(number) not in self.index:
-                self.index.add(int(number), self._level(int(number)))
-        turn = self._turn(self.uncertainty.between(b, older[:1]))
-        matches = self.index.nearest(b, older, turn)
-        by_odometry = next((m for m in matches if m.number == near), PlaceMatch(near, float("nan"), 0.0))
+            about = older[away <= away.min() + reach]
+            chosen = self._matches(b, nearest)
+            return chosen, lambda: self._elsewhere(self._alike(b, about)[:1], chosen)
+        alike = self._alike(b, older)
+        if not alike:
+            return self._matches(b, nearest), list
+        return alike, lambda: self._elsewhere(self._matches(b, nearest), alike)
+
+    def _elsewhere(self, matches: list[PlaceMatch], chosen: list[PlaceMatch]) -> list[PlaceMatch]:
+        """Those of the matches that are not at the place of a chosen one."""
+        return [m for m in matches if all(self._away(m.number, c.number) > NEAR / 2 for c in chosen)]
+
+    def _alike(self, b: int, older: NDArray[np.int64]) -> list[PlaceMatch]:
+        """Those of the `older` that look like keyframe `b`: the most similar and its rivals."""
+        near = self._nearest(older, b)
+        matches = self._matches(b, older[self._is_described[older] | (older == near)])
         limit = min(self.config.max_descriptor_distance, RIVAL * matches[0].distance)
-        alike = self._apart([m for m in matches if m.distance <= limit])
-        chosen, others = ([by_odometry], alike[:1]) if is_certain or not alike else (alike, [by_odometry])
-        far = [m for m in others if all(self._away(m.number, c.number) > NEAR / 2 for c in chosen)]
-        return chosen, far[0] if far else None
+        return self._apart([m for m in matches if m.distance <= limit])
+
+    def _matches(self, b: int, older: NDArray[np.int64]) -> list[PlaceMatch]:
+        """The `older` by their similarity to keyframe `b`, the best first."""
+        for number in (b, *older):
+            self._described.get(int(number))
+        with self._index_lock:
+            return self.index.nearest(b, older, self._turn(self.uncertainty.between(b, older[:1])))
 
     def _apart(self, matches: list[PlaceMatch]) -> list[PlaceMatch]:
         """The first few matches, none near another."""
@@ -214,7 +265,9 @@ class Detector:
         uncertainty = self.uncertainty.between(b, np.array([a]))
         expected = self.uncertainty.positions[b] - self.uncertainty.positions[a]
         yaws = self._yaws(match, self._turn(uncertainty))
-        found = self.verifier.verify(self._submap(a), self._submap(b), expected, self._reach(uncertainty), yaws)
+        found = self.verifier.verify(
+            self._submaps.get(a), self._submaps.get(b), expected, self._reach(uncertainty), yaws
+        )
         stage, reason = found.stage, found.reason
         if not reason:
             reason = self._beyond(found, expected, uncertainty)
@@ -269,16 +322,17 @@ class Detector:
         turn = np.kron(np.eye(2), R_a.T)
         return Constraint(a, b, T, turn @ found.covariance @ turn.T)
 
-    def _submap(self, number: int) -> LevelSubmap:
-        """The level submap about a keyframe, from a cache of the last few."""
-        if number not in self._submaps:
-            self._submaps[number] = make_level_submap(self._level(number), self.registration)
-            if len(self._submaps) > KEPT:
-                self._submaps.popitem(last=False)
-        self._submaps.move_to_end(number)
-        return self._submaps[number]
+    def _make_submap(self, number: int) -> LevelSubmap:
+        return make_level_submap(self._clouds.get(number), self.registration)
 
-    def _level(self, number: int) -> Points:
+    def _make_level(self, number: int) -> Points:
         """The submap about a keyframe in the axes of the world."""
-        R = self.keyframes[number].T_world_lidar[:3, :3]
-        return np.ascontiguousarray(self.cloud(number) @ R.T.astype(np.float32))
+        points = self.cloud(number)
+        level = np.empty_like(points)
+        transform(points, se3.make(self.keyframes[number].T_world_lidar[:3, :3], np.zeros(3)), level)
+        return level
+
+    def _describe(self, number: int) -> None:
+        points = self._clouds.get(number)
+        with self._index_lock:
+            self.index.add(number, points)

@@ -74,9 +74,6 @@ class PlaceIndex:
     def __len__(self) -> int:
         return len(self._rows)
 
-    def __contains__(self, number: int) -> bool:
-        return number in self._rows
-
     def add(self, number: int, points: NDArray[np.float32]) -> None:
         """Describe the cloud (N, 3), m, round keyframe `number`, level with z up."""
         row = self._rows.setdefault(number, len(self._rows))

@@ -48,10 +48,10 @@ def find_initial_guesses(
     near, floor = (p[(p[:, :2] ** 2).sum(axis=1) < max(window, NARROWEST) ** 2] for p in (b.non_ground, b.ground))
     best, turn = np.zeros_like(image), np.zeros_like(image)
     for yaw in yaws:
-        R = so3.exp(np.array([0.0, 0.0, yaw]))
-        turned = grid.heights(near @ R.T)
+        R = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
+        turned = grid.heights(near, R)
         own = correlate(A_seen, spectrum(turned**2), grid.size)
-        other = correlate(A2, spectrum(grid.cover(near @ R.T, floor @ R.T)), grid.size)
+        other = correlate(A2, spectrum(grid.cover(near, floor, R=R)), grid.size)
         score = correlate(A, spectrum(turned), grid.size) / np.sqrt(np.maximum(own * other, 1.0))
         score[own < SHARED * max(float((turned**2).sum()), 1.0)] = 0.0
         better = score > best

@@ -22,7 +22,7 @@ class LoopThrottle:
     def reset(self) -> None:
         """Attempt at the next candidate: there were none."""
         self._tried_at, self._row = -np.inf, 0
-        self._last: Verdict | None = None
+        self.last: Verdict | None = None
 
     @property
     def wait(self) -> float:
@@ -35,5 +35,5 @@ class LoopThrottle:
 
     def observe(self, distance: float, verdict: Verdict) -> None:
         """Take the verdict of an attempt at `distance` m."""
-        self._row = self._row + 1 if verdict == self._last else 1
-        self._tried_at, self._last = distance, verdict
+        self._row = self._row + 1 if verdict == self.last else 1
+        self._tried_at, self.last = distance, verdict

@@ -101,7 +101,9 @@ def _loops(
         candidates: list[LoopCandidate] = known["candidates"]
         return candidates
     submap_size = config.keyframes.submap_size
-    candidates = find_loops(store, config.loops, config.registration, submap_size, clocks, should_stop)
+    candidates = find_loops(
+        store, config.loops, config.registration, submap_size, clocks, should_stop, config.input.workers
+    )
     if checkpoints is not None:
         checkpoints.write(len(poses), lambda: {"poses": poses, "candidates": Records(candidates)})
     return candidates

@@ -92,7 +92,7 @@ def build_feature_map(
     maker, first = (make(), 0) if checkpoints is None else checkpoints.begin(make, poses)
     for _ in range(first):
         on_step()
-    ahead = read_ahead(sequence, odometry.prepare, config.input.threads, first=first)
+    ahead = read_ahead(sequence, odometry.prepare, config.input.workers, first=first)
     for k, (loaded, result) in enumerate(zip(ahead, results[first:], strict=False), first):
         is_last = should_stop()
         if checkpoints is not None:

@@ -71,7 +71,7 @@ def estimate_poses(
     motion = odometry.motion if isinstance(odometry, GivenPoses) else inertial.motion
     with manifest.timed("odometry_s"), Keyframing(store, config) as keyframing:
         results = estimate(
-            sequence, odometry, threads=config.input.threads, max_failures=limit, stationary=stationary,
+            sequence, odometry, threads=config.input.workers, max_failures=limit, stationary=stationary,
             motion=motion, should_stop=watch.should_stop, on_scan=seen, keyframing=keyframing,
             checkpoints=checkpoints, monitor=monitor,
         )  # fmt: skip

@@ -122,7 +122,7 @@ def test_repetition_threads_and_the_written_config_give_the_same_bytes(
     first: tuple[Done, Path], tmp_path: Path
 ) -> None:
     _, out = first
-    assert tomllib.loads((out / "config.toml").read_text())["input"]["threads"] == 2
+    assert tomllib.loads((out / "config.toml").read_text())["input"]["threads"] == 0
     for number, words in enumerate((("--threads", 1), ("--config", out / "config.toml"))):
         again = tmp_path / str(number)
         assert lslam("run", SAMPLE, "--out", again, *words).returncode == 0

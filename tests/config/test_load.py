@@ -61,7 +61,7 @@ def test_variables_of_others_are_left_alone() -> None:
         ("preprocess.ego_box=[1,0,0,1,0,1]", "x_min, x_max, y_min, y_max, z_min, z_max"),
         ("preprocess.downsample=grd", "did you mean 'grid'"),
         ("registration.kernel_min=2", "kernel_min = 2.0 must be less than kernel_max = 1.0"),
-        ("input.threads=0", "input.threads = 0"),
+        ("input.threads=-1", "input.threads = -1"),
         ("input.count=0", "input.count = 0"),
         ("input.start=-1", "input.start = -1"),
         ("input.strict=maybe", "input.strict = 'maybe'"),

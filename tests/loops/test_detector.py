@@ -17,6 +17,7 @@ from lslam.config.registration import RegistrationConfig
 from lslam.geometry import se3, so3
 from lslam.kernels import gauss_newton, gaussians, polar_image, residuals
 from lslam.keyframes.store import KeyframeStore
+from lslam.loops.descriptor import PlaceMatch
 from lslam.loops.detector import Detector, find_loops, warm_up
 from lslam.types.constraint import LoopCandidate
 
@@ -206,3 +207,30 @@ def test_compares_places_in_a_level_world() -> None:
     assert accepted(detector.find())
     for keyframe, expected in zip(detector.keyframes, level, strict=True):
         assert np.rad2deg(np.arccos(keyframe.T_world_lidar[2, :3] @ expected[2, :3])) < 1.5
+
+
+def test_threads_change_no_candidate(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Verdicts change on the way, so keyframes are verified ahead that are never due."""
+    true = np.array([round_the_square(d) for d in np.arange(0, 560, 5.0)])
+    world, odometry = town(), drifted(true)
+
+    def cloud(number: int) -> Points:
+        # From time to time there is nothing to see.
+        return seen(world, true[number], np.random.default_rng(number))[:: 1 if number % 5 else 400]
+
+    def found(threads: int) -> tuple[list[str], int]:
+        detector = Detector(keyframes_of(odometry), cloud, LoopsConfig(), RegistrationConfig())
+        verified: list[int] = []
+        examine = detector._examine
+
+        def note(match: PlaceMatch, b: int) -> LoopCandidate:
+            verified.append(b)
+            return examine(match, b)
+
+        monkeypatch.setattr(detector, "_examine", note)
+        return [repr(candidate) for candidate in detector.find(threads=threads)], len(set(verified))
+
+    (alone, least), (together, more) = found(1), found(4)
+    assert alone == together
+    assert len({repr(c).partition("stage=")[2][:30] for c in alone}) > 2, "verdicts of several kinds are needed"
+    assert more > least

@@ -17,9 +17,11 @@ from lslam.geometry import se3, so3
 from lslam.loops.detector import LEAST_REACH, TURN_STEP, WIDEST_TURN, Detector
 from lslam.loops.gating import RelativeUncertainty
 from lslam.loops.scan_context import PlaceMatch
+from lslam.loops.shared_results import SharedResults
 from lslam.loops.verify import Verification, Verifier, _is_elsewhere
 from lslam.registration.solver import RegistrationResult
 from lslam.types.constraint import LoopCandidate, LoopStage, Verdict
+from lslam.types.stage_clock import StageClock
 
 Floats = NDArray[np.float64]
 # Sigmas of odometry: 2 m along x, 0.5 m across, and three degrees.
@@ -109,8 +111,8 @@ def chosen(distances: list[float], where: list[float], **settings: float) -> tup
     chooser = Detector(keyframes, lambda _: np.zeros((0, 3), np.float32), LoopsConfig(**settings), RegistrationConfig())  # type: ignore[arg-type]
 
     class Looks:
-        def __contains__(self, number: int) -> bool:
-            return True
+        def add(self, number: int, points: NDArray[np.float32]) -> None:
+            pass
 
         def nearest(self, number: int, others: NDArray[np.int64], turn: float) -> list[PlaceMatch]:
             return [
@@ -120,7 +122,7 @@ def chosen(distances: list[float], where: list[float], **settings: float) -> tup
 
     chooser.index = Looks()  # type: ignore[assignment]
     matches, fallback = chooser._choose(count + 1, np.arange(count))
-    return [match.number for match in matches], None if fallback is None else fallback.number
+    return [match.number for match in matches], next((match.number for match in fallback()), None)
 
 
 def alike(distances: list[float], apart: float = 20.0, **settings: float) -> list[int]:
@@ -153,7 +155,7 @@ def test_one_keyframe_stands_for_four_metres_of_the_way() -> None:
 def test_what_fits_and_is_too_far_from_odometry_is_refused_by_the_gate(shift: float, stage: str) -> None:
     gate = detector()
     gate.uncertainty.between = lambda b, older: UNCERTAINTY  # type: ignore[method-assign]
-    gate._submap = lambda number: None  # type: ignore[assignment, method-assign, return-value]
+    gate._submaps = SharedResults(lambda number: None)  # type: ignore[assignment, arg-type, return-value]
 
     class Finds:
         def verify(self, a: object, b: object, expected: Floats, reach: float, yaws: Floats) -> Verification:
@@ -179,9 +181,9 @@ def test_odometrys_nearest_is_asked_when_nothing_fits_and_nothing_fits_twice(
 ) -> None:
     """Where a place fits twice, no other can be told from it either."""
     gate = detector()
-    gate._choose = lambda b, older: ([PlaceMatch(0, 0.1, 0.0)], PlaceMatch(1, 0.2, 0.0))  # type: ignore[method-assign]
+    gate._choose = lambda b, older: ([PlaceMatch(0, 0.1, 0.0)], lambda: [PlaceMatch(1, 0.2, 0.0)])  # type: ignore[method-assign]
     gate._examine = lambda match, b: LoopCandidate(match.number, b, 0.0, match.distance, verdict, stage)  # type: ignore[method-assign]
-    examined = gate._examined(2, np.arange(2))
+    examined = gate._examined(2, np.arange(2), StageClock())
     assert [(c.a, c.verdict, c.stage) for c in examined] == [(a, verdict, stage) for a in range(1 + is_asked)]
 
 
