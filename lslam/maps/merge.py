@@ -18,8 +18,7 @@ from lslam.types.state import State
 
 log = logging.getLogger("lslam")
 
-_START_ROWS = 1 << 17
-_MOST_ROWS = 4_000_000  # some 250 MB with the slots; what is more goes to disk
+_MOST_ROWS = 1 << 20  # some 60 MB with the slots, and as much when they are sorted; what is more goes to disk
 _NO_INTENSITY = np.zeros(0, np.float32)
 _EVERYWHERE = np.array([-np.inf, np.inf] * 3)
 
@@ -127,13 +126,12 @@ class MapMerger:
         self._voxel, self._range_min = float(voxel), float(range_min)
         self._range_max = min(float(range_max), 1e150)  # squared it must stay finite, or Inf would pass the gate
         self._origin: NDArray[np.int64] | None = None
-        self._rows = np.empty((_START_ROWS, 5), np.int64)
-        self._slots = np.full(2 * _START_ROWS, -1, np.int32)
+        self._most, self._used = most, 0
+        self._start(columns=5)
         self._crop = _EVERYWHERE if crop is None else np.asarray(crop, np.float64).reshape(6)
-        self._spool, self._keep, self._most = spool, keep, most
+        self._spool, self._keep = spool, keep
         self._runs: SortedRuns | None = None
         self._with_intensity: bool | None = None
-        self._used = 0
         self.scans = self.gated = self.outside = self.refused = 0
 
     def add(
@@ -209,15 +207,20 @@ class MapMerger:
         self.scans, self.gated, self.outside, self.refused = state["counts"]
         if state["with_intensity"] is not None:
             self._with_intensity = bool(state["with_intensity"])
-            self._rows = np.empty((_START_ROWS, 6 if self._with_intensity else 5), np.int64)
+            self._start(columns=6 if self._with_intensity else 5)
 
     def _take(self) -> NDArray[np.int64]:
         """The rows in memory, sorted; none are left."""
         rows = self._rows[: self._used]
         rows = rows[np.argsort(rows[:, 0])]
-        self._rows, self._used = np.empty((_START_ROWS, self._rows.shape[1]), np.int64), 0
-        self._slots = np.full(2 * _START_ROWS, -1, np.int32)
+        self._start(columns=self._rows.shape[1])
         return rows
+
+    def _start(self, columns: int) -> None:
+        """Room for `most` rows: the system gives memory for those only that are written to."""
+        self._rows: NDArray[np.int64] = np.empty((self._most, columns), np.int64)
+        self._slots: NDArray[np.int32] = np.full(_slots_for(self._most), -1, np.int32)
+        self._used = 0
 
     def _spill(self) -> None:
         if self._runs is None:
@@ -233,16 +236,19 @@ class MapMerger:
             self._with_intensity, self._rows = False, np.ascontiguousarray(self._rows[:, :5])
 
     def _reserve(self, rows: int) -> None:
-        """Room for `rows` rows; the slots stay at most two thirds full."""
+        """Room for `rows` rows, of one scan with more than `most` of them."""
         from lslam.kernels.row_table import enter
 
         if rows > len(self._rows):
-            more = max(rows, len(self._rows) * 3 // 2) - len(self._rows)
+            more = rows - len(self._rows)
             self._rows = np.concatenate([self._rows, np.empty((more, self._rows.shape[1]), np.int64)])
-        if rows * 3 > len(self._slots) * 2:
-            size = 1 << int(np.ceil(np.log2(rows * 2)))
-            self._slots = np.full(size, -1, np.int32)
+            self._slots = np.full(_slots_for(rows), -1, np.int32)
             enter(self._slots, self._rows, self._used)
+
+
+def _slots_for(rows: int) -> int:
+    """A power of two that keeps them half full at most."""
+    return 1 << int(np.ceil(np.log2(max(rows, 1) * 2)))
 
 
 def _add_up(rows: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -255,6 +261,5 @@ def _add_up(rows: NDArray[np.int64]) -> NDArray[np.int64]:
 
 def warm_up() -> None:
     """Compile or load the merger's kernels, so that a caller can do it under the compile lock."""
-    merger = MapMerger(1.0, 0.0)
-    merger.add(np.ones((1, 3), np.float32), np.eye(4))
-    merger._reserve(_START_ROWS * 2)
+    merger = MapMerger(1.0, 0.0, most=1)
+    merger.add(np.ones((2, 3), np.float32), np.eye(4))

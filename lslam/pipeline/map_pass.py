@@ -67,18 +67,26 @@ def build_map(
     for _ in range(done):
         on_step()
     first = maker.first_again(done)
-    ahead = read_ahead(sequence, None, config.input.threads, first=first)
-    for k, (loaded, result) in enumerate(zip(ahead, results[first:], strict=False), first):
+    registered = {result.index: result for result in results if result.status == "ok"}
+
+    def pose_scan(scan: Scan) -> PosedScan | None:
+        """In the thread that reads, since merging takes as long as reading and deskewing together."""
+        result = registered.get(scan.index)
+        if result is None:
+            return None
+        scan = scan if ego_box is None else without_box(scan, ego_box)
+        points = deskew_points(scan.points, scan.times, motion_within(scan, stamps, poses))
+        return PosedScan(points, result.T_world_lidar, scan.intensity)
+
+    ahead = read_ahead(sequence, pose_scan, config.input.workers, first=first)
+    for k, (loaded, _) in enumerate(zip(ahead, results[first:], strict=False), first):
         is_last = should_stop()
         if checkpoints is not None and k >= done:
             checkpoints.offer(k, maker, is_last)
         if is_last:
             raise InterruptedRunError(INTERRUPTED)
-        if loaded.scan is not None and result.status == "ok":
-            scan = loaded.scan if ego_box is None else without_box(loaded.scan, ego_box)
-            motion = motion_within(scan, stamps, poses)
-            points = deskew_points(scan.points, scan.times, motion)
-            maker.add(k, PosedScan(points, result.T_world_lidar, scan.intensity))
+        if loaded.prepared is not None:
+            maker.add(k, loaded.prepared)
         if k >= done:
             on_step()
     with asking(should_stop, INTERRUPTED):
