@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from typing import Any
+
+from pydantic import model_validator
+
 from lslam.config.debug import DebugConfig
 from lslam.config.eval import EvalConfig
 from lslam.config.gnss import GnssConfig
@@ -12,7 +16,7 @@ from lslam.config.keyframes import KeyframesConfig
 from lslam.config.loam import LoamConfig
 from lslam.config.loops import LoopsConfig
 from lslam.config.map import MapConfig
-from lslam.config.odometry import OdometryConfig
+from lslam.config.odometry import TIGHTLY_COUPLED, OdometryConfig
 from lslam.config.osm import OsmConfig
 from lslam.config.preprocess import PreprocessConfig
 from lslam.config.recovery import RecoveryConfig
@@ -40,3 +44,18 @@ class Config(Section):
     eval: EvalConfig = EvalConfig()
     report: ReportConfig = ReportConfig()
     debug: DebugConfig = DebugConfig()
+
+    @model_validator(mode="before")
+    @classmethod
+    def _with_needed_imu(cls, given: Any) -> Any:
+        """A tightly coupled method cannot do without the IMU.
+
+        >>> Config.model_validate({"odometry": {"method": "fast-lio2"}}).imu.use
+        True
+        """
+        odometry = given.get("odometry") if isinstance(given, dict) else None
+        method = odometry.get("method") if isinstance(odometry, dict) else getattr(odometry, "method", None)
+        if method not in TIGHTLY_COUPLED:
+            return given
+        imu = given.get("imu", {})
+        return {**given, "imu": {**(imu if isinstance(imu, dict) else imu.model_dump()), "use": True}}

@@ -6,6 +6,9 @@ from pydantic import Field
 
 from lslam.config.section import Section
 
+# Methods whose estimate is of points and IMU together.
+TIGHTLY_COUPLED = ("fast-lio2",)
+
 
 class OdometryConfig(Section):
     """Which method estimates the trajectory."""

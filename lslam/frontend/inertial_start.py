@@ -11,11 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.config import Config
+from lslam.config.odometry import TIGHTLY_COUPLED
 from lslam.errors import InputError
 from lslam.formats.state_files import read_state, write_state
 from lslam.frontend.register_scans import read_ahead
 from lslam.frontend.state_classes import STATE_CLASSES
 from lslam.frontend.tracker import Tracker
+from lslam.inertial.filter import FilterMotion
 from lslam.inertial.fusion import InertialMotion
 from lslam.inertial.imu_cleaning import ImuRefusedError
 from lslam.inertial.initialise import FirstPoses, InertialStart, start
@@ -46,13 +48,23 @@ def warm_up() -> None:
     create_odometry(Config()).warm_up()
 
 
+def motion_of(begun: InertialStart, config: Config) -> InertialMotion:
+    """The motion model that the method asks for."""
+    kind = FilterMotion if config.odometry.method in TIGHTLY_COUPLED else InertialMotion
+    return kind(begun.imu, begun.T_lidar_imu, begun.estimate, config.imu)
+
+
 def begin_inertial(sequence: Sequence, config: Config) -> Inertial:
     """Check and align the sequence's IMU; a refused one leaves the run to constant velocity.
 
-    Raises InputError when the sequence has no IMU.
+    Raises InputError when the sequence has no IMU, or a refused one and a tightly coupled method.
     """
+    is_needed = config.odometry.method in TIGHTLY_COUPLED
     if sequence.imu is None:
-        raise InputError(f"{sequence.path} has no IMU: name its file with `imu` in sequence.toml, or run without --imu")
+        raise InputError(
+            f"{sequence.path} has no IMU: name its file with `imu` in sequence.toml, or run without --imu, by a method that "
+            "needs none"
+        )
     part = Inertial(None)
     T_lidar_imu = sequence.calibration.T_lidar_imu
     if T_lidar_imu is None:
@@ -61,12 +73,14 @@ def begin_inertial(sequence: Sequence, config: Config) -> Inertial:
     try:
         begun = _begin(sequence, sequence.imu, T_lidar_imu, config)
     except ImuRefusedError as error:
+        if is_needed:
+            raise InputError(f"{config.odometry.method} needs an IMU, and this one is refused: {error}") from None
         part.problems.append(f"the IMU is refused, the run goes on without it: {error}")
         log.warning("%s", part.problems[-1])
         return part
     part.start, part.notes = begun, list(begun.notes)
     part.problems += begun.problems
-    part.motion = InertialMotion(begun.imu, T_lidar_imu, begun.estimate, config.imu)
+    part.motion = motion_of(begun, config)
     for note in part.notes:
         log.info("%s", note)
     return part
@@ -88,7 +102,7 @@ def load_start(path: Path, config: Config) -> Inertial | None:
         return None
     part = Inertial(None, known["start"], known["notes"], known["problems"])
     if part.start is not None:
-        part.motion = InertialMotion(part.start.imu, part.start.T_lidar_imu, part.start.estimate, config.imu)
+        part.motion = motion_of(part.start, config)
     return part
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from lslam.inertial.gyroscope import Gyroscope
 from lslam.inertial.imu_estimate import ImuEstimate
 from lslam.inertial.initialise import InertialStart
+from lslam.inertial.navigation_state import NavigationState
 from lslam.integrity.monitor import Seen
 from lslam.odometry.feature_scan import FeatureScan
 from lslam.preprocessing.features import FeaturePoints, Features
@@ -17,5 +18,5 @@ from lslam.types.scan_result import ScanResult
 
 STATE_CLASSES = (
     Constraint, FeaturePoints, Features, FeatureScan, GravityDirection, Gyroscope, ImuEstimate, ImuStream, LoopCandidate,
-    MotionCheck, PreparedPoints, ScanResult, Seen, InertialStart,
+    MotionCheck, NavigationState, PreparedPoints, ScanResult, Seen, InertialStart,
 )  # fmt: skip

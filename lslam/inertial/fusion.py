@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from dataclasses import replace
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,7 +42,7 @@ class InertialMotion(Stateful):
     JUDGED, WORSE, SLACK_M = 30, 2.0, 0.02
     # One scan in so many is registered from constant velocity too, to tell what the IMU saves.
     COMPARED = 20
-    STATE = (
+    STATE: ClassVar[tuple[str, ...]] = (
         "estimate", "coasting", "refusal", "gap_scans", "_scans", "_has_gap", "_was_bridged", "_instant_ns", "_pose",
     )  # fmt: skip
 

@@ -22,6 +22,10 @@ METHODS = {
     "vgicp": ("lslam.odometry.icp", "likewise, distribution to distribution over the voxels around (Koide 2021)"),
     "ndt": ("lslam.odometry.icp", "likewise, normal distributions transform: a score over the voxels (Magnusson 2009)"),
     "icp-svd": ("lslam.odometry.icp_svd", "the classic: point to point, scan to scan, closed form by SVD (Besl 1992)"),
+    "fast-lio2": (
+        "lslam.odometry.fast_lio2",
+        "tightly coupled with the IMU: points and prior in one iterated Kalman filter (Xu 2022); needs an IMU",
+    ),
     "loam-odom": ("lslam.odometry.loam", "edges and planar points, scan to scan: LOAM without its map"),
     "loam": ("lslam.odometry.loam", "LOAM: scan to scan, then refined on the feature map at every scan"),
     "floam": ("lslam.odometry.loam", "F-LOAM: motion prior, then scan to feature map in one stage"),

@@ -6,6 +6,7 @@ import time
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lslam.config.config import Config
 from lslam.errors import UsageError
@@ -73,11 +74,15 @@ class Icp(Stateful):
         began = time.perf_counter()
         points = deskew(prepared, prior)
         deskewed = time.perf_counter()
-        located = self.registration.locate(points, prior.pose, is_near)
+        located = self.registration.locate(points, prior.pose, is_near, self.information_of(prior))
         stages = {"register": time.perf_counter() - deskewed}
         if points is not prepared:
             stages = {"deskew": deskewed - began, **stages}
         return Registered(of_registration(scan, located, self._uncertainty.map_age, stages), (points, located))
+
+    def information_of(self, prior: MotionPrior) -> NDArray[np.float64] | None:
+        """(6, 6) with which the prior joins the points; None, since the prior is only where to begin."""
+        return None
 
     def update(self, prior: MotionPrior, found: Registered) -> ScanResult:
         """Enter the scan into the local map where its result puts it."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from lslam.config import Config
+from lslam.config.odometry import TIGHTLY_COUPLED
 from lslam.config.preset_files import read_preset
 from lslam.errors import UsageError
 from lslam.evaluation.recipes import check_words, parse_delta
@@ -38,6 +39,8 @@ def check_config(config: Config) -> None:
         )
     if method == "poses" and config.imu.use:
         raise UsageError("--imu does nothing with --poses, whose motion is given: drop one of them")
+    if method in TIGHTLY_COUPLED and (config.imu.velocity != "registration" or not config.imu.weigh):
+        raise UsageError(f"imu.velocity and imu.weigh are of the loosely coupled IMU, {method} has a filter: drop them")
     if config.map.write and (config.map.denoise or config.map.mesh):
         from lslam.maps.mesh import require_open3d
 

@@ -61,11 +61,13 @@ def with_imu(sequence: Sequence, data_root: Path | None = None) -> Sequence:
         raise why_no_imu(sequence.bag)
     number = sequence.path.name
     if not isinstance(sequence, FolderSequence):
-        raise InputError(f"{sequence.path} ({sequence.kind}) has no IMU: run without --imu")
+        raise InputError(
+            f"{sequence.path} ({sequence.kind}) has no IMU: run without --imu, by a method that needs none"
+        )
     if sequence.kind != KIND or number not in DRIVES:
         raise InputError(
             f"{sequence.path} has no IMU: looked for {sequence.path / 'imu.csv'} and `imu` in sequence.toml there; "
-            "add it, or run without --imu"
+            "add it, or run without --imu, by a method that needs none"
         )
     return _with_imu(sequence, *_drive_of(sequence, number, data_root, "IMU", "imu.csv", "--imu"))
 

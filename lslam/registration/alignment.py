@@ -30,12 +30,13 @@ class MapAlignment:
 
     def refine(
         self, points: PreparedPoints, start: Floats, width: float, steps: int, coarser: Sequence[GaussianMap] = (),
-        allowed: Floats = EVERYWHERE,
+        allowed: Floats = EVERYWHERE, information: Floats | None = None,
     ) -> RegistrationResult:  # fmt: skip
         """Align with the fine map from `start` (4, 4), the kernel closing from `width`, m, or as the user wants it.
 
         coarser : maps for the points that find nothing in the fine one, finest first; none: all that there are
         allowed : (6, 6) projector on the directions that are aligned, world axes; no rows: all
+        information : (6, 6) of the start as a prior, world axes, 1/m2 and 1/rad2; None: it is only a start
         """
         c, coarser = self._config, coarser or self._map.coarser
         coarser = coarser if residual_named(self._residual).is_wide else coarser[:1]
@@ -50,7 +51,7 @@ class MapAlignment:
             sigma=c.sigma, blob_weight=c.blob_weight, weak_share=c.weak_share,
             coarser=coarser, residual=self._residual,
             inlier_distance=np.inf if c.inlier_distance is None else c.inlier_distance, inlier_ratio=c.inlier_ratio,
-            allowed=allowed, matches=self._remembered(len(points.source)),
+            allowed=allowed, matches=self._remembered(len(points.source)), information=information,
         )  # fmt: skip
 
     def _remembered(self, count: int) -> Correspondences:

@@ -96,10 +96,13 @@ class Registration(Stateful):
         self.update(points, result)
         return result
 
-    def locate(self, points: PreparedPoints, T_prior: Floats, is_near: bool = False) -> RegistrationResult:
+    def locate(
+        self, points: PreparedPoints, T_prior: Floats, is_near: bool = False, information: Floats | None = None
+    ) -> RegistrationResult:
         """Align with the map as it is; the result says whether it is accepted.
 
         is_near : the prior is nearly right: nothing is sought away from it
+        information : (6, 6) of the prior, world axes, that joins the points'; None: the prior is only a start
         """
         count, c = len(points.source), self.config
         if count < MIN_SOURCE_POINTS:
@@ -116,7 +119,7 @@ class Registration(Stateful):
             width = NEAR_KERNEL * c.kernel_min
         elif self.starting > 0:
             steps = c.start_iterations
-        result = self.judged(self.alignment.refine(points, T_prior, width, steps), T_prior)
+        result = self.judged(self.alignment.refine(points, T_prior, width, steps, information=information), T_prior)
         for policy in () if is_near else self.recovery:
             result = policy.recover(self, points, T_prior, result)
         return result

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.kernels import prior_residual
 from lslam.preprocessing.prepare import PreparedPoints
 from lslam.registration.gaussian_map import GaussianMap
 from lslam.registration.optimiser import (
@@ -95,17 +96,21 @@ def solve(
     target: GaussianMap, points: PreparedPoints, T_prior: Floats, annealing: Annealing, *, sigma: float,
     blob_weight: float, weak_share: float, coarser: Sequence[GaussianMap] = (), residual: str | ResidualKind = "plane",
     inlier_distance: float = np.inf, inlier_ratio: float = 1.0, allowed: Floats = EVERYWHERE,
-    matches: Correspondences | None = None,
+    matches: Correspondences | None = None, information: Floats | None = None,
 ) -> RegistrationResult:  # fmt: skip
     """Align the source points with the map by annealed Gauss-Newton, starting at `T_prior` (4, 4).
 
     Points without a plane or a blob in `target` are matched in the first of the `coarser` maps that has one. Correspondences
     beyond `inlier_distance`, m, are rejected, and all but the nearest `inlier_ratio`. `allowed` as in `Limits`; `matches` of as
-    many points in these maps, if there are any, spare what was looked up.
+    many points in these maps, if there are any, spare what was looked up. `information` (6, 6) of the prior, world axes,
+    joins that of the points.
     """
     kind = residual if isinstance(residual, ResidualKind) else residual_named(residual)
     matches = Correspondences(len(points.source)) if matches is None else matches
     terms = voxel_terms(kind, kind.points(points, sigma), (target, *coarser), matches, sigma, blob_weight)
+    if information is not None:
+        R, t = (np.ascontiguousarray(part, np.float64) for part in (T_prior[:3, :3], T_prior[:3, 3]))
+        terms.append(Term(prior_residual.linearise, (), (R, t, information), ()))
     found = optimise(
         terms, T_prior, annealing, Limits(weak_share, by_surfaces=kind.by_surfaces, allowed=allowed), matches,
         inlier_distance=inlier_distance, inlier_ratio=inlier_ratio,

@@ -16,10 +16,13 @@ class MotionPrior:
 
     times : (K,) float64 s from the scan's stamp, increasing, 0 within; poses : (K, 4, 4) float64 T_world_lidar at those times
     K is 1 when only the pose at the stamp is predicted.
+    covariance : (6, 6) of the pose at the stamp, t' = t + d[:3], R' = exp(d[3:]) R in world axes, m2 and rad2; None where
+        the motion model has none
     """
 
     times: NDArray[np.float64]
     poses: NDArray[np.float64]
+    covariance: NDArray[np.float64] | None = None
 
     @classmethod
     def at_once(cls, pose: NDArray[np.float64]) -> MotionPrior:

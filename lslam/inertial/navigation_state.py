@@ -1,0 +1,114 @@
+"""The error state of a tightly coupled filter: pose, velocity, gravity and errors of the IMU, with one covariance.
+
+After Xu et al. 2022 (FAST-LIO2), but propagated by preintegrated increments, one step a scan, and with the axes of a
+consumer gyroscope among the states.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.geometry import se3, so3
+from lslam.inertial.gyroscope import BIAS_WALK, Gyroscope
+from lslam.inertial.imu_estimate import (
+    ACCEL_WALK,
+    FORCE_NOISE,
+    GRAVITY,
+    GRAVITY_SIGMA,
+    GRAVITY_WALK,
+    ImuEstimate,
+)
+from lslam.inertial.integrate import Increments
+from lslam.inertial.kalman import update
+
+Floats = NDArray[np.float64]
+
+PLACE, TURN, SPEED, DOWN, FORCE = (slice(3 * k, 3 * k + 3) for k in range(5))
+POSE, REST, GYRO = slice(0, 6), slice(6, 15), slice(15, 27)
+SIZE = 27
+# Of the pose at the beginning, where the world is put: m and rad, one sigma.
+BEGIN_SIGMA = 1e-4
+
+
+@dataclass(frozen=True)
+class NavigationState:
+    """Where the IMU is, and all that is known of its motion and its errors.
+
+    T_world_imu : (4, 4); estimate : velocity, gravity, accelerometer bias and gyroscope, whose covariances are parts of
+    covariance : (27, 27) of position, rotation (R' = exp(d) R), velocity, gravity, all in world axes, accelerometer bias,
+        gyroscope bias and axes
+    """
+
+    T_world_imu: Floats
+    estimate: ImuEstimate
+    covariance: Floats = field(repr=False)
+
+    @classmethod
+    def begin(cls, T_world_imu: Floats, estimate: ImuEstimate) -> NavigationState:
+        """The state of an IMU that was initialised at a pose (4, 4) which is the world's."""
+        P = np.zeros((SIZE, SIZE))
+        P[POSE, POSE] = BEGIN_SIGMA**2 * np.eye(6)
+        P[REST, REST], P[GYRO, GYRO] = estimate.covariance, estimate.gyroscope.covariance
+        return cls(T_world_imu, estimate, P)
+
+    def propagated(self, step: Increments) -> NavigationState:
+        """The state at the last instant of `step`, which this estimate integrated, with nothing but the IMU to go by."""
+        e, R, t = self.estimate, self.T_world_imu[:3, :3], float(step.seconds[-1])
+        R_end, velocities, moved = step.motion(0, R, e.velocity, e.gravity)
+        F = np.eye(SIZE)
+        F[PLACE, TURN] = -so3.hat(R @ step.positions[-1])
+        F[PLACE, SPEED], F[PLACE, DOWN] = t * np.eye(3), 0.5 * t**2 * np.eye(3)
+        F[PLACE, FORCE] = -R @ step.position_arms[-1]
+        F[TURN, GYRO] = R_end[-1] @ e.gyroscope.columns(step)
+        F[SPEED, TURN] = -so3.hat(R @ step.velocities[-1])
+        F[SPEED, DOWN], F[SPEED, FORCE] = t * np.eye(3), -R @ step.velocity_arms[-1]
+        P = F @ self.covariance @ F.T
+        force = FORCE_NOISE**2 * np.array([[t**3 / 3, t**2 / 2], [t**2 / 2, t]])
+        for i, a in enumerate((PLACE, SPEED)):
+            for j, b in enumerate((PLACE, SPEED)):
+                P[a, b] += force[i, j] * np.eye(3)
+        walks = (e.gyroscope.rate_variance, GRAVITY_WALK**2, ACCEL_WALK**2, BIAS_WALK**2)
+        for part, variance in zip((TURN, DOWN, FORCE, slice(15, 18)), walks, strict=True):
+            P[part, part] += variance * t * np.eye(3)
+        T = se3.normalise(se3.make(R_end[-1], self.T_world_imu[:3, 3] + moved[-1]))
+        return NavigationState(T, replace(e, velocity=velocities[-1]), P)._shared()
+
+    def moved_to(self, T_world_imu: Floats, covariance: Floats) -> NavigationState:
+        """After the pose was found to be another (4, 4), with its `covariance` (6, 6), by what knows nothing of the rest."""
+        P = self.covariance
+        gain = np.linalg.solve(P[POSE, POSE], P[POSE]).T
+        d = np.concatenate([
+            T_world_imu[:3, 3] - self.T_world_imu[:3, 3], so3.log(T_world_imu[:3, :3] @ self.T_world_imu[:3, :3].T)
+        ])  # fmt: skip
+        P = P - gain @ (P[POSE, POSE] - covariance) @ gain.T
+        found = self._shifted(gain @ d, 0.5 * (P + P.T))._with_gravity()
+        return replace(found, T_world_imu=T_world_imu)._shared()
+
+    def _shifted(self, x: Floats, P: Floats) -> NavigationState:
+        """All states but the pose, moved by the error x (27,), with the covariance P."""
+        e, gyro = self.estimate, x[GYRO]
+        gyroscope = replace(
+            e.gyroscope, bias=e.gyroscope.bias + gyro[:3], axes=e.gyroscope.axes + gyro[3:].reshape(3, 3)
+        )
+        e = replace(
+            e, velocity=e.velocity + x[SPEED], gravity=e.gravity + x[DOWN], accel_bias=e.accel_bias + x[FORCE],
+            gyroscope=gyroscope,
+        )  # fmt: skip
+        return replace(self, estimate=e, covariance=P)
+
+    def _with_gravity(self) -> NavigationState:
+        """Gravity is as long as it is all over the Earth; what that says of the pose is far below what registration does."""
+        norm = float(np.linalg.norm(self.estimate.gravity))
+        H = np.zeros((1, SIZE))
+        H[0, DOWN] = self.estimate.gravity / norm
+        x, P = update(np.zeros(SIZE), self.covariance, H, np.array([GRAVITY - norm]), np.array([[GRAVITY_SIGMA**2]]))
+        return self._shifted(x, P)
+
+    def _shared(self) -> NavigationState:
+        """The parts of the covariance where the estimate has them too."""
+        P, e = self.covariance, self.estimate
+        gyroscope: Gyroscope = replace(e.gyroscope, covariance=P[GYRO, GYRO])
+        return replace(self, estimate=replace(e, covariance=P[REST, REST], gyroscope=gyroscope))

@@ -1,0 +1,32 @@
+"""Method `fast-lio2`: tightly coupled LiDAR and IMU by an iterated error-state Kalman filter (Xu et al. 2022)."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.config.config import Config
+from lslam.odometry.icp import Icp
+from lslam.registration.registration import Registration
+from lslam.types.motion_prior import MotionPrior
+
+
+def create(config: Config) -> FastLio2:
+    """The method as the configuration wants it: point to plane, with no recovery beside the filter."""
+    section = config.registration.model_copy(update={"residual": "plane"})
+    return FastLio2(Registration(section, config.preprocess))
+
+
+class FastLio2(Icp):
+    """Points and the filter's prior in one estimate, on the local map of Gaussian voxels.
+
+    The filter is the motion model (`lslam.inertial.filter`), since it predicts and deskews too; where it is silent, over a gap
+    of the IMU, a scan is registered from constant velocity.
+    """
+
+    deskew = "by back propagation of the filter"
+    is_tightly_coupled = True
+
+    def information_of(self, prior: MotionPrior) -> NDArray[np.float64] | None:
+        """The inverse of the filter's covariance."""
+        return None if prior.covariance is None else np.asarray(np.linalg.inv(prior.covariance))

@@ -1,0 +1,104 @@
+"""FAST-LIO2: ahead of the loosely coupled IMU on violent motion, no worse elsewhere, and nothing without an IMU."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from stub_sequences import Stub, sample
+
+import lslam
+from lslam.config import Config, load_config
+from lslam.errors import InputError
+from lslam.simulation.scenarios import simulate
+from lslam.types.imu import ImuStream
+from lslam.types.scan_result import ScanResult
+
+QUIET = ("map.write=false", "report.html=false", "loops.use=false", "imu.start_s=1")
+
+
+def config_of(method: str, *settings: str) -> Config:
+    return load_config(None, [f"odometry.method={method}", *QUIET, *settings], {})
+
+
+def walk(count: int, seed: int = 100) -> Stub:
+    drive = simulate("walk", lidar="vlp16", seed=seed, count=count, imu="icm20948", motion_compensated=False)
+    return Stub(
+        [drive.scan(i) for i in range(count)], drive.ground_truth, drive.calibration, motion_compensated=False,
+        imu=drive.imu,
+    )  # fmt: skip
+
+
+def ate(sequence: Stub, *settings: str, method: str) -> tuple[float, list[ScanResult]]:
+    outcome = lslam.run(sequence, config_of(method, *settings))
+    assert outcome.evaluation is not None
+    error = outcome.evaluation.scores["ate"]["se3"].translation
+    assert error is not None
+    return error.rmse, outcome.record.results
+
+
+def test_a_walk_is_followed_as_well_as_by_the_loose_imu_and_far_better_than_without() -> None:
+    sequence = walk(50)
+    tight, results = ate(sequence, method="fast-lio2")
+    loose, _ = ate(sequence, "imu.use=true", method="icp")
+    alone, _ = ate(sequence, method="icp")
+    assert all(result.status == "ok" for result in results)
+    assert tight < 1.2 * loose
+    assert tight < 0.5 * alone
+    # A sweep is deskewed once, by back propagation.
+    assert all("deskew" in result.stages for result in results[1:])
+    assert all(result.covariance is not None for result in results)
+
+
+def test_a_gap_of_the_imu_is_crossed_by_constant_velocity_and_said() -> None:
+    sequence = walk(50)
+    assert isinstance(sequence.imu, ImuStream)
+    stamps = sequence.imu.stamps_ns
+    kept = (stamps < 2_500_000_000) | (stamps > 3_000_000_000)
+    imu = ImuStream(stamps[kept], sequence.imu.accel[kept], sequence.imu.gyro[kept])
+    outcome = lslam.run(replace(sequence, imu=imu), config_of("fast-lio2"))
+    assert outcome.record.manifest["imu"]["scans_in_gaps"] > 3
+    assert any("gaps of the IMU" in problem for problem in outcome.record.manifest["problems"])
+    assert sum(result.status == "ok" for result in outcome.record.results) == 50
+
+
+def test_it_asks_for_the_imu_by_itself_and_does_nothing_without_one() -> None:
+    assert config_of("fast-lio2").imu.use
+    assert not config_of("icp").imu.use
+    with pytest.raises(InputError, match="has no IMU: run without --imu, by a method that needs none"):
+        lslam.run(sample(5), config_of("fast-lio2"))
+
+
+def test_a_refused_imu_ends_the_run() -> None:
+    sequence = walk(15)
+    assert isinstance(sequence.imu, ImuStream)
+    no_gravity = replace(sequence.imu, accel=np.zeros_like(sequence.imu.accel))
+    with pytest.raises(InputError, match="fast-lio2 needs an IMU, and this one is refused"):
+        lslam.run(replace(sequence, imu=no_gravity), config_of("fast-lio2"))
+
+
+def test_a_run_goes_on_where_it_was(tmp_path: Path) -> None:
+    """The states of the filter are part of the checkpoint; see `tests/frontend/test_resumable_state.py`."""
+    from lslam.formats.state_files import read_state, write_state
+    from lslam.frontend.inertial_start import begin_inertial
+    from lslam.frontend.register_scans import read_ahead
+    from lslam.frontend.state_classes import STATE_CLASSES
+    from lslam.frontend.tracker import Tracker
+    from lslam.odometry import create_odometry
+
+    sequence, config = walk(16), config_of("fast-lio2")
+
+    def fresh() -> Tracker:
+        return Tracker(create_odometry(config), motion=begin_inertial(sequence, config).motion)
+
+    whole, expected = fresh(), []
+    loaded = list(read_ahead(sequence, whole.odometry.prepare, 1))
+    for scan in loaded:
+        expected.append(whole.track(scan).T_world_lidar)
+        if len(expected) == 8:
+            write_state(tmp_path / "8.npz", whole.state())
+    again = fresh()
+    again.restore(read_state(tmp_path / "8.npz", STATE_CLASSES))
+    np.testing.assert_array_equal([again.track(scan).T_world_lidar for scan in loaded[8:]], expected[8:])
