@@ -47,8 +47,8 @@ TURN_STEP, WIDEST_TURN = np.deg2rad(2.0), np.deg2rad(20.0)
 # Factor on the best descriptor distance within which others are candidates too, and how many; different places of a town
 # differ by twice as much.
 RIVAL, RIVALS = 1.5, 3
-# Level submaps and clouds cached, and how many serve to estimate the vertical.
-KEPT, CLOUDS, LOOKS = 4, 4, 8
+# Level submaps, clouds and gates cached, and how many submaps serve to estimate the vertical.
+KEPT, CLOUDS, HELD, LOOKS = 4, 4, 256, 8
 
 
 def find_loops(
@@ -126,17 +126,20 @@ class Detector:
         clocks = KeyframeClocks() if clocks is None else clocks
         candidates: list[LoopCandidate] = []
         throttle = LoopThrottle(self.config.spacing)
-        gated = [self._gated(b) for b in range(len(self.keyframes))]
-        if any(len(older) for older in gated):
+        count = len(self.keyframes)
+        if any(len(self._gated(b)) for b in range(count)):
             self._level_world()
+        # Of thousands of keyframes, each has thousands: those of the next few are held.
+        gated = SharedResults(self._gated, HELD)
         ahead: dict[int, Future[list[LoopCandidate]]] = {}
         with ThreadPoolExecutor(threads, "lslam-loops") as pool:
             try:
-                for b, (keyframe, older) in enumerate(zip(self.keyframes, gated, strict=True)):
+                for b, keyframe in enumerate(self.keyframes):
                     if should_stop():
                         raise InterruptedRunError(
-                            f"interrupted during loop closure detection, at keyframe {b} of {len(gated)}"
+                            f"interrupted during loop closure detection, at keyframe {b} of {count}"
                         )
+                    older = gated.get(b)
                     if len(older) == 0:
                         throttle.reset()
                         continue
@@ -146,7 +149,7 @@ class Detector:
                     for n in (b, *islice(self._due_after(b, gated, throttle), threads - 1)):
                         if n not in ahead:
                             clock = clocks[n]
-                            ahead[n] = pool.submit(copy_context().run, self._examined, n, gated[n], clock)
+                            ahead[n] = pool.submit(copy_context().run, self._examined, n, gated.get(n), clock)
                     examined = ahead.pop(b).result()
                     candidates += examined
                     throttle.observe(
@@ -157,12 +160,12 @@ class Detector:
                 pool.shutdown(cancel_futures=True)
         return candidates
 
-    def _due_after(self, b: int, gated: list[NDArray[np.int64]], throttle: LoopThrottle) -> Iterator[int]:
+    def _due_after(self, b: int, gated: SharedResults[NDArray[np.int64]], throttle: LoopThrottle) -> Iterator[int]:
         """The keyframes after `b` that are due next if all verdicts are as the last one."""
         throttle = copy(throttle)
         throttle.observe(self.keyframes[b].distance, throttle.last or Verdict.ACCEPTED)
-        for n in range(b + 1, len(gated)):
-            if len(gated[n]) == 0:
+        for n in range(b + 1, len(self.keyframes)):
+            if len(gated.get(n)) == 0:
                 throttle.reset()
             elif throttle.is_due(self.keyframes[n].distance):
                 yield n
@@ -187,20 +190,9 @@ class Detector:
 
     def _gated(self, b: int) -> NDArray[np.int64]:
         """Older keyframes within the gate of odometry about `b`, but not on the way just travelled."""
-        travelled = self.uncertainty.distances[b] - self.uncertainty.distances[:b]
-        older: NDArray[np.int64] = np.flatnonzero(travelled >= self.config.min_travel)
-        if len(older) == 0:
-            return older
-        away = np.linalg.norm(self.uncertainty.positions[older] - self.uncertainty.positions[b], axis=1)
-        if self.config.radius is not None:
-            return np.asarray(older[away <= self.config.radius])
-        limit = NEAR + self.config.sigmas * self.uncertainty.between(b, older[:1]).reach[0]
-        is_inside = away <= NEAR
-        # The reach is never negative: those nearby are inside whatever it is.
-        asked = np.flatnonzero(~is_inside & (away <= limit))
-        reach = self.uncertainty.between(b, older[asked]).reach
-        is_inside[asked] = away[asked] <= NEAR + self.config.sigmas * reach
-        return np.asarray(older[is_inside])
+        if self.config.radius is None:
+            return self.uncertainty.gated(b, self.config.min_travel, NEAR, self.config.sigmas)
+        return self.uncertainty.gated(b, self.config.min_travel, self.config.radius, 0.0)
 
     def _thinned(self, older: NDArray[np.int64], b: int, wait: float) -> LoopCandidate:
         a = self._nearest(older, b)

@@ -76,3 +76,24 @@ def test_drift_of_a_straight_way_is_its_scale_and_its_bend_at_the_lever() -> Non
         lever = h * np.sqrt((np.arange(steps + 1) ** 2).mean())
         assert turn == pytest.approx(bend)
         assert reach == pytest.approx(np.hypot(0.005 * steps * h, bend * lever))
+
+
+@pytest.mark.parametrize("is_known", [True, False])
+def test_within_the_gate_is_what_the_uncertainty_between_says(is_known: bool) -> None:
+    """Random covariances, so that differences of some are not even positive: each keyframe by itself, against `between`."""
+    rng = np.random.default_rng(4)
+    poses = np.array([round_the_square(d) for d in np.arange(0, 900, 4.0)])
+    keyframes = keyframes_of(poses)
+    for k, keyframe in enumerate(keyframes):
+        root = rng.normal(0, 0.05, (6, 6)) @ np.diag([1, 1, 1, 0.02, 0.02, 0.02]) * np.sqrt(k)
+        keyframes[k] = replace(keyframe, covariance=root @ root.T if is_known else None)
+    uncertainty = OdometryUncertainty(keyframes, 0.5, 0.25)
+    least, near, sigmas = 60.0, 8.0, 1.5
+    seen = 0
+    for b in range(0, len(keyframes), 7):
+        older = np.flatnonzero(uncertainty.distances[b] - uncertainty.distances[:b] >= least)
+        away = np.linalg.norm(uncertainty.positions[older] - uncertainty.positions[b], axis=1)
+        expected = older[away <= near + sigmas * uncertainty.between(b, older).reach] if len(older) else older
+        np.testing.assert_array_equal(uncertainty.gated(b, least, near, sigmas), expected)
+        seen += 0 < len(expected) < len(older)
+    assert seen > 10
