@@ -86,6 +86,7 @@ def warm_up(config: LoopsConfig) -> None:
     room = np.random.default_rng(0).uniform(-8, 8, (3000, 3)).astype(np.float32)
     room[np.arange(3000), np.arange(3000) % 3] = 8.0
     transform(room, np.eye(4), np.empty_like(room))
+    OdometryUncertainty([Keyframe(0, 0, 0, np.eye(4), np.eye(6))], 0.0, 0.0).gated(0, 1.0, 1.0, 1.0)
     create_descriptor(config).add(0, room)
     submap_of_room = make_level_submap(room, RegistrationConfig())
     Verifier(LoopsConfig(), RegistrationConfig()).verify(

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from lslam.config.loops import LoopsConfig
 from lslam.config.registration import RegistrationConfig
 from lslam.geometry import se3, so3
-from lslam.kernels import gauss_newton, gaussians, polar_image, residuals
+from lslam.kernels import gating, gauss_newton, gaussians, polar_image, residuals, transform
 from lslam.keyframes.store import KeyframeStore
 from lslam.loops.descriptor import PlaceMatch
 from lslam.loops.detector import Detector, find_loops, warm_up
@@ -186,7 +186,7 @@ def test_joins_the_clouds_of_a_store(caplog: pytest.LogCaptureFixture) -> None:
 def test_after_a_warm_start_nothing_is_left_to_compile() -> None:
     warm_up(LoopsConfig())
     kernels: list[Any] = [polar_image.polar_image, gaussians.insert, gaussians.coarsen, residuals.linearise,
-                          gauss_newton.step]  # fmt: skip
+                          gauss_newton.step, gating.gated, transform.transform]  # fmt: skip
     before = [len(kernel.signatures) for kernel in kernels]
     assert all(before)
     true = np.array([round_the_square(d) for d in np.arange(0, 380, 10.0)])

@@ -39,7 +39,7 @@ def test_coarse_to_fine_is_believed_only_where_it_agrees_as_usual(
     assert registration.starting == 0
     points = prepare_points(drive.scan(7).points, registration.preprocess, 7)
     found, other = aside(last, 0.6, 0.0), aside(last, coarse)
-    monkeypatch.setattr(registration.alignment, "refine", lambda *_: found)
+    monkeypatch.setattr(registration.alignment, "refine", lambda *_, **__: found)
     monkeypatch.setattr(registration.alignment, "coarse_to_fine", lambda *_: other)
     registration.agreement.usual = 1.0
     located = registration.locate(points, last.T_world_lidar)
