@@ -65,7 +65,7 @@ def test_at_the_start_the_larger_consensus_wins(
     registration, points, known = begun()
     assert registration.starting > 0
     near, far = aside(known, fine, 0.0), aside(known, coarse)
-    monkeypatch.setattr(registration.alignment, "refine", lambda *_: near)
+    monkeypatch.setattr(registration.alignment, "refine", lambda *_, **__: near)
     monkeypatch.setattr(registration.alignment, "coarse_to_fine", lambda *_: far)
     located = registration.locate(points, np.eye(4))
     assert located.ok
@@ -77,7 +77,7 @@ def test_at_the_start_the_larger_consensus_wins(
 def test_a_coarse_result_that_fails_is_not_taken_however_many_agree(monkeypatch: pytest.MonkeyPatch) -> None:
     registration, points, known = begun()
     near, far = aside(known, 0.4, 0.0), aside(known, 0.9, 1.1 * registration.config.max_jump_m)
-    monkeypatch.setattr(registration.alignment, "refine", lambda *_: near)
+    monkeypatch.setattr(registration.alignment, "refine", lambda *_, **__: near)
     monkeypatch.setattr(registration.alignment, "coarse_to_fine", lambda *_: far)
     located = registration.locate(points, np.eye(4))
     assert located.ok
