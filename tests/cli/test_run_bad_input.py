@@ -53,7 +53,7 @@ def test_wrong_words(sequence: Path, tmp_path: Path) -> None:
     refuse(sequence, tmp_path, 2, "did you mean 'kiss-icp'", "--method", "kissicp")
     refuse(sequence, tmp_path, 2, "did you mean 'voxel'", "--set", "map.voxle=1")
     refuse(sequence, tmp_path, 2, "beyond the last scan", "--start", "12")
-    refuse(sequence, tmp_path, 2, "input.threads = 0", "--threads", "0")
+    refuse(sequence, tmp_path, 2, "input.threads = -1", "--threads", "-1")
     refuse(sequence, tmp_path, 3, "none.toml cannot be read", "--config", tmp_path / "none.toml")
     refuse(sequence, tmp_path, 3, "gt.tum does not exist", "--gt", tmp_path / "gt.tum")
 
