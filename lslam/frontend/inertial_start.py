@@ -17,6 +17,7 @@ from lslam.formats.state_files import read_state, write_state
 from lslam.frontend.register_scans import read_ahead
 from lslam.frontend.state_classes import STATE_CLASSES
 from lslam.frontend.tracker import Tracker
+from lslam.inertial import fusion
 from lslam.inertial.filter import FilterMotion
 from lslam.inertial.fusion import InertialMotion
 from lslam.inertial.imu_cleaning import ImuRefusedError
@@ -44,8 +45,9 @@ class Inertial:
 
 
 def warm_up() -> None:
-    """Compile what the scans before the run need."""
+    """Compile what the motion model and the scans before the run need."""
     create_odometry(Config()).warm_up()
+    fusion.warm_up()
 
 
 def motion_of(begun: InertialStart, config: Config) -> InertialMotion:

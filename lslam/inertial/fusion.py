@@ -10,12 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.config.imu import ImuConfig
-from lslam.geometry import se3, so3
+from lslam.geometry import se3
 from lslam.inertial.gyroscope import Gyroscope
 from lslam.inertial.imu_cleaning import covers, gaps
-from lslam.inertial.imu_estimate import ImuEstimate
+from lslam.inertial.imu_estimate import GRAVITY, ImuEstimate
 from lslam.inertial.integrate import Increments
 from lslam.inertial.kalman import surprise
+from lslam.kernels import kalman
+from lslam.kernels.rotation import apart, vector_between
 from lslam.preprocessing.deskew import knots_over
 from lslam.registration.constant_velocity import ConstantVelocity, middle_of
 from lslam.types.gravity import GravityDirection
@@ -124,17 +126,15 @@ class InertialMotion(Stateful):
         moved, felt = e.displacement(step, begin[:3, :3])
         P = np.zeros((6, 6))
         P[:3, :3], P[3:, 3:] = felt, R_felt @ e.gyroscope.turn_covariance(step) @ R_felt.T
-        rest = np.concatenate([end[:3, 3] - begin[:3, 3] - moved, R_felt @ so3.log(R_felt.T @ end[:3, :3])])
+        rest = np.concatenate([end[:3, 3] - begin[:3, 3] - moved, R_felt @ vector_between(R_felt, end[:3, :3])])
         gyroscope = e.taught(step, begin[:3, :3], end[:3, :3], C[3:, 3:])
         self._taught = instant_ns, gyroscope, C[:3, :3]
         if surprise(rest, P + 2 * C) > 1:
             return self._denied(result, rest, P)
         # A pose that is wrong moves the map by one part in its age only, the scans before hold it: random errors of both
         # then add up to the least drift when those of the IMU count as many times.
-        K = np.linalg.solve(C + result.map_age * P, C).T
-        d = -K @ rest
-        pose = se3.make(so3.exp(d[3:]) @ result.T_world_lidar[:3, :3], result.T_world_lidar[:3, 3] + d[:3])
-        return replace(result, T_world_lidar=se3.normalise(pose), registration_covariance=C - K @ C)
+        pose, covariance = kalman.weighed(result.T_world_lidar, rest, C, P, result.map_age)
+        return replace(result, T_world_lidar=pose, registration_covariance=covariance)
 
     def _denied(self, result: ScanResult, rest: Floats, covariance: Floats) -> ScanResult:
         """What comes of a registration that contradicts the IMU by `rest` (6,), m and rad: constant velocity decides.
@@ -179,7 +179,7 @@ class InertialMotion(Stateful):
                     self.estimate = self._carried(instant_ns)
             elif self._instant_ns is None:
                 self.estimate = self._advanced(stamp_ns, instant_ns)
-        self.coasting.correct(stamp_ns, pose, prior)
+        self.coasting.correct(instant_ns, middle)
         self._instant_ns, self._pose = instant_ns, middle.copy()
         self._was_bridged = not is_registered
         self._taught = self._felt = self._expected = None
@@ -237,13 +237,10 @@ class InertialMotion(Stateful):
         self, estimate: ImuEstimate, anchor_ns: int, anchor: Floats, stamp_ns: int, times: Floats
     ) -> MotionPrior:
         wanted = stamp_ns + np.round(1e9 * times).astype(np.int64)
-        instants = np.unique(np.append(wanted, anchor_ns))
-        T_world_imu = anchor @ self.T_lidar_imu
-        k = int(np.searchsorted(instants, anchor_ns))
-        step = estimate.over(self.imu, instants)
-        R, _, moved = step.motion(k, T_world_imu[:3, :3], estimate.velocity, estimate.gravity)
-        poses = se3.make(R, T_world_imu[:3, 3] + moved) @ self.T_imu_lidar
-        return MotionPrior(times, se3.normalise(poses[np.searchsorted(instants, wanted)]))
+        k = int(np.searchsorted(wanted, anchor_ns))
+        step = estimate.over(self.imu, np.concatenate([wanted[:k], [anchor_ns], wanted[k:]]))
+        poses = step.poses(k, anchor @ self.T_lidar_imu, estimate.velocity, estimate.gravity, self.T_imu_lidar)
+        return MotionPrior(times, np.concatenate([poses[:k], poses[k + 1 :]]))
 
     def _corrected(self, instant_ns: int, middle: Floats) -> ImuEstimate:
         """The estimate at `instant_ns`, where registration put the LiDAR at `middle` (4, 4)."""
@@ -297,7 +294,8 @@ class InertialMotion(Stateful):
         self._errors.append((_distance(mine, pose), _distance(self.coasting.predict(stamp_ns), pose)))
         if len(self._errors) < self.JUDGED or self.config.velocity == "integrated":
             return
-        own, steady = (float(v) for v in np.median(np.array(self._errors[-self.JUDGED :]), axis=0))
+        newest = np.sort(np.array(self._errors[-self.JUDGED :]), axis=0)
+        own, steady = (float(v) for v in 0.5 * (newest[(self.JUDGED - 1) // 2] + newest[self.JUDGED // 2]))
         if own > self.WORSE * steady + self.SLACK_M:
             self.refusal = (
                 f"it predicts scans {own:.3f} m wrong where constant velocity is {steady:.3f} m wrong (turns counted at "
@@ -318,5 +316,20 @@ class InertialMotion(Stateful):
 
 
 def _distance(a: Floats, b: Floats) -> float:
-    delta = se3.relative(a, b)
-    return float(np.linalg.norm(delta[:3, 3]) + LEVER_M * so3.angle(delta[:3, :3]))
+    return float(apart(a, b, LEVER_M))
+
+
+def warm_up() -> None:
+    """Compile or load what the first scans would otherwise wait for: three of a sensor that stands."""
+    none = np.zeros(3)
+    imu = ImuStream(
+        np.arange(60, dtype=np.int64) * 10_000_000, np.tile([0.0, 0.0, GRAVITY], (60, 1)), np.zeros((60, 3))
+    )
+    estimate = ImuEstimate(none, np.array([0.0, 0.0, -GRAVITY]), none, Gyroscope.of_bias(none, 0.01), 1e-2 * np.eye(9))
+    motion = InertialMotion(imu, np.eye(4), estimate, ImuConfig())
+    for k in range(3):
+        stamp_ns = 100_000_000 * k
+        prior = motion.sweep(stamp_ns, Span(0.0, 0.1))
+        prior = motion.refine(prior, stamp_ns, prior.pose)
+        found = ScanResult(k, stamp_ns, prior.pose, registration_covariance=1e-4 * np.eye(6))
+        motion.correct(stamp_ns, motion.weigh(found, prior).T_world_lidar, prior)

@@ -11,9 +11,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.geometry import so3
 from lslam.inertial.integrate import Increments
-from lslam.inertial.kalman import OUTLIER, update
+from lslam.inertial.kalman import OUTLIER
+from lslam.kernels import kalman
 
 Floats = NDArray[np.float64]
 
@@ -51,25 +51,22 @@ class Gyroscope:
 
     def turn_covariance(self, step: Increments) -> Floats:
         """(3, 3) rad2 of the turn over `step`, in IMU axes at its end."""
-        H = self.columns(step)
-        return np.asarray(H @ self.covariance @ H.T + self.rate_variance * step.seconds[-1] * np.eye(3))
+        return kalman.turn_covariance(
+            self.covariance, self.rate_variance, step.rotations[-1], step.velocity_arms[-1], self.axes, step.duration
+        )
 
     def learnt(self, step: Increments, rest: Floats, noise: Floats) -> Gyroscope:
         """After registration found the turn over `step` larger by `rest` (3,) rad, itself known to `noise` (3, 3), rad2.
 
         `rest` and `noise` are in IMU axes at the end of the step.
         """
-        seconds = float(step.seconds[-1])
-        before = self.covariance + np.diag(np.repeat([BIAS_WALK**2 * seconds, 0.0], [3, 9]))
-        H, own = self.columns(step), self.rate_variance * seconds * np.eye(3)
-        allowed = float(np.trace(H @ before @ H.T + own + noise))
-        excess = (min(float(rest @ rest), OUTLIER**2 * allowed) - allowed) / (3 * seconds)
-        x, P = update(np.concatenate([self.bias, self.axes.ravel()]), before, H, rest, noise + own)
-        variance = max(self.rate_variance + excess / MEMORY, float(RATE_NOISE**2))
+        x, P, excess = kalman.turned(
+            np.concatenate([self.bias, self.axes.ravel()]), self.covariance, self.rate_variance, step.rotations[-1],
+            step.velocity_arms[-1], step.duration, rest, noise, BIAS_WALK, OUTLIER,
+        )  # fmt: skip
+        variance = max(self.rate_variance + excess / (3 * step.duration * MEMORY), float(RATE_NOISE**2))
         return Gyroscope(x[:3], x[3:].reshape(3, 3), P, variance)
 
     def columns(self, step: Increments) -> Floats:
         """(3, 12) by which the turn over `step` grows with bias and axes; the rate is taken for constant."""
-        arm = step.rotations[-1].T @ step.velocity_arms[-1]
-        reading = np.linalg.solve(self.axes, so3.log(step.rotations[-1])) / step.seconds[-1]
-        return np.hstack([-arm @ self.axes, arm @ np.kron(np.eye(3), reading)])
+        return kalman.turn_columns(step.rotations[-1], step.velocity_arms[-1], self.axes, step.duration)

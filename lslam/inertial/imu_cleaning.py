@@ -8,6 +8,7 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.kernels.strapdown import overlaps
 from lslam.types.imu import ImuStream
 
 GRAVITY = 9.80665
@@ -112,7 +113,7 @@ def gaps(imu: ImuStream, longest_s: float) -> NDArray[np.int64]:
 
 def covers(silent: NDArray[np.int64], begin_ns: int, end_ns: int) -> bool:
     """Whether there are samples all the way from one instant to the other; silent : (G, 2) ns, the stream's `gaps`."""
-    return not bool(((silent[:, 0] < end_ns) & (silent[:, 1] > begin_ns)).any())
+    return not overlaps(silent, begin_ns, end_ns)
 
 
 def _ordered(imu: ImuStream, notes: list[str]) -> ImuStream:

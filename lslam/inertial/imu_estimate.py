@@ -6,15 +6,16 @@ so the rotations along the way are taken as known when forces are integrated.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.geometry import so3
 from lslam.inertial.gyroscope import Gyroscope
 from lslam.inertial.integrate import Increments, integrate
-from lslam.inertial.kalman import update
+from lslam.inertial.kalman import OUTLIER
+from lslam.kernels import kalman
+from lslam.kernels.rotation import vector_between
 from lslam.types.imu import ImuStream
 
 Floats = NDArray[np.float64]
@@ -28,6 +29,12 @@ FORCE_NOISE = 0.05
 # Random walks of bias and direction of gravity, per sqrt(s).
 GRAVITY_WALK, ACCEL_WALK = 5e-3, 2e-3
 GRAVITY_SIGMA = 0.03  # m/s2, over the Earth
+
+# (3, 3) m2 and rad2, of a registration without covariance.
+PLACE_NOISE, TURN_NOISE = PLACE_SIGMA**2 * np.eye(3), TURN_SIGMA**2 * np.eye(3)
+
+# (9, 9) per second, random walks of velocity, gravity and accelerometer bias.
+WALK = np.diag(np.repeat([0.0, GRAVITY_WALK**2, ACCEL_WALK**2], 3))
 
 VELOCITY, DOWN, BIAS = slice(0, 3), slice(3, 6), slice(6, 9)
 
@@ -76,8 +83,8 @@ class ImuEstimate:
         """
         R_felt = R @ step.rotations[-1]
         if noise is None:
-            noise = TURN_SIGMA**2 * np.eye(3)
-        return self.gyroscope.learnt(step, so3.log(R_felt.T @ R_end), 2 * R_felt.T @ noise @ R_felt)
+            noise = TURN_NOISE
+        return self.gyroscope.learnt(step, vector_between(R_felt, R_end), 2 * R_felt.T @ noise @ R_felt)
 
     def corrected(
         self, imu: ImuStream, step: Increments, R: Floats, R_end: Floats, moved: Floats,
@@ -90,39 +97,26 @@ class ImuEstimate:
         gyroscope : as the turn has `taught`
         noise : (3, 3) m2, world axes, of either place; None for a registration without covariance
         """
-        rest = so3.log((R @ step.rotations[-1]).T @ R_end)
+        rest = vector_between(R @ step.rotations[-1], R_end)
         # The shape of the turn is the gyroscope's, its sum is registration's.
-        arm = step.rotations[-1].T @ step.velocity_arms[-1]
         axes = self.gyroscope.axes
-        bias = self.gyroscope.bias - np.linalg.solve(arm @ axes, rest)
+        bias = self.gyroscope.bias - kalman.turn_bias(step.rotations[-1], step.velocity_arms[-1], axes, rest)
         step = integrate(imu, step.instants_ns, bias, self.accel_bias, axes)
+        place = PLACE_NOISE if noise is None else PLACE_NOISE + noise
         x, P = _propagate(self, step, R)
-        H = np.zeros((3, 12))
-        H[:, :3] = np.eye(3)
-        place = PLACE_SIGMA**2 * np.eye(3) + (0.0 if noise is None else noise)
-        x, P = update(x, P, H, moved - x[:3], 2 * place)
-        down = x[6:9]
-        norm = float(np.linalg.norm(down))
-        H = np.zeros((1, 12))
-        H[0, 6:9] = down / norm
-        x, P = update(x, P, H, np.array([GRAVITY - norm]), np.array([[GRAVITY_SIGMA**2]]))
-        return replace(self, gyroscope=gyroscope)._with(x[3:], P[3:, 3:], step)
+        x, P = kalman.placed(x, P, moved, 2 * place, GRAVITY, GRAVITY_SIGMA, OUTLIER)
+        return self._with(x[3:], P[3:, 3:], step, gyroscope)
 
-    def _with(self, x: Floats, P: Floats, step: Increments) -> ImuEstimate:
-        walk = np.zeros((9, 9))
-        np.fill_diagonal(walk, np.repeat([0.0, GRAVITY_WALK**2, ACCEL_WALK**2], 3) * step.seconds[-1])
-        return replace(self, velocity=x[VELOCITY], gravity=x[DOWN], accel_bias=x[BIAS], covariance=P + walk)
+    def _with(self, x: Floats, P: Floats, step: Increments, gyroscope: Gyroscope | None = None) -> ImuEstimate:
+        walk = WALK * step.duration
+        known = self.gyroscope if gyroscope is None else gyroscope
+        return ImuEstimate(x[VELOCITY], x[DOWN], x[BIAS], known, P + walk)
 
 
 def _propagate(estimate: ImuEstimate, step: Increments, R: Floats) -> tuple[Floats, Floats]:
     """Mean (12,) and covariance (12, 12) of displacement, velocity, gravity and accelerometer bias at the end of `step`."""
-    t = float(step.seconds[-1])
-    _, velocities, moved = step.motion(0, R, estimate.velocity, estimate.gravity)
-    F = np.zeros((12, 9))
-    F[0:3] = np.hstack([t * np.eye(3), 0.5 * t**2 * np.eye(3), -R @ step.position_arms[-1]])
-    F[3:6] = np.hstack([np.eye(3), t * np.eye(3), -R @ step.velocity_arms[-1]])
-    F[6:, 3:] = np.eye(6)
-    P = F @ estimate.covariance @ F.T
-    noise = FORCE_NOISE**2 * np.array([[t**3 / 3, t**2 / 2], [t**2 / 2, t]])
-    P[:6, :6] += np.kron(noise, np.eye(3))
-    return np.concatenate([moved[-1], velocities[-1], estimate.gravity, estimate.accel_bias]), P
+    x = np.concatenate([estimate.velocity, estimate.gravity, estimate.accel_bias])
+    return kalman.propagate(
+        x, estimate.covariance, step.duration, step.velocities[-1], step.positions[-1], step.velocity_arms[-1],
+        step.position_arms[-1], R, FORCE_NOISE,
+    )  # fmt: skip

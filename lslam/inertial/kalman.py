@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.kernels import kalman
+
 Floats = NDArray[np.float64]
 
 # Innovations beyond so many sigma are outliers and count accordingly less.
@@ -16,16 +18,9 @@ def update(x: Floats, P: Floats, H: Floats, rest: Floats, noise: Floats) -> tupl
 
     An outlier's noise is raised to what it shows.
     """
-    S = H @ P @ H.T + noise
-    beyond = surprise(rest, S)
-    if beyond > 1:
-        noise = noise * beyond
-        S = H @ P @ H.T + noise
-    K = np.linalg.solve(S, H @ P).T
-    left = np.eye(len(x)) - K @ H
-    return x + K @ rest, left @ P @ left.T + K @ noise @ K.T
+    return kalman.update(x, P, H, rest, noise, OUTLIER)
 
 
 def surprise(rest: Floats, expected: Floats) -> float:
     """Squared Mahalanobis length of the innovation (M,), over the outlier threshold."""
-    return float(rest @ np.linalg.solve(expected, rest)) / (len(rest) * OUTLIER**2)
+    return float(kalman.square(rest, expected)) / (len(rest) * OUTLIER**2)

@@ -198,14 +198,13 @@ def means(
     table = np.empty(table_size(n), np.int32)
     table[:] = -1
     keys = np.empty(n, np.int64)
-    # The first point of each voxel, sums relative to it, and count.
-    first, sums = np.empty((n, 3), np.float32), np.empty((n, 4))
+    # The first point of each voxel; sums relative to it, count, and sum of times, zeroed when the voxel is opened.
+    first, sums = np.empty((n, 3), np.float32), np.empty((n, 5))
     is_timed = len(times) == n
     half = np.float32(0.0)
     if is_timed and n > 0:
         early, late = extent(times)
         half = np.float32(0.5) * (early + late)
-    time_sums = np.zeros(n if is_timed else 0)
     inverse = 1.0 / size
     count = 0
     last_key = -1
@@ -224,7 +223,8 @@ def means(
                 slot = count
                 table[h] = slot
                 keys[slot] = key
-                sums[slot, 0], sums[slot, 1], sums[slot, 2], sums[slot, 3] = 0.0, 0.0, 0.0, 0.0
+                for k in range(5):
+                    sums[slot, k] = 0.0
                 first[slot, 0], first[slot, 1], first[slot, 2] = x, y, z
                 count += 1
         sums[slot, 0] += x - first[slot, 0]
@@ -232,7 +232,7 @@ def means(
         sums[slot, 2] += z - first[slot, 2]
         sums[slot, 3] += 1.0
         if is_timed:
-            time_sums[slot] += times[i]
+            sums[slot, 4] += times[i]
     out = np.empty((count, 3), np.float32)
     mean_times = np.empty(count if is_timed else 0, np.float32)
     counts = np.empty(count, np.int32)
@@ -243,7 +243,7 @@ def means(
         out[j, 1] = first[j, 1] + sums[j, 1] * w
         out[j, 2] = first[j, 2] + sums[j, 2] * w
         if is_timed:
-            mean_times[j] = time_sums[j] * w
+            mean_times[j] = sums[j, 4] * w
     return out, mean_times, counts
 
 

@@ -101,13 +101,17 @@ class ConstantVelocity(Stateful, MotionModel):
         self._step_s = 0.0
         # Velocity (6,) between the last two poses, m/s and rad/s.
         self._seen: Floats | None = None
+        # The newest prediction and its stamp, ns: several ask for the same one.
+        self._predicted: tuple[int, Floats] | None = None
 
     def predict(self, stamp_ns: int) -> Floats:
         """(4, 4) T_world_lidar expected at `stamp_ns`; the identity before the first scan."""
         if self._instant_ns is None or self._step_s <= 0:
             return self._pose.copy()
-        stretch = min(max((stamp_ns - self._instant_ns) * 1e-9 / self._step_s, 0.0), self.MAX_STRETCH)
-        return se3.normalise(self._pose @ se3.exp(stretch * self._twist))
+        if self._predicted is None or self._predicted[0] != stamp_ns:
+            stretch = min(max((stamp_ns - self._instant_ns) * 1e-9 / self._step_s, 0.0), self.MAX_STRETCH)
+            self._predicted = stamp_ns, se3.normalise(self._pose @ se3.exp(stretch * self._twist))
+        return self._predicted[1].copy()
 
     @property
     def is_known(self) -> bool:
@@ -149,6 +153,12 @@ class ConstantVelocity(Stateful, MotionModel):
             if step > 0:
                 self._learn(se3.log(se3.relative(self._pose, middle)) / step, step)
         self._instant_ns, self._pose = instant_ns, middle.copy()
+        self._predicted = None
+
+    def restore(self, state: State) -> None:
+        """Go on where `state` was taken."""
+        super().restore(state)
+        self._predicted = None
 
     def _learn(self, velocity: Floats, step: float) -> None:
         """Update with the velocity (6,) of a step of so many seconds, with bounded acceleration."""
