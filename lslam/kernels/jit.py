@@ -7,10 +7,10 @@ on the machine; no `parallel`, because results must not depend on the number of 
 from __future__ import annotations
 
 import contextlib
+import gc
 import hashlib
 import logging
 import os
-import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -53,6 +53,7 @@ else:
     os.environ["NUMBA_CACHE_DIR"] = str(_folder)  # numba reads it when it is imported
 
 import numba  # noqa: E402
+from numba.core import event  # noqa: E402
 
 
 def kernel(function: F) -> F:
@@ -109,13 +110,34 @@ def lock_file() -> Path | None:
 
 
 @contextlib.contextmanager
-def announced(log: logging.Logger, after_s: float = 2.0) -> Iterator[None]:
-    """Say that kernels are being compiled when the block takes longer than loading them would."""
-    kept = "for this run only" if _folder is None else f"once; they are kept in {_folder}"
-    timer = threading.Timer(after_s, log.info, ["compiling kernels, %s", kept])
-    timer.daemon = True
-    timer.start()
+def announced(log: logging.Logger) -> Iterator[None]:
+    """Say that kernels are being compiled in the block when the first one is: not when they are loaded, however slowly."""
+    with event.install_listener("numba:compile", _Announcement(log)), _rarely_collecting():
+        yield
+
+
+class _Announcement(event.Listener):
+    """Hears of every function that numba begins to compile."""
+
+    def __init__(self, log: logging.Logger) -> None:
+        self._log: logging.Logger | None = log
+
+    def on_start(self, event: Any) -> None:
+        log, self._log = self._log, None
+        if log is not None:
+            kept = "for this run only" if _folder is None else f"once; they are kept in {_folder}"
+            log.info("compiling kernels, %s", kept)
+
+    def on_end(self, event: Any) -> None:
+        pass
+
+
+@contextlib.contextmanager
+def _rarely_collecting() -> Iterator[None]:
+    """Compiling makes millions of objects that stay: looking at them again and again is a tenth of its time."""
+    before = gc.get_threshold()
+    gc.set_threshold(100_000, *before[1:])
     try:
         yield
     finally:
-        timer.cancel()
+        gc.set_threshold(*before)
