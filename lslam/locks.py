@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 from collections.abc import Iterator
 from pathlib import Path
 from typing import IO
+
+log = logging.getLogger("lslam")
 
 
 def lock(stream: IO[str], wait: bool = False) -> bool:
@@ -25,8 +28,11 @@ def lock(stream: IO[str], wait: bool = False) -> bool:
 
 
 @contextlib.contextmanager
-def one_at_a_time(path: Path | None) -> Iterator[None]:
-    """Hold `path`, made when it is missing, during the block: others wait. Where it cannot be made, or is None, nobody does."""
+def one_at_a_time(path: Path | None, doing: str) -> Iterator[None]:
+    """Hold `path`, made when it is missing, during the block: others wait. Where it cannot be made, or is None, nobody does.
+
+    doing : what whoever holds it does, for who waits: "compiles the kernels"
+    """
     if path is None:
         yield
         return
@@ -37,5 +43,7 @@ def one_at_a_time(path: Path | None) -> Iterator[None]:
         yield
         return
     with stream:
-        lock(stream, wait=True)
+        if not lock(stream):
+            log.info("waiting for another process that %s", doing)
+            lock(stream, wait=True)
         yield

@@ -40,7 +40,7 @@ def recordings(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path
     def unpack(name: str) -> Path:
         if not (SHARED / "unpack.py").is_file() or not any(SHARED.glob(f"{name}.*")):
             pytest.skip(f"recording {name} is not on this machine")
-        with one_at_a_time(target / f"{name}.lock"):
+        with one_at_a_time(target / f"{name}.lock", f"unpacks {name}"):
             if not (done := target / f"{name}.done").exists():
                 subprocess.run(
                     [sys.executable, str(SHARED / "unpack.py"), str(target), name], check=True, capture_output=True

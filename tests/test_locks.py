@@ -2,37 +2,42 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 import time
 from pathlib import Path
 
+import pytest
+
 from lslam.locks import lock, one_at_a_time
 
 
-def test_the_lock_makes_others_wait(tmp_path: Path) -> None:
+def test_the_lock_makes_others_wait_and_says_so(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO, "lslam")
     path = tmp_path / "new" / "some.lock"
     order = []
     inside = threading.Event()
 
     def other() -> None:
         inside.wait()
-        with one_at_a_time(path):
+        with one_at_a_time(path, "works"):
             order.append("second")
 
     thread = threading.Thread(target=other)
     thread.start()
-    with one_at_a_time(path):
+    with one_at_a_time(path, "works"):
         inside.set()
         time.sleep(0.2)
         order.append("first")
     thread.join(10)
     assert order == ["first", "second"]
+    assert caplog.messages == ["waiting for another process that works"]
 
 
 def test_what_cannot_be_locked_does_not_stop_the_work(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     done = []
-    with one_at_a_time(tmp_path / "file" / "below" / "some.lock"):
+    with one_at_a_time(tmp_path / "file" / "below" / "some.lock", "works"):
         done.append(1)
     assert done
 

@@ -117,7 +117,7 @@ def _up_by_ground(sequence: Sequence, results: list[ScanResult], config: Config)
     for number, result in enumerate(results):
         if result.status != "ok":
             continue
-        with suppress(InputError), jit.announced(log), one_at_a_time(jit.lock_file()):
+        with suppress(InputError), jit.announced(log), one_at_a_time(jit.lock_file(), "compiles kernels"):
             R, height = levelling(sequence.scan(number).points, config.preprocess.ground_tolerance, CELLS)
             return np.asarray(result.T_world_lidar[:3, :3] @ R[2]) if np.isfinite(height) else None
     return None

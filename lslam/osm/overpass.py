@@ -124,7 +124,7 @@ def _bounds_of(path: Path) -> Bounds | None:
 def _ask_patiently(bounds: Bounds, config: OsmConfig, folder: Path, sleep: Callable[[float], None]) -> OverpassReply:
     wait = config.backoff
     # Many runs at once, threads or processes, are still one polite client.
-    with _one_thread_at_a_time, one_at_a_time(folder / "request.lock"):
+    with _one_thread_at_a_time, one_at_a_time(folder / "request.lock", "asks the map server"):
         for attempt in range(1, config.attempts + 1):
             try:
                 return _ask(bounds, config)

@@ -133,7 +133,7 @@ def _warm_up(
     config: Config, manifest: Manifest, is_over: bool,
 ) -> None:  # fmt: skip
     """Compile or load what the scans would otherwise wait for, less of it when odometry is over."""
-    with manifest.timed("compile_s"), jit.announced(log), one_at_a_time(jit.lock_file()):
+    with manifest.timed("compile_s"), jit.announced(log), one_at_a_time(jit.lock_file(), "compiles kernels"):
         if not is_over:
             odometry.warm_up()
         if stationary is not None:

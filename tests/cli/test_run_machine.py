@@ -55,9 +55,13 @@ def test_cold_starts_on_one_cache_all_succeed(cold_starts: Starts) -> None:
     for _, stderr in ended:
         assert "Traceback" not in stderr
         assert "damaged" not in stderr
-        assert stderr.count("compiling kernels, once") <= 1
-    # Who finds them compiled while waiting has waited long enough to be told.
-    assert sum("compiling kernels, once" in stderr for _, stderr in ended) > STARTS // 2
+    # A kernel that the first one's scans do not need may be left to another: the first always compiles.
+    told = [
+        (s.count("compiling kernels, once"), s.count("waiting for another process that compiles")) for _, s in ended
+    ]
+    assert max(max(t) for t in told) == 1
+    assert sum(compiles for compiles, _ in told) >= 1
+    assert sum(waits for _, waits in told) >= STARTS // 2
     assert len({(base / f"run{k}" / "map.ply").read_bytes() for k in range(STARTS)}) == 1
 
 

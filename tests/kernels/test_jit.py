@@ -146,13 +146,14 @@ def test_only_compiling_is_announced_and_once(caplog: pytest.LogCaptureFixture) 
     def twice(value: float) -> float:
         return value + value
 
-    with caplog.at_level("INFO"):
-        with jit.announced(logging.getLogger("lslam")):
+    log = logging.getLogger(__name__)  # that of lslam is as the command lines of other tests left it
+    with caplog.at_level("INFO", __name__):
+        with jit.announced(log):
             time.sleep(0.05)
         assert not caplog.messages
-        with jit.announced(logging.getLogger("lslam")):
+        with jit.announced(log):
             assert (twice(1.0), twice(1)) == (2.0, 2)
-        with jit.announced(logging.getLogger("lslam")):
+        with jit.announced(log):
             twice(2.0)
     assert len(caplog.messages) == 1
     assert caplog.messages[0].startswith("compiling kernels")
