@@ -21,7 +21,7 @@ LAYERS = [
     ["readers", "odometry", "inertial", "integrity", "loops", "graph", "maps", "evaluation", "simulation"],
     ["recovery"],
     ["keyframes", "registration"],
-    ["preprocessing"],
+    ["preprocessing", "profiling"],
     ["formats", "warned"],
     ["types"],
     ["geometry"],

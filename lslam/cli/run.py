@@ -67,6 +67,12 @@ if TYPE_CHECKING:
     "--poses", type=click.Path(path_type=Path), metavar="FILE", help="Somebody else's trajectory instead of odometry."
 )
 @click.option("--strict", is_flag=True, help="Exit 4 when anything was degraded: a scan skipped or bridged.")
+@click.option(
+    "--profile",
+    type=click.Path(dir_okay=False, path_type=Path),
+    metavar="FILE.json",
+    help="Write where the time goes, for speedscope.",
+)
 @click.option("--dry-run", is_flag=True, help="Resolve everything, write nothing.")
 @options.metrics
 @options.reading
@@ -93,13 +99,14 @@ def _run(sequence: str, given: dict[str, Any]) -> None:
     truth = read_truth(given["gt"], opened)
     from lslam.pipeline.run import plan, run
     from lslam.pipeline.run_folder import default_folder
+    from lslam.profiling import profiled
 
     out = given["out"] or default_folder(opened.name, _variant(config))
     if given["dry_run"]:
         _print_plan(plan(opened, config, truth), config, out, given["as_json"])
         return
     try:
-        with heeded() as stop, ExitStack() as stack:
+        with heeded() as stop, profiled(given["profile"]), ExitStack() as stack:
             run(
                 opened, config, out=out, ground_truth=truth, overwrite=given["overwrite"], resume=given["resume"],
                 command=shlex.join(["lslam", *sys.argv[1:]]),
@@ -144,11 +151,13 @@ def _variant(config: Config) -> str:
 
 
 def _check_folder(given: dict[str, Any]) -> None:
-    """Raise UsageError for flags about the folder that contradict each other."""
+    """Raise UsageError for flags about folders that contradict each other, or that are not there."""
     if given["overwrite"] and given["resume"]:
         raise UsageError("--overwrite runs everything anew and --resume keeps what is done: give one of them")
     if given["resume"] and given["out"] is None:
         raise UsageError("--resume needs --out: the folder of the run that shall go on")
+    if given["profile"] is not None and not given["profile"].absolute().parent.is_dir():
+        raise UsageError(f"--profile: {given['profile'].absolute().parent} is not a folder")
     if given["out"] is not None and not given["resume"] and not given["dry_run"]:
         from lslam.pipeline.run_folder import check_target
 

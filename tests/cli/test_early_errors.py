@@ -30,6 +30,7 @@ NOTHING = [
     (f"run {SAMPLE} --gt nowhere.tum", "nowhere.tum does not exist"),
     (f"run {SAMPLE} --osm nowhere.osm --origin 49,8", "nowhere.osm does not exist"),
     (f"run {SAMPLE} --metrics foo", "no metrics 'foo'"),
+    (f"run {SAMPLE} --profile nowhere/p.json", "is not a folder"),
     (f"run {SAMPLE} --gnss --crs foo", "no EPSG code"),
     (f"eval nowhere.tum {TRUTH}", "nowhere.tum does not exist"),
     (f"eval {TRUTH} {TRUTH} --align foo", "--align foo"),

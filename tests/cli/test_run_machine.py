@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import resource
 import shutil
@@ -121,3 +122,14 @@ def test_nothing_is_written_beside_the_output_and_the_cache(tmp_path: Path) -> N
     assert done.returncode == 0, done.stderr
     assert list(work.iterdir()) == []
     assert [p.name for p in home.iterdir()] in ([], [".cache"])
+
+
+def test_a_profile_shows_where_the_time_went(tmp_path: Path) -> None:
+    done = lslam_process(*MAPPING, tmp_path / "out", "--profile", tmp_path / "profile.json", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    document = json.loads((tmp_path / "profile.json").read_text())
+    main = document["profiles"][[p["name"] for p in document["profiles"]].index("MainThread")]
+    files = [document["shared"]["frames"][k]["file"] for sample in main["samples"] for k in sample]
+    assert any(file.endswith("lslam/pipeline/map_pass.py") for file in files)
+    took = sum(manifest(tmp_path / "out")["timings"].values())
+    assert main["endValue"] > took
