@@ -9,6 +9,7 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from contextvars import copy_context
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -46,7 +47,7 @@ class StackProfile:
     """Stacks of every thread but its own, with the seconds spent in each."""
 
     def __init__(self) -> None:
-        self._thread = threading.Thread(target=self._look, name="profile", daemon=True)
+        self._thread = threading.Thread(target=copy_context().run, args=(self._look,), name="profile", daemon=True)
         self._is_over = threading.Event()
         self._began = self._ended = 0.0
         self._interval_s, self._changes = INTERVAL_S, 0

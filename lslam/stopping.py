@@ -7,7 +7,7 @@ import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
-from itertools import dropwhile, islice
+from itertools import dropwhile
 from threading import Timer, current_thread, main_thread
 from types import FrameType
 from typing import NoReturn, TypeVar
@@ -18,8 +18,10 @@ T = TypeVar("T")
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 AGAIN_S = 0.01
-# A kernel that gives back an array calls this module of numba, and ends as a SystemError when something is raised there.
-_OF_KERNELS, _DEEP = "numba.core.serialize", 10
+# Nothing is raised in these: a kernel that gives back an array would end as a SystemError, LLVM would free a module twice.
+_FOREIGN = ("numba", "llvmlite")
+_BETWEEN_PASSES = "numba.core.compiler_machinery"  # of one kernel: where compiling can be left
+_DEEP = 10
 
 
 class Interrupt(KeyboardInterrupt):
@@ -30,7 +32,7 @@ class Stop:
     """Whether somebody asked to stop.
 
     While `is_gentle`, the first signal only says so; otherwise, and for the second one, it raises Interrupt where Python is,
-    but never in a kernel. may_force : whether a second one means more than the first
+    but never in a kernel or in LLVM. may_force : whether a second one means more than the first
     """
 
     def __init__(self, may_force: bool = True) -> None:
@@ -57,12 +59,12 @@ class Stop:
             self._is_asked, self._number = True, number
         if self.is_gentle and not self._is_forced:
             return
-        inner = [(str(f.f_globals.get("__name__")), f) for f in islice(_outwards(frame), _DEEP)]
-        if any(name == __name__ for name, _ in inner):  # in `on_lost`, where it would be lost once more
+        names = [(str(f.f_globals.get("__name__")), f) for f in _outwards(frame)]
+        if any(name == __name__ for name, _ in names[:_DEEP]):  # in `on_lost`, where it would be lost once more
             self._come_again()
             return
-        left = dropwhile(lambda named: named[0] != _OF_KERNELS, inner)
-        caller = next((f for name, f in left if not name.startswith("numba.")), None)
+        left = dropwhile(lambda named: _package(named[0]) not in _FOREIGN, names)
+        caller = next((f for name, f in left if _can_be_left(name)), None)
         if caller is None:
             raise Interrupt
         _raise_after(caller)
@@ -164,8 +166,18 @@ def _outwards(frame: FrameType | None) -> Iterator[FrameType]:
         frame = frame.f_back
 
 
+def _package(name: str) -> str:
+    return name.partition(".")[0]
+
+
+def _can_be_left(name: str) -> bool:
+    """Whether raising in this module harms nothing below it."""
+    package = _package(name)
+    return name == _BETWEEN_PASSES or (package not in _FOREIGN and package not in sys.stdlib_module_names)
+
+
 def _raise_after(caller: FrameType) -> None:
-    """Raise Interrupt in the frame that called the kernel, at its next line or its end."""
+    """Raise Interrupt in the frame `caller`, at its next line or its end."""
 
     def interrupt(*_: object) -> NoReturn:
         raise Interrupt

@@ -5,10 +5,14 @@ from __future__ import annotations
 import os
 import signal
 import time
+import types
 from collections.abc import Iterator
+from typing import Any
 
+import numba
 import numpy as np
 import pytest
+from numba.core import event
 
 from lslam.kernels.jit import kernel
 from lslam.stopping import Interrupt, heeded
@@ -91,3 +95,44 @@ def _alarm() -> Iterator[None]:
     before = signal.signal(signal.SIGALRM, lambda number, frame: signal.getsignal(signal.SIGINT)(number, frame))  # type: ignore
     yield
     signal.signal(signal.SIGALRM, before)
+
+
+def test_compiling_is_left_between_two_passes_and_the_kernel_compiles_afterwards() -> None:
+    """Raised in the middle of LLVM, an interrupt leaves a module with two owners, who both free it."""
+    passes: list[str] = []
+
+    class Struck(event.Listener):
+        def on_start(self, event: Any) -> None:
+            passes.append(event.data["name"])
+            if len(passes) == 10:
+                os.kill(os.getpid(), signal.SIGINT)
+                for _ in range(1000):
+                    pass
+
+        def on_end(self, event: Any) -> None:
+            pass
+
+    @numba.njit
+    def doubled(x: float) -> float:
+        return 2 * x
+
+    with heeded(), pytest.raises(Interrupt) as raised, event.install_listener("numba:run_pass", Struck()):
+        doubled(1.0)
+    assert len(passes) == 10
+    assert raised.traceback[-2].frame.f_globals["__name__"] == "numba.core.compiler_machinery"
+    assert doubled(1.5) == 3.0
+
+
+def test_what_comes_in_llvm_is_raised_when_it_is_left() -> None:
+    module = types.ModuleType("llvmlite.binding.struck")
+    source = "def strike(kill):\n    kill()\n    for k in range(1000):\n        pass\n    return 'whole'\n"
+    exec(source, module.__dict__)
+    seen: list[str] = []
+
+    def work() -> None:
+        seen.append(module.strike(lambda: signal.raise_signal(signal.SIGINT)))
+        seen.append("too late")
+
+    with heeded(), pytest.raises(Interrupt):
+        work()
+    assert seen == ["whole"]

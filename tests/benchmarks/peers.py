@@ -383,7 +383,8 @@ def timed(peer: Peer, scans: Iterable[Scan]) -> tuple[Floats, Floats]:
         done = time.perf_counter(), time.process_time()
         peer.convert_within(converted)
         after = time.perf_counter(), time.process_time()
-        seconds.append([2 * done[k] - began[k] - after[k] for k in (0, 1)])
+        # A first scan, which is only kept, may take less than the noise of its conversion.
+        seconds.append([max(2 * done[k] - began[k] - after[k], 0.0) for k in (0, 1)])
         poses.append(pose)
     return np.stack(poses), np.array(seconds)
 
