@@ -25,9 +25,10 @@ class RegistrationConfig(Section):
         description="`gicp` and `vgicp`: a point's surface is that of its scan in the voxel around, where several rings make "
         "one, or of its twenty nearest neighbours, as in the paper",
     )
-    target: Literal["map", "keyframe", "scan"] = Field(
+    target: Literal["map", "submap", "keyframe", "scan"] = Field(
         "map",
-        description="registered against a map of all scans near by, of the last keyframes, or the last scan alone",
+        description="registered against a map of all scans near by, of the keyframes around, of the last keyframes, or "
+        "the last scan alone",
     )
     keyframes: int = Field(10, ge=1, description="`target = keyframe`: how many")
     keyframe_m: float = Field(2.0, gt=0, description="m; so far from the newest of them a new one is made")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import replace
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,7 +50,7 @@ class Icp(Stateful):
     """
 
     deskew = "by the motion prior, and again by the motion that registration finds"
-    STATE = ("registration", "_uncertainty")
+    STATE: ClassVar[tuple[str, ...]] = ("registration", "_uncertainty")
 
     def __init__(self, registration: Registration) -> None:
         self.registration = registration

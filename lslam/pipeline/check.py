@@ -17,8 +17,8 @@ ON_GAUSSIANS = tuple(name for name, (module, _) in METHODS.items() if module == 
 HEEDED = {
     "residual": ON_GAUSSIANS,
     "target": ON_GAUSSIANS,
-    "inlier_distance": (*ON_GAUSSIANS, "icp-svd"),
-    "inlier_ratio": (*ON_GAUSSIANS, "icp-svd"),
+    "inlier_distance": (*ON_GAUSSIANS, "dlo", "icp-svd"),
+    "inlier_ratio": (*ON_GAUSSIANS, "dlo", "icp-svd"),
 }
 
 

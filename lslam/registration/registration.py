@@ -66,6 +66,8 @@ class Registration(Stateful):
         self.residual = c.residual or "plane"
         self.kind = residual_named(self.residual)
         self.target = make_target(c)
+        # On keyframes far apart a sparse sensor finds few of the surfaces it sees: the share alone tells nothing, its fall does.
+        self._gates = c.model_copy(update={"min_inliers": 0.0}) if c.target == "submap" else c
         self.map = LocalMap(
             c.voxel_size * self.kind.voxel_share, coarse_factor=c.coarse_factor,
             min_points=c.min_points, planarity=c.planarity, count_cap=c.count_cap, reach=1.2 * self.preprocess.range_max,
@@ -109,9 +111,7 @@ class Registration(Stateful):
             return failed(T_prior, count, f"{count} usable points, {MIN_SOURCE_POINTS} needed")
         if len(self.map) == 0:
             return RegistrationResult(T_prior, covariance=np.diag([1e-12] * 6), source_points=count)
-        if self.kind.needs_covariance and points.covariance is None:
-            found = source_covariance(points.source, points.map_points, c.sigma**2, c.neighbourhood)
-            points = replace(points, covariance=found)
+        points = self.covered(points)
         if self.kind.needs_gaps:
             points = replace(points, gaps=self._gaps(points))
         width, steps = self.threshold.width, c.max_iterations * self.kind.times_steps
@@ -123,6 +123,14 @@ class Registration(Stateful):
         for policy in () if is_near else self.recovery:
             result = policy.recover(self, points, T_prior, result)
         return result
+
+    def covered(self, points: PreparedPoints) -> PreparedPoints:
+        """The points with the covariance of the surface at each of them, where the residual asks for it."""
+        if not self.kind.needs_covariance or points.covariance is not None:
+            return points
+        c = self.config
+        found = source_covariance(points.source, points.map_points, c.sigma**2, c.neighbourhood)
+        return replace(points, covariance=found)
 
     def update(self, points: PreparedPoints, result: RegistrationResult) -> None:
         """Insert the scan into the map unless its registration failed; adapt thresholds unless it was denied."""
@@ -159,4 +167,6 @@ class Registration(Stateful):
         """The result with its correction of the prior, or a failed one at the prior with the reason."""
         # One scan of a sparse sensor makes few planes: what matches them may be right and yet a small share.
         c, is_filled = self.config, self.inserted > self.config.start_scans and self.config.target != "scan"
-        return accepted(result, T_prior, c, self.agreement, c.min_overlap if is_filled else c.start_overlap, WORDING)
+        return accepted(
+            result, T_prior, self._gates, self.agreement, c.min_overlap if is_filled else c.start_overlap, WORDING
+        )

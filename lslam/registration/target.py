@@ -1,4 +1,4 @@
-"""What a scan is registered against: all scans near by, the last keyframes, or the last scan alone."""
+"""What a scan is registered against: all scans near by, a submap, the last keyframes, or the last scan alone."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from lslam.config.registration import RegistrationConfig
 from lslam.geometry import se3, so3
 from lslam.preprocessing.prepare import PreparedPoints
 from lslam.registration.local_map import LocalMap
+from lslam.registration.submap import SubmapTarget
 from lslam.types.state import Stateful
 
 Floats = NDArray[np.float64]
@@ -68,6 +69,8 @@ class KeyframeTarget(Stateful):
 
 def make_target(config: RegistrationConfig) -> Target:
     """The target that `config.target` names."""
+    if config.target == "submap":
+        return SubmapTarget()
     if config.target == "keyframe":
         return KeyframeTarget(config.keyframes, config.keyframe_m, float(np.deg2rad(config.keyframe_deg)))
     return ScanTarget() if config.target == "scan" else MapTarget()

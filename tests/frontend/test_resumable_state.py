@@ -34,6 +34,7 @@ VARIANTS: list[tuple[str, tuple[str, ...]]] = [
     ("icp", ("preprocess.skip_standing=true",)),
     ("icp", ("registration.target=keyframe", "registration.keyframes=2")),
     ("ndt", ("registration.target=scan",)),
+    ("dlo", ()),
     ("icp-svd", ()),
     ("loam", ()),
     ("lego-loam", ()),

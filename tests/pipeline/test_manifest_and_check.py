@@ -115,7 +115,9 @@ def test_names_are_checked_with_a_way_out() -> None:
     [("loam", "target='scan'", False), ("lego-loam", "inlier_ratio=0.8", False), ("floam", "inlier_distance=2", False),
      ("kiss-icp", "target='keyframe'", False), ("small-gicp", "residual='ndt'", False), ("icp-svd", "target='keyframe'", False),
      ("icp-svd", "residual='point'", False), ("loam", "target='map'", True), ("icp-svd", "target='scan'", True),
-     ("icp-svd", "inlier_ratio=0.8", True), ("icp-svd", "inlier_distance=2", True), ("ndt", "target='keyframe'", True),
+     ("dlo", "target='scan'", False), ("dlo", "residual='plane'", False), ("icp", "target='submap'", True),
+     ("dlo", "inlier_ratio=0.8", True), ("icp-svd", "inlier_ratio=0.8", True), ("icp-svd", "inlier_distance=2", True),
+     ("ndt", "target='keyframe'", True),
      ("gicp", "inlier_ratio=0.8", True), ("icp", "residual='ndt'", True)],
 )  # fmt: skip
 def test_a_key_that_the_method_would_pass_over_is_refused(method: str, setting: str, heeds: bool) -> None:

@@ -63,7 +63,7 @@ def test_the_coarse_map_alone_brings_a_start_near(residual: Residual) -> None:
 
 
 @pytest.mark.parametrize("residual", RESIDUALS)
-@pytest.mark.parametrize("target", ["map", "keyframe", "scan"])
+@pytest.mark.parametrize("target", ["map", "submap", "keyframe", "scan"])
 def test_a_drive_through_the_room_is_followed(residual: Residual, target: str) -> None:
     """Twelve scans, 0.3 m and 2 deg apart; one that claims to stand still is 3.3 m off in the end."""
     rng = np.random.default_rng(1)
