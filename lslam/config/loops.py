@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 from pydantic import Field
 
 from lslam.config.section import Section
@@ -36,6 +38,14 @@ class LoopsConfig(Section):
     )
     descriptor: str = Field(
         "scan-context", description="by which places are told alike: scan-context, or a plug-in's name"
+    )
+    memory: Literal["all", "bounded"] = Field(
+        "all",
+        description="which older places are compared: all, or a working memory of bounded size (Labbé and Michaud 2013), so "
+        "that the time per keyframe does not grow with the run",
+    )
+    memory_places: int = Field(
+        500, ge=20, description="places, 4 m of way each, in the working memory of `loops.memory = bounded`"
     )
     rings: int = Field(20, ge=4, le=400, description="Scan Context: rings of the polar image (Kim and Kim 2018)")
     sectors: int = Field(60, ge=8, le=360, description="Scan Context: sectors of the polar image")

@@ -26,22 +26,22 @@ def largest_eigenvalue(a: float, b: float, c: float, d: float, e: float, f: floa
 
 @kernel
 def gated(
-    b: int, positions: Floats, distances: Floats, covariances: Floats, sums: Floats, squares: Floats,
+    b: int, among: NDArray[np.int64], positions: Floats, distances: Floats, covariances: Floats, sums: Floats, squares: Floats,
     rates: tuple[float, float], bounds: tuple[float, float, float],
 ) -> NDArray[np.int64]:  # fmt: skip
-    """Older keyframes, increasing, that `loops.gating` has within the gate about keyframe `b`.
+    """The keyframes of `among`, in their order, that `loops.gating` has within the gate about keyframe `b`.
 
     positions (K, 3), distances (K,) travelled, m; covariances (K, 6, 6) or none; sums (K + 1, 3), squares (K + 1,) of positions
     rates : error of scale and bend per m; bounds : least way between two keyframes, m away that is always within, sigmas
     """
-    kept = np.empty(b, np.int64)
+    kept = np.empty(len(among), np.int64)
     count = 0
     per_m, turn_per_m = rates
     least, near, sigmas = bounds
     x, y, z = positions[b, 0], positions[b, 1], positions[b, 2]
     is_known = len(covariances) > 0
     D, E = np.zeros((3, 3)), np.empty((3, 3))
-    for k in range(b):
+    for k in among:
         travelled = distances[b] - distances[k]
         if not travelled >= least:
             continue

@@ -29,6 +29,7 @@ from lslam.loops.level_submap import LevelSubmap, make_level_submap
 from lslam.loops.shared_results import SharedResults
 from lslam.loops.throttling import LoopThrottle
 from lslam.loops.verify import Verification, Verifier
+from lslam.loops.working_memory import WorkingMemory
 from lslam.types.constraint import Constraint, LoopCandidate, LoopStage, Verdict
 from lslam.types.keyframe import Keyframe
 from lslam.types.stage_clock import KeyframeClocks, StageClock
@@ -86,7 +87,7 @@ def warm_up(config: LoopsConfig) -> None:
     room = np.random.default_rng(0).uniform(-8, 8, (3000, 3)).astype(np.float32)
     room[np.arange(3000), np.arange(3000) % 3] = 8.0
     transform(room, np.eye(4), np.empty_like(room))
-    OdometryUncertainty([Keyframe(0, 0, 0, np.eye(4), np.eye(6))], 0.0, 0.0).gated(0, 1.0, 1.0, 1.0)
+    OdometryUncertainty([Keyframe(0, 0, 0, np.eye(4), np.eye(6))], 0.0, 0.0).gated(0, np.arange(0), 1.0, 1.0, 1.0)
     create_descriptor(config).add(0, room)
     submap_of_room = make_level_submap(room, RegistrationConfig())
     Verifier(LoopsConfig(), RegistrationConfig()).verify(
@@ -119,6 +120,9 @@ class Detector:
         # Submaps overlap: the first keyframe of every few metres represents those after it.
         steps = np.floor(self.uncertainty.distances / (NEAR / 2))
         self._is_described = np.diff(steps, prepend=-1.0) > 0
+        bound = config.memory_places if config.memory == "bounded" else None
+        places = np.cumsum(self._is_described) - 1
+        self.memory = WorkingMemory(places, self.uncertainty.distances, bound, config.min_travel)
 
     def find(
         self, clocks: KeyframeClocks | None = None, should_stop: Callable[[], bool] = lambda: False, threads: int = 1
@@ -132,7 +136,7 @@ class Detector:
             self._level_world()
         # Of thousands of keyframes, each has thousands: those of the next few are held.
         gated = SharedResults(self._gated, HELD)
-        ahead: dict[int, Future[list[LoopCandidate]]] = {}
+        ahead: dict[int, tuple[NDArray[np.int64], Future[list[LoopCandidate]]]] = {}
         with ThreadPoolExecutor(threads, "lslam-loops") as pool:
             try:
                 for b, keyframe in enumerate(self.keyframes):
@@ -140,6 +144,8 @@ class Detector:
                         raise InterruptedRunError(
                             f"interrupted during loop closure detection, at keyframe {b} of {count}"
                         )
+                    if self.memory.reach(b):
+                        gated = SharedResults(self._gated, HELD)
                     older = gated.get(b)
                     if len(older) == 0:
                         throttle.reset()
@@ -148,11 +154,16 @@ class Detector:
                         candidates.append(self._thinned(older, b, throttle.wait))
                         continue
                     for n in (b, *islice(self._due_after(b, gated, throttle), threads - 1)):
-                        if n not in ahead:
-                            clock = clocks[n]
-                            ahead[n] = pool.submit(copy_context().run, self._examined, n, gated.get(n), clock)
-                    examined = ahead.pop(b).result()
+                        # What was begun with another memory is begun again.
+                        if n not in ahead or (n == b and not np.array_equal(ahead[n][0], older)):
+                            compared = gated.get(n)
+                            task = pool.submit(copy_context().run, self._examined, n, compared, clocks[n])
+                            ahead[n] = compared, task
+                    examined = ahead.pop(b)[1].result()
                     candidates += examined
+                    for closed in examined:
+                        if closed.is_accepted:
+                            self.memory.close(closed.a, b)
                     throttle.observe(
                         keyframe.distance,
                         Verdict.ACCEPTED if any(c.is_accepted for c in examined) else Verdict.REJECTED,
@@ -162,10 +173,10 @@ class Detector:
         return candidates
 
     def _due_after(self, b: int, gated: SharedResults[NDArray[np.int64]], throttle: LoopThrottle) -> Iterator[int]:
-        """The keyframes after `b` that are due next if all verdicts are as the last one."""
+        """The next keyframes after `b` that are due if all verdicts are as the last one."""
         throttle = copy(throttle)
         throttle.observe(self.keyframes[b].distance, throttle.last or Verdict.ACCEPTED)
-        for n in range(b + 1, len(self.keyframes)):
+        for n in range(b + 1, min(b + HELD, len(self.keyframes))):
             if len(gated.get(n)) == 0:
                 throttle.reset()
             elif throttle.is_due(self.keyframes[n].distance):
@@ -190,10 +201,11 @@ class Detector:
         self.uncertainty = OdometryUncertainty(self.keyframes, self.config.drift_percent, self.config.drift_deg)
 
     def _gated(self, b: int) -> NDArray[np.int64]:
-        """Older keyframes within the gate of odometry about `b`, but not on the way just travelled."""
+        """Older keyframes in the memory within the gate of odometry about `b`, but not on the way just travelled."""
+        among = self.memory.before(b)
         if self.config.radius is None:
-            return self.uncertainty.gated(b, self.config.min_travel, NEAR, self.config.sigmas)
-        return self.uncertainty.gated(b, self.config.min_travel, self.config.radius, 0.0)
+            return self.uncertainty.gated(b, among, self.config.min_travel, NEAR, self.config.sigmas)
+        return self.uncertainty.gated(b, among, self.config.min_travel, self.config.radius, 0.0)
 
     def _thinned(self, older: NDArray[np.int64], b: int, wait: float) -> LoopCandidate:
         a = self._nearest(older, b)

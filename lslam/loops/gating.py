@@ -66,14 +66,14 @@ class OdometryUncertainty:
             square = square + np.maximum(np.linalg.eigvalsh(own[:, 3:, 3:])[:, 2], 0.0)
         return RelativeUncertainty(position, np.sqrt(square))
 
-    def gated(self, b: int, least: float, near: float, sigmas: float) -> NDArray[np.int64]:
-        """Older keyframes (C,), increasing, at least `least` m of way ago and no farther from keyframe `b` than `near` m and so
-        many times the standard deviation of the position where it is worst (`RelativeUncertainty.reach`).
+    def gated(self, b: int, among: NDArray[np.int64], least: float, near: float, sigmas: float) -> NDArray[np.int64]:
+        """Those `among` the older keyframes (C,) at least `least` m of way ago and no farther from keyframe `b` than `near` m and
+        so many times the standard deviation of the position where it is worst (`RelativeUncertainty.reach`).
         """
         covariances = np.zeros((0, 6, 6)) if self.covariances is None else self.covariances
         return np.asarray(gating.gated(
-            b, self.positions, self.distances, covariances, self._sum, self._squares, (self._per_m, float(self._turn_per_m)),
-            (float(least), float(near), float(sigmas)),
+            b, among, self.positions, self.distances, covariances, self._sum, self._squares,
+            (self._per_m, float(self._turn_per_m)), (float(least), float(near), float(sigmas)),
         ))  # fmt: skip
 
     def _lever(self, b: int, older: NDArray[np.int64]) -> Floats:
