@@ -37,6 +37,23 @@ def index_of(x: float, inverse_size: float) -> int:
     return int(np.floor(x * inverse_size))
 
 
+@inline
+def _passes(
+    a: np.float32, b: np.float32, c: np.float32, range_min: float, range_max: float, is_cylinder: bool,
+    box: NDArray[np.float64],
+) -> bool:  # fmt: skip
+    """Whether a point is finite, not zero, inside the range gate and outside the ego box."""
+    x, y, z = float(a), float(b), float(c)
+    d = x * x + y * y
+    full = d + z * z
+    if not is_cylinder:
+        d = full
+    # The comparison is false for NaN and the upper bound stops Inf; zero points fail even with range_min = 0.
+    if not (d >= range_min * range_min and d <= range_max * range_max and full > 1e-12 and np.isfinite(full)):
+        return False
+    return not (len(box) == 6 and box[0] <= x <= box[1] and box[2] <= y <= box[3] and box[4] <= z <= box[5])
+
+
 @kernel
 def gate(
     points: NDArray[np.float32], range_min: float, range_max: float, is_cylinder: bool, box: NDArray[np.float64]
@@ -45,25 +62,33 @@ def gate(
 
     `box` is x_min, x_max, y_min, y_max, z_min, z_max, or empty.
     """
-    n = len(points)
-    kept = np.empty(n, np.int64)
+    kept = np.empty(len(points), np.int64)
     count = 0
-    low, high = range_min * range_min, range_max * range_max
-    has_box = len(box) == 6
-    for i in range(n):
-        x, y, z = float(points[i, 0]), float(points[i, 1]), float(points[i, 2])
-        d = x * x + y * y
-        full = d + z * z
-        if not is_cylinder:
-            d = full
-        # The comparison is false for NaN and the upper bound stops Inf; zero points fail even with range_min = 0.
-        if not (d >= low and d <= high and full > 1e-12 and np.isfinite(full)):
-            continue
-        if has_box and box[0] <= x <= box[1] and box[2] <= y <= box[3] and box[4] <= z <= box[5]:
-            continue
-        kept[count] = i
-        count += 1
+    for i in range(len(points)):
+        if _passes(points[i, 0], points[i, 1], points[i, 2], range_min, range_max, is_cylinder, box):
+            kept[count] = i
+            count += 1
     return kept[:count]
+
+
+@kernel
+def gated(
+    points: NDArray[np.float32], times: NDArray[np.float32], range_min: float, range_max: float, is_cylinder: bool,
+    box: NDArray[np.float64],
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:  # fmt: skip
+    """The points (K, 3) that `gate` keeps, and their times (K,); no times where none are given."""
+    n = len(points)
+    is_timed = len(times) == n
+    kept, when = np.empty((n, 3), np.float32), np.empty(n if is_timed else 0, np.float32)
+    count = 0
+    for i in range(n):
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        if _passes(x, y, z, range_min, range_max, is_cylinder, box):
+            kept[count, 0], kept[count, 1], kept[count, 2] = x, y, z
+            if is_timed:
+                when[count] = times[i]
+            count += 1
+    return kept[:count], when[:count] if is_timed else when
 
 
 @kernel

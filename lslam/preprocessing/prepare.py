@@ -54,10 +54,8 @@ def prepare_points(
     Centroids, not first points: the average of the points of a cell is nearer to the surface than any one of them.
     Further columns are ignored. Raises InputError for arrays of another shape.
     """
-    cloud = as_cloud(points)
-    chosen = gate_points(cloud, config)
-    kept = voxel.take(cloud, chosen)
-    kept_times = NO_TIMES if times is None else np.ascontiguousarray(times, np.float32)[chosen]
+    times_of = NO_TIMES if times is None else np.ascontiguousarray(times, np.float32)
+    kept, kept_times = _gated(as_cloud(points), times_of, config)
     map_points, map_times, counts = voxel.means(kept, kept_times, config.map_leaf)
     if config.least_line > 0:
         solid = on_surfaces(map_points, counts, config.map_leaf, config.least_line)
@@ -115,8 +113,7 @@ def gate_points(points: NDArray[np.float32], config: PreprocessConfig) -> NDArra
     With `remove_ground` and `denoise` also neither on the ground nor, among the rest, an outlier. Every method's points
     pass here.
     """
-    box = np.array(config.ego_box if config.ego_box is not None else (), np.float64)
-    kept = voxel.gate(points, config.range_min, config.range_max, config.range_shape == "cylinder", box)
+    kept = voxel.gate(points, *_gate_of(config))
     if config.remove_ground:
         kept = kept[above_ground(points[kept], config.ground_slope, config.ground_tolerance)]
     if config.denoise:
@@ -124,6 +121,22 @@ def gate_points(points: NDArray[np.float32], config: PreprocessConfig) -> NDArra
 
         kept = kept[dense_points(points[kept], config.denoise_neighbours, config.denoise_deviations)]
     return kept
+
+
+def _gate_of(config: PreprocessConfig) -> tuple[float, float, bool, NDArray[np.float64]]:
+    """Range gate and ego box as the kernels take them."""
+    box = np.array(config.ego_box if config.ego_box is not None else (), np.float64)
+    return config.range_min, config.range_max, config.range_shape == "cylinder", box
+
+
+def _gated(
+    cloud: NDArray[np.float32], times: NDArray[np.float32], config: PreprocessConfig
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """The points that `gate_points` keeps, and their times: in one pass where only the gate asks."""
+    if not (config.remove_ground or config.denoise):
+        return voxel.gated(cloud, times, *_gate_of(config))
+    chosen = gate_points(cloud, config)
+    return voxel.take(cloud, chosen), times[chosen] if len(times) else times
 
 
 Down = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]

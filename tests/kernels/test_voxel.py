@@ -198,3 +198,16 @@ def test_take_gives_the_rows_in_the_order_asked_for() -> None:
     index = rng.integers(0, 200, 333)
     np.testing.assert_array_equal(voxel.take(points, index), points[index])
     assert voxel.take(points, index[:0]).shape == (0, 3)
+
+
+@pytest.mark.parametrize("is_timed", [True, False])
+@pytest.mark.parametrize("box", [NO_BOX, np.array([-5.0, 5, -4, 4, -3, 3])])
+def test_gated_points_are_those_that_the_gate_names(is_timed: bool, box: NDArray[np.float64]) -> None:
+    points = cloud(3)
+    points[::7] = np.nan
+    times = np.arange(len(points), dtype=np.float32) if is_timed else UNTIMED
+    chosen = voxel.gate(points, 2.0, 15.0, True, box)
+    assert 0 < len(chosen) < len(points)
+    kept, when = voxel.gated(points, times, 2.0, 15.0, True, box)
+    np.testing.assert_array_equal(kept, points[chosen])
+    np.testing.assert_array_equal(when, chosen.astype(np.float32) if is_timed else UNTIMED)
