@@ -47,7 +47,7 @@ HOMES = {
     "fsspec": ["remote.py"],
     "dask": ["studies/cluster.py"],
     "distributed": ["studies/cluster.py"],
-    "pyarrow": ["formats/study_parquet.py"],
+    "pyarrow": ["formats/study_files.py"],
     "numba": ["kernels/"],
     "matplotlib": ["reports/"],
 }

@@ -127,9 +127,8 @@ def _convert_trajectory(source: str, kind: str, out: Path, given: dict[str, Any]
 def _read_trajectory(source: str, kind: str, given: dict[str, Any]) -> tuple[Trajectory, Calibration]:
     """The file, or the ground truth of a sequence, and what is known of the bodies."""
     from lslam.errors import InputError
-    from lslam.formats.kitti_calib import read_cam0_lidar
+    from lslam.formats.calibration_files import read_cam0_lidar, read_transform
     from lslam.formats.trajectory_files import read_trajectory
-    from lslam.formats.transform_text import read_transform
     from lslam.types.calibration import Calibration
 
     if _is_trajectory(source):

@@ -143,8 +143,8 @@ def _evaluate_all(
 ) -> list[Evaluation]:
     from lslam.errors import InputError
     from lslam.evaluation.evaluate import evaluate
+    from lslam.formats.calibration_files import read_transform
     from lslam.formats.trajectory_files import read_trajectory
-    from lslam.formats.transform_text import read_transform
 
     ground_truth = read_trajectory(truth, given["gt_format"], given["times"])
     T_est_gt = None if given["transform"] is None else read_transform(given["transform"])
@@ -162,15 +162,15 @@ def _evaluate_all(
 
 def _calibration(truth: Path, calib: Path | None) -> Calibration | None:
     """--calib, or the calibration that lies where KITTI puts it for this ground truth."""
-    from lslam.formats import kitti_calib
+    from lslam.formats import calibration_files
     from lslam.types.calibration import Calibration
 
     if calib is not None:
-        return Calibration(T_cam0_lidar=kitti_calib.read_cam0_lidar(calib))
+        return Calibration(T_cam0_lidar=calibration_files.read_cam0_lidar(calib))
     above = truth.resolve().parent
     for found in (above / "calib.txt", above.parent / "sequences" / truth.stem / "calib.txt"):
         if found.is_file():
-            return Calibration(T_cam0_lidar=kitti_calib.read_odometry_calib(found))
+            return Calibration(T_cam0_lidar=calibration_files.read_odometry_calib(found))
     return None
 
 

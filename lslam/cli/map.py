@@ -61,7 +61,7 @@ def command(target: Path, **given: Any) -> None:
 
 def _measure(target: Path, given: dict[str, Any]) -> None:
     options.require_there(target, given["against"])
-    from lslam.formats.cloud_files import read_cloud
+    from lslam.formats.point_files import read_cloud
     from lslam.maps.compare import THRESHOLD, compare
     from lslam.maps.crispness import RADIUS, crispness
     from lslam.pipeline.rebuild import map_of

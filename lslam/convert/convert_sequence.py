@@ -18,10 +18,9 @@ from lslam.convert.output import check_output
 from lslam.errors import InputError, OutputError, UsageError, cause
 from lslam.formats import bag_messages
 from lslam.formats.bag_files import INFO_TOPIC, BagWriter
-from lslam.formats.gnss_csv import write_gnss_csv
-from lslam.formats.imu_csv import write_imu_csv
 from lslam.formats.kitti_layout import PER_POINT, POINTS, in_camera, write_calib, write_scan, write_times
 from lslam.formats.sequence_toml import FILE_NAME, FRAMES, SequenceInfo, sequence_toml_text, write_sequence_toml
+from lslam.formats.stamped_csv import write_gnss_csv, write_imu_csv
 from lslam.formats.trajectory_files import write_kitti, write_tum
 from lslam.frontend.register_scans import sweep_of
 from lslam.geometry import se3

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.formats.timing_csv import read_timing_rows
+from lslam.formats.run_tables import read_timing_rows
 from lslam.remote import as_path
 
 

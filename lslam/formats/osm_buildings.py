@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -14,7 +15,6 @@ from numpy.typing import NDArray
 from lslam.errors import InputError
 from lslam.formats.osm_files import DECIMALS, Member, OsmData, Relation, Way, read_osm
 from lslam.formats.osm_rings import footprints_from_rings, join_rings
-from lslam.formats.osm_tags import base_of, height_of, is_underground
 from lslam.geometry.geodesy import from_local, to_local
 from lslam.types.building import Building, Footprint, footprint_polygon
 
@@ -257,3 +257,48 @@ def _way_out(origin: Floats, is_swapped: bool = False) -> str:
 
 def _far(distance: float) -> str:
     return f"{distance / 1000:.1f} km" if distance > 1000 else f"{distance:.0f} m"
+
+
+STOREY = 3.0  # m, docs/conventions.md
+FOOT = 0.3048  # m
+TALLEST = 1000.0  # m; what is higher is a slip of the pen
+
+
+def height_of(tags: Mapping[str, str]) -> float | None:
+    """Height in m from `height` (m, or feet and inches), else `building:levels` x 3 m; None when neither is a sensible number."""
+    height = _length(tags.get("height", ""))
+    if height is None:
+        levels = _number(tags.get("building:levels", ""))
+        height = None if levels is None else levels * STOREY
+    return height if height is not None and 0 < height < TALLEST else None
+
+
+def base_of(tags: Mapping[str, str]) -> float:
+    """Where the walls begin, m above the ground: `min_height`, else `building:min_level` x 3 m, else 0.
+
+    What lies above the building's own height is nonsense and counts as 0.
+    """
+    base = _length(tags.get("min_height", ""))
+    if base is None:
+        base = (_number(tags.get("building:min_level", "")) or 0.0) * STOREY
+    return base if 0 < base < (height_of(tags) or TALLEST) else 0.0
+
+
+def is_underground(tags: Mapping[str, str]) -> bool:
+    """True for `location=underground` and for a negative `layer`."""
+    layer = _number(tags.get("layer", ""))
+    return tags.get("location") == "underground" or (layer is not None and layer < 0)
+
+
+def _number(text: str) -> float | None:
+    found = re.fullmatch(r"\s*([+-]?\d+(?:[.,]\d+)?)\s*", text)
+    return float(found[1].replace(",", ".")) if found else None
+
+
+def _length(text: str) -> float | None:
+    """Metres from `12`, `12.5 m`, `40 ft` or `40'6"`."""
+    found = re.fullmatch(r"\s*(\d+(?:[.,]\d+)?)\s*(m|metres?|meters?|ft|feet|')?\s*(?:(\d+(?:\.\d+)?)\")?\s*", text)
+    if not found or (found[3] and found[2] != "'"):
+        return None
+    value = float(found[1].replace(",", "."))
+    return value * FOOT + float(found[3] or 0) * FOOT / 12 if found[2] in ("ft", "feet", "'") else value

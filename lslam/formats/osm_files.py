@@ -17,8 +17,7 @@ from xml.sax.saxutils import quoteattr
 
 from lslam.errors import InputError, cause
 from lslam.formats.atomic import atomic_write
-from lslam.formats.osm_geojson import elements_of, is_geojson
-from lslam.formats.overpass_reply import ELEMENTS, OverpassReply
+from lslam.formats.overpass_reply import ELEMENTS, OverpassReply, elements_of, is_geojson
 from lslam.untrusted import JsonItems
 
 ATTRIBUTION = "© OpenStreetMap contributors, ODbL 1.0, openstreetmap.org/copyright"

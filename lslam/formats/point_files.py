@@ -1,4 +1,4 @@
-"""Point files by suffix: KITTI `.bin`, PCD, PLY and NumPy, read and written."""
+"""Point files by suffix: clouds in `.bin`, PCD, PLY and NumPy; maps in PLY, PCD, LAS and LAZ, written block by block."""
 
 from __future__ import annotations
 
@@ -11,10 +11,12 @@ from numpy.typing import NDArray
 
 from lslam.errors import InputError, UsageError, cause
 from lslam.formats.atomic import atomic_write
-from lslam.formats.pcd_files import read_pcd, write_pcd
-from lslam.formats.ply_files import read_ply, write_ply
+from lslam.formats.las_files import read_las, write_las
+from lslam.formats.pcd_files import pcd_header, read_pcd, write_pcd
+from lslam.formats.ply_files import ply_header, read_ply, write_ply
 from lslam.formats.point_cloud import PointCloud
 from lslam.remote import RemotePath
+from lslam.types.cloud import ArrayCloud, Cloud
 from lslam.untrusted import MISFIT
 
 SUFFIXES = (".bin", ".pcd", ".ply", ".npy")
@@ -123,3 +125,46 @@ def _read_text(path: Path) -> PointCloud:
     if table.shape[1] != 4:
         raise InputError(f"{path}: {table.shape[1]} numbers a line where x y z intensity are 4")
     return PointCloud(np.ascontiguousarray(table[:, :3]), np.ascontiguousarray(table[:, 3]))
+
+
+MAP_SUFFIXES = (".ply", ".pcd", ".las", ".laz")
+
+
+def write_cloud(path: Path, cloud: Cloud, *, comment: str = "", wkt: str = "") -> None:
+    """Write a cloud, m, atomically and without holding it in memory.
+
+    Parameters
+    ----------
+    path : its suffix chooses: .ply and .pcd hold float32, .las and .laz millimetres about an offset
+    comment : goes into PLY headers; wkt : coordinate reference system of the points, for LAS and LAZ
+
+    Raises
+    ------
+    UsageError : another suffix. OutputError : the file cannot be written
+    """
+    suffix = path.suffix.lower()
+    if suffix in (".las", ".laz"):
+        write_las(path, cloud, wkt)
+        return
+    if suffix not in MAP_SUFFIXES:
+        raise UsageError(f"{path}: no map file lslam writes; known suffixes: {', '.join(SUFFIXES)}")
+    names = ["x", "y", "z", "intensity"] if cloud.has_intensity else ["x", "y", "z"]
+    with atomic_write(path) as stream:
+        stream.write(ply_header(len(cloud), names, comment) if suffix == ".ply" else pcd_header(len(cloud), names))
+        for block in cloud.blocks():
+            table = np.empty((len(block), len(names)), "<f4")
+            table[:, :3] = block.points
+            if block.intensity is not None:
+                table[:, 3] = block.intensity
+            stream.write(table.data)
+
+
+def read_cloud(path: Path) -> ArrayCloud:
+    """Read any map or point file whole, its points as float64, m; LAS and LAZ keep their millimetres at any offset.
+
+    Raises InputError naming the file when it is missing, damaged or of another kind.
+    """
+    if path.suffix.lower() in (".las", ".laz"):
+        return read_las(path)[0]
+    read = read_points(path)
+    return ArrayCloud.of(read.points, read.intensity)

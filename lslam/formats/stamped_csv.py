@@ -1,4 +1,4 @@
-"""CSV files of stamped numbers with named columns: what imu.csv and gnss.csv share."""
+"""CSV files of stamped numbers with named columns: `imu.csv`, where EuRoC's imu0/data.csv reads as well, and `gnss.csv`."""
 
 from __future__ import annotations
 
@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 from lslam.errors import InputError, cause
 from lslam.formats.atomic import write_text
 from lslam.formats.stamps_files import parse_stamp
+from lslam.types.gnss import GnssStream
+from lslam.types.imu import ImuStream
 from lslam.untrusted import decimal_number
 
 TIME_COLUMNS = ("stamp_ns", "timestamp", "stamp", "time", "t", "time_s", "stamp_s")
@@ -79,3 +81,46 @@ def _plain(name: str) -> str:
 
 def _find(header: list[str], names: Sequence[str]) -> int | None:
     return next((header.index(name) for name in names if name in header), None)
+
+
+IMU_COLUMNS = ("accel_x", "accel_y", "accel_z", "gyro_x", "gyro_y", "gyro_z")
+_ALIASES = [
+    *((f"accel_{axis}", f"a{axis}", f"a_rs_s_{axis}", f"acc_{axis}", f"linear_acceleration_{axis}") for axis in "xyz"),
+    *((f"gyro_{axis}", f"w{axis}", f"w_rs_s_{axis}", f"g{axis}", f"angular_velocity_{axis}") for axis in "xyz"),
+]
+
+
+def read_imu_csv(path: Path) -> ImuStream:
+    """Read specific force (m/s2, +g up at rest) and angular rate (rad/s) in the IMU frame; nothing is converted.
+
+    Columns are `stamp_ns` (or seconds as `t`, `time`, `timestamp`), `accel_x..z` and `gyro_x..z` or their usual aliases.
+    Raises InputError naming file and line.
+    """
+    stamps, values = read_stamped_csv(path, _ALIASES)
+    return ImuStream(stamps, values[:, :3], values[:, 3:])
+
+
+def write_imu_csv(path: Path, imu: ImuStream) -> None:
+    """Write `imu` atomically; it reads back exactly."""
+    write_stamped_csv(path, IMU_COLUMNS, imu.stamps_ns, np.hstack([imu.accel, imu.gyro]))
+
+
+GNSS_COLUMNS = ("lat_deg", "lon_deg", "alt_m", "sigma_m")
+
+
+def read_gnss_csv(path: Path) -> GnssStream:
+    """Read fixes: `stamp_ns` (or seconds), `lat_deg`, `lon_deg`, `alt_m` (WGS84) and, if known, `sigma_m`.
+
+    Without `sigma_m` the one-sigma error is NaN: unknown. Raises InputError naming file and line.
+    """
+    stamps, values = read_stamped_csv(
+        path,
+        [("lat_deg", "lat", "latitude"), ("lon_deg", "lon", "longitude"), ("alt_m", "alt", "altitude", "height")],
+        [("sigma_m", "sigma", "pos_acc")],
+    )
+    return GnssStream(stamps, values[:, :3], values[:, 3])
+
+
+def write_gnss_csv(path: Path, gnss: GnssStream) -> None:
+    """Write `gnss` atomically; it reads back exactly."""
+    write_stamped_csv(path, GNSS_COLUMNS, gnss.stamps_ns, np.hstack([gnss.lat_lon_alt, gnss.sigma[:, None]]))

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.errors import InputError, OutputError, cause
-from lslam.formats.npz_files import pack_npz, read_npz, write_npz
+from lslam.formats.state_files import pack_npz, read_npz, write_npz
 from lslam.types.keyframe import Keyframe
 
 Points = NDArray[np.float32]

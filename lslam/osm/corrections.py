@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.config.osm import OsmConfig
-from lslam.formats.buildings_geojson import write_corrected
+from lslam.formats.geojson import write_corrected
 from lslam.formats.osm_corrections import corrected_osm
 from lslam.formats.osm_files import OsmData, write_osm
 from lslam.graph.building_graph import BuildingSolution, MapPrior, agreeing, solve_buildings

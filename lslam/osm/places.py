@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from lslam.errors import InputError, UsageError
 from lslam.formats.geojson import read_line
-from lslam.formats.gnss_csv import read_gnss_csv
+from lslam.formats.stamped_csv import read_gnss_csv
 from lslam.formats.trajectory_files import read_trajectory
 from lslam.geometry.geodesy import from_local
 

@@ -18,8 +18,7 @@ from lslam.backend.outcome import BackEnd
 from lslam.config import Config
 from lslam.errors import InterruptedRunError
 from lslam.formats.g2o import write_g2o
-from lslam.formats.loops_csv import write_loops
-from lslam.formats.osm_matches_csv import write_osm_matches
+from lslam.formats.run_tables import write_loops, write_osm_matches
 from lslam.formats.state_files import Records
 from lslam.formats.trajectory_files import write_tum
 from lslam.frontend.checkpoints import Checkpoints

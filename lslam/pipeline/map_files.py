@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 
 from lslam.formats.atomic import atomic_write
-from lslam.formats.cloud_files import write_cloud
 from lslam.formats.geojson import write_line
 from lslam.formats.ply_files import write_ply, write_ply_mesh
+from lslam.formats.point_files import write_cloud
 from lslam.maps.floor_plan import floor_plan
 from lslam.maps.georeference import ProjectedCloud, Projection, to_lat_lon
 from lslam.maps.mesh import surface

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from lslam.errors import OutputError, cause
-from lslam.formats.cloud_files import SUFFIXES
+from lslam.formats.point_files import MAP_SUFFIXES
 from lslam.pipeline.json_files import read_json, write_json
 
 Note = dict[str, Any]
@@ -64,7 +64,7 @@ def _notes(path: Path) -> dict[str, Note]:
 
 def _is_of(path: Path, name: str) -> bool:
     other = Path(name)
-    return other.name == name and other.stem == path.stem and other.suffix.lower() in SUFFIXES
+    return other.name == name and other.stem == path.stem and other.suffix.lower() in MAP_SUFFIXES
 
 
 def _joined(notes: dict[str, Note]) -> Note:

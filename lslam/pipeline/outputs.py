@@ -12,7 +12,7 @@ from lslam.config import Config, to_toml
 from lslam.config.map import MapConfig
 from lslam.evaluation.evaluate import Evaluation
 from lslam.formats.ply_files import write_ply
-from lslam.formats.timing_csv import timing_text
+from lslam.formats.run_tables import timing_text
 from lslam.formats.trajectory_files import write_kitti, write_tum
 from lslam.geometry import se3
 from lslam.pipeline import map_files

@@ -16,7 +16,7 @@ import numpy as np
 
 from lslam.config import Config, load_config
 from lslam.errors import InputError, InterruptedRunError, OutputError, OutputExistsError, UsageError, cause
-from lslam.formats.cloud_files import SUFFIXES
+from lslam.formats.point_files import MAP_SUFFIXES
 from lslam.formats.trajectory_files import read_trajectory
 from lslam.maps.crispness import crispness
 from lslam.maps.georeference import Projection
@@ -170,8 +170,8 @@ def rebuild(
 
 def check_output(path: Path, overwrite: bool) -> None:
     """Raise UsageError, OutputExistsError or OutputError before any work is done for a file that will not do."""
-    if path.suffix.lower() not in SUFFIXES:
-        raise UsageError(f"{path}: no map file lslam writes; known suffixes: {', '.join(SUFFIXES)}")
+    if path.suffix.lower() not in MAP_SUFFIXES:
+        raise UsageError(f"{path}: no map file lslam writes; known suffixes: {', '.join(MAP_SUFFIXES)}")
     if not path.parent.is_dir():
         raise OutputError(f"{path} cannot be written: the folder {path.parent} does not exist")
     if path.exists() and not overwrite:
@@ -255,7 +255,7 @@ def map_of(target: Path) -> Path:
     """A map file, or the one that was written last in a run folder; raises InputError when there is none."""
     if not target.is_dir():
         return target
-    found = [target / f"map{suffix}" for suffix in SUFFIXES if (target / f"map{suffix}").is_file()]
+    found = [target / f"map{suffix}" for suffix in MAP_SUFFIXES if (target / f"map{suffix}").is_file()]
     if not found:
         raise InputError(f"{target} has no map file; build one with: lslam map {target}")
     return noted_last(found[0]) or found[0]

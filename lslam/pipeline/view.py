@@ -6,7 +6,7 @@ import logging
 from pathlib import Path
 
 from lslam.errors import InputError
-from lslam.formats.cloud_files import read_cloud
+from lslam.formats.point_files import read_cloud
 from lslam.formats.trajectory_files import read_trajectory
 from lslam.maps.georeference import Projection
 from lslam.pipeline.map_files import georeference_of

@@ -73,8 +73,8 @@ def open_sequence(
             folder = Path(os.path.abspath(folder))
     except OSError as error:
         raise _unreadable(name_or_path, error) from None
+    from lslam.formats.calibration_files import read_transform
     from lslam.formats.sequence_toml import SequenceInfo, is_rate
-    from lslam.formats.transform_text import read_transform
 
     if rate_hz is not None and not is_rate(rate_hz):
         raise UsageError(f"a scan rate of {rate_hz} Hz makes no sense")

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.errors import InputError, cause
-from lslam.formats.npz_files import DAMAGE
 from lslam.formats.point_cloud import PointCloud
 from lslam.formats.point_files import read_bin, read_points
+from lslam.formats.state_files import DAMAGE
 from lslam.readers.point_times import TimeRule, apply_rule, azimuth_times
 from lslam.types.calibration import Calibration
 from lslam.types.gnss import GnssStream

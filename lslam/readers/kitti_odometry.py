@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.errors import InputError
-from lslam.formats.kitti_calib import read_odometry_calib
+from lslam.formats.calibration_files import read_odometry_calib
 from lslam.formats.sequence_toml import SequenceInfo
 from lslam.printable import printable
 from lslam.readers.folder_sequence import FolderSequence

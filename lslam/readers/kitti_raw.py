@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.errors import InputError, cause
-from lslam.formats.kitti_calib import read_raw_cam0_lidar, read_rigid
+from lslam.formats.calibration_files import read_raw_cam0_lidar, read_rigid
 from lslam.formats.oxts_files import ACCEL, GYRO, POS_ACC, Oxts, read_oxts
 from lslam.formats.point_files import SUFFIXES
 from lslam.formats.sequence_toml import SequenceInfo

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.errors import InputError
-from lslam.formats.kitti_calib import read_rigid
+from lslam.formats.calibration_files import read_rigid
 from lslam.formats.oxts_files import ACCEL, GYRO, POS_ACC, Oxts, read_oxts
 from lslam.formats.stamps_files import read_stamps
 from lslam.readers.bag import BagSequence

@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.errors import InputError
-from lslam.formats.kitti_calib import read_odometry_calib
-from lslam.formats.mcd_calib import read_mcd_extrinsics
+from lslam.formats.calibration_files import read_mcd_extrinsics, read_odometry_calib
 from lslam.formats.point_files import SUFFIXES, read_points
 from lslam.formats.sequence_toml import SequenceInfo
 from lslam.printable import printable

@@ -10,10 +10,9 @@ from typing import TypeVar
 import numpy as np
 
 from lslam.errors import InputError
-from lslam.formats.gnss_csv import read_gnss_csv
-from lslam.formats.imu_csv import read_imu_csv
 from lslam.formats.point_files import read_points
 from lslam.formats.sequence_toml import FILE_NAME, SequenceInfo, read_sequence_toml
+from lslam.formats.stamped_csv import read_gnss_csv, read_imu_csv
 from lslam.types.calibration import Calibration
 from lslam.types.gnss import GnssStream
 from lslam.types.imu import ImuStream

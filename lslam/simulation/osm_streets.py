@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.formats.osm_buildings import is_underground
 from lslam.formats.osm_files import OsmData
-from lslam.formats.osm_tags import is_underground
 from lslam.geometry.geodesy import to_local
 from lslam.simulation.curve import RouteCurve, smooth_curve
 from lslam.types.building import Building, footprint_polygon, is_canopy

@@ -9,9 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.formats.atomic import write_text
-from lslam.formats.gnss_csv import write_gnss_csv
-from lslam.formats.imu_csv import write_imu_csv
-from lslam.formats.stamped_csv import write_stamped_csv
+from lslam.formats.stamped_csv import write_gnss_csv, write_imu_csv, write_stamped_csv
 from lslam.formats.trajectory_files import write_tum
 from lslam.geometry import se3
 from lslam.printable import toml_text

@@ -8,8 +8,7 @@ from collections.abc import Sequence
 from math import nan
 from pathlib import Path
 
-from lslam.formats.study_csv import read_study_csv, write_study_csv
-from lslam.formats.study_parquet import write_study_parquet
+from lslam.formats.study_files import read_study_csv, write_study_csv, write_study_parquet
 from lslam.remote import RemotePath
 from lslam.studies.collect import collect_run
 from lslam.studies.grid import Job

@@ -11,7 +11,7 @@ from lslam.config.finding import ExpectedFinding
 from lslam.config.study import StudyConfig, read_study
 from lslam.errors import InputError, RunFailedError
 from lslam.evaluation.sensitivity import evaluate_study
-from lslam.formats.study_csv import read_study_csv
+from lslam.formats.study_files import read_study_csv
 from lslam.printable import toml_text
 from lslam.reports.study_html import timing_notes, write_study_files
 from lslam.studies.engines import Engine

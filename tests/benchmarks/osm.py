@@ -33,9 +33,9 @@ from lslam.config import Config
 from lslam.config.load import load_config
 from lslam.evaluation.buildings import BuildingError, building_errors
 from lslam.evaluation.thesis import planar
-from lslam.formats.buildings_geojson import read_corrected
+from lslam.formats.geojson import read_corrected
 from lslam.formats.osm_buildings import read_buildings
-from lslam.formats.timing_csv import read_timing_rows
+from lslam.formats.run_tables import read_timing_rows
 from lslam.formats.trajectory_files import read_trajectory
 from lslam.geometry import geodesy, se2
 from lslam.osm.corrections import BUILDINGS_GEOJSON

@@ -18,7 +18,7 @@ from lslam.cli.main import cli
 from lslam.errors import InputError, LslamError, OutputError
 from lslam.formats import bag_messages
 from lslam.formats.bag_files import BagWriter
-from lslam.formats.cloud_files import read_cloud
+from lslam.formats.point_files import read_cloud
 from lslam.geometry.geodesy import from_local
 from lslam.pipeline import refresh
 from lslam.pipeline.map_files import georeference_note

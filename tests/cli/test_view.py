@@ -13,7 +13,7 @@ import pytest
 
 from lslam.cli.main import cli
 from lslam.errors import InputError, OutputError, OutputExistsError
-from lslam.formats.cloud_files import read_cloud
+from lslam.formats.point_files import read_cloud
 from lslam.formats.trajectory_files import write_tum
 from lslam.geometry import se3, so3
 from lslam.pipeline.map_files import MapNote, georeference_note, write_map

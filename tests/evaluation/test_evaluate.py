@@ -14,7 +14,7 @@ from lslam.config.eval import EvalConfig
 from lslam.errors import InputError
 from lslam.evaluation.evaluate import Evaluation, evaluate
 from lslam.evaluation.frames import R_BODY_CAMERA, body_rotation, main_axis
-from lslam.formats.kitti_calib import read_odometry_calib
+from lslam.formats.calibration_files import read_odometry_calib
 from lslam.formats.trajectory_files import read_trajectory
 from lslam.geometry import se3, so3
 from lslam.types.calibration import Calibration

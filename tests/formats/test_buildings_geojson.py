@@ -11,7 +11,7 @@ import pytest
 from osm_builders import ORIGIN, square_at
 
 from lslam.errors import InputError, OutputError
-from lslam.formats.buildings_geojson import read_corrected, write_corrected
+from lslam.formats.geojson import read_corrected, write_corrected
 from lslam.formats.osm_buildings import read_buildings
 from lslam.formats.osm_files import ATTRIBUTION
 from lslam.types.building import Building, Footprint

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from lslam.errors import InputError, OutputError, UsageError
-from lslam.formats.cloud_files import SUFFIXES, read_cloud, write_cloud
 from lslam.formats.las_files import read_las
+from lslam.formats.point_files import SUFFIXES, read_cloud, write_cloud
 from lslam.types import cloud as cloud_module
 from lslam.types.cloud import ArrayCloud, CloudBlock, bounds, in_memory
 

@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 
 from lslam.errors import InputError, UsageError
-from lslam.formats.kitti_calib import (
+from lslam.formats.calibration_files import (
     read_cam0_lidar,
     read_odometry_calib,
     read_raw_cam0_lidar,
     read_rectification,
     read_rigid,
+    read_transform,
 )
-from lslam.formats.transform_text import read_transform
 from lslam.geometry import se3
 
 TR = (

@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 
 from lslam.errors import InputError
-from lslam.formats.cloud_files import read_cloud, write_cloud
+from lslam.formats.point_files import read_cloud, write_cloud
 from lslam.types.cloud import ArrayCloud
 
 READ = """
 import sys
 from pathlib import Path
 from lslam.errors import InputError
-from lslam.formats.cloud_files import read_cloud
+from lslam.formats.point_files import read_cloud
 try:
     read_cloud(Path(sys.argv[1]))
 except InputError as error:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from lslam.errors import OutputError
-from lslam.formats.loops_csv import COLUMNS, write_loops
+from lslam.formats.run_tables import COLUMNS, write_loops
 from lslam.types.constraint import Constraint, LoopCandidate
 from lslam.types.keyframe import Keyframe
 

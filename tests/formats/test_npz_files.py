@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from lslam.formats.npz_files import pack_npz, read_npz
+from lslam.formats.state_files import pack_npz, read_npz
 
 
 def packed(values: NDArray[np.float32], level: int) -> bytes:

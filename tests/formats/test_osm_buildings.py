@@ -12,7 +12,7 @@ from osm_builders import ORIGIN, ExtractMaker, square_at
 from shapely import LinearRing, MultiPolygon, Polygon, STRtree, box, points
 
 from lslam.errors import InputError
-from lslam.formats.mcd_calib import read_mcd_extrinsics
+from lslam.formats.calibration_files import read_mcd_extrinsics
 from lslam.formats.osm_buildings import (
     BuildingExtract,
     buildings_near,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from lslam.formats.osm_tags import base_of, height_of
+from lslam.formats.osm_buildings import base_of, height_of
 
 
 @pytest.mark.parametrize(

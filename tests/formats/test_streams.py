@@ -10,10 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lslam.errors import InputError
-from lslam.formats.gnss_csv import read_gnss_csv, write_gnss_csv
-from lslam.formats.imu_csv import read_imu_csv, write_imu_csv
-from lslam.formats.mcd_calib import read_mcd_extrinsics
+from lslam.formats.calibration_files import read_mcd_extrinsics
 from lslam.formats.oxts_files import POS_ACC, read_oxts
+from lslam.formats.stamped_csv import read_gnss_csv, read_imu_csv, write_gnss_csv, write_imu_csv
 from lslam.formats.stamps_files import parse_stamp, read_stamps
 from lslam.types.gnss import GnssStream
 from lslam.types.imu import ImuStream

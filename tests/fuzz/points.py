@@ -12,12 +12,11 @@ from types import SimpleNamespace
 import numpy as np
 from fuzz.cases import Files, Parser
 
-from lslam.formats.cloud_files import read_cloud, write_cloud
-from lslam.formats.npz_files import read_npz, write_npz
 from lslam.formats.pcd_files import write_pcd
 from lslam.formats.ply_files import write_ply
-from lslam.formats.point_files import read_points
+from lslam.formats.point_files import read_cloud, read_points, write_cloud
 from lslam.formats.pointcloud2 import decode_livox, decode_pointcloud2
+from lslam.formats.state_files import read_npz, write_npz
 from lslam.types.cloud import ArrayCloud
 
 _N = 30

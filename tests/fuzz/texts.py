@@ -16,21 +16,17 @@ from lslam.config.load import to_toml
 from lslam.config.study import read_study
 from lslam.errors import LslamError
 from lslam.evaluation.timing import read_timing
-from lslam.formats.buildings_geojson import read_corrected
+from lslam.formats.calibration_files import read_cam0_lidar, read_mcd_extrinsics, read_transform
 from lslam.formats.g2o import read_g2o
-from lslam.formats.geojson import read_line
-from lslam.formats.gnss_csv import read_gnss_csv
-from lslam.formats.imu_csv import read_imu_csv
-from lslam.formats.kitti_calib import read_cam0_lidar
-from lslam.formats.mcd_calib import read_mcd_extrinsics
+from lslam.formats.geojson import read_corrected, read_line
 from lslam.formats.osm_buildings import read_buildings
 from lslam.formats.oxts_files import read_oxts
 from lslam.formats.sequence_toml import read_sequence_toml
+from lslam.formats.stamped_csv import read_gnss_csv, read_imu_csv
 from lslam.formats.stamps_files import read_stamps
 from lslam.formats.state_files import read_state, write_state
-from lslam.formats.study_csv import read_study_csv, write_study_csv
+from lslam.formats.study_files import read_study_csv, write_study_csv
 from lslam.formats.trajectory_files import read_times, read_trajectory
-from lslam.formats.transform_text import read_transform
 from lslam.osm.bounds import Bounds
 from lslam.osm.overpass import kept_reply
 from lslam.pipeline.rebuild import map_of, read_run

@@ -15,9 +15,9 @@ from xml.etree import ElementTree
 import numpy as np
 
 from lslam.config import Config
-from lslam.formats.cloud_files import read_cloud
 from lslam.formats.g2o import read_g2o
 from lslam.formats.osm_files import read_osm
+from lslam.formats.point_files import read_cloud
 from lslam.formats.state_files import read_state
 from lslam.formats.trajectory_files import read_trajectory
 from lslam.frontend.state_classes import STATE_CLASSES

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 import lslam
 from lslam.config.load import load_config
-from lslam.formats.buildings_geojson import read_corrected
+from lslam.formats.geojson import read_corrected
 from lslam.formats.osm_buildings import osm_from_buildings, read_buildings
 from lslam.formats.osm_files import write_osm
 from lslam.formats.trajectory_files import read_trajectory

@@ -17,7 +17,7 @@ from lslam.config import Config, load_config
 from lslam.doctor.examine_turns import examine_turns
 from lslam.doctor.findings import Finding
 from lslam.errors import GateError, InputError
-from lslam.formats.timing_csv import read_timing_rows
+from lslam.formats.run_tables import read_timing_rows
 from lslam.formats.trajectory_files import read_trajectory
 from lslam.frontend.inertial_start import begin_inertial, close_inertial
 from lslam.frontend.register_scans import estimate

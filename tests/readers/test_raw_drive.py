@@ -12,7 +12,7 @@ import pytest
 from sequence_builders import kitti_root
 
 from lslam.errors import InputError
-from lslam.formats.imu_csv import write_imu_csv
+from lslam.formats.stamped_csv import write_imu_csv
 from lslam.formats.trajectory_files import read_trajectory
 from lslam.geometry import se3, so3
 from lslam.readers import open_sequence

@@ -15,9 +15,9 @@ from stub_sequences import SAMPLE
 from lslam.config import Config
 from lslam.errors import InputError, StorageError, UsageError
 from lslam.formats import bag_messages
+from lslam.formats.bag_chunks import BLOCK, RangedFile
 from lslam.formats.bag_files import BagWriter
 from lslam.formats.point_files import write_points
-from lslam.formats.ranged import BLOCK, RangedFile
 from lslam.pipeline.identity import input_digest, listing_digest
 from lslam.pipeline.run import run
 from lslam.readers import open_sequence

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from lslam.errors import OutputError, OutputExistsError
-from lslam.formats.kitti_calib import read_odometry_calib
+from lslam.formats.calibration_files import read_odometry_calib
 from lslam.formats.point_files import read_bin
 from lslam.formats.sequence_toml import read_sequence_toml
 from lslam.formats.trajectory_files import read_trajectory

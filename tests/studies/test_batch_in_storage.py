@@ -11,7 +11,7 @@ from storages import Counted, counted, stored
 from stub_sequences import SAMPLE
 
 from lslam.config.batch import BatchConfig, parse_batch
-from lslam.formats.study_csv import read_study_csv
+from lslam.formats.study_files import read_study_csv
 from lslam.pipeline.storage import spool_of
 from lslam.remote import RemotePath
 from lslam.studies.batch import expand_batch, expand_lines, listed_line

@@ -17,7 +17,7 @@ from distributed import LocalCluster
 from lslam.cli.options import engine_of
 from lslam.config.study import parse_study
 from lslam.errors import InputError, RunFailedError, UsageError
-from lslam.formats.study_csv import read_study_csv
+from lslam.formats.study_files import read_study_csv
 from lslam.studies import cluster
 from lslam.studies.cluster import Cluster, connected, pack, unpack
 from lslam.studies.grid import Job

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from lslam.config import Config
-from lslam.formats.study_csv import read_study_csv
+from lslam.formats.study_files import read_study_csv
 from lslam.studies import results
 from lslam.studies.grid import Job
 from lslam.studies.results import Results

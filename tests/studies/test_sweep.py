@@ -15,7 +15,7 @@ import pytest
 
 from lslam.config.study import StudyConfig, parse_study
 from lslam.errors import ConfigError, InputError, InterruptedRunError, OutputExistsError, RunFailedError, UsageError
-from lslam.formats.study_csv import VERSION, read_study_csv
+from lslam.formats.study_files import VERSION, read_study_csv
 from lslam.studies.engines import Local
 from lslam.studies.estimate import estimate, from_finished
 from lslam.studies.expanded_study import ExpandedStudy

@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 
 from lslam.config import load_config
-from lslam.formats.study_csv import read_study_csv
+from lslam.formats.study_files import read_study_csv
 from lslam.odometry.icp import Icp
 from lslam.pipeline import job as prepared
 from lslam.studies import worker

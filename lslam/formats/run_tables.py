@@ -1,16 +1,96 @@
-"""timing.csv: seconds per scan and stage."""
+"""Tables of a run folder: `loops.csv`, `osm_matches.csv` (every candidate, its verdict and reason) and `timing.csv`."""
 
 from __future__ import annotations
 
 import csv
-from collections.abc import Mapping
+import io
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lslam.errors import InputError, cause
+from lslam.formats.atomic import write_text
+from lslam.types.building_match import BuildingMatch, KeyframeMatch, OsmMatches
+from lslam.types.constraint import LoopCandidate
+from lslam.types.keyframe import Keyframe
+
+LOOP_COLUMNS = (
+    "keyframe_a", "keyframe_b", "scan_a", "scan_b", "distance_m", "descriptor_distance", "verdict", "stage", "rmse_m",
+    "overlap", "sigma_m", "sigma_deg", "reason",
+)  # fmt: skip
+
+
+def write_loops(path: Path, candidates: Sequence[LoopCandidate], keyframes: Sequence[Keyframe]) -> None:
+    """One row per candidate in their order; `sigma` is the standard deviation where it is largest, empty when unknown.
+
+    Raises OutputError when the file cannot be written.
+    """
+    text = io.StringIO()
+    table = csv.writer(text, lineterminator="\n")
+    table.writerow(LOOP_COLUMNS)
+    for c in candidates:
+        sigma_m, sigma_deg = _sigmas(c)
+        row = (
+            c.a, c.b, keyframes[c.a].scan, keyframes[c.b].scan, f"{c.distance:.3f}", _number(c.descriptor_distance),
+            c.verdict, c.stage, _number(c.rmse), _number(c.overlap), _number(sigma_m), _number(sigma_deg), c.reason,
+        )  # fmt: skip
+        table.writerow(row)
+    write_text(path, text.getvalue())
+
+
+def _sigmas(candidate: LoopCandidate) -> tuple[float, float]:
+    """m and deg."""
+    if candidate.constraint is None:
+        return float("nan"), float("nan")
+    C = candidate.constraint.covariance
+    largest = [float(np.sqrt(max(np.linalg.eigvalsh(block)[-1], 0.0))) for block in (C[:3, :3], C[3:, 3:])]
+    return largest[0], float(np.rad2deg(largest[1]))
+
+
+def _number(value: float) -> str:
+    return f"{value:.4f}" if np.isfinite(value) else ""
+
+
+# x, y, yaw: of the keyframe in the map frame, or of the displacement of the building about its middle.
+MATCH_COLUMNS = (
+    "keyframe", "scan", "building", "verdict", "kind", "rank", "walls", "fitness", "coverage", "rms_m", "x_m", "y_m", "yaw_deg",
+    "reason",
+)  # fmt: skip
+
+
+def write_osm_matches(
+    path: Path, matches: OsmMatches, keyframes: Sequence[Keyframe], poses: NDArray[np.float64]
+) -> None:
+    """One row per keyframe, `building` empty, then one per building seen from one, with its OpenStreetMap number.
+
+    poses : (K, 3) final planar poses of the keyframes in the map frame. Raises OutputError when it cannot be written.
+    """
+    text = io.StringIO()
+    table = csv.writer(text, lineterminator="\n")
+    table.writerow(MATCH_COLUMNS)
+    for match in matches.keyframes:
+        table.writerow(_row(match, keyframes, "", match.pose))
+    for one in matches.local:
+        building = matches.buildings[one.building]
+        moved = one.displacement(poses[one.keyframe], building.middle)
+        table.writerow(_row(one, keyframes, building.osm_id, moved))
+    write_text(path, text.getvalue())
+
+
+def _row(
+    match: KeyframeMatch | BuildingMatch, keyframes: Sequence[Keyframe], building: str, pose: NDArray[np.float64]
+) -> tuple[Any, ...]:
+    x, y, yaw = (pose[0], pose[1], np.degrees(pose[2])) if match.rank else (np.nan, np.nan, np.nan)
+    numbers = (match.fitness, match.coverage, match.rms, x, y, yaw)
+    return (
+        match.keyframe, keyframes[match.keyframe].scan, building, match.verdict, match.kind, match.rank, len(match.pairs),
+        *(f"{value:.4f}" if np.isfinite(value) else "" for value in numbers), match.reason,
+    )  # fmt: skip
+
 
 SAVED = "saved_s"
 NOT_STAGES = ("index", "stamp_ns", "stamp", "total", SAVED)

@@ -17,7 +17,8 @@ from typing import Any, get_args
 
 from lslam.config.study import StudyMetric
 from lslam.errors import InputError, cause
-from lslam.formats.atomic import write_text
+from lslam.formats.atomic import atomic_write, write_text
+from lslam.printable import printable_tree
 from lslam.types.study import StudyRow, Value
 
 VERSION = 3
@@ -128,3 +129,24 @@ def _value(text: str) -> Value:
 
 
 _READ: dict[str, Callable[[str], Value]] = {"str": str, "int": int, "float": _number, "bool": _truth}
+
+
+def write_study_parquet(path: Path, rows: Sequence[StudyRow]) -> None:
+    """Write all rows atomically, what is not there as null; a parameter of several types becomes text. Raises OutputError."""
+    import pyarrow as pa
+    from pyarrow import parquet
+
+    table = pa.table(
+        {name: pa.array(printable_tree(_of_one_type(column))) for name, column in study_columns(rows).items()}
+    )
+    with atomic_write(path) as stream:
+        parquet.write_table(table, stream)
+
+
+def _of_one_type(column: list[Value | None]) -> list[Value | None]:
+    kinds = {type(value) for value in column if value is not None}
+    if len(kinds) < 2:
+        return column
+    if kinds == {int, float}:
+        return [None if value is None else float(value) for value in column]
+    return [None if value is None else str(value) for value in column]
