@@ -9,10 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.simulation.foliage import penetrate
 from lslam.simulation.lidar_models import LidarModel
-from lslam.simulation.rays import Hits, Rays
-from lslam.simulation.returns import Errors, Returns, errors, mirrored, range_walk, reflect
+from lslam.simulation.returns import Errors, Hits, Rays, Returns, errors, mirrored, penetrate, range_walk, reflect
 from lslam.simulation.scene_mesh import SceneMesh, Surface
 from lslam.types.scan import Scan
 

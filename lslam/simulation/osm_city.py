@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,11 +12,10 @@ from numpy.typing import NDArray
 from lslam.errors import InputError
 from lslam.simulation.city import KERB, MARGIN, City, Layout, Lots, add_garden_trees, add_street_furniture
 from lslam.simulation.curve import RouteCurve
-from lslam.simulation.extrusion import extrude, likely_height
 from lslam.simulation.scene_mesh import MeshBuilder, Surface, grid_faces
 from lslam.simulation.terrain import Terrain
 from lslam.simulation.town import CAR_LENGTH, Network, Places, add_road
-from lslam.types.building import Building
+from lslam.types.building import Building, Footprint, footprint_polygon, is_canopy
 
 Floats = NDArray[np.float64]
 
@@ -154,3 +154,182 @@ class _Gaps:
         ends = points(np.stack([xy - half, xy, xy + half]))
         near = self._walls.query(ends, predicate="dwithin", distance=AIR[is_car])
         return near.size == 0 and self._places(xy, offset, yaw)
+
+
+DEPTH = 0.5  # m, walls reach below the lowest ground at their foot
+STOREY = 3.0  # m
+PARAPET = 0.4  # m of wall above a flat roof
+OVERHANG = 0.3  # m, eaves beyond the walls
+SLAB = 0.2  # m, the roof of a canopy
+GABLED = ("gabled", "hipped", "half-hipped", "saltbox")  # tags whose roof is drawn with two slopes
+FLAT = ("flat", "skillion", "round", "dome")
+
+
+@dataclass(frozen=True)
+class _FacadeStyle:
+    """What the facades of one building share, m."""
+
+    window: float
+    spacing: float
+    sill: float
+    head: float
+    recess: float
+    pitch: float
+    likes_gables: bool
+
+
+def likely_height(building: Building, rng: np.random.Generator) -> float:
+    """A height, m, for a building whose tags give none: small ones are garages, large ones have more storeys."""
+    if building.area < 45:
+        return round(float(rng.uniform(2.4, 3.0)), 1)
+    return STOREY * float(rng.integers(2, 4 if building.area < 250 else 6))
+
+
+def extrude(builder: MeshBuilder, building: Building, low: float, high: float, rng: np.random.Generator) -> None:
+    """Add a building of known height to `builder`, in the frame of its footprints.
+
+    low, high : m, lowest and highest ground along its outlines; heights count from `high`, walls reach below `low`
+    """
+    if building.height is None:
+        raise ValueError(f"{building.osm_id} has no height: choose one first")
+    style = _FacadeStyle(
+        window=rng.uniform(0.9, 1.5),
+        spacing=rng.uniform(2.2, 3.4),
+        sill=rng.uniform(0.7, 1.0),
+        head=rng.uniform(2.0, 2.4),
+        recess=rng.uniform(0.12, 0.3),
+        pitch=rng.uniform(0.5, 0.9),
+        likes_gables=bool(rng.random() < 0.6),
+    )
+    top, base = high + building.height, high + building.base
+    for footprint in building.footprints:
+        if is_canopy(building):
+            _canopy(builder, footprint, low - DEPTH, top)
+            continue
+        bottom = base if building.base > 0 else low - DEPTH
+        gable = _gable(building, footprint, style)
+        eaves = top if gable is None else top - gable.rise
+        for ring in footprint.rings:
+            for start, end in zip(ring, np.roll(ring, -1, axis=0), strict=True):
+                _facade(builder, style, start, end, (bottom, base, eaves))
+        if gable is None:
+            _level(builder, footprint, top - min(PARAPET, 0.2 * building.height))
+        else:
+            _gabled_roof(builder, gable, eaves)
+        if building.base > 0:
+            _level(builder, footprint, bottom)
+
+
+def _facade(
+    builder: MeshBuilder, style: _FacadeStyle, start: Floats, end: Floats, levels: tuple[float, float, float]
+) -> None:
+    """One wall from `start` to `end` (2,), outside to its right, from bottom over the ground floor to the top (`levels`)."""
+    bottom, floor, top = levels
+    length = float(np.linalg.norm(end - start))
+    along = (end - start) / length
+    outward = np.array([along[1], -along[0]])
+
+    def quads(u0: Any, u1: Any, z: tuple[Any, Any, Any, Any], in0: Any, in1: Any) -> Floats:
+        """(N, 4, 3) between u0 and u1 m along the wall, at heights z round the quad; insets of its two ends, m."""
+        u0, u1, *rest = np.broadcast_arrays(u0, u1, *z, in0, in1)
+        z0, z1, z2, z3, i0, i1 = (np.ravel(v) for v in rest)
+
+        def at(u: Any, inset: Any, height: Any) -> Floats:
+            return np.column_stack([start + np.ravel(u)[:, None] * along - inset[:, None] * outward, height])
+
+        return np.stack([at(u0, i0, z0), at(u1, i1, z1), at(u1, i1, z2), at(u0, i0, z3)], axis=1)
+
+    count = int((length - 1.0) // style.spacing)
+    storeys = int((top - floor - 0.2) // STOREY)
+    if count < 1 or storeys < 1:
+        builder.add_quads(quads(0.0, length, (bottom, bottom, top, top), 0.0, 0.0), Surface.WALL)
+        return
+    centres = length / 2 + (np.arange(count) - (count - 1) / 2) * style.spacing
+    left, right = centres - style.window / 2, centres + style.window / 2
+    sills = (floor + style.sill + STOREY * np.arange(storeys))[:, None]
+    heads = sills + (style.head - style.sill)
+    bands = np.append(bottom, heads), np.append(sills, top)
+    r = style.recess
+    walls = [
+        quads(0.0, length, (bands[0], bands[0], bands[1], bands[1]), 0.0, 0.0),
+        quads(np.append(0.0, right), np.append(left, length), (sills, sills, heads, heads), 0.0, 0.0),
+        quads(left, left, (sills, sills, heads, heads), 0.0, r),
+        quads(right, right, (sills, sills, heads, heads), 0.0, r),
+    ]
+    for z in (sills, heads):
+        # Level: the far side lies behind the wall.
+        near, far = quads(left, right, (z, z, z, z), 0.0, 0.0), quads(left, right, (z, z, z, z), r, r)
+        walls.append(np.concatenate([near[:, :2], far[:, 1::-1]], axis=1))
+    builder.add_quads(np.concatenate(walls), Surface.WALL)
+    builder.add_quads(quads(left, right, (sills, sills, heads, heads), r, r), Surface.GLASS)
+
+
+@dataclass(frozen=True)
+class _Gable:
+    """Four corners of a nearly rectangular outline, the two short sides 0-1 and 2-3, and how high the ridge is above them."""
+
+    corners: Floats
+    rise: float
+
+
+def _gable(building: Building, footprint: Footprint, style: _FacadeStyle) -> _Gable | None:
+    """The gabled roof of a building that can carry one, None for a flat roof."""
+    shape = building.tags.get("roof:shape", "")
+    if footprint.holes or shape in FLAT or not (shape in GABLED or style.likes_gables):
+        return None
+    polygon = footprint_polygon(footprint).simplify(0.02)
+    corners = np.array(polygon.exterior.coords)[:-1]
+    if len(corners) != 4 or polygon.area < 0.9 * polygon.minimum_rotated_rectangle.area:
+        return None
+    sides = np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1)
+    if sides[0] + sides[2] > sides[1] + sides[3]:
+        corners, sides = np.roll(corners, -1, axis=0), np.roll(sides, -1)
+    span, height = min(sides[0], sides[2]), (building.height or 0.0) - building.base
+    # Halls have no gables; under the eaves people stand, and most of a house is wall.
+    rise = min(span / 2 * style.pitch, height - 2.2, 0.4 * height)
+    return _Gable(corners, rise) if span < 16 and rise > 0.5 else None
+
+
+def _gabled_roof(builder: MeshBuilder, gable: _Gable, eaves: float) -> None:
+    """Two slopes that reach over the walls and two gables above the short sides."""
+    a, b, c, d = gable.corners
+    ridge = np.array([(a + b) / 2, (c + d) / 2])
+    top = eaves + gable.rise
+    gables = [[*a, eaves], [*b, eaves], [*ridge[0], top], [*c, eaves], [*d, eaves], [*ridge[1], top]]
+    builder.add(np.array(gables), np.arange(6).reshape(2, 3), Surface.WALL)
+    axis = (ridge[1] - ridge[0]) / np.linalg.norm(ridge[1] - ridge[0])
+    ends = ridge + OVERHANG * np.array([-axis, axis])
+    for first, second in ((a, d), (b, c)):
+        out = [corner - middle for corner, middle in zip((first, second), ridge, strict=True)]
+        share = [OVERHANG / float(np.linalg.norm(o)) for o in out]
+        eave = [end + (1 + k) * o for end, o, k in zip(ends, out, share, strict=True)]
+        drops = [eaves - k * gable.rise for k in share]
+        slope = [[*eave[0], drops[0]], [*eave[1], drops[1]], [*ends[1], top], [*ends[0], top]]
+        builder.add_quads([slope], Surface.ROOF)
+
+
+def _level(builder: MeshBuilder, footprint: Footprint, z: float) -> None:
+    """The footprint as a level surface at height `z`."""
+    from shapely import constrained_delaunay_triangles, get_coordinates
+
+    triangles = constrained_delaunay_triangles(footprint_polygon(footprint))
+    corners = get_coordinates(triangles).reshape(-1, 4, 2)[:, :3].reshape(-1, 2)
+    vertices = np.column_stack([corners, np.full(len(corners), z)])
+    builder.add(vertices, np.arange(len(corners)).reshape(-1, 3), Surface.ROOF)
+
+
+def _canopy(builder: MeshBuilder, footprint: Footprint, bottom: float, top: float) -> None:
+    """A slab on posts, open on all sides."""
+    for z in (top - SLAB, top):
+        _level(builder, footprint, z)
+    for ring in footprint.rings:
+        following = np.roll(ring, -1, axis=0)
+        rim = [np.column_stack([p, np.full(len(p), z)]) for z, p in zip(
+            (top - SLAB, top - SLAB, top, top), (ring, following, following, ring), strict=True
+        )]  # fmt: skip
+        builder.add_quads(np.stack(rim, axis=1), Surface.ROOF)
+    inner = footprint_polygon(footprint).buffer(-0.4, join_style="mitre").simplify(1.0)
+    polygons = [p for p in getattr(inner, "geoms", [inner]) if not p.is_empty]
+    for polygon in polygons:
+        for x, y in np.array(polygon.exterior.coords)[:-1]:
+            builder.add_box([x - 0.1, y - 0.1, bottom], [x + 0.1, y + 0.1, top - SLAB], Surface.POLE)

@@ -14,8 +14,7 @@ from lslam.formats.osm_buildings import buildings_of, osm_from_buildings
 from lslam.formats.osm_files import write_osm
 from lslam.simulation.city import City
 from lslam.simulation.osm_city import OsmCity
-from lslam.simulation.osm_faults import MapFaults, draw_perturbation
-from lslam.simulation.osm_perturb import Perturbation, perturb, write_perturbation
+from lslam.simulation.osm_perturb import MapFaults, Perturbation, draw_perturbation, perturb, write_perturbation
 from lslam.types.building import Building, footprints_of
 
 EXACT, PERTURBED = "map.osm", "map_perturbed.osm"

@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 
 from lslam.errors import UsageError
 from lslam.geometry import se3, so3
-from lslam.simulation.built_scenario import build_scenario, populate
+from lslam.simulation.built_scenario import build_scenario, check_path, populate
 from lslam.simulation.city import City
-from lslam.simulation.clearance import check_path
 from lslam.simulation.gnss import ORIGIN, GnssModel
 from lslam.simulation.imu import ImuModel, imu_named
 from lslam.simulation.kinematics import PosePath, smooth_motion, standing_start

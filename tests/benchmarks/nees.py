@@ -25,7 +25,7 @@ from lslam.geometry import geodesy, se3, so3
 from lslam.pipeline.run import RunOutcome, run
 from lslam.simulation.gnss import ORIGIN, GnssModel
 from lslam.simulation.osm_extract import write_extracts
-from lslam.simulation.osm_faults import MapFaults
+from lslam.simulation.osm_perturb import MapFaults
 from lslam.simulation.scenarios import SimulatedDrive, simulate
 
 Floats = NDArray[np.float64]

@@ -33,8 +33,8 @@ from lslam.pipeline.rebuild import map_of, read_run
 from lslam.pipeline.resume import may_go_on
 from lslam.pipeline.view import viewed_run
 from lslam.simulation.osm_perturb import read_perturbation
+from lslam.simulation.record import read_mark
 from lslam.simulation.scenario_files import scenario_named
-from lslam.simulation.stream import read_mark
 from lslam.simulation.waypoints import read_way_points
 from lslam.studies import states
 from lslam.types.study import StudyRow

@@ -19,8 +19,15 @@ from lslam.formats.osm_files import ATTRIBUTION, read_osm, write_osm
 from lslam.simulation.city import City
 from lslam.simulation.osm_city import build_osm_city
 from lslam.simulation.osm_extract import Extracts, city_buildings, write_extracts
-from lslam.simulation.osm_faults import MapFaults, draw_perturbation
-from lslam.simulation.osm_perturb import Change, map_errors, perturb, read_perturbation, write_perturbation
+from lslam.simulation.osm_perturb import (
+    Change,
+    MapFaults,
+    draw_perturbation,
+    map_errors,
+    perturb,
+    read_perturbation,
+    write_perturbation,
+)
 from lslam.simulation.osm_place import read_extract
 from lslam.simulation.scenarios import simulate
 from lslam.simulation.scene_mesh import Surface

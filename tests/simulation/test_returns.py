@@ -11,8 +11,7 @@ from scipy import stats
 
 from lslam.simulation.lidar import RayScene, trace
 from lslam.simulation.lidar_models import LidarModel
-from lslam.simulation.rays import Hits, Rays
-from lslam.simulation.returns import Returns, errors, mixed, range_walk, texture
+from lslam.simulation.returns import Hits, Rays, Returns, errors, mixed, range_walk, texture
 from lslam.simulation.scenario_files import scenario_named
 from lslam.simulation.scenarios import simulate
 from lslam.simulation.scene_mesh import MeshBuilder, Surface

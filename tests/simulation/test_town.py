@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from lslam.errors import UsageError
+from lslam.simulation.built_scenario import check_bends, check_path
 from lslam.simulation.city import KERB, City
-from lslam.simulation.clearance import check_bends, check_path
 from lslam.simulation.lidar import RayScene
 from lslam.simulation.scenario_files import scenario_names
 from lslam.simulation.scenarios import SimulatedDrive, simulate
