@@ -21,8 +21,7 @@ from lslam.graph.fix_noise import DriftOfFixes, GaussMarkovNoise, fit_gauss_mark
 from lslam.graph.gnss_alignment import GnssAlignment, align
 from lslam.graph.problem import PoseGraph, PositionFix
 from lslam.maps.georeference import Projection
-from lslam.types.georeference import Georeference
-from lslam.types.gnss import GnssStream
+from lslam.types.gnss import Georeference, GnssStream
 from lslam.types.keyframe import Keyframe
 from lslam.types.scan_result import ScanResult
 from lslam.types.sequence import Sequence

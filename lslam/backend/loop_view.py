@@ -9,8 +9,7 @@ from lslam.backend.outcome import BackEnd
 from lslam.geometry import se3
 from lslam.keyframes.store import KeyframeStore
 from lslam.types.constraint import LoopCandidate
-from lslam.types.loop_view import LoopSurroundings, LoopView
-from lslam.types.run_record import RunRecord
+from lslam.types.run_record import LoopSurroundings, LoopView, RunRecord
 
 Floats = NDArray[np.float64]
 

@@ -20,10 +20,9 @@ from lslam.graph.odometry_constraints import corrected
 from lslam.graph.pose_graph import optimise
 from lslam.graph.problem import EstimatedDrift, PoseGraph, Solution
 from lslam.keyframes.store import KeyframeStore
-from lslam.types.building_correction import CorrectedMap
-from lslam.types.building_match import OsmMatches
+from lslam.types.building import CorrectedMap, OsmMatches
 from lslam.types.constraint import Constraint, LoopCandidate, LoopStage, Verdict
-from lslam.types.georeference import Georeference
+from lslam.types.gnss import Georeference
 from lslam.types.scan_result import ScanResult
 from lslam.types.stage_clock import KeyframeClocks
 

@@ -14,7 +14,7 @@ from lslam.cli.console import progress, setup_logging, show
 from lslam.stopping import heeded
 
 if TYPE_CHECKING:
-    from lslam.types.map_score import Crispness
+    from lslam.types.run_record import Crispness
 
 EPILOG = """\b
 Examples:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.geometry import geodesy, se2
-from lslam.types.building_correction import BuildingCorrection, BuildingStatus, CorrectedMap
+from lslam.types.building import BuildingCorrection, BuildingStatus, CorrectedMap
 
 Floats = NDArray[np.float64]
 

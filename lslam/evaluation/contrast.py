@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 
 from lslam.evaluation.landmarks import FLAT
-from lslam.types.sensitivity import Curve, Floats
+from lslam.types.study import Curve, Floats
 
 Rise = Literal["worse", "as good", "unknown"]
 

@@ -7,8 +7,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from lslam.evaluation.efficiency import efficiency
-from lslam.types.sensitivity import Bools, Curve, Floats
-from lslam.types.study import StudyRow, Value
+from lslam.types.study import Bools, Curve, Floats, StudyRow, Value
 
 # Everything else is registration: what Girolimetto's times per iteration hold (equation 5.2).
 NOT_REGISTRATION = ("read", "prepare", "standing", "keyframe", "integrity")

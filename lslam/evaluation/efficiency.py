@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lslam.evaluation.student import two_sided
-from lslam.types.sensitivity import Floats, Interval
+from lslam.types.study import Floats, Interval
 
 LEVEL = 0.95
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from lslam.types.sensitivity import Bools, Curve, Divergence, Floats, Optimum
+from lslam.types.study import Bools, Curve, Divergence, Floats, Optimum
 
 FLAT = 0.1  # what differs by less than a tenth is as good
 ELBOW = 1.5  # an error above so many times the plateau's is not on the plateau

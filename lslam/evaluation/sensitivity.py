@@ -12,8 +12,7 @@ from lslam.evaluation.efficiency import median_over_seeds, over_seeds
 from lslam.evaluation.landmarks import divergence, optimum
 from lslam.evaluation.laws import FEWEST, fit_law, law_over
 from lslam.evaluation.verdicts import judge
-from lslam.types.sensitivity import Curve, CurveResult, Floats, Interval, Law, LawKind, StudyResult
-from lslam.types.study import StudyRow
+from lslam.types.study import Curve, CurveResult, Floats, Interval, Law, LawKind, StudyResult, StudyRow
 
 if TYPE_CHECKING:
     from lslam.config.finding import ExpectedFinding

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lslam.types.sensitivity import Floats
+from lslam.types.study import Floats
 
 
 def two_sided(level: float, freedom: ArrayLike) -> Floats:

@@ -20,7 +20,7 @@ from lslam.evaluation.verdicts_of_places import (
     judge_holds_up_to,
     judge_largest_between,
 )
-from lslam.types.sensitivity import Curve, CurveResult, FindingVerdict, Judged, Law, Outcome
+from lslam.types.study import Curve, CurveResult, FindingVerdict, Judged, Law, Outcome
 
 _OF_TIME = ("time_per_scan", "total_time")
 _LAWS = ("linear", "inverse", "product")

@@ -15,8 +15,7 @@ from lslam.formats.atomic import write_text
 from lslam.formats.osm_files import DECIMALS
 from lslam.geometry import se2
 from lslam.geometry.geodesy import from_local, to_local
-from lslam.types.building import Building, Footprint
-from lslam.types.building_correction import BuildingCorrection, CorrectedMap
+from lslam.types.building import Building, BuildingCorrection, CorrectedMap, Footprint
 from lslam.untrusted import MISFIT, parse_json
 
 

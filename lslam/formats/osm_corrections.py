@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from lslam.formats.osm_files import DECIMALS, OsmData
 from lslam.geometry.geodesy import from_local, to_local
-from lslam.types.building import Building, about
-from lslam.types.building_correction import BuildingCorrection, CorrectedMap
+from lslam.types.building import Building, BuildingCorrection, CorrectedMap, about
 
 Floats = NDArray[np.float64]
 

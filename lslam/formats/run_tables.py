@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from lslam.errors import InputError, cause
 from lslam.formats.atomic import write_text
-from lslam.types.building_match import BuildingMatch, KeyframeMatch, OsmMatches
+from lslam.types.building import BuildingMatch, KeyframeMatch, OsmMatches
 from lslam.types.constraint import LoopCandidate
 from lslam.types.keyframe import Keyframe
 

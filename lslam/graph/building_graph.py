@@ -17,7 +17,7 @@ from lslam.geometry import se2
 from lslam.graph.chi_square import quantile
 from lslam.graph.gnc import truncated_weights
 from lslam.stopping import checking
-from lslam.types.building_match import BuildingMatch
+from lslam.types.building import BuildingMatch
 
 Floats = NDArray[np.float64]
 

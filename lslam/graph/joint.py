@@ -22,7 +22,7 @@ from lslam.graph.gnc import OutlierCandidate, gnc_solve, joined
 from lslam.graph.pose_graph import check_graph
 from lslam.graph.problem import PlanarPrior, PoseGraph
 from lslam.graph.solve import marginal_blocks, marginals
-from lslam.types.building_match import BuildingMatch
+from lslam.types.building import BuildingMatch
 
 Floats = NDArray[np.float64]
 

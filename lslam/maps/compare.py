@@ -6,7 +6,7 @@ import numpy as np
 
 from lslam.errors import InputError, UsageError
 from lslam.types.cloud import ArrayCloud
-from lslam.types.map_score import MapDifference
+from lslam.types.run_record import MapDifference
 
 THRESHOLD = 0.2  # m
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from lslam.errors import UsageError
 from lslam.maps.merge import MergedMap
 from lslam.types.cloud import ArrayCloud, Cloud, in_memory
-from lslam.types.map_score import Crispness
+from lslam.types.run_record import Crispness
 
 Floats = NDArray[np.float64]
 

@@ -14,7 +14,7 @@ from lslam.errors import UsageError
 from lslam.geometry import se3
 from lslam.geometry.geodesy import from_local, local_crs
 from lslam.types.cloud import Cloud, CloudBlock
-from lslam.types.georeference import Georeference
+from lslam.types.gnss import Georeference
 from lslam.untrusted import whole_number
 
 Floats = NDArray[np.float64]

@@ -23,8 +23,7 @@ from lslam.osm.join_buildings import accepted_part
 from lslam.osm.matcher import Laid
 from lslam.osm.wall_map import OsmMap
 from lslam.stopping import checking
-from lslam.types.building_correction import CorrectedMap
-from lslam.types.building_match import BuildingMatch, KeyframeMatch, OsmMatches
+from lslam.types.building import BuildingMatch, CorrectedMap, KeyframeMatch, OsmMatches
 from lslam.types.stage_clock import KeyframeClocks, StageClock
 
 Floats = NDArray[np.float64]

@@ -17,8 +17,7 @@ from lslam.formats.osm_files import OsmData, write_osm
 from lslam.graph.building_graph import BuildingSolution, MapPrior, agreeing, solve_buildings
 from lslam.osm.map_changes import absent_buildings, new_walls
 from lslam.osm.overlap import Untangled, remove_overlaps
-from lslam.types.building_correction import BuildingCorrection, BuildingStatus, CorrectedMap
-from lslam.types.building_match import BuildingMatch, OsmMatches
+from lslam.types.building import BuildingCorrection, BuildingMatch, BuildingStatus, CorrectedMap, OsmMatches
 
 log = logging.getLogger("lslam")
 Floats = NDArray[np.float64]

@@ -15,7 +15,7 @@ from lslam.osm import matcher_named
 from lslam.osm.location import finish
 from lslam.osm.on_map import find_on_map
 from lslam.osm.source import OsmSource
-from lslam.types.georeference import Georeference
+from lslam.types.gnss import Georeference
 
 
 def hold_by_buildings(osm: OsmSource, graph: PoseGraph, placement: Placement, given: Given) -> BackEnd | None:

@@ -13,8 +13,7 @@ from lslam.graph.joint import JointSolution, optimise_jointly
 from lslam.graph.problem import PoseGraph, Solution
 from lslam.osm.corrections import agreed, correct_buildings, map_prior, middles_of, place_buildings
 from lslam.osm.matcher import Laid
-from lslam.types.building_correction import CorrectedMap
-from lslam.types.building_match import OsmMatches
+from lslam.types.building import CorrectedMap, OsmMatches
 
 
 def lay(graph: PoseGraph, solution: Solution, matches: OsmMatches, extract: BuildingExtract, given: Given) -> Laid:

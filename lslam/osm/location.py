@@ -30,7 +30,7 @@ from lslam.osm.track import OsmTrack
 from lslam.osm.wall_map import OsmMap
 from lslam.osm.wall_match import START_WALLS
 from lslam.stopping import checking
-from lslam.types.building_match import BuildingMatch, KeyframeMatch, OsmMatches
+from lslam.types.building import BuildingMatch, KeyframeMatch, OsmMatches
 from lslam.types.constraint import Verdict
 from lslam.types.stage_clock import KeyframeClocks
 

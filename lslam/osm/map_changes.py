@@ -18,8 +18,7 @@ from lslam.kernels import wall_matching
 from lslam.osm.wall_match import LIKENESS
 from lslam.osm.walls import walls_of
 from lslam.stopping import checking
-from lslam.types.building import Building, footprint_polygon, is_canopy
-from lslam.types.building_match import KeyframeMatch
+from lslam.types.building import Building, KeyframeMatch, footprint_polygon, is_canopy
 
 Floats = NDArray[np.float64]
 

@@ -10,8 +10,7 @@ if TYPE_CHECKING:
     from lslam.formats.osm_buildings import BuildingExtract
     from lslam.graph.joint import JointSolution
     from lslam.graph.problem import PoseGraph, Solution
-    from lslam.types.building_correction import CorrectedMap
-    from lslam.types.building_match import OsmMatches
+    from lslam.types.building import CorrectedMap, OsmMatches
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from lslam.geometry import se2
 from lslam.osm.wall_map import OsmMap
 from lslam.osm.wall_match import WINDOW, WallMatch, match_walls
 from lslam.osm.walls import find_walls
-from lslam.types.building_match import BuildingMatch, KeyframeMatch
+from lslam.types.building import BuildingMatch, KeyframeMatch
 from lslam.types.constraint import Verdict
 
 Floats = NDArray[np.float64]

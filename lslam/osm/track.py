@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.geometry import se2
-from lslam.types.building_match import KeyframeMatch
+from lslam.types.building import KeyframeMatch
 
 Floats = NDArray[np.float64]
 

@@ -31,7 +31,7 @@ from lslam.osm.source import OsmSource
 from lslam.pipeline.manifest import Manifest
 from lslam.stopping import asking
 from lslam.types.constraint import LoopCandidate
-from lslam.types.georeference import Georeference
+from lslam.types.gnss import Georeference
 from lslam.types.run_record import RunRecord
 from lslam.types.sequence import Sequence
 from lslam.types.stage_clock import KeyframeClocks

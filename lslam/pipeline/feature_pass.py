@@ -19,7 +19,7 @@ from lslam.pipeline.map_checkpoints import MapCheckpoints
 from lslam.pipeline.map_pass import motion_within
 from lslam.preprocessing.features import Features
 from lslam.stopping import asking
-from lslam.types.feature_view import FeatureView
+from lslam.types.run_record import FeatureView
 from lslam.types.scan_result import ScanResult
 from lslam.types.sequence import Sequence
 from lslam.types.state import State

@@ -21,7 +21,7 @@ from lslam.pipeline.json_files import write_json
 from lslam.pipeline.map_notes import SCHEMA, note_with
 from lslam.reports.png import grey_png
 from lslam.types.cloud import Cloud, in_memory
-from lslam.types.georeference import Georeference
+from lslam.types.gnss import Georeference
 from lslam.types.trajectory import Trajectory
 from lslam.untrusted import MISFIT
 from lslam.version import __version__

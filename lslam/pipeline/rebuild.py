@@ -38,9 +38,8 @@ from lslam.pipeline.run_folder import MANIFEST, SPOOL, held, require_run
 from lslam.readers import open_sequence
 from lslam.readers.selection import select
 from lslam.remote import as_path
-from lslam.types.georeference import Georeference
-from lslam.types.map_score import Crispness
-from lslam.types.run_record import RunRecord
+from lslam.types.gnss import Georeference
+from lslam.types.run_record import Crispness, RunRecord
 from lslam.types.scan_result import ScanResult, Status
 from lslam.types.sequence import Sequence
 from lslam.types.trajectory import Trajectory

@@ -15,8 +15,7 @@ from lslam.reports.crops import Crop, crop_images
 from lslam.reports.plane import Track, plane_chart
 from lslam.reports.plots import ALIGNED, DISTANCE, Figure, first_available
 from lslam.reports.png import data_uri, density_png
-from lslam.types.loop_view import LoopView
-from lslam.types.run_record import RunRecord
+from lslam.types.run_record import LoopView, RunRecord
 from lslam.types.table import Table
 
 if TYPE_CHECKING:

@@ -14,9 +14,7 @@ from lslam.geometry import se2
 from lslam.printable import counted
 from lslam.reports.plane import MOST_POINTS, Track, plane_chart
 from lslam.reports.plots import Figure
-from lslam.types.building import Building
-from lslam.types.building_correction import BuildingCorrection, CorrectedMap
-from lslam.types.building_match import KeyframeMatch, OsmMatches
+from lslam.types.building import Building, BuildingCorrection, CorrectedMap, KeyframeMatch, OsmMatches
 from lslam.types.run_record import RunRecord
 from lslam.types.table import Table
 

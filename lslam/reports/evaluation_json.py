@@ -29,8 +29,7 @@ from typing import Any
 from lslam.evaluation.metrics import METRICS
 from lslam.evaluation.results import Evaluation
 from lslam.evaluation.timing import Timing
-from lslam.types.map_score import Crispness
-from lslam.types.run_record import RunRecord
+from lslam.types.run_record import Crispness, RunRecord
 from lslam.version import __version__
 
 SCHEMA, VERSION = "lslam-evaluation", 1

@@ -10,7 +10,7 @@ from lslam.reports.crops import Crop, crop_images
 from lslam.reports.plane import MOST_POINTS, plane_chart
 from lslam.reports.plots import Figure
 from lslam.reports.png import data_uri, density_png
-from lslam.types.feature_view import FeatureView
+from lslam.types.run_record import FeatureView
 
 Floats = NDArray[np.float64]
 

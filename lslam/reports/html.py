@@ -16,8 +16,7 @@ from lslam.reports.facts import RunFacts, run_facts
 from lslam.reports.feature_view import feature_figures
 from lslam.reports.png import data_uri, density_png
 from lslam.reports.text import imu_rows
-from lslam.types.map_score import Crispness
-from lslam.types.run_record import RunRecord
+from lslam.types.run_record import Crispness, RunRecord
 from lslam.types.table import Table
 from lslam.version import __version__
 

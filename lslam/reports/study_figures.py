@@ -14,8 +14,7 @@ from lslam.evaluation.efficiency import normalise
 from lslam.evaluation.landmarks import FLAT
 from lslam.evaluation.laws import band
 from lslam.reports.picture import COLOURS, house_style, label, pictures
-from lslam.types.sensitivity import CurveResult, Floats, Law, StudyResult
-from lslam.types.study import StudyRow
+from lslam.types.study import CurveResult, Floats, Law, StudyResult, StudyRow
 
 # Of section 5.3, by studied parameter and figure.
 THESIS = {

@@ -21,8 +21,7 @@ from lslam.studies.output import STUDY, OutputOptions
 from lslam.studies.results import RESULTS
 from lslam.studies.runner import StudyProgress
 from lslam.studies.variants import study_variants
-from lslam.types.sensitivity import StudyResult
-from lslam.types.study import StudyRow
+from lslam.types.study import StudyResult, StudyRow
 
 log = logging.getLogger("lslam")
 

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any
+from math import erf, sqrt
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lslam.geometry import se2
+from lslam.types.constraint import Verdict
 
 Floats = NDArray[np.float64]
 
@@ -109,3 +111,160 @@ def footprints_of(geometry: Any) -> tuple[Footprint, ...]:
 def _signed_area(ring: Floats) -> float:
     x, y = (ring - ring[0]).T
     return float(np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y) / 2)
+
+
+MatchKind = Literal["edges", "lines", "none"]
+
+
+@dataclass(frozen=True)
+class KeyframeMatch:
+    """The walls seen about one keyframe, laid on all buildings near: Del Tufo's global match.
+
+    walls : (S, 2, 2) segments seen, m, level frame, the outside to the right; views : (V, 2) the sensor's places there
+    prior : (3,) where the run expected the keyframe in the map frame; sigma : (3,) how well, m, m, rad
+    pose : (3,) where the walls put it, the prior where there is no match
+    information : (3, 3) of `pose` in the axes of the map, 1/m2 and 1/rad2, singular along what the walls leave free
+    rank : directions it fixes, 0 to 3; kind : `edges` walls of two directions, `lines` parallel ones, `none` no match
+    fitness, coverage, rms : as of `osm.wall_match.WallMatch`, NaN without a match
+    pairs : (K, 2) which wall seen lies on which wall of the map, numbers of `map_walls` of the run's `OsmMatches`
+    verdict, reason : whether it constrains the trajectory, and why not, one clause
+    """
+
+    keyframe: int
+    walls: Floats
+    views: Floats
+    prior: Floats
+    sigma: Floats
+    pose: Floats
+    information: Floats
+    rank: int = 0
+    kind: MatchKind = "none"
+    fitness: float = float("nan")
+    coverage: float = float("nan")
+    rms: float = float("nan")
+    pairs: NDArray[np.int64] = field(default_factory=lambda: np.zeros((0, 2), np.int64))
+    verdict: Verdict = Verdict.REJECTED
+    reason: str = ""
+
+    @property
+    def is_accepted(self) -> bool:
+        """Whether it constrains the trajectory."""
+        return self.verdict == Verdict.ACCEPTED
+
+
+@dataclass(frozen=True)
+class BuildingMatch:
+    """One building's walls laid on the walls seen about one keyframe: Del Tufo's local match, of use to the buildings only.
+
+    building : number among the buildings of the run's `OsmMatches`
+    pose : (3,) of the building in the level frame of the keyframe: its axes are the map's and its origin is
+        `Building.middle`, as OpenStreetMap has it, so that it does not matter where the keyframe is thought to be
+    information : (3, 3) of `pose` in the axes of that level frame, singular along what the walls leave free
+    pairs : (K, 2) which of the building's walls (rows of `osm.walls.walls_of([building])`) lies on which wall seen
+    """
+
+    keyframe: int
+    building: int
+    pose: Floats
+    information: Floats
+    rank: int
+    kind: MatchKind
+    fitness: float
+    coverage: float
+    rms: float
+    pairs: NDArray[np.int64]
+    verdict: Verdict = Verdict.ACCEPTED
+    reason: str = ""
+
+    @property
+    def is_accepted(self) -> bool:
+        """Whether it constrains its building."""
+        return self.verdict == Verdict.ACCEPTED
+
+    def displacement(self, keyframe: Floats, middle: Floats) -> Floats:
+        """(3,) by which the building moves, turned about its `middle` (2,), when the keyframe is at `keyframe` (3,)."""
+        pose = se2.compose(keyframe, self.pose)
+        return np.asarray(pose - [middle[0], middle[1], 0.0])
+
+
+@dataclass(frozen=True)
+class OsmMatches:
+    """All matches of a run.
+
+    origin : (3,) lat, lon (deg), height (m) of the map frame
+    buildings : those that came near; map_walls : (T, 2, 2) their walls, m, map frame; owners : (T,) number of each's building
+    keyframes : one per keyframe that was looked at; local : of every building near each of them that is partly seen
+    shift : (2,) m by which the run found OpenStreetMap to lie off as a whole (true minus map), and its sigma, m
+    source : of messages; attribution : what outputs have to carry, None where nobody surveyed the map
+    """
+
+    origin: Floats
+    buildings: tuple[Building, ...]
+    map_walls: Floats
+    owners: NDArray[np.int64]
+    keyframes: tuple[KeyframeMatch, ...]
+    local: tuple[BuildingMatch, ...]
+    shift: Floats = field(default_factory=lambda: np.zeros(2))
+    shift_sigma: Floats = field(default_factory=lambda: np.full(2, np.inf))
+    source: str = ""
+    attribution: str | None = None
+
+    @property
+    def accepted(self) -> list[KeyframeMatch]:
+        """The matches that constrain the trajectory."""
+        return [match for match in self.keyframes if match.is_accepted]
+
+
+# `seen`: scans hold it; `unseen`: no scan says anything, it follows the map; `absent`: scans look through where it should be.
+BuildingStatus = Literal["seen", "unseen", "absent"]
+
+NEAR = 0.5  # m; what `BuildingCorrection.confidence` counts as in its place
+
+
+@dataclass(frozen=True)
+class BuildingCorrection:
+    """One building of the map and its real place.
+
+    building : as on the map, m, map frame
+    displacement : (3,) x, y (m), yaw (rad) about the building's `middle`, real minus map
+    covariance : (3, 3) of it, m2 and rad2
+    used, rejected : matches with walls seen that hold it, and that were given up
+    """
+
+    building: Building
+    displacement: Floats
+    covariance: Floats
+    status: BuildingStatus
+    used: int = 0
+    rejected: int = 0
+
+    @property
+    def corrected(self) -> Building:
+        """The building where it really stands."""
+        return self.building.displaced(self.displacement)
+
+    @property
+    def confidence(self) -> float:
+        """Probability, by the covariance, that it stands within `NEAR` m of its place along both axes of its uncertainty."""
+        variances = np.maximum(np.linalg.eigvalsh(self.covariance[:2, :2]), 1e-12)
+        return float(np.prod([erf(NEAR / sqrt(2 * v)) for v in variances]))
+
+
+@dataclass(frozen=True)
+class CorrectedMap:
+    """All buildings of a run.
+
+    origin : (3,) lat, lon (deg), height (m) of the map frame, x east, y north
+    mode : `osm.mode` they were corrected in; shift : (2,) m by which the map is off as a whole, real minus map
+    new_walls : (S, 2, 2) m, map frame: walls seen where no building is
+    left : pairs of positions in `buildings` that overlap and could not be parted
+    attribution : what outputs have to carry, None where nobody surveyed the map
+    """
+
+    origin: Floats
+    buildings: tuple[BuildingCorrection, ...]
+    mode: str
+    shift: Floats = field(default_factory=lambda: np.zeros(2))
+    new_walls: Floats = field(default_factory=lambda: np.zeros((0, 2, 2)))
+    left: tuple[tuple[int, int], ...] = ()
+    attribution: str | None = None

@@ -9,15 +9,113 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.types.building_correction import CorrectedMap
-from lslam.types.building_match import OsmMatches
+from lslam.types.building import CorrectedMap, OsmMatches
 from lslam.types.constraint import LoopCandidate, Turn
-from lslam.types.feature_view import FeatureView
-from lslam.types.georeference import Georeference
-from lslam.types.loop_view import LoopView
-from lslam.types.map_score import Crispness
+from lslam.types.gnss import Georeference
 from lslam.types.scan_result import ScanResult
 from lslam.types.trajectory import Trajectory
+
+
+@dataclass(frozen=True)
+class Crispness:
+    """How sharp a map is, without ground truth (Razlaw, Droeschel, Holz, Behnke, ECMR 2015); lower is crisper.
+
+    entropy : mean map entropy, the mean of 1/2 ln |2 pi e C| over neighbourhoods with covariance C (m2); nats
+    plane_variance : mean plane variance, the mean variance of neighbours about the plane through them, m2
+    neighbourhoods : that had enough points; None values when there was none
+    """
+
+    entropy: float | None
+    plane_variance: float | None
+    neighbourhoods: int
+    sampled: int
+    points: int
+    radius: float
+    least: int
+
+    @property
+    def recipe(self) -> str:
+        """How the numbers were made, for people."""
+        return (
+            f"Razlaw et al. 2015: {self.neighbourhoods} neighbourhoods of {self.radius:g} m with at least {self.least} "
+            f"points, about {self.sampled} of {self.points} map points"
+        )
+
+
+@dataclass(frozen=True)
+class MapDifference:
+    """An estimated map against a reference cloud; distances are those to the nearest point of the other, m.
+
+    precision : share of the map's points within `threshold` of the reference; recall : the other way round; f1 : their
+        harmonic mean; chamfer : mean of the two mean distances, m
+    """
+
+    threshold: float
+    precision: float
+    recall: float
+    f1: float
+    chamfer: float
+    mean_to_reference: float
+    mean_from_reference: float
+    points: int
+    reference_points: int
+
+    @property
+    def recipe(self) -> str:
+        """How the numbers were made, for people."""
+        return (
+            f"nearest points within {self.threshold:g} m, every point of both clouds ({self.points} and "
+            f"{self.reference_points}), no alignment"
+        )
+
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class LoopSurroundings:
+    """The surroundings of a loop as one trajectory has them.
+
+    points : (N, 3) of the keyframes on both ways past it, m; older, newer : (A, 2), (B, 2) those ways; centre : (2,) of the
+        older end
+    """
+
+    points: Floats
+    older: Floats
+    newer: Floats
+    centre: Floats
+
+
+@dataclass(frozen=True)
+class LoopView:
+    """The loop that the pose graph corrected most: between which scans, how far it moved one end against the other, m."""
+
+    older_scan: int
+    newer_scan: int
+    correction: float
+    before: LoopSurroundings
+    after: LoopSurroundings
+
+
+@dataclass(frozen=True)
+class FeatureView:
+    """What a feature method works on.
+
+    scan : the one that is shown; edges (E, 2), planes (P, 2) : its sharp and flat features, m, LiDAR frame; around (K, 3) :
+        all its other features there
+    map_edges (M, 3), map_planes (N, 3) : less sharp edges and less planar points of the scans looked at, m, world frame
+    scans : (S,) those; edge_counts, plane_counts : (S,) features of each
+    """
+
+    scan: int
+    edges: Floats
+    planes: Floats
+    around: Floats
+    map_edges: Floats
+    map_planes: Floats
+    scans: NDArray[np.int64]
+    edge_counts: NDArray[np.int64]
+    plane_counts: NDArray[np.int64]
 
 
 @dataclass

@@ -27,7 +27,7 @@ from lslam.osm.first_match import see_walls
 from lslam.osm.prior import match_buildings, match_keyframe, warm_up
 from lslam.osm.wall_map import OsmMap
 from lslam.readers import open_sequence
-from lslam.types.building_match import KeyframeMatch
+from lslam.types.building import KeyframeMatch
 from lslam.types.keyframe import Keyframe
 from lslam.types.motion_prior import MotionPrior
 

@@ -24,7 +24,7 @@ from lslam.pipeline import refresh
 from lslam.pipeline.map_files import georeference_note
 from lslam.pipeline.run_folder import held
 from lslam.readers import open_sequence
-from lslam.types.georeference import Georeference
+from lslam.types.gnss import Georeference
 
 COUNT = 10
 

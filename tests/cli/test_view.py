@@ -20,7 +20,7 @@ from lslam.pipeline.map_files import MapNote, georeference_note, write_map
 from lslam.pipeline.view import viewed_run
 from lslam.reports.recording import MOST_POINTS, by_height
 from lslam.types.cloud import ArrayCloud
-from lslam.types.georeference import Georeference
+from lslam.types.gnss import Georeference
 from lslam.types.trajectory import Trajectory
 
 POINTS = np.random.default_rng(0).uniform(-50, 50, (400, 3))

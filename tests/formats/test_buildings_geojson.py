@@ -14,8 +14,7 @@ from lslam.errors import InputError, OutputError
 from lslam.formats.geojson import read_corrected, write_corrected
 from lslam.formats.osm_buildings import read_buildings
 from lslam.formats.osm_files import ATTRIBUTION
-from lslam.types.building import Building, Footprint
-from lslam.types.building_correction import BuildingCorrection, CorrectedMap
+from lslam.types.building import Building, BuildingCorrection, CorrectedMap, Footprint
 
 YES = {"building": "yes"}
 

@@ -14,8 +14,7 @@ from lslam.errors import InputError
 from lslam.formats.osm_buildings import buildings_of
 from lslam.formats.osm_corrections import corrected_osm
 from lslam.formats.osm_files import ATTRIBUTION, Member, OsmData, Way, from_overpass, read_osm, write_osm
-from lslam.types.building import Building
-from lslam.types.building_correction import BuildingCorrection, CorrectedMap
+from lslam.types.building import Building, BuildingCorrection, CorrectedMap
 
 Floats = NDArray[np.float64]
 

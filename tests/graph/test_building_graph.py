@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from lslam.geometry import se2
 from lslam.graph.building_graph import SUPPORT, BuildingSolution, MapPrior, agreeing, solve_buildings
-from lslam.types.building_match import BuildingMatch
+from lslam.types.building import BuildingMatch
 
 Floats = NDArray[np.float64]
 

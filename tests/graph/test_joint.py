@@ -19,7 +19,7 @@ from lslam.graph.drift import with_drift
 from lslam.graph.joint import optimise_jointly
 from lslam.graph.odometry_constraints import in_plane
 from lslam.graph.problem import FloorPlane, PoseGraph
-from lslam.types.building_match import BuildingMatch
+from lslam.types.building import BuildingMatch
 from lslam.types.constraint import Constraint
 
 Floats = NDArray[np.float64]

@@ -17,7 +17,7 @@ from lslam.geometry import se3, so3
 from lslam.maps.georeference import Projection, parse_crs, to_lat_lon, utm_epsg
 from lslam.pipeline.map_files import MapNote, write_geojson, write_map
 from lslam.types.cloud import ArrayCloud
-from lslam.types.georeference import Georeference
+from lslam.types.gnss import Georeference
 from lslam.types.trajectory import Trajectory
 
 KARLSRUHE = np.array([49.0113, 8.4256, 116.4])

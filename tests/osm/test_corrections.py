@@ -14,9 +14,7 @@ from lslam.geometry import se2
 from lslam.osm.corrections import correct_buildings
 from lslam.osm.wall_match import match_walls
 from lslam.osm.walls import walls_of
-from lslam.types.building import Building, Footprint
-from lslam.types.building_correction import CorrectedMap
-from lslam.types.building_match import BuildingMatch, KeyframeMatch, OsmMatches
+from lslam.types.building import Building, BuildingMatch, CorrectedMap, Footprint, KeyframeMatch, OsmMatches
 
 Floats = NDArray[np.float64]
 Mode = Literal["prior", "rigid", "non-rigid", "two-level"]

@@ -18,8 +18,7 @@ from lslam.osm import location
 from lslam.osm.location import Located, finish, locate
 from lslam.osm.prior import match_keyframe
 from lslam.osm.wall_map import OsmMap
-from lslam.types.building import Building, Footprint
-from lslam.types.building_match import KeyframeMatch
+from lslam.types.building import Building, Footprint, KeyframeMatch
 from lslam.types.keyframe import Keyframe
 
 Outline = list[tuple[float, float]]

@@ -13,8 +13,7 @@ from wall_scenes import box_at
 from lslam.geometry import se2
 from lslam.osm.map_changes import absent_buildings, new_walls
 from lslam.osm.walls import walls_of
-from lslam.types.building import Building, Footprint, footprint_polygon
-from lslam.types.building_match import KeyframeMatch
+from lslam.types.building import Building, Footprint, KeyframeMatch, footprint_polygon
 
 Floats = NDArray[np.float64]
 

@@ -25,7 +25,7 @@ from lslam.osm.on_map import find_on_map, on_map, sightings
 from lslam.osm.source import OsmServer
 from lslam.pipeline.check import check_config
 from lslam.types.constraint import Constraint
-from lslam.types.georeference import Georeference
+from lslam.types.gnss import Georeference
 from lslam.types.scan_result import ScanResult
 
 SURE = np.diag([1e-6] * 3 + [1e-8] * 3)

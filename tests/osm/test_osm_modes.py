@@ -25,8 +25,7 @@ from lslam.geometry import geodesy, se2, se3
 from lslam.osm import location
 from lslam.osm.track import OsmTrack
 from lslam.simulation.osm_perturb import map_errors, read_perturbation
-from lslam.types.building_correction import CorrectedMap
-from lslam.types.building_match import KeyframeMatch
+from lslam.types.building import CorrectedMap, KeyframeMatch
 from lslam.types.stage_clock import KeyframeClocks
 
 Floats = NDArray[np.float64]

@@ -6,7 +6,7 @@ from scipy.optimize import minimize
 
 from lslam.geometry import se2
 from lslam.osm.track import OsmTrack
-from lslam.types.building_match import KeyframeMatch
+from lslam.types.building import KeyframeMatch
 
 MAP = np.array([0.5, 0.5, 0.02])
 

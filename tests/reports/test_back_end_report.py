@@ -12,9 +12,9 @@ from lslam.config.eval import EvalConfig
 from lslam.evaluation.evaluate import evaluate
 from lslam.geometry import se3
 from lslam.reports.back_end import back_end_figures, back_end_rows
-from lslam.types.building_match import OsmMatches
+from lslam.types.building import OsmMatches
 from lslam.types.constraint import LoopCandidate
-from lslam.types.georeference import Georeference
+from lslam.types.gnss import Georeference
 from lslam.types.run_record import RunRecord
 
 

@@ -10,9 +10,15 @@ from numpy.typing import NDArray
 
 from lslam.reports.back_end import back_end_rows
 from lslam.reports.buildings import MOST_ROWS, building_figures, building_pages, building_tables, drift_tables
-from lslam.types.building import Building, Footprint
-from lslam.types.building_correction import BuildingCorrection, CorrectedMap
-from lslam.types.building_match import BuildingMatch, KeyframeMatch, OsmMatches
+from lslam.types.building import (
+    Building,
+    BuildingCorrection,
+    BuildingMatch,
+    CorrectedMap,
+    Footprint,
+    KeyframeMatch,
+    OsmMatches,
+)
 from lslam.types.run_record import RunRecord
 
 Floats = NDArray[np.float64]

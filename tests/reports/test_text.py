@@ -143,7 +143,7 @@ def test_degenerate_directions_are_named() -> None:
 
 def test_crispness_is_stated_with_and_without_truth(make_record: MakeRecord) -> None:
     from lslam.reports.evaluation_json import run_document
-    from lslam.types.map_score import Crispness
+    from lslam.types.run_record import Crispness
 
     record = make_record(5)
     assert run_document(record, None) is None
