@@ -67,8 +67,8 @@ def command(jobs_file: Path, **given: Any) -> None:
 
 def _expanded(path: Path, output: OutputOptions, given: dict[str, Any]) -> ExpandedStudy:
     if path != Path("-"):
-        from lslam.config.batch import read_batch
         from lslam.config.load import check_settings
+        from lslam.config.study import read_batch
 
         check_settings(given["settings"])
         batch = read_batch(path)

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from lslam.config import Config
+from lslam.config.load import read_preset
 from lslam.config.odometry import TIGHTLY_COUPLED
-from lslam.config.preset_files import read_preset
 from lslam.errors import UsageError
 from lslam.evaluation.recipes import check_words, parse_delta
 from lslam.loops import require_descriptor

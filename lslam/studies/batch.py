@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from lslam.config import Config
-from lslam.config.batch import BatchConfig, parse_batch
+from lslam.config.study import BatchConfig, parse_batch
 from lslam.errors import UsageError
 from lslam.pipeline.identity import imu_digest, input_digest, job_digest, listing_digest
 from lslam.printable import file_safe, toml_text

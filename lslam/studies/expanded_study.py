@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from lslam.config.preset_files import read_toml
+from lslam.config.load import read_toml
 from lslam.errors import InterruptedRunError, LslamError, OutputExistsError
 from lslam.formats.atomic import write_text
 from lslam.studies.engines import Engine

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 from lslam.config import Config, load_config
-from lslam.config.preset_files import known_presets
+from lslam.config.load import known_presets
 from lslam.config.study import Point, StudyConfig
 from lslam.errors import ConfigError, UsageError, nearest
 from lslam.odometry import known_methods

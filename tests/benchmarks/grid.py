@@ -32,7 +32,7 @@ from traced import Traced
 
 from lslam import Registration
 from lslam.config import load_config
-from lslam.config.preset_files import known_presets
+from lslam.config.load import known_presets
 from lslam.errors import RunFailedError
 from lslam.formats.trajectory_files import read_trajectory
 from lslam.geometry import se3

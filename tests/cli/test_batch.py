@@ -14,7 +14,7 @@ import pytest
 from calling import COMMAND, Done, assert_one_sentence, environment, lslam, sample_copy
 
 from lslam.cli.batch import _line, command
-from lslam.config.batch import BatchConfig, read_batch
+from lslam.config.study import BatchConfig, read_batch
 from lslam.errors import ConfigError, LslamError, OutputExistsError
 from lslam.formats.study_files import read_study_csv
 from lslam.studies.batch import expand_batch, run_words

@@ -11,9 +11,8 @@ from formats.osm_builders import ExtractMaker
 from fuzz.cases import Files, Parser
 
 from lslam.config import load_config
-from lslam.config.batch import read_batch
 from lslam.config.load import to_toml
-from lslam.config.study import read_study
+from lslam.config.study import read_batch, read_study
 from lslam.errors import LslamError
 from lslam.evaluation.timing import read_timing
 from lslam.formats.calibration_files import read_cam0_lidar, read_mcd_extrinsics, read_transform

@@ -10,7 +10,7 @@ from distributed import LocalCluster
 from storages import Counted, counted, stored
 from stub_sequences import SAMPLE
 
-from lslam.config.batch import BatchConfig, parse_batch
+from lslam.config.study import BatchConfig, parse_batch
 from lslam.formats.study_files import read_study_csv
 from lslam.pipeline.storage import spool_of
 from lslam.remote import RemotePath
