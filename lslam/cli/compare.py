@@ -143,10 +143,10 @@ def _truth(path: Path | None, subjects: list[Subject]) -> Trajectory | None:
 
 
 def _print(comparison: Comparison, style: str, as_json: bool) -> None:
-    from lslam.reports import compare_json, compare_table
+    from lslam.reports import compare_table
 
     if as_json:
-        show(json.dumps(compare_json.to_document(comparison), allow_nan=False) + "\n")
+        show(json.dumps(compare_table.to_document(comparison), allow_nan=False) + "\n")
     elif style == "text" and sys.stdout.isatty():
         _print_rich(comparison)
     else:

@@ -86,7 +86,7 @@ def command(
         raise UsageError("--timing belongs to one estimate; with several, put timing.csv beside each")
     options.require_there(*estimates, truth, given["calib"], given["times"], given["timing_file"])
     config = _config(given, flags)
-    from lslam.reports import evaluation_json, evaluation_plot, evaluation_table
+    from lslam.reports import evaluation_json, evaluation_table, picture
 
     evaluations = _evaluate_all(estimates, truth, config, given)
     timings = [_timing(path, given["timing_file"]) for path in estimates]
@@ -95,7 +95,7 @@ def command(
     else:
         click.echo(evaluation_table.render(evaluations, timings, table))
     if plot is not None:
-        evaluation_plot.write_plot(plot, evaluations)
+        picture.write_plot(plot, evaluations)
     _hold_gates(evaluations, given)
 
 

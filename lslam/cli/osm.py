@@ -166,7 +166,7 @@ def show(file: Path, png: Path | None, origin: str | None, overwrite: bool, as_j
     facts = _facts(extract)
     facts["elements"] = {"nodes": len(data.nodes), "ways": len(data.ways), "relations": len(data.relations)}
     if png is not None:
-        from lslam.reports.osm_plot import write_buildings_png
+        from lslam.reports.picture import write_buildings_png
 
         write_buildings_png(png, extract)
     if as_json:

@@ -12,9 +12,9 @@ from lslam.printable import counted, metres
 from lslam.reports import svg
 from lslam.reports.buildings import drift_tables
 from lslam.reports.crops import Crop, crop_images
-from lslam.reports.plane import Track, plane_chart
 from lslam.reports.plots import ALIGNED, DISTANCE, Figure, first_available
 from lslam.reports.png import data_uri, density_png
+from lslam.reports.svg import Track, plane_chart
 from lslam.types.run_record import LoopView, RunRecord
 from lslam.types.table import Table
 

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from lslam.geometry import se2
 from lslam.printable import counted
-from lslam.reports.plane import MOST_POINTS, Track, plane_chart
 from lslam.reports.plots import Figure
+from lslam.reports.svg import MOST_POINTS, Track, plane_chart
 from lslam.types.building import Building, BuildingCorrection, CorrectedMap, KeyframeMatch, OsmMatches
 from lslam.types.run_record import RunRecord
 from lslam.types.table import Table

@@ -4,17 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from html import escape
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
+import numpy as np
+
+from lslam.errors import LslamError
 from lslam.formats.atomic import atomic_write
-from lslam.reports.compare_figures import crop_figures, error_figure, style_of, time_figure, trajectory_figure
+from lslam.formats.point_files import read_points
+from lslam.reports import svg
 from lslam.reports.compare_table import recipes, tables
-from lslam.reports.crops import Crop
+from lslam.reports.crops import Crop, Floats, choose_crops, crop_images
 from lslam.reports.html import flatten, template
-from lslam.reports.plots import Figure
-from lslam.types.comparison import Comparison, Drawing
+from lslam.reports.plots import DISTANCE, LIMIT_IN_VIEW, Figure
+from lslam.reports.png import data_uri, density_png
+from lslam.reports.svg import Track, plane_chart
+from lslam.types.comparison import Comparison, Drawing, DrawnRun, RunScore
 from lslam.version import __version__
 
 WIDEST = 125  # characters of a table that the page shows without scrolling
@@ -100,3 +107,142 @@ def _configs(comparison: Comparison) -> list[tuple[str, list[str], bool]]:
 
 def _text(value: Any) -> str:
     return "absent" if value is None else str(value)
+
+
+STYLES = 12
+_ROW, _BAR = 42, 18
+
+
+def style_of(method: str, methods: Sequence[str]) -> str:
+    """The class of the style sheet that a method is drawn with, the same everywhere on the page."""
+    return f"s{methods.index(method) % STYLES + 1}"
+
+
+def trajectory_figure(drawing: Drawing, methods: Sequence[str]) -> Figure:
+    """All trajectories of a drawing from above, ground truth dashed."""
+    tracks = []
+    for run in drawing.runs:
+        tracks.append(Track(run.method, run.positions[:, :2], style_of(run.method, methods)))
+    if drawing.gt_positions is not None:
+        tracks.append(Track("ground truth", drawing.gt_positions[:, :2], "gt"))
+    chart = plane_chart(tracks, f"trajectories on {drawing.sequence} from above")
+    legend = tuple((track.style, track.label) for track in tracks)
+    return Figure("Trajectories from above", chart, legend, _sentence(f"Seed {drawing.seed}, {drawing.recipe}"))
+
+
+def error_figure(drawing: Drawing, methods: Sequence[str]) -> Figure | None:
+    """Position error over distance, one line per method; None without ground truth."""
+    lines = [
+        svg.Line(run.method, run.distance, run.errors, style_of(run.method, methods))
+        for run in drawing.runs
+        if run.distance is not None and run.errors is not None
+    ]
+    if not lines:
+        return None
+    chart = svg.line_chart(lines, DISTANCE, "position error, m", f"position error on {drawing.sequence}")
+    legend = tuple((line.style, line.label) for line in lines)
+    return Figure("Position error", chart, legend, _sentence(f"Seed {drawing.seed}, {drawing.recipe}"))
+
+
+def time_figure(comparison: Comparison, sequence: str) -> Figure | None:
+    """Mean time per scan of every method, stages stacked, against the real-time limit; None when nothing was timed."""
+    runs = [r for r in comparison.runs if r.sequence == sequence and r.is_usable and r.stages]
+    stages = list(dict.fromkeys(name for run in comparison.runs for name in run.stages))
+    bars = []
+    for method in comparison.methods:
+        own = [run for run in runs if run.method == method]
+        if own:
+            means = {name: 1e3 * float(np.mean([run.stages.get(name, 0.0) for run in own])) for name in stages}
+            bars.append((_bar_label(method, means, own), means))
+    if not bars:
+        return None
+    limits = [run.limit for run in runs if run.limit]
+    chart = _bars(bars, stages, 1e3 * limits[0] if limits else 0.0, f"time per scan on {sequence}")
+    caption = "Means over all scans and seeds, stages stacked; reading and preparing may overlap registration."
+    if any(run.jobs > 1 for run in runs):
+        caption += " Marked ~: several runs shared the machine, so these times cannot be compared."
+    return Figure(
+        "Time per scan",
+        chart,
+        tuple((f"s{i % STYLES + 1}", name) for i, name in enumerate(stages)),
+        caption,
+        is_area=True,
+    )
+
+
+def crop_figures(drawing: Drawing, crop: Crop | None) -> list[list[Figure]]:
+    """One list per place, with one figure per method that has a map; places are chosen in the first method's map."""
+    clouds = [_cloud(run) for run in drawing.runs]
+    known = [cloud for cloud in clouds if cloud is not None]
+    if not known:
+        return []
+    places = []
+    for place in [crop] if crop is not None else choose_crops(known[0]):
+        images, top = crop_images(clouds, place)
+        row = []
+        for run, image in zip(drawing.runs, images, strict=True):
+            if image is None:
+                continue
+            backdrop = (data_uri(density_png(image, top)), place.extent)
+            empty = Track("", np.full((1, 2), np.nan), "gt")
+            title = f"map of {run.method} on {drawing.sequence} at {place.x:g}, {place.y:g}"
+            row.append(Figure(run.method, plane_chart([empty], title, backdrop=backdrop, width=340, tallest=340)))
+        places.append(row)
+    return places
+
+
+def _cloud(run: DrawnRun) -> Floats | None:
+    """The map's points in the world of the drawing; None when there is no map that can be read."""
+    if run.map_file is None:
+        return None
+    try:
+        points = np.asarray(read_points(run.map_file).points, np.float64)
+    except LslamError:
+        return None
+    T = run.T_drawing_world
+    return points @ T[:3, :3].T + T[:3, 3]
+
+
+def _bar_label(method: str, means: dict[str, float], runs: Sequence[RunScore]) -> str:
+    p95 = float(np.mean([run.values["time.p95"] for run in runs if "time.p95" in run.values]))
+    mark = "~" if any(run.jobs > 1 for run in runs) else ""
+    return f"{method}: {mark}{sum(means.values()):.1f} ms, p95 {mark}{p95:.1f}"
+
+
+def _bars(bars: Sequence[tuple[str, dict[str, float]]], stages: Sequence[str], limit: float, title: str) -> str:
+    """A horizontal bar per method with its label above; the limit is a line when it is in view, else an arrow says where."""
+    longest = max(sum(means.values()) for _, means in bars) or 1.0
+    limit_inside = 0 < limit <= LIMIT_IN_VIEW * longest
+    right = 1.06 * max(longest, limit if limit_inside else 0.0)
+    frame = svg.Frame((0.0, right), (0.0, 1.0), height=svg.MARGIN_TOP + svg.MARGIN_BOTTOM + _ROW * len(bars))
+    frame.left = 14
+    for value in svg.ticks(0.0, right, 6):
+        x = float(frame.px(value))
+        frame.add(f'<path class="grid" d="M{x:.1f} {frame.top}V{frame.bottom}"/>')
+        frame.text(x, frame.bottom + 16, svg.number(value, right), "middle")
+    frame.text((frame.left + frame.right) / 2, frame.height - 6, "time per scan, ms", "middle", "label")
+    for i, (_, means) in enumerate(bars):
+        y = frame.top + _ROW * i
+        below = 0.0
+        for k, stage in enumerate(stages):
+            x0, x1 = float(frame.px(below)), float(frame.px(below + means[stage]))
+            said = escape(f"{stage}: {means[stage]:.2f} ms")
+            frame.add(
+                f'<rect class="area s{k % STYLES + 1}" x="{x0:.1f}" y="{y + 21}" width="{x1 - x0:.1f}" height="{_BAR}">'
+                f"<title>{said}</title></rect>"
+            )
+            below += means[stage]
+    frame.add(f'<path class="axis" d="M{frame.left} {frame.top}V{frame.bottom}"/>')
+    if limit_inside:
+        x = float(frame.px(limit))
+        frame.add(f'<path class="limit" d="M{x:.1f} {frame.top}V{frame.bottom}"/>')
+        frame.text(x - 4, frame.top - 8, f"real-time limit {limit:.0f} ms", "end", "limit-text")
+    elif limit > 0:
+        frame.text(frame.right, frame.top - 8, f"real-time limit {limit:.0f} ms →", "end", "limit-text")
+    for i, (label, _) in enumerate(bars):  # last, so that the limit does not cross them out
+        frame.text(frame.left + 4, frame.top + _ROW * i + 15, label, "start", "label over")
+    return frame.svg(title)
+
+
+def _sentence(text: str) -> str:
+    return f"{text[0].upper()}{text[1:]}."

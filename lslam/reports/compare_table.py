@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 from lslam.formats.atomic import write_text
 from lslam.printable import counted, fixed, metres
+from lslam.reports.evaluation_json import strict
 from lslam.reports.grid_text import Grid, aligned, comma_separated, latex, markdown
-from lslam.types.comparison import Comparison, Metric, Spread, SummaryRow
+from lslam.types.comparison import Comparison, Metric, RunScore, Spread, SummaryRow
+from lslam.version import __version__
 
 STYLES = ("md", "csv", "tex")
 TITLES = {"error": "errors", "time": "time", "health": "scans and runs"}
@@ -199,3 +203,56 @@ def _runs_grid(comparison: Comparison) -> Grid:
             [run.sequence, run.method, str(run.seed), run.status, run.reason or run.note, str(run.jobs), *numbers]
         )
     return grid
+
+
+SCHEMA, VERSION = "lslam-compare", 1
+
+
+def to_document(comparison: Comparison) -> dict[str, Any]:
+    """The comparison as plain values, ready for `json.dumps`; what is not finite becomes None."""
+    c = comparison
+    document = _head(c.command, "done") | {
+        "methods": list(c.methods),
+        "sequences": list(c.sequences),
+        "notes": list(c.notes),
+        "recipes": recipes(c),
+        "tie_m": c.tie,
+        "timing_is_comparable": c.is_timing_comparable,
+        "configs": c.configs,
+        "metrics": [asdict(metric) for metric in c.metrics],
+        "runs": [_run(run) for run in c.runs],
+        "rows": [asdict(row) for row in c.rows],
+        "paired": [asdict(pair) for pair in c.paired],
+        "differences": [asdict(difference) for difference in c.differences],
+    }
+    plain = strict(document)
+    assert isinstance(plain, dict)
+    return plain
+
+
+def write_running(path: Path, command: str) -> None:
+    """Mark the folder of a comparison before its first run; raises OutputError."""
+    _write(path, _head(command, "running"))
+
+
+def write_result(path: Path, comparison: Comparison) -> None:
+    """Write compare.json atomically; raises OutputError."""
+    _write(path, to_document(comparison))
+
+
+def _head(command: str, status: str) -> dict[str, Any]:
+    return {"schema": SCHEMA, "version": VERSION, "lslam": __version__, "status": status, "command": command}
+
+
+def _run(run: RunScore) -> dict[str, Any]:
+    values = asdict(run)
+    values["folder"] = str(values["folder"])
+    values["stages_s"] = values.pop("stages")
+    values["real_time_limit_s"] = values.pop("limit")
+    values["reused"] = values.pop("is_reused")
+    return values
+
+
+def _write(path: Path, document: dict[str, Any]) -> None:
+    text = json.dumps(document, indent=1, allow_nan=False, ensure_ascii=False)
+    write_text(path, text + "\n")

@@ -7,9 +7,9 @@ from numpy.typing import NDArray
 
 from lslam.reports import svg
 from lslam.reports.crops import Crop, crop_images
-from lslam.reports.plane import MOST_POINTS, plane_chart
 from lslam.reports.plots import Figure
 from lslam.reports.png import data_uri, density_png
+from lslam.reports.svg import MOST_POINTS, plane_chart
 from lslam.types.run_record import FeatureView
 
 Floats = NDArray[np.float64]

@@ -8,7 +8,15 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from lslam.errors import UsageError, nearest
+from lslam.evaluation.results import AbsoluteError, Evaluation
+from lslam.formats.atomic import atomic_write
+from lslam.formats.osm_buildings import BuildingExtract
+from lslam.printable import printable
+from lslam.reports.evaluation_table import short_names
 
 FORMATS = ("png", "svg", "pdf")
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")  # Okabe and Ito: safe for colour blindness
@@ -52,3 +60,139 @@ def label(plot: Any, x: str, y: str) -> None:
     plot.set_ylabel(y)
     plot.grid(alpha=0.25)
     plot.spines[["top", "right"]].set_visible(False)
+
+
+def write_plot(path: str | Path, evaluations: Sequence[Evaluation], names: Sequence[str] | None = None) -> None:
+    """Draw evaluations against one ground truth into `path` (.png, .svg, .pdf), atomically.
+
+    Raises UsageError for another suffix, OutputError when the file cannot be written.
+    """
+    path = Path(path)
+    check_plot_path(path)
+    with house_style():
+        labels = names or short_names([e.estimate for e in evaluations])
+        figure = _draw(evaluations, [printable(label) for label in labels])
+        with atomic_write(path) as stream:
+            stream.write(picture(figure, path.suffix.lstrip(".").lower()))
+
+
+def _draw(evaluations: Sequence[Evaluation], names: Sequence[str]) -> Any:
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(13, 9), layout="constrained")
+    grid = figure.add_gridspec(4, 2, width_ratios=[1.15, 1])
+    above, height = figure.add_subplot(grid[:3, 0]), figure.add_subplot(grid[3, 0])
+    position, rotation = figure.add_subplot(grid[0, 1]), figure.add_subplot(grid[1, 1])
+    axes, drift = figure.add_subplot(grid[2, 1]), figure.add_subplot(grid[3, 1])
+    shown = [_best_alignment(e) for e in evaluations]
+    _trajectories(above, height, evaluations, names, shown)
+    for e, name, error, colour in zip(evaluations, names, shown, _colours(len(names)), strict=True):
+        position.plot(e.distance, np.linalg.norm(error.errors, axis=1), color=colour, lw=1.1, label=name)
+        rotation.plot(e.distance, error.rotation_errors_deg, color=colour, lw=1.1)
+        by_length = e.scores["kitti_drift"].by_length
+        drift.plot(sorted(by_length), [by_length[n][0] for n in sorted(by_length)], "o-", ms=3, color=colour)
+    rmse = ", ".join(f"{error.translation.rmse:.3f} m" for error in shown if error.translation)
+    position.set_title(f"position error, alignment {shown[0].alignment}: rmse {rmse}", fontsize=9)
+    rotation.set_title("rotation error, same alignment", fontsize=9)
+    label(position, "", "m")
+    label(rotation, "distance along ground truth, m", "deg")
+    _axis_errors(axes, evaluations[0], names[0])
+    _drift_axes(drift, evaluations)
+    return figure
+
+
+def _trajectories(
+    above: Any, height: Any, evaluations: Sequence[Evaluation], names: Sequence[str], shown: Sequence[AbsoluteError]
+) -> None:
+    first = evaluations[0]
+    above.plot(*first.gt_positions[:, :2].T, color="black", lw=2.5, alpha=0.35, label="ground truth")
+    height.plot(first.distance, first.gt_positions[:, 2], color="black", lw=2.5, alpha=0.35)
+    for e, name, error, colour in zip(evaluations, names, shown, _colours(len(names)), strict=True):
+        above.plot(*error.aligned_positions[:, :2].T, color=colour, lw=1.2, label=f"{name} ({error.alignment})")
+        height.plot(e.distance, error.aligned_positions[:, 2], color=colour, lw=1.1)
+    above.plot(*first.gt_positions[0, :2], "o", color="black", ms=5)
+    above.annotate("start", first.gt_positions[0, :2], textcoords="offset points", xytext=(6, 6))
+    above.set_aspect("equal", adjustable="datalim")
+    above.legend(loc="best", frameon=False)
+    above.set_title(f"seen from above; {first.matched} poses, {first.path_length:.1f} m", fontsize=9)
+    label(above, "x, m", "y, m")
+    label(height, "distance along ground truth, m", "z, m")
+
+
+def _axis_errors(plot: Any, evaluation: Evaluation, name: str) -> None:
+    for k, axis in enumerate("xyz"):
+        plot.plot(evaluation.distance, evaluation.scores["thesis1"].xyz[:, k], lw=1.0, color=COLOURS[k], label=axis)
+    plot.legend(loc="best", ncol=3, frameon=False)
+    plot.set_title(f"error per axis, alignment origin: {name}", fontsize=9)
+    label(plot, "distance along ground truth, m", "m")
+
+
+def _drift_axes(plot: Any, evaluations: Sequence[Evaluation]) -> None:
+    drifts = [e.scores["kitti_drift"] for e in evaluations]
+    if any(drift.available for drift in drifts):
+        plot.set_title("KITTI drift over segment length", fontsize=9)
+        plot.set_ylim(bottom=0)
+        label(plot, "segment, m", "%")
+        return
+    plot.set_axis_off()
+    plot.text(0.5, 0.5, f"KITTI drift: {drifts[0].note}", ha="center", va="center")
+
+
+def _best_alignment(evaluation: Evaluation) -> AbsoluteError:
+    """The first alignment asked for that is determined; the origin's errors otherwise."""
+    for error in evaluation.ate.values():
+        if error.available:
+            return error
+    raise UsageError(f"--plot: no alignment of {evaluation.estimate} is determined; add --align origin")
+
+
+def _colours(count: int) -> list[str]:
+    return [COLOURS[k % len(COLOURS)] for k in range(count)]
+
+
+UNKNOWN = "#bbbbbb"
+
+
+def write_buildings_png(path: Path, extract: BuildingExtract, along: NDArray[Any] | None = None) -> None:
+    """Draw the outlines of `extract` from above in its local frame into a PNG, coloured by height; atomically.
+
+    along : (N, 2) a path in the same frame, m. Raises OutputError when the file cannot be written.
+    """
+    from matplotlib import colormaps
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.collections import PathCollection
+    from matplotlib.colors import Normalize
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(10, 10), layout="constrained")
+    axes = figure.add_subplot()
+    heights = [b.height for b in extract.buildings if b.height is not None]
+    scale = Normalize(0.0, max([10.0, *heights]))
+    colours = colormaps["viridis"]
+    shapes = [
+        (_outline(footprint.rings), UNKNOWN if b.height is None else colours(scale(b.height)))
+        for b in extract.buildings
+        for footprint in b.footprints
+    ]
+    axes.add_collection(
+        PathCollection([s for s, _ in shapes], facecolors=[c for _, c in shapes], edgecolors="black", linewidths=0.5)
+    )
+    if along is not None:
+        axes.plot(along[:, 0], along[:, 1], color="#d55e00", lw=1.5)
+    axes.autoscale_view()
+    axes.set_aspect("equal")
+    axes.grid(visible=True, lw=0.3)
+    axes.set_xlabel(f"m east of {extract.origin[0]:.6f}, {extract.origin[1]:.6f}")
+    axes.set_ylabel("m north")
+    if heights:
+        figure.colorbar(ScalarMappable(scale, colours), ax=axes, label="height, m (grey: unknown)", shrink=0.6)
+    if extract.attribution:
+        axes.set_title(extract.attribution, fontsize=8, loc="right")
+    with atomic_write(path) as stream:
+        figure.savefig(stream, format="png", dpi=110, metadata={"Software": None})
+
+
+def _outline(rings: tuple[NDArray[np.float64], ...]) -> Any:
+    from matplotlib.path import Path as Outline
+
+    return Outline.make_compound_path(*(Outline(np.concatenate([r, r[:1]]), closed=True) for r in rings))

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from lslam.errors import InterruptedRunError, LslamError
-from lslam.reports import compare_html, compare_json, compare_table
+from lslam.reports import compare_html, compare_table
 from lslam.studies.collect import IMU, collect_run, metrics_of
 from lslam.studies.drawings import draw
 from lslam.studies.grid import Cell, Job, expand, fitted_scene, recorded_cell
@@ -37,7 +37,7 @@ def compare(plan: Plan, progress: StudyProgress | None = None) -> Comparison:
     check_plan(plan)
     lock_output(plan.out, COMPARISON, "comparison", plan.overwrite, plan.resume)
     if not (plan.out / COMPARISON).is_file():
-        compare_json.write_running(plan.out / COMPARISON, plan.command)
+        compare_table.write_running(plan.out / COMPARISON, plan.command)
     jobs: list[Job] = []
     try:
         jobs = expand(_cells(plan, progress), plan.variants, plan.seeds, plan.out, plan.command)
@@ -56,7 +56,7 @@ def compare(plan: Plan, progress: StudyProgress | None = None) -> Comparison:
     comparison, drawings = _weigh(plan, jobs, scores)
     compare_table.write_files(plan.out, comparison)
     compare_html.write_page(plan.out / "compare.html", comparison, drawings, plan.crop)
-    compare_json.write_result(plan.out / COMPARISON, comparison)
+    compare_table.write_result(plan.out / COMPARISON, comparison)
     return comparison
 
 

@@ -16,8 +16,7 @@ from comparisons import comparison, drawing, row, walls
 from test_html import parse
 
 from lslam.reports.compare_html import render_page
-from lslam.reports.compare_json import to_document
-from lslam.reports.compare_table import recipes, render, tables
+from lslam.reports.compare_table import recipes, render, tables, to_document
 from lslam.reports.crops import Crop, choose_crops, crop_images
 from lslam.types.comparison import Spread
 

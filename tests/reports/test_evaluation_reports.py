@@ -17,7 +17,7 @@ from lslam.evaluation.evaluate import evaluate
 from lslam.evaluation.results import Evaluation
 from lslam.evaluation.timing import StageTime, Timing
 from lslam.geometry import se3
-from lslam.reports import evaluation_json, evaluation_plot, evaluation_table, picture
+from lslam.reports import evaluation_json, evaluation_table, picture
 from lslam.types.trajectory import Trajectory
 
 STAGE = StageTime(0.01, 0.02, 0.03, 0.011, 1.0)
@@ -133,7 +133,7 @@ def test_table_of_several_tells_them_apart(result: Evaluation, unavailable: Eval
 @pytest.mark.parametrize(("suffix", "magic"), [("png", b"\x89PNG"), ("svg", b"<?xml"), ("pdf", b"%PDF")])
 def test_pictures(suffix: str, magic: bytes, result: Evaluation, unavailable: Evaluation, tmp_path: Path) -> None:
     path = tmp_path / f"plot.{suffix}"
-    evaluation_plot.write_plot(path, [result, replace(unavailable, scores=unavailable.scores | {"rpe": result.rpe})])
+    picture.write_plot(path, [result, replace(unavailable, scores=unavailable.scores | {"rpe": result.rpe})])
     content = path.read_bytes()
     assert content.startswith(magic)
     assert len(content) > 10_000
@@ -142,14 +142,14 @@ def test_pictures(suffix: str, magic: bytes, result: Evaluation, unavailable: Ev
 
 def test_the_same_picture_twice(result: Evaluation, tmp_path: Path) -> None:
     for name in ("a.svg", "b.svg"):
-        evaluation_plot.write_plot(tmp_path / name, [result])
+        picture.write_plot(tmp_path / name, [result])
     assert (tmp_path / "a.svg").read_bytes() == (tmp_path / "b.svg").read_bytes()
 
 
 def test_pictures_that_cannot_be(result: Evaluation, tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="png, svg, pdf"):
-        evaluation_plot.write_plot(tmp_path / "plot.bmp", [result])
+        picture.write_plot(tmp_path / "plot.bmp", [result])
     with pytest.raises(UsageError, match="did you mean 'png'"):
         picture.check_plot_path(tmp_path / "plot.pn")
     with pytest.raises(OutputError, match="cannot be written"):
-        evaluation_plot.write_plot(tmp_path / "none" / "plot.png", [result])
+        picture.write_plot(tmp_path / "none" / "plot.png", [result])

@@ -9,10 +9,9 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from lslam.reports.plane import Track, plane_chart
+from lslam.reports.plots import stage_chart
 from lslam.reports.png import density_png
-from lslam.reports.stage_chart import stage_chart
-from lslam.reports.svg import Frame, Line, finite_runs, line_chart, number, thin, ticks
+from lslam.reports.svg import Frame, Line, Track, finite_runs, line_chart, number, plane_chart, thin, ticks
 
 
 @pytest.mark.parametrize("low", [-1234.5, -0.031, 0.0, 1e-7, 5.4e6])
