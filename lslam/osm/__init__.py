@@ -27,7 +27,7 @@ class Matcher:
 
 
 MATCHERS = {
-    "walls": Matcher("lslam.osm.join_buildings"),
+    "walls": Matcher("lslam.osm.matcher"),
     "baseline": Matcher("lslam.osm.baseline_matcher", reveals_drift=False),
 }
 

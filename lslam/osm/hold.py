@@ -2,20 +2,30 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lslam.backend.georeferencing import Placement, on_earth
 from lslam.backend.outcome import BackEnd, Given, solve
+from lslam.config import Config
+from lslam.config.osm import OsmConfig
 from lslam.errors import GraphError, InputError
+from lslam.formats.osm_buildings import BuildingExtract
+from lslam.geometry import se2, se3
 from lslam.graph.odometry_constraints import corrected
-from lslam.graph.problem import PoseGraph
+from lslam.graph.problem import PlanarPrior, PoseGraph
+from lslam.keyframes.store import KeyframeStore
 from lslam.osm import matcher_named
-from lslam.osm.location import finish
-from lslam.osm.on_map import find_on_map
+from lslam.osm.location import Located, finish, locate
+from lslam.osm.prior import match_buildings
 from lslam.osm.source import OsmSource
+from lslam.osm.wall_drift import WallDrift, WallSightings, find_wall_drift, without_drift
+from lslam.stopping import checking
 from lslam.types.gnss import Georeference
+from lslam.types.stage_clock import KeyframeClocks
 
 
 def hold_by_buildings(osm: OsmSource, graph: PoseGraph, placement: Placement, given: Given) -> BackEnd | None:
@@ -61,3 +71,114 @@ def hold_by_buildings(osm: OsmSource, graph: PoseGraph, placement: Placement, gi
     poses, covariances = laid.joint.poses, laid.joint.covariances
     moved = corrected(given.results, store.keyframes, poses, covariances, out.solution.drift, config.graph)
     return replace(laid_out, results=moved, keyframes=poses)
+
+
+log = logging.getLogger("lslam")
+Floats = NDArray[np.float64]
+
+# Iterations of the drift estimate: walls seen from the ends of a submap hide a part of it.
+ROUNDS = 5
+# Modes in which the map's buildings stand to each other as they are drawn.
+TRUSTING = ("prior", "rigid")
+# m, sigma of their walls: the rounding of a survey.
+TRUE = 0.01
+
+
+def find_on_map(
+    extract: BuildingExtract,
+    graph: PoseGraph,
+    store: KeyframeStore,
+    up: Floats | None,
+    placed: Floats | None,
+    config: Config,
+    clocks: KeyframeClocks | None = None,
+) -> tuple[Located, PoseGraph]:
+    """The keyframes located on the map, and the graph in its frame, corrected where the map reveals a drift.
+
+    graph : of odometry, or aligned by GNSS fixes; up, placed, clocks : as of `locate`; stage `drift` of the last keyframe
+    """
+    clocks = KeyframeClocks() if clocks is None else clocks
+    located = locate(extract, store, up, config, placed, clocks=clocks)
+    held = on_map(graph, located, config)
+    is_straight = held.is_rigid or not config.graph.steady_drift
+    if located.problem or not matcher_named(config.osm.matcher).reveals_drift or is_straight:
+        return located, held
+    before: WallDrift | None = None
+    for _ in range(ROUNDS):
+        with clocks[len(store) - 1].stage("drift"):
+            seen = sightings(located, held.poses, config)
+            drift = find_wall_drift(held, seen, *_wall_sigmas(config.osm), config.graph, before)
+        if drift is None or not drift.is_sure:
+            break
+        before = drift
+        held = replace(without_drift(held, drift.rates), spread=drift.spread, estimated_drift=drift.estimated_drift)
+        odometry = se3.inverse(located.T_enu_odometry) @ held.poses
+        again = None if drift.is_settled else locate(extract, store, up, config, placed, odometry, clocks)
+        if again is None or again.problem:
+            break
+        located = again
+        held = on_map(replace(held, poses=odometry), located, config)
+    if before is not None:
+        estimated = before.estimated_drift
+        rates = estimated.rates if estimated.rms is None else estimated.rms
+        log.info(
+            "OSM: %s drift of odometry, %.1f %% and %.1f deg/100 m, is corrected",
+            "varying" if estimated.is_varying else "steady",
+            100 * np.linalg.norm(rates[:2]), 100 * np.degrees(rates[2]),
+        )  # fmt: skip
+    return located, held
+
+
+def on_map(graph: PoseGraph, located: Located, config: Config) -> PoseGraph:
+    """The graph in the frame of the map, with planar priors by its walls, and its fixes where it has some."""
+    return replace(
+        graph,
+        poses=graph.poses if graph.fixes else located.T_enu_odometry @ graph.poses,
+        map_priors=_priors(located, config),
+        shift_sigma=0.0 if config.osm.mode == "prior" else config.osm.shift_sigma,
+        map_sigma=0.0 if config.osm.mode in TRUSTING else config.osm.map_sigma,
+        world_up=np.array([0.0, 0.0, 1.0]),
+        start=None if graph.fixes else located.start,
+        start_sigma=None if graph.fixes else located.start_sigma,
+        is_rigid=config.osm.trust_poses and config.odometry.method == "poses",
+    )
+
+
+def _priors(located: Located, config: Config) -> list[PlanarPrior]:
+    """The planar priors by the matches. With an exact map only sightings have errors, independent per submap.
+
+    Walls drawn by hand have an error of `wall_sigma`, common to all keyframes that see them (`shares`).
+    """
+    if config.osm.mode not in TRUSTING:
+        return located.priors
+    sharper = (config.osm.wall_sigma / _wall_sigmas(config.osm)[0]) ** 2
+    share = 1.0 / config.keyframes.submap_size
+    return [replace(prior, information=sharper * prior.information, share=share) for prior in located.priors]
+
+
+def _wall_sigmas(config: OsmConfig) -> tuple[float, float]:
+    """m, sigmas of a sighting against the map's wall, and of the wall's building."""
+    if config.mode in TRUSTING:
+        # Its points lie anywhere within the tolerance.
+        return config.wall_tolerance / np.sqrt(3.0), TRUE
+    return config.wall_sigma, config.building_sigma
+
+
+def sightings(located: Located, poses: Floats, config: Config) -> WallSightings:
+    """The sightings of all buildings' walls, with the keyframes at `poses` (K, 4, 4)."""
+    osm, planar = located.osm, se2.of_se3(poses)
+    rows: list[tuple[Floats, Floats]] = [(np.zeros((0, 2, 2)), np.zeros((0, 2), np.int64))]
+    for match in checking(located.matches):
+        at = match.pose if match.is_accepted else match.prior
+        for one in match_buildings(match, at, np.zeros(2), osm, config.osm):
+            if one.is_accepted:
+                walls = np.flatnonzero(osm.owners == one.building)[one.pairs[:, 0]]
+                seen = se2.apply(planar[match.keyframe], match.walls[one.pairs[:, 1]])
+                rows.append((seen, np.column_stack([np.full(len(walls), match.keyframe), walls])))
+    keyframes, walls = np.concatenate([numbers for _, numbers in rows]).T
+    places = np.concatenate([seen for seen, _ in rows]).mean(axis=1)
+    along = osm.walls[walls, 1] - osm.walls[walls, 0]
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    normals = np.column_stack([-along[:, 1], along[:, 0]])
+    offsets = np.einsum("ni,ni->n", normals, places - osm.walls[walls, 0])
+    return WallSightings(keyframes, walls, normals, places, offsets, 1.0 / config.keyframes.submap_size)

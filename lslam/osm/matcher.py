@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from dataclasses import dataclass, replace
+from typing import Protocol
 
-if TYPE_CHECKING:
-    from lslam.backend.outcome import Given
-    from lslam.formats.osm_buildings import BuildingExtract
-    from lslam.graph.joint import JointSolution
-    from lslam.graph.problem import PoseGraph, Solution
-    from lslam.types.building import CorrectedMap, OsmMatches
+from lslam.backend.outcome import Given
+from lslam.config import Config
+from lslam.formats.osm_buildings import BuildingExtract
+from lslam.geometry import se2
+from lslam.graph.drift import with_drift
+from lslam.graph.joint import JointSolution, optimise_jointly
+from lslam.graph.problem import PoseGraph, Solution
+from lslam.osm.corrections import agreed, correct_buildings, map_prior, middles_of, place_buildings
+from lslam.types.building import CorrectedMap, OsmMatches
 
 
 @dataclass(frozen=True)
@@ -33,3 +36,37 @@ class Lay(Protocol):
         graph : in the frame of the map; solution : of it, held by walls; matches : of walls, judged by the solution
         Raises GraphError and LinAlgError when it cannot be solved.
         """
+
+
+def lay(graph: PoseGraph, solution: Solution, matches: OsmMatches, extract: BuildingExtract, given: Given) -> Laid:
+    """As `matcher.Lay`, by `osm.mode`."""
+    with given.clocks[len(given.store) - 1].stage("graph"):
+        if given.config.osm.mode == "non-rigid":
+            joint, buildings = join_buildings(graph, solution, matches, given.config)
+            return Laid(matches, buildings, joint)
+        return Laid(matches, correct_buildings(matches, se2.of_se3(solution.poses), given.config.osm))
+
+
+def join_buildings(
+    graph: PoseGraph, solution: Solution, matches: OsmMatches, config: Config
+) -> tuple[JointSolution, CorrectedMap]:
+    """Mode `non-rigid`: the inliers of `solution` in `graph`, and every building, in one graph.
+
+    Raises GraphError when it cannot be solved.
+    """
+    accepted = replace(
+        accepted_part(graph, solution),
+        poses=solution.poses,
+        odometry=with_drift(graph, solution.drift, config.graph),
+        map_priors=(),
+    )
+    local = agreed(matches, se2.of_se3(solution.poses))
+    found = optimise_jointly(accepted, middles_of(matches), local, map_prior(matches, config.osm), config.graph)
+    return found, place_buildings(matches, se2.of_se3(found.poses), local, found.buildings, config.osm, config.osm.mode)
+
+
+def accepted_part(graph: PoseGraph, solution: Solution) -> PoseGraph:
+    """The graph without the loops and fixes that `solution` rejected."""
+    loops = [loop for loop, why in zip(graph.loops, solution.loop_reasons, strict=True) if not why]
+    fixes = [fix for fix, is_kept in zip(graph.fixes, solution.fix_inliers, strict=True) if is_kept]
+    return replace(graph, loops=loops, fixes=fixes)

@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 
 from lslam.config.osm import OsmConfig
 from lslam.geometry import se2
-from lslam.osm.wall_map import OsmMap
 from lslam.osm.wall_match import WINDOW, WallMatch, match_walls
-from lslam.osm.walls import find_walls
+from lslam.osm.walls import OsmMap, find_walls
 from lslam.types.building import BuildingMatch, KeyframeMatch
 from lslam.types.constraint import Verdict
 

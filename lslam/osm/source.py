@@ -22,7 +22,7 @@ from lslam.geometry import se2
 from lslam.geometry.geodesy import to_local
 from lslam.osm.buffer import Fetch, OsmBuffer
 from lslam.osm.overpass import fetch_buildings, reply_folder
-from lslam.osm.wall_map import OsmMap
+from lslam.osm.walls import OsmMap
 from lslam.types.gnss import GnssStream
 from lslam.types.sequence import Sequence
 from lslam.untrusted import MISFIT

@@ -23,9 +23,9 @@ from lslam.formats.osm_buildings import read_buildings
 from lslam.geometry import se2
 from lslam.keyframes.cloud import keyframe_cloud
 from lslam.keyframes.store import KeyframeStore
-from lslam.osm.first_match import see_walls
+from lslam.osm.location import see_walls
 from lslam.osm.prior import match_buildings, match_keyframe, warm_up
-from lslam.osm.wall_map import OsmMap
+from lslam.osm.walls import OsmMap
 from lslam.readers import open_sequence
 from lslam.types.building import KeyframeMatch
 from lslam.types.keyframe import Keyframe

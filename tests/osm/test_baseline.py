@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from wall_scenes import block, box_at, plain, turned
 
 from lslam.geometry import se2
-from lslam.osm.baseline import flatten_scan, lay_building, lay_scan, outline_points
+from lslam.osm.baseline_matcher import flatten_scan, lay_building, lay_scan, outline_points
 from lslam.osm.walls import walls_of
 from lslam.types.building import Building, Footprint
 

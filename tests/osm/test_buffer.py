@@ -22,7 +22,7 @@ from lslam.formats.osm_files import from_overpass
 from lslam.osm.bounds import Bounds
 from lslam.osm.buffer import OsmBuffer
 from lslam.osm.overpass import fetch_buildings
-from lslam.osm.wall_map import OsmMap
+from lslam.osm.walls import OsmMap
 from lslam.types.building import Building
 
 ORIGIN = np.array([49.0112, 8.4229, 112.8])

@@ -17,9 +17,8 @@ from lslam.geometry import se2
 from lslam.graph.factors import PLANAR
 from lslam.graph.problem import PoseGraph
 from lslam.graph.rates import LASTING, MEMORY, SIZES, linear_basis, rate_roots, walk_root
-from lslam.osm import drift_fit
-from lslam.osm.drift_fit import DriftFit, Sizes, WallSightings
-from lslam.osm.wall_drift import SCALES, _effects, find_wall_drift, without_drift
+from lslam.osm import wall_drift
+from lslam.osm.wall_drift import SCALES, DriftFit, Sizes, WallSightings, _effects, find_wall_drift, without_drift
 
 Floats = NDArray[np.float64]
 CHOICES = [(0.25, 0.0, 0.5), (0.25, 0.5, 0.9), (0.5, 2.0, 0.99), (1.0, 8.0, 0.5)]
@@ -152,7 +151,7 @@ def test_rates_that_wander_go_as_far_as_a_walk(length: float, apart: float) -> N
 
 @pytest.mark.parametrize("seed", [0, 2])
 def test_a_drift_is_sure_when_it_explains_more_than_chance(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(drift_fit, "FREEDOM", 1e12)
+    monkeypatch.setattr(wall_drift, "FREEDOM", 1e12)
     graph, seen = scene(seed, 1.0, 60)
     dense = Dense(graph, seen)
     best = min(dense.negative_log_likelihood(*choice) for choice in product(SCALES, SIZES, LASTING))

@@ -17,7 +17,7 @@ from lslam.keyframes.store import KeyframeStore
 from lslam.osm import location
 from lslam.osm.location import Located, finish, locate
 from lslam.osm.prior import match_keyframe
-from lslam.osm.wall_map import OsmMap
+from lslam.osm.walls import OsmMap
 from lslam.types.building import Building, Footprint, KeyframeMatch
 from lslam.types.keyframe import Keyframe
 

@@ -19,9 +19,8 @@ from lslam.geometry import se2, se3
 from lslam.graph.problem import PoseGraph
 from lslam.keyframes.store import KeyframeStore
 from lslam.osm import MATCHERS
-from lslam.osm.hold import hold_by_buildings
+from lslam.osm.hold import find_on_map, hold_by_buildings, on_map, sightings
 from lslam.osm.location import Located, locate
-from lslam.osm.on_map import find_on_map, on_map, sightings
 from lslam.osm.source import OsmServer
 from lslam.pipeline.check import check_config
 from lslam.types.constraint import Constraint

@@ -10,7 +10,7 @@ from wall_scenes import box_at
 from lslam.config.osm import OsmConfig
 from lslam.kernels import segments, wall_matching
 from lslam.osm.prior import match_buildings, match_keyframe, shares, warm_up
-from lslam.osm.wall_map import OsmMap
+from lslam.osm.walls import OsmMap
 from lslam.types.building import Building, Footprint, KeyframeMatch
 
 CORNERS = [box_at(4, 6, 10, 8), box_at(-14, 5, 9, 9), box_at(2, -16, 12, 7)]

@@ -12,8 +12,7 @@ from shapely import LineString, Point, unary_union
 from shapely.affinity import rotate, scale, translate
 from wall_scenes import box_at
 
-from lslam.osm.contacts import STEEPEST
-from lslam.osm.overlap import Untangled, remove_overlaps
+from lslam.osm.overlap import STEEPEST, Untangled, remove_overlaps
 from lslam.types.building import Building, Footprint, footprint_polygon
 
 Floats = NDArray[np.float64]

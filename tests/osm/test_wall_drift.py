@@ -10,8 +10,7 @@ from lslam.config.graph import GraphConfig
 from lslam.geometry import se2, se3, so3
 from lslam.graph.pose_graph import optimise
 from lslam.graph.problem import PlanarPrior, PoseGraph
-from lslam.osm.drift_fit import WallSightings
-from lslam.osm.wall_drift import WallDrift, find_wall_drift, without_drift
+from lslam.osm.wall_drift import WallDrift, WallSightings, find_wall_drift, without_drift
 from lslam.types.constraint import Constraint
 
 COUNT = 100
