@@ -19,8 +19,7 @@ from lslam.evaluation.metric import (
     two,
 )
 from lslam.evaluation.recipes import ALIGNMENTS
-from lslam.evaluation.results import AbsoluteError, Evaluation
-from lslam.evaluation.statistics import describe, percent_of_length
+from lslam.evaluation.results import AbsoluteError, Evaluation, describe, percent_of_length
 from lslam.geometry import se3, so3, umeyama
 from lslam.printable import fixed, metres, significant
 from lslam.types.comparison import Metric

@@ -8,7 +8,7 @@ from typing import Literal
 
 import numpy as np
 
-from lslam.evaluation.landmarks import FLAT
+from lslam.evaluation.curves import FLAT
 from lslam.types.study import Curve, Floats
 
 Rise = Literal["worse", "as good", "unknown"]

@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from lslam.evaluation.efficiency import efficiency
-from lslam.types.study import Bools, Curve, Floats, StudyRow, Value
+from lslam.evaluation.student import two_sided
+from lslam.types.study import Bools, Curve, Divergence, Floats, Interval, Optimum, StudyRow, Value
 
 # Everything else is registration: what Girolimetto's times per iteration hold (equation 5.2).
 NOT_REGISTRATION = ("read", "prepare", "standing", "keyframe", "integrity")
@@ -93,3 +94,105 @@ def _curve(rows: Sequence[StudyRow], limit: float) -> Curve:
         words=() if is_number else tuple(str(value) for value in order),
         is_timed_alone=all(row.is_timing_comparable for row in rows if row.is_usable),
     )
+
+
+LEVEL = 0.95
+
+
+def efficiency(translation: ArrayLike, angular: ArrayLike, seconds: ArrayLike) -> Floats:
+    """1 / (translation rmse in m, angular rmse in deg, time in s); nan where one of them is not above 0 or unknown.
+
+    Time is that of registration per scan for equation 5.2 and the total for equation 5.3 of Girolimetto.
+
+    >>> float(efficiency(0.5, 2.0, 0.1))
+    10.0
+    """
+    product = np.asarray(translation, np.float64) * np.asarray(angular, np.float64) * np.asarray(seconds, np.float64)
+    return np.asarray(np.divide(1.0, product, out=np.full_like(product, np.nan), where=product > 0))
+
+
+def normalise(values: Floats) -> Floats:
+    """Values over the largest of them, as Girolimetto shows efficiency; all nan where there is none above 0."""
+    known = values[np.isfinite(values)]
+    top = float(known.max()) if len(known) else 0.0
+    return values / top if top > 0 else np.full_like(values, np.nan)
+
+
+def median_over_seeds(table: Floats) -> Floats:
+    """(V,) median over the seeds (V, S) that have a number: one lucky or unlucky seed of three does not move it."""
+    out = np.full(len(table), np.nan)
+    known = np.isfinite(table).any(1)
+    out[known] = np.nanmedian(table[known], axis=1)
+    return out
+
+
+def over_seeds(table: Floats, level: float = LEVEL) -> Interval:
+    """Mean over the seeds (V, S) that have a number, with Student's t interval of `level`.
+
+    Seeds are few, so the interval is wide: three of them stand for 4.3 standard errors either way. One has none.
+    """
+    known = np.isfinite(table)
+    n = known.sum(1)
+    total = np.where(known, table, 0.0).sum(1)
+    mean = np.divide(total, n, out=np.full(len(n), np.nan), where=n > 0)
+    squares = np.where(known, (table - mean[:, None]) ** 2, 0.0).sum(1)
+    several = n > 1
+    std, error = np.full(len(n), np.nan), np.full(len(n), np.nan)
+    std[several] = np.sqrt(squares[several] / (n[several] - 1))
+    error[several] = std[several] / np.sqrt(n[several]) * two_sided(level, n[several] - 1)
+    return Interval(mean, mean - error, mean + error, n, std)
+
+
+FLAT = 0.1  # what differs by less than a tenth is as good
+ELBOW = 1.5  # an error above so many times the plateau's is not on the plateau
+
+
+def divergence(curve: Curve) -> Divergence:
+    """From which value on the curve is lost.
+
+    A value is lost when more than half of its runs are; the curve is lost from the first lost value above which, itself
+    counted, more than half of the values are. What is lost below stands alone: one unlucky value is not a divergence.
+    """
+    scored = curve.scored.any(1)
+    values, bad = curve.values[scored], curve.is_lost[scored]
+    for i in np.flatnonzero(bad):
+        if 2 * bad[i:].sum() > len(bad) - i:
+            before = float(values[i - 1]) if i else None
+            return Divergence(before, float(values[i]), tuple(float(v) for v in values[:i][bad[:i]]))
+    return Divergence(None, None, tuple(float(v) for v in values[bad]))
+
+
+def optimum(values: Floats, means: Floats, *, is_highest_best: bool = True) -> Optimum | None:
+    """The best value and its flat surroundings: all values next to it, without a gap, that are at most a tenth worse.
+
+    means : (V,) above 0, nan or 0 where there is nothing; None when there is nothing at all
+    """
+    known = np.isfinite(means) & (means > 0)
+    if not known.any():
+        return None
+    values, score = values[known], means[known] if is_highest_best else 1 / means[known]
+    best = int(np.argmax(score))
+    good = score >= (1 - FLAT) * score[best]
+    low = high = best
+    while low > 0 and good[low - 1]:
+        low -= 1
+    while high + 1 < len(good) and good[high + 1]:
+        high += 1
+    return Optimum(float(values[best]), float(values[low]), float(values[high]))
+
+
+def elbow(values: Floats, errors: Floats, is_lost: Bools) -> float | None:
+    """The value from which on the error lies on its plateau, None when it does not at the largest value.
+
+    The plateau is the median error of the upper half of the values, and reaches 1.5 times that high.
+    errors : (V,) nan where unknown
+    """
+    known = np.isfinite(errors) | is_lost
+    values, errors, is_lost = values[known], errors[known], is_lost[known]
+    upper = errors[len(errors) // 2 :][~is_lost[len(errors) // 2 :]]
+    if not len(upper):
+        return None
+    good = ~is_lost & (np.nan_to_num(errors, nan=np.inf) <= ELBOW * np.median(upper))
+    bad = np.flatnonzero(~good)
+    first = int(bad[-1]) + 1 if len(bad) else 0
+    return float(values[first]) if first < len(values) else None

@@ -10,13 +10,11 @@ from numpy.typing import NDArray
 
 from lslam.config.eval import EvalConfig
 from lslam.errors import InputError
-from lslam.evaluation.associate import Matches, associate
-from lslam.evaluation.frames import reconcile
-from lslam.evaluation.hand_eye import body_turn
+from lslam.evaluation.associate import Matches, associate, estimate_offset
+from lslam.evaluation.frames import body_turn, reconcile
 from lslam.evaluation.metric import MatchedPoses
 from lslam.evaluation.metrics import METRICS
 from lslam.evaluation.results import Evaluation
-from lslam.evaluation.time_offset import estimate_offset
 from lslam.geometry import se3, so3
 from lslam.types.calibration import Calibration
 from lslam.types.trajectory import Trajectory

@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.config.eval import EvalConfig
-from lslam.evaluation.results import Evaluation
-from lslam.evaluation.statistics import Statistics
+from lslam.evaluation.results import Evaluation, Statistics
 from lslam.printable import significant
 from lslam.types.comparison import Metric
 from lslam.types.table import Table

@@ -7,9 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from lslam.evaluation.curves import curves_of, lost_above
-from lslam.evaluation.efficiency import median_over_seeds, over_seeds
-from lslam.evaluation.landmarks import divergence, optimum
+from lslam.evaluation.curves import curves_of, divergence, lost_above, median_over_seeds, optimum, over_seeds
 from lslam.evaluation.laws import FEWEST, fit_law, law_over
 from lslam.evaluation.verdicts import judge
 from lslam.types.study import Curve, CurveResult, Floats, Interval, Law, LawKind, StudyResult, StudyRow

@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from lslam.config.eval import EvalConfig
 from lslam.evaluation.absolute import align
 from lslam.evaluation.metric import MatchedPoses, MetricRow, TrajectoryMetric, two
-from lslam.evaluation.results import Evaluation
-from lslam.evaluation.statistics import percent_of_length
+from lslam.evaluation.results import Evaluation, percent_of_length
 from lslam.geometry import so3
 from lslam.printable import fixed, metres, significant
 from lslam.types.comparison import Metric

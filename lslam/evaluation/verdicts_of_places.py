@@ -9,7 +9,7 @@ import numpy as np
 
 from lslam.config.finding import ExpectedFinding
 from lslam.evaluation.contrast import Rise, contrast, plateau, rise_at, rise_below
-from lslam.evaluation.landmarks import divergence, elbow, optimum
+from lslam.evaluation.curves import divergence, elbow, optimum
 from lslam.types.study import Curve, CurveResult, Floats, Judged, Optimum, Outcome
 
 BELOW: dict[Rise, str] = {

@@ -9,9 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from lslam.evaluation.curves import NOT_REGISTRATION, registration_ms
-from lslam.evaluation.efficiency import normalise
-from lslam.evaluation.landmarks import FLAT
+from lslam.evaluation.curves import FLAT, NOT_REGISTRATION, normalise, registration_ms
 from lslam.evaluation.laws import band
 from lslam.reports.picture import COLOURS, house_style, label, pictures
 from lslam.types.study import CurveResult, Floats, Law, StudyResult, StudyRow

@@ -9,7 +9,7 @@ from math import inf
 
 import numpy as np
 
-from lslam.evaluation.efficiency import normalise
+from lslam.evaluation.curves import normalise
 from lslam.evaluation.recipes import ALIGNMENTS
 from lslam.printable import counted, fixed, metres
 from lslam.reports.compare_table import CompareTable

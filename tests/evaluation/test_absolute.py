@@ -11,7 +11,7 @@ from hypothesis.extra.numpy import arrays
 
 from lslam.errors import UsageError
 from lslam.evaluation.absolute import absolute_error
-from lslam.evaluation.statistics import describe
+from lslam.evaluation.results import describe
 from lslam.evaluation.thesis import axis_errors
 from lslam.geometry import se3, so3
 from lslam.types.trajectory import Trajectory

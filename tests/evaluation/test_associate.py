@@ -11,8 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lslam.errors import InputError
-from lslam.evaluation.associate import associate, nearest_one_to_one, time_range
-from lslam.evaluation.time_offset import estimate_offset
+from lslam.evaluation.associate import associate, estimate_offset, nearest_one_to_one, time_range
 from lslam.types.trajectory import Trajectory
 
 stamps = st.lists(st.integers(0, 10_000), min_size=1, max_size=30, unique=True).map(

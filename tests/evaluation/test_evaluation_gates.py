@@ -10,10 +10,9 @@ from evaluation_drives import STEP_NS, drive
 from numpy.typing import NDArray
 
 from lslam.errors import InputError
-from lslam.evaluation.associate import associate
+from lslam.evaluation.associate import _peaks, associate, estimate_offset
 from lslam.evaluation.frames import R_BODY_CAMERA, body_rotation, main_axis, reconcile
 from lslam.evaluation.thesis import planar
-from lslam.evaluation.time_offset import _peaks, estimate_offset
 from lslam.geometry import se3, so3
 from lslam.types.trajectory import Trajectory
 

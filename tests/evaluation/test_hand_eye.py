@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from lslam.evaluation.evaluate import evaluate
-from lslam.evaluation.hand_eye import body_turn
+from lslam.evaluation.frames import body_turn
 from lslam.geometry import se3, so3
 from lslam.types.trajectory import Trajectory
 

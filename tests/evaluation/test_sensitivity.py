@@ -9,8 +9,7 @@ import pytest
 from study_rows import rows_of
 
 from lslam.config.finding import ExpectedFinding
-from lslam.evaluation.curves import curves_of, lost_above, registration_ms
-from lslam.evaluation.landmarks import divergence, elbow, optimum
+from lslam.evaluation.curves import curves_of, divergence, elbow, lost_above, optimum, registration_ms
 from lslam.evaluation.sensitivity import evaluate_study
 from lslam.types.study import StudyRow
 

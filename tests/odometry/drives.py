@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from lslam.config.preprocess import PreprocessConfig
 from lslam.evaluation.absolute import absolute_error
-from lslam.evaluation.pairs import by_path
-from lslam.evaluation.relative import error_transforms
+from lslam.evaluation.relative import by_path, error_transforms
 from lslam.geometry import se3, so3
 from lslam.preprocessing.prepare import PreparedPoints, prepare_points
 from lslam.recovery.policies import RecoveringRegistration

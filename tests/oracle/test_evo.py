@@ -13,8 +13,7 @@ import pytest
 
 from lslam.config.eval import EvalConfig
 from lslam.evaluation.evaluate import evaluate
-from lslam.evaluation.pairs import by_index, by_path
-from lslam.evaluation.relative import error_transforms
+from lslam.evaluation.relative import by_index, by_path, error_transforms
 from lslam.evaluation.results import Evaluation
 from lslam.formats.trajectory_files import read_trajectory
 from lslam.types.trajectory import Trajectory
