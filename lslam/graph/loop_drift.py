@@ -17,10 +17,9 @@ from lslam.config.graph import GraphConfig
 from lslam.geometry import noise, se3, so3
 from lslam.graph.chi_square import quantile
 from lslam.graph.consistency import Ends, judge_loops, moved
-from lslam.graph.drift import chains
+from lslam.graph.drift import LASTING, SIZES, chains, correct_drift, linear_basis, rate_roots
 from lslam.graph.pose_graph import check_graph, with_distances
 from lslam.graph.problem import EstimatedDrift, PoseGraph
-from lslam.graph.rates import LASTING, SIZES, correct_drift, linear_basis, rate_roots
 from lslam.stopping import checking
 from lslam.types.constraint import Constraint
 

@@ -14,9 +14,16 @@ from lslam.geometry import noise, se3
 from lslam.graph import factors
 from lslam.graph.consistency import judge_loops
 from lslam.graph.drift import drift_factor, with_drift
-from lslam.graph.gnc import GncResult, OutlierCandidate, gnc_solve, joined
 from lslam.graph.problem import PoseGraph, Solution
-from lslam.graph.solve import marginal_blocks, marginals, solve_incrementally
+from lslam.graph.solve import (
+    GncResult,
+    OutlierCandidate,
+    gnc_solve,
+    joined,
+    marginal_blocks,
+    marginals,
+    solve_incrementally,
+)
 from lslam.types.constraint import LoopStage
 
 Floats = NDArray[np.float64]

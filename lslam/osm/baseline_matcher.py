@@ -13,9 +13,9 @@ from lslam.backend.outcome import Given
 from lslam.config import Config
 from lslam.formats.osm_buildings import BuildingExtract
 from lslam.geometry import se2, se3
+from lslam.graph.building_graph import JointSolution, optimise_jointly
 from lslam.graph.drift import with_drift
 from lslam.graph.factors import PLANAR
-from lslam.graph.joint import JointSolution, optimise_jointly
 from lslam.graph.odometry_constraints import fitness_covariance
 from lslam.graph.problem import PoseGraph, Solution
 from lslam.keyframes.store import KeyframeStore

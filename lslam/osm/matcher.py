@@ -9,8 +9,8 @@ from lslam.backend.outcome import Given
 from lslam.config import Config
 from lslam.formats.osm_buildings import BuildingExtract
 from lslam.geometry import se2
+from lslam.graph.building_graph import JointSolution, optimise_jointly
 from lslam.graph.drift import with_drift
-from lslam.graph.joint import JointSolution, optimise_jointly
 from lslam.graph.problem import PoseGraph, Solution
 from lslam.osm.corrections import agreed, correct_buildings, map_prior, middles_of, place_buildings
 from lslam.types.building import CorrectedMap, OsmMatches

@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 
 from lslam.config.graph import GraphConfig
 from lslam.graph.chi_square import quantile
+from lslam.graph.drift import MEMORY, SIZES, correct_drift, linear_basis, rate_roots, walk_root
 from lslam.graph.factors import PLANAR
 from lslam.graph.problem import EstimatedDrift, PoseGraph
-from lslam.graph.rates import MEMORY, SIZES, correct_drift, linear_basis, rate_roots, walk_root
 from lslam.stopping import checking
 
 Floats = NDArray[np.float64]

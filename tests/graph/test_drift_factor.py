@@ -10,10 +10,9 @@ from graph_builders import STEP_SIGMAS, ate, graph_of, measured, truth
 
 from lslam.config.graph import GraphConfig
 from lslam.geometry import se3, so3
-from lslam.graph.drift import drift_factor, with_drift
+from lslam.graph.drift import correct_drift, drift_factor, with_drift
 from lslam.graph.pose_graph import optimise, with_distances
 from lslam.graph.problem import PoseGraph, PositionFix
-from lslam.graph.rates import correct_drift
 from lslam.types.constraint import Constraint
 
 CONFIG = GraphConfig()

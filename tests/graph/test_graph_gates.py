@@ -16,8 +16,8 @@ from lslam.config.graph import GraphConfig
 from lslam.geometry import se3
 from lslam.graph.consistency import judge_loops
 from lslam.graph.drift import drift_factor
-from lslam.graph.gnc import GncResult, OutlierCandidate, gnc_solve
 from lslam.graph.problem import PoseGraph, UpDirection
+from lslam.graph.solve import GncResult, OutlierCandidate, gnc_solve
 from lslam.types.constraint import Constraint
 
 Floats = NDArray[np.float64]

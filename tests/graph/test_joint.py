@@ -13,10 +13,9 @@ from test_building_graph import across
 from lslam.config.graph import GraphConfig
 from lslam.errors import GraphError
 from lslam.geometry import se2, se3, so3
-from lslam.graph import joint, solve
-from lslam.graph.building_graph import MapPrior
+from lslam.graph import building_graph, solve
+from lslam.graph.building_graph import MapPrior, optimise_jointly
 from lslam.graph.drift import with_drift
-from lslam.graph.joint import optimise_jointly
 from lslam.graph.odometry_constraints import in_plane
 from lslam.graph.problem import FloorPlane, PoseGraph
 from lslam.types.building import BuildingMatch
@@ -133,7 +132,7 @@ def test_covariances_of_buildings_do_not_depend_on_how_they_are_had(monkeypatch:
         config = GraphConfig(robust="none")
         by_gtsam = optimise_jointly(known, middles, matches, MAP_PRIOR, config)
         with monkeypatch.context() as without:
-            without.setattr(joint, "marginal_blocks", lambda f, v, keys: solve.scaled_blocks(f, v, list(keys)))
+            without.setattr(building_graph, "marginal_blocks", lambda f, v, keys: solve.scaled_blocks(f, v, list(keys)))
             by_scaling = optimise_jointly(known, middles, matches, MAP_PRIOR, config)
         np.testing.assert_allclose(
             by_scaling.buildings.covariances, by_gtsam.buildings.covariances, rtol=1e-4, atol=1e-9

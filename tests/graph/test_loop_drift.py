@@ -17,11 +17,10 @@ from lslam.config.graph import GraphConfig
 from lslam.errors import GraphError
 from lslam.geometry import se3, so3
 from lslam.graph import loop_drift
-from lslam.graph.drift import drift_covariance
+from lslam.graph.drift import SIZES, correct_drift, drift_covariance, linear_basis, rate_roots
 from lslam.graph.loop_drift import APART, LASTS, PARTS, WALKS, without_loop_drift
 from lslam.graph.pose_graph import optimise, with_distances
 from lslam.graph.problem import PoseGraph, Solution
-from lslam.graph.rates import SIZES, correct_drift, linear_basis, rate_roots
 from lslam.types.constraint import Constraint
 from lslam.types.scan_result import ScanResult
 

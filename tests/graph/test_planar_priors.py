@@ -10,10 +10,9 @@ from lslam.config.graph import GraphConfig
 from lslam.geometry import se2, se3
 from lslam.graph import factors
 from lslam.graph.drift import drift_factor
-from lslam.graph.gnc import joined
 from lslam.graph.pose_graph import optimise
 from lslam.graph.problem import PlanarPrior, PoseGraph, PositionFix
-from lslam.graph.solve import marginal_blocks, scaled_blocks
+from lslam.graph.solve import joined, marginal_blocks, scaled_blocks
 from lslam.types.constraint import Constraint
 
 REAL = truth(120, 1)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from lslam.config.graph import GraphConfig
-from lslam.graph.rates import MEMORY, linear_basis, rate_roots, walk_root
+from lslam.graph.drift import MEMORY, linear_basis, rate_roots, walk_root
 
 CONFIG = GraphConfig(drift_percent=2.0, drift_deg_per_100m=0.25)
 SIGMA = np.array([0.02] * 3 + [np.radians(0.25) / 100] * 3)
