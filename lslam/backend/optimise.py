@@ -16,12 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.backend.georeferencing import Placement, on_earth, place
-from lslam.backend.inputs import floor_planes, up_directions, world_up
+from lslam.backend.inputs import floor_planes, on_one_plane, up_directions, world_up
 from lslam.backend.outcome import BackEnd, Given, solve, unsolved, without_steady_drift
 from lslam.config import Config
 from lslam.geometry import se3
 from lslam.graph.drift import tilt_factor
-from lslam.graph.floors import on_one_plane
 from lslam.graph.odometry_constraints import bent, fitness_covariance, fitness_score, odometry_constraints
 from lslam.graph.problem import PoseGraph
 from lslam.keyframes.store import KeyframeStore

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from lslam.backend.inputs import on_one_plane
 from lslam.config.graph import GraphConfig
 from lslam.geometry import se3, so3
-from lslam.graph.floors import on_one_plane
 from lslam.graph.problem import FloorPlane
 
 WAY = 2.0 * np.arange(60)
