@@ -17,7 +17,7 @@ from lslam.odometry import create_odometry
 from lslam.readers.selection import select
 from lslam.registration.solver import RegistrationResult
 from lslam.simulation.scenarios import simulate
-from lslam.studies.cached_sequence import ScanStore, SequenceCache
+from lslam.studies.worker import ScanStore, SequenceCache
 from lslam.types.scan_result import ScanResult
 from lslam.types.sequence import Sequence
 

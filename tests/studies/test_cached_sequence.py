@@ -10,11 +10,11 @@ import pytest
 
 from lslam.config.load import load_config
 from lslam.simulation.scenarios import SimulatedDrive, simulate
-from lslam.studies.cached_sequence import ScanStore, SequenceCache, memory_bound, size_of
 from lslam.studies.grid import Job
 from lslam.studies.jobs import run_jobs
 from lslam.studies.runner import StudyProgress, Task, WorkerPool
 from lslam.studies.states import read_state
+from lslam.studies.worker import ScanStore, SequenceCache, memory_bound, size_of
 from lslam.types.scan import Scan
 
 pytestmark = pytest.mark.usefixtures("forked_runs")
