@@ -15,8 +15,7 @@ from lslam.frontend.register_scans import read_ahead
 from lslam.geometry import se3
 from lslam.maps.merge import MapMerger
 from lslam.odometry.base import FeatureSource
-from lslam.pipeline.map_checkpoints import MapCheckpoints
-from lslam.pipeline.map_pass import motion_within
+from lslam.pipeline.map_pass import MapCheckpoints, motion_within
 from lslam.preprocessing.features import Features
 from lslam.stopping import asking
 from lslam.types.run_record import FeatureView

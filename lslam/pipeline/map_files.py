@@ -3,28 +3,104 @@
 from __future__ import annotations
 
 import io
+import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from lslam.formats.atomic import atomic_write
+from lslam.errors import OutputError, cause
+from lslam.formats.atomic import atomic_write, write_text
 from lslam.formats.geojson import write_line
 from lslam.formats.ply_files import write_ply, write_ply_mesh
-from lslam.formats.point_files import write_cloud
+from lslam.formats.point_files import MAP_SUFFIXES, write_cloud
 from lslam.maps.floor_plan import floor_plan
 from lslam.maps.georeference import ProjectedCloud, Projection, to_lat_lon
 from lslam.maps.mesh import surface
 from lslam.maps.occupancy import OccupancyGrid
-from lslam.pipeline.json_files import write_json
-from lslam.pipeline.map_notes import SCHEMA, note_with
+from lslam.reports.evaluation_json import strict
 from lslam.reports.png import grey_png
 from lslam.types.cloud import Cloud, in_memory
 from lslam.types.gnss import Georeference
 from lslam.types.trajectory import Trajectory
-from lslam.untrusted import MISFIT
+from lslam.untrusted import MISFIT, parse_json
 from lslam.version import __version__
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """The document; empty when there is none that can be read."""
+    try:
+        tree = parse_json(path.read_text(encoding="utf-8"))
+    except (OSError, *MISFIT):
+        return {}
+    return tree if isinstance(tree, dict) else {}
+
+
+def write_json(path: Path, document: dict[str, Any]) -> None:
+    """Strict JSON, indented, atomically; numbers that JSON has not become null. Raises OutputError."""
+    write_text(path, json.dumps(strict(document), indent=2, allow_nan=False, ensure_ascii=False) + "\n")
+
+
+Note = dict[str, Any]
+SCHEMA = "lslam-map"
+
+
+def note_of(path: Path) -> Note:
+    """What the note beside a map says of it; empty when it says nothing."""
+    return _notes(path).get(path.name, {})
+
+
+def noted_last(path: Path) -> Path | None:
+    """The map beside `path`, with its stem, that was written last as the note knows it; None when it knows none."""
+    return next((path.with_name(name) for name in _notes(path)), None)
+
+
+def is_note(path: Path) -> bool:
+    """Whether `path` may become a note: a file of this kind, none at all, or one that nobody can read."""
+    return bool(read_json(path).get("schema", SCHEMA) == SCHEMA)
+
+
+def note_with(path: Path, about: Note) -> Note:
+    """The note beside `path` when it tells of that map first, and of the others of its stem that are there."""
+    return _joined({path.name: about, **{name: note for name, note in _notes(path).items() if name != path.name}})
+
+
+def drop_note(path: Path) -> None:
+    """Tell of the map no more: another is about to take its name. Raises OutputError."""
+    notes, target = _notes(path), path.with_suffix(".json")
+    if notes.pop(path.name, None) is None:
+        return
+    if notes:
+        write_json(target, _joined(notes))
+        return
+    try:
+        target.unlink(missing_ok=True)
+    except OSError as error:
+        raise OutputError(f"{target} cannot be written: {cause(error)}") from None
+
+
+def _notes(path: Path) -> dict[str, Note]:
+    """By file name, the last written first; files that are gone, and names that are none of a map's, are left out."""
+    tree = read_json(path.with_suffix(".json"))
+    others = tree.pop("others", None)
+    told = {str(tree.get("file")): tree, **(others if isinstance(others, dict) else {})}
+    return {
+        name: note
+        for name, note in told.items()
+        if isinstance(note, dict) and _is_of(path, name) and path.with_name(name).is_file()
+    }
+
+
+def _is_of(path: Path, name: str) -> bool:
+    other = Path(name)
+    return other.name == name and other.stem == path.stem and other.suffix.lower() in MAP_SUFFIXES
+
+
+def _joined(notes: dict[str, Note]) -> Note:
+    first, *others = notes
+    return notes[first] | ({"others": {name: notes[name] for name in others}} if others else {})
+
 
 LOCAL = "world of trajectory.tum"
 

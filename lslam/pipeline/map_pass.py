@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import hashlib
 import logging
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lslam.config import Config
 from lslam.config.map import MapConfig
-from lslam.errors import InterruptedRunError
+from lslam.errors import InputError, InterruptedRunError
+from lslam.frontend.checkpoints import Checkpoints
 from lslam.frontend.register_scans import read_ahead
 from lslam.geometry.interpolate import poses_at
 from lslam.maps.clean import Cleaner, PosedScan
@@ -20,7 +23,7 @@ from lslam.maps.merge import MapMerger
 from lslam.maps.mesh import denoise
 from lslam.maps.occupancy import OccupancyGrid, OccupancyMapper
 from lslam.maps.top_view import top_view
-from lslam.pipeline.map_checkpoints import MapCheckpoints
+from lslam.pipeline.run_folder import CHECKPOINT, RunFolder
 from lslam.preprocessing.deskew import deskew_points, knots_over
 from lslam.stopping import asking
 from lslam.types.cloud import Cloud, in_memory
@@ -184,3 +187,58 @@ def motion_within(scan: Scan, stamps_ns: NDArray[np.int64], poses: NDArray[np.fl
     if len(times) < 2 or len(stamps_ns) < 2:
         return MotionPrior.at_once(np.eye(4))
     return MotionPrior(times, poses_at(stamps_ns, poses, scan.stamp_ns + np.round(1e9 * times).astype(np.int64)))
+
+
+class Maker(Protocol):
+    """What makes a map of scans, one after the other."""
+
+    def state(self) -> State:
+        """What `restore` needs to go on from here."""
+
+    def restore(self, state: State) -> None:
+        """Go on where `state` was taken, in an empty maker of the same kind; raises InputError when voxels are missing."""
+
+
+M = TypeVar("M", bound=Maker)
+
+
+class MapCheckpoints:
+    """What an interrupted pass over the scans leaves to one over the same poses."""
+
+    def __init__(self, checkpoints: Checkpoints, what: str) -> None:
+        self._checkpoints, self._what = checkpoints, what
+        self._poses = ""
+
+    @property
+    def folder(self) -> Path:
+        """Where voxels are kept, in folders of their own."""
+        return self._checkpoints.folder
+
+    def begin(self, make: Callable[[], M], poses: NDArray[np.float64]) -> tuple[M, int]:
+        """A maker that is where an earlier pass over `poses` (N, 4, 4) left off, and after how many scans that was."""
+        self._poses = hashlib.sha256(np.ascontiguousarray(poses).tobytes()).hexdigest()
+        latest, maker = self._checkpoints.latest(), make()
+        try:
+            if latest is None or latest["poses"] != self._poses:
+                raise InputError("the poses are others")
+            maker.restore(latest["maker"])
+        except InputError as error:
+            if latest is not None:
+                log.warning("the %s begins again: %s", self._what, error)
+            self._checkpoints.clear()
+            return make(), 0
+        log.info("%s: going on after %d scans", self._what, latest["scans"])
+        return maker, int(latest["scans"])
+
+    def offer(self, scans: int, maker: Maker, is_last: bool = False) -> None:
+        """Write a checkpoint after `scans` scans when one is due, or when it is the last."""
+        if scans and (is_last or self._checkpoints.schedule.is_due):
+            self._checkpoints.write(scans, lambda: {"poses": self._poses, "scans": scans, "maker": maker.state()})
+
+
+def map_checkpoints(folder: RunFolder, config: Config, what: str = "map") -> MapCheckpoints | None:
+    """Those of a run folder; None when they are not wanted."""
+    every_s = config.odometry.checkpoint_s
+    if every_s == 0:
+        return None
+    return MapCheckpoints(Checkpoints(folder.path / CHECKPOINT, what.replace(" ", "-"), every_s), what)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from contextlib import suppress
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from lslam.frontend.checkpoints import Checkpoints, OdometryCheckpoints
 from lslam.frontend.inertial_start import Inertial, begin_inertial, close_inertial, load_start, save_start
 from lslam.frontend.keyframing import Keyframing
 from lslam.frontend.register_scans import estimate, is_diverged, to_trajectory
+from lslam.integrity.alerts import Alert, alerts
 from lslam.integrity.monitor import IntegrityMonitor
 from lslam.kernels import jit
 from lslam.keyframes.store import KeyframeStore
@@ -28,7 +30,6 @@ from lslam.odometry.sanity import measurable
 from lslam.odometry.stationary import StationaryDetector
 from lslam.osm import prior
 from lslam.osm.source import OsmSource
-from lslam.pipeline.lost import mark_lost
 from lslam.pipeline.manifest import Manifest
 from lslam.pipeline.run_folder import CHECKPOINT, RunFolder
 from lslam.pipeline.watch import Watch
@@ -169,3 +170,35 @@ def _begin_imu(
     if getattr(odometry, "ignores_prior", False):
         inertial.problems.append(f"{config.odometry.method} predicts by itself: the IMU only bridges scans that fail")
     return inertial
+
+
+# Sentences of one run; the scans beyond are marked all the same.
+MOST_SAID = 6
+
+
+def mark_lost(results: list[ScanResult], monitor: IntegrityMonitor, manifest: Manifest) -> list[ScanResult]:
+    """The results, those that an alert speaks of marked so; the manifest has a problem for each stretch of them."""
+    positions = np.stack([r.T_world_lidar[:3, 3] for r in results])
+    found = alerts(monitor.checks, positions, np.array([r.stamp_ns for r in results]))
+    said = [_sentence(results, alert) for alert in found]
+    if len(said) > MOST_SAID:
+        said = [
+            *said[:MOST_SAID],
+            f"and {len(said) - MOST_SAID} more stretches of scans that may be lost: see scans.csv",
+        ]
+    for sentence in said:
+        log.warning("%s", sentence)
+    manifest.problems += said
+    manifest.integrity = {
+        "checks": len(monitor.checks),
+        "conclusive": sum(check.is_conclusive for check in monitor.checks),
+        "alerts": len(found),
+    }
+    lost = {k for alert in found for k in range(alert.first, alert.last + 1)}
+    return [replace(r, is_lost=True) if k in lost else r for k, r in enumerate(results)]
+
+
+def _sentence(results: list[ScanResult], alert: Alert) -> str:
+    first, last = results[alert.first].index, results[alert.last].index
+    scans = f"scan {first}" if first == last else f"scans {first} to {last}"
+    return f"{scans} may be lost: {alert.why}"

@@ -16,28 +16,35 @@ import numpy as np
 
 from lslam.config import Config, load_config
 from lslam.errors import InputError, InterruptedRunError, OutputError, OutputExistsError, UsageError, cause
+from lslam.formats.atomic import write_text
 from lslam.formats.point_files import MAP_SUFFIXES
 from lslam.formats.trajectory_files import read_trajectory
 from lslam.maps.crispness import crispness
 from lslam.maps.georeference import Projection
 from lslam.maps.mesh import require_open3d
-from lslam.pipeline.json_files import write_json
 from lslam.pipeline.map_files import (
     LOCAL,
     MapNote,
+    drop_note,
     georeference_of,
+    is_note,
+    note_of,
+    note_with,
+    noted_last,
+    read_json,
     write_geojson,
+    write_json,
     write_map,
     write_mesh,
     write_occupancy,
 )
-from lslam.pipeline.map_notes import drop_note, is_note, note_of, note_with, noted_last
 from lslam.pipeline.map_pass import INTERRUPTED, BuiltMap, build_map
-from lslam.pipeline.refresh import write_renewed
 from lslam.pipeline.run_folder import MANIFEST, SPOOL, held, require_run
 from lslam.readers import open_sequence
 from lslam.readers.selection import select
 from lslam.remote import as_path
+from lslam.reports.evaluation_json import run_document
+from lslam.reports.html import with_new_map
 from lslam.types.gnss import Georeference
 from lslam.types.run_record import Crispness, RunRecord
 from lslam.types.scan_result import ScanResult, Status
@@ -276,3 +283,30 @@ def _statuses(path: Path, count: int) -> tuple[Status, ...]:
     if len(words) != count or not set(words) <= set(known):
         raise InputError(f"{path} does not list the {count} scans of trajectory.tum; run the sequence again")
     return tuple(known[word] for word in words)
+
+
+EVALUATION, REPORT = "evaluation.json", "report.html"
+_KEPT = "%s keeps the figures of the map before: it %s"
+
+
+def write_renewed(target: Path, folder: Path, record: RunRecord) -> None:
+    """Write into `target` what lies in the run folder `folder`, all of it as it is but what it says of the map.
+
+    record : of the new map, what is drawn with it, and the manifest as it shall be. A report that the run did not write is
+        not made; what cannot be read is left alone, which is said. Raises OutputError.
+    """
+    known, new = read_json(folder / EVALUATION), run_document(record, None) or {}
+    if known or not (folder / EVALUATION).exists():
+        write_json(target / EVALUATION, {**new, **known, "map": new["map"]})
+    else:
+        log.warning(_KEPT, folder / EVALUATION, "cannot be read")
+    try:
+        page = with_new_map((folder / REPORT).read_text(encoding="utf-8"), record)
+        write_text(target / REPORT, page)
+    except FileNotFoundError:
+        pass
+    except OSError as error:
+        log.warning(_KEPT, folder / REPORT, f"cannot be read ({error})")
+    except ValueError:
+        log.warning(_KEPT, folder / REPORT, "was not written by this version of lslam: run the sequence again")
+    write_json(target / MANIFEST, record.manifest)

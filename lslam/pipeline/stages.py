@@ -19,8 +19,7 @@ from lslam.pipeline import outputs
 from lslam.pipeline.back_end_pass import level_world, optimise_poses
 from lslam.pipeline.feature_pass import build_feature_map, view_features
 from lslam.pipeline.job import PreparedRun, announce, stoppable
-from lslam.pipeline.map_checkpoints import map_checkpoints
-from lslam.pipeline.map_pass import build_map
+from lslam.pipeline.map_pass import build_map, map_checkpoints
 from lslam.pipeline.odometry_pass import estimate_poses
 from lslam.pipeline.run_folder import REPLIES, RunFolder
 from lslam.types.run_record import RunRecord

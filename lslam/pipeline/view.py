@@ -9,8 +9,7 @@ from lslam.errors import InputError
 from lslam.formats.point_files import read_cloud
 from lslam.formats.trajectory_files import read_trajectory
 from lslam.maps.georeference import Projection
-from lslam.pipeline.map_files import georeference_of
-from lslam.pipeline.map_notes import note_of
+from lslam.pipeline.map_files import georeference_of, note_of
 from lslam.pipeline.rebuild import map_of, read_run
 from lslam.reports.recording import ViewedRun
 from lslam.types.cloud import ArrayCloud

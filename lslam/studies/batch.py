@@ -12,7 +12,7 @@ from typing import Any
 from lslam.config import Config
 from lslam.config.study import BatchConfig, parse_batch
 from lslam.errors import UsageError
-from lslam.pipeline.identity import imu_digest, input_digest, job_digest, listing_digest
+from lslam.pipeline.resume import imu_digest, input_digest, job_digest, listing_digest
 from lslam.printable import file_safe, toml_text
 from lslam.studies.expanded_study import ExpandedStudy, check_same
 from lslam.studies.grid import Job, cells_of, expand, label_of, run_folder

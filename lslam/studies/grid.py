@@ -12,7 +12,7 @@ from lslam.config.input import AS_CONFIGURED, ScanRange
 from lslam.config.study import StudySequence
 from lslam.errors import UsageError
 from lslam.formats.bag_listing import suffix_of
-from lslam.pipeline.identity import imu_digest, input_digest, job_digest, listing_digest
+from lslam.pipeline.resume import imu_digest, input_digest, job_digest, listing_digest
 from lslam.printable import file_safe
 from lslam.readers import open_sequence
 from lslam.readers.lookup import find_folder

@@ -20,7 +20,7 @@ from lslam.formats import bag_messages
 from lslam.formats.bag_files import BagWriter
 from lslam.formats.point_files import read_cloud
 from lslam.geometry.geodesy import from_local
-from lslam.pipeline import refresh
+from lslam.pipeline import rebuild
 from lslam.pipeline.map_files import georeference_note
 from lslam.pipeline.run_folder import held
 from lslam.readers import open_sequence
@@ -201,7 +201,7 @@ def test_a_disk_that_is_full_leaves_everything_as_it_was(run: Path, monkeypatch:
     def full(path: Path, document: object) -> None:
         raise OutputError(f"{path} cannot be written: no space left on device")
 
-    monkeypatch.setattr(refresh, "write_json", full)
+    monkeypatch.setattr(rebuild, "write_json", full)
     with pytest.raises(OutputError):
         cli(["map", str(run), "--voxel", "1", "--overwrite", "-q"], standalone_mode=False)
     assert {p.name: p.read_bytes() for p in run.iterdir() if p.is_file()} == before

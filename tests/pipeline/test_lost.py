@@ -18,8 +18,8 @@ from lslam.config import Config, load_config
 from lslam.errors import GateError, RunFailedError
 from lslam.integrity.monitor import IntegrityMonitor
 from lslam.pipeline import job
-from lslam.pipeline.lost import MOST_SAID, mark_lost
 from lslam.pipeline.manifest import Manifest
+from lslam.pipeline.odometry_pass import MOST_SAID, mark_lost
 from lslam.pipeline.run import run
 from lslam.pipeline.watch import RunOutcome, Watch
 from lslam.readers import open_sequence

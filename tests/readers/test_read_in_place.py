@@ -18,7 +18,7 @@ from lslam.formats import bag_messages
 from lslam.formats.bag_chunks import BLOCK, RangedFile
 from lslam.formats.bag_files import BagWriter
 from lslam.formats.point_files import write_points
-from lslam.pipeline.identity import input_digest, listing_digest
+from lslam.pipeline.resume import input_digest, listing_digest
 from lslam.pipeline.run import run
 from lslam.readers import open_sequence
 from lslam.remote import RemotePath

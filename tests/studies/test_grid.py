@@ -11,7 +11,7 @@ import pytest
 
 from lslam.config import Config, load_config
 from lslam.errors import InputError, UsageError
-from lslam.pipeline.identity import input_digest, job_digest
+from lslam.pipeline.resume import input_digest, job_digest
 from lslam.printable import file_safe
 from lslam.readers import open_sequence
 from lslam.simulation.record import record
