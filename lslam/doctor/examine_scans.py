@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from lslam.doctor.findings import Facts, Finding, plural
 from lslam.errors import InputError
 from lslam.odometry.sanity import FARTHEST_M
-from lslam.readers.ringed import Ringed, with_rings
+from lslam.readers.selection import Ringed, with_rings
 from lslam.types.scan import Scan
 from lslam.types.sequence import Sequence
 

@@ -28,8 +28,7 @@ from lslam.pipeline.manifest import Manifest, describe_deskew
 from lslam.pipeline.watch import Watch
 from lslam.readers import open_sequence
 from lslam.readers.raw_drive import with_streams
-from lslam.readers.ringed import with_rings
-from lslam.readers.selection import select
+from lslam.readers.selection import select, with_rings
 from lslam.stopping import asking
 from lslam.types.scan import Span
 from lslam.types.sequence import Sequence

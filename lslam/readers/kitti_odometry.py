@@ -13,7 +13,7 @@ from lslam.formats.sequence_toml import SequenceInfo
 from lslam.printable import printable
 from lslam.readers.folder_sequence import FolderSequence
 from lslam.readers.ground_truth import Voice, find_ground_truth, load_poses, to_lidar
-from lslam.readers.listing import list_scans, rows_of
+from lslam.readers.listing import DEFAULT_RATE_HZ, check_stamps, list_scans, load_stamps, nominal_stamps, rows_of
 from lslam.readers.sidecars import (
     calibration_over,
     compensation_note,
@@ -23,7 +23,6 @@ from lslam.readers.sidecars import (
     read_info,
     vertical_correction,
 )
-from lslam.readers.stamps import DEFAULT_RATE_HZ, check_stamps, load_stamps, nominal_stamps
 from lslam.types.calibration import Calibration
 from lslam.types.trajectory import Trajectory
 

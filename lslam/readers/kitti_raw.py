@@ -25,9 +25,16 @@ from lslam.formats.point_files import SUFFIXES
 from lslam.formats.sequence_toml import SequenceInfo
 from lslam.printable import printable
 from lslam.readers.folder_sequence import FolderSequence
-from lslam.readers.ground_truth import Voice, find_ground_truth, load_poses, to_lidar
-from lslam.readers.listing import list_scans, rows_of
-from lslam.readers.oxts_truth import oxts_truth
+from lslam.readers.ground_truth import Voice, find_ground_truth, load_poses, oxts_truth, to_lidar
+from lslam.readers.listing import (
+    DEFAULT_RATE_HZ,
+    check_stamps,
+    list_scans,
+    load_stamps,
+    measured_rate,
+    nominal_stamps,
+    rows_of,
+)
 from lslam.readers.sidecars import (
     calibration_over,
     compensation_note,
@@ -37,7 +44,6 @@ from lslam.readers.sidecars import (
     read_info,
     vertical_correction,
 )
-from lslam.readers.stamps import DEFAULT_RATE_HZ, check_stamps, load_stamps, measured_rate, nominal_stamps
 from lslam.types.calibration import Calibration
 from lslam.types.gnss import GnssStream
 from lslam.types.imu import ImuStream

@@ -15,10 +15,17 @@ from lslam.formats.sequence_toml import SequenceInfo
 from lslam.printable import printable
 from lslam.readers.folder_sequence import FolderSequence
 from lslam.readers.ground_truth import Numbered, Voice, find_ground_truth, load_poses, pair_by_number, to_lidar
-from lslam.readers.listing import list_scans, rows_of, stamps_in_names
+from lslam.readers.listing import (
+    DEFAULT_RATE_HZ,
+    check_stamps,
+    list_scans,
+    load_stamps,
+    nominal_stamps,
+    rows_of,
+    stamps_in_names,
+)
 from lslam.readers.point_times import TimeRule, decide_rule
 from lslam.readers.sidecars import calibration_over, compensation_note, load_gnss, load_imu, per_point_folder, read_info
-from lslam.readers.stamps import DEFAULT_RATE_HZ, check_stamps, load_stamps, nominal_stamps
 from lslam.types.calibration import Calibration
 from lslam.types.trajectory import Trajectory
 

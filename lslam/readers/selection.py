@@ -2,13 +2,36 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.errors import UsageError
-from lslam.readers.sequence_view import SequenceView
+from lslam.errors import InputError, UsageError
+from lslam.preprocessing.rings import RingRule, decide_rings
 from lslam.types.scan import Scan
 from lslam.types.sequence import Sequence
+
+
+class SequenceView:
+    """Delegates to `whole` whatever `own` does not replace; a subclass says which scans there are and what they hold."""
+
+    def __init__(self, whole: Sequence, **own: Any) -> None:
+        self.whole = whole
+        vars(self).update(own)
+
+    def __getattr__(self, name: str) -> Any:
+        if name == "whole":  # a copy that is not filled in yet
+            raise AttributeError(name)
+        return getattr(self.whole, name)
+
+    def __len__(self) -> int:
+        return len(self.whole)
+
+    def scan(self, index: int) -> Scan:
+        """Scan `index` of the whole. Raises InputError as it does."""
+        return self.whole.scan(index)
 
 
 class Selection(SequenceView):
@@ -43,3 +66,54 @@ def select(sequence: Sequence, start: int = 0, count: int | None = None, skip_fr
     if len(indices) == len(sequence):
         return sequence
     return Selection(sequence, indices)
+
+
+# Scans the rule is decided on: the first that can be read.
+_LOOKED_AT = 3
+
+
+class Ringed(SequenceView):
+    """A sequence with the rings of its scans filled in; all else is the sequence's own."""
+
+    def __init__(self, whole: Sequence, rule: RingRule) -> None:
+        super().__init__(whole, notes=[*whole.notes, str(rule)])
+        self.rule = rule
+
+    def scan(self, index: int) -> Scan:
+        """Read scan `index` and find its rings. Raises InputError when either fails."""
+        scan = self.whole.scan(index)
+        return replace(scan, rings=self.rule.rings_of(scan)) if len(scan) else scan
+
+
+def with_rings(sequence: Sequence, wanted: str = "auto") -> Sequence:
+    """`sequence` with rings in every scan, found as `input.rings` says; the rule is among its notes.
+
+    The first scans of the recording decide, whatever part of it is used, so that a run that is resumed decides alike.
+    Raises InputError naming --rings when there are no rings to be found.
+    """
+    scans = _first_scans(sequence)
+    if not scans:
+        return sequence  # nothing can be read, which is said in its turn
+    rows = getattr(sequence, "rows", None)
+    try:
+        if rows and wanted == "auto":
+            rule = RingRule("rows", rows)  # as the reader filled them in
+        else:
+            rule = decide_rings(scans, wanted, rows or getattr(sequence, "rings", None))
+    except InputError as error:
+        raise InputError(f"{sequence.path}: {error}") from None
+    return Ringed(sequence, rule)
+
+
+def _first_scans(sequence: Sequence) -> list[Scan]:
+    scans: list[Scan] = []
+    for index in range(len(sequence)):
+        try:
+            scan = sequence.scan(index)
+        except InputError:
+            continue
+        if len(scan):
+            scans.append(scan)
+        if len(scans) == _LOOKED_AT:
+            break
+    return scans

@@ -21,7 +21,7 @@ import numpy as np
 from lslam.errors import GateError, InterruptedRunError, LslamError, OutputExistsError, RunFailedError, RunFinishedError
 from lslam.pipeline.run_folder import KEYFRAMES, LOG, MANIFEST
 from lslam.pipeline.storage import spool_of
-from lslam.readers.sequence_view import SequenceView
+from lslam.readers.selection import SequenceView
 from lslam.remote import RemotePath
 from lslam.stopping import current, is_interrupt
 from lslam.studies.grid import Job
