@@ -7,9 +7,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.kernels.extent import extent
 from lslam.kernels.jit import inline, kernel
-from lslam.kernels.linalg import eigen
+from lslam.kernels.linalg import eigen, extent
 from lslam.kernels.voxel import pack
 
 # Neighbourhoods thinner than 0.1 mm count as that thick: a perfect plane has an entropy, too.

@@ -7,10 +7,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.kernels.extent import extent
 from lslam.kernels.facts import INFORMATION, LEVER, MATCHED, POPULATION
 from lslam.kernels.jit import inline, inline_with_arrays, kernel
-from lslam.kernels.linalg import eigen, rotate_left
+from lslam.kernels.linalg import eigen, extent, rotate_left
 from lslam.kernels.linearisation import Pose, Sums
 from lslam.kernels.surface_information import solve_on_surfaces
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -155,3 +156,16 @@ def rotate_symmetric(R: NDArray[np.float64], q: NDArray[np.float64]) -> tuple[fl
         a10 * R[2, 0] + a11 * R[2, 1] + a12 * R[2, 2],
         a20 * R[2, 0] + a21 * R[2, 1] + a22 * R[2, 2],
     )
+
+
+@inline
+def extent(values: NDArray[Any]) -> tuple[Any, Any]:
+    """Least and greatest of the values (N,), N > 0; both are NaN where one of them is, as NumPy has it."""
+    low = high = values[0]
+    for value in values:
+        # NaN is what differs from itself; nothing is smaller or larger than it, so that it stays.
+        if value < low or value != value:
+            low = value
+        if value > high or value != value:
+            high = value
+    return low, high

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.kernels.jit import inline, kernel
-from lslam.kernels.row_table import pack, row_of
+from lslam.kernels.voxel_average import pack, row_of
 
 COLUMNS = 5
 

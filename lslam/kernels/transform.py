@@ -1,6 +1,8 @@
-"""One rigid transform of a cloud of float32 points, in one pass without intermediate arrays."""
+"""Points moved: by one rigid transform, by the motion of the sensor within a sweep, by the HDL-64E's vertical correction."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,3 +17,63 @@ def transform(points: NDArray[np.float32], T: NDArray[np.float64], moved: NDArra
         x, y, z = float(points[i, 0]), float(points[i, 1]), float(points[i, 2])
         for j in range(3):
             moved[i, j] = T[j, 0] * x + T[j, 1] * y + T[j, 2] * z + T[j, 3]
+
+
+@kernel
+def deskew(
+    points: Any, times: NDArray[np.float32], start: float, step: float, knots: NDArray[np.float64], moved: Any
+) -> None:
+    """Write points (N, 3) at `times` (N,), s, into `moved` (N, 3) as the pose `knots` carries them.
+
+    knots : (K, 3, 4) transforms at start, start + step, ...; between two of them the matrices are blended, before the
+    first and after the last the outer pair is continued.
+    """
+    last = len(knots) - 2
+    for i in range(len(points)):
+        s = (times[i] - start) / step
+        if not np.isfinite(s):
+            s = -start / step
+        k = min(max(int(np.floor(s)), 0), last)
+        b = s - k
+        a = 1.0 - b
+        p, q = knots[k], knots[k + 1]
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        for j in range(3):
+            moved[i, j] = (
+                (a * p[j, 0] + b * q[j, 0]) * x
+                + (a * p[j, 1] + b * q[j, 1]) * y
+                + (a * p[j, 2] + b * q[j, 2]) * z
+                + a * p[j, 3]
+                + b * q[j, 3]
+            )
+
+
+Floats = NDArray[np.float32]
+
+
+@kernel
+def split(raw: Floats, points: Floats, intensity: Floats) -> None:
+    """Copy (N, 4) records into points (N, 3) and intensity (N,)."""
+    for i in range(raw.shape[0]):
+        points[i, 0] = raw[i, 0]
+        points[i, 1] = raw[i, 1]
+        points[i, 2] = raw[i, 2]
+        intensity[i] = raw[i, 3]
+
+
+@kernel
+def rotate_up(points: Any, sine: float, cosine: float) -> None:
+    """Rotate every point (N, 3) about p x z, in place, by the angle of `sine` and `cosine`; positive lifts the point.
+
+    The axis is horizontal and perpendicular to p, so Rodrigues' formula needs no trigonometry: the horizontal range h
+    becomes h cos - z sin and the height z cos + h sin. Points on the z axis have no such axis and stay; NaN stays NaN.
+    """
+    one, s, c = np.float32(1), np.float32(sine), np.float32(cosine)
+    for i in range(points.shape[0]):
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        h = np.sqrt(x * x + y * y)
+        if h != 0:
+            share = c - z * s * (one / h)
+            points[i, 0] = x * share
+            points[i, 1] = y * share
+            points[i, 2] = z * c + h * s

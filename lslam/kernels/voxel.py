@@ -9,8 +9,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.kernels.extent import extent
 from lslam.kernels.jit import inline, kernel
+from lslam.kernels.linalg import extent
 
 OFFSET = 1 << 20
 MASK = (1 << 21) - 1

@@ -12,10 +12,67 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.kernels import row_table
-from lslam.kernels.jit import kernel
-from lslam.kernels.row_table import pack, row_of, slot_of
+from lslam.kernels.jit import inline, kernel
 from lslam.kernels.voxel import AHEAD
+
+AXIS_BITS = 21
+HALF = 1 << (AXIS_BITS - 1)
+_MIX = -7046029254386353131  # 0x9E3779B97F4A7C15 as int64: Fibonacci hashing
+
+
+@inline
+def pack(ix: int, iy: int, iz: int) -> int:
+    """Key of cell indices relative to the origin; -1 when one lies outside what has a key."""
+    x, y, z = ix + HALF, iy + HALF, iz + HALF
+    if (x | y | z) >> AXIS_BITS != 0:  # negative or too large on some axis
+        return -1
+    return (x << (2 * AXIS_BITS)) | (y << AXIS_BITS) | z
+
+
+@inline
+def slot_of(key: int, mask: int) -> int:
+    """Home of a key in a table of mask + 1 slots."""
+    mixed = key * _MIX
+    return (mixed ^ (mixed >> 29) ^ (mixed >> 43)) & mask
+
+
+@inline
+def row_of(key: int, slots: NDArray[np.int32], rows: NDArray[np.int64], used: int) -> int:
+    """Row of a key; `used` when it has none yet: entered in `slots` then, the key written, the other columns not.
+
+    slots : (S,) row of each hash slot or -1, S a power of two above `used`; rows : (R, k), R > `used`
+    """
+    mask = slots.shape[0] - 1
+    slot = slot_of(key, mask)
+    row = slots[slot]
+    while row >= 0 and rows[row, 0] != key:
+        slot = (slot + 1) & mask
+        row = slots[slot]
+    if row < 0:
+        row = used
+        slots[slot] = row
+        rows[row, 0] = key
+    return int(row)
+
+
+@kernel
+def enter(slots: NDArray[np.int32], rows: NDArray[np.int64], used: int) -> None:
+    """Enter the first `used` rows into `slots`, which are all -1 and a power of two above `used`."""
+    mask = slots.shape[0] - 1
+    for row in range(used):
+        slot = slot_of(rows[row, 0], mask)
+        while slots[slot] >= 0:
+            slot = (slot + 1) & mask
+        slots[slot] = row
+
+
+def unpack_cells(keys: NDArray[np.int64], origin: NDArray[np.int64]) -> NDArray[np.int64]:
+    """(M, 3) cell indices of keys (M,)."""
+    cells = np.empty((len(keys), 3), np.int64)
+    for axis in range(3):
+        cells[:, axis] = ((keys >> (AXIS_BITS * (2 - axis))) & ((1 << AXIS_BITS) - 1)) - HALF + origin[axis]
+    return cells
+
 
 UNITS = float(2**24)  # 2**39 points fit into one voxel's sum
 INTENSITY_UNITS = float(2**20)
@@ -110,6 +167,6 @@ def accumulate(
 
 def unpack(rows: NDArray[np.int64], origin: NDArray[np.int64], voxel: float) -> NDArray[Any]:
     """(M, 3) float64 mean positions, m, of finished rows (M, 5 or 6)."""
-    cells = row_table.unpack(rows[:, 0], origin)
+    cells = unpack_cells(rows[:, 0], origin)
     points = (cells + 0.5 + rows[:, 1:4] / (rows[:, 4:5] * UNITS)) * voxel
     return np.asarray(points)

@@ -237,7 +237,7 @@ class MapMerger:
 
     def _reserve(self, rows: int) -> None:
         """Room for `rows` rows, of one scan with more than `most` of them."""
-        from lslam.kernels.row_table import enter
+        from lslam.kernels.voxel_average import enter
 
         if rows > len(self._rows):
             more = rows - len(self._rows)

@@ -115,7 +115,7 @@ class OccupancyMapper:
     def result(self) -> OccupancyGrid:
         """The cells seen so far; the mapper is empty then."""
         from lslam.kernels.ray_cells import compose
-        from lslam.kernels.row_table import unpack
+        from lslam.kernels.voxel_average import unpack_cells
 
         if self._runs is None:
             rows = self._take()
@@ -125,7 +125,7 @@ class OccupancyMapper:
             rows = stored.read(0, len(stored))
             self._runs = None
         origin = np.zeros(3, np.int64) if self._origin is None else self._origin
-        cells = unpack(rows[:, 0], origin).astype(np.int32)
+        cells = unpack_cells(rows[:, 0], origin).astype(np.int32)
         return OccupancyGrid(cells, np.clip(rows[:, 1], rows[:, 2], rows[:, 3]).astype(np.int16), self._voxel)
 
     def state(self) -> State:
@@ -158,7 +158,7 @@ class OccupancyMapper:
     def _reserve(self, rows: int) -> None:
         """Room for `rows` rows; the slots stay at most two thirds full."""
         from lslam.kernels.ray_cells import COLUMNS
-        from lslam.kernels.row_table import enter
+        from lslam.kernels.voxel_average import enter
 
         if rows > len(self._rows):
             more = max(rows, len(self._rows) * 3 // 2)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from lslam.geometry import se3
 from lslam.geometry.interpolate import poses_at
-from lslam.kernels import deskew_kernel
+from lslam.kernels import transform
 from lslam.preprocessing.prepare import PreparedPoints
 from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan import Span
@@ -35,7 +35,7 @@ def deskew_points(points: NDArray[Any], times: NDArray[np.float32] | None, prior
         return points
     moved = np.empty_like(points)
     start, step, knots = _knots(prior)
-    deskew_kernel.deskew(points, times, start, step, knots, moved)
+    transform.deskew(points, times, start, step, knots, moved)
     return moved
 
 

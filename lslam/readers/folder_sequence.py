@@ -69,7 +69,7 @@ class FolderSequence:
         cloud = _split(read_bin(path)) if path.suffix.lower() == ".bin" else read_points(path)
         times, rings, stamp = self._times_and_rings(path, cloud, index, stamp)
         if self.correction_deg and len(cloud):
-            from lslam.kernels.correction import rotate_up
+            from lslam.kernels.transform import rotate_up
 
             angle = math.radians(self.correction_deg)
             rotate_up(cloud.points, math.sin(angle), math.cos(angle))
@@ -97,7 +97,7 @@ class FolderSequence:
 
 
 def _split(raw: NDArray[np.float32]) -> PointCloud:
-    from lslam.kernels.correction import split
+    from lslam.kernels.transform import split
 
     points = np.empty((len(raw), 3), np.float32)
     intensity = np.empty(len(raw), np.float32)

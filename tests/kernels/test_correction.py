@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from lslam.geometry import so3
-from lslam.kernels.correction import rotate_up, split
+from lslam.kernels.transform import rotate_up, split
 
 ANGLE = math.radians(0.205)
 

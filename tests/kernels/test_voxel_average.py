@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from lslam.kernels.row_table import AXIS_BITS, enter
-from lslam.kernels.voxel_average import accumulate, unpack
+from lslam.kernels.voxel_average import AXIS_BITS, accumulate, enter, unpack
 
 NO_INTENSITY = np.zeros(0, np.float32)
 ORIGIN = np.zeros(3, np.int64)
