@@ -62,8 +62,7 @@ def command(target: Path, **given: Any) -> None:
 def _measure(target: Path, given: dict[str, Any]) -> None:
     options.require_there(target, given["against"])
     from lslam.formats.point_files import read_cloud
-    from lslam.maps.compare import THRESHOLD, compare
-    from lslam.maps.crispness import RADIUS, crispness
+    from lslam.maps.crispness import RADIUS, THRESHOLD, compare, crispness
     from lslam.pipeline.rebuild import map_of
     from lslam.reports.evaluation_json import crispness_document, strict
 

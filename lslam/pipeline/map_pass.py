@@ -19,10 +19,10 @@ from lslam.frontend.checkpoints import Checkpoints
 from lslam.frontend.register_scans import read_ahead
 from lslam.geometry.interpolate import poses_at
 from lslam.maps.clean import Cleaner, PosedScan
+from lslam.maps.floor_plan import top_view
 from lslam.maps.merge import MapMerger
 from lslam.maps.mesh import denoise
 from lslam.maps.occupancy import OccupancyGrid, OccupancyMapper
-from lslam.maps.top_view import top_view
 from lslam.pipeline.run_folder import CHECKPOINT, RunFolder
 from lslam.preprocessing.deskew import deskew_points, knots_over
 from lslam.stopping import asking

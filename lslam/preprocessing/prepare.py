@@ -117,7 +117,7 @@ def gate_points(points: NDArray[np.float32], config: PreprocessConfig) -> NDArra
     if config.remove_ground:
         kept = kept[above_ground(points[kept], config.ground_slope, config.ground_tolerance)]
     if config.denoise:
-        from lslam.preprocessing.denoise import dense_points
+        from lslam.preprocessing.weather_filter import dense_points
 
         kept = kept[dense_points(points[kept], config.denoise_neighbours, config.denoise_deviations)]
     return kept

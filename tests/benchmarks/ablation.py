@@ -34,7 +34,7 @@ from lslam.errors import UsageError
 from lslam.frontend import tracker
 from lslam.frontend.tracker import Loaded, Tracker
 from lslam.odometry import create_odometry
-from lslam.recovery import non_ground, start_search
+from lslam.recovery import start_search as non_ground
 from lslam.registration import local_map, residuals, solver
 from lslam.simulation.scenarios import simulate
 from lslam.types.scan import Scan

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lslam.errors import InputError, UsageError
-from lslam.maps.compare import compare
+from lslam.maps.crispness import compare
 from lslam.types.cloud import ArrayCloud
 
 

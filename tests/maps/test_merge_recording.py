@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from lslam.formats.trajectory_files import read_trajectory
 from lslam.geometry import se3
+from lslam.maps.floor_plan import top_view
 from lslam.maps.merge import MapMerger
-from lslam.maps.top_view import top_view
 
 
 def pack(cells: NDArray[np.float64]) -> NDArray[np.int64]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lslam.maps.top_view import top_view
+from lslam.maps.floor_plan import top_view
 
 
 def test_every_point_is_counted_in_its_pixel() -> None:

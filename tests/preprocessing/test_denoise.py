@@ -9,8 +9,8 @@ import pytest
 from numpy.typing import NDArray
 
 from lslam.config.preprocess import PreprocessConfig
-from lslam.preprocessing.denoise import dense_points
 from lslam.preprocessing.prepare import gate_points
+from lslam.preprocessing.weather_filter import dense_points
 
 
 def cloud(seed: int, n: int = 400) -> NDArray[np.float32]:

@@ -12,8 +12,7 @@ from lslam.config.config import Config
 from lslam.config.recovery import RecoveryConfig
 from lslam.geometry import se3
 from lslam.preprocessing.prepare import prepare_points
-from lslam.recovery.coarse_to_fine import CoarseToFine
-from lslam.recovery.policies import RecoveringRegistration, policies_of
+from lslam.recovery.policies import CoarseToFine, RecoveringRegistration, policies_of
 from lslam.recovery.start_search import StartSearch
 from lslam.registration.registration import Registration
 from lslam.registration.solver import RegistrationResult
