@@ -187,7 +187,7 @@ def _timing(estimate: Path, given: Path | None) -> Timing | None:
 def _hold_gates(evaluations: list[Evaluation], given: dict[str, Any]) -> None:
     """GateError naming every number that is over its gate; a number that is not available holds no gate."""
     from lslam.errors import GateError
-    from lslam.evaluation.metrics import METRICS
+    from lslam.evaluation.evaluate import METRICS
 
     broken = []
     for e in evaluations:

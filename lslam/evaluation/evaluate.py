@@ -4,20 +4,38 @@ from __future__ import annotations
 
 import logging
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lslam.config.eval import EvalConfig
 from lslam.errors import InputError
+from lslam.evaluation.absolute import AbsoluteTrajectoryError
 from lslam.evaluation.associate import Matches, associate, estimate_offset
 from lslam.evaluation.frames import body_turn, reconcile
-from lslam.evaluation.metric import MatchedPoses
-from lslam.evaluation.metrics import METRICS
+from lslam.evaluation.kitti_drift import KittiOdometry
+from lslam.evaluation.metric import MatchedPoses, TrajectoryMetric
+from lslam.evaluation.relative import RelativePoseError
 from lslam.evaluation.results import Evaluation
+from lslam.evaluation.thesis import DelTufo, Girolimetto
 from lslam.geometry import se3, so3
 from lslam.types.calibration import Calibration
 from lslam.types.trajectory import Trajectory
+
+METRICS: tuple[TrajectoryMetric[Any], ...] = (
+    AbsoluteTrajectoryError(),
+    RelativePoseError(),
+    KittiOdometry(),
+    Girolimetto(),
+    DelTufo(),
+)
+
+
+def shown_metrics(evaluation: Evaluation) -> list[TrajectoryMetric[Any]]:
+    """Those that are always shown, and those of the words of `eval.metrics`."""
+    return [metric for metric in METRICS if not metric.word or metric.word in evaluation.shown]
+
 
 __all__ = ["Evaluation", "evaluate"]
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from lslam.evaluation.student import two_sided
+from lslam.evaluation.curves import two_sided
 from lslam.types.study import Curve, Floats, Interval, Law, LawKind
 
 FEWEST = 6

@@ -7,8 +7,7 @@ from itertools import permutations
 import numpy as np
 
 from lslam.config.finding import ExpectedFinding
-from lslam.evaluation.contrast import contrast
-from lslam.evaluation.curves import NOT_REGISTRATION, over_seeds
+from lslam.evaluation.curves import NOT_REGISTRATION, contrast, over_seeds
 from lslam.evaluation.laws import FEWEST, law_over, rival
 from lslam.types.study import Bools, Curve, CurveResult, Floats, Judged, Law, Outcome
 

@@ -8,8 +8,7 @@ from typing import Literal
 import numpy as np
 
 from lslam.config.finding import ExpectedFinding
-from lslam.evaluation.contrast import Rise, contrast, plateau, rise_at, rise_below
-from lslam.evaluation.curves import divergence, elbow, optimum
+from lslam.evaluation.curves import Rise, contrast, divergence, elbow, optimum, plateau, rise_at, rise_below
 from lslam.types.study import Curve, CurveResult, Floats, Judged, Optimum, Outcome
 
 BELOW: dict[Rise, str] = {

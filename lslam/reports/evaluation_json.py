@@ -26,7 +26,7 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
 
-from lslam.evaluation.metrics import METRICS
+from lslam.evaluation.evaluate import METRICS
 from lslam.evaluation.results import Evaluation
 from lslam.evaluation.timing import Timing
 from lslam.types.run_record import Crispness, RunRecord

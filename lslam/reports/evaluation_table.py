@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
+from lslam.evaluation.evaluate import shown_metrics
 from lslam.evaluation.metric import MetricRow
-from lslam.evaluation.metrics import shown_metrics
 from lslam.evaluation.results import Evaluation
 from lslam.evaluation.timing import StageTime, Timing
 from lslam.printable import significant

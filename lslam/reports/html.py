@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from lslam.evaluation.metrics import shown_metrics
+from lslam.evaluation.evaluate import shown_metrics
 from lslam.formats.atomic import atomic_write
 from lslam.reports import plots
 from lslam.reports.back_end import back_end_figures

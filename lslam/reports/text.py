@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from lslam.evaluation.metrics import shown_metrics
+from lslam.evaluation.evaluate import shown_metrics
 from lslam.printable import counted, metres
 from lslam.reports.back_end import back_end_rows
 from lslam.reports.facts import Failure, RunFacts, run_facts

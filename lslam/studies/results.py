@@ -12,7 +12,7 @@ from typing import Any
 
 from lslam.config.eval import EvalConfig
 from lslam.errors import InputError
-from lslam.evaluation.metrics import METRICS
+from lslam.evaluation.evaluate import METRICS
 from lslam.evaluation.timing import Timing, read_timing
 from lslam.formats.study_files import read_study_csv, write_study_csv, write_study_parquet
 from lslam.remote import RemotePath

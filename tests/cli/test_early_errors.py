@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from lslam.evaluation.metrics import METRICS
+from lslam.evaluation.evaluate import METRICS
 from lslam.evaluation.recipes import WORDS
 
 SAMPLE = str(Path(__file__).resolve().parents[2] / "sample_data")

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lslam.evaluation.curves import efficiency, median_over_seeds, normalise, over_seeds
-from lslam.evaluation.student import two_sided
+from lslam.evaluation.curves import efficiency, median_over_seeds, normalise, over_seeds, two_sided
 
 # Its open flight (tables 4.13 and 5.3): rmse m, angular rmse deg, s of registration per scan (LOAM and map added), s in all.
 OPEN = {
