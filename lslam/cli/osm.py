@@ -116,7 +116,7 @@ def _bounds(
     import numpy as np
 
     from lslam.osm import bounds
-    from lslam.osm.places import positions_along
+    from lslam.osm.bounds import positions_along
 
     if bbox is not None:
         return bounds.Bounds(*_box(bbox))

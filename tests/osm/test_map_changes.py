@@ -11,7 +11,7 @@ from shapely import intersection, length, linestrings, union_all
 from wall_scenes import box_at
 
 from lslam.geometry import se2
-from lslam.osm.map_changes import absent_buildings, new_walls
+from lslam.osm.corrections import absent_buildings, new_walls
 from lslam.osm.walls import walls_of
 from lslam.types.building import Building, Footprint, KeyframeMatch, footprint_polygon
 
