@@ -86,7 +86,9 @@ def command(
         raise UsageError("--timing belongs to one estimate; with several, put timing.csv beside each")
     options.require_there(*estimates, truth, given["calib"], given["times"], given["timing_file"])
     config = _config(given, flags)
-    from lslam.reports import evaluation_json, evaluation_table, picture
+    from lslam.reports import evaluations as evaluation_json
+    from lslam.reports import evaluations as evaluation_table
+    from lslam.reports import picture
 
     evaluations = _evaluate_all(estimates, truth, config, given)
     timings = [_timing(path, given["timing_file"]) for path in estimates]

@@ -64,7 +64,7 @@ def _measure(target: Path, given: dict[str, Any]) -> None:
     from lslam.formats.point_files import read_cloud
     from lslam.maps.crispness import RADIUS, THRESHOLD, compare, crispness
     from lslam.pipeline.rebuild import map_of
-    from lslam.reports.evaluation_json import crispness_document, strict
+    from lslam.reports.evaluations import crispness_document, strict
 
     path = map_of(target)
     cloud = read_cloud(path)
@@ -99,7 +99,7 @@ def _rebuild(target: Path, given: dict[str, Any]) -> None:
     require_run(target)
     from lslam.maps.georeference import parse_crs
     from lslam.pipeline.rebuild import check_output, open_scans, read_run, rebuild
-    from lslam.reports.evaluation_json import crispness_document
+    from lslam.reports.evaluations import crispness_document
 
     out: Path | None = given["out"]
     crs = None if given["crs"] is None else parse_crs(given["crs"])

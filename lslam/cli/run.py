@@ -283,7 +283,7 @@ def _print_result(outcome: RunOutcome, out: Path, as_json: bool) -> None:
 
         show(summary(outcome.record, outcome.evaluation))
         return
-    from lslam.reports.evaluation_json import run_document
+    from lslam.reports.evaluations import run_document
 
     score = run_document(outcome.record, outcome.evaluation)
     document = {"folder": str(out), "manifest": outcome.record.manifest, "evaluation": score}

@@ -19,7 +19,7 @@ from lslam.maps.floor_plan import floor_plan
 from lslam.maps.georeference import ProjectedCloud, Projection, to_lat_lon
 from lslam.maps.mesh import surface
 from lslam.maps.occupancy import OccupancyGrid
-from lslam.reports.evaluation_json import strict
+from lslam.reports.evaluations import strict
 from lslam.reports.png import grey_png
 from lslam.types.cloud import Cloud, in_memory
 from lslam.types.gnss import Georeference

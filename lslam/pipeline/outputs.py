@@ -20,7 +20,7 @@ from lslam.pipeline.feature_pass import FeatureCloud
 from lslam.pipeline.map_files import LOCAL, MapNote
 from lslam.pipeline.map_pass import BuiltMap
 from lslam.pipeline.run_folder import RunFolder
-from lslam.reports.evaluation_json import run_document
+from lslam.reports.evaluations import run_document
 from lslam.reports.facts import stage_matrix
 from lslam.types.calibration import Calibration
 from lslam.types.run_record import RunRecord

@@ -43,7 +43,7 @@ from lslam.pipeline.run_folder import MANIFEST, SPOOL, held, require_run
 from lslam.readers import open_sequence
 from lslam.readers.selection import select
 from lslam.remote import as_path
-from lslam.reports.evaluation_json import run_document
+from lslam.reports.evaluations import run_document
 from lslam.reports.html import with_new_map
 from lslam.types.gnss import Georeference
 from lslam.types.run_record import Crispness, RunRecord

@@ -11,7 +11,7 @@ from typing import Any
 
 from lslam.formats.atomic import write_text
 from lslam.printable import counted, fixed, metres
-from lslam.reports.evaluation_json import strict
+from lslam.reports.evaluations import strict
 from lslam.reports.grid_text import Grid, aligned, comma_separated, latex, markdown
 from lslam.types.comparison import Comparison, Metric, RunScore, Spread, SummaryRow
 from lslam.version import __version__

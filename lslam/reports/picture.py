@@ -16,7 +16,7 @@ from lslam.evaluation.results import AbsoluteError, Evaluation
 from lslam.formats.atomic import atomic_write
 from lslam.formats.osm_buildings import BuildingExtract
 from lslam.printable import printable
-from lslam.reports.evaluation_table import short_names
+from lslam.reports.evaluations import short_names
 
 FORMATS = ("png", "svg", "pdf")
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")  # Okabe and Ito: safe for colour blindness

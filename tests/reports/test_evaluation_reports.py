@@ -17,7 +17,8 @@ from lslam.evaluation.evaluate import evaluate
 from lslam.evaluation.results import Evaluation
 from lslam.evaluation.timing import StageTime, Timing
 from lslam.geometry import se3
-from lslam.reports import evaluation_json, evaluation_table, picture
+from lslam.reports import evaluations as evaluation_table
+from lslam.reports import picture
 from lslam.types.trajectory import Trajectory
 
 STAGE = StageTime(0.01, 0.02, 0.03, 0.011, 1.0)
@@ -58,7 +59,7 @@ def strict(text: str) -> Any:
 
 
 def test_schema_of_one(result: Evaluation) -> None:
-    document = strict(evaluation_json.to_json([result], [TIMING]))
+    document = strict(evaluations.to_json([result], [TIMING]))
     assert (document["schema"], document["version"]) == ("lslam-evaluation", 1)
     ate = result.ate["se3"].translation
     assert ate is not None
@@ -78,7 +79,7 @@ def test_schema_of_one(result: Evaluation) -> None:
 
 
 def test_what_is_not_available_is_null_and_said(unavailable: Evaluation) -> None:
-    document = strict(evaluation_json.to_json([unavailable]))
+    document = strict(evaluations.to_json([unavailable]))
     se3_part = document["ate"]["se3"]
     assert (se3_part["available"], se3_part["rmse"], se3_part["note"]) == (False, None, "n/a (collinear)")
     assert document["kitti_drift"]["translation_percent"] is None
@@ -88,7 +89,7 @@ def test_what_is_not_available_is_null_and_said(unavailable: Evaluation) -> None
 
 
 def test_several_are_a_list(result: Evaluation, unavailable: Evaluation) -> None:
-    document = strict(evaluation_json.to_json([result, unavailable]))
+    document = strict(evaluations.to_json([result, unavailable]))
     assert [d["estimate"] for d in document["evaluations"]] == ["runs/a/trajectory.tum", "runs/b/trajectory.tum"]
 
 

@@ -142,7 +142,7 @@ def test_degenerate_directions_are_named() -> None:
 
 
 def test_crispness_is_stated_with_and_without_truth(make_record: MakeRecord) -> None:
-    from lslam.reports.evaluation_json import run_document
+    from lslam.reports.evaluations import run_document
     from lslam.types.run_record import Crispness
 
     record = make_record(5)
