@@ -20,7 +20,7 @@ from lslam.untrusted import whole_number
 
 if TYPE_CHECKING:
     from lslam.config.input import ScanRange
-    from lslam.studies.engines import Engine
+    from lslam.studies.jobs import Engine
     from lslam.studies.output import OutputOptions
 
 F = TypeVar("F", bound=Callable[..., Any])
@@ -216,7 +216,7 @@ def engine_of(given: dict[str, Any], title: str, is_persistent: bool = True) -> 
 
     is_persistent : whether data stay read from one run to the next, and keyframes do not stay
     """
-    from lslam.studies.engines import Local
+    from lslam.studies.jobs import Local
 
     jobs, scheduler, cluster = given["jobs"], given["scheduler"], given["cluster"]
     if scheduler is None and cluster is None:

@@ -19,9 +19,8 @@ from typing import Any
 
 from lslam.errors import InputError, OutputError, RunFailedError, UsageError, cause
 from lslam.remote import RemotePath, as_path
-from lslam.studies.engines import simulate_scenes
 from lslam.studies.grid import Job
-from lslam.studies.jobs import clear_attempt, ensure_state
+from lslam.studies.jobs import clear_attempt, ensure_state, simulate_scenes
 from lslam.studies.runner import StudyProgress
 from lslam.studies.worker import WorkerContext, execute
 from lslam.untrusted import whole_number

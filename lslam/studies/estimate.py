@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from lslam.errors import RunFailedError
 from lslam.readers import open_sequence
-from lslam.studies.engines import Local
 from lslam.studies.grid import Job
+from lslam.studies.jobs import Local
 from lslam.studies.results import Results
 from lslam.studies.runner import StudyProgress
 from lslam.studies.scenes import drive_of, simulate_once

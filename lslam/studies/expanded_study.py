@@ -9,9 +9,8 @@ from typing import Any
 from lslam.config.load import read_toml
 from lslam.errors import InterruptedRunError, LslamError, OutputExistsError
 from lslam.formats.atomic import write_text
-from lslam.studies.engines import Engine
 from lslam.studies.grid import Job
-from lslam.studies.jobs import finished
+from lslam.studies.jobs import Engine, finished
 from lslam.studies.output import OutputOptions, lock_output, release_output
 from lslam.studies.results import Results
 from lslam.studies.runner import StudyProgress

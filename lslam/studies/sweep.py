@@ -15,9 +15,9 @@ from lslam.evaluation.sensitivity import evaluate_study
 from lslam.formats.study_files import read_study_csv
 from lslam.printable import toml_text
 from lslam.reports.study_html import timing_notes, write_study_files
-from lslam.studies.engines import Engine
 from lslam.studies.expanded_study import ExpandedStudy, check_same, make_runs
 from lslam.studies.grid import cells_of, expand
+from lslam.studies.jobs import Engine
 from lslam.studies.output import STUDY, OutputOptions
 from lslam.studies.results import RESULTS
 from lslam.studies.runner import StudyProgress

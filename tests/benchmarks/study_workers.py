@@ -22,7 +22,7 @@ from collections import Counter
 from pathlib import Path
 from resource import RUSAGE_CHILDREN, RUSAGE_SELF, getrusage
 
-from lslam.studies.engines import Local
+from lslam.studies.jobs import Local
 from lslam.studies.output import OutputOptions
 from lslam.studies.runner import StudyProgress
 from lslam.studies.states import read_state

@@ -16,9 +16,9 @@ import pytest
 from lslam.config.study import StudyConfig, parse_study
 from lslam.errors import ConfigError, InputError, InterruptedRunError, OutputExistsError, RunFailedError, UsageError
 from lslam.formats.study_files import VERSION, read_study_csv
-from lslam.studies.engines import Local
 from lslam.studies.estimate import estimate, from_finished
 from lslam.studies.expanded_study import ExpandedStudy
+from lslam.studies.jobs import Local
 from lslam.studies.output import OutputOptions
 from lslam.studies.results import is_comparable
 from lslam.studies.runner import StudyProgress
