@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from lslam.errors import InputError, cause
 from lslam.formats.atomic import write_text
-from lslam.formats.stamps_files import parse_stamp
+from lslam.formats.pose_rows import parse_stamp
 from lslam.types.gnss import GnssStream
 from lslam.types.imu import ImuStream
 from lslam.untrusted import decimal_number

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from lslam.errors import InputError, cause
 from lslam.formats.point_files import SUFFIXES
-from lslam.formats.stamps_files import parse_stamp, read_stamps
+from lslam.formats.pose_rows import parse_stamp, read_stamps
 
 
 def list_scans(folder: Path, suffixes: tuple[str, ...] = SUFFIXES) -> tuple[list[Path], list[str]]:

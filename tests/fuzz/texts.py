@@ -20,9 +20,9 @@ from lslam.formats.g2o import read_g2o
 from lslam.formats.geojson import read_corrected, read_line
 from lslam.formats.osm_buildings import read_buildings
 from lslam.formats.oxts_files import read_oxts
+from lslam.formats.pose_rows import read_stamps
 from lslam.formats.sequence_toml import read_sequence_toml
 from lslam.formats.stamped_csv import read_gnss_csv, read_imu_csv
-from lslam.formats.stamps_files import read_stamps
 from lslam.formats.state_files import read_state, write_state
 from lslam.formats.study_files import read_study_csv, write_study_csv
 from lslam.formats.trajectory_files import read_times, read_trajectory
