@@ -12,12 +12,11 @@ from numpy.typing import NDArray
 
 from lslam.errors import InputError
 from lslam.readers import open_sequence
-from lslam.types.calibration import Calibration
 from lslam.types.gnss import GnssStream
 from lslam.types.imu import ImuStream
 from lslam.types.scan import Scan
 from lslam.types.scan_result import ScanResult
-from lslam.types.sequence import Sequence
+from lslam.types.sequence import Calibration, Sequence
 from lslam.types.trajectory import Trajectory
 
 SAMPLE = Path(__file__).resolve().parents[1] / "sample_data"

@@ -12,8 +12,7 @@ from lslam.cli import options
 from lslam.formats.trajectory_formats import WRITTEN
 
 if TYPE_CHECKING:
-    from lslam.types.calibration import Calibration
-    from lslam.types.sequence import Sequence
+    from lslam.types.sequence import Calibration, Sequence
     from lslam.types.trajectory import Trajectory
 
 SEQUENCES = ("bag", "mcap", "sqlite", "kitti")
@@ -129,7 +128,7 @@ def _read_trajectory(source: str, kind: str, given: dict[str, Any]) -> tuple[Tra
     from lslam.errors import InputError
     from lslam.formats.calibration_files import read_cam0_lidar, read_transform
     from lslam.formats.trajectory_files import read_trajectory
-    from lslam.types.calibration import Calibration
+    from lslam.types.sequence import Calibration
 
     if _is_trajectory(source):
         trajectory = read_trajectory(Path(source).expanduser(), times=given["times"])

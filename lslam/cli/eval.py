@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from lslam.config.eval import EvalConfig
     from lslam.evaluation.results import Evaluation
     from lslam.evaluation.timing import Timing
-    from lslam.types.calibration import Calibration
+    from lslam.types.sequence import Calibration
     from lslam.types.trajectory import Trajectory
 
 EPILOG = """\b
@@ -165,7 +165,7 @@ def _evaluate_all(
 def _calibration(truth: Path, calib: Path | None) -> Calibration | None:
     """--calib, or the calibration that lies where KITTI puts it for this ground truth."""
     from lslam.formats import calibration_files
-    from lslam.types.calibration import Calibration
+    from lslam.types.sequence import Calibration
 
     if calib is not None:
         return Calibration(T_cam0_lidar=calibration_files.read_cam0_lidar(calib))

@@ -26,9 +26,8 @@ from lslam.frontend.register_scans import sweep_of
 from lslam.geometry import se3
 from lslam.pipeline.map_pass import motion_within
 from lslam.preprocessing.deskew import deskew_points
-from lslam.types.calibration import Calibration
 from lslam.types.scan import Scan
-from lslam.types.sequence import Sequence
+from lslam.types.sequence import Calibration, Sequence
 from lslam.types.trajectory import Trajectory
 
 log = logging.getLogger("lslam")

@@ -10,7 +10,7 @@ from lslam.errors import InputError, OutputExistsError, UsageError
 from lslam.formats.sequence_toml import FRAMES
 from lslam.formats.trajectory_formats import FORMATS, WRITTEN
 from lslam.geometry import se3
-from lslam.types.calibration import Calibration
+from lslam.types.sequence import Calibration
 from lslam.types.trajectory import Trajectory
 
 log = logging.getLogger("lslam")

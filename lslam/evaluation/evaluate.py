@@ -20,7 +20,7 @@ from lslam.evaluation.relative import RelativePoseError
 from lslam.evaluation.results import Evaluation
 from lslam.evaluation.thesis import DelTufo, Girolimetto
 from lslam.geometry import se3, so3
-from lslam.types.calibration import Calibration
+from lslam.types.sequence import Calibration
 from lslam.types.trajectory import Trajectory
 
 METRICS: tuple[TrajectoryMetric[Any], ...] = (

@@ -22,8 +22,8 @@ from lslam.pipeline.map_pass import BuiltMap
 from lslam.pipeline.run_folder import RunFolder
 from lslam.reports.evaluations import run_document
 from lslam.reports.facts import stage_matrix
-from lslam.types.calibration import Calibration
 from lslam.types.run_record import RunRecord
+from lslam.types.sequence import Calibration
 from lslam.types.trajectory import Trajectory
 from lslam.version import __version__
 

@@ -31,11 +31,10 @@ from lslam.readers.ground_truth import Voice
 from lslam.readers.listing import measured_rate
 from lslam.readers.point_times import TimeRule, apply_rule, decide_rule
 from lslam.readers.sidecars import compensation_note
-from lslam.types.calibration import Calibration
 from lslam.types.gnss import GnssStream
 from lslam.types.imu import ImuStream
 from lslam.types.scan import Scan
-from lslam.types.sequence import no_shared_time
+from lslam.types.sequence import Calibration, no_shared_time
 from lslam.types.trajectory import Trajectory
 
 KIND = "bag"

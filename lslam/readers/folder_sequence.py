@@ -14,10 +14,10 @@ from lslam.formats.point_cloud import PointCloud
 from lslam.formats.point_files import read_bin, read_points
 from lslam.formats.state_files import DAMAGE
 from lslam.readers.point_times import TimeRule, apply_rule, azimuth_times
-from lslam.types.calibration import Calibration
 from lslam.types.gnss import GnssStream
 from lslam.types.imu import ImuStream
 from lslam.types.scan import Scan, Span
+from lslam.types.sequence import Calibration
 from lslam.types.trajectory import Trajectory
 
 

@@ -19,7 +19,7 @@ from lslam.geometry import geodesy, se3, so3
 from lslam.geometry.interpolate import poses_at
 from lslam.readers.listing import file_numbers, rows_of
 from lslam.remote import RemotePath, as_path
-from lslam.types.calibration import Calibration
+from lslam.types.sequence import Calibration
 from lslam.types.trajectory import Trajectory
 from lslam.untrusted import whole_number
 

@@ -23,7 +23,7 @@ from lslam.readers.sidecars import (
     read_info,
     vertical_correction,
 )
-from lslam.types.calibration import Calibration
+from lslam.types.sequence import Calibration
 from lslam.types.trajectory import Trajectory
 
 KIND = "kitti-odometry"

@@ -44,9 +44,9 @@ from lslam.readers.sidecars import (
     read_info,
     vertical_correction,
 )
-from lslam.types.calibration import Calibration
 from lslam.types.gnss import GnssStream
 from lslam.types.imu import ImuStream
+from lslam.types.sequence import Calibration
 from lslam.types.trajectory import Trajectory
 
 KIND = "kitti-raw"

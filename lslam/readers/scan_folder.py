@@ -26,7 +26,7 @@ from lslam.readers.listing import (
 )
 from lslam.readers.point_times import TimeRule, decide_rule
 from lslam.readers.sidecars import calibration_over, compensation_note, load_gnss, load_imu, per_point_folder, read_info
-from lslam.types.calibration import Calibration
+from lslam.types.sequence import Calibration
 from lslam.types.trajectory import Trajectory
 
 KIND = "scan-folder"

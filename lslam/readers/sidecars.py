@@ -13,9 +13,9 @@ from lslam.errors import InputError
 from lslam.formats.point_files import read_points
 from lslam.formats.sequence_toml import FILE_NAME, SequenceInfo, read_sequence_toml
 from lslam.formats.stamped_csv import read_gnss_csv, read_imu_csv
-from lslam.types.calibration import Calibration
 from lslam.types.gnss import GnssStream
 from lslam.types.imu import ImuStream
+from lslam.types.sequence import Calibration
 
 T = TypeVar("T")
 

@@ -24,10 +24,10 @@ from lslam.simulation.scenario_files import Scenario, scenario_named
 from lslam.simulation.sensors import Sensors, read_sensors
 from lslam.simulation.vibration import shaking
 from lslam.simulation.waypoints import WayPoints, read_way_points
-from lslam.types.calibration import Calibration
 from lslam.types.gnss import GnssStream
 from lslam.types.imu import ImuStream
 from lslam.types.scan import Scan
+from lslam.types.sequence import Calibration
 from lslam.types.trajectory import Trajectory
 
 FASTEST = 40.0  # m/s

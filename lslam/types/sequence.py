@@ -2,17 +2,29 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.types.calibration import Calibration
 from lslam.types.gnss import GnssStream
 from lslam.types.imu import ImuStream
 from lslam.types.scan import Scan
 from lslam.types.trajectory import Trajectory
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """Extrinsics as (4, 4) transforms; None where the recording does not say.
+
+    T_cam0_lidar : KITTI's `Tr`; T_lidar_imu and T_lidar_gnss : IMU and antenna in the LiDAR frame
+    """
+
+    T_cam0_lidar: NDArray[np.float64] | None = None
+    T_lidar_imu: NDArray[np.float64] | None = None
+    T_lidar_gnss: NDArray[np.float64] | None = None
 
 
 def no_shared_time(stream: str) -> str:

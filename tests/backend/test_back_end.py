@@ -20,12 +20,12 @@ from lslam.formats.g2o import write_g2o
 from lslam.geometry import geodesy, se3, so3
 from lslam.geometry.umeyama import align
 from lslam.keyframes.store import KeyframeStore
-from lslam.types.calibration import Calibration
 from lslam.types.constraint import Constraint, LoopCandidate
 from lslam.types.gnss import GnssStream
 from lslam.types.gravity import GravityDirection
 from lslam.types.keyframe import Keyframe
 from lslam.types.scan_result import ScanResult
+from lslam.types.sequence import Calibration
 
 # Two laps of 400 m, a scan each metre, a keyframe every other scan.
 Floats = NDArray[np.float64]

@@ -36,7 +36,7 @@ READER = """
 import time
 from pathlib import Path
 import numpy as np
-from lslam.types.calibration import Calibration
+from lslam.types.sequence import Calibration
 from lslam.types.scan import Scan
 from lslam.types.scan_result import ScanResult
 FILE = "sleep.txt"

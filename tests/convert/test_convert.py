@@ -20,8 +20,7 @@ from lslam.geometry import se3
 from lslam.readers import open_sequence
 from lslam.simulation.gnss import GnssModel
 from lslam.simulation.scenarios import SimulatedDrive, simulate
-from lslam.types.calibration import Calibration
-from lslam.types.sequence import Sequence
+from lslam.types.sequence import Calibration, Sequence
 
 NAMES = {"bag": "a.bag", "mcap": "a.mcap", "sqlite": "a"}
 

@@ -23,11 +23,10 @@ from lslam.doctor.inspect import inspect
 from lslam.geometry import so3
 from lslam.inertial.imu_cleaning import ImuFault, ImuRefusedError, clean
 from lslam.readers import open_sequence
-from lslam.types.calibration import Calibration
 from lslam.types.gnss import GnssStream
 from lslam.types.imu import ImuStream
 from lslam.types.scan import Scan
-from lslam.types.sequence import Sequence, no_shared_time
+from lslam.types.sequence import Calibration, Sequence, no_shared_time
 
 SAMPLE = Path(__file__).parents[2] / "sample_data"
 Spoil = Callable[[ImuStream], ImuStream]

@@ -17,7 +17,7 @@ from lslam.evaluation.frames import R_BODY_CAMERA, body_rotation, main_axis
 from lslam.formats.calibration_files import read_odometry_calib
 from lslam.formats.trajectory_files import read_trajectory
 from lslam.geometry import se3, so3
-from lslam.types.calibration import Calibration
+from lslam.types.sequence import Calibration
 from lslam.types.trajectory import Trajectory
 
 T_CAM_LIDAR = se3.make(R_BODY_CAMERA.T @ so3.exp(np.array([0.01, -0.02, 0.015])), np.array([-0.005, -0.07, -0.33]))
