@@ -36,7 +36,7 @@ def command(run: Path, out: Path | None, overwrite: bool, verbose: bool, quiet: 
     if path.exists() and not overwrite:
         raise OutputExistsError(f"{path} exists; name another file with --out or replace it with --overwrite")
     require_run(run)
-    from lslam.pipeline.view import viewed_run
+    from lslam.pipeline.rebuild import viewed_run
 
     viewed = viewed_run(run)
     if not path.parent.is_dir():

@@ -17,7 +17,7 @@ import numpy as np
 from lslam.config import Config, load_config
 from lslam.errors import InputError, InterruptedRunError, OutputError, OutputExistsError, UsageError, cause
 from lslam.formats.atomic import write_text
-from lslam.formats.point_files import MAP_SUFFIXES
+from lslam.formats.point_files import MAP_SUFFIXES, read_cloud
 from lslam.formats.trajectory_files import read_trajectory
 from lslam.maps.crispness import crispness
 from lslam.maps.georeference import Projection
@@ -45,6 +45,8 @@ from lslam.readers.selection import select
 from lslam.remote import as_path
 from lslam.reports.evaluations import run_document
 from lslam.reports.html import with_new_map
+from lslam.reports.recording import ViewedRun
+from lslam.types.cloud import ArrayCloud
 from lslam.types.gnss import Georeference
 from lslam.types.run_record import Crispness, RunRecord
 from lslam.types.scan_result import ScanResult, Status
@@ -310,3 +312,31 @@ def write_renewed(target: Path, folder: Path, record: RunRecord) -> None:
     except ValueError:
         log.warning(_KEPT, folder / REPORT, "was not written by this version of lslam: run the sequence again")
     write_json(target / MANIFEST, record.manifest)
+
+
+def viewed_run(folder: Path) -> ViewedRun:
+    """Trajectory, odometry where there was a back end, and the map, all in the run's world.
+
+    Raises InputError naming what is missing or broken; a run without a map is shown without one.
+    """
+    run = read_run(folder)
+    odometry = None
+    if (folder / "trajectory_odometry.tum").is_file():
+        odometry = read_trajectory(folder / "trajectory_odometry.tum", "tum")
+    name = str(run.manifest.get("sequence", {}).get("name", folder.name))
+    return ViewedRun(f"{name} ({folder.name})", run.trajectory, _cloud(folder), odometry)
+
+
+def _cloud(folder: Path) -> ArrayCloud | None:
+    """The run's map; LAS of a georeferenced run comes back from its coordinates."""
+    try:
+        path = map_of(folder)
+    except InputError as error:
+        log.warning("%s", error)
+        return None
+    cloud = read_cloud(path)
+    about = note_of(path)
+    georeference = georeference_of(about.get("georeference"))
+    if about.get("crs") is None or georeference is None:
+        return cloud
+    return ArrayCloud(Projection(georeference).invert(cloud.points), cloud.intensity)

@@ -6,8 +6,7 @@ import logging
 from dataclasses import replace
 from pathlib import Path
 
-from lslam.backend.loop_view import view_loop
-from lslam.backend.outcome import BackEnd
+from lslam.backend.outcome import BackEnd, view_loop
 from lslam.config import Config
 from lslam.errors import LslamError
 from lslam.evaluation.evaluate import Evaluation, evaluate

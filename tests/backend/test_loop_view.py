@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from lslam.backend.loop_view import AROUND, view_loop
-from lslam.backend.outcome import BackEnd
+from lslam.backend.outcome import AROUND, BackEnd, view_loop
 from lslam.geometry import se3
 from lslam.keyframes.store import KeyframeStore
 from lslam.reports.back_end import loop_figures

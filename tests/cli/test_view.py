@@ -17,7 +17,7 @@ from lslam.formats.point_files import read_cloud
 from lslam.formats.trajectory_files import write_tum
 from lslam.geometry import se3, so3
 from lslam.pipeline.map_files import MapNote, georeference_note, write_map
-from lslam.pipeline.view import viewed_run
+from lslam.pipeline.rebuild import viewed_run
 from lslam.reports.recording import MOST_POINTS, by_height
 from lslam.types.cloud import ArrayCloud
 from lslam.types.gnss import Georeference

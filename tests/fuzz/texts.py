@@ -28,9 +28,8 @@ from lslam.formats.study_files import read_study_csv, write_study_csv
 from lslam.formats.trajectory_files import read_times, read_trajectory
 from lslam.osm.bounds import Bounds
 from lslam.osm.overpass import kept_reply
-from lslam.pipeline.rebuild import map_of, read_run
+from lslam.pipeline.rebuild import map_of, read_run, viewed_run
 from lslam.pipeline.resume import may_go_on
-from lslam.pipeline.view import viewed_run
 from lslam.simulation.osm_perturb import read_perturbation
 from lslam.simulation.record import read_mark
 from lslam.simulation.scenario_files import scenario_named
