@@ -125,8 +125,8 @@ def command(
     if out is not None:
         check_target(out, overwrite, resume)
     at = None if origin is None else _numbers(origin)
-    from lslam.simulation.gnss import GnssModel
     from lslam.simulation.scenarios import simulate
+    from lslam.simulation.sensors import GnssModel
 
     if plan is not None and out is None and osm is not None and path_file is None:
         _draw_map(scenario, seed, settings, osm, at, plan)

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 from lslam.errors import UsageError
 from lslam.simulation.curve import RouteCurve, rounded_rectangle, smooth_curve, winding_line
 from lslam.simulation.path import SpeedProfile, drive, suspension
-from lslam.simulation.scenario_files import Scenario
-from lslam.simulation.shapes import SHAPES, out_and_back
+from lslam.simulation.scenario_files import SHAPES, Scenario, out_and_back
 from lslam.simulation.terrain import flat
 from lslam.simulation.waypoints import WayPoints
 

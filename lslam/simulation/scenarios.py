@@ -13,16 +13,14 @@ from lslam.errors import UsageError
 from lslam.geometry import se3, so3
 from lslam.simulation.built_scenario import build_scenario, check_path, populate
 from lslam.simulation.city import City
-from lslam.simulation.gnss import ORIGIN, GnssModel
 from lslam.simulation.imu import ImuModel, imu_named
-from lslam.simulation.kinematics import PosePath, smooth_motion, standing_start
+from lslam.simulation.kinematics import PosePath, shaking, smooth_motion, standing_start
 from lslam.simulation.lidar import RayScene, Roof, trace
 from lslam.simulation.lidar_models import LidarModel, lidar_named
 from lslam.simulation.moving import Mover, moving_meshes
 from lslam.simulation.osm_place import read_extract
 from lslam.simulation.scenario_files import Scenario, scenario_named
-from lslam.simulation.sensors import Sensors, read_sensors
-from lslam.simulation.vibration import shaking
+from lslam.simulation.sensors import ORIGIN, GnssModel, Sensors, read_sensors
 from lslam.simulation.waypoints import WayPoints, read_way_points
 from lslam.types.gnss import GnssStream
 from lslam.types.imu import ImuStream

@@ -88,9 +88,9 @@ def simulate_once(
 
 def drive_of(scene: Scene, seed: int) -> SimulatedDrive:
     """The drive with its scans still to be traced; raises what `simulate` raises."""
-    from lslam.simulation.gnss import GnssModel
     from lslam.simulation.lidar_models import lidar_named
     from lslam.simulation.scenarios import simulate
+    from lslam.simulation.sensors import GnssModel
 
     scenario = scenario_named(scene.scenario, scene.settings)
     lidar = lidar_named(scene.lidar or scenario.lidar)

@@ -15,8 +15,8 @@ from lslam.frontend.checkpoints import Checkpoints
 from lslam.geometry import geodesy, se3
 from lslam.geometry.umeyama import align
 from lslam.pipeline import back_end_pass
-from lslam.simulation.gnss import GnssModel
-from lslam.simulation.gnss import _errors as gnss_errors
+from lslam.simulation.sensors import GnssModel
+from lslam.simulation.sensors import _errors as gnss_errors
 from lslam.types.stage_clock import KeyframeClocks
 
 

@@ -21,7 +21,7 @@ from traced import Traced, run_on, traced
 
 from lslam.geometry import geodesy, se3
 from lslam.geometry.umeyama import align
-from lslam.simulation.gnss import ORIGIN, GnssModel
+from lslam.simulation.sensors import ORIGIN, GnssModel
 
 Floats = NDArray[np.float64]
 

@@ -23,10 +23,10 @@ from lslam.config.config import Config
 from lslam.errors import LslamError
 from lslam.geometry import geodesy, se3, so3
 from lslam.pipeline.run import RunOutcome, run
-from lslam.simulation.gnss import ORIGIN, GnssModel
 from lslam.simulation.osm_extract import write_extracts
 from lslam.simulation.osm_perturb import MapFaults
 from lslam.simulation.scenarios import SimulatedDrive, simulate
+from lslam.simulation.sensors import ORIGIN, GnssModel
 
 Floats = NDArray[np.float64]
 

@@ -18,8 +18,8 @@ from lslam.formats.bag_files import BagWriter
 from lslam.formats.sequence_toml import FILE_NAME, read_sequence_toml
 from lslam.geometry import se3
 from lslam.readers import open_sequence
-from lslam.simulation.gnss import GnssModel
 from lslam.simulation.scenarios import SimulatedDrive, simulate
+from lslam.simulation.sensors import GnssModel
 from lslam.types.sequence import Calibration, Sequence
 
 NAMES = {"bag": "a.bag", "mcap": "a.mcap", "sqlite": "a"}

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from lslam.errors import UsageError
 from lslam.geometry import geodesy, se3, so3
-from lslam.simulation.gnss import ORIGIN, T_CAR_ANTENNA, GnssModel, SimulatedGnss, simulate_gnss
 from lslam.simulation.kinematics import Motion, smooth_motion
 from lslam.simulation.scenarios import SimulatedDrive, simulate
+from lslam.simulation.sensors import ORIGIN, T_CAR_ANTENNA, GnssModel, SimulatedGnss, simulate_gnss
 
 Floats = NDArray[np.float64]
 

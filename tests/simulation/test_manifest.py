@@ -11,10 +11,10 @@ import pytest
 
 from lslam.errors import OutputError
 from lslam.simulation import record as recording
-from lslam.simulation.gnss import GnssModel
 from lslam.simulation.record import MANIFEST, record
 from lslam.simulation.scenario_files import Scenario
 from lslam.simulation.scenarios import SimulatedDrive, simulate
+from lslam.simulation.sensors import GnssModel
 from lslam.version import __version__
 
 

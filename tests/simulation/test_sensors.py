@@ -14,10 +14,10 @@ from lslam.formats.stamped_csv import read_stamped_csv
 from lslam.formats.trajectory_files import read_trajectory
 from lslam.geometry import geodesy, se3, so3
 from lslam.readers import open_sequence
-from lslam.simulation.gnss import GnssModel
 from lslam.simulation.imu import GRAVITY
 from lslam.simulation.record import record
 from lslam.simulation.scenarios import SimulatedDrive, simulate
+from lslam.simulation.sensors import GnssModel
 
 
 @pytest.fixture(scope="module")
