@@ -86,16 +86,15 @@ def command(
         raise UsageError("--timing belongs to one estimate; with several, put timing.csv beside each")
     options.require_there(*estimates, truth, given["calib"], given["times"], given["timing_file"])
     config = _config(given, flags)
-    from lslam.reports import evaluations as evaluation_json
-    from lslam.reports import evaluations as evaluation_table
     from lslam.reports import picture
+    from lslam.reports.evaluations import render, to_json
 
     evaluations = _evaluate_all(estimates, truth, config, given)
     timings = [_timing(path, given["timing_file"]) for path in estimates]
     if as_json:
-        click.echo(evaluation_json.to_json(evaluations, timings))
+        click.echo(to_json(evaluations, timings))
     else:
-        click.echo(evaluation_table.render(evaluations, timings, table))
+        click.echo(render(evaluations, timings, table))
     if plot is not None:
         picture.write_plot(plot, evaluations)
     _hold_gates(evaluations, given)

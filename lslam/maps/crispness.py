@@ -1,4 +1,4 @@
-"""Scores of a map: crispness without ground truth (mean map entropy and mean plane variance), and distances to a reference cloud."""
+"""Scores of a map: its crispness (mean map entropy, mean plane variance), and its distances to a reference cloud."""
 
 from __future__ import annotations
 

@@ -1,4 +1,8 @@
-"""Evaluations as documents and tables: `evaluation.json`, every value beside its recipe, under a schema with a version; one column per estimate for the terminal, Markdown, CSV and LaTeX."""
+"""Evaluations as `evaluation.json` and as tables.
+
+The document has every value beside its recipe, under a schema with a version. Tables have one column per estimate, for the
+terminal, Markdown, CSV and LaTeX.
+"""
 
 from __future__ import annotations
 

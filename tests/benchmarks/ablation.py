@@ -34,7 +34,7 @@ from lslam.errors import UsageError
 from lslam.frontend import tracker
 from lslam.frontend.tracker import Loaded, Tracker
 from lslam.odometry import create_odometry
-from lslam.recovery import start_search as non_ground
+from lslam.recovery import start_search
 from lslam.registration import local_map, residuals, solver
 from lslam.simulation.scenarios import simulate
 from lslam.types.scan import Scan
@@ -65,7 +65,7 @@ WITHOUT: dict[str, dict[str, Variant]] = {
         "coarse-to-fine": (("recovery.coarse_to_fine=false",), ()),
         "start search": (("recovery.start_search=false",), ()),
         "at rest": ((), ((start_search, "is_at_rest", lambda pose, last: False),)),
-        "HIGH": ((), ((non_ground, "HIGH", 0.3),)),
+        "HIGH": ((), ((start_search, "HIGH", 0.3),)),
         "CLEARLY": ((), ((start_search, "CLEARLY", 1.0),)),
         "MUCH": ((), ((start_search, "MUCH", 1.0),)),
         "agreement": (("registration.min_agreement=0",), ()),

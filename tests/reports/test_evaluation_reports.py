@@ -17,8 +17,7 @@ from lslam.evaluation.evaluate import evaluate
 from lslam.evaluation.results import Evaluation
 from lslam.evaluation.timing import StageTime, Timing
 from lslam.geometry import se3
-from lslam.reports import evaluations as evaluation_table
-from lslam.reports import picture
+from lslam.reports import evaluations, picture
 from lslam.types.trajectory import Trajectory
 
 STAGE = StageTime(0.01, 0.02, 0.03, 0.011, 1.0)
@@ -94,8 +93,8 @@ def test_several_are_a_list(result: Evaluation, unavailable: Evaluation) -> None
 
 
 def test_text_table_names_every_recipe(result: Evaluation) -> None:
-    text = evaluation_table.render([replace(result, shown=("thesis",))], [TIMING])
-    assert "thesis" not in evaluation_table.render([result], [TIMING])
+    text = evaluations.render([replace(result, shown=("thesis",))], [TIMING])
+    assert "thesis" not in evaluations.render([result], [TIMING])
     ate = result.ate["se3"].translation
     assert ate is not None
     assert f"{ate.rmse:.4g}" in text
@@ -108,27 +107,27 @@ def test_text_table_names_every_recipe(result: Evaluation) -> None:
 
 def test_table_of_several_tells_them_apart(result: Evaluation, unavailable: Evaluation) -> None:
     pair = [result, replace(unavailable, scores=unavailable.scores | {"rpe": result.rpe})]
-    text = evaluation_table.render(pair)
+    text = evaluations.render(pair)
     assert text.splitlines()[1].startswith("estimate      a: runs/a/trajectory.tum")
-    assert evaluation_table.short_names(["x/a.tum", "y/a.tum", "runs/b/trajectory.tum"]) == [
+    assert evaluations.short_names(["x/a.tum", "y/a.tum", "runs/b/trajectory.tum"]) == [
         "x/a.tum",
         "y/a.tum",
         "runs/b",
     ]
-    assert evaluation_table.short_names(["a.tum", "a.tum"]) == ["1: a.tum", "2: a.tum"]
+    assert evaluations.short_names(["a.tum", "a.tum"]) == ["1: a.tum", "2: a.tum"]
     assert "n/a (collinear)" in text
     for style in ("md", "csv", "tex"):
-        lines = evaluation_table.render(pair, style=style).splitlines()
+        lines = evaluations.render(pair, style=style).splitlines()
         assert len(lines) > 15
-    rows = list(csv.reader(evaluation_table.render(pair, style="csv").splitlines()))
+    rows = list(csv.reader(evaluations.render(pair, style="csv").splitlines()))
     assert {len(row) for row in rows} == {4}
     assert len({row[0] for row in rows}) == len(rows), "a label that stands alone names one row"
-    markdown = evaluation_table.render(pair, style="md").splitlines()
+    markdown = evaluations.render(pair, style="md").splitlines()
     assert {line.count("|") for line in markdown if line.startswith("|")} == {5}
     assert any(line.startswith("- ATE alignment se3: ") for line in markdown), "numbers stand with their recipe"
-    assert "\\%" in evaluation_table.render(pair, style="tex")
+    assert "\\%" in evaluations.render(pair, style="tex")
     with pytest.raises(ValueError, match="one of text"):
-        evaluation_table.render(pair, style="html")
+        evaluations.render(pair, style="html")
 
 
 @pytest.mark.parametrize(("suffix", "magic"), [("png", b"\x89PNG"), ("svg", b"<?xml"), ("pdf", b"%PDF")])
