@@ -14,11 +14,11 @@ from lslam.config import Config
 from lslam.config.odometry import TIGHTLY_COUPLED
 from lslam.errors import InputError
 from lslam.formats.state_files import read_state, write_state
+from lslam.frontend.motion_models import motion_of
 from lslam.frontend.register_scans import read_ahead
 from lslam.frontend.state_classes import STATE_CLASSES
 from lslam.frontend.tracker import Tracker
 from lslam.inertial import fusion
-from lslam.inertial.filter import FilterMotion
 from lslam.inertial.fusion import InertialMotion
 from lslam.inertial.imu_cleaning import ImuRefusedError
 from lslam.inertial.initialise import FirstPoses, InertialStart, start
@@ -48,12 +48,6 @@ def warm_up() -> None:
     """Compile what the motion model and the scans before the run need."""
     create_odometry(Config()).warm_up()
     fusion.warm_up()
-
-
-def motion_of(begun: InertialStart, config: Config) -> InertialMotion:
-    """The motion model that the method asks for."""
-    kind = FilterMotion if config.odometry.method in TIGHTLY_COUPLED else InertialMotion
-    return kind(begun.imu, begun.T_lidar_imu, begun.estimate, config.imu)
 
 
 def begin_inertial(sequence: Sequence, config: Config) -> Inertial:

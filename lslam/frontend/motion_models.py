@@ -1,0 +1,31 @@
+"""Which motion model a tightly coupled method predicts with; the loosely coupled IMU serves all others.
+
+A new one is one function and one line here, and its method's name in `TIGHTLY_COUPLED` of `lslam.config.odometry`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from lslam.config import Config
+from lslam.inertial.filter import FilterMotion
+from lslam.inertial.fusion import InertialMotion
+from lslam.inertial.initialise import InertialStart
+
+
+def _loose(begun: InertialStart, config: Config) -> InertialMotion:
+    return InertialMotion(begun.imu, begun.T_lidar_imu, begun.estimate, config.imu)
+
+
+def _filter(begun: InertialStart, config: Config) -> InertialMotion:
+    return FilterMotion(begun.imu, begun.T_lidar_imu, begun.estimate, config.imu)
+
+
+MOTION_MODELS: dict[str, Callable[[InertialStart, Config], InertialMotion]] = {
+    "fast-lio2": _filter,
+}
+
+
+def motion_of(begun: InertialStart, config: Config) -> InertialMotion:
+    """The motion model that the method asks for."""
+    return MOTION_MODELS.get(config.odometry.method, _loose)(begun, config)
