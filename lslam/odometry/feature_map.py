@@ -10,6 +10,7 @@ from lslam.preprocessing.features import Features
 from lslam.preprocessing.prepare import NO_TIMES
 from lslam.registration.gaussian_map import GaussianMap
 from lslam.registration.local_map import LocalMap
+from lslam.registration.target import KeyframeTarget
 from lslam.types.state import State, Stateful
 
 # As LOAM fits its lines: five points at least.
@@ -58,10 +59,24 @@ class FeatureMap(Stateful):
         flat = features.less_planes.points.astype(np.float32)
         self.planes.insert(flat, thinned(features)[0], T_world_lidar)
 
+    def clear(self) -> None:
+        """Forget all points."""
+        self.planes.clear()
+        self.edges.clear()
+        self._lines = _lines_for(self.edges)
+
     def restore(self, state: State) -> None:
         """Go on with the voxels of `state`."""
         super().restore(state)
         self._lines = _lines_for(self.edges)
+
+
+class FeatureKeyframes(KeyframeTarget):
+    """Keeps the features of the newest keyframes in a feature map, and no others'."""
+
+    def insert(self, target: FeatureMap, cloud: Features, T_world_lidar: NDArray[np.float64]) -> None:
+        """Add the features of one scan."""
+        target.insert(cloud, T_world_lidar)
 
 
 def thinned(features: Features) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -12,7 +12,7 @@ from lslam.config.recovery import RecoveryConfig
 from lslam.config.registration import RegistrationConfig
 from lslam.geometry import se3
 from lslam.odometry.all_points import AllPoints
-from lslam.odometry.feature_map import FeatureMap, thinned
+from lslam.odometry.feature_map import FeatureKeyframes, FeatureMap, thinned
 from lslam.odometry.feature_scan import FeatureScan, feature_scan, surface_size
 from lslam.odometry.feature_solver import NONE, FeatureNoise, remap_solution, solve_on_map
 from lslam.odometry.feature_steps import ScanStep
@@ -45,16 +45,18 @@ class FeatureRegistration(Stateful):
     with_map : whether the pose is found, or refined, on the feature map
     with_less_planes : whether the map is matched with centroids of the less planar points in place of the planar points
     reach : m, how far from the sensor the map is kept
+    keyframes : decides which scans are in the feature map; None enters all, until the sensor has left them behind
     recovery : what is tried where features are not enough; `start_search` is by edges, or by all points with that fallback
     """
 
     STATE = (
-        "map", "target", "threshold", "agreement", "_starting", "_inserted", "_failures", "_all",
+        "map", "target", "threshold", "agreement", "_starting", "_inserted", "_failures", "_all", "_keyframes",
     )  # fmt: skip
 
     def __init__(
         self, config: RegistrationConfig, loam: LoamConfig, *, scan_step: ScanStep | None, with_map: bool,
         with_less_planes: bool = False, reach: float = 120.0, recovery: RecoveryConfig | None = None,
+        keyframes: FeatureKeyframes | None = None,
     ) -> None:  # fmt: skip
         self.config, self.loam, self.recovery = config, loam, recovery or RecoveryConfig()
         self._step, self._with_less_planes, self._reach = scan_step, with_less_planes, reach
@@ -67,6 +69,7 @@ class FeatureRegistration(Stateful):
         self._inserted = 0
         self._failures = 0
         size = surface_size(config.voxel_size, loam.grid_step)
+        self._keyframes = keyframes
         self._all = AllPoints(config, size) if self.recovery.fallback == "all-points" else None
 
     @property
@@ -148,7 +151,9 @@ class FeatureRegistration(Stateful):
         """Insert the scan into map and target unless its registration failed; adapt thresholds unless it was denied."""
         if result.ok:
             self._inserted += 1
-            if self.map is not None:
+            if self.map is not None and self._keyframes is not None:
+                self._keyframes.enter(self.map, features, result.T_world_lidar)
+            elif self.map is not None:
                 self.map.insert(features, result.T_world_lidar)
             if self._all is not None:
                 self._all.update(features, result)

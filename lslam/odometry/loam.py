@@ -7,7 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lslam.config.config import Config
+from lslam.config.recovery import RecoveryConfig
 from lslam.odometry.base import Registered
+from lslam.odometry.feature_map import FeatureKeyframes
 from lslam.odometry.feature_registration import FeatureRegistration
 from lslam.odometry.feature_steps import ScanStep, joint_step
 from lslam.odometry.scan_outcome import of_registration
@@ -66,9 +68,18 @@ class Loam(Stateful):
         c, v = self.config, self.variant
         self.registration = FeatureRegistration(
             c.registration, c.loam, scan_step=v.scan_step, with_map=v.with_map, with_less_planes=v.with_less_planes,
-            reach=1.2 * c.preprocess.range_max, recovery=c.recovery,
+            reach=1.2 * c.preprocess.range_max, recovery=self.recovery, keyframes=self._fresh_keyframes(),
         )  # fmt: skip
         self._uncertainty = PoseUncertainty(is_scan_to_scan=not v.with_map)
+
+    @property
+    def recovery(self) -> RecoveryConfig:
+        """What is tried where features are not enough."""
+        return self.config.recovery
+
+    def _fresh_keyframes(self) -> FeatureKeyframes | None:
+        """What chooses the scans of the feature map; None enters all."""
+        return None
 
     def prepare(self, scan: Scan) -> Features:
         """Edges and planar points. Raises InputError for a scan without usable rings."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,22 +49,26 @@ class KeyframeTarget(Stateful):
 
     def __init__(self, count: int, move: float, turn: float) -> None:
         self.count, self.move, self.turn = count, move, turn
-        self.keyframes: list[tuple[PreparedPoints, Floats]] = []
+        self.keyframes: list[tuple[Any, Floats]] = []
 
-    def enter(self, target: LocalMap, points: PreparedPoints, T_world_lidar: Floats) -> None:
+    def enter(self, target: Any, cloud: Any, T_world_lidar: Floats) -> None:
         """Add a keyframe when it is due; the map is built anew when an old one leaves."""
         if self.keyframes:
             step = se3.relative(self.keyframes[-1][1], T_world_lidar)
             if np.linalg.norm(step[:3, 3]) < self.move and float(so3.angle(step[:3, :3])) < self.turn:
                 return
-        self.keyframes.append((points, T_world_lidar.copy()))
+        self.keyframes.append((cloud, T_world_lidar.copy()))
         if len(self.keyframes) <= self.count:
-            target.insert(points.map_points, points.source, T_world_lidar)
+            self.insert(target, cloud, T_world_lidar)
             return
         del self.keyframes[0]
         target.clear()
-        for cloud, pose in self.keyframes:
-            target.insert(cloud.map_points, cloud.source, pose)
+        for kept, pose in self.keyframes:
+            self.insert(target, kept, pose)
+
+    def insert(self, target: Any, cloud: Any, T_world_lidar: Floats) -> None:
+        """Add what a map of this kind takes of a scan."""
+        target.insert(cloud.map_points, cloud.source, T_world_lidar)
 
 
 def make_target(config: RegistrationConfig) -> Target:
