@@ -13,10 +13,11 @@ from lslam.preprocessing.prepare import PreparedPoints
 from lslam.types.constraint import Constraint, LoopCandidate
 from lslam.types.gravity import GravityDirection
 from lslam.types.imu import ImuStream
+from lslam.types.inertial_state import InertialState, InertialStep
 from lslam.types.motion_check import MotionCheck
 from lslam.types.scan_result import ScanResult
 
 STATE_CLASSES = (
-    Constraint, FeaturePoints, Features, FeatureScan, GravityDirection, Gyroscope, ImuEstimate, ImuStream, LoopCandidate,
-    MotionCheck, NavigationState, PreparedPoints, ScanResult, Seen, InertialStart,
+    Constraint, FeaturePoints, Features, FeatureScan, GravityDirection, Gyroscope, ImuEstimate, ImuStream, InertialState,
+    InertialStep, LoopCandidate, MotionCheck, NavigationState, PreparedPoints, ScanResult, Seen, InertialStart,
 )  # fmt: skip

@@ -18,13 +18,13 @@ Floats = NDArray[np.float64]
 
 def to_body(covariance: NDArray[Any], T: NDArray[Any]) -> Floats:
     """(..., 6, 6) covariances of poses `T` (..., 4, 4) as gtsam wants them: rotation first, body axes."""
-    J = _into_body(T)
+    J = into_body(T)
     return np.asarray(J @ np.asarray(covariance, np.float64) @ np.swapaxes(J, -1, -2))
 
 
 def from_body(covariance: NDArray[Any], T: NDArray[Any]) -> Floats:
     """The inverse of `to_body`."""
-    J = np.swapaxes(_into_body(T), -1, -2)  # orthogonal: the transpose is the inverse
+    J = np.swapaxes(into_body(T), -1, -2)  # orthogonal: the transpose is the inverse
     return np.asarray(J @ np.asarray(covariance, np.float64) @ np.swapaxes(J, -1, -2))
 
 
@@ -44,7 +44,8 @@ def rotated(covariance: NDArray[Any], R: NDArray[Any]) -> Floats:
     return np.asarray(B @ np.asarray(covariance, np.float64) @ np.swapaxes(B, -1, -2))
 
 
-def _into_body(T: NDArray[Any]) -> Floats:
+def into_body(T: NDArray[Any]) -> Floats:
+    """(..., 6, 6) J of poses `T` (..., 4, 4), orthogonal: xi = J d."""
     Rt = np.swapaxes(np.asarray(T, np.float64)[..., :3, :3], -1, -2)
     J = np.zeros((*Rt.shape[:-2], 6, 6))
     J[..., :3, 3:] = J[..., 3:, :3] = Rt
