@@ -13,6 +13,7 @@ from lslam.config.graph import GraphConfig
 from lslam.config.imu import ImuConfig
 from lslam.config.input import InputConfig
 from lslam.config.keyframes import KeyframesConfig
+from lslam.config.lio_sam import LioSamConfig
 from lslam.config.loam import LoamConfig
 from lslam.config.loops import LoopsConfig
 from lslam.config.map import MapConfig
@@ -34,6 +35,7 @@ class Config(Section):
     registration: RegistrationConfig = RegistrationConfig()
     recovery: RecoveryConfig = RecoveryConfig()
     loam: LoamConfig = LoamConfig()
+    lio_sam: LioSamConfig = LioSamConfig()
     imu: ImuConfig = ImuConfig()
     keyframes: KeyframesConfig = KeyframesConfig()
     loops: LoopsConfig = LoopsConfig()

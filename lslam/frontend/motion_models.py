@@ -8,9 +8,15 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from lslam.config import Config
+from lslam.graph.inertial_smoother import ImuNoise, InertialSmoother
 from lslam.inertial.filter import FilterMotion
 from lslam.inertial.fusion import InertialMotion
+from lslam.inertial.gyroscope import BIAS_WALK
+from lslam.inertial.imu_estimate import ACCEL_WALK, FORCE_NOISE, GRAVITY_WALK
 from lslam.inertial.initialise import InertialStart
+from lslam.inertial.smoothing import SmootherMotion
+
+IMU_NOISE = ImuNoise(FORCE_NOISE, ACCEL_WALK, float(BIAS_WALK), GRAVITY_WALK)
 
 
 def _loose(begun: InertialStart, config: Config) -> InertialMotion:
@@ -21,8 +27,14 @@ def _filter(begun: InertialStart, config: Config) -> InertialMotion:
     return FilterMotion(begun.imu, begun.T_lidar_imu, begun.estimate, config.imu)
 
 
+def _smoother(begun: InertialStart, config: Config) -> InertialMotion:
+    smoother = InertialSmoother(IMU_NOISE, config.lio_sam.reset_scans)
+    return SmootherMotion(begun.imu, begun.T_lidar_imu, begun.estimate, config.imu, smoother)
+
+
 MOTION_MODELS: dict[str, Callable[[InertialStart, Config], InertialMotion]] = {
     "fast-lio2": _filter,
+    "lio-sam": _smoother,
 }
 
 

@@ -26,6 +26,10 @@ METHODS = {
         "lslam.odometry.fast_lio2",
         "tightly coupled with the IMU: points and prior in one iterated Kalman filter (Xu 2022); needs an IMU",
     ),
+    "lio-sam": (
+        "lslam.odometry.lio_sam",
+        "tightly coupled with the IMU: features and preintegration in one factor graph (Shan 2020); needs an IMU",
+    ),
     "dlo": ("lslam.odometry.dlo", "plane to plane, scan to scan, then to a submap of keyframes (Chen 2022)"),
     "loam-odom": ("lslam.odometry.loam", "edges and planar points, scan to scan: LOAM without its map"),
     "loam": ("lslam.odometry.loam", "LOAM: scan to scan, then refined on the feature map at every scan"),

@@ -1,0 +1,122 @@
+"""LIO-SAM: ahead of its features without the smoother, as good as the loose IMU on all points, and nothing without an IMU."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from stub_sequences import Stub, sample
+
+import lslam
+from lslam.config import Config, load_config
+from lslam.errors import InputError
+from lslam.formats.state_files import read_state, write_state
+from lslam.frontend.inertial_start import begin_inertial
+from lslam.frontend.register_scans import read_ahead
+from lslam.frontend.state_classes import STATE_CLASSES
+from lslam.frontend.tracker import Tracker
+from lslam.odometry import create_odometry
+from lslam.odometry.lio_sam import LioSam, LioSamOfPoints
+from lslam.simulation.scenarios import simulate
+from lslam.types.imu import ImuStream
+from lslam.types.scan_result import ScanResult
+
+QUIET = ("map.write=false", "report.html=false", "loops.use=false", "odometry.integrity=false", "imu.start_s=1")
+COUNT = 30
+
+
+def config_of(*settings: str) -> Config:
+    return load_config(None, [*QUIET, *settings], {})
+
+
+TIGHT = "odometry.method=lio-sam"
+POINTS = "lio_sam.features=points"
+
+
+@cache
+def walk() -> Stub:
+    drive = simulate("walk", lidar="vlp16", seed=100, count=COUNT, imu="icm20948", motion_compensated=False)
+    return Stub(
+        [drive.scan(i) for i in range(COUNT)], drive.ground_truth, drive.calibration, motion_compensated=False,
+        imu=drive.imu,
+    )  # fmt: skip
+
+
+def ate(sequence: Stub, *settings: str) -> tuple[float, list[ScanResult]]:
+    outcome = lslam.run(sequence, config_of(*settings))
+    assert outcome.evaluation is not None
+    error = outcome.evaluation.scores["ate"]["se3"].translation
+    assert error is not None
+    return error.rmse, outcome.record.results
+
+
+def test_a_walk_is_followed_closer_than_by_the_same_features_without_the_smoother() -> None:
+    tight, results = ate(walk(), TIGHT)
+    loose, _ = ate(walk(), "odometry.method=floam", "imu.use=true")
+    alone, _ = ate(walk(), "odometry.method=floam")
+    assert all(result.status == "ok" for result in results)
+    assert tight < 1.2 * loose
+    assert tight < 0.5 * alone
+    assert all(result.covariance is not None and not result.posed_by for result in results)
+
+
+def test_all_points_may_take_the_place_of_features() -> None:
+    assert isinstance(create_odometry(config_of(TIGHT)), LioSam)
+    assert isinstance(create_odometry(config_of(TIGHT, POINTS)), LioSamOfPoints)
+    tight, results = ate(walk(), TIGHT, POINTS)
+    loose, _ = ate(walk(), "imu.use=true")
+    assert all(result.status == "ok" for result in results)
+    assert tight < 1.2 * loose
+
+
+def test_a_gap_of_the_imu_is_crossed_by_constant_velocity_and_said() -> None:
+    assert isinstance(walk().imu, ImuStream)
+    stamps = walk().imu.stamps_ns
+    kept = (stamps < 1_800_000_000) | (stamps > 2_300_000_000)
+    imu = ImuStream(stamps[kept], walk().imu.accel[kept], walk().imu.gyro[kept])
+    outcome = lslam.run(replace(walk(), imu=imu), config_of(TIGHT, POINTS))
+    assert outcome.record.manifest["imu"]["scans_in_gaps"] > 3
+    assert any("gaps of the IMU" in problem for problem in outcome.record.manifest["problems"])
+    assert sum(result.status == "ok" for result in outcome.record.results) == COUNT
+
+
+def test_it_asks_for_the_imu_by_itself_and_does_nothing_without_one() -> None:
+    assert config_of(TIGHT).imu.use
+    with pytest.raises(InputError, match="has no IMU: run without --imu, by a method that needs none"):
+        lslam.run(sample(5), config_of(TIGHT))
+
+
+def test_a_refused_imu_ends_the_run() -> None:
+    assert isinstance(walk().imu, ImuStream)
+    no_gravity = replace(walk().imu, accel=np.zeros_like(walk().imu.accel))
+    with pytest.raises(InputError, match="lio-sam needs an IMU, and this one is refused"):
+        lslam.run(replace(walk(), imu=no_gravity), config_of(TIGHT))
+
+
+def test_a_run_goes_on_where_it_was_and_carries_a_scan_that_failed(tmp_path: Path) -> None:
+    """Over a reset of the graph, and a scan of which too little is left to register."""
+    config = config_of(TIGHT, POINTS, "lio_sam.reset_scans=5")
+    scans = [walk().scan(i) for i in range(16)]
+    scans[10] = scans[10].select(np.arange(3))
+    sequence = replace(walk(), scans=scans)
+
+    def fresh() -> Tracker:
+        return Tracker(create_odometry(config), motion=begin_inertial(sequence, config).motion)
+
+    whole, expected = fresh(), []
+    loaded = list(read_ahead(sequence, whole.odometry.prepare, 1))
+    for scan in loaded:
+        expected.append(whole.track(scan))
+        if len(expected) in (8, 12):
+            write_state(tmp_path / f"{len(expected)}.npz", whole.state())
+    assert [result.status for result in expected].count("bridged") == 1
+    for k in (8, 12):
+        again = fresh()
+        again.restore(read_state(tmp_path / f"{k}.npz", STATE_CLASSES))
+        for scan, one in zip(loaded[k:], expected[k:], strict=True):
+            other = again.track(scan)
+            np.testing.assert_array_equal(other.T_world_lidar, one.T_world_lidar)
+            np.testing.assert_array_equal(other.covariance, one.covariance)
