@@ -230,6 +230,7 @@ MARKS = {
     "NO_TIMES",
     "PLANAR",
     "FIX_NOISE",
+    "GRAVITY_KEY",
     "STATE",
     "FREE",
     "EMPTY",

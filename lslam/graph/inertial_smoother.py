@@ -1,6 +1,6 @@
 """Registered poses and preintegrated IMU measurements in one factor graph, smoothed by iSAM2 (LIO-SAM, Shan et al. 2020).
 
-State k has the keys 4 k to 4 k + 3: pose, velocity and biases; gravity has the key `GRAVITY`.
+State k has the keys 4 k to 4 k + 3: pose, velocity and biases; gravity has the key `GRAVITY_KEY`.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from lslam.types.state import State
 
 Floats = NDArray[np.float64]
 
-GRAVITY = 1 << 40
+GRAVITY_KEY = 1 << 40
 # Pose, velocity, biases and gravity among the 18 of a state.
 POSE, SPEED, BIASES, DOWN = slice(0, 6), slice(6, 9), slice(9, 15), slice(15, 18)
 # m2 per s, of the integration itself: none but rounding.
@@ -66,7 +66,7 @@ class InertialSmoother:
         params.setFactorization("QR")
         self._solver = gtsam.ISAM2(params)
         factors, values = gtsam.NonlinearFactorGraph(), _values(0, state)
-        values.insert(GRAVITY, state.gravity)
+        values.insert(GRAVITY_KEY, state.gravity)
         factors.add(_prior(state))
         self._solver.update(factors, values)
 
@@ -107,7 +107,7 @@ class InertialSmoother:
         felt = self._preintegrated(step, before)
         names = (4 * k, 4 * k + 1, 4 * k + 4, 4 * k + 5, 4 * k + 2, 4 * k + 6)
         factors = gtsam.NonlinearFactorGraph()
-        factors.add(gtsam.CombinedImuFactorWithGravityVector(*names, GRAVITY, felt))
+        factors.add(gtsam.CombinedImuFactorWithGravityVector(*names, GRAVITY_KEY, felt))
         T, velocity = _predicted(before, felt)
         if step.T_world_imu is not None and step.covariance is not None:
             body = noise.to_body(well_conditioned(step.covariance), step.T_world_imu)
@@ -146,12 +146,12 @@ class InertialSmoother:
         solver, pose, speed, bias = self._solver, 4 * k, 4 * k + 1, 4 * k + 2
         T = se3.normalise(solver.calculateEstimatePose3(pose).matrix())
         biases = solver.calculateEstimateConstantBias(bias)
-        joint = solver.jointMarginalCovariance([pose, speed, bias, GRAVITY]).fullMatrix()
+        joint = solver.jointMarginalCovariance([pose, speed, bias, GRAVITY_KEY]).fullMatrix()
         J = _into_house(T)
         covariance = J @ joint @ J.T
         return InertialState(
             T, solver.calculateEstimatePoint3(speed), biases.accelerometer(), biases.gyroscope(),
-            solver.calculateEstimatePoint3(GRAVITY), 0.5 * (covariance + covariance.T),
+            solver.calculateEstimatePoint3(GRAVITY_KEY), 0.5 * (covariance + covariance.T),
         )  # fmt: skip
 
     def _walked(self, state: InertialState) -> InertialState:
@@ -197,10 +197,10 @@ def _prior(state: InertialState) -> Any:
                 jacobians[i] = np.eye(18)[:, part]
         return np.concatenate([
             origin.localCoordinates(values.atPose3(0)), values.atPoint3(1) - state.velocity,
-            bias.localCoordinates(values.atConstantBias(2)), values.atPoint3(GRAVITY) - state.gravity,
+            bias.localCoordinates(values.atConstantBias(2)), values.atPoint3(GRAVITY_KEY) - state.gravity,
         ])  # fmt: skip
 
-    return gtsam.CustomFactor(model, [0, 1, 2, GRAVITY], error)
+    return gtsam.CustomFactor(model, [0, 1, 2, GRAVITY_KEY], error)
 
 
 def _into_house(T: Floats) -> Floats:

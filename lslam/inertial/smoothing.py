@@ -14,6 +14,7 @@ from lslam.inertial.fusion import InertialMotion
 from lslam.inertial.gyroscope import Gyroscope
 from lslam.inertial.imu_estimate import ImuEstimate
 from lslam.inertial.integrate import Increments
+from lslam.inertial.navigation_state import BEGIN_SIGMA
 from lslam.registration.constant_velocity import middle_of
 from lslam.types.imu import ImuStream
 from lslam.types.inertial_state import InertialState, InertialStep
@@ -24,8 +25,6 @@ from lslam.types.state import State
 
 Floats = NDArray[np.float64]
 
-# Of the pose at the beginning, where the world is put: m and rad, one sigma.
-BEGIN_SIGMA = 1e-4
 # Velocity, gravity and accelerometer bias of an `ImuEstimate` among the 18 of an `InertialState`.
 ESTIMATE = np.r_[6:9, 15:18, 9:12]
 
