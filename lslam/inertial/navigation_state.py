@@ -33,6 +33,35 @@ SIZE = 27
 BEGIN_SIGMA = 1e-4
 
 
+def transition(step: Increments, R: Floats, R_end: Floats, gyroscope: Gyroscope) -> Floats:
+    """(27, 27) by which errors at the first instant of `step` become errors at its last.
+
+    R, R_end : (3, 3) of the IMU in the world at the two; gyroscope : that `step` was integrated with
+    """
+    t = float(step.seconds[-1])
+    F = np.eye(SIZE)
+    F[PLACE, TURN] = -so3.hat(R @ step.positions[-1])
+    F[PLACE, SPEED], F[PLACE, DOWN] = t * np.eye(3), 0.5 * t**2 * np.eye(3)
+    F[PLACE, FORCE] = -R @ step.position_arms[-1]
+    F[TURN, GYRO] = R_end @ gyroscope.columns(step)
+    F[SPEED, TURN] = -so3.hat(R @ step.velocities[-1])
+    F[SPEED, DOWN], F[SPEED, FORCE] = t * np.eye(3), -R @ step.velocity_arms[-1]
+    return F
+
+
+def process_noise(t: float, rate_variance: float) -> Floats:
+    """(27, 27) that `t` seconds add; rate_variance : (rad/s)^2 per Hz of the gyroscope."""
+    Q = np.zeros((SIZE, SIZE))
+    force = FORCE_NOISE**2 * np.array([[t**3 / 3, t**2 / 2], [t**2 / 2, t]])
+    for i, a in enumerate((PLACE, SPEED)):
+        for j, b in enumerate((PLACE, SPEED)):
+            Q[a, b] = force[i, j] * np.eye(3)
+    walks = (rate_variance, GRAVITY_WALK**2, ACCEL_WALK**2, BIAS_WALK**2)
+    for part, variance in zip((TURN, DOWN, FORCE, slice(15, 18)), walks, strict=True):
+        Q[part, part] = variance * t * np.eye(3)
+    return Q
+
+
 @dataclass(frozen=True)
 class NavigationState:
     """Where the IMU is, and all that is known of its motion and its errors.
@@ -58,21 +87,8 @@ class NavigationState:
         """The state at the last instant of `step`, which this estimate integrated, with nothing but the IMU to go by."""
         e, R, t = self.estimate, self.T_world_imu[:3, :3], float(step.seconds[-1])
         R_end, velocities, moved = step.motion(0, R, e.velocity, e.gravity)
-        F = np.eye(SIZE)
-        F[PLACE, TURN] = -so3.hat(R @ step.positions[-1])
-        F[PLACE, SPEED], F[PLACE, DOWN] = t * np.eye(3), 0.5 * t**2 * np.eye(3)
-        F[PLACE, FORCE] = -R @ step.position_arms[-1]
-        F[TURN, GYRO] = R_end[-1] @ e.gyroscope.columns(step)
-        F[SPEED, TURN] = -so3.hat(R @ step.velocities[-1])
-        F[SPEED, DOWN], F[SPEED, FORCE] = t * np.eye(3), -R @ step.velocity_arms[-1]
-        P = F @ self.covariance @ F.T
-        force = FORCE_NOISE**2 * np.array([[t**3 / 3, t**2 / 2], [t**2 / 2, t]])
-        for i, a in enumerate((PLACE, SPEED)):
-            for j, b in enumerate((PLACE, SPEED)):
-                P[a, b] += force[i, j] * np.eye(3)
-        walks = (e.gyroscope.rate_variance, GRAVITY_WALK**2, ACCEL_WALK**2, BIAS_WALK**2)
-        for part, variance in zip((TURN, DOWN, FORCE, slice(15, 18)), walks, strict=True):
-            P[part, part] += variance * t * np.eye(3)
+        F = transition(step, R, R_end[-1], e.gyroscope)
+        P = F @ self.covariance @ F.T + process_noise(t, e.gyroscope.rate_variance)
         T = se3.normalise(se3.make(R_end[-1], self.T_world_imu[:3, 3] + moved[-1]))
         return NavigationState(T, replace(e, velocity=velocities[-1]), P)._shared()
 

@@ -12,10 +12,10 @@ from lslam.config.registration import RegistrationConfig
 from lslam.preprocessing.prepare import PreparedPoints
 from lslam.registration.gaussian_map import GaussianMap
 from lslam.registration.local_map import LocalMap
-from lslam.registration.optimiser import EVERYWHERE, Correspondences
+from lslam.registration.optimiser import EVERYWHERE, Correspondences, normal_equations
 from lslam.registration.residuals import residual_named
 from lslam.registration.robust import Annealing
-from lslam.registration.solver import RegistrationResult, solve
+from lslam.registration.solver import RegistrationResult, solve, voxel_terms
 
 Floats = NDArray[np.float64]
 
@@ -53,6 +53,14 @@ class MapAlignment:
             inlier_distance=np.inf if c.inlier_distance is None else c.inlier_distance, inlier_ratio=c.inlier_ratio,
             allowed=allowed, matches=self._remembered(len(points.source)), information=information,
         )  # fmt: skip
+
+    def equations(self, points: PreparedPoints, T: Floats) -> tuple[Floats, Floats]:
+        """H (6, 6) and g (6,) of the points at the pose T (4, 4), as `refine` weighs them where it ends."""
+        c = self._config
+        kind, matches = residual_named(self._residual), self._remembered(len(points.source))
+        levels = (self._map.fine, *self._map.coarser)
+        terms = voxel_terms(kind, kind.points(points, c.sigma), levels, matches, c.sigma, c.blob_weight)
+        return normal_equations(terms, T, c.kernel_min, matches)
 
     def _remembered(self, count: int) -> Correspondences:
         """What was looked up for as many points in the map as it is: a scan is deskewed twice, and moves little between."""

@@ -169,6 +169,18 @@ def optimise(
     return OptimiserResult(se3.make(*pose), H, _named(facts), d, iterations, converged, weak[:count])
 
 
+def normal_equations(terms: Sequence[Term], T: Floats, width: float, matches: Correspondences) -> tuple[Floats, Floats]:
+    """H (6, 6) and g (6,) of residuals that weigh no points against each other, at the pose T (4, 4); kernel `width`, m."""
+    pose = np.ascontiguousarray(T[:3, :3], np.float64), np.array(T[:3, 3], np.float64)
+    H, S, g, facts = np.zeros((6, 6)), np.zeros((6, 6)), np.zeros(6), np.zeros(at.COUNT)
+    matches.clear()
+    for term in terms:
+        term.linearise(
+            term.points, term.target, term.settings, term.search, pose, (width, width, np.inf), (H, S, g, facts)
+        )
+    return np.triu(H) + np.triu(H, 1).T, g
+
+
 def _named(facts: Floats) -> Facts:
     f = facts.tolist()
     return Facts(

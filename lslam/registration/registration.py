@@ -134,20 +134,28 @@ class Registration(Stateful):
 
     def update(self, points: PreparedPoints, result: RegistrationResult) -> None:
         """Insert the scan into the map unless its registration failed; adapt thresholds unless it was denied."""
+        is_first = len(self.map) == 0
         if result.ok:
-            first = len(self.map) == 0
-            self.target.enter(self.map, points, result.T_world_lidar)
-            self.inserted += 1
-            self.recent = (*self.recent, (points.map_points, result.T_world_lidar))[-self.config.start_scans :]
-            if not first and not result.is_denied:
-                self.starting = max(self.starting - 1, 0)
-                self.agreement.observe(result.agreement)
-                move, turn = result.prior_error
-                self.threshold.observe(move + turn * result.lever_arm)
-        else:
+            self.enter(points, result.T_world_lidar)
+        self.observe(result, is_first)
+
+    def enter(self, points: PreparedPoints, T_world_lidar: Floats) -> None:
+        """Insert a scan into the map at its pose (4, 4)."""
+        self.target.enter(self.map, points, T_world_lidar)
+        self.inserted += 1
+        self.recent = (*self.recent, (points.map_points, T_world_lidar))[-self.config.start_scans :]
+
+    def observe(self, result: RegistrationResult, is_first: bool = False) -> None:
+        """Adapt thresholds to a registration, unless it was denied, or no map was there for it."""
+        if not result.ok:
             self.starting = max(self.starting, 1)
             self.threshold.widen()
             self.agreement.relax()
+        elif not is_first and not result.is_denied:
+            self.starting = max(self.starting - 1, 0)
+            self.agreement.observe(result.agreement)
+            move, turn = result.prior_error
+            self.threshold.observe(move + turn * result.lever_arm)
         self._motion.correct(self._index * SCAN_NS, result.T_world_lidar)
         self._index += 1
 
