@@ -13,6 +13,7 @@ from lslam.config.graph import GraphConfig
 from lslam.config.imu import ImuConfig
 from lslam.config.input import InputConfig
 from lslam.config.keyframes import KeyframesConfig
+from lslam.config.lio_mapping import LioMappingConfig
 from lslam.config.lio_sam import LioSamConfig
 from lslam.config.loam import LoamConfig
 from lslam.config.loops import LoopsConfig
@@ -36,6 +37,7 @@ class Config(Section):
     recovery: RecoveryConfig = RecoveryConfig()
     loam: LoamConfig = LoamConfig()
     lio_sam: LioSamConfig = LioSamConfig()
+    lio_mapping: LioMappingConfig = LioMappingConfig()
     imu: ImuConfig = ImuConfig()
     keyframes: KeyframesConfig = KeyframesConfig()
     loops: LoopsConfig = LoopsConfig()

@@ -15,6 +15,7 @@ from lslam.inertial.gyroscope import BIAS_WALK
 from lslam.inertial.imu_estimate import ACCEL_WALK, FORCE_NOISE, GRAVITY_WALK
 from lslam.inertial.initialise import InertialStart
 from lslam.inertial.smoothing import SmootherMotion
+from lslam.inertial.window_motion import WindowMotion
 
 IMU_NOISE = ImuNoise(FORCE_NOISE, ACCEL_WALK, float(BIAS_WALK), GRAVITY_WALK)
 
@@ -32,9 +33,14 @@ def _smoother(begun: InertialStart, config: Config) -> InertialMotion:
     return SmootherMotion(begun.imu, begun.T_lidar_imu, begun.estimate, config.imu, smoother)
 
 
+def _window(begun: InertialStart, config: Config) -> InertialMotion:
+    return WindowMotion(begun.imu, begun.T_lidar_imu, begun.estimate, config.imu, config.lio_mapping.window)
+
+
 MOTION_MODELS: dict[str, Callable[[InertialStart, Config], InertialMotion]] = {
     "fast-lio2": _filter,
     "lio-sam": _smoother,
+    "lio-mapping": _window,
 }
 
 

@@ -6,6 +6,7 @@ from lslam.inertial.gyroscope import Gyroscope
 from lslam.inertial.imu_estimate import ImuEstimate
 from lslam.inertial.initialise import InertialStart
 from lslam.inertial.navigation_state import NavigationState
+from lslam.inertial.window import Moment, Past, Window
 from lslam.integrity.monitor import Seen
 from lslam.odometry.feature_scan import FeatureScan
 from lslam.preprocessing.features import FeaturePoints, Features
@@ -15,9 +16,11 @@ from lslam.types.gravity import GravityDirection
 from lslam.types.imu import ImuStream
 from lslam.types.inertial_state import InertialState, InertialStep
 from lslam.types.motion_check import MotionCheck
+from lslam.types.scan_equations import ScanEquations
 from lslam.types.scan_result import ScanResult
 
 STATE_CLASSES = (
     Constraint, FeaturePoints, Features, FeatureScan, GravityDirection, Gyroscope, ImuEstimate, ImuStream, InertialState,
-    InertialStep, LoopCandidate, MotionCheck, NavigationState, PreparedPoints, ScanResult, Seen, InertialStart,
+    InertialStep, LoopCandidate, Moment, MotionCheck, NavigationState, Past, PreparedPoints, ScanEquations, ScanResult, Seen,
+    InertialStart, Window,
 )  # fmt: skip

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.frontend import joint
 from lslam.geometry import se3, so3
 from lslam.integrity.monitor import IntegrityMonitor
 from lslam.odometry.base import Deskewing, Odometry, Registered, Resumable, Searching
@@ -148,6 +149,7 @@ class Tracker:
         with clock.stage("imu"):
             self.sweep = motion.refine(prior, result.stamp_ns, found) if is_blind else prior
             motion.correct(result.stamp_ns, found, prior, result.status == "ok")
+            joint.settle(odometry, motion)
         pose, instant_ns = middle_of(prior, result.stamp_ns, found)
         self.middle = (instant_ns, pose)
         result = replace(
@@ -173,7 +175,7 @@ class Tracker:
                 prior = self._begin_again(odometry, *self._first, found.result, scan.span)
                 found, prior = self._align(odometry, scan, prepared, prior)
         with clock.stage("imu"):
-            weighed = self.motion.weigh(found.result, prior)
+            weighed = joint.weighed(odometry, self.motion, found, prior)
         weighed = plausible(weighed, prior.pose, self._last)
         if weighed.status != "ok" and self.motion.is_inertial and isinstance(odometry, Searching):
             found, prior = self._near(odometry, scan, prepared, expected, found, weighed, clock), expected
@@ -211,7 +213,7 @@ class Tracker:
         """
         near, first = odometry.register_near(scan, prepared, prior, found), found.result
         with clock.stage("imu"):
-            weighed = self.motion.weigh(near.result, prior)
+            weighed = joint.weighed(odometry, self.motion, near, prior)
         if weighed.status == "ok":
             return replace(near, result=_both(first, weighed))
         apart, off = (_apart(pose, first.T_world_lidar) for pose in (near.result.T_world_lidar, prior.pose))

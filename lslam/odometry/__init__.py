@@ -30,6 +30,10 @@ METHODS = {
         "lslam.odometry.lio_sam",
         "tightly coupled with the IMU: features and preintegration in one factor graph (Shan 2020); needs an IMU",
     ),
+    "lio-mapping": (
+        "lslam.odometry.lio_mapping",
+        "tightly coupled with the IMU: a window of scans and IMU states in one estimate (Ye 2019); needs an IMU",
+    ),
     "dlo": ("lslam.odometry.dlo", "plane to plane, scan to scan, then to a submap of keyframes (Chen 2022)"),
     "loam-odom": ("lslam.odometry.loam", "edges and planar points, scan to scan: LOAM without its map"),
     "loam": ("lslam.odometry.loam", "LOAM: scan to scan, then refined on the feature map at every scan"),

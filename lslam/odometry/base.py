@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
 
 from lslam.preprocessing.features import Features
 from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan import Scan
+from lslam.types.scan_equations import ScanEquations
 from lslam.types.scan_result import ScanResult
 from lslam.types.state import State
 
@@ -90,6 +95,23 @@ class Searching(Deskewing, Protocol):
 
         Where nothing is found there, `update` is of what `register` found.
         """
+        ...
+
+
+@runtime_checkable
+class Windowed(Deskewing, Protocol):
+    """A method whose scans stay open while a motion model estimates their poses together."""
+
+    def equations(self, found: Registered) -> tuple[ScanEquations, ...]:
+        """What the points of a scan say of its pose where `register` found it; nothing where that failed."""
+        ...
+
+    def equations_at(self, poses: Mapping[int, NDArray[np.float64]]) -> tuple[ScanEquations, ...]:
+        """Likewise of scans at other poses (4, 4), by their stamps; nothing of those that are no longer open."""
+        ...
+
+    def settle(self, poses: Mapping[int, NDArray[np.float64]]) -> None:
+        """Learn the poses (4, 4) of the scans that are estimated together, by their stamps; all others are closed."""
         ...
 
 

@@ -18,6 +18,7 @@ from lslam.preprocessing.prepare import PreparedPoints, prepare_points
 from lslam.recovery.policies import policies_of
 from lslam.registration.registration import Registration
 from lslam.registration.residuals import RESIDUALS
+from lslam.registration.solver import RegistrationResult
 from lslam.registration.uncertainty import PoseUncertainty
 from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan import Scan
@@ -79,7 +80,12 @@ class Icp(Stateful):
         stages = {"register": time.perf_counter() - deskewed}
         if points is not prepared:
             stages = {"deskew": deskewed - began, **stages}
-        return Registered(of_registration(scan, located, self._uncertainty.map_age, stages), (points, located))
+        return Registered(of_registration(scan, located, self.map_age, stages), (points, located))
+
+    @property
+    def map_age(self) -> float:
+        """Mean age, in scans, of the points of the map."""
+        return self._uncertainty.map_age
 
     def information_of(self, prior: MotionPrior) -> NDArray[np.float64] | None:
         """(6, 6) with which the prior joins the points; None, since the prior is only where to begin."""
@@ -90,9 +96,13 @@ class Icp(Stateful):
         began = time.perf_counter()
         points, located = found.detail
         located = located.decided(found.result)
-        self.registration.update(points, located)
+        self.insert(prior, found.result.stamp_ns, points, located)
         result = self._uncertainty.stamped(found.result, located, prior)
         return replace(result, stages={**result.stages, "update": time.perf_counter() - began})
+
+    def insert(self, prior: MotionPrior, stamp_ns: int, points: PreparedPoints, located: RegistrationResult) -> None:
+        """Enter a scan that was registered from `prior` into the map."""
+        self.registration.update(points, located)
 
     def restart(self) -> None:
         """An empty map."""

@@ -1,0 +1,89 @@
+"""Method `lio-mapping`: a sliding window of scans and IMU states in one joint estimate (Ye, Chen and Liu 2019)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.config.config import Config
+from lslam.odometry.base import Registered
+from lslam.odometry.fast_lio2 import FastLio2
+from lslam.preprocessing.prepare import PreparedPoints
+from lslam.registration.registration import Registration
+from lslam.registration.solver import RegistrationResult
+from lslam.types.motion_prior import MotionPrior
+from lslam.types.scan_equations import ScanEquations
+
+Floats = NDArray[np.float64]
+
+
+def create(config: Config) -> LioMapping:
+    """The method as the configuration wants it: point to plane, with no recovery beside the window."""
+    section = config.registration.model_copy(update={"residual": "plane"})
+    return LioMapping(Registration(section, config.preprocess), config.lio_mapping.window - 1)
+
+
+class LioMapping(FastLio2):
+    """Registers a scan with the window's prediction in one estimate, and takes its normal equations where that ends.
+
+    The joint estimate is the motion model's (`lslam.inertial.window`), the map is of the scans that left it: each enters when
+    it is `lag` scans old, at the last pose the window gave it, and is never compared with a map that it is part of.
+    """
+
+    deskew = "by the prediction of the window"
+    STATE = (*FastLio2.STATE, "pending")
+
+    def __init__(self, registration: Registration, lag: int) -> None:
+        super().__init__(registration)
+        self.lag = lag
+        # Scans that are not in the map yet, the earliest first: stamp, points and pose.
+        self.pending: tuple[tuple[int, PreparedPoints, Floats], ...] = ()
+        # The scan that is being registered.
+        self._offered: dict[int, PreparedPoints] = {}
+
+    @property
+    def map_age(self) -> float:
+        """Mean age, in scans, of the points of the map, which begins where the window ends."""
+        return super().map_age + len(self.pending)
+
+    def equations(self, found: Registered) -> tuple[ScanEquations, ...]:
+        """Of a scan that was just registered, none where that failed."""
+        points, located = found.detail
+        self._offered = {}
+        if found.result.status != "ok" or len(self.registration.map) == 0:
+            return ()
+        self._offered = {found.result.stamp_ns: points}
+        return (self._at(found.result.stamp_ns, points, located.T_world_lidar),)
+
+    def equations_at(self, poses: Mapping[int, Floats]) -> tuple[ScanEquations, ...]:
+        """Of scans at other poses (4, 4), by their stamps; none of those that are in the map already."""
+        known = self._offered | {stamp_ns: points for stamp_ns, points, _ in self.pending}
+        return tuple(self._at(stamp_ns, known[stamp_ns], T) for stamp_ns, T in poses.items() if stamp_ns in known)
+
+    def _at(self, stamp_ns: int, points: PreparedPoints, T: Floats) -> ScanEquations:
+        return ScanEquations(stamp_ns, T, *self.registration.alignment.equations(points, T))
+
+    def insert(self, prior: MotionPrior, stamp_ns: int, points: PreparedPoints, located: RegistrationResult) -> None:
+        """Keep the scan for the map; while that is young, or the window silent, it enters at once."""
+        is_young = self.registration.inserted <= self.registration.config.start_scans
+        if not located.ok or prior.covariance is None or is_young:
+            self.registration.update(points, located)
+            return
+        self.registration.observe(located)
+        self.pending = (*self.pending, (stamp_ns, points, located.T_world_lidar))
+
+    def settle(self, poses: Mapping[int, Floats]) -> None:
+        """Move the scans that wait to the poses (4, 4) of the window; those old enough, or no longer in it, enter the map."""
+        waiting = [(stamp_ns, points, poses.get(stamp_ns, T)) for stamp_ns, points, T in self.pending]
+        due = [k < len(waiting) - self.lag or stamp_ns not in poses for k, (stamp_ns, _, _) in enumerate(waiting)]
+        for (_, points, T), is_due in zip(waiting, due, strict=True):
+            if is_due:
+                self.registration.enter(points, T)
+        self.pending = tuple(one for one, is_due in zip(waiting, due, strict=True) if not is_due)
+
+    def restart(self) -> None:
+        """An empty map, and no scan that waits for it."""
+        super().restart()
+        self.pending, self._offered = (), {}
