@@ -172,13 +172,14 @@ class Tracker:
             if self._first is None:
                 self._first = (scan, prepared, found.result.T_world_lidar)
             else:
-                prior = self._begin_again(odometry, *self._first, found.result, scan.span)
+                prior = expected = self._begin_again(odometry, *self._first, found.result, scan.span)
                 found, prior = self._align(odometry, scan, prepared, prior)
         with clock.stage("imu"):
             weighed = joint.weighed(odometry, self.motion, found, prior)
-        weighed = plausible(weighed, prior.pose, self._last)
+        weighed = plausible(weighed, expected.pose, self._last)
         if weighed.status != "ok" and self.motion.is_inertial and isinstance(odometry, Searching):
-            found, prior = self._near(odometry, scan, prepared, expected, found, weighed, clock), expected
+            found = self._near(odometry, scan, prepared, expected, found, weighed, clock)
+            prior = expected if found.sweep is None else found.sweep
         else:
             found = replace(found, result=weighed)
         return odometry.update(prior, found), prior
@@ -193,6 +194,8 @@ class Tracker:
         clock : what counts the time that takes, if anything does
         """
         found = odometry.register(scan, prepared, prior)
+        if found.sweep is not None:
+            return found, found.sweep
         if motion is None or not motion.is_known or found.result.status != "ok" or scan.span.seconds <= 0:
             return found, prior
         with (clock or StageClock()).stage("imu"):

@@ -35,6 +35,10 @@ METHODS = {
         "tightly coupled with the IMU: a window of scans and IMU states in one estimate (Ye 2019); needs an IMU",
     ),
     "dlo": ("lslam.odometry.dlo", "plane to plane, scan to scan, then to a submap of keyframes (Chen 2022)"),
+    "ct-icp": (
+        "lslam.odometry.ct_icp",
+        "elastic sweeps: poses at begin and end of each, points placed at their own times in every step (Dellenbach 2022)",
+    ),
     "loam-odom": ("lslam.odometry.loam", "edges and planar points, scan to scan: LOAM without its map"),
     "loam": ("lslam.odometry.loam", "LOAM: scan to scan, then refined on the feature map at every scan"),
     "floam": ("lslam.odometry.loam", "F-LOAM: motion prior, then scan to feature map in one stage"),

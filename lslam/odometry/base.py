@@ -22,10 +22,12 @@ class Registered:
     """A scan as `register` of a method that deskews found it.
 
     result : what is said about it; detail : what the method's own `update` needs beside
+    sweep : the motion within the sweep, of a method that estimates it itself; None: the prior's, which the found pose refines
     """
 
     result: ScanResult
     detail: Any = None
+    sweep: MotionPrior | None = None
 
 
 class Method(Protocol):

@@ -166,7 +166,7 @@ def optimise(
         scale = max(scale * annealing.decay, end)
         if inlier_ratio < 1.0:
             gate2 = trimmed(matches.away2, float(inlier_ratio), farthest2)
-    return OptimiserResult(se3.make(*pose), H, _named(facts), d, iterations, converged, weak[:count])
+    return OptimiserResult(se3.make(*pose), H, named(facts), d, iterations, converged, weak[:count])
 
 
 def normal_equations(terms: Sequence[Term], T: Floats, width: float, matches: Correspondences) -> tuple[Floats, Floats]:
@@ -181,7 +181,8 @@ def normal_equations(terms: Sequence[Term], T: Floats, width: float, matches: Co
     return np.triu(H) + np.triu(H, 1).T, g
 
 
-def _named(facts: Floats) -> Facts:
+def named(facts: Floats) -> Facts:
+    """The sums of a linearisation, by name."""
     f = facts.tolist()
     return Facts(
         information=f[at.INFORMATION], squared=f[at.SQUARED], inliers=int(f[at.INLIERS]),

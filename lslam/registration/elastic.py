@@ -1,0 +1,227 @@
+"""Elastic registration: the poses at the begin and at the end of a sweep in one estimate (CT-ICP).
+
+Dellenbach, Deschaud, Jacquet and Goulette 2022: CT-ICP, sections III-A to III-C.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.geometry import se3, so3
+from lslam.kernels import facts as at
+from lslam.kernels.gauss_newton import UNSEEN
+from lslam.preprocessing.deskew import deskew_points
+from lslam.preprocessing.prepare import PreparedPoints, subset
+from lslam.registration.gaussian_map import GaussianMap
+from lslam.registration.optimiser import (
+    LEAST_MATCHED,
+    STEP_M,
+    STEP_RAD,
+    Correspondences,
+    OptimiserResult,
+    Term,
+    named,
+)
+from lslam.registration.residuals import residual_named
+from lslam.registration.robust import Annealing
+from lslam.registration.solver import voxel_terms
+from lslam.types.motion_prior import MotionPrior
+
+Floats = NDArray[np.float64]
+
+# Weights of the two constraints, as parts of the information of the points: the paper adds them to the mean of the
+# points' squared residuals.
+LOCATION = 1e-3
+VELOCITY = 1e-3
+# Parts of a sweep whose points are linearised together. Within an eighth, what a point tells of begin and end differs from
+# the mean of its part by 1/28 rms: of the information 2 % are lost, and nothing is biased.
+PARTS = 8
+
+
+@dataclass(frozen=True)
+class ElasticSweep:
+    """Poses (4, 4) at the begin and the end of a sweep, translation linear and rotation along the geodesic between them.
+
+    times : (K,) s from the stamp; bend : (K, 4, 4) by which the motion departs from that, in the sensor's axes at each time:
+    what an IMU felt; None: nothing
+    """
+
+    begin: Floats
+    end: Floats
+    times: Floats
+    bend: Floats | None = None
+
+    @classmethod
+    def of(cls, prior: MotionPrior, *, is_bent: bool) -> ElasticSweep:
+        """Through both ends of the prior, with its bend if that is told."""
+        straight = cls(prior.poses[0], prior.poses[-1], prior.times)
+        if not is_bent:
+            return straight
+        return cls(straight.begin, straight.end, prior.times, se3.relative(straight.poses, prior.poses))
+
+    @property
+    def shares(self) -> Floats:
+        """(K,) of the sweep, 0 to 1."""
+        return np.asarray((self.times - self.times[0]) / (self.times[-1] - self.times[0]))
+
+    @property
+    def poses(self) -> Floats:
+        """(K, 4, 4) T_world_lidar at `times`."""
+        shares = self.shares[:, None]
+        turn = so3.log(self.begin[:3, :3].T @ self.end[:3, :3])
+        t = (1.0 - shares) * self.begin[:3, 3] + shares * self.end[:3, 3]
+        straight = se3.make(self.begin[:3, :3] @ so3.exp(shares * turn), t)
+        return straight if self.bend is None else straight @ self.bend
+
+    @property
+    def prior(self) -> MotionPrior:
+        """The same as a motion over the sweep."""
+        return MotionPrior(self.times, self.poses)
+
+    def moved(self, d: Floats) -> ElasticSweep:
+        """Both ends by d (2, 6): t' = t + d[:3], R' = exp(d[3:]) R."""
+        begin, end = (
+            se3.make(so3.exp(step[3:]) @ pose[:3, :3], pose[:3, 3] + step[:3])
+            for step, pose in zip(d, (self.begin, self.end), strict=True)
+        )
+        return ElasticSweep(se3.normalise(begin), se3.normalise(end), self.times, self.bend)
+
+
+@dataclass(frozen=True)
+class ElasticResult:
+    """The sweep that was found, and its pose at the stamp as any other registration's."""
+
+    sweep: ElasticSweep
+    found: OptimiserResult
+
+
+class SweepPoints:
+    """Source points in the order of their times, in `PARTS` parts that share the map's levels but no correspondence."""
+
+    def __init__(self, points: PreparedPoints, levels: Sequence[GaussianMap], sigma: float, blob_weight: float) -> None:
+        assert points.source_times is not None
+        order = np.argsort(points.source_times, kind="stable")
+        self.times = points.source_times[order]
+        self.points = subset(points, order)
+        self._moved = np.empty_like(self.points.source)
+        bounds = np.linspace(0, len(order), PARTS + 1).round().astype(int)
+        self.parts = [slice(a, b) for a, b in zip(bounds[:-1], bounds[1:], strict=True)]
+        self.matches = [Correspondences(part.stop - part.start) for part in self.parts]
+        kind = residual_named("plane")
+        self._terms: list[list[Term]] = [
+            voxel_terms(kind, (self._moved[part], self.points.scatter[part]), levels, matches, sigma, blob_weight)
+            for part, matches in zip(self.parts, self.matches, strict=True)
+        ]
+
+    def shares(self, sweep: ElasticSweep) -> Floats:
+        """(PARTS,) mean share of the sweep that is over when a part was measured."""
+        begin, end = sweep.times[0], sweep.times[-1]
+        return np.array([(self.times[part].mean(dtype=np.float64) - begin) / (end - begin) for part in self.parts])
+
+    def linearise(self, prior: MotionPrior, width: tuple[float, float, float]) -> tuple[Floats, Floats, Floats]:
+        """H (PARTS, 6, 6), g (PARTS, 6) about the pose at the stamp, and facts of the points placed by `prior`."""
+        self._moved[:] = deskew_points(self.points.source, self.times, prior)
+        T = prior.pose
+        pose = np.ascontiguousarray(T[:3, :3]), np.ascontiguousarray(T[:3, 3])
+        H, g, facts, unused = np.zeros((PARTS, 6, 6)), np.zeros((PARTS, 6)), np.zeros(at.COUNT), np.zeros((6, 6))
+        for k, (terms, matches) in enumerate(zip(self._terms, self.matches, strict=True)):
+            matches.clear()
+            for term in terms:
+                term.linearise(
+                    term.points, term.target, term.settings, term.search, pose, width, (H[k], unused, g[k], facts)
+                )
+        return np.triu(H) + np.swapaxes(np.triu(H, 1), 1, 2), g, facts
+
+
+def register_elastic(
+    points: SweepPoints, start: ElasticSweep, expected: ElasticSweep, annealing: Annealing, weak_share: float
+) -> ElasticResult:
+    """Both poses of a sweep by annealed Gauss-Newton, the points placed anew at their own times in every step.
+
+    expected : where the sweep would lie if it went on as the last one did, to which the constraints hold
+    The pose at the stamp has the rotation's and translation's share of both ends; degenerate is what holds the sweep as a
+    whole too little.
+    """
+    scale, iterations, converged, d = annealing.start, 0, False, np.zeros((2, 6))
+    sweep, shares = start, points.shares(start)
+    passed = float(-start.times[0] / (start.times[-1] - start.times[0]))
+    A, facts = np.zeros((12, 12)), np.zeros(at.COUNT)
+    weak = np.zeros((0, 6))
+    while iterations < annealing.steps and not converged:
+        iterations += 1
+        prior = sweep.prior
+        H, g, facts = points.linearise(prior, (scale, annealing.end, np.inf))
+        if facts[at.MATCHED] < LEAST_MATCHED:
+            break
+        H, g = _about_own_place(H, g, sweep, shares, prior.pose[:3, 3])
+        A, b = _of_both_ends(H, g, shares)
+        lever = np.sqrt(max(facts[at.LEVER] / max(facts[at.INFORMATION], 1e-300), 1e-6))
+        weak = _weak(H.sum(0), lever, weak_share * facts[at.INFORMATION])
+        _constrain(A, b, sweep, expected, facts[at.INFORMATION])
+        d = _step(A, b, lever, UNSEEN * weak_share * facts[at.INFORMATION]).reshape(2, 6)
+        if not np.isfinite(d).all():
+            break
+        move, turn = (float(np.linalg.norm(d[:, part], axis=1).max()) for part in (slice(0, 3), slice(3, 6)))
+        d *= min(1.0, 2.0 * max(scale, 0.5) / max(move, 1e-12))
+        sweep = sweep.moved(d)
+        converged = scale <= annealing.end and move < STEP_M and turn < STEP_RAD
+        scale = max(scale * annealing.decay, annealing.end)
+    at_stamp = np.hstack([(1.0 - passed) * np.eye(6), passed * np.eye(6)])
+    information = np.linalg.pinv(at_stamp @ np.linalg.pinv(A, hermitian=True) @ at_stamp.T, hermitian=True)
+    found = OptimiserResult(
+        sweep.prior.pose, information, named(facts), at_stamp @ d.ravel(), iterations, converged, weak
+    )
+    return ElasticResult(sweep, found)
+
+
+def _about_own_place(
+    H: Floats, g: Floats, sweep: ElasticSweep, shares: Floats, centre: Floats
+) -> tuple[Floats, Floats]:
+    """The parts' equations about where the sensor was in each of them, not about `centre` (3,)."""
+    places = (1.0 - shares)[:, None] * sweep.begin[:3, 3] + shares[:, None] * sweep.end[:3, 3]
+    G = np.tile(np.eye(6), (len(shares), 1, 1))
+    G[:, :3, 3:] = so3.hat(places - centre)
+    transposed = np.swapaxes(G, 1, 2)
+    return transposed @ H @ G, (transposed @ g[..., None])[..., 0]
+
+
+def _of_both_ends(H: Floats, g: Floats, shares: Floats) -> tuple[Floats, Floats]:
+    """(12, 12), (12,) of begin and end, where what moves a part is `1 - share` of the one and `share` of the other."""
+    weights = np.stack([1.0 - shares, shares], axis=1)
+    A = np.einsum("ka,kb,kij->aibj", weights, weights, H).reshape(12, 12)
+    return A, np.einsum("ka,ki->ai", weights, g).ravel()
+
+
+def _constrain(A: Floats, b: Floats, sweep: ElasticSweep, expected: ElasticSweep, information: float) -> None:
+    """Add location consistency of the begin and constant velocity to the equations, in place (equations 5 and 6)."""
+    begin = sweep.begin[:3, 3] - expected.begin[:3, 3]
+    way = sweep.end[:3, 3] - expected.end[:3, 3] - begin
+    for weight, signs, off in ((LOCATION, (1.0, 0.0), begin), (VELOCITY, (-1.0, 1.0), way)):
+        for i, one in zip((0, 6), signs, strict=True):
+            b[i : i + 3] += weight * information * one * off
+            for j, other in zip((0, 6), signs, strict=True):
+                A[i : i + 3, j : j + 3] += weight * information * one * other * np.eye(3)
+
+
+def _scaled(lever: float) -> Floats:
+    return np.array([1.0, 1.0, 1.0, 1.0 / lever, 1.0 / lever, 1.0 / lever])
+
+
+def _weak(H: Floats, lever: float, needed: float) -> Floats:
+    """(K, 6) directions of the sweep as a whole of which H (6, 6) tells less than `needed`, rotations scaled by `lever`."""
+    scale = _scaled(lever)
+    values, vectors = np.linalg.eigh(H * np.outer(scale, scale))
+    return np.ascontiguousarray(vectors.T[values <= needed])
+
+
+def _step(A: Floats, b: Floats, lever: float, least: float) -> Floats:
+    """-inv(A) b in the directions of both ends that more than `least` holds."""
+    scale = np.tile(_scaled(lever), 2)
+    values, vectors = np.linalg.eigh(A * np.outer(scale, scale))
+    along = vectors.T @ (scale * b)
+    followed = values > max(least, 1e-12 * float(values[-1]))
+    return -scale * (vectors @ np.where(followed, along / np.where(followed, values, 1.0), 0.0))
