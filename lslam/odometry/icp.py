@@ -69,8 +69,8 @@ class Icp(Stateful):
     def register_near(self, scan: Scan, prepared: PreparedPoints, prior: MotionPrior, found: Registered) -> Registered:
         """Align with the local map from the prior alone."""
         near = self._align(scan, prepared, prior, is_near=True)
-        points, located = near.detail
-        return near if located.ok else replace(near, detail=(points, found.detail[1]))
+        points, located, *rest = near.detail
+        return near if located.ok else replace(near, detail=(points, found.detail[1], *rest))
 
     def _align(self, scan: Scan, prepared: PreparedPoints, prior: MotionPrior, is_near: bool = False) -> Registered:
         began = time.perf_counter()
@@ -94,7 +94,7 @@ class Icp(Stateful):
     def update(self, prior: MotionPrior, found: Registered) -> ScanResult:
         """Enter the scan into the local map where its result puts it."""
         began = time.perf_counter()
-        points, located = found.detail
+        points, located, *_ = found.detail
         located = located.decided(found.result)
         self.insert(prior, found.result.stamp_ns, points, located)
         result = self._uncertainty.stamped(found.result, located, prior)

@@ -7,15 +7,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.geometry import se3, so3
+from lslam.geometry import so3
 from lslam.kernels import facts as at
 from lslam.kernels.gauss_newton import UNSEEN
 from lslam.preprocessing.deskew import deskew_points
 from lslam.preprocessing.prepare import PreparedPoints, subset
+from lslam.registration.elastic_constraints import ElasticConstraints
+from lslam.registration.elastic_sweep import ElasticSweep
 from lslam.registration.gaussian_map import GaussianMap
 from lslam.registration.optimiser import (
     LEAST_MATCHED,
@@ -33,69 +36,17 @@ from lslam.types.motion_prior import MotionPrior
 
 Floats = NDArray[np.float64]
 
-# Weights of the two constraints, as parts of the information of the points: the paper adds them to the mean of the
-# points' squared residuals.
-LOCATION = 1e-3
-VELOCITY = 1e-3
 # Parts of a sweep whose points are linearised together. Within an eighth, what a point tells of begin and end differs from
 # the mean of its part by 1/28 rms: of the information 2 % are lost, and nothing is biased.
 PARTS = 8
 
 
 @dataclass(frozen=True)
-class ElasticSweep:
-    """Poses (4, 4) at the begin and the end of a sweep, translation linear and rotation along the geodesic between them.
-
-    times : (K,) s from the stamp; bend : (K, 4, 4) by which the motion departs from that, in the sensor's axes at each time:
-    what an IMU felt; None: nothing
-    """
-
-    begin: Floats
-    end: Floats
-    times: Floats
-    bend: Floats | None = None
-
-    @classmethod
-    def of(cls, prior: MotionPrior, *, is_bent: bool) -> ElasticSweep:
-        """Through both ends of the prior, with its bend if that is told."""
-        straight = cls(prior.poses[0], prior.poses[-1], prior.times)
-        if not is_bent:
-            return straight
-        return cls(straight.begin, straight.end, prior.times, se3.relative(straight.poses, prior.poses))
-
-    @property
-    def shares(self) -> Floats:
-        """(K,) of the sweep, 0 to 1."""
-        return np.asarray((self.times - self.times[0]) / (self.times[-1] - self.times[0]))
-
-    @property
-    def poses(self) -> Floats:
-        """(K, 4, 4) T_world_lidar at `times`."""
-        shares = self.shares[:, None]
-        turn = so3.log(self.begin[:3, :3].T @ self.end[:3, :3])
-        t = (1.0 - shares) * self.begin[:3, 3] + shares * self.end[:3, 3]
-        straight = se3.make(self.begin[:3, :3] @ so3.exp(shares * turn), t)
-        return straight if self.bend is None else straight @ self.bend
-
-    @property
-    def prior(self) -> MotionPrior:
-        """The same as a motion over the sweep."""
-        return MotionPrior(self.times, self.poses)
-
-    def moved(self, d: Floats) -> ElasticSweep:
-        """Both ends by d (2, 6): t' = t + d[:3], R' = exp(d[3:]) R."""
-        begin, end = (
-            se3.make(so3.exp(step[3:]) @ pose[:3, :3], pose[:3, 3] + step[:3])
-            for step, pose in zip(d, (self.begin, self.end), strict=True)
-        )
-        return ElasticSweep(se3.normalise(begin), se3.normalise(end), self.times, self.bend)
-
-
-@dataclass(frozen=True)
 class ElasticResult:
-    """The sweep that was found, and its pose at the stamp as any other registration's."""
+    """The sweep that was found, the covariance (12, 12) of its ends, and its pose at the stamp as any registration's."""
 
     sweep: ElasticSweep
+    covariance: Floats
     found: OptimiserResult
 
 
@@ -109,7 +60,7 @@ class SweepPoints:
         self.points = subset(points, order)
         self._moved = np.empty_like(self.points.source)
         bounds = np.linspace(0, len(order), PARTS + 1).round().astype(int)
-        self.parts = [slice(a, b) for a, b in zip(bounds[:-1], bounds[1:], strict=True)]
+        self.parts = [slice(a, b) for a, b in pairwise(bounds.tolist())]
         self.matches = [Correspondences(part.stop - part.start) for part in self.parts]
         kind = residual_named("plane")
         self._terms: list[list[Term]] = [
@@ -138,11 +89,10 @@ class SweepPoints:
 
 
 def register_elastic(
-    points: SweepPoints, start: ElasticSweep, expected: ElasticSweep, annealing: Annealing, weak_share: float
+    points: SweepPoints, start: ElasticSweep, constraints: ElasticConstraints, annealing: Annealing, weak_share: float
 ) -> ElasticResult:
     """Both poses of a sweep by annealed Gauss-Newton, the points placed anew at their own times in every step.
 
-    expected : where the sweep would lie if it went on as the last one did, to which the constraints hold
     The pose at the stamp has the rotation's and translation's share of both ends; degenerate is what holds the sweep as a
     whole too little.
     """
@@ -161,7 +111,7 @@ def register_elastic(
         A, b = _of_both_ends(H, g, shares)
         lever = np.sqrt(max(facts[at.LEVER] / max(facts[at.INFORMATION], 1e-300), 1e-6))
         weak = _weak(H.sum(0), lever, weak_share * facts[at.INFORMATION])
-        _constrain(A, b, sweep, expected, facts[at.INFORMATION])
+        constraints.add_to(A, b, sweep)
         d = _step(A, b, lever, UNSEEN * weak_share * facts[at.INFORMATION]).reshape(2, 6)
         if not np.isfinite(d).all():
             break
@@ -171,11 +121,11 @@ def register_elastic(
         converged = scale <= annealing.end and move < STEP_M and turn < STEP_RAD
         scale = max(scale * annealing.decay, annealing.end)
     at_stamp = np.hstack([(1.0 - passed) * np.eye(6), passed * np.eye(6)])
-    information = np.linalg.pinv(at_stamp @ np.linalg.pinv(A, hermitian=True) @ at_stamp.T, hermitian=True)
-    found = OptimiserResult(
-        sweep.prior.pose, information, named(facts), at_stamp @ d.ravel(), iterations, converged, weak
-    )
-    return ElasticResult(sweep, found)
+    covariance = np.linalg.pinv(A, hermitian=True)
+    information = np.linalg.pinv(at_stamp @ covariance @ at_stamp.T, hermitian=True)
+    pose = sweep.prior.pose
+    found = OptimiserResult(pose, information, named(facts), at_stamp @ d.ravel(), iterations, converged, weak)
+    return ElasticResult(sweep, covariance, found)
 
 
 def _about_own_place(
@@ -194,17 +144,6 @@ def _of_both_ends(H: Floats, g: Floats, shares: Floats) -> tuple[Floats, Floats]
     weights = np.stack([1.0 - shares, shares], axis=1)
     A = np.einsum("ka,kb,kij->aibj", weights, weights, H).reshape(12, 12)
     return A, np.einsum("ka,ki->ai", weights, g).ravel()
-
-
-def _constrain(A: Floats, b: Floats, sweep: ElasticSweep, expected: ElasticSweep, information: float) -> None:
-    """Add location consistency of the begin and constant velocity to the equations, in place (equations 5 and 6)."""
-    begin = sweep.begin[:3, 3] - expected.begin[:3, 3]
-    way = sweep.end[:3, 3] - expected.end[:3, 3] - begin
-    for weight, signs, off in ((LOCATION, (1.0, 0.0), begin), (VELOCITY, (-1.0, 1.0), way)):
-        for i, one in zip((0, 6), signs, strict=True):
-            b[i : i + 3] += weight * information * one * off
-            for j, other in zip((0, 6), signs, strict=True):
-                A[i : i + 3, j : j + 3] += weight * information * one * other * np.eye(3)
 
 
 def _scaled(lever: float) -> Floats:
