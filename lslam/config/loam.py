@@ -43,6 +43,9 @@ class LoamConfig(Section):
     segment_points: int = Field(30, ge=1, description="lego-loam: smaller clusters are clutter, unless")
     small_segment_points: int = Field(5, ge=1, description="lego-loam: they have so many points")
     small_segment_rings: int = Field(3, ge=1, description="lego-loam: on so many rings, as poles have")
+    pieces: int = Field(
+        3, ge=1, description="loam-livox: parts of a sweep registered by themselves; 1: the prior deskews it whole"
+    )
     matching: Literal["one-to-many", "one-to-one"] = Field(
         "one-to-many",
         description="scan to scan: a feature matches the line or plane through several of the other scan's, or the nearest alone",

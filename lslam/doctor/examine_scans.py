@@ -119,7 +119,7 @@ def rings_rule(sequence: Sequence) -> tuple[str | None, str]:
     try:
         ringed = with_rings(sequence)
     except InputError as error:
-        return None, f"no rings, which loam and lego-loam need, can be found: {error}"
+        return None, f"no rings, which loam and lego-loam need (loam-livox does not), can be found: {error}"
     return (ringed.rule.kind, str(ringed.rule)) if isinstance(ringed, Ringed) else (None, "")
 
 

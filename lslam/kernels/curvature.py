@@ -43,12 +43,12 @@ def into_rings(rings: NDArray[np.uint16], kept: NDArray[np.int64]) -> tuple[NDAr
 @kernel
 def walk(
     points: NDArray[np.float32], order: NDArray[np.int64], starts: NDArray[np.int64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], float, float]:
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], float, float, float]:
     """Walk along every ring.
 
     Returns the points in order (K, 3), their ranges (K,), m, and the angle to the next point of the ring (K,), rad, inf
-    after the last; the median of that angle in steps of 0.01 deg (inf beyond 4 deg); and the share of points at which
-    the walk turns back.
+    after the last; the median of that angle in steps of 0.01 deg (inf beyond 4 deg); the share of points at which
+    the walk turns back; and the share of its way about the z axis that is progress: 1 for a laser that spins.
     """
     total = order.shape[0]
     xyz = np.empty((total, 3))
@@ -57,9 +57,11 @@ def walk(
     counts = np.zeros(_BINS + 1, np.int64)
     turns = 0
     inner = 0
+    way, progress = 0.0, 0.0
     for k in range(starts.shape[0] - 1):
         ux, uy, uz = 0.0, 0.0, 0.0
         dx, dy, dz = 0.0, 0.0, 0.0
+        along = 0.0
         for j in range(starts[k], starts[k + 1]):
             i = order[j]
             x, y, z = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
@@ -71,12 +73,16 @@ def walk(
                 ex, ey, ez = vx - ux, vy - uy, vz - uz
                 chord = np.sqrt(ex * ex + ey * ey + ez * ez)
                 steps[j - 1] = chord
+                turn = ux * vy - uy * vx
+                along += turn
+                way += abs(turn)
                 counts[np.int64(min(chord / _BIN, _BINS))] += 1
                 if j > starts[k] + 1:
                     inner += 1
                     turns += ex * dx + ey * dy + ez * dz < 0.0
                 dx, dy, dz = ex, ey, ez
             ux, uy, uz = vx, vy, vz
+        progress += abs(along)
     whole = counts.sum()
     half = 0
     median = np.inf
@@ -85,7 +91,7 @@ def walk(
         if 2 * half >= whole and whole > 0:
             median = (b + 0.5) * _BIN
             break
-    return xyz, ranges, steps, median, turns / max(inner, 1)
+    return xyz, ranges, steps, median, turns / max(inner, 1), progress / max(way, 1e-9)
 
 
 @kernel

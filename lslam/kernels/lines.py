@@ -104,19 +104,21 @@ def add_line(H: Floats, g: Floats, facts: Floats, ex: float, ey: float, ez: floa
 
 @kernel
 def linearise_lines(points: tuple[Floats], voxels: LineVoxels, settings: tuple[float, float, float, float],
-                    search: tuple[Longs, Ints], pose: Pose, width: Width, sums: Sums) -> None:  # fmt: skip
+                    search: tuple[Longs, Ints, Floats], pose: Pose, width: Width, sums: Sums) -> None:  # fmt: skip
     """Add all edge points (S, 3), LiDAR frame, to H, g and facts, see `linearisation`.
 
     Each takes the line voxel, of the eight around it, whose line passes nearest: residual across the line, variance =
     that of the voxel across its line + sigma2 + tilt at that distance along it, Geman-McClure weight of width `scale`.
     settings : voxel size, m; variance of a point, m2; points and floor of a line's variance, m2, see `line_of`
+    search : octant cells and slots; `away2` (S,) takes the squared distance of each matched point to its line: those beyond
+    `gate2` are rejected: counted, without a say
     """
     (source,) = points
     moments, keys, table, lines, line_keys, line_sums = voxels
     size, sigma2, min_points, floor = settings
-    cells, slots = search
+    cells, slots, away2 = search
     R, t = pose
-    scale, _, _ = width
+    scale, _, gate2 = width
     H, _, g, facts = sums
     inverse = 1.0 / size
     c2 = scale * scale
@@ -146,5 +148,9 @@ def linearise_lines(points: tuple[Floats], voxels: LineVoxels, settings: tuple[f
         p = lines[best]
         ex, ey, ez = x - p[0], y - p[1], z - p[2]
         along = ex * p[3] + ey * p[4] + ez * p[5]
+        away2[i] = max(ex * ex + ey * ey + ez * ez - along * along, 0.0)
+        if away2[i] > gate2:
+            facts[MATCHED] += 1.0
+            continue
         variance = p[6] + sigma2 + TILT * p[7] * along * along
         add_line(H, g, facts, ex, ey, ez, p[3], p[4], p[5], rx, ry, rz, variance, c2)

@@ -43,6 +43,10 @@ METHODS = {
     "loam": ("lslam.odometry.loam", "LOAM: scan to scan, then refined on the feature map at every scan"),
     "floam": ("lslam.odometry.loam", "F-LOAM: motion prior, then scan to feature map in one stage"),
     "lego-loam": ("lslam.odometry.lego_loam", "LeGO-LOAM: ground, clusters, two steps scan to scan, then feature map"),
+    "loam-livox": (
+        "lslam.odometry.loam_livox",
+        "LOAM for Livox and other patterns without rings: by pieces of the sweep to the feature map (Lin 2020)",
+    ),
     "kiss-icp": ("lslam.odometry.kiss", "the baseline: the kiss-icp package with its own preprocessing and defaults"),
     "small-gicp": ("lslam.odometry.small_gicp", "baseline: GICP of the small_gicp package on a local map of keyframes"),
     "poses": ("lslam.odometry.given", "somebody else's: the poses of a trajectory file, see `lslam run --poses`"),
@@ -51,7 +55,7 @@ METHODS = {
 
 
 # Those whose scans have features, and so a feature map to write.
-FEATURE_METHODS = ("loam-odom", "loam", "floam", "lego-loam")
+FEATURE_METHODS = ("loam-odom", "loam", "floam", "lego-loam", "loam-livox")
 
 
 def known_methods() -> dict[str, str]:

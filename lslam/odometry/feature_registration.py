@@ -47,6 +47,7 @@ class FeatureRegistration(Stateful):
     reach : m, how far from the sensor the map is kept
     keyframes : decides which scans are in the feature map; None enters all, until the sensor has left them behind
     recovery : what is tried where features are not enough; `start_search` is by edges, or by all points with that fallback
+    inlier_ratio : share of the correspondences with the feature map, the nearest, that have a say
     """
 
     STATE = (
@@ -56,10 +57,11 @@ class FeatureRegistration(Stateful):
     def __init__(
         self, config: RegistrationConfig, loam: LoamConfig, *, scan_step: ScanStep | None, with_map: bool,
         with_less_planes: bool = False, reach: float = 120.0, recovery: RecoveryConfig | None = None,
-        keyframes: FeatureKeyframes | None = None,
+        keyframes: FeatureKeyframes | None = None, inlier_ratio: float = 1.0,
     ) -> None:  # fmt: skip
         self.config, self.loam, self.recovery = config, loam, recovery or RecoveryConfig()
         self._step, self._with_less_planes, self._reach = scan_step, with_less_planes, reach
+        self._inlier_ratio = inlier_ratio
         self.map: FeatureMap | None = self._new_map(1 << 16) if with_map else None
         self.target: FeatureScan | None = None
         self._usual = FeatureNoise(loam.edge_sigma, config.sigma, config.weak_share)
@@ -205,8 +207,9 @@ class FeatureRegistration(Stateful):
             with clock.stage("map"):
                 points, scatter = thinned(features) if self._with_less_planes else (features.planes.points, None)
                 result = solve_on_map(
-                    self.map, features.edges.points, points, start, quick, self.noise, scatter=scatter
-                )
+                    self.map, features.edges.points, points, start, quick, self.noise, scatter=scatter,
+                    inlier_ratio=self._inlier_ratio,
+                )  # fmt: skip
             result = self._judge(result, T_prior)
         return replace(result, iterations=result.iterations + (iterations if self.map is not None else 0))
 

@@ -69,25 +69,27 @@ def solve_on_scan(
 
 def solve_on_map(
     target: FeatureMap, edges: Floats, planes: Floats, T_prior: Floats, annealing: Annealing, noise: FeatureNoise, *,
-    scatter: Floats | None = None, levels: Sequence[GaussianMap] | None = None,
+    scatter: Floats | None = None, levels: Sequence[GaussianMap] | None = None, inlier_ratio: float = 1.0,
 ) -> RegistrationResult:  # fmt: skip
     """Align edges (E, 3) and planar points (P, 3), LiDAR frame, with the feature map, starting at `T_prior` (4, 4).
 
     scatter : (P, 6) m2, of the points behind each planar point when that is a centroid
     levels : of the map's planes, the finest first, each for the points without a plane in those before; None takes all
+    inlier_ratio : share of the correspondences, the nearest, that have a say from the second step on
     """
     if scatter is None:
         scatter = np.zeros((len(planes), 6))
-    lines, matches = target.edges, Correspondences(len(planes))
+    lines, matches = target.edges, Correspondences(len(planes) + len(edges))
     on_lines = Term(
         linearise_lines, (edges,), (lines.moments, lines.keys, lines.table, *target.lines),
-        (float(lines.size), float(noise.edge) ** 2, float(MIN_LINE_POINTS), FLOOR), slots_of(len(edges)),
+        (float(lines.size), float(noise.edge) ** 2, float(MIN_LINE_POINTS), FLOOR),
+        (*slots_of(len(edges)), matches.away2[len(planes) :]),
     )  # fmt: skip
     on_planes = voxel_terms(
         RESIDUALS["plane"], (planes, scatter), levels or target.planes.levels, matches, noise.plane, 0.0
     )
     limits = Limits(noise.weak_share, noise.least / noise.plane**2, unseen=1.0)
-    found = optimise([on_lines, *on_planes], T_prior, annealing, limits, matches)
+    found = optimise([on_lines, *on_planes], T_prior, annealing, limits, matches, inlier_ratio=inlier_ratio)
     return result_of(found, T_prior, len(edges) + len(planes))
 
 

@@ -30,11 +30,13 @@ class LoamVariant:
     scan_step : how a scan is registered on the one before; None leaves that out
     with_map : whether the pose is found, or refined, on a feature map
     with_less_planes : whether the map is matched with the less planar points in place of the planar ones
+    inlier_ratio : share of the correspondences with the map, the nearest, that have a say
     """
 
     scan_step: ScanStep | None
     with_map: bool
     with_less_planes: bool = False
+    inlier_ratio: float = 1.0
 
 
 VARIANTS = {
@@ -69,6 +71,7 @@ class Loam(Stateful):
         self.registration = FeatureRegistration(
             c.registration, c.loam, scan_step=v.scan_step, with_map=v.with_map, with_less_planes=v.with_less_planes,
             reach=1.2 * c.preprocess.range_max, recovery=self.recovery, keyframes=self._fresh_keyframes(),
+            inlier_ratio=v.inlier_ratio,
         )  # fmt: skip
         self._uncertainty = PoseUncertainty(is_scan_to_scan=not v.with_map)
 
@@ -87,8 +90,11 @@ class Loam(Stateful):
 
     def features_of(self, prepared: Features, motion: MotionPrior) -> Features:
         """The features as seen from the pose at the stamp, the sensor having moved as `motion` says."""
-        is_swept = self.config.preprocess.deskew and prepared.planes.times is not None and len(motion.times) > 1
-        return _deskewed(prepared, motion) if is_swept else prepared
+        return deskewed(prepared, motion) if self.is_swept(prepared, motion) else prepared
+
+    def is_swept(self, prepared: Features, motion: MotionPrior) -> bool:
+        """Whether there is a motion within the sweep to take out, and times to do so by."""
+        return self.config.preprocess.deskew and prepared.planes.times is not None and len(motion.times) > 1
 
     def register(self, scan: Scan, prepared: Features, prior: MotionPrior) -> Registered:
         """Align with the scan before, with the feature map, or with one after the other."""
@@ -129,7 +135,7 @@ class Loam(Stateful):
             trial.update(prior, trial.register(scan, prepared, prior))
 
 
-def _deskewed(features: Features, prior: MotionPrior) -> Features:
+def deskewed(features: Features, prior: MotionPrior) -> Features:
     """The features as seen from the pose at the stamp."""
 
     def moved(part: FeaturePoints) -> FeaturePoints:

@@ -20,6 +20,8 @@ MAY_BE_EDGE, MAY_BE_FLAT, MAY_BE_PLANE = 1, 2, 4
 WIDEST_STEP = np.radians(2.0)
 # A beam that turns back more often than this is not given in the order it was fired.
 _MANY_TURNS = 0.1
+# A beam of which less of its way about the axis is progress does not spin: it sweeps to and fro.
+_SPINS = 0.5
 # Neighbours farther apart than this many steps have missing returns between them: one lost return is bridged.
 _GAP_STEPS = 2.5
 # m; grid of the points that are no feature: they only tell what stands where.
@@ -116,17 +118,19 @@ def features_along(
         config.edge_curvature * walk.step, config.planar_curvature * walk.step,
         config.edge_noise * noise, _PLANE_NOISE * noise,
     )  # fmt: skip
-    return _gather(scan, walk, labels, config.grid_step)
+    return gather_features(scan, walk, labels, config.grid_step)
 
 
-def curvature_noise(ranges: NDArray[np.float64]) -> float:
+def curvature_noise(ranges: NDArray[np.float64], side: int = curvature.SIDE) -> float:
     """Standard deviation, m, of curvature times range that the noise of `ranges` (K,), m, along the rings makes.
+
+    side : neighbours on either side that the curvature takes
 
     The noise is that of second differences, whose median knows nothing of edges and little of curved surfaces.
     """
     thinned = np.abs(ranges[:-2:4] - 2 * ranges[1:-1:4] + ranges[2::4])
     sigma = 1.4826 * float(np.median(thinned)) / np.sqrt(6) if len(thinned) else 0.0
-    n = 2 * curvature.SIDE
+    n = 2 * side
     return sigma * float(np.sqrt(n * n + n)) / (n + 1)
 
 
@@ -136,23 +140,26 @@ def walk_rings(scan: Scan, gate: PreprocessConfig) -> RingWalk:
     The order of the file is kept where it follows the beam; else rings are walked by azimuth.
     """
     if scan.rings is None:
-        raise InputError(f"scan {scan.index} has no rings, which LOAM's features need: see --rings")
+        raise InputError(
+            f"scan {scan.index} has no rings, which LOAM's features need: see --rings, or use --method loam-livox"
+        )
     order, starts = curvature.into_rings(scan.rings, gate_points(scan.points, gate))
-    points, ranges, steps, step, turns = curvature.walk(scan.points, order, starts)
-    if step > WIDEST_STEP or turns > _MANY_TURNS:
+    points, ranges, steps, step, turns, progress = curvature.walk(scan.points, order, starts)
+    if step > WIDEST_STEP or turns > _MANY_TURNS or progress < _SPINS:
         azimuth = np.arctan2(scan.points[order, 1], scan.points[order, 0])
         order = order[np.lexsort((azimuth, scan.rings[order]))]
-        points, ranges, steps, step, _ = curvature.walk(scan.points, order, starts)
+        points, ranges, steps, step, _, _ = curvature.walk(scan.points, order, starts)
     if step > WIDEST_STEP and len(order) > len(starts):
         raise InputError(
             f"scan {scan.index}: neighbours on a ring are more than {np.degrees(WIDEST_STEP):.0f} deg apart, so they "
-            "lie on no common surface (a pattern that does not repeat, or rings that are none): use --method icp, or "
-            "another --rings"
+            "lie on no common surface (a pattern that does not repeat, or rings that are none): use --method loam-livox, "
+            "which needs no rings, or another --rings"
         )
     return RingWalk(order, starts, points, ranges, steps, min(step, WIDEST_STEP))
 
 
-def _gather(scan: Scan, walk: RingWalk, labels: NDArray[np.int8], grid_step: float) -> Features:
+def gather_features(scan: Scan, walk: RingWalk, labels: NDArray[np.int8], grid_step: float) -> Features:
+    """The features of a scan with rings, as the walk along them is labelled (K,)."""
     assert scan.rings is not None
     rings, times = scan.rings[walk.order], None if scan.times is None else scan.times[walk.order]
 

@@ -224,4 +224,4 @@ def _refusal(kind: str, count: int | None, scan: Scan) -> str:
         if kind == "auto"
         else "try --rings auto, or"
     )
-    return f"--rings {kind}: the scans {why}; {way} use --method icp, which needs no rings"
+    return f"--rings {kind}: the scans {why}; {way} use --method loam-livox or icp, which need no rings"

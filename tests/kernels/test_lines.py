@@ -47,7 +47,7 @@ class LineScene:
         H, S, g, facts = np.zeros((6, 6)), np.zeros((6, 6)), np.zeros(6), np.zeros(at.COUNT)
         lines.linearise_lines(
             (self.source,), (m.moments, m.keys, m.table, *self.rows), (SIZE, SIGMA2, float(MIN_LINE_POINTS), FLOOR),
-            slots_of(n), (self.R, self.t), (c, c, np.inf), (H, S, g, facts),
+            (*slots_of(n), np.full(n, -1.0)), (self.R, self.t), (c, c, np.inf), (H, S, g, facts),
         )  # fmt: skip
         return np.triu(H) + np.triu(H, 1).T, g, facts
 

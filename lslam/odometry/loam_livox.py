@@ -1,0 +1,136 @@
+"""Method `loam-livox`: LOAM for patterns that do not repeat and a small view, the sweep in pieces (Lin and Zhang 2020)."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.config.config import Config
+from lslam.geometry import se3
+from lslam.odometry.base import Registered
+from lslam.odometry.loam import Loam, LoamVariant, deskewed
+from lslam.odometry.scan_outcome import of_registration
+from lslam.preprocessing.features import FeaturePoints, Features
+from lslam.preprocessing.petals import petal_features
+from lslam.registration.acceptance import correction, failed
+from lslam.registration.solver import RegistrationResult
+from lslam.types.motion_prior import MotionPrior
+from lslam.types.scan import Scan
+from lslam.types.stage_clock import StageClock
+
+Floats = NDArray[np.float64]
+
+# Of the correspondences, the nearest, that have a say: a fifth is dropped as outliers (section IV-C).
+INLIERS = 0.8
+# Part of the slope over the pieces that is the sensor's motion, not noise of thirds of a scan.
+TRUST = float(os.environ.get("LV_LAM", "0.5"))
+LIVOX = LoamVariant(None, with_map=True, with_less_planes=os.environ.get("LV_LESS", "1") == "1", inlier_ratio=INLIERS)
+
+
+def create(config: Config) -> LoamLivox:
+    """The method as the configuration wants it."""
+    return LoamLivox(config, LIVOX)
+
+
+class LoamLivox(Loam):
+    """Each piece of a sweep is registered on the feature map by itself; the motion within the sweep follows from them."""
+
+    deskew = "by the pieces of a sweep, each of them by the motion prior"
+
+    def __init__(self, config: Config, variant: LoamVariant) -> None:
+        super().__init__(config, variant)
+        # Lines come as they are recorded, unless somebody says how the lasers are told apart.
+        self.needs_rings = config.input.rings != "auto"
+
+    def prepare(self, scan: Scan) -> Features:
+        """Edges and planar points along the lines. Raises InputError for points that are not in the order of firing."""
+        return petal_features(scan, self.config.loam, self.config.preprocess)
+
+    def _align(self, scan: Scan, prepared: Features, prior: MotionPrior, is_near: bool = False) -> Registered:
+        count = self.config.loam.pieces
+        if is_near or count < 2 or self.registration.target is None or not self.is_swept(prepared, prior):
+            return super()._align(scan, prepared, prior, is_near)
+        clock = StageClock()
+        with clock.stage("deskew"):
+            features = deskewed(prepared, prior)
+        borders = np.linspace(*scan.span, count + 1)
+        middles = (borders[:-1] + borders[1:]) / 2
+        found: list[RegistrationResult] = []
+        pose = prior.pose
+        for k in range(count):
+            piece = between(features, borders[k], borders[k + 1] if k + 1 < count else np.inf)
+            found.append(self.registration.locate(piece, pose, clock))
+            pose = found[-1].T_world_lidar if found[-1].ok else pose
+        located, sweep = joined(found, middles, prior)
+        with clock.stage("deskew"):
+            features = deskewed(prepared, sweep)
+        result = of_registration(scan, located, self._uncertainty.map_age, clock.seconds)
+        return Registered(result, (features, located), sweep)
+
+
+def between(features: Features, begin: float, end: float) -> Features:
+    """The features measured from `begin` to before `end`, s from the stamp."""
+
+    def part(points: FeaturePoints) -> FeaturePoints:
+        assert points.times is not None
+        within = (points.times >= begin) & (points.times < end)
+        return FeaturePoints(points.points[within], points.rings[within], points.times[within])
+
+    return replace(
+        features, edges=part(features.edges), less_edges=part(features.less_edges), planes=part(features.planes),
+        less_planes=part(features.less_planes), neither=part(features.neither),
+    )  # fmt: skip
+
+
+def joined(
+    found: list[RegistrationResult], middles: Floats, prior: MotionPrior
+) -> tuple[RegistrationResult, MotionPrior]:
+    """The registrations of the pieces as one of the scan, and the motion over its sweep.
+
+    Each of them says where the sensor was at the stamp, had it moved as the prior says. Their differences are a motion that
+    the prior does not know, and noise: the sweep moves by the line through them, drawn by least squares and followed by
+    `TRUST` of its slope. A scan has failed when half of its pieces have.
+
+    middles : s from the stamp
+    """
+    good = [k for k, result in enumerate(found) if result.ok]
+    offered = sum(result.source_points for result in found)
+    if 2 * len(good) <= len(found):
+        reason = next(result.reason for result in found if not result.ok)
+        return failed(prior.pose, offered, reason), prior
+    parts = [found[k] for k in good]
+    base = parts[len(parts) // 2].T_world_lidar
+    off = np.stack([se3.log(se3.relative(base, part.T_world_lidar)) for part in parts])
+
+    def at(times: Floats) -> Floats:
+        return np.asarray(base @ se3.exp(line_weights(middles[good], times) @ off))
+
+    sweep = replace(prior, poses=se3.normalise(at(prior.times) @ se3.relative(prior.pose, prior.poses)))
+    pose = se3.normalise(at(np.zeros(1))[0])
+    shares = line_weights(middles[good], np.zeros(1))[0]
+    located = replace(
+        parts[len(parts) // 2], T_world_lidar=pose, covariance=_combined(parts, shares), source_points=offered,
+        matched=sum(part.matched for part in parts), inliers=sum(part.inliers for part in parts),
+        iterations=sum(result.iterations for result in found), converged=all(part.converged for part in parts),
+        rmse=float(np.sqrt(np.mean([part.rmse**2 for part in parts]))), prior_error=correction(prior.pose, pose),
+        posed_by=next((part.posed_by for part in parts if part.posed_by), ""),
+        degenerate=min((part.degenerate for part in parts), key=len),
+    )  # fmt: skip
+    return located, sweep
+
+
+def line_weights(at: Floats, times: Floats) -> Floats:
+    """(T, N) what each of the values at the times `at` (N,), s, counts in the line through them at `times` (T,), s."""
+    off = at - at.mean()
+    return np.asarray(1.0 / len(at) + TRUST * np.outer(times - at.mean(), off) / (off @ off))
+
+
+def _combined(parts: list[RegistrationResult], shares: Floats) -> Floats | None:
+    """Covariance (6, 6) of the sum of independent poses that count by `shares`; None where one has none."""
+    known = [part.covariance for part in parts if part.covariance is not None]
+    if len(known) < len(parts):
+        return None
+    return np.asarray(np.einsum("k,kij->ij", shares**2, np.stack(known)))
