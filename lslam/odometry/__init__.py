@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from enum import StrEnum
 from typing import TYPE_CHECKING, cast
 
+from lslam.config.odometry import TIGHTLY_COUPLED
 from lslam.plugins import factory, known, require
 
 if TYPE_CHECKING:
@@ -56,6 +59,40 @@ METHODS = {
 
 # Those whose scans have features, and so a feature map to write.
 FEATURE_METHODS = ("loam-odom", "loam", "floam", "lego-loam", "loam-livox")
+# They predict by themselves whatever the IMU says, or have nothing to predict.
+LIDAR_ONLY = ("kiss-icp", "poses")
+# Of other people, to compare with.
+BASELINES = ("kiss-icp", "small-gicp", "open3d-gicp")
+
+
+class Coupling(StrEnum):
+    """What a method does with an IMU."""
+
+    LOOSE = "loose"
+    TIGHT = "tight"
+    NONE = "none"
+
+
+@dataclass(frozen=True)
+class Method:
+    """A method as people choose it; is_baseline : it is a package of other people."""
+
+    name: str
+    summary: str
+    coupling: Coupling
+    is_baseline: bool = False
+
+
+def coupling_of(method: str) -> Coupling:
+    """What the method does with an IMU; those of other packages are predicted by it."""
+    if method in TIGHTLY_COUPLED:
+        return Coupling.TIGHT
+    return Coupling.NONE if method in LIDAR_ONLY else Coupling.LOOSE
+
+
+def listed_methods() -> list[Method]:
+    """All methods in the order of the table, those of other packages last."""
+    return [Method(name, said, coupling_of(name), name in BASELINES) for name, said in known_methods().items()]
 
 
 def known_methods() -> dict[str, str]:

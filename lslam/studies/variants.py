@@ -14,7 +14,7 @@ from lslam.config import Config, load_config
 from lslam.config.load import known_presets
 from lslam.config.study import Point, StudyConfig
 from lslam.errors import ConfigError, UsageError, nearest
-from lslam.odometry import known_methods
+from lslam.odometry import Coupling, coupling_of, known_methods
 from lslam.pipeline.check import check_config
 from lslam.printable import file_safe
 
@@ -22,8 +22,6 @@ log = logging.getLogger("lslam")
 
 Imu = Literal["off", "on", "both"]
 WITH_IMU = "+imu"
-# They predict by themselves whatever the IMU says: run with it they would be the same run twice.
-PREDICT_THEMSELVES = ("kiss-icp",)
 # Methods that bring their own preprocessing and so never draw by `preprocess.seed`.
 DRAW_NOTHING = ("kiss-icp", "small-gicp", "open3d-gicp", "loam-odom", "loam", "floam", "lego-loam")
 
@@ -71,7 +69,7 @@ def find_variants(
     """One variant per name of a method, name of a preset or TOML file, over the configuration that the others make.
 
     imu : `both` makes two of each, the second with the IMU and named `icp+imu`; `on` only that one, `off` only the other;
-        None leaves it to the configuration
+        None leaves it to the configuration. A tightly coupled method is one variant by its own name, with the IMU always
 
     Raises UsageError for an empty list, an unknown name (with the nearest one) or a name given twice, ConfigError and
     InputError as `load_config`.
@@ -88,11 +86,18 @@ def find_variants(
         if label in labels:
             raise UsageError(f"--methods names {label!r} twice")
         labels.add(label)
-        for uses in {"off": (False,), "on": (True,), "both": (False, True), None: (None,)}[imu]:
+        wanted: tuple[bool | None, ...] = {"off": (False,), "on": (True,), "both": (False, True), None: (None,)}[imu]
+        for uses in wanted:
             more = [] if uses is None else [f"imu.use={str(uses).lower()}"]
             config = load_config(path, [*settings, setting, *more])
             check_config(config)
-            if uses and config.odometry.method in PREDICT_THEMSELVES and imu == "both":
+            coupling = coupling_of(config.odometry.method)
+            if coupling is Coupling.TIGHT:
+                if uses is False:
+                    log.info("%s is an estimate of points and IMU: it runs with the IMU only", label)
+                variants.append(Variant(label, config, label))
+                break
+            if uses and coupling is Coupling.NONE and imu == "both":
                 log.info("%s predicts by itself: it runs without the IMU only", label)
                 continue
             called = label + WITH_IMU if uses else label

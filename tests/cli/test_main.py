@@ -9,9 +9,11 @@ import tomllib
 from pathlib import Path
 
 import pytest
-from calling import COMMAND, assert_one_sentence, environment, lslam, lslam_process
+from calling import COMMAND, assert_one_sentence, environment, lslam, lslam_process, strict_json
 
 from lslam.cli.main import COMMANDS
+from lslam.config.odometry import TIGHTLY_COUPLED
+from lslam.odometry import METHODS
 
 
 def test_help_is_instant_and_imports_nothing_heavy() -> None:
@@ -68,9 +70,20 @@ def test_completion_completes() -> None:
 def test_methods_are_listed() -> None:
     done = lslam("methods")
     assert (done.returncode, done.stderr) == (0, "")
-    names = [line.split()[0] for line in done.stdout.splitlines()]
-    assert names[0] == "icp", "the default comes first"
-    assert {"gicp", "loam", "floam", "lego-loam", "kiss-icp", "small-gicp"} < set(names)
+    groups = {
+        lines[0]: [line.split()[0] for line in lines[1:]]
+        for lines in (part.splitlines() for part in done.stdout.split("\n\n"))
+    }
+    loose, tight, baselines, given = groups.values()
+    assert loose[0] == "icp", "the default comes first"
+    assert {"gicp", "loam", "floam", "lego-loam"} < set(loose)
+    assert tight == list(TIGHTLY_COUPLED)
+    assert "kiss-icp" in baselines
+    assert given == ["poses"]
+    listed = {each["name"]: each for each in strict_json(lslam("methods", "--json").stdout)["methods"]}
+    assert set(listed) == set(METHODS)
+    assert (listed["kiss-icp"]["coupling"], listed["kiss-icp"]["is_baseline"]) == ("none", True)
+    assert (listed["fast-lio2"]["coupling"], listed["fast-lio2"]["is_baseline"]) == ("tight", False)
 
 
 def test_config_show_can_be_checked_and_shown_again(tmp_path: Path) -> None:

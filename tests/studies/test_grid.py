@@ -81,6 +81,9 @@ def test_both_makes_two_of_each_method_and_one_of_what_ignores_the_imu() -> None
         ("thesis-icp+imu", True, "thesis-icp"),
     ]  # fmt: skip
     assert [v.name for v in find_variants(("icp", "kiss-icp"), imu="on")] == ["icp+imu", "kiss-icp+imu"]
+    for imu in ("both", "on", "off", None):
+        (tight,) = find_variants(("fast-lio2",), imu=imu)
+        assert (tight.name, tight.config.imu.use, tight.without) == ("fast-lio2", True, ""), "with the IMU, once"
     (without,) = find_variants(("icp",), None, ["imu.use=true"], imu="off")
     assert (without.name, without.config.imu.use) == ("icp", False)
     with pytest.raises(UsageError, match="twice"):
