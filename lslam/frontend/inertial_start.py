@@ -20,7 +20,7 @@ from lslam.frontend.state_classes import STATE_CLASSES
 from lslam.frontend.tracker import Tracker
 from lslam.inertial import fusion
 from lslam.inertial.fusion import InertialMotion
-from lslam.inertial.imu_cleaning import ImuRefusedError
+from lslam.inertial.imu_cleaning import LEAST_RATE_HZ, ImuRefusedError, rate_of
 from lslam.inertial.initialise import FirstPoses, InertialStart, start
 from lslam.odometry import create_odometry
 from lslam.readers.selection import Selection, select
@@ -53,7 +53,7 @@ def warm_up() -> None:
 def begin_inertial(sequence: Sequence, config: Config) -> Inertial:
     """Check and align the sequence's IMU; a refused one leaves the run to constant velocity.
 
-    Raises InputError when the sequence has no IMU, or a refused one and a tightly coupled method.
+    Raises InputError when the sequence has no IMU, or a refused or slow one and a tightly coupled method.
     """
     is_needed = config.odometry.method in TIGHTLY_COUPLED
     if sequence.imu is None:
@@ -61,6 +61,8 @@ def begin_inertial(sequence: Sequence, config: Config) -> Inertial:
             f"{sequence.path} has no IMU: name its file with `imu` in sequence.toml, or run without --imu, by a method that "
             "needs none"
         )
+    if is_needed:
+        _require_rate(sequence, sequence.imu, config.odometry.method)
     part = Inertial(None)
     T_lidar_imu = sequence.calibration.T_lidar_imu
     if T_lidar_imu is None:
@@ -80,6 +82,17 @@ def begin_inertial(sequence: Sequence, config: Config) -> Inertial:
     for note in part.notes:
         log.info("%s", note)
     return part
+
+
+def _require_rate(sequence: Sequence, imu: ImuStream, method: str) -> None:
+    """Raise InputError for an IMU that a filter cannot propagate within a sweep."""
+    rate = rate_of(imu)
+    if 0 < rate < LEAST_RATE_HZ:
+        extract = ", or take KITTI's `_extract` drive (100 Hz)" if sequence.kind.startswith("kitti") else ""
+        raise InputError(
+            f"{sequence.path}: {method} is tightly coupled and needs an IMU of {LEAST_RATE_HZ:.0f} Hz or more, this one has "
+            f"{rate:.1f} Hz: run a loosely coupled method with it (--method icp --imu){extract}"
+        )
 
 
 def save_start(path: Path, part: Inertial) -> None:

@@ -46,7 +46,7 @@ class Cleaned:
     @property
     def rate_hz(self) -> float:
         """Samples per second."""
-        return 1e9 / float(np.median(np.diff(self.imu.stamps_ns)))
+        return rate_of(self.imu)
 
 
 def clean(imu: ImuStream, first_ns: int, last_ns: int) -> Cleaned:
@@ -72,10 +72,17 @@ def clean(imu: ImuStream, first_ns: int, last_ns: int) -> Cleaned:
     cleaned = Cleaned(ImuStream(imu.stamps_ns, accel, imu.gyro), notes)
     if cleaned.rate_hz < LEAST_RATE_HZ:
         notes.append(
-            f"IMU at {cleaned.rate_hz:.0f} Hz: it predicts the motion from scan to scan, but is too slow to see shaking "
-            "within a scan"
+            f"IMU at {cleaned.rate_hz:.0f} Hz, which degrades what it is good for: it predicts the motion from scan to scan, "
+            f"but is too slow to see shaking within a scan ({LEAST_RATE_HZ:.0f} Hz would do)"
         )
     return cleaned
+
+
+def rate_of(imu: ImuStream) -> float:
+    """Samples per second; 0 for a stream whose time stands."""
+    steps = np.diff(imu.stamps_ns)
+    forward = steps[steps > 0]
+    return 1e9 / float(np.median(forward)) if len(forward) else 0.0
 
 
 def gravity_unit(imu: ImuStream) -> tuple[float, str | None]:

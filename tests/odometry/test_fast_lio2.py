@@ -79,6 +79,19 @@ def test_a_refused_imu_ends_the_run() -> None:
         lslam.run(replace(sequence, imu=no_gravity), config_of("fast-lio2"))
 
 
+def test_an_imu_that_is_too_slow_for_a_filter_ends_the_run_before_anything_is_registered() -> None:
+    """KITTI's raw drives have 10 Hz; loosely coupled it is used, and said to be slow."""
+    sequence = replace(walk(15), reads=[])
+    assert isinstance(sequence.imu, ImuStream)
+    slow = ImuStream(sequence.imu.stamps_ns[::10], sequence.imu.accel[::10], sequence.imu.gyro[::10])
+    sequence = replace(sequence, imu=slow, kind="kitti-raw")
+    with pytest.raises(InputError, match=r"an IMU of 50 Hz or more, this one has 10\.0 Hz: run a loosely .*`_extract`"):
+        lslam.run(sequence, config_of("fast-lio2"))
+    assert set(sequence.reads) <= {0}
+    notes = lslam.run(sequence, config_of("icp", "imu.use=true")).record.manifest["imu"]["decisions"]
+    assert any("10 Hz, which degrades" in note for note in notes)
+
+
 def test_a_run_goes_on_where_it_was(tmp_path: Path) -> None:
     """The states of the filter are part of the checkpoint; see `tests/frontend/test_resumable_state.py`."""
     from lslam.formats.state_files import read_state, write_state
