@@ -11,19 +11,22 @@ from numpy.typing import NDArray
 
 from lslam.errors import UsageError
 from lslam.simulation import path as paths
+from lslam.simulation.aerobatics import EightFlight, eight_flight
 from lslam.simulation.carpark import build_carpark
 from lslam.simulation.city import City, build_city
 from lslam.simulation.countryside import build_corridor, build_motorway, build_woods
 from lslam.simulation.curve import RouteCurve, stretched
 from lslam.simulation.flight import FreePath, buffeting, climb_spline, fly, gait
+from lslam.simulation.hall import build_hall
 from lslam.simulation.kinematics import PosePath
 from lslam.simulation.lidar import RayScene
 from lslam.simulation.moving import Mover, add_traffic
 from lslam.simulation.osm_city import OsmCity
 from lslam.simulation.osm_place import MapExtract, city_of_map, keep_out_of_walls, route_in_map
 from lslam.simulation.routes import SPARE, TIGHTEST, Route, given_route, own_route, speed_profile
-from lslam.simulation.scenario_files import Scenario
+from lslam.simulation.scenario_files import INDOORS, Scenario
 from lslam.simulation.scene_mesh import Surface
+from lslam.simulation.stairwell import build_stairwell
 from lslam.simulation.terrain import Terrain, rolling
 from lslam.simulation.town import build_town
 from lslam.simulation.waypoints import WayPoints
@@ -38,7 +41,7 @@ class BuiltScenario:
     """A built scenario: the city, the path of the LiDAR through it, and how many scans it gives."""
 
     city: City
-    path: paths.VehiclePath | FreePath
+    path: paths.VehiclePath | FreePath | EightFlight
     scans: int
 
 
@@ -56,6 +59,10 @@ def build_scenario(
     own line, `extract` its town; `standing` of the `count` scans pass before it moves off. Raises UsageError for bends too
     tight and more scans than fit, InputError for an extract that is far from the way-points.
     """
+    if scenario.world.kind in INDOORS and (way_points is not None or extract is not None):
+        raise UsageError(
+            f"scenario {scenario.name!r} has a line of its own in a {scenario.world.kind}: leave out --path and --osm"
+        )
     place, build, shake = (np.random.default_rng([seed, 2**32 - k]) for k in (1, 2, 3))
     if extract is not None:
         route = route_in_map(scenario, extract, way_points)
@@ -113,6 +120,10 @@ def _city(scenario: Scenario, street: RouteCurve, terrain: Terrain, rng: np.rand
         return build_woods(stretched(street, SPARE), terrain, scenario.layout, rng)
     if world.kind == "carpark":
         return build_carpark(street, terrain, scenario.layout, world.roughness, rng)
+    if world.kind == "hall":
+        return build_hall(street, terrain, rng)
+    if world.kind == "stairwell":
+        return build_stairwell(street, terrain, rng)
     return build_town([stretched(street, SPARE)], terrain, scenario.layout, rng, world.spacing, world.levels)
 
 
@@ -125,13 +136,13 @@ def _check_radius(scenario: Scenario, line: RouteCurve) -> None:
             f"the path bends with a radius of {1 / abs(curvature[worst]):.1f} m at {s[worst]:.0f} m along, a "
             f"{scenario.carrier} needs {least:g} m: use way-points farther apart or more --set path.smoothing"
         )
-    if scenario.carrier == "drone":
+    if scenario.carrier == "drone" and scenario.path.shape != "eights":
         check_bends(curvature, s, scenario.speed, scenario.lateral)
 
 
 def _move(
     scenario: Scenario, route: Route, terrain: Terrain, count: int | None, standing: int, rng: np.random.Generator
-) -> tuple[paths.VehiclePath | FreePath, int]:
+) -> tuple[paths.VehiclePath | FreePath | EightFlight, int]:
     """The path, and how many scans there are: `count`, or one lap, or all that fit on an open line."""
     line, rate = route.line, scenario.rate_hz
     distance = line.length
@@ -156,8 +167,12 @@ def _move(
 
 def _carried(
     scenario: Scenario, route: Route, terrain: Terrain, distance: float, rng: np.random.Generator
-) -> paths.VehiclePath | FreePath:
+) -> paths.VehiclePath | FreePath | EightFlight:
     line, section = route.line, scenario.path
+    if section.shape == "eights":
+        above = line.position(np.array([0.5 * line.length]))[0]
+        swing = buffeting(rng, section.swing)
+        return eight_flight(rng, np.array([*above, section.heights[0]]), scenario.speed, scenario.lateral, swing)
     profile = speed_profile(scenario)
     if scenario.carrier == "car":
         return paths.drive(line, terrain, profile, distance, scenario.lidar_height, paths.suspension(rng))

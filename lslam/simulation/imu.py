@@ -46,6 +46,7 @@ class ImuModel:
     """A kind of IMU; the default has no errors.
 
     jitter : standard deviation of what stamps say over when a reading was taken, s; within 0.45 of a period
+    late : standard deviation of when a reading is taken over what its stamp, which is nominal, says, s; of any size
     """
 
     name: str
@@ -53,6 +54,7 @@ class ImuModel:
     gyro: Triad = field(default_factory=Triad)
     rate_hz: float = 100.0
     jitter: float = 0.0
+    late: float = 0.0
 
 
 class ImuFaults(Section):
@@ -95,6 +97,18 @@ class SimulatedImu:
 _ICM_ACCEL = Triad(19.62, 0.000598754, 0.4905, 2.0, 0.0022563, 2e-4)
 _ICM_GYRO = Triad(4.36332313, 0.000133231, 0.087266462, 2.0, 0.000261799, 4e-6)
 
+
+def _times_ten(triad: Triad, limit: float) -> Triad:
+    """`triad` with ten times its biases, constant and walking, and 16 bits over another range."""
+    return replace(triad, limit=limit, step=limit / 2**15, bias=10 * triad.bias, bias_walk=10 * triad.bias_walk)
+
+
+# A phone's: 8 g, 500 deg/s and ten times the biases. An application reads when the system lets it and notes when it should
+# have: the stamps are the nominal ones. 5 ms is half a period: stamps that were as wrong would overtake each other, and what
+# a reader of the recording drops for that would no longer count.
+_PHONE_ACCEL, _PHONE_GYRO = _times_ten(_ICM_ACCEL, 8 * GRAVITY), _times_ten(_ICM_GYRO, float(np.radians(500)))
+_PHONE = ImuModel("phone", _PHONE_ACCEL, _PHONE_GYRO, late=5e-3)
+
 IMUS = {
     model.name: model
     for model in (
@@ -104,6 +118,14 @@ IMUS = {
             "icm20948-calibrated",
             Triad(19.62, 0.000598754, 0.0, 0.0, 0.0022563, 2e-4),
             Triad(4.36332313, 0.000133231, 0.0, 0.0, 0.000261799, 4e-6),
+        ),
+        _PHONE,
+        # As the system of a phone hands it out, which takes out what it saw while the phone lay.
+        replace(
+            _PHONE,
+            name="phone-calibrated",
+            accel=replace(_PHONE_ACCEL, bias=0.0, misalignment=0.0),
+            gyro=replace(_PHONE_GYRO, bias=0.0, misalignment=0.0),
         ),
         ImuModel("ideal"),
     )
@@ -126,10 +148,13 @@ def simulate_imu(
     """
     count = int(np.floor(end * model.rate_hz + 1e-6)) + 1
     stamps = np.round(np.arange(count) * (1e9 / model.rate_hz)).astype(np.int64)
-    truth = motion.at(stamps / 1e9).carried(T_lidar_imu)
+    truth = felt = motion.at(stamps / 1e9).carried(T_lidar_imu)
+    if model.late > 0:
+        taken = stamps / 1e9 + model.late * rng.spawn(1)[0].standard_normal(count)
+        felt = motion.at(np.clip(taken, 0.0, motion.duration)).carried(T_lidar_imu)
     noise = rng.standard_normal((count, 4, 3))
-    accel, accel_bias = measure(model.accel, specific_force(truth), noise[:, :2], model.rate_hz)
-    gyro, gyro_bias = measure(model.gyro, truth.rate, noise[:, 2:], model.rate_hz)
+    accel, accel_bias = measure(model.accel, specific_force(felt), noise[:, :2], model.rate_hz)
+    gyro, gyro_bias = measure(model.gyro, felt.rate, noise[:, 2:], model.rate_hz)
     if model.jitter > 0:
         # Drawn last, so that readings are those of an IMU without it; the first stamp stays, where the recording begins.
         late = np.clip(rng.standard_normal(count) * model.jitter, -0.45 / model.rate_hz, 0.45 / model.rate_hz)

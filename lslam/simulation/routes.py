@@ -11,6 +11,7 @@ from lslam.errors import UsageError
 from lslam.simulation.curve import RouteCurve, rounded_rectangle, smooth_curve, winding_line
 from lslam.simulation.path import SpeedProfile, drive, suspension
 from lslam.simulation.scenario_files import SHAPES, Scenario, out_and_back
+from lslam.simulation.stairwell import stairs_line
 from lslam.simulation.terrain import flat
 from lslam.simulation.waypoints import WayPoints
 
@@ -18,6 +19,7 @@ Floats = NDArray[np.float64]
 
 SPARE = 60.0  # m of street before the start and after the end of an open line
 TURN = 6.0  # m, radius of the U-turn of an out-and-back: a car on full lock
+HALL = 46.0  # m that eights are flown in, when no length is given
 HOLD = 5.0  # s at full speed on each of its straights, at least
 LONGEST = 3000.0  # m that many scans make of it: the fine ground beside it must fit into memory
 TIGHTEST = {"car": 3.0, "drone": 1.0, "walker": 0.3}  # m, radius of a bend
@@ -46,6 +48,12 @@ def own_route(scenario: Scenario, rng: np.random.Generator, scans: int | None = 
         return _street(rng)
     if path.shape == "out-and-back":
         return _out_and_back(scenario, scans)
+    if path.shape == "stairs":
+        line, climb = stairs_line(path.heights[0])
+        return Route(line, line, climb)
+    if path.shape == "eights":
+        line = smooth_curve(np.array([[0.0, 0.0], [path.length or HALL, 0.0]]), closed=False)
+        return Route(line, line)
     shape, closed = SHAPES[path.shape]
     points = shape(rng)
     climb = path.heights[1] - path.heights[0] if scenario.carrier == "drone" else 0.0

@@ -136,9 +136,11 @@ SHAPES: dict[str, tuple[Shape, bool]] = {
 
 
 FOLDER = "ready"
-# `block` and `street` draw their lines from the seed, `out-and-back` is as long as speed and scans need; the other shapes are
-# way-points.
-LINES = ("block", "street", "out-and-back", *SHAPES)
+# `block` and `street` draw their lines from the seed, `out-and-back` is as long as speed and scans need, `stairs` leads through
+# a stairwell and `eights` round the middle of a hall; the other shapes are way-points.
+LINES = ("block", "street", "out-and-back", "stairs", "eights", *SHAPES)
+# Places that are built round a line of their own.
+INDOORS = {"stairwell": "stairs", "hall": "eights"}
 
 
 class PathSection(Section):
@@ -169,7 +171,7 @@ class WorldSection(Section):
     roughness : standard deviation of the surface itself, m, of a car park
     """
 
-    kind: Literal["street", "town", "motorway", "corridor", "carpark", "woods"] = "town"
+    kind: Literal["street", "town", "motorway", "corridor", "carpark", "woods", "hall", "stairwell"] = "town"
     spacing: float = Field(80.0, ge=30, le=1000)
     levels: int = Field(1, ge=0, le=3)
     relief: float = Field(0.35, ge=0, le=20)
@@ -201,9 +203,10 @@ class TrafficSection(Section):
 class Scenario(Section):
     """A kind of place and a way to move through it.
 
-    carrier : what carries the LiDAR; speed, start_speed : m/s; lateral : greatest acceleration in bends, m/s2, to which a car
-    and a walker slow down and which a drone must not exceed; roof : m behind, ahead, aside and below the LiDAR that the car's
-    own roof takes up, or nothing; roof_returns : whether the roof is seen, or what it is in the way of is only missing
+    carrier : what carries the LiDAR; speed, start_speed : m/s, the latter of a drone nothing or all; lateral : greatest
+        acceleration in bends, m/s2, to which a car and a walker slow down and which a drone must not exceed, of eights the
+        greatest thrust; roof : m behind, ahead, aside and below the LiDAR that the car's own roof takes up, or nothing;
+        roof_returns : whether the roof is seen, or what it is in the way of is only missing
     overlap : distance beyond one lap of a closed line, m
     """
 
@@ -214,7 +217,7 @@ class Scenario(Section):
     lidar_height: float = Field(1.73, gt=0.3, le=10)
     speed: float = Field(gt=0, le=40)
     start_speed: float = Field(ge=0, le=40)
-    lateral: float = Field(2.5, gt=0, le=30)
+    lateral: float = Field(2.5, gt=0, le=60)
     roof: tuple[float, float, float, float] | None = None
     roof_returns: bool = False
     rate_hz: float = Field(10.0, ge=1, le=100)
@@ -237,6 +240,12 @@ class Scenario(Section):
     def _names_are_known(self) -> Scenario:
         if self.path.shape not in LINES:
             raise ValueError(f"path.shape = {self.path.shape!r}; {nearest(self.path.shape, LINES)}")
+        shape, own = self.path.shape, INDOORS.get(self.world.kind)
+        if (own or shape) != shape or (own is None and shape in INDOORS.values()):
+            expected = own or next(kind for kind, line in INDOORS.items() if line == shape)
+            raise ValueError(
+                f"path.shape = {shape!r} in a world.kind = {self.world.kind!r}: expected {expected!r} there"
+            )
         if self.lidar not in LIDARS:
             raise ValueError(f"lidar = {self.lidar!r}; {nearest(self.lidar, LIDARS)}")
         if self.carrier != "drone" and min(self.path.heights) < 0.3:

@@ -165,7 +165,7 @@ def simulate(
     model = lidar_named(model) if isinstance(model, str) else model
     cruise = chosen.speed if speed is None else speed
     begin = (
-        (cruise if chosen.carrier == "drone" else min(chosen.start_speed, cruise))
+        (cruise if chosen.carrier == "drone" and chosen.start_speed else min(chosen.start_speed, cruise))
         if start_speed is None
         else start_speed
     )

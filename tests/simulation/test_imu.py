@@ -14,6 +14,7 @@ from lslam.simulation.imu import (
     GRAVITY,
     IMUS,
     T_CAR_IMU,
+    T_OUSTER_IMU,
     ImuModel,
     SimulatedImu,
     Triad,
@@ -71,6 +72,13 @@ def test_integrated_at_1_khz_it_reproduces_a_minute_of_the_path(laps: SimulatedD
     metres, degrees = drift(laps.vehicle, 1000)
     assert metres < 0.02
     assert degrees < 0.01
+
+
+@pytest.mark.parametrize("scenario", ["quadrotor", "stairs"])
+def test_it_reproduces_violent_and_narrow_ways(scenario: str) -> None:
+    metres, degrees = drift(simulate(scenario, lidar="vlp16").vehicle, 1000, 14.0)
+    assert metres < 0.02
+    assert degrees < 0.02
 
 
 def test_error_falls_by_four_when_the_step_halves(laps: SimulatedDrive) -> None:
@@ -203,6 +211,43 @@ def test_the_icm_keeps_to_its_range_and_bits(laps: SimulatedDrive) -> None:
         assert np.abs(readings).max() <= triad.limit
         inside = readings[np.abs(readings) < triad.limit] / triad.step
         np.testing.assert_allclose(inside, np.round(inside), atol=1e-6)
+
+
+def test_a_phone_has_ten_times_the_biases_and_takes_its_readings_late() -> None:
+    """A reading at the wrong time is off by the jerk, and by that of the turn, times how late it is."""
+    for name, calibrated in (("phone", False), ("phone-calibrated", True)):
+        phone = IMUS[name]
+        for triad, icm in ((phone.accel, ICM.accel), (phone.gyro, ICM.gyro)):
+            assert triad.bias == (0.0 if calibrated else pytest.approx(10 * icm.bias))
+            assert triad.bias_walk == pytest.approx(10 * icm.bias_walk)
+            assert triad.noise_density == icm.noise_density
+        assert phone.accel.limit == pytest.approx(8 * GRAVITY)
+        assert np.degrees(phone.gyro.limit) == pytest.approx(500)
+    motion = simulate("quadrotor", lidar="vlp16").vehicle
+    exact, late = (read(motion, replace(IDEAL, late=seconds), 14.0) for seconds in (0.0, 0.005))
+    np.testing.assert_array_equal(late.stream.stamps_ns, exact.stream.stamps_ns)
+    np.testing.assert_array_equal(late.truth.poses, exact.truth.poses)
+    off = late.stream.gyro - exact.stream.gyro
+    assert np.std(off[500:]) == pytest.approx(0.005 * np.std(exact.truth.rate_change[500:]), rel=0.1)
+    assert np.abs(np.mean(off)) < 0.1 * np.std(off)
+    longer = read(motion, replace(ICM, late=0.005), 14.0).stream
+    np.testing.assert_array_equal(read(motion, replace(ICM, late=0.005), 9.0).stream.gyro[:1], longer.gyro[:1])
+
+
+def test_what_is_beyond_the_range_reads_as_its_end() -> None:
+    """The flight feels 5 g and turns at 400 deg/s: an ICM-20948 stops at 2 g and 250, a phone reaches."""
+    motion = simulate("quadrotor", lidar="vlp16").vehicle
+    stuck = {}
+    for model in (ICM, IMUS["phone"]):
+        felt = simulate_imu(motion, model, T_OUSTER_IMU, 14.0, np.random.default_rng(0))
+        assert np.abs(felt.stream.accel).max() <= model.accel.limit
+        stuck[model.name] = [
+            np.mean(np.abs(values[500:]).max(axis=1) >= triad.limit)
+            for values, triad in ((felt.stream.accel, model.accel), (felt.stream.gyro, model.gyro))
+        ]
+    assert stuck["icm20948"][0] > 0.5
+    assert stuck["icm20948"][1] > 0.05
+    assert stuck["phone"][0] == 0.0
 
 
 def test_same_seed_same_readings_and_more_time_only_adds(laps: SimulatedDrive) -> None:

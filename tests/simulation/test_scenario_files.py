@@ -84,12 +84,13 @@ def test_residential_is_as_long_as_kitti_07() -> None:
 def test_every_scenario_says_what_it_is() -> None:
     names = scenario_names()
     drives = {"block", "street", "residential", "urban", "motorway", "corridor", "identical", "walk", "carpark"}
-    assert {*FLIGHTS, *drives} <= set(names)
+    assert {*FLIGHTS, *drives, "quadrotor", "stairs"} <= set(names)
     for name in names:
         scenario = scenario_named(name)
         assert scenario.name == name
         assert scenario.summary.endswith(".")
-        assert scenario.motion_compensated == (scenario.carrier == "drone" or name in ("block", "street"))
+        flown = scenario.carrier == "drone" and scenario.world.kind == "town"
+        assert scenario.motion_compensated == (flown or name in ("block", "street"))
 
 
 def test_settings_change_one_thing() -> None:
