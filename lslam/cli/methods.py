@@ -11,7 +11,7 @@ import click
 from lslam.cli import options
 
 if TYPE_CHECKING:
-    from lslam.odometry import Method
+    from lslam.odometry import ListedMethod
 
 BASELINES, FOREIGN = "Baselines, of other packages", "Registered by other packages"
 
@@ -27,7 +27,7 @@ def command(as_json: bool) -> None:
         click.echo(json.dumps({"methods": [asdict(method) for method in methods]}, indent=1))
         return
     width = max(len(method.name) for method in methods)
-    groups: dict[str, list[Method]] = {}
+    groups: dict[str, list[ListedMethod]] = {}
     for method in methods:
         groups.setdefault(_group(method), []).append(method)
     for k, (title, group) in enumerate(groups.items()):
@@ -36,7 +36,7 @@ def command(as_json: bool) -> None:
             click.echo(f"  {method.name:<{width}}  {method.summary}")
 
 
-def _group(method: Method) -> str:
+def _group(method: ListedMethod) -> str:
     from lslam.odometry import METHODS, Coupling
 
     if method.name not in METHODS:

@@ -74,7 +74,7 @@ class Coupling(StrEnum):
 
 
 @dataclass(frozen=True)
-class Method:
+class ListedMethod:
     """A method as people choose it; is_baseline : it is a package of other people."""
 
     name: str
@@ -90,9 +90,9 @@ def coupling_of(method: str) -> Coupling:
     return Coupling.NONE if method in LIDAR_ONLY else Coupling.LOOSE
 
 
-def listed_methods() -> list[Method]:
+def listed_methods() -> list[ListedMethod]:
     """All methods in the order of the table, those of other packages last."""
-    return [Method(name, said, coupling_of(name), name in BASELINES) for name, said in known_methods().items()]
+    return [ListedMethod(name, said, coupling_of(name), name in BASELINES) for name, said in known_methods().items()]
 
 
 def known_methods() -> dict[str, str]:
