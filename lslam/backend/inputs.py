@@ -25,6 +25,10 @@ CELLS, ROUGHNESS = 80, 0.15
 STEEPEST = np.deg2rad(10.0)
 # m; a floor farther from the usual height below the sensor is a roof or a hole (height_clip_range there).
 CLIP_M = 1.0
+# Largest difference of two measurements of one flat floor, m and rad.
+NOISE_M, NOISE_RAD = 0.05, np.deg2rad(0.5)
+# Least share of inliers: on hills a half or fewer, on flat streets nearly all.
+MOST = 0.8
 
 
 def up_directions(
@@ -64,12 +68,6 @@ def floor_planes(store: KeyframeStore, config: GraphConfig) -> list[FloorPlane]:
         planes.append(FloorPlane(keyframe.number, normal, -height, float(np.deg2rad(config.floor_deg)), config.floor_m))
     usual = float(np.median([p.offset for p in planes])) if planes else 0.0
     return [p for p in planes if abs(p.offset - usual) <= CLIP_M]
-
-
-# Largest difference of two measurements of one flat floor, m and rad.
-NOISE_M, NOISE_RAD = 0.05, np.deg2rad(0.5)
-# Least share of inliers: on hills a half or fewer, on flat streets nearly all.
-MOST = 0.8
 
 
 def on_one_plane(

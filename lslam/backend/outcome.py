@@ -35,6 +35,8 @@ _OF_WALLS = ("east_percent", "north_percent", "left_deg_per_100m")
 _OF_LOOPS = (
     "x_percent", "y_percent", "z_percent", "about_x_deg_per_100m", "about_y_deg_per_100m", "left_deg_per_100m"
 )  # fmt: skip
+# Keyframes before and after each end of the loop whose clouds are shown.
+AROUND = 10
 
 
 @dataclass(frozen=True)
@@ -227,10 +229,6 @@ def _drift_facts(drift: EstimatedDrift) -> dict[str, Any]:
     }
     told |= {"log_likelihood_gain": round(0.5 * drift.gain, 1), "gain_by_chance": round(0.5 * drift.chance, 1)}
     return {"wandering_drift" if drift.is_varying else "steady_drift": told}
-
-
-# Keyframes before and after each end of the loop whose clouds are shown.
-AROUND = 10
 
 
 def view_loop(record: RunRecord, done: BackEnd, store: KeyframeStore) -> LoopView | None:

@@ -20,6 +20,7 @@ from lslam.untrusted import is_file, parse_toml
 FOLDER = "presets"
 # A preset may say what it is, and on which other one it stands, on a line each beside its sections.
 SUMMARY, BASE = "summary", "base"
+Tree = dict[str, Any]
 
 
 def known_presets() -> dict[str, str]:
@@ -62,9 +63,6 @@ def _shipped() -> dict[str, str]:
         (f for f in (folder.iterdir() if folder.is_dir() else ()) if f.name.endswith(".toml")), key=lambda f: f.name
     )
     return {f.name.removesuffix(".toml"): f.read_text(encoding="utf-8") for f in files}
-
-
-Tree = dict[str, Any]
 
 
 def load_config(

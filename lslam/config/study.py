@@ -22,6 +22,8 @@ Point = dict[str, Value]
 _DIGITS = 12
 # Values of a range, and points of a grid: each is a run at least, and a study of more would never end.
 MOST_VALUES, MOST_POINTS = 10_000, 100_000
+# The errors that a study may be judged by.
+StudyMetric = Literal["ate_se3", "ate_origin", "thesis_rmse"]
 
 
 class Range(Section):
@@ -104,10 +106,6 @@ class StudySequence(ScanRange):
     def name(self) -> str:
         """What the user called it."""
         return self.path or self.scenario
-
-
-# The errors that a study may be judged by.
-StudyMetric = Literal["ate_se3", "ate_origin", "thesis_rmse"]
 
 
 class StudyConfig(Section):

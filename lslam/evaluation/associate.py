@@ -16,6 +16,11 @@ Stamps = NDArray[np.int64]
 LEAST = 3
 # Interpolation pays when truth has a pose at least every 0.6 estimate intervals, and stops at holes of 5 of its own.
 DENSER, HOLE = 0.6, 5
+LEAST_OVERLAP = 0.6  # of the shorter trajectory
+LEAST_SCORE = 0.8
+SAME_STAMPS_NS = 1_000_000
+WINDOW = 5
+AMBIGUOUS = 1.2
 
 
 @dataclass(frozen=True)
@@ -168,13 +173,6 @@ def _no_overlap(estimate: Trajectory, stamps: Stamps, truth: Trajectory, found: 
     else:
         way_out = "they share no time: try --time-offset auto (or seconds) if one clock is shifted"
     return f"only {found} poses match within {max_diff:g} s, {LEAST} are needed: {ranges}; {way_out}"
-
-
-LEAST_OVERLAP = 0.6  # of the shorter trajectory
-LEAST_SCORE = 0.8
-SAME_STAMPS_NS = 1_000_000
-WINDOW = 5
-AMBIGUOUS = 1.2
 
 
 def estimate_offset(estimate: Trajectory, truth: Trajectory) -> tuple[int, float]:

@@ -12,6 +12,17 @@ from numpy.typing import ArrayLike
 
 from lslam.types.study import Bools, Curve, Divergence, Floats, Interval, Optimum, StudyRow, Value
 
+# Everything else is registration: what Girolimetto's times per iteration hold (equation 5.2).
+NOT_REGISTRATION = ("read", "prepare", "standing", "keyframe", "integrity")
+# A run is lost when its error is that many times the best of the study ...
+LOST_FACTOR = 10.0
+# ... and more than Girolimetto takes for a result: its largest rmse that is one (LOAM, large eight) is 2.156 m.
+LOST_FLOOR_M = 2.2
+LEVEL = 0.95
+FLAT = 0.1  # what differs by less than a tenth is as good
+ELBOW = 1.5  # an error above so many times the plateau's is not on the plateau
+Rise = Literal["worse", "as good", "unknown"]
+
 
 def two_sided(level: float, freedom: ArrayLike) -> Floats:
     """Standard errors either way that hold the truth with confidence `level`, by Student's t of `freedom` degrees.
@@ -24,14 +35,6 @@ def two_sided(level: float, freedom: ArrayLike) -> Floats:
     from scipy.special import stdtrit
 
     return np.asarray(stdtrit(np.asarray(freedom, np.float64), 0.5 + level / 2), np.float64)
-
-
-# Everything else is registration: what Girolimetto's times per iteration hold (equation 5.2).
-NOT_REGISTRATION = ("read", "prepare", "standing", "keyframe", "integrity")
-# A run is lost when its error is that many times the best of the study ...
-LOST_FACTOR = 10.0
-# ... and more than Girolimetto takes for a result: its largest rmse that is one (LOAM, large eight) is 2.156 m.
-LOST_FLOOR_M = 2.2
 
 
 def lost_above(rows: Sequence[StudyRow]) -> float:
@@ -112,9 +115,6 @@ def _curve(rows: Sequence[StudyRow], limit: float) -> Curve:
     )
 
 
-LEVEL = 0.95
-
-
 def efficiency(translation: ArrayLike, angular: ArrayLike, seconds: ArrayLike) -> Floats:
     """1 / (translation rmse in m, angular rmse in deg, time in s); nan where one of them is not above 0 or unknown.
 
@@ -157,10 +157,6 @@ def over_seeds(table: Floats, level: float = LEVEL) -> Interval:
     std[several] = np.sqrt(squares[several] / (n[several] - 1))
     error[several] = std[several] / np.sqrt(n[several]) * two_sided(level, n[several] - 1)
     return Interval(mean, mean - error, mean + error, n, std)
-
-
-FLAT = 0.1  # what differs by less than a tenth is as good
-ELBOW = 1.5  # an error above so many times the plateau's is not on the plateau
 
 
 def divergence(curve: Curve) -> Divergence:
@@ -212,9 +208,6 @@ def elbow(values: Floats, errors: Floats, is_lost: Bools) -> float | None:
     bad = np.flatnonzero(~good)
     first = int(bad[-1]) + 1 if len(bad) else 0
     return float(values[first]) if first < len(values) else None
-
-
-Rise = Literal["worse", "as good", "unknown"]
 
 
 @dataclass(frozen=True)

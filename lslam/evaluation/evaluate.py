@@ -30,15 +30,7 @@ METRICS: tuple[TrajectoryMetric[Any], ...] = (
     Girolimetto(),
     DelTufo(),
 )
-
-
-def shown_metrics(evaluation: Evaluation) -> list[TrajectoryMetric[Any]]:
-    """Those that are always shown, and those of the words of `eval.metrics`."""
-    return [metric for metric in METRICS if not metric.word or metric.word in evaluation.shown]
-
-
 __all__ = ["Evaluation", "evaluate"]
-
 log = logging.getLogger("lslam")
 Floats = NDArray[np.float64]
 STRAIGHT = 0.01
@@ -49,6 +41,11 @@ UNITS = ((1 / 0.33, 1 / 0.28, "feet"), (67.0, 150.0, "cm"), (670.0, 1500.0, "mm"
 SPREAD = 5.0
 # Chi-square of three degrees of freedom that chance exceeds once in a million times.
 UNLIKELY = 30.7
+
+
+def shown_metrics(evaluation: Evaluation) -> list[TrajectoryMetric[Any]]:
+    """Those that are always shown, and those of the words of `eval.metrics`."""
+    return [metric for metric in METRICS if not metric.word or metric.word in evaluation.shown]
 
 
 def evaluate(

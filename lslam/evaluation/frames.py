@@ -19,6 +19,13 @@ Floats = NDArray[np.float64]
 R_BODY_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 STEADY = 0.8  # of the mean direction, from which a body counts as moving along one of its axes
 SAME_DEG = 30.0
+# Motions that are compared, at most, and how long they are at least: noise of poses counts less over more way.
+MOST, LEAST_M, LEAST_RAD = 300, 5.0, np.deg2rad(15.0)
+FEWEST = 6
+# One sigma of what odometry and truth disagree by in direction without any calibration to blame: drift to one side of a
+# percent of the way.
+DRIFT_RAD = 0.01
+ROUNDS, SCALE = 30, 1.345
 
 
 @dataclass
@@ -161,15 +168,6 @@ def _say_difference(out: Reconciled, way_out: str = "give", explained: str = "")
 def _turn(poses: Floats) -> Floats:
     C = se3.make(R_BODY_CAMERA, np.zeros(3))
     return np.asarray(C @ poses @ C.T)
-
-
-# Motions that are compared, at most, and how long they are at least: noise of poses counts less over more way.
-MOST, LEAST_M, LEAST_RAD = 300, 5.0, np.deg2rad(15.0)
-FEWEST = 6
-# One sigma of what odometry and truth disagree by in direction without any calibration to blame: drift to one side of a
-# percent of the way.
-DRIFT_RAD = 0.01
-ROUNDS, SCALE = 30, 1.345
 
 
 @dataclass(frozen=True)

@@ -36,6 +36,7 @@ RULES = {
     ("s", "consecutive"): "end to end, each with the later pose whose stamp is nearest `delta` later, within 10 %",
     ("s", "all"): "every pose with the later one whose stamp is nearest `delta` later, within 10 %",
 }
+Floats = NDArray[np.float64]
 
 
 def by_index(count: int, delta: int, all_pairs: bool) -> Pairs:
@@ -89,9 +90,6 @@ def _nearest(along: NDArray[np.float64], delta: float) -> Pairs:
         if off[best] <= tolerance:
             pairs.append((i, first + best))
     return np.array(pairs, np.int64).reshape(-1, 2)
-
-
-Floats = NDArray[np.float64]
 
 
 def relative_error(estimate: Floats, truth: Floats, seconds: Floats | None, recipe: str) -> RelativeError:

@@ -12,6 +12,8 @@ from lslam.evaluation.recipes import ALIGNMENTS
 
 # A path this short, m, is the rounding of poses that do not move.
 STANDS_M = 1e-3
+Floats = NDArray[np.float64]
+UNITS = {"scan": "scans", "m": "m", "s": "s"}
 
 
 @dataclass(frozen=True)
@@ -50,11 +52,6 @@ def percent_of_length(rmse: float, truth: NDArray[np.float64]) -> float:
     """An error, m, in % of the path of the poses `truth` (N, 4, 4); NaN for a sensor that stood still."""
     length = float(np.linalg.norm(np.diff(truth[:, :3, 3], axis=0), axis=1).sum())
     return 100 * rmse / length if length > STANDS_M else float("nan")
-
-
-Floats = NDArray[np.float64]
-
-UNITS = {"scan": "scans", "m": "m", "s": "s"}
 
 
 @dataclass(frozen=True)

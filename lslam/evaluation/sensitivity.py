@@ -36,6 +36,20 @@ _OF_TIME = ("time_per_scan", "total_time")
 _LAWS = ("linear", "inverse", "product")
 _OF_ERROR = ("diverges_beyond", "holds_up_to", "elbow_at", "good_from")
 _OF_WORDS = ("matters_little", "acts_only_on")
+_JUDGES: dict[str, Callable[[ExpectedFinding, CurveResult], Judged]] = {
+    "diverges_beyond": judge_diverges_beyond,
+    "holds_up_to": judge_holds_up_to,
+    "best_between": judge_best_between,
+    "largest_between": judge_largest_between,
+    "elbow_at": judge_elbow_at,
+    "good_from": judge_good_from,
+    "matters_little": judge_matters_little,
+    "linear": judge_law,
+    "inverse": judge_law,
+    "acts_only_on": judge_acts_only_on,
+}
+SKIP = "input.skip_frames"
+EFFICIENCIES = ("efficiency", "total_efficiency")
 
 
 def judge(finding: ExpectedFinding, results: Sequence[CurveResult], products: Mapping[str, Law]) -> FindingVerdict:
@@ -92,24 +106,6 @@ def _speaks_of(finding: ExpectedFinding, result: CurveResult) -> bool:
         and finding.imu in (None, curve.uses_imu)
         and all(dict(curve.at).get(key) == value for key, value in finding.at.items())
     )
-
-
-_JUDGES: dict[str, Callable[[ExpectedFinding, CurveResult], Judged]] = {
-    "diverges_beyond": judge_diverges_beyond,
-    "holds_up_to": judge_holds_up_to,
-    "best_between": judge_best_between,
-    "largest_between": judge_largest_between,
-    "elbow_at": judge_elbow_at,
-    "good_from": judge_good_from,
-    "matters_little": judge_matters_little,
-    "linear": judge_law,
-    "inverse": judge_law,
-    "acts_only_on": judge_acts_only_on,
-}
-
-
-SKIP = "input.skip_frames"
-EFFICIENCIES = ("efficiency", "total_efficiency")
 
 
 def evaluate_study(rows: Sequence[StudyRow], findings: Sequence[ExpectedFinding] = ()) -> list[StudyResult]:

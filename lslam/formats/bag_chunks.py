@@ -24,6 +24,11 @@ from lslam.remote import RemotePath
 BLOCK = 1 << 15
 # Blocks asked for together, and blocks kept: 2 and 8 MB.
 _AHEAD, _KEPT = 64, 256
+LARGEST = 1 << 29  # bytes of a compressed chunk or message when it is unpacked; recorders make a thousandth of it
+_BLOCK = 1 << 18  # compressed bytes read at a time when only the beginning of a chunk is wanted
+_HEAD = 1 << 12  # bytes that hold the headers of a record and of its message
+IN_FILE = -1  # chunk number of a message that lies in the file itself
+Pairs = NDArray[np.int64]
 
 
 class RangedFile:
@@ -97,14 +102,6 @@ def _runs(numbers: list[int]) -> list[tuple[int, int]]:
         else:
             runs.append((number, number + 1))
     return runs
-
-
-LARGEST = 1 << 29  # bytes of a compressed chunk or message when it is unpacked; recorders make a thousandth of it
-_BLOCK = 1 << 18  # compressed bytes read at a time when only the beginning of a chunk is wanted
-_HEAD = 1 << 12  # bytes that hold the headers of a record and of its message
-IN_FILE = -1  # chunk number of a message that lies in the file itself
-
-Pairs = NDArray[np.int64]
 
 
 class CutOffError(Exception):

@@ -27,6 +27,15 @@ from lslam.formats.ros1_records import Ros1Bag
 
 SUFFIXES = (".bag", ".bag.active", ".mcap", ".db3")
 _PART = re.compile(r"(.+)_\d+\.(bag|mcap|db3)(?:\.active)?$")
+# Said once, at the beginning: where lslam's own bags keep what else is known of a sequence, as `sequence.toml`.
+INFO_TOPIC = "/lslam/sequence"
+LATCHED = ("/tf_static", INFO_TOPIC)
+KINDS = ("bag", "mcap", "sqlite")
+_ENCODINGS = ("cdr", "ros1")
+_ZSTD = b"\x28\xb5\x2f\xfd"  # ROS 2 can compress every message by itself
+_ZSTD_BLOCK = 1 << 18  # more than the largest block of zstd
+_TRANSFORMS = "tf2_msgs/msg/TFMessage"
+_OLD_NAMES = {"tf/msg/tfMessage": _TRANSFORMS}
 
 
 def list_bag_files(path: Path) -> list[Path]:
@@ -69,17 +78,6 @@ def suffix_of(path: Path) -> str:
 def _natural(path: Path) -> list[tuple[int, str]]:
     """Sort key with numbers compared as numbers: part_2 before part_10."""
     return [(int(p), "") if p.isdecimal() else (-1, p) for p in re.split(r"(\d+)", path.name)]
-
-
-# Said once, at the beginning: where lslam's own bags keep what else is known of a sequence, as `sequence.toml`.
-INFO_TOPIC = "/lslam/sequence"
-LATCHED = ("/tf_static", INFO_TOPIC)
-KINDS = ("bag", "mcap", "sqlite")
-_ENCODINGS = ("cdr", "ros1")
-_ZSTD = b"\x28\xb5\x2f\xfd"  # ROS 2 can compress every message by itself
-_ZSTD_BLOCK = 1 << 18  # more than the largest block of zstd
-_TRANSFORMS = "tf2_msgs/msg/TFMessage"
-_OLD_NAMES = {"tf/msg/tfMessage": _TRANSFORMS}
 
 
 class Recording(Protocol):

@@ -15,6 +15,7 @@ from lslam.untrusted import is_file
 
 Floats = NDArray[np.float64]
 LIDAR_TO_CAMERA = ("Tr", "Tr_velo_to_cam", "Tr_velo_cam")
+_ROW = re.compile(r"-\s*\[(.*)\]\s*$")
 
 
 def read_odometry_calib(path: str | Path) -> Floats | None:
@@ -120,9 +121,6 @@ def _rigid(upper: Floats, path: Path, name: str) -> Floats:
     if not so3.is_rotation(R, 1e-2):
         raise InputError(f"calibration {path}: {name} holds no rotation")
     return se3.normalise(se3.make(R, upper[:, 3]))
-
-
-_ROW = re.compile(r"-\s*\[(.*)\]\s*$")
 
 
 def read_mcd_extrinsics(path: Path, sensor: str = "os_sensor") -> NDArray[np.float64] | None:

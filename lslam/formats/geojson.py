@@ -18,6 +18,9 @@ from lslam.geometry.geodesy import from_local, to_local
 from lslam.types.building import Building, BuildingCorrection, CorrectedMap, Footprint
 from lslam.untrusted import MISFIT, parse_json
 
+Floats = NDArray[np.float64]
+SCHEMA = "lslam-buildings-1"
+
 
 def write_line(path: Path, lat_lon_alt: NDArray[Any], properties: Mapping[str, Any]) -> None:
     """Write a way (N, 3) of lat, lon (deg), height (m), WGS84, as one feature, a point where N is 1; atomically.
@@ -68,11 +71,6 @@ def _shapes(tree: Any) -> Iterator[Any]:
         yield from _shapes(tree.get("geometry") or {})
     else:
         yield tree
-
-
-Floats = NDArray[np.float64]
-
-SCHEMA = "lslam-buildings-1"
 
 
 def write_corrected(path: Path, found: CorrectedMap) -> None:

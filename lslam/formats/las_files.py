@@ -29,6 +29,10 @@ _LAYERED = 3  # the compressor of point formats 6 and above: every field of a ch
 _LAYERS = {10: 9, 11: 1, 12: 2, 13: 1}
 _EXTRA_BYTES = 14
 _SIZES = {2: 227, 3: 235, 4: 375, 5: 393}  # bytes of the header by minor version
+SCALE = 0.001  # m
+_WAY_OUT = "install it with: pip install laspy lazrs"
+_REACH = 2**31 - 1
+_BLOCK = 1 << 26  # bytes of points decompressed at a time
 
 
 @dataclass(frozen=True)
@@ -152,12 +156,6 @@ def _check_layers(stream: BinaryIO, laszip: _Laszip, begin: int, length: int, re
     said = stream.read(need) if record + need <= length else b""
     if len(said) < need or record + need + sum(struct.unpack_from(f"<{laszip.layers}I", said, 4)) > length:
         raise ValueError(f"the chunk at byte {begin} has less than its layers need")
-
-
-SCALE = 0.001  # m
-_WAY_OUT = "install it with: pip install laspy lazrs"
-_REACH = 2**31 - 1
-_BLOCK = 1 << 26  # bytes of points decompressed at a time
 
 
 def write_las(path: Path, cloud: Cloud, wkt: str = "") -> None:

@@ -21,6 +21,9 @@ from lslam.types.building import Building, Footprint, footprint_polygon
 Floats = NDArray[np.float64]
 
 FARTHEST = 100e3  # m
+STOREY = 3.0  # m, docs/conventions.md
+FOOT = 0.3048  # m
+TALLEST = 1000.0  # m; what is higher is a slip of the pen
 
 
 @dataclass(frozen=True)
@@ -257,11 +260,6 @@ def _way_out(origin: Floats, is_swapped: bool = False) -> str:
 
 def _far(distance: float) -> str:
     return f"{distance / 1000:.1f} km" if distance > 1000 else f"{distance:.0f} m"
-
-
-STOREY = 3.0  # m, docs/conventions.md
-FOOT = 0.3048  # m
-TALLEST = 1000.0  # m; what is higher is a slip of the pen
 
 
 def height_of(tags: Mapping[str, str]) -> float | None:

@@ -12,6 +12,10 @@ from typing import IO, Any
 from lslam.untrusted import JsonItems, parse_json
 
 ELEMENTS = "elements"
+KINDS = ("FeatureCollection", "Feature", "Polygon", "MultiPolygon", "GeometryCollection")
+# What names the one coordinate system that RFC 7946 allows; older files say it in so many ways.
+_WGS84 = re.compile(r"CRS84|EPSG:+4326|WGS ?84", re.IGNORECASE)
+_REPROJECT = "turn it into longitude and latitude first (ogr2ogr -t_srs EPSG:4326 new.geojson old.geojson)"
 
 
 class OverpassReply(Mapping[str, Any]):
@@ -56,12 +60,6 @@ class OverpassReply(Mapping[str, Any]):
 
     def __repr__(self) -> str:
         return f"OverpassReply({self.text[:60]!r}..., {len(self.text)} bytes)"
-
-
-KINDS = ("FeatureCollection", "Feature", "Polygon", "MultiPolygon", "GeometryCollection")
-# What names the one coordinate system that RFC 7946 allows; older files say it in so many ways.
-_WGS84 = re.compile(r"CRS84|EPSG:+4326|WGS ?84", re.IGNORECASE)
-_REPROJECT = "turn it into longitude and latitude first (ogr2ogr -t_srs EPSG:4326 new.geojson old.geojson)"
 
 
 def is_geojson(tree: Any) -> bool:

@@ -22,6 +22,7 @@ from lslam.untrusted import MISFIT
 SUFFIXES = (".bin", ".pcd", ".ply", ".npy")
 # Record sizes other data sets use, to tell a truncated file from one of another kind.
 _OTHER_RECORDS = {12: "x, y, z", 20: "x, y, z, intensity, ring", 24: "x, y, z, intensity, ring, time"}
+MAP_SUFFIXES = (".ply", ".pcd", ".las", ".laz")
 
 
 def read_points(path: Path) -> PointCloud:
@@ -125,9 +126,6 @@ def _read_text(path: Path) -> PointCloud:
     if table.shape[1] != 4:
         raise InputError(f"{path}: {table.shape[1]} numbers a line where x y z intensity are 4")
     return PointCloud(np.ascontiguousarray(table[:, :3]), np.ascontiguousarray(table[:, 3]))
-
-
-MAP_SUFFIXES = (".ply", ".pcd", ".las", ".laz")
 
 
 def write_cloud(path: Path, cloud: Cloud, *, comment: str = "", wkt: str = "") -> None:

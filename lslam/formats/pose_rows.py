@@ -18,6 +18,9 @@ from lslam.untrusted import decimal_number
 
 Floats = NDArray[np.float64]
 LARGEST_NS = 2**62
+_DATE = re.compile(r"(\d{4})-(\d\d)-(\d\d)[ T](\d\d):(\d\d):(\d\d)(?:\.(\d{1,9}))?$")
+# Whole numbers from here on are nanoseconds: as seconds they would lie 3 million years ahead.
+_NS_FROM = 10**14
 
 
 class Row(NamedTuple):
@@ -133,11 +136,6 @@ def write_lines(path: str | Path, lines: list[str]) -> None:
     """Write a text file, atomically; names that are no text are escaped."""
     with atomic_write(Path(path)) as stream:
         stream.writelines(f"{line}\n".encode("utf-8", "backslashreplace") for line in lines)
-
-
-_DATE = re.compile(r"(\d{4})-(\d\d)-(\d\d)[ T](\d\d):(\d\d):(\d\d)(?:\.(\d{1,9}))?$")
-# Whole numbers from here on are nanoseconds: as seconds they would lie 3 million years ahead.
-_NS_FROM = 10**14
 
 
 def read_stamps(path: Path) -> NDArray[np.int64]:

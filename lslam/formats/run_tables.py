@@ -22,6 +22,15 @@ LOOP_COLUMNS = (
     "keyframe_a", "keyframe_b", "scan_a", "scan_b", "distance_m", "descriptor_distance", "verdict", "stage", "rmse_m",
     "overlap", "sigma_m", "sigma_deg", "reason",
 )  # fmt: skip
+# x, y, yaw: of the keyframe in the map frame, or of the displacement of the building about its middle.
+MATCH_COLUMNS = (
+    "keyframe", "scan", "building", "verdict", "kind", "rank", "walls", "fitness", "coverage", "rms_m", "x_m", "y_m", "yaw_deg",
+    "reason",
+)  # fmt: skip
+SAVED = "saved_s"
+NOT_STAGES = ("index", "stamp_ns", "stamp", "total", SAVED)
+# Before the names of what is done after odometry.
+AFTER = "back end: "
 
 
 def write_loops(path: Path, candidates: Sequence[LoopCandidate], keyframes: Sequence[Keyframe]) -> None:
@@ -55,13 +64,6 @@ def _number(value: float) -> str:
     return f"{value:.4f}" if np.isfinite(value) else ""
 
 
-# x, y, yaw: of the keyframe in the map frame, or of the displacement of the building about its middle.
-MATCH_COLUMNS = (
-    "keyframe", "scan", "building", "verdict", "kind", "rank", "walls", "fitness", "coverage", "rms_m", "x_m", "y_m", "yaw_deg",
-    "reason",
-)  # fmt: skip
-
-
 def write_osm_matches(
     path: Path, matches: OsmMatches, keyframes: Sequence[Keyframe], poses: NDArray[np.float64]
 ) -> None:
@@ -90,12 +92,6 @@ def _row(
         match.keyframe, keyframes[match.keyframe].scan, building, match.verdict, match.kind, match.rank, len(match.pairs),
         *(f"{value:.4f}" if np.isfinite(value) else "" for value in numbers), match.reason,
     )  # fmt: skip
-
-
-SAVED = "saved_s"
-NOT_STAGES = ("index", "stamp_ns", "stamp", "total", SAVED)
-# Before the names of what is done after odometry.
-AFTER = "back end: "
 
 
 @dataclass(frozen=True)

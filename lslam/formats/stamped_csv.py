@@ -17,6 +17,12 @@ from lslam.types.imu import ImuStream
 from lslam.untrusted import decimal_number
 
 TIME_COLUMNS = ("stamp_ns", "timestamp", "stamp", "time", "t", "time_s", "stamp_s")
+IMU_COLUMNS = ("accel_x", "accel_y", "accel_z", "gyro_x", "gyro_y", "gyro_z")
+_ALIASES = [
+    *((f"accel_{axis}", f"a{axis}", f"a_rs_s_{axis}", f"acc_{axis}", f"linear_acceleration_{axis}") for axis in "xyz"),
+    *((f"gyro_{axis}", f"w{axis}", f"w_rs_s_{axis}", f"g{axis}", f"angular_velocity_{axis}") for axis in "xyz"),
+]
+GNSS_COLUMNS = ("lat_deg", "lon_deg", "alt_m", "sigma_m")
 
 
 def read_stamped_csv(
@@ -83,13 +89,6 @@ def _find(header: list[str], names: Sequence[str]) -> int | None:
     return next((header.index(name) for name in names if name in header), None)
 
 
-IMU_COLUMNS = ("accel_x", "accel_y", "accel_z", "gyro_x", "gyro_y", "gyro_z")
-_ALIASES = [
-    *((f"accel_{axis}", f"a{axis}", f"a_rs_s_{axis}", f"acc_{axis}", f"linear_acceleration_{axis}") for axis in "xyz"),
-    *((f"gyro_{axis}", f"w{axis}", f"w_rs_s_{axis}", f"g{axis}", f"angular_velocity_{axis}") for axis in "xyz"),
-]
-
-
 def read_imu_csv(path: Path) -> ImuStream:
     """Read specific force (m/s2, +g up at rest) and angular rate (rad/s) in the IMU frame; nothing is converted.
 
@@ -103,9 +102,6 @@ def read_imu_csv(path: Path) -> ImuStream:
 def write_imu_csv(path: Path, imu: ImuStream) -> None:
     """Write `imu` atomically; it reads back exactly."""
     write_stamped_csv(path, IMU_COLUMNS, imu.stamps_ns, np.hstack([imu.accel, imu.gyro]))
-
-
-GNSS_COLUMNS = ("lat_deg", "lon_deg", "alt_m", "sigma_m")
 
 
 def read_gnss_csv(path: Path) -> GnssStream:

@@ -25,6 +25,8 @@ from lslam.untrusted import MISFIT, parse_json
 
 # What zipfile and NumPy raise; no memory, for arrays that are said to be larger than any machine; a flag of encryption.
 DAMAGE = (*MISFIT, EOFError, SyntaxError, MemoryError, RuntimeError, zipfile.BadZipFile, zlib.error, struct.error)
+Arrays = dict[str, NDArray[Any]]
+Classes = Mapping[str, type]
 
 
 def write_npz(path: Path, arrays: Mapping[str, NDArray[Any]], level: int = 1) -> None:
@@ -62,10 +64,6 @@ def _array(member: bytes) -> NDArray[Any]:
 
 def _name(source: Path | BinaryIO) -> str:
     return str(source) if isinstance(source, Path) else "an archive"
-
-
-Arrays = dict[str, NDArray[Any]]
-Classes = Mapping[str, type]
 
 
 @dataclass(frozen=True)

@@ -32,6 +32,7 @@ PROBABILITY = 0.999  # chi-square quantile of an inlier match
 SUPPORT = 2  # other matches that must agree
 # Shares of information below which a direction is unobserved, and from which another match observes it as well.
 FREE, ALIKE = 1e-9, 0.05
+FIRM, LOOSE = 1e-4, 1e4  # m and rad; sigmas of what is anchored, and of what has no prior
 
 
 @dataclass(frozen=True)
@@ -157,9 +158,6 @@ def _squared(
     away = measured - solution[0][owners]
     away[:, 2] = se2.wrapped(away[:, 2])
     return np.asarray(np.einsum("mi,mij,mj->m", away, weights, away))
-
-
-FIRM, LOOSE = 1e-4, 1e4  # m and rad; sigmas of what is anchored, and of what has no prior
 
 
 @dataclass(frozen=True)

@@ -22,6 +22,10 @@ Floats = NDArray[np.float64]
 
 # Loop closures used at most, evenly spread, and bounds of the factor on the drift's variance.
 MOST, SMALLEST, LARGEST = 300, 1e-8, 1e8
+# m, correlation length of a rate.
+MEMORY = 100.0
+# Hyperparameters tried: share of the variance of rates that is constant over the run, and scale of the configured drift.
+LASTING, SIZES = (0.5, 0.9, 0.99), (0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
 
 
 def drift_covariance(way: float, config: GraphConfig) -> Floats:
@@ -198,12 +202,6 @@ def _squared(error: Floats, covariance: Floats) -> Floats:
 
 def _length(constraint: Constraint) -> float:
     return float(np.linalg.norm(constraint.T_a_b[:3, 3]))
-
-
-# m, correlation length of a rate.
-MEMORY = 100.0
-# Hyperparameters tried: share of the variance of rates that is constant over the run, and scale of the configured drift.
-LASTING, SIZES = (0.5, 0.9, 0.99), (0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
 
 
 def linear_basis(distances: NDArray[np.float64], apart: float = MEMORY) -> Floats:

@@ -20,6 +20,10 @@ Floats = NDArray[np.float64]
 
 # Keyframes that iSAM2 takes in per update.
 BATCH = 10
+# The control parameter's growth per round, and rounds at most (Yang et al. take 1.4 and 100, from far worse starts).
+GROWTH, ROUNDS = 2.0, 30
+# Weights beyond these are decided; a factor below the first is left out.
+OUT, IN = 1e-3, 0.999
 
 
 def solve(factors: Any, values: Any, config: GraphConfig) -> Any:
@@ -144,12 +148,6 @@ def scaled_blocks(factors: Any, values: Any, keys: list[int]) -> Floats:
 def _first_line(failure: RuntimeError) -> str:
     text = str(failure).strip()
     return text.splitlines()[0] if text else type(failure).__name__
-
-
-# The control parameter's growth per round, and rounds at most (Yang et al. take 1.4 and 100, from far worse starts).
-GROWTH, ROUNDS = 2.0, 30
-# Weights beyond these are decided; a factor below the first is left out.
-OUT, IN = 1e-3, 0.999
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,8 @@ from numpy.typing import NDArray
 
 from lslam.kernels.jit import kernel
 
+Floats = NDArray[np.float32]
+
 
 @kernel
 def transform(points: NDArray[np.float32], T: NDArray[np.float64], moved: NDArray[np.float32]) -> None:
@@ -46,9 +48,6 @@ def deskew(
                 + a * p[j, 3]
                 + b * q[j, 3]
             )
-
-
-Floats = NDArray[np.float32]
 
 
 @kernel

@@ -18,6 +18,9 @@ from lslam.kernels.voxel import AHEAD
 AXIS_BITS = 21
 HALF = 1 << (AXIS_BITS - 1)
 _MIX = -7046029254386353131  # 0x9E3779B97F4A7C15 as int64: Fibonacci hashing
+UNITS = float(2**24)  # 2**39 points fit into one voxel's sum
+INTENSITY_UNITS = float(2**20)
+_BRIGHTEST = float(2**24)  # of such points a voxel's sum holds 2**19
 
 
 @inline
@@ -72,11 +75,6 @@ def unpack_cells(keys: NDArray[np.int64], origin: NDArray[np.int64]) -> NDArray[
     for axis in range(3):
         cells[:, axis] = ((keys >> (AXIS_BITS * (2 - axis))) & ((1 << AXIS_BITS) - 1)) - HALF + origin[axis]
     return cells
-
-
-UNITS = float(2**24)  # 2**39 points fit into one voxel's sum
-INTENSITY_UNITS = float(2**20)
-_BRIGHTEST = float(2**24)  # of such points a voxel's sum holds 2**19
 
 
 @kernel

@@ -17,6 +17,7 @@ Floats = NDArray[np.float64]
 RADIUS = 0.5  # m
 LEAST = 10  # points in a neighbourhood
 SAMPLES = 50_000
+THRESHOLD = 0.2  # m
 
 
 def crispness(cloud: Cloud, radius: float = RADIUS, least: int = LEAST, samples: int = SAMPLES) -> Crispness:
@@ -84,9 +85,6 @@ def _slabs(cloud: Cloud, radius: float, step: int) -> Iterator[tuple[Floats, Flo
 def warm_up() -> None:
     """Compile or load the kernels, so that a caller can do it under the compile lock."""
     crispness(ArrayCloud.of(np.random.default_rng(0).random((8, 3))), least=4)
-
-
-THRESHOLD = 0.2  # m
 
 
 def compare(cloud: ArrayCloud, reference: ArrayCloud, threshold: float = THRESHOLD) -> MapDifference:

@@ -15,6 +15,7 @@ OCCUPIED, UNKNOWN, FREE = 0, 205, 254  # the grey values of ROS' map_server
 LOWEST, HIGHEST = 0.3, 2.0  # m above the floor: kerbs are walked over, canopies walked under
 _AROUND = 4.0  # m; what is narrower than twice that is no floor
 _LONGEST = 4000  # pixels
+Extent = tuple[float, float, float, float]
 
 
 @dataclass(frozen=True)
@@ -77,9 +78,6 @@ def floor_plan(grid: OccupancyGrid) -> FloorPlan:
         np.ascontiguousarray(image.reshape(height, width)[::-1]), resolution, float(low[0] * grid.voxel),
         float(low[1] * grid.voxel),
     )  # fmt: skip
-
-
-Extent = tuple[float, float, float, float]
 
 
 def top_view(

@@ -35,6 +35,15 @@ Floats = NDArray[np.float64]
 # Keyframes after which the baseline's graph is optimised again; Del Tufo's timer does so every 3 s.
 EVERY = 5
 ONLY_START = "the baseline lays buildings from there and holds no keyframe by it"
+SPACING = 0.25  # m between the points of an outline, and the grid of a flattened scan
+HEIGHTS = (0.2, 0.7, 1.2, 1.7)  # m
+NDT_VOXEL, VGICP_VOXEL = 2.0, 1.0  # m; hdl_graph_slam's NDT resolution, fast_gicp's voxel
+WIDTH, STEPS = 2.0, 40  # m, where the kernel opens; Gauss-Newton steps at most
+NOISE = 0.1  # m
+LEAST_POINTS = 20
+LEAST_OVERLAP = 0.1  # share of the points that found a voxel
+FARTHEST = 5.0  # m from the prior; farther is no convergence
+FAR = 1.0  # m; points farther from their nearest one do not count in the fitness score (the range of hdl_graph_slam's)
 
 
 def lay(graph: PoseGraph, solution: Solution, matches: OsmMatches, extract: BuildingExtract, given: Given) -> Laid:
@@ -122,17 +131,6 @@ def _first(graph: PoseGraph, poses: Floats, count: int) -> PoseGraph:
         floors=[floor for floor in graph.floors if floor.keyframe < count],
         distances=graph.distances[:count],
     )
-
-
-SPACING = 0.25  # m between the points of an outline, and the grid of a flattened scan
-HEIGHTS = (0.2, 0.7, 1.2, 1.7)  # m
-NDT_VOXEL, VGICP_VOXEL = 2.0, 1.0  # m; hdl_graph_slam's NDT resolution, fast_gicp's voxel
-WIDTH, STEPS = 2.0, 40  # m, where the kernel opens; Gauss-Newton steps at most
-NOISE = 0.1  # m
-LEAST_POINTS = 20
-LEAST_OVERLAP = 0.1  # share of the points that found a voxel
-FARTHEST = 5.0  # m from the prior; farther is no convergence
-FAR = 1.0  # m; points farther from their nearest one do not count in the fitness score (the range of hdl_graph_slam's)
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,7 @@ from lslam.geometry.geodesy import from_local
 METRES_PER_DEGREE = 111_320.0
 DECIMALS = 6  # docs/conventions.md: what a cached reply is known by
 LARGEST_KM2 = 600.0
+OTHER_WAYS = "say where it is with --around LAT,LON or --bbox"
 
 
 @dataclass(frozen=True)
@@ -98,9 +99,6 @@ def around(lat_lon: NDArray[Any], radius: float) -> Bounds:
     sides = (first + east.min() - aside, first + east.max() + aside)
     west, east_side = ((side + 180) % 360 - 180 for side in sides)
     return Bounds(south, west, north, east_side)
-
-
-OTHER_WAYS = "say where it is with --around LAT,LON or --bbox"
 
 
 def positions_along(

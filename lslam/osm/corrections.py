@@ -44,6 +44,10 @@ DEPTH = 0.5  # m that a ray must pass inside an outline at least
 ONE_LINE = 0.5  # m; walls seen so near one line are one
 ONE_WAY = np.sin(np.radians(10.0))
 LONG = 6.0  # m; a shorter wall is a hedge, a van, a sign
+log = logging.getLogger("lslam")
+BUILDINGS_GEOJSON, BUILDINGS_OSM = "buildings.geojson", "buildings.osm"
+# m and rad; prior sigmas of a building that may only move with all others.
+TOGETHER = np.array([1e-3, 1e-3, 1e-5])
 
 
 @dataclass(frozen=True)
@@ -168,14 +172,6 @@ def _ground(building: Building) -> Any:
     from shapely import union_all
 
     return union_all([footprint_polygon(f).buffer(0) for f in building.footprints])
-
-
-log = logging.getLogger("lslam")
-
-BUILDINGS_GEOJSON, BUILDINGS_OSM = "buildings.geojson", "buildings.osm"
-
-# m and rad; prior sigmas of a building that may only move with all others.
-TOGETHER = np.array([1e-3, 1e-3, 1e-5])
 
 
 def correct_buildings(matches: OsmMatches, poses: NDArray[np.float64], config: OsmConfig) -> CorrectedMap:

@@ -27,6 +27,15 @@ from lslam.stopping import checking
 from lslam.types.gnss import Georeference
 from lslam.types.stage_clock import KeyframeClocks
 
+log = logging.getLogger("lslam")
+Floats = NDArray[np.float64]
+# Iterations of the drift estimate: walls seen from the ends of a submap hide a part of it.
+ROUNDS = 5
+# Modes in which the map's buildings stand to each other as they are drawn.
+TRUSTING = ("prior", "rigid")
+# m, sigma of their walls: the rounding of a survey.
+TRUE = 0.01
+
 
 def hold_by_buildings(osm: OsmSource, graph: PoseGraph, placement: Placement, given: Given) -> BackEnd | None:
     """The run held by the buildings of a map, and by fixes where it has some; None, and why, where they hold nothing."""
@@ -71,17 +80,6 @@ def hold_by_buildings(osm: OsmSource, graph: PoseGraph, placement: Placement, gi
     poses, covariances = laid.joint.poses, laid.joint.covariances
     moved = corrected(given.results, store.keyframes, poses, covariances, out.solution.drift, config.graph)
     return replace(laid_out, results=moved, keyframes=poses)
-
-
-log = logging.getLogger("lslam")
-Floats = NDArray[np.float64]
-
-# Iterations of the drift estimate: walls seen from the ends of a submap hide a part of it.
-ROUNDS = 5
-# Modes in which the map's buildings stand to each other as they are drawn.
-TRUSTING = ("prior", "rigid")
-# m, sigma of their walls: the rounding of a survey.
-TRUE = 0.01
 
 
 def find_on_map(

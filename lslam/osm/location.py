@@ -42,6 +42,8 @@ Floats = NDArray[np.float64]
 LOST = 4.0
 # Chi-square quantile within which a match is supported by the others.
 BORNE_OUT = 0.95
+# Submaps grow by this factor, so often, until the walls of one fit one place only.
+GROWTH, TRIES = 2, 4
 
 
 @dataclass(frozen=True)
@@ -259,10 +261,6 @@ def _why_none(matches: list[KeyframeMatch], osm: OsmMap, extract: BuildingExtrac
         f"OSM: none of {len(matches)} keyframes could be laid on {extract.source} (most often: {usual}): check --origin and "
         "--heading; the run goes on without the buildings"
     )
-
-
-# Submaps grow by this factor, so often, until the walls of one fit one place only.
-GROWTH, TRIES = 2, 4
 
 
 @dataclass(frozen=True)

@@ -27,6 +27,11 @@ LARGEST = 5.0  # m; largest displacement of a building
 FLUSH_WORTH = 1.0  # m more than a bare touch that walls flush with each other may cost
 PARALLEL = np.cos(np.radians(10.0))
 SHORTEST = 0.3  # m; walls under this length are ornaments
+ROUNDS = 20  # after which overlaps are left as they are
+STEPS = 10  # of Gauss-Newton
+HARD = 1e-4  # m; one sigma of a contact
+NESTED = 0.5  # share of the smaller building's ground; if more overlaps on the map it is meant so: a part, a copy
+log = logging.getLogger("lslam")
 
 
 @dataclass(frozen=True)
@@ -178,14 +183,6 @@ def _on_map(contact: tuple[int, int, int], one: Solid, other: Solid) -> Contact:
     side, corner, wall = contact
     owner, holder = (one, other) if side == 0 else (other, one)
     return Contact(owner.number, owner.walls[corner, 0], holder.number, holder.walls[wall])
-
-
-ROUNDS = 20  # after which overlaps are left as they are
-STEPS = 10  # of Gauss-Newton
-HARD = 1e-4  # m; one sigma of a contact
-NESTED = 0.5  # share of the smaller building's ground; if more overlaps on the map it is meant so: a part, a copy
-
-log = logging.getLogger("lslam")
 
 
 @dataclass(frozen=True)

@@ -26,6 +26,17 @@ Floats = NDArray[np.float64]
 
 # Degrees of freedom of the residuals (Student's t), against walls matched wrongly.
 FREEDOM = 3.0
+# Scales of the configured sigma of a sighting that are tried. Far and at a grazing angle a wall is seen centimetres off for
+# many keyframes: the sigma is no smaller.
+SCALES = (0.25, 0.5, 1.0)
+# A larger constant share extrapolates farther where no wall is seen: it must be significantly more likely, at this level.
+SELDOM = 0.95
+# Hyperparameters of drift, degrees of freedom of the likelihood ratio test: scale and constant share. Rates are marginalised.
+FITTED = 2
+ROUNDS = 6
+# m between knots of varying rates, or so many knots at most.
+APART, MOST = 20.0, 40
+SETTLED = 0.1  # of the expected squared Mahalanobis length of the rates
 
 
 @dataclass(frozen=True)
@@ -161,19 +172,6 @@ class DriftFit:
         root = self._root(sizes.root)
         covariance = root @ np.linalg.solve(np.eye(len(root)) + root.T @ normal @ root, root.T)
         return np.asarray(covariance @ pull), np.asarray(covariance)
-
-
-# Scales of the configured sigma of a sighting that are tried. Far and at a grazing angle a wall is seen centimetres off for
-# many keyframes: the sigma is no smaller.
-SCALES = (0.25, 0.5, 1.0)
-# A larger constant share extrapolates farther where no wall is seen: it must be significantly more likely, at this level.
-SELDOM = 0.95
-# Hyperparameters of drift, degrees of freedom of the likelihood ratio test: scale and constant share. Rates are marginalised.
-FITTED = 2
-ROUNDS = 6
-# m between knots of varying rates, or so many knots at most.
-APART, MOST = 20.0, 40
-SETTLED = 0.1  # of the expected squared Mahalanobis length of the rates
 
 
 @dataclass(frozen=True)

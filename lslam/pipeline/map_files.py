@@ -27,6 +27,10 @@ from lslam.types.trajectory import Trajectory
 from lslam.untrusted import MISFIT, parse_json
 from lslam.version import __version__
 
+Note = dict[str, Any]
+SCHEMA = "lslam-map"
+LOCAL = "world of trajectory.tum"
+
 
 def read_json(path: Path) -> dict[str, Any]:
     """The document; empty when there is none that can be read."""
@@ -40,10 +44,6 @@ def read_json(path: Path) -> dict[str, Any]:
 def write_json(path: Path, document: dict[str, Any]) -> None:
     """Strict JSON, indented, atomically; numbers that JSON has not become null. Raises OutputError."""
     write_text(path, json.dumps(strict(document), indent=2, allow_nan=False, ensure_ascii=False) + "\n")
-
-
-Note = dict[str, Any]
-SCHEMA = "lslam-map"
 
 
 def note_of(path: Path) -> Note:
@@ -100,9 +100,6 @@ def _is_of(path: Path, name: str) -> bool:
 def _joined(notes: dict[str, Note]) -> Note:
     first, *others = notes
     return notes[first] | ({"others": {name: notes[name] for name in others}} if others else {})
-
-
-LOCAL = "world of trajectory.tum"
 
 
 @dataclass(frozen=True)

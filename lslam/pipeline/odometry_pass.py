@@ -40,6 +40,8 @@ from lslam.types.sequence import Sequence
 from lslam.types.trajectory import Trajectory
 
 log = logging.getLogger("lslam")
+# Sentences of one run; the scans beyond are marked all the same.
+MOST_SAID = 6
 
 
 def estimate_poses(
@@ -170,10 +172,6 @@ def _begin_imu(
     if getattr(odometry, "ignores_prior", False):
         inertial.problems.append(f"{config.odometry.method} predicts by itself: the IMU only bridges scans that fail")
     return inertial
-
-
-# Sentences of one run; the scans beyond are marked all the same.
-MOST_SAID = 6
 
 
 def mark_lost(results: list[ScanResult], monitor: IntegrityMonitor, manifest: Manifest) -> list[ScanResult]:

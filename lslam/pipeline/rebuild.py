@@ -55,6 +55,8 @@ from lslam.types.trajectory import Trajectory
 from lslam.untrusted import parse_json
 
 log = logging.getLogger("lslam")
+EVALUATION, REPORT = "evaluation.json", "report.html"
+_KEPT = "%s keeps the figures of the map before: it %s"
 
 
 @dataclass(frozen=True)
@@ -285,10 +287,6 @@ def _statuses(path: Path, count: int) -> tuple[Status, ...]:
     if len(words) != count or not set(words) <= set(known):
         raise InputError(f"{path} does not list the {count} scans of trajectory.tum; run the sequence again")
     return tuple(known[word] for word in words)
-
-
-EVALUATION, REPORT = "evaluation.json", "report.html"
-_KEPT = "%s keeps the figures of the map before: it %s"
 
 
 def write_renewed(target: Path, folder: Path, record: RunRecord) -> None:

@@ -22,6 +22,9 @@ from lslam.types.trajectory import Trajectory
 from lslam.untrusted import MISFIT, parse_json, parse_toml
 from lslam.version import __version__
 
+# Keys that change no byte of the result, or only which of its metrics are shown.
+FREE = ("input.threads", "odometry.checkpoint_s", "keyframes.deflate", "eval.metrics")
+
 
 def input_digest(sequence: Sequence, truth: Trajectory | None) -> str:
     """Digest of a recording without reading its scans: path, number of scans, size and time of every file, the truth's poses.
@@ -93,10 +96,6 @@ def _files(path: Path) -> Iterator[tuple[str, os.stat_result]]:
             file = os.path.join(folder, name)
             if os.path.isfile(file):
                 yield os.path.normpath(os.path.join(place, name)), os.stat(file)
-
-
-# Keys that change no byte of the result, or only which of its metrics are shown.
-FREE = ("input.threads", "odometry.checkpoint_s", "keyframes.deflate", "eval.metrics")
 
 
 def run_identity(

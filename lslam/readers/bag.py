@@ -41,6 +41,10 @@ KIND = "bag"
 _LAYOUTS = ("velodyne", "velodyne_points", "sequences")
 _LOOKED_AT = 5
 _SAID_NS = 1000  # shorter shifts are what absolute seconds are rounded by
+Transforms = dict[tuple[str, str], NDArray[np.float64]]
+CAMERA = "cam0"
+# Odometry in a bag is somebody's estimate, unless its name says that it is the truth.
+_TRUTH = re.compile(r"(^|[/_])(ground_?truth|gt)([/_]|$)", re.IGNORECASE)
 
 
 @dataclass
@@ -200,13 +204,6 @@ def _decide_times(sequence: BagSequence, info: SequenceInfo) -> None:
         sequence.notes.append(
             f"stamps of the scans moved by {shift * 1e-9:.6f} s, to where their first points were measured"
         )
-
-
-Transforms = dict[tuple[str, str], NDArray[np.float64]]
-
-CAMERA = "cam0"
-# Odometry in a bag is somebody's estimate, unless its name says that it is the truth.
-_TRUTH = re.compile(r"(^|[/_])(ground_?truth|gt)([/_]|$)", re.IGNORECASE)
 
 
 def find_extrinsics(

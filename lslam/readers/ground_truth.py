@@ -29,6 +29,10 @@ USUAL_NAMES = (
 )  # fmt: skip
 
 _NUMBER_COLUMNS = ("num", "number", "index", "scan")
+# Above this the reference is worse than LiDAR odometry over the length of a drive.
+_POOR_M = 0.2
+# How far a scan may lie before the first or after the last OXTS sample: one period.
+_BEYOND_NS = 100_000_000
 
 
 @dataclass
@@ -172,12 +176,6 @@ def _pair(
             f"{path} has {len(poses)} poses for {len(files)} scans: the {int(have.sum())} common ones are used, {rule}"
         )
     return Trajectory(stamps_ns[have], poses[rows[have]], "cam0", True, None, str(path))
-
-
-# Above this the reference is worse than LiDAR odometry over the length of a drive.
-_POOR_M = 0.2
-# How far a scan may lie before the first or after the last OXTS sample: one period.
-_BEYOND_NS = 100_000_000
 
 
 def oxts_truth(

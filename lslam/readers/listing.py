@@ -13,6 +13,9 @@ from lslam.errors import InputError, cause
 from lslam.formats.point_files import SUFFIXES
 from lslam.formats.pose_rows import parse_stamp, read_stamps
 
+DEFAULT_RATE_HZ = 10.0
+Stamps = NDArray[np.int64]
+
 
 def list_scans(folder: Path, suffixes: tuple[str, ...] = SUFFIXES) -> tuple[list[Path], list[str]]:
     """Point files of `folder` in natural order (scan2 before scan10), and notes about what was left out.
@@ -66,11 +69,6 @@ def stamps_in_names(files: list[Path]) -> NDArray[np.int64] | None:
             return None
         stamps.append(parse_stamp(path.stem.replace("_", ".")))
     return np.array(stamps, np.int64)
-
-
-DEFAULT_RATE_HZ = 10.0
-
-Stamps = NDArray[np.int64]
 
 
 def nominal_stamps(count: int, rate_hz: float, start_ns: int = 0) -> Stamps:

@@ -13,6 +13,9 @@ from lslam.preprocessing.rings import RingRule, decide_rings
 from lslam.types.scan import Scan
 from lslam.types.sequence import Sequence
 
+# Scans the rule is decided on: the first that can be read.
+_LOOKED_AT = 3
+
 
 class SequenceView:
     """Delegates to `whole` whatever `own` does not replace; a subclass says which scans there are and what they hold."""
@@ -66,10 +69,6 @@ def select(sequence: Sequence, start: int = 0, count: int | None = None, skip_fr
     if len(indices) == len(sequence):
         return sequence
     return Selection(sequence, indices)
-
-
-# Scans the rule is decided on: the first that can be read.
-_LOOKED_AT = 3
 
 
 class Ringed(SequenceView):

@@ -32,6 +32,17 @@ NEAR, NO_PLANES = 0.4, 2.0
 REACH = 1.0
 # m above the ground: crash barriers are lower, along which a sensor's rings match best where nothing moved.
 HIGH = 1.2
+# m; starts this far apart leave no gap between their capture ranges, not even between piers of a facade.
+START_STEP = 1.0
+# A hand-held sensor turns at 100 deg/s, by 30 deg at every third scan; so far apart that 20 m away a step is left.
+START_TURNS_DEG = np.delete(np.arange(-30.0, 31.0, 3.0), 10)
+# Less than the rings of most sensors are apart.
+AT_REST_DEG = 3.0
+# Every so many-th source point is enough to tell a good start from a bad one; so many of the best are looked at closely.
+SEARCH_SHARE, LOOKED_AT = 4, 3
+# Along a bare wall the rings repeat best where nothing moved, by five percent: a start elsewhere must have more, and twice
+# as much where planes, the prior or both say otherwise.
+CLEARLY, MUCH = 1.06, 1.1
 
 
 class NonGroundPoints:
@@ -85,19 +96,6 @@ def on_ground(points: PreparedPoints, ground: Ground, tolerance: float) -> Prepa
     is_ground = np.ones(len(points.source), bool)
     is_ground[ground.above(points.source.astype(np.float32), tolerance)] = False
     return subset(points, is_ground)
-
-
-# m; starts this far apart leave no gap between their capture ranges, not even between piers of a facade.
-START_STEP = 1.0
-# A hand-held sensor turns at 100 deg/s, by 30 deg at every third scan; so far apart that 20 m away a step is left.
-START_TURNS_DEG = np.delete(np.arange(-30.0, 31.0, 3.0), 10)
-# Less than the rings of most sensors are apart.
-AT_REST_DEG = 3.0
-# Every so many-th source point is enough to tell a good start from a bad one; so many of the best are looked at closely.
-SEARCH_SHARE, LOOKED_AT = 4, 3
-# Along a bare wall the rings repeat best where nothing moved, by five percent: a start elsewhere must have more, and twice
-# as much where planes, the prior or both say otherwise.
-CLEARLY, MUCH = 1.06, 1.1
 
 
 class StartSearch:

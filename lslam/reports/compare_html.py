@@ -25,6 +25,8 @@ from lslam.types.comparison import Comparison, Drawing, DrawnRun, RunScore
 from lslam.version import __version__
 
 WIDEST = 125  # characters of a table that the page shows without scrolling
+STYLES = 12
+_ROW, _BAR = 42, 18
 
 
 @dataclass(frozen=True)
@@ -107,10 +109,6 @@ def _configs(comparison: Comparison) -> list[tuple[str, list[str], bool]]:
 
 def _text(value: Any) -> str:
     return "absent" if value is None else str(value)
-
-
-STYLES = 12
-_ROW, _BAR = 42, 18
 
 
 def style_of(method: str, methods: Sequence[str]) -> str:

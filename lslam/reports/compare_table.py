@@ -19,6 +19,7 @@ from lslam.version import __version__
 STYLES = ("md", "csv", "tex")
 TITLES = {"error": "errors", "time": "time", "health": "scans and runs"}
 HEALTH = ("bridged", "skipped", "degenerate", "fallback")
+SCHEMA, VERSION = "lslam-compare", 1
 
 
 @dataclass(frozen=True)
@@ -203,9 +204,6 @@ def _runs_grid(comparison: Comparison) -> Grid:
             [run.sequence, run.method, str(run.seed), run.status, run.reason or run.note, str(run.jobs), *numbers]
         )
     return grid
-
-
-SCHEMA, VERSION = "lslam-compare", 1
 
 
 def to_document(comparison: Comparison) -> dict[str, Any]:

@@ -23,6 +23,7 @@ from lslam.version import __version__
 
 SCHEMA, VERSION = "lslam-evaluation", 1
 Document = dict[str, Any]
+STYLES = ("text", "md", "csv", "tex")
 
 
 def to_document(evaluation: Evaluation, timing: Timing | None = None) -> Document:
@@ -91,9 +92,6 @@ def strict(value: Any) -> Any:
     if isinstance(value, (list, tuple)):
         return [strict(item) for item in value]
     return value
-
-
-STYLES = ("text", "md", "csv", "tex")
 
 
 def render(evaluations: Sequence[Evaluation], timings: Sequence[Timing | None] = (), style: str = "text") -> str:

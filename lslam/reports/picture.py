@@ -20,6 +20,7 @@ from lslam.reports.evaluations import short_names
 
 FORMATS = ("png", "svg", "pdf")
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")  # Okabe and Ito: safe for colour blindness
+UNKNOWN = "#bbbbbb"
 
 
 def check_plot_path(path: Path) -> None:
@@ -148,9 +149,6 @@ def _best_alignment(evaluation: Evaluation) -> AbsoluteError:
 
 def _colours(count: int) -> list[str]:
     return [COLOURS[k % len(COLOURS)] for k in range(count)]
-
-
-UNKNOWN = "#bbbbbb"
 
 
 def write_buildings_png(path: Path, extract: BuildingExtract, along: NDArray[Any] | None = None) -> None:

@@ -27,6 +27,9 @@ ALIGNED = {
     "origin": "moved so that the first poses coincide (origin)",
     "none": "not aligned",
 }
+Floats = NDArray[np.float64]
+# A limit further away than this many times the usual scan would press the stages flat: an arrow says where it is.
+LIMIT_IN_VIEW = 4.0
 
 
 @dataclass(frozen=True)
@@ -249,12 +252,6 @@ def _covariances(record: RunRecord) -> NDArray[np.float64] | None:
     if len(given) != len(record.trajectory) or all(c is None for c in given):
         return None
     return np.array([np.full((6, 6), np.nan) if c is None else c for c in given])
-
-
-Floats = NDArray[np.float64]
-
-# A limit further away than this many times the usual scan would press the stages flat: an arrow says where it is.
-LIMIT_IN_VIEW = 4.0
 
 
 def stage_chart(index: NDArray[Any], ms: Floats, limit: float, title: str) -> tuple[str, str]:

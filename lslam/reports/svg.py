@@ -20,6 +20,7 @@ Floats = NDArray[np.float64]
 WIDTH = 480
 BINS = 360  # about one per pixel and a half of the plot area
 MARGIN_LEFT, MARGIN_RIGHT, MARGIN_TOP, MARGIN_BOTTOM = 52, 14, 26, 40
+MOST_POINTS = 3000
 
 
 @dataclass(frozen=True)
@@ -204,9 +205,6 @@ def _widened(low: float, high: float) -> tuple[float, float]:
         return low, high
     half = 0.5 * max(1e-3, 0.1 * abs(low)) if low else 0.5
     return (low, high + 2 * half) if low == 0 else (low - half, high + half)
-
-
-MOST_POINTS = 3000
 
 
 @dataclass(frozen=True)

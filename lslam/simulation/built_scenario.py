@@ -34,6 +34,11 @@ from lslam.simulation.waypoints import WayPoints
 Floats = NDArray[np.float64]
 
 CORRIDOR_SPARE = 130.0  # m, so that no LiDAR here sees an end of the corridor
+SOLID = (Surface.ROAD, Surface.PAVEMENT, Surface.LAWN, Surface.WALL, Surface.GLASS, Surface.ROOF)
+NAMES = {Surface.ROAD: "the ground", Surface.PAVEMENT: "the ground", Surface.LAWN: "the ground"}
+HALF_WIDTH = 0.7  # m on both sides of the path that must be free as well
+LOWEST = 0.3  # m above the ground
+STEP = 0.05  # s
 
 
 @dataclass(frozen=True)
@@ -184,13 +189,6 @@ def _carried(
     # A drone holds its speed through the bends it was allowed.
     steady = paths.SpeedProfile(scenario.speed, scenario.start_speed, lateral=1e6)
     return fly(line, steady, distance, climb, section.bank, buffeting(rng, section.swing))
-
-
-SOLID = (Surface.ROAD, Surface.PAVEMENT, Surface.LAWN, Surface.WALL, Surface.GLASS, Surface.ROOF)
-NAMES = {Surface.ROAD: "the ground", Surface.PAVEMENT: "the ground", Surface.LAWN: "the ground"}
-HALF_WIDTH = 0.7  # m on both sides of the path that must be free as well
-LOWEST = 0.3  # m above the ground
-STEP = 0.05  # s
 
 
 def check_path(scene: RayScene, city: City, poses: Callable[[NDArray[Any]], Floats], duration: float) -> None:

@@ -19,6 +19,11 @@ VERGE = -0.06  # m, of grass beside a road without kerbs
 WALL_HEIGHT = 6.0  # m, of a corridor
 OPENINGS = (135.0, 155.0)  # m from the middle of one opening of a corridor to the next
 OPENING = 28.0  # m of an opening
+DEEP = 32.0  # m on both sides in which trees stand
+APART = 1.1  # m from one trunk to the next, at least
+NEAREST = 1.0  # m from the edge of the way
+HEDGE = 12.0  # m of way for every hedge that may stand beside it
+LODGES = 90.0  # m of way from one house to the next
 
 
 def build_motorway(street: RouteCurve, terrain: Terrain, layout: Layout, rng: np.random.Generator) -> City:
@@ -216,13 +221,6 @@ def _add_country(
         footprints.append(outline)
         heights.append(height)
     return footprints, heights
-
-
-DEEP = 32.0  # m on both sides in which trees stand
-APART = 1.1  # m from one trunk to the next, at least
-NEAREST = 1.0  # m from the edge of the way
-HEDGE = 12.0  # m of way for every hedge that may stand beside it
-LODGES = 90.0  # m of way from one house to the next
 
 
 def build_woods(street: RouteCurve, terrain: Terrain, layout: Layout, rng: np.random.Generator) -> City:

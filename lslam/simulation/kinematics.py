@@ -21,6 +21,7 @@ Floats = NDArray[np.float64]
 SPACING = 0.02  # s between the knots: scans at 10 Hz fall on knots, where the spline meets the path exactly
 STANDING_ACCELERATION = 2.0  # m/s2, the most that moving off from a standing start adds
 _EDGE = 1e-6  # s by which a query may overstep the ends: rounding of stamps to ns
+SINES = 12  # on each axis
 
 
 class PosePath(Protocol):
@@ -164,9 +165,6 @@ def _conjugate_times(q: Floats, p: Floats) -> Floats:
     """Vector part (M, 3) of conj(q) p, quaternions xyzw (M, 4)."""
     v, w = q[:, :3], q[:, 3:]
     return np.asarray(w * p[:, :3] - p[:, 3:] * v - np.cross(v, p[:, :3]))
-
-
-SINES = 12  # on each axis
 
 
 class Vibration(Section):

@@ -24,6 +24,13 @@ MOST_CELLS = 1_500_000
 BESIDE_KERB = 0.05  # m that the grass ends below the pavement
 UNDER_ROAD = 0.2  # m that the ground lies lower where a road covers it
 AIR = {True: 1.0, False: 0.5}  # m between walls and a parked car, or anything else
+DEPTH = 0.5  # m, walls reach below the lowest ground at their foot
+STOREY = 3.0  # m
+PARAPET = 0.4  # m of wall above a flat roof
+OVERHANG = 0.3  # m, eaves beyond the walls
+SLAB = 0.2  # m, the roof of a canopy
+GABLED = ("gabled", "hipped", "half-hipped", "saltbox")  # tags whose roof is drawn with two slopes
+FLAT = ("flat", "skillion", "round", "dome")
 
 
 @dataclass(frozen=True)
@@ -154,15 +161,6 @@ class _Gaps:
         ends = points(np.stack([xy - half, xy, xy + half]))
         near = self._walls.query(ends, predicate="dwithin", distance=AIR[is_car])
         return near.size == 0 and self._places(xy, offset, yaw)
-
-
-DEPTH = 0.5  # m, walls reach below the lowest ground at their foot
-STOREY = 3.0  # m
-PARAPET = 0.4  # m of wall above a flat roof
-OVERHANG = 0.3  # m, eaves beyond the walls
-SLAB = 0.2  # m, the roof of a canopy
-GABLED = ("gabled", "hipped", "half-hipped", "saltbox")  # tags whose roof is drawn with two slopes
-FLAT = ("flat", "skillion", "round", "dome")
 
 
 @dataclass(frozen=True)

@@ -33,6 +33,10 @@ SIDE_ROADS = 100.0  # m from the path
 FARTHEST = 10_000.0  # m from the origin: beyond, single precision would blur the walls
 ELBOW_ROOM = 1.3  # m between a street's lane and the walls beside it
 _PROBE = 0.2  # s
+CELL = 1.0  # m, of the raster of distances to walls
+SHIFT = 4.0  # m between the places that are tried
+HEADINGS = 72
+SEEN = 50.0  # m: a place on the line counts when a wall is that near; nothing is known farther from the map
 
 
 @dataclass(frozen=True)
@@ -126,12 +130,6 @@ def _along_streets(scenario: Scenario, extract: MapExtract, margin: float) -> Ro
     street = smooth_curve(found, closed=False)
     log.info("going along %.0f m of the streets of %s: --path FILE takes another line", street.length, source)
     return Route(street, beside(street, -lane))
-
-
-CELL = 1.0  # m, of the raster of distances to walls
-SHIFT = 4.0  # m between the places that are tried
-HEADINGS = 72
-SEEN = 50.0  # m: a place on the line counts when a wall is that near; nothing is known farther from the map
 
 
 def fit_shape(shape: WayPoints, buildings: Sequence[Building], margin: float, source: str) -> WayPoints:

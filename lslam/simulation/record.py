@@ -34,6 +34,12 @@ from lslam.version import __version__
 
 MANIFEST = "manifest.json"
 SCHEMA = 1
+MARK = "simulation.json"
+TRACERS = 2  # threads; Embree and NumPy let each other run
+AHEAD = 4  # scans traced and not yet written, at most
+log = logging.getLogger("lslam")
+_MAP_SEED = 2**32 - 9  # of the faults in the perturbed map
+_SIDES, _HOUSE = 80e3, 4e3  # bytes beside the scans: per second of readings and truth, and per building of the maps
 
 
 def write_manifest(folder: Path, drive: SimulatedDrive, command: str, points: int, size: int) -> Path:
@@ -93,11 +99,6 @@ def _plain(value: Any) -> Any:
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     return value
-
-
-MARK = "simulation.json"
-TRACERS = 2  # threads; Embree and NumPy let each other run
-AHEAD = 4  # scans traced and not yet written, at most
 
 
 def fingerprint(drive: SimulatedDrive) -> str:
@@ -167,12 +168,6 @@ def _traced(drive: SimulatedDrive, indices: list[int]) -> Iterator[Scan]:
             yield waiting.popleft().result()
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
-
-
-log = logging.getLogger("lslam")
-
-_MAP_SEED = 2**32 - 9  # of the faults in the perturbed map
-_SIDES, _HOUSE = 80e3, 4e3  # bytes beside the scans: per second of readings and truth, and per building of the maps
 
 
 @dataclass(frozen=True)

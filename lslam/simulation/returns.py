@@ -18,6 +18,21 @@ from lslam.config.section import Section
 from lslam.simulation.lidar_models import LidarModel
 from lslam.simulation.scene_mesh import SceneMesh, Surface
 
+Cast = Callable[[NDArray[np.float32], NDArray[np.float32]], tuple[NDArray[np.float32], NDArray[np.int32]]]
+LAYERS = 8  # surfaces of volumes that a beam passes, at most
+_BEYOND = np.float32(1e-3)  # m behind a surface from which a ray goes on
+VOLUMES = (Surface.CROWN, Surface.HEDGE)
+Array = NDArray[np.float32]
+CELL = 0.15  # m of one bump of a surface's texture
+FLATTEST = 0.1  # cosine of incidence: what is met still flatter errs no more than there
+REFERENCE = 0.4  # share of light that comes back at which a LiDAR's ranges are calibrated
+SLANT = 2.0  # times the step of a slanted surface between two rays: more is an edge
+_TABLE = 1 << 16
+_TEXTURED = {
+    "ground": (Surface.ROAD, Surface.PAVEMENT, Surface.LAWN),
+    "walls": (Surface.WALL, Surface.ROOF, Surface.FENCE, Surface.TRUNK),
+}
+
 
 @dataclass(frozen=True)
 class Rays:
@@ -54,13 +69,6 @@ class Hits:
     cosine: NDArray[np.float32]
     surface: NDArray[np.uint8]
     face: NDArray[np.int32]
-
-
-Cast = Callable[[NDArray[np.float32], NDArray[np.float32]], tuple[NDArray[np.float32], NDArray[np.int32]]]
-
-LAYERS = 8  # surfaces of volumes that a beam passes, at most
-_BEYOND = np.float32(1e-3)  # m behind a surface from which a ray goes on
-VOLUMES = (Surface.CROWN, Surface.HEDGE)
 
 
 def penetrate(
@@ -124,19 +132,6 @@ def _solid(
     hits.cosine[which] = np.abs(np.einsum("ij,ij->i", mesh.normals[face], rays.directions[which]))
     hits.surface[which] = mesh.surfaces[face]
     hits.face[which] = face
-
-
-Array = NDArray[np.float32]
-
-CELL = 0.15  # m of one bump of a surface's texture
-FLATTEST = 0.1  # cosine of incidence: what is met still flatter errs no more than there
-REFERENCE = 0.4  # share of light that comes back at which a LiDAR's ranges are calibrated
-SLANT = 2.0  # times the step of a slanted surface between two rays: more is an edge
-_TABLE = 1 << 16
-_TEXTURED = {
-    "ground": (Surface.ROAD, Surface.PAVEMENT, Surface.LAWN),
-    "walls": (Surface.WALL, Surface.ROOF, Surface.FENCE, Surface.TRUNK),
-}
 
 
 class Returns(Section):

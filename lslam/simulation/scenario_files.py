@@ -27,6 +27,24 @@ Floats = NDArray[np.float64]
 Shape = Callable[[np.random.Generator], Floats]
 
 STEP = 1.0  # m between the points of arcs
+_CLOSED = [(0, 0), (190, 0), (235, 25), (235, 150), (120, 150), (120, 95), (0, 95)]
+_OPEN = [(0, 0), (125, 0), (125, 105), (260, 125), (300, 190)]
+_RESIDENTIAL = [
+    (0, 0),
+    (95, -6),
+    (168, 14),
+    (185, 92),
+    (150, 168),
+    (92, 180),
+    (70, 118),
+    (-18, 128),
+    (-30, 62),
+    (-45, 8),
+]
+_URBAN = [(0, 0), (150, 0), (162, 88), (60, 112), (-8, 100)]
+_MOTORWAY = [(0, 0), (380, 0), (760, 95), (1150, 60)]
+_WALK = [(0, 0), (38, 2), (52, 24), (36, 48), (4, 44), (-10, 20)]
+FOLDER = "ready"
 
 
 def rounded(corners: Sequence[tuple[float, float]], radius: float, closed: bool) -> Floats:
@@ -97,25 +115,6 @@ def out_and_back(length: float, radius: float) -> Floats:
     return np.concatenate([[[0.0, 0.0]], turn, [[0.0, 2 * radius]]])
 
 
-_CLOSED = [(0, 0), (190, 0), (235, 25), (235, 150), (120, 150), (120, 95), (0, 95)]
-_OPEN = [(0, 0), (125, 0), (125, 105), (260, 125), (300, 190)]
-_RESIDENTIAL = [
-    (0, 0),
-    (95, -6),
-    (168, 14),
-    (185, 92),
-    (150, 168),
-    (92, 180),
-    (70, 118),
-    (-18, 128),
-    (-30, 62),
-    (-45, 8),
-]
-_URBAN = [(0, 0), (150, 0), (162, 88), (60, 112), (-8, 100)]
-_MOTORWAY = [(0, 0), (380, 0), (760, 95), (1150, 60)]
-_WALK = [(0, 0), (38, 2), (52, 24), (36, 48), (4, 44), (-10, 20)]
-
-
 def _straight(length: float) -> Shape:
     return lambda _: np.array([[0.0, 0.0], [length, 0.0]])
 
@@ -135,7 +134,6 @@ SHAPES: dict[str, tuple[Shape, bool]] = {
 """Way-points by name, and whether they close; `length` of a scenario scales them."""
 
 
-FOLDER = "ready"
 # `block` and `street` draw their lines from the seed, `out-and-back` is as long as speed and scans need, `stairs` leads through
 # a stairwell and `eights` round the middle of a hall; the other shapes are way-points.
 LINES = ("block", "street", "out-and-back", "stairs", "eights", *SHAPES)

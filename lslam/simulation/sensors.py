@@ -29,6 +29,9 @@ ORIGIN = np.array([49.0, 8.4, 115.0])
 T_CAR_ANTENNA = se3.make(np.eye(3), np.array([-0.9, 0.0, -0.15]))
 T_DRONE_ANTENNA = se3.make(np.eye(3), np.array([-0.1, 0.0, 0.35]))
 T_WALKER_ANTENNA = se3.make(np.eye(3), np.array([-0.05, 0.0, 0.25]))
+IMU_FILE, GNSS_FILE, TRUTH = "imu.csv", "gnss.csv", "truth"
+TRUTH_HZ = 100
+_IMU_SEED, _GNSS_SEED = 2**32 - 11, 2**32 - 12  # of the generators; the scenarios count down from 2**32 - 1
 
 
 @dataclass(frozen=True)
@@ -119,11 +122,6 @@ def _errors(model: GnssModel, count: int, rng: np.random.Generator) -> Floats:
     driven[:1] = draws[:1, 1]
     slow = np.asarray(lfilter([1.0], [1.0, -keep], driven, axis=0))
     return np.asarray((model.white * draws[:, 0] + model.slow * slow) * [1.0, 1.0, model.vertical])
-
-
-IMU_FILE, GNSS_FILE, TRUTH = "imu.csv", "gnss.csv", "truth"
-TRUTH_HZ = 100
-_IMU_SEED, _GNSS_SEED = 2**32 - 11, 2**32 - 12  # of the generators; the scenarios count down from 2**32 - 1
 
 
 @dataclass(frozen=True)

@@ -33,6 +33,8 @@ from lslam.types.trajectory import Trajectory
 
 log = logging.getLogger("lslam")
 PREFERRED = EvalConfig(align=("se3", "origin"))
+# More than this many busy cores before the first run, and its times are somebody else's too.
+BUSY = 0.5
 
 
 @dataclass(frozen=True)
@@ -133,10 +135,6 @@ def _differences(sequence: str, runs: Sequence[Finished]) -> list[Difference]:
         rmse = {name: e.translation.rmse if e.translation else float("nan") for name, e in score.ate.items()}
         out.append(Difference(sequence, run.job.method, reference, run.job.seed, rmse["origin"], rmse["se3"]))
     return out
-
-
-# More than this many busy cores before the first run, and its times are somebody else's too.
-BUSY = 0.5
 
 
 def compare(plan: Plan, progress: StudyProgress | None = None) -> Comparison:

@@ -29,6 +29,14 @@ COUNTS = {
 }  # fmt: skip
 IMU = "imu_used"
 NO_TRUTH = "no ground truth"
+RESULTS = "results.csv"
+PARQUET = "results.parquet"
+# Data stay read from one run to the next, so reading is no part of a run's time.
+_NOT_TIMED = ("read",)
+# A run that waited longer for its core was held up by somebody.
+_MOST_WAITED = 0.05
+# A table of so many rows takes its time to write, and no more than one part in so many of all time.
+_MANY, _PARTS = 1000, 10
 
 
 def collect_run(job: Job, is_reused: bool = False) -> RunScore:
@@ -129,16 +137,6 @@ def metrics_of(configs: Sequence[EvalConfig], runs: Sequence[RunScore]) -> list[
 def _more(key: str, unit: str, group: Group) -> Metric:
     """What stands in CSV and JSON only."""
     return Metric(key, key, unit, group, is_main=False)
-
-
-RESULTS = "results.csv"
-PARQUET = "results.parquet"
-# Data stay read from one run to the next, so reading is no part of a run's time.
-_NOT_TIMED = ("read",)
-# A run that waited longer for its core was held up by somebody.
-_MOST_WAITED = 0.05
-# A table of so many rows takes its time to write, and no more than one part in so many of all time.
-_MANY, _PARTS = 1000, 10
 
 
 class Results:

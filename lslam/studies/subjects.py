@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
 
 log = logging.getLogger("lslam")
+ONE_TRUTH = "--gt belongs to one recorded sequence: a scenario has its own, and several need one each"
 
 
 @dataclass(frozen=True)
@@ -116,9 +117,6 @@ def scans_needed(configs: Iterable[InputConfig]) -> int | None:
     needed = [None if c.count is None else c.start + (c.count - 1) * c.skip_frames + 1 for c in configs]
     known = [scans for scans in needed if scans is not None]
     return max(known) if len(known) == len(needed) else None
-
-
-ONE_TRUTH = "--gt belongs to one recorded sequence: a scenario has its own, and several need one each"
 
 
 @dataclass(frozen=True)

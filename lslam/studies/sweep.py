@@ -26,6 +26,8 @@ from lslam.types.study import StudyResult, StudyRow
 from lslam.untrusted import parse_toml
 
 log = logging.getLogger("lslam")
+# Studies that ship with lslam.
+FOLDER = "ready"
 
 
 @dataclass(frozen=True)
@@ -99,10 +101,6 @@ def report_folder(folder: Path) -> list[StudyResult]:
         return write_study_report(folder, rows)
     study = read_study(folder / STUDY)
     return write_study_report(folder, rows, study.finding, study.summary or study.name)
-
-
-# Studies that ship with lslam.
-FOLDER = "ready"
 
 
 def study_names() -> tuple[str, ...]:

@@ -31,6 +31,7 @@ from lslam.types.sequence import Sequence
 
 # Bytes of scans a process keeps at most, and its share of what was free when it began.
 _MOST, _SHARE = 2 * 10**9, 0.2
+INTERRUPTED = ("interrupted", "interrupted before its end")
 
 
 class ScanStore:
@@ -98,9 +99,6 @@ def memory_bound() -> int:
     except (AttributeError, OSError, ValueError):
         return _MOST // 4
     return min(_MOST, int(_SHARE * free))
-
-
-INTERRUPTED = ("interrupted", "interrupted before its end")
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,10 @@ from lslam.geometry import se2
 from lslam.types.constraint import Verdict
 
 Floats = NDArray[np.float64]
+MatchKind = Literal["edges", "lines", "none"]
+# `seen`: scans hold it; `unseen`: no scan says anything, it follows the map; `absent`: scans look through where it should be.
+BuildingStatus = Literal["seen", "unseen", "absent"]
+NEAR = 0.5  # m; what `BuildingCorrection.confidence` counts as in its place
 
 
 @dataclass(frozen=True)
@@ -113,9 +117,6 @@ def _signed_area(ring: Floats) -> float:
     return float(np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y) / 2)
 
 
-MatchKind = Literal["edges", "lines", "none"]
-
-
 @dataclass(frozen=True)
 class KeyframeMatch:
     """The walls seen about one keyframe, laid on all buildings near: Del Tufo's global match.
@@ -213,12 +214,6 @@ class OsmMatches:
     def accepted(self) -> list[KeyframeMatch]:
         """The matches that constrain the trajectory."""
         return [match for match in self.keyframes if match.is_accepted]
-
-
-# `seen`: scans hold it; `unseen`: no scan says anything, it follows the map; `absent`: scans look through where it should be.
-BuildingStatus = Literal["seen", "unseen", "absent"]
-
-NEAR = 0.5  # m; what `BuildingCorrection.confidence` counts as in its place
 
 
 @dataclass(frozen=True)

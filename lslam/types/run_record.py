@@ -15,6 +15,8 @@ from lslam.types.gnss import Georeference
 from lslam.types.scan_result import ScanResult
 from lslam.types.trajectory import Trajectory
 
+Floats = NDArray[np.float64]
+
 
 @dataclass(frozen=True)
 class Crispness:
@@ -67,9 +69,6 @@ class MapDifference:
             f"nearest points within {self.threshold:g} m, every point of both clouds ({self.points} and "
             f"{self.reference_points}), no alignment"
         )
-
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

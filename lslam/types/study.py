@@ -12,6 +12,12 @@ from numpy.typing import NDArray
 from lslam.types.comparison import USABLE
 
 Value = bool | int | float | str
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+Outcome = Literal["confirmed", "refuted", "undecided"]
+# And the numbers that say so.
+Judged = tuple[Outcome, str]
+LawKind = Literal["linear", "inverse", "product"]
 
 
 @dataclass(frozen=True)
@@ -94,14 +100,6 @@ def series_of(method: str, uses_imu: bool) -> str:
     'icp+imu'
     """
     return f"{method}+imu" if uses_imu else method
-
-
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
-Outcome = Literal["confirmed", "refuted", "undecided"]
-# And the numbers that say so.
-Judged = tuple[Outcome, str]
-LawKind = Literal["linear", "inverse", "product"]
 
 
 @dataclass(frozen=True)
