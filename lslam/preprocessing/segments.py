@@ -55,11 +55,6 @@ class Segments:
         return int(self.labels.max(initial=0))
 
 
-def segment_scan(scan: Scan, config: LoamConfig | None = None, gate: PreprocessConfig | None = None) -> Segments:
-    """Ground and clusters of a scan that has rings. Raises InputError as `extract_features` does."""
-    return _segment(scan, walk_rings(scan, gate or PreprocessConfig()), config or LoamConfig())
-
-
 def lego_features(
     scan: Scan, config: LoamConfig | None = None, gate: PreprocessConfig | None = None
 ) -> tuple[Features, Segments]:

@@ -41,14 +41,14 @@ def drift(result: Evaluation) -> float:
 def test_defaults_are_se3_and_origin_and_every_part_has_a_recipe(estimate: Trajectory, truth: Trajectory) -> None:
     result = evaluate(estimate, truth)
     assert list(result.ate) == ["se3", "origin"]
-    assert [(e.delta, e.unit, e.pairs) for e in result.rpe] == [(1, "scan", "consecutive"), (10, "m", "all")]
+    assert [(e.delta, e.unit, e.pairs) for e in result.scores["rpe"]] == [(1, "scan", "consecutive"), (10, "m", "all")]
     assert (result.matched, result.possible) == (300, 300)
     assert result.path_length == pytest.approx(truth.path_lengths[-1])
     assert result.notes == []
-    for part in [*result.ate.values(), *result.rpe, *list(result.scores.values())[2:]]:
+    for part in [*result.ate.values(), *result.scores["rpe"], *list(result.scores.values())[2:]]:
         assert len(part.recipe) > 20
     assert "300 poses" in result.ate["se3"].recipe
-    assert str(result.rpe[1].n_pairs) in result.rpe[1].recipe
+    assert str(result.scores["rpe"][1].n_pairs) in result.scores["rpe"][1].recipe
 
 
 def test_an_estimate_that_never_moves_fails_every_number(truth: Trajectory) -> None:
@@ -57,8 +57,8 @@ def test_an_estimate_that_never_moves_fails_every_number(truth: Trajectory) -> N
     result = evaluate(sentinel, truth)
     assert not result.ate["se3"].available
     assert rmse(result, "origin") > 20
-    assert result.rpe[0].translation is not None
-    assert result.rpe[0].translation.rmse > 0.5
+    assert result.scores["rpe"][0].translation is not None
+    assert result.scores["rpe"][0].translation.rmse > 0.5
     assert drift(result) > 50
     assert result.scores["thesis1"].thesis_rmse > 20
     assert result.scores["thesis2"].ate_mean > 20

@@ -13,7 +13,7 @@ from lslam.config.loam import LoamConfig
 from lslam.errors import InputError
 from lslam.kernels import range_image
 from lslam.preprocessing.features import extract_features
-from lslam.preprocessing.segments import lego_features, segment_scan
+from lslam.preprocessing.segments import Segments, lego_features
 from lslam.simulation import lidar
 from lslam.simulation.scenarios import simulate
 from lslam.simulation.scene_mesh import Surface
@@ -43,6 +43,10 @@ def classed(monkeypatch: pytest.MonkeyPatch, scenario: str, model: str, index: i
 
 
 @pytest.mark.parametrize(("scenario", "model"), [("street", "hdl64-kitti"), ("street", "vlp16"), ("walk", "os1-64")])
+def segment_scan(scan: Scan, config: LoamConfig | None = None) -> Segments:
+    return lego_features(scan, config)[1]
+
+
 def test_ground_is_found_and_little_else_and_foliage_is_dropped_before_walls(
     monkeypatch: pytest.MonkeyPatch, scenario: str, model: str
 ) -> None:
