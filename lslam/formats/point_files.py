@@ -145,7 +145,7 @@ def write_cloud(path: Path, cloud: Cloud, *, comment: str = "", wkt: str = "") -
         write_las(path, cloud, wkt)
         return
     if suffix not in MAP_SUFFIXES:
-        raise UsageError(f"{path}: no map file lslam writes; known suffixes: {', '.join(SUFFIXES)}")
+        raise UsageError(f"{path}: no map file lslam writes; known suffixes: {', '.join(MAP_SUFFIXES)}")
     names = ["x", "y", "z", "intensity"] if cloud.has_intensity else ["x", "y", "z"]
     with atomic_write(path) as stream:
         stream.write(ply_header(len(cloud), names, comment) if suffix == ".ply" else pcd_header(len(cloud), names))

@@ -13,7 +13,7 @@ import pytest
 
 from lslam.errors import InputError, OutputError, UsageError
 from lslam.formats.las_files import read_las
-from lslam.formats.point_files import SUFFIXES, read_cloud, write_cloud
+from lslam.formats.point_files import MAP_SUFFIXES, read_cloud, write_cloud
 from lslam.types import cloud as cloud_module
 from lslam.types.cloud import ArrayCloud, CloudBlock, bounds, in_memory
 
@@ -24,7 +24,7 @@ def make(count: int = 1000, offset: float = 0.0, brightest: float = 1.0) -> Arra
     return ArrayCloud.of(points, np.linspace(0, brightest, count))
 
 
-@pytest.mark.parametrize("suffix", SUFFIXES)
+@pytest.mark.parametrize("suffix", MAP_SUFFIXES)
 @pytest.mark.parametrize("count", [0, 1, 1000])
 def test_written_and_read_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, suffix: str, count: int) -> None:
     monkeypatch.setattr(cloud_module, "BLOCK", 300)
@@ -41,7 +41,7 @@ def test_written_and_read_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, 
     assert [p.name for p in tmp_path.iterdir()] == [path.name]
 
 
-@pytest.mark.parametrize("suffix", SUFFIXES)
+@pytest.mark.parametrize("suffix", MAP_SUFFIXES)
 def test_blocks_do_not_show_in_the_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, suffix: str) -> None:
     digests = set()
     # lazrs compresses chunks of 50,000 points, so what is handed over in pieces must still come out the same.
@@ -103,7 +103,7 @@ def test_what_is_no_map_file(tmp_path: Path) -> None:
 
 
 def test_what_cannot_be_written(tmp_path: Path) -> None:
-    for suffix in SUFFIXES:
+    for suffix in MAP_SUFFIXES:
         with pytest.raises(OutputError, match=f"map{suffix} cannot be written"):
             write_cloud(tmp_path / "absent" / f"map{suffix}", make(3))
     wide = ArrayCloud.of([[0, 0, 0], [3e6, 0, 0]])

@@ -22,6 +22,10 @@ from lslam.types.scan import Scan
 GROUND = [Surface.ROAD, Surface.PAVEMENT, Surface.LAWN]
 
 
+def segment_scan(scan: Scan, config: LoamConfig | None = None) -> Segments:
+    return lego_features(scan, config)[1]
+
+
 def classed(monkeypatch: pytest.MonkeyPatch, scenario: str, model: str, index: int) -> tuple[Scan, NDArray[np.uint8]]:
     """A simulated scan and the surface each of its points was met on, overheard from the ray caster."""
     heard: list[Any] = []
@@ -43,10 +47,6 @@ def classed(monkeypatch: pytest.MonkeyPatch, scenario: str, model: str, index: i
 
 
 @pytest.mark.parametrize(("scenario", "model"), [("street", "hdl64-kitti"), ("street", "vlp16"), ("walk", "os1-64")])
-def segment_scan(scan: Scan, config: LoamConfig | None = None) -> Segments:
-    return lego_features(scan, config)[1]
-
-
 def test_ground_is_found_and_little_else_and_foliage_is_dropped_before_walls(
     monkeypatch: pytest.MonkeyPatch, scenario: str, model: str
 ) -> None:
