@@ -231,6 +231,8 @@ MARKS = {
     "PLANAR",
     "FIX_NOISE",
     "GRAVITY_KEY",
+    "SPEED_KEY",
+    "BIAS_KEY",
     "STATE",
     "FREE",
     "EMPTY",

@@ -26,6 +26,7 @@ from lslam.graph.problem import PoseGraph
 from lslam.keyframes.store import KeyframeStore
 from lslam.stopping import checking
 from lslam.types.constraint import LoopCandidate, Turn
+from lslam.types.inertial_state import InertialChain
 from lslam.types.scan_result import ScanResult
 from lslam.types.sequence import Sequence
 from lslam.types.stage_clock import KeyframeClocks
@@ -39,7 +40,7 @@ Hold = Callable[[PoseGraph, Placement, Given], BackEnd | None]
 def run_back_end(
     sequence: Sequence, results: list[ScanResult], store: KeyframeStore, config: Config,
     candidates: list[LoopCandidate], turns: Many[Turn] = (), hold: Hold | None = None,
-    clocks: KeyframeClocks | None = None,
+    clocks: KeyframeClocks | None = None, inertial: InertialChain | None = None,
 ) -> BackEnd:  # fmt: skip
     """Optimise the pose graph with loop closures, fixes and map priors, and correct all scans; odometry's poses on failure."""
     keyframes = store.keyframes
@@ -49,7 +50,8 @@ def run_back_end(
         if config.gnss.mode != "off":
             problems.append("GNSS: fewer than two keyframes have no heading on the Earth")
         return BackEnd(results, candidates, problems=problems)
-    graph = replace(_graph(given), turns=turns)
+    # What carries gravity is left out with it.
+    graph = replace(_graph(given), turns=turns, inertial=inertial if config.graph.gravity else None)
     out = None
     if hold is not None:
         by_fixes = config.gnss.mode == "graph" or (config.gnss.mode == "fit" and config.osm.origin is None)

@@ -22,3 +22,7 @@ class LioSamConfig(Section):
     reset_scans: int = Field(
         100, ge=2, description="scans after which the smoother's graph begins anew, with what it knows as its prior"
     )
+    graph_imu: bool = Field(
+        True,
+        description="preintegrated IMU factors between the keyframes of the pose graph, with velocities and biases",
+    )

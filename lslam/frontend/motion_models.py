@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from lslam.config import Config
-from lslam.graph.inertial_smoother import ImuNoise, InertialSmoother
+from lslam.graph.inertial_smoother import InertialSmoother
 from lslam.inertial.filter import FilterMotion
 from lslam.inertial.fusion import InertialMotion
 from lslam.inertial.gyroscope import BIAS_WALK
@@ -16,6 +16,7 @@ from lslam.inertial.imu_estimate import ACCEL_WALK, FORCE_NOISE, GRAVITY_WALK
 from lslam.inertial.initialise import InertialStart
 from lslam.inertial.smoothing import SmootherMotion
 from lslam.inertial.window_motion import WindowMotion
+from lslam.types.inertial_state import ImuNoise
 
 IMU_NOISE = ImuNoise(FORCE_NOISE, ACCEL_WALK, float(BIAS_WALK), GRAVITY_WALK)
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from lslam.geometry import noise, se2, se3
 from lslam.graph.fix_noise import GaussMarkovNoise
+from lslam.graph.inertial_factors import inertial_factors, insert_inertial
 from lslam.graph.problem import FloorPlane, PlanarPrior, PoseGraph, PositionFix
 from lslam.types.constraint import Constraint, Turn
 
@@ -128,7 +129,9 @@ def fixed_part(graph: PoseGraph, may_tilt: bool = False) -> Any:
     factors.add(gtsam.PriorFactorPose3(0, gtsam.Pose3(first), start))
     for factor in between_all(graph.odometry):
         factors.add(factor)
-    for up in graph.ups:
+    for factor in [] if graph.inertial is None else inertial_factors(graph.inertial, graph.world_up):
+        factors.add(factor)
+    for up in graph.ups if graph.inertial is None else ():
         model = gtsam.noiseModel.Isotropic.Sigma(2, up.sigma / np.sqrt(up.share))
         factors.add(gtsam.AttitudeFactorPose3(up.keyframe, gtsam.Unit3(graph.world_up), model, gtsam.Unit3(up.up)))
     for turn in graph.turns:
@@ -156,6 +159,8 @@ def start_values(graph: PoseGraph, poses: Floats) -> Any:
         values.insert(len(poses), gtsam.OrientedPlane3(_floor_in_world(graph.floors, poses)))
     if graph.map_priors:
         values.insert(map_key(graph), gtsam.Pose3())
+    if graph.inertial is not None:
+        insert_inertial(values, graph.inertial, poses)
     if graph.fix_noise is not None:
         for i in range(len(graph.fix_noise.seconds)):
             values.insert(FIX_NOISE + i, np.zeros(3))

@@ -5,7 +5,7 @@ State k has the keys 4 k to 4 k + 3: pose, velocity and biases; gravity has the 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,8 @@ from lslam.errors import GraphError
 from lslam.formats.state_files import Records
 from lslam.geometry import noise, se3
 from lslam.graph.factors import well_conditioned
-from lslam.types.inertial_state import InertialState, InertialStep
+from lslam.graph.preintegration import preintegrated
+from lslam.types.inertial_state import ImuNoise, InertialState, InertialStep
 from lslam.types.state import State
 
 Floats = NDArray[np.float64]
@@ -23,21 +24,6 @@ Floats = NDArray[np.float64]
 GRAVITY_KEY = 1 << 40
 # Pose, velocity, biases and gravity among the 18 of a state.
 POSE, SPEED, BIASES, DOWN = slice(0, 6), slice(6, 9), slice(9, 15), slice(15, 18)
-# m2 per s, of the integration itself: none but rounding.
-INTEGRATION = 1e-10
-
-
-@dataclass(frozen=True)
-class ImuNoise:
-    """Densities, one sigma: force, m/s2 per sqrt(Hz); random walks per sqrt(s) of both biases and of gravity in the map's world.
-
-    The rates' noise stands with each step.
-    """
-
-    force: float
-    accel_walk: float
-    gyro_walk: float
-    gravity_walk: float
 
 
 class InertialSmoother:
@@ -104,7 +90,7 @@ class InertialSmoother:
         before = self.newest
         assert before is not None
         k = len(self._steps)
-        felt = self._preintegrated(step, before)
+        felt = preintegrated(step, before.accel_bias, before.gyro_bias, before.gravity, self._noise)
         names = (4 * k, 4 * k + 1, 4 * k + 4, 4 * k + 5, 4 * k + 2, 4 * k + 6)
         factors = gtsam.NonlinearFactorGraph()
         factors.add(gtsam.CombinedImuFactorWithGravityVector(*names, GRAVITY_KEY, felt))
@@ -125,22 +111,6 @@ class InertialSmoother:
             said = str(failure).strip() or "nothing is said why"
             raise GraphError(f"the smoother of poses and IMU cannot be solved: {said.splitlines()[0]}") from None
         return self.newest
-
-    def _preintegrated(self, step: InertialStep, before: InertialState) -> Any:
-        import gtsam
-
-        n, one = self._noise, np.eye(3)
-        params = gtsam.PreintegrationCombinedParams(before.gravity)
-        params.setAccelerometerCovariance(n.force**2 * one)
-        params.setGyroscopeCovariance(step.rate_noise)
-        params.setIntegrationCovariance(INTEGRATION * one)
-        params.setBiasAccCovariance(n.accel_walk**2 * one)
-        params.setBiasOmegaCovariance(n.gyro_walk**2 * one)
-        bias = gtsam.imuBias.ConstantBias(before.accel_bias, before.gyro_bias)
-        felt = gtsam.PreintegratedCombinedMeasurements(params, bias)
-        for accel, rate, seconds in zip(step.accel, step.rates, step.seconds.tolist(), strict=True):
-            felt.integrateMeasurement(accel, rate, seconds)
-        return felt
 
     def _estimate(self, k: int) -> InertialState:
         solver, pose, speed, bias = self._solver, 4 * k, 4 * k + 1, 4 * k + 2

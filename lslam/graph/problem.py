@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from lslam.graph.fix_noise import GaussMarkovNoise
 from lslam.types.constraint import Constraint, LoopStage, Turn
+from lslam.types.inertial_state import InertialChain
 
 Floats = NDArray[np.float64]
 
@@ -107,6 +108,7 @@ class PoseGraph:
     spread : (K, 6, 6) covariances of poses to be added to those of `Solution`; None for nothing
     estimated_drift : the drift that odometry was corrected by
     fix_noise : correlated noise of the fixes, None where they are independent
+    inertial : the IMU between keyframes, which then tells up in place of the `ups`; None for none
     """
 
     poses: Floats
@@ -129,6 +131,7 @@ class PoseGraph:
     spread: Floats | None = None
     estimated_drift: EstimatedDrift | None = None
     fix_noise: GaussMarkovNoise | None = None
+    inertial: InertialChain | None = None
 
     def __len__(self) -> int:
         return len(self.poses)

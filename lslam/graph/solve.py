@@ -14,6 +14,7 @@ from lslam.errors import GraphError
 from lslam.geometry import noise
 from lslam.graph.chi_square import quantile
 from lslam.graph.factors import FIX_NOISE
+from lslam.graph.inertial_factors import BIAS_KEY, SPEED_KEY
 from lslam.stopping import check_stop, checking
 
 Floats = NDArray[np.float64]
@@ -63,7 +64,7 @@ def solve_incrementally(factors: Any, values: Any, count: int) -> Any:
         due[max((key for key in names if key < count), default=0)].append(factor)
     params = gtsam.ISAM2Params()
     params.relinearizeSkip = 1
-    together = [key for key in map(int, values.keys()) if key >= FIX_NOISE]
+    together = [key for key in map(int, values.keys()) if FIX_NOISE <= key < SPEED_KEY]
     if together:
         # Beside odometry of a centimetre the information of correlated noise of a metre is lost in the normal equations.
         params.setFactorization("QR")
@@ -74,6 +75,9 @@ def solve_incrementally(factors: Any, values: Any, count: int) -> Any:
             part, start = gtsam.NonlinearFactorGraph(), gtsam.Values()
             for k in range(begin, min(begin + BATCH, count)):
                 start.insert(k, values.atPose3(k))
+                if values.exists(SPEED_KEY + k):
+                    start.insert(SPEED_KEY + k, values.atPoint3(SPEED_KEY + k))
+                    start.insert(BIAS_KEY + k, values.atConstantBias(BIAS_KEY + k))
                 for factor in due[k]:
                     part.add(factor)
             if begin == 0 and values.exists(count + 1):

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
+from itertools import pairwise
 from typing import Protocol
 
 import numpy as np
@@ -17,7 +19,7 @@ from lslam.inertial.integrate import Increments
 from lslam.inertial.navigation_state import BEGIN_SIGMA
 from lslam.registration.constant_velocity import middle_of
 from lslam.types.imu import ImuStream
-from lslam.types.inertial_state import InertialState, InertialStep
+from lslam.types.inertial_state import ImuNoise, InertialChain, InertialLink, InertialState, InertialStep
 from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan import Span
 from lslam.types.scan_result import ScanResult
@@ -57,7 +59,7 @@ class SmootherMotion(InertialMotion):
     """Predicts with the newest state of a smoother, which takes each registered pose as a measurement beside the IMU's.
 
     States are at the middles of the sweeps. The errors of the gyroscope's axes, which the smoother has none of, are calibrated
-    as with any IMU, and taken off its readings.
+    as with any IMU, and taken off its readings, as the bias at the start is.
     """
 
     def __init__(
@@ -65,6 +67,8 @@ class SmootherMotion(InertialMotion):
     ) -> None:
         super().__init__(imu, T_lidar_imu, estimate, config)
         self.smoother = smoother
+        # Taken off the gyroscope's readings, so that what the smoother estimates does not change with the axes.
+        self._usual_bias = estimate.gyroscope.bias
         # Whether the smoother's newest state is that of the newest sweep, `_instant_ns`.
         self._is_begun = False
         # The state that `weigh` added, ns and the state, for `correct`.
@@ -122,6 +126,26 @@ class SmootherMotion(InertialMotion):
             return
         self.estimate = self._as_estimate(found)
 
+    def chain(self, keyframes: Sequence[tuple[int, int]], imu_noise: ImuNoise) -> InertialChain:
+        """The IMU between these keyframes, numbers and stamps in ns, by what is known of it now."""
+        links = []
+        for (a, begin_ns), (b, end_ns) in pairwise(keyframes):
+            if end_ns > begin_ns and self._covers(begin_ns, end_ns):
+                step = self._measured(self.estimate.over(self.imu, np.array([begin_ns, end_ns])))
+                links.append(InertialLink(a, b, self._at_lidar(step)))
+        R = self.T_lidar_imu[:3, :3]
+        known = self._beginning()
+        return InertialChain(links, R @ known.accel_bias, R @ known.gyro_bias, imu_noise)
+
+    def _at_lidar(self, step: InertialStep) -> InertialStep:
+        """The readings of an IMU in the place and axes of the LiDAR, its biases but turned."""
+        R, lever = self.T_lidar_imu[:3, :3], self.T_imu_lidar[:3, 3]
+        rates = step.rates - self._beginning().gyro_bias
+        middles = np.cumsum(step.seconds) - 0.5 * step.seconds
+        turning = np.gradient(rates, middles, axis=0) if len(rates) > 1 else np.zeros_like(rates)
+        forces = step.accel + np.cross(turning, lever) + np.cross(rates, np.cross(rates, lever))
+        return InertialStep(step.seconds, forces @ R.T, step.rates @ R.T, R @ step.rate_noise @ R.T)
+
     def state(self) -> State:
         """What `restore` needs to go on from here; not the stream."""
         return {**super().state(), "is_begun": self._is_begun, "smoother": self.smoother.state()}
@@ -164,7 +188,7 @@ class SmootherMotion(InertialMotion):
 
         gyroscope = self.estimate.gyroscope
         return InertialStep(
-            np.diff(at), means(self.imu.accel), means(self.imu.gyro) @ gyroscope.axes.T,
+            np.diff(at), means(self.imu.accel), (means(self.imu.gyro) - self._usual_bias) @ gyroscope.axes.T,
             gyroscope.turn_covariance(step) / step.duration, T_world_imu, C,
         )  # fmt: skip
 
@@ -175,13 +199,12 @@ class SmootherMotion(InertialMotion):
         P[np.ix_(ESTIMATE, ESTIMATE)] = e.covariance
         axes = e.gyroscope.axes
         P[12:15, 12:15] = axes @ e.gyroscope.covariance[:3, :3] @ axes.T
-        return InertialState(
-            self._pose @ self.T_lidar_imu, e.velocity, e.accel_bias, axes @ e.gyroscope.bias, e.gravity, P
-        )
+        bias = axes @ (e.gyroscope.bias - self._usual_bias)
+        return InertialState(self._pose @ self.T_lidar_imu, e.velocity, e.accel_bias, bias, e.gravity, P)
 
     def _as_estimate(self, found: InertialState) -> ImuEstimate:
         """The state as what predicts; the gyroscope's axes and noise are the calibration's."""
         known = self.estimate.gyroscope
-        gyroscope: Gyroscope = replace(known, bias=np.linalg.solve(known.axes, found.gyro_bias))
+        gyroscope: Gyroscope = replace(known, bias=self._usual_bias + np.linalg.solve(known.axes, found.gyro_bias))
         P = found.covariance[np.ix_(ESTIMATE, ESTIMATE)]
         return ImuEstimate(found.velocity, found.gravity, found.accel_bias, gyroscope, P)

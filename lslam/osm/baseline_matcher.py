@@ -128,6 +128,7 @@ def _first(graph: PoseGraph, poses: Floats, count: int) -> PoseGraph:
         fixes=[fix for fix in graph.fixes if fix.keyframe < count],
         ups=[up for up in graph.ups if up.keyframe < count],
         turns=[turn for turn in graph.turns if max(turn.a, turn.b) < count],
+        inertial=None if graph.inertial is None else graph.inertial.until(count),
         floors=[floor for floor in graph.floors if floor.keyframe < count],
         distances=graph.distances[:count],
     )

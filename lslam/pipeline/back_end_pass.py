@@ -69,7 +69,9 @@ def optimise_poses(
             if should_stop():
                 raise InterruptedRunError("interrupted before the pose graph")
             with asking(should_stop, "interrupted before the pose graph was solved"):
-                done = run_back_end(sequence, record.results, store, config, candidates, record.turns, hold, clocks)
+                done = run_back_end(
+                    sequence, record.results, store, config, candidates, record.turns, hold, clocks, record.inertial
+                )
         except InterruptedRunError as error:
             manifest.interrupt(str(error))
             return BackEnd(record.results)

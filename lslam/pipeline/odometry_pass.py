@@ -16,7 +16,9 @@ from lslam.frontend import inertial_start
 from lslam.frontend.checkpoints import Checkpoints, OdometryCheckpoints
 from lslam.frontend.inertial_start import Inertial, begin_inertial, close_inertial, load_start, save_start
 from lslam.frontend.keyframing import Keyframing
+from lslam.frontend.motion_models import IMU_NOISE
 from lslam.frontend.register_scans import estimate, is_diverged, to_trajectory
+from lslam.inertial.smoothing import SmootherMotion
 from lslam.integrity.alerts import Alert, alerts
 from lslam.integrity.monitor import IntegrityMonitor
 from lslam.kernels import jit
@@ -34,6 +36,7 @@ from lslam.pipeline.manifest import Manifest
 from lslam.pipeline.run_folder import CHECKPOINT, RunFolder
 from lslam.pipeline.watch import Watch
 from lslam.types.constraint import Turn
+from lslam.types.inertial_state import InertialChain
 from lslam.types.run_record import RunRecord
 from lslam.types.scan_result import ScanResult
 from lslam.types.sequence import Sequence
@@ -101,7 +104,16 @@ def estimate_poses(
         real_time_limit=config.input.skip_frames / sequence.rate_hz,
         pose_time=manifest.pose_time,
         turns=_turns(inertial, store, config),
+        inertial=_chain(inertial, store, config),
     )
+
+
+def _chain(inertial: Inertial, store: KeyframeStore, config: Config) -> InertialChain | None:
+    """The IMU between keyframes, when the graph is to have it."""
+    motion = inertial.motion
+    if not isinstance(motion, SmootherMotion) or motion.refusal or not config.lio_sam.graph_imu:
+        return None
+    return motion.chain([(k.number, k.stamp_ns) for k in store.keyframes], IMU_NOISE)
 
 
 def _turns(inertial: Inertial, store: KeyframeStore, config: Config) -> list[Turn]:

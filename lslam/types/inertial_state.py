@@ -1,13 +1,27 @@
-"""What a smoother of poses and inertial measurements takes and gives, as plain values."""
+"""Inertial measurements beside poses, as smoothers and pose graphs take and give them: plain values."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class ImuNoise:
+    """Densities, one sigma: force, m/s2 per sqrt(Hz); random walks per sqrt(s) of both biases and of gravity in the map's world.
+
+    The rates' noise stands with each step.
+    """
+
+    force: float
+    accel_walk: float
+    gyro_walk: float
+    gravity_walk: float
 
 
 @dataclass(frozen=True)
@@ -44,3 +58,29 @@ class InertialStep:
     rate_noise: Floats
     T_world_imu: Floats | None = None
     covariance: Floats | None = None
+
+
+@dataclass(frozen=True)
+class InertialLink:
+    """What an IMU in the place and axes of the LiDAR would have measured from keyframe `a` to keyframe `b`."""
+
+    a: int
+    b: int
+    step: InertialStep
+
+
+@dataclass(frozen=True)
+class InertialChain:
+    """The IMU between the keyframes of a run, without the pairs over which it was silent.
+
+    accel_bias, gyro_bias : (3,) as they were at the end, LiDAR axes, m/s2 and rad/s
+    """
+
+    links: Sequence[InertialLink]
+    accel_bias: Floats
+    gyro_bias: Floats
+    noise: ImuNoise
+
+    def until(self, count: int) -> InertialChain:
+        """That of the first `count` keyframes."""
+        return replace(self, links=[link for link in self.links if max(link.a, link.b) < count])

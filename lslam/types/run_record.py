@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from lslam.types.building import CorrectedMap, OsmMatches
 from lslam.types.constraint import LoopCandidate, Turn
 from lslam.types.gnss import Georeference
+from lslam.types.inertial_state import InertialChain
 from lslam.types.scan_result import ScanResult
 from lslam.types.trajectory import Trajectory
 
@@ -131,6 +132,7 @@ class RunRecord:
     unscored : why a known ground truth gave no score, empty where it did
     odometry : the trajectory before the pose graph, in its own world, None when there was no back end
     T_final_odometry : (4, 4) from that world into the trajectory's
+    inertial : the IMU between keyframes, when a tightly coupled method has it in the graph
     turns : of the IMU between keyframes, when the graph is to have them
     osm : what walls seen and buildings of a map had to do with each other, None without a map that could be used; buildings :
         of that map, where they really stand
@@ -159,6 +161,7 @@ class RunRecord:
     odometry: Trajectory | None = None
     T_final_odometry: NDArray[np.float64] = field(default_factory=lambda: np.eye(4))
     turns: list[Turn] = field(default_factory=list)
+    inertial: InertialChain | None = None
     loops: list[LoopCandidate] = field(default_factory=list)
     keyframe_scans: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
     back_end_seconds: dict[int, dict[str, float]] = field(default_factory=dict)

@@ -13,8 +13,8 @@ from lslam.errors import GraphError
 from lslam.formats.state_files import read_state, write_state
 from lslam.frontend.state_classes import STATE_CLASSES
 from lslam.geometry import se3, so3
-from lslam.graph.inertial_smoother import ImuNoise, InertialSmoother
-from lslam.types.inertial_state import InertialState, InertialStep
+from lslam.graph.inertial_smoother import InertialSmoother
+from lslam.types.inertial_state import ImuNoise, InertialState, InertialStep
 
 Floats = NDArray[np.float64]
 

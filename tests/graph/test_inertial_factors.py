@@ -1,0 +1,110 @@
+"""A pose graph with its IMU: tilt that odometry loses is kept, covariances stay honest, and gaps are no links."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from graph_builders import ate, measured
+from numpy.typing import NDArray
+
+from lslam.config.graph import GraphConfig
+from lslam.geometry import se3, so3
+from lslam.graph.pose_graph import optimise
+from lslam.graph.problem import PoseGraph, PositionFix
+from lslam.types.constraint import Constraint
+from lslam.types.inertial_state import ImuNoise, InertialChain, InertialLink, InertialStep
+
+Floats = NDArray[np.float64]
+
+COUNT, HZ, G = 60, 100, 9.80665
+# A second from keyframe to keyframe; odometry is poor at turns, so that the IMU has something to say.
+SIGMAS = np.array([0.02, 0.02, 0.02, 2e-3, 2e-3, 2e-3])
+FORCE, RATE = 0.05, 2e-4
+NOISE = ImuNoise(FORCE, 2e-3, 2e-5, 5e-3)
+BIAS = np.array([0.05, -0.05, 0.08]), np.array([1e-3, -2e-3, 1e-3])
+
+
+def curve(t: Floats) -> tuple[Floats, Floats, Floats]:
+    """Positions, accelerations and rotations on a figure of eight that climbs and rolls."""
+    p = np.stack([30 * np.sin(0.1 * t), 15 * np.sin(0.2 * t), np.sin(0.2 * t)], -1)
+    v = np.stack([3 * np.cos(0.1 * t), 3 * np.cos(0.2 * t), 0.2 * np.cos(0.2 * t)], -1)
+    a = np.stack([-0.3 * np.sin(0.1 * t), -0.6 * np.sin(0.2 * t), -0.04 * np.sin(0.2 * t)], -1)
+    yaw = np.unwrap(np.arctan2(v[..., 1], v[..., 0]))
+    pitch = -np.arctan2(v[..., 2], np.hypot(v[..., 0], v[..., 1]))
+    return p, a, so3.from_euler_rpy(np.stack([0.05 * np.sin(0.3 * t), pitch, yaw], -1))
+
+
+def link(k: int, rng: np.random.Generator) -> InertialLink:
+    at = k + np.arange(HZ + 1) / HZ
+    R = curve(at)[2]
+    rates = so3.log(np.swapaxes(R[:-1], -1, -2) @ R[1:]) * HZ
+    _, a, middle = curve(at[:-1] + 0.5 / HZ)
+    forces = np.einsum("nji,nj->ni", middle, a + np.array([0.0, 0.0, G]))
+    forces = forces + BIAS[0] + FORCE * np.sqrt(HZ) * rng.standard_normal(forces.shape)
+    rates = rates + BIAS[1] + RATE * np.sqrt(HZ) * rng.standard_normal(rates.shape)
+    return InertialLink(k, k + 1, InertialStep(np.full(HZ, 1 / HZ), forces, rates, RATE**2 * np.eye(3)))
+
+
+def graph_and_truth(seed: int) -> tuple[PoseGraph, Floats]:
+    rng = np.random.default_rng(seed)
+    p, _, R = curve(np.arange(COUNT, dtype=float))
+    poses = se3.make(R, p)
+    real = se3.inverse(poses[0]) @ poses
+    steps = measured(se3.relative(real[:-1], real[1:]), SIGMAS, rng)
+    begun = [np.eye(4)]
+    for step in steps:
+        begun.append(se3.normalise(begun[-1] @ step))
+    odometry = [Constraint(k, k + 1, T, np.diag(SIGMAS**2), "odometry") for k, T in enumerate(steps)]
+    chain = InertialChain([link(k, rng) for k in range(COUNT - 1)], BIAS[0] + 0.01, BIAS[1] + 1e-4, NOISE)
+    return PoseGraph(np.stack(begun), odometry, world_up=R[0].T @ [0, 0, 1], inertial=chain), real
+
+
+def fixes_of(real: Floats) -> list[PositionFix]:
+    rng = np.random.default_rng(7)
+    return [
+        PositionFix(k, real[k, :3, 3] + 0.5 * rng.normal(size=3), np.full(3, 0.5), np.zeros(3))
+        for k in range(0, COUNT, 3)
+    ]
+
+
+def turned(poses: Floats, real: Floats) -> float:
+    """rad, rms."""
+    return float(np.linalg.norm(so3.log(poses[:, :3, :3] @ np.swapaxes(real[:, :3, :3], -1, -2))))
+
+
+def nees(poses: Floats, covariances: Floats, real: Floats) -> float:
+    e = poses[1:, :3, 3] - real[1:, :3, 3]
+    return float(np.mean(np.einsum("ki,ki->k", e, np.linalg.solve(covariances[1:, :3, :3], e[..., None])[..., 0])) / 3)
+
+
+def test_the_imu_keeps_what_odometry_loses_and_says_how_well() -> None:
+    ratios, consistency = [], []
+    for seed in range(4):
+        graph, real = graph_and_truth(seed)
+        held = optimise(graph, GraphConfig())
+        alone = optimise(replace(graph, inertial=None), GraphConfig())
+        ratios.append(turned(held.poses, real) / turned(alone.poses, real))
+        consistency.append(nees(held.poses, held.covariances, real))
+    assert np.median(ratios) < 0.5
+    assert 0.3 < np.mean(consistency) < 2.0
+
+
+@pytest.mark.parametrize("settings", [{}, {"incremental": True}])
+def test_fixes_and_imu_hold_one_graph(settings: dict[str, object]) -> None:
+    graph, real = graph_and_truth(0)
+    config = GraphConfig.model_validate(settings)
+    free = replace(graph, fixes=fixes_of(real), is_anchored=False)
+    held = optimise(free, config)
+    assert held.fix_inliers.all()
+    assert ate(held.poses, real) < 0.9 * ate(optimise(replace(free, inertial=None), config).poses, real)
+
+
+def test_a_gap_of_the_imu_leaves_odometry_alone_there() -> None:
+    graph, real = graph_and_truth(1)
+    assert graph.inertial is not None
+    kept = [one for one in graph.inertial.links if not 20 <= one.a < 24]
+    held = optimise(replace(graph, inertial=replace(graph.inertial, links=kept)), GraphConfig())
+    assert ate(held.poses, real) < ate(optimise(replace(graph, inertial=None), GraphConfig()).poses, real)
+    assert len(graph.inertial.until(10).links) == 9
