@@ -26,7 +26,7 @@ def inertial_factors(chain: InertialChain, world_up: Floats) -> list[Any]:
     """The factors of all links; world_up : (3,) unit, in the world of the graph."""
     import gtsam
 
-    made = []
+    made: list[Any] = []
     gravity = -GRAVITY * world_up
     bias = gtsam.imuBias.ConstantBias(chain.accel_bias, chain.gyro_bias)
     about = gtsam.noiseModel.Diagonal.Sigmas(np.repeat([FORCE_BIAS, RATE_BIAS], 3))

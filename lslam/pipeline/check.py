@@ -41,7 +41,7 @@ def check_config(config: Config) -> None:
         raise UsageError("--imu does nothing with --poses, whose motion is given: drop one of them")
     if method in TIGHTLY_COUPLED and (config.imu.velocity != "registration" or not config.imu.weigh):
         raise UsageError(
-            f"imu.velocity and imu.weigh are of the loosely coupled IMU, which {method} does not have: drop them"
+            f"imu.velocity and imu.weigh are of the loosely coupled IMU, {method} weighs points and IMU together: drop them"
         )
     if config.map.write and (config.map.denoise or config.map.mesh):
         from lslam.maps.mesh import require_open3d
