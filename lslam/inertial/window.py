@@ -244,7 +244,9 @@ def moment_of(state: NavigationState, instant_ns: int, stamp_ns: int, T_imu_scan
 
 def off_by(a: Floats, b: Floats) -> Floats:
     """(6,) error, world axes, by which the pose b (4, 4) is away from a (4, 4)."""
-    return np.concatenate([b[:3, 3] - a[:3, 3], b[:3, :3] @ vector_between(a[:3, :3], b[:3, :3])])
+    # The copy is one compiled function less.
+    R = np.ascontiguousarray(a[:3, :3])
+    return np.concatenate([b[:3, 3] - a[:3, 3], R @ vector_between(R, b[:3, :3])])
 
 
 def marginalised(H: Floats, g: Floats, gone: NDArray[np.int64]) -> tuple[Floats, Floats]:
