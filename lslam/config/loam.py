@@ -44,7 +44,9 @@ class LoamConfig(Section):
     small_segment_points: int = Field(5, ge=1, description="lego-loam: they have so many points")
     small_segment_rings: int = Field(3, ge=1, description="lego-loam: on so many rings, as poles have")
     pieces: int = Field(
-        3, ge=1, description="loam-livox: parts of a sweep registered by themselves; 1: the prior deskews it whole"
+        3,
+        ge=1,
+        description="loam-livox: parts of a sweep, each registered by itself; 1: the motion prior deskews it whole",
     )
     matching: Literal["one-to-many", "one-to-one"] = Field(
         "one-to-many",

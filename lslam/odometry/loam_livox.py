@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import replace
 
 import numpy as np
@@ -26,8 +25,8 @@ Floats = NDArray[np.float64]
 # Of the correspondences, the nearest, that have a say: a fifth is dropped as outliers (section IV-C).
 INLIERS = 0.8
 # Part of the slope over the pieces that is the sensor's motion, not noise of thirds of a scan.
-TRUST = float(os.environ.get("LV_LAM", "0.5"))
-LIVOX = LoamVariant(None, with_map=True, with_less_planes=os.environ.get("LV_LESS", "1") == "1", inlier_ratio=INLIERS)
+TRUST = 0.5
+LIVOX = LoamVariant(None, with_map=True, with_less_planes=True, inlier_ratio=INLIERS)
 
 
 def create(config: Config) -> LoamLivox:
@@ -41,7 +40,11 @@ class LoamLivox(Loam):
     deskew = "by the pieces of a sweep, each of them by the motion prior"
 
     def __init__(self, config: Config, variant: LoamVariant) -> None:
-        super().__init__(config, variant)
+        # As in the paper, nothing is tried beside the pieces: coarse planes slide along what a small view holds.
+        quiet = config.recovery.model_copy(
+            update={"coarse_to_fine": False, "start_search": False, "less_planar": False}
+        )
+        super().__init__(config.model_copy(update={"recovery": quiet}), variant)
         # Lines come as they are recorded, unless somebody says how the lasers are told apart.
         self.needs_rings = config.input.rings != "auto"
 

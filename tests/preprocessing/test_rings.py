@@ -144,7 +144,9 @@ def test_clouds_without_rings_are_refused_with_the_way_out(wanted: str) -> None:
     livox = bare(scans("street", "livox")[0])
     blob = Scan(np.random.default_rng(0).normal(0, 10, (20_000, 3)).astype(np.float32), 0, 0)
     for scan in (livox, blob):
-        with pytest.raises(InputError, match=f"--rings {wanted.split(':')[0]}: the scans .* --method loam-livox or icp"):
+        with pytest.raises(
+            InputError, match=f"--rings {wanted.split(':')[0]}: the scans .* --method loam-livox or icp"
+        ):
             decide_rings([scan], wanted)
 
 
