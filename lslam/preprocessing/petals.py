@@ -11,7 +11,14 @@ from lslam.config.loam import LoamConfig
 from lslam.config.preprocess import PreprocessConfig
 from lslam.errors import InputError
 from lslam.kernels import curvature, petals
-from lslam.preprocessing.features import WIDEST_STEP, Features, RingWalk, curvature_noise, gather_features
+from lslam.preprocessing.features import (
+    MAY_BE_EDGE,
+    WIDEST_STEP,
+    Features,
+    RingWalk,
+    curvature_noise,
+    gather_features,
+)
 from lslam.preprocessing.prepare import gate_points
 from lslam.types.scan import Scan
 
@@ -60,8 +67,9 @@ def petal_features(scan: Scan, config: LoamConfig | None = None, gate: Preproces
         config.edge_curvature * usual, config.planar_curvature * usual, config.edge_noise * noise, _PLANE_NOISE * noise,
     )  # fmt: skip
     if len(brightness):
+        allowed.fill(MAY_BE_EDGE)
         painted = curvature.pick(
-            contrast, contrast, walk.ranges, breaks, allowed & 1, walk.starts, 1, (*limits, 0), _CONTRAST, 0.0, 0.0, 0.0
+            contrast, contrast, walk.ranges, breaks, allowed, walk.starts, 1, (*limits, 0), _CONTRAST, 0.0, 0.0, 0.0
         )
         labels = np.where(painted > 0, np.maximum(labels, painted), labels)
     lines = np.zeros(len(scan), np.uint16)

@@ -14,7 +14,9 @@ from rosbags.rosbag1 import Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from lslam.config import load_config
+from lslam.formats.state_files import read_state, write_state
 from lslam.frontend.register_scans import estimate
+from lslam.frontend.state_classes import STATE_CLASSES
 from lslam.frontend.tracker import Loaded, Tracker
 from lslam.geometry import se3
 from lslam.odometry import create_odometry
@@ -63,6 +65,26 @@ def test_a_drive_is_followed_and_the_pieces_tell_the_motion_within_a_sweep() -> 
     step = se3.relative(truth[-2], truth[-1])
     assert np.linalg.norm(step[:3, 3]) > 0.3
     np.testing.assert_allclose(moved[:3, 3], step[:3, 3], atol=0.05)
+
+
+def test_it_goes_on_where_it_was_to_the_last_bit(tmp_path: Path) -> None:
+    given, _ = scans()
+    whole = Tracker(create_odometry(config_of()))
+    tracked(whole, given[:6])
+    write_state(tmp_path / "6.npz", whole.state())
+    again = Tracker(create_odometry(config_of()))
+    again.restore(read_state(tmp_path / "6.npz", STATE_CLASSES))
+    for one, other in zip(tracked(whole, given[6:9]), tracked(again, given[6:9]), strict=True):
+        np.testing.assert_array_equal(one.T_world_lidar, other.T_world_lidar)
+        np.testing.assert_array_equal(one.covariance, other.covariance)
+
+
+def test_a_spinning_lidar_is_followed_along_its_rings() -> None:
+    drive = simulate("block", seed=1, lidar="vlp16", count=COUNT, motion_compensated=False)
+    assert drive.ground_truth is not None
+    results = tracked(Tracker(create_odometry(config_of())), [drive.scan(i) for i in range(COUNT)])
+    assert all(r.status == "ok" for r in results)
+    assert error(results, drive.ground_truth.poses) < 0.2
 
 
 def pieces(poses: list[Floats], ok: tuple[bool, ...] = (True, True, True)) -> list[RegistrationResult]:
