@@ -69,9 +69,10 @@ class FeatureSource(Method, Protocol):
 
 @runtime_checkable
 class Deskewing(Method, Protocol):
-    """A method that takes the motion within a sweep from the prior.
+    """A method that takes the motion within a sweep from the prior, or begins there and estimates it.
 
-    Its `register` only aligns, so that the front end can call it again with the motion that the first alignment found;
+    Its `register` only aligns, so that the front end can call it again with the motion that the first alignment found,
+    unless that tells its own;
     `update` then takes the scan in.
     """
 

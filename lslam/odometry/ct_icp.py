@@ -58,7 +58,7 @@ class CtIcp(Icp):
         points = deskew(prepared, sweep or prior)
         stages = {"register": time.perf_counter() - began}
         result = of_registration(scan, located, self._uncertainty.map_age, stages)
-        return Registered(result, (points, located, prior, found.covariance), sweep)
+        return Registered(result, (points, located, prior, found), sweep)
 
     def _elastic(
         self, prepared: PreparedPoints, prior: MotionPrior, start: ElasticSweep, constraints: ElasticConstraints,
@@ -91,8 +91,11 @@ class CtIcp(Icp):
         if found.sweep is None or result.status != "ok":
             self._last.forget()
         else:
-            _, _, expected, covariance = found.detail
-            self._last.follow(result.stamp_ns, result.T_world_lidar, found.sweep, expected, covariance)
+            _, _, expected, elastic = found.detail
+            # Its mean age is half the number of scans that the map is made of.
+            share = 0.5 / self._uncertainty.map_age
+            pose, facts = result.T_world_lidar, (elastic.skew, elastic.covariance, share)
+            self._last.follow(result.stamp_ns, pose, found.sweep, expected, *facts)
         return result
 
     def restart(self) -> None:

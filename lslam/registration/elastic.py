@@ -43,9 +43,13 @@ PARTS = 8
 
 @dataclass(frozen=True)
 class ElasticResult:
-    """The sweep that was found, the covariance (12, 12) of its ends, and its pose at the stamp as any registration's."""
+    """The sweep and the map's skew (6,) that were found, and the pose at the stamp as any registration's.
+
+    covariance : (18, 18) of begin, end and skew, world axes
+    """
 
     sweep: ElasticSweep
+    skew: Floats
     covariance: Floats
     found: OptimiserResult
 
@@ -96,10 +100,10 @@ def register_elastic(
     The pose at the stamp has the rotation's and translation's share of both ends; degenerate is what holds the sweep as a
     whole too little.
     """
-    scale, iterations, converged, d = annealing.start, 0, False, np.zeros((2, 6))
+    scale, iterations, converged, d, skew = annealing.start, 0, False, np.zeros((2, 6)), np.zeros((1, 6))
     sweep, shares = start, points.shares(start)
     passed = float(-start.times[0] / (start.times[-1] - start.times[0]))
-    A, facts = np.zeros((12, 12)), np.zeros(at.COUNT)
+    A, facts = np.zeros((18, 18)), np.zeros(at.COUNT)
     weak = np.zeros((0, 6))
     while iterations < annealing.steps and not converged:
         iterations += 1
@@ -108,11 +112,11 @@ def register_elastic(
         if facts[at.MATCHED] < LEAST_MATCHED:
             break
         H, g = _about_own_place(H, g, sweep, shares, prior.pose[:3, 3])
-        A, b = _of_both_ends(H, g, shares)
+        A, b = _of_ends_and_skew(H, g, shares)
         lever = np.sqrt(max(facts[at.LEVER] / max(facts[at.INFORMATION], 1e-300), 1e-6))
         weak = _weak(H.sum(0), lever, weak_share * facts[at.INFORMATION])
         constraints.add_to(A, b, sweep)
-        d = _step(A, b, lever, UNSEEN * weak_share * facts[at.INFORMATION]).reshape(2, 6)
+        d, skew = np.split(_step(A, b, lever, UNSEEN * weak_share * facts[at.INFORMATION]).reshape(3, 6), [2])
         if not np.isfinite(d).all():
             break
         move, turn = (float(np.linalg.norm(d[:, part], axis=1).max()) for part in (slice(0, 3), slice(3, 6)))
@@ -122,10 +126,10 @@ def register_elastic(
         scale = max(scale * annealing.decay, annealing.end)
     at_stamp = np.hstack([(1.0 - passed) * np.eye(6), passed * np.eye(6)])
     covariance = np.linalg.pinv(A, hermitian=True)
-    information = np.linalg.pinv(at_stamp @ covariance @ at_stamp.T, hermitian=True)
+    information = np.linalg.pinv(at_stamp @ covariance[:12, :12] @ at_stamp.T, hermitian=True)
     pose = sweep.prior.pose
     found = OptimiserResult(pose, information, named(facts), at_stamp @ d.ravel(), iterations, converged, weak)
-    return ElasticResult(sweep, covariance, found)
+    return ElasticResult(sweep, skew[0], covariance, found)
 
 
 def _about_own_place(
@@ -139,10 +143,13 @@ def _about_own_place(
     return transposed @ H @ G, (transposed @ g[..., None])[..., 0]
 
 
-def _of_both_ends(H: Floats, g: Floats, shares: Floats) -> tuple[Floats, Floats]:
-    """(12, 12), (12,) of begin and end, where what moves a part is `1 - share` of the one and `share` of the other."""
-    weights = np.stack([1.0 - shares, shares], axis=1)
-    A = np.einsum("ka,kb,kij->aibj", weights, weights, H).reshape(12, 12)
+def _of_ends_and_skew(H: Floats, g: Floats, shares: Floats) -> tuple[Floats, Floats]:
+    """(18, 18), (18,) of begin, end and the map's skew: `1 - share` of the first, `share` of the second move a part.
+
+    A map that was made of sweeps with an error `skew` from begin to end shows a part too far by `share - 1/2` of it.
+    """
+    weights = np.stack([1.0 - shares, shares, 0.5 - shares], axis=1)
+    A = np.einsum("ka,kb,kij->aibj", weights, weights, H).reshape(18, 18)
     return A, np.einsum("ka,ki->ai", weights, g).ravel()
 
 
@@ -159,7 +166,7 @@ def _weak(H: Floats, lever: float, needed: float) -> Floats:
 
 def _step(A: Floats, b: Floats, lever: float, least: float) -> Floats:
     """-inv(A) b in the directions of both ends that more than `least` holds."""
-    scale = np.tile(_scaled(lever), 2)
+    scale = np.tile(_scaled(lever), 3)
     values, vectors = np.linalg.eigh(A * np.outer(scale, scale))
     along = vectors.T @ (scale * b)
     followed = values > max(least, 1e-12 * float(values[-1]))

@@ -1,4 +1,8 @@
-"""What holds an elastic sweep to the last one: location consistency and constant velocity, each as surely as it lately held."""
+"""What holds an elastic sweep to the last one: location consistency and constant velocity, each as surely as it lately held.
+
+A spinning sensor sees every direction at the same share of each sweep. A map that was begun with wrong motion within the sweep
+is skewed from direction to direction, and all sweeps registered on it agree with that error: it is one more unknown.
+"""
 
 from __future__ import annotations
 
@@ -20,32 +24,49 @@ Floats = NDArray[np.float64]
 FORGETTING = 0.8
 # m and rad, a change that registration cannot tell from none.
 LEAST_CHANGE = 1e-3
+# m and rad, likewise of the map, which is the mean of many scans.
+LEAST_SKEW = 1e-4
 # Under a constant acceleration a line fitted to a sweep of T seconds is a T^2 / 12 off at both ends, and the next one likewise,
 # to the same side: sweeps do not meet by a sixth of the change of velocity.
 MISS = 1.0 / 6.0
+# From the middle of one sweep to that of the next the velocity is half a change behind.
+LAG = 0.5
 NOTHING: Floats = np.zeros((6, 6))
 
 
 @dataclass(frozen=True)
 class ElasticConstraints:
-    """Where a sweep is expected; information (6, 6), world axes, of its begin and of the motion from there to its end."""
+    """What is known of a sweep before its points are looked at; information (6, 6) in world axes.
+
+    expected, location : where it begins, and of that; velocity : of the motion within it being that since the middle of the
+        last one; since : the sweep's part of the time since then
+    skew, skewed : (6,) by how much the map was made with wrong motion from begin to end, and of that
+    """
 
     expected: ElasticSweep
     location: Floats
     velocity: Floats
+    since: float
+    skew: Floats
+    skewed: Floats
 
     def add_to(self, A: Floats, b: Floats, sweep: ElasticSweep) -> None:
-        """Add both to the normal equations (12, 12), (12,) of begin and end, in place (Dellenbach et al. 2022, section III-B)."""
+        """Add all to the normal equations (18, 18), (18,) of begin, end and skew, in place.
+
+        Location consistency and constant velocity: Dellenbach et al. 2022, section III-B.
+        """
         begin, end = off(sweep.begin, self.expected.begin), off(sweep.end, self.expected.end)
-        for W, signs, rest in ((self.location, (1.0, 0.0), begin), (self.velocity, (-1.0, 1.0), end - begin)):
-            b += np.kron(signs, W @ rest)
+        # The middle is half of both ends.
+        steady = (-1.0 - self.since / 2, 1.0 - self.since / 2, 0.0)
+        for W, signs in ((self.location, (1.0, 0.0, 0.0)), (self.velocity, steady), (self.skewed, (0.0, 0.0, 1.0))):
+            b += np.kron(signs, W @ (signs[0] * begin + signs[1] * end - signs[2] * self.skew))
             A += np.kron(np.outer(signs, signs), W)
 
 
 class LastSweep(Stateful):
     """Remembers the last sweep, how well it was known, and how much the motion lately changed from scan to scan."""
 
-    STATE = ("_ends_ns", "_ends", "_covariance", "_change")
+    STATE = ("_ends_ns", "_ends", "_covariance", "_change", "_skew", "_skewed")
 
     def __init__(self) -> None:
         # Begin and end, ns, the poses (2, 4, 4) there, and their covariance (12, 12), world axes.
@@ -54,6 +75,9 @@ class LastSweep(Stateful):
         self._covariance: Floats | None = None
         # (6, 6) mean square of what registration corrected the prior by at the middle of a sweep, LiDAR axes.
         self._change: Floats | None = None
+        # (6,) and covariance (6, 6), world axes, of the map's skew.
+        self._skew = np.zeros(6)
+        self._skewed: Floats | None = None
 
     def constraints(self, stamp_ns: int, prior: MotionPrior, is_felt: bool) -> ElasticConstraints:
         """Of the scan at `stamp_ns`: it follows the last sweep at the same velocity, or as an IMU felt that it does (`is_felt`).
@@ -61,24 +85,34 @@ class LastSweep(Stateful):
         Where scans between are missing the prior says where it begins.
         """
         begin_ns, end_ns = _ends_ns(stamp_ns, prior)
-        Q = self._change_over(prior.span_s)
-        Q = noise.rotated(Q, prior.pose[:3, :3])
+        Q = noise.rotated(self._change_over(prior.span_s), prior.pose[:3, :3])
+        # The first sweep has the velocity at its end.
+        M = Q if self._skewed is None else self._skewed
         expected, P = ElasticSweep.of(prior, is_bent=is_felt), self._covariance
         length = self._ends_ns[1] - self._ends_ns[0]
-        if self._ends is None or P is None or abs(begin_ns - self._ends_ns[1]) > length / 2:
-            return ElasticConstraints(expected, NOTHING, np.linalg.inv(Q))
-        if not is_felt:
-            twist = se3.log(se3.relative(*self._ends)) / length
-            begin, end = (self._ends[1] @ se3.exp((ns - self._ends_ns[1]) * twist) for ns in (begin_ns, end_ns))
-            expected = ElasticSweep(se3.normalise(begin), se3.normalise(end), prior.times)
-        way = P[:6, :6] + P[6:, 6:] - P[:6, 6:] - P[6:, :6]
-        return ElasticConstraints(expected, np.linalg.inv(MISS**2 * Q + P[6:, 6:]), np.linalg.inv(Q + way))
+        location, since = NOTHING, 0.0
+        if self._ends is not None and P is not None and abs(begin_ns - self._ends_ns[1]) < length / 2:
+            location, since = np.linalg.inv(MISS**2 * Q + P[6:, 6:]), 1.0
+            if not is_felt:
+                twist = se3.log(se3.relative(*self._ends)) / length
+                begin, end = (self._ends[1] @ se3.exp((ns - self._ends_ns[1]) * twist) for ns in (begin_ns, end_ns))
+                expected = ElasticSweep(se3.normalise(begin), se3.normalise(end), prior.times)
+        velocity, skewed = np.linalg.inv(LAG**2 * Q), np.linalg.inv(M + LEAST_SKEW**2 * np.eye(6))
+        return ElasticConstraints(expected, location, velocity, since, self._skew, skewed)
 
-    def follow(self, stamp_ns: int, pose: Floats, sweep: MotionPrior, prior: MotionPrior, covariance: Floats) -> None:
-        """Take the `sweep` that was found for `prior`, its pose at the stamp now `pose` (4, 4), with the covariance (12, 12)."""
+    def follow(
+        self, stamp_ns: int, pose: Floats, sweep: MotionPrior, prior: MotionPrior, skew: Floats, covariance: Floats,
+        share: float,
+    ) -> None:  # fmt: skip
+        """Take the `sweep` that was found for `prior`, its pose at the stamp now `pose` (4, 4).
+
+        skew, covariance : as of `ElasticResult`; share : of the map that this scan is
+        """
         self._ends_ns = _ends_ns(stamp_ns, sweep)
         self._ends = np.asarray(pose @ se3.relative(sweep.pose, sweep.poses[[0, -1]]))
-        self._covariance = covariance
+        self._covariance = covariance[:12, :12]
+        L = np.kron((-share, share, 1.0 - share), np.eye(6))
+        self._skew, self._skewed = (1.0 - share) * skew, L @ covariance @ L.T
         found, expected = middle_of(sweep, stamp_ns, pose)[0], middle_of(prior, stamp_ns, prior.pose)[0]
         change = se3.log(se3.relative(expected, found))
         Q = self._change_over(prior.span_s)

@@ -35,6 +35,7 @@ VARIANTS: list[tuple[str, tuple[str, ...]]] = [
     ("icp", ("registration.target=keyframe", "registration.keyframes=2")),
     ("ndt", ("registration.target=scan",)),
     ("dlo", ()),
+    ("ct-icp", ()),
     ("icp-svd", ()),
     ("loam", ()),
     ("lego-loam", ()),

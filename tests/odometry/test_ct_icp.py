@@ -1,0 +1,206 @@
+"""CT-ICP: both ends of a sweep are found, which the motion within it follows; without times it is `icp`."""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from analytic_scenes import pose_at, room
+from numpy.typing import NDArray
+from stub_sequences import Stub, sample
+
+from lslam.config import load_config
+from lslam.formats.state_files import read_state, write_state
+from lslam.frontend.register_scans import estimate, read_ahead
+from lslam.frontend.state_classes import STATE_CLASSES
+from lslam.frontend.tracker import Tracker
+from lslam.geometry import se3, so3
+from lslam.odometry import create_odometry
+from lslam.odometry.base import Odometry
+from lslam.preprocessing.deskew import deskew_points, knots_over
+from lslam.preprocessing.prepare import prepare_points
+from lslam.registration.elastic import PARTS, SweepPoints, register_elastic
+from lslam.registration.elastic_constraints import ElasticConstraints, LastSweep
+from lslam.registration.elastic_sweep import ElasticSweep
+from lslam.registration.registration import Registration
+from lslam.registration.robust import Annealing
+from lslam.simulation.scenarios import simulate
+from lslam.types.motion_prior import MotionPrior
+from lslam.types.scan import Span
+from lslam.types.scan_result import ScanResult
+
+Floats = NDArray[np.float64]
+COUNT = 24
+SPAN = Span(0.0, 0.1)
+ANNEALING = Annealing(1.0, 0.15, 0.5, 20)
+
+
+def method(name: str, *settings: str) -> Odometry:
+    return create_odometry(load_config(None, [f"odometry.method={name}", *settings], {}))
+
+
+@cache
+def walk() -> Stub:
+    """A sensor that is carried and turned by hand; its sweeps hold that motion."""
+    drive = simulate("walk", lidar="vlp16", seed=100, count=COUNT, motion_compensated=False)
+    scans = [drive.scan(i) for i in range(COUNT)]
+    return Stub(scans, drive.ground_truth, drive.calibration, motion_compensated=False)
+
+
+def tracked(tracker: Tracker, sequence: Stub, begin: int = 0) -> tuple[list[ScanResult], list[MotionPrior]]:
+    results, sweeps = [], []
+    for loaded in list(read_ahead(sequence, tracker.odometry.prepare, 1))[begin:]:
+        results.append(tracker.track(loaded))
+        sweeps.append(tracker.sweep)
+    return results, sweeps
+
+
+@cache
+def followed(name: str) -> tuple[list[ScanResult], list[MotionPrior]]:
+    return tracked(Tracker(method(name)), walk())
+
+
+# -- one sweep in a room
+
+
+def elastic(begin: Floats, end: Floats) -> ElasticSweep:
+    return ElasticSweep(begin, end, knots_over(SPAN))
+
+
+def scanned(sweep: ElasticSweep) -> SweepPoints:
+    """A room whose points are seen one azimuth after the other on the way, against a map of the same room."""
+    registration = Registration()
+    registration.register(room(np.random.default_rng(0)), np.eye(4))
+    world = room(np.random.default_rng(1))
+    times = (0.1 * (np.arctan2(world[:, 1], world[:, 0]) / (2 * np.pi) + 0.5)).astype(np.float32)
+    order = np.argsort(times)
+    world, times = world[order], times[order]
+    seen = np.empty_like(world)
+    for part in np.array_split(np.arange(len(times)), 200):
+        share = float(times[part].mean()) / 0.1
+        t = (1 - share) * sweep.begin[:3, 3] + share * sweep.end[:3, 3]
+        R = sweep.begin[:3, :3] @ so3.exp(share * so3.log(sweep.begin[:3, :3].T @ sweep.end[:3, :3]))
+        seen[part] = (world[part] - t) @ R
+    points = prepare_points(seen, registration.preprocess, 0, times)
+    c = registration.config
+    return SweepPoints(points, registration.map.levels, c.sigma, c.blob_weight)
+
+
+def test_both_ends_are_found_from_a_start_that_knows_neither() -> None:
+    true = elastic(pose_at((0.1, -0.05, 0.0), 1.0), pose_at((0.5, 0.1, 0.05), 9.0))
+    start = elastic(pose_at(), pose_at((0.2, 0.0, 0.0), 3.0))
+    none = np.zeros((6, 6))
+    free = ElasticConstraints(start, none, none, 0.0, np.zeros(6), 1e12 * np.eye(6))
+    result = register_elastic(scanned(true), start, free, ANNEALING, 1e-3)
+    assert result.found.converged
+    for found, wanted in ((result.sweep.begin, true.begin), (result.sweep.end, true.end)):
+        error = se3.relative(wanted, found)
+        assert np.linalg.norm(error[:3, 3]) < 0.02
+        assert np.rad2deg(so3.angle(error[:3, :3])) < 0.15
+    errors = np.concatenate([_off(result.sweep.begin, true.begin), _off(result.sweep.end, true.end)])
+    nees = errors @ np.linalg.solve(result.covariance[:12, :12], errors) / 12
+    assert 0.1 < nees < 6
+    assert len(result.found.weak) == 0
+    np.testing.assert_allclose(result.found.pose, result.sweep.begin, atol=1e-12)
+
+
+def _off(found: Floats, true: Floats) -> Floats:
+    return np.concatenate([found[:3, 3] - true[:3, 3], so3.log(found[:3, :3] @ true[:3, :3].T)])
+
+
+def test_points_lie_where_the_sensor_was_at_their_times() -> None:
+    """Translation linear, rotation along the geodesic: at a third of the sweep a third of both."""
+    sweep = elastic(pose_at((1.0, 0.0, 0.0), 0.0), pose_at((1.9, 0.3, 0.0), 30.0))
+    point = np.array([[2.0, 0.0, 0.0]])
+    seen = deskew_points(point, np.full(1, 0.1 / 3, np.float32), sweep.prior)
+    expected = np.array([1.3, 0.1, 0.0]) + 2.0 * np.array([np.cos(np.deg2rad(10)), np.sin(np.deg2rad(10)), 0.0])
+    np.testing.assert_allclose(se3.apply(sweep.prior.pose, seen)[0], expected, atol=1e-4)
+
+
+def test_the_bend_of_what_an_imu_felt_stays_as_the_ends_move() -> None:
+    times = knots_over(SPAN)
+    bow = se3.make(np.eye(3), np.column_stack([10 * times, times * (0.1 - times), 0 * times]))
+    sweep = ElasticSweep.of(MotionPrior(times, bow), is_bent=True)
+    np.testing.assert_allclose(sweep.poses, bow, atol=1e-12)
+    assert np.abs(ElasticSweep.of(MotionPrior(times, bow), is_bent=False).poses - bow).max() > 2e-3
+    shift = np.tile([0.3, -0.1, 0.2, 0.0, 0.0, 0.0], (2, 1))
+    np.testing.assert_allclose(sweep.moved(shift).poses[:, :3, 3], bow[:, :3, 3] + [0.3, -0.1, 0.2], atol=1e-12)
+
+
+def test_the_parts_of_a_sweep_add_up_to_the_whole() -> None:
+    """What moves all of it is told by the sum of what moves its parts, about one place."""
+    true = elastic(pose_at(), pose_at())
+    points = scanned(true)
+    H, _, _ = points.linearise(true.prior, (0.15, 0.15, np.inf))
+    assert H.shape == (PARTS, 6, 6)
+    shift = np.array([0.01, -0.02, 0.01, 0.001, 0.002, -0.001])
+    moved = true.moved(np.tile(shift, (2, 1)))
+    _, g_moved, _ = points.linearise(moved.prior, (10.0, 10.0, np.inf))
+    H0, g0, _ = points.linearise(true.prior, (10.0, 10.0, np.inf))
+    assert np.linalg.norm(g_moved.sum(0) - g0.sum(0) - H0.sum(0) @ shift) < 0.1 * np.linalg.norm(H0.sum(0) @ shift)
+
+
+# -- sweep after sweep
+
+
+def test_the_motion_within_a_walks_sweeps_is_nearer_to_the_truth_than_constant_velocity() -> None:
+    truth = walk().ground_truth
+    assert truth is not None
+    assert all(result.status == "ok" for result in followed("ct-icp")[0])
+    moves, turns = {}, {}
+    for name in ("ct-icp", "icp"):
+        # From stamp to stamp is from a sweep's begin to its end. The first ones only undo what the map was begun with.
+        errors = [
+            se3.log(se3.relative(se3.relative(a, b), se3.relative(s.poses[0], s.poses[-1])))
+            for a, b, s in list(zip(truth.poses, truth.poses[1:], followed(name)[1], strict=False))[10:]
+        ]
+        moves[name], turns[name] = np.sqrt(np.mean(np.square(errors), axis=0).reshape(2, 3).sum(1))
+    assert moves["ct-icp"] < 0.8 * moves["icp"]
+    assert turns["ct-icp"] < 0.9 * turns["icp"]
+
+
+def test_every_scan_has_a_covariance_and_one_registration() -> None:
+    results, sweeps = followed("ct-icp")
+    for result, sweep in zip(results[2:], sweeps[2:], strict=True):
+        assert result.covariance is not None
+        assert np.linalg.eigvalsh(result.covariance)[0] > 0
+        np.testing.assert_allclose(sweep.pose, result.T_world_lidar, atol=1e-9)
+    assert max(result.iterations for result in results[8:]) <= 10
+
+
+def test_scans_without_times_have_one_pose_that_of_icp() -> None:
+    sequence = sample(6)
+    one, other = (list(estimate(sequence, method(name))) for name in ("ct-icp", "icp"))
+    for a, b in zip(one, other, strict=True):
+        np.testing.assert_array_equal(a.T_world_lidar, b.T_world_lidar)
+        np.testing.assert_array_equal(a.covariance, b.covariance)
+
+
+def test_it_goes_on_where_it_was(tmp_path: Path) -> None:
+    results, _ = followed("ct-icp")
+    tracker = Tracker(method("ct-icp"))
+    for loaded in list(read_ahead(walk(), tracker.odometry.prepare, 1))[:12]:
+        tracker.track(loaded)
+    write_state(tmp_path / "12.npz", tracker.state())
+    again = Tracker(method("ct-icp"))
+    again.restore(read_state(tmp_path / "12.npz", STATE_CLASSES))
+    for one, other in zip(results[12:], tracked(again, walk(), 12)[0], strict=True):
+        np.testing.assert_array_equal(one.T_world_lidar, other.T_world_lidar)
+        np.testing.assert_array_equal(one.covariance, other.covariance)
+
+
+@pytest.mark.parametrize("gap", [0, 1])
+def test_a_sweep_that_does_not_follow_the_last_one_is_not_held_to_its_end(gap: int) -> None:
+    last, times = LastSweep(), knots_over(SPAN)
+    before = elastic(pose_at(), pose_at((1.0, 0.0, 0.0))).prior
+    last.follow(0, np.eye(4), before, before, np.zeros(6), 1e-6 * np.eye(18), 0.1)
+    prior = MotionPrior(times, before.poses + (1 + gap) * (before.poses[-1] - before.poses[0]) + 0.01)
+    found = last.constraints(100_000_000 * (1 + gap), MotionPrior(times, prior.poses), False)
+    if gap:
+        assert not found.location.any()
+        np.testing.assert_allclose(found.expected.begin, prior.poses[0])
+    else:
+        assert found.location[0, 0] > 1e4
+        np.testing.assert_allclose(found.expected.end[:3, 3], [2.0, 0.0, 0.0], atol=1e-9)
