@@ -1,6 +1,6 @@
 """Elastic registration: the poses at the begin and at the end of a sweep in one estimate (CT-ICP).
 
-Dellenbach, Deschaud, Jacquet and Goulette 2022: CT-ICP, sections III-A to III-C.
+Dellenbach et al. 2022, sections III-A to III-C.
 """
 
 from __future__ import annotations
