@@ -215,7 +215,7 @@ def on_terminal(*words: object, **env: str) -> tuple[int, str, str]:
     return child.wait(60), child.stdout.read(), received.decode()
 
 
-def test_a_terminal_gets_a_bar_and_colours_unless_unwanted(tmp_path: Path) -> None:
+def test_a_terminal_has_a_progress_bar_and_colours(tmp_path: Path) -> None:
     code, stdout, screen = on_terminal("run", SAMPLE, "--out", tmp_path / "colour", "--count", 40)
     assert code == 0
     assert "odometry" in screen

@@ -72,7 +72,7 @@ def test_without_loops_it_is_odometry_byte_for_byte(closed: Path, tmp_path: Path
     assert not (tmp_path / "out" / "graph.g2o").exists()
 
 
-def test_poses_of_somebody_else(closed: Path, tmp_path: Path) -> None:
+def test_external_poses(closed: Path, tmp_path: Path) -> None:
     """Without stamps and of the camera: one line per scan, converted."""
     out = tmp_path / "out"
     words = ("--poses", SAMPLE / "poses" / "00.txt", "--georeference", "-q", "--json", "--set", "report.html=false")
@@ -86,7 +86,7 @@ def test_poses_of_somebody_else(closed: Path, tmp_path: Path) -> None:
     assert (out / "map.ply").exists()
 
 
-def test_drift_is_loud(tmp_path: Path) -> None:
+def test_drift_is_reported(tmp_path: Path) -> None:
     done = lslam("run", SAMPLE, "--out", tmp_path / "out", *PART, "--set", "debug.drift=true")
     assert done.returncode == 0
     facts = manifest(tmp_path / "out")
@@ -95,7 +95,7 @@ def test_drift_is_loud(tmp_path: Path) -> None:
     assert "experiment" in done.stderr
 
 
-def test_bad_fixes_degrade_and_say_so(tmp_path: Path) -> None:
+def test_bad_fixes_make_the_run_degraded(tmp_path: Path) -> None:
     copy = sample_copy(tmp_path / "copy", 40)
     path = copy / "gnss.csv"
     head, *rows = path.read_text().splitlines()

@@ -176,7 +176,7 @@ def drop_tr(folder: Path) -> None:
         (drop_tr, 12, "has no Tr"),
     ],
 )
-def test_contradictions_are_resolved_and_said(
+def test_contradictions_are_resolved_and_reported(
     sequence: Path, tmp_path: Path, spoil: Callable[[Path], None], scans: int, words: str
 ) -> None:
     spoil(sequence)

@@ -17,7 +17,7 @@ def test_the_sample_runs_with_its_imu(tmp_path: Path) -> None:
     assert abs(np.linalg.norm(facts["imu"]["gravity_in_world_m_s2"]) - 9.81) < 0.1
 
 
-def test_garbage_is_refused_said_and_no_error(tmp_path: Path) -> None:
+def test_an_invalid_imu_stream_is_rejected_and_reported(tmp_path: Path) -> None:
     copy = sample_copy(tmp_path, 20)
     path = next(copy.rglob("imu.csv"))
     header, *lines = path.read_text().splitlines()

@@ -77,7 +77,7 @@ def held(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def test_buildings_hold_what_drifts_wherever_it_was_said_to_begin(held: Path, tmp_path: Path) -> None:
+def test_buildings_correct_drift_from_any_given_start(held: Path, tmp_path: Path) -> None:
     error = off(held)
     assert error[:, :2].max() < 0.6
     assert error[:, 2].max() < 1.0

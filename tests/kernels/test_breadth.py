@@ -81,7 +81,7 @@ def test_two_rings_and_one_that_sweeps_over_the_ground_make_it_a_surface() -> No
     assert np.degrees(np.arccos(np.abs(ahead[:, 5]))).max() < 2.0
 
 
-def test_walls_seen_by_several_rings_are_surfaces_and_bushes_are_solid() -> None:
+def test_walls_seen_by_several_rings_are_surfaces_and_bushes_are_volumes() -> None:
     rng = np.random.default_rng(0)
     wall = np.column_stack([rng.normal(8.4, 0.02, 3000), rng.uniform(-4, 4, 3000), rng.uniform(-0.8, 1.6, 3000)])
     m = asked()
@@ -92,7 +92,7 @@ def test_walls_seen_by_several_rings_are_surfaces_and_bushes_are_solid() -> None
     assert (kinds(bush) == BLOB).mean() > 0.4
 
 
-def test_coarser_voxels_remember_from_where_their_points_were_seen() -> None:
+def test_coarser_voxels_keep_the_viewpoints_of_their_points() -> None:
     rng = np.random.default_rng(0)
     m = GaussianMap(0.5, breadth=4.0, count_cap=1e9)
     direct = GaussianMap(1.5, breadth=4.0, min_points=18, count_cap=1e9)

@@ -126,7 +126,7 @@ def test_nearest_is_that_of_brute_force(scene: Scene, limit: float) -> None:
 
 
 @pytest.mark.parametrize("x", [[np.nan, 0, 0], [np.inf, 0, 0], [1e9, 0, 0], [0, -1e300, 0]])
-def test_a_point_nowhere_finds_nothing(scene: Scene, x: list[float]) -> None:
+def test_a_point_that_is_not_finite_has_no_neighbour(scene: Scene, x: list[float]) -> None:
     assert search(np.array(x, np.float64), SIZE, REACH, 0, -1, -1, *scene.grid)[0] == -1
 
 

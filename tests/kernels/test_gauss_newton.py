@@ -53,7 +53,7 @@ def test_unobserved_directions_get_none(rank: int) -> None:
         np.testing.assert_allclose(d, -np.linalg.pinv(H, 1e-10) @ g, atol=1e-8)
 
 
-def test_the_share_of_information_draws_the_line() -> None:
+def test_a_direction_is_observed_by_its_share_of_information() -> None:
     H = np.diag([1.0, 1.0, 1e-3, 1.0, 1.0, 1.0])
     for share, expected, is_followed in [(1e-4, 0, True), (7e-4, 1, True), (2e-3, 1, False)]:
         d, weak = solve(H, np.ones(6), weak_share=share)
@@ -61,7 +61,7 @@ def test_the_share_of_information_draws_the_line() -> None:
         assert d[2] == pytest.approx(-1e3 if is_followed else 0.0)
 
 
-def test_so_does_the_least_that_is_asked_for() -> None:
+def test_a_direction_is_observed_by_its_least_information() -> None:
     H = np.diag([1.0, 1.0, 1e-2, 1.0, 1.0, 1.0])
     for least, expected, is_followed in [(0.9e-2, 0, True), (1.1e-2, 1, True), (3.2e-2, 1, True), (3.5e-2, 1, False)]:
         d, weak = solve(H, np.ones(6), least=least)

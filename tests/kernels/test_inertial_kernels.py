@@ -114,7 +114,7 @@ def columns(R: Floats, V: Floats, axes: Floats, seconds: float) -> Floats:
     return np.hstack([-arm @ axes, arm @ np.kron(np.eye(3), reading)])
 
 
-def test_a_turn_teaches_the_gyroscope_as_the_update_of_its_columns() -> None:
+def test_a_rotation_updates_the_gyroscope_as_the_full_update() -> None:
     rng = np.random.default_rng(5)
     R, V, t = so3.exp(rng.normal(size=3)), rng.normal(size=(3, 3)), 0.1
     axes, bias, P = np.eye(3) + rng.normal(0, 0.02, (3, 3)), rng.normal(size=3), covariance(12, rng)

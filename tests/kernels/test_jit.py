@@ -27,7 +27,7 @@ def all_kernels() -> list[tuple[str, Any]]:
 
 
 @pytest.mark.parametrize(("name", "function"), all_kernels())
-def test_every_kernel_is_strict_about_sums_and_lets_other_threads_run(name: str, function: Any) -> None:
+def test_every_kernel_sums_in_order_and_releases_the_gil(name: str, function: Any) -> None:
     options = function.targetoptions
     assert options["nogil"] is True
     assert not options.get("fastmath")

@@ -104,7 +104,7 @@ def test_gradient_is_that_of_the_robust_cost(scene: LineScene, c: float) -> None
     np.testing.assert_allclose(scene.linearise(c)[1], numeric, atol=1e-6 * np.abs(numeric).max())
 
 
-def test_a_pole_is_blind_along_itself_and_holds_both_directions_across() -> None:
+def test_a_pole_observes_the_two_directions_across_itself() -> None:
     scene = LineScene()
     scene.source = np.column_stack([np.zeros(8), np.zeros(8), np.linspace(0, 0.7, 8)])
     scene.target = GaussianMap(SIZE)
@@ -136,7 +136,7 @@ def test_lines_follow_the_map_as_it_grows_and_as_slots_change_hands(scene: LineS
     assert not np.array_equal(kept[0], scene.linearise(0.3)[0])
 
 
-def test_a_line_follows_a_voxel_that_is_full() -> None:
+def test_a_line_is_updated_when_its_voxel_is_full() -> None:
     """Its count comes back to the cap with every scan: what it held once is not all it will ever hold."""
     scene = LineScene()
     scene.target = GaussianMap(SIZE, count_cap=200)

@@ -175,7 +175,7 @@ def test_distances_and_counts_are_those_of_the_closest_pair(scene: Scene, residu
     np.testing.assert_array_equal(gated.facts[[at.INLIERS, at.MATCHED]], found.facts[[at.INLIERS, at.MATCHED]])
 
 
-def test_a_mean_of_few_points_holds_nothing_where_rings_lie_far_apart(scene: Scene) -> None:
+def test_means_of_few_points_between_distant_rings_are_not_matched(scene: Scene) -> None:
     sparse, dense = np.array([[40.0, -25.0, 80.0]]), np.array([[40.0, -25.0, 90.0]])
     some = np.tile(np.eye(3) / 10, (2, 1)).astype(np.float32)
     target = GaussianMap(SIZE)
@@ -191,7 +191,7 @@ def test_a_mean_of_few_points_holds_nothing_where_rings_lie_far_apart(scene: Sce
 
 
 @pytest.mark.parametrize("residual", ["gicp", "vgicp"])
-def test_without_a_weight_blobs_stay_out(scene: Scene, residual: str) -> None:
+def test_without_a_weight_volumes_are_not_matched(scene: Scene, residual: str) -> None:
     pairs, _ = reference(scene, residual, 0.5, blob=0.0)
     counted = linearise(scene, residual, 0.5, blob=0.0).facts[at.MATCHED]
     assert counted == len({p.index for p in pairs}) < linearise(scene, residual, 0.5).facts[at.MATCHED]
@@ -206,7 +206,7 @@ def test_a_pose_far_off_matches_nothing(scene: Scene, residual: str, where: floa
         np.testing.assert_array_equal(sums, 0.0)
 
 
-def test_ndt_knows_no_voxel_that_holds_a_line(scene: Scene) -> None:
+def test_ndt_ignores_voxels_whose_points_lie_on_a_line(scene: Scene) -> None:
     wire = np.column_stack([np.linspace(-5, 5, 50), np.zeros(50), np.full(50, 2.5)])
     source = (wire + np.array([40.0, -25.0, 3.0]) - scene.t) @ scene.R
     on_wire = Scene(scene.target, scene.reference, source, scene.covariance[:50], scene.R, scene.t)

@@ -134,7 +134,7 @@ def test_normal_equations_are_those_of_numpy(scene: Scene, c: float, along: floa
 
 
 @pytest.mark.parametrize("gate", [0.02, 0.1])
-def test_matches_beyond_the_gate_count_but_do_not_pull(scene: Scene, gate: float) -> None:
+def test_matches_beyond_the_gate_are_counted_without_weight(scene: Scene, gate: float) -> None:
     H, _, facts = linearise(scene, scene.R, scene.t, 0.5, gate2=gate**2)
     expected = np.zeros((6, 6))
     kept = [m for m in scene.matches() if m.distance2(scene.R, scene.t) <= gate**2]
@@ -155,7 +155,7 @@ def test_rmse_facts_are_those_of_the_planes(scene: Scene) -> None:
 
 
 @pytest.mark.parametrize("step", [1e-3, 0.02, 0.05])
-def test_what_is_remembered_of_the_search_changes_nothing(scene: Scene, step: float) -> None:
+def test_the_cached_search_gives_the_same_result(scene: Scene, step: float) -> None:
     n = len(scene.points.source)
     matches = Correspondences(n)
     cells, _, chosen, asked, _, _ = matches.search(scene.target)
@@ -173,7 +173,7 @@ def test_what_is_remembered_of_the_search_changes_nothing(scene: Scene, step: fl
     assert 0 < same_nearest < same_octant < 12 * n
 
 
-def test_points_are_blind_in_the_plane() -> None:
+def test_points_do_not_observe_directions_in_their_plane() -> None:
     rng = np.random.default_rng(0)
     floor = np.column_stack([rng.uniform(-6, 6, (9000, 2)), np.full(9000, 0.3)]).astype(np.float32)
     target = GaussianMap(SIZE)
@@ -205,7 +205,7 @@ def test_an_empty_map_and_an_empty_scan_match_nothing(scene: Scene) -> None:
     np.testing.assert_array_equal(H, 0.0)
 
 
-def test_planes_and_blobs_weigh_what_they_are_told(scene: Scene) -> None:
+def test_planes_and_volumes_have_their_configured_weights(scene: Scene) -> None:
     """H is a sum over both: a quarter of the planes' part and all of the blobs'."""
     H, planes = (linearise(scene, scene.R, scene.t, 0.5, blob)[0] for blob in (BLOB, 0.0))
     quarter = linearise(scene, scene.R, scene.t, 0.5, BLOB, plane=0.25)[0]

@@ -116,7 +116,7 @@ def test_means_are_the_centroids_to_the_last_bit(is_timed: bool) -> None:
     assert len(times_of) == (len(whole) if is_timed else 0)
 
 
-def test_what_no_lidar_measures_is_counted_out() -> None:
+def test_impossible_ranges_are_removed_and_counted() -> None:
     points = np.array([[1, 2, 3], [np.nan, 0, 0], [0, np.inf, 0], [0, 0, -9999.5], [0, 0, 10000]], np.float32)
     assert voxel.count_within(points, 1e4) == 2
     assert voxel.count_within(points[:0], 1e4) == 0
@@ -155,7 +155,7 @@ def test_points_on_voxel_borders_belong_to_the_upper_voxel() -> None:
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1e30, -314573.1])
-def test_points_that_have_no_voxel_harm_nobody_else(bad: float) -> None:
+def test_points_without_a_voxel_do_not_affect_others(bad: float) -> None:
     good = cloud(4, 300, 3.0)
     points = np.concatenate([np.array([[0.0, 0.0, bad]], np.float32), good])
     assert set(groups(good, 0.3)[0] + 1) <= set(voxel.first_points(points, 0.3).tolist())

@@ -67,7 +67,7 @@ def test_what_is_below_the_horizon_is_cut_off_and_the_rest_is_flat_and_thin() ->
     assert len(flat) < len(outline_points(walls)) * 1.5
 
 
-def test_nothing_is_claimed_without_points_or_far_away() -> None:
+def test_no_match_without_points_or_overlap() -> None:
     seen = flatten_scan(scan(0), 60.0)
     walls, _ = walls_of(village())
     assert lay_scan(np.zeros((0, 2)), walls, np.zeros(3)) is None

@@ -98,7 +98,7 @@ def test_a_new_circle_is_asked_for_only_outside_the_sixty_metres() -> None:
     np.testing.assert_allclose(widths, 240, rtol=0.01)
 
 
-def test_a_server_that_sleeps_costs_the_caller_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_slow_server_does_not_block_the_caller(monkeypatch: pytest.MonkeyPatch) -> None:
     """Its one open request is never answered, and nobody but the buffer's own thread ever waits for a message."""
     caller, waits = threading.get_ident(), list[float | None]()
 
@@ -120,7 +120,7 @@ def test_a_server_that_sleeps_costs_the_caller_nothing(monkeypatch: pytest.Monke
     server.gate.release(100)
 
 
-def test_a_dead_or_lying_server_is_named_once_a_circle(
+def test_a_failed_or_invalid_reply_is_reported_once_per_circle(
     server: FakeOverpass, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     server.script = ["html", "elsewhere", "redirect", "cut"]
@@ -140,7 +140,7 @@ def test_a_dead_or_lying_server_is_named_once_a_circle(
     assert len(caplog.records) == 4
 
 
-def test_what_no_server_should_send_ends_nothing() -> None:
+def test_invalid_replies_do_not_end_the_run() -> None:
     server = Server(lambda _: {"elements": [{"type": "way", "id": 1, "nodes": [{}], "tags": {"building": "yes"}}]})
     with OsmBuffer(server, ORIGIN, OsmConfig()) as buffer:
         buffer.ask(np.zeros(2))
@@ -174,7 +174,7 @@ def test_a_run_that_goes_on_uses_the_replies_it_has_and_asks_only_for_others(tmp
         OsmBuffer(server, ORIGIN, OsmConfig(), tmp_path)
 
 
-def test_what_comes_too_late_is_not_kept_as_if_it_had_been_used(tmp_path: Path) -> None:
+def test_a_reply_after_the_deadline_is_not_kept(tmp_path: Path) -> None:
     server = Server()
     with OsmBuffer(server, ORIGIN, OsmConfig(), tmp_path) as buffer:
         buffer.ask(np.zeros(2))

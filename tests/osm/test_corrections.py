@@ -77,7 +77,7 @@ def solved(seed: int, mode: Mode = "two-level") -> tuple[CorrectedMap, Floats, l
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_buildings_end_where_they_stand(seed: int) -> None:
+def test_corrected_buildings_are_at_their_true_places(seed: int) -> None:
     found, off, real, matches = solved(seed)
     assert [c.building for c in found.buildings] == list(matches.buildings)
     two_sided = [k for k in range(10) if any(m.building == k and m.rank == 3 for m in matches.local)]
@@ -95,7 +95,7 @@ def test_buildings_end_where_they_stand(seed: int) -> None:
     assert found.attribution == "© OpenStreetMap contributors"
 
 
-def test_what_is_gone_new_or_out_of_sight_is_told_apart() -> None:
+def test_absent_new_and_unobserved_buildings_are_distinguished() -> None:
     found, _, _, _ = solved(0)
     assert [c.status for c in found.buildings[10:12]] == ["unseen", "absent"]
     np.testing.assert_allclose(found.buildings[10].displacement[:2], found.shift, atol=1e-6)
@@ -106,7 +106,7 @@ def test_what_is_gone_new_or_out_of_sight_is_told_apart() -> None:
     np.testing.assert_allclose(np.sort(front[0, :, 0]), [100, 110], atol=0.4)
 
 
-def test_a_trusted_map_stays_and_a_rigid_one_moves_as_a_whole() -> None:
+def test_mode_prior_keeps_the_map_and_mode_rigid_shifts_it() -> None:
     fixed, _, _, _ = solved(1, "prior")
     assert not any(c.displacement.any() for c in fixed.buildings)
     assert not fixed.shift.any()
@@ -119,7 +119,7 @@ def test_a_trusted_map_stays_and_a_rigid_one_moves_as_a_whole() -> None:
     np.testing.assert_allclose(rigid.shift, [1.0, -0.6], atol=0.6)
 
 
-def test_neighbours_that_were_drawn_into_each_other_are_parted() -> None:
+def test_overlapping_neighbours_are_separated() -> None:
     matches, poses, _, _ = scene(2)
     first = matches.buildings[0]
     copy = Building("way/99", (Footprint(np.add(first.footprints[0].outer, [7.0, 0.0])),), tags=first.tags)
@@ -132,7 +132,7 @@ def test_neighbours_that_were_drawn_into_each_other_are_parted() -> None:
     assert found.left == ()
 
 
-def test_without_matches_the_map_stays_where_it_is_thought_to_be() -> None:
+def test_without_matches_the_map_keeps_its_prior() -> None:
     matches, poses, _, _ = scene(0)
     blind = OsmMatches(
         matches.origin,

@@ -139,7 +139,7 @@ def test_five_copies_that_count_a_fifth_are_one() -> None:
 
 
 @pytest.mark.parametrize(("length", "apart"), [(366.0, 20.0), (2000.0, 50.0)])
-def test_rates_that_wander_go_as_far_as_a_walk(length: float, apart: float) -> None:
+def test_wandering_rates_have_the_variance_of_a_random_walk(length: float, apart: float) -> None:
     """Its variance grows with the way, and over `MEMORY` it is that of rates that last as long."""
     way = np.arange(0.0, length, 2.0)
     moves = 2.0 * np.cumsum(linear_basis(way, apart), axis=0)
@@ -150,7 +150,7 @@ def test_rates_that_wander_go_as_far_as_a_walk(length: float, apart: float) -> N
 
 
 @pytest.mark.parametrize("seed", [0, 2])
-def test_a_drift_is_sure_when_it_explains_more_than_chance(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_drift_is_significant_by_the_likelihood_ratio(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(wall_drift, "FREEDOM", 1e12)
     graph, seen = scene(seed, 1.0, 60)
     dense = Dense(graph, seen)
@@ -165,7 +165,7 @@ def test_a_drift_is_sure_when_it_explains_more_than_chance(seed: int, monkeypatc
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_a_drift_is_settled_well_below_what_it_is_unsure_by(seed: int) -> None:
+def test_the_fit_converges_well_within_its_sigma(seed: int) -> None:
     """The fewer sightings count as new, the less sure are the same rates: 0.5 and 0.02 of the squares that chance gives."""
     graph = odometry(0.1, 0.0)
     seen = sighted(graph, seed, 0.5)
@@ -175,7 +175,7 @@ def test_a_drift_is_settled_well_below_what_it_is_unsure_by(seed: int) -> None:
 
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize(("metres", "lasting", "tolerance"), [(100.0, 0.5, 2e-3), (200.0, 1.0, 1e-3)])
-def test_where_no_wall_is_seen_drift_lasts_by_half_and_whole_once_it_stayed_the_same_for_long(
+def test_drift_is_extrapolated_by_half_or_in_full_by_its_correlation(
     metres: float, lasting: float, tolerance: float, seed: int
 ) -> None:
     graph = odometry(1.0, 0.0)
@@ -191,7 +191,7 @@ def test_where_no_wall_is_seen_drift_lasts_by_half_and_whole_once_it_stayed_the_
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_what_is_left_of_a_drift_is_no_smaller_one_where_no_wall_is_seen(seed: int) -> None:
+def test_residual_drift_is_not_underestimated_without_walls(seed: int) -> None:
     """The first 80 m are without walls, and are no surer for the rest being set right already."""
     graph = odometry(2.5, 1.0)
 

@@ -105,7 +105,7 @@ def test_the_heading_is_found_among_all(turn: float) -> None:
 
 
 @pytest.mark.parametrize("heading", [90.0, None])
-def test_a_start_that_is_held_is_where_it_was_said_to_be(heading: float | None) -> None:
+def test_a_fixed_start_stays_at_its_prior(heading: float | None) -> None:
     """Houses half a metre north of where the map has them: the place is what was given, a heading that was sought the walls'."""
     houses = [[(x, y - 0.5) for x, y in ring] for ring in HOUSES]
     keyframes = driven(HOUSES, street(24.0))
@@ -119,7 +119,7 @@ def test_a_start_that_is_held_is_where_it_was_said_to_be(heading: float | None) 
     np.testing.assert_allclose((free.T_enu_odometry[:2, 3]), [0.0, -0.5], atol=0.1)
 
 
-def test_odometry_that_runs_away_is_followed() -> None:
+def test_drifting_odometry_is_tracked() -> None:
     """3 % too long and 4 deg per 100 m to the left: where it ends it would be 3 m off."""
     way = street()
     told = way * 1.03
@@ -132,7 +132,7 @@ def test_odometry_that_runs_away_is_followed() -> None:
 @pytest.mark.parametrize(
     ("wrong", "known"), [((0.0, 0.0, 2.5), 1.0), ((0.3, 2.0, -3.0), 1.0), ((0.3, 1.5, -2.0), 2e-4)]
 )
-def test_a_first_match_that_is_wrong_or_unsure_neither_turns_the_run_nor_moves_it(
+def test_a_wrong_or_uncertain_first_match_does_not_move_the_run(
     wrong: tuple[float, float, float], known: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     way, error = street(60.0), np.array([*wrong[:2], np.radians(wrong[2])])
@@ -189,20 +189,20 @@ def test_many_keyframes_that_see_one_wall_count_as_one() -> None:
     assert seen.max() < 3.0
 
 
-def test_no_building_within_reach_is_said_with_the_distance() -> None:
+def test_no_building_in_range_is_reported_with_the_distance() -> None:
     far = [box_at(500.0, 0.0, 20, 10)]
     located = locate(extract_of(far), driven(HOUSES, street(12.0)), None, config())
     assert not located.priors
     assert "no building of town.osm comes near the run, the nearest is 490 m away" in located.problem
 
 
-def test_a_park_says_nothing() -> None:
+def test_without_walls_nothing_is_matched() -> None:
     located = locate(extract_of(HOUSES), driven([], street(12.0)), None, config())
     assert not located.priors
     assert "most often: no walls seen" in located.problem
 
 
-def test_a_tunnel_is_not_laid_on_the_houses_above_it() -> None:
+def test_walls_of_a_tunnel_are_not_matched_with_buildings_above() -> None:
     """Parallel walls that are on no map, 5 m aside; house fronts run as they do."""
     tunnel = [box_at(-60, 5, 160, 1), box_at(-60, -6, 160, 1)]
     for given in (config(), config(None)):
@@ -211,7 +211,7 @@ def test_a_tunnel_is_not_laid_on_the_houses_above_it() -> None:
         assert "goes on without the buildings" in located.problem
 
 
-def test_one_long_wall_does_not_say_where_a_run_begins() -> None:
+def test_one_long_wall_does_not_determine_the_start() -> None:
     hall = [box_at(-80, 8, 200, 30)]
     for given in (config(), config(None)):
         located = locate(extract_of(hall), driven(hall, street(12.0)), None, given)
@@ -219,7 +219,7 @@ def test_one_long_wall_does_not_say_where_a_run_begins() -> None:
         assert "OSM: " in located.problem
 
 
-def test_along_one_long_wall_the_pose_is_odometrys() -> None:
+def test_along_one_long_wall_the_pose_is_that_of_odometry() -> None:
     """After the houses a hall of 200 m: across it the run is held, along it nothing is claimed."""
     town = [*HOUSES[:4], *HOUSES[5:8], box_at(90, 8, 260, 30)]
     way = np.column_stack([np.arange(20.0, 190.0, 4.0), np.zeros(43), np.zeros(43)])
@@ -239,7 +239,7 @@ def test_along_one_long_wall_the_pose_is_odometrys() -> None:
             assert abs(match.pose[1]) < 0.15
 
 
-def test_a_round_building_invents_nothing() -> None:
+def test_a_round_building_gives_no_false_match() -> None:
     """It has no corner; what is claimed of it has to be right."""
     angles = np.linspace(0, 2 * np.pi, 32, endpoint=False)
     tower: Outline = [(20 + 9 * np.cos(a), 16 + 9 * np.sin(a)) for a in angles]
@@ -251,7 +251,7 @@ def test_a_round_building_invents_nothing() -> None:
     assert "OSM: " in lost.problem
 
 
-def test_a_start_among_houses_that_are_all_alike_is_refused() -> None:
+def test_an_ambiguous_start_is_rejected() -> None:
     rows = [box_at(12.0 * i, y, 8, 8) for i in range(-6, 9) for y in (8, -16)]
     located = locate(extract_of(rows), driven(rows, street(8.0)), None, config(None))
     assert not located.priors
@@ -280,7 +280,7 @@ def test_in_the_end_each_building_is_laid_on_what_was_seen() -> None:
         np.testing.assert_allclose(np.median(shifts[:, :2], axis=0), [-0.8 if number == 2 else 0.0, 0.0], atol=0.1)
 
 
-def test_a_world_that_leans_is_set_upright_by_the_ground() -> None:
+def test_a_tilted_world_is_levelled_by_the_ground() -> None:
     way = street(20.0)
     store = driven(HOUSES, way)
     lean = se3.make(so3.exp(np.array([0.06, -0.05, 0.0])), np.zeros(3))

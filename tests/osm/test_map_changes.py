@@ -56,7 +56,7 @@ def drive(real: list[Building], keyframes: int = 9, seed: int = 0) -> tuple[list
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_a_house_that_is_gone_is_looked_through(seed: int) -> None:
+def test_an_absent_building_is_seen_through(seed: int) -> None:
     on_map = street()
     sights, poses = drive([b for k, b in enumerate(on_map) if k != 1], seed=seed)
     assert absent_buildings(on_map, sights, poses).tolist() == [False, True, False, False]
@@ -64,7 +64,7 @@ def test_a_house_that_is_gone_is_looked_through(seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_a_new_house_shows_its_front(seed: int) -> None:
+def test_a_new_building_gives_a_new_wall(seed: int) -> None:
     real = street()
     sights, poses = drive(real, seed=seed)
     on_map = [b for k, b in enumerate(real) if k != 1]
@@ -76,7 +76,7 @@ def test_a_new_house_shows_its_front(seed: int) -> None:
     assert not absent_buildings(on_map, sights, poses).any()
 
 
-def test_a_right_map_has_no_changes_and_hidden_houses_are_not_absent() -> None:
+def test_an_exact_map_has_no_changes_and_occluded_buildings_are_not_absent() -> None:
     hidden = house(2, BEHIND + 30)
     sights, poses = drive([*street(), hidden])
     assert not absent_buildings([*street(), hidden], sights, poses).any()
@@ -128,7 +128,7 @@ def test_roofs_on_posts_are_looked_through_and_stay() -> None:
     assert not absent_buildings(on_map, sights, poses).any()
 
 
-def test_without_walls_or_buildings_nothing_is_claimed() -> None:
+def test_without_walls_or_buildings_there_are_no_changes() -> None:
     sights, poses = drive(street(), 4)
     blind = [replace(s, walls=np.zeros((0, 2, 2))) for s in sights]
     assert not absent_buildings(street(), blind, poses).any()

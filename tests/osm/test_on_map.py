@@ -65,7 +65,7 @@ def off(poses: np.ndarray, way: np.ndarray) -> float:
 
 
 @pytest.mark.parametrize("seed", range(2))
-def test_a_drift_is_taken_out_by_a_map_that_errs(seed: int, caplog: pytest.LogCaptureFixture) -> None:
+def test_drift_is_corrected_by_a_perturbed_map(seed: int, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level("INFO", "lslam")
     way = street(60.0)
     store = driven(HOUSES, way, runaway(way, 4.0, 3.0))
@@ -98,7 +98,7 @@ def test_a_drift_is_taken_out_by_a_map_that_errs(seed: int, caplog: pytest.LogCa
     assert told["log_likelihood_gain"] > told["gain_by_chance"] > 5.0
 
 
-def test_drift_that_wanders_is_said_to(caplog: pytest.LogCaptureFixture) -> None:
+def test_wandering_drift_is_reported_as_such(caplog: pytest.LogCaptureFixture) -> None:
     """To the north for a third of the way, to the south as long, and back."""
     caplog.set_level("INFO", "lslam")
     way = street(60.0)
@@ -139,7 +139,7 @@ def test_a_run_that_does_not_drift_stays_as_it_is(size: float) -> None:
     np.testing.assert_allclose(held.poses, located.T_enu_odometry @ given.poses, atol=1e-12)
 
 
-def test_trusted_poses_and_the_baseline_are_not_set_straight() -> None:
+def test_trusted_poses_and_the_baseline_are_not_corrected_for_drift() -> None:
     way = street(24.0)
     store = driven(HOUSES, way, runaway(way, 4.0, 3.0))
     for given in (config(90.0, "osm.matcher=baseline"), config(90.0, "odometry.method=poses")):
@@ -163,7 +163,7 @@ def test_each_wall_seen_is_measured_from_its_own_line_on_the_map() -> None:
     assert np.linalg.norm(seen.places - way[seen.keyframes, :2], axis=1).max() < 60.0
 
 
-def test_walls_are_sought_from_where_a_keyframe_was_laid_or_else_expected() -> None:
+def test_walls_are_searched_from_the_matched_pose_or_else_the_predicted_one() -> None:
     """What is not asked lies 9 m off, where no building would be found."""
     given = config(90.0, "keyframes.submap_size=3")
     located = locate(extract_of(HOUSES), driven(HOUSES, street(12.0)), None, given)
@@ -188,7 +188,7 @@ def test_without_a_building_there_is_no_wall_to_see() -> None:
     assert not len(sightings(located, held.poses, config()).walls)
 
 
-def test_a_run_that_its_fixes_cannot_place_says_what_would() -> None:
+def test_a_run_without_enough_fixes_reports_what_is_needed() -> None:
     store = driven(HOUSES, street(6.0))
     given = Given([], store, load_config(), [])
     nobody_asks = OsmServer(ORIGIN, None, given.config.osm, lambda bounds: {})

@@ -167,7 +167,7 @@ def test_a_match_far_from_odometry_is_refused() -> None:
         (True, "osm.matcher=baseline"),
     ],
 )
-def test_poses_that_are_trusted_are_not_bent(is_trusted: bool, how: str, tmp_path: Path) -> None:
+def test_trusted_poses_are_not_changed(is_trusted: bool, how: str, tmp_path: Path) -> None:
     given = DRIVE / "truth" / "trajectory.tum"
     trust = f"osm.trust_poses={str(is_trusted).lower()}"
     folder = run(tmp_path / "run", "odometry.method=poses", f"odometry.poses={given}", trust, how, scans=30)

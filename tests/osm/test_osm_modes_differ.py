@@ -43,7 +43,7 @@ def test_no_two_modes_give_the_same_trajectory(
             assert np.abs(found[one].places - found[other].places).max() > 1e-4, f"{one} and {other}"
 
 
-def test_a_map_that_is_true_is_trusted_more_than_the_start(exact: dict[str, Found]) -> None:
+def test_an_exact_map_outweighs_the_start(exact: dict[str, Found]) -> None:
     assert exact["prior"].trajectory < 0.2
     assert exact["prior"].buildings == 0.0
     for mode in ("rigid", "non-rigid", "two-level"):
@@ -58,7 +58,7 @@ def test_a_map_that_is_off_as_a_whole_moves_as_one(shifted: dict[str, Found]) ->
     assert shifted["rigid"].trajectory < min(0.3, shifted["prior"].trajectory)
 
 
-def test_houses_that_are_off_by_themselves_move_by_themselves(houses: dict[str, Found]) -> None:
+def test_independent_errors_of_buildings_are_corrected_independently(houses: dict[str, Found]) -> None:
     for mode in ("non-rigid", "two-level"):
         assert houses[mode].buildings < 0.5 * min(houses["prior"].buildings, houses["rigid"].buildings)
         assert houses[mode].trajectory < min(houses["prior"].trajectory, houses["rigid"].trajectory)

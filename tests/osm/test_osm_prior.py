@@ -59,14 +59,14 @@ def test_a_building_is_found_where_the_map_as_a_whole_is_off() -> None:
         np.testing.assert_allclose(moved, [*shift, 0.0], atol=1e-3)
 
 
-def test_buildings_are_sought_where_the_map_has_them() -> None:
+def test_buildings_are_searched_at_their_places_on_the_map() -> None:
     """Ten metres about a place that is thirty metres away from the same place of the map."""
     shift = np.array([30.0, -1.0])
     found = match_buildings(view(TOWN.walls), np.append(shift, 0.0), shift, TOWN, OsmConfig(use_radius=10.0))
     assert [one.building for one in found] == [0, 1, 2]
 
 
-def test_a_building_that_may_be_either_of_two_is_not_moved() -> None:
+def test_an_ambiguous_building_is_not_moved() -> None:
     house = OsmMap(TOWN.buildings[:1])
     off = np.array([1.6, 1.0])
     twice = np.concatenate([house.walls + off, house.walls - off])
@@ -76,7 +76,7 @@ def test_a_building_that_may_be_either_of_two_is_not_moved() -> None:
     assert [(one.verdict, one.reason) for one in alone] == [("accepted", "")]
 
 
-def test_what_many_see_counts_once() -> None:
+def test_repeated_sightings_count_once() -> None:
     one = view(TOWN.walls)
     pairs = [[[0, 0], [1, 1]], [[0, 0]], [[0, 0], [2, 5]], [[0, 0]]]
     matches = [replace(one, pairs=np.array(p)) for p in pairs]

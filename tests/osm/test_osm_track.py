@@ -15,7 +15,7 @@ def track(sigma: tuple[float, float, float] = (0.1, 0.1, 0.01)) -> OsmTrack:
     return OsmTrack(np.array([10.0, 5.0, np.pi / 2]), np.array(sigma), 1.0, np.radians(0.5) / 100, MAP)
 
 
-def test_it_follows_odometry_and_doubts_it_by_a_percent_of_a_hundred_metres() -> None:
+def test_prediction_follows_odometry_with_a_sigma_of_one_percent() -> None:
     one = track((0.0, 0.0, 0.0))
     for _ in range(50):
         one.move(np.array([2.0, 0.0, 0.0]), 2.0)
@@ -47,14 +47,14 @@ def test_the_gate_counts_directions_that_are_seen_and_wraps_the_heading() -> Non
     np.testing.assert_allclose(far, 9.0 / (0.01 + 0.01 + 0.25), rtol=1e-6)
 
 
-def test_many_matches_never_make_it_surer_than_the_map() -> None:
+def test_the_covariance_never_falls_below_that_of_the_map() -> None:
     one = track()
     for _ in range(200):
         one.take(one.pose, np.diag([1e4, 1e4, 1e6]))
     assert (one.sigma >= MAP).all()
 
 
-def test_it_begins_anew_at_a_match() -> None:
+def test_the_filter_restarts_at_a_match() -> None:
     one = track()
     one.begin(np.array([1.0, 2.0, 3.0]), np.diag([100.0, 100.0, 1e4]))
     np.testing.assert_array_equal(one.pose, [1.0, 2.0, 3.0])
@@ -80,7 +80,7 @@ def laid_on(
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_a_run_is_turned_as_all_its_matches_have_it_though_the_first_house_is_askew(seed: int) -> None:
+def test_the_heading_is_that_of_all_matches(seed: int) -> None:
     rng = np.random.default_rng(seed)
     way = se2.compose(np.array([30.0, -20.0, 2.0]), np.column_stack([5.0 * np.arange(20), np.zeros((20, 2))]))
     real = way + rng.normal(0, [0.1, 0.1, 0.005], way.shape)
@@ -121,7 +121,7 @@ def test_a_run_is_laid_where_matches_and_what_is_known_of_its_start_are_likelies
     assert turn == pytest.approx(np.degrees(best[2]), abs=1e-4)
 
 
-def test_what_no_wall_fixes_turns_nothing() -> None:
+def test_unobserved_directions_are_not_turned() -> None:
     """All walls lie along the way, and the matches are 9 m farther along them; or on the other side of the circle."""
     told = np.column_stack([5.0 * np.arange(10), np.zeros((10, 2))])
     assert laid_on(told, told + np.array([9.0, 0.3, 0.0]), [WALL] * 10)[0] == pytest.approx(0.0, abs=0.1)
@@ -137,7 +137,7 @@ def test_far_matches_count_less_by_what_odometry_may_have_drifted_since() -> Non
     assert -2.1 < laid_on(told, way, [SURE] * 80)[0] < -1.0
 
 
-def test_a_match_is_known_as_well_as_the_map_or_not() -> None:
+def test_a_match_has_at_best_the_sigma_of_the_map() -> None:
     assert track().knows(np.diag([5.0, 5.0, 3e3]))
     assert not track().knows(np.diag([3.0, 1e4, 1e6]))
     assert not track().knows(np.diag([1e4, 1e4, 2e3]))

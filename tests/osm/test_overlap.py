@@ -79,7 +79,7 @@ def test_houses_in_a_row_stay_flush_whichever_of_them_was_seen(seed: int) -> Non
     assert np.ptp(found.displacements[:, 2]) < np.radians(0.05)
 
 
-def test_the_building_known_best_gives_way_least_and_across_the_nearest_wall() -> None:
+def test_displacements_are_weighted_by_information() -> None:
     pair = [house(0, 0, 10, 10, 1), house(12, 1, 9, 8, 2)]
     found = remove_overlaps(pair, np.array([[2.5, 0, 0], [0, 0, 0]]), information([True, False]))
     check_apart(pair, found)
@@ -89,7 +89,7 @@ def test_the_building_known_best_gives_way_least_and_across_the_nearest_wall() -
     np.testing.assert_allclose(equal.displacements[:, 0], [2.25, 0.25], atol=0.005)
 
 
-def test_a_house_that_stands_askew_ends_flush() -> None:
+def test_a_rotated_building_is_aligned_with_its_party_wall() -> None:
     pair = [house(0, 0, 10, 10, 1), house(10.2, 0, 10, 10, 2)]
     found = remove_overlaps(pair, np.array([[0.0, 0, 0], [0, 0, np.radians(4)]]), information([True, False]))
     check_apart(pair, found)
@@ -105,7 +105,7 @@ def test_a_corner_finds_its_corner_where_one_wall_is_not_enough() -> None:
     np.testing.assert_allclose(found.displacements[1] - found.displacements[0], [-1, -1, 0], atol=0.03)
 
 
-def test_no_house_is_turned_far_to_lie_flush() -> None:
+def test_rotations_to_align_party_walls_are_bounded() -> None:
     pair = [house(0, 0, 12, 12, 1), house(12.5, 2, 8, 8, 2)]
     found = remove_overlaps(pair, np.array([[0, 0, 0], [0, 0, np.radians(45)]]), information([True, False]))
     check_apart(pair, found)
@@ -114,7 +114,7 @@ def test_no_house_is_turned_far_to_lie_flush() -> None:
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_a_town_drawn_askew_has_no_overlaps_left(seed: int) -> None:
+def test_no_overlaps_remain_in_a_perturbed_town(seed: int) -> None:
     rng = np.random.default_rng(seed)
     town = [house(11.0 * (k % 4), 12.0 * (k // 4), rng.uniform(8, 11), rng.uniform(8, 12), k) for k in range(16)]
     moved = np.column_stack([rng.uniform(-1.5, 1.5, (16, 2)), rng.uniform(-0.05, 0.05, 16)])
@@ -123,7 +123,7 @@ def test_a_town_drawn_askew_has_no_overlaps_left(seed: int) -> None:
     assert np.abs(found.displacements - moved)[:, :2].max() < 3.0
 
 
-def test_who_touches_nobody_keeps_his_place_to_the_last_bit() -> None:
+def test_buildings_without_contacts_keep_their_displacement_exactly() -> None:
     town = [house(0, 0, 10, 10, 1), house(9, 0, 10, 10, 2), house(40, 0, 7, 7, 3)]
     moved = np.array([[0.1, 0, 0], [0, 0.2, 0.01], [0.123456789, 0.3, 0.02]])
     found = remove_overlaps(town, moved, information([True] * 3))
@@ -133,7 +133,7 @@ def test_who_touches_nobody_keeps_his_place_to_the_last_bit() -> None:
     assert nothing.displacements.shape == (0, 3)
 
 
-def test_canopies_and_parts_of_buildings_are_let_alone() -> None:
+def test_canopies_and_building_parts_are_not_moved() -> None:
     town = [house(0, 0, 20, 20, 1), house(5, 5, 6, 6, 2), house(15, 0, 10, 10, 3, building="roof")]
     moved = np.array([[0.3, 0, 0], [0.0, 0.1, 0], [0.0, 0, 0]])
     found = remove_overlaps(town, moved, information([True] * 3))
@@ -141,7 +141,7 @@ def test_canopies_and_parts_of_buildings_are_let_alone() -> None:
     assert found.left == ()
 
 
-def test_what_no_small_move_takes_apart_is_said(caplog: pytest.LogCaptureFixture) -> None:
+def test_overlaps_that_no_small_move_removes_are_reported(caplog: pytest.LogCaptureFixture) -> None:
     crossed = [house(-30, -4, 60, 8, 1), house(-4, -30, 8, 60, 2)]
     with caplog.at_level(logging.WARNING, logger="lslam"):
         found = remove_overlaps(crossed, np.zeros((2, 3)), information([True, True]))
@@ -151,7 +151,7 @@ def test_what_no_small_move_takes_apart_is_said(caplog: pytest.LogCaptureFixture
 
 
 @pytest.mark.parametrize(("inside", "is_meant"), [(0.45, False), (0.55, True)])
-def test_a_building_that_the_map_puts_mostly_into_another_is_meant_so(inside: float, is_meant: bool) -> None:
+def test_a_nested_building_is_not_separated(inside: float, is_meant: bool) -> None:
     """A shed of 1 m x 8 m, less or more than half of it in a house: the one is drawn askew, the other is a part."""
     pair = [house(0, 0, 10, 10, 1), house(10 - inside, 1, 1, 8, 2)]
     found = remove_overlaps(pair, np.zeros((2, 3)), information([True, False]))

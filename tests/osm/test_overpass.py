@@ -91,7 +91,7 @@ def test_without_network_only_what_is_kept(server: FakeOverpass, tmp_path: Path)
         (["cut", "remark", "ok"], [5.0, 10.0]),
     ],
 )
-def test_a_busy_server_is_given_time(
+def test_a_busy_server_is_asked_again_later(
     server: FakeOverpass, tmp_path: Path, script: list[str], waits: list[float]
 ) -> None:
     assert len(from_overpass(fetch(server, tmp_path, *script)).ways) == 2
@@ -119,7 +119,7 @@ def test_a_busy_server_is_given_time(
         ("torn", "after 3 attempts: the connection broke", 3),
     ],
 )
-def test_what_no_patience_mends_is_one_sentence_and_is_not_kept(
+def test_permanent_failures_are_one_sentence_and_are_not_cached(
     server: FakeOverpass, tmp_path: Path, word: str, sentence: str, requests: int
 ) -> None:
     timeout = 0.3 if word.startswith(("slow", "drip", "header")) else 5.0

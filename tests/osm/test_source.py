@@ -78,7 +78,7 @@ def test_with_a_heading_it_asks_along_the_way(tmp_path: Path) -> None:
     assert [b.osm_id for b in again.buildings] == [b.osm_id for b in found.buildings]
 
 
-def test_fixes_say_the_way_better_than_a_heading() -> None:
+def test_fixes_determine_the_path_better_than_a_heading() -> None:
     fetch = Fetch()
     east = np.array([[d, 0.0, 0.0] for d in (0.0, 150.0, 300.0)])
     fixes = GnssStream(
@@ -93,7 +93,7 @@ def test_fixes_say_the_way_better_than_a_heading() -> None:
     assert middles[:, 0].max() > 240.0
 
 
-def test_fixes_that_are_no_places_say_nothing_of_the_way() -> None:
+def test_invalid_fixes_are_ignored() -> None:
     fetch = Fetch()
     blind = GnssStream(
         np.arange(3, dtype=np.int64), np.array([[0.0, 0.0, 0.0], [np.nan] * 3, [91.0, 8.0, 0.0]]), np.ones(3)
@@ -115,7 +115,7 @@ def test_without_a_heading_the_circle_grows() -> None:
     assert len(fetch.boxes) == 4
 
 
-def test_a_dead_server_costs_nothing_and_is_named() -> None:
+def test_an_unreachable_server_is_reported_and_does_not_delay() -> None:
     """It is asked once for each circle and not once for each pose, and none is waited for when all have failed."""
     asked = []
 
@@ -133,7 +133,7 @@ def test_a_dead_server_costs_nothing_and_is_named() -> None:
     assert len(asked) == 5
 
 
-def test_a_sleeping_server_is_waited_for_once(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_a_slow_server_is_waited_for_once(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """The first reply comes, no other does; half a second later the run goes on with what it has."""
     gate = threading.Semaphore(1)
 

@@ -79,7 +79,7 @@ def found(graph: PoseGraph, seen: WallSightings) -> WallDrift | None:
 
 @pytest.mark.parametrize("size", [0.1, 1.0])
 @pytest.mark.parametrize("seed", SEEDS)
-def test_drift_is_taken_out_though_the_map_errs(seed: int, size: float) -> None:
+def test_drift_is_corrected_on_a_perturbed_map(seed: int, size: float) -> None:
     graph = odometry(2.0, 1.0)
     drift = found(graph, sighted(graph, seed, size))
     assert drift is not None
@@ -93,7 +93,7 @@ def test_drift_is_taken_out_though_the_map_errs(seed: int, size: float) -> None:
     np.testing.assert_allclose(alone.poses, straight.poses, atol=1e-6)
 
 
-def test_what_is_told_are_the_rates_themselves() -> None:
+def test_the_reported_rates_are_those_of_the_drift() -> None:
     graph = odometry(1.0, 0.4)
     drift = found(graph, sighted(graph, 0, 0.5))
     assert drift is not None
@@ -108,7 +108,7 @@ def test_what_is_told_are_the_rates_themselves() -> None:
     assert not drift.is_sure
 
 
-def test_what_counts_less_is_as_far_off_and_less_sure() -> None:
+def test_downweighted_sightings_give_the_same_rates_with_larger_sigmas() -> None:
     graph = odometry(1.0, 0.4)
     seen = sighted(graph, 0, 0.5)
     once, fifth = found(graph, seen), found(graph, replace(seen, share=0.2))
@@ -130,14 +130,14 @@ def test_errors_of_the_map_are_no_drift(size: float) -> None:
         assert drift.estimated_drift.gain < 0.0, "not even likelier"
 
 
-def test_walls_that_look_one_way_tell_no_drift_along_them() -> None:
+def test_drift_along_parallel_walls_is_not_observed() -> None:
     graph = odometry(2.0, 0.0)
     drift = found(graph, sighted(graph, 1, 0.1, np.pi / 2))
     assert drift is not None
     assert np.abs(drift.rates[:, 0]).max() < 0.2 * np.abs(drift.rates[:, 1]).max()
 
 
-def test_without_a_start_on_the_map_a_way_or_walls_nothing_is_told() -> None:
+def test_without_a_start_a_path_or_walls_there_is_no_estimate() -> None:
     graph = odometry(2.0, 1.0)
     seen = sighted(graph, 0, 0.1)
     assert found(replace(graph, start_sigma=None), seen) is None
@@ -154,7 +154,7 @@ def unsure(drift: WallDrift, straight: PoseGraph) -> float:
     return float(np.einsum("ki,kij,kj->k", error[10:], np.linalg.inv(planar[10:]), error[10:]).mean() / 3)
 
 
-def test_poses_are_as_unsure_as_the_rates_are() -> None:
+def test_the_covariances_of_poses_follow_from_those_of_the_rates() -> None:
     """Over drifts and maps."""
     squared = []
     for seed in range(12):
@@ -169,7 +169,7 @@ def test_poses_are_as_unsure_as_the_rates_are() -> None:
 
 
 @pytest.mark.parametrize("memory", [20.0, 50.0])
-def test_drift_that_wanders_is_taken_for_no_other_and_taken_out(memory: float) -> None:
+def test_wandering_drift_is_recognised_and_corrected(memory: float) -> None:
     """Rates that last explain it worse, and would be far too sure of it."""
     ratios, squared = [], []
     for seed in range(6):
@@ -194,7 +194,7 @@ def test_drift_that_wanders_is_taken_for_no_other_and_taken_out(memory: float) -
     assert 0.3 < np.mean(squared) < 3.0
 
 
-def test_a_solution_is_unsure_by_what_is_given_beside_its_graph() -> None:
+def test_covariances_include_what_is_given_beside_the_graph() -> None:
     spread = np.zeros((COUNT, 6, 6))
     spread[:, 0, 0] = np.linspace(0, 1, COUNT)
     graph = replace(odometry(0.0, 0.0), map_priors=[PlanarPrior(0, se2.of_se3(REAL)[0], np.eye(3), 3)])

@@ -84,7 +84,7 @@ def test_a_known_offset_is_recovered_through_clutter_and_gaps(seed: int) -> None
     assert np.median(lies) < 0.1
 
 
-def test_where_houses_are_drawn_a_metre_off_the_answer_seldom_hangs_on_the_prior() -> None:
+def test_matches_on_a_perturbed_map_seldom_depend_on_the_prior() -> None:
     """It did in most villages while the last walls with half weight still pulled; some have two answers that fit alike."""
     spread = []
     for seed in range(10):
@@ -171,7 +171,7 @@ def test_the_map_of_another_town_is_no_start() -> None:
         assert match is None or match.is_ambiguous
 
 
-def test_what_looks_alike_from_two_headings_is_refused() -> None:
+def test_a_match_ambiguous_in_heading_is_rejected() -> None:
     # Inside a square court every quarter turn fits as well.
     court = outline(box_at(-10, -10, 20, 20))[:, ::-1]
     match = find_heading(court, turned(court, (3.0, 1.0, 0.4)), np.array([2.0, 2.0]), 8.0)
@@ -189,7 +189,7 @@ def test_what_looks_alike_from_two_headings_is_refused() -> None:
 
 
 @pytest.mark.parametrize(("period", "turn"), [(4.0, 0.0), (5.0, 0.8), (6.0, 2.0), (8.0, -0.4)])
-def test_equal_gables_shifted_by_one_house_are_bounded_by_the_window_or_refused(period: float, turn: float) -> None:
+def test_repeated_gables_are_limited_by_the_window_or_rejected(period: float, turn: float) -> None:
     # One side of each house is seen, and no corner: across these walls the next house fits as well.
     gables = turned(np.array([[[k * period, 6.0], [k * period, 14.0]] for k in range(-20, 21)]), (0.0, 0.0, turn))
     rng = np.random.default_rng(int(period))
@@ -211,7 +211,7 @@ def gables(*places: float) -> Floats:
 
 @pytest.mark.parametrize("turn", [0.0, 0.8, 2.5])
 @pytest.mark.parametrize("beside", [2.0, 4.0, 5.5, -2.0, -4.0, -5.5, 10.0, -10.0])
-def test_one_gable_beside_is_an_alternative_as_far_as_the_window_goes(beside: float, turn: float) -> None:
+def test_a_neighbouring_gable_is_an_alternative_within_the_window(beside: float, turn: float) -> None:
     """The window is 6 m along each axis; what lies beyond it is no answer, on whichever side it is."""
     known = turned(gables(0.0, beside), (0.0, 0.0, turn))
     match = match_walls(gables(0.0), known, np.array([0.2, 0.1, turn]), np.array([2.0, 2.0, 0.03]))
@@ -221,7 +221,7 @@ def test_one_gable_beside_is_an_alternative_as_far_as_the_window_goes(beside: fl
 
 @pytest.mark.parametrize("off_by", [-5.0, -3.0, 4.0])
 @pytest.mark.parametrize("gap", [2.5, 4.0, 5.0])
-def test_two_gables_are_laid_on_two_though_one_lies_nearer_the_prior(gap: float, off_by: float) -> None:
+def test_two_gables_are_matched_with_two_though_one_is_nearer_the_prior(gap: float, off_by: float) -> None:
     both = gables(0.0, gap)
     match = match_walls(both, both, np.array([off_by, 0.1, 0.0]), np.array([2.0, 2.0, 0.03]))
     assert match is not None
@@ -230,7 +230,7 @@ def test_two_gables_are_laid_on_two_though_one_lies_nearer_the_prior(gap: float,
     assert match.coverage > 0.95
 
 
-def test_a_wall_that_loses_its_partners_in_the_end_is_no_match() -> None:
+def test_a_wall_without_final_correspondences_is_no_match() -> None:
     wall, beside = (np.array([[[-8.0, y], [8.0, y]]]) for y in (4.0, 5.6))
     between = np.concatenate([wall, beside])
     known = np.array([[[-8.0, 4.8], [8.0, 4.8]]])
@@ -239,7 +239,7 @@ def test_a_wall_that_loses_its_partners_in_the_end_is_no_match() -> None:
 
 
 @pytest.mark.parametrize("turn", [0.0, 0.6, 2.2])
-def test_along_lone_parallel_walls_nothing_is_claimed(turn: float) -> None:
+def test_the_direction_along_parallel_walls_is_free(turn: float) -> None:
     street = np.array([[[-30, 5], [30, 5]], [[30, -5], [-30, -5]]], np.float64)[:, ::-1]
     pose = (0.0, 0.0, turn)
     part = np.array([[[12, 5.02], [-9, 4.98]], [[-11, -5], [10, -5]]])
@@ -273,7 +273,7 @@ def test_walls_that_are_nearly_parallel_do_not_slide_along_each_other() -> None:
     assert np.linalg.eigvalsh(match.information)[0] == pytest.approx(0.0, abs=1e-9)
 
 
-def test_information_turns_with_the_map_and_speaks_of_the_sensors_place() -> None:
+def test_information_rotates_with_the_map_and_refers_to_the_sensor() -> None:
     source, target, pose = scene(3)
     one = match_walls(source, target, np.array(pose), SIGMA)
     turn = (0.0, 0.0, 0.9)
