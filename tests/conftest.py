@@ -24,6 +24,8 @@ settings.load_profile("untimed")
 
 # The hundred processes that tests start would each compile what they import of lslam anew.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+# Workers fill the cores already; threads of BLAS on small matrices wait for each other.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
 
