@@ -1,7 +1,7 @@
-"""Overlap removal: displaced buildings taken apart, party walls flush, and everything else as it was measured.
+"""Overlap removal: displaced buildings are separated, party walls aligned, and all other displacements kept.
 
 Del Tufo, section 3.5. Contacts are hard constraints between buildings; the information of each building, from scans or
-only from the map's prior, weights its displacement. An unseen building is held near its place by that prior.
+only from the map's prior, weights its displacement. That prior keeps an unseen building near its place on the map.
 """
 
 from __future__ import annotations
@@ -19,18 +19,18 @@ from lslam.types.building import Building, about, footprint_polygon, is_canopy
 
 Floats = NDArray[np.float64]
 
-TOUCHING = 0.05  # m; walls of neighbours that lie so near one another on the map are one wall
-SHARED = 0.5  # m of it at least
-SLACK = 0.005  # m each of two buildings may stand in the other: half the tolerance
-STEEPEST = np.radians(60.0)  # by which a building is turned at most (Del Tufo)
+TOUCHING = 0.05  # m; walls of neighbours at most this far apart on the map are a party wall
+SHARED = 0.5  # m; least length of a party wall
+SLACK = 0.005  # m; by which each of two buildings may overlap the other: half the tolerance
+STEEPEST = np.radians(60.0)  # largest rotation of a building (Del Tufo)
 LARGEST = 5.0  # m; largest displacement of a building
-FLUSH_WORTH = 1.0  # m more than a bare touch that walls flush with each other may cost
+FLUSH_WORTH = 1.0  # m; cost of a move that aligns no walls, so that aligned walls are preferred
 PARALLEL = np.cos(np.radians(10.0))
-SHORTEST = 0.3  # m; walls under this length are ornaments
-ROUNDS = 20  # after which overlaps are left as they are
+SHORTEST = 0.3  # m; shorter walls are not aligned
+ROUNDS = 20  # most rounds of separation
 STEPS = 10  # of Gauss-Newton
 HARD = 1e-4  # m; one sigma of a contact
-NESTED = 0.5  # share of the smaller building's ground; if more overlaps on the map it is meant so: a part, a copy
+NESTED = 0.5  # share of the smaller building's area; a larger overlap on the map is a building part or a copy
 log = logging.getLogger("lslam")
 
 
@@ -45,7 +45,7 @@ class Contact:
 
 
 class Solid:
-    """A building as a thing that others cannot enter: its rings, its walls, and its ground less `SLACK`."""
+    """A building for contacts: its rings, its walls, and its area less `SLACK`."""
 
     def __init__(self, number: int, building: Building) -> None:
         from shapely import MultiPolygon, make_valid
@@ -67,12 +67,12 @@ class Solid:
         return np.asarray(self.walls @ R.T + shift)
 
     def core_at(self, displacement: Floats) -> Any:
-        """The displaced ground less `SLACK`, of shapely."""
+        """The displaced area less `SLACK`, of shapely."""
         return _transformed(self.core, *about(self.middle, displacement))
 
 
 def party_contacts(one: Solid, other: Solid) -> list[Contact]:
-    """Contacts of the walls that `one` and `other` share on the map; none of buildings that stand in each other."""
+    """Contacts of the walls that `one` and `other` share on the map; none where the two overlap."""
     if one.shape.distance(other.shape) > TOUCHING or one.core.intersects(other.core):
         return []
     found = []
@@ -93,7 +93,7 @@ def party_contacts(one: Solid, other: Solid) -> list[Contact]:
 def separate(one: Solid, at: Floats, other: Solid, other_at: Floats) -> list[Contact]:
     """Contacts that the smallest separating move of `one` makes, both displaced by `at` and `other_at` (3,).
 
-    Empty when no move of less than `LARGEST` m and `STEEPEST` takes the two apart.
+    Empty when no move of less than `LARGEST` m and `STEEPEST` separates the two.
     """
     from shapely import prepare
 
@@ -109,7 +109,7 @@ def separate(one: Solid, at: Floats, other: Solid, other_at: Floats) -> list[Con
 
 @dataclass(frozen=True)
 class _Move:
-    """A rigid move of the first building, what it costs, m, and (side, corner or wall, wall) of the contacts it makes.
+    """A rigid move of the first building, its cost, m, and (side, corner or wall, wall) of the contacts it makes.
 
     side : 0 when the corner is the first building's and the wall the second's, else 1
     """
@@ -121,13 +121,13 @@ class _Move:
 
 
 def _alignments(one: Solid, ours: Floats, other: Solid, theirs: Floats) -> Iterator[_Move]:
-    """Walls laid on walls, and corners on corners with one of their walls on each other."""
+    """Moves that align a wall with a wall, and corners with corners."""
     middle = ours[:, 0].mean(axis=0)
     for a, wall in enumerate(ours):
         u, length = _direction(wall)
         for b, facing in enumerate(theirs):
             v, along = _direction(facing)
-            # Walls that face each other run against each other.
+            # Walls that face each other have opposite directions.
             turn = np.arctan2(u[1] * v[0] - u[0] * v[1], -(u @ v))
             if min(length, along) < SHORTEST or abs(turn) > STEEPEST:
                 continue
@@ -143,7 +143,7 @@ def _alignments(one: Solid, ours: Floats, other: Solid, theirs: Floats) -> Itera
 
 
 def _touches(ours: Floats, theirs: Floats) -> Iterator[_Move]:
-    """Corners pushed out as far as walls, without a turn."""
+    """Moves by translation alone that push the deepest corner out to a wall."""
     for side, corners, walls in ((0, ours[:, 0], theirs), (1, theirs[:, 0], ours)):
         for k, wall in enumerate(walls):
             u, length = _direction(wall)
@@ -187,10 +187,10 @@ def _on_map(contact: tuple[int, int, int], one: Solid, other: Solid) -> Contact:
 
 @dataclass(frozen=True)
 class Untangled:
-    """Displaced buildings that do not stand in each other.
+    """Displaced buildings without overlaps.
 
     displacements : (B, 3) x, y (m), yaw (rad) about each building's middle
-    contacts : those that hold; left : pairs that still overlap, because no small move takes them apart
+    contacts : those that hold; left : pairs that still overlap, because no small move separates them
     """
 
     displacements: Floats
@@ -201,15 +201,15 @@ class Untangled:
 def remove_overlaps(
     buildings: Sequence[Building], displacements: NDArray[np.float64], information: NDArray[np.float64]
 ) -> Untangled:
-    """Move displaced buildings as little as it takes to part those that overlap, and to keep party walls flush.
+    """The least displacements that separate overlapping buildings and keep party walls aligned.
 
     Parameters
     ----------
     displacements : (B, 3) x, y (m), yaw (rad) about each building's `middle`
-    information : (B, 3, 3) of these, 1/m2 and 1/rad2, positive definite: what is known of each, the weak prior included
+    information : (B, 3, 3) of these, 1/m2 and 1/rad2, positive definite: the weak prior included
 
-    Buildings in no contact keep their displacement to the last bit. Canopies, buildings that begin above the ground and
-    those that the map itself puts into each other by more than `NESTED` are let alone.
+    Buildings without contacts keep their displacement exactly. Canopies, buildings that begin above the ground and those
+    that overlap on the map by more than `NESTED` are not separated.
     """
     wanted = np.asarray(displacements, np.float64).reshape(-1, 3)
     if not len(wanted):
@@ -237,7 +237,7 @@ def remove_overlaps(
 
 
 def _overlapping(solids: Sequence[Solid], displacements: Floats) -> list[tuple[int, int]]:
-    """Pairs of buildings that stand in each other by more than the tolerance."""
+    """Pairs of buildings that overlap by more than the tolerance."""
     from shapely import STRtree
 
     cores = [s.core_at(displacements[s.number]) for s in solids]
@@ -283,7 +283,7 @@ def _settled(
 
 
 def _group(members: list[int], middles: Floats, wanted: Floats, information: Floats, held: list[Contact]) -> Floats:
-    """Gauss-Newton on one group; dense, since a block of houses has few."""
+    """Gauss-Newton on one group; dense, since groups are small."""
     place = {m: k for k, m in enumerate(members)}
     moved = wanted.copy()
     size = 3 * len(members)

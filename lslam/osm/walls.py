@@ -1,8 +1,8 @@
-"""Walls as directed segments on level ground: those a cloud shows, and those a map says.
+"""Walls as directed segments on level ground: extracted from a cloud, and those of a map.
 
-Del Tufo, section 3.2: what is low is cut off, what is no upright plane left out, the rest flattened, and lines found by
-RANSAC. Height is counted from the ground below each point and not from the sensor, which may fly. All segments are directed
-so that the outside, where a wall is seen from, lies to the right; so a wall's back is never taken for its front.
+Del Tufo, section 3.2: low points are removed, then points off vertical planes; the rest is projected on the ground, and lines
+are found by RANSAC. Height is that above the ground below each point, not below the sensor, which may fly. All segments are
+directed so that the outside, from where a wall is seen, lies to the right; so a wall's back never matches a front.
 """
 
 from __future__ import annotations
@@ -20,17 +20,17 @@ from lslam.types.building import Building, Footprint, footprint_polygon, is_cano
 
 Floats = NDArray[np.float64]
 
-CELL = 2.0  # m; of the grid in which the ground is looked for
-SLOPE = 0.3  # m per m; no street is steeper
-NEIGHBOURHOOD = 0.6  # m; half a window of a wall has to look like a plane in
-THICKNESS = 0.1  # m; standard deviation across such a window
-STEP = 0.5  # m; three of them lead from the last window of a wall to its corner
-THIN = 0.25  # m; points above one another count as one, with their number
-AGREEMENT = np.cos(np.radians(20.0))  # of a point's own plane with the line's
-TRIES = 12  # lines tried for each segment
-MOST = 200  # segments looked for
-HIGHEST = 1e4  # m; nothing that is seen lies higher or lower, what is not finite included
-STRAIGHT = 0.1  # m; corners of a footprint that lie so near the line through their neighbours are none
+CELL = 2.0  # m; of the grid in which the ground is found
+SLOPE = 0.3  # m per m; steepest street
+NEIGHBOURHOOD = 0.6  # m; half the window in which the points of a wall lie on a plane
+THICKNESS = 0.1  # m; largest standard deviation across that plane
+STEP = 0.5  # m; three of them reach from the last such neighbourhood of a wall to its corner
+THIN = 0.25  # m; points above one another within it are merged, with their count
+AGREEMENT = np.cos(np.radians(20.0))  # cosine of the angle between a point's plane and the line
+TRIES = 12  # RANSAC hypotheses per segment
+MOST = 200  # most segments
+HIGHEST = 1e4  # m; points higher or lower, or not finite, are left out
+STRAIGHT = 0.1  # m; corners of a footprint nearer to the line through their neighbours are removed
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ def find_walls(points: NDArray[Any], config: OsmConfig | None = None, views: NDA
     """Walls in the points (N, 3), m, of a scan or of a submap, in a frame whose z points up.
 
     views : (V, 2) or (V, 3) where the sensor was, m, so that walls can be directed; the origin by default
-    The result is the same for the same input, whatever else runs. Without walls it is empty.
+    The same input gives the same result. Without walls it is empty.
     """
     config = config or OsmConfig()
     cloud = np.asarray(points, np.float32).reshape(-1, 3)
@@ -86,7 +86,7 @@ def find_walls(points: NDArray[Any], config: OsmConfig | None = None, views: NDA
 def walls_of(buildings: Iterable[Building]) -> tuple[Floats, NDArray[np.int64]]:
     """Walls (T, 2, 2), m, of the footprints of `buildings`, the outside to the right, and the building (T,) each is of.
 
-    Corners that are none, because an outline was drawn with more nodes than it has, are left out; canopies have no walls.
+    Nodes on straight walls are left out; canopies have no walls.
     """
     rows: list[Floats] = []
     owners: list[int] = []
@@ -112,7 +112,7 @@ def _high(cloud: NDArray[np.float32], height: float) -> NDArray[np.int64]:
 
 
 def _directed(found: Floats, views: Floats) -> Floats:
-    """Turned so that the side that filled more of the `views` lies to the right: height over it, by distance cubed."""
+    """Directed so that the side seen more from the `views` lies to the right: the distance from its line, by range cubed."""
     to_view = views[None] - found.mean(axis=1)[:, None]
     along = (found[:, 1] - found[:, 0])[:, None]
     left = along[..., 0] * to_view[..., 1] - along[..., 1] * to_view[..., 0]
@@ -121,13 +121,13 @@ def _directed(found: Floats, views: Floats) -> Floats:
 
 
 def _simplified(footprint: Footprint) -> Footprint:
-    """Without corners on straight walls; as it is where nothing would be left."""
+    """Without nodes on straight walls; unchanged where no polygon would remain."""
     from shapely import Polygon
 
     polygon = footprint_polygon(footprint)
     rings = []
     for ring in (polygon.exterior, *polygon.interiors):
-        # The first corner stays whatever it is: begin at one that is surely a corner, far out.
+        # Simplification keeps the first node: begin at the farthest one, which is a corner.
         corners = np.asarray(ring.coords, np.float64)[:-1]
         corners = np.roll(corners, -int(np.argmax(np.linalg.norm(corners - corners.mean(0), axis=1))), axis=0)
         rings.append(np.asarray(Polygon(corners).simplify(STRAIGHT).exterior.coords, np.float64)[:-1])
