@@ -77,8 +77,8 @@ def thin(points: PreparedPoints, step: int) -> PreparedPoints:
     return subset(points, slice(None, None, step))
 
 
-def subset(points: PreparedPoints, which: slice | NDArray[np.bool_]) -> PreparedPoints:
-    """Some of the source points, with what goes with each; the map points stay."""
+def subset(points: PreparedPoints, which: slice | NDArray[np.bool_] | NDArray[np.int64]) -> PreparedPoints:
+    """Some of the source points, or all in another order, with what goes with each; the map points stay."""
     times, covariance, gaps = points.source_times, points.covariance, points.gaps
     return replace(
         points,

@@ -59,7 +59,7 @@ class SweepPoints:
 
     def __init__(self, points: PreparedPoints, levels: Sequence[GaussianMap], sigma: float, blob_weight: float) -> None:
         assert points.source_times is not None
-        order = np.argsort(points.source_times, kind="stable")
+        order = np.argsort(points.source_times, kind="stable").astype(np.int64)
         self.times = points.source_times[order]
         self.points = subset(points, order)
         self._moved = np.empty_like(self.points.source)
@@ -125,8 +125,8 @@ def register_elastic(
         converged = scale <= annealing.end and move < STEP_M and turn < STEP_RAD
         scale = max(scale * annealing.decay, annealing.end)
     at_stamp = np.hstack([(1.0 - passed) * np.eye(6), passed * np.eye(6)])
-    covariance = np.linalg.pinv(A, hermitian=True)
-    information = np.linalg.pinv(at_stamp @ covariance[:12, :12] @ at_stamp.T, hermitian=True)
+    covariance = np.asarray(np.linalg.pinv(A, hermitian=True), np.float64)
+    information = np.asarray(np.linalg.pinv(at_stamp @ covariance[:12, :12] @ at_stamp.T, hermitian=True), np.float64)
     pose = sweep.prior.pose
     found = OptimiserResult(pose, information, named(facts), at_stamp @ d.ravel(), iterations, converged, weak)
     return ElasticResult(sweep, skew[0], covariance, found)
@@ -170,4 +170,4 @@ def _step(A: Floats, b: Floats, lever: float, least: float) -> Floats:
     values, vectors = np.linalg.eigh(A * np.outer(scale, scale))
     along = vectors.T @ (scale * b)
     followed = values > max(least, 1e-12 * float(values[-1]))
-    return -scale * (vectors @ np.where(followed, along / np.where(followed, values, 1.0), 0.0))
+    return np.asarray(-scale * (vectors @ np.where(followed, along / np.where(followed, values, 1.0), 0.0)))

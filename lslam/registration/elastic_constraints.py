@@ -92,12 +92,12 @@ class LastSweep(Stateful):
         length = self._ends_ns[1] - self._ends_ns[0]
         location, since = NOTHING, 0.0
         if self._ends is not None and P is not None and abs(begin_ns - self._ends_ns[1]) < length / 2:
-            location, since = np.linalg.inv(MISS**2 * Q + P[6:, 6:]), 1.0
+            location, since = _inverse(MISS**2 * Q + P[6:, 6:]), 1.0
             if not is_felt:
                 twist = se3.log(se3.relative(*self._ends)) / length
                 begin, end = (self._ends[1] @ se3.exp((ns - self._ends_ns[1]) * twist) for ns in (begin_ns, end_ns))
                 expected = ElasticSweep(se3.normalise(begin), se3.normalise(end), prior.times)
-        velocity, skewed = np.linalg.inv(LAG**2 * Q), np.linalg.inv(M + LEAST_SKEW**2 * np.eye(6))
+        velocity, skewed = _inverse(LAG**2 * Q), _inverse(M + LEAST_SKEW**2 * np.eye(6))
         return ElasticConstraints(expected, location, velocity, since, self._skew, skewed)
 
     def follow(
@@ -135,3 +135,7 @@ def off(pose: Floats, expected: Floats) -> Floats:
 
 def _ends_ns(stamp_ns: int, sweep: MotionPrior) -> tuple[int, int]:
     return stamp_ns + round(1e9 * float(sweep.times[0])), stamp_ns + round(1e9 * float(sweep.times[-1]))
+
+
+def _inverse(covariance: Floats) -> Floats:
+    return np.asarray(np.linalg.inv(covariance), np.float64)
