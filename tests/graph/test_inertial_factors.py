@@ -18,7 +18,7 @@ from lslam.types.inertial_state import ImuNoise, InertialChain, InertialLink, In
 
 Floats = NDArray[np.float64]
 
-COUNT, HZ, G = 60, 100, 9.80665
+COUNT, HZ, G = 40, 50, 9.80665
 # A second from keyframe to keyframe; odometry is poor at turns, so that the IMU has something to say.
 SIGMAS = np.array([0.02, 0.02, 0.02, 2e-3, 2e-3, 2e-3])
 FORCE, RATE = 0.05, 2e-4
@@ -81,7 +81,7 @@ def nees(poses: Floats, covariances: Floats, real: Floats) -> float:
 
 def test_the_imu_keeps_what_odometry_loses_and_says_how_well() -> None:
     ratios, consistency = [], []
-    for seed in range(4):
+    for seed in range(3):
         graph, real = graph_and_truth(seed)
         held = optimise(graph, GraphConfig())
         alone = optimise(replace(graph, inertial=None), GraphConfig())
@@ -98,13 +98,15 @@ def test_fixes_and_imu_hold_one_graph(settings: dict[str, object]) -> None:
     free = replace(graph, fixes=fixes_of(real), is_anchored=False)
     held = optimise(free, config)
     assert held.fix_inliers.all()
-    assert ate(held.poses, real) < 0.9 * ate(optimise(replace(free, inertial=None), config).poses, real)
+    alone = optimise(replace(free, inertial=None), config)
+    assert ate(held.poses, real) < ate(alone.poses, real)
+    assert turned(held.poses, real) < 0.8 * turned(alone.poses, real)
 
 
 def test_a_gap_of_the_imu_leaves_odometry_alone_there() -> None:
     graph, real = graph_and_truth(1)
     assert graph.inertial is not None
-    kept = [one for one in graph.inertial.links if not 20 <= one.a < 24]
+    kept = [one for one in graph.inertial.links if not 15 <= one.a < 19]
     held = optimise(replace(graph, inertial=replace(graph.inertial, links=kept)), GraphConfig())
     assert ate(held.poses, real) < ate(optimise(replace(graph, inertial=None), GraphConfig()).poses, real)
     assert len(graph.inertial.until(10).links) == 9
