@@ -7,7 +7,7 @@ from pydantic import Field
 from lslam.config.section import Section
 
 # Methods whose estimate is of points and IMU together.
-TIGHTLY_COUPLED = ("fast-lio2", "lio-sam", "lio-mapping")
+TIGHTLY_COUPLED = ("fast-lio2", "lio-sam", "lio-mapping", "lips")
 
 
 class OdometryConfig(Section):

@@ -14,6 +14,7 @@ from lslam.inertial.fusion import InertialMotion
 from lslam.inertial.gyroscope import BIAS_WALK
 from lslam.inertial.imu_estimate import ACCEL_WALK, FORCE_NOISE, GRAVITY_WALK
 from lslam.inertial.initialise import InertialStart
+from lslam.inertial.smoothed import SmoothedMotion
 from lslam.inertial.smoothing import SmootherMotion
 from lslam.inertial.window_motion import WindowMotion
 from lslam.types.inertial_state import ImuNoise
@@ -38,10 +39,15 @@ def _window(begun: InertialStart, config: Config) -> InertialMotion:
     return WindowMotion(begun.imu, begun.T_lidar_imu, begun.estimate, config.imu, config.lio_mapping.window)
 
 
+def _planes(begun: InertialStart, config: Config) -> InertialMotion:
+    return SmoothedMotion(begun.imu, begun.T_lidar_imu, begun.estimate, config.imu)
+
+
 MOTION_MODELS: dict[str, Callable[[InertialStart, Config], InertialMotion]] = {
     "fast-lio2": _filter,
     "lio-sam": _smoother,
     "lio-mapping": _window,
+    "lips": _planes,
 }
 
 

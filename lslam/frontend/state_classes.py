@@ -9,6 +9,9 @@ from lslam.inertial.navigation_state import NavigationState
 from lslam.inertial.window import Moment, Past, Window
 from lslam.integrity.monitor import Seen
 from lslam.odometry.feature_scan import FeatureScan
+from lslam.odometry.plane_factors import Sightings, WindowPrior
+from lslam.odometry.plane_values import WindowValues
+from lslam.odometry.plane_window import Landmarks, PlaneWindow
 from lslam.preprocessing.features import FeaturePoints, Features
 from lslam.preprocessing.prepare import PreparedPoints
 from lslam.types.constraint import Constraint, LoopCandidate
@@ -16,11 +19,13 @@ from lslam.types.gravity import GravityDirection
 from lslam.types.imu import ImuStream
 from lslam.types.inertial_state import InertialState, InertialStep
 from lslam.types.motion_check import MotionCheck
+from lslam.types.preintegration import MotionState, PreintegratedStep
 from lslam.types.scan_equations import ScanEquations
 from lslam.types.scan_result import ScanResult
 
 STATE_CLASSES = (
     Constraint, FeaturePoints, Features, FeatureScan, GravityDirection, Gyroscope, ImuEstimate, ImuStream, InertialState,
-    InertialStep, LoopCandidate, Moment, MotionCheck, NavigationState, Past, PreparedPoints, ScanEquations, ScanResult, Seen,
-    InertialStart, Window,
+    InertialStep, Landmarks, LoopCandidate, Moment, MotionCheck, MotionState, NavigationState, Past, PlaneWindow,
+    PreintegratedStep, PreparedPoints, ScanEquations, ScanResult, Seen, Sightings, InertialStart, Window, WindowPrior,
+    WindowValues,
 )  # fmt: skip

@@ -37,6 +37,10 @@ METHODS = {
         "lslam.odometry.lio_mapping",
         "tightly coupled with the IMU: a window of scans and IMU states in one estimate (Ye 2019); needs an IMU",
     ),
+    "lips": (
+        "lslam.odometry.lips",
+        "tightly coupled with the IMU: planes as landmarks, smoothed over a window (Geneva 2018); needs an IMU and planes",
+    ),
     "dlo": ("lslam.odometry.dlo", "plane to plane, scan to scan, then to a submap of keyframes (Chen 2022)"),
     "ct-icp": (
         "lslam.odometry.ct_icp",

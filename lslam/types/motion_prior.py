@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.geometry.interpolate import poses_at
+from lslam.types.preintegration import InertialLink
 
 
 @dataclass(frozen=True)
@@ -18,11 +19,13 @@ class MotionPrior:
     K is 1 when only the pose at the stamp is predicted.
     covariance : (6, 6) of the pose at the stamp, t' = t + d[:3], R' = exp(d[3:]) R in world axes, m2 and rad2; None where
         the motion model has none
+    link : what joins the scan to the one before in a smoother; None where the motion model is for none
     """
 
     times: NDArray[np.float64]
     poses: NDArray[np.float64]
     covariance: NDArray[np.float64] | None = None
+    link: InertialLink | None = None
 
     @classmethod
     def at_once(cls, pose: NDArray[np.float64]) -> MotionPrior:

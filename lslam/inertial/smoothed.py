@@ -1,0 +1,130 @@
+"""The motion model of a smoother: it hands over what the IMU felt between two scans, and takes the states that come back."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.config.imu import ImuConfig
+from lslam.geometry import se3
+from lslam.inertial.filter import FilterMotion
+from lslam.inertial.gyroscope import BIAS_WALK, Gyroscope
+from lslam.inertial.imu_estimate import ACCEL_WALK, FORCE_NOISE, ImuEstimate
+from lslam.inertial.integrate import Increments
+from lslam.inertial.navigation_state import GYRO, REST, NavigationState
+from lslam.registration.acceptance import PRIOR_COVARIANCE
+from lslam.registration.constant_velocity import middle_of
+from lslam.types.imu import ImuStream
+from lslam.types.motion_prior import MotionPrior
+from lslam.types.preintegration import InertialLink, MotionState, PreintegratedStep
+from lslam.types.scan import Span
+from lslam.types.scan_result import ScanResult
+
+Floats = NDArray[np.float64]
+
+# m/s2, change of velocity over a gap of the IMU, one sigma: a car brakes.
+BRAKING = 3.0
+
+
+class SmoothedMotion(FilterMotion):
+    """Predicts and deskews as the filter does; the estimate itself is the smoother's, of all states it holds."""
+
+    STATE: ClassVar[tuple[str, ...]] = (*FilterMotion.STATE, "_linked")
+
+    def __init__(self, imu: ImuStream, T_lidar_imu: Floats, estimate: ImuEstimate, config: ImuConfig) -> None:
+        super().__init__(imu, T_lidar_imu, estimate, config)
+        # Instant, ns, and pose of the LiDAR of the newest state in the smoother: a scan that nobody could read has none.
+        self._linked: tuple[int, Floats] | None = None
+
+    def sweep(self, stamp_ns: int, span: Span) -> MotionPrior:
+        """The motion, with what joins it to the last scan."""
+        prior = super().sweep(stamp_ns, span)
+        return replace(prior, link=self._link(prior, stamp_ns))
+
+    def refine(self, prior: MotionPrior, stamp_ns: int, pose: Floats) -> MotionPrior:
+        """The prior itself where the IMU predicted it: a sweep is deskewed once."""
+        return prior if self.is_inertial else replace(super().refine(prior, stamp_ns, pose), link=prior.link)
+
+    def is_compared(self, stamp_ns: int, span: Span) -> bool:
+        """Never: without the IMU there is nothing to estimate the states from."""
+        return False
+
+    def weigh(self, result: ScanResult, prior: MotionPrior) -> ScanResult:
+        """The result as it is; the states of the smoother are kept for `correct`."""
+        self._found = None
+        if result.inertial is not None and prior.link is not None:
+            middle, instant_ns = middle_of(prior, result.stamp_ns, result.T_world_lidar)
+            self._found = instant_ns, self._state_of(result.inertial)
+            self._linked = instant_ns, middle
+        return replace(result, inertial=None)
+
+    def rewind(self, stamp_ns: int, pose: Floats, span: Span) -> MotionPrior:
+        """As of any IMU; the smoother begins anew, too."""
+        self._now = self._next = self._found = None
+        prior = super().rewind(stamp_ns, pose, span)
+        assert self._instant_ns is not None
+        self._linked = self._instant_ns, self._pose.copy()
+        state = NavigationState.begin(self._pose @ self.T_lidar_imu, self.estimate)
+        return replace(prior, link=InertialLink(self.T_lidar_imu, se3.relative(pose, self._pose), _plain(state)))
+
+    def _link(self, prior: MotionPrior, stamp_ns: int) -> InertialLink:
+        middle, instant_ns = middle_of(prior, stamp_ns, prior.pose)
+        T_world_imu = middle @ self.T_lidar_imu
+        # Where a smoother begins; no filter had a state there.
+        state = NavigationState.begin(T_world_imu, self.estimate) if self._next is None else self._next[1]
+        link = InertialLink(self.T_lidar_imu, se3.relative(prior.pose, middle), _plain(state))
+        if self._linked is None or self._instant_ns is None or self._linked[0] >= instant_ns:
+            return link
+        before_ns, before = self._linked
+        if not self.refusal and self._covers(before_ns, instant_ns):
+            felt = self.estimate.over(self.imu, np.array([before_ns, instant_ns]))
+            return replace(link, step=_felt(self.estimate, felt))
+        moved = se3.relative(before @ self.T_lidar_imu, T_world_imu)
+        return replace(link, step=_coasted(self.estimate, moved, 1e-9 * (instant_ns - before_ns)))
+
+    def _state_of(self, found: MotionState) -> NavigationState:
+        P, before = found.covariance, self.estimate.gyroscope
+        gyroscope = Gyroscope(found.gyro_bias, found.gyro_axes, P[GYRO, GYRO], before.rate_variance)
+        estimate = ImuEstimate(found.velocity, found.gravity, found.accel_bias, gyroscope, P[REST, REST])
+        return NavigationState(found.T_world_imu, estimate, P)
+
+
+def _plain(state: NavigationState) -> MotionState:
+    e = state.estimate
+    return MotionState(
+        state.T_world_imu, e.velocity, e.gravity, e.accel_bias, e.gyroscope.bias, e.gyroscope.axes, state.covariance
+    )
+
+
+def _felt(e: ImuEstimate, step: Increments) -> PreintegratedStep:
+    """What the IMU felt, as the estimate integrated it."""
+    t = step.duration
+    force = FORCE_NOISE**2 * np.array([[t**3 / 3, t**2 / 2], [t**2 / 2, t]])
+    C = np.zeros((15, 15))
+    for i, a in enumerate((0, 6)):
+        for j, b in enumerate((0, 6)):
+            C[a : a + 3, b : b + 3] = force[i, j] * np.eye(3)
+    for k, variance in zip((3, 9, 12), (e.gyroscope.rate_variance, ACCEL_WALK**2, BIAS_WALK**2), strict=True):
+        C[k : k + 3, k : k + 3] = variance * t * np.eye(3)
+    return PreintegratedStep(
+        t, step.rotations[-1], step.velocities[-1], step.positions[-1], step.velocity_arms[-1], step.position_arms[-1],
+        e.gyroscope.columns(step), e.accel_bias, e.gyroscope.bias, e.gyroscope.axes, C,
+    )  # fmt: skip
+
+
+def _coasted(e: ImuEstimate, moved: Floats, seconds: float) -> PreintegratedStep:
+    """The motion (4, 4) of the IMU that constant velocity expects, over a gap or after the IMU was refused."""
+    C = np.zeros((15, 15))
+    C[:6, :6] = PRIOR_COVARIANCE
+    for k, sigma in zip(
+        (6, 9, 12), (BRAKING * seconds, ACCEL_WALK * seconds**0.5, BIAS_WALK * seconds**0.5), strict=True
+    ):
+        C[k : k + 3, k : k + 3] = sigma**2 * np.eye(3)
+    none = np.zeros((3, 3))
+    return PreintegratedStep(
+        0.0, moved[:3, :3], np.zeros(3), moved[:3, 3], none, none, np.zeros((3, 12)), e.accel_bias, e.gyroscope.bias,
+        e.gyroscope.axes, C,
+    )  # fmt: skip

@@ -1,0 +1,171 @@
+"""Method `lips`: planes as landmarks and a preintegrated IMU in one smoother (Geneva et al. 2018)."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.config.config import Config
+from lslam.errors import UsageError
+from lslam.geometry import noise, se3, so3
+from lslam.kernels.transform import transform
+from lslam.odometry.base import Registered
+from lslam.odometry.plane_association import associate
+from lslam.odometry.plane_factors import sighting_residuals
+from lslam.odometry.plane_values import SHARED
+from lslam.odometry.plane_window import PlaneWindow
+from lslam.preprocessing.deskew import deskew_points
+from lslam.preprocessing.prepare import PreparedPoints, prepare_points
+from lslam.registration.planes import PlaneExtractor, Planes, turned
+from lslam.types.motion_prior import MotionPrior
+from lslam.types.preintegration import InertialLink
+from lslam.types.scan import Scan
+from lslam.types.scan_result import ScanResult
+from lslam.types.stage_clock import StageClock
+from lslam.types.state import Stateful
+
+Floats = NDArray[np.float64]
+Longs = NDArray[np.int64]
+
+# Share of the points on planes that known planes must take; where it is less, the scan is elsewhere.
+LEAST_SHARE = 0.1
+# m, lever arm that makes rotations comparable.
+LEVER_M = 10.0
+
+
+def create(config: Config) -> Lips:
+    """The method as the configuration wants it."""
+    return Lips(config)
+
+
+class Lips(Stateful):
+    """Planes of each scan are associated with landmarks, and the window of states and planes is optimised."""
+
+    deskew = "by the motion that the smoother and the IMU predict"
+    STATE: ClassVar[tuple[str, ...]] = ("window",)
+
+    def __init__(self, config: Config) -> None:
+        self.config = config
+        self.window: PlaneWindow | None = None
+        self._extractor = PlaneExtractor()
+
+    def prepare(self, scan: Scan) -> PreparedPoints:
+        """Range gate and down-sampling."""
+        config = self.config.preprocess
+        return prepare_points(scan.points, config, scan.index, scan.times if config.deskew else None)
+
+    def register(self, scan: Scan, prepared: PreparedPoints, prior: MotionPrior) -> Registered:
+        """Optimise the window with the planes of the scan; raises UsageError without the IMU."""
+        link = prior.link
+        if link is None:
+            raise UsageError("lips is a smoother of planes and IMU: run it on a sequence that has one")
+        clock = StageClock()
+        with clock.stage("deskew"):
+            points = deskew_points(prepared.map_points, prepared.map_times, prior)
+            centred = np.empty_like(points)
+            transform(points, se3.inverse(link.within), centred)
+        with clock.stage("planes"):
+            planes = self._extractor.extract(centred)
+        with clock.stage("register"):
+            predicted = self._predicted(link)
+            found = associate(predicted, planes, predicted.joint_covariance())
+            reason = _refusal(predicted, planes, found)
+            window, steps = predicted, 0
+            if not reason:
+                window, steps = _with(predicted, planes, found).solved()
+        with clock.stage("covariance"):
+            result = self._result(scan, link, window, planes, found)
+        off = _correction(prior.pose, result.T_world_lidar)
+        return Registered(
+            replace(
+                result, status="bridged" if reason else "ok", reason=reason, converged=not reason, iterations=steps,
+                source_points=len(points), prior_error=off, stages=clock.seconds,
+            ),
+            (window, predicted),
+        )  # fmt: skip
+
+    def update(self, prior: MotionPrior, found: Registered) -> ScanResult:
+        """The window goes on with the scan's planes, or without them where its result is not believed."""
+        began = time.perf_counter()
+        window, predicted = found.detail
+        if found.result.status != "ok":
+            none = np.zeros((0, 3))
+            window = replace(predicted, landmarks=predicted.landmarks.seen(np.zeros(0, np.int64), none, none))
+        self.window = window.marginalised()
+        result = found.result
+        return replace(result, stages={**result.stages, "update": time.perf_counter() - began})
+
+    def restart(self) -> None:
+        """An empty window."""
+        self.window = None
+
+    def warm_up(self) -> None:
+        """Extract the planes of a small room."""
+        rng = np.random.default_rng(0)
+        room = rng.uniform(-8, 8, (3000, 3)).astype(np.float32)
+        room[np.arange(3000), rng.integers(0, 3, 3000)] = 8.0
+        self._extractor.extract(room)
+
+    def _predicted(self, link: InertialLink) -> PlaneWindow:
+        """The window with one more state where the IMU leads, or its first."""
+        if self.window is None or link.step is None:
+            return PlaneWindow.begin(link.state, se3.inverse(link.T_lidar_imu))
+        return self.window.extended(link.step)
+
+    def _result(self, scan: Scan, link: InertialLink, window: PlaneWindow, planes: Planes, found: Longs) -> ScanResult:
+        pose = se3.normalise(window.T_world_lidar @ se3.inverse(link.within))
+        P = window.joint_covariance()
+        known = np.flatnonzero(found >= 0)
+        state = slice(SHARED, SHARED + 6)
+        on_planes = window.covariance_on_planes()
+        step = pose[:3, 3] - window.values.poses[-1, :3, 3]
+        total = float(planes.counts.sum())
+        share = float(planes.counts[known].sum()) / total if total else 0.0
+        n = planes.counts[known]
+        return ScanResult(
+            index=scan.index, stamp_ns=scan.stamp_ns, T_world_lidar=pose,
+            covariance=noise.transported(P[state, state], step), registration_covariance=noise.transported(on_planes, step),
+            inliers=round(float(n.sum())), overlap=share, rmse=float(np.sqrt(n @ planes.rms[known] ** 2 / max(n.sum(), 1.0))),
+            degenerate=self._degenerate(window, found), inertial=window.values.newest(P[:27, :27]),
+        )  # fmt: skip
+
+    def _degenerate(self, window: PlaneWindow, found: Longs) -> Floats:
+        """(D, 6) twists of the LiDAR along which the known planes of the scan say next to nothing."""
+        if window.values.states == 1:
+            return np.zeros((0, 6))  # the first scan begins the world
+        is_known = (window.seen.states == window.values.states - 1) & np.isin(window.seen.planes, found[found >= 0])
+        seen = window.seen.only(is_known)
+        _, J, _ = sighting_residuals(window.values, seen, window.landmarks.anchors, window.T_imu_lidar)
+        J[:, :, 3:] /= LEVER_M
+        values, vectors = np.linalg.eigh(np.einsum("kia,kij,kjb->ab", J, seen.information, J))
+        return np.ascontiguousarray(vectors[:, values <= self.config.registration.weak_share * values.sum()].T)
+
+
+def _refusal(window: PlaneWindow, planes: Planes, found: Longs) -> str:
+    """Why a scan's planes are not believed; empty where they are."""
+    if len(planes) == 0:
+        return "no plane is seen: the IMU carries the scan"
+    if len(window.landmarks) == 0:
+        return ""
+    share = float(planes.counts[found >= 0].sum() / planes.counts.sum())
+    if share < LEAST_SHARE:
+        return f"only {share:.0%} of the points on planes lie on known ones: the IMU carries the scan"
+    return ""
+
+
+def _with(window: PlaneWindow, planes: Planes, found: Longs) -> PlaneWindow:
+    """The window whose newest state saw the planes, known ones and new ones."""
+    information, (lows, highs) = np.linalg.inv(planes.covariance), turned(planes, window.T_world_lidar)
+    old, new = found >= 0, found < 0
+    window = window.with_sightings(found[old], planes.cp[old], information[old], lows[old], highs[old])
+    return window.with_planes(planes.cp[new], information[new], lows[new], highs[new])
+
+
+def _correction(prior: Floats, pose: Floats) -> tuple[float, float]:
+    """How far (m, rad) the pose is from what was expected."""
+    step = se3.relative(prior, pose)
+    return float(np.linalg.norm(step[:3, 3])), float(so3.angle(step[:3, :3]))

@@ -1,0 +1,193 @@
+"""A fixed-lag smoother over the states of the newest scans and the planes that they saw (after Geneva et al. 2018)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.geometry import se3
+from lslam.kernels import positive
+from lslam.odometry.plane_factors import Normal, Sightings, WindowPrior, normal_equations, step_residual
+from lslam.odometry.plane_values import ORDER, PLANE_SIZE, SHARED, STATE_SIZE, WindowValues
+from lslam.types.preintegration import MotionState, PreintegratedStep
+
+Floats = NDArray[np.float64]
+Longs = NDArray[np.int64]
+
+# States in the window: a second of most sensors.
+LAG = 10
+# Scans after which a plane that none of them saw is marginalised too.
+FORGET = 10
+# Gauss-Newton steps, and the step, in sigmas of the newest pose, below which they end.
+MOST_STEPS, SMALL = 5, 0.02
+
+
+@dataclass(frozen=True)
+class Landmarks:
+    """What is known of the planes beside their closest points.
+
+    anchors : (M, 4, 4) T_world_anchor, fixed frames of LiDARs that saw the planes first
+    lows, highs : (M, 3) corners of the boxes round what was seen of them, world, m; unseen : (M,) scans since
+    """
+
+    anchors: Floats = field(default_factory=lambda: np.zeros((0, 4, 4)))
+    lows: Floats = field(default_factory=lambda: np.zeros((0, 3)))
+    highs: Floats = field(default_factory=lambda: np.zeros((0, 3)))
+    unseen: Longs = field(default_factory=lambda: np.zeros(0, np.int64))
+
+    def __len__(self) -> int:
+        return len(self.unseen)
+
+    def only(self, which: NDArray[np.bool_]) -> Landmarks:
+        """Some of them."""
+        return Landmarks(self.anchors[which], self.lows[which], self.highs[which], self.unseen[which])
+
+    def seen(self, which: Longs, lows: Floats, highs: Floats) -> Landmarks:
+        """After planes `which` (K,) were seen within boxes (K, 3) and all others were not."""
+        low, high, unseen = self.lows.copy(), self.highs.copy(), self.unseen + 1
+        np.minimum.at(low, which, lows)
+        np.maximum.at(high, which, highs)
+        unseen[which] = 0
+        return replace(self, lows=low, highs=high, unseen=unseen)
+
+    def joined(self, anchor: Floats, lows: Floats, highs: Floats) -> Landmarks:
+        """These and K new ones, with their boxes (K, 3) and a common anchor (4, 4)."""
+        return Landmarks(
+            np.concatenate([self.anchors, np.broadcast_to(anchor, (len(lows), 4, 4))]),
+            np.concatenate([self.lows, lows]), np.concatenate([self.highs, highs]),
+            np.concatenate([self.unseen, np.zeros(len(lows), np.int64)]),
+        )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class PlaneWindow:
+    """States, planes and the factors among them; every method returns a new window.
+
+    values : of `LAG` states at most; steps : between them; seen : planes in them; T_imu_lidar : (4, 4)
+    """
+
+    T_imu_lidar: Floats
+    values: WindowValues
+    prior: WindowPrior
+    landmarks: Landmarks = field(default_factory=Landmarks)
+    steps: tuple[PreintegratedStep, ...] = ()
+    seen: Sightings = field(default_factory=Sightings.none)
+
+    @classmethod
+    def begin(cls, state: MotionState, T_imu_lidar: Floats) -> PlaneWindow:
+        """One state that is known as the motion model says, and no planes."""
+        values = WindowValues.begin(state)
+        C = state.covariance[np.ix_(ORDER, ORDER)]
+        information = positive.inverse(C)
+        return cls(T_imu_lidar, values, WindowPrior(information, np.zeros(len(C)), values))
+
+    @property
+    def T_world_lidar(self) -> Floats:
+        """(4, 4) of the newest state."""
+        return np.asarray(se3.normalise(self.values.poses[-1] @ self.T_imu_lidar))
+
+    def extended(self, step: PreintegratedStep) -> PlaneWindow:
+        """With one more state, where `step` leads from the newest one."""
+        v = self.values
+        doubled = replace(
+            v, poses=np.concatenate([v.poses, v.poses[-1:]]), velocities=np.concatenate([v.velocities, v.velocities[-1:]]),
+            accel_biases=np.concatenate([v.accel_biases, v.accel_biases[-1:]]),
+            gyro_biases=np.concatenate([v.gyro_biases, v.gyro_biases[-1:]]),
+        )  # fmt: skip
+        r, _ = step_residual(doubled, v.states - 1, step)
+        update = np.zeros(doubled.size)
+        update[doubled.first_plane - STATE_SIZE : doubled.first_plane] = -r
+        return replace(self, values=doubled.moved(update), steps=(*self.steps, step))
+
+    def normal(self) -> Normal:
+        """The normal equations of all factors."""
+        return normal_equations(
+            self.values, self.prior, self.steps, self.seen, self.landmarks.anchors, self.T_imu_lidar
+        )
+
+    def with_sightings(
+        self, planes: Longs, cp: Floats, information: Floats, lows: Floats, highs: Floats
+    ) -> PlaneWindow:
+        """The newest state saw known `planes` (K,): closest points (K, 3), their information (K, 3, 3) and boxes (K, 3)."""
+        more = Sightings(np.full(len(planes), self.values.states - 1), planes, cp, information)
+        return replace(self, seen=self.seen.joined(more), landmarks=self.landmarks.seen(planes, lows, highs))
+
+    def with_planes(self, cp: Floats, information: Floats, lows: Floats, highs: Floats) -> PlaneWindow:
+        """The newest state saw new planes (K): its LiDAR is their anchor."""
+        count, old = len(cp), len(self.landmarks)
+        pad = np.zeros((len(self.prior.gradient) + PLANE_SIZE * count,) * 2)
+        n = len(self.prior.gradient)
+        pad[:n, :n] = self.prior.information
+        at = replace(self.prior.at, planes=np.concatenate([self.prior.at.planes, cp]))
+        prior = WindowPrior(pad, np.concatenate([self.prior.gradient, np.zeros(PLANE_SIZE * count)]), at)
+        values = replace(self.values, planes=np.concatenate([self.values.planes, cp]))
+        more = Sightings(np.full(count, values.states - 1), old + np.arange(count), cp, information)
+        landmarks = self.landmarks.joined(self.T_world_lidar, lows, highs)
+        return replace(self, values=values, prior=prior, seen=self.seen.joined(more), landmarks=landmarks)
+
+    def solved(self) -> tuple[PlaneWindow, int]:
+        """At the minimum of all factors, and after how many Gauss-Newton steps."""
+        window, count = self, 0
+        pose = np.arange(6) + self.values.first_plane - STATE_SIZE
+        while count < MOST_STEPS:
+            count += 1
+            normal = window.normal()
+            update = normal.step()
+            window = replace(window, values=window.values.moved(update))
+            far = update[pose]
+            if float(far @ normal.H[np.ix_(pose, pose)] @ far) < SMALL**2:
+                break
+        return window, count
+
+    def joint_covariance(self) -> Floats:
+        """(27 + 3 M) square: the shared part, the newest state and the planes."""
+        return positive.inverse(self.normal().without(self._older).H)
+
+    def covariance_on_planes(self) -> Floats:
+        """(6, 6) of the newest pose, were the planes known exactly."""
+        first = self.values.first_plane
+        left = Normal(self.normal().H[:first, :first], np.zeros(first)).without(self._older[:first])
+        return positive.inverse(left.H)[SHARED : SHARED + 6, SHARED : SHARED + 6]
+
+    @property
+    def _older(self) -> NDArray[np.bool_]:
+        """(N,) the states but the newest."""
+        out = np.zeros(self.values.size, bool)
+        out[SHARED : self.values.first_plane - STATE_SIZE] = True
+        return out
+
+    def marginalised(self) -> PlaneWindow:
+        """Without the oldest state where there are more than `LAG`, and without planes that were not seen for long."""
+        window = self
+        while window.values.states > LAG:
+            window = window._without_oldest()
+        return window._without_planes(window.landmarks.unseen >= FORGET)
+
+    def _without_oldest(self) -> PlaneWindow:
+        v, of_first = self.values, self.seen.states == 0
+        few = replace(self, values=v.cut(slice(2)), steps=self.steps[:1], seen=self.seen.only(of_first))
+        out = np.zeros(few.values.size, bool)
+        out[SHARED : SHARED + STATE_SIZE] = True
+        left = few.normal().without(out)
+        rest = self.seen.only(~of_first)
+        values = v.cut(slice(1, None))
+        return replace(
+            self, values=values, prior=WindowPrior(left.H, left.g, values.cut(slice(1))), steps=self.steps[1:],
+            seen=replace(rest, states=rest.states - 1),
+        )  # fmt: skip
+
+    def _without_planes(self, gone: NDArray[np.bool_]) -> PlaneWindow:
+        gone = gone & ~np.isin(np.arange(len(gone)), self.seen.planes)
+        if not gone.any():
+            return self
+        out = np.concatenate([np.zeros(SHARED + STATE_SIZE, bool), np.repeat(gone, PLANE_SIZE)])
+        # At the present planes, not where they were: the prior moves with its gradient.
+        at = self.prior.at
+        left = Normal(self.prior.information, self.prior.gradient).without(out)
+        number = np.cumsum(~gone) - 1
+        return replace(
+            self, values=self.values.cut(slice(None), ~gone), prior=WindowPrior(left.H, left.g, at.cut(slice(None), ~gone)),
+            landmarks=self.landmarks.only(~gone), seen=replace(self.seen, planes=number[self.seen.planes]),
+        )  # fmt: skip

@@ -1,0 +1,258 @@
+"""Planes of one scan: regions grown over Gaussian voxels, as closest points with covariances."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from lslam.kernels import gaussians
+from lslam.kernels.voxel import MASK, OFFSET
+from lslam.registration import closest_point
+from lslam.registration.gaussian_map import GaussianMap
+from lslam.registration.local_map import BREADTH
+
+Floats = NDArray[np.float64]
+Longs = NDArray[np.int64]
+
+# m, edge of the voxels: at 15 m two rings of a 16-beam sensor fall into one.
+VOXEL = 1.0
+# Points of a voxel that is asked at all, and of one that a plane may begin in.
+FEWEST, LEAST_SEED = 3, 8
+# m, rms distance of a voxel's points from the plane that takes it: three sigma of ranging and calibration.
+NEAR = 0.09
+# Times the usual mean square of a plane's voxels: beyond, a voxel holds points of another surface too.
+MIXED = 4.0
+# Cosine of 20 deg between the plane's normal and a planar voxel's.
+ALIKE = 0.94
+# m, between means of voxels that touch: beyond the next but one there is a gap.
+TOUCHING = 2.2
+# m, so far round the seed the plane is fitted, step after step; nothing farther is of it, since ground and long walls bend.
+GROWTH = (2.0, 4.0, 8.0, 16.0, 30.0)
+# Voxels and points of a plane; m, least standard deviation of its points across its length: a strip has no normal.
+LEAST_VOXELS, LEAST_POINTS, BREADTH_M = 5, 40, 0.3
+# m, least distance of the sensor from a plane: the closest point of a nearer one has no direction.
+LEAST_DISTANCE = 0.3
+# m, least noise of the points, each the mean of what one sensor measures in a cell.
+SIGMA = 0.01
+# m and rad, one sigma, of what all points of a plane are off by together: ranging has a bias, deskewing leaves some motion, and
+# another part of a wall, seen from elsewhere, leans a little.
+COMMON_M, COMMON_RAD = 0.005, np.deg2rad(0.03)
+# Voxels so many times larger begin planes where small ones hold one ring each, on the ground round the sensor.
+WIDER = 3
+# Planes of a scan, and seeds that are tried for them.
+MOST_PLANES, MOST_SEEDS = 60, 150
+
+
+@dataclass(frozen=True)
+class Planes:
+    """Planes seen by one scan, LiDAR frame.
+
+    cp : (K, 3) closest points, m; covariance : (K, 3, 3) m2; counts : (K,) points of each
+    means (K, 3), scatters (K, 3, 3) : first moment and covariance of the points, m and m2; rms : (K,) off the plane, m
+    lows, highs : (K, 3) corners of the boxes round the means of its voxels, m
+    """
+
+    cp: Floats
+    covariance: Floats
+    counts: Floats
+    means: Floats
+    scatters: Floats
+    rms: Floats
+    lows: Floats
+    highs: Floats
+
+    def __len__(self) -> int:
+        return len(self.cp)
+
+
+class PlaneExtractor:
+    """Extracts planes, scan after scan, in voxels of which only the room is kept.
+
+    sigma : m, noise of a point; no plane is taken for better
+    common_m, common_rad : by which all points of a plane are off together
+    """
+
+    def __init__(self, sigma: float = SIGMA, common_m: float = COMMON_M, common_rad: float = COMMON_RAD) -> None:
+        self.sigma, self.common_m, self.common_rad = sigma, common_m, common_rad
+        self._voxels = GaussianMap(
+            VOXEL,
+            min_points=LEAST_SEED,
+            planarity=0.3,
+            count_cap=np.inf,
+            reach=np.inf,
+            capacity=1 << 13,
+            breadth=BREADTH,
+        )
+
+    def extract(self, points: NDArray[np.float32]) -> Planes:
+        """Planes of points (N, 3), m, LiDAR frame, without motion in them; the surest seeds come first."""
+        voxels = self._voxels
+        voxels.clear()
+        voxels.insert(points, np.eye(4))
+        used = int(voxels.pool[gaussians.USED])
+        order = np.argsort(voxels.keys[:used], kind="stable")
+        cells = _Cells.of(voxels, order[voxels.moments[order, 0] >= FEWEST])
+        wide = voxels.coarsen(WIDER)
+        few = np.argsort(wide.keys[: len(wide)], kind="stable")
+        found = self._regions(
+            cells, [_Seeds.of(cells, voxels.planes[order]), _Seeds.of(cells, wide.planes[few], WIDER)]
+        )
+        if not found:
+            none = np.zeros((0, 3))
+            return Planes(none, np.zeros((0, 3, 3)), np.zeros(0), none, np.zeros((0, 3, 3)), np.zeros(0), none, none)
+        return Planes(*(np.stack(column) for column in zip(*found, strict=True)))
+
+    def _regions(self, cells: _Cells, sizes: list[_Seeds]) -> list[tuple[Floats, ...]]:
+        free, found = np.ones(len(cells.means), bool), list[tuple[Floats, ...]]()
+        tried = 0
+        for seeds in sizes:
+            fresh = free.copy()
+            for cell, mean, normal in zip(seeds.cells, seeds.means, seeds.normals, strict=True):
+                if not fresh[cell] or len(found) == MOST_PLANES or tried == MOST_SEEDS:
+                    continue
+                tried += 1
+                region = cells.grown(int(cell), mean, normal, seeds.radii, free)
+                fresh[cell] = False
+                fresh[region] = False
+                plane = self._plane(cells, region)
+                if plane is not None:
+                    free[region] = False
+                    found.append(plane)
+        return found
+
+    def _plane(self, cells: _Cells, region: Longs) -> tuple[Floats, ...] | None:
+        """The plane of a region of voxels in the order of `Planes`, None where it is too small."""
+        if len(region) < LEAST_VOXELS or cells.counts[region].sum() < LEAST_POINTS:
+            return None
+        n, d, fit = _fitted(cells.counts[region], cells.means[region], cells.scatters[region])
+        if fit.values[1] < BREADTH_M**2 or abs(d) < LEAST_DISTANCE:
+            return None
+        cp, variance = n * d, max(float(fit.values[0]), self.sigma**2)
+        C = closest_point.covariance(cp, fit.count, fit.mean, fit.scatter, variance) + self._common(cp)
+        rms = np.sqrt(max(float(fit.values[0]), 0.0))
+        means = cells.means[region]
+        return (
+            cp,
+            C,
+            np.asarray(fit.count),
+            fit.mean,
+            fit.scatter,
+            np.asarray(rms),
+            means.min(axis=0),
+            means.max(axis=0),
+        )
+
+    def _common(self, cp: Floats) -> Floats:
+        """(3, 3) m2 of what all points of a plane are off by together."""
+        n, d = closest_point.split(cp)
+        along = np.outer(n, n)
+        return np.asarray(self.common_m**2 * along + (self.common_rad * float(d)) ** 2 * (np.eye(3) - along))
+
+
+@dataclass(frozen=True)
+class _Spread:
+    count: float
+    mean: Floats
+    scatter: Floats
+    values: Floats
+
+
+def _fitted(counts: Floats, means: Floats, scatters: Floats) -> tuple[Floats, float, _Spread]:
+    """Normal (3,), distance and moments of the points of voxels, from the moments of each."""
+    count = float(counts.sum())
+    mean = np.einsum("v,vi->i", counts, means) / count
+    off = means - mean
+    scatter = np.einsum("v,vij->ij", counts, scatters + off[:, :, None] * off[:, None, :]) / count
+    values, vectors = np.linalg.eigh(scatter)
+    n = vectors[:, 0]
+    return n, float(n @ mean), _Spread(count, mean, scatter, values)
+
+
+@dataclass(frozen=True)
+class _Cells:
+    """Voxels of a scan: counts (V,), means (V, 3), scatters (V, 3, 3), normals (V, 3) and tilts (V,), positive on
+    planes; a tree of the means, and which of them touch.
+    """
+
+    counts: Floats
+    means: Floats
+    scatters: Floats
+    normals: Floats
+    tilts: Floats
+    tree: cKDTree
+    touching: csr_matrix
+
+    @classmethod
+    def of(cls, voxels: GaussianMap, slots: Longs) -> _Cells:
+        s = voxels.moments[slots]
+        key, count = voxels.keys[slots], s[:, 0]
+        cell = np.stack([key >> 42, (key >> 21) & MASK, key & MASK], axis=1) - OFFSET
+        mean = s[:, 1:4] / count[:, None]
+        second = s[:, [4, 5, 6, 5, 7, 8, 6, 8, 9]].reshape(-1, 3, 3) / count[:, None, None]
+        scatter = second - mean[:, :, None] * mean[:, None, :]
+        mean += (cell + 0.5) * voxels.size
+        tree = cKDTree(mean)
+        pairs = tree.query_pairs(TOUCHING, output_type="ndarray")
+        touching = csr_matrix((np.ones(len(pairs), np.int8), pairs.T), (len(mean), len(mean)))
+        return cls(count, mean, scatter, voxels.planes[slots, 3:6], voxels.planes[slots, 7], tree, touching)
+
+    def grown(self, seed: int, mean: Floats, n: Floats, radii: tuple[float, ...], free: NDArray[np.bool_]) -> Longs:
+        """The voxels, sorted, of the plane through `mean` (3,) with normal n (3,) that touch the cell `seed`; of the `free`."""
+        d, alone = float(n @ mean), np.array([seed])
+        region = alone
+        for radius in radii:
+            around = np.array(self.tree.query_ball_point(mean, radius, return_sorted=True), np.int64)
+            around = around[free[around]]
+            region = around[self._on(around, n, d)]
+            if len(region) < 3:
+                return alone
+            n, d, _ = _fitted(self.counts[region], self.means[region], self.scatters[region])
+        thick = self._off(region, n, d)
+        region = region[thick <= MIXED * np.median(thick)]
+        at = np.flatnonzero(region == seed)
+        if len(at) == 0 or len(region) < LEAST_VOXELS:
+            return alone
+        _, label = connected_components(self.touching[region][:, region], directed=False)
+        return np.asarray(region[label == label[at[0]]])
+
+    def _on(self, some: Longs, n: Floats, d: float) -> NDArray[np.bool_]:
+        """Which of some voxels have their points on the plane n . x = d, and do not face elsewhere."""
+        is_alike = (self.tilts[some] <= 0) | (np.abs(np.einsum("vi,i->v", self.normals[some], n)) > ALIKE)
+        return np.asarray((self._off(some, n, d) < NEAR**2) & is_alike)
+
+    def _off(self, some: Longs, n: Floats, d: float) -> Floats:
+        """Mean squares, m2, of the distances of some voxels' points from the plane n . x = d."""
+        off = np.einsum("vi,i->v", self.means[some], n) - d
+        return np.asarray(np.einsum("vij,ij->v", self.scatters[some], np.outer(n, n)) + off**2)
+
+
+@dataclass(frozen=True)
+class _Seeds:
+    """Where planes may begin: the cell (S,) there, a point and a normal (S, 3) of each; the radii in which they grow."""
+
+    cells: Longs
+    means: Floats
+    normals: Floats
+    radii: tuple[float, ...]
+
+    @classmethod
+    def of(cls, cells: _Cells, planes: Floats, size: int = 1) -> _Seeds:
+        """Those of voxels `planes` (V, 8) that are planes, the surest first; `size` : of a voxel, in cells."""
+        planes = planes[planes[:, 7] > 0]
+        planes = planes[np.argsort(planes[:, 7], kind="stable")]
+        nearest = cells.tree.query(planes[:, :3])[1] if len(planes) and len(cells.means) else np.zeros(0, np.int64)
+        return cls(
+            nearest, planes[: len(nearest), :3], planes[: len(nearest), 3:6], tuple(r for r in GROWTH if r > size)
+        )
+
+
+def turned(planes: Planes, T: Floats) -> tuple[Floats, Floats]:
+    """Corners (K, 3) of the boxes round the planes in the frame that T (4, 4) takes them to."""
+    centre, half = 0.5 * (planes.lows + planes.highs), 0.5 * (planes.highs - planes.lows)
+    moved, grown = centre @ T[:3, :3].T + T[:3, 3], half @ np.abs(T[:3, :3]).T
+    return moved - grown, moved + grown

@@ -1,0 +1,152 @@
+"""LIPS: a walk between houses is followed, an open plane is said to hold little, and nothing works without an IMU."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from analytic_scenes import floor_only, seen_from
+from stub_sequences import Stub, sample
+
+import lslam
+from lslam.config import Config, load_config
+from lslam.errors import InputError, UsageError
+from lslam.formats.state_files import read_state, write_state
+from lslam.frontend.inertial_start import Inertial, begin_inertial
+from lslam.frontend.register_scans import read_ahead
+from lslam.frontend.state_classes import STATE_CLASSES
+from lslam.frontend.tracker import Tracker
+from lslam.geometry import se3
+from lslam.odometry import create_odometry
+from lslam.simulation.scenarios import simulate
+from lslam.types.imu import ImuStream
+from lslam.types.motion_prior import MotionPrior
+from lslam.types.scan import Scan
+from lslam.types.scan_result import ScanResult
+
+COUNT = 24
+
+
+def config_of() -> Config:
+    return load_config(None, ["odometry.method=lips", "imu.start_s=1", "loops.use=false"], {})
+
+
+@cache
+def walk() -> Stub:
+    drive = simulate("walk", lidar="vlp16", seed=100, count=COUNT, imu="icm20948", motion_compensated=False)
+    return Stub(
+        [drive.scan(i) for i in range(COUNT)], drive.ground_truth, drive.calibration, motion_compensated=False,
+        imu=drive.imu,
+    )  # fmt: skip
+
+
+@cache
+def start() -> Inertial:
+    return begin_inertial(walk(), config_of())
+
+
+def tracker() -> Tracker:
+    return Tracker(create_odometry(config_of()), motion=begin_again().motion)
+
+
+def begin_again() -> Inertial:
+    from lslam.frontend.inertial_start import motion_of
+
+    begun = start().start
+    assert begun is not None
+    return Inertial(motion_of(begun, config_of()), begun)
+
+
+def tracked(sequence: Stub, motion: Inertial) -> list[ScanResult]:
+    one = Tracker(create_odometry(config_of()), motion=motion.motion)
+    return [one.track(loaded) for loaded in read_ahead(sequence, one.odometry.prepare, 1)]
+
+
+def worst(results: list[ScanResult]) -> float:
+    truth = walk().ground_truth
+    assert truth is not None
+    true = se3.relative(truth.poses[0], truth.poses[: len(results)])
+    return float(
+        np.linalg.norm([r.T_world_lidar[:3, 3] - t[:3, 3] for r, t in zip(results, true, strict=True)], axis=1).max()
+    )
+
+
+def test_a_walk_between_houses_is_followed_and_its_states_are_resumed(tmp_path: Path) -> None:
+    whole, results = tracker(), []
+    loaded = list(read_ahead(walk(), whole.odometry.prepare, 1))
+    for scan in loaded:
+        results.append(whole.track(scan))
+        if len(results) == 14:
+            write_state(tmp_path / "14.npz", whole.state())
+    assert all(r.status == "ok" for r in results)
+    assert worst(results) < 0.1
+    assert all(r.inertial is None and r.covariance is not None for r in results)
+    sigmas = [float(np.sqrt(np.trace(r.covariance[:3, :3]))) for r in results if r.covariance is not None]
+    assert 0.001 < sigmas[-1] < 0.1
+    again = tracker()
+    again.restore(read_state(tmp_path / "14.npz", STATE_CLASSES))
+    rest = [again.track(scan).T_world_lidar for scan in loaded[14:]]
+    np.testing.assert_array_equal(rest, [r.T_world_lidar for r in results[14:]])
+
+
+def test_over_a_gap_and_a_lost_scan_the_planes_carry_on() -> None:
+    part = begin_again()
+    assert part.motion is not None
+    imu = part.motion.imu
+    kept = (imu.stamps_ns < 1_200_000_000) | (imu.stamps_ns > 1_600_000_000)
+    assert part.start is not None
+    silent = replace(part.start, imu=ImuStream(imu.stamps_ns[kept], imu.accel[kept], imu.gyro[kept]))
+    from lslam.frontend.inertial_start import motion_of
+
+    motion = Inertial(motion_of(silent, config_of()), silent)
+    scans = [*walk().scans[:8], "gone", *walk().scans[9:]]
+    results = tracked(replace(walk(), scans=scans), motion)
+    assert motion.motion is not None
+    assert motion.motion.gap_scans >= 3
+    assert [r.status for r in results].count("ok") >= COUNT - 2
+    assert worst(results) < 0.3
+
+
+def test_where_there_is_only_ground_the_directions_it_leaves_free_are_said() -> None:
+    truth, rng = walk().ground_truth, np.random.default_rng(0)
+    assert truth is not None
+    true = se3.relative(truth.poses[0], truth.poses[:12])
+    scans: list[Scan | str] = [
+        Scan(seen_from(floor_only(rng, 6000, (pose[0, 3], pose[1, 3])), pose), k * 100_000_000, k)
+        for k, pose in enumerate(true)
+    ]
+    low = replace(walk(), scans=scans)
+    results = tracked(low, begin_again())
+    seen = [r for r in results[1:] if r.status == "ok"]
+    assert len(seen) >= 9
+    assert [len(r.degenerate) for r in seen] == [3] * len(seen)
+    covariance, first = results[-1].covariance, results[2].covariance
+    assert covariance is not None
+    assert first is not None
+    assert np.trace(covariance[:2, :2]) > 4 * np.trace(first[:2, :2])
+
+
+def test_without_planes_the_imu_carries_and_every_scan_says_so() -> None:
+    rng = np.random.default_rng(0)
+
+    def bush(scan: Scan | str) -> Scan | str:
+        assert isinstance(scan, Scan)
+        return replace(scan, points=rng.normal(0, 8, scan.points.shape).astype(np.float32))
+
+    scans = [*walk().scans[:5], *(bush(scan) for scan in walk().scans[5:10])]
+    results = tracked(replace(walk(), scans=scans), begin_again())
+    assert [r.status for r in results[5:]] == ["bridged"] * 5
+    assert all("the IMU carries the scan" in r.reason for r in results[5:])
+    assert worst(results) < 0.3
+
+
+def test_without_an_imu_there_is_no_such_method() -> None:
+    with pytest.raises(InputError, match="has no IMU: run without --imu, by a method that needs none"):
+        lslam.run(sample(3), config_of())
+    method, scan = create_odometry(config_of()), walk().scans[0]
+    assert isinstance(scan, Scan)
+    with pytest.raises(UsageError, match="lips is a smoother of planes and IMU"):
+        method.register(scan, method.prepare(scan), MotionPrior.at_once(np.eye(4)))
