@@ -19,7 +19,7 @@ from lslam.registration.acceptance import PRIOR_COVARIANCE
 from lslam.registration.constant_velocity import middle_of
 from lslam.types.imu import ImuStream
 from lslam.types.motion_prior import MotionPrior
-from lslam.types.preintegration import InertialLink, MotionState, PreintegratedStep
+from lslam.types.preintegration import SweepLink, MotionState, PreintegratedStep
 from lslam.types.scan import Span
 from lslam.types.scan_result import ScanResult
 
@@ -68,14 +68,14 @@ class SmoothedMotion(FilterMotion):
         assert self._instant_ns is not None
         self._linked = self._instant_ns, self._pose.copy()
         state = NavigationState.begin(self._pose @ self.T_lidar_imu, self.estimate)
-        return replace(prior, link=InertialLink(self.T_lidar_imu, se3.relative(pose, self._pose), _plain(state)))
+        return replace(prior, link=SweepLink(self.T_lidar_imu, se3.relative(pose, self._pose), _plain(state)))
 
-    def _link(self, prior: MotionPrior, stamp_ns: int) -> InertialLink:
+    def _link(self, prior: MotionPrior, stamp_ns: int) -> SweepLink:
         middle, instant_ns = middle_of(prior, stamp_ns, prior.pose)
         T_world_imu = middle @ self.T_lidar_imu
         # Where a smoother begins; no filter had a state there.
         state = NavigationState.begin(T_world_imu, self.estimate) if self._next is None else self._next[1]
-        link = InertialLink(self.T_lidar_imu, se3.relative(prior.pose, middle), _plain(state))
+        link = SweepLink(self.T_lidar_imu, se3.relative(prior.pose, middle), _plain(state))
         if self._linked is None or self._instant_ns is None or self._linked[0] >= instant_ns:
             return link
         before_ns, before = self._linked

@@ -22,7 +22,7 @@ from lslam.preprocessing.deskew import deskew_points
 from lslam.preprocessing.prepare import PreparedPoints, prepare_points
 from lslam.registration.planes import PlaneExtractor, Planes, turned
 from lslam.types.motion_prior import MotionPrior
-from lslam.types.preintegration import InertialLink
+from lslam.types.preintegration import SweepLink
 from lslam.types.scan import Scan
 from lslam.types.scan_result import ScanResult
 from lslam.types.stage_clock import StageClock
@@ -110,13 +110,13 @@ class Lips(Stateful):
         room[np.arange(3000), rng.integers(0, 3, 3000)] = 8.0
         self._extractor.extract(room)
 
-    def _predicted(self, link: InertialLink) -> PlaneWindow:
+    def _predicted(self, link: SweepLink) -> PlaneWindow:
         """The window with one more state where the IMU leads, or its first."""
         if self.window is None or link.step is None:
             return PlaneWindow.begin(link.state, se3.inverse(link.T_lidar_imu))
         return self.window.extended(link.step)
 
-    def _result(self, scan: Scan, link: InertialLink, window: PlaneWindow, planes: Planes, found: Longs) -> ScanResult:
+    def _result(self, scan: Scan, link: SweepLink, window: PlaneWindow, planes: Planes, found: Longs) -> ScanResult:
         pose = se3.normalise(window.T_world_lidar @ se3.inverse(link.within))
         P = window.joint_covariance()
         known = np.flatnonzero(found >= 0)
@@ -159,7 +159,8 @@ def _refusal(window: PlaneWindow, planes: Planes, found: Longs) -> str:
 
 def _with(window: PlaneWindow, planes: Planes, found: Longs) -> PlaneWindow:
     """The window whose newest state saw the planes, known ones and new ones."""
-    information, (lows, highs) = np.linalg.inv(planes.covariance), turned(planes, window.T_world_lidar)
+    information: Floats = np.asarray(np.linalg.inv(planes.covariance), np.float64)
+    lows, highs = turned(planes, window.T_world_lidar)
     old, new = found >= 0, found < 0
     window = window.with_sightings(found[old], planes.cp[old], information[old], lows[old], highs[old])
     return window.with_planes(planes.cp[new], information[new], lows[new], highs[new])

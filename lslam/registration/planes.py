@@ -245,7 +245,9 @@ class _Seeds:
         """Those of voxels `planes` (V, 8) that are planes, the surest first; `size` : of a voxel, in cells."""
         planes = planes[planes[:, 7] > 0]
         planes = planes[np.argsort(planes[:, 7], kind="stable")]
-        nearest = cells.tree.query(planes[:, :3])[1] if len(planes) and len(cells.means) else np.zeros(0, np.int64)
+        nearest = np.zeros(0, np.int64)
+        if len(planes) and len(cells.means):
+            nearest = np.asarray(cells.tree.query(planes[:, :3])[1], np.int64)
         return cls(
             nearest, planes[: len(nearest), :3], planes[: len(nearest), 3:6], tuple(r for r in GROWTH if r > size)
         )

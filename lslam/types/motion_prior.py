@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.geometry.interpolate import poses_at
-from lslam.types.preintegration import InertialLink
+from lslam.types.preintegration import SweepLink
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,7 @@ class MotionPrior:
     times: NDArray[np.float64]
     poses: NDArray[np.float64]
     covariance: NDArray[np.float64] | None = None
-    link: InertialLink | None = None
+    link: SweepLink | None = None
 
     @classmethod
     def at_once(cls, pose: NDArray[np.float64]) -> MotionPrior:

@@ -57,7 +57,7 @@ class PreintegratedStep:
 
 
 @dataclass(frozen=True)
-class InertialLink:
+class SweepLink:
     """What joins a scan to the state before it.
 
     T_lidar_imu : (4, 4); within : (4, 4) pose of the LiDAR at the middle of the sweep, where the state is, as seen from that
