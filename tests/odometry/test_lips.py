@@ -27,7 +27,7 @@ from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan import Scan
 from lslam.types.scan_result import ScanResult
 
-COUNT = 24
+COUNT = 20
 
 
 def config_of() -> Config:
@@ -79,24 +79,24 @@ def test_a_walk_between_houses_is_followed_and_its_states_are_resumed(tmp_path: 
     loaded = list(read_ahead(walk(), whole.odometry.prepare, 1))
     for scan in loaded:
         results.append(whole.track(scan))
-        if len(results) == 14:
-            write_state(tmp_path / "14.npz", whole.state())
+        if len(results) == 12:
+            write_state(tmp_path / "12.npz", whole.state())
     assert all(r.status == "ok" for r in results)
     assert worst(results) < 0.1
     assert all(r.inertial is None and r.covariance is not None for r in results)
     sigmas = [float(np.sqrt(np.trace(r.covariance[:3, :3]))) for r in results if r.covariance is not None]
     assert 0.001 < sigmas[-1] < 0.1
     again = tracker()
-    again.restore(read_state(tmp_path / "14.npz", STATE_CLASSES))
-    rest = [again.track(scan).T_world_lidar for scan in loaded[14:]]
-    np.testing.assert_array_equal(rest, [r.T_world_lidar for r in results[14:]])
+    again.restore(read_state(tmp_path / "12.npz", STATE_CLASSES))
+    rest = [again.track(scan).T_world_lidar for scan in loaded[12:]]
+    np.testing.assert_array_equal(rest, [r.T_world_lidar for r in results[12:]])
 
 
 def test_over_a_gap_and_a_lost_scan_the_planes_carry_on() -> None:
     part = begin_again()
     assert part.motion is not None
     imu = part.motion.imu
-    kept = (imu.stamps_ns < 1_200_000_000) | (imu.stamps_ns > 1_600_000_000)
+    kept = (imu.stamps_ns < 1_000_000_000) | (imu.stamps_ns > 1_400_000_000)
     assert part.start is not None
     silent = replace(part.start, imu=ImuStream(imu.stamps_ns[kept], imu.accel[kept], imu.gyro[kept]))
     from lslam.frontend.inertial_start import motion_of
