@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from lslam.config.imu import ImuConfig
 from lslam.geometry import noise
 from lslam.inertial.fusion import InertialMotion
-from lslam.inertial.imu_estimate import ImuEstimate
+from lslam.inertial.imu_estimate import PLACE_SIGMA, TURN_SIGMA, ImuEstimate
 from lslam.inertial.navigation_state import POSE, NavigationState
 from lslam.registration.constant_velocity import middle_of
 from lslam.types.imu import ImuStream
@@ -54,8 +54,24 @@ class FilterMotion(InertialMotion):
         return replace(prior, covariance=noise.transported(self._of_lidar(state), back))
 
     def refine(self, prior: MotionPrior, stamp_ns: int, pose: Floats) -> MotionPrior:
-        """The prior itself: a sweep is deskewed once, by back propagation."""
-        return prior if prior.covariance is not None else super().refine(prior, stamp_ns, pose)
+        """The prior itself: a sweep is deskewed once, by back propagation.
+
+        But where the range of the IMU cut readings, the states that the registered `pose` implies deskew it again: the speed
+        in the middle of the sweep is then off by all that the force lacked since the last one. The prior joins in with the
+        same covariance, which there is far wider than what it is registered with.
+        """
+        if prior.covariance is None or self._next is None:
+            return super().refine(prior, stamp_ns, pose)
+        instant_ns, state = self._next
+        hidden = self._since_last(instant_ns).hidden
+        if hidden is None:
+            return prior
+        middle, _ = middle_of(prior, stamp_ns, pose)
+        T_world_imu = middle @ self.T_lidar_imu
+        noise_found = np.diag(np.repeat([PLACE_SIGMA**2, TURN_SIGMA**2], 3))
+        found = state.moved_to(T_world_imu, noise_found).estimate
+        swept = self._prior(found, instant_ns, middle, stamp_ns, prior.times)
+        return replace(swept, covariance=prior.covariance)
 
     def weigh(self, result: ScanResult, prior: MotionPrior) -> ScanResult:
         """The result as it is: its registration weighed points and prior already. The other states follow its pose."""

@@ -52,7 +52,7 @@ class Gyroscope:
     def turn_covariance(self, step: Increments) -> Floats:
         """(3, 3) rad2 of the turn over `step`, in IMU axes at its end."""
         return kalman.turn_covariance(
-            self.covariance, self.rate_variance, step.rotations[-1], step.velocity_arms[-1], self.axes, step.duration
+            self.covariance, self._variance(step), step.rotations[-1], step.velocity_arms[-1], self.axes, step.duration
         )
 
     def learnt(self, step: Increments, rest: Floats, noise: Floats) -> Gyroscope:
@@ -61,11 +61,17 @@ class Gyroscope:
         `rest` and `noise` are in IMU axes at the end of the step.
         """
         x, P, excess = kalman.turned(
-            np.concatenate([self.bias, self.axes.ravel()]), self.covariance, self.rate_variance, step.rotations[-1],
+            np.concatenate([self.bias, self.axes.ravel()]), self.covariance, self._variance(step), step.rotations[-1],
             step.velocity_arms[-1], step.duration, rest, noise, BIAS_WALK, OUTLIER,
         )  # fmt: skip
         variance = max(self.rate_variance + excess / (3 * step.duration * MEMORY), float(RATE_NOISE**2))
         return Gyroscope(x[:3], x[3:].reshape(3, 3), P, variance)
+
+    def _variance(self, step: Increments) -> float:
+        """(rad/s)^2 per Hz over `step`; a rate hidden over all of it adds as much to the turn as noise of that density."""
+        if step.hidden is None:
+            return self.rate_variance
+        return self.rate_variance + float(step.hidden[3:].max()) ** 2 * step.duration
 
     def columns(self, step: Increments) -> Floats:
         """(3, 12) by which the turn over `step` grows with bias and axes; the rate is taken for constant."""

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.inertial.saturation import with_hidden
 from lslam.kernels.strapdown import overlaps
 from lslam.types.imu import ImuStream
 
@@ -69,7 +70,7 @@ def clean(imu: ImuStream, first_ns: int, last_ns: int) -> Cleaned:
         if not np.ptp(values, axis=0).any():
             raise ImuRefusedError(f"its {what} repeats one reading, {_text(values[0])}, all the time")
     accel = _in_si(imu, notes)
-    cleaned = Cleaned(ImuStream(imu.stamps_ns, accel, imu.gyro), notes)
+    cleaned = Cleaned(with_hidden(replace(imu, accel=accel), notes), notes)
     if cleaned.rate_hz < LEAST_RATE_HZ:
         notes.append(
             f"IMU at {cleaned.rate_hz:.0f} Hz, which degrades what it is good for: it predicts the motion from scan to scan, "
@@ -137,7 +138,8 @@ def _ordered(imu: ImuStream, notes: list[str]) -> ImuStream:
     good = finite & ahead
     if good.sum() < 2:
         raise ImuRefusedError(f"it has {int(good.sum())} usable samples")
-    return ImuStream(imu.stamps_ns[good], imu.accel[good], imu.gyro[good])
+    hidden = None if imu.hidden is None else imu.hidden[good]
+    return ImuStream(imu.stamps_ns[good], imu.accel[good], imu.gyro[good], hidden)
 
 
 def _in_si(imu: ImuStream, notes: list[str]) -> NDArray[np.float64]:

@@ -6,6 +6,7 @@ so the rotations along the way are taken as known when forces are integrated.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -118,5 +119,12 @@ def _propagate(estimate: ImuEstimate, step: Increments, R: Floats) -> tuple[Floa
     x = np.concatenate([estimate.velocity, estimate.gravity, estimate.accel_bias])
     return kalman.propagate(
         x, estimate.covariance, step.duration, step.velocities[-1], step.positions[-1], step.velocity_arms[-1],
-        step.position_arms[-1], R, FORCE_NOISE,
+        step.position_arms[-1], R, _force_noise(step),
     )  # fmt: skip
+
+
+def _force_noise(step: Increments) -> float:
+    """m/s2 per sqrt(Hz); a force hidden over the whole step adds as much to the velocity as noise of that density."""
+    if step.hidden is None:
+        return FORCE_NOISE
+    return math.sqrt(FORCE_NOISE**2 + float(step.hidden[:3].max()) ** 2 * step.duration)

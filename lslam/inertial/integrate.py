@@ -22,6 +22,7 @@ class Increments:
     instants_ns : (K,) increasing; rotations : (K, 3, 3) from the IMU then to the IMU at the first instant
     velocities (K, 3), positions (K, 3) : the specific force integrated once and twice, m/s and m
     velocity_arms, position_arms : (K, 3, 3) likewise of the rotations: what a constant force in IMU axes adds
+    hidden : (6,) one sigma of the mean force and rate, to the last instant, that the range of the IMU cut off; None for none
     """
 
     instants_ns: NDArray[np.int64]
@@ -30,6 +31,7 @@ class Increments:
     positions: Floats
     velocity_arms: Floats
     position_arms: Floats
+    hidden: Floats | None = None
 
     @property
     def seconds(self) -> Floats:
@@ -78,4 +80,13 @@ def integrate(
     axes = PERFECT if gyro_axes is None else gyro_axes
     first = int(np.searchsorted(imu.stamps_ns, instants_ns[0], side="right"))
     felt = strapdown.integrate(imu.stamps_ns, imu.gyro, imu.accel, first, instants_ns, gyro_bias, accel_bias, axes)
-    return Increments(instants_ns, *felt)
+    return Increments(instants_ns, *felt, hidden=_hidden(imu, int(instants_ns[0]), int(instants_ns[-1])))
+
+
+def _hidden(imu: ImuStream, begin_ns: int, end_ns: int) -> Floats | None:
+    """(6,) the mean of what the samples between two instants lack; of one cut as a whole, so it does not average out."""
+    if imu.hidden is None:
+        return None
+    i, j = np.searchsorted(imu.stamps_ns, [begin_ns, end_ns])
+    within = imu.hidden[max(i - 1, 0) : j + 1]
+    return np.asarray(within.mean(axis=0)) if within.any() else None

@@ -62,6 +62,20 @@ def process_noise(t: float, rate_variance: float) -> Floats:
     return Q
 
 
+def cut_noise(hidden: Floats, F: Floats) -> Floats:
+    """(27, 27) that readings which the range cut off add over a step with the transition F (27, 27).
+
+    hidden : (6,) one sigma of force and rate, of one error of the whole cut, as a bias would be that lasts for this step
+    """
+    turned, errors = F[TURN, GYRO][:, :3] * hidden[3:], np.zeros((SIZE, 6))
+    errors[TURN, 3:], errors[PLACE, :3] = turned, F[PLACE, FORCE] * hidden[:3]
+    errors[SPEED, :3] = F[SPEED, FORCE] * hidden[:3]
+    # It has grown to its half, and in the mean of a double integral to its third, while forces were turned by it.
+    errors[PLACE, 3:] = F[PLACE, TURN] @ turned / 3
+    errors[SPEED, 3:] = F[SPEED, TURN] @ turned / 2
+    return np.asarray(errors @ errors.T)
+
+
 @dataclass(frozen=True)
 class NavigationState:
     """Where the IMU is, and all that is known of its motion and its errors.
@@ -89,6 +103,8 @@ class NavigationState:
         R_end, velocities, moved = step.motion(0, R, e.velocity, e.gravity)
         F = transition(step, R, R_end[-1], e.gyroscope)
         P = F @ self.covariance @ F.T + process_noise(t, e.gyroscope.rate_variance)
+        if step.hidden is not None:
+            P += cut_noise(step.hidden, F)
         T = se3.normalise(se3.make(R_end[-1], self.T_world_imu[:3, 3] + moved[-1]))
         return NavigationState(T, replace(e, velocity=velocities[-1]), P)._shared()
 

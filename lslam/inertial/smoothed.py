@@ -19,7 +19,7 @@ from lslam.registration.acceptance import PRIOR_COVARIANCE
 from lslam.registration.constant_velocity import middle_of
 from lslam.types.imu import ImuStream
 from lslam.types.motion_prior import MotionPrior
-from lslam.types.preintegration import SweepLink, MotionState, PreintegratedStep
+from lslam.types.preintegration import MotionState, PreintegratedStep, SweepLink
 from lslam.types.scan import Span
 from lslam.types.scan_result import ScanResult
 

@@ -1,0 +1,95 @@
+"""Readings at the end of the range: found in the data, filled in, trusted the less, and survived."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from lslam.config import load_config
+from lslam.inertial.gyroscope import Gyroscope
+from lslam.inertial.imu_cleaning import clean
+from lslam.inertial.imu_estimate import GRAVITY, ImuEstimate
+from lslam.inertial.navigation_state import PLACE, SPEED, TURN, NavigationState
+from lslam.inertial.saturation import with_hidden
+from lslam.pipeline.run import run
+from lslam.simulation.scenarios import simulate
+from lslam.types.imu import ImuStream
+
+LIMIT = np.deg2rad(250)
+
+
+def turning(peak_deg: float, limit: float = LIMIT, noise: float = 1e-4) -> tuple[ImuStream, ImuStream]:
+    """Six seconds of turns to and fro, as they are and as an IMU of a limited range reads them."""
+    rng, t = np.random.default_rng(0), np.arange(600) * 0.01
+    gyro = np.zeros((600, 3))
+    gyro[:, 1] = np.deg2rad(peak_deg) * np.sin(2 * np.pi * 0.9 * t)
+    accel = np.tile([0.0, 0.0, GRAVITY], (600, 1)) + rng.normal(0, 0.02, (600, 3))
+    whole = ImuStream((t * 1e9).astype(np.int64), accel, gyro + rng.normal(0, noise, gyro.shape))
+    return whole, ImuStream(whole.stamps_ns, accel, np.clip(whole.gyro, -limit, limit))
+
+
+@pytest.mark.parametrize("peak_deg", [300.0, 360.0])
+def test_what_is_cut_off_is_filled_in_and_its_sigma_says_how_well(peak_deg: float) -> None:
+    whole, read = turning(peak_deg)
+    notes: list[str] = []
+    filled = with_hidden(read, notes)
+    assert filled.hidden is not None
+    cut = np.abs(read.gyro[:, 1]) >= LIMIT
+    np.testing.assert_array_equal(filled.hidden[:, 4] > 0, cut)
+    np.testing.assert_array_equal(filled.gyro[~cut], read.gyro[~cut])
+    np.testing.assert_array_equal(filled.accel, read.accel)
+    before, after = (np.sqrt(np.mean((s.gyro[cut, 1] - whole.gyro[cut, 1]) ** 2)) for s in (read, filled))
+    assert after < 0.5 * before
+    assert np.mean(np.abs(filled.gyro[cut, 1] - whole.gyro[cut, 1]) < 2 * filled.hidden[cut, 4]) > 0.9
+    assert len(notes) == 1
+    assert f"{int(cut.sum())} at the 4.363 rad/s of its gyroscope" in notes[0]
+
+
+def test_an_extreme_that_noise_made_is_no_end_of_the_range() -> None:
+    whole, _ = turning(360.0)
+    notes: list[str] = []
+    assert with_hidden(whole, notes) is whole
+    assert not notes
+
+
+def test_what_was_filled_in_is_not_taken_for_a_range() -> None:
+    _, read = turning(400.0)
+    once = clean(read, 0, int(5e9))
+    again = clean(once.imu, 0, int(5e9))
+    assert once.imu.hidden is not None
+    assert again.imu.hidden is not None
+    np.testing.assert_array_equal(again.imu.hidden, once.imu.hidden)
+    np.testing.assert_array_equal(again.imu.gyro, once.imu.gyro)
+
+
+def test_a_step_over_a_cut_is_known_the_less_and_any_other_as_before() -> None:
+    _, read = turning(400.0)
+    filled = with_hidden(read, [])
+    none = np.zeros(3)
+    estimate = ImuEstimate(none, np.array([0, 0, -GRAVITY]), none, Gyroscope.of_bias(none, 1e-3), 1e-4 * np.eye(9))
+    state = NavigationState.begin(np.eye(4), estimate)
+    at = np.abs(read.gyro[:, 1]) >= LIMIT
+    cut = int(np.flatnonzero(at[1:] & ~at[:-1])[1]) + 1
+    calm, blind = ((int(read.stamps_ns[k]), int(read.stamps_ns[k + 10])) for k in (cut - 20, cut))
+    sigmas = []
+    for stream, span in ((read, calm), (filled, calm), (read, blind), (filled, blind)):
+        P = state.propagated(estimate.over(stream, np.array(span))).covariance
+        sigmas.append([np.sqrt(np.diag(P[part, part])) for part in (PLACE, TURN, SPEED)])
+    np.testing.assert_array_equal(sigmas[0], sigmas[1])
+    assert filled.hidden is not None
+    hidden = filled.hidden[cut - 1 : cut + 11, 4].mean()
+    assert sigmas[3][1][1] == pytest.approx(np.hypot(sigmas[2][1][1], 0.1 * hidden), rel=0.05)
+    assert sigmas[3][2][0] > 2 * sigmas[2][2][0], "a force that is turned wrongly leads astray"
+
+
+def test_a_flight_beyond_the_range_of_its_imu_is_survived_and_said() -> None:
+    """Two thirds of its readings sit at 2 g and a tenth at 250 deg/s from the third second on."""
+    drive = simulate("quadrotor", lidar="vlp16", count=60, imu="icm20948", motion_compensated=False)
+    settings = ["odometry.method=fast-lio2", "loops.use=false", "map.write=false"]
+    outcome = run(drive, load_config(None, settings, {}))
+    assert all(r.status == "ok" for r in outcome.record.results)
+    assert outcome.evaluation is not None
+    ate = outcome.evaluation.ate["se3"].translation
+    assert ate is not None
+    assert ate.rmse < 0.15
+    assert "the end of the range" in str(outcome.record.manifest["imu"]["decisions"])
