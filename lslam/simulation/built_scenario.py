@@ -165,6 +165,7 @@ def _move(
             )
         return path, fits if count is None else count
     if count is None:
+        assert not isinstance(path, EightFlight)  # whose line is open
         reached = path.travelled(np.arange(fits) / rate)
         count = int(np.searchsorted(reached, line.length + scenario.overlap)) + 1
     return path, min(count, fits)

@@ -49,8 +49,8 @@ def own_route(scenario: Scenario, rng: np.random.Generator, scans: int | None = 
     if path.shape == "out-and-back":
         return _out_and_back(scenario, scans)
     if path.shape == "stairs":
-        line, rise = stairs_line(path.heights[0])
-        return Route(line, line, rise)
+        line, heights = stairs_line(path.heights[0])
+        return Route(line, line, heights)
     if path.shape == "eights":
         line = smooth_curve(np.array([[0.0, 0.0], [path.length or HALL, 0.0]]), closed=False)
         return Route(line, line)
