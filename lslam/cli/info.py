@@ -20,6 +20,8 @@ from lslam.cli import options
 @click.option("--rows", type=int, metavar="N", help="Organised clouds: rows (rings).")
 @click.option("--cols", type=int, metavar="N", help="Organised clouds: columns.")
 @click.option("--quick", is_flag=True, help="Register no scans: the IMU's clock and axes are not checked.")
+@click.option("--imu-toml", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE",
+              help="Write the IMU's noise as a configuration for --config.")  # fmt: skip
 @options.reading
 @options.as_json
 def command(
@@ -30,6 +32,7 @@ def command(
     rows: int | None,
     cols: int | None,
     quick: bool,
+    imu_toml: Path | None,
     as_json: bool,
     **given: Any,
 ) -> None:
@@ -43,6 +46,8 @@ def command(
     from lslam.doctor.inspect import inspect
 
     facts = inspect(opened, None if all_scans else scans, quick)
+    if imu_toml is not None:
+        _write_noise(imu_toml, facts)
     if as_json:
         import json
 
@@ -93,6 +98,7 @@ def _lines(facts: dict[str, Any]) -> Iterator[tuple[str, str]]:
     yield "extrinsics", ", ".join(known) or "none"
     yield "IMU", _imu(facts["imu"])
     if facts["imu"]:
+        yield "IMU noise", _noise(facts["imu"]["noise"])
         yield "IMU and scans turn", _turns(facts["imu"]["turns"])
     yield "GNSS", _gnss(facts["gnss"])
     yield "ground truth", _ground_truth(facts["ground_truth"])
@@ -122,6 +128,32 @@ def _imu(imu: dict[str, Any] | None) -> str:
         f"{imu['samples']} samples, {rate}mean specific force {imu['gravity_norm']:.3f} {unit}{up}, "
         f"turning {imu['gyro_median_deg_s']:.1f} deg/s (median)"
     )
+
+
+def _noise(noise: dict[str, Any] | None) -> str:
+    if noise is None:
+        return "unknown"
+    how = f"Allan deviation over {noise['standing_s']:.0f} s of standing"
+    parts = [
+        f"{noise['accel_density']:.3g} m/s2/sqrt(Hz), {noise['gyro_density']:.3g} rad/s/sqrt(Hz) by "
+        + (how if noise["method"] == "allan" else "differences of readings, shaking included")
+    ]
+    if noise["accel_instability"] is not None:
+        parts.append(f"bias instability {noise['accel_instability']:.3g} m/s2, {noise['gyro_instability']:.3g} rad/s")
+    return "; ".join(parts)
+
+
+def _write_noise(path: Path, facts: dict[str, Any]) -> None:
+    from lslam.doctor.examine_noise import imu_toml
+    from lslam.errors import InputError
+    from lslam.formats.atomic import atomic_write
+
+    noise = (facts["imu"] or {}).get("noise")
+    if noise is None:
+        what = "it has no IMU" if facts["imu"] is None else "its IMU is too short or of unknown unit"
+        raise InputError(f"--imu-toml {path}: nothing to write, {what}: {facts['path']}")
+    with atomic_write(path) as stream:
+        stream.write(imu_toml(noise, facts["name"]).encode())
 
 
 def _turns(turns: dict[str, Any] | None) -> str:

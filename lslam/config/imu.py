@@ -33,6 +33,28 @@ class ImuConfig(Section):
     time_offset_s: float | None = Field(
         None, ge=-10, le=10, description="s to add to the IMU's stamps; absent: estimated from the rotation rates"
     )
+    accel_noise: float | None = Field(
+        None,
+        gt=0,
+        description="m/s2 per sqrt(Hz), of forces, shaking included; absent: 0.05. `lslam info SEQUENCE --imu-toml FILE` measures it",
+    )
+    gyro_noise: float | None = Field(
+        None, gt=0, description="rad/s per sqrt(Hz), of rates, the least: more is learnt; absent: 0.000175"
+    )
+    accel_walk: float | None = Field(
+        None, gt=0, description="m/s2 per sqrt(s), random walk of the accelerometer's bias; absent: 0.002"
+    )
+    gyro_walk: float | None = Field(
+        None, gt=0, description="rad/s per sqrt(s), random walk of the gyroscope's bias; absent: 0.0000175"
+    )
+    estimate_offset: bool = Field(
+        False,
+        description="refine the offset of the clocks at every scan, from what the start found or time_offset_s says",
+    )
+    estimate_extrinsics: bool = Field(
+        False,
+        description="estimate the rotation of T_lidar_imu, from the given one: by turns as they come, about what was turned",
+    )
     inlier_distance: float | None = Field(
         None, gt=0, description="m; takes the place of registration.inlier_distance when the IMU is used"
     )

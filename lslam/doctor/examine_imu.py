@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.doctor.examine_noise import examine_noise
 from lslam.doctor.findings import Facts, Finding, plural
 from lslam.inertial.imu_cleaning import GRAVITY, LEAST_RATE_HZ, gravity_unit, mean_forces
 from lslam.types.imu import ImuStream
@@ -39,7 +40,10 @@ def examine_imu(sequence: Sequence, findings: list[Finding]) -> Facts | None:
     usable = ImuStream(imu.stamps_ns[finite], imu.accel[finite], imu.gyro[finite])
     _examine_extrinsics(sequence, findings)
     return (
-        facts | _examine_gravity(usable, sequence.calibration.T_lidar_imu, findings) | _examine_gyro(usable, findings)
+        facts
+        | _examine_gravity(usable, sequence.calibration.T_lidar_imu, findings)
+        | _examine_gyro(usable, findings)
+        | {"noise": examine_noise(usable)}
     )
 
 

@@ -14,6 +14,7 @@ from lslam.config import Config
 from lslam.config.odometry import TIGHTLY_COUPLED
 from lslam.errors import InputError
 from lslam.formats.state_files import read_state, write_state
+from lslam.frontend.inertial_calibration import calibration_found, doubts
 from lslam.frontend.motion_models import motion_of
 from lslam.frontend.register_scans import read_ahead
 from lslam.frontend.state_classes import STATE_CLASSES
@@ -205,6 +206,8 @@ def close_inertial(part: Inertial, results: list[ScanResult]) -> dict[str, Any]:
         part.problems.append(
             f"IMU: {motion.gap_scans} scans fell into gaps of the IMU and were predicted by constant velocity"
         )
+    if said := doubts(motion.estimate.gyroscope):
+        part.problems.append(said)
     if motion.refusal:
         part.problems.append(f"the IMU was refused on the way, the run went on without it: {motion.refusal}")
     last = motion.estimate
@@ -216,7 +219,8 @@ def close_inertial(part: Inertial, results: list[ScanResult]) -> dict[str, Any]:
         "used": not motion.refusal,
         "decisions": part.notes,
         "velocity": motion.config.velocity,
-        "time_offset_s": round(begun.offset_s, 5),
+        "time_offset_s": round(begun.offset_s + last.gyroscope.offset_s, 5),
+        **calibration_found(last.gyroscope, begun),
         "is_checked_by_turns": begun.is_checked,
         "is_static_start": begun.is_static,
         "gyro_bias_rad_s": _rounded(last.gyroscope.bias, 5),

@@ -11,15 +11,18 @@ from lslam.config import Config
 from lslam.graph.inertial_smoother import InertialSmoother
 from lslam.inertial.filter import FilterMotion
 from lslam.inertial.fusion import InertialMotion
-from lslam.inertial.gyroscope import BIAS_WALK
-from lslam.inertial.imu_estimate import ACCEL_WALK, FORCE_NOISE, GRAVITY_WALK
+from lslam.inertial.imu_estimate import GRAVITY_WALK
+from lslam.inertial.imu_noise import ImuNoise
 from lslam.inertial.initialise import InertialStart
 from lslam.inertial.smoothed import SmoothedMotion
 from lslam.inertial.smoothing import SmootherMotion
 from lslam.inertial.window_motion import WindowMotion
-from lslam.types.inertial_state import ImuNoise
+from lslam.types.inertial_state import SmootherNoise
 
-IMU_NOISE = ImuNoise(FORCE_NOISE, ACCEL_WALK, float(BIAS_WALK), GRAVITY_WALK)
+
+def smoother_noise(noise: ImuNoise) -> SmootherNoise:
+    """The noise of an IMU as factors take it."""
+    return SmootherNoise(noise.force, noise.accel_walk, noise.gyro_walk, GRAVITY_WALK)
 
 
 def _loose(begun: InertialStart, config: Config) -> InertialMotion:
@@ -31,7 +34,7 @@ def _filter(begun: InertialStart, config: Config) -> InertialMotion:
 
 
 def _smoother(begun: InertialStart, config: Config) -> InertialMotion:
-    smoother = InertialSmoother(IMU_NOISE, config.lio_sam.reset_scans)
+    smoother = InertialSmoother(smoother_noise(begun.estimate.gyroscope.noise), config.lio_sam.reset_scans)
     return SmootherMotion(begun.imu, begun.T_lidar_imu, begun.estimate, config.imu, smoother)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from lslam.inertial.gyroscope import Gyroscope
 from lslam.inertial.imu_estimate import ImuEstimate
+from lslam.inertial.imu_noise import ImuNoise
 from lslam.inertial.initialise import InertialStart
 from lslam.inertial.navigation_state import NavigationState
 from lslam.inertial.window import Moment, Past, Window
@@ -17,6 +18,7 @@ from lslam.preprocessing.prepare import PreparedPoints
 from lslam.types.constraint import Constraint, LoopCandidate
 from lslam.types.gravity import GravityDirection
 from lslam.types.imu import ImuStream
+from lslam.types.imu_state import ImuState
 from lslam.types.inertial_state import InertialState, InertialStep
 from lslam.types.motion_check import MotionCheck
 from lslam.types.preintegration import MotionState, PreintegratedStep
@@ -24,8 +26,8 @@ from lslam.types.scan_equations import ScanEquations
 from lslam.types.scan_result import ScanResult
 
 STATE_CLASSES = (
-    Constraint, FeaturePoints, Features, FeatureScan, GravityDirection, Gyroscope, ImuEstimate, ImuStream, InertialState,
-    InertialStep, Landmarks, LoopCandidate, Moment, MotionCheck, MotionState, NavigationState, Past, PlaneWindow,
-    PreintegratedStep, PreparedPoints, ScanEquations, ScanResult, Seen, Sightings, InertialStart, Window, WindowPrior,
-    WindowValues,
+    Constraint, FeaturePoints, Features, FeatureScan, GravityDirection, Gyroscope, ImuEstimate, ImuNoise, ImuState, ImuStream,
+    InertialState, InertialStep, Landmarks, LoopCandidate, Moment, MotionCheck, MotionState, NavigationState, Past,
+    PlaneWindow, PreintegratedStep, PreparedPoints, ScanEquations, ScanResult, Seen, Sightings, InertialStart, Window,
+    WindowPrior, WindowValues,
 )  # fmt: skip

@@ -157,6 +157,7 @@ class Tracker:
             prior_norm=_matrix_norm(expected.pose, found),
             steady_norm=None if steady is None else _matrix_norm(steady, found),
             gravity=motion.gravity_at(found) if result.status == "ok" else None,
+            imu=motion.imu_state(),
             stages=result.stages if coasting is None else {**result.stages, **clock.seconds},
         )
         return result if trial is None or "bridged" in (trial.status, result.status) else _compared(result, trial)

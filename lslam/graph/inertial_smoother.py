@@ -16,7 +16,7 @@ from lslam.formats.state_files import Records
 from lslam.geometry import noise, se3
 from lslam.graph.factors import well_conditioned
 from lslam.graph.preintegration import preintegrated
-from lslam.types.inertial_state import ImuNoise, InertialState, InertialStep
+from lslam.types.inertial_state import InertialState, InertialStep, SmootherNoise
 from lslam.types.state import State
 
 Floats = NDArray[np.float64]
@@ -33,7 +33,7 @@ class InertialSmoother:
     that of each variable by itself.
     """
 
-    def __init__(self, imu_noise: ImuNoise, reset: int) -> None:
+    def __init__(self, imu_noise: SmootherNoise, reset: int) -> None:
         self._noise, self._reset = imu_noise, reset
         self._begun: InertialState | None = None
         self._steps: list[InertialStep] = []

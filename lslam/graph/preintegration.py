@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.types.inertial_state import ImuNoise, InertialStep
+from lslam.types.inertial_state import InertialStep, SmootherNoise
 
 Floats = NDArray[np.float64]
 
@@ -16,14 +16,14 @@ INTEGRATION = 1e-10
 
 
 def preintegrated(
-    step: InertialStep, accel_bias: Floats, gyro_bias: Floats, gravity: Floats, imu_noise: ImuNoise
+    step: InertialStep, accel_bias: Floats, gyro_bias: Floats, gravity: Floats, imu_noise: SmootherNoise
 ) -> Any:
     """`PreintegratedCombinedMeasurements` of the readings, linear in the biases (3,) about these; gravity (3,) in the world."""
     import gtsam
 
     one = np.eye(3)
     params = gtsam.PreintegrationCombinedParams(gravity)
-    params.setAccelerometerCovariance(imu_noise.force**2 * one)
+    params.setAccelerometerCovariance((imu_noise.force**2 + step.hidden) * one)
     params.setGyroscopeCovariance(step.rate_noise)
     params.setIntegrationCovariance(INTEGRATION * one)
     params.setBiasAccCovariance(imu_noise.accel_walk**2 * one)

@@ -22,6 +22,7 @@ from lslam.preprocessing.deskew import knots_over
 from lslam.registration.constant_velocity import ConstantVelocity, middle_of
 from lslam.types.gravity import GravityDirection
 from lslam.types.imu import ImuStream
+from lslam.types.imu_state import ImuState
 from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan import Span
 from lslam.types.scan_result import ScanResult
@@ -194,6 +195,10 @@ class InertialMotion(Stateful):
             return None
         direction, sigma = self.estimate.down
         return GravityDirection(pose[:3, :3].T @ direction, sigma)
+
+    def imu_state(self) -> ImuState | None:
+        """What the filter knows of the IMU as of the last scan; None once it is refused."""
+        return None if self.refusal else self.estimate.summary
 
     def rewind(self, stamp_ns: int, pose: Floats, span: Span) -> MotionPrior:
         """Forget all scans but the first, taken at `stamp_ns` and `pose` (4, 4); its sweep by what is known of the speed.

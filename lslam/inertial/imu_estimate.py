@@ -18,24 +18,19 @@ from lslam.inertial.kalman import OUTLIER
 from lslam.kernels import kalman
 from lslam.kernels.rotation import vector_between
 from lslam.types.imu import ImuStream
+from lslam.types.imu_state import ImuState
 
 Floats = NDArray[np.float64]
 
 GRAVITY = 9.80665
 # Registration from scan to scan, at the least: m and rad, one sigma.
 PLACE_SIGMA, TURN_SIGMA = 0.007, np.deg2rad(0.05)
-# Force that no bias explains (shaking, misaligned axes, readings cut at the rate), m/s2 per sqrt(Hz). With the ICM-20948 over
-# 0.1 s of simulated drives, walks and flights it is 0.004 (motorway) to 0.05 (streets, flights).
-FORCE_NOISE = 0.05
-# Random walks of bias and direction of gravity, per sqrt(s).
-GRAVITY_WALK, ACCEL_WALK = 5e-3, 2e-3
+# Random walk of gravity in the world of a registration that drifts, m/s2 per sqrt(s).
+GRAVITY_WALK = 5e-3
 GRAVITY_SIGMA = 0.03  # m/s2, over the Earth
 
 # (3, 3) m2 and rad2, of a registration without covariance.
 PLACE_NOISE, TURN_NOISE = PLACE_SIGMA**2 * np.eye(3), TURN_SIGMA**2 * np.eye(3)
-
-# (9, 9) per second, random walks of velocity, gravity and accelerometer bias.
-WALK = np.diag(np.repeat([0.0, GRAVITY_WALK**2, ACCEL_WALK**2], 3))
 
 VELOCITY, DOWN, BIAS = slice(0, 3), slice(3, 6), slice(6, 9)
 
@@ -62,9 +57,27 @@ class ImuEstimate:
         values = np.linalg.eigvalsh(across @ self.covariance[DOWN, DOWN] @ across)
         return direction, float(np.sqrt(max(values[-1], 0.0))) / norm
 
+    @property
+    def summary(self) -> ImuState:
+        """Means and standard deviations, for people; NaN for what is not estimated."""
+        g = self.gyroscope
+        values, variances = np.full(13, np.nan), np.full(13, np.nan)
+        values[:9] = np.concatenate([self.accel_bias, g.bias, self.gravity])
+        diagonal = np.diag(self.covariance)
+        variances[:9] = np.concatenate([diagonal[BIAS], np.diag(g.covariance)[:3], diagonal[DOWN]])
+        if g.is_mounted:
+            values[9:12], variances[9:12] = g.rotation[0], np.diag(g.rotation_covariance)
+        if g.has_offset:
+            values[12], variances[12] = g.offset_s, g.covariance[12, 12]
+        return ImuState(values, np.sqrt(np.maximum(variances, 0.0)))
+
     def over(self, imu: ImuStream, instants_ns: NDArray[np.int64]) -> Increments:
         """What the IMU felt between increasing instants, biases taken off."""
-        return integrate(imu, instants_ns, self.gyroscope.bias, self.accel_bias, self.gyroscope.axes)
+        return self._integrated(imu, instants_ns, self.gyroscope.bias)
+
+    def _integrated(self, imu: ImuStream, instants_ns: NDArray[np.int64], gyro_bias: Floats) -> Increments:
+        g = self.gyroscope
+        return integrate(imu, instants_ns, gyro_bias, self.accel_bias, g.axes, g.mounting, g.offset_ns)
 
     def displacement(self, step: Increments, R: Floats) -> tuple[Floats, Floats]:
         """Mean (3,) and covariance (3, 3) of how far `step` leads, m, world axes; R (3, 3) of the IMU at its beginning."""
@@ -102,29 +115,41 @@ class ImuEstimate:
         # The shape of the turn is the gyroscope's, its sum is registration's.
         axes = self.gyroscope.axes
         bias = self.gyroscope.bias - kalman.turn_bias(step.rotations[-1], step.velocity_arms[-1], axes, rest)
-        step = integrate(imu, step.instants_ns, bias, self.accel_bias, axes)
+        step = self._integrated(imu, step.instants_ns, bias)
         place = PLACE_NOISE if noise is None else PLACE_NOISE + noise
         x, P = _propagate(self, step, R)
         x, P = kalman.placed(x, P, moved, 2 * place, GRAVITY, GRAVITY_SIGMA, OUTLIER)
         return self._with(x[3:], P[3:, 3:], step, gyroscope)
 
     def _with(self, x: Floats, P: Floats, step: Increments, gyroscope: Gyroscope | None = None) -> ImuEstimate:
-        walk = WALK * step.duration
+        # Velocity, gravity and accelerometer bias.
+        P = P + np.diag(np.repeat([0.0, GRAVITY_WALK**2, self.gyroscope.noise.accel_walk**2], 3)) * step.duration
         known = self.gyroscope if gyroscope is None else gyroscope
-        return ImuEstimate(x[VELOCITY], x[DOWN], x[BIAS], known, P + walk)
+        bias = x[BIAS]
+        before, after = self.gyroscope.mounting, known.mounting
+        if gyroscope is not None and before is not None and after is not None:
+            # The force goes on as it was: the bias had learnt it about the axes before, and may be wrong by as much.
+            felt = np.linalg.solve(step.velocity_arms[-1], step.velocities[-1])
+            change = before.T @ felt - after.T @ felt
+            bias = bias + change
+            P[BIAS, BIAS] += np.outer(change, change)
+        return ImuEstimate(x[VELOCITY], x[DOWN], bias, known, P)
 
 
 def _propagate(estimate: ImuEstimate, step: Increments, R: Floats) -> tuple[Floats, Floats]:
     """Mean (12,) and covariance (12, 12) of displacement, velocity, gravity and accelerometer bias at the end of `step`."""
     x = np.concatenate([estimate.velocity, estimate.gravity, estimate.accel_bias])
+    velocity_arm, position_arm = step.velocity_arms[-1], step.position_arms[-1]
+    if (mounting := estimate.gyroscope.mounting) is not None:
+        velocity_arm, position_arm = velocity_arm @ mounting, position_arm @ mounting
     return kalman.propagate(
-        x, estimate.covariance, step.duration, step.velocities[-1], step.positions[-1], step.velocity_arms[-1],
-        step.position_arms[-1], R, _force_noise(step),
+        x, estimate.covariance, step.duration, step.velocities[-1], step.positions[-1], velocity_arm, position_arm, R,
+        _force_noise(step, estimate.gyroscope.noise.force),
     )  # fmt: skip
 
 
-def _force_noise(step: Increments) -> float:
+def _force_noise(step: Increments, usual: float) -> float:
     """m/s2 per sqrt(Hz); a force hidden over the whole step adds as much to the velocity as noise of that density."""
     if step.hidden is None:
-        return FORCE_NOISE
-    return math.sqrt(FORCE_NOISE**2 + float(step.hidden[:3].max()) ** 2 * step.duration)
+        return usual
+    return math.sqrt(usual**2 + float(step.hidden[:3].max()) ** 2 * step.duration)

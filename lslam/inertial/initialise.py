@@ -13,6 +13,7 @@ from lslam.inertial.agreement import LEAST_OFFSET_S, check_agreement
 from lslam.inertial.gyroscope import Gyroscope
 from lslam.inertial.imu_cleaning import ImuRefusedError, clean, covers, gaps
 from lslam.inertial.imu_estimate import BIAS, DOWN, GRAVITY, ImuEstimate
+from lslam.inertial.imu_noise import ImuNoise
 from lslam.types.imu import ImuStream
 
 Floats = NDArray[np.float64]
@@ -111,10 +112,16 @@ def start(
     told, opening = told_poses(first, usable, config.gap_s)
     _refuse_sign(usable, T_lidar_imu, told, agreement.gyro_bias)
     guess, is_static = _first_guess(usable, T_lidar_imu, told.stamps_ns, told.poses, config, agreement.gyro_bias)
+    asked = config.estimate_extrinsics, config.estimate_offset
+    guess = replace(guess, gyroscope=guess.gyroscope.calibrated(*asked))
     estimate = _learnt(usable, T_lidar_imu, guess, told, opening, config)
+    if any(asked):
+        # Once more, with forces about the axes that the turns showed and at their time: what was learnt is no prior.
+        known = replace(estimate.gyroscope, covariance=guess.gyroscope.covariance)
+        estimate = _learnt(usable, T_lidar_imu, replace(guess, gyroscope=known), told, opening, config)
     if config.gyro_bias is not None:
         bias = np.array(config.gyro_bias)
-        known = Gyroscope.of_bias(bias, _bias_sigma(bias, estimate.gyroscope))
+        known = Gyroscope.of_bias(bias, _bias_sigma(bias, estimate.gyroscope), ImuNoise.of(config)).calibrated(*asked)
         estimate = _learnt(usable, T_lidar_imu, replace(guess, gyroscope=known), told, opening, config)
     notes.append("IMU aligned " + ("while standing" if is_static else "while moving"))
     return InertialStart(usable, T_lidar_imu, estimate, offset, agreement.is_judged, is_static, notes, problems)
@@ -195,7 +202,8 @@ def _first_guess(
     covariance = np.zeros((9, 9))
     np.fill_diagonal(covariance, np.repeat([ANY_SPEED**2, LEVEL_SIGMA**2 + shared, shared], 3))
     covariance[DOWN, BIAS], covariance[BIAS, DOWN] = shared * R, shared * R.T
-    guess = ImuEstimate(np.zeros(3), np.zeros(3), accel_bias, Gyroscope.of_bias(gyro_bias, gyro_sigma), covariance)
+    gyroscope = Gyroscope.of_bias(gyro_bias, gyro_sigma, ImuNoise.of(config))
+    guess = ImuEstimate(np.zeros(3), np.zeros(3), accel_bias, gyroscope, covariance)
     gravity = _path_of_force(imu, poses @ T_lidar_imu, stamps_ns, guess, GRAVITY_S)[1]
     return replace(guess, gravity=GRAVITY * gravity / max(float(np.linalg.norm(gravity)), 1e-9)), stands
 

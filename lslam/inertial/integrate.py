@@ -22,6 +22,7 @@ class Increments:
     instants_ns : (K,) increasing; rotations : (K, 3, 3) from the IMU then to the IMU at the first instant
     velocities (K, 3), positions (K, 3) : the specific force integrated once and twice, m/s and m
     velocity_arms, position_arms : (K, 3, 3) likewise of the rotations: what a constant force in IMU axes adds
+    readings : (2, 3) rad/s of the gyroscope at the first and the last instant
     hidden : (6,) one sigma of the mean force and rate, to the last instant, that the range of the IMU cut off; None for none
     """
 
@@ -31,6 +32,7 @@ class Increments:
     positions: Floats
     velocity_arms: Floats
     position_arms: Floats
+    readings: Floats
     hidden: Floats | None = None
 
     @property
@@ -68,19 +70,36 @@ class Increments:
 
 def integrate(
     imu: ImuStream, instants_ns: NDArray[np.int64], gyro_bias: Floats, accel_bias: Floats,
-    gyro_axes: Floats | None = None,
+    gyro_axes: Floats | None = None, mounting: Floats | None = None, offset_ns: int = 0,
 ) -> Increments:  # fmt: skip
     """Integrate the stream over increasing `instants_ns` (K,), K >= 1, with the biases (3,) taken off.
 
     gyro_axes : (3, 3) that makes true rates of the gyroscope's readings less their bias; None takes them as they are
+    mounting : (3, 3) likewise of the forces; offset_ns : to add to the stamps of the stream
 
     Readings are linear between samples and constant beyond the ends of the stream, so the result does not depend on how the
     instants lie among the samples (midpoint rule: exact for a constant rate and force).
     """
     axes = PERFECT if gyro_axes is None else gyro_axes
-    first = int(np.searchsorted(imu.stamps_ns, instants_ns[0], side="right"))
-    felt = strapdown.integrate(imu.stamps_ns, imu.gyro, imu.accel, first, instants_ns, gyro_bias, accel_bias, axes)
-    return Increments(instants_ns, *felt, hidden=_hidden(imu, int(instants_ns[0]), int(instants_ns[-1])))
+    at = instants_ns - offset_ns if offset_ns else instants_ns
+    first = int(np.searchsorted(imu.stamps_ns, at[0], side="right"))
+    stamps, gyro, accel = imu.stamps_ns, imu.gyro, imu.accel
+    if mounting is not None:
+        # Of what is integrated only: with a sample beyond either end.
+        used = slice(max(first - 1, 0), int(np.searchsorted(stamps, at[-1], side="left")) + 1)
+        stamps, gyro, first = stamps[used], gyro[used], first - used.start
+        accel, accel_bias = accel[used] @ mounting.T, mounting @ accel_bias
+    felt = strapdown.integrate(stamps, gyro, accel, first, at, gyro_bias, accel_bias, axes)
+    return Increments(instants_ns, *felt, _readings(imu, at[[0, -1]]), _hidden(imu, int(at[0]), int(at[-1])))
+
+
+def _readings(imu: ImuStream, instants_ns: NDArray[np.int64]) -> Floats:
+    """(K, 3) of the gyroscope at instants (K,), linear between samples and constant beyond them."""
+    after = np.clip(np.searchsorted(imu.stamps_ns, instants_ns), 1, max(len(imu) - 1, 1))
+    before, after = after - 1, np.minimum(after, len(imu) - 1)
+    step = np.maximum(imu.stamps_ns[after] - imu.stamps_ns[before], 1)
+    share = np.clip((instants_ns - imu.stamps_ns[before]) / step, 0.0, 1.0)[:, None]
+    return np.asarray(imu.gyro[before] + share * (imu.gyro[after] - imu.gyro[before]))
 
 
 def _hidden(imu: ImuStream, begin_ns: int, end_ns: int) -> Floats | None:

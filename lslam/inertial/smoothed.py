@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 from lslam.config.imu import ImuConfig
 from lslam.geometry import se3
 from lslam.inertial.filter import FilterMotion
-from lslam.inertial.gyroscope import BIAS_WALK, Gyroscope
-from lslam.inertial.imu_estimate import ACCEL_WALK, FORCE_NOISE, ImuEstimate
+from lslam.inertial.gyroscope import Gyroscope
+from lslam.inertial.imu_estimate import ImuEstimate
+from lslam.inertial.imu_noise import ACCEL_WALK, BIAS_WALK
 from lslam.inertial.integrate import Increments
-from lslam.inertial.navigation_state import GYRO, REST, NavigationState
+from lslam.inertial.navigation_state import GYRO, OWN, REST, NavigationState, cut_noise, process_noise, transition
 from lslam.registration.acceptance import PRIOR_COVARIANCE
 from lslam.registration.constant_velocity import middle_of
 from lslam.types.imu import ImuStream
@@ -81,13 +82,13 @@ class SmoothedMotion(FilterMotion):
         before_ns, before = self._linked
         if not self.refusal and self._covers(before_ns, instant_ns):
             felt = self.estimate.over(self.imu, np.array([before_ns, instant_ns]))
-            return replace(link, step=_felt(self.estimate, felt))
+            return replace(link, step=_felt(self.estimate, felt, (before @ self.T_lidar_imu)[:3, :3]))
         moved = se3.relative(before @ self.T_lidar_imu, T_world_imu)
         return replace(link, step=_coasted(self.estimate, moved, 1e-9 * (instant_ns - before_ns)))
 
     def _state_of(self, found: MotionState) -> NavigationState:
         P, before = found.covariance, self.estimate.gyroscope
-        gyroscope = Gyroscope(found.gyro_bias, found.gyro_axes, P[GYRO, GYRO], before.rate_variance)
+        gyroscope = Gyroscope(found.gyro_bias, found.gyro_axes, P[GYRO, GYRO], before.rate_variance, before.noise)
         estimate = ImuEstimate(found.velocity, found.gravity, found.accel_bias, gyroscope, P[REST, REST])
         return NavigationState(found.T_world_imu, estimate, P)
 
@@ -99,19 +100,15 @@ def _plain(state: NavigationState) -> MotionState:
     )
 
 
-def _felt(e: ImuEstimate, step: Increments) -> PreintegratedStep:
-    """What the IMU felt, as the estimate integrated it."""
+def _felt(e: ImuEstimate, step: Increments, R: Floats) -> PreintegratedStep:
+    """What the IMU felt, as the estimate integrated it; R : (3, 3) of the IMU in the world at the first instant."""
     t = step.duration
-    force = FORCE_NOISE**2 * np.array([[t**3 / 3, t**2 / 2], [t**2 / 2, t]])
-    C = np.zeros((15, 15))
-    for i, a in enumerate((0, 6)):
-        for j, b in enumerate((0, 6)):
-            C[a : a + 3, b : b + 3] = force[i, j] * np.eye(3)
-    for k, variance in zip((3, 9, 12), (e.gyroscope.rate_variance, ACCEL_WALK**2, BIAS_WALK**2), strict=True):
-        C[k : k + 3, k : k + 3] = variance * t * np.eye(3)
+    C = process_noise(t, e.gyroscope.rate_variance, e.gyroscope.noise)
+    if step.hidden is not None:
+        C += cut_noise(step.hidden, transition(step, R, R @ step.rotations[-1], e.gyroscope))
     return PreintegratedStep(
         t, step.rotations[-1], step.velocities[-1], step.positions[-1], step.velocity_arms[-1], step.position_arms[-1],
-        e.gyroscope.columns(step), e.accel_bias, e.gyroscope.bias, e.gyroscope.axes, C,
+        e.gyroscope.columns(step), e.accel_bias, e.gyroscope.bias, e.gyroscope.axes, C[np.ix_(OWN, OWN)],
     )  # fmt: skip
 
 

@@ -19,7 +19,7 @@ from lslam.inertial.integrate import Increments
 from lslam.inertial.navigation_state import BEGIN_SIGMA
 from lslam.registration.constant_velocity import middle_of
 from lslam.types.imu import ImuStream
-from lslam.types.inertial_state import ImuNoise, InertialChain, InertialLink, InertialState, InertialStep
+from lslam.types.inertial_state import InertialChain, InertialLink, InertialState, InertialStep, SmootherNoise
 from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan import Span
 from lslam.types.scan_result import ScanResult
@@ -126,7 +126,7 @@ class SmootherMotion(InertialMotion):
             return
         self.estimate = self._as_estimate(found)
 
-    def chain(self, keyframes: Sequence[tuple[int, int]], imu_noise: ImuNoise) -> InertialChain:
+    def chain(self, keyframes: Sequence[tuple[int, int]], imu_noise: SmootherNoise) -> InertialChain:
         """The IMU between these keyframes, numbers and stamps in ns, by what is known of it now."""
         links = []
         for (a, begin_ns), (b, end_ns) in pairwise(keyframes):
@@ -144,7 +144,7 @@ class SmootherMotion(InertialMotion):
         middles = np.cumsum(step.seconds) - 0.5 * step.seconds
         turning = np.gradient(rates, middles, axis=0) if len(rates) > 1 else np.zeros_like(rates)
         forces = step.accel + np.cross(turning, lever) + np.cross(rates, np.cross(rates, lever))
-        return InertialStep(step.seconds, forces @ R.T, step.rates @ R.T, R @ step.rate_noise @ R.T)
+        return InertialStep(step.seconds, forces @ R.T, step.rates @ R.T, R @ step.rate_noise @ R.T, hidden=step.hidden)
 
     def state(self) -> State:
         """What `restore` needs to go on from here; not the stream."""
@@ -190,6 +190,7 @@ class SmootherMotion(InertialMotion):
         return InertialStep(
             np.diff(at), means(self.imu.accel), (means(self.imu.gyro) - self._usual_bias) @ gyroscope.axes.T,
             gyroscope.turn_covariance(step) / step.duration, T_world_imu, C,
+            0.0 if step.hidden is None else float(step.hidden[:3].max()) ** 2 * step.duration,
         )  # fmt: skip
 
     def _beginning(self) -> InertialState:

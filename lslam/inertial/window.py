@@ -14,17 +14,17 @@ from numpy.typing import NDArray
 from lslam.geometry import se3, so3
 from lslam.inertial.gyroscope import Gyroscope
 from lslam.inertial.imu_estimate import GRAVITY, GRAVITY_SIGMA, GRAVITY_WALK, ImuEstimate
+from lslam.inertial.imu_noise import ImuNoise
 from lslam.inertial.integrate import integrate
-from lslam.inertial.navigation_state import GYRO, REST, NavigationState, process_noise, transition
+from lslam.inertial.navigation_state import GYRO, OWN, REST, NavigationState, cut_noise, process_noise, transition
 from lslam.kernels.rotation import vector_between
 from lslam.types.imu import ImuStream
 from lslam.types.scan_equations import ScanEquations
 
 Floats = NDArray[np.float64]
 
-# Of the filter's error state: what all moments have in common, gravity and the gyroscope's axes; and what each has of its
-# own, position, rotation, velocity and both biases.
-COMMON, OWN = np.r_[9:12, 18:27], np.r_[0:9, 12:18]
+# Of the filter's error state what all moments have in common: gravity and the gyroscope's axes.
+COMMON = np.r_[9:12, 18:27]
 SHARED, EACH = len(COMMON), len(OWN)
 DOWN, AXES = slice(0, 3), slice(3, 12)
 # m and rad: a step of all poses below ends the iteration; what it leaves is its square.
@@ -87,13 +87,14 @@ class Past:
 class Window:
     """The moments, the earliest first; gravity (3,) in the world and axes (3, 3) of the gyroscope, which all have in common.
 
-    rate_variance : (rad/s)^2 per Hz of the gyroscope
+    rate_variance : (rad/s)^2 per Hz of the gyroscope; noise : of the device
     """
 
     moments: tuple[Moment, ...]
     gravity: Floats
     axes: Floats
     rate_variance: float
+    noise: ImuNoise
     past: Past
 
     @classmethod
@@ -104,7 +105,7 @@ class Window:
         e = state.estimate
         information = inverse(state.covariance[np.ix_(order, order)])
         past = Past(information, np.zeros(len(order)), e.gravity, e.gyroscope.axes, moment)
-        return cls((moment,), e.gravity, e.gyroscope.axes, e.gyroscope.rate_variance, past)
+        return cls((moment,), e.gravity, e.gyroscope.axes, e.gyroscope.rate_variance, e.gyroscope.noise, past)
 
     def extended(self, moment: Moment) -> Window:
         """With one more moment, the newest."""
@@ -173,8 +174,7 @@ class Window:
     def _add_increments(self, H: Floats, g: Floats, k: int, imu: ImuStream) -> None:
         """What the IMU felt between moment k - 1 and moment k, integrated anew with the biases as they are."""
         a, b = self.moments[k - 1], self.moments[k]
-        rest, J = self.residual(a, b, imu)
-        W = certainty(b.instant_ns - a.instant_ns, self.rate_variance)
+        rest, J, W = self._increment(a, b, imu)
         begin = SHARED + EACH * (k - 1)
         at = np.r_[0:SHARED, begin : begin + 2 * EACH]
         weighed = J.T @ W
@@ -187,14 +187,24 @@ class Window:
         The columns are of the common errors and of both moments'. Their rotations are taken for near each other, as those of
         the manifold are.
         """
+        return self._increment(a, b, imu)[:2]
+
+    def _increment(self, a: Moment, b: Moment, imu: ImuStream) -> tuple[Floats, Floats, Floats]:
+        """As `residual`, with its information (15, 15)."""
         step = integrate(imu, np.array([a.instant_ns, b.instant_ns]), a.gyro_bias, a.accel_bias, self.axes)
         R = a.T_world_imu[:3, :3]
         R_end, velocities, moved = step.motion(0, R, a.velocity, self.gravity)
         led = replace(
             a, T_world_imu=se3.make(R_end[-1], a.T_world_imu[:3, 3] + moved[-1]), velocity=velocities[-1]
         )  # fmt: skip
-        F = transition(step, R, R_end[-1], Gyroscope(a.gyro_bias, self.axes))[OWN]
-        return b.away(led), np.concatenate([-F[:, COMMON], -F[:, OWN], np.eye(EACH)], axis=1)
+        F = transition(step, R, R_end[-1], Gyroscope(a.gyro_bias, self.axes))
+        nanoseconds = b.instant_ns - a.instant_ns
+        W = certainty(nanoseconds, self.rate_variance, self.noise)
+        if step.hidden is not None:
+            Q = process_noise(1e-9 * nanoseconds, self.rate_variance, self.noise) + cut_noise(step.hidden, F)
+            W = inverse(Q[np.ix_(OWN, OWN)])
+        J = np.concatenate([-F[OWN][:, COMMON], -F[OWN][:, OWN], np.eye(EACH)], axis=1)
+        return b.away(led), J, W
 
     def without_first(self, imu: ImuStream) -> Window:
         """The first moment marginalised: what past, points and increments say of it becomes the past of the next.
@@ -227,9 +237,9 @@ class Window:
 
 
 @lru_cache(maxsize=64)
-def certainty(nanoseconds: int, rate_variance: float) -> Floats:
+def certainty(nanoseconds: int, rate_variance: float, noise: ImuNoise) -> Floats:
     """(15, 15) information of the increments over so long, read only."""
-    W = np.linalg.inv(process_noise(1e-9 * nanoseconds, rate_variance)[np.ix_(OWN, OWN)])
+    W = np.linalg.inv(process_noise(1e-9 * nanoseconds, rate_variance, noise)[np.ix_(OWN, OWN)])
     W.flags.writeable = False
     return W
 

@@ -43,6 +43,11 @@ def check_config(config: Config) -> None:
         raise UsageError(
             f"imu.velocity and imu.weigh are of the loosely coupled IMU, {method} weighs points and IMU together: drop them"
         )
+    if (config.imu.estimate_offset or config.imu.estimate_extrinsics) and method in ("lio-sam", "lio-mapping", "lips"):
+        raise UsageError(
+            f"imu.estimate_offset and imu.estimate_extrinsics are states of a filter, which {method} does not have: drop them, "
+            "or take --method fast-lio2"
+        )
     if config.map.write and (config.map.denoise or config.map.mesh):
         from lslam.maps.mesh import require_open3d
 

@@ -16,7 +16,7 @@ from lslam.frontend import inertial_start
 from lslam.frontend.checkpoints import Checkpoints, OdometryCheckpoints
 from lslam.frontend.inertial_start import Inertial, begin_inertial, close_inertial, load_start, save_start
 from lslam.frontend.keyframing import Keyframing
-from lslam.frontend.motion_models import IMU_NOISE
+from lslam.frontend.motion_models import smoother_noise
 from lslam.frontend.register_scans import estimate, is_diverged, to_trajectory
 from lslam.inertial.smoothing import SmootherMotion
 from lslam.integrity.alerts import Alert, alerts
@@ -105,6 +105,7 @@ def estimate_poses(
         pose_time=manifest.pose_time,
         turns=_turns(inertial, store, config),
         inertial=_chain(inertial, store, config),
+        imu=sequence.imu if config.imu.use else None,
     )
 
 
@@ -113,7 +114,9 @@ def _chain(inertial: Inertial, store: KeyframeStore, config: Config) -> Inertial
     motion = inertial.motion
     if not isinstance(motion, SmootherMotion) or motion.refusal or not config.lio_sam.graph_imu:
         return None
-    return motion.chain([(k.number, k.stamp_ns) for k in store.keyframes], IMU_NOISE)
+    return motion.chain(
+        [(k.number, k.stamp_ns) for k in store.keyframes], smoother_noise(motion.estimate.gyroscope.noise)
+    )
 
 
 def _turns(inertial: Inertial, store: KeyframeStore, config: Config) -> list[Turn]:

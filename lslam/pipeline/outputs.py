@@ -11,6 +11,7 @@ import numpy as np
 from lslam.config import Config, to_toml
 from lslam.config.map import MapConfig
 from lslam.evaluation.evaluate import Evaluation
+from lslam.formats.imu_states_csv import imu_states_text
 from lslam.formats.ply_files import write_ply
 from lslam.formats.run_tables import timing_text
 from lslam.formats.trajectory_files import write_kitti, write_tum
@@ -67,6 +68,8 @@ def write_trajectories(folder: RunFolder, record: RunRecord, calibration: Calibr
 def write_scans(folder: RunFolder, record: RunRecord) -> None:
     """timing.csv, seconds per stage, those of the back end beside their sum, and scans.csv, what became of each scan.
 
+    With an IMU also imu_states.csv, what was known of it after each.
+
     `saved_s` of timing.csv is what the IMU saved where a scan was registered from constant velocity too, empty elsewhere.
     """
     names, seconds = stage_matrix(record.results)
@@ -86,6 +89,8 @@ def write_scans(folder: RunFolder, record: RunRecord) -> None:
         )  # fmt: skip
         rows.append(",".join(str(v) for v in values))
     folder.write_text("scans.csv", "\n".join(rows) + "\n")
+    if any(r.imu is not None for r in record.results):
+        folder.write_text("imu_states.csv", imu_states_text(record.results))
 
 
 def write_map(folder: RunFolder, built: BuiltMap, config: MapConfig, record: RunRecord) -> None:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from lslam.geometry import se3
 from lslam.preprocessing.deskew import knots_over
 from lslam.types.gravity import GravityDirection
+from lslam.types.imu_state import ImuState
 from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan import Span
 from lslam.types.scan_result import ScanResult
@@ -75,6 +76,10 @@ class MotionModel(Protocol):
 
     def gravity_at(self, pose: Floats) -> GravityDirection | None:
         """Direction of gravity for a LiDAR at `pose` (4, 4) in the world, as of the last scan; None where unknown."""
+        return None
+
+    def imu_state(self) -> ImuState | None:
+        """What is known of the sensor's errors as of the last scan; None without one."""
         return None
 
 

@@ -14,6 +14,7 @@ from lslam.reports.back_end import back_end_figures
 from lslam.reports.buildings import building_pages
 from lslam.reports.facts import RunFacts, run_facts
 from lslam.reports.feature_view import feature_figures
+from lslam.reports.imu_figures import imu_figures
 from lslam.reports.png import data_uri, density_png
 from lslam.reports.text import imu_rows
 from lslam.types.run_record import Crispness, RunRecord
@@ -77,6 +78,7 @@ def render_report(record: RunRecord, evaluation: Evaluation | None) -> str:
         registration=plots.registration_figures(record),
         features=feature_figures(record.features),
         imu=[said for _, said in imu_rows(record)],
+        imu_figures=imu_figures(record),
         uncertainty=plots.uncertainty_figures(record),
         config_text=_config_text(record.folder),
         **map_context(record),

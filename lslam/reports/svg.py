@@ -33,6 +33,16 @@ class Line:
     style: str
 
 
+@dataclass(frozen=True)
+class Band:
+    """An area between two series, `low` and `high` (N,), over `x` (N,), in the style of its line."""
+
+    x: NDArray[Any]
+    low: NDArray[Any]
+    high: NDArray[Any]
+    style: str
+
+
 class Frame:
     """A plot area with axes: maps data to SVG units and collects elements."""
 
@@ -84,6 +94,16 @@ class Frame:
                 self.dot(float(px[run.start]), float(py[run.start]), style, 3)
             else:
                 self.add(f'<path class="line {style}" d="{path(px[run], py[run])}"/>')
+
+    def band(self, band: Band) -> None:
+        """An area, broken where one of its limits is not finite."""
+        x, low, high = (
+            np.asarray(v, np.float64)[:: max(len(band.x) // BINS, 1)] for v in (band.x, band.low, band.high)
+        )
+        px, py_low, py_high = self.px(x), self.py(low), self.py(high)
+        for run in finite_runs(px + py_low + py_high):
+            around = path(np.append(px[run], px[run][::-1]), np.append(py_low[run], py_high[run][::-1]))
+            self.add(f'<path class="band {band.style}" d="{around}Z"/>')
 
     def dot(self, px: float, py: float, style: str, radius: float = 4) -> None:
         """A filled circle at SVG coordinates."""
@@ -182,9 +202,13 @@ def line_chart(
     zero: bool = True,
     marks: NDArray[Any] | None = None,
     whole_x: bool = False,
+    bands: Sequence[Band] = (),
 ) -> str:
-    """Lines over a common abscissa; `marks` are abscissas of failed scans. Empty text when no value is finite."""
-    x_span, y_span = span_of([line.x for line in lines]), span_of([line.y for line in lines], zero)
+    """Lines over a common abscissa; `marks` are abscissas of failed scans. Empty text when no value is finite.
+
+    bands : areas behind the lines; where one is wider than the lines need, as at the start of a filter, it is cut off
+    """
+    x_span, y_span = span_of([line.x for line in lines]), span_of([*(line.y for line in lines), *_settled(bands)], zero)
     if x_span is None or y_span is None:
         return ""
     pad = 0.06 * (y_span[1] - y_span[0])
@@ -193,9 +217,17 @@ def line_chart(
     frame.axes(x_label, y_label, whole_x=whole_x)
     if marks is not None:
         frame.marks(marks, "failed")
+    for band in bands:
+        low, high = np.clip(band.low, frame.y0, frame.y1), np.clip(band.high, frame.y0, frame.y1)
+        frame.band(Band(band.x, low, high, band.style))
     for line in lines:
         frame.polyline(*thin(line.x, line.y), line.style)
     return frame.svg(title)
+
+
+def _settled(bands: Sequence[Band]) -> list[NDArray[Any]]:
+    """Limits of the bands in their second half."""
+    return [v[len(v) // 2 :] for band in bands for v in (band.low, band.high)]
 
 
 def _widened(low: float, high: float) -> tuple[float, float]:

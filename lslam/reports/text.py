@@ -77,7 +77,27 @@ def imu_rows(record: RunRecord) -> list[tuple[str, str]]:
     ]
     if imu.get("mean_iterations"):
         rows.append(("", f"{imu['mean_iterations']:.1f} iterations per scan; {_saved(imu)}"))
+    if said := _calibrated(imu):
+        rows.append(("", said))
     return rows
+
+
+def _calibrated(imu: dict[str, Any]) -> str:
+    """In words the clock and the mounting that were estimated; empty where that is nothing.
+
+    >>> _calibrated({"time_offset_s": -0.0203, "time_offset_sigma_s": 0.0004})
+    'IMU 20.3 ms late (0.4)'
+    """
+    parts = []
+    if "time_offset_sigma_s" in imu:
+        offset = 1e3 * imu["time_offset_s"]
+        parts.append(
+            f"{abs(offset):.1f} ms {'late' if offset < 0 else 'early'} ({1e3 * imu['time_offset_sigma_s']:.1f})"
+        )
+    if "mounting_deg" in imu:
+        angle = sum(v * v for v in imu["mounting_deg"]) ** 0.5
+        parts.append(f"turned by {angle:.1f} deg ({imu['mounting_sigma_deg']:.1f} about the least certain axis)")
+    return "IMU " + ", ".join(parts) if parts else ""
 
 
 def _saved(imu: dict[str, Any]) -> str:

@@ -12,7 +12,7 @@ Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class ImuNoise:
+class SmootherNoise:
     """Densities, one sigma: force, m/s2 per sqrt(Hz); random walks per sqrt(s) of both biases and of gravity in the map's world.
 
     The rates' noise stands with each step.
@@ -48,6 +48,7 @@ class InertialStep:
 
     seconds : (N,) that each reading lasts; accel, rates : (N, 3) m/s2 and rad/s, biases left in
     rate_noise : (3, 3) (rad/s)2 per Hz
+    hidden : (m/s2)2 per Hz of force that the range of the IMU cut off
     T_world_imu : (4, 4) registered, and its covariance (6, 6), t' = t + d[:3], R' = exp(d[3:]) R in world axes; None where
         registration failed
     """
@@ -58,6 +59,7 @@ class InertialStep:
     rate_noise: Floats
     T_world_imu: Floats | None = None
     covariance: Floats | None = None
+    hidden: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -79,7 +81,7 @@ class InertialChain:
     links: Sequence[InertialLink]
     accel_bias: Floats
     gyro_bias: Floats
-    noise: ImuNoise
+    noise: SmootherNoise
 
     def until(self, count: int) -> InertialChain:
         """That of the first `count` keyframes."""

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from lslam.types.building import CorrectedMap, OsmMatches
 from lslam.types.constraint import LoopCandidate, Turn
 from lslam.types.gnss import Georeference
+from lslam.types.imu import ImuStream
 from lslam.types.inertial_state import InertialChain
 from lslam.types.scan_result import ScanResult
 from lslam.types.trajectory import Trajectory
@@ -140,6 +141,7 @@ class RunRecord:
     back_end_seconds : by the number of its scan, what each stage after odometry took a keyframe, s; the whole graph with the last
     loop_view : the map at the loop that was corrected most, None without one
     features : what a feature method saw, None of another
+    imu : the recording's, None of a run that uses none
     """
 
     name: str
@@ -168,5 +170,6 @@ class RunRecord:
     georeference: Georeference | None = None
     loop_view: LoopView | None = None
     features: FeatureView | None = None
+    imu: ImuStream | None = None
     osm: OsmMatches | None = None
     buildings: CorrectedMap | None = None

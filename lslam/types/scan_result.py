@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.types.gravity import GravityDirection
+from lslam.types.imu_state import ImuState
 from lslam.types.preintegration import MotionState
 
 Status = Literal["ok", "bridged", "skipped"]
@@ -40,6 +41,7 @@ class ScanResult:
     saved_s : likewise, how much longer that took, s; the IMU's own part counted against it
     gravity : which way is down, when an IMU says so; None where the scan is bridged or the IMU has a gap
     inertial : the state of the IMU that a smoother found, for the motion model, which takes it off
+    imu : what was known of the IMU after the scan; None without one, and once it was refused
     stages : seconds per stage, by name, in the order they ran
     """
 
@@ -68,6 +70,7 @@ class ScanResult:
     saved_s: float | None = None
     gravity: GravityDirection | None = None
     inertial: MotionState | None = None
+    imu: ImuState | None = None
     stages: dict[str, float] = field(default_factory=dict)
 
     def poser(self, method: str) -> str:

@@ -14,7 +14,7 @@ from lslam.geometry import se3, so3
 from lslam.graph.pose_graph import optimise
 from lslam.graph.problem import PoseGraph, PositionFix
 from lslam.types.constraint import Constraint
-from lslam.types.inertial_state import ImuNoise, InertialChain, InertialLink, InertialStep
+from lslam.types.inertial_state import InertialChain, InertialLink, InertialStep, SmootherNoise
 
 Floats = NDArray[np.float64]
 
@@ -22,7 +22,7 @@ COUNT, HZ, G = 40, 50, 9.80665
 # A second from keyframe to keyframe; odometry is poor at turns, so that the IMU has something to say.
 SIGMAS = np.array([0.02, 0.02, 0.02, 2e-3, 2e-3, 2e-3])
 FORCE, RATE = 0.05, 2e-4
-NOISE = ImuNoise(FORCE, 2e-3, 2e-5, 5e-3)
+NOISE = SmootherNoise(FORCE, 2e-3, 2e-5, 5e-3)
 BIAS = np.array([0.05, -0.05, 0.08]), np.array([1e-3, -2e-3, 1e-3])
 
 

@@ -14,11 +14,11 @@ from lslam.formats.state_files import read_state, write_state
 from lslam.frontend.state_classes import STATE_CLASSES
 from lslam.geometry import se3, so3
 from lslam.graph.inertial_smoother import InertialSmoother
-from lslam.types.inertial_state import ImuNoise, InertialState, InertialStep
+from lslam.types.inertial_state import InertialState, InertialStep, SmootherNoise
 
 Floats = NDArray[np.float64]
 
-NOISE = ImuNoise(force=0.02, accel_walk=1e-4, gyro_walk=1e-6, gravity_walk=1e-4)
+NOISE = SmootherNoise(force=0.02, accel_walk=1e-4, gyro_walk=1e-6, gravity_walk=1e-4)
 GRAVITY = np.array([0.0, 0.0, -9.81])
 ACCEL_BIAS, GYRO_BIAS = np.array([0.05, -0.08, 0.03]), np.array([0.004, -0.002, 0.003])
 PLACE, TURN, RATE, DT, READINGS = 0.003, 5e-4, 1e-3, 0.005, 20

@@ -5,14 +5,16 @@ from __future__ import annotations
 import numpy as np
 
 from lslam.config.imu import ImuConfig
-from lslam.frontend.motion_models import IMU_NOISE
+from lslam.frontend.motion_models import smoother_noise
 from lslam.geometry import se3, so3
 from lslam.graph.inertial_smoother import InertialSmoother
 from lslam.inertial.gyroscope import Gyroscope
 from lslam.inertial.imu_estimate import GRAVITY, ImuEstimate
+from lslam.inertial.imu_noise import USUAL
 from lslam.inertial.smoothing import SmootherMotion
 from lslam.types.imu import ImuStream
 
+IMU_NOISE = smoother_noise(USUAL)
 LEVER = np.array([0.4, -0.3, 0.2])
 FORCE_BIAS, RATE_BIAS = np.array([0.1, 0.2, -0.3]), np.array([0.02, -0.01, 0.03])
 
