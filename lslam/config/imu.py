@@ -36,7 +36,7 @@ class ImuConfig(Section):
     accel_noise: float | None = Field(
         None,
         gt=0,
-        description="m/s2 per sqrt(Hz), of forces, shaking included; absent: 0.05. `lslam info SEQUENCE --imu-toml FILE` measures it",
+        description="m/s2 per sqrt(Hz), of forces, shaking included; absent: 0.05; see `lslam info SEQUENCE --imu-toml FILE`",
     )
     gyro_noise: float | None = Field(
         None, gt=0, description="rad/s per sqrt(Hz), of rates, the least: more is learnt; absent: 0.000175"

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from lslam.geometry import se3, so3
 from lslam.inertial.gyroscope import Gyroscope
 from lslam.inertial.imu_estimate import GRAVITY, ImuEstimate
+from lslam.inertial.imu_noise import USUAL
 from lslam.inertial.navigation_state import BEGIN_SIGMA, SIZE, NavigationState
 from lslam.inertial.window import (
     EACH,
@@ -94,7 +95,7 @@ def test_increments_agree_with_the_truth() -> None:
 
 def test_jacobians_are_derivatives() -> None:
     imu, (a, b) = stream(), disturbed(true_window(2)).moments
-    window = Window((a, b), DOWN, np.eye(3) + 0.01, 1e-6, true_window(1).past)
+    window = Window((a, b), DOWN, np.eye(3) + 0.01, 1e-6, USUAL, true_window(1).past)
     _, J = window.residual(a, b, imu)
     numerical = np.zeros_like(J)
     step = 1e-6

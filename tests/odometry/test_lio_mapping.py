@@ -122,5 +122,5 @@ def test_it_does_nothing_without_an_imu() -> None:
     assert windowed().imu.use
     with pytest.raises(InputError, match="has no IMU: run without --imu, by a method that needs none"):
         lslam.run(sample(5), windowed())
-    with pytest.raises(UsageError, match="of the loosely coupled IMU, which lio-mapping does not have"):
+    with pytest.raises(UsageError, match="of the loosely coupled IMU, lio-mapping weighs points and IMU together"):
         check_config(config_of("lio-mapping", "imu.velocity=integrated"))
