@@ -17,6 +17,7 @@ from lslam.inertial.imu_estimate import GRAVITY, GRAVITY_SIGMA, GRAVITY_WALK, Im
 from lslam.inertial.imu_noise import ImuNoise
 from lslam.inertial.integrate import integrate
 from lslam.inertial.navigation_state import GYRO, OWN, REST, NavigationState, cut_noise, process_noise, transition
+from lslam.kernels import positive
 from lslam.kernels.rotation import vector_between
 from lslam.types.imu import ImuStream
 from lslam.types.scan_equations import ScanEquations
@@ -103,7 +104,7 @@ class Window:
         moment = moment_of(state, instant_ns, stamp_ns, T_imu_scan)
         order = np.concatenate([COMMON, OWN])
         e = state.estimate
-        information = inverse(state.covariance[np.ix_(order, order)])
+        information = positive.inverse(state.covariance[np.ix_(order, order)])
         past = Past(information, np.zeros(len(order)), e.gravity, e.gyroscope.axes, moment)
         return cls((moment,), e.gravity, e.gyroscope.axes, e.gyroscope.rate_variance, e.gyroscope.noise, past)
 
@@ -122,7 +123,7 @@ class Window:
         window, H = self, np.zeros((0, 0))
         for _ in range(MOST_STEPS):
             H, g = window.equations(imu)
-            d = -solve(H, g)
+            d = -positive.solved(H, g)
             window = window.moved(d)
             if np.abs(d[SHARED:].reshape(-1, EACH)[:, :6]).max() < STEP:
                 break
@@ -202,7 +203,7 @@ class Window:
         W = certainty(nanoseconds, self.rate_variance, self.noise)
         if step.hidden is not None:
             Q = process_noise(1e-9 * nanoseconds, self.rate_variance, self.noise) + cut_noise(step.hidden, F)
-            W = inverse(Q[np.ix_(OWN, OWN)])
+            W = positive.inverse(Q[np.ix_(OWN, OWN)])
         J = np.concatenate([-F[OWN][:, COMMON], -F[OWN][:, OWN], np.eye(EACH)], axis=1)
         return b.away(led), J, W
 
@@ -230,7 +231,7 @@ class Window:
         which = np.r_[0:SHARED, len(H) - EACH : len(H)]
         P = np.zeros_like(like.covariance)
         order = np.concatenate([COMMON, OWN])
-        P[np.ix_(order, order)] = inverse(H)[np.ix_(which, which)]
+        P[np.ix_(order, order)] = positive.inverse(H)[np.ix_(which, which)]
         gyroscope = replace(like.estimate.gyroscope, bias=m.gyro_bias, axes=self.axes, covariance=P[GYRO, GYRO])
         estimate = ImuEstimate(m.velocity, self.gravity, m.accel_bias, gyroscope, P[REST, REST])
         return NavigationState(se3.normalise(m.T_world_imu), estimate, P)
@@ -262,26 +263,15 @@ def off_by(a: Floats, b: Floats) -> Floats:
 def marginalised(H: Floats, g: Floats, gone: NDArray[np.int64]) -> tuple[Floats, Floats]:
     """Normal equations of what is left, without those `gone`: the Schur complement."""
     left = np.setdiff1d(np.arange(len(g)), gone)
-    across = H[np.ix_(left, gone)]
-    solved = solve(H[np.ix_(gone, gone)], np.column_stack([across.T, g[gone]]))
-    kept = H[np.ix_(left, left)] - across @ solved[:, :-1]
-    return 0.5 * (kept + kept.T), g[left] - across @ solved[:, -1]
+    # The gradient rides along as one more column.
+    across, n = np.column_stack([H[np.ix_(gone, left)], g[gone]]), len(left)
+    rest = np.zeros((n + 1, n + 1))
+    rest[:n, :n], rest[:n, n], rest[n, :n] = H[np.ix_(left, left)], g[left], g[left]
+    kept = positive.complement(H[np.ix_(gone, gone)], across, rest)
+    return 0.5 * (kept[:n, :n] + kept[:n, :n].T), kept[:n, n].copy()
 
 
 def loosened(H: Floats, g: Floats, part: slice, variance: float) -> tuple[Floats, Floats]:
     """Normal equations after a `part` of what they speak of walked by so much: the Schur complement of where it was."""
     K = np.linalg.inv(np.eye(part.stop - part.start) / variance + H[part, part])
     return H - H[:, part] @ K @ H[part], g - H[:, part] @ K @ g[part]
-
-
-def solve(H: Floats, right: Floats) -> Floats:
-    """inv(H) right of a positive definite H, whose entries are of many units."""
-    scale = 1.0 / np.sqrt(np.diag(H))
-    scaled = H * np.outer(scale, scale)
-    return np.asarray((np.linalg.solve(scaled, (right.T * scale).T).T * scale).T)
-
-
-def inverse(H: Floats) -> Floats:
-    """The inverse of a positive definite H, whose entries are of many units."""
-    P = solve(H, np.eye(len(H)))
-    return np.asarray(0.5 * (P + P.T))

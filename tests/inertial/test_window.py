@@ -18,12 +18,11 @@ from lslam.inertial.window import (
     SHARED,
     Moment,
     Window,
-    inverse,
     loosened,
     marginalised,
     off_by,
-    solve,
 )
+from lslam.kernels import positive
 from lslam.types.imu import ImuStream
 from lslam.types.scan_equations import ScanEquations
 
@@ -139,8 +138,8 @@ def test_marginalising_a_linear_problem_leaves_its_solution_and_covariance() -> 
     H, g = (J * scale).T @ (J * scale), (J * scale).T @ rest
     gone, left = np.array([0, 4, 5, 9]), np.array([1, 2, 3, 6, 7, 8, 10, 11])
     kept, gradient = marginalised(H, g, gone)
-    np.testing.assert_allclose(solve(kept, gradient), solve(H, g)[left], rtol=1e-7)
-    np.testing.assert_allclose(inverse(kept), inverse(H)[np.ix_(left, left)], rtol=1e-6)
+    np.testing.assert_allclose(positive.solved(kept, gradient), positive.solved(H, g)[left], rtol=1e-7)
+    np.testing.assert_allclose(positive.inverse(kept), positive.inverse(H)[np.ix_(left, left)], rtol=1e-6)
 
 
 def test_a_walk_widens_the_covariance_of_what_walks_and_keeps_the_mean() -> None:
@@ -164,14 +163,14 @@ def test_a_window_that_slid_knows_what_the_whole_of_it_knows(monkeypatch: pytest
     part, H_part = slid.solved(imu)
     assert len(part.moments) == 4
     tail = np.r_[0:SHARED, len(H) - 4 * EACH : len(H)]
-    sigma = np.sqrt(np.diag(inverse(H))[tail])
+    sigma = np.sqrt(np.diag(positive.inverse(H))[tail])
     off = np.concatenate([
         part.gravity - whole.gravity, (part.axes - whole.axes).ravel(),
         *(a.away(b) for a, b in zip(part.moments, whole.moments[4:], strict=True)),
     ])  # fmt: skip
     # Linearised earlier: a small part of what is known at all.
     assert np.abs(off / sigma).max() < 0.05
-    np.testing.assert_allclose(np.sqrt(np.diag(inverse(H_part))), sigma, rtol=0.02)
+    np.testing.assert_allclose(np.sqrt(np.diag(positive.inverse(H_part))), sigma, rtol=0.02)
 
 
 def test_biases_and_velocity_are_found() -> None:
