@@ -119,11 +119,16 @@ class Window:
         )
 
     def solved(self, imu: ImuStream) -> tuple[Window, Floats]:
-        """The joint estimate by Gauss-Newton, and its information (12 + 15 W, 12 + 15 W), common errors first."""
+        """The joint estimate by Gauss-Newton, and its information (12 + 15 W, 12 + 15 W), common errors first.
+
+        Where that is not positive definite the estimate stays, and `newest` has no finite covariance.
+        """
         window, H = self, np.zeros((0, 0))
         for _ in range(MOST_STEPS):
             H, g = window.equations(imu)
             d = -positive.solved(H, g)
+            if not np.isfinite(d).all():
+                break
             window = window.moved(d)
             if np.abs(d[SHARED:].reshape(-1, EACH)[:, :6]).max() < STEP:
                 break

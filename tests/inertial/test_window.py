@@ -201,3 +201,12 @@ def true_velocity(t: float) -> Floats:
 
 def like() -> ImuEstimate:
     return ImuEstimate(np.zeros(3), DOWN, np.zeros(3), Gyroscope(np.zeros(3)), np.zeros((9, 9)))
+
+
+def test_what_cannot_be_solved_stays_where_it_is_and_has_no_covariance() -> None:
+    window = begun(true_moment(0))
+    window = replace(window, past=replace(window.past, information=-window.past.information))
+    found, H = window.solved(stream())
+    np.testing.assert_array_equal(found.moments[0].T_world_imu, window.moments[0].T_world_imu)
+    newest = found.newest(H, NavigationState(np.eye(4), like(), np.zeros((SIZE, SIZE))))
+    assert not np.isfinite(newest.covariance).all()
