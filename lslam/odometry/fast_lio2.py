@@ -25,7 +25,6 @@ class FastLio2(Icp):
     """
 
     deskew = "by back propagation of the filter"
-    is_tightly_coupled = True
 
     def information_of(self, prior: MotionPrior) -> NDArray[np.float64] | None:
         """The inverse of the filter's covariance."""
