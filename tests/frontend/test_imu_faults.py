@@ -17,7 +17,7 @@ from lslam.geometry import so3
 from lslam.simulation.scenarios import simulate
 
 COUNT = 40
-# m, of the ATE: a walk of 4 s; without an IMU it is about as much.
+# m, of the ATE: a walk of 4 s.
 BOUND = 0.05
 QUIET = ("map.write=false", "report.html=false", "loops.use=false", "imu.use=true", "imu.start_s=2")
 
