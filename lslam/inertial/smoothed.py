@@ -13,7 +13,6 @@ from lslam.geometry import se3
 from lslam.inertial.filter import FilterMotion
 from lslam.inertial.gyroscope import Gyroscope
 from lslam.inertial.imu_estimate import ImuEstimate
-from lslam.inertial.imu_noise import ACCEL_WALK, BIAS_WALK
 from lslam.inertial.integrate import Increments
 from lslam.inertial.navigation_state import GYRO, OWN, REST, NavigationState, cut_noise, process_noise, transition
 from lslam.registration.acceptance import PRIOR_COVARIANCE
@@ -114,12 +113,10 @@ def _felt(e: ImuEstimate, step: Increments, R: Floats) -> PreintegratedStep:
 
 def _coasted(e: ImuEstimate, moved: Floats, seconds: float) -> PreintegratedStep:
     """The motion (4, 4) of the IMU that constant velocity expects, over a gap or after the IMU was refused."""
-    C = np.zeros((15, 15))
+    walk = e.gyroscope.noise
+    sigmas = BRAKING * seconds, walk.accel_walk * seconds**0.5, walk.gyro_walk * seconds**0.5
+    C = np.diag(np.repeat([0.0, 0.0, *np.square(sigmas)], 3))
     C[:6, :6] = PRIOR_COVARIANCE
-    for k, sigma in zip(
-        (6, 9, 12), (BRAKING * seconds, ACCEL_WALK * seconds**0.5, BIAS_WALK * seconds**0.5), strict=True
-    ):
-        C[k : k + 3, k : k + 3] = sigma**2 * np.eye(3)
     none = np.zeros((3, 3))
     return PreintegratedStep(
         0.0, moved[:3, :3], np.zeros(3), moved[:3, 3], none, none, np.zeros((3, 12)), e.accel_bias, e.gyroscope.bias,
