@@ -79,7 +79,9 @@ class SmoothedMotion(FilterMotion):
         if self._linked is None or self._instant_ns is None or self._linked[0] >= instant_ns:
             return link
         before_ns, before = self._linked
-        if not self.refusal and self._covers(before_ns, instant_ns):
+        # Since then it stood, in no state of the smoother: its pose is known, forces over minutes lead anywhere.
+        has_stood = self._instant_ns != before_ns and not self._was_bridged
+        if not self.refusal and not has_stood and self._covers(before_ns, instant_ns):
             felt = self.estimate.over(self.imu, np.array([before_ns, instant_ns]))
             return replace(link, step=_felt(self.estimate, felt, (before @ self.T_lidar_imu)[:3, :3]))
         moved = se3.relative(before @ self.T_lidar_imu, T_world_imu)
@@ -112,7 +114,7 @@ def _felt(e: ImuEstimate, step: Increments, R: Floats) -> PreintegratedStep:
 
 
 def _coasted(e: ImuEstimate, moved: Floats, seconds: float) -> PreintegratedStep:
-    """The motion (4, 4) of the IMU that constant velocity expects, over a gap or after the IMU was refused."""
+    """The motion (4, 4) of the IMU that is expected over a gap, after it stood, or after the IMU was refused."""
     walk = e.gyroscope.noise
     sigmas = BRAKING * seconds, walk.accel_walk * seconds**0.5, walk.gyro_walk * seconds**0.5
     C = np.diag(np.repeat([0.0, 0.0, *np.square(sigmas)], 3))

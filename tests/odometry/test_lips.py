@@ -110,6 +110,25 @@ def test_over_a_gap_and_a_lost_scan_the_planes_carry_on() -> None:
     assert worst(results) < 0.3
 
 
+def test_behind_a_stand_a_scan_is_linked_by_its_pose_and_not_by_all_that_was_felt() -> None:
+    one = tracker()
+    loaded = list(read_ahead(walk(), one.odometry.prepare, 1))
+    results = [one.track(scan) for scan in loaded[:8]]
+    stood, last = results[-1].T_world_lidar, walk().scans[13]
+    assert isinstance(last, Scan)
+    linked = one.motion.sweep(loaded[8].stamp_ns, last.span).link
+    assert linked is not None
+    assert linked.step is not None
+    assert linked.step.seconds == pytest.approx(0.1, abs=0.01)
+    for scan in loaded[8:13]:
+        one.motion.correct(scan.stamp_ns, stood)
+    prior = one.motion.sweep(last.stamp_ns, last.span)
+    assert prior.link is not None
+    assert prior.link.step is not None
+    assert prior.link.step.seconds == 0.0
+    assert np.linalg.norm(prior.link.step.position) < 0.15
+
+
 def test_where_there_is_only_ground_the_directions_it_leaves_free_are_said() -> None:
     truth, rng = walk().ground_truth, np.random.default_rng(0)
     assert truth is not None
