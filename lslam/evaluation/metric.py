@@ -43,7 +43,7 @@ class MetricRow:
 class TrajectoryMetric(ABC, Generic[Score]):
     """One way to score matched poses.
 
-    A metric is a subclass in a module of its own and an entry of `evaluation.metrics.METRICS`. `measure` makes its score: a
+    A metric is a subclass in a module of its own and an entry of `evaluation.evaluate.METRICS`. `measure` makes its score: a
     frozen dataclass with a `recipe`. From `columns` follows all that is shown; a metric with a form of its own overrides
     the methods.
 

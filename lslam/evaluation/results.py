@@ -123,7 +123,7 @@ class Evaluation:
 
     matched, possible : pairs found, pairs at most; stamps_ns : (N,) of the matched poses, on the ground truth's clock
     distance : (N,) m travelled along the ground truth; gt_positions : (N, 3) m; path_length : m
-    scores : by key of the metric (`evaluation.metrics`), each with its recipe; shown : words of `eval.metrics`
+    scores : by key of the metric (`evaluation.evaluate`), each with its recipe; shown : words of `eval.metrics`
     time_offset : s added to the estimate's stamps; association : recipe sentence; notes : decisions and warnings
     faults : those of the notes that say what makes the numbers wrong
     odometry : of a run whose poses a graph moved, the same of the poses before

@@ -27,7 +27,7 @@ from lslam.types.building import BuildingMatch
 
 Floats = NDArray[np.float64]
 
-GROWTH, ROUNDS = 2.0, 30  # of graduated non-convexity, as in `graph.gnc`
+GROWTH, ROUNDS = 2.0, 30  # of graduated non-convexity, as in `graph.solve`
 PROBABILITY = 0.999  # chi-square quantile of an inlier match
 SUPPORT = 2  # other matches that must agree
 # Shares of information below which a direction is unobserved, and from which another match observes it as well.
@@ -70,7 +70,7 @@ def solve_buildings(
 ) -> BuildingSolution:
     """Displacements of the buildings with `middles` (B, 2), m, from `matches`, with each keyframe at `poses` (3,) of the map.
 
-    Outlier matches are rejected by graduated non-convexity with truncated least squares (`graph.gnc`); the map's prior is no
+    Outlier matches are rejected by graduated non-convexity with truncated least squares (`graph.solve`); the map's prior is no
     outlier candidate. Matches of one building share the map's error, so the covariances are those of one match of mean
     information, while the displacements use all of them.
     """

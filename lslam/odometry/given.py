@@ -73,7 +73,7 @@ class GivenMotion(Stateful, MotionModel):
 
 
 class GivenPoses(Stateful):
-    """Scan by scan the pose of a trajectory, which has to be of the LiDAR: `pipeline.given_poses` sees to it."""
+    """Scan by scan the pose of a trajectory, which has to be of the LiDAR: `pipeline.job.bind` sees to it."""
 
     deskew = "by the motion of the given trajectory"
     ignores_prior = True
