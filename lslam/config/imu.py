@@ -1,4 +1,4 @@
-"""Section `imu`: the loosely coupled inertial measurement unit."""
+"""Section `imu`: the inertial measurement unit."""
 
 from __future__ import annotations
 
