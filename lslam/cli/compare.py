@@ -16,7 +16,8 @@ from lslam.cli import options
 from lslam.cli.console import log, setup_logging, show
 
 if TYPE_CHECKING:
-    from lslam.studies.subjects import Plan, Subject
+    from lslam.studies.plan import Plan
+    from lslam.studies.subjects import Subject
     from lslam.types.comparison import Comparison
     from lslam.types.trajectory import Trajectory
 
@@ -91,7 +92,7 @@ def command(sequences: tuple[str, ...], **given: Any) -> None:
 def _plan(sequences: tuple[str, ...], given: dict[str, Any]) -> Plan:
     """What is compared; what is cheap to see is seen before anything heavy is imported."""
     from lslam.studies.output import COMPARISON, require_free
-    from lslam.studies.subjects import Plan, check_numbers
+    from lslam.studies.plan import Plan, check_numbers
 
     seeds, crop = options.seeds_of(given["seeds"]), _crop(given["crop"])
     check_numbers(seeds, given["jobs"], crop)
@@ -132,7 +133,7 @@ def _truth(path: Path | None, subjects: list[Subject]) -> Trajectory | None:
     from lslam.cli.run import read_truth
     from lslam.errors import UsageError
     from lslam.readers import open_sequence
-    from lslam.studies.subjects import ONE_TRUTH
+    from lslam.studies.plan import ONE_TRUTH
 
     if path is None:
         return None

@@ -66,7 +66,7 @@ def command(source: str, kind: str, out: Path, **given: Any) -> None:
 
 def _is_trajectory(source: str) -> bool:
     """A run folder, or a file that is no bag."""
-    from lslam.formats.bag_files import list_bag_files
+    from lslam.formats.bag_listing import list_bag_files
 
     path = Path(source).expanduser()
     return (path / "trajectory.tum").is_file() or (path.is_file() and not list_bag_files(path))

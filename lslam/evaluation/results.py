@@ -150,3 +150,9 @@ class Evaluation:
         """Absolute errors by alignment."""
         errors: dict[str, AbsoluteError] = self.scores["ate"]
         return errors
+
+    @property
+    def rpe(self) -> list[RelativeError]:
+        """Relative errors by distance."""
+        errors: list[RelativeError] = self.scores["rpe"]
+        return errors

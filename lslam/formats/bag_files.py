@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import re
 import shutil
 import sqlite3
 import struct
@@ -21,12 +20,11 @@ from typing import Any, NamedTuple, Protocol
 
 from lslam.errors import InputError, OutputError, UsageError, cause
 from lslam.formats.bag_chunks import Topic, unpack
+from lslam.formats.bag_listing import SUFFIXES, list_bag_files, suffix_of
 from lslam.formats.bag_sqlite import SqliteBag
 from lslam.formats.mcap_records import McapFile
 from lslam.formats.ros1_records import Ros1Bag
 
-SUFFIXES = (".bag", ".bag.active", ".mcap", ".db3")
-_PART = re.compile(r"(.+)_\d+\.(bag|mcap|db3)(?:\.active)?$")
 # Said once, at the beginning: where lslam's own bags keep what else is known of a sequence, as `sequence.toml`.
 INFO_TOPIC = "/lslam/sequence"
 LATCHED = ("/tf_static", INFO_TOPIC)
@@ -36,48 +34,6 @@ _ZSTD = b"\x28\xb5\x2f\xfd"  # ROS 2 can compress every message by itself
 _ZSTD_BLOCK = 1 << 18  # more than the largest block of zstd
 _TRANSFORMS = "tf2_msgs/msg/TFMessage"
 _OLD_NAMES = {"tf/msg/tfMessage": _TRANSFORMS}
-
-
-def list_bag_files(path: Path) -> list[Path]:
-    """The file itself, or the bag files of a folder in natural order; empty when there are none.
-
-    Raises InputError for a folder whose files are compressed as a whole.
-    """
-    if path.is_file():
-        return [path] if suffix_of(path) else []
-    if not path.is_dir():
-        return []
-    files = [p for p in path.iterdir() if p.is_file() and not p.name.startswith(".")]
-    # The last part of a set whose recorder died is still called .bag.active.
-    kinds = [k for p in files if (k := suffix_of(p).removesuffix(".active"))]
-    packed = [p for p in files if p.name.endswith((".mcap.zstd", ".db3.zstd"))]
-    if packed and not kinds:
-        raise InputError(
-            f"{packed[0]} is compressed as a whole: `zstd -d {packed[0].name}` in {path} makes it readable"
-        )
-    if not kinds:
-        return []
-    kind = max(sorted(set(kinds)), key=kinds.count)
-    return sorted((p for p in files if suffix_of(p).removesuffix(".active") == kind), key=_natural)
-
-
-def parts_beside(path: Path) -> list[Path]:
-    """Files beside a bag that recorders name so when they split it: as `path` but for the number at the end of the name."""
-    stem = _PART.match(path.name)
-    if stem is None:
-        return []
-    beside = (p for p in path.parent.iterdir() if p.is_file() and p != path)
-    return sorted((p for p in beside if (m := _PART.match(p.name)) and m.groups() == stem.groups()), key=_natural)
-
-
-def suffix_of(path: Path) -> str:
-    """The suffix that makes a file a bag, empty when it is none."""
-    return next((s for s in SUFFIXES if path.name.lower().endswith(s)), "")
-
-
-def _natural(path: Path) -> list[tuple[int, str]]:
-    """Sort key with numbers compared as numbers: part_2 before part_10."""
-    return [(int(p), "") if p.isdecimal() else (-1, p) for p in re.split(r"(\d+)", path.name)]
 
 
 class Recording(Protocol):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
@@ -11,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.config.imu import ImuConfig
+from lslam.errors import GraphError
 from lslam.geometry import noise, se3
 from lslam.inertial.fusion import InertialMotion
 from lslam.inertial.gyroscope import Gyroscope
@@ -26,6 +28,7 @@ from lslam.types.scan_result import ScanResult
 from lslam.types.state import State
 
 Floats = NDArray[np.float64]
+log = logging.getLogger("lslam")
 
 # Velocity, gravity and accelerometer bias of an `ImuEstimate` among the 18 of an `InertialState`.
 ESTIMATE = np.r_[6:9, 15:18, 9:12]
@@ -90,7 +93,11 @@ class SmootherMotion(InertialMotion):
         there = noise.transported(C, T_world_imu[:3, 3] - result.T_world_lidar[:3, 3])
         begin = (self._pose @ self.T_lidar_imu)[:3, :3]
         self._taught = instant_ns, self.estimate.taught(step, begin, T_world_imu[:3, :3], C[3:, 3:]), C[:3, :3]
-        found = self.smoother.add(self._measured(step, T_world_imu, there))
+        try:
+            found = self.smoother.add(self._measured(step, T_world_imu, there))
+        except GraphError as error:
+            self._is_begun = False
+            return replace(result, status="bridged", reason=str(error), T_world_lidar=prior.pose, converged=False)
         self._added = instant_ns, found
         within = se3.relative(result.T_world_lidar, middle)
         pose = se3.normalise(found.T_world_imu @ self.T_imu_lidar @ se3.inverse(within))
@@ -117,14 +124,24 @@ class SmootherMotion(InertialMotion):
             return
         if added is not None and added[0] == self._instant_ns:
             found = added[1]
-        elif step is not None:
-            found = self.smoother.add(self._measured(step))
         else:
-            # The first scan, the first behind a gap, or one that stood: at its pose, by what the loose estimate knows.
-            self.smoother.begin(self._beginning())
-            self._is_begun = True
-            return
+            carried = None if step is None else self._carried_by_smoother(step)
+            if carried is None:
+                # The first scan, the first behind a gap or a graph without solution, or one that stood: at its pose, by what
+                # the loose estimate knows.
+                self.smoother.begin(self._beginning())
+                self._is_begun = True
+                return
+            found = carried
         self.estimate = self._as_estimate(found)
+
+    def _carried_by_smoother(self, step: Increments) -> InertialState | None:
+        """The state at the end of `step` by the IMU alone; None where the graph has no solution."""
+        try:
+            return self.smoother.add(self._measured(step))
+        except GraphError as error:
+            log.warning("%s: the graph begins anew", error)
+            return None
 
     def chain(self, keyframes: Sequence[tuple[int, int]], imu_noise: SmootherNoise) -> InertialChain:
         """The IMU between these keyframes, numbers and stamps in ns, by what is known of it now."""

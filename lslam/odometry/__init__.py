@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import TYPE_CHECKING, cast
 
-from lslam.config.odometry import TIGHTLY_COUPLED
 from lslam.plugins import factory, known, require
 
 if TYPE_CHECKING:
@@ -89,6 +88,8 @@ class ListedMethod:
 
 def coupling_of(method: str) -> Coupling:
     """What the method does with an IMU; those of other packages are predicted by it."""
+    from lslam.config.odometry import TIGHTLY_COUPLED
+
     if method in TIGHTLY_COUPLED:
         return Coupling.TIGHT
     return Coupling.NONE if method in LIDAR_ONLY else Coupling.LOOSE

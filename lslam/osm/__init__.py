@@ -7,10 +7,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from importlib import import_module
-from typing import cast
+from typing import TYPE_CHECKING, cast
 
 from lslam.errors import UsageError, nearest
-from lslam.osm.matcher import Lay
+
+if TYPE_CHECKING:
+    from lslam.osm.matcher import Lay
 
 
 @dataclass(frozen=True)
@@ -23,7 +25,7 @@ class Matcher:
     @property
     def lay(self) -> Lay:
         """Imported when it is asked for."""
-        return cast(Lay, import_module(self.module).lay)
+        return cast("Lay", import_module(self.module).lay)
 
 
 MATCHERS = {

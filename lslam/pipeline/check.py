@@ -39,15 +39,7 @@ def check_config(config: Config) -> None:
         )
     if method == "poses" and config.imu.use:
         raise UsageError("--imu does nothing with --poses, whose motion is given: drop one of them")
-    if method in TIGHTLY_COUPLED and (config.imu.velocity != "registration" or not config.imu.weigh):
-        raise UsageError(
-            f"imu.velocity and imu.weigh are of the loosely coupled IMU, {method} weighs points and IMU together: drop them"
-        )
-    if (config.imu.estimate_offset or config.imu.estimate_extrinsics) and method in ("lio-sam", "lio-mapping", "lips"):
-        raise UsageError(
-            f"imu.estimate_offset and imu.estimate_extrinsics are states of a filter, which {method} does not have: drop them, "
-            "or take --method fast-lio2"
-        )
+    _check_imu(config)
     if config.map.write and (config.map.denoise or config.map.mesh):
         from lslam.maps.mesh import require_open3d
 
@@ -66,6 +58,24 @@ def check_config(config: Config) -> None:
     for delta in config.eval.delta:
         parse_delta(delta)
     check_words(config.eval.metrics)
+
+
+def _check_imu(config: Config) -> None:
+    """What a tightly coupled method leaves of the keys of the IMU."""
+    method = config.odometry.method
+    if method in TIGHTLY_COUPLED and (config.imu.velocity != "registration" or not config.imu.weigh):
+        raise UsageError(
+            f"imu.velocity and imu.weigh are of the loosely coupled IMU, {method} weighs points and IMU together: drop them"
+        )
+    if method == "lio-sam" and config.lio_sam.graph_imu and config.graph.imu_orientation:
+        raise UsageError(
+            "graph.imu_orientation and lio_sam.graph_imu both bring the gyroscope's turns into the pose graph: set one to false"
+        )
+    if (config.imu.estimate_offset or config.imu.estimate_extrinsics) and method in ("lio-sam", "lio-mapping", "lips"):
+        raise UsageError(
+            f"imu.estimate_offset and imu.estimate_extrinsics are states of a filter, which {method} does not have: drop them, "
+            "or take --method fast-lio2"
+        )
 
 
 def _check_heeded(config: Config) -> None:

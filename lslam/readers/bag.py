@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from lslam.errors import InputError
 from lslam.formats import bag_streams
-from lslam.formats.bag_files import INFO_TOPIC, Bag, BagTopic, list_bag_files, open_bag, parts_beside, read_header
+from lslam.formats.bag_files import INFO_TOPIC, Bag, BagTopic, open_bag, read_header
+from lslam.formats.bag_listing import list_bag_files, parts_beside
 from lslam.formats.bag_streams import Stream, chain, read_poses
 from lslam.formats.point_cloud import TIME_NAMES, PointCloud
 from lslam.formats.pointcloud2 import decode_livox, decode_pointcloud2

@@ -8,7 +8,7 @@ import re
 from pathlib import Path
 
 from lslam.errors import InputError
-from lslam.formats.bag_files import SUFFIXES, list_bag_files
+from lslam.formats.bag_listing import SUFFIXES, list_bag_files
 from lslam.remote import RemotePath, as_path
 
 _SEQUENCE = re.compile(r"(?:.*/)?(?:seq)?(\d{1,2})$")

@@ -6,17 +6,18 @@ import io
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import TYPE_CHECKING, Any
 
 from lslam.errors import UsageError, nearest
-from lslam.evaluation.results import AbsoluteError, Evaluation
 from lslam.formats.atomic import atomic_write
-from lslam.formats.osm_buildings import BuildingExtract
 from lslam.printable import printable
-from lslam.reports.evaluations import short_names
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from lslam.evaluation.results import AbsoluteError, Evaluation
+    from lslam.formats.osm_buildings import BuildingExtract
 
 FORMATS = ("png", "svg", "pdf")
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")  # Okabe and Ito: safe for colour blindness
@@ -68,6 +69,8 @@ def write_plot(path: str | Path, evaluations: Sequence[Evaluation], names: Seque
 
     Raises UsageError for another suffix, OutputError when the file cannot be written.
     """
+    from lslam.reports.evaluations import short_names
+
     path = Path(path)
     check_plot_path(path)
     with house_style():
@@ -78,6 +81,7 @@ def write_plot(path: str | Path, evaluations: Sequence[Evaluation], names: Seque
 
 
 def _draw(evaluations: Sequence[Evaluation], names: Sequence[str]) -> Any:
+    import numpy as np
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(13, 9), layout="constrained")
@@ -191,6 +195,7 @@ def write_buildings_png(path: Path, extract: BuildingExtract, along: NDArray[Any
 
 
 def _outline(rings: tuple[NDArray[np.float64], ...]) -> Any:
+    import numpy as np
     from matplotlib.path import Path as Outline
 
     return Outline.make_compound_path(*(Outline(np.concatenate([r, r[:1]]), closed=True) for r in rings))

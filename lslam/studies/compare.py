@@ -23,10 +23,11 @@ from lslam.studies.grid import Cell, Job, expand, fitted_scene, recorded_cell
 from lslam.studies.jobs import finished, pool_of, run_jobs
 from lslam.studies.output import COMPARISON, SIMULATED, lock_output, release_output
 from lslam.studies.paired import TIE_M, compare_pairs, summarise
+from lslam.studies.plan import Plan, check_plan
 from lslam.studies.results import IMU, collect_run, metrics_of
 from lslam.studies.runner import StudyProgress
 from lslam.studies.scenes import Scene, simulate_once
-from lslam.studies.subjects import Plan, Subject, check_plan, scans_needed, with_range
+from lslam.studies.subjects import Subject, scans_needed, with_range
 from lslam.types.comparison import Comparison, Difference, Drawing, DrawnRun, RunScore
 from lslam.types.sequence import Sequence as Recording
 from lslam.types.trajectory import Trajectory

@@ -11,7 +11,7 @@ from lslam.config import Config
 from lslam.config.input import AS_CONFIGURED, ScanRange
 from lslam.config.study import StudySequence
 from lslam.errors import UsageError
-from lslam.formats.bag_files import suffix_of
+from lslam.formats.bag_listing import suffix_of
 from lslam.pipeline.resume import imu_digest, input_digest, job_digest, listing_digest
 from lslam.printable import file_safe
 from lslam.readers import open_sequence

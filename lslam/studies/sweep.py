@@ -11,7 +11,6 @@ from pathlib import Path
 from lslam.config.finding import ExpectedFinding
 from lslam.config.study import StudyConfig, parse_study, read_study
 from lslam.errors import InputError, RunFailedError, UsageError, nearest
-from lslam.evaluation.sensitivity import evaluate_study
 from lslam.formats.study_files import read_study_csv
 from lslam.printable import toml_text
 from lslam.reports.study_html import timing_notes, write_study_files
@@ -80,6 +79,8 @@ def write_study_report(
     findings : what the study is expected to find, for the verdicts; title : of the page, the names of the studies by default
     Raises OutputError.
     """
+    from lslam.evaluation.sensitivity import evaluate_study
+
     results = evaluate_study(rows, findings)
     write_study_files(folder, results, rows, title or ", ".join(dict.fromkeys(row.study for row in rows)))
     return results

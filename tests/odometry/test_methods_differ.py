@@ -13,6 +13,8 @@ from lslam.odometry import METHODS, create_odometry
 from lslam.simulation.scenarios import simulate
 
 FOREIGN = {"kiss-icp", "small-gicp", "open3d-gicp", "poses"}
+# On scans without times a sweep has one pose, and `ct-icp` is `icp` to the last bit.
+ALIKE = {("ct-icp", "icp")}
 # Their own ways of looking twice.
 OWN = {"", "less planar points", "coarse-to-fine", "start search"}
 
@@ -27,4 +29,5 @@ def test_no_two_methods_give_the_same_trajectory() -> None:
         trajectories[method] = np.stack([r.T_world_lidar for r in results])
     assert len(trajectories) >= 10
     for one, other in combinations(trajectories, 2):
-        assert np.abs(trajectories[one] - trajectories[other]).max() > 1e-6, f"{one} and {other}"
+        off = np.abs(trajectories[one] - trajectories[other]).max()
+        assert (off == 0) if (one, other) in ALIKE else (off > 1e-6), f"{one} and {other}"

@@ -25,9 +25,10 @@ from lslam.simulation.scenarios import simulate
 from lslam.studies.compare import compare
 from lslam.studies.grid import Job
 from lslam.studies.jobs import finished, run_jobs
+from lslam.studies.plan import Plan, check_plan
 from lslam.studies.runner import StudyProgress, WorkerPool
 from lslam.studies.states import read_state
-from lslam.studies.subjects import Plan, Subject, check_plan
+from lslam.studies.subjects import Subject
 from lslam.studies.variants import find_variants
 from lslam.studies.worker import WorkerContext
 from lslam.types.comparison import Comparison, RunScore
