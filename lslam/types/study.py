@@ -4,16 +4,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from math import nan
-from typing import Literal
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import TYPE_CHECKING, Literal
 
 from lslam.types.comparison import USABLE
 
 Value = bool | int | float | str
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    Floats = NDArray[np.float64]
+    Bools = NDArray[np.bool_]
 Outcome = Literal["confirmed", "refuted", "undecided"]
 # And the numbers that say so.
 Judged = tuple[Outcome, str]
@@ -143,11 +144,15 @@ class Curve:
     @property
     def scored(self) -> Bools:
         """(V, S) runs that say whether their values work: with an error, or lost. One without ground truth does not."""
+        import numpy as np
+
         return np.asarray(self.lost | np.isfinite(self.quantities["translation"]))
 
     @property
     def is_lost(self) -> Bools:
         """(V,) values at which more than half of the runs that say so were lost."""
+        import numpy as np
+
         return np.asarray(2 * self.lost.sum(1) > self.scored.sum(1))
 
     def of_seed(self, index: int) -> Curve:
