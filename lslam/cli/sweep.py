@@ -98,7 +98,7 @@ def _sweep(word: str, given: dict[str, Any]) -> Sweep:
     from lslam.config.load import check_settings
     from lslam.config.study import parse_study
     from lslam.studies.output import STUDY, require_free
-    from lslam.studies.sweep import find_study
+    from lslam.studies.study_files import find_study
 
     check_settings(given["settings"])
     study = find_study(word)
@@ -131,7 +131,7 @@ def _report(folder: Path) -> None:
 
 
 def _print_list() -> None:
-    from lslam.studies.sweep import find_study, study_names
+    from lslam.studies.study_files import find_study, study_names
 
     for name in study_names():
         show(f"{name:<22}  {find_study(name).summary}\n")

@@ -5,15 +5,13 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from importlib import resources
 from pathlib import Path
 
 from lslam.config.finding import ExpectedFinding
-from lslam.config.study import StudyConfig, parse_study, read_study
-from lslam.errors import InputError, RunFailedError, UsageError, nearest
+from lslam.config.study import StudyConfig, read_study
+from lslam.errors import InputError, RunFailedError
 from lslam.formats.study_files import read_study_csv
 from lslam.printable import toml_text
-from lslam.reports.study_html import timing_notes, write_study_files
 from lslam.studies.expanded_study import ExpandedStudy, check_same, make_runs
 from lslam.studies.grid import cells_of, expand
 from lslam.studies.jobs import Engine
@@ -22,11 +20,8 @@ from lslam.studies.results import RESULTS
 from lslam.studies.runner import StudyProgress
 from lslam.studies.variants import study_variants
 from lslam.types.study import StudyResult, StudyRow
-from lslam.untrusted import parse_toml
 
 log = logging.getLogger("lslam")
-# Studies that ship with lslam.
-FOLDER = "ready"
 
 
 @dataclass(frozen=True)
@@ -80,6 +75,7 @@ def write_study_report(
     Raises OutputError.
     """
     from lslam.evaluation.sensitivity import evaluate_study
+    from lslam.reports.study_html import write_study_files
 
     results = evaluate_study(rows, findings)
     write_study_files(folder, results, rows, title or ", ".join(dict.fromkeys(row.study for row in rows)))
@@ -93,6 +89,8 @@ def report_folder(folder: Path) -> list[StudyResult]:
 
     Raises InputError for a folder without runs and what cannot be read, ConfigError for findings that make no sense, OutputError.
     """
+    from lslam.reports.study_html import timing_notes
+
     rows = read_study_csv(folder / RESULTS)
     if not rows:
         raise InputError(f"study {folder} has no finished run yet: lslam sweep with --out {folder} --resume makes them")
@@ -102,22 +100,3 @@ def report_folder(folder: Path) -> list[StudyResult]:
         return write_study_report(folder, rows)
     study = read_study(folder / STUDY)
     return write_study_report(folder, rows, study.finding, study.summary or study.name)
-
-
-def study_names() -> tuple[str, ...]:
-    """Names of the studies that ship with lslam: those of Girolimetto's chapter 5.3."""
-    files = resources.files(__package__).joinpath(FOLDER).iterdir()
-    return tuple(sorted(file.name.removesuffix(".toml") for file in files if file.name.endswith(".toml")))
-
-
-def find_study(word: str) -> StudyConfig:
-    """The study of a TOML file, else the ready one of that name.
-
-    Raises UsageError with the nearest name for what is neither, and what `read_study` raises.
-    """
-    if word.endswith(".toml") or Path(word).is_file():
-        return read_study(Path(word))
-    if word not in study_names():
-        raise UsageError(f"no study {word!r} and no TOML file; {nearest(word, study_names())}")
-    text = resources.files(__package__).joinpath(FOLDER, f"{word}.toml").read_text(encoding="utf-8")
-    return parse_study(parse_toml(text), f"study {word!r}", word)

@@ -16,7 +16,8 @@ from pathlib import Path
 
 import tables
 
-from lslam.studies.sweep import find_study, report_folder, study_names
+from lslam.studies.study_files import find_study, study_names
+from lslam.studies.sweep import report_folder
 from lslam.types.study import StudyResult
 
 
