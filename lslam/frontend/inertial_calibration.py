@@ -11,13 +11,13 @@ from lslam.inertial.initialise import InertialStart
 
 # An IMU whose turns lie so far beside those of the scans, and by so many sigma, is turned against T_lidar_imu: axes two per
 # cent askew (a consumer device's data sheet) show 1.6 deg.
-DOUBTFUL, SURE = np.deg2rad(2.0), 4.0
+LEAST_TURN_RAD, SIGMAS = np.deg2rad(2.0), 4.0
 
 
-def doubts(gyroscope: Gyroscope) -> str:
+def mounting_problem(gyroscope: Gyroscope) -> str:
     """A sentence where the turns contradict the rotation of T_lidar_imu and it is not estimated; else empty."""
     angle, sigma = gyroscope.tilt
-    if gyroscope.is_mounted or angle < DOUBTFUL or angle < SURE * sigma:
+    if gyroscope.is_mounted or angle < LEAST_TURN_RAD or angle < SIGMAS * sigma:
         return ""
     return (
         f"IMU: it turns about an axis {np.rad2deg(angle):.1f} deg (sigma {np.rad2deg(sigma):.1f}) beside that of the scans: "

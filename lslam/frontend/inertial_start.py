@@ -14,7 +14,7 @@ from lslam.config import Config
 from lslam.config.odometry import TIGHTLY_COUPLED
 from lslam.errors import InputError
 from lslam.formats.state_files import read_state, write_state
-from lslam.frontend.inertial_calibration import calibration_found, doubts
+from lslam.frontend.inertial_calibration import calibration_found, mounting_problem
 from lslam.frontend.motion_models import motion_of
 from lslam.frontend.register_scans import read_ahead
 from lslam.frontend.state_classes import STATE_CLASSES
@@ -206,7 +206,7 @@ def close_inertial(part: Inertial, results: list[ScanResult]) -> dict[str, Any]:
         part.problems.append(
             f"IMU: {motion.gap_scans} scans fell into gaps of the IMU and were predicted by constant velocity"
         )
-    if said := doubts(motion.estimate.gyroscope):
+    if said := mounting_problem(motion.estimate.gyroscope):
         part.problems.append(said)
     if motion.refusal:
         part.problems.append(f"the IMU was refused on the way, the run went on without it: {motion.refusal}")

@@ -89,7 +89,7 @@ class Lips(Stateful):
         )  # fmt: skip
 
     def update(self, prior: MotionPrior, found: Registered) -> ScanResult:
-        """The window goes on with the scan's planes, or without them where its result is not believed."""
+        """The window goes on with the scan's planes, or without them where its result is rejected."""
         began = time.perf_counter()
         window, predicted = found.detail
         if found.result.status != "ok":
@@ -146,7 +146,7 @@ class Lips(Stateful):
 
 
 def _refusal(window: PlaneWindow, planes: Planes, found: Longs) -> str:
-    """Why a scan's planes are not believed; empty where they are."""
+    """Why a scan's planes are rejected; empty where they are not."""
     if len(planes) == 0:
         return "no plane is seen: the IMU carries the scan"
     if len(window.landmarks) == 0:
