@@ -18,7 +18,7 @@ from lslam.evaluation.verdicts_of_places import (
     judge_holds_up_to,
     judge_largest_between,
 )
-from lslam.types.study import (
+from lslam.types.sensitivity import (
     Curve,
     CurveResult,
     FindingVerdict,
@@ -29,8 +29,8 @@ from lslam.types.study import (
     LawKind,
     Outcome,
     StudyResult,
-    StudyRow,
 )
+from lslam.types.study import StudyRow
 
 _OF_TIME = ("time_per_scan", "total_time")
 _LAWS = ("linear", "inverse", "product")

@@ -12,7 +12,8 @@ import numpy as np
 from lslam.evaluation.curves import FLAT, NOT_REGISTRATION, normalise, registration_ms
 from lslam.evaluation.laws import band
 from lslam.reports.picture import COLOURS, house_style, label, pictures
-from lslam.types.study import CurveResult, Floats, Law, StudyResult, StudyRow
+from lslam.types.sensitivity import CurveResult, Floats, Law, StudyResult
+from lslam.types.study import StudyRow
 
 # Of section 5.3, by studied parameter and figure.
 THESIS = {

@@ -15,7 +15,8 @@ from lslam.reports.grid_text import comma_separated
 from lslam.reports.html import template
 from lslam.reports.study_figures import StudyFigure, study_figures
 from lslam.reports.study_table import means_grid, study_recipes, study_tables
-from lslam.types.study import StudyResult, StudyRow
+from lslam.types.sensitivity import StudyResult
+from lslam.types.study import StudyRow
 from lslam.version import __version__
 
 

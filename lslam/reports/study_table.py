@@ -14,7 +14,8 @@ from lslam.evaluation.recipes import ALIGNMENTS
 from lslam.printable import counted, fixed, metres
 from lslam.reports.compare_table import CompareTable
 from lslam.reports.grid_text import Grid
-from lslam.types.study import CurveResult, Interval, Law, StudyResult, StudyRow
+from lslam.types.sensitivity import CurveResult, Interval, Law, StudyResult
+from lslam.types.study import StudyRow
 
 UNKNOWN = "-"
 LABELS = {"ate_se3": "ATE se3", "ate_origin": "ATE origin", "thesis_rmse": "thesis_rmse"}

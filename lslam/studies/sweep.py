@@ -19,7 +19,8 @@ from lslam.studies.output import STUDY, OutputOptions
 from lslam.studies.results import RESULTS
 from lslam.studies.runner import StudyProgress
 from lslam.studies.variants import study_variants
-from lslam.types.study import StudyResult, StudyRow
+from lslam.types.sensitivity import StudyResult
+from lslam.types.study import StudyRow
 
 log = logging.getLogger("lslam")
 

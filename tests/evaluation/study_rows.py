@@ -10,7 +10,8 @@ import numpy as np
 
 from lslam.config.finding import ExpectedFinding
 from lslam.evaluation.sensitivity import evaluate_study
-from lslam.types.study import FindingVerdict, StudyRow
+from lslam.types.sensitivity import FindingVerdict
+from lslam.types.study import StudyRow
 
 Formula = Callable[[float], float]
 

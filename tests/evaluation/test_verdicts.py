@@ -12,7 +12,8 @@ import pytest
 from study_rows import by_seed, outcome, rows_of, verdict
 
 from lslam.config.finding import Kind
-from lslam.types.study import FindingVerdict, StudyRow
+from lslam.types.sensitivity import FindingVerdict
+from lslam.types.study import StudyRow
 
 SKIPS = range(1, 21)
 DISTANCES = (0.1, 0.2, 0.3, 0.5, 0.7, 1.0, 1.5)

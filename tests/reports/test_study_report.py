@@ -17,7 +17,8 @@ from lslam.evaluation.sensitivity import evaluate_study
 from lslam.reports.study_figures import StudyFigure, study_figures
 from lslam.reports.study_html import timing_notes, write_study_files
 from lslam.reports.study_table import means_grid, study_tables
-from lslam.types.study import StudyResult, StudyRow
+from lslam.types.sensitivity import StudyResult
+from lslam.types.study import StudyRow
 
 SKIP, SHARE = "input.skip_frames", "preprocess.random_share"
 
