@@ -57,7 +57,7 @@ def test_every_method_can_be_made_and_says_what_it_is(name: str, request: pytest
 
 @pytest.mark.parametrize(
     ("wrong", "hint"),
-    [("ipc", "did you mean 'icp'"), ("kis_icp", "did you mean 'kiss-icp'?"), ("zzz", "known: icp")],
+    [("ipc", "did you mean 'icp', 'lips' or 'gicp'?"), ("kis_icp", "did you mean 'kiss-icp'?"), ("zzz", "known: icp")],
 )
 def test_an_unknown_method_is_refused_with_the_nearest(wrong: str, hint: str) -> None:
     with pytest.raises(UsageError) as caught:
