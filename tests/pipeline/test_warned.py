@@ -18,7 +18,7 @@ import lslam
 from lslam.config import Config, load_config
 from lslam.errors import InterruptedRunError
 from lslam.frontend.checkpoints import CheckpointSchedule
-from lslam.pipeline import run
+from lslam.pipeline import deliver
 from lslam.pipeline.watch import Watch
 from lslam.warned import MOST_ALIKE, hearing, warnings_so_far
 
@@ -176,7 +176,7 @@ def test_a_failed_run_says_what_it_was_warned_of(tmp_path: Path, monkeypatch: py
     def broken(*_: object) -> None:
         raise MemoryError("no room")
 
-    monkeypatch.setattr(run, "make_map", broken)
+    monkeypatch.setattr(deliver, "make_map", broken)
     with pytest.raises(MemoryError):
         lslam.run(replace(sample(4), motion_compensated=None), config_of(), out=tmp_path / "out")
     facts = manifest(tmp_path / "out")
