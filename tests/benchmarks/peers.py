@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import os
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from itertools import chain, count, islice
@@ -288,7 +289,7 @@ def gicp_open3d(beginning: Beginning) -> Keyframed:
     return Keyframed(method, cloud, covered)
 
 
-class SmallGicp(Timed):
+class SmallGicp(Timed, ABC):
     """small_gicp 1.0 as in its `src/example/kitti_odometry.py`: leaf 0.25 m, ten neighbours, correspondences within 1 m."""
 
     LEAF, REACH, VOXEL = 0.25, 1.0, 1.0
@@ -310,11 +311,13 @@ class SmallGicp(Timed):
         self._enter(source, tree)
         return pose
 
+    @abstractmethod
     def _located(self, source: Any) -> Floats:
-        raise NotImplementedError
+        """Pose (4, 4) of the scan."""
 
+    @abstractmethod
     def _enter(self, source: Any, tree: Any) -> None:
-        raise NotImplementedError
+        """Make the scan part of what the next one is registered on."""
 
 
 class GicpScans(SmallGicp):
