@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.geometry import se3, so3
+from lslam.geometry.normal_equations import Normal
 from lslam.inertial.gyroscope import Gyroscope
 from lslam.inertial.imu_estimate import GRAVITY, GRAVITY_SIGMA, GRAVITY_WALK, ImuEstimate
 from lslam.inertial.imu_noise import ImuNoise
@@ -223,10 +224,11 @@ class Window:
         self._add_past(H, g)
         self._add_scan(H, g, 0)
         self._add_increments(H, g, 1, imu)
-        gone = np.arange(SHARED, SHARED + EACH)
-        information, gradient = marginalised(H, g, gone)
+        gone = np.zeros(size, bool)
+        gone[SHARED : SHARED + EACH] = True
+        left = Normal(H, g).without(gone)
         walk = GRAVITY_WALK**2 * 1e-9 * (second.instant_ns - first.instant_ns)
-        information, gradient = loosened(information, gradient, DOWN, walk)
+        information, gradient = loosened(left.H, left.g, DOWN, walk)
         past = Past(information, gradient, self.gravity, self.axes, second)
         return replace(self, moments=self.moments[1:], past=past)
 
@@ -263,17 +265,6 @@ def off_by(a: Floats, b: Floats) -> Floats:
     # The copy is one compiled function less.
     R = np.ascontiguousarray(a[:3, :3])
     return np.concatenate([b[:3, 3] - a[:3, 3], R @ vector_between(R, b[:3, :3])])
-
-
-def marginalised(H: Floats, g: Floats, gone: NDArray[np.int64]) -> tuple[Floats, Floats]:
-    """Normal equations of what is left, without those `gone`: the Schur complement."""
-    left = np.setdiff1d(np.arange(len(g)), gone)
-    # The gradient rides along as one more column.
-    across, n = np.column_stack([H[np.ix_(gone, left)], g[gone]]), len(left)
-    rest = np.zeros((n + 1, n + 1))
-    rest[:n, :n], rest[:n, n], rest[n, :n] = H[np.ix_(left, left)], g[left], g[left]
-    kept = positive.complement(H[np.ix_(gone, gone)], across, rest)
-    return 0.5 * (kept[:n, :n] + kept[:n, :n].T), kept[:n, n].copy()
 
 
 def loosened(H: Floats, g: Floats, part: slice, variance: float) -> tuple[Floats, Floats]:

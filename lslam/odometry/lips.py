@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from lslam.config.config import Config
 from lslam.errors import UsageError
-from lslam.geometry import noise, se3, so3
+from lslam.geometry import noise, se3
 from lslam.kernels.transform import transform
 from lslam.odometry.base import Registered
 from lslam.odometry.plane_association import associate
@@ -20,6 +20,7 @@ from lslam.odometry.plane_values import SHARED
 from lslam.odometry.plane_window import PlaneWindow
 from lslam.preprocessing.deskew import deskew_points
 from lslam.preprocessing.prepare import PreparedPoints, prepare_points
+from lslam.registration.acceptance import correction
 from lslam.registration.planes import PlaneExtractor, Planes, turned
 from lslam.types.motion_prior import MotionPrior
 from lslam.types.preintegration import SweepLink
@@ -76,10 +77,14 @@ class Lips(Stateful):
             reason = _refusal(predicted, planes, found)
             window, steps = predicted, 0
             if not reason:
-                window, steps = _with(predicted, planes, found).solved()
+                solution, steps = _with(predicted, planes, found).solved()
+                reason = (
+                    "the window of planes and IMU has no solution: the IMU carries the scan" if solution is None else ""
+                )
+                window = solution or predicted
         with clock.stage("covariance"):
             result = self._result(scan, link, window, planes, found)
-        off = _correction(prior.pose, result.T_world_lidar)
+        off = correction(prior.pose, result.T_world_lidar)
         return Registered(
             replace(
                 result, status="bridged" if reason else "ok", reason=reason, converged=not reason, iterations=steps,
@@ -164,9 +169,3 @@ def _with(window: PlaneWindow, planes: Planes, found: Longs) -> PlaneWindow:
     old, new = found >= 0, found < 0
     window = window.with_sightings(found[old], planes.cp[old], information[old], lows[old], highs[old])
     return window.with_planes(planes.cp[new], information[new], lows[new], highs[new])
-
-
-def _correction(prior: Floats, pose: Floats) -> tuple[float, float]:
-    """How far (m, rad) the pose is from what was expected."""
-    step = se3.relative(prior, pose)
-    return float(np.linalg.norm(step[:3, 3])), float(so3.angle(step[:3, :3]))

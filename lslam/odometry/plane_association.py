@@ -32,7 +32,7 @@ def associate(window: PlaneWindow, planes: Planes, covariance: Floats) -> Longs:
     if len(which) == 0:
         return found
     newest = window.values.states - 1
-    seen = Sightings(np.full(len(which), newest), landmark, planes.cp[which], planes.covariance[which])
+    seen = Sightings(np.full(len(which), newest), landmark, planes.cp[which], np.linalg.inv(planes.covariance[which]))
     r, by_pose, by_plane = sighting_residuals(window.values, seen, window.landmarks.anchors, window.T_imu_lidar)
     J = np.concatenate([by_pose, by_plane], axis=2)
     at = np.concatenate([

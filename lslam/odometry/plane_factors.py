@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.geometry import so3
-from lslam.kernels import positive
+from lslam.geometry.normal_equations import Normal
 from lslam.odometry.plane_values import PLANE_SIZE, SHARED, STATE_SIZE, WindowValues
 from lslam.registration import closest_point
 from lslam.types.preintegration import PreintegratedStep
@@ -60,31 +60,6 @@ class Sightings:
             np.concatenate([getattr(self, name), getattr(more, name)])
             for name in ("states", "planes", "cp", "information")
         ))  # fmt: skip
-
-
-@dataclass(frozen=True)
-class Normal:
-    """The normal equations: H (N, N) and gradient g (N,) at some values; the cost decreases along -H^-1 g."""
-
-    H: Floats
-    g: Floats
-
-    def step(self) -> Floats:
-        """(N,) the update to the minimum."""
-        return -positive.solved(self.H, self.g)
-
-    def without(self, out: NDArray[np.bool_]) -> Normal:
-        """The Schur complement: the variables `out` (N,) are marginalised."""
-        if not out.any():
-            return self
-        kept = ~out
-        # The gradient rides along as one more column.
-        across = np.column_stack([self.H[np.ix_(out, kept)], self.g[out]])
-        n = len(across[0])
-        rest = np.zeros((n, n))
-        rest[:-1, :-1], rest[:-1, -1], rest[-1, :-1] = self.H[np.ix_(kept, kept)], self.g[kept], self.g[kept]
-        left = positive.complement(self.H[np.ix_(out, out)], across, rest)
-        return Normal(np.ascontiguousarray(left[:-1, :-1]), np.ascontiguousarray(left[:-1, -1]))
 
 
 def step_residual(values: WindowValues, k: int, step: PreintegratedStep) -> tuple[Floats, Floats]:

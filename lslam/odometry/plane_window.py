@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.geometry import se3
+from lslam.geometry.normal_equations import Normal
 from lslam.kernels import positive
-from lslam.odometry.plane_factors import Normal, Sightings, WindowPrior, normal_equations, step_residual
+from lslam.odometry.plane_factors import Sightings, WindowPrior, normal_equations, step_residual
 from lslam.odometry.plane_values import ORDER, PLANE_SIZE, SHARED, STATE_SIZE, WindowValues
 from lslam.types.preintegration import MotionState, PreintegratedStep
 
@@ -127,14 +128,16 @@ class PlaneWindow:
         landmarks = self.landmarks.joined(self.T_world_lidar, lows, highs)
         return replace(self, values=values, prior=prior, seen=self.seen.joined(more), landmarks=landmarks)
 
-    def solved(self) -> tuple[PlaneWindow, int]:
-        """At the minimum of all factors, and after how many Gauss-Newton steps."""
+    def solved(self) -> tuple[PlaneWindow | None, int]:
+        """At the minimum of all factors, and after how many Gauss-Newton steps; None where H is not positive definite."""
         window, count = self, 0
         pose = np.arange(6) + self.values.first_plane - STATE_SIZE
         while count < MOST_STEPS:
             count += 1
             normal = window.normal()
             update = normal.step()
+            if not np.isfinite(update).all():
+                return None, count
             window = replace(window, values=window.values.moved(update))
             far = update[pose]
             if float(far @ normal.H[np.ix_(pose, pose)] @ far) < SMALL**2:

@@ -19,7 +19,6 @@ from lslam.inertial.window import (
     Moment,
     Window,
     loosened,
-    marginalised,
     off_by,
 )
 from lslam.kernels import positive
@@ -129,17 +128,6 @@ def test_a_scan_pulls_the_imu_along_its_lever() -> None:
     steps = 1e-6 * np.eye(EACH)
     numerical = np.array([(cost(s) - cost(-s)) / 2e-6 for s in steps])
     np.testing.assert_allclose(g[SHARED:], numerical, rtol=0.02, atol=1e-3 * np.abs(numerical).max())
-
-
-def test_marginalising_a_linear_problem_leaves_its_solution_and_covariance() -> None:
-    rng = np.random.default_rng(1)
-    J, rest = rng.normal(size=(40, 12)), rng.normal(size=40)
-    scale = 10.0 ** rng.uniform(-3, 3, 12)
-    H, g = (J * scale).T @ (J * scale), (J * scale).T @ rest
-    gone, left = np.array([0, 4, 5, 9]), np.array([1, 2, 3, 6, 7, 8, 10, 11])
-    kept, gradient = marginalised(H, g, gone)
-    np.testing.assert_allclose(positive.solved(kept, gradient), positive.solved(H, g)[left], rtol=1e-7)
-    np.testing.assert_allclose(positive.inverse(kept), positive.inverse(H)[np.ix_(left, left)], rtol=1e-6)
 
 
 def test_a_walk_widens_the_covariance_of_what_walks_and_keeps_the_mean() -> None:

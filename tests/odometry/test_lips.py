@@ -20,6 +20,7 @@ from lslam.frontend.register_scans import read_ahead
 from lslam.frontend.state_classes import STATE_CLASSES
 from lslam.frontend.tracker import Tracker
 from lslam.geometry import se3
+from lslam.geometry.normal_equations import Normal
 from lslam.odometry import create_odometry
 from lslam.simulation.scenarios import simulate
 from lslam.types.imu import ImuStream
@@ -160,6 +161,21 @@ def test_without_planes_the_imu_carries_and_every_scan_says_so() -> None:
     assert [r.status for r in results[5:]] == ["bridged"] * 5
     assert all("the IMU carries the scan" in r.reason for r in results[5:])
     assert worst(results) < 0.3
+
+
+def test_a_window_without_a_solution_is_bridged_and_planes_go_on_behind_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    one = tracker()
+    loaded = list(read_ahead(walk(), one.odometry.prepare, 1))
+    before = [one.track(scan) for scan in loaded[:8]]
+    with monkeypatch.context() as patch:
+        patch.setattr(Normal, "step", lambda self: np.full(len(self.g), np.nan))
+        without = one.track(loaded[8])
+    behind = [one.track(scan) for scan in loaded[9:]]
+    assert (without.status, without.reason) == (
+        "bridged", "the window of planes and IMU has no solution: the IMU carries the scan"
+    )  # fmt: skip
+    assert [r.status for r in behind] == ["ok"] * len(behind)
+    assert worst([*before, without, *behind]) < 0.1
 
 
 def test_without_an_imu_there_is_no_such_method() -> None:
