@@ -146,7 +146,7 @@ def _about_own_place(
 def _of_ends_and_skew(H: Floats, g: Floats, shares: Floats) -> tuple[Floats, Floats]:
     """(18, 18), (18,) of begin, end and the map's skew: `1 - share` of the first, `share` of the second move a part.
 
-    A map that was made of sweeps with an error `skew` from begin to end shows a part too far by `share - 1/2` of it.
+    A map made of sweeps that lack the motion `skew` from begin to end shows a part too near by `share - 1/2` of it.
     """
     weights = np.stack([1.0 - shares, shares, 0.5 - shares], axis=1)
     A = np.einsum("ka,kb,kij->aibj", weights, weights, H).reshape(18, 18)

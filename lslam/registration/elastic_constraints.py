@@ -6,6 +6,7 @@ is skewed from direction to direction, and all sweeps registered on it agree wit
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,11 +27,11 @@ FORGETTING = 0.8
 LEAST_CHANGE = 1e-3
 # m and rad, likewise of the map, which is the mean of many scans.
 LEAST_SKEW = 1e-4
-# Under a constant acceleration a line fitted to a sweep of T seconds is a T^2 / 12 off at both ends, and the next one likewise,
-# to the same side: sweeps do not meet by a sixth of the change of velocity.
+# With an acceleration a of its own in each sweep of T seconds, lines fitted to neighbouring ones miss each other by
+# (a2 - a1) T^2 / 12, the velocity of a line is ahead of that between their middles by (a1 + 2 a2) T^2 / 6, and the change of
+# motion that is measured is (a0 + 4 a1 + a2) T^2 / 6: rms of the first two by that of the third.
 MISS = 1.0 / 6.0
-# From the middle of one sweep to that of the next the velocity is half a change behind.
-LAG = 0.5
+LAG = math.sqrt(10.0) / 6.0
 NOTHING: Floats = np.zeros((6, 6))
 
 
@@ -40,7 +41,7 @@ class ElasticConstraints:
 
     expected, location : where it begins, and of that; velocity : of the motion within it being that since the middle of the
         last one; since : the sweep's part of the time since then
-    skew, skewed : (6,) by how much the map was made with wrong motion from begin to end, and of that
+    skew, skewed : (6,) motion from begin to end that the sweeps lack which the map was made of, and of that
     """
 
     expected: ElasticSweep

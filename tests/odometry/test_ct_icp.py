@@ -22,7 +22,15 @@ from lslam.odometry.base import Odometry
 from lslam.preprocessing.deskew import deskew_points, knots_over
 from lslam.preprocessing.prepare import prepare_points
 from lslam.registration.elastic import PARTS, SweepPoints, register_elastic
-from lslam.registration.elastic_constraints import ElasticConstraints, LastSweep
+from lslam.registration.elastic_constraints import (
+    FORGETTING,
+    LAG,
+    LEAST_CHANGE,
+    LEAST_SKEW,
+    MISS,
+    ElasticConstraints,
+    LastSweep,
+)
 from lslam.registration.elastic_sweep import ElasticSweep
 from lslam.registration.registration import Registration
 from lslam.registration.robust import Annealing
@@ -69,10 +77,11 @@ def elastic(begin: Floats, end: Floats) -> ElasticSweep:
     return ElasticSweep(begin, end, knots_over(SPAN))
 
 
-def scanned(sweep: ElasticSweep) -> SweepPoints:
+def scanned(sweep: ElasticSweep, registration: Registration | None = None) -> SweepPoints:
     """A room whose points are seen one azimuth after the other on the way, against a map of the same room."""
-    registration = Registration()
-    registration.register(room(np.random.default_rng(0)), np.eye(4))
+    if registration is None:
+        registration = Registration()
+        registration.register(room(np.random.default_rng(0)), np.eye(4))
     world = room(np.random.default_rng(1))
     times = (0.1 * (np.arctan2(world[:, 1], world[:, 0]) / (2 * np.pi) + 0.5)).astype(np.float32)
     order = np.argsort(times)
@@ -189,6 +198,56 @@ def test_it_goes_on_where_it_was(tmp_path: Path) -> None:
     for one, other in zip(results[12:], tracked(again, walk(), 12)[0], strict=True):
         np.testing.assert_array_equal(one.T_world_lidar, other.T_world_lidar)
         np.testing.assert_array_equal(one.covariance, other.covariance)
+
+
+def test_lines_miss_each_other_and_lag_as_the_constants_say() -> None:
+    """A way with an acceleration of its own in each of many sweeps, a line fitted to each."""
+    a, n = np.random.default_rng(0).normal(size=4000), 200
+    u = (np.arange(n) + 0.5) / n
+    v = np.concatenate([[0.0], np.cumsum(a)[:-1]])
+    x = np.concatenate([[0.0], np.cumsum(v + a / 2)[:-1]])
+    way = x[:, None] + v[:, None] * u + 0.5 * a[:, None] * u**2
+    slope, offset = np.polyfit(u, way.T, 1)
+    middle = offset + slope / 2
+    change = np.diff(middle, 2).std()
+    assert (offset[1:] - offset[:-1] - slope[:-1]).std() / change == pytest.approx(MISS, rel=0.03)
+    assert (slope[1:] - np.diff(middle)).std() / change == pytest.approx(LAG, rel=0.03)
+
+
+def test_the_skew_of_a_map_is_found_where_the_sweep_is_known() -> None:
+    """Of the motion that the map was begun without, each part lacks share - 1/2: nothing else tells that from motion."""
+    skew = np.array([0.12, -0.06, 0.03, 0.0, 0.0, 0.004])
+    registration, world = Registration(), room(np.random.default_rng(0))
+    share = np.arctan2(world[:, 1], world[:, 0]) / (2 * np.pi) + 0.5
+    turned = np.cross(skew[3:], world)
+    registration.register((world - (share - 0.5)[:, None] * (skew[:3] + turned)).astype(np.float32), np.eye(4))
+    true, none = elastic(pose_at(), pose_at((0.4, 0.1, 0.0), 5.0)), np.zeros((6, 6))
+    points = scanned(true, registration)
+    sure, free = 1e8 * np.eye(6), 1e-8 * np.eye(6)
+    known = ElasticConstraints(true, sure, sure, 0.0, np.zeros(6), free)
+    np.testing.assert_allclose(register_elastic(points, true, known, ANNEALING, 1e-3).skew, skew, atol=0.01)
+    # Where the map is known to have none, the sweep takes all of it on itself.
+    straight = ElasticConstraints(true, none, none, 0.0, np.zeros(6), sure)
+    found = register_elastic(points, true, straight, ANNEALING, 1e-3)
+    taken = _off(found.sweep.begin, true.begin) - _off(found.sweep.end, true.end)
+    np.testing.assert_allclose(taken, skew, atol=0.02)
+
+
+def test_a_sweep_in_the_map_leaves_its_share_of_the_skew_and_a_change_is_forgotten_over_five_scans() -> None:
+    last, steady = LastSweep(), elastic(pose_at(), pose_at((1.0, 0.0, 0.0))).prior
+    found = MotionPrior(steady.times, pose_at((0.2, 0.0, 0.0)) @ steady.poses)
+    P = np.kron(np.eye(3), 1e-4 * np.eye(6))
+    last.follow(0, found.pose, found, steady, np.full(6, 0.01), P, 0.25)
+    held = last.constraints(100_000_000, steady, False)
+    np.testing.assert_allclose(held.skew, 0.0075)
+    sigma2 = 1e-4 * (0.25**2 + 0.25**2 + 0.75**2) + LEAST_SKEW**2
+    np.testing.assert_allclose(np.linalg.inv(held.skewed), sigma2 * np.eye(6), rtol=1e-9, atol=1e-15)
+    changes = []
+    for k in range(1, 6):
+        changes.append(1.0 / held.velocity[0, 0] / LAG**2 - 2 * LEAST_CHANGE**2)
+        last.follow(100_000_000 * k, steady.pose, steady, steady, np.zeros(6), P, 0.1)
+        held = last.constraints(100_000_000 * (k + 1), steady, False)
+    np.testing.assert_allclose(np.divide(changes[1:], changes[:-1]), FORGETTING, rtol=0.01)
 
 
 @pytest.mark.parametrize("gap", [0, 1])
