@@ -1,0 +1,186 @@
+"""The rules of one method, each off or otherwise, one at a time: which of them its accuracy needs.
+
+    python tests/benchmarks/method_ablation.py ct-icp [--seeds 100-104] [--scans 60] [--write docs/results.md]
+
+Drives are uncompensated, as in `tight.py`; `saturation` is of `quadrotor`, whole.
+"""
+
+from __future__ import annotations
+
+import argparse
+import logging
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from typing import Any
+from unittest import mock
+
+import numpy as np
+import tables
+from tight import cell, one
+from traced import traced
+
+from lslam.inertial import imu_cleaning, saturation
+from lslam.inertial.filter import FilterMotion
+from lslam.inertial.fusion import InertialMotion
+from lslam.odometry import lips, loam_livox, plane_association, plane_factors
+from lslam.odometry.ct_icp import CtIcp
+from lslam.odometry.lio_mapping import LioMapping
+from lslam.registration import elastic_constraints, planes
+from lslam.registration.elastic_constraints import NOTHING, LastSweep
+from lslam.types.imu import ImuStream
+
+Patch = tuple[object, str, Any]
+
+
+@dataclass(frozen=True)
+class Ablation:
+    """methods, scenarios, lidar, imu : what is run; variants : what is patched, by name"""
+
+    methods: tuple[str, ...]
+    scenarios: tuple[str, ...]
+    variants: dict[str, tuple[Patch, ...]]
+    lidar: str = "vlp16"
+    imu: str | None = "icm20948"
+    whole: bool = False
+
+
+with_hidden = saturation.with_hidden
+constraints = LastSweep.constraints
+
+
+def as_read(imu: ImuStream, notes: list[str]) -> ImuStream:
+    """Nothing is looked for."""
+    return imu
+
+
+def doubted(imu: ImuStream, notes: list[str]) -> ImuStream:
+    """What is cut off is trusted the less, and not filled in."""
+    return replace(with_hidden(imu, notes), accel=imu.accel, gyro=imu.gyro)
+
+
+def trusted(imu: ImuStream, notes: list[str]) -> ImuStream:
+    """It is filled in and trusted as any other reading."""
+    return replace(with_hidden(imu, notes), hidden=None)
+
+
+def without(**changes: Any) -> Callable[..., Any]:
+    """The constraints of a sweep, some of them otherwise."""
+    return lambda self, *args: replace(constraints(self, *args), **changes)
+
+
+def small_voxels_only(self: planes.PlaneExtractor, cells: Any, sizes: list[Any]) -> Any:
+    return regions(self, cells, sizes[:1])
+
+
+regions = planes.PlaneExtractor._regions
+
+ABLATIONS = {
+    "saturation": Ablation(
+        ("fast-lio2", "icp+imu.use=true"), ("quadrotor",),
+        {
+            "all of it": ((imu_cleaning, "with_hidden", as_read),),
+            "filling in": ((imu_cleaning, "with_hidden", doubted),),
+            "its sigma": ((imu_cleaning, "with_hidden", trusted),),
+            "deskewing again": ((FilterMotion, "refine", lambda self, prior, stamp_ns, pose: (
+                prior if prior.covariance is not None else InertialMotion.refine(self, prior, stamp_ns, pose)
+            )),),
+            "HIDDEN 0.25": ((saturation, "HIDDEN", 0.25),),
+            "HIDDEN 1": ((saturation, "HIDDEN", 1.0),),
+            "FORGOTTEN 0.1": ((saturation, "FORGOTTEN", 0.1),),
+            "FORGOTTEN 0.4": ((saturation, "FORGOTTEN", 0.4),),
+        },
+        whole=True,
+    ),
+    "ct-icp": Ablation(
+        ("ct-icp",), ("walk", "urban", "residential"),
+        {
+            "skew": ((LastSweep, "constraints", without(skew=np.zeros(6), skewed=1e12 * np.eye(6))),),
+            "location": ((LastSweep, "constraints", without(location=NOTHING, since=0.0)),),
+            "velocity": ((LastSweep, "constraints", without(velocity=NOTHING)),),
+            "both": ((LastSweep, "constraints", without(location=NOTHING, since=0.0, velocity=NOTHING)),),
+            "recovery": ((CtIcp, "_recovered", lambda self, prepared, prior, found, located: (found, located)),),
+            "MISS 1/3": ((elastic_constraints, "MISS", 1 / 3),),
+            "MISS 1/12": ((elastic_constraints, "MISS", 1 / 12),),
+            "LAG 1": ((elastic_constraints, "LAG", 1.0),),
+            "FORGETTING 0": ((elastic_constraints, "FORGETTING", 0.0),),
+            "FORGETTING 0.95": ((elastic_constraints, "FORGETTING", 0.95),),
+            "LEAST_CHANGE 1e-4": ((elastic_constraints, "LEAST_CHANGE", 1e-4),),
+            "LEAST_SKEW 1e-3": ((elastic_constraints, "LEAST_SKEW", 1e-3),),
+        },
+        imu=None,
+    ),
+    "lips": Ablation(
+        ("lips",), ("walk", "urban"),
+        {
+            "LEAST_SHARE": ((lips, "LEAST_SHARE", 0.0),),
+            "HUBER": ((plane_factors, "HUBER", 1e9),),
+            "GATE": ((plane_association, "GATE", 1e9),),
+            "ALIKE 20 deg": ((plane_association, "ALIKE", 0.94),),
+            "CLOSE 2 m": ((plane_association, "CLOSE", 2.0),),
+            "APART": ((plane_association, "APART", 1e9),),
+            "wide voxels": ((planes.PlaneExtractor, "_regions", small_voxels_only),),
+            "MIXED": ((planes, "MIXED", 1e9),),
+            "COMMON": ((lips, "PlaneExtractor", lambda: planes.PlaneExtractor(common_m=0.0, common_rad=0.0)),),
+        },
+    ),
+    "lio-mapping": Ablation(
+        ("lio-mapping",), ("walk", "urban", "residential", "corridor"),
+        {
+            "late entry": ((LioMapping, "insert", lambda self, prior, stamp_ns, points, located: (
+                self.registration.update(points, located)
+            )),),
+        },
+    ),
+    "loam-livox": Ablation(
+        ("loam-livox", "loam-livox+loam.pieces=1"), ("urban", "residential", "walk"),
+        {
+            "TRUST 0": ((loam_livox, "TRUST", 0.0),),
+            "TRUST 1": ((loam_livox, "TRUST", 1.0),),
+            "INLIERS": ((loam_livox, "LIVOX", replace(loam_livox.LIVOX, inlier_ratio=1.0)),),
+        },
+        lidar="livox", imu=None,
+    ),
+}  # fmt: skip
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", choices=list(ABLATIONS))
+    parser.add_argument("--scans", type=int, default=60)
+    parser.add_argument("--only", help="variants, comma-separated; default: all")
+    tables.offer(parser)
+    args = parser.parse_args()
+    logging.getLogger("lslam").setLevel(logging.CRITICAL)
+    ablation, seeds = ABLATIONS[args.what], tables.numbers(args.seeds)
+    names = args.only.split(",") if args.only else list(ablation.variants)
+    variants: dict[str, tuple[Patch, ...]] = {"nothing": ()} | {name: ablation.variants[name] for name in names}
+    count = None if ablation.whole else args.scans
+    columns = [(s, m) for s in ablation.scenarios for m in ablation.methods]
+    runs: dict[tuple[str, str, str], list[dict[str, Any]]] = {(v, *c): [] for v in variants for c in columns}
+    for seed in seeds:
+        for scenario in ablation.scenarios:
+            drive = traced(
+                scenario, seed, lidar=ablation.lidar, imu=ablation.imu, count=count, motion_compensated=False
+            )
+            length = float(drive.ground_truth.path_lengths[-1])
+            for name, patches in variants.items():
+                for method in ablation.methods:
+                    with ExitStack() as stack:
+                        for patch in patches:
+                            stack.enter_context(mock.patch.object(*patch))
+                        run = one(drive, method) | {"length": length}
+                    runs[name, scenario, method].append(run)
+                    print(seed, scenario, f"{name:18} {method:20}", run.get("ate"), run["status"], flush=True)
+    caption = (
+        f"{args.what}: ATE se3, m, median / worst of {tables.seeds_named(seeds)}, {count or 'all'} scans of "
+        f"{ablation.lidar}{f' and {ablation.imu}' if ablation.imu else ''}; lost: off by a twentieth of the path or without a "
+        "result, silently where the run did not say `degraded` either."
+    )
+    heads = [s if len(ablation.methods) == 1 else f"{s} {m}" for s, m in columns]
+    rows = [[name, *(cell(runs[name, *c]) for c in columns)] for name in variants]
+    tables.table(f"ablation-{args.what}", caption, ["without, or with", *heads], rows, args.write)
+
+
+if __name__ == "__main__":
+    main()
