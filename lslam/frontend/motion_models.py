@@ -14,7 +14,7 @@ from lslam.inertial.fusion import InertialMotion
 from lslam.inertial.imu_estimate import GRAVITY_WALK
 from lslam.inertial.imu_noise import ImuNoise
 from lslam.inertial.initialise import InertialStart
-from lslam.inertial.smoothed import SmoothedMotion
+from lslam.inertial.linked_motion import LinkedMotion
 from lslam.inertial.smoothing import SmootherMotion
 from lslam.inertial.window_motion import WindowMotion
 from lslam.types.inertial_state import SmootherNoise
@@ -43,7 +43,7 @@ def _window(begun: InertialStart, config: Config) -> InertialMotion:
 
 
 def _planes(begun: InertialStart, config: Config) -> InertialMotion:
-    return SmoothedMotion(begun.imu, begun.T_lidar_imu, begun.estimate, config.imu)
+    return LinkedMotion(begun.imu, begun.T_lidar_imu, begun.estimate, config.imu)
 
 
 MOTION_MODELS: dict[str, Callable[[InertialStart, Config], InertialMotion]] = {

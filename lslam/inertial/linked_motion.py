@@ -29,7 +29,7 @@ Floats = NDArray[np.float64]
 BRAKING = 3.0
 
 
-class SmoothedMotion(FilterMotion):
+class LinkedMotion(FilterMotion):
     """Predicts and deskews as the filter does; the estimate itself is the smoother's, of all states it holds."""
 
     STATE: ClassVar[tuple[str, ...]] = (*FilterMotion.STATE, "_linked")
