@@ -224,8 +224,12 @@ def test_files_that_a_page_names_exist(name: str) -> None:
 
 _ROW = re.compile(r"^\| `([\w.]+)` \| (.+?) \| (.*?) \| `(\S+)` \| (.+?) \|$", re.MULTILINE)
 REGISTER = [match.groups() for match in _ROW.finditer(METHODS.text.split("## Register of constants")[1])]
-# Not quantities: empty arrays, indices, keys and marks.
+# Not quantities: empty arrays, indices, sizes, keys and marks.
 MARKS = {
+    "ORDER",
+    "SHARED",
+    "STATE_SIZE",
+    "PLANE_SIZE",
     "EVERYWHERE",
     "NO_TIMES",
     "PLANAR",
@@ -244,7 +248,7 @@ MARKS = {
     "FACTORS",
 }
 SECTIONS = ("preprocess", "registration", "recovery", "keyframes", "loops", "graph")
-HELD = ("registration", "recovery", "loops", "graph")
+HELD = ("registration", "recovery", "loops", "graph", "odometry")
 
 
 def value_in_code(name: str, file: str) -> Any:
