@@ -245,7 +245,7 @@ class InertialMotion(Stateful):
         k = int(np.searchsorted(wanted, anchor_ns))
         step = estimate.over(self.imu, np.concatenate([wanted[:k], [anchor_ns], wanted[k:]]))
         poses = step.poses(k, anchor @ self.T_lidar_imu, estimate.velocity, estimate.gravity, self.T_imu_lidar)
-        return MotionPrior(times, np.concatenate([poses[:k], poses[k + 1 :]]))
+        return MotionPrior(times, np.concatenate([poses[:k], poses[k + 1 :]]), is_felt=True)
 
     def _corrected(self, instant_ns: int, middle: Floats) -> ImuEstimate:
         """The estimate at `instant_ns`, where registration put the LiDAR at `middle` (4, 4)."""

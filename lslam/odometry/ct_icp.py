@@ -27,21 +27,20 @@ from lslam.types.scan_result import ScanResult
 def create(config: Config) -> CtIcp:
     """The method as the configuration wants it: point to plane, on the local map of `icp`."""
     section = config.registration.model_copy(update={"residual": "plane"})
-    return CtIcp(Registration(section, config.preprocess, policies_of(config.recovery)), is_felt=config.imu.use)
+    return CtIcp(Registration(section, config.preprocess, policies_of(config.recovery)))
 
 
 class CtIcp(Icp):
     """Two poses per scan; one where its points have no times, or as long as the speed is unknown.
 
-    is_felt : an IMU predicts the motion within a sweep: the constraints hold to that, and its bend stays
+    Where an IMU felt the motion within the sweep the constraints hold to that, and its bend stays.
     """
 
     deskew = "within the registration, between a pose at the sweep's begin and one at its end"
     STATE = (*Icp.STATE, "_last")
 
-    def __init__(self, registration: Registration, *, is_felt: bool = False) -> None:
+    def __init__(self, registration: Registration) -> None:
         super().__init__(registration)
-        self.is_felt = is_felt
         self._last = LastSweep()
 
     def _align(self, scan: Scan, prepared: PreparedPoints, prior: MotionPrior, is_near: bool = False) -> Registered:
@@ -50,7 +49,7 @@ class CtIcp(Icp):
         if is_one_pose or len(registration.map) == 0 or len(prepared.source) < MIN_SOURCE_POINTS:
             return super()._align(scan, prepared, prior, is_near)
         began = time.perf_counter()
-        constraints = self._last.constraints(scan.stamp_ns, prior, self.is_felt)
+        constraints = self._last.constraints(scan.stamp_ns, prior)
         found, located = self._elastic(prepared, prior, constraints.expected, constraints, is_near)
         if (registration.starting > 0 or not located.ok) and not is_near:
             found, located = self._recovered(prepared, prior, found, located)
@@ -78,9 +77,8 @@ class CtIcp(Icp):
         whole = self.registration.locate(deskew(prepared, prior), prior.pose)
         if not whole.ok:
             return first, denied
-        moved = MotionPrior(prior.times, whole.T_world_lidar @ se3.relative(prior.pose, prior.poses))
-        start = ElasticSweep.of(moved, is_bent=self.is_felt)
-        free = LastSweep().constraints(0, moved, self.is_felt)
+        moved = replace(prior, poses=whole.T_world_lidar @ se3.relative(prior.pose, prior.poses))
+        start, free = ElasticSweep.of(moved), LastSweep().constraints(0, moved)
         found, located = self._elastic(prepared, prior, start, free)
         iterations = whole.iterations + located.iterations
         return found, replace(located, posed_by=whole.posed_by if located.ok else "", iterations=iterations)

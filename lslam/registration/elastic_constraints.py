@@ -80,8 +80,8 @@ class LastSweep(Stateful):
         self._skew = np.zeros(6)
         self._skewed: Floats | None = None
 
-    def constraints(self, stamp_ns: int, prior: MotionPrior, is_felt: bool) -> ElasticConstraints:
-        """Of the scan at `stamp_ns`: it follows the last sweep at the same velocity, or as an IMU felt that it does (`is_felt`).
+    def constraints(self, stamp_ns: int, prior: MotionPrior) -> ElasticConstraints:
+        """Of the scan at `stamp_ns`: it follows the last sweep at the same velocity, or as an IMU felt that it does.
 
         Where scans between are missing the prior says where it begins.
         """
@@ -89,12 +89,12 @@ class LastSweep(Stateful):
         Q = noise.rotated(self._change_over(prior.span_s), prior.pose[:3, :3])
         # The first sweep has the velocity at its end.
         M = Q if self._skewed is None else self._skewed
-        expected, P = ElasticSweep.of(prior, is_bent=is_felt), self._covariance
+        expected, P = ElasticSweep.of(prior), self._covariance
         length = self._ends_ns[1] - self._ends_ns[0]
         location, since = NOTHING, 0.0
         if self._ends is not None and P is not None and abs(begin_ns - self._ends_ns[1]) < length / 2:
             location, since = _inverse(MISS**2 * Q + P[6:, 6:]), 1.0
-            if not is_felt:
+            if not prior.is_felt:
                 twist = se3.log(se3.relative(*self._ends)) / length
                 begin, end = (self._ends[1] @ se3.exp((ns - self._ends_ns[1]) * twist) for ns in (begin_ns, end_ns))
                 expected = ElasticSweep(se3.normalise(begin), se3.normalise(end), prior.times)

@@ -27,10 +27,10 @@ class ElasticSweep:
     bend: Floats | None = None
 
     @classmethod
-    def of(cls, prior: MotionPrior, *, is_bent: bool) -> ElasticSweep:
-        """Through both ends of the prior, with its bend if that is told."""
+    def of(cls, prior: MotionPrior) -> ElasticSweep:
+        """Through both ends of the prior, with its bend where that was felt."""
         straight = cls(prior.poses[0], prior.poses[-1], prior.times)
-        if not is_bent:
+        if not prior.is_felt:
             return straight
         return cls(straight.begin, straight.end, prior.times, se3.relative(straight.poses, prior.poses))
 

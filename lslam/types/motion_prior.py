@@ -20,12 +20,14 @@ class MotionPrior:
     covariance : (6, 6) of the pose at the stamp, t' = t + d[:3], R' = exp(d[3:]) R in world axes, m2 and rad2; None where
         the motion model has none
     link : what joins the scan to the one before in a smoother; None where the motion model is for none
+    is_felt : an IMU measured the motion within the sweep
     """
 
     times: NDArray[np.float64]
     poses: NDArray[np.float64]
     covariance: NDArray[np.float64] | None = None
     link: SweepLink | None = None
+    is_felt: bool = False
 
     @classmethod
     def at_once(cls, pose: NDArray[np.float64]) -> MotionPrior:

@@ -13,10 +13,12 @@ from stub_sequences import Stub, sample
 
 from lslam.config import load_config
 from lslam.formats.state_files import read_state, write_state
+from lslam.frontend.inertial_start import begin_inertial
 from lslam.frontend.register_scans import estimate, read_ahead
 from lslam.frontend.state_classes import STATE_CLASSES
 from lslam.frontend.tracker import Tracker
 from lslam.geometry import se3, so3
+from lslam.inertial.fusion import InertialMotion
 from lslam.odometry import create_odometry
 from lslam.odometry.base import Odometry
 from lslam.preprocessing.deskew import deskew_points, knots_over
@@ -35,6 +37,7 @@ from lslam.registration.elastic_sweep import ElasticSweep
 from lslam.registration.registration import Registration
 from lslam.registration.robust import Annealing
 from lslam.simulation.scenarios import simulate
+from lslam.types.imu import ImuStream
 from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan import Span
 from lslam.types.scan_result import ScanResult
@@ -131,9 +134,9 @@ def test_points_lie_where_the_sensor_was_at_their_times() -> None:
 def test_the_bend_of_what_an_imu_felt_stays_as_the_ends_move() -> None:
     times = knots_over(SPAN)
     bow = se3.make(np.eye(3), np.column_stack([10 * times, times * (0.1 - times), 0 * times]))
-    sweep = ElasticSweep.of(MotionPrior(times, bow), is_bent=True)
+    sweep = ElasticSweep.of(MotionPrior(times, bow, is_felt=True))
     np.testing.assert_allclose(sweep.poses, bow, atol=1e-12)
-    assert np.abs(ElasticSweep.of(MotionPrior(times, bow), is_bent=False).poses - bow).max() > 2e-3
+    assert np.abs(ElasticSweep.of(MotionPrior(times, bow)).poses - bow).max() > 2e-3
     shift = np.tile([0.3, -0.1, 0.2, 0.0, 0.0, 0.0], (2, 1))
     np.testing.assert_allclose(sweep.moved(shift).poses[:, :3, 3], bow[:, :3, 3] + [0.3, -0.1, 0.2], atol=1e-12)
 
@@ -168,6 +171,26 @@ def test_the_motion_within_a_walks_sweeps_is_nearer_to_the_truth_than_constant_v
         moves[name], turns[name] = np.sqrt(np.mean(np.square(errors), axis=0).reshape(2, 3).sum(1))
     assert moves["ct-icp"] < 0.8 * moves["icp"]
     assert turns["ct-icp"] < 0.9 * turns["icp"]
+
+
+def test_an_imu_bends_the_sweep_and_over_its_gap_nothing_is_taken_for_felt() -> None:
+    drive = simulate("walk", lidar="vlp16", seed=100, count=COUNT, imu="icm20948", motion_compensated=False)
+    assert drive.imu is not None
+    kept = (drive.imu.stamps_ns < 1_500_000_000) | (drive.imu.stamps_ns > 1_900_000_000)
+    imu = ImuStream(drive.imu.stamps_ns[kept], drive.imu.accel[kept], drive.imu.gyro[kept])
+    scans = [drive.scan(i) for i in range(COUNT)]
+    sequence = Stub(scans, drive.ground_truth, drive.calibration, motion_compensated=False, imu=imu)
+    config = load_config(None, ["odometry.method=ct-icp", "imu.use=true", "imu.start_s=1"], {})
+    tracker, felt, results = Tracker(create_odometry(config), motion=begin_inertial(sequence, config).motion), [], []
+    assert isinstance(tracker.motion, InertialMotion)
+    for loaded in read_ahead(sequence, tracker.odometry.prepare, 1):
+        felt.append(tracker.motion.sweep(loaded.stamp_ns, loaded.scan.span).is_felt)
+        results.append(tracker.track(loaded))
+    assert felt == [k < 15 or k > 19 for k in range(COUNT)]
+    assert all(result.status == "ok" for result in results)
+    found, truth = np.stack([result.T_world_lidar for result in results]), drive.ground_truth
+    assert truth is not None
+    assert np.linalg.norm((found - se3.relative(truth.poses[0], truth.poses))[:, :3, 3], axis=1).max() < 0.1
 
 
 def test_every_scan_has_a_covariance_and_one_registration() -> None:
@@ -238,7 +261,7 @@ def test_a_sweep_in_the_map_leaves_its_share_of_the_skew_and_a_change_is_forgott
     found = MotionPrior(steady.times, pose_at((0.2, 0.0, 0.0)) @ steady.poses)
     P = np.kron(np.eye(3), 1e-4 * np.eye(6))
     last.follow(0, found.pose, found, steady, np.full(6, 0.01), P, 0.25)
-    held = last.constraints(100_000_000, steady, False)
+    held = last.constraints(100_000_000, steady)
     np.testing.assert_allclose(held.skew, 0.0075)
     sigma2 = 1e-4 * (0.25**2 + 0.25**2 + 0.75**2) + LEAST_SKEW**2
     np.testing.assert_allclose(np.linalg.inv(held.skewed), sigma2 * np.eye(6), rtol=1e-9, atol=1e-15)
@@ -246,7 +269,7 @@ def test_a_sweep_in_the_map_leaves_its_share_of_the_skew_and_a_change_is_forgott
     for k in range(1, 6):
         changes.append(1.0 / held.velocity[0, 0] / LAG**2 - 2 * LEAST_CHANGE**2)
         last.follow(100_000_000 * k, steady.pose, steady, steady, np.zeros(6), P, 0.1)
-        held = last.constraints(100_000_000 * (k + 1), steady, False)
+        held = last.constraints(100_000_000 * (k + 1), steady)
     np.testing.assert_allclose(np.divide(changes[1:], changes[:-1]), FORGETTING, rtol=0.01)
 
 
@@ -256,7 +279,7 @@ def test_a_sweep_that_does_not_follow_the_last_one_is_not_held_to_its_end(gap: i
     before = elastic(pose_at(), pose_at((1.0, 0.0, 0.0))).prior
     last.follow(0, np.eye(4), before, before, np.zeros(6), 1e-6 * np.eye(18), 0.1)
     prior = MotionPrior(times, before.poses + (1 + gap) * (before.poses[-1] - before.poses[0]) + 0.01)
-    found = last.constraints(100_000_000 * (1 + gap), MotionPrior(times, prior.poses), False)
+    found = last.constraints(100_000_000 * (1 + gap), MotionPrior(times, prior.poses))
     if gap:
         assert not found.location.any()
         np.testing.assert_allclose(found.expected.begin, prior.poses[0])
