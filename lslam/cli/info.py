@@ -40,8 +40,11 @@ def command(
 
     Each finding says what to do. The first scans are registered to compare their turns with the IMU's.
     """
+    from lslam.errors import OutputExistsError
     from lslam.readers import open_sequence
 
+    if imu_toml is not None and imu_toml.exists():
+        raise OutputExistsError(f"{imu_toml} exists already: name another file with --imu-toml")
     opened = open_sequence(sequence, data_root=data_root, rows=rows, cols=cols, **options.reading_of(given))
     from lslam.doctor.inspect import inspect
 

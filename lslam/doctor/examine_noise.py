@@ -18,6 +18,8 @@ Floats = NDArray[np.float64]
 _WHITE_S, _STABLE_S = 10.0, 120.0
 # The Allan deviation over a time is known to a tenth or so where that fits nine times into the record (IEEE Std 952).
 _FITS = 9
+# m/s2 and rad/s per sqrt(Hz): no device is as quiet, so what is below is a simulated or a silent one.
+_LEAST = 1e-8
 # Flicker noise of bias instability B has the Allan deviation B sqrt(2 ln 2 / pi).
 _FLAT = float(np.sqrt(2 * np.log(2) / np.pi))
 # Variance of the third difference of white noise, over that of the noise: 1 + 9 + 9 + 1.
@@ -128,5 +130,7 @@ def imu_toml(noise: Facts, name: str) -> str:
     )
     known = ("accel_density", "gyro_density", "accel_walk", "gyro_walk")
     keys = ("accel_noise", "gyro_noise", "accel_walk", "gyro_walk")
-    lines = [f"{key} = {noise[found]:.4g}" for key, found in zip(keys, known, strict=True) if noise[found]]
+    lines = [
+        f"{key} = {noise[found]:.4g}" for key, found in zip(keys, known, strict=True) if (noise[found] or 0) > _LEAST
+    ]
     return "\n".join([f"# IMU of {name}, {how}.", "[imu]", *lines]) + "\n"

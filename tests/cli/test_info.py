@@ -128,3 +128,11 @@ def test_a_healthy_and_a_broken_copy_at_the_terminal(tmp_path: Path) -> None:
     late = re.search(r"its stamps are ([\d.]+) ms late .* --set imu.time_offset_s=-0.0", findings[1])
     assert late is not None
     assert abs(float(late.group(1)) - 60) < 5
+
+
+def test_noise_that_stands_in_a_file_is_not_written_over(tmp_path: Path) -> None:
+    (tmp_path / "imu.toml").write_text("[imu]\nstart_s = 3\n")
+    done = lslam("info", SAMPLE, "--quick", "--imu-toml", tmp_path / "imu.toml")
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1)
+    assert "imu.toml exists already" in done.stderr
+    assert (tmp_path / "imu.toml").read_text() == "[imu]\nstart_s = 3\n"

@@ -81,7 +81,7 @@ def test_methods_are_listed() -> None:
     assert "kiss-icp" in baselines
     assert given == ["poses"]
     listed = {each["name"]: each for each in strict_json(lslam("methods", "--json").stdout)["methods"]}
-    assert set(listed) == set(METHODS)
+    assert set(listed) == set(METHODS) == {*loose, *tight, *baselines, *given}
     assert (listed["kiss-icp"]["coupling"], listed["kiss-icp"]["is_baseline"]) == ("none", True)
     assert (listed["fast-lio2"]["coupling"], listed["fast-lio2"]["is_baseline"]) == ("tight", False)
 

@@ -82,3 +82,11 @@ def test_a_stream_that_says_nothing_has_no_noise() -> None:
     assert examine_noise(device(0.3)) is None
     whole = device(20)
     assert examine_noise(ImuStream(whole.stamps_ns, whole.accel * 0.3, whole.gyro)) is None, "of unknown unit"
+
+
+def test_a_noise_that_no_device_has_is_not_handed_on() -> None:
+    facts = {
+        "method": "differences", "standing_s": 0.0, "accel_density": 8e-13, "gyro_density": 2e-4, "accel_walk": None,
+        "gyro_walk": None,
+    }  # fmt: skip
+    assert imu_toml(facts, "drive").splitlines()[1:] == ["[imu]", "gyro_noise = 0.0002"]
