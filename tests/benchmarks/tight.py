@@ -157,6 +157,7 @@ def main() -> None:
     parser.add_argument("--imus", default="icm20948,phone-calibrated")
     parser.add_argument("--methods", default=METHODS)
     parser.add_argument("--scans", type=int, default=100)
+    parser.add_argument("--table", default="tight", help="name of the first table; the second adds -sums")
     tables.offer(parser)
     args = parser.parse_args()
     if args.case:
@@ -192,7 +193,7 @@ def main() -> None:
         "rko-lio in its defaults, at the instant of the sweep that suits it best."
     )
     rows = [[" ".join(p), *(cell(runs[p, m]) for m in methods)] for p in places]
-    tables.table("tight", caption, ["drive", *methods], rows, args.write)
+    tables.table(args.table, caption, ["drive", *methods], rows, args.write)
     caption = (
         "The same runs: how many were lost, and of those that were not the end's distance from the truth in % of the path, "
         "ms of CPU a scan, and NEES per degree of freedom, median / worst."
@@ -203,7 +204,7 @@ def main() -> None:
         lost = sum(map(is_lost, all_of))
         measures = [middle(all_of, *how) for how in (("drift", 100, 2), ("cpu", 1e3, 1), ("nees", 1, 2))]
         sums.append([m, f"{lost} of {len(all_of)}", *measures])
-    tables.table("tight-sums", caption, ["method", "lost", "drift, %", "ms a scan", "NEES"], sums, args.write)
+    tables.table(f"{args.table}-sums", caption, ["method", "lost", "drift, %", "ms a scan", "NEES"], sums, args.write)
 
 
 if __name__ == "__main__":
