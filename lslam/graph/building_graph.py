@@ -21,13 +21,23 @@ from lslam.graph import factors
 from lslam.graph.chi_square import quantile
 from lslam.graph.pose_graph import check_graph
 from lslam.graph.problem import PlanarPrior, PoseGraph
-from lslam.graph.solve import OutlierCandidate, gnc_solve, joined, marginal_blocks, marginals, truncated_weights
+from lslam.graph.solve import (
+    GROWTH,
+    IN,
+    OUT,
+    ROUNDS,
+    OutlierCandidate,
+    gnc_solve,
+    joined,
+    marginal_blocks,
+    marginals,
+    truncated_weights,
+)
 from lslam.stopping import checking
 from lslam.types.building import BuildingMatch
 
 Floats = NDArray[np.float64]
 
-GROWTH, ROUNDS = 2.0, 30  # of graduated non-convexity, as in `graph.solve`
 PROBABILITY = 0.999  # chi-square quantile of an inlier match
 SUPPORT = 2  # other matches that must agree
 # Shares of information below which a direction is unobserved, and from which another match observes it as well.
@@ -86,7 +96,7 @@ def solve_buildings(
         trust = truncated_weights(ratio, mu)
         solution = _linear(len(middles), owners, measured, trust[:, None, None] * weights, map_prior)
         ratio = _squared(solution, owners, measured, weights) / limits
-        if bool(np.all((trust < 1e-3) | (trust > 0.999))):
+        if bool(np.all((trust < OUT) | (trust > IN))):
             break
         mu *= GROWTH
     inliers = ratio <= 1
