@@ -22,6 +22,11 @@ GRAVITY = 9.80665
 FORCE_BIAS, RATE_BIAS = 0.1, 0.003
 
 
+def keyframe_of(key: int) -> int:
+    """The keyframe whose pose, velocity or biases have this key; any other key as it is."""
+    return key - next((first for first in (BIAS_KEY, SPEED_KEY) if key >= first), 0)
+
+
 def inertial_factors(chain: InertialChain, world_up: Floats) -> list[Any]:
     """The factors of all links; world_up : (3,) unit, in the world of the graph."""
     import gtsam

@@ -14,7 +14,7 @@ from lslam.errors import GraphError
 from lslam.geometry import noise
 from lslam.graph.chi_square import quantile
 from lslam.graph.factors import FIX_NOISE
-from lslam.graph.inertial_factors import BIAS_KEY, SPEED_KEY
+from lslam.graph.inertial_factors import BIAS_KEY, SPEED_KEY, keyframe_of
 from lslam.stopping import check_stop, checking
 
 Floats = NDArray[np.float64]
@@ -60,8 +60,7 @@ def solve_incrementally(factors: Any, values: Any, count: int) -> Any:
     due: list[list[Any]] = [[] for _ in range(count)]
     for i in range(factors.size()):
         factor = factors.at(i)
-        names = factor.keys()
-        due[max((key for key in names if key < count), default=0)].append(factor)
+        due[max((k for k in map(keyframe_of, factor.keys()) if k < count), default=0)].append(factor)
     params = gtsam.ISAM2Params()
     params.relinearizeSkip = 1
     together = [key for key in map(int, values.keys()) if FIX_NOISE <= key < SPEED_KEY]
