@@ -202,7 +202,7 @@ def _facts(
         "loop_candidates": len(candidates),
         "loops": len(accepted),
         "fixes": int(solution.fix_inliers.sum()),
-        "gravity_factors": len(graph.ups) if graph.inertial is None else 0,
+        "gravity_factors": len(graph.free_ups),
         **({} if graph.inertial is None else {"imu_factors": len(graph.inertial.links)}),
         "imu_orientation_factors": len(graph.turns),
         "floor_factors": len(graph.floors),

@@ -131,7 +131,7 @@ def fixed_part(graph: PoseGraph, may_tilt: bool = False) -> Any:
         factors.add(factor)
     for factor in [] if graph.inertial is None else inertial_factors(graph.inertial, graph.world_up):
         factors.add(factor)
-    for up in graph.ups if graph.inertial is None else ():
+    for up in graph.free_ups:
         model = gtsam.noiseModel.Isotropic.Sigma(2, up.sigma / np.sqrt(up.share))
         factors.add(gtsam.AttitudeFactorPose3(up.keyframe, gtsam.Unit3(graph.world_up), model, gtsam.Unit3(up.up)))
     for turn in graph.turns:

@@ -143,13 +143,15 @@ class SmootherMotion(InertialMotion):
             log.warning("%s: the graph begins anew", error)
             return None
 
-    def chain(self, keyframes: Sequence[tuple[int, int]], imu_noise: SmootherNoise) -> InertialChain:
-        """The IMU between these keyframes, numbers and stamps in ns, by what is known of it now."""
+    def chain(self, keyframes: Sequence[tuple[int, int]], imu_noise: SmootherNoise) -> InertialChain | None:
+        """The IMU between these keyframes, numbers and stamps in ns, by what is known of it now; None where it was silent."""
         links = []
         for (a, begin_ns), (b, end_ns) in pairwise(keyframes):
             if end_ns > begin_ns and self._covers(begin_ns, end_ns):
                 step = self._measured(self.estimate.over(self.imu, np.array([begin_ns, end_ns])))
                 links.append(InertialLink(a, b, self._at_lidar(step)))
+        if not links:
+            return None
         R = self.T_lidar_imu[:3, :3]
         known = self._beginning()
         return InertialChain(links, R @ known.accel_bias, R @ known.gyro_bias, imu_noise)

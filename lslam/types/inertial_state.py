@@ -83,6 +83,17 @@ class InertialChain:
     gyro_bias: Floats
     noise: SmootherNoise
 
-    def until(self, count: int) -> InertialChain:
-        """That of the first `count` keyframes."""
-        return replace(self, links=[link for link in self.links if max(link.a, link.b) < count])
+    @property
+    def level(self) -> frozenset[int]:
+        """The keyframes whose tilt the IMU tells.
+
+        A link by itself tells of none: the velocities at its ends are free, and take up whatever gravity is said to be.
+        """
+        joints = {link.a for link in self.links} & {link.b for link in self.links}
+        known = [(link.a, link.b) for link in self.links if not joints.isdisjoint((link.a, link.b))]
+        return frozenset(k for ends in known for k in ends)
+
+    def until(self, count: int) -> InertialChain | None:
+        """That of the first `count` keyframes; None without a link."""
+        links = [link for link in self.links if max(link.a, link.b) < count]
+        return replace(self, links=links) if links else None

@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 
 from lslam.config.graph import GraphConfig
 from lslam.geometry import se3, so3
+from lslam.graph.factors import fixed_part
 from lslam.graph.pose_graph import optimise
-from lslam.graph.problem import PoseGraph, PositionFix
+from lslam.graph.problem import PoseGraph, PositionFix, UpDirection
 from lslam.types.constraint import Constraint
 from lslam.types.inertial_state import InertialChain, InertialLink, InertialStep, SmootherNoise
 
@@ -113,4 +114,41 @@ def test_a_gap_of_the_imu_leaves_odometry_alone_there(incremental: bool) -> None
         kept = [one for one in graph.inertial.links if one.a not in gap]
         held = optimise(replace(graph, inertial=replace(graph.inertial, links=kept)), config)
         assert ate(held.poses, real) < ate(optimise(replace(graph, inertial=None), config).poses, real)
-    assert len(graph.inertial.until(10).links) == 9
+    until = graph.inertial.until(10)
+    assert until is not None
+    assert len(until.links) == 9
+    assert graph.inertial.until(1) is None
+
+
+def tilting(seed: int) -> tuple[PoseGraph, Floats]:
+    """Odometry that sinks its front by a quarter of a degree a step, with gravity felt at each keyframe."""
+    graph, real = graph_and_truth(seed)
+    bend = se3.make(so3.exp(np.array([0.0, 0.004, 0.0])), np.zeros(3))
+    steps = [replace(c, T_a_b=c.T_a_b @ bend) for c in graph.odometry]
+    poses = [np.eye(4)]
+    for step in steps:
+        poses.append(se3.normalise(poses[-1] @ step.T_a_b))
+    ups = [UpDirection(k, T[:3, :3].T @ graph.world_up, 0.005) for k, T in enumerate(real)]
+    return replace(graph, poses=np.stack(poses), odometry=steps, ups=ups), real
+
+
+def test_gravity_holds_where_the_imu_has_no_links_or_a_single_one() -> None:
+    graph, real = tilting(2)
+    assert graph.inertial is not None
+    alone = optimise(replace(graph, inertial=None), GraphConfig())
+    assert turned(alone.poses, real) < 0.5 * turned(graph.poses, real)
+    for links in ([], graph.inertial.links[20:21]):
+        held = optimise(replace(graph, inertial=replace(graph.inertial, links=links)), GraphConfig())
+        assert turned(held.poses, real) < 1.1 * turned(alone.poses, real)
+        assert ate(held.poses, real) < 1.1 * ate(alone.poses, real)
+
+
+def test_gravity_is_counted_once() -> None:
+    graph, _ = tilting(2)
+    assert graph.inertial is not None
+    late = replace(graph.inertial, links=graph.inertial.links[30:])
+    for chain, levelled_by_ups in ((graph.inertial, []), (late, list(range(30)))):
+        held = replace(graph, inertial=chain)
+        assert [up.keyframe for up in held.free_ups] == levelled_by_ups
+        without = fixed_part(replace(held, ups=())).size()
+        assert fixed_part(held).size() - without == len(levelled_by_ups)

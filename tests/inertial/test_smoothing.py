@@ -36,6 +36,7 @@ def swinging() -> SmootherMotion:
 def test_readings_are_carried_to_the_lidar() -> None:
     motion = swinging()
     chain = motion.chain([(0, 100_000_000), (1, 900_000_000), (2, 1_700_000_000)], IMU_NOISE)
+    assert chain is not None
     assert [(link.a, link.b) for link in chain.links] == [(0, 1), (1, 2)]
     for link in chain.links:
         assert abs(link.step.seconds.sum() - 0.8) < 1e-9
@@ -47,5 +48,9 @@ def test_readings_are_carried_to_the_lidar() -> None:
         assert np.ptp(rates[:, 2]) > 1
 
 
-def test_silence_is_no_link() -> None:
-    assert swinging().chain([(0, 100_000_000), (1, 900_000_000), (2, 3_000_000_000)], IMU_NOISE).links[-1].b == 1
+def test_silence_is_no_link_and_nothing_else_no_chain() -> None:
+    motion = swinging()
+    chain = motion.chain([(0, 100_000_000), (1, 900_000_000), (2, 3_000_000_000)], IMU_NOISE)
+    assert chain is not None
+    assert chain.links[-1].b == 1
+    assert motion.chain([(0, 100_000_000), (1, 3_000_000_000)], IMU_NOISE) is None
