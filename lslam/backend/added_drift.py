@@ -134,10 +134,14 @@ def describe(config: DebugConfig) -> str:
 
 def _moved(result: ScanResult, pose: Floats) -> ScanResult:
     R = so3.normalise(pose[:3, :3] @ result.T_world_lidar[:3, :3].T)
-    own, total = result.registration_covariance, result.covariance
+
+    def turned(covariance: Floats | None) -> Floats | None:
+        return None if covariance is None else noise.rotated(covariance, R)
+
     return replace(
         result,
         T_world_lidar=pose,
-        covariance=None if total is None else noise.rotated(total, R),
-        registration_covariance=None if own is None else noise.rotated(own, R),
+        covariance=turned(result.covariance),
+        registration_covariance=turned(result.registration_covariance),
+        points_covariance=turned(result.points_covariance),
     )

@@ -92,6 +92,7 @@ def level_results(results: list[ScanResult], level: Level) -> list[ScanResult]:
             T_world_lidar=se3.normalise(T @ r.T_world_lidar),
             covariance=turned(r.covariance),
             registration_covariance=turned(r.registration_covariance),
+            points_covariance=turned(r.points_covariance),
             degenerate=r.degenerate @ B.T,
         )
         for r in results

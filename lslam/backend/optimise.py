@@ -50,8 +50,7 @@ def run_back_end(
         if config.gnss.mode != "off":
             problems.append("GNSS: fewer than two keyframes have no heading on the Earth")
         return BackEnd(results, candidates, problems=problems)
-    # What carries gravity is left out with it.
-    graph = replace(_graph(given), turns=turns, inertial=inertial if config.graph.gravity else None)
+    graph = replace(_graph(given, inertial), turns=turns)
     out = None
     if hold is not None:
         by_fixes = config.gnss.mode == "graph" or (config.gnss.mode == "fit" and config.osm.origin is None)
@@ -107,7 +106,7 @@ def _fitness(store: KeyframeStore, a: int, b: int, T_a_b: Floats) -> float:
     return fitness_score(store.points(b), store.points(a), T_a_b)
 
 
-def _graph(given: Given) -> PoseGraph:
+def _graph(given: Given, inertial: InertialChain | None) -> PoseGraph:
     store, config, results, candidates = given.store, given.config, given.results, given.candidates
     loops = [c.constraint for c in candidates if c.is_accepted and c.constraint is not None]
     fitness = None
@@ -130,12 +129,15 @@ def _graph(given: Given) -> PoseGraph:
             f"floor: the ground seen from {len(seen)} keyframes is not one plane: it holds no pose "
             "(graph.floor = false looks for none)"
         )
+    # Odometry that a smoother estimated knows of the IMU: beside its factors it weighs as much as its points.
+    told = results if inertial is None else [result.by_points for result in results]
     return PoseGraph(
         poses=poses,
-        odometry=odometry_constraints(store.keyframes, results, config.graph, fitness),
+        odometry=odometry_constraints(store.keyframes, told, config.graph, fitness),
         loops=loops,
         floors=floors,
         distances=distances,
         ups=ups,
+        inertial=inertial,
         world_up=np.array([0.0, 0.0, 1.0]) if up is None else up,
     )

@@ -105,7 +105,7 @@ def corrected(
     for result, T, before, k in zip(results, final, moved, owners.tolist(), strict=True):
         keyframe = results[keyframes[k].scan]
         S = _covariance(result, keyframe, T, before, poses[k], covariances[k], drift, config)
-        out.append(replace(result, T_world_lidar=T, covariance=S))
+        out.append(replace(result, T_world_lidar=T, covariance=S, points_covariance=None))
     return out
 
 

@@ -5,14 +5,21 @@ The smoother is the motion model (`lslam.inertial.smoothing`, `lslam.graph.inert
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from lslam.config.config import Config
 from lslam.config.recovery import RecoveryConfig
+from lslam.odometry.base import Registered
 from lslam.odometry.feature_map import FeatureKeyframes
 from lslam.odometry.icp import Icp
 from lslam.odometry.loam import Loam, LoamVariant
 from lslam.registration.registration import Registration
+from lslam.registration.solver import RegistrationResult
+from lslam.registration.uncertainty import PoseUncertainty
+from lslam.types.motion_prior import MotionPrior
+from lslam.types.scan_result import ScanResult
 
 SCAN_TO_MAP = LoamVariant(None, with_map=True)
 # The smoother is what bridges a scan: nothing else is tried.
@@ -33,10 +40,36 @@ def create(config: Config) -> LioSam | LioSamOfPoints:
     return LioSamOfPoints(Registration(section, config.preprocess))
 
 
+def _with_points(result: ScanResult, found: Registered, prior: MotionPrior, points: PoseUncertainty) -> ScanResult:
+    """The result with the covariance of the local map by the points alone, which `points` accumulates.
+
+    A state of the smoother shares the IMU with those before: taken as independent, and beside the IMU in a pose graph, its
+    covariance would count that again and again.
+    """
+    located: RegistrationResult = found.detail[1]
+    entered = located.decided(found.result)
+    if found.result.status == "ok":
+        entered = entered.moved(entered.T_world_lidar, located.covariance)
+    alone = points.stamped(found.result, entered, prior)
+    if alone.covariance is None or alone.registration_covariance is None:
+        return result
+    return replace(result, points_covariance=alone.covariance - alone.registration_covariance)
+
+
 class LioSam(Loam):
     """Edges and planar points on the feature map of the newest keyframes."""
 
     deskew = "features, by the newest state of the smoother"
+    STATE = (*Loam.STATE, "_points")
+
+    def restart(self) -> None:
+        """No scan seen, an empty feature map."""
+        super().restart()
+        self._points = PoseUncertainty()
+
+    def update(self, prior: MotionPrior, found: Registered) -> ScanResult:
+        """Enter the scan into the feature map where the smoother puts it."""
+        return _with_points(super().update(prior, found), found, prior, self._points)
 
     @property
     def recovery(self) -> RecoveryConfig:
@@ -52,3 +85,17 @@ class LioSamOfPoints(Icp):
     """All points on the local map of the newest keyframes."""
 
     deskew = "by the newest state of the smoother"
+    STATE = (*Icp.STATE, "_points")
+
+    def __init__(self, registration: Registration) -> None:
+        super().__init__(registration)
+        self._points = PoseUncertainty()
+
+    def restart(self) -> None:
+        """An empty map."""
+        super().restart()
+        self._points = PoseUncertainty()
+
+    def update(self, prior: MotionPrior, found: Registered) -> ScanResult:
+        """Enter the scan into the local map where the smoother puts it."""
+        return _with_points(super().update(prior, found), found, prior, self._points)

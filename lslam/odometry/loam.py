@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 
@@ -59,7 +60,7 @@ class Loam(Stateful):
 
     needs_rings = True
     deskew = "features by the motion prior, and again by the motion that registration finds"
-    STATE = ("registration", "_uncertainty")
+    STATE: ClassVar[tuple[str, ...]] = ("registration", "_uncertainty")
 
     def __init__(self, config: Config, variant: LoamVariant) -> None:
         self.config, self.variant = config, variant

@@ -57,6 +57,7 @@ class StationaryDetector(Stateful):
             scan.index, scan.stamp_ns, self._last.T_world_lidar.copy(),
             reason=f"standing since scan {self._last.index}", is_stationary=True,
             covariance=self._last.covariance, registration_covariance=self._last.registration_covariance,
+            points_covariance=self._last.points_covariance,
         )  # fmt: skip
 
     def observe(self, scan: Scan, result: ScanResult) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -27,6 +27,8 @@ class ScanResult:
     covariance : (6, 6) of the pose in the world, t' = t + d[:3], R' = exp(d[3:]) R in world axes, m2 and rad2; grows with
         the distance travelled. None when the method has none
     registration_covariance : likewise, but relative to the local map the scan was registered on
+    points_covariance : as `covariance`, of the local map by the points of all scans alone, where `covariance` knows of an IMU
+        that a pose graph may get beside; None elsewhere
     map_age : how many scans ago that local map was taken, on the mean; 1 from scan to scan
     is_stationary : the sensor had not moved, so the scan was not registered and has the pose of the one before
     posed_by : what within a method found the pose in its place, as a recovery policy or all points in place of features;
@@ -52,6 +54,7 @@ class ScanResult:
     reason: str = ""
     covariance: NDArray[np.float64] | None = None
     registration_covariance: NDArray[np.float64] | None = None
+    points_covariance: NDArray[np.float64] | None = None
     map_age: float = 1.0
     converged: bool = True
     iterations: int = 0
@@ -72,6 +75,13 @@ class ScanResult:
     inertial: MotionState | None = None
     imu: ImuState | None = None
     stages: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def by_points(self) -> ScanResult:
+        """The same pose, which varies as the local map does by the points alone; the result itself where that is all there is."""
+        if self.points_covariance is None:
+            return self
+        return replace(self, covariance=self.points_covariance, registration_covariance=None)
 
     def poser(self, method: str) -> str:
         """What posed the scan: the `method`, its fallback, the motion prior, or the scan before while stationary."""

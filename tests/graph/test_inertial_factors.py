@@ -10,12 +10,16 @@ from graph_builders import ate, measured
 from numpy.typing import NDArray
 
 from lslam.config.graph import GraphConfig
-from lslam.geometry import se3, so3
+from lslam.geometry import noise, se3, so3
 from lslam.graph.factors import fixed_part
+from lslam.graph.inertial_smoother import InertialSmoother
+from lslam.graph.odometry_constraints import odometry_constraints
 from lslam.graph.pose_graph import optimise
 from lslam.graph.problem import PoseGraph, PositionFix, UpDirection
 from lslam.types.constraint import Constraint
-from lslam.types.inertial_state import InertialChain, InertialLink, InertialStep, SmootherNoise
+from lslam.types.inertial_state import InertialChain, InertialLink, InertialState, InertialStep, SmootherNoise
+from lslam.types.keyframe import Keyframe
+from lslam.types.scan_result import ScanResult
 
 Floats = NDArray[np.float64]
 
@@ -152,3 +156,53 @@ def test_gravity_is_counted_once() -> None:
         assert [up.keyframe for up in held.free_ups] == levelled_by_ups
         without = fixed_part(replace(held, ups=())).size()
         assert fixed_part(held).size() - without == len(levelled_by_ups)
+
+
+def smoothed(seed: int) -> tuple[PoseGraph, list[Keyframe], list[ScanResult], Floats]:
+    """A graph, and its keyframes by odometry whose smoother has the same IMU, each registered on the one before."""
+    graph, real = graph_and_truth(seed)
+    assert graph.inertial is not None
+    rng = np.random.default_rng(100 + seed)
+    chain, known = graph.inertial, np.repeat([1e-8, 1e-8, 0.01, 4e-4, 1e-6, 2.5e-3], 3)
+    speed = curve(np.zeros(1))[2][0].T @ [3.0, 3.0, 0.2] + 0.05 * rng.normal(size=3)
+    smoother = InertialSmoother(NOISE, 100)
+    smoother.begin(
+        InertialState(np.eye(4), speed, chain.accel_bias, chain.gyro_bias, -G * graph.world_up, np.diag(known))
+    )
+    pose, own, nothing = np.eye(4), np.diag(SIGMAS**2), np.zeros((6, 6))
+    results = [ScanResult(0, 0, pose, covariance=nothing, registration_covariance=nothing, points_covariance=nothing)]
+    for k, (link, true) in enumerate(zip(chain.links, se3.relative(real[:-1], real[1:]), strict=True), 1):
+        registered = pose @ measured(true[None], SIGMAS, rng)[0]
+        turned_own = noise.rotated(own, pose[:3, :3])
+        found = smoother.add(replace(link.step, T_world_imu=registered, covariance=turned_own))
+        step, before = found.T_world_imu[:3, 3] - pose[:3, 3], results[-1]
+        assert before.covariance is not None
+        assert before.points_covariance is not None
+        pose = found.T_world_imu
+        results.append(
+            ScanResult(
+                k, 1_000_000_000 * k, pose, registration_covariance=nothing,
+                covariance=noise.transported(before.covariance, step) + found.covariance[:6, :6],
+                points_covariance=noise.transported(before.points_covariance, step) + turned_own,
+            )
+        )  # fmt: skip
+    keyframes = [Keyframe(r.index, r.index, r.stamp_ns, r.T_world_lidar, r.covariance, 1.0 * r.index) for r in results]
+    return replace(graph, poses=np.stack([r.T_world_lidar for r in results])), keyframes, results, real
+
+
+def turning_nees(poses: Floats, covariances: Floats, real: Floats) -> float:
+    e = so3.log(poses[1:, :3, :3] @ np.swapaxes(real[1:, :3, :3], -1, -2))
+    return float(np.mean(np.einsum("ki,ki->k", e, np.linalg.solve(covariances[1:, 3:, 3:], e[..., None])[..., 0])) / 3)
+
+
+def test_odometry_that_knows_the_imu_weighs_beside_it_as_much_as_its_points() -> None:
+    """The smoother's own covariances would count the IMU twice: a NEES of 4."""
+    twice, once = [], []
+    for seed in range(4):
+        graph, keyframes, results, real = smoothed(seed)
+        for told, consistency in ((results, twice), ([r.by_points for r in results], once)):
+            odometry = odometry_constraints(keyframes, told, GraphConfig())
+            held = optimise(replace(graph, odometry=odometry), GraphConfig())
+            consistency.append(turning_nees(held.poses, held.covariances, real))
+    assert 0.3 < np.mean(once) < 2.0
+    assert np.mean(twice) > 2 * np.mean(once)
