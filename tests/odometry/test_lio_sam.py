@@ -5,12 +5,15 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from stub_sequences import Stub, sample
 
 import lslam
+from lslam.backend.optimise import run_back_end
+from lslam.backend.outcome import BackEnd
 from lslam.config import Config, load_config
 from lslam.errors import InputError
 from lslam.formats.state_files import read_state, write_state
@@ -18,12 +21,18 @@ from lslam.frontend.inertial_start import begin_inertial
 from lslam.frontend.register_scans import read_ahead
 from lslam.frontend.state_classes import STATE_CLASSES
 from lslam.frontend.tracker import Tracker
+from lslam.graph.factors import well_conditioned
+from lslam.graph.odometry_constraints import odometry_constraints
+from lslam.keyframes.store import KeyframeStore
 from lslam.odometry import create_odometry
 from lslam.odometry.lio_sam import LioSam, LioSamOfPoints
+from lslam.pipeline import back_end_pass
 from lslam.simulation.imu import IMUS
 from lslam.simulation.lidar_models import LIDARS
 from lslam.simulation.scenarios import simulate
+from lslam.simulation.sensors import GnssModel
 from lslam.types.imu import ImuStream
+from lslam.types.keyframe import Keyframe
 from lslam.types.scan_result import ScanResult
 
 QUIET = ("map.write=false", "report.html=false", "loops.use=false", "odometry.integrity=false", "imu.start_s=1")
@@ -41,10 +50,13 @@ POINTS = "lio_sam.features=points"
 @cache
 def walk() -> Stub:
     lidar = replace(LIDARS["vlp16"], columns=900)
-    drive = simulate("walk", lidar=lidar, seed=100, count=COUNT, imu="icm20948", motion_compensated=False)
+    receiver = GnssModel(rate_hz=10.0, white=0.02, slow=0.0)
+    drive = simulate(
+        "walk", lidar=lidar, seed=100, count=COUNT, imu="icm20948", gnss=receiver, motion_compensated=False
+    )
     return Stub(
         [drive.scan(i) for i in range(COUNT)], drive.ground_truth, drive.calibration, motion_compensated=False,
-        imu=drive.imu,
+        imu=drive.imu, gnss=drive.gnss,
     )  # fmt: skip
 
 
@@ -127,3 +139,30 @@ def test_a_run_goes_on_where_it_was_and_carries_a_scan_that_failed(tmp_path: Pat
             other = again.track(scan)
             np.testing.assert_array_equal(other.T_world_lidar, one.T_world_lidar)
             np.testing.assert_array_equal(other.covariance, one.covariance)
+            np.testing.assert_array_equal(other.points_covariance, one.points_covariance)
+
+
+def test_the_pose_graph_has_the_imu_beside_odometry_that_weighs_as_much_as_its_points(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    seen: list[tuple[list[Keyframe], list[ScanResult], BackEnd]] = []
+
+    def watched(sequence: Any, results: list[ScanResult], store: KeyframeStore, *more: Any) -> BackEnd:
+        seen.append((list(store.keyframes), results, run_back_end(sequence, results, store, *more)))
+        return seen[0][2]
+
+    monkeypatch.setattr(back_end_pass, "run_back_end", watched)
+    outcome = lslam.run(walk(), config_of(TIGHT, "gnss.mode=graph", "gnss.min_sigma=0.02", "keyframes.distance=0.2"))
+    facts = outcome.record.manifest["graph"]
+    assert facts["keyframes"] > 5
+    assert facts["imu_factors"] == facts["keyframes"] - 1
+    assert facts["gravity_factors"] == 0
+    assert facts["fixes"] > 10
+    (keyframes, results, done), config = seen[0], config_of(TIGHT).graph
+    by_points = odometry_constraints(keyframes, [result.by_points for result in results], config)
+    by_smoother = odometry_constraints(keyframes, results, config)
+    for held, one in zip(done.constraints, by_points, strict=True):
+        np.testing.assert_allclose(held.covariance, well_conditioned(one.covariance), rtol=1e-9, atol=1e-15)
+    # Of rotation, where the IMU is what is known better.
+    grown = [sum(np.trace(c.covariance[3:, 3:]) for c in steps) for steps in (by_points, by_smoother)]
+    assert grown[0] > 1.2 * grown[1]
