@@ -12,13 +12,18 @@ from lslam.odometry import FEATURE_METHODS, METHODS, require_method
 from lslam.osm import matcher_named
 from lslam.registration.residuals import residual_named
 
-# Methods that match a scan against Gaussian voxels, and what of `registration` only some methods look at.
+# Methods that match a scan against Gaussian voxels, and what only some methods look at. A policy of `recovery` that is switched
+# off is heeded by all: those that override it have it switched off.
 ON_GAUSSIANS = tuple(name for name, (module, _) in METHODS.items() if module == METHODS["icp"][0])
 HEEDED = {
-    "residual": ON_GAUSSIANS,
-    "target": ON_GAUSSIANS,
-    "inlier_distance": (*ON_GAUSSIANS, "dlo", "icp-svd"),
-    "inlier_ratio": (*ON_GAUSSIANS, "dlo", "icp-svd"),
+    "registration.residual": ON_GAUSSIANS,
+    "registration.target": ON_GAUSSIANS,
+    "registration.keyframes": ON_GAUSSIANS,
+    "registration.keyframe_m": ON_GAUSSIANS,
+    "registration.keyframe_deg": ON_GAUSSIANS,
+    "registration.inlier_distance": (*ON_GAUSSIANS, "dlo", "icp-svd"),
+    "registration.inlier_ratio": (*ON_GAUSSIANS, "dlo", "icp-svd"),
+    "recovery.fallback": FEATURE_METHODS,
 }
 
 
@@ -71,6 +76,11 @@ def _check_imu(config: Config) -> None:
         raise UsageError(
             "graph.imu_orientation and lio_sam.graph_imu both bring the gyroscope's turns into the pose graph: set one to false"
         )
+    if method == "lio-sam" and config.lio_sam.graph_imu and not config.graph.gravity:
+        raise UsageError(
+            "graph.gravity = false leaves gravity out of the pose graph, lio_sam.graph_imu brings it in: set both to false, or "
+            "drop the first"
+        )
     if (config.imu.estimate_offset or config.imu.estimate_extrinsics) and method in ("lio-sam", "lio-mapping", "lips"):
         raise UsageError(
             f"imu.estimate_offset and imu.estimate_extrinsics are states of a filter, which {method} does not have: drop them, "
@@ -79,21 +89,29 @@ def _check_imu(config: Config) -> None:
 
 
 def _check_heeded(config: Config) -> None:
-    """Raise UsageError for a registration key that was changed and that the method would pass over in silence."""
-    method, section = config.odometry.method, config.registration
+    """Raise UsageError for a key that was changed and that the method would pass over in silence."""
+    method = config.odometry.method
     if method not in METHODS:
         return  # of another package: it knows what it takes
-    for key, methods in HEEDED.items():
+    for name, methods in HEEDED.items():
+        part, _, key = name.partition(".")
+        section = getattr(config, part)
         value, default = getattr(section, key), type(section).model_fields[key].default
         is_so_anyway = key == "target" and value == "scan" and method == "icp-svd"
         if value != default and method not in methods and not is_so_anyway:
             preset = config.odometry.preset
-            if preset and read_preset(preset).get("registration", {}).get(key) == value:
+            if preset and read_preset(preset).get(part, {}).get(key) == value:
                 raise UsageError(
-                    f"preset {preset} sets registration.{key} = {value!r}, which does nothing with method {method}: leave out "
-                    "--method, or the preset"
+                    f"preset {preset} sets {name} = {value!r}, which does nothing with method {method}: leave out --method, or "
+                    "the preset"
                 )
             raise UsageError(
-                f"registration.{key} = {value!r} does nothing with method {method}: drop it, or use one that heeds it "
+                f"{name} = {value!r} does nothing with method {method}: drop it, {_own_key(config, key)}or use one that heeds it "
                 f"({', '.join(methods)})"
             )
+
+
+def _own_key(config: Config, key: str) -> str:
+    """The way to the method's own key of this name, empty where it has none."""
+    part = config.odometry.method.replace("-", "_")
+    return f"set {part}.{key}, " if hasattr(getattr(config, part, None), key) else ""

@@ -132,6 +132,31 @@ def test_a_key_that_the_method_would_pass_over_is_refused(method: str, setting: 
         check_config(config)
 
 
+@pytest.mark.parametrize(
+    ("method", "settings", "words"),
+    [("lio-sam", ("recovery.fallback=all-points",), r"recovery\.fallback = 'all-points' .* method lio-sam.*\(loam-odom, loam"),
+     ("lio-sam", ("lio_sam.features=points", "registration.keyframes=5"), r"lio-sam: drop it, set lio_sam\.keyframes, or"),
+     ("lio-sam", ("registration.keyframe_deg=5",), r"set lio_sam\.keyframe_deg, or"),
+     ("lio-sam", ("graph.gravity=false",), r"^graph\.gravity = false .* lio_sam\.graph_imu brings it in"),
+     ("lio-sam", ("graph.gravity=false", "lio_sam.graph_imu=false"), ""),
+     ("ct-icp", ("registration.keyframe_m=1",), "method ct-icp: drop it, or"),
+     ("lips", ("recovery.fallback=all-points",), "method lips"),
+     ("lio-mapping", ("recovery.fallback=all-points",), "method lio-mapping"),
+     ("ct-icp", ("recovery.fallback=all-points",), "method ct-icp"), ("icp", ("recovery.fallback=all-points",), "method icp"),
+     ("loam-livox", ("recovery.fallback=all-points",), ""), ("lio-sam", ("recovery.start_search=false",), ""),
+     ("lips", ("graph.gravity=false",), ""), ("icp", ("registration.keyframes=5",), "")],
+)  # fmt: skip
+def test_what_a_method_overrides_is_refused_and_what_it_does_anyway_is_not(
+    method: str, settings: tuple[str, ...], words: str
+) -> None:
+    config = load_config(settings=[f"odometry.method={method}", *settings], environ={})
+    if not words:
+        check_config(config)
+        return
+    with pytest.raises(UsageError, match=words):
+        check_config(config)
+
+
 def test_what_a_preset_says_and_its_method_only_heeds_is_said_to_be_the_presets() -> None:
     preset = "odometry.preset=thesis-icp"
     with pytest.raises(UsageError, match=r"preset thesis-icp sets registration\.target = 'scan', which .* method loam"):
