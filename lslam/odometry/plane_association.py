@@ -31,15 +31,15 @@ def associate(window: PlaneWindow, planes: Planes, covariance: Floats) -> Longs:
     which, landmark = _candidates(window, planes)
     if len(which) == 0:
         return found
-    newest = window.values.states - 1
-    seen = Sightings(np.full(len(which), newest), landmark, planes.cp[which], np.linalg.inv(planes.covariance[which]))
+    states, covariances = np.full(len(which), window.values.states - 1), planes.covariance[which]
+    seen = Sightings(states, landmark, planes.cp[which], np.asarray(np.linalg.inv(covariances), np.float64))
     r, by_pose, by_plane = sighting_residuals(window.values, seen, window.landmarks.anchors, window.T_imu_lidar)
     J = np.concatenate([by_pose, by_plane], axis=2)
     at = np.concatenate([
         np.broadcast_to(SHARED + np.arange(6), (len(which), 6)),
         SHARED + STATE_SIZE + PLANE_SIZE * landmark[:, None] + np.arange(PLANE_SIZE),
     ], axis=1)  # fmt: skip
-    S = J @ covariance[at[:, :, None], at[:, None, :]] @ np.swapaxes(J, 1, 2) + planes.covariance[which]
+    S = J @ covariance[at[:, :, None], at[:, None, :]] @ np.swapaxes(J, 1, 2) + covariances
     squares = np.einsum("ki,ki->k", r, np.linalg.solve(S, r[:, :, None])[:, :, 0])
     # The nearest landmark of each plane: the last one written is the smallest.
     for k in np.argsort(-squares, kind="stable"):
