@@ -15,6 +15,12 @@ Floats = NDArray[np.float64]
 LEAST_FORCE, LEAST_RATE = 13.0, np.deg2rad(100)
 # So many samples in a row at one and the same extreme are its end: noise alone repeats no extreme.
 ROW = 3
+# And more of them than times as many as on the next reading: a smooth top that ends within its highest bit stands on that at
+# most sqrt(2) + 1 times as long as on the one below.
+PILED = 2.42
+# A device has one range. Its two ends differ by a bit of 12 or more (5e-4), and from axis to axis by scales and offsets, which
+# are some per cent.
+BIT, ALIKE = 1e-3, 0.9
 # What is hidden is between the end of the range and as much again: half of that in the mean, and at the most.
 HIDDEN = 0.5
 # s from an edge of a cut until nothing of it tells how far beyond the range a reading is: vehicles and arms do not follow
@@ -36,12 +42,12 @@ def with_hidden(imu: ImuStream, notes: list[str]) -> ImuStream:
     for values, least, unit, name in (
         (imu.accel, LEAST_FORCE, "m/s2", "accelerometer"), (imu.gyro, LEAST_RATE, "rad/s", "gyroscope")
     ):  # fmt: skip
-        limit = float(np.abs(values).max(initial=0.0))
-        cut = _cuts(values, limit) if limit >= least else np.zeros(values.shape, bool)
-        filled = np.stack([_excess(seconds, values[:, k], cut[:, k], HIDDEN * limit) for k in range(3)], axis=-1)
+        cut = _cuts(values, least)
+        filled = np.stack([_excess(seconds, values[:, k], cut[:, k]) for k in range(3)], axis=-1)
         parts.append(values + np.sign(values) * filled[0])
         hidden.append(filled[1])
         if cut.any():
+            limit = float(np.abs(values).max())
             said.append(f"{int(cut.any(axis=1).sum())} at the {limit:.4g} {unit} of its {name}")
     if not said:
         return imu
@@ -52,22 +58,34 @@ def with_hidden(imu: ImuStream, notes: list[str]) -> ImuStream:
     return replace(imu, accel=parts[0], gyro=parts[1], hidden=np.hstack(hidden))
 
 
-def _cuts(values: Floats, limit: float) -> NDArray[np.bool_]:
-    """(M, 3) where readings (M, 3) sit at either end of the range, and have done so `ROW` times in a row on some axis."""
-    at = np.abs(values) >= limit * (1 - 1e-9)
-    same = at[1:] & at[:-1] & (np.sign(values[1:]) == np.sign(values[:-1]))
-    rows = (
-        np.lib.stride_tricks.sliding_window_view(same, ROW - 1, axis=0) if len(same) >= ROW - 1 else same[:0, :, None]
-    )
-    return at if rows.all(axis=-1).any() else np.zeros(values.shape, bool)
+def _cuts(values: Floats, least: float) -> NDArray[np.bool_]:
+    """(M, 3) where readings (M, 3) sit at an end of the range, which is `least` or more either way.
+
+    Every axis has an upper and a lower end of its own: 16 bits read from -32768 to +32767, and scales differ. An extreme is an
+    end where it stands in a row, `PILED`, or is within a bit of one that does; not where others of the device go far beyond.
+    """
+    if len(values) < ROW:
+        return np.zeros(values.shape, bool)
+    # (M, 6): upwards and downwards.
+    sizes = np.hstack([values, -values])
+    extremes = sizes.max(axis=0)
+    at = sizes >= extremes * (1 - 1e-9)
+    may_be = extremes >= max(least, ALIKE * float(extremes.max()))
+    stands = may_be & np.lib.stride_tricks.sliding_window_view(at, ROW, axis=0).all(axis=-1).any(axis=0)
+    below = np.where(at, -np.inf, sizes).max(axis=0)
+    stands &= at.sum(axis=0) > PILED * (sizes == below).sum(axis=0)
+    alike = np.abs(extremes[:, None] - extremes[stands]) <= BIT * extremes[stands]
+    at &= may_be & alike.any(axis=1)
+    return np.asarray(at[:, :3] | at[:, 3:])
 
 
-def _excess(seconds: Floats, values: Floats, cut: NDArray[np.bool_], most: float) -> Floats:
-    """(2, M) by how much readings (M,) at the end of the range were likely beyond it, and one sigma of that."""
+def _excess(seconds: Floats, values: Floats, cut: NDArray[np.bool_]) -> Floats:
+    """(2, M) by how much readings (M,) at an end of the range were likely beyond it, and one sigma of that."""
     beyond = np.zeros((2, len(values)))
+    size = np.abs(values)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], cut, [False]]).astype(np.int8)))
     for first, end in edges.reshape(-1, 2).tolist():
-        size = np.abs(values)
+        most = HIDDEN * float(size[first])
         rise = max(_slope(seconds, size, first - 2, first - 1), 0.0)
         fall = max(-_slope(seconds, size, end, end + 1), 0.0)
         t = seconds[first:end]

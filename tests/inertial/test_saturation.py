@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from lslam.config import load_config
 from lslam.inertial.gyroscope import Gyroscope
@@ -15,6 +18,7 @@ from lslam.pipeline.run import run
 from lslam.simulation.scenarios import simulate
 from lslam.types.imu import ImuStream
 
+Floats = NDArray[np.float64]
 LIMIT = np.deg2rad(250)
 
 
@@ -50,6 +54,76 @@ def test_an_extreme_that_noise_made_is_no_end_of_the_range() -> None:
     notes: list[str] = []
     assert with_hidden(whole, notes) is whole
     assert not notes
+
+
+BIT = LIMIT / 2**15
+
+
+def of_16_bits(rates: Floats, scales: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> Floats:
+    """Rates (M, 3) as whole numbers from -32768 to +32767 give them, by a scale of each axis."""
+    return np.asarray(np.clip(np.round(rates / BIT), -(2**15), 2**15 - 1) * BIT * np.array(scales))
+
+
+def test_both_ends_of_an_asymmetric_range_are_filled_in() -> None:
+    whole, _ = turning(360.0)
+    read = replace(whole, gyro=of_16_bits(whole.gyro))
+    filled = with_hidden(read, [])
+    assert filled.hidden is not None
+    upper, lower = read.gyro[:, 1] >= LIMIT - BIT, read.gyro[:, 1] <= -LIMIT
+    np.testing.assert_array_equal(filled.hidden[:, 4] > 0, upper | lower)
+    means = [float(np.mean(s.gyro[:, 1])) for s in (whole, read, filled)]
+    assert abs(means[2] - means[0]) < abs(means[1] - means[0]), "one half alone turns the heading"
+
+
+def test_every_axis_has_an_end_of_its_own() -> None:
+    """The third comes to its end for a sample at a time only: that the others stay there tells what it is."""
+    rates = np.tile(turning(360.0)[0].gyro[:, 1:2], 3)
+    rates[:, 2] = 0.0
+    rates[7::50, 2] = 2 * LIMIT
+    read = replace(turning(360.0)[0], gyro=of_16_bits(rates, (1.0, 0.99, 1.0)))
+    filled = with_hidden(read, [])
+    assert filled.hidden is not None
+    np.testing.assert_array_equal(filled.hidden[:, 3:] > 0, (rates >= LIMIT - BIT) | (rates <= -LIMIT))
+
+
+def resting(coarse: float) -> Floats:
+    """The first axis at its end, the second at rest in steps of `coarse`, the third without a sensor."""
+    rng, gyro = np.random.default_rng(1), np.zeros((600, 3))
+    gyro[:, 0] = turning(360.0)[1].gyro[:, 1]
+    gyro[:, 1] = np.round(rng.normal(0, 0.6 * coarse, 600) / coarse) * coarse
+    return gyro
+
+
+@pytest.mark.parametrize("coarse", [BIT, np.deg2rad(1.0), np.deg2rad(20.0)])
+def test_an_axis_at_rest_and_one_of_nothing_are_at_no_end(coarse: float) -> None:
+    whole, _ = turning(360.0)
+    filled = with_hidden(replace(whole, gyro=resting(coarse)), [])
+    assert filled.hidden is not None
+    assert filled.hidden[:, 3].any()
+    assert not filled.hidden[:, 4:].any()
+    alone = replace(whole, gyro=resting(coarse) * np.array([0.0, 1.0, 1.0]))
+    assert with_hidden(alone, []) is alone
+
+
+def test_a_steady_turn_is_no_end_where_another_axis_reads_more() -> None:
+    whole, read = turning(360.0)
+    gyro = read.gyro.copy()
+    gyro[:, 2] = np.clip(np.arange(600) * BIT * 100, 0.0, 0.7 * LIMIT)
+    filled = with_hidden(replace(whole, gyro=gyro), [])
+    assert filled.hidden is not None
+    assert filled.hidden[:, 4].any()
+    assert not filled.hidden[:, 5].any()
+
+
+def test_the_smooth_top_of_a_coarse_reading_is_no_end_of_the_range() -> None:
+    """At 1 kHz and half a degree per second a turn stays on its highest bit for many samples; on the next for less."""
+    t = np.arange(5000) * 1e-3
+    step = np.deg2rad(0.5)
+    rates = np.deg2rad(200.3) * np.sin(2 * np.pi * np.outer(t, [0.7, 0.9, 1.1]))
+    accel = np.tile([0.0, 0.0, GRAVITY], (5000, 1))
+    smooth = ImuStream(np.round(1e9 * t).astype(np.int64), accel, np.round(rates / step) * step)
+    assert np.count_nonzero(smooth.gyro == smooth.gyro.max()) > 50
+    assert with_hidden(smooth, []) is smooth
 
 
 def test_what_was_filled_in_is_not_taken_for_a_range() -> None:
