@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from lslam.doctor.examine_noise import examine_noise
 from lslam.doctor.findings import Facts, Finding, plural
-from lslam.inertial.imu_cleaning import GRAVITY, LEAST_RATE_HZ, gravity_unit, mean_forces
+from lslam.inertial.imu_cleaning import GRAVITY, LEAST_RATE_HZ, gravity_unit, is_slow, mean_forces
 from lslam.types.imu import ImuStream
 from lslam.types.sequence import Sequence, no_shared_time
 
@@ -51,7 +51,7 @@ def _examine_time(
     sequence: Sequence, imu: ImuStream, steps: Floats, median: float, findings: list[Finding]
 ) -> int:  # fmt: skip
     """Rate, order, gaps and overlap; the number of gaps."""
-    if median > 0 and 1 / median < LEAST_RATE_HZ:
+    if median > 0 and is_slow(1 / median):
         what = f"IMU: {1 / median:.1f} Hz, too slow to see shaking within a scan ({LEAST_RATE_HZ:.0f} Hz would do)"
         findings.append(Finding("imu-rate", what, "record it faster, of KITTI raw take the `_extract` drive (100 Hz)"))
     back = int((steps <= 0).sum())

@@ -21,7 +21,7 @@ from lslam.frontend.state_classes import STATE_CLASSES
 from lslam.frontend.tracker import Tracker
 from lslam.inertial import fusion
 from lslam.inertial.fusion import InertialMotion
-from lslam.inertial.imu_cleaning import LEAST_RATE_HZ, ImuRefusedError, rate_of
+from lslam.inertial.imu_cleaning import LEAST_RATE_HZ, ImuRefusedError, is_slow, rate_of
 from lslam.inertial.initialise import FirstPoses, InertialStart, start
 from lslam.odometry import create_odometry
 from lslam.readers.selection import Selection, select
@@ -88,7 +88,7 @@ def begin_inertial(sequence: Sequence, config: Config) -> Inertial:
 def _require_rate(sequence: Sequence, imu: ImuStream, method: str) -> None:
     """Raise InputError for an IMU that a filter cannot propagate within a sweep."""
     rate = rate_of(imu)
-    if 0 < rate < LEAST_RATE_HZ:
+    if is_slow(rate):
         extract = ", or take KITTI's `_extract` drive (100 Hz)" if sequence.kind.startswith("kitti") else ""
         raise InputError(
             f"{sequence.path}: {method} is tightly coupled and needs an IMU of {LEAST_RATE_HZ:.0f} Hz or more, this one has "

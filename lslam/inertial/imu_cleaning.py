@@ -19,6 +19,8 @@ PLAUSIBLE_G = (0.8, 1.2)
 CALM_S = 1.0
 # A stream slower than this cannot tell how the sensor moves within a sweep of 0.1 s.
 LEAST_RATE_HZ = 50.0
+# Clocks differ by some ppm, and drivers round their periods: nearer to that rate than a twentieth is that rate.
+RATE_SLACK = 0.05
 MOST_BAD = 0.1
 
 
@@ -71,7 +73,7 @@ def clean(imu: ImuStream, first_ns: int, last_ns: int) -> Cleaned:
             raise ImuRefusedError(f"its {what} repeats one reading, {_text(values[0])}, all the time")
     accel = _in_si(imu, notes)
     cleaned = Cleaned(with_hidden(replace(imu, accel=accel), notes), notes)
-    if cleaned.rate_hz < LEAST_RATE_HZ:
+    if is_slow(cleaned.rate_hz):
         notes.append(
             f"IMU at {cleaned.rate_hz:.0f} Hz, which degrades what it is good for: it predicts the motion from scan to scan, "
             f"but is too slow to see shaking within a scan ({LEAST_RATE_HZ:.0f} Hz would do)"
@@ -84,6 +86,11 @@ def rate_of(imu: ImuStream) -> float:
     steps = np.diff(imu.stamps_ns)
     forward = steps[steps > 0]
     return 1e9 / float(np.median(forward)) if len(forward) else 0.0
+
+
+def is_slow(rate_hz: float) -> bool:
+    """Whether a stream of that rate cannot tell how the sensor moves within a sweep; nothing is said of time that stands."""
+    return 0 < rate_hz < (1 - RATE_SLACK) * LEAST_RATE_HZ
 
 
 def gravity_unit(imu: ImuStream) -> tuple[float, str | None]:

@@ -5,11 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from stub_sequences import Stub
 
+from lslam.doctor.examine_imu import examine_imu
+from lslam.doctor.findings import Finding
+from lslam.errors import InputError
+from lslam.frontend.inertial_start import _require_rate
 from lslam.geometry import se3, so3
 from lslam.inertial.agreement import check_agreement
 from lslam.inertial.gyroscope import Gyroscope
-from lslam.inertial.imu_cleaning import ImuRefusedError
+from lslam.inertial.imu_cleaning import ImuRefusedError, clean
 from lslam.inertial.imu_estimate import ImuEstimate
 from lslam.inertial.initialise import _is_stationary, _path_of_force
 from lslam.inertial.kalman import update
@@ -37,6 +42,25 @@ def test_gravity_and_bias_wander_while_nothing_tells_of_them() -> None:
         after = before.carried(before.over(imu, stamps[[0, -1]]), np.eye(3))
         sigmas = np.sqrt(np.diag(after.covariance) / seconds)
         np.testing.assert_allclose(sigmas, np.repeat([0.05, 5e-3, 2e-3], 3), rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("rate_hz", "is_refused"), [(50 * (1 - 20e-6), False), (48.0, False), (47.0, True), (10.0, True)]
+)
+def test_fifty_hertz_by_a_clock_that_is_slow_are_fifty_hertz(rate_hz: float, is_refused: bool) -> None:
+    """By 20 ppm here: the method, the note of a run and `info` agree."""
+    stamps = np.round(np.arange(120) * 1e9 / rate_hz).astype(np.int64)
+    shaken = np.random.default_rng(0).normal(0, 0.01, (2, 120, 3))
+    imu = ImuStream(stamps, np.array([0.0, 0.0, 9.8]) + shaken[0], shaken[1])
+    sequence, findings = Stub(["no scan"] * 20, imu=imu), list[Finding]()
+    if is_refused:
+        with pytest.raises(InputError, match=r"an IMU of 50 Hz or more, this one has (47|10)\.0 Hz"):
+            _require_rate(sequence, imu, "fast-lio2")
+    else:
+        _require_rate(sequence, imu, "fast-lio2")
+    assert any("degrades" in note for note in clean(imu, 0, 2_000_000_000).notes) is is_refused
+    examine_imu(sequence, findings)
+    assert ("imu-rate" in {finding.code for finding in findings}) is is_refused
 
 
 def tumbling(noise_deg: float, turned_deg: float = 0.0, mirrored: int = 1) -> None:
