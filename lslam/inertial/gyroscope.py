@@ -139,10 +139,8 @@ class Gyroscope:
         return self._moved(x, P, excess, step)
 
     def _variance(self, step: Increments) -> float:
-        """(rad/s)^2 per Hz over `step`; a rate hidden over all of it adds as much to the turn as noise of that density."""
-        if step.hidden is None:
-            return self.rate_variance
-        return self.rate_variance + float(step.hidden[3:].max()) ** 2 * step.duration
+        """(rad/s)^2 per Hz over `step`."""
+        return self.rate_variance + step.hidden_density[1]
 
     def columns(self, step: Increments) -> Floats:
         """(3, 12) by which the turn over `step` grows with bias and axes; the rate is taken for constant.

@@ -144,12 +144,5 @@ def _propagate(estimate: ImuEstimate, step: Increments, R: Floats) -> tuple[Floa
         velocity_arm, position_arm = velocity_arm @ mounting, position_arm @ mounting
     return kalman.propagate(
         x, estimate.covariance, step.duration, step.velocities[-1], step.positions[-1], velocity_arm, position_arm, R,
-        _force_noise(step, estimate.gyroscope.noise.force),
+        math.sqrt(estimate.gyroscope.noise.force**2 + step.hidden_density[0]),
     )  # fmt: skip
-
-
-def _force_noise(step: Increments, usual: float) -> float:
-    """m/s2 per sqrt(Hz); a force hidden over the whole step adds as much to the velocity as noise of that density."""
-    if step.hidden is None:
-        return usual
-    return math.sqrt(usual**2 + float(step.hidden[:3].max()) ** 2 * step.duration)

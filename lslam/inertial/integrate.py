@@ -45,6 +45,16 @@ class Increments:
         """Seconds from the first instant to the last."""
         return 1e-9 * int(self.instants_ns[-1] - self.instants_ns[0])
 
+    @property
+    def hidden_density(self) -> tuple[float, float]:
+        """(m/s2)^2 and (rad/s)^2 per Hz of white noise that adds as much over the step as what is hidden over all of it does.
+
+        Of the worst axis; 0 where nothing is hidden.
+        """
+        if self.hidden is None:
+            return 0.0, 0.0
+        return float(self.hidden[:3].max()) ** 2 * self.duration, float(self.hidden[3:].max()) ** 2 * self.duration
+
     def motion(self, anchor: int, R: Floats, velocity: Floats, gravity: Floats) -> tuple[Floats, Floats, Floats]:
         """Rotations (K, 3, 3), velocities (K, 3) and positions (K, 3) in the world, relative to the position at `anchor`.
 

@@ -208,8 +208,7 @@ class SmootherMotion(InertialMotion):
         gyroscope = self.estimate.gyroscope
         return InertialStep(
             np.diff(at), means(self.imu.accel), (means(self.imu.gyro) - self._usual_bias) @ gyroscope.axes.T,
-            gyroscope.turn_covariance(step) / step.duration, T_world_imu, C,
-            0.0 if step.hidden is None else float(step.hidden[:3].max()) ** 2 * step.duration,
+            gyroscope.turn_covariance(step) / step.duration, T_world_imu, C, step.hidden_density[0],
         )  # fmt: skip
 
     def _beginning(self) -> InertialState:

@@ -156,6 +156,21 @@ def test_a_step_over_a_cut_is_known_the_less_and_any_other_as_before() -> None:
     assert sigmas[3][2][0] > 2 * sigmas[2][2][0], "a force that is turned wrongly leads astray"
 
 
+def test_speed_and_turn_over_a_cut_are_unsure_by_what_it_may_hide() -> None:
+    """A force and a rate hidden all the time lead as far astray as a constant error of one sigma."""
+    stamps, none = np.arange(11, dtype=np.int64) * 10_000_000, np.zeros(3)
+    accel = np.tile([0.0, 0.0, GRAVITY], (11, 1))
+    seen = ImuStream(stamps, accel, np.zeros((11, 3)))
+    blind = replace(seen, hidden=np.tile([0.0, 3.0, 0.0, 0.0, 0.0, 0.5], (11, 1)))
+    estimate = ImuEstimate(none, np.array([0, 0, -GRAVITY]), none, Gyroscope.of_bias(none, 1e-3), 1e-4 * np.eye(9))
+    steps = [estimate.over(stream, stamps[[0, -1]]) for stream in (seen, blind)]
+    speeds = [estimate.carried(step, np.eye(3)).covariance[:3, :3] for step in steps]
+    turns = [estimate.gyroscope.turn_covariance(step) for step in steps]
+    np.testing.assert_allclose(speeds[1] - speeds[0], (0.1 * 3.0) ** 2 * np.eye(3), atol=1e-9)
+    np.testing.assert_allclose(turns[1] - turns[0], (0.1 * 0.5) ** 2 * np.eye(3), atol=1e-9)
+    np.testing.assert_allclose([step.hidden_density for step in steps], [(0.0, 0.0), (0.9, 0.025)])
+
+
 def test_a_flight_beyond_the_range_of_its_imu_is_survived_and_said() -> None:
     """Two thirds of its readings sit at 2 g and a tenth at 250 deg/s from the third second on."""
     drive = simulate("quadrotor", lidar="vlp16", count=60, imu="icm20948", motion_compensated=False)
