@@ -190,3 +190,14 @@ def test_more_than_a_tenth_of_the_scans_with_an_open_direction_degrade_the_run(w
     manifest.judge([replace(r, degenerate=along) if i < weak else r for i, r in enumerate(found)], 10, False)
     assert manifest.outcome == outcome
     assert all("scan 10: along x" in problem for problem in manifest.problems)
+
+
+@pytest.mark.parametrize("key", ["estimate_offset", "estimate_extrinsics"])
+def test_an_imu_that_learns_nothing_of_registration_cannot_estimate_its_device(key: str) -> None:
+    """`integrated` carries the first seconds' calibration to the end."""
+    asked = (f"imu.{key}=true", "imu.use=true")
+    check_config(load_config(None, asked, {}))
+    with pytest.raises(
+        UsageError, match=r"estimate_extrinsics learn from registered turns, of which .* drop them, or imu\.v"
+    ):
+        check_config(load_config(None, [*asked, "imu.velocity=integrated"], {}))
