@@ -8,6 +8,8 @@ from lslam.config.section import Section
 
 # Methods whose estimate is of points and IMU together.
 TIGHTLY_COUPLED = ("fast-lio2", "lio-sam", "lio-mapping", "lips")
+# Of these, the ones that have no states for the device, the rotation of its extrinsics and its clock.
+FIXED_DEVICE = ("lio-sam", "lio-mapping", "lips")
 
 
 class OdometryConfig(Section):

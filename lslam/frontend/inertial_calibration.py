@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from lslam.inertial.fusion import InertialMotion
 from lslam.inertial.gyroscope import Gyroscope
 from lslam.inertial.initialise import InertialStart
 
@@ -14,14 +15,21 @@ from lslam.inertial.initialise import InertialStart
 LEAST_TURN_RAD, SIGMAS = np.deg2rad(2.0), 4.0
 
 
-def mounting_problem(gyroscope: Gyroscope) -> str:
-    """A sentence where the turns contradict the rotation of T_lidar_imu and it is not estimated; else empty."""
+def mounting_problem(motion: InertialMotion) -> str:
+    """A sentence where the turns contradict the rotation of T_lidar_imu and it is not estimated; else empty.
+
+    What it advises is what the method of this motion model takes.
+    """
+    gyroscope = motion.estimate.gyroscope
     angle, sigma = gyroscope.tilt
     if gyroscope.is_mounted or angle < LEAST_TURN_RAD or angle < SIGMAS * sigma:
         return ""
+    first = "" if motion.HAS_DEVICE else "--method fast-lio2 "
+    if motion.config.velocity == "integrated":
+        first = "--set imu.velocity=registration "
     return (
         f"IMU: it turns about an axis {np.rad2deg(angle):.1f} deg (sigma {np.rad2deg(sigma):.1f}) beside that of the scans: "
-        "correct T_lidar_imu, or have it estimated by --set imu.estimate_extrinsics=true"
+        f"correct T_lidar_imu, or have it estimated by {first}--set imu.estimate_extrinsics=true"
     )
 
 

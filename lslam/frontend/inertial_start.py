@@ -206,7 +206,7 @@ def close_inertial(part: Inertial, results: list[ScanResult]) -> dict[str, Any]:
         part.problems.append(
             f"IMU: {motion.gap_scans} scans fell into gaps of the IMU and were predicted by constant velocity"
         )
-    if said := mounting_problem(motion.estimate.gyroscope):
+    if said := mounting_problem(motion):
         part.problems.append(said)
     if motion.refusal:
         part.problems.append(f"the IMU was refused on the way, the run went on without it: {motion.refusal}")

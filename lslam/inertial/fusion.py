@@ -45,6 +45,8 @@ class InertialMotion(Stateful):
     JUDGED, WORSE, SLACK_M = 30, 2.0, 0.02
     # One scan in so many is registered from constant velocity too, to tell what the IMU saves.
     COMPARED = 20
+    # Whether it has states for the device, the rotation of its extrinsics and its clock.
+    HAS_DEVICE: ClassVar[bool] = True
     STATE: ClassVar[tuple[str, ...]] = (
         "estimate", "coasting", "refusal", "gap_scans", "_scans", "_has_gap", "_was_bridged", "_instant_ns", "_pose",
     )  # fmt: skip

@@ -32,6 +32,7 @@ BRAKING = 3.0
 class LinkedMotion(FilterMotion):
     """Predicts and deskews as the filter does; the estimate itself is the smoother's, of all states it holds."""
 
+    HAS_DEVICE: ClassVar[bool] = False
     STATE: ClassVar[tuple[str, ...]] = (*FilterMotion.STATE, "_linked")
 
     def __init__(self, imu: ImuStream, T_lidar_imu: Floats, estimate: ImuEstimate, config: ImuConfig) -> None:

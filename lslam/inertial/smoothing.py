@@ -6,7 +6,7 @@ import logging
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,6 +64,8 @@ class SmootherMotion(InertialMotion):
     States are at the middles of the sweeps. The errors of the gyroscope's axes, which the smoother has none of, are calibrated
     as with any IMU, and taken off its readings, as the bias at the start is.
     """
+
+    HAS_DEVICE: ClassVar[bool] = False
 
     def __init__(
         self, imu: ImuStream, T_lidar_imu: Floats, estimate: ImuEstimate, config: ImuConfig, smoother: Smoother

@@ -34,6 +34,7 @@ class WindowMotion(FilterMotion):
     size : moments in the window between two scans
     """
 
+    HAS_DEVICE: ClassVar[bool] = False
     STATE: ClassVar[tuple[str, ...]] = (*FilterMotion.STATE, "window")
 
     def __init__(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from lslam.config import Config
 from lslam.config.load import read_preset
-from lslam.config.odometry import TIGHTLY_COUPLED
+from lslam.config.odometry import FIXED_DEVICE, TIGHTLY_COUPLED
 from lslam.errors import UsageError
 from lslam.evaluation.recipes import check_words, parse_delta
 from lslam.loops import require_descriptor
@@ -86,7 +86,7 @@ def _check_imu(config: Config) -> None:
             "imu.estimate_offset and imu.estimate_extrinsics learn from registered turns, of which imu.velocity = 'integrated' "
             "takes none: drop them, or imu.velocity"
         )
-    if (config.imu.estimate_offset or config.imu.estimate_extrinsics) and method in ("lio-sam", "lio-mapping", "lips"):
+    if (config.imu.estimate_offset or config.imu.estimate_extrinsics) and method in FIXED_DEVICE:
         raise UsageError(
             f"imu.estimate_offset and imu.estimate_extrinsics are states of a filter, which {method} does not have: drop them, "
             "or take --method fast-lio2"
