@@ -126,9 +126,7 @@ class InertialMotion(Stateful):
         step = self._since_last(instant_ns)
         begin, end = self._pose @ self.T_lidar_imu, middle @ self.T_lidar_imu
         R_felt = begin[:3, :3] @ step.rotations[-1]
-        moved, felt = e.displacement(step, begin[:3, :3])
-        P = np.zeros((6, 6))
-        P[:3, :3], P[3:, 3:] = felt, R_felt @ e.gyroscope.turn_covariance(step) @ R_felt.T
+        moved, P = self._felt_motion(step)
         rest = np.concatenate([end[:3, 3] - begin[:3, 3] - moved, R_felt @ vector_between(R_felt, end[:3, :3])])
         gyroscope = e.taught(step, begin[:3, :3], end[:3, :3], C[3:, 3:])
         self._taught = instant_ns, gyroscope, C[:3, :3]
@@ -138,6 +136,18 @@ class InertialMotion(Stateful):
         # then add up to the least drift when those of the IMU count as many times.
         pose, covariance = kalman.weighed(result.T_world_lidar, rest, C, P, result.map_age)
         return replace(result, T_world_lidar=pose, registration_covariance=covariance)
+
+    def _felt_motion(self, step: Increments) -> tuple[Floats, Floats]:
+        """How far, m, the IMU came over `step` from the newest pose, (3,), and the covariance (6, 6) of that and of its turn.
+
+        All in world axes.
+        """
+        R = (self._pose @ self.T_lidar_imu)[:3, :3]
+        R_felt = R @ step.rotations[-1]
+        moved, felt = self.estimate.displacement(step, R)
+        P = np.zeros((6, 6))
+        P[:3, :3], P[3:, 3:] = felt, R_felt @ self.estimate.gyroscope.turn_covariance(step) @ R_felt.T
+        return moved, P
 
     def _denied(self, result: ScanResult, rest: Floats, covariance: Floats) -> ScanResult:
         """What comes of a registration that contradicts the IMU by `rest` (6,), m and rad: constant velocity decides.

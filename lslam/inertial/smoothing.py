@@ -99,7 +99,13 @@ class SmootherMotion(InertialMotion):
             found = self.smoother.add(self._measured(step, T_world_imu, there))
         except GraphError as error:
             self._is_begun = False
-            return replace(result, status="bridged", reason=str(error), T_world_lidar=prior.pose, converged=False)
+            # The IMU's pose is as sure as the IMU, whatever registration said of its own.
+            lever = prior.pose[:3, 3] - (prior.pose @ self.T_lidar_imu)[:3, 3]
+            covariance = noise.transported(self._felt_motion(step)[1], lever)
+            return replace(
+                result, status="bridged", reason=str(error), T_world_lidar=prior.pose, converged=False,
+                registration_covariance=covariance,
+            )  # fmt: skip
         self._added = instant_ns, found
         within = se3.relative(result.T_world_lidar, middle)
         pose = se3.normalise(found.T_world_imu @ self.T_imu_lidar @ se3.inverse(within))

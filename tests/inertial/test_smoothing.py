@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from imu_drives import drone, extrinsics_of, stream_of, truth_of
 
 from lslam.config.imu import ImuConfig
 from lslam.frontend.motion_models import smoother_noise
@@ -11,8 +12,11 @@ from lslam.graph.inertial_smoother import InertialSmoother
 from lslam.inertial.gyroscope import Gyroscope
 from lslam.inertial.imu_estimate import GRAVITY, ImuEstimate
 from lslam.inertial.imu_noise import USUAL
+from lslam.inertial.initialise import FirstPoses, start
 from lslam.inertial.smoothing import SmootherMotion
 from lslam.types.imu import ImuStream
+from lslam.types.scan import Span
+from lslam.types.scan_result import ScanResult
 
 IMU_NOISE = smoother_noise(USUAL)
 LEVER = np.array([0.4, -0.3, 0.2])
@@ -46,6 +50,81 @@ def test_readings_are_carried_to_the_lidar() -> None:
         rates = link.step.rates - chain.gyro_bias
         np.testing.assert_allclose(rates[:, :2], 0, atol=1e-3)
         assert np.ptp(rates[:, 2]) > 1
+
+
+STAMPS, POSES = truth_of(drone())
+SURE = np.diag([0.005**2] * 3 + [1e-3**2] * 3)
+
+
+def flying(count: int) -> SmootherMotion:
+    """An IMU in flight after so many scans, registered where they were."""
+    first = FirstPoses(STAMPS[:50], POSES[:50], STAMPS[:50], POSES[:50], np.repeat(SURE[None], 50, axis=0))
+    begun = start(stream_of(drone()), extrinsics_of(drone()), first, int(STAMPS[-1]), ImuConfig())
+    motion = SmootherMotion(begun.imu, begun.T_lidar_imu, begun.estimate, ImuConfig(), InertialSmoother(IMU_NOISE, 100))
+    for k in range(count):
+        weighed(motion, k)
+    return motion
+
+
+def weighed(motion: SmootherMotion, k: int) -> ScanResult:
+    """Scan k, registered where it was."""
+    stamp = int(STAMPS[k])
+    prior = motion.sweep(stamp, Span())
+    result = motion.weigh(ScanResult(k, stamp, POSES[k], registration_covariance=SURE), prior)
+    motion.correct(stamp, result.T_world_lidar, prior, result.status == "ok")
+    return result
+
+
+def unsolvable(motion: SmootherMotion) -> None:
+    """Until its graph begins anew."""
+
+    class Unsolvable:
+        def update(self, *_: object) -> None:
+            raise RuntimeError("Indeterminant linear system detected\nand more")
+
+    assert isinstance(motion.smoother, InertialSmoother)
+    motion.smoother._solver = Unsolvable()
+
+
+def is_followed(motion: SmootherMotion, k: int) -> bool:
+    """Whether scans from k on are weighed by a graph again, and are where they were."""
+    results = [weighed(motion, k + i) for i in range(3)]
+    # The first begins the graph, at the pose of the scan before or its own.
+    states = [motion.smoother.state()["steps"].rows, results[-1].T_world_lidar[:3, 3] - POSES[k + 2][:3, 3]]
+    return all(r.status == "ok" for r in results) and len(states[0]) == 3 and float(np.linalg.norm(states[1])) < 0.02
+
+
+def test_a_scan_whose_graph_has_no_solution_is_bridged_as_surely_as_the_imu_is() -> None:
+    motion = flying(10)
+    unsolvable(motion)
+    predicted = motion.sweep(int(STAMPS[10]), Span()).pose
+    result = weighed(motion, 10)
+    assert (result.status, result.converged) == ("bridged", False)
+    assert result.reason == "the smoother of poses and IMU cannot be solved: Indeterminant linear system detected"
+    np.testing.assert_array_equal(result.T_world_lidar, predicted)
+    C = result.registration_covariance
+    assert C is not None
+    off = se3.relative(POSES[9], POSES[10])[:3, 3] - se3.relative(POSES[9], predicted)[:3, 3]
+    assert np.linalg.norm(off) < 4 * np.sqrt(np.linalg.eigvalsh(C[:3, :3])[-1])
+    twice = flying(10)
+    unsolvable(twice)
+    stamp = int(STAMPS[10])
+    surer = ScanResult(10, stamp, POSES[10], registration_covariance=1e-4 * SURE)
+    np.testing.assert_array_equal(twice.weigh(surer, twice.sweep(stamp, Span())).registration_covariance, C)
+    assert is_followed(motion, 11)
+
+
+def test_where_the_graph_cannot_carry_a_scan_it_begins_anew_behind_it() -> None:
+    motion = flying(10)
+    unsolvable(motion)
+    stamp = int(STAMPS[10])
+    prior = motion.sweep(stamp, Span())
+    motion.correct(stamp, prior.pose, prior, is_registered=False)
+    newest = motion.smoother.state()["begun"]
+    assert newest is not None
+    np.testing.assert_allclose(newest.T_world_imu, prior.pose @ extrinsics_of(drone()), atol=1e-9)
+    np.testing.assert_array_equal(newest.velocity, motion.estimate.velocity)
+    assert is_followed(motion, 11)
 
 
 def test_silence_is_no_link_and_nothing_else_no_chain() -> None:
