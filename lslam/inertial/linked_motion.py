@@ -62,6 +62,14 @@ class LinkedMotion(FilterMotion):
             self._linked = instant_ns, middle
         return replace(result, inertial=None)
 
+    def correct(
+        self, stamp_ns: int, pose: Floats, prior: MotionPrior | None = None, is_registered: bool = True
+    ) -> None:
+        """As of the filter; a scan that was denied has its state in the smoother where it was put in the end."""
+        super().correct(stamp_ns, pose, prior, is_registered)
+        if self._linked is not None and self._linked[0] == self._instant_ns:
+            self._linked = self._linked[0], self._pose.copy()
+
     def rewind(self, stamp_ns: int, pose: Floats, span: Span) -> MotionPrior:
         """As of any IMU; the smoother begins anew, too."""
         self._now = self._next = self._found = None

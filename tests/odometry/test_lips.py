@@ -21,7 +21,10 @@ from lslam.frontend.state_classes import STATE_CLASSES
 from lslam.frontend.tracker import Tracker
 from lslam.geometry import se3
 from lslam.geometry.normal_equations import Normal
+from lslam.inertial.linked_motion import LinkedMotion
 from lslam.odometry import create_odometry
+from lslam.odometry.lips import Lips
+from lslam.odometry.sanity import plausible
 from lslam.simulation.scenarios import simulate
 from lslam.types.imu import ImuStream
 from lslam.types.motion_prior import MotionPrior
@@ -128,6 +131,33 @@ def test_behind_a_stand_a_scan_is_linked_by_its_pose_and_not_by_all_that_was_fel
     assert prior.link.step is not None
     assert prior.link.step.seconds == 0.0
     assert np.linalg.norm(prior.link.step.position) < 0.15
+
+
+def test_behind_a_denied_scan_the_next_is_linked_to_where_the_smoother_put_that() -> None:
+    """Its planes are taken back and the window goes on by the IMU, which then falls silent."""
+    one = tracker()
+    loaded = list(read_ahead(walk(), one.odometry.prepare, 1))
+    for scan in loaded[:5]:
+        one.track(scan)
+    denied, last = walk().scans[5], walk().scans[6]
+    assert isinstance(denied, Scan)
+    assert isinstance(last, Scan)
+    assert isinstance(one.odometry, Lips)
+    prior = one.motion.sweep(loaded[5].stamp_ns, denied.span)
+    found = one.odometry.register(denied, loaded[5].prepared, prior)
+    far = replace(found.result, T_world_lidar=se3.make(np.eye(3), np.array([50.0, 0.0, 0.0])) @ prior.pose)
+    result = plausible(one.motion.weigh(far, prior), prior.pose, ScanResult(4, loaded[4].stamp_ns, np.eye(4)))
+    assert result.status == "bridged"
+    one.odometry.update(prior, replace(found, result=result))
+    one.motion.correct(result.stamp_ns, result.T_world_lidar, prior, is_registered=False)
+    assert isinstance(one.motion, LinkedMotion)
+    one.motion.refusal = "it was silent from here on"
+    after = one.motion.sweep(loaded[6].stamp_ns, last.span)
+    assert after.link is not None
+    assert after.link.step is not None
+    assert after.link.step.seconds == 0.0
+    led = one.odometry._predicted(after.link).T_world_lidar @ se3.inverse(after.link.within)
+    assert np.linalg.norm(led[:3, 3] - after.pose[:3, 3]) < 0.05
 
 
 def test_where_there_is_only_ground_the_directions_it_leaves_free_are_said() -> None:
