@@ -35,3 +35,11 @@ class Normal:
         rest[:-1, :-1], rest[:-1, -1], rest[-1, :-1] = self.H[np.ix_(kept, kept)], self.g[kept], self.g[kept]
         left = positive.complement(self.H[np.ix_(out, out)], across, rest)
         return Normal(0.5 * (left[:-1, :-1] + left[:-1, :-1].T), left[:-1, -1].copy())
+
+
+def warm_up() -> None:
+    """Compile or load what an estimate over a window is solved, marginalised and given a covariance with."""
+    normal = Normal(np.eye(2), np.zeros(2))
+    normal.step()
+    normal.without(np.array([True, False]))
+    positive.inverse(normal.H)

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.config.config import Config
+from lslam.geometry import normal_equations
 from lslam.odometry.base import Registered
 from lslam.odometry.fast_lio2 import FastLio2
 from lslam.preprocessing.prepare import PreparedPoints
@@ -82,6 +83,11 @@ class LioMapping(FastLio2):
             if is_due:
                 self.registration.enter(points, T)
         self.pending = tuple(one for one, is_due in zip(waiting, due, strict=True) if not is_due)
+
+    def warm_up(self) -> None:
+        """As of `icp`, and a small window, which the motion model solves."""
+        super().warm_up()
+        normal_equations.warm_up()
 
     def restart(self) -> None:
         """An empty map, and no scan that waits for it."""

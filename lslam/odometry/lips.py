@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from lslam.config.config import Config
 from lslam.errors import UsageError
-from lslam.geometry import noise, se3
+from lslam.geometry import noise, normal_equations, se3
 from lslam.kernels.transform import transform
 from lslam.odometry.base import Registered
 from lslam.odometry.plane_association import associate
@@ -109,11 +109,12 @@ class Lips(Stateful):
         self.window = None
 
     def warm_up(self) -> None:
-        """Extract the planes of a small room."""
+        """Extract the planes of a small room, and solve a small window."""
         rng = np.random.default_rng(0)
         room = rng.uniform(-8, 8, (3000, 3)).astype(np.float32)
         room[np.arange(3000), rng.integers(0, 3, 3000)] = 8.0
         self._extractor.extract(room)
+        normal_equations.warm_up()
 
     def _predicted(self, link: SweepLink) -> PlaneWindow:
         """The window with one more state where the IMU leads, or its first."""

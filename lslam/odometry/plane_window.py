@@ -151,7 +151,8 @@ class PlaneWindow:
     def covariance_on_planes(self) -> Floats:
         """(6, 6) of the newest pose, were the planes known exactly."""
         first = self.values.first_plane
-        left = Normal(self.normal().H[:first, :first], np.zeros(first)).without(self._older[:first])
+        H = np.ascontiguousarray(self.normal().H[:first, :first])
+        left = Normal(H, np.zeros(first)).without(self._older[:first])
         return positive.inverse(left.H)[SHARED : SHARED + 6, SHARED : SHARED + 6]
 
     @property

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from stub_sequences import Stub, sample
+from warmed_kernels import recorded
 
 import lslam
 from lslam.config import Config, load_config
@@ -19,6 +20,7 @@ from lslam.frontend.register_scans import read_ahead
 from lslam.frontend.state_classes import STATE_CLASSES
 from lslam.frontend.tracker import Loaded, Tracker
 from lslam.inertial.window_motion import WindowMotion
+from lslam.kernels import positive
 from lslam.odometry import create_odometry
 from lslam.odometry.lio_mapping import LioMapping
 from lslam.pipeline.check import check_config
@@ -124,3 +126,16 @@ def test_it_does_nothing_without_an_imu() -> None:
         lslam.run(sample(5), windowed())
     with pytest.raises(UsageError, match="of the loosely coupled IMU, lio-mapping weighs points and IMU together"):
         check_config(config_of("lio-mapping", "imu.velocity=integrated"))
+
+
+def test_warming_up_compiles_what_the_window_is_solved_with(monkeypatch: pytest.MonkeyPatch) -> None:
+    sequence = replace(walk(), scans=walk().scans[:8])
+    one, method, _ = tracker_of(sequence, windowed())
+    calls = recorded(monkeypatch, positive, "inverse", "complement", "solved")
+    method.warm_up()
+    warm = set(calls)
+    assert len(method.registration.map) == 0
+    for loaded in read_ahead(sequence, method.prepare, 1):
+        one.track(loaded)
+    assert {name for name, _ in calls} == {"inverse", "complement", "solved"}
+    assert calls == warm

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from analytic_scenes import floor_only, seen_from
 from stub_sequences import Stub, sample
+from warmed_kernels import recorded
 
 import lslam
 from lslam.config import Config, load_config
@@ -22,6 +23,7 @@ from lslam.frontend.tracker import Tracker
 from lslam.geometry import se3
 from lslam.geometry.normal_equations import Normal
 from lslam.inertial.linked_motion import LinkedMotion
+from lslam.kernels import positive
 from lslam.odometry import create_odometry
 from lslam.odometry.lips import Lips
 from lslam.odometry.sanity import plausible
@@ -112,6 +114,17 @@ def test_over_a_gap_and_a_lost_scan_the_planes_carry_on() -> None:
     assert motion.motion.gap_scans >= 3
     assert [r.status for r in results].count("ok") >= COUNT - 2
     assert worst(results) < 0.3
+
+
+def test_warming_up_compiles_what_the_window_is_solved_with(monkeypatch: pytest.MonkeyPatch) -> None:
+    one = tracker()
+    calls = recorded(monkeypatch, positive, "inverse", "complement", "solved")
+    one.odometry.warm_up()
+    warm = set(calls)
+    assert {name for name, _ in warm} == {"inverse", "complement", "solved"}
+    for loaded in read_ahead(replace(walk(), scans=walk().scans[:3]), one.odometry.prepare, 1):
+        one.track(loaded)
+    assert calls == warm
 
 
 def test_behind_a_stand_a_scan_is_linked_by_its_pose_and_not_by_all_that_was_felt() -> None:
