@@ -138,6 +138,20 @@ class Gyroscope:
         )  # fmt: skip
         return self._moved(x, P, excess, step)
 
+    def with_bias(self, bias: Floats, covariance: Floats) -> Gyroscope:
+        """After another estimate, which knows nothing of the rest, found this `bias` (3,), with its `covariance` (3, 3).
+
+        The rest follows by its covariance with the bias, as the states of a filter follow a pose.
+        """
+        P = self.covariance
+        gain = np.linalg.solve(P[:3, :3], P[:3]).T
+        d = gain @ (bias - self.bias)
+        P = P - gain @ (P[:3, :3] - covariance) @ gain.T
+        offset = self.offset_s + float(d[12]) if self.has_offset else self.offset_s
+        return replace(
+            self, bias=bias, axes=self.axes + d[3:12].reshape(3, 3), covariance=0.5 * (P + P.T), offset_s=offset
+        )
+
     def _variance(self, step: Increments) -> float:
         """(rad/s)^2 per Hz over `step`."""
         return self.rate_variance + step.hidden_density[1]

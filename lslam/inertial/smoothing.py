@@ -15,7 +15,6 @@ from lslam.config.imu import ImuConfig
 from lslam.errors import GraphError
 from lslam.geometry import noise, se3
 from lslam.inertial.fusion import InertialMotion
-from lslam.inertial.gyroscope import Gyroscope
 from lslam.inertial.imu_estimate import ImuEstimate
 from lslam.inertial.integrate import Increments
 from lslam.inertial.navigation_state import BEGIN_SIGMA
@@ -230,8 +229,11 @@ class SmootherMotion(InertialMotion):
         return InertialState(self._pose @ self.T_lidar_imu, e.velocity, e.accel_bias, bias, e.gravity, P)
 
     def _as_estimate(self, found: InertialState) -> ImuEstimate:
-        """The state as what predicts; the gyroscope's axes and noise are the calibration's."""
+        """The state as what predicts; the gyroscope's axes and noise are the calibration's, which follows the bias."""
         known = self.estimate.gyroscope
-        gyroscope: Gyroscope = replace(known, bias=self._usual_bias + np.linalg.solve(known.axes, found.gyro_bias))
+        unturned = np.linalg.inv(known.axes)
+        gyroscope = known.with_bias(
+            self._usual_bias + unturned @ found.gyro_bias, unturned @ found.covariance[12:15, 12:15] @ unturned.T
+        )
         P = found.covariance[np.ix_(ESTIMATE, ESTIMATE)]
         return ImuEstimate(found.velocity, found.gravity, found.accel_bias, gyroscope, P)

@@ -159,3 +159,23 @@ def test_turns_over_many_steps_are_the_gyroscopes_not_the_noise_of_registration(
         off = (gyroscope.bias - BIAS) * step.seconds[-1]
         gyroscope = gyroscope.learnt(step, rng.normal(0, seen_to, 3) + off, seen_to**2 * np.eye(3))
     assert np.sqrt(np.mean(np.square(errors))) < np.deg2rad(0.01)
+
+
+def test_what_is_known_of_the_axes_follows_a_bias_that_another_estimate_found() -> None:
+    """A steady turn tells of bias and scale together: who knows the one knows the other, and the turn as well as before."""
+    turning = ImuStream(np.arange(11) * 10_000_000, np.zeros((11, 3)), np.tile([0.0, 0.0, 2.0], (11, 1)))
+    step = integrate(turning, np.array([0, 100_000_000]), np.zeros(3), np.zeros(3))
+    prior = Gyroscope.of_bias(np.zeros(3), 0.01)
+    learnt = prior
+    for _ in range(20):
+        learnt = learnt.learnt(step, np.zeros(3), 1e-10 * np.eye(3))
+    sure = learnt.with_bias(np.array([0.0, 0.0, 0.004]), 1e-8 * np.eye(3))
+    np.testing.assert_allclose(sure.covariance[:3, :3], 1e-8 * np.eye(3), atol=1e-12)
+    assert np.linalg.eigvalsh(sure.covariance)[0] > 0
+    assert sure.covariance[11, 11] < 0.1 * learnt.covariance[11, 11]
+    assert sure.turn_covariance(step)[2, 2] < 1.1 * learnt.turn_covariance(step)[2, 2]
+    reading = np.array([0.0, 0.0, 2.0])
+    np.testing.assert_allclose(sure.rates(reading), learnt.rates(reading), atol=1e-4)
+    same = learnt.with_bias(learnt.bias, learnt.covariance[:3, :3])
+    np.testing.assert_allclose(same.covariance, learnt.covariance, atol=1e-15)
+    np.testing.assert_array_equal(same.axes, learnt.axes)

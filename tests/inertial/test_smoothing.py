@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from imu_drives import drone, extrinsics_of, stream_of, truth_of
+from imu_drives import GYRO_BIAS, drone, extrinsics_of, stream_of, truth_of
 
 from lslam.config.imu import ImuConfig
 from lslam.frontend.motion_models import smoother_noise
@@ -73,6 +73,23 @@ def weighed(motion: SmootherMotion, k: int) -> ScanResult:
     result = motion.weigh(ScanResult(k, stamp, POSES[k], registration_covariance=SURE), prior)
     motion.correct(stamp, result.T_world_lidar, prior, result.status == "ok")
     return result
+
+
+def test_the_bias_of_the_gyroscope_and_its_sigma_are_both_the_smoothers() -> None:
+    """Its other states too, and a graph that begins anew begins with them; readings less its bias are in the axes."""
+    motion = flying(30)
+    assert isinstance(motion.smoother, InertialSmoother)
+    newest, gyroscope = motion.smoother.newest, motion.estimate.gyroscope
+    assert newest is not None
+    begun = motion._beginning()
+    np.testing.assert_allclose(begun.covariance[6:, 6:][3:6, 3:6], newest.covariance[9:12, 9:12])
+    np.testing.assert_allclose(begun.covariance[12:15, 12:15], newest.covariance[12:15, 12:15], rtol=2e-2)
+    np.testing.assert_allclose(begun.gyro_bias, newest.gyro_bias, rtol=0.05, atol=1e-6)
+    summary = motion.estimate.summary
+    np.testing.assert_allclose(summary.sigmas[3:6], np.sqrt(np.diag(newest.covariance)[12:15]), rtol=0.05)
+    assert np.linalg.eigvalsh(gyroscope.covariance)[0] > 0
+    # Of the data sheet, as it stays over three seconds.
+    assert (np.abs(summary.values[3:6] - GYRO_BIAS) < 4 * summary.sigmas[3:6]).all()
 
 
 def unsolvable(motion: SmootherMotion) -> None:
