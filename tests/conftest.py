@@ -13,6 +13,7 @@ from types import ModuleType
 
 import pytest
 from hypothesis import settings
+from shared_towns import Towns
 
 from lslam.errors import InputError
 from lslam.foreign import importing_open3d
@@ -51,6 +52,19 @@ def recordings(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path
         return target
 
     return unpack
+
+
+TOWNS = Towns()
+
+
+@pytest.fixture(scope="module", autouse=True)
+def shared_towns(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Towns are built once for all tests but those of the simulator, which build each anew unless `SHARES_TOWNS` there."""
+    with pytest.MonkeyPatch.context() as patch:
+        if request.path.parent.name != "simulation" or getattr(request.module, "SHARES_TOWNS", False):
+            patch.setattr("lslam.simulation.built_scenario._city", TOWNS.city)
+            patch.setattr("lslam.simulation.scenarios.RayScene", TOWNS.scene)
+        yield
 
 
 @pytest.fixture(scope="session")

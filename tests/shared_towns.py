@@ -1,0 +1,46 @@
+"""Towns of scenarios that are built once, however many tests of a worker drive through them: to build one takes seconds."""
+
+from __future__ import annotations
+
+import hashlib
+import pickle
+from collections import OrderedDict
+
+import numpy as np
+
+from lslam.simulation import built_scenario
+from lslam.simulation.city import City
+from lslam.simulation.curve import RouteCurve
+from lslam.simulation.lidar import RayScene
+from lslam.simulation.scenario_files import Scenario
+from lslam.simulation.scene_mesh import SceneMesh
+from lslam.simulation.terrain import Terrain
+
+HELD = 5  # towns, of some 100 MB each with what rays need
+
+
+class Towns:
+    """Stands in for the two steps of `simulate` that take long: the town round a street, and the scene of its mesh.
+
+    A town is known by all that it is built of, to the byte, the state of the generator among it.
+    """
+
+    def __init__(self) -> None:
+        self._build = built_scenario._city
+        self._held: OrderedDict[str, tuple[City, RayScene]] = OrderedDict()
+
+    def city(self, scenario: Scenario, street: RouteCurve, terrain: Terrain, rng: np.random.Generator) -> City:
+        given = pickle.dumps((scenario.world, scenario.layout, street, terrain, rng.bit_generator.state))
+        key = hashlib.sha256(given).hexdigest()
+        if key not in self._held:
+            city = self._build(scenario, street, terrain, rng)
+            self._held[key] = city, RayScene(city.mesh)
+        self._held.move_to_end(key)
+        while len(self._held) > HELD:
+            self._held.popitem(last=False)
+        return self._held[key][0]
+
+    def scene(self, mesh: SceneMesh) -> RayScene:
+        """The one of a town that is held, else a new one."""
+        held = [scene for city, scene in self._held.values() if city.mesh is mesh]
+        return held[0] if held else RayScene(mesh)

@@ -1,0 +1,30 @@
+"""Towns that tests share are those that the simulator builds, to the last bit, and no others."""
+
+from __future__ import annotations
+
+import pytest
+from shared_towns import HELD, Towns
+
+from lslam.simulation import built_scenario, scenarios
+from lslam.simulation.lidar import RayScene
+from lslam.simulation.scenarios import simulate
+
+
+def test_a_shared_town_is_the_one_that_is_built_anew(monkeypatch: pytest.MonkeyPatch) -> None:
+    shared = Towns()
+
+    def scan(seed: int, count: int, *settings: str) -> bytes:
+        return simulate("block", seed=seed, count=count, settings=settings).scan(1).points.tobytes()
+
+    asked = [(0, 2), (1, 2), (0, 2, "layout.storeys=[1, 1]"), (0, 2, "world.relief=0.1"), (0, 3)]
+    monkeypatch.setattr(built_scenario, "_city", shared._build)
+    monkeypatch.setattr(scenarios, "RayScene", RayScene)
+    anew = [scan(*words) for words in asked]
+    monkeypatch.setattr(built_scenario, "_city", shared.city)
+    monkeypatch.setattr(scenarios, "RayScene", shared.scene)
+    assert [scan(*words) for words in asked] == anew
+    assert len(set(anew)) == len(shared._held) == 4, "the length of a drive is none of the town's"
+    assert HELD > 4
+    held = simulate("block", seed=1, count=5)
+    assert held.scene is simulate("block", seed=1, count=2, lidar="vlp16").scene
+    assert held.city is not simulate("block", seed=0).city
