@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -12,8 +13,9 @@ from stub_sequences import Stub, sample
 import lslam
 from lslam.config import Config, load_config
 from lslam.errors import InputError
-from lslam.simulation.scenarios import simulate
+from lslam.simulation.scenarios import SimulatedDrive, simulate
 from lslam.types.imu import ImuStream
+from lslam.types.scan import Scan
 from lslam.types.scan_result import ScanResult
 
 QUIET = ("map.write=false", "report.html=false", "loops.use=false", "imu.start_s=1")
@@ -23,12 +25,15 @@ def config_of(method: str, *settings: str) -> Config:
     return load_config(None, [f"odometry.method={method}", *QUIET, *settings], {})
 
 
-def walk(count: int, seed: int = 100) -> Stub:
-    drive = simulate("walk", lidar="vlp16", seed=seed, count=count, imu="icm20948", motion_compensated=False)
-    return Stub(
-        [drive.scan(i) for i in range(count)], drive.ground_truth, drive.calibration, motion_compensated=False,
-        imu=drive.imu,
-    )  # fmt: skip
+@cache
+def traced(count: int) -> tuple[list[Scan | str], SimulatedDrive]:
+    drive = simulate("walk", lidar="vlp16", seed=100, count=count, imu="icm20948", motion_compensated=False)
+    return list(drive), drive
+
+
+def walk(count: int) -> Stub:
+    scans, drive = traced(count)
+    return Stub(scans, drive.ground_truth, drive.calibration, motion_compensated=False, imu=drive.imu)
 
 
 def ate(sequence: Stub, *settings: str, method: str) -> tuple[float, list[ScanResult]]:

@@ -282,8 +282,8 @@ def test_a_first_step_of_nine_metres_is_found(method: str) -> None:
 
 
 @cache
-def of_motorway(seed: int, lidar: str, count: int) -> tuple[list[Scan], Floats]:
-    drive = simulate("motorway", seed=seed, lidar=lidar, count=count, motion_compensated=True)
+def of_motorway(seed: int, lidar: str, count: int, speed: float | None = None) -> tuple[list[Scan], Floats]:
+    drive = simulate("motorway", seed=seed, lidar=lidar, count=count, motion_compensated=True, speed=speed, start_speed=speed)
     return list(drive), se3.relative(drive.ground_truth.poses[0], drive.ground_truth.poses)
 
 
@@ -339,35 +339,31 @@ def test_a_start_that_is_taken_up_again_knows_what_stands() -> None:
     assert metres(first.feed(scans[2]), prior) > 3.0
 
 
+@cache
+def of_carpark() -> tuple[list[Scan], Floats]:
+    drive = simulate(
+        "carpark", seed=1, lidar="vlp16", count=80, motion_compensated=True, speed=5.0, start_speed=0.0, static_start=2.5
+    )  # fmt: skip
+    return list(drive), drive.ground_truth.poses
+
+
 @pytest.mark.parametrize("method", METHODS)
 def test_features_pose_every_scan_by_themselves(method: str) -> None:
     """Sixteen beams on open ground: all that is asked beside the sharp and flat ones are the method's own less planar points."""
-    drive = simulate(
-        "carpark",
-        seed=1,
-        lidar="vlp16",
-        count=80,
-        motion_compensated=True,
-        speed=5.0,
-        start_speed=0.0,
-        static_start=2.5,
-    )
-    assert drive.ground_truth is not None
+    scans, truth = of_carpark()
     driver = Driver(method)
-    results = driver.drive(list(drive))
+    results = driver.drive(scans)
     assert driver.loam.registration._all is None
     assert {r.posed_by for r in results} <= {"", LESS_PLANAR}
     assert all(r.status == "ok" for r in results)
-    assert ate(poses_of(results), drive.ground_truth.poses) < {"loam-odom": 0.2, "lego-loam": 0.1}.get(method, 0.02)
+    assert ate(poses_of(results), truth) < {"loam-odom": 0.2, "lego-loam": 0.1}.get(method, 0.02)
 
 
 @pytest.mark.parametrize("method", METHODS)
 def test_edges_find_a_start_at_thirty_metres_a_second(method: str) -> None:
     """Planar points slide along the road by all of the 3 m a scan; without the search they do."""
-    drive = simulate("motorway", seed=2, lidar="hdl64", count=5, motion_compensated=True, speed=30.0, start_speed=30.0)
-    assert drive.ground_truth is not None
-    truth = se3.relative(drive.ground_truth.poses[0], drive.ground_truth.poses)
-    found, blind = (Driver(method, start_reach=reach).drive(list(drive)) for reach in (12.0, 0.0))
+    scans, truth = of_motorway(2, "hdl64", 5, 30.0)
+    found, blind = (Driver(method, start_reach=reach).drive(scans) for reach in (12.0, 0.0))
     assert max(metres(result, true) for result, true in zip(found, truth, strict=True)) < 0.05
     assert metres(blind[1], truth[1]) > 1.0
     assert {r.posed_by for r in found} <= {"", LESS_PLANAR}
