@@ -27,20 +27,24 @@ class Towns:
 
     def __init__(self) -> None:
         self._build = built_scenario._city
-        self._held: OrderedDict[str, tuple[City, RayScene]] = OrderedDict()
+        self._held: OrderedDict[str, City] = OrderedDict()
+        self._scenes: dict[str, RayScene] = {}
 
     def city(self, scenario: Scenario, street: RouteCurve, terrain: Terrain, rng: np.random.Generator) -> City:
         given = pickle.dumps((scenario.world, scenario.layout, street, terrain, rng.bit_generator.state))
         key = hashlib.sha256(given).hexdigest()
         if key not in self._held:
-            city = self._build(scenario, street, terrain, rng)
-            self._held[key] = city, RayScene(city.mesh)
+            self._held[key] = self._build(scenario, street, terrain, rng)
         self._held.move_to_end(key)
         while len(self._held) > HELD:
-            self._held.popitem(last=False)
-        return self._held[key][0]
+            self._scenes.pop(self._held.popitem(last=False)[0], None)
+        return self._held[key]
 
     def scene(self, mesh: SceneMesh) -> RayScene:
         """The one of a town that is held, else a new one."""
-        held = [scene for city, scene in self._held.values() if city.mesh is mesh]
-        return held[0] if held else RayScene(mesh)
+        for key, city in self._held.items():
+            if city.mesh is mesh:
+                if key not in self._scenes:
+                    self._scenes[key] = RayScene(mesh)
+                return self._scenes[key]
+        return RayScene(mesh)

@@ -222,10 +222,10 @@ def test_a_terminal_has_a_progress_bar_and_colours(tmp_path: Path) -> None:
     assert "scans/s" in screen
     assert "\x1b[3" in screen
     assert "\x1b" not in stdout
-    code, _, screen = on_terminal("run", SAMPLE, "--out", tmp_path / "plain", "--count", 40, NO_COLOR="1")
+    code, _, screen = on_terminal("run", SAMPLE, "--out", tmp_path / "plain", "--count", 8, NO_COLOR="1")
     assert code == 0
     assert "\x1b[3" not in screen
-    code, _, screen = on_terminal("run", SAMPLE, "--out", tmp_path / "quiet", "--count", 40, "-q")
+    code, _, screen = on_terminal("run", SAMPLE, "--out", tmp_path / "quiet", "--count", 8, "-q")
     assert (code, screen) == (0, "")
 
 

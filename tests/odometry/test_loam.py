@@ -283,7 +283,9 @@ def test_a_first_step_of_nine_metres_is_found(method: str) -> None:
 
 @cache
 def of_motorway(seed: int, lidar: str, count: int, speed: float | None = None) -> tuple[list[Scan], Floats]:
-    drive = simulate("motorway", seed=seed, lidar=lidar, count=count, motion_compensated=True, speed=speed, start_speed=speed)
+    drive = simulate(
+        "motorway", seed=seed, lidar=lidar, count=count, motion_compensated=True, speed=speed, start_speed=speed
+    )
     return list(drive), se3.relative(drive.ground_truth.poses[0], drive.ground_truth.poses)
 
 

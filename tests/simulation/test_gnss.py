@@ -14,6 +14,8 @@ from lslam.simulation.kinematics import Motion, smooth_motion
 from lslam.simulation.scenarios import SimulatedDrive, simulate
 from lslam.simulation.sensors import ORIGIN, T_CAR_ANTENNA, GnssModel, SimulatedGnss, simulate_gnss
 
+SHARES_TOWNS = True
+
 Floats = NDArray[np.float64]
 
 EXACT = GnssModel(white=0.0, slow=0.0)

@@ -14,6 +14,8 @@ from lslam.simulation.scenario_files import parse_scenario, scenario_named, scen
 from lslam.simulation.scenarios import simulate
 from lslam.simulation.scene_mesh import Surface
 
+SHARES_TOWNS = True
+
 FLIGHTS = ("closed", "open", "climbing", "small-eight", "large-eight")
 PAIRS = {name: f"{name}-hard" for name in ("urban", "residential", *FLIGHTS)}
 

@@ -26,6 +26,8 @@ from lslam.simulation.kinematics import Motion, smooth_motion, standing_start
 from lslam.simulation.scenarios import SimulatedDrive, simulate
 from lslam.types.imu import ImuStream
 
+SHARES_TOWNS = True
+
 Floats = NDArray[np.float64]
 
 IDEAL = ImuModel("ideal")

@@ -10,6 +10,8 @@ from lslam.simulation.built_scenario import BuiltScenario, build_scenario
 from lslam.simulation.scenario_files import Scenario, parse_scenario, scenario_named, scenario_names
 from lslam.simulation.scenarios import simulate
 
+SHARES_TOWNS = True
+
 # Girolimetto, tables 4.2, 4.5, 4.7 and 4.9: length m, time s, speed m/s, frames.
 FLIGHTS = {
     "closed": (812.25, 81.23, 10.0, 813),

@@ -19,6 +19,8 @@ from lslam.simulation.record import record
 from lslam.simulation.scenarios import SimulatedDrive, simulate
 from lslam.simulation.sensors import GnssModel
 
+SHARES_TOWNS = True
+
 
 @pytest.fixture(scope="module")
 def drive() -> SimulatedDrive:

@@ -14,6 +14,8 @@ from lslam.simulation.scenario_files import scenario_named
 from lslam.simulation.scenarios import simulate
 from lslam.simulation.scene_mesh import MeshBuilder, Surface
 
+SHARES_TOWNS = True
+
 SHAKEN = ["vibration.angle_deg=0.2", "vibration.height_mm=5"]
 
 
