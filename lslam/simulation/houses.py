@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from lslam.simulation.scene_mesh import MeshBuilder, SceneMesh, Surface
 
 Floats = NDArray[np.float64]
-Quad = list[list[float]]
+Quad = list[tuple[float, float, float]]
 
 FOUNDATION = -1.5  # m, walls reach below uneven ground
 HIGHEST_ROOF = 5.0  # m from the eaves to the ridge
@@ -71,17 +71,21 @@ def _facade(
     along = (end - start) / length
     outward = np.array([along[1], -along[0]])
 
+    # A corner is (u, inset, z): m along the wall, behind its face, and up.
     def quad(u0: float, u1: float, z0: float, z1: float, inset: float = 0.0) -> Quad:
-        a, b = start + u0 * along - inset * outward, start + u1 * along - inset * outward
-        return [[*a, z0], [*b, z0], [*b, z1], [*a, z1]]
+        return [(u0, inset, z0), (u1, inset, z0), (u1, inset, z1), (u0, inset, z1)]
 
     def reveal(u: float, v: float, z0: float, z1: float) -> Quad:
         """The side of a recess: upright when u == v, level when z0 == z1."""
-        a, b = start + u * along, start + v * along
-        inner = style.recess * outward
         if u == v:
-            return [[*a, z0], [*(a - inner), z0], [*(a - inner), z1], [*a, z1]]
-        return [[*a, z0], [*b, z0], [*(b - inner), z0], [*(a - inner), z0]]
+            return [(u, 0.0, z0), (u, style.recess, z0), (u, style.recess, z1), (u, 0.0, z1)]
+        return [(u, 0.0, z0), (v, 0.0, z0), (v, style.recess, z0), (u, style.recess, z0)]
+
+    def placed(quads: list[Quad]) -> Floats:
+        """(N, 4, 3) corners, m."""
+        corners = np.array(quads, np.float64).reshape(-1, 4, 3)
+        xy = start + corners[..., :1] * along - corners[..., 1:2] * outward
+        return np.concatenate([xy, corners[..., 2:]], axis=-1)
 
     count = int((length - 1.0) // style.spacing) if street or rng.random() < 0.7 else 0
     centres = length / 2 + (np.arange(count) - (count - 1) / 2) * style.spacing
@@ -93,7 +97,7 @@ def _facade(
         sill, head = floor + style.sill, floor + style.head
         walls += [quad(0, length, head, floor + style.storey)]
         left = 0.0
-        for k, centre in enumerate(centres):
+        for k, centre in enumerate(centres.tolist()):
             u0, u1 = centre - style.window / 2, centre + style.window / 2
             low = floor if k == door else sill
             walls += [quad(left, u0, floor, head), reveal(u0, u0, low, head), reveal(u1, u1, low, head)]
@@ -108,8 +112,8 @@ def _facade(
                 _balcony(builder, start + centre * along, along, outward, floor, rng.uniform(0.8, 1.4))
             left = u1
         walls.append(quad(left, length, floor, head))
-    builder.add_quads(walls, Surface.WALL)
-    builder.add_quads(panes, Surface.GLASS)
+    builder.add_quads(placed(walls), Surface.WALL)
+    builder.add_quads(placed(panes), Surface.GLASS)
 
 
 def _balcony(builder: MeshBuilder, middle: Floats, along: Floats, outward: Floats, floor: float, reach: float) -> None:
