@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -61,25 +62,33 @@ def modules() -> dict[str, Path]:
     return names
 
 
-def imports_of(path: Path) -> set[str]:
-    """Every name imported anywhere in the file, also inside functions and `if TYPE_CHECKING`, with from-imports expanded."""
-    found: set[str] = set()
+@cache
+def read(path: Path) -> tuple[set[str], set[str], list[str]]:
+    """What a file says, parsed once for all tests: its imports, its dotted names, its classes."""
+    imports: set[str] = set()
+    names: set[str] = set()
+    classes: list[str] = []
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.Import):
-            found |= {alias.name for alias in node.names}
+            imports |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom) and node.module:
             assert node.level == 0, f"{path}: relative import"
-            found |= {node.module} | {f"{node.module}.{alias.name}" for alias in node.names}
-    return found
+            imports |= {node.module} | {f"{node.module}.{alias.name}" for alias in node.names}
+        elif isinstance(node, ast.ClassDef):
+            classes.append(node.name)
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str) and node.value.startswith("lslam."):
+            names.add(node.value.split(":")[0])
+    return imports, names, classes
+
+
+def imports_of(path: Path) -> set[str]:
+    """Every name imported anywhere in the file, also inside functions and `if TYPE_CHECKING`, with from-imports expanded."""
+    return read(path)[0]
 
 
 def tables_of(path: Path) -> set[str]:
     """Dotted names in string constants: modules imported lazily through a table."""
-    return {
-        node.value.split(":")[0]
-        for node in ast.walk(ast.parse(path.read_text()))
-        if isinstance(node, ast.Constant) and isinstance(node.value, str) and node.value.startswith("lslam.")
-    }
+    return read(path)[1]
 
 
 MODULES = modules()
@@ -157,9 +166,8 @@ def test_a_class_name_stands_once() -> None:
     """A reader who searches for a class finds one."""
     homes: dict[str, list[str]] = {}
     for name, path in MODULES.items():
-        for node in ast.walk(ast.parse(path.read_text())):
-            if isinstance(node, ast.ClassDef):
-                homes.setdefault(node.name, []).append(name)
+        for found in read(path)[2]:
+            homes.setdefault(found, []).append(name)
     wrong = {name: places for name, places in homes.items() if len(places) > 1}
     assert not wrong, wrong
 
