@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from functools import cache
 
 import numpy as np
 import pytest
@@ -35,7 +36,7 @@ def in_room(residual: Residual, seed: int = 0, **given: object) -> Registration:
 
 @pytest.mark.parametrize("residual", RESIDUALS)
 def test_a_start_at_unknown_speed_is_found(residual: Residual) -> None:
-    for seed in range(4):
+    for seed in range(2):
         rng = np.random.default_rng(seed + 10)
         T = random_pose(rng, 1.5, 5.0)
         result = in_room(residual, seed).register(seen_from(room(rng), T))
@@ -92,13 +93,20 @@ def test_rings_on_flat_ground_do_not_teach_a_false_speed(residual: Residual, see
     assert distance(se3.relative(truth[0], truth[-1]), found[-1])[0] < 0.8
 
 
-@pytest.mark.parametrize("residual", RESIDUALS)
-@pytest.mark.parametrize("kind", ["noise", "nan", "far", "few"])
-def test_a_bad_scan_fails_says_why_and_leaves_the_map_alone(residual: Residual, kind: str) -> None:
+@cache
+def on_the_way(residual: Residual) -> tuple[Registration, np.random.Generator]:
+    """A registration that has followed six scans through the room, and the generator of the next one."""
     rng = np.random.default_rng(2)
     registration = in_room(residual)
     for k in range(1, 7):
         assert registration.register(seen_from(room(rng, 2000), pose_at((0.1 * k, 0.0, 0.0)))).ok
+    return registration, rng
+
+
+@pytest.mark.parametrize("residual", RESIDUALS)
+@pytest.mark.parametrize("kind", ["noise", "nan", "far", "few"])
+def test_a_bad_scan_fails_says_why_and_leaves_the_map_alone(residual: Residual, kind: str) -> None:
+    registration, rng = copy.deepcopy(on_the_way(residual))
     before = copy.deepcopy(registration.map)
     points = {
         "noise": rng.uniform(-40, 40, (20_000, 3)),
