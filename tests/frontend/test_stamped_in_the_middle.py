@@ -18,6 +18,7 @@ from lslam.formats.point_files import read_points
 from lslam.formats.trajectory_files import read_trajectory
 from lslam.geometry import se3
 from lslam.pipeline.run import run
+from lslam.simulation.lidar_models import LIDARS
 from lslam.simulation.scenarios import SimulatedDrive, simulate
 from lslam.types.sequence import Sequence
 
@@ -28,7 +29,8 @@ COUNT = 30
 @cache
 def drive() -> SimulatedDrive:
     """A walk, looking about at up to 110 deg/s, rays fired on the way."""
-    return simulate("walk", lidar="vlp16", count=COUNT, imu="icm20948", motion_compensated=False)
+    lidar = dataclasses.replace(LIDARS["vlp16"], columns=900)
+    return simulate("walk", lidar=lidar, count=COUNT, imu="icm20948", motion_compensated=False)
 
 
 @cache
