@@ -23,6 +23,7 @@ from lslam.odometry.stationary import StationaryDetector
 from lslam.readers.selection import with_rings
 from lslam.registration.constant_velocity import ConstantVelocity
 from lslam.registration.gaussian_map import GaussianMap
+from lslam.simulation.lidar_models import LIDARS
 from lslam.simulation.scenarios import simulate
 from lslam.types.scan import Scan
 from lslam.types.scan_result import ScanResult
@@ -98,7 +99,8 @@ def test_every_method_of_ours_can_leave_off(method: str) -> None:
 
 
 def test_the_imu_goes_on_where_it_was(tmp_path: Path) -> None:
-    walk = simulate("walk", lidar="vlp16", count=20, imu="icm20948", motion_compensated=False)
+    lidar = replace(LIDARS["vlp16"], columns=900)
+    walk = simulate("walk", lidar=lidar, count=20, imu="icm20948", motion_compensated=False)
     sequence = Stub([walk.scan(i) for i in range(20)], None, walk.calibration, motion_compensated=False, imu=walk.imu)
     config = config_of("icp", "imu.use=true", "imu.start_s=1")
     part = begin_inertial(sequence, config)

@@ -24,6 +24,7 @@ from lslam.kernels import positive
 from lslam.odometry import create_odometry
 from lslam.odometry.lio_mapping import LioMapping
 from lslam.pipeline.check import check_config
+from lslam.simulation.lidar_models import LIDARS
 from lslam.simulation.scenarios import simulate
 from lslam.types.imu import ImuStream
 
@@ -41,7 +42,8 @@ def windowed() -> Config:
 
 @cache
 def walk(count: int = 40) -> Stub:
-    drive = simulate("walk", lidar="vlp16", seed=100, count=count, imu="icm20948", motion_compensated=False)
+    lidar = replace(LIDARS["vlp16"], columns=900)
+    drive = simulate("walk", lidar=lidar, seed=100, count=count, imu="icm20948", motion_compensated=False)
     return Stub(
         [drive.scan(i) for i in range(count)], drive.ground_truth, drive.calibration, motion_compensated=False,
         imu=drive.imu,
