@@ -38,9 +38,17 @@ class Found:
 
 
 def on(
-    folder: Path, name: str, off: tuple[float, float] = (0.0, 0.0), radius: float = 0.3, drifts: Sequence[int] = (0,)
+    folder: Path,
+    name: str,
+    off: tuple[float, float] = (0.0, 0.0),
+    radius: float = 0.3,
+    drifts: Sequence[int] = (0,),
+    more: Sequence[str] = (),
 ) -> dict[str, list[Found]]:
-    """Every mode on one map, one run per drift; `off` m from the true start the run is said to begin, within `radius` m."""
+    """Every mode on one map, one run per drift, with `more` settings.
+
+    off : m from the true start the run is said to begin, within `radius` m
+    """
     world = tomllib.loads((DRIVE / "truth" / "world.toml").read_text())
     origin = np.array(world["origin_lat_lon_alt"])
     real = np.array(world["T_enu_world"]) @ read_trajectory(DRIVE / "truth" / "trajectory.tum").poses
@@ -53,10 +61,10 @@ def on(
     truth = map_errors(exact, wrong)
     start = real[0, :3, 3] + [*off, 0.0]
     settings = [
-        "loops.use=false", "map.write=false", "debug.drift=true", "debug.drift_kind=random-walk",
+        "loops.use=false", "map.write=false", "report.html=false", "debug.drift=true", "debug.drift_kind=random-walk",
         f"osm.extract={folder / 'map.osm'}", f"osm.origin={geodesy.from_local(start[None], origin)[0].tolist()}",
         f"osm.heading_deg={90 - np.degrees(se2.of_se3(real[0])[2])}", f"osm.start_radius={radius}",
-        "osm.hold_start=true",
+        "osm.hold_start=true", *more,
     ]  # fmt: skip
 
     def run(mode: str, drift: int) -> Found:
