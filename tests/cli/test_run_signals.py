@@ -84,7 +84,7 @@ def assert_whole(out: Path) -> None:
     [
         (signal.SIGINT, in_odometry, []),
         (signal.SIGTERM, in_odometry, ["--threads", "1"]),
-        (signal.SIGTERM, in_map, ["--count", "350"]),
+        (signal.SIGTERM, in_map, ["--count", "150"]),
     ],
 )
 def test_a_signal_ends_the_run_with_what_was_done(
@@ -135,7 +135,7 @@ def test_a_kill_leaves_nothing_half_written_and_the_folder_can_be_used_again(
     laps: Path, tmp_path: Path, place: Callable[[Path, Child], None]
 ) -> None:
     out = tmp_path / "out"
-    with started(laps, out, *(["--count", "350"] if place is in_map else [])) as child:
+    with started(laps, out, *(["--count", "150"] if place is in_map else [])) as child:
         place(out, child)
         os.kill(child.pid, signal.SIGKILL)
         child.wait(30)

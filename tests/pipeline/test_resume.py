@@ -22,6 +22,7 @@ from lslam.frontend import checkpoints
 from lslam.frontend.checkpoints import CheckpointSchedule
 from lslam.maps import clean
 from lslam.pipeline.watch import Watch
+from lslam.simulation.lidar_models import LIDARS
 from lslam.simulation.scenarios import simulate
 from lslam.types.scan import Scan
 
@@ -48,7 +49,8 @@ def rings() -> Stub:
 
 @cache
 def walk() -> Stub:
-    scans = simulate("walk", lidar="vlp16", count=COUNT, imu="icm20948", motion_compensated=False)
+    lidar = replace(LIDARS["vlp16"], columns=900)
+    scans = simulate("walk", lidar=lidar, count=COUNT, imu="icm20948", motion_compensated=False)
     return Stub([scans.scan(i) for i in range(COUNT)], None, scans.calibration, motion_compensated=False, imu=scans.imu)
 
 
