@@ -78,6 +78,7 @@ def test_poses_and_extracts_by_such_names_are_found_and_resumed(ran: Path, tmp_p
     assert "differs" not in lslam(*words, "--out", out, "--resume").stderr
 
 
+@pytest.mark.usefixtures("forked_runs")
 def test_studies_and_simulations(scans: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     out = odd(tmp_path, b"c\xf6mpare")
     assert lslam("compare", scans, "--methods", "icp", "--set", "report.html=false", "--out", out).returncode == 0

@@ -13,6 +13,7 @@ from stub_sequences import Stub, sample
 import lslam
 from lslam.config import Config, load_config
 from lslam.errors import InputError
+from lslam.simulation.lidar_models import LIDARS
 from lslam.simulation.scenarios import SimulatedDrive, simulate
 from lslam.types.imu import ImuStream
 from lslam.types.scan import Scan
@@ -27,7 +28,8 @@ def config_of(method: str, *settings: str) -> Config:
 
 @cache
 def traced(count: int) -> tuple[list[Scan | str], SimulatedDrive]:
-    drive = simulate("walk", lidar="vlp16", seed=100, count=count, imu="icm20948", motion_compensated=False)
+    lidar = replace(LIDARS["vlp16"], columns=900)
+    drive = simulate("walk", lidar=lidar, seed=100, count=count, imu="icm20948", motion_compensated=False)
     return list(drive), drive
 
 
