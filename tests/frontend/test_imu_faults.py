@@ -14,6 +14,7 @@ import lslam
 from lslam.config import load_config
 from lslam.errors import InputError
 from lslam.geometry import so3
+from lslam.simulation.lidar_models import LIDARS
 from lslam.simulation.scenarios import simulate
 
 COUNT = 40
@@ -24,7 +25,8 @@ QUIET = ("map.write=false", "report.html=false", "loops.use=false", "imu.use=tru
 
 @cache
 def walk() -> Stub:
-    drive = simulate("walk", lidar="vlp16", seed=100, count=COUNT, imu="icm20948-calibrated", motion_compensated=False)
+    lidar = replace(LIDARS["vlp16"], columns=900)
+    drive = simulate("walk", lidar=lidar, seed=100, count=COUNT, imu="icm20948-calibrated", motion_compensated=False)
     scans = [drive.scan(i) for i in range(COUNT)]
     return Stub(scans, drive.ground_truth, drive.calibration, motion_compensated=False, imu=drive.imu)
 
