@@ -28,6 +28,12 @@ os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 # Workers fill the cores already; threads of BLAS on small matrices wait for each other.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
+
+def pytest_xdist_auto_num_workers() -> int:
+    """One more than there are cores: what waits for a process that it started, or for a lock, leaves one idle."""
+    return (os.cpu_count() or 1) + 1
+
+
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
 
 

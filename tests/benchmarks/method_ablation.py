@@ -1,6 +1,6 @@
 """The rules of one method, each off or otherwise, one at a time: which of them its accuracy needs.
 
-    python tests/benchmarks/method_ablation.py ct-icp [--seeds 100-104] [--scans 60] [--write docs/results.md]
+    python tests/benchmarks/method_ablation.py ct-icp [--seeds 100-104] [--scans 60]
 
 Drives are uncompensated, as in `tight.py`; `saturation` is of `quadrotor`, whole.
 """

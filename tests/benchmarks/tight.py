@@ -193,7 +193,7 @@ def main() -> None:
         "rko-lio in its defaults, at the instant of the sweep that suits it best."
     )
     rows = [[" ".join(p), *(cell(runs[p, m]) for m in methods)] for p in places]
-    tables.table(args.table, caption, ["drive", *methods], rows, args.write)
+    tables.table(f"{args.table}", caption, ["drive", *methods], rows, args.write)
     caption = (
         "The same runs: how many were lost, and of those that were not the end's distance from the truth in % of the path, "
         "ms of CPU a scan, and NEES per degree of freedom, median / worst."

@@ -14,7 +14,7 @@ from calling import COMMAND, SAMPLE, environment, lslam_process, manifest
 
 from lslam.kernels import jit
 
-STARTS = 3
+STARTS = 4
 # The fewest kernels that make a map: those of a map of given poses.
 MAPPING = ("run", SAMPLE, "--poses", SAMPLE / "poses" / "00.txt", "--no-loops", "--count", 5, "--out")
 Starts = tuple[Path, list[tuple[int, str]], Path, list[float]]
