@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.errors import InputError, UsageError, cause
+from lslam.formats.array_headers import HEADERS
 from lslam.formats.atomic import atomic_write
 from lslam.formats.las_files import read_las, write_las
 from lslam.formats.pcd_files import pcd_header, read_pcd, write_pcd
@@ -99,7 +100,7 @@ def _read_npy(path: Path) -> PointCloud:
     from lslam.formats.point_cloud import cloud_from_fields
 
     try:
-        with path.open("rb") as stream:
+        with HEADERS, path.open("rb") as stream:
             table = np.load(stream, allow_pickle=False)
     except (OSError, *MISFIT, EOFError, SyntaxError, MemoryError, TokenError) as error:
         raise InputError(f"{path} cannot be read as a NumPy array: {error}") from None

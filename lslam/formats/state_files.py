@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.errors import InputError, cause
+from lslam.formats.array_headers import HEADERS
 from lslam.formats.atomic import atomic_write
 from lslam.untrusted import MISFIT, parse_json
 
@@ -59,7 +60,8 @@ def read_npz(source: Path | BinaryIO) -> dict[str, NDArray[Any]]:
 
 
 def _array(member: bytes) -> NDArray[Any]:
-    return np.asarray(np.lib.format.read_array(io.BytesIO(member), allow_pickle=False))
+    with HEADERS:
+        return np.asarray(np.lib.format.read_array(io.BytesIO(member), allow_pickle=False))
 
 
 def _name(source: Path | BinaryIO) -> str:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.errors import InputError, cause
+from lslam.formats.array_headers import HEADERS
 from lslam.formats.point_cloud import PointCloud
 from lslam.formats.point_files import read_bin, read_points
 from lslam.formats.state_files import DAMAGE
@@ -107,7 +108,7 @@ def _split(raw: NDArray[np.float32]) -> PointCloud:
 
 def _read_per_point(path: Path, count: int) -> tuple[NDArray[np.float32] | None, NDArray[np.uint16] | None]:
     try:
-        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
+        with HEADERS, path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
             times = np.asarray(file["t"], np.float32) if "t" in file else None
             rings = np.asarray(file["ring"], np.uint16) if "ring" in file else None
     except (OSError, *DAMAGE) as error:
