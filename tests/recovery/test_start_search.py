@@ -88,8 +88,8 @@ def test_sixteen_beams_start_at_thirty_metres_a_second(lidar: str, seed: int) ->
 
 @cache
 def flown_high(seed: int) -> tuple[Floats, Floats, Floats]:
-    """Poses (15, 4, 4) from the first scan on, high above a town: true, as found, and as found where the prior is the truth."""
-    flight = simulate("closed", seed=seed, lidar="os1-16", count=15, motion_compensated=True)
+    """Poses (40, 4, 4) from the first scan on, high above a town: true, as found, and as found where the prior is the truth."""
+    flight = simulate("closed", seed=seed, lidar="os1-16", count=40, motion_compensated=True)
     assert flight.ground_truth is not None
     truth = se3.relative(flight.ground_truth.poses[0], flight.ground_truth.poses)
     alone, led = RecoveringRegistration(), RecoveringRegistration()
