@@ -82,9 +82,9 @@ class FolderSequence:
         times: NDArray[np.float32] | None = None
         rings = cloud.rings
         if self.per_point is not None:
-            times, rings = _read_per_point(self.per_point / f"{path.stem}.npz", len(cloud))
-            # Compensated scans keep no times: nobody shall deskew them a second time.
-            times = None if self.motion_compensated else times
+            # Compensated scans have no times: nobody shall deskew them a second time.
+            names = ("ring",) if self.motion_compensated else ("t", "ring")
+            times, rings = _read_per_point(self.per_point / f"{path.stem}.npz", len(cloud), names)
         elif self.time_rule is not None and cloud.times is not None:
             times, shift_ns = apply_rule(self.time_rule, cloud.times, stamp)
             stamp += shift_ns
@@ -106,14 +106,20 @@ def _split(raw: NDArray[np.float32]) -> PointCloud:
     return PointCloud(points, intensity)
 
 
-def _read_per_point(path: Path, count: int) -> tuple[NDArray[np.float32] | None, NDArray[np.uint16] | None]:
+def _read_per_point(
+    path: Path, count: int, names: tuple[str, ...]
+) -> tuple[NDArray[np.float32] | None, NDArray[np.uint16] | None]:
+    """Times and rings of a scan's points, (count,) each, of which `names` are read."""
     try:
         with HEADERS, path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
-            times = np.asarray(file["t"], np.float32) if "t" in file else None
-            rings = np.asarray(file["ring"], np.uint16) if "ring" in file else None
+            held = {name: file[name] for name in names if name in file}
     except (OSError, *DAMAGE) as error:
         raise InputError(f"{path}, named by per_point of sequence.toml, cannot be read: {cause(error)}") from None
-    for name, values in (("t", times), ("ring", rings)):
-        if values is not None and values.shape != (count,):
+    for name, values in held.items():
+        if values.shape != (count,):
             raise InputError(f"{path}: {name} has shape {values.shape} for a scan of {count} points")
-    return times, rings
+    times, rings = held.get("t"), held.get("ring")
+    return (
+        None if times is None else np.asarray(times, np.float32),
+        None if rings is None else np.asarray(rings, np.uint16),
+    )
