@@ -128,7 +128,8 @@ def stack_of(frame: FrameType | None) -> tuple[Frame, ...]:
     """(name, file, line) of each frame, the outermost first; below the innermost, the line of source that it is at."""
     stack: list[Frame] = []
     if frame is not None:
-        code, line = frame.f_code, frame.f_lineno
+        # Between two lines a frame has no number.
+        code, line = frame.f_code, frame.f_lineno or frame.f_code.co_firstlineno
         stack.append((linecache.getline(code.co_filename, line).strip() or f"line {line}", code.co_filename, line))
     while frame is not None:
         code = frame.f_code

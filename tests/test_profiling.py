@@ -6,7 +6,8 @@ import json
 import threading
 import time
 from pathlib import Path
-from typing import Any
+from types import FrameType
+from typing import Any, cast
 
 import pytest
 
@@ -75,3 +76,12 @@ def test_it_is_written_when_the_block_fails(tmp_path: Path) -> None:
 def test_a_place_that_cannot_be_written_is_named(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match=r"p\.json"), profiling.profiled(tmp_path / "none" / "p.json"):
         pass
+
+
+def test_a_frame_between_two_lines_has_the_line_of_its_function() -> None:
+    class Between:
+        f_code, f_lineno, f_back = spin.__code__, None, None
+
+    outer, inner = profiling.stack_of(cast(FrameType, Between()))
+    assert outer == ("spin", spin.__code__.co_filename, spin.__code__.co_firstlineno)
+    assert inner[0] == "def spin(seconds: float) -> None:"
