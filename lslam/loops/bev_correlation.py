@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import fft, ndimage
 
 from lslam.kernels import bev
 
@@ -55,19 +54,25 @@ class BevGrid:
 
     def shifts(self) -> Floats:
         """(size,) m that row or column k of a correlation stands for."""
-        return np.asarray(fft.fftfreq(self.size, 1 / (self.size * CELL)))
+        return np.asarray(np.fft.fftfreq(self.size, 1 / (self.size * CELL)))
 
 
 def blurred(image: Image) -> Image:
     """Mean over a cell and the eight round it."""
+    from scipy import ndimage
+
     return np.asarray(ndimage.uniform_filter(image, 3, mode="constant"))
 
 
 def spectrum(image: Image) -> Spectrum:
     """Fourier transform of an image, for `correlate`."""
+    from scipy import fft
+
     return np.asarray(fft.rfft2(image))
 
 
 def correlate(a: Spectrum, b: Spectrum, size: int) -> Image:
     """(size, size) sum over the cells of image a times image b shifted, for all shifts."""
+    from scipy import fft
+
     return np.asarray(fft.irfft2(a * np.conj(b), s=(size, size)))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from lslam.kernels import voxel
 
@@ -57,6 +56,8 @@ def dense_points(points: NDArray[np.float32], neighbours: int, deviations: float
     among them, must lie below the mean of all points plus `deviations` standard deviations (ddof 1). Points whose
     neighbours all coincide with them have no distance and go too.
     """
+    from scipy.spatial import cKDTree
+
     if len(points) <= neighbours:
         return np.arange(len(points))
     cloud = points.astype(np.float64)

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import ConvexHull
 
 from lslam.geometry import se3, so3
 from lslam.preprocessing.prepare import PreparedPoints
@@ -103,4 +102,6 @@ def hull_of(positions: Floats) -> tuple[int, ...]:
         return tuple(sorted({int(along[:, 0].argmin()), int(along[:, 0].argmax())}))
     if len(positions) <= dimensions + 1:
         return tuple(range(len(positions)))
+    from scipy.spatial import ConvexHull
+
     return tuple(sorted(int(k) for k in ConvexHull(along).vertices))
