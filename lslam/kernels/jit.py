@@ -110,23 +110,28 @@ def lock_file() -> Path | None:
 
 
 @contextlib.contextmanager
-def announced(log: logging.Logger) -> Iterator[None]:
-    """Say that kernels are being compiled in the block when the first one is: not when they are loaded, however slowly."""
-    with event.install_listener("numba:compile", _Announcement(log)), _rarely_collecting():
+def announced(log: logging.Logger, on_first: Callable[[], None] = lambda: None) -> Iterator[None]:
+    """Say that kernels are being compiled in the block when the first one is: not when they are loaded, however slowly.
+
+    on_first : called then, too
+    """
+    with event.install_listener("numba:compile", _Announcement(log, on_first)), _rarely_collecting():
         yield
 
 
 class _Announcement(event.Listener):
     """Hears of every function that numba begins to compile."""
 
-    def __init__(self, log: logging.Logger) -> None:
+    def __init__(self, log: logging.Logger, on_first: Callable[[], None]) -> None:
         self._log: logging.Logger | None = log
+        self._on_first = on_first
 
     def on_start(self, event: Any) -> None:
         log, self._log = self._log, None
         if log is not None:
             kept = "for this run only" if _folder is None else f"once; they are kept in {_folder}"
             log.info("compiling kernels, %s", kept)
+            self._on_first()
 
     def on_end(self, event: Any) -> None:
         pass

@@ -84,15 +84,21 @@ def find_loops(
 
 def warm_up(config: LoopsConfig) -> None:
     """Compile or load every kernel that loop closure detection needs, with a small room."""
+    room = warm_up_candidates(config)
+    submap_of_room = make_level_submap(room, RegistrationConfig())
+    Verifier(LoopsConfig(), RegistrationConfig()).verify(
+        submap_of_room, submap_of_room, np.zeros(3), LEAST_REACH, [0.0]
+    )
+
+
+def warm_up_candidates(config: LoopsConfig) -> Points:
+    """Compile or load the kernels by which candidates are found; the room (3000, 3), m, that serves for it."""
     room = np.random.default_rng(0).uniform(-8, 8, (3000, 3)).astype(np.float32)
     room[np.arange(3000), np.arange(3000) % 3] = 8.0
     transform(room, np.eye(4), np.empty_like(room))
     OdometryUncertainty([Keyframe(0, 0, 0, np.eye(4), np.eye(6))], 0.0, 0.0).gated(0, np.arange(0), 1.0, 1.0, 1.0)
     create_descriptor(config).add(0, room)
-    submap_of_room = make_level_submap(room, RegistrationConfig())
-    Verifier(LoopsConfig(), RegistrationConfig()).verify(
-        submap_of_room, submap_of_room, np.zeros(3), LEAST_REACH, [0.0]
-    )
+    return room
 
 
 class Detector:

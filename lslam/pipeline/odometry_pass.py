@@ -33,6 +33,7 @@ from lslam.odometry.stationary import StationaryDetector
 from lslam.osm import prior
 from lslam.osm.source import OsmSource
 from lslam.pipeline.manifest import Manifest
+from lslam.pipeline.precompile import helped
 from lslam.pipeline.run_folder import CHECKPOINT, RunFolder
 from lslam.pipeline.watch import Watch
 from lslam.types.constraint import Turn
@@ -151,7 +152,10 @@ def _warm_up(
     config: Config, manifest: Manifest, is_over: bool,
 ) -> None:  # fmt: skip
     """Compile or load what the scans would otherwise wait for, less of it when odometry is over."""
-    with manifest.timed("compile_s"), jit.announced(log), one_at_a_time(jit.lock_file(), "compiles kernels"):
+    with (
+        manifest.timed("compile_s"), one_at_a_time(jit.lock_file(), "compiles kernels"), helped(config) as start_helper,
+        jit.announced(log, start_helper),
+    ):  # fmt: skip
         if not is_over:
             odometry.warm_up()
         if stationary is not None:

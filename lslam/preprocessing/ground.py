@@ -86,3 +86,10 @@ def levelling(points: NDArray[np.float32], tolerance: float, half: int) -> tuple
     sine = float(np.linalg.norm(axis))
     R = np.eye(3) if sine < 1e-9 else so3.exp(axis / sine * np.arctan2(sine, normal[2]))
     return R, float((near @ R[2]).mean())
+
+
+def warm_up() -> None:
+    """Compile or load the kernels, with a small floor."""
+    floor = np.zeros((400, 3), np.float32)
+    floor[:, 0], floor[:, 1] = np.divmod(np.arange(400, dtype=np.float32), 20)
+    above_ground(floor, 0.3, 0.2)

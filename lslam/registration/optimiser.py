@@ -169,6 +169,14 @@ def optimise(
     return OptimiserResult(se3.make(*pose), H, named(facts), d, iterations, converged, weak[:count])
 
 
+def warm_up() -> None:
+    """Compile or load the step, which takes longer than any other kernel."""
+    sums = np.eye(6), np.zeros((6, 6)), np.zeros(6), np.zeros(at.COUNT)
+    limits = Limits(0.1)
+    bounds = (float(limits.weak_share), float(limits.least), float(limits.unseen))
+    step((np.eye(3), np.zeros(3)), sums, 1.0, bounds, limits.allowed, np.zeros(6), np.zeros((6, 6)))
+
+
 def normal_equations(terms: Sequence[Term], T: Floats, width: float, matches: Correspondences) -> tuple[Floats, Floats]:
     """H (6, 6) and g (6,) of residuals that weigh no points against each other, at the pose T (4, 4); kernel `width`, m."""
     pose = np.ascontiguousarray(T[:3, :3], np.float64), np.array(T[:3, 3], np.float64)

@@ -146,14 +146,16 @@ def test_only_compiling_is_announced_and_once(caplog: pytest.LogCaptureFixture) 
     def twice(value: float) -> float:
         return value + value
 
+    calls: list[str] = []
     log = logging.getLogger(__name__)  # that of lslam is as the command lines of other tests left it
     with caplog.at_level("INFO", __name__):
-        with jit.announced(log):
+        with jit.announced(log, lambda: calls.append("loaded")):
             time.sleep(0.05)
         assert not caplog.messages
-        with jit.announced(log):
+        with jit.announced(log, lambda: calls.append("compiled")):
             assert (twice(1.0), twice(1)) == (2.0, 2)
-        with jit.announced(log):
+        with jit.announced(log, lambda: calls.append("compiled before")):
             twice(2.0)
+    assert calls == ["compiled"]
     assert len(caplog.messages) == 1
     assert caplog.messages[0].startswith("compiling kernels")
