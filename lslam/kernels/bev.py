@@ -15,7 +15,9 @@ OUTSIDE = -1
 
 @inline
 def cell_of(x: float, y: float, R: Floats, size: int, edge: float) -> tuple[int, int]:
-    """Row and column of a place x, y, m, rotated by R (2, 2), in size x size cells about the origin; OUTSIDE twice beyond."""
+    """Row and column of the position x, y, m, rotated by R (2, 2), among size x size cells of `edge` m about the origin.
+
+    Both are OUTSIDE for a position beyond the cells."""
     row = math.floor((R[0, 0] * x + R[0, 1] * y) / edge) + size // 2
     column = math.floor((R[1, 0] * x + R[1, 1] * y) / edge) + size // 2
     if 0 <= row < size and 0 <= column < size:

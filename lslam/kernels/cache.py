@@ -1,4 +1,5 @@
-"""Folders for what can be made again. Machine code in them is run, and its index unpickled: nobody else may write there."""
+"""Folders for files that can be made again. Their machine code is run and its index unpickled: only the user may write there.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +15,7 @@ log = logging.getLogger("lslam")
 def cache_folder(name: str) -> Path | None:
     """The folder `name` of the user's XDG cache, or of the temporary directory when the home cannot be written.
 
-    None when no folder can be had that is the user's own; what is wrong with it is said.
+    None, and a warning, when neither folder belongs to the user alone.
     """
     base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     shared = Path(tempfile.gettempdir()) / f"lslam-cache-{os.getuid() if hasattr(os, 'getuid') else 0}"
@@ -31,10 +32,12 @@ def cache_folder(name: str) -> Path | None:
 
 
 def own_folder(folder: Path) -> Path:
-    """Make the folder, for the user alone, or see that it is; raises OSError, a PermissionError without file when it is not.
+    """Make the folder with access for the user alone, or check that an existing one belongs to the user.
 
-    Where others can make files too, as in /tmp, it may be no link and no group's; elsewhere a link of the user's may lead
-    there, and a group, which a umask of 002 lets in, is shut out from now on.
+    In a folder where others can write, as /tmp, it may neither be a link nor be writable for a group. Elsewhere a link of the
+    user's is followed, and a group's permission to write, which a umask of 002 gives, is removed.
+
+    Raises OSError; a PermissionError without a file name when the folder is not the user's own.
     """
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     if hasattr(os, "getuid"):

@@ -50,7 +50,9 @@ def shapes(
     radius: float,
     least: int,
 ) -> NDArray[np.float64]:
-    """(Q, 2) entropy (nats) and plane variance (m2) of the points within `radius` of each query; NaN with under `least`.
+    """Entropy, nats, and plane variance, m2, (Q, 2) of the points within `radius`, m, of each query.
+
+    NaN where they are fewer than `least`.
 
     points : (N, 3) sorted by `keys`, their cells of edge `radius` from `cell_keys`
     The plane variance is the residual sum of squares over n - 3, the unbiased estimate.

@@ -105,18 +105,18 @@ def curvatures(
     jump_slope: float,
     parallel_slope: float,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
-    """Curvature (K,) of equation 2.21, NaN where a ring ends, or has a gap, within `SIDE` points; how much of it is a bend
-    (K,); and what breaks (K,).
+    """Curvature (K,) of equation 2.21, the part of it that is a bend (K,), and the breaks of the rings (K,).
 
-    A point gets NaN as well, being no feature, next to an occlusion boundary on its far side, where the surface that is
-    hidden begins, and where a surface is nearly parallel to the beam (Zhang and Singh 2014, section V.A).
+    The curvature is NaN where a ring ends or has a gap within `SIDE` points. It is NaN as well on the far side of an
+    occlusion boundary and where a surface is nearly parallel to the beam: such points are no features (Zhang and Singh
+    2014, section V.A).
 
     gap : rad, angle between neighbours above which returns are missing
     jump, jump_slope : neighbours whose ranges differ by more than `jump` m and `jump_slope` * range are an occlusion
     parallel_slope : change of range over distance across, above which on both sides a surface is parallel to the beam
-    On a plane that is sampled unevenly the curvature is not zero, but points along it: the bend is what is left across the
-    line from the first to the last neighbour, or all of it where a jump is among them.
-    The third result tells whether the ring is broken, by a gap or a jump, between a point and the next.
+    On a plane that is sampled unevenly the vector of equation 2.21 is not zero, but lies in the plane. The bend is its part
+    across the line from the first to the last neighbour, or all of it where a jump is among the neighbours.
+    A ring breaks at a point when a gap or a jump lies between the point and the next one.
     """
     total = xyz.shape[0]
     curvature = np.full(total, np.nan)
@@ -187,12 +187,13 @@ def pick(
 ) -> NDArray[np.int8]:
     """Label (K,) every point `EDGE`, `LESS_EDGE`, `NEITHER`, `LESS_PLANE` or `PLANE`.
 
-    In each of `regions` parts of a ring with equally many points: the points of largest curvature are edges, of smallest
-    planes; a point that is picked keeps its `SIDE` neighbours on either side, up to a break, from being picked likewise.
+    A ring is divided into `regions` parts of equally many points. In each part the points of largest curvature are edges,
+    those of smallest curvature planes. The `SIDE` neighbours on either side of a picked point, up to a break, are not picked.
 
-    allowed : (K,) bit 0: may be an edge, bit 1: less planar, bit 2: planar; limits : of edges, all edges, planes
-    edge_curvature, edge_noise : an edge's bend exceeds the one, and times its range, m, the other
-    plane_curvature, plane_noise : a plane's curvature is less than the one, or times its range less than the other
+    allowed : (K,) bit 0: may be an edge, bit 1: less planar, bit 2: planar
+    limits : largest number of edges, of edges and less sharp edges together, and of planes in a part
+    edge_curvature, edge_noise : an edge's bend exceeds `edge_curvature`, and its bend times range, m, exceeds `edge_noise`
+    plane_curvature, plane_noise : a plane's curvature is below `plane_curvature`, or times its range, m, below `plane_noise`
     """
     total = curvature.shape[0]
     labels = np.zeros(total, np.int8)

@@ -31,9 +31,9 @@ def disc(nx: float, ny: float, nz: float, thin: float) -> tuple[float, float, fl
 @kernel
 def source_discs(source: Floats, size: float, planes: Floats, keys: Longs, table: Ints, thin: float,
                  out: Floats) -> int:  # fmt: skip
-    """Discs (S, 6) of the source points that lie in a plane voxel of their own scan; returns how many do.
+    """Write the discs, covariances (S, 6), m2, of the source points in plane voxels of their own scan to `out`.
 
-    The others keep what `out` holds.
+    Returns the number of such points. Rows of the other points are not changed.
     """
     inverse = 1.0 / size
     count = 0

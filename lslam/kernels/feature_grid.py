@@ -1,4 +1,4 @@
-"""Points of one scan in the cells of a hashed grid, with the ring of each: what the next scan's features are matched with.
+"""Features of one scan in the cells of a hashed grid, with the ring of each. The next scan's features are matched with them.
 
 A grid is points (N, 3) float64 world, m, cell after cell; rings (N,) uint16; starts (C + 1,) int32, the cells' ranges;
 keys (C,) int64, packed cells; table (E,) int32, open addressing.
@@ -75,9 +75,10 @@ def _gap(low: float, size: float, v: float) -> float:
 @inline
 def nearest(x: float, y: float, z: float, size: float, limit: float, ring: int | np.int64, nearby: int, skipped: int,
             points: Floats, rings: Rings, starts: Ints, keys: Longs, table: Ints) -> tuple[int, float]:  # fmt: skip
-    """Point of the grid nearest to x, y, z and less than `limit` away, and its squared distance; -1 when there is none.
+    """Index of the point of the grid that is nearest to x, y, z and less than `limit`, m, away, and its squared distance, m2.
 
-    `nearby` < 0: any ring; 0: of `ring` alone, but not the point `skipped`; more: of another ring, at most so many away.
+    The index is -1 when there is none.
+    nearby : -1 allows every ring, 0 only `ring` and not the point `skipped`, n > 0 other rings that differ by n at most
     """
     inverse = 1.0 / size
     best, best_d = -1, limit * limit
@@ -88,7 +89,7 @@ def nearest(x: float, y: float, z: float, size: float, limit: float, ring: int |
         return -1, best_d
     fx, fy, fz = x - ix * size, y - iy * size, z - iz * size
     margin = min(fx, size - fx, fy, size - fy, fz, size - fz)
-    # Shell after shell of cells: what a near one finds rules the farther ones out.
+    # Shell after shell of cells: a point that is found in a near shell is nearer than all points of the farther ones.
     for shell in range(int(np.ceil(limit * inverse)) + 1):
         least = margin + (shell - 1) * size
         if shell > 0 and least * least >= best_d:

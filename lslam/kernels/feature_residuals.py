@@ -26,17 +26,17 @@ Floats = NDArray[np.float64]
 Longs = NDArray[np.int64]
 Ints = NDArray[np.int32]
 Rings = NDArray[np.uint16]
-# A grid, see `feature_grid`; one with the normal of the surface around each point; and cells of it, m, how far a
-# counterpart may lie, m, the variance of a point, m2, and whether several counterparts make a line or a plane.
+# A grid, see `feature_grid`; a grid with the normal of the surface around each point; and the size of its cells, m, the
+# largest distance of a counterpart, m, the variance of a point, m2, and whether counterparts are joined to lines and planes.
 Grid = tuple[Floats, Rings, Ints, Longs, Ints]
 SurfaceGrid = tuple[Floats, Rings, Ints, Longs, Ints, Floats]
 Reach = tuple[float, float, float, bool]
 
-# Two rings up or down, as in LOAM. (Rings are unsigned: int() of them stays so, and a difference would wrap.)
+# Two rings up or down, as in LOAM. (Rings are unsigned, also after int() in a kernel: their difference would wrap.)
 NEARBY_RINGS = 2
-# Three points that are nearly in line make no plane: sine of the angle at the nearest.
+# Three points that are nearly in line define no plane: least sine of the angle at the nearest point.
 LEAST_SINE = 0.1
-# rad2, of a normal that nothing around confirms: four degrees.
+# Largest variance, rad2, of a normal of three points that counts as observing a direction: four degrees.
 UNSURE = 5e-3
 SHORTEST = 1e-3  # m, of a line or a side of a triangle
 
@@ -82,7 +82,7 @@ def _add_plane(H: Floats, g: Floats, facts: Floats, e: float, nx: float, ny: flo
 @kernel
 def linearise_edges(points: tuple[Floats], grid: Grid, settings: Reach, search: tuple[()], pose: Pose, width: Width,
                     sums: Sums) -> None:  # fmt: skip
-    """Add all edges (S, 3), LiDAR frame, to H, S, g and facts, see `linearisation`: lines are what they are."""
+    """Add all edges (S, 3), LiDAR frame, to H, S, g and facts, see `linearisation`. Both H and S take all of them."""
     (source,) = points
     edges, rings, starts, keys, table = grid
     size, limit, variance, with_lines = settings
@@ -114,7 +114,7 @@ def linearise_edges(points: tuple[Floats], grid: Grid, settings: Reach, search: 
             continue
         s = 1.0 / length
         ux, uy, uz = ux * s, uy * s, uz * s
-        # What the two points' noise makes of the line beside, between or beyond them.
+        # Variance of the line, by the noise of its two points, at the foot of the source point.
         share = (ex * ux + ey * uy + ez * uz) * s
         spread = variance * (1.0 + share * share + (1.0 - share) * (1.0 - share))
         add_line(E, g, facts, ex, ey, ez, ux, uy, uz, rx, ry, rz, spread, c2)
@@ -145,12 +145,12 @@ def add_normals(points: Floats, size: float, thick: float, waver: float, rows: F
 @kernel
 def linearise_planes(points: tuple[Floats], grid: SurfaceGrid, settings: Reach, search: tuple[()], pose: Pose,
                      width: Width, sums: Sums) -> None:  # fmt: skip
-    """As `linearise_edges`, of planar points; S takes those planes that are sure of themselves.
+    """As `linearise_edges`, for planar points (S, 3). S takes the planes alone whose normal is known well.
 
-    normals : (N, 3) of the surface around each point of the grid, zero where it is not known. Three points a few
-        decimetres apart make a normal that wavers by ten degrees and more, and a sum of wavering normals seems to observe
-        every direction, that along a corridor too. So the distance is that to the plane through the three points, but it
-        moves the pose along the surface's normal: an instrumental variable, whose error has nothing to do with theirs.
+    normals : (N, 3) of the surface around each point of the grid, zero where it is not known. The normal of three points
+        a few decimetres apart has an error of ten degrees and more, and a sum of such normals seems to observe every
+        direction, the one along a corridor included. So the residual is the distance to the plane through the three
+        points, but its Jacobian takes the surface's normal: an instrumental variable, whose error is independent of theirs.
     """
     (source,) = points
     surface, rings, starts, keys, table, normals = grid
@@ -191,7 +191,7 @@ def linearise_planes(points: tuple[Floats], grid: SurfaceGrid, settings: Reach, 
         s = 1.0 / area
         nx, ny, nz = nx * s, ny * s, nz * s
         e = nx * ex + ny * ey + nz * ez
-        # Barycentric coordinates: what the three points' noise makes of the plane at the foot of the source point.
+        # Variance of the plane, by the noise of its three points, at the foot of the source point: barycentric coordinates.
         ab = ax * bx + ay * by + az * bz
         ea, eb = ex * ax + ey * ay + ez * az, ex * bx + ey * by + ez * bz
         wa, wb = (ea * bb - eb * ab) * s * s, (eb * aa - ea * ab) * s * s
@@ -202,6 +202,6 @@ def linearise_planes(points: tuple[Floats], grid: SurfaceGrid, settings: Reach, 
             sign = 1.0 if towards > 0.0 else -1.0
             nx, ny, nz = sign * ux, sign * uy, sign * uz
         w = _add_plane(H, g, facts, e, nx, ny, nz, rx, ry, rz, spread, c2)
-        # Waver of the normal, rad2, that the noise of three points makes; what is around them has confirmed it or not.
+        # The normal is that of the surface, or the noise of the three points leaves it a small variance, rad2.
         if towards != 0.0 or 2.0 * variance * (aa + bb - ab) * s * s < UNSURE:
             add_surface(S, unused, w, nx, ny, nz, rx, ry, rz)

@@ -1,4 +1,4 @@
-"""Which older keyframes lie within the gate of odometry about a newer one: all of a long run, for each of its keyframes."""
+"""Gating by odometry's uncertainty: the older keyframes that may show the place of a newer one, see `loops.gating`."""
 
 from __future__ import annotations
 
@@ -29,10 +29,12 @@ def gated(
     b: int, among: NDArray[np.int64], positions: Floats, distances: Floats, covariances: Floats, sums: Floats, squares: Floats,
     rates: tuple[float, float], bounds: tuple[float, float, float],
 ) -> NDArray[np.int64]:  # fmt: skip
-    """The keyframes of `among`, in their order, that `loops.gating` has within the gate about keyframe `b`.
+    """Indices of the keyframes among `among`, in the same order, that lie within the gate about keyframe `b`.
 
-    positions (K, 3), distances (K,) travelled, m; covariances (K, 6, 6) or none; sums (K + 1, 3), squares (K + 1,) of positions
-    rates : error of scale and bend per m; bounds : least way between two keyframes, m away that is always within, sigmas
+    positions : (K, 3) world, m; distances : (K,) m travelled; covariances : (K, 6, 6) of the poses, or none
+    sums, squares : (K + 1, 3), (K + 1,) cumulative sums of the positions and of their squared norms
+    rates : drift in scale, m per m, and in heading, rad per m
+    bounds : least distance travelled between two keyframes, m; distance that is always within the gate, m; sigmas of the gate
     """
     kept = np.empty(len(among), np.int64)
     count = 0
@@ -58,7 +60,7 @@ def gated(
             reach2 = (per_m * travelled) ** 2 + (turn_per_m * travelled) ** 2 * lever2
             if is_known:
                 S, C = covariances[b], covariances[k]
-                # hat(d): a turn of the older keyframe moves the newer one.
+                # hat(d): an error of the older keyframe's rotation moves the newer one.
                 D[0, 1], D[0, 2], D[1, 2] = -dz, dy, -dx
                 D[1, 0], D[2, 0], D[2, 1] = dz, -dy, dx
                 for i in range(3):

@@ -16,21 +16,21 @@ from lslam.kernels.surface_information import solve_on_surfaces
 Floats = NDArray[np.float64]
 Limits = tuple[float, float, float]
 
-# A direction flagged as degenerate is still stepped in until its information is below this part of the threshold: normals with
-# errors of a degree look like 3e-4 of the information.
+# A degenerate direction is still estimated until its information is below this part of the threshold: errors of a degree in the
+# normals alone give a direction that nothing observes 3e-4 of the information.
 UNSEEN = 0.3
-# Of the largest eigenvalue: less is what rounding leaves of none.
+# Part of the largest eigenvalue below which an eigenvalue is an error of rounding.
 ROUNDING = 1e-12
 
 
 @inline_with_arrays
 def solve_observed(H: Floats, g: Floats, facts: Floats, weak_share: float, least: float, unseen: float, d: Floats,
                    weak: Floats) -> int:  # fmt: skip
-    """Step d = -inv(H) g in the directions the points observe; returns how many they do not, as unit rows of `weak`.
+    """Step d = -inv(H) g, (6,) m and rad, in the observed directions; returns the number of degenerate ones, rows of `weak`.
 
-    Rotations are scaled by the rms lever arm, which makes the six eigenvalues comparable; a direction is unobserved when
-    it holds less than `weak_share` of the total information or less than `least`, 1/m2, and not followed below `unseen`
-    times that.
+    Rotations are scaled by the rms lever arm, m, which makes the six eigenvalues comparable. A direction is degenerate when
+    its eigenvalue is less than `weak_share` of the total information or less than `least`, 1/m2. It is left out of the step
+    below `unseen` times that threshold: solution remapping (Zhang, Kaess and Singh 2016).
     """
     lever = math.sqrt(max(facts[LEVER] / max(facts[INFORMATION], 1e-300), 1e-6))
     A = np.empty((6, 6))
@@ -76,10 +76,13 @@ def step_norms(d: Floats) -> tuple[float, float]:
 
 @inline
 def move_by(d: Floats, move: float, turn: float, scale: float, R: Floats, t: Floats) -> bool:
-    """Move R and t by the step d, whose translation and rotation are given; False when it is not finite."""
+    """Move R and t by the step d (6,), bounded by the kernel's width `scale`, m; False when the step is not finite.
+
+    move, turn : norms of the translation, m, and the rotation, rad, of d
+    """
     if not (np.isfinite(move) and np.isfinite(turn)):
         return False
-    # A step beyond the kernel's width leaves the region where its correspondences mean anything.
+    # Correspondences are not valid beyond a step of the kernel's width.
     limit = 2.0 * max(scale, 0.5)
     if move > limit:
         for i in range(6):
@@ -93,7 +96,7 @@ def move_by(d: Floats, move: float, turn: float, scale: float, R: Floats, t: Flo
 
 @inline
 def scale_by_population(H: Floats, S: Floats, g: Floats, facts: Floats) -> None:
-    """What weighs points against each other, divided by its mean: the information stays that of the points."""
+    """Divide H, S, g and the information by the mean relative weight, so that H is the information of the points."""
     w = facts[MATCHED] / max(facts[POPULATION], 1e-300)
     for i in range(6):
         g[i] *= w
@@ -106,7 +109,7 @@ def scale_by_population(H: Floats, S: Floats, g: Floats, facts: Floats) -> None:
 
 @inline_with_arrays
 def within(allowed: Floats, H: Floats) -> Floats:
-    """H (6, 6) as seen by the directions on which `allowed` (6, 6) projects; where it has no rows, all are."""
+    """A H A, the information (6, 6) along the directions on which A = `allowed` (6, 6) projects; H where it has no rows."""
     if len(allowed) == 0:
         return H
     A = np.zeros((6, 6))
@@ -120,7 +123,7 @@ def within(allowed: Floats, H: Floats) -> Floats:
 
 @inline
 def make_whole(sums: Sums) -> None:
-    """The sums of a linearisation, scaled by what it weighed, and H from its upper triangle."""
+    """Divide the sums of a linearisation by the mean relative weight of its points, and fill in H's lower triangle."""
     H, S, g, facts = sums
     if facts[POPULATION] > 0.0:
         scale_by_population(H, S, g, facts)
@@ -130,17 +133,20 @@ def make_whole(sums: Sums) -> None:
 @kernel
 def step(pose: Pose, sums: Sums, scale: float, limits: Limits, allowed: Floats, d: Floats,
          weak: Floats) -> tuple[bool, int, float, float]:  # fmt: skip
-    """Move the pose by one guarded step, left in d (6,): whether it could, how many directions are unobserved, which are
-    rows of `weak` (6, 6), and the translation, m, and rotation, rad, of the step.
+    """Move the pose by one step in the observed directions, and write the step to d (6,), m and rad.
 
+    sums : of a linearisation; H has its upper triangle alone, and is filled in
+    scale : width of the robust kernel, m
     limits : `weak_share`, `least` and `unseen` of `solve_observed`
-    allowed : projector on the directions that may be stepped in; no rows: on all
-    H comes with its upper triangle and leaves whole.
+    allowed : (6, 6) projector on the directions that may be estimated; (0, 6) allows all
+    weak : (6, 6), whose first rows become the degenerate directions
+
+    Returns whether the step is finite, the number of degenerate directions, and the step's translation, m, and rotation, rad.
     """
     R, t = pose
     H, _, g, facts = sums
     make_whole(sums)
-    # What the projector takes away has no eigenvalue left, so that the step never looks along it in g.
+    # Directions that the projector excludes have eigenvalue 0, so that their part of g does not enter the step.
     count = solve_observed(within(allowed, H), g, facts, limits[0], limits[1], limits[2], d, weak)
     move, turn = step_norms(d)
     return move_by(d, move, turn, scale, R, t), count, move, turn
@@ -149,7 +155,7 @@ def step(pose: Pose, sums: Sums, scale: float, limits: Limits, allowed: Floats, 
 @kernel
 def step_on_surfaces(pose: Pose, sums: Sums, scale: float, limits: Limits, allowed: Floats, d: Floats,
                      weak: Floats) -> tuple[bool, int, float, float]:  # fmt: skip
-    """As `step`, where S tells what is observed; a kernel of its own, which runs of other residuals need not compile."""
+    """As `step`, with degenerate directions by S; a kernel of its own, so that runs of other residuals need not compile it."""
     R, t = pose
     H, S, g, facts = sums
     make_whole(sums)
@@ -161,9 +167,9 @@ def step_on_surfaces(pose: Pose, sums: Sums, scale: float, limits: Limits, allow
 
 @kernel
 def trimmed(away2: Floats, share: float, gate2: float) -> float:
-    """Squared distance up to which the nearest `share` of the matched points lie, `gate2` at most.
+    """Squared distance, m2, within which `share` of the matched points within `gate2` lie: that quantile of `away2` (S,).
 
-    Unmatched points have a negative distance. Bisection: no copy, no sort, and the same for any order of the points.
+    Unmatched points have a negative distance. Bisection needs no copy and no sort, and is the same for any order of points.
     """
     if share >= 1.0:
         return gate2

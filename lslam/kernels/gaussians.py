@@ -1,10 +1,10 @@
 """The local map's voxels, each a running Gaussian.
 
 Layout, one row per slot of the pool:
-    moments (C, 13) float64 : n, sum x y z, sum xx xy xz yy yz zz, sum of the sensor's x y z when the points were seen, all
-        relative to the voxel centre
-    planes (C, 8) float64 : mean x y z (world), normal x y z, variance along the normal, tilt: the variance of the normal's
-        direction, rad2, or BLOB or EMPTY; one cache line, all that a residual needs
+    moments (C, 13) float64 : n, sum x y z, sum xx xy xz yy yz zz, sum of the sensor's x y z when the points were measured,
+        all m and relative to the voxel centre
+    planes (C, 8) float64 : mean x y z, m, world; unit normal x y z; variance along the normal, m2; tilt, the variance of the
+        normal's direction, rad2, or BLOB or EMPTY. One cache line, all that a residual needs.
     keys (C,) int64 : packed voxel, FREE when the slot is unused
     refreshed (C,) float64 : n when `planes` was computed last
     table (E,) int32 : open addressing, slot or -1
@@ -29,8 +29,8 @@ Ints = NDArray[np.int32]
 
 FREE = -1
 EMPTY, BLOB = -2.0, -1.0
-# Of the largest variance of a blob: how broad it must be across the beams that saw it. A bush is as deep as it is wide, a
-# ring that bends in its voxel is a strip.
+# Least variance of a blob across the beams, as a part of its largest variance. A bush is as deep as it is wide; a single ring
+# that bends in its voxel is a strip.
 SOLID = 0.1
 USED, FREED, HAND, LIVE = 0, 1, 2, 3
 
@@ -91,11 +91,11 @@ def _release(slot: int, keys: Longs, table: Ints, state: Longs, free: Ints, plan
 @inline
 def _refresh(slot: int, size: float, moments: Floats, planes: Floats, keys: Longs, min_points: float,
              planarity: float, floor: float, breadth: float) -> None:  # fmt: skip
-    """Mean, normal and kind of one voxel from its moments.
+    """Mean, normal and kind of one voxel, its row of `planes`, from its moments.
 
-    What one ring of one scan hits lies on the cone of its beams, and so does what it hits next, wherever the sensor went: a
-    voxel of such points is `EMPTY`, because they tell where the sensor is, not where a surface is. It is matched when its
-    points spread across the beams by `breadth` times the variance of the surface; 0 asks for nothing.
+    The points of one ring of one scan lie on the cone of its beams, and those of the next scan lie on the same cone wherever
+    the sensor has moved: they observe the sensor, not a surface. A voxel of such points is `EMPTY`. A voxel counts when the
+    variance of its points across the beams is at least `breadth` times that of the surface; `breadth` = 0 turns this off.
     """
     s = moments[slot]
     n = s[0]
@@ -112,7 +112,7 @@ def _refresh(slot: int, size: float, moments: Floats, planes: Floats, keys: Long
     xx, xy, xz = s[4] * w - mx * mx, s[5] * w - mx * my, s[6] * w - mx * mz
     yy, yz, zz = s[7] * w - my * my, s[8] * w - my * mz, s[9] * w - mz * mz
     l0, l1, l2, nx, ny, nz = plane_of(xx, xy, xz, yy, yz, zz)
-    # Planarity as in the field: (l1 - l0) / l2 is 1 on a disc, 0 on a line or a ball.
+    # Planarity (l1 - l0) / l2 is 1 on a disc, 0 on a line or a ball.
     is_plane = l1 - l0 >= planarity * max(l2, 1e-12)
     if breadth > 0.0:
         across = breadth_of(xx, xy, xz, yy, yz, zz, mx - s[10] * w, my - s[11] * w, mz - s[12] * w)
@@ -122,7 +122,7 @@ def _refresh(slot: int, size: float, moments: Floats, planes: Floats, keys: Long
     if is_plane:
         p[3], p[4], p[5] = nx, ny, nz
         p[6] = max(l0, 0.0) + floor
-        # A strip of few points fixes its own height but hardly its slope across.
+        # The normal of a narrow strip of few points is uncertain about the strip's axis.
         p[7] = p[6] / (n * max(l1, 1e-12))
     else:
         p[6] = max((l0 + l1 + l2) / 3.0, 0.0) + floor
@@ -132,9 +132,9 @@ def _refresh(slot: int, size: float, moments: Floats, planes: Floats, keys: Long
 @inline
 def breadth_of(xx: float, xy: float, xz: float, yy: float, yz: float, zz: float, dx: float, dy: float,
                dz: float) -> float:  # fmt: skip
-    """Smaller variance, m2, of points of covariance xx..zz across the beams that saw them, which come along d.
+    """Smaller variance, m2, of points of covariance xx..zz across the direction d of the beams that measured them.
 
-    The smaller eigenvalue of the covariance seen along d: of all planes through the sensor, the one that fits best leaves it.
+    The smaller eigenvalue of the covariance projected along d. It is the variance about the best plane that holds d.
     """
     d2 = dx * dx + dy * dy + dz * dz
     if d2 < 1e-12:
@@ -154,11 +154,11 @@ def breadth_of(xx: float, xy: float, xz: float, yy: float, yz: float, zz: float,
 def insert(points: NDArray[np.float32], R: Floats, t: Floats, size: float, cap: float, min_points: float,
            planarity: float, floor: float, breadth: float, reach: float, moments: Floats, planes: Floats, keys: Longs,
            refreshed: Floats, table: Ints, state: Longs, free: Ints) -> int:  # fmt: skip
-    """Add points (N, 3), LiDAR frame, seen from the pose R, t; returns how many found no room.
+    """Add points (N, 3), LiDAR frame, m, measured from the pose R (3, 3), t (3,); returns the number that found no slot.
 
-
-    Counts over `cap` are scaled down, so that new points keep their say. A voxel's plane is recomputed when it has grown
-    by a tenth. For every voxel touched the clock hand looks at two more and frees those farther than `reach` from t.
+    Moments of a voxel with more than `cap` points are scaled down, so that new points keep their weight. A voxel's plane is
+    computed again when its count has grown by a tenth. For every voxel touched, the clock hand examines two slots and frees
+    those farther than `reach`, m, from t.
     """
     n = len(points)
     inverse = 1.0 / size
@@ -190,7 +190,7 @@ def insert(points: NDArray[np.float32], R: Floats, t: Floats, size: float, cap: 
             )
             views[some, 0], views[some, 1], views[some, 2] = x, y, z
             some += 1
-        # The map is larger than the nearest caches: no branch waits for one voxel while others could be fetched.
+        # The map is larger than the processor's caches: a batch of voxels is fetched before any branch depends on one.
         for k in range(some):
             likely[k] = table[hash_key(ahead[k], mask)]
         for k in range(some):
@@ -275,7 +275,7 @@ def rehash(keys: Longs, table: Ints, used: int) -> None:
 def coarsen(factor: int, size: float, min_points: float, planarity: float, floor: float, breadth: float, fine_moments: Floats,
             fine_keys: Longs, used: int, moments: Floats, planes: Floats, keys: Longs, refreshed: Floats,
             table: Ints, state: Longs, free: Ints) -> None:  # fmt: skip
-    """Fill an empty map of voxels of `size` = factor * fine size with the exact moments of a finer one."""
+    """Fill an empty map of voxels of `size`, m, = factor * fine size with the moments of a finer map, which add up exactly."""
     fine = size / factor
     for j in range(used):
         key = fine_keys[j]

@@ -22,7 +22,7 @@ _log = logging.getLogger("lslam")
 
 
 def source_digest() -> str:
-    """Digest of all kernel sources: numba looks at a kernel's own file only, not at the files of what it calls."""
+    """Digest of all kernel sources: numba checks the file of a kernel only, not the files of the functions it calls."""
     digest = hashlib.sha256()
     for path in sorted(Path(__file__).parent.glob("*.py")):
         digest.update(path.read_bytes())
@@ -30,13 +30,13 @@ def source_digest() -> str:
 
 
 def kernel_folder() -> Path | None:
-    """Where machine code is kept; None when there is no folder that is safe, and why is said."""
+    """Folder of the machine code; None, and a warning, when there is no safe one."""
     base, own = os.environ.get("NUMBA_CACHE_DIR"), source_digest()
     if base is None:
         folder = cache_folder("numba")
         return None if folder is None else folder / own
-    # A folder set by the user is kept, below it each version has its own. The processes of a study find the variable as this
-    # one leaves it, and the kernels compiled.
+    # Each version has its own folder below one that the user sets. The processes of a study inherit the variable as it is set
+    # here, and with it the compiled kernels.
     folder = Path(base) if Path(base).name == own else Path(base) / own
     try:
         return own_folder(folder)
@@ -66,7 +66,7 @@ def kernel(function: F) -> F:
 
 
 def _forgive(cache: Any) -> None:
-    """Let a damaged or full cache cost time, not the run: numba passes on whatever unpickling or writing raises."""
+    """Compile again when the cache is damaged or full: numba passes on every error of unpickling and writing."""
     load, save = cache.load_overload, cache.save_overload
 
     def load_or_compile(*args: Any) -> Any:
@@ -88,10 +88,10 @@ def _forgive(cache: Any) -> None:
 
 
 def inline(function: F) -> F:
-    """A small helper of kernels, compiled into its callers and not cached by itself. It makes no arrays.
+    """Compile a small function into the kernels that call it. It is not cached by itself and may not allocate arrays.
 
-    Without numba's runtime, the arrays that it takes are not counted at each call: two atomic operations for every one of
-    them, which cost ten times a lookup in a hash table.
+    Without numba's runtime the references to its array arguments are not counted at each call. Counting takes two atomic
+    operations per array, ten times the cost of a lookup in a hash table.
     """
     options: dict[str, Any] = {"nogil": True, "error_model": "numpy", "forceinline": True, "_nrt": False}
     compiled = numba.njit(**options)(function)
@@ -99,28 +99,25 @@ def inline(function: F) -> F:
 
 
 def inline_with_arrays(function: F) -> F:
-    """As `inline`, for one that makes arrays of its own. Its calls count references: for what is called once per step."""
+    """As `inline`, for functions that allocate arrays. References are counted at each call: for one call per step at most."""
     compiled = numba.njit(nogil=True, error_model="numpy", forceinline=True)(function)
     return cast(F, compiled)
 
 
 def lock_file() -> Path | None:
-    """Who compiles holds it (`lslam.locks`): others wait instead of compiling the same kernels into the same files."""
+    """Lock (`lslam.locks`) of the process that compiles; others wait and then load the kernels. None without a cache."""
     return None if _folder is None else _folder / "compile.lock"
 
 
 @contextlib.contextmanager
 def announced(log: logging.Logger, on_first: Callable[[], None] = lambda: None) -> Iterator[None]:
-    """Say that kernels are being compiled in the block when the first one is: not when they are loaded, however slowly.
-
-    on_first : called then, too
-    """
+    """Log a line when the first kernel is compiled within the block, and call `on_first`; loading kernels does neither."""
     with event.install_listener("numba:compile", _Announcement(log, on_first)), _rarely_collecting():
         yield
 
 
 class _Announcement(event.Listener):
-    """Hears of every function that numba begins to compile."""
+    """Listener to numba's compilations, which logs the first one."""
 
     def __init__(self, log: logging.Logger, on_first: Callable[[], None]) -> None:
         self._log: logging.Logger | None = log
@@ -139,7 +136,7 @@ class _Announcement(event.Listener):
 
 @contextlib.contextmanager
 def _rarely_collecting() -> Iterator[None]:
-    """Compiling makes millions of objects that stay: looking at them again and again is a tenth of its time."""
+    """Collect garbage rarely: compiling makes millions of objects that stay, and scanning them is a tenth of its time."""
     before = gc.get_threshold()
     gc.set_threshold(100_000, *before[1:])
     try:

@@ -1,4 +1,4 @@
-"""The matrices of a small Kalman filter: in NumPy a call costs more than what it computes."""
+"""The matrix products of small Kalman filters: in NumPy the overhead of a call exceeds the computation."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Floats = NDArray[np.float64]
 
 @kernel
 def _eliminate(A: Floats, B: Floats) -> None:
-    """B (M, N) <- inv(A) B by Gaussian elimination with partial pivoting; A (M, M) is used up."""
+    """B (M, N) <- inv(A) B by Gaussian elimination with partial pivoting; A (M, M) is overwritten."""
     m, n = B.shape
     for c in range(m):
         p = c
@@ -63,7 +63,7 @@ def _transposed(A: Floats) -> Floats:
 
 @kernel
 def _sum(A: Floats, B: Floats, factor: float) -> Floats:
-    """A + factor B, which an array expression takes many times as long to compile."""
+    """A + factor B; an array expression takes many times as long to compile."""
     out = np.empty(A.shape)
     for i in range(A.shape[0]):
         for j in range(A.shape[1]):
@@ -88,7 +88,7 @@ def _in_axes_of(H: Floats, P: Floats) -> Floats:
 
 @kernel
 def square(rest: Floats, S: Floats) -> float:
-    """Squared Mahalanobis length of `rest` (M,) with covariance S (M, M)."""
+    """Squared Mahalanobis norm of the residual `rest` (M,) with covariance S (M, M)."""
     solved = np.empty((len(rest), 1))
     for i in range(len(rest)):
         solved[i, 0] = rest[i]
@@ -103,7 +103,7 @@ def square(rest: Floats, S: Floats) -> float:
 def update(x: Floats, P: Floats, H: Floats, rest: Floats, noise: Floats, outlier: float) -> tuple[Floats, Floats]:
     """Mean (N,) and covariance (N, N) after the innovation `rest` (M,) with H (M, N) and `noise` (M, M).
 
-    Beyond `outlier` sigma, the noise is raised to what the innovation shows.
+    An innovation whose squared Mahalanobis norm, per dimension, exceeds `outlier`^2 has its noise multiplied by that excess.
     """
     n, m = len(x), len(rest)
     S, gain = _in_axes_of(H, P), _product(H, P)
@@ -128,8 +128,10 @@ def propagate(
 ) -> tuple[Floats, Floats]:  # fmt: skip
     """Mean (12,) and covariance (12, 12) of displacement, velocity, gravity and accelerometer bias after `t` seconds.
 
-    x (9,), covariance (9, 9) : of the last three before; gained, moved (3,), the arms (3, 3) : at the end, as in `Increments`
-    R : (3, 3) of the IMU at the beginning; force_noise : m/s2 per sqrt(Hz)
+    x (9,), covariance (9, 9) : velocity, m/s, gravity and accelerometer bias, m/s2, at the beginning
+    gained (3,), moved (3,), velocity_arm (3, 3), position_arm (3, 3) : velocity, position and their arms at the end, as in
+        `Increments`
+    R : (3, 3) world from IMU at the beginning; force_noise : m/s2 per sqrt(Hz)
     """
     mean, F = np.empty(12), np.zeros((12, 9))
     for i in range(3):
@@ -159,9 +161,9 @@ def propagate(
 def placed(
     x: Floats, P: Floats, moved: Floats, noise: Floats, gravity: float, gravity_sigma: float, outlier: float
 ) -> tuple[Floats, Floats]:
-    """The mean (12,) and covariance (12, 12) of `propagate` after registration found the displacement `moved` (3,), m.
+    """Mean (12,) and covariance (12, 12) of `propagate` after the update by the displacement `moved` (3,), m, of registration.
 
-    noise : (3, 3) m2 of that; gravity, gravity_sigma : how strong it is, m/s2
+    noise : (3, 3) covariance of `moved`, m2; gravity, gravity_sigma : magnitude of gravity and its sigma, m/s2
     """
     H, rest = np.zeros((3, 12)), np.empty(3)
     for i in range(3):
@@ -178,9 +180,9 @@ def placed(
 
 @kernel
 def turn_bias(rotation: Floats, velocity_arm: Floats, axes: Floats, rest: Floats) -> Floats:
-    """(3,) rad/s by which a gyroscope's bias is smaller than was thought, by the `rest` (3,), rad, that its turn lacks.
+    """Amount (3,), rad/s, by which a gyroscope's bias is below the assumed one when its rotation lacks `rest` (3,), rad.
 
-    rotation (3, 3) from the end of the turn to its beginning, velocity_arm (3, 3) : as in `Increments`; axes : (3, 3)
+    rotation (3, 3), from the end to the beginning, and velocity_arm (3, 3) : as in `Increments`; axes : (3, 3) of the gyroscope
     """
     less, out = np.empty((3, 1)), np.empty(3)
     for i in range(3):
@@ -193,7 +195,7 @@ def turn_bias(rotation: Floats, velocity_arm: Floats, axes: Floats, rest: Floats
 
 @kernel
 def turn_columns(rotation: Floats, velocity_arm: Floats, axes: Floats, seconds: float) -> Floats:
-    """(3, 12) by which a turn grows with the gyroscope's bias and the rows of its axes; the rate is taken for constant."""
+    """Jacobian (3, 12) of a rotation by the gyroscope's bias and the rows of its axes, for a constant rate."""
     out, reading, turn = np.zeros((3, 12)), np.empty((3, 1)), np.empty(3)
     logarithm(rotation, turn)
     for i in range(3):
@@ -213,10 +215,10 @@ def turn_columns(rotation: Floats, velocity_arm: Floats, axes: Floats, seconds: 
 def turn_covariance(
     covariance: Floats, rate_variance: float, rotation: Floats, velocity_arm: Floats, axes: Floats, seconds: float
 ) -> Floats:
-    """(3, 3) rad2 of a turn of so many seconds, in axes at its end.
+    """Covariance (3, 3), rad2, of a rotation that takes `seconds`, in the IMU's axes at its end.
 
     covariance : (12, 12) of the gyroscope's bias and the rows of its `axes` (3, 3); rate_variance : (rad/s)^2 per Hz
-    rotation (3, 3) from the end of the turn to its beginning, velocity_arm (3, 3) : as in `Increments`
+    rotation (3, 3), from the end to the beginning, and velocity_arm (3, 3) : as in `Increments`
     """
     H = turn_columns(rotation, velocity_arm, axes, seconds)
     out = _in_axes_of(H, covariance)
@@ -230,10 +232,10 @@ def turned(
     x: Floats, covariance: Floats, rate_variance: float, rotation: Floats, velocity_arm: Floats, seconds: float,
     rest: Floats, noise: Floats, bias_walk: float, outlier: float,
 ) -> tuple[Floats, Floats, float]:  # fmt: skip
-    """The bias and the rows of the axes, x (12,), and their covariance after the turn was found larger by `rest` (3,), rad.
+    """Bias and rows of the axes, x (12,), and their covariance (12, 12), updated by a rotation larger by `rest` (3,), rad.
 
-    noise : (3, 3) rad2 of that; bias_walk : rad/s per sqrt(s); the others as in `turn_covariance`
-    Returns also by how much more the square of `rest`, bounded at `outlier` sigma, is than its variance, rad2.
+    noise : (3, 3) covariance of the measured rotation, rad2; bias_walk : rad/s per sqrt(s); the others as in `turn_covariance`
+    Returns also the excess, rad2, of the squared norm of `rest`, bounded at `outlier` sigma, over its expected value.
     """
     before, own = _copy(covariance), _copy(noise)
     for i in range(3):
@@ -255,9 +257,10 @@ def turned(
 
 @kernel
 def weighed(T: Floats, rest: Floats, C: Floats, P: Floats, age: float) -> tuple[Floats, Floats]:
-    """The pose T (4, 4), known to C (6, 6), and what another, known to P, that it is `rest` (6,) away from makes of both.
+    """Weighted mean of the pose T (4, 4) with covariance C (6, 6) and of one with covariance P (6, 6), and its covariance.
 
-    All in world axes, m and rad; P counts `age` times.
+    rest : (6,) from the other pose to T; all in world axes, m and rad
+    age : factor on P
     """
     gain = _copy(C)
     _eliminate(_sum(C, P, age), gain)

@@ -52,7 +52,7 @@ def plane_of(
 def eigen(matrix: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Eigenvalues (n,) and eigenvectors in columns (n, n) of a small symmetric matrix, by cyclic Jacobi rotations.
 
-    LAPACK would do, but its threads and vendor decide the last bits; these loops give the same bytes everywhere.
+    The last bits of LAPACK's results depend on vendor and threads; these loops give the same bytes everywhere.
     """
     n = len(matrix)
     a = matrix.copy()
@@ -160,10 +160,10 @@ def rotate_symmetric(R: NDArray[np.float64], q: NDArray[np.float64]) -> tuple[fl
 
 @inline
 def extent(values: NDArray[Any]) -> tuple[Any, Any]:
-    """Least and greatest of the values (N,), N > 0; both are NaN where one of them is, as NumPy has it."""
+    """Least and greatest of the values (N,), N > 0; both are NaN when a value is NaN, as in NumPy."""
     low = high = values[0]
     for value in values:
-        # NaN is what differs from itself; nothing is smaller or larger than it, so that it stays.
+        # Only NaN differs from itself. No value compares as smaller or larger than NaN, so that it stays.
         if value < low or value != value:
             low = value
         if value > high or value != value:

@@ -1,15 +1,16 @@
-"""What every residual's `linearise` takes and gives: one protocol, so that one loop steps by all of them.
+"""The signature of every residual's `linearise`: one protocol, so that one optimiser takes all of them.
 
     linearise(points, target, settings, search, pose, width, sums) -> None
 
-points : source points (S, 3), LiDAR frame, and what goes with each; target : arrays of one map
-settings : numbers that stay as they are; on voxels size, m, variance of a point, m2, weights of planes and of blobs, the
-    blobs' part along the sensor's axis, and whether this is the coarsest of several maps, which takes what the others left
-search : what is remembered from one iteration to the next, and of one map for the next coarser one, see `Search`
-pose : R (3, 3) and t (3,); width : of the robust kernel, m, the one it ends with, and the squared distance, m2, beyond
-    which correspondences are rejected
-sums : H and S (6, 6), of which the upper triangles are added to, g (6,) and facts. S is the information of the surfaces
-    alone, for residuals whose matrices are full, see `surface_information`; the others leave it be.
+points : source points (S, 3), LiDAR frame, m, and the attributes of each
+target : arrays of one map
+settings : constant numbers. For voxels: size, m; variance of a point, m2; weights of planes and of blobs; factor on the
+    blobs' weight along the sensor's axis; whether the map is the coarsest of several, which takes all remaining points.
+search : results kept from one iteration to the next, and from one map to the next coarser one, see `Search`
+pose : R (3, 3) and t (3,), m, world from LiDAR
+width : width of the robust kernel, m; its final width, m; squared distance, m2, beyond which correspondences are rejected
+sums : H and S (6, 6), whose upper triangles are added to, g (6,) and `facts`. S is the information of the surfaces alone, for
+    residuals with full information matrices, see `surface_information`; the other residuals do not change it.
 
 Pose update: t <- t + d[:3], R <- exp(d[3:]) R, so a residual n . (R s + t - m) has the Jacobian [n, (R s) x n].
 """
@@ -25,8 +26,8 @@ Ints = NDArray[np.int32]
 Flags = NDArray[np.bool_]
 
 Settings = tuple[float, float, float, float, float, bool]
-# Octant cell (S,) and slots (S, 8) of each point, its nearest plane and blob (S, 2) and where and how long that holds (S, 4),
-# see `residuals.nearest`; whether it is matched, and its squared distance, -1 where it is not.
+# Octant cell (S,) and slots (S, 8) of each point; its nearest plane and blob (S, 2), and the sphere within which these are the
+# nearest (S, 4), see `residuals.nearest`; whether it is matched (S,); its squared distance (S,), m2, -1 where it is not.
 Search = tuple[Longs, Ints, Ints, Floats, Flags, Floats]
 Pose = tuple[Floats, Floats]
 Width = tuple[float, float, float]

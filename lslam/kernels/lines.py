@@ -2,8 +2,8 @@
 
 A row of `lines` (C, 8) float64 belongs to a slot of the voxel pool: a point x y z on the line (the mean), its unit direction
 x y z (the largest eigenvector), the variance across it, and the variance of its direction, rad2, or NO_LINE. Rows are
-computed when a point asks for the voxel and kept until the voxel has changed: most voxels behind the sensor never are.
-A voxel has changed when the sum of its count and second moments has: the count of a full one stays what it is.
+computed when a point is matched with the voxel, and kept until the voxel changes: most voxels behind the sensor never do.
+A voxel has changed when the sum of its count and second moments has changed: the count alone is constant in a full voxel.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ LineVoxels = tuple[Floats, Longs, Ints, Floats, Longs, Floats]
 NO_LINE = -1.0
 # LOAM's rule: a line when the largest eigenvalue is three times the second one.
 ELONGATION = 3.0
-# Four sigma-squared of tilt, as for planes: points of one pole err together.
+# Factor on the variance of the direction, two sigma, as for planes: the errors of points on one pole are correlated.
 TILT = 4.0
 
 
@@ -80,7 +80,7 @@ def add_line(H: Floats, g: Floats, facts: Floats, ex: float, ey: float, ez: floa
     robust = c2 / (c2 + d2)
     robust *= robust
     w = robust / variance
-    # Two unit vectors across the line; the axis it is least along starts them.
+    # Two unit vectors across the line, beginning with the axis that is most nearly across it.
     ax, ay, az = abs(ux), abs(uy), abs(uz)
     if ax <= ay and ax <= az:
         px, py, pz = 0.0, -uz, uy
@@ -111,7 +111,7 @@ def linearise_lines(points: tuple[Floats], voxels: LineVoxels, settings: tuple[f
     that of the voxel across its line + sigma2 + tilt at that distance along it, Geman-McClure weight of width `scale`.
     settings : voxel size, m; variance of a point, m2; points and floor of a line's variance, m2, see `line_of`
     search : octant cells and slots; `away2` (S,) takes the squared distance of each matched point to its line: those beyond
-    `gate2` are rejected: counted, without a say
+    `gate2` are rejected: they count as matched and have no weight
     """
     (source,) = points
     moments, keys, table, lines, line_keys, line_sums = voxels

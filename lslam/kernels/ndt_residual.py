@@ -21,8 +21,8 @@ Ints = NDArray[np.int32]
 
 # Eigenvalues below this share of the largest are raised to it (Magnusson, section 6.2.1).
 SMALLEST_SHARE = 0.01
-# A voxel whose second eigenvalue is below this share of the largest holds a line: one ring, or a few in a row. Across it
-# the Gaussian knows only where an earlier scan happened to be cut, and would hold the sensor there.
+# A voxel whose second eigenvalue is below this share of the largest holds a line: one ring, or a few neighbouring ones. Across
+# the line such a Gaussian describes where the beams of an earlier scan were, not the surface.
 LINE_SHARE = 0.1
 OUTLIER_RATIO = 0.55
 
@@ -77,12 +77,12 @@ def linearise_ndt(points: tuple[Floats], voxels: Voxels, settings: Settings, sea
     """Add all source points (S, 3), LiDAR frame, that are not done, to the sums, see `linearisation`.
 
     The cost is the negative score: -d1 u exp(-d2 / (2 u) e^T C^-1 e) over the eight voxels around R s + t, where u =
-    `widening` is 1 but while annealing, when the Gaussians are as much wider as the kernel is. g is its gradient. H is the
-    Gauss-Newton Hessian, J^T C^-1 J times the weight d1 d2 exp(..) of the gradient: Newton's, which Magnusson steps with,
-    also has the curvature of that weight and of the rotation, is indefinite away from the optimum, and then has to be
-    mended. The score brings its own robustness: neither the variance of a point nor blobs matter to it. Distances are e^T
-    C^-1 e times the smallest eigenvalue of C, of the nearest voxel. S is the information along the thinnest axis of each
-    voxel alone.
+    `widening` is 1 except during annealing, when it widens the Gaussians as the kernel is widened. g is the gradient. H is
+    the Gauss-Newton Hessian, J^T C^-1 J times the weight d1 d2 exp(..) of the gradient. Newton's Hessian, which Magnusson
+    uses, also has the curvature of that weight and of the rotation; it is indefinite away from the optimum and then needs
+    correction. The score is robust by itself: the variance of a point and the weight of blobs do not enter. Distances are
+    e^T C^-1 e times the smallest eigenvalue of C, for the nearest voxel. S is the information along the thinnest axis of
+    each voxel alone.
     """
     (source,) = points
     shapes, keys, table = voxels

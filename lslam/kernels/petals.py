@@ -1,6 +1,7 @@
-"""Lines of a pattern that does not repeat, walked in the order of firing: where they turn, and how smooth they are.
+"""Lines of a pattern that does not repeat, in the order of firing: where they turn, and their curvature.
 
-Lin and Zhang 2020, section III, and the authors' code. Two neighbours on each side, as there: more of them see the line bend.
+Lin and Zhang 2020, section III, and the authors' code. Two neighbours on each side, as there: over more of them the line itself
+bends.
 """
 
 from __future__ import annotations
@@ -19,10 +20,12 @@ SIDE = 2  # neighbours on each side
 
 @kernel
 def cut(xyz: Floats, steps: Floats, starts: NDArray[np.int64], gap: float, turn: float) -> NDArray[np.int64]:
-    """Where lines begin, and their end (lines + 1,), among points (K, 3) of lasers that own `starts` (lasers + 1,).
+    """Index of the first point of each line, and the number of points at the end (lines + 1,), among points (K, 3).
 
-    A line ends where the next point is more than `gap`, rad, away, and at the point that is farthest from the x axis, the
-    sensor's own, or nearest to it: one that the angle to that axis has turned back from by `turn`, rad.
+    A line ends where the next point is more than `gap`, rad, away. It also ends where its angle to the sensor's x axis is
+    largest or smallest, once the angle has turned back by `turn`, rad.
+
+    steps : (K,) rad to the next point; starts : (lasers + 1,), laser k has the points starts[k] to starts[k + 1] - 1
     """
     total = xyz.shape[0]
     begins = np.empty(total + 1, np.int64)
@@ -65,13 +68,15 @@ def smoothness(
     jump_slope: float,
     grazing: float,
 ) -> tuple[Floats, Floats, Floats, NDArray[np.bool_]]:
-    """Curvature (K,) over `SIDE` neighbours, NaN for what is no feature; its bend (K,); contrast (K,); what breaks (K,).
+    """Curvature (K,) over `SIDE` neighbours on each side, its bend (K,), the contrast (K,) and the breaks of the lines (K,).
 
-    No feature is a point that is `left_out`, within `SIDE` points of a line's end, just behind an occlusion boundary, on a
-    surface whose angle with the beam has a cosine above `grazing`, or alone between two breaks.
+    The curvature is NaN for points that are no features: those that are `left_out`, within `SIDE` points of a line's end,
+    just behind an occlusion boundary, on a surface whose angle with the beam has a cosine above `grazing`, or alone between
+    two breaks.
 
     brightness : (K,) intensities, or (0,); jump, jump_slope, bend and breaks as in `curvature.curvatures`
-    The contrast is the step of brightness between both sides over their sum, 0 where these do not agree in themselves.
+    The contrast is the difference of brightness between both sides over its sum. It is 0 where the brightness within the
+    sides varies by half of that difference or more.
     """
     total = xyz.shape[0]
     curvature = np.full(total, np.nan)

@@ -1,4 +1,4 @@
-"""Point to point: each source point is drawn to the nearest voxel mean, equally in all directions."""
+"""Point to point: the distance of each source point to the nearest voxel mean, weighted equally in all directions."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ def linearise_point(points: tuple[Floats, Floats], voxels: Voxels, settings: Set
                     width: Width, sums: Sums) -> None:  # fmt: skip
     """Add all source points (S, 3), LiDAR frame, that are not done, to H, g and facts, see `linearisation`.
 
-    Residual e = R s + t - mean of the nearest of eight voxels, planes or not; variance sigma2 plus that of a place in a
-    voxel, size2 / 12; Geman-McClure weight of width sqrt(scale2 + size2): where in its voxel a point lies is no outlier.
-    Where the next ring lies farther off than a voxel, gaps (S,), a mean of few points is one ring's, and would hold those
-    that follow to where this one lies: such a match is left to a coarser map, the coarsest of which takes all. Distances
-    are those to the mean.
+    Residual e = R s + t - mean of the nearest of eight voxels of any kind. Its variance is sigma2 plus that of a uniform
+    position within a voxel, size2 / 12; its Geman-McClure weight has the width sqrt(scale2 + size2), as an offset within the
+    voxel is no outlier. Where the next ring lies farther away than a voxel, gaps (S,), m, the mean of few points is that of
+    a single ring, which moves with the sensor: such a point is left to a coarser map, and the coarsest map takes all.
+    Distances are those to the mean.
     """
     source, gaps = points
     planes, keys, table = voxels

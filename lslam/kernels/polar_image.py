@@ -25,7 +25,7 @@ def polar_image(points: NDArray[np.float32], rings: int, sectors: int, reach: fl
     for i in range(len(points)):
         x, y, z = float(points[i, 0]), float(points[i, 1]), points[i, 2]
         ring = math.sqrt(x * x + y * y) * per_metre
-        # Also false for NaN, which has no place.
+        # Also false for NaN.
         if not (ring < rings and np.isfinite(z)):
             continue
         angle = math.atan2(y, x)

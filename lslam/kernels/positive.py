@@ -1,7 +1,8 @@
-"""Positive definite matrices: the same bits for any number of threads, which libraries do not give beyond some size.
+"""Positive definite matrices: Cholesky factors with the same bits for any number of threads, unlike those of LAPACK.
 
-Rows and columns are scaled to a unit diagonal first, since metres and radians differ. Inner loops run along rows and add no
-terms to each other, so that they are vectorised without another order of sums. NaN comes of what is not positive definite.
+Rows and columns are first scaled to a unit diagonal, since metres and radians differ. Inner loops run along rows and sum no
+terms, so that they are vectorised without changing the order of sums. The result of a matrix that is not positive definite is
+NaN.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ def _factorise(A: Floats, scale: Floats, L: Floats, column: Floats) -> None:
 
 @kernel
 def inverse(A: Floats) -> Floats:
-    """(N, N) inverse of A (N, N), symmetric to the last bit."""
+    """Inverse (N, N) of A (N, N), symmetric to the last bit."""
     n = len(A)
     scale, L, column, W = np.empty(n), np.zeros((n, n)), np.empty(n), np.zeros((n, n))
     _factorise(A, scale, L, column)
@@ -66,7 +67,7 @@ def inverse(A: Floats) -> Floats:
 
 @kernel
 def complement(A: Floats, B: Floats, C: Floats) -> Floats:
-    """(M, M) Schur complement C - B^T A^-1 B of A (N, N) with B (N, M) and C (M, M), symmetric as C is."""
+    """Schur complement C - B^T A^-1 B (M, M) of A (N, N) with B (N, M) and symmetric C (M, M), symmetric to the last bit."""
     n, m = B.shape
     scale, L, column, X = np.empty(n), np.zeros((n, n)), np.empty(n), np.empty((n, m))
     _factorise(A, scale, L, column)
@@ -90,7 +91,7 @@ def complement(A: Floats, B: Floats, C: Floats) -> Floats:
 
 @kernel
 def solved(A: Floats, b: Floats) -> Floats:
-    """(N,) x with A x = b, A (N, N), b (N,)."""
+    """Solution x (N,) of A x = b with A (N, N) and b (N,)."""
     n = len(b)
     scale, L, column, x = np.empty(n), np.zeros((n, n)), np.empty(n), np.empty(n)
     _factorise(A, scale, L, column)

@@ -17,8 +17,9 @@ def linearise(points: Floats, target: tuple[Floats, Floats, Floats], settings: f
               width: Width, sums: Sums) -> None:  # fmt: skip
     """Add the prior R0 (3, 3), t0 (3,) with its information (6, 6), world axes, to H and g, see `linearisation`.
 
-    The residual is t - t0 and the rotation vector of R R0', whose Jacobian is taken for the identity: the prior is right to a
-    few degrees. It counts as it is, whatever the points' weights are divided by at the end of a linearisation.
+    The residual is t - t0, m, and the rotation vector of R R0^T, rad. Its Jacobian is approximated by the identity, which is
+    valid for a prior with an error of a few degrees. The information is multiplied by the mean relative weight of the points,
+    by which all sums are divided at the end of a linearisation.
     """
     R0, t0, information = target
     R, t = pose
@@ -31,7 +32,7 @@ def linearise(points: Floats, target: tuple[Floats, Floats, Floats], settings: f
             for k in range(3):
                 D[i, j] += R[i, k] * R0[j, k]
     away[3], away[4], away[5] = D[2, 1] - D[1, 2], D[0, 2] - D[2, 0], D[1, 0] - D[0, 1]
-    # The vector has twice the sine of the angle for its length.
+    # The norm of the vector is twice the sine of the angle.
     sine = 0.5 * np.sqrt(away[3] * away[3] + away[4] * away[4] + away[5] * away[5])
     cosine = 0.5 * (D[0, 0] + D[1, 1] + D[2, 2] - 1.0)
     stretch = 0.5 if sine < 1e-9 else 0.5 * np.arctan2(sine, cosine) / sine

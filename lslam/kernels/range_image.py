@@ -35,9 +35,11 @@ def project(
     rows: int,
     columns: int,
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Pixel (K,) of every point, and the nearest point of every pixel (rows * columns,), -1 for none.
+    """Pixel (K,) of every point, and the index of the nearest point in every pixel (rows * columns,), -1 for none.
 
-    points : (K, 3) and ranges (K,), m, ring k owning starts[k]..starts[k + 1]; row : (rings,) of each ring
+    points : (K, 3), m, in ring order; ranges : (K,), m; starts : (rings + 1,), ring k has the points starts[k] to
+        starts[k + 1] - 1
+    row : (rings,) image row of each ring
     """
     pixel = np.empty(points.shape[0], np.int64)
     nearest = np.full(rows * columns, -1, np.int64)
@@ -63,13 +65,14 @@ def find_ground(
     baseline: float,
     tolerance: float,
 ) -> NDArray[np.bool_]:
-    """Pixels (rows * columns,) whose point lies on the ground.
+    """Whether the point of each pixel (rows * columns,) lies on the ground.
 
-    Column by column from below: ground leads to ground over no more than `slope`, and is itself no steeper towards the next
-    pixel above that is `baseline` m away; what lies as high as the ground before may have something standing behind it. Where
-    a column starts it lies within `slope` and `tolerance` m of the floor.
+    Each column is followed from its lowest pixel. The first ground point of a column lies within `slope` and `tolerance`, m,
+    of the floor, and the line from one ground point to the next is no steeper than `slope`. Neither is the line to the next
+    pixel above that is `baseline`, m, away, unless the point is level with the ground before it: an object may stand behind.
 
-    points : (K, 3), m; up : (3,) unit vector; floor : height of the ground along it under the sensor, m
+    points : (K, 3), m; nearest : (rows * columns,) index of a pixel's point, see `project`
+    up : (3,) unit vector; floor : height of the ground along `up` under the sensor, m; slope : tangent
     """
     rows = nearest.shape[0] // columns
     is_ground = np.zeros(nearest.shape[0], np.bool_)
@@ -106,8 +109,10 @@ def find_ground(
 
 @inline
 def _joined(a: float, b: float, sine: float, cosine: float, tangent: float) -> bool:
-    """Whether ranges a and b, m, seen under an angle of `sine` and `cosine` belong together: the line through both makes more
-    than the angle of `tangent` with the farther beam."""
+    """Whether the points at ranges a and b, m, lie on one object: the line through both makes a large angle with the beam.
+
+    sine, cosine : of the angle between the beams; tangent : of the least angle of the line with the beam of the farther point
+    """
     far, near = max(a, b), min(a, b)
     across, along = near * sine, far - near * cosine
     return along <= 0.0 or across > tangent * along
@@ -123,17 +128,17 @@ def cluster(
     angle: float,
     least: tuple[int, int, int],
 ) -> NDArray[np.int32]:
-    """Label (rows * columns,) the pixels off the ground: 1, 2, ... of clusters, 0 of what belongs to none.
+    """Label (rows * columns,) of the pixels off the ground: 1, 2, ... for clusters, 0 for pixels in none.
 
-    Neighbours belong together when the line through them makes more than `angle`, rad, with the beam. Clusters are filled
-    breadth first, in the order of their lowest, leftmost pixel.
+    Neighbours belong to one cluster when the line through them makes more than `angle`, rad, with the beam. Clusters are
+    filled breadth first, in the order of their lowest, leftmost pixels.
 
-    ranges : (K,) m; elevation : (rows,) rad; least : a cluster has so many pixels, or so many over so many rows
+    ranges : (K,) m; elevation : (rows,) rad; least : least number of pixels of a cluster, or of pixels and of rows they span
     """
     total = nearest.shape[0]
     rows = total // columns
     labels = np.zeros(total, np.int32)
-    # What is empty or ground is done with from the start.
+    # Empty pixels and ground belong to no cluster.
     seen = np.ones(total, np.bool_)
     image = np.zeros(total)
     for p in range(total):
@@ -204,9 +209,10 @@ def give_back(
     same: float,
     count: int,
 ) -> tuple[NDArray[np.bool_], NDArray[np.int32]]:
-    """Ground and labels (count,) of the points of a scan from those of their pixels.
+    """Whether each point of a scan (count,) is ground, and its label (count,), from those of its pixel.
 
-    Points that share a pixel are what its nearest point is when their ranges are within `same` m, else nothing.
+    A point takes those of its pixel when its range is within `same`, m, of the pixel's nearest point. Otherwise it is not
+    ground and has label 0.
     """
     ground_of = np.zeros(count, np.bool_)
     labels_of = np.zeros(count, np.int32)

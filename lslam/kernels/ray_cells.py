@@ -1,8 +1,8 @@
-"""Occupancy by rays: cells a beam ends in are hit, cells it crosses are missed, over a hash of packed cell indices.
+"""Occupancy by rays: the cell in which a beam ends is hit, cells that it crosses are missed; a hash of packed cell indices.
 
-A row is (key, a, low, high, stamp), int64. What a cell has seen is the function x -> clamp(x + a, low, high) of the log-odds
-x it had before: clamped updates, as OctoMap's (Hornung et al. 2013), are closed under composition, so parts of a
-recording that were summed apart can be put one after the other without loss.
+A row is (key, a, low, high, stamp), int64. The updates of a cell are the function x -> clamp(x + a, low, high) of its previous
+log-odds x. Clamped updates, those of OctoMap (Hornung et al. 2013), are closed under composition, so parts of a recording that
+were summed separately can be joined in their order without loss.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ COLUMNS = 5
 
 @inline
 def _seen_row(key: int, slots: NDArray[np.int32], rows: NDArray[np.int64], used: int) -> int:
-    """Row of a key; `used` when it has none yet: one that nothing is known of then."""
+    """Row of a key; a new row without any update, number `used`, for a key that has none."""
     row = row_of(key, slots, rows, used)
     if row == used:
         rows[row, 1] = 0
@@ -51,17 +51,17 @@ def mark_ends(
     stamp: int,
     model: NDArray[np.int64],
 ) -> tuple[int, NDArray[np.float64]]:
-    """Update the cells that beams end in, once each; rows used now, and the ends (E, 3) to be cast to, in cells.
+    """Update the cells in which beams end, once each; returns the rows used now, and the ends (E, 3) of the beams, in cells.
 
     points : (N, 3) sensor frame, m; T : (4, 4) world from sensor; origin : (3,) cell in the middle of the key range
-    stamp : number of the scan; model : hit, miss, lowest, highest log-odds
-    Beams longer than `range_max` end there without a hit. One beam per end cell is cast.
+    stamp : number of the scan; model : log-odds of a hit and of a miss, and their lower and upper bound
+    Beams longer than `range_max`, m, end there without a hit. Only one beam per end cell is returned.
     """
     ends = np.empty((len(points), 3))
     count = 0
     inverse = 1.0 / voxel
     near = range_min * range_min
-    for far in range(2):  # hits first: they beat whatever else a scan says of a cell
+    for far in range(2):  # hits first: a cell that a scan hits is not missed by the same scan
         for i in range(len(points)):
             x, y, z = float(points[i, 0]), float(points[i, 1]), float(points[i, 2])
             r2 = x * x + y * y + z * z
@@ -104,10 +104,10 @@ def carve(
     stamp: int,
     model: NDArray[np.int64],
 ) -> tuple[int, int]:
-    """Miss every cell that the beams from `start` (3,) cross before they end, once each (Amanatides and Woo 1987).
+    """Update the cells that the beams cross before their ends with a miss, once each (Amanatides and Woo 1987).
 
-    ends, start : in cells; longest : no beam crosses more cells
-    Returns the rows used now, and the beam to go on with when `rows` has no room for another, else len(ends).
+    start : (3,) common start of the beams, in cells; ends : (E, 3), in cells; longest : most cells that a beam crosses
+    Returns the rows used now, and the index of the first beam that was not cast because `rows` was full, else len(ends).
     """
     cell = np.empty(3, np.int64)
     last = np.empty(3, np.int64)
@@ -145,7 +145,7 @@ def carve(
 
 @kernel
 def compose(rows: NDArray[np.int64]) -> NDArray[np.int64]:
-    """One row per key of rows (N, 5) sorted by key, those of one key in the order they happened."""
+    """Composition of rows (N, 5), one row per key (K, 5). They are sorted by key, and those of one key by time."""
     out = np.empty_like(rows)
     count = 0
     for i in range(len(rows)):

@@ -1,4 +1,4 @@
-"""Normal equations of scan points against Gaussian voxels, point to plane; and what the other residuals share with it."""
+"""Normal equations of scan points against Gaussian voxels, point to plane, and the functions that other residuals share."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ Floats = NDArray[np.float64]
 # Rows of planes, keys and table, see `gaussians`.
 Voxels = tuple[Floats, NDArray[np.int64], NDArray[np.int32]]
 
-# Four sigma-squared of tilt: neighbouring points of one ring err together.
+# Factor on the variance of the normal, two sigma: the errors of neighbouring points of one ring are correlated.
 TILT = 4.0
 
 
 @inline
 def octant_slots(x: float, y: float, z: float, i: int, inverse: float, cells: NDArray[np.int64],
                  slots: NDArray[np.int32], keys: NDArray[np.int64], table: NDArray[np.int32]) -> bool:  # fmt: skip
-    """Slots of the eight voxels around a world point, looked up again, True, only when the point left its octant cell."""
+    """Look up the slots (8,) of the voxels around point i at x, y, z, world, when it has left its octant cell; True then."""
     ix, iy, iz = (
         index_of(x - 0.5 / inverse, inverse),
         index_of(y - 0.5 / inverse, inverse),
@@ -46,10 +46,12 @@ def octant_slots(x: float, y: float, z: float, i: int, inverse: float, cells: ND
 @inline
 def nearest(x: float, y: float, z: float, i: int, slots: NDArray[np.int32], chosen: NDArray[np.int32], asked: Floats,
             planes: Floats) -> tuple[int, float, int, float]:  # fmt: skip
-    """Nearest plane and, without one, nearest blob among the slots of point i: slot or -1, and squared distance of its mean, m2.
+    """Nearest plane and nearest blob among the slots of point i: for each the slot, or -1, and its mean's squared distance, m2.
 
-    A point that has moved by less than half of what the second nearest is farther away still has the same nearest one:
-    `chosen` (S, 2) plane and blob, `asked` (S, 4) where, and within which distance that holds.
+    The nearest one stays the same while the point moves by less than half of the difference between the distances to the
+    second nearest and to the nearest one. The blob is kept up to date only without a plane.
+    chosen : (S, 2) plane and blob found last; asked : (S, 4) where the point was then, m, and the squared distance, m2, within
+        which they stay the same
     """
     best, blob = int(chosen[i, 0]), int(chosen[i, 1])
     best_d, blob_d = 1e300, 1e300
@@ -88,10 +90,11 @@ def nearest(x: float, y: float, z: float, i: int, slots: NDArray[np.int32], chos
 
 @inline
 def variance_of(p: Floats, off: float, d2: float) -> float:
-    """Variance, m2, of a plane voxel's surface, a row of `planes`, beneath a point.
+    """Variance, m2, of the surface of a plane voxel at the foot of a point.
 
-    Its thickness, and what the uncertainty of its normal makes of the way to the mean: the point is `off` from the plane and
-    the root of `d2` from the mean.
+    The sum of the variance along the normal and of the normal's uncertainty times the squared distance of the foot from the
+    mean.
+    p : (8,) row of `planes`; off : distance of the point from the plane, m; d2 : squared distance from the mean, m2
     """
     variance: float = p[6] + TILT * p[7] * (d2 - off * off)
     return variance
@@ -102,14 +105,15 @@ def linearise(points: tuple[Floats, Floats], voxels: Voxels, settings: Settings,
               width: Width, sums: Sums) -> None:  # fmt: skip
     """Add all source points (S, 3), LiDAR frame, with scatter (S, 6) around each, to H, g and facts, see `linearisation`.
 
-    Points that are done are left out, those that find a plane here become so: a coarser map can serve the rest.
+    Points that are matched already are skipped; points that are matched with a plane here are marked. A coarser map takes the
+    others.
 
     Each point takes the nearest plane voxel of the eight around it: residual n . (R s + t - mean), variance = map
     eigenvalue + source scatter along the normal + sigma2 + tilt at that distance from the mean, Geman-McClure weight of
-    width `scale`, times `plane_weight`. Without a plane the nearest blob stands in, point to point: its mean variance,
-    times `blob_weight`, and once more times `along` in the direction of the sensor's axis.
-    `away2` (S,) takes the squared distance of each matched point to its plane, or mean; those beyond `gate2` are
-    rejected: counted, without a say.
+    width `scale`, times `plane_weight`. Without a plane the residual is point to point to the nearest blob, with its mean
+    variance, times `blob_weight`, and times `along` in the direction of the sensor's axis.
+    `away2` (S,), m2, takes the squared distance of each matched point to its plane or mean. Points beyond `gate2` are
+    rejected: they count as matched and have no weight.
     """
     source, scatter = points
     planes, keys, table = voxels
@@ -142,7 +146,7 @@ def linearise(points: tuple[Floats, Floats], voxels: Voxels, settings: Settings,
                 facts[INLIERS] += 1.0
             if r * r > gate2:
                 continue
-            # The normal seen from the scan, to read the source scatter along it.
+            # The normal in the LiDAR frame, for the source scatter along it.
             lx = R[0, 0] * nx + R[1, 0] * ny + R[2, 0] * nz
             ly = R[0, 1] * nx + R[1, 1] * ny + R[2, 1] * nz
             lz = R[0, 2] * nx + R[1, 2] * ny + R[2, 2] * nz

@@ -14,14 +14,14 @@ _FULL = 2 * np.pi
 def follow(
     points: NDArray[np.float32], backward: float, tilt: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float32], NDArray[np.int64], float]:
-    """Follow the azimuth from point to point (N, 3).
+    """Follow the azimuth of points (N, 3) in the order in which they are stored.
 
-    backward : rad that the azimuth may go back before that counts as nearly a whole turn onwards
-    tilt : change of slope (tangent of elevation) from point to point that is a jump
+    backward : largest step of the azimuth, rad, against the sense of rotation; a larger one is nearly a whole turn forward
+    tilt : least change of slope (tangent of elevation) between two points that is a jump
 
-    Returns the angle turned up to each point (N,), rad, the slopes (N,), NaN for points that are none (zero, not finite; they
-    turn nothing), the points (J,) at which the slope jumps, and the share of steps that are small and in the sense of
-    turning, which is the sense of most.
+    Returns the angle turned up to each point (N,), rad; the slopes (N,), NaN for points that are zero or not finite, at which
+    the angle does not change; the indices (J,) of the points at which the slope jumps; and the share of small steps in the
+    sense of rotation, which is that of most steps.
     """
     n = points.shape[0]
     azimuth = np.empty(n, np.float32)
@@ -69,9 +69,9 @@ def follow(
 def cut(
     turned: NDArray[np.float64], slope: NDArray[np.float32], seam: float
 ) -> tuple[NDArray[np.uint16], NDArray[np.float64], NDArray[np.int64]]:
-    """Rings (N,), from 0, of points that turned so far (N,), rad: a new one each time the angle passes the `seam`.
+    """Ring (N,) of each point, counted from 0: a new ring begins whenever the angle `turned` (N,), rad, passes the `seam`, rad.
 
-    Also the mean slope (rings,) and the number (rings,) of the points of each that have one.
+    Returns also the mean slope (rings,) of each ring, and the number of its points with a slope (rings,).
     """
     n = turned.shape[0]
     rings = np.empty(n, np.uint16)

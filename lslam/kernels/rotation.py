@@ -58,7 +58,7 @@ def logarithm(R: Floats, out: Floats) -> None:
 
 @inline
 def straighten(R: Floats) -> None:
-    """R (3, 3) <- the nearest rotation, to what rounding moved off SO(3): one step of Newton, which squares the distance."""
+    """R (3, 3) <- the nearest rotation, for a matrix off SO(3) by rounding: one step of Newton, which squares the distance."""
     xx = R[0, 0] * R[0, 0] + R[1, 0] * R[1, 0] + R[2, 0] * R[2, 0]
     yy = R[0, 1] * R[0, 1] + R[1, 1] * R[1, 1] + R[2, 1] * R[2, 1]
     zz = R[0, 2] * R[0, 2] + R[1, 2] * R[1, 2] + R[2, 2] * R[2, 2]
@@ -90,7 +90,7 @@ def vector_between(A: Floats, B: Floats) -> Floats:
 
 @kernel
 def apart(A: Floats, B: Floats, lever: float) -> float:
-    """How far two poses (4, 4) are apart, m, rotation counted at a lever arm of so many metres."""
+    """Distance of two poses (4, 4), m, with the rotation between them times `lever`, m."""
     out = np.empty(3)
     _between(A, B, np.empty((3, 3)), out)
     move, turn = 0.0, 0.0

@@ -1,4 +1,4 @@
-"""Which points of one scan another scan sees through: range images and votes."""
+"""Points of one scan that beams of another scan pass through: range images and votes."""
 
 from __future__ import annotations
 
@@ -22,11 +22,12 @@ def _pixel(x: float, y: float, z: float, low: float, inverse: float, columns: in
 def nearest_ranges(
     points: NDArray[np.float32], stands: NDArray[np.bool_], rows: int, columns: int, low: float, inverse: float
 ) -> NDArray[np.float32]:
-    """(rows, columns, 3) of the nearest point (N, 3) of the sensor's frame in each pixel: range, height, and what is clear, m.
+    """Range image (rows, columns, 3) of points (N, 3), sensor frame: range, height and clear range of each pixel, m.
 
-    The range is inf where there is no point; the height, along the sensor's z, is NaN unless the point is ground. Clear is
-    the way to the nearest point in the pixel and the eight around it, and 0 where the row below is empty.
-    stands : (N,) whether it is not ground; low : elevation of the lowest row's lower edge, rad; inverse : rows per rad
+    The range is that of the nearest point, inf without one. The height, along the sensor's z, is that of the same point, NaN
+    unless it is ground. The clear range is the least range in the pixel and the eight around it, 0 where the row below is
+    empty.
+    stands : (N,) whether a point is off the ground; low : elevation of the lowest row's lower edge, rad; inverse : rows per rad
     """
     image = np.full((rows, columns, 3), np.float32(np.inf))
     image[:, :, 1] = np.nan
@@ -49,7 +50,7 @@ def nearest_ranges(
 
 @inline
 def _clear(image: NDArray[np.float32], row: int, column: int) -> np.float32:
-    """The nearest range in a pixel and those around it; 0 where the row below is empty."""
+    """Least range in a pixel and the eight around it, m; 0 where the row below is empty."""
     rows, columns = image.shape[:2]
     left = column - 1 if column > 0 else columns - 1
     right = column + 1 if column + 1 < columns else 0
@@ -75,15 +76,17 @@ def vote(
     free: NDArray[np.int16],
     hit: NDArray[np.int16],
 ) -> None:
-    """Count for each point whether the scan behind `image` looked through where it is, or saw something there.
+    """Count for each point whether the scan of `image` passed through its place or measured a surface there.
 
-    points : (N, 3) in their own frame, T : (4, 4) into the frame of the image
-    It is free when all that was measured in its pixel and the eight around it lies `margin` + `slope` r, m, behind it, and
-    the row below is not empty: neither the edge of a thing nor ground met at a grazing angle is taken for free then. Ground
-    as far away as the point is says that something was there only within `step` of that in height: a foot is not what it
-    stands on.
-    left : images still to come, this one included; a point that more than so many of those before saw than looked through
-        is not asked again, as more of them saw it whatever the rest say
+    It passed through, counted in `free` (N,), when all ranges in the point's pixel and the eight around it are larger than the
+    point's by the tolerance, and the row below is not empty. So edges of objects and ground at grazing angles are not free.
+    It measured a surface, counted in `hit` (N,), when the range of the pixel differs by the tolerance at most. Ground does so
+    only when its height differs by `step` times the tolerance at most: it does not confirm the foot of an object.
+
+    points : (N, 3), m, in their own frame; T : (4, 4) from there to the frame of the image
+    margin, slope : the tolerance is `margin` + `slope` r, m, for a point at range r
+    left : number of images still to come, this one included; a point with more hits than that above its free counts is
+        skipped, since its majority is decided
     """
     rows, columns = image.shape[:2]
     for i in range(len(points)):

@@ -1,6 +1,6 @@
-"""Walls as line segments: points whose surroundings are an upright plane, flattened, and lines through them by RANSAC.
+"""Walls as line segments: points whose neighbourhood is a vertical plane, projected to the ground, and lines by RANSAC.
 
-A row of `flat` (M, 5) float64 stands for the wall points above one another: x, y, the horizontal unit normal, their number.
+A row of `flat` (M, 5) float64 is one column of wall points: x, y, m, their horizontal unit normal, their number.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ Ints = NDArray[np.int32]
 def upright_plane(
     ix: int, iy: int, iz: int, table: Ints, keys: Longs, sums: Floats, tilt: float, thickness: float
 ) -> tuple[float, float]:
-    """Horizontal unit normal of the points in the eight cells about a corner of the lattice; 0, 0 when they are no wall."""
+    """Horizontal unit normal of the points in the eight cells about a corner of the lattice; 0, 0 where they are no wall."""
     n = sx = sy = sz = xx = xy = xz = yy = yz = zz = 0.0
     for a in range(2):
         for b in range(2):
@@ -48,7 +48,7 @@ def upright_plane(
     l0, l1, _, nx, ny, nz = plane_of(
         xx * w - mx * mx, xy * w - mx * my, xz * w - mx * mz, yy * w - my * my, yz * w - my * mz, zz * w - mz * mz
     )
-    # The second axis decides how well the normal is known: points of one ring lie on a line, whatever the wall does.
+    # The second eigenvalue decides how well the normal is known: points of one ring lie on a line on every surface.
     if abs(nz) > tilt or l0 > thickness * thickness or l1 < 6.0 * l0 or l1 < 4.0 * thickness * thickness:
         return 0.0, 0.0
     length = math.sqrt(nx * nx + ny * ny)
@@ -59,12 +59,13 @@ def upright_plane(
 def flat_walls(
     points: NDArray[np.float32], kept: Longs, cell: float, tilt: float, thickness: float, thin: float
 ) -> tuple[Floats, Floats]:
-    """`flat` of the points `kept` (K,) of (N, 3), m: those whose surroundings are an upright plane, one row per `thin` m.
+    """Rows of `flat` (M, 5) for the points on vertical planes, one row per cell of `thin`, m; and all points thinned likewise.
 
-    And every point kept, (L, 3): x, y, number, thinned in the same way.
+    points : (N, 3), m; kept : (K,) indices of the points that are used
+    cell : m; the neighbourhood of a point is the eight cells about the nearest corner of their lattice
+    tilt : largest vertical component of the unit normal; thickness : largest standard deviation across the plane, m
 
-    The surroundings are the eight cells of `cell` m about the corner of their lattice next to the point; `tilt` is the
-    largest vertical part of the normal, `thickness` the largest standard deviation across the plane, m.
+    The second result (L, 3) has x, y and number of the points in each cell.
     """
     n = len(kept)
     entries = table_size(n)
@@ -129,7 +130,7 @@ def flat_walls(
         if nx == 0.0 and ny == 0.0:
             continue
         f = flat[row]
-        # A normal and its opposite are one wall.
+        # Opposite normals describe one plane.
         sign = -1.0 if f[2] * nx + f[3] * ny < 0.0 else 1.0
         f[0] += x
         f[1] += y
@@ -151,7 +152,7 @@ def flat_walls(
 
 @inline
 def best_line(flat: Floats, tries: Longs, first: int, tolerance: float, agreement: float) -> int:
-    """Which row, of those tried, has most points near the line through it and along it, with normals like its own."""
+    """Row whose line, through its position and across its normal, has most points, among the rows that are tried."""
     best, best_score = -1, -1.0
     for t in range(tries.shape[1]):
         k = tries[first, t] % len(flat)
@@ -170,10 +171,10 @@ def best_line(flat: Floats, tries: Longs, first: int, tolerance: float, agreemen
 def heaviest_run(
     flat: Floats, line: Floats, tolerance: float, agreement: float, gap: float, bins: Floats
 ) -> tuple[float, float, float]:
-    """The stretch of a line (x, y, nx, ny) with most points and no gap: from, to, m along it, and its points.
+    """Begin and end, m along a line (x, y, nx, ny), of its stretch without a gap that has most points, and their number.
 
-    `bins` (B, 3), lowest, highest and points of each metre, is room to work in: sorting would take longer to compile than
-    everything else here.
+    bins : (B, 3) workspace: lowest and highest position, m, and number of points in each interval of `gap`, m; a sort would
+        take longer to compile than the rest of this module
     """
     half = len(bins) // 2
     for i in range(len(bins)):
@@ -205,9 +206,9 @@ def heaviest_run(
 def reach_out(
     every: Floats, line: Floats, low: float, high: float, tolerance: float, step: float
 ) -> tuple[float, float]:
-    """The stretch of a line, longer by what of `every` (L, 3) lies on it at most `step` m beyond an end.
+    """Begin and end, m, of a stretch of a line, extended by points of `every` (L, 3) at most `step`, m, beyond an end.
 
-    Next to a corner the surroundings of a point are two walls and no plane: its points do not begin a wall, but end it.
+    Near a corner the neighbourhood of a point is two walls and no plane. Such points do not begin a segment, but extend it.
     """
     new_low, new_high = low, high
     for j in range(len(every)):
@@ -223,7 +224,7 @@ def reach_out(
 
 @inline
 def refit(flat: Floats, line: Floats, low: float, high: float, tolerance: float, agreement: float) -> float:
-    """Move `line` in place to the total least squares line of its points between `low` and `high`; their rms, m."""
+    """Replace `line` (4,) by the total least squares line of its points between `low` and `high`, m; returns their rms, m."""
     n = sx = sy = xx = xy = yy = 0.0
     for j in range(len(flat)):
         f = flat[j]
@@ -243,7 +244,7 @@ def refit(flat: Floats, line: Floats, low: float, high: float, tolerance: float,
         return 0.0
     mx, my = sx / n, sy / n
     xx, xy, yy = xx / n - mx * mx, xy / n - mx * my, yy / n - my * my
-    # The normal is the short axis of the scatter.
+    # The normal is the short axis of the covariance.
     angle = 0.5 * math.atan2(2.0 * xy, xx - yy)
     nx, ny = -math.sin(angle), math.cos(angle)
     if nx * line[2] + ny * line[3] < 0.0:
@@ -266,11 +267,11 @@ def find_segments(
     min_length: float,
     step: float,
 ) -> Floats:
-    """Segments (S, 6) through `flat`, most points first found: x y of both ends, number of points, their rms, m.
+    """Segments (S, 6) through `flat` (M, 5), those of most points first: x, y of both ends, number of points, their rms; m.
 
-    Del Tufo, algorithm 3.1: the best of a few lines, the largest cluster of its inliers, a segment between its extreme
-    projections; the cluster is taken away and the next line sought, until fewer than `min_cluster` points are left or no
-    row of random numbers `tries` (R, K) is. A line is tried through one point along its own plane, not through two.
+    Del Tufo, algorithm 3.1: RANSAC finds the best of a few lines, and the segment spans the largest cluster of its inliers,
+    which is then removed. This repeats until fewer than `min_cluster` points or no row of random numbers `tries` (R, K) is
+    left. A hypothesis is one point with its own normal, not two points.
     """
     flat = flat.copy()
     found = np.empty((len(tries), 6))
@@ -311,6 +312,6 @@ def find_segments(
                     flat[kept, i] = flat[j, i]
                 kept += 1
         if kept == len(flat):
-            kept -= 1  # a line that lost all its points in the fit: drop one, so that the search ends
+            kept -= 1  # no point is left on the line after the fit: remove one, so that the search ends
         flat = flat[:kept]
     return found[:count]

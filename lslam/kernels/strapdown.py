@@ -1,4 +1,4 @@
-"""The loops of strapdown integration: rates to rotations, forces to velocities and positions, sample by sample."""
+"""Strapdown integration: angular rates to rotations, specific forces to velocities and positions, sample by sample."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ def integrate(
 ) -> tuple[Floats, Floats, Floats, Floats, Floats]:  # fmt: skip
     """Rotations, velocities, positions, velocity arms and position arms at `instants_ns` (K,), as in `Increments`.
 
-    stamps_ns (N,), gyro and accel (N, 3), N >= 1 : the samples; s : number of the first one after the first instant
+    stamps_ns (N,), gyro (N, 3), rad/s, accel (N, 3), m/s2, N >= 1 : the samples; s : index of the first one after instant 0
     gyro_bias, accel_bias (3,), gyro_axes (3, 3) : rates are gyro_axes (gyro - gyro_bias)
-    From each instant or sample to the next the readings are those in their middle, so that the sums are the same however
-    the instants lie.
+    Midpoint rule: between two neighbours among samples and instants the reading is the one in the middle, so that the sums do
+    not depend on where the instants lie.
     """
     count = len(instants_ns)
     rotations, velocity_arms, position_arms = np.empty((count, 3, 3)), np.empty((count, 3, 3)), np.empty((count, 3, 3))
@@ -66,9 +66,9 @@ def integrate(
 def _readings(
     stamps_ns: NDArray[np.int64], values: Floats, s: int, now: int, then: int, bias: Floats, out: Floats
 ) -> None:
-    """out (3,) <- the readings less their bias between two instants, of which no sample lies within; `s` is the next one.
+    """out (3,) <- mean reading less the bias between two instants, with no sample between them; `s` is the next sample.
 
-    Linear between the samples, constant beyond the first and the last.
+    Linear between samples, constant before the first and after the last.
     """
     if s == 0 or s == len(stamps_ns):
         k = min(s, len(stamps_ns) - 1)
@@ -121,7 +121,7 @@ def poses(
 
 @kernel
 def overlaps(stretches: NDArray[np.int64], begin: int, end: int) -> bool:
-    """Whether one of the `stretches` (G, 2), begin and end, has more than an instant in common with another."""
+    """Whether one of the `stretches` (G, 2) of time overlaps the one from `begin` to `end` by more than an instant."""
     found = False
     for k in range(len(stretches)):
         found |= stretches[k, 0] < end and stretches[k, 1] > begin

@@ -1,8 +1,8 @@
-"""What the surfaces alone observe, beside residuals whose matrices are full.
+"""The information of the surfaces' normals alone, for residuals with full information matrices.
 
-A Gaussian of a plane voxel also holds a point to where in the plane the voxel's points happen to be. That is little for
-each point, but it is all there is along a corridor, and it draws the sensor back to where the map was made. So the
-directions that no normal observes are found without it, and along them the motion prior stays.
+The Gaussian of a plane voxel also has information within the plane, about the positions of the voxel's points. It is small, but
+it is the only information along a corridor, and it pulls the pose towards where the map was measured. So degenerate directions
+are found without it, and the pose keeps the motion prior along them.
 """
 
 from __future__ import annotations
@@ -38,9 +38,9 @@ def thin_information(p: Floats, xx: float, xy: float, xz: float, yy: float, yz: 
 @inline_with_arrays
 def solve_on_surfaces(H: Floats, S: Floats, g: Floats, facts: Floats, weak_share: float, least: float, d: Floats,
                       weak: Floats) -> int:  # fmt: skip
-    """As `gauss_newton.solve_observed`, with S deciding by its share which directions are observed: d solves H there.
+    """As `gauss_newton.solve_observed`, with the observed directions by the share of S; d solves H in them.
 
-    `least` is asked of H. Both matrices are whole, not triangles.
+    `least` applies to H. Both matrices are full, not triangles.
     """
     lever = math.sqrt(max(facts[LEVER] / max(facts[INFORMATION], 1e-300), 1e-6))
     needed = weak_share * (S[0, 0] + S[1, 1] + S[2, 2])

@@ -25,10 +25,10 @@ def transform(points: NDArray[np.float32], T: NDArray[np.float64], moved: NDArra
 def deskew(
     points: Any, times: NDArray[np.float32], start: float, step: float, knots: NDArray[np.float64], moved: Any
 ) -> None:
-    """Write points (N, 3) at `times` (N,), s, into `moved` (N, 3) as the pose `knots` carries them.
+    """Write points (N, 3), m, transformed by the pose at their times (N,), s, to `moved` (N, 3).
 
-    knots : (K, 3, 4) transforms at start, start + step, ...; between two of them the matrices are blended, before the
-    first and after the last the outer pair is continued.
+    knots : (K, 3, 4) transforms at start, start + step, ..., s. Matrices are interpolated linearly between two knots, and
+        extrapolated from the outer pair before the first and after the last one.
     """
     last = len(knots) - 2
     for i in range(len(points)):

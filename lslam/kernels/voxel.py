@@ -14,7 +14,7 @@ from lslam.kernels.linalg import extent
 
 OFFSET = 1 << 20
 MASK = (1 << 21) - 1
-# Points that are looked up together in a table larger than the nearest caches.
+# Number of points that are looked up together in a table larger than the processor's caches.
 AHEAD = 64
 
 
@@ -104,7 +104,7 @@ def count_within(points: NDArray[np.float32], limit: float) -> int:
 
 @kernel
 def take(points: NDArray[np.float32], index: NDArray[np.int64]) -> NDArray[np.float32]:
-    """points[index], (K, 3): a tenth of the time that NumPy takes for it."""
+    """points[index], (K, 3), in a tenth of the time of NumPy."""
     out = np.empty((len(index), 3), np.float32)
     for k in range(len(index)):
         i = index[k]
@@ -114,7 +114,7 @@ def take(points: NDArray[np.float32], index: NDArray[np.int64]) -> NDArray[np.fl
 
 @inline
 def place_of(key: int, keys: NDArray[np.int64], table: NDArray[np.int32]) -> int:
-    """Where in an open-addressed table of slots a key stands, or the free place where it belongs."""
+    """Position of a key in an open-addressed table of slots, or the free position for it."""
     mask = len(table) - 1
     h = hash_key(key, mask)
     while table[h] >= 0 and keys[table[h]] != key:
@@ -138,9 +138,9 @@ def centroids(
     """One centroid per voxel in order of first appearance: (M, 3) float32, mean time (M,), scatter (M, 6), count (M,).
 
     The scatter is the covariance xx, xy, xz, yy, yz, zz of the voxel's points, m2. Sums run relative to the first point
-    of the voxel, so float32 input keeps its digits. `times` (N,) may be empty, then the mean times are. Points of the
-    first and of the second half of the sweep never share a centroid: where the sweep closes they lie side by side, but
-    the sensor has moved in between.
+    of the voxel, so float32 input keeps its digits. `times` (N,) may be empty, and the mean times are empty then. Points of
+    the first and of the second half of the sweep never share a centroid: they meet where the sweep closes, and the sensor has
+    moved in between.
     """
     n = len(points)
     table = np.empty(table_size(n), np.int32)
@@ -276,11 +276,12 @@ def means(
 def accompanied(
     points: NDArray[np.float32], counts: NDArray[np.int32], least: float, size: float, least_around: float, one_in: int
 ) -> tuple[NDArray[np.int64], int]:
-    """Indices of the points (N, 3) whose count times range reaches `least`, and that of their voxel `least_around`.
+    """Indices of the points (N, 3) whose count times range reaches `least`, and whose voxel's count reaches `least_around`.
 
-    counts : (N,), what each point stands for; a voxel's is the sum over those of its points that reach `least`
-    one_in : a power of two; of so many voxels one is looked at, the hash of its key chooses
-    Returns also how many points lie in the voxels that were looked at.
+    counts : (N,) number of returns that each point averages; a voxel's count is the sum over its points that reach `least`
+    least, least_around : m, counts times the range of the point
+    one_in : a power of two; one in so many voxels, chosen by the hash of its key, is examined
+    Returns also the number of points in the voxels examined.
     """
     n = len(points)
     table = np.empty(table_size(n), np.int32)

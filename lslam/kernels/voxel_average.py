@@ -1,8 +1,8 @@
 """Voxel averages of transformed scans: an open-addressing hash of packed voxel indices over rows of integer sums.
 
 A row is (key, sum x, sum y, sum z, count) and perhaps (sum of intensities), int64. The sums are offsets from the voxel's
-centre in units of voxel / 2**24, and intensities in units of 2**-20, so they are exact whatever the coordinates and equal
-for any order of the points; rows of one voxel that were summed apart are simply added.
+centre in units of voxel / 2**24, and intensities in units of 2**-20. So they are exact for all coordinates and equal for any
+order of the points, and rows of one voxel that were summed separately can be added.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ def slot_of(key: int, mask: int) -> int:
 
 @inline
 def row_of(key: int, slots: NDArray[np.int32], rows: NDArray[np.int64], used: int) -> int:
-    """Row of a key; `used` when it has none yet: entered in `slots` then, the key written, the other columns not.
+    """Row of a key; a new one, number `used`, for a key that has none: it is entered in `slots`, with the key alone written.
 
     slots : (S,) row of each hash slot or -1, S a power of two above `used`; rows : (R, k), R > `used`
     """
@@ -137,14 +137,14 @@ def accumulate(
             offsets[count, 1] = np.int64(np.rint((y - fy - 0.5) * UNITS))
             offsets[count, 2] = np.int64(np.rint((z - fz - 0.5) * UNITS))
             count += 1
-        # The table and the rows are far larger than any cache: no branch waits for one of them while others could be fetched.
+        # Table and rows are far larger than the processor's caches: a batch of rows is fetched before a branch depends on one.
         for k in range(count):
             likely[k] = slots[slot_of(keys[k], mask)]
         for k in range(count):
             if rows[max(likely[k], 0), 0] != keys[k]:
                 likely[k] = -1
         for k in range(count):
-            # Neighbouring points of a ring mostly fall into one voxel: the table is not asked again.
+            # Neighbouring points of a ring mostly share a voxel, which is then not looked up again.
             if keys[k] != last_key:
                 row = likely[k]
                 if row < 0:

@@ -1,4 +1,4 @@
-"""Matching of directed segments on a plane: corners, the poses they propose, how well a pose fits, and its refinement.
+"""Matching of directed segments in the plane: corners, votes of their pairs for a pose, score of a pose, and its refinement.
 
 A segment is a row x y x y of (N, 4) float64, m. A corner is a row of (E, 5): x, y, the directions of its two walls, rad, the
 second to the left of the first, and its weight. A pose is x, y, yaw of the source's frame in the target's.
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from lslam.kernels.jit import inline, inline_with_arrays, kernel
 
-STAYS, STAYS_RAD = 0.002, 0.0001  # m and rad; a pose that moves less in one step stays: far below what a map is worth
+STAYS, STAYS_RAD = 0.002, 0.0001  # m and rad; a smaller step ends the iteration: far below the accuracy of a map
 
 Floats = NDArray[np.float64]
 Longs = NDArray[np.int64]
@@ -29,8 +29,8 @@ def wrapped(angle: float) -> float:
 def corners(segments: Floats, reach: float, sharpest: float) -> Floats:
     """Corners of all pairs of segments (N, 4) that meet at `sharpest` rad or more, at most `reach` m beyond their ends.
 
-    Angular edges have a common end, virtual edges have none (Del Tufo, section 3.3.1): the weight is the shorter of
-    both lengths, less the farther the walls have to be produced.
+    The walls of an angular edge meet, those of a virtual edge meet when extended (Del Tufo, section 3.3.1). The weight is the
+    shorter of both lengths, and decreases with the distance by which the walls are extended.
     """
     n = len(segments)
     found = np.empty((n * (n - 1) // 2, 5))
@@ -63,10 +63,10 @@ def corners(segments: Floats, reach: float, sharpest: float) -> Floats:
 
 @kernel
 def votes(source: Floats, target: Floats, prior: Floats, window: Floats, cell: Floats, spread: float) -> Floats:
-    """Sum of weights (X, Y, A, 4) of the poses that pairs of corners propose, and their weighted sums of x, y, yaw.
+    """Votes (X, Y, A, 4) of pairs of corners for poses: sum of weights, and weighted sums of x, y, m, and yaw, rad.
 
-    Poses are counted from `prior` in cells of `cell` (3,) within `window` (3,), m, m, rad; the two walls of a pair may
-    disagree by `spread` rad.
+    Poses lie within `window` (3,), m, m, rad, of `prior`, in cells of `cell` (3,). The angles of the two corners of a pair
+    differ by `spread`, rad, at most.
     """
     nx, ny = int(2.0 * window[0] / cell[0]) + 1, int(2.0 * window[1] / cell[1]) + 1
     na = int(2.0 * window[2] / cell[2]) + 1
@@ -99,9 +99,9 @@ def votes(source: Floats, target: Floats, prior: Floats, window: Floats, cell: F
 
 @kernel
 def peaks(grid: Floats, prior: Floats, count: int, is_round: bool) -> Floats:
-    """Poses (K, 3) of the at most `count` heaviest cells of `votes` that are the heaviest among their neighbours.
+    """Poses (K, 3) of the local maxima of `votes`, at most `count` of them, those of largest weight first.
 
-    `is_round` says that the first and the last cell of yaw are neighbours.
+    is_round : whether the first and the last cell of yaw are neighbours
     """
     nx, ny, na = grid.shape[0], grid.shape[1], grid.shape[2]
     best = np.zeros((count, 5))
@@ -124,7 +124,7 @@ def peaks(grid: Floats, prior: Floats, count: int, is_round: bool) -> Floats:
                             total += g[0]
                             sx += g[1]
                             sy += g[2]
-                            # Over the seam the sums count from the other side.
+                            # Across the seam of yaw the sums are off by a whole turn.
                             sa += g[3] + g[0] * 2.0 * math.pi * ((d >= na) - (d < 0))
                 if not is_peak:
                     continue
@@ -148,7 +148,7 @@ def peaks(grid: Floats, prior: Floats, count: int, is_round: bool) -> Floats:
 
 @inline
 def moved(segment: Floats, pose: Floats) -> tuple[float, float, float, float]:
-    """A segment at a pose."""
+    """End points x y x y, m, of a segment that is moved by a pose."""
     c, s = math.cos(pose[2]), math.sin(pose[2])
     return (
         pose[0] + c * segment[0] - s * segment[1],
@@ -162,11 +162,11 @@ def moved(segment: Floats, pose: Floats) -> tuple[float, float, float, float]:
 def line_distance(
     ax: float, ay: float, bx: float, by: float, target: Floats, farthest: float, likeness: float, by_coverage: bool
 ) -> tuple[float, float]:
-    """Distance of the segment a b to a target one, m, and how much of it is covered, m; `farthest`, 0 when they are no pair.
+    """Distance of the segment a b from a target segment, m, and the length covered by it, m; `farthest` and 0 for no pair.
 
-    Del Tufo, section 3.3.4 and figure 3.8. Without coverage: mean distance of both ends from the target, beyond its
-    ends from the end. With coverage: mean distance from its line where the two lie side by side. `likeness` is the least
-    cosine between the directions: a wall seen from outside is no wall seen from inside.
+    Del Tufo, section 3.3.4 and figure 3.8. Without coverage: mean distance of both ends from the target segment. With
+    coverage: mean distance from the target's line over the part where both lie side by side.
+    likeness : least cosine between the directions; outside and inside of a wall have opposite directions
     """
     ux, uy = target[2] - target[0], target[3] - target[1]
     lu, lv = math.hypot(ux, uy), math.hypot(bx - ax, by - ay)
@@ -193,9 +193,9 @@ def line_distance(
 def fit(
     source: Floats, target: Floats, pose: Floats, farthest: float, likeness: float, by_coverage: bool
 ) -> tuple[float, float, Longs]:
-    """Mean distance, m, of the source at `pose` from the target, the covered share of its length, and the pairs.
+    """Mean distance, m, of the source (S, 4) at `pose` from the target, the covered share of its length, and the pairs (S,).
 
-    Long walls count more than short ones; a wall without a pair counts as `farthest`. The pair (S,) of each is -1 then.
+    The mean is weighted by length. A wall without a partner has the distance `farthest`, m, and pair -1.
     """
     distance = covered = total = 0.0
     pair = np.full(len(source), -1, np.int64)
@@ -218,13 +218,13 @@ def refine(
     source: Floats, target: Floats, pose: Floats, prior: Floats, trust: Floats, gates: Floats, more: int, likeness: float,
     short: float, by_coverage: bool,
 ) -> tuple[Floats, Floats, Floats, float, Longs]:  # fmt: skip
-    """Gauss-Newton of the walls' distances across their partners' lines, from `pose`, pairs anew with each of `gates`, m.
+    """Gauss-Newton from `pose` on the distances of walls from their partners' lines; new pairs for each of the `gates`, m.
 
-    The last of them is repeated until the pose stays, but at most `more` times: walls with half weight converge slowly.
-    Every wall is one measurement of an offset and an angle: two points at +- length / sqrt(12) about its middle, weighted
-    length / (length + short), downweighted as Geman and McClure do. `trust` (3,), the inverse variances about `prior` in units
-    of a wall's, keeps what no wall says. Returns the pose, the normal matrix of the walls alone about their centre, the
-    centre, the weighted rms of the distances, m, and the pairs of the last round.
+    The last gate is repeated until the pose converges, `more` times at most: walls with half weight converge slowly.
+    Every wall is one measurement of an offset and an angle: two points at +- length / sqrt(12) about its middle, weighted by
+    length / (length + short) and by the Geman-McClure weight. `trust` (3,), the inverse variances of `prior` relative to that
+    of a wall, decides along free directions. Returns the pose (3,), the normal matrix (3, 3) of the walls alone about their
+    centre, the centre (2,), m, the weighted rms of the distances, m, and the pairs (S,) of the last iteration.
     """
     pose = pose.copy()
     normal = np.zeros((3, 3))
@@ -288,9 +288,9 @@ def refine(
 
 @inline_with_arrays
 def damped_step(normal: Floats, gradient: Floats, trust: Floats, pose: Floats, prior: Floats, centre: Floats) -> Floats:
-    """Solve the normal equations with the prior added; x, y of the walls' centre and yaw."""
+    """Solution (3,) of the normal equations with the prior added: step of the walls' centre in x, y, m, and of yaw, rad."""
     arm_x, arm_y = pose[0] - centre[0], pose[1] - centre[1]
-    # How the pose's own x, y, yaw move with the centre's: the prior speaks of the pose.
+    # Jacobian of the pose by the centre's x, y and yaw: the prior is one of the pose.
     jacobian = np.eye(3)
     jacobian[0, 2], jacobian[1, 2] = -arm_y, arm_x
     away = np.array([pose[0] - prior[0], pose[1] - prior[1], wrapped(pose[2] - prior[2])])
