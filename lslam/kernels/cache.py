@@ -1,5 +1,4 @@
-"""Folders for files that can be made again. Their machine code is run and its index unpickled: only the user may write there.
-"""
+"""Folders for files that can be made again. Machine code from them is executed: only the user may write there."""
 
 from __future__ import annotations
 
