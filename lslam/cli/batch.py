@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from lslam.studies.output import OutputOptions
     from lslam.types.study import StudyRow
 
-# What a line may not say, because the batch does.
+# Options of `lslam run` that belong to the whole batch.
 _OF_THE_BATCH = ("resume", "overwrite", "dry_run", "as_json")
 
 
@@ -84,7 +84,7 @@ def _expanded(path: Path, output: OutputOptions, given: dict[str, Any]) -> Expan
 
 
 def _line(number: int, words: list[str], given: dict[str, Any]) -> RunLine:
-    """One `lslam run`, understood as that command does; raises what it raises, naming the line."""
+    """The run of one line, parsed as by `lslam run`; raises the errors of that command with the number of the line."""
     from lslam.cli.run import command as run_command
     from lslam.cli.run import opened_with, read_truth, resolved
     from lslam.readers.lookup import find_folder
@@ -119,7 +119,7 @@ def _print(rows: list[StudyRow]) -> None:
 
 
 def _judge(rows: list[StudyRow], is_strict: bool) -> None:
-    """The exit code."""
+    """Raise RunFailedError when a run failed, and GateError with --strict when one was degraded."""
     failed = [row for row in rows if not row.is_usable]
     if failed:
         raise RunFailedError(

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 )  # fmt: skip
 @options.preset
 @click.option(
-    "--seeds", default="0", show_default=True, metavar="N,N,...", help="Of simulations, and of methods that draw."
+    "--seeds", default="0", show_default=True, metavar="N,N,...", help="Seeds of simulations and of random methods."
 )
 @click.option(
     "--imu",
@@ -67,7 +67,7 @@ if TYPE_CHECKING:
 @options.as_json
 @options.verbosity
 def command(sequences: tuple[str, ...], **given: Any) -> None:
-    """Run methods on the same sequences, one table and one page for all.
+    """Run methods on the same sequences and write one table and one page about all of them.
 
     SEQUENCE is what `lslam run` takes, or a scenario of `lslam simulate --list`, which is simulated once per seed.
     """
@@ -90,7 +90,7 @@ def command(sequences: tuple[str, ...], **given: Any) -> None:
 
 
 def _plan(sequences: tuple[str, ...], given: dict[str, Any]) -> Plan:
-    """What is compared; what is cheap to see is seen before anything heavy is imported."""
+    """The comparison that the options describe. They are checked as far as possible before heavy imports."""
     from lslam.studies.output import COMPARISON, require_free
     from lslam.studies.plan import Plan, check_numbers
 

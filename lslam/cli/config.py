@@ -22,7 +22,7 @@ def command() -> None:
 @command.command(epilog="Example: lslam config show --preset thesis-icp --set map.voxel=0.1")
 @options.preset
 @options.configuration
-@click.option("--describe", is_flag=True, help="Say beside each key what it means.")
+@click.option("--describe", is_flag=True, help="Explain each key in a comment.")
 def show(config_file: Path | None, preset: str | None, settings: tuple[str, ...], describe: bool) -> None:
     """Print the resolved configuration as TOML."""
     from lslam.config import load_config, to_described_toml, to_toml

@@ -1,4 +1,4 @@
-"""Everything a person sees besides results: log and progress on stderr, coloured on a terminal, sparse lines elsewhere."""
+"""Log and progress on stderr, in colour on a terminal and as few plain lines elsewhere; results on stdout."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ log = logging.getLogger("lslam")
 
 
 def setup_logging(verbose: bool = False, quiet: bool = False) -> None:
-    """Send lslam's log to stderr; a run's log.txt listens to the same logger and keeps more than `quiet` shows."""
+    """Send lslam's log to stderr. The log.txt of a run is written by another handler, which `quiet` does not limit."""
     handler: logging.Handler
     if sys.stderr.isatty():
         from rich.logging import RichHandler
@@ -32,20 +32,20 @@ def setup_logging(verbose: bool = False, quiet: bool = False) -> None:
     log.handlers[:] = [handler]
     log.setLevel(logging.DEBUG if verbose else logging.INFO)
     log.propagate = False
-    # A terminal or pipe that goes away must not end a run of hours with tracebacks of the log.
+    # A terminal or pipe that is closed during a run must not cause tracebacks of the log.
     logging.raiseExceptions = False
 
 
 @cache
 def terminal() -> Console:
-    """One console for log and bar, so that a warning does not tear the bar apart."""
+    """The console that log and progress bar share, so that a line of the log does not break the bar."""
     from rich.console import Console
 
     return Console(stderr=True)
 
 
 def show(text: str) -> None:
-    """Results on stdout. A reader that has left (`lslam ... | head`) has seen what it wanted: the rest goes nowhere."""
+    """Write results to stdout. When its reader has closed the pipe (`lslam ... | head`), the rest is discarded."""
     import click
 
     try:
@@ -55,12 +55,12 @@ def show(text: str) -> None:
 
 
 def leave_stdout() -> None:
-    """Nobody reads our stdout any more: what is still written, also at exit, must not fail."""
+    """Redirect stdout to the null device after its pipe was closed, so that later writes, also at exit, do not fail."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 class Advance(Protocol):
-    """Called after each unit of work with what to show beside the bar."""
+    """Callback after each unit of work; `note` is shown beside the bar."""
 
     def __call__(self, note: str = "") -> None:
         """One unit is done."""
@@ -70,7 +70,7 @@ class Advance(Protocol):
 @contextmanager
 def progress(title: str, total: int, unit: str = "scans") -> Iterator[Advance]:
     """A progress bar with rate and ETA on a terminal; elsewhere a plain line at most every 10 s and one at the end."""
-    # The first handler is the screen's; log.txt listens behind it.
+    # The first handler is that of stderr; that of log.txt follows.
     if log.handlers and log.handlers[0].level > logging.INFO:
         yield lambda note="": None
         return

@@ -31,20 +31,22 @@ Examples:
     "--to", "kind", required=True, type=click.Choice(list(dict.fromkeys(SEQUENCES + WRITTEN))),
     help="bag is ROS 1, mcap and sqlite are ROS 2; tum and euroc are for trajectories, kitti for both.",
 )  # fmt: skip
-@click.option("--out", required=True, type=click.Path(path_type=Path), metavar="PATH", help="What is written.")
-@click.option("--overwrite", is_flag=True, help="Replace what is there.")
+@click.option("--out", required=True, type=click.Path(path_type=Path), metavar="PATH", help="File or folder to write.")
+@click.option("--overwrite", is_flag=True, help="Replace an existing PATH.")
 @click.option("--zstd", "is_zstd", is_flag=True, help="Compress (mcap, sqlite).")
 @click.option(
     "--deskewed",
     type=click.Path(path_type=Path),
     metavar="RUN|TRAJ",
-    help="Take the motion of this run out of the scans.",
+    help="Deskew the scans by the trajectory of this run.",
 )
 @options.scan_range
 @click.option(
     "--frame", metavar="BODY", help="Trajectory: lidar, cam0 or imu [default: what the format usually holds]."
 )
-@click.option("--from-frame", metavar="BODY", help="Trajectory: whose poses SOURCE holds, where it does not say.")
+@click.option(
+    "--from-frame", metavar="BODY", help="Trajectory: body of SOURCE's poses, where the file does not name it."
+)
 @click.option("--calib", type=click.Path(path_type=Path), metavar="FILE", help="Trajectory: KITTI calibration with Tr.")
 @click.option("--times", type=click.Path(path_type=Path), metavar="FILE", help="Trajectory: stamps of a KITTI file.")
 @options.reading
@@ -53,7 +55,7 @@ Examples:
 def command(source: str, kind: str, out: Path, **given: Any) -> None:
     """Convert SOURCE, a sequence (path or name) or a trajectory (file or run folder).
 
-    Points, per-point times, rings, IMU, fixes, extrinsics and ground truth go along; what was written reads back the same.
+    Points, per-point times, rings, IMU, fixes, extrinsics and ground truth are converted; the result reads as the same sequence.
     """
     from lslam.cli.console import setup_logging
 
@@ -65,7 +67,7 @@ def command(source: str, kind: str, out: Path, **given: Any) -> None:
 
 
 def _is_trajectory(source: str) -> bool:
-    """A run folder, or a file that is no bag."""
+    """Whether `source` is a run folder, or a file that is no bag."""
     from lslam.formats.bag_listing import list_bag_files
 
     path = Path(source).expanduser()
@@ -124,7 +126,7 @@ def _convert_trajectory(source: str, kind: str, out: Path, given: dict[str, Any]
 
 
 def _read_trajectory(source: str, kind: str, given: dict[str, Any]) -> tuple[Trajectory, Calibration]:
-    """The file, or the ground truth of a sequence, and what is known of the bodies."""
+    """The trajectory of the file, or the ground truth of the sequence, and the calibration between the bodies."""
     from lslam.errors import InputError
     from lslam.formats.calibration_files import read_cam0_lidar, read_transform
     from lslam.formats.trajectory_files import read_trajectory

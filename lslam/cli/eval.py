@@ -101,7 +101,7 @@ def command(
 
 
 def _flags(given: dict[str, Any]) -> dict[str, Any]:
-    """What the flags set in section `eval`, by key; raises UsageError for words that mean nothing."""
+    """Values of the flags by key of section `eval`; raises UsageError for unknown words."""
     align = [name for text in given["align"] for name in text.split(",") if name]
     for name in align:
         if name not in ALIGNMENTS:
@@ -122,7 +122,7 @@ def _flags(given: dict[str, Any]) -> dict[str, Any]:
 
 
 def _config(given: dict[str, Any], flags: dict[str, Any]) -> EvalConfig:
-    """Section `eval` with the flags over it."""
+    """Section `eval` of the configuration, overridden by the flags."""
     from pydantic import ValidationError
 
     from lslam.config import load_config
@@ -162,7 +162,7 @@ def _evaluate_all(
 
 
 def _calibration(truth: Path, calib: Path | None) -> Calibration | None:
-    """--calib, or the calibration that lies where KITTI puts it for this ground truth."""
+    """The calibration of --calib, or the file at KITTI's place for this ground truth; None without one."""
     from lslam.formats import calibration_files
     from lslam.types.sequence import Calibration
 
@@ -176,7 +176,7 @@ def _calibration(truth: Path, calib: Path | None) -> Calibration | None:
 
 
 def _timing(estimate: Path, given: Path | None) -> Timing | None:
-    """--timing, or the timing.csv beside the estimate."""
+    """The timing of --timing, or of timing.csv beside the estimate; None without one."""
     from lslam.evaluation.timing import read_timing
 
     if given is not None:
@@ -186,7 +186,7 @@ def _timing(estimate: Path, given: Path | None) -> Timing | None:
 
 
 def _hold_gates(evaluations: list[Evaluation], given: dict[str, Any]) -> None:
-    """GateError naming every number that is over its gate; a number that is not available holds no gate."""
+    """Raise GateError with every number above its gate; a number that is not available fails its gate."""
     from lslam.errors import GateError
     from lslam.evaluation.evaluate import METRICS
 

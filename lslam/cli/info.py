@@ -15,8 +15,8 @@ from lslam.cli import options
 @click.argument("sequence")
 @options.data_root
 @click.option("--scans", type=click.IntRange(min=1), default=50, show_default=True, metavar="N",
-              help="Scans whose points are looked at, spread evenly.")  # fmt: skip
-@click.option("--all", "all_scans", is_flag=True, help="Look at the points of every scan.")
+              help="Number of scans whose points are examined, spread evenly.")  # fmt: skip
+@click.option("--all", "all_scans", is_flag=True, help="Examine the points of every scan.")
 @click.option("--rows", type=int, metavar="N", help="Organised clouds: rows (rings).")
 @click.option("--cols", type=int, metavar="N", help="Organised clouds: columns.")
 @click.option("--quick", is_flag=True, help="Register no scans: the IMU's clock and axes are not checked.")
@@ -36,9 +36,9 @@ def command(
     as_json: bool,
     **given: Any,
 ) -> None:
-    """Show what is in SEQUENCE, a folder, a bag, or a name under the data root, and what is wrong with it.
+    """Show the contents and the faults of SEQUENCE: a folder, a bag, or a name under the data root.
 
-    Each finding says what to do. The first scans are registered to compare their turns with the IMU's.
+    Each finding comes with advice. The first scans are registered, to compare their rotations with the IMU's.
     """
     from lslam.errors import OutputExistsError
     from lslam.readers import open_sequence

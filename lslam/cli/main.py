@@ -1,4 +1,4 @@
-"""The `lslam` command: finds the sub-command's module when it is called, and turns errors into exit codes."""
+"""The `lslam` command: imports a sub-command's module when it is called, and turns errors into exit codes."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ COMMANDS = {
     "simulate": "Simulate a drive with exact ground truth.",
     "convert": "Convert a sequence to a bag or KITTI's layout, or a trajectory to another format.",
     "osm": "Fetch buildings from OpenStreetMap, or show what is in an extract.",
-    "info": "Show what is in a sequence and what is wrong with it.",
+    "info": "Show the contents and the faults of a sequence.",
     "map": "Build a run's map anew with other settings, or score a map.",
     "view": "Write a run as a recording for the rerun viewer.",
     "methods": "List the odometry methods.",
@@ -31,7 +31,7 @@ COMMANDS = {
     "completion": "Print the completion script of a shell.",
 }
 
-STANDS_ON = (
+LIBRARIES = (
     "numpy",
     "numba",
     "scipy",
@@ -61,7 +61,7 @@ class LazyGroup(click.Group):
         return command
 
     def make_context(self, *args: Any, **more: Any) -> click.Context:
-        """As click does, with the same care for what --help and --version write: click would exit with 1."""
+        """As click does, but a closed pipe behind --help and --version is no error; click exits with 1."""
         try:
             return super().make_context(*args, **more)
         except BrokenPipeError:
@@ -71,7 +71,7 @@ class LazyGroup(click.Group):
             raise click.exceptions.Exit(0) from None
 
     def invoke(self, ctx: click.Context) -> Any:
-        """As click does, but a reader of stdout that has left (`lslam ... | head`) is no error."""
+        """As click does, but a closed pipe behind stdout (`lslam ... | head`) is no error."""
         try:
             return super().invoke(ctx)
         except BrokenPipeError:
@@ -81,13 +81,13 @@ class LazyGroup(click.Group):
             return 0
 
     def resolve_command(self, ctx: click.Context, args: list[str]) -> Any:
-        """As click does, but an unknown name is answered with the nearest one."""
+        """As click does, but the error about an unknown name suggests the nearest one."""
         if args and args[0] not in COMMANDS and not args[0].startswith("-"):
             raise click.UsageError(f"no command {args[0]!r}; {nearest(args[0], COMMANDS)}", ctx)
         return super().resolve_command(ctx, args)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """The table itself: help needs no module."""
+        """List the commands from the table, without importing their modules."""
         with formatter.section("Commands"):
             formatter.write_dl(list(COMMANDS.items()))
 
@@ -98,7 +98,7 @@ def _print_version(ctx: click.Context, _: click.Parameter, wanted: bool) -> None
     from importlib.metadata import PackageNotFoundError, version
 
     click.echo(f"lslam {__version__}, Python {sys.version.split()[0]}")
-    for name in STANDS_ON:
+    for name in LIBRARIES:
         try:
             click.echo(f"  {name} {version(name)}")
         except PackageNotFoundError:
@@ -113,7 +113,7 @@ def _print_version(ctx: click.Context, _: click.Parameter, wanted: bool) -> None
 )
 @click.option(
     "--version", is_flag=True, is_eager=True, expose_value=False, callback=_print_version,
-    help="Show the versions of lslam and what it stands on.",
+    help="Show the versions of lslam and its libraries.",
 )  # fmt: skip
 def cli() -> None:
     """Batch LiDAR SLAM: a recorded sequence goes in; a trajectory, a map and an honest report come out."""
@@ -124,7 +124,7 @@ def main() -> NoReturn:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")  # an ASCII terminal shows ? for ±, instead of an error after hours
-    # SIGTERM ends lslam as Ctrl-C does, with 130 and nothing half-written.
+    # SIGTERM ends lslam as Ctrl-C does, with exit code 130 and without partly written files.
     with heeded():
         code = _call()
     sys.exit(code)
@@ -172,7 +172,7 @@ def _fail_usage(error: click.ClickException) -> NoReturn:
 
 
 def _fail_unexpected(error: Exception) -> NoReturn:
-    """A mistake of ours: say so in one sentence, and show where only to those who ask."""
+    """Report an error of lslam itself in one sentence, with the traceback in the debug log alone."""
     import logging
 
     logging.getLogger("lslam").debug("traceback", exc_info=error)

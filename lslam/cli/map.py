@@ -30,18 +30,20 @@ Examples:
 @click.option("--voxel", type=float, metavar="M", help="Edge of a voxel  [as the run].")
 @click.option("--format", "file_format", metavar="NAME", help="ply, pcd, las or laz  [--out's suffix, or as the run].")
 @click.option("--crop", metavar="BOX", help="Keep x_min,x_max,y_min,y_max[,z_min,z_max] of the world, m.")
-@click.option("--clean", is_flag=True, help="Take out what moves: cars and people on their way.")
+@click.option("--clean", is_flag=True, help="Remove moving objects, such as cars and people.")
 @click.option("--occupancy", is_flag=True, help="Write occupied and free cells too, and a floor plan.")
-@click.option("--denoise", is_flag=True, help="Take out points far from their neighbours (Open3D).")
+@click.option("--denoise", is_flag=True, help="Remove points far from their neighbours (Open3D).")
 @click.option("--mesh", is_flag=True, help="Write a surface too, FILE_mesh.ply (Open3D).")
 @click.option("--crs", metavar="EPSG:N", help="Coordinates of las and laz of a georeferenced run  [its UTM zone].")
 @click.option("--out", type=click.Path(path_type=Path), metavar="FILE", help="Map file  [RUN/map.FORMAT].")
-@click.option("--overwrite", is_flag=True, help="Replace files that are there.")
-@click.option("--sequence", type=click.Path(path_type=Path), metavar="PATH", help="Where the raw scans are now.")
-@click.option("--score", "is_scored", is_flag=True, help="Only say how crisp the map of RUN, or FILE, is.")
+@click.option("--overwrite", is_flag=True, help="Replace existing files.")
+@click.option(
+    "--sequence", type=click.Path(path_type=Path), metavar="PATH", help="Sequence of the raw scans, when it has moved."
+)
+@click.option("--score", "is_scored", is_flag=True, help="Only compute the crispness of the map of RUN, or of FILE.")
 @click.option("--against", type=click.Path(path_type=Path), metavar="CLOUD", help="Only compare with this cloud.")
-@click.option("--threshold", type=float, metavar="M", help="--against: nearest points that count as equal  [0.2].")
-@click.option("--radius", type=float, metavar="M", help="--score: neighbourhoods  [0.5].")
+@click.option("--threshold", type=float, metavar="M", help="--against: largest distance of matching points  [0.2].")
+@click.option("--radius", type=float, metavar="M", help="--score: radius of neighbourhoods  [0.5].")
 @options.reading
 @click.option("--set", "settings", multiple=True, metavar="map.KEY=VALUE", help="Set one key of the map; repeatable.")
 @options.as_json
@@ -49,8 +51,8 @@ Examples:
 def command(target: Path, **given: Any) -> None:
     """Build the map of a run anew from its raw scans and poses, with other settings and without odometry.
 
-    With --score or --against a map, of RUN or FILE, is only measured: crispness without truth, F1 and Chamfer distance
-    against a reference in the same frame.
+    With --score or --against the map of RUN, or FILE, is only scored: by crispness, which needs no ground truth, or by F1 and
+    Chamfer distance against a reference cloud in the same frame.
     """
     setup_logging(given["verbose"], given["quiet"])
     if given["is_scored"] or given["against"] is not None:
@@ -140,7 +142,7 @@ def _settings(given: dict[str, Any]) -> list[str]:
 
 
 def crispness_rows(score: Crispness) -> list[tuple[str, str]]:
-    """What is said of a map's crispness, as rows."""
+    """Rows of the table about a map's crispness."""
     if score.entropy is None or score.plane_variance is None:
         return [("crispness", f"n/a: {score.recipe}")]
     return [

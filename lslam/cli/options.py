@@ -38,7 +38,7 @@ class Place(click.Path):
 
 def verbosity(function: F) -> F:
     """--verbose and --quiet."""
-    function = click.option("-v", "--verbose", is_flag=True, help="Say more on stderr.")(function)
+    function = click.option("-v", "--verbose", is_flag=True, help="Log debugging messages on stderr.")(function)
     return click.option("-q", "--quiet", is_flag=True, help="Only warnings and errors on stderr.")(function)
 
 
@@ -75,9 +75,9 @@ def scan_ranges(function: F) -> F:
 
 
 def ranges_of(given: dict[str, Any], words: Iterable[str]) -> tuple[list[str], dict[str, ScanRange]]:
-    """What the options of `scan_ranges` set for all sequences, as --set takes it, and for single `words`.
+    """The ranges that the options of `scan_ranges` set for all sequences, as --set takes them, and for single `words`.
 
-    Raises UsageError for what is no number, or names no such sequence, ConfigError for a number out of range.
+    Raises UsageError for words that are no numbers or name no sequence, ConfigError for a number out of range.
     """
     from pydantic import ValidationError
 
@@ -116,7 +116,7 @@ def reading(function: F) -> F:
 
 
 def reading_of(given: dict[str, Any]) -> dict[str, Any]:
-    """What `open_sequence` takes of the options of `reading`."""
+    """Arguments of `open_sequence` from the options of `reading`."""
     return {name: given[name] for name in ("lidar_topic", "imu_topic", "gnss_topic", "extrinsics")}
 
 
@@ -203,7 +203,7 @@ def engine(function: F) -> F:
 
 
 def check_engine(given: dict[str, Any]) -> None:
-    """Raise UsageError for what of the options of `engine` does not go together."""
+    """Raise UsageError when options of `engine` contradict each other."""
     if sum(given[name] is not None for name in ("jobs", "scheduler", "cluster")) > 1:
         raise UsageError("--jobs, --scheduler and --cluster are three ways to make the runs: give one of them")
     if given["jobs"] is not None and given["jobs"] < 1:
@@ -212,9 +212,9 @@ def check_engine(given: dict[str, Any]) -> None:
 
 @contextmanager
 def engine_of(given: dict[str, Any], title: str, is_persistent: bool = True) -> Iterator[Engine]:
-    """What makes the runs, as the options of `engine` say, which `check_engine` has looked at.
+    """The engine that the options of `engine` choose, after `check_engine`.
 
-    is_persistent : whether data stay read from one run to the next, and keyframes do not stay
+    is_persistent : whether workers keep sequences from one run to the next, and delete keyframes
     """
     from lslam.studies.jobs import Local
 
@@ -229,7 +229,7 @@ def engine_of(given: dict[str, Any], title: str, is_persistent: bool = True) -> 
 
 
 def seeds_of(text: str) -> tuple[int, ...]:
-    """The numbers of --seeds; raises UsageError when they are none."""
+    """The numbers of --seeds; raises UsageError for other words."""
     try:
         return tuple(int(part) for part in text.split(",") if part.strip())
     except ValueError:
@@ -242,7 +242,7 @@ def as_json(function: F) -> F:
 
 
 def require_there(*paths: Path | None) -> None:
-    """Raise InputError for one that is given and not there: what reads it costs more to import than a look."""
+    """Raise InputError for a path that does not exist, before the modules that read it are imported."""
     for path in paths:
         if path is not None and not os.path.lexists(path):
             raise InputError(f"{path} does not exist")
@@ -256,12 +256,12 @@ def metrics(function: F) -> F:
 
 
 def metrics_of(texts: Iterable[str]) -> list[str]:
-    """The words of --metrics, with commas or in several."""
+    """The words of --metrics, separated by commas or in several options."""
     return [word for text in texts for word in text.split(",") if word]
 
 
 def numbers(flag: str, text: str, counts: tuple[int, ...], example: str) -> list[float]:
-    """The comma-separated numbers of a flag; raises UsageError when they are not so many."""
+    """The comma-separated numbers of a flag; raises UsageError unless their number is among `counts`."""
     try:
         values = [float(part) for part in text.split(",")]
     except ValueError:
@@ -272,7 +272,7 @@ def numbers(flag: str, text: str, counts: tuple[int, ...], example: str) -> list
 
 
 def place(flag: str, text: str) -> list[float]:
-    """Latitude, longitude (deg) and perhaps height (m) of a flag; raises UsageError when they are no place."""
+    """Latitude, longitude (deg) and perhaps height (m) of a flag; raises UsageError when they are out of range."""
     at = numbers(flag, text, (2, 3), "LAT,LON, for example 49.0112,8.4229")
     if not (abs(at[0]) <= 90 and abs(at[1]) <= 180):
         raise click.UsageError(f"{flag} {text} is no place on the Earth: latitude first, in degrees")

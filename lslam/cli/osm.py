@@ -1,4 +1,4 @@
-"""`lslam osm`: fetch building extracts, and look at them."""
+"""`lslam osm`: fetch building extracts, and show their contents."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ Examples:
 @click.option(
     "--along", metavar="PATH", help="The surroundings of a sequence's satellite fixes, a run folder, or a trajectory."
 )
-@click.option("--radius", type=float, metavar="M", help="Round the place or path  [osm.fetch_radius, 120].")
+@click.option("--radius", type=float, metavar="M", help="Radius about the place or path  [osm.fetch_radius, 120].")
 @click.option(
     "--origin", metavar="LAT,LON[,H]", help="With --along TRAJECTORY in metres: where x = y = 0 is, x east, y north."
 )
@@ -49,8 +49,8 @@ Examples:
 )  # fmt: skip
 @click.option("--overwrite", is_flag=True, help="Replace FILE.")
 @click.option("--server", metavar="URL", help="Another Overpass server  [osm.server].")
-@click.option("--refresh", is_flag=True, help="Ask the server even for what was fetched before.")
-@click.option("--offline", is_flag=True, help="Take only what was fetched before.")
+@click.option("--refresh", is_flag=True, help="Ask the server also for areas that are in the cache.")
+@click.option("--offline", is_flag=True, help="Use the cache alone.")
 @options.data_root
 @options.configuration
 @options.verbosity
@@ -71,9 +71,9 @@ def fetch(
     verbose: bool,
     quiet: bool,
 ) -> None:
-    """Fetch the buildings of a place from an Overpass server, or from the cache when they were fetched before."""
+    """Fetch the buildings of a place from an Overpass server, or from the cache of earlier replies."""
     if sum(given is not None for given in (bbox, around, along)) != 1:
-        raise click.UsageError("say which place: one of --bbox, --around and --along")
+        raise click.UsageError("no place is given: give one of --bbox, --around and --along")
     if refresh and offline:
         raise click.UsageError("--refresh asks the server and --offline never does: give one of them")
     if bbox is not None and radius is not None:

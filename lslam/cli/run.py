@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 @click.argument("sequence")
 @click.option("--method", metavar="NAME", help="Odometry method, see `lslam methods` [default: icp].")
 @options.preset
-@click.option("--residual", metavar="NAME", help=f"Of --method icp: {', '.join(RESIDUALS)} [default: plane].")
+@click.option("--residual", metavar="NAME", help=f"Residual of icp: {', '.join(RESIDUALS)} [default: plane].")
 @click.option(
     "--gt", type=click.Path(path_type=Path), metavar="FILE", help="Ground truth instead of the sequence's own."
 )
@@ -51,27 +51,33 @@ if TYPE_CHECKING:
 @click.option("--threads", type=int, metavar="N", help="0: as many as there are cores; 1: one. Results stay the same.")
 @click.option("--rings", metavar="RULE", help="How rings are found: auto, field, order, rows[:N], elevation[:N].")
 @click.option("--save-feature-map", is_flag=True, help="Write feature_map.ply; for the LOAM family.")
-@click.option("--clean", is_flag=True, help="Take what moves out of the map.")
+@click.option("--clean", is_flag=True, help="Remove moving objects from the map.")
 @click.option("--occupancy", is_flag=True, help="Write occupied and free cells, and a floor plan.")
 @click.option("--imu/--no-imu", default=None, help="Predict and deskew with the IMU [default: no].")
 @click.option("--loops/--no-loops", default=None, help="Close loops where a place is seen again [default: yes].")
-@click.option("--gnss", "gnss", flag_value="graph", default=None, help="Satellite fixes hold the trajectory.")
-@click.option("--georeference", "gnss", flag_value="fit", help="Satellite fixes only say where on the Earth it lies.")
-@click.option("--osm", metavar="FILE|auto", help="Buildings of OpenStreetMap hold the trajectory; auto fetches them.")
-@click.option("--origin", metavar="LAT,LON[,H]", help="With --osm: where the first scan is, where no fix says it.")
+@click.option("--gnss", "gnss", flag_value="graph", default=None, help="Satellite fixes are factors of the pose graph.")
+@click.option("--georeference", "gnss", flag_value="fit", help="Satellite fixes only georeference the result.")
+@click.option("--osm", metavar="FILE|auto", help="Buildings of OpenStreetMap give planar priors; auto fetches them.")
+@click.option("--origin", metavar="LAT,LON[,H]", help="With --osm: place of the first scan, where there are no fixes.")
 @click.option(
-    "--heading", type=float, metavar="DEG", help="With --osm: of the first scan, clockwise from north [sought]."
+    "--heading",
+    type=float,
+    metavar="DEG",
+    help="With --osm: heading of the first scan, clockwise from north [default: searched].",
 )
 @click.option("--crs", metavar="EPSG:N", help="Coordinates of georeferenced maps [default: the UTM zone].")
 @click.option(
-    "--poses", type=click.Path(path_type=Path), metavar="FILE", help="Somebody else's trajectory instead of odometry."
+    "--poses",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="Trajectory of another program instead of odometry.",
 )
 @click.option("--strict", is_flag=True, help="Exit 4 when anything was degraded: a scan skipped or bridged.")
 @click.option(
     "--profile",
     type=click.Path(dir_okay=False, path_type=Path),
     metavar="FILE.json",
-    help="Write where the time goes, for speedscope.",
+    help="Write a profile of the run's time, for speedscope.",
 )
 @click.option("--dry-run", is_flag=True, help="Resolve everything, write nothing.")
 @options.metrics
@@ -119,9 +125,9 @@ def _run(sequence: str, given: dict[str, Any]) -> None:
 
 
 def opened_with(given: dict[str, Any]) -> tuple[Sequence, Config]:
-    """The sequence and the configuration that the words of a command line mean; raises what is wrong with them.
+    """The sequence and the configuration that the options describe; raises the errors in them.
 
-    What costs least is looked at first: words, then the configuration, then what is to be read.
+    Cheap checks come first: words, then the configuration, then the sequence.
     """
     from lslam.readers.lookup import find_folder
 
@@ -141,21 +147,21 @@ def opened_with(given: dict[str, Any]) -> tuple[Sequence, Config]:
 
 
 def resolved(given: dict[str, Any]) -> Config:
-    """The configuration alone; raises what is wrong with it."""
+    """The configuration alone; raises the errors in it."""
     return _resolve(given, _flags(given))
 
 
 def _variant(config: Config) -> str:
-    """Of the default folder's name."""
+    """Method and sensors, for the name of the default folder."""
     return config.odometry.method + ("-imu" if config.imu.use else "") + ("-osm" if config.osm.extract else "")
 
 
 def _check_folder(given: dict[str, Any]) -> None:
-    """Raise UsageError for flags about folders that contradict each other, or that are not there."""
+    """Raise UsageError for flags about folders that contradict each other or name a folder that does not exist."""
     if given["overwrite"] and given["resume"]:
-        raise UsageError("--overwrite runs everything anew and --resume keeps what is done: give one of them")
+        raise UsageError("--overwrite runs everything anew and --resume keeps finished parts: give one of them")
     if given["resume"] and given["out"] is None:
-        raise UsageError("--resume needs --out: the folder of the run that shall go on")
+        raise UsageError("--resume needs --out: the folder of the interrupted run")
     if given["profile"] is not None and not given["profile"].absolute().parent.is_dir():
         raise UsageError(f"--profile: {given['profile'].absolute().parent} is not a folder")
     if given["out"] is not None and not given["resume"] and not given["dry_run"]:
@@ -165,7 +171,7 @@ def _check_folder(given: dict[str, Any]) -> None:
 
 
 def _flags(given: dict[str, Any]) -> dict[str, Any]:
-    """The configuration that flags set, by key, None where they do not. Raises UsageError for words that mean nothing."""
+    """Values of the flags by configuration key, None for flags that are not given. Raises UsageError for unknown words."""
     from lslam.evaluation.recipes import check_words
     from lslam.odometry import require_method
 
@@ -205,7 +211,7 @@ def _flags(given: dict[str, Any]) -> dict[str, Any]:
 
 
 def _resolve(given: dict[str, Any], flags: dict[str, Any]) -> Config:
-    """Flags over --set over environment over --config over --preset over defaults; checked."""
+    """The checked configuration. Precedence: flags, --set, environment, --config, --preset, defaults."""
     from lslam.config import load_config
     from lslam.pipeline.check import check_config
 
@@ -216,7 +222,7 @@ def _resolve(given: dict[str, Any], flags: dict[str, Any]) -> Config:
 
 
 def read_truth(path: Path | None, sequence: Sequence) -> Trajectory | None:
-    """Ground truth of --gt; a file without stamps takes those of the sequence, line by line."""
+    """Ground truth of --gt; the poses of a file without stamps take those of the sequence, one per scan."""
     if path is None:
         return None
     from dataclasses import replace
@@ -230,7 +236,7 @@ def read_truth(path: Path | None, sequence: Sequence) -> Trajectory | None:
 
 
 def _watch(stack: ExitStack, stop: Stop, finish: Callable[[RunOutcome], None]) -> Watch:
-    """Progress bars, and signals as a wish to stop after the scan at hand."""
+    """Progress bars, and a stop after the current scan on a signal."""
     from lslam.pipeline.watch import Watch
 
     bar = stack.enter_context(ExitStack())
@@ -262,7 +268,7 @@ def _print_plan(sequence: Sequence, config: Config, out: Path, as_json: bool) ->
 
 
 def _print_finished(out: Path, as_json: bool) -> None:
-    """The result that is there, for scripts that read it; people are told on stderr that nothing was done."""
+    """Print the existing result for --json; the log states that nothing was done."""
     if not as_json:
         return
     import json

@@ -1,4 +1,4 @@
-"""`lslam simulate`: a drive through a generated town or that of a map, with exact ground truth, in KITTI's layout."""
+"""`lslam simulate`: a drive through a generated or mapped town, with exact ground truth, in KITTI's layout."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 @click.argument("scenario", required=False)
 @click.option("--out", type=click.Path(path_type=Path), metavar="DIR", help="Folder to write; must not exist.")
 @click.option(
-    "--seed", type=int, default=0, show_default=True, metavar="N", help="Of the town, the drive and the noise."
+    "--seed", type=int, default=0, show_default=True, metavar="N", help="Seed of the town, the drive and the noise."
 )
 @click.option("--lidar", metavar="NAME", help="The sensor; see --list.")
 @click.option(
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     "--distorted/--compensated",
     "distorted",
     default=None,
-    help="Fire the rays while the sensor moves, with times per point, or all from one pose [default: the scenario's].",
+    help="Cast the rays while the sensor moves, with per-point times, or all from one pose [default: the scenario's].",
 )
 @click.option(
     "--path",
@@ -56,8 +56,9 @@ if TYPE_CHECKING:
     help="Where x = y = 0 of the city lies [default: the extract's middle, or a GeoJSON path's first point].",
 )
 @click.option(
-    "--set", "settings", multiple=True, metavar="KEY=VALUE", help="Change the scenario, as world.relief=1; repeatable."
-)
+    "--set", "settings", multiple=True, metavar="KEY=VALUE",
+    help="Set one key of the scenario, for example world.relief=1; repeatable.",
+)  # fmt: skip
 @click.option(
     "--plan", type=click.Path(path_type=Path), metavar="FILE.png", help="Draw the scene from above with a metric grid."
 )
@@ -69,10 +70,10 @@ if TYPE_CHECKING:
 @click.option(
     "--gnss-outage", type=(float, float), multiple=True, metavar="FROM TO", help="Seconds without fixes; repeatable."
 )
-@click.option("--static-start", type=float, default=0.0, metavar="S", help="Stand still for S seconds first.")
+@click.option("--static-start", type=float, default=0.0, metavar="S", help="Stay at the start for S seconds first.")
 @click.option("--overwrite", is_flag=True, help="Replace sequences/00 and poses/00.txt in an existing folder.")
-@click.option("--resume", is_flag=True, help="Go on with a simulation that was interrupted.")
-@click.option("--show", is_flag=True, help="Print SCENARIO with all its keys as TOML, to --set or to write one's own.")
+@click.option("--resume", is_flag=True, help="Continue an interrupted simulation.")
+@click.option("--show", is_flag=True, help="Print SCENARIO with all its keys as TOML.")
 @click.option("--list", "show_list", is_flag=True, help="List scenarios and sensors.")
 @options.verbosity
 def command(
@@ -100,9 +101,10 @@ def command(
     verbose: bool,
     quiet: bool,
 ) -> None:
-    """Simulate a drive or a flight with exact ground truth; SCENARIO is a name of --list, or a .toml file of one's own.
+    """Simulate a drive or a flight with exact ground truth; SCENARIO is a name of --list, or a .toml file.
 
-    With --plan the scene is drawn, and recorded only when --out is given as well; of an --osm extract without --path all of it.
+    With --plan the scene is drawn, and recorded only with --out as well. With --osm and without --path the whole extract is
+    drawn.
     """
     if show_list:
         _print_list()
@@ -170,7 +172,7 @@ def _draw(drive: SimulatedDrive, plan: Path) -> None:
 def _draw_map(
     scenario: str, seed: int, settings: tuple[str, ...], osm: Path, origin: list[float] | None, plan: Path
 ) -> None:
-    """The whole extract, with the street that would be driven when there is one."""
+    """Draw the whole extract, with the street of the drive when there is one."""
     from lslam.simulation.built_scenario import whole_map
     from lslam.simulation.lidar import RayScene
     from lslam.simulation.osm_place import read_extract
@@ -195,7 +197,7 @@ def _record(drive: SimulatedDrive, out: Path, overwrite: bool, resume: bool) -> 
 
         def on_scan(index: int) -> None:
             advance()
-            stop.is_gentle = index + 1 < len(drive)  # a scan that is begun is written; what is whole stays for --resume
+            stop.is_gentle = index + 1 < len(drive)  # a started scan is completed, so that --resume finds whole scans
             stop.check()
 
         done = record(drive, out, overwrite, on_scan, resume, shlex.join(["lslam", *sys.argv[1:]]))

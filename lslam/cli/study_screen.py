@@ -1,4 +1,4 @@
-"""How a study is followed on stderr: one bar after the other, and on a terminal the best of each method so far."""
+"""Progress of a study on stderr: one bar after the other, and on a terminal the best result of each method so far."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ def bars(stack: ExitStack) -> StudyProgress:
 
 
 class BestTable:
-    """The best of each method so far, under the bar; called with all rows whenever a run has ended."""
+    """Table of the best result of each method so far, below the bar; called with all rows after every run."""
 
     def __init__(self) -> None:
         self.table: Table | str = ""
 
     def __call__(self, rows: Sequence[StudyRow]) -> None:
-        """Take up the rows."""
+        """Make the table of the rows."""
         from rich import box
         from rich.table import Table
 
@@ -54,7 +54,7 @@ class BestTable:
 
 @contextmanager
 def best_so_far() -> Iterator[BestTable]:
-    """A table that is live on a terminal, and nothing elsewhere: the log then is for machines."""
+    """A live table on a terminal; elsewhere it is not shown."""
     table = BestTable()
     is_quiet = bool(log.handlers) and log.handlers[0].level > log.getEffectiveLevel()
     if is_quiet or not sys.stderr.isatty():

@@ -27,7 +27,9 @@ if TYPE_CHECKING:
 )
 @click.argument("study", required=False)
 @click.option("--list", "show_list", is_flag=True, help="List the studies that ship with lslam.")
-@click.option("--dry-run", is_flag=True, help="List and count the runs, and stop; the time, as finished ones took it.")
+@click.option(
+    "--dry-run", is_flag=True, help="List and count the runs, estimate their time by finished ones, and stop."
+)
 @click.option("--pilot", is_flag=True, help="With --dry-run: estimate the time by a few short runs.")
 @options.studied
 @click.option(
@@ -35,7 +37,7 @@ if TYPE_CHECKING:
     help="Write the report of the study in DIR anew from its results.csv, run nothing.",
 )  # fmt: skip
 @options.engine
-@click.option("--seeds", metavar="N,N,...", help="Instead of the study's.")
+@click.option("--seeds", metavar="N,N,...", help="Seeds instead of the study's.")
 @options.data_root
 @click.option(
     "--set", "settings", multiple=True, metavar="SECTION.KEY=VALUE", help="Set one key in all runs; repeatable."
@@ -44,11 +46,11 @@ if TYPE_CHECKING:
 @options.verbosity
 def command(study: str | None, **given: Any) -> None:
     """Vary parameters over sequences, methods and seeds; every run is a row of results.csv and results.parquet, and
-    report.html shows what was found.
+    report.html shows the findings.
 
-    STUDY is a file, or a name of --list. Its sequences may each have a start, count and skip_frames of their own. What fails or
-    diverges is a row with its reason. Findings about time are judged when every run had a core to itself: on an idle machine,
-    with --jobs 1 where in doubt.
+    STUDY is a file, or a name of --list. Each of its sequences can have its own start, count and skip_frames. A run that fails
+    or diverges is a row with its reason. Findings about time are decided when every run had a core of its own: use an idle
+    machine, and --jobs 1 where in doubt.
     """
     if given["show_list"]:
         _print_list()
@@ -93,7 +95,7 @@ def command(study: str | None, **given: Any) -> None:
 
 
 def _sweep(word: str, given: dict[str, Any]) -> Sweep:
-    """What is studied; what is cheap to see is seen before anything heavy is imported."""
+    """The study that the options describe. They are checked as far as possible before heavy imports."""
     seeds = None if given["seeds"] is None else options.seeds_of(given["seeds"])
     from lslam.config.load import check_settings
     from lslam.config.study import parse_study
@@ -138,7 +140,7 @@ def _print_list() -> None:
 
 
 def _print_plan(sweep: Sweep, at_once: int, is_piloted: bool, stack: ExitStack) -> None:
-    """Every run, how many there are, and how long those will take that are not finished."""
+    """Print every run, their number, and the estimated time of those that are not finished."""
     from lslam.cli.study_screen import bars
     from lslam.studies.estimate import estimate, from_finished
     from lslam.studies.expanded_study import left_to_do
@@ -158,6 +160,6 @@ def _print_plan(sweep: Sweep, at_once: int, is_piloted: bool, stack: ExitStack) 
         return
     earlier = from_finished(expanded.jobs, left, expanded.variants, at_once)
     if earlier is None:
-        show(f"{many}; how long they take says --pilot, by a few short ones\n")
+        show(f"{many}; --pilot estimates their time by a few short runs\n")
     else:
         show(f"{many}: about {earlier.text}, {at_once} at once (as the finished ones took)\n")

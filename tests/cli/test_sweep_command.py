@@ -75,7 +75,7 @@ def test_a_dry_run_lists_and_counts_and_writes_nothing(file: Path, tmp_path: Pat
     *runs, last = done.stdout.splitlines()
     assert runs[0] == "block icp-skip_frames_1 seed 1"
     assert len(runs) == 8
-    assert last == "8 runs, 8 left to do; how long they take says --pilot, by a few short ones"
+    assert last == "8 runs, 8 left to do; --pilot estimates their time by a few short runs"
     assert done.stderr == "", "nothing is simulated or run"
     piloted = lslam(*words, "--pilot")
     assert piloted.stdout.splitlines()[-1].startswith("8 runs, 8 left to do: about ")
