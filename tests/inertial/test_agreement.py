@@ -36,7 +36,7 @@ def compared(
 
 
 @pytest.mark.parametrize("noise_deg", [0.0, 0.05, 0.2, 0.3])
-def test_a_good_gyroscope_fits_what_a_poor_registration_sees(noise_deg: float) -> None:
+def test_a_correct_gyroscope_correlates_with_noisy_registration(noise_deg: float) -> None:
     """From scan to scan 0.2 deg are 5 deg/s of noise beside turns of 3: over a few scans the turns stand out."""
     for seed in range(5):
         found = compared(noise_deg, seed)
@@ -51,13 +51,13 @@ def test_a_good_gyroscope_fits_what_a_poor_registration_sees(noise_deg: float) -
     ("factor", "says"),
     [(57.3, "deg/s"), (3.0, r"vary 2\.[5-9] times"), (0.3, r"vary 0\.2[3-9] times"), (-1.0, "do not fit")],
 )
-def test_a_wrong_gyroscope_is_refused_by_a_poor_registration_too(factor: float, says: str) -> None:
+def test_a_wrong_gyroscope_is_refused_with_noisy_registration(factor: float, says: str) -> None:
     for seed in range(5):
         with pytest.raises(ImuRefusedError, match=says):
             compared(0.2, seed, factor)
 
 
-def test_a_clock_is_found_by_a_poor_registration() -> None:
+def test_a_time_offset_is_estimated_with_noisy_registration() -> None:
     for seed in range(5):
         found = compared(0.1, seed, weave_deg_s=20.0, late_s=0.1)
         assert found.offset_s == pytest.approx(-0.1, abs=4 * found.offset_sigma_s)
@@ -65,13 +65,13 @@ def test_a_clock_is_found_by_a_poor_registration() -> None:
 
 
 @pytest.mark.parametrize("late_s", [0.0165, 0.0175, -0.021])
-def test_a_clock_is_found_between_the_offsets_that_are_tried(late_s: float) -> None:
+def test_a_time_offset_is_interpolated_between_the_offsets_tried(late_s: float) -> None:
     """Those are 5 ms apart."""
     found = compared(0.0, 0, weave_deg_s=20.0, late_s=late_s)
     assert found.offset_s == pytest.approx(-late_s, abs=4e-4)
 
 
-def test_turns_that_drown_in_noise_are_judged_by_nobody() -> None:
+def test_rotations_below_the_noise_are_not_judged() -> None:
     """They would pass for an IMU whose rates are too small; quick ones, for turns that no scan shows. Degrees are too many."""
     for seed in range(5):
         assert not compared(0.2, seed, weave_deg_s=0.5).is_judged
@@ -83,7 +83,7 @@ def test_turns_that_drown_in_noise_are_judged_by_nobody() -> None:
 @pytest.mark.parametrize(
     ("felt", "shown", "is_refused"), [(11.5, 0.5, False), (12.5, 0.5, True), (19.0, 10.0, False), (21.0, 10.0, True)]
 )
-def test_a_gyroscope_that_turns_twice_as_much_as_anything_shows_is_refused(
+def test_a_gyroscope_with_twice_the_rate_variation_of_the_scans_is_refused(
     felt: float, shown: float, is_refused: bool
 ) -> None:
     """Deg/s about one axis; of less than twelve nothing is told. Scans need not have turned about the others."""
@@ -99,7 +99,7 @@ def test_a_gyroscope_that_turns_twice_as_much_as_anything_shows_is_refused(
 
 
 @pytest.mark.parametrize(("scans", "heard", "is_told"), [(41, 19, False), (41, 20, True), (7, 5, True), (7, 4, False)])
-def test_turns_are_compared_where_half_of_them_were_felt_and_five_at_the_least(
+def test_rotations_are_compared_when_samples_cover_half_of_them_and_at_least_five(
     scans: int, heard: int, is_told: bool
 ) -> None:
     """Turns from scan to scan at 10 Hz, of which the stream reaches over so many."""

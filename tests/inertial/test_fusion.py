@@ -65,7 +65,7 @@ def errors(
 
 
 @pytest.mark.parametrize("make", [walk, drone])
-def test_it_predicts_better_than_constant_velocity(make: object) -> None:
+def test_imu_prediction_is_better_than_constant_velocity(make: object) -> None:
     """Biases of 5 deg/s and axes that feel each other by 2 % included."""
     drive: SimulatedDrive = make()  # type: ignore[operator]
     own, own_sweep = errors(motion_of(drive), drive)
@@ -78,7 +78,7 @@ def test_it_predicts_better_than_constant_velocity(make: object) -> None:
 
 
 @pytest.mark.parametrize("make", [walk, drone])
-def test_it_predicts_sweeps_about_their_stamps_as_well(make: Callable[[], SimulatedDrive]) -> None:
+def test_imu_prediction_holds_for_sweeps_around_their_stamps(make: Callable[[], SimulatedDrive]) -> None:
     """Half of each sweep lies before the last pose's next stamp: none of it is felt twice, or not at all."""
     drive = make()
     begun, _ = errors(motion_of(drive), drive)
@@ -93,7 +93,7 @@ def test_it_predicts_sweeps_about_their_stamps_as_well(make: Callable[[], Simula
     assert motion.gap_scans <= 2
 
 
-def test_a_seeming_standstill_is_no_prediction() -> None:
+def test_a_motion_corrected_by_a_false_standstill_fails_the_gate() -> None:
     """The sentinel: an IMU that is told nothing moves is far off."""
     drive = drone()
     motion = motion_of(drive)
@@ -105,7 +105,7 @@ def test_a_seeming_standstill_is_no_prediction() -> None:
     assert np.median(off) > 10.0
 
 
-def test_what_a_second_scan_taught_before_the_start_was_done_again_counts_once() -> None:
+def test_a_repeated_first_correction_counts_once() -> None:
     drive = drone()
     stamps, poses = truth_of(drive, 2)
     learnt = []
@@ -123,7 +123,7 @@ def test_what_a_second_scan_taught_before_the_start_was_done_again_counts_once()
     np.testing.assert_array_equal(twice.gyroscope.bias, once.gyroscope.bias)
 
 
-def test_failed_scans_are_bridged() -> None:
+def test_half_a_second_without_registration_is_bridged_by_the_imu() -> None:
     """Half a second without registration: the walker is lost by constant velocity, not by the IMU."""
     drive = walk()
     failed = range(60, 65)
@@ -135,7 +135,7 @@ def test_failed_scans_are_bridged() -> None:
     assert own[66:].mean(axis=0)[0] < 0.02, "and it goes on as before"
 
 
-def test_two_seconds_between_scans_are_bridged_too() -> None:
+def test_two_seconds_between_scans_are_bridged_by_the_imu() -> None:
     drive = drone()
     own, _ = errors(motion_of(drive), drive, every=20)
     assert len(own) == 4
@@ -163,7 +163,7 @@ def test_gaps_fall_back_to_constant_velocity_and_are_counted() -> None:
     assert own[70:, 0].mean() < 1.5 * whole[70:, 0].mean() + 2e-3
 
 
-def test_scans_that_only_touch_a_gap_are_still_the_imus() -> None:
+def test_scans_at_the_edge_of_a_gap_are_predicted_by_the_imu() -> None:
     """The sweep before lacks its last samples, the step to the scan after its first ones: each less than half of `gap_s`."""
     drive = walk()
     motion = motion_over_a_gap(drive, 5_985_000_000, 6_275_000_000)
@@ -175,7 +175,7 @@ def test_scans_that_only_touch_a_gap_are_still_the_imus() -> None:
     assert (own_sweep[[59, 63]] < 0.1 * steady_sweep[[59, 63]]).all()
 
 
-def test_wrong_axes_that_slipped_through_are_refused_on_the_way() -> None:
+def test_wrong_extrinsics_are_refused_during_the_run() -> None:
     drive = walk()
     wrong = extrinsics_of(drive) @ se3.make(so3.exp(np.array([np.pi / 2, 0, 0])), np.zeros(3))
     motion = motion_of(drive, T=wrong)
@@ -189,7 +189,7 @@ def test_wrong_axes_that_slipped_through_are_refused_on_the_way() -> None:
 
 
 @pytest.mark.parametrize("velocity", ["registration", "integrated"])
-def test_it_is_judged_by_thirty_scans(velocity: str) -> None:
+def test_an_imu_is_refused_after_thirty_scans_by_prior_errors(velocity: str) -> None:
     """Not by fewer; constant velocity has something to say from the third on. An integrated speed is the user's wish."""
     drive = walk()
     wrong = extrinsics_of(drive) @ se3.make(so3.exp(np.array([np.pi / 2, 0, 0])), np.zeros(3))
@@ -200,7 +200,7 @@ def test_it_is_judged_by_thirty_scans(velocity: str) -> None:
     assert (refused.index(True) if any(refused) else None) == (31 if velocity == "registration" else None)
 
 
-def test_one_scan_in_twenty_is_compared_unless_the_imu_is_silent() -> None:
+def test_one_scan_in_twenty_is_compared_with_constant_velocity_unless_in_a_gap() -> None:
     """Then constant velocity predicts it anyway, and before the second scan there is none."""
     drive = walk()
     stamps, poses = truth_of(drive)
@@ -216,7 +216,7 @@ def test_one_scan_in_twenty_is_compared_unless_the_imu_is_silent() -> None:
 
 
 @pytest.mark.parametrize("seconds", [0.101, 0.03])
-def test_a_sweep_is_refined_by_an_imu_that_does_not_end_before_it(seconds: float) -> None:
+def test_a_sweep_is_refined_by_the_imu_when_samples_cover_it(seconds: float) -> None:
     """What comes after a sweep is not asked for. Of half a sweep constant velocity is as good a judge."""
     drive = walk()
     stamps, poses = truth_of(drive)
@@ -234,7 +234,7 @@ def test_a_sweep_is_refined_by_an_imu_that_does_not_end_before_it(seconds: float
 
 
 @pytest.mark.parametrize("scans", [1, 40])
-def test_it_goes_on_where_it_was_left(scans: int) -> None:
+def test_inertial_motion_resumes_to_the_last_bit(scans: int) -> None:
     drive = walk()
     stamps, poses = truth_of(drive)
     whole = motion_of(drive)
@@ -250,7 +250,7 @@ def test_it_goes_on_where_it_was_left(scans: int) -> None:
     assert whole.prior_errors() == again.prior_errors()
 
 
-def test_velocity_from_registration_beats_integrated_velocity() -> None:
+def test_velocity_from_registration_is_more_accurate_than_integrated_velocity() -> None:
     """The thesis' two rules: 0.092 against 0.927 there."""
     drive = drone()
     by_registration, _ = errors(motion_of(drive), drive)
@@ -258,7 +258,7 @@ def test_velocity_from_registration_beats_integrated_velocity() -> None:
     assert integrated[-20:, 0].mean() > 5 * by_registration[-20:, 0].mean()
 
 
-def test_the_lever_arm_counts() -> None:
+def test_the_lever_arm_of_the_imu_is_part_of_the_prediction() -> None:
     """An IMU two metres off feels other forces; told where it sits, it predicts the same."""
     drive = walk("ideal")
     arm = se3.make(so3.from_euler_rpy(np.array([0.3, -0.2, 1.0])), np.array([1.5, -1.0, 0.5]))
@@ -277,6 +277,6 @@ def test_the_lever_arm_counts() -> None:
     assert np.median(ignored[10:, 0]) > 5 * np.median(own[10:, 0])
 
 
-def test_twice_the_same() -> None:
+def test_predictions_are_deterministic() -> None:
     drive = drone()
     np.testing.assert_array_equal(errors(motion_of(drive), drive)[0], errors(motion_of(drive), drive)[0])

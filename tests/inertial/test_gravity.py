@@ -51,7 +51,7 @@ def tilt_errors(drive: SimulatedDrive, found: list[GravityDirection | None]) -> 
 
 @pytest.mark.parametrize("is_bias_given", [False, True])
 @pytest.mark.parametrize("make", [walk, drone])
-def test_the_direction_is_as_right_as_it_says(make: object, is_bias_given: bool) -> None:
+def test_the_direction_of_gravity_is_within_its_sigma(make: object, is_bias_given: bool) -> None:
     """Biases of 0.49 m/s2 on each axis, axes 2 % askew, and a swinging or banking sensor included."""
     drive: SimulatedDrive = make()  # type: ignore[operator]
     found = directions(drive, **(BIAS if is_bias_given else {}))
@@ -61,7 +61,7 @@ def test_the_direction_is_as_right_as_it_says(make: object, is_bias_given: bool)
     assert sigmas[-1] < sigmas[0]
 
 
-def test_it_follows_the_sensor_while_registration_drifts() -> None:
+def test_the_direction_of_gravity_follows_the_sensor_while_registration_drifts() -> None:
     """A third and more of a degree of drift in half a minute shows at once: that is what a graph corrects by."""
     drive = walk(count=300)
     tilts = np.deg2rad(np.linspace(0, 1.0, len(drive.stamps_ns)))
@@ -73,7 +73,7 @@ def test_it_follows_the_sensor_while_registration_drifts() -> None:
     assert moved < 0.7, "a direction that is fixed in the world would move by 1 deg"
 
 
-def test_none_in_a_gap_and_when_velocity_is_integrated() -> None:
+def test_no_direction_of_gravity_in_a_gap_or_with_integrated_velocity() -> None:
     drive = walk()
     imu = stream_of(drive)
     keep = (imu.stamps_ns < 6_020_000_000) | (imu.stamps_ns > 6_310_000_000)

@@ -62,7 +62,7 @@ def taught(noise_of_rates: float, steps: int = 150, seen_to: float = 1e-4) -> tu
     return gyroscope, read, true
 
 
-def test_axes_and_bias_are_learnt_while_it_turns() -> None:
+def test_axes_and_bias_are_estimated_while_the_sensor_rotates() -> None:
     gyroscope, read, true = taught(RATE_NOISE)
     np.testing.assert_allclose(gyroscope.axes, SKEW, atol=4e-3)
     np.testing.assert_allclose(gyroscope.bias, BIAS, atol=2e-3)
@@ -79,7 +79,7 @@ def test_axes_and_bias_are_learnt_while_it_turns() -> None:
 
 
 @pytest.mark.parametrize("noise", [RATE_NOISE, 6 * RATE_NOISE])
-def test_its_turns_are_as_right_as_it_says(noise: float) -> None:
+def test_rotations_are_within_their_covariance(noise: float) -> None:
     gyroscope, read, true = taught(noise)
     perfect = Gyroscope(np.zeros(3))
     ratios = []
@@ -90,7 +90,7 @@ def test_its_turns_are_as_right_as_it_says(noise: float) -> None:
     assert gyroscope.rate_variance >= RATE_NOISE**2
 
 
-def test_errors_turn_as_the_covariance_says() -> None:
+def test_the_covariance_of_a_rotation_equals_its_finite_differences() -> None:
     """Each of bias and axes, against the turn integrated with that error; its rates are nearly constant over a step."""
     read = stream(readings_of(tumbling(41)))
     gyroscope = Gyroscope(BIAS, SKEW)
@@ -106,7 +106,7 @@ def test_errors_turn_as_the_covariance_says() -> None:
         )
 
 
-def test_a_turn_of_no_quality_teaches_nothing() -> None:
+def test_a_rotation_without_information_changes_nothing() -> None:
     gyroscope, read, _ = taught(RATE_NOISE, steps=20)
     step = turns(read, gyroscope, 1)[0]
     again = gyroscope.learnt(step, np.array([0.01, 0.0, -0.01]), 1e6 * np.eye(3))
@@ -114,7 +114,7 @@ def test_a_turn_of_no_quality_teaches_nothing() -> None:
     np.testing.assert_allclose(again.bias, gyroscope.bias, atol=1e-8)
 
 
-def test_a_bias_that_nobody_watches_wanders_and_axes_do_not() -> None:
+def test_without_information_the_bias_walks_and_the_axes_do_not() -> None:
     still = integrate(stream(np.zeros((41, 3))), np.array([0, STEP_NS]), np.zeros(3), np.zeros(3))
     gyroscope = Gyroscope(np.zeros(3))
     for _ in range(3):
@@ -123,7 +123,7 @@ def test_a_bias_that_nobody_watches_wanders_and_axes_do_not() -> None:
     np.testing.assert_allclose(gyroscope.covariance, expected, rtol=1e-6, atol=1e-18)
 
 
-def test_one_absurd_turn_is_no_noise_of_the_device() -> None:
+def test_an_outlier_rotation_has_a_bounded_effect_on_the_rate_variance() -> None:
     still = integrate(stream(np.zeros((41, 3))), np.array([0, STEP_NS]), np.zeros(3), np.zeros(3))
     found = [Gyroscope(np.zeros(3)).learnt(still, np.array([turn, 0, 0]), 1e-8 * np.eye(3)) for turn in (0.1, 2.0)]
     assert RATE_NOISE**2 < found[0].rate_variance == found[1].rate_variance
@@ -149,7 +149,7 @@ def test_an_outlier_moves_the_mean_less_than_what_is_likely() -> None:
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
-def test_turns_over_many_steps_are_the_gyroscopes_not_the_noise_of_registration(seed: int) -> None:
+def test_the_bias_does_not_follow_the_noise_of_registration_over_many_steps(seed: int) -> None:
     """A minute against registrations wrong by a tenth of a degree: a bias that may wander fast follows their noise."""
     rng = np.random.default_rng(seed)
     read = stream(np.tile(BIAS, (int(60e9 / SAMPLE_NS) + 1, 1)))
@@ -161,7 +161,7 @@ def test_turns_over_many_steps_are_the_gyroscopes_not_the_noise_of_registration(
     assert np.sqrt(np.mean(np.square(errors))) < np.deg2rad(0.01)
 
 
-def test_what_is_known_of_the_axes_follows_a_bias_that_another_estimate_found() -> None:
+def test_the_covariance_of_the_axes_follows_a_bias_of_another_estimate() -> None:
     """A steady turn tells of bias and scale together: who knows the one knows the other, and the turn as well as before."""
     turning = ImuStream(np.arange(11) * 10_000_000, np.zeros((11, 3)), np.tile([0.0, 0.0, 2.0], (11, 1)))
     step = integrate(turning, np.array([0, 100_000_000]), np.zeros(3), np.zeros(3))

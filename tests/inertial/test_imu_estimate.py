@@ -18,7 +18,7 @@ FORCE_NOISE, PLACE_SIGMA = 0.05, 0.007
 
 
 @pytest.mark.parametrize("direction", range(9))
-def test_errors_travel_as_the_covariance_says(direction: int) -> None:
+def test_covariance_propagation_equals_finite_differences_of_the_integration(direction: int) -> None:
     """Velocity, gravity, accelerometer bias: displacement and velocity after a turn of 0.3 s change by the same column."""
     stamps = np.arange(0, 300_000_001, 10_000_000)
     rng = np.random.default_rng(5)
@@ -44,7 +44,9 @@ def test_errors_travel_as_the_covariance_says(direction: int) -> None:
 
 
 @pytest.mark.parametrize("sigmas", [None, (0.1, 0.2, 0.3)])
-def test_two_places_teach_the_velocity_as_well_as_both_are_known(sigmas: tuple[float, float, float] | None) -> None:
+def test_a_displacement_updates_the_velocity_as_a_scalar_kalman_filter(
+    sigmas: tuple[float, float, float] | None,
+) -> None:
     """A step of `t` seconds at an unknown velocity: the scalar Kalman filter of displacement and velocity, axis by axis."""
     t = 0.3
     stamps = np.arange(0, 300_000_001, 10_000_000)
@@ -62,7 +64,7 @@ def test_two_places_teach_the_velocity_as_well_as_both_are_known(sigmas: tuple[f
     np.testing.assert_allclose(after.velocity, gain * moved, rtol=1e-6)
 
 
-def test_instants_within_a_step_say_nothing_more() -> None:
+def test_instants_within_a_step_do_not_change_the_update() -> None:
     """Where the turn ends is its last instant, however many lie between."""
     stamps = np.arange(0, 300_000_001, 10_000_000)
     rng = np.random.default_rng(2)

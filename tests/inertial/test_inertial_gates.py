@@ -33,7 +33,7 @@ def test_an_outlier_begins_beyond_four_sigmas(sigmas: float, gain: float) -> Non
     assert P[0, 0] == pytest.approx(1 - gain)
 
 
-def test_gravity_and_bias_wander_while_nothing_tells_of_them() -> None:
+def test_without_measurements_gravity_and_bias_walk_as_configured() -> None:
     """2 mm/s2 of the accelerometer's bias and 5 mm/s2 of gravity in a second, as the root of time; speed by shaking."""
     for seconds in (1, 4):
         stamps = np.arange(0, seconds * 1_000_000_000 + 1, IMU_NS)
@@ -47,7 +47,7 @@ def test_gravity_and_bias_wander_while_nothing_tells_of_them() -> None:
 @pytest.mark.parametrize(
     ("rate_hz", "is_refused"), [(50 * (1 - 20e-6), False), (48.0, False), (47.0, True), (10.0, True)]
 )
-def test_fifty_hertz_by_a_clock_that_is_slow_are_fifty_hertz(rate_hz: float, is_refused: bool) -> None:
+def test_the_least_rate_tolerates_a_slow_clock(rate_hz: float, is_refused: bool) -> None:
     """By 20 ppm here: the method, the note of a run and `info` agree."""
     stamps = np.round(np.arange(120) * 1e9 / rate_hz).astype(np.int64)
     shaken = np.random.default_rng(0).normal(0, 0.01, (2, 120, 3))
@@ -93,7 +93,9 @@ def tumbling(noise_deg: float, turned_deg: float = 0.0, mirrored: int = 1) -> No
         (0.5, 0.0, -1, ""),
     ],
 )
-def test_other_axes_must_fit_four_times_as_well(noise_deg: float, turned_deg: float, mirrored: int, says: str) -> None:
+def test_wrong_axes_are_refused_when_others_fit_four_times_as_well(
+    noise_deg: float, turned_deg: float, mirrored: int, says: str
+) -> None:
     """And be 20 deg off. What is left about the given axes is 5.7 and 3.1 times what is left about those turned by 25 deg,
     5.9 and 2.7 times what is left when mirrored: the noise of registration is half of a mounting that is a little askew."""
     if says:
@@ -112,7 +114,7 @@ def test_other_axes_must_fit_four_times_as_well(noise_deg: float, turned_deg: fl
         (0.018, 0.27, 0.055, False),
     ],
 )
-def test_a_sensor_stands_that_hardly_shakes_and_hardly_moves(
+def test_a_static_start_needs_small_readings_and_small_motion(
     rate: float, force: float, moved: float, stands: bool
 ) -> None:
     """Readings to either side of their mean by so many rad/s and m/s2, over a second, and so many m to and fro."""
@@ -127,7 +129,7 @@ def test_a_sensor_stands_that_hardly_shakes_and_hardly_moves(
 
 
 @pytest.mark.parametrize(("samples", "first_scan", "stands"), [(5, 0, True), (4, 0, False), (5, 1, False)])
-def test_a_second_of_too_few_samples_or_scans_tells_of_no_standing(samples: int, first_scan: int, stands: bool) -> None:
+def test_a_static_start_needs_five_samples_and_three_scans(samples: int, first_scan: int, stands: bool) -> None:
     """Five samples and three scans are needed within a second of the first scan."""
     begin = 600_000_000 * first_scan
     stamps = begin + np.round(np.linspace(0, 1e9, samples, endpoint=False)).astype(np.int64)
@@ -136,7 +138,7 @@ def test_a_second_of_too_few_samples_or_scans_tells_of_no_standing(samples: int,
     assert _is_stationary(imu, scans, np.tile(np.eye(4), (len(scans), 1, 1)))[0] == stands
 
 
-def test_the_first_speed_is_as_sure_as_the_scans_show_a_path_without_noise() -> None:
+def test_the_sigma_of_the_first_velocity_follows_the_noise_of_the_scans() -> None:
     """A sensor at rest whose places are seen with white noise of 0.2 m: the speed that they fit errs by as much as is said."""
     stamps = np.arange(0, 3_100_000_000, IMU_NS)
     imu = ImuStream(stamps, np.tile([0.0, 0.0, 9.8], (len(stamps), 1)), np.zeros((len(stamps), 3)))
@@ -155,7 +157,7 @@ def test_the_first_speed_is_as_sure_as_the_scans_show_a_path_without_noise() -> 
 
 
 @pytest.mark.parametrize(("scan_ns", "used"), [(SCAN_NS, 8), (3 * SCAN_NS, 4)])
-def test_the_first_speed_is_that_of_the_first_scans_alone(scan_ns: int, used: int) -> None:
+def test_the_first_velocity_is_that_of_the_first_scans_alone(scan_ns: int, used: int) -> None:
     """Of 0.8 s, or of four scans where they are slow; 3 m/s, and whatever becomes of the path from then on."""
     stamps = np.arange(0, 3_100_000_000, IMU_NS)
     imu = ImuStream(stamps, np.tile([0.0, 0.0, 9.8], (len(stamps), 1)), np.zeros((len(stamps), 3)))
@@ -170,7 +172,7 @@ def test_the_first_speed_is_that_of_the_first_scans_alone(scan_ns: int, used: in
         assert (sigma < 1e-6) == is_right
 
 
-def test_turns_that_hardly_fit_better_at_the_edge_tell_nothing_of_the_clock() -> None:
+def test_a_flat_correlation_gives_no_time_offset() -> None:
     """A turn that grows evenly, all but, felt 0.3 s too late: the best of a quarter of a second is none."""
     stamps = np.arange(0, 13_000_000_000, IMU_NS)
     t, scans = 1e-9 * stamps, SCAN_NS * np.arange(5, 125)
@@ -183,7 +185,7 @@ def test_turns_that_hardly_fit_better_at_the_edge_tell_nothing_of_the_clock() ->
     assert found.offset_s == 0.0
 
 
-def test_gravity_is_as_strong_as_anywhere_on_the_earth() -> None:
+def test_the_sigma_of_gravity_covers_the_earth() -> None:
     """From 9.764 m/s2 on Huascaran to 9.834 at sea in the Arctic: beyond one sigma, within two. Its direction stays free."""
     stamps = np.arange(0, 100_000_001, IMU_NS)
     imu = ImuStream(stamps, np.tile([0.0, 0.0, 9.8], (len(stamps), 1)), np.zeros((len(stamps), 3)))

@@ -35,7 +35,7 @@ def spoilt(imu: ImuStream, **values: object) -> ImuStream:
     return dataclasses.replace(imu, **values)  # type: ignore[arg-type]
 
 
-def test_only_what_no_silence_parts_tells_of_the_first_scans() -> None:
+def test_first_poses_are_split_where_the_imu_has_a_gap() -> None:
     """Sweeps of 0.1 s and no sample from 0.32 to 0.58 s, of which 50 ms at either end are known: scans 3 to 6 stand apart."""
     stamps = np.arange(12) * 100_000_000
     numbered = np.arange(12.0)[:, None, None] * np.eye(4)
@@ -74,7 +74,7 @@ def test_a_moving_start_finds_speed_biases_and_gravity(make: object) -> None:
     assert np.linalg.norm(found.estimate.velocity - velocity) < 0.1
 
 
-def test_a_static_start_is_seen_and_levels_to_half_a_degree() -> None:
+def test_a_static_start_is_detected_and_levels_to_half_a_degree() -> None:
     drive = walk("icm20948-calibrated", static_start=2.0)
     found = begun(drive)
     assert found.is_static
@@ -85,7 +85,7 @@ def test_a_static_start_is_seen_and_levels_to_half_a_degree() -> None:
     assert np.rad2deg(np.arccos(cosine)) < 0.5
 
 
-def test_stamps_that_are_late_are_moved_back() -> None:
+def test_a_time_offset_of_the_imu_is_corrected() -> None:
     drive = walk()
     for wrong in (0.02, -0.035):
         found = begun(drive, late(stream_of(drive), wrong))
@@ -95,7 +95,7 @@ def test_stamps_that_are_late_are_moved_back() -> None:
     assert begun(drive).offset_s == pytest.approx(0.0, abs=2e-3)
 
 
-def test_a_given_offset_and_given_values_are_taken() -> None:
+def test_a_configured_time_offset_and_configured_values_are_used() -> None:
     drive = drone()
     found = begun(
         drive, late(stream_of(drive), 3.0), time_offset_s=-3.0, gyro_bias=(GYRO_BIAS,) * 3, initial_velocity=(9.0, 0, 0)
@@ -106,7 +106,7 @@ def test_a_given_offset_and_given_values_are_taken() -> None:
 
 
 @pytest.mark.parametrize("make", [walk, drone])
-def test_a_given_bias_is_known_unless_the_first_scans_contradict_it(make: object) -> None:
+def test_a_configured_bias_is_used_unless_the_first_scans_contradict_it(make: object) -> None:
     drive: SimulatedDrive = make()  # type: ignore[operator]
     right, wrong = (begun(drive, gyro_bias=(given,) * 3).estimate.gyroscope for given in (GYRO_BIAS, GYRO_BIAS - 0.025))
     assert np.abs(right.bias - GYRO_BIAS).max() < 5e-4
@@ -114,7 +114,7 @@ def test_a_given_bias_is_known_unless_the_first_scans_contradict_it(make: object
     assert np.abs(wrong.bias - GYRO_BIAS).max() < 0.004
 
 
-def test_g_is_converted_and_said() -> None:
+def test_readings_in_g_are_converted_and_noted() -> None:
     drive = walk()
     imu = stream_of(drive)
     found = begun(drive, spoilt(imu, accel=imu.accel / 9.80665))
@@ -122,7 +122,7 @@ def test_g_is_converted_and_said() -> None:
     assert any("in g" in note for note in found.notes)
 
 
-def test_a_slow_imu_says_what_it_cannot_do() -> None:
+def test_a_slow_imu_is_noted_with_its_rate() -> None:
     drive = walk()
     imu = stream_of(drive)
     found = begun(drive, ImuStream(imu.stamps_ns[::10], imu.accel[::10], imu.gyro[::10]))
@@ -158,7 +158,7 @@ ROLLED = np.roll(np.eye(3), 1, axis=0)
         ("empty", "0 usable"),
     ],
 )
-def test_garbage_is_refused_with_a_reason(kind: str, says: str) -> None:
+def test_invalid_streams_are_refused_with_a_reason(kind: str, says: str) -> None:
     drive = walk()
     imu = stream_of(drive)
     rng = np.random.default_rng(0)
@@ -186,7 +186,7 @@ def test_garbage_is_refused_with_a_reason(kind: str, says: str) -> None:
         begun(drive, bad)
 
 
-def test_a_clock_just_beyond_the_near_search_is_named_not_called_its_edge() -> None:
+def test_a_time_offset_beyond_the_near_search_is_reported_with_its_value() -> None:
     """At 0.25 s a slow turner's rates still correlate above the limit of a refusal."""
     drive = drone()
     shake = walk()
@@ -206,7 +206,7 @@ def test_a_rough_road_does_not_hide_gravity() -> None:
     assert gravity_unit(spoilt(rough, accel=rough.accel - [0, 0, 9.80665]))[1] is None
 
 
-def test_wrong_extrinsics_are_named_with_the_turn_that_would_mend_them() -> None:
+def test_wrong_extrinsics_are_reported_with_the_rotation_that_corrects_them() -> None:
     drive = walk()
     with pytest.raises(ImuRefusedError, match=r"turned by 1[12]\d deg"):
         begun(drive, T_lidar_imu=se3.make(ROLLED, np.zeros(3)))

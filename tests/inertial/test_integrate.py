@@ -15,7 +15,7 @@ NONE = np.zeros(3)
 
 
 @pytest.mark.parametrize("anchor", [0, 5, 10])
-def test_an_ideal_imu_walks_where_the_body_walked(anchor: int) -> None:
+def test_integration_of_an_ideal_imu_is_the_true_path(anchor: int) -> None:
     """From any of the instants, forwards and backwards: half a second of a walker's swing, to a millimetre."""
     drive = walk("ideal")
     assert drive.imu is not None

@@ -62,7 +62,7 @@ def ahead(known: NavigationState, imu: ImuStream) -> NavigationState:
 
 
 @pytest.mark.parametrize("direction", range(SIZE))
-def test_errors_travel_as_the_covariance_says(direction: int) -> None:
+def test_covariance_propagation_equals_finite_differences_of_the_integration(direction: int) -> None:
     imu, x = stream(), 1e-4 * np.eye(SIZE)[direction]
     nothing = np.zeros((SIZE, SIZE))
     moved = difference(ahead(state(nothing), imu), ahead(disturbed(state(nothing), x), imu))
@@ -76,14 +76,14 @@ def test_errors_travel_as_the_covariance_says(direction: int) -> None:
     np.testing.assert_allclose(added[np.ix_(kept, kept)], np.outer(moved[kept], moved[kept]), atol=2e-11)
 
 
-def test_noise_grows_where_nothing_is_wrong() -> None:
+def test_process_noise_alone_increases_the_covariance() -> None:
     grown = ahead(state(np.zeros((SIZE, SIZE))), stream()).covariance
     assert (np.diag(grown)[: GYRO.start + 3] > 0).all()
     assert (np.diag(grown)[GYRO.start + 3 :] == 0).all(), "axes of a device do not wander"
     np.testing.assert_array_equal(grown, grown.T)
 
 
-def test_a_pose_teaches_what_the_joint_gaussian_says() -> None:
+def test_a_pose_update_is_conditioning_of_the_joint_gaussian() -> None:
     """Against the information form: the pose's own estimate replaces its prior, the rest follows."""
     rng = np.random.default_rng(7)
     root = rng.normal(size=(SIZE, SIZE)) * 1e-3

@@ -33,7 +33,7 @@ def turning(peak_deg: float, limit: float = LIMIT, noise: float = 1e-4) -> tuple
 
 
 @pytest.mark.parametrize("peak_deg", [300.0, 360.0])
-def test_what_is_cut_off_is_filled_in_and_its_sigma_says_how_well(peak_deg: float) -> None:
+def test_saturated_readings_are_filled_in_within_their_sigma(peak_deg: float) -> None:
     whole, read = turning(peak_deg)
     notes: list[str] = []
     filled = with_hidden(read, notes)
@@ -49,7 +49,7 @@ def test_what_is_cut_off_is_filled_in_and_its_sigma_says_how_well(peak_deg: floa
     assert f"{int(cut.sum())} at the 4.363 rad/s of its gyroscope" in notes[0]
 
 
-def test_an_extreme_that_noise_made_is_no_end_of_the_range() -> None:
+def test_an_extreme_of_noise_is_not_the_end_of_the_range() -> None:
     whole, _ = turning(360.0)
     notes: list[str] = []
     assert with_hidden(whole, notes) is whole
@@ -75,7 +75,7 @@ def test_both_ends_of_an_asymmetric_range_are_filled_in() -> None:
     assert abs(means[2] - means[0]) < abs(means[1] - means[0]), "one half alone turns the heading"
 
 
-def test_every_axis_has_an_end_of_its_own() -> None:
+def test_every_axis_has_its_own_range() -> None:
     """The third comes to its end for a sample at a time only: that the others stay there tells what it is."""
     rates = np.tile(turning(360.0)[0].gyro[:, 1:2], 3)
     rates[:, 2] = 0.0
@@ -126,7 +126,7 @@ def test_the_smooth_top_of_a_coarse_reading_is_no_end_of_the_range() -> None:
     assert with_hidden(smooth, []) is smooth
 
 
-def test_what_was_filled_in_is_not_taken_for_a_range() -> None:
+def test_filled_in_readings_do_not_define_a_range() -> None:
     _, read = turning(400.0)
     once = clean(read, 0, int(5e9))
     again = clean(once.imu, 0, int(5e9))
@@ -136,7 +136,7 @@ def test_what_was_filled_in_is_not_taken_for_a_range() -> None:
     np.testing.assert_array_equal(again.imu.gyro, once.imu.gyro)
 
 
-def test_a_step_over_a_cut_is_known_the_less_and_any_other_as_before() -> None:
+def test_only_a_step_over_saturated_readings_has_a_larger_covariance() -> None:
     _, read = turning(400.0)
     filled = with_hidden(read, [])
     none = np.zeros(3)
@@ -156,7 +156,7 @@ def test_a_step_over_a_cut_is_known_the_less_and_any_other_as_before() -> None:
     assert sigmas[3][2][0] > 2 * sigmas[2][2][0], "a force that is turned wrongly leads astray"
 
 
-def test_speed_and_turn_over_a_cut_are_unsure_by_what_it_may_hide() -> None:
+def test_saturation_adds_its_sigma_to_velocity_and_rotation() -> None:
     """A force and a rate hidden all the time lead as far astray as a constant error of one sigma."""
     stamps, none = np.arange(11, dtype=np.int64) * 10_000_000, np.zeros(3)
     accel = np.tile([0.0, 0.0, GRAVITY], (11, 1))
@@ -171,7 +171,7 @@ def test_speed_and_turn_over_a_cut_are_unsure_by_what_it_may_hide() -> None:
     np.testing.assert_allclose([step.hidden_density for step in steps], [(0.0, 0.0), (0.9, 0.025)])
 
 
-def test_a_flight_beyond_the_range_of_its_imu_is_survived_and_said() -> None:
+def test_a_flight_with_saturated_readings_is_followed_and_reported() -> None:
     """Two thirds of its readings sit at 2 g and a tenth at 250 deg/s from the third second on."""
     drive = simulate("quadrotor", lidar="vlp16", count=60, imu="icm20948", motion_compensated=False)
     settings = ["odometry.method=fast-lio2", "loops.use=false", "map.write=false"]

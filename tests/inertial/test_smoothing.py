@@ -37,7 +37,7 @@ def swinging() -> SmootherMotion:
     return SmootherMotion(imu, T_lidar_imu, estimate, ImuConfig(), InertialSmoother(IMU_NOISE, 10))
 
 
-def test_readings_are_carried_to_the_lidar() -> None:
+def test_readings_are_transformed_to_the_lidar() -> None:
     motion = swinging()
     chain = motion.chain([(0, 100_000_000), (1, 900_000_000), (2, 1_700_000_000)], IMU_NOISE)
     assert chain is not None
@@ -111,7 +111,7 @@ def is_followed(motion: SmootherMotion, k: int) -> bool:
     return all(r.status == "ok" for r in results) and len(states[0]) == 3 and float(np.linalg.norm(states[1])) < 0.02
 
 
-def test_a_scan_whose_graph_has_no_solution_is_bridged_as_surely_as_the_imu_is() -> None:
+def test_a_scan_without_a_graph_solution_is_bridged_with_the_covariance_of_the_imu() -> None:
     motion = flying(10)
     unsolvable(motion)
     predicted = motion.sweep(int(STAMPS[10]), Span()).pose
@@ -131,7 +131,7 @@ def test_a_scan_whose_graph_has_no_solution_is_bridged_as_surely_as_the_imu_is()
     assert is_followed(motion, 11)
 
 
-def test_where_the_graph_cannot_carry_a_scan_it_begins_anew_behind_it() -> None:
+def test_the_graph_restarts_after_a_scan_that_it_cannot_solve() -> None:
     motion = flying(10)
     unsolvable(motion)
     stamp = int(STAMPS[10])
@@ -144,7 +144,7 @@ def test_where_the_graph_cannot_carry_a_scan_it_begins_anew_behind_it() -> None:
     assert is_followed(motion, 11)
 
 
-def test_silence_is_no_link_and_nothing_else_no_chain() -> None:
+def test_a_gap_gives_no_link_and_gaps_alone_give_no_chain() -> None:
     motion = swinging()
     chain = motion.chain([(0, 100_000_000), (1, 900_000_000), (2, 3_000_000_000)], IMU_NOISE)
     assert chain is not None

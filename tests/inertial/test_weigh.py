@@ -71,14 +71,14 @@ def followed(
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
-def test_turns_that_registration_hardly_sees_are_the_gyroscopes(seed: int) -> None:
+def test_poorly_registered_rotations_are_taken_from_the_gyroscope(seed: int) -> None:
     seen, weighed = followed(motion_of(), 0.005, np.deg2rad(0.15), seed)
     assert np.sqrt(np.mean(weighed[:, 1] ** 2)) < 0.35 * np.sqrt(np.mean(seen[:, 1] ** 2))
     assert np.sqrt(np.mean(weighed[:, 0] ** 2)) < 1.1 * np.sqrt(np.mean(seen[:, 0] ** 2))
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
-def test_a_registration_that_is_better_than_the_imu_stays(seed: int) -> None:
+def test_a_registration_better_than_the_imu_is_kept(seed: int) -> None:
     seen, weighed = followed(motion_of(), 1e-3, np.deg2rad(2e-3), seed)
     assert np.abs(weighed - seen).max() < 1e-3
     assert np.sqrt(np.mean(weighed[:, 1] ** 2)) < 1.05 * np.sqrt(np.mean(seen[:, 1] ** 2))
@@ -92,7 +92,7 @@ def begun(motion: InertialMotion, count: int = 3) -> tuple[int, Floats]:
     return int(stamps[count]), poses[count]
 
 
-def test_a_direction_that_registration_leaves_open_is_the_imus() -> None:
+def test_a_degenerate_direction_is_taken_from_the_imu() -> None:
     """A metre along x, tied to 0.1 rad of pitch, as a weak direction of both together is: neither may run away."""
     motion = motion_of()
     stamp, true = begun(motion)
@@ -107,7 +107,7 @@ def test_a_direction_that_registration_leaves_open_is_the_imus() -> None:
     assert out.registration_covariance[0, 0] < 1e-2
 
 
-def test_a_poor_registration_teaches_the_gyroscope_nothing() -> None:
+def test_a_poor_registration_does_not_update_the_gyroscope() -> None:
     """Neither by what it saw, nor by agreeing with the gyroscope once it was weighed against it."""
     motion = motion_of()
     stamp, true = begun(motion)
@@ -123,7 +123,7 @@ def test_a_poor_registration_teaches_the_gyroscope_nothing() -> None:
     assert (np.diag(after.covariance) > (1 - 1e-5) * np.diag(before.covariance)).all()
 
 
-def test_a_place_that_registration_hardly_sees_along_one_axis_teaches_the_velocity_nothing_there() -> None:
+def test_a_poorly_constrained_axis_does_not_update_the_velocity_along_it() -> None:
     """Agreeing with the IMU once it was weighed against it is no proof of the velocity either."""
     motion = motion_of()
     stamp, true = begun(motion)
@@ -142,7 +142,7 @@ def test_a_place_that_registration_hardly_sees_along_one_axis_teaches_the_veloci
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
-def test_the_velocity_is_as_sure_as_it_says_whatever_registration_is(seed: int) -> None:
+def test_the_velocity_is_within_its_covariance_with_poor_registration(seed: int) -> None:
     """Places known to decimetres: the velocity's error is within its own covariance, not within a good registration's."""
     motion = motion_of()
     rng = np.random.default_rng(seed)
@@ -181,7 +181,7 @@ def test_no_interval_is_integrated_twice(monkeypatch: pytest.MonkeyPatch) -> Non
 
 
 @pytest.mark.parametrize("why", ["another scan was expected", "restored"])
-def test_what_was_integrated_for_another_scan_is_not_taken(why: str) -> None:
+def test_the_integration_of_another_scan_is_not_reused(why: str) -> None:
     motion, other = motion_of(), motion_of()
     stamps, poses = truth_of(drone())
     begun(motion)
@@ -201,7 +201,7 @@ def test_what_was_integrated_for_another_scan_is_not_taken(why: str) -> None:
     assert motion.prior_errors() == other.prior_errors()
 
 
-def test_an_old_map_counts_for_more_than_one_scan() -> None:
+def test_registration_on_an_older_map_has_more_weight() -> None:
     motion = motion_of()
     stamp, true = begun(motion)
     seen = true @ se3.make(so3.exp(np.array([0, 0, 4e-4])), np.zeros(3))
@@ -236,7 +236,7 @@ def test_the_registered_pose_stays_where_nothing_can_be_weighed(why: str) -> Non
         assert not np.array_equal(weighed.T_world_lidar, seen), "with samples it would have been"
 
 
-def test_the_step_from_a_scan_in_a_gap_teaches_the_gyroscope_nothing() -> None:
+def test_the_step_from_a_scan_in_a_gap_does_not_update_the_gyroscope() -> None:
     """That scan was deskewed without the IMU: here it is off by half a degree."""
     imu = motion_of().imu
     stamps, poses = truth_of(drone())
@@ -255,7 +255,7 @@ def test_the_step_from_a_scan_in_a_gap_teaches_the_gyroscope_nothing() -> None:
     assert taught[1] == 0.0
 
 
-def test_over_a_silence_between_two_sweeps_constant_velocity_predicts() -> None:
+def test_over_a_gap_between_two_sweeps_constant_velocity_predicts() -> None:
     """Samples tell of the last scan and of the next, which is the fourth after it, and of nothing between."""
     imu, (stamps, _) = motion_of().imu, truth_of(drone())
     near_ns = 10_000_000
@@ -273,7 +273,7 @@ FALSE = se3.make(so3.exp(np.array([0, 0.2, 0])), np.array([0, 0, 2.0]))
 SURE = np.diag([1e-4] * 3 + [1e-6] * 3)
 
 
-def test_a_registration_that_neither_imu_nor_constant_velocity_bears_out_is_bridged() -> None:
+def test_a_registration_that_contradicts_imu_and_constant_velocity_is_bridged() -> None:
     motion = motion_of()
     stamp, true = begun(motion)
     prior = motion.sweep(stamp, Span())
@@ -286,7 +286,7 @@ def test_a_registration_that_neither_imu_nor_constant_velocity_bears_out_is_brid
     assert 1e-4 < np.sqrt(np.linalg.eigvalsh(out.registration_covariance[:3, :3])[-1]) < 0.05
 
 
-def test_a_bridged_scan_is_as_sure_as_the_imu_whatever_registration_said_of_itself() -> None:
+def test_a_bridged_scan_has_the_covariance_of_the_imu() -> None:
     bridged = []
     for C in (SURE, 0.1 * SURE):
         motion = motion_of()
@@ -300,7 +300,7 @@ def test_a_bridged_scan_is_as_sure_as_the_imu_whatever_registration_said_of_itse
 
 
 @pytest.mark.parametrize("why", ["no speed yet", "the sweep ends in a gap", "another scan was expected"])
-def test_a_contradiction_that_nobody_can_decide_leaves_the_pose_registered(why: str) -> None:
+def test_an_undecidable_contradiction_keeps_the_registered_pose(why: str) -> None:
     imu, stamps = motion_of().imu, drone().stamps_ns
     config, span = ImuConfig(use=True), Span(0.0, 0.1 if why == "the sweep ends in a gap" else 0.0)
     # Samples tell of `gap_s` more: of the middle of the sweep that begins at scan 3, not of its end.
@@ -316,7 +316,7 @@ def test_a_contradiction_that_nobody_can_decide_leaves_the_pose_registered(why: 
 
 
 @pytest.mark.parametrize("is_restored", [False, True])
-def test_a_registration_that_insists_is_believed(is_restored: bool) -> None:
+def test_a_registration_that_persists_is_accepted(is_restored: bool) -> None:
     motion = motion_of()
     stamps, poses = truth_of(drone())
     stamp, true = begun(motion)
@@ -335,7 +335,7 @@ def test_a_registration_that_insists_is_believed(is_restored: bool) -> None:
             motion.correct(stamp, poses[k], prior)
 
 
-def test_an_imu_that_constant_velocity_does_not_bear_out_leaves_the_pose_registered() -> None:
+def test_an_imu_that_contradicts_constant_velocity_keeps_the_registered_pose() -> None:
     """It was hit: for a tenth of a second its gyroscope reads three turns per second more."""
     imu, stamps = motion_of().imu, drone().stamps_ns
     gyro = imu.gyro.copy()

@@ -114,7 +114,7 @@ def test_jacobians_are_derivatives() -> None:
     assert np.abs(numerical[6:9][:, rates]).max() < 0.1
 
 
-def test_a_scan_pulls_the_imu_along_its_lever() -> None:
+def test_the_factor_of_a_scan_includes_the_lever_arm() -> None:
     window = replace(true_window(1), moments=(replace(true_moment(0), T_world_imu=true_pose(0.02)),))
     H, g = np.zeros((SHARED + EACH,) * 2), np.zeros(SHARED + EACH)
     window._add_scan(H, g, 0)
@@ -140,7 +140,7 @@ def test_a_walk_widens_the_covariance_of_what_walks_and_keeps_the_mean() -> None
     np.testing.assert_allclose(np.linalg.solve(wider, gradient), np.linalg.solve(H, g), atol=1e-10)
 
 
-def test_a_window_that_slid_knows_what_the_whole_of_it_knows(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_marginalised_window_has_the_estimate_of_the_whole(monkeypatch: pytest.MonkeyPatch) -> None:
     """The batch of all moments, against one that marginalised half of them on the way, where gravity does not walk."""
     monkeypatch.setattr("lslam.inertial.window.GRAVITY_WALK", 1e-9)
     imu, batch = stream(), disturbed(true_window(8))
@@ -191,7 +191,7 @@ def like() -> ImuEstimate:
     return ImuEstimate(np.zeros(3), DOWN, np.zeros(3), Gyroscope(np.zeros(3)), np.zeros((9, 9)))
 
 
-def test_what_cannot_be_solved_stays_where_it_is_and_has_no_covariance() -> None:
+def test_an_unsolvable_window_is_unchanged_and_has_no_covariance() -> None:
     window = begun(true_moment(0))
     window = replace(window, past=replace(window.past, information=-window.past.information))
     found, H = window.solved(stream())

@@ -25,7 +25,7 @@ def lifted(p: NDArray[np.float32], angle: float = ANGLE) -> NDArray[np.float32]:
 
 
 @pytest.mark.parametrize("angle", [ANGLE, -0.3, 1.0])
-def test_is_the_rotation_about_p_cross_z(angle: float) -> None:
+def test_vertical_correction_is_the_rotation_about_p_cross_z(angle: float) -> None:
     p = points()
     axis = np.cross(p.astype(np.float64), [0.0, 0.0, 1.0])
     axis /= np.linalg.norm(axis, axis=1, keepdims=True)
@@ -33,7 +33,7 @@ def test_is_the_rotation_about_p_cross_z(angle: float) -> None:
     np.testing.assert_allclose(lifted(p, angle), expected, atol=2e-5)
 
 
-def test_agrees_with_kiss_icp() -> None:
+def test_vertical_correction_agrees_with_kiss_icp() -> None:
     pybind = pytest.importorskip("kiss_icp.pybind.kiss_icp_pybind")
     p = points()
     theirs = np.asarray(pybind._correct_kitti_scan(pybind._Vector3dVector(p.astype(np.float64))))

@@ -20,7 +20,7 @@ def by_hand(points: NDArray[np.float32], rings: int, sectors: int, reach: float)
     return image
 
 
-def test_equals_the_definition() -> None:
+def test_polar_image_equals_its_definition() -> None:
     points = np.random.default_rng(0).uniform([-90, -90, -3], [90, 90, 9], (5000, 3)).astype(np.float32)
     assert np.array_equal(polar_image(points, 20, 60, 80.0), by_hand(points, 20, 60, 80.0))
 

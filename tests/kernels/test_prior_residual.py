@@ -51,7 +51,7 @@ def test_gradient_and_curvature_are_those_of_the_squared_length(turn: float) -> 
         assert g[k] == pytest.approx((ahead - behind) / (2 * step), abs=1e-6 + 12 * turn)
 
 
-def test_it_counts_as_it_is_whatever_the_points_are_divided_by() -> None:
+def test_the_prior_is_unaffected_by_the_relative_weights_of_points() -> None:
     target = known()
     t = target[1] + 0.1
     H, _, g, facts = sums_at(target[0], t, target, population=25.0)

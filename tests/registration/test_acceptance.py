@@ -30,7 +30,7 @@ def judged(
     return accepted(result, PRIOR, CONFIG, usual, 0.6, wording)
 
 
-def test_what_passes_all_gates_gets_its_correction_of_the_prior() -> None:
+def test_an_accepted_result_has_its_correction_of_the_prior() -> None:
     result = judged(OF_POINTS)
     assert (result.ok, result.reason, result.inliers) == (True, "", 80)
     np.testing.assert_allclose(result.prior_error, (0.1, np.deg2rad(1.0)))
@@ -51,7 +51,7 @@ def test_what_passes_all_gates_gets_its_correction_of_the_prior() -> None:
         ({"reason": "singular", "inliers": 0}, "singular", "singular"),
     ],
 )  # fmt: skip
-def test_what_is_refused_keeps_the_prior_and_says_why(
+def test_a_rejected_result_keeps_the_prior_with_a_reason(
     facts: dict[str, float], of_points: str, of_features: str
 ) -> None:
     for wording, why in ((OF_POINTS, of_points), (OF_FEATURES, of_features)):

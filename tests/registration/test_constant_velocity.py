@@ -98,7 +98,7 @@ def test_a_sweep_moves_as_the_sensor_did(span: Span) -> None:
 
 
 @pytest.mark.parametrize("span", SPANS)
-def test_refining_finds_the_velocity_that_the_middle_tells(span: Span) -> None:
+def test_refining_estimates_the_velocity_from_the_middle_of_the_sweep(span: Span) -> None:
     """The prior is 20 % too slow; registration puts the middle of the sweep right, as it does for a skewed cloud."""
     motion = ConstantVelocity()
     poses = drive(motion, TWIST, 4, span)
@@ -120,7 +120,7 @@ def test_the_first_sweep_has_no_motion_to_refine(span: Span) -> None:
     assert ConstantVelocity().refine(prior, TENTH, poses(4)[3]) is prior
 
 
-def test_a_misplaced_scan_is_not_taken_for_a_velocity_and_a_lasting_change_is() -> None:
+def test_a_velocity_change_is_accepted_when_it_persists() -> None:
     """At 30 m/s, one scan half a metre too far: 50 m/s2 no sensor has. What the next step says again is believed."""
     most = ConstantVelocity.MAX_ACCELERATION * 0.1**2
 

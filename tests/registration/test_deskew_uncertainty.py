@@ -32,7 +32,7 @@ def steady(pose: float, velocity: float, passed: float = 0.0) -> MotionPrior:
 
 @pytest.mark.parametrize("passed", [0.0, 0.5, 0.3])
 @pytest.mark.parametrize("every", [1, 4])
-def test_a_steady_acceleration_is_told_to_its_last_millimetre(every: int, passed: float) -> None:
+def test_the_deskew_uncertainty_of_a_steady_acceleration_is_exact(every: int, passed: float) -> None:
     """Points deskewed by the velocity since the last sweep's middle: their mean error is that of the pose at the stamp.
 
     2 m/s2, points all over the sweep, every scan and every fourth, stamps at its start, in its middle and between.
@@ -54,7 +54,7 @@ def test_a_steady_acceleration_is_told_to_its_last_millimetre(every: int, passed
 
 
 @pytest.mark.parametrize(("passed", "part"), [(0.0, 6), (0.5, 24)])
-def test_before_anything_is_known_a_car_may_brake_and_a_hand_turn(passed: float, part: int) -> None:
+def test_the_first_deskew_uncertainty_allows_braking_and_hand_rotation(passed: float, part: int) -> None:
     """3 m/s2 and 1 rad/s2 over a sweep T put its start off by a T^2 / 6 and its middle by a T^2 / 24.
 
     The second scan cannot tell, the third can.
@@ -67,7 +67,7 @@ def test_before_anything_is_known_a_car_may_brake_and_a_hand_turn(passed: float,
     assert not doubt.observe(steady(2.0, 10.0, passed), 2 * 10**8, at(2.0), is_registered=True).any()
 
 
-def test_what_is_taken_up_again_learns_as_if_nothing_had_been() -> None:
+def test_deskew_uncertainty_resumes_to_the_last_bit() -> None:
     """The next lesson needs where in its sweep the stamp of the scan before lay."""
     whole, again = DeskewUncertainty(), DeskewUncertainty()
     for k in range(6):
@@ -79,7 +79,7 @@ def test_what_is_taken_up_again_learns_as_if_nothing_had_been() -> None:
 
 
 @pytest.mark.parametrize("passed", [0.0, 0.5])
-def test_a_sweep_that_outlasts_the_way_to_the_next_teaches_no_more_than_one_that_fills_it(passed: float) -> None:
+def test_a_sweep_longer_than_the_step_counts_as_one_of_its_length(passed: float) -> None:
     """Stamps that come in bursts make it look so. The velocity is what was wrong, and it is the same."""
     full, longer, step = DeskewUncertainty(), DeskewUncertainty(), round(1e9 * SPAN)
     for k in range(6):
@@ -115,7 +115,7 @@ def test_scans_of_one_instant_have_no_deskew_uncertainty() -> None:
         assert not S.any()
 
 
-def test_a_failed_scan_teaches_nothing() -> None:
+def test_a_failed_scan_does_not_change_the_deskew_uncertainty() -> None:
     rng = np.random.default_rng(0)
     doubt = DeskewUncertainty()
     for k in range(12):
@@ -144,7 +144,7 @@ def test_the_first_sweep_is_in_all_poses() -> None:
     assert found.covariance[2, 2] > one.covariance[2, 2] + 90**2 * found.registration_covariance[4, 4]
 
 
-def test_a_calm_ride_later_says_nothing_of_the_first_sweep() -> None:
+def test_later_motion_does_not_change_the_uncertainty_of_the_first_sweep() -> None:
     rng, C = np.random.default_rng(3), 1e-12 * np.eye(6)
     uncertainty, doubts = PoseUncertainty(), []
     for k in range(80):
@@ -160,7 +160,7 @@ def test_a_calm_ride_later_says_nothing_of_the_first_sweep() -> None:
     assert calm[0] == pytest.approx(0.8 * shaken[0], rel=0.1)
 
 
-def test_covariances_of_a_shaken_sensor_are_honest() -> None:
+def test_covariances_of_a_shaken_sensor_are_consistent() -> None:
     """Carried by a walker, deskewed at constant velocity: registrations alone are a hundred times too sure (1600).
 
     The error of the first sweep is in all poses, so their mean is that of a few draws: 0.7 and 4.6 for two seeds.
@@ -178,7 +178,7 @@ def test_covariances_of_a_shaken_sensor_are_honest() -> None:
     assert 0.05 < np.mean(nees) < 10.0
 
 
-def test_where_a_denied_scan_was_put_says_nothing_of_the_motion() -> None:
+def test_the_pose_of_a_rejected_scan_does_not_change_the_estimated_motion() -> None:
     """Two decimetres off, as an IMU may be: neither the way to it nor the way from it is an acceleration."""
     C, uncertainty = 1e-8 * np.eye(6), PoseUncertainty()
     for k in range(12):

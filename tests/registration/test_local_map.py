@@ -46,7 +46,7 @@ def test_map_points_enter_fine_voxels_and_source_points_all_larger_ones() -> Non
     assert len(target) == len(fine) > len(target.coarser[0]) > len(target.coarser[2]) > 0
 
 
-def test_all_levels_are_forgotten_and_taken_up_again() -> None:
+def test_all_levels_are_cleared_and_restored() -> None:
     target = new_map()
     target.insert(scan(0).map_points, scan(0).source, np.eye(4))
     known, again = deepcopy(target.state()), new_map()
@@ -75,7 +75,7 @@ def test_near_its_prior_a_scan_is_placed_well_while_the_map_is_young(scenario: s
     assert np.linalg.norm(result.T_world_lidar[:3, 3] - second[:3, 3]) < 0.02
 
 
-def test_what_an_alignment_remembers_is_void_once_the_map_has_changed() -> None:
+def test_cached_correspondences_are_discarded_when_the_map_changes() -> None:
     target, config = new_map(), RegistrationConfig()
     target.insert(scan(0).map_points, scan(0).source, np.eye(4))
     alignment, points = MapAlignment(target, config, "plane"), scan(1)

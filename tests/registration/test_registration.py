@@ -65,7 +65,7 @@ def test_a_start_at_unknown_speed_is_found(seed: int, limits: tuple[float, float
 
 @given(st.integers(0, 2**31))
 @settings(max_examples=10)
-def test_surprises_after_the_start_are_caught_coarse_to_fine(seed: int) -> None:
+def test_unexpected_motion_after_the_start_is_recovered_coarse_to_fine(seed: int) -> None:
     registration, _ = settled(6)
     rng = np.random.default_rng(seed)
     T = pose_at((0.5, 0.0, 0.0), 2.5) @ random_pose(rng, 2.0, 6.0)
@@ -103,7 +103,7 @@ def test_a_corridor_keeps_the_prior_along_itself_scan_after_scan() -> None:
 
 
 @pytest.mark.parametrize("n", [0, 1, MIN_SOURCE_POINTS - 1])
-def test_too_few_points_keep_the_prior_and_say_so(n: int) -> None:
+def test_too_few_points_keep_the_prior_with_a_reason(n: int) -> None:
     registration = in_room()
     prior = pose_at((0.3, 0.0, 0.0))
     result = registration.register(np.full((n, 3), 5.0) + np.arange(n)[:, None], prior)
@@ -129,7 +129,7 @@ def bad_scan(kind: str) -> NDArray[np.float32]:
 
 
 @pytest.mark.parametrize("kind", ["noise", "a ball of noise", "nan", "zeros", "empty"])
-def test_a_bad_scan_fails_touches_nothing_and_is_got_over(kind: str) -> None:
+def test_a_bad_scan_fails_without_effect_on_the_map_and_the_next_is_registered(kind: str) -> None:
     registration, rng = settled()
     before = copy.deepcopy(registration.map)
     result = registration.register(bad_scan(kind))
@@ -160,7 +160,7 @@ def test_a_jump_beyond_the_limit_fails() -> None:
     assert "5 deg" in result.reason
 
 
-def test_a_standing_sensor_neither_drifts_nor_grows_sure_of_itself() -> None:
+def test_a_static_sensor_neither_drifts_nor_becomes_overconfident() -> None:
     rng = np.random.default_rng(0)
     base = room(rng, 2500)
     registration = Registration()

@@ -82,7 +82,7 @@ def test_a_drive_through_the_room_is_followed(residual: Residual, target: str) -
 
 @pytest.mark.parametrize("residual", ["point", "vgicp"])
 @pytest.mark.parametrize("seed", [0, 1])
-def test_rings_on_flat_ground_do_not_teach_a_false_speed(residual: Residual, seed: int) -> None:
+def test_rings_on_flat_ground_do_not_bias_the_velocity(residual: Residual, seed: int) -> None:
     """3 m per scan on a motorway: what the first steps are short of would be kept at every later one."""
     drive = simulate("motorway", seed=seed, count=10, motion_compensated=True)
     registration = Registration(RegistrationConfig(residual=residual))
@@ -105,7 +105,7 @@ def on_the_way(residual: Residual) -> tuple[Registration, np.random.Generator]:
 
 @pytest.mark.parametrize("residual", RESIDUALS)
 @pytest.mark.parametrize("kind", ["noise", "nan", "far", "few"])
-def test_a_bad_scan_fails_says_why_and_leaves_the_map_alone(residual: Residual, kind: str) -> None:
+def test_a_bad_scan_fails_with_a_reason_and_does_not_change_the_map(residual: Residual, kind: str) -> None:
     registration, rng = copy.deepcopy(on_the_way(residual))
     before = copy.deepcopy(registration.map)
     points = {
@@ -175,7 +175,7 @@ def test_a_narrow_bound_rejects_what_has_moved(residual: Residual) -> None:
 
 
 @pytest.mark.parametrize("target", ["keyframe", "scan"])
-def test_the_map_holds_what_its_target_says(target: str) -> None:
+def test_the_map_has_the_extent_of_its_target(target: str) -> None:
     """Along a corridor 20 m are driven: the map of the last scan ends with it, that of three keyframes a little earlier."""
     rng = np.random.default_rng(6)
     registration = Registration(RegistrationConfig.model_validate({"target": target, "keyframes": 3}))

@@ -56,7 +56,7 @@ def test_agreement_collapses_only_against_what_was_usual() -> None:
     assert not agreement.is_collapse(0.21)
 
 
-def test_a_scan_that_agrees_less_than_usual_is_told_from_one_that_varies() -> None:
+def test_lower_agreement_is_distinguished_from_its_variation() -> None:
     agreement = UsualAgreement(0.5)
     assert not agreement.is_less(0.01)
     for share in (0.8, 0.72, 0.8, 0.72):
@@ -65,7 +65,7 @@ def test_a_scan_that_agrees_less_than_usual_is_told_from_one_that_varies() -> No
     assert agreement.is_less(0.6)
 
 
-def test_what_a_filling_map_agrees_with_is_usual_at_once() -> None:
+def test_usual_agreement_follows_a_growing_map_at_once() -> None:
     agreement = UsualAgreement(0.5)
     for share in (0.18, 0.34, 0.42, 0.46, 0.52):  # the sample drive, 16 x 400 rays
         assert not agreement.is_less(share)

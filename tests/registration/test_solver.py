@@ -112,7 +112,7 @@ def test_covariance_is_the_spread_of_the_results(room_map: GaussianMap) -> None:
 @pytest.mark.parametrize(
     ("held", "is_weak", "is_followed"), [(1.2, False, True), (0.9, True, True), (0.36, True, True), (0.25, True, False)]
 )
-def test_a_weak_direction_is_followed_while_it_holds_three_tenths_of_what_it_needs(
+def test_a_degenerate_direction_is_estimated_down_to_three_tenths_of_the_threshold(
     held: float, is_weak: bool, is_followed: bool
 ) -> None:
     """Along a corridor whose end is seen in 20 points: how much they hold is read from the covariance of a first solution."""

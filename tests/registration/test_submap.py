@@ -79,7 +79,7 @@ def test_the_nearest_and_the_hulls_nearest_corners_are_the_map() -> None:
     assert len(listed.held) <= NEAREST + ON_HULL
 
 
-def test_a_place_is_found_again_and_the_map_only_built_anew_when_a_keyframe_leaves() -> None:
+def test_the_map_is_rebuilt_only_when_a_keyframe_leaves_it() -> None:
     target = SubmapTarget()
     listed = entered(target, [pose_at((6.0 * k, 0.0, 0.0)) for k in range(NEAREST)], 15.0)
     assert listed.cleared == 0

@@ -37,7 +37,7 @@ def test_a_standing_sensor_does_not_drift() -> None:
         assert (now < C * (1 + np.pi**2 / 6) + 1e-18).all()
 
 
-def test_what_few_scans_are_registered_on_fewer_with_is_in_all_that_follow() -> None:
+def test_errors_of_the_first_registrations_remain_in_all_later_poses() -> None:
     """They agree with each other, so half of a large error of the second lasts, however good the later ones are."""
     exact, poor, good = 1e-9 * C, 100 * C, 0.01 * C
     uncertainty, chained = PoseUncertainty(), PoseUncertainty(is_scan_to_scan=True)
@@ -131,7 +131,7 @@ def test_no_covariance_gives_none() -> None:
     assert PoseUncertainty().add(result(1.0, None)) is None
 
 
-def test_a_map_is_as_old_as_the_way_over_which_it_is_seen() -> None:
+def test_map_age_is_the_number_of_scans_over_a_lever_arm() -> None:
     """One scan makes a new one, a standing sensor's is the mean of all; on the way it is renewed over a lever arm."""
     standing, driving, jumping = PoseUncertainty(), PoseUncertainty(), PoseUncertainty(is_scan_to_scan=True)
     for k in range(1, 400):
@@ -146,7 +146,7 @@ def test_a_map_is_as_old_as_the_way_over_which_it_is_seen() -> None:
     assert driving.map_age == before, "a scan that failed is not in the map"
 
 
-def test_covariances_do_not_ask_where_the_world_begins() -> None:
+def test_covariances_do_not_depend_on_the_origin_of_the_world() -> None:
     """The first sweep's tilt swings what lies ahead about the first place, not about the origin."""
     rng = np.random.default_rng(4)
     sweep = 1e-6 * np.cov(rng.normal(size=(6, 50)))
