@@ -71,7 +71,7 @@ def in_degrees(stub: Stub) -> Stub:
         (turned, "beside that of the scans: correct T_lidar_imu"), (in_g, "is in g, converted"),
     ],
 )  # fmt: skip
-def test_a_fault_is_said_and_survived(fault: Callable[[Stub], Stub], sentence: str, method: str) -> None:
+def test_a_fault_is_reported_and_the_run_is_followed(fault: Callable[[Stub], Stub], sentence: str, method: str) -> None:
     outcome = lslam.run(fault(walk()), load_config(None, [f"odometry.method={method}", *QUIET], {}))
     manifest = outcome.record.manifest
     said = [*manifest["imu"]["decisions"], *manifest["problems"]]

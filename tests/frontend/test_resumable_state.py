@@ -77,7 +77,7 @@ def drive() -> Sequence:
 
 
 @pytest.mark.parametrize(("method", "settings"), VARIANTS)
-def test_any_method_goes_on_where_it_was(method: str, settings: tuple[str, ...], tmp_path: Path) -> None:
+def test_every_method_resumes_to_the_last_bit(method: str, settings: tuple[str, ...], tmp_path: Path) -> None:
     config, sequence = config_of(method, *settings), drive()
     whole = tracker_of(config)
     assert isinstance(whole.odometry, Resumable)
@@ -98,7 +98,7 @@ def test_every_method_of_ours_can_leave_off(method: str) -> None:
     assert isinstance(create_odometry(config_of(method)), Resumable)
 
 
-def test_the_imu_goes_on_where_it_was(tmp_path: Path) -> None:
+def test_the_imu_resumes_to_the_last_bit(tmp_path: Path) -> None:
     lidar = replace(LIDARS["vlp16"], columns=900)
     walk = simulate("walk", lidar=lidar, count=20, imu="icm20948", motion_compensated=False)
     sequence = Stub([walk.scan(i) for i in range(20)], None, walk.calibration, motion_compensated=False, imu=walk.imu)
@@ -116,7 +116,7 @@ def test_the_imu_goes_on_where_it_was(tmp_path: Path) -> None:
         assert_same(one, other)
 
 
-def test_forgetting_any_part_of_the_state_would_be_seen(tmp_path: Path) -> None:
+def test_every_part_of_the_state_affects_the_resumed_result(tmp_path: Path) -> None:
     """The comparison above is worth something: a velocity that is lost changes bits."""
     config, sequence = config_of("icp"), sample(8)
     whole = tracker_of(config)

@@ -174,7 +174,7 @@ WHY = "registration is 3.00 m and 0.0 deg from what the IMU felt"
         ("elsewhere", True, 0.0, "lost"),
     ],
 )
-def test_a_scan_that_is_lost_or_denied_is_sought_again_where_the_imu_expects_it(
+def test_a_lost_or_rejected_scan_is_registered_again_from_the_imus_prediction(
     near: str, is_lost: bool, off_m: float, reason: str
 ) -> None:
     """Found there, it is there; found where it was denied from there too, it is right and the IMU wrong."""
@@ -187,7 +187,9 @@ def test_a_scan_that_is_lost_or_denied_is_sought_again_where_the_imu_expects_it(
     assert denied.iterations == 2
 
 
-def test_it_is_sought_where_the_imu_expects_it_and_not_where_it_was_denied(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_second_registration_starts_at_the_imus_prediction_not_at_the_rejected_pose(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """However little the sweep changes: deskewed anew, it begins at the false place."""
     monkeypatch.setattr(Tracker, "REFINE_M", -1.0)
     oracle, results = braked(kind=Misled, span=Span(0.0, SPAN_S))
@@ -199,13 +201,13 @@ def test_it_is_sought_where_the_imu_expects_it_and_not_where_it_was_denied(monke
     np.testing.assert_allclose(denied.T_world_lidar, oracle.poses[denied.index], atol=0.02)
 
 
-def test_nothing_is_sought_where_a_silent_imu_expects_nothing() -> None:
+def test_over_a_gap_of_the_imu_a_lost_scan_is_not_registered_again() -> None:
     oracle, results = braked(gap=(1.5, 2.6), kind=type("Told", (Misled,), {"is_lost": True}))
     lost = results[Misled.FALSE_AT]
     assert (lost.status, lost.reason, oracle.calls.count(lost.index)) == ("bridged", "lost", 1)
 
 
-def test_a_first_sweep_that_began_before_the_imu_is_deskewed_once_the_second_tells_the_speed() -> None:
+def test_a_first_sweep_before_the_imu_is_deskewed_after_the_second() -> None:
     """Stamped in the middle: of the second sweep, and of all since the first stamp, the IMU tells."""
     for begins_s, asked in ((0.08, 2), (0.0, 1)):
         oracle, results = braked(gap=(-1.0, begins_s), span=Span(-0.5 * SPAN_S, 0.5 * SPAN_S))
@@ -213,7 +215,7 @@ def test_a_first_sweep_that_began_before_the_imu_is_deskewed_once_the_second_tel
         assert oracle.calls.count(0) == asked
 
 
-def test_some_scans_tell_what_the_imu_saves() -> None:
+def test_one_scan_in_twenty_measures_what_the_imu_saves() -> None:
     oracle, results = braked()
     sample = [r for r in results if r.steady_iterations is not None]
     assert [r.index for r in sample] == [19, 39], "one in twenty"
@@ -225,12 +227,12 @@ def test_some_scans_tell_what_the_imu_saves() -> None:
     assert all(r.stages["imu"] > 0 and r.saved_s is None for r in results[2:] if r not in sample)
 
 
-def test_a_scan_that_constant_velocity_loses_compares_with_nothing() -> None:
+def test_a_scan_lost_by_constant_velocity_gives_no_comparison() -> None:
     _, results = braked(lost_m=0.06)
     assert [r.index for r in results[2:] if r.status != "ok" or r.steady_iterations is not None] == []
 
 
-def test_over_a_gap_of_the_imu_nothing_is_compared() -> None:
+def test_over_a_gap_of_the_imu_no_scan_is_compared() -> None:
     """The 20th scan lies in the gap: constant velocity predicts it anyway."""
     oracle, results = braked(gap=(1.65, 2.55))
     assert [r.index for r in results if r.steady_iterations is not None] == [39]
@@ -243,7 +245,7 @@ def test_scans_that_are_not_found_are_not_all_tried_twice() -> None:
     assert [k for k in range(2, 45) if oracle.calls.count(k) > 1] == [19, 39]
 
 
-def test_a_scan_that_the_imu_loses_compares_with_nothing() -> None:
+def test_a_scan_lost_by_the_imu_gives_no_comparison() -> None:
     _, results = braked(missed=frozenset({(19, 2)}))
     assert results[19].status == "bridged"
     assert [r.index for r in results if r.saved_s is not None] == [39]

@@ -127,7 +127,7 @@ def test_a_lone_wall_moves_its_building_across_and_not_along() -> None:
     np.testing.assert_allclose(found.displacements[0], [1.0, -2.0, 0.0], atol=1e-3)
 
 
-def test_who_was_not_seen_follows_the_shift_of_the_whole() -> None:
+def test_unseen_buildings_take_the_common_shift() -> None:
     middles, poses, _ = town(2)
     shift = np.array([2.0, -1.0, 0.0])
     matches = [match(k, b, seen_from(poses[k], middles[b], shift)) for b in range(11) for k in near(poses, middles[b])]
@@ -139,7 +139,7 @@ def test_who_was_not_seen_follows_the_shift_of_the_whole() -> None:
     assert empty.covariances[0, 0, 0] == pytest.approx(10.0)
 
 
-def test_matches_with_the_wrong_wall_are_given_up() -> None:
+def test_matches_with_the_wrong_wall_are_rejected() -> None:
     middles, poses, truth = town(3)
     good = [match(k, b, seen_from(poses[k], middles[b], truth[b])) for b in range(12) for k in near(poses, middles[b])]
     wrong = [match(k, b, seen_from(poses[k], middles[b], truth[b] + [3.0, -2.0, 0.2])) for b in range(12)
@@ -153,7 +153,7 @@ def test_matches_with_the_wrong_wall_are_given_up() -> None:
 
 @pytest.mark.parametrize("metres", [2.5, 6.0])
 @pytest.mark.parametrize("seed", range(4))
-def test_two_wrong_matches_of_five_are_given_up_though_they_agree(seed: int, metres: float) -> None:
+def test_two_agreeing_wrong_matches_of_five_are_rejected(seed: int, metres: float) -> None:
     """They pull the first solution so far that right ones do not fit it: nothing may be decided there.
 
     Nor at the second, when they are far off: decided is what counts in full or not at all.
@@ -174,7 +174,7 @@ def test_two_wrong_matches_of_five_are_given_up_though_they_agree(seed: int, met
 
 
 @pytest.mark.parametrize(("share", "knows"), [(0.04, False), (0.06, True)])
-def test_a_match_that_knows_a_twentieth_as_well_may_confirm(share: float, knows: bool) -> None:
+def test_a_match_with_a_twentieth_of_the_information_may_support(share: float, knows: bool) -> None:
     middles, poses, truth = town(4)
     keyframes = near(poses, middles[5], 40.0)[:3]
     said = [seen_from(poses[k], middles[5], truth[5]) for k in keyframes]

@@ -44,7 +44,7 @@ def test_noise_of_fixes_is_no_drift() -> None:
     assert ate(shape, se3.relative(REAL[0], REAL)) < 0.05
 
 
-def test_fixes_still_tell_drift() -> None:
+def test_drift_is_estimated_from_accurate_and_from_noisy_fixes() -> None:
     for seed in range(6):
         assert drift_factor(fixed(seed, 0.5, 0.01), [], CONFIG) > 1.0
         assert drift_factor(fixed(seed, 5.0, 0.1), [], CONFIG) > 1.0
@@ -62,7 +62,7 @@ def test_drift_is_a_walk_beside_what_odometry_says(factor: float) -> None:
     np.testing.assert_allclose(sums[1], sums[0] + factor * drift, rtol=1e-12, atol=1e-18)
 
 
-def test_drift_that_loops_tell_does_not_ask_where_the_world_begins() -> None:
+def test_drift_estimated_by_loops_does_not_depend_on_the_frame_of_the_world() -> None:
     """Odometry that thinks ten times too well of itself, and loops that know where they are along their way, not across."""
     graph = graph_of(REAL, 30, 0, np.random.default_rng(6), 2, 0.01)
     loops = [replace(c, covariance=np.diag([1e-4, 1.0, 1.0, 1e-6, 1e-2, 1e-2])) for c in graph.loops]

@@ -50,7 +50,7 @@ def fixes(
 
 
 @pytest.mark.parametrize(("count", "gap"), [(30, 1.0), (300, 0.2)])
-def test_fixes_that_scatter_as_they_state_err_alone(count: int, gap: float) -> None:
+def test_fixes_with_their_stated_scatter_have_no_common_part(count: int, gap: float) -> None:
     assert [fixes(count, gap, 1.0, 0.0, 100.0, seed) for seed in range(12)] == [(None, 0.0)] * 12
 
 
@@ -67,7 +67,7 @@ def test_the_common_part_and_its_memory_are_found(
     assert memory / 2 < np.median([f.memory for f in found if f]) < 2 * memory
 
 
-def test_fixes_that_are_wrong_hide_nothing_from_the_others() -> None:
+def test_wrong_fixes_do_not_change_the_common_part() -> None:
     rng = np.random.default_rng(2)
     seconds = np.arange(200.0)
     residuals = 0.8 + 0.3 * rng.normal(size=(200, 3))
@@ -104,7 +104,7 @@ def test_the_common_part_is_found_on_a_way_without_a_bend(ahead: tuple[float, fl
     assert found.sigma[0] == pytest.approx(np.hypot(0.8 / np.sqrt(2), 0.2), abs=0.15)
 
 
-def test_where_a_trajectory_was_laid_says_nothing_of_the_fixes() -> None:
+def test_the_alignment_of_the_trajectory_does_not_change_the_noise_of_fixes() -> None:
     """Place and heading were fitted: another place, and a little turn, are as likely (restricted likelihood)."""
     rng, seconds = np.random.default_rng(5), 3.0 * np.arange(40.0)
     path = 60 * np.column_stack([np.cos(seconds / 12), np.sin(seconds / 12), 0 * seconds])
@@ -119,7 +119,7 @@ def test_where_a_trajectory_was_laid_says_nothing_of_the_fixes() -> None:
     np.testing.assert_allclose(other[0].sigma, one[0].sigma, rtol=1e-3)
 
 
-def test_nothing_is_told_of_fixes_out_of_order_or_alone() -> None:
+def test_unordered_or_single_fixes_give_no_estimate() -> None:
     flat, one = np.zeros((3, 3)), np.ones((3, 3))
     assert fit_gauss_markov(np.array([0.0, 1.0, 1.0]), flat, one, flat, 0.999, drift_of(flat)) == (None, 0.0)
     assert fit_gauss_markov(np.zeros(1), flat[:1], one[:1], flat[:1], 0.999, drift_of(flat[:1])) == (None, 0.0)
@@ -145,7 +145,7 @@ def test_odometry_drifts_where_fixes_cannot_err_so_much(percent: float, drifts: 
         assert 13.0 / 4 < at_end < 13.0 * 4
 
 
-def test_what_an_early_place_errs_by_a_later_one_errs_by_too() -> None:
+def test_the_covariance_of_drift_along_a_path_is_that_of_drawn_drives() -> None:
     """Against drives drawn step by step; rates that last come to the walk's size at the end of the way."""
     angle = np.linspace(0, 2, 6)
     path = np.column_stack([40 * np.cos(angle), 40 * np.sin(angle), 3 * angle])
@@ -177,7 +177,7 @@ def test_the_graph_has_the_covariance_of_the_process() -> None:
     np.testing.assert_allclose(np.linalg.inv(information), np.kron(expected, np.diag(fix_noise.sigma**2)), atol=1e-8)
 
 
-def test_a_fix_that_errs_with_others_is_one_without_where_they_err_by_nothing() -> None:
+def test_a_fix_with_zero_common_error_equals_an_independent_fix() -> None:
     pose = se3.exp(np.array([1.0, 2.0, 3.0, 0.3, -0.2, 0.5]))
     alone, together = (
         factors.position(PositionFix(0, np.array([1.5, 2.0, 2.0]), np.array([1.0, 2.0, 3.0]), np.array([0.3, 0.2, 0.9]), k))

@@ -73,7 +73,7 @@ def test_a_loop_stays_when_half_of_the_others_agree_with_it() -> None:
     assert there_and_back([here] * 5 + [there] * 4) == [""] * 5 + ["only 38% of the loops around it agree with it"] * 4
 
 
-def test_loops_far_away_have_no_say() -> None:
+def test_loops_far_away_do_not_vote() -> None:
     """Odometry may have drifted by some decimetres on 100 m: what a loop there agrees with is no witness."""
     wrong, right = shift(0.2), np.zeros(6)
     said = there_and_back([right] * 3 + [wrong] + [right] * 9, [0.0, 0.001, 0.002, 0.003, *(100.0 + np.arange(9.0))])
@@ -81,14 +81,14 @@ def test_loops_far_away_have_no_say() -> None:
     assert said[3].startswith("only 0%")
 
 
-def test_a_loop_that_was_voted_out_has_no_say_any_more() -> None:
+def test_a_rejected_loop_does_not_vote() -> None:
     """Fifty metres from either neighbour, and a hundred off: it goes, and the two that are left agree."""
     said = there_and_back([shift(0.0), shift(100.0), shift(0.0)], [0.0, 50.0, 100.0])
     assert said == ["", "only 0% of the loops around it agree with it", ""]
 
 
 @pytest.mark.parametrize("origin", [(0.0, 0.0), (-700.0, 2000.0)])
-def test_odometry_is_asked_first(origin: tuple[float, float]) -> None:
+def test_a_loop_beyond_odometrys_drift_is_rejected_first(origin: tuple[float, float]) -> None:
     """A per cent of a way of 1,000 m, and half a degree per 100 m of it over the mean distance of that way."""
     said = there_and_back([shift(0.0, 1000.0)], origin=origin)
     assert "1000.0 m from where odometry is" in said[0]
@@ -119,7 +119,7 @@ def pulled(
     return gnc_solve(fixed, [sighting(x) for x in distances], values, GraphConfig.model_validate({"robust": robust}))
 
 
-def test_the_last_word_is_that_of_the_chi_square_distribution() -> None:
+def test_gnc_ends_with_the_chi_square_gate() -> None:
     """Whatever is weighed on the way: in below the quantile of its own degrees of freedom, out above."""
     limit = float(np.sqrt(chi2.ppf(0.999, 3)))
     found = pulled([0.5, 0.95 * limit, 1.05 * limit, 2 * limit, 5 * limit, 30 * limit])
@@ -129,7 +129,7 @@ def test_the_last_word_is_that_of_the_chi_square_distribution() -> None:
     np.testing.assert_allclose(np.sqrt(found.squared) / limit, [0.5 / limit, 0.95, 1.05, 2, 5, 30], rtol=1e-4)
 
 
-def test_the_weights_of_all_are_settled_by_doubling_and_not_at_a_stroke() -> None:
+def test_gnc_doubles_its_control_parameter_up_to_convergence() -> None:
     """The control parameter begins at 1 / (2 R - 1) for a worst ratio R of 100 and is 4 when one of 0.8 counts in full.
 
     That are ten doublings, a solution each, one before and one after: Yang et al. 2020, section III, with a growth of 2.
@@ -140,7 +140,7 @@ def test_the_weights_of_all_are_settled_by_doubling_and_not_at_a_stroke() -> Non
     assert pulled([0.5 * limit, 0.99 * limit]).rounds == 1
 
 
-def test_what_is_weighed_less_is_taken_for_less_certain() -> None:
+def test_gnc_weights_divide_the_information() -> None:
     """One over the weight of Yang et al. 2020, equation 14, multiplies the covariance; ratios are 0.8 and 25 all along."""
     limit, scales = float(np.sqrt(chi2.ppf(0.999, 3))), list[float]()
     pulled([np.sqrt(0.8) * limit, 5 * limit], scales=scales)

@@ -84,7 +84,7 @@ def nees(poses: Floats, covariances: Floats, real: Floats) -> float:
     return float(np.mean(np.einsum("ki,ki->k", e, np.linalg.solve(covariances[1:, :3, :3], e[..., None])[..., 0])) / 3)
 
 
-def test_the_imu_keeps_what_odometry_loses_and_says_how_well() -> None:
+def test_the_imu_halves_the_tilt_error_with_consistent_covariances() -> None:
     ratios, consistency = [], []
     for seed in range(3):
         graph, real = graph_and_truth(seed)
@@ -97,7 +97,7 @@ def test_the_imu_keeps_what_odometry_loses_and_says_how_well() -> None:
 
 
 @pytest.mark.parametrize("settings", [{}, {"incremental": True}])
-def test_fixes_and_imu_hold_one_graph(settings: dict[str, object]) -> None:
+def test_fixes_and_imu_together_are_better_than_fixes_alone(settings: dict[str, object]) -> None:
     graph, real = graph_and_truth(0)
     config = GraphConfig.model_validate(settings)
     free = replace(graph, fixes=fixes_of(real), is_anchored=False)
@@ -136,7 +136,7 @@ def tilting(seed: int) -> tuple[PoseGraph, Floats]:
     return replace(graph, poses=np.stack(poses), odometry=steps, ups=ups), real
 
 
-def test_gravity_holds_where_the_imu_has_no_links_or_a_single_one() -> None:
+def test_gravity_levels_a_graph_without_imu_links_or_with_one() -> None:
     graph, real = tilting(2)
     assert graph.inertial is not None
     alone = optimise(replace(graph, inertial=None), GraphConfig())
@@ -195,7 +195,7 @@ def turning_nees(poses: Floats, covariances: Floats, real: Floats) -> float:
     return float(np.mean(np.einsum("ki,ki->k", e, np.linalg.solve(covariances[1:, 3:, 3:], e[..., None])[..., 0])) / 3)
 
 
-def test_odometry_that_knows_the_imu_weighs_beside_it_as_much_as_its_points() -> None:
+def test_tightly_coupled_odometry_enters_with_the_information_of_its_points() -> None:
     """The smoother's own covariances would count the IMU twice: a NEES of 4."""
     twice, once = [], []
     for seed in range(4):

@@ -87,7 +87,7 @@ def error_of(found: InertialState, k: int) -> Floats:
     ])  # fmt: skip
 
 
-def test_its_errors_are_as_large_as_it_says_and_smaller_than_those_of_the_poses() -> None:
+def test_errors_are_within_the_covariance_and_smaller_than_those_of_the_poses() -> None:
     squares, places = [], []
     for seed in range(6):
         smoother = begun(seed)
@@ -100,7 +100,7 @@ def test_its_errors_are_as_large_as_it_says_and_smaller_than_those_of_the_poses(
     assert np.sqrt(np.mean(np.square(places))) < 0.8 * PLACE
 
 
-def test_a_step_without_a_pose_is_carried_by_the_imu() -> None:
+def test_a_step_without_a_pose_is_predicted_by_the_imu() -> None:
     made = steps(25)
     smoother = begun()
     for step in made[:20]:
@@ -111,7 +111,7 @@ def test_a_step_without_a_pose_is_carried_by_the_imu() -> None:
     assert np.trace(carried.covariance[:3, :3]) > 2 * np.trace(sure.covariance[:3, :3])
 
 
-def test_a_graph_that_begins_anew_knows_what_the_one_before_knew() -> None:
+def test_a_restarted_graph_keeps_the_joint_marginal() -> None:
     """Only its linearisation is fixed: the joint marginal loses nothing, which marginals of single variables do."""
     made = steps(30)
     whole, often = begun(reset=100), begun(reset=7)
@@ -128,7 +128,7 @@ def assert_same(a: InertialState, b: InertialState) -> None:
 
 
 @pytest.mark.parametrize("at", [3, 8])
-def test_it_goes_on_where_it_was_to_the_last_bit(at: int, tmp_path: Path) -> None:
+def test_the_smoother_resumes_to_the_last_bit(at: int, tmp_path: Path) -> None:
     made = steps(12)
     made[2] = replace(made[2], T_world_imu=None, covariance=None)
     whole = begun(reset=5)
@@ -153,7 +153,7 @@ def test_what_is_withdrawn_leaves_no_trace() -> None:
         assert_same(plain.add(step), tried.add(step))
 
 
-def test_what_cannot_be_solved_is_said() -> None:
+def test_an_unsolvable_graph_raises_an_error() -> None:
     step = steps(1)[0]
     with pytest.raises(GraphError, match="smoother"):
         begun().add(replace(step, accel=np.full_like(step.accel, np.nan)))

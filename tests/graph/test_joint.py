@@ -61,7 +61,7 @@ def off_the_way(poses: Floats, real: Floats) -> float:
     return float(np.sqrt(np.mean(np.sum((poses[:, :2, 3] - real[:, :2, 3]) ** 2, axis=1))))
 
 
-def test_poses_are_unsure_by_what_is_given_beside_the_graph() -> None:
+def test_a_given_spread_adds_to_the_covariances() -> None:
     graph, _, middles, _, matches = drive(0)
     spread = np.tile(np.diag([0.04, 0.09, 0.0, 0.0, 0.0, 1e-4]), (len(graph), 1, 1))
     known = optimise_jointly(graph, middles, matches, MAP_PRIOR, GraphConfig())
@@ -71,7 +71,7 @@ def test_poses_are_unsure_by_what_is_given_beside_the_graph() -> None:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_walls_mend_the_way_and_the_map_together(seed: int) -> None:
+def test_walls_correct_trajectory_and_map_together(seed: int) -> None:
     graph, real, middles, off, matches = drive(seed)
     found = optimise_jointly(graph, middles, matches, MAP_PRIOR, GraphConfig())
     assert off_the_way(found.poses, real) < max(0.5 * off_the_way(graph.poses, real), 0.2)

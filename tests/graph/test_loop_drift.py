@@ -60,7 +60,7 @@ def nees(solution: Solution) -> float:
     return float((d * np.linalg.solve(solution.covariances[5:], d[..., None])[..., 0]).sum(1).mean() / 6)
 
 
-def test_drift_that_lasts_is_taken_out_and_loops_close_better() -> None:
+def test_a_constant_drift_is_corrected_before_loops_are_closed() -> None:
     before, after, unsure, sure = [], [], [], []
     for seed in range(6):
         graph = away(seed, 1.0, 0.2)
@@ -82,7 +82,7 @@ def test_drift_that_lasts_is_taken_out_and_loops_close_better() -> None:
     assert 0.3 < np.mean(sure) < 3.0
 
 
-def test_what_bends_the_way_much_is_sought_again_on_the_way_set_straight() -> None:
+def test_a_large_drift_is_estimated_again_on_the_corrected_path() -> None:
     """Seven degrees a lap: what the first answer leaves is three times as much."""
     for seed in range(4):
         graph = away(seed, 1.0, 2.0)
@@ -90,7 +90,7 @@ def test_what_bends_the_way_much_is_sought_again_on_the_way_set_straight() -> No
 
 
 @pytest.mark.parametrize(("percent", "degrees"), [(1.0, 0.0), (0.0, 0.5), (1.0, 0.5)])
-def test_what_is_claimed_is_the_drift_and_how_well_it_is_known(percent: float, degrees: float) -> None:
+def test_the_estimated_drift_is_within_its_sigma(percent: float, degrees: float) -> None:
     squared = []
     for seed in range(5):
         estimated_drift = without_loop_drift(away(seed, percent, degrees), CONFIG).estimated_drift
@@ -106,7 +106,7 @@ def test_what_is_claimed_is_the_drift_and_how_well_it_is_known(percent: float, d
     assert 0.1 < np.mean(squared) < 3.0
 
 
-def test_drift_that_wanders_is_known_for_what_it_is() -> None:
+def test_wandering_drift_keeps_covariances_consistent() -> None:
     """Rates of some 100 m, and walks: never much worse once corrected, and covariances neither far too large nor too small."""
     ratios, known = [], []
     for seed in range(8):
@@ -137,7 +137,7 @@ def test_noise_is_no_drift(inflated: float) -> None:
         np.testing.assert_array_equal(straight.poses, graph.poses)
 
 
-def test_wrong_loops_among_them_tell_nothing_else() -> None:
+def test_wrong_loops_do_not_change_the_estimated_drift() -> None:
     for seed in range(4):
         graph = away(seed, 1.0, 0.5)
         rng = np.random.default_rng(seed)
@@ -154,7 +154,7 @@ def test_wrong_loops_among_them_tell_nothing_else() -> None:
         np.testing.assert_allclose(estimates[1].rates, estimates[0].rates, atol=2e-4)
 
 
-def test_a_loop_that_is_a_little_off_changes_little() -> None:
+def test_a_slightly_wrong_loop_adds_a_walk_and_keeps_the_rates() -> None:
     """Too little to be thrown out: it makes a walk likelier beside the rates, and not the rates others."""
     graph = away(0, 1.0, 0.2)
     T = graph.loops[2].T_a_b.copy()
@@ -167,7 +167,7 @@ def test_a_loop_that_is_a_little_off_changes_little() -> None:
     assert mixed.walk > 5 * right.walk
 
 
-def test_loops_surer_than_can_be_reckoned_with_tell_their_drift_too() -> None:
+def test_loops_with_tiny_covariances_give_the_same_drift() -> None:
     """Each twice, and to a hundredth of a micrometre: large rates and walks leave no such difference in 64 bits."""
     graph = away(0, 1.0, 0.5)
     loops = [replace(c, covariance=1e-16 * np.eye(6)) for c in graph.loops for _ in range(2)]
@@ -193,7 +193,7 @@ def test_a_long_way_takes_little_memory() -> None:
     assert peak < 80e6
 
 
-def test_parts_are_of_one_way(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_estimation_in_parts_equals_estimation_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """Written out ten keyframes at a time or all at once: loops begin and end in any of them."""
     graph = away(0, 1.0, 0.5, real=truth(61, 2))
     loops = [
@@ -212,7 +212,7 @@ def test_parts_are_of_one_way(monkeypatch: pytest.MonkeyPatch) -> None:
         np.testing.assert_allclose(in_parts, whole, rtol=1e-6, atol=1e-6 * np.abs(whole).max())
 
 
-def test_one_loop_none_or_no_way_tell_nothing() -> None:
+def test_without_two_loops_or_a_path_there_is_no_estimate() -> None:
     graph = away(0, 1.0, 0.5)
     none, one = replace(graph, loops=[]), replace(graph, loops=graph.loops[:1])
     stays = replace(graph, distances=np.zeros(len(graph)))
@@ -223,7 +223,7 @@ def test_one_loop_none_or_no_way_tell_nothing() -> None:
         without_loop_drift(lost, CONFIG)
 
 
-def test_ways_are_found_where_nobody_measured_them() -> None:
+def test_distances_are_computed_where_they_are_not_given() -> None:
     graph = away(0, 1.0, 0.5)
     way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(graph.poses[:, :3, 3], axis=0), axis=1))])
     measured_by, unmeasured = (without_loop_drift(replace(graph, distances=d), CONFIG) for d in (way, np.zeros(0)))

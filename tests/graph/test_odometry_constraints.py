@@ -127,7 +127,7 @@ def test_covariances_of_scans_grow_from_their_keyframe() -> None:
         assert np.linalg.eigvalsh(result.covariance).min() > 0
 
 
-def test_a_scan_is_as_unsure_as_the_way_to_its_keyframe_makes_it() -> None:
+def test_the_covariance_of_a_scan_includes_the_path_to_its_keyframe() -> None:
     """Keyframes that are known without an error: what is left is the steps between and the scan's own registration."""
     results = results_of(POSES)
     keyframes = keyframes_of(results, 10)

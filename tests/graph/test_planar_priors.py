@@ -34,7 +34,7 @@ def off(poses: np.ndarray, real: np.ndarray = REAL) -> np.ndarray:
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
-def test_the_map_holds_the_plan(seed: int) -> None:
+def test_planar_priors_bound_position_and_heading(seed: int) -> None:
     graph = held(seed)
     solution = optimise(graph, GraphConfig())
     assert off(graph.poses)[:, :2].max() > 0.4
@@ -43,7 +43,7 @@ def test_the_map_holds_the_plan(seed: int) -> None:
     assert solution.map_reasons == [""] * len(graph.map_priors)
 
 
-def test_the_map_knows_neither_height_nor_tilt() -> None:
+def test_planar_priors_do_not_constrain_height_and_tilt() -> None:
     """Twenty metres up everything is the same but the height; a tilt of the whole stays, where the plan allows it."""
     graph = held(4)
     low = optimise(graph, GraphConfig()).poses
@@ -68,7 +68,7 @@ def test_a_lone_wall_leaves_the_way_along_it_free() -> None:
     assert abs(solution.poses[0, 0, 3] - graph.poses[0, 0, 3]) < 1e-3
 
 
-def test_a_map_that_is_off_as_a_whole_does_not_move_a_start_that_is_known() -> None:
+def test_a_shift_of_the_map_does_not_move_a_known_start() -> None:
     graph = held(6)
     shift = np.array([1.5, -2.0])
     priors = [replace(p, pose=p.pose - [*shift, 0.0]) for p in graph.map_priors]
@@ -82,7 +82,7 @@ def test_a_map_that_is_off_as_a_whole_does_not_move_a_start_that_is_known() -> N
     assert off(rigid.poses)[60:, :2].max() > 1.0
 
 
-def test_what_a_given_start_and_the_map_disagree_on_is_shared_by_how_well_both_are_known() -> None:
+def test_start_and_map_are_weighted_by_their_covariances() -> None:
     """The start is said to be 1.3 m beside where the map puts it: of one metre's sigma against the map's two."""
     graph = held(6)
     begun = se2.of_se3(REAL[0]) + np.array([1.2, -0.5, 0.0])
@@ -93,7 +93,7 @@ def test_what_a_given_start_and_the_map_disagree_on_is_shared_by_how_well_both_a
     assert off(trusted.poses)[:, :2].max() < 0.15
 
 
-def test_a_match_with_the_wrong_house_is_given_up() -> None:
+def test_a_match_with_the_wrong_house_is_rejected() -> None:
     graph = held(7)
     wrong = [5, 20, 41]
     priors = [
@@ -118,7 +118,7 @@ def test_a_share_of_a_match_counts_that_much() -> None:
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_what_the_map_is_off_by_is_not_odometrys_drift(seed: int) -> None:
+def test_errors_of_the_map_are_not_attributed_to_drift(seed: int) -> None:
     graph = held(seed)
     rng = np.random.default_rng(seed)
     drawn = [replace(p, pose=np.add(p.pose, [*rng.normal(0, 0.5, 2), 0.0])) for p in graph.map_priors]
@@ -148,7 +148,7 @@ def test_covariances_do_not_depend_on_how_they_are_had() -> None:
     np.testing.assert_allclose(by_scaling, by_gtsam, rtol=1e-4, atol=1e-9)
 
 
-def test_a_straight_path_has_covariances_though_nothing_tells_its_roll() -> None:
+def test_a_straight_path_with_unobserved_roll_has_covariances() -> None:
     """gtsam's elimination gives up here: odometry to 0.1 mm, and a first pose of which little is known."""
     poses = np.tile(np.eye(4), (20, 1, 1))
     poses[:, 0, 3] = 2.0 * np.arange(20)

@@ -40,19 +40,19 @@ def test_checks_that_confirm_the_poses_raise_no_alert() -> None:
     assert spans(checks_of([0.01, -0.02, 0.0, 0.02] * 5)) == []
 
 
-def test_the_same_in_a_row_raises_one_alert_from_the_first_to_the_last_of_them() -> None:
+def test_consecutive_inconsistent_checks_raise_one_alert_over_all_of_them() -> None:
     around = [0.0] * 8
     assert spans(checks_of([*around, *[0.2] * (IN_A_ROW - 1), *around])) == []
     assert spans(checks_of([*around, *[0.2] * IN_A_ROW, *around])) == [(41, 60)]
 
 
-def test_one_check_is_enough_where_it_says_much_and_explains_more_points() -> None:
+def test_one_large_inconsistency_with_more_agreement_raises_an_alert() -> None:
     alone = [0.0] * 8 + [1.0] + [0.0] * 8
     assert spans(checks_of(alone)) == []
     assert spans(checks_of(alone, claimed_agreement=0.5)) == [(41, 45)]
 
 
-def test_inconclusive_checks_say_nothing_and_part_nothing() -> None:
+def test_inconclusive_checks_neither_raise_nor_split_an_alert() -> None:
     checks = checks_of([0.0] * 8 + [0.2] * IN_A_ROW + [0.0] * 8)
     assert spans([replace(check, agreement=0.1) for check in checks]) == []
     vague = [

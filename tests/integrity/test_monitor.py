@@ -53,7 +53,7 @@ def test_true_poses_are_confirmed() -> None:
     assert np.abs([check.apart for check in monitor.checks]).max() < 0.05
 
 
-def test_poses_that_freeze_are_not() -> None:
+def test_frozen_poses_are_inconsistent() -> None:
     monitor, (_, true) = new_monitor(), street()
     see(monitor, np.concatenate([true[:12], np.repeat(true[11:12], COUNT - 12, axis=0)]))
     assert np.abs([check.apart for check in monitor.checks[:2]]).max() < 0.05
@@ -63,13 +63,13 @@ def test_poses_that_freeze_are_not() -> None:
         assert np.linalg.norm(check.apart[:3]) == pytest.approx(np.linalg.norm(moved), abs=0.05)
 
 
-def test_the_first_check_behind_scans_that_failed_says_so() -> None:
+def test_the_first_check_after_failed_scans_is_marked() -> None:
     monitor, (_, true) = new_monitor(), street()
     see(monitor, true, lost=range(8, 10))
     assert [(check.last, check.is_after_break) for check in monitor.checks[:3]] == [(6, False), (10, True), (15, False)]
 
 
-def test_it_goes_on_from_a_checkpoint_as_if_nothing_had_been(tmp_path: Path) -> None:
+def test_the_monitor_resumes_to_the_last_bit(tmp_path: Path) -> None:
     whole, again, (_, true) = new_monitor(), new_monitor(), street()
     see(whole, true, end=13)
     write_state(tmp_path / "monitor.npz", whole.state())

@@ -62,9 +62,7 @@ def test_a_pose_beyond_three_sigmas_of_odometry_is_none(shift: tuple[float, floa
     ("shift", "turn_deg", "is_out"),
     [(0.95, 0.0, False), (1.05, 0.0, True), (0.0, 1.9, False), (0.0, 2.1, True)],
 )
-def test_odometry_that_is_sure_of_itself_may_be_wrong_by_a_metre_and_two_degrees(
-    shift: float, turn_deg: float, is_out: bool
-) -> None:
+def test_the_gate_is_at_least_a_metre_and_two_degrees(shift: float, turn_deg: float, is_out: bool) -> None:
     """Two registrations of one place differ by as much."""
     sure = RelativeUncertainty(1e-8 * np.eye(3)[None], np.array([1e-8]))
     gate = detector()
@@ -80,7 +78,7 @@ def test_a_radius_is_the_limit_in_every_direction() -> None:
         assert gate._beyond(found(shift), EXPECTED, UNCERTAINTY) == said
 
 
-def test_turns_that_are_tried_are_odometrys_or_else_the_descriptors() -> None:
+def test_headings_tried_are_odometrys_or_else_the_descriptors() -> None:
     match = PlaceMatch(0, 0.1, yaw=2.0)
     near, wide = detector()._yaws(match, np.deg2rad(5.0)), detector()._yaws(match, 1.01 * WIDEST_TURN)
     for yaws, centre, spread in ((near, 0.0, np.deg2rad(5.0)), (wide, 2.0, np.pi / LoopsConfig().sectors)):
@@ -140,12 +138,12 @@ def test_descriptors_half_as_far_again_as_the_best_are_no_candidates() -> None:
 
 
 @pytest.mark.parametrize(("x", "fallback"), [(6.9, None), (7.1, 1)])
-def test_odometrys_nearest_is_fallen_back_on_unless_it_is_asked_already(x: float, fallback: int | None) -> None:
+def test_odometrys_nearest_keyframe_is_the_fallback_candidate(x: float, fallback: int | None) -> None:
     """Within half of what two passes of a street lie apart it is the same place: here within 4 m of x = 3 m."""
     assert chosen([0.3, 0.3, 0.1], [0.0, 3.0, x]) == ([2], fallback)
 
 
-def test_one_keyframe_stands_for_four_metres_of_the_way() -> None:
+def test_one_keyframe_per_four_metres_is_compared() -> None:
     """Of those at 5 and 6 m the second is not compared, however much it looks alike, and that at 3 m only as the nearest."""
     assert chosen([0.3, 0.3, 0.2, 0.01], [0.0, 3.0, 5.0, 6.0]) == ([2], None)
     assert chosen([0.3, 0.1, 0.2, 0.01], [0.0, 3.0, 5.0, 6.0]) == ([1], None)
@@ -176,7 +174,7 @@ def test_what_fits_and_is_too_far_from_odometry_is_refused_by_the_gate(shift: fl
         (Verdict.REJECTED, LoopStage.OVERLAP, True),
     ],
 )
-def test_odometrys_nearest_is_asked_when_nothing_fits_and_nothing_fits_twice(
+def test_the_fallback_candidate_is_tried_after_rejections_without_ambiguity(
     verdict: Verdict, stage: LoopStage, is_asked: bool
 ) -> None:
     """Where a place fits twice, no other can be told from it either."""
@@ -193,7 +191,7 @@ def agree(gap: tuple[float, ...], **settings: float) -> Verification:
     return Verifier(LoopsConfig(**settings), RegistrationConfig())._agree(Verification("overlap"), FORWARD, backward)  # type: ignore[arg-type]
 
 
-def test_a_closure_lies_half_way_and_is_no_surer_than_the_two_differ() -> None:
+def test_a_closure_is_the_mean_of_both_registrations_with_their_difference_as_sigma() -> None:
     gap = (0.12, -0.06, 0.04, 0.0, 0.003, -0.004)
     closure = agree(gap, sigma_m=0.03, sigma_deg=0.1)
     assert (closure.stage, closure.reason) == ("agreement", "")
@@ -219,7 +217,7 @@ def test_registrations_that_differ_close_nothing(gap: tuple[float, ...], is_said
     assert found.reason.startswith("old to new and new to old differ by ") == is_said
 
 
-def test_a_way_back_that_is_not_found_is_said() -> None:
+def test_a_failed_registration_back_is_reported() -> None:
     verifier = Verifier(LoopsConfig(), RegistrationConfig())
     lost = RegistrationResult(se3.inverse(FORWARD.T_world_lidar), ok=False, reason="only 3 points match")
     assert verifier._agree(Verification("overlap"), FORWARD, lost).reason == "new to old: only 3 points match"
@@ -230,7 +228,7 @@ def test_a_way_back_that_is_not_found_is_said() -> None:
 @pytest.mark.parametrize(
     ("x", "yaw_deg", "expected"), [(0.9, 0, False), (1.1, 0, True), (0.0, 4.5, False), (0.0, 5.5, True)]
 )
-def test_places_are_told_apart_from_a_metre_or_five_degrees(x: float, yaw_deg: float, expected: bool) -> None:
+def test_poses_differ_from_a_metre_or_five_degrees(x: float, yaw_deg: float, expected: bool) -> None:
     assert _is_elsewhere(pose(0, 0), pose(x, 0, yaw_deg)) == expected
 
 

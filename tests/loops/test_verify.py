@@ -63,7 +63,7 @@ def test_refuses_what_hardly_overlaps() -> None:
     assert found.reason
 
 
-def test_refuses_a_terrace_that_odometry_does_not_tell_apart_and_takes_it_where_it_does() -> None:
+def test_a_terrace_is_ambiguous_unless_odometry_resolves_it() -> None:
     world = terrace()
     T_a, T_b = pose(70, 0), pose(73, 0.5)
     a, b = place(world, T_a, 1), place(world, T_b, 2)
@@ -76,7 +76,7 @@ def test_refuses_a_terrace_that_odometry_does_not_tell_apart_and_takes_it_where_
     assert np.linalg.norm(sure.T_a_b[:3, 3] - [3, 0.5, 0]) < 0.03
 
 
-def test_refuses_a_corridor_along_which_nothing_tells() -> None:
+def test_a_corridor_without_features_along_it_is_rejected() -> None:
     x, up = np.arange(-60, 60, 0.2), np.arange(0, 3, 0.2)
     line = np.stack(np.meshgrid(x, up), axis=-1).reshape(-1, 2)
     walls = [np.column_stack([line[:, 0], np.full(len(line), y), line[:, 1]]) for y in (-3.0, 3.0)]
@@ -129,7 +129,7 @@ def test_overlap_is_that_of_the_place_that_is_covered_less() -> None:
         assert compare(a, b, np.zeros(3), 3.0, min_overlap=0.7).stage == "overlap"
 
 
-def test_max_rmse_and_overlap_are_heeded() -> None:
+def test_gates_on_rmse_overlap_and_disagreement_apply() -> None:
     world = town()
     a, b = place(world, pose(5, -45), 1), place(world, pose(7, -45), 2)
     assert compare(a, b, np.zeros(3), 5.0, max_rmse=0.001).stage == "registration"
@@ -137,7 +137,7 @@ def test_max_rmse_and_overlap_are_heeded() -> None:
     assert compare(a, b, np.zeros(3), 5.0, max_disagreement_m=1e-6).stage == "agreement"
 
 
-def test_the_search_from_above_tells_shift_turn_and_climb() -> None:
+def test_bev_correlation_finds_shift_heading_and_climb() -> None:
     world = town()
     T_a, T_b = pose(5, -45), pose(11, -48, 8)
     T_b[2, 3] += 4.0
@@ -165,7 +165,7 @@ def test_starts_lie_four_metres_apart_fit_seven_tenths_as_well_and_are_five() ->
     assert starts((0.0, 0.5), (18.0, 0.5), (18.5, 1.0)) == [0.0, 18.0]
 
 
-def test_a_place_knows_what_stands_up() -> None:
+def test_a_submap_has_its_vertical_surfaces() -> None:
     flat = np.mgrid[-20:20:0.3, -20:20:0.3].reshape(2, -1).T
     world = np.concatenate([box(5, 5, 8, 8, 6), np.column_stack([flat, np.zeros(len(flat))])])
     at = pose(0, 0)
@@ -192,7 +192,7 @@ def test_a_slope_of_twenty_five_degrees_is_the_steepest_ground(degrees: float, s
 
 
 @pytest.mark.parametrize(("metres", "support"), [(0.28, 1.0), (0.32, 0.0)])
-def test_what_stands_supports_a_start_within_two_kernels(metres: float, support: float) -> None:
+def test_vertical_surfaces_support_a_start_within_two_kernels(metres: float, support: float) -> None:
     """A kernel ends 0.15 m wide: a wall that registration left 30 cm beside the other is not the same."""
     along, up = np.mgrid[-12:12:0.1, 0:6:0.1].reshape(2, -1)
     wall = np.column_stack([along, np.full_like(along, 8.05), up]).astype(np.float32)
@@ -204,7 +204,7 @@ def test_what_stands_supports_a_start_within_two_kernels(metres: float, support:
 
 
 @pytest.mark.parametrize(("metres", "support"), [(7.0, 1.0), (3.0, 0.0)])
-def test_a_start_has_support_where_a_quarter_of_what_stands_was_seen(metres: float, support: float) -> None:
+def test_a_start_is_supported_when_a_quarter_of_its_vertical_surfaces_was_seen(metres: float, support: float) -> None:
     """Of a wall of 24 m the other place saw so many, and as far as the next cell: all that can be compared fits."""
     along, up = np.mgrid[-12:12:0.1, 0:6:0.1].reshape(2, -1)
     wall = np.column_stack([along, np.full_like(along, 8.05), up]).astype(np.float32)

@@ -119,6 +119,6 @@ def test_laps_are_closed_with_places_in_memory_and_threads_change_nothing(monkey
     assert sum(c.is_accepted for c in detect(monkeypatch, "all", 80, 4.2)[0]) <= 1.2 * len(closures)
 
 
-def test_a_memory_that_holds_everything_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_unbounded_memory_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     bounded, every = (detect(monkeypatch, memory, 400, 2.2)[0] for memory in ("bounded", "all"))
     assert [repr(c) for c in bounded] == [repr(c) for c in every]

@@ -82,7 +82,7 @@ def test_small_gicp_is_the_package_itself() -> None:
     assert np.linalg.norm(ours[:3, 3] - truth[3][:3, 3]) < 0.02
 
 
-def test_small_gicp_forgets_old_keyframes() -> None:
+def test_small_gicp_removes_old_keyframes() -> None:
     method = created("small-gicp")
     points = np.random.default_rng(0).uniform(-5, 5, (500, 3))
     for i in range(15):
@@ -115,7 +115,7 @@ def test_a_bad_scan_is_bridged_and_the_next_one_registered(method: str, bad: str
 
 
 @pytest.mark.parametrize("method", BASELINES)
-def test_an_impossible_jump_is_not_believed(method: str) -> None:
+def test_an_impossible_jump_is_rejected(method: str) -> None:
     scans, truth = block()
     config = Config.model_validate({"odometry": {"method": method}, "registration": {"max_jump_m": 0.2}})
     made: Any = create_odometry(config)

@@ -100,7 +100,7 @@ def scanned(sweep: ElasticSweep, registration: Registration | None = None) -> Sw
     return SweepPoints(points, registration.map.levels, c.sigma, c.blob_weight)
 
 
-def test_both_ends_are_found_from_a_start_that_knows_neither() -> None:
+def test_both_poses_of_a_sweep_are_found_from_a_wrong_start() -> None:
     true = elastic(pose_at((0.1, -0.05, 0.0), 1.0), pose_at((0.5, 0.1, 0.05), 9.0))
     start = elastic(pose_at(), pose_at((0.2, 0.0, 0.0), 3.0))
     none = np.zeros((6, 6))
@@ -131,7 +131,7 @@ def test_points_lie_where_the_sensor_was_at_their_times() -> None:
     np.testing.assert_allclose(se3.apply(sweep.prior.pose, seen)[0], expected, atol=1e-4)
 
 
-def test_the_bend_of_what_an_imu_felt_stays_as_the_ends_move() -> None:
+def test_the_motion_measured_by_an_imu_keeps_its_shape_as_the_ends_move() -> None:
     times = knots_over(SPAN)
     bow = se3.make(np.eye(3), np.column_stack([10 * times, times * (0.1 - times), 0 * times]))
     sweep = ElasticSweep.of(MotionPrior(times, bow, is_felt=True))
@@ -173,7 +173,7 @@ def test_the_motion_within_a_walks_sweeps_is_nearer_to_the_truth_than_constant_v
     assert turns["ct-icp"] < 0.9 * turns["icp"]
 
 
-def test_an_imu_bends_the_sweep_and_over_its_gap_nothing_is_taken_for_felt() -> None:
+def test_a_sweep_has_the_shape_of_the_imu_except_over_a_gap() -> None:
     drive = simulate("walk", lidar="vlp16", seed=100, count=COUNT, imu="icm20948", motion_compensated=False)
     assert drive.imu is not None
     kept = (drive.imu.stamps_ns < 1_500_000_000) | (drive.imu.stamps_ns > 1_900_000_000)
@@ -210,7 +210,7 @@ def test_scans_without_times_have_one_pose_that_of_icp() -> None:
         np.testing.assert_array_equal(a.covariance, b.covariance)
 
 
-def test_it_goes_on_where_it_was(tmp_path: Path) -> None:
+def test_ct_icp_resumes_to_the_last_bit(tmp_path: Path) -> None:
     results, _ = followed("ct-icp")
     tracker = Tracker(method("ct-icp"))
     for loaded in list(read_ahead(walk(), tracker.odometry.prepare, 1))[:12]:
@@ -223,7 +223,7 @@ def test_it_goes_on_where_it_was(tmp_path: Path) -> None:
         np.testing.assert_array_equal(one.covariance, other.covariance)
 
 
-def test_lines_miss_each_other_and_lag_as_the_constants_say() -> None:
+def test_miss_and_lag_are_the_constants_of_random_acceleration() -> None:
     """A way with an acceleration of its own in each of many sweeps, a line fitted to each."""
     a, n = np.random.default_rng(0).normal(size=4000), 200
     u = (np.arange(n) + 0.5) / n
@@ -256,7 +256,7 @@ def test_the_skew_of_a_map_is_found_where_the_sweep_is_known() -> None:
     np.testing.assert_allclose(taken, skew, atol=0.02)
 
 
-def test_a_sweep_in_the_map_leaves_its_share_of_the_skew_and_a_change_is_forgotten_over_five_scans() -> None:
+def test_the_skew_of_the_map_decays_over_five_scans() -> None:
     last, steady = LastSweep(), elastic(pose_at(), pose_at((1.0, 0.0, 0.0))).prior
     found = MotionPrior(steady.times, pose_at((0.2, 0.0, 0.0)) @ steady.poses)
     P = np.kron(np.eye(3), 1e-4 * np.eye(6))
@@ -274,7 +274,7 @@ def test_a_sweep_in_the_map_leaves_its_share_of_the_skew_and_a_change_is_forgott
 
 
 @pytest.mark.parametrize("gap", [0, 1])
-def test_a_sweep_that_does_not_follow_the_last_one_is_not_held_to_its_end(gap: int) -> None:
+def test_location_consistency_applies_to_consecutive_sweeps_only(gap: int) -> None:
     last, times = LastSweep(), knots_over(SPAN)
     before = elastic(pose_at(), pose_at((1.0, 0.0, 0.0))).prior
     last.follow(0, np.eye(4), before, before, np.zeros(6), 1e-6 * np.eye(18), 0.1)

@@ -31,7 +31,7 @@ def test_the_weak_axis_of_a_corridor_is_its_length() -> None:
     assert share_along(d.results, d.truth) >= 0.95
 
 
-def test_it_is_so_for_loam_scan_to_scan_too() -> None:
+def test_the_weak_axis_of_a_corridor_is_its_length_in_loam_scan_to_scan() -> None:
     """Points of one ring, a few decimetres apart, make normals that waver and seem to see along it."""
     results, truth = between_walls(0, "loam-odom")
     assert share_along(results, truth) >= 0.95
@@ -40,7 +40,7 @@ def test_it_is_so_for_loam_scan_to_scan_too() -> None:
 @pytest.mark.parametrize(
     ("method", "usual", "worst"), [("loam-odom", 0.01, 0.016), ("loam", 0.016, 0.03), ("lego-loam", 0.012, 0.04)]
 )
-def test_bare_walls_do_not_lead_features_astray(method: str, usual: float, worst: float) -> None:
+def test_features_keep_the_speed_between_bare_walls(method: str, usual: float, worst: float) -> None:
     """The last scans that see anything know the speed; a few edges that walls do not have must not unlearn it.
 
     How well they know it is a matter of where the last pier stands: of one of five seeds to four percent.
@@ -51,14 +51,14 @@ def test_bare_walls_do_not_lead_features_astray(method: str, usual: float, worst
 
 
 @pytest.mark.parametrize("method", ["loam", "lego-loam"])
-def test_between_bare_walls_all_points_know_the_speed_better(method: str) -> None:
+def test_all_points_keep_the_speed_between_bare_walls_better(method: str) -> None:
     shares = [strayed(seed, method, "all-points") for seed in HELPED]
     assert np.median(shares) < 0.001
     assert max(shares) < 0.025
 
 
 @pytest.mark.parametrize("seed", [0, 1])
-def test_a_sparse_sensor_holds_every_direction_as_it_turns(seed: int) -> None:
+def test_a_rotating_sparse_sensor_observes_every_direction(seed: int) -> None:
     """16 x 400 rays make few features: they know the yaw by 2 cm at their distance, the last turn of it ten times worse."""
     block = simulate("block", seed=seed, motion_compensated=True)
     results = by_features(block, "loam-odom")
@@ -107,14 +107,14 @@ def by_features(drive: Sequence, method: str, fallback: str = "none") -> list[Sc
 
 
 @pytest.mark.parametrize("scenario", ["street", "urban"])
-def test_towns_hold_every_direction(scenario: str) -> None:
+def test_every_direction_is_observed_in_towns(scenario: str) -> None:
     d = drive(scenario, 0, 25, every=2, compensated=True)
     flagged = [len(r.degenerate) > 0 for r in d.results]
     assert np.mean(flagged) < 0.02
 
 
 @pytest.mark.parametrize(("scenario", "lidar"), [("street", "vlp16"), ("urban", None)])
-def test_towns_hold_every_direction_of_loam_scan_to_scan(scenario: str, lidar: str | None) -> None:
+def test_every_direction_is_observed_in_towns_by_loam_scan_to_scan(scenario: str, lidar: str | None) -> None:
     whole = simulate(scenario, seed=1, count=29, lidar=lidar, motion_compensated=True)
     results = by_features(select(whole, skip_frames=2), "loam-odom")
     assert len(results) == 15

@@ -20,7 +20,7 @@ from lslam.types.scan_result import ScanResult
 
 
 @pytest.mark.parametrize("method", ["gicp", "loam-odom"])
-def test_a_scan_enters_where_it_was_put(method: str) -> None:
+def test_a_scan_enters_the_map_at_the_pose_of_the_update(method: str) -> None:
     """From scan to scan the next one, here the same one, is found where the last was put."""
     config = Config.model_validate({"odometry": {"method": method}, "registration": {"target": "scan"}})
     odometry = create_odometry(config)
@@ -61,7 +61,7 @@ def scans_in(registration: Any) -> int:
 
 
 @pytest.mark.parametrize("method", ["icp", "loam"])
-def test_a_scan_whose_registration_is_denied_enters_where_it_is_put_and_teaches_nothing(method: str) -> None:
+def test_a_rejected_scan_enters_at_the_prior_and_does_not_change_the_thresholds(method: str) -> None:
     """The third scan is found a metre from its prior: believed, that opens the kernel; denied, it enters at the prior."""
     odometry, registration, scan, (_, before, _) = before_the_third(method)
     prepared, prior = odometry.prepare(scan), MotionPrior.at_once(before)
@@ -80,7 +80,7 @@ def test_a_scan_whose_registration_is_denied_enters_where_it_is_put_and_teaches_
 
 
 @pytest.mark.parametrize("method", ["icp", "loam"])
-def test_near_a_prior_nothing_is_sought_elsewhere(method: str) -> None:
+def test_with_a_near_prior_no_recovery_is_tried(method: str) -> None:
     """The third scan, expected two metres beside it: it is found all the same, but not near there."""
     odometry, registration, scan, (*_, true) = before_the_third(method)
     prepared = odometry.prepare(scan)

@@ -59,7 +59,7 @@ def test_a_walk_is_followed_as_well_as_by_the_loose_imu_and_far_better_than_with
     assert all(result.covariance is not None for result in results)
 
 
-def test_a_gap_of_the_imu_is_crossed_by_constant_velocity_and_said() -> None:
+def test_a_gap_of_the_imu_is_bridged_by_constant_velocity_and_reported() -> None:
     sequence = walk(50)
     assert isinstance(sequence.imu, ImuStream)
     stamps = sequence.imu.stamps_ns
@@ -99,7 +99,7 @@ def test_an_imu_that_is_too_slow_for_a_filter_ends_the_run_before_anything_is_re
     assert any("10 Hz, which degrades" in note for note in notes)
 
 
-def test_a_run_goes_on_where_it_was(tmp_path: Path) -> None:
+def test_fast_lio2_resumes_to_the_last_bit(tmp_path: Path) -> None:
     """The states of the filter are part of the checkpoint; see `tests/frontend/test_resumable_state.py`."""
     from lslam.formats.state_files import read_state, write_state
     from lslam.frontend.inertial_start import begin_inertial

@@ -217,7 +217,7 @@ def test_a_map_of_all_points_is_given_up_when_features_are_fed_again(
     ("inliers", "before", "after", "is_taken"),
     [(200, 1, 0, True), (200, 2, 1, True), (200, 1, 1, False), (10, 0, 0, True), (10, 1, 1, True), (10, 0, 1, False)],
 )
-def test_who_stands_in_closes_a_direction_or_opens_none_where_features_are_few(
+def test_less_planar_points_are_taken_when_fewer_directions_stay_degenerate(
     monkeypatch: pytest.MonkeyPatch, inliers: int, before: int, after: int, is_taken: bool
 ) -> None:
     registration = engine(None, True)
@@ -249,7 +249,7 @@ def test_what_led_astray_where_nothing_is_observed_is_taken_back_and_nothing_els
         np.testing.assert_allclose(kept.T_world_lidar, right, atol=2e-4)
 
 
-def test_features_are_asked_to_be_as_good_as_the_prior_and_no_better_than_one_planar_point() -> None:
+def test_the_least_information_of_a_direction_follows_the_error_of_the_prior() -> None:
     """A prior that is wrong by 0.3 m knows a direction as one planar point in a hundred would: 3 cm over 0.3 m, squared."""
     registration = engine(joint_step, False)
     for error, least in [(0.3, 0.01), (0.06, 0.25), (0.03, 1.0), (0.001, 1.0), (0.0, 1.0)]:

@@ -109,7 +109,7 @@ def bad_points(kind: str) -> NDArray[np.float32]:
 
 
 @pytest.mark.parametrize("kind", ["noise", "nan", "far", "empty", "kidnapped 20 m", "kidnapped 30 m", "kidnapped 37 m"])
-def test_a_bad_scan_is_bridged_flagged_kept_out_of_the_map_and_got_over(kind: str) -> None:
+def test_a_bad_scan_is_bridged_without_changing_the_map_and_the_next_is_registered(kind: str) -> None:
     scans, truth = block()
     driver = warmed()
     target = driver.icp.registration.map
@@ -132,7 +132,7 @@ def test_a_bad_scan_is_bridged_flagged_kept_out_of_the_map_and_got_over(kind: st
         assert np.sqrt(good.covariance[0, 0]) < 0.05
 
 
-def test_a_sensor_carried_away_while_the_map_is_young_is_told() -> None:
+def test_scans_from_elsewhere_are_rejected_by_a_young_map() -> None:
     """Few points agree with a young map, and of those from elsewhere hardly fewer than of the map's own second scan."""
     scans, truth = block()
     driver = Driver()
@@ -155,7 +155,7 @@ def test_five_bad_scans_in_a_row_are_bridged_by_constant_velocity() -> None:
     assert metres(found, truth[BAD + 5]) < 0.05
 
 
-def test_a_sensor_carried_away_for_good_is_said_before_it_is_believed() -> None:
+def test_scans_of_another_place_are_bridged_before_they_are_accepted() -> None:
     scans, _ = block()
     driver = warmed()
     statuses = [
@@ -164,7 +164,7 @@ def test_a_sensor_carried_away_for_good_is_said_before_it_is_believed() -> None:
     assert statuses[:2] == ["bridged", "bridged"]
 
 
-def test_preparing_knows_nothing_of_other_scans() -> None:
+def test_preparation_does_not_depend_on_other_scans() -> None:
     scans, _ = block()
     used, fresh = warmed().icp, create(Config())
     for k in (0, 30):
@@ -230,7 +230,7 @@ def test_world_covariance_grows_with_the_way_driven() -> None:
     assert np.linalg.norm(se3.relative(np.eye(4), driver.motion.predict(0))[:3, 3]) > 10.0
 
 
-def test_beginning_again_keeps_how_errors_add_up() -> None:
+def test_a_restart_keeps_the_accumulation_of_covariances() -> None:
     """From scan to scan every registration's error enters in full, before a restart and after it."""
     scans, _ = block()
     traces = []

@@ -110,7 +110,7 @@ def test_a_scan_that_is_missing_stays_in_the_window_without_equations() -> None:
     assert np.linalg.norm(found[:3, 3] - real[:3, 3]) < 0.05
 
 
-def test_a_gap_of_the_imu_is_crossed_by_constant_velocity_and_said() -> None:
+def test_a_gap_of_the_imu_is_bridged_by_constant_velocity_and_reported() -> None:
     sequence = walk()
     assert isinstance(sequence.imu, ImuStream)
     stamps = sequence.imu.stamps_ns

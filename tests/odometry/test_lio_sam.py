@@ -91,7 +91,7 @@ def test_all_points_may_take_the_place_of_features() -> None:
     assert tight < 1.2 * loose
 
 
-def test_a_gap_of_the_imu_is_crossed_by_constant_velocity_and_said() -> None:
+def test_a_gap_of_the_imu_is_bridged_by_constant_velocity_and_reported() -> None:
     assert isinstance(walk().imu, ImuStream)
     stamps = walk().imu.stamps_ns
     kept = (stamps < 1_300_000_000) | (stamps > 1_800_000_000)

@@ -98,7 +98,7 @@ def test_a_walk_between_houses_is_followed_and_its_states_are_resumed(tmp_path: 
     np.testing.assert_array_equal(rest, [r.T_world_lidar for r in results[12:]])
 
 
-def test_over_a_gap_and_a_lost_scan_the_planes_carry_on() -> None:
+def test_planes_are_registered_over_a_gap_and_a_lost_scan() -> None:
     part = begin_again()
     assert part.motion is not None
     imu = part.motion.imu
@@ -127,7 +127,7 @@ def test_warming_up_compiles_what_the_window_is_solved_with(monkeypatch: pytest.
     assert calls == warm
 
 
-def test_behind_a_stand_a_scan_is_linked_by_its_pose_and_not_by_all_that_was_felt() -> None:
+def test_after_a_standstill_a_scan_is_linked_by_its_pose_and_not_by_the_imu() -> None:
     one = tracker()
     loaded = list(read_ahead(walk(), one.odometry.prepare, 1))
     results = [one.track(scan) for scan in loaded[:8]]
@@ -146,7 +146,7 @@ def test_behind_a_stand_a_scan_is_linked_by_its_pose_and_not_by_all_that_was_fel
     assert np.linalg.norm(prior.link.step.position) < 0.15
 
 
-def test_behind_a_denied_scan_the_next_is_linked_to_where_the_smoother_put_that() -> None:
+def test_the_scan_after_a_rejected_one_is_linked_to_its_smoothed_pose() -> None:
     """Its planes are taken back and the window goes on by the IMU, which then falls silent."""
     one = tracker()
     loaded = list(read_ahead(walk(), one.odometry.prepare, 1))
@@ -173,7 +173,7 @@ def test_behind_a_denied_scan_the_next_is_linked_to_where_the_smoother_put_that(
     assert np.linalg.norm(led[:3, 3] - after.pose[:3, 3]) < 0.05
 
 
-def test_where_there_is_only_ground_the_directions_it_leaves_free_are_said() -> None:
+def test_ground_alone_leaves_degenerate_directions_reported() -> None:
     truth, rng = walk().ground_truth, np.random.default_rng(0)
     assert truth is not None
     true = se3.relative(truth.poses[0], truth.poses[:12])
@@ -192,7 +192,7 @@ def test_where_there_is_only_ground_the_directions_it_leaves_free_are_said() -> 
     assert np.trace(covariance[:2, :2]) > 4 * np.trace(first[:2, :2])
 
 
-def test_without_planes_the_imu_carries_and_every_scan_says_so() -> None:
+def test_without_planes_scans_are_bridged_by_the_imu_with_a_reason() -> None:
     rng = np.random.default_rng(0)
 
     def bush(scan: Scan | str) -> Scan | str:

@@ -139,7 +139,7 @@ def starved(scan: Scan, kind: str) -> Scan:
 
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("kind", ["empty", "nan", "noise"])
-def test_a_scan_without_features_is_bridged_and_got_over(method: str, kind: str) -> None:
+def test_a_scan_without_features_is_bridged_and_the_next_is_registered(method: str, kind: str) -> None:
     scans, truth = street()
     driver = Driver(method)
     driver.drive(scans[:12])
@@ -293,7 +293,7 @@ def of_motorway(seed: int, lidar: str, count: int, speed: float | None = None) -
     ("method", "seed", "lidar"),
     [("loam-odom", 1, "os1-16"), ("loam", 1, "vlp16"), ("floam", 0, "os1-16"), ("lego-loam", 0, "os1-16")],
 )
-def test_sixteen_beams_hold_a_start_at_thirty_metres_a_second(method: str, seed: int, lidar: str) -> None:
+def test_a_start_at_thirty_metres_a_second_is_followed_with_sixteen_beams(method: str, seed: int, lidar: str) -> None:
     """Planar points of so few rings lie on the road and slide with it, by all of the 3 m a scan."""
     scans, truth = of_motorway(seed, lidar, 4)
     for result, true in zip(Driver(method, fallback="all-points").drive(scans), truth, strict=True):
@@ -301,7 +301,7 @@ def test_sixteen_beams_hold_a_start_at_thirty_metres_a_second(method: str, seed:
         assert metres(result, true) < 0.8
 
 
-def test_all_points_hold_features_to_what_stands() -> None:
+def test_all_points_correct_a_slide_of_features_by_non_ground_points() -> None:
     """Two metres on the road's planar points agree as well, with sixteen beams these lie there, too; posts do not."""
     scans, truth = of_motorway(0, "os1-16", 9)
     driver = Driver("floam", fallback="all-points")
@@ -316,7 +316,7 @@ def test_all_points_hold_features_to_what_stands() -> None:
     assert np.linalg.norm(held.T_world_lidar[:3, 3] - expected[:3, 3]) < 0.2
 
 
-def test_where_features_hold_the_place_badly_all_points_are_asked() -> None:
+def test_all_points_register_scans_with_poorly_constraining_features() -> None:
     """A hundred features of sixteen rings leave decimetres along a motorway open from scan to scan, unseen."""
     off = []
     for seed in range(4):
@@ -330,7 +330,7 @@ def test_where_features_hold_the_place_badly_all_points_are_asked() -> None:
     assert np.max(off) < 0.3
 
 
-def test_a_start_that_is_taken_up_again_knows_what_stands() -> None:
+def test_a_resumed_start_has_its_non_ground_points() -> None:
     scans, _ = of_motorway(1, "vlp16", 9)
     first, again = (Driver("floam", fallback="all-points") for _ in range(2))
     first.drive(scans[:2])
@@ -371,7 +371,7 @@ def test_edges_find_a_start_at_thirty_metres_a_second(method: str) -> None:
     assert {r.posed_by for r in found} <= {"", LESS_PLANAR}
 
 
-def test_few_edges_start_no_search_astray() -> None:
+def test_two_matching_edges_do_not_support_a_start() -> None:
     """One scan of sixteen beams makes hardly a line: where two edges agree, not one, is no place."""
     scans, truth = street(100, "vlp16", 6, speed=12.0)
     for result, true in zip(Driver("loam").drive(scans), truth, strict=True):

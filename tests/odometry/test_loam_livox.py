@@ -53,7 +53,7 @@ def error(results: list[ScanResult], truth: Floats) -> float:
     return float(np.linalg.norm(se3.relative(found, se3.relative(truth[0], truth[-1]))[:3, 3]))
 
 
-def test_a_drive_is_followed_and_the_pieces_tell_the_motion_within_a_sweep() -> None:
+def test_a_drive_is_followed_and_pieces_estimate_the_motion_within_a_sweep() -> None:
     given, truth = scans()
     tracker = Tracker(create_odometry(config_of()))
     results = tracked(tracker, given)
@@ -67,7 +67,7 @@ def test_a_drive_is_followed_and_the_pieces_tell_the_motion_within_a_sweep() -> 
     np.testing.assert_allclose(moved[:3, 3], step[:3, 3], atol=0.05)
 
 
-def test_it_goes_on_where_it_was_to_the_last_bit(tmp_path: Path) -> None:
+def test_loam_livox_resumes_to_the_last_bit(tmp_path: Path) -> None:
     given, _ = scans()
     whole = Tracker(create_odometry(config_of()))
     tracked(whole, given[:6])

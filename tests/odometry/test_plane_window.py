@@ -130,7 +130,7 @@ def test_marginalising_loses_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     )  # fmt: skip
 
 
-def test_the_way_through_a_room_is_found_as_surely_as_it_says() -> None:
+def test_the_path_through_a_room_is_within_its_covariance() -> None:
     squares = []
     for seed in range(12):
         window = driven(8, seed)
@@ -140,7 +140,7 @@ def test_the_way_through_a_room_is_found_as_surely_as_it_says() -> None:
     assert 0.3 < np.mean(squares) / 3 < 2.0
 
 
-def test_planes_are_their_landmarks_and_strangers_are_none() -> None:
+def test_planes_are_associated_with_their_landmarks_and_others_with_none() -> None:
     rng = np.random.default_rng(3)
     window = driven(3).extended(step_of(rng))
     planes = seen_planes(window.T_world_lidar, rng)

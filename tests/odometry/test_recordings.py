@@ -47,14 +47,14 @@ def kth(recordings: Recordings) -> tuple[list[RegistrationResult], Floats]:
     return FOUND["kth"]
 
 
-def test_0005_holds_its_rotation(recordings: Recordings) -> None:
+def test_drive_0005_has_its_bounded_rotation_error(recordings: Recordings) -> None:
     results, truth = kitti(recordings, "0005")
     assert all(r.ok for r in results)
     assert rotation_rpe(poses_of(results), truth, poses_of(results)) <= 0.24
     assert abs(final_yaw_deg(poses_of(results)) - final_yaw_deg(truth)) <= 0.2
 
 
-def test_0048_holds_its_rotation(recordings: Recordings) -> None:
+def test_drive_0048_has_its_bounded_rotation_error(recordings: Recordings) -> None:
     """The target is 0.11 deg: 0.105 is reached over the pairs whose scans are nearest 10 m of true path.
 
     Evo's rule, over the pairs of the estimated path, gives 0.116; of 22 scans and 17 m few pairs exist, and they overlap.
@@ -64,7 +64,7 @@ def test_0048_holds_its_rotation(recordings: Recordings) -> None:
     assert rotation_rpe(poses_of(results), truth, poses_of(results)) <= 0.125
 
 
-def test_kth_holds_its_position(recordings: Recordings) -> None:
+def test_kth_has_its_bounded_position_error(recordings: Recordings) -> None:
     results, truth = kth(recordings)
     assert all(r.ok for r in results)
     assert ate(poses_of(results), truth) <= 0.09

@@ -69,7 +69,7 @@ def test_a_pose_that_is_none_is_bridged_by_the_motion_prior(pose: Floats, reason
 
 
 @pytest.mark.parametrize(("x", "stamp_ns"), [(14.0, PERIOD_NS), (14.0, 100), (140.0, 10 * PERIOD_NS)])
-def test_what_a_vehicle_can_do_is_believed(x: float, stamp_ns: int) -> None:
+def test_motions_that_a_vehicle_can_make_are_accepted(x: float, stamp_ns: int) -> None:
     """Also where the stamps run too fast: a registration may err by decimetres within no time."""
     result = at(x, 1, stamp_ns)
     assert plausible(result, np.eye(4), at(0.0, 0, 0)) is result

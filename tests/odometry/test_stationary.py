@@ -91,7 +91,7 @@ def test_a_stationary_scan_has_the_pose_and_covariance_of_its_reference() -> Non
     np.testing.assert_array_equal(result.covariance, uncertainty)
 
 
-def test_nothing_is_asked_while_driving_and_after_a_failure() -> None:
+def test_the_detector_is_off_while_driving_and_after_a_failure() -> None:
     scans, truth = drive("block", None, 34, static_start=1.0)
     config = Config()
     stationary = StationaryDetector(config.preprocess, config.registration)
@@ -107,7 +107,7 @@ def test_nothing_is_asked_while_driving_and_after_a_failure() -> None:
 
 
 @pytest.mark.parametrize("kind", ["empty", "noise", "a plane without end"])
-def test_a_scan_that_cannot_tell_does_not_stand(kind: str) -> None:
+def test_a_scan_without_observability_is_not_stationary(kind: str) -> None:
     rng = np.random.default_rng(0)
     plane = np.column_stack([rng.uniform(-30, 30, (9000, 2)), np.full(9000, -1.7)])
     first = {"empty": plane, "noise": rng.uniform(-20, 20, (9000, 3)), "a plane without end": plane}[kind]

@@ -81,7 +81,7 @@ def whole_of_all(everything: Config, tmp_path_factory: pytest.TempPathFactory) -
     return out, all_looks(everything, out)
 
 
-def test_every_stage_looks(whole: tuple[Path, list[str]]) -> None:
+def test_every_stage_checks_for_a_stop(whole: tuple[Path, list[str]]) -> None:
     """Each scan of odometry and of the map, each keyframe, before and in the graph, the map, and before the last word."""
     out, looks = whole
     keyframes = json.loads((out / "manifest.json").read_text())["keyframes"]["count"]
@@ -93,7 +93,7 @@ def test_every_stage_looks(whole: tuple[Path, list[str]]) -> None:
     assert counts["solve"] >= 2, "before the first iteration and after it"
 
 
-def test_every_loop_that_may_take_long_looks(whole_of_all: tuple[Path, list[str]]) -> None:
+def test_every_long_loop_checks_for_a_stop(whole_of_all: tuple[Path, list[str]]) -> None:
     out, looks = whole_of_all
     keyframes = json.loads((out / "manifest.json").read_text())["keyframes"]["count"]
     counts = Counter(looks)
@@ -128,7 +128,7 @@ def assert_goes_on(
 
 # Of 48 scans, 24 keyframes, the graph, 48 scans again, the map, and the report.
 @pytest.mark.parametrize("look", [0, 20, 47, 49, 65, 72, 77, -50, -25, -2, -1])
-def test_asked_at_any_look_it_is_interrupted_and_goes_on(
+def test_a_stop_at_any_check_interrupts_and_resumes_to_the_same_bytes(
     look: int, whole: tuple[Path, list[str]], config: Config, tmp_path: Path
 ) -> None:
     reference, looks = whole
@@ -138,7 +138,7 @@ def test_asked_at_any_look_it_is_interrupted_and_goes_on(
 @pytest.mark.parametrize(
     "asker", ["solve", "marginal_blocks", "_along", "agreeing", "new_walls", "combined", "_pieces"]
 )
-def test_asked_in_graph_buildings_or_map_it_is_interrupted_and_goes_on(
+def test_a_stop_in_graph_buildings_or_map_interrupts_and_resumes_to_the_same_bytes(
     asker: str, whole_of_all: tuple[Path, list[str]], everything: Config, tmp_path: Path
 ) -> None:
     last = Counter(whole_of_all[1])[asker]

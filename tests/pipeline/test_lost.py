@@ -82,7 +82,7 @@ class Holed(Stub):
 
 @pytest.mark.parametrize("scenario", ["street", "residential"])
 @pytest.mark.parametrize(("corruption", "words"), [(freeze, "m ahead"), (slip, "m ahead"), (yaw_ramp, "deg of yaw")])
-def test_poses_that_contradict_the_scans_are_noticed(
+def test_poses_that_contradict_the_scans_degrade_the_run(
     scenario: str, corruption: Corruption, words: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(job, "create_odometry", lambda _: Lost(corruption, BEGIN))
@@ -95,9 +95,7 @@ def test_poses_that_contradict_the_scans_are_noticed(
     assert "may be lost" in summary(outcome.record, None)
 
 
-def test_what_is_lost_for_two_seconds_is_named_and_fails_a_strict_run(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_two_lost_seconds_are_reported_and_fail_a_strict_run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(job, "create_odometry", lambda _: Lost(slip, BEGIN, BEGIN + 20))
     with pytest.raises(GateError, match="may be lost"):
         run(drive("street"), config("input.strict=true"), out=tmp_path / "run")
@@ -112,7 +110,7 @@ def test_what_is_lost_for_two_seconds_is_named_and_fails_a_strict_run(
 
 
 @pytest.mark.parametrize("scenario", ["street", "residential"])
-def test_four_scans_out_of_order_are_recovered_from_or_named(scenario: str) -> None:
+def test_four_scans_out_of_order_are_recovered_or_reported(scenario: str) -> None:
     order = list(range(80))
     order[40:44] = [43, 42, 41, 40]
     outcome = ended(reordered(drive(scenario), order))
@@ -121,7 +119,7 @@ def test_four_scans_out_of_order_are_recovered_from_or_named(scenario: str) -> N
     assert any("out of order" in problem for problem in problems(outcome))
 
 
-def test_scans_that_change_places_by_twos_are_noticed() -> None:
+def test_scans_swapped_in_pairs_degrade_the_run() -> None:
     order = np.arange(60).reshape(-1, 2)[:, ::-1].ravel().tolist()
     outcome = ended(reordered(drive("street"), order))
     assert outcome.record.manifest["status"] in ("degraded", "diverged")
@@ -129,7 +127,7 @@ def test_scans_that_change_places_by_twos_are_noticed() -> None:
 
 
 @pytest.mark.parametrize("lidar", ["vlp16", "hdl64"])
-def test_a_hole_of_three_seconds_while_moving_is_noticed(lidar: str) -> None:
+def test_three_missing_seconds_while_moving_degrade_the_run(lidar: str) -> None:
     whole = drive("street", 100, lidar=lidar)
     scans = [whole.scan(i) for i in (*range(40), *range(70, 100))]
     outcome = ended(Holed([replace(scan, index=k) for k, scan in enumerate(scans)], None, whole.calibration))
@@ -145,14 +143,14 @@ def test_a_hole_of_three_seconds_while_moving_is_noticed(lidar: str) -> None:
         ("motorway", "vlp16"), ("motorway", "hdl64"), ("urban", "vlp16"), ("climbing", "vlp16"), ("walk", "vlp16"),
     ],
 )  # fmt: skip
-def test_no_good_drive_is_accused(scenario: str, lidar: str) -> None:
+def test_a_good_drive_raises_no_alert(scenario: str, lidar: str) -> None:
     outcome = ended(drive(scenario, 80, 1, lidar))
     assert problems(outcome) == []
     assert outcome.record.manifest["integrity"]["checks"] >= 14
 
 
 @pytest.mark.parametrize("more", [0, 1, 3])
-def test_of_many_stretches_the_first_are_told_and_the_others_counted(more: int) -> None:
+def test_the_first_alerts_are_listed_and_the_others_counted(more: int) -> None:
     """One check in six finds the sensor a metre ahead: the scans of each are marked, also of those that are not told."""
     stretches = MOST_SAID + more
     cfg = config()
@@ -176,14 +174,14 @@ def test_of_many_stretches_the_first_are_told_and_the_others_counted(more: int) 
 
 
 @pytest.mark.parametrize("method", ["icp", "kiss-icp", "loam"])
-def test_the_sample_is_not_accused_by_any_method(method: str) -> None:
+def test_the_sample_raises_no_alert_with_any_method(method: str) -> None:
     outcome = ended(open_sequence(SAMPLE), f"odometry.method={method}")
     assert problems(outcome) == []
     assert outcome.record.manifest["integrity"]["conclusive"] > 10
 
 
 @pytest.mark.parametrize("name", ["kitti_raw_0005", "kitti_raw_0048", "mcd_kth_day_06"])
-def test_no_recording_is_accused(recordings: Callable[[str], Path], name: str) -> None:
+def test_recordings_raise_no_alert(recordings: Callable[[str], Path], name: str) -> None:
     folder = recordings(name)
     drive_folder = folder / "2011_09_26" / f"2011_09_26_drive_{name[-4:]}_sync" if "kitti" in name else folder / name
     outcome = ended(select(open_sequence(drive_folder), 0, 100))

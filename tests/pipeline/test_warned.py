@@ -90,21 +90,21 @@ def test_a_warning_alone_does_not_make_a_run_degraded(tmp_path: Path) -> None:
     assert outcome.record.manifest["problems"] == facts["problems"]
 
 
-def test_a_run_without_a_folder_hears_too_and_a_deaf_log_does_not_matter() -> None:
+def test_warnings_are_problems_without_a_folder_and_at_any_log_level() -> None:
     LOG.setLevel(logging.CRITICAL)
     outcome = lslam.run(replace(sample(4), motion_compensated=None), config_of())
     assert [sentence[:9] for sentence in outcome.record.manifest["problems"]] == ["no deskew"]
     assert LOG.level == logging.CRITICAL
 
 
-def test_what_was_heard_before_a_run_belongs_to_it(tmp_path: Path) -> None:
+def test_warnings_before_a_run_are_problems_of_the_run(tmp_path: Path) -> None:
     with hearing():
         LOG.warning("times.txt has 3 stamps")
         lslam.run(sample(4), config_of("map.write=false"), out=tmp_path / "out")
     assert manifest(tmp_path / "out")["problems"] == ["times.txt has 3 stamps"]
 
 
-def test_one_run_after_the_other_and_both_at_once_do_not_mix(tmp_path: Path) -> None:
+def test_warnings_of_consecutive_and_concurrent_runs_do_not_mix(tmp_path: Path) -> None:
     settings = config_of("map.write=false", "report.html=false", "input.threads=2")
     both = threading.Barrier(2)
 
@@ -131,9 +131,7 @@ def test_one_run_after_the_other_and_both_at_once_do_not_mix(tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize("threads", [1, 2])
-def test_a_run_that_goes_on_keeps_what_it_was_warned_of(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, threads: int
-) -> None:
+def test_a_resumed_run_keeps_its_warnings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, threads: int) -> None:
     monkeypatch.setattr(CheckpointSchedule, "is_due", True)
     settings = config_of("report.html=false", f"input.threads={threads}")
     stub = replace(sample(COUNT), motion_compensated=None)
@@ -149,7 +147,7 @@ def test_a_run_that_goes_on_keeps_what_it_was_warned_of(
     assert manifest(out)["problems"] == manifest(tmp_path / "whole")["problems"]
 
 
-def test_a_map_that_goes_on_keeps_what_it_was_warned_of(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_resumed_map_keeps_its_warnings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(CheckpointSchedule, "is_due", True)
     stub, out, begun = sample(COUNT), tmp_path / "out", [False]
 
@@ -172,7 +170,7 @@ def test_a_map_that_goes_on_keeps_what_it_was_warned_of(tmp_path: Path, monkeypa
     assert manifest(out)["problems"] == ["a voxel looks odd"]
 
 
-def test_a_failed_run_says_what_it_was_warned_of(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failed_run_lists_its_warnings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def broken(*_: object) -> None:
         raise MemoryError("no room")
 
@@ -184,7 +182,7 @@ def test_a_failed_run_says_what_it_was_warned_of(tmp_path: Path, monkeypatch: py
     assert [sentence[:9] for sentence in facts["problems"]] == ["no deskew"]
 
 
-def test_many_alike_are_counted_and_what_is_told_is_told_once() -> None:
+def test_similar_warnings_are_counted_and_listed_once() -> None:
     with hearing() as heard:
         for scan in range(100):
             LOG.warning("scan %d skipped: no points", scan)

@@ -29,7 +29,7 @@ def aside(result: RegistrationResult, share: float, y: float = 0.05) -> Registra
 
 
 @pytest.mark.parametrize(("coarse", "is_taken"), [(0.9, True), (0.7, False)])
-def test_coarse_to_fine_is_believed_only_where_it_agrees_as_usual(
+def test_coarse_to_fine_is_accepted_only_with_usual_agreement(
     coarse: float, is_taken: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """What hides the map from the fine registration, as passers-by do, hides it from the coarse one, which knows no better."""
@@ -58,7 +58,7 @@ def begun() -> tuple[RecoveringRegistration, PreparedPoints, RegistrationResult]
 @pytest.mark.parametrize(
     ("fine", "coarse", "is_taken"), [(0.6, 0.7, True), (0.7, 0.6, False), (0.7, 0.7, False), (0.01, 0.4, True)]
 )
-def test_at_the_start_the_larger_consensus_wins(
+def test_at_the_start_the_result_with_the_larger_consensus_is_taken(
     fine: float, coarse: float, is_taken: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Also the only one that does not fail: of 1 % nothing is believed."""
@@ -84,7 +84,7 @@ def test_a_coarse_result_that_fails_is_not_taken_however_many_agree(monkeypatch:
     assert located.T_world_lidar is near.T_world_lidar
 
 
-def test_a_result_that_is_sure_is_not_asked_twice(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_coarse_to_fine_is_not_tried_after_a_confident_result(monkeypatch: pytest.MonkeyPatch) -> None:
     registration, rng = RecoveringRegistration(), np.random.default_rng(0)
     for k in range(8):
         registration.register(seen_from(room(rng), pose_at((0.1 * k, 0.0, 0.0))))
@@ -110,7 +110,7 @@ def test_a_standing_start_on_few_planes_does_not_slide() -> None:
 
 
 @pytest.mark.parametrize(("seed", "first"), [(0, 10), (1, 5)])
-def test_scans_that_went_missing_unnoticed_leave_no_scan_misplaced(seed: int, first: int) -> None:
+def test_missing_scans_do_not_misplace_the_next_ones(seed: int, first: int) -> None:
     # A metre and more beyond the prior a fine map holds a scan by its own rings, with two thirds of the usual points.
     drive = driven("urban", seed)
     registration = RecoveringRegistration()

@@ -49,7 +49,7 @@ def test_the_share_is_that_of_points_with_a_neighbour_and_leaves_the_ground_out(
     assert first.share(seen, true) > 1.06 * first.share(seen, true @ pose_at((1.0, 0.0, 0.0)))
 
 
-def test_what_is_as_low_as_a_crash_barrier_is_not_asked() -> None:
+def test_points_as_low_as_crash_barriers_are_left_out() -> None:
     """Barriers lie along the road everywhere: the sensor's own rings match on them best where nothing moved."""
     points = street(np.random.default_rng(1), 0.0)
     along = np.arange(-20, 20, 0.1)
@@ -62,12 +62,12 @@ def test_what_is_as_low_as_a_crash_barrier_is_not_asked() -> None:
     assert non_ground_of(points, np.eye(4)).share(low, np.eye(4)) == 1.0
 
 
-def test_bare_ground_says_nothing() -> None:
+def test_bare_ground_has_no_share() -> None:
     ground = street(np.random.default_rng(1), 0.0)[:4000]
     assert non_ground_of(ground, np.eye(4)).share(seen_in(ground), np.eye(4)) == 0.0
 
 
-def test_the_points_on_the_ground_are_the_others() -> None:
+def test_ground_and_non_ground_points_are_complementary() -> None:
     points = street(np.random.default_rng(1), 0.0)
     seen = PreparedPoints(points, points.astype(np.float64), np.arange(len(points))[:, None] * np.ones(6), len(points))
     ground = on_ground(seen, ground_under(seen, PreprocessConfig()), PreprocessConfig().ground_tolerance)

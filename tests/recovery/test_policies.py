@@ -20,7 +20,7 @@ from lslam.registration.solver import RegistrationResult
 Floats = NDArray[np.float64]
 
 
-def test_each_policy_has_its_switch_and_the_nearer_one_is_asked_first() -> None:
+def test_each_policy_has_its_switch_and_coarse_to_fine_comes_first() -> None:
     def kinds(config: RecoveryConfig) -> list[type]:
         return [type(policy) for policy in policies_of(config)]
 
@@ -39,7 +39,7 @@ def surprised(config: RecoveryConfig) -> tuple[RegistrationResult, Floats]:
     return registration.register(seen_from(room(rng), T)), T
 
 
-def test_coarse_to_fine_catches_a_surprise_where_it_is_switched_on() -> None:
+def test_coarse_to_fine_recovers_unexpected_motion_where_it_is_on() -> None:
     result, T = surprised(RecoveryConfig())
     assert is_near(T, result.T_world_lidar, 0.01, 0.05)
     assert result.posed_by == "coarse-to-fine"
@@ -49,7 +49,7 @@ def test_coarse_to_fine_catches_a_surprise_where_it_is_switched_on() -> None:
 
 
 @pytest.mark.parametrize("coarse_to_fine", [True, False])
-def test_the_start_search_finds_a_far_first_step_where_it_is_switched_on(coarse_to_fine: bool) -> None:
+def test_the_start_search_finds_a_far_first_step_where_it_is_on(coarse_to_fine: bool) -> None:
     """Nine metres on a motorway, from one scan to the next."""
     drive = driven("motorway", 0)
     truth = se3.relative(drive.ground_truth.poses[0], drive.ground_truth.poses[3])
@@ -69,7 +69,7 @@ def test_the_start_search_finds_a_far_first_step_where_it_is_switched_on(coarse_
     assert not lost.ok or np.linalg.norm(lost.T_world_lidar[:3, 3] - truth[:3, 3]) > 1.0
 
 
-def test_without_policies_it_is_the_core() -> None:
+def test_without_policies_registration_is_the_plain_one() -> None:
     bare = RecoveryConfig(coarse_to_fine=False, start_search=False)
     poses = []
     for registration in (RecoveringRegistration(recovery=bare), Registration()):
@@ -80,7 +80,7 @@ def test_without_policies_it_is_the_core() -> None:
     np.testing.assert_array_equal(*poses)
 
 
-def test_near_its_prior_nobody_is_asked(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_with_a_near_prior_no_policy_is_tried(monkeypatch: pytest.MonkeyPatch) -> None:
     for policy in (CoarseToFine, StartSearch):
         monkeypatch.setattr(policy, "recover", lambda *_: pytest.fail("asked"))
     registration = RecoveringRegistration()

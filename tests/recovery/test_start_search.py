@@ -33,12 +33,12 @@ def at_every_third(scenario: str, seed: int, first: int, prior: Floats | None) -
 
 
 @pytest.mark.parametrize(("seed", "first"), [(0, 0), (0, 217), (1, 72), (2, 145)])
-def test_nine_metres_a_scan_are_found_among_posts_and_cars_that_keep_pace(seed: int, first: int) -> None:
+def test_nine_metres_a_scan_are_found_among_posts_and_moving_cars(seed: int, first: int) -> None:
     error, _ = at_every_third("motorway", seed, first, np.eye(4))
     assert error < 0.1
 
 
-def test_what_the_search_has_found_is_not_given_up_for_a_wide_kernel() -> None:
+def test_a_start_found_by_the_search_is_refined_with_the_final_kernel() -> None:
     """Four metres and five degrees round a corner: from the true place coarse planes led to a false one 1.9 m on."""
     error, _ = at_every_third("block", 0, 42, np.eye(4))
     assert error < 0.05
@@ -50,7 +50,7 @@ def test_a_first_turn_of_more_than_twenty_degrees_is_found(seed: int, first: int
     assert error < 0.02
 
 
-def test_turns_of_thirty_degrees_that_nothing_foretells_are_found_along_the_way() -> None:
+def test_unpredicted_rotations_of_thirty_degrees_are_found_during_the_drive() -> None:
     drive = driven("walk", 0)
     registration = RecoveringRegistration()
     for i in range(0, 54, STRIDE):
@@ -121,7 +121,7 @@ def test_a_start_high_above_a_town_keeps_height_and_tilt() -> None:
     assert np.median(off[:, 1]) < 0.05
 
 
-def test_a_start_that_is_taken_up_again_knows_what_stands() -> None:
+def test_a_resumed_start_has_its_non_ground_points() -> None:
     drive = seen_by("os1-16", "motorway", 1)
     first, again = RecoveringRegistration(), RecoveringRegistration()
     for i in range(2):
@@ -132,7 +132,7 @@ def test_a_start_that_is_taken_up_again_knows_what_stands() -> None:
 
 
 @pytest.mark.parametrize("scenario", ["residential", "urban"])
-def test_a_second_scan_from_elsewhere_is_not_placed_by_the_few_points_that_agree(scenario: str) -> None:
+def test_a_second_scan_of_another_place_is_rejected(scenario: str) -> None:
     """Somewhere twelve metres around, a tenth of what stands has a point near by: planes refuse the scan with reason."""
     begun, other = (seen_by("vlp16", name) for name in ("street", scenario))
     registration = RecoveringRegistration()
@@ -151,7 +151,7 @@ def hills(rng: np.random.Generator, at: float) -> NDArray[np.float32]:
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
-def test_where_nothing_stands_the_ground_decides(seed: int) -> None:
+def test_without_non_ground_points_the_ground_decides(seed: int) -> None:
     rng = np.random.default_rng(seed)
     registration = RecoveringRegistration()
     registration.register(hills(rng, 0.0))
@@ -160,7 +160,7 @@ def test_where_nothing_stands_the_ground_decides(seed: int) -> None:
     np.testing.assert_allclose(result.T_world_lidar[:3, 3], [8, 0, 0], atol=0.03)
 
 
-def test_starts_reach_as_far_as_asked_nearest_first() -> None:
+def test_starts_cover_the_configured_reach_nearest_first() -> None:
     offsets = start_offsets(9.0, 3.0)
     lengths = np.linalg.norm(offsets, axis=1)
     assert lengths.max() == 9.0
@@ -169,7 +169,7 @@ def test_starts_reach_as_far_as_asked_nearest_first() -> None:
     assert np.abs(start_offsets(4.0, 3.0)).max() == 4.0
 
 
-def test_much_more_is_more_than_chance_and_more_than_walls_show() -> None:
+def test_a_larger_share_is_significant_and_above_the_margin() -> None:
     def of(agree_here: int, agree_there: int, agree_at_both: int, count: int) -> tuple[Flags, Flags]:
         k = np.arange(count)
         return k < agree_here, (agree_here - agree_at_both <= k) & (k < agree_here - agree_at_both + agree_there)
