@@ -26,7 +26,7 @@ def made(method: str) -> Any:
         ("open3d-gicp", "open3d", "pip install open3d-cpu"),
     ],
 )
-def test_a_missing_package_is_said_with_the_way_out(
+def test_the_error_about_a_missing_package_names_the_remedy(
     method: str, module: str, way_out: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, module, None)

@@ -162,7 +162,7 @@ def test_foreign_libraries_have_one_home() -> None:
     assert not wrong, wrong
 
 
-def test_a_class_name_stands_once() -> None:
+def test_class_names_are_unique() -> None:
     """A reader who searches for a class finds one."""
     homes: dict[str, list[str]] = {}
     for name, path in MODULES.items():
@@ -172,7 +172,7 @@ def test_a_class_name_stands_once() -> None:
     assert not wrong, wrong
 
 
-def test_kernels_know_nothing_of_lslam() -> None:
+def test_kernels_import_nothing_of_lslam() -> None:
     wrong = [
         f"{name} -> {target}"
         for name, path in MODULES.items()

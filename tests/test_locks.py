@@ -12,7 +12,7 @@ import pytest
 from lslam.locks import lock, one_at_a_time
 
 
-def test_the_lock_makes_others_wait_and_says_so(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_held_lock_makes_others_wait_with_a_message(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO, "lslam")
     path = tmp_path / "new" / "some.lock"
     order = []
@@ -42,7 +42,7 @@ def test_what_cannot_be_locked_does_not_stop_the_work(tmp_path: Path) -> None:
     assert done
 
 
-def test_who_does_not_wait_is_told(tmp_path: Path) -> None:
+def test_lock_returns_whether_it_was_acquired(tmp_path: Path) -> None:
     with (tmp_path / "a").open("a") as first, (tmp_path / "a").open("a") as second:
         assert lock(first)
         assert not lock(second)

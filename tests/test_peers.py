@@ -244,7 +244,7 @@ def test_processes_are_set_beside_the_first() -> None:
     ]
 
 
-def test_every_rival_is_a_peer() -> None:
+def test_every_benchmark_competitor_is_a_peer() -> None:
     assert set(speed_tables.RIVALS) <= set(peers.OURS)
     assert {peer for some in speed_tables.RIVALS.values() for peer in some} == set(peers.PEERS) - set(peers.OURS)
     assert {row[0] for row in speed_tables.PUBLISHED} <= set(peers.OURS)

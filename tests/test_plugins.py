@@ -79,7 +79,7 @@ def test_they_do_not_take_the_place_of_ours(theirs: Path) -> None:
     assert "theirs" not in sys.modules
 
 
-def test_their_reader_is_asked_about_what_ours_do_not_take(theirs: Path, tmp_path: Path) -> None:
+def test_a_foreign_reader_is_tried_after_ours(theirs: Path, tmp_path: Path) -> None:
     drive = tmp_path / "drive"
     scans = sorted((Path(__file__).parents[1] / "sample_data/sequences/00/velodyne").glob("*.bin"))[:3]
     (drive / "deep").mkdir(parents=True)
@@ -121,7 +121,7 @@ def test_of_two_packages_with_one_name_the_order_of_installation_decides_nothing
     assert known_methods()["theirs"] == "from also:method"
 
 
-def test_what_nobody_has_is_refused_before_a_run() -> None:
+def test_an_unknown_name_is_refused_before_a_run() -> None:
     with pytest.raises(UsageError, match="no place descriptor 'scan-contxt'; did you mean 'scan-context'"):
         check_config(config(loops={"descriptor": "scan-contxt"}))
 

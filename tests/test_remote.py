@@ -36,7 +36,7 @@ def test_words_become_paths() -> None:
     assert type(pickle.loads(pickle.dumps(place.parent))) is RemotePath
 
 
-def test_it_answers_as_a_folder_of_a_disk_does(bucket: RemotePath, tmp_path: Path) -> None:
+def test_storage_paths_behave_as_paths_of_a_disk(bucket: RemotePath, tmp_path: Path) -> None:
     for name in ("a/2.txt", "a/10.txt", "a/b/c.csv", "top.txt"):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text(f"in {name}\nü\n", encoding="utf-8")
@@ -59,7 +59,7 @@ def test_it_answers_as_a_folder_of_a_disk_does(bucket: RemotePath, tmp_path: Pat
         (bucket / "none").read_bytes()
 
 
-def test_what_is_written_is_there_at_once_and_a_time_tells_it_from_what_was(bucket: RemotePath) -> None:
+def test_writes_are_visible_at_once_and_have_a_new_time(bucket: RemotePath) -> None:
     place = bucket / "results.csv"
     write_text(place, "one\n")
     before = (bucket / "results.csv").stat().st_mtime_ns
@@ -83,7 +83,7 @@ def test_an_object_whose_writing_fails_is_not_written(bucket: RemotePath) -> Non
     assert not (bucket / "x").exists()
 
 
-def test_what_needs_a_disk_is_refused(bucket: RemotePath) -> None:
+def test_storage_is_refused_where_a_disk_is_needed(bucket: RemotePath) -> None:
     for use in (os.fspath, os.listdir, lambda path: path.open("wb"), io.open):
         with pytest.raises(
             UsageError, match="counted://bucket lies in storage, and here a file or folder of this machine"
@@ -104,7 +104,7 @@ class NoCredentialsError(Exception):
         (RuntimeError("a strange\nthing"), "RuntimeError: a strange thing"),
     ],
 )
-def test_storage_that_does_not_give_is_one_sentence(error: Exception, said: str, bucket: RemotePath) -> None:
+def test_unreadable_storage_is_an_error_in_one_sentence(error: Exception, said: str, bucket: RemotePath) -> None:
     def refuse(verb: str, name: str) -> None:
         raise error
 
@@ -117,7 +117,7 @@ def test_storage_that_does_not_give_is_one_sentence(error: Exception, said: str,
     assert "\n" not in str(caught.value)
 
 
-def test_what_is_not_installed_is_said_with_the_way_to_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_error_about_a_missing_package_names_the_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "s3fs", None)
     monkeypatch.setitem(sys.modules, "fsspec.core", None)
     with pytest.raises(

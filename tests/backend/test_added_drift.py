@@ -21,7 +21,7 @@ RESULTS = [ScanResult(i, i * 100_000_000, T, covariance=np.eye(6)) for i, T in e
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
-def test_it_drifts_by_what_was_asked_for(seed: int) -> None:
+def test_added_drift_has_the_configured_size(seed: int) -> None:
     straight = with_drift(RESULTS, DebugConfig(drift_deg_per_100m=0, drift_seed=seed))
     assert np.linalg.norm(straight[-1].T_world_lidar[:3, 3] - [200, 0, 0]) == pytest.approx(2.0)
     turned = with_drift(RESULTS, DebugConfig(drift_percent=0, drift_seed=seed))
@@ -42,7 +42,7 @@ def test_seeds_differ_and_repeat() -> None:
     assert np.linalg.norm(ends[0] - ends[2]) > 0.1
 
 
-def test_drift_that_forgets_is_a_random_walk() -> None:
+def test_drift_without_correlation_is_a_random_walk() -> None:
     """Its variance grows with the way, 2 L W (1 - L / W) times the squared rate for a memory L that is short beside W."""
     memory, way = 5.0, 200.0
     settings = [
@@ -55,7 +55,7 @@ def test_drift_that_forgets_is_a_random_walk() -> None:
     assert "steadily" in describe(DebugConfig())
 
 
-def test_a_random_walk_has_the_size_asked_for_after_a_hundred_metres() -> None:
+def test_a_random_walk_has_the_configured_size_after_a_hundred_metres() -> None:
     """Its variance grows with the way, however that is cut into steps."""
     for every in (1, 8):
         ends = np.stack([

@@ -100,7 +100,7 @@ def test_loops_take_the_drift_away(seed: int) -> None:
         assert np.linalg.eigvalsh(result.covariance).min() > 0
 
 
-def test_drift_that_lasts_is_set_right_and_said() -> None:
+def test_a_constant_drift_is_corrected_and_reported() -> None:
     results = drifted()
     done = run_back_end(Stub([]), results, store_of(results), config(), LOOPS)
     plain = run_back_end(Stub([]), results, store_of(results), config("graph.steady_drift=false"), LOOPS)
@@ -129,7 +129,7 @@ def test_without_drift_nothing_is_set_right() -> None:
         np.testing.assert_array_equal(a.T_world_lidar, b.T_world_lidar)
 
 
-def test_wrong_loops_are_refused_and_say_so() -> None:
+def test_wrong_loops_are_rejected_with_a_reason() -> None:
     results = drifted()
     wrong = [candidate(a, a + 160, off=15.0) for a in (10, 60, 110, 160)]
     mixed = sorted([*LOOPS, *wrong], key=lambda c: c.b)
@@ -166,7 +166,7 @@ def test_a_graph_that_cannot_be_solved_leaves_odometry(monkeypatch: pytest.Monke
     }
 
 
-def test_odometry_that_claims_to_know_everything_can_be_written_down(tmp_path: Path) -> None:
+def test_odometry_with_zero_covariance_can_be_written(tmp_path: Path) -> None:
     """Covariances that do not grow say that nothing was added on the way: information without end."""
     results = [replace(r, covariance=OWN) for r in drifted()]
     done = run_back_end(Stub([]), results, store_of(results), config(), LOOPS)
@@ -202,7 +202,7 @@ def on_earth(done: BackEnd) -> np.ndarray:
 
 
 @pytest.mark.parametrize("loops", [[], LOOPS])
-def test_fixes_of_a_metre_hold_the_trajectory_through_an_outage(loops: list[LoopCandidate]) -> None:
+def test_fixes_of_a_metre_bound_the_error_through_an_outage(loops: list[LoopCandidate]) -> None:
     """200 m without fixes, drift of 0.5 %: horizontally within half a metre of the Earth's truth."""
     results = drifted("debug.drift_percent=0.5", "debug.drift_deg_per_100m=0.25")
     done = run_back_end(recording(), results, store_of(results), config("gnss.mode=graph"), loops)
@@ -216,7 +216,7 @@ def test_fixes_of_a_metre_hold_the_trajectory_through_an_outage(loops: list[Loop
     assert np.sqrt((off**2).sum(1).mean()) < 0.7 * np.sqrt((before[:, :2] ** 2).sum(1).mean())
 
 
-def test_drift_that_lasts_is_set_right_before_fixes_hold_it() -> None:
+def test_a_constant_drift_is_corrected_before_fixes_are_used() -> None:
     """Loops know its rate to a part of what fixes of a metre know: the shape is theirs, the place on the Earth the fixes'."""
     results = drifted()
     shapes = []
@@ -277,7 +277,7 @@ def test_fixes_that_are_all_bad_leave_odometry_and_its_loops() -> None:
 
 @pytest.mark.parametrize("mode", ["graph", "fit"])
 @pytest.mark.parametrize("axis", [0, 1])
-def test_fixes_that_lost_a_sign_are_said_and_left_out(axis: int, mode: str) -> None:
+def test_fixes_with_a_wrong_sign_are_reported_and_left_out(axis: int, mode: str) -> None:
     """A third of them in another hemisphere: the others place the run; nearly all: they are a mirror image, and none does."""
     sequence = recording(0.5)
     results = drifted("debug.drift_percent=0.2", "debug.drift_deg_per_100m=0.1")
@@ -369,7 +369,7 @@ def test_gravity_that_is_no_better_than_odometry_moves_nothing(seed: int, count:
 
 
 @pytest.mark.parametrize("steepness", [0.0, 0.06])
-def test_only_flat_ground_holds_poses(steepness: float) -> None:
+def test_only_flat_ground_constrains_poses(steepness: float) -> None:
     """A hill under the wheels is said and left out; a flat floor keeps from climbing what drifts upwards."""
     x = 2.0 * np.arange(40)
     pitch = -np.arctan(steepness * np.sin(x / 8))

@@ -139,7 +139,7 @@ def test_some_bad_fixes_do_not_matter() -> None:
     assert found.used < 0.7 * found.fixes
 
 
-def test_a_recording_without_fixes_is_told_before_the_run() -> None:
+def test_a_recording_without_fixes_is_reported_before_the_run() -> None:
     with pytest.raises(InputError, match="--georeference"):
         require_gnss(replace(recording(0.1), gnss=None), GnssConfig(mode="fit"))
     require_gnss(replace(recording(0.1), gnss=None), GnssConfig())
@@ -167,7 +167,7 @@ def moved(which: np.ndarray, metres: float, noise: float = 0.85) -> Stub:
 
 
 @pytest.mark.parametrize("which", [[3], [2, 5, 8], [20, 21, 22], [0, 39], [0, 1, 39]])
-def test_fixes_that_odometry_contradicts_are_counted_and_said(which: list[int]) -> None:
+def test_fixes_that_odometry_contradicts_are_counted_and_reported(which: list[int]) -> None:
     placed = fit(moved(np.array(which), 100.0))
     assert placed.georeference is not None
     assert placed.georeference.used == 40 - len(which)
@@ -177,7 +177,7 @@ def test_fixes_that_odometry_contradicts_are_counted_and_said(which: list[int]) 
 
 
 @pytest.mark.parametrize(("first", "may_be_right"), [(20, True), (26, False)])
-def test_a_jump_of_all_fixes_is_said_with_its_size_and_time(first: int, may_be_right: bool) -> None:
+def test_a_jump_of_all_fixes_is_reported_with_its_size_and_time(first: int, may_be_right: bool) -> None:
     problem = fit(moved(np.arange(first, 40), 100.0)).problem
     match = re.search(rf"all fixes jump by ([0-9.]+) m together {first}.0 s after the first", problem)
     assert match is not None, problem

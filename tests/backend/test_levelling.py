@@ -67,7 +67,7 @@ def test_gravity_makes_the_world_level(spread: float, bound: float) -> None:
     np.testing.assert_allclose(found[0][:3, 3], 0, atol=1e-12)
 
 
-def test_what_is_known_better_counts_for_more() -> None:
+def test_up_directions_are_weighted_by_their_sigmas() -> None:
     """The start mistakes a bias for a tilt of 5 deg, and says so."""
     results = results_of(bend())
     wrong = so3.exp(np.array([np.deg2rad(5), 0, 0]))
@@ -134,7 +134,7 @@ def test_the_ground_makes_the_world_level() -> None:
 
 
 @pytest.mark.parametrize("wanted", ["ground", "gravity"])
-def test_what_cannot_be_had_is_said(wanted: str) -> None:
+def test_an_unavailable_levelling_is_reported(wanted: str) -> None:
     results = [ScanResult(0, 0, np.eye(4))]
     level = find_level(Stub([ground_scan(False)]), results, config(f"input.level={wanted}"))
     assert not level.is_turned

@@ -30,7 +30,7 @@ def wandering(seed: int) -> Stub:
     return replace(sequence, gnss=replace(sequence.gnss, lat_lon_alt=geodesy.from_local(places, ORIGIN), sigma=sigma))
 
 
-def test_poses_know_that_fixes_err_together() -> None:
+def test_covariances_include_the_common_error_of_fixes() -> None:
     """As if each erred alone, covariances would be four hundred times too small (NEES per degree of freedom 70)."""
     results = drifted("debug.drift_percent=0", "debug.drift_deg_per_100m=0")
     store, nees = store_of(results), []

@@ -106,7 +106,7 @@ def test_ranges_hold_both_ends_and_round_numbers(given: dict[str, Any], values: 
         ("[parameters]", FINDING.format('at = { "input.start" = 1 }'), r"speaks of 'input\.start'"),
     ],
 )
-def test_what_is_no_study_is_said_in_one_sentence(tmp_path: Path, old: str, new: str, sentence: str) -> None:
+def test_invalid_studies_are_errors_in_one_sentence(tmp_path: Path, old: str, new: str, sentence: str) -> None:
     assert old in TEXT
     with pytest.raises(ConfigError, match=sentence) as caught:
         study(tmp_path, TEXT.replace(old, new))
@@ -120,7 +120,7 @@ def test_parameters_are_a_table_with_something_in_it() -> None:
             parse_study({**tree, "parameters": parameters}, "mine", "mine")
 
 
-def test_a_file_that_is_not_there_is_said(tmp_path: Path) -> None:
+def test_a_missing_file_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"study .*none\.toml cannot be read"):
         read_study(tmp_path / "none.toml")
 

@@ -78,13 +78,13 @@ def test_what_is_written_is_a_configuration_that_the_filters_take(tmp_path: Path
     assert ImuNoise.of(load_config(path, [], {}).imu).accel_walk == USUAL.accel_walk, "what is not seen stays as it is"
 
 
-def test_a_stream_that_says_nothing_has_no_noise() -> None:
+def test_short_streams_and_streams_of_unknown_unit_have_no_noise_estimate() -> None:
     assert examine_noise(device(0.3)) is None
     whole = device(20)
     assert examine_noise(ImuStream(whole.stamps_ns, whole.accel * 0.3, whole.gyro)) is None, "of unknown unit"
 
 
-def test_a_noise_that_no_device_has_is_not_handed_on() -> None:
+def test_an_implausible_noise_is_not_written() -> None:
     facts = {
         "method": "differences", "standing_s": 0.0, "accel_density": 8e-13, "gyro_density": 2e-4, "accel_walk": None,
         "gyro_walk": None,

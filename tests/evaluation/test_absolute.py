@@ -63,7 +63,7 @@ def test_moving_the_estimate_changes_nothing_under_se3_and_origin(xi: np.ndarray
 
 @given(st.floats(-3, 3), arrays(np.float64, 3, elements=st.floats(-100, 100)))
 @settings(max_examples=25)
-def test_posyaw_forgives_what_gravity_leaves_open(yaw: float, t: np.ndarray) -> None:
+def test_posyaw_aligns_the_directions_that_gravity_leaves_free(yaw: float, t: np.ndarray) -> None:
     T = se3.make(so3.exp(np.array([0, 0, yaw])), t)
     here = absolute_error(ESTIMATE, TRUTH, "posyaw").translation
     moved = absolute_error(T @ ESTIMATE, TRUTH, "posyaw").translation
@@ -72,7 +72,7 @@ def test_posyaw_forgives_what_gravity_leaves_open(yaw: float, t: np.ndarray) -> 
     assert moved.rmse == pytest.approx(here.rmse, rel=1e-7)
 
 
-def test_posyaw_does_not_forgive_a_tilt(truth: Trajectory) -> None:
+def test_posyaw_does_not_align_a_tilt(truth: Trajectory) -> None:
     tilt = se3.exp(np.array([0, 0, 0, 0.05, 0, 0]))
     error = absolute_error(tilt @ truth.poses, truth.poses, "posyaw")
     assert error.translation is not None
@@ -138,7 +138,7 @@ def test_standing_still_has_no_yaw() -> None:
     assert not absolute_error(poses, poses, "se3").available
 
 
-def test_an_unknown_alignment_is_answered_with_the_nearest(truth: Trajectory) -> None:
+def test_the_error_about_an_unknown_alignment_names_the_nearest(truth: Trajectory) -> None:
     with pytest.raises(UsageError, match="did you mean 'sim3'"):
         absolute_error(truth.poses, truth.poses, "sim33")
 

@@ -49,7 +49,7 @@ def test_missing_scans_are_left_out(truth: Trajectory) -> None:
     assert "nearest stamp" in matches.recipe
 
 
-def test_dense_truth_is_interpolated_and_beats_the_nearest() -> None:
+def test_interpolated_dense_truth_is_more_accurate_than_the_nearest() -> None:
     dense = drive(3000, step_ns=10_000_000)
     every = dense.select(slice(5, 2900, 10))
     shifted = replace(every, stamps_ns=every.stamps_ns + 4_000_000)

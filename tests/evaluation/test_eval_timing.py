@@ -76,7 +76,7 @@ def test_total_is_the_sum_when_absent(tmp_path: Path) -> None:
         ("index,stamp_ns\n0,1\n", "neither"),
     ],
 )
-def test_what_is_wrong_is_said(text: str, sentence: str, tmp_path: Path) -> None:
+def test_invalid_timing_files_are_errors_with_a_reason(text: str, sentence: str, tmp_path: Path) -> None:
     (tmp_path / "timing.csv").write_text(text)
     with pytest.raises(InputError, match=sentence):
         read_timing(tmp_path / "timing.csv")

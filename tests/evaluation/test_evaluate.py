@@ -75,7 +75,7 @@ def test_camera_truth_is_converted_when_the_calibration_is_known(estimate: Traje
     assert rmse(other, "origin") == pytest.approx(rmse(plain, "origin"), abs=1e-9)
 
 
-def test_camera_truth_without_calibration_is_said_loudly(
+def test_camera_truth_without_calibration_is_reported(
     estimate: Trajectory, truth: Trajectory, caplog: pytest.LogCaptureFixture
 ) -> None:
     result = evaluate(estimate, as_camera(truth))
@@ -113,7 +113,7 @@ def test_a_body_turned_against_the_other_is_found(estimate: Trajectory, truth: T
     assert rmse(right, "origin") == pytest.approx(rmse(evaluate(estimate, truth), "origin"), abs=1e-9)
 
 
-def test_the_inverse_of_the_transform_is_noticed(estimate: Trajectory, truth: Trajectory) -> None:
+def test_the_inverse_of_the_transform_is_reported(estimate: Trajectory, truth: Trajectory) -> None:
     T = se3.make(so3.exp(np.array([0, 0, np.pi / 2])), np.zeros(3))
     turned = replace(truth, poses=truth.poses @ T, frame="unknown")
     wrong = evaluate(estimate, turned, T_est_gt=se3.inverse(T))

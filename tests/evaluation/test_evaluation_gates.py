@@ -106,7 +106,7 @@ def test_bodies_that_move_to_either_side_have_a_rotation_between_them(degrees: f
 
 
 @pytest.mark.parametrize("is_camera", [(True, False), (False, True)])
-def test_who_is_in_the_camera_frame_is_named(is_camera: tuple[bool, bool]) -> None:
+def test_the_trajectory_in_the_camera_frame_is_named(is_camera: tuple[bool, bool]) -> None:
     """And converted to the other, when the calibration is known."""
     k = np.arange(60)
     lidar = straight(np.column_stack([k, 5 * np.cos(k / 15)]), np.arctan2(-np.sin(k / 15) / 3, np.ones(60)))
@@ -130,7 +130,7 @@ def paced(speeds: Floats) -> Trajectory:
 
 
 @pytest.mark.parametrize(("other_noise", "is_refused"), [(0.085, True), (0.105, False)])
-def test_a_clock_that_fits_another_shift_nearly_as_well_is_not_told(other_noise: float, is_refused: bool) -> None:
+def test_an_ambiguous_time_offset_is_not_reported(other_noise: float, is_refused: bool) -> None:
     """Two laps at one rhythm: the estimate is off the first by noise of 0.08 m/s and off the second by its own.
 
     Their mean squares differ by 1.13 or 1.72; a fifth more is what it takes to tell.
@@ -150,7 +150,7 @@ def test_a_clock_that_fits_another_shift_nearly_as_well_is_not_told(other_noise:
         assert estimate_offset(estimate, truth)[0] == pytest.approx(0, abs=STEP_NS // 2)
 
 
-def test_a_clock_is_told_through_the_noise_of_poses_and_by_motion_of_a_second() -> None:
+def test_a_time_offset_is_found_through_noise_and_from_a_second_of_motion() -> None:
     """Places with noise of 5 cm every 0.1 s are speeds with noise of 0.7 m/s; a walker's speed changes within half a second."""
     rng, k = np.random.default_rng(1), np.arange(400)
     for wobble, amplitude, noise in ((59, 0.5, 0.05), (9, 0.8, 0.0)):

@@ -75,7 +75,7 @@ def test_noise_alone_is_no_turn(seed: int) -> None:
     assert found.squared < 16, "chi-square of three, once in a thousand"
 
 
-def test_what_the_motion_does_not_tell_is_not_judged() -> None:
+def test_unobserved_rotations_are_not_estimated() -> None:
     """Straight on nothing tells a roll, whatever the noise; yaw shows. Without noise: to a radian, and to what drift leaves."""
     truth = drive(300, bend=0.0, relief=0.0)
     odometry = noisy(truth, 0.02, 0.02, 0)

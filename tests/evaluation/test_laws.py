@@ -155,7 +155,7 @@ def test_r2_says_when_the_law_is_wrong() -> None:
         ("inverse", np.linspace(20, 22, 8), None, "a x + b"),
     ],
 )
-def test_the_rival_is_what_the_parameter_that_varied_says_alone(
+def test_the_alternative_law_depends_on_the_varied_parameter_alone(
     kind: LawKind, x: np.ndarray, y: np.ndarray | None, said: str
 ) -> None:
     points = x if y is None else np.column_stack([x, y])

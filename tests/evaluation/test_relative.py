@@ -85,7 +85,7 @@ def test_pairs_by_time_skip_a_gap() -> None:
     assert by_time(t, 1.0, False).tolist() == [[0, 2], [4, 6]]
 
 
-def test_what_cannot_be_compared_is_said(estimate: Trajectory, truth: Trajectory) -> None:
+def test_pairs_that_cannot_be_compared_are_reported(estimate: Trajectory, truth: Trajectory) -> None:
     error = relative_error(estimate.poses, truth.poses, None, "1s")
     assert (error.translation, error.note) == (None, "n/a (no stamps)")
     far = relative_error(estimate.poses, truth.poses, None, "5000m")
@@ -105,7 +105,7 @@ def test_drift_of_a_wrong_scale_is_that_scale() -> None:
     assert drift.segments == sum(n for _, _, n in drift.by_length.values())
 
 
-def test_drift_is_told_by_length_as_well() -> None:
+def test_kitti_drift_is_given_for_each_length() -> None:
     """Straight ahead, a metre a scan, while the estimate is 2 % long and turns by a millirad a metre.
 
     A segment of so many metres ends a scan beyond them: of 100 m it has 101, which turn by 101 mrad.
@@ -149,7 +149,7 @@ def test_thesis1_angles_per_axis_have_a_known_answer(truth: Trajectory) -> None:
     assert result.angular_max_deg == pytest.approx(2)
 
 
-def test_thesis2_is_blind_to_height_and_keeps_the_sign(truth: Trajectory) -> None:
+def test_thesis2_ignores_height_and_keeps_the_sign(truth: Trajectory) -> None:
     lifted = truth.poses.copy()
     lifted[:, 2, 3] += np.linspace(0, 5, len(truth))
     assert planar(lifted, truth.poses).ate_mean < 1e-9

@@ -44,7 +44,7 @@ def test_holding_up() -> None:
     assert once.measured == "nothing diverges for good, though 3 of 3 runs at 5 are lost"
 
 
-def test_runs_lost_where_most_seeds_hold_are_told() -> None:
+def test_runs_lost_where_most_seeds_succeed_are_counted() -> None:
     rows = rows_of(SKIPS)
     one = [replace(r, status="diverged") if r.seed == 1 and r.parameters["input.skip_frames"] > 18 else r for r in rows]
     at_20 = verdict(one, "holds_up_to", 20)

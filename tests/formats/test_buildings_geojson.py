@@ -93,7 +93,7 @@ def test_confidence_is_the_share_of_draws_that_lie_near() -> None:
 @pytest.mark.parametrize(
     "text", ["", "{}", '{"schema": "other"}', '{"schema": "lslam-buildings-1", "features": 3}', "[1]"]
 )
-def test_what_is_no_such_file_is_said(tmp_path: Path, text: str) -> None:
+def test_other_files_are_errors_with_a_reason(tmp_path: Path, text: str) -> None:
     path = tmp_path / "buildings.geojson"
     path.write_text(text)
     with pytest.raises(InputError, match=r"buildings\.geojson is no buildings\.geojson of a run"):

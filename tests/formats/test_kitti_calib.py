@@ -72,7 +72,7 @@ def test_raw_day(tmp_path: Path) -> None:
         ("\n", "empty"),
     ],
 )
-def test_what_is_wrong_is_said(text: str, sentence: str, tmp_path: Path) -> None:
+def test_invalid_calibrations_are_errors_with_a_reason(text: str, sentence: str, tmp_path: Path) -> None:
     (tmp_path / "calib.txt").write_text(text)
     with pytest.raises(InputError, match=sentence) as caught:
         read_odometry_calib(tmp_path / "calib.txt")

@@ -77,7 +77,7 @@ def test_every_size_is_held_against_the_file(laz: Path) -> None:
         assert str(laz) in str(caught.value)
 
 
-def test_las_that_is_cut_off_is_said(tmp_path: Path) -> None:
+def test_truncated_las_is_an_error(tmp_path: Path) -> None:
     path = tmp_path / "a.las"
     write_cloud(path, ArrayCloud.of(np.zeros((100, 3))))
     path.write_bytes(path.read_bytes()[:-1])

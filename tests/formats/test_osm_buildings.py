@@ -76,7 +76,7 @@ def test_open_ways_are_skipped_and_counted() -> None:
         ({"building": "garage", "location": "underground"}, "underground"),
     ],
 )
-def test_what_nobody_sees_is_skipped_and_counted(tags: dict[str, str], reason: str) -> None:
+def test_buildings_that_cannot_be_seen_are_skipped_and_counted(tags: dict[str, str], reason: str) -> None:
     maker = ExtractMaker()
     maker.square(1, 0, 0, 5, **tags)
     maker.square(2, 10, 0, 5)
@@ -169,7 +169,7 @@ def test_an_outline_tagged_as_well_is_one_building_not_two() -> None:
     assert extract.skipped == {"outline of a multipolygon already read": 1}
 
 
-def test_other_relations_and_ways_are_nobodys_business() -> None:
+def test_other_relations_and_ways_are_ignored() -> None:
     maker = ExtractMaker()
     maker.square(1, 0, 0, 20, landuse="grass")
     maker.relation(2, [(1, "outer")], type="multipolygon", landuse="grass")
@@ -194,7 +194,7 @@ def test_degenerate_outlines_are_counted_and_crossed_ones_repaired() -> None:
     assert [f.area for f in building.footprints] == pytest.approx([25, 25], abs=0.01)
 
 
-def test_an_extract_without_buildings_says_what_it_held(tmp_path: Path) -> None:
+def test_the_error_about_an_extract_without_buildings_lists_its_elements(tmp_path: Path) -> None:
     maker = ExtractMaker()
     maker.way(2, maker.nodes(square_at(10, 0, 5)), building="yes")
     path = maker.write_xml(tmp_path / "roads.osm")

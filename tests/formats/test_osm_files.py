@@ -211,7 +211,7 @@ def test_bad_files_get_one_sentence_that_names_them(tmp_path: Path, content: byt
     assert "\n" not in str(caught.value)
 
 
-def test_every_truncation_is_noticed(tmp_path: Path) -> None:
+def test_every_truncation_is_an_error(tmp_path: Path) -> None:
     for whole in (small().write_xml(tmp_path / "a.osm"), small().write_json(tmp_path / "a.json")):
         content = whole.read_bytes()
         for share in range(1, 20):

@@ -66,6 +66,6 @@ def test_bad_files_name_the_key_and_the_way_out(text: str, tmp_path: Path) -> No
     assert BAD[text] in str(error.value)
 
 
-def test_over_prefers_what_is_said() -> None:
+def test_set_values_override_unset_ones() -> None:
     merged = SequenceInfo(rate_hz=5.0, motion_compensated=False).over(FULL)
     assert (merged.rate_hz, merged.motion_compensated, merged.sensor) == (5.0, False, "OS1-32")

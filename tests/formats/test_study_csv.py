@@ -95,7 +95,7 @@ def test_no_rows_are_a_file_too(tmp_path: Path) -> None:
         (",here,", ",", "line 2: 30 columns where the header has 31"),
     ],
 )
-def test_what_is_no_result_of_this_version_is_said(tmp_path: Path, old: str, new: str, sentence: str) -> None:
+def test_results_of_another_version_are_an_error(tmp_path: Path, old: str, new: str, sentence: str) -> None:
     path = tmp_path / "results.csv"
     write_study_csv(path, [DONE])
     text = path.read_text()
@@ -105,12 +105,12 @@ def test_what_is_no_result_of_this_version_is_said(tmp_path: Path, old: str, new
         read_study_csv(path)
 
 
-def test_a_file_that_is_not_there_is_said(tmp_path: Path) -> None:
+def test_a_missing_file_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="cannot be read"):
         read_study_csv(tmp_path / "results.csv")
 
 
-def test_a_metric_that_is_none_is_said(tmp_path: Path) -> None:
+def test_an_unknown_metric_is_an_error(tmp_path: Path) -> None:
     write_study_csv(tmp_path / "results.csv", [replace(DONE, metric="folder")])
     with pytest.raises(InputError, match="line 2: metric 'folder' is none of ate_se3, ate_origin, thesis_rmse"):
         read_study_csv(tmp_path / "results.csv")

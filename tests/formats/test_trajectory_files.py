@@ -105,7 +105,9 @@ def test_times_beside_a_kitti_file_are_used(tmp_path: Path) -> None:
     assert again.has_stamps
 
 
-def test_times_that_do_not_belong_are_said(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_times_of_another_length_are_ignored_with_a_warning_or_an_error(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     write_kitti(tmp_path / "est.txt", sample(3))
     (tmp_path / "times.txt").write_text("0.0\n0.1\n")
     with caplog.at_level(logging.WARNING, logger="lslam"):
@@ -173,7 +175,7 @@ WRONG = {
 
 
 @pytest.mark.parametrize("name", WRONG)
-def test_what_is_wrong_is_said_with_file_and_line(name: str, tmp_path: Path) -> None:
+def test_errors_name_file_and_line(name: str, tmp_path: Path) -> None:
     text, sentence = WRONG[name]
     (tmp_path / name).write_text(text)
     with pytest.raises(InputError, match=sentence) as caught:

@@ -33,7 +33,7 @@ def test_a_keyframe_each_fifteen_degrees_though_nothing_moves() -> None:
     assert chosen([result(i, 0.0, 4.0 * i) for i in range(12)]) == [0, 4, 8]
 
 
-def test_a_sensor_that_stands_makes_one() -> None:
+def test_a_static_sensor_makes_one_keyframe() -> None:
     assert chosen([result(i, 0.01 * (i % 2)) for i in range(50)]) == [0]
 
 
@@ -43,7 +43,7 @@ def test_only_registered_scans(status: Status) -> None:
     assert chosen(results) == [1, 3]
 
 
-def test_it_says_where_and_how_far() -> None:
+def test_a_keyframe_has_its_pose_and_distance_travelled() -> None:
     selector = KeyframeSelector(CONFIG)
     results = [result(0), result(1, 1.5), result(2, 0.0), result(3, 2.5)]
     first, *_, last = (selector.consider(i, r) for i, r in enumerate(results))
@@ -56,7 +56,7 @@ def test_it_says_where_and_how_far() -> None:
 
 
 @pytest.mark.parametrize("at", [0, 1, 7, 19])
-def test_it_goes_on_where_it_was(at: int) -> None:
+def test_keyframe_selection_resumes_to_the_last_bit(at: int) -> None:
     results = [result(i, 0.7 * i, 3.0 * i, "skipped" if i < 2 else "ok") for i in range(40)]
     whole = KeyframeSelector(CONFIG)
     expected = [whole.consider(i, r) for i, r in enumerate(results)]

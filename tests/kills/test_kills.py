@@ -61,7 +61,7 @@ def test_each_stage_is_drawn(whole: Whole) -> None:
     assert sum(map(tally.by_stage, STAGES)) == tally.kills == 100
 
 
-def test_half_a_file_is_noticed_whichever_it_is(copy: Path) -> None:
+def test_half_a_file_of_any_kind_is_detected(copy: Path) -> None:
     """Every other one at a time, so that those between are found whole."""
     assert torn(copy) == []
     paths = sorted(path for path in copy.rglob("*") if path.is_file() and path.name != "log.txt")
@@ -76,12 +76,12 @@ def test_half_a_file_is_noticed_whichever_it_is(copy: Path) -> None:
             path.write_bytes(data)
 
 
-def test_a_file_of_which_nobody_knows_what_it_is_is_noticed(copy: Path) -> None:
+def test_an_unknown_file_is_detected(copy: Path) -> None:
     (copy / "more.xyz").write_text("1 2 3\n")
     assert len(torn(copy)) == 1
 
 
-def test_one_other_byte_is_noticed_wherever_it_is(whole: Whole, copy: Path) -> None:
+def test_one_changed_byte_is_detected_anywhere(whole: Whole, copy: Path) -> None:
     for path in [path for path in copy.iterdir() if path.is_file() and path.name not in TIMED_FILES]:
         data = path.read_bytes()
         path.write_bytes(data.replace(b"0.1", b"0.2", 1) if path.suffix in (".json", ".html") else data[:-1] + b"?")
@@ -123,7 +123,7 @@ def _status(place: Path, status: str) -> None:
         (signal.SIGKILL, Run(stage=ODOMETRY, code=-9), lambda place: (place / "out/map.ply").touch(), "no whole file"),
     ],
 )  # fmt: skip
-def test_what_a_signal_must_not_end_in_is_noticed(
+def test_forbidden_states_after_a_signal_are_detected(
     tmp_path: Path, number: signal.Signals, ended: Run, spoil: Callable[[Path], object], said: str
 ) -> None:
     (tmp_path / OUT).mkdir()
@@ -134,6 +134,6 @@ def test_what_a_signal_must_not_end_in_is_noticed(
     assert not said or any(said in fault for fault in found)
 
 
-def test_a_kill_hits_in_the_stage_that_was_asked_for(tmp_path: Path) -> None:
+def test_a_kill_hits_in_the_stage_requested(tmp_path: Path) -> None:
     done = run("plain", tmp_path, Kill(signal.SIGKILL, 0.0, ODOMETRY))
     assert (done.is_hit, done.stage, done.code) == (True, ODOMETRY, -signal.SIGKILL)

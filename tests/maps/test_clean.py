@@ -107,7 +107,7 @@ def test_votes_equal_plain_python() -> None:
     assert min(len(expected[0]), len(expected[1])) > 50
 
 
-def test_points_that_are_decided_are_not_asked_again() -> None:
+def test_points_with_a_decided_majority_are_skipped() -> None:
     rng = np.random.default_rng(5)
     points = rng.normal(0, [6, 6, 1], (3000, 3)).astype(np.float32)
     votes = []
@@ -144,7 +144,7 @@ def sledge(k: int) -> tuple[NDArray[np.float32], NDArray[np.bool_], NDArray[np.f
     return (rays[seen] * nearest[seen, None]).astype(np.float32), np.isin(np.argmin(ranges, axis=0), (1, 2))[seen], T
 
 
-def test_ground_beside_a_low_thing_does_not_say_that_the_thing_is_there() -> None:
+def test_ground_beside_a_low_object_does_not_confirm_the_object() -> None:
     """Of the sledge itself little is above what lies behind it: it goes with its mast when nobody saw anything there."""
     cleaner = Cleaner()
     back, moving = [], 0

@@ -140,7 +140,7 @@ def test_an_empty_first_scan_does_not_switch_deskewing_off() -> None:
     np.testing.assert_allclose(adapter_poses(scans[:8], method), adapter_poses(scans[:8]), atol=1e-12)
 
 
-def test_a_missing_package_is_said_with_the_way_out(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_error_about_a_missing_package_names_the_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "kiss_icp.kiss_icp", None)
     with pytest.raises(InputError, match="pip install kiss-icp"):
         create(Config())

@@ -107,7 +107,7 @@ def test_a_method_that_registers_nothing_does_not_pass_for_accurate() -> None:
     assert rmse(estimate(stub, Standstill(), motion=motion)) > 5 * rmse(runs()[1].record.results)
 
 
-def test_the_same_twice_and_without_comparing(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_results_are_the_same_twice_and_without_the_comparison(monkeypatch: pytest.MonkeyPatch) -> None:
     """What constant velocity would have taken is tried on the side: not a bit of the result depends on it."""
     assert sum(r.saved_s is not None for r in runs()[1].record.results) >= 2
     monkeypatch.setattr(InertialMotion, "COMPARED", 10**6)
@@ -132,7 +132,7 @@ def test_scans_csv_is_the_same_twice_and_times_are_in_timing_csv(
     np.testing.assert_allclose(sum(rows.stages.values()), rows.total, atol=1e-5)
 
 
-def test_the_manifest_says_what_was_found(tmp_path: Path) -> None:
+def test_the_manifest_lists_the_estimates_of_the_imu(tmp_path: Path) -> None:
     outcome = run(with_imu(imu_of(walk())), config_of("report.html=true", "input.count=40"), out=tmp_path / "run")
     manifest = json.loads((tmp_path / "run" / "manifest.json").read_text())
     imu = manifest["imu"]
@@ -176,7 +176,7 @@ def gyro_by(factor: NDArray[np.float64]) -> ImuStream:
 
 
 @pytest.mark.parametrize("kind", ["zeros", "degrees", "axes"])
-def test_garbage_is_refused(kind: str) -> None:
+def test_invalid_imu_streams_are_refused(kind: str) -> None:
     imu = imu_of(walk())
     bad = {
         "zeros": ImuStream(imu.stamps_ns, imu.accel * 0, imu.gyro * 0),
@@ -206,7 +206,7 @@ def silent(begin_ns: int, end_ns: int) -> Stub:
     return with_imu(ImuStream(imu.stamps_ns[keep], imu.accel[keep], imu.gyro[keep]))
 
 
-def test_a_gap_is_bridged_said_and_counted() -> None:
+def test_a_gap_of_the_imu_is_bridged_reported_and_counted() -> None:
     stub, config = silent(3_000_000_000, 3_250_000_000), config_of()
     part = begin_inertial(stub, config)
     results = estimate(stub, create_odometry(config), motion=part.motion)
@@ -246,7 +246,7 @@ def test_a_hole_in_the_first_seconds_is_no_fault_of_the_imu() -> None:
     assert np.abs(part.motion.estimate.gyroscope.bias - 0.0873).max() < 0.01
 
 
-def test_an_imu_that_speaks_only_where_registration_did_not_come_is_refused() -> None:
+def test_an_imu_without_samples_at_registered_scans_is_refused() -> None:
     stub = silent(-1, 2_000_000_000)
     stub.scans[10] = walk_drive().scan(10).select(np.arange(9))
     part = begin_inertial(stub, config_of("imu.start_s=1"))
@@ -267,7 +267,7 @@ def test_late_stamps_are_found_and_the_imu_still_helps() -> None:
 
 
 @pytest.mark.parametrize("late_s", [0.0, 0.02])
-def test_the_doctor_takes_no_sweep_that_is_bent_for_a_clock_that_is_off(late_s: float) -> None:
+def test_the_doctor_does_not_take_motion_within_sweeps_for_a_time_offset(late_s: float) -> None:
     imu = imu_of(walk())
     findings: list[Finding] = []
     facts = examine_turns(with_imu(dataclasses.replace(imu, stamps_ns=imu.stamps_ns + round(1e9 * late_s))), findings)

@@ -174,7 +174,7 @@ def test_coordinates_of_a_run_with_no_place_on_the_earth_are_refused() -> None:
         check_config(load_config(settings=["gnss.crs=25832", place], environ={}))
 
 
-def test_who_posed_the_scans_is_counted() -> None:
+def test_scans_are_counted_by_the_method_that_posed_them() -> None:
     manifest = Manifest("lslam run x", Stub(["gone"] * 4), Config())
     ok, policy, bridged, standing = results("ok", "ok", "bridged", "ok")
     policy, standing = replace(policy, posed_by="start search"), replace(standing, is_stationary=True)
@@ -193,7 +193,7 @@ def test_more_than_a_tenth_of_the_scans_with_an_open_direction_degrade_the_run(w
 
 
 @pytest.mark.parametrize("key", ["estimate_offset", "estimate_extrinsics"])
-def test_an_imu_that_learns_nothing_of_registration_cannot_estimate_its_device(key: str) -> None:
+def test_the_imus_clock_and_mounting_need_registration_to_be_estimated(key: str) -> None:
     """`integrated` carries the first seconds' calibration to the end."""
     asked = (f"imu.{key}=true", "imu.use=true")
     check_config(load_config(None, asked, {}))

@@ -51,7 +51,7 @@ def test_what_has_no_times_or_no_motion_is_left_alone() -> None:
 
 
 @pytest.mark.parametrize("begin", [0.0, -0.05])
-def test_points_without_a_finite_time_keep_their_place_and_harm_nobody(begin: float) -> None:
+def test_points_without_a_finite_time_are_unchanged_and_do_not_affect_others(begin: float) -> None:
     points, times = cloud(100)
     good = deskew_points(points, times, sweep(KNOTS, begin=begin))
     times[7] = np.nan

@@ -146,7 +146,7 @@ def test_two_imus_are_listed_and_none_is_guessed(tmp_path: Path) -> None:
     assert with_imu(chosen) is chosen
 
 
-def test_one_who_asks_for_what_a_bag_lacks_hears_what_it_has(tmp_path: Path) -> None:
+def test_the_error_about_a_missing_topic_lists_the_topics(tmp_path: Path) -> None:
     def fixes(*topics: str, status: int = 0) -> Fill:
         def fill(writer: BagWriter) -> None:
             for topic in topics:
@@ -179,7 +179,7 @@ def test_extrinsics_follow_the_chain_of_static_transforms(tmp_path: Path, kind: 
     assert not sequence.problems
 
 
-def test_extrinsics_that_are_given_win_and_missing_ones_are_said(tmp_path: Path) -> None:
+def test_configured_extrinsics_have_precedence_and_missing_ones_are_noted(tmp_path: Path) -> None:
     path = bag(tmp_path / "a.bag", together(transforms({("base", "lidar"): T_BASE_LIDAR}), clouds(2), imu(5)))
     sequence = open_sequence(path)
     np.testing.assert_array_equal(sequence.calibration.T_lidar_imu, np.eye(4))
@@ -192,7 +192,7 @@ def test_extrinsics_that_are_given_win_and_missing_ones_are_said(tmp_path: Path)
     assert not given.problems
 
 
-def test_an_imu_that_shares_no_time_is_said(tmp_path: Path) -> None:
+def test_an_imu_without_common_time_is_reported(tmp_path: Path) -> None:
     for start in (START_NS - 10**10, START_NS + 10**10):
         path = bag(tmp_path / f"{start}.bag", together(clouds(3), imu(10, start)))
         assert "IMU: it shares no time with the scans" in open_sequence(path).problems

@@ -110,7 +110,7 @@ def test_every_drivers_times_become_seconds_since_scan_start(tmp_path: Path, sen
     ("clock_s", "field", "unit"),
     [(4.5, "<f8", 1.0), (3000.0, "<u4", 1e-6), (946684800.0, "<f8", 1.0), (946684800.0, "<f8", 1e-9)],
 )
-def test_a_clock_of_another_epoch_tells_the_time_within_the_scan(
+def test_times_of_another_epoch_are_relative_to_the_scan(
     tmp_path: Path, clock_s: float, field: str, unit: float
 ) -> None:
     """Since the sensor was switched on, since the hour, since 2000: the stamps of the headers stay."""
@@ -122,13 +122,13 @@ def test_a_clock_of_another_epoch_tells_the_time_within_the_scan(
     assert sequence.stamps_ns[1] == START_NS + STEP_NS
 
 
-def test_without_times_the_notes_say_so(tmp_path: Path) -> None:
+def test_missing_times_are_noted(tmp_path: Path) -> None:
     sequence = opened(tmp_path, table([*XYZI, ("ring", "<u2")], ring=RING))
     assert sequence.scan(0).times is None
     assert any("have no times" in note for note in sequence.notes)
 
 
-def test_times_that_make_no_sense_are_said_and_not_used(tmp_path: Path) -> None:
+def test_invalid_times_are_reported_and_not_used(tmp_path: Path) -> None:
     sequence = opened(tmp_path, table([*XYZI, ("time", "<f4")], time=SECONDS * 1e4))
     assert sequence.scan(0).times is None
     (problem,) = sequence.problems
@@ -156,7 +156,7 @@ STATED: list[tuple[NDArray[Any], str, int, str]] = [
 
 
 @pytest.mark.parametrize(("values", "toml", "late_ns", "words"), STATED)
-def test_what_is_stated_about_times_is_believed(
+def test_configured_facts_about_times_are_used(
     tmp_path: Path, values: NDArray[Any], toml: str, late_ns: int, words: str
 ) -> None:
     (tmp_path / "sequence.toml").write_text(toml)

@@ -111,7 +111,7 @@ def test_a_chunk_without_its_index_is_indexed_by_hand(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("shift", [7, 10**8])
-def test_an_index_that_points_elsewhere_is_said(tmp_path: Path, shift: int) -> None:
+def test_a_wrong_index_is_reported(tmp_path: Path, shift: int) -> None:
     path = bag(tmp_path / "a.bag", clouds(3))
     data = bytearray(path.read_bytes())
     field = data.rindex(b"op=\x04")  # of the last index; the length of its header stands 8 bytes before
@@ -274,7 +274,7 @@ def test_zero_stamps_give_way_to_the_times_of_recording(tmp_path: Path, kind: st
     assert any("no stamps in their headers: the times of recording" in p for p in sequence.problems)
 
 
-def test_jitter_is_sorted_repeats_and_rewinds_are_dropped_aloud(tmp_path: Path) -> None:
+def test_jitter_is_sorted_and_repeated_stamps_are_dropped_with_a_note(tmp_path: Path) -> None:
     steps = [0, 1, 3, 2, 4, 4, 5, 200, -30, 201]
     sequence = open_sequence(bag(tmp_path / "a.bag", stamped([START_NS + s * STEP_NS for s in steps])))
     np.testing.assert_array_equal((sequence.stamps_ns - START_NS) // STEP_NS, [0, 1, 2, 3, 4, 5, 200, 201])

@@ -65,14 +65,14 @@ def test_sequence_toml_switches_the_correction_off(info: SequenceInfo, tmp_path:
     assert said(s.notes, "no vertical correction")
 
 
-def test_the_argument_wins_over_everything(tmp_path: Path) -> None:
+def test_the_argument_has_precedence(tmp_path: Path) -> None:
     folder = kitti_root(tmp_path)
     write_sequence_toml(folder / "sequence.toml", SequenceInfo(vertical_correction_deg=0.205))
     s = open_sequence(folder, vertical_correction_deg=0.0)
     np.testing.assert_array_equal(s.scan(0).points, cloud(0)[:, :3])
 
 
-def test_another_sensor_in_kitti_layout_is_noticed(tmp_path: Path) -> None:
+def test_another_sensor_in_kitti_layout_is_detected(tmp_path: Path) -> None:
     """Users convert their own recordings into this layout: an Ouster looks far higher than an HDL-64E."""
     folder = kitti_root(tmp_path)
     table = cloud(0)
@@ -141,7 +141,7 @@ def test_nan_inf_and_zero_points_stay(tmp_path: Path) -> None:
     assert np.isinf(points[2, 2])
 
 
-def test_counts_that_differ_use_the_common_part_and_say_so(tmp_path: Path) -> None:
+def test_files_of_different_length_use_the_common_part_with_a_note(tmp_path: Path) -> None:
     folder = kitti_root(tmp_path)
     lines = (folder / "times.txt").read_text().splitlines()
     (folder / "times.txt").write_text("\n".join(lines[:5]))

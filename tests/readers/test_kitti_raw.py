@@ -153,7 +153,7 @@ def test_missing_scans_keep_their_stamps(tmp_path: Path) -> None:
     assert said(s.problems, "6 stamps for 5 scans")
 
 
-def test_poor_positions_are_said(tmp_path: Path) -> None:
+def test_inaccurate_positions_are_noted(tmp_path: Path) -> None:
     assert said(
         open_sequence(raw_drive(tmp_path, pos_acc=0.4)).notes, "OXTS positions are poor (pos_acc median 0.40 m)"
     )

@@ -84,7 +84,7 @@ def test_selection_keeps_indices_stamps_and_truth(tmp_path: Path) -> None:
         part.scan(-1)
 
 
-def test_what_a_recording_knows_of_its_sensor_a_part_of_it_knows_too() -> None:
+def test_a_selection_keeps_the_facts_about_the_sensor() -> None:
     whole = open_sequence(Path(__file__).resolve().parents[2] / "sample_data")
     part = select(whole, count=10)
     assert (part.sensor, part.rings) == (whole.sensor, whole.rings)  # type: ignore[attr-defined]

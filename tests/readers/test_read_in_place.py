@@ -179,7 +179,7 @@ def test_sqlite_says_what_can_be_read_instead(bucket: RemotePath, tmp_path: Path
         open_sequence(str(stored(file, bucket / "drive7.db3")))
 
 
-def test_what_is_not_there_is_said(bucket: RemotePath) -> None:
+def test_a_missing_object_is_an_error(bucket: RemotePath) -> None:
     (bucket / "notes.txt").write_bytes(b"x")
     for name, said in (("none.bag", "no such bucket, object or folder"), ("notes.txt", "is a file: give a bag")):
         with pytest.raises(InputError, match=said):
@@ -188,7 +188,7 @@ def test_what_is_not_there_is_said(bucket: RemotePath) -> None:
         open_sequence(str(bucket))
 
 
-def test_storage_that_falls_silent_ends_the_run_and_no_scan_is_skipped(bucket: RemotePath, tmp_path: Path) -> None:
+def test_unreachable_storage_ends_the_run_without_skipping_scans(bucket: RemotePath, tmp_path: Path) -> None:
     """A damaged scan is skipped and the run is degraded; one that cannot be fetched now can be later."""
     stored(SAMPLE / "sequences", bucket / "data" / "sequences")
 

@@ -152,7 +152,7 @@ def test_per_point_times_of_any_unit(
     assert abs(scan.stamp_ns - (1670403900 * 10**9 + stamp_moves_ns)) < 10
 
 
-def test_times_that_fit_no_unit_mean_no_deskew_and_say_so(tmp_path: Path) -> None:
+def test_times_of_no_known_unit_disable_deskewing_with_a_note(tmp_path: Path) -> None:
     folder = tmp_path / "a"
     folder.mkdir()
     pcd_with_times(folder / "0.pcd", "<f4", np.linspace(0, 2, 50))
@@ -161,7 +161,7 @@ def test_times_that_fit_no_unit_mean_no_deskew_and_say_so(tmp_path: Path) -> Non
     assert said(s.problems, "no deskew: per-point time field 'time' (float32, 0 to 2")
 
 
-def test_the_inside_of_a_kitti_sequence_is_noticed(tmp_path: Path) -> None:
+def test_the_velodyne_folder_of_a_kitti_sequence_is_detected(tmp_path: Path) -> None:
     s = open_sequence(scans(tmp_path / "07" / "velodyne", 2))
     assert s.kind == "scan-folder"
     assert said(s.problems, f"give {tmp_path / '07'} for its stamps")

@@ -114,7 +114,7 @@ def test_an_empty_map_draws_the_way() -> None:
     assert matches.accepted
 
 
-def test_a_drift_that_was_set_right_is_told_with_how_sure_it_is(make_record: Callable[..., RunRecord]) -> None:
+def test_a_corrected_drift_is_reported_with_its_sigma(make_record: Callable[..., RunRecord]) -> None:
     found, matches, poses = scene()
     record = make_record(len(poses), buildings=found, osm=matches)
     record.keyframe_scans = np.arange(len(poses))
@@ -141,7 +141,9 @@ def test_a_drift_that_was_set_right_is_told_with_how_sure_it_is(make_record: Cal
     assert "walls moved while they were passed" in table.recipe
 
 
-def test_a_drift_that_loops_told_is_told_along_the_axes_of_the_run(make_record: Callable[..., RunRecord]) -> None:
+def test_a_drift_estimated_by_loops_is_reported_along_the_axes_of_the_run(
+    make_record: Callable[..., RunRecord],
+) -> None:
     record = make_record(10)
     told = {"estimate": 0.5, "sigma": 0.01}
     names = ["x_percent", "y_percent", "z_percent", "about_x_deg_per_100m", "about_y_deg_per_100m", "left_deg_per_100m"]
@@ -156,7 +158,7 @@ def test_a_drift_that_loops_told_is_told_along_the_axes_of_the_run(make_record: 
     assert dict(back_end_rows(record, None))["steady drift"].startswith("along x, % +0.500 ± 0.010; ")
 
 
-def test_a_drift_that_wanders_is_told_with_its_size(make_record: Callable[..., RunRecord]) -> None:
+def test_a_wandering_drift_is_reported_with_its_size(make_record: Callable[..., RunRecord]) -> None:
     record = make_record(10)
     told = {"estimate": 0.5, "sigma": 0.01, "rms": 1.25}
     names = ["east_percent", "north_percent", "left_deg_per_100m"]

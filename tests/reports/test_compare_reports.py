@@ -34,7 +34,7 @@ def test_one_row_per_method_with_spread_failures_and_words_for_what_is_missing(t
     assert failures.rows == (("dark", "kiss-icp", "0", "crashed", "killed & gone_by 100%"),)
 
 
-def test_the_best_of_each_sequence_is_marked_and_only_against_a_rival(tmp_path: Path) -> None:
+def test_the_best_of_several_methods_is_marked_per_sequence(tmp_path: Path) -> None:
     main = tables(comparison(tmp_path))[0]
     column = main.header.index
     assert {cell for cell in main.best if cell[1] in (column("ATE se3, m"), column("total, ms"))} == {

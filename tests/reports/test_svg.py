@@ -52,7 +52,7 @@ def test_thinning_keeps_every_peak_of_a_bin() -> None:
         assert ty[inside].min() == y[part].min()
 
 
-def test_thinning_is_blind_to_holes() -> None:
+def test_thinning_ignores_missing_values() -> None:
     x, y = np.arange(5000.0), np.sin(np.arange(5000.0))
     y[::7] = np.nan
     _, ty = thin(x, y, bins=50)
@@ -129,7 +129,7 @@ def test_areas_are_the_shares_of_the_stages(scans: int) -> None:
     np.testing.assert_allclose(drawn / drawn.sum(), ms.sum(0) / ms.sum(), atol=0.01)
 
 
-def test_a_limit_in_reach_is_drawn_and_one_out_of_reach_is_told() -> None:
+def test_a_limit_outside_of_the_axes_is_noted() -> None:
     ms = np.full((20, 2), 20.0)
     near, _ = stage_chart(np.arange(20), ms, 100.0, "t")
     assert 'class="limit"' in near
@@ -141,7 +141,7 @@ def test_a_limit_in_reach_is_drawn_and_one_out_of_reach_is_told() -> None:
     assert "limit" not in none
 
 
-def test_a_peak_that_is_cut_off_is_told() -> None:
+def test_a_clipped_peak_is_noted() -> None:
     ms = np.full((200, 1), 10.0)
     ms[3] = 2000.0
     chart, remark = stage_chart(np.arange(100, 300), ms, 100.0, "t")

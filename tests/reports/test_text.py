@@ -113,7 +113,7 @@ def test_status_falls_back_on_what_the_record_shows(make_record: MakeRecord) -> 
     assert not facts.is_flawless
 
 
-def test_what_the_imu_saved_is_told_with_its_sample(make_record: MakeRecord) -> None:
+def test_the_time_saved_by_the_imu_is_reported_with_its_sample(make_record: MakeRecord) -> None:
     imu = {
         "used": True, "prior_error_m": 0.01, "constant_velocity_error_m": 0.05, "mean_iterations": 2.2, "compared_scans": 3,
         "compared_iterations": 2.0, "constant_velocity_iterations": 5.3, "saved_ms_per_scan": 4.2,

@@ -80,7 +80,7 @@ def test_a_scan_that_two_threads_read_at_once_counts_once(drive: SimulatedDrive)
     assert store.bytes == size_of(scan)
 
 
-def test_what_a_recording_is_opened_with_tells_it_from_others(tmp_path: Path) -> None:
+def test_cached_sequences_are_distinguished_by_their_options(tmp_path: Path) -> None:
     """A topic is of bags only, so the second run fails unless it is given the first one's sequence."""
     path = Path(__file__).resolve().parents[2] / "sample_data"
     config = load_config(None, ["input.count=2", "map.write=false", "report.html=false", "loops.use=false"], {})

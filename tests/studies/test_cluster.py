@@ -105,7 +105,7 @@ def test_workers_without_lslam_are_named(
         engine.prepare([job(tmp_path)], StudyProgress())
 
 
-def test_a_scheduler_without_workers_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_scheduler_without_workers_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cluster, "_WORKERS_S", 1)
     with (
         LocalCluster(n_workers=0, threads_per_worker=1, dashboard_address=None, silence_logs=50) as empty,
@@ -115,7 +115,7 @@ def test_a_scheduler_without_workers_is_said(tmp_path: Path, monkeypatch: pytest
         engine.prepare([job(tmp_path)], StudyProgress())
 
 
-def test_a_scheduler_that_does_not_answer_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_unreachable_scheduler_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cluster, "_ANSWER_S", 1)
     for address in ("tcp://127.0.0.1:9", "nonsense://there"):
         with (
@@ -125,7 +125,7 @@ def test_a_scheduler_that_does_not_answer_is_said(monkeypatch: pytest.MonkeyPatc
             pass
 
 
-def test_without_dask_the_way_to_it_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_error_about_missing_dask_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(UsageError, match=r"pip install 'lslam\[cluster\]'"), connected("tcp://127.0.0.1:9", None, ""):
         pass
@@ -161,7 +161,7 @@ class Gone:
         """Likewise."""
 
 
-def test_a_scheduler_that_goes_away_for_good_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_lost_scheduler_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("distributed.as_completed", iter)
     monkeypatch.setattr(cluster, "_PATIENCE_S", 0)
     monkeypatch.setattr(cluster, "_ANSWER_S", 1)

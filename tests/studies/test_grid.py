@@ -156,7 +156,7 @@ def test_only_what_was_finished_with_the_same_digest_is_kept(tmp_path: Path) -> 
     assert read_state(file) is None
 
 
-def test_a_recording_wins_over_a_scenario_of_its_name_and_says_so(
+def test_a_recording_has_precedence_over_a_scenario_of_its_name_with_a_note(
     drive: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.chdir(tmp_path)
