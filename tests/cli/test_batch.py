@@ -139,7 +139,7 @@ def test_a_folder_whose_list_is_damaged_is_named(held: str, said: str, sample: P
         expand_batch(batch, OutputOptions(tmp_path, resume=True))
 
 
-def test_lines_are_understood_as_lslam_run_does_and_a_failure_is_exit_1(sample: Path, tmp_path: Path) -> None:
+def test_lines_are_parsed_as_by_lslam_run_and_a_failure_is_exit_1(sample: Path, tmp_path: Path) -> None:
     own = tmp_path / "own"
     text = (
         f"# tonight\nlslam run {sample} --count 5 --set map.write=false\n"
@@ -161,7 +161,7 @@ def test_lines_are_understood_as_lslam_run_does_and_a_failure_is_exit_1(sample: 
     assert f"the folder {own} of" in twice.stderr
 
 
-def test_a_path_with_a_space_is_one_word_of_the_command_it_is_remembered_by(tmp_path: Path) -> None:
+def test_a_path_with_a_space_is_quoted_in_the_recorded_command(tmp_path: Path) -> None:
     path = sample_copy(tmp_path / "my recordings", 2)
     (line,) = [
         _line(*found, {"settings": (), "data_root": None}) for found in run_words(f"lslam run '{path}' --count 1")

@@ -42,7 +42,7 @@ def test_one_object_on_stdout_progress_on_stderr_and_a_crop_of_ones_own(tmp_path
     assert "comparing 1/1" in done.stderr
 
 
-def test_flags_of_one_sequence_beat_those_of_all(tmp_path: Path) -> None:
+def test_flags_of_one_sequence_override_those_of_all(tmp_path: Path) -> None:
     flags = ["--count", "9", "--count", "block=6", "--skip-frames", "block=2", "--start", f"{SAMPLE}=80"]
     done = lslam("compare", SAMPLE, "block", "--methods", "kiss-icp", *flags, "--json", "--out", tmp_path / "out", "-q")
     assert done.returncode == 0, done.stderr
@@ -143,7 +143,7 @@ def test_one_failed_run_is_exit_code_0_and_4_with_strict(torn: Path, tmp_path: P
         ),
     ],
 )
-def test_wrong_use_is_said_before_anything_runs(
+def test_usage_errors_come_before_any_run(
     words: list[str], error: type[Exception], sentence: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)

@@ -130,7 +130,7 @@ def test_a_healthy_and_a_broken_copy_at_the_terminal(tmp_path: Path) -> None:
     assert abs(float(late.group(1)) - 60) < 5
 
 
-def test_noise_that_stands_in_a_file_is_not_written_over(tmp_path: Path) -> None:
+def test_an_existing_noise_file_is_not_overwritten(tmp_path: Path) -> None:
     (tmp_path / "imu.toml").write_text("[imu]\nstart_s = 3\n")
     done = lslam("info", SAMPLE, "--quick", "--imu-toml", tmp_path / "imu.toml")
     assert (done.returncode, done.stderr.count("\n")) == (2, 1)

@@ -43,7 +43,7 @@ def test_every_command_has_help_with_an_example() -> None:
         assert f"lslam {name}" in done.stdout.split("Usage: ")[1].split("\n", 1)[1], f"{name} shows no example"
 
 
-def test_version_names_what_it_stands_on() -> None:
+def test_version_names_the_libraries() -> None:
     done = lslam("--version")
     assert done.returncode == 0
     assert done.stdout.startswith("lslam ")
@@ -111,7 +111,7 @@ def test_config_show_can_be_checked_and_shown_again(tmp_path: Path) -> None:
         ("not toml", "not valid TOML"),
     ],
 )
-def test_config_check_says_what_is_wrong(tmp_path: Path, text: str, words: str) -> None:
+def test_config_check_reports_errors(tmp_path: Path, text: str, words: str) -> None:
     (tmp_path / "my.toml").write_text(text)
     done = lslam("config", "check", tmp_path / "my.toml")
     assert (done.returncode, done.stdout) == (2, "")

@@ -294,7 +294,7 @@ def test_scores_and_comparisons(run: Path, tmp_path: Path) -> None:
         (["--against", "none.ply"], 3, "none.ply does not exist"),
     ],
 )  # fmt: skip
-def test_what_will_not_do_is_one_sentence(
+def test_usage_errors_are_one_sentence(
     ran: Path, monkeypatch: pytest.MonkeyPatch, words: list[str], code: int, part: str
 ) -> None:
     """In this process: `main` makes an error line and an exit code of every LslamError."""
@@ -307,7 +307,7 @@ def test_what_will_not_do_is_one_sentence(
     assert sorted(ran.iterdir()) == before
 
 
-def test_what_is_gone_is_named(run: Path, ran: Path, tmp_path: Path) -> None:
+def test_missing_files_are_named(run: Path, ran: Path, tmp_path: Path) -> None:
     scans = ran.parent / "data"
     scans.rename(tmp_path / "moved")
     try:

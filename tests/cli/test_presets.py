@@ -12,7 +12,7 @@ PRESET = (
 )
 
 
-def test_flags_beat_settings_beat_the_preset_and_the_run_records_it(tmp_path: Path) -> None:
+def test_flags_override_settings_override_the_preset(tmp_path: Path) -> None:
     (tmp_path / "mine.toml").write_text(PRESET)
     done = lslam_process(
         "run", SAMPLE, "--preset", "mine.toml", "--method", "icp", "--set", "map.voxel=0.4", "--count", "6",
@@ -33,7 +33,7 @@ def test_show_resolves_a_preset(tmp_path: Path) -> None:
     assert (done.returncode, shown["odometry"]["method"], shown["map"]["voxel"]) == (0, "kiss-icp", 0.7)
 
 
-def test_mistyped_names_are_answered_with_the_nearest_everywhere(tmp_path: Path) -> None:
+def test_errors_about_mistyped_names_suggest_the_nearest(tmp_path: Path) -> None:
     (tmp_path / "c.toml").write_text('[odometry]\nmethod = "kis-icp"\n')
     for words in (
         ("run", SAMPLE, "--method", "kis-icp"),

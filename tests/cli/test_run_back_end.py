@@ -50,7 +50,7 @@ def test_a_map_in_degrees_is_refused_before_it_is_built(closed: Path) -> None:
     assert (closed / "map.laz").read_bytes() == before
 
 
-def test_before_and_after_are_told_apart(closed: Path) -> None:
+def test_odometry_and_optimised_trajectory_are_distinguished(closed: Path) -> None:
     document = strict_json((closed / "evaluation.json").read_text())
     before, after = document["odometry"]["ate"]["se3"]["rmse"], document["ate"]["se3"]["rmse"]
     assert after < before + max(0.05 * before, 0.01)
@@ -136,7 +136,7 @@ def test_poses_that_do_not_belong_to_the_scans(tmp_path: Path) -> None:
     assert "95 scans" in done.stderr
 
 
-def test_fixes_are_asked_for_before_the_run(tmp_path: Path) -> None:
+def test_missing_fixes_are_reported_before_the_run(tmp_path: Path) -> None:
     copy = sample_copy(tmp_path / "copy", 40)
     toml = copy / "sequence.toml"
     toml.write_text(toml.read_text().replace('gnss = "gnss.csv"\n', ""))

@@ -135,7 +135,7 @@ def test_another_town_is_refused_at_once_with_its_distance(tmp_path: Path) -> No
     assert not (tmp_path / "out").exists()
 
 
-def test_a_start_among_no_houses_goes_on_without_them(tmp_path: Path) -> None:
+def test_a_start_without_buildings_continues_with_odometry(tmp_path: Path) -> None:
     done = lslam(
         "run", SAMPLE, "--out", tmp_path / "out", "--osm", FOLDER / "map.osm", "--origin", "49.02,8.4", "--heading", 0, *PART
     )  # fmt: skip
@@ -147,11 +147,11 @@ def test_a_start_among_no_houses_goes_on_without_them(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("flag", [("--origin", "49,8.4"), ("--heading", "90")])
-def test_a_place_without_a_map_does_nothing_and_says_so(flag: tuple[str, str], tmp_path: Path) -> None:
+def test_a_place_without_a_map_is_reported(flag: tuple[str, str], tmp_path: Path) -> None:
     refused(lslam("run", SAMPLE, "--out", tmp_path / "out", *flag, *PART), 2, "without --osm")
 
 
-def test_a_place_that_is_none(tmp_path: Path) -> None:
+def test_an_origin_without_coordinates_is_refused(tmp_path: Path) -> None:
     done = lslam("run", SAMPLE, "--out", tmp_path / "out", "--osm", FOLDER / "map.osm", "--origin", "north", *PART)
     refused(done, 2, "--origin north", "LAT,LON")
 

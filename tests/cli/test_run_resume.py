@@ -64,7 +64,7 @@ def test_killed_again_and_again_it_ends_with_the_same_bytes(whole: Path, tmp_pat
     assert "going on after 95 scans" in (out / "log.txt").read_text()
 
 
-def test_a_finished_run_says_so_and_gives_its_result(whole: Path) -> None:
+def test_resuming_a_finished_run_reports_its_result(whole: Path) -> None:
     before = files_of(whole)
     again = lslam("run", SAMPLE, "--out", whole, *WORDS, "--resume")
     assert (again.returncode, again.stdout) == (0, "")
@@ -108,7 +108,7 @@ def test_other_metrics_may_be_shown_of_a_run_that_is_there(whole: Path) -> None:
     assert again.returncode == 0, again.stderr
 
 
-def test_which_run_shall_go_on_must_be_said() -> None:
+def test_resume_needs_out() -> None:
     refused = lslam("run", SAMPLE, "--resume")
     assert refused.returncode == 2
     assert_one_sentence(refused.stderr)
