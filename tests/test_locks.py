@@ -1,4 +1,4 @@
-"""Files that one process at a time holds; two open files of one process are as strange to each other."""
+"""Files that one process at a time locks; two open files of one process exclude each other as well."""
 
 from __future__ import annotations
 

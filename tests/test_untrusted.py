@@ -1,4 +1,4 @@
-"""Text of strangers: every oddity is a ValueError, and nobody parses JSON or TOML elsewhere."""
+"""Untrusted text: every oddity is a ValueError, and no other module parses JSON or TOML."""
 
 from __future__ import annotations
 

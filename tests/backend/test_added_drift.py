@@ -1,4 +1,4 @@
-"""Odometry that runs away on purpose, by as much as it says."""
+"""Drift added to odometry: it has the configured size."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A level world: up is z whatever told it, and nothing but the world is turned."""
+"""Levelling: up is z, by an IMU or the ground, and only the world is rotated."""
 
 from __future__ import annotations
 

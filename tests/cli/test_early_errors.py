@@ -1,4 +1,4 @@
-"""What is wrong with a command line is said before anything heavy is imported: seen in the modules, not on a clock."""
+"""Errors on a command line come before heavy imports: checked by the modules loaded, not by time."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`lslam run --osm`: buildings hold a trajectory that drifts, and what cannot be used is said."""
+"""`lslam run --osm`: buildings correct a trajectory that drifts, and unusable input is reported."""
 
 from __future__ import annotations
 

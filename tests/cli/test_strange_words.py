@@ -1,4 +1,4 @@
-"""Words and files that no machine has numbers, names or a stack for: exit 2 or 3 with a sentence, wherever they come in."""
+"""Words and files beyond any number, name or stack: exit 2 or 3 with one sentence."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where values come from, who wins, and what is said about wrong ones."""
+"""Sources of configuration values, their precedence, and errors about wrong ones."""
 
 from __future__ import annotations
 

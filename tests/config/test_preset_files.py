@@ -1,4 +1,4 @@
-"""Presets: where their values stand among the others, and what is said about wrong ones."""
+"""Presets: their precedence among other values, and errors about wrong ones."""
 
 from __future__ import annotations
 

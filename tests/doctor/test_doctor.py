@@ -1,4 +1,4 @@
-"""Every fault the doctor knows, put into a healthy recording, is found with its size, and nothing else is."""
+"""Every fault that the doctor can find is found in a healthy recording with its size, and no other one."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Stamps in the wrong unit are told by rates that no sensor has; sound recordings of any rate are left alone."""
+"""Stamps in a wrong unit are found by rates that no sensor has; sound recordings of any rate give no finding."""
 
 from __future__ import annotations
 

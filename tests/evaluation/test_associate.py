@@ -1,4 +1,4 @@
-"""Which poses are compared, and what is said when none can be."""
+"""Association: the poses that are compared, and the notes when there are none."""
 
 from __future__ import annotations
 

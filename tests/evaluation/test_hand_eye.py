@@ -1,4 +1,4 @@
-"""By how much two bodies are turned against each other: found to its sigma, and not where the motion cannot tell."""
+"""The rotation between two bodies: found within its sigma, and not where the motion does not observe it."""
 
 from __future__ import annotations
 

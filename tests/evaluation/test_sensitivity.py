@@ -1,4 +1,4 @@
-"""Studies of known truth: curves, divergence, optimum, elbow, laws; failures appear and count for nothing."""
+"""Studies of known truth: curves, divergence, optimum, elbow, laws; failures are listed and not averaged."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Verdicts on studies of known truth, kind by kind: each turns when the data do, and says undecided where they say nothing."""
+"""Verdicts on studies of known truth, kind by kind: each follows the data, and is undecided where they do not decide."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Faults of an IMU injected into one simulated walk: what the run says of each, and that it stays on the path."""
+"""Faults of an IMU injected into one simulated walk: each is reported, and the run stays on the path."""
 
 from __future__ import annotations
 

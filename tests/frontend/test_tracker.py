@@ -1,4 +1,4 @@
-"""What the loop between motion prior and odometry counts, with an odometry that knows the truth and says what it cost."""
+"""The loop between motion prior and odometry: numbers of registrations, with an odometry that has the true poses."""
 
 from __future__ import annotations
 

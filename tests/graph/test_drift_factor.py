@@ -1,4 +1,4 @@
-"""Fixes and loops tell how much odometry drifts, and chance among noisy ones does not."""
+"""The drift factor by fixes and loops: it is found where there is drift, and not where there is noise alone."""
 
 from __future__ import annotations
 

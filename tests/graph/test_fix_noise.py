@@ -1,4 +1,4 @@
-"""What fixes err by together: told where it is, not where it is not, and a process in its steady state in the graph."""
+"""The common error of fixes: found where it is, not where it is not, and a Gauss-Markov process in the graph."""
 
 from __future__ import annotations
 

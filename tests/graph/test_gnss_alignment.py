@@ -1,4 +1,4 @@
-"""Trajectories fitted to satellite fixes: noise, jumps, mirrors, and paths that say little."""
+"""Trajectories aligned with satellite fixes: noise, jumps, mirrors, and paths that leave directions free."""
 
 from __future__ import annotations
 

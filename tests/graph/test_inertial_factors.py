@@ -1,4 +1,4 @@
-"""A pose graph with its IMU: tilt that odometry loses is kept, covariances stay honest, and gaps are no links."""
+"""A pose graph with its IMU: drift in tilt is corrected, covariances are consistent, and gaps give no links."""
 
 from __future__ import annotations
 

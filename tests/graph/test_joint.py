@@ -1,4 +1,4 @@
-"""Buildings and trajectory in one graph: walls mend a drifting way and a wrong map together; the baseline rejects none."""
+"""Buildings and trajectory in one graph: walls correct drift and a wrong map together; the baseline rejects none."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Drift that lasts is told by loops, taken out before they are closed, and what is left is as unsure as it should be."""
+"""Constant drift is estimated by loops and corrected before they are closed, with consistent covariances."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A pose graph held by a map: x, y and yaw only, only along what walls fix, and the map itself may be off as a whole."""
+"""A pose graph with planar priors: x, y and yaw only, along observed directions only, with a common shift of the map."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Graphs with known truth: what loops repair, what wrong ones spoil, and what covariances are worth."""
+"""Graphs with known truth: loops correct drift, wrong ones are rejected, covariances are consistent."""
 
 from __future__ import annotations
 

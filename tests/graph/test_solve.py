@@ -1,4 +1,4 @@
-"""What gtsam is asked for, and what it says when it gives up."""
+"""The parameters of gtsam's optimiser, and the error when it fails."""
 
 from __future__ import annotations
 

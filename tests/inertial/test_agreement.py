@@ -1,4 +1,4 @@
-"""What registration's own noise does to the comparison of turns: a car in gentle bends, whose turns are known."""
+"""The comparison of rotations of gyroscope and registration under registration's noise: a car in gentle bends."""
 
 from __future__ import annotations
 

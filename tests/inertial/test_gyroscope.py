@@ -1,4 +1,4 @@
-"""A gyroscope whose axes are askew: what its turns teach, and how far they are trusted."""
+"""A gyroscope with misaligned axes: estimation of axes and bias by rotations, and the covariance of both."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What an IMU is believed and refused for: just inside and just outside of each line."""
+"""The gates on an IMU: just inside and just outside of each."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The filter's states: errors travel as in the integration itself, and a pose teaches what a joint Gaussian says."""
+"""The filter's states: covariance propagation by finite differences, and a pose update by conditioning a Gaussian."""
 
 from __future__ import annotations
 

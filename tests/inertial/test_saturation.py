@@ -1,4 +1,4 @@
-"""Readings at the end of the range: found in the data, filled in, trusted the less, and survived."""
+"""Readings at the end of the range: found in the data, filled in with their sigma, and followed in a run."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Registered poses weighed against what the IMU felt: the better of the two counts more."""
+"""Registered poses combined with the IMU's prediction by both covariances."""
 
 from __future__ import annotations
 

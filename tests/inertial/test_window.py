@@ -1,4 +1,4 @@
-"""The sliding window: its factors hold at the truth, its Jacobians are derivatives, and leaving a moment out loses nothing."""
+"""The sliding window: factors are zero at the truth, Jacobians are derivatives, marginalisation loses nothing."""
 
 from __future__ import annotations
 

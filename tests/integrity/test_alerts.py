@@ -1,4 +1,4 @@
-"""Alerts from checks that are made up: what they say in a row or by much, what they leave open, and poses that jump."""
+"""Alerts from made-up checks: several in a row, large ones, inconclusive ones, and poses that jump."""
 
 from __future__ import annotations
 

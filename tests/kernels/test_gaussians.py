@@ -1,4 +1,4 @@
-"""The local map's voxels: moments, kinds, forgetting, eviction and the hash table under it."""
+"""The local map's voxels: moments, kinds, decay, eviction and the hash table."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a detector lets through: odometry's word on a pose that was found, the turns to try, and the axes of the constraint."""
+"""The gates of the detector: odometry's bound on a pose, the headings tried, and the axes of the constraint."""
 
 from __future__ import annotations
 

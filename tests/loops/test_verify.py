@@ -1,4 +1,4 @@
-"""Places compared: known transforms found from afar, and everything refused that is no such thing."""
+"""Verification: known transforms are found over large offsets, and other places are rejected."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What moves goes, what stands stays: against the simulator's own truth, and against NumPy."""
+"""Moving objects are removed and static ones kept: against the simulator's own truth, and against NumPy."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What counts as a small fault, and that one is noticed."""
+"""Which changes count as small faults, and that a fault is detected."""
 
 from __future__ import annotations
 

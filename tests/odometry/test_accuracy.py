@@ -1,4 +1,4 @@
-"""`icp` on simulated drives: accuracy, starts at speed, honest covariances, and gates that let no sentinel pass."""
+"""`icp` on simulated drives: accuracy, starts at speed, consistent covariances, and gates that no sentinel passes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Directions that a scan says nothing about: flagged where the world is a corridor, not where it is a town."""
+"""Degenerate directions: flagged in a corridor, not in a town."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where a scan enters: at the pose that `update` is told, whoever had a say in it."""
+"""The pose at which a scan enters the map: that of `update`, whichever stage decided it."""
 
 from __future__ import annotations
 

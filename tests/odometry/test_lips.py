@@ -1,4 +1,4 @@
-"""LIPS: a walk between houses is followed, an open plane is said to hold little, and nothing works without an IMU."""
+"""LIPS: a walk between houses is followed, open ground leaves directions degenerate, and an IMU is required."""
 
 from __future__ import annotations
 

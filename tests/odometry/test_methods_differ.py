@@ -1,4 +1,4 @@
-"""Every method poses scans in its own way: no two of them give one trajectory, and nobody else poses a scan for them."""
+"""No two methods give one trajectory, and no method is posed by another one."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whether a sensor stands, told from its scans: on simulated starts from rest, while creeping, and amid traffic."""
+"""The stationary detector: on simulated starts from rest, while creeping, and amid traffic."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A run that is asked to stop at any of its looks ends as interrupted, and goes on to the same bytes."""
+"""A run that is stopped at any of its checks ends as interrupted, and resumes to the same bytes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Never success while lost: failures that are injected are noticed without truth, and good runs are not accused."""
+"""The integrity monitor in whole runs: injected failures raise alerts without ground truth, good runs raise none."""
 
 from __future__ import annotations
 

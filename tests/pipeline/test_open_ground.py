@@ -1,4 +1,4 @@
-"""Open ground seen by sixteen beams, from rest: rings that repeat wherever the sensor is must not hold it where it was."""
+"""Open ground seen by sixteen beams, from rest: rings that move with the sensor must not bias its pose."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a run was warned of stands in its manifest and its report, and nothing that another run was warned of."""
+"""Warnings of a run are in its manifest and its report, and those of other runs are not."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Coarse to fine: the larger consensus is taken, and only where it agrees as usual once the speed is known."""
+"""Coarse to fine: the result of larger consensus is taken, and only with usual agreement once the speed is known."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The search for a first step: non-ground points decide between places that look alike."""
+"""The search for a first step: non-ground points decide between ambiguous poses."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The gates of a registration, one by one: what is refused keeps the prior and says why in the words of its matches."""
+"""The gates of a registration, one by one: a rejected result keeps the prior with a reason."""
 
 from __future__ import annotations
 

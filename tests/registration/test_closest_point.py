@@ -1,4 +1,4 @@
-"""Closest points: the same planes as points say, and derivatives as differences say."""
+"""Closest points: equivalent to planes of points, and Jacobians equal differences."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a motion that changes within the sweep does to the pose at its start, and whether the covariance says so."""
+"""The error of a pose by a motion that changes within the sweep, and its covariance."""
 
 from __future__ import annotations
 

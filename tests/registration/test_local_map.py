@@ -1,4 +1,4 @@
-"""The local map in a pyramid of resolutions: what enters each, that both forget, and what a young one holds."""
+"""The local map as a pyramid of resolutions: insertion, decay, restoring, and a young map."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Planes of a scan: all walls of a room and nothing else, as sure as their covariances say."""
+"""Planes of a scan: all walls of a room and nothing else, within their covariances."""
 
 from __future__ import annotations
 

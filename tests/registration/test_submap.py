@@ -1,4 +1,4 @@
-"""Target `submap`: how far keyframes stand apart, which of them make the map, and that a place is found again."""
+"""Target `submap`: the spacing of keyframes, the keyframes of the map, and a place that is seen again."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The stairs: two storeys of steps under the feet, and a corridor in which nothing tells how far along one is."""
+"""The stairs: two storeys of steps, and a corridor along which nothing observes the position."""
 
 from __future__ import annotations
 
