@@ -1,4 +1,4 @@
-"""OpenStreetMap as prior knowledge: fetched buildings, walls seen in clouds, and how the two are matched.
+"""OpenStreetMap as a prior: buildings are fetched, walls are extracted from clouds, and both are matched.
 
 A new matcher is one file with `lay` and one line here.
 """
@@ -17,14 +17,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Matcher:
-    """One way to lay buildings: the module with `lay`, and whether walls may show before how odometry drifts."""
+    """A matcher: the module with `lay`, and whether a drift of odometry is estimated from sightings of walls before it."""
 
     module: str
     reveals_drift: bool = True
 
     @property
     def lay(self) -> Lay:
-        """Imported when it is asked for."""
+        """The function `lay` of the module, which is imported on first use."""
         return cast("Lay", import_module(self.module).lay)
 
 

@@ -1,4 +1,4 @@
-"""Del Tufo's baseline: buildings and trajectory move each other, keyframe by keyframe."""
+"""Del Tufo's baseline: buildings and trajectory are estimated in one graph, keyframe by keyframe."""
 
 from __future__ import annotations
 
@@ -34,20 +34,20 @@ Floats = NDArray[np.float64]
 
 # Keyframes after which the baseline's graph is optimised again; Del Tufo's timer does so every 3 s.
 EVERY = 5
-ONLY_START = "the baseline lays buildings from there and holds no keyframe by it"
+ONLY_START = "the baseline starts the matches of buildings there and gives the keyframe no prior"
 SPACING = 0.25  # m between the points of an outline, and the grid of a flattened scan
 HEIGHTS = (0.2, 0.7, 1.2, 1.7)  # m
 NDT_VOXEL, VGICP_VOXEL = 2.0, 1.0  # m; hdl_graph_slam's NDT resolution, fast_gicp's voxel
 WIDTH, STEPS = 2.0, 40  # m, where the kernel opens; Gauss-Newton steps at most
 NOISE = 0.1  # m
 LEAST_POINTS = 20
-LEAST_OVERLAP = 0.1  # share of the points that found a voxel
-FARTHEST = 5.0  # m from the prior; farther is no convergence
+LEAST_OVERLAP = 0.1  # share of the points with a correspondence
+FARTHEST = 5.0  # m from the prior; a result beyond has not converged
 FAR = 1.0  # m; points farther from their nearest one do not count in the fitness score (the range of hdl_graph_slam's)
 
 
 def lay(graph: PoseGraph, solution: Solution, matches: OsmMatches, extract: BuildingExtract, given: Given) -> Laid:
-    """As `matcher.Lay`; the matches of walls are not asked."""
+    """As `matcher.Lay`, without using `matches` of walls."""
     joint, matches, buildings = run_baseline(graph, solution, extract, given.store, given.config, given.clocks)
     return Laid(matches, buildings, joint)
 
@@ -56,11 +56,11 @@ def run_baseline(
     graph: PoseGraph, solution: Solution, extract: BuildingExtract, store: KeyframeStore, config: Config,
     clocks: KeyframeClocks,
 ) -> tuple[JointSolution, OsmMatches, CorrectedMap]:  # fmt: skip
-    """The baseline, keyframe by keyframe: NDT on all buildings near, VGICP of each, edges to each, optimise, go on.
+    """For each keyframe: NDT of the scan with all buildings near, VGICP of each building, an edge to each, optimisation.
 
-    graph : in the frame of the map, at the start that is shared with every other mode; of `solution` its verdicts on loops
-        and fixes are taken
-    Raises GraphError when it cannot be solved.
+    graph : in the frame of the map, with the start that all modes share
+    solution : of `graph`; the loops and fixes that it rejected are left out
+    Raises GraphError when the graph cannot be solved.
     """
     osm = OsmMap(extract.buildings)
     odometry = with_drift(graph, 0.0, config.graph)
@@ -89,7 +89,7 @@ def run_baseline(
 def _match(
     number: int, store: KeyframeStore, pose: Floats, osm: OsmMap, config: Config, clock: StageClock
 ) -> tuple[KeyframeMatch, list[BuildingMatch]]:
-    """One keyframe's scan, above the horizon and flat, against the buildings near."""
+    """Match the scan of a keyframe, its points above the horizon projected to the ground, with the buildings near."""
     at = se2.of_se3(pose)
     tilt = se2.to_se3(np.array([0.0, 0.0, -at[2]]))[:3, :3] @ pose[:3, :3]
     with clock.stage("walls"):
@@ -119,7 +119,7 @@ def _match(
 
 
 def _first(graph: PoseGraph, poses: Floats, count: int) -> PoseGraph:
-    """The graph of the first `count` keyframes, from `poses` on."""
+    """The part of the graph with the first `count` keyframes, at `poses`."""
     return replace(
         graph,
         poses=poses[:count],
@@ -136,7 +136,7 @@ def _first(graph: PoseGraph, poses: Floats, count: int) -> PoseGraph:
 
 @dataclass(frozen=True)
 class FlatFit:
-    """A planar pose (3,) of the source in the target; rmse : m, of those of its points that have one within `FAR` m, to it."""
+    """Planar pose (3,) of the source in the target; rmse : m, distance to the nearest target points, of those within `FAR`."""
 
     pose: Floats
     rmse: float
@@ -144,7 +144,7 @@ class FlatFit:
 
 
 def flatten_scan(cloud: NDArray[np.float32], reach: float) -> Floats:
-    """(N, 2) m, one a cell, of the points (N, 3) of a level scan above the sensor's horizon within `reach` m."""
+    """Points (M, 2), m, of a level scan (N, 3) above the sensor's horizon within `reach`, m, one per cell of `SPACING`."""
     flat = cloud[(cloud[:, 2] > 0) & (np.abs(cloud[:, :2]).max(axis=1, initial=0.0) < reach), :2].astype(np.float64)
     _, first = np.unique(np.floor(flat / SPACING).astype(np.int64), axis=0, return_index=True)
     return np.asarray(flat[np.sort(first)])
@@ -160,12 +160,12 @@ def outline_points(walls: NDArray[np.float64]) -> Floats:
 
 
 def lay_scan(seen: Floats, walls: NDArray[np.float64], prior: Floats) -> FlatFit | None:
-    """The flattened scan (N, 2) on all `walls` (T, 2, 2), by NDT from `prior` (3,); None without convergence."""
+    """Register the flattened scan (N, 2) with all `walls` (T, 2, 2) by NDT from `prior` (3,); None without convergence."""
     return _align(seen, outline_points(walls), prior, NDT_VOXEL, "ndt")
 
 
 def lay_building(walls: NDArray[np.float64], seen: Floats, prior: Floats) -> FlatFit | None:
-    """One building's `walls` (T, 2, 2), about its middle, on the flattened scan (N, 2), by VGICP; None likewise."""
+    """Register a building's `walls` (T, 2, 2), about its middle, with the flattened scan (N, 2) by VGICP; None likewise."""
     return _align(outline_points(walls), seen, prior, VGICP_VOXEL, "vgicp")
 
 

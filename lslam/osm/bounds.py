@@ -1,4 +1,4 @@
-"""Boxes of latitude and longitude: round a place, round a path, and whether one holds another."""
+"""Boxes of latitude and longitude: about a place, about a path, and whether one contains another."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from lslam.formats.trajectory_files import read_trajectory
 from lslam.geometry.geodesy import from_local
 
 METRES_PER_DEGREE = 111_320.0
-DECIMALS = 6  # docs/conventions.md: what a cached reply is known by
+DECIMALS = 6  # docs/conventions.md: a cached reply is found by the rounded box
 LARGEST_KM2 = 600.0
 OTHER_WAYS = "say where it is with --around LAT,LON or --bbox"
 
@@ -25,7 +25,7 @@ OTHER_WAYS = "say where it is with --around LAT,LON or --bbox"
 class Bounds:
     """South, west, north, east in deg, WGS84, rounded to 6 decimals; west > east crosses the antimeridian.
 
-    Raises UsageError when it is no box on the Earth, or one that no public server should be asked for.
+    Raises UsageError when it is no box on the Earth, or too large for a request to a public server.
     """
 
     south: float
@@ -70,7 +70,7 @@ class Bounds:
         return self.south <= other.south and other.north <= self.north and gap + other.width <= self.width + 1e-9
 
     def share_inside(self, lat_lon: NDArray[Any], margin: float) -> float:
-        """Share of the positions (N, 2), deg, inside the box grown by `margin` m; 1 of none."""
+        """Share of the positions (N, 2), deg, inside the box with a margin of `margin`, m; 1 without positions."""
         places = np.asarray(lat_lon, np.float64).reshape(-1, 2)
         if not len(places):
             return 1.0
@@ -82,7 +82,7 @@ class Bounds:
 
 
 def around(lat_lon: NDArray[Any], radius: float) -> Bounds:
-    """The smallest box that holds the circles of `radius` m about the positions (N, 2), lat, lon in deg.
+    """The smallest box that contains the circles of `radius`, m, about the positions (N, 2), lat, lon in deg.
 
     Raises UsageError for positions off the Earth, and when the box would be too large.
     """
@@ -106,10 +106,10 @@ def positions_along(
 ) -> NDArray[np.float64]:
     """(N, 2) lat, lon in deg, WGS84, of `what`: a run folder or GeoJSON line, fixes as CSV, a trajectory, or a sequence.
 
-    A trajectory in metres (TUM, EuRoC, KITTI) has to be that of a georeferenced world, x east and y north of `origin`
-    (3,) lat, lon, height; of a sequence its satellite fixes are taken.
+    A trajectory in metres (TUM, EuRoC, KITTI) is in a georeferenced world, x east and y north of `origin` (3,) lat, lon,
+    height. The positions of a sequence are its satellite fixes.
 
-    Raises InputError naming the file when it says no place, UsageError when `origin` is needed.
+    Raises InputError with the file's name when it has no positions on the Earth, UsageError when `origin` is missing.
     """
     path = Path(what)
     line = path / "trajectory.geojson" if path.is_dir() else path

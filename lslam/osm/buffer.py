@@ -1,8 +1,7 @@
-"""Buildings along an unknown way: the next circle is requested in the background, before it is needed.
+"""Buildings along a trajectory that is being estimated: the next circle is requested in the background, before it is needed.
 
-Del Tufo, section 3.1: a circle of `fetch_radius` about the estimate is asked for at once; when the estimate leaves the
-circle of `renew_radius` about that place, the next one is. The caller never waits, so a slow server costs nothing, and a
-dead one nothing but buildings.
+Del Tufo, section 3.1: the buildings within `fetch_radius` of the estimate are requested; when the estimate is more than
+`renew_radius` from that place, the next ones are. The caller never waits: a slow or unreachable server does not delay a run.
 """
 
 from __future__ import annotations
@@ -37,7 +36,7 @@ Fetch = Callable[[Bounds], Mapping[str, Any]]
 
 @dataclass(frozen=True)
 class _RequestedCircle:
-    """A circle to be asked for: its place (2,) and radius, m."""
+    """A circle to be requested: its centre (2,) and radius, m, in the local frame."""
 
     centre: NDArray[np.float64]
     radius: float
@@ -48,23 +47,23 @@ class _RequestedCircle:
 
 @dataclass(frozen=True)
 class _Circle:
-    """A finished request: the reply, of which buildings can be read; why it is none, else None."""
+    """A finished request: its reply, and why there is no valid one, else None."""
 
-    wish: _RequestedCircle
+    request: _RequestedCircle
     reply: OverpassReply
     problem: str | None = None
 
 
 class OsmBuffer:
-    """Replies about the surroundings of an estimate that moves; `replies` has them in the order in which they were asked for.
+    """Replies about the surroundings of a moving estimate; `replies` has them in the order of the requests.
 
     Parameters
     ----------
-    fetch : gives the Overpass reply for a box (`overpass.fetch_buildings`); called in a thread of the buffer's own
-    origin : (3,) lat, lon (deg), height (m) of the local frame, x east and y north, in which everything here is
+    fetch : returns the Overpass reply for a box (`overpass.fetch_buildings`); called in a thread of the buffer
+    origin : (3,) lat, lon (deg), height (m) of the local frame, x east and y north, of all positions here
     config : the radii
-    folder : where replies are kept, `000000.json` and so on; what lies there already is not asked for again, so that a run
-        that was killed goes on with the same buildings. None keeps nothing
+    folder : where replies are written, `000000.json` and so on. Replies that exist there are not requested again, so that a
+        resumed run has the same buildings. None writes nothing
 
     Use it as a context manager, or `close` it.
     """
@@ -74,7 +73,7 @@ class OsmBuffer:
         self._origin = np.asarray(origin, np.float64)
         self._config = config
         self._folder = folder
-        self._wishes: queue.SimpleQueue[_RequestedCircle | None] = queue.SimpleQueue()
+        self._queue: queue.SimpleQueue[_RequestedCircle | None] = queue.SimpleQueue()
         self._done: queue.SimpleQueue[_Circle] = queue.SimpleQueue()
         self._open: list[_RequestedCircle] = []
         self._answered: list[_RequestedCircle] = []
@@ -84,29 +83,30 @@ class OsmBuffer:
         self._load()
 
     def ask(self, position: NDArray[Any], radius: float | None = None) -> None:
-        """Ask for the circle about `position` (2,), m, unless what was asked for before reaches there; returns at once.
+        """Request the circle about `position` (2,), m, unless an earlier request covers it; returns at once.
 
-        Where a request failed, nothing is asked again before that circle is left. radius : m, other than `fetch_radius`
+        After a failed request nothing is requested again within its circle.
+        radius : m, instead of `fetch_radius`
         """
         at = np.asarray(position, np.float64)[:2]
         self._collect()
-        asked = [*self._answered, *self._open]
-        wish = _RequestedCircle(at, self._config.fetch_radius if radius is None else radius)
+        earlier = [*self._answered, *self._open]
+        new = _RequestedCircle(at, self._config.fetch_radius if radius is None else radius)
         if any(
-            w.radius >= wish.radius and w.is_at(at, self._config.renew_radius + w.radius - wish.radius) for w in asked
+            c.radius >= new.radius and c.is_at(at, self._config.renew_radius + c.radius - new.radius) for c in earlier
         ):
             return
-        self._open.append(wish)
+        self._open.append(new)
         if self._thread is None:
-            # A thread that waits for a dead server must not keep the program from ending.
+            # A daemon, so that a pending request does not delay the end of the program.
             self._thread = threading.Thread(
                 target=copy_context().run, args=(self._work,), name="osm-buffer", daemon=True
             )
             self._thread.start()
-        self._wishes.put(wish)
+        self._queue.put(new)
 
     def wait(self, seconds: float, requests: int | None = None) -> bool:
-        """Wait for what is asked for, or for so many `requests` in all, at most `seconds`. True when nothing is open any more."""
+        """Wait, at most `seconds`, for all open requests or for `requests` finished ones in all; True when none is open."""
         while self._open and seconds > 0 and (requests is None or self.requests < requests):
             try:
                 self._take(self._done.get(timeout=min(seconds, 0.05)))
@@ -122,13 +122,13 @@ class OsmBuffer:
 
     @property
     def requests(self) -> int:
-        """Requests that were answered or refused so far."""
+        """Number of requests that succeeded or failed so far."""
         return len(self._answered)
 
     def close(self) -> None:
-        """Let the thread end; a request that is under way is not waited for."""
+        """End the thread, without waiting for a request in progress."""
         self._collect()
-        self._wishes.put(None)
+        self._queue.put(None)
 
     def __enter__(self) -> OsmBuffer:
         return self
@@ -137,42 +137,42 @@ class OsmBuffer:
         self.close()
 
     def _work(self) -> None:
-        while (wish := self._wishes.get()) is not None:
-            self._done.put(self._circle(wish))
+        while (request := self._queue.get()) is not None:
+            self._done.put(self._circle(request))
 
-    def _circle(self, wish: _RequestedCircle) -> _Circle:
+    def _circle(self, request: _RequestedCircle) -> _Circle:
         try:
-            fix = from_local(np.array([[*wish.centre, 0.0]]), self._origin)[:, :2]
-            reply = OverpassReply.of(self._fetch(around(fix, wish.radius)))
+            fix = from_local(np.array([[*request.centre, 0.0]]), self._origin)[:, :2]
+            reply = OverpassReply.of(self._fetch(around(fix, request.radius)))
             self._check(reply)
-            return _Circle(wish, reply)
+            return _Circle(request, reply)
         except LslamError as error:
-            return _Circle(wish, NOTHING, str(error))
+            return _Circle(request, NOTHING, str(error))
         except Exception as error:
-            # Whatever a server sends, the run goes on without it.
+            # An invalid reply of any kind does not end the run.
             log.debug("traceback", exc_info=error)
-            return _Circle(wish, NOTHING, f"the reply cannot be used ({type(error).__name__}: {error})")
+            return _Circle(request, NOTHING, f"the reply cannot be used ({type(error).__name__}: {error})")
 
     def _check(self, reply: OverpassReply) -> None:
-        """Raise what is wrong with a reply."""
+        """Raise the errors of an invalid reply."""
         buildings_of(from_overpass(reply), self._origin, "the reply")
 
     def _keep(self, circle: _Circle, folder: Path) -> None:
-        """What is used is kept, and nothing else: not what a server sends when nobody waits any more."""
+        """Write a reply that is used; replies after the last wait are not written."""
         folder.mkdir(parents=True, exist_ok=True)
-        asked = {"lslam_centre": circle.wish.centre.tolist(), "lslam_radius": circle.wish.radius}
+        requested = {"lslam_centre": circle.request.centre.tolist(), "lslam_radius": circle.request.radius}
         with atomic_write(folder / f"{len(self.replies):06d}.json") as stream:
-            circle.reply.write(stream, asked)
+            circle.reply.write(stream, requested)
 
     def _load(self) -> None:
-        """Take what an earlier run kept."""
+        """Read the replies that an earlier run wrote."""
         for path in [] if self._folder is None else sorted(self._folder.glob("*.json")):
             try:
                 reply = OverpassReply(path.read_bytes())
                 facts = reply.facts()
-                wish = _RequestedCircle(np.array(facts["lslam_centre"], np.float64), float(facts["lslam_radius"]))
+                request = _RequestedCircle(np.array(facts["lslam_centre"], np.float64), float(facts["lslam_radius"]))
                 self._check(reply)
-                self._use(_Circle(wish, reply))
+                self._use(_Circle(request, reply))
             except (OSError, *MISFIT) as error:
                 raise InputError(f"{path} is no reply kept by an earlier run ({error}): remove it") from None
 
@@ -181,9 +181,9 @@ class OsmBuffer:
             self._take(self._done.get())
 
     def _take(self, circle: _Circle) -> None:
-        self._open = [wish for wish in self._open if wish is not circle.wish]
+        self._open = [request for request in self._open if request is not circle.request]
         if circle.problem is not None:
-            self._answered.append(circle.wish)
+            self._answered.append(circle.request)
             self.problems.append(circle.problem)
             log.warning("no buildings from OpenStreetMap here: %s", circle.problem)
             return
@@ -192,5 +192,5 @@ class OsmBuffer:
         self._use(circle)
 
     def _use(self, circle: _Circle) -> None:
-        self._answered.append(circle.wish)
+        self._answered.append(circle.request)
         self.replies.append(circle.reply)

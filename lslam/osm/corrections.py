@@ -1,4 +1,4 @@
-"""The second level: with the trajectory fixed, every building's displacement is estimated from the walls seen."""
+"""The second level: with the trajectory fixed, the displacement of every building is estimated from sightings of its walls."""
 
 from __future__ import annotations
 
@@ -37,22 +37,22 @@ from lslam.types.building import (
 Floats = NDArray[np.float64]
 
 VIEWS = 3  # keyframes that must agree
-NEAR = 1.5  # m; what is seen so near an outline may be its building
+NEAR = 1.5  # m; a building with walls seen within it of its outline is not absent
 STEP = 1.0  # m between the points of a wall that rays are drawn to
-WIDE = 3.0  # m of wall that must be seen through a building
+WIDE = 3.0  # m; least length of walls seen through an absent building
 DEPTH = 0.5  # m that a ray must pass inside an outline at least
-ONE_LINE = 0.5  # m; walls seen so near one line are one
+ONE_LINE = 0.5  # m; walls seen within it of one line are merged
 ONE_WAY = np.sin(np.radians(10.0))
-LONG = 6.0  # m; a shorter wall is a hedge, a van, a sign
+LONG = 6.0  # m; least length of a new wall, longer than a hedge, a van or a sign
 log = logging.getLogger("lslam")
 BUILDINGS_GEOJSON, BUILDINGS_OSM = "buildings.geojson", "buildings.osm"
-# m and rad; prior sigmas of a building that may only move with all others.
+# m and rad; prior sigmas of a building that moves with all others only.
 TOGETHER = np.array([1e-3, 1e-3, 1e-5])
 
 
 @dataclass(frozen=True)
-class _Sight:
-    """The walls (S, 2, 2) seen about a keyframe and the sensor's places (V, 2) there, m, map frame."""
+class _PlacedView:
+    """Walls (S, 2, 2) seen about a keyframe and the positions (V, 2) of the sensor there, m, map frame."""
 
     keyframe: int
     walls: Floats
@@ -62,9 +62,9 @@ class _Sight:
 def absent_buildings(
     buildings: Sequence[Building], sights: Sequence[KeyframeMatch], poses: Mapping[int, Floats]
 ) -> NDArray[np.bool_]:
-    """(B,) true where nothing is seen near the outline and walls behind are seen through it.
+    """Whether each building (B,) is absent: no wall is seen near its outline, and walls behind are seen through it.
 
-    buildings : at their real places, m, map frame; poses : (3,) of each keyframe in it
+    buildings : displaced, m, map frame; poses : (3,) planar pose of each keyframe in the map frame
     """
     from shapely import STRtree, linestrings, points
 
@@ -86,14 +86,14 @@ def absent_buildings(
         ray, core = tree.query(linestrings(rays.reshape(-1, 2, 2)), predicate="intersects")
         hits = np.zeros((len(samples), len(candidates)), np.int64)
         np.add.at(hits, (ray % max(len(samples), 1), core), 1)
-        # Whichever of its places the sensor saw the wall from, the way led through the building.
+        # The rays from all positions of the sensor to the wall pass through the building.
         counts += (hits == len(look.views)).sum(axis=0) * STEP >= WIDE
     found[candidates] = counts >= VIEWS
     return found
 
 
 def new_walls(buildings: Sequence[Building], sights: Sequence[KeyframeMatch], poses: Mapping[int, Floats]) -> Floats:
-    """(S, 2, 2) walls, m, map frame, that `VIEWS` keyframes saw and that no building has, longest first.
+    """Walls (S, 2, 2), m, map frame, seen from `VIEWS` keyframes and part of no building, longest first.
 
     buildings, poses : as of `absent_buildings`
     """
@@ -105,7 +105,7 @@ def new_walls(buildings: Sequence[Building], sights: Sequence[KeyframeMatch], po
     lines: list[_Line] = []
     for look in checking(_placed(sights, poses)):
         rows = np.ascontiguousarray(look.walls.reshape(-1, 4))
-        # Which side of it is outside a wall seen askew does not always tell.
+        # The outside of a wall that is seen at a grazing angle is uncertain: both directions are matched.
         pairs = [
             wall_matching.fit(side, known, np.zeros(3), NEAR, LIKENESS, False)[2]
             for side in (rows, np.ascontiguousarray(rows[:, [2, 3, 0, 1]]))
@@ -123,7 +123,7 @@ def new_walls(buildings: Sequence[Building], sights: Sequence[KeyframeMatch], po
 
 
 class _Line:
-    """Walls seen again and again on one line, as long as they reach together."""
+    """Walls of several keyframes on one line, merged to one segment."""
 
     def __init__(self, wall: Floats, keyframe: int) -> None:
         self._from, along = wall[0], wall[1] - wall[0]
@@ -133,7 +133,7 @@ class _Line:
         self.keyframes = {keyframe}
 
     def takes(self, wall: Floats, keyframe: int) -> bool:
-        """Take a wall that lies on it and touches it, or nearly so."""
+        """Merge a wall that lies on the line, within `NEAR` of the segment; True then."""
         away = wall - self._from
         s, d = away @ self._u, away @ [-self._u[1], self._u[0]]
         leaning = abs(d[1] - d[0]) > ONE_WAY * abs(s[1] - s[0])
@@ -150,18 +150,19 @@ class _Line:
         return np.asarray(self._from + np.outer([self._low, self._high], self._u))
 
 
-def _placed(sights: Sequence[KeyframeMatch], poses: Mapping[int, Floats]) -> list[_Sight]:
+def _placed(sights: Sequence[KeyframeMatch], poses: Mapping[int, Floats]) -> list[_PlacedView]:
+    """The walls seen about each keyframe with a pose, in the map frame."""
     found = []
     for sight in sights:
         if sight.keyframe in poses:
             pose = poses[sight.keyframe]
             views = sight.views if len(sight.views) else np.zeros((1, 2))
-            found.append(_Sight(sight.keyframe, se2.apply(pose, sight.walls), se2.apply(pose, views[:, :2])))
+            found.append(_PlacedView(sight.keyframe, se2.apply(pose, sight.walls), se2.apply(pose, views[:, :2])))
     return found
 
 
 def _samples(walls: Floats) -> Floats:
-    """(N, 2) points on all walls, `STEP` apart."""
+    """Points (N, 2), m, on all walls, about `STEP` apart."""
     counts = [int(np.linalg.norm(wall[1] - wall[0]) / STEP) + 1 for wall in walls]
     shares = [(np.arange(n) + 0.5)[:, None] / n for n in counts]
     found = [wall[0] + share * (wall[1] - wall[0]) for wall, share in zip(walls, shares, strict=True)]
@@ -175,14 +176,14 @@ def _ground(building: Building) -> Any:
 
 
 def correct_buildings(matches: OsmMatches, poses: NDArray[np.float64], config: OsmConfig) -> CorrectedMap:
-    """The buildings of `matches` at their real places.
+    """The map with the estimated displacements of the buildings of `matches`.
 
     Parameters
     ----------
     poses : (K, 3) x, y (m), yaw (rad) of all keyframes in the map frame
-    config : `mode` says what moves: nothing (`prior`), all buildings together (`rigid`), each by itself (the others)
+    config : by its `mode` nothing moves (`prior`), all buildings move together (`rigid`), or each by itself (other modes)
 
-    Absent buildings follow the others, as those nobody saw do. Covariances are those against the trajectory, which is given.
+    Absent and unseen buildings take the common shift. Covariances are conditional on the trajectory.
     """
     prior = map_prior(matches, config)
     if config.mode == "rigid":
@@ -196,9 +197,9 @@ def place_buildings(
     matches: OsmMatches, poses: Floats, local: Sequence[BuildingMatch], solution: BuildingSolution, config: OsmConfig,
     mode: str,
 ) -> CorrectedMap:  # fmt: skip
-    """The map that a solution of `local` matches means: overlaps parted, what is absent and what is new.
+    """The map after a solution of the `local` matches: without overlaps, with absent buildings and new walls.
 
-    mode : by which it was made, of `OsmConfig.mode`, or a matcher's name
+    mode : of `OsmConfig.mode`, or the name of the matcher
     """
     place = dict(enumerate(poses))
     untangled, own = Untangled(solution.displacements, (), ()), solution.covariances
@@ -210,39 +211,39 @@ def place_buildings(
         information = np.asarray(np.linalg.inv(solution.covariances), np.float64)
         untangled = remove_overlaps(matches.buildings, solution.displacements, information)
     displacements = untangled.displacements
-    standing = [b.displaced(d) for b, d in zip(matches.buildings, displacements, strict=True)]
-    gone = absent_buildings(standing, matches.keyframes, place)
+    displaced = [b.displaced(d) for b, d in zip(matches.buildings, displacements, strict=True)]
+    absent = absent_buildings(displaced, matches.keyframes, place)
     used, rejected = _counts(matches, local, solution)
     found = tuple(
-        BuildingCorrection(b, displacements[k], own[k], _status(used[k], bool(gone[k])), used[k], rejected[k])
+        BuildingCorrection(b, displacements[k], own[k], _status(used[k], bool(absent[k])), used[k], rejected[k])
         for k, b in enumerate(matches.buildings)
     )
-    here = [b for b, is_gone in zip(standing, gone, strict=True) if not is_gone]
+    present = [b for b, is_absent in zip(displaced, absent, strict=True) if not is_absent]
     shift = np.zeros(2) if mode == "prior" else solution.shift
-    new = new_walls(here, matches.keyframes, place)
+    new = new_walls(present, matches.keyframes, place)
     corrected = CorrectedMap(matches.origin, found, mode, shift, new, untangled.left, matches.attribution)
     counts = {status: sum(c.status == status for c in found) for status in ("seen", "unseen", "absent")}
     log.info(
-        "OSM: %d buildings seen, %d not, %d absent; %d walls that no building has",
+        "OSM: %d buildings seen, %d unseen, %d absent; %d new walls",
         counts["seen"], counts["unseen"], counts["absent"], len(corrected.new_walls),
     )  # fmt: skip
     return corrected
 
 
 def middles_of(matches: OsmMatches) -> Floats:
-    """(B, 2) m, what the buildings of a run are turned about."""
+    """Middles (B, 2), m, about which the buildings rotate."""
     return np.array([b.middle for b in matches.buildings]).reshape(-1, 2)
 
 
 def agreed(matches: OsmMatches, poses: Floats) -> list[BuildingMatch]:
-    """The accepted local matches that others support, with the keyframes at `poses` (K, 3)."""
+    """The accepted local matches that agree with others of their building, with the keyframes at `poses` (K, 3)."""
     local = [m for m in matches.local if m.is_accepted and m.keyframe < len(poses)]
-    borne_out = agreeing(middles_of(matches), local, dict(enumerate(poses)))
-    return [m for m, is_so in zip(local, borne_out, strict=True) if is_so]
+    agrees = agreeing(middles_of(matches), local, dict(enumerate(poses)))
+    return [m for m, is_kept in zip(local, agrees, strict=True) if is_kept]
 
 
 def map_prior(matches: OsmMatches, config: OsmConfig) -> MapPrior:
-    """The map's prior: common shift by the trajectory's estimate, buildings by the configuration."""
+    """The map's prior: the common shift as the trajectory's graph estimated it, buildings as configured."""
     unseen = _unseen(config)
     common = np.minimum(matches.shift_sigma, unseen.shift_sigma)
     return replace(unseen, shift=matches.shift, shift_sigma=np.maximum(common, TOGETHER[:2]))
@@ -255,7 +256,7 @@ def _unseen(config: OsmConfig) -> MapPrior:
 
 
 def write_buildings(folder: Path, found: CorrectedMap, data: OsmData) -> None:
-    """buildings.geojson, and buildings.osm to open in an editor: the elements of `data` at their real places.
+    """Write buildings.geojson, and buildings.osm for editors, which has the elements of `data` displaced.
 
     Raises OutputError when they cannot be written.
     """
@@ -263,16 +264,16 @@ def write_buildings(folder: Path, found: CorrectedMap, data: OsmData) -> None:
     write_osm(folder / BUILDINGS_OSM, corrected_osm(data, found))
 
 
-def _status(used: int, is_gone: bool) -> BuildingStatus:
+def _status(used: int, is_absent: bool) -> BuildingStatus:
     if used:
         return "seen"
-    return "absent" if is_gone else "unseen"
+    return "absent" if is_absent else "unseen"
 
 
 def _counts(
     matches: OsmMatches, local: Sequence[BuildingMatch], solution: BuildingSolution
 ) -> tuple[list[int], list[int]]:
-    """Per building, how many matches are inliers and how many were rejected."""
+    """Numbers of inlier matches and of rejected matches of each building."""
     owners = np.array([m.building for m in local], np.intp)
     size = len(matches.buildings)
     used = np.bincount(owners[solution.inliers], minlength=size)

@@ -1,4 +1,4 @@
-"""A run held by the buildings of a map: found on it, optimised with it, and the buildings laid where they really stand."""
+"""A run with a map of buildings: keyframes are located on it, the graph has planar priors by it, buildings are displaced."""
 
 from __future__ import annotations
 
@@ -29,16 +29,19 @@ from lslam.types.stage_clock import KeyframeClocks
 
 log = logging.getLogger("lslam")
 Floats = NDArray[np.float64]
-# Iterations of the drift estimate: walls seen from the ends of a submap hide a part of it.
+# Iterations of the drift estimate: the drift within a submap is not visible in its walls at first.
 ROUNDS = 5
-# Modes in which the map's buildings stand to each other as they are drawn.
-TRUSTING = ("prior", "rigid")
-# m, sigma of their walls: the rounding of a survey.
-TRUE = 0.01
+# Modes in which the buildings of the map do not move relative to each other.
+RIGID_MODES = ("prior", "rigid")
+# m, sigma of a wall in these modes: the rounding of a survey.
+SURVEY_SIGMA = 0.01
 
 
 def hold_by_buildings(osm: OsmSource, graph: PoseGraph, placement: Placement, given: Given) -> BackEnd | None:
-    """The run held by the buildings of a map, and by fixes where it has some; None, and why, where they hold nothing."""
+    """The back end with planar priors by a map's buildings, and with fixes where there are some.
+
+    None, with a problem in `given`, when there is no map, no keyframe located on it, or no solution.
+    """
     config, store, problems = given.config, given.store, given.problems
     known = placement.georeference
     origin = known.origin if known is not None else config.osm.origin
@@ -91,7 +94,7 @@ def find_on_map(
     config: Config,
     clocks: KeyframeClocks | None = None,
 ) -> tuple[Located, PoseGraph]:
-    """The keyframes located on the map, and the graph in its frame, corrected where the map reveals a drift.
+    """The keyframes located on the map, and the graph in its frame, corrected by a significant drift.
 
     graph : of odometry, or aligned by GNSS fixes; up, placed, clocks : as of `locate`; stage `drift` of the last keyframe
     """
@@ -128,13 +131,13 @@ def find_on_map(
 
 
 def on_map(graph: PoseGraph, located: Located, config: Config) -> PoseGraph:
-    """The graph in the frame of the map, with planar priors by its walls, and its fixes where it has some."""
+    """The graph in the frame of the map, with planar priors by walls, and with its fixes."""
     return replace(
         graph,
         poses=graph.poses if graph.fixes else located.T_enu_odometry @ graph.poses,
         map_priors=_priors(located, config),
         shift_sigma=0.0 if config.osm.mode == "prior" else config.osm.shift_sigma,
-        map_sigma=0.0 if config.osm.mode in TRUSTING else config.osm.map_sigma,
+        map_sigma=0.0 if config.osm.mode in RIGID_MODES else config.osm.map_sigma,
         world_up=np.array([0.0, 0.0, 1.0]),
         start=None if graph.fixes else located.start,
         start_sigma=None if graph.fixes else located.start_sigma,
@@ -143,11 +146,12 @@ def on_map(graph: PoseGraph, located: Located, config: Config) -> PoseGraph:
 
 
 def _priors(located: Located, config: Config) -> list[PlanarPrior]:
-    """The planar priors by the matches. With an exact map only sightings have errors, independent per submap.
+    """The planar priors by the matches.
 
-    Walls drawn by hand have an error of `wall_sigma`, common to all keyframes that see them (`shares`).
+    The error of a wall on the map is common to all keyframes that see it (`shares`). In the modes with an exact map only
+    sightings have errors, which are independent between submaps.
     """
-    if config.osm.mode not in TRUSTING:
+    if config.osm.mode not in RIGID_MODES:
         return located.priors
     sharper = (config.osm.wall_sigma / _wall_sigmas(config.osm)[0]) ** 2
     share = 1.0 / config.keyframes.submap_size
@@ -155,10 +159,10 @@ def _priors(located: Located, config: Config) -> list[PlanarPrior]:
 
 
 def _wall_sigmas(config: OsmConfig) -> tuple[float, float]:
-    """m, sigmas of a sighting against the map's wall, and of the wall's building."""
-    if config.mode in TRUSTING:
-        # Its points lie anywhere within the tolerance.
-        return config.wall_tolerance / np.sqrt(3.0), TRUE
+    """Sigmas, m, of a sighting relative to the map's wall, and of the wall on the map."""
+    if config.mode in RIGID_MODES:
+        # The points of a wall are uniform within the tolerance.
+        return config.wall_tolerance / np.sqrt(3.0), SURVEY_SIGMA
     return config.wall_sigma, config.building_sigma
 
 

@@ -38,11 +38,11 @@ from lslam.types.stage_clock import KeyframeClocks
 log = logging.getLogger("lslam")
 Floats = NDArray[np.float64]
 
-# Sigmas of the map beyond which the run is lost, and a match has to observe all three coordinates.
+# Sigmas of the map beyond which the track is lost, and a match has to observe all three coordinates.
 LOST = 4.0
-# Chi-square quantile within which a match is supported by the others.
-BORNE_OUT = 0.95
-# Submaps grow by this factor, so often, until the walls of one fit one place only.
+# Chi-square quantile within which a match agrees with the others.
+AGREEING = 0.95
+# Factor by which submaps grow, and how often, until the match of the start is unambiguous.
 GROWTH, TRIES = 2, 4
 
 
@@ -50,10 +50,10 @@ GROWTH, TRIES = 2, 4
 class Located:
     """The keyframes of a run located on the map.
 
-    T_enu_odometry : (4, 4) from the world of odometry into the map frame, placed by one match and turned by all
+    T_enu_odometry : (4, 4) from the world of odometry to the map frame; translation by one match, heading by all
     matches : of all keyframes; priors : the accepted ones, for the pose graph
     start, start_sigma : (3,) x, y (m), yaw (rad), prior of the first pose and its sigmas; None where matches give it
-    problem : why there are none
+    problem : why no match was accepted, empty otherwise
     """
 
     T_enu_odometry: Floats
@@ -76,10 +76,10 @@ def locate(
 ) -> Located:  # fmt: skip
     """Match all keyframes with the map.
 
-    up : (3,) up in the world of odometry by an IMU, None takes that of the ground
-    placed : (4, 4) from that world into the map frame by GNSS fixes
-    odometry : (K, 4, 4) of the keyframes in it, those of the store by default
-    clocks : take the time of each keyframe, stages `walls` and `map match`
+    up : (3,) up in the world of odometry by an IMU; None estimates it by the ground
+    placed : (4, 4) from that world to the map frame by GNSS fixes
+    odometry : (K, 4, 4) poses of the keyframes in that world, by default those of the store
+    clocks : measure the time of each keyframe, stages `walls` and `map match`
     """
     clocks = KeyframeClocks() if clocks is None else clocks
     osm = OsmMap(extract.buildings)
@@ -98,7 +98,7 @@ def locate(
     accepted = [match for match in matches if match.is_accepted]
     if not accepted:
         return Located(T_level, osm, matches, problem=_why_none(matches, osm, extract))
-    log.info("OSM: %d of %d keyframes lie on the map", len(accepted), len(matches))
+    log.info("OSM: %d of %d keyframes are matched with the map", len(accepted), len(matches))
     first = next((match for match in accepted if match.rank == 3), accepted[0])
     sigma = np.maximum(start.sigma, track.sigma)
     T = _lowered(
@@ -110,7 +110,7 @@ def locate(
     ]
     if not (config.osm.hold_start or config.osm.mode == "rigid"):
         return Located(T, osm, matches, priors, None, sigma)
-    # The heading is best estimated by all walls.
+    # The position is that of the prior, the heading the estimate by all matches.
     given, laid = known_start(config.osm), se2.of_se3(T @ odometry[0])
     place = given.pose[:2] if placed is None else start.pose[:2]
     return Located(T, osm, matches, priors, np.append(place, laid[2]), np.append(given.sigma[:2], sigma[2]))
@@ -122,7 +122,7 @@ def finish(
 ) -> OsmMatches:  # fmt: skip
     """All keyframe matches with the graph's verdicts, and the building matches from the final `poses`.
 
-    clocks : take the time of each keyframe, stage `building match`
+    clocks : measure the time of each keyframe, stage `building match`
     """
     clocks = KeyframeClocks() if clocks is None else clocks
     rejections = iter(solution.map_reasons)
@@ -138,7 +138,7 @@ def finish(
 
 
 def _up_by_ground(store: KeyframeStore, odometry: Floats, config: Config) -> Floats:
-    """(3,) up in the world of odometry, by the ground under all keyframes: roads rise and fall; its z axis without any."""
+    """Up (3,) in the world of odometry: median normal of the ground below all keyframes, z axis without any ground."""
     normals = [odometry[f.keyframe, :3, :3] @ f.normal for f in floor_planes(store, config.graph)]
     up = np.median(normals, axis=0) if normals else UP
     return np.asarray(up / np.linalg.norm(up))
@@ -172,7 +172,7 @@ def _along(
     numbers: Iterable[int], store: KeyframeStore, poses: Floats, osm: OsmMap, track: OsmTrack, config: Config,
     clocks: KeyframeClocks, before: int | None = None,
 ) -> list[KeyframeMatch]:  # fmt: skip
-    """Match the keyframes `numbers` in turn; the track stands at the keyframe `before`, None at the first of them."""
+    """Match the keyframes `numbers` in turn. The track is at keyframe `before`, or at the first of them for None."""
     planar = se2.of_se3(poses)
     matches: list[KeyframeMatch] = []
     for number in checking(numbers):
@@ -196,7 +196,7 @@ def _gated(match: KeyframeMatch, track: OsmTrack, config: OsmConfig, graph: Grap
     if match.reason:
         return match
     if track.sigma[0] > LOST * config.map_sigma and (match.rank < 3 or len(match.pairs) < START_WALLS):
-        return replace(match, reason="too few walls to find the place anew")
+        return replace(match, reason="too few walls for a relocalisation")
     squared, rank = track.squared(match.pose, match.information)
     limit = quantile(graph.probability, rank)
     if squared > limit:
@@ -220,9 +220,9 @@ def _place(
 ) -> Floats:
     """The pose (3,) of the world of `poses` (K, 3) in the map frame.
 
-    In place as that match has it, next to `first`, that is known as well as the map is and that the others bear out, and
-    turned as all have it: a house drawn askew, or few walls, are enough for one match that turns the run by degrees, which
-    would look like drift of odometry.
+    The position is that of one match: the nearest to `first` that is as accurate as the map and agrees with the others. The
+    heading is estimated from all matches. A single match of few walls, or of a house drawn with a wrong heading, would rotate
+    the run by degrees, which looks like drift of odometry.
     """
     matches = [first, *(match for match in accepted if match is not first)]
     numbers = [match.keyframe for match in matches]
@@ -232,7 +232,7 @@ def _place(
     right = [
         i
         for i, (match, far) in enumerate(zip(matches, squared, strict=True))
-        if match.rank == 3 and track.knows(match.information) and far <= quantile(BORNE_OUT, 3)
+        if match.rank == 3 and track.is_accurate(match.information) and far <= quantile(AGREEING, 3)
     ]
     at = min(right, key=lambda i: abs(numbers[i] - first.keyframe), default=0)
     there = np.append(matches[at].pose[:2], laid[at, 2] + turn)
@@ -240,7 +240,7 @@ def _place(
 
 
 def _lowered(T: Floats, first: Floats, placed: Floats | None) -> Floats:
-    """With the first keyframe at height 0, where satellite fixes do not say its height."""
+    """`T` with the first keyframe at height 0, unless satellite fixes gave its height."""
     if placed is not None:
         return T
     down = np.eye(4)
@@ -258,14 +258,14 @@ def _why_none(matches: list[KeyframeMatch], osm: OsmMap, extract: BuildingExtrac
     reasons = [m.reason for m in matches]
     usual = max(sorted(set(reasons)), key=reasons.count)
     return (
-        f"OSM: none of {len(matches)} keyframes could be laid on {extract.source} (most often: {usual}): check --origin and "
+        f"OSM: none of {len(matches)} keyframes matches {extract.source} (most often: {usual}): check --origin and "
         "--heading; the run goes on without the buildings"
     )
 
 
 @dataclass(frozen=True)
 class FirstPose:
-    """Planar pose (3,) of the first scan in the map frame with its sigma (3,), m, m, rad; or why there is none."""
+    """Planar pose (3,) of the first scan in the map frame and its sigma (3,), m, m, rad; problem : why there is none."""
 
     pose: Floats
     sigma: Floats
@@ -274,14 +274,14 @@ class FirstPose:
 
 @dataclass(frozen=True)
 class WallView:
-    """Walls (S, 2, 2) seen about a keyframe and the sensor's places (V, 2) then, m, in the keyframe's level frame."""
+    """Walls (S, 2, 2) seen about a keyframe and the positions (V, 2) of the sensor, m, in the keyframe's level frame."""
 
     walls: Floats
     views: Floats
 
 
 def see_walls(store: KeyframeStore, poses: Floats, number: int, size: int, config: OsmConfig) -> WallView:
-    """Walls in the submap of `size` keyframes about keyframe `number`; `poses` (K, 4, 4) of all in a level world."""
+    """Walls in the submap of `size` keyframes about keyframe `number`; `poses` (K, 4, 4) of all keyframes, level world."""
     at = se2.of_se3(poses[number])
     T_world_level = se2.to_se3(at)
     T_world_level[2, 3] = poses[number, 2, 3]
@@ -292,13 +292,13 @@ def see_walls(store: KeyframeStore, poses: Floats, number: int, size: int, confi
 
 
 def known_start(config: OsmConfig) -> FirstPose:
-    """The start that the configuration gives, with its heading."""
+    """The start by the origin and heading of the configuration, with their sigmas."""
     radius, turn = config.start_radius / WINDOW, np.radians(config.start_heading_deg) / WINDOW
     return FirstPose(first_pose(config), np.array([radius, radius, turn]))
 
 
 def sought_start(store: KeyframeStore, poses: Floats, osm: OsmMap, config: OsmConfig, submap_size: int) -> FirstPose:
-    """The start by the first match over all headings, of a submap that grows until it fits one place only.
+    """The start by a match over all headings, of a submap that grows until the match is unambiguous.
 
     poses : (K, 4, 4) of all keyframes in a level world; the first keyframe is the start
     """
@@ -316,7 +316,7 @@ def sought_start(store: KeyframeStore, poses: Floats, osm: OsmMap, config: OsmCo
             break
         size *= GROWTH
     problem = (
-        f"OSM: the walls about the start do not say where it is on the map ({why} within {config.start_radius:g} m of the "
+        f"OSM: the walls about the start do not locate it on the map ({why} within {config.start_radius:g} m of the "
         "origin): give --heading DEG, or a better --origin; the run goes on without the buildings"
     )
     return FirstPose(np.zeros(3), np.zeros(3), problem)

@@ -1,4 +1,4 @@
-"""What a matcher of a run and a map does."""
+"""The interface of matchers, and the matcher of walls."""
 
 from __future__ import annotations
 
@@ -18,7 +18,10 @@ from lslam.types.building import CorrectedMap, OsmMatches
 
 @dataclass(frozen=True)
 class Laid:
-    """Buildings laid where they really stand; joint : of buildings and trajectory, None where the trajectory stays."""
+    """Matches, and buildings with their displacements.
+
+    joint : solution of buildings and trajectory in one graph; None when the trajectory is fixed
+    """
 
     matches: OsmMatches
     buildings: CorrectedMap
@@ -31,15 +34,16 @@ class Lay(Protocol):
     def __call__(
         self, graph: PoseGraph, solution: Solution, matches: OsmMatches, extract: BuildingExtract, given: Given
     ) -> Laid:
-        """Lay the buildings of `extract` on what was seen.
+        """Estimate the displacements of the buildings of `extract`.
 
-        graph : in the frame of the map; solution : of it, held by walls; matches : of walls, judged by the solution
+        graph : in the frame of the map; solution : of `graph`, with planar priors; matches : of walls, with the verdicts
+            of the solution
         Raises GraphError and LinAlgError when it cannot be solved.
         """
 
 
 def lay(graph: PoseGraph, solution: Solution, matches: OsmMatches, extract: BuildingExtract, given: Given) -> Laid:
-    """As `matcher.Lay`, by `osm.mode`."""
+    """As `Lay`, by walls: with the trajectory in one graph in mode `non-rigid`, with a fixed trajectory in the others."""
     with given.clocks[len(given.store) - 1].stage("graph"):
         if given.config.osm.mode == "non-rigid":
             joint, buildings = join_buildings(graph, solution, matches, given.config)
@@ -50,7 +54,7 @@ def lay(graph: PoseGraph, solution: Solution, matches: OsmMatches, extract: Buil
 def join_buildings(
     graph: PoseGraph, solution: Solution, matches: OsmMatches, config: Config
 ) -> tuple[JointSolution, CorrectedMap]:
-    """Mode `non-rigid`: the inliers of `solution` in `graph`, and every building, in one graph.
+    """Mode `non-rigid`: one graph of all buildings and of the inliers of `solution` in `graph`.
 
     Raises GraphError when it cannot be solved.
     """

@@ -1,7 +1,7 @@
 """Overlap removal: displaced buildings are separated, party walls aligned, and all other displacements kept.
 
-Del Tufo, section 3.5. Contacts are hard constraints between buildings; the information of each building, from scans or
-only from the map's prior, weights its displacement. That prior keeps an unseen building near its place on the map.
+Del Tufo, section 3.5. Contacts are hard constraints between buildings. Each displacement is weighted by its information, from
+sightings and the map's prior; an unseen building has that of the prior alone.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ log = logging.getLogger("lslam")
 
 @dataclass(frozen=True)
 class Contact:
-    """The `point` (2,) of building `owner` lies on the line of the `wall` (2, 2) of building `other`; m, all as on the map."""
+    """The `point` (2,) of building `owner` is constrained to the line of the `wall` (2, 2) of building `other`; m, on the map."""
 
     owner: int
     point: Floats
@@ -45,7 +45,7 @@ class Contact:
 
 
 class Solid:
-    """A building for contacts: its rings, its walls, and its area less `SLACK`."""
+    """Geometry of a building: its shape, its walls, and its area less `SLACK`."""
 
     def __init__(self, number: int, building: Building) -> None:
         from shapely import MultiPolygon, make_valid
@@ -72,7 +72,7 @@ class Solid:
 
 
 def party_contacts(one: Solid, other: Solid) -> list[Contact]:
-    """Contacts of the walls that `one` and `other` share on the map; none where the two overlap."""
+    """Contacts of the party walls of `one` and `other` on the map; none where the two overlap."""
     if one.shape.distance(other.shape) > TOUCHING or one.core.intersects(other.core):
         return []
     found = []
@@ -91,7 +91,7 @@ def party_contacts(one: Solid, other: Solid) -> list[Contact]:
 
 
 def separate(one: Solid, at: Floats, other: Solid, other_at: Floats) -> list[Contact]:
-    """Contacts that the smallest separating move of `one` makes, both displaced by `at` and `other_at` (3,).
+    """Contacts after the smallest move of `one` that separates the two, displaced by `at` and `other_at` (3,).
 
     Empty when no move of less than `LARGEST` m and `STEEPEST` separates the two.
     """
@@ -109,7 +109,7 @@ def separate(one: Solid, at: Floats, other: Solid, other_at: Floats) -> list[Con
 
 @dataclass(frozen=True)
 class _Move:
-    """A rigid move of the first building, its cost, m, and (side, corner or wall, wall) of the contacts it makes.
+    """A rigid move of the first building, its cost, m, and the contacts after it, each (side, corner, wall).
 
     side : 0 when the corner is the first building's and the wall the second's, else 1
     """
@@ -143,7 +143,7 @@ def _alignments(one: Solid, ours: Floats, other: Solid, theirs: Floats) -> Itera
 
 
 def _touches(ours: Floats, theirs: Floats) -> Iterator[_Move]:
-    """Moves by translation alone that push the deepest corner out to a wall."""
+    """Moves by translation alone, by which the deepest corner comes to lie on a wall."""
     for side, corners, walls in ((0, ours[:, 0], theirs), (1, theirs[:, 0], ours)):
         for k, wall in enumerate(walls):
             u, length = _direction(wall)
@@ -190,7 +190,7 @@ class Untangled:
     """Displaced buildings without overlaps.
 
     displacements : (B, 3) x, y (m), yaw (rad) about each building's middle
-    contacts : those that hold; left : pairs that still overlap, because no small move separates them
+    contacts : all constraints; left : pairs that overlap still, because no small move separates them
     """
 
     displacements: Floats
@@ -217,23 +217,23 @@ def remove_overlaps(
     solids = [Solid(k, building) for k, building in enumerate(buildings)]
     solid_ground = [s for s, b in zip(solids, buildings, strict=True) if not is_canopy(b) and b.base <= 0]
     on_map = np.zeros_like(wanted)
-    meant = {(i, j) for i, j in _overlapping(solid_ground, on_map) if _is_nested(solids[i], solids[j])}
+    nested = {(i, j) for i, j in _overlapping(solid_ground, on_map) if _is_nested(solids[i], solids[j])}
     contacts = {(i, j): party_contacts(solids[i], solids[j]) for i, j in _neighbours(solid_ground)}
-    hopeless: set[tuple[int, int]] = set()
-    moved = _settled(solids, wanted, information, contacts)
+    inseparable: set[tuple[int, int]] = set()
+    moved = _constrained(solids, wanted, information, contacts)
     for _ in checking(range(ROUNDS)):
-        pairs = [pair for pair in _overlapping(solid_ground, moved) if pair not in meant and pair not in hopeless]
+        pairs = [pair for pair in _overlapping(solid_ground, moved) if pair not in nested and pair not in inseparable]
         if not pairs:
             break
         for i, j in pairs:
             contacts[i, j] = separate(solids[i], moved[i], solids[j], moved[j])
             if not contacts[i, j]:
-                hopeless.add((i, j))
-        moved = _settled(solids, wanted, information, contacts)
-    left = tuple(pair for pair in _overlapping(solid_ground, moved) if pair not in meant)
+                inseparable.add((i, j))
+        moved = _constrained(solids, wanted, information, contacts)
+    left = tuple(pair for pair in _overlapping(solid_ground, moved) if pair not in nested)
     if left:
-        log.warning("%d pairs of buildings overlap and no small move takes them apart", len(left))
-    return Untangled(moved, tuple(c for held in contacts.values() for c in held), left)
+        log.warning("%d pairs of buildings overlap, and no small move separates them", len(left))
+    return Untangled(moved, tuple(c for some in contacts.values() for c in some), left)
 
 
 def _overlapping(solids: Sequence[Solid], displacements: Floats) -> list[tuple[int, int]]:
@@ -245,7 +245,7 @@ def _overlapping(solids: Sequence[Solid], displacements: Floats) -> list[tuple[i
 
 
 def _neighbours(solids: Sequence[Solid]) -> list[tuple[int, int]]:
-    """Pairs that touch on the map."""
+    """Pairs of buildings that touch on the map."""
     from shapely import STRtree
 
     shapes = [s.shape for s in solids]
@@ -253,7 +253,7 @@ def _neighbours(solids: Sequence[Solid]) -> list[tuple[int, int]]:
 
 
 def _pairs(solids: Sequence[Solid], found: NDArray[np.int64]) -> list[tuple[int, int]]:
-    """Numbers of the buildings in each pair of rows, once, in order."""
+    """Numbers of the two buildings of each pair, every pair once and sorted."""
     return sorted((solids[a].number, solids[b].number) for a, b in found.T.tolist() if a < b)
 
 
@@ -262,28 +262,28 @@ def _is_nested(one: Solid, other: Solid) -> bool:
     return bool(shared > NESTED * min(one.shape.area, other.shape.area))
 
 
-def _settled(
+def _constrained(
     solids: Sequence[Solid], wanted: Floats, information: Floats, contacts: dict[tuple[int, int], list[Contact]]
 ) -> Floats:
-    """The displacements (B, 3) nearest to `wanted` at which all contacts hold, group by group of touching buildings."""
+    """The displacements (B, 3) nearest to `wanted` that satisfy all contacts, for each group of touching buildings."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
-    pairs = np.array([pair for pair, held in contacts.items() if held], np.intp).reshape(-1, 2)
+    pairs = np.array([pair for pair, some in contacts.items() if some], np.intp).reshape(-1, 2)
     moved = wanted.copy()
     count = len(solids)
     links = coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), (count, count))
     _, group = connected_components(links, directed=False)
     for name in np.unique(group[pairs[:, 0]]):
         members = np.flatnonzero(group == name)
-        held = [c for (i, _), some in contacts.items() if group[i] == name for c in some]
+        own = [c for (i, _), some in contacts.items() if group[i] == name for c in some]
         middles = np.array([solids[m].middle for m in members.tolist()])
-        moved[members] = _group(members.tolist(), middles, wanted[members], information[members], held)
+        moved[members] = _group(members.tolist(), middles, wanted[members], information[members], own)
     return moved
 
 
-def _group(members: list[int], middles: Floats, wanted: Floats, information: Floats, held: list[Contact]) -> Floats:
-    """Gauss-Newton on one group; dense, since groups are small."""
+def _group(members: list[int], middles: Floats, wanted: Floats, information: Floats, contacts: list[Contact]) -> Floats:
+    """Displacements (M, 3) of one group by Gauss-Newton; dense, since groups are small."""
     place = {m: k for k, m in enumerate(members)}
     moved = wanted.copy()
     size = 3 * len(members)
@@ -291,8 +291,8 @@ def _group(members: list[int], middles: Floats, wanted: Floats, information: Flo
     for k, own in enumerate(information):
         known[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] = own
     for _ in range(STEPS):
-        rows, values = np.zeros((len(held), size)), np.zeros(len(held))
-        for row, contact in enumerate(held):
+        rows, values = np.zeros((len(contacts), size)), np.zeros(len(contacts))
+        for row, contact in enumerate(contacts):
             i, j = place[contact.owner], place[contact.other]
             found = _residual(contact, middles[i], moved[i], middles[j], moved[j])
             values[row], rows[row, 3 * i : 3 * i + 3], rows[row, 3 * j : 3 * j + 3] = found
@@ -308,7 +308,7 @@ def _group(members: list[int], middles: Floats, wanted: Floats, information: Flo
 def _residual(
     contact: Contact, owner_middle: Floats, owner_at: Floats, other_middle: Floats, other_at: Floats
 ) -> tuple[float, Floats, Floats]:
-    """Distance of the displaced point outside the displaced wall, m, and its derivatives by both displacements (3,)."""
+    """Signed distance, m, of the displaced point from the displaced wall, positive outside, and its Jacobians (3,), (3,)."""
     R, shift = about(owner_middle, owner_at)
     point = R @ contact.point + shift
     R, shift = about(other_middle, other_at)

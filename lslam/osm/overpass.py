@@ -1,6 +1,6 @@
-"""Buildings from an Overpass server, politely: one request at a time, never twice for one place, patient when it is busy.
+"""Buildings from an Overpass server: one request at a time, none for cached places, repeated when the server is busy.
 
-Replies are kept in the user's cache as the server sent them; a box that lies inside a kept one needs no network.
+Replies are cached as the server sent them; a box inside a cached one needs no network.
 """
 
 from __future__ import annotations
@@ -36,14 +36,14 @@ log = logging.getLogger("lslam")
 
 USER_AGENT = f"lslam/{__version__} (batch LiDAR SLAM; buildings around a recorded trajectory)"
 LONGEST_REPLY = 48 * 1024 * 1024  # bytes; its text is kept, and read element by element
-LONGEST_WAIT = 120.0  # s; whoever says "retry later than that" is not waited for
+LONGEST_WAIT = 120.0  # s; a server that asks for a longer wait is not asked again
 FAR_OUT = 1000.0  # m; a long building reaches that far out of a box
 _BUSY = (429, 502, 503, 504)
 _one_thread_at_a_time = threading.Lock()
 
 
 class _TryAgainError(Exception):
-    """The server is busy, or the line broke: `wait` s as it asked for, None when it did not say."""
+    """The server is busy, or the connection broke; `wait` : s, as the server requests, None without a request."""
 
     def __init__(self, why: str, wait: float | None = None) -> None:
         super().__init__(why)
@@ -60,19 +60,19 @@ def query(bounds: Bounds, timeout: float) -> str:
 
 
 def reply_folder() -> Path:
-    """Where replies are kept: in the user's cache, or in a new folder when there is none."""
+    """Folder of the cached replies, or a new temporary folder when the user has no cache."""
     return cache_folder("osm") or Path(tempfile.mkdtemp(prefix="lslam-osm-"))
 
 
 def fetch_buildings(
     bounds: Bounds, config: OsmConfig, folder: Path, sleep: Callable[[float], None] = time.sleep
 ) -> OverpassReply:
-    """The Overpass reply for `bounds`, from `folder` when it or a larger one is kept there, else from `config.server`.
+    """The Overpass reply for `bounds`: from `folder` when a reply for it or a larger box is there, else from `config.server`.
 
-    It is checked (`osm_files.from_overpass` takes it) and kept when it is whole. `sleep` waits between attempts.
+    It is checked (by `osm_files.from_overpass`) and written to `folder` when it is complete. `sleep` waits between attempts.
 
-    Raises InputError with one sentence: server unreachable or busy to the end, a web page, a reply that is cut short, gave
-    up, is of another place or endless; nothing in the cache where `config.cache` is `only`.
+    Raises InputError when the server is unreachable or busy at all attempts, when the reply is a web page, incomplete, too
+    long or about another place, and when `config.cache` is `only` and there is no reply in `folder`.
     """
     kept = kept_reply(bounds, folder) if config.cache != "refresh" else None
     if kept is not None:
@@ -84,7 +84,7 @@ def fetch_buildings(
     try:
         reply = _ask_patiently(bounds, config, folder, sleep)
     except InputError as error:
-        # An old reply is better than none, and the world of buildings changes slowly.
+        # Buildings change slowly: an old reply is better than none.
         kept = kept_reply(bounds, folder)
         if kept is None:
             raise
@@ -98,7 +98,7 @@ def fetch_buildings(
 
 
 def kept_reply(bounds: Bounds, folder: Path) -> OverpassReply | None:
-    """The kept reply for `bounds`, or for the smallest kept box round it; None without one that can be read."""
+    """The cached reply for `bounds`, or for the smallest cached box around it; None without a valid one."""
     exact = folder / _file_name(bounds)
     larger = [(box.area_km2, path) for path in folder.glob("*.json") if (box := _bounds_of(path)) and box.holds(bounds)]
     for path in [exact, *(path for _, path in sorted(larger))]:
@@ -110,7 +110,7 @@ def kept_reply(bounds: Bounds, folder: Path) -> OverpassReply | None:
 
 
 def _file_name(bounds: Bounds) -> str:
-    """The box for people and for `holds`, a digest of the query for a change of the query."""
+    """File name with the box, which `Bounds.holds` compares, and a digest of the query, which may change with a version."""
     return f"{bounds}-{hashlib.sha256(query(bounds, 180).encode()).hexdigest()[:16]}.json"
 
 
@@ -123,7 +123,7 @@ def _bounds_of(path: Path) -> Bounds | None:
 
 def _ask_patiently(bounds: Bounds, config: OsmConfig, folder: Path, sleep: Callable[[float], None]) -> OverpassReply:
     wait = config.backoff
-    # Many runs at once, threads or processes, are still one polite client.
+    # All threads and processes of this user together send one request at a time.
     with _one_thread_at_a_time, one_at_a_time(folder / "request.lock", "asks the map server"):
         for attempt in range(1, config.attempts + 1):
             try:
@@ -142,10 +142,10 @@ def _ask_patiently(bounds: Bounds, config: OsmConfig, folder: Path, sleep: Calla
 
 
 def _ask(bounds: Bounds, config: OsmConfig) -> OverpassReply:
-    """One request; InputError when asking again is no use, _TryAgainError when it may be.
+    """One request. Raises _TryAgainError when another attempt may succeed, InputError when it cannot.
 
-    It has a thread of its own, because a name that is looked up and headers that drip know no end: all of it together has
-    `config.timeout`.
+    It runs in a thread of its own, because looking up a name and receiving headers have no timeout: all of it together takes
+    `config.timeout` at most.
     """
     reply: Future[bytes] = Future()
     is_late = threading.Event()
@@ -167,7 +167,7 @@ def _ask(bounds: Bounds, config: OsmConfig) -> OverpassReply:
 
 
 def _exchange(bounds: Bounds, config: OsmConfig, is_late: threading.Event) -> bytes:
-    """The body of a reply, unless nobody waits for it any more."""
+    """The body of a reply; raises InputError once `is_late` is set."""
     import requests
 
     server = config.server
@@ -209,10 +209,10 @@ def _check_status(reply: Any, server: str) -> None:
 
 
 def _read(reply: Any, server: str, timeout: float, is_late: threading.Event) -> bytes:
-    """The body, but neither for ever nor without end: what has come is looked at as it comes, drop by drop."""
+    """The body, read in parts, so that its length and the timeout are checked in between."""
     import urllib3
 
-    body = io.BytesIO()  # which gives its bytes away without a copy
+    body = io.BytesIO()  # `getvalue` makes no copy
     try:
         while part := reply.raw.read1(65536, decode_content=True):
             body.write(part)
@@ -228,7 +228,7 @@ def _read(reply: Any, server: str, timeout: float, is_late: threading.Event) -> 
 
 
 def _too_late(server: str, limit: float) -> str:
-    # Nobody waits for that a second time; a server with too much to do says so itself.
+    # No second attempt: a server that is merely busy answers so.
     return f"{server} did not answer within {limit:g} s: try later, or name another osm.server"
 
 
@@ -246,7 +246,7 @@ def _parsed(body: bytes, bounds: Bounds, server: str) -> OverpassReply:
 
 
 def _checked(reply: OverpassReply, bounds: Bounds, is_own: bool = True) -> OverpassReply:
-    """The reply; raises ValueError when it is none, or, of its own request, one from elsewhere."""
+    """The reply; raises ValueError when it is invalid, or, for a reply to exactly `bounds`, about another place."""
     data = from_overpass(reply)
     places = np.array([*data.nodes.values()]).reshape(-1, 2)
     if is_own and bounds.share_inside(places, FAR_OUT) < 0.5:

@@ -1,7 +1,7 @@
 """Matches of the walls seen about a keyframe with the walls of the map: planar priors, and observations of buildings.
 
-Del Tufo, sections 3.3 and 3.4: the global match aligns the walls seen with all buildings near and becomes a prior of the
-keyframe, the local one aligns each building with the walls seen and moves only the building.
+Del Tufo, sections 3.3 and 3.4: the global match aligns the walls seen with all buildings near and gives a planar prior of the
+keyframe. A local match aligns one building with the walls seen and observes the building's displacement alone.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ Floats = NDArray[np.float64]
 
 
 def warm_up() -> None:
-    """Compile or load every kernel that a map needs, by laying two walls on themselves."""
+    """Compile or load every kernel of matching, by matching two walls with themselves."""
     s, z = (part.ravel() for part in np.meshgrid(np.arange(0.0, 8.0, 0.2), np.arange(2.0, 5.0, 0.2)))
     corner = np.concatenate([np.column_stack([s, 0 * s + 8, z]), np.column_stack([0 * s + 8, s, z])])
     floor = np.column_stack([s, s, 0 * z])
@@ -33,7 +33,7 @@ def warm_up() -> None:
 
 
 def match_keyframe(view: KeyframeMatch, osm: OsmMap, config: OsmConfig) -> KeyframeMatch:
-    """`view`, walls with a prior and its sigma, laid on the buildings near; not accepted yet, but for a reason if not."""
+    """Match `view`, walls with a prior pose and its sigma, with the buildings near. `reason` says why a match is rejected."""
     if not len(view.walls):
         return replace(view, reason="no walls seen")
     reach = config.use_radius + WINDOW * float(np.hypot(view.sigma[0], view.sigma[1]))
@@ -47,7 +47,7 @@ def match_keyframe(view: KeyframeMatch, osm: OsmMap, config: OsmConfig) -> Keyfr
 
 
 def matched(view: KeyframeMatch, found: WallMatch, numbers: NDArray[np.int64]) -> KeyframeMatch:
-    """`view` with what was found for it; `numbers` (T,) of the walls it was laid on."""
+    """`view` with the match `found`; numbers : (T,) of the map's walls that it was matched with."""
     pairs = np.column_stack([found.pairs[:, 0], numbers[found.pairs[:, 1]]])
     return replace(
         view, pose=found.pose, information=found.information, rank=found.rank, kind=found.kind, fitness=found.fitness,
@@ -59,9 +59,9 @@ def matched(view: KeyframeMatch, found: WallMatch, numbers: NDArray[np.int64]) -
 def match_buildings(
     match: KeyframeMatch, pose: Floats, shift: Floats, osm: OsmMap, config: OsmConfig
 ) -> list[BuildingMatch]:
-    """Each building near laid on the walls seen from a keyframe that stands at `pose` (3,).
+    """Match each building near with the walls seen from a keyframe at `pose` (3,), map frame.
 
-    shift : (2,) m by which the map is off as a whole: buildings are sought so far away from where it has them
+    shift : (2,) m, common shift of the map, by which the prior of every building is displaced
     """
     found: list[BuildingMatch] = []
     if not len(match.walls):
@@ -73,7 +73,7 @@ def match_buildings(
         if not len(walls):
             continue
         prior = se2.relative(pose, np.append(middle + shift, 0.0))
-        # The walls of a big building reach farther than those seen, and most buildings are seen in part.
+        # By coverage, since most buildings are seen in part.
         one = match_walls(walls, match.walls, prior, sigma, config, by_coverage=True)
         if one is None:
             continue
@@ -88,7 +88,7 @@ def match_buildings(
 
 
 def shares(matches: Sequence[KeyframeMatch], walls: int) -> list[float]:
-    """Weight of each match: the mean over its walls of one over the number of matches with the same of the map's `walls`.
+    """Weight of each match: the mean over its walls of 1 / n, where n matches have the same wall of the map's `walls`.
 
     The map's error of a wall is common to all keyframes that see it, so their matches are not independent.
     """

@@ -1,4 +1,4 @@
-"""Where the buildings of a run come from: a file, or a server that is asked while odometry goes on."""
+"""Sources of a run's buildings: a file, or a server that is asked during odometry."""
 
 from __future__ import annotations
 
@@ -31,31 +31,31 @@ log = logging.getLogger("lslam")
 Floats = NDArray[np.float64]
 
 AUTO = "auto"
-# s that a run waits for its first buildings, and for the last ones when odometry is over.
+# s; longest wait for the first buildings, and for the last ones after odometry.
 FIRST_REPLY_S, LATER_REPLY_S = 60.0, 0.5
-# m from the start to the nearest building: farther away is another town.
+# m; an extract without buildings within it of the start is that of another town.
 ANOTHER_TOWN = 10e3
 
 
 class OsmSource(Protocol):
-    """Gives the buildings of a run once its place on the Earth is known; `data` is what they were read from."""
+    """Source of the buildings of a run with a known origin; `data` has the elements that they are read from."""
 
     @property
     def data(self) -> OsmData:
         """Nodes, ways and relations."""
 
     def begin(self, folder: Path | None) -> None:
-        """The run begins; `folder` keeps what it fetches."""
+        """Start of a run; replies are written to `folder`."""
 
     def see(self, stamp_ns: int, T_world_lidar: Floats) -> None:
-        """Odometry is here (4, 4) at this time; returns at once."""
+        """Take the estimate (4, 4) of odometry at a stamp, ns; returns at once."""
 
     def extract(self, origin: Floats) -> BuildingExtract:
         """The buildings in the local frame at `origin` (3,) lat, lon (deg), height (m)."""
 
 
 class OsmFile:
-    """The buildings of one file, or of a folder of replies that a run has kept; another town's are refused at once."""
+    """The buildings of a file, or of a folder of an earlier run's replies. Raises InputError for those of another town."""
 
     def __init__(self, path: Path, origin: Floats) -> None:
         self._path = path
@@ -68,10 +68,10 @@ class OsmFile:
             )
 
     def begin(self, folder: Path | None) -> None:
-        """Nothing is to be kept."""
+        """Nothing is fetched or written."""
 
     def see(self, stamp_ns: int, T_world_lidar: Floats) -> None:
-        """All there is, is there."""
+        """Nothing is fetched: all buildings are read."""
 
     def extract(self, origin: Floats) -> BuildingExtract:
         """Its buildings in the local frame at `origin` (3,)."""
@@ -79,12 +79,12 @@ class OsmFile:
 
 
 class OsmServer:
-    """Buildings round the way of a run, asked for while odometry goes on.
+    """Buildings around the trajectory of a run, requested during odometry.
 
-    Where the run is on the Earth is said by its fixes, or by origin and heading; where nobody knows the heading, the
-    circle about the origin grows with the distance from it.
+    The position on the Earth is that of the fixes, or follows from origin and heading. Without a heading the circle about the
+    origin grows with the distance from it.
 
-    origin : (3,) lat, lon (deg), height (m) of about the first scan
+    origin : (3,) lat, lon (deg), height (m), approximately of the first scan
     """
 
     def __init__(self, origin: Floats, gnss: GnssStream | None, config: OsmConfig, fetch: Fetch) -> None:
@@ -94,12 +94,12 @@ class OsmServer:
         self._buffer: OsmBuffer | None = None
 
     def begin(self, folder: Path | None) -> None:
-        """Ask for the surroundings of the origin."""
+        """Request the buildings around the origin."""
         self._buffer = OsmBuffer(self._fetch, self._origin, self._config, folder)
         self._buffer.ask(np.zeros(2))
 
     def see(self, stamp_ns: int, T_world_lidar: Floats) -> None:
-        """Ask for what comes next."""
+        """Request the buildings around the estimate, when they are not requested yet."""
         assert self._buffer is not None
         at = se2.of_se3(T_world_lidar)
         self._start = at if self._start is None else self._start
@@ -115,7 +115,7 @@ class OsmServer:
             self._buffer.ask(np.zeros(2), self._config.fetch_radius * 2.0**doubled)
 
     def extract(self, origin: Floats) -> BuildingExtract:
-        """What has come, in the local frame at `origin` (3,): for the first reply the run waits, for others hardly."""
+        """The buildings received, in the local frame at `origin` (3,), after a wait for the first reply and a short one more."""
         assert self._buffer is not None
         self._buffer.wait(FIRST_REPLY_S, requests=1)
         self._buffer.wait(LATER_REPLY_S)
@@ -129,24 +129,24 @@ class OsmServer:
 
     @property
     def data(self) -> OsmData:
-        """All that has come so far."""
+        """The elements of all replies so far."""
         return merged([] if self._buffer is None else self._buffer.replies)
 
 
 def first_pose(config: OsmConfig) -> Floats:
-    """(3,) of the first scan in the map frame, by origin and heading, which is 0 where unknown."""
+    """Planar pose (3,) of the first scan in the map frame, by origin and heading; yaw 0 when the heading is unknown."""
     return np.array(
         [0.0, 0.0, 0.0 if config.heading_deg is None else se2.wrapped(np.radians(90.0 - config.heading_deg))]
     )
 
 
 def _places(gnss: GnssStream, origin: Floats) -> tuple[NDArray[np.int64], Floats]:
-    """Stamps, ns, and places (F, 2), m, of the fixes that are some."""
+    """Stamps (F,), ns, and positions (F, 2), m, of the valid fixes."""
     return gnss.stamps_ns[gnss.is_place], to_local(gnss.lat_lon_alt[gnss.is_place], origin)[:, :2]
 
 
 def _kept_replies(folder: Path) -> OsmData:
-    """Those a run has kept. Raises InputError when there are none, or for one that is damaged."""
+    """The elements of the replies in `folder`. Raises InputError when there are none, or for one that is damaged."""
     files = sorted(folder.glob("*.json"))
     if not files:
         raise InputError(
@@ -159,26 +159,26 @@ def _kept_replies(folder: Path) -> OsmData:
 
 
 def start_of(sequence: Sequence, config: Config) -> Floats:
-    """(3,) lat, lon (deg), height (m) of about where the run begins.
+    """Approximate origin (3,) of the run, lat, lon (deg), height (m): as configured, or its first fix.
 
-    Raises UsageError when nothing says it.
+    Raises UsageError when there is neither.
     """
     if config.osm.origin is not None:
         return np.array(config.osm.origin, np.float64)
     gnss = sequence.gnss if config.gnss.mode != "off" else None
     if gnss is None or not gnss.is_place.any():
         raise UsageError(
-            "--osm has to know where the run begins: give --origin LAT,LON of the first scan, or --gnss or --georeference "
-            "where the recording has satellite fixes"
+            "--osm needs the place of the start: give --origin LAT,LON of the first scan, or --gnss or --georeference "
+            "for a recording with satellite fixes"
         )
     return np.asarray(gnss.lat_lon_alt[gnss.is_place][0])
 
 
 def open_osm(sequence: Sequence, config: Config) -> OsmSource | None:
-    """What `osm.extract` names; None when it names nothing.
+    """The source that `osm.extract` names; None without one.
 
-    Raises UsageError when nobody says where the run begins or its result is wanted in coordinates that no map can be written
-    in, InputError for a file that cannot be read or of another town.
+    Raises UsageError when the start has no place on the Earth, or the configured CRS cannot be written; InputError for a file
+    that cannot be read or is of another town.
     """
     if not config.osm.extract:
         return None
@@ -191,7 +191,7 @@ def open_osm(sequence: Sequence, config: Config) -> OsmSource | None:
 
 
 def extract_digest(config: OsmConfig) -> str:
-    """Of the file's bytes, for the identity of a run; empty without one. Raises InputError when it cannot be read."""
+    """Digest of the file's bytes, for the identity of a run; empty without a file. Raises InputError when it is unreadable."""
     if config.extract in ("", AUTO):
         return config.extract
     path = Path(config.extract)

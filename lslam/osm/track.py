@@ -1,6 +1,6 @@
 """The track of a run on the map: a planar Kalman filter, predicted by odometry and updated by matches.
 
-Its covariance opens the window in which the next match is searched, and gates the result.
+Its covariance gives the window in which the next match is searched, and gates the match.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ Floats = NDArray[np.float64]
 MEMORY = 100.0
 # Directions with less than this share of the largest information are unobserved.
 FREE = 1e-9
-# Alignment of a run with its matches: iterations, and degrees of freedom (Student's t) against wrong ones.
+# Alignment of a run with its matches: iterations, and degrees of freedom of the residuals (Student's t) against wrong ones.
 ROUNDS, FREEDOM = 10, 3.0
 
 
@@ -38,11 +38,11 @@ class OsmTrack:
 
     @property
     def sigma(self) -> Floats:
-        """(3,) m, m, rad, of the pose relative to the map around it."""
+        """Sigma (3,), m, m, rad, of the pose relative to the map around it."""
         return np.asarray(np.sqrt(np.diag(self.covariance) + self._map))
 
     def move(self, step: Floats, way: float) -> None:
-        """Go on by `step` (3,) in the track's own axes, `way` m long."""
+        """Predict by the relative pose `step` (3,) of odometry, over a distance travelled of `way`, m."""
         moved = se2.compose(self.pose, step)
         ahead: Floats = np.eye(3)
         ahead[:2, 2] = [-(moved[1] - self.pose[1]), moved[0] - self.pose[0]]
@@ -70,12 +70,12 @@ class OsmTrack:
         self.covariance = kept @ self.covariance @ kept.T + gain @ R @ gain.T
 
     def lay(self, poses: Floats, ways: Floats, matches: Sequence[KeyframeMatch], sigma: Floats) -> tuple[float, Floats]:
-        """`poses` (M, 3) moved as a whole onto their `matches`, one each.
+        """Align `poses` (M, 3) as a whole with their `matches`, one each.
 
-        The displacement has the prior `sigma` (3,); the weight of a match decreases with the `ways` (M,), m travelled since the
-        first.
+        The displacement has the prior `sigma` (3,). The weight of a match decreases with the distance travelled, `ways` (M,),
+        m, from the first one.
 
-        Returns by how much, rad, they are turned about the first, and (M,) squared Mahalanobis distances of the matches.
+        Returns the rotation, rad, about the first pose, and the squared Mahalanobis distances (M,) of the matches.
         """
         weights = np.stack([
             self._weight(m.information, self._map + self._drift * abs(way - ways[0]) * MEMORY)
@@ -97,18 +97,18 @@ class OsmTrack:
             moved = moved + np.linalg.solve(normal, pull)
         return float(moved[2]), squared
 
-    def knows(self, information: Floats) -> bool:
+    def is_accurate(self, information: Floats) -> bool:
         """Whether the sigmas of a match of full rank are at most those of the map."""
         return bool((np.diag(np.linalg.inv(information)) <= self._map).all())
 
     @staticmethod
     def _weight(information: Floats, variance: Floats) -> Floats:
-        """(3, 3) information of a match with an additional `variance` (3,); unobserved directions stay so."""
+        """Information (3, 3) of a match with an additional `variance` (3,); unobserved directions remain unobserved."""
         H, own = _seen(information)
         return np.asarray(H.T @ np.linalg.solve(own + H @ np.diag(variance) @ H.T, H))
 
     def _innovation(self, pose: Floats, information: Floats) -> tuple[Floats, Floats, Floats]:
-        """Error, directions and covariance of what the match observes."""
+        """Innovation (R,) of a match, its Jacobian (R, 3) and the covariance (R, R), along the observed directions."""
         H, own = _seen(information)
         away = np.asarray(pose, np.float64) - self.pose
         away[2] = se2.wrapped(away[2])

@@ -1,10 +1,10 @@
 """Drift of odometry, estimated from sightings of a map's walls and corrected before the graph is solved.
 
-Systematic errors (calibration, slip) turn and shift a trajectory at a constant rate; other errors that covariances do not model
-give a varying one. Model selection is by likelihood: constant rates explain a varying drift badly, and would extrapolate it
-where no wall is seen.
-The map's error of a wall is far larger than odometry's from keyframe to keyframe, but the same in all sightings: the apparent
-motion of a wall while the sensor passes it observes a rate independently of the map's accuracy.
+Systematic errors (calibration, slip) rotate and shift a trajectory at a constant rate; other errors outside the covariances give
+a varying rate. Model selection is by likelihood: constant rates fit a varying drift badly, and would extrapolate it where no
+wall is seen.
+The error of a wall on the map is far larger than that of odometry between keyframes, but it is the same in all sightings. So the
+apparent motion of a wall, while the sensor passes it, observes a rate independently of the map's accuracy.
 """
 
 from __future__ import annotations
@@ -26,15 +26,15 @@ Floats = NDArray[np.float64]
 
 # Degrees of freedom of the residuals (Student's t), against walls matched wrongly.
 FREEDOM = 3.0
-# Scales of the configured sigma of a sighting that are tried. Far and at a grazing angle a wall is seen centimetres off for
-# many keyframes: the sigma is no smaller.
+# Scales of the configured sigma of a sighting that are compared. Sightings at long range and grazing angles have errors of
+# centimetres that are correlated over many keyframes, so that smaller sigmas are excluded.
 SCALES = (0.25, 0.5, 1.0)
-# A larger constant share extrapolates farther where no wall is seen: it must be significantly more likely, at this level.
+# Level of significance for a larger constant share, which extrapolates farther where no wall is seen.
 SELDOM = 0.95
 # Hyperparameters of drift, degrees of freedom of the likelihood ratio test: scale and constant share. Rates are marginalised.
 FITTED = 2
 ROUNDS = 6
-# m between knots of varying rates, or so many knots at most.
+# m between knots of varying rates, and the largest number of knots.
 APART, MOST = 20.0, 40
 SETTLED = 0.1  # of the expected squared Mahalanobis length of the rates
 
@@ -44,8 +44,9 @@ class WallSightings:
     """Sightings of a map's walls, one row per wall and keyframe.
 
     keyframes, walls : (N,) numbers; normals : (N, 2) of the walls on the map
-    places : (N, 2) m, the middle of what was seen, as the graph has it; offsets : (N,) m, along the normal, from the wall
-    share : 0..1, weight of each, since those from neighbouring keyframes have correlated errors
+    places : (N, 2) m, middle of each sighting with the keyframes at the poses of the graph, map frame
+    offsets : (N,) m, distance of the sighting from the wall along the normal
+    share : 0..1, weight of a sighting, since errors of neighbouring keyframes are correlated
     """
 
     keyframes: NDArray[np.int64]
@@ -68,10 +69,10 @@ class Sizes:
 
 
 class DriftFit:
-    """Start, shift of the map and rates at knots, given sightings; the error of each wall on the map is eliminated.
+    """Least squares for start, shift of the map and rates at knots; the error of each wall on the map is marginalised.
 
-    effects : (K, 3, 5 + P) Jacobians of planar poses; taken : (P,) rates that the poses are corrected by already
-    seen_sigma, map_sigma : m, of a sighting and of a wall of the map; given : (5,) m, rad, prior sigmas of start and shift
+    effects : (K, 3, 5 + P) Jacobians of the planar poses; taken : (P,) rates by which the poses are corrected already
+    seen_sigma, map_sigma : m, of a sighting and of a wall on the map; given : (5,) m, rad, prior sigmas of start and shift
     """
 
     def __init__(
@@ -88,7 +89,7 @@ class DriftFit:
         self._set_weights(np.ones(len(seen.walls)))
 
     def negative_log_likelihood(self, noise: float, root: Floats, sizes: tuple[float, ...]) -> Floats:
-        """(len(sizes),) twice the negative log-likelihood, up to a constant, with `root` times each of `sizes`."""
+        """Twice the negative log-likelihood (len(sizes),), up to a constant, for `root` times each of `sizes`."""
         from scipy.linalg import cho_factor, cho_solve
 
         variance, n = noise**2 * self._seen, len(self._given)
@@ -105,7 +106,7 @@ class DriftFit:
         return np.array(found)
 
     def rates(self, sizes: Sizes) -> tuple[Floats, Floats]:
-        """(P,) at the knots, three each, and their covariance (P, P)."""
+        """Rates (P,) at the knots, three each, and their covariance (P, P)."""
         found, covariance = self._solved(sizes)
         n = len(self._given)
         return found[n:], covariance[n:, n:]
@@ -124,11 +125,11 @@ class DriftFit:
         self._set_weights(share * self._weights)
 
     def _along(self, unknown: Floats) -> Floats:
-        """(N,) m by which `unknown` moves the sightings along the normals."""
+        """Displacement (N,), m, of the sightings along the normals, by the parameters `unknown` (5 + P,)."""
         return np.asarray(np.einsum("ni,ni->n", self._axes, (self._effects @ unknown)[self._keyframes]))
 
     def _set_weights(self, weights: Floats) -> None:
-        """Sums over the sightings of each keyframe and of each wall."""
+        """Normal equations with `weights` (N,): sums over the sightings of each keyframe and of each wall."""
         from scipy.sparse import csr_array
 
         count, width = len(self._effects), self._effects.shape[2]
@@ -148,7 +149,7 @@ class DriftFit:
         self._known: dict[float, tuple[Floats, Floats, float]] = {}
 
     def _reduced(self, variance: float) -> tuple[Floats, Floats, float]:
-        """Normal matrix, right side and squared length of the offsets, with the errors of the map eliminated."""
+        """Normal matrix, right side and squared norm of the offsets, with the errors of the walls marginalised."""
         if variance not in self._known:
             share = 1.0 / np.sqrt(self._weight + variance / self._map)
             walls, offsets = share[:, None] * self._by_wall, share * self._wall_offsets
@@ -167,7 +168,7 @@ class DriftFit:
         return whole
 
     def _solved(self, sizes: Sizes) -> tuple[Floats, Floats]:
-        """Posterior mean and covariance of the unknowns, without the inverse of the prior, which may be singular."""
+        """Posterior mean and covariance of the parameters, without the inverse of the prior, which may be singular."""
         normal, pull, _ = self._reduced(sizes.noise**2 * self._seen)
         root = self._root(sizes.root)
         covariance = root @ np.linalg.solve(np.eye(len(root)) + root.T @ normal @ root, root.T)
@@ -178,12 +179,12 @@ class DriftFit:
 class WallDrift:
     """Correction of odometry by constant or varying rates of drift.
 
-    knots : (n, 3) rates at knots along the way, in total
-    rates : (K-1, 3) per m of the way from each keyframe to the next: m along x and y of the world, rad of heading; beside
-        those found before
+    knots : (n, 3) total rates at knots along the distance travelled
+    rates : (K-1, 3) per m from each keyframe to the next: m along x and y of the world, rad of heading; in addition to those
+        of earlier iterations
     spread : (K, 6, 6) covariance of the poses due to that of the rates, as the covariances of `Solution`
-    estimated_drift : in total
-    is_settled : the rates are well below their sigmas
+    estimated_drift : the total drift
+    is_settled : whether the iteration has converged: the additional rates are well below their sigmas
     """
 
     knots: Floats
@@ -202,7 +203,7 @@ def find_wall_drift(
     graph: PoseGraph, seen: WallSightings, seen_sigma: float, map_sigma: float, config: GraphConfig,
     before: WallDrift | None = None,
 ) -> WallDrift | None:  # fmt: skip
-    """The rates of drift with which walls stand still; None without sightings.
+    """The rates of drift for which the sightings of each wall agree; None without sightings.
 
     Rates at knots and errors of sightings are random, with hyperparameters that maximise the marginal likelihood (empirical
     Bayes). A likelihood ratio test decides whether there is drift, and the likelihood whether it is constant or varying.
@@ -214,20 +215,20 @@ def find_wall_drift(
     if not len(seen.walls) or graph.start_sigma is None or graph.distances[-1] <= 0:
         return None
 
-    def told(is_varying: bool) -> WallDrift:
-        return _found(graph, seen, (seen_sigma, map_sigma), config, before, is_varying)
+    def fitted(is_varying: bool) -> WallDrift:
+        return _fitted(graph, seen, (seen_sigma, map_sigma), config, before, is_varying)
 
     if before is not None:
-        return told(before.estimated_drift.is_varying)
-    lasting, wandering = told(is_varying=False), told(is_varying=True)
-    return wandering if wandering.is_sure and wandering.estimated_drift.gain > lasting.estimated_drift.gain else lasting
+        return fitted(before.estimated_drift.is_varying)
+    constant, varying = fitted(is_varying=False), fitted(is_varying=True)
+    return varying if varying.is_sure and varying.estimated_drift.gain > constant.estimated_drift.gain else constant
 
 
-def _found(
+def _fitted(
     graph: PoseGraph, seen: WallSightings, sigmas: tuple[float, float], config: GraphConfig, before: WallDrift | None,
     is_varying: bool,
 ) -> WallDrift:  # fmt: skip
-    """Drift of one kind, as `find_wall_drift`."""
+    """As `find_wall_drift`, for constant or for varying rates alone."""
     assert graph.start_sigma is not None
     length = float(graph.distances[-1])
     apart = min(max(APART, length / MOST), MEMORY) if is_varying else MEMORY
@@ -241,7 +242,7 @@ def _found(
         fit.reweight(sizes)
         sizes = _likeliest(fit, roots)
     found, _ = fit.rates(sizes)
-    # Correlated sightings change the covariance, not the estimate.
+    # The correlation of sightings is in the covariance alone, not in the estimate.
     fit.count_less(seen.share)
     _, covariance = fit.rates(sizes)
     without = min(float(fit.negative_log_likelihood(noise, sizes.root, (0.0,))[0]) for noise in SCALES)
@@ -280,7 +281,7 @@ def without_drift(graph: PoseGraph, rates: NDArray[np.float64]) -> PoseGraph:
 
 
 def _effects(graph: PoseGraph, at_knots: Floats) -> Floats:
-    """(K, 3, 5 + 3 n) Jacobians of planar poses in the map: by start, shift of the map, and rates at the knots.
+    """Jacobians (K, 3, 5 + 3 n) of the planar poses, map frame, by start, shift of the map, and rates at the knots.
 
     at_knots : (K-1, n) of `linear_basis`
     """
@@ -299,5 +300,5 @@ def _effects(graph: PoseGraph, at_knots: Floats) -> Floats:
 
 
 def _across(away: Floats) -> Floats:
-    """Where a small turn moves what lies `away` (..., 2), per rad."""
+    """Displacement of a point at `away` (..., 2), m, by a small rotation, per rad."""
     return np.stack([-away[..., 1], away[..., 0]], axis=-1)

@@ -1,7 +1,7 @@
-"""Matching of seen walls with known walls: the best planar pose, and which directions it observes.
+"""Matching of walls: the planar pose of one set of walls in another, and its information.
 
-Del Tufo, section 3.3. Pairs of corners, angular and virtual, propose poses inside the window that the odometry's
-uncertainty opens; lines refine them; the fitness of equations 3.1 to 3.4 chooses. Beyond Del Tufo, parallel walls give no
+Del Tufo, section 3.3. Pairs of corners, angular and virtual, vote for poses within the window of the prior; each is refined by
+the lines, and the one with the best fitness (equations 3.1 to 3.4) is taken. Beyond Del Tufo, parallel walls give no
 information along them, and an ambiguous match is rejected.
 """
 
@@ -25,35 +25,35 @@ SPREAD = np.radians(8.0)  # by which the corners of a pair may differ
 LIKENESS = np.cos(np.radians(25.0))  # between the directions of a pair of walls
 CELL = np.array([0.75, 0.75, np.radians(4.0)])  # of the votes
 CORNERS = 40
-PROPOSALS = 150  # that get the most votes; of these the best few are laid on the lines
+PROPOSALS = 150  # poses with the most votes; the best `REFINED` of them are refined
 REFINED = 12
 ROUGH = 2.5  # m; a pose of votes is right to about a cell
-SHORT = 4.0  # m; a wall of this length has half the weight of an endless one
-# m, round by round. Where the map is right walls lie on walls; its houses err by a metre or so, one by one. What is seen of
-# one house does not.
+SHORT = 4.0  # m; a wall of this length has half the weight of an infinite one
+# m, iteration by iteration. The last gate of the global match admits the errors of single buildings on the map, about a metre;
+# the walls of one building have no such errors among themselves.
 GATES = np.array([2.5, 2.2, 1.9, 1.6, 1.4, 1.2, 1.2])
 FINE_GATES = np.array([2.0, 1.5, 1.0, 0.7, 0.5, 0.4, 0.4])
-MORE = 30  # rounds with the last gate, at most, until the pose stays
-WIDE = np.array([6.0, 4.5, 3.0])  # from the prior itself: far walls move with its heading
-FAINT = 1e-3  # of the prior's weight while the walls are fitted: it is for the graph to weigh the two
-START_WALLS = 4  # two walls make a corner, and a town has many
-SLACK = np.array([0.5, 0.5, 0.03])  # that refinement may leave the window by
-NEAR_SAME, LIKE_SAME = 1.5, np.radians(6.0)  # m and rad; what differs less is the same answer
-BESIDE = 2.0  # m between places that are tried across parallel walls: the first gate of either kind is as wide
-ALIGNED = np.sin(np.radians(12.0)) ** 2  # a direction seen by less than this share of the best one is not seen
-LONGEST = 60.0  # m from the walls seen; the map beyond is not asked
+MORE = 30  # most iterations with the last gate, until convergence
+WIDE = np.array([6.0, 4.5, 3.0])  # first gates from the prior itself: an error in heading displaces far walls
+FAINT = 1e-3  # factor on the prior's weight in the fit, since the graph has the prior too
+START_WALLS = 4  # least walls of a start: the two of one corner would fit in many places of a town
+SLACK = np.array([0.5, 0.5, 0.03])  # m, m, rad; by which refinement may leave the window
+NEAR_SAME, LIKE_SAME = 1.5, np.radians(6.0)  # m and rad; poses that differ less are the same
+BESIDE = 2.0  # m between the poses that are tried across parallel walls, the width of the first gates
+ALIGNED = np.sin(np.radians(12.0)) ** 2  # least information of an observed direction, as a part of the largest
+LONGEST = 60.0  # m from the walls seen; the map beyond is left out
 
 
 @dataclass(frozen=True)
 class WallMatch:
-    """A planar pose of the source's frame in the target's, and how much it is worth.
+    """A planar pose of the source's frame in the target's, with its information and its scores.
 
     pose : (3,) x, y (m), yaw (rad); information : (3, 3) of x, y, yaw in the target's axes, 1/m2 and 1/rad2, singular along
-        what the walls do not fix; rank : 0 to 3, how many directions they do
+        free directions; rank : 0 to 3, number of observed directions
     fitness : of equation 3.4, weighted as the configuration says; coverage : share of the source's length that lies on the
-        target; distance : m, mean distance of equation 3.1; rms : m, across the walls that found a partner
-    pairs : (K, 2) int64 which source wall lies on which target wall
-    kind : `edges` when two walls that are not parallel found partners, else `lines`
+        target; distance : m, mean distance of equation 3.1; rms : m, of the distances across paired walls
+    pairs : (K, 2) int64 numbers of a source wall and of its target wall
+    kind : `edges` when the paired walls are not all parallel, else `lines`
     is_ambiguous : another pose fits nearly as well
     """
 
@@ -77,12 +77,13 @@ def match_walls(
     config: OsmConfig | None = None,
     by_coverage: bool = False,
 ) -> WallMatch | None:
-    """Lay `source` (S, 2, 2) on `target` (T, 2, 2), directed segments in m, near the pose `prior` (3,) x, y, yaw.
+    """Match `source` (S, 2, 2) with `target` (T, 2, 2), directed segments in m, near the pose `prior` (3,) x, y, yaw.
 
-    The window is `WINDOW` times `sigma` (3,), m, m, rad. Del Tufo's global match lays the walls of a submap on those of all
-    buildings near; its local match one building's on those of the submap, `by_coverage`, because most of it is not seen.
+    The window is `WINDOW` times `sigma` (3,), m, m, rad. Del Tufo's global match has the walls of a submap as source and those
+    of all buildings near as target. The local match has the walls of one building as source and those of the submap as target,
+    `by_coverage`, because most of the building is not seen.
 
-    Returns None when too little of the source finds a partner. A match that `is_ambiguous` is returned as such.
+    Returns None when the coverage is too small. An ambiguous match is returned, with `is_ambiguous`.
     """
     config = config or OsmConfig()
     at, spread = np.asarray(prior, np.float64), np.asarray(sigma, np.float64)
@@ -94,13 +95,13 @@ def match_walls(
 def find_heading(
     source: NDArray[Any], target: NDArray[Any], place: NDArray[Any], radius: float, config: OsmConfig | None = None
 ) -> WallMatch | None:
-    """Where, within `radius` m of `place` (2,), and with which of all headings, the source lies on the target.
+    """Match the source with the target within `radius`, m, of `place` (2,) over all headings: the start without GNSS.
 
-    The start without GNSS. Returns None when nothing fits, when it is only walls that leave a direction free, or fewer than
-    `START_WALLS`; when several poses fit alike the match `is_ambiguous` and must not be used.
+    Returns None without a match, or when it has a free direction or fewer than `START_WALLS` pairs. A match of which another
+    pose is an alternative has `is_ambiguous` and must not be used.
     """
     config = config or OsmConfig()
-    # Nobody said which way it is: more has to fit, and nothing is near or far.
+    # Without a heading the least coverage is larger, and the distance from the prior does not count.
     config = config.model_copy(update={"translation_weight": 0.0, "min_coverage": config.min_start_coverage})
     at = np.append(np.asarray(place, np.float64)[:2], 0.0)
     found = _best(
@@ -112,7 +113,7 @@ def find_heading(
 def _best(
     seen: Floats, known: Floats, at: Floats, window: Floats, trust: Floats, config: OsmConfig, by_coverage: bool
 ) -> WallMatch | None:
-    """The fittest pose of those that corners propose, and of the prior's own, each moved onto the lines."""
+    """The refined pose of best fitness, from the prior and from the poses that corners propose."""
     known, numbers = _within(known, seen, at, float(np.hypot(window[0], window[1])))
     if not len(seen) or not len(known):
         return None
@@ -142,7 +143,7 @@ def _rows(segments: NDArray[Any]) -> Floats:
 
 
 def _within(known: Floats, seen: Floats, at: Floats, slack: float) -> tuple[Floats, NDArray[np.int64]]:
-    """The target walls that the source can touch, and their numbers."""
+    """The target walls within reach of the source, and their numbers."""
     reach = min(float(np.abs(seen).max(initial=0.0)) * np.sqrt(2), LONGEST * 2) + slack + 5.0
     a, b = known[:, :2] - at[:2], known[:, 2:] - at[:2]
     along = b - a
@@ -152,11 +153,11 @@ def _within(known: Floats, seen: Floats, at: Floats, slack: float) -> tuple[Floa
 
 
 def _proposals(seen: Floats, known: Floats, at: Floats, window: Floats, by_coverage: bool) -> Floats:
-    """(K, 3) poses for which many pairs of corners vote, and at which the walls lie near others."""
+    """Poses (K, 3) with many votes of pairs of corners, those of least distance between the walls first."""
     ours, theirs = (wall_matching.corners(walls, REACH, SHARPEST) for walls in (seen, known))
     if not len(ours) or not len(theirs):
         return np.zeros((0, 3))
-    # The heaviest corners of a submap say what all do.
+    # The corners of largest weight are enough.
     ours = ours[np.argsort(-ours[:, 4], kind="stable")[:CORNERS]]
     is_round = bool(window[2] >= np.pi - 1e-9)
     cell = np.where(is_round, [*CELL[:2], 2 * np.pi / 90 * (1 + 1e-9)], CELL)
@@ -169,7 +170,7 @@ def _proposals(seen: Floats, known: Floats, at: Floats, window: Floats, by_cover
 
 
 def _beside(best: WallMatch, at: Floats, window: Floats) -> Floats:
-    """(K, 3) poses across the parallel walls of `best`, which no corner proposes, all through the window."""
+    """Poses (K, 3) across the parallel walls of `best`, over the whole window; parallel walls have no corners that vote."""
     across = np.linalg.eigh(best.information[:2, :2])[1][:, 1]
     reach = float(np.linalg.norm(across * window[:2]))
     steps = np.arange(0.5 * BESIDE, reach, BESIDE)
@@ -180,14 +181,14 @@ def _refined(
     seen: Floats, known: Floats, pose: Floats, gates: Floats, at: Floats, trust: Floats, window: Floats,
     config: OsmConfig, by_coverage: bool,
 ) -> WallMatch | None:  # fmt: skip
-    """The pose moved onto the lines; None when it leaves the window or loses all its walls."""
+    """The pose refined by lines; None when it leaves the window or no wall has a partner."""
     pose, normal, centre, rms, pair = wall_matching.refine(
         seen, known, pose, at, trust, gates, MORE, LIKENESS, SHORT, by_coverage
     )
     away = np.array([*(pose[:2] - at[:2]), (pose[2] - at[2] + np.pi) % (2 * np.pi) - np.pi])
     if (np.abs(away) > window + SLACK).any() or not (pair >= 0).any():
         return None
-    # Errors of a map's wall are those of whoever drew it: more points do not mend them.
+    # The error of a wall on the map does not decrease with the number of points on it.
     planar, free, rank = _deflated(normal / config.wall_sigma**2)
     pose[:2] -= free @ away[:2]
     distance, coverage, pair = wall_matching.fit(seen, known, pose, config.max_distance, LIKENESS, by_coverage)
@@ -209,9 +210,9 @@ def _refined(
 
 
 def _deflated(normal: Floats) -> tuple[Floats, Floats, int]:
-    """The normal matrix about the walls' centre without the directions that only noise of their angles speaks of.
+    """The normal matrix (3, 3) about the walls' centre without free directions, whose information is noise of the walls' angles.
 
-    Then the projector (2, 2) on these free directions, and the rank of what is left.
+    Returns also the projector (2, 2) on the free directions, and the rank of the matrix.
     """
     values, axes = np.linalg.eigh(normal[:2, :2])
     is_seen = (values >= ALIGNED * values[1]) & (values[1] > 0)
@@ -223,14 +224,14 @@ def _deflated(normal: Floats) -> tuple[Floats, Floats, int]:
 
 
 def _at_pose(planar: Floats, centre: Floats, pose: Floats) -> Floats:
-    """Information about the walls' centre as that of the pose: the centre moves with both its translation and its turn."""
+    """Information (3, 3) of the pose from that of the walls' centre, which moves with its translation and rotation."""
     moves = np.eye(3)
     moves[0, 2], moves[1, 2] = -(centre[1] - pose[1]), centre[0] - pose[0]
     return np.asarray(moves.T @ planar @ moves)
 
 
 def _has_alternative(best: WallMatch, found: list[WallMatch], config: OsmConfig) -> bool:
-    """True when a pose that differs in what the walls fix fits nearly as well."""
+    """Whether a pose that differs along observed directions fits nearly as well."""
     for other in found:
         if other.fitness < best.fitness - config.rival_margin:
             continue

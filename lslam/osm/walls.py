@@ -1,8 +1,8 @@
 """Walls as directed segments on level ground: extracted from a cloud, and those of a map.
 
 Del Tufo, section 3.2: low points are removed, then points off vertical planes; the rest is projected on the ground, and lines
-are found by RANSAC. Height is that above the ground below each point, not below the sensor, which may fly. All segments are
-directed so that the outside, from where a wall is seen, lies to the right; so a wall's back never matches a front.
+are found by RANSAC. Heights are above the ground below each point, since the sensor may fly. All segments are directed so that
+the outside, from where a wall is seen, lies to the right: the two sides of a wall are not matched with each other.
 """
 
 from __future__ import annotations
@@ -57,8 +57,8 @@ class Walls:
 def find_walls(points: NDArray[Any], config: OsmConfig | None = None, views: NDArray[Any] | None = None) -> Walls:
     """Walls in the points (N, 3), m, of a scan or of a submap, in a frame whose z points up.
 
-    views : (V, 2) or (V, 3) where the sensor was, m, so that walls can be directed; the origin by default
-    The same input gives the same result. Without walls it is empty.
+    views : (V, 2) or (V, 3) positions of the sensor, m, which direct the walls; the origin by default
+    The same input gives the same result, which is empty without walls.
     """
     config = config or OsmConfig()
     cloud = np.asarray(points, np.float32).reshape(-1, 3)
@@ -84,7 +84,7 @@ def find_walls(points: NDArray[Any], config: OsmConfig | None = None, views: NDA
 
 
 def walls_of(buildings: Iterable[Building]) -> tuple[Floats, NDArray[np.int64]]:
-    """Walls (T, 2, 2), m, of the footprints of `buildings`, the outside to the right, and the building (T,) each is of.
+    """Walls (T, 2, 2), m, of the footprints of `buildings`, the outside to the right, and the number (T,) of each one's building.
 
     Nodes on straight walls are left out; canopies have no walls.
     """
@@ -112,7 +112,7 @@ def _high(cloud: NDArray[np.float32], height: float) -> NDArray[np.int64]:
 
 
 def _directed(found: Floats, views: Floats) -> Floats:
-    """Directed so that the side seen more from the `views` lies to the right: the distance from its line, by range cubed."""
+    """The segments, directed with the side of most views to the right; a view weighs by distance from the line / range^3."""
     to_view = views[None] - found.mean(axis=1)[:, None]
     along = (found[:, 1] - found[:, 0])[:, None]
     left = along[..., 0] * to_view[..., 1] - along[..., 1] * to_view[..., 0]
@@ -121,13 +121,13 @@ def _directed(found: Floats, views: Floats) -> Floats:
 
 
 def _simplified(footprint: Footprint) -> Footprint:
-    """Without nodes on straight walls; unchanged where no polygon would remain."""
+    """The footprint without nodes on straight walls, or unchanged when no polygon would remain."""
     from shapely import Polygon
 
     polygon = footprint_polygon(footprint)
     rings = []
     for ring in (polygon.exterior, *polygon.interiors):
-        # Simplification keeps the first node: begin at the farthest one, which is a corner.
+        # Simplification keeps the first node: the farthest one is a corner.
         corners = np.asarray(ring.coords, np.float64)[:-1]
         corners = np.roll(corners, -int(np.argmax(np.linalg.norm(corners - corners.mean(0), axis=1))), axis=0)
         rings.append(np.asarray(Polygon(corners).simplify(STRAIGHT).exterior.coords, np.float64)[:-1])
@@ -156,7 +156,7 @@ class OsmMap:
         return float(self._away(place).min(initial=np.inf))
 
     def walls_near(self, place: Floats, reach: float) -> NDArray[np.int64]:
-        """Numbers of the walls of these buildings."""
+        """Numbers of the walls of the buildings within `reach`, m, of `place` (2,)."""
         return np.flatnonzero(np.isin(self.owners, self.near(place, reach)))
 
     def _away(self, place: Floats) -> Floats:

@@ -138,6 +138,6 @@ def test_far_matches_count_less_by_what_odometry_may_have_drifted_since() -> Non
 
 
 def test_a_match_has_at_best_the_sigma_of_the_map() -> None:
-    assert track().knows(np.diag([5.0, 5.0, 3e3]))
-    assert not track().knows(np.diag([3.0, 1e4, 1e6]))
-    assert not track().knows(np.diag([1e4, 1e4, 2e3]))
+    assert track().is_accurate(np.diag([5.0, 5.0, 3e3]))
+    assert not track().is_accurate(np.diag([3.0, 1e4, 1e6]))
+    assert not track().is_accurate(np.diag([1e4, 1e4, 2e3]))
