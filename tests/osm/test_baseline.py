@@ -1,4 +1,4 @@
-"""Del Tufo's baseline: what its NDT and VGICP find where they can, and that they say nothing without anything to match."""
+"""Del Tufo's baseline: results of its NDT and VGICP, and none without walls or points."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""From matches to a corrected map: a street of houses drawn wrong on the map, seen from a known way."""
+"""From matches to a corrected map: a street of houses drawn wrong on the map, seen from known poses."""
 
 from __future__ import annotations
 

@@ -125,7 +125,7 @@ def test_outliers_get_less_weight(seed: int) -> None:
     agree(fit, dense)
 
 
-def test_five_copies_that_count_a_fifth_are_one() -> None:
+def test_five_copies_with_weight_one_fifth_equal_one() -> None:
     graph, seen = scene(0)
     once, fifths = Dense(graph, seen).fit(), Dense(graph, some(seen, np.repeat(np.arange(len(seen.walls)), 5))).fit()
     fifths.count_less(0.2)

@@ -1,4 +1,4 @@
-"""A run laid on a map, in scenes of known truth: a street, and places where walls say little or nothing."""
+"""Localisation on a map, in scenes of known truth: a street, and places where walls leave directions free."""
 
 from __future__ import annotations
 
@@ -259,7 +259,7 @@ def test_an_ambiguous_start_is_rejected() -> None:
     assert "--heading" in located.problem
 
 
-def test_in_the_end_each_building_is_laid_on_what_was_seen() -> None:
+def test_each_building_is_matched_from_the_final_poses() -> None:
     """One house of the map stands 0.8 m off: it and no other is to be moved, whatever the graph rejected."""
     moved = [ring if n != 2 else [(x + 0.8, y) for x, y in ring] for n, ring in enumerate(HOUSES)]
     way = street()

@@ -1,4 +1,4 @@
-"""What a map misses: houses that are gone are looked through, houses that are new show walls, all others are left in peace."""
+"""Changes of a map: absent houses are seen through, new houses give new walls, all others are unchanged."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def test_an_exact_map_has_no_changes_and_occluded_buildings_are_not_absent() -> 
     assert len(new_walls([*street(), hidden], sights, poses)) == 0
 
 
-def test_two_keyframes_are_not_enough() -> None:
+def test_two_keyframes_do_not_support_a_change() -> None:
     on_map = street()
     sights, poses = drive([b for k, b in enumerate(on_map) if k != 1])
     assert not absent_buildings(on_map, sights[4:6], poses).any()
@@ -99,7 +99,7 @@ def thrice(walls: list[list[list[float]]], views: list[list[float]]) -> tuple[li
     return [replace(sight, keyframe=k) for k in range(3)], dict.fromkeys(range(3), pose)
 
 
-def test_a_house_is_absent_only_if_every_way_to_what_is_seen_leads_well_through_it() -> None:
+def test_a_house_is_absent_only_when_all_rays_pass_through_it() -> None:
     on_map = [house(0, FRONT)]
     behind = [[[8.0, 30.0], [2.0, 30.0]]]
     assert absent_buildings(on_map, *thrice(behind, [[5.0, 0.0], [4.0, 0.0]])).all()
@@ -121,7 +121,7 @@ def test_short_walls_and_those_inside_a_house_are_not_new() -> None:
         )
 
 
-def test_roofs_on_posts_are_looked_through_and_stay() -> None:
+def test_canopies_are_never_absent() -> None:
     on_map = street()
     on_map[1] = replace(on_map[1], tags={"building": "roof"})
     sights, poses = drive([b for k, b in enumerate(on_map) if k != 1])

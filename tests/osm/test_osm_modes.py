@@ -1,4 +1,4 @@
-"""Whole runs held by a wrong map, mode by mode: what they write, what reads back, and where the buildings end."""
+"""Whole runs on a wrong map, mode by mode: their files, and the displacements of the buildings."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def two_level(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return run(tmp_path_factory.mktemp("osm") / "two-level")
 
 
-def test_buildings_end_nearer_to_where_they_stand(two_level: Path) -> None:
+def test_displaced_buildings_are_nearer_to_their_true_places(two_level: Path) -> None:
     found = errors(two_level, read_corrected(two_level / "buildings.geojson"))
     assert len(found) >= 5
     held = [e for e in found if e.sides == 2]
@@ -112,7 +112,7 @@ def test_the_same_run_writes_the_same_bytes(two_level: Path, tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize("mode", ["prior", "rigid", "non-rigid"])
-def test_every_mode_moves_what_it_may(mode: str, tmp_path: Path) -> None:
+def test_every_mode_moves_its_own_variables_only(mode: str, tmp_path: Path) -> None:
     folder = run(tmp_path / "run", f"osm.mode={mode}", scans=30)
     corrected = read_corrected(folder / "buildings.geojson")
     moves = np.array([c.displacement for c in corrected.buildings])
@@ -126,7 +126,7 @@ def test_every_mode_moves_what_it_may(mode: str, tmp_path: Path) -> None:
         assert np.ptp(moves[:, 0]) > 0.2
 
 
-def test_the_way_back_begins_where_walls_fix_everything(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_backward_matching_begins_at_a_match_of_full_rank(monkeypatch: pytest.MonkeyPatch) -> None:
     def sight(number: int, rank: int) -> KeyframeMatch:
         information = np.diag([9.0, 0.0 if rank < 3 else 9.0, 100.0])
         return KeyframeMatch(number, np.zeros((0, 2, 2)), np.zeros((1, 2)), np.zeros(3), np.ones(3), np.zeros(3), information,
@@ -201,7 +201,7 @@ def test_the_baseline_runs_whole(tmp_path: Path) -> None:
     np.testing.assert_allclose(steps[:, 2, :2], own[:, 2, :2], atol=3e-4)
 
 
-def test_the_improved_system_lays_walls_of_single_scans_and_holds_the_start(tmp_path: Path) -> None:
+def test_the_improved_system_matches_single_scans_and_keeps_its_start(tmp_path: Path) -> None:
     folder = run(tmp_path / "run", "odometry.preset=thesis-improved", "loops.use=false", scans=30)
     corrected = read_corrected(folder / "buildings.geojson")
     assert corrected.mode == "two-level"

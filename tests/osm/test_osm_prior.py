@@ -22,7 +22,7 @@ def view(walls: np.ndarray, at: tuple[float, float, float] = (0.0, 0.0, 0.0)) ->
     return KeyframeMatch(7, walls, np.zeros((1, 2)), pose, np.array([0.5, 0.5, 0.02]), pose, np.zeros((3, 3)))
 
 
-def test_a_map_knows_what_is_near() -> None:
+def test_a_map_finds_buildings_and_walls_within_a_distance() -> None:
     assert TOWN.near(np.zeros(2), 7.1).tolist() == [1]
     assert TOWN.near(np.zeros(2), 7.3).tolist() == [0, 1]
     assert TOWN.distance(np.array([4.0, -30.0])) == 14.0
@@ -31,7 +31,7 @@ def test_a_map_knows_what_is_near() -> None:
     assert OsmMap([]).distance(np.zeros(2)) == np.inf
 
 
-def test_the_walls_of_the_map_lie_on_themselves_and_pairs_are_numbers_of_the_map() -> None:
+def test_walls_of_the_map_match_themselves_with_numbers_of_the_map() -> None:
     near = TOWN.walls[TOWN.owners != 1]
     found = match_keyframe(view(near - np.array([0.3, -0.2])), TOWN, OsmConfig())
     np.testing.assert_allclose(found.pose, [0.3, -0.2, 0.0], atol=1e-3)
@@ -39,7 +39,7 @@ def test_the_walls_of_the_map_lie_on_themselves_and_pairs_are_numbers_of_the_map
     assert (TOWN.owners[found.pairs[:, 1]] != 1).all()
 
 
-def test_what_cannot_be_matched_says_why() -> None:
+def test_rejected_matches_have_a_reason() -> None:
     nothing = np.zeros((0, 2, 2))
     assert match_keyframe(view(nothing), TOWN, OsmConfig()).reason == "no walls seen"
     assert match_keyframe(view(TOWN.walls, (900.0, 0.0, 0.0)), TOWN, OsmConfig()).reason == "no building near"
@@ -48,7 +48,7 @@ def test_what_cannot_be_matched_says_why() -> None:
     assert match_buildings(view(nothing), np.zeros(3), np.zeros(2), TOWN, OsmConfig()) == []
 
 
-def test_a_building_is_found_where_the_map_as_a_whole_is_off() -> None:
+def test_a_building_is_matched_under_a_common_shift_of_the_map() -> None:
     """Everything stands 2.4 m off the map; sought with that known, each house is found there."""
     shift = np.array([2.0, -1.3])
     match = view(TOWN.walls + shift)

@@ -1,4 +1,4 @@
-"""A whole run on a map: fetched or read, interrupted, by other methods and along given poses, it says the same."""
+"""A whole run on a map, fetched or read, interrupted, by other methods and along given poses: the same result."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def by_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def test_fetched_on_the_way_it_is_the_same_and_a_rerun_needs_no_network(
+def test_buildings_fetched_during_a_run_give_the_same_result_and_are_kept(
     by_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked = serve(monkeypatch)
@@ -101,7 +101,7 @@ def test_a_dead_server_leaves_odometry_as_it_is(by_file: Path, tmp_path: Path, m
 
 
 @pytest.mark.parametrize("extract", [str(MAP), "auto"])
-def test_interrupted_it_goes_on_with_the_same_bytes(
+def test_an_interrupted_run_resumes_to_the_same_bytes(
     extract: str, by_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(CheckpointSchedule, "is_due", True)

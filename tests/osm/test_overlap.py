@@ -1,4 +1,4 @@
-"""Overlap removal: neighbours end flush, the one known best stays, nothing moves that need not, and what cannot is said."""
+"""Overlap removal: party walls are aligned, displacements are weighted by information, remaining overlaps are reported."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def check_apart(buildings: list[Building], found: Untangled) -> None:
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_houses_in_a_row_stay_flush_whichever_of_them_was_seen(seed: int) -> None:
+def test_party_walls_in_a_row_stay_aligned_whichever_house_was_seen(seed: int) -> None:
     rng = np.random.default_rng(seed)
     row = [house(8.0 * k, rng.uniform(-1, 1), 8.0, 11.0, k) for k in range(5)]
     seen = [bool(k) for k in rng.integers(0, 2, 5)]
@@ -97,7 +97,7 @@ def test_a_rotated_building_is_aligned_with_its_party_wall() -> None:
     assert len(found.contacts) == 2
 
 
-def test_a_corner_finds_its_corner_where_one_wall_is_not_enough() -> None:
+def test_corners_are_aligned_where_one_wall_is_not_enough() -> None:
     court = shaped([(0, 0), (20, 0), (20, 8), (8, 8), (8, 20), (0, 20)], 1)
     tenant = house(9, 9, 6, 6, 2)
     found = remove_overlaps([court, tenant], np.array([[0, 0, 0], [-1.6, -1.5, 0.03]]), information([True, False]))

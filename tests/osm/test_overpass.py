@@ -1,4 +1,4 @@
-"""Manners, patience and suspicion: what is asked of an Overpass server, and what of its answers is believed."""
+"""Requests to an Overpass server and checks of its replies."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def test_the_query_is_that_of_the_conventions_with_a_user_agent_of_our_own(
     assert headers["User-Agent"].startswith("lslam/")
 
 
-def test_a_place_is_asked_for_once(server: FakeOverpass, tmp_path: Path) -> None:
+def test_a_place_is_requested_once(server: FakeOverpass, tmp_path: Path) -> None:
     first = fetch(server, tmp_path)
     assert fetch(server, tmp_path) == first
     assert server.requests == []
@@ -167,13 +167,15 @@ def test_one_request_at_a_time(server: FakeOverpass, tmp_path: Path) -> None:
     assert server.most_at_once == 1
 
 
-def test_an_endless_reply_is_left(server: FakeOverpass, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_reply_that_is_too_long_is_an_error(
+    server: FakeOverpass, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("lslam.osm.overpass.LONGEST_REPLY", 500)
     with pytest.raises(InputError, match="the reply grows beyond"):
         fetch(server, tmp_path)
 
 
-def test_the_digest_follows_the_box_and_not_the_patience() -> None:
+def test_the_query_depends_on_the_timeout_and_boxes_are_rounded() -> None:
     assert query(BOX, 180) != query(BOX, 60)
     near = Bounds(49.0 + 1e-9, 8.4, 49.01, 8.42)
     assert near == BOX

@@ -1,4 +1,4 @@
-"""Buildings of a run: from a file, from a server that is asked on the way, from the replies an earlier run has kept."""
+"""Buildings of a run: from a file, from a server during the run, from the replies of an earlier run."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ class Fetch:
         return street(bounds)
 
 
-def test_with_a_heading_it_asks_along_the_way(tmp_path: Path) -> None:
+def test_with_a_heading_buildings_are_requested_along_the_path(tmp_path: Path) -> None:
     fetch = Fetch()
     server = OsmServer(ORIGIN, None, OsmConfig(heading_deg=0.0), fetch)
     server.begin(tmp_path / "replies")

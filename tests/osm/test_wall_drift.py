@@ -1,4 +1,4 @@
-"""Drift that lasts is told by walls that move while they are passed, whatever the map is worth, and none where there is none."""
+"""Constant drift is estimated by sightings of walls, whatever the accuracy of the map, and none where there is none."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Matching of walls: known offsets recovered, free directions left free, look-alikes refused, and the fitness as printed."""
+"""Matching of walls: known offsets recovered, free directions free, ambiguity rejected, the fitness as printed."""
 
 from __future__ import annotations
 
@@ -309,7 +309,7 @@ def test_without_walls_or_without_partners_there_is_no_match() -> None:
 
 
 @pytest.mark.parametrize("shift", [(1.2, -0.9, 0.04), (-0.6, 1.4, -0.05)])
-def test_one_building_is_laid_on_the_walls_seen_of_it(shift: tuple[float, float, float]) -> None:
+def test_one_building_is_matched_with_the_walls_seen_of_it(shift: tuple[float, float, float]) -> None:
     house = Building("way/1", (Footprint(np.array(box_at(6.0, -4.0, 12.0, 9.0))),))
     source, _ = walls_of([house])
     front = np.array([[[6.0, 5.0], [6.0, -4.0]], [[16.0, 5.0], [6.0, 5.0]]])

@@ -66,7 +66,7 @@ def test_height_counts_from_the_ground_wherever_that_is() -> None:
     assert len(find_walls(noisy(level), OsmConfig(wall_height=0.5))) > expected
 
 
-def test_what_is_no_wall_gives_none() -> None:
+def test_other_surfaces_give_no_walls() -> None:
     rng = np.random.default_rng(1)
     foliage = rng.normal(0, 1.5, (4000, 3)) * [1, 1, 0.7] + [10, 5, 5]
     x, y = np.meshgrid(np.arange(5, 15, 0.2), np.arange(-15, -5, 0.2))
@@ -94,7 +94,7 @@ def test_a_round_building_and_a_little_one_break_nothing() -> None:
 
 
 @pytest.mark.parametrize("count", [0, 1, 30])
-def test_next_to_nothing_gives_nothing(count: int) -> None:
+def test_few_points_give_no_walls(count: int) -> None:
     cloud = np.zeros((count, 3), np.float32)
     assert find_walls(cloud).segments.shape == (0, 2, 2)
     cloud[:, 1] = np.nan
