@@ -1,1 +1,1 @@
-"""Compiled loops: bare arrays in, bare arrays out. Nothing here knows the rest of lslam; jit.py holds the compile policy."""
+"""Compiled loops: bare arrays in, bare arrays out. They import nothing else of lslam; jit.py has the compile policy."""

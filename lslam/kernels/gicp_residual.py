@@ -19,13 +19,13 @@ Floats = NDArray[np.float64]
 @kernel
 def linearise_gicp(points: tuple[Floats, Floats], voxels: Voxels, settings: Settings, search: Search, pose: Pose,
                    width: Width, sums: Sums) -> None:  # fmt: skip
-    """Add all source points (S, 3) with covariance (S, 6), LiDAR frame, not done yet, to the sums, see `linearisation`.
+    """Add all source points (S, 3) with covariance (S, 6), LiDAR frame, not matched yet, to the sums, see `linearisation`.
 
-    e = R s + t - mean of the nearest plane voxel of eight, M = inv(C_t + R C_s R^T) with the voxel's disc C_t, as thick as
-    its points and its tilt make it (Segal et al. take all alike, but theirs are planes of twenty neighbours), cost
-    robust(thin e^T M e) / thin: `thin`, the variance of a pair along a common normal, makes metres of the Mahalanobis
-    distance. Without a plane the nearest blob stands in, isotropic with its mean variance, times `blob_weight`.
-    Gauss-Newton holds M while the pose moves. S is the information along the normals alone, with blobs.
+    e = R s + t - mean of the nearest plane voxel of eight, and M = inv(C_t + R C_s R^T) with the voxel's disc C_t. The disc's
+    variance along the normal is that of the voxel's points and tilt (Segal et al. take a constant, for planes of twenty
+    neighbours). The cost is robust(thin e^T M e) / thin, where `thin`, m2, the variance of a pair along a common normal, scales
+    the squared Mahalanobis distance to m2. Without a plane the nearest blob is used, isotropic with its mean variance, times
+    `blob_weight`. M is constant within a Gauss-Newton step. S is the information along the normals alone, with blobs.
     """
     source, covariance = points
     planes, keys, table = voxels

@@ -74,7 +74,7 @@ def describe(moments: Floats, planes: Floats, keys: Longs, refreshed: Floats, us
 @kernel
 def linearise_ndt(points: tuple[Floats], voxels: Voxels, settings: Settings, search: Search, pose: Pose, width: Width,
                   sums: Sums) -> None:  # fmt: skip
-    """Add all source points (S, 3), LiDAR frame, that are not done, to the sums, see `linearisation`.
+    """Add all source points (S, 3), LiDAR frame, not matched yet, to the sums, see `linearisation`.
 
     The cost is the negative score: -d1 u exp(-d2 / (2 u) e^T C^-1 e) over the eight voxels around R s + t, where u =
     `widening` is 1 except during annealing, when it widens the Gaussians as the kernel is widened. g is the gradient. H is

@@ -25,7 +25,7 @@ _BRIGHTEST = float(2**24)  # of such points a voxel's sum holds 2**19
 
 @inline
 def pack(ix: int, iy: int, iz: int) -> int:
-    """Key of cell indices relative to the origin; -1 when one lies outside what has a key."""
+    """Key of cell indices relative to the origin; -1 when an index is outside the range of keys."""
     x, y, z = ix + HALF, iy + HALF, iz + HALF
     if (x | y | z) >> AXIS_BITS != 0:  # negative or too large on some axis
         return -1
