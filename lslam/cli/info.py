@@ -1,4 +1,4 @@
-"""`lslam info`: what is in a sequence, and what is wrong with it."""
+"""`lslam info`: the contents and the faults of a sequence."""
 
 from __future__ import annotations
 
@@ -163,7 +163,7 @@ def _turns(turns: dict[str, Any] | None) -> str:
     if turns is None:
         return "not compared"
     if turns["correlation"] is None:
-        return "they do not fit" if turns["is_judged"] else f"too few in the first {turns['scans']} scans to compare"
+        return "they do not agree" if turns["is_judged"] else f"too few in the first {turns['scans']} scans to compare"
     axes = ", ".join("-" if c is None else f"{c:.2f}" for c in turns["correlation_xyz"] or [])
     sigma = "unknown" if turns["time_offset_sigma_s"] is None else f"{1e3 * turns['time_offset_sigma_s']:.1f}"
     return (

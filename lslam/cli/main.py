@@ -145,7 +145,7 @@ def _call() -> int:
         if error.filename is None:
             from lslam.cli.console import leave_stdout
 
-            leave_stdout()  # what is still buffered would fail once more at exit, with a code of Python's own
+            leave_stdout()  # the rest of the buffer would fail again at exit, with an exit code of Python
         _fail(f"{error.filename or 'standard output'} cannot be used: {cause(error)}", 3)
     except MemoryError:
         _fail("out of memory: use fewer points (preprocess.range_max) or larger voxels (map.voxel)", 1)

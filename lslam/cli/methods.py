@@ -1,4 +1,4 @@
-"""`lslam methods`: what `--method` takes."""
+"""`lslam methods`: the names that `--method` takes."""
 
 from __future__ import annotations
 

@@ -222,7 +222,7 @@ def _print(facts: dict[str, Any], png: Path | None) -> None:
         ),
         ("extent", f"{width:.0f} x {depth:.0f} m, {south:.6f},{west:.6f} to {north:.6f},{east:.6f}"),
         ("origin", ",".join(f"{v:.7g}" if k == 2 else f"{v:.7f}" for k, v in enumerate(facts["origin_lat_lon_alt"]))),
-        ("licence", facts["attribution"] or "none: nobody surveyed it"),
+        ("licence", facts["attribution"] or "none is given"),
     ]
     lines += [("picture", str(png))] if png is not None else []
     for label, value in lines:
