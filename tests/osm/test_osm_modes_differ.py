@@ -2,15 +2,51 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from itertools import combinations
+from typing import Any
 
 import numpy as np
 import pytest
 from wrong_maps import MODES, OFF, SHIFT, Found, on
 
+from lslam.frontend.keyframing import Keyframing
+from lslam.frontend.register_scans import estimate
+from lslam.integrity.monitor import IntegrityMonitor
+from lslam.keyframes.store import KeyframeStore
+from lslam.pipeline import odometry_pass
+from lslam.types.keyframe import Keyframe
+from lslam.types.motion_check import MotionCheck
+from lslam.types.scan_result import ScanResult
+
 # Half as many keyframes: what is common to the map shows as well; of single houses each needs all that saw it.
 SPARSE = ("keyframes.distance=4",)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def shared_odometry() -> Iterator[None]:
+    """Odometry knows no map: runs whose configurations differ in the section `osm` only share its results and keyframes."""
+    held: dict[str, tuple[list[ScanResult], KeyframeStore, list[Keyframe], list[MotionCheck]]] = {}
+
+    def once(*given: Any, keyframing: Keyframing, monitor: IntegrityMonitor, **more: Any) -> list[ScanResult]:
+        key = keyframing._config.model_dump_json(exclude={"osm"})
+        if key not in held:
+            results = estimate(*given, keyframing=keyframing, monitor=monitor, **more)
+            keyframing.settle()
+            held[key] = list(results), keyframing.store, list(keyframing.store.keyframes), list(monitor.checks)
+            return results
+        results, store, keyframes, checks = held[key]
+        monitor.checks.extend(checks)
+        for keyframe in keyframes:
+            keyframing.store.add(keyframe, store.points(keyframe.number))
+        keyframing.settle()
+        for result in results:
+            more["on_scan"](result)
+        return list(results)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(odometry_pass, "estimate", once)
+        yield
 
 
 def median(found: Sequence[Found]) -> Found:
