@@ -22,15 +22,16 @@ from lslam.types.scan_result import ScanResult, Status
 from lslam.types.stage_clock import StageClock
 from lslam.types.state import State
 
-# Half the points of a scan are nearer.
+# Lever arm of rotations: half the points of a scan are nearer.
 LEVER_M = 10.0
-# Found in the same place from two sides: so many times nearer to each other than where it was sought is to it.
+# Two registrations from different initial guesses are the same minimum if their distance is below this part of the distance
+# between the prior and the first.
 SAME = 0.3
 
 
 @dataclass(frozen=True)
 class Loaded:
-    """One scan as the background thread leaves it; `error` says why there is none, which makes it one of that `status`."""
+    """One scan as the background thread leaves it; `error` : why it is unreadable, and `status` : what its result has then."""
 
     index: int
     stamp_ns: int
@@ -138,7 +139,7 @@ class Tracker:
             result = ScanResult(loaded.index, loaded.stamp_ns, prior.pose, loaded.status, loaded.error, converged=False)
         elif isinstance(odometry, Deskewing):
             if coasting is not None and motion.is_compared(loaded.stamp_ns, span):
-                # Nothing is learnt from it.
+                # For comparison alone: the map and the motion model are not updated.
                 without = coasting.sweep(scan.stamp_ns, span)
                 trial = self._align(odometry, scan, loaded.prepared, without, coasting)[0].result
             result, prior = self._register(odometry, scan, loaded.prepared, prior, clock)
@@ -165,7 +166,7 @@ class Tracker:
     def _register(
         self, odometry: Deskewing, scan: Scan, prepared: Any, prior: MotionPrior, clock: StageClock
     ) -> tuple[ScanResult, MotionPrior]:
-        """Register, weigh and enter the scan; the prior that was right."""
+        """Register the scan, fuse the pose with the IMU and update the map; also the motion that it was deskewed with."""
         expected = prior
         found, prior = self._align(odometry, scan, prepared, prior, self.motion, clock)
         is_first_open = self._first is not None or not self.motion.is_known
@@ -189,10 +190,10 @@ class Tracker:
         self, odometry: Deskewing, scan: Scan, prepared: Any, prior: MotionPrior, motion: MotionModel | None = None,
         clock: StageClock | None = None,
     ) -> tuple[Registered, MotionPrior]:  # fmt: skip
-        """Register, and again with the motion within the sweep that this found; the prior that was right.
+        """Register, and again with the motion within the sweep that follows from it; also the motion of the final deskewing.
 
-        motion : what makes a better prior of what was found; None: there is no better one
-        clock : what counts the time that takes, if anything does
+        motion : refines the prior by the registered pose; None: no second registration
+        clock : measures the time of `motion`
         """
         found = odometry.register(scan, prepared, prior)
         if found.sweep is not None:
@@ -210,10 +211,10 @@ class Tracker:
         self, odometry: Searching, scan: Scan, prepared: Any, prior: MotionPrior, found: Registered, denied: ScanResult,
         clock: StageClock,
     ) -> Registered:  # fmt: skip
-        """The registration near the IMU's prediction, in place of the one `found` elsewhere and `denied`, or failed.
+        """Register again near the IMU's prediction, after a registration that failed or whose pose the IMU overruled (`denied`).
 
-        With perceptual aliasing a wide search converges at the wrong place; a pose found from both sides is accepted against
-        the IMU.
+        With perceptual aliasing a wide search converges at the wrong place. The same minimum from both initial guesses is
+        accepted against the IMU.
         """
         near, first = odometry.register_near(scan, prepared, prior, found), found.result
         with clock.stage("imu"):
@@ -246,7 +247,7 @@ def _compared(result: ScanResult, trial: ScanResult) -> ScanResult:
 
 
 def _both(first: ScanResult, second: ScanResult) -> ScanResult:
-    """The second registration of a scan, at the cost of both."""
+    """The second registration of a scan, with the iterations and times of both."""
     stages = {name: first.stages.get(name, 0.0) + second.stages.get(name, 0.0) for name in first.stages | second.stages}
     return replace(second, iterations=first.iterations + second.iterations, stages=stages)
 
@@ -260,7 +261,7 @@ def _matrix_norm(prior: NDArray[np.float64], pose: NDArray[np.float64]) -> float
 
 
 def _distance(before: MotionPrior, after: MotionPrior) -> float:
-    """How far the motion from a sweep's begin to its end differs, m, at a lever arm of `LEVER_M`."""
+    """How far the motion from a sweep's start to its end differs, m, at a lever arm of `LEVER_M`."""
     return _apart(*(se3.relative(prior.poses[0], prior.poses[-1]) for prior in (before, after)))
 
 

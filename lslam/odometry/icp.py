@@ -67,7 +67,7 @@ class Icp(Stateful):
         return self._align(scan, prepared, prior)
 
     def register_near(self, scan: Scan, prepared: PreparedPoints, prior: MotionPrior, found: Registered) -> Registered:
-        """Align with the local map from the prior alone."""
+        """Local registration about the prior: narrow kernel, no recovery."""
         near = self._align(scan, prepared, prior, is_near=True)
         points, located, *rest = near.detail
         return near if located.ok else replace(near, detail=(points, found.detail[1], *rest))
@@ -88,7 +88,7 @@ class Icp(Stateful):
         return self._uncertainty.map_age
 
     def information_of(self, prior: MotionPrior) -> NDArray[np.float64] | None:
-        """(6, 6) with which the prior joins the points; None, since the prior is only where to begin."""
+        """(6, 6) information of the prior for the normal equations; None, since it is the initial guess only."""
         return None
 
     def update(self, prior: MotionPrior, found: Registered) -> ScanResult:

@@ -34,7 +34,7 @@ def run(
     sequence : an open sequence, or what `open_sequence` takes
     out : the run folder, a URL for one in storage; None writes nothing and builds no map
     ground_truth : replaces the sequence's own
-    reading : what `open_sequence` was told beside the path (topics, extrinsics), for the manifest: `lslam map` needs it
+    reading : options that `open_sequence` took (topics, extrinsics), for the manifest: `lslam map` needs them
     overwrite : replace an earlier run in `out`; resume : go on where it was killed or interrupted, if there is one
 
     Raises
@@ -54,7 +54,7 @@ def run(
 
 
 def plan(sequence: Sequence, config: Config, ground_truth: Trajectory | None = None) -> Sequence:
-    """The scans that `run` would take, after a look at everything else that it would read; nothing is written or fetched.
+    """Dry run: check all input that `run` would read and return the scans it would take; nothing is written or fetched.
 
     Raises InputError and UsageError as `run` does before it begins.
     """

@@ -32,7 +32,7 @@ MIN_SOURCE_POINTS = 30
 NEAR_KERNEL = 2.0
 # Between scans that come without stamps, ns: most sensors turn ten times a second.
 SCAN_NS = 100_000_000
-# A few points at the edge of sight are not worth a look at the coarse map.
+# Below this share of points in sparse surroundings the coarse level is not searched.
 SPARSE_SHARE = 0.1
 WORDING = Wording("of the points overlap the map", "of the points agree with the map")
 
@@ -66,7 +66,7 @@ class Registration(Stateful):
         self.residual = c.residual or "plane"
         self.kind = residual_named(self.residual)
         self.target = make_target(c)
-        # On keyframes far apart a sparse sensor finds few of the surfaces it sees: the share alone tells nothing, its fall does.
+        # On keyframes far apart a sparse sensor matches few of its points: only a drop of the inlier ratio is informative.
         self._gates = c.model_copy(update={"min_inliers": 0.0}) if c.target == "submap" else c
         self.map = LocalMap(
             c.voxel_size * self.kind.voxel_share, coarse_factor=c.coarse_factor,
@@ -75,11 +75,11 @@ class Registration(Stateful):
         self.alignment = MapAlignment(self.map, c, self.residual)
         self.threshold = AdaptiveThreshold(c.kernel_min, c.kernel_max)
         self.agreement = UsualAgreement(c.min_agreement)
-        # Scans to come whose speed is unknown, scans in the map, and the last of them with their poses.
+        # Initialisation scans that remain, scans in the map, and the last of them with their poses.
         self.starting, self.inserted = c.start_scans, 0
         self.recent: tuple[tuple[NDArray[np.float32], Floats], ...] = ()
         self._motion, self._index = ConstantVelocity(), 0
-        # Angle between rings, rad, for point to point; 0 where unknown.
+        # Vertical angular resolution, rad, for point to point; 0 where unknown.
         self._ring_gap = 0.0
 
     def register(self, points: NDArray[Any], prior: Floats | None = None) -> RegistrationResult:
@@ -101,10 +101,10 @@ class Registration(Stateful):
     def locate(
         self, points: PreparedPoints, T_prior: Floats, is_near: bool = False, information: Floats | None = None
     ) -> RegistrationResult:
-        """Align with the map as it is; the result says whether it is accepted.
+        """Register without updating the map; the result says whether it is accepted.
 
-        is_near : the prior is nearly right: nothing is sought away from it
-        information : (6, 6) of the prior, world axes, that joins the points'; None: the prior is only a start
+        is_near : local registration: narrow kernel, no recovery
+        information : (6, 6) of the prior, world axes, added to the normal equations; None: the prior is the initial guess only
         """
         count, c = len(points.source), self.config
         if count < MIN_SOURCE_POINTS:
@@ -133,7 +133,7 @@ class Registration(Stateful):
         return replace(points, covariance=found)
 
     def update(self, points: PreparedPoints, result: RegistrationResult) -> None:
-        """Insert the scan into the map unless its registration failed; adapt thresholds unless it was denied."""
+        """Insert the scan into the map unless its registration failed; adapt thresholds unless its pose was overruled."""
         is_first = len(self.map) == 0
         if result.ok:
             self.enter(points, result.T_world_lidar)
@@ -146,7 +146,7 @@ class Registration(Stateful):
         self.recent = (*self.recent, (points.map_points, T_world_lidar))[-self.config.start_scans :]
 
     def observe(self, result: RegistrationResult, is_first: bool = False) -> None:
-        """Adapt thresholds to a registration, unless it was denied, or no map was there for it."""
+        """Adapt thresholds to a registration, unless its pose was overruled (`is_denied`) or the map was empty."""
         if not result.ok:
             self.starting = max(self.starting, 1)
             self.threshold.widen()
@@ -160,14 +160,14 @@ class Registration(Stateful):
         self._index += 1
 
     def _gaps(self, points: PreparedPoints) -> Floats | None:
-        """(S,) m, between the rings at each source point; the angle between rings is learnt while the map is young."""
+        """(S,) m, ring spacing at each source point; the angular resolution is estimated from the first scans."""
         if self.inserted <= self.config.start_scans:
             self._ring_gap = ring_gap(points.map_points)
         gaps: Floats = self._ring_gap * np.linalg.norm(points.source, axis=1)
         return gaps if (gaps > self.map.fine.size).mean() > SPARSE_SHARE else None
 
     def is_small(self, result: RegistrationResult) -> bool:
-        """Whether the correction of the motion prior is no larger than priors are wrong by."""
+        """Whether the correction of the motion prior is within the prediction error that is expected of it."""
         move, turn = result.prior_error
         return move < self.config.recover_m and turn < np.deg2rad(self.config.recover_deg)
 

@@ -130,7 +130,7 @@ def _map_rows(record: RunRecord) -> list[tuple[str, str]]:
     if score is None or score.entropy is None or score.plane_variance is None:
         return []
     thickness = f"planes {metres(score.plane_variance**0.5)} m thick (root of the mean plane variance)"
-    return [("crispness", f"map entropy {score.entropy:.3f}, {thickness}; {score.radius:g} m, lower is crisper")]
+    return [("crispness", f"map entropy {score.entropy:.3f}, {thickness}, within {score.radius:g} m; lower is crisper")]
 
 
 def _time_rows(record: RunRecord, facts: RunFacts) -> list[tuple[str, str]]:
