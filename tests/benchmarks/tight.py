@@ -117,7 +117,8 @@ def fill(known: dict[str, Found], case: Found, file: Path) -> None:
             [sys.executable, __file__, "--case", given], stdout=subprocess.PIPE, text=True
         ) as process:
             assert process.stdout is not None
-            for line in process.stdout:
+            # Peers write to stdout, too.
+            for line in (each for each in process.stdout if each.startswith('{"method"')):
                 told = json.loads(line)
                 _keep(known, key(*words, missing.pop(0), case["scans"]), told["found"], file)
         if missing:
