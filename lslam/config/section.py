@@ -10,6 +10,10 @@ class Section(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True, validate_default=True, allow_inf_nan=False)
 
+    def changed(self) -> list[str]:
+        """Keys whose values differ from the defaults, in the order of the section."""
+        return [key for key, field in type(self).model_fields.items() if getattr(self, key) != field.get_default()]
+
     def require_order(self, low: str, high: str) -> None:
         """Raise ValueError unless the value of key `low` lies below that of `high`."""
         a, b = getattr(self, low), getattr(self, high)

@@ -98,6 +98,8 @@ def announce(job: PreparedRun) -> None:
     deskew, is_distorted = describe_deskew(sequence, config, sweep is not None, getattr(job.odometry, "deskew", ""))
     job.manifest.deskew = deskew
     job.manifest.pose_time = (sweep or Span()).instant
+    if not config.imu.use and (unused := [f"imu.{key}" for key in config.imu.changed()]):
+        log.warning("%s: without effect, this run has no IMU; --imu gives it one", ", ".join(unused))
     if is_distorted:
         log.warning("%s", deskew)
     else:

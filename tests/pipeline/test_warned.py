@@ -97,6 +97,12 @@ def test_warnings_are_problems_without_a_folder_and_at_any_log_level() -> None:
     assert LOG.level == logging.CRITICAL
 
 
+def test_keys_of_the_imu_in_a_run_without_one_are_warned_of() -> None:
+    given = config_of("imu.estimate_offset=true", "imu.gyro_noise=0.001", "imu.start_s=5.0")
+    (sentence,) = lslam.run(sample(4), given).record.manifest["problems"]
+    assert sentence.startswith("imu.gyro_noise, imu.estimate_offset: without effect")
+
+
 def test_warnings_before_a_run_are_problems_of_the_run(tmp_path: Path) -> None:
     with hearing():
         LOG.warning("times.txt has 3 stamps")
