@@ -19,7 +19,8 @@ from lslam.pipeline import precompile
 
 def signatures() -> set[tuple[str, str]]:
     """Of every kernel that this process has compiled or loaded."""
-    kernels = [k for k in gc.get_objects() if isinstance(k, Dispatcher)]
+    # By the type itself: `isinstance` follows weak references, to what may be gone.
+    kernels = [k for k in gc.get_objects() if issubclass(type(k), Dispatcher)]
     return {(f"{k.py_func.__module__}.{k.py_func.__name__}", str(s)) for k in kernels for s in k.signatures}
 
 
