@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -30,7 +31,7 @@ from lslam.readers.bag_topics import (
 )
 from lslam.readers.ground_truth import Voice
 from lslam.readers.listing import measured_rate
-from lslam.readers.point_times import TimeRule, apply_rule, decide_rule
+from lslam.readers.point_times import TimeRule, apply_rule, rule_of_scans
 from lslam.readers.sidecars import compensation_note
 from lslam.types.gnss import GnssStream
 from lslam.types.imu import ImuStream
@@ -175,24 +176,21 @@ def _info(path: Path, bag: Bag, overrides: SequenceInfo) -> SequenceInfo:
 
 def _decide_times(sequence: BagSequence, info: SequenceInfo) -> None:
     """Find out on the first scans how per-point times are meant; stamps move to the scans' starts."""
-    cloud = PointCloud(np.zeros((0, 3), np.float32))
-    for index in range(min(len(sequence), _LOOKED_AT)):
-        try:
-            cloud, shift = sequence.cloud(index)
-        except InputError:
-            continue
-        if len(cloud):
-            break
+    count = min(len(sequence), _LOOKED_AT)
+    index, cloud, shift = _first_cloud(sequence, range(count))
     if cloud.times is None or not len(cloud):
         sequence.notes.append(
             f"the points of {sequence.topic.name} have no times (looked for {', '.join(TIME_NAMES[:4])} and the like)"
         )
         return
     stamp = int(sequence.headers_ns[index]) + shift
+    late_index, late, late_shift = _first_cloud(sequence, range(count - 1, index - 1, -1))
+    stamps = (stamp, int(sequence.headers_ns[late_index]) + late_shift)
     try:
-        rule = decide_rule(
-            cloud.time_field, cloud.times, stamp, sequence.rate_hz, info.point_time_unit, info.point_time_reference
-        )
+        rule = rule_of_scans(
+            cloud.time_field, cloud.times, np.zeros(0) if late.times is None else late.times, stamps, sequence.rate_hz,
+            info.point_time_unit, info.point_time_reference,
+        )  # fmt: skip
     except InputError as error:
         sequence.problems.append(f"no deskew: {error}")
         return
@@ -205,6 +203,16 @@ def _decide_times(sequence: BagSequence, info: SequenceInfo) -> None:
         sequence.notes.append(
             f"stamps of the scans moved by {shift * 1e-9:.6f} s, to where their first points were measured"
         )
+
+
+def _first_cloud(sequence: BagSequence, indices: range) -> tuple[int, PointCloud, int]:
+    """The first of the scans `indices` that can be read and has points, its cloud and what `cloud` says of it; else no points."""
+    for index in indices:
+        with suppress(InputError):
+            cloud, shift = sequence.cloud(index)
+            if len(cloud):
+                return index, cloud, shift
+    return 0, PointCloud(np.zeros((0, 3), np.float32)), 0
 
 
 def find_extrinsics(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -78,6 +79,23 @@ def decide_rule(
         is_before_stamp,
         f"per-point times from field {name!r} ({values.dtype}), {unit}, {words}{how}",
     )
+
+
+def rule_of_scans(
+    name: str, first: NDArray[Any], later: NDArray[Any], stamps_ns: tuple[int, int], rate_hz: float, unit: str | None = None,
+    reference: str | None = None,
+) -> TimeRule:  # fmt: skip
+    """`decide_rule` for the first scan, and for a later one by which a clock that started with the recording is told.
+
+    first, later : values of the field in two scans; stamps_ns : of these
+    """
+    rule = decide_rule(name, first, stamps_ns[0], rate_hz, unit, reference)
+    if rule.is_absolute or rule.is_before_stamp or not len(later):
+        return rule
+    with suppress(InputError):
+        by_later = decide_rule(name, later, stamps_ns[1], rate_hz, unit, reference)
+        return by_later if by_later.is_absolute else rule
+    return rule
 
 
 def apply_rule(rule: TimeRule, values: NDArray[Any], stamp_ns: int) -> tuple[NDArray[np.float32], int]:

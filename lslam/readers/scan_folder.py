@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -24,7 +25,7 @@ from lslam.readers.listing import (
     rows_of,
     stamps_in_names,
 )
-from lslam.readers.point_times import TimeRule, decide_rule
+from lslam.readers.point_times import TimeRule, rule_of_scans
 from lslam.readers.sidecars import calibration_over, compensation_note, load_gnss, load_imu, per_point_folder, read_info
 from lslam.types.sequence import Calibration
 from lslam.types.trajectory import Trajectory
@@ -212,22 +213,22 @@ def _mcd_extrinsics(folder: Path, voice: Voice) -> NDArray[np.float64] | None:
 def _time_rule(
     files: list[Path], stamps: NDArray[np.int64], rate: float, info: SequenceInfo, voice: Voice
 ) -> TimeRule | None:
-    """How per-point times of the files are read, decided on the first scan that has any."""
+    """How per-point times of the files are read, decided on the first scans that have any."""
     if files[0].suffix.lower() == ".bin":
         return None
+    timed = []
     for path, stamp in zip(files[:5], stamps[:5], strict=True):
-        try:
+        with suppress(InputError):
             cloud = read_points(path)
-        except InputError:
-            continue
-        if cloud.times is not None and len(cloud):
-            try:
-                rule = decide_rule(
-                    cloud.time_field, cloud.times, int(stamp), rate, info.point_time_unit, info.point_time_reference
-                )
-            except InputError as error:
-                voice.problems.append(f"no deskew: {error}")
-                return None
-            voice.notes.append(rule.sentence)
-            return rule
-    return None
+            if cloud.times is not None and len(cloud):
+                timed.append((cloud.time_field, cloud.times, int(stamp)))
+    if not timed:
+        return None
+    (name, first, begin), (_, later, late) = timed[0], timed[-1]
+    try:
+        rule = rule_of_scans(name, first, later, (begin, late), rate, info.point_time_unit, info.point_time_reference)
+    except InputError as error:
+        voice.problems.append(f"no deskew: {error}")
+        return None
+    voice.notes.append(rule.sentence)
+    return rule

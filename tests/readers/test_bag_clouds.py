@@ -122,6 +122,26 @@ def test_times_of_another_epoch_are_relative_to_the_scan(
     assert sequence.stamps_ns[1] == START_NS + STEP_NS
 
 
+@pytest.mark.parametrize(("field", "unit"), [("<f8", 1.0), ("<f8", 1e-9)])
+def test_a_clock_that_starts_with_the_recording_is_a_clock(tmp_path: Path, field: str, unit: float) -> None:
+    """As in a simulator: the first scan alone looks as if its times were relative to it."""
+    headers = [k * STEP_NS for k in range(6)]
+
+    def fill(writer: BagWriter) -> None:
+        for stamp in headers:
+            rows = table([*XYZI, ("ring", "<u2"), ("timestamp", field)], ring=RING,
+                         timestamp=np.round((stamp / 1e9 + SECONDS) / unit, 9))  # fmt: skip
+            writer.write("/points", stamp, raw_cloud(writer.store, stamp, rows))
+
+    sequence = open_sequence(bag(tmp_path / "a.bag", fill))
+    assert sequence.stamps_ns.tolist() == headers
+    for k in (0, 5):
+        scan = sequence.scan(k)
+        assert scan.times is not None
+        assert abs(scan.stamp_ns - headers[k]) <= 1000
+        np.testing.assert_allclose(scan.times, SECONDS, atol=1e-6)
+
+
 def test_missing_times_are_noted(tmp_path: Path) -> None:
     sequence = opened(tmp_path, table([*XYZI, ("ring", "<u2")], ring=RING))
     assert sequence.scan(0).times is None

@@ -152,6 +152,20 @@ def test_per_point_times_of_any_unit(
     assert abs(scan.stamp_ns - (1670403900 * 10**9 + stamp_moves_ns)) < 10
 
 
+def test_a_clock_that_starts_with_the_recording_is_a_clock(tmp_path: Path) -> None:
+    folder = tmp_path / "a"
+    folder.mkdir()
+    within = np.linspace(0, 0.1, 50)
+    for k in range(6):
+        pcd_with_times(folder / f"{k}.pcd", "<f8", 0.1 * k + within)
+    (folder / "times.txt").write_text("".join(f"{0.1 * k:.1f}\n" for k in range(6)))
+    for k in (0, 5):
+        scan = open_sequence(folder).scan(k)
+        assert scan.times is not None
+        np.testing.assert_allclose(scan.times, within, atol=1e-6)
+        assert abs(scan.stamp_ns - k * 10**8) < 10
+
+
 def test_times_of_no_known_unit_disable_deskewing_with_a_note(tmp_path: Path) -> None:
     folder = tmp_path / "a"
     folder.mkdir()
