@@ -32,7 +32,7 @@ MIN_SOURCE_POINTS = 30
 NEAR_KERNEL = 2.0
 # Between scans that come without stamps, ns: most sensors turn ten times a second.
 SCAN_NS = 100_000_000
-# Below this share of points in sparse surroundings the coarse level is not searched.
+# Share of points with a ring spacing above a voxel from which on the coarse level is searched, too.
 SPARSE_SHARE = 0.1
 WORDING = Wording("of the points overlap the map", "of the points agree with the map")
 
