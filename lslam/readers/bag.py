@@ -184,11 +184,10 @@ def _decide_times(sequence: BagSequence, info: SequenceInfo) -> None:
         )
         return
     stamp = int(sequence.headers_ns[index]) + shift
-    late_index, late, late_shift = _first_cloud(sequence, range(count - 1, index - 1, -1))
-    stamps = (stamp, int(sequence.headers_ns[late_index]) + late_shift)
+    _, late, _ = _first_cloud(sequence, range(count - 1, index, -1))
     try:
         rule = rule_of_scans(
-            cloud.time_field, cloud.times, np.zeros(0) if late.times is None else late.times, stamps, sequence.rate_hz,
+            cloud.time_field, cloud.times, np.zeros(0) if late.times is None else late.times, stamp, sequence.rate_hz,
             info.point_time_unit, info.point_time_reference,
         )  # fmt: skip
     except InputError as error:

@@ -82,18 +82,18 @@ def decide_rule(
 
 
 def rule_of_scans(
-    name: str, first: NDArray[Any], later: NDArray[Any], stamps_ns: tuple[int, int], rate_hz: float, unit: str | None = None,
+    name: str, first: NDArray[Any], later: NDArray[Any], stamp_ns: int, rate_hz: float, unit: str | None = None,
     reference: str | None = None,
 ) -> TimeRule:  # fmt: skip
     """`decide_rule` for the first scan, and for a later one by which a clock that started with the recording is told.
 
-    first, later : values of the field in two scans; stamps_ns : of these
+    first, later : values of the field in two scans; stamp_ns : of the first
     """
-    rule = decide_rule(name, first, stamps_ns[0], rate_hz, unit, reference)
+    rule = decide_rule(name, first, stamp_ns, rate_hz, unit, reference)
     if rule.is_absolute or rule.is_before_stamp or not len(later):
         return rule
     with suppress(InputError):
-        by_later = decide_rule(name, later, stamps_ns[1], rate_hz, unit, reference)
+        by_later = decide_rule(name, later, stamp_ns, rate_hz, unit, reference)
         return by_later if by_later.is_absolute else rule
     return rule
 

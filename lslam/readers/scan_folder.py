@@ -5,6 +5,7 @@ from __future__ import annotations
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -216,19 +217,26 @@ def _time_rule(
     """How per-point times of the files are read, decided on the first scans that have any."""
     if files[0].suffix.lower() == ".bin":
         return None
-    timed = []
-    for path, stamp in zip(files[:5], stamps[:5], strict=True):
-        with suppress(InputError):
-            cloud = read_points(path)
-            if cloud.times is not None and len(cloud):
-                timed.append((cloud.time_field, cloud.times, int(stamp)))
-    if not timed:
+    count = min(len(files), 5)
+    index, name, first = _first_times(files, range(count))
+    _, _, later = _first_times(files, range(count - 1, index, -1))
+    if not len(first):
         return None
-    (name, first, begin), (_, later, late) = timed[0], timed[-1]
+    begin = int(stamps[index])
     try:
-        rule = rule_of_scans(name, first, later, (begin, late), rate, info.point_time_unit, info.point_time_reference)
+        rule = rule_of_scans(name, first, later, begin, rate, info.point_time_unit, info.point_time_reference)
     except InputError as error:
         voice.problems.append(f"no deskew: {error}")
         return None
     voice.notes.append(rule.sentence)
     return rule
+
+
+def _first_times(files: list[Path], indices: range) -> tuple[int, str, NDArray[Any]]:
+    """The first of the files `indices` whose points have times, the field's name and its values; else no values."""
+    for index in indices:
+        with suppress(InputError):
+            cloud = read_points(files[index])
+            if cloud.times is not None and len(cloud):
+                return index, cloud.time_field, cloud.times
+    return len(files), "", np.zeros(0)
