@@ -25,11 +25,13 @@ SPARSE = ("keyframes.distance=4",)
 
 @pytest.fixture(scope="module", autouse=True)
 def shared_odometry() -> Iterator[None]:
-    """Odometry knows no map: runs whose configurations differ in the section `osm` only share its results and keyframes."""
+    """Runs of the same scans whose configurations differ in the section `osm` alone share the results of odometry."""
     held: dict[str, tuple[list[ScanResult], KeyframeStore, list[Keyframe], list[MotionCheck]]] = {}
 
     def once(*given: Any, keyframing: Keyframing, monitor: IntegrityMonitor, **more: Any) -> list[ScanResult]:
-        key = keyframing._config.model_dump_json(exclude={"osm"})
+        sequence = given[0]
+        scans = hash((sequence.stamps_ns.tobytes(), sequence.scan(0).points.tobytes()))
+        key = f"{scans} {keyframing._config.model_dump_json(exclude={'osm'})}"
         if key not in held:
             results = estimate(*given, keyframing=keyframing, monitor=monitor, **more)
             keyframing.settle()
