@@ -70,6 +70,15 @@ if TYPE_CHECKING:
 @click.option(
     "--gnss-outage", type=(float, float), multiple=True, metavar="FROM TO", help="Seconds without fixes; repeatable."
 )
+@click.option(
+    "--visit",
+    type=int,
+    default=0,
+    metavar="N",
+    help="Drive there again, N-th time: other traffic and noise, the same town.",
+)
+@click.option("--reverse", is_flag=True, help="Drive in the opposite direction, on the other lane.")
+@click.option("--from", "shift", type=float, default=0.0, metavar="M", help="Begin so far along the line.")
 @click.option("--static-start", type=float, default=0.0, metavar="S", help="Stay at the start for S seconds first.")
 @click.option("--overwrite", is_flag=True, help="Replace sequences/00 and poses/00.txt in an existing folder.")
 @click.option("--resume", is_flag=True, help="Continue an interrupted simulation.")
@@ -93,6 +102,9 @@ def command(
     imu_model: str,
     gnss_rate: float,
     gnss_outage: tuple[tuple[float, float], ...],
+    visit: int,
+    reverse: bool,
+    shift: float,
     static_start: float,
     overwrite: bool,
     resume: bool,
@@ -127,6 +139,7 @@ def command(
     if out is not None:
         check_target(out, overwrite, resume)
     at = None if origin is None else _numbers(origin)
+    from lslam.simulation.routes import Visit
     from lslam.simulation.scenarios import simulate
     from lslam.simulation.sensors import GnssModel
 
@@ -147,6 +160,7 @@ def command(
         imu=imu_model if imu else None,
         gnss=GnssModel(gnss_rate, outages=gnss_outage) if gnss_rate else None,
         static_start=static_start,
+        visit=Visit(visit, reverse, shift),
     )
     if plan is not None:
         _draw(drive, plan)

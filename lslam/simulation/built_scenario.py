@@ -23,7 +23,17 @@ from lslam.simulation.lidar import RayScene
 from lslam.simulation.moving import Mover, add_traffic
 from lslam.simulation.osm_city import OsmCity
 from lslam.simulation.osm_place import MapExtract, city_of_map, keep_out_of_walls, route_in_map
-from lslam.simulation.routes import SPARE, TIGHTEST, Route, given_route, own_route, speed_profile
+from lslam.simulation.routes import (
+    FIRST_VISIT,
+    SPARE,
+    TIGHTEST,
+    Route,
+    Visit,
+    given_route,
+    own_route,
+    speed_profile,
+    visited,
+)
 from lslam.simulation.scenario_files import INDOORS, Scenario
 from lslam.simulation.scene_mesh import Surface
 from lslam.simulation.stairwell import build_stairwell
@@ -57,12 +67,13 @@ def build_scenario(
     way_points: WayPoints | None = None,
     extract: MapExtract | None = None,
     standing: int = 0,
+    visit: Visit = FIRST_VISIT,
 ) -> BuiltScenario:
     """Build the place of `scenario`; one generator per part, so that another LiDAR or speed leaves the city as it is.
 
     Only an out-and-back, and what is round it, is longer when a speed or `count` needs it. `way_points` replace the scenario's
-    own line, `extract` its town; `standing` of the `count` scans pass before it moves off. Raises UsageError for bends too
-    tight and more scans than fit, InputError for an extract that is far from the way-points.
+    own line, `extract` its town; `standing` of the `count` scans pass before it moves off; `visit` is another drive.
+    Raises UsageError for bends too tight and more scans than fit, InputError for an extract that is far from the way-points.
     """
     if scenario.world.kind in INDOORS and (way_points is not None or extract is not None):
         raise UsageError(
@@ -75,8 +86,11 @@ def build_scenario(
         moving = None if count is None else count - standing
         route = given_route(scenario, way_points) if way_points is not None else own_route(scenario, place, moving)
     terrain = _terrain(scenario, place)
-    _check_radius(scenario, route.line)
-    path, scans = _move(scenario, route, terrain, count, standing, shake)
+    way = visited(route, scenario, visit)
+    _check_radius(scenario, way.line)
+    if visit.number:
+        shake = np.random.default_rng([*visit.seeds(seed), 2**32 - 3])
+    path, scans = _move(scenario, way, terrain, count, standing, shake)
     if extract is not None:
         return BuiltScenario(city_of_map(scenario, extract, terrain, build, route), path, scans)
     return BuiltScenario(_city(scenario, route.street, terrain, build), path, scans)
@@ -97,11 +111,11 @@ def whole_map(scenario: Scenario, seed: int, extract: MapExtract) -> tuple[OsmCi
     return city_of_map(scenario, extract, terrain, build, None), np.column_stack([xy, np.zeros(len(xy))])
 
 
-def populate(scenario: Scenario, city: City, path: PosePath, seed: int) -> list[Mover]:
+def populate(scenario: Scenario, city: City, path: PosePath, seeds: tuple[int, ...]) -> list[Mover]:
     """What moves in `city` while the LiDAR is on `path`."""
     traffic = scenario.traffic
     movers = add_traffic(
-        city.streets, city.terrain, path.poses, path.duration, np.random.default_rng([seed, 2**32 - 4]),
+        city.streets, city.terrain, path.poses, path.duration, np.random.default_rng([*seeds, 2**32 - 4]),
         cars_per_km=traffic.cars, people_per_km=traffic.people, lanes=traffic.lanes,
         pavement=scenario.layout.road + 0.6 * scenario.layout.pavement, speed=traffic.speed,
     )  # fmt: skip

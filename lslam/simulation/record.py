@@ -67,6 +67,7 @@ def describe_drive(drive: SimulatedDrive) -> dict[str, Any]:
         "name": drive.name,
         "scenario": drive.scenario.model_dump(mode="json"),
         "seed": drive.seed,
+        "visit": asdict(drive.visit),
         "lidar": asdict(drive.lidar),
         "scans": len(drive),
         "rate_hz": drive.rate_hz,
@@ -79,6 +80,7 @@ def describe_drive(drive: SimulatedDrive) -> dict[str, Any]:
         "extrinsics": {key: T for key, T in vars(drive.calibration).items() if key.startswith("T_") and T is not None},
         "place": {
             "origin_lat_lon_alt": sensors.origin,
+            "T_city_world": drive.T_city_world,
             "buildings": len(drive.city.footprints),
             "triangles": len(drive.city.mesh.faces),
             "moving": len(drive.movers),
@@ -108,6 +110,7 @@ def fingerprint(drive: SimulatedDrive) -> str:
         "scenario": drive.scenario.model_dump(mode="json"),
         "lidar": asdict(drive.lidar),
         "seed": drive.seed,
+        "visit": asdict(drive.visit),
         "scans": len(drive),
         "compensated": drive.motion_compensated,
     }

@@ -34,6 +34,50 @@ class Route:
     climb: tuple[Floats, Floats] | None = None
 
 
+@dataclass(frozen=True)
+class Visit:
+    """Another drive through the town of a seed.
+
+    number : of the visit; seeds the traffic and all noise. 0 is the drive that the town was built for
+    is_reversed : along the other lane in the opposite direction
+    shift : m; the drive begins so far along the line
+    """
+
+    number: int = 0
+    is_reversed: bool = False
+    shift: float = 0.0
+
+    def seeds(self, seed: int) -> tuple[int, ...]:
+        """What seeds all that differs from visit to visit, in the town of `seed`."""
+        return (seed, self.number) if self.number else (seed,)
+
+
+FIRST_VISIT = Visit()
+
+
+def visited(route: Route, scenario: Scenario, visit: Visit) -> Route:
+    """The route as a visit takes it; the street, and with it the town, stays.
+
+    Raises UsageError for a shift beyond the line, and for what no other visit can take: a line in three dimensions.
+    """
+    if not visit.is_reversed and visit.shift == 0:
+        return route
+    if route.climb is not None or scenario.path.shape in ("eights", "out-and-back"):
+        raise UsageError(f"scenario {scenario.name!r} can only be visited as it is: leave out --reverse and --from")
+    line = beside(route.street, scenario.path.lane) if visit.is_reversed and scenario.path.lane else route.line
+    if not 0 <= visit.shift < line.length - SPARE:
+        raise UsageError(f"--from {visit.shift:g} is out of range: 0 to {line.length - SPARE:.0f} m of the line")
+    s = line.sample(0.5)
+    s = line.length - s if visit.is_reversed else s
+    travelled = (np.arange(len(s)) * line.length / len(s)) if line.closed else np.abs(s - s[0])
+    points = line.position(s)
+    if line.closed:
+        points = np.roll(points, -int(np.searchsorted(travelled, visit.shift)), axis=0)
+    else:
+        points = points[travelled >= visit.shift]
+    return Route(route.street, smooth_curve(points, line.closed))
+
+
 def speed_profile(scenario: Scenario) -> SpeedProfile:
     """What limits a car in this scenario."""
     return SpeedProfile(scenario.speed, scenario.start_speed, lateral=scenario.lateral)

@@ -19,6 +19,7 @@ from lslam.simulation.lidar import RayScene, Roof, trace
 from lslam.simulation.lidar_models import LidarModel, lidar_named
 from lslam.simulation.moving import Mover, moving_meshes
 from lslam.simulation.osm_place import read_extract
+from lslam.simulation.routes import FIRST_VISIT, Visit
 from lslam.simulation.scenario_files import Scenario, scenario_named
 from lslam.simulation.sensors import ORIGIN, GnssModel, Sensors, read_sensors
 from lslam.simulation.waypoints import WayPoints, read_way_points
@@ -56,12 +57,14 @@ class SimulatedDrive:
         movers: Sequence[Mover] = (),
         scene: RayScene | None = None,
         origin: NDArray[np.float64] = ORIGIN,
+        visit: Visit = FIRST_VISIT,
     ) -> None:
         self.scenario, self.city, self.lidar, self.movers = scenario, city, lidar, list(movers)
         # One function of time for the rays, the truth and all other sensors.
         self.vehicle = smooth_motion(path)
-        self.seed = seed
-        self.name = f"{scenario.name}-{seed}"
+        self.seed, self.visit = seed, visit
+        self._seeds = visit.seeds(seed)
+        self.name = f"{scenario.name}-{seed}" + (f"-visit{visit.number}" if visit.number else "")
         self.path = Path(self.name)
         self.rate_hz = scenario.rate_hz
         self.motion_compensated: bool | None = motion_compensated
@@ -73,7 +76,7 @@ class SimulatedDrive:
         )
         self.end = self.stamps_ns[-1] / 1e9 + 1 / self.rate_hz
         self.sensors = sensors or Sensors()
-        self.readings = read_sensors(self.vehicle, self.sensors, scenario.carrier, self.end, seed, origin)
+        self.readings = read_sensors(self.vehicle, self.sensors, scenario.carrier, self.end, self._seeds, origin)
         imu, gnss = self.readings.imu, self.readings.gnss
         self.calibration = Calibration(
             T_cam0_lidar=kitti_like_cam0(),
@@ -84,7 +87,7 @@ class SimulatedDrive:
         self.gnss: GnssStream | None = None if gnss is None else gnss.stream
         self.notes: list[str] = []
         self.problems: list[str] = []
-        self._shaking = shaking(scenario.vibration, np.random.default_rng([seed, _SHAKING_SEED]))
+        self._shaking = shaking(scenario.vibration, np.random.default_rng([*self._seeds, _SHAKING_SEED]))
         self._roof = None if scenario.roof is None else Roof(*scenario.roof, scenario.roof_returns)
         self.scene = RayScene(city.mesh) if scene is None else scene
 
@@ -110,7 +113,7 @@ class SimulatedDrive:
             poses = self.vehicle.poses(fired)
         if self._shaking is not None:
             poses = self._shaking.shaken(poses, fired)
-        rng = np.random.default_rng([self.seed, index])
+        rng = np.random.default_rng([*self._seeds, index])
         here = poses if poses.ndim == 2 else poses[len(poses) // 2]
         bodies = moving_meshes(self.movers, here[:3, 3], start, self.lidar.range_max + SPARE_REACH)
         return trace(
@@ -135,6 +138,7 @@ def simulate(
     imu: str | ImuModel | None = None,
     gnss: GnssModel | None = None,
     static_start: float = 0.0,
+    visit: Visit = FIRST_VISIT,
 ) -> SimulatedDrive:
     """Set up a drive: the city is built now, scans are traced later.
 
@@ -153,6 +157,7 @@ def simulate(
         else the first point of GeoJSON way-points, else a place of no meaning)
     imu, gnss : an IMU (a name of `IMUS` or a model) and a receiver that ride along
     static_start : s of standing still before the drive begins; its scans come on top of a default `count`
+    visit : another drive through the same town: other traffic and noise, another start, the opposite direction
 
     Raises
     ------
@@ -191,7 +196,7 @@ def simulate(
             update={"name": osm.stem, "summary": f"As {chosen.name!r}, in the city of {osm.name}."}
         )
     standing = int(static_start * chosen.rate_hz)
-    place = build_scenario(chosen, seed, count, line, extract, standing)
+    place = build_scenario(chosen, seed, count, line, extract, standing, visit)
     scene = RayScene(place.city.mesh)
     if chosen.path.clearance:
         check_path(scene, place.city, place.path.poses, place.path.duration)
@@ -200,9 +205,9 @@ def simulate(
     if static_start > 0:
         path = standing_start(path, static_start)
         scans += 0 if count is not None else int((path.duration - place.path.duration) * chosen.rate_hz)
-    movers = populate(chosen, place.city, path, seed)
+    movers = populate(chosen, place.city, path, visit.seeds(seed))
     still = chosen.motion_compensated if motion_compensated is None else motion_compensated
-    return SimulatedDrive(chosen, place.city, path, model, scans, seed, still, sensors, movers, scene, at)
+    return SimulatedDrive(chosen, place.city, path, model, scans, seed, still, sensors, movers, scene, at, visit)
 
 
 def checked_origin(origin: Iterable[float]) -> NDArray[np.float64]:

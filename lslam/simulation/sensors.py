@@ -162,7 +162,7 @@ class Readings:
 
 
 def read_sensors(
-    motion: Motion, sensors: Sensors, carrier: str, end: float, seed: int, origin: Floats = ORIGIN
+    motion: Motion, sensors: Sensors, carrier: str, end: float, seeds: tuple[int, ...], origin: Floats = ORIGIN
 ) -> Readings:
     """Let `sensors` record from 0 to `end` s of `motion`, each with a generator of its own.
 
@@ -170,10 +170,10 @@ def read_sensors(
     """
     mounts, imu, gnss = MOUNTS[carrier], None, None
     if sensors.imu is not None:
-        generator = np.random.default_rng([seed, _IMU_SEED])
+        generator = np.random.default_rng([*seeds, _IMU_SEED])
         imu = simulate_imu(motion, sensors.imu, mounts.T_lidar_imu, end, generator)
     if sensors.gnss is not None:
-        generator = np.random.default_rng([seed, _GNSS_SEED])
+        generator = np.random.default_rng([*seeds, _GNSS_SEED])
         gnss = simulate_gnss(motion, sensors.gnss, mounts.T_lidar_antenna, origin, end, generator)
     return Readings(imu, gnss, np.asarray(origin, np.float64))
 
