@@ -17,7 +17,7 @@ LAYERS = [
     ["studies", "convert"],
     ["pipeline"],
     ["doctor", "osm"],
-    ["frontend", "backend"],
+    ["frontend", "backend", "localization"],
     ["reports"],
     ["readers", "odometry", "inertial", "integrity", "loops", "graph", "maps", "evaluation", "simulation"],
     ["recovery"],

@@ -16,6 +16,7 @@ from lslam.version import __version__
 # name -> one line for --help; the module lslam.cli.<name> has the click command `command`.
 COMMANDS = {
     "run": "Estimate a trajectory and build a map from a recorded sequence.",
+    "localize": "Locate a drive in a map that exists.",
     "eval": "Score estimated trajectories against ground truth.",
     "compare": "Compare methods on the same sequences.",
     "batch": "Make many runs, from a file or from lines of lslam run.",

@@ -96,10 +96,11 @@ def command(sequence: str, **given: Any) -> None:
     from lslam.warned import hearing
 
     with hearing():
-        _run(sequence, given)
+        perform(sequence, given)
 
 
-def _run(sequence: str, given: dict[str, Any]) -> None:
+def perform(sequence: str, given: dict[str, Any]) -> None:
+    """Run what the options describe, and print the result."""
     _check_folder(given)
     opened, config = opened_with({**given, "sequence": sequence})
     truth = read_truth(given["gt"], opened)
@@ -153,7 +154,8 @@ def resolved(given: dict[str, Any]) -> Config:
 
 def _variant(config: Config) -> str:
     """Method and sensors, for the name of the default folder."""
-    return config.odometry.method + ("-imu" if config.imu.use else "") + ("-osm" if config.osm.extract else "")
+    parts = {"-imu": config.imu.use, "-osm": config.osm.extract, "-in-map": config.localize.map}
+    return config.odometry.method + "".join(word for word, is_used in parts.items() if is_used)
 
 
 def _check_folder(given: dict[str, Any]) -> None:

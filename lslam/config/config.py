@@ -16,6 +16,7 @@ from lslam.config.keyframes import KeyframesConfig
 from lslam.config.lio_mapping import LioMappingConfig
 from lslam.config.lio_sam import LioSamConfig
 from lslam.config.loam import LoamConfig
+from lslam.config.localize import LocalizeConfig
 from lslam.config.loops import LoopsConfig
 from lslam.config.map import MapConfig
 from lslam.config.odometry import TIGHTLY_COUPLED, OdometryConfig
@@ -42,6 +43,7 @@ class Config(Section):
     keyframes: KeyframesConfig = KeyframesConfig()
     loops: LoopsConfig = LoopsConfig()
     graph: GraphConfig = GraphConfig()
+    localize: LocalizeConfig = LocalizeConfig()
     gnss: GnssConfig = GnssConfig()
     osm: OsmConfig = OsmConfig()
     map: MapConfig = MapConfig()

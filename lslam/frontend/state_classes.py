@@ -20,6 +20,7 @@ from lslam.types.gravity import GravityDirection
 from lslam.types.imu import ImuStream
 from lslam.types.imu_state import ImuState
 from lslam.types.inertial_state import InertialState, InertialStep
+from lslam.types.map_fix import MapFix
 from lslam.types.motion_check import MotionCheck
 from lslam.types.preintegration import MotionState, PreintegratedStep
 from lslam.types.scan_equations import ScanEquations
@@ -27,7 +28,7 @@ from lslam.types.scan_result import ScanResult
 
 STATE_CLASSES = (
     Constraint, FeaturePoints, Features, FeatureScan, GravityDirection, Gyroscope, ImuEstimate, ImuNoise, ImuState, ImuStream,
-    InertialState, InertialStep, Landmarks, LoopCandidate, Moment, MotionCheck, MotionState, NavigationState, Past,
+    InertialState, InertialStep, Landmarks, LoopCandidate, MapFix, Moment, MotionCheck, MotionState, NavigationState, Past,
     PlaneWindow, PreintegratedStep, PreparedPoints, ScanEquations, ScanResult, Seen, Sightings, InertialStart, Window,
     WindowPrior, WindowValues,
 )  # fmt: skip

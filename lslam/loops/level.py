@@ -33,11 +33,16 @@ def find_up(maps: Iterable[GaussianMap]) -> Floats:
     return up
 
 
-def levelled(keyframes: Sequence[Keyframe], up: Floats) -> list[Keyframe]:
-    """The keyframes in a world turned by the least rotation that makes the unit vector `up` (3,) its z axis."""
+def level_rotation(up: Floats) -> Floats:
+    """(3, 3) the least rotation that makes the unit vector `up` (3,) the z axis."""
     axis = np.cross(up, [0.0, 0.0, 1.0])
     sine = float(np.linalg.norm(axis))
-    R = np.eye(3) if sine < 1e-12 else so3.exp(axis / sine * np.arctan2(sine, up[2]))
+    return np.eye(3) if sine < 1e-12 else so3.exp(axis / sine * np.arctan2(sine, up[2]))
+
+
+def levelled(keyframes: Sequence[Keyframe], up: Floats) -> list[Keyframe]:
+    """The keyframes in a world turned by the least rotation that makes the unit vector `up` (3,) its z axis."""
+    R = level_rotation(up)
     T, turn = se3.make(R, np.zeros(3)), np.kron(np.eye(2), R)
     return [
         replace(k, T_world_lidar=T @ k.T_world_lidar, covariance=None if k.covariance is None else turn @ k.covariance @ turn.T)

@@ -145,12 +145,13 @@ def write_back_end(folder: Path, record: RunRecord, store: KeyframeStore, done: 
         return
     write_tum(
         folder / "trajectory_odometry.tum", record.odometry,
-        comment=f"lslam {__version__}, {record.method}: T_world_lidar of odometry, before the pose graph\n"
+        comment=f"lslam {__version__}, {record.method}: T_world_lidar of odometry, in a world of its own\n"
         f"pose_time: {record.pose_time}",
     )  # fmt: skip
     if done.osm is not None:
         write_osm_matches(folder / "osm_matches.csv", done.osm, store.keyframes, se2.of_se3(done.keyframes))
-    write_loops(folder / "loops.csv", done.candidates, store.keyframes)
+    if not record.map_fixes:
+        write_loops(folder / "loops.csv", done.candidates, store.keyframes)
     if done.is_optimised:
         write_g2o(folder / "graph.g2o", done.keyframes, done.constraints)
 

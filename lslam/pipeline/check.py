@@ -60,6 +60,8 @@ def check_config(config: Config) -> None:
             "--crs does nothing without --gnss, --georeference or --osm, which tell where on the Earth the run lies: give one "
             "of them, or drop it"
         )
+    if config.localize.map and config.osm.extract:
+        raise UsageError("--osm holds a drive by buildings and a map by its surfaces: drop one of them")
     for delta in config.eval.delta:
         parse_delta(delta)
     check_words(config.eval.metrics)

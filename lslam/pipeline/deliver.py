@@ -81,6 +81,8 @@ def _fill(folder: RunFolder, job: PreparedRun, goes_on: bool) -> tuple[RunRecord
         write_buildings(folder.path, record.buildings, job.osm.data)
     outputs.write_trajectories(folder, record, job.sequence.calibration)
     outputs.write_scans(folder, record)
+    if record.map_fixes:
+        outputs.write_localization(folder, record)
     try:
         make_map(folder, job, record)
     finally:  # with the map's crispness, and whatever becomes of the map

@@ -25,6 +25,7 @@ from lslam.odometry.given import GivenMotion, GivenPoses
 from lslam.osm.source import OsmSource, open_osm
 from lslam.pipeline.check import check_config
 from lslam.pipeline.manifest import Manifest, describe_deskew
+from lslam.pipeline.prior_map_files import require_map
 from lslam.pipeline.watch import Watch
 from lslam.readers import open_sequence
 from lslam.readers.raw_drive import with_streams
@@ -66,6 +67,8 @@ def prepare(
     if isinstance(odometry, GivenPoses):
         sequence.notes.extend(bind(odometry, sequence))
         given = odometry.trajectory
+    if config.localize.map:
+        require_map(Path(config.localize.map), config.gnss.mode != "off")
     chosen = choose_scans(sequence, odometry, config)
     osm = open_osm(sequence, config)
     return PreparedRun(chosen, odometry, config, truth, given, Manifest(command, chosen, config), watch, osm)

@@ -43,6 +43,7 @@ class Manifest:
     world : where the coordinates begin and whether z is up
     imu : what became of the IMU, empty without `--imu`; keyframes : how many and how large
     graph, georeference : what the back end did and where on the Earth the world lies, empty where it did nothing
+    localization : how the drive was found in a map that exists and how many scans that holds, empty without one
     identity : digests that a run and its resumption share; resumed_after : scans that were done when it was resumed
     posed_by : scans by who posed them: the method, what stood in for it, the motion prior
     integrity : how many pairs of scans checked the motion beside the method, how many were conclusive, and the alerts raised
@@ -68,6 +69,7 @@ class Manifest:
         self.keyframes: dict[str, Any] = {}
         self.graph: dict[str, Any] = {}
         self.georeference: dict[str, Any] = {}
+        self.localization: dict[str, Any] = {}
         self.identity: dict[str, str] = {}
         self.resumed_after: list[int] = []
         self._ended = ""
@@ -174,6 +176,7 @@ class Manifest:
             **({"keyframes": dict(self.keyframes)} if self.keyframes else {}),
             **({"graph": dict(self.graph)} if self.graph else {}),
             **({"georeference": dict(self.georeference)} if self.georeference else {}),
+            **({"localization": dict(self.localization)} if self.localization else {}),
             **({"map_points": self.map_points} if self.map_points is not None else {}),
             "timings": {name: round(seconds, 3) for name, seconds in self.timings.items()},
             "peak_memory_mb": peak_memory_mb(),

@@ -162,7 +162,7 @@ def _warm_up(
             stationary.warm_up()
         if monitor is not None and not is_over:
             monitor.warm_up()
-        if config.loops.use:
+        if config.loops.use or config.localize.map:
             detector.warm_up(config.loops)
         if config.osm.extract:
             prior.warm_up()

@@ -93,6 +93,25 @@ def write_scans(folder: RunFolder, record: RunRecord) -> None:
         folder.write_text("imu_states.csv", imu_states_text(record.results))
 
 
+def write_localization(folder: RunFolder, record: RunRecord) -> None:
+    """localization.csv: each scan against the map that the run was located in, its place in the coordinates of the map's file."""
+    rows = [
+        "index,stamp_ns,status,doubted,overlap,inlier_share,innovation_m,innovation_deg,sigma_m,sigma_deg,x,y,z,reason"
+    ]
+    for result, fix in zip(record.results, record.map_fixes, strict=True):
+        sigma_m, sigma_rad = (
+            np.sqrt(np.linalg.eigvalsh(C)[-1]) for C in (fix.covariance[:3, :3], fix.covariance[3:, 3:])
+        )
+        at = fix.T_map_lidar[:3, 3] + record.map_origin
+        values = (
+            result.index, result.stamp_ns, fix.status, int(fix.is_doubted), f"{fix.overlap:.4f}", f"{fix.inlier_share:.4f}",
+            f"{fix.innovation[0]:.5f}", f"{np.rad2deg(fix.innovation[1]):.5f}", f"{sigma_m:.5f}", f"{np.rad2deg(sigma_rad):.5f}",
+            *(f"{v:.4f}" for v in at), fix.reason.replace(",", ";"),
+        )  # fmt: skip
+        rows.append(",".join(str(v) for v in values))
+    folder.write_text("localization.csv", "\n".join(rows) + "\n")
+
+
 def write_map(folder: RunFolder, built: BuiltMap, config: MapConfig, record: RunRecord) -> None:
     """map.ply, .pcd, .las or .laz with map.json beside, in map coordinates where the run knows where it is."""
     folder.require_space(BYTES_PER_POINT * len(built.merged), "the map")

@@ -15,9 +15,10 @@ from lslam.keyframes.store import KeyframeStore
 from lslam.maps.crispness import crispness
 from lslam.odometry.base import FeatureSource
 from lslam.pipeline import outputs
-from lslam.pipeline.back_end_pass import level_world, optimise_poses
+from lslam.pipeline.back_end_pass import describe, level_world, optimise_poses
 from lslam.pipeline.feature_pass import build_feature_map, view_features
 from lslam.pipeline.job import PreparedRun, announce, stoppable
+from lslam.pipeline.localise_pass import localise_poses
 from lslam.pipeline.map_pass import build_map, map_checkpoints
 from lslam.pipeline.odometry_pass import estimate_poses
 from lslam.pipeline.run_folder import REPLIES, RunFolder
@@ -37,11 +38,25 @@ def solve(
     record = estimate_poses(
         job.sequence, job.odometry, job.config, job.manifest, folder, job.truth, job.watch, store, checkpoints, job.osm
     )
+    if job.config.localize.map:
+        return located(job, record, store, checkpoints)
     loops = None if checkpoints is None else Checkpoints(checkpoints.folder, "loops", job.config.odometry.checkpoint_s)
     done = optimise_poses(job.sequence, record, store, job.config, job.manifest, job.osm, loops, job.watch.should_stop)
     level_world(record, job.sequence, job.config, job.manifest)
     record.loop_view = view_loop(record, done, store)
     return record, done, score(record, job.sequence, job.config)
+
+
+def located(
+    job: PreparedRun, record: RunRecord, store: KeyframeStore, checkpoints: OdometryCheckpoints | None
+) -> tuple[RunRecord, BackEnd, Evaluation | None]:
+    """The poses of all scans in the map of an earlier run, which takes the place of loops and pose graph."""
+    every_s = job.config.odometry.checkpoint_s
+    kept = None if checkpoints is None else Checkpoints(checkpoints.folder, "localise", every_s)
+    localise_poses(job.sequence, record, store, job.config, job.manifest, job.watch, kept)
+    if record.georeference is not None:
+        job.manifest.georeference = describe(record.georeference)
+    return record, BackEnd(record.results), score(record, job.sequence, job.config)
 
 
 def score(record: RunRecord, sequence: Sequence, config: Config) -> Evaluation | None:

@@ -21,15 +21,16 @@ class LocalMap(Stateful):
     Parameters
     ----------
     size : m, edge of a fine voxel; coarse_factor : how many times larger a coarse one is
-    min_points, planarity, count_cap, reach : as in `GaussianMap`
+    min_points, planarity, count_cap, reach, breadth : as in `GaussianMap`
     """
 
     def __init__(
-        self, size: float, *, coarse_factor: int, min_points: int, planarity: float, count_cap: float, reach: float
-    ) -> None:
+        self, size: float, *, coarse_factor: int, min_points: int, planarity: float, count_cap: float, reach: float,
+        breadth: float = BREADTH,
+    ) -> None:  # fmt: skip
         self.levels = tuple(
             GaussianMap(
-                edge, min_points=min_points, planarity=planarity, count_cap=count_cap, reach=reach, breadth=BREADTH
+                edge, min_points=min_points, planarity=planarity, count_cap=count_cap, reach=reach, breadth=breadth
             )
             for edge in (size, *(size * coarse_factor * wider for wider in (1, *WIDE)))
         )

@@ -37,7 +37,7 @@ def back_end_rows(record: RunRecord, evaluation: Evaluation | None) -> list[tupl
         tried = sum(c.stage != "thinned" for c in record.loops)
         text = f"{closed} closed of {tried} tried"
         if evaluation is not None and evaluation.odometry is not None:
-            text += f"; {_before_and_after(evaluation, evaluation.odometry)}"
+            text += f"; {before_and_after(evaluation, evaluation.odometry)}"
         rows.append(("loops", text))
     place = record.georeference
     if place is not None:
@@ -88,7 +88,8 @@ def back_end_figures(record: RunRecord, evaluation: Evaluation | None) -> list[F
         tracks.append(Track("ground truth", truth[:, :2], "gt"))
         legend.append(("gt", "ground truth"))
     tracks += [Track("before", before, "s2"), Track("after", after, "s1", ends=True)]
-    legend += [("s2", "odometry"), ("s1", "after the pose graph")]
+    what = "localisation in the map" if record.map_fixes else "the pose graph"
+    legend += [("s2", "odometry"), ("s1", f"after {what}")]
     closed = [c for c in record.loops if c.is_accepted]
     for loop in closed:
         ends = record.keyframe_scans[[loop.a, loop.b]]
@@ -103,12 +104,12 @@ def back_end_figures(record: RunRecord, evaluation: Evaluation | None) -> list[F
         enlarged = f", drawn {factor:g} times as large" if factor > 1 else ""
         beside = " beside the map's own shift" if _common(record).any() else ""
         legend.append(("s4", f"{SIGMAS:g} sigma{beside}{enlarged}"))
-    chart = plane_chart(tracks, "before and after the pose graph", width=720, tallest=760)
-    whole = Figure("Before and after the pose graph", chart, tuple(legend), caption, wide=True)
+    chart = plane_chart(tracks, f"before and after {what}", width=720, tallest=760)
+    whole = Figure(f"Before and after {what}", chart, tuple(legend), caption, wide=True)
     return [whole, *_error_figures(evaluation), *loop_figures(record.loop_view)]
 
 
-def _before_and_after(after: Evaluation, before: Evaluation) -> str:
+def before_and_after(after: Evaluation, before: Evaluation, what: str = "the pose graph") -> str:
     """ATE of both by the first alignment that both have."""
     name = _common_alignment(after, before)
     if name is None:
@@ -116,7 +117,7 @@ def _before_and_after(after: Evaluation, before: Evaluation) -> str:
     was, now = (error.translation for error in (before.ate[name], after.ate[name]))
     assert was is not None
     assert now is not None
-    return f"ATE {name} {metres(was.rmse)} m before the pose graph, {metres(now.rmse)} m after"
+    return f"ATE {name} {metres(was.rmse)} m before {what}, {metres(now.rmse)} m after"
 
 
 def _common_alignment(after: Evaluation, before: Evaluation) -> str | None:
@@ -141,7 +142,7 @@ def _error_figures(evaluation: Evaluation | None) -> list[Figure]:
     ]
     title = "Position error before and after the pose graph"
     chart = svg.line_chart(lines, DISTANCE, "position error, m", title)
-    caption = f"{_before_and_after(evaluation, before)}; {ALIGNED.get(name, name)}."
+    caption = f"{before_and_after(evaluation, before)}; {ALIGNED.get(name, name)}."
     return [Figure(title, chart, tuple((line.style, line.label) for line in lines), caption)] if chart else []
 
 

@@ -8,6 +8,7 @@ from lslam.evaluation.evaluate import shown_metrics
 from lslam.printable import counted, metres
 from lslam.reports.back_end import back_end_rows
 from lslam.reports.facts import Failure, RunFacts, run_facts
+from lslam.reports.localization import localization_rows
 from lslam.types.run_record import RunRecord
 from lslam.types.stage_clock import summed
 
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
 MOST_FAILURES = 5
 FILES = (
     ("trajectory", "trajectory.tum"),
+    ("in the map", "localization.csv"),
     ("map", "map.ply"),
     ("map", "map.pcd"),
     ("map", "map.las"),
@@ -34,7 +36,7 @@ def summary(record: RunRecord, evaluation: Evaluation | None) -> str:
     rows += _scan_rows(facts)
     rows.append(("path", f"{facts.path_length:.1f} m in {facts.duration:.1f} s"))
     rows += imu_rows(record)
-    rows += back_end_rows(record, evaluation)
+    rows += localization_rows(record, evaluation) + back_end_rows(record, evaluation)
     rows += _score_rows(record, evaluation)
     rows += _map_rows(record)
     rows += _time_rows(record, facts)

@@ -14,6 +14,7 @@ from lslam.types.constraint import LoopCandidate, Turn
 from lslam.types.gnss import Georeference
 from lslam.types.imu import ImuStream
 from lslam.types.inertial_state import InertialChain
+from lslam.types.map_fix import MapFix
 from lslam.types.scan_result import ScanResult
 from lslam.types.trajectory import Trajectory
 
@@ -141,6 +142,8 @@ class RunRecord:
     back_end_seconds : by the number of its scan, what each stage after odometry took a keyframe, s; the whole graph with the last
     loop_view : the map at the loop that was corrected most, None without one
     features : what a feature method saw, None of another
+    map_fixes : each scan against the map that the run was located in, empty without one; map_origin : (3,) m, what the
+        coordinates of that map are less in this world
     imu : the recording's, None of a run that uses none
     """
 
@@ -173,3 +176,5 @@ class RunRecord:
     imu: ImuStream | None = None
     osm: OsmMatches | None = None
     buildings: CorrectedMap | None = None
+    map_fixes: list[MapFix] = field(default_factory=list)
+    map_origin: Floats = field(default_factory=lambda: np.zeros(3))

@@ -1,0 +1,91 @@
+"""`lslam localize`: a run whose poses come from a map that exists."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import click
+
+from lslam.cli import options
+from lslam.cli import run as main_job
+from lslam.cli.console import setup_logging
+
+
+@click.command(
+    epilog="\b\nExamples: lslam localize tuesday --map runs/monday\n"
+    "          lslam localize tuesday --map survey.laz --start 412.5,-80,95 --imu\n"
+    "          lslam localize tuesday.bag --map runs/monday --gnss --method fast-lio2 --json"
+)
+@click.argument("sequence")
+@click.option(
+    "--map", "map_path", type=click.Path(path_type=Path), metavar="MAP", required=True,
+    help="Run folder, or a cloud: PLY, PCD, LAS or LAZ.",
+)  # fmt: skip
+@click.option(
+    "--start", metavar="X,Y,HEADING",
+    help="Place of the first scan in the map, m, and heading, deg counter-clockwise from its x axis [default: searched].",
+)  # fmt: skip
+@click.option("--gnss", is_flag=True, help="Search the start about the first satellite fix, in a georeferenced map.")
+@click.option("--method", metavar="NAME", help="Odometry method, see `lslam methods` [default: icp].")
+@options.preset
+@click.option(
+    "--poses",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="Trajectory of another program instead of odometry.",
+)
+@click.option("--imu/--no-imu", default=None, help="Predict and deskew with the IMU [default: no].")
+@click.option(
+    "--gt", type=click.Path(path_type=Path), metavar="FILE", help="Ground truth instead of the sequence's own."
+)
+@click.option("--save-map", is_flag=True, help="Write a map of this drive too, in the frame of the old one.")
+@click.option(
+    "--out",
+    type=options.Place(path_type=Path),
+    metavar="DIR|URL",
+    help="Run folder [default: runs/NAME-METHOD-in-map-TIME].",
+)
+@click.option("--resume", is_flag=True, help="Go on with a run that was killed or interrupted; needs its --out.")
+@click.option("--overwrite", is_flag=True, help="Replace an earlier run in the folder.")
+@click.option("--first", type=int, metavar="N", help="First scan used.")
+@click.option("--count", type=int, metavar="N", help="Number of scans used.")
+@click.option("--skip-frames", type=int, metavar="N", help="Use every N-th scan.")
+@click.option("--threads", type=int, metavar="N", help="0: as many as there are cores; 1: one. Results stay the same.")
+@click.option("--strict", is_flag=True, help="Exit 4 when anything was degraded: a scan that the map does not hold.")
+@click.option("--dry-run", is_flag=True, help="Resolve everything, write nothing.")
+@options.reading
+@options.data_root
+@options.configuration
+@options.as_json
+@options.verbosity
+def command(sequence: str, map_path: Path, **given: Any) -> None:
+    """Locate a drive in a map that exists: trajectory.tum is in the map's frame.
+
+    Any odometry method carries the poses from scan to scan, and each scan is registered on the map, which never changes.
+    Where the map has changed or ends, odometry carries on; localization.csv says where. Exit 1 when the drive is not found
+    in the map.
+    """
+    setup_logging(given["verbose"], given["quiet"])
+    from lslam.warned import hearing
+
+    options.require_there(map_path)
+    settings = [f"localize.map={json.dumps(str(map_path), ensure_ascii=False)}", "loops.use=false"]
+    if given["start"] is not None:
+        settings.append(f"localize.start={json.dumps(_start_of(given['start']))}")
+    if not given["save_map"]:
+        settings.append("map.write=false")
+    others = {str(p.name): () if getattr(p, "multiple", False) else None for p in main_job.command.params}
+    about = {"start": given["first"], "gnss": "fit" if given["gnss"] else None}
+    about["settings"] = (*given["settings"], *settings)
+    with hearing():
+        main_job.perform(sequence, {**others, **given, **about})
+
+
+def _start_of(text: str) -> list[float]:
+    if text.isdecimal():
+        raise click.UsageError(
+            f"--start {text}: a place in the map, X,Y,HEADING; to begin at that scan say --first {text}"
+        )
+    return options.numbers("--start", text, (3,), "X,Y,HEADING, for example 412.5,-80,95")

@@ -1,0 +1,145 @@
+"""Scans registered one after the other on a map that does not change, with odometry as the prior."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.config.config import Config
+from lslam.geometry import noise, se3, so3
+from lslam.graph.chi_square import quantile
+from lslam.graph.drift import drift_covariance
+from lslam.graph.odometry_constraints import growth
+from lslam.localization.prior_map import LocalView
+from lslam.preprocessing.prepare import PreparedPoints
+from lslam.registration.acceptance import correction
+from lslam.registration.alignment import MapAlignment
+from lslam.registration.registration import MIN_SOURCE_POINTS, NEAR_KERNEL
+from lslam.registration.robust import UsualAgreement
+from lslam.registration.solver import RegistrationResult
+from lslam.types.map_fix import FixStatus, MapFix
+from lslam.types.scan_result import ScanResult
+from lslam.types.state import Stateful
+
+Floats = NDArray[np.float64]
+
+# Sigmas that the kernel spans, and the chance that the innovation of a scan that the map holds lies beyond its gate.
+SIGMAS, CHANCE = 3.0, 1e-4
+# m, rms lever arm of a rotation.
+LEVER_M = 10.0
+# Finds the pose (4, 4) of a scan of that position anew within a radius, m, of the prior; None where it does not.
+Search = Callable[[int, Floats, float], Floats | None]
+
+
+class MapFollower(Stateful):
+    """An error-state Kalman filter over SE(3): odometry predicts, registration on the map corrects.
+
+    The prior's information enters the normal equations, so that the map corrects where its surfaces constrain a pose and odometry
+    decides along directions that they leave open. What the map corrects never changes the map.
+
+    T, P : pose (4, 4) in level axes of the map and its covariance (6, 6), of the scan seen last
+    R_level_odometry : (3, 3) axes of odometry's world in those of the map
+    """
+
+    STATE = ("T", "P", "usual", "carried")
+
+    def __init__(self, view: LocalView, T: Floats, P: Floats, config: Config, search: Search | None = None) -> None:
+        self.view, self.T, self.P, self.config, self.search = view, T, P, config, search
+        self.usual = UsualAgreement(config.registration.min_agreement)
+        # m since the map held a scan.
+        self.carried = 0.0
+        self._gate = quantile(1.0 - CHANCE, 6)
+        c = config.loops
+        # What maps and registrations err by in common from scan to scan.
+        self._floor = np.diag([c.sigma_m**2] * 3 + [np.deg2rad(c.sigma_deg) ** 2] * 3)
+
+    def predict(self, before: ScanResult, result: ScanResult) -> None:
+        """Odometry's motion from one scan to the next."""
+        step = se3.relative(before.T_world_lidar, result.T_world_lidar)
+        T = se3.normalise(self.T @ step)
+        way = float(np.linalg.norm(step[:3, 3]))
+        grown = noise.rotated(
+            growth(before, result, way, self.config.graph), T[:3, :3] @ result.T_world_lidar[:3, :3].T
+        )
+        self.P = noise.transported(self.P, T[:3, 3] - self.T[:3, 3]) + grown + drift_covariance(way, self.config.graph)
+        self.T = T
+        self.carried += way
+
+    def correct(self, position: int, points: PreparedPoints | None) -> MapFix:
+        """The scan of that position of the run on the map; its points deskewed, None when there are none."""
+        if points is None or len(points.source) < MIN_SOURCE_POINTS:
+            return self._carried("unread", "no usable points")
+        alignment = self.view.at(self.T[:3, 3])
+        found = self._align(alignment, points, self.T)
+        status, reason = self._judge(found)
+        if reason and self.search is not None and self._spread() > self.config.registration.coarse_kernel:
+            T = self.search(position, self.T, self._spread())
+            if T is not None:
+                found = self._align(self.view.at(T[:3, 3]), points, T)
+                status, reason = self._judge(found)
+        move, turn = correction(self.T, found.T_world_lidar)
+        if reason:
+            if status == "changed":
+                self.usual.relax()
+            return self._carried(status, reason, found)
+        assert found.covariance is not None
+        self.usual.observe(found.inlier_share)
+        self.T, self.P, self.carried = found.T_world_lidar, found.covariance + self._floor, 0.0
+        return MapFix(self.T, self.P, "held", found.overlap, found.inlier_share, (move, turn))
+
+    def _align(self, alignment: MapAlignment, points: PreparedPoints, start: Floats) -> RegistrationResult:
+        """Registration from the prior with its information, the kernel as wide as the prior is uncertain.
+
+        A prior wider than the widest kernel says next to nothing, and is the initial guess only.
+        """
+        c = self.config.registration
+        width = max(self._spread(), NEAR_KERNEL * c.kernel_min)
+        if start is self.T and width <= c.kernel_max:
+            information = np.asarray(np.linalg.inv(self.P), np.float64)
+            return alignment.refine(points, start, width, c.max_iterations, information=information)
+        if start is self.T:
+            start = alignment.coarse_to_fine(points, start, width).T_world_lidar
+        return alignment.refine(points, start, c.kernel_max, c.max_iterations)
+
+    def _judge(self, found: RegistrationResult) -> tuple[FixStatus, str]:
+        """What the map says of a scan, and why not more."""
+        c = self.config.registration
+        if not found.ok or found.covariance is None:
+            return "beyond", found.reason or "the map has nothing here"
+        if found.overlap < c.min_overlap:
+            return "beyond", f"{found.overlap:.0%} of the points find the map"
+        if found.inlier_share < c.min_inliers or self.usual.is_collapse(found.inlier_share):
+            return (
+                "changed",
+                f"{found.inlier_share:.0%} of the points agree with the map, {self.usual.usual:.0%} before",
+            )
+        d = se3_difference(self.T, found.T_world_lidar)
+        # A scan that fits as well as those before has found its place, and odometry is worse than its covariance.
+        is_outlier = float(d @ np.linalg.solve(self.P + self._floor, d)) > self._gate
+        if is_outlier and self.usual.is_less(found.inlier_share):
+            move, turn = correction(self.T, found.T_world_lidar)
+            return "changed", f"the map would move it by {move:.2f} m and {np.rad2deg(turn):.1f} deg"
+        return "held", ""
+
+    def _spread(self) -> float:
+        """m, `SIGMAS` standard deviations of a point at `LEVER_M`, where they are largest."""
+        position, turn = (float(np.linalg.eigvalsh(part)[-1]) for part in (self.P[:3, :3], self.P[3:, 3:]))
+        return SIGMAS * float(np.sqrt(position + LEVER_M**2 * turn))
+
+    def _carried(self, status: FixStatus, reason: str, found: RegistrationResult | None = None) -> MapFix:
+        overlap, share = (0.0, 0.0) if found is None else (found.overlap, found.inlier_share)
+        return MapFix(self.T, self.P, status, overlap, share, reason=reason)
+
+
+def doubted(fixes: list[MapFix]) -> list[MapFix]:
+    """The fixes of a run, marked where fewer points agree with the map than two scans of one place differ by."""
+    usual = float(np.median([fix.inlier_share for fix in fixes if fix.is_held] or [0.0]))
+    return [replace(f, is_doubted=f.is_held and f.inlier_share < UsualAgreement.LESS * usual) for f in fixes]
+
+
+def se3_difference(T: Floats, other: Floats) -> Floats:
+    """(6,) d with t' = t + d[:3] and R' = exp(d[3:]) R from one pose (4, 4) to the other."""
+    return np.concatenate([other[:3, 3] - T[:3, 3], so3.log(other[:3, :3] @ T[:3, :3].T)])

@@ -1,0 +1,250 @@
+"""Second pass in an existing map: where the drive began in it, then every scan on it, with odometry as the prior."""
+
+from __future__ import annotations
+
+import logging
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.config import Config
+from lslam.errors import InterruptedRunError, RunFailedError
+from lslam.formats.state_files import Records
+from lslam.frontend.checkpoints import Checkpoints
+from lslam.frontend.register_scans import read_ahead, to_trajectory
+from lslam.geometry import noise, se3
+from lslam.geometry.geodesy import to_local
+from lslam.graph.drift import drift_covariance
+from lslam.graph.odometry_constraints import corrected
+from lslam.keyframes.store import KeyframeStore
+from lslam.localization.follow import MapFollower, doubted
+from lslam.localization.place_search import PlaceSearch
+from lslam.localization.prior_map import LocalView, PriorMap
+from lslam.localization.start import Start, StartPrior, PlaceFinder
+from lslam.pipeline.manifest import Manifest
+from lslam.pipeline.map_pass import motion_within
+from lslam.pipeline.prior_map_files import read_prior_map
+from lslam.pipeline.watch import Watch
+from lslam.preprocessing.deskew import deskew
+from lslam.preprocessing.prepare import PreparedPoints, prepare_points
+from lslam.types.keyframe import Keyframe
+from lslam.types.map_fix import MapFix
+from lslam.types.run_record import RunRecord
+from lslam.types.scan import Scan
+from lslam.types.scan_result import ScanResult
+from lslam.types.sequence import Sequence
+
+log = logging.getLogger("lslam")
+Floats = NDArray[np.float64]
+# Sentences of reasons in a message, at most.
+MOST_SAID = 3
+# m that the antenna may be away from the LiDAR.
+ANTENNA_M = 3.0
+
+
+def localise_poses(
+    sequence: Sequence, record: RunRecord, store: KeyframeStore, config: Config, manifest: Manifest, watch: Watch,
+    checkpoints: Checkpoints | None = None,
+) -> None:  # fmt: skip
+    """Put the poses in the map's frame into `record`, and what became of each scan.
+
+    A run that was interrupted, or whose odometry is lost, keeps what it has. Raises RunFailedError when the drive is not found in
+    the map.
+    """
+    if manifest.outcome in ("interrupted", "diverged"):
+        return
+    with manifest.timed("localise_s"):
+        prior_map = read_prior_map(Path(config.localize.map), config.registration)
+        try:
+            search = PlaceFinder(PlaceSearch(prior_map, config.registration), store, config)
+            fixes, start = _followed(sequence, record.results, prior_map, search, config, watch, checkpoints)
+        except InterruptedRunError as error:
+            manifest.interrupt(str(error))
+            return
+    _deliver(record, prior_map, fixes, config)
+    _tell(record, prior_map, start, config, manifest)
+
+
+def _followed(
+    sequence: Sequence, results: list[ScanResult], prior_map: PriorMap, search: PlaceFinder, config: Config,
+    watch: Watch, checkpoints: Checkpoints | None,
+) -> tuple[list[MapFix], dict[str, Any]]:  # fmt: skip
+    """Every scan against the map; poses are still in level axes. And how the start was found."""
+    known = None if checkpoints is None else checkpoints.latest()
+    poses = np.stack([r.T_world_lidar for r in results])
+    if known is not None and not np.array_equal(known["poses"], poses):
+        known = None
+    view = LocalView(prior_map, config.registration, 1.2 * config.preprocess.range_max)
+    reanchor = Reanchoring(search, results)
+    if known is None:
+        start = _find_start(sequence, prior_map, search, config, watch)
+        follower = MapFollower(view, *_at_first_scan(start, search.store, results, config), config, reanchor)
+        fixes: list[MapFix] = []
+        about = {"votes": start.votes, "tried": start.tried, "scan": search.store.keyframes[start.vote.keyframe].scan,
+                 "support": round(start.vote.support, 3)}  # fmt: skip
+    else:
+        follower = MapFollower(view, np.eye(4), np.eye(6), config, reanchor)
+        follower.restore(known["follower"])
+        fixes, about = known["fixes"], known["start"]
+        log.info("localisation: going on after %d scans", len(fixes))
+    watch.on_start("localise", len(results) - len(fixes))
+    stamps = np.array([r.stamp_ns for r in results], np.int64)
+
+    def prepare(scan: Scan) -> PreparedPoints:
+        times = scan.times if config.preprocess.deskew else None
+        prepared = prepare_points(scan.points, config.preprocess, scan.index, times)
+        return deskew(prepared, motion_within(scan, stamps, poses))
+
+    first = len(fixes)
+    for k, loaded in enumerate(read_ahead(sequence, prepare, config.input.workers, first=first), first):
+        if k == len(results):
+            break
+        is_last = watch.should_stop()
+        if checkpoints is not None and k and (is_last or checkpoints.schedule.is_due):
+            checkpoints.write(
+                k, lambda: {"poses": poses, "fixes": Records(fixes), "start": about, "follower": follower.state()}
+            )
+        if is_last:
+            raise InterruptedRunError(f"interrupted during localisation, at scan {k} of {len(results)}")
+        if k:
+            follower.predict(results[k - 1], results[k])
+        fixes.append(follower.correct(k, loaded.prepared))
+        watch.on_step()
+    return fixes, about
+
+
+class Reanchoring:
+    """Finds a scan in the map anew, by the submap of the keyframe last passed, when odometry has carried it too far."""
+
+    def __init__(self, search: PlaceFinder, results: list[ScanResult]) -> None:
+        self._search, self._results = search, results
+        self._scans = np.array([k.scan for k in search.store.keyframes])
+        self._tried = -1
+
+    def __call__(self, position: int, T: Floats, radius: float) -> Floats | None:
+        """Pose (4, 4), level axes, of the scan at that position, within `radius` m of T (4, 4); once a keyframe."""
+        b = int(np.searchsorted(self._scans, position, side="right")) - 1
+        if b < 0 or b == self._tried:
+            return None
+        self._tried = b
+        step = se3.relative(self._results[position].T_world_lidar, self._results[self._scans[b]].T_world_lidar)
+        expected = T @ step
+        vote = self._search.vote(b, self._search.region_about(b, expected, radius))
+        return None if vote is None else vote.T_level_odometry @ self._results[position].T_world_lidar
+
+
+def _find_start(
+    sequence: Sequence, prior_map: PriorMap, search: PlaceFinder, config: Config, watch: Watch
+) -> Start:  # fmt: skip
+    """Raises RunFailedError when there is none, InterruptedRunError when the user asked to stop."""
+    prior, said = _prior_of(sequence, prior_map, config)
+    log.info("searching the drive in the map, %s", said)
+    start = search.find(prior, watch.should_stop)
+    if watch.should_stop():
+        raise InterruptedRunError("interrupted before the drive was found in the map")
+    if start is None:
+        counted = Counter(reason.split(",")[0] for reason in search.reasons).most_common(MOST_SAID)
+        why = "; ".join(f"{reason} ({count} x)" for reason, count in counted) or "keyframes do not agree"
+        raise RunFailedError(
+            f"the drive was not found in {prior_map.source}, {said}: {why}. Say where it begins with --start X,Y,HEADING"
+        )
+    log.info(
+        "found in the map by %d of %d keyframes tried, %.0f %% of the upright points fit",
+        start.votes, start.tried, 100 * start.vote.support,
+    )  # fmt: skip
+    return start
+
+
+def _prior_of(sequence: Sequence, prior_map: PriorMap, config: Config) -> tuple[StartPrior | None, str]:
+    """What is known of the start, level axes of the map, and in words."""
+    section = config.localize
+    into_level = se3.inverse(prior_map.T_map_level)
+    if section.start is not None:
+        x, y, heading = section.start
+        height = float(prior_map.T_map_level[2, 3])
+        position = se3.apply(into_level, np.array([[x, y, height]]) - prior_map.origin * [1, 1, 0])[0]
+        forward = into_level[:3, :3] @ [np.cos(np.deg2rad(heading)), np.sin(np.deg2rad(heading)), 0.0]
+        yaw = float(np.arctan2(forward[1], forward[0]))
+        turn = float(np.deg2rad(section.start_turn_deg))
+        return StartPrior(position[:2], yaw, section.start_radius, turn), f"about {x:g}, {y:g}"
+    fixes, place = sequence.gnss, prior_map.georeference
+    if config.gnss.mode == "off" or fixes is None or place is None or not fixes.is_place.any():
+        return None, "anywhere in it"
+    k = int(np.flatnonzero(fixes.is_place)[np.abs(fixes.stamps_ns[fixes.is_place] - sequence.stamps_ns[0]).argmin()])
+    enu = to_local(fixes.lat_lon_alt[k : k + 1], place.origin)
+    position = se3.apply(into_level @ se3.inverse(place.T_enu_world), enu)[0]
+    sigma = config.gnss.sigma or float(fixes.sigma[k])
+    return StartPrior(position[:2], None, 3.0 * sigma + ANTENNA_M), "about its first satellite fix"
+
+
+def _at_first_scan(
+    start: Start, store: KeyframeStore, results: list[ScanResult], config: Config
+) -> tuple[Floats, Floats]:
+    """Pose (4, 4) of the first scan, level axes, and its covariance: odometry leads back from the keyframe that was found."""
+    keyframe = store.keyframes[start.vote.keyframe]
+    T = start.vote.T_level_odometry @ results[0].T_world_lidar
+    at = start.vote.T_level_odometry @ keyframe.T_world_lidar
+    carried = noise.transported(start.vote.covariance, T[:3, 3] - at[:3, 3])
+    c, way = config.loops, keyframe.distance
+    systematic = np.diag(
+        np.repeat(
+            [(0.01 * c.drift_percent * way + c.sigma_m) ** 2, np.deg2rad(c.drift_deg * way / 100 + c.sigma_deg) ** 2], 3
+        )
+    )
+    return T, np.asarray(carried + drift_covariance(way, config.graph) + systematic)
+
+
+def _deliver(record: RunRecord, prior_map: PriorMap, fixes: list[MapFix], config: Config) -> None:
+    """The trajectory in the map's frame: scans that it holds are where it has them, odometry is bent to pass between them."""
+    T = prior_map.T_map_level
+    results = record.results[: len(fixes)]
+    into_map = [
+        replace(f, T_map_lidar=T @ f.T_map_lidar, covariance=noise.rotated(f.covariance, T[:3, :3]))
+        for f in doubted(fixes)
+    ]
+    held = [k for k, fix in enumerate(into_map) if fix.is_held]
+    if not held:
+        raise RunFailedError(f"no scan agrees with {prior_map.source} where the drive was found: {fixes[0].reason}")
+    first = held[0]
+    record.T_final_odometry = into_map[first].T_map_lidar @ se3.inverse(results[first].T_world_lidar)
+    anchors = [Keyframe(n, k, results[k].stamp_ns, results[k].T_world_lidar) for n, k in enumerate(held)]
+    poses = np.stack([into_map[k].T_map_lidar for k in held])
+    covariances = np.stack([into_map[k].covariance for k in held])
+    record.odometry = record.trajectory
+    record.results = corrected(results, anchors, poses, covariances, 1.0, config.graph)
+    record.trajectory = to_trajectory(record.results, record.method)
+    record.georeference = prior_map.georeference
+    record.map_fixes = [replace(f, T_map_lidar=r.T_world_lidar) for f, r in zip(into_map, record.results, strict=True)]
+    at = "" if not prior_map.origin.any() else f" less {prior_map.origin.tolist()}"
+    record.world = f"that of the map {prior_map.source}{at}"
+    record.map_origin = prior_map.origin
+
+
+def _tell(record: RunRecord, prior_map: PriorMap, start: dict[str, Any], config: Config, manifest: Manifest) -> None:
+    """What became of the scans, into manifest and problems."""
+    fixes = record.map_fixes
+    counts = Counter[str](fix.status for fix in fixes)
+    doubtful = sum(fix.is_doubted for fix in fixes)
+    shares = [fix.inlier_share for fix in fixes if fix.is_held]
+    manifest.world = record.world
+    manifest.localization = {
+        "map": config.localize.map, "points": len(prior_map), "start": start, **dict(sorted(counts.items())),
+        "doubted": doubtful, "inlier_share": round(float(np.median(shares)), 4),
+    }  # fmt: skip
+    others = ", ".join(f"{counts[status]} {said}" for status, said in WORDS.items() if counts[status])
+    if others:
+        manifest.problems.append(
+            f"the map does not hold {len(fixes) - counts['held']} of {len(fixes)} scans ({others}): odometry carries them"
+        )
+    if doubtful:
+        manifest.problems.append(
+            f"{doubtful} of {len(fixes)} scans agree less with the map than the others: something there has changed, "
+            "localization.csv says where"
+        )
+
+
+WORDS = {"changed": "where it has changed", "beyond": "beyond its end", "unread": "without points"}

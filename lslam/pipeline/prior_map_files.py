@@ -1,0 +1,58 @@
+"""The map that a drive is located in, read from what an earlier run or another program left."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+import numpy as np
+
+from lslam.config.registration import RegistrationConfig
+from lslam.errors import InputError, UsageError
+from lslam.formats.point_files import MAP_SUFFIXES, SUFFIXES, read_cloud
+from lslam.localization.prior_map import PriorMap, make_prior_map
+from lslam.pipeline.map_files import georeference_of, note_of
+from lslam.pipeline.rebuild import in_own_world, map_of
+from lslam.pipeline.run_folder import require_run
+
+log = logging.getLogger("lslam")
+# m; coordinates beyond are those of a projection, which a trajectory in float32 plots and maps would lose centimetres of.
+LARGE, KILOMETRE = 1e5, 1000.0
+
+
+def require_map(target: Path, needs_place: bool = False) -> Path:
+    """The cloud file of a map, before it is read: raises InputError when there is none.
+
+    needs_place : satellite fixes are to lead into it. Raises UsageError when nobody knows where it lies on the Earth.
+    """
+    path = _cloud_file(target)
+    if needs_place and georeference_of(note_of(path).get("georeference")) is None:
+        raise UsageError(f"--gnss: {path} is not georeferenced; say where the drive begins with --start X,Y,HEADING")
+    return path
+
+
+def _cloud_file(target: Path) -> Path:
+    if target.is_dir():
+        require_run(target)
+        return map_of(target)
+    if not target.exists():
+        raise InputError(f"the map {target} does not exist")
+    if target.suffix.lower() not in (*MAP_SUFFIXES, *SUFFIXES):
+        raise InputError(
+            f"the map {target} is no run folder and no cloud: known suffixes are {', '.join(MAP_SUFFIXES)}"
+        )
+    return target
+
+
+def read_prior_map(target: Path, config: RegistrationConfig) -> PriorMap:
+    """The map, in coordinates that lie near it: those of the run, or of the file less whole kilometres.
+
+    Raises InputError naming what is missing or broken.
+    """
+    path = require_map(target)
+    cloud, georeference = in_own_world(path, read_cloud(path))
+    points, origin = cloud.points, np.zeros(3)
+    if len(points) and float(np.abs(points).max()) > LARGE:
+        origin = np.round(np.nanmedian(points, axis=0) / KILOMETRE) * KILOMETRE
+        log.info("coordinates of %s are large: the world of this run begins at %s of them", path, origin.tolist())
+    return make_prior_map(points, config, georeference, str(path), origin)
