@@ -1,0 +1,107 @@
+"""The pass that locates a run in a map: interrupted, resumed and threaded it gives the same bytes; carried far it finds back."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import lslam
+from lslam.config import Config, load_config
+from lslam.errors import InputError, InterruptedRunError, RunFailedError
+from lslam.geometry import se3
+from lslam.keyframes.store import KeyframeStore
+from lslam.localization.place_search import PlaceSearch
+from lslam.localization.prior_map import make_prior_map
+from lslam.localization.start import PlaceFinder
+from lslam.pipeline.localise_pass import Reanchoring
+from lslam.pipeline.prior_map_files import read_prior_map
+from lslam.pipeline.watch import Watch
+
+SAMPLE = Path(__file__).resolve().parents[2] / "sample_data" / "sequences" / "00"
+SAME = ("trajectory.tum", "covariances.npz", "localization.csv", "trajectory_odometry.tum", "evaluation.json")
+
+
+@pytest.fixture(scope="module")
+def map_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("old") / "map"
+    lslam.run(SAMPLE, load_config(None, ["loops.use=false", "report.html=false"]), out=out)
+    return out
+
+
+def config(map_run: Path, *settings: str) -> Config:
+    words = [f'localize.map="{map_run}"', "loops.use=false", "map.write=false", "report.html=false", "input.start=30",
+             "input.count=40", *settings]  # fmt: skip
+    return load_config(None, words)
+
+
+@pytest.fixture(scope="module")
+def whole(map_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("whole") / "out"
+    lslam.run(SAMPLE, config(map_run), out=out)
+    return out
+
+
+def same(folder: Path, other: Path) -> None:
+    for name in SAME:
+        assert (folder / name).read_bytes() == (other / name).read_bytes(), name
+
+
+def test_any_number_of_threads_gives_the_same_bytes(map_run: Path, whole: Path, tmp_path: Path) -> None:
+    lslam.run(SAMPLE, config(map_run, "input.threads=1"), out=tmp_path / "one")
+    same(whole, tmp_path / "one")
+
+
+@pytest.mark.parametrize("scan", [0, 1, 23])
+def test_an_interrupted_localisation_goes_on_to_the_same_bytes(
+    scan: int, map_run: Path, whole: Path, tmp_path: Path
+) -> None:
+    seen = [0]
+
+    def look() -> bool:
+        seen[0] += sys._getframe(1).f_code.co_name == "_followed"
+        return seen[0] > scan
+
+    with pytest.raises(InterruptedRunError, match="localisation"):
+        lslam.run(SAMPLE, config(map_run), out=tmp_path / "out", watch=Watch(should_stop=look))
+    assert not (tmp_path / "out" / "localization.csv").exists()
+    lslam.run(SAMPLE, config(map_run), out=tmp_path / "out", resume=True)
+    same(whole, tmp_path / "out")
+
+
+def test_poses_are_those_of_the_run_that_made_the_map(map_run: Path, whole: Path) -> None:
+    rows = np.loadtxt(map_run / "trajectory.tum")[30:70, 1:4] - np.loadtxt(whole / "trajectory.tum")[:, 1:4]
+    assert np.linalg.norm(rows, axis=1).max() < 0.03
+
+
+def test_a_drive_that_the_map_does_not_know_fails_with_the_way_out(map_run: Path, tmp_path: Path) -> None:
+    wrong = config(map_run, "localize.start=[60.0, 60.0, 0.0]", "localize.start_radius=4", "localize.start_turn_deg=5")
+    with pytest.raises(RunFailedError, match="--start X,Y,HEADING"):
+        lslam.run(SAMPLE, wrong, out=tmp_path / "out")
+
+
+def test_a_scan_carried_too_far_is_found_anew_once_a_keyframe(map_run: Path) -> None:
+    section = load_config(None, []).registration
+    prior_map = read_prior_map(map_run, section)
+    record = lslam.run(SAMPLE, load_config(None, ["loops.use=false", "input.count=50", "map.write=false"])).record
+    store = keyframes_of_run(map_run)
+    finder = PlaceFinder(PlaceSearch(prior_map, section), store, load_config(None, []))
+    reanchor = Reanchoring(finder, record.results)
+    true = se3.inverse(prior_map.T_map_level) @ record.results[40].T_world_lidar
+    off = true.copy()
+    off[:2, 3] += [5.0, -4.0]
+    found = reanchor(40, off, 9.0)
+    assert found is not None
+    assert np.linalg.norm(found[:3, 3] - true[:3, 3]) < 0.1
+    assert reanchor(40, off, 9.0) is None
+
+
+def keyframes_of_run(folder: Path) -> KeyframeStore:
+    return KeyframeStore(folder / "keyframes")
+
+
+def test_a_map_without_points_is_named() -> None:
+    with pytest.raises(InputError, match="no finite point"):
+        make_prior_map(np.full((3, 3), np.nan), load_config(None, []).registration, source="hole.ply")
