@@ -9,7 +9,7 @@ from revisited import CONFIG, Revisited, error_of, revisit, town_map
 from lslam.geometry import se3, so3
 from lslam.localization.place_search import PlaceSearch
 from lslam.localization.prior_map import make_prior_map
-from lslam.localization.start import Start, StartPrior, PlaceFinder
+from lslam.localization.start import PlaceFinder, Start, StartPrior
 from lslam.simulation.routes import Visit
 
 REGISTRATION = CONFIG.registration
