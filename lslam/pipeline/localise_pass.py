@@ -24,7 +24,7 @@ from lslam.keyframes.store import KeyframeStore
 from lslam.localization.follow import MapFollower, doubted
 from lslam.localization.place_search import PlaceSearch
 from lslam.localization.prior_map import LocalView, PriorMap
-from lslam.localization.start import Start, StartPrior, PlaceFinder
+from lslam.localization.start import PlaceFinder, Start, StartPrior
 from lslam.pipeline.manifest import Manifest
 from lslam.pipeline.map_pass import motion_within
 from lslam.pipeline.prior_map_files import read_prior_map

@@ -142,8 +142,8 @@ def main() -> None:
         found = [one_seed(root, args.scenario, seed, args.starts) for seed in seeds]
     caption = (
         f"{args.scenario}, {tables.seeds_named(seeds)}: a VLP-16 on the other lane in the opposite direction, with other "
-        f"traffic and noise, in the map of an HDL-64; {args.starts} random starts a seed, drives of {KEYFRAMES} keyframes. Errors "
-        "in the map's frame without alignment, median / worst."
+        f"traffic and noise, in the map of an HDL-64; {args.starts} random starts a seed, drives of {KEYFRAMES} keyframes. "
+        "Errors in the map's frame without alignment, median / worst."
     )
     tables.table("localising", caption, ["", "value"], rows_of(found), args.write)
 
