@@ -252,9 +252,10 @@ def _publish(stage: Path, path: Path) -> None:
 
 
 def results_of(run: EarlierRun) -> list[ScanResult]:
-    """The poses and what became of the scans, as a run hands them to its map."""
+    """The poses and what became of the scans, as a run hands them to its map; scans keep their numbers in the recording."""
+    section = run.config.input
     return [
-        ScanResult(k, int(stamp), T, status)
+        ScanResult(section.start + section.skip_frames * k, int(stamp), T, status)
         for k, (stamp, T, status) in enumerate(
             zip(run.trajectory.stamps_ns, run.trajectory.poses, run.statuses, strict=True)
         )

@@ -332,3 +332,12 @@ def test_missing_files_are_named(run: Path, ran: Path, tmp_path: Path) -> None:
         path.unlink()
     with pytest.raises(InputError, match="has no map file"):
         cli(["map", str(run), "--score"], standalone_mode=False)
+
+
+def test_a_part_of_a_recording_gives_the_same_map_again(tmp_path: Path) -> None:
+    done = lslam("run", SAMPLE, "--start", 12, "--count", 8, "--skip-frames", 2, "--out", tmp_path / "run", "-q")
+    assert done.returncode == 0, done.stderr
+    assert lslam("map", tmp_path / "run", "--out", tmp_path / "again.ply", "-q").returncode == 0
+    before, after = read_cloud(tmp_path / "run" / "map.ply"), read_cloud(tmp_path / "again.ply")
+    assert len(before.points) > 10_000
+    assert np.array_equal(before.points, after.points)
