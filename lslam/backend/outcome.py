@@ -104,7 +104,7 @@ def solve(graph: PoseGraph, given: Given, georeference: Georeference | None = No
             f"GNSS: the pose graph accepts {solution.fix_inliers.sum()} of {len(graph.fixes)} fixes: all rejected"
         )
         return None
-    judged, accepted = _verdicts(given.candidates, graph, solution)
+    judged, accepted = judged_by(given.candidates, graph, solution)
     log.info(
         "pose graph: %d keyframes, %d of %d loop closures accepted, drift factor %.3g, %d rounds",
         len(graph), len(accepted), len(graph.loops), solution.drift, solution.rounds,
@@ -160,7 +160,7 @@ def _odometry(given: Given) -> Floats:
     return np.stack([k.T_world_lidar for k in given.store.keyframes])
 
 
-def _verdicts(
+def judged_by(
     candidates: list[LoopCandidate], graph: PoseGraph, solution: Solution
 ) -> tuple[list[LoopCandidate], list[Constraint]]:
     """Candidates with the graph's verdicts on those accepted before, and the constraints it accepts."""

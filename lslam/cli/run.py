@@ -118,7 +118,7 @@ def perform(sequence: str, given: dict[str, Any]) -> None:
                 opened, config, out=out, ground_truth=truth, overwrite=given["overwrite"], resume=given["resume"],
                 command=shlex.join(["lslam", *sys.argv[1:]]),
                 reading={name: text for name, text in options.reading_of(given).items() if text is not None},
-                watch=_watch(stack, stop, lambda outcome: _print_result(outcome, out, given["as_json"])),
+                watch=watch_of(stack, stop, lambda outcome: _print_result(outcome, out, given["as_json"])),
             )  # fmt: skip
     except RunFinishedError as finished:
         log.info("%s", finished)
@@ -237,7 +237,7 @@ def read_truth(path: Path | None, sequence: Sequence) -> Trajectory | None:
     return truth
 
 
-def _watch(stack: ExitStack, stop: Stop, finish: Callable[[RunOutcome], None]) -> Watch:
+def watch_of(stack: ExitStack, stop: Stop, finish: Callable[[RunOutcome], None]) -> Watch:
     """Progress bars, and a stop after the current scan on a signal."""
     from lslam.pipeline.watch import Watch
 

@@ -59,8 +59,6 @@ def build_map(
     `should_stop` says so; `checkpoints` know then where to go on.
     """
     section = config.map
-    ego_box = section.ego_box or config.preprocess.ego_box
-    stamps = np.array([r.stamp_ns for r in results], np.int64)
     poses = np.stack([r.T_world_lidar for r in results])
 
     def make() -> MapMaker:
@@ -70,18 +68,7 @@ def build_map(
     for _ in range(done):
         on_step()
     first = maker.first_again(done)
-    registered = {result.index: result for result in results if result.status == "ok"}
-
-    def pose_scan(scan: Scan) -> PosedScan | None:
-        """In the thread that reads, since merging takes as long as reading and deskewing together."""
-        result = registered.get(scan.index)
-        if result is None:
-            return None
-        scan = scan if ego_box is None else without_box(scan, ego_box)
-        points = deskew_points(scan.points, scan.times, motion_within(scan, stamps, poses))
-        return PosedScan(points, result.T_world_lidar, scan.intensity)
-
-    ahead = read_ahead(sequence, pose_scan, config.input.workers, first=first)
+    ahead = read_ahead(sequence, scan_poser(results, config), config.input.workers, first=first)
     for k, (loaded, _) in enumerate(zip(ahead, results[first:], strict=False), first):
         is_last = should_stop()
         if checkpoints is not None and k >= done:
@@ -94,6 +81,27 @@ def build_map(
             on_step()
     with asking(should_stop, INTERRUPTED):
         return maker.finish()
+
+
+def scan_poser(results: list[ScanResult], config: Config) -> Callable[[Scan], PosedScan | None]:
+    """What deskews a scan by the poses of all and puts it at its own; None for one that was not registered.
+
+    For the thread that reads, since merging takes as long as reading and deskewing together.
+    """
+    ego_box = config.map.ego_box or config.preprocess.ego_box
+    stamps = np.array([r.stamp_ns for r in results], np.int64)
+    poses = np.stack([r.T_world_lidar for r in results])
+    registered = {result.index: result for result in results if result.status == "ok"}
+
+    def pose_scan(scan: Scan) -> PosedScan | None:
+        result = registered.get(scan.index)
+        if result is None:
+            return None
+        scan = scan if ego_box is None else without_box(scan, ego_box)
+        points = deskew_points(scan.points, scan.times, motion_within(scan, stamps, poses))
+        return PosedScan(points, result.T_world_lidar, scan.intensity)
+
+    return pose_scan
 
 
 class MapMaker:

@@ -23,6 +23,7 @@ MANIFEST = "manifest.json"
 LOG = "log.txt"
 LOCK = ".lock"
 KEYFRAMES = "keyframes"
+SESSIONS = "sessions"
 CHECKPOINT = "checkpoint"
 REPLIES = "osm_replies"
 SPOOL = ".lslam-map-"  # what a map in the making is called, as its merger does
@@ -33,7 +34,7 @@ OURS = (
     "map.pcd", "map.las", "map.laz", "map.json", "map_mesh.ply", "feature_map.ply", "trajectory.geojson",
     "occupancy.npz", "occupancy.ply", "floor_plan.png", "floor_plan.yaml", "evaluation.json",
     "trajectory_odometry.tum", "loops.csv", "graph.g2o", "osm_matches.csv", "buildings.geojson", "buildings.osm",
-    "timing.csv", "scans.csv", "report.html",
+    "timing.csv", "scans.csv", "localization.csv", "sessions.csv", "report.html",
 )  # fmt: skip
 
 
@@ -131,6 +132,7 @@ class RunFolder:
         if not needed:
             _clear_own(self.path / KEYFRAMES, "*.npz")
             _clear_own(self.path / REPLIES, "*.json")
+            _clear_own(self.path / SESSIONS, "*.tum")
             self.drop_checkpoint()
 
 

@@ -340,4 +340,5 @@ def test_a_part_of_a_recording_gives_the_same_map_again(tmp_path: Path) -> None:
     assert lslam("map", tmp_path / "run", "--out", tmp_path / "again.ply", "-q").returncode == 0
     before, after = read_cloud(tmp_path / "run" / "map.ply"), read_cloud(tmp_path / "again.ply")
     assert len(before.points) > 10_000
-    assert np.array_equal(before.points, after.points)
+    # Poses of trajectory.tum are rounded.
+    assert np.abs(np.subtract(before.points, after.points)).max() < 1e-3

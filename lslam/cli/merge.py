@@ -1,0 +1,94 @@
+"""`lslam merge`: several runs of one place made one."""
+
+from __future__ import annotations
+
+import json
+import shlex
+import sys
+import time
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import click
+
+from lslam.cli import options
+from lslam.cli.console import setup_logging, show
+from lslam.stopping import heeded
+
+
+@click.command(
+    epilog="\b\nExamples: lslam merge runs/monday runs/tuesday --out runs/town\n"
+    "          lslam merge runs/town runs/friday --out runs/town2 --format laz"
+)
+@click.argument("runs", nargs=-1, required=True, metavar="RUN RUN...", type=click.Path(path_type=Path))
+@click.option(
+    "--out", type=click.Path(path_type=Path), metavar="DIR", help="Folder to write [default: runs/merged-TIME]."
+)
+@click.option("--voxel", type=float, metavar="M", help="Edge of a voxel of the map.")
+@click.option("--format", "file_format", metavar="NAME", help="Of the map: ply, pcd, las or laz [default: ply].")
+@click.option("--no-map", is_flag=True, help="Poses only.")
+@click.option("--threads", type=int, metavar="N", help="0: as many as there are cores; 1: one. Results stay the same.")
+@click.option("--resume", is_flag=True, help="Go on with an interrupted merge; needs its --out.")
+@click.option("--overwrite", is_flag=True, help="Replace an earlier result in the folder.")
+@options.configuration
+@options.as_json
+@options.verbosity
+def command(runs: tuple[Path, ...], **given: Any) -> None:
+    """Merge runs of one place: trajectories in one frame, one pose graph with loops between all, one map.
+
+    The first run gives the frame. RUN may be the folder of an earlier merge, whose runs then stand in its place. A run that
+    cannot be tied to the others is left out and named; exit 1 when none can.
+    """
+    from lslam.errors import UsageError
+
+    setup_logging(given["verbose"], given["quiet"])
+    if given["overwrite"] and given["resume"]:
+        raise UsageError("--overwrite merges anew and --resume keeps finished parts: give one of them")
+    if given["resume"] and given["out"] is None:
+        raise UsageError("--resume needs --out: the folder of the interrupted merge")
+    options.require_there(*runs)
+    from lslam.config import load_config
+    from lslam.pipeline.merged_folder import merge_into
+    from lslam.pipeline.run_folder import check_target
+
+    out = given["out"] or Path("runs") / time.strftime("merged-%Y%m%d-%H%M%S")
+    if not given["resume"]:
+        check_target(out, given["overwrite"])
+    flags = {
+        "map.voxel": given["voxel"], "map.format": given["file_format"], "input.threads": given["threads"],
+        "map.write": "false" if given["no_map"] else None,
+    }  # fmt: skip
+    settings = [*given["settings"], *(f"{key}={value}" for key, value in flags.items() if value is not None)]
+    config = load_config(given["config_file"], settings)
+    from lslam.cli.run import watch_of
+
+    with heeded() as stop, ExitStack() as stack:
+        watch = watch_of(stack, stop, lambda outcome: None)
+        stop.is_gentle = True
+        manifest = merge_into(
+            runs, out, config, watch, overwrite=given["overwrite"], resume=given["resume"],
+            command=shlex.join(["lslam", *sys.argv[1:]]),
+        )  # fmt: skip
+    show(json.dumps({"folder": str(out), "manifest": manifest}) + "\n" if given["as_json"] else _summary(out, manifest))
+
+
+def _summary(out: Path, manifest: dict[str, Any]) -> str:
+    from lslam.printable import counted, metres
+
+    lines = [f"merged, {counted(len(manifest['sessions']), 'session')}", f"  {'status':<12} {manifest['status']}"]
+    lines += [f"  {'':<12} {problem}" for problem in manifest["problems"]]
+    for one in manifest["sessions"]:
+        found = (
+            f"found by {one['votes']} of {counted(one['tried'], 'keyframe')} tried"
+            if one["tried"]
+            else "gives the world"
+        )
+        said = f"{counted(one['scans'], 'scan')}, {found}, {counted(one['loops_between'], 'loop')} with others"
+        if one["ate"] is not None:
+            said += f"; ATE se3 {metres(one['ate'][0])} m alone, {metres(one['ate'][1])} m merged"
+        lines.append(f"  {one['name']:<12} {said}")
+    graph = manifest["graph"]
+    lines.append(f"  {'graph':<12} {graph['keyframes']} keyframes, {counted(graph['loops'], 'loop')} in all")
+    lines += [f"  {name:<12} {out / name}" for name in ("sessions", "report.html") if (out / name).exists()]
+    return "\n".join(lines) + "\n"

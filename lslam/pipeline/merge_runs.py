@@ -1,0 +1,225 @@
+"""Several runs made one: each tied to the others, loops between all keyframes, one robust pose graph, one map."""
+
+from __future__ import annotations
+
+import logging
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.backend.outcome import judged_by
+from lslam.config import Config
+from lslam.errors import GraphError, InputError, InterruptedRunError, RunFailedError, UsageError
+from lslam.formats.state_files import Records, read_npz
+from lslam.frontend.checkpoints import Checkpoints
+from lslam.graph.odometry_constraints import corrected
+from lslam.graph.pose_graph import optimise
+from lslam.graph.problem import PoseGraph, Solution
+from lslam.keyframes.store import KeyframeStore
+from lslam.localization.sessions import Chain, Session, tie
+from lslam.loops.detector import Detector, warm_up
+from lslam.pipeline.rebuild import EarlierRun, read_run, results_of
+from lslam.pipeline.run_folder import KEYFRAMES, MANIFEST
+from lslam.stopping import asking
+from lslam.types.constraint import LoopCandidate
+from lslam.types.scan_result import ScanResult
+from lslam.untrusted import parse_json
+
+log = logging.getLogger("lslam")
+Floats = NDArray[np.float64]
+Stop = Callable[[], bool]
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """A session that could not be tied to the others, and why."""
+
+    name: str
+    why: str
+
+
+@dataclass(frozen=True)
+class Merged:
+    """The outcome.
+
+    runs : that were merged, in the order in which they were tied; sessions : likewise, at the poses they were tied at
+    results : all scans of each at their final poses, in the common world: that of the first
+    before : (K, 4, 4) of the chain's keyframes as tied; after : (K, 4, 4) optimised
+    candidates : loop candidates between numbers of the chain
+    """
+
+    runs: list[EarlierRun]
+    sessions: list[Session]
+    results: list[list[ScanResult]]
+    chain: Chain
+    before: Floats
+    solution: Solution
+    candidates: list[LoopCandidate]
+    left_out: list[LeftOut] = field(default_factory=list)
+
+    def between(self, session: int) -> int:
+        """Accepted loops that join a session with another."""
+        ends = [(self.chain.session_of(c.a), self.chain.session_of(c.b)) for c in self.candidates if c.is_accepted]
+        return sum(a != b and session in (a, b) for a, b in ends)
+
+
+def expanded(folders: Sequence[Path]) -> list[Path]:
+    """Run folders, with those of a merged folder in its place.
+
+    Raises InputError for a folder that is none, UsageError for fewer than two or one that is named twice.
+    """
+    out: list[Path] = []
+    for folder in folders:
+        inside = sessions_of(folder)
+        out += [folder] if inside is None else inside
+    resolved = [folder.resolve() for folder in out]
+    twice = [str(folder) for folder, count in Counter(resolved).items() if count > 1]
+    if twice:
+        raise UsageError(f"{twice[0]} is named twice")
+    if len(out) < 2:
+        raise UsageError("merging takes two runs at least")
+    return out
+
+
+def sessions_of(folder: Path) -> list[Path] | None:
+    """The run folders that a merged folder was made of, None of the folder of a single run."""
+    try:
+        manifest = parse_json((folder / MANIFEST).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    if not isinstance(manifest, dict) or manifest.get("kind") != "merge":
+        return None
+    return [Path(str(one["run"])) for one in manifest.get("sessions", [])]
+
+
+def read_session(folder: Path, name: str) -> tuple[EarlierRun, Session]:
+    """A run with its keyframes; raises InputError when there are none."""
+    run = read_run(folder)
+    store = KeyframeStore(folder / KEYFRAMES)
+    if len(store) < 2:
+        raise InputError(f"{folder} has {len(store)} keyframes, merging needs two: run the sequence again")
+    results = _with_covariances(run)
+    if store.keyframes[-1].scan >= len(results):
+        raise InputError(f"{folder / KEYFRAMES} does not belong to the {len(results)} poses of trajectory.tum")
+    keyframes = [replace(k, T_world_lidar=results[k.scan].T_world_lidar) for k in store.keyframes]
+    return run, Session(name, store, keyframes, results)
+
+
+def _with_covariances(run: EarlierRun) -> list[ScanResult]:
+    """The run's scans, with the covariances of their registrations where they are kept."""
+    results = results_of(run)
+    path = run.folder / "covariances.npz"
+    if not path.is_file():
+        return results
+    known = read_npz(path).get("registration")
+    if known is None or known.shape != (len(results), 6, 6):
+        return results
+    # Of the registration alone: how a pose graph spread the rest over the keyframes is not how it grows.
+    return [
+        r if np.isnan(C).any() else replace(r, registration_covariance=C) for r, C in zip(results, known, strict=True)
+    ]
+
+
+def merge_runs(
+    folders: Sequence[Path], config: Config, should_stop: Stop = lambda: False,
+    on_stage: Callable[[str], None] = lambda stage: None, checkpoints: Checkpoints | None = None,
+) -> Merged:  # fmt: skip
+    """Tie, close loops, optimise.
+
+    The first run gives the world. Raises RunFailedError when nothing can be tied to it, InterruptedRunError when `should_stop`
+    says so; InputError and UsageError as `expanded` and `read_session`.
+    """
+    read = [read_session(folder, name) for folder, name in zip(folders, names_of(folders), strict=True)]
+    warm_up(config.loops)
+    runs = {session.name: run for run, session in read}
+    on_stage("tie")
+    tied, left_out = _tied([session for _, session in read], config, should_stop)
+    while True:
+        if len(tied) < 2:
+            raise RunFailedError(
+                "no run can be tied to the first: " + "; ".join(f"{one.name}: {one.why}" for one in left_out)
+            )
+        chain = Chain(tied, config)
+        on_stage("loops")
+        candidates = _loops(chain, config, should_stop, checkpoints)
+        on_stage("graph")
+        merged = _solved(chain, candidates, config, runs, left_out, should_stop)
+        loose = [n for n in range(1, len(tied)) if merged.between(n) == 0]
+        if not loose:
+            return merged
+        left_out += [LeftOut(tied[n].name, "no loop closure with another run holds") for n in loose]
+        tied = [session for n, session in enumerate(tied) if n not in loose]
+
+
+def names_of(folders: Sequence[Path]) -> list[str]:
+    """Their names, with a number where two are the same."""
+    names: list[str] = []
+    for folder in folders:
+        name = folder.resolve().name
+        count = sum(known == name or known.startswith(f"{name}-") for known in names)
+        names.append(name if name not in names else f"{name}-{count + 1}")
+    return names
+
+
+def _tied(sessions: list[Session], config: Config, should_stop: Stop) -> tuple[list[Session], list[LeftOut]]:
+    """The sessions that are found among those before them, the first given; tried again as long as more of the town is known."""
+    tied, waiting, why = [sessions[0]], sessions[1:], {}
+    while waiting:
+        left = []
+        for session in waiting:
+            found, reason = tie(session, tied, config, should_stop)
+            if should_stop():
+                raise InterruptedRunError(f"interrupted while {session.name} was searched among the other runs")
+            if found is None:
+                why[session.name] = reason
+                left.append(session)
+                continue
+            assert found.start is not None
+            log.info("%s: found by %d of %d keyframes tried", found.name, found.start.votes, found.start.tried)
+            tied.append(found)
+        if len(left) == len(waiting):
+            break
+        waiting = left
+    return tied, [LeftOut(session.name, f"not found among the others: {why[session.name]}") for session in waiting]
+
+
+def _loops(chain: Chain, config: Config, should_stop: Stop, checkpoints: Checkpoints | None) -> list[LoopCandidate]:
+    """Loop candidates of the whole chain; what an interrupted merge found of the same keyframes serves again."""
+    known = None if checkpoints is None else checkpoints.latest()
+    if known is not None and np.array_equal(known["poses"], chain.poses):
+        found: list[LoopCandidate] = known["candidates"]
+        return found
+    detector = Detector(chain.keyframes(), chain.cloud, config.loops, config.registration)
+    candidates = detector.find(None, should_stop, config.input.workers)
+    if checkpoints is not None:
+        checkpoints.write(len(chain), lambda: {"poses": chain.poses, "candidates": Records(candidates)})
+    return candidates
+
+
+def _solved(
+    chain: Chain, candidates: list[LoopCandidate], config: Config, runs: dict[str, EarlierRun], left_out: list[LeftOut],
+    should_stop: Stop,
+) -> Merged:  # fmt: skip
+    keyframes = chain.keyframes()
+    loops = [c.constraint for c in candidates if c.is_accepted and c.constraint is not None]
+    graph = PoseGraph(
+        poses=chain.poses, odometry=chain.odometry(), loops=loops, distances=np.array([k.distance for k in keyframes])
+    )
+    try:
+        with asking(should_stop, "interrupted before the pose graph was solved"):
+            solution = optimise(graph, config.graph)
+    except (GraphError, np.linalg.LinAlgError) as error:
+        raise RunFailedError(f"the runs cannot be merged: {error}") from None
+    results = []
+    for n, session in enumerate(chain.sessions):
+        part = chain.part(n)
+        poses, covariances = solution.poses[part], solution.covariances[part]
+        results.append(corrected(session.results, session.keyframes, poses, covariances, solution.drift, config.graph))
+    judged, _ = judged_by(candidates, graph, solution)
+    return Merged(
+        [runs[s.name] for s in chain.sessions], chain.sessions, results, chain, chain.poses, solution, judged, left_out
+    )

@@ -1,0 +1,237 @@
+"""What merging runs writes: a trajectory a session, the graph, one map, a page, and a manifest that names the runs."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.config import Config
+from lslam.errors import InputError, InterruptedRunError, LslamError, OutputError
+from lslam.evaluation.evaluate import evaluate
+from lslam.formats.g2o import write_g2o
+from lslam.formats.run_tables import write_loops
+from lslam.formats.trajectory_files import write_tum
+from lslam.frontend.checkpoints import Checkpoints
+from lslam.frontend.register_scans import read_ahead, to_trajectory
+from lslam.geometry import se3
+from lslam.graph.factors import well_conditioned
+from lslam.pipeline.back_end_pass import describe
+from lslam.pipeline.map_files import MapNote, write_map
+from lslam.pipeline.map_pass import BuiltMap, MapMaker, scan_poser
+from lslam.pipeline.merge_runs import Merged, expanded, merge_runs
+from lslam.pipeline.outputs import config_text
+from lslam.pipeline.rebuild import EarlierRun, open_scans
+from lslam.pipeline.run_folder import CHECKPOINT, SESSIONS, RunFolder
+from lslam.pipeline.watch import Watch
+from lslam.reports.merge_html import SessionView, write_page
+from lslam.types.gnss import Georeference
+from lslam.types.scan_result import ScanResult
+from lslam.types.sequence import Sequence as Recording
+from lslam.types.trajectory import Trajectory
+from lslam.version import __version__
+
+log = logging.getLogger("lslam")
+Floats = NDArray[np.float64]
+SCHEMA = 1
+COLUMNS = "session,run,scans,keyframes,first_keyframe,start_votes,start_tried,loops_between,ate_before_m,ate_after_m"
+
+
+@dataclass(frozen=True)
+class SessionRow:
+    """One session of a merged folder, for people and programs. `ate` : se3, m, alone and merged; None without truth."""
+
+    name: str
+    run: str
+    scans: int
+    keyframes: int
+    first_keyframe: int
+    votes: int
+    tried: int
+    loops_between: int
+    ate: tuple[float, float] | None
+    T_town_session: list[list[float]]
+
+
+def merge_into(
+    folders: Sequence[Path], out: Path, config: Config, watch: Watch, *, overwrite: bool = False, resume: bool = False,
+    command: str = "",
+) -> dict[str, Any]:  # fmt: skip
+    """Merge runs into the folder `out`, and give its manifest.
+
+    Raises as `merge_runs`, OutputExistsError and OutputError as `RunFolder`.
+    """
+    folders = expanded(folders)
+    with RunFolder(out, overwrite or resume, resume) as folder:
+        manifest: dict[str, Any] = {"schema": SCHEMA, "kind": "merge", "lslam": __version__, "command": command}
+        folder.write_text("config.toml", config_text(config))
+        folder.write_manifest({**manifest, "status": "running"})
+        kept = Checkpoints(folder.path / CHECKPOINT, "merge", config.odometry.checkpoint_s)
+        try:
+            merged = merge_runs(folders, config, watch.should_stop, lambda stage: log.info("merge: %s", stage), kept)
+            manifest |= _fill(folder, merged, config, watch)
+        except BaseException as error:
+            status = "interrupted" if isinstance(error, InterruptedRunError) else "failed"
+            with suppress(OutputError):
+                folder.write_manifest({**manifest, "status": status, "why": str(error) or type(error).__name__})
+            raise
+        folder.write_manifest(manifest)
+        folder.drop_checkpoint()
+        log.info("%s; results in %s", manifest["status"], folder.path)
+    return manifest
+
+
+def _fill(folder: RunFolder, merged: Merged, config: Config, watch: Watch) -> dict[str, Any]:
+    """Everything but the manifest, whose content it gives."""
+    problems = [f"{one.name} is left out: {one.why}" for one in merged.left_out]
+    recordings = [_recording(run, problems) for run in merged.runs]
+    trajectories = [to_trajectory(results, "merge") for results in merged.results]
+    (folder.path / SESSIONS).mkdir(exist_ok=True)
+    world = f"that of {merged.sessions[0].name}"
+    for session, trajectory in zip(merged.sessions, trajectories, strict=True):
+        comment = f"lslam {__version__}, merged: T_world_lidar of {session.name}\nworld: {world}"
+        write_tum(folder.path / SESSIONS / f"{session.name}.tum", trajectory, comment=comment)
+    rows = _rows(merged, recordings, trajectories, config)
+    folder.write_text("sessions.csv", "\n".join([COLUMNS, *map(_line, rows)]) + "\n")
+    write_loops(folder.path / "loops.csv", merged.candidates, merged.chain.keyframes())
+    accepted = [c.constraint for c in merged.candidates if c.is_accepted and c.constraint is not None]
+    constraints = [replace(c, covariance=well_conditioned(c.covariance)) for c in (*merged.chain.odometry(), *accepted)]
+    write_g2o(folder.path / "graph.g2o", merged.solution.poses, constraints)
+    georeference = _georeference(merged)
+    about: dict[str, Any] = {}
+    if config.map.write:
+        built = _map(recordings, merged.results, config, watch, folder.path)
+        note = MapNote(", ".join(s.name for s in merged.sessions), config.map.voxel, built.done, world)
+        write_map(folder.path / f"map.{config.map.format}", built.merged, note, georeference)
+        about["map_points"] = len(built.merged)
+        views = _views(merged, trajectories)
+        write_page(
+            folder.path / "report.html", views, [vars(row) for row in rows], problems, (built.image, built.extent)
+        )
+    else:
+        write_page(
+            folder.path / "report.html", _views(merged, trajectories), [vars(row) for row in rows], problems, None
+        )
+    for problem in problems:
+        log.warning("%s", problem)
+    return about | {
+        "status": "degraded" if problems else "done",
+        "problems": problems,
+        "frames": {"world": world},
+        "sessions": [vars(row) for row in rows],
+        "left_out": [vars(one) for one in merged.left_out],
+        "graph": {
+            "keyframes": len(merged.chain), "loops": len(accepted), "drift_factor": round(merged.solution.drift, 4),
+            "rounds": merged.solution.rounds,
+        },
+        **({} if georeference is None else {"georeference": describe(georeference)}),
+    }  # fmt: skip
+
+
+def _recording(run: EarlierRun, problems: list[str]) -> Recording | None:
+    """The raw scans of a run, None and one more of the problems where they are gone."""
+    try:
+        return open_scans(run)
+    except InputError as error:
+        problems.append(f"{error}; they are missing in the map")
+        return None
+
+
+def _rows(
+    merged: Merged, recordings: Sequence[Recording | None], trajectories: Sequence[Trajectory], config: Config
+) -> list[SessionRow]:
+    rows = []
+    for n, (run, session, recording, trajectory) in enumerate(
+        zip(merged.runs, merged.sessions, recordings, trajectories, strict=True)
+    ):
+        part = merged.chain.part(n)
+        start = session.start
+        T = merged.solution.poses[part][0] @ se3.inverse(session.keyframes[0].T_world_lidar)
+        rows.append(
+            SessionRow(
+                session.name, str(run.folder.resolve()), len(session.results), len(session.keyframes), part.start,
+                0 if start is None else start.votes, 0 if start is None else start.tried, merged.between(n),
+                _ate(run.trajectory, trajectory, recording, config), se3.normalise(T).tolist(),
+            )
+        )  # fmt: skip
+    return rows
+
+
+def _ate(
+    before: Trajectory, after: Trajectory, recording: Recording | None, config: Config
+) -> tuple[float, float] | None:
+    """m, se3, of a session alone and merged; None without ground truth."""
+    if recording is None or recording.ground_truth is None:
+        return None
+    errors = []
+    for trajectory in (before, after):
+        try:
+            ate = evaluate(trajectory, recording.ground_truth, config.eval, calibration=recording.calibration).ate[
+                "se3"
+            ]
+        except (LslamError, KeyError):
+            return None
+        if ate.translation is None:
+            return None
+        errors.append(float(ate.translation.rmse))
+    return errors[0], errors[1]
+
+
+def _line(row: SessionRow) -> str:
+    before, after = ("", "") if row.ate is None else (f"{row.ate[0]:.5f}", f"{row.ate[1]:.5f}")
+    run = f'"{row.run}"' if "," in row.run else row.run
+    values = (row.name, run, row.scans, row.keyframes, row.first_keyframe, row.votes, row.tried, row.loops_between)
+    return ",".join([*map(str, values), before, after])
+
+
+def _georeference(merged: Merged) -> Georeference | None:
+    """Where the common world lies on the Earth, by the first session that knows."""
+    for n, run in enumerate(merged.runs):
+        if run.georeference is not None:
+            first = merged.sessions[n].keyframes[0].T_world_lidar
+            T_town_session = merged.solution.poses[merged.chain.part(n)][0] @ se3.inverse(first)
+            return replace(run.georeference, T_enu_world=run.georeference.T_enu_world @ se3.inverse(T_town_session))
+    return None
+
+
+def _map(
+    recordings: Sequence[Recording | None],
+    results: Sequence[list[ScanResult]],
+    config: Config,
+    watch: Watch,
+    spool: Path,
+) -> BuiltMap:
+    """The scans of all sessions in one map."""
+    watch.on_start(
+        "map", sum(len(r) for r, recording in zip(results, recordings, strict=True) if recording is not None)
+    )
+    maker, number = MapMaker(config.map, spool), 0
+    for recording, poses in zip(recordings, results, strict=True):
+        if recording is None:
+            continue
+        ahead = read_ahead(recording, scan_poser(poses, config), config.input.workers)
+        for _, loaded in zip(poses, ahead, strict=False):
+            if watch.should_stop():
+                raise InterruptedRunError("interrupted while the map was built: nothing of it is written")
+            if loaded.prepared is not None:
+                maker.add(number, loaded.prepared)
+            number += 1
+            watch.on_step()
+    return maker.finish()
+
+
+def _views(merged: Merged, trajectories: Sequence[Trajectory]) -> list[SessionView]:
+    return [
+        SessionView(
+            session.name,
+            (session.T_town_session @ np.stack([r.T_world_lidar for r in session.results]))[:, :3, 3],
+            after.positions,
+        )
+        for session, after in zip(merged.sessions, trajectories, strict=True)
+    ]
