@@ -159,7 +159,7 @@ def names_of(folders: Sequence[Path]) -> list[str]:
     """Their names, with a number where two are the same."""
     names: list[str] = []
     for folder in folders:
-        name = folder.resolve().name
+        name = folder.absolute().name
         count = sum(known == name or known.startswith(f"{name}-") for known in names)
         names.append(name if name not in names else f"{name}-{count + 1}")
     return names
