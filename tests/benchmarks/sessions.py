@@ -111,9 +111,9 @@ def main() -> None:
         for seed, one in zip(seeds, found, strict=True)
     ]  # fmt: skip
     caption = (
-        f"{args.scenario}, {tables.seeds_named(seeds)}: drives of one town by an HDL-64, a VLP-16, an OS1-64 and an OS1-32, two of "
-        "them in the opposite direction, and one of another town. ATE se3, m: the best and the worst session alone, and all poses "
-        "of all sessions aligned once."
+        f"{args.scenario}, {tables.seeds_named(seeds)}: drives of one town by an HDL-64, a VLP-16, an OS1-64 and an OS1-32, two "
+        "of them in the opposite direction, and one of another town. ATE se3, m: the best and the worst session alone, and all "
+        "poses of all sessions aligned once."
     )
     header = [
         "seed",

@@ -9,13 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from calling import SAMPLE, assert_one_sentence, lslam, strict_json
+from revisits import Floats, frame_from_town, record_visits, run, town_poses
 
 from lslam.formats.point_files import read_cloud, write_cloud
 from lslam.formats.trajectory_files import read_trajectory
 from lslam.geometry import se3
-from lslam.simulation.record import record
-from lslam.simulation.routes import Visit
-from lslam.simulation.scenarios import simulate
 from lslam.types.cloud import ArrayCloud
 
 GRID = np.array([512_000.0, 5_427_000.0, 0.0])
@@ -23,14 +21,10 @@ GRID = np.array([512_000.0, 5_427_000.0, 0.0])
 
 @pytest.fixture(scope="module")
 def drives(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """`monday` with its run in `map`, and `tuesday`, the other way round on the other lane; both with their truth in the town."""
+    """`monday` with its run in `map`, and `tuesday`."""
     root = tmp_path_factory.mktemp("drives")
-    for name, visit, count in (("monday", Visit(), 96), ("tuesday", Visit(1, is_reversed=True, shift=40.0), 50)):
-        drive = simulate("block", seed=7, count=count, visit=visit)
-        record(drive, root / name)
-        np.save(root / f"{name}.npy", drive.city_poses)
-    done = lslam("run", root / "monday", "--out", root / "map", "-q")
-    assert done.returncode == 0, done.stderr
+    record_visits(root)
+    run(root / "monday", root / "map")
     return root
 
 
@@ -39,15 +33,8 @@ def rows(folder: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(stream))
 
 
-def map_from_town(root: Path) -> np.ndarray:
-    """(4, 4) by which the poses of the map's run lie best on their truth."""
-    est, true = (
-        read_trajectory(root / "map" / "trajectory.tum", "tum").positions,
-        np.load(root / "monday.npy")[:, :3, 3],
-    )
-    U, _, Vt = np.linalg.svd((est - est.mean(0)).T @ (true - true.mean(0)))
-    R = U @ np.diag([1, 1, np.linalg.det(U @ Vt)]) @ Vt
-    return se3.make(R, est.mean(0) - R @ true.mean(0))
+def map_from_town(root: Path) -> Floats:
+    return frame_from_town(root, root / "map" / "trajectory.tum", "monday")
 
 
 def test_another_drive_is_found_and_followed_in_the_frame_of_the_map(drives: Path, tmp_path: Path) -> None:
@@ -58,7 +45,7 @@ def test_another_drive_is_found_and_followed_in_the_frame_of_the_map(drives: Pat
     assert about["held"] == 50
     assert about["start"]["votes"] >= 2
     est = read_trajectory(tmp_path / "run" / "trajectory.tum", "tum").positions
-    true = se3.apply(map_from_town(drives), np.load(drives / "tuesday.npy")[:, :3, 3])
+    true = se3.apply(map_from_town(drives), town_poses(drives, "tuesday")[:, :3, 3])
     # No alignment: the frame is the map's.
     assert np.linalg.norm(est - true, axis=1).max() < 0.05
     table = rows(tmp_path / "run")
@@ -74,13 +61,13 @@ def test_a_survey_in_projected_coordinates_keeps_them(drives: Path, tmp_path: Pa
     words = ("--map", tmp_path / "survey.laz", "--count", 30, "--out", tmp_path / "run", "-q")
     done = lslam("localize", drives / "tuesday", *words)
     assert done.returncode == 0, done.stderr
-    true = se3.apply(map_from_town(drives), np.load(drives / "tuesday.npy")[:30, :3, 3]) + GRID
+    true = se3.apply(map_from_town(drives), town_poses(drives, "tuesday")[:30, :3, 3]) + GRID
     at = np.array([[float(row[axis]) for axis in "xyz"] for row in rows(tmp_path / "run")])
     assert np.linalg.norm(at - true, axis=1).max() < 0.06
 
 
 def test_a_start_that_is_given_is_where_it_begins(drives: Path, tmp_path: Path) -> None:
-    T = map_from_town(drives) @ np.load(drives / "tuesday.npy")[0]
+    T = map_from_town(drives) @ town_poses(drives, "tuesday")[0]
     heading = float(np.rad2deg(np.arctan2(T[1, 0], T[0, 0])))
     place = f"{T[0, 3] + 3:.1f},{T[1, 3] - 2:.1f},{heading + 8:.0f}"
     words = ("--start", place, "--count", 20, "--out", tmp_path / "run", "-q")

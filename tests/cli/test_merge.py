@@ -1,0 +1,142 @@
+"""`lslam merge` as a user calls it: two drives of one town, one of another, and folders that are none."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from calling import SAMPLE, assert_one_sentence, lslam, strict_json
+from revisits import record_visits, run, town_poses
+
+from lslam.config import load_config
+from lslam.errors import InterruptedRunError
+from lslam.formats.point_files import read_cloud
+from lslam.formats.trajectory_files import read_trajectory
+from lslam.geometry import se3
+from lslam.geometry.umeyama import align
+from lslam.pipeline.merged_folder import merge_into
+from lslam.pipeline.watch import Watch
+
+SAME = ("sessions/monday-run.tum", "sessions/tuesday-run.tum", "loops.csv", "graph.g2o", "map.ply")
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Runs of `monday`, of `tuesday`, and of another town."""
+    root = tmp_path_factory.mktemp("runs")
+    record_visits(root)
+    for name in ("monday", "tuesday"):
+        run(root / name, root / f"{name}-run")
+    done = lslam("run", SAMPLE, "--count", 40, "--out", root / "elsewhere", "-q", "--set", "map.write=false")
+    assert done.returncode == 0, done.stderr
+    return root
+
+
+@pytest.fixture(scope="module")
+def town(runs: Path) -> Path:
+    words = (runs / "monday-run", runs / "elsewhere", runs / "tuesday-run", "--out", runs / "town", "--json")
+    done = lslam("merge", *words)
+    assert done.returncode == 0, done.stderr
+    (runs / "town.json").write_text(done.stdout)
+    return runs / "town"
+
+
+def test_all_sessions_lie_in_one_frame(runs: Path, town: Path) -> None:
+    est = [read_trajectory(town / "sessions" / f"{name}-run.tum", "tum").positions for name in ("monday", "tuesday")]
+    true = [town_poses(runs, name)[:, :3, 3] for name in ("monday", "tuesday")]
+    T, _, _ = align(np.concatenate(est), np.concatenate(true))
+    away = np.linalg.norm(se3.apply(T, np.concatenate(est)) - np.concatenate(true), axis=1)
+    # One alignment for both: what holds them together is the loops between them.
+    assert away.max() < 0.02
+
+
+def test_a_drive_of_another_town_is_left_out_and_named(runs: Path, town: Path) -> None:
+    manifest = strict_json((runs / "town.json").read_text())["manifest"]
+    assert [one["name"] for one in manifest["sessions"]] == ["monday-run", "tuesday-run"]
+    assert [one["name"] for one in manifest["left_out"]] == ["elsewhere"]
+    assert manifest["status"] == "degraded"
+    assert all(one["loops_between"] > 0 for one in manifest["sessions"])
+    page = (town / "report.html").read_text()
+    assert "elsewhere is left out" in page.replace("Elsewhere", "elsewhere")
+    assert "tuesday-run" in page
+
+
+def test_the_map_is_of_both(runs: Path, town: Path) -> None:
+    both, one = read_cloud(town / "map.ply").points, read_cloud(runs / "monday-run" / "map.ply").points
+    assert len(both) > 1.05 * len(one)
+    assert strict_json((town / "map.json").read_text())["sequence"] == "monday-run, tuesday-run"
+
+
+def test_any_number_of_threads_gives_the_same_bytes(runs: Path, town: Path, tmp_path: Path) -> None:
+    words = (
+        runs / "monday-run",
+        runs / "elsewhere",
+        runs / "tuesday-run",
+        "--threads",
+        1,
+        "--out",
+        tmp_path / "town",
+        "-q",
+    )
+    assert lslam("merge", *words).returncode == 0
+    for name in SAME:
+        assert (tmp_path / "town" / name).read_bytes() == (town / name).read_bytes(), name
+
+
+def test_a_merged_town_takes_another_run(runs: Path, town: Path, tmp_path: Path) -> None:
+    done = lslam("merge", town, runs / "elsewhere", "--out", tmp_path / "more", "--no-map", "--json")
+    assert done.returncode == 0, done.stderr
+    manifest = strict_json(done.stdout)["manifest"]
+    assert [one["name"] for one in manifest["sessions"]] == ["monday-run", "tuesday-run"]
+    for name in SAME[:2]:
+        assert (tmp_path / "more" / name).read_bytes() == (town / name).read_bytes()
+
+
+def test_a_drive_is_located_in_the_merged_town(runs: Path, town: Path, tmp_path: Path) -> None:
+    done = lslam("localize", runs / "tuesday", "--map", town, "--count", 25, "--out", tmp_path / "in", "-q")
+    assert done.returncode == 0, done.stderr
+    here = read_trajectory(tmp_path / "in" / "trajectory.tum", "tum").positions
+    there = read_trajectory(town / "sessions" / "tuesday-run.tum", "tum").positions[:25]
+    assert np.linalg.norm(here - there, axis=1).max() < 0.03
+
+
+def test_an_interrupted_merge_goes_on_to_the_same_bytes(runs: Path, town: Path, tmp_path: Path) -> None:
+    folders = [runs / "monday-run", runs / "elsewhere", runs / "tuesday-run"]
+    config = load_config(None, [])
+
+    def look() -> bool:
+        return sys._getframe(1).f_code.co_name == "_map"
+
+    with pytest.raises(InterruptedRunError):
+        merge_into(folders, tmp_path / "town", config, Watch(should_stop=look))
+    assert json.loads((tmp_path / "town" / "manifest.json").read_text())["status"] == "interrupted"
+    merge_into(folders, tmp_path / "town", config, Watch(), resume=True)
+    for name in SAME:
+        assert (tmp_path / "town" / name).read_bytes() == (town / name).read_bytes(), name
+
+
+def test_nothing_that_can_be_tied_is_a_failure(runs: Path, tmp_path: Path) -> None:
+    done = lslam("merge", runs / "monday-run", runs / "elsewhere", "--out", tmp_path / "town")
+    assert done.returncode == 1
+    assert "elsewhere: not found among the others" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "said"),
+    [
+        (("monday-run",), 2, "two runs"),
+        (("monday-run", "monday-run"), 2, "named twice"),
+        (("monday-run", "nowhere"), 3, "nowhere does not exist"),
+        (("monday-run", "monday"), 3, "no folder of a run"),
+        (("monday-run", "tuesday-run", "--resume"), 2, "--resume needs --out"),
+        (("monday-run", "tuesday-run", "--out", "tuesday-run"), 2, "exists"),
+    ],
+)
+def test_wrong_words_get_one_sentence(runs: Path, words: tuple[str, ...], code: int, said: str) -> None:
+    done = lslam("merge", *words, cwd=runs)
+    assert done.returncode == code, done.stderr
+    assert said in done.stderr
+    assert_one_sentence(done.stderr)
