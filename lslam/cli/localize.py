@@ -21,7 +21,7 @@ from lslam.cli.console import setup_logging
 @click.argument("sequence")
 @click.option(
     "--map", "map_path", type=click.Path(path_type=Path), metavar="MAP", required=True,
-    help="Run folder, or a cloud: PLY, PCD, LAS or LAZ.",
+    help="Run folder, folder of tiles, or a cloud: PLY, PCD, LAS or LAZ.",
 )  # fmt: skip
 @click.option(
     "--start", metavar="X,Y,HEADING",

@@ -14,12 +14,14 @@ from lslam.cli.console import progress, setup_logging, show
 from lslam.stopping import heeded
 
 if TYPE_CHECKING:
+    from lslam.pipeline.rebuild import EarlierRun
     from lslam.types.run_record import Crispness
 
 EPILOG = """\b
 Examples:
   lslam map runs/first --voxel 0.1 --format laz
   lslam map runs/first --clean --crop -50,50,-50,50 --out square.ply
+  lslam map runs/first --tiles 50 --format laz
   lslam map runs/first --against survey.laz --threshold 0.1
   lslam map somebody-elses.ply --score
 """
@@ -35,7 +37,15 @@ Examples:
 @click.option("--denoise", is_flag=True, help="Remove points far from their neighbours (Open3D).")
 @click.option("--mesh", is_flag=True, help="Write a surface too, FILE_mesh.ply (Open3D).")
 @click.option("--crs", metavar="EPSG:N", help="Coordinates of las and laz of a georeferenced run  [its UTM zone].")
-@click.option("--out", type=click.Path(path_type=Path), metavar="FILE", help="Map file  [RUN/map.FORMAT].")
+@click.option(
+    "--tiles", type=float, metavar="M", help="Square tiles with this edge and an index, for maps of any size."
+)
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path),
+    metavar="PATH",
+    help="Map file  [RUN/map.FORMAT], or folder of tiles  [RUN/tiles].",
+)
 @click.option("--overwrite", is_flag=True, help="Replace existing files.")
 @click.option(
     "--sequence", type=click.Path(path_type=Path), metavar="PATH", help="Sequence of the raw scans, when it has moved."
@@ -97,7 +107,7 @@ def _rebuild(target: Path, given: dict[str, Any]) -> None:
     for flag in ("threshold", "radius"):
         if given[flag] is not None:
             raise UsageError(f"--{flag} belongs to {'--against' if flag == 'threshold' else '--score'}")
-    settings = _settings(given)
+    settings = _settings(given if given["tiles"] is None else {**given, "out": None})
     require_run(target)
     from lslam.maps.georeference import parse_crs
     from lslam.pipeline.rebuild import check_output, open_scans, read_run, rebuild
@@ -106,6 +116,9 @@ def _rebuild(target: Path, given: dict[str, Any]) -> None:
     out: Path | None = given["out"]
     crs = None if given["crs"] is None else parse_crs(given["crs"])
     run = read_run(target, settings)
+    if given["tiles"] is not None:
+        _rebuild_tiles(run, out or target / "tiles", crs, given)
+        return
     check_output(out or target / f"map.{run.config.map.format}", given["overwrite"])
     sequence = open_scans(run, given["sequence"], **options.reading_of(given))
     with heeded() as stop, progress("map", len(run.trajectory)) as advance:
@@ -114,6 +127,26 @@ def _rebuild(target: Path, given: dict[str, Any]) -> None:
     rows = [("map", f"{built.path}: {built.points} points of {built.scans} scans"), *crispness_rows(built.crispness)]
     document = {"file": str(built.path), "points": built.points, "scans": built.scans}
     _print(rows, {**document, "crispness": crispness_document(built.crispness)}, given["as_json"])
+
+
+def _rebuild_tiles(run: EarlierRun, folder: Path, crs: int | None, given: dict[str, Any]) -> None:
+    from lslam.errors import UsageError
+    from lslam.pipeline.map_tiles import check_tiles, rebuild_in_tiles
+    from lslam.pipeline.rebuild import open_scans
+
+    if given["mesh"] or given["occupancy"]:
+        raise UsageError("--tiles divides the points alone: leave out --mesh and --occupancy")
+    check_tiles(folder, given["tiles"], given["overwrite"])
+    sequence = open_scans(run, given["sequence"], **options.reading_of(given))
+    with heeded() as stop, progress("map", len(run.trajectory)) as advance:
+        stop.is_gentle = True
+        index = rebuild_in_tiles(run, sequence, folder, given["tiles"], crs=crs, on_step=advance, should_stop=stop)
+    tiles = len(index["tiles"])
+    rows = [
+        ("tiles", f"{folder}: {tiles} of {given['tiles']:g} m, {index['points']} points"),
+        ("index", str(folder / "map.json")),
+    ]
+    _print(rows, {"folder": str(folder), **index}, given["as_json"])
 
 
 def _settings(given: dict[str, Any]) -> list[str]:

@@ -11,9 +11,12 @@ from lslam.config.registration import RegistrationConfig
 from lslam.errors import InputError, UsageError
 from lslam.formats.point_files import MAP_SUFFIXES, SUFFIXES, read_cloud
 from lslam.localization.prior_map import PriorMap, make_prior_map
-from lslam.pipeline.map_files import georeference_of, note_of
+from lslam.maps.georeference import Projection
+from lslam.pipeline.map_files import georeference_of, note_of, read_json
+from lslam.pipeline.map_tiles import INDEX, is_tiles, read_tiles
 from lslam.pipeline.rebuild import in_own_world, map_of
 from lslam.pipeline.run_folder import require_run
+from lslam.types.cloud import ArrayCloud
 
 log = logging.getLogger("lslam")
 # m; coordinates beyond are those of a projection, which a trajectory in float32 plots and maps would lose centimetres of.
@@ -21,17 +24,20 @@ LARGE, KILOMETRE = 1e5, 1000.0
 
 
 def require_map(target: Path, needs_place: bool = False) -> Path:
-    """The cloud file of a map, before it is read: raises InputError when there is none.
+    """The cloud file of a map, or its folder of tiles, before it is read: raises InputError when there is none.
 
     needs_place : satellite fixes are to lead into it. Raises UsageError when nobody knows where it lies on the Earth.
     """
     path = _cloud_file(target)
-    if needs_place and georeference_of(note_of(path).get("georeference")) is None:
+    about = read_json(path / INDEX) if is_tiles(path) else note_of(path)
+    if needs_place and georeference_of(about.get("georeference")) is None:
         raise UsageError(f"--gnss: {path} is not georeferenced; say where the drive begins with --start X,Y,HEADING")
     return path
 
 
 def _cloud_file(target: Path) -> Path:
+    if is_tiles(target):
+        return target
     if target.is_dir():
         require_run(target)
         return map_of(target)
@@ -50,7 +56,13 @@ def read_prior_map(target: Path, config: RegistrationConfig) -> PriorMap:
     Raises InputError naming what is missing or broken.
     """
     path = require_map(target)
-    cloud, georeference = in_own_world(path, read_cloud(path))
+    if is_tiles(path):
+        cloud, index = read_tiles(path)
+        georeference = georeference_of(index.get("georeference"))
+        if index.get("crs") is not None and georeference is not None:
+            cloud = ArrayCloud(Projection(georeference).invert(cloud.points))
+    else:
+        cloud, georeference = in_own_world(path, read_cloud(path))
     points, origin = cloud.points, np.zeros(3)
     if len(points) and float(np.abs(points).max()) > LARGE:
         origin = np.round(np.nanmedian(points, axis=0) / KILOMETRE) * KILOMETRE

@@ -162,7 +162,7 @@ def rebuild(
     check_output(path, overwrite)
     if run.config.map.denoise or run.config.map.mesh:
         require_open3d()
-    georeference = _place(run, crs)
+    georeference = place_of(run, crs)
     is_own = path.stem == "map" and path.resolve().parent == run.folder.resolve()
     with held(run.folder) if is_own else nullcontext():
         built = build_map(sequence, results_of(run), run.config, on_step, should_stop, path.parent)
@@ -191,7 +191,7 @@ def check_output(path: Path, overwrite: bool) -> None:
         raise OutputExistsError(f"{beside}, where the note of {path.name} goes, is something else: name another --out")
 
 
-def _place(run: EarlierRun, crs: int | None) -> Georeference | None:
+def place_of(run: EarlierRun, crs: int | None) -> Georeference | None:
     """Where the run lies, in the coordinates asked for."""
     georeference = run.georeference
     if crs is None:

@@ -122,3 +122,17 @@ def test_gnss_wants_a_map_that_lies_on_the_earth(drives: Path, tmp_path: Path) -
     done = lslam("localize", SAMPLE, "--map", drives / "map", "--gnss", "--out", tmp_path / "run")
     assert done.returncode == 2
     assert "not georeferenced" in done.stderr
+
+
+def test_a_map_in_tiles_serves_as_the_map(drives: Path, tmp_path: Path) -> None:
+    done = lslam("map", drives / "map", "--tiles", 20, "--format", "laz", "--out", tmp_path / "tiles", "--json")
+    assert done.returncode == 0, done.stderr
+    assert len(strict_json(done.stdout)["tiles"]) > 10
+    words = ("--map", tmp_path / "tiles", "--count", 25, "--out", tmp_path / "run", "-q")
+    assert lslam("localize", drives / "tuesday", *words).returncode == 0
+    est = read_trajectory(tmp_path / "run" / "trajectory.tum", "tum").positions
+    true = se3.apply(map_from_town(drives), town_poses(drives, "tuesday")[:25, :3, 3])
+    assert np.linalg.norm(est - true, axis=1).max() < 0.05
+    again = lslam("map", drives / "map", "--tiles", 20, "--out", tmp_path / "tiles")
+    assert again.returncode == 2
+    assert "--overwrite" in again.stderr

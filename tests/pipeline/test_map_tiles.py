@@ -1,0 +1,94 @@
+"""A map in tiles: every point in the tile where it belongs, none twice, and the whole of them the map."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+from lslam.errors import InputError, LslamError, OutputError, OutputExistsError
+from lslam.formats.point_files import read_cloud
+from lslam.maps.georeference import Projection
+from lslam.pipeline import map_tiles
+from lslam.pipeline.map_files import MapNote
+from lslam.pipeline.map_tiles import check_tiles, is_tiles, read_tiles, write_tiles
+from lslam.types.cloud import ArrayCloud
+from lslam.types.gnss import Georeference
+
+NOTE = MapNote("drive", 0.2)
+POINTS = np.random.default_rng(3).uniform([-70, -30, -2], [90, 45, 6], (5000, 3))
+CLOUD = ArrayCloud.of(POINTS, np.arange(5000) / 5000)
+
+
+@pytest.mark.parametrize("suffix", ["ply", "laz"])
+def test_each_point_lies_in_its_tile_and_in_no_other(suffix: str, tmp_path: Path) -> None:
+    index = write_tiles(tmp_path, CLOUD, NOTE, 25.0, suffix)
+    assert index["points"] == 5000 == sum(tile["points"] for tile in index["tiles"])
+    for tile in index["tiles"]:
+        points = read_cloud(tmp_path / tile["file"]).points
+        x, y = (int(part) for part in Path(tile["file"]).stem.split("_")[1:])
+        assert (np.floor((points[:, :2] + 1e-4) / 25.0) >= [x, y]).all()
+        assert (np.floor((points[:, :2] - 1e-3) / 25.0) <= [x, y]).all()
+        assert len(points) == tile["points"]
+    whole, _ = read_tiles(tmp_path)
+    away, nearest = cKDTree(POINTS).query(whole.points)
+    assert away.max() < 0.002
+    assert sorted(nearest.tolist()) == list(range(5000))
+
+
+def test_few_points_in_memory_give_the_same_tiles(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (one := tmp_path / "one").mkdir()
+    (many := tmp_path / "many").mkdir()
+    write_tiles(one, CLOUD, NOTE, 20.0, "ply")
+    monkeypatch.setattr(map_tiles, "BUFFERED", 100)
+    monkeypatch.setattr("lslam.types.cloud.BLOCK", 64)
+    write_tiles(many, CLOUD, NOTE, 20.0, "ply")
+    assert sorted(p.name for p in one.iterdir()) == sorted(p.name for p in many.iterdir())
+    for path in one.iterdir():
+        assert path.read_bytes() == (many / path.name).read_bytes(), path.name
+
+
+def test_tiles_of_a_georeferenced_run_lie_on_the_grid_of_their_crs(tmp_path: Path) -> None:
+    georeference = Georeference(np.array([49.0, 8.4, 110.0]), np.eye(4))
+    index = write_tiles(tmp_path, CLOUD, NOTE, 50.0, "laz", georeference)
+    assert index["crs"] == "EPSG:32632"
+    there = Projection(georeference).apply(POINTS)
+    names = {f"tile_{x}_{y}.laz" for x, y in np.floor(there[:, :2] / 50.0).astype(int).tolist()}
+    assert {tile["file"] for tile in index["tiles"]} == names
+
+
+def test_tiles_of_an_earlier_map_are_gone(tmp_path: Path) -> None:
+    write_tiles(tmp_path, CLOUD, NOTE, 10.0, "ply")
+    index = write_tiles(tmp_path, CLOUD, NOTE, 50.0, "laz")
+    assert {p.name for p in tmp_path.iterdir()} == {"map.json", *(tile["file"] for tile in index["tiles"])}
+
+
+def test_what_is_no_folder_of_tiles_is_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "thesis.txt").write_text("years of work")
+    with pytest.raises(OutputExistsError):
+        check_tiles(tmp_path, 50.0, False)
+    with pytest.raises(OutputError, match="something else"):
+        check_tiles(tmp_path, 50.0, True)
+    assert (tmp_path / "thesis.txt").exists()
+
+
+@pytest.mark.parametrize("size", [0.0, -5.0, 1e6, float("nan")])
+def test_a_size_that_makes_no_sense_is_refused(size: float, tmp_path: Path) -> None:
+    with pytest.raises(LslamError, match="--tiles"):
+        check_tiles(tmp_path / "new", size, False)
+
+
+def test_a_missing_tile_is_named(tmp_path: Path) -> None:
+    index = write_tiles(tmp_path, CLOUD, NOTE, 25.0, "ply")
+    (tmp_path / index["tiles"][1]["file"]).unlink()
+    assert is_tiles(tmp_path)
+    with pytest.raises(InputError, match=index["tiles"][1]["file"]):
+        read_tiles(tmp_path)
+
+
+def test_an_index_cannot_point_elsewhere(tmp_path: Path) -> None:
+    (tmp_path / "map.json").write_text('{"schema": 1, "kind": "tiles", "tiles": [{"file": "../secret.ply"}]}')
+    with pytest.raises(InputError, match="lists no tiles"):
+        read_tiles(tmp_path)
