@@ -15,6 +15,7 @@ from lslam.geometry import noise
 from lslam.graph.chi_square import quantile
 from lslam.graph.factors import FIX_NOISE
 from lslam.graph.inertial_factors import BIAS_KEY, SPEED_KEY, keyframe_of
+from lslam.graph.selected_inverse import selected_inverse
 from lslam.stopping import check_stop, checking
 
 Floats = NDArray[np.float64]
@@ -115,8 +116,9 @@ def marginal_blocks(factors: Any, values: Any, keys: Iterable[int]) -> Floats:
 
     wanted = list(keys)
     try:
-        known = gtsam.Marginals(factors, values)
-        return np.stack([known.marginalCovariance(key) for key in checking(wanted)])
+        net = factors.linearize(values).eliminateSequential(gtsam.Ordering.OrderingType.COLAMD)
+        found = dict(checking(selected_inverse(net, wanted)))
+        return np.stack([found[key] for key in wanted])
     except RuntimeError:
         # It gives up where neighbouring unknowns are known very differently well, as the roll of a straight path is.
         return scaled_blocks(factors, values, wanted)
