@@ -70,9 +70,11 @@ def tilt_factor(graph: PoseGraph, config: GraphConfig) -> float:
 
 def chains(graph: PoseGraph, config: GraphConfig) -> tuple[Floats, Floats]:
     """Odometry's covariances and drift of factor 1, both accumulated, (K, 6, 6)."""
-    unit = drift_covariance(1.0, config)
-    drifting = [replace(c, covariance=_length(c) * unit) for c in graph.odometry]
-    return _accumulated(graph.poses, graph.odometry), _accumulated(graph.poses, drifting)
+    steps = [c for c in graph.odometry if c.b == c.a + 1]
+    b, own = np.array([c.b for c in steps], np.intp), np.array([c.covariance for c in steps]).reshape(-1, 6, 6)
+    lengths = np.array([_length(c) for c in steps])
+    drifting = lengths[:, None, None] * drift_covariance(1.0, config)
+    return _accumulated(graph.poses, b, own), _accumulated(graph.poses, b, drifting)
 
 
 def _as_fixes(graph: PoseGraph) -> list[PositionFix]:
@@ -86,10 +88,8 @@ def _as_fixes(graph: PoseGraph) -> list[PositionFix]:
     return found
 
 
-def _accumulated(poses: Floats, odometry: Sequence[Constraint]) -> Floats:
-    """(K, 6, 6) of each pose in the world by odometry alone, from each keyframe to the next."""
-    steps = [c for c in odometry if c.b == c.a + 1]
-    b, own = np.array([c.b for c in steps], np.intp), np.array([c.covariance for c in steps]).reshape(-1, 6, 6)
+def _accumulated(poses: Floats, b: NDArray[np.intp], own: Floats) -> Floats:
+    """(K, 6, 6) of each pose in the world by steps to keyframes `b` (P,) from those before, of covariances `own` (P, 6, 6)."""
     # About one point the covariances of all steps add up.
     about_origin = np.zeros((len(poses), 6, 6))
     about_origin[b] = noise.transported(noise.rotated(own, poses[b - 1, :3, :3]), -poses[b, :3, 3])

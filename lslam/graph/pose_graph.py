@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -24,7 +25,7 @@ from lslam.graph.solve import (
     marginals,
     solve_incrementally,
 )
-from lslam.types.constraint import LoopStage
+from lslam.types.constraint import Constraint, LoopStage
 
 Floats = NDArray[np.float64]
 
@@ -126,10 +127,10 @@ def check_graph(graph: PoseGraph) -> None:
     if not count or not np.isfinite(graph.poses).all():
         raise GraphError("the pose graph has no keyframes" if not count else "a keyframe's pose is not finite")
     constraints = [*graph.odometry, *graph.loops]
-    for c in constraints:
+    for c, is_finite in zip(constraints, _are_finite(constraints), strict=True):
         if not (0 <= c.a < count and 0 <= c.b < count) or c.a == c.b:
             raise GraphError(f"a constraint joins keyframes {c.a} and {c.b}; there are {count}")
-        if not (np.isfinite(c.T_a_b).all() and np.isfinite(c.covariance).all()):
+        if not is_finite:
             raise GraphError(f"the constraint between keyframes {c.a} and {c.b} is not finite")
     ends = np.array([(c.a, c.b) for c in graph.odometry], np.intp).reshape(-1, 2).T
     links = coo_matrix((np.ones(ends.shape[1]), (ends[0], ends[1])), (count, count))
@@ -137,6 +138,14 @@ def check_graph(graph: PoseGraph) -> None:
     if (label != label[0]).any():
         lost = int(np.argmax(label != label[0]))
         raise GraphError(f"the pose graph is in pieces: odometry does not join keyframe {lost} to the first")
+
+
+def _are_finite(constraints: Sequence[Constraint]) -> NDArray[np.bool_]:
+    """(C,) whether a constraint's numbers are finite."""
+    if not constraints:
+        return np.zeros(0, np.bool_)
+    poses, covariances = np.stack([c.T_a_b for c in constraints]), np.stack([c.covariance for c in constraints])
+    return np.asarray(np.isfinite(poses).all(axis=(1, 2)) & np.isfinite(covariances).all(axis=(1, 2)))
 
 
 def with_distances(graph: PoseGraph) -> PoseGraph:
