@@ -198,7 +198,7 @@ def optimise_jointly(
     check_graph(graph)
     seen = list(dict.fromkeys(m.building for m in matches))
     keys = {building: factors.map_key(graph) + 1 + n for n, building in enumerate(seen)}
-    certain = [factors.between(loop) for loop in graph.loops] + [factors.position(fix) for fix in graph.fixes]
+    certain = factors.between_all(graph.loops) + [factors.position(fix) for fix in graph.fixes]
     values = factors.start_values(graph, graph.poses)
     for building, key in keys.items():
         shift = np.zeros(2) if map_prior is None else map_prior.shift

@@ -5,7 +5,8 @@ Of K keyframes k has the key k, the floor the key K, the map the key K + 1; corr
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -43,25 +44,28 @@ def well_conditioned(covariance: Floats) -> Floats:
 
 def between(constraint: Constraint, scale: float = 1.0, kernel: Any = None) -> Any:
     """A relation between two keyframes; `scale` multiplies its covariance, `kernel` is an M-estimator of gtsam."""
-    import gtsam
-
-    covariance = scale * well_conditioned(constraint.covariance)
-    model = gtsam.noiseModel.Gaussian.Covariance(noise.to_body(covariance, constraint.T_a_b))
-    return gtsam.BetweenFactorPose3(constraint.a, constraint.b, gtsam.Pose3(constraint.T_a_b), _robust(model, kernel))
+    return between_makers([constraint])[0](scale, kernel)
 
 
 def between_all(constraints: Sequence[Constraint]) -> list[Any]:
-    """As `between` of each: of thousands, linear algebra takes longer one by one."""
+    """As `between` of each."""
+    return [make(1.0, None) for make in between_makers(constraints)]
+
+
+def between_makers(constraints: Sequence[Constraint]) -> list[Callable[[float, Any], Any]]:
+    """What makes each, by scale and kernel as `between` does: linear algebra of thousands takes longer one by one."""
     import gtsam
 
     if not constraints:
         return []
     poses = np.stack([c.T_a_b for c in constraints])
     bodies = noise.to_body(well_conditioned(np.stack([c.covariance for c in constraints])), poses)
-    return [
-        gtsam.BetweenFactorPose3(c.a, c.b, gtsam.Pose3(c.T_a_b), gtsam.noiseModel.Gaussian.Covariance(body))
-        for c, body in zip(constraints, bodies, strict=True)
-    ]
+
+    def make(c: Constraint, pose: Any, body: Floats, scale: float, kernel: Any) -> Any:
+        model = gtsam.noiseModel.Gaussian.Covariance(scale * body)
+        return gtsam.BetweenFactorPose3(c.a, c.b, pose, _robust(model, kernel))
+
+    return [partial(make, c, gtsam.Pose3(c.T_a_b), body) for c, body in zip(constraints, bodies, strict=True)]
 
 
 def position(fix: PositionFix, scale: float = 1.0, kernel: Any = None) -> Any:

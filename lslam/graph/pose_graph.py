@@ -49,7 +49,7 @@ def optimise(graph: PoseGraph, config: GraphConfig) -> Solution:
     may_tilt = graph.is_anchored and len(graph.ups) > 0
     is_placed = graph.start_sigma is not None or not graph.is_anchored
     fixed = factors.fixed_part(graph, may_tilt)
-    candidates = [OutlierCandidate(partial(factors.between, loop), 6) for loop in loops]
+    candidates = [OutlierCandidate(make, 6) for make in factors.between_makers(loops)]
     candidates += [OutlierCandidate(partial(factors.position, fix), 3) for fix in graph.fixes]
     key = factors.map_key(graph)
     candidates += [

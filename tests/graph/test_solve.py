@@ -11,7 +11,7 @@ import pytest
 
 from lslam.config.graph import GraphConfig
 from lslam.errors import GraphError
-from lslam.graph.solve import marginal_blocks, solve, solve_incrementally
+from lslam.graph.solve import marginal_blocks, refine, solve, solve_incrementally
 
 
 @pytest.mark.parametrize(("optimizer", "asked"), [("dogleg", "DoglegOptimizer"), ("lm", "LevenbergMarquardtOptimizer")])
@@ -24,6 +24,46 @@ def test_the_optimiser_of_the_configuration_solves(optimizer: str, asked: str, m
         monkeypatch.delattr(gtsam, name)
     found = solve(factors, values, GraphConfig.model_validate({"optimizer": optimizer}))
     np.testing.assert_allclose(found.atPoint3(0), target, atol=1e-6)
+
+
+def bent(x: float) -> tuple[Any, Any]:
+    """A residual atan(x), whose Gauss-Newton steps run away from beyond 1.39 (x atan x = x^2 / (1 + x^2) twice over)."""
+    factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+
+    def error(_: Any, values: Any, jacobians: list[Any] | None) -> Any:
+        x = values.atVector(0)
+        if jacobians is not None:
+            jacobians[0] = np.diag(1 / (1 + x**2))
+        return np.arctan(x)
+
+    factors.add(gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(1), [0], error))
+    values.insert(0, np.array([x]))
+    return factors, values
+
+
+@pytest.mark.parametrize(("x", "needs_solve"), [(0.01, False), (1.3, False), (2.0, True)])
+def test_refining_converges_and_falls_back_where_gauss_newton_runs_away(
+    x: float, needs_solve: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = list[float]()
+
+    def noted(factors: Any, values: Any, config: GraphConfig) -> Any:
+        asked.append(float(values.atVector(0)[0]))
+        return solve(factors, values, config)
+
+    monkeypatch.setattr("lslam.graph.solve.solve", noted)
+    assert refine(*bent(x), GraphConfig()).atVector(0)[0] == pytest.approx(0.0, abs=1e-2)
+    assert asked == ([x] if needs_solve else [])
+
+
+def test_refining_a_linear_graph_is_one_elimination(monkeypatch: pytest.MonkeyPatch) -> None:
+    factors, values, stops = gtsam.NonlinearFactorGraph(), gtsam.Values(), list[int]()
+    for x in (1.0, 4.0):
+        factors.add(gtsam.PriorFactorPoint3(0, np.full(3, x), gtsam.noiseModel.Isotropic.Sigma(3, 0.1)))
+    values.insert(0, np.zeros(3))
+    monkeypatch.setattr("lslam.graph.solve.check_stop", lambda: stops.append(1))
+    np.testing.assert_allclose(refine(factors, values, GraphConfig()).atPoint3(0), 2.5, atol=1e-12)
+    assert len(stops) == 1
 
 
 @pytest.mark.parametrize(
