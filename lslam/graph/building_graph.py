@@ -23,10 +23,9 @@ from lslam.graph.pose_graph import check_graph
 from lslam.graph.problem import PlanarPrior, PoseGraph
 from lslam.graph.solve import (
     GROWTH,
-    IN,
-    OUT,
     ROUNDS,
     OutlierCandidate,
+    are_decided,
     gnc_solve,
     joined,
     marginal_blocks,
@@ -96,7 +95,7 @@ def solve_buildings(
         trust = truncated_weights(ratio, mu)
         solution = _linear(len(middles), owners, measured, trust[:, None, None] * weights, map_prior)
         ratio = _squared(solution, owners, measured, weights) / limits
-        if bool(np.all((trust < OUT) | (trust > IN))):
+        if are_decided(trust):
             break
         mu *= GROWTH
     inliers = ratio <= 1

@@ -24,8 +24,8 @@ Floats = NDArray[np.float64]
 BATCH = 10
 # The control parameter's growth per round, and rounds at most (Yang et al. take 1.4 and 100, from far worse starts).
 GROWTH, ROUNDS = 2.0, 30
-# Weights beyond these are decided; a factor below the first is left out.
-OUT, IN = 1e-3, 0.999
+# A weight beyond is decided, as one of 0 is; other small weights are not: with the control parameter all of them are small.
+IN = 0.999
 
 
 def solve(factors: Any, values: Any, config: GraphConfig) -> Any:
@@ -244,12 +244,12 @@ def _graduated(
         values = refine(factors, values, config)
         squared = _squared(plain, values)
         rounds += 1
-        if bool(np.all((weights < OUT) | (weights > IN))):
+        if are_decided(weights):
             break
         mu *= GROWTH
     # Finally inliers have their own covariance, outliers are left out.
     is_inlier = squared <= limits
-    if np.array_equal(is_inlier, weights > IN) and np.array_equal(is_inlier, weights >= OUT):
+    if are_decided(weights) and np.array_equal(is_inlier, weights > IN):
         return GncResult(factors, values, is_inlier.astype(float), squared, limits, rounds)
     weights = is_inlier.astype(float)
     factors = joined(fixed, [f for f, b in zip(plain, is_inlier, strict=True) if b])
@@ -264,10 +264,15 @@ def truncated_weights(ratio: Floats, mu: float) -> Floats:
     return np.where(ratio <= low, 1.0, np.where(ratio >= high, 0.0, np.clip(middle, 0.0, 1.0)))
 
 
+def are_decided(weights: Floats) -> bool:
+    """Whether every candidate counts in full or not at all."""
+    return bool(np.all((weights == 0) | (weights > IN)))
+
+
 def _weighted(candidates: Sequence[OutlierCandidate], plain: list[Any], weights: Floats) -> list[Any]:
     chosen = []
     for item, factor, weight in zip(candidates, plain, weights, strict=True):
-        if weight >= OUT:
+        if weight > 0:
             chosen.append(factor if weight > IN else item.make(1.0 / weight, None))
     return chosen
 
