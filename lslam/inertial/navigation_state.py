@@ -73,14 +73,19 @@ def process_noise(t: float, rate_variance: float, noise: ImuNoise = USUAL) -> Fl
 def cut_noise(hidden: Floats, F: Floats) -> Floats:
     """(N, N) that readings which the range cut off add over a step with the transition F (N, N).
 
-    hidden : (6,) one sigma of force and rate, of one error of the whole cut, as a bias would be that lasts for this step
+    hidden : (6,) one sigma of the mean force and rate; white noise over the step that adds as much velocity and turn
+
+    A constant error of each step, another in the next, would put a pole of the filter at -1: where one position is found
+    wrong, it would take twice the speed that makes up for it, back and forth ever after. With white noise it is at sqrt(3) - 2.
     """
-    turned, errors = F[TURN, GYRO][:, :3] * hidden[3:], np.zeros((len(F), 6))
-    errors[TURN, 3:], errors[PLACE, :3] = turned, F[PLACE, FORCE] * hidden[:3]
-    errors[SPEED, :3] = F[SPEED, FORCE] * hidden[:3]
-    # It has grown to its half, and in the mean of a double integral to its third, while forces were turned by it.
-    errors[PLACE, 3:] = F[PLACE, TURN] @ turned / 3
-    errors[SPEED, 3:] = F[SPEED, TURN] @ turned / 2
+    turned, errors = F[TURN, GYRO][:, :3] * hidden[3:], np.zeros((len(F), 15))
+    moved, pushed = F[PLACE, FORCE] * hidden[:3], F[SPEED, FORCE] * hidden[:3]
+    errors[SPEED, :3], errors[PLACE, :3], errors[PLACE, 3:6] = pushed, moved, moved / np.sqrt(3)
+    # The integral of a random walk, and the integral of that: with its end, with each other, and alone.
+    swayed, led = F[SPEED, TURN] @ turned, F[PLACE, TURN] @ turned
+    errors[TURN, 6:9] = turned
+    errors[SPEED, 6:9], errors[SPEED, 9:12] = swayed / 2, swayed / np.sqrt(12)
+    errors[PLACE, 6:9], errors[PLACE, 9:12], errors[PLACE, 12:] = led / 3, led / np.sqrt(12), led / np.sqrt(180)
     return np.asarray(errors @ errors.T)
 
 

@@ -156,6 +156,44 @@ def test_only_a_step_over_saturated_readings_has_a_larger_covariance() -> None:
     assert sigmas[3][2][0] > 2 * sigmas[2][2][0], "a force that is turned wrongly leads astray"
 
 
+def test_one_wrong_position_rings_in_no_later_velocity() -> None:
+    """While forces are cut off, the velocity is that of the positions found: it forgets one that was wrong by a centimetre."""
+    stamps, none = np.arange(200, dtype=np.int64) * 10_000_000, np.zeros(3)
+    accel = np.tile([0.0, 0.0, GRAVITY], (200, 1))
+    blind = ImuStream(stamps, accel, np.zeros((200, 3)), np.tile([5.0, 5.0, 5.0, 0.0, 0.0, 0.0], (200, 1)))
+    estimate = ImuEstimate(none, np.array([0, 0, -GRAVITY]), none, Gyroscope.of_bias(none, 1e-3), 1e-4 * np.eye(9))
+    state, sure, speeds = NavigationState.begin(np.eye(4), estimate), 1e-6 * np.eye(6), []
+    for k in range(18):
+        T = np.eye(4)
+        T[0, 3] = 0.01 if k == 5 else 0.0
+        step = state.estimate.over(blind, stamps[[10 * k, 10 * k + 10]])
+        state = state.propagated(step).moved_to(T, sure)
+        speeds.append(float(np.linalg.norm(state.estimate.velocity)))
+    assert speeds[5] > 0.1
+    assert speeds[-1] < 0.01 * speeds[5]
+
+
+def test_white_noise_of_a_cut_is_that_of_many_short_steps() -> None:
+    """A rate that is hidden over a tenth of a second, as one step and as a hundred of them with errors of their own."""
+    stamps, none, n = np.arange(101, dtype=np.int64) * 1_000_000, np.zeros(3), 100
+    accel = np.tile([2.0, -1.0, GRAVITY], (101, 1))
+    estimate = ImuEstimate(none, np.array([0, 0, -GRAVITY]), none, Gyroscope.of_bias(none, 1e-9), 1e-18 * np.eye(9))
+    sigma = np.array([3.0, 2.0, 1.0, 0.3, 0.2, 0.1])
+    found = []
+    for parts in (1, n):
+        hidden = np.tile(sigma * np.sqrt(parts), (101, 1))
+        states = [NavigationState.begin(np.eye(4), estimate) for _ in range(2)]
+        for k in range(parts):
+            at = stamps[[k * n // parts, (k + 1) * n // parts]]
+            states = [
+                state.propagated(state.estimate.over(ImuStream(stamps, accel, np.zeros((101, 3)), lacks), at))
+                for state, lacks in zip(states, (None, hidden), strict=True)
+            ]
+        found.append((states[1].covariance - states[0].covariance)[:9, :9])
+    scale = np.sqrt(np.diag(found[1]))
+    np.testing.assert_allclose(found[0] / np.outer(scale, scale), found[1] / np.outer(scale, scale), atol=0.03)
+
+
 def test_saturation_adds_its_sigma_to_velocity_and_rotation() -> None:
     """A force and a rate hidden all the time lead as far astray as a constant error of one sigma."""
     stamps, none = np.arange(11, dtype=np.int64) * 10_000_000, np.zeros(3)
