@@ -46,8 +46,12 @@ class LinkedMotion(FilterMotion):
         return replace(prior, link=self._link(prior, stamp_ns))
 
     def refine(self, prior: MotionPrior, stamp_ns: int, pose: Floats) -> MotionPrior:
-        """The prior itself where the IMU predicted it: a sweep is deskewed once."""
-        return prior if self.is_inertial else replace(super().refine(prior, stamp_ns, pose), link=prior.link)
+        """As of the filter, with what joins it to the last scan: the middle of the sweep is seen from the refined stamp."""
+        refined = super().refine(prior, stamp_ns, pose)
+        if refined is prior or prior.link is None:
+            return prior
+        within = se3.relative(refined.pose, middle_of(refined, stamp_ns, refined.pose)[0])
+        return replace(refined, link=replace(prior.link, within=within))
 
     def is_compared(self, stamp_ns: int, span: Span) -> bool:
         """Never: without the IMU there is nothing to estimate the states from."""

@@ -27,6 +27,7 @@ from lslam.kernels import positive
 from lslam.odometry import create_odometry
 from lslam.odometry.lips import Lips
 from lslam.odometry.sanity import plausible
+from lslam.registration.constant_velocity import middle_of
 from lslam.simulation.scenarios import simulate
 from lslam.types.imu import ImuStream
 from lslam.types.motion_prior import MotionPrior
@@ -171,6 +172,30 @@ def test_the_scan_after_a_rejected_one_is_linked_to_its_smoothed_pose() -> None:
     assert after.link.step.seconds == 0.0
     led = one.odometry._predicted(after.link).T_world_lidar @ se3.inverse(after.link.within)
     assert np.linalg.norm(led[:3, 3] - after.pose[:3, 3]) < 0.05
+
+
+def test_a_sweep_with_readings_beyond_the_range_is_deskewed_again_about_its_middle() -> None:
+    motion = begin_again().motion
+    assert isinstance(motion, LinkedMotion)
+    one = Tracker(create_odometry(config_of()), motion=motion)
+    *before, last = list(read_ahead(walk(), one.odometry.prepare, 1))[:8]
+    for loaded in before:
+        one.track(loaded)
+    assert last.scan is not None
+    prior = motion.sweep(last.stamp_ns, last.scan.span)
+    found = prior.pose @ se3.make(np.eye(3), np.array([0.05, 0.0, 0.0]))
+    assert motion.refine(prior, last.stamp_ns, found) is prior
+    motion.imu = replace(motion.imu, hidden=np.full((len(motion.imu), 6), 5.0))
+    motion._felt = None
+    prior = motion.sweep(last.stamp_ns, last.scan.span)
+    refined = motion.refine(prior, last.stamp_ns, found)
+    assert np.abs(refined.poses - prior.poses).max() > 0.01
+    assert prior.link is not None
+    assert refined.link is not None
+    assert refined.link.step is prior.link.step
+    middle = middle_of(refined, last.stamp_ns, refined.pose)[0]
+    np.testing.assert_allclose(refined.pose @ refined.link.within, middle, atol=1e-9)
+    assert np.abs(refined.link.within - prior.link.within).max() > 1e-3
 
 
 def test_ground_alone_leaves_degenerate_directions_reported() -> None:
