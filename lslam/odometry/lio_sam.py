@@ -6,6 +6,7 @@ The smoother is the motion model (`lslam.inertial.smoothing`, `lslam.graph.inert
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import ClassVar
 
 import numpy as np
 
@@ -40,36 +41,40 @@ def create(config: Config) -> LioSam | LioSamOfPoints:
     return LioSamOfPoints(Registration(section, config.preprocess))
 
 
-def _with_points(result: ScanResult, found: Registered, prior: MotionPrior, points: PoseUncertainty) -> ScanResult:
-    """The result with the covariance of the local map by the points alone, which `points` accumulates.
+class SmoothedUncertainty(PoseUncertainty):
+    """As of scan-to-map odometry, and beside it the covariance by the points alone.
 
     A state of the smoother shares the IMU with those before: taken as independent, and beside the IMU in a pose graph, its
     covariance would count that again and again.
     """
-    located: RegistrationResult = found.detail[1]
-    entered = located.decided(found.result)
-    if found.result.status == "ok":
-        entered = entered.moved(entered.T_world_lidar, located.covariance)
-    alone = points.stamped(found.result, entered, prior)
-    if alone.covariance is None or alone.registration_covariance is None:
-        return result
-    return replace(result, points_covariance=alone.covariance - alone.registration_covariance)
+
+    STATE: ClassVar[tuple[str, ...]] = (*PoseUncertainty.STATE, "points")
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.points = PoseUncertainty()
+
+    def alone(self, result: ScanResult, found: Registered, prior: MotionPrior) -> ScanResult:
+        """The `result` with `points_covariance`, that of the local map; `found` is what the smoother decided."""
+        located: RegistrationResult = found.detail[1]
+        entered = located.decided(found.result)
+        if found.result.status == "ok":
+            entered = entered.moved(entered.T_world_lidar, located.covariance)
+        by_points = self.points.stamped(found.result, entered, prior)
+        if by_points.covariance is None or by_points.registration_covariance is None:
+            return result
+        return replace(result, points_covariance=by_points.covariance - by_points.registration_covariance)
 
 
 class LioSam(Loam):
     """Edges and planar points on the feature map of the newest keyframes."""
 
     deskew = "features, by the newest state of the smoother"
-    STATE = (*Loam.STATE, "_points")
-
-    def restart(self) -> None:
-        """No scan seen, an empty feature map."""
-        super().restart()
-        self._points = PoseUncertainty()
+    _uncertainty: SmoothedUncertainty
 
     def update(self, prior: MotionPrior, found: Registered) -> ScanResult:
         """Enter the scan into the feature map where the smoother puts it."""
-        return _with_points(super().update(prior, found), found, prior, self._points)
+        return self._uncertainty.alone(super().update(prior, found), found, prior)
 
     @property
     def recovery(self) -> RecoveryConfig:
@@ -80,22 +85,19 @@ class LioSam(Loam):
         own = self.config.lio_sam
         return FeatureKeyframes(own.keyframes, own.keyframe_m, float(np.deg2rad(own.keyframe_deg)))
 
+    def _fresh_uncertainty(self) -> SmoothedUncertainty:
+        return SmoothedUncertainty()
+
 
 class LioSamOfPoints(Icp):
     """All points on the local map of the newest keyframes."""
 
     deskew = "by the newest state of the smoother"
-    STATE = (*Icp.STATE, "_points")
-
-    def __init__(self, registration: Registration) -> None:
-        super().__init__(registration)
-        self._points = PoseUncertainty()
-
-    def restart(self) -> None:
-        """An empty map."""
-        super().restart()
-        self._points = PoseUncertainty()
+    _uncertainty: SmoothedUncertainty
 
     def update(self, prior: MotionPrior, found: Registered) -> ScanResult:
         """Enter the scan into the local map where the smoother puts it."""
-        return _with_points(super().update(prior, found), found, prior, self._points)
+        return self._uncertainty.alone(super().update(prior, found), found, prior)
+
+    def _fresh_uncertainty(self) -> SmoothedUncertainty:
+        return SmoothedUncertainty()

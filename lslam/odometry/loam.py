@@ -74,12 +74,15 @@ class Loam(Stateful):
             reach=1.2 * c.preprocess.range_max, recovery=self.recovery, keyframes=self._fresh_keyframes(),
             inlier_ratio=v.inlier_ratio,
         )  # fmt: skip
-        self._uncertainty = PoseUncertainty(is_scan_to_scan=not v.with_map)
+        self._uncertainty = self._fresh_uncertainty()
 
     @property
     def recovery(self) -> RecoveryConfig:
         """What is tried where features are not enough."""
         return self.config.recovery
+
+    def _fresh_uncertainty(self) -> PoseUncertainty:
+        return PoseUncertainty(is_scan_to_scan=not self.variant.with_map)
 
     def _fresh_keyframes(self) -> FeatureKeyframes | None:
         """What chooses the scans of the feature map; None enters all."""

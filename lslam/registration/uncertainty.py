@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,7 +43,7 @@ class PoseUncertainty(Stateful):
     map_age : mean age, in scans, of the points of the map on which the next scan is registered
     """
 
-    STATE = ("_map", "_position", "_start", "_begun", "_sweep", "_scans", "map_age")
+    STATE: ClassVar[tuple[str, ...]] = ("_map", "_position", "_start", "_begun", "_sweep", "_scans", "map_age")
 
     def __init__(self, *, is_scan_to_scan: bool = False) -> None:
         self.is_scan_to_scan = is_scan_to_scan
