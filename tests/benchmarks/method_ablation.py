@@ -18,8 +18,9 @@ from unittest import mock
 import numpy as np
 import tables
 from tight import cell, one
-from traced import traced
+from traced import Traced
 
+from lslam.geometry import se3
 from lslam.inertial import imu_cleaning, saturation
 from lslam.inertial.filter import FilterMotion
 from lslam.inertial.fusion import InertialMotion
@@ -28,14 +29,19 @@ from lslam.odometry.ct_icp import CtIcp
 from lslam.odometry.lio_mapping import LioMapping
 from lslam.registration import elastic_constraints, planes
 from lslam.registration.elastic_constraints import NOTHING, LastSweep
+from lslam.simulation.scenarios import SimulatedDrive, simulate
 from lslam.types.imu import ImuStream
+from lslam.types.trajectory import Trajectory
 
 Patch = tuple[object, str, Any]
 
 
 @dataclass(frozen=True)
 class Ablation:
-    """methods, scenarios, lidar, imu : what is run; variants : what is patched, by name"""
+    """methods, scenarios, lidar, imu : what is run; variants : what is patched, by name
+
+    A scenario may have words behind it: what `simulate` takes, as `speed=30`; `from=60`, the first scan; `scans=500`.
+    """
 
     methods: tuple[str, ...]
     scenarios: tuple[str, ...]
@@ -43,6 +49,26 @@ class Ablation:
     lidar: str = "vlp16"
     imu: str | None = "icm20948"
     whole: bool = False
+
+
+class Later(Traced):
+    """A drive from a scan on, which nothing is known of before."""
+
+    def __init__(self, drive: SimulatedDrive, first: int) -> None:
+        assert drive.ground_truth is not None
+        self._drive, self.stamps_ns, poses = drive, drive.stamps_ns[first:], drive.ground_truth.poses[first:]
+        self._scans = [replace(drive.scan(i), index=i - first) for i in range(first, len(drive))]
+        self.ground_truth = Trajectory(self.stamps_ns, se3.relative(poses[0], poses), "lidar")
+
+
+def driven(words: str, seed: int, count: int | None, ablation: Ablation) -> Traced:
+    """The drive of a scenario and the words behind it."""
+    scenario, *given = words.split()
+    values: dict[str, Any] = {key: float(value) for key, _, value in (word.partition("=") for word in given)}
+    first, count = int(values.pop("from", 0)), int(values.pop("scans", count or 0)) or None
+    count = count and first + count
+    values |= {"lidar": ablation.lidar, "imu": ablation.imu, "count": count, "motion_compensated": False}
+    return Later(simulate(scenario, seed=seed, **values), first)
 
 
 with_hidden = saturation.with_hidden
@@ -110,6 +136,15 @@ ABLATIONS = {
         },
         imu=None,
     ),
+    "ct-icp-starts": Ablation(
+        ("ct-icp",),
+        (
+            "urban speed=14 start_speed=14", "walk from=60", "carpark static_start=2.5 scans=100", "corridor", "urban-hard",
+            "stairs",
+        ),
+        {"recovery": ((CtIcp, "_recovered", lambda self, prepared, prior, found, located: (found, located)),)},
+        imu=None,
+    ),
     "lips": Ablation(
         ("lips",), ("walk", "urban"),
         {
@@ -148,11 +183,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", choices=list(ABLATIONS))
     parser.add_argument("--scans", type=int, default=60)
+    parser.add_argument("--scenarios", help="those of the ablation, comma-separated; default: all")
     parser.add_argument("--only", help="variants, comma-separated; default: all")
     tables.offer(parser)
     args = parser.parse_args()
     logging.getLogger("lslam").setLevel(logging.CRITICAL)
     ablation, seeds = ABLATIONS[args.what], tables.numbers(args.seeds)
+    if args.scenarios:
+        ablation = replace(ablation, scenarios=tuple(args.scenarios.split(",")))
     names = args.only.split(",") if args.only else list(ablation.variants)
     variants: dict[str, tuple[Patch, ...]] = {"nothing": ()} | {name: ablation.variants[name] for name in names}
     count = None if ablation.whole else args.scans
@@ -160,9 +198,7 @@ def main() -> None:
     runs: dict[tuple[str, str, str], list[dict[str, Any]]] = {(v, *c): [] for v in variants for c in columns}
     for seed in seeds:
         for scenario in ablation.scenarios:
-            drive = traced(
-                scenario, seed, lidar=ablation.lidar, imu=ablation.imu, count=count, motion_compensated=False
-            )
+            drive = driven(scenario, seed, count, ablation)
             length = float(drive.ground_truth.path_lengths[-1])
             for name, patches in variants.items():
                 for method in ablation.methods:
