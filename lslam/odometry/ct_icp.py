@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import time
-from dataclasses import replace
 
 from lslam.config.config import Config
-from lslam.geometry import se3
 from lslam.odometry.base import Registered
 from lslam.odometry.icp import Icp
 from lslam.odometry.scan_outcome import of_registration
@@ -15,7 +13,6 @@ from lslam.preprocessing.prepare import PreparedPoints
 from lslam.recovery.policies import policies_of
 from lslam.registration.elastic import ElasticResult, SweepPoints, register_elastic
 from lslam.registration.elastic_constraints import ElasticConstraints, LastSweep
-from lslam.registration.elastic_sweep import ElasticSweep
 from lslam.registration.registration import MIN_SOURCE_POINTS, NEAR_KERNEL, Registration
 from lslam.registration.robust import Annealing
 from lslam.registration.solver import RegistrationResult, result_of
@@ -50,9 +47,7 @@ class CtIcp(Icp):
             return super()._align(scan, prepared, prior, is_near)
         began = time.perf_counter()
         constraints = self._last.constraints(scan.stamp_ns, prior)
-        found, located = self._elastic(prepared, prior, constraints.expected, constraints, is_near)
-        if (registration.starting > 0 or not located.ok) and not is_near:
-            found, located = self._recovered(prepared, prior, found, located)
+        found, located = self._elastic(prepared, prior, constraints, is_near)
         sweep = found.sweep.prior if located.ok else None
         points = deskew(prepared, sweep or prior)
         stages = {"register": time.perf_counter() - began}
@@ -60,28 +55,14 @@ class CtIcp(Icp):
         return Registered(result, (points, located, prior, found), sweep)
 
     def _elastic(
-        self, prepared: PreparedPoints, prior: MotionPrior, start: ElasticSweep, constraints: ElasticConstraints,
-        is_near: bool = False,
-    ) -> tuple[ElasticResult, RegistrationResult]:  # fmt: skip
+        self, prepared: PreparedPoints, prior: MotionPrior, constraints: ElasticConstraints, is_near: bool
+    ) -> tuple[ElasticResult, RegistrationResult]:
         registration, c = self.registration, self.registration.config
         width = NEAR_KERNEL * c.kernel_min if is_near else registration.threshold.width
         points = SweepPoints(prepared, registration.map.levels, c.sigma, c.blob_weight)
         annealing = Annealing(max(width, c.kernel_min), c.kernel_min, c.kernel_decay, c.max_iterations)
-        found = register_elastic(points, start, constraints, annealing, c.weak_share)
+        found = register_elastic(points, constraints.expected, constraints, annealing, c.weak_share)
         return found, registration.judged(result_of(found.found, prior.pose, len(prepared.source)), prior.pose)
-
-    def _recovered(
-        self, prepared: PreparedPoints, prior: MotionPrior, first: ElasticResult, denied: RegistrationResult
-    ) -> tuple[ElasticResult, RegistrationResult]:
-        """The sweep from where recovery finds it as a whole, while the map is young and after a failure."""
-        whole = self.registration.locate(deskew(prepared, prior), prior.pose)
-        if not whole.ok:
-            return first, denied
-        moved = replace(prior, poses=whole.T_world_lidar @ se3.relative(prior.pose, prior.poses))
-        start, free = ElasticSweep.of(moved), LastSweep().constraints(0, moved)
-        found, located = self._elastic(prepared, prior, start, free)
-        iterations = whole.iterations + located.iterations
-        return found, replace(located, posed_by=whole.posed_by if located.ok else "", iterations=iterations)
 
     def update(self, prior: MotionPrior, found: Registered) -> ScanResult:
         """Enter the scan into the local map, and its sweep as the last one."""

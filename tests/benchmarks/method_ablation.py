@@ -1,6 +1,6 @@
 """The rules of one method, each off or otherwise, one at a time: which of them its accuracy needs.
 
-    python tests/benchmarks/method_ablation.py ct-icp [--seeds 100-104] [--scans 60]
+    python tests/benchmarks/method_ablation.py ct-icp [--seeds 100-104] [--scans 60] [--scenarios "walk from=60,corridor"]
 
 Drives are uncompensated, as in `tight.py`; `saturation` is of `quadrotor`, whole.
 """
@@ -25,7 +25,6 @@ from lslam.inertial import imu_cleaning, saturation
 from lslam.inertial.filter import FilterMotion
 from lslam.inertial.fusion import InertialMotion
 from lslam.odometry import lips, loam_livox, plane_association, plane_factors
-from lslam.odometry.ct_icp import CtIcp
 from lslam.odometry.lio_mapping import LioMapping
 from lslam.registration import elastic_constraints, planes
 from lslam.registration.elastic_constraints import NOTHING, LastSweep
@@ -125,7 +124,6 @@ ABLATIONS = {
             "location": ((LastSweep, "constraints", without(location=NOTHING, since=0.0)),),
             "velocity": ((LastSweep, "constraints", without(velocity=NOTHING)),),
             "both": ((LastSweep, "constraints", without(location=NOTHING, since=0.0, velocity=NOTHING)),),
-            "recovery": ((CtIcp, "_recovered", lambda self, prepared, prior, found, located: (found, located)),),
             "MISS 1/3": ((elastic_constraints, "MISS", 1 / 3),),
             "MISS 1/12": ((elastic_constraints, "MISS", 1 / 12),),
             "LAG 1": ((elastic_constraints, "LAG", 1.0),),
@@ -134,15 +132,6 @@ ABLATIONS = {
             "LEAST_CHANGE 1e-4": ((elastic_constraints, "LEAST_CHANGE", 1e-4),),
             "LEAST_SKEW 1e-3": ((elastic_constraints, "LEAST_SKEW", 1e-3),),
         },
-        imu=None,
-    ),
-    "ct-icp-starts": Ablation(
-        ("ct-icp",),
-        (
-            "urban speed=14 start_speed=14", "walk from=60", "carpark static_start=2.5 scans=100", "corridor", "urban-hard",
-            "stairs",
-        ),
-        {"recovery": ((CtIcp, "_recovered", lambda self, prepared, prior, found, located: (found, located)),)},
         imu=None,
     ),
     "lips": Ablation(
