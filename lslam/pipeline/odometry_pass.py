@@ -46,6 +46,9 @@ from lslam.types.trajectory import Trajectory
 log = logging.getLogger("lslam")
 # Sentences of one run; the scans beyond are marked all the same.
 MOST_SAID = 6
+# Sections that choose no kernel; of buildings it is enough whether there are any.
+_WITHOUT_KERNELS = {"input", "keyframes", "graph", "gnss", "osm", "eval", "report"}
+_warmed: set[tuple[object, ...]] = set()
 
 
 def estimate_poses(
@@ -151,28 +154,44 @@ def _warm_up(
     sequence: Sequence, odometry: Odometry, stationary: StationaryDetector | None, monitor: IntegrityMonitor | None,
     config: Config, manifest: Manifest, is_over: bool,
 ) -> None:  # fmt: skip
-    """Compile or load what the scans would otherwise wait for, less of it when odometry is over."""
+    """Compile or load what the scans would otherwise wait for, less of it when odometry is over.
+
+    What this process has loaded stays: a worker of a study does it once for all its runs alike.
+    """
+    alike = type(odometry), is_over, bool(config.osm.extract), config.model_dump_json(exclude=_WITHOUT_KERNELS)
     with (
         manifest.timed("compile_s"), one_at_a_time(jit.lock_file(), "compiles kernels"), helped(config) as start_helper,
         jit.announced(log, start_helper),
     ):  # fmt: skip
-        if not is_over:
-            odometry.warm_up()
-        if stationary is not None:
-            stationary.warm_up()
-        if monitor is not None and not is_over:
-            monitor.warm_up()
-        if config.loops.use or config.localize.map:
-            detector.warm_up(config.loops)
-        if config.osm.extract:
-            prior.warm_up()
-        if config.map.write:
-            merge.warm_up()
-            crispness.warm_up()
-        if config.imu.use and not is_over:
-            inertial_start.warm_up()
+        if alike not in _warmed:
+            _load_kernels(odometry, stationary, monitor, config, is_over)
+            _warmed.add(alike)
         with suppress(InputError):
             measurable(sequence.scan(0))  # the reader's kernels; what is wrong with the scan is said in its turn
+
+
+def _load_kernels(
+    odometry: Odometry,
+    stationary: StationaryDetector | None,
+    monitor: IntegrityMonitor | None,
+    config: Config,
+    is_over: bool,
+) -> None:
+    if not is_over:
+        odometry.warm_up()
+    if stationary is not None:
+        stationary.warm_up()
+    if monitor is not None and not is_over:
+        monitor.warm_up()
+    if config.loops.use or config.localize.map:
+        detector.warm_up(config.loops)
+    if config.osm.extract:
+        prior.warm_up()
+    if config.map.write:
+        merge.warm_up()
+        crispness.warm_up()
+    if config.imu.use and not is_over:
+        inertial_start.warm_up()
 
 
 def _begin_imu(
