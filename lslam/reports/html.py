@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,7 +23,7 @@ from lslam.types.table import Table
 from lslam.version import __version__
 
 if TYPE_CHECKING:
-    from jinja2 import Template
+    from jinja2 import Environment, Template
 
     from lslam.evaluation.results import Evaluation
 
@@ -97,9 +98,15 @@ def map_context(record: RunRecord) -> dict[str, Any]:
 
 def template(name: str) -> Template:
     """A template of this package; everything it shows is escaped, and a name it does not know is an error."""
+    return _environment().get_template(name)
+
+
+@cache
+def _environment() -> Environment:
+    """One for all pages of a process: to compile a template takes longer than to fill it."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
-    environment = Environment(
+    return Environment(
         loader=PackageLoader("lslam", "reports"),
         autoescape=True,
         trim_blocks=True,
@@ -107,7 +114,6 @@ def template(name: str) -> Template:
         keep_trailing_newline=True,
         undefined=StrictUndefined,
     )
-    return environment.get_template(name)
 
 
 def _map_figure(record: RunRecord) -> plots.Figure | None:
