@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from imu_drives import GYRO_BIAS, drone, extrinsics_of, stream_of, truth_of
+from numpy.typing import NDArray
 
 from lslam.config.imu import ImuConfig
 from lslam.frontend.motion_models import smoother_noise
@@ -52,14 +53,21 @@ def test_readings_are_transformed_to_the_lidar() -> None:
         assert np.ptp(rates[:, 2]) > 1
 
 
-STAMPS, POSES = truth_of(drone())
 SURE = np.diag([0.005**2] * 3 + [1e-3**2] * 3)
+
+
+def stamps() -> NDArray[np.int64]:
+    return truth_of(drone())[0]
+
+
+def poses() -> NDArray[np.float64]:
+    return truth_of(drone())[1]
 
 
 def flying(count: int) -> SmootherMotion:
     """An IMU in flight after so many scans, registered where they were."""
-    first = FirstPoses(STAMPS[:50], POSES[:50], STAMPS[:50], POSES[:50], np.repeat(SURE[None], 50, axis=0))
-    begun = start(stream_of(drone()), extrinsics_of(drone()), first, int(STAMPS[-1]), ImuConfig())
+    first = FirstPoses(stamps()[:50], poses()[:50], stamps()[:50], poses()[:50], np.repeat(SURE[None], 50, axis=0))
+    begun = start(stream_of(drone()), extrinsics_of(drone()), first, int(stamps()[-1]), ImuConfig())
     motion = SmootherMotion(begun.imu, begun.T_lidar_imu, begun.estimate, ImuConfig(), InertialSmoother(IMU_NOISE, 100))
     for k in range(count):
         weighed(motion, k)
@@ -68,9 +76,9 @@ def flying(count: int) -> SmootherMotion:
 
 def weighed(motion: SmootherMotion, k: int) -> ScanResult:
     """Scan k, registered where it was."""
-    stamp = int(STAMPS[k])
+    stamp = int(stamps()[k])
     prior = motion.sweep(stamp, Span())
-    result = motion.weigh(ScanResult(k, stamp, POSES[k], registration_covariance=SURE), prior)
+    result = motion.weigh(ScanResult(k, stamp, poses()[k], registration_covariance=SURE), prior)
     motion.correct(stamp, result.T_world_lidar, prior, result.status == "ok")
     return result
 
@@ -107,26 +115,26 @@ def is_followed(motion: SmootherMotion, k: int) -> bool:
     """Whether scans from k on are weighed by a graph again, and are where they were."""
     results = [weighed(motion, k + i) for i in range(3)]
     # The first begins the graph, at the pose of the scan before or its own.
-    states = [motion.smoother.state()["steps"].rows, results[-1].T_world_lidar[:3, 3] - POSES[k + 2][:3, 3]]
+    states = [motion.smoother.state()["steps"].rows, results[-1].T_world_lidar[:3, 3] - poses()[k + 2][:3, 3]]
     return all(r.status == "ok" for r in results) and len(states[0]) == 3 and float(np.linalg.norm(states[1])) < 0.02
 
 
 def test_a_scan_without_a_graph_solution_is_bridged_with_the_covariance_of_the_imu() -> None:
     motion = flying(10)
     unsolvable(motion)
-    predicted = motion.sweep(int(STAMPS[10]), Span()).pose
+    predicted = motion.sweep(int(stamps()[10]), Span()).pose
     result = weighed(motion, 10)
     assert (result.status, result.converged) == ("bridged", False)
     assert result.reason == "the smoother of poses and IMU cannot be solved: Indeterminant linear system detected"
     np.testing.assert_array_equal(result.T_world_lidar, predicted)
     C = result.registration_covariance
     assert C is not None
-    off = se3.relative(POSES[9], POSES[10])[:3, 3] - se3.relative(POSES[9], predicted)[:3, 3]
+    off = se3.relative(poses()[9], poses()[10])[:3, 3] - se3.relative(poses()[9], predicted)[:3, 3]
     assert np.linalg.norm(off) < 4 * np.sqrt(np.linalg.eigvalsh(C[:3, :3])[-1])
     twice = flying(10)
     unsolvable(twice)
-    stamp = int(STAMPS[10])
-    surer = ScanResult(10, stamp, POSES[10], registration_covariance=1e-4 * SURE)
+    stamp = int(stamps()[10])
+    surer = ScanResult(10, stamp, poses()[10], registration_covariance=1e-4 * SURE)
     np.testing.assert_array_equal(twice.weigh(surer, twice.sweep(stamp, Span())).registration_covariance, C)
     assert is_followed(motion, 11)
 
@@ -134,7 +142,7 @@ def test_a_scan_without_a_graph_solution_is_bridged_with_the_covariance_of_the_i
 def test_the_graph_restarts_after_a_scan_that_it_cannot_solve() -> None:
     motion = flying(10)
     unsolvable(motion)
-    stamp = int(STAMPS[10])
+    stamp = int(stamps()[10])
     prior = motion.sweep(stamp, Span())
     motion.correct(stamp, prior.pose, prior, is_registered=False)
     newest = motion.smoother.state()["begun"]
