@@ -158,11 +158,13 @@ def _likelihoods(base: Floats, unit: Floats, sides: Floats) -> Floats:
 
     sides : (N, 1 + P) residuals, and Jacobians of the nuisance parameters
     """
+    from scipy.linalg import solve_triangular
+
     root = np.linalg.cholesky(base)
-    half = np.linalg.solve(root, unit)
+    half = solve_triangular(root, unit, lower=True)
     # Along these axes both are diagonal.
-    values, axes = np.linalg.eigh(np.linalg.solve(root, half.T))
-    turned = axes.T @ np.linalg.solve(root, sides)
+    values, axes = np.linalg.eigh(solve_triangular(root, half.T, lower=True))
+    turned = axes.T @ solve_triangular(root, sides, lower=True)
     out = np.empty(len(FACTORS))
     for i, factor in enumerate(FACTORS):
         spread = 1.0 + factor * np.maximum(values, 0.0)
