@@ -225,11 +225,11 @@ def test_calibration_errors_are_scaled() -> None:
 
 
 def test_a_hard_drive_is_decided_by_its_seed() -> None:
-    first, again = (simulate("urban-hard", seed=4, count=3) for _ in range(2))
+    first, again = (simulate("climbing-hard", seed=4, count=3) for _ in range(2))
     a, b = first.scan(2), again.scan(0)
     b = again.scan(2)
     assert a.points.tobytes() == b.points.tobytes()
     assert a.intensity is not None
     assert b.intensity is not None
     assert a.intensity.tobytes() == b.intensity.tobytes()
-    assert simulate("urban-hard", seed=5, count=3).scan(2).points.tobytes() != a.points.tobytes()
+    assert simulate("climbing-hard", seed=5, count=3).scan(2).points.tobytes() != a.points.tobytes()
