@@ -25,6 +25,11 @@ settings.load_profile("untimed")
 
 # The hundred processes that tests start would each compile what they import of lslam anew.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+# What tests start away from here runs these sources, as their workers do, and not the lslam that is installed: numba keeps
+# kernels by the files that they come from, and would compile them all once more. The one that is installed is test_run_machine's.
+# Workers inherit both from the process that starts them.
+GIVEN = os.environ.setdefault("PYTHONPATH_GIVEN", os.environ.get("PYTHONPATH", ""))
+os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, (str(Path(__file__).resolve().parents[1]), GIVEN)))
 # Workers fill the cores already; threads of BLAS on small matrices wait for each other.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 

@@ -26,6 +26,13 @@ def cpu_of_children() -> float:
     return used.ru_utime + used.ru_stime
 
 
+def installed(**more: str) -> dict[str, str]:
+    """The environment as it was given: tests prefer their sources to the lslam that is installed."""
+    env = environment(**more)
+    env["PYTHONPATH"] = env.pop("PYTHONPATH_GIVEN")  # an empty one is none
+    return env
+
+
 @pytest.fixture(scope="module")
 def cold_starts(tmp_path_factory: pytest.TempPathFactory) -> Starts:
     """First runs at once on one empty kernel cache: the cache, (exit code, stderr) of each, folders, CPU seconds of each.
@@ -34,7 +41,7 @@ def cold_starts(tmp_path_factory: pytest.TempPathFactory) -> Starts:
     the files they come from.
     """
     base = tmp_path_factory.mktemp("cold")
-    env = environment(NUMBA_CACHE_DIR=str(base / "cache"))
+    env = installed(NUMBA_CACHE_DIR=str(base / "cache"))
     children = [
         subprocess.Popen(
             [*COMMAND, *map(str, MAPPING), str(base / f"run{k}")],
@@ -69,7 +76,7 @@ def test_cold_starts_on_one_cache_all_succeed(cold_starts: Starts) -> None:
 def test_only_the_first_compiles(cold_starts: Starts, tmp_path: Path) -> None:
     cache, _, _, seconds = cold_starts
     before = cpu_of_children()
-    warm = lslam_process(*MAPPING, tmp_path / "out", env=environment(NUMBA_CACHE_DIR=str(cache)), cwd=tmp_path)
+    warm = lslam_process(*MAPPING, tmp_path / "out", env=installed(NUMBA_CACHE_DIR=str(cache)), cwd=tmp_path)
     warm_s = cpu_of_children() - before
     assert warm.returncode == 0
     assert "compiling" not in warm.stderr
@@ -87,7 +94,7 @@ def test_a_damaged_cache_costs_time_not_the_run(cold_starts: Starts, tmp_path: P
     larger.write_bytes(larger.read_bytes()[:100])
     for number, said in ((1, True), (2, False)):
         out = tmp_path / str(number)
-        done = lslam_process(*MAPPING, out, env=environment(NUMBA_CACHE_DIR=str(cache)), cwd=tmp_path)
+        done = lslam_process(*MAPPING, out, env=installed(NUMBA_CACHE_DIR=str(cache)), cwd=tmp_path)
         assert done.returncode == 0, done.stderr
         assert ("kernel cache is damaged" in done.stderr) == said, "and it is repaired by that"
         assert (out / "map.ply").read_bytes() == (base / "run0" / "map.ply").read_bytes()
@@ -101,7 +108,7 @@ def test_a_home_that_cannot_be_written(cold_starts: Starts, tmp_path: Path) -> N
     shutil.copytree(cache, stand_in / "numba")
     for home in ("/proc/none", str(tmp_path / "file")):
         more = {"HOME": home, "XDG_CACHE_HOME": f"{home}/cache", "XDG_CONFIG_HOME": f"{home}/config"}
-        env = environment(TMPDIR=str(tmp_path), **more)
+        env = installed(TMPDIR=str(tmp_path), **more)
         env.pop("NUMBA_CACHE_DIR", None)
         done = lslam_process(*MAPPING, tmp_path / home.replace("/", "_"), env=env, cwd=tmp_path)
         assert done.returncode == 0, done.stderr

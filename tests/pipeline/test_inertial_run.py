@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import dataclasses
 import json
+from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 
@@ -19,19 +20,22 @@ from lslam.doctor.findings import Finding
 from lslam.errors import GateError, InputError
 from lslam.formats.run_tables import read_timing_rows
 from lslam.formats.trajectory_files import read_trajectory
-from lslam.frontend.inertial_start import begin_inertial, close_inertial
+from lslam.frontend import inertial_start
+from lslam.frontend.inertial_start import _first_heard_ns, begin_inertial, close_inertial, first_poses
 from lslam.frontend.register_scans import estimate
 from lslam.geometry import se3
 from lslam.inertial.fusion import InertialMotion
+from lslam.inertial.initialise import FirstPoses
 from lslam.odometry import create_odometry
 from lslam.pipeline.run import run
 from lslam.pipeline.watch import RunOutcome
-from lslam.readers.selection import select
+from lslam.readers.selection import Selection, select
 from lslam.reports.text import summary
 from lslam.simulation.lidar_models import LIDARS
 from lslam.simulation.scenarios import SimulatedDrive, simulate
 from lslam.types.imu import ImuStream
 from lslam.types.scan_result import ScanResult
+from lslam.types.sequence import Sequence
 
 COUNT = 60
 
@@ -39,7 +43,7 @@ COUNT = 60
 @cache
 def walk_drive() -> SimulatedDrive:
     """A hand-held walk, looking about at up to 110 deg/s, rays fired on the way."""
-    lidar = dataclasses.replace(LIDARS["vlp16"], columns=600)
+    lidar = dataclasses.replace(LIDARS["vlp16"], columns=300)
     return simulate("walk", lidar=lidar, count=COUNT, imu="icm20948", motion_compensated=False)
 
 
@@ -54,6 +58,32 @@ def walk() -> Stub:
         motion_compensated=False,
         imu=drive.imu,
     )
+
+
+@pytest.fixture(scope="module", autouse=True)
+def shared_first_poses() -> Iterator[None]:
+    """The first seconds are registered without the IMU: once, whatever it says, for the same scans of the walk."""
+    held: dict[tuple[object, ...], FirstPoses] = {}
+
+    def once(sequence: Sequence, config: Config, motion: InertialMotion | None) -> FirstPoses:
+        whole, indices = (
+            (sequence.whole, sequence.indices.tobytes()) if isinstance(sequence, Selection) else (sequence, b"")
+        )
+        assert isinstance(whole, Stub)
+        # What is held keeps the scans, and with them their numbers.
+        scans = tuple(map(id, whole.scans))
+        since = _first_heard_ns(whole.imu, whole.stamps_ns, config)
+        given = config.imu.model_dump_json(), config.preprocess.model_dump_json(), config.input.workers
+        key = scans, indices, since, given
+        if motion is not None:
+            return first_poses(sequence, config, motion)
+        if key not in held:
+            held[key] = first_poses(sequence, config, None)
+        return held[key]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(inertial_start, "first_poses", once)
+        yield
 
 
 def imu_of(stub: Stub) -> ImuStream:
