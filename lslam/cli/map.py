@@ -11,6 +11,7 @@ import click
 
 from lslam.cli import options
 from lslam.cli.console import progress, setup_logging, show
+from lslam.cli.map_changes import compare_drives, of_the_map
 from lslam.stopping import heeded
 
 if TYPE_CHECKING:
@@ -24,6 +25,7 @@ Examples:
   lslam map runs/first --tiles 50 --format laz
   lslam map runs/first --against survey.laz --threshold 0.1
   lslam map somebody-elses.ply --score
+  lslam map runs/tuesday --against runs/monday --changes changed
 """
 
 
@@ -51,7 +53,19 @@ Examples:
     "--sequence", type=click.Path(path_type=Path), metavar="PATH", help="Sequence of the raw scans, when it has moved."
 )
 @click.option("--score", "is_scored", is_flag=True, help="Only compute the crispness of the map of RUN, or of FILE.")
-@click.option("--against", type=click.Path(path_type=Path), metavar="CLOUD", help="Only compare with this cloud.")
+@click.option(
+    "--against", type=click.Path(path_type=Path), metavar="CLOUD|RUN", help="Only compare with this cloud or run."
+)
+@click.option(
+    "--changes",
+    type=click.Path(path_type=Path),
+    metavar="DIR",
+    help="--against RUN: write there what appeared and vanished.",
+)
+@click.option(
+    "--against-sequence", type=click.Path(path_type=Path), metavar="PATH",
+    help="--changes: sequence of the other run's raw scans, when it has moved.",
+)  # fmt: skip
 @click.option("--threshold", type=float, metavar="M", help="--against: largest distance of matching points  [0.2].")
 @click.option("--radius", type=float, metavar="M", help="--score: radius of neighbourhoods  [0.5].")
 @options.reading
@@ -62,10 +76,15 @@ def command(target: Path, **given: Any) -> None:
     """Build the map of a run anew from its raw scans and poses, with other settings and without odometry.
 
     With --score or --against the map of RUN, or FILE, is only scored: by crispness, which needs no ground truth, or by F1 and
-    Chamfer distance against a reference cloud in the same frame.
+    Chamfer distance against a reference cloud in the same frame. With --changes the beams of RUN and of an earlier run, in whose
+    map `lslam localize` located it, say what appeared and what vanished; what one of them never saw is neither.
     """
     setup_logging(given["verbose"], given["quiet"])
-    if given["is_scored"] or given["against"] is not None:
+    if given["changes"] is not None:
+        compare_drives(target, given)
+    elif given["against_sequence"] is not None:
+        raise click.UsageError("--against-sequence belongs to --changes")
+    elif given["is_scored"] or given["against"] is not None:
         _measure(target, given)
     else:
         _rebuild(target, given)
@@ -158,9 +177,6 @@ def _settings(given: dict[str, Any]) -> list[str]:
     file_format = given["file_format"]
     if file_format is not None and suffix is not None and file_format != suffix:
         raise UsageError(f"--format {file_format} contradicts --out {out}: leave one out")
-    for setting in given["settings"]:
-        if not setting.startswith("map."):
-            raise UsageError(f"--set {setting}: only keys of the map can be changed after the run")
     flags = {
         "voxel": given["voxel"],
         "format": file_format
@@ -171,7 +187,10 @@ def _settings(given: dict[str, Any]) -> list[str]:
         "crop": None if given["crop"] is None else f"[{given['crop']}]",
         **{name: "true" if given[name] else None for name in ("clean", "occupancy", "denoise", "mesh")},
     }
-    return [*given["settings"], *(f"map.{key}={value}" for key, value in flags.items() if value is not None)]
+    return [
+        *of_the_map(given["settings"]),
+        *(f"map.{key}={value}" for key, value in flags.items() if value is not None),
+    ]
 
 
 def crispness_rows(score: Crispness) -> list[tuple[str, str]]:

@@ -1,9 +1,9 @@
-"""GeoJSON (RFC 7946): the line of a trajectory, and `buildings.geojson`, the corrected buildings of a run."""
+"""GeoJSON (RFC 7946): the line of a trajectory, outlines, and `buildings.geojson`, the corrected buildings of a run."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +38,26 @@ def write_line(path: Path, lat_lon_alt: NDArray[Any], properties: Mapping[str, A
     feature = {"type": "Feature", "properties": dict(properties), "geometry": geometry}
     text = json.dumps({"type": "FeatureCollection", "features": [feature]}, allow_nan=False, ensure_ascii=False)
     write_text(path, text + "\n")
+
+
+def write_areas(
+    path: Path, outlines: Iterable[Floats], properties: Iterable[Mapping[str, Any]], about: Mapping[str, Any]
+) -> None:
+    """Write an outline (C, 2) each, counter-clockwise, as a polygon with its properties, and `about` of all; atomically.
+
+    Longitude and latitude, deg, get 7 decimals; metres of a place that nobody knows, which `about` has to say, as many, too.
+    Raises OutputError when the file cannot be written.
+    """
+    features = [
+        {
+            "type": "Feature",
+            "properties": dict(said),
+            "geometry": {"type": "Polygon", "coordinates": [np.round([*ring, ring[0]], DECIMALS).tolist()]},
+        }
+        for ring, said in zip(outlines, properties, strict=True)
+    ]
+    tree = {"type": "FeatureCollection", **about, "features": features}
+    write_text(path, json.dumps(tree, allow_nan=False, ensure_ascii=False) + "\n")
 
 
 def read_line(path: Path) -> NDArray[np.float64]:

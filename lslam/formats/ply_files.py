@@ -60,18 +60,21 @@ def read_ply(path: Path) -> PointCloud:
 
 def write_ply(
     path: Path, points: NDArray[Any], intensity: NDArray[Any] | None = None, comment: str = "", *,
-    scalars: Mapping[str, NDArray[Any]] | None = None,
+    scalars: Mapping[str, NDArray[Any]] | None = None, colours: NDArray[np.uint8] | None = None,
 ) -> None:  # fmt: skip
-    """Write points (N, 3), m, intensity (N,) and further `scalars` (N,) by name as float32, binary little endian, atomically."""
+    """Write points (N, 3), m, intensity (N,) and further `scalars` (N,) by name as float32, binary little endian, atomically.
+
+    colours : (N, 3) red, green, blue, which viewers show at once
+    """
     columns = {**({} if intensity is None else {"intensity": intensity}), **(scalars or {})}
+    shades = {} if colours is None else dict(zip(("red", "green", "blue"), np.transpose(colours), strict=True))
     names = ["x", "y", "z", *columns]
-    table = np.empty((len(points), len(names)), "<f4")
-    table[:, :3] = points
-    for k, values in enumerate(columns.values()):
-        table[:, 3 + k] = values
+    table = np.empty(len(points), [*((name, "<f4") for name in names), *((name, "u1") for name in shades)])
+    for name, values in {**dict(zip("xyz", np.transpose(points), strict=True)), **columns, **shades}.items():
+        table[name] = values
     with atomic_write(path) as stream:
-        stream.write(ply_header(len(table), names, comment))
-        stream.write(table.data)
+        stream.write(ply_header(len(table), names, comment, list(shades)))
+        stream.write(table.tobytes())
 
 
 def write_ply_mesh(path: Path, vertices: NDArray[Any], triangles: NDArray[Any], comment: str = "") -> None:
@@ -86,10 +89,11 @@ def write_ply_mesh(path: Path, vertices: NDArray[Any], triangles: NDArray[Any], 
         stream.write(faces.tobytes())
 
 
-def ply_header(count: int, names: Sequence[str], comment: str = "") -> bytes:
-    """Header of `count` binary little-endian vertices of float32 properties."""
+def ply_header(count: int, names: Sequence[str], comment: str = "", byte_names: Sequence[str] = ()) -> bytes:
+    """Header of `count` binary little-endian vertices of float32 properties, then of bytes."""
     comments = "".join(f"comment {line}\n" for line in comment.splitlines())
     properties = "".join(f"property float {name}\n" for name in names)
+    properties += "".join(f"property uchar {name}\n" for name in byte_names)
     return f"ply\nformat binary_little_endian 1.0\n{comments}element vertex {count}\n{properties}end_header\n".encode(
         "utf-8", "backslashreplace"
     )

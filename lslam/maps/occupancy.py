@@ -44,6 +44,24 @@ class OccupancyGrid:
         return np.asarray((self.cells + 0.5) * self.voxel)
 
 
+@dataclass(frozen=True)
+class Evidence:
+    """What scans say of cells, by keys that are comparable between mappers of one origin.
+
+    keys : (M,) int64, rising; log_odds : (M,) int16, hundredths, clamped in the order of the scans; sums : (M,) int64, the
+    same without clamps, which no order changes; origin : (3,) cell in the middle of the key range
+    """
+
+    keys: NDArray[np.int64]
+    log_odds: NDArray[np.int16]
+    sums: NDArray[np.int64]
+    origin: NDArray[np.int64]
+    voxel: float
+
+    def __len__(self) -> int:
+        return len(self.keys)
+
+
 class OccupancyMapper:
     """Casts scans into cells; a scan says one thing about a cell, and a hit beats a miss.
 
@@ -52,6 +70,7 @@ class OccupancyMapper:
     voxel : edge of a cell, m; range_min, range_max : m; farther points only free the cells up to there
     spool : folder beside which large maps are kept meanwhile; None: the system's temporary one; keep : one that stays
         instead, for `restore`
+    origin : (3,) int64, cell in the middle of the key range; None: where the first scan is
 
     Raises
     ------
@@ -68,7 +87,7 @@ class OccupancyMapper:
 
     def __init__(
         self, voxel: float = 0.4, range_min: float = 1.0, range_max: float = 40.0, *, spool: Path | None = None,
-        keep: Path | None = None, most: int = _MOST_ROWS,
+        keep: Path | None = None, most: int = _MOST_ROWS, origin: NDArray[np.int64] | None = None,
     ) -> None:  # fmt: skip
         if not (np.isfinite([voxel, range_max]).all() and voxel > 0 and 0 <= range_min < range_max):
             raise ConfigError(
@@ -78,7 +97,7 @@ class OccupancyMapper:
         self._voxel, self._range = float(voxel), (float(range_min), float(range_max))
         self._longest = int(3 * range_max / voxel) + 4
         self._spool, self._keep, self._most = spool, keep, most
-        self._origin: NDArray[np.int64] | None = None
+        self._origin = origin
         self._runs: SortedRuns | None = None
         self._rows = np.empty((0, 5), np.int64)
         self._slots = np.empty(0, np.int32)
@@ -114,8 +133,14 @@ class OccupancyMapper:
 
     def result(self) -> OccupancyGrid:
         """The cells seen so far; the mapper is empty then."""
-        from lslam.kernels.ray_cells import compose
         from lslam.kernels.voxel_average import unpack_cells
+
+        found = self.evidence()
+        return OccupancyGrid(unpack_cells(found.keys, found.origin).astype(np.int32), found.log_odds, self._voxel)
+
+    def evidence(self) -> Evidence:
+        """The cells seen so far, and all that was said of them; the mapper is empty then."""
+        from lslam.kernels.ray_cells import compose
 
         if self._runs is None:
             rows = self._take()
@@ -125,8 +150,8 @@ class OccupancyMapper:
             rows = stored.read(0, len(stored))
             self._runs = None
         origin = np.zeros(3, np.int64) if self._origin is None else self._origin
-        cells = unpack_cells(rows[:, 0], origin).astype(np.int32)
-        return OccupancyGrid(cells, np.clip(rows[:, 1], rows[:, 2], rows[:, 3]).astype(np.int16), self._voxel)
+        log_odds = np.clip(rows[:, 1], rows[:, 2], rows[:, 3]).astype(np.int16)
+        return Evidence(rows[:, 0].copy(), log_odds, rows[:, 1].copy(), origin, self._voxel)
 
     def state(self) -> State:
         """What `restore` needs to go on from here; the cells go to `keep`, only those that changed since the last time."""

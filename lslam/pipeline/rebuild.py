@@ -119,17 +119,17 @@ def read_run(folder: Path, settings: Iterable[str] = ()) -> EarlierRun:
     return EarlierRun(folder, manifest, config, trajectory, statuses, georeference_of(manifest.get("georeference")))
 
 
-def open_scans(run: EarlierRun, sequence: Path | None = None, **reading: Any) -> Sequence:
+def open_scans(run: EarlierRun, sequence: Path | None = None, *, flag: str = "--sequence", **reading: Any) -> Sequence:
     """The scans the run worked on; `sequence` names them where they have moved.
 
-    reading : goes to `open_sequence`, over the topics that the run was told
+    flag : what to say where they are with; reading : goes to `open_sequence`, over the topics that the run was told
 
     Raises InputError naming the path when the raw scans are gone, or are others than those of the run.
     """
     path = as_path(run.sequence_path) if sequence is None else sequence
     if sequence is None and not path.exists():
         raise InputError(
-            f"the raw scans of {run.folder} are gone: {path} does not exist; say where they are with --sequence"
+            f"the raw scans of {run.folder} are gone: {path} does not exist; say where they are with {flag}"
         )
     section = run.config.input
     known = run.topics if sequence is None else {}

@@ -1,0 +1,217 @@
+"""What appeared and what vanished between two drives through one place: by their beams, since what nobody saw is not gone."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.errors import ConfigError
+from lslam.maps.occupancy import MODEL, Evidence
+from lslam.stopping import check_stop
+
+Keys = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+Kind = Literal["appeared", "vanished"]
+
+# Cells in a thing, at most, that noise explains: what is smaller than a cell lies in up to eight of them.
+NOISE_CELLS = 8
+
+
+@dataclass(frozen=True)
+class Change:
+    """A thing that only one drive saw, where beams of the other passed: cells (K, 3) of edge `voxel`, m."""
+
+    kind: Kind
+    cells: NDArray[np.int64]
+    voxel: float
+
+    @property
+    def centres(self) -> NDArray[np.float64]:
+        """(K, 3) middles of the cells, m."""
+        return np.asarray((self.cells + 0.5) * self.voxel)
+
+    @property
+    def base(self) -> float:
+        """Lower edge, m."""
+        return float(self.cells[:, 2].min() * self.voxel)
+
+    @property
+    def height(self) -> float:
+        """From the lower to the upper edge, m."""
+        return float((np.ptp(self.cells[:, 2]) + 1) * self.voxel)
+
+    @property
+    def volume(self) -> float:
+        """Of the cells, m3: those of its surface, since no beam looks inside."""
+        return float(len(self.cells) * self.voxel**3)
+
+    @property
+    def outline(self) -> NDArray[np.float64]:
+        """(C, 2) convex hull of the cells seen from above, counter-clockwise, m."""
+        from scipy.spatial import ConvexHull
+
+        columns = np.unique(self.cells[:, :2], axis=0)
+        corners = np.unique(np.concatenate([columns + np.array([x, y]) for x in (0, 1) for y in (0, 1)]), axis=0)
+        return np.asarray(corners[ConvexHull(corners).vertices] * self.voxel)
+
+    @property
+    def extent(self) -> tuple[float, float]:
+        """Length and width, m, of the smallest rectangle about the outline; one of its sides lies on a side of the hull."""
+        hull = self.outline
+        sides = np.roll(hull, -1, axis=0) - hull
+        along = sides / np.linalg.norm(sides, axis=1, keepdims=True)
+        across = np.column_stack([-along[:, 1], along[:, 0]])
+        sizes = np.column_stack([np.ptp(along @ hull.T, axis=1), np.ptp(across @ hull.T, axis=1)])
+        width, length = np.sort(sizes[sizes.prod(axis=1).argmin()])
+        return float(length), float(width)
+
+
+@dataclass(frozen=True)
+class ChangedCells:
+    """Two drives compared.
+
+    changes : what appeared, then what vanished, the largest first; same : (S, 3) occupied cells of the new drive that the
+        old one found occupied, too, there or in a cell beside it
+    occupied_new, occupied_old : occupied cells of each; unseen_new, unseen_old : those of them that the other drive never saw
+    """
+
+    changes: tuple[Change, ...]
+    same: NDArray[np.int64]
+    voxel: float
+    occupied_new: int
+    occupied_old: int
+    unseen_new: int
+    unseen_old: int
+
+    def of(self, kind: Kind) -> list[Change]:
+        """Those of one kind."""
+        return [change for change in self.changes if change.kind == kind]
+
+
+@dataclass(frozen=True)
+class _Drive:
+    """Keys of the cells that one drive saw, by what it says of them; each array rises.
+
+    seen : all; occupied : in the end, and in the sum; certain : those of them beyond doubt; free : beyond doubt; blocked : in
+        the end or in the sum
+    """
+
+    seen: Keys
+    occupied: Keys
+    certain: Keys
+    free: Keys
+    blocked: Keys
+
+
+def changed_cells(new: Evidence, old: Evidence) -> ChangedCells:
+    """What is occupied in one drive and free in the other, as things; what the other never saw is neither.
+
+    A cell is free when its log-odds lie at their lower clamp, where OctoMap calls it stable, with and without clamps: one in
+    which something came or went during the drive is neither free nor occupied. A thing needs a cell that is occupied as
+    surely. A surface may lie in a cell beside its own, by its noise and that of the poses: cells with an occupied neighbour
+    in the other drive have not changed, nor have those with an unseen one beyond a face, where that drive's surface may be,
+    as ground that beams graze; unless they border on cells that have.
+
+    Raises ConfigError when the cells of the two are no common ones; InterruptedRunError within `asking`.
+    """
+    if new.voxel != old.voxel or not np.array_equal(new.origin, old.origin):
+        raise ConfigError(
+            f"drives in cells of {new.voxel:g} m and {old.voxel:g} m, or of other origins: make them alike"
+        )
+    after, before = _drive(new), _drive(old)
+    changes = [
+        *_things("appeared", after, before, new),
+        *_things("vanished", before, after, new),
+    ]  # fmt: skip
+    same = after.occupied[_beside(after.occupied, before.blocked)]
+    return ChangedCells(
+        tuple(changes), _cells(same, new), new.voxel, len(after.occupied), len(before.occupied),
+        int((~_among(after.occupied, before.seen)).sum()), int((~_among(before.occupied, after.seen)).sum()),
+    )  # fmt: skip
+
+
+def _drive(found: Evidence) -> _Drive:
+    lowest, highest = int(MODEL[2]), int(MODEL[3])
+    in_the_end, in_the_sum = found.log_odds, found.sums
+    return _Drive(
+        found.keys,
+        found.keys[(in_the_end > 0) & (in_the_sum > 0)],
+        found.keys[(in_the_end >= highest) & (in_the_sum >= highest)],
+        found.keys[(in_the_end <= lowest) & (in_the_sum <= lowest)],
+        found.keys[(in_the_end > 0) | (in_the_sum > 0)],
+    )
+
+
+def _things(kind: Kind, here: _Drive, there: _Drive, found: Evidence) -> list[Change]:
+    """Connected cells that are occupied here and free there, the largest first."""
+    passed = here.occupied[_among(here.occupied, there.free)]
+    alone = passed[~_beside(passed, there.blocked) & _open(passed, there.seen)]
+    cells = passed[_beside(passed, alone)]
+    if not len(cells):
+        return []
+    labels = _components(cells)
+    sizes = np.bincount(labels)
+    is_certain = np.bincount(labels, _among(cells, here.certain) & _among(cells, alone)) > 0
+    kept = np.flatnonzero((sizes > NOISE_CELLS) & is_certain)
+    kept = kept[np.argsort(-sizes[kept], kind="stable")]
+    return [Change(kind, _cells(cells[labels == label], found), found.voxel) for label in kept]
+
+
+def _components(keys: Keys) -> NDArray[np.int64]:
+    """Number of the part that each of the rising keys is of, parts being joined by faces, edges and corners of cells."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    first, second = [], []
+    for step in _steps()[14:]:  # those forward: backward are the same pairs
+        at = _found(keys + step, keys)
+        first.append(np.flatnonzero(at >= 0))
+        second.append(at[at >= 0])
+    rows, columns = np.concatenate(first), np.concatenate(second)
+    pairs = coo_matrix((np.ones(len(rows), np.int8), (rows, columns)), shape=(len(keys), len(keys)))
+    return np.asarray(connected_components(pairs, directed=False)[1], np.int64)
+
+
+def _beside(keys: Keys, others: Keys) -> Mask:
+    """Whether a cell or one of its 26 neighbours is among `others`, which rise."""
+    near = np.zeros(len(keys), np.bool_)
+    for step in _steps():
+        check_stop()
+        near |= _among(keys + step, others)
+    return near
+
+
+def _open(keys: Keys, seen: Keys) -> Mask:
+    """Whether all six cells beyond the faces of a cell are among `seen`, which rise."""
+    steps = _steps()
+    return np.asarray(np.all([_among(keys + steps[k], seen) for k in (4, 10, 12, 14, 16, 22)], axis=0))
+
+
+def _steps() -> list[int]:
+    """Differences of keys to the 27 cells about one, rising; the cell itself is in the middle."""
+    from lslam.kernels.voxel_average import AXIS_BITS
+
+    return [
+        (x << 2 * AXIS_BITS) + (y << AXIS_BITS) + z for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1)
+    ]  # fmt: skip
+
+
+def _among(keys: Keys, others: Keys) -> Mask:
+    return np.asarray(_found(keys, others) >= 0)
+
+
+def _found(keys: Keys, others: Keys) -> NDArray[np.int64]:
+    """Where each key stands in `others`, which rise; -1 where it does not."""
+    if not len(others):
+        return np.full(len(keys), -1, np.int64)
+    at = np.minimum(np.searchsorted(others, keys), len(others) - 1)
+    return np.where(others[at] == keys, at, -1)
+
+
+def _cells(keys: Keys, found: Evidence) -> NDArray[np.int64]:
+    from lslam.kernels.voxel_average import unpack_cells
+
+    return unpack_cells(keys, found.origin)

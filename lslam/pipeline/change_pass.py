@@ -1,0 +1,192 @@
+"""What has changed between two runs through one place, from the raw scans and final poses of both."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.errors import InterruptedRunError, OutputError, OutputExistsError, UsageError, cause
+from lslam.formats.geojson import write_areas
+from lslam.formats.ply_files import write_ply
+from lslam.frontend.register_scans import read_ahead
+from lslam.geometry import se3
+from lslam.geometry.geodesy import from_local, to_local
+from lslam.maps.changes import Change, ChangedCells, changed_cells
+from lslam.maps.clean import Cleaner, PosedScan
+from lslam.maps.georeference import to_lat_lon
+from lslam.maps.occupancy import Evidence, OccupancyMapper
+from lslam.pipeline.map_files import read_json
+from lslam.pipeline.map_pass import scan_poser
+from lslam.pipeline.rebuild import EarlierRun, results_of
+from lslam.pipeline.run_folder import MANIFEST
+from lslam.stopping import asking
+from lslam.types.gnss import Georeference
+from lslam.types.sequence import Sequence
+from lslam.version import __version__
+
+log = logging.getLogger("lslam")
+Floats = NDArray[np.float64]
+
+CLOUD, AREAS = "changes.ply", "changes.geojson"
+INTERRUPTED = "interrupted while the drives were compared: nothing is written"
+# Red, green, blue of what vanished, is the same, and appeared; the scalar `change` is -1, 0 and 1.
+_COLOURS = np.array([[214, 69, 65], [150, 150, 150], [46, 134, 193]], np.uint8)
+# m over which the turn between two local frames of the Earth is taken.
+_BASE = 100.0
+
+
+def frame_between(new: EarlierRun, old: EarlierRun) -> Floats:
+    """(4, 4) T_old_new from the world of one run into that of the other.
+
+    Their worlds are one when one was located in the map of the other, or both in the same map; else their georeferences
+    lead from one to the other. Raises UsageError when neither does.
+    """
+    if _frame_of(new) == _frame_of(old):
+        return np.eye(4)
+    if new.georeference is None or old.georeference is None:
+        raise UsageError(
+            f"{new.folder} and {old.folder} lie in frames of their own: locate the new drive in the map of the old one with "
+            f"lslam localize {new.sequence_path} --map {old.folder}"
+        )
+    log.warning(
+        "only satellites tie %s to %s: where they are off by more than a cell all walls seem changed; lslam localize ties "
+        "drives by their scans",
+        new.folder, old.folder,
+    )  # fmt: skip
+    return _between(new.georeference, old.georeference)
+
+
+def _frame_of(run: EarlierRun) -> Path:
+    """The run folder, or map file of another program, whose coordinates those of the run are."""
+    here, manifest, seen = run.folder.resolve(), run.manifest, set[Path]()
+    while here not in seen:
+        seen.add(here)
+        about = manifest.get("localization")
+        if not isinstance(about, dict) or not about.get("map"):
+            break
+        here = Path(str(about["map"])).resolve()
+        if here.is_file() and (here.parent / MANIFEST).is_file():
+            here = here.parent
+        manifest = read_json(here / MANIFEST)
+    return here
+
+
+def _between(new: Georeference, old: Georeference) -> Floats:
+    """(4, 4) T_old_new: the rigid one that is exact at the origin of the new world."""
+    here = new.T_enu_world[:3, 3] + _BASE * np.concatenate([np.zeros((1, 3)), np.eye(3)])
+    there = to_local(from_local(here, new.origin), old.origin)
+    U, _, Vt = np.linalg.svd((there[1:] - there[0]).T)
+    T_enu_enu = se3.make(U @ Vt, there[0] - U @ Vt @ here[0])
+    return np.asarray(se3.inverse(old.T_enu_world) @ T_enu_enu @ new.T_enu_world)
+
+
+def compare_runs(
+    new: tuple[EarlierRun, Sequence], old: tuple[EarlierRun, Sequence], T_old_new: Floats, *, spool: Path | None = None,
+    on_step: Callable[[], None] = lambda: None, should_stop: Callable[[], bool] = lambda: False,
+) -> ChangedCells:  # fmt: skip
+    """What appeared and what vanished, in the world of the old run.
+
+    Moving objects are taken out of each drive by itself. Cells and their range are those of the new run's configuration.
+    What is too large for memory is kept in a temporary folder in `spool` meanwhile. Raises InterruptedRunError when
+    `should_stop` says so.
+    """
+    section = new[0].config.map
+    origin = np.floor(old[0].trajectory.positions[0] / section.occupancy_voxel).astype(np.int64)
+
+    def cast(run: EarlierRun, sequence: Sequence, T: Floats) -> Evidence:
+        voxel, near, far = section.occupancy_voxel, run.config.map.range_min, section.occupancy_range
+        mapper, cleaner = OccupancyMapper(voxel, near, far, spool=spool, origin=origin), Cleaner()
+
+        def enter(scans: list[PosedScan]) -> None:
+            for scan in scans:
+                mapper.add(scan.points, T @ scan.T_world_lidar)
+
+        results = results_of(run)
+        ahead = read_ahead(sequence, scan_poser(results, run.config), run.config.input.workers)
+        for loaded, _ in zip(ahead, results, strict=False):
+            if should_stop():
+                raise InterruptedRunError(INTERRUPTED)
+            if loaded.prepared is not None:
+                enter(cleaner.add(loaded.prepared))
+            on_step()
+        enter(cleaner.finish())
+        return mapper.evidence()
+
+    with asking(should_stop, INTERRUPTED):
+        before = cast(*old, np.eye(4))
+        return changed_cells(cast(*new, T_old_new), before)
+
+
+@contextmanager
+def output_folder(folder: Path, overwrite: bool) -> Iterator[None]:
+    """`folder`, made before any work is done; what was made is gone again when the block fails.
+
+    Raises OutputExistsError for what it may not replace, OutputError for a folder that cannot be made.
+    """
+    if folder.exists() and not folder.is_dir():
+        raise OutputExistsError(f"{folder} is no folder; name another one with --changes")
+    for name in (CLOUD, AREAS):
+        if (folder / name).exists() and not overwrite:
+            raise OutputExistsError(
+                f"{folder / name} exists; name another folder with --changes or replace it with --overwrite"
+            )
+    is_new = not folder.exists()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"{folder} cannot be written: {cause(error)}") from None
+    try:
+        yield
+    except BaseException:
+        if is_new:
+            with suppress(OSError):
+                folder.rmdir()
+        raise
+
+
+def write_changes(folder: Path, found: ChangedCells, new: EarlierRun, old: EarlierRun) -> None:
+    """changes.ply, cells that changed and those that did not, and changes.geojson, an outline of each thing.
+
+    The cloud, m, is in the world of the old run; outlines are in longitude and latitude when it is georeferenced, else in
+    metres of that world, which the file says. Raises OutputError.
+    """
+    kinds = [np.full(len(c.cells), 1 if c.kind == "appeared" else -1) for c in found.changes]
+    change = np.concatenate([*kinds, np.zeros(len(found.same), np.int64)])
+    thing = np.repeat(np.arange(len(kinds) + 1), [*(len(k) for k in kinds), len(found.same)])
+    cells = np.concatenate([*(c.cells for c in found.changes), found.same])
+    write_ply(
+        folder / CLOUD, (cells + 0.5) * found.voxel, colours=_COLOURS[change + 1],
+        scalars={"change": change, "thing": np.where(change == 0, 0, thing + 1)},
+        comment=f"lslam {__version__} changes from {old.folder} to {new.folder}, cells of {found.voxel:g} m; {old.world}",
+    )  # fmt: skip
+    place = old.georeference
+    about = {"old": str(old.folder), "new": str(new.folder), "voxel_m": found.voxel, "lslam": __version__}
+    if place is None:
+        about["frame"] = f"m in the world of {old.folder}: {old.world}"
+    areas = [_outline(change, place) for change in found.changes]
+    write_areas(folder / AREAS, areas, [properties(k, c) for k, c in enumerate(found.changes, 1)], about)
+
+
+def _outline(change: Change, place: Georeference | None) -> Floats:
+    """(C, 2) as GeoJSON has it: longitude and latitude, deg, or x and y, m."""
+    if place is None:
+        return change.outline
+    corners = np.column_stack([change.outline, np.full(len(change.outline), change.base)])
+    return np.asarray(to_lat_lon(corners, place)[:, 1::-1])
+
+
+def properties(number: int, change: Change) -> dict[str, str | int | float]:
+    """What is said of a thing beside its outline; `thing` is its number in the cloud, `base_m` in the world of the old run."""
+    x, y, _ = change.centres.mean(axis=0)
+    length, width = change.extent
+    measures = {
+        "x_m": x, "y_m": y, "base_m": change.base, "height_m": change.height, "length_m": length, "width_m": width,
+        "volume_m3": change.volume,
+    }  # fmt: skip
+    rounded = {name: round(float(value), 3) for name, value in measures.items()}
+    return {"thing": number, "kind": change.kind, "cells": len(change.cells), **rounded}

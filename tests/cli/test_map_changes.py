@@ -1,0 +1,177 @@
+"""`lslam map --against --changes` as a user calls it: a town driven twice, and a box that somebody put beside the road."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from calling import SAMPLE, assert_one_sentence, lslam, strict_json
+from numpy.typing import NDArray
+
+from lslam.formats.ply_files import read_ply
+from lslam.formats.trajectory_files import read_trajectory
+from lslam.geometry import se3
+from lslam.geometry.umeyama import align
+from lslam.simulation.lidar import RayScene
+from lslam.simulation.record import record
+from lslam.simulation.routes import Visit
+from lslam.simulation.scenarios import SimulatedDrive, simulate
+from lslam.simulation.scene_mesh import MeshBuilder, Surface
+
+# Length, width and height of the box, m.
+BOX = np.array([2.0, 1.5, 1.5])
+MONDAY, TUESDAY = Visit(), Visit(1, is_reversed=True, shift=40.0)
+
+
+def beside_the_road(drive: SimulatedDrive) -> NDArray[np.float64]:
+    """(3,) middle of the foot of the box in the town: on the other lane of the first visit."""
+    T = drive.city_poses[30]
+    at = T[:2, 3] + 3.0 * T[:2, 1]
+    return np.array([*at, float(drive.city.terrain.height(at[None])[0])])
+
+
+def with_box(drive: SimulatedDrive, foot: NDArray[np.float64]) -> SimulatedDrive:
+    built = MeshBuilder()
+    built.add_mesh(drive.city.mesh)
+    half = BOX * [0.5, 0.5, 0.0]
+    built.add_box(foot - half, foot + half + [0.0, 0.0, BOX[2]], Surface.WALL)
+    drive.scene = RayScene(built.build())
+    return drive
+
+
+@pytest.fixture(scope="module")
+def drives(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """`monday` with its run `old`; `tuesday` as it was and `boxed`, located in it."""
+    root = tmp_path_factory.mktemp("drives")
+    monday = simulate("block", seed=7, count=96, visit=MONDAY)
+    foot = beside_the_road(monday)
+    record(monday, root / "monday")
+    record(simulate("block", seed=7, count=60, visit=TUESDAY), root / "tuesday")
+    record(with_box(simulate("block", seed=7, count=60, visit=TUESDAY), foot), root / "boxed")
+    assert lslam("run", root / "monday", "--out", root / "old", "-q").returncode == 0
+    for name in ("tuesday", "boxed"):
+        done = lslam("localize", root / name, "--map", root / "old", "--out", root / f"{name}-run", "-q")
+        assert done.returncode == 0, done.stderr
+    est = read_trajectory(root / "old" / "trajectory.tum", "tum").positions
+    T, _, _ = align(monday.city_poses[:, :3, 3], est)
+    np.save(root / "foot.npy", se3.apply(T, foot[None])[0])
+    return root
+
+
+def changed(drives: Path, new: str, old: str, out: Path, *more: object) -> dict[str, object]:
+    done = lslam("map", drives / new, "--against", drives / old, "--changes", out, "--json", *more)
+    assert done.returncode == 0, done.stderr
+    return dict(strict_json(done.stdout))
+
+
+def test_a_town_that_stayed_has_no_changes(drives: Path, tmp_path: Path) -> None:
+    document = changed(drives, "tuesday-run", "old", tmp_path / "out")
+    assert document["things"] == []
+    cells = document["cells"]
+    assert isinstance(cells, dict)
+    assert cells["same"] > 0.95 * cells["occupied_new"] > 5000
+    assert cells["unseen_old"] > 100, "what the second drive never passed"
+    assert json.loads((tmp_path / "out" / "changes.geojson").read_text())["features"] == []
+    assert len(read_ply(tmp_path / "out" / "changes.ply").points) == cells["same"]
+
+
+@pytest.mark.parametrize(("new", "old", "kind"), [("boxed-run", "old", "appeared"), ("old", "boxed-run", "vanished")])
+def test_a_box_is_found_where_it_stands(new: str, old: str, kind: str, drives: Path, tmp_path: Path) -> None:
+    """Whichever drive was first: the frame is the same."""
+    document = changed(drives, new, old, tmp_path / "out")
+    things = document["things"]
+    assert isinstance(things, list)
+    assert [thing["kind"] for thing in things] == [kind]
+    (thing,) = things
+    foot = np.load(drives / "foot.npy")
+    # Cells of 0.4 m: a side lies within one of its place.
+    assert np.hypot(thing["x_m"] - foot[0], thing["y_m"] - foot[1]) < 0.5
+    assert abs(thing["base_m"] - foot[2]) <= 0.5
+    assert np.all(np.abs([thing["length_m"] - BOX[0], thing["width_m"] - BOX[1], thing["height_m"] - BOX[2]]) <= 0.8)
+
+    tree = json.loads((tmp_path / "out" / "changes.geojson").read_text())
+    (feature,) = tree["features"]
+    assert feature["properties"] == thing
+    assert "m in the world of" in tree["frame"]
+    (ring,) = feature["geometry"]["coordinates"]
+    assert ring[0] == ring[-1]
+    x, y = np.transpose(ring)
+    assert 0.5 * np.sum(x[:-1] * y[1:] - x[1:] * y[:-1]) == pytest.approx(thing["length_m"] * thing["width_m"], rel=0.3)
+    assert min(x) < foot[0] < max(x)
+    assert min(y) < foot[1] < max(y)
+    cloud = (tmp_path / "out" / "changes.ply").read_bytes()
+    assert b"property float change" in cloud
+    assert b"property uchar red" in cloud
+
+
+def test_the_table_and_the_rules_of_overwriting(drives: Path, tmp_path: Path) -> None:
+    words = ("map", drives / "boxed-run", "--against", drives / "old", "--changes", tmp_path / "out", "--voxel", 0.5)
+    done = lslam(*words)
+    assert done.returncode == 0, done.stderr
+    assert "cells of 0.5 m" in done.stdout
+    assert "    1 appeared" in done.stdout
+    before = {path.name: path.read_bytes() for path in (tmp_path / "out").iterdir()}
+    assert set(before) == {"changes.ply", "changes.geojson"}
+    again = lslam(*words)
+    assert again.returncode == 2
+    assert "--overwrite" in again.stderr
+    assert_one_sentence(again.stderr)
+    assert lslam(*words, "--overwrite", "-q", "--set", "input.threads=1").returncode == 2
+    assert lslam(*words, "--overwrite", "-q").returncode == 0
+    assert {path.name: path.read_bytes() for path in (tmp_path / "out").iterdir()} == before
+
+
+def test_scans_that_have_moved_are_named(drives: Path, tmp_path: Path) -> None:
+    old = Path(shutil.copytree(drives / "old", tmp_path / "old"))
+    manifest = json.loads((old / "manifest.json").read_text())
+    manifest["sequence"]["path"] = str(tmp_path / "gone")
+    (old / "manifest.json").write_text(json.dumps(manifest))
+    words = ("map", old, "--against", drives / "tuesday-run", "--changes", tmp_path / "out")
+    # Located in a map of another folder: two copies of a run are two runs.
+    done = lslam(*words)
+    assert done.returncode == 2
+    assert "lslam localize" in done.stderr
+    run = Path(shutil.copytree(drives / "tuesday-run", tmp_path / "tuesday-run"))
+    about = json.loads((run / "manifest.json").read_text())
+    about["localization"]["map"] = str(old / "map.ply")
+    (run / "manifest.json").write_text(json.dumps(about))
+    words = ("map", run, "--against", old, "--changes", tmp_path / "out")
+    done = lslam(*words)
+    assert done.returncode == 3
+    assert "--against-sequence" in done.stderr
+    assert_one_sentence(done.stderr)
+    assert not (tmp_path / "out").exists()
+    assert lslam(*words, "--against-sequence", drives / "monday", "-q").returncode == 0
+    assert (tmp_path / "out" / "changes.ply").is_file()
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "said"),
+    [
+        (("--changes", "out"), 2, "--against RUN"),
+        (("--against", "old", "--against-sequence", "monday"), 2, "belongs to --changes"),
+        (("--against", "old", "--changes", "out", "--clean"), 2, "--clean has no meaning"),
+        (("--against", "old", "--changes", "out", "--threshold", 0.1), 2, "--threshold has no meaning"),
+        (("--against", "old", "--changes", "old/manifest.json"), 2, "is no folder"),
+        (("--against", "nowhere", "--changes", "out"), 3, "nowhere does not exist"),
+        (("--against", "monday", "--changes", "out"), 3, "no folder of a run"),
+        (("--against", "old", "--changes", "out", "--voxel", -1), 2, "occupancy_voxel"),
+    ],
+)  # fmt: skip
+def test_wrong_words_get_one_sentence(words: tuple[object, ...], code: int, said: str, drives: Path) -> None:
+    done = lslam("map", "tuesday-run", *words, cwd=drives)
+    assert done.returncode == code, done.stderr
+    assert said in done.stderr
+    assert_one_sentence(done.stderr)
+    assert not (drives / "out").exists()
+
+
+def test_runs_that_nothing_ties_together_are_refused(drives: Path, tmp_path: Path) -> None:
+    assert lslam("run", SAMPLE, "--count", 5, "--out", tmp_path / "other", "-q").returncode == 0
+    done = lslam("map", tmp_path / "other", "--against", drives / "old", "--changes", tmp_path / "out")
+    assert done.returncode == 2
+    assert f"--map {drives / 'old'}" in done.stderr
+    assert_one_sentence(done.stderr)
