@@ -16,11 +16,13 @@ if TYPE_CHECKING:
     from lslam.types.trajectory import Trajectory
 
 SEQUENCES = ("bag", "mcap", "sqlite", "kitti")
+EARTH = ("kml", "gpx")
 EPILOG = """\b
 Examples:
   lslam convert seq07 --data-root ~/kitti --to mcap --zstd --out seq07.mcap
   lslam convert drive.bag --to kitti --out drive
   lslam convert runs/first --to euroc --frame lidar --out first.csv
+  lslam convert runs/town --to kml --out town.kml
   lslam convert drive.bag --deskewed runs/drive --to kitti --out drive_deskewed
 """
 
@@ -28,8 +30,9 @@ Examples:
 @click.command(epilog=EPILOG)
 @click.argument("source")
 @click.option(
-    "--to", "kind", required=True, type=click.Choice(list(dict.fromkeys(SEQUENCES + WRITTEN))),
-    help="bag is ROS 1, mcap and sqlite are ROS 2; tum and euroc are for trajectories, kitti for both.",
+    "--to", "kind", required=True, type=click.Choice(list(dict.fromkeys(SEQUENCES + WRITTEN + EARTH))),
+    help="bag is ROS 1, mcap and sqlite are ROS 2; tum and euroc are for trajectories, kitti for both; kml and gpx for "
+    "georeferenced runs.",
 )  # fmt: skip
 @click.option("--out", required=True, type=click.Path(path_type=Path), metavar="PATH", help="File or folder to write.")
 @click.option("--overwrite", is_flag=True, help="Replace an existing PATH.")
@@ -118,10 +121,17 @@ def _convert_trajectory(source: str, kind: str, out: Path, given: dict[str, Any]
             raise click.UsageError(f"{flag} is for sequences, and {source} to {kind} is a trajectory")
     from lslam.convert.convert_trajectory import convert_trajectory
 
-    trajectory, calibration = _read_trajectory(source, kind, given)
-    moved = convert_trajectory(
-        trajectory, kind, out, calibration, frame=given["frame"], overwrite=given["overwrite"]
-    )  # fmt: skip
+    how = {"frame": given["frame"], "overwrite": given["overwrite"]}
+    if kind in EARTH:
+        from lslam.convert.on_earth import convert_to_earth, georeference_beside
+
+        options.require_there(Path(source))
+        georeference = georeference_beside(Path(source).expanduser(), kind)
+        trajectory, calibration = _read_trajectory(source, kind, given)
+        moved = convert_to_earth(trajectory, kind, out, georeference, calibration, **how)
+    else:
+        trajectory, calibration = _read_trajectory(source, kind, given)
+        moved = convert_trajectory(trajectory, kind, out, calibration, **how)
     show(f"{out}: {len(moved)} poses of {moved.frame}\n")
 
 

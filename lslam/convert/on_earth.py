@@ -1,0 +1,85 @@
+"""The trajectory of a georeferenced run in a format of map programs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from lslam.convert.convert_trajectory import change_frame
+from lslam.errors import InputError, OutputExistsError, UsageError
+from lslam.formats.gpx_files import write_gpx
+from lslam.formats.kml_files import write_kml
+from lslam.formats.utc_times import utc_of
+from lslam.maps.georeference import to_lat_lon
+from lslam.pipeline.map_files import georeference_of, read_json
+from lslam.types.gnss import Georeference
+from lslam.types.sequence import Calibration
+from lslam.types.trajectory import Trajectory
+
+WRITERS = {"kml": write_kml, "gpx": write_gpx}
+TRAJECTORY, MANIFEST = "trajectory.tum", "manifest.json"
+
+
+def georeference_beside(source: Path, kind: str) -> Georeference:
+    """Where on the Earth the trajectory of a run folder, or its `trajectory.tum`, lies, as its manifest says.
+
+    Raises UsageError with the way out when that is unknown.
+    """
+    folder = source if source.is_dir() else source.parent
+    is_of_run = (folder / MANIFEST).is_file() and (source.is_dir() or source.name == TRAJECTORY)
+    if not is_of_run:
+        raise UsageError(
+            f"--to {kind} needs to know where on the Earth the poses lie: {source} is neither the folder of a run nor its "
+            f"{TRAJECTORY}"
+        )
+    georeference = georeference_of(read_json(folder / MANIFEST).get("georeference"))
+    if georeference is None:
+        raise UsageError(
+            f"--to {kind} needs to know where on the Earth the poses lie, and {folder} is not georeferenced: run the sequence "
+            "again with --gnss or --georeference where it has fixes, or with --osm"
+        )
+    return georeference
+
+
+def convert_to_earth(
+    trajectory: Trajectory,
+    kind: str,
+    out: Path,
+    georeference: Georeference,
+    calibration: Calibration,
+    *,
+    frame: str | None = None,
+    overwrite: bool = False,
+) -> Trajectory:
+    """Write the places of `trajectory` to `out` as `kind`, `kml` or `gpx`; what was written.
+
+    Degrees have 7 decimals (1 cm), heights above the WGS84 ellipsoid 3. Times are UTC, and left out where stamps are not
+    Unix time.
+
+    Raises
+    ------
+    OutputExistsError : `out` is there and `overwrite` is not set. UsageError : unknown `kind`, or the `frame` of a camera.
+    InputError : no pose is finite, or the change of body needs an extrinsic that `calibration` does not have.
+    """
+    if kind not in WRITERS:
+        raise UsageError(f"no format {kind!r} of map programs: {', '.join(WRITERS)} are")
+    if frame == "cam0":
+        raise UsageError(f"--frame cam0: poses of the camera have a world of their own, --to {kind} takes lidar or imu")
+    if out.exists() and not overwrite:
+        raise OutputExistsError(f"{out} exists already: choose another --out, or --overwrite it")
+    moved = change_frame(trajectory, frame or trajectory.frame, calibration)
+    moved = moved.select(np.isfinite(moved.positions).all(axis=1))
+    if not len(moved):
+        raise InputError(f"{trajectory.source} has no pose that is finite")
+    places = [
+        (round(lat, 7), round(lon, 7), round(h, 3))
+        for lat, lon, h in to_lat_lon(moved.positions, georeference).tolist()
+    ]
+    name = out.stem
+    about = f"poses of {moved.frame} by lslam, heights in m above the WGS84 ellipsoid"
+    if georeference.method == "osm":
+        about += "; placed by buildings, © OpenStreetMap contributors, ODbL 1.0"
+    out.parent.mkdir(parents=True, exist_ok=True)
+    WRITERS[kind](out, places, utc_of(moved.stamps_ns) if moved.has_stamps else None, name, about)
+    return moved
