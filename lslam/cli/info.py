@@ -38,14 +38,19 @@ def command(
 ) -> None:
     """Show the contents and the faults of SEQUENCE: a folder, a bag, or a name under the data root.
 
-    Each finding comes with advice. The first scans are registered, to compare their rotations with the IMU's.
+    Of a bag all topics are listed, also where none has clouds. Each finding comes with advice.
+    The first scans are registered, to compare their rotations with the IMU's.
     """
-    from lslam.errors import OutputExistsError
+    from lslam.errors import LslamError, OutputExistsError
     from lslam.readers import open_sequence
 
     if imu_toml is not None and imu_toml.exists():
         raise OutputExistsError(f"{imu_toml} exists already: name another file with --imu-toml")
-    opened = open_sequence(sequence, data_root=data_root, rows=rows, cols=cols, **options.reading_of(given))
+    try:
+        opened = open_sequence(sequence, data_root=data_root, rows=rows, cols=cols, **options.reading_of(given))
+    except LslamError as error:
+        _show_bag(sequence, data_root, str(error) if as_json else None)
+        raise
     from lslam.doctor.inspect import inspect
 
     facts = inspect(opened, None if all_scans else scans, quick)
@@ -58,6 +63,8 @@ def command(
         return
     for label, value in _lines(facts):
         click.echo(f"{label:<18} {value}".rstrip())
+    if facts["bag"] is not None:
+        _show_topics(facts["bag"])
     for title, key in (("notes", "notes"), ("findings", "problems")):
         if facts[key]:
             click.echo(f"\n{title}")
@@ -67,10 +74,40 @@ def command(
         click.echo("\nnothing wrong found")
 
 
+def _show_topics(bag: dict[str, Any]) -> None:
+    from lslam.cli import bag_page
+
+    click.echo("\ntopics")
+    for line in bag_page.table(bag):
+        click.echo(f"  {line}")
+
+
+def _show_bag(name: str, data_root: Path | None, error: str | None) -> None:
+    """What is in a bag that is no sequence: as JSON with the `error`, as a page without one; nothing where there is no bag."""
+    from lslam.cli import bag_page
+    from lslam.doctor.examine_bag import bag_at
+
+    bag = bag_at(name, data_root)
+    if bag is None:
+        return
+    if error is not None:
+        import json
+
+        click.echo(json.dumps({"path": name, "bag": bag, "error": error}, indent=1, allow_nan=False))
+        return
+    for label, value in bag_page.lines(bag):
+        click.echo(f"{label:<18} {value}")
+    _show_topics(bag)
+
+
 def _lines(facts: dict[str, Any]) -> Iterator[tuple[str, str]]:
     time, points = facts["time"], facts["points"]
     yield "sequence", f"{facts['name']}  ({facts['path']})"
     yield "format", facts["format"] + (f", sensor {facts['sensor']}" if facts["sensor"] else "")
+    if facts["bag"] is not None:
+        from lslam.cli import bag_page
+
+        yield from bag_page.lines(facts["bag"])
     yield "scans", f"{facts['scans']} in {time['duration_s']:.2f} s, {time['rate_hz']:g} Hz"
     if time["period_s"]:
         period = time["period_s"]

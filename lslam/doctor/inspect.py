@@ -7,6 +7,7 @@ from dataclasses import asdict
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.doctor.examine_bag import examine_bag
 from lslam.doctor.examine_gnss import examine_gnss
 from lslam.doctor.examine_imu import examine_imu
 from lslam.doctor.examine_scans import examine_points, examine_stamps, examine_times, rings_rule
@@ -14,6 +15,7 @@ from lslam.doctor.examine_truth import examine_gaps, examine_jumps
 from lslam.doctor.examine_turns import examine_turns
 from lslam.doctor.examine_units import examine_units
 from lslam.doctor.findings import Facts, Finding
+from lslam.readers.bag import BagSequence
 from lslam.types.scan import Span
 from lslam.types.sequence import Sequence
 from lslam.types.trajectory import Trajectory
@@ -64,6 +66,7 @@ def inspect(sequence: Sequence, samples: int | None = 50, is_quick: bool = False
         "path": str(sequence.path),
         "format": sequence.kind,
         "sensor": getattr(sequence, "sensor", None),
+        "bag": examine_bag(sequence.bag, sequence.uses) if isinstance(sequence, BagSequence) else None,
         "scans": n,
         "time": time,
         "points": points,

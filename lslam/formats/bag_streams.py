@@ -22,11 +22,12 @@ _LARGEST = 1e9  # m, no pose on this planet; NaN is not less either
 
 @dataclass(frozen=True)
 class Stream:
-    """Stamped rows of one topic: stamps_ns (N,) int64 of the headers, values (N, K) float64, frame of the first."""
+    """Stamped rows of one topic: stamps_ns (N,) int64 of the headers, values (N, K) float64, frame of the first, its name."""
 
     stamps_ns: NDArray[np.int64]
     values: Floats
     frame: str
+    topic: str
 
 
 def read_imu(bag: Bag, topic: BagTopic, broken: list[str]) -> Stream:
@@ -51,7 +52,7 @@ def read_imu(bag: Bag, topic: BagTopic, broken: list[str]) -> Stream:
         stamps.append(header.stamp_ns)
         rows.append(data[at + _ACCEL : at + _ACCEL + 24] + data[at + _GYRO : at + _GYRO + 24])
     values = np.frombuffer(b"".join(rows), f"{order}f8").reshape(-1, 6).astype(np.float64)
-    return Stream(np.array(stamps, np.int64), values, frame)
+    return Stream(np.array(stamps, np.int64), values, frame, topic.name)
 
 
 def read_fixes(bag: Bag, topic: BagTopic, broken: list[str]) -> Stream:
@@ -76,7 +77,7 @@ def read_fixes(bag: Bag, topic: BagTopic, broken: list[str]) -> Stream:
         is_known = fix.position_covariance_type > 0 and variance >= 0
         stamps.append(stamp_of(fix))
         rows.append([*position, float(np.sqrt(variance)) if is_known else np.nan])
-    return Stream(np.array(stamps, np.int64), np.array(rows, np.float64).reshape(-1, 4), frame)
+    return Stream(np.array(stamps, np.int64), np.array(rows, np.float64).reshape(-1, 4), frame, topic.name)
 
 
 def read_poses(bag: Bag, topic: BagTopic, broken: list[str]) -> tuple[NDArray[np.int64], Floats, str]:
@@ -98,11 +99,16 @@ def read_poses(bag: Bag, topic: BagTopic, broken: list[str]) -> tuple[NDArray[np
     return np.array(stamps, np.int64), _poses(rows), body
 
 
+def is_static(topic: BagTopic) -> bool:
+    """Whether transforms of this topic hold for good."""
+    return topic.name.rsplit("/", 1)[-1] == "tf_static"
+
+
 def read_static_transforms(bag: Bag, broken: list[str]) -> dict[tuple[str, str], Floats]:
     """`T_parent_child` by (parent, child) of /tf_static; the last one said of a pair counts."""
     found: dict[tuple[str, str], Floats] = {}
     for topic in bag.of_type("TFMessage"):
-        if topic.name.rsplit("/", 1)[-1] != "tf_static":
+        if not is_static(topic):
             continue
         for data in bag.messages(topic, broken):
             try:

@@ -14,7 +14,7 @@ from lslam.errors import InputError
 from lslam.formats import bag_streams
 from lslam.formats.bag_files import INFO_TOPIC, Bag, BagTopic, open_bag, read_header
 from lslam.formats.bag_listing import list_bag_files, parts_beside
-from lslam.formats.bag_streams import Stream, chain, read_poses
+from lslam.formats.bag_streams import Stream, chain, is_static, read_poses
 from lslam.formats.point_cloud import TIME_NAMES, PointCloud
 from lslam.formats.pointcloud2 import decode_livox, decode_pointcloud2
 from lslam.formats.sequence_toml import FILE_NAME, SequenceInfo, parse_sequence_toml, read_sequence_toml
@@ -56,6 +56,7 @@ class BagSequence:
     messages : (N,) int64, which message of `topic` each scan is; headers_ns : (N,) int64, stamps of their headers
     time_rule : how per-point times are understood, None when there are none or they are not to be used
     has_assumed_extrinsics : nothing says where the IMU sits, the identity stands in
+    uses : what each topic that is used is used for
     """
 
     name: str
@@ -78,6 +79,7 @@ class BagSequence:
     rings: int | None = None
     sensor: str | None = None
     has_assumed_extrinsics: bool = False
+    uses: dict[str, str] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.messages)
@@ -163,7 +165,21 @@ def open_folder(path: Path, overrides: SequenceInfo, why: str) -> BagSequence:
         sequence.imu = ImuStream(imu.stamps_ns, imu.values[:, :3].copy(), imu.values[:, 3:].copy())
     if gnss is not None:
         sequence.gnss = GnssStream(gnss.stamps_ns, gnss.values[:, :3].copy(), gnss.values[:, 3].copy())
+    sequence.uses = _uses(sequence, imu, gnss, transforms)
     return sequence
+
+
+def _uses(sequence: BagSequence, imu: Stream | None, gnss: Stream | None, transforms: Transforms) -> dict[str, str]:
+    """By the name of a topic."""
+    uses = {INFO_TOPIC: "sequence.toml"}
+    if transforms:
+        uses |= {topic.name: "extrinsics" for topic in sequence.bag.of_type("TFMessage") if is_static(topic)}
+    if sequence.ground_truth is not None:
+        uses[truth_topics(sequence.bag)[0].name] = "ground truth"
+    for what, stream in (("IMU", imu), ("GNSS", gnss)):
+        if stream is not None:
+            uses[stream.topic] = what
+    return uses | {sequence.topic.name: "scans"}
 
 
 def _info(path: Path, bag: Bag, overrides: SequenceInfo) -> SequenceInfo:
@@ -241,9 +257,14 @@ def find_extrinsics(
     return Calibration(T_cam0_lidar, T_lidar_imu, T_lidar_gnss), is_assumed
 
 
+def truth_topics(bag: Bag) -> list[BagTopic]:
+    """Topics of poses whose name says ground truth; the first one counts."""
+    return [t for t in bag.of_type("Odometry", "PoseStamped") if _TRUTH.search(t.name)]
+
+
 def find_truth(bag: Bag, transforms: Transforms, lidar: str, voice: Voice) -> Trajectory | None:
     """LiDAR poses of the first topic whose name says ground truth (Odometry or PoseStamped), None when there is none."""
-    topics = [t for t in bag.of_type("Odometry", "PoseStamped") if _TRUTH.search(t.name)]
+    topics = truth_topics(bag)
     if not topics:
         return None
     topic = topics[0]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -199,7 +200,7 @@ def _load(
     recorded = recorded if len(recorded) == len(stream.stamps_ns) else np.zeros(len(stream.stamps_ns), np.int64)
     order, stamps = put_in_order(stream.stamps_ns, recorded, f"{what}: samples", voice)
     voice.notes.append(f"{what} from {topic.name} ({len(topic)} messages, frame {stream.frame or 'unnamed'})")
-    return Stream(stamps, stream.values[order], stream.frame)
+    return replace(stream, stamps_ns=stamps, values=stream.values[order])
 
 
 def _why_none(bag: Bag, what: str, flag: str, kind: str, wish: str) -> LslamError:
