@@ -24,6 +24,7 @@ GROUP = "lslam.readers"
 # Tried in this order: a KITTI layout is also a folder with scans somewhere in it.
 READERS = {
     "bag": "lslam.readers.bag",
+    "pcap": "lslam.readers.pcap",
     "kitti-odometry": "lslam.readers.kitti_odometry",
     "kitti-raw": "lslam.readers.kitti_raw",
     "scan-folder": "lslam.readers.scan_folder",
@@ -136,6 +137,6 @@ def _nothing_in(folder: Path) -> str:
         return f"{folder} is empty: there is no sequence in it"
     shown = ", ".join(inside[:8]) + (", ..." if len(inside) > 8 else "")
     return (
-        f"{folder} holds no scans: looked for velodyne/, sequences/, velodyne_points/, bags and *.bin, *.pcd, *.ply, *.npy "
-        f"here and in data/, found {shown}"
+        f"{folder} holds no scans: looked for velodyne/, sequences/, velodyne_points/, bags, captures and *.bin, *.pcd, *.ply, "
+        f"*.npy here and in data/, found {shown}"
     )

@@ -8,6 +8,7 @@ import re
 from pathlib import Path
 
 from lslam.errors import InputError
+from lslam.formats import pcap_files
 from lslam.formats.bag_listing import SUFFIXES, list_bag_files
 from lslam.remote import RemotePath, as_path
 
@@ -25,11 +26,12 @@ def find_folder(name_or_path: str | Path, data_root: Path | None = None) -> Path
     """
     text = str(name_or_path)
     path = as_path(name_or_path).expanduser()
-    if path.is_dir() or list_bag_files(path):
+    if path.is_dir() or is_recording(path):
         return path
     if path.exists():
+        known = ", ".join("*" + suffix for suffix in (*SUFFIXES, *pcap_files.SUFFIXES))
         raise InputError(
-            f"{path} is a file: give a bag ({', '.join('*' + s for s in SUFFIXES)}) or the folder of the sequence (a KITTI "
+            f"{path} is a file: give a bag or a capture ({known}) or the folder of the sequence (a KITTI "
             "sequence, a raw drive, or its scans)"
         )
     if isinstance(path, RemotePath):
@@ -43,7 +45,7 @@ def find_folder(name_or_path: str | Path, data_root: Path | None = None) -> Path
     root = data_root.expanduser()
     if not root.is_dir():
         raise InputError(f"no sequence {text!r}: the data root {root} does not exist")
-    if (root / text).is_dir() or list_bag_files(root / text):
+    if (root / text).is_dir() or is_recording(root / text):
         return root / text
     found = _sequences(root, text) or _drives(root, text)
     if len(found) == 1:
@@ -51,6 +53,11 @@ def find_folder(name_or_path: str | Path, data_root: Path | None = None) -> Path
     if found:
         raise InputError(f"{text!r} may be any of {', '.join(str(p) for p in found)}: name one of them")
     raise InputError(_not_found(text, root))
+
+
+def is_recording(path: Path) -> bool:
+    """Whether `path` is a bag, or a folder of its parts, or the capture of a sensor's packets."""
+    return bool(list_bag_files(path)) or (path.suffix.lower() in pcap_files.SUFFIXES and path.is_file())
 
 
 def _sequences(root: Path, text: str) -> list[Path]:

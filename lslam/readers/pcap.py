@@ -1,0 +1,129 @@
+"""Captures of Velodyne and Ouster sensors as sequences: a scan is a revolution, read when it is asked for."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.errors import InputError
+from lslam.formats import velodyne_packets
+from lslam.formats.pcap_files import SUFFIXES, Datagrams, read_datagrams
+from lslam.formats.sequence_toml import SequenceInfo
+from lslam.printable import printable
+from lslam.readers.ground_truth import Voice
+from lslam.readers.listing import list_scans
+from lslam.readers.pcap_ouster import open_ouster
+from lslam.readers.pcap_revolutions import Opened, Revolutions
+from lslam.readers.pcap_velodyne import open_velodyne
+from lslam.readers.sidecars import calibration_over, compensation_note, load_gnss, load_imu, read_info
+from lslam.types.gnss import GnssStream
+from lslam.types.imu import ImuStream
+from lslam.types.scan import Scan
+from lslam.types.sequence import Calibration, no_shared_time
+from lslam.types.trajectory import Trajectory
+
+KIND = "pcap"
+
+
+@dataclass
+class PcapSequence:
+    """A `Sequence` over a capture. See `lslam.types.sequence` for the attributes every sequence has.
+
+    rings : number of beams; sensor : the model; has_assumed_extrinsics : nothing says where the IMU sits
+    """
+
+    name: str
+    path: Path
+    revolutions: Revolutions
+    stamps_ns: NDArray[np.int64]
+    rate_hz: float
+    rings: int
+    sensor: str
+    kind: str = KIND
+    motion_compensated: bool | None = False
+    calibration: Calibration = field(default_factory=Calibration)
+    ground_truth: Trajectory | None = None
+    imu: ImuStream | None = None
+    gnss: GnssStream | None = None
+    notes: list[str] = field(default_factory=list)
+    problems: list[str] = field(default_factory=list)
+    has_assumed_extrinsics: bool = False
+
+    def __len__(self) -> int:
+        return len(self.stamps_ns)
+
+    def scan(self, index: int) -> Scan:
+        """Read scan `index`. Raises IndexError beyond the end."""
+        if not 0 <= index < len(self):
+            raise IndexError(f"scan {index} of {len(self)}")
+        cloud, times_ns = self.revolutions.read(index)
+        stamp = int(self.stamps_ns[index])
+        times = None if self.motion_compensated else ((times_ns - stamp) * 1e-9).astype(np.float32)
+        return Scan(cloud.points, stamp, index, cloud.intensity, times, cloud.rings)
+
+
+def locate(path: Path) -> tuple[Path, str] | None:
+    """The capture at `path`, or the only one in this folder, and why; None when there is none, or when scans lie beside it.
+
+    Raises InputError listing the captures when a folder has several.
+    """
+    if path.suffix.lower() in SUFFIXES:
+        return (path, f"{path.name} is a capture") if path.is_file() else None
+    if not path.is_dir():
+        return None
+    found = sorted(p for p in path.iterdir() if p.suffix.lower() in SUFFIXES and p.is_file() and p.name[0] != ".")
+    if not found or list_scans(path)[0]:
+        return None
+    if len(found) > 1:
+        raise InputError(f"{path} holds {len(found)} captures ({', '.join(p.name for p in found)}): name one of them")
+    return found[0], f"it holds the capture {found[0].name}"
+
+
+def open_folder(path: Path, overrides: SequenceInfo, why: str) -> PcapSequence:
+    """Open the capture at `path`.
+
+    Raises InputError when it is unreadable, holds no packets of a sensor that is known, or lacks the metadata they need.
+    """
+    info, _ = read_info(path.parent, overrides)
+    voice = Voice([f"format {KIND}: {why}", *compensation_note(info)], [])
+    datagrams = read_datagrams(path)
+    if datagrams.loss:
+        voice.problems.append(datagrams.loss)
+    opened = _opener(path, datagrams)(path, datagrams, voice)
+    revolutions = opened.revolutions
+    sequence = PcapSequence(
+        info.name or printable(path.stem), path, revolutions, revolutions.stamps_ns,
+        info.rate_hz or opened.rate_hz, info.rings or opened.rings, info.sensor or opened.sensor,
+        motion_compensated=bool(info.motion_compensated), notes=voice.notes, problems=voice.problems,
+        calibration=calibration_over(info, Calibration(T_lidar_imu=opened.T_lidar_imu)),
+    )  # fmt: skip
+    beside = load_imu(path.parent, info, voice.problems)
+    sequence.imu = opened.imu if beside is None else beside
+    if beside is not None and info.T_lidar_imu is None:
+        voice.problems.append(
+            "extrinsics: nothing says where the IMU beside the capture sits: it is taken to sit in the LiDAR, axes alike; "
+            "--extrinsics states T_lidar_imu"
+        )
+        sequence.calibration = calibration_over(info, Calibration(T_lidar_imu=np.eye(4)))
+        sequence.has_assumed_extrinsics = True
+    sequence.gnss = load_gnss(path.parent, info, voice.problems)
+    stamps = sequence.stamps_ns
+    for what, stream in (("IMU", sequence.imu), ("GNSS", sequence.gnss)):
+        if stream is not None and (stream.stamps_ns[0] > stamps[-1] or stream.stamps_ns[-1] < stamps[0]):
+            voice.problems.append(no_shared_time(what))
+    return sequence
+
+
+def _opener(path: Path, datagrams: Datagrams) -> Callable[..., Opened]:
+    """Whose packets these are, told by their size: Velodyne's all have 1206 bytes and a flag, Ouster's come with metadata."""
+    of_size = np.flatnonzero(datagrams.sizes == velodyne_packets.SIZE)
+    flags = datagrams.bytes_at(of_size, (0, 1))
+    if (flags == velodyne_packets.FLAG).all(axis=1).any():
+        return open_velodyne
+    if not len(datagrams):
+        raise InputError(f"{path} holds no UDP datagrams over IPv4, which LiDAR packets are")
+    return open_ouster

@@ -1,0 +1,77 @@
+"""What a capture gives, whichever sensor it is of: revolutions with their stamps, and what is known of the sensor."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.formats.pcap_files import Datagrams
+from lslam.formats.point_cloud import PointCloud
+from lslam.readers.ground_truth import Voice
+from lslam.types.imu import ImuStream
+
+Integers = NDArray[np.int64]
+
+
+class Revolutions(Protocol):
+    """The revolutions of a capture."""
+
+    @property
+    def stamps_ns(self) -> Integers:
+        """(N,) when the first point of each was measured."""
+        ...
+
+    def read(self, index: int) -> tuple[PointCloud, Integers]:
+        """Points of revolution `index` in the order they were measured, and when each was, ns."""
+        ...
+
+
+@dataclass(frozen=True)
+class Opened:
+    """Revolutions and their sensor."""
+
+    revolutions: Revolutions
+    rate_hz: float
+    rings: int
+    sensor: str
+    imu: ImuStream | None = None
+    T_lidar_imu: NDArray[np.float64] | None = None
+
+
+def of_one_sender(datagrams: Datagrams, which: Integers, what: str, voice: Voice) -> Integers:
+    """Those of the datagrams `which` that come from the sender of most; others are named among the problems."""
+    senders, counts = np.unique(datagrams.sources[which], return_counts=True)
+    if len(senders) < 2:
+        return which
+    chosen = int(senders[np.argmax(counts)])
+    others = ", ".join(_address(int(sender)) for sender in senders if sender != chosen)
+    voice.problems.append(f"{what} of {len(senders)} senders: those of {_address(chosen)} are read, not of {others}")
+    return np.asarray(which[datagrams.sources[which] == chosen], np.int64)
+
+
+def in_order(times_ns: Integers, what: str, voice: Voice) -> Integers:
+    """Order of packets by their own times, each time once; said where it is not that of the capture."""
+    order = np.argsort(times_ns, kind="stable")
+    late = int((np.diff(times_ns) < 0).sum())
+    if late:
+        voice.problems.append(f"{what} are out of order in {late} places: sorted by their own times")
+    ordered = times_ns[order]
+    repeated = np.concatenate([[False], np.diff(ordered) == 0]) if len(ordered) else np.zeros(0, bool)
+    if repeated.any():
+        voice.problems.append(f"{what} repeat a time {int(repeated.sum())} times: the first one of each counts")
+    return np.asarray(order[~repeated], np.int64)
+
+
+def metadata_beside(path: Path) -> Sequence[Path]:
+    """JSON files that may say how the packets of the capture are laid out: of its name, else all of its folder."""
+    own = [p for p in (path.with_suffix(".json"), path.with_name(path.stem + "_0.json")) if p.is_file()]
+    return own[:1] or sorted(p for p in path.parent.glob("*.json") if p.is_file())
+
+
+def _address(source: int) -> str:
+    return ".".join(str(source >> shift & 255) for shift in (40, 32, 24, 16)) + f":{source & 0xFFFF}"

@@ -1,0 +1,141 @@
+"""Revolutions of a Velodyne sensor: cut where its azimuth passes the one it began with, stamped by its own clock."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from lslam.errors import InputError
+from lslam.formats.pcap_files import Datagrams
+from lslam.formats.point_cloud import PointCloud
+from lslam.formats.velodyne_packets import (
+    BLOCKS,
+    DUAL,
+    FLAG,
+    HOUR_US,
+    MODELS,
+    RETURNS,
+    SIZE,
+    TURN,
+    VelodyneModel,
+    points_of,
+    split_blocks,
+)
+from lslam.readers.ground_truth import Voice
+from lslam.readers.pcap_revolutions import Integers, Opened, in_order, of_one_sender
+
+_HOUR_NS = HOUR_US * 1000
+_SAID_NS = 10**9  # clocks that are nearer are the same clock, and the way of a packet
+
+
+@dataclass(frozen=True)
+class VelodyneRevolutions:
+    """Satisfies `Revolutions`.
+
+    began : azimuth of the first block, 0.01 deg
+    packets : (P,) datagrams in order; azimuth : (P,) of their first blocks from `began`, unwrapped; times_ns : (P,)
+    turns : (N,) which revolutions have points; stamps_ns : (N,)
+    """
+
+    datagrams: Datagrams
+    model: VelodyneModel
+    began: int
+    packets: Integers
+    azimuth: Integers
+    times_ns: Integers
+    turns: Integers
+    stamps_ns: Integers
+
+    def read(self, index: int) -> tuple[PointCloud, Integers]:
+        """Points of revolution `index` in the order they were measured, and when each was, ns."""
+        turn = int(self.turns[index])
+        begin = max(int(np.searchsorted(self.azimuth, turn * TURN, "right")) - 1, 0)
+        # One packet more: the azimuth of the next block tells how far the last one turns.
+        end = int(np.searchsorted(self.azimuth, (turn + 1) * TURN)) + 1
+        packets = self.datagrams.payloads(self.packets[begin:end])
+        blocks = split_blocks(packets, self.azimuth[begin:end], self.times_ns[begin:end], self.model)
+        return points_of(blocks, blocks.azimuth // TURN == turn, self.began, self.model)
+
+
+def open_velodyne(path: Path, datagrams: Datagrams, voice: Voice) -> Opened:
+    """Raises InputError for a model that is not known, and a capture of less than one revolution."""
+    which = np.flatnonzero(datagrams.sizes == SIZE)
+    which = which[(datagrams.bytes_at(which, (0, 1)) == FLAG).all(axis=1)]
+    which = of_one_sender(datagrams, which, "Velodyne packets", voice)
+    model, mode = _factory(path, datagrams, which)
+    raw = datagrams.bytes_at(which, (1200, 1201, 1202, 1203)).astype(np.int64)
+    times = _absolute(raw @ (1 << np.array([0, 8, 16, 24])), datagrams.stamps_ns[which], voice)
+    order = in_order(times, "Velodyne packets", voice)
+    which, times = which[order], times[order]
+    angle = datagrams.bytes_at(which, (2, 3)).astype(np.int64) @ (1 << np.array([0, 8]))
+    azimuth, rate = _unwrapped(path, angle, times)
+    per_packet = BLOCKS // 2 if mode == DUAL else BLOCKS
+    end = int(azimuth[-1]) + round(rate * model.block_ns * per_packet)
+    turns = np.unique(azimuth // TURN)
+    # The last block reaches to where the next one would begin, give or take its rounding.
+    turns = turns[turns < (end + round(rate * model.block_ns)) // TURN]
+    if not len(turns):
+        raise InputError(f"{path} holds {end / TURN:.2f} of a revolution of the {model.name}: one is needed")
+    if end % TURN > TURN // 100:
+        voice.notes.append(f"the last {end % TURN / TURN:.2f} of a revolution are no scan")
+    revolutions = VelodyneRevolutions(
+        datagrams, model, int(angle[0]), which, azimuth, times, turns,
+        _stamps(datagrams, which, azimuth, times, turns, model),
+    )  # fmt: skip
+    voice.notes.append(
+        f"{len(which)} packets of a {model.name}, {RETURNS[mode]} return{' read: the last' if mode == DUAL else ''}; scans are "
+        f"cut at the azimuth of {angle[0] * 0.01:.2f} deg"
+    )
+    return Opened(revolutions, round(rate * 1e9 / TURN, 3), model.lasers, model.name)
+
+
+def _factory(path: Path, datagrams: Datagrams, which: Integers) -> tuple[VelodyneModel, int]:
+    mode, number = (int(v) for v in datagrams.bytes_at(which[:1], (1204, 1205))[0])
+    if mode not in RETURNS or number not in MODELS:
+        known = ", ".join(model.name for model in MODELS.values())
+        raise InputError(
+            f"{path}: its Velodyne packets end in {mode:#04x} {number:#04x}, which is no return mode and model that is known; "
+            f"{known} are"
+        )
+    return MODELS[number], mode
+
+
+def _absolute(past_hour_us: Integers, captured_ns: Integers, voice: Voice) -> Integers:
+    """Times of the sensor's clock, which tells the hour's microseconds, in ns with the hour that the capture tells.
+
+    A sensor without satellites counts from another minute: by how much is found in the first packet and stays.
+    """
+    within = past_hour_us * 1000
+    apart = int((within[0] - captured_ns[0] + _HOUR_NS // 2) % _HOUR_NS - _HOUR_NS // 2)
+    hours = np.round((captured_ns + apart - within) / _HOUR_NS).astype(np.int64)
+    if abs(apart) >= _SAID_NS:
+        voice.notes.append(f"the sensor's clock is {apart * 1e-9:+.3f} s from the capture's: it is kept")
+    return within + hours * _HOUR_NS
+
+
+def _unwrapped(path: Path, angle: Integers, times_ns: Integers) -> tuple[Integers, float]:
+    """Azimuths from the first, 0.01 deg, and the rate, 0.01 deg/ns; lost packets are bridged by the rate."""
+    steps, spans = np.diff(angle) % TURN, np.diff(times_ns)
+    rate = float(np.median(steps / spans)) if len(steps) else 0.0
+    if rate <= 0:
+        raise InputError(f"{path}: the sensor does not turn in its {len(angle)} packets")
+    turned = np.round((rate * spans - steps) / TURN).astype(np.int64)
+    azimuth = np.concatenate([[0], np.cumsum(np.maximum(steps + TURN * turned, 0))])
+    # Over the whole of the capture the rounding of azimuths does not count.
+    return azimuth, float(azimuth[-1] / (times_ns[-1] - times_ns[0]))
+
+
+def _stamps(
+    datagrams: Datagrams, which: Integers, azimuth: Integers, times_ns: Integers, turns: Integers, model: VelodyneModel
+) -> Integers:
+    """When the first block of each revolution is measured."""
+    stamps = np.zeros(len(turns), np.int64)
+    for k, turn in enumerate(turns.tolist()):
+        begin = max(int(np.searchsorted(azimuth, turn * TURN, "right")) - 1, 0)
+        packets = datagrams.payloads(which[begin : begin + 2])
+        blocks = split_blocks(packets, azimuth[begin : begin + 2], times_ns[begin : begin + 2], model)
+        inside = np.flatnonzero(blocks.azimuth >= turn * TURN)
+        stamps[k] = blocks.times_ns[inside[0]] if len(inside) else times_ns[min(begin + 1, len(times_ns) - 1)]
+    return stamps
