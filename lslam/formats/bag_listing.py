@@ -8,6 +8,8 @@ from pathlib import Path
 from lslam.errors import InputError
 
 SUFFIXES = (".bag", ".bag.active", ".mcap", ".db3")
+# Captures of the packets of a sensor.
+CAPTURES = (".pcap", ".pcapng")
 _PART = re.compile(r"(.+)_\d+\.(bag|mcap|db3)(?:\.active)?$")
 
 

@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 from lslam.errors import InputError, UsageError, cause
 from lslam.remote import RemotePath
 
-SUFFIXES = (".pcap", ".pcapng")
 Integers = NDArray[np.int64]
 
 # First bytes of a pcap: byte order, and ns per unit of the second word of its times.

@@ -21,7 +21,7 @@ NOISE_CELLS = 8
 
 
 @dataclass(frozen=True)
-class Change:
+class MapChange:
     """A thing that only one drive saw, where beams of the other passed: cells (K, 3) of edge `voxel`, m."""
 
     kind: Kind
@@ -78,7 +78,7 @@ class ChangedCells:
     occupied_new, occupied_old : occupied cells of each; unseen_new, unseen_old : those of them that the other drive never saw
     """
 
-    changes: tuple[Change, ...]
+    changes: tuple[MapChange, ...]
     same: NDArray[np.int64]
     voxel: float
     occupied_new: int
@@ -86,7 +86,7 @@ class ChangedCells:
     unseen_new: int
     unseen_old: int
 
-    def of(self, kind: Kind) -> list[Change]:
+    def of(self, kind: Kind) -> list[MapChange]:
         """Those of one kind."""
         return [change for change in self.changes if change.kind == kind]
 
@@ -145,7 +145,7 @@ def _drive(found: Evidence) -> _Drive:
     )
 
 
-def _things(kind: Kind, here: _Drive, there: _Drive, found: Evidence) -> list[Change]:
+def _things(kind: Kind, here: _Drive, there: _Drive, found: Evidence) -> list[MapChange]:
     """Connected cells that are occupied here and free there, the largest first."""
     passed = here.occupied[_among(here.occupied, there.free)]
     alone = passed[~_beside(passed, there.blocked) & _open(passed, there.seen)]
@@ -157,7 +157,7 @@ def _things(kind: Kind, here: _Drive, there: _Drive, found: Evidence) -> list[Ch
     is_certain = np.bincount(labels, _among(cells, here.certain) & _among(cells, alone)) > 0
     kept = np.flatnonzero((sizes > NOISE_CELLS) & is_certain)
     kept = kept[np.argsort(-sizes[kept], kind="stable")]
-    return [Change(kind, _cells(cells[labels == label], found), found.voxel) for label in kept]
+    return [MapChange(kind, _cells(cells[labels == label], found), found.voxel) for label in kept]
 
 
 def _components(keys: Keys) -> NDArray[np.int64]:

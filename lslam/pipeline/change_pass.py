@@ -16,7 +16,7 @@ from lslam.formats.ply_files import write_ply
 from lslam.frontend.register_scans import read_ahead
 from lslam.geometry import se3
 from lslam.geometry.geodesy import from_local, to_local
-from lslam.maps.changes import Change, ChangedCells, changed_cells
+from lslam.maps.changes import ChangedCells, MapChange, changed_cells
 from lslam.maps.clean import Cleaner, PosedScan
 from lslam.maps.georeference import to_lat_lon
 from lslam.maps.occupancy import Evidence, OccupancyMapper
@@ -172,7 +172,7 @@ def write_changes(folder: Path, found: ChangedCells, new: EarlierRun, old: Earli
     write_areas(folder / AREAS, areas, [properties(k, c) for k, c in enumerate(found.changes, 1)], about)
 
 
-def _outline(change: Change, place: Georeference | None) -> Floats:
+def _outline(change: MapChange, place: Georeference | None) -> Floats:
     """(C, 2) as GeoJSON has it: longitude and latitude, deg, or x and y, m."""
     if place is None:
         return change.outline
@@ -180,7 +180,7 @@ def _outline(change: Change, place: Georeference | None) -> Floats:
     return np.asarray(to_lat_lon(corners, place)[:, 1::-1])
 
 
-def properties(number: int, change: Change) -> dict[str, str | int | float]:
+def properties(number: int, change: MapChange) -> dict[str, str | int | float]:
     """What is said of a thing beside its outline; `thing` is its number in the cloud, `base_m` in the world of the old run."""
     x, y, _ = change.centres.mean(axis=0)
     length, width = change.extent

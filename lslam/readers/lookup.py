@@ -8,8 +8,7 @@ import re
 from pathlib import Path
 
 from lslam.errors import InputError
-from lslam.formats import pcap_files
-from lslam.formats.bag_listing import SUFFIXES, list_bag_files
+from lslam.formats.bag_listing import CAPTURES, SUFFIXES, list_bag_files
 from lslam.remote import RemotePath, as_path
 
 _SEQUENCE = re.compile(r"(?:.*/)?(?:seq)?(\d{1,2})$")
@@ -29,7 +28,7 @@ def find_folder(name_or_path: str | Path, data_root: Path | None = None) -> Path
     if path.is_dir() or is_recording(path):
         return path
     if path.exists():
-        known = ", ".join("*" + suffix for suffix in (*SUFFIXES, *pcap_files.SUFFIXES))
+        known = ", ".join("*" + suffix for suffix in (*SUFFIXES, *CAPTURES))
         raise InputError(
             f"{path} is a file: give a bag or a capture ({known}) or the folder of the sequence (a KITTI "
             "sequence, a raw drive, or its scans)"
@@ -57,7 +56,7 @@ def find_folder(name_or_path: str | Path, data_root: Path | None = None) -> Path
 
 def is_recording(path: Path) -> bool:
     """Whether `path` is a bag, or a folder of its parts, or the capture of a sensor's packets."""
-    return bool(list_bag_files(path)) or (path.suffix.lower() in pcap_files.SUFFIXES and path.is_file())
+    return bool(list_bag_files(path)) or (path.suffix.lower() in CAPTURES and path.is_file())
 
 
 def _sequences(root: Path, text: str) -> list[Path]:

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from lslam.errors import InputError
 from lslam.formats import velodyne_packets
-from lslam.formats.pcap_files import SUFFIXES, Datagrams, read_datagrams
+from lslam.formats.bag_listing import CAPTURES
+from lslam.formats.pcap_files import Datagrams, read_datagrams
 from lslam.formats.sequence_toml import SequenceInfo
 from lslam.printable import printable
 from lslam.readers.ground_truth import Voice
@@ -71,11 +72,11 @@ def locate(path: Path) -> tuple[Path, str] | None:
 
     Raises InputError listing the captures when a folder has several.
     """
-    if path.suffix.lower() in SUFFIXES:
+    if path.suffix.lower() in CAPTURES:
         return (path, f"{path.name} is a capture") if path.is_file() else None
     if not path.is_dir():
         return None
-    found = sorted(p for p in path.iterdir() if p.suffix.lower() in SUFFIXES and p.is_file() and p.name[0] != ".")
+    found = sorted(p for p in path.iterdir() if p.suffix.lower() in CAPTURES and p.is_file() and p.name[0] != ".")
     if not found or list_scans(path)[0]:
         return None
     if len(found) > 1:

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from lslam.errors import ConfigError, InterruptedRunError
 from lslam.geometry import se3
-from lslam.maps.changes import Change, ChangedCells, changed_cells
+from lslam.maps.changes import ChangedCells, MapChange, changed_cells
 from lslam.maps.occupancy import Evidence, OccupancyMapper
 from lslam.stopping import asking
 
@@ -116,7 +116,7 @@ def test_measures_of_a_thing() -> None:
     """A staircase of cells: 10 along the diagonal, 2 high."""
     k = np.arange(10)
     cells = np.concatenate([np.column_stack([k, k, np.full(10, z)]) for z in (3, 4)])
-    thing = Change("appeared", cells, 0.5)
+    thing = MapChange("appeared", cells, 0.5)
     length, width = thing.extent
     assert (thing.base, thing.height, thing.volume) == (1.5, 1.0, 2.5)
     assert length == pytest.approx(10 * np.sqrt(2) * 0.5)
