@@ -196,10 +196,14 @@ def points_of(packets: NDArray[np.uint8], sensor: OusterSensor) -> tuple[PointCl
 
 
 def imu_of(packets: NDArray[np.uint8]) -> ImuStream:
-    """Samples of IMU packets (P, 48); g and deg/s become m/s2 and rad/s. Stamps are those of the gyroscope."""
+    """Samples of IMU packets (P, 48); g and deg/s become m/s2 and rad/s. Stamps are those of the gyroscope.
+
+    A sample that is not finite is left out: a gap, as of a lost packet.
+    """
     stamps = _numbers(packets[:, 16:24], np.dtype("<u8"))[:, 0].astype(np.int64)
     values = _numbers(packets[:, 24:48], np.dtype("<f4")).astype(np.float64)
-    return ImuStream(stamps, values[:, :3] * GRAVITY, np.radians(values[:, 3:]))
+    finite = np.isfinite(values).all(axis=1)
+    return ImuStream(stamps[finite], values[finite, :3] * GRAVITY, np.radians(values[finite, 3:]))
 
 
 def _numbers(data: NDArray[np.uint8], kind: np.dtype[Any]) -> NDArray[Any]:

@@ -102,6 +102,10 @@ def _factory(path: Path, datagrams: Datagrams, which: Integers) -> tuple[Velodyn
     return MODELS[number], mode
 
 
+# A packet that comes a day after the one before belongs to another capture.
+_LONGEST_NS = 86_400 * 10**9
+
+
 def _absolute(past_hour_us: Integers, captured_ns: Integers, voice: Voice) -> Integers:
     """Times of the sensor's clock, which tells the hour's microseconds, in ns with the hour that the capture tells.
 
@@ -118,6 +122,8 @@ def _absolute(past_hour_us: Integers, captured_ns: Integers, voice: Voice) -> In
 def _unwrapped(path: Path, angle: Integers, times_ns: Integers) -> tuple[Integers, float]:
     """Azimuths from the first, 0.01 deg, and the rate, 0.01 deg/ns; lost packets are bridged by the rate."""
     steps, spans = np.diff(angle) % TURN, np.diff(times_ns)
+    if len(spans) and float(np.abs(spans.astype(np.float64)).max()) > _LONGEST_NS:
+        raise InputError(f"{path}: the times of its packets leap by days: the capture is damaged")
     rate = float(np.median(steps / spans)) if len(steps) else 0.0
     if rate <= 0:
         raise InputError(f"{path}: the sensor does not turn in its {len(angle)} packets")

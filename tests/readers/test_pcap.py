@@ -299,3 +299,23 @@ def test_a_capture_is_shown_and_run(tmp_path: Path) -> None:
     assert len(poses) == 4
     # The sensor stands still.
     assert np.linalg.norm(poses, axis=1).max() < 0.02
+
+
+def test_times_that_leap_by_days_are_refused(tmp_path: Path) -> None:
+    frames, _ = velodyne("VLP-16", 1.5)
+    leap = [
+        (at + (3 * 86_400 * 10**9 if k > len(frames) // 2 else 0), payload) for k, (at, payload) in enumerate(frames)
+    ]
+    with pytest.raises(InputError, match="leap by days"):
+        open_sequence(write_pcap(tmp_path / "drive.pcap", leap))
+
+
+def test_imu_samples_that_are_not_finite_are_left_out(tmp_path: Path) -> None:
+    frames, samples = ouster(OusterSpec(), 2)[0], ouster_imu(8)
+    at, good = samples[3]
+    samples[3] = at, good[:24] + np.array([np.nan, 0, 1, 0, np.inf, 0], "<f4").tobytes()
+    imu = open_sequence(write_ouster(tmp_path, OusterSpec(), frames + samples)).imu
+    assert imu is not None
+    assert len(imu.stamps_ns) == 7
+    assert np.isfinite(imu.accel).all()
+    assert np.isfinite(imu.gyro).all()
