@@ -13,7 +13,7 @@ from lslam.geometry import se3, so3
 from lslam.kernels.transform import transform
 from lslam.keyframes.store import KeyframeStore
 from lslam.keyframes.submaps import submap
-from lslam.localization.place_search import PlaceSearch, Region
+from lslam.localization.place_search import APART, PlaceSearch, Region
 from lslam.loops.level import find_up, level_rotation
 from lslam.loops.level_submap import LevelSubmap, make_level_submap
 from lslam.preprocessing.prepare import PreparedPoints, thin
@@ -201,12 +201,15 @@ class PlaceFinder:
         return c.sigmas * 0.01 * c.drift_percent * way + 0.5 * turn * way, float(turn)
 
     def _same(self, one: Vote, other: Vote) -> bool:
-        """Whether two votes put the drive at the same place, as far as odometry can tell."""
+        """Whether two votes put the drive at the same place, as far as odometry can tell.
+
+        Where it drifts by more than lies between two guesses, agreement is no evidence.
+        """
         b = other.keyframe
         gap = se3.relative(one.T_level_odometry @ self._poses[b], other.T_level_odometry @ self._poses[b])
         move, turn = self._drift(one.keyframe, b)
         is_near = float(np.linalg.norm(gap[:3, 3])) < SAME_M + move
-        return is_near and float(so3.angle(gap[:3, :3])) < np.deg2rad(SAME_DEG) + turn
+        return is_near and move < APART and float(so3.angle(gap[:3, :3])) < np.deg2rad(SAME_DEG) + turn
 
     def _agreed(self, votes: list[Vote], least: int) -> Start | None:
         """The start that at least so many keyframes vote for, and more than twice as many as for any other."""

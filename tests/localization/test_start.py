@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from revisited import CONFIG, Revisited, error_of, revisit, town_map
@@ -72,3 +74,19 @@ def test_a_wrong_start_is_refused_and_not_corrected_from_afar(world: Revisited, 
     away = T[:2, 3] + 45.0 * np.array([np.cos(0.7), np.sin(0.7)])
     start = search.find(StartPrior(away, float(np.arctan2(T[1, 0], T[0, 0])) + np.pi / 2, 5.0, 0.2))
     assert start is None
+
+
+def test_votes_that_odometry_cannot_compare_do_not_agree(search: PlaceFinder, world: Revisited) -> None:
+    found = search.find()
+    assert found is not None
+    vote = found.vote
+    count = len(search.store.keyframes)
+    near = replace(vote, keyframe=min(vote.keyframe + 2, count - 1))
+    assert search._same(vote, near)
+    distances = search._distances
+    try:
+        # The same two keyframes half a kilometre of way apart: odometry may be wrong by a street.
+        search._distances = distances + np.where(np.arange(count) >= near.keyframe, 500.0, 0.0)
+        assert not search._same(vote, near)
+    finally:
+        search._distances = distances
