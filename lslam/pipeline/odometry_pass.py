@@ -158,7 +158,7 @@ def _warm_up(
 
     What this process has loaded stays: a worker of a study does it once for all its runs alike.
     """
-    alike = type(odometry), is_over, bool(config.osm.extract), config.model_dump_json(exclude=_WITHOUT_KERNELS)
+    alike = type(odometry), is_over, bool(config.osm.extract), repr(config.model_dump(exclude=_WITHOUT_KERNELS))
     with (
         manifest.timed("compile_s"), one_at_a_time(jit.lock_file(), "compiles kernels"), helped(config) as start_helper,
         jit.announced(log, start_helper),
