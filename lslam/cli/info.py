@@ -84,6 +84,13 @@ def _show_topics(bag: dict[str, Any]) -> None:
 
 def _show_bag(name: str, data_root: Path | None, error: str | None) -> None:
     """What is in a bag that is no sequence: as JSON with the `error`, as a page without one; nothing where there is no bag."""
+    from lslam.errors import LslamError
+    from lslam.readers.lookup import find_folder
+
+    try:
+        find_folder(name, data_root)
+    except LslamError:
+        return  # there is nothing: no need to import what would look into it
     from lslam.cli import bag_page
     from lslam.doctor.examine_bag import bag_at
 

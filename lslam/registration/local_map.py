@@ -21,13 +21,14 @@ class LocalMap(Stateful):
     Parameters
     ----------
     size : m, edge of a fine voxel; coarse_factor : how many times larger a coarse one is
-    min_points, planarity, count_cap, reach, breadth : as in `GaussianMap`
+    min_points, planarity, count_cap, reach, breadth : as in `GaussianMap`; None: `BREADTH`
     """
 
     def __init__(
         self, size: float, *, coarse_factor: int, min_points: int, planarity: float, count_cap: float, reach: float,
-        breadth: float = BREADTH,
+        breadth: float | None = None,
     ) -> None:  # fmt: skip
+        breadth = BREADTH if breadth is None else breadth
         self.levels = tuple(
             GaussianMap(
                 edge, min_points=min_points, planarity=planarity, count_cap=count_cap, reach=reach, breadth=breadth
