@@ -44,13 +44,11 @@ class MapFollower(Stateful):
     R_level_odometry : (3, 3) axes of odometry's world in those of the map
     """
 
-    STATE = ("T", "P", "usual", "carried")
+    STATE = ("T", "P", "usual")
 
     def __init__(self, view: LocalView, T: Floats, P: Floats, config: Config, search: Search | None = None) -> None:
         self.view, self.T, self.P, self.config, self.search = view, T, P, config, search
         self.usual = UsualAgreement(config.registration.min_agreement)
-        # m since the map held a scan.
-        self.carried = 0.0
         self._gate = quantile(1.0 - CHANCE, 6)
         c = config.loops
         # What maps and registrations err by in common from scan to scan.
@@ -66,7 +64,6 @@ class MapFollower(Stateful):
         )
         self.P = noise.transported(self.P, T[:3, 3] - self.T[:3, 3]) + grown + drift_covariance(way, self.config.graph)
         self.T = T
-        self.carried += way
 
     def correct(self, position: int, points: PreparedPoints | None) -> MapFix:
         """The scan of that position of the run on the map; its points deskewed, None when there are none."""
@@ -87,7 +84,7 @@ class MapFollower(Stateful):
             return self._carried(status, reason, found)
         assert found.covariance is not None
         self.usual.observe(found.inlier_share)
-        self.T, self.P, self.carried = found.T_world_lidar, found.covariance + self._floor, 0.0
+        self.T, self.P = found.T_world_lidar, found.covariance + self._floor
         return MapFix(self.T, self.P, "held", found.overlap, found.inlier_share, (move, turn))
 
     def _align(self, alignment: MapAlignment, points: PreparedPoints, start: Floats) -> RegistrationResult:

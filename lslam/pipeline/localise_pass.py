@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import logging
 from collections import Counter
 from dataclasses import replace
@@ -76,7 +77,8 @@ def _followed(
     """Every scan against the map; poses are still in level axes. And how the start was found."""
     known = None if checkpoints is None else checkpoints.latest()
     poses = np.stack([r.T_world_lidar for r in results])
-    if known is not None and not np.array_equal(known["poses"], poses):
+    of_map = hashlib.sha256(prior_map.points.tobytes()).hexdigest()
+    if known is not None and not (np.array_equal(known["poses"], poses) and known["map"] == of_map):
         known = None
     view = LocalView(prior_map, config.registration, 1.2 * config.preprocess.range_max)
     reanchor = Reanchoring(search, results)
@@ -106,7 +108,14 @@ def _followed(
         is_last = watch.should_stop()
         if checkpoints is not None and k and (is_last or checkpoints.schedule.is_due):
             checkpoints.write(
-                k, lambda: {"poses": poses, "fixes": Records(fixes), "start": about, "follower": follower.state()}
+                k,
+                lambda: {
+                    "poses": poses,
+                    "map": of_map,
+                    "fixes": Records(fixes),
+                    "start": about,
+                    "follower": follower.state(),
+                },
             )
         if is_last:
             raise InterruptedRunError(f"interrupted during localisation, at scan {k} of {len(results)}")
@@ -118,22 +127,18 @@ def _followed(
 
 
 class Reanchoring:
-    """Finds a scan in the map anew, by the submap of the keyframe last passed, when odometry has carried it too far."""
+    """Finds a keyframe in the map anew, by its submap, when odometry has carried it too far. It keeps no state."""
 
     def __init__(self, search: PlaceFinder, results: list[ScanResult]) -> None:
         self._search, self._results = search, results
-        self._scans = np.array([k.scan for k in search.store.keyframes])
-        self._tried = -1
+        self._keyframe_of = {k.scan: k.number for k in search.store.keyframes}
 
     def __call__(self, position: int, T: Floats, radius: float) -> Floats | None:
-        """Pose (4, 4), level axes, of the scan at that position, within `radius` m of T (4, 4); once a keyframe."""
-        b = int(np.searchsorted(self._scans, position, side="right")) - 1
-        if b < 0 or b == self._tried:
+        """Pose (4, 4), level axes, of the scan at that position, within `radius` m of T (4, 4); None of no keyframe."""
+        b = self._keyframe_of.get(position)
+        if b is None:
             return None
-        self._tried = b
-        step = se3.relative(self._results[position].T_world_lidar, self._results[self._scans[b]].T_world_lidar)
-        expected = T @ step
-        vote = self._search.vote(b, self._search.region_about(b, expected, radius))
+        vote = self._search.vote(b, self._search.region_about(b, T, radius))
         return None if vote is None else vote.T_level_odometry @ self._results[position].T_world_lidar
 
 

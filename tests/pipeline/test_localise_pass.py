@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import sys
 from pathlib import Path
 
@@ -11,6 +12,7 @@ import pytest
 import lslam
 from lslam.config import Config, load_config
 from lslam.errors import InputError, InterruptedRunError, RunFailedError
+from lslam.formats.point_files import read_cloud, write_cloud
 from lslam.geometry import se3
 from lslam.keyframes.store import KeyframeStore
 from lslam.localization.place_search import PlaceSearch
@@ -19,6 +21,7 @@ from lslam.localization.start import PlaceFinder
 from lslam.pipeline.localise_pass import Reanchoring
 from lslam.pipeline.prior_map_files import read_prior_map
 from lslam.pipeline.watch import Watch
+from lslam.types.cloud import ArrayCloud
 
 SAMPLE = Path(__file__).resolve().parents[2] / "sample_data" / "sequences" / "00"
 SAME = ("trajectory.tum", "covariances.npz", "localization.csv", "trajectory_odometry.tum", "evaluation.json")
@@ -71,6 +74,23 @@ def test_an_interrupted_localisation_goes_on_to_the_same_bytes(
     same(whole, tmp_path / "out")
 
 
+def test_a_map_that_is_another_by_then_is_searched_anew(map_run: Path, whole: Path, tmp_path: Path) -> None:
+    moved = Path(shutil.copytree(map_run, tmp_path / "moved"))
+    seen = [0]
+
+    def look() -> bool:
+        seen[0] += sys._getframe(1).f_code.co_name == "_followed"
+        return seen[0] > 10
+
+    with pytest.raises(InterruptedRunError):
+        lslam.run(SAMPLE, config(moved), out=tmp_path / "out", watch=Watch(should_stop=look))
+    cloud = read_cloud(moved / "map.ply")
+    write_cloud(moved / "map.ply", ArrayCloud.of(cloud.points + np.array([3.0, 0.0, 0.0])))
+    lslam.run(SAMPLE, config(moved), out=tmp_path / "out", resume=True)
+    here, there = (np.loadtxt(folder / "trajectory.tum")[:, 1:4] for folder in (tmp_path / "out", whole))
+    assert np.abs(here - there - [3.0, 0.0, 0.0]).max() < 0.02
+
+
 def test_poses_are_those_of_the_run_that_made_the_map(map_run: Path, whole: Path) -> None:
     rows = np.loadtxt(map_run / "trajectory.tum")[30:70, 1:4] - np.loadtxt(whole / "trajectory.tum")[:, 1:4]
     assert np.linalg.norm(rows, axis=1).max() < 0.03
@@ -82,20 +102,23 @@ def test_a_drive_that_the_map_does_not_know_fails_with_the_way_out(map_run: Path
         lslam.run(SAMPLE, wrong, out=tmp_path / "out")
 
 
-def test_a_scan_carried_too_far_is_found_anew_once_a_keyframe(map_run: Path) -> None:
+def test_a_keyframe_carried_too_far_is_found_anew(map_run: Path) -> None:
     section = load_config(None, []).registration
     prior_map = read_prior_map(map_run, section)
     record = lslam.run(SAMPLE, load_config(None, ["loops.use=false", "input.count=50", "map.write=false"])).record
     store = keyframes_of_run(map_run)
     finder = PlaceFinder(PlaceSearch(prior_map, section), store, load_config(None, []))
     reanchor = Reanchoring(finder, record.results)
-    true = se3.inverse(prior_map.T_map_level) @ record.results[40].T_world_lidar
+    scan = next(k.scan for k in store.keyframes if k.scan >= 35)
+    true = se3.inverse(prior_map.T_map_level) @ record.results[scan].T_world_lidar
     off = true.copy()
     off[:2, 3] += [5.0, -4.0]
-    found = reanchor(40, off, 9.0)
+    found = reanchor(scan, off, 9.0)
     assert found is not None
     assert np.linalg.norm(found[:3, 3] - true[:3, 3]) < 0.1
-    assert reanchor(40, off, 9.0) is None
+    assert np.array_equal(reanchor(scan, off, 9.0), found)  # nothing that a resumed run would lack
+    between = next(k for k in range(36, 50) if k not in {one.scan for one in store.keyframes})
+    assert reanchor(between, off, 9.0) is None
 
 
 def keyframes_of_run(folder: Path) -> KeyframeStore:
