@@ -139,7 +139,10 @@ def _recording(run: EarlierRun, problems: list[str]) -> Recording | None:
     try:
         return open_scans(run)
     except InputError as error:
-        problems.append(f"{error}; they are missing in the map")
+        log.debug("%s", error)
+        problems.append(
+            f"the raw scans of {run.folder.name} cannot be read at {run.sequence_path}: they are missing in the map"
+        )
         return None
 
 

@@ -94,7 +94,10 @@ def write_scans(folder: RunFolder, record: RunRecord) -> None:
 
 
 def write_localization(folder: RunFolder, record: RunRecord) -> None:
-    """localization.csv: each scan against the map that the run was located in, its place in the coordinates of the map's file."""
+    """localization.csv: each scan against the map that the run was located in, its place in the coordinates of the map's file.
+
+    trajectory.geojson where that map lies on the Earth.
+    """
     rows = [
         "index,stamp_ns,status,doubted,overlap,inlier_share,innovation_m,innovation_deg,sigma_m,sigma_deg,x,y,z,reason"
     ]
@@ -110,6 +113,8 @@ def write_localization(folder: RunFolder, record: RunRecord) -> None:
         )  # fmt: skip
         rows.append(",".join(str(v) for v in values))
     folder.write_text("localization.csv", "\n".join(rows) + "\n")
+    if record.georeference is not None:
+        map_files.write_geojson(folder.path / "trajectory.geojson", record.trajectory, record.georeference, record.name)
 
 
 def write_map(folder: RunFolder, built: BuiltMap, config: MapConfig, record: RunRecord) -> None:

@@ -44,7 +44,9 @@ def back_end_rows(record: RunRecord, evaluation: Evaluation | None) -> list[tupl
         lat, lon, height = (float(v) for v in place.origin)
         what = "GNSS in the graph" if place.method == "graph" else "GNSS fitted afterwards"
         said = f"{what}: {place.used} of {place.fixes} fixes, {metres(place.rmse_horizontal)} m rms horizontally"
-        if place.method == "osm":
+        if record.map_fixes:
+            said = "that of the map"
+        elif place.method == "osm":
             said = "by the buildings of OpenStreetMap"
         rows.append(("georeference", f"origin {lat:.7f}, {lon:.7f}, {height:.1f} m; {said}"))
     if record.osm is not None:

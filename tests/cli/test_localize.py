@@ -136,3 +136,17 @@ def test_a_map_in_tiles_serves_as_the_map(drives: Path, tmp_path: Path) -> None:
     again = lslam("map", drives / "map", "--tiles", 20, "--out", tmp_path / "tiles")
     assert again.returncode == 2
     assert "--overwrite" in again.stderr
+
+
+def test_fixes_lead_into_a_georeferenced_map(tmp_path: Path) -> None:
+    words = ("--georeference", "--set", "map.format=laz", "--out", tmp_path / "map", "-q")
+    assert lslam("run", SAMPLE, *words).returncode == 0
+    words = ("--map", tmp_path / "map", "--gnss", "--first", 20, "--count", 25, "--out", tmp_path / "run")
+    done = lslam("localize", SAMPLE, *words)
+    assert done.returncode == 0, done.stderr
+    assert "about its first satellite fix" in done.stderr
+    assert "that of the map" in done.stdout
+    here = read_trajectory(tmp_path / "run" / "trajectory.tum", "tum").positions
+    there = read_trajectory(tmp_path / "map" / "trajectory.tum", "tum").positions[20:45]
+    assert np.linalg.norm(here - there, axis=1).max() < 0.03
+    assert (tmp_path / "run" / "trajectory.geojson").is_file()

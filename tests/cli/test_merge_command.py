@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import sys
 from pathlib import Path
 
@@ -140,3 +141,17 @@ def test_wrong_words_get_one_sentence(runs: Path, words: tuple[str, ...], code: 
     assert done.returncode == code, done.stderr
     assert said in done.stderr
     assert_one_sentence(done.stderr)
+
+
+def test_scans_that_are_gone_are_missing_in_the_map_alone(runs: Path, tmp_path: Path) -> None:
+    shutil.copytree(runs / "tuesday", tmp_path / "moving")
+    run(tmp_path / "moving", tmp_path / "tuesday-run")
+    shutil.rmtree(tmp_path / "moving")
+    words = (runs / "monday-run", tmp_path / "tuesday-run", "--out", tmp_path / "town", "--json")
+    done = lslam("merge", *words)
+    assert done.returncode == 0, done.stderr
+    manifest = strict_json(done.stdout)["manifest"]
+    assert [one["name"] for one in manifest["sessions"]] == ["monday-run", "tuesday-run"]
+    assert any("tuesday-run cannot be read" in problem for problem in manifest["problems"])
+    assert "--sequence" not in done.stderr
+    assert len(read_cloud(tmp_path / "town" / "map.ply").points) > 10_000
