@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.geometry import noise, se2, se3
+from lslam.geometry import noise, se2, se3, so3
 from lslam.graph.fix_noise import GaussMarkovNoise
 from lslam.graph.inertial_factors import inertial_factors, insert_inertial
 from lslam.graph.problem import FloorPlane, PlanarPrior, PoseGraph, PositionFix
@@ -20,12 +20,15 @@ from lslam.types.constraint import Constraint, Turn
 
 Floats = NDArray[np.float64]
 
-# Sigmas of the prior on the first pose, m and rad, when anchored and when the fixes anchor it; of its tilt before up is known.
+# Sigmas of the prior on the first pose, m and rad, when anchored and when the fixes anchor it, where its tilt has one of its
+# own (`PoseGraph.tilt_sigma`); of its tilt before up is known.
 HELD, FREE, TILTING = (1e-4, 1e-4), (1e3, 3.0), 0.2
 # m, sigma of the positions that a gyroscope does not observe.
 ANYWHERE = 1e4
 # x, y and yaw among the six of a pose, translation first.
 PLANAR = [0, 1, 5]
+# Roll and pitch, likewise.
+TILT = [3, 4]
 # First key of the correlated noise of fixes, beyond all others.
 FIX_NOISE = 1 << 40
 # Correlation times after which an error is independent.
@@ -73,10 +76,12 @@ def position(fix: PositionFix, scale: float = 1.0, kernel: Any = None) -> Any:
     import gtsam
 
     model = _robust(gtsam.noiseModel.Diagonal.Sigmas(np.sqrt(scale) * fix.sigma), kernel)
+    if fix.share:
+        return _between_keyframes(fix, model)
     if fix.instant is None:
         return gtsam.GPSFactorArm(fix.keyframe, fix.position, fix.arm, model)
     key, arm = FIX_NOISE + fix.instant, fix.arm
-    across = np.array([[0.0, -arm[2], arm[1]], [arm[2], 0.0, -arm[0]], [-arm[1], arm[0], 0.0]])
+    across = so3.hat(arm)
 
     def error(_: Any, values: Any, jacobians: list[Floats] | None) -> Floats:
         pose = values.atPose3(fix.keyframe)
@@ -87,6 +92,25 @@ def position(fix: PositionFix, scale: float = 1.0, kernel: Any = None) -> Any:
         return np.asarray(pose.translation() + R @ arm + values.atPoint3(key) - fix.position)
 
     return gtsam.CustomFactor(model, [fix.keyframe, key], error)
+
+
+def _between_keyframes(fix: PositionFix, model: Any) -> Any:
+    """A measured position on the way from one keyframe to the next: scans there follow both."""
+    import gtsam
+
+    ends = ((fix.keyframe, fix.arm, 1.0 - fix.share), (fix.keyframe + 1, fix.next_arm, fix.share))
+
+    def error(_: Any, values: Any, jacobians: list[Floats] | None) -> Floats:
+        off = -fix.position
+        for i, (key, arm, weight) in enumerate(ends):
+            pose = values.atPose3(key)
+            R = pose.rotation().matrix()
+            off = off + weight * (pose.translation() + R @ arm)
+            if jacobians is not None:
+                jacobians[i] = weight * np.hstack([-R @ so3.hat(arm), R])
+        return np.asarray(off)
+
+    return gtsam.CustomFactor(model, [key for key, _, _ in ends], error)
 
 
 def planar(prior: PlanarPrior, pose: Floats, key: int, scale: float = 1.0, kernel: Any = None) -> Any:
@@ -118,23 +142,16 @@ def map_key(graph: PoseGraph) -> int:
 
 
 def fixed_part(graph: PoseGraph, may_tilt: bool = False) -> Any:
-    """The factors that are no outlier candidates; with `may_tilt` the prior on the first pose leaves roll and pitch free."""
+    """The factors that are no outlier candidates, held ones too; with `may_tilt` the first pose may tilt."""
     import gtsam
 
     factors = gtsam.NonlinearFactorGraph()
-    sigma_m, sigma_rad = HELD if graph.is_anchored else FREE
-    held = np.diag(np.repeat([sigma_m**2, sigma_rad**2], 3))
-    if graph.start_sigma is not None:
-        held[PLANAR, PLANAR] = graph.start_sigma**2
-    if may_tilt:
-        held[3:, 3:] += TILTING**2 * (np.eye(3) - np.outer(graph.world_up, graph.world_up))
-    first = graph.poses[0] if graph.start is None else _seen_from_above(graph.start, graph.poses[0])
-    start = gtsam.noiseModel.Gaussian.Covariance(noise.to_body(held, first))
-    factors.add(gtsam.PriorFactorPose3(0, gtsam.Pose3(first), start))
-    for factor in between_all(graph.odometry):
+    factors.add(_start(graph, may_tilt))
+    for factor in _relative(graph):
         factors.add(factor)
-    for factor in [] if graph.inertial is None else inertial_factors(graph.inertial, graph.world_up):
-        factors.add(factor)
+    for fix in graph.fixes:
+        if fix.is_held:
+            factors.add(position(fix))
     for up in graph.free_ups:
         model = gtsam.noiseModel.Isotropic.Sigma(2, up.sigma / np.sqrt(up.share))
         factors.add(gtsam.AttitudeFactorPose3(up.keyframe, gtsam.Unit3(graph.world_up), model, gtsam.Unit3(up.up)))
@@ -150,6 +167,30 @@ def fixed_part(graph: PoseGraph, may_tilt: bool = False) -> Any:
         )
         factors.add(gtsam.PriorFactorPose3(map_key(graph), gtsam.Pose3(), shift))
     return factors
+
+
+def _relative(graph: PoseGraph) -> list[Any]:
+    """Odometry, held loop closures and the IMU between keyframes."""
+    held = [loop for loop in graph.loops if loop.is_held]
+    imu = [] if graph.inertial is None else inertial_factors(graph.inertial, graph.world_up)
+    return [*between_all([*graph.odometry, *held]), *imu]
+
+
+def _start(graph: PoseGraph, may_tilt: bool) -> Any:
+    """The prior on the first pose."""
+    import gtsam
+
+    sigma_m, sigma_rad = HELD if graph.is_anchored else FREE
+    held = np.diag(np.repeat([sigma_m**2, sigma_rad**2], 3))
+    if not graph.is_anchored:
+        held[TILT, TILT] = graph.tilt_sigma**2
+    if graph.start_sigma is not None:
+        held[PLANAR, PLANAR] = graph.start_sigma**2
+    if may_tilt:
+        held[3:, 3:] += TILTING**2 * (np.eye(3) - np.outer(graph.world_up, graph.world_up))
+    first = graph.poses[0] if graph.start is None else _seen_from_above(graph.start, graph.poses[0])
+    start = gtsam.noiseModel.Gaussian.Covariance(noise.to_body(held, first))
+    return gtsam.PriorFactorPose3(0, gtsam.Pose3(first), start)
 
 
 def start_values(graph: PoseGraph, poses: Floats) -> Any:

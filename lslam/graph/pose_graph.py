@@ -23,6 +23,7 @@ from lslam.graph.solve import (
     joined,
     marginal_blocks,
     marginals,
+    solve,
     solve_incrementally,
 )
 from lslam.types.constraint import Constraint, LoopStage
@@ -33,24 +34,27 @@ Floats = NDArray[np.float64]
 def optimise(graph: PoseGraph, config: GraphConfig) -> Solution:
     """Poses and covariances of all keyframes, and which loop closures, fixes and planar priors are inliers.
 
-    Loop closures inconsistent with each other or with odometry are rejected first; odometry's covariances grow by the drift
-    that the others reveal; then all is solved together, with loop closures, fixes and planar priors as outlier candidates.
+    Where some are held, everything else is judged from where these put the poses. Loop closures inconsistent with each other
+    or with odometry are rejected first; odometry's covariances grow by the drift that the others reveal; then all is solved
+    together, with loop closures, fixes and planar priors that are not held as outlier candidates.
 
     Raises GraphError when the graph is disconnected, singular or not finite.
     """
     check_graph(graph)
-    graph = with_distances(graph)
+    graph = from_held(with_distances(graph), config)
     reasons = judge_loops(graph, config) if config.is_pairwise else [""] * len(graph.loops)
+    reasons = ["" if loop.is_held else reason for loop, reason in zip(graph.loops, reasons, strict=True)]
     stages = [LoopStage.CONSISTENCY if reason else LoopStage.GRAPH for reason in reasons]
     kept = [i for i, reason in enumerate(reasons) if not reason]
-    loops = [graph.loops[i] for i in kept]
-    drift = 0.0 if graph.is_rigid else max(drift_factor(graph, loops, config), graph.walk)
+    drift = 0.0 if graph.is_rigid else max(drift_factor(graph, [graph.loops[i] for i in kept], config), graph.walk)
+    kept = [i for i in kept if not graph.loops[i].is_held]
+    loops, fixes = [graph.loops[i] for i in kept], [fix for fix in graph.fixes if not fix.is_held]
     graph = replace(graph, odometry=with_drift(graph, drift, config))
     may_tilt = graph.is_anchored and len(graph.ups) > 0
     is_placed = graph.start_sigma is not None or not graph.is_anchored
     fixed = factors.fixed_part(graph, may_tilt)
     candidates = [OutlierCandidate(make, 6) for make in factors.between_makers(loops)]
-    candidates += [OutlierCandidate(partial(factors.position, fix), 3) for fix in graph.fixes]
+    candidates += [OutlierCandidate(partial(factors.position, fix), 3) for fix in fixes]
     key = factors.map_key(graph)
     candidates += [
         OutlierCandidate(partial(factors.planar, prior, graph.poses[prior.keyframe], key), prior.rank)
@@ -79,14 +83,16 @@ def optimise(graph: PoseGraph, config: GraphConfig) -> Solution:
     ]
     for i, rejection in zip(kept, rejections, strict=False):
         reasons[i] = reasons[i] or rejection
-    rest = len(loops) + len(graph.fixes)
+    rest = len(loops) + len(fixes)
+    fix_inliers = np.ones(len(graph.fixes), np.bool_)
+    fix_inliers[[not fix.is_held for fix in graph.fixes]] = solved.weights[len(loops) : rest] >= 0.5
     shift, shift_sigma = _map_shift(graph, solved)
     return Solution(
         poses=poses,
         covariances=covariances,
         loop_reasons=reasons,
         loop_stages=stages,
-        fix_inliers=solved.weights[len(loops) : rest] >= 0.5,
+        fix_inliers=fix_inliers,
         map_reasons=rejections[rest:],
         shift=shift,
         shift_sigma=shift_sigma,
@@ -94,6 +100,28 @@ def optimise(graph: PoseGraph, config: GraphConfig) -> Solution:
         rounds=solved.rounds,
         error=float(solved.factors.error(solved.values)),
     )
+
+
+def from_held(graph: PoseGraph, config: GraphConfig) -> PoseGraph:
+    """The graph with its poses where the held loop closures and positions alone put them, and the drift that these reveal.
+
+    What odometry may drift is no measure for the rest once a person has said how far it did.
+    """
+    loops, fixes = [loop for loop in graph.loops if loop.is_held], [fix for fix in graph.fixes if fix.is_held]
+    if not (loops or fixes):
+        return graph
+    alone = replace(
+        graph, loops=loops, fixes=fixes, map_priors=(), fix_noise=None, is_anchored=graph.is_anchored or not fixes
+    )
+    walk = 0.0 if graph.is_rigid else max(drift_factor(alone, loops, config), graph.walk)
+    alone = replace(alone, odometry=with_drift(alone, walk, config))
+    values = solve(factors.fixed_part(alone), factors.start_values(alone, alone.poses), config)
+    poses = factors.poses_of(values, len(graph))
+    if not np.isfinite(poses).all():
+        raise GraphError("the pose graph cannot be optimised: its poses are not finite")
+    if alone.is_anchored:
+        poses = graph.poses[0] @ se3.inverse(poses[0]) @ poses
+    return replace(graph, poses=se3.normalise(poses), walk=walk)
 
 
 def _map_shift(graph: PoseGraph, solved: GncResult) -> tuple[Floats, Floats]:

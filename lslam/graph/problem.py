@@ -21,6 +21,8 @@ class PositionFix:
 
     sigma : (3,) m; the arm is the antenna at the instant of the fix, relative to the keyframe by odometry
     instant : index of the correlated error in the graph's `fix_noise`, None for none
+    is_held : a control point: no outlier candidate of the graph
+    share, next_arm : of an instant on the way to the next keyframe, which has the point there (3,), and counts by `share`, 0..1
     """
 
     keyframe: int
@@ -28,6 +30,17 @@ class PositionFix:
     sigma: Floats
     arm: Floats
     instant: int | None = None
+    is_held: bool = False
+    share: float = 0.0
+    next_arm: Floats = field(default_factory=lambda: np.zeros(3))
+
+    def seen(self, poses: Floats) -> Floats:
+        """(3,) m, where the keyframes at `poses` (K, 4, 4) have the point."""
+        here = poses[self.keyframe, :3, :3] @ self.arm + poses[self.keyframe, :3, 3]
+        if not self.share:
+            return np.asarray(here)
+        after = poses[self.keyframe + 1]
+        return np.asarray((1.0 - self.share) * here + self.share * (after[:3, :3] @ self.next_arm + after[:3, 3]))
 
 
 @dataclass(frozen=True)
@@ -101,6 +114,7 @@ class PoseGraph:
     map_priors : planar priors in the frame of a map with a common shift of `shift_sigma` m, and errors of `map_sigma` m
         about each place
     is_anchored : whether the first pose has a tight prior; else the fixes anchor the graph
+    tilt_sigma : rad, prior of the first pose's tilt where fixes anchor the graph
     start : (3,) x, y (m), yaw (rad), prior of the first pose; None takes `poses`
     start_sigma : (3,) m, m, rad, its sigmas; height, roll and pitch keep the tight prior
     is_rigid : odometry has no error: the trajectory moves as a whole
@@ -124,6 +138,7 @@ class PoseGraph:
     shift_sigma: float = 0.0
     map_sigma: float = 0.0
     is_anchored: bool = True
+    tilt_sigma: float = 3.0
     start: Floats | None = None
     start_sigma: Floats | None = None
     is_rigid: bool = False

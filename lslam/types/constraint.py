@@ -20,7 +20,7 @@ class Verdict(StrEnum):
 
 
 class LoopStage(StrEnum):
-    """What decided on a loop candidate, in the order in which it is asked."""
+    """What decided on a loop candidate, in the order in which it is asked; `manual` : a person knows the pair."""
 
     THINNED = "thinned"
     REGISTRATION = "registration"
@@ -30,6 +30,7 @@ class LoopStage(StrEnum):
     GATE = "gate"
     CONSISTENCY = "consistency"
     GRAPH = "graph"
+    MANUAL = "manual"
 
 
 @dataclass(frozen=True)
@@ -37,6 +38,7 @@ class Constraint:
     """A measured pose of keyframe `b` relative to keyframe `a`.
 
     T_a_b : (4, 4); covariance : (6, 6) of t' = t + d[:3], R' = exp(d[3:]) R in the axes of keyframe a, m2 and rad2
+    is_held : a person vouches for it: no outlier candidate of the graph
     """
 
     a: int
@@ -44,6 +46,7 @@ class Constraint:
     T_a_b: NDArray[np.float64]
     covariance: NDArray[np.float64]
     kind: ConstraintKind = "loop"
+    is_held: bool = False
 
 
 @dataclass(frozen=True)
