@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import logging
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextvars import copy_context
 from copy import copy
+from dataclasses import replace
 from itertools import islice
 
 import numpy as np
@@ -18,8 +18,6 @@ from lslam.config.registration import RegistrationConfig
 from lslam.errors import InterruptedRunError
 from lslam.geometry import se3, so3
 from lslam.kernels.transform import transform
-from lslam.keyframes.store import KeyframeStore
-from lslam.keyframes.submaps import submap
 from lslam.loops import create_descriptor
 from lslam.loops.ambiguity import resolve_ambiguity
 from lslam.loops.descriptor import PlaceMatch
@@ -32,9 +30,8 @@ from lslam.loops.verify import Verification, Verifier
 from lslam.loops.working_memory import WorkingMemory
 from lslam.types.constraint import Constraint, LoopCandidate, LoopStage, Verdict
 from lslam.types.keyframe import Keyframe
+from lslam.types.manual import KnownPair
 from lslam.types.stage_clock import KeyframeClocks, StageClock
-
-log = logging.getLogger("lslam")
 
 Floats = NDArray[np.float64]
 Points = NDArray[np.float32]
@@ -52,55 +49,6 @@ RIVAL, RIVALS = 1.5, 3
 KEPT, CLOUDS, HELD, LOOKS = 4, 4, 256, 8
 
 
-def find_loops(
-    store: KeyframeStore,
-    config: LoopsConfig,
-    registration: RegistrationConfig,
-    submap_size: int = 5,
-    clocks: KeyframeClocks | None = None,
-    should_stop: Callable[[], bool] = lambda: False,
-    threads: int = 1,
-) -> list[LoopCandidate]:
-    """Loop candidates of a run in the order of the newer keyframe, with verdicts.
-
-    store : the run's keyframes with odometry's poses, their covariances and the distance travelled
-    submap_size : keyframes whose clouds make one submap (`keyframes.submap_size`)
-    clocks : take the time of each keyframe, stage `loops`
-    threads : so many keyframes are verified at once; the candidates do not depend on it
-
-    An accepted candidate carries its constraint, T_a_b between LiDAR frames. Raises InterruptedRunError when `should_stop`
-    said so between two keyframes.
-    """
-    poses = np.array([keyframe.T_world_lidar for keyframe in store.keyframes]).reshape(-1, 4, 4)
-    detector = Detector(
-        store.keyframes, lambda number: submap(store, poses, number, submap_size), config, registration
-    )  # fmt: skip
-    candidates = detector.find(clocks, should_stop, threads)
-    accepted = sum(c.is_accepted for c in candidates)
-    tried = sum(c.stage != LoopStage.THINNED for c in candidates)
-    log.info("loop closures: %d of %d candidates accepted, %d keyframes", accepted, tried, len(store))
-    return candidates
-
-
-def warm_up(config: LoopsConfig) -> None:
-    """Compile or load every kernel that loop closure detection needs, with a small room."""
-    room = warm_up_candidates(config)
-    submap_of_room = make_level_submap(room, RegistrationConfig())
-    Verifier(LoopsConfig(), RegistrationConfig()).verify(
-        submap_of_room, submap_of_room, np.zeros(3), LEAST_REACH, [0.0]
-    )
-
-
-def warm_up_candidates(config: LoopsConfig) -> Points:
-    """Compile or load the kernels by which candidates are found; the room (3000, 3), m, that serves for it."""
-    room = np.random.default_rng(0).uniform(-8, 8, (3000, 3)).astype(np.float32)
-    room[np.arange(3000), np.arange(3000) % 3] = 8.0
-    transform(room, np.eye(4), np.empty_like(room))
-    OdometryUncertainty([Keyframe(0, 0, 0, np.eye(4), np.eye(6))], 0.0, 0.0).gated(0, np.arange(0), 1.0, 1.0, 1.0)
-    create_descriptor(config).add(0, room)
-    return room
-
-
 class Detector:
     """Detects loop closures among keyframes.
 
@@ -116,6 +64,8 @@ class Detector:
         registration: RegistrationConfig,
     ) -> None:
         self.keyframes, self.cloud, self.config, self.registration = keyframes, cloud, config, registration
+        self.forbidden: Sequence[tuple[int, int]] = ()
+        self._is_level = False
         self.uncertainty = OdometryUncertainty(keyframes, config.drift_percent, config.drift_deg)
         self.index = create_descriptor(config)
         self.verifier = Verifier(config, registration)
@@ -178,6 +128,23 @@ class Detector:
                 pool.shutdown(cancel_futures=True)
         return candidates
 
+    def verify_known(self, pair: KnownPair) -> LoopCandidate:
+        """The pair registered, whatever odometry says of its place; of its heading odometry is believed where it is sure."""
+        self._level_world()
+        a, b = pair.a, pair.b
+        turn = self._turn(self.uncertainty.between(b, np.array([a])))
+        spread = WIDEST_TURN if turn <= WIDEST_TURN else np.pi
+        yaws = np.arange(-spread, spread, TURN_STEP)
+        expected = self.keyframes[a].T_world_lidar[:3, :3] @ pair.place
+        within = self.config.known_within if pair.within is None else pair.within
+        found = self.verifier.verify(self._submaps.get(a), self._submaps.get(b), expected, within, yaws)
+        closed = self._constraint(a, b, found)
+        return LoopCandidate(
+            a, b, self._away(a, b), float("nan"), Verdict.REJECTED if found.reason else Verdict.ACCEPTED,
+            found.stage if found.reason else LoopStage.MANUAL, found.reason, found.rmse, found.overlap,
+            None if closed is None else replace(closed, is_held=not found.reason),
+        )  # fmt: skip
+
     def _due_after(self, b: int, gated: SharedResults[NDArray[np.int64]], throttle: LoopThrottle) -> Iterator[int]:
         """The next keyframes after `b` that are due if all verdicts are as the last one."""
         throttle = copy(throttle)
@@ -201,6 +168,9 @@ class Detector:
 
     def _level_world(self) -> None:
         """Rotate the world so that z is up, as BEV correlation needs. Relative poses stay."""
+        if self._is_level:
+            return
+        self._is_level = True
         shown = np.unique(np.linspace(0, len(self.keyframes) - 1, LOOKS).round().astype(int))
         up = find_up([make_level_submap(self._make_level(int(number)), self.registration).fine for number in shown])
         self.keyframes = levelled(self.keyframes, up)
@@ -208,10 +178,18 @@ class Detector:
 
     def _gated(self, b: int) -> NDArray[np.int64]:
         """Older keyframes in the memory within the gate of odometry about `b`, but not on the way just travelled."""
-        among = self.memory.before(b)
+        among = self._allowed(b, self.memory.before(b))
         if self.config.radius is None:
             return self.uncertainty.gated(b, among, self.config.min_travel, NEAR, self.config.sigmas)
         return self.uncertainty.gated(b, among, self.config.min_travel, self.config.radius, 0.0)
+
+    def _allowed(self, b: int, among: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Those that no forbidden pair lies at: so near along the way the same surfaces are taken for the same place."""
+        distances = self.uncertainty.distances
+        for older, newer in self.forbidden:
+            if abs(distances[b] - distances[newer]) <= NEAR:
+                among = among[np.abs(distances[among] - distances[older]) > NEAR]
+        return among
 
     def _thinned(self, older: NDArray[np.int64], b: int, wait: float) -> LoopCandidate:
         a = self._nearest(older, b)

@@ -21,7 +21,8 @@ from lslam.graph.pose_graph import optimise
 from lslam.graph.problem import PoseGraph, Solution
 from lslam.keyframes.store import KeyframeStore
 from lslam.localization.sessions import Chain, Session, tie
-from lslam.loops.detector import Detector, warm_up
+from lslam.loops.detector import Detector
+from lslam.loops.find_loops import warm_up
 from lslam.pipeline.rebuild import EarlierRun, read_run, results_of
 from lslam.pipeline.run_folder import KEYFRAMES, MANIFEST
 from lslam.stopping import asking

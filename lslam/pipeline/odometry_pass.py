@@ -24,7 +24,7 @@ from lslam.integrity.monitor import IntegrityMonitor
 from lslam.kernels import jit
 from lslam.keyframes.store import KeyframeStore
 from lslam.locks import one_at_a_time
-from lslam.loops import detector
+from lslam.loops import find_loops
 from lslam.maps import crispness, merge
 from lslam.odometry.base import Odometry, Resumable
 from lslam.odometry.given import GivenPoses
@@ -184,7 +184,7 @@ def _load_kernels(
     if monitor is not None and not is_over:
         monitor.warm_up()
     if config.loops.use or config.localize.map:
-        detector.warm_up(config.loops)
+        find_loops.warm_up(config.loops)
     if config.osm.extract:
         prior.warm_up()
     if config.map.write:

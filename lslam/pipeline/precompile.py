@@ -44,7 +44,7 @@ def helped(config: Config) -> Iterator[Callable[[], None]]:
 
 def main(words: list[str]) -> None:
     """Compile the optimiser's step and the ground's kernels, and those of the map and of loop candidates where named."""
-    from lslam.loops import detector
+    from lslam.loops import find_loops
     from lslam.maps import crispness, merge
     from lslam.preprocessing import ground
     from lslam.registration import optimiser
@@ -55,7 +55,7 @@ def main(words: list[str]) -> None:
         merge.warm_up()
         crispness.warm_up()
     if "loops" in words:
-        detector.warm_up_candidates(Config().loops)
+        find_loops.warm_up_candidates(Config().loops)
 
 
 if __name__ == "__main__":

@@ -23,7 +23,7 @@ from lslam.config.registration import RegistrationConfig
 from lslam.geometry import se3, so3
 from lslam.keyframes.cloud import keyframe_cloud
 from lslam.keyframes.store import KeyframeStore
-from lslam.loops.detector import find_loops
+from lslam.loops.find_loops import find_loops
 from lslam.loops.scan_context import PlaceIndex
 from lslam.simulation.scenarios import simulate
 from lslam.types.keyframe import Keyframe

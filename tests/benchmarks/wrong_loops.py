@@ -25,7 +25,7 @@ from lslam.config import Config, load_config
 from lslam.evaluation.associate import associate
 from lslam.frontend.register_scans import to_trajectory
 from lslam.keyframes.store import KeyframeStore
-from lslam.loops.detector import find_loops
+from lslam.loops.find_loops import find_loops
 from lslam.odometry import create_odometry
 from lslam.pipeline.job import choose_scans
 from lslam.pipeline.manifest import Manifest

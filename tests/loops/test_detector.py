@@ -18,7 +18,8 @@ from lslam.geometry import se3, so3
 from lslam.kernels import gating, gauss_newton, gaussians, polar_image, residuals, transform
 from lslam.keyframes.store import KeyframeStore
 from lslam.loops.descriptor import PlaceMatch
-from lslam.loops.detector import Detector, find_loops, warm_up
+from lslam.loops.detector import Detector
+from lslam.loops.find_loops import find_loops, warm_up
 from lslam.types.constraint import LoopCandidate
 
 Floats = NDArray[np.float64]

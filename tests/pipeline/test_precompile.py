@@ -11,7 +11,7 @@ import pytest
 from numba.core.dispatcher import Dispatcher
 
 from lslam.config import Config
-from lslam.loops import detector
+from lslam.loops import find_loops
 from lslam.maps import crispness, merge
 from lslam.odometry import create_odometry
 from lslam.pipeline import precompile
@@ -27,7 +27,7 @@ def signatures() -> set[tuple[str, str]]:
 def test_it_compiles_nothing_that_the_run_does_not_need() -> None:
     config = Config()
     create_odometry(config).warm_up()
-    detector.warm_up(config.loops)
+    find_loops.warm_up(config.loops)
     merge.warm_up()
     crispness.warm_up()
     of_run = signatures()

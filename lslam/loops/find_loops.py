@@ -1,0 +1,105 @@
+"""Loop closures of a run: candidates that are searched, pairs that a person knows."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.config.loops import LoopsConfig
+from lslam.config.registration import RegistrationConfig
+from lslam.errors import InterruptedRunError
+from lslam.kernels.transform import transform
+from lslam.keyframes.store import KeyframeStore
+from lslam.keyframes.submaps import submap
+from lslam.loops import create_descriptor
+from lslam.loops.detector import LEAST_REACH, Detector
+from lslam.loops.gating import OdometryUncertainty
+from lslam.loops.level_submap import make_level_submap
+from lslam.loops.verify import Verifier
+from lslam.types.constraint import LoopCandidate, LoopStage
+from lslam.types.keyframe import Keyframe
+from lslam.types.manual import KnownPair
+from lslam.types.stage_clock import KeyframeClocks
+
+log = logging.getLogger("lslam")
+
+Points = NDArray[np.float32]
+
+
+def find_loops(
+    store: KeyframeStore,
+    config: LoopsConfig,
+    registration: RegistrationConfig,
+    submap_size: int = 5,
+    clocks: KeyframeClocks | None = None,
+    should_stop: Callable[[], bool] = lambda: False,
+    threads: int = 1,
+    keyframes: Sequence[Keyframe] | None = None,
+    forbidden: Sequence[tuple[int, int]] = (),
+) -> list[LoopCandidate]:
+    """Loop candidates of a run in the order of the newer keyframe, with verdicts.
+
+    store : the run's keyframes with odometry's poses, their covariances and the distance travelled
+    submap_size : keyframes whose clouds make one submap (`keyframes.submap_size`)
+    clocks : take the time of each keyframe, stage `loops`
+    threads : so many keyframes are verified at once; the candidates do not depend on it
+    keyframes : those of the store at other poses than odometry's; forbidden : pairs of them that are no candidates, nor are
+        those around them
+
+    An accepted candidate carries its constraint, T_a_b between LiDAR frames. Raises InterruptedRunError when `should_stop`
+    said so between two keyframes.
+    """
+    detector = _detector(store, store.keyframes if keyframes is None else keyframes, config, registration, submap_size)
+    detector.forbidden = tuple(forbidden)
+    candidates = detector.find(clocks, should_stop, threads)
+    accepted = sum(c.is_accepted for c in candidates)
+    tried = sum(c.stage != LoopStage.THINNED for c in candidates)
+    log.info("loop closures: %d of %d candidates accepted, %d keyframes", accepted, tried, len(store))
+    return candidates
+
+
+def verify_known(
+    store: KeyframeStore, pairs: Sequence[KnownPair], config: LoopsConfig, registration: RegistrationConfig,
+    submap_size: int = 5, should_stop: Callable[[], bool] = lambda: False,
+) -> list[LoopCandidate]:  # fmt: skip
+    """The known pairs as candidates, verified wherever their scans may lie; an accepted one is held by the graph.
+
+    Raises InterruptedRunError when `should_stop` said so between two.
+    """
+    detector = _detector(store, store.keyframes, config, registration, submap_size)
+    found = []
+    for pair in pairs:
+        if should_stop():
+            raise InterruptedRunError("interrupted while known pairs were verified")
+        found.append(detector.verify_known(pair))
+    return found
+
+
+def _detector(
+    store: KeyframeStore, keyframes: Sequence[Keyframe], config: LoopsConfig, registration: RegistrationConfig,
+    submap_size: int,
+) -> Detector:  # fmt: skip
+    poses = np.array([keyframe.T_world_lidar for keyframe in keyframes]).reshape(-1, 4, 4)
+    return Detector(keyframes, lambda number: submap(store, poses, number, submap_size), config, registration)
+
+
+def warm_up(config: LoopsConfig) -> None:
+    """Compile or load every kernel that loop closure detection needs, with a small room."""
+    room = warm_up_candidates(config)
+    submap_of_room = make_level_submap(room, RegistrationConfig())
+    Verifier(LoopsConfig(), RegistrationConfig()).verify(
+        submap_of_room, submap_of_room, np.zeros(3), LEAST_REACH, [0.0]
+    )
+
+
+def warm_up_candidates(config: LoopsConfig) -> Points:
+    """Compile or load the kernels by which candidates are found; the room (3000, 3), m, that serves for it."""
+    room = np.random.default_rng(0).uniform(-8, 8, (3000, 3)).astype(np.float32)
+    room[np.arange(3000), np.arange(3000) % 3] = 8.0
+    transform(room, np.eye(4), np.empty_like(room))
+    OdometryUncertainty([Keyframe(0, 0, 0, np.eye(4), np.eye(6))], 0.0, 0.0).gated(0, np.arange(0), 1.0, 1.0, 1.0)
+    create_descriptor(config).add(0, room)
+    return room
