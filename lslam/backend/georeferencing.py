@@ -33,6 +33,8 @@ Floats = NDArray[np.float64]
 UNSTATED = 5.0
 # rad; one sigma of the z axis against up, of a world that nothing levelled and of one levelled by an IMU.
 UNLEVELLED, LEVELLED = np.deg2rad(10.0), np.deg2rad(1.0)
+# rad; of the tilt where nothing is said of it.
+UNKNOWN = 3.0
 # Sigmas (noise and drift) beyond which a fix is no outlier candidate of the graph but left out.
 ABSURD = 20.0
 # m; beyond noise and multipath: a lost sign.
@@ -68,6 +70,7 @@ class Placement:
     """A georeference and, for the graph, position factors of the fixes with their correlated noise.
 
     walk : factor on odometry's random-walk drift, estimated from the fixes
+    tilt_sigma : rad, of the tilt that the georeference gives the first pose
     problem : why there is none, or what was left out
     """
 
@@ -76,6 +79,7 @@ class Placement:
     fix_noise: GaussMarkovNoise | None = None
     walk: float = 0.0
     problem: str = ""
+    tilt_sigma: float = UNKNOWN
 
 
 def require_gnss(sequence: Sequence, config: GnssConfig) -> None:
@@ -143,7 +147,7 @@ def on_earth(graph: PoseGraph, placement: Placement) -> PoseGraph:
     up = np.array([0.0, 0.0, 1.0])
     return replace(
         graph, poses=T @ graph.poses, fixes=placement.fixes, world_up=up, is_anchored=False, spread=spread,
-        fix_noise=placement.fix_noise, walk=max(graph.walk, placement.walk),
+        fix_noise=placement.fix_noise, walk=max(graph.walk, placement.walk), tilt_sigma=placement.tilt_sigma,
     )  # fmt: skip
 
 

@@ -15,6 +15,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.backend.control_points import against_odometry, contradicting, control_facts, control_residuals, with_control
 from lslam.backend.georeferencing import Placement, on_earth, place
 from lslam.backend.inputs import floor_planes, on_one_plane, up_directions, world_up
 from lslam.backend.outcome import BackEnd, Given, solve, unsolved, without_steady_drift
@@ -27,6 +28,7 @@ from lslam.keyframes.store import KeyframeStore
 from lslam.stopping import checking
 from lslam.types.constraint import LoopCandidate, Turn
 from lslam.types.inertial_state import InertialChain
+from lslam.types.manual import ControlPoint
 from lslam.types.scan_result import ScanResult
 from lslam.types.sequence import Sequence
 from lslam.types.stage_clock import KeyframeClocks
@@ -40,25 +42,31 @@ Hold = Callable[[PoseGraph, Placement, Given], BackEnd | None]
 def run_back_end(
     sequence: Sequence, results: list[ScanResult], store: KeyframeStore, config: Config,
     candidates: list[LoopCandidate], turns: Many[Turn] = (), hold: Hold | None = None,
-    clocks: KeyframeClocks | None = None, inertial: InertialChain | None = None,
+    clocks: KeyframeClocks | None = None, inertial: InertialChain | None = None, points: Many[ControlPoint] = (),
 ) -> BackEnd:  # fmt: skip
-    """Optimise the pose graph with loop closures, fixes and map priors, and correct all scans; odometry's poses on failure."""
+    """Optimise the pose graph with loop closures, fixes and map priors, and correct all scans; odometry's poses on failure.
+
+    points : control points, which hold
+    """
     keyframes = store.keyframes
-    given = Given(results, store, config, candidates, KeyframeClocks() if clocks is None else clocks)
+    clocks = KeyframeClocks() if clocks is None else clocks
+    given = Given(results, store, config, candidates, clocks, points=tuple(points))
     problems = given.problems
     if len(keyframes) < 2:
-        if config.gnss.mode != "off":
-            problems.append("GNSS: fewer than two keyframes have no heading on the Earth")
+        if config.gnss.mode != "off" or points:
+            what = "control points" if points else "GNSS"
+            problems.append(f"{what}: fewer than two keyframes have no heading on the Earth")
         return BackEnd(results, candidates, problems=problems)
     graph = replace(_graph(given, inertial), turns=turns)
     out = None
     if hold is not None:
-        by_fixes = config.gnss.mode == "graph" or (config.gnss.mode == "fit" and config.osm.origin is None)
-        out = hold(graph, _placed(sequence, graph, given) if by_fixes else Placement(), given)
+        out = hold(
+            graph, _placed(sequence, graph, given, ("graph", "fit") if config.osm.origin is None else ("graph",)), given
+        )
     if out is None:
         # Loop closures observe a steady drift far better than fixes, whose gates assume odometry without it.
         graph = without_steady_drift(graph, given)
-        placement = _placed(sequence, graph, given) if config.gnss.mode == "graph" else Placement()
+        placement = _placed(sequence, graph, given)
         if placement.georeference is not None:
             out = solve(on_earth(graph, placement), given, placement.georeference)
     if out is None and (graph.loops or graph.floors or tilt_factor(graph, config.graph) > 0):
@@ -67,13 +75,39 @@ def run_back_end(
         out = unsolved(given)
     if config.gnss.mode == "fit" and out.georeference is None:
         moved = replace(graph, poses=out.keyframes)
-        out = replace(out, georeference=_placed(sequence, moved, given, out.results).georeference)
+        out = replace(out, georeference=_by_fixes(sequence, moved, given, out.results).georeference)
+    if points and out.georeference is not None:
+        left = control_residuals(points, out.results, out.georeference)
+        out = replace(out, control=left, facts=out.facts | {"control_points": control_facts(left)})
+        problems += [
+            *against_odometry(points, results, keyframes, config), *contradicting(left, config.graph.probability),
+        ]  # fmt: skip
     for problem in problems:
         log.warning("%s", problem)
     return replace(out, problems=problems, facts={"keyframes": len(keyframes)} | out.facts)
 
 
-def _placed(
+def _placed(sequence: Sequence, graph: PoseGraph, given: Given, modes: tuple[str, ...] = ("graph",)) -> Placement:
+    """By fixes, when they are used in one of the `modes`, and by control points; empty without both."""
+    placement = _by_fixes(sequence, graph, given) if given.config.gnss.mode in modes else Placement()
+    if not given.points:
+        return placement
+    is_fitted = placement.georeference is not None and not placement.georeference.is_in_graph
+    results = bent(given.results, given.store.keyframes, graph.poses)
+    placed = with_control(
+        Placement() if is_fitted else placement, given.points, results, given.store.keyframes, _up(graph), given.config
+    )
+    return _said(placed, given)
+
+
+def _said(placement: Placement, given: Given) -> Placement:
+    """The placement; its problem is one of the run."""
+    if placement.problem and placement.problem not in given.problems:
+        given.problems.append(placement.problem)
+    return placement
+
+
+def _by_fixes(
     sequence: Sequence, graph: PoseGraph, given: Given, results: list[ScanResult] | None = None
 ) -> Placement:  # fmt: skip
     """Placement of the graph's poses by the fixes of a run.
@@ -87,10 +121,7 @@ def _placed(
         results, up = given.results, None if up is None else graph.world_up
     elif results is None:
         results = bent(given.results, keyframes, graph.poses)
-    placement = place(sequence, results, keyframes, up, graph, config)
-    if placement.problem and placement.problem not in given.problems:
-        given.problems.append(placement.problem)
-    return placement
+    return _said(place(sequence, results, keyframes, up, graph, config), given)
 
 
 def _up(graph: PoseGraph) -> Floats | None:

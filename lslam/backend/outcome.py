@@ -23,6 +23,7 @@ from lslam.keyframes.store import KeyframeStore
 from lslam.types.building import CorrectedMap, OsmMatches
 from lslam.types.constraint import Constraint, LoopCandidate, LoopStage, Verdict
 from lslam.types.gnss import Georeference
+from lslam.types.manual import ControlPoint, ControlResidual
 from lslam.types.run_record import LoopSurroundings, LoopView, RunRecord
 from lslam.types.scan_result import ScanResult
 from lslam.types.stage_clock import KeyframeClocks
@@ -45,6 +46,7 @@ class Given:
 
     results : of odometry, all scans; store : of the keyframes; candidates : all loop candidates with the verdicts of verification
     clocks : time the work on each keyframe; the last one takes that of the whole graph
+    points : control points
     problems : what failed so far, one sentence each; appended to
     """
 
@@ -54,6 +56,7 @@ class Given:
     candidates: list[LoopCandidate]
     clocks: KeyframeClocks = field(default_factory=KeyframeClocks)
     problems: list[str] = field(default_factory=list)
+    points: tuple[ControlPoint, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -65,6 +68,7 @@ class BackEnd:
     georeference : of the world of `results`, None when unknown
     T_final_odometry : (4, 4) from the world of odometry into that of `results`
     solution : of the graph, None where the poses are odometry's
+    control : what is left of the control points
     osm : matches of walls with buildings, None without a usable map; buildings : of that map, at their estimated places
     facts : for the manifest; problems : what failed, one sentence each
     """
@@ -76,6 +80,7 @@ class BackEnd:
     georeference: Georeference | None = None
     T_final_odometry: Floats = field(default_factory=lambda: np.eye(4))
     solution: Solution | None = None
+    control: list[ControlResidual] = field(default_factory=list)
     osm: OsmMatches | None = None
     buildings: CorrectedMap | None = None
     facts: dict[str, Any] = field(default_factory=dict)
@@ -99,11 +104,15 @@ def solve(graph: PoseGraph, given: Given, georeference: Georeference | None = No
     except (GraphError, np.linalg.LinAlgError) as error:
         given.problems.append(f"{error}; the run goes on without it")
         return None
-    if graph.fixes and solution.fix_inliers.sum() < config.gnss.min_fixes:
+    free = [not fix.is_held for fix in graph.fixes]
+    accepted_fixes = int(solution.fix_inliers[free].sum())
+    if any(free) and accepted_fixes < config.gnss.min_fixes:
+        said = f"GNSS: the pose graph accepts {accepted_fixes} of {sum(free)} fixes"
         given.problems.append(
-            f"GNSS: the pose graph accepts {solution.fix_inliers.sum()} of {len(graph.fixes)} fixes: all rejected"
+            f"{said}: all rejected" if all(free) else f"{said}, the control points contradict the others"
         )
-        return None
+        if all(free):
+            return None
     judged, accepted = judged_by(given.candidates, graph, solution)
     log.info(
         "pose graph: %d keyframes, %d of %d loop closures accepted, drift factor %.3g, %d rounds",
@@ -178,18 +187,21 @@ def judged_by(
 
 
 def _scored(georeference: Georeference, graph: PoseGraph, solution: Solution) -> Georeference:
-    """The georeference with the residuals of the graph's inlier fixes; unchanged without fixes."""
-    if not graph.fixes:
-        return georeference
-    k = np.array([f.keyframe for f in graph.fixes])
-    arms, positions = np.stack([f.arm for f in graph.fixes]), np.stack([f.position for f in graph.fixes])
-    antenna = np.einsum("fij,fj->fi", solution.poses[k, :3, :3], arms) + solution.poses[k, :3, 3]
-    off = (positions - antenna)[solution.fix_inliers]
+    """The georeference with the residuals of the graph's inliers, of the kind that gave it; unchanged without any."""
+    is_control = georeference.method == "control"
+    used = [
+        fix
+        for fix, is_inlier in zip(graph.fixes, solution.fix_inliers, strict=True)
+        if is_inlier and fix.is_held == is_control
+    ]
+    if not used:
+        return replace(georeference, used=0) if graph.fixes else georeference
+    off = np.stack([f.position - f.seen(solution.poses) for f in used])
     return replace(
         georeference,
         rmse_horizontal=float(np.sqrt((off[:, :2] ** 2).sum(1).mean())),
         rmse_vertical=float(np.sqrt((off[:, 2] ** 2).mean())),
-        used=int(solution.fix_inliers.sum()),
+        used=len(used),
     )
 
 
@@ -201,7 +213,7 @@ def _facts(
     return {
         "loop_candidates": len(candidates),
         "loops": len(accepted),
-        "fixes": int(solution.fix_inliers.sum()),
+        "fixes": sum(bool(ok) and not fix.is_held for fix, ok in zip(graph.fixes, solution.fix_inliers, strict=True)),
         "gravity_factors": len(graph.free_ups),
         **({} if graph.inertial is None else {"imu_factors": len(graph.inertial.links)}),
         "imu_orientation_factors": len(graph.turns),

@@ -17,6 +17,7 @@ from lslam.version import __version__
 COMMANDS = {
     "run": "Estimate a trajectory and build a map from a recorded sequence.",
     "localize": "Locate a drive in a map that exists.",
+    "graph": "Optimise a run's pose graph again, with loops and control points that you know.",
     "merge": "Merge several runs of one place into one.",
     "eval": "Score estimated trajectories against ground truth.",
     "compare": "Compare methods on the same sequences.",

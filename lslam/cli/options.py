@@ -120,6 +120,27 @@ def reading_of(given: dict[str, Any]) -> dict[str, Any]:
     return {name: given[name] for name in ("lidar_topic", "imu_topic", "gnss_topic", "extrinsics")}
 
 
+def manual(function: F) -> F:
+    """--loops-file and --control."""
+    for name, text in (
+        ("--control", "CSV of control points, surveyed positions that hold the poses: scan,x,y,z,sigma,crs."),
+        (
+            "--loops-file",
+            "CSV of pairs of scans that are loops, or must not be: scan_a,scan_b,verdict (known, forbidden).",
+        ),
+    ):
+        function = click.option(name, type=click.Path(path_type=Path), metavar="FILE", help=text)(function)
+    return function
+
+
+def manual_settings(loops: Path | None, control: Path | None) -> dict[str, str | None]:
+    """Configuration keys of these files; absolute, so that the run's copy of them is found from anywhere."""
+    return {
+        key: None if path is None else json.dumps(str(path.absolute()), ensure_ascii=False)
+        for key, path in (("loops.file", loops), ("graph.control", control))
+    }
+
+
 def configuration(function: F) -> F:
     """--config and --set."""
     function = click.option(

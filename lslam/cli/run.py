@@ -55,6 +55,7 @@ if TYPE_CHECKING:
 @click.option("--occupancy", is_flag=True, help="Write occupied and free cells, and a floor plan.")
 @click.option("--imu/--no-imu", default=None, help="Predict and deskew with the IMU [default: no].")
 @click.option("--loops/--no-loops", default=None, help="Close loops where a place is seen again [default: yes].")
+@options.manual
 @click.option("--gnss", "gnss", flag_value="graph", default=None, help="Satellite fixes are factors of the pose graph.")
 @click.option("--georeference", "gnss", flag_value="fit", help="Satellite fixes only georeference the result.")
 @click.option("--osm", metavar="FILE|auto", help="Buildings of OpenStreetMap give planar priors; auto fetches them.")
@@ -118,11 +119,11 @@ def perform(sequence: str, given: dict[str, Any]) -> None:
                 opened, config, out=out, ground_truth=truth, overwrite=given["overwrite"], resume=given["resume"],
                 command=shlex.join(["lslam", *sys.argv[1:]]),
                 reading={name: text for name, text in options.reading_of(given).items() if text is not None},
-                watch=watch_of(stack, stop, lambda outcome: _print_result(outcome, out, given["as_json"])),
+                watch=watch_of(stack, stop, lambda outcome: print_result(outcome, out, given["as_json"])),
             )  # fmt: skip
     except RunFinishedError as finished:
         log.info("%s", finished)
-        _print_finished(out, given["as_json"])
+        print_finished(out, given["as_json"])
 
 
 def opened_with(given: dict[str, Any]) -> tuple[Sequence, Config]:
@@ -134,7 +135,7 @@ def opened_with(given: dict[str, Any]) -> tuple[Sequence, Config]:
 
     flags = _flags(given)
     extract = None if given["osm"] in (None, "auto") else Path(given["osm"])
-    options.require_there(given["gt"], given["poses"], extract)
+    options.require_there(given["gt"], given["poses"], extract, given["loops_file"], given["control"])
     find_folder(given["sequence"], given["data_root"])
     config = _resolve(given, flags)
     from lslam.readers import open_sequence
@@ -197,6 +198,7 @@ def _flags(given: dict[str, Any]) -> dict[str, Any]:
         "imu.use": None if given["imu"] is None else str(given["imu"]).lower(),
         "input.strict": "true" if given["strict"] else None,
         "loops.use": None if given["loops"] is None else str(given["loops"]).lower(),
+        **options.manual_settings(given["loops_file"], given["control"]),
         "gnss.mode": given["gnss"],
         "osm.extract": None if given["osm"] is None else json.dumps(given["osm"], ensure_ascii=False),
         "osm.origin": None
@@ -269,7 +271,7 @@ def _print_plan(sequence: Sequence, config: Config, out: Path, as_json: bool) ->
     show("\n".join(lines) + "\n" + to_toml(config))
 
 
-def _print_finished(out: Path, as_json: bool) -> None:
+def print_finished(out: Path, as_json: bool) -> None:
     """Print the existing result for --json; the log states that nothing was done."""
     if not as_json:
         return
@@ -285,7 +287,8 @@ def _print_finished(out: Path, as_json: bool) -> None:
     show(json.dumps(document, allow_nan=False) + "\n")
 
 
-def _print_result(outcome: RunOutcome, out: Path, as_json: bool) -> None:
+def print_result(outcome: RunOutcome, out: Path, as_json: bool) -> None:
+    """The summary, or the document of --json."""
     if not as_json:
         from lslam.reports.text import summary
 

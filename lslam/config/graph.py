@@ -12,6 +12,7 @@ from lslam.config.section import Section
 class GraphConfig(Section):
     """The optimisation of keyframe poses."""
 
+    control: str = Field("", description="CSV of control points, surveyed positions that hold the poses; empty: none")
     optimizer: Literal["lm", "dogleg"] = Field(
         "lm", description="Levenberg-Marquardt, or Powell's dog leg (trust region)"
     )

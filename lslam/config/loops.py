@@ -13,6 +13,10 @@ class LoopsConfig(Section):
     """Candidates by a place descriptor and odometry, verified by registration of submap to submap."""
 
     use: bool = Field(True, description="look for places seen before and close loops there")
+    file: str = Field(
+        "", description="CSV of pairs that are known to be loop closures, or forbidden to be any; empty: none"
+    )
+    known_within: float = Field(10.0, gt=0, description="m; so far apart the scans of a known pair may have been taken")
     radius: float | None = Field(
         None,
         gt=0,

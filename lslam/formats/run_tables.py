@@ -33,10 +33,10 @@ NOT_STAGES = ("index", "stamp_ns", "stamp", "total", SAVED)
 AFTER = "back end: "
 
 
-def write_loops(path: Path, candidates: Sequence[LoopCandidate], keyframes: Sequence[Keyframe]) -> None:
+def write_loops(path: Path, candidates: Sequence[LoopCandidate], scans: Sequence[int]) -> None:
     """One row per candidate in their order; `sigma` is the standard deviation where it is largest, empty when unknown.
 
-    Raises OutputError when the file cannot be written.
+    scans : of the keyframes, as the recording numbers them. Raises OutputError when the file cannot be written.
     """
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
@@ -44,7 +44,7 @@ def write_loops(path: Path, candidates: Sequence[LoopCandidate], keyframes: Sequ
     for c in candidates:
         sigma_m, sigma_deg = _sigmas(c)
         row = (
-            c.a, c.b, keyframes[c.a].scan, keyframes[c.b].scan, f"{c.distance:.3f}", _number(c.descriptor_distance),
+            c.a, c.b, scans[c.a], scans[c.b], f"{c.distance:.3f}", _number(c.descriptor_distance),
             c.verdict, c.stage, _number(c.rmse), _number(c.overlap), _number(sigma_m), _number(sigma_deg), c.reason,
         )  # fmt: skip
         table.writerow(row)

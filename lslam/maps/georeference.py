@@ -117,6 +117,30 @@ def to_lat_lon(points: NDArray[Any], georeference: Georeference) -> Floats:
     return from_local(se3.apply(georeference.T_enu_world, points), georeference.origin)
 
 
+def to_wgs84(points: NDArray[Any], epsg: int) -> Floats:
+    """Points (N, 3) in the coordinates `epsg`, x (or longitude, deg) first, to (N, 3) lat, lon (deg), height (m), WGS84.
+
+    Heights are those of the coordinates where these have some, else above the ellipsoid. Raises UsageError for a code that PROJ
+    does not know, and for what is no place in it.
+    """
+    from pyproj import CRS, Transformer
+    from pyproj.exceptions import CRSError
+
+    there = np.asarray(points, np.float64).reshape(-1, 3)
+    try:
+        crs = CRS.from_epsg(epsg)
+        transformer = Transformer.from_crs(crs if len(crs.axis_info) > 2 else crs.to_3d(), "EPSG:4979", always_xy=True)
+    except CRSError:
+        raise UsageError(f"EPSG:{epsg}: PROJ knows no such coordinate reference system") from None
+    lon, lat, height = transformer.transform(there[:, 0], there[:, 1], there[:, 2])
+    out = np.column_stack([lat, lon, height])
+    wrong = np.flatnonzero(~(np.isfinite(out).all(1) & (np.abs(out[:, 0]) <= 90) & (np.abs(out[:, 1]) <= 360)))
+    if len(wrong):
+        x, y, _ = there[wrong[0]]
+        raise UsageError(f"{x:.1f}, {y:.1f} is no place in EPSG:{epsg} ({crs.name}): easting or longitude comes first")
+    return out
+
+
 def parse_crs(text: str) -> int:
     """The code of `EPSG:25832`; raises UsageError on anything else."""
     name, _, digits = text.strip().partition(":")

@@ -57,7 +57,7 @@ def hold_by_buildings(osm: OsmSource, graph: PoseGraph, placement: Placement, gi
         problems.append(f"OSM: {error}; the run goes on without the buildings")
         return None
     up = graph.world_up if graph.ups else None
-    is_on_earth = config.gnss.mode == "graph" and known is not None
+    is_on_earth = known is not None and known.is_in_graph
     if is_on_earth:
         graph = on_earth(graph, placement)
     located, held = find_on_map(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
+from collections.abc import Sequence as Many
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
@@ -12,12 +13,15 @@ from typing import Any
 import numpy as np
 
 from lslam.backend import added_drift
+from lslam.backend.held_first import doubts, where_held
 from lslam.backend.levelling import find_level, level_results
+from lslam.backend.manual import KeyframePairs, keyframe_pairs
 from lslam.backend.optimise import run_back_end
 from lslam.backend.outcome import BackEnd
 from lslam.config import Config
 from lslam.errors import InterruptedRunError
 from lslam.formats.g2o import write_g2o
+from lslam.formats.manual_files import write_control
 from lslam.formats.run_tables import write_loops, write_osm_matches
 from lslam.formats.state_files import Records
 from lslam.formats.trajectory_files import write_tum
@@ -25,14 +29,16 @@ from lslam.frontend.checkpoints import Checkpoints
 from lslam.frontend.register_scans import to_trajectory
 from lslam.geometry import se2, se3
 from lslam.keyframes.store import KeyframeStore
-from lslam.loops.detector import find_loops
+from lslam.loops.find_loops import find_loops, verify_known
 from lslam.osm.hold import hold_by_buildings
 from lslam.osm.source import OsmSource
 from lslam.pipeline.manifest import Manifest
 from lslam.stopping import asking
 from lslam.types.constraint import LoopCandidate
 from lslam.types.gnss import Georeference
+from lslam.types.manual import ControlPoint, Manual
 from lslam.types.run_record import RunRecord
+from lslam.types.scan_result import ScanResult
 from lslam.types.sequence import Sequence
 from lslam.types.stage_clock import KeyframeClocks
 from lslam.version import __version__
@@ -43,13 +49,14 @@ log = logging.getLogger("lslam")
 def optimise_poses(
     sequence: Sequence, record: RunRecord, store: KeyframeStore, config: Config, manifest: Manifest,
     osm: OsmSource | None = None, checkpoints: Checkpoints | None = None,
-    should_stop: Callable[[], bool] = lambda: False,
+    should_stop: Callable[[], bool] = lambda: False, manual: Manual | None = None,
 ) -> BackEnd:  # fmt: skip
     """Put the final poses into `record`, and what the graph did into the manifest.
 
     A run that was interrupted, or whose odometry is lost, keeps what it has; `should_stop` is asked between keyframes, before
-    the graph and wherever its loops turn. `checkpoints` keep the loops that were found.
+    the graph and wherever its loops turn. `checkpoints` keep the loops that were found. `manual` : what a person knows.
     """
+    manual = manual or Manual()
     if config.debug.drift:
         manifest.problems.append(added_drift.describe(config.debug))
         log.warning("%s", manifest.problems[-1])
@@ -63,15 +70,20 @@ def optimise_poses(
     with manifest.timed("back_end_s"):
         candidates: list[LoopCandidate] = []
         try:
-            if config.loops.use:
+            if config.loops.use or manual.pairs:
                 with manifest.timed("loops_s"):
-                    candidates = _loops(store, config, checkpoints, clocks, should_stop)
+                    pairs = keyframe_pairs(manual.pairs, record.results, store.keyframes)
+                    candidates, said = _loops(
+                        store, record.results, config, manual.points, pairs, checkpoints, clocks, should_stop
+                    )
+                    manifest.problems += [*pairs.problems, *said]
             if should_stop():
                 raise InterruptedRunError("interrupted before the pose graph")
             with asking(should_stop, "interrupted before the pose graph was solved"):
                 done = run_back_end(
-                    sequence, record.results, store, config, candidates, record.turns, hold, clocks, record.inertial
-                )
+                    sequence, record.results, store, config, candidates, record.turns, hold, clocks, record.inertial,
+                    manual.points,
+                )  # fmt: skip
         except InterruptedRunError as error:
             manifest.interrupt(str(error))
             return BackEnd(record.results)
@@ -92,22 +104,32 @@ def optimise_poses(
 
 
 def _loops(
-    store: KeyframeStore, config: Config, checkpoints: Checkpoints | None, clocks: KeyframeClocks,
-    should_stop: Callable[[], bool],
-) -> list[LoopCandidate]:  # fmt: skip
-    """All candidates of the keyframes where they are now, by an earlier run where it found them for the same poses."""
+    store: KeyframeStore, results: list[ScanResult], config: Config, points: Many[ControlPoint], pairs: KeyframePairs,
+    checkpoints: Checkpoints | None, clocks: KeyframeClocks, should_stop: Callable[[], bool],
+) -> tuple[list[LoopCandidate], list[str]]:  # fmt: skip
+    """All candidates of the keyframes where they are now, by an earlier run where it found them for the same poses.
+
+    The known pairs come first: the others are searched from where those and control points put the keyframes. Beside them what
+    is doubtful about the known ones.
+    """
     poses = np.array([k.T_world_lidar for k in store.keyframes]).reshape(-1, 4, 4)
     known = None if checkpoints is None else checkpoints.latest()
     if known is not None and np.array_equal(known["poses"], poses):
         candidates: list[LoopCandidate] = known["candidates"]
-        return candidates
+        return candidates, doubts(store.keyframes, candidates[: len(pairs.known)], pairs.known, results, config)
     submap_size = config.keyframes.submap_size
-    candidates = find_loops(
-        store, config.loops, config.registration, submap_size, clocks, should_stop, config.input.workers
-    )
+    candidates = verify_known(store, pairs.known, config.loops, config.registration, submap_size, should_stop)
+    said = doubts(store.keyframes, candidates, pairs.known, results, config)
+    if config.loops.use:
+        taken = {(c.a, c.b) for c in candidates}
+        found = find_loops(
+            store, config.loops, config.registration, submap_size, clocks, should_stop, config.input.workers,
+            where_held(store.keyframes, candidates, points, results, config), pairs.forbidden,
+        )  # fmt: skip
+        candidates += [c for c in found if (c.a, c.b) not in taken]
     if checkpoints is not None:
         checkpoints.write(len(poses), lambda: {"poses": poses, "candidates": Records(candidates)})
-    return candidates
+    return candidates, said
 
 
 def level_world(record: RunRecord, sequence: Sequence, config: Config, manifest: Manifest) -> None:
@@ -116,7 +138,7 @@ def level_world(record: RunRecord, sequence: Sequence, config: Config, manifest:
     The last of all that moves poses, so keyframes on disk stay where odometry put them.
     """
     place = record.georeference
-    if place is not None and place.method in ("graph", "osm"):
+    if place is not None and place.is_in_graph:
         record.world = "east, north, up from the origin of the georeference"
     else:
         level = find_level(sequence, record.results, config)
@@ -151,7 +173,10 @@ def write_back_end(folder: Path, record: RunRecord, store: KeyframeStore, done: 
     if done.osm is not None:
         write_osm_matches(folder / "osm_matches.csv", done.osm, store.keyframes, se2.of_se3(done.keyframes))
     if not record.map_fixes:
-        write_loops(folder / "loops.csv", done.candidates, store.keyframes)
+        numbers = [record.results[k.scan].index for k in store.keyframes]
+        write_loops(folder / "loops.csv", done.candidates, numbers)
+    if done.control:
+        write_control(folder / "control.csv", done.control)
     if done.is_optimised:
         write_g2o(folder / "graph.g2o", done.keyframes, done.constraints)
 

@@ -55,16 +55,25 @@ def check_config(config: Config) -> None:
     matcher_named(config.osm.matcher)
     if not config.osm.extract and (config.osm.origin is not None or config.osm.heading_deg is not None):
         raise UsageError("--origin and --heading do nothing without --osm FILE: give it, or drop them")
-    if config.gnss.crs is not None and config.gnss.mode == "off" and not config.osm.extract:
-        raise UsageError(
-            "--crs does nothing without --gnss, --georeference or --osm, which tell where on the Earth the run lies: give one "
-            "of them, or drop it"
-        )
-    if config.localize.map and config.osm.extract:
-        raise UsageError("--osm holds a drive by buildings and a map by its surfaces: drop one of them")
+    _check_places(config)
     for delta in config.eval.delta:
         parse_delta(delta)
     check_words(config.eval.metrics)
+
+
+def _check_places(config: Config) -> None:
+    """What tells a run where it lies."""
+    if config.gnss.crs is not None and config.gnss.mode == "off" and not (config.osm.extract or config.graph.control):
+        raise UsageError(
+            "--crs does nothing without --gnss, --georeference, --osm or --control, which tell where on the Earth the run lies: "
+            "give one of them, or drop it"
+        )
+    if config.localize.map and config.osm.extract:
+        raise UsageError("--osm holds a drive by buildings and a map by its surfaces: drop one of them")
+    if config.localize.map and (config.loops.file or config.graph.control):
+        raise UsageError(
+            "a map takes the place of the pose graph: --loops-file and --control do nothing there, drop them"
+        )
 
 
 def _check_imu(config: Config) -> None:

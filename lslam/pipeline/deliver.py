@@ -26,8 +26,10 @@ from lslam.types.run_record import RunRecord
 log = logging.getLogger("lslam")
 
 
-def perform(job: PreparedRun, out: Path | None, overwrite: bool, resume: bool) -> RunOutcome:
-    """The run, into its folder when there is one."""
+def perform(
+    job: PreparedRun, out: Path | None, overwrite: bool, resume: bool, odometry_of: Path | None = None
+) -> RunOutcome:  # fmt: skip
+    """The run, into its folder when there is one; `odometry_of` : the folder of a run whose odometry serves."""
     manifest = job.manifest
     if isinstance(out, RemotePath):
         return _perform_afar(job, out, overwrite, resume)
@@ -40,14 +42,16 @@ def perform(job: PreparedRun, out: Path | None, overwrite: bool, resume: bool) -
     goes_on = resume and may_go_on(out, manifest.identity, job.config)
     with RunFolder(out, overwrite or resume, goes_on) as folder:
         try:
-            record, evaluation = _fill(folder, job, goes_on)
+            if odometry_of is not None and not goes_on:
+                folder.begin_from(odometry_of)
+            record, evaluation = _fill(folder, job, goes_on or odometry_of is not None)
         except BaseException as error:
             status = manifest.word_for(error)
             _write_last(folder, manifest.as_dict(status, str(error) or type(error).__name__))
             raise
         folder.write_manifest(record.manifest)
         if manifest.outcome != "interrupted":
-            folder.drop_checkpoint()
+            folder.keep_odometry()
         log.info("%s; results in %s", manifest.outcome, folder.path)
     return RunOutcome(record, evaluation)
 

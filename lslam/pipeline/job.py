@@ -5,12 +5,13 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
 from lslam.backend.georeferencing import require_gnss
+from lslam.backend.manual import read_manual
 from lslam.config import Config
 from lslam.doctor.examine_truth import examine_jumps
 from lslam.doctor.examine_units import examine_units
@@ -31,6 +32,7 @@ from lslam.readers import open_sequence
 from lslam.readers.raw_drive import with_streams
 from lslam.readers.selection import select, with_rings
 from lslam.stopping import asking
+from lslam.types.manual import Manual
 from lslam.types.scan import Span
 from lslam.types.sequence import Sequence
 from lslam.types.trajectory import Trajectory
@@ -50,6 +52,7 @@ class PreparedRun:
     manifest: Manifest
     watch: Watch
     osm: OsmSource | None = None
+    manual: Manual = field(default_factory=Manual)
 
 
 def prepare(
@@ -71,7 +74,8 @@ def prepare(
         require_map(Path(config.localize.map), config.gnss.mode != "off")
     chosen = choose_scans(sequence, odometry, config)
     osm = open_osm(sequence, config)
-    return PreparedRun(chosen, odometry, config, truth, given, Manifest(command, chosen, config), watch, osm)
+    manual = read_manual(config, chosen)
+    return PreparedRun(chosen, odometry, config, truth, given, Manifest(command, chosen, config), watch, osm, manual)
 
 
 def choose_scans(sequence: Sequence, odometry: Odometry, config: Config) -> Sequence:

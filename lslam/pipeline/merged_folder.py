@@ -99,7 +99,8 @@ def _fill(folder: RunFolder, merged: Merged, config: Config, watch: Watch) -> di
         write_tum(folder.path / SESSIONS / f"{session.name}.tum", trajectory, comment=comment)
     rows = _rows(merged, recordings, trajectories, config)
     folder.write_text("sessions.csv", "\n".join([COLUMNS, *map(_line, rows)]) + "\n")
-    write_loops(folder.path / "loops.csv", merged.candidates, merged.chain.keyframes())
+    numbers = [s.results[k.scan].index for s in merged.sessions for k in s.keyframes]
+    write_loops(folder.path / "loops.csv", merged.candidates, numbers)
     accepted = [c.constraint for c in merged.candidates if c.is_accepted and c.constraint is not None]
     constraints = [replace(c, covariance=well_conditioned(c.covariance)) for c in (*merged.chain.odometry(), *accepted)]
     write_g2o(folder.path / "graph.g2o", merged.solution.poses, constraints)

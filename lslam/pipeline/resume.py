@@ -119,7 +119,17 @@ def run_identity(
         "gnss": _digest(() if gnss is None else vars(gnss).values()),
         "osm": extract_digest(config.osm),
         "poses": _digest(() if given is None else (given.stamps_ns, given.poses)),
+        "manual": _content(config.loops.file, config.graph.control),
     }
+
+
+def _content(*paths: str) -> str:
+    """Digest of what files say; empty without any."""
+    try:
+        known = [Path(path).read_bytes() for path in paths if path]
+    except OSError as error:
+        raise InputError(f"{error.filename} cannot be read: {cause(error)}") from None
+    return hashlib.sha256(b"\0".join(known)).hexdigest() if known else ""
 
 
 def _digest(values: Iterable[Any]) -> str:
@@ -178,8 +188,9 @@ def _difference(
         "gnss": "the satellite fixes are others",
         "osm": "the extract of OpenStreetMap is another",
         "poses": "the poses of --poses are others",
+        "manual": "the pairs of --loops-file or the points of --control are others",
     }
-    return "; ".join(text for name, text in named.items() if known.get(name) != identity[name])
+    return "; ".join(text for name, text in named.items() if known.get(name, "") != identity[name])
 
 
 def _refuse_finished(folder: Path, status: str, manifest: dict[str, Any], config: Config) -> None:

@@ -25,6 +25,8 @@ LOCK = ".lock"
 KEYFRAMES = "keyframes"
 SESSIONS = "sessions"
 CHECKPOINT = "checkpoint"
+# Among the keyframes of a run that is over: what its pose graph was made of.
+ODOMETRY, IMU_START = "odometry.npz", "imu.npz"
 REPLIES = "osm_replies"
 SPOOL = ".lslam-map-"  # what a map in the making is called, as its merger does
 # What a run that goes on needs of what the one before left.
@@ -33,7 +35,7 @@ OURS = (
     MANIFEST, "config.toml", LOG, "trajectory.tum", "trajectory_kitti.txt", "covariances.npz", "map.ply",
     "map.pcd", "map.las", "map.laz", "map.json", "map_mesh.ply", "feature_map.ply", "trajectory.geojson",
     "occupancy.npz", "occupancy.ply", "floor_plan.png", "floor_plan.yaml", "evaluation.json",
-    "trajectory_odometry.tum", "loops.csv", "graph.g2o", "osm_matches.csv", "buildings.geojson", "buildings.osm",
+    "trajectory_odometry.tum", "loops.csv", "control.csv", "graph.g2o", "osm_matches.csv", "buildings.geojson", "buildings.osm",
     "timing.csv", "scans.csv", "localization.csv", "sessions.csv", "report.html",
 )  # fmt: skip
 
@@ -92,6 +94,30 @@ class RunFolder:
         """The run is over: what it would have gone on with is of no use any more."""
         shutil.rmtree(self.path / CHECKPOINT, ignore_errors=True)
 
+    def keep_odometry(self) -> None:
+        """The run is over: of its checkpoints those of odometry stay beside the keyframes, for another pose graph."""
+        kept = [*sorted((self.path / CHECKPOINT).glob("odometry-*.npz"))[-1:], self.path / CHECKPOINT / IMU_START]
+        if (self.path / KEYFRAMES).is_dir():
+            for file, name in zip(kept, (ODOMETRY, IMU_START), strict=False):
+                with contextlib.suppress(FileNotFoundError):
+                    os.replace(file, self.path / KEYFRAMES / name)
+        self.drop_checkpoint()
+
+    def begin_from(self, run: Path) -> None:
+        """Lay the keyframes and the odometry of another run ready to go on from; clouds are shared where the disk can.
+
+        Raises OutputError when they cannot be written.
+        """
+        source = run / KEYFRAMES
+        try:
+            for name in (KEYFRAMES, CHECKPOINT):
+                (self.path / name).mkdir(exist_ok=True)
+            for file in sorted(source.glob("*.npz")):
+                place = {ODOMETRY: f"{CHECKPOINT}/odometry-{0:07d}.npz", IMU_START: f"{CHECKPOINT}/{IMU_START}"}
+                _share(file, self.path / place.get(file.name, f"{KEYFRAMES}/{file.name}"))
+        except OSError as error:
+            raise OutputError(f"output folder {self.path} cannot be written: {cause(error)}") from None
+
     def __enter__(self) -> RunFolder:
         """Copy lslam's log into log.txt while the folder is held."""
         try:
@@ -134,6 +160,15 @@ class RunFolder:
             _clear_own(self.path / REPLIES, "*.json")
             _clear_own(self.path / SESSIONS, "*.tum")
             self.drop_checkpoint()
+
+
+def _share(file: Path, target: Path) -> None:
+    """The same file under another name, or a copy of it; files of a run are replaced, never changed."""
+    target.unlink(missing_ok=True)
+    try:
+        os.link(file, target)
+    except OSError:
+        shutil.copyfile(file, target)
 
 
 def _clear_own(folder: Path, names: str) -> None:
@@ -186,6 +221,15 @@ def require_run(path: Path) -> None:
         (path / MANIFEST).stat()
     except OSError as error:
         raise InputError(f"{path} is no folder of a run: {MANIFEST} cannot be read: {cause(error)}") from None
+
+
+def require_odometry(path: Path) -> None:
+    """Raise InputError unless the run in `path` kept what `RunFolder.begin_from` takes."""
+    if not (path / KEYFRAMES / ODOMETRY).is_file():
+        raise InputError(
+            f"{path} kept no state of its odometry, as runs with odometry.checkpoint_s = 0 and those of an earlier lslam: run "
+            "the sequence again"
+        )
 
 
 def _require_free(path: Path, overwrite: bool) -> None:

@@ -41,7 +41,9 @@ def solve(
     if job.config.localize.map:
         return located(job, record, store, checkpoints)
     loops = None if checkpoints is None else Checkpoints(checkpoints.folder, "loops", job.config.odometry.checkpoint_s)
-    done = optimise_poses(job.sequence, record, store, job.config, job.manifest, job.osm, loops, job.watch.should_stop)
+    done = optimise_poses(
+        job.sequence, record, store, job.config, job.manifest, job.osm, loops, job.watch.should_stop, job.manual
+    )
     level_world(record, job.sequence, job.config, job.manifest)
     record.loop_view = view_loop(record, done, store)
     return record, done, score(record, job.sequence, job.config)

@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     from lslam.evaluation.results import Evaluation
 
 Floats = NDArray[np.float64]
+# How fixes were used.
+_WAYS = {"graph": "GNSS in the graph", "fit": "GNSS fitted afterwards"}
 
 # Ellipses on the plan, their sigmas, and how large the largest is drawn at least, as a share of the plan.
 ELLIPSES, SIGMAS, SEEN = 16, 3.0, 0.02
@@ -42,13 +44,22 @@ def back_end_rows(record: RunRecord, evaluation: Evaluation | None) -> list[tupl
     place = record.georeference
     if place is not None:
         lat, lon, height = (float(v) for v in place.origin)
-        what = "GNSS in the graph" if place.method == "graph" else "GNSS fitted afterwards"
-        said = f"{what}: {place.used} of {place.fixes} fixes, {metres(place.rmse_horizontal)} m rms horizontally"
+        way, rmse = _WAYS.get(place.method), metres(place.rmse_horizontal)
+        said = f"{way}: {place.used} of {place.fixes} fixes, {rmse} m rms horizontally"
         if record.map_fixes:
             said = "that of the map"
         elif place.method == "osm":
             said = "by the buildings of OpenStreetMap"
+        elif place.method == "control":
+            said = "by control points"
         rows.append(("georeference", f"origin {lat:.7f}, {lon:.7f}, {height:.1f} m; {said}"))
+    control = record.manifest.get("graph", {}).get("control_points")
+    if control is not None:
+        rows.append((
+            "control",
+            f"{counted(control['count'], 'point')}, {metres(control['rms_horizontal_m'])} m rms horizontally and "
+            f"{metres(control['rms_vertical_m'])} m vertically, the worst {control['worst_sigmas']:.1f} sigmas off",
+        ))  # fmt: skip
     if record.osm is not None:
         (east, north), sigma = -record.osm.shift, float(record.osm.shift_sigma.max())
         rows.append((

@@ -40,7 +40,7 @@ class Georeference:
     T_enu_world : (4, 4) from the run's world into that frame; the identity when the run's world is that frame
     epsg : the code outputs are to be written in; None leaves it to the writer, which takes the UTM zone of the origin
     method : `fit` one rigid transform of the finished trajectory to all fixes; `graph` fixes were factors; `osm` the
-        buildings of OpenStreetMap were
+        buildings of OpenStreetMap were, `control` surveyed points
     fixes, used : fixes that were given, and the inliers
     rmse_horizontal, rmse_vertical : m, of the inliers against the trajectory's antenna
     """
@@ -48,8 +48,13 @@ class Georeference:
     origin: NDArray[np.float64]
     T_enu_world: NDArray[np.float64]
     epsg: int | None = None
-    method: Literal["fit", "graph", "osm"] = "fit"
+    method: Literal["fit", "graph", "osm", "control"] = "fit"
     fixes: int = 0
     used: int = 0
     rmse_horizontal: float = float("nan")
     rmse_vertical: float = float("nan")
+
+    @property
+    def is_in_graph(self) -> bool:
+        """Whether factors of the pose graph made the run's world that frame."""
+        return self.method != "fit"

@@ -10,13 +10,16 @@ import pytest
 from stub_sequences import Stub
 from test_back_end import CITY, COUNT, EVERY, LOOPS, ORIGIN, candidate, config, drifted, on_earth, recording, store_of
 
+from lslam.backend.manual import KeyframePairs
 from lslam.backend.optimise import run_back_end
 from lslam.frontend.checkpoints import Checkpoints
 from lslam.geometry import geodesy, se3
 from lslam.geometry.umeyama import align
+from lslam.keyframes.store import KeyframeStore
 from lslam.pipeline import back_end_pass
 from lslam.simulation.sensors import GnssModel
 from lslam.simulation.sensors import _errors as gnss_errors
+from lslam.types.constraint import LoopCandidate
 from lslam.types.stage_clock import KeyframeClocks
 
 
@@ -74,16 +77,17 @@ def test_loops_that_an_earlier_run_found_are_not_sought_again(tmp_path: Path, mo
     store, kept = store_of(results), Checkpoints(tmp_path / "checkpoint", "loops", 30.0)
     refused = replace(candidate(3, 190), verdict="rejected", constraint=None)
     monkeypatch.setattr(back_end_pass, "find_loops", lambda *_: [*LOOPS, refused])
-    first = back_end_pass._loops(store, config(), kept, KeyframeClocks(), lambda: False)
+
+    def loops(store: KeyframeStore, kept: Checkpoints | None) -> list[LoopCandidate]:
+        none = KeyframePairs([], [])
+        return back_end_pass._loops(store, results, config(), (), none, kept, KeyframeClocks(), lambda: False)[0]
+
+    first = loops(store, kept)
     monkeypatch.setattr(back_end_pass, "find_loops", lambda *_: [])
-    again = back_end_pass._loops(
-        store, config(), Checkpoints(tmp_path / "checkpoint", "loops", 30.0), KeyframeClocks(), lambda: False
-    )
+    again = loops(store, Checkpoints(tmp_path / "checkpoint", "loops", 30.0))
     assert [repr(c) for c in again] == [repr(c) for c in first]
     np.testing.assert_array_equal(
         [c.constraint.covariance for c in again[:-1]], [c.constraint.covariance for c in LOOPS]
     )
-    assert back_end_pass._loops(store_of(results[:-EVERY]), config(), kept, KeyframeClocks(), lambda: False) == [], (
-        "the keyframes are others"
-    )
-    assert back_end_pass._loops(store, config(), None, KeyframeClocks(), lambda: False) == []
+    assert loops(store_of(results[:-EVERY]), kept) == [], "the keyframes are others"
+    assert loops(store, None) == []

@@ -17,7 +17,7 @@ WORDS = ("--set", "odometry.checkpoint_s=0.2", "--set", "report.html=false")
 
 
 def files_of(folder: Path) -> dict[str, bytes]:
-    changing = ("manifest.json", "log.txt", "timing.csv", "config.toml")
+    changing = ("manifest.json", "log.txt", "timing.csv", "config.toml", "odometry.npz")
     files = [file for file in folder.rglob("*") if file.is_file() and file.name not in changing]
     return {str(file.relative_to(folder)): file.read_bytes() for file in files}
 

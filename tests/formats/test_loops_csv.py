@@ -11,9 +11,8 @@ import pytest
 from lslam.errors import OutputError
 from lslam.formats.run_tables import LOOP_COLUMNS, write_loops
 from lslam.types.constraint import Constraint, LoopCandidate
-from lslam.types.keyframe import Keyframe
 
-KEYFRAMES = [Keyframe(k, 3 * k, k, np.eye(4)) for k in range(5)]
+SCANS = [0, 3, 6, 9, 12]
 COVARIANCE = np.diag([0.01, 0.04, 0.01, 1e-6, 1e-6, np.deg2rad(0.5) ** 2])
 
 
@@ -24,7 +23,7 @@ def test_rows_say_what_became_of_each_candidate(tmp_path: Path) -> None:
         ),
         LoopCandidate(1, 4, 7.0, float("nan"), "rejected", "ambiguity", 'twice, and "alike"'),
     ]
-    write_loops(tmp_path / "loops.csv", candidates, KEYFRAMES)
+    write_loops(tmp_path / "loops.csv", candidates, SCANS)
     with (tmp_path / "loops.csv").open(newline="") as stream:
         rows = list(csv.DictReader(stream))
     assert tuple(rows[0]) == LOOP_COLUMNS

@@ -18,6 +18,7 @@ from lslam.evaluation.timing import read_timing
 from lslam.formats.calibration_files import read_cam0_lidar, read_mcd_extrinsics, read_transform
 from lslam.formats.g2o import read_g2o
 from lslam.formats.geojson import read_corrected, read_line
+from lslam.formats.manual_files import read_control_points, read_named_pairs
 from lslam.formats.osm_buildings import read_buildings
 from lslam.formats.oxts_files import read_oxts
 from lslam.formats.pose_rows import read_stamps
@@ -148,6 +149,18 @@ def _results(folder: Path) -> list[Files]:
     return [{"results.csv": (folder / "results.csv").read_bytes()}]
 
 
+def _named_pairs(folder: Path) -> list[Files]:
+    return [
+        {"a.csv": b"scan_a,scan_b,verdict,x_m,within_m\n0,84,known,2.5,4\n2,88,accepted,,\n3,90,forbidden,,\n"},
+        {"a.csv": b"stamp_a;stamp_b;verdict\n12.5;99.25;known\n"},
+    ]
+
+
+def _control_points(folder: Path) -> list[Files]:
+    row = b"7,457799.014,5428861.26,115.006,0.01,EPSG:25832,1,2,-1.5\n"
+    return [{"a.csv": b"scan,x,y,z,sigma,crs,lidar_x,lidar_y,lidar_z\n" + row + row}]
+
+
 def _state(folder: Path) -> list[Files]:
     write_state(folder / "a.npz", {"a": [1, 2.0, "x", None], "b": (np.eye(3), {"c": np.arange(4)})}, 1)
     return [{"a.npz": (folder / "a.npz").read_bytes()}]
@@ -159,7 +172,7 @@ def _oxts(folder: Path) -> list[Files]:
     return [rows | {"timestamps.txt": stamps}, rows | {"timestamps.txt": b"9999-99-99 99:99:99\n"}]
 
 
-_IDENTITY = dict.fromkeys(("input", "reading", "imu", "gnss", "osm", "poses"), "x")
+_IDENTITY = dict.fromkeys(("input", "reading", "imu", "gnss", "osm", "poses", "manual"), "x")
 _SCANS_CSV = "index,stamp_ns,status,posed_by\n" + "".join(f"{k},0,ok,\n" for k in range(5))
 _GEOREFERENCE = {
     "origin_lat_lon_height": [49.0, 8.4, 110.0],
@@ -224,6 +237,8 @@ PARSERS = [
     _text_parser("g2o", "graph.g2o", read_g2o, _G2O),
     _text_parser("timing.csv", "timing.csv", read_timing, _TIMING),
     Parser("results.csv", lambda f: read_study_csv(f / "results.csv"), _results, tables=("results.csv",)),
+    Parser("named pairs", lambda f: read_named_pairs(f / "a.csv"), _named_pairs, tables=("a.csv",)),
+    Parser("control points", lambda f: read_control_points(f / "a.csv"), _control_points, tables=("a.csv",)),
     Parser("run state", lambda f: read_state(f / "a.npz", ()), _state),
     _text_parser("sequence.toml", "sequence.toml", read_sequence_toml, (_SAMPLE / "sequence.toml").read_bytes()),
     _text_parser("configuration", "c.toml", load_config, to_toml(load_config()), '[odometry]\npreset = "hdl"\n'),

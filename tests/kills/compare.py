@@ -1,8 +1,8 @@
 """Two run folders, byte by byte, but for what is a time.
 
-Not compared: log.txt and timing.csv. Of manifest.json, and where the report shows it: `timings`, `started`, `written`,
-`peak_memory_mb`, `resumed_after_scans` and `imu.saved_ms_per_scan`. Of report.html: its section "Time", the two headline
-numbers of it, and the milliseconds in the sentence about the IMU.
+Not compared: log.txt, timing.csv and keyframes/odometry.npz, which have the seconds of each scan. Of manifest.json, and where
+the report shows it: `timings`, `started`, `written`, `peak_memory_mb`, `resumed_after_scans` and `imu.saved_ms_per_scan`. Of
+report.html: its section "Time", the two headline numbers of it, and the milliseconds in the sentence about the IMU.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import json
 import re
 from pathlib import Path
 
-TIMED_FILES = ("log.txt", "timing.csv")
+TIMED_FILES = ("log.txt", "timing.csv", "keyframes/odometry.npz")
 TIMED_KEYS = ("timings", "started", "written", "peak_memory_mb", "resumed_after_scans")
 _ROWS = "|".join(re.escape(key) for key in (*TIMED_KEYS, "imu.saved_ms_per_scan"))
 _TIMES_OF_REPORT = (

@@ -1,0 +1,185 @@
+"""Control points: surveyed positions as factors of the pose graph, and what is left of them in the solution."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence as Many
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.backend.georeferencing import LEVELLED, UNLEVELLED, Placement
+from lslam.backend.manual import stamp_of
+from lslam.config import Config
+from lslam.errors import UsageError
+from lslam.geometry import geodesy, se3, so3
+from lslam.geometry.interpolate import poses_at
+from lslam.graph.chi_square import quantile
+from lslam.graph.consistency import Drift
+from lslam.graph.problem import PositionFix
+from lslam.maps.georeference import Projection, to_wgs84
+from lslam.types.gnss import Georeference
+from lslam.types.keyframe import Keyframe
+from lslam.types.manual import ControlPoint, ControlResidual
+from lslam.types.scan_result import ScanResult
+
+log = logging.getLogger("lslam")
+Floats = NDArray[np.float64]
+
+# rad; with a heading known no better, the points say nothing of which way a run goes.
+VAGUE = np.deg2rad(10.0)
+# Sentences of one run.
+MOST_SAID = 6
+
+
+def with_control(
+    placement: Placement, points: Many[ControlPoint], results: Many[ScanResult], keyframes: Many[Keyframe],
+    up: Floats | None, config: Config,
+) -> Placement:  # fmt: skip
+    """The placement with the control points as held fixes; where there is none, they give it.
+
+    results : at the poses of odometry; up : (3,) up in their world as an IMU has it, None for its z axis
+
+    Raises UsageError for coordinates that PROJ does not know or that are none of a place.
+    """
+    on_earth = np.concatenate([to_wgs84(point.position[None], point.epsg) for point in points])
+    stamps = np.array([stamp_of(point.at, results) for point in points])
+    seen = _seen(points, stamps, results)
+    sigmas = np.stack([point.sigma for point in points])
+    known = placement.georeference
+    if known is None:
+        level = so3.least_rotation(np.array([0.0, 0.0, 1.0]) if up is None else up, np.array([0.0, 0.0, 1.0]))
+        enu = geodesy.to_local(on_earth, on_earth[0])
+        T = _aligned(seen @ level.T, enu, sigmas)
+        if T is None:
+            return replace(
+                placement,
+                problem=f"control points: {len(points)} of them lie too near to each other to say which way the run goes",
+            )
+        T_enu_world = T @ se3.make(level, np.zeros(3))
+        known = Georeference(on_earth[0], T_enu_world, _epsg(points, on_earth[0], config), "control")
+        tilt = UNLEVELLED if up is None else LEVELLED
+    else:
+        enu, tilt = geodesy.to_local(on_earth, known.origin), placement.tilt_sigma
+    held = [
+        _held(position, sigma, place, int(stamp), results, keyframes)
+        for position, sigma, place, stamp in zip(enu, sigmas, seen, stamps, strict=True)
+    ]
+    return replace(placement, georeference=known, fixes=(*placement.fixes, *held), tilt_sigma=tilt)
+
+
+def _held(
+    position: Floats, sigma: Floats, seen: Floats, stamp_ns: int, results: Many[ScanResult], keyframes: Many[Keyframe]
+) -> PositionFix:
+    """The factor, between the keyframes around the instant."""
+    known = [k.stamp_ns for k in keyframes]
+    owner = int(np.clip(np.searchsorted(known, stamp_ns, side="right") - 1, 0, len(known) - 2))
+    share = float(np.clip((stamp_ns - known[owner]) / (known[owner + 1] - known[owner]), 0.0, 1.0))
+    arms = [se3.apply(se3.inverse(results[keyframes[k].scan].T_world_lidar), seen[None])[0] for k in (owner, owner + 1)]
+    return PositionFix(owner, position, sigma, arms[0], is_held=True, share=share, next_arm=arms[1])
+
+
+def control_residuals(
+    points: Many[ControlPoint], results: Many[ScanResult], georeference: Georeference
+) -> list[ControlResidual]:
+    """What is left of the points at the final poses."""
+    on_earth = np.concatenate([to_wgs84(point.position[None], point.epsg) for point in points])
+    stamps = np.array([stamp_of(point.at, results) for point in points])
+    off = geodesy.to_local(on_earth, georeference.origin) - se3.apply(
+        georeference.T_enu_world, _seen(points, stamps, results)
+    )
+    return [
+        ControlResidual(point, int(stamp), residual) for point, stamp, residual in zip(points, stamps, off, strict=True)
+    ]
+
+
+def against_odometry(
+    points: Many[ControlPoint], results: Many[ScanResult], keyframes: Many[Keyframe], config: Config
+) -> list[str]:
+    """One sentence for each pair of successive points that are not so far apart as odometry may have them.
+
+    Distances need no heading. A trajectory that holds the points bends to a wrong one without a residual: odometry alone tells.
+    """
+    if len(points) < 2 or len(keyframes) < 2:
+        return []
+    stamps = np.array([stamp_of(point.at, results) for point in points])
+    order = np.argsort(stamps, kind="stable")
+    there = np.concatenate([to_wgs84(points[i].position[None], points[i].epsg) for i in order])
+    enu, seen = geodesy.to_local(there, there[0]), _seen(points, stamps, results)[order]
+    nearest = np.abs(np.array([k.stamp_ns for k in keyframes]) - stamps[order][:, None]).argmin(1)
+    drift = Drift(
+        np.stack([k.T_world_lidar[:3, 3] for k in keyframes]), np.array([k.distance for k in keyframes]),
+        config.graph.drift_percent, np.deg2rad(config.graph.drift_deg_per_100m) / 100,
+    )  # fmt: skip
+    own = np.array([float((points[i].sigma ** 2).max()) for i in order])
+    sigma = np.sqrt(drift.covariance(nearest[:-1], nearest[1:])[:, 0, 0] + own[:-1] + own[1:])
+    off = np.linalg.norm(np.diff(enu, axis=0), axis=1) - np.linalg.norm(np.diff(seen, axis=0), axis=1)
+    times = np.abs(off) / (float(np.sqrt(quantile(config.graph.probability, 1))) * sigma)
+    names = [points[i].at.said for i in order]
+    said = [
+        f"{names[k]} and {names[k + 1]}: the control points are {abs(off[k]):.2f} m "
+        f"{'farther apart' if off[k] > 0 else 'nearer to each other'} than odometry has them, {times[k]:.1f} times what it may "
+        "drift: they hold, are scan, sigma and CRS right?"
+        for k in np.flatnonzero(times > 1).tolist()
+    ]
+    return (
+        said
+        if len(said) <= MOST_SAID
+        else [*said[:MOST_SAID], f"and {len(said) - MOST_SAID} more pairs of control points"]
+    )
+
+
+def control_facts(residuals: Many[ControlResidual]) -> dict[str, float]:
+    """For the manifest."""
+    off = np.stack([one.residual for one in residuals])
+    return {
+        "count": len(residuals),
+        "rms_horizontal_m": round(float(np.sqrt((off[:, :2] ** 2).sum(1).mean())), 4),
+        "rms_vertical_m": round(float(np.sqrt((off[:, 2] ** 2).mean())), 4),
+        "worst_sigmas": round(max(one.size for one in residuals), 2),
+    }
+
+
+def contradicting(residuals: Many[ControlResidual], probability: float) -> list[str]:
+    """One sentence for each point that the others and odometry contradict: a held one bends the trajectory to it all the same."""
+    limit = float(np.sqrt(quantile(probability, 3)))
+    wrong = sorted((one for one in residuals if one.size > limit), key=lambda one: -one.size)
+    said = [
+        f"{one.point.at.said}: the control point is left off by {np.linalg.norm(one.residual):.2f} m, {one.size:.1f} sigmas: "
+        "is it the right scan, sigma and CRS?"
+        for one in wrong[:MOST_SAID]
+    ]
+    more = len(wrong) - MOST_SAID
+    return [*said, f"and {more} more control points: see control.csv"] if more > 0 else said
+
+
+def _seen(points: Many[ControlPoint], stamps: NDArray[np.int64], results: Many[ScanResult]) -> Floats:
+    """(N, 3) m, where the results have the points, in their world."""
+    poses = poses_at(np.array([r.stamp_ns for r in results]), np.stack([r.T_world_lidar for r in results]), stamps)
+    return np.asarray(np.einsum("nij,nj->ni", poses[:, :3, :3], np.stack([p.seen for p in points])) + poses[:, :3, 3])
+
+
+def _aligned(seen: Floats, enu: Floats, sigmas: Floats) -> Floats | None:
+    """(4, 4) by heading and place, least squares of points (N, 3) of a level world; None where they leave the heading vague."""
+    weights = 1.0 / sigmas[:, 0] ** 2
+    weights /= weights.sum()
+    a, b = (points - weights @ points for points in (seen, enu))
+    spread = weights @ (a[:, :2] ** 2).sum(1)
+    if float(np.sqrt((weights @ sigmas[:, 0] ** 2) / len(seen))) > VAGUE * float(np.sqrt(spread)):
+        return None
+    across = weights @ (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
+    R = so3.exp(np.array([0.0, 0.0, np.arctan2(across, weights @ (a[:, :2] * b[:, :2]).sum(1))]))
+    return se3.make(R, weights @ enu - R @ (weights @ seen))
+
+
+def _epsg(points: Many[ControlPoint], origin: Floats, config: Config) -> int | None:
+    """What the outputs are written in: as configured, else as the points are given where that is a plane in metres."""
+    codes = {point.epsg for point in points}
+    if config.gnss.crs is not None or len(codes) > 1:
+        return config.gnss.crs
+    try:
+        Projection(Georeference(origin, np.eye(4), epsg=next(iter(codes)))).check()
+    except UsageError:
+        return None
+    return codes.pop()

@@ -1,0 +1,97 @@
+"""`lslam graph`: the pose graph of a run again, without its odometry."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import click
+
+from lslam.cli import options
+from lslam.cli.console import log, setup_logging
+from lslam.errors import RunFinishedError, UsageError
+
+
+@click.command(
+    epilog="\b\nExamples: lslam graph runs/first --loops edits.csv\n"
+    "          lslam graph runs/first --control points.csv --out runs/surveyed\n"
+    "          lslam graph runs/first --loops edits.csv --only-known --set graph.robust=huber --json"
+)
+@click.argument("run", metavar="RUN", type=click.Path(path_type=Path))
+@click.option(
+    "--loops", "loops_file", type=click.Path(path_type=Path), metavar="FILE",
+    help="CSV of pairs of scans that are loops, or must not be: scan_a,scan_b,verdict (known, forbidden); loops.csv of the "
+    "run with these words in it will do.",
+)  # fmt: skip
+@click.option("--only-known", is_flag=True, help="Close the known pairs alone, search no others.")
+@click.option(
+    "--control", type=click.Path(path_type=Path), metavar="FILE",
+    help="CSV of control points, surveyed positions that hold the poses: scan,x,y,z,sigma,crs.",
+)  # fmt: skip
+@click.option("--gnss", "gnss", flag_value="graph", default=None, help="Satellite fixes are factors of the pose graph.")
+@click.option("--georeference", "gnss", flag_value="fit", help="Satellite fixes only georeference the result.")
+@click.option("--crs", metavar="EPSG:N", help="Coordinates of georeferenced maps [default: the control points'].")
+@click.option(
+    "--gt", type=click.Path(path_type=Path), metavar="FILE", help="Ground truth instead of the sequence's own."
+)
+@click.option(
+    "--sequence", type=click.Path(path_type=Path), metavar="PATH", help="Sequence of the raw scans, when it has moved."
+)
+@click.option("--no-map", is_flag=True, help="Only trajectory and report.")
+@click.option("--out", type=click.Path(path_type=Path), metavar="DIR", help="Run folder [default: RUN-graph].")
+@click.option("--resume", is_flag=True, help="Go on where it was killed or interrupted.")
+@click.option("--overwrite", is_flag=True, help="Replace an earlier run in the folder.")
+@options.reading
+@click.option(
+    "--set", "settings", multiple=True, metavar="SECTION.KEY=VALUE",
+    help="Set one configuration key of what follows odometry; repeatable.",
+)  # fmt: skip
+@options.as_json
+@options.verbosity
+def command(run: Path, **given: Any) -> None:
+    """Optimise the pose graph of a run again, without odometry, into a run folder of its own.
+
+    Known pairs and control points hold the poses: nothing rejects them, and what they contradict is said.
+    """
+    setup_logging(given["verbose"], given["quiet"])
+    if given["overwrite"] and given["resume"]:
+        raise UsageError("--overwrite does everything anew and --resume keeps finished parts: give one of them")
+    options.require_there(given["loops_file"], given["control"], given["gt"])
+    from lslam.cli.run import print_finished, print_result, read_truth, watch_of
+    from lslam.pipeline.regraph import open_again, optimise_again, read_for_graph
+    from lslam.pipeline.run_folder import check_target
+    from lslam.stopping import heeded
+
+    out = given["out"] or run.with_name(f"{run.absolute().name}-graph")
+    if not given["resume"]:
+        check_target(out, given["overwrite"])
+    if out.absolute() == run.absolute():
+        raise UsageError(f"--out {out}: the run itself stays as it is, name another folder")
+    known = read_for_graph(run, _settings(given))
+    opened = open_again(known, given["sequence"], **options.reading_of(given))
+    truth = read_truth(given["gt"], opened)
+    try:
+        with heeded() as stop, ExitStack() as stack:
+            optimise_again(
+                known, opened, out, ground_truth=truth, overwrite=given["overwrite"], resume=given["resume"],
+                command=shlex.join(["lslam", *sys.argv[1:]]),
+                watch=watch_of(stack, stop, lambda outcome: print_result(outcome, out, given["as_json"])),
+            )  # fmt: skip
+    except RunFinishedError as finished:
+        log.info("%s", finished)
+        print_finished(out, given["as_json"])
+
+
+def _settings(given: dict[str, Any]) -> list[str]:
+    """Flags over --set, as settings."""
+    flags = options.manual_settings(given["loops_file"], given["control"])
+    flags |= {
+        "loops.use": "false" if given["only_known"] else None,
+        "gnss.mode": given["gnss"],
+        "gnss.crs": None if given["crs"] is None else str(options.epsg(given["crs"])),
+        "map.write": "false" if given["no_map"] else None,
+    }
+    return [*given["settings"], *(f"{key}={value}" for key, value in flags.items() if value is not None)]
