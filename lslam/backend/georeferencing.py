@@ -13,7 +13,7 @@ from lslam.config.config import Config
 from lslam.config.gnss import GnssConfig
 from lslam.config.graph import GraphConfig
 from lslam.errors import InputError
-from lslam.geometry import geodesy, noise, se3, so3
+from lslam.geometry import geodesy, noise, se3
 from lslam.geometry.interpolate import poses_at
 from lslam.graph.chi_square import quantile
 from lslam.graph.drift import chains, drift_covariance
@@ -186,10 +186,7 @@ def _at_first(found: GnssAlignment, fixes: Fixes, config: GnssConfig) -> tuple[G
     """The georeference with its origin at the first inlier fix, and that shift of origin, (4, 4)."""
     first = fixes.positions[int(np.argmax(found.inliers))]
     origin = geodesy.from_local(first[None], fixes.origin)[0]
-    # Meridians converge: the two frames' norths differ by a little turn about up.
-    ahead = geodesy.to_local(geodesy.from_local(first[None] + [[0.0, 1000.0, 0.0]], fixes.origin), origin)[0]
-    R = so3.exp(np.array([0.0, 0.0, np.arctan2(-ahead[0], ahead[1])]))
-    shift = se3.make(R, -R @ first)
+    shift = geodesy.frame_change(fixes.origin, origin)
     residuals = found.residuals[found.inliers]
     return Georeference(
         origin=origin,

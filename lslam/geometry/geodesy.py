@@ -7,6 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.geometry import se3, so3
+
 Floats = NDArray[np.float64]
 
 
@@ -31,6 +33,17 @@ def from_local(enu: NDArray[Any], origin: NDArray[Any]) -> Floats:
     points = np.asarray(enu, np.float64).reshape(-1, 3)
     lon, lat = _projection(origin)(points[:, 0], points[:, 1], inverse=True)
     return np.column_stack([lat, lon, points[:, 2] + float(np.asarray(origin)[2])])
+
+
+def frame_change(old: NDArray[Any], new: NDArray[Any]) -> Floats:
+    """(4, 4) from the local frame about `old` (3,) lat, lon (deg), height (m) to that about `new`, near both.
+
+    Meridians converge: the norths of the two differ by a little turn about up.
+    """
+    at = to_local(np.asarray(new, np.float64)[None], old)[0]
+    ahead = to_local(from_local(at[None] + [[0.0, 1000.0, 0.0]], old), new)[0]
+    R = so3.exp(np.array([0.0, 0.0, np.arctan2(-ahead[0], ahead[1])]))
+    return se3.make(R, -R @ at)
 
 
 def _projection(origin: NDArray[Any]) -> Any:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.config.config import Config
-from lslam.geometry import noise, se3
+from lslam.geometry import geodesy, noise, se3
 from lslam.graph.odometry_constraints import positive
 from lslam.kernels import voxel
 from lslam.kernels.transform import transform
@@ -17,9 +17,10 @@ from lslam.keyframes.store import KeyframeStore
 from lslam.keyframes.submaps import submap
 from lslam.localization.place_search import PlaceSearch
 from lslam.localization.prior_map import make_prior_map
-from lslam.localization.start import PlaceFinder, Start
+from lslam.localization.start import PlaceFinder, Start, StartPrior
 from lslam.preprocessing.prepare import NO_TIMES
 from lslam.types.constraint import Constraint
+from lslam.types.gnss import Georeference
 from lslam.types.keyframe import Keyframe
 from lslam.types.scan_result import ScanResult
 
@@ -37,6 +38,7 @@ class Session:
     keyframes : at the final poses of its run, in its own world; store : their clouds
     results : all its scans, likewise; T_town_session : (4, 4) from its world into the common one
     start : how it was found among the sessions before it, None of the first
+    georeference : of its own world, None where that lies nowhere
     """
 
     name: str
@@ -45,6 +47,7 @@ class Session:
     results: list[ScanResult]
     T_town_session: Floats = field(default_factory=lambda: np.eye(4))
     start: Start | None = None
+    georeference: Georeference | None = None
 
     @property
     def poses(self) -> Floats:
@@ -147,11 +150,33 @@ def tie(
     cloud = np.concatenate([_cloud_of(s) for s in known])
     prior_map = make_prior_map(cloud.astype(np.float64), config.registration, source="the sessions before")
     finder = PlaceFinder(PlaceSearch(prior_map, config.registration), _AtFinalPoses(session), config)
-    start = finder.find(None, should_stop)
+    expected = by_georeference(session, known)
+    prior = None if expected is None else _prior(se3.inverse(prior_map.T_map_level) @ expected, session, config)
+    start = finder.find(prior, should_stop)
+    if start is None and prior is not None:
+        return None, "it is not where its georeference puts it among them"
     if start is None:
         said = [reason.split(",")[0] for reason in finder.reasons]
         return None, max(set(said), key=said.count) if said else "its keyframes do not agree on a place"
     return replace(session, T_town_session=prior_map.T_map_level @ start.vote.T_level_odometry, start=start), ""
+
+
+def by_georeference(session: Session, known: Sequence[Session]) -> Floats | None:
+    """(4, 4) from its world into the common one, by the first known one that lies on the Earth; None without two that do."""
+    other = next((s for s in known if s.georeference is not None), None)
+    if other is None or other.georeference is None or session.georeference is None:
+        return None
+    T_other_own = geodesy.frame_change(session.georeference.origin, other.georeference.origin)
+    T_world_enu = se3.inverse(other.georeference.T_enu_world)
+    return np.asarray(other.T_town_session @ T_world_enu @ T_other_own @ session.georeference.T_enu_world)
+
+
+def _prior(T: Floats, session: Session, config: Config) -> StartPrior:
+    """Where the first keyframe is expected by T (4, 4), from the session's world into level axes of the map."""
+    first = T @ session.keyframes[0].T_world_lidar
+    c = config.localize
+    heading = float(np.arctan2(first[1, 0], first[0, 0]))
+    return StartPrior(first[:2, 3], heading, c.start_radius, float(np.deg2rad(c.start_turn_deg)))
 
 
 class _AtFinalPoses(KeyframeStore):

@@ -107,7 +107,7 @@ def read_session(folder: Path, name: str) -> tuple[EarlierRun, Session]:
     if store.keyframes[-1].scan >= len(results):
         raise InputError(f"{folder / KEYFRAMES} does not belong to the {len(results)} poses of trajectory.tum")
     keyframes = [replace(k, T_world_lidar=results[k.scan].T_world_lidar) for k in store.keyframes]
-    return run, Session(name, store, keyframes, results)
+    return run, Session(name, store, keyframes, results, georeference=run.georeference)
 
 
 def _with_covariances(run: EarlierRun) -> list[ScanResult]:

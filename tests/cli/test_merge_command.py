@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from calling import SAMPLE, assert_one_sentence, lslam, strict_json
-from revisits import record_visits, run, town_poses
+from revisits import frame_from_town, record_visits, run, town_poses
 
 from lslam.config import load_config
 from lslam.errors import InterruptedRunError
@@ -18,8 +18,12 @@ from lslam.formats.point_files import read_cloud
 from lslam.formats.trajectory_files import read_trajectory
 from lslam.geometry import se3
 from lslam.geometry.umeyama import align
+from lslam.localization.sessions import by_georeference
+from lslam.maps.georeference import Projection
+from lslam.pipeline.merge_runs import read_session
 from lslam.pipeline.merged_folder import merge_into
 from lslam.pipeline.watch import Watch
+from lslam.types.gnss import Georeference
 
 SAME = ("sessions/monday-run.tum", "sessions/tuesday-run.tum", "loops.csv", "graph.g2o", "map.ply")
 
@@ -69,6 +73,29 @@ def test_the_map_is_of_both(runs: Path, town: Path) -> None:
     both, one = read_cloud(town / "map.ply").points, read_cloud(runs / "monday-run" / "map.ply").points
     assert len(both) > 1.05 * len(one)
     assert strict_json((town / "map.json").read_text())["sequence"] == "monday-run, tuesday-run"
+
+
+def test_sessions_on_the_earth_are_sought_where_they_lie(runs: Path, tmp_path: Path) -> None:
+    on_earth = Projection(Georeference(np.array([49.0112, 8.4229, 115.0]), np.eye(4), 25832))
+    truths = {name: town_poses(runs, name)[:40, :3, 3] for name in ("monday", "tuesday")}
+    for name, run_of in (("monday", "monday-run"), ("tuesday", "tuesday-run"), ("monday", "elsewhere")):
+        places = on_earth.apply(truths[name])
+        rows = [f"{k},{places[k, 0]:.3f},{places[k, 1]:.3f},{places[k, 2]:.3f},0.5,EPSG:25832" for k in (0, 15, 39)]
+        (tmp_path / "points.csv").write_text("\n".join(["scan,x,y,z,sigma,crs", *rows]) + "\n")
+        words = ("--control", tmp_path / "points.csv", "--no-map", "--out", tmp_path / run_of, "-q")
+        assert lslam("graph", runs / run_of, *words).returncode == 0
+    read = [read_session(tmp_path / name, name)[1] for name in ("monday-run", "tuesday-run")]
+    T = by_georeference(read[1], read[:1])
+    assert T is not None
+    true = [frame_from_town(runs, tmp_path / f"{name}-run" / "trajectory.tum", name) for name in ("monday", "tuesday")]
+    apart = se3.relative(true[0] @ se3.inverse(true[1]), T)
+    assert np.linalg.norm(apart[:2, 3]) < 0.5
+    names = [tmp_path / name for name in ("monday-run", "elsewhere", "tuesday-run")]
+    done = lslam("merge", *names, "--out", tmp_path / "town", "--json", "--set", "map.write=false")
+    assert done.returncode == 0, done.stderr
+    about = strict_json(done.stdout)["manifest"]
+    assert [one["name"] for one in about["sessions"]] == ["monday-run", "tuesday-run"]
+    assert "not where its georeference puts it" in about["left_out"][0]["why"]
 
 
 def test_any_number_of_threads_gives_the_same_bytes(runs: Path, town: Path, tmp_path: Path) -> None:

@@ -89,3 +89,10 @@ def test_devkit_projection_gives_the_official_ground_truth(recordings: Callable[
     error = np.linalg.norm(se3.apply(T, estimate) - truth, axis=1)
     assert error.mean() < 0.06
     assert error.max() < 0.15
+
+
+def test_a_point_has_the_same_place_in_two_local_frames() -> None:
+    old, new = np.array([49.0, 8.4, 110.0]), np.array([49.02, 8.45, 130.0])
+    there = np.array([[3650.0, 2300.0, 5.0], [3000.0, 2000.0, -4.0]])
+    moved = se3.apply(geodesy.frame_change(old, new), there)
+    np.testing.assert_allclose(moved, geodesy.to_local(geodesy.from_local(there, old), new), atol=2e-3)
