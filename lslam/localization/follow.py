@@ -40,14 +40,16 @@ class MapFollower(Stateful):
     The prior's information enters the normal equations, so that the map corrects where its surfaces constrain a pose and odometry
     decides along directions that they leave open. What the map corrects never changes the map.
 
-    T, P : pose (4, 4) in level axes of the map and its covariance (6, 6), of the scan seen last
+    T, P : pose (4, 4) in level axes of the map and its covariance (6, 6), of the scan seen last, as independent steps add up
+    way : m since the map last held a scan, over which odometry drifts steadily
     R_level_odometry : (3, 3) axes of odometry's world in those of the map
     """
 
-    STATE = ("T", "P", "usual")
+    STATE = ("T", "P", "way", "usual")
 
     def __init__(self, view: LocalView, T: Floats, P: Floats, config: Config, search: Search | None = None) -> None:
         self.view, self.T, self.P, self.config, self.search = view, T, P, config, search
+        self.way = 0.0
         self.usual = UsualAgreement(config.registration.min_agreement)
         self._gate = quantile(1.0 - CHANCE, 6)
         c = config.loops
@@ -64,6 +66,15 @@ class MapFollower(Stateful):
         )
         self.P = noise.transported(self.P, T[:3, 3] - self.T[:3, 3]) + grown + drift_covariance(way, self.config.graph)
         self.T = T
+        self.way += way
+
+    @property
+    def covariance(self) -> Floats:
+        """(6, 6) of the pose, with the drift that does not average out: in proportion to the way, its turn to the way squared."""
+        c = self.config.loops
+        turn = np.deg2rad(c.drift_deg) / 100 * self.way
+        move = 0.01 * c.drift_percent * self.way + 0.5 * turn * self.way
+        return self.P + np.diag(np.repeat([move**2, turn**2], 3))
 
     def correct(self, position: int, points: PreparedPoints | None) -> MapFix:
         """The scan of that position of the run on the map; its points deskewed, None when there are none."""
@@ -84,7 +95,7 @@ class MapFollower(Stateful):
             return self._carried(status, reason, found)
         assert found.covariance is not None
         self.usual.observe(found.inlier_share)
-        self.T, self.P = found.T_world_lidar, found.covariance + self._floor
+        self.T, self.P, self.way = found.T_world_lidar, found.covariance + self._floor, 0.0
         return MapFix(self.T, self.P, "held", found.overlap, found.inlier_share, (move, turn))
 
     def _align(self, alignment: MapAlignment, points: PreparedPoints, start: Floats) -> RegistrationResult:
@@ -95,7 +106,7 @@ class MapFollower(Stateful):
         c = self.config.registration
         width = max(self._spread(), NEAR_KERNEL * c.kernel_min)
         if start is self.T and width <= c.kernel_max:
-            information = np.asarray(np.linalg.inv(self.P), np.float64)
+            information = np.asarray(np.linalg.inv(self.covariance), np.float64)
             return alignment.refine(points, start, width, c.max_iterations, information=information)
         if start is self.T:
             start = alignment.coarse_to_fine(points, start, width).T_world_lidar
@@ -115,7 +126,7 @@ class MapFollower(Stateful):
             )
         d = se3_difference(self.T, found.T_world_lidar)
         # A scan that fits as well as those before has found its place, and odometry is worse than its covariance.
-        is_outlier = float(d @ np.linalg.solve(self.P + self._floor, d)) > self._gate
+        is_outlier = float(d @ np.linalg.solve(self.covariance + self._floor, d)) > self._gate
         if is_outlier and self.usual.is_less(found.inlier_share):
             move, turn = correction(self.T, found.T_world_lidar)
             return "changed", f"the map would move it by {move:.2f} m and {np.rad2deg(turn):.1f} deg"
@@ -123,12 +134,13 @@ class MapFollower(Stateful):
 
     def _spread(self) -> float:
         """m, `SIGMAS` standard deviations of a point at `LEVER_M`, where they are largest."""
-        position, turn = (float(np.linalg.eigvalsh(part)[-1]) for part in (self.P[:3, :3], self.P[3:, 3:]))
+        P = self.covariance
+        position, turn = (float(np.linalg.eigvalsh(part)[-1]) for part in (P[:3, :3], P[3:, 3:]))
         return SIGMAS * float(np.sqrt(position + LEVER_M**2 * turn))
 
     def _carried(self, status: FixStatus, reason: str, found: RegistrationResult | None = None) -> MapFix:
         overlap, share = (0.0, 0.0) if found is None else (found.overlap, found.inlier_share)
-        return MapFix(self.T, self.P, status, overlap, share, reason=reason)
+        return MapFix(self.T, self.covariance, status, overlap, share, reason=reason)
 
 
 def doubted(fixes: list[MapFix]) -> list[MapFix]:

@@ -53,6 +53,12 @@ class PlaceSearch:
         self._lowest = self.grid.lowest(self.whole.ground)
         self.is_seen = seen.ravel() > 0
 
+    def is_near(self, position: Floats, radius: float) -> bool:
+        """Whether the map was observed anywhere within `radius` m of a position (2,), level axes."""
+        at = (np.arange(self.grid.size) - self.grid.size // 2 + 0.5) * CELL
+        away2 = (at[:, None] - position[0]) ** 2 + (at[None, :] - position[1]) ** 2
+        return bool(self.is_seen.reshape(away2.shape)[away2 <= max(radius, CELL) ** 2].any())
+
     def guesses(self, query: LevelSubmap, region: Region | None = None) -> list[Floats]:
         """T_level_query (4, 4), level axes of both, of the best correlations, best first; empty without upright structure.
 

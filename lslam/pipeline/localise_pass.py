@@ -134,9 +134,11 @@ class Reanchoring:
         self._keyframe_of = {k.scan: k.number for k in search.store.keyframes}
 
     def __call__(self, position: int, T: Floats, radius: float) -> Floats | None:
-        """Pose (4, 4), level axes, of the scan at that position, within `radius` m of T (4, 4); None of no keyframe."""
+        """Pose (4, 4), level axes, of the scan at that position, within `radius` m of T (4, 4); None of no keyframe, and far
+        from the map.
+        """
         b = self._keyframe_of.get(position)
-        if b is None:
+        if b is None or not self._search.search.is_near(T[:2, 3], radius):
             return None
         vote = self._search.vote(b, self._search.region_about(b, T, radius))
         return None if vote is None else vote.T_level_odometry @ self._results[position].T_world_lidar

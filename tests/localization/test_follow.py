@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from revisited import CONFIG, Revisited, error_of, revisit
 
 from lslam.geometry import se3
 from lslam.localization.follow import MapFollower, doubted
+from lslam.localization.place_search import PlaceSearch
 from lslam.localization.prior_map import LocalView, PriorMap, make_prior_map
 from lslam.preprocessing.prepare import prepare_points
 from lslam.simulation.routes import Visit
@@ -105,3 +108,37 @@ def test_a_scan_without_points_is_carried(world: Revisited) -> None:
     fix = follower.correct(0, None)
     assert fix.status == "unread"
     assert np.array_equal(fix.T_map_lidar, np.eye(4))
+
+
+def test_beyond_the_map_it_may_be_off_as_odometry_drifts_steadily(world: Revisited) -> None:
+    """A drift at the rate that loops allow for lies within three sigmas after any way, and a random walk alone forbids it."""
+    prior_map = make_prior_map(world.points, CONFIG.registration)
+    view = LocalView(prior_map, CONFIG.registration, 100.0)
+    follower = MapFollower(view, np.eye(4), np.diag([1e-4] * 3 + [1e-10] * 3), CONFIG)
+    c, before = CONFIG.loops, world.results[0]
+    for k in range(1, 301):
+        pose = before.T_world_lidar @ se3.make(np.eye(3), np.array([2.0, 0.0, 0.0]))
+        after = replace(before, index=k, T_world_lidar=pose, covariance=None, registration_covariance=None)
+        follower.predict(replace(before, covariance=None, registration_covariance=None), after)
+        before = after
+    way = 600.0
+    turn = np.deg2rad(c.drift_deg) / 100 * way
+    off = np.hypot(0.01 * c.drift_percent * way, 0.5 * turn * way)
+    across = follower.T[:3, 1]
+    allowed = 3.0 * float(np.sqrt(across @ follower.covariance[:3, :3] @ across))
+    assert off < allowed < 4 * off
+    walked = 3.0 * float(np.sqrt(across @ follower.P[:3, :3] @ across))
+    assert walked < allowed
+    # The map holds it again: nothing of that way is left.
+    follower.way = 0.0
+    np.testing.assert_array_equal(follower.covariance, follower.P)
+
+
+def test_what_is_searched_is_near_the_map(world: Revisited) -> None:
+    prior_map = make_prior_map(world.points, CONFIG.registration)
+    search = PlaceSearch(prior_map, CONFIG.registration)
+    low, high = prior_map.points[:, :2].min(0), prior_map.points[:, :2].max(0)
+    assert search.is_near((se3.inverse(prior_map.T_map_level) @ world.true_poses[0])[:2, 3], 5.0)
+    beyond = np.array([high[0] + 30.0, 0.5 * (low + high)[1]])
+    assert not search.is_near(beyond, 20.0)
+    assert search.is_near(beyond, 30.0 + float(high[0] - low[0]))
