@@ -7,6 +7,7 @@ import ctypes
 from collections.abc import Iterator
 
 from lslam.errors import InputError
+from lslam.extras import install_hint
 
 
 @contextlib.contextmanager
@@ -33,9 +34,6 @@ def importing_open3d() -> Iterator[None]:
         import libusb_package
 
         ctypes.CDLL(str(libusb_package.get_library_path()), mode=ctypes.RTLD_GLOBAL)
-    way_out = (
-        "install it with: pip install open3d-cpu (Linux x86-64) or pip install open3d; on a bare Linux also: "
-        "pip install libusb-package; apt install libgl1 libegl1 libx11-6 libgomp1"
-    )
+    way_out = f"{install_hint('open3d')}; on a bare Linux also: apt install libgl1 libegl1 libx11-6 libgomp1"
     with importing("Open3D", way_out):
         yield

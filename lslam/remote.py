@@ -21,10 +21,10 @@ from pathlib import Path, PosixPath
 from typing import Any
 
 from lslam.errors import LslamError, OutputError, StorageError, UsageError, sentence
+from lslam.extras import install_command
 
 _URL = re.compile(r"[a-z][a-z0-9+.-]*://")
 _DISK = "file://"
-_INSTALL = "pip install 'lslam[cloud]'"
 # When a thing was last written, as the file systems of fsspec name it.
 _TIMES = ("LastModified", "last_modified", "mtime", "updated", "created")
 _NO_CREDENTIALS = ("NoCredentialsError", "PartialCredentialsError", "DefaultCredentialsError", "RefreshError")
@@ -216,13 +216,13 @@ def _asking(path: RemotePath, what: str) -> Iterator[tuple[Any, str]]:
     try:
         from fsspec.core import url_to_fs
     except ImportError:
-        raise UsageError(f"{path}: to read {scheme}:// in place takes fsspec: {_INSTALL}") from None
+        raise UsageError(f"{path}: to read {scheme}:// in place takes fsspec: {install_command('cloud')}") from None
     _silence()
     try:
         system, place = url_to_fs(str(path), use_listings_cache=False)
         yield system, place
     except ImportError as error:
-        raise UsageError(f"{path}: {scheme}:// is not installed ({error}): {_INSTALL}") from None
+        raise UsageError(f"{path}: {scheme}:// is not installed ({error}): {install_command('cloud')}") from None
     except (LslamError, FileNotFoundError, NotADirectoryError):
         raise
     except Exception as error:

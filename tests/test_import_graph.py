@@ -28,7 +28,7 @@ LAYERS = [
     ["geometry"],
     ["kernels", "config"],
     ["foreign", "locks", "machine", "plugins", "printable", "remote", "stopping", "untrusted"],
-    ["errors", "version"],
+    ["errors", "extras", "version"],
 ]
 LEVEL = {name: level for level, names in enumerate(LAYERS) for name in names}
 

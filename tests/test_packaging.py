@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import importlib
+import json
 import re
 import resource
 import shutil
@@ -21,6 +22,8 @@ from packaging.markers import Marker
 from packaging.requirements import Requirement
 from packaging.specifiers import SpecifierSet
 
+from lslam.extras import install_command
+
 ROOT = Path(__file__).resolve().parents[1]
 PROJECT: dict[str, Any] = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 
@@ -30,7 +33,7 @@ TEST_EXTRA = [Requirement(text) for text in PROJECT["optional-dependencies"]["te
 CHOICES = [
     Requirement(t)
     for name, texts in PROJECT["optional-dependencies"].items()
-    if name not in ("test", "peers", "docs")
+    if name not in ("test", "peers", "docs", "all")
     for t in texts
 ]
 DOCS = [Requirement(t) for t in PROJECT["optional-dependencies"]["docs"]]
@@ -74,11 +77,13 @@ def third_party(folder: Path) -> dict[str, list[str]]:
             names = [a.name for a in node.names] if isinstance(node, ast.Import) else []
             if isinstance(node, ast.ImportFrom) and node.module and not node.level:
                 names = [node.module]
-            for name in {name.partition(".")[0] for name in names} - ours - set(sys.stdlib_module_names):
+            for name in {name.partition(".")[0] for name in names} - ours - set(sys.stdlib_module_names) - LATER:
                 found.setdefault(name, []).append(str(path.relative_to(ROOT)))
     return found
 
 
+# Of Python itself, from 3.14 on.
+LATER = {"compression"}
 # Too large to be installed for tests: their packages by the modules they provide.
 ABSENT = {"rerun": "rerun-sdk"}
 
@@ -117,7 +122,7 @@ def test_every_import_of_the_tests_is_declared() -> None:
     declared = {canonical(r.name) for r in DEPENDENCIES + PEERS} | extra | WITH_PYTEST | ELSEWHERE
     imported = third_party(ROOT / "tests")
     assert not {name: where for name, where in imported.items() if not provider(name) & declared}
-    assert extra - {name for module in imported for name in provider(module)} <= TOOLS
+    assert extra - {name for module in imported for name in provider(module)} <= TOOLS | EITHER
 
 
 @pytest.mark.parametrize("requirement", DEPENDENCIES + CHOICES + PEERS + DOCS + TEST_EXTRA, ids=str)
@@ -130,8 +135,8 @@ def test_lower_bounds_are_stated(requirement: Requirement) -> None:
 
 def test_python_bounds() -> None:
     python = SpecifierSet(PROJECT["requires-python"])
-    assert [v for v in ("3.10", "3.11", "3.12", "3.13", "3.14") if v in python] == ["3.11", "3.12", "3.13"]
-    assert "Python 3.11 to 3.13" in (ROOT / "README.md").read_text()
+    assert [v for v in ("3.10", "3.11", "3.12", "3.13", "3.14") if v in python] == ["3.11", "3.12", "3.13", "3.14"]
+    assert "Python 3.11 to 3.13" in (ROOT / "README.md").read_text(), "what is tested"
     installed = distribution("lslam").metadata["Requires-Python"]
     assert SpecifierSet(installed) == python
 
@@ -146,8 +151,26 @@ def test_one_open3d_for_every_machine(system: str, machine: str, expected: str) 
     def applies(marker: Marker | None) -> bool:
         return marker is None or marker.evaluate(environment)
 
-    chosen = [r.name for r in DEPENDENCIES if r.name.startswith("open3d") and applies(r.marker)]
-    assert chosen == [expected]
+    for extra in (CHOICES, TEST_EXTRA):
+        assert [r.name for r in extra if r.name.startswith("open3d") and applies(r.marker)] == [expected]
+
+
+def test_python_without_a_wheel_of_kiss_icp_installs_all_else() -> None:
+    skipped = [r.name for r in DEPENDENCIES if r.marker and not r.marker.evaluate({"python_version": "3.14"})]
+    assert skipped == ["backports.zstd", "kiss-icp"]
+
+
+def test_all_is_every_extra_for_users() -> None:
+    (everything,) = [Requirement(text) for text in PROJECT["optional-dependencies"]["all"]]
+    assert everything.extras == set(PROJECT["optional-dependencies"]) - {"all", "test", "peers", "docs"}
+
+
+def test_the_install_command_names_what_is_installed() -> None:
+    source = json.loads(distribution("lslam").read_text("direct_url.json") or "{}").get("url", "")
+    said = install_command("geo")
+    assert said.endswith("[geo]'" if "[" in said and "'" in said else "[geo]")
+    # From a folder, as here and in CI, it is that folder: the index has no lslam that could be meant.
+    assert source.startswith("file:") == ("lslam[geo]" not in said)
 
 
 def test_data_files_of_the_package_are_packed() -> None:

@@ -6,6 +6,7 @@ import bz2
 import contextlib
 import os
 import struct
+import sys
 import threading
 from bisect import bisect_left
 from collections import OrderedDict
@@ -275,16 +276,21 @@ def _codec(name: str) -> Callable[[], Any]:
         import lz4.frame
 
         return lz4.frame.LZ4FrameDecompressor  # type: ignore[no-any-return]
-    from backports import zstd
-
-    return zstd.ZstdDecompressor
+    return zstd().ZstdDecompressor  # type: ignore[no-any-return]
 
 
 def _damage() -> tuple[type[Exception], ...]:
     """What the decompressors raise."""
-    from backports import zstd
+    return (OSError, EOFError, ValueError, RuntimeError, zstd().ZstdError)
 
-    return (OSError, EOFError, ValueError, RuntimeError, zstd.ZstdError)
+
+def zstd() -> Any:
+    """The module: Python's own from 3.14 on."""
+    if sys.version_info >= (3, 14):
+        from compression import zstd
+    else:
+        from backports import zstd
+    return zstd
 
 
 def gather(topic: Topic, stamps: list[NDArray[np.int64]], where: list[Pairs]) -> None:

@@ -19,7 +19,7 @@ from types import TracebackType
 from typing import Any, NamedTuple, Protocol
 
 from lslam.errors import InputError, OutputError, UsageError, cause
-from lslam.formats.bag_chunks import Topic, unpack
+from lslam.formats.bag_chunks import Topic, unpack, zstd
 from lslam.formats.bag_listing import SUFFIXES, list_bag_files, suffix_of
 from lslam.formats.bag_sqlite import SqliteBag
 from lslam.formats.mcap_records import McapFile
@@ -268,11 +268,10 @@ def _store(encoding: str) -> Any:
 
 def _unpacked(recording: Recording, topic: Topic, k: int, limit: int | None) -> bytes:
     """A message that was compressed by itself; what is wanted of its beginning lies in the first block."""
-    from backports import zstd
-
     try:
         if limit is None:
             return unpack("zstd", recording.read(topic, k))
-        return zstd.ZstdDecompressor().decompress(recording.read(topic, k, _ZSTD_BLOCK), max_length=limit)
-    except (zstd.ZstdError, ValueError) as error:
+        begin: bytes = zstd().ZstdDecompressor().decompress(recording.read(topic, k, _ZSTD_BLOCK), max_length=limit)
+        return begin
+    except (zstd().ZstdError, ValueError) as error:
         raise InputError(f"{recording.path}: message {k} of {topic.name} is damaged: {error}") from None

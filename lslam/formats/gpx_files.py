@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from datetime import datetime
 from pathlib import Path
 
+from lslam.extras import install_hint
 from lslam.foreign import importing
 from lslam.formats.atomic import write_text
 from lslam.formats.kml_files import Place
@@ -17,7 +18,7 @@ def write_gpx(path: Path, places: Sequence[Place], times: Sequence[datetime] | N
 
     Raises OutputError when the file cannot be written, InputError without gpxpy.
     """
-    with importing("gpxpy", "install it with: pip install 'lslam[geo]'"):
+    with importing("gpxpy", install_hint("geo")):
         from gpxpy.gpx import GPX, GPXTrack, GPXTrackPoint, GPXTrackSegment
     points = [
         GPXTrackPoint(lat, lon, elevation=height, time=None if times is None else times[k])

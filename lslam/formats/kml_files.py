@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from datetime import datetime
 from pathlib import Path
 
+from lslam.extras import install_hint
 from lslam.foreign import importing
 from lslam.formats.atomic import write_text
 
@@ -19,7 +20,7 @@ def write_kml(path: Path, places: Sequence[Place], times: Sequence[datetime] | N
     The line lies on the ground: KML counts heights from the sea, ours are above the ellipsoid. They stand in the coordinates.
     Raises OutputError when the file cannot be written, InputError without fastkml.
     """
-    with importing("fastkml", "install it with: pip install 'lslam[geo]'"), warnings.catch_warnings():
+    with importing("fastkml", install_hint("geo")), warnings.catch_warnings():
         warnings.simplefilter("ignore")  # without lxml it does not indent
         from fastkml import KML, Document, Placemark, gx
         from fastkml.enums import AltitudeMode

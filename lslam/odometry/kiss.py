@@ -39,7 +39,7 @@ class Kiss:
     ignores_prior = True
 
     def __init__(self, preprocess: PreprocessConfig, has_user_range: bool) -> None:
-        with importing("kiss-icp", "install it with: pip install kiss-icp"):
+        with importing("kiss-icp", "it has no wheel for Python 3.14 and later, else: pip install kiss-icp"):
             from kiss_icp.config import KISSConfig
             from kiss_icp.kiss_icp import KissICP
         config = KISSConfig()

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from lslam.config.config import Config
 from lslam.config.preprocess import PreprocessConfig
 from lslam.config.registration import RegistrationConfig
+from lslam.extras import install_hint
 from lslam.foreign import importing
 from lslam.geometry import se3, so3
 from lslam.odometry.scan_outcome import AlignerResult, judged
@@ -39,7 +40,7 @@ class SmallGicp:
     """GICP, scan to keyframe map. Not ours: with several threads its sums may differ in the last digits."""
 
     def __init__(self, preprocess: PreprocessConfig, limits: RegistrationConfig, threads: int = 2) -> None:
-        with importing("small_gicp", "install it with: pip install 'lslam[small-gicp]'"):
+        with importing("small_gicp", install_hint("small-gicp")):
             import small_gicp
         self._package: Any = small_gicp
         self._preprocess, self._limits, self._threads = preprocess, limits, threads

@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.errors import OutputError, cause
+from lslam.extras import install_hint
 from lslam.foreign import importing
 from lslam.types.cloud import ArrayCloud
 from lslam.types.trajectory import Trajectory
 
-WAY_OUT = "install it with: pip install 'lslam[view]'"
 MOST_POINTS = 2_000_000  # what a viewer turns smoothly
 _ESTIMATE, _ODOMETRY = (31, 119, 180), (214, 39, 40)
 
@@ -35,7 +35,7 @@ class ViewedRun:
 
 def require_rerun() -> Any:
     """The module; raises InputError with the way out when it is missing."""
-    with importing("rerun", WAY_OUT):
+    with importing("rerun", install_hint("view")):
         import rerun
     return rerun
 

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from lslam.errors import InputError, OutputError, RunFailedError, UsageError, cause
+from lslam.extras import install_command
 from lslam.remote import RemotePath, as_path
 from lslam.studies.grid import Job
 from lslam.studies.jobs import clear_attempt, ensure_state, simulate_scenes
@@ -44,7 +45,7 @@ def connected(scheduler: str | None, local: str | None, title: str, *, is_persis
     try:
         from distributed import Client, LocalCluster
     except ImportError:
-        raise UsageError("--scheduler and --cluster need Dask: pip install 'lslam[cluster]'") from None
+        raise UsageError(f"--scheduler and --cluster need Dask: {install_command('cluster')}") from None
     for name in ("distributed", "distributed.client"):  # what goes wrong is said in one sentence, not in its tracebacks
         logging.getLogger(name).setLevel(logging.CRITICAL)
     if local is not None:

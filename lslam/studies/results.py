@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import time
 from collections.abc import Sequence
 from dataclasses import replace
+from importlib.util import find_spec
 from math import nan
 from pathlib import Path
 from typing import Any
@@ -14,6 +16,7 @@ from lslam.config.eval import EvalConfig
 from lslam.errors import InputError
 from lslam.evaluation.evaluate import METRICS
 from lslam.evaluation.timing import Timing, read_timing
+from lslam.extras import install_command
 from lslam.formats.study_files import read_study_csv, write_study_csv, write_study_parquet
 from lslam.remote import RemotePath
 from lslam.studies.grid import Job
@@ -22,6 +25,8 @@ from lslam.studies.variants import Variant
 from lslam.types.comparison import Group, Metric, RunScore
 from lslam.types.study import StudyRow
 from lslam.untrusted import parse_json
+
+log = logging.getLogger("lslam")
 
 COUNTS = {
     "bridged": "bridged scans of a run", "skipped": "skipped scans of a run", "degenerate": "degenerate scans of a run",
@@ -177,7 +182,10 @@ class Results:
             return
         began = time.monotonic()
         write_study_csv(self.out / RESULTS, self.rows)
-        write_study_parquet(self.out / PARQUET, self.rows)
+        if find_spec("pyarrow") is not None:
+            write_study_parquet(self.out / PARQUET, self.rows)
+        elif self._next_s == 0.0:
+            log.info("%s is not written, it takes pyarrow: %s", PARQUET, install_command("parquet"))
         self._is_behind, ended = False, time.monotonic()
         self._next_s = ended + (_PARTS * (ended - began) if len(self._rows) >= _MANY else 0.0)
 

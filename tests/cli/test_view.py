@@ -110,7 +110,7 @@ def test_a_recording_holds_ways_map_and_every_pose(
 
 def test_without_rerun_the_way_out_is_said(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "rerun", None)
-    with pytest.raises(InputError, match=r"rerun cannot be imported: .*pip install 'lslam\[view\]'") as caught:
+    with pytest.raises(InputError, match=r"rerun cannot be imported: .*pip install .*\[view\]") as caught:
         cli(["view", str(run)], standalone_mode=False)
     assert caught.value.exit_code == 3
     assert not (run / "run.rrd").exists()
