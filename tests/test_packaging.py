@@ -238,10 +238,25 @@ def test_top_level_holds_nothing_else() -> None:
         "mkdocs.yml",
         "LICENSE",
         "CITATION.cff",
+        "Dockerfile",
         ".ci",
+        ".dockerignore",
         ".gitignore",
     }
-    assert required - {".ci", ".gitignore"} <= top <= required
+    assert required - {".ci", ".dockerignore", ".gitignore"} <= top <= required
+
+
+def test_the_image_has_two_stages_and_no_root() -> None:
+    lines = [
+        line.split() for line in (ROOT / "Dockerfile").read_text().splitlines() if line and not line.startswith("#")
+    ]
+    stages = [n for n, words in enumerate(lines) if words[0] == "FROM"]
+    assert [lines[n][1] for n in stages] == ["python:3.11-slim"] * 2
+    last = lines[stages[1] :]
+    assert ["USER", "lslam"] in last
+    assert last[-1][0] == "ENTRYPOINT"
+    # What built it stays behind: of the first stage only the environment is taken.
+    assert [words[1:] for words in last if words[0] == "COPY"] == [["--from=build", "/opt/lslam", "/opt/lslam"]]
 
 
 def test_repository_is_small() -> None:
