@@ -28,6 +28,7 @@ COMMANDS = {
     "osm": "Fetch buildings from OpenStreetMap, or show what is in an extract.",
     "info": "Show the contents and the faults of a sequence.",
     "map": "Build a run's map anew with other settings, or score a map.",
+    "plot": "Draw one figure of a run, for a paper.",
     "view": "Write a run as a recording for the rerun viewer.",
     "methods": "List the odometry methods.",
     "config": "Show or check a configuration.",

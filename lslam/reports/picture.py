@@ -48,11 +48,11 @@ def pictures(figure: Any, kinds: Sequence[str]) -> list[bytes]:
     return [picture(figure, kind) for kind in kinds]
 
 
-def picture(figure: Any, kind: str) -> bytes:
+def picture(figure: Any, kind: str, dpi: int = 120) -> bytes:
     """The file of a matplotlib figure in one of FORMATS, without the time it was made."""
     stamp: dict[str, Any] = {"svg": {"Date": None}, "pdf": {"CreationDate": None}, "png": {}}[kind]
     stream = io.BytesIO()
-    figure.savefig(stream, format=kind, dpi=120, metadata=stamp)
+    figure.savefig(stream, format=kind, dpi=dpi, metadata=stamp)
     return stream.getvalue()
 
 

@@ -1,0 +1,78 @@
+"""What the figures of a run are drawn of, from its folder and, where they need it, from its recording."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from lslam.errors import UsageError
+from lslam.evaluation.evaluate import evaluate
+from lslam.formats.atomic import atomic_write
+from lslam.formats.geojson import read_corrected
+from lslam.odometry import create_odometry
+from lslam.odometry.base import FeatureSource
+from lslam.pipeline.feature_pass import view_features
+from lslam.pipeline.job import choose_scans
+from lslam.pipeline.rebuild import read_run, results_of, viewed_run
+from lslam.pipeline.regraph import open_again
+from lslam.reports.figures import WIDTHS, PlottedRun, draw_figure, require_figure
+from lslam.reports.picture import check_plot_path, house_style, picture
+from lslam.types.trajectory import Trajectory
+
+# What is drawn without the recording.
+OF_FOLDER = ("map", "buildings")
+
+
+def plotted_run(
+    folder: Path, what: str, sequence: Path | None = None, truth: Trajectory | None = None, **reading: Any
+) -> PlottedRun:
+    """As much of the run as the figure `what` shows.
+
+    sequence : where the raw scans have moved; truth : replaces the recording's; reading : as `open_sequence`
+
+    Raises InputError naming what is missing, UsageError for an unknown figure.
+    """
+    require_figure(what)
+    view, run = viewed_run(folder), read_run(folder)
+    about: dict[str, Any] = {"cloud": view.cloud, "odometry": view.odometry, "georeference": run.georeference}
+    if what == "buildings" and (folder / "buildings.geojson").is_file():
+        about["buildings"] = read_corrected(folder / "buildings.geojson")
+    if what not in OF_FOLDER:
+        opened = open_again(run, sequence, **reading)
+        given = opened.ground_truth if truth is None else truth
+        if given is not None and what in ("trajectory", "errors"):
+            about["evaluation"] = evaluate(run.trajectory, given, run.config.eval, calibration=opened.calibration)
+        if what == "imu":
+            about["imu"] = opened.imu
+        if what == "features":
+            odometry = create_odometry(run.config)
+            if isinstance(odometry, FeatureSource):
+                chosen = choose_scans(opened, odometry, run.config)
+                about["features"] = view_features(chosen, odometry, results_of(run))
+    return PlottedRun(view.name, run.trajectory, **about)
+
+
+def write_figure(run: PlottedRun, what: str, path: Path, width: float, font: float) -> None:
+    """Draw a figure into `path`, .png, .svg or .pdf, atomically; width : mm; font : points.
+
+    Raises UsageError for another suffix or a size that no page has, OutputError when it cannot be written.
+    """
+    from matplotlib import rc_context
+
+    check_plot_path(path)
+    if not 20 <= width <= 2000 or not 3 <= font <= 72:
+        raise UsageError(f"--width {width:g} --font {font:g}: 20 to 2000 mm, 3 to 72 points")
+    with house_style(), rc_context({"font.size": font}):
+        drawn = picture(draw_figure(run, what, width), path.suffix.lstrip(".").lower(), dpi=300)
+        with atomic_write(path) as stream:
+            stream.write(drawn)
+
+
+def width_of(text: str) -> float:
+    """mm, of `column`, `page` or a number; raises UsageError."""
+    if text in WIDTHS:
+        return WIDTHS[text]
+    try:
+        return float(text)
+    except ValueError:
+        raise UsageError(f"--width {text}: column, page, or mm") from None

@@ -1,0 +1,207 @@
+"""Figures of a run for papers, drawn with matplotlib: one quantity each, as wide as a column or a page."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.errors import InputError, UsageError, nearest
+from lslam.geometry import geodesy, se3, so3
+from lslam.reports.picture import COLOURS, label
+from lslam.reports.plots import first_available
+from lslam.types.building import CorrectedMap
+from lslam.types.cloud import ArrayCloud
+from lslam.types.gnss import Georeference
+from lslam.types.imu import ImuStream
+from lslam.types.run_record import FeatureView
+from lslam.types.trajectory import Trajectory
+
+if TYPE_CHECKING:
+    from lslam.evaluation.results import Evaluation
+
+Floats = NDArray[np.float64]
+
+# mm: a column and the text of two in IEEE's journals.
+WIDTHS = {"column": 88.9, "page": 181.9}
+INCH = 25.4
+# Points of a map that are drawn at most: more are not seen at the resolution of a page.
+MOST = 400_000
+
+
+@dataclass(frozen=True)
+class PlottedRun:
+    """What figures are drawn of, in the run's world; what a run does not have is None."""
+
+    name: str
+    trajectory: Trajectory
+    odometry: Trajectory | None = None
+    evaluation: Evaluation | None = None
+    cloud: ArrayCloud | None = None
+    imu: ImuStream | None = None
+    features: FeatureView | None = None
+    buildings: CorrectedMap | None = None
+    georeference: Georeference | None = None
+
+
+def require_figure(what: str) -> None:
+    """Raise UsageError with the nearest name when there is no such figure."""
+    if what not in FIGURES:
+        raise UsageError(f"no figure {what!r}; {nearest(what, FIGURES)}")
+
+
+def draw_figure(run: PlottedRun, what: str, width: float = WIDTHS["column"]) -> Any:
+    """The matplotlib figure, `width` mm wide; raises UsageError as `require_figure`, InputError for what a run does not have."""
+    from matplotlib.figure import Figure
+
+    require_figure(what)
+    draw, height = FIGURES[what]
+    figure = Figure(figsize=(width / INCH, height * width / INCH), layout="constrained")
+    draw(figure, run)
+    return figure
+
+
+def _map(figure: Any, run: PlottedRun) -> None:
+    plot = figure.add_subplot()
+    seen = _points(plot, run)
+    figure.colorbar(seen, ax=plot, label="height, m", shrink=0.7)
+    _line(plot, run.trajectory.positions, "black", run.name)
+    _from_above(plot)
+
+
+def _trajectory(figure: Any, run: PlottedRun) -> None:
+    above, deep = figure.add_subplot(1, 2, 1), figure.add_subplot(1, 2, 2, projection="3d")
+    lines = [("estimate", run.trajectory.positions, COLOURS[0])]
+    if run.odometry is not None:
+        lines.append(("odometry", run.odometry.positions, COLOURS[1]))
+    absolute = first_available(run.evaluation)
+    if run.evaluation is not None and absolute is not None:
+        truth = se3.apply(se3.inverse(absolute.T_gt_est), run.evaluation.gt_positions)
+        lines.insert(0, ("ground truth", truth, "black"))
+    for name, positions, colour in lines:
+        _line(above, positions, colour, name)
+        deep.plot(*positions.T, color=colour, lw=0.8)
+    above.plot(*run.trajectory.positions[0, :2], "o", color="black", ms=3)
+    _legend(figure, above)
+    _from_above(above)
+    size = np.ptp(run.trajectory.positions, axis=0)
+    deep.set_box_aspect(np.maximum(size, 0.15 * size.max()) + 1e-9, zoom=0.8)
+    deep.set(xlabel="x, m", ylabel="y, m", zlabel="z, m")
+    for axis, ticks in (("x", 3), ("y", 3), ("z", 2)):
+        deep.locator_params(axis=axis, nbins=ticks)
+
+
+def _errors(figure: Any, run: PlottedRun) -> None:
+    absolute = first_available(run.evaluation)
+    if run.evaluation is None or absolute is None:
+        raise InputError(f"{run.name} has no ground truth: say where it is with --gt")
+    planar, turn = figure.subplots(2, 1, sharex=True)
+    stamps = run.trajectory.stamps_ns
+    nearest_pose = np.searchsorted(stamps, run.evaluation.stamps_ns).clip(0, len(stamps) - 1)
+    R = absolute.T_gt_est[:3, :3] @ run.trajectory.poses[nearest_pose, :3, :3]
+    own = -np.einsum("nji,nj->ni", R, absolute.errors)
+    distance = run.evaluation.distance
+    for axis, (name, colour) in enumerate((("ahead", COLOURS[0]), ("left", COLOURS[1]), ("up", COLOURS[2]))):
+        planar.plot(distance, own[:, axis], color=colour, lw=0.8, label=name)
+    planar.plot(distance, np.linalg.norm(own[:, :2], axis=1), color="black", lw=0.8, label="planar")
+    _legend(figure, planar)
+    turn.plot(distance, absolute.rotation_errors_deg, color=COLOURS[0], lw=0.8)
+    label(planar, "", f"error ({absolute.alignment}), m")
+    label(turn, "distance, m", "rotation error, deg")
+
+
+def _imu(figure: Any, run: PlottedRun) -> None:
+    if run.imu is None:
+        raise InputError(f"{run.name} has no IMU: what it was run without is not plotted")
+    force, rates, speed, yaw = figure.subplots(4, 1, sharex=True)
+    begin = run.trajectory.stamps_ns[0]
+    seconds = 1e-9 * (run.imu.stamps_ns - begin)
+    for axis, (name, colour) in enumerate(zip("xyz", COLOURS, strict=False)):
+        force.plot(seconds, run.imu.accel[:, axis], color=colour, lw=0.4, label=name)
+        rates.plot(seconds, np.rad2deg(run.imu.gyro[:, axis]), color=colour, lw=0.4)
+    step = np.maximum(1e-9 * np.diff(run.trajectory.stamps_ns), 1e-9)
+    middle = 1e-9 * (run.trajectory.stamps_ns[:-1] - begin) + 0.5 * step
+    moved = se3.relative(run.trajectory.poses[:-1], run.trajectory.poses[1:])
+    speed.plot(middle, np.linalg.norm(moved[:, :3, 3], axis=1) / step, color="black", lw=0.6)
+    yaw.plot(middle, np.rad2deg(so3.log(moved[:, :3, :3])[:, 2]) / step, color="black", lw=0.6)
+    _legend(figure, force)
+    for plot, unit in ((force, "force, m/s²"), (rates, "rate, deg/s"), (speed, "speed, m/s"), (yaw, "yaw rate, deg/s")):
+        label(plot, "time, s" if plot is yaw else "", unit)
+
+
+def _features(figure: Any, run: PlottedRun) -> None:
+    view = run.features
+    if view is None:
+        raise InputError(f"{run.name} has no features: a method of the LOAM family has some")
+    scan, whole = figure.subplots(1, 2)
+    scan.plot(*view.around[:, :2].T, ",", color="#999999")
+    scan.plot(*view.planes.T, ".", ms=1.5, color=COLOURS[0], label="planar")
+    scan.plot(*view.edges.T, ".", ms=1.5, color=COLOURS[1], label="edge")
+    scan.set_title(f"scan {view.scan}", fontsize="medium")
+    scan.legend(loc="best", frameon=False, markerscale=4)
+    whole.plot(*_some(view.map_planes)[:, :2].T, ",", color=COLOURS[0])
+    whole.plot(*_some(view.map_edges)[:, :2].T, ",", color=COLOURS[1])
+    whole.set_title("feature map", fontsize="medium")
+    for plot in (scan, whole):
+        _from_above(plot)
+
+
+def _buildings(figure: Any, run: PlottedRun) -> None:
+    if run.buildings is None or run.georeference is None:
+        raise InputError(f"{run.name} has no buildings: run it with --osm")
+    plot = figure.add_subplot()
+    T = geodesy.frame_change(run.georeference.origin, run.buildings.origin) @ run.georeference.T_enu_world
+    _points(plot, run, T)
+    for k, one in enumerate(run.buildings.buildings):
+        for building, colour, name in (
+            (one.building, COLOURS[4], "on the map"),
+            (one.corrected, COLOURS[0], "corrected"),
+        ):
+            for footprint in building.footprints:
+                ring = footprint.outer
+                _line(plot, np.concatenate([ring, ring[:1]]), colour, name if k == 0 else "_")
+    _line(plot, se3.apply(T, run.trajectory.positions), "black", "trajectory")
+    _legend(figure, plot)
+    _from_above(plot, "east, m", "north, m")
+
+
+def _points(plot: Any, run: PlottedRun, T: Floats | None = None) -> Any:
+    """The map beneath, by height: dark is low."""
+    if run.cloud is None or not len(run.cloud):
+        raise InputError(f"{run.name} has no map: build one with lslam map")
+    points = _some(run.cloud.points)
+    points = points if T is None else se3.apply(T, points)
+    points = points[np.argsort(points[:, 2], kind="stable")]
+    low, high = np.percentile(points[:, 2], [2, 98])
+    return plot.scatter(
+        points[:, 0], points[:, 1], c=points[:, 2], s=0.15, cmap="cividis", vmin=low, vmax=high, linewidths=0,
+        rasterized=True,
+    )  # fmt: skip
+
+
+def _legend(figure: Any, plot: Any) -> None:
+    """Above all plots, where no line runs."""
+    lines, names = plot.get_legend_handles_labels()
+    figure.legend(lines, names, loc="outside upper center", ncol=4, frameon=False, handlelength=1.2, columnspacing=1.0)
+
+
+def _some(points: NDArray[Any]) -> NDArray[Any]:
+    return points[:: max(1, -(-len(points) // MOST))]
+
+
+def _line(plot: Any, positions: NDArray[Any], colour: str, name: str) -> None:
+    plot.plot(positions[:, 0], positions[:, 1], color=colour, lw=0.8, label=name)
+
+
+def _from_above(plot: Any, x: str = "x, m", y: str = "y, m") -> None:
+    plot.set_aspect("equal", adjustable="datalim")
+    label(plot, x, y)
+
+
+# name -> (what draws it, its height as a share of its width)
+FIGURES = {
+    "map": (_map, 0.8), "trajectory": (_trajectory, 0.55), "errors": (_errors, 0.75), "features": (_features, 0.55),
+    "imu": (_imu, 1.1), "buildings": (_buildings, 0.9),
+}  # fmt: skip
