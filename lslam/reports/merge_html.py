@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.formats.atomic import atomic_write
+from lslam.maps.floor_plan import TopView
 from lslam.printable import metres
 from lslam.reports.compare_html import style_of
 from lslam.reports.html import template
@@ -22,7 +23,6 @@ from lslam.version import __version__
 
 Floats = NDArray[np.float64]
 RECIPE = "ATE of each session by itself, se3, m rmse; found by keyframes that agree, of those tried."
-MapView = tuple[NDArray[np.float32], tuple[float, float, float, float]]
 
 
 @dataclass(frozen=True)
@@ -39,11 +39,11 @@ def write_page(
     sessions: Sequence[SessionView],
     rows: Sequence[Mapping[str, Any]],
     problems: Sequence[str],
-    view: MapView | None,
+    view: TopView | None,
 ) -> None:
     """Write the page atomically; raises OutputError when it cannot be written.
 
-    rows : of the manifest's `sessions`; view : density of the map from above and its extent, m
+    rows : of the manifest's `sessions`; view : of the merged map
     """
     page = template("merge.html.j2").render(
         names=[s.name for s in sessions], problems=problems, figures=_figures(sessions, view), table=_table(rows),
@@ -53,9 +53,9 @@ def write_page(
         stream.write(page.encode("utf-8", "replace"))
 
 
-def _figures(sessions: Sequence[SessionView], view: MapView | None) -> list[Figure]:
+def _figures(sessions: Sequence[SessionView], view: TopView | None) -> list[Figure]:
     names = [s.name for s in sessions]
-    backdrop = None if view is None else (data_uri(density_png(view[0])), view[1])
+    backdrop = None if view is None else (data_uri(density_png(view.image)), view.extent)
     figures = []
     for title, caption, positions in (
         ("After the pose graph, from above", "On the map of all sessions.", [s.after for s in sessions]),
