@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from lslam.reports import svg
 from lslam.reports.facts import RunFacts, stage_matrix
-from lslam.reports.svg import Track, plane_chart
+from lslam.reports.svg import By, Track, plane_chart
 from lslam.types.run_record import RunRecord
 
 if TYPE_CHECKING:
@@ -19,6 +19,9 @@ if TYPE_CHECKING:
 
 
 DISTANCE = "distance along ground truth, m"
+# What of a scan plane and abscissa are: without, and with ground truth.
+_BY_WAY: tuple[By, By] = ("own", "way")
+_BY_TRUTH: tuple[By, By] = ("aligned", "truth")
 ALIGNMENTS = ("se3", "origin", "posyaw", "sim3", "none")
 ALIGNED = {
     "se3": "aligned to ground truth by a rigid transform (se3)",
@@ -50,17 +53,21 @@ def trajectory_figures(record: RunRecord, evaluation: Evaluation | None) -> list
     if evaluation is None or absolute is None:
         positions = record.trajectory.positions
         truth, distance = None, record.trajectory.path_lengths
-        caption, x_label = "Estimate in its own world.", "distance travelled, m"
+        caption, x_label, along = "Estimate in its own world.", "distance travelled, m", _BY_WAY
     else:
         positions, truth, distance = absolute.aligned_positions, evaluation.gt_positions, evaluation.distance
-        caption, x_label = f"Estimate {ALIGNED.get(absolute.alignment, absolute.alignment)}.", DISTANCE
+        caption, x_label, along = (
+            f"Estimate {ALIGNED.get(absolute.alignment, absolute.alignment)}.",
+            DISTANCE,
+            _BY_TRUTH,
+        )
     tracks = [] if truth is None else [Track("ground truth", truth[:, :2], "gt")]
     tracks.append(Track("estimate", positions[:, :2], "s1", ends=True))
     failed = _failed_positions(record, absolute)
-    top = plane_chart(tracks, "trajectory from above", points=failed)
+    top = plane_chart(tracks, "trajectory from above", points=failed, by=along[0])
     lines = [] if truth is None else [svg.Line("ground truth", distance, truth[:, 2], "gt")]
     lines.append(svg.Line("estimate", distance, positions[:, 2], "s1"))
-    height = svg.line_chart(lines, x_label, "height z, m", "height profile", zero=False)
+    height = svg.line_chart(lines, x_label, "height z, m", "height profile", zero=False, by=along[1])
     legend = tuple((t.style, t.label) for t in tracks)
     start_end = (("start", "start"), ("end", "end"))
     extra = (("bad", "bridged or skipped scan"),) if len(failed) else ()
@@ -159,7 +166,7 @@ def registration_figures(record: RunRecord) -> list[Figure]:
             svg.Line(words.get(f, f), index, v, f"s{i + 1}")
             for i, (f, v) in enumerate(zip(fields, values, strict=True))
         ]
-        chart = svg.line_chart(lines, "scan", y_label, f"{title} per scan", marks=failed, whole_x=True)
+        chart = svg.line_chart(lines, "scan", y_label, f"{title} per scan", marks=failed, whole_x=True, by="scan")
         legend = tuple((line.style, line.label) for line in lines) if len(lines) > 1 else ()
         if len(failed):
             legend += (("failed", "bridged or skipped scan"),)
@@ -193,7 +200,9 @@ def uncertainty_figures(record: RunRecord) -> list[Figure]:
         ("Rotation uncertainty", "deg", ("about x", "about y", "about z"), np.degrees(sigma[:, 3:])),
     ):
         lines = _three(names, distance, values)
-        chart = svg.line_chart(lines, "distance travelled, m", f"sigma, {unit}", title, marks=distance[failed])
+        chart = svg.line_chart(
+            lines, "distance travelled, m", f"sigma, {unit}", title, marks=distance[failed], by="way"
+        )
         legend = tuple((line.style, line.label) for line in lines)
         legend += (("failed", "bridged or skipped scan"),) if failed.any() else ()
         figures.append(Figure(title, chart, legend, recipe))
@@ -228,7 +237,7 @@ def share_bar(facts: RunFacts) -> str:
 
 
 def _lines(title: str, lines: list[svg.Line], x_label: str, y_label: str, caption: str) -> Figure:
-    chart = svg.line_chart(lines, x_label, y_label, title)
+    chart = svg.line_chart(lines, x_label, y_label, title, by="truth")
     return Figure(title, chart, tuple((line.style, line.label) for line in lines), caption)
 
 
@@ -266,7 +275,7 @@ def stage_chart(index: NDArray[Any], ms: Floats, limit: float, title: str) -> tu
     limit_inside = 0 < limit <= LIMIT_IN_VIEW * top
     if limit_inside:
         top = max(top, 1.08 * limit)
-    frame = svg.Frame((x[0], x[-1]), (0.0, top))
+    frame = svg.Frame((x[0], x[-1]), (0.0, top), by="scan")
     frame.axes("scan", "time, ms", whole_x=True)
     stacked = np.cumsum(np.minimum(layers, 1e9), axis=1)
     below = np.zeros(len(stacked))
