@@ -14,12 +14,11 @@ from lslam.formats.atomic import atomic_write
 from lslam.maps.floor_plan import TopView
 from lslam.printable import metres
 from lslam.reports.compare_html import style_of
-from lslam.reports.html import template
 from lslam.reports.plots import Figure
 from lslam.reports.png import data_uri, density_png
+from lslam.reports.shell import render
 from lslam.reports.svg import Track, plane_chart
 from lslam.types.table import Table
-from lslam.version import __version__
 
 Floats = NDArray[np.float64]
 RECIPE = "ATE of each session by itself, se3, m rmse; found by keyframes that agree, of those tried."
@@ -45,10 +44,8 @@ def write_page(
 
     rows : of the manifest's `sessions`; view : of the merged map
     """
-    page = template("merge.html.j2").render(
-        names=[s.name for s in sessions], problems=problems, figures=_figures(sessions, view), table=_table(rows),
-        version=__version__,
-    )  # fmt: skip
+    names = [s.name for s in sessions]
+    page = render("merge.html.j2", names=names, problems=problems, figures=_figures(sessions, view), table=_table(rows))
     with atomic_write(path) as stream:
         stream.write(page.encode("utf-8", "replace"))
 
