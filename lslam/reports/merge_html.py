@@ -59,10 +59,8 @@ def _figures(sessions: Sequence[SessionView], view: TopView | None) -> list[Figu
         ("Before, from above", "Each session moved as a whole to where it was found.", [s.before for s in sessions]),
     ):
         tracks = [Track(name, p[:, :2], style_of(name, names)) for name, p in zip(names, positions, strict=True)]
-        chart = plane_chart(
-            tracks, title.lower(), backdrop=backdrop if "After" in title else None, width=720, tallest=760
-        )
-        figures.append(Figure(title, chart, tuple((t.style, t.label) for t in tracks), caption, wide=True))
+        chart = plane_chart(tracks, title.lower(), backdrop=backdrop if "After" in title else None)
+        figures.append(Figure(title, chart, tuple((t.style, t.label) for t in tracks), caption))
     return figures
 
 
