@@ -146,6 +146,7 @@ class MapView {
   /** One more line of the legend: what the drawing underneath does not show. */
   explain(name, style) {
     const item = document.createElement("li");
+    item.className = "only-live";
     const line = make("svg", { viewBox: "0 0 26 12", "aria-hidden": "true" }, item);
     make("path", { class: `line ${style}`, d: "M0 6H26" }, line);
     item.append(name);

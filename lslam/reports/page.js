@@ -173,7 +173,7 @@ function gestures(element, on) {
       0: () => on.reset(), Home: () => on.reset(),
       ArrowLeft: () => on.pan(40, 0, event), ArrowRight: () => on.pan(-40, 0, event),
       ArrowUp: () => on.pan(0, 40, event), ArrowDown: () => on.pan(0, -40, event),
-      ",": () => mark(marked - 1), ".": () => mark(marked + 1),
+      ",": () => mark(marked - 1), ".": () => mark(marked + 1), Escape: () => element.blur(),
     }[event.key];
     if (!done) return;
     event.preventDefault();
@@ -219,3 +219,4 @@ function startPrinting() {
 
 startBar();
 startPrinting();
+for (const hint of document.querySelectorAll(".hint")) hint.hidden = false;

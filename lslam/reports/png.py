@@ -60,7 +60,7 @@ def coloured_png(image: NDArray[Any], values: NDArray[Any], low: float, high: fl
     colour = np.rint(np.clip(share, 0, 1) * (len(VIRIDIS) - 1)).astype(np.uint8)
     raw = np.zeros((levels.shape[0], 1 + levels.shape[1]), np.uint8)  # column 0: filter type none
     raw[:, 1:] = np.where(levels > 0, colour * LEVELS + levels, 0)
-    alpha = [round(255 * (0.25 + 0.75 * i / (LEVELS - 1)) if i else 0) for i in range(LEVELS)]
+    alpha = [round(255 * (0.4 + 0.6 * i / (LEVELS - 1)) if i else 0) for i in range(LEVELS)]
     header = struct.pack(">IIBBBBB", levels.shape[1], levels.shape[0], 8, 3, 0, 0, 0)
     return _png(
         [
