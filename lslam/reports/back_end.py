@@ -12,7 +12,7 @@ from lslam.printable import counted, metres
 from lslam.reports import svg
 from lslam.reports.buildings import drift_tables
 from lslam.reports.crops import PIXELS, Crop, crop_images
-from lslam.reports.plots import ALIGNED, DISTANCE, Figure, first_available
+from lslam.reports.plots import ALIGNED, DISTANCE, PLAN_HEIGHT, Figure, first_available
 from lslam.reports.png import data_uri, density_png
 from lslam.reports.svg import WIDTH, By, Track, plane_chart
 from lslam.types.run_record import LoopView, RunRecord
@@ -122,7 +122,7 @@ def back_end_figures(record: RunRecord, evaluation: Evaluation | None) -> list[F
         legend.append(("s4", f"{SIGMAS:g} sigma{beside}, to scale"))
     elif ellipses:
         captions.append(f"{SIGMAS:g} sigma{beside}: at most {metres(largest)} m, too small to be drawn.")
-    chart = plane_chart(tracks, f"before and after {what}", by="own")
+    chart = plane_chart(tracks, f"before and after {what}", tallest=PLAN_HEIGHT, by="own")
     title = f"Before and after {what}" if is_seen else f"After {what}"
     whole = Figure(title, chart, tuple(legend), " ".join(captions))
     return [whole, *_error_figures(evaluation), *loop_figures(record.loop_view)]

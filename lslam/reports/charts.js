@@ -151,13 +151,13 @@ class Chart {
   }
 }
 
-/** A picture within its frame: zoomed about the pointer, never smaller than the frame. */
+/** A picture within its frame: zoomed about the pointer, never smaller than it is at first. */
 function startPicture(frame) {
   const picture = frame.querySelector("img");
   let [k, x, y] = [1, 0, 0];
   const show = () => {
-    x = clamp(x, frame.clientWidth * (1 - k), 0);
-    y = clamp(y, frame.clientHeight * (1 - k), 0);
+    x = clamp(x, frame.clientWidth - picture.offsetWidth * k, 0);
+    y = clamp(y, frame.clientHeight - picture.offsetHeight * k, 0);
     picture.style.transform = `translate(${x}px, ${y}px) scale(${k})`;
     frame.classList.toggle("moved", k > 1);
   };
@@ -171,7 +171,7 @@ function startPicture(frame) {
       show();
     },
     pan: (dx, dy) => { [x, y] = [x + dx, y + dy]; show(); },
-    reset: () => { k = 1; show(); },
+    reset: () => { [k, x, y] = [1, 0, 0]; show(); },
   });
 }
 

@@ -104,4 +104,4 @@ function drawAxes(pen, view, { right, up }, colour) {
 }
 
 const cloudOfMap = read("cloud");
-if (cloudOfMap) new MapView(document.getElementById("map"), cloudOfMap);
+const mapView = cloudOfMap && new MapView(document.getElementById("map"), cloudOfMap);

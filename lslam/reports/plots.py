@@ -32,6 +32,7 @@ ALIGNED = {
 }
 Floats = NDArray[np.float64]
 MAP_WIDTH, MAP_HEIGHT = 980, 700
+PLAN_HEIGHT = 340  # of one beside a chart
 # A limit further away than this many times the usual scan would press the stages flat: an arrow says where it is.
 LIMIT_IN_VIEW = 4.0
 
@@ -65,7 +66,7 @@ def trajectory_figures(record: RunRecord, evaluation: Evaluation | None) -> list
     tracks = [] if truth is None else [Track("ground truth", truth[:, :2], "gt")]
     tracks.append(Track("estimate", positions[:, :2], "s1", ends=True))
     failed = _failed_positions(record, absolute)
-    top = plane_chart(tracks, "trajectory from above", points=failed, by=along[0])
+    top = plane_chart(tracks, "trajectory from above", points=failed, tallest=PLAN_HEIGHT, by=along[0])
     lines = [] if truth is None else [svg.Line("ground truth", distance, truth[:, 2], "gt")]
     lines.append(svg.Line("estimate", distance, positions[:, 2], "s1"))
     height = svg.line_chart(lines, x_label, "height z, m", "height profile", zero=False, by=along[1])

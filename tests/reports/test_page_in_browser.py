@@ -153,6 +153,10 @@ def test_the_map_zooms_turns_and_comes_back_by_keys_and_buttons(browser: Any, ru
     assert (whole != picture(browser)).any(axis=2).mean() < MOVED / 2
     click(browser, "[data-do=turn]")
     turned = picture(browser)
+    # Points and what is drawn over them are put in their places by two programs.
+    x, y = browser.execute_script("return [...mapView.project([5, 25, 8.5])]")
+    rows, columns = np.nonzero(np.abs(turned - palette()[-1].astype(int)).max(axis=2) < 24)
+    assert (columns.mean(), rows.mean()) == pytest.approx((x, y), abs=6)
     assert (whole != turned).any(axis=2).mean() > MOVED
     assert find(browser, "[data-do=turn]").get_attribute("aria-pressed") == "true"
     canvas.send_keys(Keys.ARROW_RIGHT)
