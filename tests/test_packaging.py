@@ -33,11 +33,12 @@ TEST_EXTRA = [Requirement(text) for text in PROJECT["optional-dependencies"]["te
 CHOICES = [
     Requirement(t)
     for name, texts in PROJECT["optional-dependencies"].items()
-    if name not in ("test", "peers", "docs", "all")
+    if name not in ("test", "peers", "docs", "browser", "all")
     for t in texts
 ]
 DOCS = [Requirement(t) for t in PROJECT["optional-dependencies"]["docs"]]
-PEERS = [Requirement(t) for t in PROJECT["optional-dependencies"]["peers"]]
+# What some tests ask for and are skipped without.
+PEERS = [Requirement(t) for name in ("peers", "browser") for t in PROJECT["optional-dependencies"][name]]
 # One module by two names: a machine has one of them.
 EITHER = {"open3d", "open3d-cpu"}
 # Run as commands, not imported.
@@ -162,7 +163,7 @@ def test_python_without_a_wheel_of_kiss_icp_installs_all_else() -> None:
 
 def test_all_is_every_extra_for_users() -> None:
     (everything,) = [Requirement(text) for text in PROJECT["optional-dependencies"]["all"]]
-    assert everything.extras == set(PROJECT["optional-dependencies"]) - {"all", "test", "peers", "docs"}
+    assert everything.extras == set(PROJECT["optional-dependencies"]) - {"all", "test", "peers", "docs", "browser"}
 
 
 def test_the_install_command_names_what_is_installed() -> None:

@@ -80,10 +80,22 @@ def floor_plan(grid: OccupancyGrid) -> FloorPlan:
     )  # fmt: skip
 
 
-def top_view(
-    cloud: Cloud | NDArray[Any], pixel: float = 0.2, longest: int = 1600, trim: float = 0.001
-) -> tuple[NDArray[np.float32], Extent]:
-    """Density image of a map: how many of its points lie in each column.
+@dataclass(frozen=True)
+class TopView:
+    """A map seen from above.
+
+    image : (H, W) float32 points per pixel, row 0 at the largest y; (1, 1) zero without points
+    heights : (H, W) float32 their mean z, m; NaN where there are none
+    extent : x_min, x_max, y_min, y_max of the image's edges, m
+    """
+
+    image: NDArray[np.float32]
+    heights: NDArray[np.float32]
+    extent: Extent
+
+
+def top_view(cloud: Cloud | NDArray[Any], pixel: float = 0.2, longest: int = 1600, trim: float = 0.001) -> TopView:
+    """How many points of a map lie in each column, and how high.
 
     On a voxel map the number is the occupied height, so walls stand out from the ground.
 
@@ -93,29 +105,27 @@ def top_view(
     pixel : smallest edge of a pixel, m, not under the map's voxel (empty lines would appear); larger when the long side
         would exceed `longest` pixels
     trim : share of points that may fall off each side, so that a few far points do not shrink the rest
-
-    Returns
-    -------
-    image : (H, W) float32 points per pixel, row 0 at the largest y; (1, 1) zero without points
-    extent : x_min, x_max, y_min, y_max of the image's edges, m
     """
     cloud = ArrayCloud.of(cloud) if isinstance(cloud, np.ndarray) else cloud
     low, high = _bounds(cloud, trim)
     if not np.all(np.isfinite([*low, *high])):
-        return np.zeros((1, 1), np.float32), (0.0, 1.0, 0.0, 1.0)
+        return TopView(np.zeros((1, 1), np.float32), np.full((1, 1), np.nan, np.float32), (0.0, 1.0, 0.0, 1.0))
     # One pixel to spare, because the upper edge belongs to the last pixel.
     size = max(pixel, float(np.max(high - low)) / max(longest - 1, 1))
     width, height = (int(n) + 1 for n in (high - low) / size)
-    counts = np.zeros(width * height, np.int64)
+    counts, sums = np.zeros(width * height, np.int64), np.zeros(width * height)
     for block in cloud.blocks():
-        part = block.points[:, :2]
-        part = part[np.isfinite(part).all(1)]
-        cell = np.floor((part - low) / size)
+        part = block.points[np.isfinite(block.points).all(1)]
+        cell = np.floor((part[:, :2] - low) / size)
         inside = (cell[:, 0] >= 0) & (cell[:, 1] >= 0) & (cell[:, 0] < width) & (cell[:, 1] < height)
         column, row = cell[inside].astype(np.int64).T
-        counts += np.bincount((height - 1 - row) * width + column, minlength=width * height)
+        pixel_of = (height - 1 - row) * width + column
+        counts += np.bincount(pixel_of, minlength=width * height)
+        sums += np.bincount(pixel_of, part[inside, 2], minlength=width * height)
     extent = (float(low[0]), float(low[0] + width * size), float(low[1]), float(low[1] + height * size))
-    return counts.reshape(height, width).astype(np.float32), extent
+    heights = np.divide(sums, counts, out=np.full(width * height, np.nan), where=counts > 0)
+    shape = (height, width)
+    return TopView(counts.reshape(shape).astype(np.float32), heights.reshape(shape).astype(np.float32), extent)
 
 
 def _bounds(cloud: Cloud, trim: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

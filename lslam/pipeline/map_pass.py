@@ -19,14 +19,14 @@ from lslam.frontend.checkpoints import Checkpoints
 from lslam.frontend.register_scans import read_ahead
 from lslam.geometry.interpolate import poses_at
 from lslam.maps.clean import Cleaner, PosedScan
-from lslam.maps.floor_plan import top_view
+from lslam.maps.floor_plan import TopView, top_view
 from lslam.maps.merge import MapMerger
 from lslam.maps.mesh import denoise
 from lslam.maps.occupancy import OccupancyGrid, OccupancyMapper
 from lslam.pipeline.run_folder import CHECKPOINT, RunFolder
 from lslam.preprocessing.deskew import deskew_points, knots_over
 from lslam.stopping import asking
-from lslam.types.cloud import Cloud, in_memory
+from lslam.types.cloud import ArrayCloud, Cloud, in_memory, thinned
 from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan import Scan
 from lslam.types.scan_result import ScanResult
@@ -35,16 +35,18 @@ from lslam.types.state import State
 
 log = logging.getLogger("lslam")
 
+SAMPLE = 150_000  # points that a page shows in 3D: 12 bytes each in it
 INTERRUPTED = "interrupted while the map was built: nothing of it is written"
 
 
 @dataclass(frozen=True)
 class BuiltMap:
-    """The merged map, its view from above, what was done to it, in words, and the occupancy when it was asked for."""
+    """The merged map, its view from above, some of its points for pages, what was done to it, in words, and the
+    occupancy when it was asked for."""
 
     merged: Cloud
-    image: NDArray[np.float32]
-    extent: tuple[float, float, float, float]
+    view: TopView
+    sample: ArrayCloud
     done: tuple[str, ...] = ()
     occupancy: OccupancyGrid | None = None
 
@@ -140,8 +142,9 @@ class MapMaker:
         if self._section.denoise:
             before, merged = len(merged), denoise(in_memory(merged))
             done = (*done, f"denoised: {before - len(merged)} of {before} points were far from their neighbours")
-        image, extent = top_view(merged, pixel=max(0.2, self._section.voxel))
-        return BuiltMap(merged, image, extent, done, None if self._occupancy is None else self._occupancy.result())
+        view = top_view(merged, pixel=max(0.2, self._section.voxel))
+        occupancy = None if self._occupancy is None else self._occupancy.result()
+        return BuiltMap(merged, view, thinned(merged, SAMPLE), done, occupancy)
 
     def state(self) -> State:
         """What `restore` needs to go on from here; voxels and cells go to `keep`."""

@@ -112,9 +112,7 @@ def _fill(folder: RunFolder, merged: Merged, config: Config, watch: Watch) -> di
         write_map(folder.path / f"map.{config.map.format}", built.merged, note, georeference)
         about["map_points"] = len(built.merged)
         views = _views(merged, trajectories)
-        write_page(
-            folder.path / "report.html", views, [vars(row) for row in rows], problems, (built.image, built.extent)
-        )
+        write_page(folder.path / "report.html", views, [vars(row) for row in rows], problems, built.view)
     else:
         write_page(
             folder.path / "report.html", _views(merged, trajectories), [vars(row) for row in rows], problems, None

@@ -30,7 +30,9 @@ from lslam.version import __version__
 
 # Bytes per point of the map files: 16 in PLY and PCD, 30 in LAS, with room for the header.
 BYTES_PER_POINT = 32
-# The 95 scans of sample_data make 220 kB without the map, half of it the report.
+# Of a point that the report shows: 12, with room for the map's picture.
+BYTES_PER_POINT_SHOWN = 15
+# The 95 scans of sample_data make 310 kB without the map, half of it the report.
 BYTES_PER_SCAN, BYTES_OF_REPORT = 4000, 500_000
 
 
@@ -119,7 +121,8 @@ def write_localization(folder: RunFolder, record: RunRecord) -> None:
 
 def write_map(folder: RunFolder, built: BuiltMap, config: MapConfig, record: RunRecord) -> None:
     """map.ply, .pcd, .las or .laz with map.json beside, in map coordinates where the run knows where it is."""
-    folder.require_space(BYTES_PER_POINT * len(built.merged), "the map")
+    shown = BYTES_PER_POINT_SHOWN * len(built.sample)
+    folder.require_space(BYTES_PER_POINT * len(built.merged) + shown, "the map")
     note = MapNote(record.name, config.voxel, built.done, f"{LOCAL}: {record.world}")
     map_files.write_map(folder.path / f"map.{config.format}", built.merged, note, record.georeference)
     if config.mesh:

@@ -222,8 +222,8 @@ def _record(run: EarlierRun, built: BuiltMap, name: str, score: Crispness) -> Ru
     manifest = {**run.manifest, "map_points": points, "map": about}
     return RunRecord(
         name="", method=run.config.odometry.method, folder=run.folder, results=[], trajectory=run.trajectory,
-        ground_truth=None, real_time_limit=0.0, manifest=manifest, map_file=name, map_image=built.image,
-        map_extent=built.extent, crispness=score,
+        ground_truth=None, real_time_limit=0.0, manifest=manifest, map_file=name, map_image=built.view.image,
+        map_heights=built.view.heights, map_extent=built.view.extent, map_sample=built.sample, crispness=score,
     )  # fmt: skip
 
 

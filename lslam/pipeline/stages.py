@@ -94,7 +94,9 @@ def make_map(folder: RunFolder, job: PreparedRun, record: RunRecord) -> None:
         )  # fmt: skip
         score = crispness(built.merged)
         outputs.write_map(folder, built, config.map, record)
-        record.map_file, record.map_image, record.map_extent = f"map.{config.map.format}", built.image, built.extent
+        record.map_file, record.map_sample = f"map.{config.map.format}", built.sample
+        record.map_image, record.map_heights = built.view.image, built.view.heights
+        record.map_extent = built.view.extent
         record.crispness = score
         manifest.map_points = len(built.merged)
 

@@ -11,10 +11,10 @@ from lslam.geometry import se3
 from lslam.printable import counted, metres
 from lslam.reports import svg
 from lslam.reports.buildings import drift_tables
-from lslam.reports.crops import Crop, crop_images
-from lslam.reports.plots import ALIGNED, DISTANCE, Figure, first_available
+from lslam.reports.crops import PIXELS, Crop, crop_images
+from lslam.reports.plots import ALIGNED, DISTANCE, PLAN_HEIGHT, Figure, first_available
 from lslam.reports.png import data_uri, density_png
-from lslam.reports.svg import Track, plane_chart
+from lslam.reports.svg import WIDTH, By, Track, plane_chart
 from lslam.types.run_record import LoopView, RunRecord
 from lslam.types.table import Table
 
@@ -25,8 +25,8 @@ Floats = NDArray[np.float64]
 # How fixes were used.
 _WAYS = {"graph": "GNSS in the graph", "fit": "GNSS fitted afterwards"}
 
-# Ellipses on the plan, their sigmas, and how large the largest is drawn at least, as a share of the plan.
-ELLIPSES, SIGMAS, SEEN = 16, 3.0, 0.02
+# Ellipses on the plan, and their sigmas.
+ELLIPSES, SIGMAS = 16, 3.0
 # m; the edge of the square leaves so much beside the correction, and is no smaller and no larger than that.
 BESIDE, SMALLEST, LARGEST = 40.0, 50.0, 150.0
 
@@ -88,11 +88,10 @@ def _drift_row(table: Table) -> tuple[str, str]:
 
 
 def back_end_figures(record: RunRecord, evaluation: Evaluation | None) -> list[Figure]:
-    """Plan, error and map at a loop before and after the pose graph; nothing where that moved nothing."""
+    """Plan, error and map at a loop; before and after the pose graph where it moved anything that can be seen."""
     odometry = record.odometry
     if odometry is None or odometry is record.trajectory:
         return []
-    before = se3.apply(record.T_final_odometry, odometry.positions)[:, :2]
     after = record.trajectory.positions[:, :2]
     tracks, legend = [], []
     absolute = first_available(evaluation)
@@ -100,26 +99,49 @@ def back_end_figures(record: RunRecord, evaluation: Evaluation | None) -> list[F
         truth = se3.apply(se3.inverse(absolute.T_gt_est), evaluation.gt_positions)
         tracks.append(Track("ground truth", truth[:, :2], "gt"))
         legend.append(("gt", "ground truth"))
-    tracks += [Track("before", before, "s2"), Track("after", after, "s1", ends=True)]
+    captions = ["Estimate in its own world" + ("; ground truth moved to it." if tracks else ".")]
     what = "localisation in the map" if record.map_fixes else "the pose graph"
-    legend += [("s2", "odometry"), ("s1", f"after {what}")]
+    moved, pixel = most_moved(record), _extent(record) / WIDTH
+    is_seen = moved > pixel
+    if is_seen:
+        before = se3.apply(record.T_final_odometry, odometry.positions)[:, :2]
+        tracks.append(Track("before", before, "s2"))
+        legend.append(("s2", "odometry"))
+    captions.append(f"{what[0].upper()}{what[1:]} moved poses by at most {metres(moved)} m.")
+    tracks.append(Track("after", after, "s1", ends=True))
+    legend.append(("s1", f"after {what}"))
     closed = [c for c in record.loops if c.is_accepted]
     for loop in closed:
         ends = record.keyframe_scans[[loop.a, loop.b]]
         tracks.append(Track("loop", after[ends], "s3"))
     legend += [("s3", f"{counted(len(closed), 'loop')} closed")] if closed else []
-    ellipses, factor = _ellipses(record)
-    tracks += [Track("uncertainty", ellipse, "s4") for ellipse in ellipses]
-    caption = (
-        "Estimate in its own world; ground truth moved to it." if len(tracks) > 2 else "Estimate in its own world."
-    )
-    if ellipses:
-        enlarged = f", drawn {factor:g} times as large" if factor > 1 else ""
-        beside = " beside the map's own shift" if _common(record).any() else ""
-        legend.append(("s4", f"{SIGMAS:g} sigma{beside}{enlarged}"))
-    chart = plane_chart(tracks, f"before and after {what}", width=720, tallest=760)
-    whole = Figure(f"Before and after {what}", chart, tuple(legend), caption, wide=True)
+    ellipses, largest = _ellipses(record)
+    beside = " beside the map's own shift" if _common(record).any() else ""
+    if largest > pixel:
+        tracks += [Track("uncertainty", ellipse, "s4") for ellipse in ellipses]
+        legend.append(("s4", f"{SIGMAS:g} sigma{beside}, to scale"))
+    elif ellipses:
+        captions.append(f"{SIGMAS:g} sigma{beside}: at most {metres(largest)} m, too small to be drawn.")
+    chart = plane_chart(tracks, f"before and after {what}", tallest=PLAN_HEIGHT, by="own")
+    title = f"Before and after {what}" if is_seen else f"After {what}"
+    whole = Figure(title, chart, tuple(legend), " ".join(captions))
     return [whole, *_error_figures(evaluation), *loop_figures(record.loop_view)]
+
+
+def most_moved(record: RunRecord) -> float:
+    """How far the back end moved the pose that it moved most, m; both trajectories in the world of the final one."""
+    if record.odometry is None or len(record.odometry) != len(record.trajectory):
+        return 0.0
+    before = se3.apply(record.T_final_odometry, record.odometry.positions)
+    moved = np.linalg.norm(record.trajectory.positions - before, axis=1)
+    return float(moved[np.isfinite(moved)].max(initial=0.0))
+
+
+def _extent(record: RunRecord) -> float:
+    """The longer side of the plan of the trajectory, m."""
+    xy = record.trajectory.positions[:, :2]
+    xy = xy[np.isfinite(xy).all(1)]
+    return float(np.ptp(xy, axis=0).max()) if len(xy) else 0.0
 
 
 def before_and_after(after: Evaluation, before: Evaluation, what: str = "the pose graph") -> str:
@@ -154,7 +176,7 @@ def _error_figures(evaluation: Evaluation | None) -> list[Figure]:
         for word, part, style in (("odometry", before, "s2"), ("after the pose graph", evaluation, "s1"))
     ]
     title = "Position error before and after the pose graph"
-    chart = svg.line_chart(lines, DISTANCE, "position error, m", title)
+    chart = svg.line_chart(lines, DISTANCE, "position error, m", title, by="truth")
     caption = f"{before_and_after(evaluation, before)}; {ALIGNED.get(name, name)}."
     return [Figure(title, chart, tuple((line.style, line.label) for line in lines), caption)] if chart else []
 
@@ -167,31 +189,31 @@ def _common(record: RunRecord) -> Floats:
 
 
 def _ellipses(record: RunRecord) -> tuple[list[Floats], float]:
-    """Outlines (33, 2) of horizontal uncertainty at some poses, and the power of ten that makes them visible.
+    """Outlines (33, 2) of horizontal uncertainty at some poses, to scale, and the largest half axis, m.
 
     What all poses are unsure by together moves the run and bends nothing: it is not drawn.
     """
     covariances, positions = record.trajectory.covariances, record.trajectory.positions
     if covariances is None or len(positions) < 2:
-        return [], 1.0
+        return [], 0.0
     some = np.unique(np.linspace(0, len(positions) - 1, ELLIPSES).round().astype(int))
     circle = np.linspace(0, 2 * np.pi, 33)
     ring = np.column_stack([np.cos(circle), np.sin(circle)])
     values, vectors = np.linalg.eigh(covariances[some, :2, :2] - _common(record))
     axes = SIGMAS * np.sqrt(np.maximum(values, 0.0))
-    size, largest = float(np.ptp(positions[:, :2], axis=0).max()), float(axes.max(initial=0.0))
-    if not (np.isfinite(largest) and largest > 0 and size > 0):
-        return [], 1.0
-    factor = 10.0 ** max(int(np.ceil(np.log10(SEEN * size / largest))), 0)
-    outlines = [positions[i, :2] + factor * (ring * a) @ v.T for i, a, v in zip(some, axes, vectors, strict=True)]
-    return outlines, factor
+    largest = float(axes.max(initial=0.0))
+    if not (np.isfinite(largest) and largest > 0):
+        return [], 0.0
+    return [positions[i, :2] + (ring * a) @ v.T for i, a, v in zip(some, axes, vectors, strict=True)], largest
 
 
 def loop_figures(view: LoopView | None) -> list[Figure]:
-    """Both figures; nothing without a loop."""
+    """Both figures; nothing without a loop, or where the correction is less than a pixel of them."""
     if view is None:
         return []
     size = float(np.clip(2 * view.correction + BESIDE, SMALLEST, LARGEST))
+    if view.correction < size / PIXELS:
+        return []
     places = (("before", view.before), ("after", view.after))
     crops = [Crop(float(place.centre[0]), float(place.centre[1]), size) for _, place in places]
     # The same grey in both: what is drawn twice is fainter, not hidden.
@@ -204,6 +226,7 @@ def loop_figures(view: LoopView | None) -> list[Figure]:
         assert image is not None
         tracks = [Track("older", crop.inside(place.older), "s2"), Track("newer", crop.inside(place.newer), "s1")]
         backdrop = (data_uri(density_png(image, top)), crop.extent)
-        chart = plane_chart(tracks, f"map at a loop, {word} the pose graph", backdrop=backdrop)
+        by: By = "own" if word == "after" else ""
+        chart = plane_chart(tracks, f"map at a loop, {word} the pose graph", backdrop=backdrop, by=by)
         figures.append(Figure(f"Map at a loop, {word} the pose graph", chart, legend, caption))
     return figures

@@ -61,7 +61,7 @@ def building_figures(found: CorrectedMap, matches: OsmMatches, poses: NDArray[np
     tracks = [Track(label, part, style) for style, label, lines in drawn for part in _parts(lines)]
     legend = tuple((style, label) for style, label, lines in drawn if len(lines))
     caption = f"x east, y north of the run's origin. Mode {found.mode}. {found.attribution or 'A map nobody surveyed.'}"
-    plan = plane_chart(tracks, "buildings from above, before and after", width=720, tallest=760)
+    plan = plane_chart(tracks, "buildings from above, before and after", width=720, tallest=760, by="own")
     return [Figure("Buildings before and after, from above", plan, legend, caption, wide=True), _holds(matches, poses)]
 
 
@@ -143,7 +143,7 @@ def _holds(matches: OsmMatches, poses: Floats) -> Figure:
     tracks += [Track(label, _dots(poses[keys, :2]), style) for style, label, keys in kinds if len(keys)]
     legend = [("gt", "way"), *((style, label) for style, label, keys in kinds if len(keys))]
     legend += [("bad", "match not used")] if refused else []
-    chart = plane_chart(tracks, "matches along the way", points=poses[refused, :2], width=720, tallest=560)
+    chart = plane_chart(tracks, "matches along the way", points=poses[refused, :2], width=720, tallest=560, by="own")
     caption = f"{len(used)} of {counted(len(at), 'keyframe')} held by the map."
     return Figure("Where the map held the trajectory, from above", chart, tuple(legend), caption, wide=True)
 

@@ -1,4 +1,4 @@
-"""compare.html: one self-contained page about a comparison. No script, no second file, no network."""
+"""compare.html: one self-contained page about a comparison. No second file, no network; whole without its script."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from lslam.formats.point_files import read_points
 from lslam.reports import svg
 from lslam.reports.compare_table import recipes, tables
 from lslam.reports.crops import Crop, Floats, choose_crops, crop_images
-from lslam.reports.html import flatten, template
+from lslam.reports.html import flatten
 from lslam.reports.plots import DISTANCE, LIMIT_IN_VIEW, Figure
 from lslam.reports.png import data_uri, density_png
+from lslam.reports.shell import render
 from lslam.reports.svg import Track, plane_chart
 from lslam.types.comparison import Comparison, Drawing, DrawnRun, RunScore
-from lslam.version import __version__
 
 WIDEST = 125  # characters of a table that the page shows without scrolling
 STYLES = 12
@@ -56,9 +56,9 @@ def render_page(
     """The page as text; links to runs are relative to `folder`."""
     place = None if crop is None else Crop(*crop)
     sections = [_section(folder, comparison, name, drawings, place) for name in comparison.sequences]
-    return template("compare.html.j2").render(
+    return render(
+        "compare.html.j2",
         comparison=comparison,
-        version=__version__,
         tables=tables(comparison, WIDEST),
         recipes=recipes(comparison),
         sections=sections,

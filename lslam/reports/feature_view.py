@@ -41,7 +41,7 @@ def feature_figures(view: FeatureView | None) -> list[Figure]:
         svg.Line("edges", view.scans.astype(np.float64), view.edge_counts.astype(np.float64), "s1"),
         svg.Line("planar points", view.scans.astype(np.float64), view.plane_counts.astype(np.float64), "s2"),
     ]
-    counts = svg.line_chart(lines, "scan", "features", "features per scan", whole_x=True)
+    counts = svg.line_chart(lines, "scan", "features", "features per scan", whole_x=True, by="scan")
     looked = f"{len(view.scans)} scans, evenly spaced over the run."
     return [
         Figure(

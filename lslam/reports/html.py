@@ -1,33 +1,33 @@
-"""report.html: one self-contained page about one run. No script, no second file, no network."""
+"""report.html: one self-contained page about one run. No second file, no network; whole without its script."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lslam.evaluation.evaluate import shown_metrics
 from lslam.formats.atomic import atomic_write
 from lslam.reports import plots
-from lslam.reports.back_end import back_end_figures
+from lslam.reports.back_end import back_end_figures, back_end_rows
 from lslam.reports.buildings import building_pages
+from lslam.reports.colours import VIRIDIS, usual_range
 from lslam.reports.facts import RunFacts, run_facts
 from lslam.reports.feature_view import feature_figures
 from lslam.reports.imu_figures import imu_figures
-from lslam.reports.png import data_uri, density_png
+from lslam.reports.page_data import cloud_data, scan_data
+from lslam.reports.png import coloured_png, data_uri, density_png, halved
+from lslam.reports.shell import RUN, render, template
 from lslam.reports.text import imu_rows
 from lslam.types.run_record import Crispness, RunRecord
 from lslam.types.table import Table
-from lslam.version import __version__
 
 if TYPE_CHECKING:
-    from jinja2 import Environment, Template
-
     from lslam.evaluation.results import Evaluation
 
 MOST_ROWS = 100
+MOST_PICTURE = 1_500_000  # bytes of the map from above, so that the page stays below 6 MB
 # Parts of the page, between marks of these names, that another map changes.
 MAP_PARTS = {"cards": "map_cards.html.j2", "map": "map_section.html.j2", "manifest": "manifest_table.html.j2"}
 
@@ -61,16 +61,20 @@ def write_report(path: Path, record: RunRecord, evaluation: Evaluation | None) -
 def render_report(record: RunRecord, evaluation: Evaluation | None) -> str:
     """The page as text."""
     facts = run_facts(record)
-    return template("report.html.j2").render(
+    return render(
+        "report.html.j2",
+        RUN,
         record=record,
         facts=facts,
-        version=__version__,
+        scan_data=scan_data(record, evaluation),
         cards=_cards(facts, evaluation),
         failures=facts.failures[:MOST_ROWS],
         degenerate=facts.degenerate[:MOST_ROWS],
         evaluation=evaluation,
         has_truth=record.ground_truth is not None,
-        trajectory=plots.trajectory_figures(record, evaluation) + back_end_figures(record, evaluation),
+        trajectory=plots.trajectory_figures(record, evaluation),
+        back_end=back_end_figures(record, evaluation),
+        back_end_said=next((said for _, said in back_end_rows(record, evaluation)), ""),
         errors=plots.error_figures(evaluation) if evaluation is not None else [],
         tables=[] if evaluation is None else _metric_tables(evaluation),
         buildings=building_pages(record),
@@ -92,35 +96,26 @@ def map_context(record: RunRecord) -> dict[str, Any]:
         "map_cards": _map_cards(record.crispness),
         "map_figure": _map_figure(record),
         "map_note": _map_note(record.manifest.get("map")),
-        "facts_of_input": flatten(record.manifest),
+        "cloud_data": cloud_data(record.map_sample, record.trajectory),
+        "map_extent": record.map_extent,
+        "colours": VIRIDIS,
+        # Digests, which the machine compares, after what people read.
+        "facts_of_input": sorted(flatten(record.manifest), key=lambda row: row[0].startswith("identity.")),
     }
 
 
-def template(name: str) -> Template:
-    """A template of this package; everything it shows is escaped, and a name it does not know is an error."""
-    return _environment().get_template(name)
-
-
-@cache
-def _environment() -> Environment:
-    """One for all pages of a process: to compile a template takes longer than to fill it."""
-    from jinja2 import Environment, PackageLoader, StrictUndefined
-
-    return Environment(
-        loader=PackageLoader("lslam", "reports"),
-        autoescape=True,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        keep_trailing_newline=True,
-        undefined=StrictUndefined,
-    )
-
-
-def _map_figure(record: RunRecord) -> plots.Figure | None:
-    image = record.map_image
+def _map_figure(record: RunRecord) -> plots.MapFigure | None:
+    image, heights = record.map_image, record.map_heights
     if image is None or not (image > 0).any():
         return None
-    return plots.map_figure(record, data_uri(density_png(image)))
+    if heights is None:
+        return plots.map_figure(record, data_uri(density_png(image)), None)
+    low, high = usual_range(heights)
+    png = coloured_png(image, heights, low, high)
+    while len(png) > MOST_PICTURE:
+        image, heights = halved(image, heights)
+        png = coloured_png(image, heights, low, high)
+    return plots.map_figure(record, data_uri(png), (low, high))
 
 
 def flatten(tree: Mapping[str, Any], prefix: str = "") -> list[tuple[str, list[str]]]:

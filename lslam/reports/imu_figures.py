@@ -60,7 +60,7 @@ def _course(course: _Course, seconds: Floats, values: Floats, sigmas: Floats) ->
         lines.append(svg.Line(name, seconds, values[:, k], style))
         reach = BAND_SIGMAS * sigmas[:, k]
         bands.append(svg.Band(seconds, values[:, k] - reach, values[:, k] + reach, style))
-    chart = svg.line_chart(lines, TIME, course.y_label, course.title, zero=False, bands=bands)
+    chart = svg.line_chart(lines, TIME, course.y_label, course.title, zero=False, bands=bands, by="time")
     legend = tuple((line.style, line.label) for line in lines) if len(lines) > 1 else ()
     return Figure(course.title, chart, legend, f"{course.recipe} Band: {BAND_SIGMAS:g} sigma.".strip())
 
@@ -80,7 +80,7 @@ def _readings(record: RunRecord) -> list[Figure]:
         ("Angular rate", "as recorded (rad/s if it is right)", imu.gyro[during]),
     ):
         lines = [svg.Line(name, seconds, values[:, k], f"s{k + 1}") for k, name in enumerate(XYZ)]
-        chart = svg.line_chart(lines, TIME, y_label, title)
+        chart = svg.line_chart(lines, TIME, y_label, title, by="time")
         figures.append(Figure(title, chart, tuple((line.style, line.label) for line in lines), recipe))
     return figures
 

@@ -11,18 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.formats.atomic import atomic_write
+from lslam.maps.floor_plan import TopView
 from lslam.printable import metres
 from lslam.reports.compare_html import style_of
-from lslam.reports.html import template
 from lslam.reports.plots import Figure
 from lslam.reports.png import data_uri, density_png
+from lslam.reports.shell import render
 from lslam.reports.svg import Track, plane_chart
 from lslam.types.table import Table
-from lslam.version import __version__
 
 Floats = NDArray[np.float64]
 RECIPE = "ATE of each session by itself, se3, m rmse; found by keyframes that agree, of those tried."
-MapView = tuple[NDArray[np.float32], tuple[float, float, float, float]]
 
 
 @dataclass(frozen=True)
@@ -39,33 +38,29 @@ def write_page(
     sessions: Sequence[SessionView],
     rows: Sequence[Mapping[str, Any]],
     problems: Sequence[str],
-    view: MapView | None,
+    view: TopView | None,
 ) -> None:
     """Write the page atomically; raises OutputError when it cannot be written.
 
-    rows : of the manifest's `sessions`; view : density of the map from above and its extent, m
+    rows : of the manifest's `sessions`; view : of the merged map
     """
-    page = template("merge.html.j2").render(
-        names=[s.name for s in sessions], problems=problems, figures=_figures(sessions, view), table=_table(rows),
-        version=__version__,
-    )  # fmt: skip
+    names = [s.name for s in sessions]
+    page = render("merge.html.j2", names=names, problems=problems, figures=_figures(sessions, view), table=_table(rows))
     with atomic_write(path) as stream:
         stream.write(page.encode("utf-8", "replace"))
 
 
-def _figures(sessions: Sequence[SessionView], view: MapView | None) -> list[Figure]:
+def _figures(sessions: Sequence[SessionView], view: TopView | None) -> list[Figure]:
     names = [s.name for s in sessions]
-    backdrop = None if view is None else (data_uri(density_png(view[0])), view[1])
+    backdrop = None if view is None else (data_uri(density_png(view.image)), view.extent)
     figures = []
     for title, caption, positions in (
         ("After the pose graph, from above", "On the map of all sessions.", [s.after for s in sessions]),
         ("Before, from above", "Each session moved as a whole to where it was found.", [s.before for s in sessions]),
     ):
         tracks = [Track(name, p[:, :2], style_of(name, names)) for name, p in zip(names, positions, strict=True)]
-        chart = plane_chart(
-            tracks, title.lower(), backdrop=backdrop if "After" in title else None, width=720, tallest=760
-        )
-        figures.append(Figure(title, chart, tuple((t.style, t.label) for t in tracks), caption, wide=True))
+        chart = plane_chart(tracks, title.lower(), backdrop=backdrop if "After" in title else None)
+        figures.append(Figure(title, chart, tuple((t.style, t.label) for t in tracks), caption))
     return figures
 
 

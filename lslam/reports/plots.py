@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from lslam.reports import svg
 from lslam.reports.facts import RunFacts, stage_matrix
-from lslam.reports.svg import Track, plane_chart
+from lslam.reports.svg import By, Track, plane_chart
 from lslam.types.run_record import RunRecord
 
 if TYPE_CHECKING:
@@ -19,6 +19,9 @@ if TYPE_CHECKING:
 
 
 DISTANCE = "distance along ground truth, m"
+# What of a scan plane and abscissa are: without, and with ground truth.
+_BY_WAY: tuple[By, By] = ("own", "way")
+_BY_TRUTH: tuple[By, By] = ("aligned", "truth")
 ALIGNMENTS = ("se3", "origin", "posyaw", "sim3", "none")
 ALIGNED = {
     "se3": "aligned to ground truth by a rigid transform (se3)",
@@ -28,6 +31,8 @@ ALIGNED = {
     "none": "not aligned",
 }
 Floats = NDArray[np.float64]
+MAP_WIDTH, MAP_HEIGHT = 980, 700
+PLAN_HEIGHT = 340  # of one beside a chart
 # A limit further away than this many times the usual scan would press the stages flat: an arrow says where it is.
 LIMIT_IN_VIEW = 4.0
 
@@ -50,17 +55,21 @@ def trajectory_figures(record: RunRecord, evaluation: Evaluation | None) -> list
     if evaluation is None or absolute is None:
         positions = record.trajectory.positions
         truth, distance = None, record.trajectory.path_lengths
-        caption, x_label = "Estimate in its own world.", "distance travelled, m"
+        caption, x_label, along = "Estimate in its own world.", "distance travelled, m", _BY_WAY
     else:
         positions, truth, distance = absolute.aligned_positions, evaluation.gt_positions, evaluation.distance
-        caption, x_label = f"Estimate {ALIGNED.get(absolute.alignment, absolute.alignment)}.", DISTANCE
+        caption, x_label, along = (
+            f"Estimate {ALIGNED.get(absolute.alignment, absolute.alignment)}.",
+            DISTANCE,
+            _BY_TRUTH,
+        )
     tracks = [] if truth is None else [Track("ground truth", truth[:, :2], "gt")]
     tracks.append(Track("estimate", positions[:, :2], "s1", ends=True))
     failed = _failed_positions(record, absolute)
-    top = plane_chart(tracks, "trajectory from above", points=failed)
+    top = plane_chart(tracks, "trajectory from above", points=failed, tallest=PLAN_HEIGHT, by=along[0])
     lines = [] if truth is None else [svg.Line("ground truth", distance, truth[:, 2], "gt")]
     lines.append(svg.Line("estimate", distance, positions[:, 2], "s1"))
-    height = svg.line_chart(lines, x_label, "height z, m", "height profile", zero=False)
+    height = svg.line_chart(lines, x_label, "height z, m", "height profile", zero=False, by=along[1])
     legend = tuple((t.style, t.label) for t in tracks)
     start_end = (("start", "start"), ("end", "end"))
     extra = (("bad", "bridged or skipped scan"),) if len(failed) else ()
@@ -116,18 +125,27 @@ def time_figure(record: RunRecord, facts: RunFacts) -> Figure | None:
     return Figure("Time per scan", chart, legend, f"{caption} {remark}".strip(), is_area=True)
 
 
-def map_figure(record: RunRecord, png_uri: str) -> Figure:
-    """The merged map from above with the trajectory on it."""
+@dataclass(frozen=True)
+class MapFigure:
+    """The map of a run: its drawing, and the range of heights, m, that colours stand for; None of one that is grey."""
+
+    figure: Figure
+    heights: tuple[float, float] | None
+    pixel: float
+
+
+def map_figure(record: RunRecord, png_uri: str, heights: tuple[float, float] | None) -> MapFigure:
+    """The merged map from above with the trajectory on it; `png_uri` is its picture, coloured by `heights` or grey."""
+    assert record.map_image is not None
     tracks = [Track("trajectory", record.trajectory.positions[:, :2], "s2", ends=True)]
+    style = "density" if heights is None else "coloured"
     chart = plane_chart(
-        tracks, "merged map from above", backdrop=(png_uri, record.map_extent), width=720, tallest=760, points=None
-    )
-    caption = (
-        "The more voxels of a column are occupied, the stronger it is drawn: walls stand out. World of the estimate."
-    )
-    return Figure(
-        "Map from above", chart, (("s2", "trajectory"), ("start", "start"), ("end", "end")), caption, wide=True
-    )
+        tracks, "merged map from above", backdrop=(png_uri, record.map_extent), backdrop_style=style, width=MAP_WIDTH,
+        tallest=MAP_HEIGHT, by="own",
+    )  # fmt: skip
+    caption = "World of the estimate. The more voxels of a column are occupied, the stronger it is drawn from above."
+    figure = Figure("Map", chart, (("s2", "trajectory"), ("start", "start"), ("end", "end")), caption)
+    return MapFigure(figure, heights, (record.map_extent[1] - record.map_extent[0]) / record.map_image.shape[1])
 
 
 def registration_figures(record: RunRecord) -> list[Figure]:
@@ -159,7 +177,7 @@ def registration_figures(record: RunRecord) -> list[Figure]:
             svg.Line(words.get(f, f), index, v, f"s{i + 1}")
             for i, (f, v) in enumerate(zip(fields, values, strict=True))
         ]
-        chart = svg.line_chart(lines, "scan", y_label, f"{title} per scan", marks=failed, whole_x=True)
+        chart = svg.line_chart(lines, "scan", y_label, f"{title} per scan", marks=failed, whole_x=True, by="scan")
         legend = tuple((line.style, line.label) for line in lines) if len(lines) > 1 else ()
         if len(failed):
             legend += (("failed", "bridged or skipped scan"),)
@@ -193,7 +211,9 @@ def uncertainty_figures(record: RunRecord) -> list[Figure]:
         ("Rotation uncertainty", "deg", ("about x", "about y", "about z"), np.degrees(sigma[:, 3:])),
     ):
         lines = _three(names, distance, values)
-        chart = svg.line_chart(lines, "distance travelled, m", f"sigma, {unit}", title, marks=distance[failed])
+        chart = svg.line_chart(
+            lines, "distance travelled, m", f"sigma, {unit}", title, marks=distance[failed], by="way"
+        )
         legend = tuple((line.style, line.label) for line in lines)
         legend += (("failed", "bridged or skipped scan"),) if failed.any() else ()
         figures.append(Figure(title, chart, legend, recipe))
@@ -228,7 +248,7 @@ def share_bar(facts: RunFacts) -> str:
 
 
 def _lines(title: str, lines: list[svg.Line], x_label: str, y_label: str, caption: str) -> Figure:
-    chart = svg.line_chart(lines, x_label, y_label, title)
+    chart = svg.line_chart(lines, x_label, y_label, title, by="truth")
     return Figure(title, chart, tuple((line.style, line.label) for line in lines), caption)
 
 
@@ -266,7 +286,7 @@ def stage_chart(index: NDArray[Any], ms: Floats, limit: float, title: str) -> tu
     limit_inside = 0 < limit <= LIMIT_IN_VIEW * top
     if limit_inside:
         top = max(top, 1.08 * limit)
-    frame = svg.Frame((x[0], x[-1]), (0.0, top))
+    frame = svg.Frame((x[0], x[-1]), (0.0, top), by="scan")
     frame.axes("scan", "time, ms", whole_x=True)
     stacked = np.cumsum(np.minimum(layers, 1e9), axis=1)
     below = np.zeros(len(stacked))

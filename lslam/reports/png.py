@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.reports.colours import VIRIDIS, palette
+
 LEVELS = 16  # four bits per pixel
 
 
@@ -32,6 +34,39 @@ def density_png(image: NDArray[Any], top: float | None = None) -> bytes:
             (b"IHDR", struct.pack(">IIBBBBB", width, height, 4, 3, 0, 0, 0)),
             (b"PLTE", bytes(3 * LEVELS)),
             (b"tRNS", alpha),
+            (b"IDAT", zlib.compress(raw.tobytes(), 6)),
+            (b"IEND", b""),
+        ]
+    )
+
+
+def halved(image: NDArray[Any], values: NDArray[Any]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """A density image (H, W) and its values with half as many pixels each way: sums, and means by density."""
+    height, width = (2 * (n // 2) for n in image.shape)
+    blocks = (height // 2, 2, width // 2, 2)
+    density = np.nan_to_num(np.asarray(image[:height, :width], np.float32)).reshape(blocks)
+    weighted = np.nan_to_num(np.asarray(values[:height, :width], np.float32)).reshape(blocks) * density
+    sums = density.sum((1, 3))
+    return sums, np.divide(weighted.sum((1, 3)), sums, out=np.full_like(sums, np.nan), where=sums > 0)
+
+
+def coloured_png(image: NDArray[Any], values: NDArray[Any], low: float, high: float) -> bytes:
+    """PNG of a density image (H, W) whose colour says `values` (H, W), from `low` to `high`, and whose opacity the density.
+
+    Of 16 colours and 16 opacities; empty pixels are transparent.
+    """
+    levels = _levels(np.nan_to_num(np.asarray(image, np.float32), nan=0.0, posinf=0.0, neginf=0.0), None)
+    share = (np.nan_to_num(np.asarray(values, np.float32), nan=low) - low) / (high - low)
+    colour = np.rint(np.clip(share, 0, 1) * (len(VIRIDIS) - 1)).astype(np.uint8)
+    raw = np.zeros((levels.shape[0], 1 + levels.shape[1]), np.uint8)  # column 0: filter type none
+    raw[:, 1:] = np.where(levels > 0, colour * LEVELS + levels, 0)
+    alpha = [round(255 * (0.4 + 0.6 * i / (LEVELS - 1)) if i else 0) for i in range(LEVELS)]
+    header = struct.pack(">IIBBBBB", levels.shape[1], levels.shape[0], 8, 3, 0, 0, 0)
+    return _png(
+        [
+            (b"IHDR", header),
+            (b"PLTE", palette().repeat(LEVELS, axis=0).tobytes()),
+            (b"tRNS", bytes(alpha * len(VIRIDIS))),
             (b"IDAT", zlib.compress(raw.tobytes(), 6)),
             (b"IEND", b""),
         ]

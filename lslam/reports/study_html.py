@@ -12,12 +12,11 @@ from lslam.formats.atomic import atomic_write
 from lslam.printable import counted
 from lslam.reports.compare_table import CompareTable, as_text
 from lslam.reports.grid_text import comma_separated
-from lslam.reports.html import template
+from lslam.reports.shell import render
 from lslam.reports.study_figures import StudyFigure, study_figures
 from lslam.reports.study_table import means_grid, study_recipes, study_tables
 from lslam.types.sensitivity import StudyResult
 from lslam.types.study import StudyRow
-from lslam.version import __version__
 
 
 @dataclass(frozen=True)
@@ -50,9 +49,9 @@ def write_study_files(folder: Path, results: Sequence[StudyResult], rows: Sequen
         data = [f"data:image/svg+xml;base64,{base64.b64encode(figure.svg).decode('ascii')}" for figure in figures]
         shown = list(zip(figures, data, strict=True))
         sections.append(StudySection(result, shown, study_tables(result), study_recipes(result)))
-    page = template("study.html.j2").render(
+    page = render(
+        "study.html.j2",
         title=title,
-        version=__version__,
         rows=rows,
         failed=sum(not row.is_usable for row in rows),
         notes=timing_notes(rows),

@@ -1,5 +1,8 @@
 """Small charts as inline SVG: no plotting library, colours and fonts left to the page's style sheet.
 
+Each is whole as it stands. For the page's script, which zooms charts and finds scans in them, axes and data are groups of
+their own, `data-view` has the limits of the axes and their places, and `data-by` what of a scan the abscissa is.
+
 Drawn by hand because a report must be quick (importing a plotting library alone takes half a second of a run that
 lasts two), readable on a phone and follow the page's light and dark colours. Long series are drawn as minimum and
 maximum per bin, so a peak is never lost.
@@ -10,12 +13,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
+
+# What of a scan an abscissa is: its number, distance along ground truth or travelled, s since the first; or both axes of a
+# plane its place in the run's own world or as aligned to ground truth. Empty: nothing of a scan.
+By = Literal["", "scan", "truth", "way", "time", "own", "aligned"]
 
 WIDTH = 480
 BINS = 360  # about one per pixel and a half of the plot area
@@ -47,14 +54,21 @@ class Frame:
     """A plot area with axes: maps data to SVG units and collects elements."""
 
     def __init__(
-        self, x_range: tuple[float, float], y_range: tuple[float, float], width: int = WIDTH, height: int = 260
+        self,
+        x_range: tuple[float, float],
+        y_range: tuple[float, float],
+        width: int = WIDTH,
+        height: int = 260,
+        by: By = "",
     ) -> None:
-        self.width, self.height = width, height
+        self.width, self.height, self.by, self.kind = width, height, by, "chart"
         self.x0, self.x1 = _widened(*x_range)
         self.y0, self.y1 = _widened(*y_range)
         self.left, self.right = MARGIN_LEFT, width - MARGIN_RIGHT
         self.top, self.bottom = MARGIN_TOP, height - MARGIN_BOTTOM
         self.parts: list[str] = []
+        self._grid: list[str] = []
+        self._labels: list[str] = []
 
     def px(self, x: Any) -> Any:
         """SVG abscissa of data x."""
@@ -68,15 +82,15 @@ class Frame:
         """Grid, tick labels and axis labels; the y label stands above the axis, where it can be read."""
         for value in ticks(self.x0, self.x1, x_ticks, whole_x):
             x = float(self.px(value))
-            self.add(f'<path class="grid" d="M{x:.1f} {self.top}V{self.bottom}"/>')
-            self.text(x, self.bottom + 16, number(value, self.x1 - self.x0), "middle")
+            self._grid.append(f'<path class="grid" d="M{x:.1f} {self.top}V{self.bottom}"/>')
+            self._grid.append(_text(x, self.bottom + 16, number(value, self.x1 - self.x0), "middle", "tick"))
         for value in ticks(self.y0, self.y1, y_ticks):
             y = float(self.py(value))
-            self.add(f'<path class="grid" d="M{self.left} {y:.1f}H{self.right}"/>')
-            self.text(self.left - 6, y + 4, number(value, self.y1 - self.y0), "end")
-        self.add(f'<path class="axis" d="M{self.left} {self.top}V{self.bottom}H{self.right}"/>')
-        self.text((self.left + self.right) / 2, self.height - 6, x_label, "middle", "label")
-        self.text(6, 14, y_label, "start", "label")
+            self._grid.append(f'<path class="grid" d="M{self.left} {y:.1f}H{self.right}"/>')
+            self._grid.append(_text(self.left - 6, y + 4, number(value, self.y1 - self.y0), "end", "tick"))
+        self._labels.append(f'<path class="axis" d="M{self.left} {self.top}V{self.bottom}H{self.right}"/>')
+        self._labels.append(_text((self.left + self.right) / 2, self.height - 6, x_label, "middle", "label"))
+        self._labels.append(_text(6, 14, y_label, "start", "label"))
 
     def add(self, element: str) -> None:
         """One more element."""
@@ -84,7 +98,7 @@ class Frame:
 
     def text(self, x: float, y: float, text: str, anchor: str = "start", style: str = "tick") -> None:
         """Escaped text."""
-        self.add(f'<text class="{style}" x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}">{escape(text)}</text>')
+        self.add(_text(x, y, text, anchor, style))
 
     def polyline(self, x: NDArray[Any], y: NDArray[Any], style: str) -> None:
         """A line, broken where a value is not finite; a single point becomes a dot."""
@@ -116,12 +130,20 @@ class Frame:
             self.add(f'<path class="{style}" d="{"".join(f"M{p} {self.top}V{self.bottom}" for p in places)}"/>')
 
     def svg(self, title: str) -> str:
-        """The finished element; `title` is what a screen reader says."""
+        """The finished element; `title` is what a screen reader says. What has no axes does not move."""
+        head = f'<svg viewBox="0 0 {self.width} {self.height}" role="img" aria-label="{escape(title)}"'
+        content = "".join(self.parts)
+        if not self._labels:
+            return f"{head}>{content}</svg>"
+        view = (self.x0, self.x1, self.y0, self.y1, self.left, self.right, self.top, self.bottom)
         return (
-            f'<svg viewBox="0 0 {self.width} {self.height}" role="img" aria-label="{escape(title)}">'
-            + "".join(self.parts)
-            + "</svg>"
+            f'{head} class="{self.kind}" data-view="{" ".join(f"{v:.9g}" for v in view)}" data-by="{self.by}">'
+            f'<g class="ticks">{"".join(self._grid)}</g><g class="data">{content}</g>{"".join(self._labels)}</svg>'
         )
+
+
+def _text(x: float, y: float, text: str, anchor: str, style: str) -> str:
+    return f'<text class="{style}" x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}">{escape(text)}</text>'
 
 
 def ticks(low: float, high: float, wanted: int = 5, whole: bool = False) -> list[float]:
@@ -203,17 +225,19 @@ def line_chart(
     marks: NDArray[Any] | None = None,
     whole_x: bool = False,
     bands: Sequence[Band] = (),
+    by: By = "",
 ) -> str:
     """Lines over a common abscissa; `marks` are abscissas of failed scans. Empty text when no value is finite.
 
     bands : areas behind the lines; where one is wider than the lines need, as at the start of a filter, it is cut off
+    by : what of a scan the abscissa is
     """
     x_span, y_span = span_of([line.x for line in lines]), span_of([*(line.y for line in lines), *_settled(bands)], zero)
     if x_span is None or y_span is None:
         return ""
     pad = 0.06 * (y_span[1] - y_span[0])
     low = y_span[0] - (pad if y_span[0] < 0 or not zero else 0)
-    frame = Frame(x_span, (low, y_span[1] + pad))
+    frame = Frame(x_span, (low, y_span[1] + pad), by=by)
     frame.axes(x_label, y_label, whole_x=whole_x)
     if marks is not None:
         frame.marks(marks, "failed")
@@ -254,15 +278,18 @@ def plane_chart(
     title: str,
     *,
     backdrop: tuple[str, tuple[float, float, float, float]] | None = None,
+    backdrop_style: str = "density",
     points: NDArray[Any] | None = None,
     dots: Sequence[tuple[str, NDArray[Any]]] = (),
     width: int = WIDTH,
     tallest: int = 460,
+    by: By = "",
 ) -> str:
-    """Tracks from above, x to the right, y up; `backdrop` is an image's address and its extent (x0, x1, y0, y1).
+    """Tracks from above, x to the right, y up; `backdrop` is an image's address and its extent (x0, x1, y0, y1),
+    in the style `backdrop_style`.
 
     `points` (K, 2) are marked as failures; `dots` are points (K, 2) in a style each, one group over
-    the other. Empty text when nothing is finite.
+    the other; `by` says whose world it is. Empty text when nothing is finite.
     """
     xs, ys = [t.xy[:, 0] for t in tracks], [t.xy[:, 1] for t in tracks]
     if backdrop is not None:
@@ -271,13 +298,14 @@ def plane_chart(
     if x_span is None or y_span is None:
         return ""
     frame = _fitted(x_span, y_span, width, tallest, 0.0 if backdrop else 0.05)
+    frame.by, frame.kind = by, "plane"
     frame.axes("x, m", "y, m", x_ticks=min(6, width // 80), y_ticks=max(2, round((frame.bottom - frame.top) / 60)))
     if backdrop is not None:
         x0, x1, y0, y1 = backdrop[1]
         left, right = float(frame.px(x0)), float(frame.px(x1))
         top, bottom = float(frame.py(y1)), float(frame.py(y0))
         frame.add(
-            f'<image class="density" x="{left:.1f}" y="{top:.1f}" width="{right - left:.1f}" '
+            f'<image class="{backdrop_style}" x="{left:.1f}" y="{top:.1f}" width="{right - left:.1f}" '
             f'height="{bottom - top:.1f}" preserveAspectRatio="none" href="{backdrop[0]}"/>'
         )
     for style, group in dots:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.types.building import CorrectedMap, OsmMatches
+from lslam.types.cloud import ArrayCloud
 from lslam.types.constraint import LoopCandidate, Turn
 from lslam.types.gnss import Georeference
 from lslam.types.imu import ImuStream
@@ -127,6 +128,7 @@ class RunRecord:
     folder : where its results are, None when nothing is written
     map_file : name of the merged map in that folder, empty without one
     map_image : (H, W) float32 density of the merged map seen from above, row 0 at the largest y, or None
+    map_heights : (H, W) mean z of what lies in each pixel, m, NaN where nothing does; map_sample : some of its points
     map_extent : (x_min, x_max, y_min, y_max), m; crispness : of the merged map, None without one
     real_time_limit : seconds one scan may take: skip_frames / rate
     pose_time : where in a sweep the stamps of scans lie, to which poses belong: scan_start, scan_middle or scan_end
@@ -157,6 +159,8 @@ class RunRecord:
     manifest: dict[str, Any] = field(default_factory=dict)
     map_file: str = ""
     map_image: NDArray[np.float32] | None = None
+    map_heights: NDArray[np.float32] | None = None
+    map_sample: ArrayCloud | None = None
     map_extent: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
     crispness: Crispness | None = None
     world: str = "LiDAR at the first scan, not levelled"

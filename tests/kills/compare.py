@@ -15,7 +15,7 @@ TIMED_FILES = ("log.txt", "timing.csv", "keyframes/odometry.npz")
 TIMED_KEYS = ("timings", "started", "written", "peak_memory_mb", "resumed_after_scans")
 _ROWS = "|".join(re.escape(key) for key in (*TIMED_KEYS, "imu.saved_ms_per_scan"))
 _TIMES_OF_REPORT = (
-    re.compile(r"<section>\s*<h2>Time</h2>.*?</section>", re.S),
+    re.compile(r"<section>\s*<details[^>]*>\s*<summary><h2>Time</h2>.*?</section>", re.S),
     re.compile(r"<b>[^<]*</b>(?= ?(ms<span>median time per scan|×<span>real time))"),
     re.compile(rf'<tr><th scope="row">({_ROWS})[^<]*</th>.*?</tr>\s*', re.S),
     re.compile(r"[0-9.]+ ms per scan (saved|lost)"),

@@ -48,7 +48,8 @@ def test_a_recording_merges_as_in_numpy(recordings: Callable[[str], Path]) -> No
     assert merged.intensity is not None
     assert 0.0 <= merged.intensity.min() <= merged.intensity.max() <= 1.0
 
-    image, (x0, x1, y0, y1) = top_view(merged.points)
+    view = top_view(merged.points)
+    x0, x1, y0, y1 = view.extent
     assert x0 < poses[0, 0, 3] < x1
     assert y0 < poses[0, 1, 3] < y1
-    assert image.sum() > 0.98 * len(merged)
+    assert view.image.sum() > 0.98 * len(merged)

@@ -10,7 +10,8 @@ from lslam.maps.floor_plan import top_view
 
 def test_every_point_is_counted_in_its_pixel() -> None:
     points = np.random.default_rng(1).uniform([-20, 5, 0], [10, 25, 3], (5000, 3))
-    image, (x0, x1, y0, y1) = top_view(points, pixel=0.5, trim=0.0)
+    view = top_view(points, pixel=0.5, trim=0.0)
+    image, (x0, x1, y0, y1) = view.image, view.extent
     height, width = image.shape
     assert image.sum() == 5000
     assert (x1 - x0) / width == pytest.approx(0.5)
@@ -19,11 +20,22 @@ def test_every_point_is_counted_in_its_pixel() -> None:
         points[:, 1], points[:, 0], (height, width), ((y0, y0 + height * 0.5), (x0, x0 + width * 0.5))
     )
     assert np.array_equal(image, expected[::-1])
+    heights, _, _ = np.histogram2d(
+        points[:, 1],
+        points[:, 0],
+        (height, width),
+        ((y0, y0 + height * 0.5), (x0, x0 + width * 0.5)),
+        weights=points[:, 2],
+    )
+    seen = image > 0
+    np.testing.assert_allclose(view.heights[seen], heights[::-1][seen] / image[seen], rtol=1e-5)
+    assert np.isnan(view.heights[~seen]).all()
 
 
 def test_row_zero_is_north_and_column_zero_west() -> None:
     points = np.array([[0, 0, 0], [0, 10, 0], [0, 10, 1], [20, 10, 0]], float)
-    image, extent = top_view(points, pixel=1.0, trim=0.0)
+    view = top_view(points, pixel=1.0, trim=0.0)
+    image, extent = view.image, view.extent
     assert image.shape == (11, 21)
     assert (image[0, 0], image[0, 20], image[10, 0], image.sum()) == (2, 1, 1, 4)
     assert extent == (0.0, 21.0, 0.0, 11.0)
@@ -32,7 +44,7 @@ def test_row_zero_is_north_and_column_zero_west() -> None:
 @pytest.mark.parametrize("shape", [(5000.0, 300.0), (300.0, 5000.0), (4000.0, 4000.0)])
 def test_long_side_is_bounded(shape: tuple[float, float]) -> None:
     points = np.random.default_rng(2).uniform(0, 1, (20_000, 3)) * [*shape, 1]
-    image, _ = top_view(points, trim=0.0)
+    image = top_view(points, trim=0.0).image
     assert 1500 < max(image.shape) <= 1600
     assert image.sum() == 20_000
 
@@ -40,28 +52,30 @@ def test_long_side_is_bounded(shape: tuple[float, float]) -> None:
 def test_stray_points_do_not_shrink_the_map() -> None:
     points = np.random.default_rng(3).uniform(0, 100, (10_000, 3))
     points[:5] = 1e6
-    _, (x0, x1, _, _) = top_view(points)
+    x0, x1, _, _ = top_view(points).extent
     assert x0 > -1
     assert x1 < 101
 
 
 def test_large_coordinates_keep_their_pixels() -> None:
     points = np.random.default_rng(4).uniform(0, 50, (3000, 3))
-    near, _ = top_view(points, pixel=0.25)
-    far, _ = top_view(points + np.array([5e6, 5e6, 0]), pixel=0.25)
+    near = top_view(points, pixel=0.25).image
+    far = top_view(points + np.array([5e6, 5e6, 0]), pixel=0.25).image
     assert near.shape == far.shape
     assert np.abs(near - far).sum() < 10  # a point on an edge may round to the other side
 
 
 @pytest.mark.parametrize("points", [np.zeros((0, 3)), np.full((4, 3), np.nan)])
 def test_nothing_to_see(points: np.ndarray) -> None:
-    image, extent = top_view(points)
-    assert image.tolist() == [[0.0]]
-    assert extent == (0.0, 1.0, 0.0, 1.0)
+    view = top_view(points)
+    assert view.image.tolist() == [[0.0]]
+    assert np.isnan(view.heights).all()
+    assert view.extent == (0.0, 1.0, 0.0, 1.0)
 
 
 def test_one_point_and_points_that_are_not_finite() -> None:
-    image, (x0, x1, _, _) = top_view(np.array([[3.0, 4.0, 0.0], [np.nan, 1.0, 1.0], [np.inf, 1.0, 1.0]]))
-    assert image.tolist() == [[1.0]]
+    view = top_view(np.array([[3.0, 4.0, 0.0], [np.nan, 1.0, 1.0], [np.inf, 1.0, 1.0]]))
+    x0, x1, _, _ = view.extent
+    assert view.image.tolist() == [[1.0]]
     assert x0 == pytest.approx(3.0)
     assert x1 - x0 == pytest.approx(0.2)

@@ -75,7 +75,7 @@ def test_every_warning_of_the_log_is_a_problem_of_manifest_and_report(
     assert warned <= set(problems)
     assert len(problems) == len(set(problems))
     page = (out / "report.html").read_text()
-    section = page[page.index("<h2>What went wrong</h2>") : page.index("<h2>Trajectory</h2>")]
+    section = page[page.index("<h2>What went wrong</h2>") : page.index("<h2>Map</h2>")]
     assert "Nothing" not in section
     for sentence in warned:
         assert escape(sentence) in section.replace("&#39;", "&#x27;")

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from lslam.geometry import se3, so3
+from lslam.types.cloud import ArrayCloud
 from lslam.types.run_record import RunRecord
 from lslam.types.scan_result import ScanResult
 from lslam.types.trajectory import Trajectory
@@ -52,6 +53,7 @@ def make_record(tmp_path: Path) -> MakeRecord:
                 ScanResult(i, int(stamps[i]), poses[i], status, reason, stages=stages, **details)  # type: ignore[arg-type]
             )
         image = rng.poisson(1.0, (40, 70)).astype(np.float32) if with_map else None
+        points = rng.uniform((-10, -5, 0), (60, 35, 8), (3000, 3))
         values: dict[str, Any] = {
             "name": "drive",
             "method": "icp",
@@ -62,6 +64,8 @@ def make_record(tmp_path: Path) -> MakeRecord:
             "real_time_limit": 0.1,
             "manifest": {"status": "done", "command": "lslam run drive", "sequence": {"format": "kitti-odometry"}},
             "map_image": image,
+            "map_heights": None if image is None else rng.uniform(0, 8, image.shape).astype(np.float32),
+            "map_sample": ArrayCloud.of(points, points[:, 2] / 8) if with_map else None,
             "map_extent": (-10.0, 60.0, -5.0, 35.0),
         }
         return RunRecord(**(values | changes))

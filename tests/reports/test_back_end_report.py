@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -11,11 +12,11 @@ import pytest
 from lslam.config.eval import EvalConfig
 from lslam.evaluation.evaluate import evaluate
 from lslam.geometry import se3
-from lslam.reports.back_end import back_end_figures, back_end_rows
+from lslam.reports.back_end import back_end_figures, back_end_rows, loop_figures
 from lslam.types.building import OsmMatches
 from lslam.types.constraint import LoopCandidate
 from lslam.types.gnss import Georeference
-from lslam.types.run_record import RunRecord
+from lslam.types.run_record import LoopSurroundings, LoopView, RunRecord
 
 
 def test_a_run_without_a_back_end_says_nothing(make_record: Callable[..., RunRecord]) -> None:
@@ -43,26 +44,42 @@ def test_loops_and_fixes_are_counted_and_drawn(make_record: Callable[..., RunRec
     (figure,) = back_end_figures(record, None)
     labels = [label for _, label in figure.legend]
     assert "1 loop closed" in labels
-    assert any(label.startswith("3 sigma, drawn") for label in labels)
-    # Before, after, one loop and sixteen ellipses.
-    assert figure.svg.count('class="line') == 19
+    assert "odometry" in labels
+    # Before, after and one loop; ellipses of 3 cm are no pixel of a plan of 55 m.
+    assert figure.svg.count('class="line') == 3
+    assert "moved poses by at most 0.500 m" in figure.caption
+    assert "3 sigma: at most 0.030 m, too small to be drawn" in figure.caption
 
 
-@pytest.mark.parametrize(("variance", "said"), [(1e-4, "3 sigma, drawn 100 times as large"), (100.0, "3 sigma")])
-def test_ellipses_are_enlarged_until_they_are_seen(
-    make_record: Callable[..., RunRecord], variance: float, said: str
-) -> None:
+def test_what_cannot_be_seen_is_said_and_what_is_drawn_is_to_scale(make_record: Callable[..., RunRecord]) -> None:
     record = make_record(40)
-    record.odometry = replace(record.trajectory, poses=record.trajectory.poses + 0.1)
-    record.trajectory = replace(record.trajectory, covariances=np.tile(variance * np.eye(6), (40, 1, 1)))
-    assert said in [label for _, label in back_end_figures(record, None)[0].legend]
+    shift = se3.make(np.eye(3), np.array([0.0, 0.003, 0.0]))
+    record.odometry = replace(record.trajectory, poses=shift @ record.trajectory.poses)
+    record.trajectory = replace(record.trajectory, covariances=np.tile(np.eye(6), (40, 1, 1)))
+    (figure,) = back_end_figures(record, None)
+    assert figure.title == "After the pose graph"
+    assert [label for _, label in figure.legend] == ["after the pose graph", "3 sigma, to scale"]
+    assert "moved poses by at most 0.0030 m" in figure.caption
+    # An ellipse, here a circle of 3 m, against the ticks of the plan.
+    ring = re.findall(r'class="line s4" d="M([^"]+)"', figure.svg)[0]
+    drawn = np.ptp(np.array(re.findall(r"[\d.]+", ring), float).reshape(-1, 2)[:, 0])
+    x0, x1, _, _, left, right, *_ = map(float, re.findall(r'data-view="([^"]+)"', figure.svg)[0].split())
+    assert drawn * (x1 - x0) / (right - left) == pytest.approx(6.0, abs=0.05)
+
+
+def test_a_loop_is_shown_where_it_moved_the_map_by_a_pixel(make_record: Callable[..., RunRecord]) -> None:
+    points = np.random.default_rng(0).uniform(-10, 10, (500, 3))
+    at = LoopSurroundings(points, points[:5, :2], points[5:9, :2], np.zeros(2))
+    assert loop_figures(LoopView(1, 9, 0.2, at, at)) == []
+    figures = loop_figures(LoopView(1, 9, 0.6, at, at))
+    assert [f.title for f in figures] == ["Map at a loop, before the pose graph", "Map at a loop, after the pose graph"]
 
 
 def test_the_shift_of_the_map_is_not_drawn_about_each_pose(make_record: Callable[..., RunRecord]) -> None:
-    """A trajectory known to a centimetre on a map known to two metres: the ellipses are those of the trajectory."""
+    """A trajectory known to half a metre on a map known to two metres: the ellipses are those of the trajectory."""
     record = make_record(40)
     record.odometry = replace(record.trajectory, poses=record.trajectory.poses + 0.1)
-    own = np.tile(1e-4 * np.eye(6), (40, 1, 1))
+    own = np.tile(0.25 * np.eye(6), (40, 1, 1))
     record.trajectory = replace(record.trajectory, covariances=own)
     alone = back_end_figures(record, None)[0]
     sigma = np.array([2.0, 1.5])
@@ -73,7 +90,7 @@ def test_the_shift_of_the_map_is_not_drawn_about_each_pose(make_record: Callable
     record.trajectory = replace(record.trajectory, covariances=shifted)
     figure = back_end_figures(record, None)[0]
     assert figure.svg == alone.svg
-    assert "3 sigma beside the map's own shift, drawn 100 times as large" in [label for _, label in figure.legend]
+    assert "3 sigma beside the map's own shift, to scale" in [label for _, label in figure.legend]
 
 
 def test_the_error_is_drawn_before_and_after(make_record: Callable[..., RunRecord]) -> None:

@@ -95,7 +95,7 @@ def test_the_page_nests_shows_everything_and_needs_nothing_else(tmp_path: Path) 
     (tmp_path / "a" / "report.html").write_text("")
     parsed = parse(render_page(tmp_path, c, [drawing(tmp_path)]))
     assert not parsed.open
-    assert "script" not in parsed.tags
+    assert [kind for kind, _ in parsed.scripts] == [""]
     assert not parsed.handlers
     assert all(a.startswith("data:image/png;base64,") or a == "a/report.html" for a in parsed.addresses)
     assert "a/report.html" in parsed.addresses
