@@ -147,7 +147,7 @@ def _write_bag(source: _Source, out: Path, kind: str, is_zstd: bool) -> None:
         writer.write(INFO_TOPIC, begin, bag_messages.text(writer.store, sequence_toml_text(source.info())))
         transforms = _transforms(source.calibration)
         if transforms:
-            writer.write("/tf_static", begin, bag_messages.static_transforms(writer.store, begin, transforms))
+            writer.write("/tf_static", begin, bag_messages.transforms(writer.store, begin, transforms))
         for stamp, _, topic, message in heapq.merge(*_messages(source, writer.store), key=lambda m: m[:2]):
             writer.write(topic, stamp, message())
 
