@@ -89,7 +89,10 @@ def command(source: str, kind: str | None, out: Path | None, **given: Any) -> No
     _refuse(given, OF_RUNS, "is for the folder of a run to bag, mcap or sqlite")
     if out is None:
         raise click.UsageError("--out names the file or folder to write")
-    if kind not in SEQUENCES or _is_trajectory(source):
+    if kind == "gpkg":
+        _refuse(given, (*NOT_OF_RUNS, "is_zstd"), "is not for --to gpkg, which has the poses of a run as they lie")
+        _convert_to_gpkg(Path(source).expanduser(), out, given["overwrite"])
+    elif kind not in SEQUENCES or _is_trajectory(source):
         _convert_trajectory(source, kind, out, given)
     else:
         _convert_sequence(source, kind, out, given)
@@ -99,7 +102,7 @@ def _refuse(given: dict[str, Any], names: tuple[str, ...], why: str) -> None:
     """Raise UsageError for an option of `names` that was given."""
     for name in names:
         if given[name] not in (None, False):
-            raise click.UsageError(f"--{name.replace('_', '-')} {why}")
+            raise click.UsageError(f"--{name.removeprefix('is_').replace('_', '-')} {why}")
 
 
 def _is_trajectory(source: str) -> bool:
@@ -170,6 +173,15 @@ def _convert_run(folder: Path, kind: str, out: Path | None, given: dict[str, Any
             voxel=given["voxel"] or 0.0, is_zstd=given["is_zstd"], overwrite=given["overwrite"], on_scan=advance,
         )  # fmt: skip
     show(f"{done.path}: {done.poses} poses, {done.clouds} clouds, a map of {done.map_points} points\n")
+
+
+def _convert_to_gpkg(folder: Path, out: Path, overwrite: bool) -> None:
+    from lslam.cli.console import show
+    from lslam.convert.to_gpkg import convert_to_gpkg
+
+    options.require_there(folder)
+    done = convert_to_gpkg(folder, out, overwrite=overwrite)
+    show(f"{out}: {', '.join(f'{len(layer.features)} in {layer.name}' for layer in done)}\n")
 
 
 def _convert_trajectory(source: str, kind: str, out: Path, given: dict[str, Any]) -> None:

@@ -15,12 +15,11 @@ from lslam.errors import InputError, UsageError
 from lslam.formats import bag_messages
 from lslam.formats.bag_files import MAP_TOPIC, PATH_TOPIC, BagWriter
 from lslam.formats.point_files import read_cloud
-from lslam.formats.state_files import read_npz
 from lslam.frontend.register_scans import read_ahead
 from lslam.kernels.voxel import first_points
 from lslam.maps.clean import PosedScan
 from lslam.pipeline.map_pass import scan_poser
-from lslam.pipeline.rebuild import EarlierRun, in_own_world, map_of, results_of
+from lslam.pipeline.rebuild import EarlierRun, covariances_of, in_own_world, map_of, results_of
 from lslam.types.sequence import Sequence
 
 log = logging.getLogger("lslam")
@@ -78,12 +77,14 @@ def convert_run(
     stamps, poses = run.trajectory.stamps_ns, run.trajectory.poses
     if not len(stamps):
         raise InputError(f"{run.folder / 'trajectory.tum'} has no pose")
-    covariances = _covariances(run)
+    covariances = covariances_of(run)
     due, clouds = _path_ends(len(stamps)), 0
     with staged(out) as made, BagWriter(made, kind, is_zstd) as writer:
         map_points = _write_map(writer, run, int(stamps[0]))
         for k, posed in enumerate(_posed(run, scans)):
-            _write_pose(writer, int(stamps[k]), poses[k], None if covariances is None else covariances[k])
+            _write_pose(
+                writer, int(stamps[k]), poses[k], None if covariances is None else np.nan_to_num(covariances[k])
+            )
             if posed is not None:
                 _write_points(writer, int(stamps[k]), posed, voxel)
                 clouds += 1
@@ -135,17 +136,6 @@ def _write_map(writer: BagWriter, run: EarlierRun, stamp: int) -> int:
     intensity = None if cloud.intensity is None else cloud.intensity[kept]
     writer.write(MAP_TOPIC, stamp, bag_messages.points(writer.store, stamp, cloud.points[kept], intensity, WORLD))
     return len(kept)
-
-
-def _covariances(run: EarlierRun) -> NDArray[np.float64] | None:
-    """(N, 6, 6) of the poses, zero where unknown; None where the run has none that fit."""
-    path = run.folder / "covariances.npz"
-    if not path.is_file():
-        return None
-    known = read_npz(path).get("covariances")
-    if known is None or known.shape != (len(run.trajectory), 6, 6):
-        return None
-    return np.where(np.isfinite(known).all((1, 2), keepdims=True), known, 0.0)
 
 
 def _path_ends(count: int) -> set[int]:

@@ -1,27 +1,37 @@
-"""`lslam convert RUN --to mcap|bag|sqlite`, read by rosbags and by Foxglove's library, by the schemas in the file alone."""
+"""`lslam convert RUN`: a bag, read by rosbags and, by its schemas alone, by Foxglove's library; a GeoPackage, by SQL and WKB."""
 
 from __future__ import annotations
 
 import json
 import shutil
+import sqlite3
+import struct
 from collections import defaultdict
+from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import shapely
 from calling import SAMPLE, assert_one_sentence, lslam, manifest
+from fudgeo import GeoPackage
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 from scipy.spatial import cKDTree
+from shapely.geometry.base import BaseGeometry
 
 from lslam.convert.convert_run import PATHS, convert_run
-from lslam.formats.trajectory_files import read_trajectory
+from lslam.formats.trajectory_files import read_trajectory, write_tum
 from lslam.geometry import se3, so3
+from lslam.geometry.geodesy import from_local
 from lslam.pipeline.rebuild import open_scans, read_run
 
 SCANS, VOXEL = 48, 0.2
+SEQUENCE = SAMPLE / "sequences" / "00"
+BEGIN_NS = 1_700_000_000_123_456_000
 TYPES = {
     "/map": "sensor_msgs/msg/PointCloud2",
     "/points": "sensor_msgs/msg/PointCloud2",
@@ -34,10 +44,19 @@ COUNTS = {"/map": 1, "/points": SCANS, "/odometry": SCANS, "/path": PATHS, "/tf"
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Every other scan of the sample; the map lies in its UTM zone, the poses do not."""
+    """Every other scan of the sample, held by buildings; the map lies in its UTM zone, the poses do not."""
     out = tmp_path_factory.mktemp("bag") / "town"
-    words = ("--skip-frames", 2, "--georeference", "--no-loops", "--set", "map.format=laz", "--out", out)
-    assert (done := lslam("run", SAMPLE, *words)).returncode == 0, done.stderr
+    words = (
+        "--skip-frames",
+        2,
+        "--no-loops",
+        "--georeference",
+        "--osm",
+        SEQUENCE / "map.osm",
+        "--set",
+        "map.format=laz",
+    )
+    assert (done := lslam("run", SAMPLE, *words, "--out", out)).returncode == 0, done.stderr
     assert json.loads((out / "map.json").read_text())["crs"] == "EPSG:32632"
     return out
 
@@ -205,3 +224,80 @@ def test_what_does_not_belong_to_a_run_is_refused(run: Path, tmp_path: Path) -> 
         assert_one_sentence(done.stderr)
     assert [p.name for p in tmp_path.iterdir()] == ["there.mcap"]
     assert sorted(run.iterdir()) == before
+
+
+def shape_of(blob: bytes) -> BaseGeometry:
+    """The standard's header, which has the box and the reference system, then WKB."""
+    assert (blob[:2], blob[2]) == (b"GP", 0)
+    assert struct.unpack_from("<i", blob, 4)[0] == 4326
+    return shapely.from_wkb(blob[8 + (0, 32, 48, 48, 64)[blob[3] >> 1 & 7] :])
+
+
+def test_a_geopackage_has_every_scan_and_building_where_it_lies(run: Path, tmp_path: Path) -> None:
+    dated, out = tmp_path / "dated", tmp_path / "town.gpkg"
+    shutil.copytree(run, dated)
+    trajectory = read_trajectory(run)
+    write_tum(dated / "trajectory.tum", replace(trajectory, stamps_ns=trajectory.stamps_ns + BEGIN_NS))
+    buildings = json.loads((run / "buildings.geojson").read_text())["features"]
+    known = [f for f in buildings if f["properties"]["status"] != "new"]
+    done = lslam("convert", dated, "--out", out)
+    said = f"1 in trajectory, {SCANS} in scans, {len(known)} in buildings, {len(buildings) - len(known)} in new_walls"
+    assert (done.returncode, done.stdout) == (0, f"{out}: {said}\n"), done.stderr
+
+    told = manifest(run)["georeference"]
+    positions = se3.apply(np.array(told["T_enu_world"]), trajectory.positions)
+    places = from_local(positions, np.array(told["origin_lat_lon_height"]))[:, [1, 0, 2]]
+    with np.load(run / "covariances.npz") as arrays:
+        sigmas = np.sqrt(np.linalg.eigvalsh(arrays["covariances"][:, :3, :3])[:, -1])
+    with closing(sqlite3.connect(out)) as db:
+        assert db.execute("PRAGMA application_id").fetchone() == (0x47504B47,)
+        assert db.execute("PRAGMA integrity_check").fetchone() == ("ok",)
+        systems = db.execute("SELECT DISTINCT organization, organization_coordsys_id FROM gpkg_contents JOIN "
+                             "gpkg_spatial_ref_sys USING (srs_id)").fetchall()  # fmt: skip
+        assert systems == [("EPSG", 4326)]
+        box = db.execute("SELECT min_x, min_y, max_x, max_y FROM gpkg_contents WHERE table_name = 'scans'").fetchone()
+        np.testing.assert_allclose(box, [*places[:, :2].min(0), *places[:, :2].max(0)], atol=1e-12)
+        assert db.execute("SELECT count(*) FROM rtree_scans_geom").fetchone() == (SCANS,)
+        scans = db.execute("SELECT geom, scan, stamp_ns, utc, status, sigma_m FROM scans ORDER BY fid").fetchall()
+        (line,) = db.execute("SELECT geom FROM trajectory").fetchone()
+        houses = db.execute("SELECT geom, osm_id, status, displacement_east_m FROM buildings ORDER BY fid").fetchall()
+    shapes, numbers, stamps, times, statuses, spread = zip(*scans, strict=True)
+    np.testing.assert_allclose([np.array(shape_of(s).coords)[0] for s in shapes], places, atol=1e-8)
+    np.testing.assert_allclose(shapely.get_coordinates(shape_of(line), include_z=True), places, atol=1e-8)
+    assert numbers == tuple(range(0, 2 * SCANS, 2))
+    assert stamps == tuple((trajectory.stamps_ns + BEGIN_NS).tolist())
+    assert times[0] == "2023-11-14T22:13:20.123Z"
+    assert set(statuses) == {"ok"}
+    np.testing.assert_allclose(spread, sigmas, rtol=1e-9)
+    for (blob, name, status, east), feature in zip(houses, known, strict=True):
+        about, wanted = feature["properties"], shapely.geometry.shape(feature["geometry"])
+        assert (name, status, east) == (about["@id"], about["status"], about["displacement_east_m"])
+        assert shape_of(blob).is_valid
+        assert shape_of(blob).hausdorff_distance(wanted) < 2e-9
+    # As its own library reads it.
+    assert {name: len(layer) for name, layer in GeoPackage(out).feature_classes.items()}["buildings"] == len(known)
+
+
+def test_a_geopackage_is_of_a_run_that_lies_on_the_earth(run: Path, tmp_path: Path) -> None:
+    bare, out = tmp_path / "bare", tmp_path / "a.gpkg"
+    shutil.copytree(run, bare)
+    about = manifest(bare)
+    del about["georeference"]
+    (bare / "manifest.json").write_text(json.dumps(about))
+    for words, code, sentence in (
+        ((bare, "--out", out), 2, "is not georeferenced"),
+        ((run / "trajectory.tum", "--out", out), 3, "is no folder of a run"),
+        ((run, "--to", "gpkg", "--out", tmp_path / "a.sqlite"), 2, "its name ends in .gpkg"),
+        ((run, "--out", out, "--frame", "imu"), 2, "--frame is not for --to gpkg"),
+        ((run, "--out", out, "--zstd"), 2, "--zstd is not for --to gpkg"),
+    ):
+        done = lslam("convert", *words)
+        assert done.returncode == code, done.stderr
+        assert sentence in done.stderr
+        assert_one_sentence(done.stderr)
+    assert [p.name for p in tmp_path.iterdir()] == ["bare"]
+    out.write_bytes(b"mine")
+    assert lslam("convert", run, "--out", out).returncode == 2
+    assert out.read_bytes() == b"mine"
+    assert lslam("convert", run, "--out", out, "--overwrite").returncode == 0
+    assert out.read_bytes()[:15] == b"SQLite format 3"
