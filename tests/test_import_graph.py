@@ -48,6 +48,7 @@ HOMES = {
     "fsspec": ["remote.py"],
     "fastkml": ["formats/kml_files.py"],
     "pygeoif": ["formats/kml_files.py"],
+    "fudgeo": ["formats/gpkg_files.py"],
     "gpxpy": ["formats/gpx_files.py"],
     "dask": ["studies/cluster.py"],
     "distributed": ["studies/cluster.py"],

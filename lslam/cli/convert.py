@@ -17,12 +17,18 @@ if TYPE_CHECKING:
 
 SEQUENCES = ("bag", "mcap", "sqlite", "kitti")
 EARTH = ("kml", "gpx")
+BAGS = {"bag": ".bag", "mcap": ".mcap", "sqlite": ".db3"}
+OF_RUNS = ("no_clouds", "voxel", "sequence")
+NOT_OF_RUNS = ("deskewed", "start", "count", "skip_frames", "frame", "from_frame", "calib", "times")
+BY_SUFFIX = {suffix: kind for kind, suffix in BAGS.items()} | {f".{kind}": kind for kind in (*EARTH, "gpkg", "tum")}
 EPILOG = """\b
 Examples:
   lslam convert seq07 --data-root ~/kitti --to mcap --zstd --out seq07.mcap
   lslam convert drive.bag --to kitti --out drive
   lslam convert runs/first --to euroc --frame lidar --out first.csv
   lslam convert runs/town --to kml --out town.kml
+  lslam convert runs/town --out town.gpkg
+  lslam convert runs/first --to mcap --voxel 0.3 --zstd
   lslam convert drive.bag --deskewed runs/drive --to kitti --out drive_deskewed
 """
 
@@ -30,11 +36,14 @@ Examples:
 @click.command(epilog=EPILOG)
 @click.argument("source")
 @click.option(
-    "--to", "kind", required=True, type=click.Choice(list(dict.fromkeys(SEQUENCES + WRITTEN + EARTH))),
-    help="bag is ROS 1, mcap and sqlite are ROS 2; tum and euroc are for trajectories, kitti for both; kml and gpx for "
-    "georeferenced runs.",
+    "--to", "kind", type=click.Choice(list(dict.fromkeys((*SEQUENCES, *WRITTEN, *EARTH, "gpkg")))),
+    help="bag is ROS 1, mcap and sqlite are ROS 2; tum and euroc are for trajectories, kitti for both; kml, gpx and gpkg for "
+    "georeferenced runs  [--out's suffix].",
 )  # fmt: skip
-@click.option("--out", required=True, type=click.Path(path_type=Path), metavar="PATH", help="File or folder to write.")
+@click.option(
+    "--out", type=click.Path(path_type=Path), metavar="PATH",
+    help="File or folder to write  [RUN/run.mcap and so on, of a run to a bag].",
+)  # fmt: skip
 @click.option("--overwrite", is_flag=True, help="Replace an existing PATH.")
 @click.option("--zstd", "is_zstd", is_flag=True, help="Compress (mcap, sqlite).")
 @click.option(
@@ -42,6 +51,11 @@ Examples:
     type=click.Path(path_type=Path),
     metavar="RUN|TRAJ",
     help="Deskew the scans by the trajectory of this run.",
+)
+@click.option("--no-clouds", is_flag=True, help="RUN to a bag: poses and map alone, without the scans.")
+@click.option("--voxel", type=float, metavar="M", help="RUN to a bag: one point of a scan per voxel of this edge.")
+@click.option(
+    "--sequence", type=click.Path(path_type=Path), metavar="PATH", help="RUN to a bag: the raw scans, when they moved."
 )
 @options.scan_range
 @click.option(
@@ -55,18 +69,40 @@ Examples:
 @options.reading
 @options.data_root
 @options.verbosity
-def command(source: str, kind: str, out: Path, **given: Any) -> None:
-    """Convert SOURCE, a sequence (path or name) or a trajectory (file or run folder).
+def command(source: str, kind: str | None, out: Path | None, **given: Any) -> None:
+    """Convert SOURCE, a sequence (path or name), a run folder or a trajectory file.
 
-    Points, per-point times, rings, IMU, fixes, extrinsics and ground truth are converted; the result reads as the same sequence.
+    Of a sequence points, per-point times, rings, IMU, fixes, extrinsics and ground truth are converted; the result reads as the
+    same sequence. A run becomes a bag of its deskewed scans, poses, path, transforms and map for rviz and Foxglove.
     """
     from lslam.cli.console import setup_logging
 
     setup_logging(given["verbose"], given["quiet"])
-    if kind not in SEQUENCES or _is_trajectory(source):
+    kind = kind or BY_SUFFIX.get("" if out is None else out.suffix.lower())
+    if kind is None:
+        raise click.UsageError(f"--to says what to write; an --out whose name ends in {', '.join(BY_SUFFIX)} does too")
+    is_run = kind in BAGS and (Path(source).expanduser() / "trajectory.tum").is_file()
+    if is_run:
+        _refuse(given, NOT_OF_RUNS, f"is not for the folder of a run to {kind}: all its scans are written as they lie")
+        _convert_run(Path(source).expanduser(), kind, out, given)
+        return
+    _refuse(given, OF_RUNS, "is for the folder of a run to bag, mcap or sqlite")
+    if out is None:
+        raise click.UsageError("--out names the file or folder to write")
+    if kind == "gpkg":
+        _refuse(given, (*NOT_OF_RUNS, "is_zstd"), "is not for --to gpkg, which has the poses of a run as they lie")
+        _convert_to_gpkg(Path(source).expanduser(), out, given["overwrite"])
+    elif kind not in SEQUENCES or _is_trajectory(source):
         _convert_trajectory(source, kind, out, given)
     else:
         _convert_sequence(source, kind, out, given)
+
+
+def _refuse(given: dict[str, Any], names: tuple[str, ...], why: str) -> None:
+    """Raise UsageError for an option of `names` that was given."""
+    for name in names:
+        if given[name] not in (None, False):
+            raise click.UsageError(f"--{name.removeprefix('is_').replace('_', '-')} {why}")
 
 
 def _is_trajectory(source: str) -> bool:
@@ -111,6 +147,41 @@ def _convert_sequence(source: str, kind: str, out: Path, given: dict[str, Any]) 
         )  # fmt: skip
     left = f", {done.skipped} that could not be read left out" if done.skipped else ""
     show(f"{done.path}: {done.scans} scans{left}\n")
+
+
+def _convert_run(folder: Path, kind: str, out: Path | None, given: dict[str, Any]) -> None:
+    from lslam.cli.console import progress, show
+    from lslam.convert.output import check_output
+
+    out = folder / f"run{BAGS[kind]}" if out is None else out
+    check_output(kind, out, given["is_zstd"], given["overwrite"])
+    has_clouds = not given["no_clouds"]
+    if not has_clouds:
+        _refuse(given, ("voxel", "sequence"), "contradicts --no-clouds")
+    options.require_there(given["sequence"])
+    from lslam.convert.convert_run import convert_run
+    from lslam.pipeline.rebuild import open_scans, read_run
+
+    run = read_run(folder)
+    scans = None
+    if has_clouds:
+        flag = "--sequence, or leave them out with --no-clouds"
+        scans = open_scans(run, given["sequence"], flag=flag, **options.reading_of(given))
+    with progress("convert", len(run.trajectory)) as advance:
+        done = convert_run(
+            run, scans, kind, out,
+            voxel=given["voxel"] or 0.0, is_zstd=given["is_zstd"], overwrite=given["overwrite"], on_scan=advance,
+        )  # fmt: skip
+    show(f"{done.path}: {done.poses} poses, {done.clouds} clouds, a map of {done.map_points} points\n")
+
+
+def _convert_to_gpkg(folder: Path, out: Path, overwrite: bool) -> None:
+    from lslam.cli.console import show
+    from lslam.convert.to_gpkg import convert_to_gpkg
+
+    options.require_there(folder)
+    done = convert_to_gpkg(folder, out, overwrite=overwrite)
+    show(f"{out}: {', '.join(f'{len(layer.features)} in {layer.name}' for layer in done)}\n")
 
 
 def _convert_trajectory(source: str, kind: str, out: Path, given: dict[str, Any]) -> None:

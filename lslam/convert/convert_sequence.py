@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import heapq
 import logging
-import os
-import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from lslam.convert.convert_trajectory import change_frame
-from lslam.convert.output import check_output
-from lslam.errors import InputError, OutputError, UsageError, cause
+from lslam.convert.output import check_beside, check_output, staged
+from lslam.errors import InputError
 from lslam.formats import bag_messages
 from lslam.formats.bag_files import INFO_TOPIC, BagWriter
 from lslam.formats.kitti_layout import PER_POINT, POINTS, in_camera, write_calib, write_scan, write_times
@@ -69,25 +67,12 @@ def convert_sequence(
     """
     check_output(kind, out, is_zstd, overwrite)
     source = _Source(sequence, trajectory, on_scan)
-    here, there = sequence.path.resolve(), out.resolve()
-    if there == here or there in here.parents:
-        raise UsageError(f"--out {out} holds the sequence itself: choose another")
-    stage = out.with_name(out.name + ".new")
-    try:
-        shutil.rmtree(stage, ignore_errors=True)
-        stage.mkdir(parents=True)
-        made = stage / out.name
+    check_beside(out, sequence.path, "the sequence")
+    with staged(out) as made:
         if kind == "kitti":
             _write_kitti(source, made)
         else:
             _write_bag(source, made, kind, is_zstd)
-        if out.exists():
-            out.rename(stage / "old")
-        os.replace(made, out)
-    except OSError as error:
-        raise OutputError(f"{error.filename or out} cannot be written: {cause(error)}") from None
-    finally:
-        shutil.rmtree(stage, ignore_errors=True)
     return Converted(out, source.written, source.skipped)
 
 
@@ -162,7 +147,7 @@ def _write_bag(source: _Source, out: Path, kind: str, is_zstd: bool) -> None:
         writer.write(INFO_TOPIC, begin, bag_messages.text(writer.store, sequence_toml_text(source.info())))
         transforms = _transforms(source.calibration)
         if transforms:
-            writer.write("/tf_static", begin, bag_messages.static_transforms(writer.store, begin, transforms))
+            writer.write("/tf_static", begin, bag_messages.transforms(writer.store, begin, transforms))
         for stamp, _, topic, message in heapq.merge(*_messages(source, writer.store), key=lambda m: m[:2]):
             writer.write(topic, stamp, message())
 

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
-from lslam.errors import OutputExistsError, UsageError
+from lslam.errors import OutputError, OutputExistsError, UsageError, cause
 
 SUFFIXES = {"bag": ".bag", "mcap": ".mcap", "sqlite": ".db3"}
 
@@ -22,3 +26,31 @@ def check_output(kind: str, out: Path, is_zstd: bool, overwrite: bool) -> None:
         raise UsageError(f"--out {out}: a ROS 1 bag is one file, its name ends in .bag")
     if out.exists() and not overwrite:
         raise OutputExistsError(f"{out} exists already: choose another --out, or --overwrite it")
+
+
+def check_beside(out: Path, source: Path, what: str) -> None:
+    """Raise UsageError when `out` is `source`, in words `what`, or a folder that holds it."""
+    here, there = source.resolve(), out.resolve()
+    if there == here or there in here.parents:
+        raise UsageError(f"--out {out} holds {what} itself: choose another")
+
+
+@contextmanager
+def staged(out: Path) -> Iterator[Path]:
+    """Where to make what becomes the file or folder `out`, in place of what is there, when the block ends well.
+
+    Raises OutputError naming what cannot be written.
+    """
+    stage = out.with_name(out.name + ".new")
+    try:
+        shutil.rmtree(stage, ignore_errors=True)
+        stage.mkdir(parents=True)
+        made = stage / out.name
+        yield made
+        if out.exists():
+            out.rename(stage / "old")
+        os.replace(made, out)
+    except OSError as error:
+        raise OutputError(f"{error.filename or out} cannot be written: {cause(error)}") from None
+    finally:
+        shutil.rmtree(stage, ignore_errors=True)

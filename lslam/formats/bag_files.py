@@ -27,7 +27,9 @@ from lslam.formats.ros1_records import Ros1Bag
 
 # Said once, at the beginning: where lslam's own bags keep what else is known of a sequence, as `sequence.toml`.
 INFO_TOPIC = "/lslam/sequence"
-LATCHED = ("/tf_static", INFO_TOPIC)
+# What belongs to the whole of a run.
+MAP_TOPIC, PATH_TOPIC = "/map", "/path"
+LATCHED = ("/tf_static", INFO_TOPIC, MAP_TOPIC, PATH_TOPIC)
 KINDS = ("bag", "mcap", "sqlite")
 _ENCODINGS = ("cdr", "ros1")
 _ZSTD = b"\x28\xb5\x2f\xfd"  # ROS 2 can compress every message by itself

@@ -23,18 +23,34 @@ def cloud(store: Any, scan: Scan, frame: str) -> Any:
     columns: dict[str, NDArray[Any]] = {axis: scan.points[:, k] for k, axis in enumerate("xyz")}
     optional = {"intensity": scan.intensity, "ring": scan.rings, "time": scan.times}
     columns |= {name: values for name, values in optional.items() if values is not None}
+    is_dense = bool(np.isfinite(scan.points).all())
+    return _cloud(store, header(store, scan.stamp_ns, frame, scan.index), columns, is_dense)
+
+
+def points(
+    store: Any, stamp_ns: int, places: NDArray[np.floating[Any]], intensity: NDArray[np.float32] | None, frame: str
+) -> Any:
+    """PointCloud2 of places (N, 3), m, finite, and intensities (N,) where they are known, as float32."""
+    columns: dict[str, NDArray[Any]] = {axis: places[:, k].astype(np.float32) for k, axis in enumerate("xyz")}
+    if intensity is not None:
+        columns["intensity"] = intensity.astype(np.float32)
+    return _cloud(store, header(store, stamp_ns, frame), columns, True)
+
+
+def _cloud(store: Any, head: Any, columns: Mapping[str, NDArray[Any]], is_dense: bool) -> Any:
     fields, step, data = encode_fields(columns)
+    count = len(columns["x"])
     field = store.types["sensor_msgs/msg/PointField"]
     return store.types["sensor_msgs/msg/PointCloud2"](
-        header=header(store, scan.stamp_ns, frame, scan.index),
+        header=head,
         height=1,
-        width=len(scan),
+        width=count,
         fields=[field(name=name, offset=offset, datatype=code, count=1) for name, offset, code in fields],
         is_bigendian=False,
         point_step=step,
-        row_step=step * len(scan),
+        row_step=step * count,
         data=data,
-        is_dense=bool(np.isfinite(scan.points).all()),
+        is_dense=is_dense,
     )
 
 
@@ -66,23 +82,37 @@ def fix(store: Any, stamp_ns: int, lat_lon_alt: Floats, sigma: float, frame: str
     )
 
 
-def odometry(store: Any, stamp_ns: int, T_world_body: Floats, frame: str, body: str) -> Any:
-    """Odometry: a pose (4, 4) of `body` in `frame`, without velocity."""
+def odometry(
+    store: Any, stamp_ns: int, T_world_body: Floats, frame: str, body: str, covariance: Floats | None = None
+) -> Any:
+    """Odometry: a pose (4, 4) of `body` in `frame`, without velocity.
+
+    covariance : (6, 6) of t' = t + d[:3], R' = exp(d[3:]) R in axes of `frame`, which is how ROS has it; None where unknown
+    """
     types = store.types
-    pose = types["geometry_msgs/msg/Pose"](
-        position=types["geometry_msgs/msg/Point"](**_xyz(T_world_body[:3, 3])),
-        orientation=_rotation(store, T_world_body),
-    )
+    known = np.zeros(36) if covariance is None else np.ascontiguousarray(covariance, np.float64).ravel()
     zero = types["geometry_msgs/msg/Twist"](linear=_vector(store, np.zeros(3)), angular=_vector(store, np.zeros(3)))
     return types["nav_msgs/msg/Odometry"](
         header=header(store, stamp_ns, frame),
         child_frame_id=body,
-        pose=types["geometry_msgs/msg/PoseWithCovariance"](pose=pose, covariance=np.zeros(36)),
+        pose=types["geometry_msgs/msg/PoseWithCovariance"](pose=_pose(store, T_world_body), covariance=known),
         twist=types["geometry_msgs/msg/TwistWithCovariance"](twist=zero, covariance=np.zeros(36)),
     )
 
 
-def static_transforms(store: Any, stamp_ns: int, transforms: Mapping[tuple[str, str], Floats]) -> Any:
+def path(store: Any, stamps_ns: NDArray[np.int64], poses: Floats, frame: str) -> Any:
+    """Path of poses (N, 4, 4) in `frame` at their stamps (N,), stamped with the last."""
+    posed = store.types["geometry_msgs/msg/PoseStamped"]
+    return store.types["nav_msgs/msg/Path"](
+        header=header(store, int(stamps_ns[-1]), frame),
+        poses=[
+            posed(header=header(store, stamp, frame), pose=_pose(store, T))
+            for stamp, T in zip(stamps_ns.tolist(), poses, strict=True)
+        ],
+    )
+
+
+def transforms(store: Any, stamp_ns: int, tree: Mapping[tuple[str, str], Floats]) -> Any:
     """TFMessage of `T_parent_child` (4, 4) by (parent, child)."""
     types = store.types
     return types["tf2_msgs/msg/TFMessage"](
@@ -94,7 +124,7 @@ def static_transforms(store: Any, stamp_ns: int, transforms: Mapping[tuple[str, 
                     translation=_vector(store, T[:3, 3]), rotation=_rotation(store, T)
                 ),
             )
-            for (parent, child), T in transforms.items()
+            for (parent, child), T in tree.items()
         ]
     )
 
@@ -111,6 +141,13 @@ def header(store: Any, stamp_ns: int, frame: str, number: int = 0) -> Any:
     stamp = store.types["builtin_interfaces/msg/Time"](sec=seconds, nanosec=nanoseconds)
     counted = {"seq": number} if "seq" in kind.__dataclass_fields__ else {}
     return kind(stamp=stamp, frame_id=frame, **counted)
+
+
+def _pose(store: Any, T: Floats) -> Any:
+    types = store.types
+    return types["geometry_msgs/msg/Pose"](
+        position=types["geometry_msgs/msg/Point"](**_xyz(T[:3, 3])), orientation=_rotation(store, T)
+    )
 
 
 def _vector(store: Any, v: Floats) -> Any:

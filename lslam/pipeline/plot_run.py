@@ -57,12 +57,10 @@ def write_figure(run: PlottedRun, what: str, path: Path, width: float, font: flo
 
     Raises UsageError for another suffix or a size that no page has, OutputError when it cannot be written.
     """
-    from matplotlib import rc_context
-
     check_plot_path(path)
     if not 20 <= width <= 2000 or not 3 <= font <= 72:
         raise UsageError(f"--width {width:g} --font {font:g}: 20 to 2000 mm, 3 to 72 points")
-    with house_style(), rc_context({"font.size": font}):
+    with house_style(font):
         drawn = picture(draw_figure(run, what, width), path.suffix.lstrip(".").lower(), dpi=300)
         with atomic_write(path) as stream:
             stream.write(drawn)

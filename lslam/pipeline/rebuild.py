@@ -13,11 +13,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lslam.config import Config, load_config
 from lslam.errors import InputError, InterruptedRunError, OutputError, OutputExistsError, UsageError, cause
 from lslam.formats.atomic import write_text
 from lslam.formats.point_files import MAP_SUFFIXES, read_cloud
+from lslam.formats.state_files import read_npz
 from lslam.formats.trajectory_files import read_trajectory
 from lslam.maps.crispness import crispness
 from lslam.maps.georeference import Projection
@@ -260,6 +262,18 @@ def results_of(run: EarlierRun) -> list[ScanResult]:
             zip(run.trajectory.stamps_ns, run.trajectory.poses, run.statuses, strict=True)
         )
     ]
+
+
+def covariances_of(run: EarlierRun) -> NDArray[np.float64] | None:
+    """(N, 6, 6) of the poses, as `Trajectory` has them, NaN all over where one is not known; None where none are kept.
+
+    Raises InputError when the file is damaged.
+    """
+    path = run.folder / "covariances.npz"
+    known = read_npz(path).get("covariances") if path.is_file() else None
+    if known is None or known.shape != (len(run.trajectory), 6, 6):
+        return None
+    return np.where(np.isfinite(known).all((1, 2), keepdims=True), known, np.nan)
 
 
 def map_of(target: Path) -> Path:

@@ -32,11 +32,11 @@ def check_plot_path(path: Path) -> None:
 
 
 @contextmanager
-def house_style() -> Iterator[None]:
-    """The look; a figure is made and turned into a picture inside. Text stays text."""
+def house_style(font: float = 9.0) -> Iterator[None]:
+    """The look; a figure is made and turned into a picture inside. Text stays text, of `font` points."""
     from matplotlib import rc_context
 
-    with rc_context({"svg.hashsalt": "lslam", "svg.fonttype": "none", "font.size": 9}):
+    with rc_context({"svg.hashsalt": "lslam", "svg.fonttype": "none", "font.size": font}):
         yield
 
 

@@ -11,15 +11,20 @@ import pytest
 from rosbags.highlevel import AnyReader
 from stub_sequences import StampedInTheMiddle, sample
 
+from lslam.config import load_config
+from lslam.convert.convert_run import convert_run
 from lslam.convert.convert_sequence import convert_sequence
 from lslam.errors import InputError, OutputExistsError, UsageError
 from lslam.formats import bag_messages
 from lslam.formats.bag_files import BagWriter
+from lslam.formats.pointcloud2 import decode_pointcloud2
 from lslam.formats.sequence_toml import FILE_NAME, read_sequence_toml
 from lslam.geometry import se3
+from lslam.pipeline.rebuild import EarlierRun
 from lslam.readers import open_sequence
 from lslam.simulation.scenarios import SimulatedDrive, simulate
 from lslam.simulation.sensors import GnssModel
+from lslam.types.scan import Scan
 from lslam.types.sequence import Calibration, Sequence
 
 NAMES = {"bag": "a.bag", "mcap": "a.mcap", "sqlite": "a"}
@@ -134,6 +139,32 @@ def test_extrinsics_a_reader_assumed_do_not_become_facts(distorted: Sequence, tm
     assert back.calibration.T_lidar_imu is None
 
 
+def exact_points(drive: SimulatedDrive, scan: Scan) -> np.ndarray:
+    """Every point where the exact motion has it at the scan's stamp."""
+    assert scan.times is not None
+    stamp = scan.stamp_ns / 1e9
+    T_stamp_point = se3.relative(drive.vehicle.poses(np.array([stamp])), drive.vehicle.poses(stamp + scan.times))
+    moved: np.ndarray = np.einsum("nij,nj->ni", T_stamp_point[:, :3, :3], scan.points) + T_stamp_point[:, :3, 3]
+    return moved
+
+
+def test_a_run_in_a_bag_has_deskewed_scans_of_what_was_registered(distorted: SimulatedDrive, tmp_path: Path) -> None:
+    truth = distorted.ground_truth
+    assert truth is not None
+    run = EarlierRun(tmp_path, {}, load_config(None), truth, ("ok", "ok", "bridged", "ok"), None)
+    done = convert_run(run, distorted, "bag", tmp_path / "a.bag")
+    assert (done.poses, done.clouds, done.map_points) == (4, 3, 0)
+    with AnyReader([done.path]) as reader:
+        clouds = {
+            stamp: reader.deserialize(data, c.msgtype) for c, stamp, data in reader.messages() if c.topic == "/points"
+        }
+    assert list(clouds) == truth.stamps_ns[[0, 1, 3]].tolist()
+    scan = distorted.scan(1)
+    points = decode_pointcloud2(clouds[scan.stamp_ns], done.path).points
+    off = np.linalg.norm(points - exact_points(distorted, scan), axis=1)
+    assert off.max() < 0.03 < 0.5 < np.linalg.norm(scan.points - points, axis=1).max()
+
+
 @pytest.mark.parametrize("instant", ["scan_start", "scan_middle"])
 def test_deskewed_scans_put_every_point_where_the_exact_motion_does(
     distorted: SimulatedDrive, tmp_path: Path, instant: str
@@ -147,11 +178,7 @@ def test_deskewed_scans_put_every_point_where_the_exact_motion_does(
     assert before.times is not None
     assert after.times is None
     np.testing.assert_array_equal(after.rings, before.rings)
-    stamp = before.stamp_ns / 1e9
-    T_stamp_point = se3.relative(
-        distorted.vehicle.poses(np.array([stamp])), distorted.vehicle.poses(stamp + before.times)
-    )
-    wanted = np.einsum("nij,nj->ni", T_stamp_point[:, :3, :3], before.points) + T_stamp_point[:, :3, 3]
+    wanted = exact_points(distorted, before)
     off = np.linalg.norm(after.points - wanted, axis=1)
     assert np.linalg.norm(before.points - wanted, axis=1).max() > (0.5 if instant == "scan_start" else 0.25)
     assert off.max() < 0.03, "poses 0.1 s apart are all there is between"

@@ -72,6 +72,13 @@ def test_las_is_what_laspy_and_gis_expect(tmp_path: Path) -> None:
     np.testing.assert_allclose(header.mins, made.points.min(0), atol=0.00051)
     np.testing.assert_allclose(header.maxs, made.points.max(0), atol=0.00051)
     assert header.global_encoding.wkt
+    # What CloudCompare offers as scalar fields: the standard ones alone, of which a map has intensity.
+    assert list(header.point_format.dimension_names) == list(laspy.PointFormat(6).dimension_names)
+    assert {name for name in header.point_format.standard_dimension_names if np.any(data[name])} == {
+        "X", "Y", "Z", "intensity", "return_number", "number_of_returns",
+    }  # fmt: skip
+    assert made.intensity is not None
+    np.testing.assert_allclose(data.intensity, made.intensity * 65535, atol=0.51)
     assert read_las(tmp_path / "map.las")[1] == wkt
     np.testing.assert_allclose(data.xyz, made.points, atol=0.00051)
 

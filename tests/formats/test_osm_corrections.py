@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from defusedxml import ElementTree
 from numpy.typing import NDArray
 from osm_builders import ORIGIN, ExtractMaker, square_at
 
@@ -129,6 +130,41 @@ def test_an_editor_gets_versions_and_marks_and_the_file_reads_back(tmp_path: Pat
     back = read_osm(tmp_path / "buildings.osm")
     np.testing.assert_allclose(list(back.nodes.values()), list(after.nodes.values()), rtol=0, atol=5.1e-8)
     assert replace(back, nodes=after.nodes) == after
+
+
+def test_an_editor_finds_nothing_missing(tmp_path: Path) -> None:
+    """What JOSM refuses a file for, or asks the server: numbers, versions, references; told by plain XML."""
+    data = pair()
+    data.versions = {("node", 1): 4, ("relation", 7): 3}
+    moves = {
+        "way/1": (0.7, -0.4, 0.0),
+        "way/2": (0.7, 0.3, 0.02),
+        "way/4": (0.5, 0.0, 0.0),
+        "relation/7": (-1.0, 0.5, 0.0),
+    }
+    write_osm(tmp_path / "buildings.osm", correct(data, moves, sure="way/2"))
+    root = ElementTree.parse(tmp_path / "buildings.osm").getroot()
+    assert (root.tag, root.get("version")) == ("osm", "0.6")
+    numbers: dict[str, list[int]] = {
+        kind: [int(e.get("id")) for e in root.iter(kind)] for kind in ("node", "way", "relation")
+    }
+    assert min(numbers["node"]) < 0 < max(numbers["node"]), "nodes that parted are new ones"
+    for kind, found in numbers.items():
+        assert len(set(found)) == len(found) > 0
+        assert 0 not in found
+        for element in root.iter(kind):
+            assert int(element.get("version")) >= 1
+            assert element.get("action") in (None, "modify")
+            assert int(element.get("id")) > 0 or element.get("action") == "modify"
+    assert all(abs(float(n.get("lat"))) <= 90 and abs(float(n.get("lon"))) <= 180 for n in root.iter("node"))
+    for way in root.iter("way"):
+        refs = [int(nd.get("ref")) for nd in way.iter("nd")]
+        assert set(refs) <= set(numbers["node"])
+        assert refs[0] == refs[-1]
+        assert len(set(refs)) == len(refs) - 1 >= 3
+    for member in root.iter("member"):
+        assert int(member.get("ref")) in numbers[member.get("type")]
+        assert member.get("role") in ("outer", "inner")
 
 
 def test_a_version_that_is_no_number_is_refused(tmp_path: Path) -> None:

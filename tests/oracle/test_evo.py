@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +17,7 @@ from lslam.config.eval import EvalConfig
 from lslam.evaluation.evaluate import evaluate
 from lslam.evaluation.relative import by_index, by_path, error_transforms
 from lslam.evaluation.results import Evaluation
-from lslam.formats.trajectory_files import read_trajectory
+from lslam.formats.trajectory_files import read_trajectory, write_tum
 from lslam.types.trajectory import Trajectory
 
 GOLDEN = json.loads(make_golden.GOLDEN.read_text())
@@ -70,6 +72,31 @@ def test_real_equals_live_evo(name: str, recordings: Callable[[str], Path]) -> N
     paths = (root / "estimates" / f"{name}.txt", root / "ground_truth" / f"{make_golden.REAL[name]}.txt")
     live = make_golden.evo_numbers(*(make_golden.load_kitti(path) for path in paths))
     assert_agree(evaluate(*(read_trajectory(path) for path in paths), CONFIG), live)
+
+
+def test_evo_ape_reads_what_lslam_writes(tmp_path: Path) -> None:
+    """`evo_ape tum` on two files of ours: TUM's grammar to the letter, poses and stamps as they are, and the same error."""
+    estimate, truth = (replace(trajectory(poses[:200]), frame="lidar") for poses in make_golden.synthetic())
+    begin = 1_700_000_000_123_456_789
+    for name, poses in (("est", estimate), ("gt", truth)):
+        shifted = replace(poses, stamps_ns=poses.stamps_ns + begin)
+        write_tum(tmp_path / name, shifted, "lslam: T_world_lidar\nworld: LiDAR at the first scan")
+        lines = (tmp_path / name).read_text(encoding="ascii").splitlines()
+        rows = [line for line in lines if not line.startswith("#")]
+        assert lines == [*lines[: len(lines) - len(rows)], *rows], "comments come first"
+        assert len(rows) == 200
+        assert all(re.fullmatch(r"\d+\.\d{9}(?: -?\d+\.\d+){7}", row) for row in rows)
+    pytest.importorskip("evo")
+    from evo.core.metrics import PoseRelation
+    from evo.main_ape import ape
+    from evo.tools.file_interface import read_tum_trajectory_file
+
+    theirs, reference = (read_tum_trajectory_file(str(tmp_path / name)) for name in ("est", "gt"))
+    np.testing.assert_allclose(theirs.poses_se3, estimate.poses, atol=2e-9)
+    np.testing.assert_allclose(theirs.timestamps, (estimate.stamps_ns + begin) / 1e9, rtol=0, atol=3e-7)
+    found = ape(reference, theirs, PoseRelation.translation_part, align=True)
+    mine = evaluate(estimate, truth, CONFIG).ate["se3"].translation.rmse
+    assert found.stats["rmse"] == pytest.approx(mine, abs=1e-8)
 
 
 @pytest.mark.parametrize("relation", ["full_transformation", "rotation_part", "rotation_angle_rad", "point_distance"])

@@ -66,7 +66,7 @@ def transforms(pairs: dict[tuple[str, str], NDArray[np.float64]]) -> Fill:
     """/tf_static."""
 
     def fill(writer: BagWriter) -> None:
-        writer.write("/tf_static", START_NS, bag_messages.static_transforms(writer.store, START_NS, pairs))
+        writer.write("/tf_static", START_NS, bag_messages.transforms(writer.store, START_NS, pairs))
 
     return fill
 

@@ -103,7 +103,7 @@ def write(path: Path, driver: Callable[[Scan], tuple[int, NDArray[Any]]], kind: 
     assert T_lidar_imu is not None
 
     def fill(writer: BagWriter) -> None:
-        tree = bag_messages.static_transforms(writer.store, START_NS, {("lidar", "imu"): T_lidar_imu})
+        tree = bag_messages.transforms(writer.store, START_NS, {("lidar", "imu"): T_lidar_imu})
         writer.write("/tf_static", START_NS, tree)
         for stamp, accel, gyro in zip((START_NS + imu.stamps_ns).tolist(), imu.accel, imu.gyro, strict=True):
             writer.write("/imu", stamp, bag_messages.imu(writer.store, stamp, accel, gyro, "imu"))

@@ -1,0 +1,152 @@
+"""A run as a bag that rviz and Foxglove show: scans where they were found, poses, path, transforms and the map."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.convert.output import check_beside, check_output, staged
+from lslam.errors import InputError, UsageError
+from lslam.formats import bag_messages
+from lslam.formats.bag_files import MAP_TOPIC, PATH_TOPIC, BagWriter
+from lslam.formats.point_files import read_cloud
+from lslam.frontend.register_scans import read_ahead
+from lslam.kernels.voxel import first_points
+from lslam.maps.clean import PosedScan
+from lslam.pipeline.map_pass import scan_poser
+from lslam.pipeline.rebuild import EarlierRun, covariances_of, in_own_world, map_of, results_of
+from lslam.types.sequence import Sequence
+
+log = logging.getLogger("lslam")
+
+WORLD, BODY = "map", "lidar"  # as ROS calls them (REP 105)
+POINTS_TOPIC, POSE_TOPIC = "/points", "/odometry"
+# What viewers take in one message; of more, every k-th is written.
+MOST_MAP_POINTS, MOST_PATH_POSES = 2_000_000, 1000
+PATHS = 20
+
+
+@dataclass(frozen=True)
+class RunBag:
+    """What was written: where, how many poses, how many clouds of scans, and how many points of the map."""
+
+    path: Path
+    poses: int
+    clouds: int
+    map_points: int
+
+
+def convert_run(
+    run: EarlierRun,
+    scans: Sequence | None,
+    kind: str,
+    out: Path,
+    *,
+    voxel: float = 0.0,
+    is_zstd: bool = False,
+    overwrite: bool = False,
+    on_scan: Callable[[], None] = lambda: None,
+) -> RunBag:
+    """Write a run to `out`, whole or not at all; one scan is in memory at a time.
+
+    Every scan has its pose as Odometry, with the run's covariance, and as the transform map -> lidar; those that were registered
+    have their points, deskewed along the run's poses to the scan's stamp. The path so far comes `PATHS` times, the map first.
+
+    Parameters
+    ----------
+    scans : the raw scans of the run, as `open_scans` gives them; None leaves the clouds out
+    kind : `bag` (ROS 1), `mcap` or `sqlite` (ROS 2), as `convert_sequence` has them
+    voxel : edge, m, of the voxels that keep one point of a scan each; 0 keeps all
+
+    Raises
+    ------
+    OutputExistsError, OutputError : as named. UsageError : `out` does not suit `kind`, or `voxel` is no length.
+    InputError : covariances or the map are damaged.
+    """
+    check_output(kind, out, is_zstd, overwrite)
+    check_beside(out, run.folder, "the run")
+    if not (np.isfinite(voxel) and voxel >= 0):
+        raise UsageError(f"--voxel {voxel:g}: an edge in m, 0 for all points")
+    if scans is not None:
+        check_beside(out, scans.path, "the sequence")
+    stamps, poses = run.trajectory.stamps_ns, run.trajectory.poses
+    if not len(stamps):
+        raise InputError(f"{run.folder / 'trajectory.tum'} has no pose")
+    covariances = covariances_of(run)
+    due, clouds = _path_ends(len(stamps)), 0
+    with staged(out) as made, BagWriter(made, kind, is_zstd) as writer:
+        map_points = _write_map(writer, run, int(stamps[0]))
+        for k, posed in enumerate(_posed(run, scans)):
+            _write_pose(
+                writer, int(stamps[k]), poses[k], None if covariances is None else np.nan_to_num(covariances[k])
+            )
+            if posed is not None:
+                _write_points(writer, int(stamps[k]), posed, voxel)
+                clouds += 1
+            if k in due:
+                some = _spread(k + 1, MOST_PATH_POSES)
+                path = bag_messages.path(writer.store, stamps[some], poses[some], WORLD)
+                writer.write(PATH_TOPIC, int(stamps[k]), path)
+            on_scan()
+    return RunBag(out, len(stamps), clouds, map_points)
+
+
+def _write_pose(writer: BagWriter, stamp: int, T: NDArray[np.float64], covariance: NDArray[np.float64] | None) -> None:
+    writer.write("/tf", stamp, bag_messages.transforms(writer.store, stamp, {(WORLD, BODY): T}))
+    writer.write(POSE_TOPIC, stamp, bag_messages.odometry(writer.store, stamp, T, WORLD, BODY, covariance))
+
+
+def _write_points(writer: BagWriter, stamp: int, posed: PosedScan, voxel: float) -> None:
+    points, intensity = posed.points, posed.intensity
+    if voxel:
+        kept = first_points(np.ascontiguousarray(points, np.float32), voxel)
+        points, intensity = points[kept], None if intensity is None else intensity[kept]
+    writer.write(POINTS_TOPIC, stamp, bag_messages.points(writer.store, stamp, points, intensity, BODY))
+
+
+def _posed(run: EarlierRun, scans: Sequence | None) -> Iterator[PosedScan | None]:
+    """One for each pose; None for a scan that was not registered or cannot be read."""
+    if scans is None:
+        yield from [None] * len(run.trajectory)
+        return
+    results = results_of(run)
+    ahead = read_ahead(scans, scan_poser(results, run.config), run.config.input.workers)
+    for loaded, _ in zip(ahead, results, strict=False):
+        if loaded.error:
+            log.warning("left out: %s", loaded.error)
+        yield loaded.prepared
+
+
+def _write_map(writer: BagWriter, run: EarlierRun, stamp: int) -> int:
+    """The map in the world of the poses, and of how many points; none, which is said, where the run has none."""
+    try:
+        path = map_of(run.folder)
+    except InputError as error:
+        log.warning("%s", error)
+        return 0
+    cloud = in_own_world(path, read_cloud(path))[0]
+    if len(cloud) > MOST_MAP_POINTS:
+        log.info("%s: %d of its %d points are written", path, MOST_MAP_POINTS, len(cloud))
+    kept = _spread(len(cloud), MOST_MAP_POINTS)
+    intensity = None if cloud.intensity is None else cloud.intensity[kept]
+    writer.write(MAP_TOPIC, stamp, bag_messages.points(writer.store, stamp, cloud.points[kept], intensity, WORLD))
+    return len(kept)
+
+
+def _path_ends(count: int) -> set[int]:
+    """After which of `count` scans the path comes: the last is one of them."""
+    return set(np.unique(np.ceil(np.linspace(0, count, PATHS + 1)[1:]).astype(int) - 1).tolist())
+
+
+def _spread(count: int, most: int) -> NDArray[np.intp]:
+    """At most `most` indices spread evenly over `count`, the first and the last among them."""
+    return (
+        np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(np.intp))
+        if count
+        else np.zeros(0, np.intp)
+    )

@@ -1,0 +1,126 @@
+"""A georeferenced run as a GeoPackage: its trajectory, what became of each scan, and the buildings it corrected."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.convert.on_earth import georeference_beside
+from lslam.convert.output import staged
+from lslam.errors import InputError, OutputExistsError, UsageError
+from lslam.formats.geojson import read_corrected
+from lslam.formats.gpkg_files import GeoLayer, write_gpkg
+from lslam.formats.utc_times import utc_of
+from lslam.geometry.geodesy import from_local
+from lslam.maps.georeference import to_lat_lon
+from lslam.pipeline.rebuild import EarlierRun, covariances_of, read_run, results_of
+from lslam.pipeline.run_folder import require_run
+from lslam.types.building import CorrectedMap
+from lslam.types.gnss import Georeference
+
+Floats = NDArray[np.float64]
+SUFFIX = ".gpkg"
+
+
+def convert_to_gpkg(folder: Path, out: Path, *, overwrite: bool = False) -> list[GeoLayer]:
+    """Write the run in `folder` to `out`, whole or not at all; the layers that it has.
+
+    `trajectory` is one line, `scans` a point each with number, stamp, UTC where stamps are Unix time, status and the standard
+    deviation where it is largest, `buildings` and `new_walls` what the run found of OpenStreetMap. WGS84, heights in m above its
+    ellipsoid.
+
+    Raises
+    ------
+    UsageError : the run is not georeferenced, or `out` has another suffix. OutputExistsError, OutputError : as named.
+    InputError : `folder` is no folder of a run, its files are damaged, or fudgeo is missing.
+    """
+    if out.suffix != SUFFIX:
+        raise UsageError(f"--out {out}: a GeoPackage is one file, its name ends in {SUFFIX}")
+    if out.exists() and not overwrite:
+        raise OutputExistsError(f"{out} exists already: choose another --out, or --overwrite it")
+    require_run(folder)
+    georeference = georeference_beside(folder, "gpkg")
+    run = read_run(folder)
+    if not len(run.trajectory):
+        raise InputError(f"{folder / 'trajectory.tum'} has no pose")
+    layers = _of_poses(run, georeference)
+    if (folder / "buildings.geojson").is_file():
+        layers += _of_buildings(read_corrected(folder / "buildings.geojson"))
+    with staged(out) as made:
+        write_gpkg(made, layers)
+    return layers
+
+
+def _of_poses(run: EarlierRun, georeference: Georeference) -> list[GeoLayer]:
+    about = "heights in m above the WGS84 ellipsoid; by lslam"
+    if georeference.method == "osm":
+        about += "; placed by buildings, © OpenStreetMap contributors, ODbL 1.0"
+    places = to_lat_lon(run.trajectory.positions, georeference)[:, [1, 0, 2]]
+    stamps, nothing = run.trajectory.stamps_ns, [None] * len(places)
+    times = utc_of(stamps) or nothing
+    covariances = covariances_of(run)
+    columns: dict[str, Any] = {
+        "scan": [result.index for result in results_of(run)],
+        "stamp_ns": stamps.tolist(),
+        "utc": times,
+        "status": list(run.statuses),
+        "sigma_m": nothing if covariances is None else _sigmas(covariances[:, :3, :3]),
+        "sigma_deg": nothing if covariances is None else _sigmas(np.degrees(1) ** 2 * covariances[:, 3:, 3:]),
+    }
+    # A line has two points.
+    line = places if len(places) > 1 else np.repeat(places, 2, axis=0)
+    whole: dict[str, Any] = {
+        "sequence": [str(run.manifest.get("sequence", {}).get("name", run.folder.name))],
+        "scans": [len(places)],
+        "length_m": [float(run.trajectory.path_lengths[-1])],
+        "begin": times[:1],
+        "end": times[-1:],
+    }
+    return [
+        GeoLayer("trajectory", "lines", [line], whole, about),
+        GeoLayer("scans", "points", list(places), columns, about),
+    ]
+
+
+def _sigmas(covariances: Floats) -> list[float | None]:
+    """Square root of the largest eigenvalue of each (N, 3, 3); None where it is not known."""
+    known = np.asarray(np.isfinite(covariances).all((1, 2)))
+    largest = np.linalg.eigvalsh(np.where(known[:, None, None], covariances, 0.0))[:, -1]
+    return [float(np.sqrt(max(v, 0.0))) if k else None for v, k in zip(largest, known, strict=True)]
+
+
+def _of_buildings(found: CorrectedMap) -> list[GeoLayer]:
+    """Real places, as in buildings.geojson."""
+    about = f"{found.attribution}; corrected by lslam" if found.attribution else "corrected by lslam"
+    held, origin = found.buildings, found.origin
+    polygons = [
+        [[_closed(ring, origin) for ring in footprint.rings] for footprint in c.corrected.footprints] for c in held
+    ]
+    columns: dict[str, Any] = {
+        "osm_id": [c.building.osm_id for c in held],
+        "status": [c.status for c in held],
+        "displacement_east_m": [float(c.displacement[0]) for c in held],
+        "displacement_north_m": [float(c.displacement[1]) for c in held],
+        "turn_deg": [float(np.degrees(c.displacement[2])) for c in held],
+        "confidence": [c.confidence for c in held],
+        "height_m": [c.building.height for c in held],
+        "name": [c.building.tags.get("name") for c in held],
+    }
+    walls = [_placed(wall, origin) for wall in found.new_walls]
+    lengths = np.linalg.norm(found.new_walls[:, 1] - found.new_walls[:, 0], axis=1).tolist()
+    return [
+        GeoLayer("buildings", "polygons", polygons, columns, about),
+        GeoLayer("new_walls", "lines", walls, {"length_m": lengths}, f"walls where the map has no building; {about}"),
+    ]
+
+
+def _placed(points: Floats, origin: Floats) -> Floats:
+    """(K, 2) m to (K, 3) longitude, latitude, height of the origin."""
+    return from_local(np.column_stack([points, np.zeros(len(points))]), origin)[:, [1, 0, 2]]
+
+
+def _closed(ring: Floats, origin: Floats) -> Floats:
+    return _placed(np.concatenate([ring, ring[:1]]), origin)[:, :2]
