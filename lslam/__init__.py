@@ -18,14 +18,18 @@ if TYPE_CHECKING:
     from lslam.pipeline.run import run
     from lslam.readers import open_sequence
     from lslam.recovery.policies import RecoveringRegistration as Registration
+    from lslam.simulation.scenarios import simulate
+    from lslam.studies.from_python import compare
 
-__all__ = ["Registration", "__version__", "evaluate", "open_sequence", "run"]
+__all__ = ["Registration", "__version__", "compare", "evaluate", "open_sequence", "run", "simulate"]
 
 _HOMES = {
     "Registration": ("lslam.recovery.policies", "RecoveringRegistration"),
+    "compare": ("lslam.studies.from_python", "compare"),
     "evaluate": ("lslam.evaluation.evaluate", "evaluate"),
     "open_sequence": ("lslam.readers", "open_sequence"),
     "run": ("lslam.pipeline.run", "run"),
+    "simulate": ("lslam.simulation.scenarios", "simulate"),
 }
 
 

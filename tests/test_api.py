@@ -137,3 +137,45 @@ def test_examples_in_docstrings_run(name: str, tmp_path: Path, monkeypatch: pyte
     failed, attempted = doctest.testmod(importlib.import_module(name), optionflags=doctest.ELLIPSIS)
     assert attempted > 0
     assert failed == 0
+
+
+def test_a_sequence_is_indexed_from_both_ends_and_walked_through() -> None:
+    sequence = lslam.open_sequence(SAMPLE)
+    assert sequence[0].index == 0
+    assert sequence[-1].index == len(sequence) - 1
+    np.testing.assert_array_equal(sequence[3].points, sequence.scan(3).points)
+    drive = lslam.simulate("block", count=3, lidar="vlp16")
+    assert [scan.index for scan in drive] == [0, 1, 2]
+    with pytest.raises(IndexError):
+        _ = sequence[len(sequence)]
+
+
+def test_an_outcome_has_the_map_the_errors_and_figures(tmp_path: Path) -> None:
+    outcome = lslam.run(SAMPLE, few_scans(), out=tmp_path / "run")
+    assert outcome.map is not None
+    assert len(outcome.map) == outcome.record.manifest["map_points"]
+    assert outcome.errors is not None
+    assert outcome.evaluation is not None
+    rmse = outcome.evaluation.ate["se3"].translation
+    assert rmse is not None
+    assert np.sqrt(np.mean(outcome.errors**2)) == pytest.approx(rmse.rmse)
+    assert outcome.plot("map").axes
+    with pytest.raises(UsageError, match="did you mean 'errors'"):
+        outcome.plot("error")
+    assert "<pre>block-0, icp" in outcome._repr_html_()
+    bare = lslam.run(lslam.simulate("block", count=8, lidar="vlp16"), few_scans())
+    assert bare.map is None
+    with pytest.raises(InputError, match="has no map"):
+        bare.plot("map")
+
+
+def test_a_comparison_from_python_has_all_runs(tmp_path: Path) -> None:
+    words = ("input.count=6", "map.write=false", "report.html=false")
+    compared = lslam.compare([SAMPLE], ["icp", "icp-point"], out=tmp_path / "out", settings=words)
+    assert compared.comparison.methods == ("icp", "icp-point")
+    assert len(compared.comparison.runs) == 2
+    assert not compared.comparison.failed
+    assert (compared.folder / "compare.html").is_file()
+    assert compared.table("csv").count("\n") == 2
+    with pytest.raises(UsageError, match="exists"):
+        lslam.compare([SAMPLE], ["icp"], out=tmp_path / "out")

@@ -42,7 +42,7 @@ PEERS = [Requirement(t) for name in ("peers", "browser") for t in PROJECT["optio
 # One module by two names: a machine has one of them.
 EITHER = {"open3d", "open3d-cpu"}
 # Run as commands, not imported.
-TOOLS = {"mypy", "pytest-xdist", "ruff", "scipy-stubs", "types-defusedxml", "types-requests"}
+TOOLS = {"ipykernel", "mypy", "pytest-xdist", "ruff", "scipy-stubs", "types-defusedxml", "types-requests"}
 # Comes with pytest.
 WITH_PYTEST = {"packaging"}
 # Imported by a script that runs in an environment of its own: it wants an older numpy than other peers.

@@ -18,8 +18,9 @@ from lslam.formats.point_files import read_cloud
 from lslam.frontend.register_scans import read_ahead
 from lslam.kernels.voxel import first_points
 from lslam.maps.clean import PosedScan
+from lslam.pipeline.map_files import in_own_world
 from lslam.pipeline.map_pass import scan_poser
-from lslam.pipeline.rebuild import EarlierRun, covariances_of, in_own_world, map_of, results_of
+from lslam.pipeline.rebuild import EarlierRun, covariances_of, map_of, results_of
 from lslam.types.sequence import Sequence
 
 log = logging.getLogger("lslam")

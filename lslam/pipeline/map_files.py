@@ -21,7 +21,7 @@ from lslam.maps.mesh import surface
 from lslam.maps.occupancy import OccupancyGrid
 from lslam.reports.evaluations import strict
 from lslam.reports.png import grey_png
-from lslam.types.cloud import Cloud, in_memory
+from lslam.types.cloud import ArrayCloud, Cloud, in_memory
 from lslam.types.gnss import Georeference
 from lslam.types.trajectory import Trajectory
 from lslam.untrusted import MISFIT, parse_json
@@ -215,3 +215,15 @@ def georeference_of(note: Any) -> Georeference | None:
         )
     except MISFIT:
         return None
+
+
+def in_own_world(path: Path, cloud: ArrayCloud) -> tuple[ArrayCloud, Georeference | None]:
+    """A map in the world of the run that wrote it, and where that lies on the Earth.
+
+    One that no run wrote, or that lies nowhere, is in its own coordinates.
+    """
+    about = note_of(path)
+    georeference = georeference_of(about.get("georeference"))
+    if about.get("crs") is None or georeference is None:
+        return cloud, georeference
+    return ArrayCloud(Projection(georeference).invert(cloud.points), cloud.intensity), georeference

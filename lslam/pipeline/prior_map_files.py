@@ -12,9 +12,9 @@ from lslam.errors import InputError, UsageError
 from lslam.formats.point_files import MAP_SUFFIXES, SUFFIXES, read_cloud
 from lslam.localization.prior_map import PriorMap, make_prior_map
 from lslam.maps.georeference import Projection
-from lslam.pipeline.map_files import georeference_of, note_of, read_json
+from lslam.pipeline.map_files import georeference_of, in_own_world, note_of, read_json
 from lslam.pipeline.map_tiles import INDEX, is_tiles, read_tiles
-from lslam.pipeline.rebuild import in_own_world, map_of
+from lslam.pipeline.rebuild import map_of
 from lslam.pipeline.run_folder import require_run
 from lslam.types.cloud import ArrayCloud
 

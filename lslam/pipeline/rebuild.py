@@ -29,6 +29,7 @@ from lslam.pipeline.map_files import (
     MapNote,
     drop_note,
     georeference_of,
+    in_own_world,
     is_note,
     note_of,
     note_with,
@@ -348,15 +349,3 @@ def _cloud(folder: Path) -> ArrayCloud | None:
         log.warning("%s", error)
         return None
     return in_own_world(path, read_cloud(path))[0]
-
-
-def in_own_world(path: Path, cloud: ArrayCloud) -> tuple[ArrayCloud, Georeference | None]:
-    """A map in the world of the run that wrote it, and where that lies on the Earth.
-
-    One that no run wrote, or that lies nowhere, is in its own coordinates.
-    """
-    about = note_of(path)
-    georeference = georeference_of(about.get("georeference"))
-    if about.get("crs") is None or georeference is None:
-        return cloud, georeference
-    return ArrayCloud(Projection(georeference).invert(cloud.points), cloud.intensity), georeference

@@ -4,8 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from lslam.evaluation.evaluate import Evaluation
+from lslam.formats.point_files import read_cloud
+from lslam.pipeline.map_files import in_own_world
+from lslam.reports.figures import PlottedRun, draw_figure
+from lslam.reports.notebook import WIDTH, as_html, drawn
+from lslam.reports.plots import first_available
+from lslam.reports.text import summary
+from lslam.types.cloud import ArrayCloud
 from lslam.types.run_record import RunRecord
 from lslam.types.trajectory import Trajectory
 
@@ -21,6 +32,40 @@ class RunOutcome:
     def trajectory(self) -> Trajectory:
         """T_world_lidar per scan, at its stamp."""
         return self.record.trajectory
+
+    @property
+    def map(self) -> ArrayCloud | None:
+        """The merged map in the run's world, read from its folder; None where none was written."""
+        if self.record.folder is None or not self.record.map_file:
+            return None
+        path = self.record.folder / self.record.map_file
+        return in_own_world(path, read_cloud(path))[0]
+
+    @property
+    def errors(self) -> NDArray[np.float64] | None:
+        """(N,) m, position errors of the matched poses, aligned as the report draws them; None without ground truth."""
+        absolute = first_available(self.evaluation)
+        return None if absolute is None else np.linalg.norm(absolute.errors, axis=1)
+
+    def plot(self, what: str = "trajectory") -> Any:
+        """A figure of `lslam plot` as one of matplotlib: trajectory, map, errors, features or imu.
+
+        Raises UsageError for another name, InputError for what the run does not have.
+        """
+        return draw_figure(self._plotted(self.map if what == "map" else None), what)
+
+    def _plotted(self, cloud: ArrayCloud | None = None) -> PlottedRun:
+        record = self.record
+        return PlottedRun(
+            record.name, record.trajectory, None if record.odometry is record.trajectory else record.odometry,
+            self.evaluation, cloud, record.imu, record.features, record.buildings, record.georeference,
+        )  # fmt: skip
+
+    def _repr_html_(self) -> str:
+        """Summary and trajectory, for notebooks."""
+        return as_html(
+            summary(self.record, self.evaluation), drawn(lambda: draw_figure(self._plotted(), "trajectory", WIDTH))
+        )
 
 
 @dataclass(frozen=True)

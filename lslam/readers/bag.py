@@ -36,7 +36,7 @@ from lslam.readers.sidecars import compensation_note
 from lslam.types.gnss import GnssStream
 from lslam.types.imu import ImuStream
 from lslam.types.scan import Scan
-from lslam.types.sequence import Calibration, no_shared_time
+from lslam.types.sequence import Calibration, Scans, no_shared_time
 from lslam.types.trajectory import Trajectory
 
 KIND = "bag"
@@ -50,7 +50,7 @@ _TRUTH = re.compile(r"(^|[/_])(ground_?truth|gt)([/_]|$)", re.IGNORECASE)
 
 
 @dataclass
-class BagSequence:
+class BagSequence(Scans):
     """A `Sequence` over a bag. See `lslam.types.sequence` for the attributes every sequence has.
 
     messages : (N,) int64, which message of `topic` each scan is; headers_ns : (N,) int64, stamps of their headers

@@ -18,12 +18,12 @@ from lslam.readers.point_times import TimeRule, apply_rule, azimuth_times
 from lslam.types.gnss import GnssStream
 from lslam.types.imu import ImuStream
 from lslam.types.scan import Scan, Span
-from lslam.types.sequence import Calibration
+from lslam.types.sequence import Calibration, Scans
 from lslam.types.trajectory import Trajectory
 
 
 @dataclass
-class FolderSequence:
+class FolderSequence(Scans):
     """A `Sequence` over point files. See `lslam.types.sequence` for the attributes every sequence has.
 
     files : one per scan; correction_deg : rotation of every point about p x z, 0 for none

@@ -24,14 +24,14 @@ from lslam.readers.sidecars import calibration_over, compensation_note, load_gns
 from lslam.types.gnss import GnssStream
 from lslam.types.imu import ImuStream
 from lslam.types.scan import Scan
-from lslam.types.sequence import Calibration, no_shared_time
+from lslam.types.sequence import Calibration, Scans, no_shared_time
 from lslam.types.trajectory import Trajectory
 
 KIND = "pcap"
 
 
 @dataclass
-class PcapSequence:
+class PcapSequence(Scans):
     """A `Sequence` over a capture. See `lslam.types.sequence` for the attributes every sequence has.
 
     rings : number of beams; sensor : the model; has_assumed_extrinsics : nothing says where the IMU sits

@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 from lslam.errors import InputError, UsageError
 from lslam.preprocessing.rings import RingRule, decide_rings
 from lslam.types.scan import Scan
-from lslam.types.sequence import Sequence
+from lslam.types.sequence import Scans, Sequence
 
 # Scans the rule is decided on: the first that can be read.
 _LOOKED_AT = 3
 
 
-class SequenceView:
+class SequenceView(Scans):
     """Delegates to `whole` whatever `own` does not replace; a subclass says which scans there are and what they hold."""
 
     def __init__(self, whole: Sequence, **own: Any) -> None:

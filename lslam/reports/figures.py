@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from lslam.errors import InputError, UsageError, nearest
 from lslam.geometry import geodesy, se3, so3
-from lslam.reports.picture import COLOURS, label
+from lslam.reports.picture import COLOURS, label, shown_figure
 from lslam.reports.plots import first_available
 from lslam.types.building import CorrectedMap
 from lslam.types.cloud import ArrayCloud
@@ -54,11 +54,9 @@ def require_figure(what: str) -> None:
 
 def draw_figure(run: PlottedRun, what: str, width: float = WIDTHS["column"]) -> Any:
     """The matplotlib figure, `width` mm wide; raises UsageError as `require_figure`, InputError for what a run does not have."""
-    from matplotlib.figure import Figure
-
     require_figure(what)
     draw, height = FIGURES[what]
-    figure = Figure(figsize=(width / INCH, height * width / INCH), layout="constrained")
+    figure = shown_figure()(figsize=(width / INCH, height * width / INCH), layout="constrained")
     draw(figure, run)
     return figure
 

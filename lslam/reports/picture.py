@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -54,6 +55,20 @@ def picture(figure: Any, kind: str, dpi: int = 120) -> bytes:
     stream = io.BytesIO()
     figure.savefig(stream, format=kind, dpi=dpi, metadata=stamp)
     return stream.getvalue()
+
+
+@cache
+def shown_figure() -> type[Any]:
+    """matplotlib's figure, which a notebook shows without pyplot."""
+    from matplotlib.figure import Figure
+
+    class ShownFigure(Figure):
+        """A figure that is its own picture."""
+
+        def _repr_png_(self) -> bytes:
+            return picture(self, "png")
+
+    return ShownFigure
 
 
 def label(plot: Any, x: str, y: str) -> None:

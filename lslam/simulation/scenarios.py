@@ -26,7 +26,7 @@ from lslam.simulation.waypoints import WayPoints, read_way_points
 from lslam.types.gnss import GnssStream
 from lslam.types.imu import ImuStream
 from lslam.types.scan import Scan
-from lslam.types.sequence import Calibration
+from lslam.types.sequence import Calibration, Scans
 from lslam.types.trajectory import Trajectory
 
 FASTEST = 40.0  # m/s
@@ -35,7 +35,7 @@ SPARE_REACH = 10.0  # m that anything may get nearer while a scan is taken
 _SHAKING_SEED = 2**32 - 13  # of the generator of the LiDAR's vibration
 
 
-class SimulatedDrive:
+class SimulatedDrive(Scans):
     """A drive through a generated city; satisfies the `Sequence` protocol without touching the disk.
 
     `ground_truth` is T_world_lidar at the scans' stamps, world = LiDAR at the first scan; `T_city_world` carries it into

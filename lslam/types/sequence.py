@@ -32,6 +32,24 @@ def no_shared_time(stream: str) -> str:
     return f"{stream}: it shares no time with the scans"
 
 
+class Scans:
+    """`sequence[i]` and iteration, by `scan`; from the end below 0."""
+
+    def __len__(self) -> int:
+        """Number of scans."""
+        raise NotImplementedError
+
+    def scan(self, index: int) -> Scan:
+        """Read scan `index`."""
+        raise NotImplementedError
+
+    def __getitem__(self, index: int) -> Scan:
+        """As `scan`; IndexError beyond the last."""
+        if not -len(self) <= index < len(self):
+            raise IndexError(f"scan {index} of {len(self)}")
+        return self.scan(index % len(self))
+
+
 class Sequence(Protocol):
     """A recorded sequence, opened but not loaded: scans are read one at a time, from any thread.
 
@@ -69,4 +87,8 @@ class Sequence(Protocol):
 
     def scan(self, index: int) -> Scan:
         """Read scan `index`. Raises InputError naming the file when it cannot be read."""
+        ...
+
+    def __getitem__(self, index: int) -> Scan:
+        """As `scan`; IndexError beyond the last, and from the end below 0."""
         ...
