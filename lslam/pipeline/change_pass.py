@@ -15,7 +15,7 @@ from lslam.formats.geojson import write_areas
 from lslam.formats.ply_files import write_ply
 from lslam.frontend.register_scans import read_ahead
 from lslam.geometry import se3
-from lslam.geometry.geodesy import from_local, to_local
+from lslam.geometry.geodesy import frame_change
 from lslam.maps.changes import ChangedCells, MapChange, changed_cells
 from lslam.maps.clean import Cleaner, PosedScan
 from lslam.maps.georeference import to_lat_lon
@@ -36,8 +36,6 @@ CLOUD, AREAS = "changes.ply", "changes.geojson"
 INTERRUPTED = "interrupted while the drives were compared: nothing is written"
 # Red, green, blue of what vanished, is the same, and appeared; the scalar `change` is -1, 0 and 1.
 _COLOURS = np.array([[214, 69, 65], [150, 150, 150], [46, 134, 193]], np.uint8)
-# m over which the turn between two local frames of the Earth is taken.
-_BASE = 100.0
 
 
 def frame_between(new: EarlierRun, old: EarlierRun) -> Floats:
@@ -54,11 +52,12 @@ def frame_between(new: EarlierRun, old: EarlierRun) -> Floats:
             f"lslam localize {new.sequence_path} --map {old.folder}"
         )
     log.warning(
-        "only satellites tie %s to %s: where they are off by more than a cell all walls seem changed; lslam localize ties "
-        "drives by their scans",
+        "only their places on the Earth tie %s to %s: where these are off by more than a cell all walls seem changed; lslam localize "
+        "ties drives by their scans",
         new.folder, old.folder,
     )  # fmt: skip
-    return _between(new.georeference, old.georeference)
+    T_old_new = frame_change(new.georeference.origin, old.georeference.origin)
+    return np.asarray(se3.inverse(old.georeference.T_enu_world) @ T_old_new @ new.georeference.T_enu_world)
 
 
 def _frame_of(run: EarlierRun) -> Path:
@@ -74,15 +73,6 @@ def _frame_of(run: EarlierRun) -> Path:
             here = here.parent
         manifest = read_json(here / MANIFEST)
     return here
-
-
-def _between(new: Georeference, old: Georeference) -> Floats:
-    """(4, 4) T_old_new: the rigid one that is exact at the origin of the new world."""
-    here = new.T_enu_world[:3, 3] + _BASE * np.concatenate([np.zeros((1, 3)), np.eye(3)])
-    there = to_local(from_local(here, new.origin), old.origin)
-    U, _, Vt = np.linalg.svd((there[1:] - there[0]).T)
-    T_enu_enu = se3.make(U @ Vt, there[0] - U @ Vt @ here[0])
-    return np.asarray(se3.inverse(old.T_enu_world) @ T_enu_enu @ new.T_enu_world)
 
 
 def compare_runs(

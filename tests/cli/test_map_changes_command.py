@@ -15,11 +15,13 @@ from lslam.formats.ply_files import read_ply
 from lslam.formats.trajectory_files import read_trajectory
 from lslam.geometry import se3
 from lslam.geometry.umeyama import align
+from lslam.maps.georeference import Projection, to_wgs84
 from lslam.simulation.lidar import RayScene
 from lslam.simulation.record import record
 from lslam.simulation.routes import Visit
 from lslam.simulation.scenarios import SimulatedDrive, simulate
 from lslam.simulation.scene_mesh import MeshBuilder, Surface
+from lslam.types.gnss import Georeference
 
 # Length, width and height of the box, m.
 BOX = np.array([2.0, 1.5, 1.5])
@@ -175,3 +177,31 @@ def test_runs_that_nothing_ties_together_are_refused(drives: Path, tmp_path: Pat
     assert done.returncode == 2
     assert f"--map {drives / 'old'}" in done.stderr
     assert_one_sentence(done.stderr)
+
+
+def test_drives_that_only_the_earth_ties_are_compared_too(drives: Path, tmp_path: Path) -> None:
+    """Each is placed by its own surveyed points, in coordinates of its own origin."""
+    assert lslam("run", drives / "boxed", "--out", tmp_path / "alone", "-q", "--set", "map.write=false").returncode == 0
+    on_earth = Projection(Georeference(np.array([49.0112, 8.4229, 115.0]), np.eye(4), 25832))
+    for run, visit in ((drives / "old", MONDAY), (tmp_path / "alone", TUESDAY)):
+        places = on_earth.apply(simulate("block", seed=7, count=60, visit=visit).city_poses[:, :3, 3])
+        rows = [
+            f"{k},{places[k, 0]:.4f},{places[k, 1]:.4f},{places[k, 2]:.4f},0.02,EPSG:25832" for k in (0, 20, 40, 59)
+        ]
+        (tmp_path / "points.csv").write_text("\n".join(["scan,x,y,z,sigma,crs", *rows]) + "\n")
+        words = ("--control", tmp_path / "points.csv", "--no-map", "--out", tmp_path / f"{run.name}-placed", "-q")
+        done = lslam("graph", run, *words)
+        assert done.returncode == 0, done.stderr
+    done = lslam(
+        "map", tmp_path / "alone-placed", "--against", tmp_path / "old-placed", "--changes", tmp_path / "out", "--json"
+    )
+    assert done.returncode == 0, done.stderr
+    assert "only their places on the Earth tie" in done.stderr
+    assert [thing["kind"] for thing in strict_json(done.stdout)["things"]] == ["appeared"]
+    tree = json.loads((tmp_path / "out" / "changes.geojson").read_text())
+    (ring,) = tree["features"][0]["geometry"]["coordinates"]
+    lon, lat = np.mean(ring[:-1], axis=0)
+    drive = simulate("block", seed=7, count=96, visit=MONDAY)
+    true = on_earth.apply(beside_the_road(drive)[None])
+    (box,) = to_wgs84(true, 25832)
+    assert np.hypot((lat - box[0]) * 111_200, (lon - box[1]) * 72_900) < 0.6
