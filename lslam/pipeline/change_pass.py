@@ -52,8 +52,8 @@ def frame_between(new: EarlierRun, old: EarlierRun) -> Floats:
             f"lslam localize {new.sequence_path} --map {old.folder}"
         )
     log.warning(
-        "only their places on the Earth tie %s to %s: where these are off by more than a cell all walls seem changed; lslam localize "
-        "ties drives by their scans",
+        "only their places on the Earth tie %s to %s: where these are off by more than a cell all walls seem changed; lslam "
+        "localize ties drives by their scans",
         new.folder, old.folder,
     )  # fmt: skip
     T_old_new = frame_change(new.georeference.origin, old.georeference.origin)
