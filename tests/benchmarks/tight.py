@@ -5,7 +5,8 @@
 
 What was run once stands in FOLDER/tight.json and is not run again, whatever became of the code: take another folder for
 that. Every drive is a process of its own: a method that ends it is counted as failed, and the others go on. `quadrotor` and
-`stairs` are run whole. A run is lost when its ATE exceeds a twentieth of the path or it ends without a result.
+`stairs` are run whole. A run is lost when its ATE exceeds a twentieth of the path or it ends without a result. Every drive has
+satellite fixes, and loops where it is long enough, for methods with `+loops.use=true+gnss.mode=graph`.
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ from traced import Traced, run_on, traced
 from lslam.errors import LslamError
 from lslam.formats.atomic import write_text
 from lslam.geometry import se3
+from lslam.simulation.sensors import GnssModel
 from lslam.types.trajectory import Trajectory
 
 SCENARIOS = "walk,urban-hard,residential-hard,corridor,carpark,quadrotor,stairs"
@@ -94,9 +96,8 @@ def work(case: Found) -> None:
     """In a process of its own: a drive, and one line of JSON a method."""
     logging.getLogger("lslam").setLevel(logging.CRITICAL)
     count = None if case["scenario"] in WHOLE else case["scans"]
-    drive = traced(
-        case["scenario"], case["seed"], lidar=case["lidar"], imu=case["imu"], count=count, motion_compensated=False
-    )
+    given = {"lidar": case["lidar"], "imu": case["imu"], "gnss": GnssModel(), "count": count}
+    drive = traced(case["scenario"], case["seed"], **given, motion_compensated=False)
     length = float(drive.ground_truth.path_lengths[-1])
     for method in case["methods"]:
         found = one(drive, method) | {"length": length}
