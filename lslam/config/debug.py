@@ -18,12 +18,12 @@ class DebugConfig(Section):
         description="at rates that last, or for `drift_memory` only; at rates drawn anew at every step, of the same size after "
         "100 m; or as the odometry of a real run did",
     )
-    drift_percent: float = Field(1.0, ge=0, description="% of the way travelled, in one direction of the world")
-    drift_deg_per_100m: float = Field(0.5, ge=0, description="deg of heading per 100 m travelled")
-    drift_tilt_deg_per_100m: float = Field(0.0, ge=0, description="deg of roll and pitch per 100 m travelled, likewise")
+    drift_percent: float = Field(1.0, ge=0, description="%; of the way travelled, in one direction of the world")
+    drift_deg_per_100m: float = Field(0.5, ge=0, description="deg/100 m; of heading, over the way travelled")
+    drift_tilt_deg_per_100m: float = Field(0.0, ge=0, description="deg/100 m; of roll and pitch, likewise")
     drift_seed: int = Field(0, ge=0, description="draws that direction and the side the heading turns to")
     drift_memory: float | None = Field(
-        None, gt=0, description="m travelled over which both are forgotten and drawn anew; absent: they never change"
+        None, gt=0, description="m; way over which both are forgotten and drawn anew; absent: they never change"
     )
     drift_estimate: str = Field(
         "",

@@ -20,7 +20,7 @@ class EvalConfig(Section):
         description="RPE: number, unit scan|m|s, / pair rule consecutive|all",
     )
     max_diff: float = Field(0.01, gt=0, description="s; largest stamp difference of a matched pair")
-    time_offset: float | Literal["auto"] = Field(0.0, description="s added to the estimate's stamps, or auto")
+    time_offset: float | Literal["auto"] = Field(0.0, description="s; added to the estimate's stamps, or auto")
     metrics: tuple[str, ...] = Field(
         (), description="shown beside ATE, RPE and KITTI drift: thesis for those of the theses"
     )

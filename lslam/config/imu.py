@@ -25,27 +25,27 @@ class ImuConfig(Section):
         description="weigh each registered motion against what the IMU felt by their covariances, and bridge a scan whose "
         "registration the IMU and constant velocity deny; false: it predicts only",
     )
-    gyro_bias: Three | None = Field(None, description="rad/s, IMU axes; absent: estimated")
-    accel_bias: Three | None = Field(None, description="m/s2, IMU axes; absent: estimated")
+    gyro_bias: Three | None = Field(None, description="rad/s; IMU axes; absent: estimated")
+    accel_bias: Three | None = Field(None, description="m/s2; IMU axes; absent: estimated")
     initial_velocity: Three | None = Field(
-        None, description="m/s, LiDAR axes at the first scan; absent: estimated from the first scans"
+        None, description="m/s; LiDAR axes at the first scan; absent: estimated from the first scans"
     )
     time_offset_s: float | None = Field(
-        None, ge=-10, le=10, description="s to add to the IMU's stamps; absent: estimated from the rotation rates"
+        None, ge=-10, le=10, description="s; to add to the IMU's stamps; absent: estimated from the rotation rates"
     )
     accel_noise: float | None = Field(
         None,
         gt=0,
-        description="m/s2 per sqrt(Hz), of forces, shaking included; absent: 0.05; see `lslam info SEQUENCE --imu-toml FILE`",
+        description="m/s2 per sqrt(Hz); of forces, shaking included; absent: 0.05; see `lslam info SEQUENCE --imu-toml FILE`",
     )
     gyro_noise: float | None = Field(
-        None, gt=0, description="rad/s per sqrt(Hz), of rates, the least: more is learnt; absent: 0.000175"
+        None, gt=0, description="rad/s per sqrt(Hz); of rates, the least: more is learnt; absent: 0.000175"
     )
     accel_walk: float | None = Field(
-        None, gt=0, description="m/s2 per sqrt(s), random walk of the accelerometer's bias; absent: 0.002"
+        None, gt=0, description="m/s2 per sqrt(s); random walk of the accelerometer's bias; absent: 0.002"
     )
     gyro_walk: float | None = Field(
-        None, gt=0, description="rad/s per sqrt(s), random walk of the gyroscope's bias; absent: 0.0000175"
+        None, gt=0, description="rad/s per sqrt(s); random walk of the gyroscope's bias; absent: 0.0000175"
     )
     estimate_offset: bool = Field(
         False,
@@ -59,6 +59,8 @@ class ImuConfig(Section):
         None, gt=0, description="m; takes the place of registration.inlier_distance when the IMU is used"
     )
     start_s: float = Field(
-        5.0, ge=0.5, le=60, description="s at the start that are registered once without the IMU, to check and align it"
+        5.0, ge=0.5, le=60, description="s; the start, which is registered once without the IMU, to check and align it"
     )
-    gap_s: float = Field(0.1, gt=0, description="s without samples beyond which a scan falls back to constant velocity")
+    gap_s: float = Field(
+        0.1, gt=0, description="s; time without samples beyond which a scan falls back to constant velocity"
+    )

@@ -52,7 +52,7 @@ class InputConfig(Section):
     )
     strict: bool = Field(False, description="every degradation is a failed gate: exit 4")
     vertical_correction_deg: float | None = Field(
-        None, description="rotation of KITTI HDL-64E points about p x z; absent: the reader knows"
+        None, description="deg; rotation of KITTI HDL-64E points about p x z; absent: the reader knows"
     )
     level: Literal["auto", "gravity", "ground", "none"] = Field(
         "auto",

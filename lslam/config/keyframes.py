@@ -10,8 +10,8 @@ from lslam.config.section import Section
 class KeyframesConfig(Section):
     """When a scan becomes a keyframe, and what is kept of it."""
 
-    distance: float = Field(2.0, gt=0, description="m travelled since the last keyframe")
-    angle_deg: float = Field(15.0, gt=0, description="deg turned since the last keyframe")
+    distance: float = Field(2.0, gt=0, description="m; way since the last keyframe")
+    angle_deg: float = Field(15.0, gt=0, description="deg; turn since the last keyframe")
     voxel: float = Field(0.3, ge=0.05, description="m; one averaged point per voxel is kept of a keyframe's scan")
     deflate: int = Field(
         1,

@@ -17,8 +17,8 @@ class LioSamConfig(Section):
         description="what is registered: edges and planar points along the rings, as in the paper, or all points",
     )
     keyframes: int = Field(25, ge=1, description="newest keyframes that make the local map")
-    keyframe_m: float = Field(1.0, gt=0, description="m moved since the last of them, or")
-    keyframe_deg: float = Field(10.0, gt=0, description="deg turned, for a new one")
+    keyframe_m: float = Field(1.0, gt=0, description="m; moved so far since the last of them, or")
+    keyframe_deg: float = Field(10.0, gt=0, description="deg; turned by so much, for a new one")
     reset_scans: int = Field(
         100, ge=2, description="scans after which the smoother's graph begins anew, with what it knows as its prior"
     )

@@ -28,17 +28,17 @@ class LoamConfig(Section):
     )
     occlusion: float = Field(0.3, gt=0, description="m; a jump in range from beam to beam that hides what is behind")
     parallel_deg: float = Field(
-        80.0, gt=0, lt=90, description="angle of incidence above which a surface is parallel to the beam"
+        80.0, gt=0, lt=90, description="deg; angle of incidence above which a surface is parallel to the beam"
     )
     grid_step: float = Field(0.2, ge=0, description="m; grid of the less planar points, 0 keeps all")
     feature_map_voxel: float = Field(
         1.0, gt=0, description="m; voxels of the feature map; those of planes are 1.5 times `grid_step` at least"
     )
     ground_angle_deg: float = Field(
-        10.0, gt=0, lt=90, description="lego-loam: steepest ground against the dominant plane"
+        10.0, gt=0, lt=90, description="deg; lego-loam: steepest ground against the dominant plane"
     )
     segment_angle_deg: float = Field(
-        60.0, gt=0, lt=90, description="lego-loam: neighbours whose line makes more with the beam belong together"
+        60.0, gt=0, lt=90, description="deg; lego-loam: neighbours whose line makes more with the beam belong together"
     )
     segment_points: int = Field(30, ge=1, description="lego-loam: smaller clusters are clutter, unless")
     small_segment_points: int = Field(5, ge=1, description="lego-loam: they have so many points")

@@ -29,15 +29,15 @@ class LoopsConfig(Section):
     drift_percent: float = Field(
         0.5,
         ge=0,
-        description="% of the distance travelled that odometry may be wrong by, one standard deviation, beside its own "
+        description="%; of the distance travelled, that odometry may be wrong by, one standard deviation, beside its own "
         "covariance, which knows of no systematic errors",
     )
-    drift_deg: float = Field(0.25, ge=0, description="deg per 100 m, likewise for rotation")
-    min_travel: float = Field(30.0, gt=0, description="m travelled before a keyframe can be seen again")
+    drift_deg: float = Field(0.25, ge=0, description="deg/100 m; likewise for rotation")
+    min_travel: float = Field(30.0, gt=0, description="m; way before a keyframe can be seen again")
     spacing: float = Field(
         4.0,
         ge=0,
-        description="m travelled between one candidate that is registered and the next; up to three times as far after "
+        description="m; way between one candidate that is registered and the next; up to three times as far after "
         "several that came out alike",
     )
     descriptor: str = Field(

@@ -34,12 +34,12 @@ class MapConfig(Section):
     mesh: bool = Field(False, description="write map_mesh.ply, a surface through the points (Poisson)")
     ego_box: tuple[float, float, float, float, float, float] | None = Field(
         None,
-        description="x_min, x_max, y_min, y_max, z_min, z_max in the LiDAR frame, m: points inside are left out; "
+        description="m; x_min, x_max, y_min, y_max, z_min, z_max in the LiDAR frame: points inside are left out; "
         "`preprocess.ego_box` where absent",
     )
     crop: tuple[float, ...] | None = Field(
         None,
-        description="x_min, x_max, y_min, y_max and perhaps z_min, z_max of the world, m: points outside are left out",
+        description="m; x_min, x_max, y_min, y_max and perhaps z_min, z_max of the world: points outside are left out",
     )
 
     @model_validator(mode="after")

@@ -23,7 +23,7 @@ class OsmConfig(Section):
         None,
         ge=-360,
         le=360,
-        description="deg clockwise from north, of the LiDAR's x axis at the first pose; none: sought",
+        description="deg; clockwise from north, of the LiDAR's x axis at the first pose; none: sought",
     )
     start_radius: float = Field(10.0, gt=0, le=100, description="m; so far off the origin may be")
     start_heading_deg: float = Field(20.0, gt=0, le=180, description="deg; so far off the heading may be")
@@ -66,7 +66,7 @@ class OsmConfig(Section):
     renew_radius: float = Field(60.0, gt=0, description="m; so far from the last request's place a new one is made")
     use_radius: float = Field(35.0, gt=0, description="m; buildings so far from the estimate are matched")
     wall_height: float = Field(
-        1.6, ge=0, description="m above the ground; what is lower is clutter: cars, fences, hedges, people"
+        1.6, ge=0, description="m; above the ground: what is lower is clutter: cars, fences, hedges, people"
     )
     wall_range: float = Field(60.0, gt=0, le=150, description="m; walls are looked for so far from the sensor")
     wall_tilt_deg: float = Field(15.0, gt=0, lt=45, description="deg; largest tilt of a wall's surface")

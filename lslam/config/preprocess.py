@@ -17,12 +17,10 @@ class PreprocessConfig(Section):
     range_shape: Literal["sphere", "cylinder"] = Field("sphere", description="distance in space, or horizontal")
     ego_box: tuple[float, float, float, float, float, float] | None = Field(
         None,
-        description="x_min, x_max, y_min, y_max, z_min, z_max in the LiDAR frame, m: points inside are dropped",
+        description="m; x_min, x_max, y_min, y_max, z_min, z_max in the LiDAR frame: points inside are dropped",
     )
     remove_ground: bool = Field(False, description="take out the points that lie on the ground")
-    ground_slope: float = Field(
-        0.2, gt=0, lt=1, description="m per m; steepest ground against the plane under the sensor"
-    )
+    ground_slope: float = Field(0.2, gt=0, lt=1, description="m/m; steepest ground against the plane under the sensor")
     ground_tolerance: float = Field(0.25, gt=0, description="m; what is lower above the ground counts as ground")
     denoise: bool = Field(
         False, description="take out points far from their neighbours (statistical outlier removal): distant ones first"

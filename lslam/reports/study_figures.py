@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from lslam.config.units import unit_of, with_unit
 from lslam.evaluation.curves import FLAT, NOT_REGISTRATION, normalise, registration_ms
 from lslam.evaluation.laws import band
 from lslam.reports.picture import COLOURS, house_style, label, pictures
@@ -106,7 +107,7 @@ def _stages(figure: Any, result: StudyResult, shown: Sequence[CurveResult]) -> b
             plot.plot(r.curve.values, means.mean, ".-", color=COLOURS[names.index(name) % len(COLOURS)], label=name)
         plot.set_title(r.curve.label, fontsize=9)
         _abscissa(plot, r)
-        label(plot, result.parameters[0], "ms per scan" if plot is plots[0] else "")
+        label(plot, with_unit(result.parameters[0]), "ms per scan" if plot is plots[0] else "")
     plots[0].set_ylim(bottom=0)  # shared; before the last panel is drawn it would fix the top as well
     _legend(figure, *plots)
     return True
@@ -125,7 +126,7 @@ def _efficiency(figure: Any, result: StudyResult, shown: Sequence[CurveResult]) 
         plot.set_yticks(np.linspace(0, 1, 6))
         _abscissa(plot, shown[0])
         title = "E, per scan (equation 5.2)" if name == "efficiency" else "E tot, in all (equation 5.3)"
-        label(plot, result.parameters[0], f"{title}, over the largest")
+        label(plot, with_unit(result.parameters[0]), f"{title}, over the largest")
     _legend(figure, figure.axes[0])
     return any(r.optimum is not None for r in shown)
 
@@ -161,7 +162,7 @@ def _quantity(
     else:
         plot.set_ylim(0, 1.15 * drawn.max() if len(drawn) else 1.0)
     _abscissa(plot, shown[0])
-    label(plot, result.parameters[0], words)
+    label(plot, with_unit(result.parameters[0]), words)
 
 
 def _beside(result: StudyResult, of_row: Callable[[StudyRow], float]) -> Iterator[tuple[StudyRow, str]]:
@@ -241,7 +242,7 @@ def draw_laws(figure: Any, result: StudyResult, shown: Sequence[CurveResult]) ->
             _single(upper, lower, law, f"{name}: {law.text} s, R2 {law.r2:.3f}", colours[name])
         lower.axhline(0, color="0.5", lw=0.8)
         label(upper, "", "total time, s")
-        label(lower, law.names[0], "residual, %")
+        label(lower, with_unit(law.names[0]), "residual, %")
         upper.legend(frameon=False, fontsize=8)
         upper.tick_params(labelbottom=False)
     for upper in figure.axes[::2]:
@@ -264,13 +265,14 @@ def _product(upper: Any, lower: Any, law: Law, name: str) -> None:
     from matplotlib import colormaps
 
     seconds = np.unique(law.points[:, 1])
+    key, unit = law.names[1].rpartition(".")[2], unit_of(law.names[1])
     for second, colour in zip(seconds, colormaps["viridis"](np.linspace(0.0, 0.88, len(seconds))), strict=True):
         own = law.points[:, 1] == second
         x = law.points[own, 0]
         line = np.linspace(x.min(), x.max(), SAMPLES)
         fitted, half = band(law, np.stack([line, np.full(SAMPLES, second)], 1))
         upper.plot(x, law.observed[own], "o", ms=3, color=colour)
-        upper.plot(line, fitted, lw=1.1, color=colour, label=f"{law.names[1].rpartition('.')[2]} {second:g}")
+        upper.plot(line, fitted, lw=1.1, color=colour, label=f"{key} {second:g} {unit}".rstrip())
         upper.fill_between(line, fitted - half, fitted + half, color=colour, alpha=0.2, lw=0)
         lower.plot(x, 100 * law.residuals[own], "o", ms=2.5, color=colour)
     upper.set_title(f"{name}: {law.text} s, R2 {law.r2:.3f}", fontsize=9)

@@ -9,6 +9,7 @@ from math import inf
 
 import numpy as np
 
+from lslam.config.units import with_unit
 from lslam.evaluation.curves import normalise
 from lslam.evaluation.recipes import ALIGNMENTS
 from lslam.printable import counted, fixed, metres
@@ -96,7 +97,7 @@ def _landmarks(result: StudyResult) -> CompareTable:
         cells += [UNKNOWN] * 2 if r.optimum is None else [name(r.optimum.value), _range(r)]
         cells.append(name(curve.values[np.nanargmin(least)]) if np.isfinite(least).any() else UNKNOWN)
         rows.append((curve.label, *cells, f"{curve.lost.sum()}/{curve.ran.sum()}"))
-    return CompareTable(f"landmarks of {result.parameters[0]}", header, tuple(rows), 1)
+    return CompareTable(f"landmarks of {with_unit(result.parameters[0])}", header, tuple(rows), 1)
 
 
 def _laws(result: StudyResult) -> CompareTable:
@@ -118,8 +119,9 @@ def _law_row(name: str, law: Law) -> tuple[str, ...]:
 
 
 def _means(result: StudyResult) -> CompareTable:
+    key = result.parameters[0]
     head = (
-        "method", result.parameters[0].rpartition(".")[2], "translation, m", "rotation, deg", "registration, ms", "total, s",
+        "method", with_unit(key, key.rpartition(".")[2]), "translation, m", "rotation, deg", "registration, ms", "total, s",
         "fallback, %", "E", "E tot", "lost/runs",
     )  # fmt: skip
     rows: list[tuple[str, ...]] = []

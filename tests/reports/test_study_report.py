@@ -186,6 +186,16 @@ def test_study_of_two_parameters_draws_the_product_law_and_many_curves() -> None
     assert laws.rows[0][:2] == ("icp", "T = 152.2 random_share / skip_frames")
 
 
+def test_axes_and_columns_say_the_unit_of_the_key() -> None:
+    (result,) = evaluate_study([row(v, 0, "icp", parameters={"map.voxel": v, SKIP: k}, total_time_s=v / k)
+                                for v in (0.1, 0.2, 0.4) for k in (1, 2, 4)])  # fmt: skip
+    svg = {figure.name: figure.svg.decode() for figure in study_figures(result)}
+    assert svg["errors"].count(">map.voxel, m</text>") == svg["times"].count(">map.voxel, m</text>") == 2
+    assert ">voxel 0.4 m</text>" in svg["law"]
+    assert ">input.skip_frames</text>" in svg["law"]
+    assert next(table for table in study_tables(result) if table.title == "means over seeds").header[1] == "voxel, m"
+
+
 def test_panels_of_stages_reach_the_longest_of_all() -> None:
     rows = [
         row(v, 0, method, stages_ms={"scan": top, "map": 1.0})
