@@ -151,16 +151,18 @@ def time_figure(comparison: Comparison, sequence: str) -> Figure | None:
         own = [run for run in runs if run.method == method]
         if own:
             means = {name: 1e3 * float(np.mean([run.stages.get(name, 0.0) for run in own])) for name in stages}
-            bars.append((_bar_label(method, means, own), means))
+            bars.append((_bar_label(method, own), means))
     if not bars:
         return None
     limits = [run.limit for run in runs if run.limit]
-    chart = _bars(bars, stages, 1e3 * limits[0] if limits else 0.0, f"time per scan on {sequence}")
-    caption = "Means over all scans and seeds, stages stacked; reading and preparing may overlap registration."
+    chart = _bars(bars, stages, 1e3 * limits[0] if limits else 0.0, f"mean time per scan on {sequence}")
+    caption = (
+        "Means over scans, then seeds, as in the table; stages stacked. Reading and preparing may overlap registration."
+    )
     if any(run.jobs > 1 for run in runs):
         caption += " Marked ~: several runs shared the machine, so these times cannot be compared."
     return Figure(
-        "Time per scan",
+        "Mean time per scan",
         chart,
         tuple((f"s{i % STYLES + 1}", name) for i, name in enumerate(stages)),
         caption,
@@ -201,10 +203,14 @@ def _cloud(run: DrawnRun) -> Floats | None:
     return points @ T[:3, :3].T + T[:3, 3]
 
 
-def _bar_label(method: str, means: dict[str, float], runs: Sequence[RunScore]) -> str:
-    p95 = float(np.mean([run.values["time.p95"] for run in runs if "time.p95" in run.values]))
+def _bar_label(method: str, runs: Sequence[RunScore]) -> str:
     mark = "~" if any(run.jobs > 1 for run in runs) else ""
-    return f"{method}: {mark}{sum(means.values()):.1f} ms, p95 {mark}{p95:.1f}"
+    mean, p95 = (_mean_of(runs, f"time.{name}") for name in ("mean", "p95"))
+    return f"{method}: mean {mark}{mean:.1f} ms, p95 {mark}{p95:.1f}"
+
+
+def _mean_of(runs: Sequence[RunScore], key: str) -> float:
+    return float(np.mean([run.values[key] for run in runs if key in run.values]))
 
 
 def _bars(bars: Sequence[tuple[str, dict[str, float]]], stages: Sequence[str], limit: float, title: str) -> str:
@@ -218,7 +224,7 @@ def _bars(bars: Sequence[tuple[str, dict[str, float]]], stages: Sequence[str], l
         x = float(frame.px(value))
         frame.add(f'<path class="grid" d="M{x:.1f} {frame.top}V{frame.bottom}"/>')
         frame.text(x, frame.bottom + 16, svg.number(value, right), "middle")
-    frame.text((frame.left + frame.right) / 2, frame.height - 6, "time per scan, ms", "middle", "label")
+    frame.text((frame.left + frame.right) / 2, frame.height - 6, "mean time per scan, ms", "middle", "label")
     for i, (_, means) in enumerate(bars):
         y = frame.top + _ROW * i
         below = 0.0

@@ -17,7 +17,7 @@ from lslam.types.comparison import Comparison, Metric, RunScore, Spread, Summary
 from lslam.version import __version__
 
 STYLES = ("md", "csv", "tex")
-TITLES = {"error": "errors", "time": "time", "health": "scans and runs"}
+TITLES = {"error": "errors", "time": "mean time per scan", "health": "scans and runs"}
 HEALTH = ("bridged", "skipped", "degenerate", "fallback")
 SCHEMA, VERSION = "lslam-compare", 1
 
@@ -73,9 +73,7 @@ def recipes(comparison: Comparison) -> list[str]:
         if m.is_main and m.recipe and not m.key.startswith("time.") and m.key not in HEALTH
     ]
     lines = [f"{m.label}: {m.recipe}" for m in shown]
-    lines.append(
-        "ms: median over scans of each stage, then of all stages together (total), and its 95th percentile (p95)"
-    )
+    lines.append("ms: mean over scans of each stage, then of all stages together (mean), and its 95th percentile (p95)")
     if any(row.runs > 1 for row in comparison.rows):
         lines.append("over seeds: mean ± sample standard deviation (n - 1) of the runs that did not fail")
     if len(comparison.methods) > 1:

@@ -15,7 +15,7 @@ import pytest
 from comparisons import comparison, drawing, row, walls
 from test_html import parse
 
-from lslam.reports.compare_html import render_page
+from lslam.reports.compare_html import render_page, time_figure
 from lslam.reports.compare_table import recipes, render, tables, to_document
 from lslam.reports.crops import Crop, choose_crops, crop_images
 from lslam.types.comparison import Spread
@@ -37,18 +37,34 @@ def test_one_row_per_method_with_spread_failures_and_words_for_what_is_missing(t
 def test_the_best_of_several_methods_is_marked_per_sequence(tmp_path: Path) -> None:
     main = tables(comparison(tmp_path))[0]
     column = main.header.index
-    assert {cell for cell in main.best if cell[1] in (column("ATE se3, m"), column("total, ms"))} == {
-        (0, column("ATE se3, m")), (0, column("total, ms")),
+    assert {cell for cell in main.best if cell[1] in (column("ATE se3, m"), column("mean, ms"))} == {
+        (0, column("ATE se3, m")), (0, column("mean, ms")),
     }  # fmt: skip
     assert not [cell for cell in main.best if cell[0] > 1]
 
 
 def test_times_of_shared_machines_are_marked_and_never_best(tmp_path: Path) -> None:
-    slow = row("drive", "b", {"time.total": Spread(2.0, 0.0, 1)}, is_timed_alone=False)
-    fast = row("drive", "a", {"time.total": Spread(1.0, 0.0, 1)})
+    slow = row("drive", "b", {"time.mean": Spread(2.0, 0.0, 1)}, is_timed_alone=False)
+    fast = row("drive", "a", {"time.mean": Spread(1.0, 0.0, 1)})
     main = tables(comparison(tmp_path, rows=(fast, slow)))[0]
-    assert [line[main.header.index("total, ms")] for line in main.rows] == ["1.0", "~2.0"]
+    assert [line[main.header.index("mean, ms")] for line in main.rows] == ["1.0", "~2.0"]
     assert not main.best
+
+
+def test_bars_and_table_show_the_same_number_and_name_it(tmp_path: Path) -> None:
+    c = comparison(tmp_path)
+    main, figure = tables(c)[0], time_figure(c, "drive")
+    assert figure is not None
+    shown = {line[1]: line[main.header.index("mean, ms")] for line in main.rows if line[0] == "drive"}
+    assert dict(re.findall(r">([\w-]+): mean ([\d.]+) ms", figure.svg)) == shown == {"icp": "12.0", "kiss-icp": "40.0"}
+    # A bar is as long as that number says.
+    lengths = dict.fromkeys(shown, 0.0)
+    rows = sorted({float(y) for y in re.findall(r'<rect [^>]*y="([\d.]+)"', figure.svg)})
+    for y, width in re.findall(r'<rect [^>]*y="([\d.]+)" width="([\d.]+)"', figure.svg):
+        lengths[list(shown)[rows.index(float(y))]] += float(width)
+    assert lengths["kiss-icp"] / lengths["icp"] == pytest.approx(40.0 / 12.0, abs=0.02)
+    assert any(line.startswith("ms: mean over scans") for line in recipes(c))
+    assert figure.title.startswith("Mean")
 
 
 def test_a_narrow_terminal_gets_errors_and_times_apart(tmp_path: Path) -> None:
@@ -56,7 +72,7 @@ def test_a_narrow_terminal_gets_errors_and_times_apart(tmp_path: Path) -> None:
     whole = tables(c)[0]
     assert tables(c, whole.width)[0].header == whole.header
     errors, times = tables(c, whole.width - 1)[:2]
-    assert (errors.title, times.title) == ("errors", "time")
+    assert (errors.title, times.title) == ("errors", "mean time per scan")
     assert [*errors.header, *times.header[2:]] == list(whole.header)
 
 
@@ -102,8 +118,8 @@ def test_the_page_nests_shows_everything_and_needs_nothing_else(tmp_path: Path) 
     for word in (
         "killed & gone_by 100%",
         "no ground truth",
-        "kiss-icp: 1.0 ms",
-        "icp: 12.0 ms",
+        "kiss-icp: mean 40.0 ms",
+        "icp: mean 12.0 ms",
         "others were using",
         "1 failed",
     ):

@@ -84,6 +84,7 @@ def test_every_cell_is_a_run_folder_with_the_numbers_of_its_own_files(made: Comp
         totals = [1e3 * float(row["total"]) for row in rows]
         assert len(totals) == SCANS
         assert run.values["time.total"] == pytest.approx(np.median(totals))
+        assert run.values["time.mean"] == pytest.approx(np.mean(totals), rel=1e-3)
         assert run.values["factor"] == pytest.approx(100.0 * SCANS / sum(totals), rel=1e-6)
         assert sum(run.stages.values()) * 1e3 == pytest.approx(np.mean(totals), rel=1e-3)
         assert run.values["bridged"] == run.values["skipped"] == 0
