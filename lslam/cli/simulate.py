@@ -12,6 +12,7 @@ import click
 from lslam.cli import console, options
 
 if TYPE_CHECKING:
+    from lslam.simulation.plan import ScenePlan
     from lslam.simulation.scenarios import SimulatedDrive
 
 
@@ -60,7 +61,10 @@ if TYPE_CHECKING:
     help="Set one key of the scenario, for example world.relief=1; repeatable.",
 )  # fmt: skip
 @click.option(
-    "--plan", type=click.Path(path_type=Path), metavar="FILE.png", help="Draw the scene from above with a metric grid."
+    "--plan",
+    type=click.Path(path_type=Path),
+    metavar="FILE.png",
+    help="Draw the scene from above with a metric grid, a scale and a legend.",
 )
 @click.option("--imu/--no-imu", default=True, show_default=True, help="Record an ICM-20948 at 100 Hz.")
 @click.option("--imu-model", metavar="NAME", default="icm20948", show_default=True, help="Another IMU; see --list.")
@@ -178,9 +182,9 @@ def _numbers(origin: str) -> list[float]:
 
 
 def _draw(drive: SimulatedDrive, plan: Path) -> None:
-    from lslam.simulation.plan import write_plan
+    from lslam.simulation.plan import plan_of
 
-    _say_plan(plan, *write_plan(plan, drive.scene, drive.city, drive.city_poses[:, :3, 3]))
+    _write_plan(plan, plan_of(drive.scene, drive.city, drive.city_poses[:, :3, 3]))
 
 
 def _draw_map(
@@ -190,17 +194,21 @@ def _draw_map(
     from lslam.simulation.built_scenario import whole_map
     from lslam.simulation.lidar import RayScene
     from lslam.simulation.osm_place import read_extract
-    from lslam.simulation.plan import write_plan
+    from lslam.simulation.plan import plan_of
     from lslam.simulation.scenario_files import scenario_named
     from lslam.simulation.scenarios import checked_origin
 
     extract = read_extract(osm, None if origin is None else checked_origin(origin))
     city, line = whole_map(scenario_named(scenario, settings), seed, extract)
-    _say_plan(plan, *write_plan(plan, RayScene(city.mesh), city, line))
+    _write_plan(plan, plan_of(RayScene(city.mesh), city, line))
 
 
-def _say_plan(plan: Path, width: float, depth: float) -> None:
-    click.echo(f"{plan}: {width:.0f} x {depth:.0f} m, a line every 10 m")
+def _write_plan(path: Path, plan: ScenePlan) -> None:
+    from lslam.reports.scene_plan import write_plan
+
+    write_plan(path, plan)
+    width, depth = plan.high - plan.low
+    click.echo(f"{path}: {width:.0f} x {depth:.0f} m, a line every 10 m")
 
 
 def _record(drive: SimulatedDrive, out: Path, overwrite: bool, resume: bool) -> None:

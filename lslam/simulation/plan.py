@@ -1,15 +1,12 @@
-"""The plan of a scene: a top view with a metric grid, from which way-points can be read, as a PNG."""
+"""The plan of a scene: a top view with a metric grid, from which way-points can be read."""
 
 from __future__ import annotations
 
-import struct
-import zlib
-from pathlib import Path
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.formats.atomic import atomic_write
 from lslam.simulation.city import City
 from lslam.simulation.lidar import RayScene
 from lslam.simulation.scene_mesh import Surface
@@ -20,6 +17,7 @@ LARGEST = 2000  # pixels on a side
 FINEST = 0.1  # m per pixel
 BORDER = 25.0  # m round buildings and path
 FINE, COARSE = 10, 50  # m between the lines of the grid
+PATH = (214, 30, 40)
 SKY = 1000.0  # m, whence the view is taken
 
 COLOURS = np.full((len(Surface), 3), 128, np.uint8)
@@ -41,42 +39,38 @@ for _surface, _colour in {
 }.items():
     COLOURS[_surface] = _colour
 
-# Digits and the minus sign, 3 x 5, rows from the top.
-_GLYPHS = {
-    "0": "757557", "1": "262227", "2": "717477", "3": "717177", "4": "557111", "5": "747177", "6": "747577",
-    "7": "711111", "8": "757577", "9": "757177", "-": "007000",
-}  # fmt: skip
 
+@dataclass(frozen=True)
+class ScenePlan:
+    """A top view.
 
-def write_plan(path: Path, scene: RayScene, city: City, line: NDArray[np.float64]) -> tuple[float, float]:
-    """Write the top view of `city` with the path `line` (M, 3), m, in the city frame, or none (0, 3); its size, m.
-
-    A line of the grid every 10 m, a labelled one every 50 m; x to the right, y up; the start is a square.
+    image : (H, W, 3) uint8, row 0 the north, with a line of the grid every 10 m, a darker one every 50 m, and the path
+    low, high : (2,) m, x and y of its corners in the city frame; pixel : m
+    surfaces : what is seen in it, in the order of `Surface`; has_path : whether there is one, whose start is a square
     """
+
+    image: Image
+    low: NDArray[np.float64]
+    high: NDArray[np.float64]
+    pixel: float
+    surfaces: tuple[Surface, ...]
+    has_path: bool
+
+    def marks(self, axis: int) -> list[tuple[int, int]]:
+        """Metres and pixels, from the west or the south, of the darker lines of the grid along an axis."""
+        lines = _lines(float(self.low[axis]), self.image.shape[1 - axis], self.pixel, COARSE)
+        return [(int(metre), int(at)) for metre, at in zip(*lines, strict=True)]
+
+
+def plan_of(scene: RayScene, city: City, line: NDArray[np.float64]) -> ScenePlan:
+    """The top view of `city` with the path `line` (M, 3), m, in the city frame, or none (0, 3)."""
     low, high = _extent(city, line)
     pixel = max(float((high - low).max()) / LARGEST, FINEST)
-    image = _view(scene, low, high, pixel)
+    image, surfaces = _view(scene, low, high, pixel)
     _draw_grid(image, low, pixel)
     if len(line):
         _draw_path(image, line[:, :2], low, pixel)
-    _draw_labels(image, low, pixel)
-    with atomic_write(path) as stream:
-        stream.write(png(image))
-    return float(high[0] - low[0]), float(high[1] - low[1])
-
-
-def png(image: Image) -> bytes:
-    """An RGB image (H, W, 3) as PNG."""
-    height, width, _ = image.shape
-    raw = np.zeros((height, 1 + 3 * width), np.uint8)  # column 0: filter type none
-    raw[:, 1:] = image.reshape(height, -1)
-    chunks = [
-        (b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)),
-        (b"IDAT", zlib.compress(raw.tobytes(), 6)),
-        (b"IEND", b""),
-    ]
-    body = (struct.pack(">I", len(d)) + k + d + struct.pack(">I", zlib.crc32(k + d)) for k, d in chunks)
-    return b"\x89PNG\r\n\x1a\n" + b"".join(body)
+    return ScenePlan(image, low, high, pixel, surfaces, bool(len(line)))
 
 
 def _extent(city: City, line: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -84,11 +78,14 @@ def _extent(city: City, line: NDArray[np.float64]) -> tuple[NDArray[np.float64],
     return np.floor(places.min(axis=0) - BORDER), np.ceil(places.max(axis=0) + BORDER)
 
 
-def _view(scene: RayScene, low: NDArray[np.float64], high: NDArray[np.float64], pixel: float) -> Image:
-    """What rays from far above meet, lit from the north-west; row 0 is the north."""
+def _view(
+    scene: RayScene, low: NDArray[np.float64], high: NDArray[np.float64], pixel: float
+) -> tuple[Image, tuple[Surface, ...]]:
+    """What rays from far above meet, lit from the north-west; row 0 is the north; with the surfaces that they met."""
     width, height = (int(n) for n in np.ceil((high - low) / pixel))
     image = np.full((height, width, 3), 255, np.uint8)
     x = (low[0] + (np.arange(width) + 0.5) * pixel).astype(np.float32)
+    seen: set[int] = set()
     light = np.array([-0.4, 0.5, 0.77], np.float32)
     for row in range(height):
         y = np.float32(low[1] + (height - row - 0.5) * pixel)
@@ -98,8 +95,10 @@ def _view(scene: RayScene, low: NDArray[np.float64], high: NDArray[np.float64], 
         normals = scene.mesh.normals[face[met]]
         upward = normals * np.sign(normals[:, 2:3] + np.float32(1e-9))
         shade = 0.55 + 0.45 * np.clip(upward @ light, 0, 1) / light[2]
-        image[row, met] = np.clip(COLOURS[scene.mesh.surfaces[face[met]]] * shade[:, None], 0, 255)
-    return image
+        surfaces = scene.mesh.surfaces[face[met]]
+        seen.update(np.unique(surfaces).tolist())
+        image[row, met] = np.clip(COLOURS[surfaces] * shade[:, None], 0, 255)
+    return image, tuple(map(Surface, sorted(seen)))
 
 
 def _lines(low: float, count: int, pixel: float, every: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -130,23 +129,4 @@ def _draw_path(image: Image, line: NDArray[np.float64], low: NDArray[np.float64]
     wide = (at[:, None] + np.array([[0, 0], [1, 0], [0, 1], [-1, 0], [0, -1]])).reshape(-1, 2)
     for cells in (wide, start):
         inside = cells[((cells >= 0) & (cells < [width, height])).all(axis=1)]
-        image[height - 1 - inside[:, 1], inside[:, 0]] = (214, 30, 40)
-
-
-def _draw_labels(image: Image, low: NDArray[np.float64], pixel: float) -> None:
-    """Metres at the lower end of every coarse column and the left end of every coarse row."""
-    height, width, _ = image.shape
-    for metres, column in zip(*_lines(float(low[0]), width, pixel, COARSE), strict=True):
-        _stamp(image, str(metres), height - 18, int(column) + 4)
-    for metres, row in zip(*_lines(float(low[1]), height, pixel, COARSE), strict=True):
-        _stamp(image, str(metres), height - 1 - int(row) - 18, 4)
-
-
-def _stamp(image: Image, text: str, top: int, left: int, scale: int = 2) -> None:
-    """White figures on black, cut off at the border."""
-    glyphs = [[[int(row) >> bit & 1 for bit in (2, 1, 0)] for row in _GLYPHS[c]] for c in text]
-    tile = np.concatenate([np.pad(np.array(g), ((1, 1), (1, 0))) for g in glyphs], axis=1)
-    tile = np.pad(tile, ((0, 0), (0, 1))).repeat(scale, axis=0).repeat(scale, axis=1)
-    top, left = max(top, 0), max(left, 0)
-    part = image[top : top + tile.shape[0], left : left + tile.shape[1]]
-    part[:] = np.where(tile[: part.shape[0], : part.shape[1], None] > 0, 255, 20)
+        image[height - 1 - inside[:, 1], inside[:, 0]] = PATH
