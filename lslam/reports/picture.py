@@ -109,15 +109,13 @@ def _draw(evaluations: Sequence[Evaluation], names: Sequence[str]) -> Any:
     for e, name, error, colour in zip(evaluations, names, shown, _colours(len(names)), strict=True):
         position.plot(e.distance, np.linalg.norm(error.errors, axis=1), color=colour, lw=1.1, label=name)
         rotation.plot(e.distance, error.rotation_errors_deg, color=colour, lw=1.1)
-        by_length = e.scores["kitti_drift"].by_length
-        drift.plot(sorted(by_length), [by_length[n][0] for n in sorted(by_length)], "o-", ms=3, color=colour)
     rmse = ", ".join(f"{error.translation.rmse:.3f} m" for error in shown if error.translation)
     position.set_title(f"position error, alignment {shown[0].alignment}: rmse {rmse}", fontsize=9)
     rotation.set_title("rotation error, same alignment", fontsize=9)
     label(position, "", "m")
     label(rotation, "distance along ground truth, m", "deg")
     _axis_errors(axes, evaluations[0], names[0])
-    _drift_axes(drift, evaluations)
+    _drift_axes(drift, evaluations, names)
     return figure
 
 
@@ -147,15 +145,25 @@ def _axis_errors(plot: Any, evaluation: Evaluation, name: str) -> None:
     label(plot, "distance along ground truth, m", "m")
 
 
-def _drift_axes(plot: Any, evaluations: Sequence[Evaluation]) -> None:
+def _drift_axes(plot: Any, evaluations: Sequence[Evaluation], names: Sequence[str]) -> None:
+    """A line per estimate over segment length; words where none has two lengths, and there would be dots alone."""
     drifts = [e.scores["kitti_drift"] for e in evaluations]
-    if any(drift.available for drift in drifts):
+    if any(len(drift.by_length) > 1 for drift in drifts):
+        for drift, colour in zip(drifts, _colours(len(names)), strict=True):
+            lengths = sorted(drift.by_length)
+            plot.plot(lengths, [drift.by_length[n][0] for n in lengths], "o-", ms=3, color=colour)
         plot.set_title("KITTI drift over segment length", fontsize=9)
         plot.set_ylim(bottom=0)
         label(plot, "segment, m", "%")
         return
+    said = [
+        " ".join(f"{percent:.3g} % over segments of {length} m" for length, (percent, _, _) in drift.by_length.items())
+        or drift.note
+        for drift in drifts
+    ]
+    lines = said[:1] if len(set(said)) == 1 else [f"{name}: {words}" for name, words in zip(names, said, strict=True)]
     plot.set_axis_off()
-    plot.text(0.5, 0.5, f"KITTI drift: {drifts[0].note}", ha="center", va="center")
+    plot.text(0.5, 0.5, "\n".join(["KITTI drift", *lines]), ha="center", va="center")
 
 
 def _best_alignment(evaluation: Evaluation) -> AbsoluteError:

@@ -146,6 +146,17 @@ def test_the_same_picture_twice(result: Evaluation, tmp_path: Path) -> None:
     assert (tmp_path / "a.svg").read_bytes() == (tmp_path / "b.svg").read_bytes()
 
 
+def test_drift_over_one_length_is_said_and_not_drawn(result: Evaluation, tmp_path: Path) -> None:
+    longer = evaluate(circle(radius=50.0, noise=0.01), circle(radius=50.0))
+    for name, e in (("one.svg", result), ("three.svg", longer)):
+        picture.write_plot(tmp_path / name, [e])
+    one, three = ((tmp_path / name).read_text() for name in ("one.svg", "three.svg"))
+    assert list(result.scores["kitti_drift"].by_length) == [100]
+    assert f"{result.scores['kitti_drift'].by_length[100][0]:.3g} % over segments of 100 m" in one
+    assert ">segment, m</text>" not in one
+    assert ">segment, m</text>" in three
+
+
 def test_pictures_that_cannot_be(result: Evaluation, tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="png, svg, pdf"):
         picture.write_plot(tmp_path / "plot.bmp", [result])
