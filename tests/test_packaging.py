@@ -7,6 +7,7 @@ import importlib
 import json
 import re
 import resource
+import shlex
 import shutil
 import subprocess
 import sys
@@ -166,12 +167,39 @@ def test_all_is_every_extra_for_users() -> None:
     assert everything.extras == set(PROJECT["optional-dependencies"]) - {"all", "test", "peers", "docs", "browser"}
 
 
-def test_the_install_command_names_what_is_installed() -> None:
-    source = json.loads(distribution("lslam").read_text("direct_url.json") or "{}").get("url", "")
-    said = install_command("geo")
-    assert said.endswith("[geo]'" if "[" in said and "'" in said else "[geo]")
-    # From a folder, as here and in CI, it is that folder: the index has no lslam that could be meant.
-    assert source.startswith("file:") == ("lslam[geo]" not in said)
+@pytest.mark.parametrize(
+    ("source", "said"),
+    [
+        ({"url": ROOT.as_uri(), "dir_info": {"editable": True}}, f"{ROOT}[geo]"),
+        ({"url": "file:///no/such/folder", "dir_info": {}}, "lslam[geo]"),  # a container into which the build was copied
+        ({"url": "https://a.b/lslam.whl", "archive_info": {}}, "lslam[geo] @ https://a.b/lslam.whl"),
+        ({"url": "https://a.b/l.git", "vcs_info": {"vcs": "git", "commit_id": "7f5c"}}, "lslam[geo] @ git+https://a.b/l.git@7f5c"),
+        ({}, "lslam[geo]"),  # from an index
+    ],
+)  # fmt: skip
+def test_the_install_command_names_what_is_installed(
+    source: dict[str, object], said: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """As PEP 610 records where a package came from; sources on the path have no such record."""
+    monkeypatch.setattr("lslam.extras._SOURCES", tmp_path)
+
+    class Installed:
+        def read_text(self, name: str) -> str | None:
+            assert name == "direct_url.json"
+            return json.dumps(source) if source else None
+
+    monkeypatch.setattr("lslam.extras.distribution", lambda name: Installed())
+    pip, install, requirement = shlex.split(install_command("geo"))
+    assert (pip, install, requirement) == ("pip", "install", said)
+    # As pip reads it.
+    assert Requirement(requirement).extras == {"geo"} if requirement.startswith("lslam") else Path(said[:-5]).is_dir()
+    (tmp_path / "pyproject.toml").touch()
+    assert source or install_command("geo") == f"pip install '{tmp_path}[geo]'"
+
+
+def test_no_text_names_an_extra_but_by_the_install_command() -> None:
+    """Where lslam came from a folder, `pip install lslam[geo]` asks an index for another."""
+    assert not [path for path in (ROOT / "lslam").rglob("*.py") if re.search(r"lslam\[[a-z]", path.read_text())]
 
 
 def test_data_files_of_the_package_are_packed() -> None:

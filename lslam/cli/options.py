@@ -215,7 +215,7 @@ def engine(function: F) -> F:
             "--scheduler",
             str,
             "tcp://HOST:PORT",
-            "Make the runs on the Dask cluster of this scheduler (lslam[cluster]).",
+            "Make the runs on the Dask cluster of this scheduler; needs the extra `cluster`.",
         ),
         ("--jobs", int, "N", "Runs at once on this machine [default: one per core]."),
     ):

@@ -8,7 +8,13 @@ import click
 
 from lslam.cli import options
 from lslam.cli.console import setup_logging, show
+from lslam.extras import install_command
 
+HELP = f"""Write trajectory, odometry before the pose graph, and map of a run as a recording for the rerun viewer.
+
+\b
+It needs rerun: {install_command("view")}
+"""
 EPILOG = """\b
 Examples:
   lslam view runs/first
@@ -16,16 +22,13 @@ Examples:
 """
 
 
-@click.command(epilog=EPILOG)
+@click.command(help=HELP, epilog=EPILOG)
 @click.argument("run", metavar="RUN", type=click.Path(path_type=Path))
 @click.option("--out", type=click.Path(path_type=Path), metavar="FILE", help="Recording  [RUN/run.rrd].")
 @click.option("--overwrite", is_flag=True, help="Replace a recording that is there.")
 @options.verbosity
 def command(run: Path, out: Path | None, overwrite: bool, verbose: bool, quiet: bool) -> None:
-    """Write trajectory, odometry before the pose graph, and map of a run as a recording for the rerun viewer.
-
-    It needs rerun: pip install 'lslam[view]'.
-    """
+    """Write the recording; what users read is HELP."""
     setup_logging(verbose, quiet)
     from lslam.errors import OutputError, OutputExistsError
     from lslam.pipeline.run_folder import require_run
