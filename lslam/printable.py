@@ -78,6 +78,17 @@ def significant(value: float | None) -> str:
     return f"{value:.4g}" if abs(value) < 1000 else f"{value:.1f}"
 
 
+def lasting(seconds: float) -> str:
+    """A time as people say it.
+
+    >>> lasting(5400), lasting(200), lasting(8.2)
+    ('1.5 h', '3.3 min', '8 s')
+    """
+    if seconds >= 3600:
+        return f"{seconds / 3600:.1f} h"
+    return f"{seconds / 60:.1f} min" if seconds >= 90 else f"{seconds:.0f} s"
+
+
 def counted(number: int, noun: str) -> str:
     """A number with its noun, in the plural unless it is one."""
     return f"{number} {noun}" if number == 1 else f"{number} {noun}s"

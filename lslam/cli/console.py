@@ -14,6 +14,8 @@ from typing import TYPE_CHECKING, Protocol
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from lslam.cli.time_left import TimeLeft
+
 log = logging.getLogger("lslam")
 
 
@@ -68,14 +70,17 @@ class Advance(Protocol):
 
 
 @contextmanager
-def progress(title: str, total: int, unit: str = "scans") -> Iterator[Advance]:
-    """A progress bar with rate and ETA on a terminal; elsewhere a plain line at most every 10 s and one at the end."""
+def progress(title: str, total: int, unit: str = "scans", left: TimeLeft | None = None) -> Iterator[Advance]:
+    """A progress bar with rate and time left on a terminal; elsewhere a plain line at most every 10 s and one at the end.
+
+    left : tells the time of steps that are long or several at once, where rates of the last seconds say nothing
+    """
     # The first handler is that of stderr; that of log.txt follows.
     if log.handlers and log.handlers[0].level > logging.INFO:
         yield lambda note="": None
         return
     if sys.stderr.isatty():
-        with _bar(title, total, unit) as advance:
+        with _bar(title, total, unit, left) as advance:
             yield advance
         return
     began = last = time.monotonic()
@@ -84,13 +89,18 @@ def progress(title: str, total: int, unit: str = "scans") -> Iterator[Advance]:
     def plain(note: str = "") -> None:
         nonlocal done, last
         done += 1
+        if left is not None:
+            left.step()
         now = time.monotonic()
         if now - last < 10 and done < total:
             return
         last = now
         rate = done / max(now - began, 1e-9)
-        left = f"{(total - done) / rate:.0f} s left" if done < total else f"{now - began:.1f} s"
-        log.info("%s %d/%d, %s, %s%s", title, done, total, _pace(rate, unit), left, note and f", {note}")
+        end = f"{now - began:.1f} s"
+        if done < total:
+            end = f"{(total - done) / rate:.0f} s left" if left is None else left.text
+        pace = _pace(rate, unit) if left is None else left.pace
+        log.info("%s %d/%d, %s, %s%s", title, done, total, pace, end, note and f", {note}")
 
     yield plain
 
@@ -100,12 +110,37 @@ def _pace(rate: float, unit: str) -> str:
 
 
 @contextmanager
-def _bar(title: str, total: int, unit: str) -> Iterator[Advance]:
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+def _bar(title: str, total: int, unit: str, left: TimeLeft | None) -> Iterator[Advance]:
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        ProgressColumn,
+        Task,
+        TextColumn,
+        TimeRemainingColumn,
+    )
+    from rich.table import Column
+    from rich.text import Text
 
+    class LeftColumn(ProgressColumn):
+        """Counts down between steps."""
+
+        def render(self, task: Task) -> Text:
+            """What is left now."""
+            return Text(left.text if left is not None else "", style="progress.remaining")
+
+    class PaceColumn(ProgressColumn):
+        """Is cut where the terminal is narrow."""
+
+        def render(self, task: Task) -> Text:
+            """The pace and what was done last."""
+            return Text(task.fields["rate"], no_wrap=True, overflow="ellipsis")
+
+    whole = Column(no_wrap=True)
     columns = (
-        TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(),
-        TextColumn("{task.fields[rate]}"), TimeRemainingColumn(),
+        TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(table_column=whole),
+        TimeRemainingColumn(table_column=whole) if left is None else LeftColumn(table_column=whole), PaceColumn(),
     )  # fmt: skip
     with Progress(*columns, console=terminal(), transient=True) as bar:
         task = bar.add_task(title, total=total, rate="")
@@ -115,7 +150,9 @@ def _bar(title: str, total: int, unit: str) -> Iterator[Advance]:
         def advance(note: str = "") -> None:
             nonlocal done
             done += 1
-            rate = done / max(time.monotonic() - began, 1e-9)
-            bar.update(task, advance=1, rate=f"{_pace(rate, unit)} {note}")
+            if left is not None:
+                left.step()
+            pace = left.pace if left is not None else _pace(done / max(time.monotonic() - began, 1e-9), unit)
+            bar.update(task, advance=1, rate=f"{pace} {note}")
 
         yield advance

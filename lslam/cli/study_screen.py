@@ -8,6 +8,7 @@ from contextlib import ExitStack, contextmanager
 from typing import TYPE_CHECKING, Any
 
 from lslam.cli.console import log, progress, terminal
+from lslam.cli.time_left import TimeLeft
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -23,9 +24,10 @@ def bars(stack: ExitStack) -> StudyProgress:
     bar = stack.enter_context(ExitStack())
     advance: list[Any] = []
 
-    def on_start(stage: str, total: int, unit: str) -> None:
+    def on_start(stage: str, total: int, unit: str, at_once: int) -> None:
         bar.close()
-        advance[:] = [bar.enter_context(progress(stage, total, unit))]
+        left = None if unit == "scans" else TimeLeft(total, at_once)
+        advance[:] = [bar.enter_context(progress(stage, total, unit, left))]
 
     return StudyProgress(on_start, lambda note: advance[0](note))
 

@@ -132,7 +132,7 @@ class Cluster:
         """
         if not jobs:
             return
-        progress.on_start(self.title, len(jobs), "runs")
+        progress.on_start(self.title, len(jobs), "runs", self.at_once)
         left = list(jobs)
         while left := self._attempt(left, progress, on_done):
             log.warning(

@@ -194,7 +194,7 @@ def _cells(plan: Plan, progress: StudyProgress) -> list[Cell]:
         for seed in plan.seeds:
             path = simulate_once(
                 scenes[subject.label], seed, plan.out / SIMULATED,
-                lambda stage, total: progress.on_start(stage, total, "scans"), lambda: progress.on_step(""),
+                lambda stage, total: progress.on_start(stage, total, "scans", 1), lambda: progress.on_step(""),
             )  # fmt: skip
             cells.append(recorded_cell(subject.label, path, seed, needs_imu=needs_imu, own=subject.range))
     return cells

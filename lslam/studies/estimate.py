@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.errors import RunFailedError
+from lslam.printable import lasting
 from lslam.readers import open_sequence
 from lslam.studies.grid import Job
 from lslam.studies.jobs import Local
@@ -41,13 +42,8 @@ class Guess:
 
     @property
     def text(self) -> str:
-        """For people.
-
-        >>> Guess(5400, 1).text, Guess(200, 1).text, Guess(8.2, 1).text
-        ('1.5 h', '3.3 min', '8 s')
-        """
-        s = self.seconds
-        return f"{s / 3600:.1f} h" if s >= 3600 else f"{s / 60:.1f} min" if s >= 90 else f"{s:.0f} s"
+        """For people."""
+        return lasting(self.seconds)
 
 
 @dataclass(frozen=True)
@@ -187,7 +183,7 @@ def _places(jobs: Sequence[Job], folder: Path, progress: StudyProgress) -> dict[
         part = replace(job.scene, scans=min(whole, start + _SIMULATED))
         began = time.monotonic()
         path = simulate_once(
-            part, job.seed, folder, lambda stage, total: progress.on_start(stage, total, "scans"),
+            part, job.seed, folder, lambda stage, total: progress.on_start(stage, total, "scans", 1),
             lambda: progress.on_step(""),
         )  # fmt: skip
         assert part.scans is not None

@@ -80,7 +80,7 @@ def run_jobs(
         on_done(jobs[index])
         progress.on_step(jobs[index].name)
 
-    progress.on_start(title, len(jobs), "runs")
+    progress.on_start(title, len(jobs), "runs", pool.at_once)
     run_tasks(tasks, pool, lambda index: log.debug("%s begins", jobs[index].name), on_end)
 
 
@@ -171,10 +171,11 @@ def simulate_scenes(jobs: Sequence[Job], most_at_once: int, progress: StudyProgr
         said = path.parents[1].with_name(f"{path.parents[1].name}.out")
         parent = path.parents[2]
         tasks.append(Task(f"{job.scene.name} {job.seed}", partial(simulate_once, job.scene, job.seed, parent), said))
-    progress.on_start("simulating", len(tasks), "scenarios")
+    pool = pool_of(most_at_once, len(tasks))
+    progress.on_start("simulating", len(tasks), "scenarios", pool.at_once)
 
     def on_end(index: int, cause: str) -> None:
         log.debug("%s: %s", tasks[index].name, cause or "simulated")
         progress.on_step(tasks[index].name)
 
-    run_tasks(tasks, pool_of(most_at_once, len(tasks)), lambda index: None, on_end)
+    run_tasks(tasks, pool, lambda index: None, on_end)

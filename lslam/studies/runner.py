@@ -23,9 +23,9 @@ _PATIENCE_S = 20.0
 
 @dataclass(frozen=True)
 class StudyProgress:
-    """How a caller follows a study: on_start(stage, number of steps, unit), then on_step(note) per step."""
+    """How a caller follows a study: on_start(stage, steps, unit, how many are made at once), then on_step(note) per step."""
 
-    on_start: Callable[[str, int, str], None] = lambda stage, total, unit: None
+    on_start: Callable[[str, int, str, int], None] = lambda stage, total, unit, at_once: None
     on_step: Callable[[str], None] = lambda note: None
 
 

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import heapq
 import io
+import logging
+import random
 import sys
+from contextlib import ExitStack
 
 import pytest
 from rich.console import Console
 
 from lslam.cli import study_screen
-from lslam.cli.study_screen import BestTable, best_so_far
+from lslam.cli.study_screen import BestTable, bars, best_so_far
+from lslam.cli.time_left import TimeLeft
 from lslam.types.study import StudyRow
 
 ROWS = [
@@ -51,3 +56,54 @@ def test_it_is_live_on_a_terminal_and_nothing_elsewhere(monkeypatch: pytest.Monk
         with best_so_far() as table:
             table(ROWS)
         assert ("voxel 0.5" in stream.getvalue()) is shown
+
+
+def ends(durations: list[float], at_once: int) -> list[float]:
+    """When runs end of which so many are made at once, each begun when another ends."""
+    free, out = [0.0] * at_once, []
+    for duration in durations:
+        out.append(heapq.heappop(free) + duration)
+        heapq.heappush(free, out[-1])
+    return sorted(out)
+
+
+@pytest.mark.parametrize(("total", "at_once"), [(1, 1), (5, 1), (7, 2), (8, 3), (3, 8)])
+def test_the_time_left_of_runs_that_take_as_long_is_exact(total: int, at_once: int) -> None:
+    now = [0.0]
+    left = TimeLeft(total, at_once, lambda: now[0])
+    assert left.text == ""
+    made = ends([60.0] * total, at_once)
+    for end in made:
+        now[0] = end
+        left.step()
+        if made.count(end) == 1:  # else others of this instant are not told yet
+            assert left.seconds == pytest.approx(made[-1] - end)
+    assert (left.mean, left.seconds) == (60.0, 0.0)
+
+
+def test_the_time_left_of_unlike_runs_is_never_far_off() -> None:
+    """Runs of 40 to 80 s, three at once: after a third of them the estimate is within a run of the truth, and counts down."""
+    now, rng = [0.0], random.Random(1)
+    made = ends([rng.uniform(40, 80) for _ in range(60)], 3)
+    left = TimeLeft(60, 3, lambda: now[0])
+    for k, end in enumerate(made):
+        now[0] = end
+        left.step()
+        if k >= 20:
+            assert left.seconds == pytest.approx(made[-1] - end, abs=80)
+    assert left.mean == pytest.approx(60, abs=5)
+
+
+def test_a_plain_line_says_how_long_is_left(caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [0.0]
+    monkeypatch.setattr("time.monotonic", lambda: now[0])
+    monkeypatch.setattr(TimeLeft.__init__, "__defaults__", (1, lambda: now[0]))
+    monkeypatch.setattr(study_screen.log, "propagate", True)
+    monkeypatch.setattr(study_screen.log, "handlers", [])
+    with caplog.at_level(logging.INFO, "lslam"), ExitStack() as stack:
+        progress = bars(stack)
+        progress.on_start("studying", 6, "runs", 2)
+        for now[0] in (60.0, 62.0, 120.0, 124.0, 180.0, 186.0):
+            progress.on_step("icp")
+    assert caplog.messages[0] == "studying 1/6, 60.0 s each, 2 at once, about 2.0 min left, icp"
+    assert caplog.messages[-1] == "studying 6/6, 61.0 s each, 2 at once, 186.0 s, icp"
