@@ -16,7 +16,6 @@ from lslam.errors import InputError, cause
 from lslam.formats.atomic import write_text
 from lslam.types.building import BuildingMatch, KeyframeMatch, OsmMatches
 from lslam.types.constraint import LoopCandidate
-from lslam.types.keyframe import Keyframe
 
 LOOP_COLUMNS = (
     "keyframe_a", "keyframe_b", "scan_a", "scan_b", "distance_m", "descriptor_distance", "verdict", "stage", "rmse_m",
@@ -64,32 +63,31 @@ def _number(value: float) -> str:
     return f"{value:.4f}" if np.isfinite(value) else ""
 
 
-def write_osm_matches(
-    path: Path, matches: OsmMatches, keyframes: Sequence[Keyframe], poses: NDArray[np.float64]
-) -> None:
+def write_osm_matches(path: Path, matches: OsmMatches, scans: Sequence[int], poses: NDArray[np.float64]) -> None:
     """One row per keyframe, `building` empty, then one per building seen from one, with its OpenStreetMap number.
 
-    poses : (K, 3) final planar poses of the keyframes in the map frame. Raises OutputError when it cannot be written.
+    scans : of the keyframes, as the recording numbers them; poses : (K, 3) their final planar poses in the map frame.
+    Raises OutputError when it cannot be written.
     """
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
     table.writerow(MATCH_COLUMNS)
     for match in matches.keyframes:
-        table.writerow(_row(match, keyframes, "", match.pose))
+        table.writerow(_row(match, scans, "", match.pose))
     for one in matches.local:
         building = matches.buildings[one.building]
         moved = one.displacement(poses[one.keyframe], building.middle)
-        table.writerow(_row(one, keyframes, building.osm_id, moved))
+        table.writerow(_row(one, scans, building.osm_id, moved))
     write_text(path, text.getvalue())
 
 
 def _row(
-    match: KeyframeMatch | BuildingMatch, keyframes: Sequence[Keyframe], building: str, pose: NDArray[np.float64]
+    match: KeyframeMatch | BuildingMatch, scans: Sequence[int], building: str, pose: NDArray[np.float64]
 ) -> tuple[Any, ...]:
     x, y, yaw = (pose[0], pose[1], np.degrees(pose[2])) if match.rank else (np.nan, np.nan, np.nan)
     numbers = (match.fitness, match.coverage, match.rms, x, y, yaw)
     return (
-        match.keyframe, keyframes[match.keyframe].scan, building, match.verdict, match.kind, match.rank, len(match.pairs),
+        match.keyframe, scans[match.keyframe], building, match.verdict, match.kind, match.rank, len(match.pairs),
         *(f"{value:.4f}" if np.isfinite(value) else "" for value in numbers), match.reason,
     )  # fmt: skip
 

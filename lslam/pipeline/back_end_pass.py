@@ -170,10 +170,10 @@ def write_back_end(folder: Path, record: RunRecord, store: KeyframeStore, done: 
         comment=f"lslam {__version__}, {record.method}: T_world_lidar of odometry, in a world of its own\n"
         f"pose_time: {record.pose_time}",
     )  # fmt: skip
+    numbers = [record.results[k.scan].index for k in store.keyframes]
     if done.osm is not None:
-        write_osm_matches(folder / "osm_matches.csv", done.osm, store.keyframes, se2.of_se3(done.keyframes))
+        write_osm_matches(folder / "osm_matches.csv", done.osm, numbers, se2.of_se3(done.keyframes))
     if not record.map_fixes:
-        numbers = [record.results[k.scan].index for k in store.keyframes]
         write_loops(folder / "loops.csv", done.candidates, numbers)
     if done.control:
         write_control(folder / "control.csv", done.control)
