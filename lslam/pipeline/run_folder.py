@@ -36,7 +36,7 @@ OURS = (
     "map.pcd", "map.las", "map.laz", "map.json", "map_mesh.ply", "feature_map.ply", "trajectory.geojson",
     "occupancy.npz", "occupancy.ply", "floor_plan.png", "floor_plan.yaml", "evaluation.json",
     "trajectory_odometry.tum", "loops.csv", "control.csv", "graph.g2o", "osm_matches.csv", "buildings.geojson", "buildings.osm",
-    "timing.csv", "scans.csv", "localization.csv", "sessions.csv", "report.html",
+    "timing.csv", "scans.csv", "imu_states.csv", "localization.csv", "sessions.csv", "report.html",
 )  # fmt: skip
 
 
