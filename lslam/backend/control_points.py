@@ -19,6 +19,7 @@ from lslam.graph.chi_square import quantile
 from lslam.graph.consistency import Drift
 from lslam.graph.problem import PositionFix
 from lslam.maps.georeference import Projection, to_wgs84
+from lslam.printable import counted
 from lslam.types.gnss import Georeference
 from lslam.types.keyframe import Keyframe
 from lslam.types.manual import ControlPoint, ControlResidual
@@ -55,13 +56,15 @@ def with_control(
         if T is None:
             return replace(
                 placement,
-                problem=f"control points: {len(points)} of them lie too near to each other to say which way the run goes",
+                problem=f"control points: from {counted(len(points), 'place')} nobody can say which way the run goes; it "
+                "takes two that lie apart",
             )
         T_enu_world = T @ se3.make(level, np.zeros(3))
         known = Georeference(on_earth[0], T_enu_world, _epsg(points, on_earth[0], config), "control")
         tilt = UNLEVELLED if up is None else LEVELLED
     else:
         enu, tilt = geodesy.to_local(on_earth, known.origin), placement.tilt_sigma
+        known = replace(known, epsg=known.epsg or _epsg(points, known.origin, config))
     held = [
         _held(position, sigma, place, int(stamp), results, keyframes)
         for position, sigma, place, stamp in zip(enu, sigmas, seen, stamps, strict=True)

@@ -31,7 +31,7 @@ def where_held(
 ) -> list[Keyframe]:  # fmt: skip
     """The keyframes where odometry, known pairs and control points put them: further loop closures are searched from there."""
     loops = [c.constraint for c in known if c.is_accepted and c.constraint is not None]
-    if not loops and not points:
+    if len(keyframes) < 2 or not (loops or points):
         return keyframes
     graph, R = _graph_of(keyframes, loops, results, config), np.eye(3)
     if points:

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.backend.georeferencing import require_crs
 from lslam.config import Config
 from lslam.errors import InputError
 from lslam.formats.manual_files import read_control_points, read_named_pairs
@@ -21,6 +22,8 @@ from lslam.types.scan_result import ScanResult
 from lslam.types.sequence import Sequence
 
 Floats = NDArray[np.float64]
+# Beyond the first and the last scan a control point's stamp is that of a pose only as far as seconds are rounded.
+ROUNDING_NS = 5_000_000
 
 
 @dataclass(frozen=True)
@@ -40,9 +43,10 @@ def read_manual(config: Config, sequence: Sequence) -> Manual:
     pairs = read_named_pairs(Path(config.loops.file)) if config.loops.file else []
     points = read_control_points(Path(config.graph.control)) if config.graph.control else []
     numbers = sequence.indices if isinstance(sequence, Selection) else np.arange(len(sequence))
-    slack = int(1e9 / sequence.rate_hz) if sequence.rate_hz > 0 else 0
-    span = int(sequence.stamps_ns[0]) - slack, int(sequence.stamps_ns[-1]) + slack
-    for instant in (*(end for pair in pairs for end in (pair.first, pair.second)), *(point.at for point in points)):
+    period = int(1e9 / sequence.rate_hz) if sequence.rate_hz > 0 else 0
+    ends = [(end, period) for pair in pairs for end in (pair.first, pair.second)]
+    for instant, slack in (*ends, *((point.at, ROUNDING_NS) for point in points)):
+        span = int(sequence.stamps_ns[0]) - slack, int(sequence.stamps_ns[-1]) + slack
         if instant.scan is not None and instant.scan not in numbers:
             raise InputError(
                 f"{instant.said}: scan {instant.scan} is none of the run's, which are {numbers[0]} to {numbers[-1]}"
@@ -53,7 +57,7 @@ def read_manual(config: Config, sequence: Sequence) -> Manual:
                 f"{1e-9 * span[0]:.3f} to {1e-9 * span[1]:.3f} s"
             )
     for point in points:
-        to_wgs84(point.position[None], point.epsg)
+        require_crs(to_wgs84(point.position[None], point.epsg)[0], config.gnss)
     return Manual(tuple(pairs), tuple(points))
 
 
@@ -75,12 +79,20 @@ def keyframe_pairs(pairs: Many[NamedPair], results: Many[ScanResult], keyframes:
             stamp = stamp_of(instant, results)
             ends.append((int(np.abs(stamps - stamp).argmin()), stamp))
         (a, _), (b, _) = ends
+        taken = {(known.a, known.b) for known in found.known}
         if a == b:
             found.problems.append(f"{pair.first.said}: both scans belong to one keyframe: there is no loop to close")
         elif pair.verdict == "forbidden":
             found.forbidden.append((min(a, b), max(a, b)))
+        elif (min(a, b), max(a, b)) in taken:
+            found.problems.append(f"{pair.first.said}: the pair is named twice, it counts once")
         else:
             found.known.append(_known(pair, ends, results, keyframes))
+    found.problems.extend(
+        f"{known.said}: the pair is known and forbidden: it holds, and nothing else is closed there"
+        for known in found.known
+        if (known.a, known.b) in found.forbidden
+    )
     return found
 
 

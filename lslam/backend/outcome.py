@@ -195,7 +195,9 @@ def _scored(georeference: Georeference, graph: PoseGraph, solution: Solution) ->
         if is_inlier and fix.is_held == is_control
     ]
     if not used:
-        return replace(georeference, used=0) if graph.fixes else georeference
+        if not graph.fixes:
+            return georeference
+        return replace(georeference, used=0, rmse_horizontal=float("nan"), rmse_vertical=float("nan"))
     off = np.stack([f.position - f.seen(solution.poses) for f in used])
     return replace(
         georeference,

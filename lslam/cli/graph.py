@@ -18,7 +18,7 @@ from lslam.errors import RunFinishedError, UsageError
 @click.command(
     epilog="\b\nExamples: lslam graph runs/first --loops edits.csv\n"
     "          lslam graph runs/first --control points.csv --out runs/surveyed\n"
-    "          lslam graph runs/first --loops edits.csv --only-known --set graph.robust=huber --json"
+    "          lslam graph runs/first --loops edits.csv --only-known --out runs/known --json"
 )
 @click.argument("run", metavar="RUN", type=click.Path(path_type=Path))
 @click.option(
@@ -61,22 +61,23 @@ def command(run: Path, **given: Any) -> None:
         raise UsageError("--overwrite does everything anew and --resume keeps finished parts: give one of them")
     options.require_there(given["loops_file"], given["control"], given["gt"])
     from lslam.cli.run import print_finished, print_result, read_truth, watch_of
-    from lslam.pipeline.regraph import open_again, optimise_again, read_for_graph
+    from lslam.pipeline.regraph import open_again, optimise_again, read_for_graph, reading_of, require_another
     from lslam.pipeline.run_folder import check_target
     from lslam.stopping import heeded
 
-    out = given["out"] or run.with_name(f"{run.absolute().name}-graph")
+    named = run if run.name not in ("", "..") else run.resolve()
+    out = given["out"] or named.with_name(f"{named.name}-graph")
+    require_another(run, out)
     if not given["resume"]:
         check_target(out, given["overwrite"])
-    if out.absolute() == run.absolute():
-        raise UsageError(f"--out {out}: the run itself stays as it is, name another folder")
     known = read_for_graph(run, _settings(given))
     opened = open_again(known, given["sequence"], **options.reading_of(given))
     truth = read_truth(given["gt"], opened)
+    reading = reading_of(known, given["sequence"], **options.reading_of(given))
     try:
         with heeded() as stop, ExitStack() as stack:
             optimise_again(
-                known, opened, out, ground_truth=truth, overwrite=given["overwrite"], resume=given["resume"],
+                known, opened, out, reading=reading, ground_truth=truth, overwrite=given["overwrite"], resume=given["resume"],
                 command=shlex.join(["lslam", *sys.argv[1:]]),
                 watch=watch_of(stack, stop, lambda outcome: print_result(outcome, out, given["as_json"])),
             )  # fmt: skip

@@ -40,6 +40,7 @@ def command(run: Path, **given: Any) -> None:
     setup_logging(given["verbose"], given["quiet"])
     out: Path = given["out"]
     options.require_there(given["gt"])
+    from lslam.cli.run import read_truth
     from lslam.pipeline.plot_run import plotted_run, width_of, write_figure
     from lslam.reports.figures import require_figure
     from lslam.reports.picture import check_plot_path
@@ -49,11 +50,9 @@ def command(run: Path, **given: Any) -> None:
     width = width_of(given["width"])
     if out.exists() and not given["overwrite"]:
         raise OutputExistsError(f"{out} exists; name another file with --out or replace it with --overwrite")
-    truth = None
-    if given["gt"] is not None:
-        from lslam.formats.trajectory_files import read_trajectory
-
-        truth = read_trajectory(given["gt"])
-    drawn = plotted_run(run, given["what"], given["sequence"], truth, **options.reading_of(given))
+    reading = options.reading_of(given)
+    drawn = plotted_run(
+        run, given["what"], given["sequence"], lambda opened: read_truth(given["gt"], opened), **reading
+    )
     write_figure(drawn, given["what"], out, width, given["font"])
     show(f"{out}\n")

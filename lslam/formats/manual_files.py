@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Iterable, Iterator
+import re
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, cast
@@ -144,15 +145,20 @@ def _seen(row: _Row) -> NDArray[np.float64]:
     return np.array([value or 0.0 for value in seen])
 
 
-def _rows(path: Path, needed: Iterable[tuple[str, ...]]) -> Iterator[_Row]:
+def _is_comment(line: str, names: set[str]) -> bool:
+    """Whether a line begins with # and is no header that does."""
+    text = line.strip()
+    return text.startswith("#") and not names & {word.strip().lower() for word in re.split("[;,]", text.lstrip("#"))}
+
+
+def _rows(path: Path, needed: Sequence[tuple[str, ...]]) -> Iterator[_Row]:
     """The lines below the header, which has one column of each of the `needed`."""
     try:
         lines = path.read_text(encoding="utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"{path} cannot be read: {cause(error)}") from None
-    numbered = [
-        (n, line) for n, line in enumerate(lines, 1) if line.strip() and (n == 1 or not line.lstrip().startswith("#"))
-    ]
+    names = {name for one in needed for name in one}
+    numbered = [(n, line) for n, line in enumerate(lines, 1) if line.strip() and not _is_comment(line, names)]
     if not numbered:
         raise InputError(f"{path} is empty")
     separator = ";" if ";" in numbered[0][1] else ","
@@ -166,6 +172,8 @@ def _rows(path: Path, needed: Iterable[tuple[str, ...]]) -> Iterator[_Row]:
         raise InputError(
             f"{path}, line {numbered[0][0]}: no column {' or '.join(missing[0])}; the file has {', '.join(header)}"
         )
+    if len(set(header)) < len(header):
+        raise InputError(f"{path}, line {numbered[0][0]}: a column stands there twice: {', '.join(header)}")
     for (number, _), cells in zip(numbered[1:], table[1:], strict=True):
         if len(cells) > len(header):
             raise InputError(f"{path}, line {number}: {len(cells)} columns where the header has {len(header)}")

@@ -6,7 +6,7 @@ import logging
 from pathlib import Path
 
 from lslam.config import Config
-from lslam.errors import GateError, InterruptedRunError, OutputError, RunFailedError, RunFinishedError
+from lslam.errors import GateError, InputError, InterruptedRunError, OutputError, RunFailedError, RunFinishedError
 from lslam.evaluation.evaluate import Evaluation
 from lslam.keyframes.store import KeyframeStore
 from lslam.osm.corrections import write_buildings
@@ -42,16 +42,19 @@ def perform(
     goes_on = resume and may_go_on(out, manifest.identity, job.config)
     with RunFolder(out, overwrite or resume, goes_on) as folder:
         try:
-            if odometry_of is not None and not goes_on:
+            if odometry_of is not None:
+                folder.write_text("config.toml", outputs.config_text(job.config))
                 folder.begin_from(odometry_of)
-            record, evaluation = _fill(folder, job, goes_on or odometry_of is not None)
+            record, evaluation = _fill(folder, job, goes_on or odometry_of is not None, odometry_of is not None)
         except BaseException as error:
             status = manifest.word_for(error)
             _write_last(folder, manifest.as_dict(status, str(error) or type(error).__name__))
             raise
-        folder.write_manifest(record.manifest)
         if manifest.outcome != "interrupted":
             folder.keep_odometry()
+        folder.write_manifest(record.manifest)
+        if manifest.outcome != "interrupted":
+            folder.drop_checkpoint()
         log.info("%s; results in %s", manifest.outcome, folder.path)
     return RunOutcome(record, evaluation)
 
@@ -72,13 +75,20 @@ def _perform_afar(job: PreparedRun, place: RemotePath, overwrite: bool, resume: 
     return outcome
 
 
-def _fill(folder: RunFolder, job: PreparedRun, goes_on: bool) -> tuple[RunRecord, Evaluation | None]:
-    """The whole result in a run folder, the last word of its manifest aside."""
+def _fill(
+    folder: RunFolder, job: PreparedRun, goes_on: bool, has_odometry: bool = False
+) -> tuple[RunRecord, Evaluation | None]:
+    """The whole result in a run folder, the last word of its manifest aside; `has_odometry` : that of another run serves.
+
+    Raises InputError when that cannot be read.
+    """
     folder.require_space(outputs.least_bytes(len(job.sequence)), "the result without its map")
     folder.write_text("config.toml", outputs.config_text(job.config))
     folder.write_manifest(job.manifest.as_dict("running"))
     store = KeyframeStore(folder.path / KEYFRAMES, deflate=job.config.keyframes.deflate)
     checkpoints = odometry_checkpoints(folder, job.odometry, job.config, goes_on)
+    if has_odometry and (checkpoints is None or not checkpoints.is_over):
+        raise InputError("the state of the run's odometry is damaged or incomplete: run the sequence again")
     record, done, evaluation = solve(job, store, folder.path, checkpoints)
     write_back_end(folder.path, record, store, done)
     if job.osm is not None and record.buildings is not None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -9,14 +10,16 @@ from lslam.errors import UsageError
 from lslam.evaluation.evaluate import evaluate
 from lslam.formats.atomic import atomic_write
 from lslam.formats.geojson import read_corrected
+from lslam.formats.trajectory_files import read_trajectory
 from lslam.odometry import create_odometry
 from lslam.odometry.base import FeatureSource
 from lslam.pipeline.feature_pass import view_features
 from lslam.pipeline.job import choose_scans
 from lslam.pipeline.rebuild import read_run, results_of, viewed_run
-from lslam.pipeline.regraph import open_again
+from lslam.pipeline.regraph import is_gone, open_again
 from lslam.reports.figures import WIDTHS, PlottedRun, draw_figure, require_figure
 from lslam.reports.picture import check_plot_path, house_style, picture
+from lslam.types.sequence import Sequence
 from lslam.types.trajectory import Trajectory
 
 # What is drawn without the recording.
@@ -24,22 +27,28 @@ OF_FOLDER = ("map", "buildings")
 
 
 def plotted_run(
-    folder: Path, what: str, sequence: Path | None = None, truth: Trajectory | None = None, **reading: Any
-) -> PlottedRun:
+    folder: Path, what: str, sequence: Path | None = None,
+    truth_of: Callable[[Sequence], Trajectory | None] = lambda sequence: None, **reading: Any,
+) -> PlottedRun:  # fmt: skip
     """As much of the run as the figure `what` shows.
 
-    sequence : where the raw scans have moved; truth : replaces the recording's; reading : as `open_sequence`
+    sequence : where the raw scans have moved; truth_of : gives what replaces the recording's truth, None for nothing
+    reading : as `open_sequence`
 
     Raises InputError naming what is missing, UsageError for an unknown figure.
     """
     require_figure(what)
-    view, run = viewed_run(folder), read_run(folder)
-    about: dict[str, Any] = {"cloud": view.cloud, "odometry": view.odometry, "georeference": run.georeference}
+    run = read_run(folder)
+    about: dict[str, Any] = {"georeference": run.georeference}
+    if what in OF_FOLDER:
+        about["cloud"] = viewed_run(folder).cloud
+    if what == "trajectory" and (folder / "trajectory_odometry.tum").is_file():
+        about["odometry"] = read_trajectory(folder / "trajectory_odometry.tum", "tum")
     if what == "buildings" and (folder / "buildings.geojson").is_file():
         about["buildings"] = read_corrected(folder / "buildings.geojson")
-    if what not in OF_FOLDER:
+    if what not in OF_FOLDER and not (what == "trajectory" and sequence is None and is_gone(run)):
         opened = open_again(run, sequence, **reading)
-        given = opened.ground_truth if truth is None else truth
+        given = truth_of(opened) or opened.ground_truth
         if given is not None and what in ("trajectory", "errors"):
             about["evaluation"] = evaluate(run.trajectory, given, run.config.eval, calibration=opened.calibration)
         if what == "imu":
@@ -49,7 +58,8 @@ def plotted_run(
             if isinstance(odometry, FeatureSource):
                 chosen = choose_scans(opened, odometry, run.config)
                 about["features"] = view_features(chosen, odometry, results_of(run))
-    return PlottedRun(view.name, run.trajectory, **about)
+    name = str(run.manifest.get("sequence", {}).get("name", folder.name))
+    return PlottedRun(f"{name} ({folder.name})", run.trajectory, **about)
 
 
 def write_figure(run: PlottedRun, what: str, path: Path, width: float, font: float) -> None:

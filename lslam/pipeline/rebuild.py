@@ -115,6 +115,8 @@ def read_run(folder: Path, settings: Iterable[str] = ()) -> EarlierRun:
     if not isinstance(manifest, dict):
         raise InputError(f"{folder / MANIFEST} holds no manifest; run the sequence again")
     config = load_config(folder / "config.toml", settings)
+    if manifest.get("kind") == "merge":
+        raise InputError(f"{folder} is a merge of several runs: name one of them")
     if not (folder / "trajectory.tum").is_file():
         raise InputError(f"{folder} has no trajectory.tum: the run ended before it; run the sequence again")
     trajectory = read_trajectory(folder / "trajectory.tum", "tum")

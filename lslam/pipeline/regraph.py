@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -30,41 +31,59 @@ def open_again(run: EarlierRun, sequence: Path | None = None, **reading: Any) ->
 
     Raises InputError when it is gone.
     """
-    path = as_path(run.sequence_path) if sequence is None else sequence
-    if sequence is None and not path.exists():
+    if sequence is None and is_gone(run):
         raise InputError(
-            f"the raw scans of {run.folder} are gone: {path} does not exist; say where they are with --sequence"
+            f"the raw scans of {run.folder} are gone: {run.sequence_path} does not exist; say where they are with --sequence"
         )
-    told = run.manifest.get("sequence", {}).get("reading", {}) if sequence is None else {}
-    given = {name: value for name, value in reading.items() if value is not None}
-    config = run.config
+    path, config = as_path(run.sequence_path) if sequence is None else sequence, run.config
     return open_sequence(
         path, vertical_correction_deg=config.input.vertical_correction_deg, imu=config.imu.use,
-        gnss=config.gnss.mode != "off", **(told | given),
+        gnss=config.gnss.mode != "off", **reading_of(run, sequence, **reading),
     )  # fmt: skip
 
 
+def is_gone(run: EarlierRun) -> bool:
+    """Whether the recording is no longer where it was."""
+    return not as_path(run.sequence_path).exists()
+
+
+def reading_of(run: EarlierRun, sequence: Path | None = None, **reading: Any) -> dict[str, Any]:
+    """Options of `open_sequence` for the recording of the run, or for what it has moved to."""
+    told = run.manifest.get("sequence", {}).get("reading", {}) if sequence is None else {}
+    return told | {name: value for name, value in reading.items() if value is not None}
+
+
 def optimise_again(
-    run: EarlierRun, sequence: Sequence, out: Path, *, ground_truth: Trajectory | None = None, overwrite: bool = False,
-    resume: bool = False, command: str = "", watch: Watch | None = None,
+    run: EarlierRun, sequence: Sequence, out: Path, *, reading: Mapping[str, str] | None = None,
+    ground_truth: Trajectory | None = None, overwrite: bool = False, resume: bool = False, command: str = "",
+    watch: Watch | None = None,
 ) -> RunOutcome:  # fmt: skip
     """A run folder at `out` with the odometry of `run` and the pose graph of its configuration; `run` stays as it is.
+
+    reading : options that the sequence was opened with, for the manifest
 
     Raises as `pipeline.run`, and UsageError for settings that odometry would have to be run again for.
     """
     watch = watch or Watch()
+    require_another(run.folder, out)
     _require_same_odometry(run)
     with hearing() as heard:
         job = prepare(sequence, run.config, ground_truth, command, watch)
         stamps = np.asarray(job.sequence.stamps_ns)
         if not np.array_equal(stamps, run.trajectory.stamps_ns):
             raise InputError(f"{sequence.path} does not fit {run.folder}: its {len(stamps)} scans have other stamps")
-        job.manifest.reading = dict(run.manifest.get("sequence", {}).get("reading", {}))
+        job.manifest.reading = dict(reading or {})
         job.manifest.warnings = heard
         outcome = perform(job, out, overwrite, resume, odometry_of=run.folder)
     watch.on_end(outcome)
     raise_outcome(job.manifest, job.config, ", and --resume goes on")
     return outcome
+
+
+def require_another(run: Path, out: Path) -> None:
+    """Raise UsageError when both are one folder, by whatever name."""
+    if out.resolve() == run.resolve():
+        raise UsageError(f"--out {out}: the run itself stays as it is, name another folder")
 
 
 def _require_same_odometry(run: EarlierRun) -> None:

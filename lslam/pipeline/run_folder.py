@@ -95,20 +95,25 @@ class RunFolder:
         shutil.rmtree(self.path / CHECKPOINT, ignore_errors=True)
 
     def keep_odometry(self) -> None:
-        """The run is over: of its checkpoints those of odometry stay beside the keyframes, for another pose graph."""
+        """The run is over: of its checkpoints those of odometry stay beside the keyframes, for another pose graph.
+
+        The checkpoints stay too, until `drop_checkpoint`: nothing is lost in between.
+        """
         kept = [*sorted((self.path / CHECKPOINT).glob("odometry-*.npz"))[-1:], self.path / CHECKPOINT / IMU_START]
         if (self.path / KEYFRAMES).is_dir():
-            for file, name in zip(kept, (ODOMETRY, IMU_START), strict=False):
+            for file in kept:
+                name = IMU_START if file.name == IMU_START else ODOMETRY
                 with contextlib.suppress(FileNotFoundError):
-                    os.replace(file, self.path / KEYFRAMES / name)
-        self.drop_checkpoint()
+                    _share(file, self.path / KEYFRAMES / name)
 
     def begin_from(self, run: Path) -> None:
-        """Lay the keyframes and the odometry of another run ready to go on from; clouds are shared where the disk can.
+        """Lay the keyframes and the odometry of another run ready to go on from, unless they are.
 
         Raises OutputError when they cannot be written.
         """
         source = run / KEYFRAMES
+        if any((self.path / CHECKPOINT).glob("odometry-*.npz")):
+            return  # the last of the files that are laid there
         try:
             for name in (KEYFRAMES, CHECKPOINT):
                 (self.path / name).mkdir(exist_ok=True)
@@ -164,11 +169,15 @@ class RunFolder:
 
 def _share(file: Path, target: Path) -> None:
     """The same file under another name, or a copy of it; files of a run are replaced, never changed."""
-    target.unlink(missing_ok=True)
+    if not file.is_file():
+        raise FileNotFoundError(file)
+    part = target.with_name(f"{target.name}.part")
+    part.unlink(missing_ok=True)
     try:
-        os.link(file, target)
+        os.link(file, part)
     except OSError:
-        shutil.copyfile(file, target)
+        shutil.copyfile(file, part)
+    os.replace(part, target)
 
 
 def _clear_own(folder: Path, names: str) -> None:
@@ -226,6 +235,10 @@ def require_run(path: Path) -> None:
 def require_odometry(path: Path) -> None:
     """Raise InputError unless the run in `path` kept what `RunFolder.begin_from` takes."""
     if not (path / KEYFRAMES / ODOMETRY).is_file():
+        if (path / CHECKPOINT).is_dir():
+            raise InputError(
+                f"the run in {path} is not finished: go on with lslam run SEQUENCE --out {path} --resume first"
+            )
         raise InputError(
             f"{path} kept no state of its odometry, as runs with odometry.checkpoint_s = 0 and those of an earlier lslam: run "
             "the sequence again"

@@ -76,7 +76,7 @@ def _trajectory(figure: Any, run: PlottedRun) -> None:
         lines.append(("odometry", run.odometry.positions, COLOURS[1]))
     absolute = first_available(run.evaluation)
     if run.evaluation is not None and absolute is not None:
-        truth = se3.apply(se3.inverse(absolute.T_gt_est), run.evaluation.gt_positions)
+        truth = se3.apply(se3.inverse(absolute.T_gt_est), run.evaluation.gt_positions) / absolute.scale
         lines.insert(0, ("ground truth", truth, "black"))
     for name, positions, colour in lines:
         _line(above, positions, colour, name)
@@ -85,7 +85,7 @@ def _trajectory(figure: Any, run: PlottedRun) -> None:
     _legend(figure, above)
     _from_above(above)
     size = np.ptp(run.trajectory.positions, axis=0)
-    deep.set_box_aspect(np.maximum(size, 0.15 * size.max()) + 1e-9, zoom=0.8)
+    deep.set_box_aspect(np.maximum(size, 0.3 * size.max()) + 1e-9, zoom=0.7)
     deep.set(xlabel="x, m", ylabel="y, m", zlabel="z, m")
     for axis, ticks in (("x", 3), ("y", 3), ("z", 2)):
         deep.locator_params(axis=axis, nbins=ticks)
@@ -99,7 +99,7 @@ def _errors(figure: Any, run: PlottedRun) -> None:
     stamps = run.trajectory.stamps_ns
     nearest_pose = np.searchsorted(stamps, run.evaluation.stamps_ns).clip(0, len(stamps) - 1)
     R = absolute.T_gt_est[:3, :3] @ run.trajectory.poses[nearest_pose, :3, :3]
-    own = -np.einsum("nji,nj->ni", R, absolute.errors)
+    own = np.einsum("nji,nj->ni", R, absolute.errors)
     distance = run.evaluation.distance
     for axis, (name, colour) in enumerate((("ahead", COLOURS[0]), ("left", COLOURS[1]), ("up", COLOURS[2]))):
         planar.plot(distance, own[:, axis], color=colour, lw=0.8, label=name)
@@ -115,10 +115,11 @@ def _imu(figure: Any, run: PlottedRun) -> None:
         raise InputError(f"{run.name} has no IMU: what it was run without is not plotted")
     force, rates, speed, yaw = figure.subplots(4, 1, sharex=True)
     begin = run.trajectory.stamps_ns[0]
-    seconds = 1e-9 * (run.imu.stamps_ns - begin)
+    inside = (run.imu.stamps_ns >= begin) & (run.imu.stamps_ns <= run.trajectory.stamps_ns[-1])
+    seconds = 1e-9 * (run.imu.stamps_ns[inside] - begin)
     for axis, (name, colour) in enumerate(zip("xyz", COLOURS, strict=False)):
-        force.plot(seconds, run.imu.accel[:, axis], color=colour, lw=0.4, label=name)
-        rates.plot(seconds, np.rad2deg(run.imu.gyro[:, axis]), color=colour, lw=0.4)
+        force.plot(seconds, run.imu.accel[inside, axis], color=colour, lw=0.4, label=name)
+        rates.plot(seconds, np.rad2deg(run.imu.gyro[inside, axis]), color=colour, lw=0.4)
     step = np.maximum(1e-9 * np.diff(run.trajectory.stamps_ns), 1e-9)
     middle = 1e-9 * (run.trajectory.stamps_ns[:-1] - begin) + 0.5 * step
     moved = se3.relative(run.trajectory.poses[:-1], run.trajectory.poses[1:])

@@ -9,6 +9,7 @@ import pytest
 
 from lslam.backend.control_points import contradicting, control_residuals, with_control
 from lslam.backend.georeferencing import Placement
+from lslam.backend.held_first import where_held
 from lslam.config import Config
 from lslam.errors import UsageError
 from lslam.geometry import se3, so3
@@ -71,7 +72,8 @@ def test_a_point_of_the_wrong_scan_is_named_with_its_line() -> None:
 def test_points_beside_fixes_keep_the_place_of_the_fixes() -> None:
     known = Placement(replace(TRUE, method="graph"))
     placed = with_control(known, surveyed((0, 60)), RESULTS, KEYFRAMES, None, Config())
-    assert placed.georeference is known.georeference
+    assert placed.georeference is not None
+    assert placed.georeference.origin is TRUE.origin
     np.testing.assert_allclose(placed.fixes[0].position, se3.apply(TRUE.T_enu_world, POSES[:1, :3, 3])[0], atol=2e-3)
 
 
@@ -79,7 +81,7 @@ def test_points_that_leave_the_heading_vague_give_no_place() -> None:
     for points in (surveyed((20,)), surveyed((20, 20, 20))):
         placed = with_control(Placement(), points, RESULTS, KEYFRAMES, None, Config())
         assert placed.georeference is None
-        assert "too near to each other" in placed.problem
+        assert "nobody can say which way the run goes" in placed.problem
 
 
 def test_coordinates_go_to_the_earth_and_back() -> None:
@@ -99,3 +101,9 @@ def test_coordinates_go_to_the_earth_and_back() -> None:
 def test_coordinates_that_are_none_are_refused(position: list[float], epsg: int, said: str) -> None:
     with pytest.raises(UsageError, match=said):
         to_wgs84(np.array([position]), epsg)
+
+
+def test_one_keyframe_and_one_scan_are_placed_nowhere() -> None:
+    points = surveyed((0, 60))
+    for results, keyframes in ((RESULTS, KEYFRAMES[:1]), (RESULTS[:1], KEYFRAMES[:1])):
+        assert where_held(keyframes, [], points, results, Config()) == keyframes

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -86,12 +87,16 @@ def test_one_known_pair_closes_the_loops_that_drift_had_hidden(drives: Path, tmp
 
 
 def test_a_pair_that_shows_two_places_closes_nothing_and_is_said(drives: Path, tmp_path: Path) -> None:
-    document = again(
-        drives / "plain", tmp_path / "out", "--loops", pairs(tmp_path / "edits.csv", "0,50,known", "4,4,known")
-    )
+    edits = pairs(tmp_path / "edits.csv", "0,50,known", "4,4,known", "50,0,known", "50,0,forbidden")
+    document = again(drives / "plain", tmp_path / "out", "--loops", edits)
     said = document["manifest"]["problems"]
     assert any("line 2: the scans of the known pair do not close a loop" in sentence for sentence in said)
-    assert any("line 3: both scans belong to one keyframe" in sentence for sentence in said)
+    for problem in (
+        "line 3: both scans belong to one keyframe",
+        "line 4: the pair is named twice",
+        "line 2: the pair is known and",
+    ):
+        assert any(problem in sentence for sentence in said)
     assert document["manifest"]["status"] == "degraded"
 
 
@@ -184,6 +189,11 @@ def test_files_that_do_not_fit_the_run_are_refused_before_any_work(drives: Path,
         ("--loops", "scan_a,scan_b,verdict\n0,95,known\n", "line 2: scan 95 is none of the run's, which are 0 to 94"),
         ("--loops", "stamp_a,stamp_b,verdict\n0,99,known\n", "line 2: the stamp 99.000 s is none of the run's"),
         ("--control", "scan,x,y,z,sigma,crs\n0,1,2,3,0.1,EPSG:1999\n", "EPSG:1999: PROJ knows no such"),
+        (
+            "--control",
+            "stamp,x,y,z,sigma,crs\n9.45,8,49,3,0.1,EPSG:4326\n",
+            "line 2: the stamp 9.450 s is none of the run's",
+        ),
     ):
         (tmp_path / "file.csv").write_text(text)
         done = lslam("graph", drives / "plain", "--out", tmp_path / "out", name, tmp_path / "file.csv")
@@ -203,10 +213,31 @@ def test_a_run_without_the_state_of_its_odometry_is_refused(drives: Path, tmp_pa
     assert not (tmp_path / "run-graph").exists()
 
 
+def test_a_damaged_state_of_odometry_is_no_reason_to_run_it_again(drives: Path, tmp_path: Path) -> None:
+    shutil.copytree(drives / "plain", tmp_path / "run")
+    (tmp_path / "run" / "keyframes" / "odometry.npz").write_bytes(b"PK")
+    refused = lslam("graph", tmp_path / "run")
+    assert refused.returncode == 3
+    assert "damaged or incomplete" in refused.stderr
+    # What was begun from it is repeated from one that is whole.
+    shutil.copy(drives / "plain" / "keyframes" / "odometry.npz", tmp_path / "run" / "keyframes")
+    done = lslam("graph", tmp_path / "run", "--resume", "--no-map")
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "run-graph" / "trajectory.tum").read_bytes() == (
+        drives / "plain" / "trajectory.tum"
+    ).read_bytes()
+
+
 def test_the_run_itself_is_never_written_over(drives: Path) -> None:
     before = manifest(drives / "plain")
-    for flag in ("--overwrite", "--resume"):
-        done = lslam("graph", drives / "plain", "--out", drives / "plain", flag)
+    link = drives / "link"
+    link.symlink_to(drives / "plain")
+    for out, flag in (
+        (drives / "plain", "--overwrite"),
+        (link, "--overwrite"),
+        (drives / "lost" / ".." / "plain", "--resume"),
+    ):
+        done = lslam("graph", drives / "plain", "--out", out, flag)
         assert done.returncode == 2
         assert "the run itself stays as it is" in done.stderr
     assert manifest(drives / "plain") == before

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from calling import SAMPLE, assert_one_sentence, lslam
 
+from lslam.evaluation.results import AbsoluteError
 from lslam.pipeline.plot_run import plotted_run
 from lslam.reports.figures import draw_figure
 
@@ -50,6 +51,10 @@ def test_the_same_bytes_twice_and_the_size_of_a_page(run: Path, tmp_path: Path) 
     assert "font-size: 10px" in text
 
 
+def T_gt_est_R(absolute: AbsoluteError) -> np.ndarray:
+    return absolute.T_gt_est[:3, :3]
+
+
 def test_errors_are_in_the_axes_of_the_lidar(run: Path) -> None:
     """The planar error is that of x and y of the body, and no larger than the whole."""
     plotted = plotted_run(run, "errors")
@@ -57,7 +62,13 @@ def test_errors_are_in_the_axes_of_the_lidar(run: Path) -> None:
     planar, _ = draw_figure(plotted, "errors").axes
     ahead, left, up, both = (np.asarray(line.get_ydata()) for line in planar.get_lines())
     np.testing.assert_allclose(np.hypot(ahead, left), both, atol=1e-12)
-    whole = np.linalg.norm(plotted.evaluation.ate["se3"].errors, axis=1)
+    absolute = plotted.evaluation.ate["se3"]
+    whole = np.linalg.norm(absolute.errors, axis=1)
+    # Estimate minus truth: who is ahead of it has a positive error ahead.
+    axes = np.stack([T_gt_est_R(absolute) @ pose[:3, 0] for pose in plotted.trajectory.poses])
+    np.testing.assert_allclose(
+        ahead, np.einsum("ni,ni->n", axes, absolute.aligned_positions - plotted.evaluation.gt_positions), atol=1e-9
+    )
     np.testing.assert_allclose(np.hypot(both, up), whole, atol=1e-9)
 
 

@@ -89,6 +89,14 @@ def test_what_is_wrong_with_control_points_is_said_with_its_line(tmp_path: Path,
         read_control_points(written(tmp_path, POINTS + row + "\n"))
 
 
+def test_comments_are_passed_over_and_a_header_may_be_one(tmp_path: Path) -> None:
+    text = "# pairs of mine\n# scan_a, scan_b, verdict\n# the corner\n0,84,known\n"
+    (pair,) = read_named_pairs(written(tmp_path, text))
+    assert (pair.first.scan, pair.second.scan) == (0, 84)
+    with pytest.raises(InputError, match="stands there twice"):
+        read_named_pairs(written(tmp_path, "scan_a,scan_b,scan_a,verdict\n1,2,3,known\n"))
+
+
 def test_a_file_that_is_not_there(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"none\.csv cannot be read"):
         read_control_points(tmp_path / "none.csv")

@@ -21,7 +21,7 @@ START, FOLDER, KERNELS, ODOMETRY, LOOPS, GRAPH, OSM, FILES, MAP, MAP_END, REPORT
 MARKS = {
     "lslam.pipeline.run": {"run": FOLDER},
     "lslam.pipeline.deliver": {
-        "write_back_end": FILES, "make_map": MAP, "make_report": REPORT, "RunFolder.keep_odometry": END,
+        "write_back_end": FILES, "make_map": MAP, "make_report": REPORT, "RunFolder.drop_checkpoint": END,
     },
     "lslam.pipeline.odometry_pass": {"_warm_up": KERNELS, "estimate": ODOMETRY},
     "lslam.pipeline.back_end_pass": {"find_loops": LOOPS, "run_back_end": GRAPH, "hold_by_buildings": OSM},
