@@ -133,7 +133,7 @@ def _bounds(cloud: Cloud, trim: float) -> tuple[NDArray[np.float64], NDArray[np.
     step, seen = max(1, len(cloud) // 100_000), 0
     parts = [np.zeros((0, 2))]
     for block in cloud.blocks():
-        parts.append(block.points[-seen % step :: step, :2])
+        parts.append(block.points[-seen % step :: step, :2].copy())  # a view would keep its whole block
         seen += len(block)
     sample = np.concatenate(parts)
     sample = sample[np.isfinite(sample).all(1)]

@@ -104,8 +104,8 @@ def thinned(cloud: Cloud, most: int) -> ArrayCloud:
     points, values = [np.zeros((0, 3))], [np.zeros(0, np.float32)]
     for block in cloud.blocks():
         some = slice(-seen % step, None, step)
-        points.append(block.points[some])
+        points.append(block.points[some].copy())  # a view would keep its whole block
         if block.intensity is not None:
-            values.append(block.intensity[some])
+            values.append(block.intensity[some].copy())
         seen += len(block)
     return ArrayCloud(np.concatenate(points), np.concatenate(values) if cloud.has_intensity else None)

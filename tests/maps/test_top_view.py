@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import tracemalloc
+from collections.abc import Iterator
+
 import numpy as np
 import pytest
 
 from lslam.maps.floor_plan import top_view
+from lslam.types.cloud import CloudBlock, thinned
 
 
 def test_every_point_is_counted_in_its_pixel() -> None:
@@ -79,3 +83,29 @@ def test_one_point_and_points_that_are_not_finite() -> None:
     assert view.image.tolist() == [[1.0]]
     assert x0 == pytest.approx(3.0)
     assert x1 - x0 == pytest.approx(0.2)
+
+
+class Stream:
+    """A cloud of `count` blocks, each made when it is asked for."""
+
+    SIZE, has_intensity = 1 << 16, False
+
+    def __init__(self, count: int) -> None:
+        self.count = count
+
+    def __len__(self) -> int:
+        return self.count * self.SIZE
+
+    def blocks(self) -> Iterator[CloudBlock]:
+        for k in range(self.count):
+            yield CloudBlock(np.random.default_rng(k).uniform(-100, 100, (self.SIZE, 3)), None)
+
+
+def test_a_map_of_any_size_is_seen_in_the_memory_of_a_few_blocks() -> None:
+    block = Stream.SIZE * 3 * 8
+    for look in (lambda cloud: top_view(cloud, longest=100), lambda cloud: thinned(cloud, 1000)):
+        tracemalloc.start()
+        look(Stream(24))
+        _, peak = tracemalloc.get_traced_memory()
+        tracemalloc.stop()
+        assert peak < 10 * block, "24 blocks are not held"
