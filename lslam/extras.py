@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import shlex
 from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
 from urllib.parse import urlsplit
 from urllib.request import url2pathname
+
+from lslam.untrusted import parse_json
 
 # Of a checkout; where lslam is installed, the folder of packages.
 _SOURCES = Path(__file__).resolve().parents[1]
@@ -31,7 +32,7 @@ def _requirement(extra: str) -> str:
     """By what pip was told (PEP 610): a path that is there, an address; else the folder of sources, or the name."""
     named = f"lslam[{extra}]"
     try:
-        source = json.loads(distribution("lslam").read_text("direct_url.json") or "{}")
+        source = parse_json(distribution("lslam").read_text("direct_url.json") or "{}")
         url, repository = str(source.get("url", "")), source.get("vcs_info", {})
         if repository:
             return f"{named} @ {repository['vcs']}+{url}@{repository['commit_id']}"

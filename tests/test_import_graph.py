@@ -27,8 +27,9 @@ LAYERS = [
     ["types"],
     ["geometry"],
     ["kernels", "config"],
-    ["foreign", "locks", "machine", "plugins", "printable", "remote", "stopping", "untrusted"],
-    ["errors", "extras", "version"],
+    ["foreign", "locks", "machine", "plugins", "printable", "remote", "stopping"],
+    ["extras"],
+    ["errors", "untrusted", "version"],
 ]
 LEVEL = {name: level for level, names in enumerate(LAYERS) for name in names}
 

@@ -125,7 +125,7 @@ def test_the_error_about_a_missing_package_names_the_remedy(monkeypatch: pytest.
     monkeypatch.undo()
     monkeypatch.setitem(sys.modules, "gcsfs", None)
     for url, said in (
-        ("gs://b/x", r"gs:// is not installed .*lslam\[cloud\]"),
+        ("gs://b/x", r"gs:// is not installed .*\[cloud\]"),
         ("nfs://b/x", "no storage is called nfs://"),
     ):
         with pytest.raises(LslamError, match=said) as caught:

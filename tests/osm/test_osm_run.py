@@ -39,7 +39,7 @@ def config(extract: str | Path = MAP, *more: str) -> Config:
 
 def bytes_of(folder: Path) -> dict[str, bytes]:
     """All that a run promises to repeat, its replies aside."""
-    changing = ("manifest.json", "log.txt", "timing.csv", "config.toml")
+    changing = ("manifest.json", "log.txt", "timing.csv", "config.toml", "odometry.npz")
     files = [f for f in folder.rglob("*") if f.is_file() and f.name not in changing and f.parent.name != "osm_replies"]
     return {str(file.relative_to(folder)): file.read_bytes() for file in files}
 

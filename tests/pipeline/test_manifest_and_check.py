@@ -168,9 +168,9 @@ def test_what_a_preset_says_and_its_method_only_heeds_is_said_to_be_the_presets(
 
 
 def test_coordinates_of_a_run_with_no_place_on_the_earth_are_refused() -> None:
-    with pytest.raises(UsageError, match=r"^--crs does nothing without --gnss, --georeference or --osm"):
+    with pytest.raises(UsageError, match=r"^--crs does nothing without --gnss, --georeference, --osm or --control"):
         check_config(load_config(settings=["gnss.crs=25832"], environ={}))
-    for place in ("gnss.mode=fit", "gnss.mode=graph", 'osm.extract="town.osm"'):
+    for place in ("gnss.mode=fit", "gnss.mode=graph", 'osm.extract="town.osm"', 'graph.control="points.csv"'):
         check_config(load_config(settings=["gnss.crs=25832", place], environ={}))
 
 
