@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
@@ -32,16 +33,16 @@ def no_shared_time(stream: str) -> str:
     return f"{stream}: it shares no time with the scans"
 
 
-class Scans:
+class Scans(ABC):
     """`sequence[i]` and iteration, by `scan`; from the end below 0."""
 
+    @abstractmethod
     def __len__(self) -> int:
         """Number of scans."""
-        raise NotImplementedError
 
+    @abstractmethod
     def scan(self, index: int) -> Scan:
         """Read scan `index`."""
-        raise NotImplementedError
 
     def __getitem__(self, index: int) -> Scan:
         """As `scan`; IndexError beyond the last."""
