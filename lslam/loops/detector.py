@@ -54,6 +54,7 @@ class Detector:
 
     keyframes : all of the run, in order
     cloud : gives the submap about a keyframe, (M, 3) m, in its LiDAR frame
+    forbidden : pairs of keyframes, the older first, that are no candidates, nor are those around them
     """
 
     def __init__(
@@ -62,9 +63,10 @@ class Detector:
         cloud: Callable[[int], Points],
         config: LoopsConfig,
         registration: RegistrationConfig,
+        forbidden: Sequence[tuple[int, int]] = (),
     ) -> None:
         self.keyframes, self.cloud, self.config, self.registration = keyframes, cloud, config, registration
-        self.forbidden: Sequence[tuple[int, int]] = ()
+        self.forbidden = forbidden
         self._is_level = False
         self.uncertainty = OdometryUncertainty(keyframes, config.drift_percent, config.drift_deg)
         self.index = create_descriptor(config)

@@ -52,8 +52,8 @@ def find_loops(
     An accepted candidate carries its constraint, T_a_b between LiDAR frames. Raises InterruptedRunError when `should_stop`
     said so between two keyframes.
     """
-    detector = _detector(store, store.keyframes if keyframes is None else keyframes, config, registration, submap_size)
-    detector.forbidden = tuple(forbidden)
+    at = store.keyframes if keyframes is None else keyframes
+    detector = _detector(store, at, config, registration, submap_size, forbidden)
     candidates = detector.find(clocks, should_stop, threads)
     accepted = sum(c.is_accepted for c in candidates)
     tried = sum(c.stage != LoopStage.THINNED for c in candidates)
@@ -80,10 +80,12 @@ def verify_known(
 
 def _detector(
     store: KeyframeStore, keyframes: Sequence[Keyframe], config: LoopsConfig, registration: RegistrationConfig,
-    submap_size: int,
+    submap_size: int, forbidden: Sequence[tuple[int, int]] = (),
 ) -> Detector:  # fmt: skip
     poses = np.array([keyframe.T_world_lidar for keyframe in keyframes]).reshape(-1, 4, 4)
-    return Detector(keyframes, lambda number: submap(store, poses, number, submap_size), config, registration)
+    return Detector(
+        keyframes, lambda number: submap(store, poses, number, submap_size), config, registration, forbidden
+    )
 
 
 def warm_up(config: LoopsConfig) -> None:
