@@ -44,7 +44,7 @@ def with_control(
 
     Raises UsageError for coordinates that PROJ does not know or that are none of a place.
     """
-    on_earth = np.concatenate([to_wgs84(point.position[None], point.epsg) for point in points])
+    on_earth = _on_earth(points)
     stamps = np.array([stamp_of(point.at, results) for point in points])
     seen = _seen(points, stamps, results)
     sigmas = np.stack([point.sigma for point in points])
@@ -87,7 +87,7 @@ def control_residuals(
     points: Many[ControlPoint], results: Many[ScanResult], georeference: Georeference
 ) -> list[ControlResidual]:
     """What is left of the points at the final poses."""
-    on_earth = np.concatenate([to_wgs84(point.position[None], point.epsg) for point in points])
+    on_earth = _on_earth(points)
     stamps = np.array([stamp_of(point.at, results) for point in points])
     off = geodesy.to_local(on_earth, georeference.origin) - se3.apply(
         georeference.T_enu_world, _seen(points, stamps, results)
@@ -98,7 +98,7 @@ def control_residuals(
 
 
 def against_odometry(
-    points: Many[ControlPoint], results: Many[ScanResult], keyframes: Many[Keyframe], config: Config
+    points: Many[ControlPoint], results: Many[ScanResult], keyframes: Many[Keyframe], drift: Drift, probability: float
 ) -> list[str]:
     """One sentence for each pair of successive points that are not so far apart as odometry may have them.
 
@@ -108,17 +108,13 @@ def against_odometry(
         return []
     stamps = np.array([stamp_of(point.at, results) for point in points])
     order = np.argsort(stamps, kind="stable")
-    there = np.concatenate([to_wgs84(points[i].position[None], points[i].epsg) for i in order])
+    there = _on_earth(points)[order]
     enu, seen = geodesy.to_local(there, there[0]), _seen(points, stamps, results)[order]
     nearest = np.abs(np.array([k.stamp_ns for k in keyframes]) - stamps[order][:, None]).argmin(1)
-    drift = Drift(
-        np.stack([k.T_world_lidar[:3, 3] for k in keyframes]), np.array([k.distance for k in keyframes]),
-        config.graph.drift_percent, np.deg2rad(config.graph.drift_deg_per_100m) / 100,
-    )  # fmt: skip
     own = np.array([float((points[i].sigma ** 2).max()) for i in order])
     sigma = np.sqrt(drift.covariance(nearest[:-1], nearest[1:])[:, 0, 0] + own[:-1] + own[1:])
     off = np.linalg.norm(np.diff(enu, axis=0), axis=1) - np.linalg.norm(np.diff(seen, axis=0), axis=1)
-    times = np.abs(off) / (float(np.sqrt(quantile(config.graph.probability, 1))) * sigma)
+    times = np.abs(off) / (float(np.sqrt(quantile(probability, 1))) * sigma)
     names = [points[i].at.said for i in order]
     said = [
         f"{names[k]} and {names[k + 1]}: the control points are {abs(off[k]):.2f} m "
@@ -126,11 +122,7 @@ def against_odometry(
         "drift: they hold, are scan, sigma and CRS right?"
         for k in np.flatnonzero(times > 1).tolist()
     ]
-    return (
-        said
-        if len(said) <= MOST_SAID
-        else [*said[:MOST_SAID], f"and {len(said) - MOST_SAID} more pairs of control points"]
-    )
+    return _some(said, "pairs of control points")
 
 
 def control_facts(residuals: Many[ControlResidual]) -> dict[str, float]:
@@ -151,10 +143,19 @@ def contradicting(residuals: Many[ControlResidual], probability: float) -> list[
     said = [
         f"{one.point.at.said}: the control point is left off by {np.linalg.norm(one.residual):.2f} m, {one.size:.1f} sigmas: "
         "is it the right scan, sigma and CRS?"
-        for one in wrong[:MOST_SAID]
+        for one in wrong
     ]
-    more = len(wrong) - MOST_SAID
-    return [*said, f"and {more} more control points: see control.csv"] if more > 0 else said
+    return _some(said, "control points: see control.csv")
+
+
+def _some(said: list[str], what: str) -> list[str]:
+    more = len(said) - MOST_SAID
+    return [*said[:MOST_SAID], f"and {more} more {what}"] if more > 0 else said
+
+
+def _on_earth(points: Many[ControlPoint]) -> Floats:
+    """(N, 3) lat, lon (deg), height (m)."""
+    return np.concatenate([to_wgs84(point.position[None], point.epsg) for point in points])
 
 
 def _seen(points: Many[ControlPoint], stamps: NDArray[np.int64], results: Many[ScanResult]) -> Floats:

@@ -33,8 +33,6 @@ Floats = NDArray[np.float64]
 UNSTATED = 5.0
 # rad; one sigma of the z axis against up, of a world that nothing levelled and of one levelled by an IMU.
 UNLEVELLED, LEVELLED = np.deg2rad(10.0), np.deg2rad(1.0)
-# rad; of the tilt where nothing is said of it.
-UNKNOWN = 3.0
 # Sigmas (noise and drift) beyond which a fix is no outlier candidate of the graph but left out.
 ABSURD = 20.0
 # m; beyond noise and multipath: a lost sign.
@@ -79,7 +77,7 @@ class Placement:
     fix_noise: GaussMarkovNoise | None = None
     walk: float = 0.0
     problem: str = ""
-    tilt_sigma: float = UNKNOWN
+    tilt_sigma: float = PoseGraph.tilt_sigma
 
 
 def require_gnss(sequence: Sequence, config: GnssConfig) -> None:

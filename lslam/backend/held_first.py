@@ -40,7 +40,7 @@ def where_held(
             graph, R = on_earth(graph, placement), placement.georeference.T_enu_world[:3, :3]
     try:
         poses = from_held(graph, config.graph).poses
-    except GraphError as error:
+    except (GraphError, np.linalg.LinAlgError) as error:
         log.debug("known pairs and control points alone: %s", error)  # said where all of it is solved
         return keyframes
     return [

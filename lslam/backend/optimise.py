@@ -21,6 +21,7 @@ from lslam.backend.inputs import floor_planes, on_one_plane, up_directions, worl
 from lslam.backend.outcome import BackEnd, Given, solve, unsolved, without_steady_drift
 from lslam.config import Config
 from lslam.geometry import se3
+from lslam.graph.consistency import drift_of
 from lslam.graph.drift import tilt_factor
 from lslam.graph.odometry_constraints import bent, fitness_covariance, fitness_score, odometry_constraints
 from lslam.graph.problem import PoseGraph
@@ -58,6 +59,7 @@ def run_back_end(
             problems.append(f"{what}: fewer than two keyframes have no heading on the Earth")
         return BackEnd(results, candidates, problems=problems)
     graph = replace(_graph(given, inertial), turns=turns)
+    drift = drift_of(graph, config.graph)
     out = None
     if hold is not None:
         out = hold(
@@ -79,9 +81,8 @@ def run_back_end(
     if points and out.georeference is not None:
         left = control_residuals(points, out.results, out.georeference)
         out = replace(out, control=left, facts=out.facts | {"control_points": control_facts(left)})
-        problems += [
-            *against_odometry(points, results, keyframes, config), *contradicting(left, config.graph.probability),
-        ]  # fmt: skip
+        probability = config.graph.probability
+        problems += against_odometry(points, results, keyframes, drift, probability) + contradicting(left, probability)
     for problem in problems:
         log.warning("%s", problem)
     return replace(out, problems=problems, facts={"keyframes": len(keyframes)} | out.facts)
