@@ -15,15 +15,12 @@ from lslam.odometry import create_odometry
 from lslam.odometry.base import FeatureSource
 from lslam.pipeline.feature_pass import view_features
 from lslam.pipeline.job import choose_scans
-from lslam.pipeline.rebuild import read_run, results_of, viewed_run
-from lslam.pipeline.regraph import is_gone, open_again
-from lslam.reports.figures import WIDTHS, PlottedRun, draw_figure, require_figure
+from lslam.pipeline.rebuild import is_gone, read_run, results_of, viewed_run
+from lslam.pipeline.regraph import open_again
+from lslam.reports.figures import ON_THE_MAP, WIDTHS, PlottedRun, draw_figure, require_figure
 from lslam.reports.picture import check_plot_path, house_style, picture
 from lslam.types.sequence import Sequence
 from lslam.types.trajectory import Trajectory
-
-# What is drawn without the recording.
-OF_FOLDER = ("map", "buildings")
 
 
 def plotted_run(
@@ -40,13 +37,13 @@ def plotted_run(
     require_figure(what)
     run = read_run(folder)
     about: dict[str, Any] = {"georeference": run.georeference}
-    if what in OF_FOLDER:
+    if what in ON_THE_MAP:
         about["cloud"] = viewed_run(folder).cloud
     if what == "trajectory" and (folder / "trajectory_odometry.tum").is_file():
         about["odometry"] = read_trajectory(folder / "trajectory_odometry.tum", "tum")
     if what == "buildings" and (folder / "buildings.geojson").is_file():
         about["buildings"] = read_corrected(folder / "buildings.geojson")
-    if what not in OF_FOLDER and not (what == "trajectory" and sequence is None and is_gone(run)):
+    if what not in ON_THE_MAP and not (what == "trajectory" and sequence is None and is_gone(run)):
         opened = open_again(run, sequence, **reading)
         given = truth_of(opened) or opened.ground_truth
         if given is not None and what in ("trajectory", "errors"):

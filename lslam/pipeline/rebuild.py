@@ -124,6 +124,20 @@ def read_run(folder: Path, settings: Iterable[str] = ()) -> EarlierRun:
     return EarlierRun(folder, manifest, config, trajectory, statuses, georeference_of(manifest.get("georeference")))
 
 
+def is_gone(run: EarlierRun) -> bool:
+    """Whether the recording is no longer where it was."""
+    return not as_path(run.sequence_path).exists()
+
+
+def recording_of(run: EarlierRun, sequence: Path | None = None, flag: str = "--sequence") -> Path:
+    """Where the run's recording lies, or what it has moved to; raises InputError when it is gone, naming the `flag`."""
+    if sequence is None and is_gone(run):
+        raise InputError(
+            f"the raw scans of {run.folder} are gone: {run.sequence_path} does not exist; say where they are with {flag}"
+        )
+    return as_path(run.sequence_path) if sequence is None else sequence
+
+
 def open_scans(run: EarlierRun, sequence: Path | None = None, *, flag: str = "--sequence", **reading: Any) -> Sequence:
     """The scans the run worked on; `sequence` names them where they have moved.
 
@@ -131,11 +145,7 @@ def open_scans(run: EarlierRun, sequence: Path | None = None, *, flag: str = "--
 
     Raises InputError naming the path when the raw scans are gone, or are others than those of the run.
     """
-    path = as_path(run.sequence_path) if sequence is None else sequence
-    if sequence is None and not path.exists():
-        raise InputError(
-            f"the raw scans of {run.folder} are gone: {path} does not exist; say where they are with {flag}"
-        )
+    path = recording_of(run, sequence, flag)
     section = run.config.input
     known = run.topics if sequence is None else {}
     given = {name: value for name, value in reading.items() if value is not None}

@@ -13,11 +13,10 @@ from lslam.config.load import load_config
 from lslam.errors import InputError, UsageError
 from lslam.pipeline.deliver import perform, raise_outcome
 from lslam.pipeline.job import prepare
-from lslam.pipeline.rebuild import EarlierRun, read_run
+from lslam.pipeline.rebuild import EarlierRun, read_run, recording_of
 from lslam.pipeline.run_folder import require_odometry
 from lslam.pipeline.watch import RunOutcome, Watch
 from lslam.readers import open_sequence
-from lslam.remote import as_path
 from lslam.types.sequence import Sequence
 from lslam.types.trajectory import Trajectory
 from lslam.warned import hearing
@@ -31,20 +30,11 @@ def open_again(run: EarlierRun, sequence: Path | None = None, **reading: Any) ->
 
     Raises InputError when it is gone.
     """
-    if sequence is None and is_gone(run):
-        raise InputError(
-            f"the raw scans of {run.folder} are gone: {run.sequence_path} does not exist; say where they are with --sequence"
-        )
-    path, config = as_path(run.sequence_path) if sequence is None else sequence, run.config
+    config = run.config
     return open_sequence(
-        path, vertical_correction_deg=config.input.vertical_correction_deg, imu=config.imu.use,
+        recording_of(run, sequence), vertical_correction_deg=config.input.vertical_correction_deg, imu=config.imu.use,
         gnss=config.gnss.mode != "off", **reading_of(run, sequence, **reading),
     )  # fmt: skip
-
-
-def is_gone(run: EarlierRun) -> bool:
-    """Whether the recording is no longer where it was."""
-    return not as_path(run.sequence_path).exists()
 
 
 def reading_of(run: EarlierRun, sequence: Path | None = None, **reading: Any) -> dict[str, Any]:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from lslam.evaluation.evaluate import Evaluation
 from lslam.formats.point_files import read_cloud
 from lslam.pipeline.map_files import in_own_world
-from lslam.reports.figures import PlottedRun, draw_figure
+from lslam.reports.figures import ON_THE_MAP, PlottedRun, draw_figure
 from lslam.reports.notebook import WIDTH, as_html, drawn
 from lslam.reports.plots import first_available
 from lslam.reports.text import summary
@@ -48,11 +48,11 @@ class RunOutcome:
         return None if absolute is None else np.linalg.norm(absolute.errors, axis=1)
 
     def plot(self, what: str = "trajectory") -> Any:
-        """A figure of `lslam plot` as one of matplotlib: trajectory, map, errors, features or imu.
+        """A figure of `lslam plot` as one of matplotlib: trajectory, map, errors, features, imu or buildings.
 
         Raises UsageError for another name, InputError for what the run does not have.
         """
-        return draw_figure(self._plotted(self.map if what == "map" else None), what)
+        return draw_figure(self._plotted(self.map if what in ON_THE_MAP else None), what)
 
     def _plotted(self, cloud: ArrayCloud | None = None) -> PlottedRun:
         record = self.record

@@ -27,6 +27,8 @@ Floats = NDArray[np.float64]
 # mm: a column and the text of two in IEEE's journals.
 WIDTHS = {"column": 88.9, "page": 181.9}
 INCH = 25.4
+# Figures with the map beneath.
+ON_THE_MAP = ("map", "buildings")
 # Points of a map that are drawn at most: more are not seen at the resolution of a page.
 MOST = 400_000
 

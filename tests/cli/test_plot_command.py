@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 from calling import SAMPLE, assert_one_sentence, lslam
 
+import lslam as lslam_api
+from lslam.config import load_config
 from lslam.evaluation.results import AbsoluteError
 from lslam.pipeline.plot_run import plotted_run
 from lslam.reports.figures import draw_figure
@@ -101,3 +103,9 @@ def test_what_a_run_does_not_have_is_said(tmp_path: Path) -> None:
         done = lslam("plot", tmp_path / "run", "--what", what, "--out", tmp_path / "a.png", "-q")
         assert done.returncode == 3
         assert said in done.stderr
+
+
+def test_an_outcome_draws_its_buildings_on_its_map(tmp_path: Path) -> None:
+    settings = [f"osm.extract='{WALLS}'", "gnss.mode=fit", "input.count=60", "report.html=false"]
+    outcome = lslam_api.run(SAMPLE, load_config(None, settings), out=tmp_path / "run")
+    assert outcome.plot("buildings").axes[0].collections, "the map beneath"
