@@ -12,13 +12,14 @@ from lslam.formats.atomic import atomic_write
 from lslam.reports import plots
 from lslam.reports.back_end import back_end_figures, back_end_rows
 from lslam.reports.buildings import building_pages
-from lslam.reports.colours import VIRIDIS, usual_range
+from lslam.reports.colours import VIRIDIS
 from lslam.reports.facts import RunFacts, run_facts
 from lslam.reports.feature_view import feature_figures
 from lslam.reports.imu_figures import imu_figures
+from lslam.reports.map_view import MapFigure, map_figure
 from lslam.reports.page_data import cloud_data, scan_data
-from lslam.reports.png import coloured_png, data_uri, density_png, halved
 from lslam.reports.shell import RUN, render, template
+from lslam.reports.svg import Track
 from lslam.reports.text import imu_rows
 from lslam.types.run_record import Crispness, RunRecord
 from lslam.types.table import Table
@@ -27,7 +28,6 @@ if TYPE_CHECKING:
     from lslam.evaluation.results import Evaluation
 
 MOST_ROWS = 100
-MOST_PICTURE = 1_500_000  # bytes of the map from above, so that the page stays below 6 MB
 # Parts of the page, between marks of these names, that another map changes.
 MAP_PARTS = {"cards": "map_cards.html.j2", "map": "map_section.html.j2", "manifest": "manifest_table.html.j2"}
 
@@ -104,18 +104,14 @@ def map_context(record: RunRecord) -> dict[str, Any]:
     }
 
 
-def _map_figure(record: RunRecord) -> plots.MapFigure | None:
-    image, heights = record.map_image, record.map_heights
-    if image is None or not (image > 0).any():
+def _map_figure(record: RunRecord) -> MapFigure | None:
+    if record.map_image is None:
         return None
-    if heights is None:
-        return plots.map_figure(record, data_uri(density_png(image)), None)
-    low, high = usual_range(heights)
-    png = coloured_png(image, heights, low, high)
-    while len(png) > MOST_PICTURE:
-        image, heights = halved(image, heights)
-        png = coloured_png(image, heights, low, high)
-    return plots.map_figure(record, data_uri(png), (low, high))
+    tracks = [Track("trajectory", record.trajectory.positions[:, :2], "s2", ends=True)]
+    legend = (("s2", "trajectory"), ("start", "start"), ("end", "end"))
+    return map_figure(
+        record.map_image, record.map_heights, record.map_extent, tracks, legend, "World of the estimate.", by="own"
+    )
 
 
 def flatten(tree: Mapping[str, Any], prefix: str = "") -> list[tuple[str, list[str]]]:

@@ -31,7 +31,6 @@ ALIGNED = {
     "none": "not aligned",
 }
 Floats = NDArray[np.float64]
-MAP_WIDTH, MAP_HEIGHT = 980, 700
 PLAN_HEIGHT = 340  # of one beside a chart
 # A limit further away than this many times the usual scan would press the stages flat: an arrow says where it is.
 LIMIT_IN_VIEW = 4.0
@@ -123,29 +122,6 @@ def time_figure(record: RunRecord, facts: RunFacts) -> Figure | None:
     caption = "Stages stacked; reading and preprocessing may overlap registration, so a scan takes at most this long."
     legend = tuple((f"s{i % 6 + 1}", name) for i, name in enumerate(names))
     return Figure("Time per scan", chart, legend, f"{caption} {remark}".strip(), is_area=True)
-
-
-@dataclass(frozen=True)
-class MapFigure:
-    """The map of a run: its drawing, and the range of heights, m, that colours stand for; None of one that is grey."""
-
-    figure: Figure
-    heights: tuple[float, float] | None
-    pixel: float
-
-
-def map_figure(record: RunRecord, png_uri: str, heights: tuple[float, float] | None) -> MapFigure:
-    """The merged map from above with the trajectory on it; `png_uri` is its picture, coloured by `heights` or grey."""
-    assert record.map_image is not None
-    tracks = [Track("trajectory", record.trajectory.positions[:, :2], "s2", ends=True)]
-    style = "density" if heights is None else "coloured"
-    chart = plane_chart(
-        tracks, "merged map from above", backdrop=(png_uri, record.map_extent), backdrop_style=style, width=MAP_WIDTH,
-        tallest=MAP_HEIGHT, by="own",
-    )  # fmt: skip
-    caption = "World of the estimate. The more voxels of a column are occupied, the stronger it is drawn from above."
-    figure = Figure("Map", chart, (("s2", "trajectory"), ("start", "start"), ("end", "end")), caption)
-    return MapFigure(figure, heights, (record.map_extent[1] - record.map_extent[0]) / record.map_image.shape[1])
 
 
 def registration_figures(record: RunRecord) -> list[Figure]:
