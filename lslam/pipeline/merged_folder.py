@@ -106,17 +106,14 @@ def _fill(folder: RunFolder, merged: Merged, config: Config, watch: Watch) -> di
     write_g2o(folder.path / "graph.g2o", merged.solution.poses, constraints)
     georeference = _georeference(merged)
     about: dict[str, Any] = {}
+    built = None
     if config.map.write:
         built = _map(recordings, merged.results, config, watch, folder.path)
         note = MapNote(", ".join(s.name for s in merged.sessions), config.map.voxel, built.done, world)
         write_map(folder.path / f"map.{config.map.format}", built.merged, note, georeference)
         about["map_points"] = len(built.merged)
-        views = _views(merged, trajectories)
-        write_page(folder.path / "report.html", views, [vars(row) for row in rows], problems, built.view)
-    else:
-        write_page(
-            folder.path / "report.html", _views(merged, trajectories), [vars(row) for row in rows], problems, None
-        )
+    views, shown = _views(merged, trajectories), (None, None) if built is None else (built.view, built.sample)
+    write_page(folder.path / "report.html", views, [vars(row) for row in rows], problems, _ties(merged), *shown)
     for problem in problems:
         log.warning("%s", problem)
     return about | {
@@ -234,6 +231,14 @@ def _views(merged: Merged, trajectories: Sequence[Trajectory]) -> list[SessionVi
             session.name,
             (session.T_town_session @ np.stack([r.T_world_lidar for r in session.results]))[:, :3, 3],
             after.positions,
+            np.array([r.index for r in session.results]),
         )
         for session, after in zip(merged.sessions, trajectories, strict=True)
     ]
+
+
+def _ties(merged: Merged) -> Floats:
+    """(K, 2, 3) m, both ends of each loop between two sessions."""
+    session_of = merged.chain.session_of
+    ends = [(c.a, c.b) for c in merged.candidates if c.is_accepted and session_of(c.a) != session_of(c.b)]
+    return np.asarray(merged.solution.poses[np.array(ends, int).reshape(-1, 2)][..., :3, 3])

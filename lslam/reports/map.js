@@ -136,6 +136,7 @@ class MapView {
     for (const [name, style] of scans ? [["ground truth", scans.truth && "gt"], ["loop closed", scans.loops.length && "s1"]] : []) {
       if (style) this.explain(name, style);
     }
+    if (sessions && sessions.tied) this.explain("loop between two of them", "");
     this.known = colourings(this.cloud);
     const select = tools.querySelector("select");
     for (const name of Object.keys(this.known)) select.add(new Option(name));
@@ -256,6 +257,10 @@ class MapView {
   }
 
   hover(x, y) {
+    if (sessions) {
+      this.pointed = sessionAt(x, y);
+      this.draw();
+    }
     if (!this.way) return;
     const away = Float32Array.from({ length: scans.count }, (_, k) => Math.hypot(this.way[2 * k] - x, this.way[2 * k + 1] - y));
     const k = nearestBy(away, 0);

@@ -1,4 +1,4 @@
-"""The page of merged runs: each session in its colour, as it was tied in and as the graph left it."""
+"""The page of merged runs: the map of all, each session on it in its colour, and where each was tied in."""
 
 from __future__ import annotations
 
@@ -13,24 +13,30 @@ from numpy.typing import NDArray
 from lslam.formats.atomic import atomic_write
 from lslam.maps.floor_plan import TopView
 from lslam.printable import metres
+from lslam.reports.colours import VIRIDIS
 from lslam.reports.compare_html import style_of
+from lslam.reports.map_view import MapFigure, map_figure
+from lslam.reports.page_data import cloud_data, packed
 from lslam.reports.plots import Figure
-from lslam.reports.png import data_uri, density_png
-from lslam.reports.shell import render
+from lslam.reports.shell import RUN, render
 from lslam.reports.svg import Track, plane_chart
+from lslam.types.cloud import ArrayCloud
 from lslam.types.table import Table
 
 Floats = NDArray[np.float64]
+MOST_POSES = 5000  # of a session that the script draws
 RECIPE = "ATE of each session by itself, se3, m rmse; found by keyframes that agree, of those tried."
 
 
 @dataclass(frozen=True)
 class SessionView:
-    """Positions (N, 3), m, common world, of one session: as it was tied to the others, and after the pose graph."""
+    """One session: positions (N, 3), m, common world, as it was tied to the others and after the pose graph, and the
+    numbers (N,) of its scans."""
 
     name: str
     before: Floats
     after: Floats
+    scans: NDArray[np.int64]
 
 
 def write_page(
@@ -38,30 +44,61 @@ def write_page(
     sessions: Sequence[SessionView],
     rows: Sequence[Mapping[str, Any]],
     problems: Sequence[str],
+    ties: Floats,
     view: TopView | None,
+    sample: ArrayCloud | None,
 ) -> None:
     """Write the page atomically; raises OutputError when it cannot be written.
 
-    rows : of the manifest's `sessions`; view : of the merged map
+    rows : of the manifest's `sessions`; view, sample : of the merged map, from above and some of its points
+    ties : (K, 2, 3) m, both ends of each loop between two sessions
     """
-    names = [s.name for s in sessions]
-    page = render("merge.html.j2", names=names, problems=problems, figures=_figures(sessions, view), table=_table(rows))
+    shown = None if view is None else _map(sessions, view)
+    after = [] if shown else [_figure("After the pose graph, from above", "", sessions, [s.after for s in sessions])]
+    found = "Each session moved as a whole to where it was found."
+    page = render(
+        "merge.html.j2",
+        RUN,
+        names=[s.name for s in sessions],
+        problems=problems,
+        figures=[*after, _figure("Before the pose graph, from above", found, sessions, [s.before for s in sessions])],
+        table=_table(rows),
+        sessions_data=_sessions_data(sessions, ties),
+        map_figure=shown,
+        map_extent=None if view is None else view.extent,
+        map_note="",
+        cloud_data=cloud_data(sample),
+        colours=VIRIDIS,
+    )
     with atomic_write(path) as stream:
         stream.write(page.encode("utf-8", "replace"))
 
 
-def _figures(sessions: Sequence[SessionView], view: TopView | None) -> list[Figure]:
+def _tracks(sessions: Sequence[SessionView], positions: Sequence[Floats]) -> list[Track]:
     names = [s.name for s in sessions]
-    backdrop = None if view is None else (data_uri(density_png(view.image)), view.extent)
-    figures = []
-    for title, caption, positions in (
-        ("After the pose graph, from above", "On the map of all sessions.", [s.after for s in sessions]),
-        ("Before, from above", "Each session moved as a whole to where it was found.", [s.before for s in sessions]),
-    ):
-        tracks = [Track(name, p[:, :2], style_of(name, names)) for name, p in zip(names, positions, strict=True)]
-        chart = plane_chart(tracks, title.lower(), backdrop=backdrop if "After" in title else None)
-        figures.append(Figure(title, chart, tuple((t.style, t.label) for t in tracks), caption))
-    return figures
+    return [Track(name, p[:, :2], style_of(name, names)) for name, p in zip(names, positions, strict=True)]
+
+
+def _map(sessions: Sequence[SessionView], view: TopView) -> MapFigure | None:
+    tracks = _tracks(sessions, [s.after for s in sessions])
+    legend = [(t.style, t.label) for t in tracks]
+    return map_figure(view.image, view.heights, view.extent, tracks, legend, f"World of {sessions[0].name}.")
+
+
+def _figure(title: str, caption: str, sessions: Sequence[SessionView], positions: Sequence[Floats]) -> Figure:
+    tracks = _tracks(sessions, positions)
+    return Figure(title, plane_chart(tracks, title.lower()), tuple((t.style, t.label) for t in tracks), caption)
+
+
+def _sessions_data(sessions: Sequence[SessionView], ties: Floats) -> dict[str, Any]:
+    """What the script draws over the points: each session's positions and the numbers of its scans, and the loops."""
+    names = [s.name for s in sessions]
+    shown = []
+    for s in sessions:
+        some = slice(None, None, -(-len(s.after) // MOST_POSES) or 1)
+        own = {"positions": packed(s.after[some], "<f4"), "index": packed(s.scans[some], "<i4")}
+        shown.append({"name": s.name, "style": style_of(s.name, names), **own})
+    return {"sessions": shown, "ties": packed(ties, "<f4"), "tied": len(ties)}
 
 
 def _table(rows: Sequence[Mapping[str, Any]]) -> Table:

@@ -1,5 +1,6 @@
 "use strict";
-// What is drawn over the points of the map: ground truth, trajectory, loops, failed scans, the marked scan, scale and axes.
+// What is drawn over the points of the map: ground truth, trajectory, loops, failed scans, the marked scan, scale and axes;
+// of merged runs the trajectory of each, and the loops between them.
 
 function drawOver(pen, view, axes) {
   const style = getComputedStyle(view.figure);
@@ -7,6 +8,7 @@ function drawOver(pen, view, axes) {
   pen.lineJoin = "round";
   pen.font = "12px system-ui, sans-serif";
   if (scans) drawWay(pen, view, colour);
+  if (sessions) drawSessions(pen, view, colour);
   drawScale(pen, view, colour);
   drawAxes(pen, view, axes, colour);
 }
@@ -75,6 +77,38 @@ function drawMarked(pen, view, sign, colour) {
   sign(marked, colour("ink"), (x, y) => pen.arc(x, y, 7, 0, 7));
 }
 
+/** Merged runs: where each went, where they are tied, and the scan under the pointer. */
+function drawSessions(pen, view, colour) {
+  const paper = colour("paper");
+  for (const session of sessions.sessions) {
+    session.way = view.project(session.positions);
+    stroke(pen, session.way, getComputedStyle(view.figure.querySelector(`.legend .${session.style}`)).color, paper, 2);
+  }
+  const ends = view.project(sessions.ties);
+  for (let i = 0; i < ends.length; i += 4) stroke(pen, ends.subarray(i, i + 4), colour("ink"), null, 1);
+  if (!view.pointed) return;
+  const { session, k } = view.pointed;
+  const [x, y] = [session.way[2 * k], session.way[2 * k + 1]];
+  pen.beginPath();
+  pen.arc(x, y, 6, 0, 7);
+  [pen.fillStyle, pen.strokeStyle, pen.lineWidth] = [colour("ink"), paper, 1.5];
+  pen.fill();
+  pen.stroke();
+  const text = `${session.name}, scan ${session.index[k]}`;
+  label(pen, text, clamp(x, pen.measureText(text).width / 2 + 4, view.width - pen.measureText(text).width / 2 - 4), y - 12, colour);
+}
+
+/** The scan of a merged run that is seen nearest to px; null further away than 30. */
+function sessionAt(x, y) {
+  let [found, least] = [null, 30];
+  for (const session of sessions.sessions) {
+    const k = nearestBy(Float32Array.from({ length: session.index.length }, (_, i) => Math.hypot(session.way[2 * i] - x, session.way[2 * i + 1] - y)), 0);
+    const away = k < 0 ? Infinity : Math.hypot(session.way[2 * k] - x, session.way[2 * k + 1] - y);
+    if (away < least) [found, least] = [{ session, k }, away];
+  }
+  return found;
+}
+
 /** A bar of a round length, which from above is true everywhere, in 3D at the centre. */
 function drawScale(pen, view, colour) {
   const power = 10 ** Math.floor(Math.log10(120 * view.metres));
@@ -103,5 +137,13 @@ function drawAxes(pen, view, { right, up }, colour) {
   });
 }
 
+/** Merged runs with their positions; null on the page of one. */
+const sessions = (() => {
+  const data = read("sessions");
+  if (!data) return null;
+  data.ties = unpack(data.ties, Float32Array);
+  for (const session of data.sessions) [session.positions, session.index] = [unpack(session.positions, Float32Array), unpack(session.index, Int32Array)];
+  return data;
+})();
 const cloudOfMap = read("cloud");
 const mapView = cloudOfMap && new MapView(document.getElementById("map"), cloudOfMap);

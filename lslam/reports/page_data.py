@@ -44,15 +44,15 @@ def scan_data(record: RunRecord, evaluation: Evaluation | None) -> dict[str, Any
     data: dict[str, Any] = {
         "count": len(trajectory),
         "first_stamp_ns": str(int(trajectory.stamps_ns[0])),
-        "stamps": _packed(trajectory.stamps_ns - trajectory.stamps_ns[0], "<f8"),
-        "index": _packed(np.array([-1 if r is None else r.index for r in results]), "<i4"),
-        "positions": _packed(trajectory.positions, "<f4"),
-        "angles": _packed(_angles_deg(trajectory.poses), "<f4"),
-        "way": _packed(trajectory.path_lengths, "<f4"),
-        "status": _packed(np.array([_status(r) for r in results]), "u1"),
+        "stamps": packed(trajectory.stamps_ns - trajectory.stamps_ns[0], "<f8"),
+        "index": packed(np.array([-1 if r is None else r.index for r in results]), "<i4"),
+        "positions": packed(trajectory.positions, "<f4"),
+        "angles": packed(_angles_deg(trajectory.poses), "<f4"),
+        "way": packed(trajectory.path_lengths, "<f4"),
+        "status": packed(np.array([_status(r) for r in results]), "u1"),
         "statuses": STATUSES,
         "flags": FLAGS,
-        "posed_by": _packed(np.array([names.index(who) if who else len(names) for who in posers]), "u1"),
+        "posed_by": packed(np.array([names.index(who) if who else len(names) for who in posers]), "u1"),
         "posers": names,
         "reasons": {
             str(k): r.reason[:LONGEST_REASON] for k, r in enumerate(results) if r is not None and r.status != "ok"
@@ -73,17 +73,17 @@ def _truth(trajectory: Trajectory, evaluation: Evaluation) -> dict[str, Any]:
     some = evaluation.gt_positions[:: -(-len(evaluation.gt_positions) // MOST_TRUTH)]
     return {
         "alignment": absolute.alignment,
-        "error": _packed(error, "<f4"),
-        "truth_way": _packed(way, "<f4"),
+        "error": packed(error, "<f4"),
+        "truth_way": packed(way, "<f4"),
         "aligned": np.column_stack([absolute.scale * T[:3, :3], T[:3, 3]]).tolist(),
-        "truth": _packed(se3.apply(se3.inverse(T), some) / absolute.scale, "<f4"),
+        "truth": packed(se3.apply(se3.inverse(T), some) / absolute.scale, "<f4"),
     }
 
 
-def cloud_data(cloud: ArrayCloud | None, trajectory: Trajectory) -> dict[str, Any] | None:
+def cloud_data(cloud: ArrayCloud | None, trajectory: Trajectory | None = None) -> dict[str, Any] | None:
     """Some points of the map for the script; None without any.
 
-    points : (M, 3) int16 q, where a coordinate is `low` + `step` (q + 32768), m; nearest : (M,) the pose whose place is nearest
+    points : (M, 3) int16 q, where a coordinate is `low` + `step` (q + 32768), m; nearest : (M,) the nearest pose
     height, values : range of colours; intensity : (M,) 0 to 255 over their usual range, when the map has them
     """
     if cloud is None:
@@ -97,7 +97,7 @@ def cloud_data(cloud: ArrayCloud | None, trajectory: Trajectory) -> dict[str, An
     quanta = np.rint((points - low) / step) - (QUANTA + 1) // 2
     data: dict[str, Any] = {
         "count": len(points),
-        "points": _packed(quanta, "<i2"),
+        "points": packed(quanta, "<i2"),
         "low": low.tolist(),
         "step": step.tolist(),
         "height": usual_range(points[:, 2]),
@@ -106,10 +106,10 @@ def cloud_data(cloud: ArrayCloud | None, trajectory: Trajectory) -> dict[str, An
     if cloud.intensity is not None and np.ptp(cloud.intensity[finite]) > 0:
         values = cloud.intensity[finite].astype(np.float64)
         least, most = usual_range(values)
-        data["intensity"] = _packed(np.rint(255 * np.clip((values - least) / (most - least), 0, 1)), "u1")
+        data["intensity"] = packed(np.rint(255 * np.clip((values - least) / (most - least), 0, 1)), "u1")
         data["values"] = [least, most]
-    if len(trajectory):
-        data["nearest"] = _packed(_nearest(points, trajectory.positions), "<u2" if len(trajectory) <= QUANTA else "<u4")
+    if trajectory is not None and len(trajectory):
+        data["nearest"] = packed(_nearest(points, trajectory.positions), "<u2" if len(trajectory) <= QUANTA else "<u4")
     return data
 
 
@@ -156,5 +156,6 @@ def _angles_deg(poses: Floats) -> Floats:
     return angles
 
 
-def _packed(values: NDArray[Any], kind: str) -> str:
+def packed(values: NDArray[Any], kind: str) -> str:
+    """Base64 of an array in one of numpy's little-endian kinds."""
     return base64.b64encode(np.ascontiguousarray(values).astype(kind).tobytes()).decode("ascii")

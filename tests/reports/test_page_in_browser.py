@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 from comparisons import comparison, drawing
+from merged_sessions import sessions, write
 
 from lslam.evaluation.evaluate import evaluate
 from lslam.evaluation.results import Evaluation
@@ -296,3 +297,21 @@ def test_a_comparison_zooms(browser: Any, tmp_path: Path) -> None:
     before = [tick.text for tick in chart.find_elements("css selector", "g.ticks text")]
     chart.send_keys("+++")
     assert [tick.text for tick in chart.find_elements("css selector", "g.ticks text")] != before
+
+
+def test_merged_runs_lie_on_one_map_and_the_pointer_names_session_and_scan(browser: Any, tmp_path: Path) -> None:
+    load(browser, write(tmp_path / "merge.html"))
+    assert browser.get_log("browser") == []
+    bare = picture(browser)
+    click(browser, "[data-do=turn]")
+    assert (bare != picture(browser)).any(axis=2).mean() > MOVED
+    click(browser, "[data-do=flat]")
+    place = sessions()[1].after[31]
+    x, y = browser.execute_script("return [...mapView.project(arguments[0])]", place.tolist())
+    hover(browser, find(browser, "canvas.lines"), x, y)
+    name, scan = browser.execute_script(
+        "const { session, k } = mapView.pointed; return [session.name, session.index[k]]"
+    )
+    assert (name, scan) == ("tuesday", 231)
+    disc = picture(browser)[round(y) - 2 : round(y) + 3, round(x) - 2 : round(x) + 3]
+    assert disc.max() < 80  # of ink, on a light floor
