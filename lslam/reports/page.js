@@ -116,9 +116,11 @@ function nearestBy(values, value) {
 
 /**
  * Wheel, drag, pinch and keys on an element. `on` has zoom(factor, x, y, event), pan(dx, dy, event), reset() and, where
- * scans are marked, hover(x, y); px within the element. The wheel scrolls the page until the element was clicked.
+ * something is marked, hover(x, y), px within the element, and step(by) where that is no scan. The wheel scrolls the page
+ * until the element was clicked.
  */
 function gestures(element, on) {
+  const step = on.step || ((by) => mark(marked + by));
   const pointers = new Map();
   let spread = 0;
   const at = (event) => {
@@ -173,7 +175,7 @@ function gestures(element, on) {
       0: () => on.reset(), Home: () => on.reset(),
       ArrowLeft: () => on.pan(40, 0, event), ArrowRight: () => on.pan(-40, 0, event),
       ArrowUp: () => on.pan(0, 40, event), ArrowDown: () => on.pan(0, -40, event),
-      ",": () => mark(marked - 1), ".": () => mark(marked + 1), Escape: () => element.blur(),
+      ",": () => step(-1), ".": () => step(1), Escape: () => element.blur(),
     }[event.key];
     if (!done) return;
     event.preventDefault();

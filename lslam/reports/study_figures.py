@@ -13,6 +13,7 @@ from lslam.config.units import unit_of, with_unit
 from lslam.evaluation.curves import FLAT, NOT_REGISTRATION, normalise, registration_ms
 from lslam.evaluation.laws import band
 from lslam.reports.picture import COLOURS, house_style, label, pictures
+from lslam.reports.picture_points import PicturePoint, picture_points
 from lslam.types.sensitivity import CurveResult, Floats, Law, StudyResult
 from lslam.types.study import StudyRow
 
@@ -41,19 +42,22 @@ _LAW = (
 _EFFICIENCY = (
     "Median over seeds, each curve over its own largest; a lost run counts as 0; squares: within 10 % of the largest."
 )
+_LOST = "more than half of the runs lost"
 _LEGEND_WIDTH = 130  # characters of a line, with six for each handle
 _LOG_RATIO = 30.0  # of the largest to the smallest error, above which the axis is logarithmic
 
 
 @dataclass(frozen=True)
 class StudyFigure:
-    """One figure as files: `name` is that of the files; `caption` says how it is made and which of Girolimetto's it repeats."""
+    """One figure as files: `name` is that of the files; `caption` says how it is made and which of Girolimetto's it repeats;
+    `points` say what is drawn where."""
 
     name: str
     title: str
     caption: str
     png: bytes
     svg: bytes
+    points: list[PicturePoint]
 
 
 def study_figures(result: StudyResult) -> Iterator[StudyFigure]:
@@ -68,7 +72,8 @@ def study_figures(result: StudyResult) -> Iterator[StudyFigure]:
                 continue
             of_thesis = THESIS.get(result.parameters[0], {}).get(name, "")
             more = f" Girolimetto, figure {of_thesis}." if of_thesis else ""
-            yield StudyFigure(name, title, caption + more, *pictures(figure, ("png", "svg")))
+            png, svg = pictures(figure, ("png", "svg"))
+            yield StudyFigure(name, title, caption + more, png, svg, picture_points(figure, _LOST))
 
 
 def _errors(figure: Any, result: StudyResult, shown: Sequence[CurveResult]) -> bool:
@@ -107,7 +112,7 @@ def _stages(figure: Any, result: StudyResult, shown: Sequence[CurveResult]) -> b
             plot.plot(r.curve.values, means.mean, ".-", color=COLOURS[names.index(name) % len(COLOURS)], label=name)
         plot.set_title(r.curve.label, fontsize=9)
         _abscissa(plot, r)
-        label(plot, with_unit(result.parameters[0]), "ms per scan" if plot is plots[0] else "")
+        label(plot, with_unit(result.parameters[0]), "time per scan, ms" if plot is plots[0] else "")
     plots[0].set_ylim(bottom=0)  # shared; before the last panel is drawn it would fix the top as well
     _legend(figure, *plots)
     return True
@@ -144,7 +149,9 @@ def _quantity(
             lost, height = values[r.curve.is_lost], 1.0 + 0.03 * rows_of_crosses
             rows_of_crosses += 1
             above = {"transform": plot.get_xaxis_transform(), "clip_on": False}
-            plot.plot(lost, np.full(len(lost), height), "x", ms=4, color=look["color"], **above)
+            plot.plot(
+                lost, np.full(len(lost), height), "x", ms=4, color=look["color"], label=f"_{r.curve.label}", **above
+            )
         half = means.high - means.mean
         # Below zero there is nothing, and a logarithmic axis could not draw it.
         below = np.minimum(half, 0.999 * means.mean)
@@ -239,7 +246,7 @@ def draw_laws(figure: Any, result: StudyResult, shown: Sequence[CurveResult]) ->
         if law.kind == "product":
             _product(upper, lower, law, name)
         else:
-            _single(upper, lower, law, f"{name}: {law.text} s, R2 {law.r2:.3f}", colours[name])
+            _single(upper, lower, law, name, colours[name])
         lower.axhline(0, color="0.5", lw=0.8)
         label(upper, "", "total time, s")
         label(lower, with_unit(law.names[0]), "residual, %")
@@ -250,14 +257,14 @@ def draw_laws(figure: Any, result: StudyResult, shown: Sequence[CurveResult]) ->
     return True
 
 
-def _single(upper: Any, lower: Any, law: Law, name: str, colour: str) -> None:
+def _single(upper: Any, lower: Any, law: Law, curve: str, colour: str) -> None:
     x = law.points[:, 0]
     line = np.linspace(x.min(), x.max(), SAMPLES)
     fitted, half = band(law, line)
-    upper.plot(x, law.observed, "o", ms=3.5, color=colour)
-    upper.plot(line, fitted, color=colour, lw=1.2, label=name)
+    upper.plot(x, law.observed, "o", ms=3.5, color=colour, label=f"_{curve}")
+    upper.plot(line, fitted, color=colour, lw=1.2, label=f"{curve}: {law.text} s, R2 {law.r2:.3f}")
     upper.fill_between(line, fitted - half, fitted + half, color=colour, alpha=0.2, lw=0)
-    lower.plot(x, 100 * law.residuals, "o", ms=3, color=colour)
+    lower.plot(x, 100 * law.residuals, "o", ms=3, color=colour, label=f"_{curve}")
 
 
 def _product(upper: Any, lower: Any, law: Law, name: str) -> None:
@@ -271,10 +278,11 @@ def _product(upper: Any, lower: Any, law: Law, name: str) -> None:
         x = law.points[own, 0]
         line = np.linspace(x.min(), x.max(), SAMPLES)
         fitted, half = band(law, np.stack([line, np.full(SAMPLES, second)], 1))
-        upper.plot(x, law.observed[own], "o", ms=3, color=colour)
-        upper.plot(line, fitted, lw=1.1, color=colour, label=f"{key} {second:g} {unit}".rstrip())
+        curve = f"{key} {second:g} {unit}".rstrip()
+        upper.plot(x, law.observed[own], "o", ms=3, color=colour, label=f"_{curve}")
+        upper.plot(line, fitted, lw=1.1, color=colour, label=curve)
         upper.fill_between(line, fitted - half, fitted + half, color=colour, alpha=0.2, lw=0)
-        lower.plot(x, 100 * law.residuals[own], "o", ms=2.5, color=colour)
+        lower.plot(x, 100 * law.residuals[own], "o", ms=2.5, color=colour, label=f"_{curve}")
     upper.set_title(f"{name}: {law.text} s, R2 {law.r2:.3f}", fontsize=9)
 
 

@@ -17,12 +17,16 @@ import numpy as np
 import pytest
 from comparisons import comparison, drawing
 from merged_sessions import sessions, write
+from study_rows import study_rows
 
 from lslam.evaluation.evaluate import evaluate
 from lslam.evaluation.results import Evaluation
+from lslam.evaluation.sensitivity import evaluate_study
 from lslam.reports.colours import palette
 from lslam.reports.compare_html import write_page
 from lslam.reports.html import write_report
+from lslam.reports.picture import COLOURS
+from lslam.reports.study_html import write_study_files
 from lslam.types.cloud import ArrayCloud
 from lslam.types.run_record import RunRecord
 
@@ -315,3 +319,28 @@ def test_merged_runs_lie_on_one_map_and_the_pointer_names_session_and_scan(brows
     assert (name, scan) == ("tuesday", 231)
     disc = picture(browser)[round(y) - 2 : round(y) + 3, round(x) - 2 : round(x) + 3]
     assert disc.max() < 80  # of ink, on a light floor
+
+
+def test_a_figure_of_a_study_says_the_value_under_the_pointer(browser: Any, tmp_path: Path) -> None:
+    rows = study_rows()
+    write_study_files(tmp_path, evaluate_study(rows), rows, "study")
+    load(browser, tmp_path / "report.html", 1000)
+    assert browser.get_log("browser") == []
+    frame = find(browser, ".picture")
+    points = browser.execute_script("return JSON.parse(arguments[0].querySelector('script').textContent)", frame)
+    x, y, text = next(p for p in points if p[2].startswith("loam+imu, input.skip_frames 3"))
+    size = frame.rect
+    hover(browser, frame, x * size["width"], y * size["height"])
+    # Both curves have it.
+    assert find(browser, ".told").text == f"{text.replace('loam+imu', 'icp')}; {text}"
+    frame.click()
+    frame.send_keys("+.")
+    settle(browser)
+    assert find(browser, ".told").text.startswith("icp, input.skip_frames 4")
+    # Zoomed: the ring lies about the next point of the curve.
+    ring = find(browser, ".ring").rect
+    around = picture(browser, ".ring")
+    assert (ring["width"], ring["height"]) == (15, 15)
+    middle = around[6:9, 6:9].reshape(-1, 3)
+    curve = [int(COLOURS[1][i : i + 2], 16) for i in (1, 3, 5)]  # drawn last
+    assert np.abs(middle - curve).max(axis=1).min() < 60

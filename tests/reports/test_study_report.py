@@ -11,38 +11,22 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
+from study_rows import SHARE, SKIP, row, study_rows
 
 from lslam.config.finding import ExpectedFinding
 from lslam.evaluation.sensitivity import evaluate_study
+from lslam.reports.picture import COLOURS
 from lslam.reports.study_figures import StudyFigure, study_figures
 from lslam.reports.study_html import timing_notes, write_study_files
 from lslam.reports.study_table import means_grid, study_tables
 from lslam.types.sensitivity import StudyResult
 from lslam.types.study import StudyRow
 
-SKIP, SHARE = "input.skip_frames", "preprocess.random_share"
-
-
-def row(value: float, seed: int, method: str, uses_imu: bool = False, **more: object) -> StudyRow:
-    """Error 0.5 m, 2 deg and 100 ms per scan in two stages at any value, total time 40 / value."""
-    plain = StudyRow(
-        f"{method}-{uses_imu}-{value}-{seed}", "skip", "open", seed, method, uses_imu, {SKIP: value}, status="done",
-        thesis_rmse=0.5, metric="thesis_rmse", angular_rmse_deg=2.0, scans=100,
-        stages_ms={"read": 5.0, "scan": 60.0, "map": 40.0}, total_time_s=40.0 / value, fallback_share=0.125,
-    )  # fmt: skip
-    return replace(plain, **more)  # type: ignore[arg-type]
-
 
 @pytest.fixture(scope="module")
 def rows() -> list[StudyRow]:
-    """Two methods over 8 values and 2 seeds, the first lost from 6 on; one run failed, one lies beside."""
-    out = []
-    for value in range(1, 9):
-        for seed in (0, 1):
-            lost = {"status": "diverged", "reason": "lost <the> motion"} if value > 5 else {}
-            out += [row(value, seed, "icp", **lost), row(value, seed, "loam", uses_imu=True)]
-    out.append(row(9, 0, "loam", uses_imu=True, status="crashed", reason="killed & gone_by 100%"))
-    return [*out, row(1, 0, "kiss-icp", parameters={}, is_beside=True, thesis_rmse=0.25)]
+    return study_rows()
 
 
 @pytest.fixture(scope="module")
@@ -70,6 +54,24 @@ def test_every_figure_is_written_as_png_and_svg(folder: Path) -> None:
     for name in names:
         assert (folder / "figures" / f"{name}.png").read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
         ET.fromstring((folder / "figures" / f"{name}.svg").read_text())
+
+
+def test_every_point_lies_where_its_curve_is_drawn_and_says_what_it_is(figures: dict[str, StudyFigure]) -> None:
+    for name in ("errors", "times", "stages", "law", "efficiency"):
+        drawn = np.asarray(Image.open(io.BytesIO(figures[name].png)).convert("RGB"), int)
+        height, width = drawn.shape[:2]
+        colours = np.array([[int(c[i : i + 2], 16) for i in (1, 3, 5)] for c in COLOURS])
+        for x, y, text in figures[name].points:
+            column, line = round(x * width - 0.5), round(y * height - 0.5)
+            around = drawn[max(line - 2, 0) : line + 3, max(column - 2, 0) : column + 3].reshape(-1, 3)
+            assert np.abs(around[:, None] - colours).max(axis=2).min() < 60, (name, text)
+    texts = {point.text for point in figures["errors"].points}
+    assert {"loam+imu, input.skip_frames 3, rmse of translation 0.5 ± 0 m", "icp, input.skip_frames 6, lost"} <= {
+        text.replace("more than half of the runs lost", "lost") for text in texts
+    }
+    assert len(texts) == 2 * (8 + 5 + 3) - 3  # a cross is in both plots
+    assert "icp, map, input.skip_frames 2, time per scan 40 ms" in {p.text for p in figures["stages"].points}
+    assert "loam+imu, input.skip_frames 4, total time 10 s" in {p.text for p in figures["law"].points}
 
 
 def test_keys_of_one_name_in_two_sections_have_figures_of_their_own(tmp_path: Path) -> None:
