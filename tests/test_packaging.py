@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import importlib
 import json
+import os
 import re
 import resource
 import shlex
@@ -237,6 +238,35 @@ def test_commands_load_only_what_they_need(arguments: list[str], unwanted: set[s
     done = subprocess.run([sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert done.stderr.splitlines()[-1] == "loaded []"
+
+
+@pytest.mark.parametrize(
+    ("tool", "folder", "programs"),
+    [("pipx", "PIPX_HOME", "PIPX_BIN_DIR"), ("uv", "UV_TOOL_DIR", "UV_TOOL_BIN_DIR")],
+)
+def test_installers_of_programs_install_a_command_that_runs(
+    tool: str, folder: str, programs: str, tmp_path: Path
+) -> None:
+    """Where they are: they install into an environment of their own."""
+    if shutil.which(tool) is None:
+        pytest.skip(f"no {tool}")
+    source = tmp_path / "source"
+    for path in files():
+        if path.is_relative_to(ROOT / "lslam") or path.parent == ROOT:
+            (source / path.relative_to(ROOT)).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy(path, source / path.relative_to(ROOT))
+    words = {
+        "pipx": ["pipx", "install", "--python", sys.executable],
+        "uv": ["uv", "tool", "install", "--python", sys.executable],
+    }
+    env = {**os.environ, folder: str(tmp_path / "tools"), programs: str(tmp_path / "bin")}
+    env.pop("PYTHONPATH", None)
+    done = subprocess.run([*words[tool], str(source)], env=env, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    sample = (str(tmp_path / "bin" / "lslam"), "run", str(ROOT / "sample_data"), "--count", "5", "--json", "-q")
+    run = subprocess.run([*sample, "--out", "run"], env=env, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert run.returncode == 0, run.stderr
+    assert json.loads(run.stdout)["manifest"]["counts"]["ok"] == 5
 
 
 def test_help_is_instant() -> None:
