@@ -72,25 +72,30 @@ def _map(figure: Any, run: PlottedRun) -> None:
 
 
 def _trajectory(figure: Any, run: PlottedRun) -> None:
-    above, deep = figure.add_subplot(1, 2, 1), figure.add_subplot(1, 2, 2, projection="3d")
-    lines = [("estimate", run.trajectory.positions, COLOURS[0])]
+    from matplotlib.ticker import MaxNLocator
+
+    above, deep = figure.add_subplot(2, 1, 1), figure.add_subplot(2, 1, 2, projection="3d")
+    # One over the other, the wider below: where they coincide, all are seen.
+    lines = [("estimate", run.trajectory.positions, COLOURS[0], 0.7)]
     if run.odometry is not None:
-        lines.append(("odometry", run.odometry.positions, COLOURS[1]))
+        lines.insert(0, ("odometry", run.odometry.positions, COLOURS[1], 1.6))
     absolute = first_available(run.evaluation)
     if run.evaluation is not None and absolute is not None:
         truth = se3.apply(se3.inverse(absolute.T_gt_est), run.evaluation.gt_positions) / absolute.scale
-        lines.insert(0, ("ground truth", truth, "black"))
-    for name, positions, colour in lines:
-        _line(above, positions, colour, name)
-        deep.plot(*positions.T, color=colour, lw=0.8)
+        lines.insert(0, ("ground truth", truth, "0.7", 3.0))
+    for name, positions, colour, width in lines:
+        above.plot(*positions[:, :2].T, color=colour, lw=width, label=name)
+        deep.plot(*positions.T, color=colour, lw=width)
     above.plot(*run.trajectory.positions[0, :2], "o", color="black", ms=3)
     _legend(figure, above)
     _from_above(above)
     size = np.ptp(run.trajectory.positions, axis=0)
-    deep.set_box_aspect(np.maximum(size, 0.3 * size.max()) + 1e-9, zoom=0.7)
+    deep.set_box_aspect(np.maximum(size, 0.3 * size.max()) + 1e-9, zoom=0.95)
     deep.set(xlabel="x, m", ylabel="y, m", zlabel="z, m")
-    for axis, ticks in (("x", 3), ("y", 3), ("z", 2)):
-        deep.locator_params(axis=axis, nbins=ticks)
+    for axis, ticks in ((deep.xaxis, 4), (deep.yaxis, 4), (deep.zaxis, 3)):
+        axis.set_major_locator(MaxNLocator(ticks))
+        axis.set_tick_params(pad=0)
+        axis.labelpad = -4 if axis is deep.zaxis else 0  # outside the figure else
 
 
 def _errors(figure: Any, run: PlottedRun) -> None:
@@ -141,12 +146,14 @@ def _features(figure: Any, run: PlottedRun) -> None:
     scan.plot(*view.planes.T, ".", ms=1.5, color=COLOURS[0], label="planar")
     scan.plot(*view.edges.T, ".", ms=1.5, color=COLOURS[1], label="edge")
     scan.set_title(f"scan {view.scan}", fontsize="medium")
-    scan.legend(loc="best", frameon=False, markerscale=4)
-    whole.plot(*_some(view.map_planes)[:, :2].T, ",", color=COLOURS[0])
-    whole.plot(*_some(view.map_edges)[:, :2].T, ",", color=COLOURS[1])
+    planes, edges = _some(view.map_planes)[:, :2], _some(view.map_edges)[:, :2]
+    whole.plot(*planes.T, ",", color=COLOURS[0])
+    whole.plot(*edges.T, ",", color=COLOURS[1])
     whole.set_title("feature map", fontsize="medium")
-    for plot in (scan, whole):
+    _legend(figure, scan, markerscale=4)
+    for plot, shown in ((scan, np.concatenate([view.planes, view.edges])), (whole, np.concatenate([planes, edges]))):
         _from_above(plot)
+        _about(plot, shown)
 
 
 def _buildings(figure: Any, run: PlottedRun) -> None:
@@ -182,10 +189,23 @@ def _points(plot: Any, run: PlottedRun, T: Floats | None = None) -> Any:
     )  # fmt: skip
 
 
-def _legend(figure: Any, plot: Any) -> None:
+def _legend(figure: Any, plot: Any, markerscale: float = 1.0) -> None:
     """Above all plots, where no line runs."""
     lines, names = plot.get_legend_handles_labels()
-    figure.legend(lines, names, loc="outside upper center", ncol=4, frameon=False, handlelength=1.2, columnspacing=1.0)
+    figure.legend(
+        lines, names, loc="outside upper center", ncol=4, frameon=False, handlelength=1.2, columnspacing=1.0,
+        markerscale=markerscale,
+    )  # fmt: skip
+
+
+def _about(plot: Any, points: Floats) -> None:
+    """A square about points (N, 2) but for the 2 % furthest out each way, which would press the others together."""
+    if not len(points):
+        return
+    low, high = np.percentile(points, [2, 98], axis=0)
+    middle, half = (low + high) / 2, 0.6 * max(*(high - low), 1.0)
+    plot.set_aspect("equal", adjustable="box")
+    plot.set(xlim=(middle[0] - half, middle[0] + half), ylim=(middle[1] - half, middle[1] + half))
 
 
 def _some(points: NDArray[Any]) -> NDArray[Any]:
@@ -203,6 +223,6 @@ def _from_above(plot: Any, x: str = "x, m", y: str = "y, m") -> None:
 
 # name -> (what draws it, its height as a share of its width)
 FIGURES = {
-    "map": (_map, 0.8), "trajectory": (_trajectory, 0.55), "errors": (_errors, 0.75), "features": (_features, 0.55),
+    "map": (_map, 0.8), "trajectory": (_trajectory, 1.3), "errors": (_errors, 0.75), "features": (_features, 0.55),
     "imu": (_imu, 1.1), "buildings": (_buildings, 0.9),
 }  # fmt: skip
