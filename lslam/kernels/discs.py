@@ -18,13 +18,15 @@ EXTENT2 = 1.0
 
 
 @inline
-def disc(nx: float, ny: float, nz: float, thin: float) -> tuple[float, float, float, float, float, float]:
-    """Covariance xx, xy, xz, yy, yz, zz, m2, of a disc with unit normal n and variance `thin` along it."""
-    a = EXTENT2 - thin
+def disc(
+    nx: float, ny: float, nz: float, thin: float, extent2: float
+) -> tuple[float, float, float, float, float, float]:
+    """Covariance xx, xy, xz, yy, yz, zz, m2, of a disc with unit normal n: variance `thin` along it, `extent2` across."""
+    a = extent2 - thin
     return (
-        EXTENT2 - a * nx * nx, -a * nx * ny, -a * nx * nz,
-        EXTENT2 - a * ny * ny, -a * ny * nz,
-        EXTENT2 - a * nz * nz,
+        extent2 - a * nx * nx, -a * nx * ny, -a * nx * nz,
+        extent2 - a * ny * ny, -a * ny * nz,
+        extent2 - a * nz * nz,
     )  # fmt: skip
 
 
@@ -42,7 +44,7 @@ def source_discs(source: Floats, size: float, planes: Floats, keys: Longs, table
         s = find(pack(ix, iy, iz), keys, table)
         if s < 0 or planes[s, 7] < 0.0:
             continue
-        xx, xy, xz, yy, yz, zz = disc(planes[s, 3], planes[s, 4], planes[s, 5], thin)
+        xx, xy, xz, yy, yz, zz = disc(planes[s, 3], planes[s, 4], planes[s, 5], thin, EXTENT2)
         out[i, 0], out[i, 1], out[i, 2] = xx, xy, xz
         out[i, 3], out[i, 4], out[i, 5] = yy, yz, zz
         count += 1

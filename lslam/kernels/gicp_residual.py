@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.kernels.discs import disc
+from lslam.kernels.discs import EXTENT2, disc
 from lslam.kernels.facts import INFORMATION, INLIERS, LEVER, MATCHED, ROBUST, SQUARED
 from lslam.kernels.jit import kernel
 from lslam.kernels.linalg import invert_symmetric, rotate_symmetric
@@ -37,6 +37,8 @@ def linearise_gicp(points: tuple[Floats, Floats], voxels: Voxels, settings: Sett
     inverse = 1.0 / size
     unused = np.zeros(6)
     c2 = scale * scale
+    # A match may lie anywhere in its voxel: what is off sideways in a wide one says nothing.
+    extent2 = max(EXTENT2, size * size)
     for i in range(len(source)):
         if is_done[i]:
             continue
@@ -58,7 +60,7 @@ def linearise_gicp(points: tuple[Floats, Floats], voxels: Voxels, settings: Sett
         if p[7] >= 0.0:
             off = p[3] * (x - p[0]) + p[4] * (y - p[1]) + p[5] * (z - p[2])
             across = variance_of(p, off, best_d) + sigma2
-            dxx, dxy, dxz, dyy, dyz, dzz = disc(p[3], p[4], p[5], across)
+            dxx, dxy, dxz, dyy, dyz, dzz = disc(p[3], p[4], p[5], across, extent2)
             share, thin = plane_weight, across + sigma2
         else:
             dxx, dxy, dxz, dyy, dyz, dzz = p[6], 0.0, 0.0, p[6], 0.0, p[6]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.kernels.discs import disc
+from lslam.kernels.discs import EXTENT2, disc
 from lslam.kernels.facts import INFORMATION, INLIERS, LEVER, MATCHED, POPULATION, ROBUST, SQUARED
 from lslam.kernels.jit import kernel
 from lslam.kernels.linalg import invert_symmetric, rotate_symmetric
@@ -36,6 +36,8 @@ def linearise_vgicp(points: tuple[Floats, Floats], voxels: tuple[Floats, Floats,
     inverse = 1.0 / size
     unused = np.zeros(6)
     c2 = scale * scale
+    # A match may lie anywhere in its voxel: what is off sideways in a wide one says nothing.
+    extent2 = max(EXTENT2, size * size)
     for i in range(len(source)):
         if is_done[i]:
             continue
@@ -61,7 +63,7 @@ def linearise_vgicp(points: tuple[Floats, Floats], voxels: tuple[Floats, Floats,
             if best >= 0:
                 off = p[3] * ex + p[4] * ey + p[5] * ez
                 across = variance_of(p, off, ex * ex + ey * ey + ez * ez) + sigma2
-                dxx, dxy, dxz, dyy, dyz, dzz = disc(p[3], p[4], p[5], across)
+                dxx, dxy, dxz, dyy, dyz, dzz = disc(p[3], p[4], p[5], across, extent2)
                 n, thin = plane_weight * counts[v], across + sigma2
             else:
                 dxx, dxy, dxz, dyy, dyz, dzz = p[6], 0.0, 0.0, p[6], 0.0, p[6]

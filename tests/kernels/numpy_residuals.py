@@ -107,7 +107,7 @@ def disc_pairs(
     only_nearest: bool,
 ) -> list[Pair]:  # fmt: skip
     """G-ICP's pairs, or with all planes around VGICP's, whose weight is the voxel's count."""
-    out = []
+    out, extent2 = [], max(EXTENT2, target.size**2)
     for i, (s, six) in enumerate(zip(source, covariance, strict=True)):
         world = R @ s + t
         near = [(*kind_of(v, MIN_POINTS, PLANARITY), v.count) for v in around(target, world)]
@@ -120,7 +120,7 @@ def disc_pairs(
                 e = world - mean
                 beside2 = float(e @ e - (normal @ e) ** 2)
                 across = sigma2 + variance + TILT * slope * beside2
-                C_t = EXTENT2 * (np.eye(3) - np.outer(normal, normal)) + across * np.outer(normal, normal)
+                C_t = extent2 * (np.eye(3) - np.outer(normal, normal)) + across * np.outer(normal, normal)
                 metres2 = across + sigma2
             else:
                 C_t, metres2 = variance * np.eye(3), variance + sigma2

@@ -62,10 +62,14 @@ def surfaces(rng: np.random.Generator, n: int) -> Floats:
 
 @pytest.fixture(scope="module")
 def scene() -> Scene:
+    return scene_of(SIZE)
+
+
+def scene_of(size: float) -> Scene:
     rng = np.random.default_rng(0)
     cloud = surfaces(rng, 1500).astype(np.float32)
     shift = np.array([40.0, -25.0, 3.0])
-    target, reference = GaussianMap(SIZE), VoxelMap(SIZE)
+    target, reference = GaussianMap(size), VoxelMap(size)
     T = np.eye(4)
     T[:3, 3] = shift
     target.insert(cloud, T)
@@ -153,6 +157,11 @@ def test_normal_equations_are_those_of_numpy(scene: Scene, residual: str, c: flo
     assert found.facts[at.LEVER] == pytest.approx(lever, rel=1e-6)
     if residual == "vgicp":
         assert found.facts[at.POPULATION] == pytest.approx(sum(p.weight for p in pairs), rel=1e-9)
+
+
+@pytest.mark.parametrize("residual", ["gicp", "vgicp"])
+def test_discs_of_wide_voxels_are_as_wide_as_these(residual: str) -> None:
+    test_normal_equations_are_those_of_numpy(scene_of(3 * SIZE), residual, 0.5, np.inf)
 
 
 @pytest.mark.parametrize("residual", RESIDUALS)

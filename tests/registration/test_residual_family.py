@@ -80,6 +80,20 @@ def test_a_drive_through_the_room_is_followed(residual: Residual, target: str) -
     assert not is_near(np.eye(4), T, 1.0, 10.0)
 
 
+@pytest.mark.parametrize("residual", ["gicp", "vgicp"])
+def test_the_second_scan_of_a_drive_agrees_as_on_planes(residual: Residual) -> None:
+    """One scan makes few small planes: its points find wide voxels, and lie anywhere in them."""
+    drive = simulate("small-eight", seed=100, count=2, motion_compensated=True)
+    shares = {}
+    for name in ("plane", residual):
+        registration = Registration(RegistrationConfig(residual=name))
+        registration.register(drive.scan(0).points)
+        result = registration.register(drive.scan(1).points)
+        assert is_near(drive.ground_truth.poses[1], result.T_world_lidar, 0.03, 0.1)
+        shares[name] = result.inlier_share
+    assert shares[residual] > 0.8 * shares["plane"]
+
+
 @pytest.mark.parametrize("residual", ["point", "vgicp"])
 @pytest.mark.parametrize("seed", [0, 1])
 def test_rings_on_flat_ground_do_not_bias_the_velocity(residual: Residual, seed: int) -> None:
