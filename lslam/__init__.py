@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 from lslam.version import __version__
 
 if TYPE_CHECKING:
+    from lslam.config.load import load_config
     from lslam.evaluation.evaluate import evaluate
     from lslam.pipeline.run import run
     from lslam.readers import open_sequence
@@ -21,12 +22,13 @@ if TYPE_CHECKING:
     from lslam.simulation.scenarios import simulate
     from lslam.studies.from_python import compare
 
-__all__ = ["Registration", "__version__", "compare", "evaluate", "open_sequence", "run", "simulate"]
+__all__ = ["Registration", "__version__", "compare", "evaluate", "load_config", "open_sequence", "run", "simulate"]
 
 _HOMES = {
     "Registration": ("lslam.recovery.policies", "RecoveringRegistration"),
     "compare": ("lslam.studies.from_python", "compare"),
     "evaluate": ("lslam.evaluation.evaluate", "evaluate"),
+    "load_config": ("lslam.config.load", "load_config"),
     "open_sequence": ("lslam.readers", "open_sequence"),
     "run": ("lslam.pipeline.run", "run"),
     "simulate": ("lslam.simulation.scenarios", "simulate"),
@@ -41,3 +43,8 @@ def __getattr__(name: str) -> Any:
 
     module, attribute = _HOMES[name]
     return getattr(import_module(module), attribute)
+
+
+def __dir__() -> list[str]:
+    """What completion offers: the API, also before it is imported."""
+    return sorted(__all__)

@@ -179,3 +179,10 @@ def test_a_comparison_from_python_has_all_runs(tmp_path: Path) -> None:
     assert compared.table("csv").count("\n") == 2
     with pytest.raises(UsageError, match="exists"):
         lslam.compare([SAMPLE], ["icp"], out=tmp_path / "out")
+
+
+def test_completion_offers_the_api_and_settings_choose_the_method() -> None:
+    assert {"run", "open_sequence", "evaluate", "load_config", "simulate", "compare", "Registration"} <= set(dir(lslam))
+    assert all(hasattr(lslam, name) for name in dir(lslam))
+    outcome = lslam.run(SAMPLE, lslam.load_config(settings=["odometry.method=gicp", "input.count=4"]))
+    assert outcome.record.method == "gicp"

@@ -32,10 +32,12 @@ def run(
     Parameters
     ----------
     sequence : an open sequence, or what `open_sequence` takes
+    config : the method and every other key: `load_config(settings=["odometry.method=gicp", "map.voxel=0.1"])`
     out : the run folder, a URL for one in storage; None writes nothing and builds no map
     ground_truth : replaces the sequence's own
     reading : options that `open_sequence` took (topics, extrinsics), for the manifest: `lslam map` needs them
     overwrite : replace an earlier run in `out`; resume : go on where it was killed or interrupted, if there is one
+    command : what the manifest says the run was made by; watch : is told of progress, and may stop the run
 
     Raises
     ------

@@ -100,7 +100,7 @@ def back_end_figures(record: RunRecord, evaluation: Evaluation | None) -> list[F
         tracks.append(Track("ground truth", truth[:, :2], "gt"))
         legend.append(("gt", "ground truth"))
     captions = ["Estimate in its own world" + ("; ground truth moved to it." if tracks else ".")]
-    what = "localisation in the map" if record.map_fixes else "the pose graph"
+    what = "localisation" if record.map_fixes else "the pose graph"
     moved, pixel = most_moved(record), _extent(record) / WIDTH
     is_seen = moved > pixel
     if is_seen:
@@ -125,7 +125,7 @@ def back_end_figures(record: RunRecord, evaluation: Evaluation | None) -> list[F
     chart = plane_chart(tracks, f"before and after {what}", tallest=PLAN_HEIGHT, by="own")
     title = f"Before and after {what}" if is_seen else f"After {what}"
     whole = Figure(title, chart, tuple(legend), " ".join(captions))
-    return [whole, *_error_figures(evaluation), *loop_figures(record.loop_view)]
+    return [whole, *_error_figures(evaluation, what), *loop_figures(record.loop_view)]
 
 
 def most_moved(record: RunRecord) -> float:
@@ -163,8 +163,8 @@ def _common_alignment(after: Evaluation, before: Evaluation) -> str | None:
     return None
 
 
-def _error_figures(evaluation: Evaluation | None) -> list[Figure]:
-    """Position error before and after the pose graph over the way; nothing without ground truth."""
+def _error_figures(evaluation: Evaluation | None, what: str) -> list[Figure]:
+    """Position error before and after the pose graph, or `what` stands for it, over the way; nothing without ground truth."""
     if evaluation is None or evaluation.odometry is None:
         return []
     before = evaluation.odometry
@@ -173,11 +173,11 @@ def _error_figures(evaluation: Evaluation | None) -> list[Figure]:
         return []
     lines = [
         svg.Line(word, part.distance, np.linalg.norm(part.ate[name].errors, axis=1), style)
-        for word, part, style in (("odometry", before, "s2"), ("after the pose graph", evaluation, "s1"))
+        for word, part, style in (("odometry", before, "s2"), (f"after {what}", evaluation, "s1"))
     ]
-    title = "Position error before and after the pose graph"
+    title = f"Position error before and after {what}"
     chart = svg.line_chart(lines, DISTANCE, "position error, m", title, by="truth")
-    caption = f"{before_and_after(evaluation, before)}; {ALIGNED.get(name, name)}."
+    caption = f"{before_and_after(evaluation, before, what)}; {ALIGNED.get(name, name)}."
     return [Figure(title, chart, tuple((line.style, line.label) for line in lines), caption)] if chart else []
 
 

@@ -100,11 +100,11 @@ def building_tables(found: CorrectedMap, matches: OsmMatches) -> list[Table]:
     order = sorted(found.buildings, key=lambda c: (c.status == "unseen", -float(np.linalg.norm(c.displacement[:2]))))
     rows = tuple(_row(c) for c in order[:MOST_ROWS])
     counts = Counter(c.status for c in found.buildings)
-    east, north = found.shift
+    east, north = -found.shift
     recipe = (
         f"Real minus map, about the middle of each building; {counted(len(found.buildings), 'building')}: {counts['seen']} seen, "
-        f"{counts['unseen']} not, {counts['absent']} absent; the map as a whole is off by {east:+.2f} m east, {north:+.2f} m "
-        f"north; {counted(len(found.left), 'pair')} still overlap. Confidence: to stand within 0.5 m of there."
+        f"{counts['unseen']} not, {counts['absent']} absent; the map as a whole lies {east:+.2f} m east and {north:+.2f} m "
+        f"north of the run; {counted(len(found.left), 'pair')} still overlap. Confidence: to stand within 0.5 m of there."
     )
     header = ("building", "status", "east, m", "north, m", "turn, deg", "confidence", "matches", "given up")
     tables = [Table("Displacement of buildings", header, rows, recipe)]

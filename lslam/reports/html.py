@@ -16,6 +16,7 @@ from lslam.reports.colours import VIRIDIS
 from lslam.reports.facts import RunFacts, run_facts
 from lslam.reports.feature_view import feature_figures
 from lslam.reports.imu_figures import imu_figures
+from lslam.reports.localization import localization_rows
 from lslam.reports.map_view import MapFigure, map_figure
 from lslam.reports.page_data import cloud_data, scan_data
 from lslam.reports.shell import RUN, render, template
@@ -74,7 +75,8 @@ def render_report(record: RunRecord, evaluation: Evaluation | None) -> str:
         has_truth=record.ground_truth is not None,
         trajectory=plots.trajectory_figures(record, evaluation),
         back_end=back_end_figures(record, evaluation),
-        back_end_said=next((said for _, said in back_end_rows(record, evaluation)), ""),
+        back_end_title="In the map" if record.map_fixes else "Pose graph",
+        back_end_said=localization_rows(record, evaluation) + back_end_rows(record, evaluation),
         errors=plots.error_figures(evaluation) if evaluation is not None else [],
         tables=[] if evaluation is None else _metric_tables(evaluation),
         buildings=building_pages(record),

@@ -9,7 +9,7 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from lslam.errors import UsageError, nearest
+from lslam.errors import UsageError
 from lslam.formats.atomic import atomic_write
 from lslam.printable import printable
 
@@ -29,7 +29,7 @@ def check_plot_path(path: Path) -> None:
     """UsageError when the suffix of `path` names no picture format we write: asked before the work, not after."""
     kind = path.suffix.lstrip(".").lower()
     if kind not in FORMATS:
-        raise UsageError(f"--plot {path}: {nearest(kind, FORMATS) if kind else 'end the name with .png, .svg or .pdf'}")
+        raise UsageError(f"{path}: a picture ends with .png, .svg or .pdf")
 
 
 @contextmanager

@@ -31,6 +31,7 @@ ALIGNED = {
     "none": "not aligned",
 }
 Floats = NDArray[np.float64]
+SHADES = 8  # of the style sheet that are all different
 PLAN_HEIGHT = 340  # of one beside a chart
 # A limit further away than this many times the usual scan would press the stages flat: an arrow says where it is.
 LIMIT_IN_VIEW = 4.0
@@ -120,7 +121,7 @@ def time_figure(record: RunRecord, facts: RunFacts) -> Figure | None:
     index = np.array([r.index for r in record.results])
     chart, remark = stage_chart(index, seconds * 1e3, record.real_time_limit * 1e3, "time per scan and stage")
     caption = "Stages stacked; reading and preprocessing may overlap registration, so a scan takes at most this long."
-    legend = tuple((f"s{i % 6 + 1}", name) for i, name in enumerate(names))
+    legend = tuple((f"s{i % SHADES + 1}", name) for i, name in enumerate(names))
     return Figure("Time per scan", chart, legend, f"{caption} {remark}".strip(), is_area=True)
 
 
@@ -215,7 +216,7 @@ def share_bar(facts: RunFacts) -> str:
         width = 480 * stage.share
         name = escape(f"{stage_name}: {100 * stage.share:.1f} %")
         frame.add(
-            f'<rect class="area s{i % 6 + 1}" x="{x:.1f}" y="2" width="{width:.1f}" height="30"><title>{name}</title></rect>'
+            f'<rect class="area s{i % SHADES + 1}" x="{x:.1f}" y="2" width="{width:.1f}" height="30"><title>{name}</title></rect>'
         )
         if width > 34:
             frame.text(x + width / 2, 22, f"{100 * stage.share:.0f} %", "middle", "onbar")
@@ -268,7 +269,7 @@ def stage_chart(index: NDArray[Any], ms: Floats, limit: float, title: str) -> tu
     below = np.zeros(len(stacked))
     for layer in range(ms.shape[1]):
         above = stacked[:, layer]
-        frame.add(f'<path class="area s{layer % 6 + 1}" d="{_steps(frame, x, below, above, top)}"/>')
+        frame.add(f'<path class="area s{layer % SHADES + 1}" d="{_steps(frame, x, below, above, top)}"/>')
         below = above
     if highest is not None:
         frame.polyline(np.repeat(x, 2)[1:-1], np.minimum(np.repeat(highest, 2), top), "peak")

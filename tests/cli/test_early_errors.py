@@ -35,7 +35,7 @@ NOTHING = [
     (f"eval nowhere.tum {TRUTH}", "nowhere.tum does not exist"),
     (f"eval {TRUTH} {TRUTH} --align foo", "--align foo"),
     (f"eval {TRUTH} {TRUTH} --delta foo", "RPE distance 'foo'"),
-    (f"eval {TRUTH} {TRUTH} --plot x.foo", "--plot x.foo"),
+    (f"eval {TRUTH} {TRUTH} --plot x.foo", "x.foo: a picture ends with .png, .svg or .pdf"),
     (f"eval {TRUTH} {TRUTH} {TRUTH} --timing t.csv", "--timing belongs to one"),
     ("sweep skip-frames --jobs 0", "--jobs 0"),
     ("sweep --report nowhere", "nowhere/results.csv does not exist"),

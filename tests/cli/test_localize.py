@@ -52,7 +52,10 @@ def test_another_drive_is_found_and_followed_in_the_frame_of_the_map(drives: Pat
     assert [row["status"] for row in table] == ["held"] * 50
     assert np.allclose([[float(row[axis]) for axis in "xyz"] for row in table], est, atol=1e-3)
     assert not (tmp_path / "run" / "map.ply").exists()
-    assert "localisation" in (tmp_path / "run" / "report.html").read_text()
+    page = (tmp_path / "run" / "report.html").read_text()
+    assert "<h2>In the map</h2>" in page
+    assert "of the points agree" in page
+    assert "the pose graph</h3>" not in page
 
 
 def test_a_survey_in_projected_coordinates_keeps_them(drives: Path, tmp_path: Path) -> None:

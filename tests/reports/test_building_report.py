@@ -94,7 +94,7 @@ def test_the_tables_name_displacements_and_refusals() -> None:
     ]  # fmt: skip
     assert moves.rows[1][2:] == ("+0.10", "-0.20", "+0.57", "1.00", "4", "1")
     assert "4 buildings: 2 seen, 1 not, 1 absent" in moves.recipe
-    assert "+0.30 m east, -0.10 m north; 1 pair still overlap" in moves.recipe
+    assert "the map as a whole lies -0.30 m east and +0.10 m north of the run; 1 pair still overlap" in moves.recipe
     assert ("keyframe on the map", "… times as far from odometry as it may have drifted", "1") in verdicts.rows
     assert ("building on the walls seen", "another place fits nearly as well", "1") in verdicts.rows
     assert sum(int(row[2]) for row in verdicts.rows) == 8

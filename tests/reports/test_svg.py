@@ -11,6 +11,7 @@ import pytest
 
 from lslam.reports.plots import stage_chart
 from lslam.reports.png import density_png
+from lslam.reports.shell import template
 from lslam.reports.svg import Frame, Line, Track, finite_runs, line_chart, number, plane_chart, thin, ticks
 
 
@@ -165,3 +166,15 @@ def test_an_empty_density_image_is_transparent() -> None:
     image_module = pytest.importorskip("PIL.Image")
     picture = image_module.open(io.BytesIO(density_png(np.zeros((3, 3)))))
     assert np.asarray(picture.convert("RGBA"))[..., 3].max() == 0
+
+
+def test_every_stage_has_a_colour_of_its_own() -> None:
+    """Seven with an IMU; the style sheet must tell the classes apart, in light and dark."""
+    chart, _ = stage_chart(np.arange(20), np.ones((20, 7)), 0.0, "t")
+    classes = re.findall(r'class="area (s\d+)"', chart)
+    assert len(set(classes)) == 7
+    style = template("style.html.j2").render()
+    colours = dict(re.findall(r"\.(s\d+) \{ color: var\((--c\d)\); \}", style))
+    for part in style.split("prefers-color-scheme: dark", 1):
+        values = dict(re.findall(r"(--c\d): (#\w+)", part))
+        assert len({values[colours[name]] for name in classes}) == 7
