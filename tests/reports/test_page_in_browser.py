@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from comparisons import comparison, drawing
 from merged_sessions import sessions, write
-from study_rows import study_rows
+from reported_study import study_rows
 
 from lslam.evaluation.evaluate import evaluate
 from lslam.evaluation.results import Evaluation

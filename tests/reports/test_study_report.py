@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from study_rows import SHARE, SKIP, row, study_rows
+from reported_study import SHARE, SKIP, row, study_rows
 
 from lslam.config.finding import ExpectedFinding
 from lslam.evaluation.sensitivity import evaluate_study
