@@ -61,7 +61,9 @@ def tables(comparison: Comparison, width: int | None = None) -> list[CompareTabl
         if width is None or all(table.width <= width for table in out):
             break
     return out + [
-        table for table in (_paired(comparison), _differences(comparison), _failures(comparison)) if table.rows
+        table
+        for table in (_paired(comparison), _differences(comparison), _degraded(comparison), _failures(comparison))
+        if table.rows
     ]
 
 
@@ -74,6 +76,9 @@ def recipes(comparison: Comparison) -> list[str]:
     ]
     lines = [f"{m.label}: {m.recipe}" for m in shown]
     lines.append("ms: mean over scans of each stage, then of all stages together (mean), and its 95th percentile (p95)")
+    lines.append(
+        f"{'/'.join(HEALTH)}: scans, mean over the runs; fallback: posed by a recovery policy or another method"
+    )
     if any(row.runs > 1 for row in comparison.rows):
         lines.append("over seeds: mean ± sample standard deviation (n - 1) of the runs that did not fail")
     if len(comparison.methods) > 1:
@@ -128,7 +133,7 @@ def _methods_table(comparison: Comparison, groups: Sequence[str], title: str) ->
             cells = ["failed"] * bool(cells) + ["-"] * (len(cells) - 1)
         rival = [other for other in comparison.rows if other.sequence == row.sequence]
         best |= {(i, 2 + k) for k, metric in enumerate(metrics) if _is_best(metric, row, rival)}
-        health = [_health(row), f"{row.runs - row.failed}/{row.runs}"] if "health" in groups else []
+        health = [_health(row), _usable(row)] if "health" in groups else []
         rows.append((row.sequence, row.method, *cells, *health))
     return CompareTable(title, tuple(header), tuple(rows), 2, frozenset(best))
 
@@ -153,6 +158,11 @@ def _health(row: SummaryRow) -> str:
     """Mean counts per run; a row without a usable run has none."""
     values = [row.values.get(key) for key in HEALTH]
     return "/".join("-" if v is None else f"{v.mean:.3g}" for v in values)
+
+
+def _usable(row: SummaryRow) -> str:
+    doubted = f", {row.degraded} degraded" if row.degraded else ""
+    return f"{row.runs - row.failed}/{row.runs}{doubted}"
 
 
 def _is_best(metric: Metric, row: SummaryRow, rivals: Sequence[SummaryRow]) -> bool:
@@ -182,6 +192,12 @@ def _differences(comparison: Comparison) -> CompareTable:
         rows.append((d.sequence, d.method, d.reference, str(d.seed), metres(d.origin), metres(d.se3)))
     header = ("sequence", "method", "against", "seed", "rmse from the same start, m", "rmse after se3, m")
     return CompareTable("distance between trajectories, without ground truth", header, tuple(rows), 3)
+
+
+def _degraded(comparison: Comparison) -> CompareTable:
+    rows = tuple((r.sequence, r.method, str(r.seed), r.reason) for r in comparison.degraded)
+    title = f"{counted(len(rows), 'run')} degraded: part of it is doubted"
+    return CompareTable(title, ("sequence", "method", "seed", "reason"), rows, 4)
 
 
 def _failures(comparison: Comparison) -> CompareTable:

@@ -26,7 +26,10 @@ def summarise(runs: Sequence[RunScore]) -> list[SummaryRow]:
         values = {key: spread([run.values[key] for run in usable if key in run.values]) for key in keys}
         note = next((run.note for run in usable if run.note), "")
         alone = all(run.jobs == 1 for run in usable)
-        rows.append(SummaryRow(sequence, method, len(members), len(members) - len(usable), values, note, alone))
+        degraded = sum(run.status == "degraded" for run in usable)
+        rows.append(
+            SummaryRow(sequence, method, len(members), len(members) - len(usable), values, note, alone, degraded)
+        )
     return rows
 
 

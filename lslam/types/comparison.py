@@ -77,7 +77,7 @@ class Spread:
 
 @dataclass(frozen=True)
 class SummaryRow:
-    """One method on one sequence over its seeds; `failed` of `runs` do not count in `values`."""
+    """One method on one sequence over its seeds; `failed` of `runs` do not count in `values`, `degraded` ones do."""
 
     sequence: str
     method: str
@@ -86,6 +86,7 @@ class SummaryRow:
     values: dict[str, Spread]
     note: str
     is_timed_alone: bool
+    degraded: int = 0
 
 
 @dataclass(frozen=True)
@@ -169,6 +170,11 @@ class Comparison:
     notes: tuple[str, ...]
     configs: dict[str, dict[str, Any]]
     tie: float
+
+    @property
+    def degraded(self) -> tuple[RunScore, ...]:
+        """The runs that count and doubt a part of themselves."""
+        return tuple(run for run in self.runs if run.status == "degraded")
 
     @property
     def failed(self) -> tuple[RunScore, ...]:

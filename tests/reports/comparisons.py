@@ -67,8 +67,10 @@ def drawing(folder: Path, methods: tuple[str, ...] = ("icp", "kiss-icp"), has_tr
 
 
 def row(sequence: str, method: str, values: dict[str, Spread], **more: Any) -> SummaryRow:
-    kept = {"runs": 2, "failed": 0, "note": "", "is_timed_alone": True} | more
-    return SummaryRow(sequence, method, kept["runs"], kept["failed"], values, kept["note"], kept["is_timed_alone"])
+    kept = {"runs": 2, "failed": 0, "note": "", "is_timed_alone": True, "degraded": 0} | more
+    return SummaryRow(
+        sequence, method, kept["runs"], kept["failed"], values, kept["note"], kept["is_timed_alone"], kept["degraded"]
+    )
 
 
 def comparison(folder: Path, **changes: Any) -> Comparison:
@@ -98,7 +100,7 @@ def comparison(folder: Path, **changes: Any) -> Comparison:
         "runs": tuple(runs),
         "rows": (
             row("drive", "icp", two),
-            row("drive", "kiss-icp", worse),
+            row("drive", "kiss-icp", worse, degraded=1),
             row("dark", "icp", {"time.mean": Spread(12.0, none, 1)}, runs=1, note="no ground truth"),
             row("dark", "kiss-icp", {}, runs=1, failed=1),
         ),

@@ -22,15 +22,16 @@ from lslam.types.comparison import Spread
 
 
 def test_one_row_per_method_with_spread_failures_and_words_for_what_is_missing(tmp_path: Path) -> None:
-    main, pairs, differences, failures = tables(comparison(tmp_path))
+    main, pairs, differences, degraded, failures = tables(comparison(tmp_path))
     cells = [dict(zip(main.header, line, strict=True)) for line in main.rows]
     assert cells[0]["ATE se3, m"] == "0.100 ± 0.020"
     assert cells[1]["bridged/skipped/degenerate/fallback"] == "1.5/-/-/-"
     assert cells[2]["ATE se3, m"] == "no ground truth"
     assert cells[3]["ATE se3, m"] == "failed"
-    assert [c["runs"] for c in cells] == ["2/2", "2/2", "1/1", "0/1"]
+    assert [c["runs"] for c in cells] == ["2/2", "2/2, 1 degraded", "1/1", "0/1"]
     assert pairs.rows == (("kiss-icp", "icp", "1", "3.000", "0/0/2", "n too small"),)
     assert differences.rows[0][-2:] == ("1.500", "0.500")
+    assert degraded.rows == (("drive", "kiss-icp", "0", "1 scan <bridged>"),)
     assert failures.rows == (("dark", "kiss-icp", "0", "crashed", "killed & gone_by 100%"),)
 
 
@@ -87,7 +88,7 @@ def test_latex_is_escaped_and_balanced(tmp_path: Path) -> None:
     text = render(comparison(tmp_path), "tex")
     assert r"killed \& gone\_by 100\%" in text
     assert r"0.100 $\pm$ 0.020" in text
-    assert text.count(r"\begin{tabular}") == text.count(r"\end{tabular}") == 4
+    assert text.count(r"\begin{tabular}") == text.count(r"\end{tabular}") == 5
     for line in text.splitlines():
         assert line.startswith(("%", "\\")) or not line or line.endswith(r"\\")
 

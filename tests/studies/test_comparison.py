@@ -9,6 +9,7 @@ import shutil
 import signal
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -18,11 +19,12 @@ import lslam
 from lslam.errors import InputError, InterruptedRunError, OutputExistsError, UsageError
 from lslam.evaluation.evaluate import evaluate
 from lslam.formats.trajectory_files import read_trajectory
+from lslam.geometry import se3
 from lslam.pipeline.watch import Watch
 from lslam.readers import open_sequence
 from lslam.simulation.record import record
 from lslam.simulation.scenarios import simulate
-from lslam.studies.compare import compare
+from lslam.studies.compare import _in_world_of_truth, compare
 from lslam.studies.grid import Job
 from lslam.studies.jobs import finished, run_jobs
 from lslam.studies.plan import Plan, check_plan
@@ -32,6 +34,7 @@ from lslam.studies.subjects import Subject
 from lslam.studies.variants import find_variants
 from lslam.studies.worker import WorkerContext
 from lslam.types.comparison import Comparison, RunScore
+from lslam.types.trajectory import Trajectory
 
 pytestmark = pytest.mark.usefixtures("forked_runs")
 SCANS = 14
@@ -229,3 +232,23 @@ def test_a_process_that_dies_is_a_crashed_job_that_is_tried_again(plan: Plan, tm
     assert state.status == "crashed"
     assert state.reason.startswith("the process was killed by SIGSEGV")
     assert finished([job]) == set()
+
+
+@pytest.mark.parametrize(("sideways", "alignment"), [(0.02, "origin"), (20.0, "se3")])
+def test_maps_beside_a_nearly_straight_path_are_not_turned_about_it(
+    sideways: float, alignment: str, tmp_path: Path
+) -> None:
+    """A roll of 20 deg about the path fits noisy positions as well as none, and moves a wall 30 m beside it by metres."""
+    rng, along = np.random.default_rng(0), np.linspace(0.0, 1.0, 60)
+    poses = np.tile(np.eye(4), (60, 1, 1))
+    poses[:, :3, 3] = np.stack([60 * along, sideways * np.sin(6 * along), 0 * along], 1)
+    truth = Trajectory(np.arange(60) * 10**8, poses)
+    noisy = poses.copy()
+    noisy[1:, :3, 3] += rng.normal(0, 0.05, (59, 3))
+    job = SimpleNamespace(method="icp", folder=tmp_path)
+    finished_run: Any = SimpleNamespace(trajectory=Trajectory(truth.stamps_ns, noisy), job=job)
+    recording: Any = SimpleNamespace(calibration=None)
+    drawn = _in_world_of_truth("drive", 0, [finished_run], recording, truth)
+    assert alignment in drawn.recipe
+    wall = np.array([30.0, 30.0, 0.0])
+    assert np.linalg.norm(se3.apply(drawn.runs[0].T_drawing_world, wall[None])[0] - wall) < 0.5
