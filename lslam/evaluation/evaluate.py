@@ -161,24 +161,14 @@ def _turned(estimate: Floats, truth: Floats) -> list[str]:
 
 def _nearly_straight(truth: Floats, config: EvalConfig) -> list[str]:
     """A note when positions hardly hold the rotation about the path, which then spoils aligned rotation errors."""
-    if not {"se3", "sim3"} & set(config.align) or not is_nearly_straight(truth[:, :3, 3]):
+    centred = truth[:, :3, 3] - truth[:, :3, 3].mean(axis=0)
+    spread = np.linalg.svd(centred, compute_uv=False) / np.sqrt(len(truth))
+    if not {"se3", "sim3"} & set(config.align) or not 1e-4 * spread[0] < spread[1] <= STRAIGHT * spread[0]:
         return []
-    spread = _spread(truth[:, :3, 3])
     return [
         f"the path is nearly straight ({spread[1]:.2g} m sideways, {spread[0]:.3g} m along, standard deviations): "
         "se3 and sim3 hardly determine the rotation about it; read rotation errors under origin"
     ]
-
-
-def is_nearly_straight(positions: Floats) -> bool:
-    """Whether positions (N, 3) hardly determine the rotation about the path; at rest and on a line they do not at all."""
-    spread = _spread(positions)
-    return bool(1e-4 * spread[0] < spread[1] <= STRAIGHT * spread[0])
-
-
-def _spread(positions: Floats) -> Floats:
-    """(3,) standard deviations along the principal axes, m, the largest first."""
-    return np.asarray(np.linalg.svd(positions - positions.mean(axis=0), compute_uv=False) / np.sqrt(len(positions)))
 
 
 def _check(which: str, trajectory: Trajectory) -> None:

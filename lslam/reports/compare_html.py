@@ -240,7 +240,10 @@ def _bars(bars: Sequence[tuple[str, dict[str, float]]], stages: Sequence[str], l
     if limit_inside:
         x = float(frame.px(limit))
         frame.add(f'<path class="limit" d="M{x:.1f} {frame.top}V{frame.bottom}"/>')
-        frame.text(x - 4, frame.top - 8, f"real-time limit {limit:.0f} ms", "end", "limit-text")
+        side = "end" if x > (frame.left + frame.right) / 2 else "start"
+        frame.text(
+            x + (-4 if side == "end" else 4), frame.top - 8, f"real-time limit {limit:.0f} ms", side, "limit-text"
+        )
     elif limit > 0:
         frame.text(frame.right, frame.top - 8, f"real-time limit {limit:.0f} ms →", "end", "limit-text")
     for i, (label, _) in enumerate(bars):  # last, so that the limit does not cross them out

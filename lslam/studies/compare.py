@@ -10,10 +10,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lslam.config.eval import EvalConfig
 from lslam.errors import InterruptedRunError, LslamError
-from lslam.evaluation.evaluate import evaluate, is_nearly_straight
+from lslam.evaluation.evaluate import evaluate
 from lslam.evaluation.recipes import ALIGNMENTS
 from lslam.evaluation.results import AbsoluteError
 from lslam.formats.trajectory_files import read_trajectory
@@ -34,6 +35,8 @@ from lslam.types.trajectory import Trajectory
 
 log = logging.getLogger("lslam")
 PREFERRED = EvalConfig(align=("se3", "origin"))
+# rad; half a metre at a wall that stands 30 m beside the path.
+LARGEST_TURN = 1 / 60
 # More than this many busy cores before the first run, and its times are somebody else's too.
 BUSY = 0.5
 
@@ -93,9 +96,9 @@ def _in_world_of_truth(
     drawn, names, gt_positions = [], set(), None
     for run in runs:
         score = evaluate(run.trajectory, truth, PREFERRED, calibration=recording.calibration)
-        # What lies beside a nearly straight path would be turned about it by se3.
-        is_turned = is_nearly_straight(score.gt_positions) and score.ate["origin"].available
-        error = score.ate["origin"] if is_turned else _available(list(score.ate.values()))
+        error = _available(list(score.ate.values()))
+        if score.ate["origin"].available and _turn_about_path(error, score.gt_positions) > LARGEST_TURN:
+            error = score.ate["origin"]
         names.add(error.alignment)
         gt_positions = score.gt_positions
         distances = np.linalg.norm(error.errors, axis=1)
@@ -104,6 +107,12 @@ def _in_world_of_truth(
         )
     recipe = "; ".join(f"{name}: {ALIGNMENTS[name]}" for name in sorted(names))
     return Drawing(sequence, seed, gt_positions, tuple(drawn), f"moved onto the ground truth, {recipe}")
+
+
+def _turn_about_path(error: AbsoluteError, gt_positions: NDArray[np.float64]) -> float:
+    """What an alignment of positions leaves of the rotation about the path, rad: errors over the path's width."""
+    width = np.linalg.svd(gt_positions - gt_positions.mean(axis=0), compute_uv=False)[1] / np.sqrt(len(gt_positions))
+    return np.inf if error.translation is None or width == 0 else float(error.translation.rmse / width)
 
 
 def _available(errors: list[AbsoluteError]) -> AbsoluteError:
