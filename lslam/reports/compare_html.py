@@ -239,7 +239,9 @@ def _bars(bars: Sequence[tuple[str, dict[str, float]]], stages: Sequence[str], l
     frame.add(f'<path class="axis" d="M{frame.left} {frame.top}V{frame.bottom}"/>')
     if limit_inside:
         x = float(frame.px(limit))
-        frame.add(f'<path class="limit" d="M{x:.1f} {frame.top}V{frame.bottom}"/>')
+        # Not through labels.
+        across = "".join(f"M{x:.1f} {frame.top + _ROW * i + 20}v{_BAR + 2}" for i in range(len(bars)))
+        frame.add(f'<path class="limit" d="{across}"/>')
         side = "end" if x > (frame.left + frame.right) / 2 else "start"
         frame.text(
             x + (-4 if side == "end" else 4), frame.top - 8, f"real-time limit {limit:.0f} ms", side, "limit-text"

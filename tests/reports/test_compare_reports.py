@@ -68,6 +68,19 @@ def test_bars_and_table_show_the_same_number_and_name_it(tmp_path: Path) -> None
     assert figure.title.startswith("Mean")
 
 
+def test_the_limit_crosses_bars_and_no_label(tmp_path: Path) -> None:
+    figure = time_figure(comparison(tmp_path), "drive")
+    assert figure is not None
+    (line,) = re.findall(r'class="limit" d="([^"]+)"', figure.svg)
+    pieces = [(float(y), float(y) + float(dy)) for y, dy in re.findall(r"M[\d.]+ ([\d.]+)v([\d.]+)", line)]
+    bars = sorted({float(y) for y in re.findall(r'<rect [^>]*y="([\d.]+)"', figure.svg)})
+    labels = [float(y) for y in re.findall(r'class="label over"[^>]* y="([\d.]+)"', figure.svg)]
+    assert len(pieces) == len(bars) == 2
+    assert all(a < y < b for (a, b), y in zip(pieces, bars, strict=True))
+    assert len(labels) == 2
+    assert not [y for y in labels for a, b in pieces if a < y < b]
+
+
 def test_a_narrow_terminal_gets_errors_and_times_apart(tmp_path: Path) -> None:
     c = comparison(tmp_path)
     whole = tables(c)[0]
