@@ -18,7 +18,8 @@ from lslam.version import __version__
 
 STYLES = ("md", "csv", "tex")
 TITLES = {"error": "errors", "time": "mean time per scan", "health": "scans and runs"}
-HEALTH = ("bridged", "skipped", "degenerate", "fallback")
+# What people read for each key.
+HEALTH = {"bridged": "bridged", "skipped": "skipped", "degenerate": "degenerate", "fallback": "recovered"}
 SCHEMA, VERSION = "lslam-compare", 1
 
 
@@ -77,7 +78,8 @@ def recipes(comparison: Comparison) -> list[str]:
     lines = [f"{m.label}: {m.recipe}" for m in shown]
     lines.append("ms: mean over scans of each stage, then of all stages together (mean), and its 95th percentile (p95)")
     lines.append(
-        f"{'/'.join(HEALTH)}: scans, mean over the runs; fallback: posed by a recovery policy or another method"
+        f"{'/'.join(HEALTH.values())}: scans of a run, mean over the runs of all seeds that did not fail; recovered: posed by "
+        "a recovery policy or a fallback"
     )
     if any(row.runs > 1 for row in comparison.rows):
         lines.append("over seeds: mean ± sample standard deviation (n - 1) of the runs that did not fail")
@@ -123,7 +125,7 @@ def write_files(out: Path, comparison: Comparison) -> None:
 def _methods_table(comparison: Comparison, groups: Sequence[str], title: str) -> CompareTable:
     metrics = [m for m in comparison.metrics if m.is_main and m.group in groups and m.key not in HEALTH]
     header = ["sequence", "method", *(f"{m.label}, {m.unit}" if m.unit != "x" else f"x {m.label}" for m in metrics)]
-    header += ["/".join(HEALTH), "runs"] if "health" in groups else []
+    header += ["/".join(HEALTH.values()), "runs"] if "health" in groups else []
     rows, best = [], set()
     for i, row in enumerate(comparison.rows):
         cells = [_cell(metric, row) for metric in metrics]

@@ -66,7 +66,7 @@ def study_recipes(result: StudyResult) -> list[str]:
         "registration: all stages of a scan but reading, preparing, standing still and keyframes",
         "E: 1 over translation, rotation and registration time per scan (equation 5.2); E tot: with the total time (5.3); both "
         "over the largest of the curve; median over seeds, a lost run counts as 0",
-        "fallback: scans that a recovery policy or another method posed",
+        "recovered: scans that a recovery policy or a fallback posed",
         f"lost: a run that says so, or whose error is above {result.lost_above:.3g} m: 10 times the best of the study, and not "
         "less than Girolimetto takes for a result (2.2 m)",
         "diverges: the first value, lost in more than half of its runs, from which on more than half of the values are",
@@ -122,7 +122,7 @@ def _means(result: StudyResult) -> CompareTable:
     key = result.parameters[0]
     head = (
         "method", with_unit(key, key.rpartition(".")[2]), "translation, m", "rotation, deg", "registration, ms", "total, s",
-        "fallback, %", "E", "E tot", "lost/runs",
+        "recovered, %", "E", "E tot", "lost/runs",
     )  # fmt: skip
     rows: list[tuple[str, ...]] = []
     best = set()

@@ -19,6 +19,7 @@ from lslam.evaluation.timing import Timing, read_timing
 from lslam.extras import install_command
 from lslam.formats.study_files import read_study_csv, write_study_csv, write_study_parquet
 from lslam.remote import RemotePath
+from lslam.reports.compare_table import HEALTH
 from lslam.studies.grid import Job
 from lslam.studies.states import FINAL, State, read_state
 from lslam.studies.variants import Variant
@@ -30,7 +31,7 @@ log = logging.getLogger("lslam")
 
 COUNTS = {
     "bridged": "bridged scans of a run", "skipped": "skipped scans of a run", "degenerate": "degenerate scans of a run",
-    "fallback": "scans of a run that a recovery policy or another method posed",
+    "fallback": "scans of a run that a recovery policy or a fallback posed",
 }  # fmt: skip
 IMU = "imu_used"
 NO_TRUTH = "no ground truth"
@@ -128,7 +129,7 @@ def metrics_of(configs: Sequence[EvalConfig], runs: Sequence[RunScore]) -> list[
         Metric("time.mean", "mean", "ms", "time", "all stages of a scan: mean over scans"),
         Metric("time.p95", "p95", "ms", "time", "all stages of a scan: 95th percentile over scans"),
         Metric("factor", "real time", "x", "time", "recorded time over processing time (mean)", "high"),
-        *(Metric(key, key, "scans", "health", recipe, "") for key, recipe in COUNTS.items()),
+        *(Metric(key, HEALTH[key], "scans", "health", recipe, "") for key, recipe in COUNTS.items()),
         *(metric for metric in errors if not metric.is_main),
         _more("path", "m", "error"),
         _more("map.entropy", "nats", "error"),

@@ -15,9 +15,11 @@ import pytest
 from comparisons import comparison, drawing, row, walls
 from test_html import parse
 
+from lslam.config.eval import EvalConfig
 from lslam.reports.compare_html import render_page, time_figure
 from lslam.reports.compare_table import recipes, render, tables, to_document
 from lslam.reports.crops import Crop, choose_crops, crop_images
+from lslam.studies.results import metrics_of
 from lslam.types.comparison import Spread
 
 
@@ -25,7 +27,7 @@ def test_one_row_per_method_with_spread_failures_and_words_for_what_is_missing(t
     main, pairs, differences, degraded, failures = tables(comparison(tmp_path))
     cells = [dict(zip(main.header, line, strict=True)) for line in main.rows]
     assert cells[0]["ATE se3, m"] == "0.100 ± 0.020"
-    assert cells[1]["bridged/skipped/degenerate/fallback"] == "1.5/-/-/-"
+    assert cells[1]["bridged/skipped/degenerate/recovered"] == "1.5/-/-/-"
     assert cells[2]["ATE se3, m"] == "no ground truth"
     assert cells[3]["ATE se3, m"] == "failed"
     assert [c["runs"] for c in cells] == ["2/2", "2/2, 1 degraded", "1/1", "0/1"]
@@ -33,6 +35,16 @@ def test_one_row_per_method_with_spread_failures_and_words_for_what_is_missing(t
     assert differences.rows[0][-2:] == ("1.500", "0.500")
     assert degraded.rows == (("drive", "kiss-icp", "0", "1 scan <bridged>"),)
     assert failures.rows == (("dark", "kiss-icp", "0", "crashed", "killed & gone_by 100%"),)
+
+
+def test_scans_that_a_policy_posed_are_called_recovered_and_the_cell_a_mean_over_runs(tmp_path: Path) -> None:
+    (line,) = [
+        line for line in recipes(comparison(tmp_path)) if line.startswith("bridged/skipped/degenerate/recovered:")
+    ]
+    assert "mean over the runs of all seeds" in line
+    assert "recovery policy or a fallback" in line
+    (metric,) = [m for m in metrics_of([EvalConfig()], []) if m.key == "fallback"]
+    assert metric.label == "recovered"
 
 
 def test_the_best_of_several_methods_is_marked_per_sequence(tmp_path: Path) -> None:
