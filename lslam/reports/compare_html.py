@@ -26,6 +26,7 @@ from lslam.types.comparison import Comparison, Drawing, DrawnRun, RunScore
 
 WIDEST = 125  # characters of a table that the page shows without scrolling
 STYLES = 12
+SHADES = 8  # of grey, for stages: colours are those of methods
 _ROW, _BAR = 42, 18
 
 
@@ -164,7 +165,7 @@ def time_figure(comparison: Comparison, sequence: str) -> Figure | None:
     return Figure(
         "Mean time per scan",
         chart,
-        tuple((f"s{i % STYLES + 1}", name) for i, name in enumerate(stages)),
+        tuple((f"t{i % SHADES + 1}", name) for i, name in enumerate(stages)),
         caption,
         is_area=True,
     )
@@ -232,7 +233,7 @@ def _bars(bars: Sequence[tuple[str, dict[str, float]]], stages: Sequence[str], l
             x0, x1 = float(frame.px(below)), float(frame.px(below + means[stage]))
             said = escape(f"{stage}: {means[stage]:.2f} ms")
             frame.add(
-                f'<rect class="area s{k % STYLES + 1}" x="{x0:.1f}" y="{y + 21}" width="{x1 - x0:.1f}" height="{_BAR}">'
+                f'<rect class="area t{k % SHADES + 1}" x="{x0:.1f}" y="{y + 21}" width="{x1 - x0:.1f}" height="{_BAR}">'
                 f"<title>{said}</title></rect>"
             )
             below += means[stage]

@@ -83,6 +83,7 @@ def test_bars_and_table_show_the_same_number_and_name_it(tmp_path: Path) -> None
 def test_the_limit_crosses_bars_and_no_label(tmp_path: Path) -> None:
     figure = time_figure(comparison(tmp_path), "drive")
     assert figure is not None
+    assert {style[0] for style, _ in figure.legend} == {"t"}, "stages have shades, and methods colours"
     (line,) = re.findall(r'class="limit" d="([^"]+)"', figure.svg)
     pieces = [(float(y), float(y) + float(dy)) for y, dy in re.findall(r"M[\d.]+ ([\d.]+)v([\d.]+)", line)]
     bars = sorted({float(y) for y in re.findall(r'<rect [^>]*y="([\d.]+)"', figure.svg)})
