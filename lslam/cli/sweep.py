@@ -45,8 +45,8 @@ if TYPE_CHECKING:
 @click.option("--strict", is_flag=True, help="Exit 4 when any run failed or diverged.")
 @options.verbosity
 def command(study: str | None, **given: Any) -> None:
-    """Vary parameters over sequences, methods and seeds; every run is a row of results.csv and results.parquet, and
-    report.html shows the findings.
+    """Vary parameters over sequences, methods and seeds; every run is a row of results.csv, and of results.parquet
+    with the extra `parquet`; report.html shows the findings.
 
     STUDY is a file, or a name of --list. Each of its sequences can have its own start, count and skip_frames. A run that fails
     or diverges is a row with its reason. Findings about time are decided when every run had a core of its own: use an idle

@@ -81,7 +81,7 @@ class FolderSequence(Scans):
     ) -> tuple[NDArray[np.float32] | None, NDArray[np.uint16] | None, int]:
         times: NDArray[np.float32] | None = None
         rings = cloud.rings
-        if self.per_point is not None:
+        if self.per_point is not None and len(cloud):
             # Compensated scans have no times: nobody shall deskew them a second time.
             names = ("ring",) if self.motion_compensated else ("t", "ring")
             times, rings = _read_per_point(self.per_point / f"{path.stem}.npz", len(cloud), names)

@@ -93,20 +93,22 @@ def _only_warnings() -> Iterator[None]:
 def _in_world_of_truth(
     sequence: str, seed: int, runs: Sequence[Finished], recording: Recording, truth: Trajectory
 ) -> Drawing:
-    drawn, names, gt_positions = [], set(), None
-    for run in runs:
-        score = evaluate(run.trajectory, truth, PREFERRED, calibration=recording.calibration)
-        error = _available(list(score.ate.values()))
-        if score.ate["origin"].available and _turn_about_path(error, score.gt_positions) > LARGEST_TURN:
-            error = score.ate["origin"]
-        names.add(error.alignment)
-        gt_positions = score.gt_positions
-        distances = np.linalg.norm(error.errors, axis=1)
-        drawn.append(
-            DrawnRun(run.job.method, error.aligned_positions, score.distance, distances, error.T_gt_est, _map_file(run))
+    scores = [evaluate(run.trajectory, truth, PREFERRED, calibration=recording.calibration) for run in runs]
+    errors = [_available(list(score.ate.values())) for score in scores]
+    turns = [_turn_about_path(error, score.gt_positions) for error, score in zip(errors, scores, strict=True)]
+    # One alignment for all, or their errors could not be compared.
+    if max(turns) > LARGEST_TURN and all(score.ate["origin"].available for score in scores):
+        errors = [score.ate["origin"] for score in scores]
+    drawn = tuple(
+        DrawnRun(
+            run.job.method, error.aligned_positions, score.distance, np.linalg.norm(error.errors, axis=1),
+            error.T_gt_est, _map_file(run),
         )
+        for run, score, error in zip(runs, scores, errors, strict=True)
+    )  # fmt: skip
+    names = {error.alignment for error in errors}
     recipe = "; ".join(f"{name}: {ALIGNMENTS[name]}" for name in sorted(names))
-    return Drawing(sequence, seed, gt_positions, tuple(drawn), f"moved onto the ground truth, {recipe}")
+    return Drawing(sequence, seed, scores[-1].gt_positions, drawn, f"moved onto the ground truth, {recipe}")
 
 
 def _turn_about_path(error: AbsoluteError, gt_positions: NDArray[np.float64]) -> float:

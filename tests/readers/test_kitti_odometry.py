@@ -110,6 +110,9 @@ def test_per_point_rings_and_times(tmp_path: Path) -> None:
     (folder / "per_point" / "000003.npz").write_bytes(b"PK\x03\x04 this is no archive")
     with pytest.raises(InputError, match=r"000003\.npz"):
         s.scan(3)
+    # A scan without points is empty, whatever is held of its points.
+    (folder / "velodyne" / "000001.bin").write_bytes(b"")
+    assert len(s.scan(1).points) == 0
     compensated = open_sequence(folder, motion_compensated=True).scan(0)
     assert compensated.times is None
     assert compensated.rings is not None
