@@ -42,8 +42,8 @@ def meet(own: Path, other: Path) -> None:
 
 
 def wait_to_be_ended(own: Path) -> None:
-    own.write_text(str(os.getpid()))
     try:
+        own.write_text(str(os.getpid()))  # from here on it may be interrupted
         time.sleep(120)
     except KeyboardInterrupt:
         own.write_text("ended")
