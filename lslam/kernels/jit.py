@@ -54,42 +54,15 @@ else:
 
 import numba  # noqa: E402
 from numba.core import event  # noqa: E402
-from numba.core.compiler_lock import global_compiler_lock  # noqa: E402
 
 
 def kernel(function: F) -> F:
     """Compile `function` on first use and keep the machine code in the cache."""
-    compiled: Any = numba.njit(cache=_folder is not None, nogil=True, error_model="numpy", boundscheck=False)(function)
-    if _folder is not None:
+    is_kept = _folder is not None
+    compiled: Any = numba.njit(cache=is_kept, nogil=True, error_model="numpy", boundscheck=False)(function)
+    if is_kept:
         _forgive(compiled._cache)
-        _take_turns(compiled, _folder / f"{function.__module__}.{function.__qualname__}.lock")
     return cast(F, compiled)
-
-
-def _take_turns(compiled: Any, path: Path) -> None:
-    """Let one process at a time compile this kernel: others load what it keeps.
-
-    Of two that compile it for other types at once, numba's index would keep one.
-    """
-    compile_or_load = compiled.compile
-
-    def in_turn(signature: Any) -> Any:
-        # This process's lock first: a thread that compiles a caller of this kernel holds it.
-        with global_compiler_lock, _held(path):
-            return compile_or_load(signature)
-
-    compiled.compile = in_turn
-
-
-@contextlib.contextmanager
-def _held(path: Path) -> Iterator[None]:
-    """Hold the lock of a file during the block; where there are no locks, nobody does."""
-    with contextlib.ExitStack() as stack:
-        with contextlib.suppress(ImportError, OSError):
-            import fcntl
-
-            fcntl.flock(stack.enter_context(path.open("a")), fcntl.LOCK_EX)
-        yield
 
 
 def _forgive(cache: Any) -> None:
