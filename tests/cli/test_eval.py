@@ -164,7 +164,7 @@ def test_a_straight_line(folder: Path) -> None:
         ),
         (("good.tum", "gt.tum", "--align", "se33"), 2, "did you mean 'se3'"),
         (("good.tum", "gt.tum", "--delta", "10q"), 2, "RPE distance '10q'"),
-        (("good.tum", "gt.tum", "--plot", "x.bmp"), 2, "png, svg, pdf"),
+        (("good.tum", "gt.tum", "--plot", "x.bmp"), 2, "ends with .png, .svg or .pdf"),
         (("good.tum", "gt.tum", "--T-est-gt", "1,2,3"), 2, "3 numbers"),
         (("good.tum", "gt.tum", "--time-offset", "soon"), 2, "seconds, or auto"),
         (("good.tum", "gt.tum", "--max-diff", "-1"), 2, "max_diff"),
