@@ -37,6 +37,7 @@ LEVEL = {name: level for level, names in enumerate(LAYERS) for name in names}
 HOMES = {
     "gtsam": ["graph/"],
     "rosbags": ["formats/bag_files.py"],
+    "ruamel": ["formats/bag_listing.py"],
     "laspy": ["formats/las_files.py"],
     "small_gicp": ["odometry/small_gicp.py"],
     "rerun": ["reports/"],

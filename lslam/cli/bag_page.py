@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import PurePath
 from typing import Any
+
+_SHOWN = 8  # names of files
 
 
 def lines(bag: dict[str, Any]) -> Iterator[tuple[str, str]]:
@@ -14,6 +17,9 @@ def lines(bag: dict[str, Any]) -> Iterator[tuple[str, str]]:
         begin = bag["start_utc"] or f"{bag['start_ns'] * 1e-9:.3f} s"
         parts.append(f"{bag['duration_s']:.2f} s from {begin}")
     yield "bag", ", ".join(parts)
+    if files > 1:
+        names = [PurePath(file).name for file in bag["files"]]
+        yield "parts", ", ".join(names if files <= _SHOWN else [*names[: _SHOWN - 2], "...", names[-1]])
 
 
 def table(bag: dict[str, Any]) -> Iterator[str]:

@@ -104,6 +104,8 @@ def _show_bag(name: str, data_root: Path | None, error: str | None) -> None:
         return
     for label, value in bag_page.lines(bag):
         click.echo(f"{label:<18} {value}")
+    for sentence in bag["remarks"]:
+        click.echo(f"  - {sentence}")
     _show_topics(bag)
 
 

@@ -18,7 +18,7 @@ from lslam.readers.lookup import find_folder
 def examine_bag(bag: Bag, uses: Mapping[str, str]) -> Facts:
     """JSON-ready facts; times are those of recording.
 
-    uses : what each topic that is used is used for
+    uses : what each topic that is used is used for; `remarks` are sentences about files that were left out, lost or unpacked
 
     A rate is that of the steps between the first and the last message, None below two.
     """
@@ -28,6 +28,7 @@ def examine_bag(bag: Bag, uses: Mapping[str, str]) -> Facts:
     began = None if begin is None else utc_of(np.array([begin], np.int64))
     return {
         "files": [str(file) for file in bag.files],
+        "remarks": [*bag.notes, *bag.losses],
         "size_bytes": sum(file.stat().st_size for file in bag.files),
         "start_ns": begin,
         "start_utc": began[0].isoformat() if began else None,

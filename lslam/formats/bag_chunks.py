@@ -146,11 +146,12 @@ class Topic:
 class ChunkFile:
     """Random access to a file and to its chunks, from any thread; one decompressed chunk is kept."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, unpacked: Path | None = None) -> None:
+        """Open `path`, or what it holds, where it was unpacked."""
         self.path = path
         try:
             self._ranged = RangedFile(path) if isinstance(path, RemotePath) else None
-            self._file = None if self._ranged else path.open("rb")
+            self._file = None if self._ranged else (unpacked or path).open("rb")
         except OSError as error:
             raise InputError(f"{path} cannot be read: {cause(error)}") from None
         self.size = os.fstat(self._file.fileno()).st_size if self._file else self._ranged.size if self._ranged else 0

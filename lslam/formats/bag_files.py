@@ -13,17 +13,23 @@ import sqlite3
 import struct
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from functools import cache
+from functools import cache, cached_property
 from pathlib import Path
 from types import TracebackType
 from typing import Any, NamedTuple, Protocol
 
+import numpy as np
+from numpy.typing import NDArray
+
 from lslam.errors import InputError, OutputError, UsageError, cause
 from lslam.formats.bag_chunks import Topic, unpack, zstd
-from lslam.formats.bag_listing import SUFFIXES, list_bag_files, suffix_of
+from lslam.formats.bag_listing import SUFFIXES, left_out, list_bag_files, missing_parts, suffix_of
+from lslam.formats.bag_parts import apart
 from lslam.formats.bag_sqlite import SqliteBag
+from lslam.formats.bag_unpacking import unpacked
 from lslam.formats.mcap_records import McapFile
 from lslam.formats.ros1_records import Ros1Bag
+from lslam.remote import RemotePath
 
 # Said once, at the beginning: where lslam's own bags keep what else is known of a sequence, as `sequence.toml`.
 INFO_TOPIC = "/lslam/sequence"
@@ -54,17 +60,25 @@ class Recording(Protocol):
         ...
 
 
-READERS: dict[str, Callable[[Path], Recording]] = {
+READERS: dict[str, Callable[[Path, Path], Recording]] = {
     ".bag": Ros1Bag,
     ".bag.active": Ros1Bag,
     ".mcap": McapFile,
     ".db3": SqliteBag,
 }
+_MAGIC: dict[bytes, Callable[[Path, Path], Recording]] = {
+    b"#ROSBAG": Ros1Bag,
+    b"\x89MCAP0": McapFile,
+    b"SQLite format 3": SqliteBag,
+}
 
 
 @dataclass
 class BagTopic:
-    """One topic over all files of a bag; `encoding` is `cdr` or `ros1`."""
+    """One topic over all files and connections of a bag; `encoding` is `cdr` or `ros1`.
+
+    Its messages are numbered by the time of recording, whichever part they lie in.
+    """
 
     name: str
     type: str
@@ -73,6 +87,27 @@ class BagTopic:
 
     def __len__(self) -> int:
         return sum(len(topic) for _, topic in self.parts)
+
+    @cached_property
+    def stamps_ns(self) -> NDArray[np.int64]:
+        """(N,) when each message was recorded."""
+        stamps = np.concatenate([topic.stamps_ns for _, topic in self.parts])
+        return stamps if self._order is None else stamps[self._order]
+
+    def place(self, k: int) -> tuple[Recording, Topic, int]:
+        """Where message `k` lies, and its number there. Raises IndexError beyond the last."""
+        k = k if self._order is None else int(self._order[k])
+        for recording, topic in self.parts:
+            if k < len(topic):
+                return recording, topic, k
+            k -= len(topic)
+        raise IndexError(k)
+
+    @cached_property
+    def _order(self) -> NDArray[np.int64] | None:
+        """The messages, counted one part after the other, by their times; None where they are in order."""
+        stamps = np.concatenate([topic.stamps_ns for _, topic in self.parts])
+        return None if (np.diff(stamps) >= 0).all() else np.argsort(stamps, kind="stable")
 
 
 class Header(NamedTuple):
@@ -88,9 +123,17 @@ class Bag:
     """The files of one recording, as one bag; messages are read when they are asked for, from any thread."""
 
     def __init__(self, path: Path, files: list[Path]) -> None:
-        self.path, self.files = path, files
-        recordings: list[Recording] = [READERS[suffix_of(file)](file) for file in files]
-        self.losses = [recording.loss for recording in recordings if recording.loss]
+        """Open the files of a recording.
+
+        Raises InputError where none can be read, and for files of ROS 1 and of ROS 2 that hold the same topics.
+        """
+        self.path = path
+        self.losses = left_out(path, files) + missing_parts(path, files)
+        self.notes: list[str] = []
+        recordings, copies = apart(_recordings(files, self.notes, self.losses))
+        self.losses += [recording.loss for recording in recordings if recording.loss]
+        self.notes += [f"{copy.path.name} is left out: all of it is in {of.path.name} as well" for copy, of in copies]
+        self.files = [recording.path for recording in recordings]
         topics: dict[tuple[str, str, str], BagTopic] = {}
         for recording in recordings:
             for topic in recording.topics:
@@ -98,6 +141,7 @@ class Bag:
                 key = (topic.name, kind, topic.encoding)
                 topics.setdefault(key, BagTopic(*key)).parts.append((recording, topic))
         self.topics = sorted(topics.values(), key=lambda t: t.name)
+        _check_encodings(path, self.topics)
 
     def of_type(self, *names: str) -> list[BagTopic]:
         """Topics with messages that lslam can decode, of the types whose names (`Imu`, `PointCloud2`) are given."""
@@ -105,7 +149,7 @@ class Bag:
 
     def recorded_ns(self, topic: BagTopic) -> list[int]:
         """When each message of `topic` was recorded, ns."""
-        return [int(stamp) for _, part in topic.parts for stamp in part.stamps_ns]
+        return [int(stamp) for stamp in topic.stamps_ns]
 
     def expect(self, topic: BagTopic, is_head: bool = False) -> None:
         """Say that all messages of `topic` will be read next, or no more than their beginnings."""
@@ -117,12 +161,9 @@ class Bag:
 
         Raises InputError when it is damaged.
         """
-        for recording, part in topic.parts:
-            if k < len(part):
-                data = recording.read(part, k, limit)
-                return _unpacked(recording, part, k, limit) if data[:4] == _ZSTD else data
-            k -= len(part)
-        raise IndexError(k)
+        recording, part, row = topic.place(k)
+        data = recording.read(part, row, limit)
+        return _unpacked(recording, part, row, limit) if data[:4] == _ZSTD else data
 
     def messages(self, topic: BagTopic, broken: list[str]) -> Iterator[bytes]:
         """All messages of `topic`; of those that are damaged the reason goes to `broken`."""
@@ -144,6 +185,52 @@ class Bag:
             return store.deserialize_cdr(memoryview(data), topic.type)
         except (SerdeError, KeyError, AssertionError) as error:
             raise InputError(f"{self.path}: a message of {topic.name} is no {topic.type}: {error}") from None
+
+
+def _recordings(files: list[Path], notes: list[str], losses: list[str]) -> list[Recording]:
+    """The files opened; why others cannot be goes to `losses`. Raises InputError where none can."""
+    packed: list[str] = []
+    recordings: list[Recording] = []
+    failures: list[InputError] = []
+    for file in files:
+        try:
+            with unpacked(file) as (there, loss):
+                recordings.append(_reader(file, there)(file, there))
+            losses += [loss] if loss else []
+            packed += [file.name] if there != file else []
+        except InputError as error:
+            failures.append(error)
+    if not recordings:
+        raise failures[0]
+    losses += [f"a part of the recording is not read: {failure}" for failure in failures]
+    if packed:
+        what = "is compressed as a whole" if len(packed) == 1 else "are compressed as a whole"
+        notes.append(f"{', '.join(packed)} {what}: unpacked in the user's cache for as long as the recording is read")
+    return recordings
+
+
+def _check_encodings(path: Path, topics: list[BagTopic]) -> None:
+    """Raise InputError for a topic of ROS 1 that is one of ROS 2 as well."""
+    there: dict[str, BagTopic] = {}
+    for topic in topics:
+        if len(topic) and topic.encoding in _ENCODINGS:
+            other = there.setdefault(topic.name, topic)
+            if other.encoding != topic.encoding:
+                files = ", ".join(t.parts[0][0].path.name for t in (other, topic))
+                raise InputError(
+                    f"{path} holds bags of ROS 1 and of ROS 2 ({files}) that are no copies of each other, and {topic.name} is in "
+                    "both: name one of them"
+                )
+
+
+def _reader(path: Path, there: Path) -> Callable[[Path, Path], Recording]:
+    """By the file's first bytes, else by its name."""
+    by_name = READERS[suffix_of(path)]
+    if isinstance(there, RemotePath):
+        return by_name
+    with there.open("rb") as stream:
+        head = stream.read(16)
+    return next((reader for magic, reader in _MAGIC.items() if head.startswith(magic)), by_name)
 
 
 def open_bag(path: Path) -> Bag:

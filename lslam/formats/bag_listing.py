@@ -1,53 +1,151 @@
-"""Which files are bags, and which of them make one recording."""
+"""Which files are bags, which of them make one recording, and what the numbers in their names and `metadata.yaml` miss."""
 
 from __future__ import annotations
 
 import re
 from pathlib import Path
-
-from lslam.errors import InputError
+from typing import Any
 
 SUFFIXES = (".bag", ".bag.active", ".mcap", ".db3")
+# Endings of files that were compressed as a whole, as recorders and people do.
+PACKED = {".zstd": "zstd", ".zst": "zstd", ".lz4": "lz4", ".gz": "gz", ".bz2": "bz2", ".xz": "xz"}
 # Captures of the packets of a sensor.
 CAPTURES = (".pcap", ".pcapng")
-_PART = re.compile(r"(.+)_\d+\.(bag|mcap|db3)(?:\.active)?$")
+METADATA = "metadata.yaml"
+# Recorders of ROS 1 put the time at which a part begins before its number.
+_TIME = re.compile(r"\d{4}([-_]\d\d){5}")
+_NUMBER = re.compile(r"(?:(.*?)[_-])?(\d{1,4})$")
+# Beside a database SQLite keeps these; they hold no recording of their own.
+_COMPANIONS = ("-wal", "-shm", "-journal")
 
 
 def list_bag_files(path: Path) -> list[Path]:
     """The file itself, or the bag files of a folder in natural order; empty when there are none.
 
-    Raises InputError for a folder whose files are compressed as a whole.
+    Of a part that lies there as it is and compressed as well, the first.
     """
     if path.is_file():
         return [path] if suffix_of(path) else []
     if not path.is_dir():
         return []
-    files = [p for p in path.iterdir() if p.is_file() and not p.name.startswith(".")]
-    # The last part of a set whose recorder died is still called .bag.active.
-    kinds = [k for p in files if (k := suffix_of(p).removesuffix(".active"))]
-    packed = [p for p in files if p.name.endswith((".mcap.zstd", ".db3.zstd"))]
-    if packed and not kinds:
-        raise InputError(
-            f"{packed[0]} is compressed as a whole: `zstd -d {packed[0].name}` in {path} makes it readable"
-        )
-    if not kinds:
+    files = [p for p in path.iterdir() if suffix_of(p) and p.is_file() and not p.name.startswith(".")]
+    plain = {p.name for p in files}
+    return sorted((p for p in files if p.name == _unpacked(p.name) or _unpacked(p.name) not in plain), key=_natural)
+
+
+def left_out(path: Path, files: list[Path]) -> list[str]:
+    """Sentences about what lies in the folder `path` beside the bag files that are read and looks like a part of them."""
+    if not path.is_dir():
         return []
-    kind = max(sorted(set(kinds)), key=kinds.count)
-    return sorted((p for p in files if suffix_of(p).removesuffix(".active") == kind), key=_natural)
+    names = {p.name for p in files}
+    said = []
+    for name in sorted(p.name for p in path.iterdir() if p.name[0] != "."):
+        if name in names or name.endswith(_COMPANIONS):
+            continue
+        if _unpacked(name) in names:
+            said.append(f"{name} is left out: {_unpacked(name)} is the same part, not compressed")
+        elif inner := next((s for s in SUFFIXES if f"{s}." in name.lower()), None):
+            ending = name.lower().rpartition(f"{inner}.")[2]
+            said.append(f"{name} is not read: .{ending} is no ending of a bag nor of a compression that is known")
+    return said
+
+
+def missing_parts(path: Path, files: list[Path]) -> list[str]:
+    """Sentences about parts that are not there, by the numbers in the names and by `metadata.yaml`."""
+    said = []
+    series: dict[str, dict[int, Path]] = {}
+    for file in files:
+        if (own := _numbered(file)) is not None:
+            series.setdefault(own[0], {})[own[1]] = file
+    for name, numbers in series.items():
+        have = sorted(numbers)
+        missing = sorted(set(range(have[0], have[-1])) - set(have))
+        # More numbers missing than there are: they count something else, days or minutes.
+        if 0 < len(missing) <= 10 * len(have):
+            said.append(
+                f"{_parts(missing)} missing: the parts in {path} are numbered from {have[0]} ({numbers[have[0]].name}) to "
+                f"{have[-1]} ({numbers[have[-1]].name})"
+            )
+        # ROS 2 counts from 0 and calls the parts as their folder.
+        first = 0 if name == path.name else 1
+        if have[0] > first and (len(have) > 1 or first == 0):
+            said.append(f"the first part in {path} is {numbers[have[0]].name}: those before it are missing")
+    return said + _unlisted(path, files)
 
 
 def parts_beside(path: Path) -> list[Path]:
     """Files beside a bag that recorders name so when they split it: as `path` but for the number at the end of the name."""
-    stem = _PART.match(path.name)
-    if stem is None:
+    own = _numbered(path)
+    if own is None:
         return []
-    beside = (p for p in path.parent.iterdir() if p.is_file() and p != path)
-    return sorted((p for p in beside if (m := _PART.match(p.name)) and m.groups() == stem.groups()), key=_natural)
+    beside = (p for p in path.parent.iterdir() if suffix_of(p) and p != path and p.is_file())
+    return sorted((p for p in beside if (m := _numbered(p)) and m[0] == own[0] and m[1] != own[1]), key=_natural)
 
 
 def suffix_of(path: Path) -> str:
-    """The suffix that makes a file a bag, empty when it is none."""
-    return next((s for s in SUFFIXES if path.name.lower().endswith(s)), "")
+    """The suffix that makes a file a bag, compressed or not, empty when it is none."""
+    name = _unpacked(path.name.lower())
+    return next((s for s in SUFFIXES if name.endswith(s)), "")
+
+
+def packing_of(path: Path) -> str:
+    """How a file is compressed as a whole, by its name; empty where it is not."""
+    return next((kind for ending, kind in PACKED.items() if path.name.lower().endswith(ending)), "")
+
+
+def stem_of(path: Path) -> str:
+    """The name without what makes it a bag and without what says that it is compressed."""
+    return _unpacked(path.name)[: -len(suffix_of(path)) or None]
+
+
+def _unpacked(name: str) -> str:
+    ending = next((e for e in PACKED if name.lower().endswith(e)), "")
+    return name[: len(name) - len(ending)]
+
+
+def _numbered(path: Path) -> tuple[str, int] | None:
+    """What all parts of a recording are called, and the number of this one; None where the name has none."""
+    stem = _TIME.sub("", stem_of(path))
+    match = _NUMBER.search(stem)
+    return None if match is None or not match[1] else (match[1].rstrip("_-"), int(match[2]))
+
+
+def _unlisted(path: Path, files: list[Path]) -> list[str]:
+    """What `metadata.yaml` lists and is not there."""
+    listed = _listed(path / METADATA) if path.is_dir() else None
+    if listed is None:
+        return []
+    names = {_unpacked(p.name) for p in files}
+    absent = [name for name in listed if _unpacked(name) not in names]
+    if not absent:
+        return []
+    verb = "is" if len(absent) == 1 else "are"
+    return [f"{path / METADATA} lists {len(listed)} files, of which {', '.join(absent)} {verb} not there"]
+
+
+def _listed(path: Path) -> list[str] | None:
+    """Names of the parts by ROS 2's `metadata.yaml`, of every version; None where there is none that can be read."""
+    if not path.is_file():
+        return None
+    from ruamel.yaml import YAML
+    from ruamel.yaml.error import YAMLError
+
+    try:
+        tree: Any = YAML(typ="safe", pure=True).load(path.read_text(errors="replace"))
+        names = tree["rosbag2_bagfile_information"]["relative_file_paths"]
+        return [str(name).rpartition("/")[2] for name in names]
+    except (YAMLError, LookupError, TypeError, ValueError, RecursionError, OSError):
+        return None
+
+
+def _parts(numbers: list[int]) -> str:
+    """As part of a sentence.
+
+    >>> _parts([3]), _parts([3, 4])
+    ('part 3 is', 'parts 3, 4 are')
+    """
+    shown = ", ".join(map(str, numbers[:8])) + (", ..." if len(numbers) > 8 else "")
+    return f"part {shown} is" if len(numbers) == 1 else f"parts {shown} are"
 
 
 def _natural(path: Path) -> list[tuple[int, str]]:

@@ -19,19 +19,20 @@ _TABLES = {"topics", "messages"}
 class SqliteBag:
     """One `.db3` file: `topics`, and `loss`, a sentence when it was cut off."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, unpacked: Path | None = None) -> None:
+        """Open `path`, or what it holds, where it was unpacked."""
         if isinstance(path, RemotePath):
             raise UsageError(
                 f"{path}: SQLite cannot be read in place from storage; *.mcap and *.bag are: `lslam convert` makes an MCAP file "
                 "of a copy, or run the copy"
             )
-        self.path = path
+        self.path, self._on_disk = path, unpacked or path
         self.loss = ""
         self._lock = threading.Lock()
         try:
             # Nothing is written beside the file, neither a lock nor a journal.
             self._db = sqlite3.connect(
-                f"file:{quote(str(path.resolve()))}?immutable=1", uri=True, check_same_thread=False
+                f"file:{quote(str(self._on_disk.resolve()))}?immutable=1", uri=True, check_same_thread=False
             )
             # SQLite then opens files that are shorter than their header says; nothing can be changed all the same.
             self._db.execute("PRAGMA writable_schema = ON")
@@ -85,10 +86,10 @@ class SqliteBag:
 
     def _sizes(self) -> tuple[int, int]:
         """Bytes of the file, and how many its header states (SQLite's file format, 1.3)."""
-        with self.path.open("rb") as file:
+        with self._on_disk.open("rb") as file:
             header = file.read(100)
         page, pages = int.from_bytes(header[16:18], "big"), int.from_bytes(header[28:32], "big")
-        return self.path.stat().st_size, pages * (65536 if page == 1 else page)
+        return self._on_disk.stat().st_size, pages * (65536 if page == 1 else page)
 
 
 def _word(value: object) -> str:

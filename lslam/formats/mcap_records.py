@@ -33,9 +33,10 @@ _STAMPS = 22  # bytes before the data of a message: channel, sequence, log time,
 class McapFile:
     """One `.mcap` file: `topics`, and `loss`, a sentence when it was cut off."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, unpacked: Path | None = None) -> None:
+        """Open `path`, or what it holds, where it was unpacked."""
         self.path = path
-        self._file = ChunkFile(path)
+        self._file = ChunkFile(path, unpacked)
         self._chunks: list[Chunk] = []
         self._schemas: dict[int, str] = {}
         self._channels: dict[int, tuple[int, str, str]] = {}

@@ -43,9 +43,10 @@ class _Record(NamedTuple):
 class Ros1Bag:
     """One `.bag` file: `topics`, and `loss`, a sentence when it was cut off."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, unpacked: Path | None = None) -> None:
+        """Open `path`, or what it holds, where it was unpacked."""
         self.path = path
-        self._file = ChunkFile(path)
+        self._file = ChunkFile(path, unpacked)
         self._chunks: list[Chunk] = []
         self._connections: dict[int, Topic] = {}
         self._pieces: dict[int, tuple[list[NDArray[np.int64]], list[Pairs]]] = {}

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from lslam.errors import InputError
 from lslam.formats import bag_streams
 from lslam.formats.bag_files import INFO_TOPIC, Bag, BagTopic, open_bag, read_header
-from lslam.formats.bag_listing import list_bag_files, parts_beside
+from lslam.formats.bag_listing import list_bag_files, parts_beside, stem_of
 from lslam.formats.bag_streams import Stream, chain, is_static, read_poses
 from lslam.formats.point_cloud import TIME_NAMES, PointCloud
 from lslam.formats.pointcloud2 import decode_livox, decode_pointcloud2
@@ -123,14 +123,19 @@ def locate(path: Path) -> tuple[Path, str] | None:
     if not files:
         return None
     if path.is_file():
-        others = parts_beside(path)
-        more = (
-            f"; by its name {others[0].name} is another part of it: a folder of its parts is read as one"
-            if others
-            else ""
-        )
-        return path, f"{path.name} is a bag{more}"
+        return path, f"{path.name} is a bag{_others(path)}"
     return path, f"it holds {len(files)} bag file{'s' if len(files) > 1 else ''}, {files[0].name} first"
+
+
+def _others(path: Path) -> str:
+    """The other parts of a recording of which one is named."""
+    names = [p.name for p in parts_beside(path)]
+    if not names:
+        return ""
+    shown = ", ".join(names[:4]) + (f" and {len(names) - 4} more" if len(names) > 4 else "")
+    is_one = len(names) == 1
+    are = "is another part" if is_one else "are other parts"
+    return f"; by {'its name' if is_one else 'their names'} {shown} {are} of it: a folder of its parts is read as one"
 
 
 def open_folder(path: Path, overrides: SequenceInfo, why: str) -> BagSequence:
@@ -140,14 +145,14 @@ def open_folder(path: Path, overrides: SequenceInfo, why: str) -> BagSequence:
     """
     bag = open_bag(path)
     info = _info(path, bag, overrides)
-    voice = Voice([f"format {KIND}: {why}", *compensation_note(info)], list(bag.losses))
+    voice = Voice([f"format {KIND}: {why}", *compensation_note(info), *bag.notes], list(bag.losses))
     topic = choose_clouds(bag, info.lidar_topic)
     voice.notes.append(f"scans from {topic.name} ({topic.type}, {len(topic)} messages)")
     check_parts(bag, topic)
     messages, stamps, frame = index_scans(bag, topic, voice)
     rate = info.rate_hz or measured_rate(stamps)
     sequence = BagSequence(
-        info.name or re.sub(r"\.(bag|mcap|db3|bag\.active)$", "", printable(path.name)),
+        info.name or printable(stem_of(path)),
         path, bag, topic, messages, stamps, stamps, rate,
         motion_compensated=info.motion_compensated, rings=info.rings, sensor=info.sensor,
         notes=voice.notes, problems=voice.problems,

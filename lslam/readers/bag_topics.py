@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lslam.errors import InputError, LslamError, UsageError
 from lslam.formats.bag_files import Bag, BagTopic, read_header
+from lslam.formats.bag_listing import missing_parts
 from lslam.formats.bag_streams import Stream, read_fixes, read_imu
 from lslam.readers.ground_truth import Voice
 
@@ -54,13 +56,27 @@ def choose_clouds(bag: Bag, wanted: str | None) -> BagTopic:
 
 
 def check_parts(bag: Bag, topic: BagTopic) -> None:
-    """Raise UsageError when the files of a folder are no parts of one recording: the next begins long after one has ended."""
-    parts = sorted((int(p.stamps_ns[0]), int(p.stamps_ns[-1]), r.path) for r, p in topic.parts if len(p))
-    for (_, end, path), (start, _, following) in pairwise(parts):
+    """Raise UsageError when the files of a folder are no parts of one recording.
+
+    They are when the next one begins where one has ended, or soon after, and neither tells of the time of the other.
+    """
+    spans: dict[Path, tuple[int, int]] = {}
+    for recording, part in topic.parts:
+        if len(part):
+            begin, end = spans.get(recording.path, (int(part.stamps_ns[0]), 0))
+            spans[recording.path] = min(begin, int(part.stamps_ns[0])), max(end, int(part.stamps_ns[-1]))
+    parts = sorted((begin, end, path) for path, (begin, end) in spans.items())
+    for (begin, end, path), (start, stop, following) in pairwise(parts):
+        wrong = ""
         if start - end > _APART_NS:
+            wrong = f"{following.name} begins {(start - end) * 1e-9:.0f} s after {path.name} has ended"
+        elif end - start > 0.5 * min(stop - start, end - begin) > 0:
+            wrong = f"{following.name} and {path.name} hold {topic.name} of the same {(min(end, stop) - start) * 1e-9:.1f} s"
+        if wrong:
+            gaps = "".join(f"; {sentence}" for sentence in missing_parts(bag.path, bag.files))
             raise UsageError(
-                f"{bag.path} holds {len(bag.files)} bags that are no parts of one recording: {following.name} begins "
-                f"{(start - end) * 1e-9:.0f} s after {path.name} has ended; name one of them, for example {path}"
+                f"{bag.path} holds {len(bag.files)} bags that are no parts of one recording: {wrong}{gaps}; name one of them, "
+                f"for example {path}"
             )
 
 

@@ -11,7 +11,7 @@ from lslam.config import Config
 from lslam.config.input import AS_CONFIGURED, ScanRange
 from lslam.config.study import StudySequence
 from lslam.errors import UsageError
-from lslam.formats.bag_listing import suffix_of
+from lslam.formats.bag_listing import stem_of
 from lslam.pipeline.resume import imu_digest, input_digest, job_digest, listing_digest
 from lslam.printable import file_safe
 from lslam.readers import open_sequence
@@ -137,7 +137,7 @@ def recorded_cell(
 
 def label_of(path: Path) -> str:
     """What a recording goes by that is not opened: the name of its file or folder."""
-    return file_safe(path.name.removesuffix(suffix_of(path)))
+    return file_safe(stem_of(path))
 
 
 def scene_cell(scene: Scene, seed: int, parent: Path, own: ScanRange = AS_CONFIGURED) -> Cell:

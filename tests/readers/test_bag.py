@@ -85,9 +85,13 @@ def test_a_split_bag_is_one_recording_in_natural_order(tmp_path: Path) -> None:
     assert [p.name for p in sequence.bag.files] == ["drive_0.bag", "drive_2.bag", "drive_10.bag.active"]
     np.testing.assert_array_equal(sequence.stamps_ns, START_NS + np.array([0, 2, 10]) * STEP_NS)
     np.testing.assert_array_equal(sequence.scan(2).points, scan(10).points)
+    (missing,) = sequence.problems
+    assert missing.startswith("parts 1, 3, 4, 5, 6, 7, 8, 9 are missing")
     part = open_sequence(tmp_path / "drive_2.bag")
     assert len(part) == 1
-    assert "drive_2.bag is a bag; by its name drive_0.bag is another part of it" in part.notes[0]
+    assert (
+        "drive_2.bag is a bag; by their names drive_0.bag, drive_10.bag.active are other parts of it" in part.notes[0]
+    )
 
 
 def test_bags_of_different_days_are_not_taken_for_one_recording(tmp_path: Path) -> None:

@@ -1,0 +1,105 @@
+"""Bag files that were compressed as a whole: unpacked into the user's cache for as long as they are read."""
+
+from __future__ import annotations
+
+import bz2
+import gzip
+import lzma
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+from zlib import error as zlib_error
+
+from lslam.errors import InputError, OutputError, UsageError, cause
+from lslam.formats.bag_chunks import zstd
+from lslam.formats.bag_listing import packing_of
+from lslam.kernels.cache import cache_folder
+from lslam.remote import RemotePath
+
+CACHE = "bags"
+MAGIC = {
+    b"\x28\xb5\x2f\xfd": "zstd",
+    b"\x04\x22\x4d\x18": "lz4",
+    b"\x1f\x8b": "gz",
+    b"BZh": "bz2",
+    b"\xfd7zXZ\0": "xz",
+}
+_BLOCK = 1 << 20
+# Recordings shrink to a tenth at best; what grows further was made to fill a disk.
+_MOST, _LEAST = 1000, 1 << 30
+
+
+@contextmanager
+def unpacked(path: Path) -> Iterator[tuple[Path, str]]:
+    """A file with what `path` holds, and what it lacks, a sentence; `path` itself where it is not compressed.
+
+    The file has no name any more after the `with`: whoever opened it meanwhile has it until it is closed.
+
+    Raises InputError when nothing can be unpacked, OutputError for a full disk, UsageError for storage.
+    """
+    kind = _kind(path)
+    if not kind:
+        yield path, ""
+        return
+    if isinstance(path, RemotePath):
+        raise UsageError(f"{path} is compressed as a whole and cannot be read in place from storage: copy it")
+    folder = cache_folder(CACHE)
+    if folder is None:
+        raise OutputError(f"{path} needs a folder to be unpacked in: name a folder of your own in XDG_CACHE_HOME")
+    with tempfile.NamedTemporaryFile(dir=folder, suffix=path.name) as target:
+        loss = _unpack(path, kind, target)
+        target.flush()
+        yield Path(target.name), loss
+
+
+def _kind(path: Path) -> str:
+    """How it is compressed: by its first bytes, whatever its name; a name that they contradict is refused."""
+    if isinstance(path, RemotePath):
+        return packing_of(path)
+    try:
+        with path.open("rb") as stream:
+            head = stream.read(8)
+    except OSError as error:
+        raise InputError(f"{path} cannot be read: {cause(error)}") from None
+    kind = next((kind for magic, kind in MAGIC.items() if head.startswith(magic)), "")
+    if not kind and (packing := packing_of(path)):
+        fact = f"begins with {head!r}" if head else "has 0 bytes"
+        raise InputError(f"{path} is not compressed by {packing} as its name says: it {fact}")
+    return kind
+
+
+def _unpack(path: Path, kind: str, target: Any) -> str:
+    size, most = 0, max(_MOST * path.stat().st_size, _LEAST)
+    try:
+        with _open(path, kind) as source:
+            while data := source.read1(_BLOCK):
+                size += len(data)
+                if size > most:
+                    raise InputError(f"{path} unpacks to more than {_MOST} times its size: it is no recording")
+                _write(path, target, data)
+    except (EOFError, ValueError, RuntimeError, OSError, lzma.LZMAError, zlib_error, zstd().ZstdError) as error:
+        if not size:
+            raise InputError(f"{path} cannot be unpacked: {error}") from None
+        return f"{path} is damaged or cut off: {size} bytes before that are unpacked ({error})"
+    return ""
+
+
+def _write(path: Path, target: Any, data: bytes) -> None:
+    try:
+        target.write(data)
+    except OSError as error:
+        raise OutputError(f"{path} cannot be unpacked into {target.name}: {cause(error)}") from None
+
+
+def _open(path: Path, kind: str) -> Any:
+    """A stream over what is packed in `path`, in one frame or several."""
+    if kind == "lz4":
+        import lz4.frame
+
+        return lz4.frame.open(path, "rb")
+    if kind == "zstd":
+        return zstd().open(path, "rb")
+    openers: dict[str, Any] = {"gz": gzip.open, "bz2": bz2.open, "xz": lzma.open}
+    return openers[kind](path, "rb")
