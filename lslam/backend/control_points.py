@@ -44,7 +44,7 @@ def with_control(
 
     Raises UsageError for coordinates that PROJ does not know or that are none of a place.
     """
-    on_earth = _on_earth(points)
+    on_earth = _on_earth(points, config.gnss.geoid)
     stamps = np.array([stamp_of(point.at, results) for point in points])
     seen = _seen(points, stamps, results)
     sigmas = np.stack([point.sigma for point in points])
@@ -60,11 +60,11 @@ def with_control(
                 "takes two that lie apart",
             )
         T_enu_world = T @ se3.make(level, np.zeros(3))
-        known = Georeference(on_earth[0], T_enu_world, _epsg(points, on_earth[0], config), "control")
+        known = _in_crs(Georeference(on_earth[0], T_enu_world, method="control"), points, config)
         tilt = UNLEVELLED if up is None else LEVELLED
     else:
         enu, tilt = geodesy.to_local(on_earth, known.origin), placement.tilt_sigma
-        known = replace(known, epsg=known.epsg or _epsg(points, known.origin, config))
+        known = known if known.epsg else _in_crs(known, points, config)
     held = [
         _held(position, sigma, place, int(stamp), results, keyframes)
         for position, sigma, place, stamp in zip(enu, sigmas, seen, stamps, strict=True)
@@ -84,10 +84,10 @@ def _held(
 
 
 def control_residuals(
-    points: Many[ControlPoint], results: Many[ScanResult], georeference: Georeference
+    points: Many[ControlPoint], results: Many[ScanResult], georeference: Georeference, geoid: str = ""
 ) -> list[ControlResidual]:
     """What is left of the points at the final poses."""
-    on_earth = _on_earth(points)
+    on_earth = _on_earth(points, geoid)
     stamps = np.array([stamp_of(point.at, results) for point in points])
     off = geodesy.to_local(on_earth, georeference.origin) - se3.apply(
         georeference.T_enu_world, _seen(points, stamps, results)
@@ -98,7 +98,12 @@ def control_residuals(
 
 
 def against_odometry(
-    points: Many[ControlPoint], results: Many[ScanResult], keyframes: Many[Keyframe], drift: Drift, probability: float
+    points: Many[ControlPoint],
+    results: Many[ScanResult],
+    keyframes: Many[Keyframe],
+    drift: Drift,
+    probability: float,
+    geoid: str = "",
 ) -> list[str]:
     """One sentence for each pair of successive points that are not so far apart as odometry may have them.
 
@@ -108,7 +113,7 @@ def against_odometry(
         return []
     stamps = np.array([stamp_of(point.at, results) for point in points])
     order = np.argsort(stamps, kind="stable")
-    there = _on_earth(points)[order]
+    there = _on_earth(points, geoid)[order]
     enu, seen = geodesy.to_local(there, there[0]), _seen(points, stamps, results)[order]
     nearest = np.abs(np.array([k.stamp_ns for k in keyframes]) - stamps[order][:, None]).argmin(1)
     own = np.array([float((points[i].sigma ** 2).max()) for i in order])
@@ -153,9 +158,9 @@ def _some(said: list[str], what: str) -> list[str]:
     return [*said[:MOST_SAID], f"and {more} more {what}"] if more > 0 else said
 
 
-def _on_earth(points: Many[ControlPoint]) -> Floats:
+def _on_earth(points: Many[ControlPoint], geoid: str) -> Floats:
     """(N, 3) lat, lon (deg), height (m)."""
-    return np.concatenate([to_wgs84(point.position[None], point.epsg) for point in points])
+    return np.concatenate([to_wgs84(p.position[None], p.epsg, p.height_epsg, geoid) for p in points])
 
 
 def _seen(points: Many[ControlPoint], stamps: NDArray[np.int64], results: Many[ScanResult]) -> Floats:
@@ -177,13 +182,17 @@ def _aligned(seen: Floats, enu: Floats, sigmas: Floats) -> Floats | None:
     return se3.make(R, weights @ enu - R @ (weights @ seen))
 
 
-def _epsg(points: Many[ControlPoint], origin: Floats, config: Config) -> int | None:
+def _in_crs(georeference: Georeference, points: Many[ControlPoint], config: Config) -> Georeference:
     """What the outputs are written in: as configured, else as the points are given where that is a plane in metres."""
-    codes = {point.epsg for point in points}
-    if config.gnss.crs is not None or len(codes) > 1:
-        return config.gnss.crs
+    crs, height_crs, geoid = config.gnss.crs, config.gnss.height_crs, config.gnss.geoid
+    configured = replace(georeference, epsg=crs, height_epsg=height_crs, geoid=geoid)
+    codes = {(point.epsg, point.height_epsg) for point in points}
+    if crs is not None or height_crs is not None or len(codes) > 1:
+        return configured
+    epsg, height_epsg = codes.pop()
+    given = replace(configured, epsg=epsg, height_epsg=height_epsg)
     try:
-        Projection(Georeference(origin, np.eye(4), epsg=next(iter(codes)))).check()
+        Projection(given).check()
     except UsageError:
-        return None
-    return codes.pop()
+        return configured
+    return given

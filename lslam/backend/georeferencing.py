@@ -99,8 +99,10 @@ def require_gnss(sequence: Sequence, config: GnssConfig) -> None:
 
 def require_crs(origin: Floats, config: GnssConfig) -> None:
     """Raise UsageError when results about `origin`, lat, lon (deg), height (m), are wanted in coordinates of no map."""
-    if config.crs is not None:
-        Projection(Georeference(origin, np.eye(4), config.crs)).check()
+    if config.crs is not None or config.height_crs is not None or config.geoid:
+        place = Georeference(origin, np.eye(4), config.crs, height_epsg=config.height_crs, geoid=config.geoid)
+        if lacking := Projection(place).check():
+            log.warning("%s", lacking)
 
 
 def place(
@@ -195,6 +197,8 @@ def _at_first(found: GnssAlignment, fixes: Fixes, config: GnssConfig) -> tuple[G
         used=int(found.inliers.sum()),
         rmse_horizontal=float(np.sqrt((residuals[:, :2] ** 2).sum(1).mean())),
         rmse_vertical=float(np.sqrt((residuals[:, 2] ** 2).mean())),
+        height_epsg=config.height_crs,
+        geoid=config.geoid,
     ), shift
 
 

@@ -57,7 +57,7 @@ def read_manual(config: Config, sequence: Sequence) -> Manual:
                 f"{1e-9 * span[0]:.3f} to {1e-9 * span[1]:.3f} s"
             )
     for point in points:
-        require_crs(to_wgs84(point.position[None], point.epsg)[0], config.gnss)
+        require_crs(to_wgs84(point.position[None], point.epsg, point.height_epsg, config.gnss.geoid)[0], config.gnss)
     return Manual(tuple(pairs), tuple(points))
 
 

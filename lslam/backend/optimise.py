@@ -79,10 +79,11 @@ def run_back_end(
         moved = replace(graph, poses=out.keyframes)
         out = replace(out, georeference=_by_fixes(sequence, moved, given, out.results).georeference)
     if points and out.georeference is not None:
-        left = control_residuals(points, out.results, out.georeference)
+        left = control_residuals(points, out.results, out.georeference, config.gnss.geoid)
         out = replace(out, control=left, facts=out.facts | {"control_points": control_facts(left)})
         probability = config.graph.probability
-        problems += against_odometry(points, results, keyframes, drift, probability) + contradicting(left, probability)
+        problems += against_odometry(points, results, keyframes, drift, probability, config.gnss.geoid)
+        problems += contradicting(left, probability)
     for problem in problems:
         log.warning("%s", problem)
     return replace(out, problems=problems, facts={"keyframes": len(keyframes)} | out.facts)

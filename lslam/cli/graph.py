@@ -33,7 +33,7 @@ from lslam.errors import RunFinishedError, UsageError
 )  # fmt: skip
 @click.option("--gnss", "gnss", flag_value="graph", default=None, help="Satellite fixes are factors of the pose graph.")
 @click.option("--georeference", "gnss", flag_value="fit", help="Satellite fixes only georeference the result.")
-@click.option("--crs", metavar="EPSG:N", help="Coordinates of georeferenced maps [default: the control points'].")
+@options.coordinates
 @click.option(
     "--gt", type=click.Path(path_type=Path), metavar="FILE", help="Ground truth instead of the sequence's own."
 )
@@ -92,7 +92,7 @@ def _settings(given: dict[str, Any]) -> list[str]:
     flags |= {
         "loops.use": "false" if given["only_known"] else None,
         "gnss.mode": given["gnss"],
-        "gnss.crs": None if given["crs"] is None else str(options.epsg(given["crs"])),
+        **options.crs_settings(given["crs"], given["geoid"]),
         "map.write": "false" if given["no_map"] else None,
     }
     return [*given["settings"], *(f"{key}={value}" for key, value in flags.items() if value is not None)]

@@ -16,6 +16,7 @@ from lslam.stopping import heeded
 
 if TYPE_CHECKING:
     from lslam.pipeline.rebuild import EarlierRun
+    from lslam.types.gnss import OutputCrs
     from lslam.types.run_record import Crispness
 
 EPILOG = """\b
@@ -38,7 +39,8 @@ Examples:
 @click.option("--occupancy", is_flag=True, help="Write occupied and free cells too, and a floor plan.")
 @click.option("--denoise", is_flag=True, help="Remove points far from their neighbours (Open3D).")
 @click.option("--mesh", is_flag=True, help="Write a surface too, FILE_mesh.ply (Open3D).")
-@click.option("--crs", metavar="EPSG:N", help="Coordinates of las and laz of a georeferenced run  [its UTM zone].")
+@click.option("--crs", metavar="EPSG:N[+M]", help="Coordinates of las and laz of a georeferenced run, +M of heights.")
+@click.option("--geoid", metavar="GRID", help="Heights of las and laz above this geoid (.gtx, .tif).")
 @click.option(
     "--tiles", type=float, metavar="M", help="Square tiles with this edge and an index, for maps of any size."
 )
@@ -128,12 +130,15 @@ def _rebuild(target: Path, given: dict[str, Any]) -> None:
             raise UsageError(f"--{flag} belongs to {'--against' if flag == 'threshold' else '--score'}")
     settings = _settings(given if given["tiles"] is None else {**given, "out": None})
     require_run(target)
-    from lslam.maps.georeference import parse_crs
+    from lslam.geometry.crs_names import parse_crs
     from lslam.pipeline.rebuild import check_output, open_scans, read_run, rebuild
     from lslam.reports.evaluations import crispness_document
+    from lslam.types.gnss import OutputCrs
 
     out: Path | None = given["out"]
-    crs = None if given["crs"] is None else parse_crs(given["crs"])
+    epsg, height_epsg = (None, None) if given["crs"] is None else parse_crs(given["crs"])
+    geoid = "" if given["geoid"] is None else options.grid_file(given["geoid"])
+    crs = OutputCrs(epsg, height_epsg, geoid) if epsg or geoid else None
     run = read_run(target, settings)
     if given["tiles"] is not None:
         _rebuild_tiles(run, out or target / "tiles", crs, given)
@@ -148,7 +153,7 @@ def _rebuild(target: Path, given: dict[str, Any]) -> None:
     _print(rows, {**document, "crispness": crispness_document(built.crispness)}, given["as_json"])
 
 
-def _rebuild_tiles(run: EarlierRun, folder: Path, crs: int | None, given: dict[str, Any]) -> None:
+def _rebuild_tiles(run: EarlierRun, folder: Path, crs: OutputCrs | None, given: dict[str, Any]) -> None:
     from lslam.errors import UsageError
     from lslam.pipeline.map_tiles import check_tiles, rebuild_in_tiles
     from lslam.pipeline.rebuild import open_scans

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 # What a map is made with, and how clouds are scored: no part of a comparison of drives.
 _OTHERS = (
-    "file_format", "crop", "clean", "occupancy", "denoise", "mesh", "crs", "out", "is_scored", "threshold", "radius",
+    "file_format", "crop", "clean", "occupancy", "denoise", "mesh", "crs", "geoid", "out", "is_scored", "threshold", "radius",
 )  # fmt: skip
 _FLAGS = {"file_format": "format", "is_scored": "score"}
 # Rows of the table, at most; the files have all.

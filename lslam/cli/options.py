@@ -16,7 +16,6 @@ import click
 
 from lslam.errors import ConfigError, InputError, UsageError, nearest
 from lslam.remote import RemotePath, as_path
-from lslam.untrusted import whole_number
 
 if TYPE_CHECKING:
     from lslam.config.input import ScanRange
@@ -171,12 +170,33 @@ def with_preset(settings: Iterable[str], preset: str | None) -> list[str]:
     return [*settings, *([] if preset is None else [f"odometry.preset={json.dumps(preset)}"])]
 
 
-def epsg(text: str) -> int:
-    """The number of `EPSG:25832` or `25832`; raises UsageError for anything else."""
-    number = whole_number(text.upper().removeprefix("EPSG:"))
-    if number is None:
-        raise UsageError(f"--crs {text} is no EPSG code: EPSG:25832 is one")
-    return number
+def coordinates(function: F) -> F:
+    """--crs and --geoid."""
+    for name, metavar, text in (
+        ("--geoid", "GRID", "Heights above this geoid (.gtx, .tif) in place of the ellipsoid."),
+        ("--crs", "EPSG:N[+M]", "Coordinates of georeferenced maps, +M of heights [default: control points', UTM]."),
+    ):
+        function = click.option(name, metavar=metavar, help=text)(function)
+    return function
+
+
+def crs_settings(crs: str | None, geoid: str | None) -> dict[str, str | None]:
+    """Configuration keys of these flags; raises UsageError for what is no code."""
+    from lslam.geometry.crs_names import parse_crs
+
+    epsg, height_epsg = (None, None) if crs is None else parse_crs(f"EPSG:{crs}" if crs[:1].isdecimal() else crs)
+    path = None if geoid is None else grid_file(geoid)
+    return {
+        "gnss.crs": None if epsg is None else str(epsg),
+        "gnss.height_crs": None if height_epsg is None else str(height_epsg),
+        "gnss.geoid": None if path is None else json.dumps(path, ensure_ascii=False),
+    }
+
+
+def grid_file(geoid: str) -> str:
+    """A file by its absolute path; other names are those of PROJ's own grids."""
+    path = Path(geoid).expanduser()
+    return str(path.absolute()) if path.exists() else geoid
 
 
 def studied(function: F) -> F:

@@ -66,7 +66,7 @@ if TYPE_CHECKING:
     metavar="DEG",
     help="With --osm: heading of the first scan, clockwise from north [default: searched].",
 )
-@click.option("--crs", metavar="EPSG:N", help="Coordinates of georeferenced maps [default: the UTM zone].")
+@options.coordinates
 @click.option(
     "--poses",
     type=click.Path(path_type=Path),
@@ -205,7 +205,7 @@ def _flags(given: dict[str, Any]) -> dict[str, Any]:
         if given["origin"] is None
         else json.dumps([*options.place("--origin", given["origin"]), 0.0][:3]),
         "osm.heading_deg": given["heading"],
-        "gnss.crs": None if given["crs"] is None else options.epsg(given["crs"]),
+        **options.crs_settings(given["crs"], given["geoid"]),
     }
     if given["poses"] is not None:
         if given["method"] not in (None, "poses"):

@@ -18,6 +18,15 @@ class GnssConfig(Section):
     crs: int | None = Field(
         None, ge=1024, le=32767, description="EPSG code of georeferenced outputs; default: UTM zone"
     )
+    height_crs: int | None = Field(
+        None,
+        ge=1024,
+        le=32767,
+        description="EPSG code of a vertical coordinate reference system: --crs EPSG:25832+7837",
+    )
+    geoid: str = Field(
+        "", description="grid (GTX, GeoTIFF) of the geoid that heights of outputs and control points count from"
+    )
     sigma: float | None = Field(None, gt=0, description="m; one sigma of a fix; default: what the recording states")
     min_sigma: float = Field(0.02, gt=0, description="m; least sigma of a fix")
     vertical: float = Field(1.8, ge=1, description="heights are worse than positions by this factor")

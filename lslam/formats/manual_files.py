@@ -12,9 +12,10 @@ from typing import Literal, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.errors import InputError, cause, nearest
+from lslam.errors import InputError, UsageError, cause, nearest
 from lslam.formats.atomic import write_text
 from lslam.formats.pose_rows import seconds_to_ns
+from lslam.geometry.crs_names import parse_crs
 from lslam.types.manual import ControlPoint, ControlResidual, Instant, NamedPair
 from lslam.untrusted import whole_number
 
@@ -113,16 +114,18 @@ def read_control_points(path: Path) -> list[ControlPoint]:
     """
     points = []
     for row in _rows(path, (("scan", "stamp", "stamp_ns"), X, Y, Z, ("sigma", "sigma_m"), ("crs",))):
-        name, _, digits = row.text("crs").partition(":")
-        epsg = whole_number(digits)
-        if name.strip().upper() != "EPSG" or epsg is None:
-            raise row.error(f"crs = {row.text('crs')!r}: EPSG and a number, for example EPSG:25832")
+        try:
+            epsg, height_epsg = parse_crs(row.text("crs"))
+        except UsageError:
+            raise row.error(
+                f"crs = {row.text('crs')!r}: EPSG and a number, for example EPSG:25832, or EPSG:25832+7837 with heights"
+            ) from None
         sigma = row.size("sigma", "sigma_m")
         if sigma is None:
             raise row.error("sigma is empty: a point without it holds nothing")
         spread = np.array([sigma, sigma, row.size("sigma_z", "sigma_z_m") or sigma])
         position = np.array([row.needed(*X), row.needed(*Y), row.needed(*Z)])
-        points.append(ControlPoint(row.instant(), position, spread, epsg, _seen(row)))
+        points.append(ControlPoint(row.instant(), position, spread, epsg, _seen(row), height_epsg))
     if not points:
         raise InputError(f"{path} has no control points below its header")
     return points

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,10 +13,18 @@ from numpy.typing import NDArray
 
 from lslam.errors import UsageError
 from lslam.geometry import se3
-from lslam.geometry.geodesy import from_local, local_crs
+from lslam.geometry.crs_names import crs_name
+from lslam.geometry.geodesy import (
+    crs_of,
+    exact_transformer,
+    from_local,
+    geoid_heights,
+    has_heights,
+    local_crs,
+    to_local,
+)
 from lslam.types.cloud import Cloud, CloudBlock
 from lslam.types.gnss import Georeference
-from lslam.untrusted import whole_number
 
 Floats = NDArray[np.float64]
 
@@ -34,16 +43,31 @@ def utm_epsg(lat: float, lon: float) -> int:
 class Projection:
     """Carries a run's world into a projected coordinate reference system: that of the georeference, else the UTM zone.
 
-    Heights are those above the WGS84 ellipsoid, m.
+    Heights are those of its vertical datum or of the geoid of the georeference, m; without both above the WGS84 ellipsoid.
     """
 
     georeference: Georeference
 
     @property
     def epsg(self) -> int:
-        """Code of the coordinate reference system."""
+        """Code of the coordinate reference system, without that of its heights."""
         lat, lon, _ = (float(v) for v in self.georeference.origin)
         return self.georeference.epsg or utm_epsg(lat, lon)
+
+    @property
+    def name(self) -> str:
+        """As `EPSG:25832`, or `EPSG:25832+7837` with heights."""
+        return crs_name(self.epsg, self.georeference.height_epsg)
+
+    @property
+    def frame(self) -> str:
+        """The coordinates in words."""
+        geoid = self.georeference.geoid
+        if geoid:
+            return f"{self.name}, heights above the geoid of {Path(geoid).name}"
+        if has_heights(self._crs):
+            return f"{self.name}, {self._crs.sub_crs_list[1].name}"
+        return f"{self.name}, heights above the WGS84 ellipsoid"
 
     @property
     def wkt(self) -> str:
@@ -51,44 +75,71 @@ class Projection:
         return str(self._crs.to_wkt("WKT1_GDAL") or self._crs.to_wkt())
 
     def apply(self, points: NDArray[Any]) -> Floats:
-        """Points (N, 3) of the run's world, m, to (N, 3) easting, northing, height, m."""
+        """Points (N, 3) of the run's world, m, to (N, 3) easting, northing, height, m.
+
+        Raises UsageError where a grid of heights ends.
+        """
         enu = se3.apply(self.georeference.T_enu_world, np.asarray(points, np.float64).reshape(-1, 3))
+        if self._is_vertical:
+            places = from_local(enu, self.georeference.origin)
+            out = np.column_stack(self._transformer.transform(places[:, 1], places[:, 0], places[:, 2]))
+            if not np.isfinite(out).all():
+                raise UsageError(f"--crs {self.name}: its grid of heights ends within the map")
+            return out
         x, y = self._transformer.transform(enu[:, 0], enu[:, 1])
-        return np.column_stack([x, y, enu[:, 2] + float(self.georeference.origin[2])])
+        heights = enu[:, 2] + float(self.georeference.origin[2])
+        if self.georeference.geoid and len(enu):
+            heights -= geoid_heights(self.georeference.geoid, from_local(enu, self.georeference.origin))
+        return np.column_stack([x, y, heights])
 
     def invert(self, points: NDArray[Any]) -> Floats:
         """The inverse of `apply`: easting, northing, height, m, to the run's world, m."""
         from pyproj.enums import TransformDirection
 
         there = np.asarray(points, np.float64).reshape(-1, 3)
+        T_world_enu = se3.inverse(self.georeference.T_enu_world)
+        if self._is_vertical:
+            lon, lat, height = self._transformer.transform(*there.T, direction=TransformDirection.INVERSE)
+            return se3.apply(T_world_enu, to_local(np.column_stack([lat, lon, height]), self.georeference.origin))
         x, y = self._transformer.transform(there[:, 0], there[:, 1], direction=TransformDirection.INVERSE)
         enu = np.column_stack([x, y, there[:, 2] - float(self.georeference.origin[2])])
-        return se3.apply(se3.inverse(self.georeference.T_enu_world), enu)
+        if self.georeference.geoid and len(enu):
+            enu[:, 2] += geoid_heights(self.georeference.geoid, from_local(enu, self.georeference.origin))
+        return se3.apply(T_world_enu, enu)
 
-    def check(self) -> None:
-        """Raise UsageError unless the coordinate reference system is known and counts in metres."""
-        units = {axis.unit_name for axis in self._crs.axis_info[:2]}
-        if not self._crs.is_projected or units != {"metre"}:
+    def check(self) -> str:
+        """What its operation lacks, in a sentence, or nothing.
+
+        Raises UsageError unless the coordinate reference system is known, counts in metres and is reached exactly.
+        """
+        units = {axis.unit_name for axis in self._crs.axis_info}
+        if not self._crs.is_projected or units != {"metre"} or self._crs.axis_info[-1].direction == "down":
             raise UsageError(
-                f"--crs EPSG:{self.epsg} ({self._crs.name}) does not count in metres on a plane: choose a projected "
+                f"--crs {self.name} ({self._crs.name}) does not count in metres on a plane: choose a projected "
                 f"one, for example EPSG:{Projection(_without_epsg(self.georeference)).epsg}"
             )
+        self.apply(np.zeros((1, 3)))
+        return self._operation[1]
 
     @cached_property
     def _crs(self) -> Any:
-        from pyproj import CRS
-        from pyproj.exceptions import CRSError
+        return crs_of(self.epsg, self.georeference.height_epsg)
 
-        try:
-            return CRS.from_epsg(self.epsg)
-        except CRSError:
-            raise UsageError(f"--crs EPSG:{self.epsg}: PROJ knows no such coordinate reference system") from None
+    @property
+    def _is_vertical(self) -> bool:
+        """Whether PROJ's own operation gives the heights."""
+        return has_heights(self._crs) and not self.georeference.geoid
+
+    @property
+    def _transformer(self) -> Any:
+        return self._operation[0]
 
     @cached_property
-    def _transformer(self) -> Any:
-        from pyproj import Transformer
-
-        return Transformer.from_crs(local_crs(self.georeference.origin), self._crs, always_xy=True)
+    def _operation(self) -> tuple[Any, str]:
+        if self._is_vertical:
+            return exact_transformer("EPSG:4979", self._crs, self.georeference.origin[:2], self.name)
+        plane = self._crs.sub_crs_list[0] if has_heights(self._crs) else self._crs
+        return exact_transformer(local_crs(self.georeference.origin), plane, self.georeference.origin[:2], self.name)
 
 
 @dataclass(frozen=True)
@@ -117,37 +168,45 @@ def to_lat_lon(points: NDArray[Any], georeference: Georeference) -> Floats:
     return from_local(se3.apply(georeference.T_enu_world, points), georeference.origin)
 
 
-def to_wgs84(points: NDArray[Any], epsg: int) -> Floats:
+def to_wgs84(points: NDArray[Any], epsg: int, height_epsg: int | None = None, geoid: str = "") -> Floats:
     """Points (N, 3) in the coordinates `epsg`, x (or longitude, deg) first, to (N, 3) lat, lon (deg), height (m), WGS84.
 
-    Heights are those of the coordinates where these have some, else above the ellipsoid. Raises UsageError for a code that PROJ
-    does not know, and for what is no place in it.
+    Heights are those above the grid `geoid` where there is one and the coordinates are not ellipsoidal by name, else of the
+    coordinates where these have some, else above the ellipsoid. Raises UsageError for a code that PROJ does not know, for what
+    is no place in it, and where the exact operation lacks a grid.
     """
-    from pyproj import CRS, Transformer
-    from pyproj.exceptions import CRSError
+    from pyproj import Transformer
 
-    there = np.asarray(points, np.float64).reshape(-1, 3)
-    try:
-        crs = CRS.from_epsg(epsg)
-        transformer = Transformer.from_crs(crs if len(crs.axis_info) > 2 else crs.to_3d(), "EPSG:4979", always_xy=True)
-    except CRSError:
-        raise UsageError(f"EPSG:{epsg}: PROJ knows no such coordinate reference system") from None
-    lon, lat, height = transformer.transform(there[:, 0], there[:, 1], there[:, 2])
-    out = np.column_stack([lat, lon, height])
-    wrong = np.flatnonzero(~(np.isfinite(out).all(1) & (np.abs(out[:, 0]) <= 90) & (np.abs(out[:, 1]) <= 360)))
-    if len(wrong):
-        x, y, _ = there[wrong[0]]
-        raise UsageError(f"{x:.1f}, {y:.1f} is no place in EPSG:{epsg} ({crs.name}): easting or longitude comes first")
+    there, crs = np.asarray(points, np.float64).reshape(-1, 3), crs_of(epsg, height_epsg)
+    is_compound, is_ellipsoidal = has_heights(crs), not has_heights(crs) and len(crs.axis_info) > 2
+    plane = crs.sub_crs_list[0] if is_compound else crs if is_ellipsoidal else crs.to_3d()
+    flat = crs.sub_crs_list[0] if is_compound else crs.to_2d()
+    lon, lat = Transformer.from_crs(flat, "EPSG:4326", always_xy=True).transform(there[:, 0], there[:, 1])
+    _require_places(there, np.column_stack([lat, lon, there[:, 2]]), crs, epsg)
+    places, name = np.column_stack([lat, lon]), crs_name(epsg, height_epsg)
+    if not is_compound or geoid:
+        source = plane if not is_compound else plane.to_3d()
+        transformer, _ = exact_transformer(source, "EPSG:4979", places, name)
+        out = _transformed(transformer, there)
+        if geoid and not is_ellipsoidal:
+            # The plane's own ellipsoid has no say in heights above a geoid.
+            out[:, 2] = there[:, 2] + geoid_heights(geoid, out)
+    else:
+        out = _transformed(exact_transformer(crs, "EPSG:4979", places, name)[0], there)
+    _require_places(there, out, crs, epsg)
     return out
 
 
-def parse_crs(text: str) -> int:
-    """The code of `EPSG:25832`; raises UsageError on anything else."""
-    name, _, digits = text.strip().partition(":")
-    number = whole_number(digits)
-    if name.upper() != "EPSG" or number is None:
-        raise UsageError(f"--crs {text}: expected EPSG and a number, for example EPSG:25832")
-    return number
+def _transformed(transformer: Any, points: Floats) -> Floats:
+    lon, lat, height = transformer.transform(points[:, 0], points[:, 1], points[:, 2])
+    return np.column_stack([lat, lon, height])
+
+
+def _require_places(points: Floats, places: Floats, crs: Any, epsg: int) -> None:
+    wrong = np.flatnonzero(~(np.isfinite(places).all(1) & (np.abs(places[:, 0]) <= 90) & (np.abs(places[:, 1]) <= 360)))
+    if len(wrong):
+        x, y, _ = points[wrong[0]]
+        raise UsageError(f"{x:.1f}, {y:.1f} is no place in EPSG:{epsg} ({crs.name}): easting or longitude comes first")
 
 
 def _without_epsg(georeference: Georeference) -> Georeference:

@@ -66,7 +66,10 @@ def hold_by_buildings(osm: OsmSource, graph: PoseGraph, placement: Placement, gi
     if located.problem:
         problems.append(located.problem)
         return None
-    on_walls = Georeference(extract.origin, located.T_enu_odometry, config.gnss.crs, "osm", used=len(located.priors))
+    on_walls = Georeference(
+        extract.origin, located.T_enu_odometry, config.gnss.crs, "osm", used=len(located.priors),
+        height_epsg=config.gnss.height_crs, geoid=config.gnss.geoid,
+    )  # fmt: skip
     georeference = known if is_on_earth else on_walls
     out = solve(held, given, georeference)
     if out is None or out.solution is None:

@@ -187,5 +187,8 @@ def describe(georeference: Georeference) -> dict[str, Any]:
     plain["origin_lat_lon_height"] = [float(v) for v in plain.pop("origin")]
     plain["T_enu_world"] = georeference.T_enu_world.tolist()
     plain["projection"] = "transverse Mercator at the origin, scale 1, WGS84"
+    for name in ("height_epsg", "geoid"):
+        if not plain[name]:
+            del plain[name]
     known = {k: v for k, v in plain.items() if not (isinstance(v, float) and np.isnan(v))}
     return {k: round(v, 4) if isinstance(v, float) else v for k, v in known.items()}

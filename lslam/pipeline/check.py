@@ -63,10 +63,11 @@ def check_config(config: Config) -> None:
 
 def _check_places(config: Config) -> None:
     """What tells a run where it lies."""
-    if config.gnss.crs is not None and config.gnss.mode == "off" and not (config.osm.extract or config.graph.control):
+    wanted = "--crs" if config.gnss.crs or config.gnss.height_crs else "--geoid" if config.gnss.geoid else ""
+    if wanted and config.gnss.mode == "off" and not (config.osm.extract or config.graph.control):
         raise UsageError(
-            "--crs does nothing without --gnss, --georeference, --osm or --control, which tell where on the Earth the run lies: "
-            "give one of them, or drop it"
+            f"{wanted} does nothing without --gnss, --georeference, --osm or --control, which tell where on the Earth the run "
+            "lies: give one of them, or drop it"
         )
     if config.localize.map and config.osm.extract:
         raise UsageError("--osm holds a drive by buildings and a map by its surfaces: drop one of them")

@@ -124,7 +124,7 @@ def write_map(path: Path, cloud: Cloud, note: MapNote, georeference: Georeferenc
     """
     projection = None if georeference is None else Projection(georeference)
     projected = projection is not None and path.suffix.lower() in (".las", ".laz")
-    where = "not georeferenced" if projection is None else f"EPSG:{projection.epsg}" if projected else "local"
+    where = "not georeferenced" if projection is None else projection.name if projected else "local"
     comment = f"lslam {__version__} map, {where}; {note.world}"
     if projection is not None and projected:
         projection.check()
@@ -138,10 +138,8 @@ def write_map(path: Path, cloud: Cloud, note: MapNote, georeference: Georeferenc
         "points": len(cloud),
         "unit": "m",
         "intensity": cloud.has_intensity,
-        "frame": f"EPSG:{projection.epsg}, heights above the WGS84 ellipsoid"
-        if projection is not None and projected
-        else note.world,
-        "crs": f"EPSG:{projection.epsg}" if projection is not None and projected else None,
+        "frame": projection.frame if projection is not None and projected else note.world,
+        "crs": projection.name if projection is not None and projected else None,
         "georeference": None if georeference is None else georeference_note(georeference),
         "voxel": note.voxel,
         "done": list(note.done),
@@ -197,7 +195,14 @@ def georeference_note(georeference: Georeference) -> dict[str, Any]:
         "enu": "transverse Mercator at the origin, scale 1, WGS84: east, north, height above the origin, m",
         "epsg": Projection(georeference).epsg,
         "method": georeference.method,
+        **height_note(georeference),
     }
+
+
+def height_note(georeference: Georeference) -> dict[str, Any]:
+    """What its heights count from, where that is not the ellipsoid or the coordinate reference system's own."""
+    said = {"height_epsg": georeference.height_epsg, "geoid": georeference.geoid}
+    return {name: value for name, value in said.items() if value}
 
 
 def georeference_of(note: Any) -> Georeference | None:
@@ -212,6 +217,8 @@ def georeference_of(note: Any) -> Georeference | None:
             T_enu_world,
             None if note.get("epsg") is None else int(note["epsg"]),
             note["method"],
+            height_epsg=None if note.get("height_epsg") is None else int(note["height_epsg"]),
+            geoid=str(note.get("geoid", "")),
         )
     except MISFIT:
         return None

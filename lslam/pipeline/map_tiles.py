@@ -20,7 +20,7 @@ from lslam.pipeline.map_pass import INTERRUPTED, build_map
 from lslam.pipeline.rebuild import EarlierRun, place_of, results_of
 from lslam.pipeline.run_folder import SPOOL
 from lslam.types.cloud import ArrayCloud, Cloud
-from lslam.types.gnss import Georeference
+from lslam.types.gnss import Georeference, OutputCrs
 from lslam.types.sequence import Sequence
 from lslam.version import __version__
 
@@ -30,7 +30,7 @@ BUFFERED = 1 << 22
 
 
 def rebuild_in_tiles(
-    run: EarlierRun, sequence: Sequence, folder: Path, size: float, *, crs: int | None = None,
+    run: EarlierRun, sequence: Sequence, folder: Path, size: float, *, crs: OutputCrs | None = None,
     on_step: Callable[[], None] = lambda: None, should_stop: Callable[[], bool] = lambda: False,
 ) -> dict[str, Any]:  # fmt: skip
     """The map of a run anew, in tiles of `size` m, in `folder`, which `check_tiles` has checked; gives the index.
@@ -66,10 +66,10 @@ def write_tiles(
             low, high = tile.points.min(axis=0), tile.points.max(axis=0)
             tiles.append({"file": path.name, "points": len(tile), "low": low.tolist(), "high": high.tolist()})
         _publish(Path(stage), folder, {tile["file"] for tile in tiles})
-    crs = f"EPSG:{projection.epsg}" if projection is not None and is_projected else None
+    crs = projection.name if projection is not None and is_projected else None
     index: dict[str, Any] = {
         "schema": SCHEMA, "kind": "tiles", "tile_m": size, "unit": "m", "points": len(cloud), "tiles": tiles,
-        "frame": note.world if crs is None else f"{crs}, heights above the WGS84 ellipsoid", "crs": crs,
+        "frame": note.world if projection is None or crs is None else projection.frame, "crs": crs,
         "georeference": None if georeference is None else georeference_note(georeference),
         "voxel": note.voxel, "done": list(note.done), "sequence": note.sequence, "lslam": __version__,
     }  # fmt: skip

@@ -50,7 +50,7 @@ from lslam.reports.evaluations import run_document
 from lslam.reports.html import with_new_map
 from lslam.reports.recording import ViewedRun
 from lslam.types.cloud import ArrayCloud
-from lslam.types.gnss import Georeference
+from lslam.types.gnss import Georeference, OutputCrs
 from lslam.types.run_record import Crispness, RunRecord
 from lslam.types.scan_result import ScanResult, Status
 from lslam.types.sequence import Sequence
@@ -160,7 +160,7 @@ def open_scans(run: EarlierRun, sequence: Path | None = None, *, flag: str = "--
 
 
 def rebuild(
-    run: EarlierRun, sequence: Sequence, out: Path | None = None, *, overwrite: bool = False, crs: int | None = None,
+    run: EarlierRun, sequence: Sequence, out: Path | None = None, *, overwrite: bool = False, crs: OutputCrs | None = None,
     on_step: Callable[[], None] = lambda: None, should_stop: Callable[[], bool] = lambda: False,
 ) -> RebuiltMap:  # fmt: skip
     """Build the map with the run's configuration and write it to `out`, by default map.<format> in the run folder.
@@ -206,15 +206,19 @@ def check_output(path: Path, overwrite: bool) -> None:
         raise OutputExistsError(f"{beside}, where the note of {path.name} goes, is something else: name another --out")
 
 
-def place_of(run: EarlierRun, crs: int | None) -> Georeference | None:
+def place_of(run: EarlierRun, crs: OutputCrs | None) -> Georeference | None:
     """Where the run lies, in the coordinates asked for."""
     georeference = run.georeference
     if crs is None:
         return georeference
     if georeference is None:
-        raise UsageError(f"--crs: {run.folder} is not georeferenced; run the sequence with --georeference or --gnss")
-    georeference = replace(georeference, epsg=crs)
-    Projection(georeference).check()
+        flag = "--geoid" if crs.epsg is None else "--crs"
+        raise UsageError(f"{flag}: {run.folder} is not georeferenced; run the sequence with --georeference or --gnss")
+    if crs.epsg is not None:
+        georeference = replace(georeference, epsg=crs.epsg, height_epsg=crs.height_epsg)
+    georeference = replace(georeference, geoid=crs.geoid or georeference.geoid)
+    if lacking := Projection(georeference).check():
+        log.warning("%s", lacking)
     return georeference
 
 

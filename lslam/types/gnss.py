@@ -32,6 +32,15 @@ class GnssStream:
 
 
 @dataclass(frozen=True)
+class OutputCrs:
+    """Coordinates that a map is asked for in; what is None or empty stays as the run has it, as `Georeference` names them."""
+
+    epsg: int | None = None
+    height_epsg: int | None = None
+    geoid: str = ""
+
+
+@dataclass(frozen=True)
 class Georeference:
     """From the coordinates of a run's trajectory and map to the Earth.
 
@@ -39,6 +48,8 @@ class Georeference:
         projection there with scale 1 (`geometry.geodesy`)
     T_enu_world : (4, 4) from the run's world into that frame; the identity when the run's world is that frame
     epsg : the code outputs are to be written in; None leaves it to the writer, which takes the UTM zone of the origin
+    height_epsg : code of their vertical coordinate reference system, None for that of `epsg`, which may have none
+    geoid : grid of a geoid above which their heights are, empty for none
     method : `fit` one rigid transform of the finished trajectory to all fixes; `graph` fixes were factors; `osm` the
         buildings of OpenStreetMap were, `control` surveyed points
     fixes, used : fixes that were given, and the inliers
@@ -53,6 +64,8 @@ class Georeference:
     used: int = 0
     rmse_horizontal: float = float("nan")
     rmse_vertical: float = float("nan")
+    height_epsg: int | None = None
+    geoid: str = ""
 
     @property
     def is_in_graph(self) -> bool:

@@ -40,6 +40,7 @@ class ControlPoint:
 
     position : (3,) in the coordinates `epsg`: easting, northing, height, m, or longitude, latitude, deg, height, m
     sigma : (3,) m; seen : (3,) m, the point in the axes of the LiDAR; the sensor itself is the origin
+    height_epsg : of the heights, None for those of `epsg`
     """
 
     at: Instant
@@ -47,6 +48,7 @@ class ControlPoint:
     sigma: Floats
     epsg: int
     seen: Floats = field(default_factory=lambda: np.zeros(3))
+    height_epsg: int | None = None
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,8 @@ from pyproj import CRS, Transformer
 from lslam.errors import UsageError
 from lslam.formats.las_files import read_las
 from lslam.geometry import se3, so3
-from lslam.maps.georeference import Projection, parse_crs, to_lat_lon, utm_epsg
+from lslam.geometry.crs_names import parse_crs
+from lslam.maps.georeference import Projection, to_lat_lon, utm_epsg
 from lslam.pipeline.map_files import MapNote, write_geojson, write_map
 from lslam.types.cloud import ArrayCloud
 from lslam.types.gnss import Georeference
@@ -94,8 +95,9 @@ def test_coordinate_reference_systems_that_will_not_do(tmp_path: Path) -> None:
         Projection(reference(99999)).check()
     with pytest.raises(UsageError, match="EPSG:2263"):
         Projection(reference(2263)).check()  # US feet
-    assert parse_crs("epsg:25832") == 25832
-    for bad in ("25832", "EPSG:", "EPSG:x", "ESRI:102100"):
+    assert parse_crs("epsg:25832") == (25832, None)
+    assert parse_crs("EPSG:25832+7837") == parse_crs("EPSG:25832+EPSG:7837") == (25832, 7837)
+    for bad in ("25832", "EPSG:", "EPSG:x", "EPSG:25832+", "EPSG:25832+x", "ESRI:102100"):
         with pytest.raises(UsageError, match="expected EPSG and a number"):
             parse_crs(bad)
     assert not list(tmp_path.iterdir())
