@@ -13,6 +13,7 @@ from lslam.formats.bag_files import Bag, BagTopic, read_header
 from lslam.geometry import se3, so3
 
 Floats = NDArray[np.float64]
+Transforms = dict[tuple[str, str], Floats]
 
 # sensor_msgs/Imu behind its header, float64: orientation 4, covariance 9, angular velocity 3, covariance 9, acceleration 3.
 _IMU_BYTES, _GYRO, _ACCEL = 37 * 8, 13 * 8, 25 * 8
@@ -104,20 +105,17 @@ def is_static(topic: BagTopic) -> bool:
     return topic.name.rsplit("/", 1)[-1] == "tf_static"
 
 
-def read_static_transforms(bag: Bag, broken: list[str]) -> dict[tuple[str, str], Floats]:
-    """`T_parent_child` by (parent, child) of /tf_static; the last one said of a pair counts."""
-    found: dict[tuple[str, str], Floats] = {}
-    for topic in bag.of_type("TFMessage"):
-        if not is_static(topic):
-            continue
-        for data in bag.messages(topic, broken):
-            try:
-                for t in bag.decode(topic, data).transforms:
-                    pair = (t.header.frame_id.lstrip("/"), t.child_frame_id.lstrip("/"))
-                    found[pair] = _poses([_numbers(topic, t.transform.translation, t.transform.rotation)])[0]
-            except InputError as error:
-                broken.append(str(error))
-    return found
+def read_transforms(bag: Bag, topic: BagTopic, broken: list[str]) -> Transforms:
+    """`T_parent_child` (N, 4, 4) by (parent, child), all that a TFMessage topic says of a pair, as it was recorded."""
+    found: dict[tuple[str, str], list[list[float]]] = {}
+    for data in bag.messages(topic, broken):
+        try:
+            for t in bag.decode(topic, data).transforms:
+                pair = (t.header.frame_id.lstrip("/"), t.child_frame_id.lstrip("/"))
+                found.setdefault(pair, []).append(_numbers(topic, t.transform.translation, t.transform.rotation))
+        except InputError as error:
+            broken.append(str(error))
+    return {pair: _poses(rows) for pair, rows in found.items()}
 
 
 def read_text(bag: Bag, name: str) -> str | None:
@@ -131,7 +129,7 @@ def read_text(bag: Bag, name: str) -> str | None:
     return texts[-1] if texts else None
 
 
-def chain(transforms: dict[tuple[str, str], Floats], a: str, b: str) -> Floats | None:
+def chain(transforms: Transforms, a: str, b: str) -> Floats | None:
     """(4, 4) `T_a_b` along static transforms, forwards and backwards; None when no chain connects the two frames."""
     if a == b:
         return np.eye(4)

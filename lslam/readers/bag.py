@@ -20,6 +20,7 @@ from lslam.formats.pointcloud2 import decode_livox, decode_pointcloud2
 from lslam.formats.sequence_toml import FILE_NAME, SequenceInfo, parse_sequence_toml, read_sequence_toml
 from lslam.geometry import se3
 from lslam.printable import printable
+from lslam.readers.bag_links import Links
 from lslam.readers.bag_topics import (
     check_parts,
     choose_clouds,
@@ -43,7 +44,6 @@ KIND = "bag"
 _LAYOUTS = ("velodyne", "velodyne_points", "sequences")
 _LOOKED_AT = 5
 _SAID_NS = 1000  # shorter shifts are what absolute seconds are rounded by
-Transforms = dict[tuple[str, str], NDArray[np.float64]]
 CAMERA = "cam0"
 # Odometry in a bag is somebody's estimate, unless its name says that it is the truth.
 _TRUTH = re.compile(r"(^|[/_])(ground_?truth|gt)([/_]|$)", re.IGNORECASE)
@@ -163,22 +163,23 @@ def open_folder(path: Path, overrides: SequenceInfo, why: str) -> BagSequence:
     for what, stream in (("IMU", imu), ("GNSS", gnss)):
         if stream is not None and (stream.stamps_ns[0] > stamps[-1] or stream.stamps_ns[-1] < stamps[0]):
             voice.problems.append(no_shared_time(what))
-    transforms = bag_streams.read_static_transforms(bag, voice.problems)
-    sequence.calibration, sequence.has_assumed_extrinsics = find_extrinsics(transforms, frame, imu, gnss, info, voice)
-    sequence.ground_truth = find_truth(bag, transforms, frame, voice)
+    links = Links(bag, voice)
+    sequence.calibration, sequence.has_assumed_extrinsics = find_extrinsics(links, frame, imu, gnss, info, voice)
+    sequence.ground_truth = find_truth(bag, links, frame, voice)
     if imu is not None:
         sequence.imu = ImuStream(imu.stamps_ns, imu.values[:, :3].copy(), imu.values[:, 3:].copy())
     if gnss is not None:
         sequence.gnss = GnssStream(gnss.stamps_ns, gnss.values[:, :3].copy(), gnss.values[:, 3].copy())
-    sequence.uses = _uses(sequence, imu, gnss, transforms)
+    sequence.uses = _uses(sequence, imu, gnss, links)
     return sequence
 
 
-def _uses(sequence: BagSequence, imu: Stream | None, gnss: Stream | None, transforms: Transforms) -> dict[str, str]:
+def _uses(sequence: BagSequence, imu: Stream | None, gnss: Stream | None, links: Links) -> dict[str, str]:
     """By the name of a topic."""
     uses = {INFO_TOPIC: "sequence.toml"}
-    if transforms:
-        uses |= {topic.name: "extrinsics" for topic in sequence.bag.of_type("TFMessage") if is_static(topic)}
+    for topic in sequence.bag.of_type("TFMessage"):
+        if links.static if is_static(topic) else links.is_tf_used:
+            uses[topic.name] = "extrinsics"
     if sequence.ground_truth is not None:
         uses[truth_topics(sequence.bag)[0].name] = "ground truth"
     for what, stream in (("IMU", imu), ("GNSS", gnss)):
@@ -236,29 +237,27 @@ def _first_cloud(sequence: BagSequence, indices: range) -> tuple[int, PointCloud
 
 
 def find_extrinsics(
-    transforms: Transforms, lidar: str, imu: Stream | None, gnss: Stream | None, info: SequenceInfo, voice: Voice
+    links: Links, lidar: str, imu: Stream | None, gnss: Stream | None, info: SequenceInfo, voice: Voice
 ) -> tuple[Calibration, bool]:
-    """Extrinsics that the user or the recording states, else from /tf_static, else the identity with a warning (True).
+    """Extrinsics that the user or the recording states, else by the transforms, else the identity with a warning (True).
 
-    transforms : `T_parent_child` of /tf_static; lidar : the frame of the scans
+    lidar : the frame of the scans
     """
-    T_cam0_lidar = chain(transforms, CAMERA, lidar) if info.T_cam0_lidar is None else info.T_cam0_lidar
+    T_cam0_lidar = chain(links.static, CAMERA, lidar) if info.T_cam0_lidar is None else info.T_cam0_lidar
     T_lidar_imu, T_lidar_gnss = info.T_lidar_imu, info.T_lidar_gnss
     is_assumed = False
     if imu is not None and T_lidar_imu is None:
-        T_lidar_imu = _find(transforms, lidar, imu.frame, "IMU", voice)
+        T_lidar_imu = _find(links, lidar, imu.frame, "IMU", voice)
         if T_lidar_imu is None:
             voice.problems.append(
-                f"extrinsics: {_why_not(transforms, lidar, imu.frame)}, so the IMU is taken to sit in the LiDAR, axes alike; "
+                f"extrinsics: {links.why_not(lidar, imu.frame)}, so the IMU is taken to sit in the LiDAR, axes alike; "
                 "--extrinsics states T_lidar_imu"
             )
             T_lidar_imu, is_assumed = np.eye(4), True
     if gnss is not None and T_lidar_gnss is None:
-        T_lidar_gnss = _find(transforms, lidar, gnss.frame, "GNSS", voice)
+        T_lidar_gnss = _find(links, lidar, gnss.frame, "GNSS", voice)
         if T_lidar_gnss is None:
-            voice.notes.append(
-                f"extrinsics: {_why_not(transforms, lidar, gnss.frame)}: the place of the antenna is unknown"
-            )
+            voice.notes.append(f"extrinsics: {links.why_not(lidar, gnss.frame)}: the place of the antenna is unknown")
     return Calibration(T_cam0_lidar, T_lidar_imu, T_lidar_gnss), is_assumed
 
 
@@ -267,12 +266,15 @@ def truth_topics(bag: Bag) -> list[BagTopic]:
     return [t for t in bag.of_type("Odometry", "PoseStamped") if _TRUTH.search(t.name)]
 
 
-def find_truth(bag: Bag, transforms: Transforms, lidar: str, voice: Voice) -> Trajectory | None:
+def find_truth(bag: Bag, links: Links, lidar: str, voice: Voice) -> Trajectory | None:
     """LiDAR poses of the first topic whose name says ground truth (Odometry or PoseStamped), None when there is none."""
     topics = truth_topics(bag)
     if not topics:
         return None
     topic = topics[0]
+    if topics[1:]:
+        others = ", ".join(t.name for t in topics[1:])
+        voice.notes.append(f"ground truth from {topic.name}, the first of {len(topics)}: {others} left out")
     broken: list[str] = []
     stamps, poses, body = read_poses(bag, topic, broken)
     say_broken(broken, topic.name, voice)
@@ -280,31 +282,24 @@ def find_truth(bag: Bag, transforms: Transforms, lidar: str, voice: Voice) -> Tr
     if not len(order):
         return None
     poses = poses[order]
-    T_body_lidar = chain(transforms, body, lidar)
-    if T_body_lidar is None:
+    rigid = links.find(body, lidar)
+    if rigid is None:
         voice.problems.append(
             f"ground truth {topic.name} holds poses of {body or 'an unnamed body'} and no static transform leads from there to "
             f"{lidar}: they are taken as LiDAR poses"
         )
     elif body != lidar:
+        T_body_lidar, source = rigid
         poses = se3.normalise(poses @ T_body_lidar)
-        voice.notes.append(f"ground truth {topic.name}: poses of {body}, carried to {lidar} with /tf_static")
+        voice.notes.append(
+            f"ground truth {topic.name}: poses of {body}, carried to {lidar} with {source.removeprefix('from ')}"
+        )
     return Trajectory(stamps, poses, "lidar", True, None, f"{bag.path}, {topic.name}")
 
 
-def _find(transforms: Transforms, lidar: str, frame: str, what: str, voice: Voice) -> NDArray[np.float64] | None:
-    if not lidar or not frame:
+def _find(links: Links, lidar: str, frame: str, what: str, voice: Voice) -> NDArray[np.float64] | None:
+    found = links.find(lidar, frame) if frame else None
+    if found is None:
         return None
-    T = chain(transforms, lidar, frame)
-    if T is not None:
-        how = "the same frame" if lidar == frame else "from /tf_static"
-        voice.notes.append(f"extrinsics of the {what}: T_{lidar}_{frame}, {how}")
-    return T
-
-
-def _why_not(transforms: Transforms, lidar: str, frame: str) -> str:
-    if not lidar or not frame:
-        return "messages name no frame"
-    return (
-        f"{'no transform leads' if transforms else 'there is no /tf_static that leads'} from frame {lidar} to {frame}"
-    )
+    voice.notes.append(f"extrinsics of the {what}: T_{lidar}_{frame}, {found[1]}")
+    return found[0]

@@ -1,0 +1,109 @@
+"""Where sensors sit: transforms of a bag that hold for good, said once on /tf_static or again and again, the same, on /tf."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.formats.bag_files import Bag
+from lslam.formats.bag_streams import Transforms, chain, is_static, read_transforms
+from lslam.geometry import se3, so3
+from lslam.readers.bag_topics import say_broken
+from lslam.readers.ground_truth import Voice
+
+Floats = NDArray[np.float64]
+
+# What moves by less over a whole recording is rigid: the rounding of a driver, the play of a joint.
+_STILL_M, _STILL_RAD = 1e-3, 1e-3
+
+
+@dataclass
+class Links:
+    """Transforms between frames; /tf is read when /tf_static does not lead from one to the other.
+
+    static : of /tf_static; is_tf_used : whether a chain went over /tf
+    """
+
+    bag: Bag
+    voice: Voice
+    static: Transforms = field(default_factory=dict)
+    is_tf_used: bool = False
+
+    def __post_init__(self) -> None:
+        """Read /tf_static; a pair that it tells of differently is named."""
+        for pair, poses in self._read(True).items():
+            self.static[pair] = poses[-1]
+            metres, turn = _spread(poses)
+            if metres > _STILL_M or turn > _STILL_RAD:
+                self.voice.problems.append(
+                    f"/tf_static says more than one thing of {pair[0]} -> {pair[1]}, {_apart(metres, turn)}: the last one counts"
+                )
+
+    def find(self, a: str, b: str) -> tuple[Floats, str] | None:
+        """`T_a_b` (4, 4) along transforms that hold for good, and what says so; None when no chain connects the frames."""
+        if (T := chain(self.static, a, b)) is not None:
+            return T, "the same frame" if a == b else "from /tf_static"
+        if not a or not b:
+            return None
+        if (T := chain(self._still, a, b)) is not None:
+            self.is_tf_used = True
+            return T, "from /tf, which always says the same of it"
+        return None
+
+    def why_not(self, a: str, b: str) -> str:
+        """Why `find` gives nothing."""
+        if not a or not b:
+            return "messages name no frame"
+        moving = {pair: poses[0] for pair, poses in self._told.items() if pair not in self._still}
+        every = {**moving, **self._still}
+        if moving and chain(every, a, b) is not None:
+            broken = [pair for pair in moving if chain({p: T for p, T in every.items() if p != pair}, a, b) is None]
+            what = ", ".join(f"{p} -> {c}, which {self._behaviour((p, c))}" for p, c in broken or list(moving))
+            return f"the way from frame {a} to {b} leads over {what}"
+        there = "no transform leads" if every else "there is no /tf_static that leads"
+        return f"{there} from frame {a} to {b}"
+
+    @cached_property
+    def _told(self) -> Transforms:
+        """All that /tf says, (N, 4, 4) by pair."""
+        return self._read(False)
+
+    @cached_property
+    def _still(self) -> Transforms:
+        """/tf_static, and of /tf what it says more than once and always the same."""
+        same = {
+            pair: poses[0]
+            for pair, poses in self._told.items()
+            if len(poses) > 1
+            and all(d <= limit for d, limit in zip(_spread(poses), (_STILL_M, _STILL_RAD), strict=True))
+        }
+        return {**same, **self.static}
+
+    def _behaviour(self, pair: tuple[str, str]) -> str:
+        poses = self._told[pair]
+        return "/tf says only once" if len(poses) == 1 else f"changes on /tf ({_apart(*_spread(poses))})"
+
+    def _read(self, wants_static: bool) -> Transforms:
+        found: dict[tuple[str, str], list[Floats]] = {}
+        for topic in self.bag.of_type("TFMessage"):
+            if is_static(topic) == wants_static:
+                broken: list[str] = []
+                for pair, poses in read_transforms(self.bag, topic, broken).items():
+                    found.setdefault(pair, []).append(poses)
+                say_broken(broken, topic.name, self.voice)
+        return {pair: np.concatenate(pieces) for pair, pieces in found.items()}
+
+
+def _spread(poses: Floats) -> tuple[float, float]:
+    """By how much poses (N, 4, 4) differ from the first at most: m, rad."""
+    off = se3.inverse(poses[0]) @ poses
+    return float(np.linalg.norm(off[:, :3, 3], axis=1).max()), float(
+        np.linalg.norm(so3.log(off[:, :3, :3]), axis=1).max()
+    )
+
+
+def _apart(metres: float, turn: float) -> str:
+    return f"{metres:.3f} m and {np.degrees(turn):.1f} deg apart"
