@@ -14,11 +14,14 @@ from lslam.errors import InputError, LslamError, UsageError
 from lslam.formats.bag_files import Bag, BagTopic, read_header
 from lslam.formats.bag_listing import missing_parts
 from lslam.formats.bag_streams import Stream, read_fixes, read_imu
+from lslam.formats.pose_rows import seconds_text
+from lslam.readers.clocks import Clock, agree, stands_still
 from lslam.readers.ground_truth import Voice
 
 CLOUDS = ("PointCloud2", "CustomMsg")
 _HEADER = 512  # bytes of a message that hold its header
-_LATE_NS = 10**9  # stamps that go back further are no jitter
+_LATE_NS = 10**9  # stamps that go back further are no jitter, nor by more than so many messages
+_LATE_STEPS = 10
 _CROWDED = 1.5  # times as many messages as the rate makes: they tell of a time that others have told of
 _APART_NS = 60 * 10**9  # parts of one recording follow each other sooner
 _SAID = 3  # damaged messages that are named one by one
@@ -129,25 +132,32 @@ def index_scans(bag: Bag, topic: BagTopic, voice: Voice) -> tuple[Stamps, Stamps
 def put_in_order(stamps: Stamps, recorded: Stamps, what: str, voice: Voice) -> tuple[Stamps, Stamps]:
     """Which messages stay, in order, and their stamps, which then increase; what was wrong goes to the problems.
 
-    Stamps that are all zero give way to the times of recording. What is late by up to a second is sorted in; what goes back
-    further, or tells again of a time that is told of, comes from a clock that was set back, and is dropped, as repeated
-    stamps are.
+    Stamps that stand still give way to the times of recording, and their steps are taken out by these (`clocks`). What is late
+    by a few messages is sorted in; what goes back further by both clocks, or tells again of a time that is told of, is dropped,
+    as repeated stamps are.
     """
-    if len(stamps) and not stamps.any() and recorded.any():
+    if stands_still(stamps, recorded):
+        fact = f"stamps in their headers that stand still at {seconds_text(int(stamps[0]))} s"
         voice.problems.append(
-            f"{what} have no stamps in their headers: the times of recording are used, late as they are"
+            f"{what} have {fact if stamps.any() else 'no stamps in their headers'}: the times of recording are used, late as "
+            "they are"
         )
         stamps = recorded
+    late, again = _lateness(stamps)
+    agreement = agree(stamps, np.where(again, 0, late), Clock("the times of recording", recorded), what)
+    voice.problems.extend(agreement.problems)
+    voice.notes.extend(agreement.notes)
+    if agreement.problems:
+        stamps = agreement.stamps_ns
+        late, again = _lateness(stamps)
     index = np.arange(len(stamps), dtype=np.int64)
-    late = np.maximum.accumulate(stamps) - stamps if len(stamps) else stamps
-    dropped = (late > _LATE_NS) | _told_again(stamps, late)
-    if dropped.any():
-        first = int(np.flatnonzero(dropped)[0])
+    if again.any():
+        first = int(np.flatnonzero(again)[0])
         voice.problems.append(
-            f"{what} go back in time by {late[dropped].max() * 1e-9:.3f} s at message {first}: {int(dropped.sum())} of "
+            f"{what} go back in time by {late[again].max() * 1e-9:.3f} s at message {first}: {int(again.sum())} of "
             f"{len(stamps)} are dropped until time goes on"
         )
-    index = index[~dropped]
+    index = index[~again]
     jitter = int((late[index] > 0).sum())
     if jitter:
         voice.problems.append(
@@ -161,13 +171,19 @@ def put_in_order(stamps: Stamps, recorded: Stamps, what: str, voice: Voice) -> t
     return index, stamps[index]
 
 
-def _told_again(stamps: Stamps, late: Stamps) -> NDArray[np.bool_]:
-    """Which messages, late by `late` ns, are behind a clock that was set back: they do not fill a hole, they interleave."""
-    again = np.zeros(len(stamps), bool)
+def _lateness(stamps: Stamps) -> tuple[Stamps, NDArray[np.bool_]]:
+    """By how much messages are stamped earlier than one before them, ns, and which of them are so by no mere jitter."""
+    late = np.maximum.accumulate(stamps) - stamps if len(stamps) else stamps
     steps = np.diff(stamps)
     if not (late > 0).any() or not (steps > 0).any():
-        return again
+        return late, np.zeros(len(stamps), bool)
     step = float(np.median(steps[steps > 0]))
+    return late, (late > max(_LATE_NS, _LATE_STEPS * min(step, _LATE_NS))) | _told_again(stamps, late, step)
+
+
+def _told_again(stamps: Stamps, late: Stamps, step: float) -> NDArray[np.bool_]:
+    """Which messages, late by `late` ns, are behind a clock that was set back: they do not fill a hole, they interleave."""
+    again = np.zeros(len(stamps), bool)
     ahead = stamps[late == 0]
     edges = np.flatnonzero(np.diff(np.concatenate([[0], (late > 0).astype(np.int8), [0]])))
     for begin, end in edges.reshape(-1, 2):

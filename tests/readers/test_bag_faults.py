@@ -275,15 +275,14 @@ def test_zero_stamps_give_way_to_the_times_of_recording(tmp_path: Path, kind: st
 
 
 def test_jitter_is_sorted_and_repeated_stamps_are_dropped_with_a_note(tmp_path: Path) -> None:
-    steps = [0, 1, 3, 2, 4, 4, 5, 200, -30, 201]
+    steps = [0, 1, 3, 2, 4, 4, 5, 6]
     sequence = open_sequence(bag(tmp_path / "a.bag", stamped([START_NS + s * STEP_NS for s in steps])))
-    np.testing.assert_array_equal((sequence.stamps_ns - START_NS) // STEP_NS, [0, 1, 2, 3, 4, 5, 200, 201])
-    for k, message in enumerate([0, 1, 3, 2, 4, 6, 7, 9]):
+    np.testing.assert_array_equal((sequence.stamps_ns - START_NS) // STEP_NS, [0, 1, 2, 3, 4, 5, 6])
+    for k, message in enumerate([0, 1, 3, 2, 4, 6, 7]):
         np.testing.assert_array_equal(sequence.scan(k).points, scan(message).points)
     said = " ".join(sequence.problems)
     assert "out of order in 1 places, by up to 0.100 s: sorted" in said
     assert "repeat a stamp 1 times" in said
-    assert "go back in time by 23.000 s at message 8: 1 of 10 are dropped" in said
 
 
 def test_what_follows_a_clock_that_was_set_back_a_little_is_dropped_and_what_comes_late_is_not() -> None:

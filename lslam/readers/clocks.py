@@ -1,0 +1,220 @@
+"""Clocks of a stream of messages held against each other: where one is impossible the others win, and a sentence says so.
+
+The stamps of the headers are the finest clock and the one that fails: it steps when the sensor learns the time, stands still when
+a driver repeats its own start, or is two clocks in turns. The times of recording are late, never early, and go on.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Stamps = NDArray[np.int64]
+
+# Median intervals of two clocks that both tell the time of the drive; beyond, one was played back at another speed.
+_SLOWEST, _FASTEST = 0.8, 1.25
+_WINDOWS = (1, 2, 6, 14, 50)  # intervals; where they are even in number, two clocks in turns cancel
+_LEVEL_SAMPLES = 100  # the one of them that was recorded with the least delay says how far apart two clocks are
+_SPREAD_SAMPLES = 8  # and four times as many
+_REGULAR = 0.02  # of the interval, the median deviation of a clock that ticks
+_SNAP = 0.3  # of the interval, how far an interval across a step may lie from whole ones
+_MIN_SHARE = 0.05  # of all samples on a clock that may be the one the others are brought onto
+_MESSAGES_PER_STAMP = 5  # fewer are parts of one scan
+_JUMP_INTERVALS = 10  # by which the times of recording jump before a sentence says so
+_FAR = 1000  # durations of a recording, by which nothing pauses within it
+_MANY, _UNEVEN = 0.3, 0.25  # share of all messages; of the interval
+
+
+@dataclass(frozen=True)
+class Clock:
+    """Readings of one clock for all messages, (N,) ns, and its name in the plural."""
+
+    name: str
+    stamps_ns: Stamps
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """Stamps (N,) ns on one clock, in the order of the messages; what was wrong, and what else is worth a sentence."""
+
+    stamps_ns: Stamps
+    problems: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+
+
+def stands_still(stamps: Stamps, witness: Stamps) -> bool:
+    """Whether a clock gives several messages in a row one reading nearly everywhere, while the witness goes on."""
+    if not len(stamps) or np.any(np.diff(witness) < 0) or len(np.unique(witness)) < len(witness) / 2:
+        return False
+    if len(stamps) == 1:
+        return not stamps.any() and bool(witness.any())
+    return len(np.unique(stamps)) <= max(1, len(stamps) / _MESSAGES_PER_STAMP)
+
+
+def agree(headers: Stamps, late_ns: Stamps, witness: Clock, what: str) -> Agreement:
+    """`headers` (N,) with their steps taken out by the witness (N,), both in the order of recording.
+
+    late_ns : (N,) by how much messages came after their turn, 0 for most; these say nothing about the clock
+
+    Where both clocks pause, nothing is wrong. An interval of the headers is a step where the witness contradicts it and it is
+    impossible for a clock whose messages are recorded late and never early. Regular headers remain regular: the interval
+    across a step is a whole number of periods. A witness that runs at another speed, as of a recording that was played back,
+    counts only against steps that go back, or forward by far more than the whole recording lasts.
+    """
+    if _in_turns(headers, witness.stamps_ns):
+        late_ns = np.zeros_like(late_ns)
+    keep = np.flatnonzero(late_ns == 0)
+    h, w = headers[keep], witness.stamps_ns[keep]
+    period, speed = _period_and_speed(h, w)
+    if not period or _in_parts(h):
+        return Agreement(headers)
+    is_real_time = _SLOWEST <= speed <= _FASTEST
+    notes: list[str] = []
+    if not is_real_time:
+        notes.append(
+            f"{what}: {witness.name} run {speed:.3g} times as fast as the stamps of the headers, as of a recording that was "
+            "played back or written anew: the headers count"
+        )
+        w = w[0] + np.rint((w - w[0]) * speed).astype(np.int64)
+    steps, jumps = np.diff(h), np.diff(w)
+    spread = _recording_spread(w, period)
+    limit = max(0.5 * period, spread, 0.5 * period + float(late_ns.max()) if late_ns.any() else 0.0)
+    is_apart = np.abs(steps - jumps) > limit
+    is_odd = np.abs(steps - period) > 0.5 * period
+    if not is_real_time:
+        is_apart &= (steps < 0) | (steps > _FAR * float(w[-1] - w[0]))
+    edges = np.flatnonzero(is_apart & is_odd)
+    sizes = _step_sizes(h, w, edges, limit)
+    pauses = np.abs(jumps[is_apart & ~is_odd])
+    if is_real_time and len(pauses) and pauses.max() > _JUMP_INTERVALS * max(period, spread):
+        notes.append(
+            f"{what}: {witness.name} jump by up to {pauses.max() * 1e-9:.3f} s where the stamps of the headers go on: the "
+            "headers count"
+        )
+    edges, sizes = edges[sizes != 0], sizes[sizes != 0]
+    if not len(edges):
+        return Agreement(headers, notes=tuple(notes))
+    repaired = steps.copy()
+    repaired[edges] = _intervals(steps[edges] - sizes if is_real_time else np.zeros(len(edges)), steps, period)
+    offset = h - np.concatenate(
+        [[h[0]], h[0] + np.cumsum(repaired)]
+    )  # of the clock at each message from that at the first
+    offset = _offsets(offset, h - w, limit)
+    stamps = headers - offset[np.maximum(np.searchsorted(keep, np.arange(len(headers)), "right") - 1, 0)]
+    first = int(edges[0])
+    places = f" and at {len(edges) - 1} more" if len(edges) > 1 else ""
+    how = f"step by {steps[first] * 1e-9:+.3f} s" if steps[first] else "stand still"
+    problem = (
+        f"{what}: the stamps of their headers {how} at message {keep[first + 1]}{places}, where {witness.name} go on by "
+        f"{jumps[first] * 1e-9:.3f} s: brought onto one clock by {witness.name}"
+    )
+    return Agreement(stamps, (problem,), tuple(notes))
+
+
+def _period_and_speed(h: Stamps, w: Stamps) -> tuple[float, float]:
+    """The interval between messages, ns, and by how much faster `w` runs; by the windows in which the clocks agree best.
+
+    The interval is 0 where one of them does not go on.
+    """
+    best = (np.inf, 0.0, 0.0)
+    for length in _WINDOWS:
+        if len(h) < 2 * length:
+            break
+        a, b = (float(np.median(c[length:] - c[:-length])) / length for c in (h, w))
+        if a > 0 and b > 0:
+            best = min(best, (abs(float(np.log(a / b))), a, a / b))
+    return best[1], best[2]
+
+
+def _in_turns(h: Stamps, w: Stamps) -> bool:
+    """Whether two clocks take turns: many stamps are late, and sorted they are irregular, unlike the times of recording."""
+    if len(h) < _SPREAD_SAMPLES or np.mean(np.maximum.accumulate(h) > h) < _MANY:
+        return False
+    period, _ = _period_and_speed(h, w)
+    is_irregular = np.abs(np.diff(np.sort(h)).astype(np.float64) - period) > _UNEVEN * period
+    return bool(np.mean(is_irregular) > _MANY and _recording_spread(w, period) < 0.5 * period)
+
+
+def _in_parts(h: Stamps) -> bool:
+    """Whether each scan comes as the same number of messages of one stamp."""
+    counts = np.bincount(np.unique(h, return_inverse=True)[1], minlength=1)
+    usual = int(np.median(counts))
+    return 1 < usual < _MESSAGES_PER_STAMP and bool(np.mean(counts == usual) > 1 - _MIN_SHARE)
+
+
+def _recording_spread(w: Stamps, period: float) -> float:
+    """How far apart the delays of neighbouring messages lie, ns: they often arrive in batches."""
+    even = w - w[0] - np.arange(len(w)) * period
+    spread = 0.0
+    for length in _SPREAD_SAMPLES, 4 * _SPREAD_SAMPLES:
+        if len(w) >= 3 * length:
+            windows = np.lib.stride_tricks.sliding_window_view(even, length)
+            spread = max(spread, float(np.median(windows.max(1) - windows.min(1))))
+    return spread
+
+
+def _step_sizes(h: Stamps, w: Stamps, edges: Stamps, limit: float) -> Stamps:
+    """Step of the clock `h` between messages k and k + 1 for every k of `edges`, ns, 0 where there is none.
+
+    h - w is an offset less the delay of recording, so its largest values tell. Where the clock goes back or stands still it is
+    wrong. Where it goes on, a delay could be the reason instead: it is a step only if no message on the same stretch that
+    increases was recorded with so little delay.
+    """
+    ahead = h - w
+    runs = np.cumsum(np.concatenate([[0], np.diff(h) <= 0]))
+    highest_before, highest_after = _running_max(ahead, runs), _running_max(ahead[::-1], runs[::-1])[::-1]
+    bounds = np.concatenate([[-1], edges, [len(h) - 1]])
+    sizes = np.zeros(len(edges), np.int64)
+    for i, k in enumerate(edges.tolist()):
+        before = int(ahead[max(int(bounds[i]) + 1, k + 1 - _LEVEL_SAMPLES) : k + 1].max())
+        after = int(ahead[k + 1 : min(int(bounds[i + 2]), k + _LEVEL_SAMPLES) + 1].max())
+        if h[k + 1] <= h[k]:
+            is_step = abs(after - before) > limit
+        elif after > before:
+            is_step = after > highest_before[k] + limit
+        else:
+            is_step = before > highest_after[k + 1] + limit
+        sizes[i] = after - before if is_step else 0
+    return sizes
+
+
+def _running_max(values: Stamps, runs: Stamps) -> Stamps:
+    """Largest value so far within each run of equal `runs`."""
+    out = np.empty_like(values)
+    for begin, end in pairwise([0, *_starts(runs).tolist(), len(runs)]):
+        out[begin:end] = np.maximum.accumulate(values[begin:end])
+    return out
+
+
+def _intervals(across: NDArray[Any], steps: Stamps, period: float) -> Stamps:
+    """Intervals across steps, ns: whole periods where the clock ticks regularly, positive ever."""
+    is_regular = np.median(np.abs(steps - np.float64(period))) < _REGULAR * period
+    count = np.maximum(np.rint(across / period), 1)
+    is_near = np.abs(across / period - count) < _SNAP
+    repaired = np.where(is_regular & is_near, np.rint(count * period), np.where(across > 0, across, period))
+    return repaired.astype(np.int64)
+
+
+def _offsets(offset: Stamps, ahead: Stamps, limit: float) -> Stamps:
+    """Offsets of all messages, ns: one for each clock, 0 for the one nearest to the witness that tells enough messages."""
+    order = np.argsort(offset, kind="stable")
+    group = np.empty(len(offset), np.int64)
+    group[order] = np.cumsum(np.concatenate([[0], np.diff(offset[order]) > 0.5 * limit]))
+    levels = np.array([int(np.sort(part)[len(part) // 2]) for part in np.split(offset[order], _starts(group[order]))])
+    highest = np.full(len(levels), np.iinfo(np.int64).min)
+    np.maximum.at(highest, group, ahead)
+    distance = np.abs(highest.astype(np.float64))
+    is_candidate = np.bincount(group) >= max(_MIN_SHARE * len(offset), 2)
+    if is_candidate.any():
+        distance[~is_candidate] = np.inf
+    moved: Stamps = levels[group] - levels[int(np.argmin(distance))]
+    return moved
+
+
+def _starts(values: Stamps) -> Stamps:
+    """Where another value begins."""
+    return np.flatnonzero(np.diff(values)) + 1

@@ -1,0 +1,176 @@
+"""Header stamps held against the times of recording: the impossible clock loses, and nothing legitimate is touched."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from bag_builders import GRAVITY, START_NS, STEP_NS, Fill, bag, scan, together
+from numpy.typing import NDArray
+
+from lslam.formats import bag_messages
+from lslam.formats.bag_files import BagWriter
+from lslam.readers import open_sequence
+from lslam.readers.bag_topics import put_in_order
+from lslam.readers.ground_truth import Voice
+
+Stamps = NDArray[np.int64]
+SECOND = 10**9
+S37 = 37 * SECOND
+COUNT = 30
+K = np.arange(COUNT)
+TRUE = START_NS + K * STEP_NS
+
+
+def ordered(headers: Stamps, recorded: Stamps) -> tuple[Stamps, Stamps, Voice]:
+    voice = Voice([], [])
+    order, stamps = put_in_order(np.asarray(headers, np.int64), np.asarray(recorded, np.int64), "scans", voice)
+    return order, stamps, voice
+
+
+def delays(count: int, sigma_s: float) -> Stamps:
+    """Of recording: 20 ms and more."""
+    more = np.abs(np.random.default_rng(3).normal(0, sigma_s, count)) if sigma_s else np.zeros(count)
+    return np.rint((0.02 + more) * 1e9).astype(np.int64)
+
+
+# What the header of the sensor says in place of TRUE, and what the sentence about it says.
+FAULTS: dict[str, tuple[Callable[[], Stamps], str]] = {
+    "locks on UTC": (lambda: np.where(K < 8, 12 * SECOND + K * STEP_NS, TRUE), "step by +1699999988.223 s at message 8,"),
+    "steps back": (lambda: TRUE - S37 * (K >= 8), "step by -36.900 s at message 8,"),
+    "steps on": (lambda: TRUE + S37 * (K >= 8), "step by +37.100 s at message 8,"),
+    "steps back by less than before": (lambda: TRUE - 5 * STEP_NS * (K >= 8), "step by -0.400 s at message 8,"),
+    "steps on by half a second": (lambda: TRUE + 5 * STEP_NS * (K >= 8), "step by +0.600 s at message 8,"),
+    "steps on and back": (lambda: TRUE + S37 * ((K >= 8) & (K < 20)), "step by +37.100 s at message 8 and at 1 more,"),
+    "is wrong once": (lambda: TRUE - S37 * (K == 12), "step by -36.900 s at message 12 and at 1 more,"),
+    "has no stamps at first": (lambda: TRUE * (K >= 5), "stand still at message 1 and at 4 more,"),
+    "stands still for a while": (lambda: np.where((K > 9) & (K < 16), TRUE[9], TRUE), "at message 10 and at 6 more,"),
+    "two clocks in turns": (lambda: np.where(K % 2, 12 * SECOND + K * STEP_NS, TRUE), "at message 1 and at 28 more,"),
+    "two clocks in turns that interleave": (lambda: TRUE + 33 * 10**7 * (K % 2), "at message 1 and at 28 more,"),
+    "two clocks in turns by chance": (
+        lambda: TRUE + S37 * (np.random.default_rng(0).random(COUNT) < 0.5), "on one clock|onto one clock"
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("sigma_s", [0.0, 0.006])
+@pytest.mark.parametrize("fault", FAULTS)
+def test_steps_of_the_headers_are_taken_out_by_the_times_of_recording(fault: str, sigma_s: float) -> None:
+    headers, words = FAULTS[fault]
+    order, stamps, voice = ordered(headers(), TRUE + delays(COUNT, sigma_s))
+    np.testing.assert_array_equal(order, K)
+    np.testing.assert_allclose(np.diff(stamps) * 1e-9, 0.1, atol=3 * sigma_s + 1e-9)
+    assert abs(stamps[0] - TRUE[0]) <= (3 * sigma_s + 1e-9) * 1e9, "on the clock that is nearest to the recording"
+    (problem,) = voice.problems
+    assert any(word in problem for word in words.split("|")), problem
+    assert not voice.notes
+
+
+@pytest.mark.parametrize(("value", "words"), [(0, "no stamps in their headers"), (START_NS, "stand still at 17")])
+def test_where_the_headers_stand_still_throughout_the_times_of_recording_count(value: int, words: str) -> None:
+    recorded = TRUE + delays(COUNT, 0.006)
+    order, stamps, voice = ordered(np.full(COUNT, value), recorded)
+    np.testing.assert_array_equal(order, K)
+    np.testing.assert_array_equal(stamps, recorded)
+    assert words in voice.problems[0]
+
+
+def test_stamps_of_whole_seconds_are_no_clock_of_scans() -> None:
+    _, stamps, voice = ordered(TRUE // SECOND * SECOND, TRUE)
+    np.testing.assert_array_equal(stamps, TRUE)
+    assert "stand still" in voice.problems[0]
+
+
+def burst(recorded: Stamps) -> Stamps:
+    """A disk that writes nothing for 1.5 s."""
+    return np.where((recorded > recorded[9]) & (recorded < recorded[9] + 1.5e9), recorded[9] + int(1.5e9), recorded)
+
+
+def test_what_is_legitimate_stays_as_it_is() -> None:
+    recorded = TRUE + delays(COUNT, 0.006)
+    pause = 600 * SECOND * (K >= 12)
+    jitter = (np.clip(np.random.default_rng(1).normal(0, 0.01, COUNT), -0.045, 0.045) * 1e9).astype(np.int64)
+    gaps = np.setdiff1d(K, [12, 13, 14, 18, 19])
+    for headers, times, words in (
+        (TRUE, recorded, ""),
+        (TRUE + pause, recorded + pause, ""),
+        (TRUE[gaps], recorded[gaps], ""),
+        (TRUE, burst(recorded), "the times of recording jump by up to 1.4"),
+        (TRUE[gaps], burst(recorded)[gaps], None),
+        (TRUE + jitter, recorded + jitter, ""),
+        (TRUE + jitter, recorded, ""),
+        (TRUE, recorded + S37 * (K >= 8), "the times of recording jump by up to 37.1"),
+        (TRUE, recorded + 90 * 86400 * SECOND, ""),
+        (TRUE + pause, TRUE[0] + (TRUE - TRUE[0]) // 2, "run 2 times as fast as the stamps of the headers"),
+        (TRUE + pause, TRUE[0] + K * 1_000_000, "run 100 times as fast"),
+        (TRUE + pause, np.zeros(COUNT, np.int64), ""),
+    ):
+        order, stamps, voice = ordered(headers, times)
+        np.testing.assert_array_equal(stamps, headers)
+        np.testing.assert_array_equal(order, np.arange(len(headers)))
+        assert not voice.problems
+        assert words is None or [words in note for note in voice.notes] == [True] * bool(words), voice.notes
+
+
+def test_a_recording_that_was_played_back_says_that_its_headers_cannot_go_back() -> None:
+    for headers in (TRUE - S37 * (K >= 8), np.where(K < 8, 12 * SECOND + K * STEP_NS, TRUE)):
+        _, stamps, voice = ordered(headers, TRUE[0] + (TRUE - TRUE[0]) // 2)
+        np.testing.assert_array_equal(np.diff(stamps), STEP_NS)
+        assert len(voice.problems) == 1
+
+
+def test_samples_that_arrive_in_batches_keep_their_own_clock() -> None:
+    """200 Hz in batches of 20: the times of recording are uneven, the headers are not."""
+    k = np.arange(2000)
+    true = START_NS + k * 5_000_000
+    recorded = np.repeat(true[19::20] + delays(100, 0.002), 20)
+    locked = np.where(k < 800, 12 * SECOND + k * 5_000_000, true)
+    for headers in (true, true - S37 * (k >= 800), true + 3 * STEP_NS * (k >= 801), locked):
+        order, stamps, voice = ordered(headers, recorded)
+        np.testing.assert_array_equal(order, k)
+        np.testing.assert_allclose(stamps, true, atol=5_000_000)
+        np.testing.assert_array_equal(np.diff(stamps), 5_000_000)
+        assert len(voice.problems) == (headers is not true)
+    twice = true.copy()
+    twice[5::7] = true[4::7][: len(twice[5::7])]
+    _, stamps, voice = ordered(twice, recorded)
+    assert np.isin(stamps, true).all(), "repeated stamps are dropped, and the others stay"
+    assert "repeat a stamp" in voice.problems[0]
+
+
+def test_two_messages_of_one_stamp_are_no_clock_that_stands_still() -> None:
+    _, stamps, voice = ordered(np.repeat(TRUE, 2), np.repeat(TRUE, 2) + 50_000_000 * np.tile([0, 1], COUNT))
+    np.testing.assert_array_equal(stamps, TRUE)
+    assert "repeat a stamp 30 times" in voice.problems[0]
+
+
+def on_a_clock(shift_ns: Callable[[int], int]) -> Fill:
+    """Scans at 10 Hz and an IMU at 100 Hz that are stamped by a clock which is off by `shift_ns` of the true time."""
+
+    def fill(writer: BagWriter) -> None:
+        for k in range(COUNT):
+            message = bag_messages.cloud(
+                writer.store, scan(k, 50, stamp_ns=int(TRUE[k]) + shift_ns(int(TRUE[k]))), "lidar"
+            )
+            writer.write("/points", int(TRUE[k]) + 15_000_000, message)
+        for k in range(COUNT * 10):
+            stamp = START_NS + k * 10_000_000
+            values = GRAVITY, np.array([0, 0, 0.001 * k])
+            message = bag_messages.imu(writer.store, stamp + shift_ns(stamp), *values, "imu")
+            writer.write("/imu", stamp + 2_000_000, message)
+
+    return fill
+
+
+@pytest.mark.parametrize("shift_s", [-37.0, 37.0, 0.5])
+def test_a_step_does_not_tear_scans_and_imu_of_one_clock_apart(tmp_path: Path, shift_s: float) -> None:
+    at = START_NS + 12 * STEP_NS - 3_000_000
+    fill = on_a_clock(lambda ns: int(shift_s * 1e9) * (ns >= at))
+    sequence = open_sequence(bag(tmp_path / "a.mcap", together(fill), "mcap"))
+    np.testing.assert_array_equal(sequence.stamps_ns, TRUE)
+    assert sequence.imu is not None
+    np.testing.assert_array_equal(sequence.imu.stamps_ns, START_NS + np.arange(COUNT * 10) * 10_000_000)
+    np.testing.assert_allclose(sequence.imu.gyro[:, 2], 0.001 * np.arange(COUNT * 10))
+    assert sum("brought onto one clock" in p for p in sequence.problems) == 2
