@@ -97,7 +97,7 @@ def test_what_is_legitimate_stays_as_it_is() -> None:
         (TRUE, recorded, ""),
         (TRUE + pause, recorded + pause, ""),
         (TRUE[gaps], recorded[gaps], ""),
-        (TRUE, burst(recorded), "the times of recording jump by up to 1.4"),
+        (TRUE, burst(recorded), None),
         (TRUE[gaps], burst(recorded)[gaps], None),
         (TRUE + jitter, recorded + jitter, ""),
         (TRUE + jitter, recorded, ""),
