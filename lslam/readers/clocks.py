@@ -38,7 +38,7 @@ class Clock:
 
 
 @dataclass(frozen=True)
-class Agreement:
+class OneClock:
     """Stamps (N,) ns on one clock, in the order of the messages; what was wrong, and what else is worth a sentence."""
 
     stamps_ns: Stamps
@@ -55,7 +55,7 @@ def stands_still(stamps: Stamps, witness: Stamps) -> bool:
     return len(np.unique(stamps)) <= max(1, len(stamps) / _MESSAGES_PER_STAMP)
 
 
-def agree(headers: Stamps, late_ns: Stamps, witness: Clock, what: str) -> Agreement:
+def agree(headers: Stamps, late_ns: Stamps, witness: Clock, what: str) -> OneClock:
     """`headers` (N,) with their steps taken out by the witness (N,), both in the order of recording.
 
     late_ns : (N,) by how much messages came after their turn, 0 for most; these say nothing about the clock
@@ -71,7 +71,7 @@ def agree(headers: Stamps, late_ns: Stamps, witness: Clock, what: str) -> Agreem
     h, w = headers[keep], witness.stamps_ns[keep]
     period, speed = _period_and_speed(h, w)
     if not period or _in_parts(h):
-        return Agreement(headers)
+        return OneClock(headers)
     is_real_time = _SLOWEST <= speed <= _FASTEST
     notes: list[str] = []
     if not is_real_time:
@@ -97,7 +97,7 @@ def agree(headers: Stamps, late_ns: Stamps, witness: Clock, what: str) -> Agreem
         )
     edges, sizes = edges[sizes != 0], sizes[sizes != 0]
     if not len(edges):
-        return Agreement(headers, notes=tuple(notes))
+        return OneClock(headers, notes=tuple(notes))
     repaired = steps.copy()
     repaired[edges] = _intervals(steps[edges] - sizes if is_real_time else np.zeros(len(edges)), steps, period)
     offset = h - np.concatenate(
@@ -112,7 +112,7 @@ def agree(headers: Stamps, late_ns: Stamps, witness: Clock, what: str) -> Agreem
         f"{what}: the stamps of their headers {how} at message {keep[first + 1]}{places}, where {witness.name} go on by "
         f"{jumps[first] * 1e-9:.3f} s: brought onto one clock by {witness.name}"
     )
-    return Agreement(stamps, (problem,), tuple(notes))
+    return OneClock(stamps, (problem,), tuple(notes))
 
 
 def _period_and_speed(h: Stamps, w: Stamps) -> tuple[float, float]:
