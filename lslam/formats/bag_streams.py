@@ -112,7 +112,8 @@ def read_transforms(bag: Bag, topic: BagTopic, broken: list[str]) -> Transforms:
         try:
             for t in bag.decode(topic, data).transforms:
                 pair = (t.header.frame_id.lstrip("/"), t.child_frame_id.lstrip("/"))
-                found.setdefault(pair, []).append(_numbers(topic, t.transform.translation, t.transform.rotation))
+                row = _numbers(topic, t.transform.translation, t.transform.rotation)
+                found.setdefault(pair, []).append(row)
         except InputError as error:
             broken.append(str(error))
     return {pair: _poses(rows) for pair, rows in found.items()}

@@ -12,14 +12,14 @@ from numpy.typing import NDArray
 
 from lslam.errors import InputError
 from lslam.formats import bag_streams
-from lslam.formats.bag_files import INFO_TOPIC, Bag, BagTopic, open_bag, read_header
+from lslam.formats.bag_files import INFO_TOPIC, Bag, BagTopic, open_bag
 from lslam.formats.bag_listing import list_bag_files, parts_beside, stem_of
 from lslam.formats.bag_streams import Stream, chain, is_static, read_poses
 from lslam.formats.point_cloud import TIME_NAMES, PointCloud
-from lslam.formats.pointcloud2 import decode_livox, decode_pointcloud2
 from lslam.formats.sequence_toml import FILE_NAME, SequenceInfo, parse_sequence_toml, read_sequence_toml
 from lslam.geometry import se3
 from lslam.printable import printable
+from lslam.readers.bag_halves import Halves, read_whole
 from lslam.readers.bag_links import Links
 from lslam.readers.bag_topics import (
     check_parts,
@@ -56,7 +56,7 @@ class BagSequence(Scans):
     messages : (N,) int64, which message of `topic` each scan is; headers_ns : (N,) int64, stamps of their headers
     time_rule : how per-point times are understood, None when there are none or they are not to be used
     has_assumed_extrinsics : nothing says where the IMU sits, the identity stands in
-    uses : what each topic that is used is used for
+    uses : what each topic that is used is used for; halves : further messages of a scan
     """
 
     name: str
@@ -80,6 +80,7 @@ class BagSequence(Scans):
     sensor: str | None = None
     has_assumed_extrinsics: bool = False
     uses: dict[str, str] = field(default_factory=dict)
+    halves: Halves = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.messages)
@@ -104,15 +105,7 @@ class BagSequence(Scans):
 
     def cloud(self, index: int) -> tuple[PointCloud, int]:
         """The points of scan `index` as the message holds them, and ns from its header's stamp to the base of their times."""
-        k = int(self.messages[index])
-        where = Path(f"{self.path}, {self.topic.name}, message {k}")
-        data = self.bag.message(self.topic, k)
-        if not self.topic.type.endswith("CustomMsg"):
-            return decode_pointcloud2(self.bag.decode(self.topic, data), where), 0
-        header = read_header(self.topic, data)
-        cloud, timebase = decode_livox(data, header.end, self.topic.encoding == "ros1", header.order, where)
-        shift = timebase - header.stamp_ns
-        return cloud, shift if abs(shift) < 10**9 else 0
+        return read_whole(self.bag, self.topic, int(self.messages[index]), self.halves)
 
 
 def locate(path: Path) -> tuple[Path, str] | None:
@@ -149,13 +142,13 @@ def open_folder(path: Path, overrides: SequenceInfo, why: str) -> BagSequence:
     topic = choose_clouds(bag, info.lidar_topic)
     voice.notes.append(f"scans from {topic.name} ({topic.type}, {len(topic)} messages)")
     check_parts(bag, topic)
-    messages, stamps, frame = index_scans(bag, topic, voice)
+    messages, stamps, frame, halves = index_scans(bag, topic, voice)
     rate = info.rate_hz or measured_rate(stamps)
     sequence = BagSequence(
         info.name or printable(stem_of(path)),
         path, bag, topic, messages, stamps, stamps, rate,
         motion_compensated=info.motion_compensated, rings=info.rings, sensor=info.sensor,
-        notes=voice.notes, problems=voice.problems,
+        notes=voice.notes, problems=voice.problems, halves=halves,
     )  # fmt: skip
     if not info.motion_compensated:
         _decide_times(sequence, info)

@@ -15,6 +15,7 @@ from lslam.formats.bag_files import Bag, BagTopic, read_header
 from lslam.formats.bag_listing import missing_parts
 from lslam.formats.bag_streams import Stream, read_fixes, read_imu
 from lslam.formats.pose_rows import seconds_text
+from lslam.readers.bag_halves import Halves, find_halves
 from lslam.readers.clocks import Clock, agree, stands_still
 from lslam.readers.ground_truth import Voice
 
@@ -103,13 +104,13 @@ def why_no_fixes(bag: Bag) -> LslamError:
     return _why_none(bag, "GNSS", "--gnss-topic", "NavSatFix", "--gnss and --georeference")
 
 
-def index_scans(bag: Bag, topic: BagTopic, voice: Voice) -> tuple[Stamps, Stamps, str]:
-    """Which messages are scans, (N,), their header stamps, (N,) ns increasing, and the frame of the first.
+def index_scans(bag: Bag, topic: BagTopic, voice: Voice) -> tuple[Stamps, Stamps, str, Halves]:
+    """Which messages are scans, (N,), their header stamps, (N,) ns increasing, the frame of the first, and `find_halves`.
 
-    Only headers are read. Raises InputError when not a single one can be.
+    Only headers are read, where stamps do not repeat. Raises InputError when not a single one can be.
     """
     kept, stamps, broken = [], [], []
-    frame = ""
+    frames: list[str] = []
     bag.expect(topic, is_head=True)
     for k in range(len(topic)):
         try:
@@ -119,14 +120,17 @@ def index_scans(bag: Bag, topic: BagTopic, voice: Voice) -> tuple[Stamps, Stamps
             continue
         kept.append(k)
         stamps.append(header.stamp_ns)
-        frame = frame or header.frame
+        frames.append(header.frame)
     say_broken(broken, topic.name, voice)
     if not kept:
         way_out = "; where its index is wrong `rosbag reindex` mends it" if topic.encoding == "ros1" else ""
         raise InputError(f"{bag.path}: none of the {len(topic)} messages of {topic.name} can be read{way_out}")
-    recorded = np.array(bag.recorded_ns(topic), np.int64)[kept]
-    order, ordered = put_in_order(np.array(stamps, np.int64), recorded, f"{topic.name}: scans", voice)
-    return np.array(kept, np.int64)[order], ordered, frame
+    messages, headers = np.array(kept, np.int64), np.array(stamps, np.int64)
+    halves = find_halves(bag, topic, messages, headers, frames, voice)
+    is_scan = ~np.isin(messages, [k for others in halves.values() for k in others])
+    messages, recorded = messages[is_scan], np.array(bag.recorded_ns(topic), np.int64)[kept][is_scan]
+    order, ordered = put_in_order(headers[is_scan], recorded, f"{topic.name}: scans", voice)
+    return messages[order], ordered, next(filter(None, frames), ""), halves
 
 
 def put_in_order(stamps: Stamps, recorded: Stamps, what: str, voice: Voice) -> tuple[Stamps, Stamps]:

@@ -1,0 +1,165 @@
+"""Drivers that publish a revolution in several messages of one stamp: what these hold tells halves of a scan from repeats."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.errors import InputError
+from lslam.formats.bag_files import Bag, BagTopic, read_header
+from lslam.formats.point_cloud import PointCloud
+from lslam.formats.pointcloud2 import decode_livox, decode_pointcloud2
+from lslam.readers.ground_truth import Voice
+
+Stamps = NDArray[np.int64]
+# Messages of one stamp by the first of them.
+Halves = Mapping[int, tuple[int, ...]]
+
+_MOST = 40  # parts of a revolution; more messages of one stamp come from a clock that stands still
+_LOOKED_AT = 40  # stamps; of more of them so many are looked at before the recording is read
+_BINS = 90  # of azimuth
+_FULL = 5 / 6  # of all directions, by 12 deg: the sensor turns, and what it sees again is another revolution
+_SHARED = 0.2  # of azimuths or of the time: parts of one revolution meet at their seams
+_SAME = 0.1  # of the points: a repeat, or another return of the same beams
+
+
+def read_cloud(bag: Bag, topic: BagTopic, k: int) -> tuple[PointCloud, int]:
+    """The points of message `k`, and ns from its header's stamp to the base of their times.
+
+    Raises InputError when it is damaged.
+    """
+    where = Path(f"{bag.path}, {topic.name}, message {k}")
+    data = bag.message(topic, k)
+    if not topic.type.endswith("CustomMsg"):
+        return decode_pointcloud2(bag.decode(topic, data), where), 0
+    header = read_header(topic, data)
+    cloud, timebase = decode_livox(data, header.end, topic.encoding == "ros1", header.order, where)
+    shift = timebase - header.stamp_ns
+    return cloud, shift if abs(shift) < 10**9 else 0
+
+
+def read_whole(bag: Bag, topic: BagTopic, k: int, halves: Halves) -> tuple[PointCloud, int]:
+    """As `read_cloud`, with what the other messages of its stamp add."""
+    cloud, shift = read_cloud(bag, topic, k)
+    for other in halves.get(k, ()):
+        more, base = read_cloud(bag, topic, other)
+        cloud = join(cloud, more, base - shift) or cloud
+    return cloud, shift
+
+
+def find_halves(bag: Bag, topic: BagTopic, messages: Stamps, stamps: Stamps, frames: list[str], voice: Voice) -> Halves:
+    """Which of `messages` (N,), by their stamps (N,) and frames, are further parts of a scan; said in `voice`.
+
+    On many stamps not all are looked at: what is no part of a scan after all is left out when the scan is read.
+    """
+    groups = _groups(messages, stamps, frames)
+    looked_at = np.unique(np.linspace(0, len(groups) - 1, min(len(groups), _LOOKED_AT)).round().astype(int)).tolist()
+    parts = {n: _parts(bag, topic, groups[n]) for n in (looked_at if groups else [])}
+    if not any(parts.values()):
+        return {}
+    found = {group[0]: parts.get(n, group[1:]) for n, group in enumerate(groups) if parts.get(n, group[1:])}
+    said = "" if len(parts) == len(groups) else f", as {sum(map(bool, parts.values()))} of {len(parts)} looked at are"
+    voice.notes.append(
+        f"{topic.name}: {len(found)} scans come in several messages of one stamp, which see other directions, rings or times: "
+        f"put together{said}"
+    )
+    return found
+
+
+def join(a: PointCloud, b: PointCloud, later_ns: int = 0) -> PointCloud | None:
+    """Both as one cloud in the order they were measured, where they are parts of one scan; None where they are not.
+
+    later_ns : of the base of b's times, which are ns then
+    """
+    if not len(b):
+        return a
+    if not len(a):
+        return b
+    times = _times_of_both(a, b, later_ns)
+    if not _is_complement(a, b, times) or (a.rings is None) != (b.rings is None):
+        return None
+    first, last = a, b
+    if times is not None and np.median(times[1]) < np.median(times[0]):
+        first, last, times = b, a, times[::-1]
+    return PointCloud(
+        np.concatenate([first.points, last.points]),
+        _both(first.intensity, last.intensity),
+        _both(first.rings, last.rings),
+        None if times is None else np.concatenate(times),
+        a.time_field,
+    )
+
+
+def _groups(messages: Stamps, stamps: Stamps, frames: list[str]) -> list[tuple[int, ...]]:
+    """Messages of one stamp and frame, where they are several and no clock stands still."""
+    by_stamp: dict[tuple[int, str], list[int]] = {}
+    for message, stamp, frame in zip(messages.tolist(), stamps.tolist(), frames, strict=True):
+        if stamp:
+            by_stamp.setdefault((stamp, frame), []).append(message)
+    return [tuple(group) for group in by_stamp.values() if 1 < len(group) <= _MOST]
+
+
+def _parts(bag: Bag, topic: BagTopic, group: tuple[int, ...]) -> tuple[int, ...]:
+    """Which messages of a group add to the first."""
+    try:
+        cloud, shift = read_cloud(bag, topic, group[0])
+        parts = []
+        for k in group[1:]:
+            more, base = read_cloud(bag, topic, k)
+            whole = join(cloud, more, base - shift)
+            if whole is not None and len(more):
+                cloud = whole
+                parts.append(k)
+        return tuple(parts)
+    except InputError:
+        return ()
+
+
+def _times_of_both(a: PointCloud, b: PointCloud, later_ns: int) -> tuple[NDArray[Any], NDArray[Any]] | None:
+    if a.times is None or b.times is None or a.times.dtype != b.times.dtype:
+        return None
+    if not later_ns:
+        return a.times, b.times
+    return a.times.astype(np.int64), b.times.astype(np.int64) + later_ns
+
+
+def _is_complement(a: PointCloud, b: PointCloud, times: tuple[NDArray[Any], NDArray[Any]] | None) -> bool:
+    """Whether b sees what a does not: other azimuths, other rings, or, of a sensor that does not turn, at another time."""
+    if (a.times is None) != (b.times is None) or np.isin(_keys(b), _keys(a)).mean() > _SAME:
+        return False
+    of_a, of_b = _azimuths(a), _azimuths(b)
+    if np.minimum(of_a, of_b).sum() <= _SHARED * min(of_a.sum(), of_b.sum()):
+        return True
+    if a.rings is not None and b.rings is not None and not np.isin(b.rings, a.rings).any():
+        return True
+    is_turning = max(float(of.reshape(-1, 3).any(axis=1).mean()) for of in (of_a, of_b)) > _FULL
+    return times is not None and not is_turning and _overlap(*times) <= _SHARED
+
+
+def _keys(cloud: PointCloud) -> NDArray[np.uint64]:
+    """A number of each point, the same where its place is."""
+    bits = np.ascontiguousarray(cloud.points).view(np.uint32).astype(np.uint64)
+    keys: NDArray[np.uint64] = bits @ np.array([1, 0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F], np.uint64)
+    return keys
+
+
+def _azimuths(cloud: PointCloud) -> NDArray[np.int64]:
+    """(90,) points of each 4 deg; those at the sensor itself were not measured."""
+    x, y = cloud.points[:, 0], cloud.points[:, 1]
+    turn = np.degrees(np.arctan2(y, x))[(x != 0) | (y != 0)]
+    return np.histogram(turn, _BINS, (-180, 180))[0]
+
+
+def _overlap(a: NDArray[Any], b: NDArray[Any]) -> float:
+    """Which part of the shorter span of times the other shares."""
+    (a0, a1), (b0, b1) = (np.percentile(t.astype(np.float64), (1, 99)) for t in (a, b))
+    shorter = min(a1 - a0, b1 - b0)
+    return float((min(a1, b1) - max(a0, b0)) / shorter) if shorter > 0 else 1.0
+
+
+def _both(a: NDArray[Any] | None, b: NDArray[Any] | None) -> NDArray[Any] | None:
+    return None if a is None or b is None else np.concatenate([a, b])
