@@ -140,6 +140,8 @@ def _convert_sequence(source: str, kind: str, out: Path, given: dict[str, Any]) 
     for problem in sequence.problems:
         log.warning("%s", problem)
     trajectory = None if given["deskewed"] is None else read_trajectory(given["deskewed"])
+    if trajectory is not None and not trajectory.has_rotations:
+        raise click.UsageError(f"--deskewed {given['deskewed']}: positions without rotations deskew no scan")
     with progress("convert", len(sequence)) as advance:
         done = convert_sequence(
             sequence, kind, out,

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from lslam.config.eval import EvalConfig
 from lslam.errors import UsageError, nearest
 from lslam.evaluation.metric import (
+    NO_ROTATIONS,
     Document,
     MatchedPoses,
     MetricRow,
@@ -28,13 +29,15 @@ from lslam.types.table import Table
 Floats = NDArray[np.float64]
 
 
-def absolute_error(estimate: Floats, truth: Floats, alignment: str) -> AbsoluteError:
+def absolute_error(estimate: Floats, truth: Floats, alignment: str, has_rotations: bool = True) -> AbsoluteError:
     """ATE of matched poses (N, 4, 4), N >= 1, under `alignment`; z of the ground truth's world is up.
 
-    Agrees with evo's APE (translation part, rotation angle) for none, origin, se3 and sim3.
-    Raises UsageError for an unknown alignment.
+    Agrees with evo's APE (translation part, rotation angle) for none, origin, se3 and sim3. Without rotations there is no
+    alignment by the first pose, and no angle. Raises UsageError for an unknown alignment.
     """
     T, scale, note = align(estimate, truth, alignment)
+    if alignment == "origin" and not has_rotations:
+        note = NO_ROTATIONS
     if note:
         empty = np.zeros((0, 3))
         return AbsoluteError(
@@ -44,14 +47,14 @@ def absolute_error(estimate: Floats, truth: Floats, alignment: str) -> AbsoluteE
     errors = positions - truth[:, :3, 3]
     turned = np.swapaxes(T[:3, :3] @ estimate[:, :3, :3], -1, -2) @ truth[:, :3, :3]
     # Printed matrices are rotations to six digits only; the angle of the nearest rotation is what is meant.
-    angles = np.rad2deg(so3.angle(so3.normalise(turned)))
+    angles = np.rad2deg(so3.angle(so3.normalise(turned))) if has_rotations else np.full(len(errors), np.nan)
     translation = describe(np.linalg.norm(errors, axis=1))
     return AbsoluteError(
         alignment=alignment,
         available=True,
         note="",
         translation=translation,
-        rotation_deg=describe(angles),
+        rotation_deg=describe(angles) if has_rotations else None,
         horizontal=describe(np.linalg.norm(errors[:, :2], axis=1)),
         vertical=describe(np.abs(errors[:, 2])),
         percent_of_length=percent_of_length(translation.rmse, truth) if translation else float("nan"),
@@ -97,7 +100,7 @@ class AbsoluteTrajectoryError(TrajectoryMetric[dict[str, AbsoluteError]]):
     key, name, gate_option = "ate", "ATE", "ate"
 
     def measure(self, poses: MatchedPoses, config: EvalConfig) -> dict[str, AbsoluteError]:
-        return {name: absolute_error(poses.estimate, poses.truth, name) for name in config.align}
+        return {name: absolute_error(poses.estimate, poses.truth, name, poses.has_rotations) for name in config.align}
 
     def document(self, score: dict[str, AbsoluteError]) -> Document:
         return {name: _document(error) for name, error in score.items()}
@@ -166,7 +169,7 @@ class AbsoluteTrajectoryError(TrajectoryMetric[dict[str, AbsoluteError]]):
                 values[f"ate.{name}"] = error["rmse"]
                 values[f"ate.{name}.max"] = error["max"]
                 values[f"ate.{name}.rotation"] = error["rotation_deg"]["rmse"]
-        return values
+        return {key: value for key, value in values.items() if value is not None}
 
 
 def _document(error: AbsoluteError) -> Document:

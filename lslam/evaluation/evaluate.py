@@ -79,6 +79,11 @@ def evaluate(
     matches = associate(estimate, ground_truth, config.max_diff, offset_ns)
     if len(matches.stamps_ns) < matches.possible:
         notes.append(f"{matches.possible - len(matches.stamps_ns)} of {matches.possible} poses found no partner")
+    notes += [
+        f"{which}: {note}" for which, t in (("estimate", estimate), ("ground truth", ground_truth)) for note in t.notes
+    ]
+    if not (estimate.has_rotations and ground_truth.has_rotations):
+        return _evaluate_positions(estimate, ground_truth, matches, config, T_est_gt, offset_ns / 1e9, notes)
     truth = matches.truth
     if T_est_gt is not None:
         truth = truth @ se3.inverse(T_est_gt)
@@ -104,6 +109,40 @@ def evaluate(
     return replace(found, faults=faults)
 
 
+def _evaluate_positions(
+    estimate: Trajectory,
+    ground_truth: Trajectory,
+    matches: Matches,
+    config: EvalConfig,
+    T_est_gt: Floats | None,
+    time_offset: float,
+    notes: list[str],
+) -> Evaluation:
+    """What needs no rotation of two trajectories of which one has positions alone.
+
+    A prism or an antenna lies off the LiDAR: the side that has rotations is carried to the other's place by `T_est_gt`.
+    """
+    bare = [name for name, t in (("estimate", estimate), ("ground truth", ground_truth)) if not t.has_rotations]
+    have = "have" if len(bare) == 2 else "has"
+    notes.append(
+        f"{' and '.join(bare)} {have} positions without rotations: ATE by positions is scored; rotation errors, origin "
+        "alignment, RPE and KITTI drift are not available"
+    )
+    P, Q = matches.estimate, matches.truth
+    if T_est_gt is not None and len(bare) == 2:
+        raise InputError("--T-est-gt needs rotations of the estimate or of the ground truth: both have positions alone")
+    if T_est_gt is not None:
+        P, Q = (P @ T_est_gt, Q) if estimate.has_rotations else (P, Q @ se3.inverse(T_est_gt))
+        other = "estimate" if estimate.has_rotations else "ground truth"
+        notes.append(f"{other} carried to the place of the {bare[0]} by the transform given (T_est_gt)")
+    faults = _other_unit(P, Q)
+    notes = [*faults, *notes, *_nearly_straight(Q, config)]
+    for note in notes:
+        log.log(logging.WARNING if note in faults else logging.INFO, "%s: %s", estimate.source or "estimate", note)
+    pair = (estimate, ground_truth)
+    return replace(_measure(P, Q, matches, config, pair, time_offset, notes, False), faults=tuple(faults))
+
+
 def _measure(
     P: Floats,
     Q: Floats,
@@ -112,10 +151,11 @@ def _measure(
     trajectories: tuple[Trajectory, Trajectory],
     time_offset: float,
     notes: list[str],
+    has_rotations: bool = True,
 ) -> Evaluation:
     """All metrics of matched poses in one body frame: P estimate, Q ground truth, (N, 4, 4)."""
     distance = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(Q[:, :3, 3], axis=0), axis=1))])
-    poses = MatchedPoses(P, Q, matches.seconds)
+    poses = MatchedPoses(P, Q, matches.seconds, has_rotations)
     return Evaluation(
         estimate=trajectories[0].source or "estimate",
         ground_truth=trajectories[1].source or "ground truth",

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.config.eval import EvalConfig
-from lslam.evaluation.metric import Document, MatchedPoses, MetricRow, TrajectoryMetric
+from lslam.evaluation.metric import NO_ROTATIONS, Document, MatchedPoses, MetricRow, TrajectoryMetric
 from lslam.evaluation.results import Evaluation
 from lslam.printable import counted, significant
 from lslam.types.comparison import Metric
@@ -93,6 +93,8 @@ class KittiOdometry(TrajectoryMetric[KittiDrift]):
     )
 
     def measure(self, poses: MatchedPoses, config: EvalConfig) -> KittiDrift:
+        if not poses.has_rotations:
+            return KittiDrift(False, NO_ROTATIONS, float("nan"), float("nan"), 0, {})
         return kitti_drift(poses.estimate, poses.truth)
 
     def document(self, score: KittiDrift) -> Document:

@@ -23,11 +23,15 @@ Score = TypeVar("Score")
 
 @dataclass(frozen=True)
 class MatchedPoses:
-    """Poses in one body frame: estimate, truth (N, 4, 4); seconds (N,), None when nothing is known about time."""
+    """Poses in one body frame: estimate, truth (N, 4, 4); seconds (N,), None when nothing is known about time.
+
+    has_rotations : False when one of both has positions alone: what needs a rotation is not available then
+    """
 
     estimate: Floats
     truth: Floats
     seconds: Floats | None
+    has_rotations: bool = True
 
 
 @dataclass(frozen=True)
@@ -118,6 +122,9 @@ class TrajectoryMetric(ABC, Generic[Score]):
     def _texts(self, e: Evaluation) -> list[tuple[Metric, str]]:
         score = self.of(e)
         return [(metric, significant(getattr(score, field))) for field, metric in self.columns]
+
+
+NO_ROTATIONS = "n/a (positions alone)"
 
 
 def statistics_document(values: Statistics | None) -> Document:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from lslam.config.eval import EvalConfig
 from lslam.evaluation.metric import (
+    NO_ROTATIONS,
     Document,
     MatchedPoses,
     MetricRow,
@@ -113,6 +114,13 @@ def relative_error(estimate: Floats, truth: Floats, seconds: Floats | None, reci
     )  # fmt: skip
 
 
+def _without_rotations(recipe: str) -> RelativeError:
+    """The error at one distance that positions alone do not have: it compares motions in the frame of the body."""
+    delta, unit, rule = parse_delta(recipe)
+    sentence = RULES[unit, rule].replace("`delta`", f"{delta:g} {unit}")
+    return RelativeError(delta, unit, rule, 0, None, None, NO_ROTATIONS, sentence)
+
+
 def error_transforms(estimate: Floats, truth: Floats, pairs: NDArray[np.int64]) -> Floats:
     """E (M, 4, 4) = inv(inv(Q_i) Q_j) (inv(P_i) P_j) of `pairs` (M, 2); P estimate, Q truth, (N, 4, 4)."""
     i, j = pairs[:, 0], pairs[:, 1]
@@ -134,6 +142,8 @@ class RelativePoseError(TrajectoryMetric[list[RelativeError]]):
     key, name, gate_option = "rpe", "RPE", "rpe"
 
     def measure(self, poses: MatchedPoses, config: EvalConfig) -> list[RelativeError]:
+        if not poses.has_rotations:
+            return [_without_rotations(text) for text in config.delta]
         return [relative_error(poses.estimate, poses.truth, poses.seconds, delta) for delta in config.delta]
 
     def document(self, score: list[RelativeError]) -> list[Document]:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from lslam.config.eval import EvalConfig
 from lslam.evaluation.absolute import align
-from lslam.evaluation.metric import MatchedPoses, MetricRow, TrajectoryMetric, two
+from lslam.evaluation.metric import NO_ROTATIONS, MatchedPoses, MetricRow, TrajectoryMetric, two
 from lslam.evaluation.results import Evaluation, percent_of_length
 from lslam.geometry import so3
 from lslam.printable import fixed, metres, significant
@@ -149,6 +149,11 @@ class Girolimetto(TrajectoryMetric[AxisErrors]):
     )
 
     def measure(self, poses: MatchedPoses, config: EvalConfig) -> AxisErrors:
+        if not poses.has_rotations:
+            nan, three, none = float("nan"), (float("nan"),) * 3, np.full((len(poses.truth), 3), np.nan)
+            return AxisErrors(
+                "origin", nan, nan, nan, nan, three, three, nan, nan, none, none, none[:, 0], NO_ROTATIONS
+            )
         return axis_errors(poses.estimate, poses.truth)
 
     def summary(self, e: Evaluation) -> list[tuple[str, str]]:
@@ -181,6 +186,9 @@ class DelTufo(TrajectoryMetric[Planar]):
     key, name, word = "thesis2", "thesis2", "thesis"
 
     def measure(self, poses: MatchedPoses, config: EvalConfig) -> Planar:
+        if not poses.has_rotations:
+            nan = float("nan")
+            return Planar(nan, nan, nan, nan, nan, nan, nan, NO_ROTATIONS)
         return planar(poses.estimate, poses.truth)
 
     def summary(self, e: Evaluation) -> list[tuple[str, str]]:
@@ -203,7 +211,10 @@ class DelTufo(TrajectoryMetric[Planar]):
         ]
 
     def recipes(self, e: Evaluation) -> list[str]:
-        return [f"{self.name}: {self.of(e).recipe}; mean spacing {self.of(e).spacing:.2f} m"]
+        spacing = self.of(e).spacing
+        return [
+            f"{self.name}: {self.of(e).recipe}" + (f"; mean spacing {spacing:.2f} m" if np.isfinite(spacing) else "")
+        ]
 
     def tables(self, e: Evaluation) -> list[Table]:
         s = self.of(e)
@@ -212,7 +223,7 @@ class DelTufo(TrajectoryMetric[Planar]):
             ("RPE translation, m", fixed(s.rpe_translation_mean, 5), fixed(s.rpe_translation_std, 5)),
             ("RPE rotation, rad", f"{s.rpe_rotation_mean:.3e}", f"{s.rpe_rotation_std:.3e}"),
         )
-        recipe = f"{s.recipe}; matched poses are {s.spacing:.2f} m apart."
+        recipe = f"{s.recipe}; matched poses are {fixed(s.spacing, 2)} m apart."
         return [Table("Del Tufo (thesis2): planar errors", ("", "mean", "std"), rows, recipe)]
 
 

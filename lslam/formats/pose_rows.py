@@ -18,7 +18,7 @@ from lslam.untrusted import decimal_number
 
 Floats = NDArray[np.float64]
 LARGEST_NS = 2**62
-_DATE = re.compile(r"(\d{4})-(\d\d)-(\d\d)[ T](\d\d):(\d\d):(\d\d)(?:\.(\d{1,9}))?$")
+_DATE = re.compile(r"(\d{4})-(\d\d)-(\d\d)[ T](\d\d):(\d\d):(\d\d)(?:\.(\d{1,9}))?\s*(?:Z|UTC|([+-])(\d\d):?(\d\d))?$")
 # Whole numbers from here on are nanoseconds: as seconds they would lie 3 million years ahead.
 _NS_FROM = 10**14
 
@@ -31,7 +31,7 @@ class Row(NamedTuple):
 
 
 def read_rows(path: Path) -> tuple[list[Row], list[str]]:
-    """Data lines and comment lines (with `#`) of a text file; InputError when it cannot be read as text."""
+    """Data lines and comment lines (with `#` or `%`) of a text file; InputError when it cannot be read as text."""
     try:
         text = path.read_text(encoding="utf-8-sig")
     except FileNotFoundError:
@@ -43,29 +43,26 @@ def read_rows(path: Path) -> tuple[list[Row], list[str]]:
     rows, comments = [], []
     for number, line in enumerate(text.splitlines(), start=1):
         stripped = line.strip()
-        if stripped.startswith("#"):
+        if stripped.startswith(("#", "%")):
             comments.append(stripped)
         elif stripped:
             rows.append(Row(number, stripped))
     return rows, comments
 
 
-def numbers(rows: list[Row], columns: int, path: Path, what: str, separator: str | None = None) -> Floats:
-    """(N, columns) float64 of the first `columns` fields; InputError with the line that is short, no number or not finite.
-
-    `separator` None means white space, and then lines that are too long are wrong too.
-    """
+def numbers(rows: list[Row], columns: int, path: Path, what: str, may_be_nan: bool = False) -> Floats:
+    """(N, columns) float64; InputError with the line that is short or long, no number or not finite, NaN aside if it may be."""
     table = []
     for row in rows:
-        fields = row.text.split(separator)
-        if len(fields) < columns or (separator is None and len(fields) > columns):
+        fields = row.text.split()
+        if len(fields) != columns:
             raise InputError(f"{path}, line {row.number}: {len(fields)} columns where {what} has {columns}")
         try:
-            table.append([float(field) for field in fields[:columns]])
+            table.append([float(field) for field in fields])
         except ValueError:
             raise InputError(f"{path}, line {row.number}: not a number in {row.text[:60]!r}") from None
     values = np.array(table, np.float64).reshape(len(rows), columns)
-    check_finite(values, rows, path)
+    check_finite(np.nan_to_num(values, posinf=np.inf, neginf=-np.inf) if may_be_nan else values, rows, path)
     return values
 
 
@@ -89,11 +86,11 @@ def check_increasing(stamps_ns: NDArray[np.int64], rows: list[Row], path: Path) 
 def seconds_to_ns(text: str, path: Path, line: int, scale: int = 1_000_000_000) -> int:
     """Exact integer ns of a decimal number in a unit of `scale` ns (seconds by default)."""
     try:
-        value = Decimal(text) * scale
+        value = Decimal(text)
         is_finite = value.is_finite()
         # Compared before it becomes an integer: 1e999999 would have a million digits.
-        if is_finite and abs(value) <= LARGEST_NS:
-            return int(value.to_integral_value(ROUND_HALF_EVEN))
+        if is_finite and abs(value) <= LARGEST_NS and abs(value * scale) <= LARGEST_NS:
+            return int((value * scale).to_integral_value(ROUND_HALF_EVEN))
     except (ArithmeticError, ValueError):
         is_finite = False
     if not is_finite:
@@ -138,47 +135,15 @@ def write_lines(path: str | Path, lines: list[str]) -> None:
         stream.writelines(f"{line}\n".encode("utf-8", "backslashreplace") for line in lines)
 
 
-def read_stamps(path: Path) -> NDArray[np.int64]:
-    """(N,) int64 ns from a text file: the first column of each line, `#` comments and a header line aside.
-
-    Seconds may be decimal or scientific (KITTI's times.txt), whole numbers of 15 digits and more are ns, dates such as
-    `2011-09-26 13:04:32.349659964` (KITTI raw, taken as UTC) keep all nine digits.
-    Raises InputError naming file and line.
-    """
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path} cannot be read: {cause(error)}") from None
-    stamps: list[int] = []
-    headed = False
-    for number, line in enumerate(lines, 1):
-        text = line.split("#")[0].strip()
-        if not text:
-            continue
-        try:
-            stamps.append(parse_stamp(text if _DATE.match(text) else re.split(r"[,;\s]+", text)[0]))
-        except ValueError:
-            if stamps or headed:
-                raise InputError(f"{path}, line {number}: {text[:40]!r} is no time (s, ns or date)") from None
-            headed = True
-    return np.array(stamps, np.int64)
-
-
 def parse_stamp(text: str) -> int:
     """Nanoseconds of one stamp in any of the three notations; ValueError when it is none.
 
     >>> parse_stamp("1.036224e-01"), parse_stamp("1670403902235281229"), parse_stamp("1970-01-01 00:00:01.000000002")
     (103622400, 1670403902235281229, 1000000002)
     """
-    date = _DATE.match(text)
-    if date:
-        fields = [int(v) for v in date.groups()[:6]]
-        if not 1 <= fields[1] <= 12:
-            raise ValueError(f"no month {fields[1]}")
-        ns = calendar.timegm((*fields, 0, 0, 0)) * 10**9 + int((date.group(7) or "").ljust(9, "0"))
-        if abs(ns) >= 2**63:
-            raise ValueError(f"the year {fields[0]} is out of range")
-        return ns
+    date = date_to_ns(text)
+    if date is not None:
+        return date
     value = decimal_number(text)
     whole = value == value.to_integral_value()
     if whole and abs(value) >= _NS_FROM:
@@ -186,4 +151,26 @@ def parse_stamp(text: str) -> int:
     ns = int((value * 10**9).to_integral_value())
     if abs(ns) >= 2**63:
         raise ValueError(f"no time: {text!r}")
+    return ns
+
+
+def date_to_ns(text: str) -> int | None:
+    """Nanoseconds since 1970 of a date with a time of day, UTC unless it states an offset; None when it is no date.
+
+    Raises ValueError for a month or year that there is not.
+
+    >>> date_to_ns("1970-01-01T01:00:01.5+01:00"), date_to_ns("12.5")
+    (1500000000, None)
+    """
+    date = _DATE.match(text)
+    if date is None:
+        return None
+    fields = [int(v) for v in date.groups()[:6]]
+    if not 1 <= fields[1] <= 12:
+        raise ValueError(f"no month {fields[1]}")
+    ns = calendar.timegm((*fields, 0, 0, 0)) * 10**9 + int((date.group(7) or "").ljust(9, "0"))
+    if date.group(8):
+        ns -= int(f"{date.group(8)}1") * (int(date.group(9)) * 3600 + int(date.group(10)) * 60) * 10**9
+    if abs(ns) >= 2**63:
+        raise ValueError(f"the year {fields[0]} is out of range")
     return ns

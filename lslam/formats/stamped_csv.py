@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -9,14 +10,16 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.errors import InputError, cause
+from lslam.errors import InputError
 from lslam.formats.atomic import write_text
-from lslam.formats.pose_rows import parse_stamp
+from lslam.formats.pose_rows import read_rows
+from lslam.formats.text_tables import TextTable, text_table
+from lslam.formats.time_columns import find_clock
 from lslam.types.gnss import GnssStream
 from lslam.types.imu import ImuStream
-from lslam.untrusted import decimal_number
 
-TIME_COLUMNS = ("stamp_ns", "timestamp", "stamp", "time", "t", "time_s", "stamp_s")
+log = logging.getLogger("lslam")
+TIME_COLUMNS = "stamp_ns, timestamp, stamp, time, t, time_s, or sec and nanosec"
 IMU_COLUMNS = ("accel_x", "accel_y", "accel_z", "gyro_x", "gyro_y", "gyro_z")
 _ALIASES = [
     *((f"accel_{axis}", f"a{axis}", f"a_rs_s_{axis}", f"acc_{axis}", f"linear_acceleration_{axis}") for axis in "xyz"),
@@ -30,38 +33,40 @@ def read_stamped_csv(
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Stamps (N,) ns and values (N, K), one column per entry of `columns`, each entry its accepted names.
 
-    Columns of `optional` follow and are NaN where the file has none. The header is the first line, a leading `#`, units
-    in brackets and case aside. `stamp_ns` holds whole ns however small; what other time columns hold shows from the numbers
-    (`stamps_files`). Raises InputError naming file, line and what is missing.
+    Columns of `optional` follow and are NaN where the file has none. The header is the first line; a leading `#` or `%`,
+    units in brackets, case and what stands before the last points or slashes (`field.linear_acceleration.x`) do not count.
+    The time is one column or two (`time_columns`). Raises InputError naming file, line and what is missing.
     """
-    try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path} cannot be read: {cause(error)}") from None
-    header = [_plain(name) for name in lines[0].split(",")] if lines else []
-    time = _find(header, TIME_COLUMNS)
-    if time is None:
-        raise InputError(f"{path}, line 1: no time column ({', '.join(TIME_COLUMNS)}) in {', '.join(header)!r}")
-    where = [_find(header, names) for names in columns]
-    missing = [names[0] for names, k in zip(columns, where, strict=True) if k is None]
+    rows, comments = read_rows(path)
+    table = text_table(path, rows, comments) if rows else None
+    if table is None or not table.rows:
+        names = table.names if table is not None else _named_alone(comments)
+        table = TextTable(path, tuple(names), [], [], ",")
+    header = [_spellings(name) for name in table.names]
+    where = [_find(header, names) for names in (*columns, *optional)]
+    shown = ", ".join(table.names)
+    width = len(table.names)
+    for row, cells in zip(table.rows, table.cells, strict=True):
+        if len(cells) != width:
+            raise InputError(f"{path}, line {row.number}: {len(cells)} columns where the header has {width}")
+    clock = find_clock(table, [k for k in where if k is not None])
+    if clock is None:
+        raise InputError(f"{path}, line 1: no time column ({TIME_COLUMNS}) in {shown!r}")
+    missing = [names[0] for names, k in zip(columns, where, strict=False) if k is None]
     if missing:
-        raise InputError(f"{path}, line 1: no column {', '.join(missing)}; the file has {', '.join(header)}")
-    where += [_find(header, names) for names in optional]
-    parse = _nanoseconds if header[time] == "stamp_ns" else parse_stamp
-    stamps: list[int] = []
-    rows: list[list[float]] = []
-    for number, line in enumerate(lines[1:], 2):
-        cells = line.split(",")
-        if not line.strip() or line.startswith("#"):
-            continue
-        if len(cells) != len(header):
-            raise InputError(f"{path}, line {number}: {len(cells)} columns where the header has {len(header)}")
-        try:
-            stamps.append(parse(cells[time].strip()))
-            rows.append([float("nan") if k is None else float(cells[k]) for k in where])
-        except ValueError:
-            raise InputError(f"{path}, line {number}: {line[:60]!r} holds something that is no number") from None
-    return np.array(stamps, np.int64), np.array(rows, np.float64).reshape(len(stamps), len(where))
+        raise InputError(f"{path}, line 1: no column {', '.join(missing)}; the file has {shown}")
+    values = np.full((len(table.rows), len(where)), np.nan)
+    known = [k for k in where if k is not None]
+    values[:, [i for i, k in enumerate(where) if k is not None]] = table.values(known)
+    if clock.others:
+        chosen = " and ".join(table.names[k] for k in clock.columns)
+        log.info("%s: the time is %s; left out: %s", path, chosen, ", ".join(clock.others))
+    return clock.stamps_ns, values
+
+
+def _named_alone(comments: list[str]) -> list[str]:
+    """The names of a file that has a header in a comment and no data."""
+    return comments[0].lstrip("#% ").split(",") if comments else []
 
 
 def write_stamped_csv(
@@ -74,19 +79,18 @@ def write_stamped_csv(
     write_text(path, "\n".join(rows) + "\n")
 
 
-def _nanoseconds(text: str) -> int:
-    stamp = decimal_number(text)
-    if stamp != stamp.to_integral_value():
-        raise ValueError(f"no whole number of nanoseconds: {text!r}")
-    return int(stamp)
+def _spellings(name: str) -> list[str]:
+    """The names that a column may go by: without units, and each of its endings after a point or slash.
+
+    >>> _spellings("field.linear_acceleration.x [m/s^2]")
+    ['x', 'linear_acceleration_x', 'field_linear_acceleration_x']
+    """
+    words = [word for word in re.split(r"[./]", re.sub(r"[\[(].*?[\])]", "", name).strip(" #%\"'").lower()) if word]
+    return ["_".join(words[k:]).strip() for k in reversed(range(len(words)))]
 
 
-def _plain(name: str) -> str:
-    return re.sub(r"\[.*?\]", "", name).strip().lstrip("#").strip().lower()
-
-
-def _find(header: list[str], names: Sequence[str]) -> int | None:
-    return next((header.index(name) for name in names if name in header), None)
+def _find(header: list[list[str]], names: Sequence[str]) -> int | None:
+    return next((k for name in names for k, spellings in enumerate(header) if name in spellings), None)
 
 
 def read_imu_csv(path: Path) -> ImuStream:

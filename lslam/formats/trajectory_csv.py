@@ -1,11 +1,13 @@
-"""Trajectories as tables whose columns have names: EuRoC ground truth, MCD, and what people export."""
+"""Trajectories as tables: EuRoC ground truth, MCD, prisms and RTK, exports of ROS, PlotJuggler and pandas."""
 
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lslam.errors import InputError
 from lslam.formats.pose_rows import (
@@ -14,26 +16,17 @@ from lslam.formats.pose_rows import (
     check_increasing,
     frame_in,
     poses_from_quaternions,
-    seconds_to_ns,
     write_lines,
 )
-from lslam.geometry import so3
+from lslam.formats.text_tables import TextTable, looks_like_header, text_table
+from lslam.formats.time_columns import find_clock, is_fraction, is_index
+from lslam.formats.trajectory_columns import PoseColumns, named_columns, placed_columns
+from lslam.geometry import se3, so3
 from lslam.types.trajectory import Trajectory
 
-# Names after lower case and without units, prefixes and punctuation.
-TIME = ("t", "time", "timestamp", "stamp", "sec", "secs", "seconds", "timens", "nsec")
-POSITION = {axis: (axis, f"t{axis}", f"p{axis}", f"pos{axis}", f"position{axis}", f"prsr{axis}") for axis in "xyz"}
-ROTATION = {
-    axis: (f"q{axis}", f"quat{axis}", f"orientation{axis}", f"rotation{axis}", f"rot{axis}", f"qrs{axis}")
-    for axis in "xyzw"
-}
-UNITS_NS = {"ns": 1, "us": 1_000, "ms": 1_000_000, "s": 1_000_000_000}
-
-
-def looks_like_header(line: str) -> bool:
-    """Whether the first field of `line` is a name and no number."""
-    field = re.split(r"[,;\s]+", line.strip())[0]
-    return bool(re.match(r"[A-Za-z_]", field)) and field.lower() not in ("nan", "inf", "infinity")
+Floats = NDArray[np.float64]
+# A path that strays so far from a line, in parts of its length, has bends, in which a body turns.
+BENT = 0.01
 
 
 def is_table(first: str) -> bool:
@@ -53,12 +46,12 @@ def fits_csv(first: str) -> bool:
 
 def read_euroc(path: Path, rows: list[Row], comments: list[str], times: Path | None) -> Trajectory:
     """Poses of the IMU, if no comment names another body."""
-    return parse(path, rows, comments, is_euroc=True)
+    return parse(path, rows, comments, scalar="first", default_ns=1, frame="imu")
 
 
 def read_csv(path: Path, rows: list[Row], comments: list[str], times: Path | None) -> Trajectory:
     """Poses of the body that a comment names."""
-    return parse(path, rows, comments, is_euroc=False)
+    return parse(path, rows, comments)
 
 
 def write_euroc(path: str | Path, trajectory: Trajectory) -> None:
@@ -73,112 +66,102 @@ def write_euroc(path: str | Path, trajectory: Trajectory) -> None:
     write_lines(path, lines)
 
 
-def parse(path: Path, rows: list[Row], comments: list[str], is_euroc: bool) -> Trajectory:
-    """Read a table with named columns, or EuRoC's order when it has no names and `is_euroc`.
+def parse(
+    path: Path,
+    rows: list[Row],
+    comments: list[str],
+    scalar: str = "",
+    default_ns: int | None = None,
+    frame: str = "unknown",
+) -> Trajectory:
+    """Read a table by the names of its columns, which may stand in a comment, else by what stands in them.
 
-    A header may be a comment. The time unit is the one in the column's name, else ns for EuRoC, else by size.
+    scalar : place of w in quaternions without names, `first` or `last`; default_ns : unit of times without one
+    frame : the body, if no comment names another
+    Rows whose position or rotation is NaN or empty are lost poses and are left out.
     """
-    header, unit_names, data = _header(path, rows, comments, is_euroc)
-    if not data:
+    table = text_table(path, rows, comments)
+    if not table.rows:
         raise InputError(f"{path} has a header but no poses")
-    separator = _separator(data[0].text)
-    columns = _columns(path, header, is_euroc)
-    table = [[field.strip() for field in row.text.split(separator)] for row in data]
-    width = max(columns.values()) + 1
-    for row, fields in zip(data, table, strict=True):
-        if len(fields) < width or (header and len(fields) < len(header)):
-            raise InputError(f"{path}, line {row.number}: {len(fields)} columns, {max(width, len(header))} expected")
-    time = columns["t"]
-    scale = _scale(unit_names[time] if time < len(unit_names) else "", table[0][time], is_euroc)
-    stamps = np.array(
-        [seconds_to_ns(f[time], path, r.number, scale) for r, f in zip(data, table, strict=True)], np.int64
-    )
-    check_increasing(stamps, data, path)
-    values = _values(path, data, table, [columns[name] for name in ("x", "y", "z", "qx", "qy", "qz", "qw")])
-    return Trajectory(
-        stamps_ns=stamps,
-        poses=poses_from_quaternions(values[:, :3], values[:, 3:], data, path),
-        frame=frame_in(comments) or ("imu" if is_euroc else "unknown"),
-        source=str(path),
-    )
-
-
-def _header(path: Path, rows: list[Row], comments: list[str], is_euroc: bool) -> tuple[list[str], list[str], list[Row]]:
-    """Column names, the same with their units, and the lines of data."""
-    text = ""
-    if looks_like_header(rows[0].text):
-        text, rows = rows[0].text, rows[1:]
-    else:
-        named = [
-            c.lstrip("# ") for c in comments if re.search(r"time|stamp", c, re.IGNORECASE) and re.search("[,;]", c)
-        ]
-        text = named[0] if named else ""
-    if not text and not is_euroc:
+    columns = named_columns(path, table.names) if table.names else None
+    if columns is None and looks_like_header(rows[0].text):
         raise InputError(
-            f"{path}, line {rows[0].number}: a table without a header: name the columns (t,x,y,z,qx,qy,qz,qw), "
-            "or use --format euroc for integer nanoseconds"
-        )
-    full = [name.strip().lower() for name in text.split(_separator(text))] if text else []
-    return [_plain(name) for name in full], full, rows
-
-
-def _separator(text: str) -> str | None:
-    return next((s for s in (",", ";", "\t") if s in text), None)
-
-
-def _plain(name: str) -> str:
-    """`p_RS_R_x [m]` -> `prsrx`; `pose.position.x` -> `positionx`."""
-    name = re.sub(r"[\[(].*?[\])]", "", name)
-    name = re.sub(r"_(ns|us|ms|s|m)$", "", name.strip())
-    name = re.sub(r"^(field\.)?(pose\.)*", "", name)
-    return re.sub(r"[^a-z0-9]", "", name)
-
-
-def _columns(path: Path, header: list[str], is_euroc: bool) -> dict[str, int]:
-    if not header:
-        return {"t": 0, "x": 1, "y": 2, "z": 3, "qw": 4, "qx": 5, "qy": 6, "qz": 7}
-    wanted = {"t": TIME, **POSITION, **{f"q{axis}": names for axis, names in ROTATION.items()}}
-    columns, missing = {}, []
-    for key, names in wanted.items():
-        found = [header.index(name) for name in names if name in header]
-        if found:
-            columns[key] = found[0]
-        else:
-            missing.append(key)
-    if missing and is_euroc and len(header) >= 8:
-        return _columns(path, [], is_euroc)
-    if missing:
-        raise InputError(
-            f"{path}: no column for {', '.join(missing)} in the header {', '.join(header)}; "
+            f"{path}: no column for x, y, z in the header {', '.join(table.names)}; "
             "name the columns t, x, y, z, qx, qy, qz, qw"
         )
-    return columns
+    if columns is None:
+        table = replace(table, names=())
+    _check_widths(table)
+    if columns is None:
+        columns = _placed(table, scalar)
+    values = table.values(list(columns.all))
+    lost = np.asarray(np.isnan(values).any(axis=1), np.bool_)
+    if lost.all():
+        raise InputError(f"{path}: every row holds NaN or no numbers: there is no pose")
+    table, values = table.select(~lost), values[~lost]
+    check_finite(values, table.rows, path)
+    taken = columns.all if table.names else range(columns.leading, len(table.cells[0]))
+    clock = find_clock(table, taken, default_ns)
+    if clock is None:
+        raise InputError(f"{path}: no column is a time in the header {', '.join(table.names)}; name it t, or stamp_ns")
+    check_increasing(clock.stamps_ns, table.rows, path)
+    poses, has_rotations, rotation_notes = poses_of(values, table.rows, path)
+    notes = [*columns.notes, *rotation_notes]
+    if clock.others:
+        chosen = " and ".join(table.names[k] for k in clock.columns)
+        notes.append(f"the time is {chosen}; left out: {', '.join(clock.others)}")
+    if lost.any():
+        notes.append(f"{int(lost.sum())} of {len(lost)} rows hold NaN or no numbers: lost poses, left out")
+    return Trajectory(
+        stamps_ns=clock.stamps_ns,
+        poses=poses,
+        frame=frame_in(comments) or frame,
+        source=str(path),
+        has_rotations=has_rotations,
+        notes=tuple(notes),
+    )
 
 
-def _scale(name: str, first: str, is_euroc: bool) -> int:
-    """Nanoseconds in one unit of the time column."""
-    unit = re.search(r"[\[(_ ](ns|us|ms|s)[\])]?$", name.strip())
-    if unit:
-        return UNITS_NS[unit.group(1)]
-    if is_euroc:
-        return 1
-    try:
-        size = abs(float(first))
-    except ValueError:
-        return UNITS_NS["s"]
-    # Unix time in 2001..2286 has 10 digits before the point in s, 13 in ms, 16 in us, 19 in ns.
-    for limit, name_of_unit in ((1e17, "ns"), (1e14, "us"), (1e11, "ms")):
-        if size >= limit:
-            return UNITS_NS[name_of_unit]
-    return UNITS_NS["s"]
+def poses_of(values: Floats, rows: list[Row], path: Path) -> tuple[Floats, bool, list[str]]:
+    """Poses (N, 4, 4) of positions (N, 3) or positions and quaternions xyzw (N, 7), whether their rotations are any, and notes.
+
+    Quaternions of zeros everywhere are none, nor is one axis or identity everywhere along a path that bends: tools write
+    those for positions alone.
+    """
+    p, q = values[:, :3], values[:, 3:]
+    if q.shape[1] == 0:
+        return se3.make(np.eye(3), p), False, []
+    if not q.any():
+        return se3.make(np.eye(3), p), False, ["all quaternions are zero: positions alone"]
+    poses = poses_from_quaternions(p, q, rows, path)
+    is_constant = len(q) > 2 and bool((q == q[0]).all()) and np.count_nonzero(q[0]) == 1
+    if is_constant and _bends(p):
+        return (
+            se3.make(np.eye(3), p),
+            False,
+            ["the quaternion is the same everywhere on a path that bends: positions alone"],
+        )
+    return poses, True, []
 
 
-def _values(path: Path, data: list[Row], table: list[list[str]], columns: list[int]) -> np.ndarray:
-    values = np.empty((len(data), len(columns)))
-    for i, (row, fields) in enumerate(zip(data, table, strict=True)):
-        try:
-            values[i] = [float(fields[c]) for c in columns]
-        except ValueError:
-            raise InputError(f"{path}, line {row.number}: not a number in {row.text[:60]!r}") from None
-    check_finite(values, data, path)
-    return values
+def _bends(positions: Floats) -> bool:
+    spread = np.linalg.svd(positions - positions.mean(axis=0), compute_uv=False)
+    return bool(spread[1] > BENT * spread[0] and spread[1] > BENT * np.sqrt(len(positions)))
+
+
+def _check_widths(table: TextTable) -> None:
+    width = len(table.names) or len(table.cells[0])
+    for row, cells in zip(table.rows, table.cells, strict=True):
+        if len(cells) < width or (table.separator is None and len(cells) != width):
+            raise InputError(f"{table.path}, line {row.number}: {len(cells)} columns, {width} expected")
+
+
+def _placed(table: TextTable, scalar: str) -> PoseColumns:
+    """The columns of a table without names."""
+    values = np.stack([table.numbers(k) for k in range(len(table.cells[0]))], axis=1)
+    first = values[:, :3]
+    known = np.isfinite(first).all(axis=1)
+    a, b, c = (first[known, k] if first.shape[1] > k else np.zeros(0) for k in range(3))
+    rises = len(b) > 1 and bool(np.all(np.diff(b) > 0))
+    is_time = [True, (is_index(a) and rises) or is_fraction(a, b, False), is_index(a) and is_fraction(b, c, False)]
+    return placed_columns(table.path, table, values, is_time, scalar)

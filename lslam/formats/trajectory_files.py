@@ -2,10 +2,10 @@
 
 | format | line | time | rotation | frame |
 |---|---|---|---|---|
-| `kitti` | 12 numbers, the upper 3x4 of a pose, row-major | none, or `times.txt` | matrix | cam0 |
-| `tum` | `stamp tx ty tz qx qy qz qw` | s | xyzw | in a comment: `# frame: lidar` |
+| `kitti` | 12 numbers, the upper 3x4 of a pose, row-major, or 16; behind a scan's number or time | `times.txt` | matrix | cam0 |
+| `tum` | `stamp tx ty tz qx qy qz qw`, or without rotation | s, or by size | xyzw | in a comment: `# frame: lidar` |
 | `euroc` | `ns, p, q_w q_x q_y q_z, ...` | ns | wxyz | imu |
-| `csv` | columns named in the header | s, or the unit in the name | by name | unknown |
+| `csv` | columns named in the header | by the name, or by size | by name | unknown |
 
 Stamps go between text and int64 ns without passing through a float. Matrices are kept as the file states them, so that
 numbers agree with tools that do the same.
@@ -17,9 +17,10 @@ from pathlib import Path
 
 from lslam.errors import InputError
 from lslam.formats.pose_rows import Row, read_rows
+from lslam.formats.stamp_files import read_times
 from lslam.formats.trajectory_csv import write_euroc
 from lslam.formats.trajectory_formats import FORMATS, format_named
-from lslam.formats.trajectory_lines import find_times, read_times, write_kitti, write_tum
+from lslam.formats.trajectory_lines import find_times, write_kitti, write_tum
 from lslam.remote import as_path
 from lslam.types.trajectory import Trajectory
 
@@ -48,21 +49,12 @@ def read_trajectory(path: str | Path, format: str | None = None, times: str | Pa
     forced = None if format is None else format_named(format)
     if not rows:
         raise InputError(f"{path} holds no poses: the file is empty or all comments")
-    return (forced or FORMATS[detect_format(path, rows)]).read(
-        path, rows, comments, None if times is None else Path(times)
-    )
+    return (forced or FORMATS[detect_format(rows)]).read(path, rows, comments, None if times is None else Path(times))
 
 
-def detect_format(path: Path, rows: list[Row]) -> str:
-    """Name of the format of `rows`, the lines of a file without comments; InputError when it is none we know."""
-    first = rows[0].text
-    for name, one in FORMATS.items():
-        if one.fits(first):
-            return name
-    raise InputError(
-        f"{path}, line {rows[0].number}: {len(first.split())} columns are no trajectory format lslam knows "
-        "(12 numbers: KITTI; 8: TUM; commas: EuRoC or named columns); --format forces one"
-    )
+def detect_format(rows: list[Row]) -> str:
+    """Name of the format that the first of `rows` is read by, the lines of a file without comments."""
+    return next(name for name, one in FORMATS.items() if one.fits(rows[0].text))
 
 
 def _in_run_folder(folder: Path) -> Path:

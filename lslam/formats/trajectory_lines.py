@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -13,14 +14,13 @@ from lslam.formats import trajectory_csv
 from lslam.formats.pose_rows import (
     Row,
     check_increasing,
-    frame_in,
     numbers,
-    poses_from_quaternions,
-    read_rows,
     seconds_text,
-    seconds_to_ns,
     write_lines,
 )
+from lslam.formats.stamp_files import read_times
+from lslam.formats.text_tables import TextTable
+from lslam.formats.time_columns import find_clock
 from lslam.geometry import so3
 from lslam.remote import as_path
 from lslam.types.trajectory import Trajectory
@@ -28,29 +28,86 @@ from lslam.types.trajectory import Trajectory
 log = logging.getLogger("lslam")
 
 NOMINAL_STEP_NS = 100_000_000
+WIDTHS = (12, 16)
 
 
 def fits_kitti(first: str) -> bool:
-    """Twelve numbers."""
-    return not trajectory_csv.is_table(first) and len(first.split()) == 12
+    """The upper 3x4 of a pose or the whole 4x4, with an index or a time before it or not: 12, 13, 16 or 17 numbers."""
+    return not trajectory_csv.is_table(first) and len(first.split()) in (*WIDTHS, *(width + 1 for width in WIDTHS))
 
 
 def read_kitti(path: Path, rows: list[Row], comments: list[str], times: Path | None) -> Trajectory:
     """Poses of camera 0; stamps of `times`, else of the times that belong to the file."""
-    values = numbers(rows, 12, path, "KITTI poses")
-    poses = np.tile(np.eye(4), (len(rows), 1, 1))
-    poses[:, :3, :] = values.reshape(-1, 3, 4)
-    wrong = np.flatnonzero(~so3.is_rotation(poses[:, :3, :3], 1e-2))
-    if len(wrong):
-        raise InputError(f"{path}, line {rows[wrong[0]].number}: the 3x3 part is no rotation matrix")
-    stamps = _stamps_of_kitti(path, len(rows), times)
+    table = read_matrices(path, rows)
+    notes = [] if table.note is None else [table.note]
+    kept = np.asarray(~np.isnan(table.poses).any(axis=(1, 2)), np.bool_)
+    if not kept.all():
+        notes.append(f"{int((~kept).sum())} of {len(kept)} rows hold NaN: lost poses, left out")
+    stamps = table.stamps_ns
+    if stamps is None:
+        stamps = _stamps_of_kitti(path, table.numbers, times)
     return Trajectory(
-        stamps_ns=np.arange(len(rows), dtype=np.int64) * NOMINAL_STEP_NS if stamps is None else stamps,
-        poses=poses,
-        frame="cam0",
+        stamps_ns=(table.numbers * NOMINAL_STEP_NS if stamps is None else stamps)[kept],
+        poses=table.poses[kept],
+        frame="cam0" if table.is_cam0 else "unknown",
         has_stamps=stamps is not None,
         source=str(path),
+        notes=tuple(notes),
     )
+
+
+@dataclass(frozen=True)
+class MatrixRows:
+    """Poses as matrices: numbers (N,) of the scans they belong to, poses (N, 4, 4), NaN where lost; stamps_ns (N,) or None.
+
+    is_cam0 : whether they are camera 0's by convention; note : how they were read, None for 12 numbers
+    """
+
+    numbers: NDArray[np.int64]
+    poses: NDArray[np.float64]
+    stamps_ns: NDArray[np.int64] | None
+    is_cam0: bool
+    note: str | None
+
+
+def read_matrices(path: Path, rows: list[Row]) -> MatrixRows:
+    """The poses of rows of 12 or 16 numbers, row-major, perhaps behind a number of the scan (KITTI-360) or a time.
+
+    Raises InputError naming the line that is short, no number, infinite, or no rotation.
+    """
+    width = len(rows[0].text.split())
+    size = next((w for w in WIDTHS if width in (w, w + 1)), WIDTHS[0])
+    lead = width - size if width in (size, size + 1) else 0
+    values = numbers(rows, size + lead, path, "KITTI poses", may_be_nan=True)
+    matrices = values[:, lead:]
+    poses = np.tile(np.eye(4), (len(rows), 1, 1))
+    if size == 16 and not np.nan_to_num(matrices[:, [3, 7, 11]]).any() and np.nan_to_num(matrices[:, 12:15]).any():
+        poses[:] = np.swapaxes(matrices.reshape(-1, 4, 4), 1, 2)
+        how = "4x4 matrices, column by column"
+    else:
+        poses[:, :3, :] = matrices[:, :12].reshape(-1, 3, 4)
+        how = f"{'4x4' if size == 16 else '3x4'} matrices, row by row"
+    lost = np.isnan(matrices).any(axis=1)
+    poses[lost] = np.nan
+    if lost.all():
+        raise InputError(f"{path}: every row holds NaN: there is no pose")
+    wrong = np.flatnonzero(~lost & ~so3.is_rotation(np.nan_to_num(poses[:, :3, :3]), 1e-2))
+    if len(wrong):
+        raise InputError(f"{path}, line {rows[wrong[0]].number}: the 3x3 part is no rotation matrix")
+    indices, stamps = np.arange(len(rows), dtype=np.int64), None
+    if lead:
+        first = values[:, 0]
+        is_number = bool(
+            np.all(first == np.rint(first)) and np.all(np.diff(first) > 0) and 0 <= first[0] <= first[-1] < 1e8
+        )
+        if is_number:
+            indices, how = first.astype(np.int64), f"the number of the scan, then {how}"
+        else:
+            clock = find_clock(TextTable(path, (), rows, [row.text.split()[:1] for row in rows], None))
+            assert clock is not None
+            stamps, how = clock.stamps_ns, f"the time, then {how}"
+            check_increasing(stamps, rows, path)
+    return MatrixRows(indices, poses, stamps, width == 12, None if width == 12 else how)
 
 
 def write_kitti(path: str | Path, trajectory: Trajectory) -> None:
@@ -60,21 +117,13 @@ def write_kitti(path: str | Path, trajectory: Trajectory) -> None:
 
 
 def fits_tum(first: str) -> bool:
-    """Eight numbers."""
-    return not trajectory_csv.is_table(first) and len(first.split()) == 8
+    """Other numbers between blanks: eight, or a time and a position, with an index or a second column of time or not."""
+    return not trajectory_csv.is_table(first) and not fits_kitti(first)
 
 
 def read_tum(path: Path, rows: list[Row], comments: list[str], times: Path | None) -> Trajectory:
     """Poses of the body that a comment names."""
-    values = numbers(rows, 8, path, "TUM (stamp tx ty tz qx qy qz qw)")
-    stamps = np.array([seconds_to_ns(row.text.split()[0], path, row.number) for row in rows], np.int64)
-    check_increasing(stamps, rows, path)
-    return Trajectory(
-        stamps_ns=stamps,
-        poses=poses_from_quaternions(values[:, 1:4], values[:, 4:8], rows, path),
-        frame=frame_in(comments) or "unknown",
-        source=str(path),
-    )
+    return trajectory_csv.parse(path, rows, comments, scalar="last")
 
 
 def write_tum(path: str | Path, trajectory: Trajectory, comment: str = "") -> None:
@@ -86,17 +135,6 @@ def write_tum(path: str | Path, trajectory: Trajectory, comment: str = "") -> No
         pose = " ".join([*(f"{v:.9f}" for v in p), *(f"{v:.12f}" for v in r)])
         lines.append(f"{seconds_text(stamp)} {pose}")
     write_lines(path, lines)
-
-
-def read_times(path: str | Path) -> NDArray[np.int64]:
-    """Stamps (N,) int64 ns of a file with one time in seconds per line, as KITTI's `times.txt`."""
-    path = as_path(path)
-    rows, _ = read_rows(path)
-    if not rows:
-        raise InputError(f"{path} holds no times")
-    stamps = np.array([seconds_to_ns(row.text.strip(), path, row.number) for row in rows], np.int64)
-    check_increasing(stamps, rows, path)
-    return stamps
 
 
 def find_times(path: str | Path) -> Path | None:
@@ -111,20 +149,20 @@ def find_times(path: str | Path) -> Path | None:
     return next((c for c in candidates if c.is_file() and c != path.resolve()), None)
 
 
-def _stamps_of_kitti(path: Path, count: int, times: Path | None) -> NDArray[np.int64] | None:
-    if times is not None:
-        stamps = read_times(times)
-        if len(stamps) != count:
-            raise InputError(
-                f"{times} has {len(stamps)} stamps but {path} has {count} poses: give the times of these poses"
-            )
-        return stamps
-    found = find_times(path)
+def _stamps_of_kitti(path: Path, scans: NDArray[np.int64], times: Path | None) -> NDArray[np.int64] | None:
+    """Stamps of the poses that belong to `scans` (N,), of a file with one for each scan."""
+    found = find_times(path) if times is None else times
     if found is None:
         return None
     stamps = read_times(found)
-    if len(stamps) != count:
-        log.warning("%s has %d stamps but %s has %d poses: not used", found, len(stamps), path, count)
-        return None
-    log.info("%s: stamps from %s", path, found)
-    return stamps
+    is_numbered = bool(np.any(np.diff(scans) != 1)) or bool(scans[0])
+    if len(stamps) == len(scans) or (is_numbered and scans[-1] < len(stamps)):
+        if times is None:
+            log.info("%s: stamps from %s", path, found)
+        return stamps[scans] if is_numbered and scans[-1] < len(stamps) else stamps
+    if times is not None:
+        raise InputError(
+            f"{times} has {len(stamps)} stamps but {path} has {len(scans)} poses: give the times of these poses"
+        )
+    log.warning("%s has %d stamps but %s has %d poses: not used", found, len(stamps), path, len(scans))
+    return None

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.errors import UsageError
+from lslam.errors import InputError, UsageError
 from lslam.formats.trajectory_files import read_trajectory
 from lslam.geometry.interpolate import poses_at
 from lslam.preprocessing.deskew import knots_over
@@ -107,6 +107,11 @@ def create(config: Config) -> GivenPoses:
         raise UsageError("method poses needs a trajectory: name its file with --poses")
     path = Path(config.odometry.poses)
     trajectory = read_trajectory(path)
+    if not trajectory.has_rotations:
+        raise InputError(
+            f"{path} has positions without rotations: scans cannot be placed by them; --poses needs rotations, and as ground "
+            "truth (--gt) it scores positions"
+        )
     if len(trajectory) < 2:
         raise UsageError(f"{path} holds {len(trajectory)} pose; a trajectory for --poses needs two")
     return GivenPoses(trajectory)

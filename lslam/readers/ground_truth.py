@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 
 from lslam.errors import InputError
 from lslam.formats.oxts_files import POS_ACC, ROLL, YAW, Oxts
-from lslam.formats.pose_rows import numbers, read_rows
+from lslam.formats.pose_rows import read_rows
 from lslam.formats.sequence_toml import FILE_NAME, SequenceInfo
 from lslam.formats.trajectory_files import read_trajectory
+from lslam.formats.trajectory_lines import MatrixRows, fits_kitti, read_matrices
 from lslam.geometry import geodesy, se3, so3
 from lslam.geometry.interpolate import poses_at
 from lslam.readers.listing import file_numbers, rows_of
@@ -58,9 +59,14 @@ def find_ground_truth(folder: Path, info: SequenceInfo, voice: Voice) -> Path | 
 def load_poses(path: Path, stamps_ns: NDArray[np.int64], files: list[Path], voice: Voice) -> Trajectory | None:
     """Poses of `path` in the frame of the file; rows without time get the stamps of the scans they belong to."""
     try:
-        if _is_kitti(path):
-            return _pair(path, _kitti_poses(path), stamps_ns, files, voice)
-        return read_trajectory(path)
+        lines, _ = read_rows(path)
+        if lines and fits_kitti(lines[0].text):
+            table = read_matrices(path, lines)
+            if table.stamps_ns is None:
+                return _pair(path, table, stamps_ns, files, voice)
+        truth = read_trajectory(path)
+        voice.notes += [f"ground truth {path}: {note}" for note in truth.notes]
+        return truth
     except InputError as error:
         voice.problems.append(f"ground truth is not used: {error}")
         return None
@@ -119,7 +125,16 @@ def to_lidar(
     """`truth`, poses of `frame`, as poses of the LiDAR; None, with the reason in the problems, when extrinsics are missing.
 
     KITTI's camera poses live in a world that is camera 0 at the start: T_world_lidar = inv(Tr) @ T_cam0 @ Tr.
+    Positions alone cannot be carried: a lever arm turns with the body.
     """
+    if not truth.has_rotations:
+        arm = (
+            ""
+            if T_body_lidar is None
+            else f"; the lever arm of {np.linalg.norm(T_body_lidar[:3, 3]):.2f} m stays in them"
+        )
+        voice.notes.append(f"ground truth {truth.source} has positions without rotations: taken as the LiDAR's{arm}")
+        return replace(truth, frame="lidar")
     if frame == "cam0":
         T = calibration.T_cam0_lidar
         if T is None:
@@ -146,36 +161,28 @@ def to_lidar(
     return replace(truth, frame="lidar")
 
 
-def _is_kitti(path: Path) -> bool:
-    rows, _ = read_rows(path)
-    if not rows:
-        raise InputError(f"{path} holds no poses")
-    return len(rows[0].text.split()) == 12 and "," not in rows[0].text
-
-
-def _kitti_poses(path: Path) -> NDArray[np.float64]:
-    rows, _ = read_rows(path)
-    upper = numbers(rows, 12, path, "KITTI poses").reshape(-1, 3, 4)
-    R = upper[:, :, :3]
-    wrong = np.flatnonzero(~so3.is_rotation(R, 1e-2))
-    if len(wrong):
-        raise InputError(f"{path}, line {rows[wrong[0]].number}: the 3x3 part is no rotation matrix")
-    return se3.make(R, upper[:, :, 3])
-
-
 def _pair(
-    path: Path, poses: NDArray[np.float64], stamps_ns: NDArray[np.int64], files: list[Path], voice: Voice
+    path: Path, table: MatrixRows, stamps_ns: NDArray[np.int64], files: list[Path], voice: Voice
 ) -> Trajectory | None:
-    rows, rule = rows_of(files, len(poses))
-    have = rows >= 0
+    count = len(table.poses)
+    rows, rule = rows_of(files, count)
+    if table.note is not None:
+        voice.notes.append(f"ground truth {path}: {table.note}")
+        numbers_of_files = file_numbers(files)
+        if numbers_of_files is not None and int(table.numbers[-1]) != count - 1:
+            row_of = {int(number): k for k, number in enumerate(table.numbers)}
+            rows = np.array([row_of.get(int(number), -1) for number in numbers_of_files], np.int64)
+            rule = "by the number in the file name"
+    have = (rows >= 0) & ~np.isnan(table.poses[rows]).any(axis=(1, 2))
     if not have.any():
         voice.problems.append(f"ground truth {path} has no pose for any scan")
         return None
-    if len(poses) != len(files):
+    if count != len(files) or not have.all():
         voice.problems.append(
-            f"{path} has {len(poses)} poses for {len(files)} scans: the {int(have.sum())} common ones are used, {rule}"
+            f"{path} has {count} poses for {len(files)} scans: the {int(have.sum())} common ones are used, {rule}"
         )
-    return Trajectory(stamps_ns[have], poses[rows[have]], "cam0", True, None, str(path))
+    frame = "cam0" if table.is_cam0 else "unknown"
+    return Trajectory(stamps_ns[have], table.poses[rows[have]], frame, True, None, str(path))
 
 
 def oxts_truth(

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from lslam.errors import InputError, cause
 from lslam.formats.point_files import SUFFIXES
-from lslam.formats.pose_rows import parse_stamp, read_stamps
+from lslam.formats.pose_rows import parse_stamp
+from lslam.formats.stamp_files import read_stamps
 
 DEFAULT_RATE_HZ = 10.0
 Stamps = NDArray[np.int64]

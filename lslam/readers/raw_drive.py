@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from lslam.errors import InputError
 from lslam.formats.calibration_files import read_rigid
 from lslam.formats.oxts_files import ACCEL, GYRO, POS_ACC, Oxts, read_oxts
-from lslam.formats.pose_rows import read_stamps
+from lslam.formats.stamp_files import read_stamps
 from lslam.readers.bag import BagSequence
 from lslam.readers.bag_topics import why_no_fixes, why_no_imu
 from lslam.readers.folder_sequence import FolderSequence

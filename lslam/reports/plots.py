@@ -86,6 +86,9 @@ def error_figures(evaluation: Evaluation) -> list[Figure]:
     position = [
         svg.Line(a.alignment, distance, np.linalg.norm(a.errors, axis=1), f"s{i + 1}") for i, a in enumerate(available)
     ]
+    if not any(a.rotation_deg for a in available):
+        caption = "Distance between matched positions, per alignment."
+        return [_lines("Position error", position, DISTANCE, "position error, m", caption)]
     rotation = [svg.Line(a.alignment, distance, a.rotation_errors_deg, f"s{i + 1}") for i, a in enumerate(available)]
     axes = evaluation.scores["thesis1"]
     figures = [

@@ -17,6 +17,8 @@ class Trajectory:
     has_stamps : False when the file format has no time and stamps merely count scans at 10 Hz
     covariances : (N, 6, 6) float64 of t' = t + d[:3], R' = exp(d[3:]) R in world axes, m2 and rad2, or None
     source : file or method the poses come from
+    has_rotations : False for positions alone, as of a prism or RTK; the poses' rotations are then identity and mean nothing
+    notes : what the reader chose and left out
     """
 
     stamps_ns: NDArray[np.int64]
@@ -25,6 +27,8 @@ class Trajectory:
     has_stamps: bool = True
     covariances: NDArray[np.float64] | None = None
     source: str = ""
+    has_rotations: bool = True
+    notes: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return len(self.stamps_ns)

@@ -154,7 +154,7 @@ WRONG = {
     "short.tum": (GOOD + "0.1 0 0 0 0 0\n", "line 2: 6 columns"),
     "long.tum": (GOOD + "0.1 0 0 0 0 0 0 1 5\n", "line 2: 9 columns"),
     "text.tum": (GOOD + "# ok\n0.1 0 zero 0 0 0 0 1\n", "line 3: not a number"),
-    "nan.tum": (GOOD + "0.1 nan 0 0 0 0 0 1\n", "line 2: NaN"),
+    "nan.tum": ("0.1 nan 0 0 0 0 0 1\n", "every row holds NaN"),
     "inf.tum": (GOOD + "0.1 inf 0 0 0 0 0 1\n", "line 2: NaN or infinity"),
     "back.tum": ("0.2 0 0 0 0 0 0 1\n" + GOOD, "line 2: .* goes back"),
     "twice.tum": (GOOD + GOOD, "line 2: .* repeats"),
@@ -166,10 +166,11 @@ WRONG = {
     "mirror.txt": ("1 0 0 0 0 1 0 0 0 0 -1 0\n", "line 1: .* no rotation"),
     "columns.txt": ("1 2 3\n", "line 1: 3 columns are no trajectory format"),
     "bare.csv": ("1,2,3,4,5,6,7,8\n", "without a header"),
-    "missing.csv": ("t,x,y,z\n1,2,3,4\n", "no column for qx, qy, qz, qw"),
+    "missing.csv": ("t,x,y,z,qx,qy,qz\n1,2,3,4,0,0,0\n", "no column for qw"),
+    "planar.csv": ("t,x,y,yaw\n1,2,3,4\n", "no column for z"),
     "header.csv": ("t,x,y,z,qx,qy,qz,qw\n", "header but no poses"),
     "short.csv": ("t,x,y,z,qx,qy,qz,qw\n0,0,0,0,0,0,0,1\n1,0,0\n", "line 3: 3 columns"),
-    "nan.csv": ("t,x,y,z,qx,qy,qz,qw\n0,0,0,0,0,0,0,1\n1,nan,0,0,0,0,0,1\n", "line 3: NaN"),
+    "inf.csv": ("t,x,y,z,qx,qy,qz,qw\n0,0,0,0,0,0,0,1\n1,inf,0,0,0,0,0,1\n", "line 3: NaN or infinity"),
     "time.csv": ("t,x,y,z,qx,qy,qz,qw\nsoon,0,0,0,0,0,0,1\n", "line 2: 'soon' is no time"),
 }
 

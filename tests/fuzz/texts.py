@@ -21,8 +21,8 @@ from lslam.formats.geojson import read_corrected, read_line
 from lslam.formats.manual_files import read_control_points, read_named_pairs
 from lslam.formats.osm_buildings import read_buildings
 from lslam.formats.oxts_files import read_oxts
-from lslam.formats.pose_rows import read_stamps
 from lslam.formats.sequence_toml import read_sequence_toml
+from lslam.formats.stamp_files import read_stamps
 from lslam.formats.stamped_csv import read_gnss_csv, read_imu_csv
 from lslam.formats.state_files import read_state, write_state
 from lslam.formats.study_files import read_study_csv, write_study_csv
@@ -223,13 +223,23 @@ def _kept(folder: Path) -> list[Files]:
     return [{_file_name(_BOUNDS): json.dumps(maker.tree()).encode()}]
 
 
+_OF_TOOLS = (
+    "%time,field.header.stamp,field.pose.position.x,field.pose.position.y,field.pose.position.z\n1,2,3,4,5\n2,3,4,5,nan\n",
+    "sec;nsec;x;y;z\n7;100000000;1,5;2,5;3\n7;200000000;1,5;2,5;3\n8;1;0;0;0\n",
+    "1 1 0 0 5 0 1 0 6 0 0 1 7\n4 1 0 0 5 0 1 0 6 0 0 1 8\n",
+    "0 7.5 0 0 0 0 0 0 1\n1 7.6 1 0 0 0 0 0 1\n2 7.7 2 1 0 0 0 0 1\n",
+)
 PARSERS = [
     _text_parser("trajectory", "a.txt", read_trajectory, _TUM, _EUROC, _CSV, _KITTI),
+    _text_parser("trajectory of another tool", "a.csv", read_trajectory, *_OF_TOOLS),
     _text_parser("times", "times.txt", read_times, "0.0\n1.036224e-01\n0.2\n"),
     _text_parser("stamps", "stamps.txt", read_stamps, "0.0\n0.1\n", "2011-09-26 13:04:32.349659964\n2011-09-26 13:04:33\n",
                  "stamp\n1670403902235281229\n1670403902335281229\n"),
-    _text_parser("imu.csv", "imu.csv", read_imu_csv, _IMU),
-    _text_parser("gnss.csv", "gnss.csv", read_gnss_csv, _GNSS),
+    _text_parser("stamps in columns", "stamps.csv", read_stamps, "#sec,nsec\n7,100000000\n7,300000000\n8,1\n",
+                 "0 1670403902.2\n1 1670403902.3\n2 1670403902.4\n"),
+    _text_parser("imu.csv", "imu.csv", read_imu_csv, _IMU, "sec,nanosec," + _IMU.split(",", 1)[1].replace("\n", "\n7,", 1)),
+    _text_parser("gnss.csv", "gnss.csv", read_gnss_csv, _GNSS,
+                 "%time,field.latitude,field.longitude,field.altitude\n1670403902235281229,49,8,100\n"),
     _text_parser("KITTI calibration", "calib.txt", read_cam0_lidar, _CALIB, "R: 1 0 0 0 1 0 0 0 1\nT: 0 0 0\n"),
     _text_parser("MCD calibration", "a_calib.yaml", read_mcd_extrinsics, _MCD),
     _text_parser("transform", "T.txt", lambda p: read_transform(str(p)), "1 0 0 0 0 1 0 0 0 0 1 0\n", "0,0,0,0,0,0,1", _CALIB),

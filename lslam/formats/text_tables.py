@@ -1,0 +1,111 @@
+"""Tables of text: rows of cells between commas, semicolons, tabs or blanks, with or without names of the columns."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.errors import InputError
+from lslam.formats.pose_rows import Row
+
+_DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+(?:[eE][-+]?\d+)?")
+_DATE_AND_TIME = re.compile(r"(\d{4}-\d\d-\d\d) (\d\d:\S+)")
+# What tools write where a number is missing.
+_MISSING = frozenset(("", "nan", "+nan", "-nan", "null", "none", "na", "n/a", "<na>"))
+
+
+@dataclass(frozen=True)
+class TextTable:
+    """Cells of a text file.
+
+    names : (K,) of the columns as the file has them, empty without a header; rows : (N,) lines; cells : (N,) lists of cells
+    separator : between cells, None for blanks
+    """
+
+    path: Path
+    names: tuple[str, ...]
+    rows: list[Row]
+    cells: list[list[str]]
+    separator: str | None
+
+    def numbers(self, column: int) -> NDArray[np.float64]:
+        """(N,) float64 of a column, NaN for what is no number or not there."""
+        return np.array([_number(cells[column]) if column < len(cells) else np.nan for cells in self.cells], np.float64)
+
+    def values(self, columns: list[int]) -> NDArray[np.float64]:
+        """(N, K) float64 of columns, NaN where a number is missing; InputError with the line of a cell that is text."""
+        values = np.empty((len(self.rows), len(columns)))
+        for i, (row, cells) in enumerate(zip(self.rows, self.cells, strict=True)):
+            try:
+                values[i] = [float("nan") if cells[c].lower() in _MISSING else float(cells[c]) for c in columns]
+            except ValueError:
+                raise InputError(f"{self.path}, line {row.number}: not a number in {row.text[:60]!r}") from None
+        return values
+
+    def select(self, mask: NDArray[np.bool_]) -> TextTable:
+        """The rows where `mask` (N,) is true."""
+        kept = np.flatnonzero(mask).tolist()
+        return replace(self, rows=[self.rows[i] for i in kept], cells=[self.cells[i] for i in kept])
+
+
+def looks_like_header(line: str) -> bool:
+    """Whether the first field of `line` is a name and no number, or is empty before a name (the index of pandas)."""
+    fields = [field.strip("\"' ") for field in re.split(r"[,;\s]\s*", line.strip())[:2]]
+    return any(re.match(r"[A-Za-z_/]|\.[A-Za-z]", field) for field in fields[: 1 if fields[0] else 2]) and (
+        fields[0].lower() not in ("nan", "inf", "infinity")
+    )
+
+
+def separator_of(text: str) -> str | None:
+    """What stands between the cells of a line: a semicolon, a tab, a comma, else blanks (None)."""
+    return next((s for s in (";", "\t", ",") if s in text), None)
+
+
+def split_cells(text: str, separator: str | None) -> list[str]:
+    """Cells of a line, without quotes; decimal commas become points where cells stand between something else.
+
+    >>> split_cells("1700000000,5; 2", ";"), split_cells("2011-09-26 13:04:32.5 7", None)
+    (['1700000000.5', '2'], ['2011-09-26T13:04:32.5', '7'])
+    """
+    if separator is None:
+        text = _DATE_AND_TIME.sub(r"\1T\2", text, count=1)
+    cells = [cell.strip().strip("\"'") for cell in text.split(separator)]
+    if separator != ",":
+        cells = [cell.replace(",", ".") if _DECIMAL_COMMA.fullmatch(cell) else cell for cell in cells]
+    return cells
+
+
+def text_table(path: Path, rows: list[Row], comments: list[str]) -> TextTable:
+    """The table of the data lines and comments of a file; the names are those of the first line or of a comment as wide."""
+    header = ""
+    if looks_like_header(rows[0].text):
+        header, rows = rows[0].text, rows[1:]
+    if not rows:
+        return TextTable(path, tuple(split_cells(header, separator_of(header))), [], [], None)
+    separator = separator_of(rows[0].text)
+    cells = [split_cells(row.text, separator) for row in rows]
+    names = split_cells(header, separator_of(header)) if header else _names_in(comments, len(cells[0]))
+    return TextTable(path, tuple(names), rows, cells, separator)
+
+
+def _names_in(comments: list[str], width: int) -> list[str]:
+    """Names of the columns in the first comment that lists as many as there are, or times between commas; empty without."""
+    for comment in comments:
+        text = comment.lstrip("#%/ ")
+        for separator in dict.fromkeys((separator_of(text), None)):
+            names = split_cells(text, separator)
+            is_list = separator is not None and len(names) > 3 and re.search(r"time|stamp|sec\b", text, re.IGNORECASE)
+            if (len(names) == width > 1 or is_list) and looks_like_header(text):
+                return names
+    return []
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        return float("nan")
