@@ -34,7 +34,7 @@ _STAMPED, _TIMED, _ENDING = 0, 1, 2
 
 
 @dataclass(frozen=True)
-class Clock:
+class TimeColumns:
     """stamps_ns : (N,); columns : that hold them, one or two; others : names of the columns that might have been the time"""
 
     stamps_ns: NDArray[np.int64]
@@ -51,7 +51,7 @@ def tokens_of(name: str) -> list[str]:
     return [word for word in re.split(r"[^a-z0-9]+", re.sub(r"[\[(].*?[\])]", "", name.lower())) if word]
 
 
-def find_clock(table: TextTable, taken: Collection[int] = (), default_ns: int | None = None) -> Clock | None:
+def find_clock(table: TextTable, taken: Collection[int] = (), default_ns: int | None = None) -> TimeColumns | None:
     """The time of the rows, by names or, where there are none, by the first columns; None when no column is a time.
 
     Parameters
@@ -72,7 +72,7 @@ def find_clock(table: TextTable, taken: Collection[int] = (), default_ns: int | 
         return None
     others = {c for candidate in candidates for c in candidate} - set(chosen)
     names = tuple(table.names[c] for c in sorted(others)) if table.names else ()
-    return Clock(_stamps(table, chosen, default_ns), chosen, names)
+    return TimeColumns(_stamps(table, chosen, default_ns), chosen, names)
 
 
 def is_index(values: Floats) -> bool:
