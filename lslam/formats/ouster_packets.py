@@ -96,20 +96,25 @@ def read_metadata(path: Path) -> OusterSensor:
     Raises InputError naming the file when it is unreadable, lacks something or names a layout lslam does not know.
     """
     try:
-        tree = parse_json(path.read_bytes())
+        return parse_metadata(path.read_bytes(), str(path))
     except OSError as error:
         raise InputError(f"{path} cannot be read: {cause(error)}") from None
+
+
+def parse_metadata(text: str | bytes, where: str) -> OusterSensor:
+    """As `read_metadata`, of a text from `where`."""
+    try:
+        found = _flat(parse_json(text))
     except MISFIT as error:
-        raise InputError(f"{path} is no metadata of an Ouster sensor: {error}") from None
-    found = _flat(tree)
+        raise InputError(f"{where} is no metadata of an Ouster sensor: {error}") from None
     layout = str(found.get("udp_profile_lidar") or "LEGACY")
     if layout not in PROFILES:
-        raise InputError(f"{path}: packets of profile {layout} are not read; {', '.join(PROFILES)} are")
+        raise InputError(f"{where}: packets of profile {layout} are not read; {', '.join(PROFILES)} are")
     try:
         return _sensor(found, layout)
     except MISFIT as error:
         raise InputError(
-            f"{path} is no metadata of an Ouster sensor: beam_altitude_angles, beam_azimuth_angles and lidar_mode are needed "
+            f"{where} is no metadata of an Ouster sensor: beam_altitude_angles, beam_azimuth_angles and lidar_mode are needed "
             f"({type(error).__name__}: {error})"
         ) from None
 

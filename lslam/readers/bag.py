@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,12 +15,14 @@ from lslam.formats import bag_streams
 from lslam.formats.bag_files import INFO_TOPIC, Bag, BagTopic, open_bag
 from lslam.formats.bag_listing import list_bag_files, parts_beside, stem_of
 from lslam.formats.bag_streams import Stream, chain, is_static, read_poses
+from lslam.formats.packet_messages import is_decoded
 from lslam.formats.point_cloud import TIME_NAMES, PointCloud
 from lslam.formats.sequence_toml import FILE_NAME, SequenceInfo, parse_sequence_toml, read_sequence_toml
 from lslam.geometry import se3
 from lslam.printable import printable
 from lslam.readers.bag_halves import Halves, read_whole
 from lslam.readers.bag_links import Links
+from lslam.readers.bag_packets import open_packets
 from lslam.readers.bag_topics import (
     check_parts,
     choose_clouds,
@@ -32,6 +34,7 @@ from lslam.readers.bag_topics import (
 )
 from lslam.readers.ground_truth import Voice
 from lslam.readers.listing import measured_rate
+from lslam.readers.pcap_revolutions import Opened, Revolutions, read_scan
 from lslam.readers.point_times import TimeRule, apply_rule, rule_of_scans
 from lslam.readers.sidecars import compensation_note
 from lslam.types.gnss import GnssStream
@@ -57,6 +60,7 @@ class BagSequence(Scans):
     time_rule : how per-point times are understood, None when there are none or they are not to be used
     has_assumed_extrinsics : nothing says where the IMU sits, the identity stands in
     uses : what each topic that is used is used for; halves : further messages of a scan
+    revolutions : of packets, which then are read in place of messages
     """
 
     name: str
@@ -81,6 +85,7 @@ class BagSequence(Scans):
     has_assumed_extrinsics: bool = False
     uses: dict[str, str] = field(default_factory=dict)
     halves: Halves = field(default_factory=dict)
+    revolutions: Revolutions | None = None
 
     def __len__(self) -> int:
         return len(self.messages)
@@ -92,6 +97,8 @@ class BagSequence(Scans):
         """
         if not 0 <= index < len(self.messages):
             raise IndexError(f"scan {index} of {len(self.messages)}")
+        if self.revolutions is not None:
+            return read_scan(self.revolutions, index, not self.motion_compensated)
         stamp = int(self.headers_ns[index])
         cloud, shift = self.cloud(index)
         stamp += shift
@@ -139,20 +146,13 @@ def open_folder(path: Path, overrides: SequenceInfo, why: str) -> BagSequence:
     bag = open_bag(path)
     info = _info(path, bag, overrides)
     voice = Voice([f"format {KIND}: {why}", *compensation_note(info), *bag.notes], list(bag.losses))
-    topic = choose_clouds(bag, info.lidar_topic)
+    topic = choose_clouds(bag, info.lidar_topic, voice)
     voice.notes.append(f"scans from {topic.name} ({topic.type}, {len(topic)} messages)")
     check_parts(bag, topic)
-    messages, stamps, frame, halves = index_scans(bag, topic, voice)
-    rate = info.rate_hz or measured_rate(stamps)
-    sequence = BagSequence(
-        info.name or printable(stem_of(path)),
-        path, bag, topic, messages, stamps, stamps, rate,
-        motion_compensated=info.motion_compensated, rings=info.rings, sensor=info.sensor,
-        notes=voice.notes, problems=voice.problems, halves=halves,
-    )  # fmt: skip
-    if not info.motion_compensated:
-        _decide_times(sequence, info)
-    imu, gnss = load_imu(bag, info.imu_topic, voice), load_fixes(bag, info.gnss_topic, voice)
+    sequence, frame, opened = _scans_of(bag, topic, info, voice)
+    stamps, own = sequence.stamps_ns, opened if info.imu_topic is None else None
+    imu = load_imu(bag, info.imu_topic, voice) if own is None or own.imu is None else None
+    gnss = load_fixes(bag, info.gnss_topic, voice)
     for what, stream in (("IMU", imu), ("GNSS", gnss)):
         if stream is not None and (stream.stamps_ns[0] > stamps[-1] or stream.stamps_ns[-1] < stamps[0]):
             voice.problems.append(no_shared_time(what))
@@ -163,8 +163,34 @@ def open_folder(path: Path, overrides: SequenceInfo, why: str) -> BagSequence:
         sequence.imu = ImuStream(imu.stamps_ns, imu.values[:, :3].copy(), imu.values[:, 3:].copy())
     if gnss is not None:
         sequence.gnss = GnssStream(gnss.stamps_ns, gnss.values[:, :3].copy(), gnss.values[:, 3].copy())
+    if own is not None and own.imu is not None:
+        sequence.imu = own.imu
+        T_lidar_imu = own.T_lidar_imu if info.T_lidar_imu is None else info.T_lidar_imu
+        sequence.calibration = replace(sequence.calibration, T_lidar_imu=T_lidar_imu)
     sequence.uses = _uses(sequence, imu, gnss, links)
     return sequence
+
+
+def _scans_of(bag: Bag, topic: BagTopic, info: SequenceInfo, voice: Voice) -> tuple[BagSequence, str, Opened | None]:
+    """The scans of a topic, the frame of their points and, where it holds packets, what else these tell."""
+    name, opened = info.name or printable(stem_of(bag.path)), None
+    halves: Halves = {}
+    if is_decoded(topic):
+        opened, frame = open_packets(bag, topic, voice)
+        stamps = opened.revolutions.stamps_ns
+        messages = np.arange(len(stamps))
+        rate, rings, sensor = opened.rate_hz, opened.rings, opened.sensor
+    else:
+        messages, stamps, frame, halves = index_scans(bag, topic, voice)
+        rate, rings, sensor = measured_rate(stamps), None, None
+    sequence = BagSequence(
+        name, bag.path, bag, topic, messages, stamps, stamps, info.rate_hz or rate,
+        motion_compensated=info.motion_compensated, rings=info.rings or rings, sensor=info.sensor or sensor,
+        notes=voice.notes, problems=voice.problems, halves=halves, revolutions=None if opened is None else opened.revolutions,
+    )  # fmt: skip
+    if opened is None and not info.motion_compensated:
+        _decide_times(sequence, info)
+    return sequence, frame, opened
 
 
 def _uses(sequence: BagSequence, imu: Stream | None, gnss: Stream | None, links: Links) -> dict[str, str]:

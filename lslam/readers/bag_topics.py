@@ -14,6 +14,8 @@ from lslam.errors import InputError, LslamError, UsageError
 from lslam.formats.bag_files import Bag, BagTopic, read_header
 from lslam.formats.bag_listing import missing_parts
 from lslam.formats.bag_streams import Stream, read_fixes, read_imu
+from lslam.formats.packet_makers import is_packets, maker_by_name, not_decoded
+from lslam.formats.packet_messages import packet_topics
 from lslam.formats.pose_rows import seconds_text
 from lslam.readers.bag_halves import Halves, find_halves
 from lslam.readers.clocks import Clock, agree, stands_still
@@ -30,27 +32,29 @@ _SAID = 3  # damaged messages that are named one by one
 Stamps = NDArray[np.int64]
 
 
-def choose_clouds(bag: Bag, wanted: str | None) -> BagTopic:
-    """The topic `wanted`, or the only one with clouds.
+def choose_clouds(bag: Bag, wanted: str | None, voice: Voice) -> BagTopic:
+    """The topic `wanted`, or the only one with clouds; where there are none, the only one with packets that are decoded.
 
     Raises UsageError listing the flags when there are several or `wanted` is not among them, InputError when there is none.
     """
-    clouds = bag.of_type(*CLOUDS)
+    clouds, packets = bag.of_type(*CLOUDS), packet_topics(bag)
     if wanted is not None:
-        return _named(bag, clouds, wanted, "--lidar-topic", "clouds")
+        return _named(bag, clouds + packets, wanted, "--lidar-topic", "clouds")
+    if clouds and packets:
+        names = ", ".join(t.name for t in packets)
+        voice.notes.append(f"raw packets on {names} are left out, for there are clouds; --lidar-topic reads them")
+    clouds = clouds or packets
     if len(clouds) == 1:
         return clouds[0]
     if clouds:
         raise UsageError(
             f"{bag.path} has clouds on {len(clouds)} topics, choose one:\n{_flags(clouds, '--lidar-topic')}"
         )
-    packets = [t for t in bag.topics if "acket" in t.type or t.type.endswith("VelodyneScan")]
+    raw = [t for t in bag.topics if len(t) and is_packets(t.type)]
     nameless = [t for t in bag.topics if len(t) and not t.type]
-    if packets:
-        raise InputError(
-            f"{bag.path} holds raw packets ({packets[0].name}, {packets[0].type}) and no clouds: the sensor's driver turns them "
-            "into PointCloud2"
-        )
+    if raw:
+        where = f" on {raw[0].name} ({raw[0].type}, {len(raw[0])} messages)"
+        raise InputError(f"{bag.path} holds {not_decoded(maker_by_name(raw[0].name, raw[0].type), where)}")
     if nameless:
         raise InputError(
             f"{bag.path} lacks the type definition of {', '.join(t.name for t in nameless)} and has no other clouds: record it "

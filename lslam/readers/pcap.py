@@ -12,13 +12,14 @@ from numpy.typing import NDArray
 from lslam.errors import InputError
 from lslam.formats import velodyne_packets
 from lslam.formats.bag_listing import CAPTURES
+from lslam.formats.packet_makers import maker_by_bytes, not_decoded
 from lslam.formats.pcap_files import Datagrams, read_datagrams
 from lslam.formats.sequence_toml import SequenceInfo
 from lslam.printable import printable
 from lslam.readers.ground_truth import Voice
 from lslam.readers.listing import list_scans
 from lslam.readers.pcap_ouster import open_ouster
-from lslam.readers.pcap_revolutions import Opened, Revolutions
+from lslam.readers.pcap_revolutions import Opened, Revolutions, read_scan
 from lslam.readers.pcap_velodyne import open_velodyne
 from lslam.readers.sidecars import calibration_over, compensation_note, load_gnss, load_imu, read_info
 from lslam.types.gnss import GnssStream
@@ -28,6 +29,7 @@ from lslam.types.sequence import Calibration, Scans, no_shared_time
 from lslam.types.trajectory import Trajectory
 
 KIND = "pcap"
+_PACKET_BYTES, _LOOKED_AT = 200, 20  # LiDAR packets are larger; so many tell whose they are
 
 
 @dataclass
@@ -61,10 +63,7 @@ class PcapSequence(Scans):
         """Read scan `index`. Raises IndexError beyond the end."""
         if not 0 <= index < len(self):
             raise IndexError(f"scan {index} of {len(self)}")
-        cloud, times_ns = self.revolutions.read(index)
-        stamp = int(self.stamps_ns[index])
-        times = None if self.motion_compensated else ((times_ns - stamp) * 1e-9).astype(np.float32)
-        return Scan(cloud.points, stamp, index, cloud.intensity, times, cloud.rings)
+        return read_scan(self.revolutions, index, not self.motion_compensated)
 
 
 def locate(path: Path) -> tuple[Path, str] | None:
@@ -127,4 +126,9 @@ def _opener(path: Path, datagrams: Datagrams) -> Callable[..., Opened]:
         return open_velodyne
     if not len(datagrams):
         raise InputError(f"{path} holds no UDP datagrams over IPv4, which LiDAR packets are")
+    large = np.flatnonzero(datagrams.sizes >= _PACKET_BYTES)[:_LOOKED_AT]
+    heads = datagrams.bytes_at(large, tuple(range(4)))
+    makers = {maker_by_bytes(bytes(head), int(size)) for head, size in zip(heads, datagrams.sizes[large], strict=True)}
+    if len(makers) == 1 and (maker := makers.pop()):
+        raise InputError(f"{path} holds {not_decoded(maker)}")
     return open_ouster

@@ -9,11 +9,10 @@ import numpy as np
 
 from lslam.errors import InputError
 from lslam.formats.ouster_packets import IMU_SIZE, OusterSensor, frames_and_times, imu_of, points_of, read_metadata
-from lslam.formats.pcap_files import Datagrams
 from lslam.formats.point_cloud import PointCloud
 from lslam.geometry import se3
 from lslam.readers.ground_truth import Voice
-from lslam.readers.pcap_revolutions import Integers, Opened, in_order, metadata_beside, of_one_sender
+from lslam.readers.pcap_revolutions import Integers, Opened, Packets, in_order, metadata_beside, of_one_sender
 from lslam.types.imu import ImuStream
 
 _UNIX_NS = 10**18  # a clock that tells less was never told the time
@@ -27,7 +26,7 @@ class OusterRevolutions:
     shift_ns : from the sensor's clock to that of the stamps
     """
 
-    datagrams: Datagrams
+    datagrams: Packets
     sensor: OusterSensor
     packets: Integers
     first: Integers
@@ -43,7 +42,7 @@ class OusterRevolutions:
         return cloud, times + self.shift_ns
 
 
-def open_ouster(path: Path, datagrams: Datagrams, voice: Voice) -> Opened:
+def open_ouster(path: Path, datagrams: Packets, voice: Voice) -> Opened:
     """Raises InputError without metadata, and when no packet of the capture is laid out as they say."""
     beside = metadata_beside(path)
     if len(beside) != 1:
@@ -52,12 +51,16 @@ def open_ouster(path: Path, datagrams: Datagrams, voice: Voice) -> Opened:
             f"{path} holds no packets of a Velodyne sensor, and for one of Ouster {there}: put its metadata at "
             f"{path.with_suffix('.json').name} there"
         )
-    sensor = read_metadata(beside[0])
+    return open_with_metadata(path, datagrams, read_metadata(beside[0]), beside[0].name, voice)
+
+
+def open_with_metadata(path: Path, datagrams: Packets, sensor: OusterSensor, metadata: str, voice: Voice) -> Opened:
+    """As `open_ouster`, by metadata that were read from what is called `metadata`."""
     which = np.flatnonzero(datagrams.sizes == sensor.packet_bytes)
     if not len(which):
         sizes, counts = np.unique(datagrams.sizes, return_counts=True)
         raise InputError(
-            f"{path} holds no LiDAR packets of {sensor.packet_bytes} bytes, as {beside[0].name} has them; most of its "
+            f"{path} holds no LiDAR packets of {sensor.packet_bytes} bytes, as {metadata} has them; most of its "
             f"{len(datagrams)} datagrams have {sizes[np.argmax(counts)]}"
         )
     which = of_one_sender(datagrams, which, "LiDAR packets", voice)
@@ -69,9 +72,7 @@ def open_ouster(path: Path, datagrams: Datagrams, voice: Voice) -> Opened:
     count = np.diff(np.concatenate([first, [len(frames)]])).astype(np.int64)
     whole = _whole(count, voice)
     first, count = first[whole], count[whole]
-    voice.notes.append(
-        f"{len(which)} packets of an {sensor.name} with {sensor.beams} beams, metadata from {beside[0].name}"
-    )
+    voice.notes.append(f"{len(which)} packets of an {sensor.name} with {sensor.beams} beams, metadata from {metadata}")
     revolutions = OusterRevolutions(datagrams, sensor, which, first, count, times[first] + shift, shift)
     imu = _imu(datagrams, shift, voice)
     return Opened(
@@ -84,7 +85,7 @@ def open_ouster(path: Path, datagrams: Datagrams, voice: Voice) -> Opened:
     )
 
 
-def _heads(datagrams: Datagrams, which: Integers, sensor: OusterSensor) -> tuple[Integers, Integers]:
+def _heads(datagrams: Packets, which: Integers, sensor: OusterSensor) -> tuple[Integers, Integers]:
     """Frame and time of each packet."""
     p = sensor.profile
     positions = (p.frame, p.frame + 1, *range(p.head, p.head + 8))
@@ -113,7 +114,7 @@ def _whole(count: Integers, voice: Voice) -> Integers:
     return np.flatnonzero(keep)
 
 
-def _imu(datagrams: Datagrams, shift_ns: int, voice: Voice) -> ImuStream | None:
+def _imu(datagrams: Packets, shift_ns: int, voice: Voice) -> ImuStream | None:
     which = np.flatnonzero(datagrams.sizes == IMU_SIZE)
     which = of_one_sender(datagrams, which, "IMU packets", voice)
     if not len(which):

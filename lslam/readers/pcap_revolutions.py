@@ -1,4 +1,4 @@
-"""What a capture gives, whichever sensor it is of: revolutions with their stamps, and what is known of the sensor."""
+"""What the packets of a sensor give, of a capture or a bag: revolutions with their stamps, and what is known of the sensor."""
 
 from __future__ import annotations
 
@@ -10,12 +10,43 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.formats.pcap_files import Datagrams
 from lslam.formats.point_cloud import PointCloud
 from lslam.readers.ground_truth import Voice
 from lslam.types.imu import ImuStream
+from lslam.types.scan import Scan
 
 Integers = NDArray[np.int64]
+
+
+class Packets(Protocol):
+    """Packets that lie somewhere; of what they hold only that is read which is asked for. See `lslam.formats.pcap_files`."""
+
+    @property
+    def stamps_ns(self) -> Integers:
+        """(N,) when each arrived."""
+        ...
+
+    @property
+    def sizes(self) -> Integers:
+        """(N,) bytes."""
+        ...
+
+    @property
+    def sources(self) -> Integers:
+        """(N,) whose they are."""
+        ...
+
+    def __len__(self) -> int:
+        """Number of packets."""
+        ...
+
+    def bytes_at(self, which: Integers, positions: tuple[int, ...]) -> NDArray[np.uint8]:
+        """(K, P) the bytes at `positions` of the packets `which`, which are so long."""
+        ...
+
+    def payloads(self, which: Integers) -> NDArray[np.uint8]:
+        """(K, size) the packets `which`, which are of one size."""
+        ...
 
 
 class Revolutions(Protocol):
@@ -43,7 +74,15 @@ class Opened:
     T_lidar_imu: NDArray[np.float64] | None = None
 
 
-def of_one_sender(datagrams: Datagrams, which: Integers, what: str, voice: Voice) -> Integers:
+def read_scan(revolutions: Revolutions, index: int, is_timed: bool) -> Scan:
+    """Revolution `index` as a scan, with the times of its points unless they are not to be used."""
+    cloud, times_ns = revolutions.read(index)
+    stamp = int(revolutions.stamps_ns[index])
+    times = ((times_ns - stamp) * 1e-9).astype(np.float32) if is_timed else None
+    return Scan(cloud.points, stamp, index, cloud.intensity, times, cloud.rings)
+
+
+def of_one_sender(datagrams: Packets, which: Integers, what: str, voice: Voice) -> Integers:
     """Those of the datagrams `which` that come from the sender of most; others are named among the problems."""
     senders, counts = np.unique(datagrams.sources[which], return_counts=True)
     if len(senders) < 2:

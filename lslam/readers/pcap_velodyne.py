@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 
 from lslam.errors import InputError
-from lslam.formats.pcap_files import Datagrams
 from lslam.formats.point_cloud import PointCloud
 from lslam.formats.velodyne_packets import (
     BLOCKS,
@@ -24,7 +23,7 @@ from lslam.formats.velodyne_packets import (
     split_blocks,
 )
 from lslam.readers.ground_truth import Voice
-from lslam.readers.pcap_revolutions import Integers, Opened, in_order, of_one_sender
+from lslam.readers.pcap_revolutions import Integers, Opened, Packets, in_order, of_one_sender
 
 _HOUR_NS = HOUR_US * 1000
 _SAID_NS = 10**9  # clocks that are nearer are the same clock, and the way of a packet
@@ -39,7 +38,7 @@ class VelodyneRevolutions:
     turns : (N,) which revolutions have points; stamps_ns : (N,)
     """
 
-    datagrams: Datagrams
+    datagrams: Packets
     model: VelodyneModel
     began: int
     packets: Integers
@@ -59,10 +58,12 @@ class VelodyneRevolutions:
         return points_of(blocks, blocks.azimuth // TURN == turn, self.began, self.model)
 
 
-def open_velodyne(path: Path, datagrams: Datagrams, voice: Voice) -> Opened:
-    """Raises InputError for a model that is not known, and a capture of less than one revolution."""
+def open_velodyne(path: Path, datagrams: Packets, voice: Voice) -> Opened:
+    """Raises InputError for a model that is not known, and for less than one revolution."""
     which = np.flatnonzero(datagrams.sizes == SIZE)
     which = which[(datagrams.bytes_at(which, (0, 1)) == FLAG).all(axis=1)]
+    if not len(which):
+        raise InputError(f"{path} holds no packets of {SIZE} bytes that begin as Velodyne's do")
     which = of_one_sender(datagrams, which, "Velodyne packets", voice)
     model, mode = _factory(path, datagrams, which)
     raw = datagrams.bytes_at(which, (1200, 1201, 1202, 1203)).astype(np.int64)
@@ -91,13 +92,13 @@ def open_velodyne(path: Path, datagrams: Datagrams, voice: Voice) -> Opened:
     return Opened(revolutions, round(rate * 1e9 / TURN, 3), model.lasers, model.name)
 
 
-def _factory(path: Path, datagrams: Datagrams, which: Integers) -> tuple[VelodyneModel, int]:
+def _factory(path: Path, datagrams: Packets, which: Integers) -> tuple[VelodyneModel, int]:
     mode, number = (int(v) for v in datagrams.bytes_at(which[:1], (1204, 1205))[0])
     if mode not in RETURNS or number not in MODELS:
         known = ", ".join(model.name for model in MODELS.values())
         raise InputError(
             f"{path}: its Velodyne packets end in {mode:#04x} {number:#04x}, which is no return mode and model that is known; "
-            f"{known} are"
+            f"{known} are; of others the driver makes PointCloud2"
         )
     return MODELS[number], mode
 
@@ -134,7 +135,7 @@ def _unwrapped(path: Path, angle: Integers, times_ns: Integers) -> tuple[Integer
 
 
 def _stamps(
-    datagrams: Datagrams, which: Integers, azimuth: Integers, times_ns: Integers, turns: Integers, model: VelodyneModel
+    datagrams: Packets, which: Integers, azimuth: Integers, times_ns: Integers, turns: Integers, model: VelodyneModel
 ) -> Integers:
     """When the first block of each revolution is measured."""
     stamps = np.zeros(len(turns), np.int64)

@@ -235,8 +235,10 @@ def test_missing_type_definitions_are_a_clear_sentence(tmp_path: Path, store: An
 
 
 def test_raw_packets_are_a_clear_sentence(tmp_path: Path, store: Any) -> None:
-    path = mcap(tmp_path / "a.mcap", names("velodyne_msgs/msg/VelodyneScan", "/packets"), *messages(store, 2))
-    with pytest.raises(InputError, match=r"raw packets \(/packets, velodyne_msgs/msg/VelodyneScan\).*driver"):
+    path = mcap(tmp_path / "a.mcap", names("hesai_ros_driver/msg/UdpFrame", "/packets"), *messages(store, 2))
+    with pytest.raises(
+        InputError, match=r"raw packets of a Hesai LiDAR on /packets \(hesai_ros_driver/msg/UdpFrame, 2 m.*driver"
+    ):
         open_sequence(path)
 
 

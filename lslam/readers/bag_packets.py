@@ -1,0 +1,132 @@
+"""Packets of Velodyne and Ouster sensors in bags: read as those of a capture are, a scan is a revolution."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.errors import InputError
+from lslam.formats import velodyne_packets
+from lslam.formats.bag_files import Bag, BagTopic
+from lslam.formats.bag_streams import read_text
+from lslam.formats.ouster_packets import OusterSensor, parse_metadata, read_metadata
+from lslam.formats.packet_messages import PACKET, SCANS, is_imu, read_packets
+from lslam.readers.bag_topics import say_broken
+from lslam.readers.ground_truth import Voice
+from lslam.readers.pcap_ouster import open_with_metadata
+from lslam.readers.pcap_revolutions import Integers, Opened, metadata_beside
+from lslam.readers.pcap_velodyne import open_velodyne
+
+# The frame of the points that `lslam.formats.ouster_packets` makes, as its driver calls it.
+_OUSTER_FRAME = "os_sensor"
+
+
+@dataclass(frozen=True)
+class BagPackets:
+    """Satisfies `Packets`.
+
+    stamps_ns, sizes, sources : (N,); topic, message, number : (N,) where each lies: of `topics`, of the topic, in the message
+    heads : (N, P) the bytes at `positions` of each
+    """
+
+    bag: Bag
+    topics: tuple[BagTopic, ...]
+    stamps_ns: Integers
+    sizes: Integers
+    sources: Integers
+    topic: NDArray[np.int8]
+    message: NDArray[np.int32]
+    number: NDArray[np.int16]
+    positions: tuple[int, ...]
+    heads: NDArray[np.uint8]
+
+    def __len__(self) -> int:
+        return len(self.sizes)
+
+    def bytes_at(self, which: Integers, positions: tuple[int, ...]) -> NDArray[np.uint8]:
+        """(K, P) the bytes at `positions`, which are some of those that were kept, of the packets `which`."""
+        return self.heads[which][:, [self.positions.index(p) for p in positions]]
+
+    def payloads(self, which: Integers) -> NDArray[np.uint8]:
+        """(K, size) the packets `which`, which are of one size."""
+        rows: list[NDArray[np.uint8]] = []
+        there, packets = (-1, -1), np.zeros((0, 0), np.uint8)
+        for k in which.tolist():
+            if there != (place := (int(self.topic[k]), int(self.message[k]))):
+                topic = self.topics[place[0]]
+                there, packets = place, read_packets(topic, self.bag.message(topic, place[1]))[1]
+            rows.append(packets[self.number[k]])
+        return np.stack(rows) if rows else np.zeros((0, 0), np.uint8)
+
+
+def open_packets(bag: Bag, topic: BagTopic, voice: Voice) -> tuple[Opened, str]:
+    """The revolutions on `topic`, and the frame of their points.
+
+    Raises InputError when no packet is whole or known, or the metadata of an Ouster sensor are missing.
+    """
+    where = Path(f"{bag.path}, {topic.name}")
+    if topic.type.endswith(SCANS):
+        size = velodyne_packets.SIZE
+        packets, frame = _gather(bag, [topic], (0, 1, 2, 3, *range(size - 6, size)), voice)
+        return open_velodyne(where, packets, voice), frame
+    sensor, source = _metadata(bag, topic)
+    p = sensor.profile
+    positions = (p.frame, p.frame + 1, *range(p.head, p.head + 8))
+    inertial = [t for t in bag.of_type(PACKET) if _namespace(t) == _namespace(topic) and is_imu(bag, t)]
+    packets, _ = _gather(bag, [topic, *inertial], positions, voice)
+    return open_with_metadata(where, packets, sensor, source, voice), _OUSTER_FRAME
+
+
+def _gather(bag: Bag, topics: list[BagTopic], positions: tuple[int, ...], voice: Voice) -> tuple[BagPackets, str]:
+    """All packets of the topics, and the first frame; messages that are damaged are named."""
+    stamps, sizes, heads, places = [], [], [], []
+    frame = ""
+    for n, topic in enumerate(topics):
+        broken: list[str] = []
+        bag.expect(topic)
+        for k, recorded in enumerate(bag.recorded_ns(topic)):
+            try:
+                own, packets, of = read_packets(topic, bag.message(topic, k))
+            except InputError as error:
+                broken.append(str(error))
+                continue
+            frame = frame or of
+            count, size = packets.shape
+            stamps.append(np.where(own == 0, recorded, own))
+            sizes.append(np.full(count, size, np.int64))
+            head = np.zeros((count, len(positions)), np.uint8)
+            inside = [i for i, p in enumerate(positions) if p < size]
+            head[:, inside] = packets[:, [positions[i] for i in inside]]
+            heads.append(head)
+            places.append(np.column_stack([np.full((count, 2), (n, k)), np.arange(count)]))
+        say_broken(broken, topic.name, voice)
+    if not sum(map(len, sizes)):
+        raise InputError(f"{bag.path}: {topics[0].name} holds no packets that can be read")
+    place = np.concatenate(places)
+    of_all = np.concatenate(sizes)
+    return BagPackets(
+        bag, tuple(topics), np.concatenate(stamps), of_all, np.zeros(len(of_all), np.int64), place[:, 0].astype(np.int8),
+        place[:, 1].astype(np.int32), place[:, 2].astype(np.int16), positions, np.concatenate(heads),
+    ), frame  # fmt: skip
+
+
+def _metadata(bag: Bag, topic: BagTopic) -> tuple[OusterSensor, str]:
+    """What the sensor says of itself, on a topic beside its packets or in a file beside the bag, and where that was."""
+    named = [t for t in bag.of_type("String") if "metadata" in t.name.rsplit("/", 1)[-1]]
+    own = [t for t in named if _namespace(t) == _namespace(topic)] or named
+    if len(own) == 1 and (text := read_text(bag, own[0].name)) is not None:
+        return parse_metadata(text, f"{bag.path}, {own[0].name}"), own[0].name
+    beside = sorted(bag.path.glob("*.json")) if bag.path.is_dir() else list(metadata_beside(bag.path))
+    if len(beside) == 1:
+        return read_metadata(beside[0]), beside[0].name
+    raise InputError(
+        f"{bag.path}: for the Ouster packets of {topic.name} the sensor's metadata are needed, as std_msgs/String on "
+        f"{_namespace(topic)}/metadata or as the only *.json beside the bag; there are {len(own)} and {len(beside)}"
+    )
+
+
+def _namespace(topic: BagTopic) -> str:
+    return topic.name.rpartition("/")[0]
